@@ -1,0 +1,349 @@
+//! Bricks: 8x8x8 voxels of which only the relevant ones are kept (paper section 4.2).
+//!
+//! A brick holds values and normals, never colours or opacities, so a change of light or colour
+//! needs no new bricks (CONTRACTS.md, Wire). The paper spends 16 bytes a voxel; here an 8-bit
+//! shaded voxel takes 5 in memory (index, value, normal) and 3 to 5 on the wire.
+
+use crate::ids::BrickId;
+use crate::volume::{Digest32, SampleKind, Samples};
+
+/// Edge of a brick in voxels (the paper's choice, section 4.2).
+pub const BRICK: u32 = 8;
+/// Voxels of a full brick.
+pub const BRICK_VOXELS: usize = 512;
+/// Most bricks a volume may have: a 4096^3 volume has 2^27.
+pub const MAX_BRICKS: u64 = 1 << 27;
+
+/// How a volume is cut into bricks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BrickGrid {
+    /// Bricks along each index axis.
+    pub dims: [u32; 3],
+}
+
+impl BrickGrid {
+    /// The grid of a volume with `dims` samples.
+    pub fn of(dims: [u32; 3]) -> Self {
+        BrickGrid { dims: dims.map(|n| n.div_ceil(BRICK)) }
+    }
+
+    /// Number of bricks, relevant or not.
+    pub fn len(&self) -> usize {
+        self.dims.iter().map(|&n| n as usize).product()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Index of a brick's first voxel.
+    #[inline]
+    pub fn corner(&self, id: BrickId) -> [u32; 3] {
+        let [nx, ny, _] = self.dims;
+        [id.0 % nx * BRICK, id.0 / nx % ny * BRICK, id.0 / nx / ny * BRICK]
+    }
+
+    /// The brick at grid position (x, y, z).
+    #[inline]
+    pub fn id(&self, [x, y, z]: [u32; 3]) -> BrickId {
+        BrickId(x + self.dims[0] * (y + self.dims[1] * z))
+    }
+}
+
+/// The box of a brick's relevant voxels, in index coordinates of the volume, ends included.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TightBox {
+    /// Smallest index along each axis.
+    pub lo: [u32; 3],
+    /// Largest index along each axis.
+    pub hi: [u32; 3],
+}
+
+/// What the scheduler knows of a relevant brick.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BrickInfo {
+    /// Which brick.
+    pub id: BrickId,
+    /// Its tight box.
+    pub tight: TightBox,
+    /// Relevant voxels, 1 to 512.
+    pub voxels: u16,
+    /// Bytes of its encoding on the wire.
+    pub bytes: u32,
+}
+
+/// Which bricks these are: a volume, the values that are relevant, and whether normals are
+/// there (CONTRACTS.md: volume digest and support).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct BrickSetKey(pub Digest32);
+
+/// One brick: its relevant voxels in ascending local index.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Brick {
+    /// Which brick.
+    pub id: BrickId,
+    /// Local index `x + 8 y + 64 z` of each voxel, ascending.
+    pub index: Vec<u16>,
+    /// Code of each voxel.
+    pub values: Samples,
+    /// Octahedral normal of each voxel; `None` where the scene is unshaded.
+    pub normals: Option<Vec<u16>>,
+}
+
+/// Why bytes are not a brick.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum BrickError {
+    /// The bytes end too early or late.
+    #[error("brick encoding has {have} bytes, needs {need}")]
+    Length {
+        /// Bytes there.
+        have: usize,
+        /// Bytes needed.
+        need: usize,
+    },
+    /// The checksum does not fit.
+    #[error("brick {id} fails its checksum")]
+    Checksum {
+        /// The id it claims.
+        id: BrickId,
+    },
+    /// A field is out of range.
+    #[error("brick field {field} is out of range")]
+    Field {
+        /// Which.
+        field: &'static str,
+    },
+}
+
+const HEAD: usize = 4 + 2 + 1;
+const TAIL: usize = 4;
+const MASK_BYTES: usize = BRICK_VOXELS / 8;
+/// From this many voxels a bit mask (64 bytes) is shorter than a list of 2-byte indices.
+const MASK_FROM: usize = 32;
+
+impl Brick {
+    /// Number of voxels.
+    pub fn len(&self) -> usize {
+        self.index.len()
+    }
+
+    /// Whether there is none (never so in a brick set).
+    pub fn is_empty(&self) -> bool {
+        self.index.is_empty()
+    }
+
+    /// The tight box, in index coordinates of the volume.
+    pub fn tight(&self, grid: &BrickGrid) -> TightBox {
+        let corner = grid.corner(self.id);
+        let (mut lo, mut hi) = ([7u32; 3], [0u32; 3]);
+        for &i in &self.index {
+            let p = local(i);
+            for a in 0..3 {
+                lo[a] = lo[a].min(p[a]);
+                hi[a] = hi[a].max(p[a]);
+            }
+        }
+        TightBox {
+            lo: std::array::from_fn(|a| corner[a] + lo[a]),
+            hi: std::array::from_fn(|a| corner[a] + hi[a]),
+        }
+    }
+
+    /// Bytes it takes in memory, its own overhead included.
+    pub fn bytes_in_memory(&self) -> usize {
+        let n = self.len();
+        std::mem::size_of::<Brick>()
+            + n * (2 + self.values.kind().bytes() + if self.normals.is_some() { 2 } else { 0 })
+    }
+
+    /// Bytes that [`Brick::encode`] makes.
+    pub fn encoded_len(&self) -> usize {
+        encoded_len(self.len(), self.values.kind(), self.normals.is_some())
+    }
+
+    /// Appends the encoding: id (u32), voxels (u16), flags (u8: bits 0-1 value type, bit 2
+    /// normals), which voxels (nothing when all 512; a 64-byte mask from 32 voxels on; else u16
+    /// each), values, normals, CRC-32C over all before it. Little endian.
+    pub fn encode(&self, out: &mut Vec<u8>) {
+        let start = out.len();
+        let n = self.len();
+        out.reserve(self.encoded_len());
+        out.extend(self.id.0.to_le_bytes());
+        out.extend((n as u16).to_le_bytes());
+        let kind = match self.values.kind() {
+            SampleKind::U8 => 0u8,
+            SampleKind::U16 => 1,
+            SampleKind::F32 => 2,
+        };
+        out.push(kind | if self.normals.is_some() { 4 } else { 0 });
+        if n < MASK_FROM {
+            out.extend(self.index.iter().flat_map(|i| i.to_le_bytes()));
+        } else if n < BRICK_VOXELS {
+            let mut mask = [0u8; MASK_BYTES];
+            for &i in &self.index {
+                mask[i as usize / 8] |= 1 << (i % 8);
+            }
+            out.extend(mask);
+        }
+        match &self.values {
+            Samples::U8(v) => out.extend(v),
+            Samples::U16(v) => out.extend(v.iter().flat_map(|x| x.to_le_bytes())),
+            Samples::F32(v) => out.extend(v.iter().flat_map(|x| x.to_le_bytes())),
+        }
+        if let Some(normals) = &self.normals {
+            out.extend(normals.iter().flat_map(|x| x.to_le_bytes()));
+        }
+        let crc = crc32c::crc32c(&out[start..]);
+        out.extend(crc.to_le_bytes());
+    }
+
+    /// The brick that [`Brick::encode`] wrote as exactly these bytes.
+    pub fn decode(bytes: &[u8]) -> Result<Brick, BrickError> {
+        let have = bytes.len();
+        if have < HEAD + TAIL {
+            return Err(BrickError::Length { have, need: HEAD + TAIL });
+        }
+        let id = BrickId(u32::from_le_bytes(bytes[0..4].try_into().expect("four bytes")));
+        let n = u16::from_le_bytes(bytes[4..6].try_into().expect("two bytes")) as usize;
+        let flags = bytes[6];
+        if n == 0 || n > BRICK_VOXELS {
+            return Err(BrickError::Field { field: "voxels" });
+        }
+        let kind = match flags & 3 {
+            0 => SampleKind::U8,
+            1 => SampleKind::U16,
+            2 => SampleKind::F32,
+            _ => return Err(BrickError::Field { field: "flags" }),
+        };
+        if flags & !7 != 0 {
+            return Err(BrickError::Field { field: "flags" });
+        }
+        let with_normals = flags & 4 != 0;
+        let need = encoded_len(n, kind, with_normals);
+        if have != need {
+            return Err(BrickError::Length { have, need });
+        }
+        let (body, crc) = bytes.split_at(have - TAIL);
+        if crc32c::crc32c(body) != u32::from_le_bytes(crc.try_into().expect("four bytes")) {
+            return Err(BrickError::Checksum { id });
+        }
+        let mut rest = &body[HEAD..];
+        let mut take = |len: usize| {
+            let (a, b) = rest.split_at(len);
+            rest = b;
+            a
+        };
+        let index: Vec<u16> = if n < MASK_FROM {
+            u16s(take(2 * n))
+        } else if n < BRICK_VOXELS {
+            let mask = take(MASK_BYTES);
+            (0..BRICK_VOXELS as u16)
+                .filter(|&i| mask[i as usize / 8] & (1 << (i % 8)) != 0)
+                .collect()
+        } else {
+            (0..BRICK_VOXELS as u16).collect()
+        };
+        let ascending = index.windows(2).all(|w| w[0] < w[1]);
+        if index.len() != n || !ascending || index[n - 1] as usize >= BRICK_VOXELS {
+            return Err(BrickError::Field { field: "index" });
+        }
+        let values = match kind {
+            SampleKind::U8 => Samples::U8(take(n).to_vec()),
+            SampleKind::U16 => Samples::U16(u16s(take(2 * n))),
+            SampleKind::F32 => Samples::F32(
+                take(4 * n)
+                    .chunks_exact(4)
+                    .map(|c| f32::from_le_bytes(c.try_into().expect("four bytes")))
+                    .collect(),
+            ),
+        };
+        let normals = with_normals.then(|| u16s(take(2 * n)));
+        Ok(Brick { id, index, values, normals })
+    }
+}
+
+/// Position inside its brick of local index `i`.
+#[inline]
+pub fn local(i: u16) -> [u32; 3] {
+    let i = u32::from(i);
+    [i & 7, (i >> 3) & 7, i >> 6]
+}
+
+fn u16s(bytes: &[u8]) -> Vec<u16> {
+    bytes.chunks_exact(2).map(|c| u16::from_le_bytes([c[0], c[1]])).collect()
+}
+
+/// Bytes of the encoding of a brick of `n` voxels.
+pub fn encoded_len(n: usize, kind: SampleKind, normals: bool) -> usize {
+    let which = if n < MASK_FROM {
+        2 * n
+    } else if n < BRICK_VOXELS {
+        MASK_BYTES
+    } else {
+        0
+    };
+    HEAD + which + n * kind.bytes() + if normals { 2 * n } else { 0 } + TAIL
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn brick(bits: &[bool], kind: u8, normals: bool, seed: u32) -> Option<Brick> {
+        let index: Vec<u16> = (0..512u16).filter(|&i| bits[i as usize]).collect();
+        let n = index.len();
+        if n == 0 {
+            return None;
+        }
+        let hash = |i: usize| (seed.wrapping_add(i as u32)).wrapping_mul(2_654_435_761) >> 7;
+        let values = match kind {
+            0 => Samples::U8((0..n).map(|i| hash(i) as u8).collect()),
+            1 => Samples::U16((0..n).map(|i| hash(i) as u16).collect()),
+            _ => Samples::F32((0..n).map(|i| hash(i) as f32 * 0.37).collect()),
+        };
+        let normals = normals.then(|| (0..n).map(|i| hash(i + 9) as u16).collect());
+        Some(Brick { id: BrickId(seed), index, values, normals })
+    }
+
+    proptest! {
+        #[test]
+        fn bricks_come_back_and_every_flipped_bit_is_found(
+            bits in prop::collection::vec(prop::bool::weighted(0.3), 512),
+            sparse in any::<bool>(), kind in 0u8..3, normals in any::<bool>(),
+            seed in any::<u32>(), flip in any::<prop::sample::Index>(), bit in 0u8..8,
+        ) {
+            let bits: Vec<bool> = bits.iter().enumerate().map(|(i, &b)| b && (!sparse || i % 29 == 0)).collect();
+            let Some(b) = brick(&bits, kind, normals, seed) else { return Ok(()) };
+            let mut bytes = Vec::new();
+            b.encode(&mut bytes);
+            prop_assert_eq!(bytes.len(), b.encoded_len());
+            prop_assert_eq!(Brick::decode(&bytes).unwrap(), b);
+            let at = flip.index(bytes.len());
+            bytes[at] ^= 1 << bit;
+            prop_assert!(Brick::decode(&bytes).is_err(), "flipped bit {bit} of byte {at} went unseen");
+        }
+
+        #[test]
+        fn strangers_bytes_never_panic(bytes in prop::collection::vec(any::<u8>(), 0..3000)) {
+            let _ = Brick::decode(&bytes);
+        }
+    }
+
+    #[test]
+    fn a_full_brick_takes_three_bytes_a_shaded_voxel_and_a_few() {
+        let b = brick(&[true; 512], 0, true, 5).unwrap();
+        assert_eq!(b.encoded_len(), 512 * 3 + 11);
+    }
+
+    #[test]
+    fn grid_names_every_brick_once() {
+        let g = BrickGrid::of([17, 8, 9]);
+        assert_eq!(g.dims, [3, 1, 2]);
+        for id in 0..g.len() as u32 {
+            let c = g.corner(BrickId(id));
+            assert_eq!(g.id(c.map(|x| x / BRICK)), BrickId(id));
+        }
+    }
+}

@@ -1,0 +1,37 @@
+//! The paper's words as types.
+//!
+//! This crate refuses to know clocks, sockets, files and threads. What it holds is shared by
+//! the deciding crates (`render`, `schedule`, `volumes`) and by the wire (`proto`): a volume on
+//! its lattice, bricks, transfer functions, one camera as a [`view::View`], sheets and slabs,
+//! the occlusion map, pictures in the making, and the messages between master and worker.
+//!
+//! Everything here that ends up in a pixel has one result on every machine: no fused
+//! multiply-add, no platform maths library, sums in one order or in integers.
+
+pub mod brick;
+pub mod ids;
+pub mod image;
+pub mod math;
+pub mod message;
+pub mod occlusion;
+pub mod path;
+pub mod presets;
+pub mod quality;
+pub mod shade;
+pub mod slab;
+pub mod stats;
+pub mod transfer;
+pub mod view;
+pub mod volume;
+
+/// Version of the arithmetic behind the pixels. Two programs that agree on it give the same
+/// bytes for the same view; a change of any golden hash raises it (CONTRACTS.md, Exactness).
+pub const PIXELS_VERSION: u32 = 1;
+
+/// Version of the messages between master, worker and client.
+pub const PROTOCOL_VERSION: u32 = 1;
+
+/// SHA-256 of the self-test tile that every worker draws before it says hello
+/// (`slabcast_render::selftest`, which also has the test that keeps this constant true).
+pub const SELF_TEST_SHA256: &str =
+    "0000000000000000000000000000000000000000000000000000000000000000";

@@ -1,0 +1,265 @@
+//! What master and worker say to each other, as values.
+//!
+//! This is the seam of the system: a TCP link encodes these at `slabcast_proto::convert`, an
+//! embedded link passes them as they are, and neither side can tell. Bricks travel beside
+//! them on a path of their own ([`BrickBatch`]), so that control never queues behind data.
+
+use crate::brick::{Brick, BrickSetKey};
+use crate::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
+use crate::image::{Background, PixelFormat, TilePixels, TileState};
+use crate::occlusion::Rect;
+use crate::path::ViewPath;
+use crate::quality::{Quality, Work};
+use crate::slab::SheetRange;
+use crate::transfer::TransferFunction;
+use crate::view::View;
+use crate::volume::VolumeInfo;
+use std::sync::Arc;
+
+/// What stays the same over a job.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SceneSpec {
+    /// Its name.
+    pub id: SceneId,
+    /// The volume without its samples.
+    pub volume: VolumeInfo,
+    /// Transfer function.
+    pub transfer: TransferFunction,
+    /// Quality; `sums` is decided (never `Auto`).
+    pub quality: Quality,
+    /// Which bricks its tasks are drawn from.
+    pub bricks: BrickSetKey,
+}
+
+/// One macrotile of one slab, lent to one worker.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Lease {
+    /// Which task.
+    pub task: TaskId,
+    /// Which attempt at it.
+    pub epoch: Epoch,
+    /// Of which frame; the worker was sent its view before.
+    pub frame: FrameId,
+    /// The macrotile, inside the picture.
+    pub tile: Rect,
+    /// The slab's sheets.
+    pub slab: SheetRange,
+    /// The bricks it needs, ascending. The worker holds each of them already or has it on the
+    /// way; it starts when the last is there.
+    pub bricks: Vec<BrickId>,
+    /// The pixels as the slabs before left them.
+    pub state: TileState,
+}
+
+/// From master to worker.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ToWorker {
+    /// The hello was good. Always the first message of a link that is let in.
+    Welcome {
+        /// The worker's name from now on.
+        worker: WorkerId,
+        /// How often the master pings; silence for three times as long means it is gone.
+        heartbeat_ms: u32,
+    },
+    /// The hello was not good; the link ends. Says why and what to do.
+    Refused {
+        /// For people.
+        reason: String,
+    },
+    /// A scene, before its first frame. May come twice with the same content.
+    Scene(Arc<SceneSpec>),
+    /// A frame's view, before its first lease.
+    Frame {
+        /// The frame.
+        frame: FrameId,
+        /// Its scene, sent before.
+        scene: SceneId,
+        /// Its view.
+        view: View,
+    },
+    /// Work.
+    Lease(Box<Lease>),
+    /// A frame is over (finished or cancelled): leases of it that have not begun are dropped.
+    EndFrame {
+        /// The frame.
+        frame: FrameId,
+    },
+    /// A scene is over and may be forgotten. Its bricks stay.
+    EndScene {
+        /// The scene.
+        scene: SceneId,
+    },
+    /// Bricks to forget, so that the memory budget holds. No lease in flight needs them.
+    DropBricks {
+        /// Of which set.
+        set: BrickSetKey,
+        /// Which.
+        bricks: Vec<BrickId>,
+    },
+    /// Are you there? Answered by `Pong` with the same nonce.
+    Ping {
+        /// Master's choice.
+        nonce: u64,
+    },
+    /// The master ends; come back later.
+    Leave {
+        /// For people.
+        reason: String,
+    },
+}
+
+/// Who a worker is.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Hello {
+    /// `PROTOCOL_VERSION`.
+    pub protocol_version: u32,
+    /// `PIXELS_VERSION`.
+    pub pixels_version: u32,
+    /// A name for people (host and process).
+    pub name: String,
+    /// Render threads.
+    pub threads: u32,
+    /// Bytes of bricks it may hold.
+    pub memory_budget_bytes: u64,
+    /// Instruction set of its splat loops, for people.
+    pub simd: String,
+    /// Hash of the self-test tile, in hexadecimal.
+    pub self_test_sha256: String,
+    /// Bricks it still holds from before.
+    pub held: Vec<(BrickSetKey, Vec<BrickId>)>,
+}
+
+/// What became of a task's voxels (see `stats::VoxelStats`).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Put into a bucket.
+    pub tossed: u64,
+    /// Drawn.
+    pub splatted: u64,
+    /// Hidden, with their brick or alone.
+    pub culled: u64,
+}
+
+impl std::ops::AddAssign for Counters {
+    fn add_assign(&mut self, o: Counters) {
+        self.tossed += o.tossed;
+        self.splatted += o.splatted;
+        self.culled += o.culled;
+    }
+}
+
+/// When a task was handled, on the worker's own clock (microseconds).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct TaskTimes {
+    /// The lease came.
+    pub received_us: u64,
+    /// Its last brick was there.
+    pub ready_us: u64,
+    /// A render thread began.
+    pub start_us: u64,
+    /// It ended.
+    pub end_us: u64,
+    /// Which render thread.
+    pub thread: u32,
+}
+
+/// A rendered task.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TileResult {
+    /// Which task.
+    pub task: TaskId,
+    /// Which attempt.
+    pub epoch: Epoch,
+    /// Its pixels.
+    pub pixels: TilePixels,
+    /// Its voxels.
+    pub counters: Counters,
+    /// Its times.
+    pub times: TaskTimes,
+}
+
+/// From worker to master.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ToMaster {
+    /// The first message of a link.
+    Hello(Hello),
+    /// A task is done.
+    Result(Box<TileResult>),
+    /// A task can't be done (a brick that fails its checksum twice, a lease that makes no
+    /// sense). The worker stays.
+    Failed {
+        /// Which task.
+        task: TaskId,
+        /// Which attempt.
+        epoch: Epoch,
+        /// For people.
+        reason: String,
+    },
+    /// Bricks came in.
+    BricksIn {
+        /// Of which set.
+        set: BrickSetKey,
+        /// How many, of the batch that was sent.
+        bricks: u32,
+    },
+    /// A brick failed its checksum; send it again.
+    BricksBroken {
+        /// Of which set.
+        set: BrickSetKey,
+        /// Which.
+        bricks: Vec<BrickId>,
+    },
+    /// Answer to `Ping`.
+    Pong {
+        /// The ping's.
+        nonce: u64,
+        /// The worker's clock.
+        clock_us: u64,
+    },
+    /// The worker ends: it finishes the tasks it has begun, takes no more and closes the link.
+    Leaving {
+        /// For people.
+        reason: String,
+    },
+}
+
+/// Some bricks of a set, as they go to one worker.
+#[derive(Clone, Debug)]
+pub struct BrickBatch {
+    /// Of which set.
+    pub set: BrickSetKey,
+    /// The bricks.
+    pub bricks: Vec<Arc<Brick>>,
+    /// Bricks whose bytes were not whole.
+    pub broken: Vec<BrickId>,
+}
+
+/// A transfer function by name or in full.
+#[derive(Clone, Debug, PartialEq)]
+pub enum TransferChoice {
+    /// A preset, fitted to the master's volume.
+    Name(String),
+    /// In full.
+    Function(Box<TransferFunction>),
+}
+
+/// What a client asks for.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PathRequest {
+    /// The client's own name for the request: the same key gives the same job.
+    pub client_key: String,
+    /// The views.
+    pub path: ViewPath,
+    /// Colours and opacities.
+    pub transfer: TransferChoice,
+    /// Quality.
+    pub quality: Quality,
+    /// How the work is cut.
+    pub work: Work,
+    /// How pixels leave the master.
+    pub format: PixelFormat,
+    /// Over which background.
+    pub background: Background,
+    /// Whether each frame's statistics come with spans for a trace.
+    pub want_trace: bool,
+}

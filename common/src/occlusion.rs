@@ -1,0 +1,195 @@
+//! The occlusion map: which pixels are shut, and whether a whole rectangle is.
+//!
+//! The paper keeps accumulated opacities in a summed-area table and compares an average with
+//! one (section 4.2). Float sums drift, and an average close to one hides an open pixel. Here
+//! the table counts shut pixels in integers: a rectangle is shut when the count equals its area,
+//! exactly, in four reads.
+
+/// A rectangle of pixels, half-open, in absolute image coordinates.
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize,
+)]
+pub struct Rect {
+    /// Left column.
+    pub x0: i32,
+    /// Top row.
+    pub y0: i32,
+    /// One past the right column.
+    pub x1: i32,
+    /// One past the bottom row.
+    pub y1: i32,
+}
+
+impl Rect {
+    /// `[x0, x1) x [y0, y1)`.
+    pub fn new(x0: i32, y0: i32, x1: i32, y1: i32) -> Self {
+        Rect { x0, y0, x1, y1 }
+    }
+
+    /// A picture's rectangle.
+    pub fn of_size(size: [u32; 2]) -> Self {
+        Rect::new(0, 0, size[0] as i32, size[1] as i32)
+    }
+
+    /// Columns; 0 when empty.
+    pub fn width(&self) -> usize {
+        (self.x1 - self.x0).max(0) as usize
+    }
+
+    /// Rows; 0 when empty.
+    pub fn height(&self) -> usize {
+        (self.y1 - self.y0).max(0) as usize
+    }
+
+    /// Pixels.
+    pub fn area(&self) -> usize {
+        self.width() * self.height()
+    }
+
+    /// Whether no pixel is in it.
+    pub fn is_empty(&self) -> bool {
+        self.x1 <= self.x0 || self.y1 <= self.y0
+    }
+
+    /// What both share (may be empty).
+    pub fn intersect(&self, o: &Rect) -> Rect {
+        Rect::new(self.x0.max(o.x0), self.y0.max(o.y0), self.x1.min(o.x1), self.y1.min(o.y1))
+    }
+
+    /// The smallest rectangle that holds both (an empty one counts as nothing).
+    pub fn union(&self, o: &Rect) -> Rect {
+        if self.is_empty() {
+            *o
+        } else if o.is_empty() {
+            *self
+        } else {
+            Rect::new(self.x0.min(o.x0), self.y0.min(o.y0), self.x1.max(o.x1), self.y1.max(o.y1))
+        }
+    }
+}
+
+/// Shut pixels of a rectangle of the image, with the summed-area count over them.
+#[derive(Clone, Debug)]
+pub struct ShutMap {
+    rect: Rect,
+    /// `(w + 1) x (h + 1)`: shut pixels above and left of each corner.
+    count: Vec<u32>,
+    shut: Vec<bool>,
+    stale: bool,
+}
+
+impl ShutMap {
+    /// A map of `rect` with every pixel open.
+    pub fn open(rect: Rect) -> Self {
+        let (w, h) = (rect.width(), rect.height());
+        ShutMap { rect, count: vec![0; (w + 1) * (h + 1)], shut: vec![false; w * h], stale: false }
+    }
+
+    /// The rectangle it covers.
+    pub fn rect(&self) -> Rect {
+        self.rect
+    }
+
+    /// Opens every pixel and moves the map to `rect`, keeping its memory.
+    pub fn reset(&mut self, rect: Rect) {
+        self.rect = rect;
+        let (w, h) = (rect.width(), rect.height());
+        self.count.clear();
+        self.count.resize((w + 1) * (h + 1), 0);
+        self.shut.clear();
+        self.shut.resize(w * h, false);
+        self.stale = false;
+    }
+
+    /// Shuts the pixel with index `i` (row-major in the map's rectangle). Counts are made anew
+    /// by [`ShutMap::refresh`].
+    #[inline]
+    pub fn shut(&mut self, i: usize) {
+        self.shut[i] = true;
+        self.stale = true;
+    }
+
+    /// Whether the pixel with index `i` is shut.
+    #[inline]
+    pub fn is_shut(&self, i: usize) -> bool {
+        self.shut[i]
+    }
+
+    /// Makes the counts true again after pixels were shut.
+    pub fn refresh(&mut self) {
+        if !self.stale {
+            return;
+        }
+        self.stale = false;
+        let (w, h) = (self.rect.width(), self.rect.height());
+        for y in 0..h {
+            let (above, row) = self.count[y * (w + 1)..(y + 2) * (w + 1)].split_at_mut(w + 1);
+            let shut = &self.shut[y * w..(y + 1) * w];
+            let mut run = 0u32;
+            for x in 0..w {
+                run += u32::from(shut[x]);
+                row[x + 1] = above[x + 1] + run;
+            }
+        }
+    }
+
+    /// Number of shut pixels in the part of `r` that the map covers, as of the last refresh.
+    #[inline]
+    pub fn shut_in(&self, r: &Rect) -> u32 {
+        debug_assert!(!self.stale, "the counts are asked for before a refresh");
+        let r = r.intersect(&self.rect);
+        if r.is_empty() {
+            return 0;
+        }
+        let stride = self.rect.width() + 1;
+        let at = |x: i32, y: i32| {
+            self.count[(y - self.rect.y0) as usize * stride + (x - self.rect.x0) as usize]
+        };
+        at(r.x1, r.y1) + at(r.x0, r.y0) - at(r.x1, r.y0) - at(r.x0, r.y1)
+    }
+
+    /// Whether every pixel of `r` that the map covers is shut (true when it covers none).
+    #[inline]
+    pub fn all_shut(&self, r: &Rect) -> bool {
+        let r = r.intersect(&self.rect);
+        self.shut_in(&r) as usize == r.area()
+    }
+
+    /// Number of open pixels in the part of `r` that the map covers.
+    pub fn open_in(&self, r: &Rect) -> u32 {
+        let r = r.intersect(&self.rect);
+        r.area() as u32 - self.shut_in(&r)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn counts_equal_counting(
+            w in 1i32..40, h in 1i32..40, x0 in -9i32..9, y0 in -9i32..9,
+            bits in prop::collection::vec(any::<bool>(), 1600),
+            q in (-20i32..60, -20i32..60, 0i32..50, 0i32..50),
+        ) {
+            let rect = Rect::new(x0, y0, x0 + w, y0 + h);
+            let mut map = ShutMap::open(rect);
+            for i in 0..(w * h) as usize {
+                if bits[i] { map.shut(i); }
+            }
+            map.refresh();
+            let query = Rect::new(q.0, q.1, q.0 + q.2, q.1 + q.3);
+            let mut want = 0;
+            let inside = query.intersect(&rect);
+            for y in inside.y0..inside.y1 {
+                for x in inside.x0..inside.x1 {
+                    want += u32::from(bits[((y - y0) * w + (x - x0)) as usize]);
+                }
+            }
+            prop_assert_eq!(map.shut_in(&query), want);
+            prop_assert_eq!(map.all_shut(&query), want as usize == inside.area());
+        }
+    }
+}

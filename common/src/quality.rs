@@ -1,0 +1,200 @@
+//! What a client may ask of a picture (quality: part of the pixels) and of the work behind it
+//! (work: never changes a byte). Names are those of CONTRACTS.md, in flags, JSON and proto.
+
+use serde::{Deserialize, Serialize};
+
+/// Reconstruction kernel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Kernel {
+    /// Gaussian with its edge value subtracted.
+    Gaussian,
+    /// Cubic B-spline.
+    Bspline,
+    /// Tent, radial only.
+    Tent,
+}
+
+/// How the sheets of a pixel are composited.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Compositing {
+    /// Extinction with the neighbour-linear colour rule (NUMERICS.md section 1.2).
+    Linear,
+    /// Extinction, one colour inside a sheet.
+    Constant,
+    /// The paper's additive opacity: alphas are summed in a sheet and clamped at one.
+    Paper,
+}
+
+/// How a voxel's section reaches the sheet.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Splat {
+    /// The footprint itself.
+    Direct,
+    /// A small spline deposit, filtered when the sheet closes.
+    Deposit,
+}
+
+/// What the sheets add in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Sums {
+    /// The master decides from transfer function and quality.
+    Auto,
+    /// 16-bit fixed point.
+    I16,
+    /// 32-bit fixed point.
+    I32,
+    /// 32-bit floating point, voxels in ascending order.
+    F32,
+}
+
+/// The quality of a picture. Every field changes pixels.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Quality {
+    /// Sheet thickness in vox.
+    pub thickness: f64,
+    /// A pixel whose transmittance `1 - A` is below it is shut; 0 shuts nothing.
+    pub eps: f64,
+    /// Reconstruction kernel.
+    pub kernel: Kernel,
+    /// Standard deviation of the Gaussian, in lattice steps.
+    pub std: f64,
+    /// Support radius, in lattice steps.
+    pub radius: f64,
+    /// Compositing rule.
+    pub compositing: Compositing,
+    /// Splat.
+    pub splat: Splat,
+    /// Sums; `Auto` until the master has decided.
+    pub sums: Sums,
+    /// Whether bricks and voxels are tested against the occlusion map. Never changes a byte.
+    pub cull: bool,
+}
+
+impl Default for Quality {
+    fn default() -> Self {
+        Quality {
+            thickness: 1.0,
+            eps: 1.0 / 512.0,
+            kernel: Kernel::Gaussian,
+            std: 0.6,
+            radius: 2.0,
+            compositing: Compositing::Linear,
+            splat: Splat::Direct,
+            sums: Sums::Auto,
+            cull: true,
+        }
+    }
+}
+
+/// A value that can't be used, with the flag (or field) that carries it and what to do.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{field}: {problem}")]
+pub struct Refused {
+    /// The flag or JSON field, as the user wrote it (`thickness`, `views[3].eye`).
+    pub field: String,
+    /// What is wrong with it and what to do.
+    pub problem: String,
+}
+
+impl Refused {
+    /// A refusal of `field`.
+    pub fn new(field: impl Into<String>, problem: impl Into<String>) -> Self {
+        Refused { field: field.into(), problem: problem.into() }
+    }
+}
+
+fn within(field: &str, x: f64, lo: f64, hi: f64) -> Result<(), Refused> {
+    if x >= lo && x <= hi {
+        Ok(())
+    } else {
+        Err(Refused::new(field, format!("{x} is out of range; give {lo} to {hi}")))
+    }
+}
+
+impl Quality {
+    /// Checks ranges and names what this version does not draw yet.
+    pub fn check(&self) -> Result<(), Refused> {
+        // From vox/64 to thicker than any volume (DESIGN.md section 5).
+        within("thickness", self.thickness, 1.0 / 64.0, 65536.0)?;
+        within("eps", self.eps, 0.0, 0.5)?;
+        // Below .4 a lattice shows through as dots (ripple over 20 %), and the head-room of the
+        // integer sums (a factor of 2) would be used up; above 1 the radius cuts the bell.
+        within("std", self.std, 0.4, 1.0)?;
+        within("radius", self.radius, 1.0, 3.0)?;
+        if self.kernel != Kernel::Gaussian {
+            return Err(Refused::new("kernel", "this version draws `gaussian` only; use it"));
+        }
+        if self.splat != Splat::Direct {
+            return Err(Refused::new("splat", "this version draws `direct` splats only; use it"));
+        }
+        if self.sums == Sums::I16 {
+            return Err(Refused::new(
+                "sums",
+                "this version has no i16 sums; use `auto`, `i32` or `f32`",
+            ));
+        }
+        Ok(())
+    }
+}
+
+/// Which schedule the master runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Schedule {
+    /// The master decides.
+    Auto,
+    /// One task is one region through all depths.
+    Region,
+    /// The paper's: slab after slab, with a barrier.
+    Slab,
+}
+
+/// How the work is cut. Never changes a byte.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Work {
+    /// Slabs a frame is cut into.
+    pub slabs: u32,
+    /// Wanted ratio of macrotiles to render threads (paper section 4.3: 2 to 3).
+    pub tiles_per_worker: f64,
+    /// Macrotile edge in pixels (16, 32, 64, 128 or 256), or `None` for the quadtree to choose.
+    pub tile: Option<u32>,
+    /// Schedule.
+    pub schedule: Schedule,
+}
+
+impl Default for Work {
+    fn default() -> Self {
+        Work { slabs: 3, tiles_per_worker: 2.5, tile: None, schedule: Schedule::Auto }
+    }
+}
+
+impl Work {
+    /// Checks ranges and names what this version does not do yet.
+    pub fn check(&self) -> Result<(), Refused> {
+        if !(1..=1000).contains(&self.slabs) {
+            return Err(Refused::new("slabs", format!("{} slabs; give 1 to 1000", self.slabs)));
+        }
+        within("tiles-per-worker", self.tiles_per_worker, 0.1, 1000.0)?;
+        if let Some(tile) = self.tile
+            && !(tile.is_power_of_two() && (16..=256).contains(&tile))
+        {
+            return Err(Refused::new(
+                "tile",
+                format!("{tile} is not a quadtree level; give 16, 32, 64, 128, 256 or auto"),
+            ));
+        }
+        if self.schedule == Schedule::Region {
+            return Err(Refused::new(
+                "schedule",
+                "this version has the `slab` schedule only; use `slab` or `auto`",
+            ));
+        }
+        Ok(())
+    }
+}

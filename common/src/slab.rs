@@ -1,0 +1,86 @@
+//! Sheets and slabs along the view direction.
+//!
+//! Sheet `k` lies between the planes `k d` and `(k + 1) d` behind the target (CONTRACTS.md), in
+//! both projections, whatever the volume. A slab is a run of sheets; its borders are sheet
+//! borders, so slabs never change a pixel.
+
+use serde::{Deserialize, Serialize};
+
+/// A half-open run of sheets `[first, end)`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct SheetRange {
+    /// First sheet.
+    pub first: i32,
+    /// One past the last sheet.
+    pub end: i32,
+}
+
+impl SheetRange {
+    /// `[first, end)`.
+    pub fn new(first: i32, end: i32) -> Self {
+        SheetRange { first, end }
+    }
+
+    /// Number of sheets; 0 when empty.
+    pub fn len(self) -> u32 {
+        (self.end as i64 - self.first as i64).max(0) as u32
+    }
+
+    /// Whether there is no sheet in it.
+    pub fn is_empty(self) -> bool {
+        self.end <= self.first
+    }
+
+    /// Whether both share a sheet.
+    pub fn overlaps(self, other: SheetRange) -> bool {
+        self.first < other.end && other.first < self.end
+    }
+
+    /// The smallest run that holds both (an empty one counts as nothing).
+    pub fn union(self, other: SheetRange) -> SheetRange {
+        if self.is_empty() {
+            other
+        } else if other.is_empty() {
+            self
+        } else {
+            SheetRange::new(self.first.min(other.first), self.end.max(other.end))
+        }
+    }
+
+    /// Cuts the run into at most `count` slabs of equal thickness (to a sheet), front to back.
+    /// Empty slabs are left out: fewer sheets than slabs give one slab a sheet.
+    pub fn slabs(self, count: u32) -> Vec<SheetRange> {
+        let n = self.len() as u64;
+        let count = u64::from(count.max(1));
+        (0..count)
+            .map(|i| {
+                let at = |i: u64| (self.first as i64 + (n * i / count) as i64) as i32;
+                SheetRange::new(at(i), at(i + 1))
+            })
+            .filter(|s| !s.is_empty())
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn slabs_tile_the_run_without_gap() {
+        for n in 0..40 {
+            for count in 1..9 {
+                let run = SheetRange::new(-7, -7 + n);
+                let slabs = run.slabs(count);
+                let mut at = run.first;
+                for s in &slabs {
+                    assert_eq!(s.first, at);
+                    assert!(!s.is_empty());
+                    at = s.end;
+                }
+                assert_eq!(at, run.end);
+                assert_eq!(slabs.len() as i32, n.min(count as i32));
+            }
+        }
+    }
+}

@@ -1,0 +1,539 @@
+//! Transfer functions: from values to colour and opacity (CONTRACTS.md, Transfer functions).
+
+use crate::brick::BrickSetKey;
+use crate::math::linear_from_srgb;
+use crate::quality::{Compositing, Refused};
+use crate::shade::Shading;
+use crate::volume::{Digest32, SampleKind, Samples, ValueSummary, VolumeInfo};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+/// Cap of the extinction per vox: 16 ln 2, an alpha of `1 - 2^-16` (DESIGN.md section 1). It is
+/// part of the definition of the picture: silhouettes grow with the logarithm of sigma, so
+/// there is no limit to converge to. At 6.9 the worst alpha is 26/255 off, at 20 it is 34/255
+/// off the other way (NUMERICS.md section 2).
+pub const SIGMA_MAX: f64 = 16.0 * std::f64::consts::LN_2;
+
+/// Cap of an extinction given per world unit, per vox. Beyond it f32 sums of squares overflow.
+pub const EXTINCTION_MAX: f64 = 1e9;
+
+/// Most points of a transfer function: a 16-bit volume has no more values.
+pub const MAX_POINTS: usize = 65536;
+
+/// What the x of a point means.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Domain {
+    /// The file's values.
+    Value,
+    /// 0 is the volume's smallest value, 1 its largest.
+    Unit,
+}
+
+/// What the numbers of a colour are.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ColorSpace {
+    /// As on screen, and as in ParaView.
+    #[default]
+    Srgb,
+    /// Linear light.
+    Linear,
+}
+
+/// What an opacity means.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum OpacityUnit {
+    /// Alpha of one vox of travel.
+    #[default]
+    AlphaPerVox,
+    /// Extinction per world unit.
+    Extinction,
+}
+
+/// What a NaN looks like.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NanLook {
+    /// Colour, in the transfer function's colour space.
+    pub color: [f64; 3],
+    /// Opacity, in its unit.
+    pub opacity: f64,
+}
+
+/// A transfer function. Points ascend in x; linear between, clamped outside; two points at one
+/// x make a step (the later one holds at x).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TransferFunction {
+    /// Format version, 1.
+    pub version: u32,
+    /// Meaning of x.
+    pub domain: Domain,
+    /// `[x, r, g, b]`.
+    pub colors: Vec<[f64; 4]>,
+    /// `[x, a]`.
+    pub opacities: Vec<[f64; 2]>,
+    /// Meaning of r, g, b.
+    #[serde(default)]
+    pub color_space: ColorSpace,
+    /// Meaning of a.
+    #[serde(default)]
+    pub opacity_unit: OpacityUnit,
+    /// Look of NaN.
+    #[serde(default)]
+    pub nan: NanLook,
+    /// `[gradient magnitude, factor]`; not drawn by this version.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub gradient_opacity: Vec<[f64; 2]>,
+    /// Light on voxels.
+    #[serde(default)]
+    pub shading: Shading,
+}
+
+impl TransferFunction {
+    /// Reads and checks the JSON of CONTRACTS.md.
+    pub fn from_json(text: &str) -> Result<Self, Refused> {
+        let tf: TransferFunction = serde_json::from_str(text)
+            .map_err(|e| Refused::new("transfer function", format!("not valid: {e}")))?;
+        tf.check()?;
+        Ok(tf)
+    }
+
+    /// As JSON.
+    pub fn to_json(&self) -> String {
+        serde_json::to_string(self).expect("numbers and strings can be written")
+    }
+
+    /// Checks every number; names the field that is wrong.
+    pub fn check(&self) -> Result<(), Refused> {
+        let refuse = |field: String, problem: &str| Err(Refused::new(field, problem));
+        if self.version != 1 {
+            return refuse("version".into(), "this program knows version 1; set it to 1");
+        }
+        if self.colors.is_empty() {
+            return refuse("colors".into(), "no point; give at least one [x, r, g, b]");
+        }
+        if self.opacities.is_empty() {
+            return refuse("opacities".into(), "no point; give at least one [x, a]");
+        }
+        if self.colors.len() > MAX_POINTS || self.opacities.len() > MAX_POINTS {
+            return refuse("colors, opacities".into(), "more than 65536 points; give fewer");
+        }
+        if !self.gradient_opacity.is_empty() {
+            return refuse(
+                "gradient_opacity".into(),
+                "this version does not modulate by gradient; remove it",
+            );
+        }
+        let unit = |x: f64| (0.0..=1.0).contains(&x);
+        for (i, c) in self.colors.iter().enumerate() {
+            if !c[0].is_finite() || !c[1..].iter().all(|&x| unit(x)) {
+                return refuse(format!("colors[{i}]"), "x must be finite and r, g, b in 0 to 1");
+            }
+            if i > 0 && c[0] < self.colors[i - 1][0] {
+                return refuse(
+                    format!("colors[{i}]"),
+                    "x is smaller than the one before; sort them",
+                );
+            }
+        }
+        let opacity_ok = |a: f64| match self.opacity_unit {
+            OpacityUnit::AlphaPerVox => unit(a),
+            OpacityUnit::Extinction => (0.0..=1e300).contains(&a),
+        };
+        let opacity_range = match self.opacity_unit {
+            OpacityUnit::AlphaPerVox => "x must be finite and alpha in 0 to 1",
+            OpacityUnit::Extinction => "x must be finite and extinction not negative",
+        };
+        for (i, o) in self.opacities.iter().enumerate() {
+            if !o[0].is_finite() || !opacity_ok(o[1]) {
+                return refuse(format!("opacities[{i}]"), opacity_range);
+            }
+            if i > 0 && o[0] < self.opacities[i - 1][0] {
+                return refuse(
+                    format!("opacities[{i}]"),
+                    "x is smaller than the one before; sort them",
+                );
+            }
+        }
+        if !opacity_ok(self.nan.opacity) || !self.nan.color.iter().all(|&x| unit(x)) {
+            return refuse("nan".into(), "color must be in 0 to 1 and opacity in its unit's range");
+        }
+        let s = &self.shading;
+        if ![s.ambient, s.diffuse, s.specular].iter().all(|&x| (0.0..=10.0).contains(&x)) {
+            return refuse("shading".into(), "ambient, diffuse and specular must be 0 to 10");
+        }
+        if !(0.0..=10_000.0).contains(&s.power) {
+            return refuse("shading.power".into(), "must be 0 to 10000");
+        }
+        if let crate::shade::Light::Direction(d) = s.light {
+            let len2: f64 = d.iter().map(|x| x * x).sum();
+            if !(1e-30..=1e30).contains(&len2) {
+                return refuse("shading.light".into(), "direction must be finite and not zero");
+            }
+        }
+        Ok(())
+    }
+}
+
+/// What a value looks like: extinction per vox (or the paper's alpha) and linear colour.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Look {
+    /// Extinction per vox of travel, capped; for [`Compositing::Paper`] alpha per vox.
+    pub sigma: f32,
+    /// Linear RGB.
+    pub rgb: [f32; 3],
+}
+
+/// From the opacity numbers of a transfer function to what voxels add to sheets.
+#[derive(Clone, Copy, Debug)]
+struct OpacityRule {
+    unit: OpacityUnit,
+    vox: f64,
+    compositing: Compositing,
+}
+
+impl OpacityRule {
+    /// Extinction per vox, capped.
+    fn sigma(&self, a: f64) -> f64 {
+        match self.unit {
+            OpacityUnit::AlphaPerVox if a >= 1.0 => SIGMA_MAX,
+            OpacityUnit::AlphaPerVox => (-libm::log1p(-a)).min(SIGMA_MAX),
+            OpacityUnit::Extinction => (a * self.vox).min(EXTINCTION_MAX),
+        }
+    }
+
+    /// What is summed in sheets: the extinction, or the paper's alpha.
+    fn payload(&self, a: f64) -> f64 {
+        match self.compositing {
+            Compositing::Paper => -libm::expm1(-self.sigma(a)),
+            _ => self.sigma(a),
+        }
+    }
+}
+
+/// A transfer function made ready for one volume: a table over codes where they are few.
+#[derive(Clone, Debug)]
+pub struct Classifier {
+    /// Looks by code (256 or 65536), empty for float volumes.
+    table: Vec<Look>,
+    /// `[x, r, g, b]`, linear light.
+    colors: Vec<[f64; 4]>,
+    opacities: Vec<[f64; 2]>,
+    rule: OpacityRule,
+    nan: Look,
+    domain: Domain,
+    summary: ValueSummary,
+    payload_max: f64,
+    uncapped: bool,
+}
+
+/// Value of the piecewise linear function through `points` at `x`.
+fn interpolate<const N: usize>(points: &[[f64; N]], x: f64) -> [f64; N] {
+    // The number of points at or left of x: of two points at one x the later one holds there.
+    let after = points.partition_point(|p| p[0] <= x);
+    if after == 0 {
+        return points[0];
+    }
+    let a = points[after - 1];
+    let Some(b) = points.get(after) else { return a };
+    // Halves, since b - a may overflow for values near the end of f64.
+    let t = (x * 0.5 - a[0] * 0.5) / (b[0] * 0.5 - a[0] * 0.5);
+    std::array::from_fn(|i| a[i] * (1.0 - t) + b[i] * t)
+}
+
+impl Classifier {
+    /// Makes `tf` (which passed its check) ready for a volume.
+    pub fn new(tf: &TransferFunction, info: &VolumeInfo, compositing: Compositing) -> Self {
+        let summary = info.summary.clone();
+        let rule = OpacityRule { unit: tf.opacity_unit, vox: info.lattice.vox(), compositing };
+        let decode = |c: f64| match tf.color_space {
+            ColorSpace::Srgb => linear_from_srgb(c),
+            ColorSpace::Linear => c,
+        };
+        // A NaN look counts only where the volume has a NaN.
+        let nan_opacity = if summary.nan > 0 { tf.nan.opacity } else { 0.0 };
+        let opacities = tf.opacities.iter().map(|o| o[1]);
+        let largest = opacities.clone().fold(nan_opacity, f64::max);
+        let codes = match summary.kind {
+            SampleKind::U8 => 256,
+            SampleKind::U16 => 65536,
+            SampleKind::F32 => 0,
+        };
+        let mut c = Classifier {
+            table: Vec::new(),
+            colors: tf
+                .colors
+                .iter()
+                .map(|c| [c[0], decode(c[1]), decode(c[2]), decode(c[3])])
+                .collect(),
+            opacities: tf.opacities.clone(),
+            rule,
+            nan: Look {
+                sigma: rule.payload(nan_opacity) as f32,
+                rgb: tf.nan.color.map(|c| decode(c) as f32),
+            },
+            domain: tf.domain,
+            summary,
+            payload_max: rule.payload(largest),
+            uncapped: rule.sigma(largest) > SIGMA_MAX && compositing != Compositing::Paper,
+        };
+        c.table = (0..codes).map(|code| c.evaluate(code as f64)).collect();
+        c
+    }
+
+    /// The x of the transfer function that belongs to a finite code.
+    fn x_of(&self, code: f64) -> f64 {
+        match self.domain {
+            Domain::Value => self.summary.map.value(code),
+            Domain::Unit => {
+                let (lo, hi) = (self.summary.min_code, self.summary.max_code);
+                let t = if hi > lo { (code - lo) / (hi - lo) } else { 0.0 };
+                if self.summary.map.scale < 0.0 { 1.0 - t } else { t }
+            }
+        }
+    }
+
+    fn evaluate(&self, code: f64) -> Look {
+        if code.is_nan() {
+            return self.nan;
+        }
+        // Infinities are drawn as the nearest finite value.
+        let x = self.x_of(code.clamp(self.summary.min_code, self.summary.max_code));
+        let [_, a] = interpolate(&self.opacities, x);
+        let [_, r, g, b] = interpolate(&self.colors, x);
+        Look { sigma: self.rule.payload(a) as f32, rgb: [r as f32, g as f32, b as f32] }
+    }
+
+    /// The look of sample `i` of `samples`, which are of this volume.
+    #[inline]
+    pub fn look(&self, samples: &Samples, i: usize) -> Look {
+        match samples {
+            Samples::U8(v) => self.table[v[i] as usize],
+            Samples::U16(v) => self.table[v[i] as usize],
+            Samples::F32(v) => self.evaluate(v[i] as f64),
+        }
+    }
+
+    /// The looks by code of an 8-bit (256) or 16-bit (65536) volume; empty for floats.
+    pub fn table(&self) -> &[Look] {
+        &self.table
+    }
+
+    /// Largest extinction per vox (or alpha, for the paper's compositing) of any value.
+    pub fn payload_max(&self) -> f64 {
+        self.payload_max
+    }
+
+    /// Whether an extinction beyond [`SIGMA_MAX`] occurs; sums must be f32 then.
+    pub fn uncapped(&self) -> bool {
+        self.uncapped
+    }
+
+    /// Which codes are relevant (extinction above zero).
+    pub fn support(&self) -> Support {
+        let mut intervals: Vec<(f64, f64)> = Vec::new();
+        let nan = self.nan.sigma > 0.0;
+        if !self.table.is_empty() {
+            for (code, look) in self.table.iter().enumerate() {
+                if look.sigma > 0.0 {
+                    let c = code as f64;
+                    match intervals.last_mut() {
+                        Some((_, hi)) if *hi == c - 1.0 => *hi = c,
+                        _ => intervals.push((c, c)),
+                    }
+                }
+            }
+            return Support { intervals, nan };
+        }
+        // Floats: closed intervals of x between and outside the points, mapped back to codes.
+        // They may hold an end at which the extinction is zero; such voxels add nothing.
+        let (lo, hi) = (self.summary.min_code, self.summary.max_code);
+        let code_of = |x: f64| match self.domain {
+            Domain::Value => (x - self.summary.map.offset) / self.summary.map.scale,
+            Domain::Unit if self.summary.map.scale < 0.0 => hi - x * (hi - lo),
+            Domain::Unit => lo + x * (hi - lo),
+        };
+        let p = &self.opacities;
+        let mut add = |a: f64, b: f64| {
+            let (a, b) = (code_of(a), code_of(b));
+            // Outward by an f32 step, so that rounding never loses a voxel.
+            let (a, b) = (a.min(b), a.max(b));
+            let grow = |x: f64| x.abs() * 1e-6 + f64::from(f32::MIN_POSITIVE);
+            intervals.push(((a - grow(a)).max(lo), (b + grow(b)).min(hi)));
+        };
+        if p[0][1] > 0.0 {
+            add(-1e308, p[0][0]);
+        }
+        for w in p.windows(2) {
+            if w[0][1] > 0.0 || w[1][1] > 0.0 {
+                add(w[0][0], w[1][0]);
+            }
+        }
+        if p[p.len() - 1][1] > 0.0 {
+            add(p[p.len() - 1][0], 1e308);
+        }
+        intervals.retain(|(a, b)| a <= b);
+        intervals.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let mut merged: Vec<(f64, f64)> = Vec::new();
+        for (a, b) in intervals {
+            match merged.last_mut() {
+                Some((_, hi)) if a <= *hi => *hi = hi.max(b),
+                _ => merged.push((a, b)),
+            }
+        }
+        Support { intervals: merged, nan }
+    }
+}
+
+/// The codes that a transfer function makes visible: what decides which voxels are stored.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Support {
+    /// Closed intervals of codes, ascending, apart from each other.
+    pub intervals: Vec<(f64, f64)>,
+    /// Whether NaN is visible.
+    pub nan: bool,
+}
+
+impl Support {
+    /// Whether a code is relevant. Infinities count as the nearest finite code.
+    #[inline]
+    pub fn contains(&self, code: f64) -> bool {
+        if code.is_nan() {
+            return self.nan;
+        }
+        if code.is_infinite() {
+            let end = if code > 0.0 { self.intervals.last() } else { self.intervals.first() };
+            return end.is_some();
+        }
+        self.intervals.iter().any(|&(a, b)| a <= code && code <= b)
+    }
+
+    /// Whether all of `other` is in it.
+    pub fn covers(&self, other: &Support) -> bool {
+        (self.nan || !other.nan)
+            && other
+                .intervals
+                .iter()
+                .all(|o| self.intervals.iter().any(|s| s.0 <= o.0 && o.1 <= s.1))
+    }
+
+    /// The key of the brick set of a volume with this support, with or without normals.
+    pub fn key(&self, volume: Digest32, normals: bool) -> BrickSetKey {
+        let mut h = Sha256::new();
+        h.update(b"slabcast bricks 1");
+        h.update(volume.0);
+        h.update([u8::from(self.nan), u8::from(normals)]);
+        for (a, b) in &self.intervals {
+            h.update(a.to_le_bytes());
+            h.update(b.to_le_bytes());
+        }
+        BrickSetKey(Digest32(h.finalize().into()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::presets;
+    use crate::volume::{Lattice, ValueMap, Volume};
+
+    fn info(samples: Samples) -> VolumeInfo {
+        let n = samples.len() as u32;
+        let lattice = Lattice::from_spacing([n, 1, 1], [1.0; 3]);
+        Volume::new("t", "t", false, lattice, samples, ValueMap::IDENTITY).info(Digest32::default())
+    }
+
+    fn tf(opacities: Vec<[f64; 2]>) -> TransferFunction {
+        TransferFunction {
+            version: 1,
+            domain: Domain::Value,
+            colors: vec![[0.0, 0.0, 0.0, 0.0], [100.0, 1.0, 1.0, 1.0]],
+            opacities,
+            color_space: ColorSpace::Linear,
+            opacity_unit: OpacityUnit::AlphaPerVox,
+            nan: NanLook::default(),
+            gradient_opacity: vec![],
+            shading: Shading::default(),
+        }
+    }
+
+    #[test]
+    fn points_are_clamped_interpolated_and_stepped() {
+        let tf = tf(vec![[10.0, 0.0], [20.0, 0.5], [20.0, 0.9], [30.0, 0.0]]);
+        let info = info(Samples::U8((0..=255).collect()));
+        let c = Classifier::new(&tf, &info, Compositing::Paper);
+        let alpha = |v: u8| c.look(&Samples::U8(vec![v]), 0).sigma;
+        assert_eq!(alpha(5), 0.0);
+        assert!((alpha(15) - 0.25).abs() < 1e-6);
+        assert!((alpha(20) - 0.9).abs() < 1e-6, "the later point holds at the step");
+        assert!((alpha(25) - 0.45).abs() < 1e-6);
+        assert_eq!(alpha(200), 0.0);
+        assert_eq!(c.support().intervals, vec![(11.0, 29.0)]);
+        assert!((c.look(&Samples::U8(vec![50]), 0).rgb[1] - 0.5).abs() < 1e-6);
+    }
+
+    #[test]
+    fn alpha_one_is_capped_and_extinction_is_not() {
+        let mut tf = tf(vec![[0.0, 1.0]]);
+        let info = info(Samples::U8(vec![3; 7]));
+        let c = Classifier::new(&tf, &info, Compositing::Linear);
+        assert_eq!(c.look(&Samples::U8(vec![3]), 0).sigma, SIGMA_MAX as f32);
+        assert!(!c.uncapped());
+        tf.opacity_unit = OpacityUnit::Extinction;
+        tf.opacities = vec![[0.0, 1e6]];
+        let c = Classifier::new(&tf, &info, Compositing::Linear);
+        assert_eq!(c.look(&Samples::U8(vec![3]), 0).sigma, 1e6);
+        assert!(c.uncapped());
+    }
+
+    #[test]
+    fn float_support_loses_no_voxel() {
+        let mut values: Vec<f32> = (-300..300).map(|i| i as f32 * 0.173).collect();
+        values.extend([f32::NAN, f32::INFINITY, f32::NEG_INFINITY]);
+        let info = info(Samples::F32(values.clone()));
+        for points in [
+            vec![[-20.0, 0.0], [3.0, 0.4], [9.0, 0.0]],
+            vec![[-20.0, 0.3], [3.0, 0.0], [9.0, 0.0], [12.0, 0.2]],
+        ] {
+            let mut tf = tf(points);
+            tf.nan.opacity = 0.5;
+            let c = Classifier::new(&tf, &info, Compositing::Linear);
+            let support = c.support();
+            let samples = Samples::F32(values.clone());
+            for (i, &v) in values.iter().enumerate() {
+                let look = c.look(&samples, i);
+                assert!(look.sigma.is_finite());
+                if look.sigma > 0.0 {
+                    assert!(support.contains(v as f64), "{v} is visible but not in {support:?}");
+                }
+            }
+            assert!(support.intervals.len() <= 2 && support.covers(&support));
+        }
+    }
+
+    #[test]
+    fn json_round_trip_and_unknown_keys() {
+        let summary = info(Samples::U8((0..=255).collect())).summary;
+        let tf = presets::by_name("peer-opaque", &summary).unwrap();
+        assert_eq!(TransferFunction::from_json(&tf.to_json()).unwrap(), tf);
+        let spoiled = tf.to_json().replacen("\"version\"", "\"verzion\"", 1);
+        let e = TransferFunction::from_json(&spoiled).unwrap_err().to_string();
+        assert!(e.contains("verzion"), "{e}");
+        let unsorted = tf.to_json().replacen("[38.0,0.0]", "[-38.0,0.0]", 1);
+        let e = TransferFunction::from_json(&unsorted).unwrap_err().to_string();
+        assert!(e.contains("opacities[1]"), "{e}");
+    }
+
+    #[test]
+    fn a_smaller_support_is_covered() {
+        let big = Support { intervals: vec![(10.0, 50.0), (60.0, 255.0)], nan: false };
+        let small = Support { intervals: vec![(12.0, 20.0), (60.0, 61.0)], nan: false };
+        assert!(big.covers(&small) && !small.covers(&big));
+        let across = Support { intervals: vec![(45.0, 65.0)], nan: false };
+        assert!(!big.covers(&across));
+        assert_ne!(big.key(Digest32::default(), true), big.key(Digest32::default(), false));
+    }
+}

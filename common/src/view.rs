@@ -1,0 +1,473 @@
+//! One camera: from the lattice to eye space, to pixels and to sheets.
+//!
+//! Eye space has its origin at the target, x to the right, y down the picture, z away from the
+//! eye, all in vox. It is made from the camera relative to the volume's centre, so a picture
+//! depends neither on a far-away origin nor on the unit. A view is computed once, where the
+//! camera is known, and travels as numbers; what follows from it (positions, sheets, boxes) is
+//! computed everywhere by the functions here, in f64, in one order.
+
+use crate::brick::TightBox;
+use crate::occlusion::Rect;
+use crate::quality::{Quality, Refused};
+use crate::slab::SheetRange;
+use crate::volume::Lattice;
+use glam::{DMat3, DVec3, Vec3};
+
+/// Screen positions are rounded to this part of a pixel (DESIGN.md, Pixels are exact).
+pub const SUBPIXELS: i32 = 64;
+
+/// Largest picture edge, in pixels (DESIGN.md section 5: images of 1x1 and 8192x8192).
+pub const MAX_EDGE: u32 = 8192;
+
+/// The near plane, as a share of the eye's distance (CONTRACTS.md).
+pub const NEAR: f64 = 1e-3;
+
+/// How the world is brought onto the picture.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum CameraProjection {
+    /// World height shown.
+    Ortho {
+        /// In world units.
+        height: f64,
+    },
+    /// Vertical, full field of view.
+    Persp {
+        /// In degrees.
+        fov: f64,
+        /// From eye to target, in world units.
+        distance: f64,
+    },
+}
+
+/// A camera in the world, relative to the volume's centre.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Camera {
+    /// Direction from the target to the eye (any length).
+    pub to_eye: DVec3,
+    /// What is up in the picture (any length; need not be at right angles).
+    pub up: DVec3,
+    /// The target, from the centre of the volume's box, in world units.
+    pub target: DVec3,
+    /// Projection.
+    pub projection: CameraProjection,
+}
+
+/// From eye space to pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Projection {
+    /// Parallel.
+    Ortho {
+        /// Pixels a vox.
+        scale: f64,
+    },
+    /// Central.
+    Persp {
+        /// Focal length in pixels.
+        focal: f64,
+        /// From eye to target in vox.
+        distance: f64,
+    },
+}
+
+/// One camera, made ready for one volume and one quality.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct View {
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+    /// Eye coordinates of one index step along each axis (columns), in vox.
+    pub eye_from_index: DMat3,
+    /// Eye coordinates of sample (0, 0, 0), in vox.
+    pub eye_origin: DVec3,
+    /// Rotation from world to eye axes.
+    pub eye_from_world: DMat3,
+    /// Projection.
+    pub projection: Projection,
+    /// Sheet thickness in vox.
+    pub thickness: f64,
+    /// Standard deviation of the kernel along the eye's axes, in vox.
+    pub kernel_std: DVec3,
+    /// Support radius of the kernel along the eye's axes, in vox.
+    pub kernel_radius: DVec3,
+    /// Volume of a lattice cell in vox^3.
+    pub cell: f64,
+}
+
+/// Where a box lands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Projected {
+    /// Pixels that any of its footprints may touch, clipped to the picture; not empty.
+    pub rect: Rect,
+    /// Sheets that any of its voxels may touch.
+    pub sheets: SheetRange,
+}
+
+impl View {
+    /// Makes `camera` ready. Refuses what can't be drawn, naming `size` or a camera field.
+    pub fn new(
+        lattice: &Lattice,
+        camera: &Camera,
+        size: [u32; 2],
+        quality: &Quality,
+    ) -> Result<View, Refused> {
+        if size.iter().any(|&n| n == 0 || n > MAX_EDGE) {
+            return Err(Refused::new(
+                "size",
+                format!("{}x{} pixels; give 1 to {MAX_EDGE} each", size[0], size[1]),
+            ));
+        }
+        let unit = |field: &str, v: DVec3| {
+            let largest = v.abs().max_element();
+            if !(largest > 0.0 && largest.is_finite()) {
+                return Err(Refused::new(field, "must be finite and not zero"));
+            }
+            let v = v / largest;
+            Ok(v / v.length())
+        };
+        if !camera.target.is_finite() {
+            return Err(Refused::new("target", "must be finite"));
+        }
+        let back = unit("eye", camera.to_eye)?;
+        let forward = -back;
+        let up = unit("up", camera.up)?;
+        let mut right = forward.cross(up);
+        if right.length() < 1e-9 {
+            // Looking along up: turn by the axis that is least along it, so that the picture
+            // is defined (and the same for everyone) at the pole.
+            let a = up.abs();
+            let other = if a.x <= a.y && a.x <= a.z {
+                DVec3::X
+            } else if a.y <= a.z {
+                DVec3::Y
+            } else {
+                DVec3::Z
+            };
+            right = forward.cross(other);
+        }
+        let right = right / right.length();
+        let down = forward.cross(right);
+        let eye_from_world = DMat3::from_cols(right, down, forward).transpose();
+
+        let vox = lattice.vox();
+        let half_height_px = size[1] as f64 / 2.0;
+        let projection = match camera.projection {
+            CameraProjection::Ortho { height } => {
+                if !(height.is_finite() && height / vox > 1e-6 && height / vox < 1e9) {
+                    return Err(Refused::new(
+                        "height",
+                        format!("{height} world units; give a positive height near the volume's"),
+                    ));
+                }
+                Projection::Ortho { scale: size[1] as f64 / (height / vox) }
+            }
+            CameraProjection::Persp { fov, distance } => {
+                if !(0.01..=179.0).contains(&fov) {
+                    return Err(Refused::new("fov", format!("{fov} degrees; give 0.01 to 179")));
+                }
+                if !(distance.is_finite() && distance / vox > 1e-6 && distance / vox < 1e9) {
+                    return Err(Refused::new(
+                        "eye",
+                        format!(
+                            "{distance} world units from the target; move it nearer the volume"
+                        ),
+                    ));
+                }
+                let tan = libm::tan(fov.to_radians() / 2.0);
+                Projection::Persp { focal: half_height_px / tan, distance: distance / vox }
+            }
+        };
+
+        let steps = lattice.steps.map(|s| eye_from_world * (s / vox));
+        let eye_from_index = DMat3::from_cols(steps[0], steps[1], steps[2]);
+        let target = eye_from_world * (camera.target / vox);
+        let eye_origin = -(eye_from_index * lattice.centre_index()) - target;
+        let (spread, cell) = if lattice.is_isotropic() {
+            (DVec3::ONE, 1.0)
+        } else {
+            // The true kernel is an ellipsoid; what is drawn is the product of its marginals
+            // along the eye's axes.
+            let row =
+                |f: &dyn Fn(DVec3) -> f64| steps.iter().map(|s| f(*s) * f(*s)).sum::<f64>().sqrt();
+            let spread = DVec3::new(row(&|s| s.x), row(&|s| s.y), row(&|s| s.z));
+            (spread, eye_from_index.determinant().abs())
+        };
+        let view = View {
+            size,
+            eye_from_index,
+            eye_origin,
+            eye_from_world,
+            projection,
+            thickness: quality.thickness,
+            kernel_std: spread * quality.std,
+            kernel_radius: spread * quality.radius,
+            cell,
+        };
+        // Depths in phases must fit i32, screen positions 26 bits.
+        let corners = TightBox { lo: [0; 3], hi: lattice.dims.map(|n| n - 1) };
+        let (lo, hi) = view.eye_box(&corners);
+        let depth = (hi.z.abs().max(lo.z.abs()) + view.kernel_radius.z + 1.0) / view.thickness
+            * f64::from(view.depth_phases());
+        if !depth.is_finite() || depth >= (1u32 << 30) as f64 {
+            return Err(Refused::new(
+                "target",
+                "too far from the volume for sheets this thin; move it nearer or raise thickness",
+            ));
+        }
+        Ok(view)
+    }
+
+    /// Depth positions are rounded to this part of a sheet: 1/256 of a sheet or of a vox,
+    /// whichever is finer. Half as many double the error of thin sheets' sections, which is
+    /// then no longer below that of the 1/64 pixel.
+    pub fn depth_phases(&self) -> i32 {
+        let mut phases = 256;
+        while phases < 65536 && f64::from(phases) < 256.0 * self.thickness {
+            phases *= 2;
+        }
+        phases
+    }
+
+    /// Eye coordinates of the voxel at index position `corner` (a brick's first voxel).
+    #[inline]
+    pub fn corner_in_eye(&self, corner: [u32; 3]) -> DVec3 {
+        let [i, j, k] = corner.map(f64::from);
+        let m = &self.eye_from_index;
+        self.eye_origin + ((m.x_axis * i + m.y_axis * j) + m.z_axis * k)
+    }
+
+    /// What to add to a brick corner's eye coordinates for a voxel inside the brick. Eye
+    /// positions are corner + offset, in this order, everywhere.
+    #[inline]
+    pub fn offset_in_eye(&self, local: [u32; 3]) -> DVec3 {
+        let [i, j, k] = local.map(f64::from);
+        let m = &self.eye_from_index;
+        (m.x_axis * i + m.y_axis * j) + m.z_axis * k
+    }
+
+    /// Depth in phases of a sheet (see [`View::depth_phases`]), rounded to nearest.
+    #[inline]
+    pub fn depth_in_phases(&self, z: f64) -> i32 {
+        round_i32(z / self.thickness * f64::from(self.depth_phases()))
+    }
+
+    /// Pixels a vox at the mid-plane of sheet `k`, or `None` where the near plane clips it.
+    #[inline]
+    pub fn scale_at(&self, sheet: i32) -> Option<f64> {
+        match self.projection {
+            Projection::Ortho { scale } => Some(scale),
+            Projection::Persp { focal, distance } => {
+                let depth = (f64::from(sheet) + 0.5) * self.thickness + distance;
+                (depth >= NEAR * distance).then(|| focal / depth)
+            }
+        }
+    }
+
+    /// Screen position, in 1/64 pixel of absolute image coordinates, of the eye position
+    /// (x, y) on a plane with `scale` pixels a vox.
+    #[inline]
+    pub fn screen(&self, x: f64, y: f64, scale: f64) -> [i32; 2] {
+        // 2^24 pixels off the picture is farther than any footprint reaches.
+        const FAR: f64 = (1u32 << 24) as f64;
+        let at = |v: f64, n: u32| {
+            let p = v * scale + f64::from(n) * 0.5;
+            let p = if p > -FAR { p } else { -FAR };
+            let p = if p < FAR { p } else { FAR };
+            round_i32(p * f64::from(SUBPIXELS))
+        };
+        [at(x, self.size[0]), at(y, self.size[1])]
+    }
+
+    /// Length of the ray of pixel (x, y) between two planes one apart.
+    #[inline]
+    pub fn secant(&self, x: i32, y: i32) -> f32 {
+        match self.projection {
+            Projection::Ortho { .. } => 1.0,
+            Projection::Persp { focal, .. } => {
+                let u = (f64::from(x) + 0.5 - f64::from(self.size[0]) * 0.5) / focal;
+                let v = (f64::from(y) + 0.5 - f64::from(self.size[1]) * 0.5) / focal;
+                (1.0 + u * u + v * v).sqrt() as f32
+            }
+        }
+    }
+
+    /// Unit direction from an eye position towards the eye, in world axes.
+    #[inline]
+    pub fn to_eye(&self, p: DVec3) -> Vec3 {
+        let d = match self.projection {
+            Projection::Ortho { .. } => DVec3::new(0.0, 0.0, -1.0),
+            Projection::Persp { distance, .. } => {
+                let v = DVec3::new(-p.x, -p.y, -(p.z + distance));
+                let len = v.length();
+                if len > 1e-12 { v / len } else { DVec3::new(0.0, 0.0, -1.0) }
+            }
+        };
+        // world = eye_from_world^T * eye: a rotation.
+        let w = self.eye_from_world.transpose() * d;
+        Vec3::new(w.x as f32, w.y as f32, w.z as f32)
+    }
+
+    /// Box in eye space of the voxel centres of a box in index space.
+    fn eye_box(&self, b: &TightBox) -> (DVec3, DVec3) {
+        let lo = DVec3::from_array(b.lo.map(f64::from));
+        let hi = DVec3::from_array(b.hi.map(f64::from));
+        let (mid, half) = ((lo + hi) * 0.5, (hi - lo) * 0.5);
+        let m = &self.eye_from_index;
+        let centre = self.eye_origin + *m * mid;
+        let reach = m.x_axis.abs() * half.x + m.y_axis.abs() * half.y + m.z_axis.abs() * half.z;
+        // Rounding of the two ways to compute a position: far below a subpixel.
+        let guard = DVec3::splat(1e-9) * (1.0 + centre.abs().max_element() + reach.max_element());
+        (centre - reach - guard, centre + reach + guard)
+    }
+
+    /// Pixels and sheets that a brick's voxels may touch: the box of voxel centres grown by the
+    /// kernel's support, projected and rounded outward (DESIGN.md, Pixels are exact). `None`
+    /// when it is off the picture or behind the near plane. Never too small; as large as the
+    /// box of the projected box.
+    pub fn project(&self, b: &TightBox) -> Option<Projected> {
+        let (lo, hi) = self.eye_box(b);
+        let r = self.kernel_radius;
+        let phase = self.thickness / f64::from(self.depth_phases());
+        let sheet = |z: f64| libm::floor(z / self.thickness) as i32;
+        let mut sheets =
+            SheetRange::new(sheet(lo.z - r.z - 2.0 * phase), sheet(hi.z + r.z + 2.0 * phase) + 1);
+        // Scales at which sections may be drawn: those of the sheets' mid-planes.
+        let scales = match self.projection {
+            Projection::Ortho { scale } => (scale, scale),
+            Projection::Persp { focal, distance } => {
+                let depth = |k: i32| (f64::from(k) + 0.5) * self.thickness + distance;
+                let near = NEAR * distance;
+                if depth(sheets.end - 1) < near {
+                    return None;
+                }
+                if depth(sheets.first) < near {
+                    let k = libm::ceil((near - distance) / self.thickness - 0.5) as i32 - 1;
+                    sheets.first = k.clamp(sheets.first, sheets.end - 1);
+                }
+                (focal / depth(sheets.first).max(near), focal / depth(sheets.end - 1))
+            }
+        };
+        let span = |lo: f64, hi: f64, n: u32| {
+            let at_lo = (lo * scales.0).min(lo * scales.1) + f64::from(n) * 0.5;
+            let at_hi = (hi * scales.0).max(hi * scales.1) + f64::from(n) * 0.5;
+            // A pixel is touched when its centre (+0.5) is inside; 1/32 covers the rounding of
+            // positions.
+            let first = libm::ceil(at_lo - 0.5 - 1.0 / 32.0).max(0.0);
+            let last = libm::floor(at_hi - 0.5 + 1.0 / 32.0).min(f64::from(n) - 1.0);
+            (first as i32, last as i32 + 1)
+        };
+        let (x0, x1) = span(lo.x - r.x, hi.x + r.x, self.size[0]);
+        let (y0, y1) = span(lo.y - r.y, hi.y + r.y, self.size[1]);
+        let rect = Rect::new(x0, y0, x1, y1);
+        (!rect.is_empty()).then_some(Projected { rect, sheets })
+    }
+}
+
+/// Nearest integer, ties to even, without a library call: adding 1.5 * 2^52 leaves the integer
+/// in the low bits of the sum. `|x| < 2^31`.
+#[inline(always)]
+pub fn round_i32(x: f64) -> i32 {
+    (x + 6_755_399_441_055_744.0).to_bits() as i32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn camera(azimuth: f64, tilt: f64, projection: CameraProjection) -> Camera {
+        let (s, c) = (libm::sin(azimuth), libm::cos(azimuth));
+        Camera { to_eye: DVec3::new(s, c, tilt), up: DVec3::Z, target: DVec3::ZERO, projection }
+    }
+
+    #[test]
+    fn rounding_is_to_nearest() {
+        for (x, want) in [(0.4, 0), (0.6, 1), (-0.6, -1), (1e9 + 0.3, 1_000_000_000), (-7.49, -7)] {
+            assert_eq!(round_i32(x), want, "{x}");
+        }
+    }
+
+    #[test]
+    fn right_is_right_and_up_is_up() {
+        // Seen from +y (the front), +x must be on the left: right = forward x up = -y x z = -x.
+        let l = Lattice::from_spacing([9, 9, 9], [2.0; 3]);
+        let c = camera(0.0, 0.0, CameraProjection::Ortho { height: 36.0 });
+        let v = View::new(&l, &c, [90, 90], &Quality::default()).unwrap();
+        let at = |p: [u32; 3]| {
+            let e = v.corner_in_eye(p);
+            v.screen(e.x, e.y, v.scale_at(0).unwrap()).map(|s| f64::from(s) / 64.0)
+        };
+        assert_eq!(at([4, 4, 4]), [45.0, 45.0]);
+        assert_eq!(at([8, 4, 4]), [45.0 - 8.0 * 2.5, 45.0]);
+        assert_eq!(at([4, 4, 8]), [45.0, 45.0 - 8.0 * 2.5]);
+        assert!(v.corner_in_eye([4, 8, 4]).z < 0.0, "the front is nearer");
+    }
+
+    #[test]
+    fn units_and_origin_drop_out() {
+        let c = camera(0.3, 0.2, CameraProjection::Ortho { height: 36.0 });
+        let q = Quality::default();
+        let l = Lattice::from_spacing([9, 7, 5], [2.0; 3]);
+        let v = View::new(&l, &c, [64, 48], &q).unwrap();
+        let far = Lattice { origin: DVec3::splat(2e7), ..l };
+        assert_eq!(v, View::new(&far, &c, [64, 48], &q).unwrap());
+        let big = Lattice::from_spacing([9, 7, 5], [2.0 * 1048576.0; 3]);
+        let cb = Camera { projection: CameraProjection::Ortho { height: 36.0 * 1048576.0 }, ..c };
+        assert_eq!(v, View::new(&big, &cb, [64, 48], &q).unwrap());
+    }
+
+    #[test]
+    fn cameras_that_cannot_be_drawn_are_refused_by_field() {
+        let l = Lattice::from_spacing([9, 7, 5], [2.0; 3]);
+        let q = Quality::default();
+        let good = camera(0.3, 0.2, CameraProjection::Ortho { height: 36.0 });
+        let field = |c: Camera, size| View::new(&l, &c, size, &q).unwrap_err().field;
+        assert_eq!(field(Camera { to_eye: DVec3::NAN, ..good }, [9, 9]), "eye");
+        assert_eq!(field(Camera { up: DVec3::ZERO, ..good }, [9, 9]), "up");
+        assert_eq!(field(Camera { target: DVec3::splat(1e12), ..good }, [9, 9]), "target");
+        assert_eq!(field(good, [0, 9]), "size");
+        assert_eq!(field(good, [9, 1_000_000]), "size");
+        let p = CameraProjection::Ortho { height: f64::NAN };
+        assert_eq!(field(Camera { projection: p, ..good }, [9, 9]), "height");
+        let p = CameraProjection::Persp { fov: 180.0, distance: 9.0 };
+        assert_eq!(field(Camera { projection: p, ..good }, [9, 9]), "fov");
+    }
+
+    proptest! {
+        /// Every pixel and sheet that a voxel's sections touch lies in its box's projection.
+        #[test]
+        fn projection_of_a_box_holds_its_voxels(
+            azimuth in 0.0..6.3f64, tilt in -2.0..2.0f64, d in 0.02..5.0f64,
+            persp in any::<bool>(), near in 1.0..30.0f64, pick in (0u32..8, 0u32..8, 0u32..8),
+            corner in (0u32..2, 0u32..2, 0u32..2), aniso in 1.0..4.0f64,
+        ) {
+            let l = Lattice::from_spacing([16; 3], [1.0, 1.0, aniso]);
+            let p = if persp {
+                CameraProjection::Persp { fov: 40.0, distance: near }
+            } else {
+                CameraProjection::Ortho { height: 25.0 }
+            };
+            let q = Quality { thickness: d, ..Quality::default() };
+            let v = View::new(&l, &camera(azimuth, tilt, p), [120, 100], &q).unwrap();
+            let base = [corner.0 * 8, corner.1 * 8, corner.2 * 8];
+            let boxed = TightBox { lo: base, hi: base.map(|x| x + 7) };
+            let projected = v.project(&boxed);
+            let eye = v.corner_in_eye(base) + v.offset_in_eye([pick.0, pick.1, pick.2]);
+            let phases = v.depth_phases();
+            let zq = f64::from(v.depth_in_phases(eye.z)) / f64::from(phases);
+            let reach = v.kernel_radius.z / d;
+            for k in libm::floor(zq - reach) as i32..=libm::floor(zq + reach) as i32 {
+                let Some(scale) = v.scale_at(k) else { continue };
+                let [x, y] = v.screen(eye.x, eye.y, scale).map(|s| f64::from(s) / 64.0);
+                let (rx, ry) = (v.kernel_radius.x * scale, v.kernel_radius.y * scale);
+                let first = [libm::ceil(x - rx - 0.5).max(0.0), libm::ceil(y - ry - 0.5).max(0.0)];
+                let last = [libm::floor(x + rx - 0.5).min(119.0), libm::floor(y + ry - 0.5).min(99.0)];
+                if first[0] > last[0] || first[1] > last[1] { continue }
+                let Some(pr) = projected else {
+                    return Err(TestCaseError::fail("a visible voxel in an invisible box"));
+                };
+                prop_assert!(pr.sheets.first <= k && k < pr.sheets.end, "sheet {k} of {:?}", pr.sheets);
+                prop_assert!(pr.rect.x0 as f64 <= first[0] && last[0] < pr.rect.x1 as f64, "{x}+-{rx} in {:?}", pr.rect);
+                prop_assert!(pr.rect.y0 as f64 <= first[1] && last[1] < pr.rect.y1 as f64, "{y}+-{ry} in {:?}", pr.rect);
+            }
+        }
+    }
+}

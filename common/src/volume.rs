@@ -1,0 +1,527 @@
+//! A volume: samples on a lattice that has a place in the world.
+
+use glam::{DMat3, DVec3};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+/// Where a volume's samples lie. World units are the file's (mm), world axes anatomical (RAS+)
+/// where the file has them (CONTRACTS.md, World and camera).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Lattice {
+    /// Samples along the index axes i, j, k (i fastest).
+    pub dims: [u32; 3],
+    /// World vector of one step along each index axis.
+    pub steps: [DVec3; 3],
+    /// World position of sample (0, 0, 0).
+    pub origin: DVec3,
+}
+
+impl Lattice {
+    /// Index axes times spacing, from the origin.
+    pub fn from_spacing(dims: [u32; 3], spacing: [f64; 3]) -> Self {
+        Lattice {
+            dims,
+            steps: [
+                DVec3::new(spacing[0], 0.0, 0.0),
+                DVec3::new(0.0, spacing[1], 0.0),
+                DVec3::new(0.0, 0.0, spacing[2]),
+            ],
+            origin: DVec3::ZERO,
+        }
+    }
+
+    /// Number of samples.
+    pub fn len(&self) -> usize {
+        self.dims.iter().map(|&n| n as usize).product()
+    }
+
+    /// Whether there is no sample.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Lengths of the steps, in world units.
+    pub fn spacing(&self) -> [f64; 3] {
+        self.steps.map(|s| s.length())
+    }
+
+    /// One vox: the smallest spacing, in world units.
+    pub fn vox(&self) -> f64 {
+        let [a, b, c] = self.spacing();
+        a.min(b).min(c)
+    }
+
+    /// `world_from_index` without its translation.
+    pub fn world_from_index(&self) -> DMat3 {
+        DMat3::from_cols(self.steps[0], self.steps[1], self.steps[2])
+    }
+
+    /// Index coordinates of the centre of the volume's box.
+    pub fn centre_index(&self) -> DVec3 {
+        let [x, y, z] = self.dims.map(|n| (n as f64 - 1.0) / 2.0);
+        DVec3::new(x, y, z)
+    }
+
+    /// World position of the centre of the volume's box.
+    pub fn centre(&self) -> DVec3 {
+        self.origin + self.world_from_index() * self.centre_index()
+    }
+
+    /// The largest extent in world units (N samples count as N spacings).
+    pub fn largest_extent(&self) -> f64 {
+        let s = self.spacing();
+        (0..3).map(|a| s[a] * self.dims[a] as f64).fold(0.0, f64::max)
+    }
+
+    /// Whether the lattice is cubic: equal spacings and right angles, to 1 part in 1000 (files
+    /// carry spacings rounded to some digits). Other lattices are drawn with a kernel that is
+    /// only the projection of the true one on the eye's axes, until footprint tables come.
+    pub fn is_isotropic(&self) -> bool {
+        let s = self.spacing();
+        let vox = self.vox();
+        let right = |a: DVec3, b: DVec3| a.dot(b).abs() <= 1e-3 * a.length() * b.length();
+        s.iter().all(|&x| x <= vox * 1.001)
+            && right(self.steps[0], self.steps[1])
+            && right(self.steps[0], self.steps[2])
+            && right(self.steps[1], self.steps[2])
+    }
+
+    /// Checks that the lattice can be drawn: finite, no step of length zero, not flat.
+    pub fn check(&self) -> Result<(), String> {
+        let s = self.spacing();
+        if self.dims.contains(&0) {
+            return Err(format!("a dimension is zero ({:?})", self.dims));
+        }
+        if !self.steps.iter().all(|v| v.is_finite()) || !self.origin.is_finite() {
+            return Err("spacing or origin is not finite".into());
+        }
+        if s.iter().any(|&x| x <= 0.0 || !x.is_normal()) {
+            return Err(format!("a spacing is zero or too small ({s:?})"));
+        }
+        let u = DMat3::from_cols(self.steps[0] / s[0], self.steps[1] / s[1], self.steps[2] / s[2]);
+        if u.determinant().abs() < 1e-6 {
+            return Err("two index axes point the same way; the volume would be flat".into());
+        }
+        let ratio = s.iter().copied().fold(0.0, f64::max) / self.vox();
+        if ratio > 1e6 {
+            return Err(format!("spacings differ by a factor of {ratio:.0}; at most 1e6"));
+        }
+        Ok(())
+    }
+}
+
+/// Samples as stored: the file's type where it has at most 16 bits, else f32.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Samples {
+    /// 8-bit codes.
+    U8(Vec<u8>),
+    /// 16-bit codes.
+    U16(Vec<u16>),
+    /// Floats; NaN and infinities allowed.
+    F32(Vec<f32>),
+}
+
+/// Type of [`Samples`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SampleKind {
+    /// 8-bit codes.
+    U8,
+    /// 16-bit codes.
+    U16,
+    /// Floats.
+    F32,
+}
+
+impl SampleKind {
+    /// Bytes a sample.
+    pub fn bytes(self) -> usize {
+        match self {
+            SampleKind::U8 => 1,
+            SampleKind::U16 => 2,
+            SampleKind::F32 => 4,
+        }
+    }
+}
+
+impl Samples {
+    /// Number of samples.
+    pub fn len(&self) -> usize {
+        match self {
+            Samples::U8(v) => v.len(),
+            Samples::U16(v) => v.len(),
+            Samples::F32(v) => v.len(),
+        }
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Their type.
+    pub fn kind(&self) -> SampleKind {
+        match self {
+            Samples::U8(_) => SampleKind::U8,
+            Samples::U16(_) => SampleKind::U16,
+            Samples::F32(_) => SampleKind::F32,
+        }
+    }
+
+    /// An empty list of `kind`.
+    pub fn empty(kind: SampleKind) -> Self {
+        match kind {
+            SampleKind::U8 => Samples::U8(Vec::new()),
+            SampleKind::U16 => Samples::U16(Vec::new()),
+            SampleKind::F32 => Samples::F32(Vec::new()),
+        }
+    }
+
+    /// Sample `i` as a code.
+    #[inline]
+    pub fn code(&self, i: usize) -> f64 {
+        match self {
+            Samples::U8(v) => v[i] as f64,
+            Samples::U16(v) => v[i] as f64,
+            Samples::F32(v) => v[i] as f64,
+        }
+    }
+
+    /// Appends sample `i` of `from`, which has the same type.
+    #[inline]
+    pub fn push_from(&mut self, from: &Samples, i: usize) {
+        match (self, from) {
+            (Samples::U8(to), Samples::U8(from)) => to.push(from[i]),
+            (Samples::U16(to), Samples::U16(from)) => to.push(from[i]),
+            (Samples::F32(to), Samples::F32(from)) => to.push(from[i]),
+            _ => panic!("samples of two types can't be mixed"),
+        }
+    }
+}
+
+/// From stored codes to the file's values: `value = offset + scale * code`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ValueMap {
+    /// Value of one code step.
+    pub scale: f64,
+    /// Value of code 0.
+    pub offset: f64,
+}
+
+impl ValueMap {
+    /// Codes are values.
+    pub const IDENTITY: ValueMap = ValueMap { scale: 1.0, offset: 0.0 };
+
+    /// The value of a code.
+    #[inline]
+    pub fn value(&self, code: f64) -> f64 {
+        self.offset + self.scale * code
+    }
+}
+
+/// What is known of a volume's values without looking at the samples again.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ValueSummary {
+    /// Stored type.
+    pub kind: SampleKind,
+    /// Codes to values.
+    pub map: ValueMap,
+    /// Smallest finite code.
+    pub min_code: f64,
+    /// Largest finite code.
+    pub max_code: f64,
+    /// Finite samples in 256 equal bins from the smallest to the largest code; for 8-bit
+    /// volumes bin = code instead, so that no two codes share a bin.
+    pub histogram: Vec<u64>,
+    /// Samples that are NaN.
+    pub nan: u64,
+    /// Samples that are infinite (drawn as the nearest finite value).
+    pub infinite: u64,
+}
+
+impl ValueSummary {
+    /// Counts `samples`.
+    pub fn of(samples: &Samples, map: ValueMap) -> Self {
+        let mut s = ValueSummary {
+            kind: samples.kind(),
+            map,
+            min_code: 0.0,
+            max_code: 0.0,
+            histogram: vec![0; 256],
+            nan: 0,
+            infinite: 0,
+        };
+        match samples {
+            Samples::U8(v) => {
+                for &c in v {
+                    s.histogram[c as usize] += 1;
+                }
+                s.min_code = s.histogram.iter().position(|&n| n > 0).unwrap_or(0) as f64;
+                s.max_code = s.histogram.iter().rposition(|&n| n > 0).unwrap_or(0) as f64;
+            }
+            Samples::U16(v) => {
+                let (lo, hi) = v.iter().fold((u16::MAX, 0), |(lo, hi), &c| (lo.min(c), hi.max(c)));
+                s.min_code = lo.min(hi) as f64;
+                s.max_code = hi as f64;
+                for &c in v {
+                    let bin = s.bin(c as f64);
+                    s.histogram[bin] += 1;
+                }
+            }
+            Samples::F32(v) => {
+                let (mut lo, mut hi) = (f32::INFINITY, f32::NEG_INFINITY);
+                for &c in v {
+                    if c.is_finite() {
+                        lo = lo.min(c);
+                        hi = hi.max(c);
+                    } else if c.is_nan() {
+                        s.nan += 1;
+                    } else {
+                        s.infinite += 1;
+                    }
+                }
+                if lo <= hi {
+                    (s.min_code, s.max_code) = (lo as f64, hi as f64);
+                }
+                for &c in v.iter().filter(|c| c.is_finite()) {
+                    let bin = s.bin(c as f64);
+                    s.histogram[bin] += 1;
+                }
+            }
+        }
+        s
+    }
+
+    /// The histogram bin of a finite code.
+    pub fn bin(&self, code: f64) -> usize {
+        if self.kind == SampleKind::U8 {
+            return code as usize;
+        }
+        let span = self.max_code - self.min_code;
+        if span > 0.0 { (((code - self.min_code) / span) * 256.0).min(255.0) as usize } else { 0 }
+    }
+
+    /// The code at the lower edge of bin `b`.
+    pub fn bin_code(&self, b: usize) -> f64 {
+        if self.kind == SampleKind::U8 {
+            return b as f64;
+        }
+        self.min_code + (self.max_code - self.min_code) * b as f64 / 256.0
+    }
+
+    /// Smallest and largest finite value.
+    pub fn range(&self) -> (f64, f64) {
+        let (a, b) = (self.map.value(self.min_code), self.map.value(self.max_code));
+        (a.min(b), a.max(b))
+    }
+
+    /// Number of samples.
+    pub fn total(&self) -> u64 {
+        self.histogram.iter().sum::<u64>() + self.nan + self.infinite
+    }
+}
+
+/// A volume in memory.
+#[derive(Clone, Debug)]
+pub struct Volume {
+    /// What to call it (the file's name without folders).
+    pub name: String,
+    /// The type in the file, for people (`int16`).
+    pub file_type: String,
+    /// Whether the file says where patient right, anterior and superior are.
+    pub anatomical: bool,
+    /// Where the samples lie.
+    pub lattice: Lattice,
+    /// The samples, i fastest.
+    pub samples: Samples,
+    /// Range, histogram, codes to values.
+    pub summary: ValueSummary,
+}
+
+impl Volume {
+    /// A volume of samples; counts them.
+    ///
+    /// # Panics
+    /// If the lattice and the samples differ in number.
+    pub fn new(
+        name: impl Into<String>,
+        file_type: impl Into<String>,
+        anatomical: bool,
+        lattice: Lattice,
+        samples: Samples,
+        map: ValueMap,
+    ) -> Self {
+        assert_eq!(lattice.len(), samples.len(), "one sample for each lattice point");
+        let summary = ValueSummary::of(&samples, map);
+        Volume {
+            name: name.into(),
+            file_type: file_type.into(),
+            anatomical,
+            lattice,
+            samples,
+            summary,
+        }
+    }
+
+    /// A volume by formula: `f(i, j, k)` as 8-bit codes on a unit lattice.
+    pub fn from_fn_u8(name: &str, dims: [u32; 3], mut f: impl FnMut(u32, u32, u32) -> u8) -> Self {
+        let mut v = Vec::with_capacity(dims.iter().map(|&n| n as usize).product());
+        for k in 0..dims[2] {
+            for j in 0..dims[1] {
+                for i in 0..dims[0] {
+                    v.push(f(i, j, k));
+                }
+            }
+        }
+        let lattice = Lattice::from_spacing(dims, [1.0; 3]);
+        Volume::new(name, "uint8", false, lattice, Samples::U8(v), ValueMap::IDENTITY)
+    }
+
+    /// SHA-256 over lattice, value map and samples: two volumes with one digest give the same
+    /// pictures. The name is not part of it.
+    pub fn digest(&self) -> Digest32 {
+        let mut h = Sha256::new();
+        h.update(b"slabcast volume 1");
+        for n in self.lattice.dims {
+            h.update(n.to_le_bytes());
+        }
+        let numbers = self
+            .lattice
+            .steps
+            .iter()
+            .flat_map(|s| s.to_array())
+            .chain(self.lattice.origin.to_array())
+            .chain([self.summary.map.scale, self.summary.map.offset]);
+        for x in numbers {
+            h.update(x.to_le_bytes());
+        }
+        match &self.samples {
+            Samples::U8(v) => {
+                h.update([1]);
+                h.update(v);
+            }
+            Samples::U16(v) => {
+                h.update([2]);
+                v.chunks(1 << 15).for_each(|c| {
+                    h.update(c.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<_>>())
+                });
+            }
+            Samples::F32(v) => {
+                h.update([3]);
+                v.chunks(1 << 14).for_each(|c| {
+                    h.update(c.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<_>>())
+                });
+            }
+        }
+        Digest32(h.finalize().into())
+    }
+
+    /// Gradient of the raw field in world axes at sample (i, j, k): central differences with
+    /// spacing, one-sided at the border, zero along an axis of one sample. Unit: codes per
+    /// world unit. Not finite where a neighbour is not.
+    pub fn gradient(&self, [i, j, k]: [u32; 3], index_to_world_gradient: &DMat3) -> DVec3 {
+        let [nx, ny, nz] = self.lattice.dims;
+        let at = |x: u32, y: u32, z: u32| {
+            self.samples.code((z as usize * ny as usize + y as usize) * nx as usize + x as usize)
+        };
+        let along = |p: u32, n: u32, f: &dyn Fn(u32) -> f64| {
+            let (lo, hi) = (p.saturating_sub(1), (p + 1).min(n - 1));
+            if hi == lo { 0.0 } else { (f(hi) - f(lo)) / (hi - lo) as f64 }
+        };
+        let g = DVec3::new(
+            along(i, nx, &|x| at(x, j, k)),
+            along(j, ny, &|y| at(i, y, k)),
+            along(k, nz, &|z| at(i, j, z)),
+        );
+        *index_to_world_gradient * g
+    }
+
+    /// The matrix that [`Volume::gradient`] takes: the transposed inverse of
+    /// `world_from_index`, scaled to vox so that no unit overflows it.
+    pub fn gradient_matrix(&self) -> DMat3 {
+        let vox = self.lattice.vox();
+        let m = DMat3::from_cols(
+            self.lattice.steps[0] / vox,
+            self.lattice.steps[1] / vox,
+            self.lattice.steps[2] / vox,
+        );
+        m.inverse().transpose()
+    }
+
+    /// What workers need to know of it.
+    pub fn info(&self, digest: Digest32) -> VolumeInfo {
+        VolumeInfo { digest, lattice: self.lattice, summary: self.summary.clone() }
+    }
+}
+
+/// A volume without its samples.
+#[derive(Clone, Debug, PartialEq)]
+pub struct VolumeInfo {
+    /// [`Volume::digest`].
+    pub digest: Digest32,
+    /// Where the samples lie.
+    pub lattice: Lattice,
+    /// Range, histogram, codes to values.
+    pub summary: ValueSummary,
+}
+
+/// A SHA-256, shown in hexadecimal.
+#[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Digest32(pub [u8; 32]);
+
+impl std::fmt::Display for Digest32 {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.0.iter().try_for_each(|b| write!(f, "{b:02x}"))
+    }
+}
+
+impl std::fmt::Debug for Digest32 {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{self}")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gradient_of_a_ramp_is_its_slope_in_world_units() {
+        // Oblique axes: the field is 3 X - 2 Y + 5 Z in world coordinates.
+        let lattice = Lattice {
+            dims: [5, 4, 3],
+            steps: [
+                DVec3::new(0.5, 0.1, 0.0),
+                DVec3::new(0.0, 2.0, 0.3),
+                DVec3::new(0.2, 0.0, 1.0),
+            ],
+            origin: DVec3::new(7.0, 8.0, 9.0),
+        };
+        let mut v = Vec::new();
+        for k in 0..3 {
+            for j in 0..4 {
+                for i in 0..5 {
+                    let w = lattice.origin
+                        + lattice.world_from_index() * DVec3::new(i as f64, j as f64, k as f64);
+                    v.push((3.0 * w.x - 2.0 * w.y + 5.0 * w.z) as f32);
+                }
+            }
+        }
+        let vol = Volume::new("ramp", "float", false, lattice, Samples::F32(v), ValueMap::IDENTITY);
+        let m = vol.gradient_matrix();
+        for p in [[0, 0, 0], [2, 1, 1], [4, 3, 2]] {
+            let g = vol.gradient(p, &m) / lattice.vox();
+            assert!((g - DVec3::new(3.0, -2.0, 5.0)).length() < 1e-4, "{p:?}: {g}");
+        }
+    }
+
+    #[test]
+    fn summary_counts_the_unusual() {
+        let v = vec![f32::NAN, f32::INFINITY, -1.0, 3.0, 1e-40, f32::NEG_INFINITY];
+        let s = ValueSummary::of(&Samples::F32(v), ValueMap { scale: 2.0, offset: 1.0 });
+        assert_eq!((s.nan, s.infinite, s.total()), (1, 2, 6));
+        assert_eq!(s.range(), (-1.0, 7.0));
+        let empty = ValueSummary::of(&Samples::F32(vec![f32::NAN]), ValueMap::IDENTITY);
+        assert_eq!(empty.range(), (0.0, 0.0));
+    }
+}

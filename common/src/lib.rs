@@ -34,4 +34,4 @@ pub const PROTOCOL_VERSION: u32 = 1;
 /// SHA-256 of the self-test tile that every worker draws before it says hello
 /// (`slabcast_render::selftest`, which also has the test that keeps this constant true).
 pub const SELF_TEST_SHA256: &str =
-    "0000000000000000000000000000000000000000000000000000000000000000";
+    "6a6c90590dfd6dda6c04fb78b7ba92979e477db2809514192888f85805015dea";

@@ -1,1 +1,21 @@
-//! Placeholder.
+//! Image-aligned sheet-based splatting with occlusion culling (paper section 3), on one tile.
+//!
+//! Two renderers stand side by side:
+//! - [`serial`] is the paper's listing, plainly, over a whole frame: every voxel into every
+//!   bucket, sheet after sheet, nothing culled. It is the oracle for bytes.
+//! - [`tile`] is what workers run: lazy bucket toss, a ring of open sheets, bricks and voxels
+//!   tested against the occlusion map. It must give the oracle's bytes, always.
+//!
+//! They share what a pixel *is*: the kernel's profile and sections ([`footprint`]) and the
+//! arithmetic of a closing sheet ([`sheet`]). This crate refuses to know threads, networks and
+//! clocks; whoever calls it has those.
+
+pub mod footprint;
+pub mod scene;
+pub mod selftest;
+pub mod serial;
+pub mod sheet;
+pub mod splat;
+pub mod tile;
+
+pub use scene::{Frame, Scene};

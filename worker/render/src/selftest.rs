@@ -1,0 +1,115 @@
+//! A tile that every worker draws before it says hello.
+//!
+//! Its hash goes into the hello; the master refuses a worker whose hash differs from
+//! `slabcast_common::SELF_TEST_SHA256`, naming both. So a machine, a compiler or a build that
+//! rounds differently is found before it spoils a picture.
+
+use crate::scene::{Frame, Scene};
+use crate::splat::Simd;
+use crate::tile::{self, Scratch};
+use glam::DVec3;
+use slabcast_common::brick::{BRICK, Brick, BrickGrid};
+use slabcast_common::ids::{BrickId, SceneId};
+use slabcast_common::image::FrameState;
+use slabcast_common::message::SceneSpec;
+use slabcast_common::occlusion::Rect;
+use slabcast_common::presets;
+use slabcast_common::quality::{Quality, Sums};
+use slabcast_common::shade::encode_normal;
+use slabcast_common::slab::SheetRange;
+use slabcast_common::view::{Camera, CameraProjection, View};
+use slabcast_common::volume::{Digest32, Samples, Volume};
+use std::sync::Arc;
+
+/// Draws the self-test with `simd` and returns its hash: a shaded ball with a hole, 24 voxels
+/// wide, in perspective, with integer sums and again with floats, in two slabs.
+pub fn run(simd: Simd) -> Digest32 {
+    let n = 24u32;
+    let volume = Volume::from_fn_u8("selftest", [n; 3], |i, j, k| {
+        let d = [i, j, k].map(|x| 2 * x as i32 - (n as i32 - 1));
+        let r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+        let hole = (d[0] - 6) * (d[0] - 6) + d[2] * d[2] < 30;
+        if hole { 0 } else { (260 - r2 / 2).clamp(0, 255) as u8 }
+    });
+    let bricks = bricks_of(&volume);
+    let mut hashes = Vec::new();
+    for sums in [Sums::I32, Sums::F32] {
+        let quality = Quality { sums, ..Quality::default() };
+        let spec = SceneSpec {
+            id: SceneId(0),
+            volume: volume.info(Digest32::default()),
+            transfer: presets::by_name("peer-vessels", &volume.summary).expect("a preset"),
+            quality,
+            bricks: Default::default(),
+        };
+        let camera = Camera {
+            to_eye: DVec3::new(0.6, 1.0, 0.4),
+            up: DVec3::Z,
+            target: DVec3::ZERO,
+            projection: CameraProjection::Persp { fov: 35.0, distance: 50.0 },
+        };
+        let size = [80, 72];
+        let view = View::new(&volume.lattice, &camera, size, &quality).expect("a good view");
+        let frame = Frame::new(Arc::new(Scene::new(&spec)), view);
+        let mut state = FrameState::new(size);
+        let mut scratch = Scratch::default();
+        let rect = Rect::of_size(size);
+        for slab in [SheetRange::new(-40, 3), SheetRange::new(3, 40)] {
+            let from = state.tile(rect);
+            let (pixels, _) = tile::render(&frame, simd, rect, slab, &bricks, &from, &mut scratch);
+            state.put(rect, &pixels);
+            state.end_slab();
+        }
+        hashes.extend(state.finish().sha256().0);
+    }
+    use sha2::{Digest, Sha256};
+    Digest32(Sha256::digest(&hashes).into())
+}
+
+/// All voxels of an 8-bit volume that are not zero, as bricks, with normals.
+fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
+    let grid = BrickGrid::of(volume.lattice.dims);
+    let Samples::U8(samples) = &volume.samples else { unreachable!("made above") };
+    let [nx, ny, _] = volume.lattice.dims.map(|n| n as usize);
+    let matrix = volume.gradient_matrix();
+    (0..grid.len() as u32)
+        .filter_map(|id| {
+            let corner = grid.corner(BrickId(id));
+            let (mut index, mut values, mut normals) = (Vec::new(), Vec::new(), Vec::new());
+            for l in 0..512u16 {
+                let p: [u32; 3] =
+                    std::array::from_fn(|a| corner[a] + slabcast_common::brick::local(l)[a]);
+                if (0..3).any(|a| p[a] >= volume.lattice.dims[a]) {
+                    continue;
+                }
+                let code = samples[(p[2] as usize * ny + p[1] as usize) * nx + p[0] as usize];
+                if code > 0 {
+                    index.push(l);
+                    values.push(code);
+                    normals.push(encode_normal(volume.gradient(p, &matrix)));
+                }
+            }
+            debug_assert!(corner.iter().all(|c| c % BRICK == 0));
+            (!index.is_empty()).then(|| {
+                Arc::new(Brick {
+                    id: BrickId(id),
+                    index,
+                    values: Samples::U8(values),
+                    normals: Some(normals),
+                })
+            })
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_instruction_set_of_this_machine_passes() {
+        for simd in Simd::all() {
+            assert_eq!(run(simd).to_string(), slabcast_common::SELF_TEST_SHA256, "{}", simd.name());
+        }
+    }
+}

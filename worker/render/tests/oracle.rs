@@ -1,0 +1,203 @@
+//! The tile renderer gives the bytes of the serial one, whatever the cut.
+//!
+//! Random small volumes with opaque, faint and empty parts; random cameras of both kinds;
+//! thin and thick sheets; any tiles, slabs, instruction set, with culling and without.
+
+use glam::DVec3;
+use proptest::prelude::*;
+use slabcast_common::brick::{Brick, BrickGrid, local};
+use slabcast_common::ids::{BrickId, SceneId};
+use slabcast_common::image::{FrameState, Picture};
+use slabcast_common::message::SceneSpec;
+use slabcast_common::occlusion::Rect;
+use slabcast_common::quality::{Compositing, Quality, Sums};
+use slabcast_common::shade::{Shading, encode_normal};
+use slabcast_common::slab::SheetRange;
+use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
+use slabcast_common::view::{Camera, CameraProjection, View};
+use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
+use slabcast_render::splat::Simd;
+use slabcast_render::tile::{self, Scratch};
+use slabcast_render::{Frame, Scene, serial};
+use std::sync::Arc;
+
+/// Every voxel that is not zero, with its normal.
+fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
+    let grid = BrickGrid::of(volume.lattice.dims);
+    let [nx, ny, _] = volume.lattice.dims.map(|n| n as usize);
+    let matrix = volume.gradient_matrix();
+    let mut out = Vec::new();
+    for id in 0..grid.len() as u32 {
+        let corner = grid.corner(BrickId(id));
+        let mut brick = Brick {
+            id: BrickId(id),
+            index: vec![],
+            values: Samples::empty(volume.samples.kind()),
+            normals: Some(vec![]),
+        };
+        for l in 0..512u16 {
+            let p: [u32; 3] = std::array::from_fn(|a| corner[a] + local(l)[a]);
+            if (0..3).any(|a| p[a] >= volume.lattice.dims[a]) {
+                continue;
+            }
+            let i = (p[2] as usize * ny + p[1] as usize) * nx + p[0] as usize;
+            if volume.samples.code(i) != 0.0 {
+                brick.index.push(l);
+                brick.values.push_from(&volume.samples, i);
+                let normal = encode_normal(volume.gradient(p, &matrix));
+                brick.normals.as_mut().unwrap().push(normal);
+            }
+        }
+        if !brick.is_empty() {
+            out.push(Arc::new(brick));
+        }
+    }
+    out
+}
+
+fn transfer(top: f64, unit: OpacityUnit) -> TransferFunction {
+    TransferFunction {
+        version: 1,
+        domain: Domain::Value,
+        colors: vec![[0.0, 0.9, 0.3, 0.1], [255.0, 0.2, 0.8, 1.0]],
+        opacities: vec![[0.0, 0.0], [20.0, 0.002], [60.0, 0.05], [128.0, top], [255.0, top]],
+        color_space: ColorSpace::Srgb,
+        opacity_unit: unit,
+        nan: NanLook::default(),
+        gradient_opacity: vec![],
+        shading: Shading::default(),
+    }
+}
+
+fn tiled(
+    frame: &Frame,
+    simd: Simd,
+    bricks: &[Arc<Brick>],
+    edge: i32,
+    slabs: &[SheetRange],
+) -> Picture {
+    let size = frame.view.size;
+    let mut state = FrameState::new(size);
+    let mut scratch = Scratch::default();
+    for &slab in slabs {
+        for y in (0..size[1] as i32).step_by(edge as usize) {
+            for x in (0..size[0] as i32).step_by(edge as usize) {
+                let rect = Rect::new(x, y, x + edge, y + edge).intersect(&Rect::of_size(size));
+                let from = state.tile(rect);
+                let (pixels, _) =
+                    tile::render(frame, simd, rect, slab, bricks, &from, &mut scratch);
+                state.put(rect, &pixels);
+            }
+        }
+        state.end_slab();
+    }
+    state.finish()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 60, ..ProptestConfig::default() })]
+
+    #[test]
+    fn tiles_and_slabs_give_the_bytes_of_the_serial_renderer(
+        dims in (1u32..22, 1u32..22, 1u32..22),
+        seed in any::<u64>(),
+        azimuth in 0.0..6.3f64, tilt in -1.5..1.5f64,
+        persp in any::<bool>(), distance in 2.0..60.0f64,
+        thickness in prop::sample::select(vec![0.25, 0.5, 1.0, 1.0, 1.0, 2.3, 40.0]),
+        compositing in prop::sample::select(
+            vec![Compositing::Linear, Compositing::Linear, Compositing::Constant, Compositing::Paper]),
+        sums in prop::sample::select(vec![Sums::I32, Sums::I32, Sums::F32]),
+        eps in prop::sample::select(vec![0.0, 1.0 / 512.0, 0.1]),
+        top in prop::sample::select(vec![0.05, 0.9, 1.0]),
+        size in (1u32..150, 1u32..110),
+        edge in prop::sample::select(vec![16i32, 32, 64, 256]),
+        cuts in prop::collection::vec(0.0..1.0f64, 0..5),
+        spacing in prop::sample::select(vec![1.0, 1.0, 2.5]),
+        zoom in prop::sample::select(vec![0.3, 1.25, 1.25, 6.0]),
+    ) {
+        // Blobs: correlated values, with empty space between.
+        let hash = |i: u32, j: u32, k: u32| {
+            let mut h = seed ^ (u64::from(i / 3) << 40) ^ (u64::from(j / 3) << 20) ^ u64::from(k / 2);
+            h = (h ^ (h >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+            h = (h ^ (h >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+            (h >> 33) as u8
+        };
+        let mut v = Volume::from_fn_u8("blobs", [dims.0, dims.1, dims.2], |i, j, k| {
+            let h = hash(i, j, k);
+            if h < 110 { 0 } else { h.wrapping_add((i * 7 + j * 3 + k) as u8 & 31) }
+        });
+        v.lattice = Lattice::from_spacing(v.lattice.dims, [1.0, spacing, 1.0]);
+        let quality = Quality { thickness, eps, compositing, sums, ..Quality::default() };
+        let camera = Camera {
+            to_eye: DVec3::new(azimuth.sin(), azimuth.cos(), tilt),
+            up: DVec3::Z,
+            target: DVec3::ZERO,
+            projection: if persp {
+                CameraProjection::Persp { fov: 40.0, distance }
+            } else {
+                CameraProjection::Ortho { height: zoom * v.lattice.largest_extent() }
+            },
+        };
+        let size = [size.0, size.1];
+        let unit = if sums == Sums::F32 { OpacityUnit::Extinction } else { OpacityUnit::AlphaPerVox };
+        let view = View::new(&v.lattice, &camera, size, &quality).unwrap();
+        let bricks = bricks_of(&v);
+        let make = |cull| {
+            let spec = SceneSpec {
+                id: SceneId(1),
+                volume: v.info(Digest32::default()),
+                transfer: transfer(top, unit),
+                quality: Quality { cull, ..quality },
+                bricks: Default::default(),
+            };
+            Frame::new(Arc::new(Scene::new(&spec)), view)
+        };
+        let frame = make(true);
+        let want = serial::render(&frame, &bricks);
+        prop_assert!(want.pixels.iter().flatten().all(|x| x.is_finite() && (0.0..=1.0001).contains(x)));
+        let run = bricks.iter().filter_map(|b| view.project(&b.tight(&frame.scene.grid)))
+            .fold(SheetRange::default(), |r, p| r.union(p.sheets));
+        let mut at: Vec<i32> = cuts.iter()
+            .map(|c| run.first + (c * f64::from(run.len())) as i32).collect();
+        at.extend([run.first, run.end]);
+        at.sort_unstable();
+        at.dedup();
+        let slabs: Vec<SheetRange> = at.windows(2).map(|w| SheetRange::new(w[0], w[1])).collect();
+        let got = tiled(&frame, Simd::detect(), &bricks, edge, &slabs);
+        prop_assert!(got == want, "cut into {} slabs of {edge} pixel tiles", slabs.len());
+        let got = tiled(&make(false), Simd::plain(), &bricks, 64, &[run]);
+        prop_assert!(got == want, "without culling");
+    }
+}
+
+/// Values of a float volume that nobody sane would draw.
+#[test]
+fn wild_floats_give_finite_pixels() {
+    let wild = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e-42, 3e38, -3e38, 5.0, 0.5];
+    let samples: Vec<f32> = (0..1000).map(|i| wild[i * 7 % 8]).collect();
+    let lattice = Lattice::from_spacing([10; 3], [1e-9; 3]);
+    let v = Volume::new("wild", "float", false, lattice, Samples::F32(samples), ValueMap::IDENTITY);
+    let mut tf = transfer(1.0, OpacityUnit::AlphaPerVox);
+    tf.domain = Domain::Unit;
+    tf.opacities = vec![[0.0, 0.3], [1.0, 1.0]];
+    tf.nan.opacity = 0.2;
+    let quality = Quality { sums: Sums::I32, ..Quality::default() };
+    let spec = SceneSpec {
+        id: SceneId(1),
+        volume: v.info(Digest32::default()),
+        transfer: tf,
+        quality,
+        bricks: Default::default(),
+    };
+    let camera = Camera {
+        to_eye: DVec3::new(1.0, 2.0, 0.5),
+        up: DVec3::Z,
+        target: DVec3::ZERO,
+        projection: CameraProjection::Ortho { height: 2e-8 },
+    };
+    let view = View::new(&v.lattice, &camera, [60, 60], &quality).unwrap();
+    let frame = Frame::new(Arc::new(Scene::new(&spec)), view);
+    let picture = serial::render(&frame, &bricks_of(&v));
+    assert!(picture.pixels.iter().flatten().all(|x| x.is_finite()));
+    assert!(picture.pixels.iter().any(|p| p[3] > 0.9));
+}

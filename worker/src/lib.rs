@@ -1,1 +1,16 @@
-//! Placeholder.
+//! A worker: it caches bricks, renders macrotiles and answers the master.
+//!
+//! - [`desk`] is where everything arrives: leases, bricks, results. It decides what can start.
+//! - [`pool`] is the render threads: plain threads, never tokio's.
+//! - [`cache`] is the bricks it holds; they outlive a link, so a worker that comes back after
+//!   its master restarted brings them along.
+//! - [`dial`] is the TCP link and the patience to come back; the embedded link needs none of it.
+//!
+//! A worker never sees the volume, the queue or another worker.
+
+pub mod cache;
+pub mod desk;
+pub mod pool;
+
+pub use cache::BrickCache;
+pub use desk::{Config, Ended, Link, run};

@@ -1,0 +1,155 @@
+//! From finished sums to a picture, its hash, its bytes and its statistics.
+//!
+//! This runs on a thread of its own beside the driver, so that a frame is hashed and encoded
+//! while the next one is rendered.
+
+use crate::jobs::FinishedFrame;
+use sha2::{Digest, Sha256};
+use slabcast_common::ids::{FrameId, JobId};
+use slabcast_common::image::FrameState;
+use slabcast_common::message::{PathRequest, SceneSpec};
+use slabcast_common::quality::{Compositing, Sums};
+use slabcast_common::stats::{Bound, ErrorStats, FrameStats, LeftOut};
+use slabcast_common::view::View;
+use slabcast_common::volume::Digest32;
+use slabcast_schedule::Span;
+use std::sync::Arc;
+
+/// Everything that makes a frame.
+pub(crate) struct Sums_ {
+    pub(crate) job: JobId,
+    pub(crate) frame: FrameId,
+    pub(crate) request: Arc<PathRequest>,
+    pub(crate) scene: Arc<SceneSpec>,
+    pub(crate) view: View,
+    pub(crate) state: Box<FrameState>,
+    pub(crate) stats: Box<FrameStats>,
+    pub(crate) spans: Vec<Span>,
+    /// Depth of the volume along the view, in vox.
+    pub(crate) depth_vox: f64,
+    /// Voxels stored, for what normals would have taken.
+    pub(crate) voxels: u64,
+    pub(crate) normals: bool,
+}
+
+/// Hash of everything that decides a frame's pixels: volume, transfer function, quality, view.
+pub fn view_sha256(scene: &SceneSpec, view: &View) -> Digest32 {
+    let mut h = Sha256::new();
+    h.update(b"slabcast view 1");
+    h.update(slabcast_common::PIXELS_VERSION.to_le_bytes());
+    h.update(scene.volume.digest.0);
+    h.update(scene.transfer.to_json());
+    // Culling never changes a byte.
+    let quality = slabcast_common::quality::Quality { cull: true, ..scene.quality };
+    h.update(serde_json::to_string(&quality).unwrap_or_default());
+    h.update(view.size[0].to_le_bytes());
+    h.update(view.size[1].to_le_bytes());
+    let projection = match view.projection {
+        slabcast_common::view::Projection::Ortho { scale } => [0.0, scale, 0.0],
+        slabcast_common::view::Projection::Persp { focal, distance } => [1.0, focal, distance],
+    };
+    let numbers = view
+        .eye_from_index
+        .to_cols_array()
+        .into_iter()
+        .chain(view.eye_origin.to_array())
+        .chain(view.eye_from_world.to_cols_array())
+        .chain(view.kernel_std.to_array())
+        .chain(view.kernel_radius.to_array())
+        .chain(projection)
+        .chain([view.thickness, view.cell]);
+    for x in numbers {
+        h.update(x.to_le_bytes());
+    }
+    Digest32(h.finalize().into())
+}
+
+/// The bounds that are known without a reference (DESIGN.md section 5), in 1/255.
+fn error(scene: &SceneSpec, view: &View, depth_vox: f64) -> ErrorStats {
+    let q = &scene.quality;
+    let mut e = ErrorStats::default();
+    // At most eps of the light is missing, and no colour is brighter than one.
+    e.cutoff = Bound { bound: Some(q.eps * 255.0) };
+    if q.sums == Sums::I32 && q.compositing != Compositing::Paper {
+        // Every contribution is rounded by half a raw unit. A ray meets the kernels of
+        // (2 R)^2 voxels a vox of depth, each in 2 R / d + 1 sheets; optical depth is off by at
+        // most their sum, alpha by no more than that. A colour's two sums are rounded apart,
+        // and its change is judged from three sheets: four times.
+        let payload_max =
+            slabcast_common::transfer::Classifier::new(&scene.transfer, &scene.volume, q.compositing)
+                .payload_max();
+        let d = view.thickness;
+        let unit = 1.05 * payload_max * d / f64::from(1u32 << 30);
+        let r = view.kernel_radius;
+        let met = 4.0 * r.x * r.y / view.cell * (depth_vox + 2.0 * r.z) * (2.0 * r.z / d + 2.0);
+        e.quantisation = Bound { bound: Some(4.0 * 0.5 * unit * met * 255.0) };
+    }
+    e
+}
+
+/// Makes the frame.
+pub(crate) fn finish(s: Sums_) -> FinishedFrame {
+    let picture = s.state.finish();
+    let mut stats = *s.stats;
+    stats.view_sha256 = view_sha256(&s.scene, &s.view).to_string();
+    stats.pixels_sha256 = picture.sha256().to_string();
+    stats.pixels_version = slabcast_common::PIXELS_VERSION;
+    stats.error = error(&s.scene, &s.view, s.depth_vox);
+    if !s.normals {
+        stats.left_out.push(LeftOut {
+            name: "normals".into(),
+            saved_ms: None,
+            // Two bytes a stored voxel, in the master's memory and on every worker that holds it.
+            saved_bytes: Some(2 * s.voxels),
+        });
+    }
+    let bytes = picture.encode(s.request.format, s.request.background).into();
+    FinishedFrame {
+        number: stats.frame,
+        size: picture.size,
+        format: s.request.format,
+        bytes,
+        stats_json: serde_json::to_string(&stats).unwrap_or_default(),
+        trace_json: s.request.want_trace.then(|| chrome_trace(&s.spans, s.job, s.frame)),
+        stats,
+    }
+}
+
+/// Spans as an array of Chrome trace events: one process for the master and one a worker, all
+/// on the master's clock (microseconds).
+fn chrome_trace(spans: &[Span], job: JobId, frame: FrameId) -> String {
+    let mut names: Vec<&str> = spans.iter().filter_map(|s| s.worker.as_deref()).collect();
+    names.sort_unstable();
+    names.dedup();
+    let process = |worker: Option<&str>| {
+        // Process ids follow the names, so that every frame of a job gives a worker the same.
+        worker.map_or(1, |w| {
+            let mut h = 0xcbf2_9ce4u32;
+            for b in w.bytes() {
+                h = (h ^ u32::from(b)).wrapping_mul(0x0100_0193);
+            }
+            2 + (h >> 8)
+        })
+    };
+    let mut events: Vec<serde_json::Value> = std::iter::once(None)
+        .chain(names.iter().copied().map(Some))
+        .map(|worker| {
+            serde_json::json!({
+                "name": "process_name", "ph": "M", "pid": process(worker), "tid": 0,
+                "args": { "name": worker.unwrap_or("master") }
+            })
+        })
+        .collect();
+    for s in spans {
+        let mut args: serde_json::Map<String, serde_json::Value> =
+            s.args.iter().map(|(k, v)| ((*k).to_string(), v.clone().into())).collect();
+        args.insert("job".into(), job.to_string().into());
+        args.insert("frame".into(), frame.to_string().into());
+        events.push(serde_json::json!({
+            "name": s.name, "cat": s.category, "ph": "X", "ts": s.start,
+            "dur": s.end.saturating_sub(s.start), "pid": process(s.worker.as_deref()),
+            "tid": s.thread, "args": args
+        }));
+    }
+    serde_json::Value::Array(events).to_string()
+}

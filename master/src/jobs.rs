@@ -1,0 +1,260 @@
+//! Jobs: view paths that clients submitted, their frames, and those who wait for them.
+//!
+//! The table is shared: the driver puts frames in, watchers take them out. A watcher is a
+//! cursor, so it may come late, twice, or again after its connection broke. Frames that nobody
+//! has taken yet are never dropped; instead the driver stops rendering ahead when they fill the
+//! budget. Frames that were taken are kept while there is room and rendered again when somebody
+//! asks for one that is gone: a frame is a pure function of its job.
+
+use bytes::Bytes;
+use slabcast_common::ids::JobId;
+use slabcast_common::image::PixelFormat;
+use slabcast_common::message::PathRequest;
+use slabcast_common::stats::FrameStats;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Arc, Mutex, MutexGuard};
+use tokio::sync::watch;
+
+/// Most jobs that are remembered; the oldest ended ones are forgotten beyond it.
+pub const MAX_JOBS: usize = 1000;
+
+/// What a job is doing.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum JobState {
+    /// Other jobs come first.
+    Queued,
+    /// Its bricks are being made.
+    Preparing,
+    /// There is no worker.
+    WaitingForWorkers,
+    /// Frames are being rendered.
+    Running,
+    /// All frames are done.
+    Done,
+    /// It can't go on; says why.
+    Failed(String),
+    /// A client cancelled it.
+    Cancelled,
+}
+
+impl JobState {
+    /// Whether nothing more will happen by itself.
+    pub fn is_over(&self) -> bool {
+        matches!(self, JobState::Done | JobState::Failed(_) | JobState::Cancelled)
+    }
+}
+
+/// A job as others see it.
+#[derive(Clone, Debug)]
+pub struct JobView {
+    /// Its name.
+    pub id: JobId,
+    /// The client's name for it.
+    pub client_key: String,
+    /// What it is doing.
+    pub state: JobState,
+    /// Frames done.
+    pub frames_done: u64,
+    /// Frames in all.
+    pub frames_total: u64,
+    /// Macrotiles done and there in the slab at hand.
+    pub tiles: (u32, u32),
+    /// Slab at hand and slabs of the frame at hand.
+    pub slab: (u32, u32),
+    /// Render threads of the workers that are there.
+    pub workers: u32,
+    /// Picture size.
+    pub size: [u32; 2],
+}
+
+/// A frame, ready to leave.
+#[derive(Debug)]
+pub struct FinishedFrame {
+    /// Its number in the path.
+    pub number: u64,
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+    /// Of `bytes`.
+    pub format: PixelFormat,
+    /// The pixels.
+    pub bytes: Bytes,
+    /// Statistics, hashes included.
+    pub stats: FrameStats,
+    /// The same as one line of JSON.
+    pub stats_json: String,
+    /// Spans as Chrome trace events (a JSON array), where the client asked for them.
+    pub trace_json: Option<String>,
+}
+
+pub(crate) struct Job {
+    pub(crate) view: JobView,
+    pub(crate) request: Arc<PathRequest>,
+    pub(crate) frames: BTreeMap<u64, Arc<FinishedFrame>>,
+    /// Frames done at least once.
+    pub(crate) ever_done: BTreeSet<u64>,
+    /// Frames that a watcher has taken.
+    pub(crate) taken: BTreeSet<u64>,
+    /// Frames asked for that are done but gone.
+    pub(crate) wanted_again: BTreeSet<u64>,
+    /// Whether how to render it is forgotten: a frame that is gone stays gone.
+    pub(crate) retired: bool,
+}
+
+#[derive(Default)]
+pub(crate) struct Table {
+    pub(crate) jobs: BTreeMap<JobId, Job>,
+    pub(crate) by_key: BTreeMap<String, JobId>,
+    pub(crate) next: u64,
+}
+
+/// The table, and a bell that rings when it changes.
+pub(crate) struct Jobs {
+    table: Mutex<Table>,
+    bell: watch::Sender<u64>,
+}
+
+impl Jobs {
+    pub(crate) fn new() -> Self {
+        Jobs { table: Mutex::new(Table::default()), bell: watch::channel(0).0 }
+    }
+
+    /// The table. Held for moments only, never across an await.
+    pub(crate) fn lock(&self) -> MutexGuard<'_, Table> {
+        self.table.lock().unwrap_or_else(|broken| broken.into_inner())
+    }
+
+    /// Wakes the watchers.
+    pub(crate) fn ring(&self) {
+        self.bell.send_modify(|n| *n += 1);
+    }
+
+    pub(crate) fn listen(&self) -> watch::Receiver<u64> {
+        self.bell.subscribe()
+    }
+}
+
+impl Table {
+    /// Bytes of finished frames that wait for somebody to take them, and of all.
+    pub(crate) fn bytes(&self) -> (usize, usize) {
+        let (mut waiting, mut all) = (0, 0);
+        for job in self.jobs.values() {
+            for (n, f) in &job.frames {
+                all += f.bytes.len();
+                if !job.taken.contains(n) && !job.view.state.is_over() {
+                    waiting += f.bytes.len();
+                }
+            }
+        }
+        (waiting, all)
+    }
+
+    /// Drops frames until `budget` holds, oldest jobs and lowest numbers first: those that were
+    /// taken, then those of jobs that are over. A frame of a job in progress that nobody has
+    /// taken stays.
+    pub(crate) fn evict(&mut self, budget: usize) {
+        let (_, mut all) = self.bytes();
+        for over_too in [false, true] {
+            for job in self.jobs.values_mut() {
+                let may_go = |n: &u64| {
+                    job.taken.contains(n) || (over_too && job.view.state.is_over())
+                };
+                let gone: Vec<u64> = job.frames.keys().copied().filter(may_go).collect();
+                for n in gone {
+                    if all <= budget {
+                        return;
+                    }
+                    if let Some(f) = job.frames.remove(&n) {
+                        all -= f.bytes.len();
+                    }
+                }
+            }
+        }
+    }
+
+    /// Forgets the oldest ended jobs beyond [`MAX_JOBS`].
+    pub(crate) fn forget(&mut self) {
+        while self.jobs.len() > MAX_JOBS {
+            let Some(id) =
+                self.jobs.iter().find(|(_, j)| j.view.state.is_over()).map(|(id, _)| *id)
+            else {
+                return;
+            };
+            if let Some(job) = self.jobs.remove(&id) {
+                self.by_key.remove(&job.view.client_key);
+            }
+        }
+    }
+}
+
+/// What a watcher gets next.
+#[derive(Clone, Debug)]
+pub enum WatchItem {
+    /// Something about the job changed (also before the first frame).
+    Notice(JobView),
+    /// The next frame, in order.
+    Frame(Arc<FinishedFrame>),
+}
+
+/// A cursor over a job's frames.
+pub struct Watch {
+    pub(crate) jobs: Arc<Jobs>,
+    pub(crate) job: JobId,
+    pub(crate) next: u64,
+    pub(crate) bell: watch::Receiver<u64>,
+    pub(crate) last_notice: Option<(JobState, u64, (u32, u32), (u32, u32), u32)>,
+    pub(crate) taken: tokio::sync::mpsc::Sender<crate::driver::Event>,
+    pub(crate) over: bool,
+}
+
+impl Watch {
+    /// The next notice or frame; `None` after the last frame, or after the notice that says
+    /// that there will be none.
+    pub async fn next(&mut self) -> Option<WatchItem> {
+        loop {
+            if self.over {
+                return None;
+            }
+            let poke = {
+                // Seen before the table is read, so that no ring is missed.
+                self.bell.borrow_and_update();
+                let mut table = self.jobs.lock();
+                let Some(job) = table.jobs.get_mut(&self.job) else {
+                    self.over = true;
+                    return None;
+                };
+                if let Some(frame) = job.frames.get(&self.next).cloned() {
+                    job.taken.insert(self.next);
+                    job.wanted_again.remove(&self.next);
+                    self.next += 1;
+                    drop(table);
+                    // The driver may render ahead again. If it is busy it will see for itself.
+                    let _ = self.taken.try_send(crate::driver::Event::FrameTaken);
+                    return Some(WatchItem::Frame(frame));
+                }
+                let v = &job.view;
+                let now = (v.state.clone(), v.frames_done, v.tiles, v.slab, v.workers);
+                if self.next >= v.frames_total
+                    || matches!(v.state, JobState::Failed(_) | JobState::Cancelled)
+                    || job.retired
+                {
+                    self.over = true;
+                    return Some(WatchItem::Notice(v.clone()));
+                }
+                if self.last_notice.as_ref() != Some(&now) {
+                    self.last_notice = Some(now);
+                    return Some(WatchItem::Notice(v.clone()));
+                }
+                // Done once and gone since: ask for it again.
+                job.ever_done.contains(&self.next) && job.wanted_again.insert(self.next)
+            };
+            if poke && self.taken.send(crate::driver::Event::FrameTaken).await.is_err() {
+                self.over = true;
+                return None;
+            }
+            if self.bell.changed().await.is_err() {
+                self.over = true;
+                return None;
+            }
+        }
+    }
+}

@@ -1,0 +1,339 @@
+//! Where a worker's messages, bricks and results meet.
+//!
+//! One task on the runtime; it decides and never computes. A lease waits here until its last
+//! brick is there and then goes to the render threads; so the first tiles render while bricks
+//! of the others are still on their way.
+
+use crate::cache::BrickCache;
+use crate::pool::{FrameSlot, Pool, Ready, Rendered, SceneSlot};
+use slabcast_common::brick::BrickSetKey;
+use slabcast_common::ids::{BrickId, FrameId, SceneId, TaskId};
+use slabcast_common::message::{
+    BrickBatch, Hello, Lease, TaskTimes, TileResult, ToMaster, ToWorker,
+};
+use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION};
+use slabcast_render::splat::Simd;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+use tokio::sync::{mpsc, watch};
+use tracing::{debug, info, warn};
+
+/// How long a worker that is told to stop waits for the tasks it has begun.
+const DRAIN: Duration = Duration::from_secs(8);
+
+/// What a worker is started with.
+#[derive(Clone, Debug)]
+pub struct Config {
+    /// A name for people.
+    pub name: String,
+    /// Render threads, at least 1.
+    pub threads: u32,
+    /// Bytes of bricks that it may hold.
+    pub memory_budget_bytes: u64,
+    /// Instruction set.
+    pub simd: Simd,
+}
+
+/// A link to a master, over a network or not.
+pub struct Link {
+    /// From the master.
+    pub control: mpsc::UnboundedReceiver<ToWorker>,
+    /// To the master.
+    pub replies: mpsc::Sender<ToMaster>,
+    /// Bricks.
+    pub bricks: mpsc::Receiver<BrickBatch>,
+}
+
+/// Why a link ended.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Ended {
+    /// The connection was lost; dial again.
+    Lost(String),
+    /// The master does not take this worker; dialling again would not help.
+    Refused(String),
+    /// The master ended; dial again later.
+    MasterLeft(String),
+    /// This worker was told to stop.
+    Stopped,
+}
+
+/// The hello of a worker with `cache`. Draws the self-test tile (some milliseconds).
+pub fn hello(config: &Config, cache: &BrickCache) -> Hello {
+    Hello {
+        protocol_version: PROTOCOL_VERSION,
+        pixels_version: PIXELS_VERSION,
+        name: config.name.clone(),
+        threads: config.threads,
+        memory_budget_bytes: config.memory_budget_bytes,
+        simd: config.simd.name().into(),
+        self_test_sha256: slabcast_render::selftest::run(config.simd).to_string(),
+        held: cache.held(),
+    }
+}
+
+/// Serves one master over `link`, from the hello to its end. `stop` turning true drains the
+/// worker: it takes no more leases, finishes what it has begun and leaves.
+pub async fn run(
+    config: &Config,
+    mut link: Link,
+    cache: &mut BrickCache,
+    mut stop: watch::Receiver<bool>,
+) -> std::io::Result<Ended> {
+    let (pool, mut results) = Pool::start(config.threads, config.simd)?;
+    let hello = {
+        // The self-test draws: not on the runtime's thread.
+        let (config, held) = (config.clone(), cache.held());
+        let drawn = tokio::task::spawn_blocking(move || hello(&config, &BrickCache::default()));
+        let mut hello = drawn.await.map_err(std::io::Error::other)?;
+        hello.held = held;
+        hello
+    };
+    if link.replies.send(ToMaster::Hello(hello)).await.is_err() {
+        return Ok(Ended::Lost("the master closed the link before the hello".into()));
+    }
+    let mut desk = Desk {
+        pool,
+        cache,
+        scenes: BTreeMap::new(),
+        frames: BTreeMap::new(),
+        waiting: BTreeMap::new(),
+        missing: BTreeMap::new(),
+        in_pool: 0,
+        epoch: Instant::now(),
+        leaving: false,
+        replies: Vec::new(),
+    };
+    let mut drain_until: Option<tokio::time::Instant> = None;
+    let mut bricks_open = true;
+    loop {
+        if desk.leaving && desk.in_pool == 0 {
+            return Ok(Ended::Stopped);
+        }
+        let drained = async {
+            match drain_until {
+                Some(at) => tokio::time::sleep_until(at).await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            message = link.control.recv() => match message {
+                None => return Ok(Ended::Lost("the master closed the link".into())),
+                Some(ToWorker::Refused { reason }) => return Ok(Ended::Refused(reason)),
+                Some(ToWorker::Leave { reason }) => return Ok(Ended::MasterLeft(reason)),
+                Some(message) => desk.told(message),
+            },
+            batch = link.bricks.recv(), if bricks_open => match batch {
+                Some(batch) => desk.bricks_in(batch),
+                None => bricks_open = false,
+            },
+            Some(done) = results.recv() => desk.rendered(done),
+            changed = stop.changed(), if !desk.leaving => {
+                if changed.is_err() || *stop.borrow() {
+                    info!("stopping: finishing what has begun");
+                    desk.leave();
+                    drain_until = Some(tokio::time::Instant::now() + DRAIN);
+                }
+            }
+            () = drained => {
+                warn!(tasks = desk.in_pool, "gave up waiting for tasks");
+                return Ok(Ended::Stopped);
+            }
+        }
+        for reply in desk.replies.drain(..) {
+            if link.replies.send(reply).await.is_err() {
+                return Ok(Ended::Lost("the master closed the link".into()));
+            }
+        }
+    }
+}
+
+/// A lease whose bricks are not all here.
+struct Waiting {
+    lease: Box<Lease>,
+    frame: Arc<FrameSlot>,
+    missing: usize,
+    received: Instant,
+}
+
+struct Desk<'a> {
+    pool: Pool,
+    cache: &'a mut BrickCache,
+    scenes: BTreeMap<SceneId, Arc<SceneSlot>>,
+    frames: BTreeMap<FrameId, Arc<FrameSlot>>,
+    waiting: BTreeMap<TaskId, Waiting>,
+    /// Who waits for a brick.
+    missing: BTreeMap<(BrickSetKey, BrickId), Vec<TaskId>>,
+    /// Tasks that render threads have or will take.
+    in_pool: usize,
+    /// Zero of this worker's clock.
+    epoch: Instant,
+    leaving: bool,
+    replies: Vec<ToMaster>,
+}
+
+impl Drop for Desk<'_> {
+    /// Tasks of a link that is gone need not be rendered.
+    fn drop(&mut self) {
+        for slot in self.frames.values() {
+            slot.over.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
+impl Desk<'_> {
+    fn told(&mut self, message: ToWorker) {
+        match message {
+            ToWorker::Welcome { worker, .. } => info!(%worker, "let in"),
+            ToWorker::Scene(spec) => {
+                self.scenes.insert(spec.id, Arc::new(SceneSlot::new(spec)));
+            }
+            ToWorker::Frame { frame, scene, view } => {
+                if let Some(scene) = self.scenes.get(&scene) {
+                    self.frames.insert(frame, Arc::new(FrameSlot::new(scene.clone(), view)));
+                }
+            }
+            ToWorker::Lease(lease) => self.lease(lease),
+            ToWorker::EndFrame { frame } => {
+                if let Some(slot) = self.frames.remove(&frame) {
+                    slot.over.store(true, Ordering::Relaxed);
+                }
+                self.waiting.retain(|_, w| w.lease.frame != frame);
+            }
+            ToWorker::EndScene { scene } => {
+                self.scenes.remove(&scene);
+            }
+            ToWorker::DropBricks { set, bricks } => {
+                debug!(bricks = bricks.len(), "bricks dropped");
+                self.cache.remove(set, &bricks);
+            }
+            ToWorker::Ping { nonce } => {
+                let clock_us = self.us(Instant::now());
+                self.replies.push(ToMaster::Pong { nonce, clock_us });
+            }
+            ToWorker::Refused { .. } | ToWorker::Leave { .. } => {}
+        }
+    }
+
+    fn lease(&mut self, lease: Box<Lease>) {
+        let received = Instant::now();
+        let fail = |reason: &str| ToMaster::Failed {
+            task: lease.task,
+            epoch: lease.epoch,
+            reason: reason.into(),
+        };
+        if self.leaving {
+            self.replies.push(fail("the worker is leaving"));
+            return;
+        }
+        let Some(frame) = self.frames.get(&lease.frame).cloned() else {
+            self.replies.push(fail("its frame was never announced"));
+            return;
+        };
+        if lease.state.a.len() != lease.tile.area()
+            || lease.state.last.as_ref().is_some_and(|l| l.len() != lease.tile.area())
+        {
+            self.replies.push(fail("its planes do not have the tile's size"));
+            return;
+        }
+        let set = frame.scene.spec.bricks;
+        let mut missing = 0;
+        for id in &lease.bricks {
+            if self.cache.get(set, *id).is_none() {
+                self.missing.entry((set, *id)).or_default().push(lease.task);
+                missing += 1;
+            }
+        }
+        let waiting = Waiting { lease, frame, missing, received };
+        if missing == 0 {
+            self.start(waiting);
+        } else {
+            self.waiting.insert(waiting.lease.task, waiting);
+        }
+    }
+
+    fn start(&mut self, w: Waiting) {
+        let set = w.frame.scene.spec.bricks;
+        let bricks = w.lease.bricks.iter().filter_map(|id| self.cache.get(set, *id).cloned());
+        let bricks: Vec<_> = bricks.collect();
+        if bricks.len() != w.lease.bricks.len() {
+            self.replies.push(ToMaster::Failed {
+                task: w.lease.task,
+                epoch: w.lease.epoch,
+                reason: "bricks were dropped while it waited".into(),
+            });
+            return;
+        }
+        self.in_pool += 1;
+        self.pool.submit(Ready {
+            lease: w.lease,
+            frame: w.frame,
+            bricks,
+            received: w.received,
+            ready: Instant::now(),
+        });
+    }
+
+    fn bricks_in(&mut self, batch: BrickBatch) {
+        let set = batch.set;
+        let mut whole = 0;
+        for brick in batch.bricks {
+            let id = brick.id;
+            self.cache.put(set, brick);
+            whole += 1;
+            for task in self.missing.remove(&(set, id)).unwrap_or_default() {
+                let Some(w) = self.waiting.get_mut(&task) else { continue };
+                w.missing -= 1;
+                if w.missing == 0
+                    && let Some(w) = self.waiting.remove(&task)
+                {
+                    self.start(w);
+                }
+            }
+        }
+        if whole > 0 {
+            self.replies.push(ToMaster::BricksIn { set, bricks: whole });
+        }
+        if !batch.broken.is_empty() {
+            warn!(bricks = batch.broken.len(), "bricks failed their checksum");
+            self.replies.push(ToMaster::BricksBroken { set, bricks: batch.broken });
+        }
+    }
+
+    fn rendered(&mut self, done: Rendered) {
+        self.in_pool -= 1;
+        let Some(outcome) = done.outcome else { return };
+        let (task, epoch) = (done.lease.task, done.lease.epoch);
+        self.replies.push(match outcome {
+            Ok((pixels, counters)) => ToMaster::Result(Box::new(TileResult {
+                task,
+                epoch,
+                pixels,
+                counters,
+                times: TaskTimes {
+                    received_us: self.us(done.received),
+                    ready_us: self.us(done.ready),
+                    start_us: self.us(done.start),
+                    end_us: self.us(done.end),
+                    thread: done.thread,
+                },
+            })),
+            Err(reason) => {
+                warn!(%task, reason, "task failed");
+                ToMaster::Failed { task, epoch, reason }
+            }
+        });
+    }
+
+    /// Takes no more work. Tasks whose bricks are here are finished.
+    fn leave(&mut self) {
+        self.leaving = true;
+        self.waiting.clear();
+        self.replies.push(ToMaster::Leaving { reason: "told to stop".into() });
+    }
+
+    fn us(&self, at: Instant) -> u64 {
+        at.saturating_duration_since(self.epoch).as_micros() as u64
+    }
+}

@@ -1,0 +1,329 @@
+//! NIfTI-1 and NIfTI-2 in one file (`.nii`, `.nii.gz`), in both byte orders.
+//!
+//! The header is a struct of C, so reading it is a table of offsets; [`Header::of`] has the two
+//! tables side by side. World axes are RAS+ by definition. Which affine counts: the sform if
+//! its code is above zero, else the qform, else the spacings alone (methods 3, 2 and 1 of
+//! nifti1.h); that is also nibabel's order.
+
+use crate::error::{OpenErrorKind, Problem};
+use crate::samples::{self, Endian, Layout, Number, SKIP_MAX_BYTES, Supply};
+use crate::source::{self, Source};
+use flate2::bufread::MultiGzDecoder;
+use glam::{DMat3, DVec3};
+use slabcast_common::volume::{Lattice, ValueMap, Volume};
+use std::io::Read;
+
+/// Bytes of a NIfTI-2 header.
+const HEADER_2: usize = 540;
+
+/// Whether these first bytes (inflated, if they were gzip) are a header: of one file, of a pair
+/// or of ANALYZE, so that the latter can be refused by their names.
+pub(crate) fn sniff(head: &[u8]) -> bool {
+    let Some(size) = head.first_chunk::<4>() else { return false };
+    matches!(u32::from_le_bytes(*size), 348 | 540) || matches!(u32::from_be_bytes(*size), 348 | 540)
+}
+
+/// Reads a volume from a source at its beginning.
+pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Problem> {
+    let len = source.len;
+    let mut reader: Box<dyn Read> =
+        if gzip { Box::new(MultiGzDecoder::new(source.reader)) } else { Box::new(source.reader) };
+    let reader = &mut *reader;
+    let mut bytes = [0u8; HEADER_2];
+    fill(reader, &mut bytes[..4])?;
+    let size = *bytes.first_chunk::<4>().expect("four bytes");
+    let (size, endian) = match (u32::from_le_bytes(size), u32::from_be_bytes(size)) {
+        (size @ (348 | 540), _) => (size as usize, Endian::Little),
+        (_, size @ (348 | 540)) => (size as usize, Endian::Big),
+        (size, _) => {
+            return Err(Problem::malformed(
+                "sizeof_hdr",
+                format!("is {size}, not 348 (NIfTI-1) or 540 (NIfTI-2)"),
+                "convert it to NIfTI-1",
+            ));
+        }
+    };
+    fill(reader, &mut bytes[4..size])?;
+    let header = Header::of(&bytes[..size], endian)?;
+    let layout = header.layout(endian)?;
+    let (lattice, anatomical) = header.place(layout.dims)?;
+    let skip = header.skip(size as u64)?;
+    if !source::skip_bytes(reader, skip).map_err(|e| broken(&e))? {
+        return Err(Problem::malformed(
+            "vox_offset",
+            format!("{} lies past the end of the data", header.vox_offset),
+            "get the whole file",
+        ));
+    }
+    let supply = match gzip {
+        true => Supply::Gzip { compressed: len },
+        false => Supply::Plain { have: len.saturating_sub(size as u64 + skip) },
+    };
+    let (samples, stored) = samples::read(reader, supply, &layout)?;
+    let map = header.value_map(stored)?;
+    Ok(Volume::new(name, layout.number.name(), anatomical, lattice, samples, map))
+}
+
+fn fill(reader: &mut dyn Read, bytes: &mut [u8]) -> Result<(), Problem> {
+    reader.read_exact(bytes).map_err(|e| broken(&e))
+}
+
+fn broken(e: &std::io::Error) -> Problem {
+    match e.kind() {
+        std::io::ErrorKind::UnexpectedEof => Problem::new(
+            OpenErrorKind::Damaged,
+            "header",
+            "truncated: the file ends before the samples",
+            "get the whole file",
+        ),
+        std::io::ErrorKind::InvalidInput | std::io::ErrorKind::InvalidData => Problem::new(
+            OpenErrorKind::Damaged,
+            "header",
+            format!("the gzip stream is damaged ({e})"),
+            "get the file again",
+        ),
+        _ => Problem::io("header", e),
+    }
+}
+
+/// Numbers at offsets, in the file's byte order.
+struct Bytes<'a> {
+    bytes: &'a [u8],
+    endian: Endian,
+}
+
+macro_rules! getters {
+    ($($name:ident: $t:ty),*) => {$(
+        fn $name(&self, at: usize) -> $t {
+            let word = *self.bytes[at..].first_chunk().expect("offsets lie inside the header");
+            match self.endian {
+                Endian::Little => <$t>::from_le_bytes(word),
+                Endian::Big => <$t>::from_be_bytes(word),
+            }
+        }
+    )*};
+}
+
+impl Bytes<'_> {
+    getters!(i16: i16, i32: i32, i64: i64, f32: f32, f64: f64);
+}
+
+/// The fields that we use, as both versions have them.
+struct Header {
+    /// `dim[0]` to `dim[7]`.
+    dim: [i64; 8],
+    datatype: i16,
+    pixdim: [f64; 8],
+    vox_offset: f64,
+    slope: f64,
+    inter: f64,
+    units: u8,
+    qform_code: i32,
+    sform_code: i32,
+    quatern: [f64; 3],
+    qoffset: [f64; 3],
+    srow: [[f64; 4]; 3],
+}
+
+impl Header {
+    fn of(bytes: &[u8], endian: Endian) -> Result<Header, Problem> {
+        let two = bytes.len() == HEADER_2;
+        let magic = if two { &bytes[4..8] } else { &bytes[344..348] };
+        match magic {
+            b"n+1\0" | b"n+2\0" => {}
+            b"ni1\0" | b"ni2\0" => {
+                return Err(Problem::unsupported(
+                    "magic",
+                    "is the header of a pair (.hdr with .img)",
+                    "convert it to one .nii or .nii.gz file",
+                ));
+            }
+            _ => {
+                return Err(Problem::unsupported(
+                    "magic",
+                    format!(
+                        "is {}, so this is ANALYZE or damaged",
+                        crate::error::quoted(&String::from_utf8_lossy(magic),)
+                    ),
+                    "convert it to NIfTI-1",
+                ));
+            }
+        }
+        let b = Bytes { bytes, endian };
+        use std::array::from_fn;
+        Ok(if two {
+            Header {
+                dim: from_fn(|i| b.i64(16 + 8 * i)),
+                datatype: b.i16(12),
+                pixdim: from_fn(|i| b.f64(104 + 8 * i)),
+                vox_offset: b.i64(168) as f64,
+                slope: b.f64(176),
+                inter: b.f64(184),
+                units: b.i32(500) as u8,
+                qform_code: b.i32(344),
+                sform_code: b.i32(348),
+                quatern: from_fn(|i| b.f64(352 + 8 * i)),
+                qoffset: from_fn(|i| b.f64(376 + 8 * i)),
+                srow: from_fn(|r| from_fn(|c| b.f64(400 + 32 * r + 8 * c))),
+            }
+        } else {
+            let f = |at| f64::from(b.f32(at));
+            Header {
+                dim: from_fn(|i| b.i16(40 + 2 * i).into()),
+                datatype: b.i16(70),
+                pixdim: from_fn(|i| f(76 + 4 * i)),
+                vox_offset: f(108),
+                slope: f(112),
+                inter: f(116),
+                units: bytes[123],
+                qform_code: b.i16(252).into(),
+                sform_code: b.i16(254).into(),
+                quatern: from_fn(|i| f(256 + 4 * i)),
+                qoffset: from_fn(|i| f(268 + 4 * i)),
+                srow: from_fn(|r| from_fn(|c| f(280 + 16 * r + 4 * c))),
+            }
+        })
+    }
+
+    fn layout(&self, endian: Endian) -> Result<Layout, Problem> {
+        let number = match self.datatype {
+            2 => Number::U8,
+            4 => Number::I16,
+            8 => Number::I32,
+            16 => Number::F32,
+            64 => Number::F64,
+            256 => Number::I8,
+            512 => Number::U16,
+            768 => Number::U32,
+            1024 => Number::I64,
+            1280 => Number::U64,
+            code => {
+                let name = match code {
+                    1 => "one bit a voxel",
+                    32 | 1792 | 2048 => "complex numbers",
+                    128 => "RGB colours",
+                    2304 => "RGBA colours",
+                    1536 => "128-bit floats",
+                    _ => "no type of the NIfTI format",
+                };
+                return Err(Problem::unsupported(
+                    "datatype",
+                    format!("{code} is {name}"),
+                    "convert it to one number a voxel, such as int16 or float32",
+                ));
+            }
+        };
+        let axes = match self.dim[0] {
+            n @ 3..=7 => n as usize,
+            n => {
+                return Err(Problem::malformed(
+                    "dim[0]",
+                    format!("is {n}; a volume has 3 axes"),
+                    "convert it to a volume with three axes",
+                ));
+            }
+        };
+        if let Some(a) = (4..=axes).find(|&a| self.dim[a] > 1) {
+            return Err(Problem::unsupported(
+                format!("dim[{a}]"),
+                format!("is {}: there is more than one volume", self.dim[a]),
+                "extract one of them into a file of its own",
+            ));
+        }
+        let dims = std::array::from_fn(|a| self.dim[a + 1].try_into().unwrap_or(0));
+        Layout::new(dims, number, endian, "dim")
+    }
+
+    /// Bytes between the header and the first sample.
+    fn skip(&self, header_bytes: u64) -> Result<u64, Problem> {
+        let offset = self.vox_offset;
+        // Some programs leave it zero; the samples then follow the four bytes of the extender.
+        if offset == 0.0 {
+            return Ok(4);
+        }
+        let first = header_bytes as f64;
+        if !(first..=first + SKIP_MAX_BYTES as f64).contains(&offset) || offset.fract() != 0.0 {
+            return Err(Problem::malformed(
+                "vox_offset",
+                format!("{offset} is no place between {first} and 64 MiB behind it"),
+                "correct it (352 where there are no extensions)",
+            ));
+        }
+        Ok(offset as u64 - header_bytes)
+    }
+
+    /// The lattice, and whether the file says where it lies in the body.
+    fn place(&self, dims: [u32; 3]) -> Result<(Lattice, bool), Problem> {
+        let mm = match self.units & 7 {
+            1 => 1000.0,
+            3 => 1e-3,
+            _ => 1.0,
+        };
+        // A spacing is a length; some programs write it with the sign of the axis.
+        let spacing: [f64; 3] = std::array::from_fn(|a| self.pixdim[a + 1].abs());
+        let (steps, origin, field) = if self.sform_code > 0 {
+            let column = |c: usize| DVec3::from_array(self.srow.map(|row| row[c]));
+            ([column(0), column(1), column(2)], column(3), "srow")
+        } else if self.qform_code > 0 {
+            let r = self.rotation()?;
+            let sign = if self.pixdim[0] < 0.0 { -1.0 } else { 1.0 };
+            let steps =
+                [r.x_axis * spacing[0], r.y_axis * spacing[1], r.z_axis * spacing[2] * sign];
+            (steps, DVec3::from_array(self.qoffset), "pixdim")
+        } else {
+            (Lattice::from_spacing(dims, spacing).steps, DVec3::ZERO, "pixdim")
+        };
+        // `+ 0.0` makes of -0.0 a 0.0, so that a volume's digest does not depend on it.
+        let steps = steps.map(|s| s * mm + DVec3::ZERO);
+        let lattice = Lattice { dims, steps, origin: origin * mm + DVec3::ZERO };
+        lattice.check().map_err(|e| Problem::malformed(field, e, "correct the header's affine"))?;
+        Ok((lattice, self.sform_code > 0 || self.qform_code > 0))
+    }
+
+    /// The qform's rotation; the unit quaternion is (a, b, c, d) with a left out of the file.
+    fn rotation(&self) -> Result<DMat3, Problem> {
+        let [b, c, d] = self.quatern;
+        let rest = b * b + c * c + d * d;
+        if !rest.is_finite() {
+            return Err(Problem::malformed(
+                "quatern",
+                "is not finite",
+                "correct the header's qform",
+            ));
+        }
+        // Rounding to f32 may leave (b, c, d) a little longer than 1; then a is 0, as in
+        // nifti1_io.c.
+        let (a, b, c, d) = if rest > 1.0 - 1e-7 {
+            let s = 1.0 / rest.sqrt();
+            (0.0, b * s, c * s, d * s)
+        } else {
+            ((1.0 - rest).sqrt(), b, c, d)
+        };
+        Ok(DMat3::from_cols(
+            DVec3::new(a * a + b * b - c * c - d * d, 2.0 * (b * c + a * d), 2.0 * (b * d - a * c)),
+            DVec3::new(2.0 * (b * c - a * d), a * a + c * c - b * b - d * d, 2.0 * (c * d + a * b)),
+            DVec3::new(2.0 * (b * d + a * c), 2.0 * (c * d - a * b), a * a + d * d - c * c - b * b),
+        ))
+    }
+
+    /// The header's slope and intercept after the map of the stored codes.
+    fn value_map(&self, stored: ValueMap) -> Result<ValueMap, Problem> {
+        // "If the scl_slope field is nonzero" (nifti1.h); NaN is how SPM says none.
+        if self.slope == 0.0 || !self.slope.is_finite() {
+            return Ok(stored);
+        }
+        let inter = if self.inter.is_finite() { self.inter } else { 0.0 };
+        let map = ValueMap {
+            scale: self.slope * stored.scale,
+            offset: self.slope * stored.offset + inter,
+        };
+        if map.scale == 0.0 || !map.scale.is_finite() || !map.offset.is_finite() {
+            return Err(Problem::malformed(
+                "scl_slope",
+                format!("{} takes the values out of the range of numbers", self.slope),
+                "correct scl_slope and scl_inter",
+            ));
+        }
+        Ok(map)
+    }
+}

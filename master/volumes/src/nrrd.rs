@@ -1,0 +1,591 @@
+//! NRRD, attached (`.nrrd`) and detached (`.nhdr` over one data file).
+//!
+//! The format is told at teem.sourceforge.net/nrrd/format.html. A header is lines of
+//! `field: value`, `key:=value` and `# comment` up to an empty line. We collect the fields
+//! first and interpret them afterwards, in no particular order, which reads every file that
+//! the specification allows and some that it doesn't (fields before `dimension`).
+//!
+//! Encodings are raw and gzip. ASCII, hex, bzip2 and lists of data files are refused by name.
+
+use crate::error::{Problem, quoted};
+use crate::samples::{self, Endian, Layout, Number, SKIP_MAX_BYTES, Supply};
+use crate::source::{self, Source};
+use flate2::bufread::MultiGzDecoder;
+use glam::DVec3;
+use slabcast_common::volume::{Lattice, Volume};
+use std::collections::BTreeMap;
+use std::io::{BufRead, Read, Seek, SeekFrom};
+use std::path::Path;
+
+/// What an NRRD file starts with, before its version.
+pub(crate) const MAGIC: &[u8] = b"NRRD";
+
+/// Longest header. Slicer writes some 100 KiB of key:=value pairs for diffusion volumes with
+/// many directions; beyond a mebibyte it is no header.
+const HEADER_MAX_BYTES: u64 = 1 << 20;
+
+/// Most axes that teem knows (`NRRD_DIM_MAX`).
+const AXES_MAX: usize = 16;
+
+const RESAVE: &str = "save it again with `encoding: gzip` or `encoding: raw`";
+
+/// Reads a volume from a source at its beginning. `folder` is where a detached header lies.
+pub(crate) fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volume, Problem> {
+    let (fields, header_bytes) = Fields::read(&mut source)?;
+    let header = Header::of(&fields)?;
+    let samples = match &header.data_file {
+        None => {
+            let len = source.len.saturating_sub(header_bytes);
+            read_data(&mut source, len, &header)
+        }
+        Some(file) => {
+            let path = source::beside(folder, file, "data file")?;
+            let mut data = Source::open(&path, "data file")?;
+            let len = data.len;
+            read_data(&mut data, len, &header).map_err(|mut p| {
+                p.field = format!("data file {}", quoted(file));
+                p
+            })
+        }
+    };
+    let (samples, map) = samples?;
+    let file_type = header.layout.number.name();
+    Ok(Volume::new(name, file_type, header.anatomical, header.lattice, samples, map))
+}
+
+/// Reads the samples from a source that stands at the first of its `len` bytes of data.
+fn read_data(
+    source: &mut Source,
+    len: u64,
+    header: &Header,
+) -> Result<(slabcast_common::volume::Samples, slabcast_common::volume::ValueMap), Problem> {
+    let ends_early = |field: &str| {
+        Problem::malformed(field, "skips past the end of the data", "correct the skip")
+    };
+    let io = |e: std::io::Error| Problem::io("data", &e);
+    let reader = &mut source.reader;
+    let skipped = source::skip_lines(reader, header.line_skip)
+        .map_err(io)?
+        .ok_or_else(|| ends_early("line skip"))?;
+    let left = len.saturating_sub(skipped);
+    let need = header.layout.bytes();
+    if header.gzip {
+        let Skip::Bytes(skip) = header.byte_skip else {
+            return Err(Problem::malformed(
+                "byte skip",
+                "-1 counts from the end, which gzip does not know",
+                "give the number of bytes, or save it with `encoding: raw`",
+            ));
+        };
+        if skip > SKIP_MAX_BYTES {
+            return Err(Problem::unsupported(
+                "byte skip",
+                format!("{skip} is more than the {SKIP_MAX_BYTES} that are skipped inside gzip"),
+                "save it again without a skip",
+            ));
+        }
+        let mut reader = MultiGzDecoder::new(reader);
+        if !source::skip_bytes(&mut reader, skip).map_err(io)? {
+            return Err(ends_early("byte skip"));
+        }
+        return samples::read(&mut reader, Supply::Gzip { compressed: left }, &header.layout);
+    }
+    let skip = match header.byte_skip {
+        Skip::Bytes(skip) if skip > left => return Err(ends_early("byte skip")),
+        Skip::Bytes(skip) => skip,
+        Skip::FromEnd => left.saturating_sub(need),
+    };
+    if skip > 0 {
+        reader.seek(SeekFrom::Current(skip as i64)).map_err(io)?;
+    }
+    samples::read(reader, Supply::Plain { have: left - skip }, &header.layout)
+}
+
+/// `byte skip`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Skip {
+    Bytes(u64),
+    /// -1: the samples are the last bytes of the file.
+    FromEnd,
+}
+
+/// The fields as written: name to line number and value.
+struct Fields(BTreeMap<String, (usize, String)>);
+
+impl Fields {
+    /// Reads the lines of a header; also says how many bytes they take.
+    fn read(source: &mut Source) -> Result<(Fields, u64), Problem> {
+        let mut fields = BTreeMap::new();
+        let mut consumed = 0u64;
+        let mut line = Vec::new();
+        for number in 1.. {
+            line.clear();
+            let left = HEADER_MAX_BYTES - consumed;
+            let n = source
+                .reader
+                .by_ref()
+                .take(left)
+                .read_until(b'\n', &mut line)
+                .map_err(|e| Problem::io("header", &e))?;
+            consumed += n as u64;
+            let ended = line.last() == Some(&b'\n');
+            if !ended && consumed == HEADER_MAX_BYTES {
+                return Err(Problem::malformed(
+                    "header",
+                    format!("does not end within {HEADER_MAX_BYTES} bytes"),
+                    "end it with an empty line",
+                ));
+            }
+            let text = String::from_utf8_lossy(&line);
+            let text = text.trim_end_matches(['\n', '\r']);
+            if number == 1 {
+                check_magic(text)?;
+                continue;
+            }
+            // An empty line ends the header; so does the end of a detached one.
+            if text.is_empty() {
+                break;
+            }
+            if text.starts_with('#') {
+                continue;
+            }
+            let Some((name, value)) = text.split_once(':') else {
+                return Err(Problem::malformed(
+                    format!("line {number}"),
+                    format!("{} is neither `field: value` nor `key:=value`", quoted(text)),
+                    "correct or remove the line, or put the missing empty line before the data",
+                ));
+            };
+            if value.starts_with('=') {
+                continue;
+            }
+            let name = canonical(&name.trim().to_ascii_lowercase());
+            if let Some((before, _)) = fields.get(&name) {
+                return Err(Problem::malformed(
+                    format!("line {number}"),
+                    format!("{} was given in line {before} already", quoted(&name)),
+                    "remove one of them",
+                ));
+            }
+            fields.insert(name, (number, value.trim().to_string()));
+        }
+        Ok((Fields(fields), consumed))
+    }
+
+    fn get(&self, name: &str) -> Option<&str> {
+        self.0.get(name).map(|(_, v)| v.as_str())
+    }
+
+    fn required(&self, name: &str, example: &str) -> Result<&str, Problem> {
+        self.get(name).ok_or_else(|| {
+            Problem::malformed(
+                name,
+                "is missing",
+                format!("add a line such as `{name}: {example}`"),
+            )
+        })
+    }
+
+    /// The field's name with its line, for errors.
+    fn place(&self, name: &str) -> String {
+        match self.0.get(name) {
+            Some((line, _)) => format!("{name} (line {line})"),
+            None => name.to_string(),
+        }
+    }
+
+    fn malformed(&self, name: &str, why: &str, remedy: &str) -> Problem {
+        let value = self.get(name).unwrap_or_default();
+        Problem::malformed(self.place(name), format!("{} {why}", quoted(value)), remedy)
+    }
+
+    /// One word for each axis.
+    fn per_axis(&self, name: &str, axes: usize) -> Result<Option<Vec<&str>>, Problem> {
+        let Some(value) = self.get(name) else { return Ok(None) };
+        let words: Vec<&str> = value.split_ascii_whitespace().collect();
+        if words.len() != axes {
+            return Err(self.malformed(
+                name,
+                &format!("has {} entries for {axes} axes", words.len()),
+                "give one for each axis",
+            ));
+        }
+        Ok(Some(words))
+    }
+}
+
+fn check_magic(line: &str) -> Result<(), Problem> {
+    match line.strip_prefix("NRRD000").map(|v| v.trim_end().parse::<u32>()) {
+        Some(Ok(1..=5)) => Ok(()),
+        _ => Err(Problem::unsupported(
+            "line 1",
+            format!("{} is not NRRD0001 to NRRD0005", quoted(line)),
+            "save it again as NRRD0005 or earlier",
+        )),
+    }
+}
+
+/// Fields that the specification lets be written in two ways.
+fn canonical(name: &str) -> String {
+    match name {
+        "datafile" => "data file",
+        "lineskip" => "line skip",
+        "byteskip" => "byte skip",
+        name => name,
+    }
+    .to_string()
+}
+
+/// A header that was understood.
+struct Header {
+    layout: Layout,
+    lattice: Lattice,
+    anatomical: bool,
+    gzip: bool,
+    data_file: Option<String>,
+    line_skip: u64,
+    byte_skip: Skip,
+}
+
+impl Header {
+    fn of(fields: &Fields) -> Result<Header, Problem> {
+        let number = number_type(fields)?;
+        let gzip = encoding(fields)?;
+        let endian = endian(fields, number)?;
+        let axes = Axes::of(fields)?;
+        let layout = Layout::new(axes.sizes, number, endian, &fields.place("sizes"))?;
+        let (lattice, anatomical) = place(fields, &axes, layout.dims)?;
+        let skip = |name: &str| match fields.get(name) {
+            None => Ok(0),
+            Some(text) => text.parse::<i64>().map_err(|_| {
+                fields.malformed(name, "is not a whole number", "give the number to skip")
+            }),
+        };
+        let line_skip = u64::try_from(skip("line skip")?)
+            .map_err(|_| fields.malformed("line skip", "is negative", "give 0 or more"))?;
+        let byte_skip =
+            match skip("byte skip")? {
+                -1 => Skip::FromEnd,
+                n => Skip::Bytes(u64::try_from(n).map_err(|_| {
+                    fields.malformed("byte skip", "is below -1", "give -1, 0 or more")
+                })?),
+            };
+        let data_file = data_file(fields)?;
+        Ok(Header { layout, lattice, anatomical, gzip, data_file, line_skip, byte_skip })
+    }
+}
+
+fn number_type(fields: &Fields) -> Result<Number, Problem> {
+    Ok(match fields.required("type", "uint8")?.to_ascii_lowercase().as_str() {
+        "signed char" | "int8" | "int8_t" => Number::I8,
+        "uchar" | "unsigned char" | "uint8" | "uint8_t" => Number::U8,
+        "short" | "short int" | "signed short" | "signed short int" | "int16" | "int16_t" => {
+            Number::I16
+        }
+        "ushort" | "unsigned short" | "unsigned short int" | "uint16" | "uint16_t" => Number::U16,
+        "int" | "signed int" | "int32" | "int32_t" => Number::I32,
+        "uint" | "unsigned int" | "uint32" | "uint32_t" => Number::U32,
+        "longlong"
+        | "long long"
+        | "long long int"
+        | "signed long long"
+        | "signed long long int"
+        | "int64"
+        | "int64_t" => Number::I64,
+        "ulonglong" | "unsigned long long" | "unsigned long long int" | "uint64" | "uint64_t" => {
+            Number::U64
+        }
+        "float" => Number::F32,
+        "double" => Number::F64,
+        "block" => {
+            return Err(Problem::unsupported(
+                fields.place("type"),
+                "`block` samples are not numbers",
+                "save it as an integer or float type",
+            ));
+        }
+        _ => {
+            return Err(fields.malformed(
+                "type",
+                "is not a type of the NRRD format",
+                "give one such as uint8, int16, uint16, float or double",
+            ));
+        }
+    })
+}
+
+/// Whether the encoding is gzip (else raw).
+fn encoding(fields: &Fields) -> Result<bool, Problem> {
+    let later = |name: &str| {
+        Err(Problem::unsupported(
+            fields.place("encoding"),
+            format!("{name} is not read by this version"),
+            RESAVE,
+        ))
+    };
+    match fields.required("encoding", "gzip")?.to_ascii_lowercase().as_str() {
+        "raw" => Ok(false),
+        "gz" | "gzip" => Ok(true),
+        "txt" | "text" | "ascii" => later("ascii"),
+        "hex" => later("hex"),
+        "bz2" | "bzip2" => later("bzip2"),
+        "zrl" => later("zrl"),
+        _ => Err(fields.malformed("encoding", "is not an encoding of the NRRD format", RESAVE)),
+    }
+}
+
+fn endian(fields: &Fields, number: Number) -> Result<Endian, Problem> {
+    match fields.get("endian").map(str::to_ascii_lowercase).as_deref() {
+        Some("little") => Ok(Endian::Little),
+        Some("big") => Ok(Endian::Big),
+        None if number.bytes() == 1 => Ok(Endian::Little),
+        None => Err(Problem::malformed(
+            "endian",
+            format!("is missing, and {} has {} bytes", number.name(), number.bytes()),
+            "add the line `endian: little` (or `big`, as the data are)",
+        )),
+        Some(_) => Err(fields.malformed("endian", "is neither", "give `little` or `big`")),
+    }
+}
+
+fn data_file(fields: &Fields) -> Result<Option<String>, Problem> {
+    let Some(value) = fields.get("data file") else { return Ok(None) };
+    let words: Vec<&str> = value.split_ascii_whitespace().collect();
+    // `LIST` (file names follow, one a line) and `name%03d.raw 1 40 1`.
+    let list = words.first() == Some(&"LIST");
+    let pattern = words.len() > 3
+        && words[0].contains('%')
+        && words[1..4].iter().all(|w| w.parse::<i64>().is_ok());
+    if list || pattern {
+        return Err(Problem::unsupported(
+            fields.place("data file"),
+            format!("{} names several files", quoted(value)),
+            "save it as one file",
+        ));
+    }
+    if value.is_empty() {
+        return Err(fields.malformed("data file", "is empty", "name the data file"));
+    }
+    Ok(Some(value.to_string()))
+}
+
+/// The three axes that are kept, out of those that the file has.
+struct Axes {
+    /// Axes of the file.
+    count: usize,
+    /// Which three, ascending.
+    kept: [usize; 3],
+    sizes: [u64; 3],
+}
+
+impl Axes {
+    fn of(fields: &Fields) -> Result<Axes, Problem> {
+        let dimension = fields.required("dimension", "3")?;
+        let count = match dimension.parse::<usize>() {
+            Ok(n @ 1..=AXES_MAX) => n,
+            _ => {
+                return Err(fields.malformed("dimension", "is not 1 to 16", "a volume has 3"));
+            }
+        };
+        fields.required("sizes", "256 256 256")?;
+        let sizes = fields.per_axis("sizes", count)?.unwrap_or_default();
+        let sizes: Vec<u64> =
+            sizes.iter().map(|w| w.parse()).collect::<Result<_, _>>().map_err(|_| {
+                fields.malformed("sizes", "has something else than whole numbers", "correct it")
+            })?;
+        let mut kept: Vec<usize> = (0..count).collect();
+        // Axes of one sample are dropped: first those that are said to be no axis of space.
+        let directions = match fields.get("space directions") {
+            Some(_) => vectors(fields, "space directions", None)?,
+            None => Vec::new(),
+        };
+        let kinds: Vec<&str> =
+            fields.get("kinds").unwrap_or_default().split_ascii_whitespace().collect();
+        let outside_space = |a: usize| {
+            matches!(directions.get(a), Some(None))
+                || !matches!(
+                    kinds.get(a).map(|k| k.to_ascii_lowercase()).as_deref(),
+                    None | Some("domain" | "space" | "???" | "none")
+                )
+        };
+        while kept.len() > 3 {
+            let single = |a: &usize| sizes[*a] == 1;
+            let dropped = kept
+                .iter()
+                .rposition(|a| single(a) && outside_space(*a))
+                .or_else(|| kept.iter().rposition(single));
+            let Some(at) = dropped else {
+                let list = sizes.iter().map(u64::to_string).collect::<Vec<_>>().join(" x ");
+                return Err(Problem::unsupported(
+                    fields.place("dimension"),
+                    format!("{list} has {} axes of more than one sample", kept.len()),
+                    "save one volume of it with three axes",
+                ));
+            };
+            kept.remove(at);
+        }
+        let Ok(kept) = <[usize; 3]>::try_from(kept) else {
+            return Err(Problem::unsupported(
+                fields.place("dimension"),
+                format!("{count} axes make no volume"),
+                "save it with three axes",
+            ));
+        };
+        Ok(Axes { count, kept, sizes: kept.map(|a| sizes[a]) })
+    }
+}
+
+/// Where the samples lie, and whether that is said in anatomical axes.
+fn place(fields: &Fields, axes: &Axes, dims: [u32; 3]) -> Result<(Lattice, bool), Problem> {
+    let space = space(fields)?;
+    let mut lattice = if fields.get("space directions").is_some() {
+        directed(fields, axes, dims)?
+    } else {
+        let spacings = fields.per_axis("spacings", axes.count)?;
+        let mut spacing = [1.0; 3];
+        if let Some(words) = spacings {
+            for (a, &axis) in axes.kept.iter().enumerate() {
+                let x: f64 = words[axis].parse().map_err(|_| {
+                    fields.malformed("spacings", "has something else than numbers", "correct it")
+                })?;
+                // NaN is the format's word for "unknown".
+                spacing[a] = if x.is_nan() { 1.0 } else { x };
+            }
+        }
+        let mut lattice = Lattice::from_spacing(dims, spacing);
+        if let (Some(origin), Some(_)) = (origin(fields)?, space) {
+            lattice.origin = origin;
+        }
+        lattice
+    };
+    // Only directions say where an axis points; a space alone says nothing of index axes.
+    let directed = fields.get("space directions").is_some();
+    let space = space.filter(|_| directed);
+    let (signs, anatomical) = space.map_or((DVec3::ONE, false), |s| (s.signs, s.anatomical));
+    let scale = unit_mm(fields);
+    // `+ 0.0` makes of -0.0 a 0.0, so that a volume's digest does not depend on it.
+    lattice.steps = lattice.steps.map(|s| s * signs * scale + DVec3::ZERO);
+    lattice.origin = lattice.origin * signs * scale + DVec3::ZERO;
+    lattice.check().map_err(|e| {
+        let field = if directed { "space directions" } else { "spacings" };
+        Problem::malformed(fields.place(field), e, "correct the axes")
+    })?;
+    Ok((lattice, anatomical))
+}
+
+fn directed(fields: &Fields, axes: &Axes, dims: [u32; 3]) -> Result<Lattice, Problem> {
+    let all = vectors(fields, "space directions", Some(axes.count))?;
+    let mut steps = [DVec3::ZERO; 3];
+    for (a, &axis) in axes.kept.iter().enumerate() {
+        steps[a] = all[axis].ok_or_else(|| {
+            fields.malformed(
+                "space directions",
+                &format!("has no direction for axis {axis}, which is kept"),
+                "save a volume with three axes in space",
+            )
+        })?;
+    }
+    Ok(Lattice { dims, steps, origin: origin(fields)?.unwrap_or(DVec3::ZERO) })
+}
+
+fn origin(fields: &Fields) -> Result<Option<DVec3>, Problem> {
+    if fields.get("space origin").is_none() {
+        return Ok(None);
+    }
+    Ok(vectors(fields, "space origin", Some(1))?[0])
+}
+
+/// `(1,0,0) none (0,0,1)`.
+fn vectors(
+    fields: &Fields,
+    name: &str,
+    count: Option<usize>,
+) -> Result<Vec<Option<DVec3>>, Problem> {
+    let bad = || fields.malformed(name, "is not made of vectors (x,y,z)", "correct the vectors");
+    let mut rest = fields.get(name).unwrap_or_default().trim_start();
+    let mut found = Vec::new();
+    while !rest.is_empty() {
+        if let Some(after) = rest.strip_prefix("none") {
+            found.push(None);
+            rest = after.trim_start();
+            continue;
+        }
+        let (inside, after) =
+            rest.strip_prefix('(').and_then(|r| r.split_once(')')).ok_or_else(bad)?;
+        let numbers: Vec<f64> = inside
+            .split(',')
+            .map(|w| w.trim().parse::<f64>())
+            .collect::<Result<_, _>>()
+            .map_err(|_| bad())?;
+        let xyz: [f64; 3] = numbers.try_into().map_err(|_| bad())?;
+        found.push(Some(DVec3::from_array(xyz)));
+        rest = after.trim_start();
+    }
+    if count.is_some_and(|n| n != found.len()) {
+        return Err(fields.malformed(
+            name,
+            &format!("has {} vectors", found.len()),
+            "give one for each axis (`space origin`: one)",
+        ));
+    }
+    Ok(found)
+}
+
+/// A space by its signs on the way to RAS+.
+#[derive(Clone, Copy)]
+struct Space {
+    signs: DVec3,
+    anatomical: bool,
+}
+
+fn space(fields: &Fields) -> Result<Option<Space>, Problem> {
+    let anatomical = |x, y, z| Some(Space { signs: DVec3::new(x, y, z), anatomical: true });
+    let Some(name) = fields.get("space") else {
+        return match fields.get("space dimension") {
+            None => Ok(None),
+            Some("3") => Ok(Some(Space { signs: DVec3::ONE, anatomical: false })),
+            Some(_) => {
+                Err(fields.malformed("space dimension", "is not 3", "save it in a space of three"))
+            }
+        };
+    };
+    Ok(match name.to_ascii_lowercase().as_str() {
+        "right-anterior-superior" | "ras" => anatomical(1.0, 1.0, 1.0),
+        "left-anterior-superior" | "las" => anatomical(-1.0, 1.0, 1.0),
+        "left-posterior-superior" | "lps" => anatomical(-1.0, -1.0, 1.0),
+        "scanner-xyz" | "3d-right-handed" => Some(Space { signs: DVec3::ONE, anatomical: false }),
+        // The world is right-handed: as it stands, it would be drawn mirrored.
+        "3d-left-handed" => Some(Space { signs: DVec3::new(1.0, 1.0, -1.0), anatomical: false }),
+        other if other.ends_with("-time") || matches!(other, "rast" | "last" | "lpst") => {
+            return Err(Problem::unsupported(
+                fields.place("space"),
+                format!("{} has four dimensions", quoted(name)),
+                "save one time step in a space of three",
+            ));
+        }
+        _ => {
+            return Err(fields.malformed(
+                "space",
+                "is not a space of the NRRD format",
+                "give one such as left-posterior-superior",
+            ));
+        }
+    })
+}
+
+/// Millimetres of one unit, where the file names the same known unit for all its axes.
+fn unit_mm(fields: &Fields) -> f64 {
+    let units = fields.get("space units").or_else(|| fields.get("units")).unwrap_or_default();
+    let mut units = units.split_ascii_whitespace().map(|u| match u.trim_matches('"') {
+        "m" => Some(1000.0),
+        "cm" => Some(10.0),
+        "um" | "\u{b5}m" | "\u{3bc}m" | "microns" | "micron" => Some(1e-3),
+        "nm" => Some(1e-6),
+        "mm" => Some(1.0),
+        _ => None,
+    });
+    match units.next().flatten() {
+        Some(mm) if units.all(|u| u == Some(mm)) => mm,
+        _ => 1.0,
+    }
+}

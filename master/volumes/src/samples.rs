@@ -1,0 +1,470 @@
+//! From a file's numbers to [`Samples`]: every type and byte order, at a stranger's word.
+//!
+//! What is kept, and why:
+//!
+//! | file | codes | value of code c |
+//! |---|---|---|
+//! | uint8, uint16, float32 | as they are | c |
+//! | int8, int16 | shifted to unsigned | c - 128, c - 32768 |
+//! | other integers within 65536 of each other | u16 | c + min |
+//! | other integers | f32 in 0..1 | min + c (max - min) |
+//! | float64 that f32 holds well | f32 | c |
+//! | other float64 | f32 in 0..1 | min + c (max - min) |
+//!
+//! A 32-bit integer with a wide range loses its low bits (f32 has 24); so does every renderer
+//! that samples floats. What it must not lose is the span, hence the shift by the minimum.
+
+use crate::error::{OpenErrorKind, Problem};
+use slabcast_common::brick::{BrickGrid, MAX_BRICKS};
+use slabcast_common::volume::{Samples, ValueMap};
+use std::io::Read;
+
+/// Largest size along one axis: twice that of the largest scans we know of (8192 detector
+/// pixels), and small enough that an index times 64ths of a pixel stays in i32.
+pub(crate) const DIM_MAX: u64 = 16384;
+/// Most samples: 2048^3, 8 GiB of 8-bit codes. Larger ones want bricks read on demand.
+pub(crate) const SAMPLES_MAX: u64 = 1 << 33;
+/// Most bytes that are inflated only to be dropped (NIfTI extensions, a byte skip inside gzip):
+/// a tenth of a second's work. Real extensions are below 1 MiB.
+pub(crate) const SKIP_MAX_BYTES: u64 = 64 << 20;
+/// Bytes that one byte of deflate can at most become (two bits a match of 258 bytes, which is
+/// zlib's own figure). Lets a liar be refused before anything is inflated.
+const DEFLATE_RATIO: u64 = 1032;
+/// Bytes decoded at a time; a multiple of every type's size. Fits the second-level cache.
+const CHUNK_BYTES: usize = 128 << 10;
+
+/// A number's type in a file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Number {
+    U8,
+    I8,
+    U16,
+    I16,
+    U32,
+    I32,
+    U64,
+    I64,
+    F32,
+    F64,
+}
+
+impl Number {
+    pub(crate) fn bytes(self) -> u64 {
+        match self {
+            Number::U8 | Number::I8 => 1,
+            Number::U16 | Number::I16 => 2,
+            Number::U32 | Number::I32 | Number::F32 => 4,
+            Number::U64 | Number::I64 | Number::F64 => 8,
+        }
+    }
+
+    /// Its name for people.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Number::U8 => "uint8",
+            Number::I8 => "int8",
+            Number::U16 => "uint16",
+            Number::I16 => "int16",
+            Number::U32 => "uint32",
+            Number::I32 => "int32",
+            Number::U64 => "uint64",
+            Number::I64 => "int64",
+            Number::F32 => "float32",
+            Number::F64 => "float64",
+        }
+    }
+}
+
+/// Which end of a number comes first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Endian {
+    Little,
+    Big,
+}
+
+/// What is behind a reader.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Supply {
+    /// This many bytes are there.
+    Plain {
+        /// Bytes from the first sample on.
+        have: u64,
+    },
+    /// A gzip stream of this many compressed bytes, at most.
+    Gzip {
+        /// Bytes of the file from the start of the stream on.
+        compressed: u64,
+    },
+}
+
+/// What a header says of its samples; the sizes are checked.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Layout {
+    pub(crate) dims: [u32; 3],
+    pub(crate) number: Number,
+    pub(crate) endian: Endian,
+}
+
+impl Layout {
+    /// Checks sizes against the limits. `field` names them in the file's words.
+    pub(crate) fn new(
+        dims: [u64; 3],
+        number: Number,
+        endian: Endian,
+        field: &str,
+    ) -> Result<Layout, Problem> {
+        let shown = format!("{} x {} x {}", dims[0], dims[1], dims[2]);
+        if dims.contains(&0) {
+            return Err(Problem::malformed(
+                field,
+                format!("{shown} has no samples"),
+                "every size must be 1 or more",
+            ));
+        }
+        let too_large = |what: String, remedy: &str| {
+            Err(Problem::new(OpenErrorKind::TooLarge, field, what, remedy))
+        };
+        if dims.iter().any(|&n| n > DIM_MAX) {
+            return too_large(
+                format!("{shown} is longer than {DIM_MAX} along an axis"),
+                "crop or downsample it",
+            );
+        }
+        // Three factors of at most 2^14 can't overflow.
+        if dims.iter().product::<u64>() > SAMPLES_MAX {
+            return too_large(
+                format!("{shown} has more than {SAMPLES_MAX} samples"),
+                "crop or downsample it",
+            );
+        }
+        let dims = dims.map(|n| n as u32);
+        if BrickGrid::of(dims).dims.iter().map(|&n| u64::from(n)).product::<u64>() > MAX_BRICKS {
+            return too_large(
+                format!("{shown} has more than {MAX_BRICKS} bricks"),
+                "crop or downsample it",
+            );
+        }
+        Ok(Layout { dims, number, endian })
+    }
+
+    fn count(&self) -> usize {
+        self.dims.iter().map(|&n| n as usize).product()
+    }
+
+    /// Bytes of the samples in the file, uncompressed.
+    pub(crate) fn bytes(&self) -> u64 {
+        self.count() as u64 * self.number.bytes()
+    }
+}
+
+/// Reads the samples. Takes memory only as far as bytes are known to be there; a gzip stream is
+/// followed to its declared size and one byte more.
+pub(crate) fn read(
+    reader: &mut dyn Read,
+    supply: Supply,
+    layout: &Layout,
+) -> Result<(Samples, ValueMap), Problem> {
+    let need = layout.bytes();
+    match supply {
+        Supply::Plain { have } if have < need => return Err(short(need, have)),
+        Supply::Gzip { compressed } if need / DEFLATE_RATIO > compressed => {
+            return Err(Problem::new(
+                OpenErrorKind::Damaged,
+                "data",
+                format!(
+                    "truncated: {need} bytes are declared, and {compressed} compressed bytes \
+                     can't hold so many"
+                ),
+                "get the whole file, or correct the sizes",
+            ));
+        }
+        _ => {}
+    }
+    let mut data = Data { reader, supply, count: layout.count(), need };
+    let big = layout.endian == Endian::Big;
+    macro_rules! numbers {
+        ($t:ty) => {
+            data.collect::<$t>(|bytes, out| {
+                let words = bytes.chunks_exact(size_of::<$t>());
+                if big {
+                    out.extend(words.map(|w| <$t>::from_be_bytes(w.try_into().expect("a word"))));
+                } else {
+                    out.extend(words.map(|w| <$t>::from_le_bytes(w.try_into().expect("a word"))));
+                }
+            })?
+        };
+    }
+    // Flipping the top bit adds half the range.
+    let shifted = |offset| ValueMap { scale: 1.0, offset };
+    Ok(match layout.number {
+        Number::U8 => {
+            let v = data.collect(|bytes, out| out.extend_from_slice(bytes))?;
+            (Samples::U8(v), ValueMap::IDENTITY)
+        }
+        Number::I8 => {
+            let v = data.collect(|bytes, out| out.extend(bytes.iter().map(|b| b ^ 0x80)))?;
+            (Samples::U8(v), shifted(-128.0))
+        }
+        Number::U16 => (Samples::U16(numbers!(u16)), ValueMap::IDENTITY),
+        Number::I16 => {
+            let mut v = numbers!(u16);
+            v.iter_mut().for_each(|x| *x ^= 0x8000);
+            (Samples::U16(v), shifted(-32768.0))
+        }
+        Number::U32 => narrow(numbers!(u32), i128::from)?,
+        Number::I32 => narrow(numbers!(i32), i128::from)?,
+        Number::U64 => narrow(numbers!(u64), i128::from)?,
+        Number::I64 => narrow(numbers!(i64), i128::from)?,
+        Number::F32 => (Samples::F32(numbers!(f32)), ValueMap::IDENTITY),
+        Number::F64 => single(&numbers!(f64))?,
+    })
+}
+
+struct Data<'a> {
+    reader: &'a mut dyn Read,
+    supply: Supply,
+    count: usize,
+    need: u64,
+}
+
+impl Data<'_> {
+    fn collect<T>(&mut self, decode: impl Fn(&[u8], &mut Vec<T>)) -> Result<Vec<T>, Problem> {
+        let size = (self.need / self.count as u64) as usize;
+        let mut out = Vec::new();
+        if matches!(self.supply, Supply::Plain { .. }) {
+            reserve(&mut out, self.count)?;
+        }
+        let mut chunk = vec![0; CHUNK_BYTES.min(self.need as usize)];
+        while out.len() < self.count {
+            let want = chunk.len().min((self.count - out.len()) * size);
+            let got = self.fill(&mut chunk[..want], (out.len() * size) as u64)?;
+            let numbers = got / size;
+            if out.capacity() - out.len() < numbers {
+                // Never more than twice of what has come, nor more than was declared.
+                let room = (2 * (out.len() + numbers)).min(self.count) - out.len();
+                reserve(&mut out, room)?;
+            }
+            decode(&chunk[..got], &mut out);
+        }
+        if matches!(self.supply, Supply::Gzip { .. }) {
+            self.end()?;
+        }
+        Ok(out)
+    }
+
+    /// Fills `chunk` or says what is missing; `before` bytes came before it.
+    fn fill(&mut self, chunk: &mut [u8], before: u64) -> Result<usize, Problem> {
+        let mut at = 0;
+        while at < chunk.len() {
+            match self.reader.read(&mut chunk[at..]) {
+                Ok(0) => return Err(short(self.need, before + at as u64)),
+                Ok(n) => at += n,
+                Err(e) if e.kind() == std::io::ErrorKind::Interrupted => {}
+                Err(e) => return Err(self.broken(&e, before + at as u64)),
+            }
+        }
+        Ok(at)
+    }
+
+    /// One byte past the declared size: none may come, and gzip checks its sum on the way.
+    fn end(&mut self) -> Result<(), Problem> {
+        loop {
+            match self.reader.read(&mut [0]) {
+                Ok(0) => return Ok(()),
+                Ok(_) => {
+                    return Err(Problem::new(
+                        OpenErrorKind::Damaged,
+                        "data",
+                        format!("goes on after the {} bytes that are declared", self.need),
+                        "correct the sizes or the type",
+                    ));
+                }
+                Err(e) if e.kind() == std::io::ErrorKind::Interrupted => {}
+                Err(e) => return Err(self.broken(&e, self.need)),
+            }
+        }
+    }
+
+    fn broken(&self, e: &std::io::Error, have: u64) -> Problem {
+        match (self.supply, e.kind()) {
+            (Supply::Gzip { .. }, std::io::ErrorKind::UnexpectedEof) => short(self.need, have),
+            (Supply::Gzip { .. }, _) => Problem::new(
+                OpenErrorKind::Damaged,
+                "data",
+                format!("the gzip stream is damaged after {have} of {} bytes ({e})", self.need),
+                "get the file again",
+            ),
+            _ => Problem::io("data", e),
+        }
+    }
+}
+
+fn short(need: u64, have: u64) -> Problem {
+    Problem::new(
+        OpenErrorKind::Damaged,
+        "data",
+        format!("truncated: {need} bytes are needed and {have} are there"),
+        "get the whole file, or correct the sizes, the type or the skip",
+    )
+}
+
+fn reserve<T>(out: &mut Vec<T>, more: usize) -> Result<(), Problem> {
+    out.try_reserve_exact(more).map_err(|_| {
+        Problem::new(
+            OpenErrorKind::TooLarge,
+            "data",
+            format!("no memory for {} bytes", more as u128 * size_of::<T>() as u128),
+            "use a machine with more memory, or crop or downsample it",
+        )
+    })
+}
+
+/// 32- and 64-bit integers in 16 bits where they fit, else in f32.
+fn narrow<T: Copy + Ord>(
+    numbers: Vec<T>,
+    wide: impl Fn(T) -> i128,
+) -> Result<(Samples, ValueMap), Problem> {
+    let min = wide(*numbers.iter().min().expect("a volume has a sample"));
+    let max = wide(*numbers.iter().max().expect("a volume has a sample"));
+    // 64-bit integers are never more than 2^64 apart, so i128 can't overflow.
+    let span = max - min;
+    if span <= i128::from(u16::MAX) {
+        let mut codes: Vec<u16> = Vec::new();
+        reserve(&mut codes, numbers.len())?;
+        codes.extend(numbers.iter().map(|&v| (wide(v) - min) as u16));
+        return Ok((Samples::U16(codes), ValueMap { scale: 1.0, offset: min as f64 }));
+    }
+    let mut codes: Vec<f32> = Vec::new();
+    reserve(&mut codes, numbers.len())?;
+    codes.extend(numbers.iter().map(|&v| ((wide(v) - min) as f64 / span as f64) as f32));
+    Ok((Samples::F32(codes), ValueMap { scale: span as f64, offset: min as f64 }))
+}
+
+/// f64 as f32, by way of a map where f32 would overflow, flush to zero or be too coarse.
+fn single(numbers: &[f64]) -> Result<(Samples, ValueMap), Problem> {
+    let finite = || numbers.iter().copied().filter(|v| v.is_finite());
+    let (lo, hi) =
+        finite().fold((f64::INFINITY, f64::NEG_INFINITY), |(lo, hi), v| (lo.min(v), hi.max(v)));
+    let map = if lo > hi || held_by_f32(lo, hi) {
+        ValueMap::IDENTITY
+    } else if hi == lo {
+        ValueMap { scale: 1.0, offset: lo }
+    } else if (hi - lo).is_finite() {
+        ValueMap { scale: hi - lo, offset: lo }
+    } else {
+        // The span itself is beyond f64: codes are -1..1 around the middle.
+        ValueMap { scale: hi / 2.0 - lo / 2.0, offset: hi / 2.0 + lo / 2.0 }
+    };
+    let mut codes: Vec<f32> = Vec::new();
+    reserve(&mut codes, numbers.len())?;
+    codes.extend(numbers.iter().map(|&v| ((v - map.offset) / map.scale) as f32));
+    Ok((Samples::F32(codes), map))
+}
+
+/// Whether f32 holds values from `lo` to `hi` as they are: none overflows, and rounding (2^-24
+/// of the largest) or flushing stays below a 65536th of the span, a 16-bit scanner's step.
+fn held_by_f32(lo: f64, hi: f64) -> bool {
+    let largest = lo.abs().max(hi.abs());
+    let span = hi - lo;
+    if largest > f64::from(f32::MAX) {
+        return false;
+    }
+    if span == 0.0 {
+        return f64::from(lo as f32) == lo;
+    }
+    largest <= 256.0 * span && span >= 65536.0 * f64::from(f32::MIN_POSITIVE)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read_all(
+        bytes: &[u8],
+        n: u64,
+        number: Number,
+        endian: Endian,
+    ) -> Result<(Samples, ValueMap), Problem> {
+        let layout = Layout::new([n, 1, 1], number, endian, "sizes")?;
+        read(&mut &bytes[..], Supply::Plain { have: bytes.len() as u64 }, &layout)
+    }
+
+    fn values((samples, map): &(Samples, ValueMap)) -> Vec<f64> {
+        (0..samples.len()).map(|i| map.value(samples.code(i))).collect()
+    }
+
+    macro_rules! both_orders {
+        ($number:expr, $numbers:expr, $kind:pat) => {
+            let numbers = $numbers;
+            let n = numbers.len() as u64;
+            let le: Vec<u8> = numbers.iter().flat_map(|x| x.to_le_bytes()).collect();
+            let be: Vec<u8> = numbers.iter().flat_map(|x| x.to_be_bytes()).collect();
+            let a = read_all(&le, n, $number, Endian::Little).unwrap();
+            assert_eq!(a, read_all(&be, n, $number, Endian::Big).unwrap());
+            assert!(matches!(a.0, $kind), "{:?} became {:?}", $number, a.0);
+            let want: Vec<f64> = numbers.iter().map(|&x| x as f64).collect();
+            let span = want.iter().fold(0.0f64, |a, &b| a.max(b)) - want[0];
+            for (got, want) in values(&a).iter().zip(&want) {
+                assert!((got - want).abs() <= span.abs() * 1e-7, "{got} against {want}");
+            }
+        };
+    }
+
+    #[test]
+    fn every_type_keeps_its_values_in_both_byte_orders() {
+        both_orders!(Number::U8, [0u8, 7, 255], Samples::U8(_));
+        both_orders!(Number::I8, [-128i8, -1, 0, 127], Samples::U8(_));
+        both_orders!(Number::U16, [0u16, 258, 65535], Samples::U16(_));
+        both_orders!(Number::I16, [-32768i16, -1, 0, 1, 32767], Samples::U16(_));
+        both_orders!(Number::U32, [4_000_000_000u32, 4_000_065_535], Samples::U16(_));
+        both_orders!(Number::U32, [0u32, 5, u32::MAX], Samples::F32(_));
+        both_orders!(Number::I32, [-70000i32, -4465], Samples::U16(_));
+        both_orders!(Number::I32, [i32::MIN, 0, i32::MAX], Samples::F32(_));
+        both_orders!(Number::U64, [0u64, 1 << 40, u64::MAX], Samples::F32(_));
+        both_orders!(Number::I64, [i64::MIN, 0, i64::MAX], Samples::F32(_));
+        both_orders!(Number::I64, [-3i64, 4], Samples::U16(_));
+        both_orders!(Number::F32, [-1.5f32, 1e-40, 3e38], Samples::F32(_));
+        both_orders!(Number::F64, [-1.5f64, 0.25, 1e30], Samples::F32(_));
+    }
+
+    #[test]
+    fn doubles_beyond_f32_are_mapped_and_the_unusual_stays() {
+        let inf = f64::INFINITY;
+        for (numbers, mapped) in [
+            (vec![-1.7e308, 0.0, 1.7e308, f64::NAN, inf, -inf], true),
+            (vec![1e300, 2e300, 3e300], true),
+            (vec![1e-300, 2e-300, 3e-300], true),
+            (vec![5e-324, 1e-323], true),
+            (vec![1e9, 1e9 + 1.0, 1e9 + 2.0], true),
+            (vec![1e300; 3], true),
+            (vec![0.5; 3], false),
+            (vec![f64::NAN; 3], false),
+            (vec![0.0, 1.0, f64::NAN, inf], false),
+        ] {
+            let bytes: Vec<u8> = numbers.iter().flat_map(|x| x.to_le_bytes()).collect();
+            let got = read_all(&bytes, numbers.len() as u64, Number::F64, Endian::Little).unwrap();
+            assert_eq!(got.1 != ValueMap::IDENTITY, mapped, "{numbers:?} gave {:?}", got.1);
+            assert!(got.1.scale.is_finite() && got.1.offset.is_finite() && got.1.scale != 0.0);
+            let finite = numbers.iter().filter(|v| v.is_finite());
+            let lo = finite.clone().copied().fold(inf, f64::min);
+            let hi = finite.copied().fold(-inf, f64::max);
+            for (v, want) in values(&got).iter().zip(&numbers) {
+                if want.is_finite() {
+                    let off = (v / 2.0 - want / 2.0).abs();
+                    assert!(off <= (hi / 2.0 - lo / 2.0) * 1e-4, "{v:e} against {want:e}");
+                } else {
+                    assert!(v == want || v.is_nan() && want.is_nan(), "{v} against {want}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn sizes_beyond_the_limits_are_refused_before_memory_is_taken() {
+        for dims in [[0, 1, 1], [16385, 1, 1], [16384, 16384, 16384], [u64::MAX; 3]] {
+            assert!(Layout::new(dims, Number::F64, Endian::Little, "sizes").is_err(), "{dims:?}");
+        }
+        let e = read_all(&[0; 7], 4, Number::U16, Endian::Little).unwrap_err().to_string();
+        assert!(e.contains("8 bytes are needed and 7 are there"), "{e}");
+    }
+}

@@ -3,15 +3,17 @@
 //! Random small volumes with opaque, faint and empty parts; random cameras of both kinds;
 //! thin and thick sheets; any tiles, slabs, instruction set, with culling and without.
 
+mod world;
+
 use glam::DVec3;
 use proptest::prelude::*;
-use slabcast_common::brick::{Brick, BrickGrid, local};
-use slabcast_common::ids::{BrickId, SceneId};
+use slabcast_common::brick::Brick;
+use slabcast_common::ids::SceneId;
 use slabcast_common::image::{FrameState, Picture};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Compositing, Quality, Sums};
-use slabcast_common::shade::{Shading, encode_normal};
+use slabcast_common::shade::Shading;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
@@ -20,40 +22,7 @@ use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch};
 use slabcast_render::{Frame, Scene, serial};
 use std::sync::Arc;
-
-/// Every voxel that is not zero, with its normal.
-fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
-    let grid = BrickGrid::of(volume.lattice.dims);
-    let [nx, ny, _] = volume.lattice.dims.map(|n| n as usize);
-    let matrix = volume.gradient_matrix();
-    let mut out = Vec::new();
-    for id in 0..grid.len() as u32 {
-        let corner = grid.corner(BrickId(id));
-        let mut brick = Brick {
-            id: BrickId(id),
-            index: vec![],
-            values: Samples::empty(volume.samples.kind()),
-            normals: Some(vec![]),
-        };
-        for l in 0..512u16 {
-            let p: [u32; 3] = std::array::from_fn(|a| corner[a] + local(l)[a]);
-            if (0..3).any(|a| p[a] >= volume.lattice.dims[a]) {
-                continue;
-            }
-            let i = (p[2] as usize * ny + p[1] as usize) * nx + p[0] as usize;
-            if volume.samples.code(i) != 0.0 {
-                brick.index.push(l);
-                brick.values.push_from(&volume.samples, i);
-                let normal = encode_normal(volume.gradient(p, &matrix));
-                brick.normals.as_mut().unwrap().push(normal);
-            }
-        }
-        if !brick.is_empty() {
-            out.push(Arc::new(brick));
-        }
-    }
-    out
-}
+use world::bricks_of;
 
 fn transfer(top: f64, unit: OpacityUnit) -> TransferFunction {
     TransferFunction {

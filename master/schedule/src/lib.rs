@@ -1,1 +1,580 @@
-//! Placeholder.
+//! The paper's section 4 as a state machine: which brick and which macrotile goes to whom, and
+//! when. It refuses to know sockets, threads, files and what time it is.
+//!
+//! # How to drive it
+//!
+//! 1. Make a [`Scheduler`]. Welcome each worker on its link yourself
+//!    ([`ToWorker::Welcome`] comes before all else), then hand in [`Event::WorkerJoined`].
+//! 2. Turn whatever happens into an [`Event`] and hand it to [`Scheduler::handle`], with a
+//!    [`Clock`] that never goes back. Hand in [`Event::WorkerHeard`] for messages that have no
+//!    event of their own.
+//! 3. After each event take [`Scheduler::next_action`] until it is `None`, and do what it says,
+//!    in order for each worker. Control messages and bricks may travel on two links; each keeps
+//!    its own order.
+//! 4. Sleep until the next message or [`Scheduler::next_deadline`], whichever is first; at the
+//!    deadline hand in [`Event::Tick`].
+//!
+//! A worker that [`Action::Drop`] names, and one that was reported with
+//! [`Event::WorkerLost`], is forgotten: close its link, ignore what still comes. When it dials
+//! again it is a new worker with a new id.
+//!
+//! ```text
+//! +-------------------------------------------------------------------------------------------+
+//! | The law. A frame's bytes follow from its job alone: not from the number of workers, their |
+//! | threads, speed or memory, nor from the macrotile level, the slabs, the order of arrival,  |
+//! | or who dies when. Only a tile that takes `poison_after` workers with it breaks it, and it |
+//! | is named in the statistics.                                                               |
+//! +-------------------------------------------------------------------------------------------+
+//! ```
+//!
+//! # Rooms
+//!
+//! [`frame`](is_shut) the states of one frame, [`macrotile`] the quadtree and its workload,
+//! `queue` leases with epochs, `residency` who holds which brick, `roster` workers and every
+//! deadline, `ledger` what a frame cost. The `region` schedule will stand beside `frame`; the
+//! others know nothing of slabs but the queue's and the residency's rounds.
+
+use slabcast_common::brick::{BrickInfo, BrickSetKey};
+use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
+use slabcast_common::image::FrameState;
+use slabcast_common::message::{SceneSpec, TileResult, ToWorker};
+use slabcast_common::quality::Work;
+use slabcast_common::stats::FrameStats;
+use slabcast_common::view::View;
+use std::collections::{BTreeSet, VecDeque};
+use std::sync::Arc;
+
+mod frame;
+mod ledger;
+pub mod macrotile;
+mod queue;
+mod residency;
+mod roster;
+
+pub use frame::is_shut;
+
+use frame::{Frame, Step, carry};
+use residency::Residency;
+use roster::Roster;
+
+/// Microseconds on the master's clock, which never goes back.
+pub type Micros = u64;
+
+/// What time it is. The real one lives in the master, a virtual one in the tests.
+pub trait Clock {
+    /// Now. Never less than before.
+    fn now(&self) -> Micros;
+}
+
+/// What the scheduler goes by.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Config {
+    /// Between two pings of a worker.
+    pub heartbeat: Micros,
+    /// A worker that is silent so long is lost.
+    pub silence: Micros,
+    /// First deadline of a lease; each attempt doubles it.
+    pub lease: Micros,
+    /// A tile is given up after so many distinct workers were lost with it, or so many refusals.
+    pub poison_after: u32,
+    /// Leases a render thread has in flight, the one it renders included.
+    pub queue_ahead: u32,
+}
+
+impl Default for Config {
+    /// - heartbeat 1 s, silence 3 s: PROMISES.md R2 allows 3 s to find a partitioned worker and
+    ///   no false alarm at twice the load its cores can bear; three pings must go unanswered.
+    /// - lease 60 s: the slowest tile that is still somebody's honest work. At half, a 256x256
+    ///   tile of a large volume on a shared core is rendered twice for nothing; at double, a
+    ///   worker that lives but hangs holds up a frame for two minutes. Not measured.
+    /// - poison after 3: R5.
+    /// - two leases a thread: TRANSPORT.md, answer 3.
+    fn default() -> Self {
+        Config {
+            heartbeat: 1_000_000,
+            silence: 3_000_000,
+            lease: 60_000_000,
+            poison_after: 3,
+            queue_ahead: 2,
+        }
+    }
+}
+
+/// One frame to render.
+#[derive(Clone, Debug)]
+pub struct FrameJob {
+    /// Its name, never used before.
+    pub frame: FrameId,
+    /// Its number in its path.
+    pub number: u64,
+    /// Its scene.
+    pub scene: Arc<SceneSpec>,
+    /// The bricks of the set `scene.bricks`, ascending by id.
+    pub bricks: Arc<[BrickInfo]>,
+    /// Its view.
+    pub view: View,
+    /// How the work is cut.
+    pub work: Work,
+}
+
+/// What happens to the scheduler.
+#[derive(Clone, Debug)]
+pub enum Event {
+    /// A worker's hello was good and it was welcomed.
+    WorkerJoined {
+        /// Its name from now on, never used before.
+        worker: WorkerId,
+        /// Its name for people.
+        name: String,
+        /// Its render threads.
+        threads: u32,
+        /// Bytes of bricks it may hold, by their encoded size.
+        memory_budget_bytes: u64,
+        /// Bricks it still holds from before.
+        held: Vec<(BrickSetKey, Vec<BrickId>)>,
+    },
+    /// A message came from it. Events that carry a worker's message say so themselves.
+    WorkerHeard {
+        /// Which.
+        worker: WorkerId,
+    },
+    /// Its link ended.
+    WorkerLost {
+        /// Which.
+        worker: WorkerId,
+        /// For people.
+        reason: String,
+    },
+    /// It finishes what it has begun, takes no more and will close the link.
+    WorkerLeaving {
+        /// Which.
+        worker: WorkerId,
+    },
+    /// Somebody wants a frame. Frames are rendered in this order, one at a time.
+    FrameQueued(Box<FrameJob>),
+    /// Nobody wants it any more. There is no answer.
+    CancelFrame {
+        /// Which.
+        frame: FrameId,
+    },
+    /// No frame of the scene will be queued any more. Workers forget it when those that are
+    /// queued are done; its bricks stay.
+    SceneEnded {
+        /// Which.
+        scene: SceneId,
+    },
+    /// A task is done.
+    Result {
+        /// By whom.
+        worker: WorkerId,
+        /// Its pixels.
+        result: Box<TileResult>,
+    },
+    /// A task can't be done.
+    Failed {
+        /// By whom.
+        worker: WorkerId,
+        /// Which task.
+        task: TaskId,
+        /// Which attempt.
+        epoch: Epoch,
+        /// For people.
+        reason: String,
+    },
+    /// The next bricks of a set, in the order in which they were sent, arrived whole. Broken
+    /// ones are not counted.
+    BricksIn {
+        /// Where.
+        worker: WorkerId,
+        /// Of which set.
+        set: BrickSetKey,
+        /// How many.
+        bricks: u32,
+    },
+    /// Bricks arrived broken. They are sent again.
+    BricksBroken {
+        /// Where.
+        worker: WorkerId,
+        /// Of which set.
+        set: BrickSetKey,
+        /// Which.
+        bricks: Vec<BrickId>,
+    },
+    /// A ping's answer.
+    Pong {
+        /// From whom.
+        worker: WorkerId,
+        /// The ping's.
+        nonce: u64,
+        /// The worker's clock.
+        clock_us: u64,
+    },
+    /// Time went on.
+    Tick,
+}
+
+/// What the scheduler wants done.
+#[derive(Clone, Debug)]
+pub enum Action {
+    /// Send a control message. A scene comes before its first frame, a frame before its first
+    /// lease, for each worker.
+    Send {
+        /// To whom.
+        worker: WorkerId,
+        /// What.
+        message: ToWorker,
+    },
+    /// Send bricks, in this order. It lacks each of them.
+    SendBricks {
+        /// To whom.
+        worker: WorkerId,
+        /// Of which set.
+        set: BrickSetKey,
+        /// Which.
+        bricks: Vec<BrickId>,
+    },
+    /// Close a worker's link. The scheduler has forgotten it.
+    Drop {
+        /// Which.
+        worker: WorkerId,
+        /// For people.
+        reason: String,
+    },
+    /// Tell who watches.
+    Progress {
+        /// Which frame.
+        frame: FrameId,
+        /// Macrotiles of the slab that are done (or given up).
+        done: u32,
+        /// Macrotiles of the slab.
+        total: u32,
+        /// Number of the slab.
+        slab: u32,
+        /// Slabs of the frame.
+        slabs: u32,
+    },
+    /// A frame is done.
+    FrameDone {
+        /// Which.
+        frame: FrameId,
+        /// Its picture.
+        state: Box<FrameState>,
+        /// What it cost. Both hashes, `left_out` and `error` are for the master to fill in.
+        stats: Box<FrameStats>,
+        /// What happened when, by the end of each.
+        spans: Vec<Span>,
+    },
+    /// A frame can't be rendered: every tile that was tried was given up.
+    FrameFailed {
+        /// Which.
+        frame: FrameId,
+        /// For people.
+        reason: String,
+    },
+}
+
+/// A stretch of time in a trace, on the master's clock.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Span {
+    /// What.
+    pub name: String,
+    /// "frame", "slab", "tile" or "bricks".
+    pub category: &'static str,
+    /// Where; `None`: at the master.
+    pub worker: Option<String>,
+    /// On which render thread.
+    pub thread: u32,
+    /// From.
+    pub start: Micros,
+    /// To.
+    pub end: Micros,
+    /// More about it.
+    pub args: Vec<(&'static str, String)>,
+}
+
+/// A worker as `ListWorkers` shows it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct WorkerView {
+    /// Its id.
+    pub id: WorkerId,
+    /// Its name for people.
+    pub name: String,
+    /// Its render threads.
+    pub threads: u32,
+    /// Bricks it holds, of all sets.
+    pub bricks_held: u64,
+    /// Their encoded bytes.
+    pub bytes_held: u64,
+    /// Render threads that have something to do.
+    pub busy: u32,
+    /// Leases it has not answered.
+    pub leases: u32,
+    /// When it joined.
+    pub since: Micros,
+    /// Whether it takes no more leases.
+    pub leaving: bool,
+}
+
+/// Counts over the scheduler's life.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Totals {
+    /// Results that were late or came twice, of frames that had ended too.
+    pub dropped_results: u64,
+    /// Sendings beyond a worker's memory budget, for a lease that is larger than it alone.
+    pub over_budget: u64,
+    /// Workers lost, silent or dropped.
+    pub lost_workers: u64,
+}
+
+/// All but the frames.
+#[derive(Debug)]
+struct Cluster {
+    config: Config,
+    roster: Roster,
+    residency: Residency,
+    out: VecDeque<Action>,
+    next_task: u64,
+    totals: Totals,
+}
+
+impl Cluster {
+    fn send(&mut self, worker: WorkerId, message: ToWorker) {
+        self.out.push_back(Action::Send { worker, message });
+    }
+}
+
+/// The state machine; see the head of the crate.
+#[derive(Debug)]
+pub struct Scheduler {
+    cluster: Cluster,
+    waiting: VecDeque<Box<FrameJob>>,
+    current: Option<Frame>,
+    /// Scenes to be forgotten when their frames are done.
+    ended: BTreeSet<SceneId>,
+}
+
+impl Scheduler {
+    /// No workers, no frames.
+    pub fn new(config: Config) -> Self {
+        Scheduler {
+            cluster: Cluster {
+                config,
+                roster: Roster::default(),
+                residency: Residency::default(),
+                out: VecDeque::new(),
+                next_task: 0,
+                totals: Totals::default(),
+            },
+            waiting: VecDeque::new(),
+            current: None,
+            ended: BTreeSet::new(),
+        }
+    }
+
+    /// Takes in what happened. Events of workers that are not known (any more) do nothing.
+    pub fn handle(&mut self, clock: &dyn Clock, event: Event) {
+        let now = clock.now();
+        let cluster = &mut self.cluster;
+        cluster.roster.watch(now, &cluster.config);
+        match event {
+            Event::WorkerJoined { worker, name, threads, memory_budget_bytes, held } => {
+                cluster.residency.join(worker, memory_budget_bytes, held);
+                cluster.roster.join(worker, name, threads, now);
+                if let Some(frame) = &mut self.current {
+                    frame.joined(cluster, worker, now);
+                }
+            }
+            Event::WorkerHeard { worker } => cluster.roster.heard(worker, now),
+            Event::WorkerLost { worker, .. } => self.lose(worker, true, now),
+            Event::WorkerLeaving { worker } => {
+                cluster.roster.heard(worker, now);
+                if let Some(w) = cluster.roster.get_mut(worker)
+                    && !std::mem::replace(&mut w.leaving, true)
+                    && let Some(frame) = &mut self.current
+                {
+                    frame.leaving(worker, w.threads);
+                }
+            }
+            Event::FrameQueued(job) => self.waiting.push_back(job),
+            Event::CancelFrame { frame } => {
+                self.waiting.retain(|job| job.frame != frame);
+                if let Some(mut current) = self.current.take_if(|c| c.job.frame == frame) {
+                    current.end(&mut self.cluster);
+                }
+            }
+            Event::SceneEnded { scene } => {
+                self.ended.insert(scene);
+            }
+            Event::Result { worker, result } => {
+                cluster.roster.heard(worker, now);
+                let known = cluster.roster.get(worker).is_some();
+                match &mut self.current {
+                    Some(frame) if known => {
+                        let outcome = frame.result(cluster, worker, &result, clock);
+                        if let Err(reason) = outcome {
+                            self.drop_worker(worker, reason, false, now);
+                        } else if cluster.residency.is_lazy(worker) {
+                            carry(cluster, Some(&mut frame.ledger), worker, now);
+                        }
+                    }
+                    _ => cluster.totals.dropped_results += 1,
+                }
+            }
+            Event::Failed { worker, task, epoch, reason } => {
+                cluster.roster.heard(worker, now);
+                if let Some(frame) = &mut self.current {
+                    frame.failed(cluster, worker, task, epoch, reason);
+                }
+            }
+            Event::BricksIn { worker, set, bricks } => {
+                cluster.roster.heard(worker, now);
+                let landed = cluster.residency.arrived(worker, set, bricks);
+                self.after_bricks(worker, landed, now);
+            }
+            Event::BricksBroken { worker, set, bricks } => {
+                cluster.roster.heard(worker, now);
+                let landed = cluster.residency.broken(worker, set, &bricks);
+                self.after_bricks(worker, landed, now);
+            }
+            Event::Pong { worker, nonce, clock_us } => {
+                cluster.roster.heard(worker, now);
+                if cluster.roster.pong(worker, nonce, clock_us, now) {
+                    cluster.residency.ponged(worker, nonce);
+                    self.after_bricks(worker, None, now);
+                }
+            }
+            Event::Tick => {}
+        }
+        self.advance(clock);
+    }
+
+    fn after_bricks(&mut self, worker: WorkerId, landed: Option<residency::Flight>, now: Micros) {
+        if let (Some(frame), Some(flight)) = (&mut self.current, landed) {
+            frame.landed(worker, flight, now);
+        }
+        let ledger = self.current.as_mut().map(|f| &mut f.ledger);
+        carry(&mut self.cluster, ledger, worker, now);
+    }
+
+    /// A worker is gone.
+    fn lose(&mut self, id: WorkerId, blame: bool, now: Micros) {
+        let Some(worker) = self.cluster.roster.remove(id) else { return };
+        self.cluster.totals.lost_workers += 1;
+        if let Some(frame) = &mut self.current {
+            frame.lost(&mut self.cluster, id, &worker, blame && !worker.leaving, now);
+        }
+        self.cluster.residency.leave(id);
+    }
+
+    fn drop_worker(&mut self, worker: WorkerId, reason: String, blame: bool, now: Micros) {
+        self.lose(worker, blame, now);
+        self.cluster.out.push_back(Action::Drop { worker, reason });
+    }
+
+    /// Does what is due, and goes as far as it can.
+    fn advance(&mut self, clock: &dyn Clock) {
+        let now = clock.now();
+        for worker in self.cluster.roster.silent(now, &self.cluster.config) {
+            let secs = self.cluster.config.silence as f64 / 1e6;
+            self.drop_worker(worker, format!("silent for {secs} s"), true, now);
+        }
+        for (worker, nonce) in self.cluster.roster.beat(now, &self.cluster.config) {
+            self.cluster.send(worker, ToWorker::Ping { nonce });
+        }
+        if let Some(frame) = &mut self.current {
+            frame.tick(now);
+        }
+        loop {
+            let mut frame = match self.current.take() {
+                Some(frame) => frame,
+                None => match self.waiting.pop_front() {
+                    Some(job) => Frame::start(job, &mut self.cluster, clock),
+                    None => break,
+                },
+            };
+            match frame.step(&mut self.cluster, clock) {
+                Step::Waits => {
+                    self.current = Some(frame);
+                    break;
+                }
+                Step::Done => {
+                    frame.end(&mut self.cluster);
+                    let done = frame.finish(&mut self.cluster, clock.now());
+                    self.cluster.out.push_back(done);
+                }
+                Step::Failed(reason) => {
+                    frame.end(&mut self.cluster);
+                    let frame = frame.job.frame;
+                    self.cluster.out.push_back(Action::FrameFailed { frame, reason });
+                }
+            }
+        }
+        self.forget_scenes();
+    }
+
+    /// Ends scenes that have no frame left.
+    fn forget_scenes(&mut self) {
+        let used = |scene: SceneId| {
+            let waiting = self.waiting.iter().map(|job| job.scene.id);
+            waiting.chain(self.current.as_ref().map(|f| f.job.scene.id)).any(|s| s == scene)
+        };
+        let over: Vec<_> = self.ended.iter().copied().filter(|&s| !used(s)).collect();
+        for scene in over {
+            self.ended.remove(&scene);
+            let ids: Vec<_> = self.cluster.roster.iter().map(|(id, _)| id).collect();
+            for id in ids {
+                let worker = self.cluster.roster.get_mut(id).expect("just listed");
+                if worker.scenes.remove(&scene) {
+                    self.cluster.send(id, ToWorker::EndScene { scene });
+                }
+            }
+        }
+    }
+
+    /// The next thing to do, if any.
+    pub fn next_action(&mut self) -> Option<Action> {
+        self.cluster.out.pop_front()
+    }
+
+    /// When [`Event::Tick`] is due at the latest.
+    pub fn next_deadline(&self) -> Option<Micros> {
+        let frame = self.current.as_ref().and_then(Frame::next_deadline);
+        let roster = self.cluster.roster.next_deadline(&self.cluster.config);
+        roster.into_iter().chain(frame).min()
+    }
+
+    /// The workers, by id.
+    pub fn workers(&self) -> Vec<WorkerView> {
+        let view = |(id, w): (WorkerId, &roster::Worker)| {
+            let leases = self.current.as_ref().map_or(0, |f| f.leases(id));
+            let (bricks_held, bytes_held) = self.cluster.residency.held(id);
+            WorkerView {
+                id,
+                name: w.name.clone(),
+                threads: w.threads,
+                bricks_held,
+                bytes_held,
+                busy: leases.min(w.threads),
+                leases,
+                since: w.since,
+                leaving: w.leaving,
+            }
+        };
+        self.cluster.roster.iter().map(view).collect()
+    }
+
+    /// Counts over the scheduler's life.
+    pub fn totals(&self) -> Totals {
+        self.cluster.totals
+    }
+
+    /// Whether there is no frame to render.
+    pub fn is_idle(&self) -> bool {
+        self.current.is_none() && self.waiting.is_empty()
+    }
+
+    /// Whether there is a worker, leaving or not.
+    pub fn has_workers(&self) -> bool {
+        !self.cluster.roster.is_empty()
+    }
+}

@@ -1,0 +1,683 @@
+//! One frame under the paper's schedule: slab after slab, with a barrier (section 4.5).
+//!
+//! ```text
+//! queued -> [slab 0] -> [slab 1] -> ... -> done
+//!             | cull bricks, cut into macrotiles, sort        (begin_slab)
+//!             | lend tasks, broadcast bricks                  (dispatch)
+//!             | take in results, lend the next                (result)
+//!             | no task open: occlusion map updated           (end_slab)
+//! ```
+//!
+//! A frame waits, with nothing lost, while there is no worker. It refuses to know who is silent
+//! (`roster`), which copy of a result counts (`queue`) and where bricks are (`residency`).
+
+use crate::ledger::{Ledger, Rendered, ms, place_in_time};
+use crate::macrotile::{self, Cut, LEAF, LEVELS};
+use crate::queue::{End, Queue, Verdict};
+use crate::residency::{Errand, Flight};
+use crate::{Action, Clock, Cluster, FrameJob, Micros, Span};
+use slabcast_common::ids::{BrickId, Epoch, TaskId, WorkerId};
+use slabcast_common::image::{FrameState, TilePixels};
+use slabcast_common::message::{Lease, TileResult, ToWorker};
+use slabcast_common::occlusion::{Rect, ShutMap};
+use slabcast_common::slab::SheetRange;
+use slabcast_common::stats::{BrickStats, PoisonedTile, SlabStats, TileStats};
+use slabcast_common::view::Projected;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Whether a pixel with accumulated opacity `a` is shut for good.
+///
+/// The renderer makes the same test after each sheet, in the same f32 arithmetic; a master that
+/// shut a pixel the renderer holds open would change bytes.
+#[inline]
+pub fn is_shut(a: f32, eps: f64) -> bool {
+    eps > 0.0 && (1.0f32 - a) < eps as f32
+}
+
+/// A lease that a worker has and has not answered; perhaps dead.
+#[derive(Debug)]
+struct Lent {
+    task: TaskId,
+    epoch: Epoch,
+    sent: Micros,
+    /// Places of its bricks.
+    bricks: Vec<u32>,
+}
+
+/// The slab that is being rendered.
+#[derive(Debug)]
+struct Slab {
+    sheets: SheetRange,
+    began: Micros,
+    cut: Cut,
+    queue: Queue,
+    /// Places of the needed bricks, ascending, and their rectangles.
+    needed: Vec<u32>,
+    rects: Vec<Rect>,
+    /// Needed bricks in the order in which the queue's tiles come to them.
+    order: Vec<u32>,
+    /// Workers that the slab's bricks were queued for.
+    served: BTreeSet<WorkerId>,
+    /// End of each render thread's last task.
+    dry: BTreeMap<(WorkerId, u32), Micros>,
+}
+
+impl Slab {
+    fn bricks_of(&self, place: u32) -> Vec<u32> {
+        let tile = self.cut.tiles[place as usize].rect;
+        let over = |r: &Rect| !r.intersect(&tile).is_empty();
+        let needed = self.needed.iter().zip(&self.rects);
+        needed.filter(|(_, r)| over(r)).map(|(&i, _)| i).collect()
+    }
+}
+
+/// A frame in the making.
+#[derive(Debug)]
+pub(crate) struct Frame {
+    pub(crate) job: Box<FrameJob>,
+    began: Micros,
+    projected: Vec<Option<Projected>>,
+    slabs: Vec<SheetRange>,
+    at: usize,
+    state: FrameState,
+    shut: ShutMap,
+    slab: Option<Slab>,
+    first_task: TaskId,
+    /// Workers that were sent the frame's view.
+    told: BTreeSet<WorkerId>,
+    lent: BTreeMap<WorkerId, Vec<Lent>>,
+    needed_ever: Vec<bool>,
+    any_result: bool,
+    last_reason: String,
+    pub(crate) ledger: Ledger,
+}
+
+/// Where a frame stands.
+pub(crate) enum Step {
+    /// It waits for events.
+    Waits,
+    /// Its last slab ended.
+    Done,
+    /// It can't be rendered.
+    Failed(String),
+}
+
+impl Frame {
+    pub(crate) fn start(job: Box<FrameJob>, cluster: &mut Cluster, clock: &dyn Clock) -> Self {
+        let began = clock.now();
+        let ascending = job.bricks.windows(2).all(|w| w[0].id < w[1].id);
+        assert!(ascending, "a job's bricks ascend by id");
+        let view = &job.view;
+        let projected: Vec<_> = job.bricks.iter().map(|b| view.project(&b.tight)).collect();
+        let sheets =
+            projected.iter().flatten().fold(SheetRange::default(), |all, p| all.union(p.sheets));
+        cluster.residency.open(job.scene.bricks, &job.bricks);
+        let mut ledger = Ledger::new(began);
+        for (id, worker) in cluster.roster.iter() {
+            ledger.enrol(id, worker, began);
+        }
+        let mut frame = Frame {
+            began,
+            slabs: sheets.slabs(job.work.slabs),
+            at: 0,
+            state: FrameState::new(view.size),
+            shut: ShutMap::open(Rect::of_size(view.size)),
+            slab: None,
+            first_task: TaskId(cluster.next_task),
+            told: BTreeSet::new(),
+            lent: BTreeMap::new(),
+            needed_ever: vec![false; job.bricks.len()],
+            any_result: false,
+            last_reason: String::new(),
+            ledger,
+            projected,
+            job,
+        };
+        frame.ledger.cull_us += clock.now().saturating_sub(began);
+        frame
+    }
+
+    /// Goes as far as it can.
+    pub(crate) fn step(&mut self, cluster: &mut Cluster, clock: &dyn Clock) -> Step {
+        loop {
+            match &self.slab {
+                Some(slab) if slab.queue.open() > 0 => {
+                    self.dispatch(cluster, clock.now());
+                    return Step::Waits;
+                }
+                Some(slab) => {
+                    let tried = !slab.queue.tasks.is_empty();
+                    self.end_slab(cluster, clock.now());
+                    if tried && !self.any_result {
+                        return Step::Failed(std::mem::take(&mut self.last_reason));
+                    }
+                }
+                None if self.at == self.slabs.len() => return Step::Done,
+                // The level of the quadtree depends on how many there are.
+                None if cluster.roster.threads() == 0 => return Step::Waits,
+                None => self.begin_slab(cluster, clock),
+            }
+        }
+    }
+
+    /// Culls bricks, cuts the slab into macrotiles and sorts them.
+    fn begin_slab(&mut self, cluster: &mut Cluster, clock: &dyn Clock) {
+        let began = clock.now();
+        let sheets = self.slabs[self.at];
+        let cull = self.job.scene.quality.cull;
+        let (mut needed, mut rects) = (Vec::new(), Vec::new());
+        for (i, projected) in self.projected.iter().enumerate() {
+            let Some(p) = projected.filter(|p| p.sheets.overlaps(sheets)) else { continue };
+            if cull && self.shut.all_shut(&p.rect) {
+                self.ledger.counters.culled += u64::from(self.job.bricks[i].voxels);
+                continue;
+            }
+            self.needed_ever[i] = true;
+            needed.push(i as u32);
+            rects.push(p.rect);
+        }
+        let work = &self.job.work;
+        let wanted = (work.tiles_per_worker * cluster.roster.threads() as f64).ceil() as u64;
+        // A slab without bricks has no best level; the coarsest tells it shortest.
+        let forced = work.tile.or(needed.is_empty().then_some(LEAF << (LEVELS - 1)));
+        let size = self.job.view.size;
+        let cut = macrotile::cut(size, &rects, &self.shut, cull, wanted, forced);
+
+        let mut order: Vec<(u32, u32)> =
+            needed.iter().zip(&rects).filter_map(|(&i, r)| Some((cut.first_in(r)?, i))).collect();
+        order.sort_unstable();
+        cluster.residency.round(&needed);
+        let queue = Queue::new(TaskId(cluster.next_task), &cut.tiles);
+        cluster.next_task += cut.tiles.len() as u64;
+        self.slab = Some(Slab {
+            sheets,
+            began,
+            cut,
+            queue,
+            needed,
+            rects,
+            order: order.into_iter().map(|(_, i)| i).collect(),
+            served: BTreeSet::new(),
+            dry: BTreeMap::new(),
+        });
+        self.ledger.cull_us += clock.now().saturating_sub(began);
+    }
+
+    /// The barrier: the picture moves on to the next slab.
+    fn end_slab(&mut self, cluster: &Cluster, now: Micros) {
+        let slab = self.slab.take().expect("a slab that ends has begun");
+        self.state.end_slab();
+        self.shut.refresh();
+        let tile = |task: &crate::queue::Task| {
+            let (worker, us) = match &task.end {
+                End::Done { worker, render_us } => (worker.clone(), *render_us),
+                End::Open | End::Poisoned => (String::new(), 0),
+            };
+            TileStats {
+                x: task.tile.rect.x0 as u32,
+                y: task.tile.rect.y0 as u32,
+                size: slab.cut.edge,
+                est: task.tile.est,
+                ms: ms(us),
+                worker,
+            }
+        };
+        let mut waited = 0;
+        if !slab.queue.tasks.is_empty() {
+            for (id, worker) in cluster.roster.staying() {
+                let mut busy = 0;
+                for (_, end) in slab.dry.range((id, 0)..=(id, u32::MAX)) {
+                    busy += 1;
+                    waited += now.saturating_sub((*end).max(slab.began));
+                }
+                let idle = u64::from(worker.threads).saturating_sub(busy);
+                waited += idle * now.saturating_sub(slab.began.max(worker.since));
+            }
+        }
+        self.ledger.retries += slab.queue.retries;
+        self.ledger.slabs.push(SlabStats {
+            tiles: slab.queue.tasks.iter().map(tile).collect(),
+            empty: slab.cut.empty,
+            shut: slab.cut.shut,
+            barrier_wait_ms: ms(waited),
+        });
+        self.ledger.spans.push(Span {
+            name: format!("slab {}", self.at),
+            category: "slab",
+            worker: None,
+            thread: 0,
+            start: slab.began,
+            end: now,
+            args: vec![
+                ("tiles", slab.queue.tasks.len().to_string()),
+                ("edge", slab.cut.edge.to_string()),
+                ("bricks", slab.needed.len().to_string()),
+            ],
+        });
+        self.at += 1;
+    }
+
+    /// Lends tasks to free threads, and sends bricks.
+    ///
+    /// First every thread gets a task, round robin. Then tasks are lent ahead, so that a thread
+    /// need not wait for a round trip between two (TRANSPORT.md: two in flight a thread hide
+    /// the latency of 64x64 tiles), but not the last ones, as many as there are threads: those
+    /// go one by one to whoever runs dry, since a task that waits behind another on one worker
+    /// can't be taken by an idle one.
+    fn dispatch(&mut self, cluster: &mut Cluster, now: Micros) {
+        let slab = self.slab.as_mut().expect("a slab that is dispatched has begun");
+        let ahead = u64::from(cluster.config.queue_ahead.max(1));
+        let all_threads = cluster.roster.threads();
+        let mut leases: Vec<(WorkerId, u32)> = Vec::new();
+        let mut refused = BTreeSet::new();
+        while slab.queue.waiting() > 0 {
+            let load = |id: WorkerId| self.lent.get(&id).map_or(0, |l| l.len() as u64);
+            let takers = || cluster.roster.staying().filter(|(id, _)| !refused.contains(id));
+            let dry = takers()
+                .filter(|(id, w)| load(*id) < u64::from(w.threads))
+                .min_by_key(|(id, _)| load(*id));
+            let next = dry.or_else(|| {
+                // a/b < c/d as a d < c b.
+                takers()
+                    .filter(|_| slab.queue.waiting() as u64 > all_threads)
+                    .filter(|(id, w)| load(*id) < u64::from(w.threads).saturating_mul(ahead))
+                    .reduce(|a, b| {
+                        let (x, y) = (u128::from(load(a.0)), u128::from(load(b.0)));
+                        let less = y * u128::from(a.1.threads) < x * u128::from(b.1.threads);
+                        if less { b } else { a }
+                    })
+            });
+            let Some((id, _)) = next else { break };
+
+            let lent = self.lent.entry(id).or_default();
+            let mine: Vec<u32> = lent.iter().filter_map(|l| slab.queue.place(l.task)).collect();
+            let others = |task: &crate::queue::Task| {
+                let refused_it = |id| task.failed.iter().any(|(w, ..)| *w == id);
+                cluster.roster.staying().any(|(other, _)| other != id && !refused_it(other))
+            };
+            let suits = |place| {
+                lent.is_empty()
+                    || !cluster.residency.is_lazy(id)
+                    || cluster.residency.fits(id, &slab.bricks_of(place))
+            };
+            let Some(place) = slab.queue.next_for(id, &mine, others, suits) else {
+                refused.insert(id);
+                continue;
+            };
+            let epoch = slab.queue.lease(place, id, now, &cluster.config);
+            let bricks = slab.bricks_of(place);
+            cluster.residency.pin(id, &bricks);
+            cluster.residency.want(id, bricks.iter().copied());
+            lent.push(Lent { task: slab.queue.id(place), epoch, sent: now, bricks });
+            leases.push((id, place));
+        }
+
+        let newcomers: Vec<_> = cluster
+            .roster
+            .staying()
+            .map(|(id, _)| id)
+            .filter(|id| !slab.served.contains(id))
+            .collect();
+        for &id in &newcomers {
+            slab.served.insert(id);
+            if !cluster.residency.is_lazy(id) {
+                cluster.residency.want(id, slab.order.iter().copied());
+            }
+        }
+        let to_flush: BTreeSet<_> =
+            newcomers.into_iter().chain(leases.iter().map(|l| l.0)).collect();
+        for id in to_flush {
+            carry(cluster, Some(&mut self.ledger), id, now);
+        }
+        // Each worker's leases of this round, in the order in which it got them.
+        let mut count = BTreeMap::new();
+        for (id, _) in &leases {
+            *count.entry(*id).or_insert(0usize) += 1;
+        }
+        for (id, place) in leases {
+            let left = count.get_mut(&id).expect("counted above");
+            let lent = &self.lent[&id];
+            let lent = &lent[lent.len() - *left];
+            *left -= 1;
+            if self.told.insert(id) {
+                let scene = &self.job.scene;
+                let worker = cluster.roster.get_mut(id).expect("it was just lent a task");
+                if worker.scenes.insert(scene.id) {
+                    cluster.send(id, ToWorker::Scene(scene.clone()));
+                }
+                let view = self.job.view;
+                let message = ToWorker::Frame { frame: self.job.frame, scene: scene.id, view };
+                cluster.send(id, message);
+            }
+            let tile = slab.cut.tiles[place as usize].rect;
+            let name = |&i: &u32| -> BrickId { self.job.bricks[i as usize].id };
+            let lease = Lease {
+                task: lent.task,
+                epoch: lent.epoch,
+                frame: self.job.frame,
+                tile,
+                slab: slab.sheets,
+                bricks: lent.bricks.iter().map(name).collect(),
+                state: self.state.tile(tile),
+            };
+            cluster.send(id, ToWorker::Lease(Box::new(lease)));
+        }
+    }
+
+    /// Takes back a lease that its worker answered. `None`: it has no such lease.
+    fn answered(
+        &mut self,
+        cluster: &mut Cluster,
+        worker: WorkerId,
+        task: TaskId,
+        epoch: Epoch,
+    ) -> Option<Lent> {
+        let lent = self.lent.get_mut(&worker)?;
+        let at = lent.iter().position(|l| l.task == task && l.epoch == epoch)?;
+        let lent = lent.remove(at);
+        cluster.residency.unpin(worker, &lent.bricks);
+        Some(lent)
+    }
+
+    /// A result came. An error is the worker's lie.
+    pub(crate) fn result(
+        &mut self,
+        cluster: &mut Cluster,
+        worker: WorkerId,
+        result: &TileResult,
+        clock: &dyn Clock,
+    ) -> Result<(), String> {
+        let now = clock.now();
+        let lent = self.answered(cluster, worker, result.task, result.epoch);
+        let verdict = match &self.slab {
+            Some(slab) if lent.is_some() => slab.queue.judge(result.task, result.epoch, worker),
+            _ => Verdict::Dead,
+        };
+        let Verdict::Counts(place, lease) = verdict else {
+            cluster.totals.dropped_results += 1;
+            if result.task >= self.first_task {
+                self.ledger.dropped_results += 1;
+            }
+            return Ok(());
+        };
+        let slab = self.slab.as_mut().expect("a lease that counts is of this slab");
+        let tile = slab.cut.tiles[place as usize].rect;
+        if let Err(lie) = check(tile, &result.pixels) {
+            // Its other leases go back when it is dropped; this one it has just answered.
+            let given_up =
+                slab.queue.lose(worker, "", &[(place, result.epoch)], 0, &cluster.config);
+            self.give_up(given_up);
+            return Err(lie);
+        }
+
+        self.state.put(tile, &result.pixels);
+        let width = self.job.view.size[0] as usize;
+        let eps = self.job.scene.quality.eps;
+        if eps > 0.0 {
+            for (row, y) in result.pixels.a.chunks(tile.width()).zip(tile.y0..) {
+                for (&a, x) in row.iter().zip(tile.x0..) {
+                    if is_shut(a, eps) {
+                        self.shut.shut(y as usize * width + x as usize);
+                    }
+                }
+            }
+        }
+        self.any_result = true;
+        self.ledger.composite_us += clock.now().saturating_sub(now);
+
+        let who = cluster.roster.get(worker).expect("a worker whose result came is known");
+        let r = place_in_time(who, &result.times, lease.sent, now);
+        self.ledger.rendered(worker, &r, &result.counters);
+        let thread = result.times.thread.min(who.threads - 1);
+        let dry = slab.dry.entry((worker, thread)).or_insert(r.end);
+        *dry = r.end.max(*dry);
+        let Rendered { start, end, .. } = r;
+        self.ledger.spans.push(Span {
+            name: format!("{},{}", tile.x0, tile.y0),
+            category: "tile",
+            worker: Some(who.name.clone()),
+            thread,
+            start,
+            end,
+            args: vec![
+                ("slab", self.at.to_string()),
+                ("edge", slab.cut.edge.to_string()),
+                ("est", slab.cut.tiles[place as usize].est.to_string()),
+                ("bricks", lent.map_or(0, |l| l.bricks.len()).to_string()),
+                ("attempt", result.epoch.0.to_string()),
+            ],
+        });
+        slab.queue.finish(place, End::Done { worker: who.name.clone(), render_us: end - start });
+        self.progress(cluster);
+        Ok(())
+    }
+
+    fn progress(&self, cluster: &mut Cluster) {
+        let Some(slab) = &self.slab else { return };
+        let total = slab.queue.tasks.len() as u32;
+        cluster.out.push_back(Action::Progress {
+            frame: self.job.frame,
+            done: total - slab.queue.open(),
+            total,
+            slab: self.at as u32,
+            slabs: self.slabs.len() as u32,
+        });
+    }
+
+    /// A worker can't do a task.
+    pub(crate) fn failed(
+        &mut self,
+        cluster: &mut Cluster,
+        worker: WorkerId,
+        task: TaskId,
+        epoch: Epoch,
+        reason: String,
+    ) {
+        if self.answered(cluster, worker, task, epoch).is_none() {
+            return;
+        }
+        let Some(slab) = &mut self.slab else { return };
+        let Verdict::Counts(place, _) = slab.queue.judge(task, epoch, worker) else { return };
+        let name = cluster.roster.get(worker).map_or("", |w| &w.name);
+        let given_up = slab.queue.fail(place, epoch, worker, name, reason, &cluster.config);
+        self.give_up(given_up);
+        self.progress(cluster);
+    }
+
+    /// These tasks are given up: their pixels stay as the slabs before left them.
+    fn give_up(&mut self, places: Vec<u32>) {
+        for place in places {
+            let slab = self.slab.as_mut().expect("a task that is given up is of this slab");
+            slab.queue.finish(place, End::Poisoned);
+            let task = &slab.queue.tasks[place as usize];
+            let rect = task.tile.rect;
+            let mut workers: Vec<String> = task.blamed.iter().map(|(_, n)| n.clone()).collect();
+            workers.extend(task.failed.iter().map(|(_, n, _)| n.clone()));
+            let mut reasons: Vec<String> = Vec::new();
+            if !task.blamed.is_empty() {
+                reasons.push(format!("{} workers were lost with it", task.blamed.len()));
+            }
+            reasons.extend(task.failed.iter().map(|(_, n, reason)| format!("{n}: {reason}")));
+            let reason = reasons.join("; ");
+            self.ledger.poisoned.push(PoisonedTile {
+                slab: self.at as u32,
+                x: rect.x0 as u32,
+                y: rect.y0 as u32,
+                size: slab.cut.edge,
+                workers: workers.clone(),
+            });
+            self.ledger.spans.push(Span {
+                name: format!("{},{} given up", rect.x0, rect.y0),
+                category: "tile",
+                worker: None,
+                thread: 0,
+                start: slab.began,
+                end: slab.began,
+                args: vec![("workers", workers.join(", ")), ("reason", reason.clone())],
+            });
+            self.last_reason = format!(
+                "no tile could be rendered; tile {},{} of slab {}: {reason}",
+                rect.x0, rect.y0, self.at,
+            );
+        }
+    }
+
+    /// A worker came.
+    pub(crate) fn joined(&mut self, cluster: &Cluster, id: WorkerId, now: Micros) {
+        if let Some(worker) = cluster.roster.get(id) {
+            self.ledger.enrol(id, worker, now);
+        }
+    }
+
+    /// Leases of this slab that a worker has, in the order in which it got them, and how many
+    /// of them it is probably running.
+    fn probably(&self, id: WorkerId, threads: u32) -> (Vec<(u32, Epoch)>, usize) {
+        let Some(slab) = &self.slab else { return (Vec::new(), 0) };
+        let mut running = 0;
+        let mut leases = Vec::new();
+        for (i, lent) in self.lent.get(&id).into_iter().flatten().enumerate() {
+            if let Some(place) = slab.queue.place(lent.task) {
+                leases.push((place, lent.epoch));
+                running += usize::from(i < threads as usize);
+            }
+        }
+        (leases, running)
+    }
+
+    /// A worker leaves when it has done what it has begun.
+    pub(crate) fn leaving(&mut self, id: WorkerId, threads: u32) {
+        let (leases, running) = self.probably(id, threads);
+        if let Some(slab) = &mut self.slab {
+            let not_begun: Vec<_> = leases[running..].iter().map(|l| l.0).collect();
+            slab.queue.pass_on(&not_begun);
+        }
+    }
+
+    /// A worker is gone. `blame` says whether a task may have killed it. The caller has not
+    /// taken its bricks off the books yet.
+    pub(crate) fn lost(
+        &mut self,
+        cluster: &mut Cluster,
+        id: WorkerId,
+        worker: &crate::roster::Worker,
+        blame: bool,
+        now: Micros,
+    ) {
+        let (leases, running) = self.probably(id, worker.threads);
+        self.lent.remove(&id);
+        self.told.remove(&id);
+        if let Some(flight) = cluster.residency.flight(id) {
+            self.ledger.landed(id, flight, now);
+        }
+        self.ledger.leave(id, now);
+        if let Some(slab) = &mut self.slab {
+            let running = if blame { running } else { 0 };
+            let given_up = slab.queue.lose(id, &worker.name, &leases, running, &cluster.config);
+            self.give_up(given_up);
+        }
+    }
+
+    /// Bricks to a worker were under way until now.
+    pub(crate) fn landed(&mut self, id: WorkerId, flight: Flight, now: Micros) {
+        self.ledger.landed(id, flight, now);
+    }
+
+    /// Time went on.
+    pub(crate) fn tick(&mut self, now: Micros) {
+        if let Some(slab) = &mut self.slab {
+            slab.queue.overdue(now);
+        }
+    }
+
+    /// The next lease deadline.
+    pub(crate) fn next_deadline(&self) -> Option<Micros> {
+        self.slab.as_ref().and_then(|s| s.queue.next_deadline())
+    }
+
+    /// Leases that a worker has.
+    pub(crate) fn leases(&self, id: WorkerId) -> u32 {
+        self.lent.get(&id).map_or(0, |l| l.len() as u32)
+    }
+
+    /// The frame is over, in whatever way: workers forget it.
+    pub(crate) fn end(&mut self, cluster: &mut Cluster) {
+        for (id, lent) in std::mem::take(&mut self.lent) {
+            for lent in lent {
+                cluster.residency.unpin(id, &lent.bricks);
+            }
+        }
+        for id in std::mem::take(&mut self.told) {
+            cluster.send(id, ToWorker::EndFrame { frame: self.job.frame });
+        }
+    }
+
+    /// The finished picture with what it cost.
+    pub(crate) fn finish(mut self, cluster: &mut Cluster, now: Micros) -> Action {
+        for (id, flight) in cluster.residency.cut_flights(now) {
+            if flight.since < now {
+                self.ledger.landed(id, flight, now);
+            }
+        }
+        for (id, _) in cluster.roster.iter() {
+            self.ledger.holds(id, cluster.residency.held_of_current(id));
+        }
+        let mut bricks =
+            BrickStats { relevant: self.job.bricks.len() as u64, ..BrickStats::default() };
+        for (info, _) in self.job.bricks.iter().zip(&self.needed_ever).filter(|(_, n)| **n) {
+            bricks.needed += 1;
+            bricks.needed_voxels += u64::from(info.voxels);
+        }
+        let relevant = self.job.bricks.iter().map(|b| u64::from(b.voxels)).sum();
+        let quality = self.job.scene.quality;
+        let (stats, spans) = self.ledger.close(self.job.number, quality, relevant, bricks, now);
+        let frame = self.job.frame;
+        Action::FrameDone { frame, state: Box::new(self.state), stats: Box::new(stats), spans }
+    }
+}
+
+/// Sends a worker what it is to be sent, and tells it what to drop.
+pub(crate) fn carry(
+    cluster: &mut Cluster,
+    mut ledger: Option<&mut Ledger>,
+    id: WorkerId,
+    now: Micros,
+) {
+    let roster = &mut cluster.roster;
+    let errands = cluster.residency.flush(id, now, &mut || roster.ping(id, now));
+    for errand in errands {
+        match errand {
+            Errand::Drop { set, bricks, nonce } => {
+                cluster.send(id, ToWorker::DropBricks { set, bricks });
+                cluster.send(id, ToWorker::Ping { nonce });
+            }
+            Errand::Send { set, bricks, bytes, over_budget } => {
+                if let Some(ledger) = &mut ledger {
+                    ledger.sent(id, bricks.len() as u64, bytes);
+                }
+                cluster.totals.over_budget += u64::from(over_budget);
+                cluster.out.push_back(Action::SendBricks { worker: id, set, bricks });
+            }
+        }
+    }
+}
+
+/// Whether a stranger's pixels are those of a tile.
+fn check(tile: Rect, pixels: &TilePixels) -> Result<(), String> {
+    let n = tile.area();
+    let plane = |name: &str, len: usize| {
+        if len == n {
+            Ok(())
+        } else {
+            Err(format!("a result's {name} plane has {len} pixels, its tile {n}"))
+        }
+    };
+    plane("a", pixels.a.len())?;
+    plane("colour", pixels.colour.len())?;
+    if let Some(last) = &pixels.last {
+        plane("last", last.len())?;
+    }
+    if !pixels.a.iter().all(|a| a.is_finite()) {
+        return Err("a result's a plane has a number that is not finite".into());
+    }
+    Ok(())
+}

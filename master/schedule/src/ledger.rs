@@ -1,0 +1,276 @@
+//! What a frame cost: intervals and counts as they come, CONTRACTS.md's statistics at the end.
+//!
+//! Times of two machines meet here. A worker's clock is brought to the master's by its offset
+//! (`roster`), and then cut to what the master knows for sure: a task was rendered between the
+//! lease's going and the result's coming. So no figure is negative or longer than it can be,
+//! whatever a worker's clock does.
+
+use crate::residency::Flight;
+use crate::roster::Worker;
+use crate::{Micros, Span};
+use slabcast_common::PIXELS_VERSION;
+use slabcast_common::ids::WorkerId;
+use slabcast_common::message::{Counters, TaskTimes};
+use slabcast_common::quality::Quality;
+use slabcast_common::stats::{
+    BrickStats, ErrorStats, FrameMs, FrameStats, PoisonedTile, SlabStats, VoxelStats, WorkerStats,
+};
+use std::collections::BTreeMap;
+
+/// Times `[start, end)` on the master's clock.
+type Interval = (Micros, Micros);
+
+/// One worker's part.
+#[derive(Debug)]
+struct Account {
+    name: String,
+    threads: u32,
+    from: Micros,
+    until: Option<Micros>,
+    render_us: Micros,
+    p2p_us: Micros,
+    renders: Vec<Interval>,
+    flights: Vec<Interval>,
+    held: (u64, u64),
+    bricks_sent: u64,
+    bytes_sent: u64,
+}
+
+/// The books of one frame.
+#[derive(Debug)]
+pub(crate) struct Ledger {
+    began: Micros,
+    pub(crate) cull_us: Micros,
+    pub(crate) composite_us: Micros,
+    accounts: BTreeMap<WorkerId, Account>,
+    pub(crate) counters: Counters,
+    pub(crate) slabs: Vec<SlabStats>,
+    pub(crate) spans: Vec<Span>,
+    pub(crate) retries: u64,
+    pub(crate) dropped_results: u64,
+    pub(crate) poisoned: Vec<PoisonedTile>,
+}
+
+/// Where a task's rendering lies on the master's clock.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Rendered {
+    pub(crate) start: Micros,
+    pub(crate) end: Micros,
+    pub(crate) p2p_us: Micros,
+}
+
+/// Brings a task's times to the master's clock, between its lease and its result.
+pub(crate) fn place_in_time(
+    worker: &Worker,
+    times: &TaskTimes,
+    sent: Micros,
+    came: Micros,
+) -> Rendered {
+    let window = came.saturating_sub(sent);
+    let lasted = times.end_us.saturating_sub(times.start_us).min(window);
+    let there = times.end_us.saturating_sub(times.received_us).min(window);
+    let end = worker.to_master(times.end_us).unwrap_or(came).clamp(sent + lasted, sent + window);
+    Rendered { start: end - lasted, end, p2p_us: window - there }
+}
+
+impl Ledger {
+    pub(crate) fn new(began: Micros) -> Self {
+        Ledger {
+            began,
+            cull_us: 0,
+            composite_us: 0,
+            accounts: BTreeMap::new(),
+            counters: Counters::default(),
+            slabs: Vec::new(),
+            spans: Vec::new(),
+            retries: 0,
+            dropped_results: 0,
+            poisoned: Vec::new(),
+        }
+    }
+
+    /// A worker takes part from now on.
+    pub(crate) fn enrol(&mut self, id: WorkerId, worker: &Worker, now: Micros) {
+        self.accounts.entry(id).or_insert_with(|| Account {
+            name: worker.name.clone(),
+            threads: worker.threads,
+            from: now,
+            until: None,
+            render_us: 0,
+            p2p_us: 0,
+            renders: Vec::new(),
+            flights: Vec::new(),
+            held: (0, 0),
+            bricks_sent: 0,
+            bytes_sent: 0,
+        });
+    }
+
+    /// A worker takes part no longer.
+    pub(crate) fn leave(&mut self, id: WorkerId, now: Micros) {
+        if let Some(a) = self.accounts.get_mut(&id) {
+            a.until = Some(now);
+        }
+    }
+
+    pub(crate) fn rendered(&mut self, id: WorkerId, r: &Rendered, counters: &Counters) {
+        self.counters += *counters;
+        if let Some(a) = self.accounts.get_mut(&id) {
+            a.render_us += r.end - r.start;
+            a.p2p_us += r.p2p_us;
+            a.renders.push((r.start, r.end));
+        }
+    }
+
+    pub(crate) fn sent(&mut self, id: WorkerId, bricks: u64, bytes: u64) {
+        if let Some(a) = self.accounts.get_mut(&id) {
+            a.bricks_sent += bricks;
+            a.bytes_sent += bytes;
+        }
+    }
+
+    /// Bricks were on their way to a worker without a pause until now.
+    pub(crate) fn landed(&mut self, id: WorkerId, flight: Flight, now: Micros) {
+        let Some(a) = self.accounts.get_mut(&id) else { return };
+        let start = flight.since.max(self.began).min(now);
+        a.flights.push((start, now));
+        self.spans.push(Span {
+            name: format!("{} bricks", flight.bricks),
+            category: "bricks",
+            worker: Some(a.name.clone()),
+            thread: 0,
+            start,
+            end: now,
+            args: vec![("bytes", flight.bytes.to_string())],
+        });
+    }
+
+    pub(crate) fn holds(&mut self, id: WorkerId, held: (u64, u64)) {
+        if let Some(a) = self.accounts.get_mut(&id) {
+            a.held = held;
+        }
+    }
+
+    /// The frame is done.
+    pub(crate) fn close(
+        mut self,
+        number: u64,
+        quality: Quality,
+        relevant_voxels: u64,
+        bricks: BrickStats,
+        now: Micros,
+    ) -> (FrameStats, Vec<Span>) {
+        let flights = union(self.accounts.values().flat_map(|a| &a.flights).copied().collect());
+        let renders = union(self.accounts.values().flat_map(|a| &a.renders).copied().collect());
+        let mut workers: Vec<_> = self
+            .accounts
+            .into_values()
+            .map(|a| {
+                let present = a.until.unwrap_or(now).saturating_sub(a.from);
+                let threads_us = present.saturating_mul(u64::from(a.threads));
+                WorkerStats {
+                    id: a.name,
+                    render_ms: ms(a.render_us),
+                    distribute_ms: ms(length(&union(a.flights))),
+                    p2p_ms: ms(a.p2p_us),
+                    wait_ms: ms(threads_us.saturating_sub(a.render_us)),
+                    bricks_held: a.held.0,
+                    bytes_held: a.held.1,
+                    bricks_sent: a.bricks_sent,
+                    bytes_sent: a.bytes_sent,
+                }
+            })
+            .collect();
+        workers.sort_by(|a, b| a.id.cmp(&b.id));
+        self.spans.push(Span {
+            name: format!("frame {number}"),
+            category: "frame",
+            worker: None,
+            thread: 0,
+            start: self.began,
+            end: now,
+            args: Vec::new(),
+        });
+        let stats = FrameStats {
+            v: 1,
+            frame: number,
+            view_sha256: String::new(),
+            pixels_sha256: String::new(),
+            pixels_version: PIXELS_VERSION,
+            ms: FrameMs {
+                total: ms(now.saturating_sub(self.began)),
+                cull: ms(self.cull_us),
+                distribute: ms(length(&flights)),
+                render: workers.iter().map(|w| w.render_ms).sum(),
+                composite: ms(self.composite_us),
+                wait: self.slabs.iter().map(|s| s.barrier_wait_ms).sum(),
+                overlap: ms(length(&both(&flights, &renders))),
+            },
+            workers,
+            voxels: VoxelStats {
+                relevant: relevant_voxels,
+                tossed: self.counters.tossed,
+                splatted: self.counters.splatted,
+                culled: self.counters.culled,
+            },
+            bricks,
+            slabs: self.slabs,
+            quality,
+            left_out: Vec::new(),
+            error: ErrorStats::default(),
+            retries: self.retries,
+            dropped_results: self.dropped_results,
+            poisoned: self.poisoned,
+        };
+        (stats, self.spans)
+    }
+}
+
+/// Milliseconds.
+pub(crate) fn ms(us: Micros) -> f64 {
+    us as f64 / 1000.0
+}
+
+/// The intervals joined where they overlap, ascending.
+fn union(mut intervals: Vec<Interval>) -> Vec<Interval> {
+    intervals.sort_unstable();
+    let mut out: Vec<Interval> = Vec::new();
+    for (start, end) in intervals {
+        match out.last_mut() {
+            Some(last) if start <= last.1 => last.1 = last.1.max(end),
+            _ => out.push((start, end)),
+        }
+    }
+    out
+}
+
+/// What two unions share.
+fn both(a: &[Interval], b: &[Interval]) -> Vec<Interval> {
+    let (mut i, mut j) = (0, 0);
+    let mut out = Vec::new();
+    while i < a.len() && j < b.len() {
+        let (start, end) = (a[i].0.max(b[j].0), a[i].1.min(b[j].1));
+        if start < end {
+            out.push((start, end));
+        }
+        if a[i].1 < b[j].1 { i += 1 } else { j += 1 }
+    }
+    out
+}
+
+fn length(intervals: &[Interval]) -> Micros {
+    intervals.iter().map(|(start, end)| end - start).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn intervals_are_joined_and_shared() {
+        let a = union(vec![(5, 9), (0, 2), (1, 3), (9, 10)]);
+        assert_eq!(a, [(0, 3), (5, 10)]);
+        assert_eq!(both(&a, &[(2, 6), (7, 8), (20, 30)]), [(2, 3), (5, 6), (7, 8)]);
+        assert_eq!(length(&a), 8);
+    }
+}

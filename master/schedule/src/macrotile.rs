@@ -1,0 +1,347 @@
+//! Macrotiles: where a slab is cut, and how much work each piece is (paper section 4.3).
+//!
+//! A quadtree over the picture with leaves of 16x16 pixels, built bottom-up; a tile is empty,
+//! shut or to be rendered. Its workload is the number of its open pixels under at least one
+//! needed brick's rectangle.
+//!
+//! The paper tells neither how the pixels under a union of rectangles are counted nor what it
+//! costs. Painting each rectangle costs its area, and a brick magnified over the whole picture
+//! makes that bricks x pixels. Here one pass over the rows carries a difference line: a
+//! rectangle adds 1 at its left edge when its first row comes and takes it back after its last,
+//! and a running sum along the line says how many rectangles lie over each pixel. That is
+//! rectangles + pixels, in integers, with one line of memory beside the leaves' counts.
+
+use slabcast_common::occlusion::{Rect, ShutMap};
+
+/// Edge of a quadtree leaf in pixels (the paper's choice).
+pub const LEAF: u32 = 16;
+
+/// Levels of the quadtree: 16, 32, 64, 128 and 256 pixels. The paper saw "only around three
+/// levels"; a tile of 512 has a state of 5 MiB on the wire, and one render thread would hold
+/// up the slab with it.
+pub const LEVELS: usize = 5;
+
+/// A tile of the level that was chosen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Macrotile {
+    /// Its pixels, clipped to the picture.
+    pub rect: Rect,
+    /// Open pixels under needed bricks.
+    pub est: u64,
+}
+
+/// How one slab is cut.
+#[derive(Clone, Debug)]
+pub struct Cut {
+    /// Edge of the level's tiles in pixels.
+    pub edge: u32,
+    /// Tiles to render, largest workload first; equal ones from the top left.
+    pub tiles: Vec<Macrotile>,
+    /// Tiles of the level in which no open pixel lies under a needed brick.
+    pub empty: u64,
+    /// Tiles of the level with no open pixel left.
+    pub shut: u64,
+    /// For each level from `edge` up, row-major: the first place in `tiles` of a tile in it.
+    first: Vec<Grid<u32>>,
+}
+
+#[derive(Clone, Debug)]
+struct Grid<T> {
+    columns: usize,
+    rows: usize,
+    cells: Vec<T>,
+}
+
+impl<T: Copy> Grid<T> {
+    fn new(columns: usize, rows: usize, value: T) -> Self {
+        Grid { columns, rows, cells: vec![value; columns * rows] }
+    }
+
+    /// The grid of half as many columns and rows; `join` puts children into their parent.
+    fn parent(&self, start: T, join: impl Fn(T, T) -> T) -> Self {
+        let mut up = Grid::new(self.columns.div_ceil(2), self.rows.div_ceil(2), start);
+        for y in 0..self.rows {
+            for x in 0..self.columns {
+                let cell = &mut up.cells[y / 2 * up.columns + x / 2];
+                *cell = join(*cell, self.cells[y * self.columns + x]);
+            }
+        }
+        up
+    }
+}
+
+/// Pixels of a quadtree node.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Node {
+    /// Under a needed brick.
+    covered: u64,
+    /// Under a needed brick, and open.
+    open: u64,
+}
+
+/// Counts covered and open covered pixels of every leaf.
+fn leaves(size: [u32; 2], rects: &[Rect], shut: &ShutMap) -> Grid<Node> {
+    let [w, h] = size.map(|n| n as usize);
+    let leaf = LEAF as usize;
+    let mut grid = Grid::new(w.div_ceil(leaf), h.div_ceil(leaf), Node::default());
+    // Rectangles by first row, and by the row after their last.
+    let mut begins: Vec<u32> = (0..rects.len() as u32).collect();
+    begins.sort_by_key(|&i| rects[i as usize].y0);
+    let mut ends: Vec<u32> = (0..rects.len() as u32).collect();
+    ends.sort_by_key(|&i| rects[i as usize].y1);
+    let (mut begin, mut end) = (0, 0);
+    let mut line = vec![0i32; w + 1];
+    for y in 0..h {
+        while begin < begins.len() && rects[begins[begin] as usize].y0 <= y as i32 {
+            let r = &rects[begins[begin] as usize];
+            line[r.x0 as usize] += 1;
+            line[r.x1 as usize] -= 1;
+            begin += 1;
+        }
+        while end < ends.len() && rects[ends[end] as usize].y1 <= y as i32 {
+            let r = &rects[ends[end] as usize];
+            line[r.x0 as usize] -= 1;
+            line[r.x1 as usize] += 1;
+            end += 1;
+        }
+        if begin == end {
+            continue;
+        }
+        let mut over = 0;
+        for column in 0..grid.columns {
+            let node = &mut grid.cells[y / leaf * grid.columns + column];
+            let (x0, x1) = (column * leaf, ((column + 1) * leaf).min(w));
+            for x in x0..x1 {
+                over += line[x];
+                let covered = u64::from(over > 0);
+                node.covered += covered;
+                node.open += covered & u64::from(!shut.is_shut(y * w + x));
+            }
+        }
+    }
+    grid
+}
+
+/// Cuts a slab: chooses the coarsest level at which more than `wanted` tiles are to be
+/// rendered, or `forced`, and lists its tiles.
+///
+/// `rects` are those of the needed bricks, inside the picture. With `cull` off, a tile with
+/// bricks is rendered even when it is shut.
+pub fn cut(
+    size: [u32; 2],
+    rects: &[Rect],
+    shut: &ShutMap,
+    cull: bool,
+    wanted: u64,
+    forced: Option<u32>,
+) -> Cut {
+    let to_render = |n: &Node| if cull { n.open > 0 } else { n.covered > 0 };
+    let mut tree = vec![leaves(size, rects, shut)];
+    for level in 1..LEVELS {
+        let join =
+            |a: Node, b: Node| Node { covered: a.covered + b.covered, open: a.open + b.open };
+        let up = tree[level - 1].parent(Node::default(), join);
+        tree.push(up);
+    }
+    let level = match forced {
+        Some(edge) => {
+            let level = (0..LEVELS).find(|&l| LEAF << l == edge);
+            level.expect("Work::check lets only quadtree levels through")
+        }
+        None => (0..LEVELS)
+            .rev()
+            .find(|&l| tree[l].cells.iter().filter(|n| to_render(n)).count() as u64 > wanted)
+            .unwrap_or(0),
+    };
+    let edge = LEAF << level;
+    let grid = &tree[level];
+    let picture = Rect::of_size(size);
+    let (mut empty, mut all_shut) = (0, 0);
+    let mut tiles = Vec::new();
+    for y in 0..grid.rows {
+        for x in 0..grid.columns {
+            let (x0, y0) = (x as i32 * edge as i32, y as i32 * edge as i32);
+            let rect = Rect::new(x0, y0, x0 + edge as i32, y0 + edge as i32).intersect(&picture);
+            let node = &grid.cells[y * grid.columns + x];
+            if to_render(node) {
+                tiles.push(Macrotile { rect, est: node.open });
+            } else if shut.all_shut(&rect) {
+                all_shut += 1;
+            } else {
+                empty += 1;
+            }
+        }
+    }
+    // Stable: equal workloads stay in the order of the picture.
+    tiles.sort_by_key(|t| std::cmp::Reverse(t.est));
+    let mut first = vec![Grid::new(grid.columns, grid.rows, u32::MAX)];
+    for (place, tile) in tiles.iter().enumerate() {
+        let (x, y) = (tile.rect.x0 as usize >> edge.ilog2(), tile.rect.y0 as usize >> edge.ilog2());
+        first[0].cells[y * grid.columns + x] = place as u32;
+    }
+    while first.last().is_some_and(|g| g.cells.len() > 1) {
+        let up = first.last().expect("there is one").parent(u32::MAX, u32::min);
+        first.push(up);
+    }
+    Cut { edge, tiles, empty, shut: all_shut, first }
+}
+
+impl Cut {
+    /// The first place in `tiles` of a tile that `rect` (not empty, inside the picture) touches.
+    /// Descends the quadtree and turns back where nothing better can lie below, so a brick over
+    /// the whole picture costs one look and not one for every tile.
+    pub fn first_in(&self, rect: &Rect) -> Option<u32> {
+        let mut best = u32::MAX;
+        let top = self.first.len() - 1;
+        let mut stack = vec![(top, 0usize, 0usize)];
+        while let Some((level, x, y)) = stack.pop() {
+            let grid = &self.first[level];
+            let here = grid.cells[y * grid.columns + x];
+            if here >= best {
+                continue;
+            }
+            let edge = i64::from(self.edge) << level;
+            let (x0, y0) = (x as i64 * edge, y as i64 * edge);
+            let (rx0, ry0) = (i64::from(rect.x0), i64::from(rect.y0));
+            let (rx1, ry1) = (i64::from(rect.x1), i64::from(rect.y1));
+            if rx1 <= x0 || ry1 <= y0 || x0 + edge <= rx0 || y0 + edge <= ry0 {
+                continue;
+            }
+            let inside = rx0 <= x0 && ry0 <= y0 && x0 + edge <= rx1 && y0 + edge <= ry1;
+            if level == 0 || inside {
+                best = here;
+                continue;
+            }
+            let below = &self.first[level - 1];
+            for (cx, cy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+                let (cx, cy) = (2 * x + cx, 2 * y + cy);
+                if cx < below.columns && cy < below.rows {
+                    stack.push((level - 1, cx, cy));
+                }
+            }
+        }
+        (best != u32::MAX).then_some(best)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn open(size: [u32; 2]) -> ShutMap {
+        ShutMap::open(Rect::of_size(size))
+    }
+
+    #[test]
+    fn the_coarsest_level_with_more_tiles_than_wanted_is_chosen() {
+        // 512x512, all covered: 4 tiles of 256, 16 of 128, 64 of 64, 256 of 32, 1024 of 16.
+        let size = [512, 512];
+        let all = [Rect::of_size(size)];
+        let edge = |wanted| cut(size, &all, &open(size), true, wanted, None).edge;
+        assert_eq!(edge(0), 256);
+        assert_eq!(edge(3), 256);
+        assert_eq!(edge(4), 128, "more than wanted, not as many");
+        assert_eq!(edge(15), 128);
+        assert_eq!(edge(16), 64);
+        assert_eq!(edge(255), 32);
+        assert_eq!(edge(256), 16);
+        assert_eq!(edge(100_000), 16, "the leaves, when even they are too few");
+        assert_eq!(cut(size, &all, &open(size), true, 0, Some(64)).tiles.len(), 64);
+    }
+
+    #[test]
+    fn empty_and_shut_tiles_have_no_task() {
+        // 64x48 in tiles of 16: 4 x 3. One brick over the two left columns of the top row; the
+        // first tile of it is shut, and so is one tile without a brick.
+        let size = [64, 48];
+        let mut shut = open(size);
+        for y in 0..16 {
+            for x in (0..16).chain(48..64) {
+                shut.shut(y * 64 + x);
+            }
+        }
+        shut.refresh();
+        let brick = [Rect::new(0, 0, 20, 16)];
+        let c = cut(size, &brick, &shut, true, 1000, None);
+        let tile = Macrotile { rect: Rect::new(16, 0, 32, 16), est: 4 * 16 };
+        assert_eq!((c.edge, c.tiles, c.empty, c.shut), (16, vec![tile], 9, 2));
+        let c = cut(size, &brick, &shut, false, 1000, None);
+        assert_eq!(c.tiles.len(), 2, "without culling a shut tile with bricks is rendered");
+        assert_eq!(c.tiles[1].est, 0);
+    }
+
+    #[test]
+    fn border_tiles_are_clipped_and_the_queue_is_sorted() {
+        let size = [40, 20];
+        let c = cut(size, &[Rect::of_size(size)], &open(size), true, 0, Some(16));
+        let got: Vec<_> = c.tiles.iter().map(|t| (t.rect.x0, t.rect.y0, t.est)).collect();
+        let want =
+            [(0, 0, 256), (16, 0, 256), (32, 0, 128), (0, 16, 64), (16, 16, 64), (32, 16, 32)];
+        assert_eq!(got, want);
+        assert!(c.tiles.iter().all(|t| t.rect.area() as u64 == t.est));
+    }
+
+    #[test]
+    fn the_largest_picture_takes_one_pass() {
+        // A row of leaves in 8192 columns: nothing depends on the number of pixels a brick
+        // covers, or on that of its tiles.
+        let size = [8192, 64];
+        let all = vec![Rect::of_size(size); 20_000];
+        let c = cut(size, &all, &open(size), true, 0, Some(16));
+        assert_eq!(c.tiles.len(), 512 * 4);
+        assert!(all.iter().all(|r| c.first_in(r) == Some(0)));
+    }
+
+    fn rects(w: i32, h: i32) -> impl Strategy<Value = Vec<Rect>> {
+        let one = (0..w, 0..h, 1..=w, 1..=h)
+            .prop_map(move |(x, y, dx, dy)| Rect::new(x, y, (x + dx).min(w), (y + dy).min(h)));
+        prop::collection::vec(one, 0..12)
+    }
+
+    proptest! {
+        #[test]
+        fn workload_equals_counting(
+            (w, h, rects) in (1i32..90, 1i32..70)
+                .prop_flat_map(|(w, h)| (Just(w), Just(h), rects(w, h))),
+            bits in prop::collection::vec(any::<bool>(), 6300),
+            level in 0u32..5, cull in any::<bool>(),
+        ) {
+            let size = [w as u32, h as u32];
+            let mut shut = open(size);
+            for i in 0..(w * h) as usize {
+                if bits[i] { shut.shut(i); }
+            }
+            shut.refresh();
+            let edge = (16 << level) as i32;
+            let c = cut(size, &rects, &shut, cull, 0, Some(edge as u32));
+            let (mut tiles, mut total) = (Vec::new(), 0);
+            for y0 in (0..h).step_by(edge as usize) {
+                for x0 in (0..w).step_by(edge as usize) {
+                    total += 1;
+                    let rect = Rect::new(x0, y0, (x0 + edge).min(w), (y0 + edge).min(h));
+                    let (mut est, mut covered) = (0, 0);
+                    for y in rect.y0..rect.y1 {
+                        for x in rect.x0..rect.x1 {
+                            let under = rects.iter().any(|r| {
+                                r.x0 <= x && x < r.x1 && r.y0 <= y && y < r.y1
+                            });
+                            covered += u64::from(under);
+                            est += u64::from(under && !bits[(y * w + x) as usize]);
+                        }
+                    }
+                    if est > 0 || (!cull && covered > 0) {
+                        tiles.push(Macrotile { rect, est });
+                    }
+                }
+            }
+            tiles.sort_by_key(|t| std::cmp::Reverse(t.est));
+            prop_assert_eq!(&c.tiles, &tiles);
+            prop_assert_eq!(c.empty + c.shut + tiles.len() as u64, total);
+            for r in &rects {
+                let want = tiles.iter().position(|t| !t.rect.intersect(r).is_empty());
+                prop_assert_eq!(c.first_in(r), want.map(|p| p as u32));
+            }
+        }
+    }
+}

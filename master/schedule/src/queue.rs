@@ -1,0 +1,428 @@
+//! The task queue of one slab: largest first, and leases with attempt epochs.
+//!
+//! A task may be out on several leases: its worker was lost, or is late, or leaves. Each lease
+//! has an epoch of its own. The first result with a live epoch counts and ends all others; what
+//! comes after is counted and dropped (DESIGN.md section 3, Leases).
+//!
+//! **Which task kills workers?** A lost worker tells nothing. Its first leases, as many as it
+//! has threads, were probably running, and each of them is a suspect. With several threads an
+//! innocent neighbour is blamed along with the culprit, and if both went on together they would
+//! be condemned together. So a suspect is never lent to a worker that has another, and when a
+//! worker is lost with a suspect on it, only those blamed most before are blamed again.
+
+use crate::macrotile::Macrotile;
+use crate::{Config, Micros};
+use slabcast_common::ids::{Epoch, TaskId, WorkerId};
+use std::collections::{BTreeSet, VecDeque};
+
+/// A lease whose result would count.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Live {
+    pub(crate) worker: WorkerId,
+    pub(crate) epoch: Epoch,
+    pub(crate) sent: Micros,
+    /// When another worker gets the task too; `None` once that has happened.
+    deadline: Option<Micros>,
+}
+
+/// How a task ended.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum End {
+    /// Not yet.
+    Open,
+    /// Rendered, by whom, in what time.
+    Done { worker: String, render_us: Micros },
+    /// Given up.
+    Poisoned,
+}
+
+/// One macrotile of the slab.
+#[derive(Clone, Debug)]
+pub(crate) struct Task {
+    pub(crate) tile: Macrotile,
+    pub(crate) end: End,
+    live: Vec<Live>,
+    attempts: u32,
+    queued: bool,
+    /// Lost workers that were probably running it.
+    pub(crate) blamed: Vec<(WorkerId, String)>,
+    /// Workers that said they could not, and why.
+    pub(crate) failed: Vec<(WorkerId, String, String)>,
+}
+
+impl Task {
+    /// The leases that are live.
+    pub(crate) fn live(&self) -> &[Live] {
+        &self.live
+    }
+
+    fn is_suspect(&self) -> bool {
+        !self.blamed.is_empty()
+    }
+}
+
+/// What a result is worth.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Verdict {
+    /// It counts: the task's place, and its lease.
+    Counts(u32, Live),
+    /// Late, or twice.
+    Dead,
+}
+
+/// The tasks of one slab.
+#[derive(Debug)]
+pub(crate) struct Queue {
+    first: TaskId,
+    pub(crate) tasks: Vec<Task>,
+    waiting: VecDeque<u32>,
+    deadlines: BTreeSet<(Micros, u32, Epoch)>,
+    open: u32,
+    /// Leases beyond the first of a task.
+    pub(crate) retries: u64,
+}
+
+impl Queue {
+    /// A queue of these tiles in this order; the first is called `first`, and so on.
+    pub(crate) fn new(first: TaskId, tiles: &[Macrotile]) -> Self {
+        let task = |&tile: &Macrotile| Task {
+            tile,
+            end: End::Open,
+            live: Vec::new(),
+            attempts: 0,
+            queued: true,
+            blamed: Vec::new(),
+            failed: Vec::new(),
+        };
+        Queue {
+            first,
+            tasks: tiles.iter().map(task).collect(),
+            waiting: (0..tiles.len() as u32).collect(),
+            deadlines: BTreeSet::new(),
+            open: tiles.len() as u32,
+            retries: 0,
+        }
+    }
+
+    /// Tasks without an end.
+    pub(crate) fn open(&self) -> u32 {
+        self.open
+    }
+
+    /// Tasks waiting for a worker.
+    pub(crate) fn waiting(&self) -> usize {
+        self.waiting.len()
+    }
+
+    /// A task's name.
+    pub(crate) fn id(&self, place: u32) -> TaskId {
+        TaskId(self.first.0 + u64::from(place))
+    }
+
+    /// A task's place.
+    pub(crate) fn place(&self, id: TaskId) -> Option<u32> {
+        let place = id.0.checked_sub(self.first.0)?;
+        (place < self.tasks.len() as u64).then_some(place as u32)
+    }
+
+    /// The first waiting task that `worker` may have, if `suits` it. `mine` are the tasks of
+    /// this slab that it has leases of; `others` says whether some other worker could have it.
+    pub(crate) fn next_for(
+        &self,
+        worker: WorkerId,
+        mine: &[u32],
+        others: impl Fn(&Task) -> bool,
+        suits: impl Fn(u32) -> bool,
+    ) -> Option<u32> {
+        let has_suspect = mine.iter().any(|&p| self.tasks[p as usize].is_suspect());
+        self.waiting.iter().copied().find(|&place| {
+            let task = &self.tasks[place as usize];
+            let has_it = mine.contains(&place);
+            let failed = task.failed.iter().any(|(w, ..)| *w == worker) && others(task);
+            !has_it && !failed && !(has_suspect && task.is_suspect()) && suits(place)
+        })
+    }
+
+    /// Lends a waiting task to a worker.
+    pub(crate) fn lease(
+        &mut self,
+        place: u32,
+        worker: WorkerId,
+        now: Micros,
+        config: &Config,
+    ) -> Epoch {
+        let task = &mut self.tasks[place as usize];
+        assert!(task.queued, "only a waiting task is lent");
+        let at = self.waiting.iter().position(|&p| p == place);
+        self.waiting.remove(at.expect("a queued task waits"));
+        task.queued = false;
+        self.lend(place, worker, now, config)
+    }
+
+    /// Lends a task to a second worker while a first one has it.
+    pub(crate) fn lend_again(
+        &mut self,
+        place: u32,
+        worker: WorkerId,
+        now: Micros,
+        config: &Config,
+    ) -> Epoch {
+        self.lend(place, worker, now, config)
+    }
+
+    fn lend(&mut self, place: u32, worker: WorkerId, now: Micros, config: &Config) -> Epoch {
+        let task = &mut self.tasks[place as usize];
+        let epoch = Epoch(task.attempts);
+        self.retries += u64::from(task.attempts > 0);
+        let patience = config.lease.saturating_mul(1 << task.attempts.min(20));
+        let deadline = now.saturating_add(patience);
+        task.attempts += 1;
+        task.live.push(Live { worker, epoch, sent: now, deadline: Some(deadline) });
+        self.deadlines.insert((deadline, place, epoch));
+        epoch
+    }
+
+    /// What a result from `worker` is worth. Changes nothing.
+    pub(crate) fn judge(&self, id: TaskId, epoch: Epoch, worker: WorkerId) -> Verdict {
+        let Some(place) = self.place(id) else { return Verdict::Dead };
+        let live = &self.tasks[place as usize].live;
+        match live.iter().find(|l| l.epoch == epoch && l.worker == worker) {
+            Some(&lease) => Verdict::Counts(place, lease),
+            None => Verdict::Dead,
+        }
+    }
+
+    /// A task ended: its leases die.
+    pub(crate) fn finish(&mut self, place: u32, end: End) {
+        let task = &mut self.tasks[place as usize];
+        assert!(task.end == End::Open, "a task ends once");
+        task.end = end;
+        self.open -= 1;
+        for live in task.live.drain(..) {
+            if let Some(deadline) = live.deadline {
+                self.deadlines.remove(&(deadline, place, live.epoch));
+            }
+        }
+        if std::mem::take(&mut task.queued) {
+            self.waiting.retain(|&p| p != place);
+        }
+    }
+
+    /// One lease ends without a result.
+    fn end_lease(&mut self, place: u32, worker: WorkerId, epoch: Epoch) {
+        let task = &mut self.tasks[place as usize];
+        let Some(at) = task.live.iter().position(|l| l.worker == worker && l.epoch == epoch) else {
+            return;
+        };
+        if let Some(deadline) = task.live.remove(at).deadline {
+            self.deadlines.remove(&(deadline, place, epoch));
+        }
+    }
+
+    /// Puts a task in front, unless it waits already.
+    fn requeue(&mut self, place: u32) {
+        let task = &mut self.tasks[place as usize];
+        if task.end == End::Open && !task.queued {
+            task.queued = true;
+            self.waiting.push_front(place);
+        }
+    }
+
+    /// A worker is lost with leases on these tasks, in the order in which it got them. Returns
+    /// the tasks that are given up for it. `running` of them are blamed, from the front.
+    pub(crate) fn lose(
+        &mut self,
+        worker: WorkerId,
+        name: &str,
+        leases: &[(u32, Epoch)],
+        running: usize,
+        config: &Config,
+    ) -> Vec<u32> {
+        let mut head: Vec<u32> = leases.iter().take(running).map(|l| l.0).collect();
+        head.retain(|&p| self.tasks[p as usize].end == End::Open);
+        let most = head.iter().map(|&p| self.tasks[p as usize].blamed.len()).max().unwrap_or(0);
+        for &place in &head {
+            let task = &mut self.tasks[place as usize];
+            if task.blamed.len() == most {
+                task.blamed.push((worker, name.to_owned()));
+            }
+        }
+        self.take_back(worker, leases, config)
+    }
+
+    /// A worker can't do a task. Returns it if it is given up.
+    pub(crate) fn fail(
+        &mut self,
+        place: u32,
+        epoch: Epoch,
+        worker: WorkerId,
+        name: &str,
+        reason: String,
+        config: &Config,
+    ) -> Vec<u32> {
+        self.tasks[place as usize].failed.push((worker, name.to_owned(), reason));
+        self.take_back(worker, &[(place, epoch)], config)
+    }
+
+    /// Ends leases and puts their tasks in front in their old order. A task that has another
+    /// live lease goes on with that one; one that has none and was blamed by `poison_after`
+    /// workers is returned, to be given up.
+    fn take_back(
+        &mut self,
+        worker: WorkerId,
+        leases: &[(u32, Epoch)],
+        config: &Config,
+    ) -> Vec<u32> {
+        let mut given_up = Vec::new();
+        for &(place, epoch) in leases.iter().rev() {
+            self.end_lease(place, worker, epoch);
+            let task = &self.tasks[place as usize];
+            if task.end != End::Open || !task.live.is_empty() {
+                continue;
+            }
+            let limit = config.poison_after.max(1) as usize;
+            if task.blamed.len() >= limit || task.failed.len() >= limit {
+                given_up.push(place);
+            } else {
+                self.requeue(place);
+            }
+        }
+        given_up
+    }
+
+    /// A worker that leaves has not begun these: others get them too.
+    pub(crate) fn pass_on(&mut self, places: &[u32]) {
+        for &place in places.iter().rev() {
+            self.requeue(place);
+        }
+    }
+
+    /// Puts tasks whose lease is past its deadline in front, for another worker.
+    pub(crate) fn overdue(&mut self, now: Micros) {
+        while let Some(&(deadline, place, epoch)) = self.deadlines.first()
+            && deadline <= now
+        {
+            self.deadlines.pop_first();
+            let task = &mut self.tasks[place as usize];
+            for live in task.live.iter_mut().filter(|l| l.epoch == epoch) {
+                live.deadline = None;
+            }
+            self.requeue(place);
+        }
+    }
+
+    /// The next lease deadline.
+    pub(crate) fn next_deadline(&self) -> Option<Micros> {
+        self.deadlines.first().map(|d| d.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use slabcast_common::occlusion::Rect;
+
+    fn queue(n: u64) -> Queue {
+        let tiles: Vec<_> =
+            (0..n).map(|i| Macrotile { rect: Rect::new(0, 0, 16, 16), est: 100 - i }).collect();
+        Queue::new(TaskId(10), &tiles)
+    }
+
+    fn next(q: &Queue, w: u64, mine: &[u32]) -> Option<u32> {
+        q.next_for(WorkerId(w), mine, |_| true, |_| true)
+    }
+
+    fn take(q: &mut Queue, w: u64, mine: &[u32], now: Micros) -> (u32, Epoch) {
+        let place = next(q, w, mine).expect("something waits");
+        (place, q.lease(place, WorkerId(w), now, &Config::default()))
+    }
+
+    fn done() -> End {
+        End::Done { worker: String::new(), render_us: 1 }
+    }
+
+    #[test]
+    fn largest_first_and_returned_tasks_before_all() {
+        let c = Config::default();
+        let mut q = queue(4);
+        assert_eq!(take(&mut q, 1, &[], 0), (0, Epoch(0)));
+        assert_eq!(take(&mut q, 1, &[0], 0), (1, Epoch(0)));
+        assert_eq!(take(&mut q, 2, &[], 0), (2, Epoch(0)));
+        assert!(q.lose(WorkerId(1), "one", &[(0, Epoch(0)), (1, Epoch(0))], 1, &c).is_empty());
+        assert_eq!(q.tasks[0].blamed.len(), 1);
+        assert_eq!(q.tasks[1].blamed.len(), 0, "it was not running yet");
+        assert_eq!(take(&mut q, 3, &[], 0), (0, Epoch(1)));
+        assert_eq!(take(&mut q, 3, &[0], 0), (1, Epoch(1)));
+        assert_eq!(take(&mut q, 3, &[0, 1], 0), (3, Epoch(0)));
+        assert_eq!(q.retries, 2);
+        assert_eq!(q.judge(TaskId(10), Epoch(0), WorkerId(1)), Verdict::Dead);
+        assert_eq!(q.judge(TaskId(10), Epoch(1), WorkerId(2)), Verdict::Dead, "not its lease");
+        assert!(matches!(q.judge(TaskId(10), Epoch(1), WorkerId(3)), Verdict::Counts(0, _)));
+        assert_eq!(q.judge(TaskId(9), Epoch(0), WorkerId(3)), Verdict::Dead);
+        assert_eq!(q.judge(TaskId(14), Epoch(0), WorkerId(3)), Verdict::Dead);
+    }
+
+    #[test]
+    fn a_late_lease_stays_live_until_one_of_two_wins() {
+        let c = Config::default();
+        let mut q = queue(1);
+        take(&mut q, 1, &[], 0);
+        assert_eq!(q.next_deadline(), Some(c.lease));
+        q.overdue(c.lease);
+        assert_eq!(next(&q, 1, &[0]), None, "another worker, not the same");
+        assert_eq!(take(&mut q, 2, &[], c.lease), (0, Epoch(1)));
+        assert_eq!(q.next_deadline(), Some(c.lease + 2 * c.lease), "doubled");
+        assert!(matches!(q.judge(TaskId(10), Epoch(0), WorkerId(1)), Verdict::Counts(..)));
+        q.finish(0, done());
+        assert_eq!(q.judge(TaskId(10), Epoch(1), WorkerId(2)), Verdict::Dead);
+        assert_eq!((q.open(), q.next_deadline()), (0, None));
+    }
+
+    #[test]
+    fn a_task_that_takes_three_workers_is_given_up() {
+        let c = Config::default();
+        let mut q = queue(2);
+        for w in 1..=3 {
+            let lease = take(&mut q, w, &[], 0);
+            assert_eq!(lease.0, 0);
+            let given_up = q.lose(WorkerId(w), "x", &[lease], 4, &c);
+            assert_eq!(given_up, if w == 3 { vec![0] } else { vec![] });
+        }
+    }
+
+    #[test]
+    fn an_innocent_neighbour_is_not_condemned_with_the_culprit() {
+        // Workers of two threads; task 0 kills whoever runs it, tasks 1 and up are harmless.
+        let c = Config::default();
+        let mut q = queue(6);
+        let mut given_up = Vec::new();
+        for w in 1..=3 {
+            let a = take(&mut q, w, &[], 0);
+            let b = take(&mut q, w, &[a.0], 0);
+            assert_eq!(a.0, 0);
+            assert!(!(q.tasks[a.0 as usize].is_suspect() && q.tasks[b.0 as usize].is_suspect()));
+            given_up = q.lose(WorkerId(w), "x", &[a, b], 2, &c);
+        }
+        assert_eq!(given_up, [0]);
+        assert!(q.tasks[1..].iter().all(|t| t.blamed.len() <= 1));
+    }
+
+    #[test]
+    fn three_refusals_end_a_task() {
+        let c = Config::default();
+        let mut q = queue(1);
+        for w in [1, 1, 2] {
+            assert_eq!(q.open(), 1);
+            // Worker 1 gets it again only while there is nobody else.
+            let alone = w == 1;
+            assert_eq!(
+                q.next_for(WorkerId(1), &[], |_| true, |_| true).is_none(),
+                !q.tasks[0].failed.is_empty(),
+            );
+            let place = q.next_for(WorkerId(w), &[], |_| !alone, |_| true).unwrap();
+            let epoch = q.lease(place, WorkerId(w), 0, &c);
+            let given_up = q.fail(0, epoch, WorkerId(w), "x", "no".into(), &c);
+            assert_eq!(given_up.len(), usize::from(w == 2));
+        }
+    }
+}

@@ -1,0 +1,524 @@
+//! Who holds which brick (paper section 4.4), and what goes to whom next.
+//!
+//! The paper broadcasts a slab's unoccluded bricks and lets every node cache all it ever got.
+//! So does this room, while memory lasts. What it adds is what happens when it does not:
+//!
+//! - **In order.** Bricks of a set reach a worker in the order in which they were sent, so an
+//!   acknowledgement is a count. Broken ones are named, and go again.
+//! - **A drop takes a round trip.** `DropBricks` goes by the control link and bricks by their
+//!   own. A brick that is dropped and sent again at once could arrive before the drop and be
+//!   lost with it, and a lease would wait for it for ever. So a ping follows each drop, and
+//!   until its pong the bricks count as resident and are not sent again.
+//! - **Broadcast or lazily.** If all that a slab needs fits into a worker's budget, it gets
+//!   all, and only bricks the slab doesn't need are evicted, least recently needed first. If
+//!   not, it gets the bricks of the tiles it leases, and a lease only when its bricks fit beside
+//!   those of its other leases. One lease that is larger than the budget alone goes anyway, and
+//!   is counted: the picture comes first.
+//!
+//! The measure of memory is a brick's encoded size. A worker's own representation is larger or
+//! smaller by its own factor, which it knows when it states its budget.
+
+use slabcast_common::brick::{BrickInfo, BrickSetKey};
+use slabcast_common::ids::{BrickId, WorkerId};
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+
+use crate::Micros;
+
+/// Where a brick is, seen from one worker.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Place {
+    /// Not there.
+    Absent,
+    /// Sent, not acknowledged.
+    Flying,
+    /// There.
+    Held,
+    /// To be forgotten; not confirmed.
+    Leaving,
+}
+
+/// One worker's bricks of one set, by their place in the set's list.
+#[derive(Debug)]
+struct Books {
+    place: Vec<Place>,
+    /// Leases that need it, until their result is there.
+    pins: Vec<u32>,
+    /// Whether it stands in the shelf's `wanted`.
+    wanted: Vec<bool>,
+    flying: VecDeque<u32>,
+    held_count: u64,
+    held_bytes: u64,
+}
+
+impl Books {
+    fn new(bricks: usize) -> Self {
+        Books {
+            place: vec![Place::Absent; bricks],
+            pins: vec![0; bricks],
+            wanted: vec![false; bricks],
+            flying: VecDeque::new(),
+            held_count: 0,
+            held_bytes: 0,
+        }
+    }
+}
+
+/// Bricks on their way to a worker without a pause.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Flight {
+    pub(crate) since: Micros,
+    pub(crate) bricks: u64,
+    pub(crate) bytes: u64,
+}
+
+/// One worker's memory.
+#[derive(Debug)]
+struct Shelf {
+    budget: u64,
+    /// Bytes of all that is flying, held or leaving.
+    bytes: u64,
+    /// Bytes of what is leaving.
+    leaving_bytes: u64,
+    /// Bytes of what is pinned.
+    pinned_bytes: u64,
+    sets: BTreeMap<BrickSetKey, Books>,
+    /// Bricks it said it held, of sets not opened yet.
+    told: BTreeMap<BrickSetKey, Vec<BrickId>>,
+    /// Drops whose pong is outstanding, by the nonce that follows them.
+    leaving: VecDeque<(u64, BrickSetKey, Vec<u32>)>,
+    /// What is to be sent, in order; of the current set.
+    wanted: VecDeque<u32>,
+    lazy: bool,
+    flight: Option<Flight>,
+}
+
+/// What the residency asks the scheduler to tell a worker.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Errand {
+    /// Forget these, then ping with the nonce.
+    Drop { set: BrickSetKey, bricks: Vec<BrickId>, nonce: u64 },
+    /// These are on their way.
+    Send { set: BrickSetKey, bricks: Vec<BrickId>, bytes: u64, over_budget: bool },
+}
+
+/// A set's list of bricks, with when each was needed last.
+#[derive(Debug)]
+struct Set {
+    bricks: Arc<[BrickInfo]>,
+    needed: Vec<u64>,
+}
+
+/// Who holds which brick.
+#[derive(Debug, Default)]
+pub(crate) struct Residency {
+    sets: BTreeMap<BrickSetKey, Set>,
+    shelves: BTreeMap<WorkerId, Shelf>,
+    /// Number of slabs so far: the clock of "least recently needed".
+    round: u64,
+    /// The set that tasks are drawn from.
+    current: BrickSetKey,
+    /// Bytes that the round's needed bricks take.
+    round_bytes: u64,
+}
+
+fn place_of(bricks: &[BrickInfo], id: BrickId) -> Option<u32> {
+    bricks.binary_search_by_key(&id, |b| b.id).ok().map(|i| i as u32)
+}
+
+impl Residency {
+    pub(crate) fn join(
+        &mut self,
+        worker: WorkerId,
+        budget: u64,
+        held: Vec<(BrickSetKey, Vec<BrickId>)>,
+    ) {
+        let shelf = Shelf {
+            budget,
+            bytes: 0,
+            leaving_bytes: 0,
+            pinned_bytes: 0,
+            sets: BTreeMap::new(),
+            told: BTreeMap::new(),
+            leaving: VecDeque::new(),
+            wanted: VecDeque::new(),
+            lazy: false,
+            flight: None,
+        };
+        let before = self.shelves.insert(worker, shelf);
+        assert!(before.is_none(), "worker {worker} joins twice; a WorkerId is never used again");
+        let shelf = self.shelves.get_mut(&worker).expect("just put in");
+        for (key, ids) in held {
+            shelf.told.entry(key).or_default().extend(ids);
+        }
+        let known: Vec<_> =
+            shelf.told.keys().filter(|k| self.sets.contains_key(k)).copied().collect();
+        for key in known {
+            self.believe(worker, key);
+        }
+        self.settle_mode(worker);
+    }
+
+    pub(crate) fn leave(&mut self, worker: WorkerId) {
+        self.shelves.remove(&worker);
+    }
+
+    /// Enters the bricks that a worker brought along into the books of an opened set. Ids the
+    /// set does not have are a stranger's mistake and are ignored.
+    fn believe(&mut self, worker: WorkerId, key: BrickSetKey) {
+        let set = &self.sets[&key];
+        let shelf = self.shelves.get_mut(&worker).expect("a worker with a shelf");
+        let ids = shelf.told.remove(&key).unwrap_or_default();
+        let books = shelf.sets.entry(key).or_insert_with(|| Books::new(set.bricks.len()));
+        for id in ids {
+            let Some(i) = place_of(&set.bricks, id) else { continue };
+            if books.place[i as usize] == Place::Absent {
+                books.place[i as usize] = Place::Held;
+                books.held_count += 1;
+                books.held_bytes += u64::from(set.bricks[i as usize].bytes);
+                shelf.bytes += u64::from(set.bricks[i as usize].bytes);
+            }
+        }
+    }
+
+    /// Makes `key` the set that tasks are drawn from.
+    pub(crate) fn open(&mut self, key: BrickSetKey, bricks: &Arc<[BrickInfo]>) {
+        // A set nobody holds anything of need not be remembered.
+        let shelves = &self.shelves;
+        self.sets.retain(|k, _| *k == key || shelves.values().any(|s| s.sets.contains_key(k)));
+        for shelf in self.shelves.values_mut() {
+            shelf.keep_wanted(self.current, |_| false);
+        }
+        self.current = key;
+        self.round_bytes = 0;
+        let set = self
+            .sets
+            .entry(key)
+            .or_insert_with(|| Set { bricks: bricks.clone(), needed: vec![0; bricks.len()] });
+        assert_eq!(set.bricks.len(), bricks.len(), "a set key names one list of bricks");
+        for worker in self.shelves.keys().copied().collect::<Vec<_>>() {
+            if self.shelves[&worker].told.contains_key(&key) {
+                self.believe(worker, key);
+            }
+            self.settle_mode(worker);
+        }
+    }
+
+    /// Begins a slab that needs these bricks of the current set.
+    pub(crate) fn round(&mut self, needed: &[u32]) {
+        self.round += 1;
+        let set = self.sets.get_mut(&self.current).expect("the current set is open");
+        self.round_bytes = 0;
+        for &i in needed {
+            set.needed[i as usize] = self.round;
+            self.round_bytes += u64::from(set.bricks[i as usize].bytes);
+        }
+        for worker in self.shelves.keys().copied().collect::<Vec<_>>() {
+            self.settle_mode(worker);
+        }
+    }
+
+    /// Decides for the slab whether a worker gets all its bricks, and forgets what it was still
+    /// to be sent for the slab before, but for leases it has not given back.
+    fn settle_mode(&mut self, worker: WorkerId) {
+        let shelf = self.shelves.get_mut(&worker).expect("a worker with a shelf");
+        shelf.lazy = self.round_bytes.saturating_add(shelf.pinned_bytes) > shelf.budget;
+        shelf.keep_wanted(self.current, |pins| pins > 0);
+    }
+
+    /// Whether a worker gets only the bricks of its leases.
+    pub(crate) fn is_lazy(&self, worker: WorkerId) -> bool {
+        self.shelves[&worker].lazy
+    }
+
+    /// Whether a lease's bricks fit beside those of the worker's other leases. Always so for a
+    /// worker that gets the whole slab.
+    pub(crate) fn fits(&self, worker: WorkerId, lease: &[u32]) -> bool {
+        let shelf = &self.shelves[&worker];
+        if !shelf.lazy {
+            return true;
+        }
+        let books = shelf.sets.get(&self.current);
+        let bricks = &self.sets[&self.current].bricks;
+        let more: u64 = lease
+            .iter()
+            .filter(|&&i| books.is_none_or(|b| b.pins[i as usize] == 0))
+            .map(|&i| u64::from(bricks[i as usize].bytes))
+            .sum();
+        shelf.pinned_bytes + more <= shelf.budget
+    }
+
+    /// A lease on these bricks begins.
+    pub(crate) fn pin(&mut self, worker: WorkerId, lease: &[u32]) {
+        let set = &self.sets[&self.current];
+        let shelf = self.shelves.get_mut(&worker).expect("a worker with a shelf");
+        let books = shelf.sets.entry(self.current).or_insert_with(|| Books::new(set.bricks.len()));
+        for &i in lease {
+            let pins = &mut books.pins[i as usize];
+            *pins += 1;
+            if *pins == 1 {
+                shelf.pinned_bytes += u64::from(set.bricks[i as usize].bytes);
+            }
+        }
+    }
+
+    /// A lease on these bricks ended.
+    pub(crate) fn unpin(&mut self, worker: WorkerId, lease: &[u32]) {
+        let set = &self.sets[&self.current];
+        let Some(shelf) = self.shelves.get_mut(&worker) else { return };
+        let books = shelf.sets.get_mut(&self.current).expect("what is pinned has books");
+        for &i in lease {
+            let pins = &mut books.pins[i as usize];
+            *pins -= 1;
+            if *pins == 0 {
+                shelf.pinned_bytes -= u64::from(set.bricks[i as usize].bytes);
+            }
+        }
+    }
+
+    /// Puts what the worker lacks of these bricks of the current set behind what it is to be
+    /// sent.
+    pub(crate) fn want(&mut self, worker: WorkerId, bricks: impl IntoIterator<Item = u32>) {
+        let set = &self.sets[&self.current];
+        let shelf = self.shelves.get_mut(&worker).expect("a worker with a shelf");
+        let books = shelf.sets.entry(self.current).or_insert_with(|| Books::new(set.bricks.len()));
+        for i in bricks {
+            let at = i as usize;
+            if matches!(books.place[at], Place::Absent | Place::Leaving) && !books.wanted[at] {
+                books.wanted[at] = true;
+                shelf.wanted.push_back(i);
+            }
+        }
+    }
+
+    /// Sends what can be sent now of what is wanted, and evicts to make room. `nonce` names the
+    /// pings that follow drops.
+    pub(crate) fn flush(
+        &mut self,
+        worker: WorkerId,
+        now: Micros,
+        nonce: &mut dyn FnMut() -> u64,
+    ) -> Vec<Errand> {
+        let mut errands = Vec::new();
+        let key = self.current;
+        let Some(shelf) = self.shelves.get_mut(&worker) else { return errands };
+        if shelf.lazy {
+            // Of a lease that ended without its bricks.
+            shelf.keep_wanted(key, |pins| pins > 0);
+        }
+        if shelf.wanted.is_empty() {
+            return errands;
+        }
+        let bricks = &self.sets[&key].bricks;
+        let size = |i: u32| u64::from(bricks[i as usize].bytes);
+        let wanted_bytes: u64 = shelf.wanted.iter().map(|&i| size(i)).sum();
+        let after = shelf.bytes - shelf.leaving_bytes + wanted_bytes;
+        if after > shelf.budget {
+            evict(&self.sets, shelf, self.round, after - shelf.budget, nonce, &mut errands);
+        }
+
+        let books = shelf.sets.get_mut(&key).expect("what is wanted has books");
+        let mut send = Vec::new();
+        let (mut bytes, mut over_budget) = (0, false);
+        let alone = books.flying.is_empty() && shelf.leaving.is_empty();
+        let mut stay = VecDeque::new();
+        while let Some(i) = shelf.wanted.pop_front() {
+            let at = i as usize;
+            let fits = shelf.bytes + size(i) <= shelf.budget;
+            // Nothing more can be made room for: a lease larger than the budget.
+            let force = !fits && alone && shelf.lazy && books.pins[at] > 0;
+            if books.place[at] == Place::Leaving || !(fits || force) {
+                stay.push_back(i);
+                continue;
+            }
+            over_budget |= force;
+            books.place[at] = Place::Flying;
+            books.wanted[at] = false;
+            books.flying.push_back(i);
+            shelf.bytes += size(i);
+            bytes += size(i);
+            send.push(bricks[at].id);
+        }
+        shelf.wanted = stay;
+        if !send.is_empty() {
+            let flight = shelf.flight.get_or_insert(Flight { since: now, bricks: 0, bytes: 0 });
+            flight.bricks += send.len() as u64;
+            flight.bytes += bytes;
+            errands.push(Errand::Send { set: key, bricks: send, bytes, over_budget });
+        }
+        errands
+    }
+
+    /// The next `count` bricks arrived. Returns the flight, if it was the last of it.
+    pub(crate) fn arrived(
+        &mut self,
+        worker: WorkerId,
+        key: BrickSetKey,
+        count: u32,
+    ) -> Option<Flight> {
+        let set = self.sets.get(&key)?;
+        let shelf = self.shelves.get_mut(&worker)?;
+        let books = shelf.sets.get_mut(&key)?;
+        for _ in 0..count {
+            let Some(i) = books.flying.pop_front() else { break };
+            books.place[i as usize] = Place::Held;
+            books.held_count += 1;
+            books.held_bytes += u64::from(set.bricks[i as usize].bytes);
+        }
+        shelf.landed()
+    }
+
+    /// These arrived broken and are not counted among those that arrived. They go again.
+    pub(crate) fn broken(
+        &mut self,
+        worker: WorkerId,
+        key: BrickSetKey,
+        ids: &[BrickId],
+    ) -> Option<Flight> {
+        let set = self.sets.get(&key)?;
+        let shelf = self.shelves.get_mut(&worker)?;
+        let books = shelf.sets.get_mut(&key)?;
+        let mut again = Vec::new();
+        for &id in ids {
+            let Some(i) = place_of(&set.bricks, id) else { continue };
+            let bytes = u64::from(set.bricks[i as usize].bytes);
+            match books.place[i as usize] {
+                Place::Flying => books.flying.retain(|&f| f != i),
+                // The count of the good ones came first and was taken for this one.
+                Place::Held => {
+                    books.held_count -= 1;
+                    books.held_bytes -= bytes;
+                    if let Some(next) = books.flying.pop_front() {
+                        books.place[next as usize] = Place::Held;
+                        books.held_count += 1;
+                        books.held_bytes += u64::from(set.bricks[next as usize].bytes);
+                    }
+                }
+                Place::Absent | Place::Leaving => continue,
+            }
+            books.place[i as usize] = Place::Absent;
+            shelf.bytes -= bytes;
+            again.push(i);
+        }
+        if key == self.current {
+            // Those that somebody waits for are in front of all others.
+            let round = self.round;
+            for &i in again.iter().rev() {
+                if books.pins[i as usize] > 0 || (!shelf.lazy && set.needed[i as usize] == round) {
+                    books.wanted[i as usize] = true;
+                    shelf.wanted.push_front(i);
+                }
+            }
+        }
+        shelf.landed()
+    }
+
+    /// All control messages up to the ping `nonce` were read: what left before it is gone.
+    pub(crate) fn ponged(&mut self, worker: WorkerId, nonce: u64) {
+        let Some(shelf) = self.shelves.get_mut(&worker) else { return };
+        while shelf.leaving.front().is_some_and(|(n, ..)| *n <= nonce) {
+            let (_, key, gone) = shelf.leaving.pop_front().expect("there is a front");
+            let books = shelf.sets.get_mut(&key).expect("what leaves has books");
+            for i in gone {
+                let bytes = u64::from(self.sets[&key].bricks[i as usize].bytes);
+                books.place[i as usize] = Place::Absent;
+                shelf.bytes -= bytes;
+                shelf.leaving_bytes -= bytes;
+            }
+        }
+    }
+
+    /// Bricks and bytes that a worker has of the current set.
+    pub(crate) fn held_of_current(&self, worker: WorkerId) -> (u64, u64) {
+        let books = self.shelves.get(&worker).and_then(|s| s.sets.get(&self.current));
+        books.map_or((0, 0), |b| (b.held_count, b.held_bytes))
+    }
+
+    /// Bricks and bytes that a worker has of all sets.
+    pub(crate) fn held(&self, worker: WorkerId) -> (u64, u64) {
+        let books = self.shelves.get(&worker).into_iter().flat_map(|s| s.sets.values());
+        books.fold((0, 0), |(n, b), books| (n + books.held_count, b + books.held_bytes))
+    }
+
+    /// The flight to a worker that has not landed.
+    pub(crate) fn flight(&self, worker: WorkerId) -> Option<Flight> {
+        self.shelves.get(&worker).and_then(|s| s.flight)
+    }
+
+    /// The flight ends for the statistics of one frame and goes on for the next.
+    pub(crate) fn cut_flights(&mut self, now: Micros) -> Vec<(WorkerId, Flight)> {
+        let mut cut = Vec::new();
+        for (&worker, shelf) in &mut self.shelves {
+            if let Some(flight) = &mut shelf.flight {
+                cut.push((worker, *flight));
+                *flight = Flight { since: now, bricks: 0, bytes: 0 };
+            }
+        }
+        cut
+    }
+}
+
+impl Shelf {
+    /// Keeps of what is wanted (of the set `key`) what has so many pins.
+    fn keep_wanted(&mut self, key: BrickSetKey, keep: impl Fn(u32) -> bool) {
+        let Some(books) = self.sets.get_mut(&key) else { return };
+        self.wanted.retain(|&i| {
+            let keep = keep(books.pins[i as usize]);
+            books.wanted[i as usize] = keep;
+            keep
+        });
+    }
+
+    /// The flight, when nothing is on its way any more.
+    fn landed(&mut self) -> Option<Flight> {
+        if self.sets.values().all(|b| b.flying.is_empty()) { self.flight.take() } else { None }
+    }
+}
+
+/// Drops at least `bytes` of what no lease needs, least recently needed first; bricks of this
+/// slab only from workers that get theirs lazily.
+fn evict(
+    sets: &BTreeMap<BrickSetKey, Set>,
+    shelf: &mut Shelf,
+    round: u64,
+    bytes: u64,
+    nonce: &mut dyn FnMut() -> u64,
+    errands: &mut Vec<Errand>,
+) {
+    let mut victims = Vec::new();
+    for (key, books) in &shelf.sets {
+        let needed = &sets[key].needed;
+        for (i, place) in books.place.iter().enumerate() {
+            let spare = shelf.lazy || needed[i] < round;
+            if *place == Place::Held && books.pins[i] == 0 && spare {
+                victims.push((needed[i], *key, i as u32));
+            }
+        }
+    }
+    victims.sort_unstable();
+    let mut by_set: BTreeMap<BrickSetKey, Vec<u32>> = BTreeMap::new();
+    let mut freed = 0;
+    for (_, key, i) in victims {
+        if freed >= bytes {
+            break;
+        }
+        freed += u64::from(sets[&key].bricks[i as usize].bytes);
+        by_set.entry(key).or_default().push(i);
+    }
+    for (key, mut gone) in by_set {
+        gone.sort_unstable();
+        let books = shelf.sets.get_mut(&key).expect("victims have books");
+        let bricks = &sets[&key].bricks;
+        for &i in &gone {
+            let size = u64::from(bricks[i as usize].bytes);
+            books.place[i as usize] = Place::Leaving;
+            books.held_count -= 1;
+            books.held_bytes -= size;
+            shelf.leaving_bytes += size;
+        }
+        let nonce = nonce();
+        let names = gone.iter().map(|&i| bricks[i as usize].id).collect();
+        shelf.leaving.push_back((nonce, key, gone));
+        errands.push(Errand::Drop { set: key, bricks: names, nonce });
+    }
+}

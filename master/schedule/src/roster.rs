@@ -1,0 +1,228 @@
+//! The workers: who is here, who is silent, whose clock shows what.
+//!
+//! Every deadline of the crate is in the table below.
+//!
+//! | Deadline         | Set when                 | After                   | Then                            |
+//! |------------------|--------------------------|-------------------------|---------------------------------|
+//! | next ping        | joined, pinged           | 0, `heartbeat`          | ping again                      |
+//! | silence          | anything heard           | `silence`               | the worker is lost              |
+//! | lease (`queue`)  | task leased              | `lease` * 2^attempt     | another worker gets it too      |
+//! | outlived (`queue`) | task leased            | twice its estimate      | another gets it, if one is idle |
+//!
+//! **Silence is judged on a clock that was watched.** If the driver itself did not run for a
+//! while (the process was stopped, the machine slept), every worker looks silent while its
+//! messages wait in a socket. So when the time between two events is longer than two
+//! heartbeats, which can't happen to a driver that keeps `next_deadline`, the excess is added
+//! to everybody's account.
+
+use crate::{Config, Micros};
+use slabcast_common::ids::{SceneId, WorkerId};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+/// How fast two machines' clocks may drift apart: 100 ppm, twice what quartz is sold with. A
+/// fresh sample of an offset replaces the best one when it is no less certain than the best
+/// one has become.
+const DRIFT: f64 = 100e-6;
+
+/// One worker.
+#[derive(Debug)]
+pub(crate) struct Worker {
+    pub(crate) name: String,
+    pub(crate) threads: u32,
+    pub(crate) since: Micros,
+    /// It takes no more leases.
+    pub(crate) leaving: bool,
+    /// Scenes it was sent.
+    pub(crate) scenes: BTreeSet<SceneId>,
+    heard: Micros,
+    next_ping: Micros,
+    /// Pings without pong, oldest first.
+    pings: VecDeque<(u64, Micros)>,
+    offset: Option<Offset>,
+}
+
+/// Estimate of worker clock minus master clock.
+#[derive(Clone, Copy, Debug)]
+struct Offset {
+    us: i64,
+    /// Half a round trip: how wrong it may be.
+    half_rtt: Micros,
+    at: Micros,
+}
+
+impl Worker {
+    /// A time on the worker's clock on the master's; `None` before the first pong.
+    pub(crate) fn to_master(&self, worker_us: u64) -> Option<Micros> {
+        let o = self.offset?;
+        Some((worker_us as i128 - i128::from(o.us)).clamp(0, i128::from(Micros::MAX)) as Micros)
+    }
+}
+
+/// All workers.
+#[derive(Debug, Default)]
+pub(crate) struct Roster {
+    workers: BTreeMap<WorkerId, Worker>,
+    next_nonce: u64,
+    watched: Option<Micros>,
+}
+
+impl Roster {
+    pub(crate) fn join(&mut self, id: WorkerId, name: String, threads: u32, now: Micros) {
+        let worker = Worker {
+            name,
+            threads: threads.max(1),
+            since: now,
+            leaving: false,
+            scenes: BTreeSet::new(),
+            heard: now,
+            next_ping: now,
+            pings: VecDeque::new(),
+            offset: None,
+        };
+        self.workers.insert(id, worker);
+    }
+
+    pub(crate) fn remove(&mut self, id: WorkerId) -> Option<Worker> {
+        self.workers.remove(&id)
+    }
+
+    pub(crate) fn get(&self, id: WorkerId) -> Option<&Worker> {
+        self.workers.get(&id)
+    }
+
+    pub(crate) fn get_mut(&mut self, id: WorkerId) -> Option<&mut Worker> {
+        self.workers.get_mut(&id)
+    }
+
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (WorkerId, &Worker)> {
+        self.workers.iter().map(|(&id, w)| (id, w))
+    }
+
+    /// Those that take leases.
+    pub(crate) fn staying(&self) -> impl Iterator<Item = (WorkerId, &Worker)> {
+        self.iter().filter(|(_, w)| !w.leaving)
+    }
+
+    /// Render threads of those that take leases.
+    pub(crate) fn threads(&self) -> u64 {
+        self.staying().map(|(_, w)| u64::from(w.threads)).sum()
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.workers.is_empty()
+    }
+
+    /// Something came from the worker.
+    pub(crate) fn heard(&mut self, id: WorkerId, now: Micros) {
+        if let Some(w) = self.workers.get_mut(&id) {
+            w.heard = w.heard.max(now);
+        }
+    }
+
+    /// Time went on to `now`; see the head of this file.
+    pub(crate) fn watch(&mut self, now: Micros, config: &Config) {
+        if let Some(before) = self.watched {
+            let gap = now.saturating_sub(before);
+            if gap > 2 * config.heartbeat {
+                for w in self.workers.values_mut() {
+                    w.heard += gap;
+                }
+            }
+        }
+        self.watched = Some(now);
+    }
+
+    /// Workers that were silent too long.
+    pub(crate) fn silent(&self, now: Micros, config: &Config) -> Vec<WorkerId> {
+        let late = |w: &Worker| now >= w.heard.saturating_add(config.silence);
+        self.iter().filter(|(_, w)| late(w)).map(|(id, _)| id).collect()
+    }
+
+    /// A nonce for a ping that goes to the worker now.
+    pub(crate) fn ping(&mut self, id: WorkerId, now: Micros) -> u64 {
+        self.next_nonce += 1;
+        if let Some(w) = self.workers.get_mut(&id) {
+            w.pings.push_back((self.next_nonce, now));
+        }
+        self.next_nonce
+    }
+
+    /// The pings that are due.
+    pub(crate) fn beat(&mut self, now: Micros, config: &Config) -> Vec<(WorkerId, u64)> {
+        let due = |w: &Worker| w.next_ping <= now;
+        let ids: Vec<_> = self.iter().filter(|(_, w)| due(w)).map(|(id, _)| id).collect();
+        ids.into_iter()
+            .map(|id| {
+                self.workers.get_mut(&id).expect("just seen").next_ping = now + config.heartbeat;
+                (id, self.ping(id, now))
+            })
+            .collect()
+    }
+
+    /// A pong came. Whether its ping was ours and not answered before.
+    pub(crate) fn pong(&mut self, id: WorkerId, nonce: u64, clock_us: u64, now: Micros) -> bool {
+        let Some(w) = self.workers.get_mut(&id) else { return false };
+        let Some(i) = w.pings.iter().position(|p| p.0 == nonce) else { return false };
+        let sent = w.pings[i].1;
+        w.pings.drain(..=i);
+        let half_rtt = now.saturating_sub(sent) / 2;
+        let middle = i128::from(sent) + i128::from(half_rtt);
+        let us = (i128::from(clock_us) - middle).clamp(i64::MIN.into(), i64::MAX.into()) as i64;
+        let better = w.offset.is_none_or(|best| {
+            half_rtt as f64 <= best.half_rtt as f64 + DRIFT * now.saturating_sub(best.at) as f64
+        });
+        if better {
+            w.offset = Some(Offset { us, half_rtt, at: now });
+        }
+        true
+    }
+
+    /// The next ping or silence.
+    pub(crate) fn next_deadline(&self, config: &Config) -> Option<Micros> {
+        let of = |w: &Worker| w.next_ping.min(w.heard.saturating_add(config.silence));
+        self.workers.values().map(of).min()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn config() -> Config {
+        Config::default()
+    }
+
+    #[test]
+    fn the_offset_comes_from_the_shortest_round_trip() {
+        let mut r = Roster::default();
+        let w = WorkerId(1);
+        r.join(w, "a".into(), 1, 0);
+        assert_eq!(r.get(w).unwrap().to_master(5), None);
+        // The worker's clock is 1,000,000 ahead. A slow, lopsided pong first.
+        let n = r.ping(w, 100);
+        assert!(r.pong(w, n, 1_000_000 + 100, 5100));
+        assert_eq!(r.get(w).unwrap().to_master(1_010_000), Some(12_500));
+        let n = r.ping(w, 6000);
+        assert!(r.pong(w, n, 1_000_000 + 6050, 6100));
+        assert_eq!(r.get(w).unwrap().to_master(1_010_000), Some(10_000));
+        let n = r.ping(w, 7000);
+        assert!(r.pong(w, n, 1_000_000 + 7000, 9000));
+        assert_eq!(r.get(w).unwrap().to_master(1_010_000), Some(10_000));
+        assert!(!r.pong(w, n, 0, 9001), "answered twice");
+    }
+
+    #[test]
+    fn a_master_that_slept_blames_nobody() {
+        let mut r = Roster::default();
+        let w = WorkerId(1);
+        r.watch(0, &config());
+        r.join(w, "a".into(), 1, 0);
+        r.watch(900_000, &config());
+        r.watch(60_000_000, &config());
+        assert!(r.silent(60_000_000, &config()).is_empty());
+        for t in (60_500_000..63_000_000).step_by(500_000) {
+            r.watch(t, &config());
+        }
+        assert_eq!(r.silent(62_100_000, &config()), [w], "and yet silence is silence");
+    }
+}

@@ -21,7 +21,7 @@ import sys
 import tempfile
 import time
 
-# name, file, transfer function, axes: the paper's head, skull and blood vessels (section 5.2).
+# name, file, transfer function, axes: the paper's head, skull and blood vessels (section 5).
 SCENES = [
     ("mri256", "mri256.nrrd", "peer-opaque", ["--up=-y"]),
     ("mouse_skull", "mouse_skull.nrrd", "peer-skull", ["--up=z"]),

@@ -1,0 +1,225 @@
+//! Every message comes back from the wire as it was, to the last bit.
+
+mod any;
+
+use bytes::Bytes;
+use proptest::prelude::*;
+use prost::Message;
+use slabcast_common::brick::Brick;
+use slabcast_common::ids::BrickId;
+use slabcast_common::image::{PixelFormat, RawSums};
+use slabcast_common::message::{ToMaster, ToWorker};
+use slabcast_proto::convert::{self, Bricks, Down};
+use slabcast_proto::model::FrameChunk;
+use slabcast_proto::{MAX_BRICKS_MESSAGE, MAX_CONTROL_MESSAGE, MAX_FRAME_CHUNK, v1};
+
+/// Over the wire: encoded, decoded.
+fn wire<M: Message + Default>(message: M) -> M {
+    M::decode(&message.encode_to_vec()[..]).expect("what was encoded can be decoded")
+}
+
+/// `==` takes -0.0 for 0.0; this does not. (It does take every NaN for NaN: planes are compared
+/// by [`bits`].)
+fn shown(value: &impl std::fmt::Debug) -> String {
+    format!("{value:?}")
+}
+
+fn bits(a: &[f32]) -> Vec<u32> {
+    a.iter().map(|a| a.to_bits()).collect()
+}
+
+fn same_planes(
+    (a, last): (&[f32], &Option<Vec<RawSums>>),
+    (b, there): (&[f32], &Option<Vec<RawSums>>),
+) -> Result<(), TestCaseError> {
+    prop_assert_eq!(bits(a), bits(b));
+    prop_assert_eq!(last, there);
+    Ok(())
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(192))]
+
+    #[test]
+    fn to_master(message in any::to_master()) {
+        let back = convert::from_worker_from_wire(wire(convert::from_worker_to_wire(&message)));
+        let back = back.map_err(|e| TestCaseError::fail(e.to_string()))?;
+        prop_assert_eq!(shown(&back), shown(&message));
+        if let (ToMaster::Result(b), ToMaster::Result(m)) = (&back, &message) {
+            same_planes((&b.pixels.a, &b.pixels.last), (&m.pixels.a, &m.pixels.last))?;
+        }
+    }
+
+    #[test]
+    fn to_worker(message in any::to_worker(), session in 1u64..) {
+        let is_welcome = matches!(message, ToWorker::Welcome { .. });
+        let back = match convert::to_worker_to_wire(&message, session) {
+            Down::Control(m) => {
+                let (back, got) = convert::to_worker_from_wire(wire(m))
+                    .map_err(|e| TestCaseError::fail(e.to_string()))?;
+                prop_assert_eq!(got, is_welcome.then_some(session));
+                back
+            }
+            Down::Bricks(m) => {
+                prop_assert_eq!(m.len(), 1);
+                let m = wire(m[0].clone());
+                match convert::bricks_from_wire(m).map_err(|e| TestCaseError::fail(e.to_string()))? {
+                    Bricks::Message(back) => back,
+                    Bricks::Batch(_) => return Err(TestCaseError::fail("a batch")),
+                }
+            }
+        };
+        prop_assert_eq!(shown(&back), shown(&message));
+        if let (ToWorker::Lease(b), ToWorker::Lease(m)) = (&back, &message) {
+            same_planes((&b.state.a, &b.state.last), (&m.state.a, &m.state.last))?;
+        }
+    }
+
+    #[test]
+    fn path_requests(request in any::path_request()) {
+        let back = convert::path_request_from_wire(wire(convert::path_request_to_wire(&request)));
+        prop_assert_eq!(shown(&back.map_err(|e| TestCaseError::fail(e.to_string()))?), shown(&request));
+    }
+
+    #[test]
+    fn what_a_client_looks_at(
+        job in any::job(), notice in any::notice(), volume in any::volume(), worker in any::worker(),
+    ) {
+        prop_assert_eq!(convert::job_from_wire(wire(convert::job_to_wire(&job))), Ok(job));
+        let chunk = convert::chunk_from_wire(wire(convert::notice_to_wire(&notice)));
+        prop_assert_eq!(chunk, Ok(FrameChunk::Notice(notice)));
+        prop_assert_eq!(convert::worker_from_wire(wire(convert::worker_to_wire(&worker))), Ok(worker));
+        let back = convert::volume_from_wire(wire(convert::volume_to_wire(&volume)));
+        prop_assert_eq!(shown(&back), shown(&Ok::<_, ()>(volume)));
+    }
+
+    #[test]
+    fn bricks(set in any::key(), bricks in prop::collection::vec(any::brick(), 1..90)) {
+        let encoded = bricks.iter().map(|b| {
+            let mut bytes = Vec::new();
+            b.encode(&mut bytes);
+            Bytes::from(bytes)
+        });
+        let mut back: Vec<Brick> = Vec::new();
+        for message in convert::brick_batches_to_wire(&set, encoded) {
+            prop_assert!(message.encoded_len() <= MAX_BRICKS_MESSAGE);
+            let Ok(Bricks::Batch(batch)) = convert::bricks_from_wire(wire(message)) else {
+                return Err(TestCaseError::fail("refused"));
+            };
+            prop_assert!(batch.set == set && batch.broken.is_empty());
+            back.extend(batch.bricks.iter().map(|b| (**b).clone()));
+        }
+        prop_assert_eq!(back, bricks);
+    }
+}
+
+#[test]
+fn a_broken_brick_is_named_and_the_others_are_taken() {
+    let encode = |id| {
+        let mut bytes = Vec::new();
+        let brick = Brick {
+            id: BrickId(id),
+            index: vec![3, 4],
+            values: slabcast_common::volume::Samples::U8(vec![8, 9]),
+            normals: None,
+        };
+        brick.encode(&mut bytes);
+        bytes
+    };
+    let (good, mut flipped, mut short) = (encode(1), encode(2), encode(3));
+    flipped[8] ^= 1;
+    short.truncate(9);
+    let batch = [good, flipped, short].map(Bytes::from);
+    let message = convert::brick_batches_to_wire(&Default::default(), batch).remove(0);
+    let Ok(Bricks::Batch(batch)) = convert::bricks_from_wire(message) else { panic!("refused") };
+    assert_eq!(batch.bricks.iter().map(|b| b.id).collect::<Vec<_>>(), [BrickId(1)]);
+    assert_eq!(batch.broken, [BrickId(2), BrickId(3)]);
+    let nameless = convert::brick_batches_to_wire(&Default::default(), [Bytes::from_static(b"ab")]);
+    let e = convert::bricks_from_wire(nameless[0].clone()).unwrap_err();
+    assert_eq!(e.field(), "batch.bricks[0]");
+}
+
+#[test]
+fn many_bricks_are_cut_into_messages_of_one_http_frame() {
+    let brick = Bytes::from(vec![5; 3083]);
+    let batches = convert::brick_batches_to_wire(&Default::default(), vec![brick.clone(); 100]);
+    assert!(batches.iter().all(|b| b.encoded_len() <= MAX_BRICKS_MESSAGE));
+    assert_eq!(batches.len(), 5, "21 bricks of 3086 bytes fit into 65,000");
+    let Some(v1::bricks_down::Message::Batch(first)) = &batches[0].message else { panic!() };
+    assert_eq!(first.bricks[0].as_ptr(), brick.as_ptr(), "passed on, not copied");
+    assert!(convert::brick_batches_to_wire(&Default::default(), []).is_empty());
+
+    let drop = ToWorker::DropBricks {
+        set: Default::default(),
+        bricks: (0..40_000u32).map(|i| BrickId(i.wrapping_mul(2_654_435_761) >> 5)).collect(),
+    };
+    let Down::Bricks(messages) = convert::to_worker_to_wire(&drop, 0) else { panic!() };
+    assert!(messages.iter().all(|m| m.encoded_len() <= MAX_BRICKS_MESSAGE));
+}
+
+#[test]
+fn the_largest_lease_and_result_fit_a_control_message() {
+    use slabcast_common::ids::*;
+    use slabcast_common::image::{TilePixels, TileState};
+    use slabcast_common::message::{Lease, TileResult};
+    let n = convert::MAX_TILE_PIXELS;
+    let a: Vec<f32> = (0..n).map(|i| if i % 8 == 0 { 0.0 } else { i as f32 }).collect();
+    let last: Vec<RawSums> =
+        (0..n as u32).map(|i| if i % 9 == 0 { [0; 4] } else { [i; 4] }).collect();
+    // A gap of 64 before each brick: two bytes each.
+    let most = convert::MAX_BRICK_LIST as u32;
+    let lease = Lease {
+        task: TaskId(u64::MAX),
+        epoch: Epoch(u32::MAX),
+        frame: FrameId(u64::MAX),
+        tile: slabcast_common::occlusion::Rect::new(7936, 7936, 8192, 8192),
+        slab: slabcast_common::slab::SheetRange::new(i32::MIN, i32::MAX),
+        bricks: (0..most).map(|i| BrickId(i * 64)).collect(),
+        state: TileState { a: a.clone(), last: Some(last.clone()) },
+    };
+    let Down::Control(m) = convert::to_worker_to_wire(&ToWorker::Lease(Box::new(lease)), 0) else {
+        panic!()
+    };
+    assert!(m.encoded_len() < MAX_CONTROL_MESSAGE, "{}", m.encoded_len());
+    assert!(convert::to_worker_from_wire(wire(m)).is_ok());
+    let colour = last.iter().map(|l| [l[0], l[1], l[2]]).collect();
+    let result = TileResult {
+        task: TaskId(1),
+        epoch: Epoch(1),
+        pixels: TilePixels { a, colour, last: Some(last) },
+        counters: Default::default(),
+        times: Default::default(),
+    };
+    let m = convert::from_worker_to_wire(&ToMaster::Result(Box::new(result)));
+    assert!(m.encoded_len() < 2_100_000, "{}", m.encoded_len());
+    assert!(convert::from_worker_from_wire(wire(m)).is_ok());
+}
+
+#[test]
+fn a_frame_of_any_length_is_cut_and_put_together() {
+    let put_together = |pixels: usize, stats: &str, trace: &str| {
+        let size = [pixels as u32 / 4096 + 1, 1024];
+        let bytes = Bytes::from((0..pixels).map(|i| (i % 251) as u8).collect::<Vec<_>>());
+        let chunks = convert::frame_to_wire(7, size, PixelFormat::Rgba8, &bytes, stats, trace);
+        let (mut data, mut s, mut t) = (Vec::new(), String::new(), String::new());
+        for (i, chunk) in chunks.iter().enumerate() {
+            assert!(chunk.encoded_len() <= MAX_FRAME_CHUNK, "{}", chunk.encoded_len());
+            let Ok(FrameChunk::Pixels(p)) = convert::chunk_from_wire(wire(chunk.clone())) else {
+                panic!("refused")
+            };
+            assert_eq!((p.frame, p.size, p.offset), (7, size, data.len() as u64));
+            assert_eq!(p.last, i + 1 == chunks.len());
+            data.extend_from_slice(&p.data);
+            s += &p.stats_json;
+            t += &p.trace_json;
+        }
+        assert!(data == bytes && s == stats && t == trace);
+        chunks.len()
+    };
+    assert_eq!(put_together(3, "{}", ""), 1);
+    assert_eq!(put_together(MAX_FRAME_CHUNK - 256, "", ""), 1);
+    assert_eq!(put_together(MAX_FRAME_CHUNK - 256, "{}", "[]"), 2);
+    assert_eq!(put_together(MAX_FRAME_CHUNK - 255, "{}", "[]"), 2);
+    let long = "\u{20ac}\"a".repeat(600_000);
+    assert_eq!(put_together(5, &long, &long), 6);
+}

@@ -39,7 +39,6 @@ pub fn is_shut(a: f32, eps: f64) -> bool {
 struct Lent {
     task: TaskId,
     epoch: Epoch,
-    sent: Micros,
     /// Places of its bricks.
     bricks: Vec<u32>,
 }
@@ -75,7 +74,6 @@ impl Slab {
 #[derive(Debug)]
 pub(crate) struct Frame {
     pub(crate) job: Box<FrameJob>,
-    began: Micros,
     projected: Vec<Option<Projected>>,
     slabs: Vec<SheetRange>,
     at: usize,
@@ -117,7 +115,6 @@ impl Frame {
             ledger.enrol(id, worker, began);
         }
         let mut frame = Frame {
-            began,
             slabs: sheets.slabs(job.work.slabs),
             at: 0,
             state: FrameState::new(view.size),
@@ -308,7 +305,7 @@ impl Frame {
             let bricks = slab.bricks_of(place);
             cluster.residency.pin(id, &bricks);
             cluster.residency.want(id, bricks.iter().copied());
-            lent.push(Lent { task: slab.queue.id(place), epoch, sent: now, bricks });
+            lent.push(Lent { task: slab.queue.id(place), epoch, bricks });
             leases.push((id, place));
         }
 

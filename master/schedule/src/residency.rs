@@ -317,10 +317,10 @@ impl Residency {
             evict(&self.sets, shelf, self.round, after - shelf.budget, nonce, &mut errands);
         }
 
+        let alone = shelf.leaving.is_empty() && shelf.sets.values().all(|b| b.flying.is_empty());
         let books = shelf.sets.get_mut(&key).expect("what is wanted has books");
         let mut send = Vec::new();
         let (mut bytes, mut over_budget) = (0, false);
-        let alone = books.flying.is_empty() && shelf.leaving.is_empty();
         let mut stay = VecDeque::new();
         while let Some(i) = shelf.wanted.pop_front() {
             let at = i as usize;
@@ -382,19 +382,23 @@ impl Residency {
         for &id in ids {
             let Some(i) = place_of(&set.bricks, id) else { continue };
             let bytes = u64::from(set.bricks[i as usize].bytes);
-            match books.place[i as usize] {
-                Place::Flying => books.flying.retain(|&f| f != i),
-                // The count of the good ones came first and was taken for this one.
+            let place = books.place[i as usize];
+            if place == Place::Flying {
+                books.flying.retain(|&f| f != i);
+            } else if let Some(next) = books.flying.pop_front() {
+                // The count of the good ones came first, and was taken for this one.
+                books.place[next as usize] = Place::Held;
+                books.held_count += 1;
+                books.held_bytes += u64::from(set.bricks[next as usize].bytes);
+            }
+            match place {
+                Place::Flying => {}
                 Place::Held => {
                     books.held_count -= 1;
                     books.held_bytes -= bytes;
-                    if let Some(next) = books.flying.pop_front() {
-                        books.place[next as usize] = Place::Held;
-                        books.held_count += 1;
-                        books.held_bytes += u64::from(set.bricks[next as usize].bytes);
-                    }
                 }
-                Place::Absent | Place::Leaving => continue,
+                // It goes anyway, or is gone.
+                Place::Leaving | Place::Absent => continue,
             }
             books.place[i as usize] = Place::Absent;
             shelf.bytes -= bytes;

@@ -1,0 +1,152 @@
+//! The schedule against a virtual cluster (PROMISES.md R1 to R5, R9, R11).
+
+mod fake;
+mod rng;
+mod stories;
+mod world;
+
+use rng::Rng;
+use slabcast_common::ids::{FrameId, SceneId, WorkerId};
+use slabcast_common::quality::{Quality, Work};
+use slabcast_schedule::Config;
+use world::{Nature, Script, World};
+
+/// Seeds of a run, `SLABCAST_SEEDS=10000` for a campaign, `SLABCAST_SEED=17` for one.
+fn seeds(default: u64) -> std::ops::Range<u64> {
+    let number = |name| std::env::var(name).ok().and_then(|s| s.parse::<u64>().ok());
+    match number("SLABCAST_SEED") {
+        Some(seed) => seed..seed + 1,
+        None => 0..number("SLABCAST_SEEDS").unwrap_or(default),
+    }
+}
+
+fn nature(rng: &mut Rng, small_budgets: bool) -> Nature {
+    let rarely = |rng: &mut Rng, n| if rng.once_in(4) { rng.between(n / 2, n) } else { 0 };
+    let slowest = rng.pick(&[200, 2_000, 30_000]);
+    Nature {
+        threads: rng.pick(&[1, 1, 2, 2, 3, 4, 8]),
+        us_per_pixel_sheet: rng.pick(&[0.05, 0.3, 1.0, 3.0]),
+        budget: if small_budgets { rng.pick(&[1, 3_000, 9_000, 30_000, 60_000]) } else { u64::MAX },
+        latency: (50, slowest),
+        us_per_brick: rng.pick(&[1, 20, 300, 3_000]),
+        clock_ahead: rng.below(1 << 40),
+        twice_in: rarely(rng, 8),
+        lie_in: rarely(rng, 60),
+        fail_in: rarely(rng, 60),
+        broken_in: rarely(rng, 40),
+        deadly: None,
+        hangs_at: None,
+        immune: false,
+    }
+}
+
+/// A world of one seed, run to its end.
+fn chaos(seed: u64) -> World {
+    let mut rng = Rng::new(seed ^ 0xc4a0_5000);
+    let config = Config {
+        lease: rng.pick(&[60_000_000, 60_000_000, 100_000, 20_000]),
+        // Kills are many here; poison has its own tests.
+        poison_after: 1000,
+        queue_ahead: rng.pick(&[1, 2, 2, 4]),
+        ..Config::default()
+    };
+    let mut w = World::new(seed, config);
+    let small_budgets = rng.once_in(3);
+
+    let dims = [rng.between(8, 56) as u32, rng.between(8, 48) as u32, rng.between(8, 48) as u32];
+    let sets: Vec<_> = (0..rng.between(1, 2) as u8)
+        .map(|n| {
+            let fill = rng.pick(&[1, 4, 8]);
+            (fake::key(n), fake::bricks(&mut rng, dims, fill))
+        })
+        .collect();
+    let frames = rng.between(1, 3);
+    for frame in 0..frames {
+        let (set, bricks) = &sets[rng.below(sets.len() as u64) as usize];
+        let quality = Quality {
+            thickness: rng.pick(&[1.0, 2.0, 4.0]),
+            eps: rng.pick(&[0.0, 1.0 / 512.0, 0.05, 0.3]),
+            cull: !rng.once_in(4),
+            ..Quality::default()
+        };
+        let scene = fake::scene(frame, *set, dims, quality);
+        let work = Work {
+            slabs: rng.pick(&[1, 2, 3, 5, 100]),
+            tiles_per_worker: rng.pick(&[0.5, 2.5, 2.5, 6.0]),
+            tile: rng.pick(&[None, None, None, Some(16), Some(64)]),
+            ..Work::default()
+        };
+        let size = [rng.between(1, 130) as u32, rng.between(1, 130) as u32];
+        let job = fake::job(&mut rng, frame, &scene, bricks, size, work);
+        let when = rng.below(30_000);
+        // In the order of their numbers.
+        w.script(1_000 + 50_000 * frame + when, Script::Queue(job));
+        if rng.once_in(8) {
+            let when = rng.below(200_000);
+            w.script(1_000 + 50_000 * frame + when, Script::Cancel(FrameId(frame)));
+        }
+        let when = 60_000 * (frame + 1) + rng.below(400_000);
+        w.script(when.max(50_000 * frame + 40_000), Script::EndScene(SceneId(frame)));
+    }
+    for _ in 0..rng.between(0, 5) {
+        let n = nature(&mut rng, small_budgets);
+        w.join(n);
+    }
+    // Some things go wrong, most of them while there is work.
+    for _ in 0..rng.between(0, 10) {
+        let when = 1_000 + rng.below(rng.clone().pick(&[100_000, 400_000, 5_000_000]));
+        let whom = WorkerId(rng.between(1, 8));
+        let what = match rng.below(10) {
+            0..=3 => Script::Kill(whom),
+            4 | 5 => Script::Stall(whom, rng.pick(&[10_000, 500_000, 2_000_000, 20_000_000])),
+            6 => Script::Leave(whom),
+            7 => Script::Slow(whom, 40.0),
+            _ => Script::Join(nature(&mut rng, small_budgets)),
+        };
+        w.script(when, what);
+    }
+    // In the end there is somebody.
+    let when = rng.pick(&[1_000_000, 6_000_000]);
+    w.script(when, Script::Join(Nature { immune: true, ..Nature::default() }));
+    w.finish();
+    w
+}
+
+#[test]
+fn pictures_are_the_serial_ones_whatever_happens_to_the_cluster() {
+    let range = seeds(300);
+    let campaign = range.end - range.start > 1000;
+    let (mut frames, mut retries, mut dropped, mut lost, mut virtual_us) = (0, 0, 0, 0, 0);
+    let (mut over_budget, mut leases, mut lies) = (0, 0, 0);
+    let clock = std::time::Instant::now();
+    for seed in range {
+        let w = chaos(seed);
+        frames += w.done.len();
+        retries += w.done.values().map(|d| d.stats.retries).sum::<u64>();
+        dropped += w.scheduler.totals().dropped_results;
+        lost += w.scheduler.totals().lost_workers;
+        over_budget += w.scheduler.totals().over_budget;
+        lies += w.drops.iter().filter(|d| d.1.contains("plane")).count();
+        leases += w.leases_given;
+        virtual_us += w.now();
+    }
+    let secs = clock.elapsed().as_secs_f64();
+    let ratio = virtual_us as f64 / 1e6 / secs;
+    println!(
+        "{frames} frames, {leases} leases, {retries} retries, {dropped} results dropped, {lost} \
+         workers lost, {lies} lies, {over_budget} over budget; {secs:.1} s, {ratio:.0} x real time"
+    );
+    if std::env::var("SLABCAST_SEED").is_err() {
+        // The worlds do hold what they are there for.
+        assert!(frames > 0 && retries > 0 && dropped > 0 && lost > 0 && lies > 0);
+        assert!(over_budget > 0);
+    }
+    assert!(!campaign || ratio > 1.0, "slower than the clusters it stands for");
+}
+
+#[test]
+fn a_seed_replays() {
+    for seed in [3, 17, 40, 77] {
+        assert_eq!(chaos(seed).log, chaos(seed).log, "seed {seed}");
+    }
+}

@@ -5,14 +5,16 @@
 //! first and interpret them afterwards, in no particular order, which reads every file that
 //! the specification allows and some that it doesn't (fields before `dimension`).
 //!
-//! Encodings are raw and gzip. ASCII, hex, bzip2 and lists of data files are refused by name.
+//! Encodings are raw and gzip (inflated by miniz_oxide, which has no unsafe code; zlib-rs was
+//! 16 % faster on mri256.nrrd and 30 % on a 512x512x275 chest, 49 against 41 ms and 0.79
+//! against 0.53 s to open, which did not seem worth the difference in trust). ASCII, hex, bzip2 and lists of data files are refused by name.
 
 use crate::error::{Problem, quoted};
 use crate::samples::{self, Endian, Layout, Number, SKIP_MAX_BYTES, Supply};
 use crate::source::{self, Source};
 use flate2::bufread::MultiGzDecoder;
 use glam::DVec3;
-use slabcast_common::volume::{Lattice, Volume};
+use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
 use std::collections::BTreeMap;
 use std::io::{BufRead, Read, Seek, SeekFrom};
 use std::path::Path;
@@ -58,7 +60,7 @@ fn read_data(
     source: &mut Source,
     len: u64,
     header: &Header,
-) -> Result<(slabcast_common::volume::Samples, slabcast_common::volume::ValueMap), Problem> {
+) -> Result<(Samples, ValueMap), Problem> {
     let ends_early = |field: &str| {
         Problem::malformed(field, "skips past the end of the data", "correct the skip")
     };
@@ -128,8 +130,7 @@ impl Fields {
                 .read_until(b'\n', &mut line)
                 .map_err(|e| Problem::io("header", &e))?;
             consumed += n as u64;
-            let ended = line.last() == Some(&b'\n');
-            if !ended && consumed == HEADER_MAX_BYTES {
+            if consumed == HEADER_MAX_BYTES {
                 return Err(Problem::malformed(
                     "header",
                     format!("does not end within {HEADER_MAX_BYTES} bytes"),
@@ -587,5 +588,182 @@ fn unit_mm(fields: &Fields) -> f64 {
     match units.next().flatten() {
         Some(mm) if units.all(|u| u == Some(mm)) => mm,
         _ => 1.0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fuzz::gzip;
+
+    fn open(header: &str, data: &[u8]) -> Result<Volume, Problem> {
+        let bytes = [b"NRRD0004\n", header.as_bytes(), b"\n", data].concat();
+        crate::read(Source::memory(bytes), Path::new("."), "test.nrrd")
+    }
+
+    const RAW: &str = "type: uint8\ndimension: 3\nsizes: 3 2 1\nencoding: raw\n";
+
+    #[test]
+    fn every_name_of_every_type_is_known() {
+        for (names, kind, bytes) in [
+            ("signed char,int8,int8_t", "int8", 1),
+            ("uchar,unsigned char,uint8,uint8_t", "uint8", 1),
+            ("short,short int,signed short,signed short int,int16,int16_t", "int16", 2),
+            ("ushort,unsigned short,unsigned short int,uint16,uint16_t", "uint16", 2),
+            ("int,signed int,int32,int32_t", "int32", 4),
+            ("uint,unsigned int,uint32,uint32_t", "uint32", 4),
+            (
+                "longlong,long long,long long int,signed long long,signed long long int,int64,\
+                 int64_t",
+                "int64",
+                8,
+            ),
+            ("ulonglong,unsigned long long,unsigned long long int,uint64,uint64_t", "uint64", 8),
+            ("float", "float32", 4),
+            ("double", "float64", 8),
+        ] {
+            for name in names.split(',') {
+                let header = RAW.replace("uint8", name) + "endian: little\n";
+                let data = vec![0; 6 * bytes];
+                assert_eq!(open(&header, &data).unwrap().file_type, kind, "{name}");
+                let e = open(&header, &data[1..]).unwrap_err().to_string();
+                assert!(e.contains("bytes are needed and"), "{name}: {e}");
+            }
+        }
+    }
+
+    #[test]
+    fn spaces_become_ras() {
+        let place = "space directions: (1,0,0) (0,2,0) (0,0.5,3)\nspace origin: (10,20,30)\n";
+        for (space, signs, anatomical) in [
+            ("right-anterior-superior", [1.0, 1.0, 1.0], true),
+            ("RAS", [1.0, 1.0, 1.0], true),
+            ("left-anterior-superior", [-1.0, 1.0, 1.0], true),
+            ("left-posterior-superior", [-1.0, -1.0, 1.0], true),
+            ("LPS", [-1.0, -1.0, 1.0], true),
+            ("scanner-xyz", [1.0, 1.0, 1.0], false),
+            ("3D-right-handed", [1.0, 1.0, 1.0], false),
+            ("3D-left-handed", [1.0, 1.0, -1.0], false),
+        ] {
+            let v = open(&format!("{RAW}space: {space}\n{place}"), &[0; 6]).unwrap();
+            let s = DVec3::from_array(signs);
+            assert_eq!(v.lattice.origin, DVec3::new(10.0, 20.0, 30.0) * s, "{space}");
+            assert_eq!(v.lattice.steps[2], DVec3::new(0.0, 0.5, 3.0) * s, "{space}");
+            assert_eq!(v.anatomical, anatomical, "{space}");
+            let zeros = v.lattice.steps.iter().flat_map(|s| s.to_array()).filter(|x| *x == 0.0);
+            assert!(zeros.clone().count() > 0 && zeros.into_iter().all(f64::is_sign_positive));
+        }
+        let bare = open(&format!("{RAW}{place}space dimension: 3\n"), &[0; 6]).unwrap();
+        assert!(!bare.anatomical && bare.lattice.steps[1].y == 2.0);
+        // A space without directions does not say where the index axes point.
+        let lost = open(&format!("{RAW}space: LPS\nspacings: 1 2 3\n"), &[0; 6]).unwrap();
+        assert!(!lost.anatomical);
+        assert_eq!(lost.lattice.spacing(), [1.0, 2.0, 3.0]);
+        let um = "space units: \"um\" \"um\" \"um\"\n";
+        let um = open(&format!("{RAW}{place}{um}space: RAS\n"), &[0; 6]).unwrap();
+        assert_eq!(um.lattice.origin.x, 0.01);
+    }
+
+    #[test]
+    fn axes_of_one_sample_are_squeezed() {
+        let data: Vec<u8> = (0..6).collect();
+        let want = open(&format!("{RAW}spacings: 1 2 3\n"), &data).unwrap();
+        let four = |sizes: &str, rest: &str| {
+            let header = RAW.replace("dimension: 3", "dimension: 4").replace("3 2 1", sizes);
+            open(&format!("{header}{rest}"), &data)
+        };
+        for v in [
+            four("1 3 2 1", "spacings: nan 1 2 3\nkinds: list domain domain domain\n"),
+            four("3 2 1 1", "spacings: 1 2 3 7\n"),
+            four("1 3 2 1", "space dimension: 3\nspace directions: none (1,0,0) (0,2,0) (0,0,3)\n"),
+        ] {
+            let v = v.unwrap();
+            assert_eq!((v.lattice, v.samples), (want.lattice, want.samples.clone()));
+        }
+        let v = four("3 1 1 2", "").unwrap();
+        assert_eq!(v.lattice.dims, [3, 1, 2], "the last axis of one sample goes");
+        let e = four("3 2 2 4", "").unwrap_err().to_string();
+        assert!(e.contains("3 x 2 x 2 x 4 has 4 axes of more than one sample"), "{e}");
+    }
+
+    #[test]
+    fn skips_are_of_the_file_when_raw_and_of_the_content_when_gzip() {
+        let data: Vec<u8> = (10..16).collect();
+        let want = slabcast_common::volume::Samples::U8(data.clone());
+        let junk = [b"one\ntwo\nxyz", &data[..]].concat();
+        let skip = "line skip: 2\nbyte skip: 3\n";
+        assert_eq!(open(&format!("{RAW}{skip}"), &junk).unwrap().samples, want);
+        let v = open(&format!("{RAW}byte skip: -1\n"), &junk).unwrap();
+        assert_eq!(v.samples, want);
+        let packed = [b"one\ntwo\n".to_vec(), gzip(&[b"xyz", &data[..]].concat())].concat();
+        let gz = RAW.replace("raw", "gzip");
+        assert_eq!(open(&format!("{gz}{skip}"), &packed).unwrap().samples, want);
+        for (skip, say) in [
+            ("line skip: 99\n", "line skip: skips past"),
+            ("byte skip: 99999999999\n", "byte skip: skips past"),
+            ("byte skip: -2\n", "byte skip (line 6): `-2` is below -1"),
+            ("line skip: -1\n", "line skip (line 6): `-1` is negative"),
+            ("byte skip: x\n", "`x` is not a whole number"),
+        ] {
+            let e = open(&format!("{RAW}{skip}"), &junk).unwrap_err().to_string();
+            assert!(e.contains(say), "{skip}: {e}");
+        }
+        let e = open(&format!("{gz}byte skip: -1\n"), &packed).unwrap_err().to_string();
+        assert!(e.contains("-1 counts from the end"), "{e}");
+    }
+
+    #[test]
+    fn multi_member_gzip_and_dos_lines_and_strange_fields_are_read() {
+        let gz = RAW.replace("raw", "gz") + "flavour: odd\nkey:=x: y\n# sizes: 9 9 9\n";
+        let members = [gzip(&[1, 2, 3]), gzip(&[4, 5, 6])].concat();
+        let v = open(&gz, &members).unwrap();
+        assert_eq!(v.samples, slabcast_common::volume::Samples::U8(vec![1, 2, 3, 4, 5, 6]));
+        let dos = RAW.replace('\n', "\r\n") + "\r";
+        assert!(open(&dos, &[0; 6]).is_ok());
+    }
+
+    #[test]
+    fn what_is_not_read_is_refused_by_field_and_remedy() {
+        let with = |from: &str, to: &str| RAW.replace(from, to);
+        for (header, say) in [
+            (with("raw", "bzip2"), "encoding (line 5): bzip2 is not read by this version; save"),
+            (with("raw", "txt"), "ascii is not read"),
+            (with("raw", "hex"), "hex is not read"),
+            (with("raw", "zip"), "`zip` is not an encoding"),
+            (with("uint8", "block"), "type (line 2): `block` samples are not numbers"),
+            (with("uint8", "char8"), "`char8` is not a type"),
+            (with("uint8", "short"), "endian: is missing, and int16 has 2 bytes; add"),
+            (with("type: uint8\n", ""), "type: is missing; add a line such as"),
+            (with("sizes: 3 2 1\n", ""), "sizes: is missing"),
+            (with("3 2 1", "3 2"), "sizes (line 4): `3 2` has 2 entries for 3 axes"),
+            (with("3 2 1", "3 2 -1"), "has something else than whole numbers"),
+            (with("3 2 1", "3 0 1"), "3 x 0 x 1 has no samples"),
+            (with("3 2 1", "3 2 99999"), "is longer than 16384"),
+            (with("3 2 1", "16384 16384 16384"), "has more than 8589934592 samples"),
+            (with("dimension: 3", "dimension: 2"), "sizes (line 4)"),
+            (with("dimension: 3", "dimension: 0"), "`0` is not 1 to 16"),
+            (with("type: uint8", "type uint8"), "line 2: `type uint8` is neither"),
+            (format!("{RAW}type: uint8\n"), "line 6: `type` was given in line 2 already"),
+            (format!("{RAW}spacings: 1 1 0\n"), "spacings (line 6): a spacing is zero"),
+            (format!("{RAW}spacings: 1 1 x\n"), "has something else than numbers"),
+            (format!("{RAW}space: mars\n"), "`mars` is not a space"),
+            (format!("{RAW}space: RAST\n"), "has four dimensions"),
+            (format!("{RAW}space directions: (1,0,0) (0,1,0)\n"), "has 2 vectors"),
+            (format!("{RAW}space directions: (1,0) (0,1) (0,0)\n"), "is not made of vectors"),
+            (format!("{RAW}space directions: (1,0,0) (0,1,0) (2,0,0)\n"), "would be flat"),
+            (format!("{RAW}space directions: (1,0,0) (0,1,0) none\n"), "no direction for axis 2"),
+            (format!("{RAW}data file: LIST\n"), "`LIST` names several files"),
+            (format!("{RAW}data file: a%03d.raw 1 9 1\n"), "names several files"),
+            (format!("{RAW}data file: no/such.raw\n"), "data file: `no/such.raw` is not there"),
+        ] {
+            let e = open(&header, &[0; 6]).unwrap_err().to_string();
+            assert!(e.contains(say), "want {say:?} in {e}");
+        }
+        let bytes = b"NRRD0009\n".to_vec();
+        let e = read(Source::memory(bytes), Path::new("."), "t").unwrap_err().to_string();
+        assert!(e.contains("line 1: `NRRD0009` is not NRRD0001 to NRRD0005"), "{e}");
+        let endless = [b"NRRD0004\n".to_vec(), b"#xxxxxxx\n".repeat(1 << 17)].concat();
+        let e = read(Source::memory(endless), Path::new("."), "t").unwrap_err().to_string();
+        assert!(e.contains("does not end within 1048576 bytes"), "{e}");
     }
 }

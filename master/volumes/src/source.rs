@@ -20,8 +20,8 @@ pub(crate) struct Source {
     pub(crate) len: u64,
 }
 
-/// 64 KiB: a page-cache read costs some 10 us a call below it (measured with `examples/load`
-/// on stent.nrrd: 8 KiB 3 % slower, 256 KiB the same).
+/// Enough to see what a file is ([`Source::head`]) and to keep system calls few; samples are
+/// read past it in larger pieces.
 const BUFFER_BYTES: usize = 64 << 10;
 
 impl Source {

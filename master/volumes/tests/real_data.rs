@@ -1,0 +1,183 @@
+//! Files as people have them. They are not part of the repository (their licences differ), but
+//! for the sample; where they are missing the tests say so and pass.
+
+use glam::DVec3;
+use slabcast_common::presets;
+use slabcast_common::quality::Compositing;
+use slabcast_common::shade::encode_normal;
+use slabcast_common::transfer::Classifier;
+use slabcast_common::volume::{Samples, Volume};
+use slabcast_volumes::{BrickStore, OpenErrorKind, open};
+use std::path::{Path, PathBuf};
+
+fn data(file: &str) -> Option<PathBuf> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
+    if !folder.is_dir() {
+        println!("skipped: ../shared/data is not here");
+        return None;
+    }
+    Some(folder.join(file))
+}
+
+fn volume(path: &Path) -> Volume {
+    open(path).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// Size, type and spacing as the README beside the data has them.
+#[test]
+fn every_documented_nrrd_opens_with_its_size_type_and_spacing() {
+    for (file, dims, kind, spacing) in [
+        ("mri256", [256, 256, 256], "uint8", [1.0; 3]),
+        ("aneurism", [256, 256, 256], "uint8", [1.0; 3]),
+        ("mouse_skull", [176, 320, 128], "uint8", [0.0706; 3]),
+        ("engine", [256, 256, 128], "uint8", [1.0; 3]),
+        ("bonsai", [256, 256, 256], "uint8", [1.0; 3]),
+        ("heptane", [302, 302, 302], "uint8", [1.0; 3]),
+        ("chris_t1", [188, 256, 190], "uint8", [0.88; 3]),
+        ("t1_icbm", [180, 216, 180], "uint8", [1.0; 3]),
+        ("iguana", [210, 256, 179], "uint8", [0.10; 3]),
+        ("ct_avm", [256, 242, 154], "uint8", [0.72, 0.72, 1.0]),
+        ("lidc2", [256, 256, 133], "uint8", [1.41, 1.41, 2.5]),
+        ("stent", [128, 128, 256], "int16", [1.0; 3]),
+        ("tooth", [103, 94, 161], "uint8", [1.0; 3]),
+        ("large/lidc0314_ct", [512, 512, 275], "int16", [0.78, 0.78, 1.0]),
+    ] {
+        let Some(path) = data(&format!("{file}.nrrd")) else { return };
+        let v = volume(&path);
+        assert_eq!(v.lattice.dims, dims, "{file}");
+        assert_eq!(v.file_type, kind, "{file}");
+        for (got, want) in v.lattice.spacing().iter().zip(spacing) {
+            assert!((got - want).abs() < 0.02 * want, "{file}: spacing {got}, not {want}");
+        }
+        assert!(!v.anatomical, "{file} has spacings alone");
+        assert_eq!(v.summary.total(), v.lattice.len() as u64, "{file}");
+    }
+}
+
+#[test]
+fn shares_above_the_documented_cuts_are_as_documented() {
+    for (file, cuts) in [
+        ("mri256", &[(15.0, 24.1), (40.0, 21.3), (95.0, 7.7)][..]),
+        ("aneurism", &[(20.0, 0.73), (100.0, 0.42)]),
+        ("stent", &[(150.0, 6.2), (600.0, 0.4)]),
+        ("large/lidc0314_ct", &[(500.0, 34.3), (1200.0, 2.9)]),
+    ] {
+        let Some(path) = data(&format!("{file}.nrrd")) else { return };
+        let v = volume(&path);
+        for &(cut, percent) in cuts {
+            let map = v.summary.map;
+            let above =
+                (0..v.samples.len()).filter(|&i| map.value(v.samples.code(i)) >= cut).count();
+            let got = 100.0 * above as f64 / v.samples.len() as f64;
+            assert!((got - percent).abs() < 0.06, "{file}: {got} % above {cut}, not {percent}");
+        }
+    }
+}
+
+#[test]
+fn twins_in_other_formats_are_equal() {
+    let Some(path) = data("engine.nrrd") else { return };
+    let twin = |file: &str| volume(&data(file).expect("the folder is there"));
+    let engine = volume(&path);
+    assert_eq!(engine.digest(), twin("formats/nrrd/engine_detached_gzip.nhdr").digest());
+    assert_eq!(twin("tooth.nrrd").samples, twin("formats/nrrd/tooth_attached_raw.nrrd").samples);
+    assert_eq!(twin("ct_avm.nrrd").samples, twin("formats/nifti/CT_AVM.nii.gz").samples);
+    assert_eq!(twin("chris_t1.nrrd").samples, twin("formats/nifti/chris_t1.nii.gz").samples);
+    let Samples::U8(aneurism) = twin("aneurism.nrrd").samples else { panic!("it is uint8") };
+    let raw = data("formats/raw/aneurism_256x256x256_uint8.raw").expect("the folder is there");
+    assert!(aneurism == std::fs::read(raw).unwrap());
+}
+
+#[test]
+fn slicers_negative_directions_in_lps_point_along_ras() {
+    let Some(path) = data("formats/nrrd/A_J_attached_gzip.nrrd") else { return };
+    let v = volume(&path);
+    let plain = volume(&data("mouse_skull.nrrd").expect("the folder is there"));
+    assert!(v.anatomical && !plain.anatomical);
+    assert_eq!(v.samples, plain.samples);
+    let s = 0.0705567002296448;
+    assert_eq!(v.lattice.steps, [DVec3::X * s, DVec3::Y * s, DVec3::Z * s]);
+    assert_eq!(
+        v.lattice.origin,
+        DVec3::new(3.0515799522399902, 2.6987900733947763, 3.2279698848724365)
+    );
+}
+
+#[test]
+fn nifti_files_open_in_the_right_place_with_their_slope() {
+    let Some(path) = data("formats/nifti/CT_AVM.nii.gz") else { return };
+    let avm = volume(&path);
+    assert!(avm.anatomical);
+    assert!((avm.summary.map.scale - 2.20863).abs() < 1e-5);
+    assert!((avm.lattice.origin - DVec3::new(-73.3977, -69.6942, -64.11)).length() < 1e-3);
+    let chris = volume(&data("formats/nifti/chris_t1.nii.gz").expect("the folder is there"));
+    assert!(chris.anatomical && chris.lattice.is_isotropic());
+    assert_eq!(chris.summary.map.scale, 1.0);
+}
+
+#[test]
+fn the_sample_is_upright_and_not_mirrored() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../samples/mni152_t1.nii.gz");
+    let v = volume(&path);
+    assert_eq!((v.name.as_str(), v.file_type.as_str()), ("mni152_t1.nii.gz", "uint8"));
+    assert_eq!(v.lattice.dims, [197, 233, 189]);
+    assert!(v.anatomical, "it says where right, anterior and superior are");
+    assert_eq!(v.lattice.steps, [DVec3::X, DVec3::Y, DVec3::Z]);
+    assert_eq!(v.lattice.origin, DVec3::new(-98.0, -134.0, -72.0));
+    // What its README says: brain from 20 on 21.8 %.
+    let brain = v.summary.histogram[20..].iter().sum::<u64>() as f64 / v.lattice.len() as f64;
+    assert!((brain - 0.218).abs() < 1e-3, "{brain}");
+    // In anatomy: the top of the brain (vertex) is at z of some 80 mm above the anterior
+    // commissure, the frontal pole at y of 70, the occipital pole at -105.
+    let inside = |x: f64, y: f64, z: f64| {
+        let i = (DVec3::new(x, y, z) - v.lattice.origin).to_array().map(|c| c as usize);
+        v.samples.code(i[0] + 197 * (i[1] + 233 * i[2])) >= 20.0
+    };
+    assert!(inside(20.0, -20.0, 70.0) && !inside(20.0, -20.0, -70.0), "upside down");
+    assert!(inside(25.0, -95.0, 0.0) && !inside(25.0, 95.0, 0.0), "back to front");
+}
+
+/// The normals of a real head against the plain loop, and the time it takes, printed.
+#[test]
+fn a_head_is_cut_as_the_plain_loop_says() {
+    let Some(path) = data("mri256.nrrd") else { return };
+    let start = std::time::Instant::now();
+    let v = volume(&path);
+    let digest = v.digest();
+    let tf = presets::by_name("peer-opaque", &v.summary).unwrap();
+    let support = Classifier::new(&tf, &v.info(digest), Compositing::Linear).support();
+    let store = BrickStore::build(&v, digest, &support, true);
+    println!("mri256: open, digest, build {:?}", start.elapsed());
+    let m = v.gradient_matrix();
+    let grid = slabcast_common::brick::BrickGrid::of(v.lattice.dims);
+    for info in store.infos().iter().step_by(37) {
+        let brick = store.brick(info.id).unwrap();
+        let corner = grid.corner(info.id);
+        for (n, &i) in brick.index.iter().enumerate() {
+            let l = slabcast_common::brick::local(i);
+            let at = std::array::from_fn(|a| corner[a] + l[a]);
+            assert_eq!(brick.normals.as_ref().unwrap()[n], encode_normal(v.gradient(at, &m)));
+        }
+    }
+    let relevant: u64 = v.summary.histogram[39..].iter().sum();
+    assert_eq!(store.relevant_voxels(), relevant, "peer-opaque shows what is above 38");
+}
+
+#[test]
+fn formats_that_come_later_are_named() {
+    for (file, say) in [
+        ("formats/metaimage/stent_int16.mhd", "is MetaImage"),
+        ("formats/metaimage/LIDC2.mha", "is MetaImage"),
+        ("formats/vti/aneurism.vti", "is VTK"),
+        ("formats/dicom/1-041.dcm", "is DICOM"),
+        ("formats/raw/aneurism_256x256x256_uint8.raw", "write a .nhdr"),
+        ("formats/nrrd/engine_256x256x128_uint8.raw.gz", "is gzip, but not NIfTI"),
+        ("README.md", "is text"),
+    ] {
+        let Some(path) = data(file) else { return };
+        let e = open(&path).unwrap_err();
+        assert_eq!(e.problem.kind, OpenErrorKind::NotAVolume);
+        let line = e.to_string();
+        assert!(line.contains(say) && line.contains(file), "{line}");
+    }
+}

@@ -254,7 +254,7 @@ impl Header {
         if !(first..=first + SKIP_MAX_BYTES as f64).contains(&offset) || offset.fract() != 0.0 {
             return Err(Problem::malformed(
                 "vox_offset",
-                format!("{offset:?} is no place between {first} and 64 MiB behind it"),
+                format!("{offset:?} is no place between {first} and 16 MiB behind it"),
                 "correct it (352 where there are no extensions)",
             ));
         }

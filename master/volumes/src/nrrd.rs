@@ -22,8 +22,8 @@ use std::path::Path;
 /// What an NRRD file starts with, before its version.
 pub(crate) const MAGIC: &[u8] = b"NRRD";
 
-/// Longest header. Slicer writes some 100 KiB of key:=value pairs for diffusion volumes with
-/// many directions; beyond a mebibyte it is no header.
+/// Longest header: room for ten thousand lines of key:=value pairs. It bounds the memory that a
+/// file without an empty line can take.
 const HEADER_MAX_BYTES: u64 = 1 << 20;
 
 /// Most axes that teem knows (`NRRD_DIM_MAX`).

@@ -132,8 +132,8 @@ fn table(support: &Support, codes: usize) -> Vec<bool> {
     relevant
 }
 
-/// All bricks with a relevant voxel. One task is a row of bricks along x, 2 KiB of 8-bit codes
-/// in 64 runs for a volume of 256, so that 1024 tasks keep any number of cores even.
+/// All bricks with a relevant voxel. One task is a row of bricks along x: a 256^3 volume has
+/// 1024 of them with 16 Ki samples each, which keeps any number of cores evenly busy.
 fn cut<T: Copy + Into<f64> + Sync>(
     volume: &Volume,
     codes: &[T],

@@ -19,13 +19,14 @@ use slabcast_common::transfer::{Classifier, Support, TransferFunction};
 use slabcast_common::view::{Projected, View};
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
+use slabcast_proto::model::Worker;
 use slabcast_schedule::{
-    Action, Clock, Event as Happened, FrameJob, Micros, Scheduler, WorkerView,
+    Action, Clock, Event as Happened, FrameJob, Micros, Scheduler,
 };
 use slabcast_volumes::BrickStore;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 use tokio::sync::{mpsc, oneshot};
 use tracing::{debug, info, warn};
 
@@ -36,6 +37,9 @@ const FRAMES_IN_FLIGHT: usize = 3;
 /// Brick sets that are kept beside each other (a change of transfer function and back costs
 /// nothing then); more would only fill the master's memory.
 const BRICK_SETS: usize = 3;
+
+/// Jobs that are in progress or can be watched again; each holds its views (300 bytes a frame).
+const MAX_OPEN_JOBS: usize = 200;
 
 /// What a master is started with.
 pub struct MasterConfig {
@@ -81,21 +85,52 @@ pub struct ServedVolume {
 pub enum SubmitError {
     /// A field is wrong.
     Refused(Refused),
+    /// The client's key belongs to another request.
+    KeyTaken,
+    /// The master has as many jobs in progress as it takes.
+    Full,
     /// The master is shutting down.
     Gone,
 }
 
+pub(crate) enum Rejected {
+    Field(Refused),
+    KeyTaken,
+    Full,
+}
+
+impl From<Refused> for Rejected {
+    fn from(refused: Refused) -> Self {
+        Rejected::Field(refused)
+    }
+}
+
+impl From<Rejected> for SubmitError {
+    fn from(rejected: Rejected) -> Self {
+        match rejected {
+            Rejected::Field(refused) => SubmitError::Refused(refused),
+            Rejected::KeyTaken => SubmitError::KeyTaken,
+            Rejected::Full => SubmitError::Full,
+        }
+    }
+}
+
 /// Everything that can happen to the master.
 pub(crate) enum Event {
-    Attach { hello: Hello, link: WorkerLink, reply: oneshot::Sender<Result<WorkerId, String>> },
+    Attach {
+        hello: Hello,
+        address: String,
+        link: WorkerLink,
+        reply: oneshot::Sender<Result<WorkerId, String>>,
+    },
     Said { worker: WorkerId, message: ToMaster },
     Detached { worker: WorkerId, reason: String },
-    Submit { request: Box<PathRequest>, reply: oneshot::Sender<Result<JobId, Refused>> },
+    Submit { request: Box<PathRequest>, reply: oneshot::Sender<Result<JobId, Rejected>> },
     Prepared { job: JobId, store: Arc<BrickStore> },
     FrameTaken,
     Finished { job: JobId, flight: FrameId, frame: FinishedFrame },
     Cancel { job: JobId, reply: oneshot::Sender<bool> },
-    Workers { reply: oneshot::Sender<Vec<WorkerView>> },
+    Workers { reply: oneshot::Sender<Vec<Worker>> },
     Shutdown,
 }
 
@@ -195,7 +230,7 @@ impl Handle {
         if self.inbox.send(Event::Submit { request, reply }).await.is_err() {
             return Err(SubmitError::Gone);
         }
-        answer.await.map_err(|_| SubmitError::Gone)?.map_err(SubmitError::Refused)
+        Ok(answer.await.map_err(|_| SubmitError::Gone)??)
     }
 
     /// Watches a job from frame `from`; `None` if there is no such job.
@@ -230,7 +265,7 @@ impl Handle {
     }
 
     /// The workers that are there.
-    pub async fn workers(&self) -> Vec<WorkerView> {
+    pub async fn workers(&self) -> Vec<Worker> {
         let (reply, answer) = oneshot::channel();
         if self.inbox.send(Event::Workers { reply }).await.is_err() {
             return Vec::new();
@@ -239,10 +274,15 @@ impl Handle {
     }
 
     /// Lets a worker in, or says why not.
-    pub async fn attach(&self, hello: Hello, link: WorkerLink) -> Result<WorkerId, String> {
+    pub async fn attach(
+        &self,
+        hello: Hello,
+        address: String,
+        link: WorkerLink,
+    ) -> Result<WorkerId, String> {
         let gone = || "the master is shutting down; come back later".to_string();
         let (reply, answer) = oneshot::channel();
-        self.inbox.send(Event::Attach { hello, link, reply }).await.map_err(|_| gone())?;
+        self.inbox.send(Event::Attach { hello, address, link, reply }).await.map_err(|_| gone())?;
         answer.await.map_err(|_| gone())?
     }
 
@@ -255,6 +295,12 @@ impl Handle {
     pub async fn detach(&self, worker: WorkerId, reason: String) {
         let _ = self.inbox.send(Event::Detached { worker, reason }).await;
     }
+}
+
+/// Wall time, for people: nothing is decided by it.
+fn unix_ms() -> i64 {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    since.map_or(0, |d| d.as_millis() as i64)
 }
 
 struct RealClock(Instant);
@@ -276,6 +322,17 @@ struct Running {
     next: u64,
 }
 
+/// A worker's link and what the scheduler need not know of it.
+struct Attached {
+    link: WorkerLink,
+    address: String,
+    simd: String,
+    memory_budget_bytes: u64,
+    tasks_done: u64,
+    heard: Instant,
+    since: Instant,
+}
+
 /// A frame that the scheduler or the finisher has.
 struct Flight {
     job: JobId,
@@ -288,7 +345,7 @@ struct Driver {
     budget: usize,
     clock: RealClock,
     scheduler: Scheduler,
-    links: BTreeMap<WorkerId, WorkerLink>,
+    links: BTreeMap<WorkerId, Attached>,
     next_worker: u64,
     next_frame: u64,
     jobs: Arc<Jobs>,
@@ -341,9 +398,9 @@ impl Driver {
     }
 
     fn leave(&mut self) {
-        for link in self.links.values() {
+        for worker in self.links.values() {
             let reason = "the master ends".to_string();
-            let _ = link.control.send(ToWorker::Leave { reason });
+            let _ = worker.link.control.send(ToWorker::Leave { reason });
         }
         for id in std::mem::take(&mut self.order) {
             self.end_job(id, JobState::Failed("the master ended".into()));
@@ -352,8 +409,8 @@ impl Driver {
 
     fn handle(&mut self, event: Event) {
         match event {
-            Event::Attach { hello, link, reply } => {
-                let _ = reply.send(self.attach(hello, link));
+            Event::Attach { hello, address, link, reply } => {
+                let _ = reply.send(self.attach(hello, address, link));
             }
             Event::Said { worker, message } => self.said(worker, message),
             Event::Detached { worker, reason } => {
@@ -386,13 +443,18 @@ impl Driver {
                 let _ = reply.send(there);
             }
             Event::Workers { reply } => {
-                let _ = reply.send(self.scheduler.workers());
+                let _ = reply.send(self.workers());
             }
             Event::Shutdown => {}
         }
     }
 
-    fn attach(&mut self, hello: Hello, link: WorkerLink) -> Result<WorkerId, String> {
+    fn attach(
+        &mut self,
+        hello: Hello,
+        address: String,
+        link: WorkerLink,
+    ) -> Result<WorkerId, String> {
         let mut refuse = None;
         if hello.protocol_version != PROTOCOL_VERSION {
             refuse = Some(format!(
@@ -429,7 +491,17 @@ impl Driver {
         );
         let heartbeat_ms = 1000;
         let _ = link.control.send(ToWorker::Welcome { worker, heartbeat_ms });
-        self.links.insert(worker, link);
+        let now = Instant::now();
+        let attached = Attached {
+            link,
+            address,
+            simd: hello.simd,
+            memory_budget_bytes: hello.memory_budget_bytes,
+            tasks_done: 0,
+            heard: now,
+            since: now,
+        };
+        self.links.insert(worker, attached);
         self.scheduler.handle(
             &self.clock,
             Happened::WorkerJoined {
@@ -445,9 +517,9 @@ impl Driver {
     }
 
     fn said(&mut self, worker: WorkerId, message: ToMaster) {
-        if !self.links.contains_key(&worker) {
-            return;
-        }
+        let Some(attached) = self.links.get_mut(&worker) else { return };
+        attached.heard = Instant::now();
+        attached.tasks_done += u64::from(matches!(message, ToMaster::Result(_)));
         let clock = &self.clock;
         self.scheduler.handle(clock, Happened::WorkerHeard { worker });
         let happened = match message {
@@ -483,12 +555,44 @@ impl Driver {
         }
     }
 
-    fn submit(&mut self, request: PathRequest) -> Result<JobId, Refused> {
-        if request.client_key.is_empty() || request.client_key.len() > 256 {
-            return Err(Refused::new("client_key", "give 1 to 256 bytes, new for each request"));
+    fn workers(&self) -> Vec<Worker> {
+        let ms = |since: Instant| since.elapsed().as_millis() as u64;
+        let view = |w: slabcast_schedule::WorkerView| {
+            let a = self.links.get(&w.id)?;
+            Some(Worker {
+                id: w.id,
+                name: w.name,
+                address: a.address.clone(),
+                threads: w.threads,
+                simd: a.simd.clone(),
+                memory_budget_bytes: a.memory_budget_bytes,
+                held_bytes: w.bytes_held,
+                held_bricks: w.bricks_held,
+                tasks_lent: w.leases,
+                tasks_done: a.tasks_done,
+                silent_ms: ms(a.heard),
+                here_ms: ms(a.since),
+            })
+        };
+        self.scheduler.workers().into_iter().filter_map(view).collect()
+    }
+
+    fn submit(&mut self, request: PathRequest) -> Result<JobId, Rejected> {
+        if request.client_key.is_empty() || request.client_key.len() > 200 {
+            let problem = "give 1 to 200 bytes, new for each request";
+            return Err(Refused::new("client_key", problem).into());
         }
-        if let Some(id) = self.jobs.lock().by_key.get(&request.client_key) {
-            return Ok(*id);
+        {
+            let table = self.jobs.lock();
+            if let Some(id) = table.by_key.get(&request.client_key) {
+                return match table.jobs.get(id) {
+                    Some(job) if *job.request == request => Ok(*id),
+                    _ => Err(Rejected::KeyTaken),
+                };
+            }
+        }
+        if self.order.len() >= MAX_OPEN_JOBS {
+            return Err(Rejected::Full);
         }
         let info = &self.served.info;
         request.quality.check()?;
@@ -513,10 +617,8 @@ impl Driver {
             Sums::Auto if classifier.uncapped() => Sums::F32,
             Sums::Auto => Sums::I32,
             Sums::I32 if classifier.uncapped() => {
-                return Err(Refused::new(
-                    "sums",
-                    "this transfer function's extinction needs `f32`; use it or `auto`",
-                ));
+                let problem = "this transfer function's extinction needs `f32`; use it or `auto`";
+                return Err(Refused::new("sums", problem).into());
             }
             sums => sums,
         };
@@ -551,6 +653,9 @@ impl Driver {
                     slab: (0, 0),
                     workers: 0,
                     size: request.path.size,
+                    format: request.format,
+                    submitted_unix_ms: unix_ms(),
+                    finished_unix_ms: 0,
                 },
                 request: request.clone(),
                 frames: BTreeMap::new(),
@@ -670,8 +775,11 @@ impl Driver {
         while let Some(action) = self.scheduler.next_action() {
             match action {
                 Action::Send { worker, message } => {
-                    if let Some(link) = self.links.get(&worker) {
-                        // A closed link says so itself, by its detach.
+                    // A closed link says so itself, by its detach.
+                    let Some(Attached { link, .. }) = self.links.get(&worker) else { continue };
+                    if let ToWorker::DropBricks { set, bricks } = message {
+                        let _ = link.bricks.send(BrickOrder::Drop { set, bricks });
+                    } else {
                         let _ = link.control.send(message);
                     }
                 }
@@ -681,9 +789,9 @@ impl Driver {
                             r.store.as_ref().filter(|s| s.key() == set).cloned()
                         })
                     });
-                    if let (Some(link), Some(store)) = (self.links.get(&worker), store) {
+                    if let (Some(to), Some(store)) = (self.links.get(&worker), store) {
                         debug!(%worker, bricks = bricks.len(), "bricks sent");
-                        let _ = link.bricks.send(BrickOrder { set, store, bricks });
+                        let _ = to.link.bricks.send(BrickOrder::Send { set, store, bricks });
                     }
                 }
                 Action::Drop { worker, reason } => {
@@ -766,16 +874,18 @@ impl Driver {
             j.taken.remove(&frame.number);
             j.view.frames_done = j.ever_done.len() as u64;
             j.frames.insert(frame.number, Arc::new(frame));
+            // In one go with the last frame: whoever sees that sees this. The job stays
+            // runnable, so that frames that were dropped can be asked for again.
             over = j.view.frames_done == j.view.frames_total && !j.view.state.is_over();
+            if over {
+                j.view.state = JobState::Done;
+                j.view.finished_unix_ms = unix_ms();
+            }
         }
         table.evict(self.budget);
         drop(table);
         if over {
             info!(%job, "job done");
-            // The job stays runnable, so that frames that were dropped can be asked for again.
-            if let Some(j) = self.jobs.lock().jobs.get_mut(&job) {
-                j.view.state = JobState::Done;
-            }
             self.retire();
         }
         self.jobs.ring();
@@ -818,6 +928,7 @@ impl Driver {
             && !j.view.state.is_over()
         {
             j.view.state = state;
+            j.view.finished_unix_ms = unix_ms();
         }
         self.jobs.ring();
         self.refresh_states();

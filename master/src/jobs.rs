@@ -65,6 +65,12 @@ pub struct JobView {
     pub workers: u32,
     /// Picture size.
     pub size: [u32; 2],
+    /// Pixel format.
+    pub format: PixelFormat,
+    /// When it was submitted, in milliseconds since 1970 UTC.
+    pub submitted_unix_ms: i64,
+    /// When it ended, likewise; 0 before.
+    pub finished_unix_ms: i64,
 }
 
 /// A frame, ready to leave.

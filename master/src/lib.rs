@@ -15,5 +15,6 @@ pub mod driver;
 pub mod finish;
 pub mod jobs;
 pub mod link;
+pub mod serve;
 
-pub use driver::{Handle, Master, MasterConfig};
+pub use driver::{Handle, Master, MasterConfig, SubmitError};

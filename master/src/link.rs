@@ -7,18 +7,30 @@
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::BrickId;
 use slabcast_common::message::{BrickBatch, Hello, ToMaster, ToWorker};
+use slabcast_proto::convert::Bricks;
 use slabcast_volumes::BrickStore;
 use std::sync::Arc;
 use tokio::sync::mpsc;
 
-/// Bricks that are to go to one worker, in this order.
-pub struct BrickOrder {
-    /// Of which set.
-    pub set: BrickSetKey,
-    /// Where they are.
-    pub store: Arc<BrickStore>,
-    /// Which.
-    pub bricks: Vec<BrickId>,
+/// What is to happen to a worker's bricks, in this order.
+pub enum BrickOrder {
+    /// Send some.
+    Send {
+        /// Of which set.
+        set: BrickSetKey,
+        /// Where they are.
+        store: Arc<BrickStore>,
+        /// Which.
+        bricks: Vec<BrickId>,
+    },
+    /// Have some forgotten. Here and not among the control messages, since "forget 5" and a new
+    /// 5 must not change places on the way.
+    Drop {
+        /// Of which set.
+        set: BrickSetKey,
+        /// Which.
+        bricks: Vec<BrickId>,
+    },
 }
 
 /// What the driver holds of a worker.
@@ -31,31 +43,13 @@ pub struct WorkerLink {
     pub bricks: mpsc::UnboundedSender<BrickOrder>,
 }
 
-/// Bytes of one batch of bricks: a gRPC data frame of 64 KiB with its headers.
-pub const BATCH_BYTES: usize = 65_000;
+/// Bricks of one embedded batch: some 64 KiB, as over TCP, so that tiles start while the rest
+/// is on its way.
+const BATCH_BRICKS: usize = 64;
 
 /// Batches on their way to one worker: enough to keep a stream busy, little enough that a
 /// dropped worker's bricks don't pile up.
 pub const BATCHES_IN_FLIGHT: usize = 8;
-
-/// Cuts an order into batches of about [`BATCH_BYTES`].
-pub fn batches(order: &BrickOrder) -> impl Iterator<Item = &[BrickId]> {
-    let mut rest = &order.bricks[..];
-    std::iter::from_fn(move || {
-        let (mut bytes, mut n) = (0, 0);
-        for id in rest {
-            let len = order.store.brick(*id).map_or(0, |b| b.encoded_len() + 5);
-            if n > 0 && bytes + len > BATCH_BYTES {
-                break;
-            }
-            bytes += len;
-            n += 1;
-        }
-        let (batch, after) = rest.split_at(n);
-        rest = after;
-        (n > 0).then_some(batch)
-    })
-}
 
 /// The worker's end of an embedded link: what `slabcast_worker::Link` is made of.
 pub struct EmbeddedEnd {
@@ -64,7 +58,7 @@ pub struct EmbeddedEnd {
     /// To the master; the first message must be the hello.
     pub replies: mpsc::Sender<ToMaster>,
     /// Bricks.
-    pub bricks: mpsc::Receiver<BrickBatch>,
+    pub bricks: mpsc::Receiver<Bricks>,
 }
 
 /// Lets a worker in over channels of this process. Must be called inside a tokio runtime, which
@@ -76,12 +70,22 @@ pub fn embedded(handle: crate::Handle) -> EmbeddedEnd {
     let (batch_tx, batch_rx) = mpsc::channel(BATCHES_IN_FLIGHT);
     tokio::spawn(async move {
         while let Some(order) = order_rx.recv().await {
-            for ids in batches(&order) {
-                let bricks =
-                    ids.iter().filter_map(|id| order.store.brick(*id).cloned()).collect();
-                let batch = BrickBatch { set: order.set, bricks, broken: Vec::new() };
-                if batch_tx.send(batch).await.is_err() {
-                    return;
+            match order {
+                BrickOrder::Drop { set, bricks } => {
+                    let message = ToWorker::DropBricks { set, bricks };
+                    if batch_tx.send(Bricks::Message(message)).await.is_err() {
+                        return;
+                    }
+                }
+                BrickOrder::Send { set, store, bricks } => {
+                    for ids in bricks.chunks(BATCH_BRICKS) {
+                        let bricks = ids.iter().filter_map(|id| store.brick(*id).cloned());
+                        let batch =
+                            BrickBatch { set, bricks: bricks.collect(), broken: Vec::new() };
+                        if batch_tx.send(Bricks::Batch(batch)).await.is_err() {
+                            return;
+                        }
+                    }
                 }
             }
         }
@@ -89,27 +93,29 @@ pub fn embedded(handle: crate::Handle) -> EmbeddedEnd {
     tokio::spawn(async move {
         let Some(ToMaster::Hello(hello)) = reply_rx.recv().await else { return };
         let link = WorkerLink { control: control_tx, bricks: order_tx };
-        serve_link(handle, hello, link, &mut reply_rx).await;
+        serve_link(handle, hello, String::new(), link, &mut reply_rx).await;
     });
     EmbeddedEnd { control: control_rx, replies: reply_tx, bricks: batch_rx }
 }
 
-/// Carries a worker's messages to the driver until either side ends.
+/// Carries a worker's messages to the driver until either side ends. `address` is where the
+/// worker called from; empty for one of this process.
 pub async fn serve_link(
     handle: crate::Handle,
     hello: Hello,
+    address: String,
     link: WorkerLink,
     replies: &mut mpsc::Receiver<ToMaster>,
 ) {
     let control = link.control.clone();
-    let worker = match handle.attach(hello, link).await {
+    let worker = match handle.attach(hello, address, link).await {
         Ok(worker) => worker,
         Err(reason) => {
             let _ = control.send(ToWorker::Refused { reason });
             return;
         }
     };
-    // The driver holds the other senders; this one would keep the link open.
+    // The driver holds the other sender: when it drops that, the link is over.
     drop(control);
     while let Some(message) = replies.recv().await {
         if !handle.worker_said(worker, message).await {

@@ -12,6 +12,7 @@ use slabcast_common::message::{
     BrickBatch, Hello, Lease, TaskTimes, TileResult, ToMaster, ToWorker,
 };
 use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION};
+use slabcast_proto::convert::Bricks;
 use slabcast_render::splat::Simd;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -22,6 +23,9 @@ use tracing::{debug, info, warn};
 
 /// How long a worker that is told to stop waits for the tasks it has begun.
 const DRAIN: Duration = Duration::from_secs(8);
+
+/// How long a master may take to answer the hello.
+const UNTIL_WELCOME: Duration = Duration::from_secs(10);
 
 /// What a worker is started with.
 #[derive(Clone, Debug)]
@@ -43,7 +47,7 @@ pub struct Link {
     /// To the master.
     pub replies: mpsc::Sender<ToMaster>,
     /// Bricks.
-    pub bricks: mpsc::Receiver<BrickBatch>,
+    pub bricks: mpsc::Receiver<Bricks>,
 }
 
 /// Why a link ended.
@@ -103,6 +107,8 @@ pub async fn run(
         in_pool: 0,
         epoch: Instant::now(),
         leaving: false,
+        heard: tokio::time::Instant::now(),
+        patience: UNTIL_WELCOME,
         replies: Vec::new(),
     };
     let mut drain_until: Option<tokio::time::Instant> = None;
@@ -118,14 +124,21 @@ pub async fn run(
             }
         };
         tokio::select! {
+            () = tokio::time::sleep_until(desk.heard + desk.patience) => {
+                return Ok(Ended::Lost("the master was silent for three heartbeats".into()));
+            }
             message = link.control.recv() => match message {
                 None => return Ok(Ended::Lost("the master closed the link".into())),
                 Some(ToWorker::Refused { reason }) => return Ok(Ended::Refused(reason)),
                 Some(ToWorker::Leave { reason }) => return Ok(Ended::MasterLeft(reason)),
-                Some(message) => desk.told(message),
+                Some(message) => {
+                    desk.heard = tokio::time::Instant::now();
+                    desk.told(message);
+                }
             },
             batch = link.bricks.recv(), if bricks_open => match batch {
-                Some(batch) => desk.bricks_in(batch),
+                Some(Bricks::Batch(batch)) => desk.bricks_in(batch),
+                Some(Bricks::Message(message)) => desk.told(message),
                 None => bricks_open = false,
             },
             Some(done) = results.recv() => desk.rendered(done),
@@ -170,6 +183,10 @@ struct Desk<'a> {
     /// Zero of this worker's clock.
     epoch: Instant,
     leaving: bool,
+    /// When the master last said something.
+    heard: tokio::time::Instant,
+    /// How long it may be silent.
+    patience: Duration,
     replies: Vec<ToMaster>,
 }
 
@@ -185,7 +202,10 @@ impl Drop for Desk<'_> {
 impl Desk<'_> {
     fn told(&mut self, message: ToWorker) {
         match message {
-            ToWorker::Welcome { worker, .. } => info!(%worker, "let in"),
+            ToWorker::Welcome { worker, heartbeat_ms } => {
+                info!(%worker, "let in");
+                self.patience = Duration::from_millis(u64::from(heartbeat_ms) * 3);
+            }
             ToWorker::Scene(spec) => {
                 self.scenes.insert(spec.id, Arc::new(SceneSlot::new(spec)));
             }
@@ -207,6 +227,20 @@ impl Desk<'_> {
             ToWorker::DropBricks { set, bricks } => {
                 debug!(bricks = bricks.len(), "bricks dropped");
                 self.cache.remove(set, &bricks);
+                // A lease may have come before this message although it was written after it:
+                // control and bricks have no order. Its bricks come again.
+                for (task, w) in &mut self.waiting {
+                    let needs = |id: &&BrickId| w.lease.bricks.binary_search(id).is_ok();
+                    if w.frame.scene.spec.bricks == set {
+                        for id in bricks.iter().filter(needs) {
+                            let waiters = self.missing.entry((set, *id)).or_default();
+                            if !waiters.contains(task) {
+                                waiters.push(*task);
+                                w.missing += 1;
+                            }
+                        }
+                    }
+                }
             }
             ToWorker::Ping { nonce } => {
                 let clock_us = self.us(Instant::now());

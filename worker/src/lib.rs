@@ -10,6 +10,7 @@
 
 pub mod cache;
 pub mod desk;
+pub mod dial;
 pub mod pool;
 
 pub use cache::BrickCache;

@@ -23,7 +23,7 @@ use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::stats::{BrickStats, PoisonedTile, SlabStats, TileStats};
 use slabcast_common::view::Projected;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 /// Whether a pixel with accumulated opacity `a` is shut for good.
 ///
@@ -39,6 +39,7 @@ pub fn is_shut(a: f32, eps: f64) -> bool {
 struct Lent {
     task: TaskId,
     epoch: Epoch,
+    sent: Micros,
     /// Places of its bricks.
     bricks: Vec<u32>,
 }
@@ -84,6 +85,11 @@ pub(crate) struct Frame {
     /// Workers that were sent the frame's view.
     told: BTreeSet<WorkerId>,
     lent: BTreeMap<WorkerId, Vec<Lent>>,
+    /// When each worker answered last.
+    answered: BTreeMap<WorkerId, Micros>,
+    pace: Pace,
+    /// When the next task outlives its estimate, while a thread is idle.
+    outlived: Option<Micros>,
     needed_ever: Vec<bool>,
     any_result: bool,
     last_reason: String,
@@ -123,6 +129,9 @@ impl Frame {
             first_task: TaskId(cluster.next_task),
             told: BTreeSet::new(),
             lent: BTreeMap::new(),
+            answered: BTreeMap::new(),
+            pace: Pace::default(),
+            outlived: None,
             needed_ever: vec![false; job.bricks.len()],
             any_result: false,
             last_reason: String::new(),
@@ -302,12 +311,18 @@ impl Frame {
                 continue;
             };
             let epoch = slab.queue.lease(place, id, now, &cluster.config);
-            let bricks = slab.bricks_of(place);
-            cluster.residency.pin(id, &bricks);
-            cluster.residency.want(id, bricks.iter().copied());
-            lent.push(Lent { task: slab.queue.id(place), epoch, bricks });
+            lent.push(lend(cluster, slab, place, id, epoch, now));
             leases.push((id, place));
         }
+        self.outlived = None;
+        while let Some((place, id)) = self.next_outlived(cluster, now) {
+            let slab = self.slab.as_mut().expect("as before");
+            let epoch = slab.queue.lend_again(place, id, now, &cluster.config);
+            let lent = lend(cluster, slab, place, id, epoch, now);
+            self.lent.entry(id).or_default().push(lent);
+            leases.push((id, place));
+        }
+        let slab = self.slab.as_mut().expect("as before");
 
         let newcomers: Vec<_> = cluster
             .roster
@@ -361,8 +376,74 @@ impl Frame {
         }
     }
 
+    /// A task that outlived its estimate, and a worker with a free thread for it.
+    ///
+    /// One slow worker holds up a slab: at a tenth of the speed, its first tile lasts as long
+    /// as all the others' work. So when threads run dry, what takes more than twice the time
+    /// that tasks of its workload take is run twice, and so is what waits behind it on the
+    /// same worker. Its own lease stays live: whichever is first counts. The price is at most
+    /// one task for each idle thread. Suspects are left out, lest they take two workers at once.
+    fn next_outlived(&mut self, cluster: &Cluster, now: Micros) -> Option<(u32, WorkerId)> {
+        let slab = self.slab.as_ref()?;
+        let idle: Vec<(WorkerId, u64)> = cluster
+            .roster
+            .staying()
+            .map(|(id, w)| (id, self.leases(id).into(), w.threads))
+            .filter(|(_, load, threads)| *load < u64::from(*threads))
+            .map(|(id, load, _)| (id, load))
+            .collect();
+        if idle.is_empty() {
+            return None;
+        }
+        let pace = self.pace.measure()?;
+        let mut late: Vec<(Micros, u32)> = Vec::new();
+        for (&id, lent) in &self.lent {
+            let Some(worker) = cluster.roster.get(id) else { continue };
+            let threads = worker.threads as usize;
+            let answered = self.answered.get(&id).copied().unwrap_or(0);
+            let mut heads_late = 0;
+            for (i, lent) in lent.iter().enumerate() {
+                let open = |&p: &u32| slab.queue.tasks[p as usize].end == End::Open;
+                let place = slab.queue.place(lent.task).filter(open);
+                let at = match place {
+                    _ if i >= threads => heads_late,
+                    // It does dead work.
+                    None => now,
+                    Some(place) => {
+                        let est = slab.cut.tiles[place as usize].est;
+                        lent.sent.max(answered).saturating_add(pace.patience(est))
+                    }
+                };
+                heads_late = at.max(heads_late);
+                if let Some(place) = place.filter(|&p| slab.queue.tasks[p as usize].may_double()) {
+                    late.push((at, place));
+                }
+            }
+        }
+        late.sort_unstable();
+        for (at, place) in late {
+            let has_it = |id: WorkerId| {
+                let lent = self.lent.get(&id).into_iter().flatten();
+                lent.into_iter().any(|l| l.task == slab.queue.id(place))
+            };
+            let fits = |id: WorkerId, load: u64| {
+                load == 0
+                    || !cluster.residency.is_lazy(id)
+                    || cluster.residency.fits(id, &slab.bricks_of(place))
+            };
+            let takers = idle.iter().filter(|(id, load)| !has_it(*id) && fits(*id, *load));
+            let Some(&(id, _)) = takers.min_by_key(|(_, load)| *load) else { continue };
+            if at > now {
+                self.outlived = Some(at);
+                return None;
+            }
+            return Some((place, id));
+        }
+        None
+    }
+
     /// Takes back a lease that its worker answered. `None`: it has no such lease.
-    fn answered(
+    fn take_answered(
         &mut self,
         cluster: &mut Cluster,
         worker: WorkerId,
@@ -385,7 +466,8 @@ impl Frame {
         clock: &dyn Clock,
     ) -> Result<(), String> {
         let now = clock.now();
-        let lent = self.answered(cluster, worker, result.task, result.epoch);
+        let before = self.answered.insert(worker, now).unwrap_or(0);
+        let lent = self.take_answered(cluster, worker, result.task, result.epoch);
         let verdict = match &self.slab {
             Some(slab) if lent.is_some() => slab.queue.judge(result.task, result.epoch, worker),
             _ => Verdict::Dead,
@@ -424,6 +506,8 @@ impl Frame {
 
         let who = cluster.roster.get(worker).expect("a worker whose result came is known");
         let r = place_in_time(who, &result.times, lease.sent, now);
+        let lasted = now.saturating_sub(lease.sent.max(before));
+        self.pace.note(slab.cut.tiles[place as usize].est, r.end - r.start, lasted);
         self.ledger.rendered(worker, &r, &result.counters);
         let thread = result.times.thread.min(who.threads - 1);
         let dry = slab.dry.entry((worker, thread)).or_insert(r.end);
@@ -470,7 +554,7 @@ impl Frame {
         epoch: Epoch,
         reason: String,
     ) {
-        if self.answered(cluster, worker, task, epoch).is_none() {
+        if self.take_answered(cluster, worker, task, epoch).is_none() {
             return;
         }
         let Some(slab) = &mut self.slab else { return };
@@ -588,7 +672,8 @@ impl Frame {
 
     /// The next lease deadline.
     pub(crate) fn next_deadline(&self) -> Option<Micros> {
-        self.slab.as_ref().and_then(|s| s.queue.next_deadline())
+        let lease = self.slab.as_ref().and_then(|s| s.queue.next_deadline());
+        lease.into_iter().chain(self.outlived).min()
     }
 
     /// Leases that a worker has.
@@ -655,6 +740,75 @@ pub(crate) fn carry(
                 cluster.out.push_back(Action::SendBricks { worker: id, set, bricks });
             }
         }
+    }
+}
+
+/// Puts a lease on the books of bricks.
+fn lend(
+    cluster: &mut Cluster,
+    slab: &Slab,
+    place: u32,
+    id: WorkerId,
+    epoch: Epoch,
+    now: Micros,
+) -> Lent {
+    let bricks = slab.bricks_of(place);
+    cluster.residency.pin(id, &bricks);
+    cluster.residency.want(id, bricks.iter().copied());
+    Lent { task: slab.queue.id(place), epoch, sent: now, bricks }
+}
+
+/// How long tasks take, by the last ones of the frame.
+#[derive(Debug, Default)]
+struct Pace {
+    /// Workload, render time, and time beside it, of each.
+    last: VecDeque<(u64, Micros, Micros)>,
+}
+
+impl Pace {
+    /// Medians of 64 move slowly enough to pass over a slow worker's share and quickly enough
+    /// to follow the slabs.
+    const LAST: usize = 64;
+    /// With fewer, one slow task is the median.
+    const LEAST: usize = 4;
+    /// A task is never late before: the scheduling of two busy machines.
+    const FLOOR: Micros = 5_000;
+
+    fn note(&mut self, est: u64, render_us: Micros, lasted: Micros) {
+        self.last.push_back((est.max(1), render_us, lasted.saturating_sub(render_us)));
+        if self.last.len() > Self::LAST {
+            self.last.pop_front();
+        }
+    }
+
+    /// What these tasks say about the next: medians of render time for a workload of 2^20, and
+    /// of the time beside it.
+    fn measure(&self) -> Option<Measured> {
+        if self.last.len() < Self::LEAST {
+            return None;
+        }
+        let median = |of: &dyn Fn(&(u64, Micros, Micros)) -> u128| {
+            let mut all: Vec<u128> = self.last.iter().map(of).collect();
+            let mid = all.len() / 2;
+            *all.select_nth_unstable(mid).1
+        };
+        let render = median(&|t| (u128::from(t.1) << 20) / u128::from(t.0));
+        Some(Measured { render, beside: median(&|t| u128::from(t.2)) })
+    }
+}
+
+/// How long a task takes.
+#[derive(Clone, Copy, Debug)]
+struct Measured {
+    render: u128,
+    beside: u128,
+}
+
+impl Measured {
+    /// After what time a task of this workload has outlived its estimate.
+    fn patience(&self, est: u64) -> Micros {
+        let expected = ((self.render * u128::from(est.max(1))) >> 20) + self.beside;
+        Pace::FLOOR.saturating_add((2 * expected).min(u128::from(Micros::MAX)) as Micros)
     }
 }
 

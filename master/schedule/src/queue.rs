@@ -51,9 +51,9 @@ pub(crate) struct Task {
 }
 
 impl Task {
-    /// The leases that are live.
-    pub(crate) fn live(&self) -> &[Live] {
-        &self.live
+    /// Whether it may be run twice: one worker has it, and nobody was lost with it.
+    pub(crate) fn may_double(&self) -> bool {
+        self.live.len() == 1 && !self.queued && !self.is_suspect() && self.failed.is_empty()
     }
 
     fn is_suspect(&self) -> bool {

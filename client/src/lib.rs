@@ -1,1 +1,206 @@
-//! Placeholder.
+//! Submit a view path to a master and stream its frames.
+//!
+//! 1. [`Client::connect`] to a master.
+//! 2. [`Client::submit`] a path; the reply names the job.
+//! 3. [`Client::follow`] the job and take what comes until it ends:
+//!
+//! ```no_run
+//! # async fn f(request: slabcast_common::message::PathRequest) -> Result<(), slabcast_client::ClientError> {
+//! use slabcast_client::{Client, PATIENCE, Update};
+//! let client = Client::connect("127.0.0.1:7070").await?;
+//! let job = client.submit(&request).await?;
+//! let mut frames = client.follow(&job, 0, PATIENCE).await?;
+//! while let Some(update) = frames.next().await? {
+//!     match update {
+//!         Update::Notice(notice) => eprintln!("{}: {}", notice.state, notice.message),
+//!         Update::Frame(frame) => println!("frame {}: {} bytes", frame.number, frame.bytes.len()),
+//!     }
+//! }
+//! # Ok(()) }
+//! ```
+//!
+//! Nothing that a client drops, loses or forgets cancels a job; [`Client::cancel`] does. This
+//! crate refuses to know files, flags and progress bars: those are the program's.
+
+mod address;
+mod error;
+mod frames;
+
+pub use error::ClientError;
+pub use frames::{FrameStream, PATIENCE, ReceivedFrame, Update};
+pub use slabcast_proto::model::{Job, JobNotice, JobState, VolumeDescription, Worker};
+
+use prost::Message;
+use slabcast_common::message::PathRequest;
+use slabcast_proto::v1::render_client::RenderClient;
+use slabcast_proto::{MAX_RENDER_MESSAGE, convert, v1};
+use std::future::Future;
+use std::sync::Arc;
+use std::time::Duration;
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Request, Response, Status};
+
+/// How long a connection may take to stand. A host that is there answers within a round trip;
+/// one that is not is found out by this.
+const CONNECT: Duration = Duration::from_secs(5);
+
+/// How long a master may take to answer. It answers from memory; only a volume that is still
+/// being read or a machine that swaps takes seconds.
+pub(crate) const ANSWER: Duration = Duration::from_secs(30);
+
+/// Wait before a call is made a second time.
+const AGAIN: Duration = Duration::from_millis(100);
+
+/// A master, as its clients see it. Clones share one connection, which comes back by itself.
+#[derive(Clone, Debug)]
+pub struct Client {
+    render: RenderClient<Channel>,
+    address: Arc<str>,
+}
+
+impl Client {
+    /// Connects to the master at `host:port` (or `http://host:port`).
+    ///
+    /// # Errors
+    /// [`ClientError::Address`] and [`ClientError::Connect`] name the address and what to do.
+    pub async fn connect(address: &str) -> Result<Client, ClientError> {
+        let address = address::authority(address)?;
+        let refused = |e: &dyn std::error::Error| ClientError::Connect {
+            address: address.clone(),
+            cause: error::root_cause(e),
+        };
+        // TRANSPORT.md section 9, for the receiver of bulk on a LAN. Pings tell a master that
+        // vanished from one that renders (PROMISES.md B4: 20 s for viewers).
+        let endpoint = Endpoint::from_shared(format!("http://{address}"))
+            .map_err(|e| refused(&e))?
+            .connect_timeout(CONNECT)
+            .tcp_nodelay(true)
+            .initial_stream_window_size(1 << 20)
+            .initial_connection_window_size(4 << 20)
+            .max_frame_size(64 * 1024)
+            .http2_keep_alive_interval(Duration::from_secs(20))
+            .keep_alive_timeout(Duration::from_secs(20));
+        // The endpoint's own limit ends with TCP; a peer that takes the connection and says
+        // nothing is met by this one.
+        let channel = match tokio::time::timeout(2 * CONNECT, endpoint.connect()).await {
+            Ok(channel) => channel.map_err(|e| refused(&e))?,
+            Err(late) => return Err(refused(&late)),
+        };
+        let render = RenderClient::new(channel)
+            .max_decoding_message_size(MAX_RENDER_MESSAGE)
+            .max_encoding_message_size(MAX_RENDER_MESSAGE);
+        Ok(Client { render, address: address.into() })
+    }
+
+    /// The master's address, as `host:port`.
+    pub fn address(&self) -> &str {
+        &self.address
+    }
+
+    /// Submits a path and gives the job's name. Calling again with the same `client_key` and
+    /// the same request gives the same job.
+    pub async fn submit(&self, request: &PathRequest) -> Result<String, ClientError> {
+        let request = convert::path_request_to_wire(request);
+        let bytes = request.encoded_len();
+        if bytes > MAX_RENDER_MESSAGE {
+            return Err(ClientError::TooLong { bytes, most: MAX_RENDER_MESSAGE });
+        }
+        let reply = self
+            .call(async |mut render, request| render.submit_path(request).await, request)
+            .await?;
+        if reply.job_id.is_empty() {
+            return Err(self.nonsense("job_id is empty"));
+        }
+        Ok(reply.job_id)
+    }
+
+    /// The frames of a job from `from_frame` on, over one connection: when that breaks, so does
+    /// the stream. [`Client::follow`] takes up again.
+    pub async fn watch(&self, job: &str, from_frame: u64) -> Result<FrameStream, ClientError> {
+        FrameStream::open(self.clone(), job.to_owned(), from_frame, None).await
+    }
+
+    /// The frames of a job from `from_frame` on. When the connection breaks it is made again and
+    /// the stream goes on at the first frame that is not whole, as often as need be; only when
+    /// the master stays away for `patience` does the stream end with
+    /// [`ClientError::GaveUp`].
+    pub async fn follow(
+        &self,
+        job: &str,
+        from_frame: u64,
+        patience: Duration,
+    ) -> Result<FrameStream, ClientError> {
+        FrameStream::open(self.clone(), job.to_owned(), from_frame, Some(patience)).await
+    }
+
+    /// One job.
+    pub async fn job(&self, job: &str) -> Result<Job, ClientError> {
+        let request = v1::GetJobRequest { job_id: job.to_owned() };
+        let job = self.call(async |mut r, request| r.get_job(request).await, request).await?;
+        convert::job_from_wire(job).map_err(|e| self.nonsense(&e))
+    }
+
+    /// The master's jobs, newest first, at most `limit` (1 to 1000).
+    pub async fn jobs(&self, limit: u32) -> Result<Vec<Job>, ClientError> {
+        let request = v1::ListJobsRequest { limit };
+        let reply = self.call(async |mut r, request| r.list_jobs(request).await, request).await?;
+        let jobs = reply.jobs.into_iter().map(convert::job_from_wire);
+        jobs.collect::<Result<_, _>>().map_err(|e| self.nonsense(&e))
+    }
+
+    /// Cancels a job and gives what became of it: one that was done before stays done.
+    pub async fn cancel(&self, job: &str) -> Result<Job, ClientError> {
+        let request = v1::CancelJobRequest { job_id: job.to_owned() };
+        let job = self.call(async |mut r, request| r.cancel_job(request).await, request).await?;
+        convert::job_from_wire(job).map_err(|e| self.nonsense(&e))
+    }
+
+    /// The volume that the master serves.
+    pub async fn volume(&self) -> Result<VolumeDescription, ClientError> {
+        let request = v1::DescribeVolumeRequest {};
+        let volume =
+            self.call(async |mut r, request| r.describe_volume(request).await, request).await?;
+        convert::volume_from_wire(volume).map_err(|e| self.nonsense(&e))
+    }
+
+    /// The master's workers, in the order in which they came.
+    pub async fn workers(&self) -> Result<Vec<Worker>, ClientError> {
+        let request = v1::ListWorkersRequest {};
+        let reply =
+            self.call(async |mut r, request| r.list_workers(request).await, request).await?;
+        let workers = reply.workers.into_iter().map(convert::worker_from_wire);
+        workers.collect::<Result<_, _>>().map_err(|e| self.nonsense(&e))
+    }
+
+    /// Makes a call, and once more when the connection turns out to be broken: a master that was
+    /// restarted is met first on the connection to the one before. Every call may be repeated
+    /// (`render.proto`).
+    async fn call<Q: Clone, R, F>(
+        &self,
+        call: impl Fn(RenderClient<Channel>, Request<Q>) -> F,
+        request: Q,
+    ) -> Result<R, ClientError>
+    where
+        F: Future<Output = Result<Response<R>, Status>>,
+    {
+        let once = || {
+            let mut request = Request::new(request.clone());
+            request.set_timeout(ANSWER);
+            call(self.render.clone(), request)
+        };
+        match once().await {
+            Err(status) if error::is_weather(&status) => {
+                tokio::time::sleep(AGAIN).await;
+                once().await
+            }
+            other => other,
+        }
+        .map(Response::into_inner)
+        .map_err(|status| ClientError::of_status(&self.address, &status))
+    }
+
+    /// The master said what `render.proto` rules out.
+    pub(crate) fn nonsense(&self, problem: &(impl ToString + ?Sized)) -> ClientError {
+        ClientError::Nonsense { address: self.address.to_string(), problem: problem.to_string() }
+    }
+}

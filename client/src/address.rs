@@ -1,0 +1,66 @@
+//! Where a master is: `host:port`, as people write it.
+
+use crate::ClientError;
+
+/// The `host:port` of an address, with or without `http://`.
+pub(crate) fn authority(address: &str) -> Result<String, ClientError> {
+    let wrong =
+        |problem: &'static str| Err(ClientError::Address { address: address.to_owned(), problem });
+    let rest = address.trim();
+    if rest.starts_with("https://") {
+        return wrong("this version has no TLS; give host:port");
+    }
+    let rest = rest.strip_prefix("http://").unwrap_or(rest);
+    let rest = rest.strip_suffix('/').unwrap_or(rest);
+    let Some((host, port)) = rest.rsplit_once(':') else {
+        return wrong("has no port; give host:port");
+    };
+    if !matches!(port.parse::<u16>(), Ok(1..)) {
+        return wrong("has no port that can be called; give host:port with 1 to 65535");
+    }
+    let bare = host.strip_prefix('[').and_then(|h| h.strip_suffix(']'));
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-._".contains(c);
+    let ok = match bare {
+        Some(v6) => v6.parse::<std::net::Ipv6Addr>().is_ok(),
+        None => !host.is_empty() && host.chars().all(plain),
+    };
+    if !ok {
+        return wrong("is not host:port; write IPv6 as [::1]:port");
+    }
+    Ok(rest.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_people_write_is_understood() {
+        for (written, meant) in [
+            ("localhost:7070", "localhost:7070"),
+            (" http://10.0.0.7:1/ ", "10.0.0.7:1"),
+            ("[::1]:7070", "[::1]:7070"),
+            ("render_node-3.lan:65535", "render_node-3.lan:65535"),
+        ] {
+            assert_eq!(authority(written).unwrap(), meant);
+        }
+        for written in [
+            "",
+            "localhost",
+            "localhost:",
+            "localhost:0",
+            "localhost:99999",
+            "https://a:1",
+            "::1:70",
+            "a b:1",
+            "u@h:1",
+            "http://h:1/path",
+            "h/p:1",
+            ":70",
+            "[]:7",
+        ] {
+            let e = authority(written).unwrap_err().to_string();
+            assert!(e.contains("host:port"), "{e}");
+        }
+    }
+}

@@ -1,0 +1,332 @@
+//! A job's frames as they come: put together from chunks, taken up again after a break.
+
+use crate::error::one_line;
+use crate::{ANSWER, Client, ClientError, JobNotice, JobState};
+use slabcast_common::image::PixelFormat;
+use slabcast_common::stats::FrameStats;
+use slabcast_proto::model::{FrameChunk, PixelsChunk};
+use slabcast_proto::{convert, v1};
+use std::time::Duration;
+use tokio::time::Instant;
+use tonic::Streaming;
+
+/// How long to wait for a master that is away, where nobody says otherwise: a restart takes
+/// seconds, reading a large volume again up to a minute.
+pub const PATIENCE: Duration = Duration::from_secs(120);
+
+/// First wait before a connection is made again; it doubles up to [`LONGEST_WAIT`].
+const FIRST_WAIT: Duration = Duration::from_millis(100);
+const LONGEST_WAIT: Duration = Duration::from_secs(2);
+
+/// A stream that lived this long was a good one: when it breaks, patience starts anew. Shorter,
+/// and a master that dies of each watch would be called for ever.
+const GOOD: Duration = Duration::from_secs(10);
+
+/// Memory that is set aside for a frame on the strength of its first chunk. A frame of 8192x8192
+/// floats has 1 GiB; the rest of it is made room for as it comes.
+const ON_TRUST: usize = 64 << 20;
+
+/// Longest statistics or trace of one frame. 8192x8192 pixels in tiles of 16 and three slabs
+/// have 80 MB of statistics.
+const MAX_TEXT: usize = 256 << 20;
+
+/// What comes of a job.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Update {
+    /// News of the job.
+    Notice(JobNotice),
+    /// A whole frame.
+    Frame(Box<ReceivedFrame>),
+}
+
+/// A whole frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ReceivedFrame {
+    /// Its number in the path.
+    pub number: u64,
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+    /// Format of `bytes`.
+    pub format: PixelFormat,
+    /// Pixels, row-major from the top left, without padding.
+    pub bytes: Vec<u8>,
+    /// Its statistics.
+    pub stats: FrameStats,
+    /// Its statistics as the master wrote them, with fields that this version does not know.
+    pub stats_json: String,
+    /// Spans for a trace, if the request wanted them.
+    pub trace_json: Option<String>,
+}
+
+/// The frames of a job, in order. Dropping it cancels nothing.
+#[derive(Debug)]
+pub struct FrameStream {
+    client: Client,
+    job: String,
+    /// The first frame that is not whole.
+    next: u64,
+    stream: Option<Open>,
+    partial: Option<Partial>,
+    /// The latest notice.
+    latest: Option<JobNotice>,
+    /// Whether the master ended the stream with all that was to come.
+    over: bool,
+    /// How long to bear with breaks; `None`: not at all.
+    patience: Option<Duration>,
+    trouble: Option<Trouble>,
+}
+
+#[derive(Debug)]
+struct Open {
+    chunks: Streaming<v1::FrameChunk>,
+    since: Instant,
+}
+
+/// A master that is away.
+#[derive(Debug)]
+struct Trouble {
+    since: Instant,
+    wait: Duration,
+}
+
+impl FrameStream {
+    pub(crate) async fn open(
+        client: Client,
+        job: String,
+        from_frame: u64,
+        patience: Option<Duration>,
+    ) -> Result<FrameStream, ClientError> {
+        let mut frames = FrameStream {
+            client,
+            job,
+            next: from_frame,
+            stream: None,
+            partial: None,
+            latest: None,
+            over: false,
+            patience,
+            trouble: None,
+        };
+        while frames.stream.is_none() {
+            if let Err(e) = frames.reopen().await {
+                frames.bear(e).await?;
+            }
+        }
+        Ok(frames)
+    }
+
+    /// The job whose frames these are.
+    pub fn job(&self) -> &str {
+        &self.job
+    }
+
+    /// The first frame that has not come whole: where to take up after an error.
+    pub fn next_frame(&self) -> u64 {
+        self.next
+    }
+
+    /// The next notice or whole frame; `None` after the last frame of a job that is done. A job
+    /// that fails or is cancelled says so in a notice, and at the end in an error.
+    ///
+    /// May be dropped before it is ready (in a `select!`) without losing anything.
+    pub async fn next(&mut self) -> Result<Option<Update>, ClientError> {
+        loop {
+            if self.over {
+                let job = self.job.clone();
+                return match &self.latest {
+                    Some(JobNotice { state: JobState::Failed, message, .. }) => {
+                        Err(ClientError::JobFailed { job, reason: one_line(message) })
+                    }
+                    Some(JobNotice { state: JobState::Cancelled, .. }) => {
+                        Err(ClientError::JobCancelled { job })
+                    }
+                    _ => Ok(None),
+                };
+            }
+            match self.step().await {
+                Ok(Some(update)) => return Ok(Some(update)),
+                Ok(None) => {}
+                Err(e) => self.bear(e).await?,
+            }
+        }
+    }
+
+    /// One message, which may complete something.
+    async fn step(&mut self) -> Result<Option<Update>, ClientError> {
+        let Some(open) = &mut self.stream else {
+            self.reopen().await?;
+            return Ok(None);
+        };
+        let chunk = match open.chunks.message().await {
+            Ok(Some(chunk)) => chunk,
+            Ok(None) if self.has_all() => {
+                self.over = true;
+                return Ok(None);
+            }
+            Ok(None) => {
+                return Err(ClientError::Lost {
+                    address: self.client.address().to_owned(),
+                    cause: "the stream ended before the job did".into(),
+                });
+            }
+            Err(status) => return Err(ClientError::of_status(self.client.address(), &status)),
+        };
+        match convert::chunk_from_wire(chunk).map_err(|e| self.client.nonsense(&e))? {
+            FrameChunk::Notice(notice) => {
+                self.latest = Some(notice.clone());
+                Ok(Some(Update::Notice(notice)))
+            }
+            FrameChunk::Pixels(chunk) => {
+                let frame = self.take(chunk).map_err(|problem| self.client.nonsense(&problem))?;
+                Ok(frame.map(|f| Update::Frame(Box::new(f))))
+            }
+        }
+    }
+
+    /// Whether a stream that ends here has told everything.
+    fn has_all(&self) -> bool {
+        self.partial.is_none()
+            && self.latest.as_ref().is_some_and(|notice| match notice.state {
+                JobState::Done => self.next >= notice.frames_total,
+                state => state.is_final(),
+            })
+    }
+
+    /// Watches from the first frame that is not whole.
+    async fn reopen(&mut self) -> Result<(), ClientError> {
+        self.partial = None;
+        let request = v1::WatchRequest { job_id: self.job.clone(), from_frame: self.next };
+        let mut render = self.client.render.clone();
+        // Not the call's own deadline: that would end the stream, too.
+        let stream = match tokio::time::timeout(ANSWER, render.watch_frames(request)).await {
+            Ok(stream) => stream
+                .map_err(|status| ClientError::of_status(self.client.address(), &status))?
+                .into_inner(),
+            Err(_) => {
+                return Err(ClientError::Lost {
+                    address: self.client.address().to_owned(),
+                    cause: format!("no answer in {} s", ANSWER.as_secs()),
+                });
+            }
+        };
+        self.stream = Some(Open { chunks: stream, since: Instant::now() });
+        Ok(())
+    }
+
+    /// After an error: either it is final, or it is time to call again when this returns.
+    async fn bear(&mut self, error: ClientError) -> Result<(), ClientError> {
+        let lived = self.stream.take().map(|open| open.since.elapsed());
+        self.partial = None;
+        let Some(patience) = self.patience.filter(|_| error.is_passing()) else {
+            return Err(error);
+        };
+        if lived.is_some_and(|lived| lived >= GOOD) {
+            self.trouble = None;
+        }
+        let now = Instant::now();
+        let trouble = self.trouble.get_or_insert(Trouble { since: now, wait: FIRST_WAIT });
+        let wait = trouble.wait;
+        trouble.wait = (2 * wait).min(LONGEST_WAIT);
+        let after = now - trouble.since;
+        if after + wait > patience {
+            return Err(ClientError::GaveUp {
+                address: self.client.address().to_owned(),
+                after,
+                last: match error {
+                    ClientError::Lost { cause, .. } | ClientError::Connect { cause, .. } => cause,
+                    other => other.to_string(),
+                },
+                next_frame: self.next,
+            });
+        }
+        tokio::time::sleep(wait).await;
+        Ok(())
+    }
+
+    /// Takes in a chunk, which may complete the frame.
+    fn take(&mut self, chunk: PixelsChunk) -> Result<Option<ReceivedFrame>, String> {
+        if chunk.frame != self.next {
+            return Err(format!("frame {} came instead of {}", chunk.frame, self.next));
+        }
+        let partial = self.partial.get_or_insert_with(|| Partial::new(&chunk));
+        let last = chunk.last;
+        partial.take(chunk)?;
+        if !last {
+            return Ok(None);
+        }
+        let whole = self.partial.take().expect("it was there a moment ago").finish(self.next)?;
+        self.next += 1;
+        self.trouble = None;
+        Ok(Some(whole))
+    }
+}
+
+/// A frame while its chunks come.
+#[derive(Debug)]
+struct Partial {
+    size: [u32; 2],
+    format: PixelFormat,
+    whole: usize,
+    bytes: Vec<u8>,
+    stats_json: String,
+    trace_json: String,
+}
+
+impl Partial {
+    fn new(first: &PixelsChunk) -> Self {
+        let whole = first.size[0] as usize * first.size[1] as usize * first.format.bytes();
+        Partial {
+            size: first.size,
+            format: first.format,
+            whole,
+            bytes: Vec::with_capacity(whole.min(ON_TRUST)),
+            stats_json: String::new(),
+            trace_json: String::new(),
+        }
+    }
+
+    fn take(&mut self, chunk: PixelsChunk) -> Result<(), String> {
+        if (chunk.size, chunk.format) != (self.size, self.format) {
+            return Err(format!("frame {} changes its size or format", chunk.frame));
+        }
+        if chunk.offset != self.bytes.len() as u64 {
+            return Err(format!(
+                "frame {} goes on at byte {} instead of {}",
+                chunk.frame,
+                chunk.offset,
+                self.bytes.len()
+            ));
+        }
+        self.bytes.extend_from_slice(&chunk.data);
+        for (text, piece) in
+            [(&mut self.stats_json, &chunk.stats_json), (&mut self.trace_json, &chunk.trace_json)]
+        {
+            if text.len() + piece.len() > MAX_TEXT {
+                return Err(format!("frame {} has too long statistics", chunk.frame));
+            }
+            text.push_str(piece);
+        }
+        Ok(())
+    }
+
+    fn finish(self, number: u64) -> Result<ReceivedFrame, String> {
+        if self.bytes.len() != self.whole {
+            return Err(format!(
+                "frame {number} has {} bytes instead of {}",
+                self.bytes.len(),
+                self.whole
+            ));
+        }
+        let stats = serde_json::from_str(&self.stats_json)
+            .map_err(|e| format!("statistics of frame {number}: {e}"))?;
+        Ok(ReceivedFrame {
+            number,
+            size: self.size,
+            format: self.format,
+            bytes: self.bytes,
+            stats,
+            stats_json: self.stats_json,
+            trace_json: Some(self.trace_json).filter(|t| !t.is_empty()),
+        })
+    }
+}

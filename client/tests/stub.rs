@@ -1,0 +1,479 @@
+//! The client against a master made of a script, over real sockets.
+
+use bytes::Bytes;
+use slabcast_client::{Client, ClientError, FrameStream, JobState, ReceivedFrame, Update};
+use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::message::{PathRequest, TransferChoice};
+use slabcast_common::path::{Turntable, ViewPath};
+use slabcast_common::quality::{Quality, Work};
+use slabcast_common::stats::{FrameMs, FrameStats};
+use slabcast_proto::model::{Job, JobNotice};
+use slabcast_proto::v1::render_server::{Render, RenderServer};
+use slabcast_proto::{convert, v1};
+use std::collections::HashMap;
+use std::net::SocketAddr;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::watch;
+use tokio_stream::wrappers::TcpListenerStream;
+use tokio_stream::{Stream, StreamExt};
+use tonic::{Request, Response, Status};
+
+type Chunks = Vec<Result<v1::FrameChunk, Status>>;
+
+/// A master that answers by a script: what each watch, by its first frame, sends, and whether it
+/// ends then or stays silent.
+#[derive(Clone, Default)]
+struct Script {
+    watches: Arc<Mutex<HashMap<u64, (Chunks, bool)>>>,
+    watched_from: Arc<Mutex<Vec<u64>>>,
+    keys: Arc<Mutex<Vec<String>>>,
+}
+
+#[tonic::async_trait]
+impl Render for Script {
+    type WatchFramesStream = Pin<Box<dyn Stream<Item = Result<v1::FrameChunk, Status>> + Send>>;
+
+    async fn submit_path(
+        &self,
+        request: Request<v1::PathRequest>,
+    ) -> Result<Response<v1::SubmitReply>, Status> {
+        let request = convert::path_request_from_wire(request.into_inner())?;
+        let mut keys = self.keys.lock().unwrap();
+        let number = keys.iter().position(|k| *k == request.client_key).unwrap_or_else(|| {
+            keys.push(request.client_key);
+            keys.len() - 1
+        });
+        Ok(Response::new(v1::SubmitReply { job_id: format!("job-{number}") }))
+    }
+
+    async fn watch_frames(
+        &self,
+        request: Request<v1::WatchRequest>,
+    ) -> Result<Response<Self::WatchFramesStream>, Status> {
+        let from = request.into_inner().from_frame;
+        self.watched_from.lock().unwrap().push(from);
+        let Some((chunks, ends)) = self.watches.lock().unwrap().get(&from).cloned() else {
+            return Err(Status::not_found("job-9 is not known"));
+        };
+        let chunks = tokio_stream::iter(chunks);
+        Ok(Response::new(match ends {
+            true => Box::pin(chunks),
+            false => Box::pin(chunks.chain(tokio_stream::pending())),
+        }))
+    }
+
+    async fn get_job(&self, r: Request<v1::GetJobRequest>) -> Result<Response<v1::Job>, Status> {
+        Ok(Response::new(convert::job_to_wire(&job(&r.into_inner().job_id, JobState::Running))))
+    }
+
+    async fn list_jobs(
+        &self,
+        r: Request<v1::ListJobsRequest>,
+    ) -> Result<Response<v1::ListJobsReply>, Status> {
+        let jobs = (0..r.into_inner().limit).map(|i| job(&format!("job-{i}"), JobState::Done));
+        let jobs = jobs.map(|j| convert::job_to_wire(&j)).collect();
+        Ok(Response::new(v1::ListJobsReply { jobs }))
+    }
+
+    async fn cancel_job(
+        &self,
+        r: Request<v1::CancelJobRequest>,
+    ) -> Result<Response<v1::Job>, Status> {
+        Ok(Response::new(convert::job_to_wire(&job(&r.into_inner().job_id, JobState::Cancelled))))
+    }
+
+    async fn describe_volume(
+        &self,
+        _: Request<v1::DescribeVolumeRequest>,
+    ) -> Result<Response<v1::VolumeDescription>, Status> {
+        Ok(Response::new(v1::VolumeDescription::default()))
+    }
+
+    async fn list_workers(
+        &self,
+        _: Request<v1::ListWorkersRequest>,
+    ) -> Result<Response<v1::ListWorkersReply>, Status> {
+        Err(Status::resource_exhausted("64 watchers\nare enough"))
+    }
+}
+
+fn job(id: &str, state: JobState) -> Job {
+    Job {
+        job_id: id.into(),
+        client_key: "k".into(),
+        state,
+        message: String::new(),
+        frames_done: 0,
+        frames_total: 1,
+        size: [4, 4],
+        format: PixelFormat::Rgb8,
+        submitted_unix_ms: 1,
+        finished_unix_ms: 0,
+    }
+}
+
+fn notice(state: JobState, frames_total: u64, message: &str) -> Result<v1::FrameChunk, Status> {
+    let message = message.into();
+    Ok(convert::notice_to_wire(&JobNotice {
+        state,
+        frames_done: 0,
+        frames_total,
+        workers: 1,
+        message,
+    }))
+}
+
+fn stats(frame: u64) -> FrameStats {
+    FrameStats {
+        v: 1,
+        frame,
+        view_sha256: String::new(),
+        pixels_sha256: String::new(),
+        pixels_version: 1,
+        ms: FrameMs { total: 0.1 + 0.2, ..FrameMs::default() },
+        workers: vec![],
+        voxels: Default::default(),
+        bricks: Default::default(),
+        slabs: vec![],
+        quality: Quality::default(),
+        left_out: vec![],
+        error: Default::default(),
+        retries: 0,
+        dropped_results: 0,
+        poisoned: vec![],
+    }
+}
+
+fn pixels(frame: u64, size: [u32; 2]) -> Bytes {
+    let n = size[0] as usize * size[1] as usize * 4;
+    (0..n).map(|i| (i as u64 * 31 + frame) as u8).collect::<Vec<_>>().into()
+}
+
+fn chunks(frame: u64, size: [u32; 2], trace: &str) -> Chunks {
+    let stats = serde_json::to_string(&stats(frame)).unwrap();
+    let bytes = pixels(frame, size);
+    let chunks = convert::frame_to_wire(frame, size, PixelFormat::Rgba8, &bytes, &stats, trace);
+    chunks.into_iter().map(Ok).collect()
+}
+
+async fn serve(script: &Script) -> SocketAddr {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let server = tonic::transport::Server::builder()
+        .add_service(RenderServer::new(script.clone()))
+        .serve_with_incoming(TcpListenerStream::new(listener));
+    tokio::spawn(server);
+    address
+}
+
+/// Forwards to a master until it is cut; then its connections break, and new ones are taken or
+/// not.
+struct Wire {
+    address: SocketAddr,
+    cut: watch::Sender<u32>,
+    shut: watch::Sender<bool>,
+}
+
+async fn wire_to(master: SocketAddr) -> Wire {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let (cut, cuts) = watch::channel(0);
+    let (shut, mut shuts) = watch::channel(false);
+    tokio::spawn(async move {
+        loop {
+            let (mut near, _) = tokio::select! {
+                accepted = listener.accept() => accepted.unwrap(),
+                _ = shuts.wait_for(|shut| *shut) => return,
+            };
+            let mut cuts = cuts.clone();
+            cuts.mark_unchanged();
+            tokio::spawn(async move {
+                let mut far = TcpStream::connect(master).await.unwrap();
+                tokio::select! {
+                    _ = tokio::io::copy_bidirectional(&mut near, &mut far) => {}
+                    _ = cuts.changed() => {}
+                }
+            });
+        }
+    });
+    Wire { address, cut, shut }
+}
+
+async fn frame(frames: &mut FrameStream) -> ReceivedFrame {
+    loop {
+        match frames.next().await.unwrap() {
+            Some(Update::Frame(frame)) => return *frame,
+            Some(Update::Notice(_)) => {}
+            None => panic!("the job ended"),
+        }
+    }
+}
+
+fn request(key: &str) -> PathRequest {
+    PathRequest {
+        client_key: key.into(),
+        path: ViewPath::turn([64, 64], Turntable::default()),
+        transfer: TransferChoice::Name("auto".into()),
+        quality: Quality::default(),
+        work: Work::default(),
+        format: PixelFormat::Rgba8,
+        background: Background::Transparent,
+        want_trace: false,
+    }
+}
+
+#[tokio::test]
+async fn a_frame_in_many_chunks_comes_whole_with_its_statistics() {
+    let script = Script::default();
+    let size = [1000, 900];
+    let mut all = vec![notice(JobState::Running, 2, "")];
+    all.extend(chunks(0, size, "[{\"name\":\"render\"}]"));
+    assert_eq!(all.len(), 1 + 4, "3.6 MB take four messages of 1 MiB");
+    all.insert(3, notice(JobState::WaitingForWorkers, 2, "waiting for workers"));
+    all.extend(chunks(1, [3, 1], ""));
+    all.push(notice(JobState::Done, 2, ""));
+    script.watches.lock().unwrap().insert(0, (all, true));
+    let client = Client::connect(&serve(&script).await.to_string()).await.unwrap();
+    let mut frames = client.watch("job-0", 0).await.unwrap();
+
+    let mut notices = Vec::new();
+    let first = loop {
+        match frames.next().await.unwrap().unwrap() {
+            Update::Notice(notice) => notices.push(notice.state),
+            Update::Frame(frame) => break frame,
+        }
+    };
+    assert_eq!(notices, [JobState::Running, JobState::WaitingForWorkers], "also within a frame");
+    assert_eq!((first.number, first.size, first.format), (0, size, PixelFormat::Rgba8));
+    assert!(first.bytes == pixels(0, size));
+    assert_eq!(first.stats, stats(0));
+    assert_eq!(serde_json::from_str::<FrameStats>(&first.stats_json).unwrap(), stats(0));
+    assert_eq!(first.trace_json.as_deref(), Some("[{\"name\":\"render\"}]"));
+    let second = frame(&mut frames).await;
+    assert_eq!((second.number, second.trace_json), (1, None));
+    assert!(
+        matches!(frames.next().await, Ok(Some(Update::Notice(n))) if n.state == JobState::Done)
+    );
+    assert_eq!(frames.next().await, Ok(None));
+    assert_eq!(frames.next().await, Ok(None), "and so it stays");
+}
+
+#[tokio::test]
+async fn a_broken_connection_is_taken_up_at_the_first_frame_that_is_not_whole() {
+    let script = Script::default();
+    let size = [1000, 900];
+    let mut broken = vec![notice(JobState::Running, 3, "")];
+    broken.extend(chunks(0, size, ""));
+    broken.extend(chunks(1, size, "").into_iter().take(2));
+    let mut rest = vec![notice(JobState::Done, 3, "")];
+    rest.extend(chunks(1, size, "").into_iter().chain(chunks(2, size, "")));
+    let mut watches = HashMap::from([(0, (broken, false)), (1, (rest, true))]);
+    std::mem::swap(&mut *script.watches.lock().unwrap(), &mut watches);
+    let wire = wire_to(serve(&script).await).await;
+    let client = Client::connect(&format!("http://{}/", wire.address)).await.unwrap();
+
+    let mut frames = client.follow("job-0", 0, Duration::from_secs(30)).await.unwrap();
+    assert_eq!(frame(&mut frames).await.number, 0);
+    wire.cut.send_modify(|n| *n += 1);
+    for number in 1..3 {
+        let whole = frame(&mut frames).await;
+        assert_eq!(whole.number, number);
+        assert!(whole.bytes == pixels(number, size), "frame {number} has its own bytes only");
+    }
+    assert_eq!(frames.next().await, Ok(None), "a job that was done when it was watched ends, too");
+    assert_eq!(*script.watched_from.lock().unwrap(), [0, 1]);
+    // Calls that are not streams find the connection again, too.
+    wire.cut.send_modify(|n| *n += 1);
+    assert_eq!(client.job("job-0").await.unwrap().state, JobState::Running);
+}
+
+#[tokio::test]
+async fn without_patience_a_break_is_an_error_that_says_so() {
+    let script = Script::default();
+    let broken = vec![notice(JobState::Running, 3, "")];
+    script.watches.lock().unwrap().insert(0, (broken, false));
+    let wire = wire_to(serve(&script).await).await;
+    let client = Client::connect(&wire.address.to_string()).await.unwrap();
+    let mut frames = client.watch("job-0", 0).await.unwrap();
+    assert!(matches!(frames.next().await, Ok(Some(Update::Notice(_)))));
+    wire.cut.send_modify(|n| *n += 1);
+    let e = frames.next().await.unwrap_err();
+    assert!(matches!(e, ClientError::Lost { .. }), "{e}");
+    assert!(e.to_string().contains(&wire.address.to_string()), "{e}");
+}
+
+#[tokio::test]
+async fn a_master_that_stays_away_is_given_up_in_time() {
+    let script = Script::default();
+    let mut broken = vec![notice(JobState::Running, 3, "")];
+    broken.extend(chunks(0, [3, 3], ""));
+    script.watches.lock().unwrap().insert(0, (broken, false));
+    let wire = wire_to(serve(&script).await).await;
+    let client = Client::connect(&wire.address.to_string()).await.unwrap();
+    let mut frames = client.follow("job-0", 0, Duration::from_millis(500)).await.unwrap();
+    assert_eq!(frame(&mut frames).await.number, 0);
+    wire.shut.send_replace(true);
+    wire.shut.closed().await;
+    wire.cut.send_modify(|n| *n += 1);
+    let began = std::time::Instant::now();
+    let e = frames.next().await.unwrap_err();
+    assert!(matches!(e, ClientError::GaveUp { next_frame: 1, .. }), "{e}");
+    assert!(e.to_string().contains("from frame 1"), "{e}");
+    assert!(began.elapsed() < Duration::from_secs(20));
+}
+
+#[tokio::test]
+async fn a_stream_that_ends_too_early_is_taken_up() {
+    let script = Script::default();
+    let mut short = vec![notice(JobState::Running, 2, "")];
+    short.extend(chunks(0, [3, 3], ""));
+    let mut busy = vec![notice(JobState::Running, 2, "")];
+    busy.push(Err(Status::unavailable("the master restarts")));
+    script.watches.lock().unwrap().insert(0, (short, true));
+    script.watches.lock().unwrap().insert(1, (busy, true));
+    let client = Client::connect(&serve(&script).await.to_string()).await.unwrap();
+    let mut frames = client.follow("job-0", 0, Duration::from_secs(30)).await.unwrap();
+    assert_eq!(frame(&mut frames).await.number, 0);
+    assert!(matches!(frames.next().await, Ok(Some(Update::Notice(_)))));
+    let mut rest = chunks(1, [3, 3], "");
+    rest.push(notice(JobState::Done, 2, ""));
+    script.watches.lock().unwrap().insert(1, (rest, true));
+    assert_eq!(frame(&mut frames).await.number, 1);
+    let mut watched = script.watched_from.lock().unwrap().clone();
+    watched.dedup();
+    assert_eq!(watched, [0, 1]);
+}
+
+#[tokio::test]
+async fn what_a_job_ends_with_cannot_be_overlooked() {
+    let script = Script::default();
+    let mut failed = vec![notice(JobState::Running, 2, "")];
+    failed.extend(chunks(0, [3, 3], ""));
+    failed.push(notice(JobState::Failed, 2, "the volume changed:\nopen it again"));
+    let cancelled = vec![notice(JobState::Cancelled, 2, "")];
+    let mut watches = HashMap::from([(0, (failed, true)), (1, (cancelled, true))]);
+    std::mem::swap(&mut *script.watches.lock().unwrap(), &mut watches);
+    let client = Client::connect(&serve(&script).await.to_string()).await.unwrap();
+
+    let mut frames = client.follow("job-0", 0, Duration::from_secs(30)).await.unwrap();
+    let end = loop {
+        match frames.next().await {
+            Ok(Some(_)) => {}
+            end => break end,
+        }
+    };
+    let e = end.unwrap_err();
+    assert_eq!(e.to_string(), "job-0 failed: the volume changed: open it again");
+    let mut frames = client.watch("job-0", 1).await.unwrap();
+    assert!(matches!(frames.next().await, Ok(Some(Update::Notice(_)))));
+    assert!(matches!(frames.next().await, Err(ClientError::JobCancelled { .. })));
+}
+
+#[tokio::test]
+async fn statuses_become_one_line_with_a_remedy() {
+    let client = Client::connect(&serve(&Script::default()).await.to_string()).await.unwrap();
+    let e = client.watch("job-9", 0).await.unwrap_err();
+    assert!(matches!(e, ClientError::NotFound { .. }), "{e}");
+    let e = client.follow("job-9", 0, Duration::from_secs(60)).await.unwrap_err();
+    assert!(matches!(e, ClientError::NotFound { .. }), "no patience with what will not pass: {e}");
+    let bad = PathRequest { path: ViewPath::turn([0, 64], Turntable::default()), ..request("a") };
+    let e = client.submit(&bad).await.unwrap_err().to_string();
+    assert_eq!(e, "refused: path.width: 0 pixels; give 1 to 8192");
+    let e = client.workers().await.unwrap_err().to_string();
+    assert_eq!(
+        e,
+        "64 watchers are enough (ResourceExhausted): the master is full; try later, or cancel a job"
+    );
+    let e = client.volume().await.unwrap_err();
+    assert!(matches!(e, ClientError::Nonsense { .. }), "{e}");
+}
+
+#[tokio::test]
+async fn a_request_too_long_is_refused_before_it_is_sent() {
+    let client = Client::connect(&serve(&Script::default()).await.to_string()).await.unwrap();
+    let view = slabcast_common::path::PathView {
+        eye: [1.0; 3],
+        target: [0.0; 3],
+        up: [0.0, 0.0, 1.0],
+        projection: Default::default(),
+        height: None,
+        fov: None,
+    };
+    let views = vec![view; 100_000];
+    let path = ViewPath { version: 1, size: [64, 64], views, turntable: None };
+    let e = client.submit(&PathRequest { path, ..request("a") }).await.unwrap_err();
+    assert!(matches!(e, ClientError::TooLong { .. }), "{e}");
+}
+
+#[tokio::test]
+async fn the_same_key_gives_the_same_job_and_futures_may_move() {
+    let script = Script::default();
+    let client = Client::connect(&serve(&script).await.to_string()).await.unwrap();
+    let submitted = tokio::spawn({
+        let client = client.clone();
+        async move { client.submit(&request("a")).await }
+    });
+    assert_eq!(submitted.await.unwrap().unwrap(), "job-0");
+    assert_eq!(client.submit(&request("b")).await.unwrap(), "job-1");
+    assert_eq!(client.submit(&request("a")).await.unwrap(), "job-0");
+    assert_eq!(client.jobs(3).await.unwrap().len(), 3);
+    assert_eq!(client.cancel("job-1").await.unwrap().state, JobState::Cancelled);
+}
+
+#[tokio::test]
+async fn chunks_that_break_the_promise_are_named() {
+    let [a, b] = [0, 1].map(|f| chunks(f, [1000, 900], ""));
+    let cases: [(&str, Chunks, &str); 4] = [
+        ("a gap", vec![a[0].clone(), a[2].clone()], "goes on at byte"),
+        ("another frame", vec![b[0].clone()], "frame 1 came instead of 0"),
+        ("mixed frames", vec![a[0].clone(), b[1].clone()], "frame 1 came instead of 0"),
+        ("too short", vec![Ok(last_at_once(a[0].clone().unwrap()))], "bytes instead of 3600000"),
+    ];
+    for (name, chunks, problem) in cases {
+        let script = Script::default();
+        script.watches.lock().unwrap().insert(0, (chunks, true));
+        let client = Client::connect(&serve(&script).await.to_string()).await.unwrap();
+        let mut frames = client.follow("job-0", 0, Duration::from_secs(30)).await.unwrap();
+        let e = frames.next().await.unwrap_err().to_string();
+        assert!(e.contains(problem), "{name}: {e}");
+    }
+}
+
+fn last_at_once(mut chunk: v1::FrameChunk) -> v1::FrameChunk {
+    if let Some(v1::frame_chunk::What::Pixels(p)) = &mut chunk.what {
+        p.last = true;
+    }
+    chunk
+}
+
+#[tokio::test]
+async fn nobody_there_is_said_with_the_address() {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    drop(listener);
+    let e = Client::connect(&address).await.unwrap_err().to_string();
+    assert!(e.starts_with(&format!("no master at {address} (")), "{e}");
+    assert!(e.contains("refused") && e.contains("slabcast master"), "{e}");
+}
+
+/// A web server, say: it takes the connection and speaks something else.
+#[tokio::test]
+async fn somebody_else_there_is_an_error_and_no_panic() {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    tokio::spawn(async move {
+        while let Ok((mut stream, _)) = listener.accept().await {
+            let _ = stream.read(&mut [0; 100]).await;
+            let _ = stream.write_all(b"HTTP/1.1 400 Bad Request\r\n\r\n").await;
+        }
+    });
+    let e = match Client::connect(&address).await {
+        Ok(client) => client.job("job-0").await.unwrap_err(),
+        Err(e) => e,
+    };
+    assert!(e.to_string().contains(&address), "{e}");
+}

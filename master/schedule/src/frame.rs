@@ -23,6 +23,7 @@ use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::stats::{BrickStats, PoisonedTile, SlabStats, TileStats};
 use slabcast_common::view::Projected;
+use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 /// Whether a pixel with accumulated opacity `a` is shut for good.
@@ -301,10 +302,14 @@ impl Frame {
                 let refused_it = |id| task.failed.iter().any(|(w, ..)| *w == id);
                 cluster.roster.staying().any(|(other, _)| other != id && !refused_it(other))
             };
+            // A worker short of memory may have any of the first few that fit.
+            let tries = Cell::new(0);
             let suits = |place| {
-                lent.is_empty()
-                    || !cluster.residency.is_lazy(id)
-                    || cluster.residency.fits(id, &slab.bricks_of(place))
+                if lent.is_empty() || !cluster.residency.is_lazy(id) {
+                    return true;
+                }
+                tries.set(tries.get() + 1);
+                tries.get() <= 16 && cluster.residency.fits(id, &slab.bricks_of(place))
             };
             let Some(place) = slab.queue.next_for(id, &mine, others, suits) else {
                 refused.insert(id);
@@ -688,6 +693,7 @@ impl Frame {
                 cluster.residency.unpin(id, &lent.bricks);
             }
         }
+        cluster.residency.rest();
         for id in std::mem::take(&mut self.told) {
             cluster.send(id, ToWorker::EndFrame { frame: self.job.frame });
         }

@@ -75,7 +75,8 @@ pub struct Config {
     pub silence: Micros,
     /// First deadline of a lease; each attempt doubles it.
     pub lease: Micros,
-    /// A tile is given up after so many distinct workers were lost with it, or so many refusals.
+    /// A tile is given up after so many distinct workers were lost with it (more where others
+    /// are lost too, see `queue`), or so many refusals.
     pub poison_after: u32,
     /// Leases a render thread has in flight, the one it renders included.
     pub queue_ahead: u32,
@@ -215,6 +216,7 @@ pub enum Event {
 
 /// What the scheduler wants done.
 #[derive(Clone, Debug)]
+#[expect(clippy::large_enum_variant, reason = "a view in a message; there is one action at a time")]
 pub enum Action {
     /// Send a control message. A scene comes before its first frame, a frame before its first
     /// lease, for each worker.

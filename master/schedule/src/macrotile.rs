@@ -313,7 +313,7 @@ mod tests {
                 if bits[i] { shut.shut(i); }
             }
             shut.refresh();
-            let edge = (16 << level) as i32;
+            let edge = 16i32 << level;
             let c = cut(size, &rects, &shut, cull, 0, Some(edge as u32));
             let (mut tiles, mut total) = (Vec::new(), 0);
             for y0 in (0..h).step_by(edge as usize) {

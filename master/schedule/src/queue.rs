@@ -9,6 +9,11 @@
 //! innocent neighbour is blamed along with the culprit, and if both went on together they would
 //! be condemned together. So a suspect is never lent to a worker that has another, and when a
 //! worker is lost with a suspect on it, only those blamed most before are blamed again.
+//!
+//! And a cluster may lose workers for reasons of its own (PROMISES.md R1 kills 7 of 8 in one
+//! frame): a tile that three of them happened to hold is innocent. A deadly tile is held by
+//! every worker that is lost. So each loss in the slab that a tile has an alibi for asks for
+//! one witness more against it, up to twice as many.
 
 use crate::macrotile::Macrotile;
 use crate::{Config, Micros};
@@ -78,6 +83,8 @@ pub(crate) struct Queue {
     waiting: VecDeque<u32>,
     deadlines: BTreeSet<(Micros, u32, Epoch)>,
     open: u32,
+    /// Workers lost while it was rendered, that a task may have killed.
+    losses: usize,
     /// Leases beyond the first of a task.
     pub(crate) retries: u64,
 }
@@ -100,6 +107,7 @@ impl Queue {
             waiting: (0..tiles.len() as u32).collect(),
             deadlines: BTreeSet::new(),
             open: tiles.len() as u32,
+            losses: 0,
             retries: 0,
         }
     }
@@ -139,7 +147,8 @@ impl Queue {
             let task = &self.tasks[place as usize];
             let has_it = mine.contains(&place);
             let failed = task.failed.iter().any(|(w, ..)| *w == worker) && others(task);
-            !has_it && !failed && !(has_suspect && task.is_suspect()) && suits(place)
+            let two_suspects = has_suspect && task.is_suspect();
+            !(has_it || failed || two_suspects) && suits(place)
         })
     }
 
@@ -241,6 +250,7 @@ impl Queue {
         let mut head: Vec<u32> = leases.iter().take(running).map(|l| l.0).collect();
         head.retain(|&p| self.tasks[p as usize].end == End::Open);
         let most = head.iter().map(|&p| self.tasks[p as usize].blamed.len()).max().unwrap_or(0);
+        self.losses += usize::from(!head.is_empty());
         for &place in &head {
             let task = &mut self.tasks[place as usize];
             if task.blamed.len() == most {
@@ -265,8 +275,8 @@ impl Queue {
     }
 
     /// Ends leases and puts their tasks in front in their old order. A task that has another
-    /// live lease goes on with that one; one that has none and was blamed by `poison_after`
-    /// workers is returned, to be given up.
+    /// live lease goes on with that one; one that has none and was blamed or refused often
+    /// enough is returned, to be given up.
     fn take_back(
         &mut self,
         worker: WorkerId,
@@ -281,7 +291,8 @@ impl Queue {
                 continue;
             }
             let limit = config.poison_after.max(1) as usize;
-            if task.blamed.len() >= limit || task.failed.len() >= limit {
+            let alibis = self.losses.saturating_sub(task.blamed.len()).min(limit);
+            if task.blamed.len() >= limit + alibis || task.failed.len() >= limit {
                 given_up.push(place);
             } else {
                 self.requeue(place);
@@ -405,6 +416,26 @@ mod tests {
         }
         assert_eq!(given_up, [0]);
         assert!(q.tasks[1..].iter().all(|t| t.blamed.len() <= 1));
+    }
+
+    #[test]
+    fn a_cluster_that_loses_workers_anyway_needs_more_witnesses() {
+        let c = Config::default();
+        let mut q = queue(3);
+        // A loss that task 0 has nothing to do with: it is with worker 1 meanwhile.
+        let mut held = take(&mut q, 1, &[], 0);
+        let other = take(&mut q, 9, &[], 0);
+        assert!(q.lose(WorkerId(9), "x", &[other], 1, &c).is_empty());
+        q.lease(other.0, WorkerId(10), 0, &c);
+        for w in 1..=4 {
+            assert_eq!(held.0, 0);
+            let given_up = q.lose(WorkerId(w), "x", &[held], 1, &c);
+            // Three, and one for the other loss.
+            assert_eq!(given_up, if w == 4 { vec![0] } else { vec![] });
+            if w < 4 {
+                held = take(&mut q, w + 1, &[], 0);
+            }
+        }
     }
 
     #[test]

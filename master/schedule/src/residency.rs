@@ -183,12 +183,17 @@ impl Residency {
 
     /// Makes `key` the set that tasks are drawn from.
     pub(crate) fn open(&mut self, key: BrickSetKey, bricks: &Arc<[BrickInfo]>) {
-        // A set nobody holds anything of need not be remembered.
+        self.rest();
+        for shelf in self.shelves.values_mut() {
+            // Books without an entry.
+            let leaving = &shelf.leaving;
+            shelf.sets.retain(|k, b| {
+                let empty = b.held_count == 0 && b.flying.is_empty();
+                *k == key || !empty || leaving.iter().any(|(_, set, _)| set == k)
+            });
+        }
         let shelves = &self.shelves;
         self.sets.retain(|k, _| *k == key || shelves.values().any(|s| s.sets.contains_key(k)));
-        for shelf in self.shelves.values_mut() {
-            shelf.keep_wanted(self.current, |_| false);
-        }
         self.current = key;
         self.round_bytes = 0;
         let set = self
@@ -201,6 +206,13 @@ impl Residency {
                 self.believe(worker, key);
             }
             self.settle_mode(worker);
+        }
+    }
+
+    /// Nothing is wanted any more: a frame ended.
+    pub(crate) fn rest(&mut self) {
+        for shelf in self.shelves.values_mut() {
+            shelf.keep_wanted(self.current, |_| false);
         }
     }
 

@@ -24,6 +24,13 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 /// one has become.
 const DRIFT: f64 = 100e-6;
 
+/// A worker's threads are a stranger's claim; five times the largest machine sold.
+const MAX_THREADS: u32 = 4096;
+
+/// Pings that a worker may owe a pong for while it lives on other messages. 1024 heartbeats are
+/// a quarter of an hour; one that owes more will not answer the oldest.
+const MAX_PINGS: usize = 1024;
+
 /// One worker.
 #[derive(Debug)]
 pub(crate) struct Worker {
@@ -70,7 +77,7 @@ impl Roster {
     pub(crate) fn join(&mut self, id: WorkerId, name: String, threads: u32, now: Micros) {
         let worker = Worker {
             name,
-            threads: threads.max(1),
+            threads: threads.clamp(1, MAX_THREADS),
             since: now,
             leaving: false,
             scenes: BTreeSet::new(),
@@ -143,6 +150,9 @@ impl Roster {
         self.next_nonce += 1;
         if let Some(w) = self.workers.get_mut(&id) {
             w.pings.push_back((self.next_nonce, now));
+            if w.pings.len() > MAX_PINGS {
+                w.pings.pop_front();
+            }
         }
         self.next_nonce
     }

@@ -245,10 +245,6 @@ impl World {
         by_set.into_iter().collect()
     }
 
-    pub(crate) fn alive(&self) -> Vec<WorkerId> {
-        self.workers.keys().copied().collect()
-    }
-
     fn hand_in(&mut self, event: Event) {
         if let Event::Result { worker, result } = &event
             && let Some(w) = self.workers.get_mut(worker)

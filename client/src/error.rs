@@ -168,6 +168,10 @@ pub(crate) fn root_cause(mut error: &dyn Error) -> String {
 
 /// A stranger's text, fit for a line of a terminal.
 pub(crate) fn one_line(text: &str) -> String {
-    let text = &text[..text.floor_char_boundary(MAX_REASON)];
-    text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect::<String>().trim().to_owned()
+    text.chars()
+        .take(MAX_REASON)
+        .map(|c| if c.is_control() { ' ' } else { c })
+        .collect::<String>()
+        .trim()
+        .to_owned()
 }

@@ -268,6 +268,7 @@ async fn a_broken_connection_is_taken_up_at_the_first_frame_that_is_not_whole() 
     let mut broken = vec![notice(JobState::Running, 3, "")];
     broken.extend(chunks(0, size, ""));
     broken.extend(chunks(1, size, "").into_iter().take(2));
+    broken.push(notice(JobState::Running, 3, "half of frame 1 is there"));
     let mut rest = vec![notice(JobState::Done, 3, "")];
     rest.extend(chunks(1, size, "").into_iter().chain(chunks(2, size, "")));
     let mut watches = HashMap::from([(0, (broken, false)), (1, (rest, true))]);
@@ -277,6 +278,8 @@ async fn a_broken_connection_is_taken_up_at_the_first_frame_that_is_not_whole() 
 
     let mut frames = client.follow("job-0", 0, Duration::from_secs(30)).await.unwrap();
     assert_eq!(frame(&mut frames).await.number, 0);
+    let half = frames.next().await.unwrap();
+    assert!(matches!(half, Some(Update::Notice(n)) if n.message.starts_with("half")));
     wire.cut.send_modify(|n| *n += 1);
     for number in 1..3 {
         let whole = frame(&mut frames).await;

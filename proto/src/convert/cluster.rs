@@ -19,6 +19,7 @@ use slabcast_common::view::MAX_EDGE;
 use std::sync::Arc;
 
 /// Where a message for a worker goes.
+#[expect(clippy::large_enum_variant, reason = "it is taken apart and sent where it is made")]
 #[derive(Clone, Debug, PartialEq)]
 pub enum Down {
     /// On Control.

@@ -55,7 +55,16 @@ pub const MAX_REASON: usize = 4096;
 
 /// A text for people, cut to what the wire takes.
 fn reason_to_wire(text: &str) -> String {
-    text[..text.floor_char_boundary(MAX_REASON)].to_owned()
+    cut(text, MAX_REASON).to_owned()
+}
+
+/// As much of a text as fits `most` bytes, whole characters only.
+fn cut(text: &str, most: usize) -> &str {
+    let mut end = most.min(text.len());
+    while !text.is_char_boundary(end) {
+        end -= 1;
+    }
+    &text[..end]
 }
 
 fn reason_from_wire(field: &str, text: String) -> Result<String, WireError> {

@@ -5,8 +5,8 @@ use super::scene::{
     size_from_wire, triple_from_wire,
 };
 use super::{
-    MAX_NAME, WireError, name_from_wire, optional_name_from_wire, reason_from_wire, reason_to_wire,
-    required, transfer_from_wire,
+    MAX_NAME, WireError, cut, name_from_wire, optional_name_from_wire, reason_from_wire,
+    reason_to_wire, required, transfer_from_wire,
 };
 use crate::model::{FrameChunk, Job, JobNotice, JobState, PixelsChunk, VolumeDescription, Worker};
 use crate::{MAX_FRAME_CHUNK, v1};
@@ -237,7 +237,7 @@ pub fn frame_to_wire(
     let mut room = ROOM - chunks.last().map_or(ROOM, |c| c.data.len());
     for (mut text, is_stats) in [(stats_json, true), (trace_json, false)] {
         while !text.is_empty() {
-            let (piece, rest) = text.split_at(text.floor_char_boundary(room));
+            let (piece, rest) = text.split_at(cut(text, room).len());
             if piece.is_empty() {
                 chunks.push(empty_at(pixels.len()));
                 room = ROOM;

@@ -53,6 +53,7 @@ pub struct Lease {
 
 /// From master to worker.
 #[derive(Clone, Debug, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "a view is 400 bytes once a frame and worker")]
 pub enum ToWorker {
     /// The hello was good. Always the first message of a link that is let in.
     Welcome {

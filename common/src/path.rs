@@ -264,11 +264,11 @@ impl ViewPath {
             return Ok(Camera { to_eye, up, target: target - lattice.centre(), projection });
         };
         for (field, x) in [("start", t.start), ("step", t.step)] {
-            if !(x.abs() <= 1e9) {
+            if x.is_nan() || x.abs() > 1e9 {
                 return Err(Refused::new(field, format!("{x} degrees; give a finite angle")));
             }
         }
-        if !(t.elevation.abs() <= 90.0) {
+        if t.elevation.is_nan() || t.elevation.abs() > 90.0 {
             return Err(Refused::new(
                 "elevation",
                 format!("{} degrees; give -90 to 90", t.elevation),

@@ -104,7 +104,7 @@ impl Lattice {
         }
         let ratio = s.iter().copied().fold(0.0, f64::max) / self.vox();
         if ratio > 1e6 {
-            return Err(format!("spacings differ by a factor of {ratio:.0}; at most 1e6"));
+            return Err(format!("spacings differ by a factor of {ratio:.3e}; at most 1e6"));
         }
         Ok(())
     }

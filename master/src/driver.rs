@@ -20,9 +20,7 @@ use slabcast_common::view::{Projected, View};
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
 use slabcast_proto::model::Worker;
-use slabcast_schedule::{
-    Action, Clock, Event as Happened, FrameJob, Micros, Scheduler,
-};
+use slabcast_schedule::{Action, Clock, Event as Happened, FrameJob, Micros, Scheduler};
 use slabcast_volumes::BrickStore;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -116,6 +114,7 @@ impl From<Rejected> for SubmitError {
 }
 
 /// Everything that can happen to the master.
+#[expect(clippy::large_enum_variant, reason = "a finished frame is moved once; the queue is short")]
 pub(crate) enum Event {
     Attach {
         hello: Hello,
@@ -123,14 +122,35 @@ pub(crate) enum Event {
         link: WorkerLink,
         reply: oneshot::Sender<Result<WorkerId, String>>,
     },
-    Said { worker: WorkerId, message: ToMaster },
-    Detached { worker: WorkerId, reason: String },
-    Submit { request: Box<PathRequest>, reply: oneshot::Sender<Result<JobId, Rejected>> },
-    Prepared { job: JobId, store: Arc<BrickStore> },
+    Said {
+        worker: WorkerId,
+        message: ToMaster,
+    },
+    Detached {
+        worker: WorkerId,
+        reason: String,
+    },
+    Submit {
+        request: Box<PathRequest>,
+        reply: oneshot::Sender<Result<JobId, Rejected>>,
+    },
+    Prepared {
+        job: JobId,
+        store: Arc<BrickStore>,
+    },
     FrameTaken,
-    Finished { job: JobId, flight: FrameId, frame: FinishedFrame },
-    Cancel { job: JobId, reply: oneshot::Sender<bool> },
-    Workers { reply: oneshot::Sender<Vec<Worker>> },
+    Finished {
+        job: JobId,
+        flight: FrameId,
+        frame: FinishedFrame,
+    },
+    Cancel {
+        job: JobId,
+        reply: oneshot::Sender<bool>,
+    },
+    Workers {
+        reply: oneshot::Sender<Vec<Worker>>,
+    },
     Shutdown,
 }
 
@@ -158,7 +178,7 @@ impl Master {
         let jobs = Arc::new(Jobs::new());
         let handle = Handle { inbox: inbox.clone(), jobs: jobs.clone(), served: served.clone() };
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build()?;
-        let (to_finisher, sums) = std::sync::mpsc::channel::<(FrameId, finish::Sums_)>();
+        let (to_finisher, sums) = std::sync::mpsc::channel::<(FrameId, finish::FrameSums)>();
         let done = inbox.clone();
         std::thread::Builder::new().name("slabcast-finish".into()).spawn(move || {
             for (flight, sums) in sums {
@@ -357,7 +377,7 @@ struct Driver {
     flights: BTreeMap<FrameId, Flight>,
     inbox: mpsc::Sender<Event>,
     /// Bounded by [`FRAMES_IN_FLIGHT`].
-    finisher: std::sync::mpsc::Sender<(FrameId, finish::Sums_)>,
+    finisher: std::sync::mpsc::Sender<(FrameId, finish::FrameSums)>,
 }
 
 impl Driver {
@@ -624,9 +644,10 @@ impl Driver {
         };
         let support = classifier.support();
         let normals = transfer.shading.on;
-        let held = self.stores.iter().find(|s| {
-            s.support().covers(&support) && (s.has_normals() || !normals)
-        });
+        let held = self
+            .stores
+            .iter()
+            .find(|s| s.support().covers(&support) && (s.has_normals() || !normals));
         let (bricks, store) = match held {
             Some(store) => (store.key(), Some(store.clone())),
             None => (support.key(info.digest, normals), None),
@@ -673,10 +694,11 @@ impl Driver {
             let (volume, digest, wanted) =
                 (self.volume.clone(), self.served.info.digest, support.clone());
             let inbox = self.inbox.clone();
-            let built = std::thread::Builder::new().name("slabcast-bricks".into()).spawn(move || {
-                let store = Arc::new(BrickStore::build(&volume, digest, &wanted, normals));
-                let _ = inbox.blocking_send(Event::Prepared { job: id, store });
-            });
+            let built =
+                std::thread::Builder::new().name("slabcast-bricks".into()).spawn(move || {
+                    let store = Arc::new(BrickStore::build(&volume, digest, &wanted, normals));
+                    let _ = inbox.blocking_send(Event::Prepared { job: id, store });
+                });
             if let Err(e) = built {
                 self.end_job(id, JobState::Failed(format!("no thread to make bricks: {e}")));
                 return Ok(id);
@@ -719,9 +741,8 @@ impl Driver {
         // Jobs whose bricks were made for another job meanwhile take those.
         let stores = &self.stores;
         for r in self.running.values_mut().filter(|r| r.store.is_none()) {
-            let fits = |s: &&Arc<BrickStore>| {
-                s.key() == r.scene.bricks && s.support().covers(&r.support)
-            };
+            let fits =
+                |s: &&Arc<BrickStore>| s.key() == r.scene.bricks && s.support().covers(&r.support);
             r.store = stores.iter().find(fits).cloned();
         }
         while self.flights.len() < FRAMES_IN_FLIGHT {
@@ -758,8 +779,7 @@ impl Driver {
             if r.store.is_none() {
                 continue;
             }
-            let in_flight =
-                |n: u64| self.flights.values().any(|f| f.job == *id && f.number == n);
+            let in_flight = |n: u64| self.flights.values().any(|f| f.job == *id && f.number == n);
             if let Some(n) = job.wanted_again.iter().copied().find(|n| !in_flight(*n)) {
                 return Some((*id, n));
             }
@@ -784,11 +804,12 @@ impl Driver {
                     }
                 }
                 Action::SendBricks { worker, set, bricks } => {
-                    let store = self.stores.iter().find(|s| s.key() == set).cloned().or_else(|| {
-                        self.running.values().find_map(|r| {
-                            r.store.as_ref().filter(|s| s.key() == set).cloned()
-                        })
-                    });
+                    let store =
+                        self.stores.iter().find(|s| s.key() == set).cloned().or_else(|| {
+                            self.running
+                                .values()
+                                .find_map(|r| r.store.as_ref().filter(|s| s.key() == set).cloned())
+                        });
                     if let (Some(to), Some(store)) = (self.links.get(&worker), store) {
                         debug!(%worker, bricks = bricks.len(), "bricks sent");
                         let _ = to.link.bricks.send(BrickOrder::Send { set, store, bricks });
@@ -844,7 +865,7 @@ impl Driver {
         let depth_vox = view
             .project(&whole)
             .map_or(0.0, |Projected { sheets, .. }| f64::from(sheets.len()) * view.thickness);
-        let sums = finish::Sums_ {
+        let sums = finish::FrameSums {
             job: flight.job,
             frame,
             request: r.request.clone(),

@@ -16,7 +16,7 @@ use slabcast_schedule::Span;
 use std::sync::Arc;
 
 /// Everything that makes a frame.
-pub(crate) struct Sums_ {
+pub(crate) struct FrameSums {
     pub(crate) job: JobId,
     pub(crate) frame: FrameId,
     pub(crate) request: Arc<PathRequest>,
@@ -67,17 +67,22 @@ pub fn view_sha256(scene: &SceneSpec, view: &View) -> Digest32 {
 /// The bounds that are known without a reference (DESIGN.md section 5), in 1/255.
 fn error(scene: &SceneSpec, view: &View, depth_vox: f64) -> ErrorStats {
     let q = &scene.quality;
-    let mut e = ErrorStats::default();
-    // At most eps of the light is missing, and no colour is brighter than one.
-    e.cutoff = Bound { bound: Some(q.eps * 255.0) };
+    let mut e = ErrorStats {
+        // At most eps of the light is missing, and no colour is brighter than one.
+        cutoff: Bound { bound: Some(q.eps * 255.0) },
+        ..ErrorStats::default()
+    };
     if q.sums == Sums::I32 && q.compositing != Compositing::Paper {
         // Every contribution is rounded by half a raw unit. A ray meets the kernels of
         // (2 R)^2 voxels a vox of depth, each in 2 R / d + 1 sheets; optical depth is off by at
         // most their sum, alpha by no more than that. A colour's two sums are rounded apart,
         // and its change is judged from three sheets: four times.
-        let payload_max =
-            slabcast_common::transfer::Classifier::new(&scene.transfer, &scene.volume, q.compositing)
-                .payload_max();
+        let payload_max = slabcast_common::transfer::Classifier::new(
+            &scene.transfer,
+            &scene.volume,
+            q.compositing,
+        )
+        .payload_max();
         let d = view.thickness;
         let unit = 1.05 * payload_max * d / f64::from(1u32 << 30);
         let r = view.kernel_radius;
@@ -88,7 +93,7 @@ fn error(scene: &SceneSpec, view: &View, depth_vox: f64) -> ErrorStats {
 }
 
 /// Makes the frame.
-pub(crate) fn finish(s: Sums_) -> FinishedFrame {
+pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
     let picture = s.state.finish();
     let mut stats = *s.stats;
     stats.view_sha256 = view_sha256(&s.scene, &s.view).to_string();

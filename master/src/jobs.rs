@@ -161,9 +161,8 @@ impl Table {
         let (_, mut all) = self.bytes();
         for over_too in [false, true] {
             for job in self.jobs.values_mut() {
-                let may_go = |n: &u64| {
-                    job.taken.contains(n) || (over_too && job.view.state.is_over())
-                };
+                let may_go =
+                    |n: &u64| job.taken.contains(n) || (over_too && job.view.state.is_over());
                 let gone: Vec<u64> = job.frames.keys().copied().filter(may_go).collect();
                 for n in gone {
                     if all <= budget {
@@ -201,13 +200,16 @@ pub enum WatchItem {
     Frame(Arc<FinishedFrame>),
 }
 
+/// What a notice tells: state, frames done, tiles, slab, workers.
+pub(crate) type Told = (JobState, u64, (u32, u32), (u32, u32), u32);
+
 /// A cursor over a job's frames.
 pub struct Watch {
     pub(crate) jobs: Arc<Jobs>,
     pub(crate) job: JobId,
     pub(crate) next: u64,
     pub(crate) bell: watch::Receiver<u64>,
-    pub(crate) last_notice: Option<(JobState, u64, (u32, u32), (u32, u32), u32)>,
+    pub(crate) last_notice: Option<Told>,
     pub(crate) taken: tokio::sync::mpsc::Sender<crate::driver::Event>,
     pub(crate) over: bool,
 }

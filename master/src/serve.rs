@@ -56,10 +56,8 @@ pub async fn serve(
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
         .build_v1()
         .map_err(std::io::Error::other)?;
-    let render = RenderService {
-        handle: handle.clone(),
-        watchers: Arc::new(Semaphore::new(MAX_WATCHERS)),
-    };
+    let render =
+        RenderService { handle: handle.clone(), watchers: Arc::new(Semaphore::new(MAX_WATCHERS)) };
     let cluster = ClusterService { handle, sessions: Arc::default() };
     let (accepted, incoming) = mpsc::channel::<std::io::Result<Connection>>(16);
     let accepting = tokio::spawn(accept(listener, accepted));
@@ -321,8 +319,7 @@ async fn control(
     out: &mpsc::UnboundedSender<Result<v1::ToWorker, Status>>,
 ) -> Result<(), Status> {
     let read = |message| {
-        convert::from_worker_from_wire(message)
-            .map_err(|e| Status::invalid_argument(e.to_string()))
+        convert::from_worker_from_wire(message).map_err(|e| Status::invalid_argument(e.to_string()))
     };
     let first = tokio::time::timeout(HELLO, inbound.message()).await;
     let first = first
@@ -414,7 +411,11 @@ pub fn notice(job: &JobView) -> JobNotice {
     if state == model::JobState::Running && job.tiles.1 > 0 {
         message = format!(
             "frame {}: slab {} of {}, {} of {} tiles",
-            job.frames_done, job.slab.0 + 1, job.slab.1, job.tiles.0, job.tiles.1
+            job.frames_done,
+            job.slab.0 + 1,
+            job.slab.1,
+            job.tiles.0,
+            job.tiles.1
         );
     }
     JobNotice {

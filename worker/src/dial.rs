@@ -137,8 +137,7 @@ async fn link(
         let mut client = ClusterClient::new(channel)
             .max_decoding_message_size(MAX_CONTROL_MESSAGE)
             .max_encoding_message_size(MAX_CONTROL_MESSAGE);
-        let mut inbound =
-            client.control(outbound).await.map_err(|e| causes(&e))?.into_inner();
+        let mut inbound = client.control(outbound).await.map_err(|e| causes(&e))?.into_inner();
         let mut bricks_stream: Option<tokio::task::JoinHandle<String>> = None;
         let carried = loop {
             let bricks_ended = async {

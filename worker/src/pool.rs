@@ -3,8 +3,8 @@
 
 use crossbeam_channel::{Receiver, Sender, unbounded};
 use slabcast_common::brick::Brick;
-use slabcast_common::message::{Counters, Lease, SceneSpec};
 use slabcast_common::image::TilePixels;
+use slabcast_common::message::{Counters, Lease, SceneSpec};
 use slabcast_common::view::View;
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch};
@@ -99,12 +99,7 @@ impl Pool {
     }
 }
 
-fn work(
-    thread: u32,
-    simd: Simd,
-    tasks: &Receiver<Ready>,
-    out: &mpsc::UnboundedSender<Rendered>,
-) {
+fn work(thread: u32, simd: Simd, tasks: &Receiver<Ready>, out: &mpsc::UnboundedSender<Rendered>) {
     let mut scratch = Scratch::default();
     for task in tasks {
         let Ready { lease, frame, bricks, received, ready } = task;

@@ -132,7 +132,7 @@ fn a_wall_hides_the_wall_behind_it_by_just_its_opacity() {
             vec![[50.0, 0.0, 0.0, 1.0], [200.0, 1.0, 0.0, 0.0]],
             vec![[0.0, 0.0], [49.0, 0.0], [50.0, back], [199.0, back], [200.0, front]],
         );
-        let sigma = |a: f64| (-libm::log1p(-a)).min(16.0 * 2f64.ln());
+        let sigma = |a: f64| (-libm::log1p(-a)).min(16.0 * std::f64::consts::LN_2);
         for compositing in [Compositing::Linear, Compositing::Constant] {
             let q = Quality { compositing, ..Quality::default() };
             let p = picture(&volume, tf.clone(), q, None);

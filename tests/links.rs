@@ -1,0 +1,297 @@
+//! One master, workers over every kind of link, one picture.
+//!
+//! The same job runs over the embedded link, over an embedded link with the codec of the wire
+//! in its middle, and over TCP with two connections a worker; each gives the bytes of the
+//! serial renderer. Nothing here sleeps to wait for something: channels say when.
+
+use slabcast_common::ids::SceneId;
+use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::message::{PathRequest, SceneSpec, ToWorker, TransferChoice};
+use slabcast_common::path::{Orientation, ProjectionKind, Turntable, ViewPath};
+use slabcast_common::presets;
+use slabcast_common::quality::{Quality, Sums, Work};
+use slabcast_common::stats::FrameStats;
+use slabcast_common::transfer::Classifier;
+use slabcast_common::view::View;
+use slabcast_common::volume::Volume;
+use slabcast_master::jobs::{JobState, WatchItem};
+use slabcast_master::{Handle, Master, MasterConfig};
+use slabcast_proto::convert::{self, Bricks, Down};
+use slabcast_proto::v1;
+use slabcast_render::splat::Simd;
+use slabcast_render::{Frame, Scene, serial};
+use slabcast_volumes::BrickStore;
+use slabcast_worker::{BrickCache, Config, Link};
+use std::sync::Arc;
+use tokio::sync::{mpsc, watch};
+
+fn volume() -> Volume {
+    slabcast_volumes::open("formula:spheres:40".as_ref()).expect("a volume by formula")
+}
+
+fn request(key: &str, projection: ProjectionKind, work: Work) -> PathRequest {
+    let turn = Turntable { frames: 3, elevation: 20.0, projection, ..Turntable::default() };
+    PathRequest {
+        client_key: key.into(),
+        path: ViewPath::turn([150, 110], turn),
+        transfer: TransferChoice::Name("auto".into()),
+        quality: Quality::default(),
+        work,
+        format: PixelFormat::Rgba32F,
+        background: Background::Transparent,
+        want_trace: true,
+    }
+}
+
+fn orientation() -> Orientation {
+    Orientation::new(None, None).expect("the defaults")
+}
+
+/// The hashes of the serial renderer.
+fn truth(request: &PathRequest) -> Vec<String> {
+    let volume = volume();
+    let digest = volume.digest();
+    let info = volume.info(digest);
+    let transfer = presets::by_name("auto", &info.summary).unwrap();
+    let quality = Quality { sums: Sums::I32, ..request.quality };
+    let support = Classifier::new(&transfer, &info, quality.compositing).support();
+    let store = BrickStore::build(&volume, digest, &support, transfer.shading.on);
+    let bricks: Vec<_> =
+        store.infos().iter().map(|i| store.brick(i.id).unwrap().clone()).collect();
+    let spec = SceneSpec { id: SceneId(1), volume: info, transfer, quality, bricks: store.key() };
+    let scene = Arc::new(Scene::new(&spec));
+    (0..request.path.frames())
+        .map(|i| {
+            let camera = request.path.camera(i, &volume.lattice, orientation()).unwrap();
+            let view = View::new(&volume.lattice, &camera, request.path.size, &quality).unwrap();
+            serial::render(&Frame::new(scene.clone(), view), &bricks).sha256().to_string()
+        })
+        .collect()
+}
+
+fn config(name: &str, threads: u32) -> Config {
+    Config {
+        name: name.into(),
+        threads,
+        memory_budget_bytes: 64 << 20,
+        simd: Simd::detect(),
+    }
+}
+
+fn master() -> Master {
+    Master::start(MasterConfig::new(volume(), orientation())).expect("a master")
+}
+
+/// Runs a job to its end; its frames' statistics in order.
+async fn run(handle: &Handle, request: PathRequest) -> Vec<FrameStats> {
+    let job = handle.submit(request).await.expect("a good request");
+    let mut watch = handle.watch(job, 0).expect("a job that was just submitted");
+    let mut frames = Vec::new();
+    while let Some(item) = watch.next().await {
+        if let WatchItem::Frame(f) = item {
+            assert_eq!(f.number, frames.len() as u64, "frames come in order");
+            assert_eq!(f.bytes.len(), 150 * 110 * 16);
+            assert!(f.trace_json.as_ref().is_some_and(|t| t.contains("\"ph\":\"X\"")));
+            frames.push(f.stats.clone());
+        }
+    }
+    assert_eq!(handle.job(job).map(|j| j.state), Some(JobState::Done));
+    frames
+}
+
+fn hashes(frames: &[FrameStats]) -> Vec<String> {
+    frames.iter().map(|f| f.pixels_sha256.clone()).collect()
+}
+
+fn embed(handle: &Handle, config: Config) -> watch::Sender<bool> {
+    let end = slabcast_master::link::embedded(handle.clone());
+    let (stop, stopped) = watch::channel(false);
+    let link = Link { control: end.control, replies: end.replies, bricks: end.bricks };
+    tokio::spawn(async move {
+        let mut cache = BrickCache::default();
+        slabcast_worker::run(&config, link, &mut cache, stopped).await
+    });
+    stop
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn embedded_workers_give_the_serial_bytes_and_true_statistics() {
+    let master = master();
+    let handle = master.handle();
+    let _stops = [embed(&handle, config("a", 1)), embed(&handle, config("b", 2))];
+    let ask = request("1", ProjectionKind::Persp, Work::default());
+    let want = truth(&ask);
+    let frames = run(&handle, ask).await;
+    assert_eq!(hashes(&frames), want);
+
+    let first = &frames[0];
+    assert!(first.bricks.needed > 0 && first.bricks.needed <= first.bricks.relevant);
+    assert!(first.voxels.splatted > 0 && first.voxels.culled > 0);
+    assert!(first.ms.total > 0.0 && first.ms.render > 0.0);
+    assert_eq!(first.slabs.len(), 3);
+    for w in &first.workers {
+        assert!(w.bricks_sent > 0 && w.bytes_sent > 0, "{} got bricks", w.id);
+        assert!(w.bricks_held >= w.bricks_sent);
+    }
+    // The second view is near: only what it newly sees is sent.
+    let sent = |f: &FrameStats| f.workers.iter().map(|w| w.bricks_sent).sum::<u64>();
+    assert!(sent(&frames[1]) * 4 < sent(first), "{} then {}", sent(first), sent(&frames[1]));
+
+    // Another light or colour needs no new brick; neither does the same path again.
+    let again = run(&handle, request("2", ProjectionKind::Persp, Work::default())).await;
+    assert_eq!(hashes(&again), want);
+    assert_eq!(again.iter().map(sent).sum::<u64>(), 0, "bricks are kept from job to job");
+    master.shutdown().await;
+}
+
+/// What the wire makes of a master's messages, both ways.
+fn through_codec(handle: &Handle) -> Link {
+    use prost::Message;
+    let mut end = slabcast_master::link::embedded(handle.clone());
+    let (control_tx, control) = mpsc::unbounded_channel();
+    let (replies, mut reply_rx) = mpsc::channel(64);
+    let (bricks_tx, bricks) = mpsc::channel(8);
+    let to_bricks = bricks_tx.clone();
+    tokio::spawn(async move {
+        while let Some(message) = end.control.recv().await {
+            let Down::Control(wire) = convert::to_worker_to_wire(&message, 7) else {
+                panic!("only bricks go on the other stream")
+            };
+            let wire = v1::ToWorker::decode(&wire.encode_to_vec()[..]).unwrap();
+            let (message, _) = convert::to_worker_from_wire(wire).expect("our own message");
+            if control_tx.send(message).is_err() {
+                return;
+            }
+        }
+    });
+    tokio::spawn(async move {
+        while let Some(bricks) = end.bricks.recv().await {
+            let wires = match bricks {
+                Bricks::Batch(batch) => {
+                    let encoded = batch.bricks.iter().map(|b| {
+                        let mut bytes = Vec::new();
+                        b.encode(&mut bytes);
+                        bytes.into()
+                    });
+                    convert::brick_batches_to_wire(&batch.set, encoded)
+                }
+                Bricks::Message(message @ ToWorker::DropBricks { .. }) => {
+                    match convert::to_worker_to_wire(&message, 7) {
+                        Down::Bricks(wires) => wires,
+                        Down::Control(_) => panic!("keeps its place among the bricks"),
+                    }
+                }
+                Bricks::Message(m) => panic!("{m:?} among bricks"),
+            };
+            for wire in wires {
+                let wire = v1::BricksDown::decode(&wire.encode_to_vec()[..]).unwrap();
+                let bricks = convert::bricks_from_wire(wire).expect("our own message");
+                if to_bricks.send(bricks).await.is_err() {
+                    return;
+                }
+            }
+        }
+    });
+    drop(bricks_tx);
+    tokio::spawn(async move {
+        while let Some(message) = reply_rx.recv().await {
+            let wire = convert::from_worker_to_wire(&message).encode_to_vec();
+            let wire = v1::FromWorker::decode(&wire[..]).unwrap();
+            let message = convert::from_worker_from_wire(wire).expect("our own message");
+            if end.replies.send(message).await.is_err() {
+                return;
+            }
+        }
+    });
+    Link { control, replies, bricks }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_codec_inside_the_embedded_link_changes_nothing() {
+    let master = master();
+    let handle = master.handle();
+    let link = through_codec(&handle);
+    let (_stop, stopped) = watch::channel(false);
+    tokio::spawn(async move {
+        let mut cache = BrickCache::default();
+        slabcast_worker::run(&config("codec", 2), link, &mut cache, stopped).await
+    });
+    let work = Work { slabs: 5, tile: Some(32), ..Work::default() };
+    let ask = request("1", ProjectionKind::Ortho, work);
+    let want = truth(&ask);
+    assert_eq!(hashes(&run(&handle, ask).await), want);
+    master.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn workers_over_tcp_and_one_in_the_process_share_a_frame() {
+    let master = master();
+    let handle = master.handle();
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    let (stop, stopped) = watch::channel(false);
+    let serving = tokio::spawn(slabcast_master::serve::serve(
+        handle.clone(),
+        listener,
+        stopped.clone(),
+    ));
+    let dialled: Vec<_> = ["tcp-a", "tcp-b"]
+        .map(|name| {
+            tokio::spawn(slabcast_worker::dial::run(
+                config(name, 1),
+                address.clone(),
+                stopped.clone(),
+            ))
+        })
+        .into();
+    let _embedded = embed(&handle, config("in", 1));
+    let work = Work { tile: Some(16), ..Work::default() };
+    let ask = request("1", ProjectionKind::Persp, work);
+    let want = truth(&ask);
+    let mut seen = std::collections::BTreeSet::new();
+    // Workers join when they are there; whoever is late renders the next path.
+    for key in 0..20 {
+        let frames = run(&handle, request(&key.to_string(), ProjectionKind::Persp, work)).await;
+        assert_eq!(hashes(&frames), want);
+        let workers = frames.iter().flat_map(|f| &f.slabs).flat_map(|s| &s.tiles);
+        seen.extend(workers.map(|t| t.worker.clone()));
+        if seen.len() == 3 {
+            break;
+        }
+    }
+    assert_eq!(seen.len(), 3, "all three rendered: {seen:?}");
+    stop.send(true).unwrap();
+    for worker in dialled {
+        assert_eq!(worker.await.unwrap(), Ok(slabcast_worker::Ended::Stopped));
+    }
+    serving.await.unwrap().unwrap();
+    master.shutdown().await;
+}
+
+#[tokio::test]
+async fn bad_requests_are_refused_by_field() {
+    let master = master();
+    let handle = master.handle();
+    let refused = async |change: &dyn Fn(&mut PathRequest)| {
+        let mut r = request("x", ProjectionKind::Ortho, Work::default());
+        change(&mut r);
+        match handle.submit(r).await {
+            Err(slabcast_master::SubmitError::Refused(r)) => r.field,
+            other => panic!("{other:?}"),
+        }
+    };
+    assert_eq!(refused(&|r| r.path.size = [0, 5]).await, "size");
+    assert_eq!(refused(&|r| r.quality.thickness = f64::NAN).await, "thickness");
+    assert_eq!(refused(&|r| r.work.slabs = 0).await, "slabs");
+    assert_eq!(refused(&|r| r.transfer = TransferChoice::Name("nope".into())).await, "tf");
+    assert_eq!(refused(&|r| r.client_key = String::new()).await, "client_key");
+    let good = request("same", ProjectionKind::Ortho, Work::default());
+    let id = handle.submit(good.clone()).await.unwrap();
+    assert_eq!(handle.submit(good.clone()).await.unwrap(), id, "the same key is the same job");
+    let other = PathRequest { want_trace: false, ..good };
+    assert!(matches!(handle.submit(other).await, Err(slabcast_master::SubmitError::KeyTaken)));
+    assert!(handle.cancel(id).await);
+    assert!(!handle.cancel(id).await);
+    assert_eq!(handle.job(id).map(|j| j.state), Some(JobState::Cancelled));
+    master.shutdown().await;
+}

@@ -390,6 +390,20 @@ mod tests {
     }
 
     #[test]
+    fn what_a_leaving_worker_has_not_begun_goes_to_others_and_stays_live() {
+        let mut q = queue(4);
+        for mine in [&[][..], &[0], &[0, 1]] {
+            take(&mut q, 1, mine, 0);
+        }
+        q.pass_on(&[1, 2]);
+        assert_eq!(take(&mut q, 2, &[], 0), (1, Epoch(1)));
+        assert!(matches!(q.judge(TaskId(11), Epoch(0), WorkerId(1)), Verdict::Counts(1, _)));
+        // It had begun it after all.
+        q.finish(2, done());
+        assert_eq!(take(&mut q, 2, &[1], 0), (3, Epoch(0)));
+    }
+
+    #[test]
     fn a_task_that_takes_three_workers_is_given_up() {
         let c = Config::default();
         let mut q = queue(2);

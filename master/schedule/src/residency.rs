@@ -538,3 +538,105 @@ fn evict(
         errands.push(Errand::Drop { set: key, bricks: names, nonce });
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use slabcast_common::brick::TightBox;
+
+    const W: WorkerId = WorkerId(1);
+    const KEY: BrickSetKey = BrickSetKey(slabcast_common::volume::Digest32([3; 32]));
+
+    /// Ten bricks of 100 bytes and one worker.
+    fn residency(budget: u64) -> Residency {
+        let tight = TightBox { lo: [0; 3], hi: [7; 3] };
+        let bricks: Arc<[BrickInfo]> = (0..10)
+            .map(|i| BrickInfo { id: BrickId(2 * i), tight, voxels: 9, bytes: 100 })
+            .collect();
+        let mut r = Residency::default();
+        r.join(W, budget, vec![(KEY, vec![BrickId(0), BrickId(0), BrickId(3)])]);
+        r.open(KEY, &bricks);
+        r
+    }
+
+    fn flush(r: &mut Residency) -> Vec<Errand> {
+        r.flush(W, 5, &mut || 77)
+    }
+
+    fn send(ids: &[u32]) -> Errand {
+        let bricks = ids.iter().map(|&i| BrickId(i)).collect();
+        let bytes = 100 * ids.len() as u64;
+        Errand::Send { set: KEY, bricks, bytes, over_budget: false }
+    }
+
+    #[test]
+    fn what_a_worker_brought_along_is_held_once_and_strange_ids_are_ignored() {
+        let mut r = residency(1000);
+        assert_eq!(r.held(W), (1, 100));
+        r.round(&[0, 1]);
+        r.want(W, [0, 1, 1]);
+        assert_eq!(flush(&mut r), [send(&[2])]);
+        assert!(flush(&mut r).is_empty());
+    }
+
+    #[test]
+    fn broken_bricks_go_again_whether_they_are_named_before_the_count_or_after() {
+        for named_first in [true, false] {
+            let mut r = residency(1000);
+            r.round(&[1, 2, 3]);
+            r.want(W, [1, 2, 3]);
+            flush(&mut r);
+            if named_first {
+                assert_eq!(r.broken(W, KEY, &[BrickId(4)]), None);
+                assert!(r.arrived(W, KEY, 2).is_some());
+            } else {
+                assert_eq!(r.arrived(W, KEY, 2), None);
+                assert!(r.broken(W, KEY, &[BrickId(4)]).is_some());
+            }
+            assert_eq!(r.held(W), (3, 300));
+            assert_eq!(flush(&mut r), [send(&[4])]);
+            assert!(r.arrived(W, KEY, 1).is_some());
+            assert_eq!(r.held(W), (4, 400));
+        }
+    }
+
+    #[test]
+    fn a_dropped_brick_is_sent_again_only_after_the_pong() {
+        let mut r = residency(300);
+        r.round(&[1, 2]);
+        r.want(W, [1, 2]);
+        assert_eq!(flush(&mut r), [send(&[2, 4])]);
+        r.arrived(W, KEY, 2);
+        // Least recently needed: brick 0, which was never, then those of the round before.
+        r.round(&[2, 3, 4]);
+        r.want(W, [3, 4]);
+        let drop = |ids: &[u32]| Errand::Drop {
+            set: KEY,
+            bricks: ids.iter().map(|&i| BrickId(i)).collect(),
+            nonce: 77,
+        };
+        assert_eq!(flush(&mut r), [drop(&[0, 2])], "and no room until they are gone");
+        assert!(flush(&mut r).is_empty());
+        r.ponged(W, 76);
+        assert!(flush(&mut r).is_empty());
+        r.ponged(W, 77);
+        assert_eq!(flush(&mut r), [send(&[6, 8])]);
+    }
+
+    #[test]
+    fn a_lease_larger_than_the_budget_goes_alone_and_is_counted() {
+        let mut r = residency(250);
+        r.round(&[1, 2, 3, 4]);
+        assert!(r.is_lazy(W));
+        assert!(r.fits(W, &[1, 2]) && !r.fits(W, &[1, 2, 3]));
+        r.pin(W, &[1, 2, 3]);
+        r.want(W, [1, 2, 3]);
+        assert!(matches!(&flush(&mut r)[..], [Errand::Drop { .. }, Errand::Send { .. }]));
+        r.ponged(W, 77);
+        assert_eq!(flush(&mut r), [send(&[4])], "two fit into 250 bytes");
+        assert!(flush(&mut r).is_empty(), "what flies may make room yet");
+        r.arrived(W, KEY, 2);
+        let last = flush(&mut r);
+        assert!(matches!(&last[..], [Errand::Send { over_budget: true, .. }]), "{last:?}");
+    }
+}

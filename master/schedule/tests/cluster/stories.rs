@@ -291,6 +291,20 @@ fn a_cancelled_frame_ends_at_once_in_any_state() {
 }
 
 #[test]
+fn broken_bricks_are_sent_again_and_nothing_else() {
+    let mut w = world();
+    w.join(Nature { broken_in: 5, ..Nature::default() });
+    w.queue(job(0));
+    w.finish();
+    let stats = &w.done[&FrameId(0)].stats;
+    assert!(w.done[&FrameId(0)].at < 10_000_000, "no lease had to wait for its deadline");
+    let one = &stats.workers[0];
+    assert_eq!(one.bricks_held, stats.bricks.needed);
+    assert!(one.bricks_sent > one.bricks_held, "some went twice");
+    assert!(one.bricks_sent < 2 * one.bricks_held);
+}
+
+#[test]
 fn a_liar_is_dropped_and_its_tiles_are_rendered_by_others() {
     let mut w = world();
     workers(&mut w, 1);

@@ -177,6 +177,26 @@ fn a_tile_that_kills_its_workers_is_given_up_after_three_and_the_rest_is_deliver
 }
 
 #[test]
+fn seven_of_eight_workers_killed_mid_frame_leave_the_same_bytes_and_no_tile_accused() {
+    // PROMISES.md R1, in virtual time, with the poison rule as it is shipped.
+    for seed in 0..200 {
+        let mut rng = Rng::new(seed);
+        let mut w = World::new(seed, Config::default());
+        workers(&mut w, 8);
+        let work = Work { tile: Some(16), ..Work::default() };
+        w.queue(job_with(0, work, Quality { thickness: 2.0, ..Quality::default() }));
+        let kills = rng.pick(&[1, 4, 7]);
+        for id in 1..=kills {
+            let when = 1_000 + rng.below(25_000);
+            w.script(when, Script::Kill(WorkerId(id)));
+        }
+        w.finish();
+        let stats = &w.done[&FrameId(0)].stats;
+        assert!(stats.poisoned.is_empty(), "seed {seed}: {:?}", stats.poisoned);
+    }
+}
+
+#[test]
 fn a_frame_of_nothing_but_failures_fails_with_the_reason() {
     let mut w = world();
     w.join(Nature { fail_in: 1, ..Nature::default() });

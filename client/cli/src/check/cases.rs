@@ -1,0 +1,234 @@
+//! What is rendered for comparison: volumes, looks, two cameras; and the serial renderer's
+//! answer to each.
+
+use crate::fail::Fail;
+use crate::volume;
+use glam::DVec3;
+use slabcast_common::ids::SceneId;
+use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::message::{PathRequest, SceneSpec, TransferChoice};
+use slabcast_common::path::{Orientation, PathView, ProjectionKind, ViewPath};
+use slabcast_common::presets;
+use slabcast_common::quality::{Compositing, Quality, Sums, Work};
+use slabcast_common::transfer::{Classifier, Domain, OpacityUnit, TransferFunction};
+use slabcast_common::view::View;
+use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
+use slabcast_render::{Frame, Scene, serial};
+use slabcast_volumes::BrickStore;
+use std::path::Path;
+use std::sync::Arc;
+
+/// Names of the two views of every case.
+pub(crate) const VIEWS: [&str; 2] = ["ortho", "persp"];
+
+/// A volume, a look and a quality; drawn by both cameras.
+pub(crate) struct Case {
+    /// `spheres/auto`.
+    pub(crate) name: String,
+    pub(crate) volume: Arc<Volume>,
+    pub(crate) info: VolumeInfo,
+    pub(crate) transfer: TransferFunction,
+    pub(crate) quality: Quality,
+    pub(crate) size: [u32; 2],
+}
+
+/// A volume by formula, its look, and what is special about the quality.
+type Formula = (&'static str, &'static str, &'static str, fn(&mut Quality));
+
+/// What formula volumes are there for: shaded and opaque; faint and unlit, where nothing hides
+/// anything; 16-bit; float with a ramp of opacity; step edges in thin sheets; one voxel; a line
+/// longer than any picture; each compositing rule; sums in floats; nothing shut at all.
+const FORMULAS: [Formula; 10] = [
+    ("formula:spheres", "spheres/auto", "auto", |_| {}),
+    ("formula:fog", "fog/grey", "grey", |_| {}),
+    ("formula:blob", "blob/extinction", "extinction", |_| {}),
+    ("formula:ramp", "ramp/peer-semi/constant", "peer-semi", |q| {
+        q.compositing = Compositing::Constant;
+    }),
+    ("formula:marker", "marker/peer-opaque/thin", "peer-opaque", |q| q.thickness = 0.25),
+    ("formula:two-walls", "two-walls/peer-semi/f32", "peer-semi", |q| {
+        q.sums = Sums::F32;
+        q.eps = 0.0;
+    }),
+    ("formula:wall", "wall/peer-vessels/paper", "peer-vessels", |q| {
+        q.compositing = Compositing::Paper;
+    }),
+    ("formula:full", "full/peer-opaque/thick", "peer-opaque", |q| {
+        q.thickness = 3.5;
+        q.std = 0.5;
+    }),
+    ("formula:line", "line/bone", "bone", |_| {}),
+    ("formula:one", "one/peer-opaque", "peer-opaque", |_| {}),
+];
+
+/// How many of [`FORMULAS`] the matrix takes: those that differ in how they are rendered. The
+/// others differ in arithmetic alone, which golden frames watch.
+const IN_MATRIX: usize = 6;
+
+/// The cases of the matrix: the volume (if any), and formula volumes.
+pub(crate) fn of_matrix(file: Option<&Path>, size: [u32; 2]) -> Result<Vec<Case>, Fail> {
+    let mut cases = Vec::new();
+    if let Some(file) = file {
+        let volume = Arc::new(volume::open(file)?);
+        let name = format!("{}/auto", short(&volume.name));
+        cases.push(Case::new(name, volume, "auto", |_| {}, size)?);
+    }
+    for formula in &FORMULAS[..IN_MATRIX] {
+        cases.push(of_formula(formula, size)?);
+    }
+    Ok(cases)
+}
+
+/// The cases of golden frames: the sample in four looks, and formula volumes.
+pub(crate) fn of_golden(sample: &Path) -> Result<Vec<Case>, Fail> {
+    const SIZE: [u32; 2] = [256, 208];
+    let volume = Arc::new(volume::open(sample)?);
+    let mut cases = Vec::new();
+    let looks: [(&str, &str, fn(&mut Quality)); 4] = [
+        ("auto", "auto", |_| {}),
+        ("grey", "grey", |_| {}),
+        ("peer-opaque", "peer-opaque", |_| {}),
+        ("peer-opaque/paper", "peer-opaque", |q| q.compositing = Compositing::Paper),
+    ];
+    for (name, tf, tweak) in looks {
+        let name = format!("{}/{name}", short(&volume.name));
+        cases.push(Case::new(name, volume.clone(), tf, tweak, SIZE)?);
+    }
+    for formula in &FORMULAS {
+        cases.push(of_formula(formula, SIZE)?);
+    }
+    Ok(cases)
+}
+
+fn of_formula((file, name, tf, tweak): &Formula, size: [u32; 2]) -> Result<Case, Fail> {
+    Case::new((*name).into(), Arc::new(volume::open(file.as_ref())?), tf, tweak, size)
+}
+
+/// A file's name without its endings.
+fn short(name: &str) -> &str {
+    name.split('.').next().filter(|n| !n.is_empty()).unwrap_or(name)
+}
+
+impl Case {
+    fn new(
+        name: String,
+        volume: Arc<Volume>,
+        tf: &str,
+        tweak: impl Fn(&mut Quality),
+        size: [u32; 2],
+    ) -> Result<Case, Fail> {
+        let info = volume.info(volume.digest());
+        let transfer = match tf {
+            "extinction" => uncapped(&info),
+            name => presets::by_name(name, &info.summary).map_err(|e| Fail::flag(&e))?,
+        };
+        let mut quality = Quality::default();
+        tweak(&mut quality);
+        Ok(Case { name, volume, info, transfer, quality, size })
+    }
+
+    /// Name of view `i`.
+    pub(crate) fn view_name(&self, i: usize) -> String {
+        format!("{}/{}", self.name, VIEWS[i])
+    }
+
+    /// Both cameras. The second one is near enough to cut the volume at the picture's edge.
+    fn path(&self) -> ViewPath {
+        let (centre, extent) = (self.info.lattice.centre(), self.info.lattice.largest_extent());
+        let view = |to_eye: DVec3, projection| PathView {
+            eye: (centre + to_eye * extent).to_array(),
+            target: centre.to_array(),
+            up: [0.0, 0.0, 1.0],
+            projection,
+            height: None,
+            fov: (projection == ProjectionKind::Persp).then_some(40.0),
+        };
+        ViewPath {
+            version: 1,
+            size: self.size,
+            views: vec![
+                view(DVec3::new(0.75, 1.5, 0.625), ProjectionKind::Ortho),
+                view(DVec3::new(-0.75, 0.625, -0.375), ProjectionKind::Persp),
+            ],
+            turntable: None,
+        }
+    }
+
+    /// The request for both views.
+    pub(crate) fn request(&self, cull: bool, work: Work) -> PathRequest {
+        PathRequest {
+            client_key: crate::request::client_key(),
+            path: self.path(),
+            transfer: TransferChoice::Function(Box::new(self.transfer.clone())),
+            quality: Quality { cull, ..self.quality },
+            work,
+            format: PixelFormat::Rgba32F,
+            background: Background::Transparent,
+            want_trace: false,
+        }
+    }
+
+    /// The serial renderer's hashes of both views.
+    pub(crate) fn truth(&self) -> Result<Vec<Digest32>, Fail> {
+        let classifier = Classifier::new(&self.transfer, &self.info, self.quality.compositing);
+        let sums = match self.quality.sums {
+            Sums::Auto if classifier.uncapped() => Sums::F32,
+            Sums::Auto => Sums::I32,
+            sums => sums,
+        };
+        let quality = Quality { sums, ..self.quality };
+        let store = BrickStore::build(
+            &self.volume,
+            self.info.digest,
+            &classifier.support(),
+            self.transfer.shading.on,
+        );
+        let bricks: Vec<_> =
+            store.infos().iter().filter_map(|i| store.brick(i.id).cloned()).collect();
+        let spec = SceneSpec {
+            id: SceneId(0),
+            volume: self.info.clone(),
+            transfer: self.transfer.clone(),
+            quality,
+            bricks: store.key(),
+        };
+        let scene = Arc::new(Scene::new(&spec));
+        let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
+        let path = self.path();
+        (0..path.frames())
+            .map(|i| {
+                let view = path
+                    .camera(i, &self.info.lattice, orientation)
+                    .and_then(|c| View::new(&self.info.lattice, &c, self.size, &quality))
+                    .map_err(|e| Fail::failed(format!("{}: {e}", self.view_name(i))))?;
+                Ok(serial::render(&Frame::new(scene.clone(), view), &bricks).sha256())
+            })
+            .collect()
+    }
+}
+
+/// Extinctions far beyond the cap of opacities, so that sums are floats.
+fn uncapped(info: &VolumeInfo) -> TransferFunction {
+    let grey = presets::by_name("grey", &info.summary).expect("a preset of ours");
+    TransferFunction {
+        domain: Domain::Unit,
+        opacity_unit: OpacityUnit::Extinction,
+        opacities: vec![[0.0, 0.0], [0.2, 0.0], [0.6, 0.8], [0.9, 5.0], [1.0, 400.0]],
+        shading: slabcast_common::shade::Shading::default(),
+        ..grey
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_case_can_be_drawn_and_shows_something() {
+        for case in of_matrix(None, [24, 20]).unwrap() {
+            let truth = case.truth().unwrap();
+            assert_eq!(truth.len(), VIEWS.len());
+            assert_ne!(truth[0], truth[1], "{}", case.name);
+        }
+    }
+}

@@ -1,0 +1,390 @@
+//! One hash a view: over workers, tiles, slabs, threads, culling and links.
+
+use super::cases::{self, Case};
+use super::pairwise;
+use crate::embedded::{Cluster, Crew, start_master};
+use crate::fail::{Fail, say};
+use crate::progress::{self, Progress};
+use sha2::{Digest, Sha256};
+use slabcast_client::Client;
+use slabcast_common::message::PathRequest;
+use slabcast_common::path::Orientation;
+use slabcast_common::quality::Work;
+use slabcast_common::volume::Digest32;
+use slabcast_master::driver::SubmitError;
+use slabcast_master::jobs::{JobState, WatchItem};
+use slabcast_master::{Handle, Master, MasterConfig};
+use slabcast_render::splat::Simd;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+
+/// Where the sample lies in a checkout.
+pub(crate) const SAMPLE: &str = "samples/mni152_t1.nii.gz";
+
+/// How long workers may take to join: each draws its self-test first.
+const JOIN: Duration = Duration::from_secs(30);
+
+const WORKERS: [u32; 4] = [1, 2, 3, 5];
+const TILES: [Option<u32>; 6] = [Some(16), Some(32), Some(64), Some(128), Some(256), None];
+const SLABS: [u32; 3] = [1, 3, 5];
+const THREADS: [u32; 2] = [1, 2];
+const CULL: [bool; 2] = [true, false];
+const LINKS: [&str; 2] = ["embedded", "tcp"];
+
+/// Compares pixels over workers (1, 2, 3, 5), tiles (16 to 256, auto), slabs (1, 3, 5), threads
+/// (1, 2), culling (on, off) and links (embedded, TCP) with those of the serial renderer.
+#[derive(clap::Args, Clone, Debug)]
+pub(crate) struct MatrixArgs {
+    /// A volume to check beside formula volumes [default: samples/mni152_t1.nii.gz, if there]
+    volume: Option<PathBuf>,
+    /// Fewer settings, in which every two values still meet
+    #[arg(long)]
+    pairwise: bool,
+    /// Size of the pictures
+    #[arg(long, value_name = "WxH", default_value = "320x272", value_parser = crate::parse::size)]
+    size: [u32; 2],
+}
+
+/// One way to make a picture.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Setting {
+    // A cluster is started for each of the first three, so rows are sorted by them.
+    tcp: bool,
+    workers: u32,
+    threads: u32,
+    tile: Option<u32>,
+    slabs: u32,
+    cull: bool,
+}
+
+impl Setting {
+    fn all(pairwise: bool) -> Vec<Setting> {
+        let levels =
+            [WORKERS.len(), TILES.len(), SLABS.len(), THREADS.len(), CULL.len(), LINKS.len()];
+        let rows = if pairwise { pairwise::rows(&levels) } else { pairwise::product(&levels) };
+        let mut settings: Vec<Setting> = rows
+            .iter()
+            .map(|r| Setting {
+                workers: WORKERS[r[0]],
+                tile: TILES[r[1]],
+                slabs: SLABS[r[2]],
+                threads: THREADS[r[3]],
+                cull: CULL[r[4]],
+                tcp: r[5] == 1,
+            })
+            .collect();
+        settings.sort_unstable();
+        settings
+    }
+
+    fn crew(&self) -> Crew {
+        Crew { workers: self.workers, threads: self.threads }
+    }
+
+    fn work(&self) -> Work {
+        Work { slabs: self.slabs, tile: self.tile, ..Work::default() }
+    }
+}
+
+impl std::fmt::Display for Setting {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(
+            f,
+            "workers {} threads {} tile {} slabs {} cull {} {}",
+            self.workers,
+            self.threads,
+            self.tile.map_or("auto".into(), |t| t.to_string()),
+            self.slabs,
+            if self.cull { "on" } else { "off" },
+            LINKS[usize::from(self.tcp)]
+        )
+    }
+}
+
+/// What became of a view.
+struct Verdict {
+    want: Digest32,
+    pictures: usize,
+    /// Settings that gave another hash.
+    wrong: Vec<(Setting, String)>,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &MatrixArgs) -> Result<(), Fail> {
+    let sample = Path::new(SAMPLE);
+    let file = args.volume.as_deref().or_else(|| sample.is_file().then_some(sample));
+    if file.is_none() {
+        progress::note(&format!("no {SAMPLE} here: formula volumes alone are checked"));
+    }
+    let cases = cases::of_matrix(file, args.size)?;
+    let settings = Setting::all(args.pairwise);
+    let began = Instant::now();
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .enable_all()
+        .build()
+        .map_err(|e| Fail::failed(format!("starting threads failed: {e}")))?;
+    let mut progress = Progress::new(false);
+    let total = (cases.len() * settings.len()) as u64;
+    progress.frames(
+        total,
+        &format!("{} volumes under {} settings, two views each", cases.len(), settings.len()),
+    );
+    let mut done = 0;
+    let mut wrong = 0;
+    let mut pictures = 0;
+    for case in &cases {
+        let case_began = Instant::now();
+        let truth = case.truth()?;
+        let mut verdicts: Vec<Verdict> =
+            truth.iter().map(|&want| Verdict { want, pictures: 0, wrong: Vec::new() }).collect();
+        let mut groups: BTreeMap<(bool, u32, u32), Vec<Setting>> = BTreeMap::new();
+        for s in &settings {
+            groups.entry((s.tcp, s.workers, s.threads)).or_default().push(*s);
+        }
+        for group in groups.values() {
+            runtime.block_on(check(case, group, &mut verdicts, || {
+                done += 1;
+                progress.step(progress::Step { frames: done, ..Default::default() });
+            }))?;
+        }
+        for (i, v) in verdicts.iter().enumerate() {
+            let outcome = match v.wrong.len() {
+                0 => "exact".to_string(),
+                n => format!("{n} DIFFER"),
+            };
+            let time = if i == 0 { progress::time(case_began.elapsed()) } else { String::new() };
+            progress.aside(|| {
+                say(&format!(
+                    "{:<32} {}  {:>4} pictures  {outcome:<10} {time}\n",
+                    case.view_name(i),
+                    &v.want.to_string()[..16],
+                    v.pictures
+                ))?;
+                v.wrong.iter().take(10).try_for_each(|(setting, got)| {
+                    say(&format!("    {setting}: {}\n", &got[..got.len().min(16)]))
+                })
+            })?;
+            wrong += v.wrong.len();
+            pictures += v.pictures;
+        }
+    }
+    progress.end();
+    runtime.shutdown_timeout(Duration::from_secs(1));
+    let views = cases.len() * cases::VIEWS.len();
+    let time = progress::time(began.elapsed());
+    if wrong == 0 {
+        return say(&format!(
+            "exact: {pictures} pictures under {} settings, one hash for each of {views} views, that \
+             of the serial renderer; {time}\n",
+            settings.len()
+        ));
+    }
+    Err(Fail::failed(format!(
+        "pixels are not exact: {wrong} of {pictures} pictures differ from the serial renderer's; \
+         {time}"
+    )))
+}
+
+/// Renders a case under settings of one cluster.
+async fn check(
+    case: &Case,
+    settings: &[Setting],
+    verdicts: &mut [Verdict],
+    mut done: impl FnMut(),
+) -> Result<(), Fail> {
+    let Some(first) = settings.first() else { return Ok(()) };
+    let mut cluster = Either::start(case, first).await?;
+    for setting in settings {
+        let request = case.request(setting.cull, setting.work());
+        let hashes = cluster
+            .hashes(request)
+            .await
+            .map_err(|e| with_place(e, &format!("{}, {setting}", case.name)))?;
+        if hashes.len() != verdicts.len() {
+            return Err(Fail::failed(format!(
+                "{}, {setting}: {} frames came instead of {}",
+                case.name,
+                hashes.len(),
+                verdicts.len()
+            )));
+        }
+        for (verdict, got) in verdicts.iter_mut().zip(hashes) {
+            verdict.pictures += 1;
+            if got != verdict.want.to_string() {
+                verdict.wrong.push((*setting, got));
+            }
+        }
+        done();
+    }
+    cluster.end().await;
+    Ok(())
+}
+
+fn with_place(e: Fail, place: &str) -> Fail {
+    Fail::failed(format!("{place}: {}", e.line().unwrap_or("stopped")))
+}
+
+/// A cluster over either link.
+enum Either {
+    Embedded(Cluster),
+    Tcp(Box<Tcp>),
+}
+
+/// A master and workers in this process that speak gRPC over loopback.
+struct Tcp {
+    master: Master,
+    client: Client,
+    stop: watch::Sender<bool>,
+    tasks: JoinSet<Result<(), String>>,
+}
+
+impl Either {
+    async fn start(case: &Case, setting: &Setting) -> Result<Either, Fail> {
+        let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
+        let volume = (*case.volume).clone();
+        let (cluster, handle) = if setting.tcp {
+            let tcp = Tcp::start(MasterConfig::new(volume, orientation), setting).await?;
+            let handle = tcp.master.handle();
+            (Either::Tcp(Box::new(tcp)), handle)
+        } else {
+            let cluster = Cluster::start(volume, orientation, setting.crew())?;
+            let handle = cluster.handle();
+            (Either::Embedded(cluster), handle)
+        };
+        joined(&handle, setting.workers).await?;
+        Ok(cluster)
+    }
+
+    /// Hashes of a request's frames, over the bytes that came.
+    async fn hashes(&mut self, request: PathRequest) -> Result<Vec<String>, Fail> {
+        match self {
+            Either::Embedded(cluster) => {
+                tokio::select! {
+                    hashes = embedded_hashes(cluster.handle(), request) => hashes,
+                    trouble = cluster.trouble() => Err(trouble),
+                }
+            }
+            Either::Tcp(tcp) => tcp.hashes(request).await,
+        }
+    }
+
+    async fn end(self) {
+        match self {
+            Either::Embedded(cluster) => cluster.end().await,
+            Either::Tcp(tcp) => tcp.end().await,
+        }
+    }
+}
+
+/// Hash of a frame's floats; also whether the statistics say the same.
+fn hash(number: u64, bytes: &[u8], said: &str) -> Result<String, Fail> {
+    let hash = Digest32(Sha256::digest(bytes).into()).to_string();
+    if hash == said {
+        return Ok(hash);
+    }
+    Err(Fail::failed(format!("frame {number} hashes to {hash}, but its statistics say {said}")))
+}
+
+pub(super) async fn embedded_hashes(
+    handle: Handle,
+    request: PathRequest,
+) -> Result<Vec<String>, Fail> {
+    let job = handle.submit(request).await.map_err(|e| match e {
+        SubmitError::Refused(e) => Fail::failed(e.to_string()),
+        other => Fail::failed(format!("the master takes no job: {other:?}")),
+    })?;
+    let mut watch =
+        handle.watch(job, 0).ok_or_else(|| Fail::failed(format!("{job} was forgotten")))?;
+    let mut hashes = Vec::new();
+    while let Some(item) = watch.next().await {
+        match item {
+            WatchItem::Frame(f) => {
+                hashes.push(hash(f.number, &f.bytes, &f.stats.pixels_sha256)?);
+            }
+            WatchItem::Notice(view) => {
+                if let JobState::Failed(reason) = view.state {
+                    return Err(Fail::failed(reason));
+                }
+            }
+        }
+    }
+    Ok(hashes)
+}
+
+async fn joined(handle: &Handle, workers: u32) -> Result<(), Fail> {
+    let all = async {
+        while handle.workers().await.len() < workers as usize {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    tokio::time::timeout(JOIN, all).await.map_err(|_| {
+        Fail::failed(format!("{workers} workers did not join in {} s", JOIN.as_secs()))
+    })
+}
+
+impl Tcp {
+    async fn start(config: MasterConfig, setting: &Setting) -> Result<Tcp, Fail> {
+        let io = |e: std::io::Error| Fail::failed(format!("listening on 127.0.0.1 failed: {e}"));
+        let listener = TcpListener::bind("127.0.0.1:0").await.map_err(io)?;
+        let address = listener.local_addr().map_err(io)?.to_string();
+        let master = start_master(config)?;
+        let (stop, stopped) = watch::channel(false);
+        let mut tasks = JoinSet::new();
+        let serve = slabcast_master::serve::serve(master.handle(), listener, stopped.clone());
+        tasks.spawn(async move { serve.await.map_err(|e| e.to_string()) });
+        for n in 1..=setting.workers {
+            let config = slabcast_worker::Config {
+                name: format!("tcp-{n}"),
+                threads: setting.threads,
+                memory_budget_bytes: 1 << 30,
+                simd: Simd::detect(),
+            };
+            let run = slabcast_worker::dial::run(config, address.clone(), stopped.clone());
+            tasks.spawn(async move { run.await.map(|_| ()) });
+        }
+        let client = Client::connect(&address).await.map_err(|e| crate::remote::fail(&e))?;
+        Ok(Tcp { master, client, stop, tasks })
+    }
+
+    async fn hashes(&mut self, request: PathRequest) -> Result<Vec<String>, Fail> {
+        let fail = |e| crate::remote::fail(&e);
+        let job = self.client.submit(&request).await.map_err(fail)?;
+        let mut frames = self.client.watch(&job, 0).await.map_err(fail)?;
+        let mut hashes = Vec::new();
+        while let Some(update) = frames.next().await.map_err(fail)? {
+            if let slabcast_client::Update::Frame(f) = update {
+                hashes.push(hash(f.number, &f.bytes, &f.stats.pixels_sha256)?);
+            }
+        }
+        Ok(hashes)
+    }
+
+    async fn end(mut self) {
+        drop(self.client);
+        let _ = self.stop.send(true);
+        let ended = async {
+            self.master.shutdown().await;
+            while self.tasks.join_next().await.is_some() {}
+        };
+        let _ = tokio::time::timeout(Duration::from_secs(5), ended).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_matrix_has_every_setting_of_the_promise() {
+        let all = Setting::all(false);
+        assert_eq!(all.len(), 4 * 6 * 3 * 2 * 2 * 2);
+        let few = Setting::all(true);
+        assert!(few.len() < 40 && few.iter().all(|s| all.contains(s)));
+        assert!(few.iter().any(|s| s.tcp && s.workers == 5));
+    }
+}

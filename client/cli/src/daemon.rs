@@ -1,0 +1,323 @@
+//! `slabcast master` and `slabcast worker`: processes that somebody else looks after.
+//!
+//! Both say READY to systemd, answer its watchdog, stop gracefully on SIGTERM or Ctrl-C within
+//! ten seconds and end with 0. Every flag has an environment variable, so that a unit file
+//! needs none.
+
+use crate::embedded::{cores, start_master};
+use crate::fail::{Fail, reason, say};
+use crate::request::{AxisArgs, lattice_notice};
+use crate::{parse, signals, volume};
+use slabcast_common::path::Axis;
+use slabcast_master::{Handle, MasterConfig};
+use slabcast_render::splat::Simd;
+use slabcast_worker::{Config, Ended};
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::time::Duration;
+use tokio::net::{TcpListener, TcpSocket};
+use tokio::sync::watch;
+use tracing::{info, warn};
+
+/// How long a daemon that is told to stop may take (PROMISES R29).
+const DRAIN: Duration = Duration::from_secs(10);
+
+const MASTER_EXAMPLES: &str = "\
+Examples:
+  slabcast master --volume brain.nii.gz
+  slabcast worker --master 127.0.0.1:7433        (as often as you like, here or elsewhere)
+  slabcast render --master 127.0.0.1:7433 -o out/
+
+  For workers on other machines, on a network that you trust:
+  slabcast master --volume brain.nii.gz --listen 0.0.0.0:7433 --insecure";
+
+/// Serves a volume to workers and takes view paths from clients.
+#[derive(clap::Args, Clone, Debug)]
+#[command(after_help = MASTER_EXAMPLES)]
+pub(crate) struct MasterArgs {
+    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
+    #[arg(long, value_name = "FILE", env = "SLABCAST_VOLUME")]
+    volume: PathBuf,
+    /// World axis that is up: x, y or z with + or - [default: +z]
+    #[arg(long, value_name = "AXIS", allow_hyphen_values = true, env = "SLABCAST_UP")]
+    up: Option<Axis>,
+    /// World axis that faces the eye at azimuth 0 [default: +y, or +z where up lies along y]
+    #[arg(long, value_name = "AXIS", allow_hyphen_values = true, env = "SLABCAST_FRONT")]
+    front: Option<Axis>,
+    /// Where workers and clients call; port 0 takes any free one and says which
+    #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:7433",
+          env = "SLABCAST_LISTEN", value_parser = parse::listen)]
+    listen: String,
+    /// Listen beyond this machine although nothing is encrypted and nobody is asked who they are
+    #[arg(long, env = "SLABCAST_INSECURE",
+          value_parser = clap::builder::FalseyValueParser::new())]
+    insecure: bool,
+}
+
+const WORKER_EXAMPLES: &str = "\
+Examples:
+  slabcast worker --master node1:7433
+  slabcast worker --master node1:7433 --threads 8 --memory 4GiB --name node2
+
+A worker may come and go at any time, also in mid-frame. When its master is away it dials again
+until the master is back.";
+
+/// Renders for a master.
+#[derive(clap::Args, Clone, Debug)]
+#[command(after_help = WORKER_EXAMPLES)]
+pub(crate) struct WorkerArgs {
+    /// The master
+    #[arg(long, value_name = "HOST:PORT", env = "SLABCAST_MASTER", value_parser = parse::master)]
+    master: String,
+    /// A name for people [default: host and process number]
+    #[arg(long, value_name = "NAME", env = "SLABCAST_NAME", value_parser = parse::worker_name)]
+    name: Option<String>,
+    /// Render threads [default: all cores]
+    #[arg(long, value_name = "N", env = "SLABCAST_THREADS",
+          value_parser = clap::value_parser!(u32).range(1..=1024))]
+    threads: Option<u32>,
+    /// Memory for bricks; the process needs some 50 MiB and each thread some 10 MiB beside it
+    #[arg(long, value_name = "BYTES", default_value = "512MiB", env = "SLABCAST_MEMORY",
+          value_parser = parse::memory)]
+    memory: u64,
+}
+
+fn runtime() -> Result<tokio::runtime::Runtime, Fail> {
+    tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .thread_name("slabcast-io")
+        .enable_all()
+        .build()
+        .map_err(|e| Fail::failed(format!("starting threads failed: {}", reason(&e))))
+}
+
+/// Runs `slabcast master`.
+pub(crate) fn master(args: &MasterArgs) -> Result<(), Fail> {
+    let axes = AxisArgs { up: args.up, front: args.front };
+    let orientation = axes.orientation()?;
+    let runtime = runtime()?;
+    // The address is taken before the volume is read, so that a port in use is told at once;
+    // it is opened after, so that whoever gets through gets an answer.
+    let socket = runtime.block_on(bind(&args.listen, args.insecure))?;
+    let volume = volume::open(&args.volume)?;
+    let (name, lattice) = (volume.name.clone(), volume.lattice);
+    let config = MasterConfig::new(volume, orientation);
+    let result = runtime.block_on(async {
+        let listener = listen(socket, &args.listen)?;
+        let address = local(&listener)?;
+        let master = start_master(config)?;
+        let handle = master.handle();
+        signals::listen();
+        let (stop, stopped) = watch::channel(false);
+        let mut served =
+            tokio::spawn(slabcast_master::serve::serve(handle.clone(), listener, stopped));
+        if let Some(notice) = lattice_notice(&handle.volume().info) {
+            warn!(volume = name, "{notice}");
+        }
+        if args.insecure && !address.ip().is_loopback() {
+            warn!("--insecure: whoever reaches {address} may read the volume and submit jobs");
+        }
+        info!(%address, volume = name, dims = ?lattice.dims, %orientation.up, %orientation.front,
+              "listening");
+        // Nobody may read stdout (systemd closes it): that is no reason to end.
+        let _ = say(&format!("listening on {address}\n"));
+        systemd::ready(&format!("serving {name} on {address}"));
+        let beat = tokio::spawn(systemd::watchdog(Some(handle)));
+        let result = tokio::select! {
+            ended = &mut served => Err(ended),
+            code = signals::stopped() => Ok(code),
+        };
+        beat.abort();
+        let code = match result {
+            Ok(code) => code,
+            Err(ended) => {
+                let why = match ended {
+                    Ok(Ok(())) => "it stopped by itself".into(),
+                    Ok(Err(e)) => reason(&e),
+                    Err(e) => e.to_string(),
+                };
+                return Err(Fail::failed(format!("serving {address} failed: {why}")));
+            }
+        };
+        info!(signal = code - 128, "stopping: workers are told to leave, jobs end");
+        systemd::stopping();
+        let _ = stop.send(true);
+        let drained = async {
+            master.shutdown().await;
+            let _ = served.await;
+        };
+        if tokio::time::timeout(DRAIN, drained).await.is_err() {
+            warn!("gave up waiting for connections to end");
+        }
+        info!("stopped");
+        Ok(())
+    });
+    runtime.shutdown_timeout(Duration::from_millis(200));
+    result
+}
+
+/// Takes the address without opening it. Refuses what others can reach, unless `insecure`.
+async fn bind(text: &str, insecure: bool) -> Result<TcpSocket, Fail> {
+    let found = tokio::net::lookup_host(text).await.map_err(|e| {
+        Fail::failed(format!("--listen {text}: looking up the host failed: {}", reason(&e)))
+    })?;
+    let addresses: Vec<SocketAddr> = found.collect();
+    let Some(&address) = addresses.first() else {
+        return Err(Fail::failed(format!("--listen {text}: the host has no address")));
+    };
+    if !address.ip().is_loopback() && !insecure {
+        return Err(Fail::usage(format!(
+            "--listen {text}: other machines could reach it, and this version neither encrypts nor \
+             asks who calls; listen on 127.0.0.1:{port} (and reach it through a tunnel, like ssh -L \
+             {port}:127.0.0.1:{port}), or add --insecure on a network that you trust",
+            port = address.port()
+        )));
+    }
+    let socket = if address.is_ipv4() { TcpSocket::new_v4() } else { TcpSocket::new_v6() };
+    let taken = socket.and_then(|socket| {
+        // A port whose last connections still linger can be taken again at once.
+        socket.set_reuseaddr(true)?;
+        socket.bind(address)?;
+        Ok(socket)
+    });
+    taken.map_err(|e| cannot_listen(text, &e))
+}
+
+fn listen(socket: TcpSocket, text: &str) -> Result<TcpListener, Fail> {
+    socket.listen(1024).map_err(|e| cannot_listen(text, &e))
+}
+
+fn cannot_listen(text: &str, e: &std::io::Error) -> Fail {
+    use std::io::ErrorKind;
+    Fail::failed(match e.kind() {
+        ErrorKind::AddrInUse => format!(
+            "--listen {text}: the port is in use; stop who has it (ss -ltnp shows that), or give \
+             another port (0 takes any free one)"
+        ),
+        ErrorKind::PermissionDenied => {
+            format!("--listen {text}: not allowed; ports below 1024 are root's, give a higher one")
+        }
+        ErrorKind::AddrNotAvailable => {
+            format!(
+                "--listen {text}: this machine does not have that address; give one that it has"
+            )
+        }
+        _ => format!("--listen {text}: {}", reason(e)),
+    })
+}
+
+fn local(listener: &TcpListener) -> Result<SocketAddr, Fail> {
+    listener.local_addr().map_err(|e| Fail::failed(format!("listening failed: {}", reason(&e))))
+}
+
+/// Runs `slabcast worker`.
+pub(crate) fn worker(args: &WorkerArgs) -> Result<(), Fail> {
+    let config = Config {
+        name: args.name.clone().unwrap_or_else(host_and_process),
+        threads: args.threads.unwrap_or_else(cores),
+        memory_budget_bytes: args.memory,
+        simd: Simd::detect(),
+    };
+    let runtime = runtime()?;
+    let result = runtime.block_on(async {
+        signals::listen();
+        let (stop, stopped) = watch::channel(false);
+        info!(
+            name = config.name,
+            master = args.master,
+            threads = config.threads,
+            memory = args.memory,
+            simd = config.simd.name(),
+            "worker starts"
+        );
+        let dialling = slabcast_worker::dial::run(config, args.master.clone(), stopped);
+        let mut running = tokio::spawn(dialling);
+        systemd::ready(&format!("rendering for {}", args.master));
+        let beat = tokio::spawn(systemd::watchdog(None));
+        let ended = tokio::select! {
+            ended = &mut running => ended,
+            _ = signals::stopped() => {
+                systemd::stopping();
+                let _ = stop.send(true);
+                match tokio::time::timeout(DRAIN, &mut running).await {
+                    Ok(ended) => ended,
+                    Err(_) => {
+                        warn!("gave up waiting for tasks");
+                        return Ok(());
+                    }
+                }
+            }
+        };
+        beat.abort();
+        match ended {
+            Ok(Ok(Ended::Stopped)) => Ok(()),
+            Ok(Ok(Ended::Refused(why))) => Err(Fail::failed(format!(
+                "the master at {} refuses this worker: {why}",
+                args.master
+            ))),
+            Ok(Ok(Ended::Lost(why) | Ended::MasterLeft(why)) | Err(why)) => {
+                Err(Fail::failed(format!("master at {}: {why}", args.master)))
+            }
+            Err(e) => Err(Fail::failed(format!("the worker failed: {e}"))),
+        }
+    });
+    // Render threads end after the tile at hand; nobody waits for it.
+    runtime.shutdown_timeout(Duration::from_millis(200));
+    result
+}
+
+fn host_and_process() -> String {
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname")
+        .ok()
+        .or_else(|| std::env::var("HOSTNAME").ok())
+        .unwrap_or_default();
+    let host: String = host.trim().chars().filter(|c| !c.is_control()).take(64).collect();
+    let host = if host.is_empty() { "worker".into() } else { host };
+    format!("{host}-{}", std::process::id())
+}
+
+/// What systemd is told (sd_notify), where it listens.
+mod systemd {
+    use super::{Duration, Handle};
+
+    #[cfg(target_os = "linux")]
+    fn tell(states: &[sd_notify::NotifyState<'_>]) {
+        if let Err(e) = sd_notify::notify(states) {
+            tracing::warn!(error = %e, "systemd was not told");
+        }
+    }
+
+    /// It serves.
+    pub(super) fn ready(status: &str) {
+        #[cfg(target_os = "linux")]
+        tell(&[sd_notify::NotifyState::Ready, sd_notify::NotifyState::Status(status)]);
+        #[cfg(not(target_os = "linux"))]
+        let _ = status;
+    }
+
+    /// It ends.
+    pub(super) fn stopping() {
+        #[cfg(target_os = "linux")]
+        tell(&[sd_notify::NotifyState::Stopping]);
+    }
+
+    /// Answers the watchdog twice in its time. A master answers only while its driver does: a
+    /// process that breathes but takes no event is to be restarted.
+    pub(super) async fn watchdog(handle: Option<Handle>) {
+        #[cfg(target_os = "linux")]
+        if let Some(within) = sd_notify::watchdog_enabled() {
+            let mut beat = tokio::time::interval((within / 2).max(Duration::from_millis(1)));
+            loop {
+                beat.tick().await;
+                if let Some(handle) = &handle
+                    && tokio::time::timeout(within, handle.workers()).await.is_err()
+                {
+                    continue;
+                }
+                tell(&[sd_notify::NotifyState::Watchdog]);
+            }
+        }
+        #[cfg(not(target_os = "linux"))]
+        let _ = (handle, Duration::ZERO);
+    }
+}

@@ -1,0 +1,126 @@
+//! A master and its workers inside this process.
+//!
+//! They speak the same messages as over a network, through channels; the scheduler can't tell
+//! (DESIGN.md section 2). Bricks are shared, not copied.
+
+use crate::fail::Fail;
+use slabcast_common::path::Orientation;
+use slabcast_common::volume::Volume;
+use slabcast_master::{Handle, Master, MasterConfig, link};
+use slabcast_render::splat::Simd;
+use slabcast_worker::{BrickCache, Config, Ended, Link};
+use std::time::Duration;
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+
+/// How long workers may take to leave. They finish the tile at hand, some 50 ms at most; what
+/// takes longer ends with the process.
+const LEAVE: Duration = Duration::from_secs(2);
+
+/// Brick budget of a worker that shares the master's bricks: none of its own is used.
+const SHARED: u64 = 1 << 40;
+
+/// What embedded workers are like.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Crew {
+    /// Workers.
+    pub(crate) workers: u32,
+    /// Render threads of each.
+    pub(crate) threads: u32,
+}
+
+impl Crew {
+    /// `workers` workers of `threads` threads, or of their share of this machine's cores.
+    pub(crate) fn new(workers: u32, threads: Option<u32>) -> Result<Self, Fail> {
+        let threads = threads.unwrap_or_else(|| (cores() / workers).max(1));
+        if workers * threads > 4096 {
+            return Err(Fail::usage(format!(
+                "--workers, --threads: {workers} x {threads} threads; give 4096 in all at most"
+            )));
+        }
+        Ok(Crew { workers, threads })
+    }
+}
+
+impl std::fmt::Display for Crew {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let s = |n: u32| if n == 1 { "" } else { "s" };
+        let (w, t) = (self.workers, self.threads);
+        write!(f, "{w} worker{} of {t} thread{}", s(w), s(t))
+    }
+}
+
+/// Cores that this process may use.
+pub(crate) fn cores() -> u32 {
+    std::thread::available_parallelism().map_or(1, |n| n.get().min(1024) as u32)
+}
+
+/// A small cluster in this process.
+pub(crate) struct Cluster {
+    master: Master,
+    stop: watch::Sender<bool>,
+    workers: JoinSet<Result<Ended, std::io::Error>>,
+}
+
+impl Cluster {
+    /// Starts it. Must be called inside a tokio runtime.
+    pub(crate) fn start(
+        volume: Volume,
+        orientation: Orientation,
+        crew: Crew,
+    ) -> Result<Cluster, Fail> {
+        let master = start_master(MasterConfig::new(volume, orientation))?;
+        let (stop, stopped) = watch::channel(false);
+        let mut workers = JoinSet::new();
+        for n in 1..=crew.workers {
+            let end = link::embedded(master.handle());
+            let link = Link { control: end.control, replies: end.replies, bricks: end.bricks };
+            let config = Config {
+                name: format!("embedded-{n}"),
+                threads: crew.threads,
+                memory_budget_bytes: SHARED,
+                simd: Simd::detect(),
+            };
+            let stop = stopped.clone();
+            workers.spawn(async move {
+                slabcast_worker::run(&config, link, &mut BrickCache::default(), stop).await
+            });
+        }
+        Ok(Cluster { master, stop, workers })
+    }
+
+    /// A way to speak to its master.
+    pub(crate) fn handle(&self) -> Handle {
+        self.master.handle()
+    }
+
+    /// Waits for a worker to end before it was told to, which should not happen; says why.
+    pub(crate) async fn trouble(&mut self) -> Fail {
+        let why = match self.workers.join_next().await {
+            None => return std::future::pending().await,
+            Some(Ok(Ok(Ended::Refused(reason)))) => reason,
+            Some(Ok(Ok(Ended::Lost(reason) | Ended::MasterLeft(reason)))) => reason,
+            Some(Ok(Ok(Ended::Stopped))) => "it stopped".into(),
+            Some(Ok(Err(e))) => e.to_string(),
+            Some(Err(e)) => e.to_string(),
+        };
+        Fail::failed(format!("a worker of this process ended: {why}"))
+    }
+
+    /// Ends workers and master.
+    pub(crate) async fn end(mut self) {
+        let _ = self.stop.send(true);
+        let leave = async {
+            while self.workers.join_next().await.is_some() {}
+            self.master.shutdown().await;
+        };
+        let _ = tokio::time::timeout(LEAVE, leave).await;
+    }
+}
+
+/// A master that runs, or why the system does not let it.
+pub(crate) fn start_master(config: MasterConfig) -> Result<Master, Fail> {
+    Master::start(config).map_err(|e| {
+        Fail::failed(format!("starting the master's threads failed: {}", crate::fail::reason(&e)))
+    })
+}

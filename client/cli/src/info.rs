@@ -1,0 +1,318 @@
+//! `slabcast info`: what is in a file, before anybody waits for a picture of it.
+
+use crate::fail::{Fail, say};
+use crate::progress::bytes;
+use crate::request::{AxisArgs, lattice_notice};
+use crate::volume;
+use glam::DVec3;
+use slabcast_common::brick::{BRICK_VOXELS, BrickGrid};
+use slabcast_common::path::Orientation;
+use slabcast_common::presets;
+use slabcast_common::quality::Compositing;
+use slabcast_common::transfer::Classifier;
+use slabcast_common::volume::{Lattice, Samples, Volume, VolumeInfo};
+use std::fmt::Write;
+use std::path::PathBuf;
+
+/// Says what is in a volume file: size, orientation, values, and what each preset would draw.
+#[derive(clap::Args, Clone, Debug)]
+#[command(after_help = "\
+Examples:
+  slabcast info brain.nii.gz
+  slabcast info brain.nii.gz --json | jq .presets")]
+pub(crate) struct InfoArgs {
+    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
+    volume: PathBuf,
+    #[command(flatten)]
+    axes: AxisArgs,
+    /// As JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// What a preset would draw.
+struct Share {
+    name: &'static str,
+    what: &'static str,
+    voxels: u64,
+    /// Bytes of its bricks on a worker, about.
+    bytes: u64,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &InfoArgs) -> Result<(), Fail> {
+    let orientation = args.axes.orientation()?;
+    let volume = volume::open(&args.volume)?;
+    let info = volume.info(volume.digest());
+    let shares = shares(&volume, &info)?;
+    if args.json {
+        return say(&format!("{:#}\n", json(&volume, &info, orientation, &shares)));
+    }
+    say(&text(&volume, &info, orientation, &shares))
+}
+
+/// Samples that are visible under each preset.
+fn shares(volume: &Volume, info: &VolumeInfo) -> Result<Vec<Share>, Fail> {
+    // Samples of few codes are counted once, for all presets.
+    let counts: Option<Vec<u64>> = match &volume.samples {
+        Samples::U8(v) => Some(count(v, 256)),
+        Samples::U16(v) => Some(count(v, 65536)),
+        Samples::F32(_) => None,
+    };
+    presets::NAMES
+        .iter()
+        .map(|&(name, what)| {
+            let tf = presets::by_name(name, &info.summary).map_err(|e| Fail::flag(&e))?;
+            let c = Classifier::new(&tf, info, Compositing::Linear);
+            let voxels = match (&counts, &volume.samples) {
+                (Some(counts), _) => {
+                    let visible = |(look, n): (&slabcast_common::transfer::Look, &u64)| {
+                        if look.sigma > 0.0 { *n } else { 0 }
+                    };
+                    c.table().iter().zip(counts).map(visible).sum()
+                }
+                (None, samples) => {
+                    (0..samples.len()).filter(|&i| c.look(samples, i).sigma > 0.0).count() as u64
+                }
+            };
+            let each = 2 + info.summary.kind.bytes() as u64 + if tf.shading.on { 2 } else { 0 };
+            Ok(Share { name, what, voxels, bytes: voxels * each })
+        })
+        .collect()
+}
+
+fn count<T: Copy + Into<usize>>(samples: &[T], codes: usize) -> Vec<u64> {
+    let mut counts = vec![0; codes];
+    for &c in samples {
+        counts[c.into()] += 1;
+    }
+    counts
+}
+
+/// The box of the volume's cells (N samples count as N spacings), in world units.
+fn world_box(lattice: &Lattice) -> [DVec3; 2] {
+    let half = lattice.steps.iter().zip(lattice.dims).map(|(s, n)| s.abs() * f64::from(n) / 2.0);
+    let half = half.fold(DVec3::ZERO, |sum, h| sum + h);
+    [lattice.centre() - half, lattice.centre() + half]
+}
+
+/// Where an index axis goes: world axis and sign, and whether it lies along it.
+fn along(step: DVec3) -> (usize, bool, bool) {
+    let a = step.abs();
+    let axis = if a.x >= a.y && a.x >= a.z {
+        0
+    } else if a.y >= a.z {
+        1
+    } else {
+        2
+    };
+    let straight = a[axis] >= step.length() * 0.999_999;
+    (axis, step[axis] < 0.0, straight)
+}
+
+const ANATOMY: [[&str; 2]; 3] =
+    [["left", "right"], ["posterior", "anterior"], ["inferior", "superior"]];
+
+fn anatomy(axis: slabcast_common::path::Axis) -> &'static str {
+    ANATOMY[axis.index][usize::from(!axis.negative)]
+}
+
+fn number(x: f64) -> String {
+    let size = x.abs();
+    if x == 0.0 || (1e-3..1e7).contains(&size) {
+        let s = format!("{x:.4}");
+        s.trim_end_matches('0').trim_end_matches('.').to_string()
+    } else {
+        format!("{x:.4e}")
+    }
+}
+
+fn triple(v: [f64; 3], between: &str) -> String {
+    v.map(number).join(between)
+}
+
+/// A share in percent with two digits that mean something.
+fn percent(part: u64, whole: u64) -> String {
+    let p = 100.0 * part as f64 / whole.max(1) as f64;
+    match p {
+        _ if part == 0 => "none".into(),
+        _ if p >= 9.95 => format!("{p:.0} %"),
+        _ if p >= 0.995 => format!("{p:.1} %"),
+        _ if p >= 0.01 => format!("{p:.2} %"),
+        _ => "< 0.01 %".into(),
+    }
+}
+
+/// Bytes of the samples in memory.
+fn sample_bytes(info: &VolumeInfo) -> u64 {
+    info.lattice.len() as u64 * info.summary.kind.bytes() as u64
+}
+
+fn text(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) -> String {
+    let lattice = &info.lattice;
+    let s = &info.summary;
+    let [nx, ny, nz] = lattice.dims;
+    let unit = if volume.anatomical { " mm" } else { "" };
+    let [lo, hi] = world_box(lattice).map(|v| v.to_array());
+    let mut out = String::new();
+    let mut row = |name: &str, value: String| {
+        // Writing to a string does not fail.
+        let _ = writeln!(out, "{name:<12} {value}");
+    };
+    row("volume", volume.name.clone());
+    row("samples", format!("{nx} x {ny} x {nz} {}", volume.file_type));
+    row("spacing", format!("{}{unit}", triple(lattice.spacing(), " x ")));
+    row("world box", format!("{} to {}{unit}", triple(lo, ", "), triple(hi, ", ")));
+    for (name, step) in ["i", "j", "k"].iter().zip(lattice.steps) {
+        let (axis, negative, straight) = along(step);
+        let sign = if negative { '-' } else { '+' };
+        let about = if straight { "" } else { "about " };
+        let world = format!("{about}{sign}{}", ["x", "y", "z"][axis]);
+        let [from, to] = ANATOMY[axis];
+        let (from, to) = if negative { (to, from) } else { (from, to) };
+        row(
+            if *name == "i" { "index axes" } else { "" },
+            if volume.anatomical {
+                format!("{name} runs {world}, from {from} to {to}")
+            } else {
+                format!("{name} runs {world}")
+            },
+        );
+    }
+    row(
+        "turntable",
+        if volume.anatomical {
+            format!("up {} ({}), front {} ({})", o.up, anatomy(o.up), o.front, anatomy(o.front))
+        } else {
+            format!(
+                "up {}, front {}; the file does not say what is up: see --up and --front",
+                o.up, o.front
+            )
+        },
+    );
+    let (lo, hi) = s.range();
+    let mut values = format!("{} to {}", number(lo), number(hi));
+    if s.map != slabcast_common::volume::ValueMap::IDENTITY {
+        let _ = write!(
+            values,
+            " (value = {} + {} x stored)",
+            number(s.map.offset),
+            number(s.map.scale)
+        );
+    }
+    row("values", values);
+    if s.nan + s.infinite > 0 {
+        row("", format!("{} NaN, {} infinite", s.nan, s.infinite));
+    }
+    row("air ends at", number(lo + (hi - lo) * presets::air_cut(s)));
+    let sketch = slabcast_volumes::histogram_sketch(s, 60);
+    for (i, line) in sketch.lines().enumerate() {
+        row(if i == 0 { "histogram" } else { "" }, line.to_string());
+    }
+    let total = lattice.len() as u64;
+    let _ = writeln!(out, "{:<12} {:>8}   {:>9}", "preset", "visible", "bricks");
+    for share in shares {
+        let _ = writeln!(
+            out,
+            "  {:<12} {:>6}   {:>9}   {}",
+            share.name,
+            percent(share.voxels, total),
+            bytes(share.bytes),
+            share.what
+        );
+    }
+    let auto = shares.first().map_or(0, |s| s.bytes);
+    let _ = writeln!(
+        out,
+        "{:<12} master about {}, each worker about {} for --tf auto",
+        "memory",
+        bytes(sample_bytes(info) + 2 * auto + (60 << 20)),
+        bytes(auto + (60 << 20)),
+    );
+    if let Some(notice) = lattice_notice(info) {
+        let _ = writeln!(out, "{:<12} {notice}", "note");
+    }
+    out
+}
+
+fn json(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) -> serde_json::Value {
+    let lattice = &info.lattice;
+    let s = &info.summary;
+    let (lo, hi) = s.range();
+    let total = lattice.len() as u64;
+    let grid = BrickGrid::of(lattice.dims);
+    serde_json::json!({
+        "version": 1,
+        "name": volume.name,
+        "file_type": volume.file_type,
+        "stored_as": s.kind,
+        "anatomical": volume.anatomical,
+        "digest": info.digest.to_string(),
+        "dims": lattice.dims,
+        "spacing": lattice.spacing(),
+        "steps": lattice.steps.map(|v| v.to_array()),
+        "origin": lattice.origin.to_array(),
+        "world_box": world_box(lattice).map(|v| v.to_array()),
+        "isotropic": lattice.is_isotropic(),
+        "index_axes": lattice.steps.map(|step| {
+            let (axis, negative, _) = along(step);
+            format!("{}{}", if negative { '-' } else { '+' }, ["x", "y", "z"][axis])
+        }),
+        "up": o.up,
+        "front": o.front,
+        "values": {
+            "min": lo, "max": hi, "scale": s.map.scale, "offset": s.map.offset,
+            "nan": s.nan, "infinite": s.infinite,
+            "air_ends": lo + (hi - lo) * presets::air_cut(s),
+            "histogram": s.histogram,
+        },
+        "bricks": { "edge": 8, "count": grid.len(), "voxels": BRICK_VOXELS },
+        "presets": shares.iter().map(|p| serde_json::json!({
+            "name": p.name, "for": p.what, "visible": p.voxels,
+            "share": p.voxels as f64 / total as f64, "brick_bytes": p.bytes,
+        })).collect::<Vec<_>>(),
+        "memory_bytes": {
+            "samples": sample_bytes(info),
+            "bricks_auto": shares.first().map_or(0, |s| s.bytes),
+        },
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shares_keep_two_digits_that_mean_something() {
+        let s = |part| percent(part, 1_000_000);
+        assert_eq!(
+            [s(0), s(1), s(1234), s(23_456), s(345_678), s(1_000_000)],
+            ["none", "< 0.01 %", "0.12 %", "2.3 %", "35 %", "100 %"]
+        );
+    }
+
+    #[test]
+    fn the_worlds_box_counts_cells() {
+        let l = Lattice::from_spacing([4, 2, 1], [1.0, 2.0, 3.0]);
+        let [lo, hi] = world_box(&l);
+        assert_eq!((lo, hi), (DVec3::new(-0.5, -1.0, -1.5), DVec3::new(3.5, 3.0, 1.5)));
+    }
+
+    #[test]
+    fn axes_are_named_by_where_they_go() {
+        assert_eq!(along(DVec3::new(0.0, -2.0, 0.0)), (1, true, true));
+        assert_eq!(along(DVec3::new(0.1, 0.0, 2.0)), (2, false, false));
+    }
+
+    #[test]
+    fn every_kind_of_volume_is_described() {
+        for name in ["formula:wall:16", "formula:ramp:8", "formula:blob:8", "formula:one"] {
+            let volume = volume::open(name.as_ref()).unwrap();
+            let info = volume.info(volume.digest());
+            let shares = shares(&volume, &info).unwrap();
+            let o = Orientation::new(None, None).unwrap();
+            assert!(text(&volume, &info, o, &shares).contains("histogram"), "{name}");
+            assert_eq!(json(&volume, &info, o, &shares)["version"], 1);
+        }
+    }
+}

@@ -1,0 +1,240 @@
+//! The `slabcast` program: what is typed, which command that is, and how it ended.
+//!
+//! - [`render`] makes pictures, by this process alone ([`embedded`]) or by a cluster
+//!   ([`remote`]); [`request`] turns flags into a request, [`output`] frames into files,
+//!   [`progress`] shows what goes on meanwhile.
+//! - [`daemon`] is `master` and `worker`.
+//! - [`info`] looks into files, [`ask`] at a running master.
+//! - [`check`] compares pictures with the oracle over every way to make them.
+//!
+//! This is the only crate that sees all others. It decides nothing about pixels and schedules.
+//! Results go to stdout, everything else to stderr; every failure is one line ([`fail`]).
+
+mod ask;
+mod check;
+mod daemon;
+mod embedded;
+mod fail;
+mod info;
+mod logging;
+mod output;
+mod parse;
+mod progress;
+mod remote;
+mod render;
+mod request;
+mod signals;
+mod style;
+mod volume;
+
+use clap::error::ErrorKind;
+use clap::{CommandFactory, Parser, Subcommand};
+use fail::Fail;
+use std::process::ExitCode;
+
+/// Renders volume data (CT, MRI, simulations) on CPUs, alone or as a cluster.
+#[derive(Parser, Debug)]
+#[command(
+    name = "slabcast",
+    version,
+    disable_help_subcommand = true,
+    max_term_width = 100,
+    subcommand_value_name = "COMMAND",
+    after_help = "\
+Examples:
+  slabcast render brain.nii.gz                   18 pictures of a turn, in slabcast-out/
+  slabcast info brain.nii.gz                     what is in the file
+  slabcast master --volume brain.nii.gz          a cluster: a master,
+  slabcast worker --master 127.0.0.1:7433        workers, here or elsewhere,
+  slabcast render --master 127.0.0.1:7433        and pictures from it
+
+Each command has its own help: slabcast render --help"
+)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+    #[command(flatten)]
+    log: logging::LogArgs,
+}
+
+#[derive(Subcommand, Debug)]
+enum Command {
+    Render(Box<render::RenderArgs>),
+    Info(info::InfoArgs),
+    Master(daemon::MasterArgs),
+    Worker(daemon::WorkerArgs),
+    Status(ask::StatusArgs),
+    Jobs(ask::JobsArgs),
+    Cancel(ask::CancelArgs),
+    Check(check::CheckArgs),
+    /// Prints completions for a shell.
+    #[command(after_help = "\
+Examples:
+  slabcast completions bash > ~/.local/share/bash-completion/completions/slabcast
+  slabcast completions fish > ~/.config/fish/completions/slabcast.fish")]
+    Completions {
+        /// bash, zsh, fish, elvish or powershell
+        shell: clap_complete::Shell,
+    },
+    /// Prints the manual page, or writes one for each command into a folder.
+    #[command(after_help = "\
+Examples:
+  slabcast man | man -l -
+  slabcast man /usr/local/share/man/man1")]
+    Man {
+        /// Folder for slabcast.1, slabcast-render.1 and so on
+        dir: Option<std::path::PathBuf>,
+    },
+}
+
+fn main() -> ExitCode {
+    std::panic::set_hook(Box::new(on_panic));
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(e) => return ExitCode::from(not_understood(&e)),
+    };
+    match run(&cli) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(fail) => ExitCode::from(fail.end()),
+    }
+}
+
+fn run(cli: &Cli) -> Result<(), Fail> {
+    let daemon = matches!(cli.command, Command::Master(_) | Command::Worker(_));
+    logging::begin(&cli.log, if daemon { "info" } else { "warn" })?;
+    match &cli.command {
+        Command::Render(args) => render::run(args),
+        Command::Info(args) => info::run(args),
+        Command::Master(args) => daemon::master(args),
+        Command::Worker(args) => daemon::worker(args),
+        Command::Status(args) => ask::status(args),
+        Command::Jobs(args) => ask::jobs(args),
+        Command::Cancel(args) => ask::cancel(args),
+        Command::Check(args) => check::run(args),
+        Command::Completions { shell } => {
+            let mut script = Vec::new();
+            clap_complete::generate(*shell, &mut Cli::command(), "slabcast", &mut script);
+            fail::say(&String::from_utf8_lossy(&script))
+        }
+        Command::Man { dir: None } => {
+            let mut page = Vec::new();
+            clap_mangen::Man::new(Cli::command())
+                .render(&mut page)
+                .map_err(|e| Fail::failed(e.to_string()))?;
+            fail::say(&String::from_utf8_lossy(&page))
+        }
+        Command::Man { dir: Some(dir) } => clap_mangen::generate_to(Cli::command(), dir)
+            .map_err(|e| Fail::io(dir, "writing manual pages", &e)),
+    }
+}
+
+/// Help and versions go to stdout; what was not understood becomes one line.
+fn not_understood(e: &clap::Error) -> u8 {
+    match e.kind() {
+        ErrorKind::DisplayHelp | ErrorKind::DisplayVersion => {
+            // Colour follows stdout's own nature; a reader that has gone away is silent.
+            let _ = e.print();
+            0
+        }
+        ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => {
+            let _ = e.print();
+            2
+        }
+        _ => Fail::usage(one_sentence(&e.to_string())).end(),
+    }
+}
+
+/// Clap's paragraphs as one line: what is wrong, its tips, and where to read on.
+fn one_sentence(text: &str) -> String {
+    let mut parts: Vec<String> = Vec::new();
+    let mut help = "slabcast --help".to_string();
+    for line in text.lines().map(str::trim).filter(|l| !l.is_empty()) {
+        if let Some(usage) = line.strip_prefix("Usage: ") {
+            // `slabcast render [OPTIONS] ...`: the words before the first that is no name.
+            let name = |w: &&str| w.chars().all(|c| c.is_ascii_lowercase());
+            let words: Vec<&str> = usage.split_whitespace().take_while(name).collect();
+            help = format!("{} --help", words.join(" "));
+        } else if line.starts_with("For more information") {
+            // Said in fewer words below.
+        } else if let Some(tip) = line.strip_prefix("tip: ") {
+            parts.push(tip.replace('\'', "`"));
+        } else {
+            let line = line.strip_prefix("error: ").unwrap_or(line);
+            match parts.last_mut() {
+                // The list that a colon announced.
+                Some(last) if last.ends_with(':') || last.ends_with('>') => {
+                    last.push(' ');
+                    last.push_str(line);
+                }
+                _ => parts.push(line.replace('\'', "`")),
+            }
+        }
+    }
+    format!("{}; see `{help}`", parts.join("; "))
+}
+
+/// A panic is a mistake of ours: one line that says where. Render threads catch theirs and go
+/// on with the next tile.
+fn on_panic(panic: &std::panic::PanicHookInfo<'_>) {
+    let what = panic
+        .payload()
+        .downcast_ref::<String>()
+        .map(String::as_str)
+        .or_else(|| panic.payload().downcast_ref::<&str>().copied())
+        .unwrap_or("no words");
+    let at = panic.location().map(|l| format!("{}:{}", l.file(), l.line())).unwrap_or_default();
+    let line = format!("internal: {what} at {at}; this is a mistake in slabcast, please report it");
+    if std::thread::current().name() == Some("main") {
+        std::process::exit(Fail::failed(line).end().into());
+    }
+    tracing::error!("{}", fail::one_line(&line));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_sound() {
+        Cli::command().debug_assert();
+    }
+
+    fn says(line: &str) -> String {
+        let e = Cli::try_parse_from(line.split_whitespace()).unwrap_err();
+        one_sentence(&e.to_string())
+    }
+
+    #[test]
+    fn what_is_not_understood_becomes_one_line() {
+        for (line, want) in [
+            (
+                "slabcast render --elevatoin 3 x",
+                "unexpected argument `--elevatoin` found; a similar argument exists: \
+                 `--elevation`; see `slabcast render --help`",
+            ),
+            (
+                "slabcast worker",
+                "the following required arguments were not provided: --master <HOST:PORT>; see \
+                 `slabcast worker --help`",
+            ),
+            (
+                "slabcast render x --eps tiny",
+                "invalid value `tiny` for `--eps <E>`: give a number or a fraction, like 0.002 or \
+                 1/512; see `slabcast --help`",
+            ),
+        ] {
+            assert_eq!(says(line), want);
+        }
+        assert!(!says("slabcast rendr x").contains('\n'));
+    }
+
+    #[test]
+    fn every_help_ends_with_an_example() {
+        let cli = Cli::command();
+        for name in ["render", "info", "master", "worker", "status", "check"] {
+            let sub = cli.find_subcommand(name).unwrap_or_else(|| panic!("{name} is there"));
+            let help = sub.clone().render_help().to_string();
+            assert!(help.contains("slabcast "), "{name}");
+        }
+    }
+}

@@ -1,0 +1,217 @@
+//! Values of flags: from text to what is meant, or what to give instead.
+
+use slabcast_common::image::Background;
+use slabcast_common::view::MAX_EDGE;
+
+/// A finite number.
+pub(crate) fn number(text: &str) -> Result<f64, String> {
+    match text.trim().parse::<f64>() {
+        Ok(x) if x.is_finite() => Ok(x),
+        Ok(_) => Err("must be finite".into()),
+        Err(_) => Err("not a number".into()),
+    }
+}
+
+/// A finite number above zero.
+pub(crate) fn positive(text: &str) -> Result<f64, String> {
+    match number(text)? {
+        x if x > 0.0 => Ok(x),
+        _ => Err("give a number above 0".into()),
+    }
+}
+
+/// A number or a fraction (`1/512`).
+pub(crate) fn fraction(text: &str) -> Result<f64, String> {
+    let bad = || "give a number or a fraction, like 0.002 or 1/512".to_string();
+    let x = match text.split_once('/') {
+        None => number(text).map_err(|_| bad())?,
+        Some((a, b)) => {
+            let (a, b) = (number(a).map_err(|_| bad())?, number(b).map_err(|_| bad())?);
+            if b == 0.0 {
+                return Err("divides by zero; give a number or a fraction, like 1/512".into());
+            }
+            a / b
+        }
+    };
+    if x.is_finite() { Ok(x) } else { Err(bad()) }
+}
+
+/// `WxH` in pixels.
+pub(crate) fn size(text: &str) -> Result<[u32; 2], String> {
+    let bad = || format!("give WIDTHxHEIGHT in pixels, 1 to {MAX_EDGE} each, like 512x512");
+    let (w, h) = text.split_once(['x', 'X']).ok_or_else(bad)?;
+    let edge = |t: &str| match t.parse::<u32>() {
+        Ok(n) if (1..=MAX_EDGE).contains(&n) => Ok(n),
+        _ => Err(bad()),
+    };
+    Ok([edge(w)?, edge(h)?])
+}
+
+/// `transparent`, `black`, `white`, `R,G,B` in 0 to 1, or `#rrggbb`.
+pub(crate) fn background(text: &str) -> Result<Background, String> {
+    let bad = "give transparent, R,G,B with numbers from 0 to 1 (like 0.1,0.1,0.2), or #rrggbb";
+    match text {
+        "transparent" => return Ok(Background::Transparent),
+        "black" => return Ok(Background::Colour([0.0; 3])),
+        "white" => return Ok(Background::Colour([1.0; 3])),
+        _ => {}
+    }
+    if let Some(hex) = text.strip_prefix('#') {
+        let all = if hex.len() == 6 { u32::from_str_radix(hex, 16).ok() } else { None };
+        let all = all.filter(|_| hex.bytes().all(|b| b.is_ascii_hexdigit())).ok_or(bad)?;
+        return Ok(Background::Colour(
+            [16, 8, 0].map(|shift| f64::from((all >> shift) & 255) / 255.0),
+        ));
+    }
+    let numbers: Vec<f64> =
+        text.split(',').map(number).collect::<Result<_, _>>().map_err(|_| bad)?;
+    let rgb: [f64; 3] = numbers.try_into().map_err(|_| bad)?;
+    if rgb.iter().all(|x| (0.0..=1.0).contains(x)) {
+        return Ok(Background::Colour(rgb));
+    }
+    if rgb.iter().all(|x| (0.0..=255.0).contains(x) && x.fract() == 0.0) {
+        let [r, g, b] = rgb.map(|x| x as u8);
+        return Err(format!("numbers go from 0 to 1; did you mean #{r:02x}{g:02x}{b:02x}?"));
+    }
+    Err(bad.into())
+}
+
+/// Bytes: `512MiB`, `2GB`, `1073741824`. At least 16 MiB, at most 1 PiB.
+pub(crate) fn memory(text: &str) -> Result<u64, String> {
+    let bad = || "give bytes with a unit, from 16MiB to 1024TiB, like 512MiB or 2GiB".to_string();
+    let digits = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
+    let (count, unit) = text.split_at(digits);
+    let factor: u64 = match unit.trim().to_ascii_lowercase().as_str() {
+        "" | "b" => 1,
+        "k" | "kib" => 1 << 10,
+        "m" | "mib" => 1 << 20,
+        "g" | "gib" => 1 << 30,
+        "t" | "tib" => 1 << 40,
+        "kb" => 1_000,
+        "mb" => 1_000_000,
+        "gb" => 1_000_000_000,
+        "tb" => 1_000_000_000_000,
+        _ => return Err(bad()),
+    };
+    let bytes = count.parse::<f64>().map_err(|_| bad())? * factor as f64;
+    let range = (16u64 << 20) as f64..=(1u64 << 50) as f64;
+    if range.contains(&bytes) { Ok(bytes as u64) } else { Err(bad()) }
+}
+
+/// `HOST:PORT`, the name not looked up yet. Port 0 (any free one) only where `any_port`.
+fn host_port(text: &str, any_port: bool) -> Result<String, String> {
+    let bad = "give HOST:PORT, like 127.0.0.1:7433 or node7:7433";
+    if text.contains("://") {
+        return Err(format!("{bad}, without a scheme"));
+    }
+    let (host, port) = text.rsplit_once(':').ok_or(bad)?;
+    let bare_v6 = host.contains(':') && !(host.starts_with('[') && host.ends_with(']'));
+    if bare_v6 {
+        return Err("write an IPv6 address in brackets, like [::1]:7433".into());
+    }
+    let sane = |c: char| c.is_ascii_alphanumeric() || ".-_[]:%".contains(c);
+    match port.parse::<u16>() {
+        Ok(port) if !host.is_empty() && host.chars().all(sane) && (any_port || port > 0) => {
+            Ok(text.to_string())
+        }
+        _ => Err(bad.into()),
+    }
+}
+
+/// Where a master is.
+pub(crate) fn master(text: &str) -> Result<String, String> {
+    host_port(text, false)
+}
+
+/// Where a master listens.
+pub(crate) fn listen(text: &str) -> Result<String, String> {
+    host_port(text, true)
+}
+
+/// A macrotile's edge, or `auto` for the quadtree to choose.
+pub(crate) fn tile(text: &str) -> Result<Tile, String> {
+    match text {
+        "auto" => Ok(Tile(None)),
+        "16" | "32" | "64" | "128" | "256" => Ok(Tile(text.parse().ok())),
+        _ => Err("give auto, 16, 32, 64, 128 or 256".into()),
+    }
+}
+
+/// Edge of a macrotile; `None` is `auto`. (A type of its own: clap takes a bare `Option` for a
+/// flag that may be left out.)
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Tile(pub(crate) Option<u32>);
+
+/// A worker's name: what fits a line of a table.
+pub(crate) fn worker_name(text: &str) -> Result<String, String> {
+    if (1..=100).contains(&text.len()) && !text.chars().any(char::is_control) {
+        Ok(text.into())
+    } else {
+        Err("give 1 to 100 bytes without control characters".into())
+    }
+}
+
+/// `on` or `off`.
+pub(crate) fn on_off(text: &str) -> Result<bool, String> {
+    match text {
+        "on" => Ok(true),
+        "off" => Ok(false),
+        _ => Err("give on or off".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn eps_takes_fractions_and_refuses_nonsense() {
+        assert_eq!(fraction("1/512"), Ok(1.0 / 512.0));
+        assert_eq!(fraction("0"), Ok(0.0));
+        assert_eq!(fraction("2e-3"), Ok(0.002));
+        for bad in ["", "a", "1/0", "1/", "/2", "nan", "inf", "1/2/3", "1e300/1e-300"] {
+            assert!(fraction(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn sizes_are_two_edges_in_range() {
+        assert_eq!(size("640x480"), Ok([640, 480]));
+        assert_eq!(size("1X8192"), Ok([1, 8192]));
+        for bad in ["", "512", "0x5", "5x0", "-1x5", "8193x1", "99999999999x1", "1x2x3", "axb"] {
+            assert!(size(bad).unwrap_err().contains("512x512"), "{bad}");
+        }
+    }
+
+    #[test]
+    fn backgrounds_in_three_spellings() {
+        assert_eq!(background("#ff8000"), background("1,0.5019607843137255,0"));
+        assert_eq!(background("transparent"), Ok(Background::Transparent));
+        assert!(background("255,128,0").unwrap_err().contains("#ff8000"));
+        for bad in ["", "red", "1,1", "1,1,1,1", "#12345", "#+12345", "nan,0,0", "1,2,-3"] {
+            assert!(background(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn memory_has_units() {
+        assert_eq!(memory("512MiB"), Ok(512 << 20));
+        assert_eq!(memory("1.5g"), Ok(3 << 29));
+        assert_eq!(memory("2GB"), Ok(2_000_000_000));
+        assert_eq!(memory("1073741824"), Ok(1 << 30));
+        for bad in ["", "0", "15MiB", "1MiBs", "-1GiB", "9999999TiB", "1..5GiB", "MiB", "1e9"] {
+            assert!(memory(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn addresses_are_host_and_port() {
+        for good in ["127.0.0.1:7433", "node-7.example:1", "[::1]:65535"] {
+            assert_eq!(master(good).as_deref(), Ok(good));
+        }
+        assert!(listen("localhost:0").is_ok() && master("localhost:0").is_err());
+        for bad in ["", "host", "host:", ":7433", "host:70000", "::1:7433", "http://a:1", "a b:1"] {
+            assert!(master(bad).is_err(), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,243 @@
+//! What a person sees while frames are rendered, on stderr alone.
+//!
+//! On a terminal: one bar that moves with the macrotiles of the frame at hand. Elsewhere: a
+//! line now and then, so that a log of a long run stays short.
+
+use crate::style;
+use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::io::Write;
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+/// Time between two lines where stderr is no terminal. At half, a log of an hour has 1400
+/// lines; at double, a person wonders whether it still runs.
+const PLAIN_EVERY: Duration = Duration::from_secs(5);
+
+/// Everything that is drawn on this terminal; others write between its lines.
+fn terminal() -> &'static MultiProgress {
+    static ALL: OnceLock<MultiProgress> = OnceLock::new();
+    ALL.get_or_init(|| {
+        let target = if style::terminal() {
+            ProgressDrawTarget::stderr_with_hz(10)
+        } else {
+            ProgressDrawTarget::hidden()
+        };
+        MultiProgress::with_draw_target(target)
+    })
+}
+
+/// Writes to stderr without tearing a bar. A stderr that is gone is nobody's concern.
+pub(crate) fn write_on_stderr(bytes: &[u8]) {
+    terminal().suspend(|| {
+        let _ = std::io::stderr().lock().write_all(bytes);
+    });
+}
+
+/// A line on stderr.
+pub(crate) fn say_on_stderr(line: &str) {
+    write_on_stderr(format!("{line}\n").as_bytes());
+}
+
+/// `warning: ...` on stderr.
+pub(crate) fn warn(line: &str) {
+    say_on_stderr(&format!("{} {}", style::warning(), crate::fail::one_line(line)));
+}
+
+/// `note: ...` on stderr.
+pub(crate) fn note(line: &str) {
+    say_on_stderr(&format!("{} {}", style::note(), crate::fail::one_line(line)));
+}
+
+/// Where a run is.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Step {
+    /// What it waits for; empty while frames are rendered.
+    pub(crate) waiting: String,
+    /// Frames rendered.
+    pub(crate) frames: u64,
+    /// Macrotiles of the slab at hand, done and in all; (0, 0) where that is not known.
+    pub(crate) tiles: (u32, u32),
+    /// Slab at hand (from 0) and slabs of the frame at hand.
+    pub(crate) slab: (u32, u32),
+    /// The same in the master's words, where it has no numbers.
+    pub(crate) detail: String,
+}
+
+/// The progress of one run.
+pub(crate) struct Progress {
+    total: u64,
+    quiet: bool,
+    bar: Option<ProgressBar>,
+    began: Instant,
+    first: Option<Instant>,
+    said: Instant,
+    step: Step,
+}
+
+impl Progress {
+    /// Begins. `quiet` shows nothing but warnings.
+    pub(crate) fn new(quiet: bool) -> Self {
+        let now = Instant::now();
+        let bar = (style::terminal() && !quiet).then(|| {
+            let bar = terminal().add(ProgressBar::new_spinner());
+            bar.enable_steady_tick(Duration::from_millis(120));
+            bar
+        });
+        Progress { total: 0, quiet, bar, began: now, first: None, said: now, step: Step::default() }
+    }
+
+    /// Something that takes a while before the first frame (`reading brain.nii.gz`).
+    pub(crate) fn stage(&mut self, what: &str) {
+        if let Some(bar) = &self.bar {
+            bar.set_message(what.to_string());
+        }
+    }
+
+    /// Frames begin.
+    pub(crate) fn frames(&mut self, total: u64, what: &str) {
+        self.total = total;
+        self.began = Instant::now();
+        if let Some(bar) = &self.bar {
+            let template = if style::colours() {
+                "{msg:28} [{bar:30.cyan/dim}] {prefix}"
+            } else {
+                "{msg:28} [{bar:30}] {prefix}"
+            };
+            let style = ProgressStyle::with_template(template)
+                .expect("the template is ours")
+                .progress_chars("=> ");
+            bar.set_style(style);
+            bar.set_length(total * 1000);
+            self.draw();
+        } else if !self.quiet {
+            say_on_stderr(what);
+        }
+    }
+
+    /// The run went on.
+    pub(crate) fn step(&mut self, step: Step) {
+        if step.frames > 0 && self.first.is_none() {
+            self.first = Some(Instant::now());
+        }
+        let news = step.waiting != self.step.waiting && !step.waiting.is_empty();
+        let frame = step.frames > self.step.frames;
+        self.step = step;
+        if self.quiet {
+            return;
+        }
+        if self.bar.is_some() {
+            self.draw();
+        } else if news {
+            say_on_stderr(&self.step.waiting);
+            self.said = Instant::now();
+        } else if frame && self.step.frames < self.total && self.said.elapsed() >= PLAIN_EVERY {
+            let left = self.left().map(|l| format!(", about {} left", time(l)));
+            say_on_stderr(&format!(
+                "frame {} of {}, {}{}",
+                self.step.frames,
+                self.total,
+                time(self.began.elapsed()),
+                left.unwrap_or_default()
+            ));
+            self.said = Instant::now();
+        }
+    }
+
+    /// Time that is left, by the frames after the first (which pays for bricks and tables).
+    fn left(&self) -> Option<Duration> {
+        let first = self.first?;
+        let (done, todo) = (self.step.frames, self.total.saturating_sub(self.step.frames));
+        let each = if done > 1 {
+            first.elapsed().as_secs_f64() / (done - 1) as f64
+        } else {
+            (first - self.began).as_secs_f64()
+        };
+        Some(Duration::from_secs_f64(each * todo as f64))
+    }
+
+    fn draw(&self) {
+        let Some(bar) = &self.bar else { return };
+        let Step { waiting, frames, tiles, slab, detail } = &self.step;
+        let part = if slab.1 > 0 && tiles.1 > 0 {
+            (f64::from(slab.0) + f64::from(tiles.0) / f64::from(tiles.1)) / f64::from(slab.1)
+        } else {
+            0.0
+        };
+        bar.set_position(frames * 1000 + (part.clamp(0.0, 0.999) * 1000.0) as u64);
+        if !waiting.is_empty() {
+            bar.set_message(format!("frame {frames}/{}", self.total));
+            bar.set_prefix(waiting.clone());
+            return;
+        }
+        let at = (frames + 1).min(self.total);
+        bar.set_message(if tiles.1 > 0 {
+            format!("frame {at}/{}  tile {}/{}", self.total, tiles.0, tiles.1)
+        } else {
+            format!("frame {at}/{}", self.total)
+        });
+        let left = self.left().map(|l| format!("{} left  ", time(l))).unwrap_or_default();
+        bar.set_prefix(format!("{left}{detail}"));
+    }
+
+    /// Writes something else meanwhile, without tearing the bar.
+    pub(crate) fn aside<T>(&self, write: impl FnOnce() -> T) -> T {
+        terminal().suspend(write)
+    }
+
+    /// Takes the bar away.
+    pub(crate) fn end(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+impl Drop for Progress {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
+
+/// A time as a person says it.
+pub(crate) fn time(d: Duration) -> String {
+    let s = d.as_secs_f64();
+    match s {
+        _ if s < 1.0 => format!("{:.0} ms", s * 1e3),
+        _ if s < 60.0 => format!("{s:.1} s"),
+        _ if s < 3600.0 => format!("{:.0} min {:02.0} s", (s / 60.0).floor(), (s % 60.0).floor()),
+        _ => format!("{:.0} h {:02.0} min", (s / 3600.0).floor(), (s % 3600.0 / 60.0).floor()),
+    }
+}
+
+/// Bytes as a person says them.
+pub(crate) fn bytes(n: u64) -> String {
+    match n {
+        0..1024 => format!("{n} B"),
+        1024..1_048_576 => format!("{:.0} KiB", n as f64 / 1024.0),
+        1_048_576..1_073_741_824 => format!("{:.1} MiB", n as f64 / 1_048_576.0),
+        _ => format!("{:.2} GiB", n as f64 / 1_073_741_824.0),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_read_well() {
+        for (ms, want) in [
+            (3, "3 ms"),
+            (3210, "3.2 s"),
+            (61_900, "1 min 01 s"),
+            (3_599_900, "59 min 59 s"),
+            (7_260_000, "2 h 01 min"),
+        ] {
+            assert_eq!(time(Duration::from_millis(ms)), want);
+        }
+    }
+
+    #[test]
+    fn bytes_read_well() {
+        assert_eq!([bytes(5), bytes(2048), bytes(512 << 20)], ["5 B", "2 KiB", "512.0 MiB"]);
+    }
+}

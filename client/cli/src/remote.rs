@@ -1,0 +1,189 @@
+//! A cluster, seen through the client library.
+
+use crate::fail::Fail;
+use crate::output::Frame;
+use crate::progress::Step;
+use crate::render::{self, Facts, Source, Update};
+use crate::request::Asked;
+use slabcast_client::{Client, ClientError, JobState, PATIENCE, VolumeDescription};
+use slabcast_common::message::PathRequest;
+use slabcast_common::quality::Refused;
+use std::time::{Duration, Instant};
+use tokio::sync::{mpsc, watch};
+
+/// From how long on silence is worth a word. A large frame on few workers may take a while; a
+/// master that is away is dialled again meanwhile.
+const SILENCE: Duration = Duration::from_secs(5);
+
+/// How often a job that a restarted master has forgotten is submitted anew. Frames are a pure
+/// function of the request, so the rest of them fits what is there; a master that forgets more
+/// often than this is not well.
+const ANEW: u32 = 3;
+
+/// What a client's error says on a terminal.
+pub(crate) fn fail(e: &ClientError) -> Fail {
+    match e {
+        ClientError::Address { .. } => Fail::usage(format!("--master: {e}")),
+        _ => Fail::failed(e.to_string()),
+    }
+}
+
+/// A client that is connected.
+pub(crate) async fn connect(master: &str) -> Result<Client, Fail> {
+    Client::connect(master).await.map_err(|e| fail(&e))
+}
+
+/// What the master serves.
+pub(crate) async fn describe(client: &Client) -> Result<VolumeDescription, Fail> {
+    let served = client.volume().await.map_err(|e| fail(&e))?;
+    if served.pixels_version != slabcast_common::PIXELS_VERSION {
+        crate::progress::warn(&format!(
+            "{} draws pixels of version {}, this program those of {}: hashes will differ; run the \
+             same version of slabcast on both",
+            client.address(),
+            served.pixels_version,
+            slabcast_common::PIXELS_VERSION
+        ));
+    }
+    Ok(served)
+}
+
+/// Submits a path and follows it.
+pub(crate) async fn submit(
+    client: Client,
+    asked: &Asked,
+    request: PathRequest,
+) -> Result<Source, Fail> {
+    let job = client.submit(&request).await.map_err(|e| match &e {
+        // The master's words begin with the field.
+        ClientError::Refused { message } => match message.split_once(": ") {
+            Some((field, problem)) => asked.blame(&Refused::new(field, problem)),
+            None => Fail::usage(message.clone()),
+        },
+        _ => fail(&e),
+    })?;
+    let (name, job_now) = watch::channel(job);
+    let (to, updates) = mpsc::channel(1);
+    let cancel = Cancel { client: client.clone(), job: job_now };
+    tokio::spawn(async move {
+        if let Err(e) = pump(&client, request, name, &to).await {
+            let _ = to.send(Err(e)).await;
+        }
+    });
+    Ok(Source { updates, cancel: render::Cancel::Remote(cancel) })
+}
+
+/// Passes a job's updates on until its last frame.
+async fn pump(
+    client: &Client,
+    mut request: PathRequest,
+    job: watch::Sender<String>,
+    to: &mpsc::Sender<Result<Update, Fail>>,
+) -> Result<(), Fail> {
+    let (mut next, mut anew) = (0, 0);
+    loop {
+        let name = job.borrow().clone();
+        match follow(client, &name, &mut next, to).await {
+            Ok(()) => return Ok(()),
+            Err(ClientError::NotFound { .. }) if anew < ANEW => {
+                anew += 1;
+                tracing::warn!(job = name, "the master has forgotten the job: submitted again");
+                request.client_key = crate::request::client_key();
+                let name = client.submit(&request).await.map_err(|e| fail(&e))?;
+                job.send_replace(name);
+            }
+            Err(e) => return Err(fail(&e)),
+        }
+    }
+}
+
+async fn follow(
+    client: &Client,
+    job: &str,
+    next: &mut u64,
+    to: &mpsc::Sender<Result<Update, Fail>>,
+) -> Result<(), ClientError> {
+    let mut frames = client.follow(job, *next, PATIENCE).await?;
+    let mut heard = Instant::now();
+    let mut latest = Step { frames: *next, ..Step::default() };
+    loop {
+        let update = match tokio::time::timeout(SILENCE, frames.next()).await {
+            Err(_) => {
+                let s = heard.elapsed().as_secs();
+                Update::Step(Step {
+                    waiting: if latest.waiting.is_empty() && s > 10 {
+                        format!("no news from {} for {s} s", client.address())
+                    } else {
+                        latest.waiting.clone()
+                    },
+                    ..latest.clone()
+                })
+            }
+            Ok(update) => {
+                heard = Instant::now();
+                match update? {
+                    Some(slabcast_client::Update::Notice(n)) => {
+                        latest = step(&n, client.address());
+                        Update::Step(latest.clone())
+                    }
+                    Some(slabcast_client::Update::Frame(f)) => {
+                        *next = f.number + 1;
+                        latest.frames = *next;
+                        Update::Frame {
+                            facts: Facts::of(&f.stats),
+                            frame: Frame {
+                                number: f.number,
+                                size: f.size,
+                                format: f.format,
+                                bytes: f.bytes.into(),
+                                view_sha256: f.stats.view_sha256,
+                                pixels_sha256: f.stats.pixels_sha256,
+                            },
+                            stats_json: f.stats_json,
+                            trace_json: f.trace_json.unwrap_or_default(),
+                        }
+                    }
+                    None => Update::Done,
+                }
+            }
+        };
+        let done = matches!(update, Update::Done);
+        if to.send(Ok(update)).await.is_err() || done {
+            return Ok(());
+        }
+    }
+}
+
+/// A notice as a step of the bar.
+fn step(n: &slabcast_client::JobNotice, master: &str) -> Step {
+    let message = n.message.trim();
+    let waiting = match n.state {
+        JobState::WaitingForWorkers => {
+            format!("waiting for workers: start `slabcast worker --master {master}`")
+        }
+        JobState::Queued if message.is_empty() => "waiting: other jobs come first".into(),
+        JobState::Queued => message.to_string(),
+        _ => String::new(),
+    };
+    let detail = match n.state {
+        // "frame 3: slab 1 of 3, ...": the bar has the frame already.
+        JobState::Running => message.split_once(": ").map_or(message, |(_, rest)| rest).to_string(),
+        _ => String::new(),
+    };
+    Step { waiting, detail, frames: n.frames_done, ..Step::default() }
+}
+
+/// How a job of a cluster is cancelled; its name changes when it is submitted anew.
+pub(crate) struct Cancel {
+    client: Client,
+    job: watch::Receiver<String>,
+}
+
+impl Cancel {
+    pub(crate) async fn now(self) {
+        let job = self.job.borrow().clone();
+        if let Err(e) = self.client.cancel(&job).await {
+            tracing::warn!(job, error = %e, "the job could not be cancelled");
+        }
+    }
+}

@@ -1,0 +1,531 @@
+//! `slabcast render`: a view path to PNGs, by this process alone or by a cluster.
+//!
+//! Both ways are one loop over [`Update`]s; only where these come from differs ([`Source`]).
+
+use crate::embedded::{Cluster, Crew};
+use crate::fail::{Fail, say};
+use crate::output::{Folder, Frame, Lines, Writer};
+use crate::progress::{self, Progress, Step};
+use crate::request::{self, Asked, PictureArgs, QualityArgs, ViewArgs, WorkArgs};
+use crate::{remote, signals, volume};
+use slabcast_common::ids::JobId;
+use slabcast_common::path::Orientation;
+use slabcast_common::stats::FrameStats;
+use slabcast_common::volume::VolumeInfo;
+use slabcast_master::driver::SubmitError;
+use slabcast_master::jobs::{JobState, WatchItem};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use tokio::sync::mpsc;
+
+/// How long cancelling may take before the command ends without the master's word.
+const CANCEL: Duration = Duration::from_secs(2);
+
+const EXAMPLES: &str = "\
+Examples:
+  A turn about a head, 18 frames in slabcast-out/:
+      slabcast render brain.nii.gz
+  One picture from the front, large, on white:
+      slabcast render brain.nii.gz --azimuth 0 --size 2048x2048 --background white -o front/
+  A full turn in perspective, bones only:
+      slabcast render ct.nrrd --tf bone --frames 72 --projection persp -o turn/
+  On a cluster (see `slabcast master --help`):
+      slabcast render --master node1:7433 --tf vessels -o out/
+
+To try it without a file, give a volume by formula: formula:spheres, formula:marker, formula:blob.
+A path file looks like this:
+  {\"version\":1,\"size\":[512,512],\"turntable\":{\"start\":0,\"step\":10,\"frames\":36}}
+  {\"version\":1,\"size\":[512,512],\"views\":[{\"eye\":[0,400,0],\"target\":[0,0,0],\"up\":[0,0,1],
+   \"projection\":\"persp\",\"fov\":30}]}";
+
+/// Renders a view path of a volume to PNGs.
+///
+/// With VOLUME, a master and workers are started inside this process; with --master, a cluster
+/// renders the volume that its master serves.
+#[derive(clap::Args, Clone, Debug)]
+#[command(after_help = EXAMPLES)]
+pub(crate) struct RenderArgs {
+    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
+    volume: Option<PathBuf>,
+    /// Render on this master's cluster [env: SLABCAST_MASTER, where no VOLUME is given]
+    #[arg(long, value_name = "HOST:PORT", value_parser = crate::parse::master)]
+    master: Option<String>,
+    #[command(flatten)]
+    view: ViewArgs,
+    #[command(flatten)]
+    picture: PictureArgs,
+    #[command(flatten)]
+    quality: QualityArgs,
+    #[command(flatten)]
+    work: WorkArgs,
+    /// Workers inside this process [default: 1]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=64),
+          help_heading = "Work (never changes a pixel)")]
+    workers: Option<u32>,
+    /// Render threads of each worker [default: all cores, shared by the workers]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024),
+          help_heading = "Work (never changes a pixel)")]
+    threads: Option<u32>,
+    /// Folder for frame_0000.png and so on; it is made if missing
+    #[arg(
+        short,
+        long,
+        value_name = "DIR",
+        default_value = "slabcast-out/",
+        help_heading = "Output"
+    )]
+    output: PathBuf,
+    /// Replace frames that are there already
+    #[arg(long, help_heading = "Output")]
+    force: bool,
+    /// Statistics, one line of JSON a frame; - writes them to stdout
+    #[arg(long, value_name = "FILE|-", help_heading = "Output")]
+    stats: Option<PathBuf>,
+    /// Time line of all workers for Perfetto or chrome://tracing
+    #[arg(long, value_name = "FILE.json", help_heading = "Output")]
+    trace: Option<PathBuf>,
+    /// No progress, only warnings and the result
+    #[arg(short, long, help_heading = "Output")]
+    quiet: bool,
+}
+
+/// News of the job.
+pub(crate) enum Update {
+    /// Where it stands.
+    Step(Step),
+    /// A frame, its statistics and its trace.
+    Frame { frame: Frame, facts: Facts, stats_json: String, trace_json: String },
+    /// It ended with all frames delivered.
+    Done,
+}
+
+/// What of a frame's statistics a person may have to hear.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Facts {
+    relevant: u64,
+    splatted: u64,
+    incomplete: bool,
+}
+
+impl Facts {
+    pub(crate) fn of(stats: &FrameStats) -> Self {
+        Facts {
+            relevant: stats.voxels.relevant,
+            splatted: stats.voxels.splatted,
+            incomplete: !stats.poisoned.is_empty(),
+        }
+    }
+}
+
+/// Where updates come from, and how to cancel. One message of room: frames wait at the master,
+/// not here.
+pub(crate) struct Source {
+    pub(crate) updates: mpsc::Receiver<Result<Update, Fail>>,
+    pub(crate) cancel: Cancel,
+}
+
+/// How a job is cancelled.
+pub(crate) enum Cancel {
+    Embedded(slabcast_master::Handle, JobId),
+    Remote(remote::Cancel),
+}
+
+impl Cancel {
+    /// Cancels, in bounded time, whether the master hears it or not.
+    async fn now(self) {
+        let cancelled = async {
+            match self {
+                Cancel::Embedded(handle, job) => {
+                    handle.cancel(job).await;
+                }
+                Cancel::Remote(cancel) => cancel.now().await,
+            }
+        };
+        let _ = tokio::time::timeout(CANCEL, cancelled).await;
+    }
+}
+
+/// What all of a run shares.
+struct Run {
+    asked: Asked,
+    folder: Folder,
+    stays: Option<String>,
+    stats: Lines,
+    trace: Lines,
+    progress: Progress,
+    began: Instant,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
+    let master = match (&args.volume, &args.master) {
+        (Some(_), Some(_)) => {
+            return Err(Fail::usage(
+                "VOLUME, --master: a master renders the volume that it serves; leave one of the two \
+                 out",
+            ));
+        }
+        (Some(_), None) => None,
+        (None, Some(master)) => Some(master.clone()),
+        (None, None) => match std::env::var("SLABCAST_MASTER") {
+            Ok(text) => Some(
+                crate::parse::master(&text)
+                    .map_err(|e| Fail::usage(format!("SLABCAST_MASTER=`{text}`: {e}")))?,
+            ),
+            Err(_) => {
+                return Err(Fail::usage(
+                    "VOLUME: nothing to render; give a file (or formula:spheres), or --master \
+                     HOST:PORT; see `slabcast render --help`",
+                ));
+            }
+        },
+    };
+    if master.is_some() {
+        for (given, flag) in [(args.workers, "workers"), (args.threads, "threads")] {
+            if given.is_some() {
+                return Err(Fail::usage(format!(
+                    "--{flag}: workers of a cluster are started by `slabcast worker`; leave it out \
+                     with --master"
+                )));
+            }
+        }
+    }
+    let crew = Crew::new(args.workers.unwrap_or(1), args.threads)?;
+    let asked = Asked::new(&args.view, &args.picture, &args.quality, &args.work)?;
+    let frames = asked.path.frames() as u64;
+    let (folder, stays) = Folder::look(&args.output, frames, args.force)?;
+    let inputs: Vec<&Path> =
+        [&args.volume, &args.view.path].into_iter().flatten().map(PathBuf::as_path).collect();
+    let run = Run {
+        stats: Lines::open(args.stats.as_deref(), "stats", &inputs)?,
+        trace: Lines::open(args.trace.as_deref(), "trace", &inputs)?,
+        progress: Progress::new(args.quiet),
+        began: Instant::now(),
+        asked,
+        folder,
+        stays,
+    };
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .thread_name("slabcast-io")
+        .enable_all()
+        .build()
+        .map_err(|e| Fail::failed(format!("starting threads failed: {e}")))?;
+    let result = match (&args.volume, master) {
+        (Some(file), _) => {
+            let orientation = args.view.axes.orientation()?;
+            let mut run = run;
+            run.progress.stage(&format!("reading {}", file.display()));
+            let volume = volume::open(file)?;
+            runtime.block_on(embedded(run, volume, orientation, crew))
+        }
+        (None, Some(master)) => runtime.block_on(cluster(run, master)),
+        (None, None) => unreachable!("settled above"),
+    };
+    // A thread that still encodes or resolves a name must not hold the command up.
+    runtime.shutdown_timeout(Duration::from_millis(200));
+    result
+}
+
+async fn embedded(
+    mut run: Run,
+    volume: slabcast_common::volume::Volume,
+    orientation: Orientation,
+    crew: Crew,
+) -> Result<(), Fail> {
+    let name = volume.name.clone();
+    let mut cluster = Cluster::start(volume, orientation, crew)?;
+    let handle = cluster.handle();
+    let info = handle.volume().info.clone();
+    run.ready(&info, orientation)?;
+    let request = run.asked.request(run.trace.wanted());
+    let job = handle.submit(request).await.map_err(|e| match e {
+        SubmitError::Refused(refused) => run.asked.blame(&refused),
+        other => Fail::failed(format!("the master of this process takes no job: {other:?}")),
+    })?;
+    let Some(mut watch) = handle.watch(job, 0) else {
+        return Err(Fail::failed(format!("{job} was forgotten by the master of this process")));
+    };
+    let (to, updates) = mpsc::channel(1);
+    let total = run.asked.path.frames() as u64;
+    tokio::spawn(async move {
+        let mut taken = 0;
+        loop {
+            let update = match watch.next().await {
+                Some(WatchItem::Frame(f)) => {
+                    taken += 1;
+                    Ok(Update::Frame {
+                        facts: Facts::of(&f.stats),
+                        frame: Frame {
+                            number: f.number,
+                            size: f.size,
+                            format: f.format,
+                            bytes: f.bytes.clone(),
+                            view_sha256: f.stats.view_sha256.clone(),
+                            pixels_sha256: f.stats.pixels_sha256.clone(),
+                        },
+                        stats_json: f.stats_json.clone(),
+                        trace_json: f.trace_json.clone().unwrap_or_default(),
+                    })
+                }
+                Some(WatchItem::Notice(view)) => match view.state {
+                    JobState::Failed(reason) => Err(Fail::failed(reason)),
+                    JobState::Cancelled => Err(Fail::failed("the job was cancelled")),
+                    state => Ok(Update::Step(Step {
+                        waiting: match state {
+                            JobState::Preparing => "cutting the volume into bricks".into(),
+                            JobState::WaitingForWorkers => "workers are starting".into(),
+                            _ => String::new(),
+                        },
+                        frames: view.frames_done,
+                        tiles: view.tiles,
+                        slab: view.slab,
+                        detail: String::new(),
+                    })),
+                },
+                None if taken == total => Ok(Update::Done),
+                None => Err(Fail::failed("the job ended before its last frame")),
+            };
+            let over = matches!(update, Ok(Update::Done) | Err(_));
+            if to.send(update).await.is_err() || over {
+                return;
+            }
+        }
+    });
+    let source = Source { updates, cancel: Cancel::Embedded(handle, job) };
+    let what = format!("{name} by {crew}");
+    let result = tokio::select! {
+        result = run.go(source, &what, &info) => result,
+        trouble = cluster.trouble() => Err(trouble),
+    };
+    cluster.end().await;
+    result
+}
+
+async fn cluster(mut run: Run, master: String) -> Result<(), Fail> {
+    run.progress.stage(&format!("dialling {master}"));
+    let client = remote::connect(&master).await?;
+    let served = remote::describe(&client).await?;
+    run.ready(&served.info, served.orientation)?;
+    let request = run.asked.request(run.trace.wanted());
+    let source = tokio::select! {
+        source = remote::submit(client, &run.asked, request) => source?,
+        code = signals::stopped() => return Err(Fail::silent(code)),
+    };
+    let what = format!("{} on the cluster of {master}", served.name);
+    run.go(source, &what, &served.info).await
+}
+
+impl Run {
+    /// All that can be refused is; the folder is there.
+    fn ready(&mut self, info: &VolumeInfo, orientation: Orientation) -> Result<(), Fail> {
+        // From here on there may be files to clean up.
+        signals::listen();
+        self.asked.fit(info, orientation)?;
+        if let Some(notice) = request::lattice_notice(info) {
+            progress::note(&notice);
+        }
+        if let Some(stays) = self.stays.take() {
+            progress::note(&stays);
+        }
+        self.folder.make()
+    }
+
+    /// Takes frames until the last one is on disk, Ctrl-C, or trouble.
+    async fn go(self, mut source: Source, what: &str, info: &VolumeInfo) -> Result<(), Fail> {
+        let Run { asked, folder, mut stats, trace, mut progress, began, .. } = self;
+        let total = asked.path.frames() as u64;
+        let [w, h] = asked.path.size;
+        let s = if total == 1 { "" } else { "s" };
+        progress.frames(total, &format!("rendering {total} frame{s} of {w}x{h} of {what}"));
+        let folder = Arc::new(folder);
+        let mut writer = Writer::new(folder.clone());
+        let mut trace = Trace::new(trace);
+        let mut look = Look::default();
+        let (mut first, mut last) = (None, Instant::now());
+        let mut step = Step::default();
+        let ended: Result<(), Fail> = async {
+            loop {
+                tokio::select! {
+                    biased;
+                    code = signals::stopped() => return Err(Fail::silent(code)),
+                    written = writer.next_written() => { written?; }
+                    update = source.updates.recv(), if writer.has_room() => match update {
+                        Some(Ok(Update::Step(news))) => {
+                            // Frames that the master has done but that are not here yet count.
+                            step = Step { frames: news.frames.max(step.frames), ..news };
+                            progress.step(step.clone());
+                        }
+                        Some(Ok(Update::Frame { frame, facts, stats_json, trace_json })) => {
+                            last = Instant::now();
+                            first.get_or_insert(last);
+                            look.at(&frame, facts, info, &asked);
+                            stats.put(&format!("{stats_json}\n"))?;
+                            trace.put(&trace_json)?;
+                            step.frames = step.frames.max(frame.number + 1);
+                            step = Step { frames: step.frames, ..Step::default() };
+                            progress.step(step.clone());
+                            writer.put(frame);
+                        }
+                        Some(Ok(Update::Done)) => return Ok(()),
+                        Some(Err(e)) => return Err(e),
+                        None => return Err(Fail::failed("the job's updates ended early")),
+                    },
+                }
+            }
+        }
+        .await;
+        if ended.is_err() {
+            source.cancel.now().await;
+        }
+        // What is being encoded is whole in a moment: it is kept.
+        let drained = writer.drain().await;
+        let ended = ended.and(drained);
+        progress.end();
+        let on_stdout = stats.on_stdout();
+        let written = writer.written().to_vec();
+        if !written.is_empty() {
+            stats.keep()?;
+            trace.keep()?;
+        }
+        let kept = format!(
+            "{} of {total} frame{s} in {} ({})",
+            written.len(),
+            folder.shown(),
+            folder.list(&written)
+        );
+        if let Err(fail) = ended {
+            if fail.line().is_none() {
+                let kept = if written.is_empty() {
+                    "nothing was kept".into()
+                } else {
+                    format!("kept {kept}")
+                };
+                progress::say_on_stderr(&format!("stopped: {kept}"));
+            } else if !written.is_empty() {
+                progress::note(&format!("kept {kept}"));
+            }
+            return Err(fail);
+        }
+        look.warn();
+        let mut line = format!(
+            "{total} frame{s} in {} ({}), {}",
+            folder.shown(),
+            folder.list(&written),
+            progress::time(began.elapsed())
+        );
+        if let Some(first) = first
+            && total > 1
+        {
+            let each = (last - first).as_secs_f64() * 1e3 / (total - 1) as f64;
+            line += &format!(
+                ": the first after {}, then {each:.0} ms each",
+                progress::time(first - began)
+            );
+        }
+        if on_stdout {
+            progress::say_on_stderr(&line);
+        } else {
+            say(&format!("{line}\n"))?;
+        }
+        look.verdict()
+    }
+}
+
+/// Frames' time lines, put into one file.
+struct Trace {
+    lines: Lines,
+    any: bool,
+}
+
+impl Trace {
+    fn new(lines: Lines) -> Self {
+        Trace { lines, any: false }
+    }
+
+    /// Adds a frame's events (a JSON array).
+    fn put(&mut self, array: &str) -> Result<(), Fail> {
+        let events = array.trim().trim_start_matches('[').trim_end_matches(']').trim();
+        if !self.lines.wanted() || events.is_empty() {
+            return Ok(());
+        }
+        let before =
+            if self.any { ",\n" } else { "{\"displayTimeUnit\":\"ms\",\"traceEvents\":[\n" };
+        self.any = true;
+        self.lines.put(before)?;
+        self.lines.put(events)
+    }
+
+    fn keep(mut self) -> Result<(), Fail> {
+        if self.lines.wanted() {
+            let begin = if self.any { "" } else { "{\"displayTimeUnit\":\"ms\",\"traceEvents\":[" };
+            self.lines.put(&format!("{begin}\n]}}\n"))?;
+        }
+        self.lines.keep()
+    }
+}
+
+/// What is odd about the frames: a person should hear of a blank picture, and why.
+#[derive(Default)]
+struct Look {
+    blank: Vec<u64>,
+    why: Option<String>,
+    incomplete: Vec<u64>,
+}
+
+impl Look {
+    fn at(&mut self, frame: &Frame, facts: Facts, info: &VolumeInfo, asked: &Asked) {
+        if facts.incomplete {
+            self.incomplete.push(frame.number);
+        }
+        let pixel = frame.format.bytes();
+        let all_same = frame.bytes.chunks_exact(pixel).all(|p| p == &frame.bytes[..pixel]);
+        let (lo, hi) = info.summary.range();
+        let tf = asked.transfer.name();
+        let why = if facts.relevant == 0 && lo == hi {
+            format!("every value of the volume is {lo}, and `--tf {tf}` leaves that invisible")
+        } else if facts.relevant == 0 {
+            format!(
+                "no voxel is visible under `--tf {tf}` (values go from {lo} to {hi}); try another \
+                 --tf, `slabcast info` shows what each would draw"
+            )
+        } else if !all_same {
+            return;
+        } else if facts.splatted == 0 {
+            "the volume lies outside the view; check eye, target and height of the path".into()
+        } else if asked.background == slabcast_common::image::Background::Transparent
+            || frame.bytes.iter().take(3).all(|&b| b == 0)
+        {
+            format!("what is in view is too faint to see; raise the opacities of `--tf {tf}`")
+        } else {
+            // Filled by one colour, or hidden by a background of its own colour: no mistake of
+            // ours to guess.
+            return;
+        };
+        self.blank.push(frame.number);
+        self.why.get_or_insert(why);
+    }
+
+    fn warn(&self) {
+        if let Some(why) = &self.why {
+            let which = match &self.blank[..] {
+                [one] => format!("frame {one} is"),
+                many => format!("{} frames are", many.len()),
+            };
+            progress::warn(&format!("{which} blank: {why}"));
+        }
+    }
+
+    fn verdict(&self) -> Result<(), Fail> {
+        match &self.incomplete[..] {
+            [] => Ok(()),
+            some => Err(Fail::failed(format!(
+                "frame {} has tiles that were given up after three workers were lost with them \
+                 (--stats lists them as `poisoned`); see the workers' logs, then render again with \
+                 --force",
+                some.iter().map(u64::to_string).collect::<Vec<_>>().join(", ")
+            ))),
+        }
+    }
+}

@@ -1,0 +1,50 @@
+//! Ctrl-C and SIGTERM.
+
+use std::sync::atomic::{AtomicU8, Ordering};
+use tokio::sync::Notify;
+
+static CODE: AtomicU8 = AtomicU8::new(0);
+static TOLD: Notify = Notify::const_new();
+
+/// Starts to listen; without it signals end the process at once, as ever. A second signal does
+/// that all the same: whoever presses Ctrl-C twice means it.
+#[cfg(unix)]
+pub(crate) fn listen() {
+    use tokio::signal::unix::{SignalKind, signal};
+    for (kind, code) in [(SignalKind::interrupt(), 130), (SignalKind::terminate(), 143)] {
+        // No handler can be had on systems without signals: they keep their own ways.
+        let Ok(mut stream) = signal(kind) else { continue };
+        tokio::spawn(async move {
+            while stream.recv().await.is_some() {
+                if CODE.swap(code, Ordering::SeqCst) != 0 {
+                    std::process::exit(code.into());
+                }
+                TOLD.notify_waiters();
+            }
+        });
+    }
+}
+
+/// Starts to listen.
+#[cfg(not(unix))]
+pub(crate) fn listen() {
+    tokio::spawn(async {
+        while tokio::signal::ctrl_c().await.is_ok() {
+            if CODE.swap(130, Ordering::SeqCst) != 0 {
+                std::process::exit(130);
+            }
+            TOLD.notify_waiters();
+        }
+    });
+}
+
+/// Waits until the process is told to stop; gives the exit code for it (128 + signal).
+pub(crate) async fn stopped() -> u8 {
+    loop {
+        let told = TOLD.notified();
+        match CODE.load(Ordering::SeqCst) {
+            0 => told.await,
+            code => return code,
+        }
+    }
+}

@@ -3,7 +3,7 @@
 use crate::fail::{Fail, say};
 use crate::progress::{bytes, time};
 use crate::remote::{connect, fail};
-use slabcast_client::{Client, Job, JobState, VolumeDescription, Worker};
+use slabcast_client::{Client, ClientError, Job, JobState, VolumeDescription, Worker};
 use std::fmt::Write;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -55,7 +55,7 @@ pub(crate) struct CancelArgs {
 
 fn ask<T>(
     master: &str,
-    question: impl AsyncFnOnce(Client) -> Result<T, slabcast_client::ClientError>,
+    question: impl AsyncFnOnce(Client) -> Result<T, ClientError>,
 ) -> Result<T, Fail> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -63,7 +63,13 @@ fn ask<T>(
         .map_err(|e| Fail::failed(format!("starting threads failed: {e}")))?;
     let answer = runtime.block_on(async {
         let client = connect(master).await?;
-        question(client).await.map_err(|e| fail(&e))
+        question(client).await.map_err(|e| match &e {
+            ClientError::NotFound { .. } => Fail::failed(format!(
+                "{master} knows no such job; `slabcast jobs --master {master}` lists those that it \
+                 knows"
+            )),
+            _ => fail(&e),
+        })
     });
     runtime.shutdown_timeout(Duration::from_millis(200));
     answer

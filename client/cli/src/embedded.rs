@@ -107,14 +107,15 @@ impl Cluster {
         Fail::failed(format!("a worker of this process ended: {why}"))
     }
 
-    /// Ends workers and master.
+    /// Ends master and workers. The master first: it says goodbye, so that nobody takes the
+    /// workers for lost.
     pub(crate) async fn end(mut self) {
-        let _ = self.stop.send(true);
         let leave = async {
-            while self.workers.join_next().await.is_some() {}
             self.master.shutdown().await;
+            while self.workers.join_next().await.is_some() {}
         };
         let _ = tokio::time::timeout(LEAVE, leave).await;
+        let _ = self.stop.send(true);
     }
 }
 

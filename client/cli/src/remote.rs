@@ -106,12 +106,15 @@ async fn follow(
     let mut frames = client.follow(job, *next, PATIENCE).await?;
     let mut heard = Instant::now();
     let mut latest = Step { frames: *next, ..Step::default() };
+    let mut queued = false;
     loop {
         let update = match tokio::time::timeout(SILENCE, frames.next()).await {
             Err(_) => {
                 let s = heard.elapsed().as_secs();
                 Update::Step(Step {
-                    waiting: if latest.waiting.is_empty() && s > 10 {
+                    waiting: if queued {
+                        "waiting: other jobs come first".into()
+                    } else if latest.waiting.is_empty() && s > 10 {
                         format!("no news from {} for {s} s", client.address())
                     } else {
                         latest.waiting.clone()
@@ -124,6 +127,7 @@ async fn follow(
                 match update? {
                     Some(slabcast_client::Update::Notice(n)) => {
                         latest = step(&n, client.address());
+                        queued = n.state == JobState::Queued && n.message.is_empty();
                         Update::Step(latest.clone())
                     }
                     Some(slabcast_client::Update::Frame(f)) => {
@@ -161,13 +165,14 @@ fn step(n: &slabcast_client::JobNotice, master: &str) -> Step {
         JobState::WaitingForWorkers => {
             format!("waiting for workers: start `slabcast worker --master {master}`")
         }
-        JobState::Queued if message.is_empty() => "waiting: other jobs come first".into(),
-        JobState::Queued => message.to_string(),
         _ => String::new(),
     };
     let detail = match n.state {
         // "frame 3: slab 1 of 3, ...": the bar has the frame already.
-        JobState::Running => message.split_once(": ").map_or(message, |(_, rest)| rest).to_string(),
+        JobState::Running => message.split_once(": ").map_or(message, |(_, rest)| rest).into(),
+        // For a moment every job is: worth a word only when it lasts.
+        JobState::Queued if message.is_empty() => "queued".into(),
+        JobState::Queued => message.into(),
         _ => String::new(),
     };
     Step { waiting, detail, frames: n.frames_done, ..Step::default() }

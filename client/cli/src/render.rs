@@ -273,7 +273,8 @@ async fn embedded(
                     JobState::Failed(reason) => Err(Fail::failed(reason)),
                     JobState::Cancelled => Err(Fail::failed("the job was cancelled")),
                     state => Ok(Update::Step(Step {
-                        waiting: match state {
+                        waiting: String::new(),
+                        detail: match state {
                             JobState::Preparing => "cutting the volume into bricks".into(),
                             JobState::WaitingForWorkers => "workers are starting".into(),
                             _ => String::new(),
@@ -281,7 +282,6 @@ async fn embedded(
                         frames: view.frames_done,
                         tiles: view.tiles,
                         slab: view.slab,
-                        detail: String::new(),
                     })),
                 },
                 None if taken == total => Ok(Update::Done),

@@ -1,0 +1,275 @@
+//! Everything that a person can get wrong: each ends with the right exit code and one line that
+//! names what and what to do, and leaves no file behind.
+//!
+//! The real program runs, each time in a folder of its own.
+
+use std::collections::BTreeSet;
+use std::io::Write;
+use std::net::TcpListener;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+
+const SLABCAST: &str = env!("CARGO_BIN_EXE_slabcast");
+
+fn slabcast(dir: &Path, args: &[&str]) -> Command {
+    let mut command = Command::new(SLABCAST);
+    command.args(args).current_dir(dir).stdin(Stdio::null());
+    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("SLABCAST_")) {
+        command.env_remove(name);
+    }
+    command
+}
+
+fn run(dir: &Path, args: &[&str]) -> Output {
+    slabcast(dir, args).output().expect("the program starts")
+}
+
+/// Names of all files and folders beneath, hidden ones too.
+fn tree(dir: &Path) -> BTreeSet<String> {
+    let mut all = BTreeSet::new();
+    let mut open = vec![dir.to_path_buf()];
+    while let Some(dir) = open.pop() {
+        for entry in std::fs::read_dir(&dir).expect("a folder of ours") {
+            let path = entry.expect("an entry").path();
+            if path.is_dir() {
+                open.push(path.clone());
+            }
+            all.insert(path.display().to_string());
+        }
+    }
+    all
+}
+
+/// An 8-bit NRRD of `n` cubed samples.
+fn nrrd(n: usize) -> Vec<u8> {
+    let head = format!(
+        "NRRD0004\ntype: uint8\ndimension: 3\nsizes: {n} {n} {n}\nspacings: 1 1 1\nencoding: raw\n\n"
+    );
+    let mut bytes = head.into_bytes();
+    bytes.extend((0..n * n * n).map(|i| (i % 251) as u8));
+    bytes
+}
+
+fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut packed = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    packed.write_all(bytes).expect("memory");
+    packed.finish().expect("memory")
+}
+
+/// A NIfTI-1 file of 8-bit samples, in memory.
+fn nifti(n: i16) -> Vec<u8> {
+    let mut b = vec![0u8; 352];
+    b[0..4].copy_from_slice(&348i32.to_le_bytes());
+    for (i, d) in [3, n, n, n, 1, 1, 1, 1].into_iter().enumerate() {
+        b[40 + 2 * i..42 + 2 * i].copy_from_slice(&d.to_le_bytes());
+    }
+    b[70..72].copy_from_slice(&2i16.to_le_bytes());
+    b[72..74].copy_from_slice(&8i16.to_le_bytes());
+    for i in 0..4 {
+        b[76 + 4 * i..80 + 4 * i].copy_from_slice(&1f32.to_le_bytes());
+    }
+    b[108..112].copy_from_slice(&352f32.to_le_bytes());
+    b[344..348].copy_from_slice(b"n+1\0");
+    b.extend((0..n as usize * n as usize * n as usize).map(|i| (i % 200) as u8));
+    b
+}
+
+/// A folder with everything that the table below speaks of.
+fn world() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let put = |name: &str, bytes: &[u8]| std::fs::write(dir.path().join(name), bytes).expect(name);
+    put("good.nrrd", &nrrd(16));
+    put("short.nrrd", &nrrd(16)[..2000]);
+    put("empty.nrrd", b"");
+    put("text.txt", b"hello\n");
+    let packed = gzip(&nifti(24));
+    put("cut.nii.gz", &packed[..packed.len() / 2]);
+    put(
+        "huge.nrrd",
+        b"NRRD0004\ntype: uint8\ndimension: 3\nsizes: 4000000000 4000000000 4000000000\nencoding: raw\n\nx",
+    );
+    put("bad-tf.json", b"{\"version\":1,\"domain\":\"value\",\"colours\":[]}");
+    put(
+        "nan-tf.json",
+        b"{\"version\":1,\"domain\":\"value\",\"colors\":[[0,1,1,1]],\"opacities\":[[0,2]]}",
+    );
+    put("bad-path.json", b"{\"version\":1,\"size\":[9,9],\"views\":[{\"eye\":[0,0,1]}]}");
+    put("no-views.json", b"{\"version\":1,\"size\":[9,9]}");
+    let view = |eye: &str| {
+        format!(
+            "{{\"version\":1,\"size\":[9,9],\"views\":[{{\"eye\":{eye},\"target\":[0,0,0],\
+             \"up\":[0,0,1],\"projection\":\"ortho\"}}]}}"
+        )
+    };
+    put("nan-eye.json", view("[NaN,0,0]").as_bytes());
+    put("endless-eye.json", view("[1e999,0,0]").as_bytes());
+    put("eye-is-target.json", view("[0,0,0]").as_bytes());
+    put("big.json", br#"{"version":1,"size":[99999,9],"turntable":{}}"#);
+    std::fs::create_dir(dir.path().join("full")).expect("a folder");
+    put("full/frame_0000.png", b"mine");
+    put("full/frame_0003.png", b"mine");
+    dir
+}
+
+/// Runs and checks: exit code, one line, what it names, nothing left.
+#[track_caller]
+fn refused(dir: &Path, args: &[&str], code: i32, names: &[&str]) {
+    let before = tree(dir);
+    let out = run(dir, args);
+    let stderr = String::from_utf8_lossy(&out.stderr);
+    let what = format!("slabcast {}\n{stderr}", args.join(" "));
+    assert_eq!(out.status.code(), Some(code), "exit code of {what}");
+    let lines: Vec<&str> = stderr.lines().collect();
+    assert!(lines.len() == 1 && lines[0].starts_with("error: "), "one line from {what}");
+    for name in names {
+        assert!(stderr.contains(name), "`{name}` is not named by {what}");
+    }
+    assert!(out.stdout.is_empty(), "results from {what}");
+    assert_eq!(tree(dir), before, "files are left by {what}");
+}
+
+#[test]
+fn bad_files_are_named_with_the_remedy() {
+    let dir = world();
+    for (args, names) in [
+        (&["render", "missing.nrrd"][..], &["missing.nrrd"][..]),
+        (&["render", "."], &["."]),
+        (&["render", "text.txt"], &["text.txt", "NRRD"]),
+        (&["render", "empty.nrrd"], &["empty.nrrd"]),
+        (&["render", "short.nrrd"], &["short.nrrd"]),
+        (&["render", "cut.nii.gz"], &["cut.nii.gz"]),
+        (&["render", "huge.nrrd"], &["huge.nrrd", "sizes"]),
+        (&["render", "formula:nothing"], &["formula:nothing", "spheres"]),
+        (&["info", "missing.nrrd"], &["missing.nrrd"]),
+        (&["master", "--volume", "missing.nrrd", "--listen", "127.0.0.1:0"], &["missing.nrrd"]),
+        (&["render", "good.nrrd", "--tf", "missing.json"], &["missing.json"]),
+        (&["render", "good.nrrd", "--tf", "bad-tf.json"], &["bad-tf.json", "colours"]),
+        (&["render", "good.nrrd", "--tf", "nan-tf.json"], &["nan-tf.json", "opacities[0]"]),
+        (&["render", "good.nrrd", "--path", "missing.json"], &["missing.json"]),
+        (&["render", "good.nrrd", "--path", "bad-path.json"], &["bad-path.json", "target"]),
+        (&["render", "good.nrrd", "--path", "no-views.json"], &["no-views.json", "views"]),
+        (&["render", "good.nrrd", "--path", "nan-eye.json"], &["nan-eye.json", "line 1"]),
+        (&["render", "good.nrrd", "--path", "endless-eye.json"], &["endless-eye.json"]),
+        (&["render", "good.nrrd", "--path", "eye-is-target.json"], &["views[0].eye", "move"]),
+        (&["render", "good.nrrd", "--path", "big.json"], &["big.json", "size"]),
+        (&["render", "good.nrrd", "--path", "text.txt"], &["text.txt"]),
+        (&["render", "good.nrrd", "-o", "full"], &["full", "frame_0000.png", "--force"]),
+        (&["render", "good.nrrd", "-o", "text.txt"], &["text.txt", "-o"]),
+        (&["render", "good.nrrd", "-o", "/proc/slabcast/out"], &["/proc/slabcast"]),
+        (&["render", "good.nrrd", "--stats", "nowhere/s.jsonl"], &["nowhere/s.jsonl"]),
+        (&["render", "good.nrrd", "--trace", "full"], &["full"]),
+        (&["check", "golden", "--verify", "text.txt"], &["text.txt", "line 1"]),
+        (&["check", "golden", "--sample", "missing.nii.gz"], &["missing.nii.gz"]),
+        (&["check", "matrix", "missing.nrrd"], &["missing.nrrd"]),
+    ] {
+        refused(dir.path(), args, 1, names);
+    }
+}
+
+#[test]
+fn bad_flags_are_named_with_the_remedy() {
+    let dir = world();
+    let with = |more: &[&'static str]| [&["render", "good.nrrd"], more].concat();
+    for (args, names) in [
+        (vec!["render"], &["VOLUME", "--master"][..]),
+        (vec!["render", "good.nrrd", "--master", "127.0.0.1:1"], &["VOLUME", "--master"]),
+        (vec!["render", "--master", "127.0.0.1:1", "--workers", "2"], &["--workers"]),
+        (vec!["render", "--master", "nowhere"], &["--master", "HOST:PORT"]),
+        (vec!["rendr"], &["rendr", "render"]),
+        (with(&["--elevatoin", "3"]), &["--elevatoin", "--elevation"]),
+        (with(&["--tf", "bonee"]), &["--tf", "did you mean `bone`"]),
+        (with(&["--tf", "/tmp"]), &["--tf", "preset"]),
+        (with(&["--size", "0x0"]), &["--size", "512x512"]),
+        (with(&["--size", "8193x1"]), &["--size", "8192"]),
+        (with(&["--size", "99999999999x9"]), &["--size"]),
+        (with(&["--frames", "0"]), &["--frames", "1..=100000"]),
+        (with(&["--frames", "1000000000"]), &["--frames"]),
+        (with(&["--eps", "1/0"]), &["--eps", "1/512"]),
+        (with(&["--eps", "tiny"]), &["--eps", "1/512"]),
+        (with(&["--eps", "2"]), &["--eps", "0.5"]),
+        (with(&["--thickness", "nan"]), &["--thickness"]),
+        (with(&["--thickness", "0"]), &["--thickness"]),
+        (with(&["--kernel", "box"]), &["--kernel", "gaussian"]),
+        (with(&["--kernel", "tent"]), &["--kernel", "gaussian"]),
+        (with(&["--sums", "i16"]), &["--sums", "i32"]),
+        (with(&["--elevation", "91"]), &["--elevation", "90"]),
+        (with(&["--projection", "persp", "--fov", "180"]), &["--fov", "179"]),
+        (with(&["--height", "-3"]), &["--height"]),
+        (with(&["--height", "1e300"]), &["--height"]),
+        (with(&["--up", "z", "--front", "-z"]), &["--front", "--front"]),
+        (with(&["--up", "w"]), &["--up", "x, y or z"]),
+        (with(&["--tile", "48"]), &["--tile", "64"]),
+        (with(&["--slabs", "0"]), &["--slabs"]),
+        (with(&["--workers", "65"]), &["--workers", "64"]),
+        (with(&["--threads", "0"]), &["--threads", "1024"]),
+        (with(&["--workers", "64", "--threads", "1024"]), &["--workers", "--threads", "4096"]),
+        (with(&["--background", "300,0,0"]), &["--background"]),
+        (with(&["--background", "255,0,0"]), &["--background", "#ff0000"]),
+        (with(&["--azimuth", "3", "--frames", "4"]), &["--azimuth", "--frames"]),
+        (with(&["--path", "big.json", "--frames", "4"]), &["--path", "--frames"]),
+        (with(&["--stats", "good.nrrd"]), &["--stats", "good.nrrd"]),
+        (with(&["--log-level", "loud"]), &["--log-level", "info"]),
+        (
+            vec!["master", "--volume", "good.nrrd", "--listen", "0.0.0.0:0"],
+            &["--listen", "127.0.0.1", "--insecure"],
+        ),
+        (vec!["master", "--volume", "good.nrrd", "--listen", "7433"], &["--listen", "HOST:PORT"]),
+        (vec!["master"], &["--volume"]),
+        (vec!["worker"], &["--master"]),
+        (vec!["worker", "--master", "a:1", "--memory", "1"], &["--memory", "512MiB"]),
+        (vec!["worker", "--master", "a:1", "--threads", "9999"], &["--threads", "1024"]),
+    ] {
+        refused(dir.path(), &args, 2, names);
+    }
+}
+
+#[test]
+fn the_network_is_named_with_the_remedy() {
+    let dir = world();
+    // Held and never listened to again: whoever calls is turned away.
+    let free = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string();
+    for args in [
+        &["render", "--master", &free][..],
+        &["status", "--master", &free],
+        &["jobs", "--master", &free],
+        &["cancel", "job-1", "--master", &free],
+    ] {
+        refused(dir.path(), args, 1, &[&free, "slabcast master"]);
+    }
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let taken = taken.local_addr().map(|a| (taken, a.to_string())).unwrap();
+    let args = ["master", "--volume", "good.nrrd", "--listen", &taken.1];
+    refused(dir.path(), &args, 1, &[&taken.1, "in use", "another port"]);
+}
+
+#[test]
+fn frames_that_are_there_stay_as_they_are_without_force() {
+    let dir = world();
+    refused(dir.path(), &["render", "good.nrrd", "-o", "full"], 1, &["--force"]);
+    assert_eq!(std::fs::read(dir.path().join("full/frame_0000.png")).unwrap(), b"mine");
+    let args =
+        ["render", "good.nrrd", "-o", "full", "--force", "--frames", "2", "--size", "20x20", "-q"];
+    let out = run(dir.path(), &args);
+    let stderr = String::from_utf8_lossy(&out.stderr);
+    assert!(out.status.success(), "{stderr}");
+    assert!(stderr.contains("frame_0003.png of an earlier run stays"), "{stderr}");
+    let png = std::fs::read(dir.path().join("full/frame_0000.png")).unwrap();
+    assert!(png.starts_with(b"\x89PNG"));
+    let names = tree(&dir.path().join("full"));
+    assert_eq!(names.len(), 3, "{names:?}");
+}
+
+#[test]
+fn a_variable_of_the_environment_is_refused_like_its_flag() {
+    let dir = world();
+    let args = ["worker", "--master", "127.0.0.1:1"];
+    let out = slabcast(dir.path(), &args).env("SLABCAST_THREADS", "none").output().unwrap();
+    assert_eq!(out.status.code(), Some(2));
+    let args = ["master", "--volume", "good.nrrd"];
+    let out = slabcast(dir.path(), &args).env("SLABCAST_LISTEN", "0.0.0.0:1").output().unwrap();
+    assert_eq!(out.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&out.stderr).contains("--insecure"));
+    let out = slabcast(dir.path(), &["render"]).env("SLABCAST_MASTER", "x").output().unwrap();
+    assert_eq!(out.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&out.stderr).contains("SLABCAST_MASTER"));
+}

@@ -56,8 +56,7 @@ fn truth(request: &PathRequest) -> Vec<String> {
     let quality = Quality { sums: Sums::I32, ..request.quality };
     let support = Classifier::new(&transfer, &info, quality.compositing).support();
     let store = BrickStore::build(&volume, digest, &support, transfer.shading.on);
-    let bricks: Vec<_> =
-        store.infos().iter().map(|i| store.brick(i.id).unwrap().clone()).collect();
+    let bricks: Vec<_> = store.infos().iter().map(|i| store.brick(i.id).unwrap().clone()).collect();
     let spec = SceneSpec { id: SceneId(1), volume: info, transfer, quality, bricks: store.key() };
     let scene = Arc::new(Scene::new(&spec));
     (0..request.path.frames())
@@ -70,12 +69,7 @@ fn truth(request: &PathRequest) -> Vec<String> {
 }
 
 fn config(name: &str, threads: u32) -> Config {
-    Config {
-        name: name.into(),
-        threads,
-        memory_budget_bytes: 64 << 20,
-        simd: Simd::detect(),
-    }
+    Config { name: name.into(), threads, memory_budget_bytes: 64 << 20, simd: Simd::detect() }
 }
 
 fn master() -> Master {
@@ -230,11 +224,8 @@ async fn workers_over_tcp_and_one_in_the_process_share_a_frame() {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap().to_string();
     let (stop, stopped) = watch::channel(false);
-    let serving = tokio::spawn(slabcast_master::serve::serve(
-        handle.clone(),
-        listener,
-        stopped.clone(),
-    ));
+    let serving =
+        tokio::spawn(slabcast_master::serve::serve(handle.clone(), listener, stopped.clone()));
     let dialled: Vec<_> = ["tcp-a", "tcp-b"]
         .map(|name| {
             tokio::spawn(slabcast_worker::dial::run(

@@ -175,7 +175,9 @@ impl Master {
             orientation: config.orientation,
         });
         let (inbox, events) = mpsc::channel(1024);
-        let jobs = Arc::new(Jobs::new());
+        // Ids are never used again, not even by the next master at this address: a client that
+        // takes up its watch must not see another's job.
+        let jobs = Arc::new(Jobs::starting_at(unix_ms() as u64));
         let handle = Handle { inbox: inbox.clone(), jobs: jobs.clone(), served: served.clone() };
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build()?;
         let (to_finisher, sums) = std::sync::mpsc::channel::<(FrameId, finish::FrameSums)>();
@@ -351,6 +353,7 @@ struct Attached {
     tasks_done: u64,
     heard: Instant,
     since: Instant,
+    leaving: bool,
 }
 
 /// A frame that the scheduler or the finisher has.
@@ -434,8 +437,12 @@ impl Driver {
             }
             Event::Said { worker, message } => self.said(worker, message),
             Event::Detached { worker, reason } => {
-                if self.links.remove(&worker).is_some() {
-                    warn!(%worker, reason, "worker lost");
+                if let Some(attached) = self.links.remove(&worker) {
+                    if attached.leaving {
+                        info!(%worker, "worker left");
+                    } else {
+                        warn!(%worker, reason, "worker lost");
+                    }
                     self.scheduler.handle(&self.clock, Happened::WorkerLost { worker, reason });
                     self.refresh_states();
                 }
@@ -520,6 +527,7 @@ impl Driver {
             tasks_done: 0,
             heard: now,
             since: now,
+            leaving: false,
         };
         self.links.insert(worker, attached);
         self.scheduler.handle(
@@ -560,6 +568,7 @@ impl Driver {
             ToMaster::Pong { nonce, clock_us } => Happened::Pong { worker, nonce, clock_us },
             ToMaster::Leaving { reason } => {
                 info!(%worker, reason, "worker leaves");
+                attached.leaving = true;
                 Happened::WorkerLeaving { worker }
             }
         };

@@ -120,8 +120,10 @@ pub(crate) struct Jobs {
 }
 
 impl Jobs {
-    pub(crate) fn new() -> Self {
-        Jobs { table: Mutex::new(Table::default()), bell: watch::channel(0).0 }
+    /// A table whose first job has the number after `next`.
+    pub(crate) fn starting_at(next: u64) -> Self {
+        let table = Table { next, ..Table::default() };
+        Jobs { table: Mutex::new(table), bell: watch::channel(0).0 }
     }
 
     /// The table. Held for moments only, never across an await.

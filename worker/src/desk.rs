@@ -12,7 +12,7 @@ use slabcast_common::message::{
     BrickBatch, Hello, Lease, TaskTimes, TileResult, ToMaster, ToWorker,
 };
 use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION};
-use slabcast_proto::convert::Bricks;
+use slabcast_proto::convert::{self, Bricks};
 use slabcast_render::splat::Simd;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -211,7 +211,14 @@ impl Desk<'_> {
             }
             ToWorker::Frame { frame, scene, view } => {
                 if let Some(scene) = self.scenes.get(&scene) {
-                    self.frames.insert(frame, Arc::new(FrameSlot::new(scene.clone(), view)));
+                    // A view alone looks right; only with its volume can its depths be judged.
+                    match convert::check_view(&scene.spec.volume.lattice, &view) {
+                        Ok(()) => {
+                            let slot = FrameSlot::new(scene.clone(), view);
+                            self.frames.insert(frame, Arc::new(slot));
+                        }
+                        Err(e) => warn!(%frame, error = %e, "the master sent a view that is wrong"),
+                    }
                 }
             }
             ToWorker::Lease(lease) => self.lease(lease),

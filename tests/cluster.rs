@@ -1,0 +1,325 @@
+//! A cluster of real processes on localhost: master, workers, client.
+//!
+//! The story of each test: build a small cluster, let it render, do something to it, compare
+//! pixels with a run inside one process. A worker that is to die is first stopped (SIGSTOP), so
+//! that what it holds it holds when it is killed; the master's own word says that it held a
+//! tile. Waiting is polling with a deadline, never a sleep that hopes.
+
+use slabcast_client::Client;
+use slabcast_common::stats::FrameStats;
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+const SLABCAST: &str = env!("CARGO_BIN_EXE_slabcast");
+const VOLUME: &str = "formula:spheres:64";
+/// Thin sheets and a large picture: each tile takes long enough to be caught in the act.
+const VIEWS: [&str; 10] = [
+    "--size",
+    "300x280",
+    "--frames",
+    "4",
+    "--elevation",
+    "15",
+    "--thickness",
+    "0.125",
+    "--tf",
+    "auto",
+];
+
+/// A process that does not outlive its test.
+struct Process(Child);
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+impl Process {
+    fn signal(&self, name: &str) {
+        let status = Command::new("kill").args([name, &self.0.id().to_string()]).status();
+        assert!(status.expect("kill is there").success());
+    }
+
+    fn exit_within(&mut self, limit: Duration) -> Option<i32> {
+        let until = Instant::now() + limit;
+        while Instant::now() < until {
+            if let Some(status) = self.0.try_wait().expect("a child of ours") {
+                return status.code();
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        panic!("still running after {limit:?}");
+    }
+}
+
+fn master() -> (Process, String) {
+    let mut child = Command::new(SLABCAST)
+        .args(["master", "--volume", VOLUME, "--listen", "127.0.0.1:0"])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("the master starts");
+    let mut line = String::new();
+    let out = child.stdout.take().expect("piped");
+    BufReader::new(out).read_line(&mut line).expect("a line");
+    let address = line.trim().strip_prefix("listening on ").expect(&line).to_string();
+    (Process(child), address)
+}
+
+fn worker(master: &str, name: &str) -> Process {
+    let child = Command::new(SLABCAST)
+        .args(["worker", "--master", master, "--name", name, "--threads", "1"])
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("the worker starts");
+    Process(child)
+}
+
+fn stats(file: &Path) -> Vec<FrameStats> {
+    let text = std::fs::read_to_string(file).expect("statistics were written");
+    text.lines().map(|l| serde_json::from_str(l).expect("a line of statistics")).collect()
+}
+
+fn hashes(stats: &[FrameStats]) -> Vec<String> {
+    stats.iter().map(|f| f.pixels_sha256.clone()).collect()
+}
+
+fn run(command: &mut Command) -> Output {
+    let out = command.output().expect("slabcast runs");
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    out
+}
+
+/// The same views inside one process.
+fn embedded(dir: &Path) -> Vec<String> {
+    let file = dir.join("embedded.jsonl");
+    run(Command::new(SLABCAST)
+        .args(["render", VOLUME, "--workers", "1", "--threads", "1"])
+        .args(VIEWS)
+        .arg("-o")
+        .arg(dir.join("embedded"))
+        .arg("--stats")
+        .arg(&file));
+    hashes(&stats(&file))
+}
+
+fn render(dir: &Path, master: &str, name: &str) -> (Process, PathBuf) {
+    let file = dir.join(format!("{name}.jsonl"));
+    let child = Command::new(SLABCAST)
+        .args(["render", "--master", master])
+        .args(VIEWS)
+        .arg("-o")
+        .arg(dir.join(name))
+        .arg("--stats")
+        .arg(&file)
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the client starts");
+    (Process(child), file)
+}
+
+async fn until<T>(what: &str, mut look: impl AsyncFnMut() -> Option<T>) -> T {
+    let deadline = Instant::now() + Duration::from_secs(60);
+    loop {
+        if let Some(seen) = look().await {
+            return seen;
+        }
+        assert!(Instant::now() < deadline, "never seen: {what}");
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+}
+
+/// How many tiles the master says that a worker holds.
+async fn lent(client: &Client, name: &str) -> Option<u32> {
+    let workers = client.workers().await.expect("the master answers");
+    workers.iter().find(|w| w.name == name).map(|w| w.tasks_lent)
+}
+
+#[tokio::test]
+async fn a_worker_killed_with_a_tile_in_its_hands_costs_no_pixel() {
+    let dir = tempfile::tempdir().unwrap();
+    let want = embedded(dir.path());
+    let (_master, address) = master();
+    let client = Client::connect(&address).await.unwrap();
+    let (_a, victim, _c) =
+        (worker(&address, "a"), worker(&address, "victim"), worker(&address, "c"));
+    until("three workers", async || (client.workers().await.unwrap().len() == 3).then_some(()))
+        .await;
+
+    let (mut rendering, file) = render(dir.path(), &address, "out");
+    until("a tile lent to the victim", async || lent(&client, "victim").await.filter(|&n| n > 0))
+        .await;
+    victim.signal("-STOP");
+    // It can't answer any more. What was on its way meanwhile has arrived when two looks in a
+    // row say the same; a new lease may have come, too.
+    let held = until("the victim's tiles", async || {
+        let before = lent(&client, "victim").await;
+        tokio::time::sleep(Duration::from_millis(50)).await;
+        lent(&client, "victim").await.filter(|&n| n > 0 && Some(n) == before)
+    })
+    .await;
+    assert!(held > 0, "the victim is killed while tiles are leased to it");
+    victim.signal("-KILL");
+    assert_eq!(rendering.exit_within(Duration::from_secs(120)), Some(0));
+
+    let frames = stats(&file);
+    assert_eq!(hashes(&frames), want, "the same pixels as in one process");
+    let retries: u64 = frames.iter().map(|f| f.retries).sum();
+    assert!(retries >= 1, "its {held} tiles were handed out again");
+    until("the victim gone", async || lent(&client, "victim").await.is_none().then_some(())).await;
+    for i in 0..4 {
+        assert!(dir.path().join(format!("out/frame_{i:04}.png")).is_file());
+    }
+}
+
+#[tokio::test]
+async fn a_job_waits_for_workers_and_goes_on_with_those_that_come() {
+    let dir = tempfile::tempdir().unwrap();
+    let want = embedded(dir.path());
+    let (_master, address) = master();
+    let client = Client::connect(&address).await.unwrap();
+    let (mut rendering, file) = render(dir.path(), &address, "out");
+    let job = until("a job that waits for workers", async || {
+        let jobs = client.jobs(1).await.unwrap();
+        jobs.into_iter().find(|j| j.state == slabcast_proto::model::JobState::WaitingForWorkers)
+    })
+    .await;
+    assert!(job.message.contains("slabcast worker"), "says what to do: {}", job.message);
+
+    let first = worker(&address, "first");
+    until("a tile lent", async || lent(&client, "first").await.filter(|&n| n > 0)).await;
+    // One comes and one goes, politely, while a frame is rendered.
+    let _second = worker(&address, "second");
+    until("two workers", async || (client.workers().await.unwrap().len() == 2).then_some(())).await;
+    first.signal("-TERM");
+    let mut first = first;
+    assert_eq!(first.exit_within(Duration::from_secs(10)), Some(0), "a clean goodbye");
+    assert_eq!(rendering.exit_within(Duration::from_secs(120)), Some(0));
+    assert_eq!(hashes(&stats(&file)), want);
+}
+
+#[tokio::test]
+async fn a_master_that_comes_back_gets_its_workers_back() {
+    let (first, address) = master();
+    let _worker = worker(&address, "patient");
+    let client = Client::connect(&address).await.unwrap();
+    until("the worker", async || lent(&client, "patient").await).await;
+    first.signal("-TERM");
+    let mut first = first;
+    assert_eq!(first.exit_within(Duration::from_secs(10)), Some(0), "a clean goodbye");
+    let again = Command::new(SLABCAST)
+        .args(["master", "--volume", VOLUME, "--listen", &address])
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let _again = Process(again);
+    let client = until("the master", async || Client::connect(&address).await.ok()).await;
+    until("the worker again", async || {
+        client.workers().await.ok()?.iter().find(|w| w.name == "patient").map(|_| ())
+    })
+    .await;
+}
+
+/// A worker of another version is told so, with both versions, and does not try again.
+#[tokio::test]
+async fn a_worker_of_another_protocol_is_refused_by_name() {
+    use slabcast_common::message::{Hello, ToMaster, ToWorker};
+    use slabcast_proto::{convert, v1::cluster_client::ClusterClient};
+    let (_master, address) = master();
+    let hello = |protocol_version: u32, pixels_version: u32, hash: &str| Hello {
+        protocol_version,
+        pixels_version,
+        name: "stranger".into(),
+        threads: 1,
+        memory_budget_bytes: 1 << 20,
+        simd: "plain".into(),
+        self_test_sha256: hash.into(),
+        held: vec![],
+    };
+    let good = slabcast_common::SELF_TEST_SHA256;
+    let wrong = "0".repeat(64);
+    for (hello, both) in [
+        (hello(99, 1, good), ["99", "this master 1"]),
+        (hello(1, 99, good), ["99", "expects 1"]),
+        (hello(1, 1, &wrong), [&wrong[..], good]),
+    ] {
+        let mut client = ClusterClient::connect(format!("http://{address}")).await.unwrap();
+        let first = convert::from_worker_to_wire(&ToMaster::Hello(hello));
+        let stream =
+            tokio_stream::StreamExt::chain(tokio_stream::once(first), tokio_stream::pending());
+        let mut answers = client.control(stream).await.unwrap().into_inner();
+        let answer = answers.message().await.unwrap().expect("an answer");
+        let (ToWorker::Refused { reason }, None) = convert::to_worker_from_wire(answer).unwrap()
+        else {
+            panic!("let in")
+        };
+        assert!(both.iter().all(|b| reason.contains(b)), "names both: {reason}");
+        assert!(answers.message().await.unwrap().is_none(), "and the link ends");
+    }
+}
+
+/// What any gRPC client relies on: health, reflection, quick round trips.
+#[tokio::test]
+async fn health_and_reflection_answer_and_round_trips_are_quick() {
+    use tonic_health::pb::{HealthCheckRequest, health_client::HealthClient};
+    let (_master, address) = master();
+    let channel = tonic::transport::Endpoint::from_shared(format!("http://{address}"))
+        .unwrap()
+        .connect()
+        .await
+        .unwrap();
+    let mut health = HealthClient::new(channel.clone());
+    for service in ["slabcast.v1.Render", "slabcast.v1.Cluster"] {
+        let request = HealthCheckRequest { service: service.into() };
+        let status = health.check(request).await.unwrap().into_inner().status;
+        assert_eq!(status, 1, "{service} serves");
+    }
+    use tonic_reflection::pb::v1::ServerReflectionRequest;
+    use tonic_reflection::pb::v1::server_reflection_client::ServerReflectionClient;
+    use tonic_reflection::pb::v1::server_reflection_request::MessageRequest;
+    use tonic_reflection::pb::v1::server_reflection_response::MessageResponse;
+    let ask = ServerReflectionRequest {
+        host: String::new(),
+        message_request: Some(MessageRequest::ListServices(String::new())),
+    };
+    let mut answers = ServerReflectionClient::new(channel)
+        .server_reflection_info(tokio_stream::once(ask))
+        .await
+        .unwrap()
+        .into_inner();
+    let answer = answers.message().await.unwrap().unwrap().message_response;
+    let Some(MessageResponse::ListServicesResponse(list)) = answer else { panic!("a list") };
+    let names: Vec<_> = list.service.iter().map(|s| s.name.as_str()).collect();
+    assert!(names.contains(&"slabcast.v1.Render") && names.contains(&"slabcast.v1.Cluster"));
+
+    // Without TCP_NODELAY a round trip takes 40 ms; the best of many is far below.
+    let client = Client::connect(&address).await.unwrap();
+    let mut best = Duration::MAX;
+    for _ in 0..30 {
+        let before = Instant::now();
+        client.jobs(1).await.unwrap();
+        best = best.min(before.elapsed());
+    }
+    assert!(best < Duration::from_millis(20), "best round trip {best:?}");
+}
+
+/// A peer that says nothing is not held for ever.
+#[tokio::test]
+async fn a_silent_connection_is_closed() {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    let (_master, address) = master();
+    for words in [&b""[..], b"PRI * HTTP"] {
+        let mut io = tokio::net::TcpStream::connect(&address).await.unwrap();
+        io.write_all(words).await.unwrap();
+        let mut rest = Vec::new();
+        let closed = tokio::time::timeout(Duration::from_secs(10), io.read_to_end(&mut rest)).await;
+        assert!(closed.is_ok(), "still open after 10 s ({} bytes said)", words.len());
+    }
+}

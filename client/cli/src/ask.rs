@@ -12,7 +12,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 struct MasterArg {
     /// The master
     #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:7433",
-          env = "SLABCAST_MASTER", value_parser = crate::parse::master)]
+          env = "SLABCAST_MASTER", hide_env_values = true, value_parser = crate::parse::master)]
     master: String,
 }
 

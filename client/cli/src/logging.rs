@@ -16,11 +16,11 @@ use tracing_subscriber::fmt::MakeWriter;
 pub(crate) struct LogArgs {
     /// Logs on stderr as text or as JSON, one object a line
     #[arg(long, global = true, value_name = "text|json", default_value = "text",
-          env = "SLABCAST_LOG_FORMAT", value_parser = ["text", "json"])]
+          env = "SLABCAST_LOG_FORMAT", hide_env_values = true, value_parser = ["text", "json"])]
     log: String,
     /// off, error, warn, info, debug or trace, or filters such as slabcast_master=debug
     /// [default: info for master and worker, else warn]
-    #[arg(long, global = true, value_name = "LEVEL", env = "SLABCAST_LOG")]
+    #[arg(long, global = true, value_name = "LEVEL", env = "SLABCAST_LOG", hide_env_values = true)]
     log_level: Option<String>,
 }
 

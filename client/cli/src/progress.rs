@@ -65,6 +65,8 @@ pub(crate) struct Step {
 
 /// The progress of one run.
 pub(crate) struct Progress {
+    /// What is counted: `frame`.
+    noun: &'static str,
     total: u64,
     quiet: bool,
     bar: Option<ProgressBar>,
@@ -83,7 +85,22 @@ impl Progress {
             bar.enable_steady_tick(Duration::from_millis(120));
             bar
         });
-        Progress { total: 0, quiet, bar, began: now, first: None, said: now, step: Step::default() }
+        Progress {
+            noun: "frame",
+            total: 0,
+            quiet,
+            bar,
+            began: now,
+            first: None,
+            said: now,
+            step: Step::default(),
+        }
+    }
+
+    /// Counts something else than frames.
+    pub(crate) fn of(mut self, noun: &'static str) -> Self {
+        self.noun = noun;
+        self
     }
 
     /// Something that takes a while before the first frame (`reading brain.nii.gz`).
@@ -99,13 +116,14 @@ impl Progress {
         self.began = Instant::now();
         if let Some(bar) = &self.bar {
             let template = if style::colours() {
-                "{msg:28} [{bar:30.cyan/dim}] {prefix}"
+                "{prefix:32} [{bar:28.cyan/dim}] {wide_msg}"
             } else {
-                "{msg:28} [{bar:30}] {prefix}"
+                "{prefix:32} [{bar:28}] {wide_msg}"
             };
             let style = ProgressStyle::with_template(template)
                 .expect("the template is ours")
                 .progress_chars("=> ");
+            bar.set_message("");
             bar.set_style(style);
             bar.set_length(total * 1000);
             self.draw();
@@ -133,7 +151,8 @@ impl Progress {
         } else if frame && self.step.frames < self.total && self.said.elapsed() >= PLAIN_EVERY {
             let left = self.left().map(|l| format!(", about {} left", time(l)));
             say_on_stderr(&format!(
-                "frame {} of {}, {}{}",
+                "{} {} of {}, {}{}",
+                self.noun,
                 self.step.frames,
                 self.total,
                 time(self.began.elapsed()),
@@ -165,18 +184,18 @@ impl Progress {
         };
         bar.set_position(frames * 1000 + (part.clamp(0.0, 0.999) * 1000.0) as u64);
         if !waiting.is_empty() {
-            bar.set_message(format!("frame {frames}/{}", self.total));
-            bar.set_prefix(waiting.clone());
+            bar.set_prefix(format!("{} {frames}/{}", self.noun, self.total));
+            bar.set_message(waiting.clone());
             return;
         }
         let at = (frames + 1).min(self.total);
-        bar.set_message(if tiles.1 > 0 {
-            format!("frame {at}/{}  tile {}/{}", self.total, tiles.0, tiles.1)
-        } else {
-            format!("frame {at}/{}", self.total)
-        });
+        let mut here = format!("{} {at}/{}", self.noun, self.total);
+        if tiles.1 > 0 && slab.1 > 0 {
+            here += &format!("  slab {}/{}  tile {}/{}", slab.0 + 1, slab.1, tiles.0, tiles.1);
+        }
+        bar.set_prefix(here);
         let left = self.left().map(|l| format!("{} left  ", time(l))).unwrap_or_default();
-        bar.set_prefix(format!("{left}{detail}"));
+        bar.set_message(format!("{left}{detail}"));
     }
 
     /// Writes something else meanwhile, without tearing the bar.

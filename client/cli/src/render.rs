@@ -23,6 +23,9 @@ use tokio::sync::mpsc;
 const CANCEL: Duration = Duration::from_secs(2);
 
 const EXAMPLES: &str = "\
+With VOLUME, a master and workers are started inside this process; with --master, a cluster
+renders the volume that its master serves. Both give the same bytes.
+
 Examples:
   A turn about a head, 18 frames in slabcast-out/:
       slabcast render brain.nii.gz
@@ -40,9 +43,6 @@ A path file looks like this:
    \"projection\":\"persp\",\"fov\":30}]}";
 
 /// Renders a view path of a volume to PNGs.
-///
-/// With VOLUME, a master and workers are started inside this process; with --master, a cluster
-/// renders the volume that its master serves.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct RenderArgs {

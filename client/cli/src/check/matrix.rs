@@ -128,7 +128,7 @@ pub(crate) fn run(args: &MatrixArgs) -> Result<(), Fail> {
         .enable_all()
         .build()
         .map_err(|e| Fail::failed(format!("starting threads failed: {e}")))?;
-    let mut progress = Progress::new(false);
+    let mut progress = Progress::new(false).of("setting");
     let total = (cases.len() * settings.len()) as u64;
     progress.frames(
         total,

@@ -360,6 +360,9 @@ struct Attached {
 struct Flight {
     job: JobId,
     number: u64,
+    /// What is logged about it is logged inside these.
+    frame_span: tracing::Span,
+    slab_span: Option<(u32, tracing::Span)>,
 }
 
 struct Driver {
@@ -766,7 +769,8 @@ impl Driver {
             });
             let frame = FrameId(self.next_frame);
             self.next_frame += 1;
-            self.flights.insert(frame, Flight { job, number });
+            let frame_span = tracing::info_span!("frame", %job, number, id = %frame);
+            self.flights.insert(frame, Flight { job, number, frame_span, slab_span: None });
             let queued = FrameJob {
                 frame,
                 number,
@@ -831,7 +835,14 @@ impl Driver {
                     self.refresh_states();
                 }
                 Action::Progress { frame, done, total, slab, slabs } => {
-                    if let Some(f) = self.flights.get(&frame) {
+                    if let Some(f) = self.flights.get_mut(&frame) {
+                        if f.slab_span.as_ref().is_none_or(|(s, _)| *s != slab) {
+                            let span = tracing::info_span!(parent: &f.frame_span, "slab", slab);
+                            f.slab_span = Some((slab, span));
+                        }
+                        if let Some((_, span)) = &f.slab_span {
+                            debug!(parent: span, done, total, "tiles");
+                        }
                         if let Some(job) = self.jobs.lock().jobs.get_mut(&f.job) {
                             job.view.tiles = (done, total);
                             job.view.slab = (slab, slabs);
@@ -892,9 +903,9 @@ impl Driver {
     }
 
     fn finished(&mut self, job: JobId, flight: FrameId, frame: FinishedFrame) {
-        self.flights.remove(&flight);
+        let span = self.flights.remove(&flight).map_or(tracing::Span::none(), |f| f.frame_span);
         info!(
-            %job, frame = frame.number, ms = frame.stats.ms.total,
+            parent: &span, ms = frame.stats.ms.total,
             pixels_sha256 = frame.stats.pixels_sha256, "frame done"
         );
         let mut table = self.jobs.lock();

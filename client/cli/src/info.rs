@@ -192,7 +192,8 @@ fn text(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
     );
     let (lo, hi) = s.range();
     let mut values = format!("{} to {}", number(lo), number(hi));
-    if s.map != slabcast_common::volume::ValueMap::IDENTITY {
+    // A shift alone is how signed numbers are stored: nothing to tell.
+    if s.map.scale != 1.0 {
         let _ = write!(
             values,
             " (value = {} + {} x stored)",

@@ -149,8 +149,11 @@ impl Cancel {
 /// What all of a run shares.
 struct Run {
     asked: Asked,
+    /// Whether somebody said what is up, or it does not matter.
+    stands: bool,
     folder: Folder,
-    stays: Option<String>,
+    /// What to mention once nothing is refused any more.
+    notes: Vec<String>,
     stats: Lines,
     trace: Lines,
     progress: Progress,
@@ -202,9 +205,13 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         trace: Lines::open(args.trace.as_deref(), "trace", &inputs)?,
         progress: Progress::new(args.quiet),
         began: Instant::now(),
+        stands: args.quiet
+            || args.view.path.is_some()
+            || args.view.axes.up.is_some()
+            || args.view.axes.front.is_some(),
         asked,
         folder,
-        stays,
+        notes: stays.into_iter().collect(),
     };
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
@@ -235,6 +242,12 @@ async fn embedded(
     crew: Crew,
 ) -> Result<(), Fail> {
     let name = volume.name.clone();
+    if !volume.anatomical && !run.stands && !name.starts_with("formula:") {
+        run.notes.push(format!(
+            "{name} does not say what is up: {} is taken, with {} in front; see --up and --front",
+            orientation.up, orientation.front
+        ));
+    }
     let mut cluster = Cluster::start(volume, orientation, crew)?;
     let handle = cluster.handle();
     let info = handle.volume().info.clone();
@@ -323,13 +336,10 @@ impl Run {
         // From here on there may be files to clean up.
         signals::listen();
         self.asked.fit(info, orientation)?;
-        if let Some(notice) = request::lattice_notice(info) {
-            progress::note(&notice);
-        }
-        if let Some(stays) = self.stays.take() {
-            progress::note(&stays);
-        }
-        self.folder.make()
+        self.folder.make()?;
+        self.notes.extend(request::lattice_notice(info));
+        self.notes.iter().for_each(|n| progress::note(n));
+        Ok(())
     }
 
     /// Takes frames until the last one is on disk, Ctrl-C, or trouble.

@@ -455,9 +455,9 @@ pub(crate) fn lattice_notice(info: &VolumeInfo) -> Option<String> {
     let vox = lattice.vox();
     let cubic = [a, b, c].iter().all(|&s| s <= vox * 1.001);
     let why = if cubic {
-        "its axes are not at right angles".to_string()
+        "the axes are not at right angles".to_string()
     } else {
-        format!("its spacing is {a:.4} x {b:.4} x {c:.4}")
+        format!("the spacing is {a:.4} x {b:.4} x {c:.4}")
     };
     Some(format!(
         "{why}: this version draws such lattices with an approximate kernel (exact footprints come \

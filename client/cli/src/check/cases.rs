@@ -32,8 +32,11 @@ pub(crate) struct Case {
     pub(crate) size: [u32; 2],
 }
 
-/// A volume by formula, its look, and what is special about the quality.
-type Formula = (&'static str, &'static str, &'static str, fn(&mut Quality));
+/// What is special about a quality.
+type Tweak = fn(&mut Quality);
+
+/// A volume by formula, its case's name, its look, and what is special about the quality.
+type Formula = (&'static str, &'static str, &'static str, Tweak);
 
 /// What formula volumes are there for: shaded and opaque; faint and unlit, where nothing hides
 /// anything; 16-bit; float with a ramp of opacity; step edges in thin sheets; one voxel; a line
@@ -84,7 +87,7 @@ pub(crate) fn of_golden(sample: &Path) -> Result<Vec<Case>, Fail> {
     const SIZE: [u32; 2] = [256, 208];
     let volume = Arc::new(volume::open(sample)?);
     let mut cases = Vec::new();
-    let looks: [(&str, &str, fn(&mut Quality)); 4] = [
+    let looks: [(&str, &str, Tweak); 4] = [
         ("auto", "auto", |_| {}),
         ("grey", "grey", |_| {}),
         ("peer-opaque", "peer-opaque", |_| {}),

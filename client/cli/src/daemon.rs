@@ -88,7 +88,7 @@ pub(crate) struct WorkerArgs {
     #[arg(long, value_name = "N", env = "SLABCAST_THREADS", hide_env_values = true,
           value_parser = clap::value_parser!(u32).range(1..=1024))]
     threads: Option<u32>,
-    /// Memory for bricks; the process needs some 50 MiB and each thread some 10 MiB beside it
+    /// Memory for bricks; the process takes some 30 MiB beside them
     #[arg(long, value_name = "BYTES", default_value = "512MiB", env = "SLABCAST_MEMORY", hide_env_values = true,
           value_parser = parse::memory)]
     memory: u64,

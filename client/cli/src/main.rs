@@ -140,14 +140,23 @@ fn not_understood(e: &clap::Error) -> u8 {
             let _ = e.print();
             2
         }
-        _ => Fail::usage(one_sentence(&e.to_string())).end(),
+        _ => {
+            let typed: Vec<String> = std::env::args().skip(1).collect();
+            Fail::usage(one_sentence(&e.to_string(), &typed)).end()
+        }
     }
 }
 
 /// Clap's paragraphs as one line: what is wrong, its tips, and where to read on.
-fn one_sentence(text: &str) -> String {
+fn one_sentence(text: &str, typed: &[String]) -> String {
     let mut parts: Vec<String> = Vec::new();
-    let mut help = "slabcast --help".to_string();
+    // Where clap says no usage, the first word tells.
+    let mut help = match typed.first() {
+        Some(name) if Cli::command().find_subcommand(name).is_some() => {
+            format!("slabcast {name} --help")
+        }
+        _ => "slabcast --help".to_string(),
+    };
     for line in text.lines().map(str::trim).filter(|l| !l.is_empty()) {
         if let Some(usage) = line.strip_prefix("Usage: ") {
             // `slabcast render [OPTIONS] ...`: the words before the first that is no name.
@@ -160,6 +169,7 @@ fn one_sentence(text: &str) -> String {
             parts.push(tip.replace('\'', "`"));
         } else {
             let line = line.strip_prefix("error: ").unwrap_or(line);
+            let line = line.strip_prefix('[').and_then(|l| l.strip_suffix(']')).unwrap_or(line);
             match parts.last_mut() {
                 // The list that a colon announced.
                 Some(last) if last.ends_with(':') || last.ends_with('>') => {
@@ -201,7 +211,8 @@ mod tests {
 
     fn says(line: &str) -> String {
         let e = Cli::try_parse_from(line.split_whitespace()).unwrap_err();
-        one_sentence(&e.to_string())
+        let typed: Vec<String> = line.split_whitespace().skip(1).map(String::from).collect();
+        one_sentence(&e.to_string(), &typed)
     }
 
     #[test]
@@ -220,7 +231,7 @@ mod tests {
             (
                 "slabcast render x --eps tiny",
                 "invalid value `tiny` for `--eps <E>`: give a number or a fraction, like 0.002 or \
-                 1/512; see `slabcast --help`",
+                 1/512; see `slabcast render --help`",
             ),
         ] {
             assert_eq!(says(line), want);

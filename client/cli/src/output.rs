@@ -187,6 +187,9 @@ pub(crate) fn encode_png(frame: &Frame, out: &mut impl Write) -> std::io::Result
     });
     png.set_depth(png::BitDepth::Eight);
     png.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
+    // Fast: 0.9 ms for a rendered 512x512 picture of 236 kB, 160 ms for 8192x8192. The next
+    // better one (Balanced) takes 23 ms and 2.7 s, for files a fifth to a third smaller: longer
+    // than rendering on a good machine.
     png.set_compression(png::Compression::Fast);
     for (key, text) in [
         ("Software", concat!("slabcast ", env!("CARGO_PKG_VERSION"))),
@@ -208,9 +211,9 @@ pub(crate) struct Writer {
     written: Vec<u64>,
 }
 
-/// Frames that are encoded at once or wait for it. Encoding takes some 15 ms for 512x512 and
-/// rendering ten times that, so two keep up; each holds a whole frame's pixels (200 MB at
-/// 8192x8192), so not many more.
+/// Frames that are encoded at once or wait for it. Encoding takes a hundredth of rendering; what
+/// takes time is the sync to disk, during which a second one encodes. Each holds a frame's
+/// pixels (200 MB at 8192x8192), so not many more.
 const AT_ONCE: usize = 2;
 
 impl Writer {

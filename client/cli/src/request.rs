@@ -17,6 +17,7 @@ use slabcast_common::quality::{
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::view::View;
 use slabcast_common::volume::VolumeInfo;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// Largest transfer function or path file that is read: a path of 100,000 views has 20 MB.
@@ -218,7 +219,9 @@ impl Transfer {
             return Ok(Transfer { choice: TransferChoice::Name(text.into()), file: None });
         }
         let path = Path::new(text);
-        if !(path.is_file() || text.ends_with(".json")) {
+        // A pipe (`<(...)` of a shell) is a file, too.
+        let there = path.metadata().is_ok_and(|m| !m.is_dir());
+        if !(there || text.ends_with(".json")) {
             return Err(Fail::flag(&unknown_preset(text)));
         }
         let json = read_json(path)?;
@@ -256,19 +259,20 @@ fn unknown_preset(name: &str) -> Refused {
 }
 
 fn read_json(path: &Path) -> Result<String, Fail> {
-    let meta = std::fs::metadata(path).map_err(|e| Fail::io(path, "reading", &e))?;
-    if !meta.is_file() {
-        return Err(Fail::failed(format!("{}: is not a file; give a JSON file", path.display())));
+    let fail = |e: &std::io::Error| Fail::io(path, "reading", e);
+    let file = std::fs::File::open(path).map_err(|e| fail(&e))?;
+    if file.metadata().map_err(|e| fail(&e))?.is_dir() {
+        return Err(Fail::failed(format!("{}: is a folder; give a JSON file", path.display())));
     }
-    if meta.len() > MAX_JSON_BYTES {
+    let mut bytes = Vec::new();
+    file.take(MAX_JSON_BYTES + 1).read_to_end(&mut bytes).map_err(|e| fail(&e))?;
+    if bytes.len() as u64 > MAX_JSON_BYTES {
         return Err(Fail::failed(format!(
-            "{}: has {} MB; at most {} MB are read",
+            "{}: has more than {} MB, which is no view path or transfer function",
             path.display(),
-            meta.len() / 1_000_000,
             MAX_JSON_BYTES / 1_000_000
         )));
     }
-    let bytes = std::fs::read(path).map_err(|e| Fail::io(path, "reading", &e))?;
     String::from_utf8(bytes)
         .map_err(|_| Fail::failed(format!("{}: is not text; give a JSON file", path.display())))
 }

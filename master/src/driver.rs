@@ -1,7 +1,7 @@
 //! The thread that owns the scheduler.
 //!
 //! Everything that happens (a worker's message, a client's request, a finished picture, a
-//! deadline) reaches it as an [`Event`] in one bounded queue; it hands what concerns the
+//! deadline) reaches it as an event in one bounded queue; it hands what concerns the
 //! schedule to the pure state machine and carries out its wishes. It never waits for a worker,
 //! a disk or a client: links are channels, bricks are built and frames finished on threads of
 //! their own. It has a runtime of its own (one thread) for its queue and its timer alone, so

@@ -6,11 +6,15 @@
 //! - [`tile`] is what workers run: lazy bucket toss, a ring of open sheets, bricks and voxels
 //!   tested against the occlusion map. It must give the oracle's bytes, always.
 //!
-//! They share what a pixel *is*: the kernel's profile and sections ([`footprint`]) and the
+//! Beside them [`reference`] judges how far both are from the limit: a gather along true rays in
+//! f64 that shares none of their arithmetic.
+//!
+//! The two share what a pixel *is*: the kernel's profile and sections ([`footprint`]) and the
 //! arithmetic of a closing sheet ([`sheet`]). This crate refuses to know threads, networks and
 //! clocks; whoever calls it has those.
 
 pub mod footprint;
+pub mod reference;
 pub mod scene;
 pub mod selftest;
 pub mod serial;

@@ -11,6 +11,7 @@
 #   6. prints a verdict and takes everything down again (images stay).
 #
 # deploy/try-docker.sh [VOLUME]      exit code 0: the same pixels
+# SLABCAST_UP=-y and the like are passed on, for volumes that do not say how they stand.
 set -euo pipefail
 repo=$(cd "$(dirname "$0")/.." && pwd)
 volume=$(realpath "${1:-$repo/samples/mni152_t1.nii.gz}")
@@ -67,7 +68,7 @@ say "image"
 docker image inspect --format '{{.Id}} {{.Size}} bytes, user {{.Config.User}}' slabcast:0.1.0
 
 say "the same frames in one process"
-"$binary" render "$volume" "${view[@]}" --stats "$work/alone.jsonl" -o "$work/alone"
+"$binary" render "$volume" ${SLABCAST_UP:+"--up=$SLABCAST_UP"} "${view[@]}" --stats "$work/alone.jsonl" -o "$work/alone"
 hashes() { grep -o '"pixels_sha256":"[0-9a-f]*"' "$1"; }
 hashes "$work/alone.jsonl" >"$work/alone.hashes"
 frames=$(wc -l <"$work/alone.hashes")

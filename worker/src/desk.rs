@@ -378,3 +378,178 @@ impl Desk<'_> {
         at.saturating_duration_since(self.epoch).as_micros() as u64
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use slabcast_common::brick::{Brick, BrickGrid};
+    use slabcast_common::ids::{Epoch, WorkerId};
+    use slabcast_common::image::TileState;
+    use slabcast_common::message::SceneSpec;
+    use slabcast_common::occlusion::Rect;
+    use slabcast_common::path::{Orientation, Turntable, ViewPath};
+    use slabcast_common::presets;
+    use slabcast_common::quality::{Quality, Sums};
+    use slabcast_common::slab::SheetRange;
+    use slabcast_common::view::View;
+    use slabcast_common::volume::{Digest32, Samples, Volume};
+
+    const FRAME: FrameId = FrameId(5);
+    const SET: BrickSetKey = BrickSetKey(Digest32([7; 32]));
+
+    /// A master's end of a link, and a worker behind it.
+    struct World {
+        control: mpsc::UnboundedSender<ToWorker>,
+        bricks: mpsc::Sender<Bricks>,
+        replies: mpsc::Receiver<ToMaster>,
+        stop: watch::Sender<bool>,
+        ended: tokio::task::JoinHandle<std::io::Result<Ended>>,
+    }
+
+    /// Two full bricks beside each other.
+    fn brick(id: u32) -> Arc<Brick> {
+        Arc::new(Brick {
+            id: BrickId(id),
+            index: (0..512).collect(),
+            values: Samples::U8(vec![200; 512]),
+            normals: None,
+        })
+    }
+
+    impl World {
+        /// A worker that was let in and knows a frame of 32x32 pixels.
+        async fn new() -> World {
+            let (control, control_rx) = mpsc::unbounded_channel();
+            let (bricks, bricks_rx) = mpsc::channel(8);
+            let (replies_tx, replies) = mpsc::channel(64);
+            let (stop, stopped) = watch::channel(false);
+            let ended = tokio::spawn(async move {
+                let config = Config {
+                    name: "w".into(),
+                    threads: 1,
+                    memory_budget_bytes: 1 << 20,
+                    simd: Simd::plain(),
+                };
+                let link = Link { control: control_rx, replies: replies_tx, bricks: bricks_rx };
+                run(&config, link, &mut BrickCache::default(), stopped).await
+            });
+            let mut world = World { control, bricks, replies, stop, ended };
+            assert!(matches!(world.hear().await, ToMaster::Hello(_)), "the hello comes first");
+
+            let volume = Volume::from_fn_u8("pair", [16, 8, 8], |_, _, _| 200);
+            assert_eq!(BrickGrid::of(volume.lattice.dims).len(), 2);
+            let quality = Quality { sums: Sums::I32, ..Quality::default() };
+            let mut transfer = presets::by_name("peer-opaque", &volume.summary).unwrap();
+            transfer.shading.on = false;
+            let path = ViewPath::turn([32, 32], Turntable::default());
+            let orientation = Orientation::new(None, None).unwrap();
+            let camera = path.camera(0, &volume.lattice, orientation).unwrap();
+            let view = View::new(&volume.lattice, &camera, [32, 32], &quality).unwrap();
+            let id = SceneId(3);
+            let volume = volume.info(Digest32::default());
+            let spec = SceneSpec { id, volume, transfer, quality, bricks: SET };
+            world.say(ToWorker::Welcome { worker: WorkerId(1), heartbeat_ms: 60_000 });
+            world.say(ToWorker::Scene(Arc::new(spec)));
+            world.say(ToWorker::Frame { frame: FRAME, scene: id, view });
+            world
+        }
+
+        fn say(&self, message: ToWorker) {
+            self.control.send(message).expect("the worker listens");
+        }
+
+        async fn hear(&mut self) -> ToMaster {
+            let heard = tokio::time::timeout(Duration::from_secs(20), self.replies.recv()).await;
+            heard.expect("an answer in time").expect("the worker is there")
+        }
+
+        async fn send(&mut self, id: u32) {
+            let batch = BrickBatch { set: SET, bricks: vec![brick(id)], broken: vec![] };
+            self.bricks.send(Bricks::Batch(batch)).await.expect("the worker listens");
+            let heard = self.hear().await;
+            assert_eq!(heard, ToMaster::BricksIn { set: SET, bricks: 1 });
+        }
+
+        fn lease(&self, task: u64, bricks: &[u32]) {
+            self.say(ToWorker::Lease(Box::new(Lease {
+                task: TaskId(task),
+                epoch: Epoch(0),
+                frame: FRAME,
+                tile: Rect::new(0, 0, 32, 32),
+                slab: SheetRange::new(-20, 20),
+                bricks: bricks.iter().map(|&id| BrickId(id)).collect(),
+                state: TileState { a: vec![0.0; 32 * 32], last: None },
+            })));
+        }
+
+        /// All that was said before this has been handled when the pong comes.
+        async fn settle(&mut self) {
+            self.say(ToWorker::Ping { nonce: 77 });
+            let heard = self.hear().await;
+            assert!(matches!(heard, ToMaster::Pong { nonce: 77, .. }), "not yet: {heard:?}");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_lease_waits_for_its_last_brick() {
+        let mut world = World::new().await;
+        world.lease(1, &[0, 1]);
+        world.settle().await;
+        world.send(1).await;
+        world.settle().await;
+        world.send(0).await;
+        let ToMaster::Result(result) = world.hear().await else { panic!("a result") };
+        assert_eq!((result.task, result.pixels.a.len()), (TaskId(1), 32 * 32));
+        assert!(result.pixels.a.iter().any(|&a| a > 0.9), "both bricks were drawn");
+        assert!(result.times.ready_us >= result.times.received_us);
+    }
+
+    /// Control and bricks have no order: a lease that was written after "forget 0" may come
+    /// before it. Its brick 0 is the one that is sent again.
+    #[tokio::test]
+    async fn a_brick_that_is_dropped_under_a_waiting_lease_is_waited_for_again() {
+        let mut world = World::new().await;
+        world.send(0).await;
+        world.lease(1, &[0, 1]);
+        world.settle().await;
+        let drop = ToWorker::DropBricks { set: SET, bricks: vec![BrickId(0)] };
+        world.bricks.send(Bricks::Message(drop)).await.unwrap();
+        world.send(1).await;
+        world.settle().await;
+        world.send(0).await;
+        assert!(matches!(world.hear().await, ToMaster::Result(_)));
+    }
+
+    #[tokio::test]
+    async fn leases_that_make_no_sense_are_answered_not_obeyed() {
+        let mut world = World::new().await;
+        world.lease(1, &[0, 1]);
+        world.say(ToWorker::EndFrame { frame: FRAME });
+        world.lease(2, &[0]);
+        let ToMaster::Failed { task, reason, .. } = world.hear().await else { panic!("refused") };
+        assert!(task == TaskId(2) && reason.contains("never announced"), "{reason}");
+        // The first was dropped with its frame: its bricks wake nobody.
+        world.send(0).await;
+        world.send(1).await;
+        world.settle().await;
+    }
+
+    #[tokio::test]
+    async fn a_worker_that_is_told_to_stop_says_goodbye_and_ends() {
+        let mut world = World::new().await;
+        world.lease(1, &[0]);
+        world.settle().await;
+        world.stop.send(true).unwrap();
+        assert!(matches!(world.hear().await, ToMaster::Leaving { .. }));
+        assert_eq!(world.ended.await.unwrap().unwrap(), Ended::Stopped);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_master_that_falls_silent_is_left() {
+        let world = World::new().await;
+        let World { control: _control, bricks: _bricks, replies: _replies, stop: _stop, ended } =
+            world;
+        let Ended::Lost(reason) = ended.await.unwrap().unwrap() else { panic!("lost") };
+        assert!(reason.contains("silent"), "{reason}");
+    }
+}

@@ -503,7 +503,7 @@ impl Look {
         } else if !all_same {
             return;
         } else if facts.splatted == 0 {
-            "the volume lies outside the view; check eye, target and height of the path".into()
+            "the volume lies outside the view, or between its pixels; check eye, target and height, or ask for a larger --size".into()
         } else if asked.background == slabcast_common::image::Background::Transparent
             || frame.bytes.iter().take(3).all(|&b| b == 0)
         {

@@ -6,8 +6,8 @@
 //! - [`tile`] is what workers run: lazy bucket toss, a ring of open sheets, bricks and voxels
 //!   tested against the occlusion map. It must give the oracle's bytes, always.
 //!
-//! Beside them [`reference`] judges how far both are from the limit: a gather along true rays in
-//! f64 that shares none of their arithmetic.
+//! Beside them [`mod@reference`] judges how far both are from the limit: a gather along true rays
+//! in f64 that shares none of their arithmetic.
 //!
 //! The two share what a pixel *is*: the kernel's profile and sections ([`footprint`]) and the
 //! arithmetic of a closing sheet ([`sheet`]). This crate refuses to know threads, networks and

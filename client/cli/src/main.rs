@@ -5,7 +5,8 @@
 //!   [`progress`] shows what goes on meanwhile.
 //! - [`daemon`] is `master` and `worker`.
 //! - [`info`] looks into files, [`ask`] at a running master.
-//! - [`check`] compares pictures with the oracle over every way to make them.
+//! - [`check`] compares pictures with the oracle over every way to make them; [`error`] says how
+//!   far one is from the truth.
 //!
 //! This is the only crate that sees all others. It decides nothing about pixels and schedules.
 //! Results go to stdout, everything else to stderr; every failure is one line ([`fail`]).
@@ -14,6 +15,7 @@ mod ask;
 mod check;
 mod daemon;
 mod embedded;
+mod error;
 mod fail;
 mod info;
 mod logging;
@@ -66,6 +68,7 @@ enum Command {
     Status(ask::StatusArgs),
     Jobs(ask::JobsArgs),
     Cancel(ask::CancelArgs),
+    Error(Box<error::ErrorArgs>),
     Check(check::CheckArgs),
     /// Prints completions for a shell.
     #[command(after_help = "\
@@ -110,6 +113,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
         Command::Status(args) => ask::status(args),
         Command::Jobs(args) => ask::jobs(args),
         Command::Cancel(args) => ask::cancel(args),
+        Command::Error(args) => error::run(args),
         Command::Check(args) => check::run(args),
         Command::Completions { shell } => {
             let mut script = Vec::new();

@@ -195,7 +195,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         }
     }
     let crew = Crew::new(args.workers.unwrap_or(1), args.threads)?;
-    let asked = Asked::new(&args.view, &args.picture, &args.quality, &args.work)?;
+    let asked = Asked::new(&args.view, &args.picture, &args.quality, args.work.work()?)?;
     let frames = asked.path.frames() as u64;
     let (folder, stays) = Folder::look(&args.output, frames, args.force)?;
     let inputs: Vec<&Path> =

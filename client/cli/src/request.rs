@@ -192,7 +192,7 @@ pub(crate) struct WorkArgs {
 }
 
 impl WorkArgs {
-    fn work(&self) -> Result<Work, Fail> {
+    pub(crate) fn work(&self) -> Result<Work, Fail> {
         let w = Work {
             slabs: self.slabs,
             tiles_per_worker: self.tiles_per_worker,
@@ -294,10 +294,9 @@ impl Asked {
         view: &ViewArgs,
         picture: &PictureArgs,
         quality: &QualityArgs,
-        work: &WorkArgs,
+        work: Work,
     ) -> Result<Self, Fail> {
         let quality = quality.quality()?;
-        let work = work.work()?;
         view.axes.orientation()?;
         let path = match &view.path {
             Some(file) => {
@@ -490,7 +489,7 @@ mod tests {
     fn asked(line: &str) -> Result<Asked, String> {
         let f = Flags::try_parse_from(std::iter::once("x").chain(line.split_whitespace()))
             .map_err(|e| e.to_string())?;
-        Asked::new(&f.view, &f.picture, &f.quality, &f.work)
+        Asked::new(&f.view, &f.picture, &f.quality, f.work.work()?)
             .map_err(|e| e.line().unwrap_or_default().to_string())
     }
 

@@ -489,7 +489,9 @@ mod tests {
     fn asked(line: &str) -> Result<Asked, String> {
         let f = Flags::try_parse_from(std::iter::once("x").chain(line.split_whitespace()))
             .map_err(|e| e.to_string())?;
-        Asked::new(&f.view, &f.picture, &f.quality, f.work.work()?)
+        f.work
+            .work()
+            .and_then(|work| Asked::new(&f.view, &f.picture, &f.quality, work))
             .map_err(|e| e.line().unwrap_or_default().to_string())
     }
 

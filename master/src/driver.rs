@@ -15,6 +15,7 @@ use slabcast_common::message::{Hello, PathRequest, SceneSpec, ToMaster, ToWorker
 use slabcast_common::path::Orientation;
 use slabcast_common::presets;
 use slabcast_common::quality::{Refused, Sums};
+use slabcast_common::stats::FrameStats;
 use slabcast_common::transfer::{Classifier, Support, TransferFunction};
 use slabcast_common::view::{Projected, View};
 use slabcast_common::volume::{Volume, VolumeInfo};
@@ -841,7 +842,7 @@ impl Driver {
                             f.slab_span = Some((slab, span));
                         }
                         if let Some((_, span)) = &f.slab_span {
-                            debug!(parent: span, done, total, "tiles");
+                            span.in_scope(|| debug!(done, total, "tiles"));
                         }
                         if let Some(job) = self.jobs.lock().jobs.get_mut(&f.job) {
                             job.view.tiles = (done, total);
@@ -869,7 +870,7 @@ impl Driver {
         &mut self,
         frame: FrameId,
         state: Box<slabcast_common::image::FrameState>,
-        stats: Box<slabcast_common::stats::FrameStats>,
+        stats: Box<FrameStats>,
         spans: Vec<slabcast_schedule::Span>,
     ) {
         let Some(flight) = self.flights.get(&frame) else { return };
@@ -904,10 +905,10 @@ impl Driver {
 
     fn finished(&mut self, job: JobId, flight: FrameId, frame: FinishedFrame) {
         let span = self.flights.remove(&flight).map_or(tracing::Span::none(), |f| f.frame_span);
-        info!(
-            parent: &span, ms = frame.stats.ms.total,
-            pixels_sha256 = frame.stats.pixels_sha256, "frame done"
-        );
+        span.in_scope(|| {
+            let FrameStats { ms, pixels_sha256, .. } = &frame.stats;
+            info!(ms = ms.total, pixels_sha256, "frame done");
+        });
         let mut table = self.jobs.lock();
         let mut over = false;
         if let Some(j) = table.jobs.get_mut(&job) {

@@ -2,7 +2,7 @@
 
 use crate::brick::BrickSetKey;
 use crate::math::linear_from_srgb;
-use crate::quality::{Compositing, Refused};
+use crate::quality::{Compositing, Refused, Sums};
 use crate::shade::Shading;
 use crate::volume::{Digest32, SampleKind, Samples, ValueSummary, VolumeInfo};
 use serde::{Deserialize, Serialize};
@@ -332,6 +332,23 @@ impl Classifier {
         self.uncapped
     }
 
+    /// What sheets add in, decided from what was asked for: integers wherever extinctions are
+    /// capped, else floats.
+    ///
+    /// # Errors
+    /// Integers asked for where they can't hold the extinction.
+    pub fn sums(&self, asked: Sums) -> Result<Sums, Refused> {
+        match asked {
+            Sums::Auto if self.uncapped => Ok(Sums::F32),
+            Sums::Auto => Ok(Sums::I32),
+            Sums::I32 | Sums::I16 if self.uncapped => Err(Refused::new(
+                "sums",
+                "this transfer function's extinction needs `f32`; use it or `auto`",
+            )),
+            sums => Ok(sums),
+        }
+    }
+
     /// Which codes are relevant (extinction above zero).
     pub fn support(&self) -> Support {
         let mut intervals: Vec<(f64, f64)> = Vec::new();
@@ -487,6 +504,8 @@ mod tests {
         let c = Classifier::new(&tf, &info, Compositing::Linear);
         assert_eq!(c.look(&Samples::U8(vec![3]), 0).sigma, 1e6);
         assert!(c.uncapped());
+        assert_eq!(c.sums(Sums::Auto), Ok(Sums::F32));
+        assert_eq!(c.sums(Sums::I32).unwrap_err().field, "sums");
     }
 
     #[test]

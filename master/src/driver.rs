@@ -14,7 +14,7 @@ use slabcast_common::ids::{FrameId, JobId, SceneId, WorkerId};
 use slabcast_common::message::{Hello, PathRequest, SceneSpec, ToMaster, ToWorker, TransferChoice};
 use slabcast_common::path::Orientation;
 use slabcast_common::presets;
-use slabcast_common::quality::{Refused, Sums};
+use slabcast_common::quality::{Quality, Refused};
 use slabcast_common::stats::FrameStats;
 use slabcast_common::transfer::{Classifier, Support, TransferFunction};
 use slabcast_common::view::{Projected, View};
@@ -645,16 +645,8 @@ impl Driver {
             })
             .collect::<Result<Vec<View>, Refused>>()?;
         let classifier = Classifier::new(&transfer, info, request.quality.compositing);
-        let mut quality = request.quality;
-        quality.sums = match quality.sums {
-            Sums::Auto if classifier.uncapped() => Sums::F32,
-            Sums::Auto => Sums::I32,
-            Sums::I32 if classifier.uncapped() => {
-                let problem = "this transfer function's extinction needs `f32`; use it or `auto`";
-                return Err(Refused::new("sums", problem).into());
-            }
-            sums => sums,
-        };
+        let sums = classifier.sums(request.quality.sums)?;
+        let quality = Quality { sums, ..request.quality };
         let support = classifier.support();
         let normals = transfer.shading.on;
         let held = self

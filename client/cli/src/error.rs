@@ -90,11 +90,7 @@ pub(crate) fn run(args: &ErrorArgs) -> Result<(), Fail> {
     let view =
         View::new(&info.lattice, &camera, size, &asked.quality).map_err(|e| asked.blame(&e))?;
     let classifier = Classifier::new(&transfer, &info, asked.quality.compositing);
-    let sums = match asked.quality.sums {
-        Sums::Auto | Sums::I32 if classifier.uncapped() => Sums::F32,
-        Sums::Auto => Sums::I32,
-        sums => sums,
-    };
+    let sums = classifier.sums(asked.quality.sums).map_err(|e| asked.blame(&e))?;
     let (support, normals) = (classifier.support(), transfer.shading.on);
     let store = BrickStore::build(&volume, info.digest, &support, normals);
     let bricks: Vec<_> = store.infos().iter().filter_map(|i| store.brick(i.id).cloned()).collect();

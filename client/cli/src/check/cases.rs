@@ -174,11 +174,7 @@ impl Case {
     /// The serial renderer's hashes of both views.
     pub(crate) fn truth(&self) -> Result<Vec<Digest32>, Fail> {
         let classifier = Classifier::new(&self.transfer, &self.info, self.quality.compositing);
-        let sums = match self.quality.sums {
-            Sums::Auto if classifier.uncapped() => Sums::F32,
-            Sums::Auto => Sums::I32,
-            sums => sums,
-        };
+        let sums = classifier.sums(self.quality.sums).map_err(|e| Fail::flag(&e))?;
         let quality = Quality { sums, ..self.quality };
         let store = BrickStore::build(
             &self.volume,

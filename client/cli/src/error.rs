@@ -5,27 +5,22 @@
 //! each row below compares two pictures that differ in that source alone.
 
 use crate::fail::{Fail, say};
+use crate::local::{self, Cut};
 use crate::progress::{self, Progress};
 use crate::request::{Asked, PictureArgs, QualityArgs, ViewArgs, lattice_notice};
 use crate::volume;
-use slabcast_common::brick::Brick;
 use slabcast_common::ids::SceneId;
-use slabcast_common::image::{FrameState, Picture, TilePixels};
+use slabcast_common::image::Picture;
 use slabcast_common::message::SceneSpec;
-use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Quality, Sums, Work};
-use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::Classifier;
 use slabcast_common::view::View;
 use slabcast_render::reference::{ErrorFigures, Reference, stratified};
-use slabcast_render::splat::Simd;
-use slabcast_render::tile::{self, Scratch};
 use slabcast_render::{Frame, Scene};
 use slabcast_volumes::BrickStore;
 use std::fmt::Write;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 /// Says how far a picture is from the truth, in 1/255, and what the error is made of.
@@ -107,7 +102,11 @@ pub(crate) fn run(args: &ErrorArgs) -> Result<(), Fail> {
     let draw = |quality: Quality| {
         let spec = SceneSpec { quality, ..spec.clone() };
         let began = Instant::now();
-        let picture = picture(&Frame::new(Arc::new(Scene::new(&spec)), view), &bricks, threads);
+        let picture = local::picture(
+            &Frame::new(Arc::new(Scene::new(&spec)), view),
+            &bricks,
+            Cut::on(threads),
+        );
         (picture, began.elapsed())
     };
     let (asked_for, drawn) = draw(spec.quality);
@@ -119,7 +118,7 @@ pub(crate) fn run(args: &ErrorArgs) -> Result<(), Fail> {
     progress.frames(sample.len() as u64, &format!("{} pixels of the reference", sample.len()));
     let reference = Reference::new(&spec, view, &bricks);
     let judged = Instant::now();
-    let truth = judge(&sample, threads, &mut progress, |[x, y]| {
+    let truth = local::judge(&sample, threads, &mut progress, |[x, y]| {
         (reference.pixel(x, y), reference.at_same_thickness(x, y))
     });
     let judged = judged.elapsed();
@@ -163,75 +162,6 @@ pub(crate) fn run(args: &ErrorArgs) -> Result<(), Fail> {
         return say(&format!("{}\n", json(&rows, drawn, judged, sample.len())));
     }
     say(&text(&rows, drawn, judged, began.elapsed(), asked_for.pixels.len()))
-}
-
-/// A whole frame in one slab, its tiles shared among threads.
-fn picture(frame: &Frame, bricks: &[Arc<Brick>], threads: usize) -> Picture {
-    const TILE: i32 = 128;
-    let whole = Rect::of_size(frame.view.size);
-    let sheets = bricks
-        .iter()
-        .filter_map(|b| frame.view.project(&b.tight(&frame.scene.grid)))
-        .fold(SheetRange::default(), |r, p| r.union(p.sheets));
-    let tiles: Vec<Rect> = (0..whole.y1)
-        .step_by(TILE as usize)
-        .flat_map(|y| {
-            let row = (0..whole.x1).step_by(TILE as usize);
-            row.map(move |x| Rect::new(x, y, x + TILE, y + TILE).intersect(&whole))
-        })
-        .collect();
-    let done = shared(tiles.len(), threads, |i, scratch: &mut Scratch| -> TilePixels {
-        let blank = tile::blank(tiles[i]);
-        tile::render(frame, Simd::detect(), tiles[i], sheets, bricks, &blank, scratch).0
-    });
-    let mut state = FrameState::new(frame.view.size);
-    for (tile, pixels) in tiles.iter().zip(&done) {
-        state.put(*tile, pixels);
-    }
-    state.finish()
-}
-
-/// `work` for each of `n` items on `threads` threads; results in order.
-fn shared<S: Default, T: Send>(
-    n: usize,
-    threads: usize,
-    work: impl Fn(usize, &mut S) -> T + Sync,
-) -> Vec<T> {
-    let next = AtomicUsize::new(0);
-    let run = || {
-        let (mut own, mut done) = (S::default(), Vec::new());
-        loop {
-            let i = next.fetch_add(1, Ordering::Relaxed);
-            if i >= n {
-                return done;
-            }
-            done.push((i, work(i, &mut own)));
-        }
-    };
-    let mut all: Vec<(usize, T)> = std::thread::scope(|scope| {
-        let threads: Vec<_> = (0..threads.min(n.max(1))).map(|_| scope.spawn(run)).collect();
-        let join = |t: std::thread::ScopedJoinHandle<'_, Vec<(usize, T)>>| {
-            t.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
-        };
-        threads.into_iter().flat_map(join).collect()
-    });
-    all.sort_by_key(|(i, _)| *i);
-    all.into_iter().map(|(_, t)| t).collect()
-}
-
-/// Reference pixels, in portions, so that there is something to see meanwhile.
-fn judge<T: Send>(
-    sample: &[[u32; 2]],
-    threads: usize,
-    progress: &mut Progress,
-    pixel: impl Fn([u32; 2]) -> T + Sync,
-) -> Vec<T> {
-    let mut done = Vec::with_capacity(sample.len());
-    for portion in sample.chunks(256 * threads) {
-        done.extend(shared(portion.len(), threads, |i, _: &mut ()| pixel(portion[i])));
-        progress.step(progress::Step { frames: done.len() as u64, ..Default::default() });
-    }
-    done
 }
 
 fn text(
@@ -305,18 +235,6 @@ fn json(rows: &[Row; 6], drawn: Duration, judged: Duration, sampled: usize) -> S
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn shared_work_comes_back_in_order() {
-        for threads in [1, 2, 7] {
-            let got = shared(100, threads, |i, seen: &mut usize| {
-                *seen += 1;
-                i * i
-            });
-            assert_eq!(got, (0..100).map(|i| i * i).collect::<Vec<_>>());
-        }
-        assert!(shared(0, 3, |i, _: &mut ()| i).is_empty());
-    }
 
     #[test]
     fn numbers_keep_three_digits() {

@@ -6,7 +6,7 @@
 //! - [`daemon`] is `master` and `worker`.
 //! - [`info`] looks into files, [`ask`] at a running master.
 //! - [`check`] compares pictures with the oracle over every way to make them; [`error`] says how
-//!   far one is from the truth.
+//!   far one is from the truth. Both draw with [`local`].
 //!
 //! This is the only crate that sees all others. It decides nothing about pixels and schedules.
 //! Results go to stdout, everything else to stderr; every failure is one line ([`fail`]).
@@ -18,6 +18,7 @@ mod embedded;
 mod error;
 mod fail;
 mod info;
+mod local;
 mod logging;
 mod output;
 mod parse;

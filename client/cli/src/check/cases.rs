@@ -1,20 +1,19 @@
 //! What is rendered for comparison: volumes, looks, two cameras; and the serial renderer's
 //! answer to each.
 
+use super::shot::Drawn;
 use crate::fail::Fail;
 use crate::volume;
 use glam::DVec3;
-use slabcast_common::ids::SceneId;
 use slabcast_common::image::{Background, PixelFormat};
-use slabcast_common::message::{PathRequest, SceneSpec, TransferChoice};
+use slabcast_common::message::{PathRequest, TransferChoice};
 use slabcast_common::path::{Orientation, PathView, ProjectionKind, ViewPath};
 use slabcast_common::presets;
 use slabcast_common::quality::{Compositing, Quality, Sums, Work};
-use slabcast_common::transfer::{Classifier, Domain, OpacityUnit, TransferFunction};
+use slabcast_common::transfer::{Domain, OpacityUnit, TransferFunction};
 use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
 use slabcast_render::{Frame, Scene, serial};
-use slabcast_volumes::BrickStore;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -173,24 +172,8 @@ impl Case {
 
     /// The serial renderer's hashes of both views.
     pub(crate) fn truth(&self) -> Result<Vec<Digest32>, Fail> {
-        let classifier = Classifier::new(&self.transfer, &self.info, self.quality.compositing);
-        let sums = classifier.sums(self.quality.sums).map_err(|e| Fail::flag(&e))?;
-        let quality = Quality { sums, ..self.quality };
-        let store = BrickStore::build(
-            &self.volume,
-            self.info.digest,
-            &classifier.support(),
-            self.transfer.shading.on,
-        );
-        let bricks: Vec<_> =
-            store.infos().iter().filter_map(|i| store.brick(i.id).cloned()).collect();
-        let spec = SceneSpec {
-            id: SceneId(0),
-            volume: self.info.clone(),
-            transfer: self.transfer.clone(),
-            quality,
-            bricks: store.key(),
-        };
+        let Drawn { spec, bricks } =
+            Drawn::new(&self.volume, &self.info, &self.transfer, self.quality)?;
         let scene = Arc::new(Scene::new(&spec));
         let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
         let path = self.path();
@@ -198,7 +181,7 @@ impl Case {
             .map(|i| {
                 let view = path
                     .camera(i, &self.info.lattice, orientation)
-                    .and_then(|c| View::new(&self.info.lattice, &c, self.size, &quality))
+                    .and_then(|c| View::new(&self.info.lattice, &c, self.size, &spec.quality))
                     .map_err(|e| Fail::failed(format!("{}: {e}", self.view_name(i))))?;
                 Ok(serial::render(&Frame::new(scene.clone(), view), &bricks).sha256())
             })

@@ -1,7 +1,8 @@
 //! Hashes that are the same on every machine, build and day (CONTRACTS.md, Exactness).
 
 use super::cases::{self, VIEWS};
-use super::matrix::{SAMPLE, embedded_hashes};
+use super::cluster::embedded_hashes;
+use super::matrix::SAMPLE;
 use crate::embedded::{Cluster, Crew};
 use crate::fail::{Fail, say};
 use crate::progress::{self, Progress};

@@ -1,27 +1,44 @@
-//! `slabcast check`: are the pixels exact?
+//! `slabcast check`: does it hold what it promises?
 //!
-//! A frame's bytes must not depend on who rendered it (DESIGN.md, Pixels are exact). `matrix`
-//! renders views over every way to cut and carry the work and compares their hashes with the
-//! serial renderer's; `golden` prints hashes that have to be the same on every machine, build
-//! and day. This room belongs to the program because only here all crates can be seen.
+//! Without a subcommand: a [`table`] of cases, each with an error, its bound and a verdict. A
+//! frame's bytes must not depend on who rendered it either (DESIGN.md, Pixels are exact):
+//! `matrix` renders views over every way to cut and carry the work and compares their hashes
+//! with the serial renderer's; `golden` prints hashes that have to be the same on every machine,
+//! build and day. This room belongs to the program because only here all crates can be seen.
 
 mod cases;
+mod cluster;
+mod extreme;
 mod golden;
 mod matrix;
 mod pairwise;
+mod shot;
+mod table;
 
 use crate::fail::Fail;
 
-/// Checks that pixels are exact.
+/// Checks that pictures are right, stable and exact.
+///
+/// Draws stiff, extreme and other telling scenes, alone and by clusters in this process, and
+/// prints a table with the error of each (in 1/255, unless it says otherwise), the bound that it
+/// must keep, and whether it held.
 #[derive(clap::Args, Clone, Debug)]
-#[command(after_help = "\
+#[command(
+    args_conflicts_with_subcommands = true,
+    after_help = "\
 Examples:
+  slabcast check                            every case of the table: two minutes
+  slabcast check --group extreme --long     one group, with its long cases
+  slabcast check --list                     which cases there are
   slabcast check matrix --pairwise          every pair of settings at least once: minutes
   slabcast check matrix brain.nii.gz        all of them: an hour
-  slabcast check golden --verify tests/golden.txt")]
+  slabcast check golden --verify tests/golden.txt"
+)]
 pub(crate) struct CheckArgs {
     #[command(subcommand)]
-    what: What,
+    what: Option<What>,
+    #[command(flatten)]
+    table: table::TableArgs,
 }
 
 #[derive(clap::Subcommand, Clone, Debug)]
@@ -33,7 +50,8 @@ enum What {
 /// Runs the command.
 pub(crate) fn run(args: &CheckArgs) -> Result<(), Fail> {
     match &args.what {
-        What::Matrix(args) => matrix::run(args),
-        What::Golden(args) => golden::run(args),
+        None => table::run(&args.table),
+        Some(What::Matrix(args)) => matrix::run(args),
+        Some(What::Golden(args)) => golden::run(args),
     }
 }

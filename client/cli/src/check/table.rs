@@ -1,13 +1,64 @@
-//! The table of `slabcast check`: one row a case, with error, bound and verdict.
+//! The table of `slabcast check`: groups of cases, one row for each thing that must hold.
+//!
+//! A group is a name and a function that gives its cases; [`GROUPS`] lists them. A case draws
+//! what it needs with the [`Tools`] and gives back rows; the table adds group and case to them,
+//! prints them as they come, and counts. A case that panics, or that ends with an error, has not
+//! held, and the others go on.
 
+use super::extreme;
+use super::shot::Tools;
 use crate::fail::{Fail, say};
+use crate::progress::{self, Progress};
+use std::time::{Duration, Instant};
 
-/// One case and what became of it.
+/// Some cases that belong together.
+pub(crate) struct Group {
+    /// As in `--group`: one or two words.
+    pub(crate) name: &'static str,
+    /// What it shows, for `--list`.
+    pub(crate) about: &'static str,
+    /// Its cases, in the order of the table.
+    pub(crate) cases: fn() -> Vec<Case>,
+}
+
+/// All groups, in the order of the table.
+pub(crate) const GROUPS: &[Group] = &[Group {
+    name: "extreme",
+    about: "stiff and extreme scenes: finite, near enough to the truth, the same bytes everywhere",
+    cases: extreme::cases,
+}];
+
+/// What a case does.
+type Work = Box<dyn Fn(&Tools) -> Result<Vec<Row>, Fail> + Send + Sync>;
+
+/// One scene, or a few that are compared with each other.
+pub(crate) struct Case {
+    /// What is drawn, unique in its group.
+    pub(crate) name: String,
+    /// Whether it takes so long that only `--long` runs it.
+    pub(crate) long: bool,
+    /// Draws and compares.
+    pub(crate) work: Work,
+}
+
+impl Case {
+    /// A case that every run has.
+    pub(crate) fn new(
+        name: impl Into<String>,
+        work: impl Fn(&Tools) -> Result<Vec<Row>, Fail> + Send + Sync + 'static,
+    ) -> Case {
+        Case { name: name.into(), long: false, work: Box::new(work) }
+    }
+
+    /// The same, for `--long` only.
+    pub(crate) fn long(self) -> Case {
+        Case { long: true, ..self }
+    }
+}
+
+/// One thing that must hold.
+#[derive(Clone, Debug)]
 pub(crate) struct Row {
-    /// Which part of the check it belongs to: `extreme`, `closed form`, `invariance`.
-    pub(crate) group: &'static str,
-    /// What was drawn.
-    pub(crate) case: String,
     /// What the error is of: `max against the limit`, `bytes that differ`.
     pub(crate) what: String,
     /// What was found, in 1/255 unless `what` says otherwise. Not a number: not held.
@@ -19,24 +70,178 @@ pub(crate) struct Row {
 }
 
 impl Row {
-    /// Whether the case held.
+    /// A row without other trouble.
+    pub(crate) fn new(what: impl Into<String>, error: f64, bound: f64) -> Row {
+        Row { what: what.into(), error, bound, trouble: None }
+    }
+
+    /// The same with what else went wrong.
+    pub(crate) fn with(self, trouble: Option<String>) -> Row {
+        let all: Vec<String> = self.trouble.iter().cloned().chain(trouble).collect();
+        Row { trouble: (!all.is_empty()).then(|| all.join("; ")), ..self }
+    }
+
+    /// Whether it held.
     pub(crate) fn held(&self) -> bool {
         self.trouble.is_none() && self.error <= self.bound
     }
 
-    /// Prints the row as one line.
-    pub(crate) fn print(&self) -> Result<(), Fail> {
-        say(&format!(
-            "{:<11} {:<44} {:<28} {:>9} <= {:<9} {}{}\n",
-            self.group,
-            self.case,
+    /// As one line.
+    fn text(&self, group: &str, case: &str) -> String {
+        format!(
+            "{group:<11} {case:<44} {:<34} {:>9} <= {:<9} {}{}\n",
             self.what,
             number(self.error),
             number(self.bound),
             if self.held() { "held" } else { "NOT HELD" },
             self.trouble.as_ref().map(|t| format!(": {t}")).unwrap_or_default(),
-        ))
+        )
     }
+
+    /// As one line of JSON.
+    fn json(&self, group: &str, case: &str) -> String {
+        let row = serde_json::json!({
+            "group": group, "case": case, "what": self.what, "error": self.error,
+            "bound": self.bound, "held": self.held(), "trouble": self.trouble
+        });
+        format!("{row}\n")
+    }
+}
+
+/// What `slabcast check` without a subcommand takes.
+#[derive(clap::Args, Clone, Debug)]
+pub(crate) struct TableArgs {
+    /// Run this group only; may be given more than once
+    #[arg(long = "group", value_name = "NAME")]
+    groups: Vec<String>,
+    /// Run the cases whose name contains this only
+    #[arg(long, value_name = "TEXT")]
+    case: Option<String>,
+    /// Run the long cases too: minutes, and gigabytes of memory
+    #[arg(long)]
+    long: bool,
+    /// Say which cases there are, and run none
+    #[arg(long)]
+    list: bool,
+    /// One line of JSON a row
+    #[arg(long)]
+    json: bool,
+    /// Threads [default: all cores]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    threads: Option<u32>,
+}
+
+/// Runs the table.
+pub(crate) fn run(args: &TableArgs) -> Result<(), Fail> {
+    if let Some(stranger) = args.groups.iter().find(|g| GROUPS.iter().all(|k| k.name != **g)) {
+        let names: Vec<String> = GROUPS.iter().map(|g| format!("`{}`", g.name)).collect();
+        return Err(Fail::usage(format!(
+            "--group: there is no group `{stranger}`; give {}",
+            names.join(" or ")
+        )));
+    }
+    let mine = |g: &&Group| args.groups.is_empty() || args.groups.iter().any(|n| n == g.name);
+    let named = |c: &Case| args.case.as_ref().is_none_or(|t| c.name.contains(t.as_str()));
+    let all: Vec<(&Group, Case)> = GROUPS
+        .iter()
+        .filter(mine)
+        .flat_map(|g| (g.cases)().into_iter().map(move |c| (g, c)))
+        .filter(|(_, c)| named(c))
+        .collect();
+    if args.list {
+        return list(&all);
+    }
+    let skipped = all.iter().filter(|(_, c)| c.long && !args.long).count();
+    let cases: Vec<&(&Group, Case)> = all.iter().filter(|(_, c)| args.long || !c.long).collect();
+    if cases.is_empty() {
+        return Err(Fail::usage(match skipped {
+            0 => "--case: no case has this in its name; see `slabcast check --list`".to_string(),
+            n => format!("{n} cases fit, all of them long; add --long"),
+        }));
+    }
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .enable_all()
+        .build()
+        .map_err(|e| Fail::failed(format!("starting threads failed: {e}")))?;
+    let threads = args.threads.unwrap_or_else(crate::embedded::cores) as usize;
+    let tools = Tools { threads, runtime };
+    let began = Instant::now();
+    let mut progress = Progress::new(args.json).of("case");
+    progress.frames(cases.len() as u64, &format!("{} cases", cases.len()));
+    let (mut rows, mut wrong) = (0, 0);
+    for (done, (group, case)) in cases.iter().enumerate() {
+        progress.stage(&case.name);
+        for row in outcome(case, &tools) {
+            rows += 1;
+            wrong += usize::from(!row.held());
+            let line = if args.json {
+                row.json(group.name, &case.name)
+            } else {
+                row.text(group.name, &case.name)
+            };
+            progress.aside(|| say(&line))?;
+        }
+        progress.step(progress::Step { frames: done as u64 + 1, ..Default::default() });
+    }
+    progress.end();
+    tools.runtime.shutdown_timeout(Duration::from_secs(1));
+    let time = progress::time(began.elapsed());
+    let cases = cases.len();
+    let left = match skipped {
+        0 => String::new(),
+        n => format!("; {n} long cases left out (--long)"),
+    };
+    if wrong > 0 {
+        return Err(Fail::failed(format!(
+            "{wrong} of {rows} rows of {cases} cases not held; {time}"
+        )));
+    }
+    if args.json {
+        return Ok(());
+    }
+    say(&format!("{cases} cases, {rows} rows, all held; {time}{left}\n"))
+}
+
+/// Runs a case on a thread of its own, where a panic ends nothing else.
+fn outcome(case: &Case, tools: &Tools) -> Vec<Row> {
+    let failed =
+        |trouble: String| vec![Row::new("the case itself", f64::NAN, 0.0).with(Some(trouble))];
+    let run = std::thread::scope(|scope| {
+        std::thread::Builder::new()
+            .name("case".into())
+            .spawn_scoped(scope, || (case.work)(tools))
+            .map(|t| t.join())
+    });
+    match run {
+        Ok(Ok(Ok(rows))) if rows.is_empty() => failed("no row".into()),
+        Ok(Ok(Ok(rows))) => rows,
+        Ok(Ok(Err(e))) => failed(e.line().unwrap_or("stopped").to_string()),
+        Ok(Err(panic)) => failed(format!("panicked: {}", words(&*panic))),
+        Err(e) => failed(format!("starting a thread failed: {e}")),
+    }
+}
+
+/// What a panic said.
+fn words(panic: &(dyn std::any::Any + Send)) -> &str {
+    panic
+        .downcast_ref::<String>()
+        .map(String::as_str)
+        .or_else(|| panic.downcast_ref::<&str>().copied())
+        .unwrap_or("no words")
+}
+
+fn list(all: &[(&Group, Case)]) -> Result<(), Fail> {
+    let mut text = String::new();
+    let mut before = "";
+    for (group, case) in all {
+        if group.name != before {
+            text += &format!("{}: {}\n", group.name, group.about);
+            before = group.name;
+        }
+        text += &format!("    {}{}\n", case.name, if case.long { " (--long)" } else { "" });
+    }
+    say(&text)
 }
 
 /// Three digits, wherever they begin.
@@ -56,19 +261,42 @@ pub(crate) fn number(x: f64) -> String {
 mod tests {
     use super::*;
 
+    fn tools() -> Tools {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        Tools { threads: 1, runtime }
+    }
+
     #[test]
     fn what_is_not_a_number_is_not_held() {
-        let row = |error, trouble: Option<&str>| Row {
-            group: "extreme",
-            case: "one".into(),
-            what: "max".into(),
-            error,
-            bound: 1.0,
-            trouble: trouble.map(String::from),
+        let row = |error, trouble: Option<&str>| {
+            Row::new("max", error, 1.0).with(trouble.map(String::from))
         };
         assert!(row(1.0, None).held());
         assert!(!row(1.1, None).held());
         assert!(!row(f64::NAN, None).held());
         assert!(!row(0.0, Some("hashes differ")).held());
+        assert!(row(2.0, None).text("g", "c").contains("NOT HELD"));
+        assert!(row(f64::NAN, None).json("g", "c").contains("\"held\":false"));
+    }
+
+    #[test]
+    fn a_case_that_panics_fails_or_says_nothing_has_not_held() {
+        let held = |case: Case| outcome(&case, &tools()).iter().all(Row::held);
+        assert!(held(Case::new("good", |_| Ok(vec![Row::new("max", 0.0, 0.0)]))));
+        assert!(!held(Case::new("panics", |_| panic!("at {}", 3))));
+        assert!(!held(Case::new("fails", |_| Err(Fail::failed("no file")))));
+        assert!(!held(Case::new("silent", |_| Ok(vec![]))));
+        let rows = outcome(&Case::new("panics", |_| panic!("at {}", 3)), &tools());
+        assert_eq!(rows[0].trouble.as_deref(), Some("panicked: at 3"));
+    }
+
+    #[test]
+    fn groups_and_their_cases_have_names_of_their_own() {
+        let mut seen = std::collections::BTreeSet::new();
+        for group in GROUPS {
+            for case in (group.cases)() {
+                assert!(seen.insert((group.name, case.name.clone())), "{} twice", case.name);
+            }
+        }
     }
 }

@@ -1,0 +1,168 @@
+//! Clusters in this process, over either link, and the hashes of what they draw.
+
+use crate::embedded::{Cluster, Crew, start_master};
+use crate::fail::Fail;
+use sha2::{Digest, Sha256};
+use slabcast_client::Client;
+use slabcast_common::message::PathRequest;
+use slabcast_common::path::Orientation;
+use slabcast_common::volume::{Digest32, Volume};
+use slabcast_master::driver::SubmitError;
+use slabcast_master::jobs::{JobState, WatchItem};
+use slabcast_master::{Handle, Master, MasterConfig};
+use slabcast_render::splat::Simd;
+use std::time::Duration;
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+
+/// How long workers may take to join: each draws its self-test first.
+const JOIN: Duration = Duration::from_secs(30);
+
+/// A cluster over either link.
+pub(crate) enum Either {
+    Embedded(Cluster),
+    Tcp(Box<Tcp>),
+}
+
+/// A master and workers in this process that speak gRPC over loopback.
+pub(crate) struct Tcp {
+    master: Master,
+    client: Client,
+    stop: watch::Sender<bool>,
+    tasks: JoinSet<Result<(), String>>,
+}
+
+impl Either {
+    /// Starts one for `volume` and waits until its workers are there. `tcp`: over loopback.
+    pub(crate) async fn start(volume: &Volume, tcp: bool, crew: Crew) -> Result<Either, Fail> {
+        let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
+        let volume = volume.clone();
+        let (cluster, handle) = if tcp {
+            let tcp = Tcp::start(MasterConfig::new(volume, orientation), crew).await?;
+            let handle = tcp.master.handle();
+            (Either::Tcp(Box::new(tcp)), handle)
+        } else {
+            let cluster = Cluster::start(volume, orientation, crew)?;
+            let handle = cluster.handle();
+            (Either::Embedded(cluster), handle)
+        };
+        joined(&handle, crew.workers).await?;
+        Ok(cluster)
+    }
+
+    /// Hashes of a request's frames, over the bytes that came.
+    pub(crate) async fn hashes(&mut self, request: PathRequest) -> Result<Vec<String>, Fail> {
+        match self {
+            Either::Embedded(cluster) => {
+                tokio::select! {
+                    hashes = embedded_hashes(cluster.handle(), request) => hashes,
+                    trouble = cluster.trouble() => Err(trouble),
+                }
+            }
+            Either::Tcp(tcp) => tcp.hashes(request).await,
+        }
+    }
+
+    /// Ends master and workers.
+    pub(crate) async fn end(self) {
+        match self {
+            Either::Embedded(cluster) => cluster.end().await,
+            Either::Tcp(tcp) => tcp.end().await,
+        }
+    }
+}
+
+/// Hash of a frame's floats; also whether the statistics say the same.
+fn hash(number: u64, bytes: &[u8], said: &str) -> Result<String, Fail> {
+    let hash = Digest32(Sha256::digest(bytes).into()).to_string();
+    if hash == said {
+        return Ok(hash);
+    }
+    Err(Fail::failed(format!("frame {number} hashes to {hash}, but its statistics say {said}")))
+}
+
+pub(super) async fn embedded_hashes(
+    handle: Handle,
+    request: PathRequest,
+) -> Result<Vec<String>, Fail> {
+    let job = handle.submit(request).await.map_err(|e| match e {
+        SubmitError::Refused(e) => Fail::failed(e.to_string()),
+        other => Fail::failed(format!("the master takes no job: {other:?}")),
+    })?;
+    let mut watch =
+        handle.watch(job, 0).ok_or_else(|| Fail::failed(format!("{job} was forgotten")))?;
+    let mut hashes = Vec::new();
+    while let Some(item) = watch.next().await {
+        match item {
+            WatchItem::Frame(f) => {
+                hashes.push(hash(f.number, &f.bytes, &f.stats.pixels_sha256)?);
+            }
+            WatchItem::Notice(view) => {
+                if let JobState::Failed(reason) = view.state {
+                    return Err(Fail::failed(reason));
+                }
+            }
+        }
+    }
+    Ok(hashes)
+}
+
+async fn joined(handle: &Handle, workers: u32) -> Result<(), Fail> {
+    let all = async {
+        while handle.workers().await.len() < workers as usize {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    tokio::time::timeout(JOIN, all).await.map_err(|_| {
+        Fail::failed(format!("{workers} workers did not join in {} s", JOIN.as_secs()))
+    })
+}
+
+impl Tcp {
+    async fn start(config: MasterConfig, crew: Crew) -> Result<Tcp, Fail> {
+        let io = |e: std::io::Error| Fail::failed(format!("listening on 127.0.0.1 failed: {e}"));
+        let listener = TcpListener::bind("127.0.0.1:0").await.map_err(io)?;
+        let address = listener.local_addr().map_err(io)?.to_string();
+        let master = start_master(config)?;
+        let (stop, stopped) = watch::channel(false);
+        let mut tasks = JoinSet::new();
+        let serve = slabcast_master::serve::serve(master.handle(), listener, stopped.clone());
+        tasks.spawn(async move { serve.await.map_err(|e| e.to_string()) });
+        for n in 1..=crew.workers {
+            let config = slabcast_worker::Config {
+                name: format!("tcp-{n}"),
+                threads: crew.threads,
+                memory_budget_bytes: 1 << 30,
+                simd: Simd::detect(),
+            };
+            let run = slabcast_worker::dial::run(config, address.clone(), stopped.clone());
+            tasks.spawn(async move { run.await.map(|_| ()) });
+        }
+        let client = Client::connect(&address).await.map_err(|e| crate::remote::fail(&e))?;
+        Ok(Tcp { master, client, stop, tasks })
+    }
+
+    async fn hashes(&mut self, request: PathRequest) -> Result<Vec<String>, Fail> {
+        let fail = |e| crate::remote::fail(&e);
+        let job = self.client.submit(&request).await.map_err(fail)?;
+        let mut frames = self.client.watch(&job, 0).await.map_err(fail)?;
+        let mut hashes = Vec::new();
+        while let Some(update) = frames.next().await.map_err(fail)? {
+            if let slabcast_client::Update::Frame(f) = update {
+                hashes.push(hash(f.number, &f.bytes, &f.stats.pixels_sha256)?);
+            }
+        }
+        Ok(hashes)
+    }
+
+    async fn end(mut self) {
+        drop(self.client);
+        let _ = self.stop.send(true);
+        let ended = async {
+            self.master.shutdown().await;
+            while self.tasks.join_next().await.is_some() {}
+        };
+        let _ = tokio::time::timeout(Duration::from_secs(5), ended).await;
+    }
+}

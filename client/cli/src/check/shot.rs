@@ -1,0 +1,263 @@
+//! One picture: what is drawn, how and from where; drawn in every way there is.
+//!
+//! Groups of the table build a [`Shot`] from a volume, a look, a quality and a camera, make it
+//! [`Ready`], and ask for what they need: the serial picture, one on threads, the hashes of
+//! clusters, the reference.
+
+use super::cluster::Either;
+use crate::embedded::Crew;
+use crate::fail::Fail;
+use crate::local::{self, Cut};
+use slabcast_common::brick::Brick;
+use slabcast_common::ids::SceneId;
+use slabcast_common::image::{Background, Picture, PixelFormat};
+use slabcast_common::message::{PathRequest, SceneSpec, TransferChoice};
+use slabcast_common::path::{Orientation, PathView, ViewPath};
+use slabcast_common::quality::{Quality, Work};
+use slabcast_common::transfer::{Classifier, TransferFunction};
+use slabcast_common::view::View;
+use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_render::reference::{Reference, stratified};
+use slabcast_render::{Frame, Scene, serial};
+use slabcast_volumes::BrickStore;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// How long one cluster may take over one picture; the longest default case needs a few
+/// seconds. A cluster that hangs is a case that did not hold, not a check that never ends.
+const PATIENCE: Duration = Duration::from_secs(600);
+
+/// What cases may use of this process.
+pub(crate) struct Tools {
+    /// Threads to draw and judge with.
+    pub(crate) threads: usize,
+    /// Where clusters run. Cases run on a thread outside it and may block on it.
+    pub(crate) runtime: tokio::runtime::Runtime,
+}
+
+/// What is drawn, how and from where.
+#[derive(Clone, Debug)]
+pub(crate) struct Shot {
+    pub(crate) volume: Arc<Volume>,
+    pub(crate) transfer: TransferFunction,
+    /// `sums` may be `Auto`.
+    pub(crate) quality: Quality,
+    /// Width and height in pixels.
+    pub(crate) size: [u32; 2],
+    /// The camera, in world units.
+    pub(crate) view: PathView,
+}
+
+/// A scene's specification and all its bricks.
+#[derive(Clone)]
+pub(crate) struct Drawn {
+    pub(crate) spec: SceneSpec,
+    pub(crate) bricks: Vec<Arc<Brick>>,
+}
+
+impl Drawn {
+    /// Cuts the bricks of `volume` under `transfer`, and decides the sums, as the master does.
+    pub(crate) fn new(
+        volume: &Volume,
+        info: &VolumeInfo,
+        transfer: &TransferFunction,
+        quality: Quality,
+    ) -> Result<Drawn, Fail> {
+        let classifier = Classifier::new(transfer, info, quality.compositing);
+        let sums = classifier.sums(quality.sums).map_err(|e| Fail::flag(&e))?;
+        let (support, normals) = (classifier.support(), transfer.shading.on);
+        let store = BrickStore::build(volume, info.digest, &support, normals);
+        let bricks = store.infos().iter().filter_map(|i| store.brick(i.id).cloned()).collect();
+        let spec = SceneSpec {
+            id: SceneId(0),
+            volume: info.clone(),
+            transfer: transfer.clone(),
+            quality: Quality { sums, ..quality },
+            bricks: store.key(),
+        };
+        Ok(Drawn { spec, bricks })
+    }
+}
+
+/// A shot with everything that draws it.
+#[derive(Clone)]
+pub(crate) struct Ready {
+    /// Sums decided.
+    pub(crate) spec: SceneSpec,
+    pub(crate) view: View,
+    pub(crate) bricks: Vec<Arc<Brick>>,
+}
+
+impl Shot {
+    fn path(&self) -> ViewPath {
+        ViewPath { version: 1, size: self.size, views: vec![self.view], turntable: None }
+    }
+
+    /// The request that has a cluster draw it.
+    pub(crate) fn request(&self, cull: bool, work: Work) -> PathRequest {
+        PathRequest {
+            client_key: crate::request::client_key(),
+            path: self.path(),
+            transfer: TransferChoice::Function(Box::new(self.transfer.clone())),
+            quality: Quality { cull, ..self.quality },
+            work,
+            format: PixelFormat::Rgba32F,
+            background: Background::Transparent,
+            want_trace: false,
+        }
+    }
+
+    /// Makes it ready.
+    ///
+    /// # Errors
+    /// What the master would refuse, in the master's words.
+    pub(crate) fn ready(&self) -> Result<Ready, Fail> {
+        let refused = |e: slabcast_common::quality::Refused| Fail::failed(e.to_string());
+        self.volume.lattice.check().map_err(Fail::failed)?;
+        self.quality.check().map_err(refused)?;
+        self.transfer.check().map_err(refused)?;
+        let info = self.volume.info(self.volume.digest());
+        let orientation = Orientation::new(None, None).map_err(refused)?;
+        let camera = self.path().camera(0, &info.lattice, orientation).map_err(refused)?;
+        let view = View::new(&info.lattice, &camera, self.size, &self.quality).map_err(refused)?;
+        let Drawn { spec, bricks } = Drawn::new(&self.volume, &info, &self.transfer, self.quality)?;
+        Ok(Ready { spec, view, bricks })
+    }
+
+    /// The serial renderer's picture, and what differs from it, if anything does: on threads in
+    /// odd tiles and slabs, by an embedded cluster in small tiles and many slabs, by a TCP
+    /// cluster with culling off. `None`: one hash everywhere.
+    pub(crate) fn everywhere(
+        &self,
+        ready: &Ready,
+        tools: &Tools,
+    ) -> Result<(Picture, Option<String>), Fail> {
+        let picture = ready.serial();
+        let want = picture.sha256().to_string();
+        let mut differ = Vec::new();
+        let threaded = ready.picture(Cut { threads: tools.threads.max(2), tile: 37, slabs: 3 });
+        if threaded.sha256().to_string() != want {
+            differ.push("threads".to_string());
+        }
+        let work = |slabs, tile| Work { slabs, tile: Some(tile), ..Work::default() };
+        let (three, two) = (Crew { workers: 3, threads: 1 }, Crew { workers: 2, threads: 2 });
+        for (name, tcp, crew, cull, work) in [
+            ("embedded cluster", false, three, true, work(7, 16)),
+            ("TCP cluster", true, two, false, work(2, 64)),
+        ] {
+            match tools.runtime.block_on(self.hash(tcp, crew, cull, work)) {
+                Ok(hash) if hash == want => {}
+                Ok(_) => differ.push(name.into()),
+                Err(e) => differ.push(format!("{name} ({})", e.line().unwrap_or("stopped"))),
+            }
+        }
+        let trouble = (!differ.is_empty()).then(|| format!("differ: {}", differ.join(", ")));
+        Ok((picture, trouble))
+    }
+
+    /// The hash of the frame that a cluster draws.
+    pub(crate) async fn hash(
+        &self,
+        tcp: bool,
+        crew: Crew,
+        cull: bool,
+        work: Work,
+    ) -> Result<String, Fail> {
+        let drawn = async {
+            let mut cluster = Either::start(&self.volume, tcp, crew).await?;
+            let hashes = cluster.hashes(self.request(cull, work)).await;
+            cluster.end().await;
+            hashes?.pop().ok_or_else(|| Fail::failed("no frame came"))
+        };
+        match tokio::time::timeout(PATIENCE, drawn).await {
+            Ok(hash) => hash,
+            Err(_) => Err(Fail::failed(format!("no frame within {} s", PATIENCE.as_secs()))),
+        }
+    }
+}
+
+/// What a picture is compared with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Against {
+    /// The limit: the integral along true rays.
+    Limit,
+    /// Sheets of the same thickness in f64, nothing rounded and nothing shut.
+    SameSheets,
+}
+
+impl Ready {
+    /// Tables for drawing.
+    pub(crate) fn frame(&self) -> Frame {
+        Frame::new(Arc::new(Scene::new(&self.spec)), self.view)
+    }
+
+    /// The serial renderer's picture.
+    pub(crate) fn serial(&self) -> Picture {
+        serial::render(&self.frame(), &self.bricks)
+    }
+
+    /// The tile renderer's picture on threads of this process.
+    pub(crate) fn picture(&self, cut: Cut) -> Picture {
+        local::picture(&self.frame(), &self.bricks, cut)
+    }
+
+    /// A seeded sample of at most `n` pixels, one from each of about `n` equal cells.
+    pub(crate) fn sample(&self, n: usize) -> Vec<[u32; 2]> {
+        stratified(self.view.size, n, 1)
+    }
+
+    /// The reference at `sample`, linear premultiplied RGBA.
+    pub(crate) fn truth(
+        &self,
+        against: Against,
+        sample: &[[u32; 2]],
+        tools: &Tools,
+    ) -> Vec<[f64; 4]> {
+        let reference = Reference::new(&self.spec, self.view, &self.bricks);
+        local::shared(sample.len(), tools.threads, |i, _: &mut ()| {
+            let [x, y] = sample[i];
+            match against {
+                Against::Limit => reference.pixel(x, y),
+                Against::SameSheets => reference.at_same_thickness(x, y),
+            }
+        })
+    }
+
+    /// Pixels of `picture` at `sample`.
+    pub(crate) fn at(&self, picture: &Picture, sample: &[[u32; 2]]) -> Vec<[f32; 4]> {
+        let w = self.view.size[0];
+        sample.iter().map(|[x, y]| picture.pixels[(y * w + x) as usize]).collect()
+    }
+}
+
+/// Largest difference over all four channels, in 1/255; not a number where one of them is none.
+pub(crate) fn largest(got: &[[f32; 4]], want: &[[f64; 4]]) -> f64 {
+    let off = got.iter().flatten().zip(want.iter().flatten());
+    off.map(|(&g, &w)| (f64::from(g) - w).abs() * 255.0).fold(0.0, |a: f64, b| {
+        // f64::max would forget what is not a number.
+        if b.is_nan() || a.is_nan() { f64::NAN } else { a.max(b) }
+    })
+}
+
+/// Whether every channel of every pixel is finite, and colour and opacity lie in 0 to 1.
+pub(crate) fn sane(picture: &Picture) -> Option<String> {
+    let inside = |p: &[f32; 4]| p.iter().all(|c| (0.0..=1.0 + 1e-6).contains(c));
+    let bad = picture.pixels.iter().position(|p| !inside(p))?;
+    let w = picture.size[0] as usize;
+    Some(format!("pixel {},{} is {:?}", bad % w, bad / w, picture.pixels[bad]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_not_a_number_is_the_largest_difference() {
+        assert_eq!(largest(&[[0.0, 1.0, 0.0, 0.5]], &[[0.0, 0.0, 0.0, 0.5]]), 255.0);
+        assert!(largest(&[[f32::NAN; 4], [0.0; 4]], &[[0.0; 4]; 2]).is_nan());
+        let picture = |p| Picture { size: [1, 1], pixels: vec![p] };
+        assert_eq!(sane(&picture([0.0, 0.5, 1.0, 1.0])), None);
+        assert!(sane(&picture([0.0, -0.1, 0.0, 0.0])).is_some());
+        assert!(sane(&picture([0.0, f32::INFINITY, 0.0, 0.0])).is_some());
+    }
+}

@@ -12,7 +12,7 @@ use slabcast_common::shade::Shading;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
-use slabcast_render::reference::{ErrorFigures, Reference, stratified};
+use slabcast_render::reference::{ErrorFigures, Reference, Section, Sheets, stratified};
 use slabcast_render::{Frame, Scene, serial};
 use std::f64::consts::PI;
 use std::sync::{Arc, LazyLock};
@@ -503,27 +503,37 @@ fn the_same_sheets_in_f64_are_what_the_splatter_draws() {
     }
 }
 
-/// RMSE of sheets against the limit at 1, 1/2, 1/4 and 1/8 vox, in f64 so that nothing else shows.
+/// RMSE of sheets against the limit at 1, 1/2, 1/4 and 1/8 vox, in f64 so that nothing else shows:
+/// for linear and for constant colour.
+fn errors(projection: CameraProjection, section: Section) -> [[f64; 4]; 2] {
+    let sample = stratified([64, 64], 400, 3);
+    let mut out = [[0.0; 4]; 2];
+    for (i, thickness) in [1.0, 0.5, 0.25, 0.125].into_iter().enumerate() {
+        let q = Quality { thickness, ..i32_sums() };
+        let asked = Asked::new(balls(20), lit(), q, oblique(projection), 64);
+        let reference = asked.reference();
+        let want = reference.pixels(&sample);
+        let how = Sheets { section, rounded: false };
+        let got: Vec<_> = sample
+            .iter()
+            .map(|&[x, y]| reference.by_sheets_linear_and_constant(x, y, how))
+            .collect();
+        for (rule, out) in out.iter_mut().enumerate() {
+            let got: Vec<_> = got.iter().map(|p| p[rule].map(|x| x as f32)).collect();
+            out[i] = ErrorFigures::compare(&got, &want, BLACK).rmse;
+        }
+    }
+    out
+}
+
+fn orders(e: [f64; 4]) -> [f64; 3] {
+    [0, 1, 2].map(|i| libm::log2(e[i] / e[i + 1]))
+}
+
 #[test]
 fn constant_colour_converges_with_the_second_order_and_linear_faster() {
-    let n = 20;
-    for projection in projections(n) {
-        let sample = stratified([64, 64], 400, 3);
-        let errors = |compositing| {
-            [1.0, 0.5, 0.25, 0.125].map(|thickness| {
-                let q = Quality { thickness, compositing, ..i32_sums() };
-                let asked = Asked::new(balls(n), lit(), q, oblique(projection), 64);
-                let reference = asked.reference();
-                let want = reference.pixels(&sample);
-                let got: Vec<_> = sample
-                    .iter()
-                    .map(|p| reference.at_same_thickness(p[0], p[1]).map(|x| x as f32))
-                    .collect();
-                ErrorFigures::compare(&got, &want, BLACK).rmse
-            })
-        };
-        let orders = |e: [f64; 4]| [0, 1, 2].map(|i| libm::log2(e[i] / e[i + 1]));
-        let (constant, linear) = (errors(Compositing::Constant), errors(Compositing::Linear));
+    for projection in projections(20) {
+        let [linear, constant] = errors(projection, Section::MidPlane);
         println!("{projection:?}: constant {constant:?}, order {:?}", orders(constant));
         println!("{projection:?}: linear {linear:?}, order {:?}", orders(linear));
         assert!(orders(constant).iter().all(|o| (1.8..2.2).contains(o)), "{constant:?}");
@@ -537,4 +547,20 @@ fn constant_colour_converges_with_the_second_order_and_linear_faster() {
         assert!(orders(linear)[2] > last, "{projection:?}: {linear:?}");
         assert!((0..4).all(|i| 3.0 * linear[i] < constant[i]), "{linear:?} {constant:?}");
     }
+}
+
+/// The mid-plane is the whole reason: with the kernel integrated along the slanted ray in each
+/// sheet, a perspective view converges as a parallel one does.
+#[test]
+fn sections_along_the_slanted_ray_bring_the_order_back() {
+    let [_, persp] = projections(20);
+    let [linear, _] = errors(persp, Section::Exact);
+    println!("exact: linear {linear:?}, order {:?}", orders(linear));
+    assert!(orders(linear).iter().all(|&o| o > 3.0), "{linear:?}");
+    let [middle, _] = errors(persp, Section::MidPlane);
+    for section in [Section::Centroid, Section::Between] {
+        let [linear, _] = errors(persp, section);
+        println!("{section:?}: linear {linear:?}, order {:?}", orders(linear));
+    }
+    assert!(10.0 * linear[3] < middle[3], "{linear:?} {middle:?}");
 }

@@ -35,6 +35,7 @@ mod walk;
 
 pub use figures::ErrorFigures;
 pub use sample::stratified;
+pub use sheets::{Section, Sheets};
 
 use glam::{DMat3, DVec3};
 use profile::Profile;
@@ -128,6 +129,14 @@ impl Reference {
     #[must_use]
     pub fn with_tolerance(self, tolerance: f64) -> Reference {
         Reference { tolerance, ..self }
+    }
+
+    /// The same with what the sheets of the quality's compositing add in place of extinctions.
+    /// Under the paper's compositing these are alphas: thin sheets that add alphas come to
+    /// `1 - exp(-int alpha)`, another picture, and [`Reference::pixel`] is it then.
+    #[must_use]
+    pub fn with_what_sheets_add(self) -> Reference {
+        Reference { looks: self.sheet_looks.clone(), ..self }
     }
 
     /// The limit at pixel (x, y): linear premultiplied RGBA.

@@ -37,4 +37,13 @@ impl Profile {
             * (libm::erf(u * root) + libm::erf(r * root));
         (bell - self.edge * (u + r)) * self.per_norm
     }
+
+    /// The integral of `u` times the profile from `u` to `u + d`.
+    pub(super) fn moment(&self, u: f64, d: f64) -> f64 {
+        let up_to = |u: f64| {
+            let u = u.clamp(-self.radius, self.radius);
+            -libm::exp(-u * u * self.steep) / (2.0 * self.steep) - self.edge * u * u * 0.5
+        };
+        (up_to(u + d) - up_to(u)) * self.per_norm
+    }
 }

@@ -113,8 +113,8 @@ impl Light {
 /// well, since light and depth are integrated as one system.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Gauss {
-    nodes: [f64; 4],
-    weights: [f64; 4],
+    pub(super) nodes: [f64; 4],
+    pub(super) weights: [f64; 4],
     /// The integral up to node i of the polynomial that is one at node j and zero at the others.
     up_to: [[f64; 4]; 4],
 }

@@ -26,7 +26,7 @@ pub mod volume;
 
 /// Version of the arithmetic behind the pixels. Two programs that agree on it give the same
 /// bytes for the same view; a change of any golden hash raises it (CONTRACTS.md, Exactness).
-pub const PIXELS_VERSION: u32 = 1;
+pub const PIXELS_VERSION: u32 = 2;
 
 /// Version of the messages between master, worker and client.
 pub const PROTOCOL_VERSION: u32 = 1;
@@ -34,4 +34,4 @@ pub const PROTOCOL_VERSION: u32 = 1;
 /// SHA-256 of the self-test tile that every worker draws before it says hello
 /// (`slabcast_render::selftest`, which also has the test that keeps this constant true).
 pub const SELF_TEST_SHA256: &str =
-    "6a6c90590dfd6dda6c04fb78b7ba92979e477db2809514192888f85805015dea";
+    "767f68ecba9751f6675402ab97f135f5dbb252f07ed42bdf5ccd5f1749641e74";

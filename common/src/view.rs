@@ -13,14 +13,25 @@ use crate::slab::SheetRange;
 use crate::volume::Lattice;
 use glam::{DMat3, DVec3, Vec3};
 
-/// Screen positions are rounded to this part of a pixel (DESIGN.md, Pixels are exact).
-pub const SUBPIXELS: i32 = 64;
+/// Screen positions are rounded to 1/2^8 = 1/256 pixel.
+///
+/// In an orthographic view whole layers of the lattice are rounded alike, so this rounding is what
+/// is left of the error when sheets are thin. At 1/64 pixel thin sheets miss the reference by up
+/// to 0.14/255 (RMSE), at 1/128 by 0.07, at 1/256 by 0.034: the first below the 0.05 that is
+/// promised (docs/measurements.md). Each bit doubles the footprints' tables (8 KiB an axis at 1.6
+/// pixels a vox).
+pub const SUBPIXEL_BITS: u32 = 8;
+/// Positions a pixel: see [`SUBPIXEL_BITS`].
+pub const SUBPIXELS: i32 = 1 << SUBPIXEL_BITS;
 
 /// Largest picture edge, in pixels (DESIGN.md section 5: images of 1x1 and 8192x8192).
 pub const MAX_EDGE: u32 = 8192;
 
 /// The near plane, as a share of the eye's distance (CONTRACTS.md).
 pub const NEAR: f64 = 1e-3;
+
+/// Most pixels a vox, 2^39: screen positions stay exact in f64 and i64 with a kernel's reach.
+const LARGEST_SCALE: f64 = (1u64 << 39) as f64;
 
 /// How the world is brought onto the picture.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -175,6 +186,17 @@ impl View {
                 Projection::Persp { focal: half_height_px / tan, distance: distance / vox }
             }
         };
+        let (field, largest) = match projection {
+            Projection::Ortho { scale } => ("height", scale),
+            Projection::Persp { focal, distance } => ("eye", focal / (NEAR * distance)),
+        };
+        if largest > LARGEST_SCALE {
+            return Err(Refused::new(
+                field,
+                "magnifies a voxel over more than 10^11 pixels; move the eye away from the target \
+                 or widen what is shown",
+            ));
+        }
 
         let steps = lattice.steps.map(|s| eye_from_world * (s / vox));
         let eye_from_index = DMat3::from_cols(steps[0], steps[1], steps[2]);
@@ -217,7 +239,7 @@ impl View {
 
     /// Depth positions are rounded to this part of a sheet: 1/256 of a sheet or of a vox,
     /// whichever is finer. Half as many double the error of thin sheets' sections, which is
-    /// then no longer below that of the 1/64 pixel.
+    /// then no longer below that of the 1/256 pixel.
     pub fn depth_phases(&self) -> i32 {
         let mut phases = 256;
         while phases < 65536 && f64::from(phases) < 256.0 * self.thickness {
@@ -261,17 +283,18 @@ impl View {
         }
     }
 
-    /// Screen position, in 1/64 pixel of absolute image coordinates, of the eye position
+    /// Screen position, in 1/256 pixel of absolute image coordinates, of the eye position
     /// (x, y) on a plane with `scale` pixels a vox.
     #[inline]
-    pub fn screen(&self, x: f64, y: f64, scale: f64) -> [i32; 2] {
-        // 2^24 pixels off the picture is farther than any footprint reaches.
-        const FAR: f64 = (1u32 << 24) as f64;
+    pub fn screen(&self, x: f64, y: f64, scale: f64) -> [i64; 2] {
+        // 2^42 pixels off the picture is farther than any footprint reaches: `View::new` refuses
+        // cameras that magnify more than 2^39 pixels a vox.
+        const FAR: f64 = (1u64 << 42) as f64;
         let at = |v: f64, n: u32| {
             let p = v * scale + f64::from(n) * 0.5;
             let p = if p > -FAR { p } else { -FAR };
             let p = if p < FAR { p } else { FAR };
-            round_i32(p * f64::from(SUBPIXELS))
+            round_i64(p * f64::from(SUBPIXELS))
         };
         [at(x, self.size[0]), at(y, self.size[1])]
     }
@@ -361,11 +384,20 @@ impl View {
     }
 }
 
-/// Nearest integer, ties to even, without a library call: adding 1.5 * 2^52 leaves the integer
-/// in the low bits of the sum. `|x| < 2^31`.
+/// 1.5 * 2^52: added to a number below 2^51 it leaves the nearest integer, ties to even, in the
+/// low bits of the sum.
+const MAGIC: f64 = 6_755_399_441_055_744.0;
+
+/// Nearest integer, ties to even, without a library call. `|x| < 2^31`.
 #[inline(always)]
 pub fn round_i32(x: f64) -> i32 {
-    (x + 6_755_399_441_055_744.0).to_bits() as i32
+    (x + MAGIC).to_bits() as i32
+}
+
+/// Nearest integer, ties to even, without a library call. `|x| < 2^51`.
+#[inline(always)]
+pub fn round_i64(x: f64) -> i64 {
+    (x + MAGIC).to_bits().wrapping_sub(MAGIC.to_bits()) as i64
 }
 
 #[cfg(test)]
@@ -380,8 +412,10 @@ mod tests {
 
     #[test]
     fn rounding_is_to_nearest() {
+        assert_eq!(round_i64(-1e15 + 0.25), -1_000_000_000_000_000);
         for (x, want) in [(0.4, 0), (0.6, 1), (-0.6, -1), (1e9 + 0.3, 1_000_000_000), (-7.49, -7)] {
             assert_eq!(round_i32(x), want, "{x}");
+            assert_eq!(round_i64(x), i64::from(want), "{x}");
         }
     }
 
@@ -393,7 +427,7 @@ mod tests {
         let v = View::new(&l, &c, [90, 90], &Quality::default()).unwrap();
         let at = |p: [u32; 3]| {
             let e = v.corner_in_eye(p);
-            v.screen(e.x, e.y, v.scale_at(0).unwrap()).map(|s| f64::from(s) / 64.0)
+            v.screen(e.x, e.y, v.scale_at(0).unwrap()).map(|s| s as f64 / f64::from(SUBPIXELS))
         };
         assert_eq!(at([4, 4, 4]), [45.0, 45.0]);
         assert_eq!(at([8, 4, 4]), [45.0 - 8.0 * 2.5, 45.0]);
@@ -429,6 +463,8 @@ mod tests {
         assert_eq!(field(Camera { projection: p, ..good }, [9, 9]), "height");
         let p = CameraProjection::Persp { fov: 180.0, distance: 9.0 };
         assert_eq!(field(Camera { projection: p, ..good }, [9, 9]), "fov");
+        let p = CameraProjection::Persp { fov: 0.01, distance: 1e-4 };
+        assert_eq!(field(Camera { projection: p, ..good }, [8192, 8192]), "eye");
     }
 
     proptest! {
@@ -456,7 +492,7 @@ mod tests {
             let reach = v.kernel_radius.z / d;
             for k in libm::floor(zq - reach) as i32..=libm::floor(zq + reach) as i32 {
                 let Some(scale) = v.scale_at(k) else { continue };
-                let [x, y] = v.screen(eye.x, eye.y, scale).map(|s| f64::from(s) / 64.0);
+                let [x, y] = v.screen(eye.x, eye.y, scale).map(|s| s as f64 / f64::from(SUBPIXELS));
                 let (rx, ry) = (v.kernel_radius.x * scale, v.kernel_radius.y * scale);
                 let first = [libm::ceil(x - rx - 0.5).max(0.0), libm::ceil(y - ry - 0.5).max(0.0)];
                 let last = [libm::floor(x + rx - 0.5).min(119.0), libm::floor(y + ry - 0.5).min(99.0)];

@@ -10,11 +10,11 @@
 //!
 //! A voxel's *section* in a sheet is the integral of g between the sheet's planes (the paper's
 //! array of footprints, section 3); its footprint on the screen is g(x) g(y) at pixel centres.
-//! Positions come in phases (1/64 pixel, 1/256 sheet or finer), so both are tables, filled in
+//! Positions come in phases (1/256 pixel, 1/256 sheet or finer), so both are tables, filled in
 //! f64 and kept in f32.
 
 use slabcast_common::slab::SheetRange;
-use slabcast_common::view::{Projection, SUBPIXELS, View};
+use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, View};
 use std::sync::OnceLock;
 
 /// One axis of the kernel. Lengths in vox.
@@ -127,29 +127,41 @@ struct AxisTable {
 }
 
 /// Pixels that a footprint covers along one axis: `[first, last]` for a centre at phase `p`.
-fn reach(p: i32, radius_px: f64) -> (i32, i32) {
+fn reach(p: i32, radius_px: f64) -> (i64, i64) {
     let at = f64::from(p) / f64::from(SUBPIXELS);
-    (libm::ceil(at - radius_px - 0.5) as i32, libm::floor(at + radius_px - 0.5) as i32)
+    (libm::ceil(at - radius_px - 0.5) as i64, libm::floor(at + radius_px - 0.5) as i64)
+}
+
+/// The pixel that holds position `pos`, and its phase in there.
+#[inline]
+fn split(pos: i64) -> (i64, i32) {
+    (pos >> SUBPIXEL_BITS, (pos & i64::from(SUBPIXELS - 1)) as i32)
+}
+
+/// A pixel as one that rectangles can name; those beyond are off every picture.
+#[inline]
+fn near(pixel: i64) -> i32 {
+    pixel.clamp(-(1 << 30), 1 << 30) as i32
 }
 
 /// The one definition of a footprint weight: pixel `i` of a centre at phase `p`.
 #[inline]
-fn weight(profile: &Profile, scale: f64, p: i32, i: i32) -> f32 {
-    let u = (f64::from(i) + 0.5 - f64::from(p) / f64::from(SUBPIXELS)) / scale;
+fn weight(profile: &Profile, scale: f64, p: i32, i: i64) -> f32 {
+    let u = (i as f64 + 0.5 - f64::from(p) / f64::from(SUBPIXELS)) / scale;
     profile.at(u) as f32
 }
 
 impl AxisTable {
     fn new(profile: &Profile, scale: f64) -> Self {
         let radius = profile.radius * scale;
-        let spans: Vec<(i32, i32)> = (0..SUBPIXELS).map(|p| reach(p, radius)).collect();
-        let first: Vec<i32> = spans.iter().map(|s| s.0).collect();
+        let spans: Vec<(i64, i64)> = (0..SUBPIXELS).map(|p| reach(p, radius)).collect();
+        let first: Vec<i32> = spans.iter().map(|s| near(s.0)).collect();
         let count: Vec<u32> = spans.iter().map(|s| (s.1 - s.0 + 1).max(0) as u32).collect();
         let stride = count.iter().copied().max().unwrap_or(0) as usize;
         let mut weights = vec![0.0; stride * SUBPIXELS as usize];
         for p in 0..SUBPIXELS as usize {
             for t in 0..count[p] as usize {
-                weights[p * stride + t] = weight(profile, scale, p as i32, first[p] + t as i32);
+                weights[p * stride + t] = weight(profile, scale, p as i32, spans[p].0 + t as i64);
             }
         }
         AxisTable { first, count, weights, stride }
@@ -164,6 +176,27 @@ const TABLE_TAPS: f64 = 1024.0;
 /// section instead of a look-up.
 const TABLE_BYTES: f64 = 64.0 * 1024.0 * 1024.0;
 
+/// Tables of one scale, x and y. Where the profiles are the same (cubic lattices) there is one.
+#[derive(Debug)]
+struct Tables {
+    x: AxisTable,
+    y: Option<AxisTable>,
+}
+
+impl Tables {
+    fn new(x: &Profile, y: &Profile, scale: f64) -> Self {
+        Tables { x: AxisTable::new(x, scale), y: (x != y).then(|| AxisTable::new(y, scale)) }
+    }
+
+    #[inline]
+    fn along(&self, axis: usize) -> &AxisTable {
+        match (axis, &self.y) {
+            (1, Some(y)) => y,
+            _ => &self.x,
+        }
+    }
+}
+
 /// Footprints of a view: one scale for all sheets (orthographic) or one a sheet (perspective).
 #[derive(Debug)]
 pub struct Footprints {
@@ -171,7 +204,7 @@ pub struct Footprints {
     y: Profile,
     /// Tables of the sheets from `first`, made when first asked for; one for all sheets in an
     /// orthographic view; none where they would be too large.
-    tables: Vec<OnceLock<[AxisTable; 2]>>,
+    tables: Vec<OnceLock<Tables>>,
     first: i32,
     view: View,
 }
@@ -205,9 +238,7 @@ impl Footprints {
             Projection::Ortho { .. } => self.tables.first(),
             Projection::Persp { .. } => self.tables.get((k - self.first) as usize),
         };
-        let table = slot.map(|t| {
-            t.get_or_init(|| [AxisTable::new(&self.x, scale), AxisTable::new(&self.y, scale)])
-        });
+        let table = slot.map(|t| t.get_or_init(|| Tables::new(&self.x, &self.y, scale)));
         Some(Footprint { scale, table, profiles: [&self.x, &self.y] })
     }
 }
@@ -217,24 +248,25 @@ impl Footprints {
 pub struct Footprint<'a> {
     /// Pixels a vox.
     pub scale: f64,
-    table: Option<&'a [AxisTable; 2]>,
+    table: Option<&'a Tables>,
     profiles: [&'a Profile; 2],
 }
 
 impl Footprint<'_> {
     /// Pixels `[first, end)` along `axis` (0: x, 1: y) that a footprint at screen position
-    /// `pos` (1/64 pixel) covers.
+    /// `pos` (1/256 pixel) covers.
     #[inline]
-    pub fn extent(&self, axis: usize, pos: i32) -> (i32, i32) {
-        let (base, p) = (pos >> 6, pos & (SUBPIXELS - 1));
+    pub fn extent(&self, axis: usize, pos: i64) -> (i32, i32) {
+        let (base, p) = split(pos);
         match self.table {
             Some(t) => {
-                let first = base + t[axis].first[p as usize];
-                (first, first + t[axis].count[p as usize] as i32)
+                let t = t.along(axis);
+                let first = near(base) + t.first[p as usize];
+                (first, first + t.count[p as usize] as i32)
             }
             None => {
                 let (a, b) = reach(p, self.profiles[axis].radius * self.scale);
-                (base + a, base + (b + 1).max(a))
+                (near(base + a), near(base + (b + 1).max(a)))
             }
         }
     }
@@ -245,7 +277,7 @@ impl Footprint<'_> {
     pub fn weights<'b>(
         &'b self,
         axis: usize,
-        pos: i32,
+        pos: i64,
         (lo, hi): (i32, i32),
         buffer: &'b mut Vec<f32>,
     ) -> Span<'b> {
@@ -254,19 +286,17 @@ impl Footprint<'_> {
         if from >= to {
             return (lo, &[]);
         }
-        let p = pos & (SUBPIXELS - 1);
+        let (base, p) = split(pos);
         match self.table {
             Some(t) => {
-                let t = &t[axis];
+                let t = t.along(axis);
                 let row = p as usize * t.stride;
                 (from, &t.weights[row + (from - first) as usize..row + (to - first) as usize])
             }
             None => {
-                let base = pos >> 6;
+                let at = |i| weight(self.profiles[axis], self.scale, p, i64::from(i) - base);
                 buffer.clear();
-                buffer.extend(
-                    (from..to).map(|i| weight(self.profiles[axis], self.scale, p, i - base)),
-                );
+                buffer.extend((from..to).map(at));
                 (from, &buffer[..])
             }
         }

@@ -5,7 +5,7 @@
 //! points. Along an orthographic ray down an axis, Sx and Sy stay and Sz integrates: to the
 //! number of layers for a whole crossing, to sums of error functions for a part of it. So
 //! optical depths are known in closed form, edges included. Scales are chosen so that voxel
-//! centres fall on the 1/64 pixel grid: no rounding of positions hides an error here.
+//! centres fall on the 1/256 pixel grid: no rounding of positions hides an error here.
 
 mod world;
 

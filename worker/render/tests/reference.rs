@@ -475,7 +475,7 @@ fn thin_sheets_come_to_the_limit_in_both_projections() {
     }
 }
 
-/// The splatter and the same sheets in f64 differ by rounding alone: in positions (1/64 pixel),
+/// The splatter and the same sheets in f64 differ by rounding alone: in positions (1/256 pixel),
 /// depths (1/256 sheet), tables and sums.
 #[test]
 fn the_same_sheets_in_f64_are_what_the_splatter_draws() {

@@ -438,6 +438,11 @@ impl Volume {
 
     /// The matrix that [`Volume::gradient`] takes: the transposed inverse of
     /// `world_from_index`, scaled to vox so that no unit overflows it.
+    ///
+    /// Its numbers are rounded to f32. Gradients of integers are fractions of small numbers, and
+    /// some lie just between two codes of a normal. In another unit of length the last bits of
+    /// the matrix are others, and one in 10^4 or so would flip to the next code (the test below
+    /// counts 44 in 5 10^5 without the rounding; two voxels make 1 % of a small picture differ).
     pub fn gradient_matrix(&self) -> DMat3 {
         let vox = self.lattice.vox();
         let m = DMat3::from_cols(
@@ -445,7 +450,8 @@ impl Volume {
             self.lattice.steps[1] / vox,
             self.lattice.steps[2] / vox,
         );
-        m.inverse().transpose()
+        let m = m.inverse().transpose();
+        DMat3::from_cols_array(&m.to_cols_array().map(|x| f64::from(x as f32)))
     }
 
     /// What workers need to know of it.
@@ -512,6 +518,29 @@ mod tests {
         for p in [[0, 0, 0], [2, 1, 1], [4, 3, 2]] {
             let g = vol.gradient(p, &m) / lattice.vox();
             assert!((g - DVec3::new(3.0, -2.0, 5.0)).length() < 1e-4, "{p:?}: {g}");
+        }
+    }
+
+    /// Some of these lie just between two codes; see [`Volume::gradient_matrix`].
+    #[test]
+    fn normals_are_the_same_in_every_unit_of_length() {
+        for spacing in [[1.0; 3], [0.75, 1.0, 2.25], [0.7, 0.9, 1.1]] {
+            let codes = |unit: f64| -> Vec<u16> {
+                let mut one = Volume::from_fn_u8("one", [1; 3], |_, _, _| 0);
+                one.lattice = Lattice::from_spacing([1; 3], spacing.map(|s| s * unit));
+                let m = one.gradient_matrix();
+                let slopes = (0..256 * 256 * 8).map(|i| [i % 256, i / 256 % 256, i >> 16]);
+                let slopes = slopes.map(|[x, y, z]| {
+                    DVec3::from_array([x, y, z * 31].map(|x| f64::from(x) / 2.0 - 63.5))
+                });
+                slopes.map(|g| crate::shade::encode_normal(m * g)).collect()
+            };
+            let want = codes(1.0);
+            for unit in [0.0706, 0.7, 3.0, 25.4, 1e-9, 1e9] {
+                let got = codes(unit);
+                let differ = want.iter().zip(&got).filter(|(a, b)| a != b).count();
+                assert_eq!(differ, 0, "of {} with spacings {spacing:?} times {unit}", got.len());
+            }
         }
     }
 

@@ -454,8 +454,10 @@ impl Support {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::math::srgb_from_linear;
     use crate::presets;
     use crate::volume::{Lattice, ValueMap, Volume};
+    use proptest::prelude::*;
 
     fn info(samples: Samples) -> VolumeInfo {
         let n = samples.len() as u32;
@@ -531,6 +533,112 @@ mod tests {
             }
             assert!(support.intervals.len() <= 2 && support.covers(&support));
         }
+    }
+
+    fn looks(tf: &TransferFunction) -> Vec<Look> {
+        tf.check().unwrap();
+        let volume = info(Samples::U8((0..=255).collect()));
+        Classifier::new(tf, &volume, Compositing::Linear).table().to_vec()
+    }
+
+    fn ulps(a: f32, b: f32) -> u32 {
+        a.to_bits().abs_diff(b.to_bits())
+    }
+
+    proptest! {
+        /// Points and lines are multiples of 1/16, so that every number on them is exact.
+        #[test]
+        fn a_point_on_a_line_changes_nothing(
+            ends in prop::collection::vec((0u32..=16, 0u32..=16, 0u32..=16, 0u32..=16), 2..9),
+            which in any::<prop::sample::Index>(), at in 1u32..16,
+        ) {
+            let x = |i: usize| 16.0 * i as f64;
+            let n = |i: u32| f64::from(i) / 16.0;
+            let mut tf = presets::by_name("grey", &info(Samples::U8(vec![0, 255])).summary).unwrap();
+            (tf.domain, tf.color_space) = (Domain::Value, ColorSpace::Linear);
+            let ends = ends.iter().enumerate();
+            tf.colors = ends.clone().map(|(i, e)| [x(i), n(e.0), n(e.1), n(e.2)]).collect();
+            tf.opacities = ends.map(|(i, e)| [x(i), n(e.3)]).collect();
+            let want = looks(&tf);
+            let i = which.index(tf.colors.len() - 1);
+            let on = |a: f64, b: f64| a + (b - a) * n(at);
+            let [a, b] = [tf.colors[i], tf.colors[i + 1]];
+            tf.colors.insert(i + 1, std::array::from_fn(|c| on(a[c], b[c])));
+            let [a, b] = [tf.opacities[i], tf.opacities[i + 1]];
+            tf.opacities.insert(i + 1, [on(a[0], b[0]), on(a[1], b[1])]);
+            prop_assert_eq!(&want, &looks(&tf));
+            // The same point twice, and more of what holds outside anyway.
+            tf.opacities.insert(i + 1, tf.opacities[i + 1]);
+            tf.opacities.insert(0, [-3.0, tf.opacities[0][1]]);
+            let [_, r, g, b] = tf.colors[tf.colors.len() - 1];
+            tf.colors.push([400.0, r, g, b]);
+            let got = looks(&tf);
+            for (w, g) in want.iter().zip(&got) {
+                prop_assert_eq!(w.sigma, g.sigma);
+                // A constant is a (1 - t) + a t, which f64 may round.
+                prop_assert!((0..3).all(|c| ulps(w.rgb[c], g.rgb[c]) <= 1));
+            }
+        }
+
+        /// Any numbers: the point is off its line by the last bits of f64, of which f32 sees at
+        /// most one step.
+        #[test]
+        fn a_rounded_point_on_a_line_changes_at_most_a_last_bit(
+            (a, b) in (0.0..1.0f64, 0.0..1.0f64), t in 0.01..0.99f64, x in 1.0..200.0f64,
+        ) {
+            let mut tf = presets::by_name("grey", &info(Samples::U8(vec![0, 255])).summary).unwrap();
+            (tf.domain, tf.color_space) = (Domain::Value, ColorSpace::Linear);
+            tf.colors = vec![[0.3, a, b, a], [x + 1.0, b, a, b]];
+            tf.opacities = vec![[0.3, a], [x + 1.0, b]];
+            let want = looks(&tf);
+            let on = |a: f64, b: f64| a + (b - a) * t;
+            tf.colors.insert(1, [on(0.3, x + 1.0), on(a, b), on(b, a), on(a, b)]);
+            tf.opacities.insert(1, [on(0.3, x + 1.0), on(a, b)]);
+            for (w, g) in want.iter().zip(&looks(&tf)) {
+                prop_assert!(ulps(w.sigma, g.sigma) <= 1, "{w:?} {g:?}");
+                prop_assert!((0..3).all(|c| ulps(w.rgb[c], g.rgb[c]) <= 1), "{w:?} {g:?}");
+            }
+        }
+
+        /// Pointwise more opacity is nowhere less extinction.
+        #[test]
+        fn more_opacity_is_more_extinction(
+            points in prop::collection::vec((0.0..1.0f64, 0.0..1.0f64), 1..9),
+        ) {
+            let mut tf = presets::by_name("grey", &info(Samples::U8(vec![0, 255])).summary).unwrap();
+            tf.domain = Domain::Value;
+            let points = points.iter().enumerate();
+            tf.opacities = points.clone().map(|(i, p)| [30.0 * i as f64, p.0]).collect();
+            let less = looks(&tf);
+            tf.opacities = points
+                .map(|(i, p)| [30.0 * i as f64, (p.0 + p.1 * (1.0 - p.0)).max(p.0)])
+                .collect();
+            for (l, m) in less.iter().zip(&looks(&tf)) {
+                prop_assert!(m.sigma >= l.sigma || ulps(m.sigma, l.sigma) <= 1);
+            }
+        }
+    }
+
+    /// Colours are decoded where their points are, and lines between them are of linear light. So
+    /// what lies on a line in linear light changes nothing; the mean of two sRGB numbers is darker
+    /// than that line.
+    #[test]
+    fn lines_between_colours_are_lines_of_light() {
+        let mut tf = presets::by_name("grey", &info(Samples::U8(vec![0, 255])).summary).unwrap();
+        tf.domain = Domain::Value;
+        tf.colors = vec![[0.0, 0.2, 0.5, 0.0], [128.0, 0.9, 0.6, 1.0]];
+        let want = looks(&tf);
+        let linear = |x: f64| linear_from_srgb(x);
+        let mean = |a: f64, b: f64| srgb_from_linear((linear(a) + linear(b)) / 2.0);
+        tf.colors.insert(1, [64.0, mean(0.2, 0.9), mean(0.5, 0.6), mean(0.0, 1.0)]);
+        for (w, g) in want.iter().zip(&looks(&tf)) {
+            for c in 0..3 {
+                assert!((w.rgb[c] - g.rgb[c]).abs() < 1e-6, "{w:?} {g:?}");
+            }
+        }
+        tf.colors[1] = [64.0, 0.55, 0.55, 0.5];
+        let got = looks(&tf)[64].rgb[2];
+        assert!((want[64].rgb[2] - 0.5).abs() < 1e-6 && (got - 0.214).abs() < 1e-3, "{got}");
     }
 
     #[test]

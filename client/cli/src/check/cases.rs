@@ -190,7 +190,7 @@ impl Case {
 }
 
 /// Extinctions far beyond the cap of opacities, so that sums are floats.
-fn uncapped(info: &VolumeInfo) -> TransferFunction {
+pub(super) fn uncapped(info: &VolumeInfo) -> TransferFunction {
     let grey = presets::by_name("grey", &info.summary).expect("a preset of ours");
     TransferFunction {
         domain: Domain::Unit,

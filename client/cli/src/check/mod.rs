@@ -7,9 +7,11 @@
 //! build and day. This room belongs to the program because only here all crates can be seen.
 
 mod cases;
+mod changes;
 mod cluster;
 mod extreme;
 mod golden;
+mod invariance;
 mod matrix;
 mod pairwise;
 mod shot;

@@ -5,8 +5,8 @@
 //! prints them as they come, and counts. A case that panics, or that ends with an error, has not
 //! held, and the others go on.
 
-use super::extreme;
 use super::shot::Tools;
+use super::{extreme, invariance};
 use crate::fail::{Fail, say};
 use crate::progress::{self, Progress};
 use std::time::{Duration, Instant};
@@ -22,11 +22,19 @@ pub(crate) struct Group {
 }
 
 /// All groups, in the order of the table.
-pub(crate) const GROUPS: &[Group] = &[Group {
-    name: "extreme",
-    about: "stiff and extreme scenes: finite, near enough to the truth, the same bytes everywhere",
-    cases: extreme::cases,
-}];
+pub(crate) const GROUPS: &[Group] = &[
+    Group {
+        name: "extreme",
+        about: "stiff and extreme scenes: finite, near enough to the truth, the same bytes \
+                everywhere",
+        cases: extreme::cases,
+    },
+    Group {
+        name: "invariance",
+        about: "what must not matter (units, origin, axes, storage), and what must matter one way",
+        cases: invariance::cases,
+    },
+];
 
 /// What a case does.
 type Work = Box<dyn Fn(&Tools) -> Result<Vec<Row>, Fail> + Send + Sync>;

@@ -88,20 +88,45 @@ pub(crate) fn shared<S: Default, T: Send>(
     all.into_iter().map(|(_, t)| t).collect()
 }
 
+/// Pixels between two looks at the progress, for each thread: a second or so of the slowest.
+/// Half as many cost nothing yet; at double the bar stands still for seconds.
+const PORTION: usize = 64;
+
 /// What `pixel` says of each of `sample`, in portions, so that there is something to see
-/// meanwhile.
+/// meanwhile. `before` pixels of the progress were done earlier.
 pub(crate) fn judge<T: Send>(
     sample: &[[u32; 2]],
     threads: usize,
-    progress: &mut Progress,
+    (progress, before): (&mut Progress, usize),
     pixel: impl Fn([u32; 2]) -> T + Sync,
 ) -> Vec<T> {
-    let mut done = Vec::with_capacity(sample.len());
-    for portion in sample.chunks(256 * threads) {
-        done.extend(shared(portion.len(), threads, |i, _: &mut ()| pixel(portion[i])));
-        progress.step(progress::Step { frames: done.len() as u64, ..Default::default() });
+    // Not row by row: blank rows at the top take no time, and the time left would be a guess
+    // from them alone.
+    let order = scattered(sample.len());
+    let mut done: Vec<(usize, T)> = Vec::with_capacity(sample.len());
+    for portion in order.chunks(PORTION * threads) {
+        done.extend(shared(portion.len(), threads, |i, _: &mut ()| {
+            (portion[i], pixel(sample[portion[i]]))
+        }));
+        let frames = (before + done.len()) as u64;
+        progress.step(progress::Step { frames, ..Default::default() });
     }
-    done
+    done.sort_by_key(|(i, _)| *i);
+    done.into_iter().map(|(_, t)| t).collect()
+}
+
+/// The numbers below `n`, each once, any run of them spread over the whole: steps of about the
+/// golden section.
+fn scattered(n: usize) -> Vec<usize> {
+    let gcd = |mut a: usize, mut b: usize| {
+        while b > 0 {
+            (a, b) = (b, a % b);
+        }
+        a
+    };
+    let golden = (n as f64 * 0.618_033_988_75) as usize;
+    let step = (golden.max(1)..).find(|&s| gcd(s, n.max(1)) == 1).unwrap_or(1);
+    (0..n).scan(0, |at, _| Some(std::mem::replace(at, (*at + step) % n))).collect()
 }
 
 #[cfg(test)]
@@ -118,5 +143,23 @@ mod tests {
             assert_eq!(got, (0..100).map(|i| i * i).collect::<Vec<_>>());
         }
         assert!(shared(0, 3, |i, _: &mut ()| i).is_empty());
+    }
+
+    #[test]
+    fn pixels_are_judged_in_any_order_and_come_back_in_theirs() {
+        for n in [0, 1, 2, 5, 97, 1000] {
+            let mut order = scattered(n);
+            // The first tenth reaches into every third.
+            for third in 0..3 {
+                let part = third * n / 3..(third + 1) * n / 3;
+                assert!(n < 97 || order[..n / 10].iter().any(|i| part.contains(i)), "{n}");
+            }
+            order.sort_unstable();
+            assert_eq!(order, (0..n).collect::<Vec<_>>());
+        }
+        let sample: Vec<[u32; 2]> = (0..777).map(|i| [i, 2 * i]).collect();
+        let mut progress = Progress::new(true);
+        let got = judge(&sample, 3, (&mut progress, 0), |p| p);
+        assert_eq!(got, sample);
     }
 }

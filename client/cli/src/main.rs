@@ -27,6 +27,7 @@ mod remote;
 mod render;
 mod request;
 mod signals;
+mod still;
 mod style;
 mod volume;
 

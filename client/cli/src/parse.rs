@@ -160,6 +160,44 @@ pub(crate) fn on_off(text: &str) -> Result<bool, String> {
     }
 }
 
+/// How many pixels are looked at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Pixels {
+    /// Each.
+    All,
+    /// A sample of so many; each if there are no more.
+    Some(u32),
+}
+
+impl Pixels {
+    /// How many of a picture of this size.
+    pub(crate) fn count(self, size: [u32; 2]) -> usize {
+        let all = size[0] as usize * size[1] as usize;
+        match self {
+            Pixels::All => all,
+            Pixels::Some(n) => (n as usize).min(all),
+        }
+    }
+}
+
+/// A number of pixels, or `all`.
+pub(crate) fn pixels(text: &str) -> Result<Pixels, String> {
+    match text.parse::<u32>() {
+        _ if text == "all" => Ok(Pixels::All),
+        Ok(n) if n > 0 => Ok(Pixels::Some(n)),
+        _ => Err("give a number of pixels from 1, or all".into()),
+    }
+}
+
+/// A file for a PNG.
+pub(crate) fn png(text: &str) -> Result<std::path::PathBuf, String> {
+    let path = std::path::PathBuf::from(text);
+    match path.extension() {
+        Some(e) if e.eq_ignore_ascii_case("png") => Ok(path),
+        _ => Err("give a file that ends in .png".into()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -213,5 +251,14 @@ mod tests {
         for bad in ["", "host", "host:", ":7433", "host:70000", "::1:7433", "http://a:1", "a b:1"] {
             assert!(master(bad).is_err(), "{bad}");
         }
+    }
+
+    #[test]
+    fn pixels_are_a_number_or_all() {
+        assert_eq!(pixels("all").unwrap().count([3, 4]), 12);
+        assert_eq!(pixels("5").unwrap().count([3, 4]), 5);
+        assert_eq!(pixels("50").unwrap().count([3, 4]), 12);
+        assert!(pixels("0").is_err() && pixels("-1").is_err() && pixels("some").is_err());
+        assert!(png("a.png").is_ok() && png("a.PNG").is_ok() && png("volume.nrrd").is_err());
     }
 }

@@ -38,6 +38,12 @@ pub(crate) fn say_on_stderr(line: &str) {
     write_on_stderr(format!("{line}\n").as_bytes());
 }
 
+/// Takes all bars away: the command ends.
+pub(crate) fn end() {
+    // A terminal that is gone is nobody's concern.
+    let _ = terminal().clear();
+}
+
 /// `warning: ...` on stderr.
 pub(crate) fn warn(line: &str) {
     say_on_stderr(&format!("{} {}", style::warning(), crate::fail::one_line(line)));

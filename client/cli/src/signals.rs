@@ -1,5 +1,7 @@
 //! Ctrl-C and SIGTERM.
 
+use crate::fail::Fail;
+use crate::progress;
 use std::sync::atomic::{AtomicU8, Ordering};
 use tokio::sync::Notify;
 
@@ -47,4 +49,31 @@ pub(crate) async fn stopped() -> u8 {
             code => return code,
         }
     }
+}
+
+/// Does `work` on a thread of its own and waits for it, or for Ctrl-C or SIGTERM, which end the
+/// command at once (code 130 or 143; the thread ends with the process). So `work` must leave
+/// nothing half done on disk; who writes files does so with what comes back.
+pub(crate) fn unless_stopped<T: Send + 'static>(
+    work: impl FnOnce() -> Result<T, Fail> + Send + 'static,
+) -> Result<T, Fail> {
+    let failed = |e: std::io::Error| Fail::failed(format!("starting threads failed: {e}"));
+    let runtime =
+        tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(failed)?;
+    runtime.block_on(async {
+        listen();
+        let (done, result) = tokio::sync::oneshot::channel();
+        std::thread::Builder::new()
+            .name("slabcast-work".into())
+            // Nobody waits for the result of a command that was stopped.
+            .spawn(move || drop(done.send(work())))
+            .map_err(failed)?;
+        tokio::select! {
+            result = result => result.unwrap_or_else(|_| Err(Fail::silent(1))),
+            code = stopped() => {
+                progress::end();
+                Err(Fail::silent(code))
+            }
+        }
+    })
 }

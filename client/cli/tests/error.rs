@@ -3,11 +3,14 @@
 use std::process::Command;
 
 fn error(arguments: &[&str]) -> serde_json::Value {
-    let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
-        .args(["error", "formula:spheres:32", "--size", "96x80", "--pixels", "1500", "--json"])
-        .args(arguments)
-        .output()
-        .expect("slabcast runs");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_slabcast"));
+    command.args(["error", "formula:spheres:32", "--json"]).args(arguments);
+    for (flag, value) in [("--size", "96x80"), ("--pixels", "1500")] {
+        if !arguments.contains(&flag) {
+            command.args([flag, value]);
+        }
+    }
+    let out = command.output().expect("slabcast runs");
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
     serde_json::from_slice(&out.stdout).expect("JSON")
 }
@@ -45,4 +48,117 @@ fn thinner_sheets_are_nearer_and_the_papers_are_elsewhere() {
     assert!(coarse * 2.0 < constant, "{coarse} and {constant}");
     let paper = at("1", "paper");
     assert!(paper > 3.0 * constant, "{paper} and {constant}");
+}
+
+/// Each pixel once is all pixels, however one asks for it.
+#[test]
+fn all_pixels_are_as_many_as_there_are() {
+    let figures = |pixels: &str| {
+        let mut f = error(&["--size", "40x30", "--pixels", pixels, "--model-pixels", "100"]);
+        for time in ["draw_ms", "judge_ms", "total_ms"] {
+            assert!(f[time].as_f64().is_some_and(|t| t > 0.0), "{time}: {}", f[time]);
+            f[time] = 0.into();
+        }
+        f
+    };
+    let all = figures("all");
+    assert_eq!(all["sampled"], 1200);
+    assert_eq!(all["sampled_model"], 100);
+    assert_eq!(all["size"], serde_json::json!([40, 30]));
+    assert_eq!(all, figures("1200"));
+    assert_eq!(all, figures("99999"));
+    assert_ne!(all["limit"], figures("600")["limit"]);
+}
+
+/// Rounding parts into positions and arithmetic, of which positions are nearly all; truncation
+/// and ripple are those of the kernel: a wider cut mends the one, a narrower kernel ripples more.
+#[test]
+fn rounding_has_two_parts_and_the_model_two_errors() {
+    let f = error(&[]);
+    let (positions, arithmetic) = (rmse(&f, "rounding_positions"), rmse(&f, "rounding_arithmetic"));
+    assert!(arithmetic > 0.0 && arithmetic < 1e-3, "{arithmetic}");
+    assert!((positions / rmse(&f, "rounding") - 1.0).abs() < 0.05, "{positions}");
+    let wide = error(&["--radius", "3"]);
+    assert!(10.0 * rmse(&wide, "truncation") < rmse(&f, "truncation"));
+    let narrow = error(&["--std", "0.45"]);
+    assert!(4.0 * rmse(&f, "ripple") < rmse(&narrow, "ripple"));
+    assert!(rmse(&f, "ripple") > 0.0);
+    // Neither has anything to do with sheets.
+    let thin = error(&["--thickness", "0.25"]);
+    for source in ["truncation", "ripple"] {
+        assert_eq!(thin[source], f[source]);
+    }
+}
+
+/// A map has the picture left, its error right and says its scale; blank pixels are grey.
+#[test]
+fn a_map_shows_where_the_error_is() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let path = dir.path().join("map.png");
+    let f = error(&["--pixels", "all", "--map", path.to_str().expect("text")]);
+    assert_eq!(f["map"], path.to_str().expect("text"));
+    let file = std::io::BufReader::new(std::fs::File::open(&path).expect("the map"));
+    let mut reader = png::Decoder::new(file).read_info().expect("a PNG");
+    let mut bytes = vec![0; reader.output_buffer_size().expect("fits")];
+    reader.next_frame(&mut bytes).expect("pixels");
+    let info = reader.info();
+    let (w, h) = (info.width as usize, info.height as usize);
+    assert!(w == 2 * 96 + 8 && h > 80, "{w}x{h}");
+    let text: Vec<_> = info.uncompressed_latin1_text.iter().map(|t| &t.text[..]).collect();
+    assert!(text.iter().any(|t| t.contains("of 1/255 or less")), "{text:?}");
+    let at = |x: usize, y: usize| &bytes[(y * w + x) * 3..][..3];
+    // As many coloured pixels as were compared, and where the picture shows something.
+    let blank = |x: usize, y: usize| at(96 + 8 + x, y) == [96; 3];
+    let all = (0..80).flat_map(|y| (0..96).map(move |x| (x, y)));
+    let seen = all.clone().filter(|&(x, y)| !blank(x, y)).count();
+    assert_eq!(seen as u64, f["limit"]["pixels"].as_u64().expect("a number"));
+    assert!(all.clone().all(|(x, y)| !blank(x, y) || at(x, y) == [0; 3]), "a picture where blank");
+    // Only the map is there.
+    assert_eq!(std::fs::read_dir(dir.path()).expect("the folder").count(), 1);
+}
+
+#[test]
+fn a_map_never_replaces_the_volume_and_needs_the_name_of_a_picture() {
+    let refused = |arguments: &[&str]| {
+        let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
+            .arg("error")
+            .args(arguments)
+            .output()
+            .expect("slabcast runs");
+        let said = String::from_utf8_lossy(&out.stderr).into_owned();
+        assert_eq!(out.status.code(), Some(2), "{said}");
+        said
+    };
+    let dir = tempfile::tempdir().expect("a folder");
+    let volume = dir.path().join("v.png");
+    std::fs::write(&volume, "x").expect("a file");
+    let volume = volume.to_str().expect("text");
+    assert!(refused(&[volume, "--map", volume]).contains("is the volume"));
+    assert!(refused(&["formula:spheres", "--map", "brain.nrrd"]).contains(".png"));
+    assert!(refused(&["formula:spheres", "--pixels", "some"]).contains("or all"));
+}
+
+/// Ctrl-C ends a long run at once, with its code and no map.
+#[cfg(unix)]
+#[test]
+fn ctrl_c_ends_it_at_once() {
+    use std::time::{Duration, Instant};
+    let dir = tempfile::tempdir().expect("a folder");
+    let map = dir.path().join("map.png");
+    let mut child = Command::new(env!("CARGO_BIN_EXE_slabcast"))
+        .args(["error", "formula:spheres:96", "--size", "1024x1024", "--pixels", "all"])
+        .args(["--map", map.to_str().expect("text")])
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .expect("slabcast runs");
+    std::thread::sleep(Duration::from_millis(1500));
+    assert!(child.try_wait().expect("a child").is_none(), "it ended by itself: make it longer");
+    let told = Instant::now();
+    let killed =
+        Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill runs");
+    assert!(killed.success());
+    let code = child.wait().expect("a child").code();
+    assert_eq!(code, Some(130));
+    assert!(told.elapsed() < Duration::from_secs(5), "{:?}", told.elapsed());
+    assert_eq!(std::fs::read_dir(dir.path()).expect("the folder").count(), 0);
 }

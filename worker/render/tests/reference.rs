@@ -564,3 +564,108 @@ fn sections_along_the_slanted_ray_bring_the_order_back() {
     }
     assert!(10.0 * linear[3] < middle[3], "{linear:?} {middle:?}");
 }
+
+/// Without ripple a constant field is constant: the optical depth of a block is that of its
+/// depth, also where the limit ripples. (Its front and back add up to no more and no less, since
+/// what one place of the lattice misses before a face, its mirror image has behind it.)
+#[test]
+fn without_ripple_a_constant_field_comes_back_constant() {
+    let n = 12u32;
+    let volume = Volume::from_fn_u8("block", [n, 7, n], |_, _, _| 100);
+    let (camera, size) = front(&volume);
+    for (std, ripples) in [(0.6, 1e-3), (0.45, 1e-2)] {
+        let tf = alpha(vec![[0.0, 1.0, 1.0, 1.0]], vec![[0.0, 0.3]]);
+        let q = Quality { std, ..i32_sums() };
+        let asked = Asked::new(volume.clone(), tf, q, camera, size);
+        let (limit, level) = (asked.reference(), asked.reference().without_ripple());
+        let want = -libm::expm1(-7.0 * -libm::log1p(-0.3));
+        let tau = |a: f64| -libm::log1p(-a);
+        let mut worst = 0.0f64;
+        // Off the edges by the kernel's reach.
+        let inside = 4 * 4 + 10..size - 4 * 4 - 10;
+        for (x, y) in inside.clone().zip(inside.clone()).step_by(3) {
+            let got = level.pixel(x, y + 1 - y % 3);
+            assert!((got[3] - want).abs() < 1e-6, "std {std}, {x},{y}: {got:?}, {want}");
+            let limit = limit.pixel(x, y + 1 - y % 3)[3];
+            worst = worst.max((tau(limit) / tau(want) - 1.0).abs());
+        }
+        println!("std {std}: the limit ripples by {worst:e}");
+        assert!(worst > ripples, "std {std}: nothing to take away, {worst:e}");
+    }
+}
+
+/// From any side, in both projections: kernel sums divided place by place, against brute force.
+#[test]
+fn without_ripple_is_what_brute_force_over_a_wide_lattice_finds() {
+    let n = 6u32;
+    let volume = Volume::from_fn_u8("block", [n; 3], |_, _, _| 100);
+    let sigma = 0.2;
+    for projection in projections(n) {
+        let tf = transfer(vec![[0.0, 1.0, 1.0, 1.0]], vec![[0.0, sigma]], OpacityUnit::Extinction);
+        let asked = Asked::new(volume.clone(), tf, i32_sums(), oblique(projection), 24);
+        let view = &asked.view;
+        let level = asked.reference().without_ripple();
+        for [x, y] in [[12, 12], [9, 14], [15, 8]] {
+            let (px, py) = (f64::from(x) + 0.5 - 12.0, f64::from(y) + 0.5 - 12.0);
+            use slabcast_common::view::Projection::{Ortho, Persp};
+            let (at, slope) = match view.projection {
+                Ortho { scale } => ([px / scale, py / scale], [0.0; 2]),
+                Persp { focal, distance } => {
+                    let s = [px / focal, py / focal];
+                    (s.map(|s| s * distance), s)
+                }
+            };
+            let secant = (1.0 + slope[0] * slope[0] + slope[1] * slope[1]).sqrt();
+            let to_index = view.eye_from_index.inverse();
+            let (steps, reach) = (4000, 9.0);
+            let mut tau = 0.0;
+            for s in 0..steps {
+                let z = -reach + (f64::from(s) + 0.5) * 2.0 * reach / f64::from(steps);
+                let p = DVec3::new(at[0] + slope[0] * z, at[1] + slope[1] * z, z);
+                let near = (to_index * (p - view.eye_origin)).floor();
+                let (mut ours, mut all) = (0.0, 0.0);
+                for i in 0..9 * 9 * 9 {
+                    let step = [i % 9, i / 9 % 9, i / 81].map(|s| f64::from(s) - 4.0);
+                    let place = near + DVec3::from_array(step);
+                    let u = p - (view.eye_origin + view.eye_from_index * place);
+                    let w = g(u.x) * g(u.y) * g(u.z);
+                    all += w;
+                    let inside =
+                        place.min_element() >= 0.0 && place.max_element() <= f64::from(n - 1);
+                    ours += if inside { w } else { 0.0 };
+                }
+                tau += sigma * ours / all * secant * 2.0 * reach / f64::from(steps);
+            }
+            let want = -libm::expm1(-tau);
+            let got = level.pixel(x, y)[3];
+            // The sums have kinks where kernels end, which 4000 steps cross at 5e-3 each.
+            assert!((got - want).abs() < 1e-5, "{projection:?} {x},{y}: {got}, {want}");
+        }
+    }
+}
+
+/// A voxel with the whole Gaussian weighs that Gaussian across the ray, beyond the radius too.
+#[test]
+fn without_truncation_a_voxel_is_a_gaussian() {
+    let sigma = 3.0;
+    let tf = transfer(vec![[0.0, 1.0, 0.5, 0.25]], vec![[0.0, sigma]], OpacityUnit::Extinction);
+    let one = Volume::from_fn_u8("one", [1, 1, 1], |_, _, _| 9);
+    let n = 33;
+    let camera = oblique(CameraProjection::Ortho { height: 8.0 });
+    let asked = Asked::new(one, tf, i32_sums(), camera, n);
+    let whole = asked.reference().without_truncation();
+    let eye = asked.view.corner_in_eye([0; 3]);
+    let bell = |u: f64| bell(u) / (STD * (2.0 * PI).sqrt());
+    let mut beyond = 0;
+    for (x, y) in (0..n * n).map(|i| (i % n, i / n)) {
+        let at = |p: u32| (f64::from(p) + 0.5 - f64::from(n) / 2.0) * 8.0 / f64::from(n);
+        let (u, v) = (at(x) - eye.x, at(y) - eye.y);
+        let a = -libm::expm1(-sigma * bell(u) * bell(v));
+        assert_near(whole.pixel(x, y), [a, 0.5 * a, 0.25 * a, a], 1e-6, &format!("{x},{y}"));
+        if u.abs() > RADIUS && a > 1e-4 {
+            assert_eq!(asked.reference().pixel(x, y)[3], 0.0);
+            beyond += 1;
+        }
+    }
+    assert!(beyond > 10, "the tail was looked at: {beyond}");
+}

@@ -14,7 +14,7 @@ mod golden;
 mod invariance;
 mod matrix;
 mod pairwise;
-mod shot;
+pub(crate) mod shot;
 mod table;
 
 use crate::fail::Fail;

@@ -56,6 +56,9 @@ pub(super) struct Field<'a> {
     pub(super) kernel: &'a [Profile; 3],
     pub(super) ray: &'a Ray,
     pub(super) voxels: &'a [Near],
+    /// Every place of the lattice, endlessly, each with a payload of one: what the sums are
+    /// divided by where ripple is left out.
+    pub(super) lattice: Option<&'a [Near]>,
 }
 
 impl Field<'_> {
@@ -63,20 +66,32 @@ impl Field<'_> {
     #[inline]
     pub(super) fn at(&self, z: f64) -> [f64; 4] {
         let mut sum = [0.0; 4];
-        let [gx, gy, gz] = self.kernel;
         for v in self.voxels {
-            if z <= v.enter || z >= v.leave {
-                continue;
-            }
-            let mut w = gz.at(z - v.z);
-            if !self.ray.parallel {
-                w *= gx.at(v.x + self.ray.slope[0] * z) * gy.at(v.y + self.ray.slope[1] * z);
-            }
+            let w = self.weight(v, z);
             for c in 0..4 {
                 sum[c] += v.payload[c] * w;
             }
         }
-        sum.map(|s| s * self.ray.secant)
+        let mut scale = self.ray.secant;
+        if let Some(lattice) = self.lattice {
+            let all: f64 = lattice.iter().map(|v| v.payload[0] * self.weight(v, z)).sum();
+            // Narrow kernels leave gaps, where there is nothing to divide.
+            scale = if all > 0.0 { scale / all } else { 0.0 };
+        }
+        sum.map(|s| s * scale)
+    }
+
+    #[inline]
+    fn weight(&self, v: &Near, z: f64) -> f64 {
+        if z <= v.enter || z >= v.leave {
+            return 0.0;
+        }
+        let [gx, gy, gz] = self.kernel;
+        let along = gz.at(z - v.z);
+        if self.ray.parallel {
+            return along;
+        }
+        along * (gx.at(v.x + self.ray.slope[0] * z) * gy.at(v.y + self.ray.slope[1] * z))
     }
 }
 

@@ -1,23 +1,30 @@
 //! Which pixels of a picture are judged.
 
-/// `count` pixels of a picture, one at random in each of as many cells of about equal size; all
-/// pixels where there are no more. The same for the same seed; ascending by rows of cells.
+use slabcast_common::occlusion::Rect;
+
+/// `count` pixels of a picture, one at random in each of [`cells`]; all pixels where there are no
+/// more. The same for the same seed; ascending by rows of cells.
 pub fn stratified(size: [u32; 2], count: usize, seed: u64) -> Vec<[u32; 2]> {
-    let [w, h] = size.map(|n| n as usize);
-    if w == 0 || h == 0 || count == 0 {
-        return Vec::new();
-    }
-    if count >= w * h {
-        return (0..w * h).map(|i| [(i % w) as u32, (i / w) as u32]).collect();
-    }
     let mut state = seed;
-    let mut draw = |n: usize| {
+    let mut draw = |from: i32, to: i32| {
+        let n = (to - from) as usize;
         // SplitMix64.
         state = state.wrapping_add(0x9E37_79B9_7F4A_7C15);
         let z = (state ^ (state >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
         let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((u128::from(z ^ (z >> 31)) * n as u128) >> 64) as usize
+        from as u32 + ((u128::from(z ^ (z >> 31)) * n as u128) >> 64) as u32
     };
+    cells(size, count).into_iter().map(|r| [draw(r.x0, r.x1), draw(r.y0, r.y1)]).collect()
+}
+
+/// A picture cut into `count` cells of about equal size and shape, or into its pixels where there
+/// are no more; by rows.
+pub fn cells(size: [u32; 2], count: usize) -> Vec<Rect> {
+    let [w, h] = size.map(|n| n as usize);
+    let count = count.min(w * h);
+    if count == 0 {
+        return Vec::new();
+    }
     // Rows of cells about as high as the cells are wide; never more cells in a row than pixels.
     let even = (count as f64 * h as f64 / w as f64).sqrt() + 0.5;
     let rows = (even as usize).clamp(count.div_ceil(w), h.min(count));
@@ -27,7 +34,7 @@ pub fn stratified(size: [u32; 2], count: usize, seed: u64) -> Vec<[u32; 2]> {
         let cells = (row + 1) * count / rows - row * count / rows;
         for cell in 0..cells {
             let (x0, x1) = (cell * w / cells, (cell + 1) * w / cells);
-            out.push([(x0 + draw(x1 - x0)) as u32, (y0 + draw(y1 - y0)) as u32]);
+            out.push(Rect::new(x0 as i32, y0 as i32, x1 as i32, y1 as i32));
         }
     }
     out
@@ -58,5 +65,7 @@ mod tests {
         }
         assert_eq!(stratified([4, 2], 100, 1).len(), 8);
         assert!(stratified([4, 2], 0, 1).is_empty());
+        let all: Vec<_> = (0..35).map(|i| [i % 7, i / 7]).collect();
+        assert_eq!(stratified([7, 5], 35, 3), all, "every pixel is its own cell");
     }
 }

@@ -37,6 +37,19 @@ pub struct Sheets {
     pub rounded: bool,
 }
 
+/// One sheet at one pixel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sheet {
+    /// Which: between the depths `k` and `k + 1` thicknesses behind the target.
+    pub k: i64,
+    /// Optical depth along the ray (the sum of opacities, for the paper's compositing).
+    pub tau: f64,
+    /// Mean colour, weighted by extinction.
+    pub colour: [f64; 3],
+    /// Linear premultiplied RGBA of this sheet and all in front of it.
+    pub so_far: [f64; 4],
+}
+
 /// Length of a piece of a section that four Gauss nodes integrate. Between its ends the kernel
 /// is smooth; at half a vox the rule errs by 1e-9 of the weight (deviation .6), at one by 1e-6.
 const PIECE: f64 = 0.5;
@@ -59,6 +72,23 @@ impl Reference {
         self.stack(x, y, how).map_or([[0.0; 4]; 2], |stack| {
             [Compositing::Linear, Compositing::Constant].map(|rule| stack.composite(rule))
         })
+    }
+
+    /// [`Reference::by_sheets`], sheet by sheet; the last may be empty, and those before the first
+    /// are.
+    pub fn sheet_by_sheet(&self, x: u32, y: u32, how: Sheets) -> Vec<Sheet> {
+        let Some(stack) = self.stack(x, y, how) else { return Vec::new() };
+        let mut out = Vec::with_capacity(stack.sheets.len());
+        stack.walk(self.compositing, |i, sums, so_far| {
+            let mean = |c: usize| if sums[0] > 0.0 { sums[c] / sums[0] } else { 0.0 };
+            out.push(Sheet {
+                k: stack.base + i as i64,
+                tau: sums[0] * stack.secant,
+                colour: [mean(1), mean(2), mean(3)],
+                so_far,
+            });
+        });
+        out
     }
 
     /// The sums of all sheets on a pixel's ray; `None` where it meets no voxel.
@@ -111,7 +141,7 @@ impl Reference {
                 }
             }
         }
-        Some(Stack { sheets, peeks, y: d / self.view.kernel_std.z, secant: ray.secant })
+        Some(Stack { base, sheets, peeks, y: d / self.view.kernel_std.z, secant: ray.secant })
     }
 
     /// A section of weight `along` from depth `from` on, with its footprint where `how` says.
@@ -181,6 +211,8 @@ impl Reference {
 
 /// A pixel's sheets, first to last.
 struct Stack {
+    /// Index of the first.
+    base: i64,
     sheets: Vec<[f64; 4]>,
     /// The same without the voxels that begin in the sheet: what the one in front peeks at.
     peeks: Vec<[f64; 4]>,
@@ -192,6 +224,14 @@ struct Stack {
 impl Stack {
     fn composite(&self, rule: Compositing) -> [f64; 4] {
         let mut pixel = [0.0; 4];
+        self.walk(rule, |_, _, so_far| pixel = so_far);
+        pixel
+    }
+
+    /// Closes sheet after sheet and shows each: its number from the first, its sums, and the
+    /// pixel so far.
+    fn walk(&self, rule: Compositing, mut show: impl FnMut(usize, [f64; 4], [f64; 4])) {
+        let mut pixel = [0.0; 4];
         let mut before = [0.0; 4];
         for k in 0..self.sheets.len() - 1 {
             let here = self.sheets[k];
@@ -201,8 +241,8 @@ impl Stack {
                 pixel[c] += open * closed[c];
             }
             before = here;
+            show(k, here, pixel);
         }
-        pixel
     }
 }
 

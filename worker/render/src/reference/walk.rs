@@ -27,6 +27,29 @@ pub(super) struct Ray {
     pub(super) step: f64,
 }
 
+impl Ray {
+    /// Depths between which the ray is inside a box grown by `reach` along the eye's axes.
+    #[inline]
+    pub(super) fn inside(&self, lo: DVec3, hi: DVec3, reach: [f64; 3]) -> Option<(f64, f64)> {
+        let mut from = (lo.z - reach[2]).max(self.start);
+        let mut to = hi.z + reach[2];
+        for (a, (lo, hi)) in [(lo.x, hi.x), (lo.y, hi.y)].into_iter().enumerate() {
+            let (lo, hi) = (lo - reach[a] - self.at[a], hi + reach[a] - self.at[a]);
+            let slope = self.slope[a];
+            if slope == 0.0 {
+                if lo >= 0.0 || hi <= 0.0 {
+                    return None;
+                }
+            } else {
+                let (p, q) = (lo / slope, hi / slope);
+                from = from.max(p.min(q));
+                to = to.min(p.max(q));
+            }
+        }
+        (from < to).then_some((from, to))
+    }
+}
+
 impl Reference {
     pub(super) fn ray(&self, x: u32, y: u32) -> Ray {
         let [w, h] = self.view.size.map(f64::from);
@@ -78,8 +101,8 @@ pub(super) struct Walk<'a> {
     of: &'a Reference,
     ray: &'a Ray,
     looks: &'a Classifier,
-    /// How far along z a voxel is of use.
-    reach_z: f64,
+    /// How far along the eye's axes a voxel is of use.
+    of_use: [f64; 3],
     /// The index axis along which the ray crosses most voxels.
     axis: usize,
     /// Index position of the ray: `index + step z`.
@@ -104,7 +127,7 @@ impl<'a> Walk<'a> {
         let m = of.index_from_eye;
         let step = m * DVec3::new(ray.slope[0], ray.slope[1], 1.0);
         let index = m * (DVec3::new(ray.at[0], ray.at[1], 0.0) - of.view.eye_origin);
-        let [rx, ry, _] = of.kernel.map(|k| k.radius);
+        let [rx, ry, _] = of.kernel.each_ref().map(|k| k.radius);
         let reach = m.x_axis.abs() * rx
             + m.y_axis.abs() * ry
             + m.z_axis.abs() * reach_z
@@ -121,7 +144,7 @@ impl<'a> Walk<'a> {
             of,
             ray,
             looks,
-            reach_z,
+            of_use: [rx, ry, reach_z],
             axis,
             index,
             step,
@@ -212,30 +235,8 @@ impl<'a> Walk<'a> {
         }
     }
 
-    /// Depths between which the ray is inside a box grown by the support.
-    #[inline]
-    pub(super) fn inside(&self, lo: DVec3, hi: DVec3) -> Option<(f64, f64)> {
-        let mut from = (lo.z - self.reach_z).max(self.ray.start);
-        let mut to = hi.z + self.reach_z;
-        for (a, (lo, hi)) in [(lo.x, hi.x), (lo.y, hi.y)].into_iter().enumerate() {
-            let r = self.of.kernel[a].radius;
-            let (lo, hi) = (lo - r - self.ray.at[a], hi + r - self.ray.at[a]);
-            let slope = self.ray.slope[a];
-            if slope == 0.0 {
-                if lo >= 0.0 || hi <= 0.0 {
-                    return None;
-                }
-            } else {
-                let (p, q) = (lo / slope, hi / slope);
-                from = from.max(p.min(q));
-                to = to.min(p.max(q));
-            }
-        }
-        (from < to).then_some((from, to))
-    }
-
     pub(super) fn take_brick(&mut self, brick: &Brick, eye_box: &EyeBox) {
-        if self.inside(eye_box.lo, eye_box.hi).is_none() {
+        if self.ray.inside(eye_box.lo, eye_box.hi, self.of_use).is_none() {
             return;
         }
         let view = &self.of.view;
@@ -244,7 +245,7 @@ impl<'a> Walk<'a> {
             view.eye_origin + view.eye_from_index * DVec3::from_array(corner.map(f64::from));
         for (i, &local) in brick.index.iter().enumerate() {
             let eye = corner + self.of.offsets[local as usize];
-            let Some((enter, leave)) = self.inside(eye, eye) else { continue };
+            let Some((enter, leave)) = self.ray.inside(eye, eye, self.of_use) else { continue };
             let look = self.looks.look(&brick.values, i);
             if look.sigma <= 0.0 {
                 continue;

@@ -1,0 +1,254 @@
+//! Where the error is: the picture and, beside it, its error in false colours.
+//!
+//! The colour of a pixel is the largest error of its four channels against the limit, on a scale
+//! that is always the same, so that maps can be compared: logarithmic, from 0.01 to 10 of 1/255.
+//! A sample is shown as what it is: each cell as one block, in the colour of its one pixel.
+
+use super::Found;
+use crate::fail::Fail;
+use crate::output::write_atomic;
+use slabcast_common::image::{Background, Picture, PixelFormat};
+use slabcast_common::occlusion::Rect;
+use slabcast_render::reference::cells;
+use std::io::Write;
+use std::path::Path;
+
+/// Ends of the scale in 1/255. Three decades: at 0.01 a pixel is as good as exact in any 8-bit
+/// picture, and only one in a thousand of the worst view measured was above 10.
+const SCALE: [f64; 2] = [0.01, 10.0];
+/// Viridis at tenths (matplotlib, CC0): ascends evenly in lightness, also for the colour-blind.
+const VIRIDIS: [[u8; 3]; 11] = [
+    [68, 1, 84],
+    [72, 36, 117],
+    [65, 68, 135],
+    [53, 95, 141],
+    [42, 120, 142],
+    [33, 145, 140],
+    [34, 168, 132],
+    [68, 191, 112],
+    [122, 209, 81],
+    [189, 223, 38],
+    [253, 231, 37],
+];
+/// Neither picture nor limit shows anything there. No grey is on the scale.
+const BLANK: [u8; 3] = [96; 3];
+/// Beyond the scale, or not finite.
+const OVER: [u8; 3] = [255; 3];
+const PAPER: [u8; 3] = [24; 3];
+/// Between the two pictures and around the scale.
+const GAP: usize = 8;
+const BAR: usize = 10;
+/// Pixels of a digit's dot.
+const DOT: usize = 2;
+/// Narrower canvases have a scale without numbers.
+const NUMBERED: usize = 160;
+
+/// Refuses a map that would overwrite the volume.
+pub(super) fn check(map: &Path, volume: &Path) -> Result<(), Fail> {
+    match (map.canonicalize(), volume.canonicalize()) {
+        (Ok(a), Ok(b)) if a == b => {
+            Err(Fail::usage(format!("--map: {} is the volume; give another file", map.display())))
+        }
+        (Ok(a), _) if a.is_dir() => {
+            Err(Fail::usage(format!("--map: {} is a folder; give a file", map.display())))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// The error at each pixel of the sample, in 1/255; `None` where nothing is to be seen.
+fn errors(found: &Found) -> Vec<Option<f64>> {
+    let w = found.picture.size[0] as usize;
+    let one = |(&[x, y], want): (&[u32; 2], &[f64; 4])| {
+        let got = found.picture.pixels[y as usize * w + x as usize].map(f64::from);
+        if got[3] <= 0.0 && want[3] <= 0.0 {
+            return None;
+        }
+        let off = |c: usize| (got[c] - want[c]).abs() * 255.0;
+        // `max` would pass over what is not a number.
+        Some((0..4).map(off).fold(0.0, |a, b| if a >= b { a } else { b }))
+    };
+    found.sample.iter().zip(&found.limit).map(one).collect()
+}
+
+/// Colour of an error in 1/255.
+fn colour(error: Option<f64>) -> [u8; 3] {
+    let Some(e) = error else { return BLANK };
+    let [lo, hi] = SCALE;
+    if e.is_nan() || e > hi {
+        return OVER;
+    }
+    let at = libm::log(e.max(lo) / lo) / libm::log(hi / lo) * 10.0;
+    let i = (at as usize).min(9);
+    let t = at - i as f64;
+    std::array::from_fn(|c| {
+        let (a, b) = (f64::from(VIRIDIS[i][c]), f64::from(VIRIDIS[i + 1][c]));
+        (a + (b - a) * t).round() as u8
+    })
+}
+
+struct Canvas {
+    size: [usize; 2],
+    bytes: Vec<u8>,
+}
+
+impl Canvas {
+    fn new(size: [usize; 2]) -> Canvas {
+        Canvas { size, bytes: PAPER.repeat(size[0] * size[1]) }
+    }
+
+    fn fill(&mut self, [x, y]: [usize; 2], [w, h]: [usize; 2], colour: [u8; 3]) {
+        for y in y..(y + h).min(self.size[1]) {
+            for x in x..(x + w).min(self.size[0]) {
+                let i = (y * self.size[0] + x) * 3;
+                self.bytes[i..i + 3].copy_from_slice(&colour);
+            }
+        }
+    }
+
+    /// Digits and points, 3 x 5 dots each. Gives the width.
+    fn number(&mut self, [mut x, y]: [usize; 2], text: &str) {
+        for glyph in text.chars() {
+            // Rows from the top, three bits each.
+            let rows: [u8; 5] = match glyph {
+                '0' => [7, 5, 5, 5, 7],
+                '1' => [2, 6, 2, 2, 7],
+                _ => [0, 0, 0, 0, 2],
+            };
+            for (r, row) in rows.iter().enumerate() {
+                for c in (0..3).filter(|c| row >> (2 - c) & 1 == 1) {
+                    self.fill([x + c * DOT, y + r * DOT], [DOT; 2], [255; 3]);
+                }
+            }
+            x += 4 * DOT;
+        }
+    }
+}
+
+/// The picture left, its error right, the scale below.
+fn draw(picture: &Picture, background: Background, blocks: &[(Rect, [u8; 3])]) -> Canvas {
+    let [w, h] = picture.size.map(|n| n as usize);
+    let width = 2 * w + GAP;
+    let mut canvas = Canvas::new([width, h + GAP + BAR + GAP / 2 + 5 * DOT + GAP / 2]);
+    let behind = match background {
+        Background::Transparent => Background::Colour([0.0; 3]),
+        colour => colour,
+    };
+    let bytes = picture.encode(PixelFormat::Rgb8, behind);
+    for (y, row) in bytes.chunks_exact(w * 3).enumerate() {
+        canvas.bytes[y * width * 3..][..w * 3].copy_from_slice(row);
+    }
+    for (r, colour) in blocks {
+        canvas.fill([w + GAP + r.x0 as usize, r.y0 as usize], [r.width(), r.height()], *colour);
+    }
+    let bar = h + GAP;
+    let [lo, hi] = SCALE;
+    let all = libm::log(hi / lo);
+    for x in 0..width {
+        let e = lo * libm::exp((x as f64 + 0.5) / width as f64 * all);
+        canvas.fill([x, bar], [1, BAR], colour(Some(e)));
+    }
+    if width >= NUMBERED {
+        for (i, text) in ["0.01", "0.1", "1", "10"].into_iter().enumerate() {
+            let long = text.len() * 4 * DOT - DOT;
+            let x = (width - 1) * i / 3;
+            canvas.fill([x, bar], [1, BAR + GAP / 2], [255; 3]);
+            let x = x.saturating_sub(long / 2).min(width - long);
+            canvas.number([x, bar + BAR + GAP / 2], text);
+        }
+    }
+    canvas
+}
+
+/// Writes the map, whole or not at all.
+pub(super) fn write(path: &Path, found: &Found) -> Result<(), Fail> {
+    let cells = cells(found.picture.size, found.sample.len());
+    let blocks: Vec<_> =
+        cells.into_iter().zip(errors(found)).map(|(cell, e)| (cell, colour(e))).collect();
+    let canvas = draw(&found.picture, found.still.background, &blocks);
+    write_atomic(path, |out| encode(&canvas, found, out))
+}
+
+fn encode(canvas: &Canvas, found: &Found, out: &mut impl Write) -> std::io::Result<()> {
+    let [w, h] = canvas.size.map(|n| n as u32);
+    let mut png = png::Encoder::new(out, w, h);
+    png.set_color(png::ColorType::Rgb);
+    png.set_depth(png::BitDepth::Eight);
+    png.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
+    png.set_compression(png::Compression::Balanced);
+    let figures = found.whole[0].figures;
+    for (key, text) in [
+        ("Software", concat!("slabcast ", env!("CARGO_PKG_VERSION")).to_string()),
+        ("slabcast error scale", scale()),
+        ("slabcast error figures", format!("RMSE {} max {} of 1/255", figures.rmse, figures.max)),
+        ("slabcast pixels_sha256", found.picture.sha256().to_string()),
+    ] {
+        png.add_text_chunk(key.into(), text)?;
+    }
+    let mut png = png.write_header()?;
+    png.write_image_data(&canvas.bytes)?;
+    png.finish()?;
+    Ok(())
+}
+
+fn scale() -> String {
+    let [lo, hi] = SCALE;
+    format!(
+        "largest error of the four channels against the limit, logarithmic: violet {lo} of 1/255 \
+         or less, yellow {hi}, white above, grey blank"
+    )
+}
+
+/// A line that says what the map shows.
+pub(super) fn caption(path: &Path, found: &Found) -> String {
+    let all = found.sample.len() == found.picture.pixels.len();
+    let blocks = if all { "" } else { "; a block is a pixel of the sample (--pixels all: each)" };
+    format!("map: {}: {}{blocks}\n", path.display(), scale())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_scale_ascends_in_lightness_and_has_no_grey() {
+        let light = |c: [u8; 3]| {
+            let [r, g, b] = c.map(f64::from);
+            0.2126 * r + 0.7152 * g + 0.0722 * b
+        };
+        let mut last = 0.0;
+        for i in 0..=300 {
+            let c = colour(Some(0.01 * libm::pow(10.0, f64::from(i) / 100.0)));
+            assert!(light(c) >= last - 1.0, "{i}: {c:?}");
+            last = light(c);
+            let (lo, hi) = (c.iter().min().unwrap(), c.iter().max().unwrap());
+            assert!(hi - lo > 60, "{c:?} is almost grey");
+        }
+        assert_eq!(colour(Some(0.0)), VIRIDIS[0]);
+        assert_eq!(colour(Some(10.0)), VIRIDIS[10]);
+        for over in [10.1, f64::INFINITY, f64::NAN] {
+            assert_eq!(colour(Some(over)), OVER);
+        }
+        assert_eq!(colour(None), BLANK);
+    }
+
+    #[test]
+    fn blocks_stand_beside_the_picture_and_the_smallest_picture_has_a_scale() {
+        for size in [[1u32, 1], [90, 3]] {
+            let n = (size[0] * size[1]) as usize;
+            let picture = Picture { size, pixels: vec![[0.0, 0.0, 1.0, 1.0]; n] };
+            let whole = Rect::of_size(size);
+            let canvas = draw(&picture, Background::Transparent, &[(whole, VIRIDIS[3])]);
+            let at = |x: usize, y: usize| {
+                let i = (y * canvas.size[0] + x) * 3;
+                [canvas.bytes[i], canvas.bytes[i + 1], canvas.bytes[i + 2]]
+            };
+            let [w, h] = size.map(|n| n as usize);
+            assert_eq!(at(w - 1, h - 1), [0, 0, 255]);
+            assert_eq!(at(w, 0), PAPER);
+            assert_eq!(at(w + GAP, 0), VIRIDIS[3]);
+            assert_eq!(at(2 * w + GAP - 1, h - 1), VIRIDIS[3]);
+            assert!(at(0, h + GAP)[2] > 80, "the scale begins violet");
+        }
+    }
+}

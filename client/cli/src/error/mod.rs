@@ -1,0 +1,230 @@
+//! `slabcast error`: how far a picture is from the truth, and why.
+//!
+//! The truth is the reference (a gather in f64 along true rays, which shares nothing with the
+//! splatter) at a stratified sample of pixels, or at all. Sources are found by switching the
+//! others off: each row of the table compares two pictures that differ in that source alone.
+//!
+//! Two kinds of sources. Thickness, cut-off, quantisation and rounding lie between a picture and
+//! the limit, and add up to its error. Truncation and ripple lie between the limit and an ideal:
+//! they are errors of the model, stand beside the sum, and no quality but the kernel's changes
+//! them.
+//!
+//! [`report`] says it as text or JSON, [`map`] as a picture.
+
+mod map;
+mod report;
+
+use crate::fail::{Fail, say};
+use crate::local;
+use crate::parse::Pixels;
+use crate::progress::Progress;
+use crate::request::{PictureArgs, QualityArgs, ViewArgs};
+use crate::still::{self, Still};
+use crate::{parse, signals};
+use slabcast_common::image::Picture;
+use slabcast_common::quality::{Quality, Sums};
+use slabcast_render::reference::{ErrorFigures, Sheets, stratified};
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+/// Tolerance of the reference for those, looser than the judge's own by 100: pixels are then off
+/// by some 0.001/255, where truncation and ripple begin at 0.01, for half the kernel values.
+const MODEL_TOLERANCE: f64 = 1e-5;
+
+/// Says how far a picture is from the truth, in 1/255, and what the error is made of.
+///
+/// The first view of the path is rendered and compared, at a stratified sample of pixels, with a
+/// reference that integrates along true rays in double precision. Errors are of linear
+/// premultiplied RGBA over the pixels where either is not blank; the last column is the RMSE of
+/// the 8-bit sRGB pictures.
+///
+/// Between the picture and the limit of infinitely thin sheets lie thickness, cut-off (--eps),
+/// quantisation (sums of integers) and rounding (of positions, and f32 arithmetic). Between the
+/// limit and an ideal lie two errors of the model, which are no part of that sum: truncation (the
+/// limit with the whole Gaussian, neither cut at the radius nor lowered by its edge value) and
+/// ripple (the limit of a field in which a constant comes back constant).
+#[derive(clap::Args, Clone, Debug)]
+#[command(after_help = "\
+Examples:
+  slabcast error brain.nii.gz
+  slabcast error brain.nii.gz --tf peer-semi --thickness 0.5 --azimuth 30
+  slabcast error brain.nii.gz --map error.png                  where it is, cell by cell
+  slabcast error brain.nii.gz --map error.png --pixels all     pixel by pixel (minutes)
+  slabcast error brain.nii.gz --compositing paper --pixels 16384 --json
+
+JSON: one object. Each of limit, same_thickness, thickness, cutoff, quantisation, rounding,
+rounding_positions, rounding_arithmetic, truncation and ripple is {rmse, max, share_above_1,
+rmse_srgb8, pixels}: 1/255, the share from 0 to 1, and the pixels that are not blank; what is not
+finite is null. sum: {squares, plain, measured}, of thickness to rounding against limit. sampled
+and sampled_model: pixels looked at, blank ones included, for the sum and for truncation and
+ripple. size; pixels_sha256 of the picture; quality; draw_ms, judge_ms, total_ms; map: the file,
+if any.")]
+pub(crate) struct ErrorArgs {
+    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
+    volume: PathBuf,
+    #[command(flatten)]
+    view: ViewArgs,
+    #[command(flatten)]
+    picture: PictureArgs,
+    #[command(flatten)]
+    quality: QualityArgs,
+    /// Pixels to compare, one at random in each of as many cells; or all
+    #[arg(long, value_name = "N|all", default_value = "4096", value_parser = parse::pixels)]
+    pixels: Pixels,
+    /// Pixels at which truncation and ripple are measured, at most as many as --pixels. The
+    /// whole Gaussian meets seven times as many voxels, so these are fewer. Where little is
+    /// translucent they are a rough estimate: truncation is large on silhouettes alone
+    #[arg(long, value_name = "N|all", default_value = "512", value_parser = parse::pixels)]
+    model_pixels: Pixels,
+    /// Which sample of pixels
+    #[arg(long, value_name = "N", default_value = "1")]
+    seed: u64,
+    /// Writes the picture and, beside it, where its error is: in colours from 0.01 to 10 of 1/255
+    /// (blank pixels grey), each cell of the sample as one block
+    #[arg(long, value_name = "FILE.png", value_parser = parse::png)]
+    map: Option<PathBuf>,
+    /// Threads [default: all cores]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    threads: Option<u32>,
+    /// As JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// One comparison.
+struct Row {
+    name: &'static str,
+    what: &'static str,
+    figures: ErrorFigures,
+}
+
+/// All that was found out.
+struct Found {
+    still: Still,
+    picture: Picture,
+    /// Pixels looked at, and what the limit is there.
+    sample: Vec<[u32; 2]>,
+    limit: Vec<[f64; 4]>,
+    /// The whole, and that at the same thickness.
+    whole: [Row; 2],
+    /// What lies between the picture and the limit: adds up to the whole.
+    sources: [Row; 4],
+    /// Rounding, parted.
+    rounding: [Row; 2],
+    /// What lies between the limit and an ideal.
+    model: [Row; 2],
+    /// Pixels looked at for that.
+    sampled_model: usize,
+    drawn: Duration,
+    judged: Duration,
+    total: Duration,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &ErrorArgs) -> Result<(), Fail> {
+    if let Some(map) = &args.map {
+        map::check(map, &args.volume)?;
+    }
+    let found = {
+        let args = args.clone();
+        signals::unless_stopped(move || find(&args))?
+    };
+    if let Some(path) = &args.map {
+        map::write(path, &found)?;
+    }
+    say(&if args.json { report::json(&found, args.map.as_deref()) } else { report::text(&found) })?;
+    match &args.map {
+        Some(path) if !args.json => say(&map::caption(path, &found)),
+        _ => Ok(()),
+    }
+}
+
+/// Whether any pixel was shut. Opacity never falls, so the finished one tells.
+fn shut(picture: &Picture, eps: f64) -> bool {
+    picture.pixels.iter().any(|p| 1.0 - p[3] < eps as f32)
+}
+
+fn find(args: &ErrorArgs) -> Result<Found, Fail> {
+    let threads = still::threads(args.threads);
+    let still = Still::read(&args.volume, (&args.view, &args.picture, &args.quality), |_| Ok(()))?;
+    let size = still.view.size;
+
+    let mut progress = Progress::new(false).of("pixel");
+    let began = Instant::now();
+    progress.stage("drawing");
+    let quality = still.spec.quality;
+    let picture = still.draw(quality, threads);
+    let drawn = began.elapsed();
+    // What nothing tells apart need not be drawn twice.
+    let open = Quality { eps: 0.0, ..quality };
+    let floats = Quality { sums: Sums::F32, ..open };
+    let opened = shut(&picture, quality.eps).then(|| still.draw(open, threads));
+    let opened = opened.as_ref().unwrap_or(&picture);
+    let floated = (floats != open).then(|| still.draw(floats, threads));
+    let floated = floated.as_ref().unwrap_or(opened);
+
+    let sample = stratified(size, args.pixels.count(size), args.seed);
+    let model = stratified(size, sample.len().min(args.model_pixels.count(size)), args.seed);
+    let all = (sample.len() + model.len()) as u64;
+    progress.frames(all, &format!("{} pixels of the reference", sample.len()));
+    let reference = still.reference();
+    let judging = Instant::now();
+    let rounded = Sheets { rounded: true, ..Sheets::default() };
+    let truth = local::judge(&sample, threads, (&mut progress, 0), |[x, y]| {
+        let limit = reference.pixel(x, y);
+        [limit, reference.at_same_thickness(x, y), reference.by_sheets(x, y, rounded)]
+    });
+    let judge = || still.reference().with_tolerance(MODEL_TOLERANCE);
+    let (limit, whole, level) = (judge(), judge().without_truncation(), judge().without_ripple());
+    let ideals = local::judge(&model, threads, (&mut progress, sample.len()), |[x, y]| {
+        [limit.pixel(x, y), whole.pixel(x, y), level.pixel(x, y)]
+    });
+    let judged = judging.elapsed();
+    progress.end();
+
+    let plane =
+        |of: &[[[f64; 4]; 3]], i: usize| -> Vec<[f64; 4]> { of.iter().map(|t| t[i]).collect() };
+    let [limit, sheets, rounded] = [0, 1, 2].map(|i| plane(&truth, i));
+    let [model_limit, whole_kernel, level] = [0, 1, 2].map(|i| plane(&ideals, i));
+    let at = |p: &Picture| -> Vec<[f32; 4]> {
+        sample.iter().map(|&[x, y]| p.pixels[y as usize * size[0] as usize + x as usize]).collect()
+    };
+    let narrow =
+        |p: &[[f64; 4]]| -> Vec<[f32; 4]> { p.iter().map(|c| c.map(|x| x as f32)).collect() };
+    let widen = |p: &[[f32; 4]]| -> Vec<[f64; 4]> { p.iter().map(|c| c.map(f64::from)).collect() };
+    let row = |name, what, got: &[[f32; 4]], want: &[[f64; 4]]| Row {
+        name,
+        what,
+        figures: ErrorFigures::compare(got, want, still.background),
+    };
+    let (got, opened, floated) = (at(&picture), at(opened), at(floated));
+    let found = Found {
+        whole: [
+            row("limit", "against the limit: all of it", &got, &limit),
+            row("same_thickness", "against the same sheets in f64, nothing shut", &got, &sheets),
+        ],
+        sources: [
+            row("thickness", "sheets of finite thickness", &narrow(&sheets), &limit),
+            row("cutoff", "pixels shut before they are opaque", &got, &widen(&opened)),
+            row("quantisation", "sums of integers", &opened, &widen(&floated)),
+            row("rounding", "of positions and in f32", &floated, &sheets),
+        ],
+        rounding: [
+            row("rounding_positions", "of which subpixels and phases", &narrow(&rounded), &sheets),
+            row("rounding_arithmetic", "of which f32 and its tables", &floated, &rounded),
+        ],
+        model: [
+            row("truncation", "the kernel's cut", &narrow(&model_limit), &whole_kernel),
+            row("ripple", "a constant field is not constant", &narrow(&model_limit), &level),
+        ],
+        sampled_model: model.len(),
+        total: began.elapsed(),
+        still,
+        picture,
+        sample,
+        limit,
+        drawn,
+        judged,
+    };
+    Ok(found)
+}

@@ -1,0 +1,76 @@
+//! One view of one volume, for commands that look closely at a single picture: `error` and
+//! `explain`.
+
+use crate::check::shot::Drawn;
+use crate::fail::Fail;
+use crate::local::{self, Cut};
+use crate::progress;
+use crate::request::{Asked, PictureArgs, QualityArgs, ViewArgs, lattice_notice};
+use crate::volume;
+use slabcast_common::brick::Brick;
+use slabcast_common::image::{Background, Picture};
+use slabcast_common::message::SceneSpec;
+use slabcast_common::quality::{Quality, Work};
+use slabcast_common::view::View;
+use slabcast_render::reference::Reference;
+use slabcast_render::{Frame, Scene};
+use std::path::Path;
+use std::sync::Arc;
+
+/// The first view of a path, ready to be drawn and judged.
+pub(crate) struct Still {
+    /// Sums decided.
+    pub(crate) spec: SceneSpec,
+    pub(crate) view: View,
+    pub(crate) bricks: Vec<Arc<Brick>>,
+    pub(crate) background: Background,
+}
+
+impl Still {
+    /// Reads the volume and cuts its bricks. `check` is asked before anything is read.
+    pub(crate) fn read(
+        file: &Path,
+        (view, picture, quality): (&ViewArgs, &PictureArgs, &QualityArgs),
+        check: impl FnOnce([u32; 2]) -> Result<(), Fail>,
+    ) -> Result<Still, Fail> {
+        let asked = Asked::new(view, picture, quality, Work::default())?;
+        let orientation = view.axes.orientation()?;
+        let size = asked.path.size;
+        check(size)?;
+        let volume = volume::open(file)?;
+        let info = volume.info(volume.digest());
+        asked.fit(&info, orientation)?;
+        if let Some(notice) = lattice_notice(&info) {
+            progress::note(&notice);
+        }
+        let transfer = asked.transfer.function(&info).map_err(|e| asked.blame(&e))?;
+        let camera =
+            asked.path.camera(0, &info.lattice, orientation).map_err(|e| asked.blame(&e))?;
+        let view =
+            View::new(&info.lattice, &camera, size, &asked.quality).map_err(|e| asked.blame(&e))?;
+        let Drawn { spec, bricks } = Drawn::new(&volume, &info, &transfer, asked.quality)?;
+        Ok(Still { spec, view, bricks, background: asked.background })
+    }
+
+    /// The frame at another quality (the same sheets and kernel).
+    pub(crate) fn frame(&self, quality: Quality) -> Frame {
+        let spec = SceneSpec { quality, ..self.spec.clone() };
+        Frame::new(Arc::new(Scene::new(&spec)), self.view)
+    }
+
+    /// The picture at another quality (the same sheets and kernel).
+    pub(crate) fn draw(&self, quality: Quality, threads: usize) -> Picture {
+        local::picture(&self.frame(quality), &self.bricks, Cut::on(threads))
+    }
+
+    /// What judges it.
+    pub(crate) fn reference(&self) -> Reference {
+        Reference::new(&self.spec, self.view, &self.bricks)
+    }
+}
+
+/// As many threads as asked for, or as there are cores.
+pub(crate) fn threads(asked: Option<u32>) -> usize {
+    asked
+        .map_or_else(|| std::thread::available_parallelism().map_or(1, |n| n.get()), |n| n as usize)
+}

@@ -11,11 +11,12 @@ use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
 pub const PREFIX: &str = "formula:";
 
 /// Every name and what it shows.
-pub const NAMES: [(&str, &str); 10] = [
+pub const NAMES: [(&str, &str); 11] = [
     ("wall", "a block of 200 in the middle half: closed form of every ray"),
     ("two-walls", "two plates across y, 100 in front of 200: the first hides the second"),
     ("ramp", "float: the value is i, the gradient (1, 0, 0) everywhere"),
     ("blob", "16-bit: one gaussian, 255 at its peak, sigma a sixth of the size"),
+    ("bell", "float: one gaussian, 1 at its peak, sigma a twelfth: not cut by the box"),
     ("marker", "a body with a ball at +x, a cube at +y and a cross at +z: shows mirrored axes"),
     ("spheres", "balls beside and inside each other in a shell cut open"),
     ("fog", "low values everywhere, no air"),
@@ -131,6 +132,23 @@ fn volume(name: &str, dims: [u32; 3], title: &str) -> Option<Volume> {
             let lattice = Lattice::from_spacing(dims, [1.0; 3]);
             let map = ValueMap { scale: 1.0 / 257.0, offset: 0.0 };
             Some(Volume::new(title, "uint16", false, lattice, Samples::U16(v), map))
+        }
+        "bell" => {
+            // exp(-r^2 / 2 s^2) with s = n / 12: 1.5e-8 at the middle of a face, below the last
+            // bit of a float at the peak.
+            let tables = dims.map(|n| {
+                let factor = |i| libm::exp(-18.0 * p(i, n) * p(i, n));
+                (0..n).map(factor).collect::<Vec<f64>>()
+            });
+            let mut v = Vec::with_capacity(dims.iter().map(|&n| n as usize).product());
+            for z in &tables[2] {
+                for y in &tables[1] {
+                    v.extend(tables[0].iter().map(|x| (x * y * z) as f32));
+                }
+            }
+            let lattice = Lattice::from_spacing(dims, [1.0; 3]);
+            let samples = Samples::F32(v);
+            Some(Volume::new(title, "float32", false, lattice, samples, ValueMap::IDENTITY))
         }
         "marker" => u8s(&|i, j, k| {
             let q = at(i, j, k);
@@ -281,6 +299,7 @@ mod tests {
             ("two-walls", "ed4e5af521a120fc"),
             ("ramp", "89e6a2614988cdc2"),
             ("blob", "863c70f158798fb5"),
+            ("bell", "3d77739b8a1aa35e"),
             ("marker", "e69074140a777661"),
             ("spheres", "fe81a76a7a131a28"),
             ("fog", "759719e53f09e1d3"),

@@ -22,6 +22,7 @@ mod local;
 mod logging;
 mod output;
 mod parse;
+mod plot;
 mod progress;
 mod remote;
 mod render;

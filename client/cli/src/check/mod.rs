@@ -4,16 +4,20 @@
 //! frame's bytes must not depend on who rendered it either (DESIGN.md, Pixels are exact):
 //! `matrix` renders views over every way to cut and carry the work and compares their hashes
 //! with the serial renderer's; `golden` prints hashes that have to be the same on every machine,
-//! build and day. This room belongs to the program because only here all crates can be seen.
+//! build and day; `convergence` says how fast pictures come to the limit. This room belongs to the
+//! program because only here all crates can be seen.
 
 mod cases;
 mod changes;
+mod closed;
 mod cluster;
+mod convergence;
 mod extreme;
 mod golden;
 mod invariance;
 mod matrix;
 mod pairwise;
+mod scenes;
 pub(crate) mod shot;
 mod table;
 
@@ -34,6 +38,7 @@ Examples:
   slabcast check --list                     which cases there are
   slabcast check matrix --pairwise          every pair of settings at least once: minutes
   slabcast check matrix brain.nii.gz        all of them: an hour
+  slabcast check convergence                how fast thin sheets come to the limit: a minute
   slabcast check golden --verify tests/golden.txt"
 )]
 pub(crate) struct CheckArgs {
@@ -47,6 +52,7 @@ pub(crate) struct CheckArgs {
 enum What {
     Matrix(matrix::MatrixArgs),
     Golden(golden::GoldenArgs),
+    Convergence(Box<convergence::ConvergenceArgs>),
 }
 
 /// Runs the command.
@@ -55,5 +61,6 @@ pub(crate) fn run(args: &CheckArgs) -> Result<(), Fail> {
         None => table::run(&args.table),
         Some(What::Matrix(args)) => matrix::run(args),
         Some(What::Golden(args)) => golden::run(args),
+        Some(What::Convergence(args)) => convergence::run(args),
     }
 }

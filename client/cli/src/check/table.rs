@@ -6,7 +6,7 @@
 //! held, and the others go on.
 
 use super::shot::Tools;
-use super::{extreme, invariance};
+use super::{closed, extreme, invariance};
 use crate::fail::{Fail, say};
 use crate::progress::{self, Progress};
 use std::time::{Duration, Instant};
@@ -28,6 +28,11 @@ pub(crate) const GROUPS: &[Group] = &[
         about: "stiff and extreme scenes: finite, near enough to the truth, the same bytes \
                 everywhere",
         cases: extreme::cases,
+    },
+    Group {
+        name: "closed form",
+        about: "scenes whose pictures are known on paper, within bounds that count roundings",
+        cases: closed::cases,
     },
     Group {
         name: "invariance",

@@ -1,0 +1,224 @@
+//! One scene in one projection at one thickness after another, and what the errors are made of.
+
+use crate::check::shot::Drawn;
+use crate::fail::Fail;
+use crate::local::{self, Cut};
+use crate::progress::Progress;
+use slabcast_common::image::Picture;
+use slabcast_common::quality::{Compositing, Quality, Sums};
+use slabcast_common::transfer::TransferFunction;
+use slabcast_common::view::{Camera, View};
+use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_render::reference::{Reference, Section, Sheets, stratified};
+use slabcast_render::{Frame, Scene};
+use std::sync::Arc;
+
+/// What is swept.
+pub(super) struct Subject {
+    /// What it is called in tables and file names.
+    pub(super) name: String,
+    pub(super) volume: Volume,
+    pub(super) info: VolumeInfo,
+    pub(super) transfer: TransferFunction,
+    /// Thickness is replaced, `eps` is zero.
+    pub(super) quality: Quality,
+    pub(super) size: [u32; 2],
+    /// Pixels that are compared.
+    pub(super) pixels: usize,
+    pub(super) seed: u64,
+}
+
+/// RMSE and maximum over all channels of the pixels where either is not blank, in 1/255.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Off {
+    pub(super) rmse: f64,
+    pub(super) max: f64,
+}
+
+impl Off {
+    fn between(got: &[[f64; 4]], want: &[[f64; 4]]) -> Off {
+        let (mut squares, mut max, mut n) = (0.0, 0.0f64, 0usize);
+        for (got, want) in got.iter().zip(want) {
+            if got[3] <= 0.0 && want[3] <= 0.0 {
+                continue;
+            }
+            n += 1;
+            for c in 0..4 {
+                let off = (got[c] - want[c]).abs() * 255.0;
+                squares += off * off;
+                max = if off <= max { max } else { off };
+            }
+        }
+        Off { rmse: (squares / (4.0 * n.max(1) as f64)).sqrt(), max }
+    }
+}
+
+/// All figures of one thickness.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Rung {
+    /// Of a sheet, in vox.
+    pub(super) thickness: f64,
+    /// Rendered pictures against the limit.
+    pub(super) linear: Off,
+    pub(super) constant: Off,
+    /// The paper's form against the limit of its own, and against the limit.
+    pub(super) paper: Off,
+    pub(super) paper_limit: Off,
+    /// The same sheets in f64 against the limit: what thickness alone does.
+    pub(super) linear_f64: Off,
+    pub(super) constant_f64: Off,
+    pub(super) paper_f64: Off,
+    /// What makes linear's rest, each against what is without it: rounded positions in f64, f32
+    /// arithmetic on these, integers for floats.
+    pub(super) positions: Off,
+    pub(super) floats: Off,
+    pub(super) integers: Off,
+    /// Linear in f64 with sections placed otherwise, in perspective views and where asked for:
+    /// centroid, half-way, along the ray.
+    pub(super) placed: Option<[Off; 3]>,
+}
+
+/// What one sweep found.
+pub(super) struct Sweep {
+    pub(super) name: String,
+    pub(super) projection: &'static str,
+    /// Pixels compared that are not blank.
+    pub(super) pixels: usize,
+    /// Whether sheets added integers.
+    pub(super) integers: bool,
+    /// From the limit to that of the paper's form.
+    pub(super) elsewhere: Off,
+    pub(super) rungs: Vec<Rung>,
+}
+
+/// The rounding that is largest where it hides what thickness does.
+pub(super) struct Floor {
+    pub(super) thickness: f64,
+    pub(super) rmse: f64,
+    pub(super) name: &'static str,
+}
+
+impl Sweep {
+    /// Where linear compositing stops to gain: the thickest rung whose roundings are larger than
+    /// what thickness does, and the largest of them.
+    pub(super) fn floor(&self) -> Option<Floor> {
+        let r = self.rungs.iter().find(|r| r.linear_f64.rmse < rest(r))?;
+        let mut all = [
+            (r.positions.rmse, "rounded positions"),
+            (r.floats.rmse, "f32 arithmetic"),
+            (r.integers.rmse, "integer sums"),
+        ];
+        all.sort_by(|a, b| b.0.total_cmp(&a.0));
+        Some(Floor { thickness: r.thickness, rmse: rest(r), name: all[0].1 })
+    }
+}
+
+/// Roundings of all kinds together.
+fn rest(r: &Rung) -> f64 {
+    let all = [r.positions, r.floats, r.integers];
+    all.iter().map(|o| o.rmse * o.rmse).sum::<f64>().sqrt()
+}
+
+/// Sweeps `thicknesses` from `camera`. `placed`: also with sections placed otherwise.
+pub(super) fn sweep(
+    subject: &Subject,
+    projection: &'static str,
+    camera: &Camera,
+    thicknesses: &[f64],
+    placed: bool,
+    threads: usize,
+    progress: &mut Progress,
+) -> Result<Sweep, Fail> {
+    let view = |quality: &Quality| {
+        View::new(&subject.info.lattice, camera, subject.size, quality)
+            .map_err(|e| Fail::failed(format!("{}: {e}", subject.name)))
+    };
+    let quality =
+        |compositing, thickness| Quality { compositing, thickness, eps: 0.0, ..subject.quality };
+    let drawn = |compositing| {
+        let q = quality(compositing, 1.0);
+        Drawn::new(&subject.volume, &subject.info, &subject.transfer, q)
+    };
+    let (ours, papers) = (drawn(Compositing::Linear)?, drawn(Compositing::Paper)?);
+    let sample = stratified(subject.size, subject.pixels, subject.seed);
+    let reference = |drawn: &Drawn, quality: &Quality| {
+        Ok::<_, Fail>(Reference::new(&drawn.spec, view(quality)?, &drawn.bricks))
+    };
+    let each = |pixel: &(dyn Fn(u32, u32) -> [f64; 4] + Sync)| {
+        local::shared(sample.len(), threads, |i, _: &mut ()| pixel(sample[i][0], sample[i][1]))
+    };
+    let picture = |drawn: &Drawn, quality: Quality| {
+        let view = view(&quality)?;
+        let spec = slabcast_common::message::SceneSpec { quality, ..drawn.spec.clone() };
+        let frame = Frame::new(Arc::new(Scene::new(&spec)), view);
+        let picture: Picture = local::picture(&frame, &drawn.bricks, Cut::on(threads));
+        let at = |p: &[u32; 2]| picture.pixels[(p[1] * subject.size[0] + p[0]) as usize];
+        Ok::<_, Fail>(sample.iter().map(|p| at(p).map(f64::from)).collect::<Vec<_>>())
+    };
+    progress.stage(&format!("{}, {projection}: the limit", subject.name));
+    let q = quality(Compositing::Linear, 1.0);
+    let limit = {
+        let r = reference(&ours, &q)?;
+        each(&|x, y| r.pixel(x, y))
+    };
+    let papers_limit = {
+        let r = reference(&papers, &q)?.with_what_sheets_add();
+        each(&|x, y| r.pixel(x, y))
+    };
+    let mut rungs = Vec::new();
+    for &thickness in thicknesses {
+        progress.stage(&format!("{}, {projection}: {thickness} vox", subject.name));
+        let of = |compositing, sums| Quality { sums, ..quality(compositing, thickness) };
+        let (linear, paper) = (Compositing::Linear, Compositing::Paper);
+        let decided = ours.spec.quality.sums;
+        let drawn = picture(&ours, of(linear, decided))?;
+        let constant = picture(&ours, of(Compositing::Constant, decided))?;
+        let floats = match decided {
+            Sums::F32 => drawn.clone(),
+            _ => picture(&ours, of(linear, Sums::F32))?,
+        };
+        let additive = picture(&papers, of(paper, papers.spec.quality.sums))?;
+
+        let ours_in_f64 = reference(&ours, &of(linear, decided))?;
+        let both = |how: Sheets| {
+            let pixels = local::shared(sample.len(), threads, |i, _: &mut ()| {
+                ours_in_f64.by_sheets_linear_and_constant(sample[i][0], sample[i][1], how)
+            });
+            pixels.into_iter().map(|[l, c]| (l, c)).unzip::<_, _, Vec<_>, Vec<_>>()
+        };
+        let (linear_f64, constant_f64) = both(Sheets::default());
+        let (rounded, _) = both(Sheets { rounded: true, ..Sheets::default() });
+        let paper_f64 = {
+            let r = reference(&papers, &of(paper, papers.spec.quality.sums))?;
+            each(&|x, y| r.at_same_thickness(x, y))
+        };
+        let placed = placed.then(|| {
+            [Section::Centroid, Section::Between, Section::Exact].map(|section| {
+                let (linear, _) = both(Sheets { section, rounded: false });
+                Off::between(&linear, &limit)
+            })
+        });
+        rungs.push(Rung {
+            thickness,
+            linear: Off::between(&drawn, &limit),
+            constant: Off::between(&constant, &limit),
+            paper: Off::between(&additive, &papers_limit),
+            paper_limit: Off::between(&additive, &limit),
+            linear_f64: Off::between(&linear_f64, &limit),
+            constant_f64: Off::between(&constant_f64, &limit),
+            paper_f64: Off::between(&paper_f64, &papers_limit),
+            positions: Off::between(&rounded, &linear_f64),
+            floats: Off::between(&floats, &rounded),
+            integers: Off::between(&drawn, &floats),
+            placed,
+        });
+    }
+    Ok(Sweep {
+        name: subject.name.clone(),
+        projection,
+        pixels: limit.iter().filter(|p| p[3] > 0.0).count(),
+        integers: ours.spec.quality.sums != Sums::F32,
+        elsewhere: Off::between(&papers_limit, &limit),
+        rungs,
+    })
+}

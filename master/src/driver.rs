@@ -17,7 +17,7 @@ use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Refused};
 use slabcast_common::stats::FrameStats;
 use slabcast_common::transfer::{Classifier, Support, TransferFunction};
-use slabcast_common::view::{Projected, View};
+use slabcast_common::view::View;
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
 use slabcast_proto::model::Worker;
@@ -871,13 +871,6 @@ impl Driver {
             return;
         };
         let view = r.views[flight.number as usize];
-        let whole = slabcast_common::brick::TightBox {
-            lo: [0; 3],
-            hi: self.served.info.lattice.dims.map(|n| n - 1),
-        };
-        let depth_vox = view
-            .project(&whole)
-            .map_or(0.0, |Projected { sheets, .. }| f64::from(sheets.len()) * view.thickness);
         let sums = finish::FrameSums {
             job: flight.job,
             frame,
@@ -887,7 +880,6 @@ impl Driver {
             state,
             stats,
             spans,
-            depth_vox,
             voxels: r.store.as_ref().map_or(0, |s| s.relevant_voxels()),
             normals: r.store.as_ref().is_some_and(|s| s.has_normals()),
         };

@@ -5,10 +5,10 @@
 
 use crate::jobs::FinishedFrame;
 use sha2::{Digest, Sha256};
+use slabcast_common::bounds;
 use slabcast_common::ids::{FrameId, JobId};
 use slabcast_common::image::FrameState;
 use slabcast_common::message::{PathRequest, SceneSpec};
-use slabcast_common::quality::{Compositing, Sums};
 use slabcast_common::stats::{Bound, ErrorStats, FrameStats, LeftOut};
 use slabcast_common::view::View;
 use slabcast_common::volume::Digest32;
@@ -25,8 +25,6 @@ pub(crate) struct FrameSums {
     pub(crate) state: Box<FrameState>,
     pub(crate) stats: Box<FrameStats>,
     pub(crate) spans: Vec<Span>,
-    /// Depth of the volume along the view, in vox.
-    pub(crate) depth_vox: f64,
     /// Voxels stored, for what normals would have taken.
     pub(crate) voxels: u64,
     pub(crate) normals: bool,
@@ -65,31 +63,12 @@ pub fn view_sha256(scene: &SceneSpec, view: &View) -> Digest32 {
 }
 
 /// The bounds that are known without a reference (DESIGN.md section 5), in 1/255.
-fn error(scene: &SceneSpec, view: &View, depth_vox: f64) -> ErrorStats {
-    let q = &scene.quality;
-    let mut e = ErrorStats {
-        // At most eps of the light is missing, and no colour is brighter than one.
-        cutoff: Bound { bound: Some(q.eps * 255.0) },
+fn error(scene: &SceneSpec, view: &View) -> ErrorStats {
+    ErrorStats {
+        cutoff: Bound { bound: Some(bounds::cutoff(&scene.quality)) },
+        quantisation: Bound { bound: Some(bounds::quantisation(scene, view)) },
         ..ErrorStats::default()
-    };
-    if q.sums == Sums::I32 && q.compositing != Compositing::Paper {
-        // Every contribution is rounded by half a raw unit. A ray meets the kernels of
-        // (2 R)^2 voxels a vox of depth, each in 2 R / d + 1 sheets; optical depth is off by at
-        // most their sum, alpha by no more than that. A colour's two sums are rounded apart,
-        // and its change is judged from three sheets: four times.
-        let payload_max = slabcast_common::transfer::Classifier::new(
-            &scene.transfer,
-            &scene.volume,
-            q.compositing,
-        )
-        .payload_max();
-        let d = view.thickness;
-        let unit = 1.05 * payload_max * d / f64::from(1u32 << 30);
-        let r = view.kernel_radius;
-        let met = 4.0 * r.x * r.y / view.cell * (depth_vox + 2.0 * r.z) * (2.0 * r.z / d + 2.0);
-        e.quantisation = Bound { bound: Some(4.0 * 0.5 * unit * met * 255.0) };
     }
-    e
 }
 
 /// Makes the frame.
@@ -99,7 +78,7 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
     stats.view_sha256 = view_sha256(&s.scene, &s.view).to_string();
     stats.pixels_sha256 = picture.sha256().to_string();
     stats.pixels_version = slabcast_common::PIXELS_VERSION;
-    stats.error = error(&s.scene, &s.view, s.depth_vox);
+    stats.error = error(&s.scene, &s.view);
     if !s.normals {
         stats.left_out.push(LeftOut {
             name: "normals".into(),

@@ -3,6 +3,7 @@
 use crate::footprint::{Footprints, Profile, Sections};
 use crate::sheet::Rule;
 use glam::{DVec3, Vec3};
+use slabcast_common::bounds::raw_per_payload;
 use slabcast_common::brick::{Brick, BrickGrid, TightBox, local};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Compositing, Quality, Sums};
@@ -11,12 +12,6 @@ use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::Classifier;
 use slabcast_common::view::{Projection, View};
 use std::sync::Arc;
-
-/// What integer sums leave free above a solid of the largest extinction: ripple takes at most
-/// 5 % for every kernel that `Quality::check` lets through but the narrowest, and the factor of
-/// two up to 2^31 takes those. At half, single voxels of narrow kernels overflow; at double,
-/// one bit of precision is given away.
-const HEADROOM: f64 = 1.05;
 
 /// A volume's looks under one transfer function and quality.
 #[derive(Debug)]
@@ -87,13 +82,8 @@ impl Frame {
         let range = SheetRange::new(range.first, range.end + 1);
         let profile = Profile::new(view.kernel_std.z, view.kernel_radius.z);
         let d = view.thickness;
-        let raw_scale = if scene.float_sums() {
-            1.0
-        } else {
-            // 2^30 is a sheet full of the most extinct material (NUMERICS.md section 3).
-            let solid = HEADROOM * scene.payload_max * d;
-            if solid > 0.0 { ((1u32 << 30) as f64 / solid) as f32 } else { 1.0 }
-        };
+        let raw_scale =
+            if scene.float_sums() { 1.0 } else { raw_per_payload(scene.payload_max, d) };
         let to_eye = match view.projection {
             Projection::Ortho { .. } => Some(view.to_eye(DVec3::ZERO)),
             Projection::Persp { .. } => None,

@@ -159,9 +159,10 @@ impl Tcp {
     async fn end(mut self) {
         drop(self.client);
         let _ = self.stop.send(true);
+        // Workers first: a master that leaves before them would be dialled again.
         let ended = async {
-            self.master.shutdown().await;
             while self.tasks.join_next().await.is_some() {}
+            self.master.shutdown().await;
         };
         let _ = tokio::time::timeout(Duration::from_secs(5), ended).await;
     }

@@ -12,6 +12,7 @@ mod changes;
 mod closed;
 mod cluster;
 mod convergence;
+mod enclose;
 mod extreme;
 mod golden;
 mod invariance;

@@ -186,6 +186,14 @@ pub(crate) enum Against {
 }
 
 impl Ready {
+    /// The same scene and camera in another quality; `sums` must be decided.
+    pub(crate) fn with(&self, quality: Quality) -> Ready {
+        let mut other = self.clone();
+        other.spec.quality = quality;
+        other.view.thickness = quality.thickness;
+        other
+    }
+
     /// Tables for drawing.
     pub(crate) fn frame(&self) -> Frame {
         Frame::new(Arc::new(Scene::new(&self.spec)), self.view)
@@ -239,10 +247,21 @@ pub(crate) fn largest(got: &[[f32; 4]], want: &[[f64; 4]]) -> f64 {
     })
 }
 
-/// Whether every channel of every pixel is finite, and colour and opacity lie in 0 to 1.
+/// What is wrong with a picture by itself: a channel that is not finite or leaves 0 to 1.
 pub(crate) fn sane(picture: &Picture) -> Option<String> {
-    let inside = |p: &[f32; 4]| p.iter().all(|c| (0.0..=1.0 + 1e-6).contains(c));
-    let bad = picture.pixels.iter().position(|p| !inside(p))?;
+    first_bad(picture, |p| p.iter().all(|c| (0.0..=1.0 + 1e-6).contains(c)))
+}
+
+/// The same; also a colour above its opacity by more than `slack`.
+pub(crate) fn sane_within(picture: &Picture, slack: f64) -> Option<String> {
+    first_bad(picture, |p| {
+        let most = f64::from(p[3]) + slack;
+        (0.0..=1.0).contains(&p[3]) && p[..3].iter().all(|&c| (0.0..=most).contains(&f64::from(c)))
+    })
+}
+
+fn first_bad(picture: &Picture, good: impl Fn(&[f32; 4]) -> bool) -> Option<String> {
+    let bad = picture.pixels.iter().position(|p| !good(p))?;
     let w = picture.size[0] as usize;
     Some(format!("pixel {},{} is {:?}", bad % w, bad / w, picture.pixels[bad]))
 }
@@ -256,8 +275,10 @@ mod tests {
         assert_eq!(largest(&[[0.0, 1.0, 0.0, 0.5]], &[[0.0, 0.0, 0.0, 0.5]]), 255.0);
         assert!(largest(&[[f32::NAN; 4], [0.0; 4]], &[[0.0; 4]; 2]).is_nan());
         let picture = |p| Picture { size: [1, 1], pixels: vec![p] };
-        assert_eq!(sane(&picture([0.0, 0.5, 1.0, 1.0])), None);
-        assert!(sane(&picture([0.0, -0.1, 0.0, 0.0])).is_some());
-        assert!(sane(&picture([0.0, f32::INFINITY, 0.0, 0.0])).is_some());
+        assert_eq!(sane_within(&picture([0.0, 0.5, 1.0, 1.0]), 0.0), None);
+        for bad in [-0.1, 0.6, f32::INFINITY, f32::NAN] {
+            assert!(sane_within(&picture([0.0, bad, 0.0, 0.5]), 0.01).is_some(), "{bad}");
+            assert!(sane_within(&picture([0.0, 0.0, 0.0, bad * 2.0]), 0.01).is_some(), "{bad}");
+        }
     }
 }

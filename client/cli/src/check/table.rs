@@ -112,10 +112,11 @@ impl Row {
     }
 
     /// As one line of JSON.
-    fn json(&self, group: &str, case: &str) -> String {
+    fn json(&self, group: &str, case: &str, took: Duration) -> String {
         let row = serde_json::json!({
             "group": group, "case": case, "what": self.what, "error": self.error,
-            "bound": self.bound, "held": self.held(), "trouble": self.trouble
+            "bound": self.bound, "held": self.held(), "trouble": self.trouble,
+            "case_ms": took.as_secs_f64() * 1e3
         });
         format!("{row}\n")
     }
@@ -185,11 +186,14 @@ pub(crate) fn run(args: &TableArgs) -> Result<(), Fail> {
     let (mut rows, mut wrong) = (0, 0);
     for (done, (group, case)) in cases.iter().enumerate() {
         progress.stage(&case.name);
-        for row in outcome(case, &tools) {
+        let case_began = Instant::now();
+        let outcome = outcome(case, &tools);
+        let took = case_began.elapsed();
+        for row in outcome {
             rows += 1;
             wrong += usize::from(!row.held());
             let line = if args.json {
-                row.json(group.name, &case.name)
+                row.json(group.name, &case.name, took)
             } else {
                 row.text(group.name, &case.name)
             };
@@ -289,7 +293,7 @@ mod tests {
         assert!(!row(f64::NAN, None).held());
         assert!(!row(0.0, Some("hashes differ")).held());
         assert!(row(2.0, None).text("g", "c").contains("NOT HELD"));
-        assert!(row(f64::NAN, None).json("g", "c").contains("\"held\":false"));
+        assert!(row(f64::NAN, None).json("g", "c", Duration::ZERO).contains("\"held\":false"));
     }
 
     #[test]

@@ -7,40 +7,25 @@
 //! two ways to compute one position could fall on two sides of a boundary. They differ by 1e-13
 //! pixels or so and boundaries are 1/256 pixel apart: no scene here has a voxel that near to one.
 
-use super::cases;
+use super::asked::{
+    Asked, BYTES, Effort, LARGEST, Scene, VIEWS, cropped, largest, mirrored, pixels_that_differ,
+    rolled,
+};
 use super::changes::Turn;
-use super::shot::{Against, Shot, Tools};
+use super::shot::{Against, Shot};
 use super::table::{Case, Row};
 use crate::fail::Fail;
 use crate::local::Cut;
-use crate::volume;
 use glam::DVec3;
 use slabcast_common::image::{Background, Picture};
-use slabcast_common::path::PathView;
-use slabcast_common::path::ProjectionKind::{self, Ortho, Persp};
-use slabcast_common::presets;
 use slabcast_common::quality::Quality;
 use slabcast_common::shade::{HeadWord, Light};
-use slabcast_common::transfer::{ColorSpace, SIGMA_MAX, TransferFunction};
-use slabcast_common::volume::Lattice;
+use slabcast_common::transfer::{ColorSpace, TransferFunction};
 use slabcast_render::reference::ErrorFigures;
-use std::sync::Arc;
-
-/// How much is drawn.
-#[derive(Clone, Copy, Debug)]
-struct Effort {
-    /// Samples along the axes of a volume.
-    samples: u32,
-    size: [u32; 2],
-    /// Pixels that are compared with the reference.
-    pixels: usize,
-    /// Every how manyth of the 47 turns is tried.
-    every: usize,
-}
 
 /// The cases of the group.
 pub(crate) fn cases() -> Vec<Case> {
-    with(Effort { samples: 48, size: [160, 128], pixels: 2000, every: 1 })
+    with(Effort { samples: 48, size: [160, 128], pixels: 2000, every: 5 })
 }
 
 fn with(effort: Effort) -> Vec<Case> {
@@ -71,158 +56,6 @@ fn with(effort: Effort) -> Vec<Case> {
 
 /// One invariance of one scene.
 type Check = fn(&Asked) -> Result<Vec<Row>, Fail>;
-
-struct Asked<'a> {
-    scene: Scene,
-    effort: Effort,
-    shot: Shot,
-    tools: &'a Tools,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Scene {
-    /// Lit and opaque.
-    Opaque,
-    /// Unlit, nothing hides anything.
-    Translucent,
-    /// Extinctions far beyond the cap of opacities: the sums are floats.
-    Stiff,
-    /// Samples that are not cubes, lit from aside.
-    Boxes,
-}
-
-impl Scene {
-    fn name(self) -> &'static str {
-        match self {
-            Scene::Opaque => "opaque",
-            Scene::Translucent => "translucent",
-            Scene::Stiff => "float sums",
-            Scene::Boxes => "boxes",
-        }
-    }
-
-    fn shot(self, effort: Effort) -> Result<Shot, Fail> {
-        let n = effort.samples;
-        let (formula, n, tf) = match self {
-            Scene::Opaque => ("spheres", n, "peer-opaque"),
-            Scene::Translucent => ("marker", n - 1, "peer-semi"),
-            Scene::Stiff => ("blob", n / 2, "grey"),
-            Scene::Boxes => ("spheres", n / 2, "peer-vessels"),
-        };
-        let mut volume = volume::open(format!("formula:{formula}:{n}").as_ref())?;
-        let mut transfer = presets::by_name(tf, &volume.summary).map_err(|e| Fail::flag(&e))?;
-        match self {
-            Scene::Opaque => {}
-            Scene::Translucent => transfer.shading.on = false,
-            Scene::Stiff => transfer = cases::uncapped(&volume.info(volume.digest())),
-            Scene::Boxes => {
-                volume.lattice = Lattice::from_spacing([n; 3], [0.75, 1.0, 2.25]);
-                transfer.shading.light = Light::Direction([0.5, 1.0, 0.25]);
-            }
-        }
-        if self == Scene::Stiff {
-            transfer.shading.on = false;
-        }
-        let view = view(&volume.lattice, [0.0, 2.0, 0.0], Ortho);
-        let (volume, quality) = (Arc::new(volume), Quality::default());
-        Ok(Shot { volume, transfer, quality, size: effort.size, view })
-    }
-}
-
-/// Directions to the eye in extents of the volume. All coordinates are multiples of 1/8: they
-/// stay exact when the origin is far away.
-const VIEWS: [(&str, [f64; 3], ProjectionKind); 4] = [
-    ("oblique", [0.75, 1.5, 0.625], Ortho),
-    ("along an axis", [0.0, 2.0, 0.0], Ortho),
-    ("perspective", [-0.75, 0.625, -0.375], Persp),
-    ("perspective along an axis", [0.0, 1.5, 0.0], Persp),
-];
-
-fn view(lattice: &Lattice, to_eye: [f64; 3], projection: ProjectionKind) -> PathView {
-    let (centre, extent) = (lattice.centre(), lattice.largest_extent());
-    PathView {
-        eye: (centre + DVec3::from_array(to_eye) * extent).to_array(),
-        target: centre.to_array(),
-        up: [0.0, 0.0, 1.0],
-        projection,
-        height: (projection == Ortho).then_some(1.25 * extent),
-        fov: (projection == Persp).then_some(40.0),
-    }
-}
-
-const BYTES: &str = "pixels whose bytes differ";
-const LARGEST: &str = "largest difference";
-
-impl Asked<'_> {
-    fn picture(&self, shot: &Shot) -> Result<Picture, Fail> {
-        Ok(shot.ready()?.picture(Cut::on(self.tools.threads)))
-    }
-
-    /// The shot from each of the views, with its picture.
-    fn views(&self) -> Result<Vec<(Shot, Picture)>, Fail> {
-        VIEWS
-            .iter()
-            .map(|(name, to_eye, projection)| {
-                let view = view(&self.shot.volume.lattice, *to_eye, *projection);
-                let shot = Shot { view, ..self.shot.clone() };
-                let picture = self.picture(&shot)?;
-                if picture.pixels.iter().all(|p| p[3] == 0.0) {
-                    return Err(Fail::failed(format!("{name}: there is nothing to be seen")));
-                }
-                Ok((shot, picture))
-            })
-            .collect()
-    }
-
-    /// One row: by how many pixels any of `others` differs at most, from any view.
-    fn same_bytes(&self, what: &str, others: impl Fn(&Shot) -> Vec<Shot>) -> Result<Row, Fail> {
-        let mut most = 0;
-        for (shot, want) in self.views()? {
-            for other in others(&shot) {
-                most = most.max(pixels_that_differ(&want, &self.picture(&other)?));
-            }
-        }
-        Ok(Row::new(format!("{BYTES}: {what}"), most as f64, 0.0))
-    }
-
-    /// Sheets that the volume takes at most.
-    fn sheets(&self) -> f64 {
-        let l = &self.shot.volume.lattice;
-        let n = l.dims.map(f64::from);
-        let extent: DVec3 = DVec3::from_array(std::array::from_fn(|a| l.spacing()[a] * n[a]));
-        extent.length() / l.vox() / self.shot.quality.thickness + 8.0
-    }
-
-    /// How far sums and closing sheets may be off by rounding, as a share of full light; what
-    /// two ways to add the same numbers differ by is at most twice that.
-    ///
-    /// In a sheet a pixel gets at most (2 R + 1)^2 (2 R + 1 + d) contributions, R = 2 and d = 1:
-    /// 150. Each is off by half a unit of an integer sum, of which 2^30 are 1.05 times a sheet
-    /// full of the largest extinction; a sum of floats has 150 roundings instead. Products have 3
-    /// roundings of f32, a closing sheet has some 8, and colour one of 2^-29. Relative errors of an
-    /// optical depth count for all sheets together (tau exp(-tau) <= 0.37), absolute ones in
-    /// each.
-    fn rounding(&self) -> f64 {
-        let f32s = 2f64.powi(-24);
-        let unit = 1.05 * SIGMA_MAX * self.shot.quality.thickness * 2f64.powi(-30);
-        let (a_sheet, in_all) =
-            if self.scene == Scene::Stiff { (0.0, 150.0) } else { (75.0 * unit, 3.0) };
-        self.sheets() * (a_sheet + 8.0 * f32s) + in_all * f32s
-    }
-
-    /// How far a picture with other codes for its normals may be off, as a share of full light.
-    ///
-    /// A code's coordinates are off by up to 1/254 in x and y and twice that in z, of a vector
-    /// at least 1/sqrt 3 long: 0.0167 rad, and twice that between two codes of one normal. Light
-    /// changes by at most 0.7 a radian (diffuse 0.7; where the highlight is steep, Lambert is
-    /// flat), so a voxel's colour by 0.0234. A pixel is a mean of colours of weight A, and the
-    /// colour rule adds differences to both neighbours by its gains, of which A / 2 shows.
-    fn normals(&self) -> f64 {
-        let voxel = 0.7 * 2.0 * (6f64.sqrt() / 254.0) * 3f64.sqrt();
-        let y = self.shot.quality.thickness / self.shot.quality.std;
-        voxel * (1.0 + (0.5 + 0.2 * y) + (0.5 - 0.07 * y).max(0.25))
-    }
-}
 
 /// Lengths in another unit. Powers of two change nothing. Other factors round lengths in their
 /// last bit, 1e-16 of them, and weights and looks, kept in f32, then change in one case of 10^8.
@@ -465,40 +298,9 @@ fn points(asked: &Asked) -> Result<Vec<Row>, Fail> {
     Ok(vec![exact, Row::new(format!("{LARGEST}: rounded points"), off, bound)])
 }
 
-fn pixels_that_differ(a: &Picture, b: &Picture) -> usize {
-    let differ = |(p, q): &(&[f32; 4], &[f32; 4])| p.map(f32::to_bits) != q.map(f32::to_bits);
-    a.pixels.iter().zip(&b.pixels).filter(differ).count()
-}
-
-/// In 1/255, over all channels; not a number where one of them is none.
-fn largest(a: &Picture, b: &Picture) -> f64 {
-    let want: Vec<[f64; 4]> = b.pixels.iter().map(|p| p.map(f64::from)).collect();
-    super::shot::largest(&a.pixels, &want)
-}
-
-/// Left and right exchanged.
-fn mirrored(p: &Picture) -> Picture {
-    let mut p = p.clone();
-    let width = p.size[0] as usize;
-    p.pixels.chunks_mut(width).for_each(<[_]>::reverse);
-    p
-}
-
-/// A square picture a quarter turn round.
-fn rolled(p: &Picture) -> Picture {
-    let n = p.size[0] as usize;
-    let at = |i: usize| p.pixels[(i % n) * n + (n - 1 - i / n)];
-    Picture { size: p.size, pixels: (0..n * n).map(at).collect() }
-}
-
-fn cropped(p: &Picture, corner: [u32; 2], size: [u32; 2]) -> Picture {
-    let rows = (0..size[1]).map(|y| ((corner[1] + y) * p.size[0] + corner[0]) as usize);
-    let pixels = rows.flat_map(|at| p.pixels[at..at + size[0] as usize].iter().copied());
-    Picture { size, pixels: pixels.collect() }
-}
-
 #[cfg(test)]
 mod tests {
+    use super::super::shot::Tools;
     use super::*;
 
     #[test]

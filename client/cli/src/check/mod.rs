@@ -4,13 +4,16 @@
 //! frame's bytes must not depend on who rendered it either (DESIGN.md, Pixels are exact):
 //! `matrix` renders views over every way to cut and carry the work and compares their hashes
 //! with the serial renderer's; `golden` prints hashes that have to be the same on every machine,
-//! build and day; `convergence` says how fast pictures come to the limit. This room belongs to the
-//! program because only here all crates can be seen.
+//! build and day; `convergence` says how fast pictures come to the limit, `colour-rule` what rules
+//! of compositing buy and cost. This room belongs to the program because only here all crates can
+//! be seen.
 
+mod asked;
 mod cases;
 mod changes;
 mod closed;
 mod cluster;
+mod colour_rule;
 mod convergence;
 mod enclose;
 mod extreme;
@@ -40,6 +43,7 @@ Examples:
   slabcast check matrix --pairwise          every pair of settings at least once: minutes
   slabcast check matrix brain.nii.gz        all of them: an hour
   slabcast check convergence                how fast thin sheets come to the limit: a minute
+  slabcast check colour-rule brain.nii.gz   what each rule of compositing buys and costs
   slabcast check golden --verify tests/golden.txt"
 )]
 pub(crate) struct CheckArgs {
@@ -54,6 +58,7 @@ enum What {
     Matrix(matrix::MatrixArgs),
     Golden(golden::GoldenArgs),
     Convergence(Box<convergence::ConvergenceArgs>),
+    ColourRule(Box<colour_rule::ColourRuleArgs>),
 }
 
 /// Runs the command.
@@ -63,5 +68,6 @@ pub(crate) fn run(args: &CheckArgs) -> Result<(), Fail> {
         Some(What::Matrix(args)) => matrix::run(args),
         Some(What::Golden(args)) => golden::run(args),
         Some(What::Convergence(args)) => convergence::run(args),
+        Some(What::ColourRule(args)) => colour_rule::run(args),
     }
 }

@@ -6,7 +6,8 @@
 //! - [`daemon`] is `master` and `worker`.
 //! - [`info`] looks into files, [`ask`] at a running master.
 //! - [`check`] compares pictures with the oracle over every way to make them; [`error`] says how
-//!   far one is from the truth. Both draw with [`local`].
+//!   far one is from the truth, [`explain`] why a pixel is as it is. [`local`] draws for the
+//!   first two, [`still`] reads one view for the last two.
 //!
 //! This is the only crate that sees all others. It decides nothing about pixels and schedules.
 //! Results go to stdout, everything else to stderr; every failure is one line ([`fail`]).
@@ -16,6 +17,7 @@ mod check;
 mod daemon;
 mod embedded;
 mod error;
+mod explain;
 mod fail;
 mod info;
 mod local;
@@ -72,6 +74,7 @@ enum Command {
     Jobs(ask::JobsArgs),
     Cancel(ask::CancelArgs),
     Error(Box<error::ErrorArgs>),
+    Explain(Box<explain::ExplainArgs>),
     Check(check::CheckArgs),
     /// Prints completions for a shell.
     #[command(after_help = "\
@@ -117,6 +120,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
         Command::Jobs(args) => ask::jobs(args),
         Command::Cancel(args) => ask::cancel(args),
         Command::Error(args) => error::run(args),
+        Command::Explain(args) => explain::run(args),
         Command::Check(args) => check::run(args),
         Command::Completions { shell } => {
             let mut script = Vec::new();
@@ -249,7 +253,7 @@ mod tests {
     #[test]
     fn every_help_ends_with_an_example() {
         let cli = Cli::command();
-        for name in ["render", "info", "master", "worker", "status", "check"] {
+        for name in ["render", "info", "master", "worker", "status", "check", "error", "explain"] {
             let sub = cli.find_subcommand(name).unwrap_or_else(|| panic!("{name} is there"));
             let help = sub.clone().render_help().to_string();
             assert!(help.contains("slabcast "), "{name}");

@@ -189,6 +189,14 @@ pub(crate) fn pixels(text: &str) -> Result<Pixels, String> {
     }
 }
 
+/// A pixel, `X,Y` from the top left.
+pub(crate) fn pixel(text: &str) -> Result<[u32; 2], String> {
+    let bad = || "give a pixel as X,Y, from 0,0 at the top left".to_string();
+    let (x, y) = text.split_once(',').ok_or_else(bad)?;
+    let number = |t: &str| t.trim().parse::<u32>().map_err(|_| bad());
+    Ok([number(x)?, number(y)?])
+}
+
 /// A file for a PNG.
 pub(crate) fn png(text: &str) -> Result<std::path::PathBuf, String> {
     let path = std::path::PathBuf::from(text);
@@ -259,6 +267,8 @@ mod tests {
         assert_eq!(pixels("5").unwrap().count([3, 4]), 5);
         assert_eq!(pixels("50").unwrap().count([3, 4]), 12);
         assert!(pixels("0").is_err() && pixels("-1").is_err() && pixels("some").is_err());
+        assert_eq!(pixel("3, 12"), Ok([3, 12]));
+        assert!(pixel("3").is_err() && pixel("-1,2").is_err() && pixel("1.5,2").is_err());
         assert!(png("a.png").is_ok() && png("a.PNG").is_ok() && png("volume.nrrd").is_err());
     }
 }

@@ -8,13 +8,15 @@
 //!
 //! Beside them [`mod@reference`] judges how far both are from the limit: a gather along true rays
 //! in f64 that shares none of their arithmetic, and [`closed`] has the pictures that can be
-//! worked out on paper, with derived bounds of what rounding may do to them.
+//! worked out on paper, with derived bounds of what rounding may do to them. [`mod@explain`]
+//! shows one pixel of theirs sheet by sheet.
 //!
 //! The two share what a pixel *is*: the kernel's profile and sections ([`footprint`]) and the
 //! arithmetic of a closing sheet ([`sheet`]). This crate refuses to know threads, networks and
 //! clocks; whoever calls it has those.
 
 pub mod closed;
+pub mod explain;
 pub mod footprint;
 pub mod reference;
 pub mod scene;

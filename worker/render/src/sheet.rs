@@ -91,6 +91,12 @@ impl Rule {
         1.0 - a < self.eps
     }
 
+    /// Optical depth of a raw sum along a ray (the sum of opacities, for the paper's compositing).
+    #[inline(always)]
+    pub fn optical_depth(&self, raw: f32, secant: f32) -> f32 {
+        raw * self.unit * secant
+    }
+
     /// Closes a sheet at one pixel: `before`, `here` and `behind` are the raw sums of sheets
     /// k-1, k and (half filled) k+1; `secant` the ray's length in the sheet over its thickness.
     /// Adds to the opacity `a` and to the fixed-point colour.
@@ -108,7 +114,7 @@ impl Rule {
         if raw < FAINTEST {
             return;
         }
-        let tau = raw * self.unit * secant;
+        let tau = self.optical_depth(raw, secant);
         let (sheet_a, weight) = match self.compositing {
             Compositing::Paper => (tau.min(1.0), 0.0),
             Compositing::Constant => (opacity(tau), 0.0),

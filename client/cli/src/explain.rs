@@ -1,0 +1,260 @@
+//! `slabcast explain`: why a pixel is as it is.
+//!
+//! The numbers are the renderer's own ([`slabcast_render::explain`]): the pixel that they lead to
+//! is the pixel of the picture, to the bit. Beside each sheet stands what the same sheets are in
+//! f64, and below all of them the limit.
+
+use crate::fail::{Fail, say};
+use crate::parse;
+use crate::request::{PictureArgs, QualityArgs, ViewArgs};
+use crate::signals;
+use crate::still::Still;
+use slabcast_common::volume::ValueMap;
+use slabcast_render::explain::{Explained, Section, SheetHere, explain};
+use slabcast_render::reference::{Sheet, Sheets};
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::path::PathBuf;
+
+/// Explains a pixel sheet by sheet: what is in it, which voxels made it, where it was shut.
+///
+/// The first view of the path is taken. For each sheet that holds something at the pixel, front to
+/// back: transmittance T behind it, its optical depth tau, its colour, the same T from f64 sheets
+/// that round nothing and shut nothing, and how many voxels of how many bricks made it, the
+/// strongest first. All numbers but those are the renderer's own, in its arithmetic: they lead to
+/// the pixel of the picture to the bit. Below stand the pixel, the same sheets in f64, and the
+/// limit of infinitely thin sheets.
+#[derive(clap::Args, Clone, Debug)]
+#[command(after_help = "\
+Examples:
+  slabcast explain brain.nii.gz --pixel 256,200
+  slabcast explain brain.nii.gz --tf peer-semi --azimuth 30 --pixel 256,200 --voxels 0
+  slabcast explain brain.nii.gz --thickness 0.5 --pixel 256,200 --json | jq .sheets[0]
+
+Depths are in vox behind the target; sheet k lies between k and k + 1 thicknesses. Colours are
+linear, from 0 to 1; pixels linear, premultiplied. A voxel's weights are those of its footprint
+along x and y and of its section in the sheet.
+
+JSON: {pixel: [x, y], size, rgba, same_thickness, limit, error: {limit, same_thickness}, shut_in,
+voxels, bricks, hidden: {voxels, bricks}, sheets: [{k, depth: [from, to], tau, colour, t, light,
+raw, peek, sections, bricks, reference: {tau, colour, t}, voxels: [{voxel, brick, value, weights,
+tau, colour}]}]}. rgba, same_thickness and limit are linear, premultiplied; errors are the largest
+of four channels in 1/255; t is what is let through by this sheet and all in front of it; shut_in is
+null where the pixel stays open; reference is null where f64 sheets have nothing there.")]
+pub(crate) struct ExplainArgs {
+    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
+    volume: PathBuf,
+    #[command(flatten)]
+    view: ViewArgs,
+    #[command(flatten)]
+    picture: PictureArgs,
+    #[command(flatten)]
+    quality: QualityArgs,
+    /// The pixel, from 0,0 at the top left
+    #[arg(long, value_name = "X,Y", value_parser = parse::pixel)]
+    pixel: Option<[u32; 2]>,
+    /// Voxels to list for each sheet, strongest first
+    #[arg(long, value_name = "N", default_value = "3")]
+    voxels: usize,
+    /// As JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// A pixel, and what it should be.
+struct Found {
+    at: [u32; 2],
+    size: [u32; 2],
+    thickness: f64,
+    eps: f64,
+    explained: Explained,
+    /// The same sheets in f64.
+    sheets: BTreeMap<i64, Sheet>,
+    same_thickness: [f64; 4],
+    limit: [f64; 4],
+    values: ValueMap,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &ExplainArgs) -> Result<(), Fail> {
+    let Some(pixel) = args.pixel else {
+        return Err(Fail::usage(
+            "--pixel: say which pixel to explain, X,Y from 0,0 at the top left; see `slabcast \
+             explain --help`",
+        ));
+    };
+    let found = {
+        let args = args.clone();
+        signals::unless_stopped(move || find(&args, pixel))?
+    };
+    say(&if args.json { json(&found) } else { text(&found) })
+}
+
+fn find(args: &ExplainArgs, at: [u32; 2]) -> Result<Found, Fail> {
+    let still = Still::read(&args.volume, (&args.view, &args.picture, &args.quality), |[w, h]| {
+        if at[0] < w && at[1] < h {
+            return Ok(());
+        }
+        Err(Fail::usage(format!(
+            "--pixel: {},{} is not in the picture, which has {w}x{h} pixels; give 0,0 to \
+                 {},{}, or another --size",
+            at[0],
+            at[1],
+            w - 1,
+            h - 1
+        )))
+    })?;
+    let [x, y] = at;
+    let quality = still.spec.quality;
+    let explained = explain(&still.frame(quality), &still.bricks, at, args.voxels);
+    let reference = still.reference();
+    let sheets = reference.sheet_by_sheet(x, y, Sheets::default());
+    Ok(Found {
+        at,
+        size: still.view.size,
+        thickness: quality.thickness,
+        eps: quality.eps,
+        same_thickness: sheets.last().map_or([0.0; 4], |s| s.so_far),
+        limit: reference.pixel(x, y),
+        sheets: sheets.into_iter().map(|s| (s.k, s)).collect(),
+        values: still.spec.volume.summary.map,
+        explained,
+    })
+}
+
+/// Largest difference of four channels, in 1/255.
+fn off(got: [f32; 4], want: [f64; 4]) -> f64 {
+    (0..4).map(|c| (f64::from(got[c]) - want[c]).abs() * 255.0).fold(0.0, f64::max)
+}
+
+fn text(found: &Found) -> String {
+    let e = &found.explained;
+    let [x, y] = found.at;
+    let [w, h] = found.size;
+    let mut out = format!("pixel {x},{y} of {w}x{h}\n\n");
+    out.push_str(
+        "sheet     depth, vox         tau    colour                T      T in f64  made by\n",
+    );
+    let mut next = None;
+    for s in &e.sheets {
+        if next.is_some_and(|n| n < s.k) {
+            out.push_str("  ...  nothing between\n");
+        }
+        next = Some(s.k + 1);
+        put_sheet(&mut out, found, s);
+    }
+    if e.sheets.is_empty() {
+        out.push_str("  no voxel reaches this pixel\n");
+    }
+    out.push('\n');
+    match e.shut_in {
+        Some(k) => {
+            let _ = writeln!(
+                out,
+                "shut in sheet {k}: T is below eps ({}); {} voxels behind it were not read, and \
+                 {} bricks not at all",
+                number(found.eps),
+                e.hidden_voxels,
+                e.hidden_bricks
+            );
+        }
+        None if !e.sheets.is_empty() => out.push_str("never shut: all that lies there was read\n"),
+        None => {}
+    }
+    let _ = writeln!(out, "in all {} voxels; bricks: {}\n", e.voxels, e.bricks);
+    let row = |name: &str, p: [f64; 4], what: String| {
+        let [r, g, b, a] = p.map(|x| format!("{x:.6}"));
+        format!("{name:<15} {r}  {g}  {b}  {a}   {what}\n")
+    };
+    out.push_str("linear, premultiplied   R         G         B         A   off by, 1/255\n");
+    out += &row("pixel", e.pixel.map(f64::from), String::new());
+    let same = found.same_thickness;
+    out += &row("sheets in f64", same, number(off(e.pixel, same)));
+    out += &row("limit", found.limit, number(off(e.pixel, found.limit)));
+    out
+}
+
+fn put_sheet(out: &mut String, found: &Found, s: &SheetHere) {
+    let d = found.thickness;
+    let [r, g, b] = s.colour.map(|c| format!("{c:.3}"));
+    let t64 = found.sheets.get(&i64::from(s.k)).map(|r| number(1.0 - r.so_far[3]));
+    let _ = writeln!(
+        out,
+        "{:>5} {:>8.2} to {:<8.2} {:>7}  {r} {g} {b}  {:>9} {:>9}  {} voxel{} of {} brick{}",
+        s.k,
+        f64::from(s.k) * d,
+        f64::from(s.k + 1) * d,
+        number(f64::from(s.tau)),
+        number(f64::from(1.0 - s.a)),
+        t64.as_deref().unwrap_or("-"),
+        s.sections,
+        if s.sections == 1 { "" } else { "s" },
+        s.bricks,
+        if s.bricks == 1 { "" } else { "s" },
+    );
+    for v in &s.strongest {
+        let [i, j, k] = v.voxel;
+        let [wx, wy, wz] = v.weights;
+        let [r, g, b] = v.colour.map(|c| format!("{c:.3}"));
+        let _ = writeln!(
+            out,
+            "        voxel {i},{j},{k} of brick {}: value {}, tau {}, colour {r} {g} {b}, \
+             weights {wx:.3} {wy:.3} {wz:.3}",
+            v.brick.0,
+            plain(found.values.value(v.code)),
+            number(f64::from(v.tau)),
+        );
+    }
+}
+
+/// A value of the volume: whole numbers as such.
+fn plain(x: f64) -> String {
+    let text = format!("{x:.4}");
+    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').into() } else { text }
+}
+
+/// Four digits or so.
+fn number(x: f64) -> String {
+    if x == 0.0 {
+        "0".into()
+    } else if x.abs() < 1e-3 || x.abs() >= 1e5 {
+        format!("{x:.2e}")
+    } else {
+        format!("{x:.4}")
+    }
+}
+
+fn json(found: &Found) -> String {
+    let e = &found.explained;
+    let section = |v: &Section| {
+        serde_json::json!({
+            "voxel": v.voxel, "brick": v.brick.0, "value": found.values.value(v.code),
+            "weights": v.weights, "tau": v.tau, "colour": v.colour
+        })
+    };
+    let sheet = |s: &SheetHere| {
+        let reference = found
+            .sheets
+            .get(&i64::from(s.k))
+            .map(|r| serde_json::json!({"tau": r.tau, "colour": r.colour, "t": 1.0 - r.so_far[3]}));
+        let depth = [s.k, s.k + 1].map(|k| f64::from(k) * found.thickness);
+        serde_json::json!({
+            "k": s.k, "depth": depth, "tau": s.tau, "colour": s.colour, "t": 1.0 - s.a,
+            "light": s.light, "raw": s.raw, "peek": s.peek, "sections": s.sections,
+            "bricks": s.bricks, "reference": reference,
+            "voxels": s.strongest.iter().map(section).collect::<Vec<_>>()
+        })
+    };
+    let value = serde_json::json!({
+        "pixel": found.at, "size": found.size, "rgba": e.pixel,
+        "same_thickness": found.same_thickness, "limit": found.limit,
+        "error": {
+            "limit": off(e.pixel, found.limit),
+            "same_thickness": off(e.pixel, found.same_thickness)
+        },
+        "shut_in": e.shut_in, "voxels": e.voxels, "bricks": e.bricks,
+        "hidden": {"voxels": e.hidden_voxels, "bricks": e.hidden_bricks},
+        "sheets": e.sheets.iter().map(sheet).collect::<Vec<_>>()
+    });
+    value.to_string() + "\n"
+}

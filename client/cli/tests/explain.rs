@@ -1,0 +1,65 @@
+//! `slabcast explain` as a user runs it.
+
+use std::process::{Command, Output};
+
+fn run(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_slabcast"))
+        .arg("explain")
+        .args(arguments)
+        .output()
+        .expect("slabcast runs")
+}
+
+#[test]
+fn a_pixel_is_explained_as_json_and_its_sheets_lead_to_it() {
+    for arguments in [&["--projection", "persp"][..], &["--thickness", "0.5", "--eps", "0"]] {
+        let mut line = vec!["formula:spheres:32", "--size", "64x64", "--pixel", "30,32"];
+        line.extend(["--json", "--voxels", "2"].iter().chain(arguments));
+        let out = run(&line);
+        assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+        let e: serde_json::Value = serde_json::from_slice(&out.stdout).expect("JSON");
+        assert_eq!(e["pixel"], serde_json::json!([30, 32]));
+        assert_eq!(e["shut_in"].is_null(), arguments.contains(&"0"));
+        let sheets = e["sheets"].as_array().expect("sheets");
+        assert!(sheets.len() > 2, "{e}");
+        for c in 0..3 {
+            let light: f64 = sheets.iter().map(|s| s["light"][c].as_f64().unwrap()).sum();
+            assert!((light - e["rgba"][c].as_f64().unwrap()).abs() < 1e-6, "{e}");
+        }
+        let t = sheets.last().unwrap()["t"].as_f64().unwrap();
+        assert!((1.0 - t - e["rgba"][3].as_f64().unwrap()).abs() < 1e-6);
+        for s in sheets {
+            let off = s["t"].as_f64().unwrap() - s["reference"]["t"].as_f64().unwrap();
+            assert!(off.abs() < 0.01, "f64 sheets are near: {s}");
+            assert!((1..=2).contains(&s["voxels"].as_array().unwrap().len()), "{s}");
+        }
+        // One for thickness 1 and a cut-off of 1/512; the rest is a matter of `error`.
+        assert!(e["error"]["limit"].as_f64().unwrap() < 5.0, "{e}");
+    }
+}
+
+#[test]
+fn text_says_where_it_was_shut_and_what_it_should_be() {
+    let out = run(&["formula:spheres:32", "--size", "64x64", "--pixel", "32,32"]);
+    let text = String::from_utf8_lossy(&out.stdout);
+    for part in ["pixel 32,32 of 64x64", "shut in sheet", "of brick", "T in f64", "limit  "] {
+        assert!(text.contains(part), "{part}: {text}");
+    }
+    let out = run(&["formula:spheres:32", "--size", "64x64", "--pixel", "0,0"]);
+    assert!(out.status.success());
+    assert!(String::from_utf8_lossy(&out.stdout).contains("no voxel reaches this pixel"));
+}
+
+#[test]
+fn what_cannot_be_explained_is_a_usage_error() {
+    for (arguments, want) in [
+        (&["formula:spheres"][..], "say which pixel"),
+        (&["no-such-file.nrrd", "--pixel", "512,0"], "which has 512x512 pixels"),
+        (&["formula:spheres", "--pixel", "3"], "X,Y"),
+    ] {
+        let out = run(arguments);
+        let said = String::from_utf8_lossy(&out.stderr).into_owned();
+        assert_eq!(out.status.code(), Some(2), "{said}");
+        assert!(said.contains(want), "{said}");
+    }
+}

@@ -49,6 +49,9 @@ pub struct FrameState {
 }
 
 impl FrameState {
+    /// What a pixel takes: A, three colours, and two sheets' sums.
+    pub const BYTES_A_PIXEL: u64 = 4 + 12 + 2 * 16;
+
     /// Nothing drawn yet.
     pub fn new(size: [u32; 2]) -> Self {
         let n = size[0] as usize * size[1] as usize;

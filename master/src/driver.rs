@@ -10,6 +10,7 @@
 use crate::finish;
 use crate::jobs::{FinishedFrame, Job, JobState, JobView, Jobs, Watch};
 use crate::link::{BrickOrder, WorkerLink};
+use crate::memory;
 use slabcast_common::ids::{FrameId, JobId, SceneId, WorkerId};
 use slabcast_common::message::{Hello, PathRequest, SceneSpec, ToMaster, ToWorker, TransferChoice};
 use slabcast_common::path::Orientation;
@@ -631,6 +632,7 @@ impl Driver {
         request.quality.check()?;
         request.work.check()?;
         request.path.check()?;
+        memory::check(request.path.size, request.format)?;
         let transfer: TransferFunction = match &request.transfer {
             TransferChoice::Name(name) => presets::by_name(name, &info.summary)?,
             TransferChoice::Function(tf) => {
@@ -754,6 +756,10 @@ impl Driver {
             let Some((job, number)) = self.pick() else { return };
             let Some(r) = self.running.get_mut(&job) else { return };
             let Some(store) = &r.store else { return };
+            let beside = memory::beside_others(r.request.path.size, r.request.format);
+            if !beside && !self.flights.is_empty() {
+                return;
+            }
             if number == r.next {
                 r.next += 1;
             }
@@ -893,6 +899,7 @@ impl Driver {
             let FrameStats { ms, pixels_sha256, .. } = &frame.stats;
             info!(ms = ms.total, pixels_sha256, "frame done");
         });
+        let number = frame.number;
         let mut table = self.jobs.lock();
         let mut over = false;
         if let Some(j) = table.jobs.get_mut(&job) {
@@ -908,7 +915,7 @@ impl Driver {
                 j.view.finished_unix_ms = unix_ms();
             }
         }
-        table.evict(self.budget);
+        table.evict(self.budget, (job, number));
         drop(table);
         if over {
             info!(%job, "job done");

@@ -158,13 +158,17 @@ impl Table {
 
     /// Drops frames until `budget` holds, oldest jobs and lowest numbers first: those that were
     /// taken, then those of jobs that are over. A frame of a job in progress that nobody has
-    /// taken stays.
-    pub(crate) fn evict(&mut self, budget: usize) {
+    /// taken stays; so does `newest`, which came just now, until the next one comes. Else one that
+    /// is larger than the budget would be dropped before its watcher sees it, asked for again,
+    /// rendered again and dropped again, for ever.
+    pub(crate) fn evict(&mut self, budget: usize, newest: (JobId, u64)) {
         let (_, mut all) = self.bytes();
         for over_too in [false, true] {
-            for job in self.jobs.values_mut() {
-                let may_go =
-                    |n: &u64| job.taken.contains(n) || (over_too && job.view.state.is_over());
+            for (id, job) in &mut self.jobs {
+                let may_go = |n: &u64| {
+                    (*id, *n) != newest
+                        && (job.taken.contains(n) || (over_too && job.view.state.is_over()))
+                };
                 let gone: Vec<u64> = job.frames.keys().copied().filter(may_go).collect();
                 for n in gone {
                     if all <= budget {
@@ -371,12 +375,24 @@ mod tests {
         let mut table = jobs.lock();
         table.jobs.get_mut(&JobId(1)).unwrap().taken.insert(0);
         assert_eq!(table.bytes(), (20, 30));
-        table.evict(5);
+        table.evict(5, (JobId(1), 2));
         let left: Vec<u64> = table.jobs[&JobId(1)].frames.keys().copied().collect();
         assert_eq!(left, [1, 2], "only what was taken goes");
         table.jobs.get_mut(&JobId(1)).unwrap().view.state = JobState::Done;
-        table.evict(10);
+        table.evict(10, (JobId(1), 2));
         assert_eq!(table.jobs[&JobId(1)].frames.len(), 1, "of a job that is over others go too");
+    }
+
+    #[test]
+    fn a_frame_larger_than_the_budget_waits_for_its_watcher() {
+        let jobs = table(JobState::Done, &[2, 3]);
+        let mut table = jobs.lock();
+        let left = |t: &Table| t.jobs[&JobId(1)].frames.keys().copied().collect::<Vec<_>>();
+        table.evict(5, (JobId(1), 3));
+        assert_eq!(left(&table), [3], "the one that came just now stays");
+        table.jobs.get_mut(&JobId(1)).unwrap().frames.insert(0, frame(0, 10));
+        table.evict(5, (JobId(1), 0));
+        assert_eq!(left(&table), [0], "until the next one comes");
     }
 
     #[tokio::test]

@@ -15,6 +15,7 @@ pub mod driver;
 pub mod finish;
 pub mod jobs;
 pub mod link;
+mod memory;
 pub mod serve;
 
 pub use driver::{Handle, Master, MasterConfig, SubmitError};

@@ -1,0 +1,96 @@
+//! Whether a frame's picture fits in memory, asked before any is taken.
+//!
+//! A picture in the making and the finished one stand side by side while it is encoded. At
+//! 512x512 that is 18 MB and nobody's concern; at 8192x8192 it is 4.5 GB and may be the machine's
+//! end, or that of every other job of this master.
+
+use slabcast_common::image::{FrameState, PixelFormat};
+use slabcast_common::quality::Refused;
+
+/// Frames of more bytes than this are made one at a time, not three: workers then run dry between
+/// two frames for as long as one is encoded, some seconds of minutes. At half, pictures of
+/// 4096x4096 lose their overlap; at double, three of them take 6.4 GB.
+const ONE_AT_A_TIME: u64 = 2 << 30;
+
+/// Bytes of a picture in the making and of what is made of it.
+fn in_the_making(size: [u32; 2], format: PixelFormat) -> u64 {
+    const FINISHED: u64 = 16;
+    let pixels = u64::from(size[0]) * u64::from(size[1]);
+    pixels * (FrameState::BYTES_A_PIXEL + FINISHED + format.bytes() as u64)
+}
+
+/// Whether a frame may be begun while others are in the making.
+pub(crate) fn beside_others(size: [u32; 2], format: PixelFormat) -> bool {
+    in_the_making(size, format) <= ONE_AT_A_TIME
+}
+
+/// Refuses pictures that this machine has no memory for now.
+pub(crate) fn check(size: [u32; 2], format: PixelFormat) -> Result<(), Refused> {
+    available().map_or(Ok(()), |free| fits(size, format, free))
+}
+
+fn fits(size: [u32; 2], format: PixelFormat, free: u64) -> Result<(), Refused> {
+    let need = in_the_making(size, format);
+    if need <= free {
+        return Ok(());
+    }
+    let gib = |n: u64| n as f64 / f64::from(1 << 30);
+    Err(Refused::new(
+        "size",
+        format!(
+            "{}x{} pixels take the master {:.1} GiB, and it has {:.1} GiB free; give a smaller size",
+            size[0],
+            size[1],
+            gib(need),
+            gib(free)
+        ),
+    ))
+}
+
+/// Bytes that this process may still take: what the system could free, or what is left to its
+/// control group if that is less. `None` where neither is told; then nothing is refused.
+fn available() -> Option<u64> {
+    let number = |path: &str| std::fs::read_to_string(path).ok()?.trim().parse::<u64>().ok();
+    let system = std::fs::read_to_string("/proc/meminfo").ok().as_deref().and_then(of_meminfo);
+    let group = number("/sys/fs/cgroup/memory.max")
+        .zip(number("/sys/fs/cgroup/memory.current"))
+        .map(|(max, current)| max.saturating_sub(current));
+    system.into_iter().chain(group).min()
+}
+
+/// `MemAvailable` in bytes.
+fn of_meminfo(text: &str) -> Option<u64> {
+    let line = text.lines().find_map(|l| l.strip_prefix("MemAvailable:"))?;
+    line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_picture_without_room_is_refused_with_what_it_takes_and_what_there_is() {
+        let e = fits([8192, 8192], PixelFormat::Rgba8, 4 << 30).unwrap_err();
+        assert_eq!(e.field, "size");
+        assert_eq!(
+            e.problem,
+            "8192x8192 pixels take the master 4.2 GiB, and it has 4.0 GiB free; give a smaller size"
+        );
+        assert!(fits([8192, 8192], PixelFormat::Rgba8, 5 << 30).is_ok());
+        assert!(fits([1, 1], PixelFormat::Rgba32F, 79).is_err());
+        assert!(fits([1, 1], PixelFormat::Rgba32F, 80).is_ok());
+    }
+
+    #[test]
+    fn only_huge_frames_are_made_one_at_a_time() {
+        assert!(beside_others([4096, 4096], PixelFormat::Rgba32F));
+        assert!(!beside_others([8192, 8192], PixelFormat::Rgb8));
+    }
+
+    #[test]
+    fn what_the_system_says_is_read_or_left() {
+        let text = "MemTotal:       24000000 kB\nMemAvailable:   1024 kB\n";
+        assert_eq!(of_meminfo(text), Some(1 << 20));
+        assert_eq!(of_meminfo("MemTotal: 3 kB\nMemAvailable: some\n"), None);
+    }
+}

@@ -24,7 +24,7 @@ const GUIDE: RGBColor = RGBColor(150, 150, 146);
 /// Room around what is drawn, in powers of the axis.
 const MARGIN: f64 = 0.3;
 /// Height of the guides, in powers of ten.
-const FAN: f64 = 1.4;
+const FAN: f64 = 1.0;
 
 /// Okabe and Ito's colours, which most colour-blind readers tell apart; shapes do it for the rest.
 const COLOURS: [RGBColor; 4] =
@@ -151,7 +151,7 @@ impl LogLog {
             .points()
             .filter(|p| p.1 > 0.0 && (libm::log2(p.0) - right).abs() < 0.1)
             .fold(y[1], |least, p| least.min(libm::log10(p.1)));
-        (right, least - 0.5)
+        (right, least - 1.0)
     }
 
     fn points(&self) -> impl Iterator<Item = (f64, f64)> + '_ {

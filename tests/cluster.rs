@@ -243,12 +243,15 @@ async fn a_worker_of_another_protocol_is_refused_by_name() {
         self_test_sha256: hash.into(),
         held: vec![],
     };
-    let good = slabcast_common::SELF_TEST_SHA256;
+    use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
+    let good = SELF_TEST_SHA256;
     let wrong = "0".repeat(64);
+    let [this, expects] =
+        [format!("this master {PROTOCOL_VERSION}"), format!("expects {PIXELS_VERSION}")];
     for (hello, both) in [
-        (hello(99, 1, good), ["99", "this master 1"]),
-        (hello(1, 99, good), ["99", "expects 1"]),
-        (hello(1, 1, &wrong), [&wrong[..], good]),
+        (hello(99, PIXELS_VERSION, good), ["99", &this]),
+        (hello(PROTOCOL_VERSION, 99, good), ["99", &expects]),
+        (hello(PROTOCOL_VERSION, PIXELS_VERSION, &wrong), [&wrong[..], good]),
     ] {
         let mut client = ClusterClient::connect(format!("http://{address}")).await.unwrap();
         let first = convert::from_worker_to_wire(&ToMaster::Hello(hello));

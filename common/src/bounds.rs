@@ -23,6 +23,13 @@ pub fn raw_per_payload(payload_max: f64, thickness: f64) -> f32 {
     if solid > 0.0 { (f64::from(1u32 << 30) / solid) as f32 } else { 1.0 }
 }
 
+/// Raw units of a 16-bit sum for one unit of payload: 32767 is a sheet of `thickness` vox full of
+/// the largest payload.
+pub fn short_per_payload(payload_max: f64, thickness: f64) -> f64 {
+    let solid = HEADROOM * payload_max * thickness;
+    if solid > 0.0 { 32767.0 / solid } else { 1.0 }
+}
+
 /// Bound of the cut-off: a shut pixel lets less than eps of the light through, and no colour is
 /// brighter than one.
 pub fn cutoff(quality: &Quality) -> f64 {
@@ -64,7 +71,13 @@ pub fn quantisation(scene: &SceneSpec, view: &View) -> f64 {
     let cell = m.x_axis.abs() + m.y_axis.abs() + m.z_axis.abs();
     let r = view.kernel_radius * 2.0 + cell;
     let met = r.x * r.y * (r.z + d) / m.determinant().abs();
-    let delta = 0.5 * met / f64::from(raw_per_payload(payload_max, d)) * longest_secant(view);
+    let unit = match q.sums {
+        // Payload, section, row and contribution are each rounded by half a unit, and then times
+        // weights below one; three weights by 2^-16, times a payload below 2^15: 3.5 units.
+        Sums::I16 => 3.5 / short_per_payload(payload_max, d),
+        _ => 0.5 / f64::from(raw_per_payload(payload_max, d)),
+    };
+    let delta = met * unit * longest_secant(view);
     let times = match q.compositing {
         Compositing::Linear => 2.0 * sheets + 17.0,
         Compositing::Constant => 2.0 * sheets,

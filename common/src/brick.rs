@@ -89,6 +89,8 @@ pub struct Brick {
     pub values: Samples,
     /// Octahedral normal of each voxel; `None` where the scene is unshaded.
     pub normals: Option<Vec<u16>>,
+    /// Tight box inside the brick, lowest and highest: asked for in every frame, so kept.
+    tight: [[u8; 3]; 2],
 }
 
 /// Why bytes are not a brick.
@@ -123,6 +125,26 @@ const MASK_BYTES: usize = BRICK_VOXELS / 8;
 const MASK_FROM: usize = 32;
 
 impl Brick {
+    /// A brick of the voxels at `index` (ascending), with a value, and a normal where there are any,
+    /// for each.
+    ///
+    /// # Panics
+    /// If there are more or fewer values or normals than voxels.
+    pub fn new(id: BrickId, index: Vec<u16>, values: Samples, normals: Option<Vec<u16>>) -> Self {
+        let n = index.len();
+        assert_eq!(values.len(), n, "a value a voxel");
+        assert!(normals.as_ref().is_none_or(|v| v.len() == n), "a normal a voxel");
+        let (mut lo, mut hi) = ([7u8; 3], [0u8; 3]);
+        for &i in &index {
+            let p = local(i);
+            for a in 0..3 {
+                lo[a] = lo[a].min(p[a] as u8);
+                hi[a] = hi[a].max(p[a] as u8);
+            }
+        }
+        Brick { id, index, values, normals, tight: [lo, hi] }
+    }
+
     /// Number of voxels.
     pub fn len(&self) -> usize {
         self.index.len()
@@ -134,20 +156,11 @@ impl Brick {
     }
 
     /// The tight box, in index coordinates of the volume.
+    #[inline]
     pub fn tight(&self, grid: &BrickGrid) -> TightBox {
         let corner = grid.corner(self.id);
-        let (mut lo, mut hi) = ([7u32; 3], [0u32; 3]);
-        for &i in &self.index {
-            let p = local(i);
-            for a in 0..3 {
-                lo[a] = lo[a].min(p[a]);
-                hi[a] = hi[a].max(p[a]);
-            }
-        }
-        TightBox {
-            lo: std::array::from_fn(|a| corner[a] + lo[a]),
-            hi: std::array::from_fn(|a| corner[a] + hi[a]),
-        }
+        let at = |end: usize| std::array::from_fn(|a| corner[a] + u32::from(self.tight[end][a]));
+        TightBox { lo: at(0), hi: at(1) }
     }
 
     /// Bytes it takes in memory, its own overhead included.
@@ -259,7 +272,7 @@ impl Brick {
             ),
         };
         let normals = with_normals.then(|| u16s(take(2 * n)));
-        Ok(Brick { id, index, values, normals })
+        Ok(Brick::new(id, index, values, normals))
     }
 }
 
@@ -304,7 +317,7 @@ mod tests {
             _ => Samples::F32((0..n).map(|i| hash(i) as f32 * 0.37).collect()),
         };
         let normals = normals.then(|| (0..n).map(|i| hash(i + 9) as u16).collect());
-        Some(Brick { id: BrickId(seed), index, values, normals })
+        Some(Brick::new(BrickId(seed), index, values, normals))
     }
 
     proptest! {

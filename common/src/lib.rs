@@ -35,4 +35,4 @@ pub const PROTOCOL_VERSION: u32 = 1;
 /// SHA-256 of the self-test tile that every worker draws before it says hello
 /// (`slabcast_render::selftest`, which also has the test that keeps this constant true).
 pub const SELF_TEST_SHA256: &str =
-    "767f68ecba9751f6675402ab97f135f5dbb252f07ed42bdf5ccd5f1749641e74";
+    "28d669b66c1e84588efd827449c7003c483b64b8a3044a8f87c539e4e23389f9";

@@ -132,12 +132,6 @@ impl Quality {
         if self.splat != Splat::Direct {
             return Err(Refused::new("splat", "this version draws `direct` splats only; use it"));
         }
-        if self.sums == Sums::I16 {
-            return Err(Refused::new(
-                "sums",
-                "this version has no i16 sums; use `auto`, `i32` or `f32`",
-            ));
-        }
         Ok(())
     }
 }

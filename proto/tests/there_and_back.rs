@@ -117,12 +117,8 @@ proptest! {
 fn a_broken_brick_is_named_and_the_others_are_taken() {
     let encode = |id| {
         let mut bytes = Vec::new();
-        let brick = Brick {
-            id: BrickId(id),
-            index: vec![3, 4],
-            values: slabcast_common::volume::Samples::U8(vec![8, 9]),
-            normals: None,
-        };
+        let values = slabcast_common::volume::Samples::U8(vec![8, 9]);
+        let brick = Brick::new(BrickId(id), vec![3, 4], values, None);
         brick.encode(&mut bytes);
         bytes
     };

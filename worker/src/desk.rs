@@ -408,12 +408,8 @@ mod tests {
 
     /// Two full bricks beside each other.
     fn brick(id: u32) -> Arc<Brick> {
-        Arc::new(Brick {
-            id: BrickId(id),
-            index: (0..512).collect(),
-            values: Samples::U8(vec![200; 512]),
-            normals: None,
-        })
+        let values = Samples::U8(vec![200; 512]);
+        Arc::new(Brick::new(BrickId(id), (0..512).collect(), values, None))
     }
 
     impl World {

@@ -3,7 +3,8 @@
 
 use crate::progress::{self, Progress};
 use slabcast_common::brick::Brick;
-use slabcast_common::image::{FrameState, Picture, TilePixels};
+use slabcast_common::image::{FrameState, Picture};
+use slabcast_common::message::Counters;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::slab::SheetRange;
 use slabcast_render::Frame;
@@ -32,31 +33,51 @@ impl Cut {
 
 /// A whole frame by the tile renderer.
 pub(crate) fn picture(frame: &Frame, bricks: &[Arc<Brick>], cut: Cut) -> Picture {
+    counted_picture(frame, bricks, cut).0
+}
+
+/// A whole frame by the tile renderer, and what it took.
+pub(crate) fn counted_picture(
+    frame: &Frame,
+    bricks: &[Arc<Brick>],
+    cut: Cut,
+) -> (Picture, Counters) {
     let whole = Rect::of_size(frame.view.size);
-    let sheets = bricks
-        .iter()
-        .filter_map(|b| frame.view.project(&b.tight(&frame.scene.grid)))
-        .fold(SheetRange::default(), |r, p| r.union(p.sheets));
     let edge = cut.tile as i32;
-    let tiles: Vec<Rect> = (0..whole.y1)
+    let across = (whole.x1 + edge - 1) / edge;
+    let mut tiles: Vec<(Rect, Vec<Arc<Brick>>)> = (0..whole.y1)
         .step_by(cut.tile as usize)
         .flat_map(|y| {
             let row = (0..whole.x1).step_by(cut.tile as usize);
             row.map(move |x| Rect::new(x, y, x + edge, y + edge).intersect(&whole))
         })
+        .map(|tile| (tile, Vec::new()))
         .collect();
+    let mut sheets = SheetRange::default();
+    for brick in bricks {
+        let Some(p) = frame.view.project(&brick.tight(&frame.scene.grid)) else { continue };
+        sheets = sheets.union(p.sheets);
+        for y in p.rect.y0 / edge..=(p.rect.y1 - 1) / edge {
+            for x in p.rect.x0 / edge..=(p.rect.x1 - 1) / edge {
+                tiles[(y * across + x) as usize].1.push(brick.clone());
+            }
+        }
+    }
     let mut state = FrameState::new(frame.view.size);
+    let mut counters = Counters::default();
     for slab in sheets.slabs(cut.slabs) {
-        let done = shared(tiles.len(), cut.threads, |i, scratch: &mut Scratch| -> TilePixels {
-            let before = state.tile(tiles[i]);
-            tile::render(frame, Simd::detect(), tiles[i], slab, bricks, &before, scratch).0
+        let done = shared(tiles.len(), cut.threads, |i, scratch: &mut Scratch| {
+            let (tile, bricks) = &tiles[i];
+            let before = state.tile(*tile);
+            tile::render(frame, Simd::detect(), *tile, slab, bricks, &before, scratch)
         });
-        for (tile, pixels) in tiles.iter().zip(&done) {
+        for ((tile, _), (pixels, counted)) in tiles.iter().zip(&done) {
             state.put(*tile, pixels);
+            counters += *counted;
         }
         state.end_slab();
     }
-    state.finish()
+    (state.finish(), counters)
 }
 
 /// `work` for each of `n` items on `threads` threads; results in order. Each thread has an `S`

@@ -13,6 +13,7 @@
 //! Results go to stdout, everything else to stderr; every failure is one line ([`fail`]).
 
 mod ask;
+mod bench;
 mod check;
 mod daemon;
 mod embedded;
@@ -75,6 +76,7 @@ enum Command {
     Cancel(ask::CancelArgs),
     Error(Box<error::ErrorArgs>),
     Explain(Box<explain::ExplainArgs>),
+    Bench(Box<bench::BenchArgs>),
     Check(check::CheckArgs),
     /// Prints completions for a shell.
     #[command(after_help = "\
@@ -121,6 +123,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
         Command::Cancel(args) => ask::cancel(args),
         Command::Error(args) => error::run(args),
         Command::Explain(args) => explain::run(args),
+        Command::Bench(args) => bench::run(args),
         Command::Check(args) => check::run(args),
         Command::Completions { shell } => {
             let mut script = Vec::new();

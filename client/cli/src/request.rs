@@ -533,7 +533,6 @@ mod tests {
             ("--eps 0.9", "--eps:"),
             ("--kernel tent", "--kernel:"),
             ("--splat deposit", "--splat:"),
-            ("--sums i16", "--sums:"),
             ("--schedule region", "--schedule:"),
             ("--std nan", "--std"),
             ("--frames 0", "--frames"),

@@ -191,7 +191,6 @@ fn bad_flags_are_named_with_the_remedy() {
         (with(&["--thickness", "0"]), &["--thickness"]),
         (with(&["--kernel", "box"]), &["--kernel", "gaussian"]),
         (with(&["--kernel", "tent"]), &["--kernel", "gaussian"]),
-        (with(&["--sums", "i16"]), &["--sums", "i32"]),
         (with(&["--elevation", "91"]), &["--elevation", "90"]),
         (with(&["--projection", "persp", "--fov", "180"]), &["--fov", "179"]),
         (with(&["--height", "-3"]), &["--height"]),

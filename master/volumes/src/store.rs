@@ -156,20 +156,17 @@ fn cut<T: Copy + Into<f64> + Sync>(
                 continue;
             }
             let offsets = &found.offset[..found.voxels];
-            let brick = Brick {
-                id,
-                index: index.to_vec(),
-                values: samples(offsets.iter().map(|&o| codes[o]).collect()),
-                normals: normals.then(|| {
-                    let corner = grid.corner(id);
-                    let normal = |(&i, &offset)| {
-                        let local = slabcast_common::brick::local(i);
-                        let at = std::array::from_fn(|a| corner[a] + local[a]);
-                        encode_normal(gradient_matrix * field.difference(at, offset))
-                    };
-                    index.iter().zip(offsets).map(normal).collect()
-                }),
-            };
+            let normals = normals.then(|| {
+                let corner = grid.corner(id);
+                let normal = |(&i, &offset)| {
+                    let local = slabcast_common::brick::local(i);
+                    let at = std::array::from_fn(|a| corner[a] + local[a]);
+                    encode_normal(gradient_matrix * field.difference(at, offset))
+                };
+                index.iter().zip(offsets).map(normal).collect()
+            });
+            let values = samples(offsets.iter().map(|&o| codes[o]).collect());
+            let brick = Brick::new(id, index.to_vec(), values, normals);
             let info = BrickInfo {
                 id,
                 tight: found.tight(),

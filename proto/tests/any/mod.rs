@@ -315,12 +315,8 @@ pub fn brick() -> impl Strategy<Value = Brick> {
         |(id, index, normals)| {
             let index: Vec<u16> = index.into_iter().collect();
             let n = index.len();
-            Brick {
-                id: BrickId(id),
-                values: Samples::U8(index.iter().map(|i| *i as u8).collect()),
-                index,
-                normals: normals.then(|| vec![7; n]),
-            }
+            let values = Samples::U8(index.iter().map(|i| *i as u8).collect());
+            Brick::new(BrickId(id), index, values, normals.then(|| vec![7; n]))
         },
     )
 }

@@ -12,6 +12,7 @@ use slabcast_common::brick::Brick;
 use slabcast_common::ids::BrickId;
 use slabcast_common::image::{COLOUR_UNIT, FrameState, TilePixels};
 use slabcast_common::occlusion::Rect;
+use slabcast_common::quality::Sums;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -93,10 +94,10 @@ pub fn explain(
     let [w, h] = frame.view.size;
     assert!(x < w && y < h, "pixel {x},{y} of a picture of {w}x{h}");
     let at = [x as i32, y as i32];
-    if frame.scene.float_sums() {
-        Pixel::gather(frame, bricks, at).explain::<f32>(strongest)
-    } else {
-        Pixel::gather(frame, bricks, at).explain::<i32>(strongest)
+    match frame.scene.quality.sums {
+        Sums::F32 => Pixel::<f32>::gather(frame, bricks, at).explain(strongest),
+        Sums::I16 => Pixel::<i16>::gather(frame, bricks, at).explain(strongest),
+        Sums::I32 | Sums::Auto => Pixel::<i32>::gather(frame, bricks, at).explain(strongest),
     }
 }
 
@@ -109,32 +110,37 @@ struct Voxel {
 }
 
 /// A section at the pixel: which voxel, and its weights.
-struct Part {
+struct Part<S: Accumulate> {
     voxel: u32,
-    /// Along x and y, and of the section.
+    /// Along x and y, and of the section, as numbers.
     weights: [f32; 3],
+    /// As sums add them.
+    section: [S::Section; 4],
+    wx: S::Weight,
+    wy: S::Weight,
 }
 
-impl Part {
-    /// What it adds, multiplied in the renderer's order.
-    fn adds(&self, payload: [f32; 4]) -> [f32; 4] {
-        let [wx, wy, wz] = self.weights;
-        payload.map(|p| p * wz * wy * wx)
+impl<S: Accumulate> Part<S> {
+    /// `sums` with what it adds, in the renderer's arithmetic.
+    fn add_to(&self, sums: &mut [S; 4]) {
+        for c in 0..4 {
+            sums[c] = sums[c].plus(S::row(self.section[c], self.wy), self.wx);
+        }
     }
 }
 
-struct Pixel<'a> {
+struct Pixel<'a, S: Accumulate> {
     frame: &'a Frame,
     bricks: &'a [Arc<Brick>],
     at: [i32; 2],
     /// In the order of float sums: first sheet, brick, voxel.
     voxels: Vec<Voxel>,
     /// The sections of each sheet, in the order of voxels.
-    sheets: BTreeMap<i32, Vec<Part>>,
+    sheets: BTreeMap<i32, Vec<Part<S>>>,
 }
 
-impl<'a> Pixel<'a> {
-    fn gather(frame: &'a Frame, bricks: &'a [Arc<Brick>], at: [i32; 2]) -> Pixel<'a> {
+impl<'a, S: Accumulate> Pixel<'a, S> {
+    fn gather(frame: &'a Frame, bricks: &'a [Arc<Brick>], at: [i32; 2]) -> Pixel<'a, S> {
         let view = &frame.view;
         let here = Rect::new(at[0], at[1], at[0] + 1, at[1] + 1);
         let mut found = Vec::new();
@@ -153,16 +159,23 @@ impl<'a> Pixel<'a> {
         }
         found.sort_unstable_by_key(|&(first, id, i, ..)| (first, id, i));
         let mut pixel = Pixel { frame, bricks, at, voxels: Vec::new(), sheets: BTreeMap::new() };
-        let (mut bx, mut by) = (Vec::new(), Vec::new());
+        let (mut bx, mut by) = (S::Buffer::default(), S::Buffer::default());
+        let (mut tx, mut ty) = (Vec::new(), Vec::new());
+        let (columns, rows) = ((at[0], at[0] + 1), (at[1], at[1] + 1));
         for (first, _, i, b, eye) in found {
-            let (_, sections) = frame.sections.of(view.depth_in_phases(eye.z));
+            let z = view.depth_in_phases(eye.z);
+            let (_, sections) = frame.sections.of(z);
             let mut payload = None;
-            for (k, &wz) in (first..).zip(sections) {
+            for (n, &wz) in sections.iter().enumerate() {
+                let k = first + n as i32;
                 let Some(f) = frame.footprints.at(k) else { continue };
                 let [x, y] = view.screen(eye.x, eye.y, f.scale);
-                let (_, wx) = f.weights(0, x, (at[0], at[0] + 1), &mut bx);
-                let (_, wy) = f.weights(1, y, (at[1], at[1] + 1), &mut by);
+                let (_, wx) = S::weights(&f, 0, x, columns, &mut bx);
+                let (_, wy) = S::weights(&f, 1, y, rows, &mut by);
                 let (&[wx], &[wy]) = (wx, wy) else { continue };
+                let (_, real_x) = f.weights(0, x, columns, &mut tx);
+                let (_, real_y) = f.weights(1, y, rows, &mut ty);
+                let (&[real_x], &[real_y]) = (real_x, real_y) else { continue };
                 let payload = *payload
                     .get_or_insert_with(|| frame.payload(&bricks[b as usize], i.into(), eye));
                 if payload[0] <= 0.0 {
@@ -173,14 +186,16 @@ impl<'a> Pixel<'a> {
                 }
                 let voxel = (pixel.voxels.len() - 1) as u32;
                 let parts = pixel.sheets.entry(k).or_default();
-                parts.push(Part { voxel, weights: [wx, wy, wz] });
+                let weights = [real_x.get(), real_y.get(), wz];
+                let section = S::section(&frame.sections, z, n, &payload);
+                parts.push(Part { voxel, weights, section, wx, wy });
             }
         }
         pixel
     }
 
     /// The sums of sheet `k` of the voxels that begin at `last` or before.
-    fn sums<S: Accumulate>(&self, k: i32, last: i32) -> [S; 4] {
+    fn sums(&self, k: i32, last: i32) -> [S; 4] {
         let mut sums = [S::default(); 4];
         for part in self.sheets.get(&k).into_iter().flatten() {
             let v = &self.voxels[part.voxel as usize];
@@ -188,15 +203,12 @@ impl<'a> Pixel<'a> {
                 // They ascend.
                 break;
             }
-            let adds = part.adds(v.payload);
-            for c in 0..4 {
-                sums[c] = sums[c].plus(adds[c]);
-            }
+            part.add_to(&mut sums);
         }
         sums
     }
 
-    fn explain<S: Accumulate>(&self, strongest: usize) -> Explained {
+    fn explain(&self, strongest: usize) -> Explained {
         let frame = self.frame;
         let secant = frame.view.secant(self.at[0], self.at[1]);
         let (mut a, mut colour) = (0.0f32, [0u32; 3]);
@@ -207,9 +219,9 @@ impl<'a> Pixel<'a> {
                 break;
             }
             // An empty sheet in between is one with no sums.
-            let before = self.sums::<S>(k - 1, k - 1);
-            let here = self.sums::<S>(k, k);
-            let behind = self.sums::<S>(k + 1, k);
+            let before = self.sums(k - 1, k - 1);
+            let here = self.sums(k, k);
+            let behind = self.sums(k + 1, k);
             let (a_before, c_before) = (a, colour);
             frame.rule.close(before, here, behind, secant, &mut a, &mut colour);
             let raw = here.map(S::value);
@@ -217,7 +229,7 @@ impl<'a> Pixel<'a> {
                 f64::from(colour[c].wrapping_sub(c_before[c])) * f64::from(COLOUR_UNIT)
             });
             let mean = |c: usize| if raw[0] > 0.0 { raw[c] / raw[0] } else { 0.0 };
-            let (sections, bricks, strongest) = self.sections::<S>(k, secant, strongest);
+            let (sections, bricks, strongest) = self.sections(k, secant, strongest);
             if sections > 0 {
                 sheets.push(SheetHere {
                     k,
@@ -254,16 +266,12 @@ impl<'a> Pixel<'a> {
     }
 
     /// How many sections of sheet `k` are not zero, of how many bricks, and the strongest.
-    fn sections<S: Accumulate>(
-        &self,
-        k: i32,
-        secant: f32,
-        n: usize,
-    ) -> (usize, usize, Vec<Section>) {
+    fn sections(&self, k: i32, secant: f32, n: usize) -> (usize, usize, Vec<Section>) {
         let mut all = Vec::new();
         for part in self.sheets.get(&k).into_iter().flatten() {
-            let v = &self.voxels[part.voxel as usize];
-            let raw = S::default().plus(part.adds(v.payload)[0]).value();
+            let mut sums = [S::default(); 4];
+            part.add_to(&mut sums);
+            let raw = sums[0].value();
             if raw > 0.0 {
                 all.push((raw, part));
             }
@@ -272,7 +280,7 @@ impl<'a> Pixel<'a> {
             all.iter().map(|(_, p)| self.voxels[p.voxel as usize].brick).collect();
         // The sort is stable: of equals the first in order.
         all.sort_by(|a, b| b.0.total_cmp(&a.0));
-        let section = |&(raw, part): &(f32, &Part)| {
+        let section = |&(raw, part): &(f32, &Part<S>)| {
             let v = &self.voxels[part.voxel as usize];
             let brick = &self.bricks[v.brick as usize];
             let local = slabcast_common::brick::local(brick.index[v.i as usize]);

@@ -13,6 +13,8 @@
 //! Positions come in phases (1/256 pixel, 1/256 sheet or finer), so both are tables, filled in
 //! f64 and kept in f32.
 
+use crate::splat::Tap;
+use glam::DVec3;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, View};
 use std::sync::OnceLock;
@@ -22,6 +24,8 @@ use std::sync::OnceLock;
 pub struct Profile {
     std: f64,
     radius: f64,
+    /// What weights are multiplied by before they become 16-bit fixed point.
+    spread: f64,
     edge: f64,
     norm: f64,
 }
@@ -33,7 +37,14 @@ impl Profile {
         let bell = std
             * (2.0 * std::f64::consts::PI).sqrt()
             * libm::erf(radius / (std * std::f64::consts::SQRT_2));
-        Profile { std, radius, edge, norm: bell - 2.0 * radius * edge }
+        Profile { std, radius, spread: 1.0, edge, norm: bell - 2.0 * radius * edge }
+    }
+
+    /// The same for a lattice whose steps are `spread` vox along this axis: weights in fixed point
+    /// are then those per step, below one for every lattice.
+    #[must_use]
+    pub fn with_spread(self, spread: f64) -> Self {
+        Profile { spread, ..self }
     }
 
     /// g(u), per vox.
@@ -66,7 +77,14 @@ pub struct Sections {
     count: Vec<u32>,
     /// Row of `stride` weights a phase.
     weights: Vec<f32>,
+    /// The same over the thickness, in steps of the lattice, as [`fixed`] point.
+    fixed: Vec<i16>,
     stride: usize,
+}
+
+/// A weight from 0 to 1 in 16-bit fixed point: 2^-15 a unit, rounded to nearest.
+fn fixed(w: f64) -> i16 {
+    libm::floor(w * 32768.0 + 0.5).clamp(0.0, 32767.0) as i16
 }
 
 impl Sections {
@@ -84,15 +102,18 @@ impl Sections {
         }
         let stride = count.iter().copied().max().unwrap_or(1) as usize;
         let mut weights = vec![0.0; stride * phases as usize];
+        let mut fixed_weights = vec![0; weights.len()];
         for p in 0..phases as usize {
             let at = p as f64 / f64::from(phases);
             for s in 0..count[p] as usize {
                 let lo = (f64::from(first[p]) + s as f64 - at) * thickness;
                 let w = profile.integral_to(lo + thickness) - profile.integral_to(lo);
                 weights[p * stride + s] = w as f32;
+                fixed_weights[p * stride + s] = fixed(w * profile.spread / thickness);
             }
         }
-        Sections { phases, shift: phases.trailing_zeros(), first, count, weights, stride }
+        let shift = phases.trailing_zeros();
+        Sections { phases, shift, first, count, weights, fixed: fixed_weights, stride }
     }
 
     /// First sheet of a voxel at depth `z` (in phases) and its weights in the sheets from there.
@@ -102,6 +123,22 @@ impl Sections {
         let first = (z >> self.shift) + self.first[p];
         let row = p * self.stride;
         (first, &self.weights[row..row + self.count[p] as usize])
+    }
+
+    /// [`Sections::of`] with weights over the thickness, in steps of the lattice, in units of 2^-15.
+    #[inline]
+    pub fn of_fixed(&self, z: i32) -> (i32, &[i16]) {
+        let p = (z & (self.phases - 1)) as usize;
+        let first = (z >> self.shift) + self.first[p];
+        let row = p * self.stride;
+        (first, &self.fixed[row..row + self.count[p] as usize])
+    }
+
+    /// First sheet of a voxel at depth `z` (in phases), and in how many it lies.
+    #[inline(always)]
+    pub fn span(&self, z: i32) -> (i32, u32) {
+        let p = (z & (self.phases - 1)) as usize;
+        ((z >> self.shift) + self.first[p], self.count[p])
     }
 
     /// First sheet of a voxel at depth `z` (in phases).
@@ -122,8 +159,12 @@ struct AxisTable {
     /// First pixel of each phase, relative to the pixel that holds the centre.
     first: Vec<i32>,
     count: Vec<u32>,
-    weights: Vec<f32>,
+    weights: Vec<Tap>,
+    /// The same in steps of the lattice, as fixed point.
+    fixed: Vec<i16>,
     stride: usize,
+    /// Pixels that a footprint reaches at most from the one that holds its centre.
+    reach: i32,
 }
 
 /// Pixels that a footprint covers along one axis: `[first, last]` for a centre at phase `p`.
@@ -144,11 +185,11 @@ fn near(pixel: i64) -> i32 {
     pixel.clamp(-(1 << 30), 1 << 30) as i32
 }
 
-/// The one definition of a footprint weight: pixel `i` of a centre at phase `p`.
+/// The one definition of a footprint weight, per vox: pixel `i` of a centre at phase `p`.
 #[inline]
-fn weight(profile: &Profile, scale: f64, p: i32, i: i64) -> f32 {
+fn weight(profile: &Profile, scale: f64, p: i32, i: i64) -> f64 {
     let u = (i as f64 + 0.5 - f64::from(p) / f64::from(SUBPIXELS)) / scale;
-    profile.at(u) as f32
+    profile.at(u)
 }
 
 impl AxisTable {
@@ -158,13 +199,18 @@ impl AxisTable {
         let first: Vec<i32> = spans.iter().map(|s| near(s.0)).collect();
         let count: Vec<u32> = spans.iter().map(|s| (s.1 - s.0 + 1).max(0) as u32).collect();
         let stride = count.iter().copied().max().unwrap_or(0) as usize;
-        let mut weights = vec![0.0; stride * SUBPIXELS as usize];
+        let mut weights = vec![Tap::default(); stride * SUBPIXELS as usize];
+        let mut fixed_weights = vec![0; weights.len()];
         for p in 0..SUBPIXELS as usize {
             for t in 0..count[p] as usize {
-                weights[p * stride + t] = weight(profile, scale, p as i32, spans[p].0 + t as i64);
+                let w = weight(profile, scale, p as i32, spans[p].0 + t as i64);
+                weights[p * stride + t] = Tap::new(w as f32);
+                fixed_weights[p * stride + t] = fixed(w * profile.spread);
             }
         }
-        AxisTable { first, count, weights, stride }
+        let far = |s: &(i64, i64)| near((-s.0).max(s.1));
+        let reach = spans.iter().map(far).max().unwrap_or(0);
+        AxisTable { first, count, weights, fixed: fixed_weights, stride, reach }
     }
 }
 
@@ -210,13 +256,14 @@ pub struct Footprints {
 }
 
 /// Weights along one axis, inside a clip: the first pixel and one weight a pixel.
-pub type Span<'a> = (i32, &'a [f32]);
+pub type Span<'a> = (i32, &'a [Tap]);
 
 impl Footprints {
-    /// The footprints of `view` for sheets in `range`.
-    pub fn new(view: &View, range: SheetRange) -> Self {
-        let x = Profile::new(view.kernel_std.x, view.kernel_radius.x);
-        let y = Profile::new(view.kernel_std.y, view.kernel_radius.y);
+    /// The footprints of `view` for sheets in `range`; `spread` is the length of a lattice step
+    /// along the eye's axes in vox ([`Profile::with_spread`]).
+    pub fn new(view: &View, range: SheetRange, spread: DVec3) -> Self {
+        let x = Profile::new(view.kernel_std.x, view.kernel_radius.x).with_spread(spread.x);
+        let y = Profile::new(view.kernel_std.y, view.kernel_radius.y).with_spread(spread.y);
         let reach = view.kernel_radius.x.max(view.kernel_radius.y);
         let sheets = match view.projection {
             Projection::Ortho { .. } => 1,
@@ -253,6 +300,13 @@ pub struct Footprint<'a> {
 }
 
 impl Footprint<'_> {
+    /// Pixels that it reaches at most from the one that holds its centre, where its weights are in
+    /// a table; otherwise they are worked out where they are drawn.
+    #[inline]
+    pub fn reach(&self) -> Option<i32> {
+        self.table.map(|t| t.along(0).reach.max(t.along(1).reach))
+    }
+
     /// Pixels `[first, end)` along `axis` (0: x, 1: y) that a footprint at screen position
     /// `pos` (1/256 pixel) covers.
     #[inline]
@@ -273,14 +327,39 @@ impl Footprint<'_> {
 
     /// Weights along `axis` for a footprint at `pos`, clipped to pixels `[lo, hi)`. `buffer`
     /// is used where there is no table.
-    #[inline]
+    #[inline(always)]
     pub fn weights<'b>(
         &'b self,
         axis: usize,
         pos: i64,
-        (lo, hi): (i32, i32),
-        buffer: &'b mut Vec<f32>,
+        clip: (i32, i32),
+        buffer: &'b mut Vec<Tap>,
     ) -> Span<'b> {
+        self.window(axis, pos, clip, buffer, |t| &t.weights, |w, _| Tap::new(w as f32))
+    }
+
+    /// [`Footprint::weights`] in steps of the lattice, in units of 2^-15.
+    #[inline(always)]
+    pub fn weights_fixed<'b>(
+        &'b self,
+        axis: usize,
+        pos: i64,
+        clip: (i32, i32),
+        buffer: &'b mut Vec<i16>,
+    ) -> (i32, &'b [i16]) {
+        self.window(axis, pos, clip, buffer, |t| &t.fixed, |w, spread| fixed(w * spread))
+    }
+
+    #[inline(always)]
+    fn window<'b, W>(
+        &'b self,
+        axis: usize,
+        pos: i64,
+        (lo, hi): (i32, i32),
+        buffer: &'b mut Vec<W>,
+        column: impl Fn(&'b AxisTable) -> &'b [W],
+        make: impl Fn(f64, f64) -> W,
+    ) -> (i32, &'b [W]) {
         let (first, end) = self.extent(axis, pos);
         let (from, to) = (first.max(lo), end.min(hi));
         if from >= to {
@@ -291,12 +370,13 @@ impl Footprint<'_> {
             Some(t) => {
                 let t = t.along(axis);
                 let row = p as usize * t.stride;
-                (from, &t.weights[row + (from - first) as usize..row + (to - first) as usize])
+                (from, &column(t)[row + (from - first) as usize..row + (to - first) as usize])
             }
             None => {
-                let at = |i| weight(self.profiles[axis], self.scale, p, i64::from(i) - base);
+                let profile = self.profiles[axis];
+                let at = |i| weight(profile, self.scale, p, i64::from(i) - base);
                 buffer.clear();
-                buffer.extend((from..to).map(at));
+                buffer.extend((from..to).map(|i| make(at(i), profile.spread)));
                 (from, &buffer[..])
             }
         }

@@ -18,7 +18,9 @@
 pub mod closed;
 pub mod explain;
 pub mod footprint;
+mod mask;
 pub mod reference;
+mod ring;
 pub mod scene;
 pub mod selftest;
 pub mod serial;

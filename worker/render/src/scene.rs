@@ -3,7 +3,7 @@
 use crate::footprint::{Footprints, Profile, Sections};
 use crate::sheet::Rule;
 use glam::{DVec3, Vec3};
-use slabcast_common::bounds::raw_per_payload;
+use slabcast_common::bounds::{raw_per_payload, short_per_payload};
 use slabcast_common::brick::{Brick, BrickGrid, TightBox, local};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Compositing, Quality, Sums};
@@ -64,7 +64,8 @@ pub struct Frame {
     pub footprints: Footprints,
     /// Arithmetic of a closing sheet.
     pub rule: Rule,
-    /// Raw units of a sum for one unit of payload.
+    /// What payloads are multiplied by: raw units of a sum for one unit of payload; for 16-bit
+    /// sums that times the factors of their weights.
     pub raw_scale: f32,
     /// Eye offsets of the 512 voxels of a brick.
     offsets: Vec<DVec3>,
@@ -80,23 +81,31 @@ impl Frame {
         let range = view.project(&whole).map_or(SheetRange::new(0, 0), |p| p.sheets);
         // One sheet farther for the peek.
         let range = SheetRange::new(range.first, range.end + 1);
-        let profile = Profile::new(view.kernel_std.z, view.kernel_radius.z);
+        let spread = view.kernel_std / q.std;
+        let profile = Profile::new(view.kernel_std.z, view.kernel_radius.z).with_spread(spread.z);
         let d = view.thickness;
-        let raw_scale =
-            if scene.float_sums() { 1.0 } else { raw_per_payload(scene.payload_max, d) };
+        let (raw_scale, unit) = match q.sums {
+            Sums::F32 => (1.0, 1.0),
+            // Weights are those per step of the lattice and over the thickness, so the payload has
+            // these factors. It is at most 31,207, since a cell is no larger than the product of
+            // the spreads.
+            Sums::I16 => {
+                let units = short_per_payload(scene.payload_max, d);
+                ((units * d / (spread.x * spread.y * spread.z)) as f32, (1.0 / units) as f32)
+            }
+            Sums::I32 | Sums::Auto => {
+                let scale = raw_per_payload(scene.payload_max, d);
+                (scale, (1.0 / f64::from(scale)) as f32)
+            }
+        };
         let to_eye = match view.projection {
             Projection::Ortho { .. } => Some(view.to_eye(DVec3::ZERO)),
             Projection::Persp { .. } => None,
         };
-        let rule = Rule::new(
-            q.compositing,
-            (1.0 / f64::from(raw_scale)) as f32,
-            d / view.kernel_std.z,
-            q.eps as f32,
-        );
+        let rule = Rule::new(q.compositing, unit, d / view.kernel_std.z, q.eps as f32);
         Frame {
             sections: Sections::new(&profile, d, view.depth_phases()),
-            footprints: Footprints::new(&view, range),
+            footprints: Footprints::new(&view, range, spread),
             rule,
             raw_scale,
             offsets: (0..512).map(|i| view.offset_in_eye(local(i))).collect(),

@@ -6,25 +6,84 @@
 //! with the tile renderer what a pixel is (profile, sections, the closing of a sheet) and none
 //! of how it gets there, and stands as the oracle for its bytes.
 
+use crate::footprint::Footprint;
 use crate::scene::Frame;
 use crate::sheet::Sum;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{FrameState, Picture, TilePixels};
 use slabcast_common::occlusion::Rect;
+use slabcast_common::quality::Sums;
 use slabcast_common::slab::SheetRange;
 use std::sync::Arc;
 
 /// Renders `frame` from all bricks of its scene.
 pub fn render(frame: &Frame, bricks: &[Arc<Brick>]) -> Picture {
-    if frame.scene.float_sums() {
-        render_sums::<f32>(frame, bricks, |sum, v| sum + v)
-    } else {
+    match frame.scene.quality.sums {
+        Sums::F32 => render_sums::<f32>(frame, bricks, |to, p| {
+            floats(p, |pixel, c, v| to[pixel][c] += v);
+        }),
+        Sums::I16 => render_sums::<i16>(frame, bricks, fixed),
         // Round to nearest, as the splat loop says; saturating, as it is.
-        render_sums::<i32>(frame, bricks, |sum, v| sum.wrapping_add((v + 0.5) as i32))
+        Sums::I32 | Sums::Auto => render_sums::<i32>(frame, bricks, |to, p| {
+            floats(p, |pixel, c, v| to[pixel][c] = to[pixel][c].wrapping_add((v + 0.5) as i32));
+        }),
     }
 }
 
-fn render_sums<S: Sum>(frame: &Frame, bricks: &[Arc<Brick>], add: impl Fn(S, f32) -> S) -> Picture {
+/// One section of one voxel.
+struct Part<'a> {
+    frame: &'a Frame,
+    /// Depth in phases, and which of its sections.
+    z: i32,
+    section: usize,
+    payload: [f32; 4],
+    footprint: Footprint<'a>,
+    at: [i64; 2],
+}
+
+/// `((payload * wz) * wy) * wx` for every pixel and channel.
+fn floats(p: &Part<'_>, mut add: impl FnMut(usize, usize, f32)) {
+    let [w, h] = p.frame.view.size.map(|n| n as i32);
+    let (mut bx, mut by) = (Vec::new(), Vec::new());
+    let (x0, wx) = p.footprint.weights(0, p.at[0], (0, w), &mut bx);
+    let (y0, wy) = p.footprint.weights(1, p.at[1], (0, h), &mut by);
+    let wz = p.frame.sections.of(p.z).1[p.section];
+    let section = p.payload.map(|c| c * wz);
+    for (j, wy) in wy.iter().enumerate() {
+        for (i, wx) in wx.iter().enumerate() {
+            let pixel = (y0 as usize + j) * w as usize + x0 as usize + i;
+            for c in 0..4 {
+                add(pixel, c, section[c] * wy.get() * wx.get());
+            }
+        }
+    }
+}
+
+/// The same in 16-bit fixed point: payload, section, row and contribution each rounded to nearest.
+fn fixed(to: &mut [[i16; 4]], p: &Part<'_>) {
+    let times = |a: i32, b: i16| (a * i32::from(b) + 16384) >> 15;
+    let [w, h] = p.frame.view.size.map(|n| n as i32);
+    let (mut bx, mut by) = (Vec::new(), Vec::new());
+    let (x0, wx) = p.footprint.weights_fixed(0, p.at[0], (0, w), &mut bx);
+    let (y0, wy) = p.footprint.weights_fixed(1, p.at[1], (0, h), &mut by);
+    let wz = p.frame.sections.of_fixed(p.z).1[p.section];
+    let section = p.payload.map(|c| times((c + 0.5) as i32, wz));
+    for (j, &wy) in wy.iter().enumerate() {
+        for (i, &wx) in wx.iter().enumerate() {
+            let pixel = (y0 as usize + j) * w as usize + x0 as usize + i;
+            for c in 0..4 {
+                let sum = i32::from(to[pixel][c]) + times(times(section[c], wy), wx);
+                to[pixel][c] = sum.min(32767) as i16;
+            }
+        }
+    }
+}
+
+fn render_sums<S: Sum>(
+    frame: &Frame,
+    bricks: &[Arc<Brick>],
+    add: impl Fn(&mut [[S; 4]], &Part<'_>),
+) -> Picture {
     let [w, h] = frame.view.size.map(|n| n as usize);
     let whole = Rect::of_size(frame.view.size);
     let mut voxels = Vec::new();
@@ -57,7 +116,6 @@ fn render_sums<S: Sum>(frame: &Frame, bricks: &[Arc<Brick>], add: impl Fn(S, f32
     let mut before = vec![[S::default(); 4]; whole.area()];
     let mut here = before.clone();
     let mut peek = before.clone();
-    let (mut bx, mut by) = (Vec::new(), Vec::new());
     for k in range.first..range.end {
         here.fill([S::default(); 4]);
         peek.fill([S::default(); 4]);
@@ -70,24 +128,18 @@ fn render_sums<S: Sum>(frame: &Frame, bricks: &[Arc<Brick>], add: impl Fn(S, f32
             if payload[0] <= 0.0 {
                 continue;
             }
-            let (_, weights) = frame.sections.of(frame.view.depth_in_phases(eye.z));
+            let z = frame.view.depth_in_phases(eye.z);
+            let count = frame.sections.of(z).1.len() as i32;
             // Its section here, and the one behind: a voxel in this bucket begins no later than
             // this sheet, so what it puts into the next one is what the rule may peek at.
             for (sheet, to) in [(k, &mut here), (k + 1, &mut peek)] {
-                let Some(&wz) = weights.get((sheet - first) as usize) else { continue };
-                let Some(f) = frame.footprints.at(sheet) else { continue };
-                let [x, y] = frame.view.screen(eye.x, eye.y, f.scale);
-                let (x0, wx) = f.weights(0, x, (0, w as i32), &mut bx);
-                let (y0, wy) = f.weights(1, y, (0, h as i32), &mut by);
-                let section = payload.map(|p| p * wz);
-                for (j, &wy) in wy.iter().enumerate() {
-                    for (i, &wx) in wx.iter().enumerate() {
-                        let pixel = &mut to[(y0 as usize + j) * w + x0 as usize + i];
-                        for c in 0..4 {
-                            pixel[c] = add(pixel[c], section[c] * wy * wx);
-                        }
-                    }
+                if sheet - first >= count {
+                    continue;
                 }
+                let Some(footprint) = frame.footprints.at(sheet) else { continue };
+                let at = frame.view.screen(eye.x, eye.y, footprint.scale);
+                let section = (sheet - first) as usize;
+                add(to, &Part { frame, z, section, payload, footprint, at });
             }
         }
         for y in 0..h {

@@ -9,38 +9,195 @@
 //! float to an integer without the range check that would double the loop's cost.
 #![expect(unsafe_code, reason = "the one wall: run-time dispatch and unchecked conversion")]
 
-use crate::sheet::Sum;
+use crate::footprint::{Footprint, Sections};
+use crate::sheet::{LANES, Sum};
 
 /// Pixels of one open sheet of a tile part.
 pub type Pixels<S> = [[S; 4]];
 
-/// How contributions are added.
-pub trait Accumulate: Sum {
-    /// `self` and a contribution, which is not negative. Integers round to nearest; what would
-    /// leave them is held at their end (`Frame::raw_scale` leaves room, so nothing does).
-    fn plus(self, contribution: f32) -> Self;
+/// A weight across the view axis, not negative. Holding the value is the proof, which the unchecked
+/// conversion below leans on.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[repr(transparent)]
+pub struct Tap(f32);
+
+impl Tap {
+    /// The weight `w`; what is negative or not a number is nothing.
+    #[inline]
+    pub fn new(w: f32) -> Self {
+        Tap(if w > 0.0 { w } else { 0.0 })
+    }
+
+    /// The weight.
+    #[inline(always)]
+    pub fn get(self) -> f32 {
+        self.0
+    }
 }
+
+/// How contributions are added: a section is `payload * w_z`, a row `section * w_y`, and what is
+/// added to a pixel `row * w_x`, rounded as each kind says.
+pub trait Accumulate: Sum {
+    /// A weight across the view axis.
+    type Weight: Copy + std::fmt::Debug;
+    /// One channel of a section or a row.
+    type Section: Copy;
+    /// Memory for weights that are in no table.
+    type Buffer: Default + Send;
+
+    /// First sheet of a voxel at depth `z` (in phases), and its section in the `i`th from there.
+    fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Self::Section; 4];
+    /// Weights along `axis`: see [`Footprint::weights`].
+    fn weights<'b>(
+        footprint: &'b Footprint<'_>,
+        axis: usize,
+        pos: i64,
+        clip: (i32, i32),
+        buffer: &'b mut Self::Buffer,
+    ) -> (i32, &'b [Self::Weight]);
+    /// `section * wy`.
+    fn row(section: Self::Section, wy: Self::Weight) -> Self::Section;
+    /// `self + row * wx`.
+    #[must_use]
+    fn plus(self, row: Self::Section, wx: Self::Weight) -> Self;
+}
+
+/// One channel of a section of 32-bit sums, not negative and not NaN, or that times weights.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Section(f32);
 
 /// The largest f32 below 2^31.
 const LARGEST: f32 = 2_147_483_520.0;
 
+/// 32-bit fixed point: one rounding, to nearest, when a contribution is added. What would leave
+/// the integers is held at their end (`Frame::raw_scale` leaves room, so nothing does).
 impl Accumulate for i32 {
+    type Weight = Tap;
+    type Section = Section;
+    type Buffer = Vec<Tap>;
+
     #[inline(always)]
-    fn plus(self, contribution: f32) -> Self {
-        // Written as selects so that NaN too ends inside the range.
-        let c = contribution + 0.5;
+    fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Section; 4] {
+        let wz = sections.of(z).1[i];
+        payload.map(|p| {
+            let section = p * wz;
+            // A select, so that NaN too ends inside.
+            Section(if section > 0.0 { section } else { 0.0 })
+        })
+    }
+
+    #[inline(always)]
+    fn weights<'b>(
+        footprint: &'b Footprint<'_>,
+        axis: usize,
+        pos: i64,
+        clip: (i32, i32),
+        buffer: &'b mut Vec<Tap>,
+    ) -> (i32, &'b [Tap]) {
+        footprint.weights(axis, pos, clip, buffer)
+    }
+
+    #[inline(always)]
+    fn row(section: Section, wy: Tap) -> Section {
+        Section(section.0 * wy.0)
+    }
+
+    #[inline(always)]
+    fn plus(self, row: Section, wx: Tap) -> Self {
+        let c = row.0 * wx.0 + 0.5;
         let c = if c < LARGEST { c } else { LARGEST };
-        let c = if c > 0.0 { c } else { 0.0 };
-        // SAFETY: c is in [0, LARGEST], which fits i32.
+        // SAFETY: a section is not negative (`section`), nor is a weight (`Tap`), so their product
+        // is 0 to infinity, or NaN for infinity times 0. The select takes what is too large, and
+        // NaN, to the largest f32 below 2^31.
         self.wrapping_add(unsafe { c.to_int_unchecked::<i32>() })
     }
 }
 
+/// Floats, in one order.
 impl Accumulate for f32 {
+    type Weight = Tap;
+    type Section = f32;
+    type Buffer = Vec<Tap>;
+
     #[inline(always)]
-    fn plus(self, contribution: f32) -> Self {
-        self + contribution
+    fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [f32; 4] {
+        let wz = sections.of(z).1[i];
+        payload.map(|p| p * wz)
     }
+
+    #[inline(always)]
+    fn weights<'b>(
+        footprint: &'b Footprint<'_>,
+        axis: usize,
+        pos: i64,
+        clip: (i32, i32),
+        buffer: &'b mut Vec<Tap>,
+    ) -> (i32, &'b [Tap]) {
+        footprint.weights(axis, pos, clip, buffer)
+    }
+
+    #[inline(always)]
+    fn row(section: f32, wy: Tap) -> f32 {
+        section * wy.0
+    }
+
+    #[inline(always)]
+    fn plus(self, row: f32, wx: Tap) -> Self {
+        self + row * wx.0
+    }
+}
+
+/// The product of two numbers in units of 2^-15, rounded to nearest: one instruction on lanes.
+#[inline(always)]
+fn times(a: i16, b: i16) -> i16 {
+    ((i32::from(a) * i32::from(b) + 0x4000) >> 15) as i16
+}
+
+/// 16-bit fixed point: payload, section and row are each rounded to nearest. Sums that would leave
+/// the integers stay at their end; terms are not negative, so that too has no order.
+impl Accumulate for i16 {
+    type Weight = i16;
+    type Section = i16;
+    type Buffer = Vec<i16>;
+
+    #[inline(always)]
+    fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [i16; 4] {
+        let wz = sections.of_fixed(z).1[i];
+        section_fixed(payload.map(whole), wz)
+    }
+
+    #[inline(always)]
+    fn weights<'b>(
+        footprint: &'b Footprint<'_>,
+        axis: usize,
+        pos: i64,
+        clip: (i32, i32),
+        buffer: &'b mut Vec<i16>,
+    ) -> (i32, &'b [i16]) {
+        footprint.weights_fixed(axis, pos, clip, buffer)
+    }
+
+    #[inline(always)]
+    fn row(section: i16, wy: i16) -> i16 {
+        times(section, wy)
+    }
+
+    #[inline(always)]
+    fn plus(self, row: i16, wx: i16) -> Self {
+        self.saturating_add(times(row, wx))
+    }
+}
+
+/// The section of a 16-bit payload: each channel times `wz`.
+#[inline(always)]
+pub(crate) fn section_fixed(payload: [i16; 4], wz: i16) -> [i16; 4] {
+    payload.map(|p| times(p, wz))
+}
+
+/// A payload of 16-bit sums: rounded to nearest, 0 to 32767.
+#[inline(always)]
+pub(crate) fn whole(payload: f32) -> i16 {
+    (payload + 0.5).max(0.0) as i16
 }
 
 /// An instruction set that was seen on this machine. Holding the value is the proof.
@@ -99,46 +256,114 @@ impl Simd {
     }
 }
 
-/// Adds one section: `((payload * w_z) * w_y) * w_x`, in this order everywhere, to the pixels
-/// of rows `y0..` and columns `x0..` of a sheet with `stride` pixels a row. `section` is
-/// `payload * w_z`.
-///
-/// # Panics
-/// If the footprint leaves the sheet.
-#[inline]
-pub fn splat<S: Accumulate>(
-    simd: Simd,
-    sheet: &mut Pixels<S>,
-    stride: usize,
-    x: (usize, &[f32]),
-    y: (usize, &[f32]),
-    section: [f32; 4],
-) {
-    match simd.0 {
-        Level::Plain => rows(sheet, stride, x, y, section),
-        // SAFETY: the value proves that the instructions are there (`Simd::all`).
-        #[cfg(target_arch = "x86_64")]
-        Level::Avx2 => unsafe { rows_avx2(sheet, stride, x, y, section) },
-        // SAFETY: as above.
-        #[cfg(target_arch = "x86_64")]
-        Level::Avx512 => unsafe { rows_avx512(sheet, stride, x, y, section) },
+/// Work that is compiled for every instruction set. Whatever it calls must be `inline(always)` to be
+/// compiled with it.
+pub trait Work {
+    /// What comes out.
+    type Out;
+    /// Does it.
+    fn run(self) -> Self::Out;
+}
+
+impl Simd {
+    /// Runs `work` with this instruction set. Choosing once a tile part is free; once a section
+    /// costs a call.
+    #[inline]
+    pub fn run<W: Work>(self, work: W) -> W::Out {
+        match self.0 {
+            Level::Plain => work.run(),
+            // SAFETY: the value proves that the instructions are there (`Simd::all`).
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe { run_avx2(work) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => unsafe { run_avx512(work) },
+        }
     }
 }
 
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn run_avx2<W: Work>(work: W) -> W::Out {
+    work.run()
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+fn run_avx512<W: Work>(work: W) -> W::Out {
+    work.run()
+}
+
+/// Adds one section to the pixels of rows `y0..` and columns `x0..` of a sheet with `stride` pixels
+/// a row: `((payload * w_z) * w_y) * w_x`, in this order everywhere.
+///
+/// # Panics
+/// If the footprint leaves the sheet.
 #[inline(always)]
-fn rows<S: Accumulate>(
+pub fn splat<S: Accumulate>(
     sheet: &mut Pixels<S>,
     stride: usize,
-    (x0, wx): (usize, &[f32]),
-    (y0, wy): (usize, &[f32]),
-    section: [f32; 4],
+    (x0, wx): (usize, &[S::Weight]),
+    (y0, wy): (usize, &[S::Weight]),
+    section: [S::Section; 4],
 ) {
     for (j, &w) in wy.iter().enumerate() {
         let row = (y0 + j) * stride + x0;
-        let p = section.map(|c| c * w);
+        let p = section.map(|c| S::row(c, w));
         for (pixel, &w) in sheet[row..row + wx.len()].iter_mut().zip(wx) {
             for c in 0..4 {
-                pixel[c] = pixel[c].plus(p[c] * w);
+                pixel[c] = pixel[c].plus(p[c], w);
+            }
+        }
+    }
+}
+
+/// The sums of eight sheets at one pixel.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[repr(C, align(64))]
+pub(crate) struct Record(pub(crate) [[i16; 4]; 8]);
+
+/// Adds the sections of a voxel to records: [`splat`] for all eight sheets at once. `wz`: the
+/// section's weight in each of them.
+///
+/// # Panics
+/// If the footprint leaves the sheet.
+#[inline(always)]
+pub(crate) fn splat_record(
+    simd: Simd,
+    pixels: &mut [Record],
+    stride: usize,
+    x: (usize, &[i16]),
+    y: (usize, &[i16]),
+    payload: [i16; 4],
+    wz: [i16; 8],
+) {
+    match simd.0 {
+        Level::Plain => {
+            records(pixels, stride, x, y, &Record(wz.map(|w| section_fixed(payload, w))));
+        }
+        // SAFETY: the value proves that the instructions are there; AVX-512 has AVX2 in it.
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx2 | Level::Avx512 => unsafe { records_avx2(pixels, stride, x, y, payload, wz) },
+    }
+}
+
+/// The plain loop: what the fast one must equal.
+fn records(
+    pixels: &mut [Record],
+    stride: usize,
+    (x0, wx): (usize, &[i16]),
+    (y0, wy): (usize, &[i16]),
+    sections: &Record,
+) {
+    for (j, &wy) in wy.iter().enumerate() {
+        let row = (y0 + j) * stride + x0;
+        let rows = sections.0.map(|s| s.map(|c| times(c, wy)));
+        for (pixel, &wx) in pixels[row..row + wx.len()].iter_mut().zip(wx) {
+            for (sums, row) in pixel.0.iter_mut().zip(&rows) {
+                for c in 0..4 {
+                    sums[c] = sums[c].saturating_add(times(row[c], wx));
+                }
             }
         }
     }
@@ -146,44 +371,181 @@ fn rows<S: Accumulate>(
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn rows_avx2<S: Accumulate>(
-    sheet: &mut Pixels<S>,
+fn records_avx2(
+    pixels: &mut [Record],
     stride: usize,
-    x: (usize, &[f32]),
-    y: (usize, &[f32]),
-    section: [f32; 4],
+    (x0, wx): (usize, &[i16]),
+    y: (usize, &[i16]),
+    [p, q, r, s]: [i16; 4],
+    [a, b, c, d, e, f, g, h]: [i16; 8],
 ) {
-    rows(sheet, stride, x, y, section);
+    use std::arch::x86_64::{_mm256_mulhrs_epi16, _mm256_setr_epi16};
+    // Four channels of four sheets: the payload times each sheet's weight.
+    let payload = _mm256_setr_epi16(p, q, r, s, p, q, r, s, p, q, r, s, p, q, r, s);
+    let low = _mm256_setr_epi16(a, a, a, a, b, b, b, b, c, c, c, c, d, d, d, d);
+    let high = _mm256_setr_epi16(e, e, e, e, f, f, f, f, g, g, g, g, h, h, h, h);
+    let sections = [_mm256_mulhrs_epi16(payload, low), _mm256_mulhrs_epi16(payload, high)];
+    // Columns in groups whose weights stay in registers.
+    for (i, wx) in wx.chunks(8).enumerate() {
+        let x0 = x0 + 8 * i;
+        match *wx {
+            [a, b, c, d, e, f, g, h] => {
+                columns([a, b, c, d, e, f, g, h], pixels, stride, x0, y, sections);
+            }
+            [a, b, c, d, e, f, g] => {
+                columns([a, b, c, d, e, f, g], pixels, stride, x0, y, sections);
+            }
+            [a, b, c, d, e, f] => {
+                columns([a, b, c, d, e, f], pixels, stride, x0, y, sections);
+            }
+            _ => {
+                for (i, &w) in wx.iter().enumerate() {
+                    columns([w], pixels, stride, x0 + i, y, sections);
+                }
+            }
+        }
+    }
 }
 
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-fn rows_avx512<S: Accumulate>(
-    sheet: &mut Pixels<S>,
+#[target_feature(enable = "avx2")]
+#[inline]
+fn columns<const N: usize>(
+    wx: [i16; N],
+    pixels: &mut [Record],
     stride: usize,
-    x: (usize, &[f32]),
-    y: (usize, &[f32]),
-    section: [f32; 4],
+    x0: usize,
+    (y0, wy): (usize, &[i16]),
+    [low, high]: [std::arch::x86_64::__m256i; 2],
 ) {
-    rows(sheet, stride, x, y, section);
+    use std::arch::x86_64::{
+        __m256i, _mm256_adds_epi16, _mm256_load_si256, _mm256_mulhrs_epi16, _mm256_set1_epi16,
+        _mm256_setzero_si256, _mm256_store_si256,
+    };
+    let mut columns = [_mm256_setzero_si256(); N];
+    for i in 0..N {
+        columns[i] = _mm256_set1_epi16(wx[i]);
+    }
+    for (j, &wy) in wy.iter().enumerate() {
+        let wy = _mm256_set1_epi16(wy);
+        let (low, high) = (_mm256_mulhrs_epi16(low, wy), _mm256_mulhrs_epi16(high, wy));
+        let row = (y0 + j) * stride + x0;
+        let row = &mut pixels[row..row + N];
+        for i in 0..N {
+            let at: *mut __m256i = std::ptr::from_mut(&mut row[i]).cast();
+            // SAFETY: a record is 64 bytes, aligned to 64, and borrowed for us alone.
+            unsafe {
+                let [l, h] = [_mm256_load_si256(at), _mm256_load_si256(at.add(1))];
+                _mm256_store_si256(at, _mm256_adds_epi16(l, _mm256_mulhrs_epi16(low, columns[i])));
+                let h = _mm256_adds_epi16(h, _mm256_mulhrs_epi16(high, columns[i]));
+                _mm256_store_si256(at.add(1), h);
+            }
+        }
+    }
+}
+
+/// The four sums of eight pixels in one sheet of their records, by channel.
+///
+/// # Panics
+/// If there are not eight pixels, or no such sheet.
+#[inline(always)]
+pub(crate) fn load_records(
+    simd: Simd,
+    pixels: &[Record],
+    sheet: usize,
+    to: &mut [[f32; LANES]; 4],
+) {
+    match simd.0 {
+        Level::Plain => lanes(pixels, sheet, to),
+        // SAFETY: the value proves that the instructions are there; AVX-512 has AVX2 in it.
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx2 | Level::Avx512 => unsafe { lanes_avx2(pixels, sheet, to) },
+    }
+}
+
+/// The plain loop: what the fast one must equal.
+fn lanes(pixels: &[Record], sheet: usize, to: &mut [[f32; LANES]; 4]) {
+    for (i, record) in pixels[..LANES].iter().enumerate() {
+        for c in 0..4 {
+            to[c][i] = f32::from(record.0[sheet][c]);
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+#[inline]
+fn lanes_avx2(pixels: &[Record], sheet: usize, to: &mut [[f32; LANES]; 4]) {
+    use std::arch::x86_64::{
+        __m128i, _mm_loadl_epi64, _mm_setzero_si128, _mm_unpackhi_epi32, _mm_unpackhi_epi64,
+        _mm_unpacklo_epi16, _mm_unpacklo_epi32, _mm_unpacklo_epi64, _mm256_cvtepi16_epi32,
+        _mm256_cvtepi32_ps, _mm256_storeu_ps,
+    };
+    let mut sums = [_mm_setzero_si128(); LANES];
+    for (to, record) in sums.iter_mut().zip(&pixels[..LANES]) {
+        let at: *const __m128i = std::ptr::from_ref(&record.0[sheet]).cast();
+        // SAFETY: four 16-bit sums are the 8 bytes that are loaded.
+        *to = unsafe { _mm_loadl_epi64(at) };
+    }
+    // 8 pixels of 4 channels, turned over: pairs, quadruples, all eight.
+    let pair = |i: usize| _mm_unpacklo_epi16(sums[2 * i], sums[2 * i + 1]);
+    let (a, b, c, d) = (pair(0), pair(1), pair(2), pair(3));
+    let (low, high) = (
+        [_mm_unpacklo_epi32(a, b), _mm_unpackhi_epi32(a, b)],
+        [_mm_unpacklo_epi32(c, d), _mm_unpackhi_epi32(c, d)],
+    );
+    let channels = [
+        _mm_unpacklo_epi64(low[0], high[0]),
+        _mm_unpackhi_epi64(low[0], high[0]),
+        _mm_unpacklo_epi64(low[1], high[1]),
+        _mm_unpackhi_epi64(low[1], high[1]),
+    ];
+    for (to, channel) in to.iter_mut().zip(channels) {
+        let wide = _mm256_cvtepi32_ps(_mm256_cvtepi16_epi32(channel));
+        // SAFETY: eight floats are the 32 bytes that are stored.
+        unsafe { _mm256_storeu_ps(to.as_mut_ptr(), wide) };
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    /// One splat, as work.
+    struct One<'a, S: Accumulate> {
+        sheet: &'a mut Pixels<S>,
+        wx: &'a [S::Weight],
+        wy: &'a [S::Weight],
+        section: [S::Section; 4],
+    }
+
+    impl<S: Accumulate> Work for One<'_, S> {
+        type Out = ();
+        #[inline(always)]
+        fn run(self) {
+            splat(self.sheet, 64, (3, self.wx), (1, self.wy), self.section);
+        }
+    }
+
     #[test]
     fn every_instruction_set_gives_the_same_bytes() {
         for n in 0..40usize {
             let wx: Vec<f32> = (0..n).map(|i| 1.0 / (1.7 + i as f32)).collect();
             let wy: Vec<f32> = (0..7).map(|i| 0.9 / (1.0 + i as f32)).collect();
+            let taps = |w: &[f32]| w.iter().map(|&w| Tap::new(w)).collect::<Vec<_>>();
+            let units = |w: &[f32]| w.iter().map(|&w| (w * 32768.0) as i16).collect::<Vec<_>>();
+            let (tx, ty, ix, iy) = (taps(&wx), taps(&wy), units(&wx), units(&wy));
             let section = [1.9e8, 1.1e8, 7.7, 0.3];
-            let run = |simd| {
+            let run = |simd: Simd| {
                 let mut ints = vec![[5i32; 4]; 64 * 9];
                 let mut floats = vec![[0.1f32; 4]; 64 * 9];
-                splat(simd, &mut ints, 64, (3, &wx), (1, &wy), section);
-                splat(simd, &mut floats, 64, (3, &wx), (1, &wy), section);
-                (ints, floats)
+                let mut shorts = vec![[5i16; 4]; 64 * 9];
+                let bounded = section.map(Section);
+                simd.run(One { sheet: &mut ints[..], wx: &tx, wy: &ty, section: bounded });
+                simd.run(One { sheet: &mut floats[..], wx: &tx, wy: &ty, section });
+                let section = [31_000, 17_003, 77, 3];
+                simd.run(One { sheet: &mut shorts[..], wx: &ix, wy: &iy, section });
+                (ints, floats, shorts)
             };
             let want = run(Simd::plain());
             for simd in Simd::all() {
@@ -193,17 +555,74 @@ mod tests {
     }
 
     #[test]
+    fn records_add_as_planes_do() {
+        for n in 0..30usize {
+            let wx: Vec<i16> = (0..n).map(|i| (i * 4001 % 22_000) as i16).collect();
+            let wy: Vec<i16> = (0..7).map(|i| 22_000 / (1 + i)).collect();
+            let payload = [31_000, 17_003, 77, 3];
+            let wz: [i16; 8] = std::array::from_fn(|k| (k * 4003) as i16);
+            let mut planes = vec![vec![[11i16; 4]; 64 * 9]; 8];
+            for (plane, wz) in planes.iter_mut().zip(wz) {
+                splat(plane, 64, (3, &wx), (1, &wy), section_fixed(payload, wz));
+            }
+            for simd in Simd::all() {
+                let mut got = vec![Record([[11; 4]; 8]); 64 * 9];
+                splat_record(simd, &mut got, 64, (3, &wx), (1, &wy), payload, wz);
+                for (i, record) in got.iter().enumerate() {
+                    let want: [[i16; 4]; 8] = std::array::from_fn(|k| planes[k][i]);
+                    assert_eq!(record.0, want, "{} differs at width {n}", simd.name());
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn records_are_turned_over() {
+        let pixels: Vec<Record> = (0..8i16)
+            .map(|p| {
+                Record(std::array::from_fn(|k| [1, 2, 3, 4].map(|c| p * 100 + k as i16 * 10 + c)))
+            })
+            .collect();
+        for simd in Simd::all() {
+            for sheet in 0..8 {
+                let mut to = [[0.0; LANES]; 4];
+                load_records(simd, &pixels, sheet, &mut to);
+                for c in 0..4 {
+                    for p in 0..8 {
+                        assert_eq!(
+                            to[c][p],
+                            (p * 100 + sheet * 10 + c + 1) as f32,
+                            "{}",
+                            simd.name()
+                        );
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
     fn integers_round_to_nearest() {
         let mut sheet = vec![[0i32; 4]; 1];
-        splat(Simd::plain(), &mut sheet, 1, (0, &[1.0]), (0, &[1.0]), [2.4, 2.6, 0.49, 0.0]);
+        let one = [Tap::new(1.0)];
+        splat(&mut sheet, 1, (0, &one), (0, &one), [2.4, 2.6, 0.49, 0.0].map(Section));
         assert_eq!(sheet[0], [2, 3, 0, 0]);
+        assert_eq!([times(3, 16384), times(5, 13107), times(32767, 32767)], [2, 2, 32766]);
+        assert_eq!([whole(0.49), whole(0.5), whole(-3.0), whole(f32::NAN)], [0, 1, 0, 0]);
     }
 
     #[test]
     fn nothing_leaves_the_integers() {
         let mut sheet = vec![[0i32; 4]; 1];
-        let wild = [3e9, f32::NAN, f32::INFINITY, -5.0];
-        splat(Simd::detect(), &mut sheet, 1, (0, &[1.0]), (0, &[1.0]), wild);
-        assert_eq!(sheet[0], [2_147_483_520, 2_147_483_520, 2_147_483_520, 0]);
+        let one = [Tap::new(1.0)];
+        assert_eq!([f32::NAN, -1.0].map(|w| Tap::new(w).get()), [0.0, 0.0]);
+        splat(&mut sheet, 1, (0, &one), (0, &one), [3e9, f32::INFINITY, 0.0, 1.0].map(Section));
+        assert_eq!(sheet[0], [2_147_483_520, 2_147_483_520, 0, 1]);
+        let nothing = [Tap::new(0.0)];
+        splat(&mut sheet, 1, (0, &nothing), (0, &one), [0.0, 0.0, f32::INFINITY, 0.0].map(Section));
+        assert_eq!(sheet[0][2], 2_147_483_520);
+        let mut sheet = vec![[30_000i16; 4]; 1];
+        splat(&mut sheet, 1, (0, &[32767]), (0, &[32767]), [9_000, 1, 0, 32767]);
+        assert_eq!(sheet[0], [32767, 30_001, 30_000, 32767]);
     }
 }

@@ -15,25 +15,27 @@
 //! are integers (or floats in one order), an open pixel gets every voxel that covers it, and
 //! what a shut pixel gets is never read.
 
+use crate::footprint::Footprint;
+use crate::mask::{OpenMask, REACH_MOST};
+use crate::ring::{self, BLOCK, Planes, Records, Ring, SLOTS, Window};
 use crate::scene::Frame;
-use crate::sheet::Sum;
-use crate::splat::{Accumulate, Simd, splat};
+use crate::sheet::Row;
+use crate::splat::{Accumulate, Simd, Tap, Work};
 use glam::DVec3;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{RawSums, TilePixels, TileState};
 use slabcast_common::message::Counters;
-use slabcast_common::occlusion::{Rect, ShutMap};
+use slabcast_common::occlusion::Rect;
+use slabcast_common::quality::Sums;
 use slabcast_common::slab::SheetRange;
-use slabcast_common::view::Projected;
+use slabcast_common::view::{Projected, Projection, SUBPIXEL_BITS};
 use std::sync::Arc;
 
 /// Edge of a tile part. 64 gives 8x8 blocks of 8x8 pixels, one bit each in a word, and six open
 /// sheets of 64 KiB, which fit a second cache of 512 KiB. At 32 a head takes 12 % more splats
 /// (286 k instead of 256 k a frame) for their overlap and no less time (docs/measurements.md);
 /// at 128 the blocks would need four words, and the sheets 1.5 MiB.
-const PART: i32 = 64;
-/// Edge of the blocks by which a sheet's touched pixels are known.
-const BLOCK: usize = 8;
+const PART: i32 = ring::PART as i32;
 
 /// A voxel waiting in the bucket of its first sheet.
 #[derive(Clone, Copy)]
@@ -44,6 +46,9 @@ struct Waiting {
     voxel: u16,
     /// Depth in phases.
     z: i32,
+    /// Screen position in subpixels, where all its sections share it (orthographic views).
+    x: i32,
+    y: i32,
 }
 
 /// A brick as a part sees it.
@@ -56,68 +61,33 @@ struct PartBrick<'a> {
 /// Memory that a render thread keeps from tile to tile.
 #[derive(Default)]
 pub struct Scratch {
-    ints: Ring<i32>,
-    floats: Ring<f32>,
+    ints: Planes<i32>,
+    floats: Planes<f32>,
+    shorts: Planes<i16>,
+    records: Records,
+    taps: [Vec<Tap>; 2],
+    units: [Vec<i16>; 2],
     shared: Shared,
 }
 
+/// A part's pixels and buckets. Planes have rows of [`PART`] pixels, whatever the part's width.
 struct Shared {
-    shut: ShutMap,
     buckets: Vec<Vec<Waiting>>,
     carried: Vec<Waiting>,
     secants: Vec<f32>,
     a: Vec<f32>,
-    colour: Vec<[u32; 3]>,
-    wx: Vec<f32>,
-    wy: Vec<f32>,
+    colour: [Vec<u32>; 3],
 }
 
 impl Default for Shared {
     fn default() -> Self {
+        let n = (PART * PART) as usize;
         Shared {
-            shut: ShutMap::open(Rect::default()),
             buckets: Vec::new(),
             carried: Vec::new(),
-            secants: Vec::new(),
-            a: Vec::new(),
-            colour: Vec::new(),
-            wx: Vec::new(),
-            wy: Vec::new(),
-        }
-    }
-}
-
-/// Open sheets: the one before k, k itself, and as many behind as a voxel has sections.
-#[derive(Default)]
-struct Ring<S> {
-    sheets: Vec<Vec<[S; 4]>>,
-    /// Touched blocks of each sheet, one bit a block.
-    touched: Vec<u64>,
-}
-
-impl<S: Sum> Ring<S> {
-    fn reset(&mut self, sheets: usize) {
-        let n = (PART * PART) as usize;
-        if self.sheets.len() < sheets {
-            self.sheets.resize_with(sheets, || vec![[S::default(); 4]; n]);
-            self.touched.resize(sheets, 0);
-        }
-        for i in 0..self.sheets.len() {
-            self.clear(i);
-        }
-    }
-
-    /// Empties the touched blocks of slot `i`.
-    fn clear(&mut self, i: usize) {
-        let mut mask = std::mem::take(&mut self.touched[i]);
-        while mask != 0 {
-            let b = mask.trailing_zeros() as usize;
-            mask &= mask - 1;
-            let at = (b / 8 * BLOCK) * PART as usize + b % 8 * BLOCK;
-            for y in 0..BLOCK {
-                let row = at + y * PART as usize;
-                self.sheets[i][row..row + BLOCK].fill([S::default(); 4]);
-            }
+            secants: vec![1.0; n],
+            a: vec![0.0; n],
+            colour: std::array::from_fn(|_| vec![0; n]),
         }
     }
 }
@@ -143,7 +113,8 @@ pub fn render(
         colour: vec![[0; 3]; tile.area()],
         last: neighbours.then(|| vec![[0; 4]; tile.area()]),
     };
-    let mut counters = Counters::default();
+    let mut counted = Counters::default();
+    let counters = &mut counted;
     let mut seen: Vec<PartBrick<'_>> = bricks
         .iter()
         .filter_map(|b| {
@@ -163,28 +134,72 @@ pub fn render(
             if inside.is_empty() {
                 continue;
             }
-            let Scratch { ints, floats, shared } = scratch;
-            let part = Part { frame, simd, rect, tile, slab, bricks: &inside };
-            if frame.scene.float_sums() {
-                part.render(floats, shared, state, &mut out, &mut counters);
-            } else {
-                part.render(ints, shared, state, &mut out, &mut counters);
+            let part = Part { frame, rect, tile, slab, bricks: &inside };
+            let Scratch { ints, floats, shorts, records, taps, units, shared } = scratch;
+            let planes = (state, &mut out, &mut *counters);
+            match frame.scene.quality.sums {
+                Sums::F32 => {
+                    simd.run(RenderPart { part, simd, ring: floats, buffers: taps, shared, planes })
+                }
+                Sums::I16 if frame.sections.most() < SLOTS && part.flat().is_some() => {
+                    simd.run(RenderPart {
+                        part,
+                        simd,
+                        ring: records,
+                        buffers: units,
+                        shared,
+                        planes,
+                    });
+                }
+                Sums::I16 => simd.run(RenderPart {
+                    part,
+                    simd,
+                    ring: shorts,
+                    buffers: units,
+                    shared,
+                    planes,
+                }),
+                Sums::I32 | Sums::Auto => {
+                    simd.run(RenderPart { part, simd, ring: ints, buffers: taps, shared, planes });
+                }
             }
         }
     }
     if out.last.as_ref().is_some_and(|l| l.iter().all(|s| *s == [0; 4])) {
         out.last = None;
     }
-    (out, counters)
+    (out, counted)
 }
 
 struct Part<'a> {
     frame: &'a Frame,
-    simd: Simd,
     rect: Rect,
     tile: Rect,
     slab: SheetRange,
     bricks: &'a [&'a PartBrick<'a>],
+}
+
+/// A part with what it works on: compiled for each instruction set as a whole.
+struct RenderPart<'a, R: Ring> {
+    part: Part<'a>,
+    simd: Simd,
+    ring: &'a mut R,
+    buffers: &'a mut [Buffer<R>; 2],
+    shared: &'a mut Shared,
+    planes: (&'a TileState, &'a mut TilePixels, &'a mut Counters),
+}
+
+/// Memory for weights of one axis.
+type Buffer<R> = <<R as Ring>::Sum as Accumulate>::Buffer;
+
+impl<R: Ring> Work for RenderPart<'_, R> {
+    type Out = ();
+    #[inline(always)]
+    fn run(self) {
+        let RenderPart { part, simd, ring, buffers, shared, planes } = self;
+        ring.reset(part.frame.sections.most() + 1, simd);
+        part.render(ring, buffers, shared, planes);
+    }
 }
 
 impl Part<'_> {
@@ -195,51 +210,15 @@ impl Part<'_> {
             + (self.rect.x0 - self.tile.x0) as usize
     }
 
-    fn render<S: Accumulate>(
+    #[inline(always)]
+    fn render<R: Ring>(
         &self,
-        ring: &mut Ring<S>,
-        shared: &mut Shared,
-        state: &TileState,
-        out: &mut TilePixels,
-        counters: &mut Counters,
+        ring: &mut R,
+        buffers: &mut [Buffer<R>; 2],
+        s: &mut Shared,
+        (state, out, counters): (&TileState, &mut TilePixels, &mut Counters),
     ) {
-        let (w, h) = (self.rect.width(), self.rect.height());
-        let stride = PART as usize;
-        let slots = self.frame.sections.most() + 1;
-        ring.reset(slots);
-        let slot = |k: i32| k.rem_euclid(slots as i32) as usize;
-        let s = shared;
-        s.shut.reset(self.rect);
-        s.a.clear();
-        s.secants.clear();
-        s.colour.clear();
-        s.colour.resize(w * h, [0; 3]);
-        let mut open = 0usize;
-        for y in 0..h {
-            let row = self.tile_row(y);
-            for x in 0..w {
-                let a = state.a[row + x];
-                s.a.push(a);
-                s.secants
-                    .push(self.frame.view.secant(self.rect.x0 + x as i32, self.rect.y0 + y as i32));
-                if self.frame.rule.is_shut(a) {
-                    s.shut.shut(y * w + x);
-                } else {
-                    open += 1;
-                }
-            }
-        }
-        s.shut.refresh();
-        if let Some(last) = &state.last {
-            let before = slot(self.slab.first - 1);
-            for y in 0..h {
-                let row = self.tile_row(y);
-                for x in 0..w {
-                    ring.sheets[before][y * stride + x] = last[row + x].map(S::from_bits);
-                }
-            }
-            ring.touched[before] = u64::MAX;
-        }
+        let mut open = self.begin(ring, s, state);
         let sheets = self.slab.len() as usize;
         if s.buckets.len() < sheets {
             s.buckets.resize_with(sheets, Vec::new);
@@ -249,66 +228,114 @@ impl Part<'_> {
         }
         s.carried.clear();
 
+        let float_sums = self.frame.scene.float_sums();
+        let flat = self.flat();
+        let reach = flat.as_ref().map(|(_, reach)| *reach);
+        if let Some(reach) = reach {
+            open.grow(reach);
+        }
         let mut next = 0;
+        let mut any_open = open.count() > 0;
         for k in self.slab.first..self.slab.end {
-            if open == 0 {
+            if !any_open {
                 break;
             }
             while next < self.bricks.len() && self.bricks[next].projected.sheets.first <= k {
-                self.admit(next, s, counters);
+                if !self.admit(next, flat.as_ref(), &open, s, counters) {
+                    let brick = self.bricks[next].brick;
+                    counters.culled += brick.len() as u64;
+                }
                 next += 1;
             }
             if k == self.slab.first && !s.carried.is_empty() {
                 // Voxels that begin before the slab come first, as they do without the cut.
                 let mut carried = std::mem::take(&mut s.carried);
-                if self.frame.scene.float_sums() {
-                    carried.sort_by_key(|v| {
-                        (
-                            self.frame.sections.first(v.z),
-                            self.bricks[v.brick as usize].brick.id,
-                            v.voxel,
-                        )
-                    });
+                if float_sums {
+                    let sections = &self.frame.sections;
+                    let id = |v: &Waiting| self.bricks[v.brick as usize].brick.id;
+                    carried.sort_by_key(|v| (sections.first(v.z), id(v), v.voxel));
                 }
-                self.splat_all(&carried, k, ring, slot, s, counters);
+                self.splat_all(&carried, k, ring, buffers, &open, counters);
                 carried.clear();
                 s.carried = carried;
             }
             let mut bucket = std::mem::take(&mut s.buckets[(k - self.slab.first) as usize]);
-            if self.frame.scene.float_sums() {
+            if float_sums {
                 bucket.sort_by_key(|v| (self.bricks[v.brick as usize].brick.id, v.voxel));
             }
-            self.splat_all(&bucket, k, ring, slot, s, counters);
+            self.splat_all(&bucket, k, ring, buffers, &open, counters);
             bucket.clear();
             s.buckets[(k - self.slab.first) as usize] = bucket;
-            open -= self.close(k, ring, slot, s);
-            ring.clear(slot(k - 1));
+            if self.close(k, ring, &mut open, s) {
+                any_open = open.count() > 0;
+                if let Some(reach) = reach {
+                    open.grow(reach);
+                }
+            }
+            ring.clear(k - 1);
         }
         // Whatever the part did not come to is hidden.
         counters.culled += self.bricks[next..].iter().map(|b| b.brick.len() as u64).sum::<u64>();
         counters.culled += s.buckets.iter().map(|b| b.len() as u64).sum::<u64>();
+        self.end(ring, s, &open, out);
+    }
 
-        let last_sheet = slot(self.slab.end - 1);
+    /// Takes the part's pixels out of the tile's; returns which are open.
+    fn begin<R: Ring>(&self, ring: &mut R, s: &mut Shared, state: &TileState) -> OpenMask {
+        let (w, h) = (self.rect.width(), self.rect.height());
+        let stride = PART as usize;
+        let mut open = OpenMask::shut(self.rect);
+        for plane in &mut s.colour {
+            plane.fill(0);
+        }
         for y in 0..h {
-            let row = self.tile_row(y);
-            out.a[row..row + w].copy_from_slice(&s.a[y * w..(y + 1) * w]);
-            out.colour[row..row + w].copy_from_slice(&s.colour[y * w..(y + 1) * w]);
+            let (row, to) = (self.tile_row(y), y * stride);
+            s.a[to..to + w].copy_from_slice(&state.a[row..row + w]);
+            for x in 0..w {
+                let (px, py) = (self.rect.x0 + x as i32, self.rect.y0 + y as i32);
+                s.secants[to + x] = self.frame.view.secant(px, py);
+                if !self.frame.rule.is_shut(s.a[to + x]) {
+                    open.open(x, y);
+                }
+            }
+        }
+        if let Some(last) = &state.last {
+            for y in 0..h {
+                let row = self.tile_row(y);
+                for x in 0..w {
+                    ring.put(self.slab.first - 1, y * stride + x, last[row + x]);
+                }
+            }
+        }
+        open
+    }
+
+    /// Puts the part's pixels into the tile's.
+    fn end<R: Ring>(&self, ring: &R, s: &Shared, open: &OpenMask, out: &mut TilePixels) {
+        let (w, h) = (self.rect.width(), self.rect.height());
+        let stride = PART as usize;
+        for y in 0..h {
+            let (row, from) = (self.tile_row(y), y * stride);
+            out.a[row..row + w].copy_from_slice(&s.a[from..from + w]);
+            for x in 0..w {
+                out.colour[row + x] = std::array::from_fn(|c| s.colour[c][from + x]);
+            }
             if let Some(last) = &mut out.last {
                 for x in 0..w {
                     // Nobody reads a shut pixel's sums; they may be anything, so they are none.
-                    if !s.shut.is_shut(y * w + x) && open > 0 {
-                        last[row + x] = ring.sheets[last_sheet][y * stride + x].map(S::bits);
+                    if open.row(y) >> x & 1 == 1 {
+                        last[row + x] = ring.raw(self.slab.end - 1, from + x);
                     }
                 }
             }
         }
     }
 
-    /// Where a voxel's footprints lie, all sections together.
-    #[inline]
+    /// Where a voxel's footprints lie, all sections together, a pixel more at most.
+    #[inline(always)]
     fn extent(&self, eye: DVec3, z: i32) -> Option<Rect> {
-        let (first, weights) = self.frame.sections.of(z);
-        let last = first + weights.len() as i32 - 1;
+        let (first, count) = self.frame.sections.span(z);
+        let last = first + count as i32 - 1;
         let view = &self.frame.view;
         let at = |k: i32| {
             let f = self.frame.footprints.at(k)?;
@@ -317,8 +344,8 @@ impl Part<'_> {
             Some(Rect::new(x0, y0, x1, y1))
         };
         match view.projection {
-            slabcast_common::view::Projection::Ortho { .. } => at(first),
-            slabcast_common::view::Projection::Persp { .. } => {
+            Projection::Ortho { .. } => at(first),
+            Projection::Persp { .. } => {
                 // Edges move one way with depth, so the first and last visible sections hold
                 // the others. An end's rounding may put one a pixel farther out: grow by one.
                 let front = (first..=last).find_map(at)?;
@@ -329,58 +356,104 @@ impl Part<'_> {
         }
     }
 
-    /// Tests a brick, then its voxels, and tosses what is left into buckets.
-    fn admit(&self, which: usize, s: &mut Shared, counters: &mut Counters) {
+    /// Tests a brick, then its voxels, and tosses what is left into buckets. Whether the brick
+    /// passed.
+    #[inline(always)]
+    fn admit(
+        &self,
+        which: usize,
+        flat: Option<&(Footprint<'_>, i32)>,
+        open: &OpenMask,
+        s: &mut Shared,
+        counters: &mut Counters,
+    ) -> bool {
         let PartBrick { brick, corner, projected } = self.bricks[which];
         let cull = self.frame.scene.quality.cull;
-        if cull && s.shut.all_shut(&projected.rect) {
-            counters.culled += brick.len() as u64;
-            return;
+        if cull && !open.any(&projected.rect) {
+            return false;
         }
+        let view = &self.frame.view;
+        let (sections, slab) = (&self.frame.sections, self.slab);
         for (voxel, &local) in brick.index.iter().enumerate() {
             let eye = self.frame.eye(*corner, local);
-            let z = self.frame.view.depth_in_phases(eye.z);
-            let (first, weights) = self.frame.sections.of(z);
-            if first >= self.slab.end || first + (weights.len() as i32) <= self.slab.first {
+            let z = view.depth_in_phases(eye.z);
+            let (first, count) = sections.span(z);
+            if first >= slab.end || first + count as i32 <= slab.first {
                 continue;
             }
-            let Some(extent) = self.extent(eye, z) else { continue };
-            if extent.intersect(&self.rect).is_empty() {
-                continue;
-            }
-            if cull && s.shut.all_shut(&extent) {
-                counters.culled += 1;
-                continue;
+            let (mut x, mut y) = (0, 0);
+            if let Some((f, _)) = flat {
+                let at = view.screen(eye.x, eye.y, f.scale);
+                // Tables are of footprints of a thousand pixels at most, and this brick is near.
+                [x, y] = at.map(|p| p as i32);
+                let centre = [x, y].map(|p| p >> SUBPIXEL_BITS);
+                let (cx, cy) = (centre[0] - self.rect.x0, centre[1] - self.rect.y0);
+                if cull && !open.near(cx, cy) {
+                    counters.culled += u64::from(open.reaches(cx, cy));
+                    continue;
+                }
+                if !cull && !open.reaches(cx, cy) {
+                    continue;
+                }
+            } else {
+                let Some(extent) = self.extent(eye, z) else { continue };
+                let inside = !extent.intersect(&self.rect).is_empty();
+                if !inside || cull && !open.any(&extent) {
+                    counters.culled += u64::from(inside);
+                    continue;
+                }
             }
             counters.tossed += 1;
-            let waiting = Waiting { brick: which as u32, voxel: voxel as u16, z };
-            if first < self.slab.first {
+            let waiting = Waiting { brick: which as u32, voxel: voxel as u16, z, x, y };
+            if first < slab.first {
                 s.carried.push(waiting);
             } else {
-                s.buckets[(first - self.slab.first) as usize].push(waiting);
+                s.buckets[(first - slab.first) as usize].push(waiting);
             }
+        }
+        true
+    }
+
+    /// The footprint that all sections of all voxels share, and its reach in pixels: orthographic
+    /// views whose weights are in tables and that masks can be grown by.
+    #[inline(always)]
+    fn flat(&self) -> Option<(Footprint<'_>, i32)> {
+        match self.frame.view.projection {
+            Projection::Ortho { .. } => {
+                let f = self.frame.footprints.at(0)?;
+                let reach = f.reach().filter(|&r| r <= REACH_MOST)?;
+                Some((f, reach))
+            }
+            Projection::Persp { .. } => None,
         }
     }
 
-    fn splat_all<S: Accumulate>(
+    #[inline(always)]
+    fn splat_all<R: Ring>(
         &self,
         bucket: &[Waiting],
         k: i32,
-        ring: &mut Ring<S>,
-        slot: impl Fn(i32) -> usize,
-        s: &mut Shared,
+        ring: &mut R,
+        buffers: &mut [Buffer<R>; 2],
+        open: &OpenMask,
         counters: &mut Counters,
     ) {
         let frame = self.frame;
-        let stride = PART as usize;
         // The sheet behind the slab is filled as far as the colour rule peeks.
         let end = self.slab.end + i32::from(frame.looks_at_neighbours());
+        let flat = self.flat();
         for v in bucket {
             let PartBrick { brick, corner, .. } = self.bricks[v.brick as usize];
             let eye = frame.eye(*corner, brick.index[v.voxel as usize]);
             if frame.scene.quality.cull {
-                let hidden = self.extent(eye, v.z).is_none_or(|e| s.shut.all_shut(&e));
-                if hidden {
+                let extent = match &flat {
+                    Some((f, _)) => {
+                        let (x, y) = (f.extent(0, i64::from(v.x)), f.extent(1, i64::from(v.y)));
+                        Some(Rect::new(x.0, y.0, x.1, y.1))
+                    }
+                    None => self.extent(eye, v.z),
+                };
+                if extent.is_none_or(|e| !open.any(&e)) {
                     counters.culled += 1;
                     continue;
                 }
@@ -390,79 +463,83 @@ impl Part<'_> {
                 continue;
             }
             counters.splatted += 1;
-            let (first, weights) = frame.sections.of(v.z);
-            for (i, &wz) in weights.iter().enumerate() {
-                let sheet = first + i as i32;
-                if sheet < k.max(self.slab.first) {
-                    continue;
+            let (first, count) = frame.sections.span(v.z);
+            let sheets = first.max(k).max(self.slab.first)..(first + count as i32).min(end);
+            if let Some((f, _)) = &flat {
+                let at = [i64::from(v.x), i64::from(v.y)];
+                if let Some(window) = self.window::<R::Sum>(f, at, buffers) {
+                    ring.add_all(&frame.sections, v.z, sheets, window, &payload);
                 }
-                if sheet >= end {
-                    break;
-                }
-                let Some(f) = frame.footprints.at(sheet) else { continue };
-                let [x, y] = frame.view.screen(eye.x, eye.y, f.scale);
-                let (x0, wx) = f.weights(0, x, (self.rect.x0, self.rect.x1), &mut s.wx);
-                let (y0, wy) = f.weights(1, y, (self.rect.y0, self.rect.y1), &mut s.wy);
-                if wx.is_empty() || wy.is_empty() {
-                    continue;
-                }
-                let (x0, y0) = ((x0 - self.rect.x0) as usize, (y0 - self.rect.y0) as usize);
-                let at = slot(sheet);
-                splat(
-                    self.simd,
-                    &mut ring.sheets[at],
-                    stride,
-                    (x0, wx),
-                    (y0, wy),
-                    payload.map(|p| p * wz),
-                );
-                let (bx0, bx1) = (x0 / BLOCK, (x0 + wx.len() - 1) / BLOCK);
-                let row = (u64::MAX >> (63 - (bx1 - bx0))) << bx0;
-                for by in y0 / BLOCK..=(y0 + wy.len() - 1) / BLOCK {
-                    ring.touched[at] |= row << (8 * by);
+            } else {
+                for sheet in sheets {
+                    let Some(f) = frame.footprints.at(sheet) else { continue };
+                    let at = frame.view.screen(eye.x, eye.y, f.scale);
+                    if let Some(window) = self.window::<R::Sum>(&f, at, buffers) {
+                        let i = (sheet - first) as usize;
+                        ring.add(sheet, window, R::Sum::section(&frame.sections, v.z, i, &payload));
+                    }
                 }
             }
         }
     }
 
-    /// Closes sheet `k` where it was touched; returns how many pixels were shut.
-    fn close<S: Accumulate>(
+    /// A footprint inside the part, or nothing.
+    #[inline(always)]
+    fn window<'b, S: Accumulate>(
         &self,
-        k: i32,
-        ring: &Ring<S>,
-        slot: impl Fn(i32) -> usize,
-        s: &mut Shared,
-    ) -> usize {
-        let (w, h) = (self.rect.width(), self.rect.height());
-        let stride = PART as usize;
+        f: &'b Footprint<'_>,
+        [x, y]: [i64; 2],
+        [bx, by]: &'b mut [S::Buffer; 2],
+    ) -> Option<Window<'b, S::Weight>> {
+        let (x0, wx) = S::weights(f, 0, x, (self.rect.x0, self.rect.x1), bx);
+        let (y0, wy) = S::weights(f, 1, y, (self.rect.y0, self.rect.y1), by);
+        let inside = !wx.is_empty() && !wy.is_empty();
+        let at = |p: i32, origin: i32| (p - origin) as usize;
+        inside.then(|| ((at(x0, self.rect.x0), wx), (at(y0, self.rect.y0), wy)))
+    }
+
+    /// Closes sheet `k` where it was touched; whether pixels were shut.
+    #[inline(always)]
+    fn close<R: Ring>(&self, k: i32, ring: &R, open: &mut OpenMask, s: &mut Shared) -> bool {
         let rule = self.frame.rule;
-        let (before, here, behind) =
-            (&ring.sheets[slot(k - 1)], &ring.sheets[slot(k)], &ring.sheets[slot(k + 1)]);
-        let mut mask = ring.touched[slot(k)];
-        let mut shut = 0;
+        let mut mask = ring.touched(k);
+        let mut any_shut = false;
+        let mut row = Row::default();
         while mask != 0 {
             let b = mask.trailing_zeros() as usize;
             mask &= mask - 1;
             let (x0, y0) = (b % 8 * BLOCK, b / 8 * BLOCK);
-            for y in y0..(y0 + BLOCK).min(h) {
-                for x in x0..(x0 + BLOCK).min(w) {
-                    let (i, j) = (y * w + x, y * stride + x);
-                    if s.shut.is_shut(i) {
-                        continue;
+            for y in y0..y0 + BLOCK {
+                let live = open.row(y) >> x0 & 0xff;
+                if live == 0 {
+                    continue;
+                }
+                let at = y * PART as usize + x0;
+                ring.load(k, at, &mut row);
+                row.secant.copy_from_slice(&s.secants[at..at + BLOCK]);
+                row.a.copy_from_slice(&s.a[at..at + BLOCK]);
+                rule.close_row(&mut row);
+                // Shut pixels keep what they have.
+                let mut shut = 0u64;
+                for i in 0..BLOCK {
+                    let is_live = live >> i & 1 == 1;
+                    let a = &mut s.a[at + i];
+                    *a = if is_live { row.a[i] } else { *a };
+                    shut |= u64::from(rule.is_shut(*a)) << i;
+                }
+                for (plane, light) in s.colour.iter_mut().zip(&row.light) {
+                    for i in 0..BLOCK {
+                        let add = if live >> i & 1 == 1 { light[i] } else { 0 };
+                        plane[at + i] = plane[at + i].wrapping_add(add);
                     }
-                    let a = &mut s.a[i];
-                    rule.close(before[j], here[j], behind[j], s.secants[i], a, &mut s.colour[i]);
-                    if rule.is_shut(*a) {
-                        s.shut.shut(i);
-                        shut += 1;
-                    }
+                }
+                if shut & live != 0 {
+                    open.close(y, (shut & live) << x0);
+                    any_shut = true;
                 }
             }
         }
-        if shut > 0 {
-            s.shut.refresh();
-        }
-        shut
+        any_shut
     }
 }
 

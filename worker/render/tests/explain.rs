@@ -76,7 +76,7 @@ fn places() -> impl Iterator<Item = [u32; 2]> {
 fn qualities() -> Vec<Quality> {
     let mut out = Vec::new();
     for compositing in [Compositing::Linear, Compositing::Constant, Compositing::Paper] {
-        for sums in [Sums::I32, Sums::F32] {
+        for sums in [Sums::I32, Sums::I16, Sums::F32] {
             for (thickness, eps) in [(1.0, 1.0 / 512.0), (0.3, 0.0), (2.5, 0.1)] {
                 out.push(Quality { compositing, sums, thickness, eps, ..Quality::default() });
             }

@@ -39,8 +39,8 @@ type Formula = (&'static str, &'static str, &'static str, Tweak);
 
 /// What formula volumes are there for: shaded and opaque; faint and unlit, where nothing hides
 /// anything; 16-bit; float with a ramp of opacity; step edges in thin sheets; one voxel; a line
-/// longer than any picture; each compositing rule; sums in floats; nothing shut at all.
-const FORMULAS: [Formula; 10] = [
+/// longer than any picture; each compositing rule; sums in floats; nothing shut at all; 16-bit sums.
+const FORMULAS: [Formula; 11] = [
     ("formula:spheres", "spheres/auto", "auto", |_| {}),
     ("formula:fog", "fog/grey", "grey", |_| {}),
     ("formula:blob", "blob/extinction", "extinction", |_| {}),
@@ -52,6 +52,7 @@ const FORMULAS: [Formula; 10] = [
         q.sums = Sums::F32;
         q.eps = 0.0;
     }),
+    ("formula:spheres", "spheres/auto/i16", "auto", |q| q.sums = Sums::I16),
     ("formula:wall", "wall/peer-vessels/paper", "peer-vessels", |q| {
         q.compositing = Compositing::Paper;
     }),
@@ -65,7 +66,7 @@ const FORMULAS: [Formula; 10] = [
 
 /// How many of [`FORMULAS`] the matrix takes: those that differ in how they are rendered. The
 /// others differ in arithmetic alone, which golden frames watch.
-const IN_MATRIX: usize = 6;
+const IN_MATRIX: usize = 7;
 
 /// The cases of the matrix: the volume (if any), and formula volumes.
 pub(crate) fn of_matrix(file: Option<&Path>, size: [u32; 2]) -> Result<Vec<Case>, Fail> {

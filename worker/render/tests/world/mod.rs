@@ -16,12 +16,8 @@ pub fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
     let mut out = Vec::new();
     for id in 0..grid.len() as u32 {
         let corner = grid.corner(BrickId(id));
-        let mut brick = Brick {
-            id: BrickId(id),
-            index: vec![],
-            values: Samples::empty(volume.samples.kind()),
-            normals: Some(vec![]),
-        };
+        let (mut index, mut normals) = (Vec::new(), Vec::new());
+        let mut values = Samples::empty(volume.samples.kind());
         for l in 0..512u16 {
             let p: [u32; 3] = std::array::from_fn(|a| corner[a] + local(l)[a]);
             if (0..3).any(|a| p[a] >= volume.lattice.dims[a]) {
@@ -29,14 +25,13 @@ pub fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
             }
             let i = (p[2] as usize * ny + p[1] as usize) * nx + p[0] as usize;
             if volume.samples.code(i) != 0.0 {
-                brick.index.push(l);
-                brick.values.push_from(&volume.samples, i);
-                let normal = encode_normal(volume.gradient(p, &matrix));
-                brick.normals.as_mut().unwrap().push(normal);
+                index.push(l);
+                values.push_from(&volume.samples, i);
+                normals.push(encode_normal(volume.gradient(p, &matrix)));
             }
         }
-        if !brick.is_empty() {
-            out.push(Arc::new(brick));
+        if !index.is_empty() {
+            out.push(Arc::new(Brick::new(BrickId(id), index, values, Some(normals))));
         }
     }
     out

@@ -1,0 +1,151 @@
+//! `slabcast bench`: how long a frame takes in this process, without a cluster.
+//!
+//! A frame's time runs from camera set to picture in memory: tables, projection of bricks,
+//! rendering, compositing. Reading, bricking and writing pictures are not in it. The first view
+//! warms up and is left out; every view is another one, so nothing can be kept from one to the
+//! next but what a worker keeps, too.
+
+use crate::check::shot::Drawn;
+use crate::fail::{Fail, say};
+use crate::local::{self, Cut};
+use crate::progress::{self, Progress};
+use crate::request::{Asked, PictureArgs, QualityArgs, ViewArgs, lattice_notice};
+use crate::{still, volume};
+use slabcast_common::message::Counters;
+use slabcast_common::quality::Work;
+use slabcast_common::view::View;
+use slabcast_render::reference::{ErrorFigures, Reference, stratified};
+use slabcast_render::splat::Simd;
+use slabcast_render::{Frame, Scene};
+use std::fmt::Write;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// Times the frames of a view path in this process: milliseconds, counts and error of one run.
+///
+/// A frame's time runs from camera set to picture in memory. The first view warms up and is left
+/// out. The error is that of the middle view, as `slabcast error` has it.
+#[derive(clap::Args, Clone, Debug)]
+#[command(after_help = "\
+Examples:
+  slabcast bench brain.nii.gz --threads 1
+  slabcast bench brain.nii.gz --tf peer-semi --size 1024x1024 --projection persp --json")]
+pub(crate) struct BenchArgs {
+    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
+    volume: PathBuf,
+    #[command(flatten)]
+    view: ViewArgs,
+    #[command(flatten)]
+    picture: PictureArgs,
+    #[command(flatten)]
+    quality: QualityArgs,
+    /// Threads [default: all cores]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    threads: Option<u32>,
+    /// Edge of the tiles that threads share, in pixels
+    #[arg(long, value_name = "N", default_value = "64",
+          value_parser = clap::value_parser!(u32).range(16..=256))]
+    tile: u32,
+    /// Pixels of the middle view to compare with the reference; 0 for none
+    #[arg(long, value_name = "N", default_value = "1024",
+          value_parser = clap::value_parser!(u32).range(0..=1 << 26))]
+    pixels: u32,
+    /// As JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
+    let asked = Asked::new(&args.view, &args.picture, &args.quality, Work::default())?;
+    let orientation = args.view.axes.orientation()?;
+    let threads = still::threads(args.threads);
+    let volume = volume::open(&args.volume)?;
+    let info = volume.info(volume.digest());
+    asked.fit(&info, orientation)?;
+    if let Some(notice) = lattice_notice(&info) {
+        progress::note(&notice);
+    }
+    let transfer = asked.transfer.function(&info).map_err(|e| asked.blame(&e))?;
+    let Drawn { spec, bricks } = Drawn::new(&volume, &info, &transfer, asked.quality)?;
+    drop(volume);
+    let scene = Arc::new(Scene::new(&spec));
+    let cut = Cut { threads, tile: args.tile, slabs: 1 };
+    let views = asked.path.frames();
+    let mut progress = Progress::new(false).of("frame");
+    progress.frames(views as u64, &format!("{views} views"));
+    let (mut ms, mut counters, mut middle) = (Vec::new(), Counters::default(), None);
+    for i in 0..views {
+        let view = asked
+            .path
+            .camera(i, &info.lattice, orientation)
+            .and_then(|c| View::new(&info.lattice, &c, asked.path.size, &asked.quality))
+            .map_err(|e| asked.blame(&e))?;
+        let began = Instant::now();
+        let frame = Frame::new(scene.clone(), view);
+        let (picture, counted) = local::counted_picture(&frame, &bricks, cut);
+        let took = began.elapsed().as_secs_f64() * 1e3;
+        if i > 0 || views == 1 {
+            ms.push(took);
+            counters += counted;
+        }
+        if i == views / 2 {
+            middle = Some((view, picture));
+        }
+        progress.step(progress::Step { frames: i as u64 + 1, ..Default::default() });
+    }
+    progress.end();
+    ms.sort_by(f64::total_cmp);
+    let n = ms.len() as u64;
+    let (median, least, most) = (ms[ms.len() / 2], ms[0], ms[ms.len() - 1]);
+    let relevant: u64 = bricks.iter().map(|b| b.len() as u64).sum();
+    let errors = middle.filter(|_| args.pixels > 0).map(|(view, picture)| {
+        let sample = stratified(asked.path.size, args.pixels as usize, 1);
+        let reference = Reference::new(&spec, view, &bricks);
+        let mut progress = Progress::new(false).of("pixel");
+        progress.frames(sample.len() as u64, "the reference");
+        let truth = local::judge(&sample, threads, (&mut progress, 0), |[x, y]| {
+            (reference.pixel(x, y), reference.at_same_thickness(x, y))
+        });
+        progress.end();
+        let (limit, same): (Vec<_>, Vec<_>) = truth.into_iter().unzip();
+        let at = |p: &[u32; 2]| picture.pixels[(p[1] * asked.path.size[0] + p[0]) as usize];
+        let got: Vec<_> = sample.iter().map(at).collect();
+        [limit, same].map(|want| ErrorFigures::compare(&got, &want, asked.background))
+    });
+    let simd = Simd::detect().name();
+    if args.json {
+        let figures = |e: &ErrorFigures| serde_json::json!({ "rmse": e.rmse, "max": e.max });
+        let json = serde_json::json!({
+            "version": env!("CARGO_PKG_VERSION"),
+            "pixels_version": slabcast_common::PIXELS_VERSION,
+            "median_ms": median, "min_ms": least, "max_ms": most, "views": n,
+            "threads": threads, "tile": args.tile, "simd": simd, "size": asked.path.size,
+            "quality": spec.quality, "relevant": relevant,
+            "tossed": counters.tossed / n, "splatted": counters.splatted / n,
+            "culled": counters.culled / n,
+            "limit": errors.as_ref().map(|e| figures(&e[0])),
+            "same_thickness": errors.as_ref().map(|e| figures(&e[1])),
+        });
+        return say(&format!("{json}\n"));
+    }
+    let mut text = format!(
+        "{median:.2} ms a frame: median of {n} views ({least:.2} to {most:.2}), {threads} {}, \
+         {simd}, {} sums\n{relevant} relevant voxels; a frame tosses {}, splats {}, culls {}\n",
+        if threads == 1 { "thread" } else { "threads" },
+        format!("{:?}", spec.quality.sums).to_lowercase(),
+        counters.tossed / n,
+        counters.splatted / n,
+        counters.culled / n,
+    );
+    if let Some([limit, same]) = errors {
+        let _ = writeln!(
+            text,
+            "error of the middle view in 1/255: {:.3} (max {:.2}) against the limit, {:.3} (max \
+             {:.2}) at the same thickness",
+            limit.rmse, limit.max, same.rmse, same.max
+        );
+    }
+    say(&text)
+}

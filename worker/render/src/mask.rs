@@ -1,0 +1,150 @@
+//! Which pixels of a tile part are open, one bit each: tests of rectangles in a few words.
+//!
+//! A part has at most 64 columns, so a row is a word and "is anything open under this footprint?"
+//! is an AND of some eight words. A summed-area count needs four reads but has to be made anew
+//! over the whole part whenever a pixel shuts, which is nearly every sheet. Where all footprints
+//! are of one size, a mask grown by their reach answers a coarser question in one bit: may anything
+//! be open around this centre? Most voxels need no more.
+
+use slabcast_common::occlusion::Rect;
+
+/// Open pixels of a part of at most 64x64 pixels.
+#[derive(Clone, Debug)]
+pub(crate) struct OpenMask {
+    rect: Rect,
+    rows: [u64; 64],
+    /// Pixels with an open one at most `reach` columns and rows away.
+    grown: [u64; 64],
+    reach: i32,
+}
+
+/// Farthest that a mask is grown: beyond it every footprint covers most of a part anyway.
+pub(crate) const REACH_MOST: i32 = 31;
+
+impl OpenMask {
+    /// Every pixel of `rect` is shut.
+    ///
+    /// # Panics
+    /// If `rect` has more than 64 columns or rows.
+    pub(crate) fn shut(rect: Rect) -> Self {
+        assert!(rect.width() <= 64 && rect.height() <= 64, "a part is at most 64x64");
+        OpenMask { rect, rows: [0; 64], grown: [0; 64], reach: 0 }
+    }
+
+    /// Opens pixel (x, y) of the part.
+    #[inline(always)]
+    pub(crate) fn open(&mut self, x: usize, y: usize) {
+        self.rows[y & 63] |= 1 << x;
+    }
+
+    /// Shuts the pixels of row `y` whose bits are set.
+    #[inline(always)]
+    pub(crate) fn close(&mut self, y: usize, bits: u64) {
+        self.rows[y & 63] &= !bits;
+    }
+
+    /// Open pixels of row `y`.
+    #[inline(always)]
+    pub(crate) fn row(&self, y: usize) -> u64 {
+        self.rows[y & 63]
+    }
+
+    /// Grows the mask by `reach` pixels, at most [`REACH_MOST`]: to be done again after pixels shut.
+    #[inline(always)]
+    pub(crate) fn grow(&mut self, reach: i32) {
+        self.reach = reach.min(REACH_MOST);
+        self.grown = self.rows;
+        // What is grown by n can be grown by n + 1 more at once.
+        let mut done = 0;
+        while done < self.reach {
+            let step = (self.reach - done).min(done + 1);
+            for row in &mut self.grown {
+                *row |= *row << step | *row >> step;
+            }
+            let was = self.grown;
+            let step_rows = step as usize;
+            for y in step_rows..64 {
+                self.grown[y] |= was[y - step_rows];
+                self.grown[y - step_rows] |= was[y];
+            }
+            done += step;
+        }
+    }
+
+    /// Whether a footprint of the mask's reach, centred in pixel (x, y) of the part, may touch it.
+    #[inline(always)]
+    pub(crate) fn reaches(&self, x: i32, y: i32) -> bool {
+        let inside = |p: i32| p >= -self.reach && p < 64 + self.reach;
+        inside(x) && inside(y)
+    }
+
+    /// Whether a footprint of the mask's reach, centred in pixel (x, y) of the part (which may lie
+    /// outside), may touch an open pixel. Never wrongly no.
+    #[inline(always)]
+    pub(crate) fn near(&self, x: i32, y: i32) -> bool {
+        let bit = self.grown[y.clamp(0, 63) as usize] >> x.clamp(0, 63) & 1;
+        self.reaches(x, y) && bit == 1
+    }
+
+    /// Number of open pixels.
+    pub(crate) fn count(&self) -> usize {
+        self.rows.iter().map(|r| r.count_ones() as usize).sum()
+    }
+
+    /// Whether any pixel of `rect` (picture coordinates) is open.
+    #[inline(always)]
+    pub(crate) fn any(&self, rect: &Rect) -> bool {
+        let x0 = rect.x0.max(self.rect.x0) - self.rect.x0;
+        let x1 = rect.x1.min(self.rect.x1) - self.rect.x0;
+        let y0 = rect.y0.max(self.rect.y0) - self.rect.y0;
+        let y1 = rect.y1.min(self.rect.y1) - self.rect.y0;
+        if x0 >= x1 || y0 >= y1 {
+            return false;
+        }
+        let columns = (u64::MAX >> (64 - (x1 - x0) as u32)) << x0;
+        let mut any = 0;
+        for row in &self.rows[y0 as usize..y1 as usize] {
+            any |= row;
+        }
+        any & columns != 0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn a_rectangle_is_open_where_a_pixel_is(
+            w in 1..=64i32, h in 1..=64i32, x in -9..9i32, y in -9..9i32,
+            open in prop::collection::vec((0..64i32, 0..64i32), 0..6),
+            rects in prop::collection::vec((-20..80i32, -20..80i32, -3..40i32, -3..40i32), 1..40),
+        ) {
+            let part = Rect::new(x, y, x + w, y + h);
+            let mut mask = OpenMask::shut(part);
+            let open: Vec<_> = open.into_iter().filter(|&(i, j)| i < w && j < h).collect();
+            for &(i, j) in &open {
+                mask.open(i as usize, j as usize);
+            }
+            for (x0, y0, dx, dy) in rects {
+                let r = Rect::new(x0, y0, x0 + dx, y0 + dy);
+                // A square around a centre is open only where the grown mask says it may be.
+                let (reach, cx, cy) = (dx.clamp(0, REACH_MOST), x0, y0);
+                mask.grow(reach);
+                let square = Rect::new(
+                    x + cx - reach, y + cy - reach, x + cx + reach + 1, y + cy + reach + 1,
+                );
+                prop_assert!(mask.near(cx, cy) || !mask.any(&square), "{square:?} in {part:?}");
+                let inside = (0..64).contains(&cx) && (0..64).contains(&cy);
+                prop_assert!(!inside || mask.near(cx, cy) == mask.any(&square));
+                let inside = |&(i, j): &(i32, i32)| {
+                    let (i, j) = (i + x, j + y);
+                    r.x0 <= i && i < r.x1 && r.y0 <= j && j < r.y1
+                };
+                prop_assert_eq!(mask.any(&r), open.iter().any(inside), "{:?} in {:?}", r, part);
+            }
+        }
+    }
+}

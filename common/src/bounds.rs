@@ -86,6 +86,18 @@ pub fn quantisation(scene: &SceneSpec, view: &View) -> f64 {
     255.0 * (times * delta + fixed_point)
 }
 
+/// Bound of what f32 opacity loses by being added up, sheet after sheet.
+///
+/// A += (1 - A) a is rounded by at most 2^-25 a sheet, half the last bit below one. An error of A
+/// shrinks with every sheet that follows, so after N sheets it is at most N 2^-25. Colour adds
+/// T a c with that T: the errors of T times a telescope to those of A once more, 2 N 2^-25 in all.
+/// A million sheets make 15/255; a view of some hundred sheets 0.01.
+pub fn accumulation(scene: &SceneSpec, view: &View) -> f64 {
+    let whole = TightBox { lo: [0; 3], hi: scene.volume.lattice.dims.map(|n| n - 1) };
+    let sheets = view.project(&whole).map_or(0.0, |p| f64::from(p.sheets.len()));
+    255.0 * 2.0 * sheets / f64::from(1u32 << 25)
+}
+
 /// Of all pixels' rays, the longest between two planes one apart.
 fn longest_secant(view: &View) -> f64 {
     match view.projection {

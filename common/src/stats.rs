@@ -139,6 +139,10 @@ pub struct ErrorStats {
     pub quantisation: Bound,
     /// Rounding of positions and of f32 arithmetic.
     pub rounding: Bound,
+    /// Of f32 arithmetic the part that grows with the number of sheets: opacity stands still where
+    /// a sheet adds less than half its last bit.
+    #[serde(default)]
+    pub accumulation: Bound,
     /// Kernel tails cut off.
     pub truncation: Bound,
     /// Sheets of finite thickness.

@@ -66,7 +66,11 @@ pub fn view_sha256(scene: &SceneSpec, view: &View) -> Digest32 {
 fn error(scene: &SceneSpec, view: &View) -> ErrorStats {
     ErrorStats {
         cutoff: Bound { bound: Some(bounds::cutoff(&scene.quality)) },
-        quantisation: Bound { bound: Some(bounds::quantisation(scene, view)) },
+        // Above 255 it says nothing (16-bit sums, whose errors are a thousandth of it).
+        quantisation: Bound {
+            bound: Some(bounds::quantisation(scene, view)).filter(|&bound| bound < 255.0),
+        },
+        accumulation: Bound { bound: Some(bounds::accumulation(scene, view)) },
         ..ErrorStats::default()
     }
 }

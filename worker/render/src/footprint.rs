@@ -217,10 +217,11 @@ impl AxisTable {
 /// Most weights of one phase that are kept as a table. A larger footprint (a voxel over a
 /// thousand pixels wide) is evaluated where it is drawn, and only inside the tile.
 const TABLE_TAPS: f64 = 1024.0;
-/// Most bytes of tables that a perspective view may take; beyond it (thousands of thin sheets)
-/// weights are evaluated where they are drawn, which costs a voxel some 20 exponentials a
-/// section instead of a look-up.
-const TABLE_BYTES: f64 = 64.0 * 1024.0 * 1024.0;
+/// Most bytes of tables that a perspective view may take: sheets of 1/32 vox in a volume of 256
+/// voxels a side. Beyond it weights are evaluated where they are drawn, which costs a voxel some 20
+/// exponentials a section instead of a look-up: minutes a picture instead of seconds. Only tables of
+/// sheets that are drawn are made.
+const TABLE_BYTES: f64 = 256.0 * 1024.0 * 1024.0;
 
 /// Tables of one scale, x and y. Where the profiles are the same (cubic lattices) there is one.
 #[derive(Debug)]
@@ -271,7 +272,9 @@ impl Footprints {
         };
         let largest = (range.first..range.end).find_map(|k| view.scale_at(k)).unwrap_or(1.0);
         let taps = 2.0 * reach * largest + 2.0;
-        let bytes = taps * f64::from(SUBPIXELS) * 8.0 * sheets as f64;
+        // Two kinds of weights, along one axis or two.
+        let axes = if x == y { 1.0 } else { 2.0 };
+        let bytes = taps * f64::from(SUBPIXELS) * 6.0 * axes * sheets as f64;
         let kept = taps <= TABLE_TAPS && bytes <= TABLE_BYTES;
         let tables = (0..if kept { sheets } else { 0 }).map(|_| OnceLock::new()).collect();
         Footprints { x, y, tables, first: range.first, view: *view }

@@ -9,7 +9,7 @@
 //! 2. **Splat** bucket k: each voxel is tested once more, shaded, and all its sections are added
 //!    to the ring of open sheets. So the next sheet is half filled when this one closes, which
 //!    is just what the colour rule wants to see ([`crate::sheet`]).
-//! 3. **Close** sheet k where it was touched: composite, shut pixels, update the counts.
+//! 3. **Close** sheet k where it was touched: composite, shut pixels, take them out of the mask.
 //!
 //! A part is left as soon as all its pixels are shut. Bytes do not depend on any of this: sums
 //! are integers (or floats in one order), an open pixel gets every voxel that covers it, and

@@ -7,7 +7,7 @@
 //! the pixel was shut is counted, not drawn.
 
 use crate::scene::Frame;
-use crate::splat::Accumulate;
+use crate::splat::{Accumulate, Weight};
 use slabcast_common::brick::Brick;
 use slabcast_common::ids::BrickId;
 use slabcast_common::image::{COLOUR_UNIT, FrameState, TilePixels};
@@ -159,7 +159,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
         }
         found.sort_unstable_by_key(|&(first, id, i, ..)| (first, id, i));
         let mut pixel = Pixel { frame, bricks, at, voxels: Vec::new(), sheets: BTreeMap::new() };
-        let (mut bx, mut by) = (S::Buffer::default(), S::Buffer::default());
+        let (mut bx, mut by) = (Vec::new(), Vec::new());
         let (mut tx, mut ty) = (Vec::new(), Vec::new());
         let (columns, rows) = ((at[0], at[0] + 1), (at[1], at[1] + 1));
         for (first, _, i, b, eye) in found {
@@ -170,8 +170,8 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
                 let k = first + n as i32;
                 let Some(f) = frame.footprints.at(k) else { continue };
                 let [x, y] = view.screen(eye.x, eye.y, f.scale);
-                let (_, wx) = S::weights(&f, 0, x, columns, &mut bx);
-                let (_, wy) = S::weights(&f, 1, y, rows, &mut by);
+                let (_, wx) = S::Weight::of(&f, 0, x, columns, &mut bx);
+                let (_, wy) = S::Weight::of(&f, 1, y, rows, &mut by);
                 let (&[wx], &[wy]) = (wx, wy) else { continue };
                 let (_, real_x) = f.weights(0, x, columns, &mut tx);
                 let (_, real_y) = f.weights(1, y, rows, &mut ty);

@@ -35,26 +35,54 @@ impl Tap {
     }
 }
 
-/// How contributions are added: a section is `payload * w_z`, a row `section * w_y`, and what is
-/// added to a pixel `row * w_x`, rounded as each kind says.
-pub trait Accumulate: Sum {
-    /// A weight across the view axis.
-    type Weight: Copy + std::fmt::Debug;
-    /// One channel of a section or a row.
-    type Section: Copy;
-    /// Memory for weights that are in no table.
-    type Buffer: Default + Send;
-
-    /// First sheet of a voxel at depth `z` (in phases), and its section in the `i`th from there.
-    fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Self::Section; 4];
+/// A weight across the view axis, as sums of one kind want it.
+pub trait Weight: Copy + std::fmt::Debug {
     /// Weights along `axis`: see [`Footprint::weights`].
-    fn weights<'b>(
+    fn of<'b>(
         footprint: &'b Footprint<'_>,
         axis: usize,
         pos: i64,
         clip: (i32, i32),
-        buffer: &'b mut Self::Buffer,
-    ) -> (i32, &'b [Self::Weight]);
+        buffer: &'b mut Vec<Self>,
+    ) -> (i32, &'b [Self]);
+}
+
+impl Weight for Tap {
+    #[inline(always)]
+    fn of<'b>(
+        footprint: &'b Footprint<'_>,
+        axis: usize,
+        pos: i64,
+        clip: (i32, i32),
+        buffer: &'b mut Vec<Tap>,
+    ) -> (i32, &'b [Tap]) {
+        footprint.weights(axis, pos, clip, buffer)
+    }
+}
+
+impl Weight for i16 {
+    #[inline(always)]
+    fn of<'b>(
+        footprint: &'b Footprint<'_>,
+        axis: usize,
+        pos: i64,
+        clip: (i32, i32),
+        buffer: &'b mut Vec<i16>,
+    ) -> (i32, &'b [i16]) {
+        footprint.weights_fixed(axis, pos, clip, buffer)
+    }
+}
+
+/// How contributions are added: a section is `payload * w_z`, a row `section * w_y`, and what is
+/// added to a pixel `row * w_x`, rounded as each kind says.
+pub trait Accumulate: Sum {
+    /// A weight across the view axis.
+    type Weight: Weight;
+    /// One channel of a section or a row.
+    type Section: Copy;
+
+    /// First sheet of a voxel at depth `z` (in phases), and its section in the `i`th from there.
+    fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Self::Section; 4];
     /// `section * wy`.
     fn row(section: Self::Section, wy: Self::Weight) -> Self::Section;
     /// `self + row * wx`.
@@ -74,7 +102,6 @@ const LARGEST: f32 = 2_147_483_520.0;
 impl Accumulate for i32 {
     type Weight = Tap;
     type Section = Section;
-    type Buffer = Vec<Tap>;
 
     #[inline(always)]
     fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Section; 4] {
@@ -84,17 +111,6 @@ impl Accumulate for i32 {
             // A select, so that NaN too ends inside.
             Section(if section > 0.0 { section } else { 0.0 })
         })
-    }
-
-    #[inline(always)]
-    fn weights<'b>(
-        footprint: &'b Footprint<'_>,
-        axis: usize,
-        pos: i64,
-        clip: (i32, i32),
-        buffer: &'b mut Vec<Tap>,
-    ) -> (i32, &'b [Tap]) {
-        footprint.weights(axis, pos, clip, buffer)
     }
 
     #[inline(always)]
@@ -117,23 +133,11 @@ impl Accumulate for i32 {
 impl Accumulate for f32 {
     type Weight = Tap;
     type Section = f32;
-    type Buffer = Vec<Tap>;
 
     #[inline(always)]
     fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [f32; 4] {
         let wz = sections.of(z).1[i];
         payload.map(|p| p * wz)
-    }
-
-    #[inline(always)]
-    fn weights<'b>(
-        footprint: &'b Footprint<'_>,
-        axis: usize,
-        pos: i64,
-        clip: (i32, i32),
-        buffer: &'b mut Vec<Tap>,
-    ) -> (i32, &'b [Tap]) {
-        footprint.weights(axis, pos, clip, buffer)
     }
 
     #[inline(always)]
@@ -158,23 +162,11 @@ fn times(a: i16, b: i16) -> i16 {
 impl Accumulate for i16 {
     type Weight = i16;
     type Section = i16;
-    type Buffer = Vec<i16>;
 
     #[inline(always)]
     fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [i16; 4] {
         let wz = sections.of_fixed(z).1[i];
         section_fixed(payload.map(whole), wz)
-    }
-
-    #[inline(always)]
-    fn weights<'b>(
-        footprint: &'b Footprint<'_>,
-        axis: usize,
-        pos: i64,
-        clip: (i32, i32),
-        buffer: &'b mut Vec<i16>,
-    ) -> (i32, &'b [i16]) {
-        footprint.weights_fixed(axis, pos, clip, buffer)
     }
 
     #[inline(always)]

@@ -20,7 +20,7 @@ use crate::mask::{OpenMask, REACH_MOST};
 use crate::ring::{self, BLOCK, Planes, Records, Ring, SLOTS, Window};
 use crate::scene::Frame;
 use crate::sheet::Row;
-use crate::splat::{Accumulate, Simd, Tap, Work};
+use crate::splat::{Accumulate, Simd, Tap, Weight, Work};
 use glam::DVec3;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{RawSums, TilePixels, TileState};
@@ -190,7 +190,7 @@ struct RenderPart<'a, R: Ring> {
 }
 
 /// Memory for weights of one axis.
-type Buffer<R> = <<R as Ring>::Sum as Accumulate>::Buffer;
+type Buffer<R> = Vec<<<R as Ring>::Sum as Accumulate>::Weight>;
 
 impl<R: Ring> Work for RenderPart<'_, R> {
     type Out = ();
@@ -489,10 +489,10 @@ impl Part<'_> {
         &self,
         f: &'b Footprint<'_>,
         [x, y]: [i64; 2],
-        [bx, by]: &'b mut [S::Buffer; 2],
+        [bx, by]: &'b mut [Vec<S::Weight>; 2],
     ) -> Option<Window<'b, S::Weight>> {
-        let (x0, wx) = S::weights(f, 0, x, (self.rect.x0, self.rect.x1), bx);
-        let (y0, wy) = S::weights(f, 1, y, (self.rect.y0, self.rect.y1), by);
+        let (x0, wx) = S::Weight::of(f, 0, x, (self.rect.x0, self.rect.x1), bx);
+        let (y0, wy) = S::Weight::of(f, 1, y, (self.rect.y0, self.rect.y1), by);
         let inside = !wx.is_empty() && !wy.is_empty();
         let at = |p: i32, origin: i32| (p - origin) as usize;
         inside.then(|| ((at(x0, self.rect.x0), wx), (at(y0, self.rect.y0), wy)))

@@ -9,8 +9,8 @@ use crate::check::shot::Drawn;
 use crate::fail::{Fail, say};
 use crate::local::{self, Cut};
 use crate::progress::{self, Progress};
-use crate::request::{Asked, PictureArgs, QualityArgs, ViewArgs, lattice_notice};
-use crate::{still, volume};
+use crate::request::{PictureOf, ThreadArg, lattice_notice};
+use crate::volume;
 use slabcast_common::message::Counters;
 use slabcast_common::quality::Work;
 use slabcast_common::view::View;
@@ -18,7 +18,6 @@ use slabcast_render::reference::{ErrorFigures, Reference, stratified};
 use slabcast_render::splat::Simd;
 use slabcast_render::{Frame, Scene};
 use std::fmt::Write;
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -32,17 +31,10 @@ Examples:
   slabcast bench brain.nii.gz --threads 1
   slabcast bench brain.nii.gz --tf peer-semi --size 1024x1024 --projection persp --json")]
 pub(crate) struct BenchArgs {
-    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
-    volume: PathBuf,
     #[command(flatten)]
-    view: ViewArgs,
+    of: PictureOf,
     #[command(flatten)]
-    picture: PictureArgs,
-    #[command(flatten)]
-    quality: QualityArgs,
-    /// Threads [default: all cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
-    threads: Option<u32>,
+    threads: ThreadArg,
     /// Edge of the tiles that threads share, in pixels
     #[arg(long, value_name = "N", default_value = "64",
           value_parser = clap::value_parser!(u32).range(16..=256))]
@@ -58,10 +50,10 @@ pub(crate) struct BenchArgs {
 
 /// Runs the command.
 pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
-    let asked = Asked::new(&args.view, &args.picture, &args.quality, Work::default())?;
-    let orientation = args.view.axes.orientation()?;
-    let threads = still::threads(args.threads);
-    let volume = volume::open(&args.volume)?;
+    let asked = args.of.look.asked(Work::default())?;
+    let orientation = args.of.look.view.axes.orientation()?;
+    let threads = args.threads.count();
+    let volume = volume::open(&args.of.volume)?;
     let info = volume.info(volume.digest());
     asked.fit(&info, orientation)?;
     if let Some(notice) = lattice_notice(&info) {

@@ -6,7 +6,7 @@
 
 use crate::fail::{Fail, say};
 use crate::parse;
-use crate::request::{PictureArgs, QualityArgs, ViewArgs};
+use crate::request::PictureOf;
 use crate::signals;
 use crate::still::Still;
 use slabcast_common::volume::ValueMap;
@@ -14,7 +14,6 @@ use slabcast_render::explain::{Explained, Section, SheetHere, explain};
 use slabcast_render::reference::{Sheet, Sheets};
 use std::collections::BTreeMap;
 use std::fmt::Write;
-use std::path::PathBuf;
 
 /// Explains a pixel sheet by sheet: what is in it, which voxels made it, where it was shut.
 ///
@@ -42,14 +41,8 @@ tau, colour}]}]}. rgba, same_thickness and limit are linear, premultiplied; erro
 of four channels in 1/255; t is what is let through by this sheet and all in front of it; shut_in is
 null where the pixel stays open; reference is null where f64 sheets have nothing there.")]
 pub(crate) struct ExplainArgs {
-    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
-    volume: PathBuf,
     #[command(flatten)]
-    view: ViewArgs,
-    #[command(flatten)]
-    picture: PictureArgs,
-    #[command(flatten)]
-    quality: QualityArgs,
+    of: PictureOf,
     /// The pixel, from 0,0 at the top left
     #[arg(long, value_name = "X,Y", value_parser = parse::pixel)]
     pixel: Option<[u32; 2]>,
@@ -91,7 +84,7 @@ pub(crate) fn run(args: &ExplainArgs) -> Result<(), Fail> {
 }
 
 fn find(args: &ExplainArgs, at: [u32; 2]) -> Result<Found, Fail> {
-    let still = Still::read(&args.volume, (&args.view, &args.picture, &args.quality), |[w, h]| {
+    let still = Still::read(&args.of, |[w, h]| {
         if at[0] < w && at[1] < h {
             return Ok(());
         }

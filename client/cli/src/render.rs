@@ -6,7 +6,7 @@ use crate::embedded::{Cluster, Crew};
 use crate::fail::{Fail, say};
 use crate::output::{Folder, Frame, Lines, Writer};
 use crate::progress::{self, Progress, Step};
-use crate::request::{self, Asked, PictureArgs, QualityArgs, ViewArgs, WorkArgs};
+use crate::request::{self, Asked, LookArgs, WorkArgs};
 use crate::{remote, signals, volume};
 use slabcast_common::ids::JobId;
 use slabcast_common::path::Orientation;
@@ -52,11 +52,7 @@ pub(crate) struct RenderArgs {
     #[arg(long, value_name = "HOST:PORT", value_parser = crate::parse::master)]
     master: Option<String>,
     #[command(flatten)]
-    view: ViewArgs,
-    #[command(flatten)]
-    picture: PictureArgs,
-    #[command(flatten)]
-    quality: QualityArgs,
+    look: LookArgs,
     #[command(flatten)]
     work: WorkArgs,
     /// Workers inside this process [default: 1]
@@ -195,20 +191,20 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         }
     }
     let crew = Crew::new(args.workers.unwrap_or(1), args.threads)?;
-    let asked = Asked::new(&args.view, &args.picture, &args.quality, args.work.work()?)?;
+    let asked = args.look.asked(args.work.work()?)?;
     let frames = asked.path.frames() as u64;
     let (folder, stays) = Folder::look(&args.output, frames, args.force)?;
     let inputs: Vec<&Path> =
-        [&args.volume, &args.view.path].into_iter().flatten().map(PathBuf::as_path).collect();
+        [&args.volume, &args.look.view.path].into_iter().flatten().map(PathBuf::as_path).collect();
     let run = Run {
         stats: Lines::open(args.stats.as_deref(), "stats", &inputs)?,
         trace: Lines::open(args.trace.as_deref(), "trace", &inputs)?,
         progress: Progress::new(args.quiet),
         began: Instant::now(),
         stands: args.quiet
-            || args.view.path.is_some()
-            || args.view.axes.up.is_some()
-            || args.view.axes.front.is_some(),
+            || args.look.view.path.is_some()
+            || args.look.view.axes.up.is_some()
+            || args.look.view.axes.front.is_some(),
         asked,
         folder,
         notes: stays.into_iter().collect(),
@@ -221,7 +217,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         .map_err(|e| Fail::failed(format!("starting threads failed: {e}")))?;
     let result = match (&args.volume, master) {
         (Some(file), _) => {
-            let orientation = args.view.axes.orientation()?;
+            let orientation = args.look.view.axes.orientation()?;
             let mut run = run;
             run.progress.stage(&format!("reading {}", file.display()));
             let volume = volume::open(file)?;

@@ -170,6 +170,48 @@ impl QualityArgs {
     }
 }
 
+/// Where from, what and how well: everything that decides a picture of a given volume.
+#[derive(clap::Args, Clone, Debug)]
+pub(crate) struct LookArgs {
+    #[command(flatten)]
+    pub(crate) view: ViewArgs,
+    #[command(flatten)]
+    picture: PictureArgs,
+    #[command(flatten)]
+    quality: QualityArgs,
+}
+
+impl LookArgs {
+    /// What the flags ask for.
+    pub(crate) fn asked(&self, work: Work) -> Result<Asked, Fail> {
+        Asked::new(&self.view, &self.picture, &self.quality, work)
+    }
+}
+
+/// A picture of a volume, for commands that look closely at one.
+#[derive(clap::Args, Clone, Debug)]
+pub(crate) struct PictureOf {
+    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
+    pub(crate) volume: PathBuf,
+    #[command(flatten)]
+    pub(crate) look: LookArgs,
+}
+
+/// `--threads` of commands that draw in this process alone.
+#[derive(clap::Args, Clone, Debug)]
+pub(crate) struct ThreadArg {
+    /// Threads [default: all cores]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    threads: Option<u32>,
+}
+
+impl ThreadArg {
+    /// As many as asked for, or as there are cores.
+    pub(crate) fn count(&self) -> usize {
+        self.threads.unwrap_or_else(crate::embedded::cores) as usize
+    }
+}
+
 /// How the work is cut.
 #[derive(clap::Args, Clone, Debug)]
 #[command(next_help_heading = "Work (never changes a pixel)")]
@@ -477,11 +519,7 @@ mod tests {
     #[derive(Parser)]
     struct Flags {
         #[command(flatten)]
-        view: ViewArgs,
-        #[command(flatten)]
-        picture: PictureArgs,
-        #[command(flatten)]
-        quality: QualityArgs,
+        look: LookArgs,
         #[command(flatten)]
         work: WorkArgs,
     }
@@ -491,7 +529,7 @@ mod tests {
             .map_err(|e| e.to_string())?;
         f.work
             .work()
-            .and_then(|work| Asked::new(&f.view, &f.picture, &f.quality, work))
+            .and_then(|work| f.look.asked(work))
             .map_err(|e| e.line().unwrap_or_default().to_string())
     }
 

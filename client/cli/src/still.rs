@@ -5,7 +5,7 @@ use crate::check::shot::Drawn;
 use crate::fail::Fail;
 use crate::local::{self, Cut};
 use crate::progress;
-use crate::request::{Asked, PictureArgs, QualityArgs, ViewArgs, lattice_notice};
+use crate::request::{PictureOf, lattice_notice};
 use crate::volume;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{Background, Picture};
@@ -14,7 +14,6 @@ use slabcast_common::quality::{Quality, Work};
 use slabcast_common::view::View;
 use slabcast_render::reference::Reference;
 use slabcast_render::{Frame, Scene};
-use std::path::Path;
 use std::sync::Arc;
 
 /// The first view of a path, ready to be drawn and judged.
@@ -29,15 +28,14 @@ pub(crate) struct Still {
 impl Still {
     /// Reads the volume and cuts its bricks. `check` is asked before anything is read.
     pub(crate) fn read(
-        file: &Path,
-        (view, picture, quality): (&ViewArgs, &PictureArgs, &QualityArgs),
+        of: &PictureOf,
         check: impl FnOnce([u32; 2]) -> Result<(), Fail>,
     ) -> Result<Still, Fail> {
-        let asked = Asked::new(view, picture, quality, Work::default())?;
-        let orientation = view.axes.orientation()?;
+        let asked = of.look.asked(Work::default())?;
+        let orientation = of.look.view.axes.orientation()?;
         let size = asked.path.size;
         check(size)?;
-        let volume = volume::open(file)?;
+        let volume = volume::open(&of.volume)?;
         let info = volume.info(volume.digest());
         asked.fit(&info, orientation)?;
         if let Some(notice) = lattice_notice(&info) {
@@ -67,10 +65,4 @@ impl Still {
     pub(crate) fn reference(&self) -> Reference {
         Reference::new(&self.spec, self.view, &self.bricks)
     }
-}
-
-/// As many threads as asked for, or as there are cores.
-pub(crate) fn threads(asked: Option<u32>) -> usize {
-    asked
-        .map_or_else(|| std::thread::available_parallelism().map_or(1, |n| n.get()), |n| n as usize)
 }

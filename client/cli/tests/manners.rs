@@ -1,55 +1,13 @@
 //! How the program behaves when all is well: what goes where, what is left, how it stops.
 
+mod program;
+
+use program::{end, names, run, signal, slabcast, text};
 use slabcast_common::stats::FrameStats;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
-use std::process::{Child, Command, Output, Stdio};
+use std::process::Stdio;
 use std::time::{Duration, Instant};
-
-const SLABCAST: &str = env!("CARGO_BIN_EXE_slabcast");
-
-fn slabcast(dir: &Path, args: &[&str]) -> Command {
-    let mut command = Command::new(SLABCAST);
-    command.args(args).current_dir(dir).stdin(Stdio::null());
-    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("SLABCAST_")) {
-        command.env_remove(name);
-    }
-    command
-}
-
-fn run(dir: &Path, args: &[&str]) -> Output {
-    slabcast(dir, args).output().expect("the program starts")
-}
-
-fn names(dir: &Path) -> Vec<String> {
-    let Ok(entries) = std::fs::read_dir(dir) else { return Vec::new() };
-    let mut names: Vec<String> =
-        entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
-    names.sort();
-    names
-}
-
-fn text(bytes: &[u8]) -> String {
-    String::from_utf8_lossy(bytes).into_owned()
-}
-
-/// Waits for an end, or fails the test.
-fn end(child: &mut Child, within: Duration) -> i32 {
-    let until = Instant::now() + within;
-    while Instant::now() < until {
-        if let Some(status) = child.try_wait().unwrap() {
-            return status.code().unwrap_or(-1);
-        }
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    let _ = child.kill();
-    panic!("still running after {within:?}");
-}
-
-fn signal(child: &Child, name: &str) {
-    let status = Command::new("kill").args([name, &child.id().to_string()]).status().unwrap();
-    assert!(status.success());
-}
 
 #[test]
 fn a_turn_says_where_the_pictures_are_and_how_long_it_took() {

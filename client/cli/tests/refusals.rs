@@ -3,26 +3,13 @@
 //!
 //! The real program runs, each time in a folder of its own.
 
+mod program;
+
+use program::{run, slabcast};
 use std::collections::BTreeSet;
 use std::io::Write;
 use std::net::TcpListener;
 use std::path::Path;
-use std::process::{Command, Output, Stdio};
-
-const SLABCAST: &str = env!("CARGO_BIN_EXE_slabcast");
-
-fn slabcast(dir: &Path, args: &[&str]) -> Command {
-    let mut command = Command::new(SLABCAST);
-    command.args(args).current_dir(dir).stdin(Stdio::null());
-    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("SLABCAST_")) {
-        command.env_remove(name);
-    }
-    command
-}
-
-fn run(dir: &Path, args: &[&str]) -> Output {
-    slabcast(dir, args).output().expect("the program starts")
-}
 
 /// Names of all files and folders beneath, hidden ones too.
 fn tree(dir: &Path) -> BTreeSet<String> {

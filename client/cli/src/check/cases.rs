@@ -1,12 +1,12 @@
 //! What is rendered for comparison: volumes, looks, two cameras; and the serial renderer's
 //! answer to each.
 
+use super::cluster;
 use super::shot::Drawn;
 use crate::fail::Fail;
 use crate::volume;
 use glam::DVec3;
-use slabcast_common::image::{Background, PixelFormat};
-use slabcast_common::message::{PathRequest, TransferChoice};
+use slabcast_common::message::PathRequest;
 use slabcast_common::path::{Orientation, PathView, ProjectionKind, ViewPath};
 use slabcast_common::presets;
 use slabcast_common::quality::{Compositing, Quality, Sums, Work};
@@ -159,16 +159,7 @@ impl Case {
 
     /// The request for both views.
     pub(crate) fn request(&self, cull: bool, work: Work) -> PathRequest {
-        PathRequest {
-            client_key: crate::request::client_key(),
-            path: self.path(),
-            transfer: TransferChoice::Function(Box::new(self.transfer.clone())),
-            quality: Quality { cull, ..self.quality },
-            work,
-            format: PixelFormat::Rgba32F,
-            background: Background::Transparent,
-            want_trace: false,
-        }
+        cluster::request(self.path(), &self.transfer, Quality { cull, ..self.quality }, work)
     }
 
     /// The serial renderer's hashes of both views.

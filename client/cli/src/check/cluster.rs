@@ -4,8 +4,11 @@ use crate::embedded::{Cluster, Crew, start_master};
 use crate::fail::Fail;
 use sha2::{Digest, Sha256};
 use slabcast_client::Client;
-use slabcast_common::message::PathRequest;
-use slabcast_common::path::Orientation;
+use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::message::{PathRequest, TransferChoice};
+use slabcast_common::path::{Orientation, ViewPath};
+use slabcast_common::quality::{Quality, Work};
+use slabcast_common::transfer::TransferFunction;
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_master::driver::SubmitError;
 use slabcast_master::jobs::{JobState, WatchItem};
@@ -18,6 +21,25 @@ use tokio::task::JoinSet;
 
 /// How long workers may take to join: each draws its self-test first.
 const JOIN: Duration = Duration::from_secs(30);
+
+/// The request for the floats of a path's pictures: what is hashed and judged.
+pub(super) fn request(
+    path: ViewPath,
+    transfer: &TransferFunction,
+    quality: Quality,
+    work: Work,
+) -> PathRequest {
+    PathRequest {
+        client_key: crate::request::client_key(),
+        path,
+        transfer: TransferChoice::Function(Box::new(transfer.clone())),
+        quality,
+        work,
+        format: PixelFormat::Rgba32F,
+        background: Background::Transparent,
+        want_trace: false,
+    }
+}
 
 /// A cluster over either link.
 pub(crate) enum Either {

@@ -11,7 +11,7 @@ use super::table::number;
 use crate::fail::{Fail, say};
 use crate::local::{self, Cut};
 use crate::progress::{self, Progress};
-use crate::request::{Asked, PictureArgs, QualityArgs, ViewArgs, lattice_notice};
+use crate::request::{PictureOf, ThreadArg, lattice_notice};
 use crate::volume;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::quality::{Compositing, Quality, Work};
@@ -19,7 +19,6 @@ use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_render::reference::{ErrorFigures, Reference, stratified};
 use slabcast_render::{Frame, Scene};
 use std::fmt::Write;
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -37,14 +36,8 @@ Examples:
   slabcast check colour-rule head.nrrd --up=-y --tf peer-opaque --azimuth 20 --times
   slabcast check colour-rule head.nrrd --eps 0 --json")]
 pub(crate) struct ColourRuleArgs {
-    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
-    volume: PathBuf,
     #[command(flatten)]
-    view: ViewArgs,
-    #[command(flatten)]
-    picture: PictureArgs,
-    #[command(flatten)]
-    quality: QualityArgs,
+    of: PictureOf,
     /// Pixels to compare with the reference; all of them if there are no more
     #[arg(long, value_name = "N", default_value = "8192",
           value_parser = clap::value_parser!(u32).range(1..=1 << 26))]
@@ -53,12 +46,11 @@ pub(crate) struct ColourRuleArgs {
     #[arg(long, value_name = "N", default_value = "8", value_parser = even)]
     steps: u32,
     /// Draw on one thread and say how long a frame takes: the median of all steps. Other work on
-    /// the machine shows
+    /// the machine shows. All else is drawn on --threads
     #[arg(long)]
     times: bool,
-    /// Threads for what is not timed [default: all cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
-    threads: Option<u32>,
+    #[command(flatten)]
+    threads: ThreadArg,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -98,7 +90,7 @@ struct Line {
 
 /// Runs the command.
 pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
-    let asked = Asked::new(&args.view, &args.picture, &args.quality, Work::default())?;
+    let asked = args.of.look.asked(Work::default())?;
     let given = Quality::default();
     for (flag, given) in [
         ("thickness", asked.quality.thickness != given.thickness),
@@ -108,9 +100,9 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
             return Err(Fail::usage(format!("--{flag}: is what is compared; leave it out")));
         }
     }
-    let orientation = args.view.axes.orientation()?;
-    let threads = args.threads.unwrap_or_else(crate::embedded::cores) as usize;
-    let volume = volume::open(&args.volume)?;
+    let orientation = args.of.look.view.axes.orientation()?;
+    let threads = args.threads.count();
+    let volume = volume::open(&args.of.volume)?;
     let info = volume.info(volume.digest());
     asked.fit(&info, orientation)?;
     if let Some(notice) = lattice_notice(&info) {

@@ -4,14 +4,14 @@
 //! [`Ready`], and ask for what they need: the serial picture, one on threads, the hashes of
 //! clusters, the reference.
 
-use super::cluster::Either;
+use super::cluster::{self, Either};
 use crate::embedded::Crew;
 use crate::fail::Fail;
 use crate::local::{self, Cut};
 use slabcast_common::brick::Brick;
 use slabcast_common::ids::SceneId;
-use slabcast_common::image::{Background, Picture, PixelFormat};
-use slabcast_common::message::{PathRequest, SceneSpec, TransferChoice};
+use slabcast_common::image::Picture;
+use slabcast_common::message::{PathRequest, SceneSpec};
 use slabcast_common::path::{Orientation, PathView, ViewPath};
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::transfer::{Classifier, TransferFunction};
@@ -95,16 +95,7 @@ impl Shot {
 
     /// The request that has a cluster draw it.
     pub(crate) fn request(&self, cull: bool, work: Work) -> PathRequest {
-        PathRequest {
-            client_key: crate::request::client_key(),
-            path: self.path(),
-            transfer: TransferChoice::Function(Box::new(self.transfer.clone())),
-            quality: Quality { cull, ..self.quality },
-            work,
-            format: PixelFormat::Rgba32F,
-            background: Background::Transparent,
-            want_trace: false,
-        }
+        cluster::request(self.path(), &self.transfer, Quality { cull, ..self.quality }, work)
     }
 
     /// Makes it ready.

@@ -9,6 +9,7 @@ use super::shot::Tools;
 use super::{closed, extreme, invariance};
 use crate::fail::{Fail, say};
 use crate::progress::{self, Progress};
+use crate::request::ThreadArg;
 use std::time::{Duration, Instant};
 
 /// Some cases that belong together.
@@ -140,9 +141,8 @@ pub(crate) struct TableArgs {
     /// One line of JSON a row
     #[arg(long)]
     json: bool,
-    /// Threads [default: all cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
-    threads: Option<u32>,
+    #[command(flatten)]
+    threads: ThreadArg,
 }
 
 /// Runs the table.
@@ -178,7 +178,7 @@ pub(crate) fn run(args: &TableArgs) -> Result<(), Fail> {
         .enable_all()
         .build()
         .map_err(|e| Fail::failed(format!("starting threads failed: {e}")))?;
-    let threads = args.threads.unwrap_or_else(crate::embedded::cores) as usize;
+    let threads = args.threads.count();
     let tools = Tools { threads, runtime };
     let began = Instant::now();
     let mut progress = Progress::new(args.json).of("case");

@@ -18,8 +18,8 @@ use crate::fail::{Fail, say};
 use crate::local;
 use crate::parse::Pixels;
 use crate::progress::Progress;
-use crate::request::{PictureArgs, QualityArgs, ViewArgs};
-use crate::still::{self, Still};
+use crate::request::{PictureOf, ThreadArg};
+use crate::still::Still;
 use crate::{parse, signals};
 use slabcast_common::image::Picture;
 use slabcast_common::quality::{Quality, Sums};
@@ -60,14 +60,8 @@ and sampled_model: pixels looked at, blank ones included, for the sum and for tr
 ripple. size; pixels_sha256 of the picture; quality; draw_ms, judge_ms, total_ms; map: the file,
 if any.")]
 pub(crate) struct ErrorArgs {
-    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
-    volume: PathBuf,
     #[command(flatten)]
-    view: ViewArgs,
-    #[command(flatten)]
-    picture: PictureArgs,
-    #[command(flatten)]
-    quality: QualityArgs,
+    of: PictureOf,
     /// Pixels to compare, one at random in each of as many cells; or all
     #[arg(long, value_name = "N|all", default_value = "4096", value_parser = parse::pixels)]
     pixels: Pixels,
@@ -83,9 +77,8 @@ pub(crate) struct ErrorArgs {
     /// (blank pixels grey), each cell of the sample as one block
     #[arg(long, value_name = "FILE.png", value_parser = parse::png)]
     map: Option<PathBuf>,
-    /// Threads [default: all cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
-    threads: Option<u32>,
+    #[command(flatten)]
+    threads: ThreadArg,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -123,7 +116,7 @@ struct Found {
 /// Runs the command.
 pub(crate) fn run(args: &ErrorArgs) -> Result<(), Fail> {
     if let Some(map) = &args.map {
-        map::check(map, &args.volume)?;
+        map::check(map, &args.of.volume)?;
     }
     let found = {
         let args = args.clone();
@@ -145,8 +138,8 @@ fn shut(picture: &Picture, eps: f64) -> bool {
 }
 
 fn find(args: &ErrorArgs) -> Result<Found, Fail> {
-    let threads = still::threads(args.threads);
-    let still = Still::read(&args.volume, (&args.view, &args.picture, &args.quality), |_| Ok(()))?;
+    let threads = args.threads.count();
+    let still = Still::read(&args.of, |_| Ok(()))?;
     let size = still.view.size;
 
     let mut progress = Progress::new(false).of("pixel");

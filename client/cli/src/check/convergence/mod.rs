@@ -13,7 +13,7 @@ use super::scenes::SCENES;
 use super::table::number;
 use crate::fail::{Fail, say};
 use crate::progress::{self, Progress};
-use crate::request::{Asked, PictureArgs, QualityArgs, ViewArgs, lattice_notice};
+use crate::request::{Asked, LookArgs, ThreadArg, lattice_notice};
 use crate::{plot, volume};
 use slabcast_common::path::{Orientation, ProjectionKind, Turntable, ViewPath};
 use slabcast_common::quality::{Quality, Work};
@@ -39,11 +39,7 @@ pub(crate) struct ConvergenceArgs {
     /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) files, or formula:NAME
     volumes: Vec<PathBuf>,
     #[command(flatten)]
-    view: ViewArgs,
-    #[command(flatten)]
-    picture: PictureArgs,
-    #[command(flatten)]
-    quality: QualityArgs,
+    look: LookArgs,
     /// Pixels to compare; all of them if there are no more
     #[arg(long, value_name = "N", default_value = "512",
           value_parser = clap::value_parser!(u32).range(1..=1 << 26))]
@@ -61,9 +57,8 @@ pub(crate) struct ConvergenceArgs {
     /// Write a figure for each scene into this folder, as SVG
     #[arg(long, value_name = "DIR")]
     plot: Option<PathBuf>,
-    /// Threads [default: all cores]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
-    threads: Option<u32>,
+    #[command(flatten)]
+    threads: ThreadArg,
     /// One line of JSON a scene and projection
     #[arg(long)]
     json: bool,
@@ -80,9 +75,9 @@ pub(crate) fn run(args: &ConvergenceArgs) -> Result<(), Fail> {
             args.thinnest
         )));
     }
-    let asked = Asked::new(&args.view, &args.picture, &args.quality, Work::default())?;
-    let orientation = args.view.axes.orientation()?;
-    let threads = args.threads.unwrap_or_else(crate::embedded::cores) as usize;
+    let asked = args.look.asked(Work::default())?;
+    let orientation = args.look.view.axes.orientation()?;
+    let threads = args.threads.count();
     let thicknesses: Vec<f64> =
         (0..=args.thinnest.ilog2() + 1).map(|i| 2.0 / f64::from(1u32 << i)).collect();
     if let Some(folder) = &args.plot {

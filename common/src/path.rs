@@ -224,6 +224,22 @@ impl ViewPath {
         self.turntable.map_or(self.views.len(), |t| t.frames as usize)
     }
 
+    /// The path of frame `i` alone: the same view, to the bit.
+    ///
+    /// # Panics
+    /// If there is no such frame.
+    pub fn only(&self, i: usize) -> ViewPath {
+        assert!(i < self.frames(), "frame {i} of {}", self.frames());
+        match self.turntable {
+            // What `camera` adds up for this frame; nothing is added to it for the first.
+            Some(t) => {
+                let start = t.start + t.step * i as f64;
+                ViewPath::turn(self.size, Turntable { start, frames: 1, ..t })
+            }
+            None => ViewPath { views: vec![self.views[i]], ..self.clone() },
+        }
+    }
+
     /// The camera of frame `i`.
     ///
     /// # Errors
@@ -325,6 +341,20 @@ mod tests {
         let l = Lattice::from_spacing([256; 3], [1.0; 3]);
         let o = Orientation::new(up, None).unwrap();
         ViewPath::turn([512, 512], t).camera(0, &l, o).unwrap()
+    }
+
+    #[test]
+    fn one_frame_of_a_path_is_the_same_view_to_the_bit() {
+        let l = Lattice::from_spacing([9; 3], [1.0; 3]);
+        let o = Orientation::new(None, None).unwrap();
+        let turn = Turntable { start: 20.1, step: 5.3, frames: 40, ..Turntable::default() };
+        let path = ViewPath::turn([4, 4], turn);
+        for i in 0..40 {
+            let one = path.only(i);
+            assert_eq!(one.frames(), 1);
+            assert_eq!(path.camera(i, &l, o), one.camera(0, &l, o), "{i}");
+            assert_eq!(one.only(0), one);
+        }
     }
 
     #[test]

@@ -7,7 +7,7 @@
 use crate::embedded::{cores, start_master};
 use crate::fail::{Fail, reason, say};
 use crate::request::{AxisArgs, lattice_notice};
-use crate::{parse, signals, volume};
+use crate::{parse, runtime, signals, volume};
 use slabcast_common::path::Axis;
 use slabcast_master::{Handle, MasterConfig};
 use slabcast_render::splat::Simd;
@@ -94,20 +94,11 @@ pub(crate) struct WorkerArgs {
     memory: u64,
 }
 
-fn runtime() -> Result<tokio::runtime::Runtime, Fail> {
-    tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(2)
-        .thread_name("slabcast-io")
-        .enable_all()
-        .build()
-        .map_err(|e| Fail::failed(format!("starting threads failed: {}", reason(&e))))
-}
-
 /// Runs `slabcast master`.
 pub(crate) fn master(args: &MasterArgs) -> Result<(), Fail> {
     let axes = AxisArgs { up: args.up, front: args.front };
     let orientation = axes.orientation()?;
-    let runtime = runtime()?;
+    let runtime = runtime::start()?;
     // The address is taken before the volume is read, so that a port in use is told at once;
     // it is opened after, so that whoever gets through gets an answer.
     let socket = runtime.block_on(bind(&args.listen, args.insecure))?;
@@ -164,7 +155,7 @@ pub(crate) fn master(args: &MasterArgs) -> Result<(), Fail> {
         info!("stopped");
         Ok(())
     });
-    runtime.shutdown_timeout(Duration::from_millis(200));
+    runtime::end(runtime);
     result
 }
 
@@ -230,7 +221,7 @@ pub(crate) fn worker(args: &WorkerArgs) -> Result<(), Fail> {
         memory_budget_bytes: args.memory,
         simd: Simd::detect(),
     };
-    let runtime = runtime()?;
+    let runtime = runtime::start()?;
     let result = runtime.block_on(async {
         signals::listen();
         let (stop, stopped) = watch::channel(false);
@@ -274,7 +265,7 @@ pub(crate) fn worker(args: &WorkerArgs) -> Result<(), Fail> {
         }
     });
     // Render threads end after the tile at hand; nobody waits for it.
-    runtime.shutdown_timeout(Duration::from_millis(200));
+    runtime::end(runtime);
     result
 }
 

@@ -2,7 +2,8 @@
 //!
 //! - [`render`] makes pictures, by this process alone ([`embedded`]) or by a cluster
 //!   ([`remote`]); [`request`] turns flags into a request, [`output`] frames into files,
-//!   [`progress`] shows what goes on meanwhile.
+//!   [`progress`] shows what goes on meanwhile; [`rerender`] makes a picture again from what it
+//!   says of itself.
 //! - [`daemon`] is `master` and `worker`.
 //! - [`info`] looks into files, [`ask`] at a running master.
 //! - [`check`] compares pictures with the oracle over every way to make them; [`error`] says how
@@ -14,6 +15,7 @@
 
 mod ask;
 mod bench;
+mod canvas;
 mod check;
 mod daemon;
 mod embedded;
@@ -30,6 +32,8 @@ mod progress;
 mod remote;
 mod render;
 mod request;
+mod rerender;
+mod runtime;
 mod signals;
 mod still;
 mod style;
@@ -68,6 +72,7 @@ struct Cli {
 #[derive(Subcommand, Debug)]
 enum Command {
     Render(Box<render::RenderArgs>),
+    Rerender(rerender::RerenderArgs),
     Info(info::InfoArgs),
     Master(daemon::MasterArgs),
     Worker(daemon::WorkerArgs),
@@ -115,6 +120,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
     logging::begin(&cli.log, if daemon { "info" } else { "warn" })?;
     match &cli.command {
         Command::Render(args) => render::run(args),
+        Command::Rerender(args) => rerender::run(args),
         Command::Info(args) => info::run(args),
         Command::Master(args) => daemon::master(args),
         Command::Worker(args) => daemon::worker(args),

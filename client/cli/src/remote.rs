@@ -3,7 +3,7 @@
 use crate::fail::Fail;
 use crate::output::Frame;
 use crate::progress::Step;
-use crate::render::{self, Facts, Source, Update};
+use crate::render::{self, Source, Update};
 use crate::request::Asked;
 use slabcast_client::{Client, ClientError, JobState, PATIENCE, VolumeDescription};
 use slabcast_common::message::PathRequest;
@@ -134,15 +134,13 @@ async fn follow(
                         *next = f.number + 1;
                         latest.frames = *next;
                         Update::Frame {
-                            facts: Facts::of(&f.stats),
                             frame: Frame {
                                 number: f.number,
                                 size: f.size,
                                 format: f.format,
                                 bytes: f.bytes.into(),
-                                view_sha256: f.stats.view_sha256,
-                                pixels_sha256: f.stats.pixels_sha256,
                             },
+                            stats: Box::new(f.stats),
                             stats_json: f.stats_json,
                             trace_json: f.trace_json.unwrap_or_default(),
                         }

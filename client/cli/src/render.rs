@@ -4,14 +4,16 @@
 
 use crate::embedded::{Cluster, Crew};
 use crate::fail::{Fail, say};
-use crate::output::{Folder, Frame, Lines, Writer};
+use crate::output::provenance::Recipe;
+use crate::output::{Format, Frame, Lines, Output, OutputArgs, Patience, Writer};
 use crate::progress::{self, Progress, Step};
 use crate::request::{self, Asked, LookArgs, WorkArgs};
-use crate::{remote, signals, volume};
+use crate::{remote, runtime, signals, volume};
 use slabcast_common::ids::JobId;
+use slabcast_common::message::PathRequest;
 use slabcast_common::path::Orientation;
 use slabcast_common::stats::FrameStats;
-use slabcast_common::volume::VolumeInfo;
+use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_master::driver::SubmitError;
 use slabcast_master::jobs::{JobState, WatchItem};
 use std::path::{Path, PathBuf};
@@ -21,6 +23,10 @@ use tokio::sync::mpsc;
 
 /// How long cancelling may take before the command ends without the master's word.
 const CANCEL: Duration = Duration::from_secs(2);
+
+/// How long what is being written may take once the run has failed or was stopped: ten times what
+/// the largest picture takes on a slow disk.
+const LAST: Duration = Duration::from_secs(20);
 
 const EXAMPLES: &str = "\
 With VOLUME, a master and workers are started inside this process; with --master, a cluster
@@ -63,18 +69,8 @@ pub(crate) struct RenderArgs {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024),
           help_heading = "Work (never changes a pixel)")]
     threads: Option<u32>,
-    /// Folder for frame_0000.png and so on; it is made if missing
-    #[arg(
-        short,
-        long,
-        value_name = "DIR",
-        default_value = "slabcast-out/",
-        help_heading = "Output"
-    )]
-    output: PathBuf,
-    /// Replace frames that are there already
-    #[arg(long, help_heading = "Output")]
-    force: bool,
+    #[command(flatten)]
+    output: OutputArgs,
     /// Statistics, one line of JSON a frame; - writes them to stdout
     #[arg(long, value_name = "FILE|-", help_heading = "Output")]
     stats: Option<PathBuf>,
@@ -90,28 +86,10 @@ pub(crate) struct RenderArgs {
 pub(crate) enum Update {
     /// Where it stands.
     Step(Step),
-    /// A frame, its statistics and its trace.
-    Frame { frame: Frame, facts: Facts, stats_json: String, trace_json: String },
+    /// A frame, its statistics, those as JSON, and its trace.
+    Frame { frame: Frame, stats: Box<FrameStats>, stats_json: String, trace_json: String },
     /// It ended with all frames delivered.
     Done,
-}
-
-/// What of a frame's statistics a person may have to hear.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Facts {
-    relevant: u64,
-    splatted: u64,
-    incomplete: bool,
-}
-
-impl Facts {
-    pub(crate) fn of(stats: &FrameStats) -> Self {
-        Facts {
-            relevant: stats.voxels.relevant,
-            splatted: stats.voxels.splatted,
-            incomplete: !stats.poisoned.is_empty(),
-        }
-    }
 }
 
 /// Where updates come from, and how to cancel. One message of room: frames wait at the master,
@@ -147,13 +125,16 @@ struct Run {
     asked: Asked,
     /// Whether somebody said what is up, or it does not matter.
     stands: bool,
-    folder: Folder,
+    output: Output,
+    patience: Arc<Patience>,
     /// What to mention once nothing is refused any more.
     notes: Vec<String>,
     stats: Lines,
     trace: Lines,
     progress: Progress,
     began: Instant,
+    /// Whether it ends with a line that says where the pictures are.
+    tell: bool,
 }
 
 /// Runs the command.
@@ -193,12 +174,16 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     let crew = Crew::new(args.workers.unwrap_or(1), args.threads)?;
     let asked = args.look.asked(args.work.work()?)?;
     let frames = asked.path.frames() as u64;
-    let (folder, stays) = Folder::look(&args.output, frames, args.force)?;
     let inputs: Vec<&Path> =
         [&args.volume, &args.look.view.path].into_iter().flatten().map(PathBuf::as_path).collect();
+    let (output, stays) = Output::look(&args.output, "frame", frames, asked.background, &inputs)?;
+    if output.on_stdout() && args.stats.as_deref() == Some(Path::new("-")) {
+        return Err(Fail::usage("--stats: stdout has the frames; give a file"));
+    }
+    let patience = Arc::new(Patience::default());
     let run = Run {
-        stats: Lines::open(args.stats.as_deref(), "stats", &inputs)?,
-        trace: Lines::open(args.trace.as_deref(), "trace", &inputs)?,
+        stats: Lines::open(args.stats.as_deref(), "stats", &inputs, &patience)?,
+        trace: Lines::open(args.trace.as_deref(), "trace", &inputs, &patience)?,
         progress: Progress::new(args.quiet),
         began: Instant::now(),
         stands: args.quiet
@@ -206,15 +191,12 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
             || args.look.view.axes.up.is_some()
             || args.look.view.axes.front.is_some(),
         asked,
-        folder,
+        output,
+        patience,
         notes: stays.into_iter().collect(),
+        tell: true,
     };
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(2)
-        .thread_name("slabcast-io")
-        .enable_all()
-        .build()
-        .map_err(|e| Fail::failed(format!("starting threads failed: {e}")))?;
+    let runtime = runtime::start()?;
     let result = match (&args.volume, master) {
         (Some(file), _) => {
             let orientation = args.look.view.axes.orientation()?;
@@ -226,14 +208,34 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         (None, Some(master)) => runtime.block_on(cluster(run, master)),
         (None, None) => unreachable!("settled above"),
     };
-    // A thread that still encodes or resolves a name must not hold the command up.
-    runtime.shutdown_timeout(Duration::from_millis(200));
+    runtime::end(runtime);
+    result
+}
+
+/// Draws what a picture says of itself, by this process alone. Says nothing at the end.
+pub(crate) fn again(asked: Asked, output: Output, volume: Volume, quiet: bool) -> Result<(), Fail> {
+    let run = Run {
+        asked,
+        stands: true,
+        output,
+        patience: Arc::default(),
+        notes: Vec::new(),
+        stats: Lines::None,
+        trace: Lines::None,
+        progress: Progress::new(quiet),
+        began: Instant::now(),
+        tell: false,
+    };
+    let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
+    let runtime = runtime::start()?;
+    let result = runtime.block_on(embedded(run, volume, orientation, Crew::new(1, None)?));
+    runtime::end(runtime);
     result
 }
 
 async fn embedded(
     mut run: Run,
-    volume: slabcast_common::volume::Volume,
+    volume: Volume,
     orientation: Orientation,
     crew: Crew,
 ) -> Result<(), Fail> {
@@ -247,8 +249,8 @@ async fn embedded(
     let mut cluster = Cluster::start(volume, orientation, crew)?;
     let handle = cluster.handle();
     let info = handle.volume().info.clone();
-    run.ready(&info, orientation)?;
-    let request = run.asked.request(run.trace.wanted());
+    let recipe = run.ready(&info, orientation)?;
+    let request = run.request();
     let job = handle.submit(request).await.map_err(|e| match e {
         SubmitError::Refused(refused) => run.asked.blame(&refused),
         other => Fail::failed(format!("the master of this process takes no job: {other:?}")),
@@ -265,15 +267,13 @@ async fn embedded(
                 Some(WatchItem::Frame(f)) => {
                     taken += 1;
                     Ok(Update::Frame {
-                        facts: Facts::of(&f.stats),
                         frame: Frame {
                             number: f.number,
                             size: f.size,
                             format: f.format,
                             bytes: f.bytes.clone(),
-                            view_sha256: f.stats.view_sha256.clone(),
-                            pixels_sha256: f.stats.pixels_sha256.clone(),
                         },
+                        stats: Box::new(f.stats.clone()),
                         stats_json: f.stats_json.clone(),
                         trace_json: f.trace_json.clone().unwrap_or_default(),
                     })
@@ -305,7 +305,7 @@ async fn embedded(
     let source = Source { updates, cancel: Cancel::Embedded(handle, job) };
     let what = format!("{name} by {crew}");
     let result = tokio::select! {
-        result = run.go(source, &what, &info) => result,
+        result = run.go(source, &what, &info, &recipe) => result,
         trouble = cluster.trouble() => Err(trouble),
     };
     cluster.end().await;
@@ -316,37 +316,50 @@ async fn cluster(mut run: Run, master: String) -> Result<(), Fail> {
     run.progress.stage(&format!("dialling {master}"));
     let client = remote::connect(&master).await?;
     let served = remote::describe(&client).await?;
-    run.ready(&served.info, served.orientation)?;
-    let request = run.asked.request(run.trace.wanted());
+    let recipe = run.ready(&served.info, served.orientation)?;
+    let request = run.request();
     let source = tokio::select! {
         source = remote::submit(client, &run.asked, request) => source?,
         code = signals::stopped() => return Err(Fail::silent(code)),
     };
     let what = format!("{} on the cluster of {master}", served.name);
-    run.go(source, &what, &served.info).await
+    run.go(source, &what, &served.info, &recipe).await
 }
 
 impl Run {
+    fn request(&self) -> PathRequest {
+        let format = self.output.format.pixels(self.asked.background);
+        self.asked.request(format, self.trace.wanted())
+    }
+
     /// All that can be refused is; the folder is there.
-    fn ready(&mut self, info: &VolumeInfo, orientation: Orientation) -> Result<(), Fail> {
+    fn ready(&mut self, info: &VolumeInfo, orientation: Orientation) -> Result<Recipe, Fail> {
         // From here on there may be files to clean up.
         signals::listen();
         self.asked.fit(info, orientation)?;
-        self.folder.make()?;
+        let as_what = (self.output.format, self.output.fps());
+        let recipe = Recipe::new(&self.asked, info, orientation, as_what)?;
+        self.output.make()?;
         self.notes.extend(request::lattice_notice(info));
         self.notes.iter().for_each(|n| progress::note(n));
-        Ok(())
+        Ok(recipe)
     }
 
     /// Takes frames until the last one is on disk, Ctrl-C, or trouble.
-    async fn go(self, mut source: Source, what: &str, info: &VolumeInfo) -> Result<(), Fail> {
-        let Run { asked, folder, mut stats, trace, mut progress, began, .. } = self;
+    async fn go(
+        self,
+        mut source: Source,
+        what: &str,
+        info: &VolumeInfo,
+        recipe: &Recipe,
+    ) -> Result<(), Fail> {
+        let Run { asked, output, patience, mut stats, trace, mut progress, began, tell, .. } = self;
         let total = asked.path.frames() as u64;
         let [w, h] = asked.path.size;
         let s = if total == 1 { "" } else { "s" };
         progress.frames(total, &format!("rendering {total} frame{s} of {w}x{h} of {what}"));
-        let folder = Arc::new(folder);
-        let mut writer = Writer::new(folder.clone());
+        let output = Arc::new(output);
+        let mut writer = Writer::new(output.clone(), (total, asked.path.size), patience.clone())?;
         let mut trace = Trace::new(trace);
         let mut look = Look::default();
         let (mut first, mut last) = (None, Instant::now());
@@ -363,16 +376,21 @@ impl Run {
                             step = Step { frames: news.frames.max(step.frames), ..news };
                             progress.step(step.clone());
                         }
-                        Some(Ok(Update::Frame { frame, facts, stats_json, trace_json })) => {
+                        Some(Ok(Update::Frame { frame, stats: facts, stats_json, trace_json })) => {
                             last = Instant::now();
                             first.get_or_insert(last);
-                            look.at(&frame, facts, info, &asked);
+                            look.at(&frame, &facts, info, &asked);
                             stats.put(&format!("{stats_json}\n"))?;
                             trace.put(&trace_json)?;
                             step.frames = step.frames.max(frame.number + 1);
                             step = Step { frames: step.frames, ..Step::default() };
                             progress.step(step.clone());
-                            writer.put(frame);
+                            let made = match output.format {
+                                Format::Apng if frame.number == 0 => recipe.movie(&facts),
+                                Format::Apng | Format::Y4m => String::new(),
+                                Format::Png | Format::Png16 | Format::Exr => recipe.frame(&facts),
+                            };
+                            writer.put(frame, made);
                         }
                         Some(Ok(Update::Done)) => return Ok(()),
                         Some(Err(e)) => return Err(e),
@@ -383,24 +401,25 @@ impl Run {
         }
         .await;
         if ended.is_err() {
+            patience.give_up();
             source.cancel.now().await;
         }
-        // What is being encoded is whole in a moment: it is kept.
-        let drained = writer.drain().await;
+        // What is being encoded is whole in a moment: it is kept. Who reads a pipe may have
+        // stopped, though.
+        let patient = if ended.is_err() { LAST } else { Duration::MAX };
+        let drained = match tokio::time::timeout(patient, writer.end()).await {
+            Ok(drained) => drained,
+            Err(_) => Ok(()),
+        };
         let ended = ended.and(drained);
         progress.end();
-        let on_stdout = stats.on_stdout();
+        let on_stdout = stats.on_stdout() || output.on_stdout();
         let written = writer.written().to_vec();
         if !written.is_empty() {
             stats.keep()?;
             trace.keep()?;
         }
-        let kept = format!(
-            "{} of {total} frame{s} in {} ({})",
-            written.len(),
-            folder.shown(),
-            folder.list(&written)
-        );
+        let kept = format!("{} of {total} frame{s} in {}", written.len(), output.shown(&written));
         if let Err(fail) = ended {
             if fail.line().is_none() {
                 let kept = if written.is_empty() {
@@ -416,9 +435,8 @@ impl Run {
         }
         look.warn();
         let mut line = format!(
-            "{total} frame{s} in {} ({}), {}",
-            folder.shown(),
-            folder.list(&written),
+            "{total} frame{s} in {}, {}",
+            output.shown(&written),
             progress::time(began.elapsed())
         );
         if let Some(first) = first
@@ -430,7 +448,9 @@ impl Run {
                 progress::time(first - began)
             );
         }
-        if on_stdout {
+        if !tell {
+            // Whoever asked says it.
+        } else if on_stdout {
             progress::say_on_stderr(&line);
         } else {
             say(&format!("{line}\n"))?;
@@ -481,27 +501,27 @@ struct Look {
 }
 
 impl Look {
-    fn at(&mut self, frame: &Frame, facts: Facts, info: &VolumeInfo, asked: &Asked) {
-        if facts.incomplete {
+    fn at(&mut self, frame: &Frame, facts: &FrameStats, info: &VolumeInfo, asked: &Asked) {
+        if !facts.poisoned.is_empty() {
             self.incomplete.push(frame.number);
         }
         let pixel = frame.format.bytes();
         let all_same = frame.bytes.chunks_exact(pixel).all(|p| p == &frame.bytes[..pixel]);
         let (lo, hi) = info.summary.range();
         let tf = asked.transfer.name();
-        let why = if facts.relevant == 0 && lo == hi {
+        let why = if facts.voxels.relevant == 0 && lo == hi {
             format!("every value of the volume is {lo}, and `--tf {tf}` leaves that invisible")
-        } else if facts.relevant == 0 {
+        } else if facts.voxels.relevant == 0 {
             format!(
                 "no voxel is visible under `--tf {tf}` (values go from {lo} to {hi}); try another \
                  --tf, `slabcast info` shows what each would draw"
             )
         } else if !all_same {
             return;
-        } else if facts.splatted == 0 {
+        } else if facts.voxels.splatted == 0 {
             "the volume lies outside the view, or between its pixels; check eye, target and height, or ask for a larger --size".into()
         } else if asked.background == slabcast_common::image::Background::Transparent
-            || frame.bytes.iter().take(3).all(|&b| b == 0)
+            || frame.bytes[..pixel.div_ceil(4) * 3].iter().all(|&b| b == 0)
         {
             format!("what is in view is too faint to see; raise the opacities of `--tf {tf}`")
         } else {

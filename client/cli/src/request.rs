@@ -5,6 +5,7 @@
 //! which names the flag (or the file and its field) that is to blame.
 
 use crate::fail::Fail;
+use crate::output::provenance::Provenance;
 use crate::parse::{self, Tile};
 use clap::builder::{PossibleValuesParser, TypedValueParser, ValueParser};
 use slabcast_common::image::{Background, PixelFormat};
@@ -251,6 +252,8 @@ impl WorkArgs {
 pub(crate) struct Transfer {
     pub(crate) choice: TransferChoice,
     file: Option<PathBuf>,
+    /// The preset that a function came from, where only that is known.
+    preset: Option<String>,
 }
 
 impl Transfer {
@@ -258,7 +261,11 @@ impl Transfer {
     /// means the preset even beside a file of that name; `./bone` means the file.
     pub(crate) fn parse(text: &str) -> Result<Self, Fail> {
         if presets::NAMES.iter().any(|(name, _)| *name == text) {
-            return Ok(Transfer { choice: TransferChoice::Name(text.into()), file: None });
+            return Ok(Transfer {
+                choice: TransferChoice::Name(text.into()),
+                file: None,
+                preset: None,
+            });
         }
         let path = Path::new(text);
         // A pipe (`<(...)` of a shell) is a file, too.
@@ -272,7 +279,16 @@ impl Transfer {
         Ok(Transfer {
             choice: TransferChoice::Function(Box::new(tf)),
             file: Some(path.to_path_buf()),
+            preset: None,
         })
+    }
+
+    /// The preset that it is or came from.
+    pub(crate) fn preset(&self) -> Option<&str> {
+        match &self.choice {
+            TransferChoice::Name(name) => Some(name),
+            TransferChoice::Function(_) => self.preset.as_deref(),
+        }
     }
 
     /// What it is called in messages.
@@ -368,6 +384,22 @@ impl Asked {
         })
     }
 
+    /// What made a picture, to make it again.
+    pub(crate) fn again(p: &Provenance) -> Self {
+        Asked {
+            path: p.path.clone(),
+            path_file: None,
+            transfer: Transfer {
+                choice: TransferChoice::Function(Box::new(p.transfer.clone())),
+                file: None,
+                preset: p.preset.clone(),
+            },
+            quality: p.quality,
+            work: Work::default(),
+            background: p.background(),
+        }
+    }
+
     /// Whether all of it can be drawn of this volume.
     pub(crate) fn fit(&self, info: &VolumeInfo, orientation: Orientation) -> Result<(), Fail> {
         self.transfer.function(info).map_err(|e| self.blame(&e))?;
@@ -440,17 +472,14 @@ impl Asked {
     }
 
     /// The request, under a name that no other has.
-    pub(crate) fn request(&self, want_trace: bool) -> PathRequest {
+    pub(crate) fn request(&self, format: PixelFormat, want_trace: bool) -> PathRequest {
         PathRequest {
             client_key: client_key(),
             path: self.path.clone(),
             transfer: self.transfer.choice.clone(),
             quality: self.quality,
             work: self.work,
-            format: match self.background {
-                Background::Transparent => PixelFormat::Rgba8,
-                Background::Colour(_) => PixelFormat::Rgb8,
-            },
+            format,
             background: self.background,
             want_trace,
         }
@@ -542,8 +571,9 @@ mod tests {
         let a = asked("").unwrap();
         assert_eq!(a.path, ViewPath::turn([512, 512], Turntable::default()));
         assert_eq!((a.quality, a.work), (Quality::default(), Work::default()));
-        assert_eq!(a.request(false).transfer, TransferChoice::Name("auto".into()));
-        assert_eq!(a.request(false).format, PixelFormat::Rgb8);
+        let request = a.request(PixelFormat::Rgb8, false);
+        assert_eq!(request.transfer, TransferChoice::Name("auto".into()));
+        assert_eq!(request.background, Background::Colour([0.0; 3]));
     }
 
     #[test]
@@ -561,7 +591,7 @@ mod tests {
         assert_eq!((t.up, t.front), ("-y".parse().ok(), "-x".parse().ok()));
         assert_eq!((a.quality.eps, a.quality.cull), (1.0 / 256.0, false));
         assert_eq!((a.work.slabs, a.work.tile), (5, Some(64)));
-        assert_eq!(a.request(false).format, PixelFormat::Rgba8);
+        assert_eq!(a.background, Background::Transparent);
     }
 
     #[test]

@@ -34,11 +34,7 @@ pub(crate) fn run(args: &GoldenArgs) -> Result<(), Fail> {
     let want = args.verify.as_deref().map(read).transpose()?;
     let began = Instant::now();
     let cases = cases::of_golden(&args.sample)?;
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(2)
-        .enable_all()
-        .build()
-        .map_err(|e| Fail::failed(format!("starting threads failed: {e}")))?;
+    let runtime = crate::runtime::start()?;
     let mut progress = Progress::new(false);
     let total = (cases.len() * VIEWS.len()) as u64;
     progress.frames(total, &format!("{total} golden frames"));

@@ -110,11 +110,7 @@ pub(crate) fn run(args: &MatrixArgs) -> Result<(), Fail> {
     let cases = cases::of_matrix(file, args.size)?;
     let settings = Setting::all(args.pairwise);
     let began = Instant::now();
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(2)
-        .enable_all()
-        .build()
-        .map_err(|e| Fail::failed(format!("starting threads failed: {e}")))?;
+    let runtime = crate::runtime::start()?;
     let mut progress = Progress::new(false).of("setting");
     let total = (cases.len() * settings.len()) as u64;
     progress.frames(

@@ -173,11 +173,7 @@ pub(crate) fn run(args: &TableArgs) -> Result<(), Fail> {
             n => format!("{n} cases fit, all of them long; add --long"),
         }));
     }
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(2)
-        .enable_all()
-        .build()
-        .map_err(|e| Fail::failed(format!("starting threads failed: {e}")))?;
+    let runtime = crate::runtime::start()?;
     let threads = args.threads.count();
     let tools = Tools { threads, runtime };
     let began = Instant::now();

@@ -5,36 +5,21 @@
 //! A sample is shown as what it is: each cell as one block, in the colour of its one pixel.
 
 use super::Found;
+use crate::canvas::{self, Canvas, LINE, WHITE, viridis};
 use crate::fail::Fail;
 use crate::output::write_atomic;
-use slabcast_common::image::{Background, Picture, PixelFormat};
+use slabcast_common::image::{Background, Picture};
 use slabcast_common::occlusion::Rect;
 use slabcast_render::reference::cells;
-use std::io::Write;
 use std::path::Path;
 
 /// Ends of the scale in 1/255. Three decades: at 0.01 a pixel is as good as exact in any 8-bit
 /// picture, and only one in a thousand of the worst view measured was above 10.
 const SCALE: [f64; 2] = [0.01, 10.0];
-/// Viridis at tenths (matplotlib, CC0): ascends evenly in lightness, also for the colour-blind.
-const VIRIDIS: [[u8; 3]; 11] = [
-    [68, 1, 84],
-    [72, 36, 117],
-    [65, 68, 135],
-    [53, 95, 141],
-    [42, 120, 142],
-    [33, 145, 140],
-    [34, 168, 132],
-    [68, 191, 112],
-    [122, 209, 81],
-    [189, 223, 38],
-    [253, 231, 37],
-];
 /// Neither picture nor limit shows anything there. No grey is on the scale.
 const BLANK: [u8; 3] = [96; 3];
 /// Beyond the scale, or not finite.
-const OVER: [u8; 3] = [255; 3];
-const PAPER: [u8; 3] = [24; 3];
+const OVER: [u8; 3] = WHITE;
 /// Between the two pictures and around the scale.
 const GAP: usize = 8;
 const BAR: usize = 10;
@@ -78,66 +63,15 @@ fn colour(error: Option<f64>) -> [u8; 3] {
     if e.is_nan() || e > hi {
         return OVER;
     }
-    let at = libm::log(e.max(lo) / lo) / libm::log(hi / lo) * 10.0;
-    let i = (at as usize).min(9);
-    let t = at - i as f64;
-    std::array::from_fn(|c| {
-        let (a, b) = (f64::from(VIRIDIS[i][c]), f64::from(VIRIDIS[i + 1][c]));
-        (a + (b - a) * t).round() as u8
-    })
-}
-
-struct Canvas {
-    size: [usize; 2],
-    bytes: Vec<u8>,
-}
-
-impl Canvas {
-    fn new(size: [usize; 2]) -> Canvas {
-        Canvas { size, bytes: PAPER.repeat(size[0] * size[1]) }
-    }
-
-    fn fill(&mut self, [x, y]: [usize; 2], [w, h]: [usize; 2], colour: [u8; 3]) {
-        for y in y..(y + h).min(self.size[1]) {
-            for x in x..(x + w).min(self.size[0]) {
-                let i = (y * self.size[0] + x) * 3;
-                self.bytes[i..i + 3].copy_from_slice(&colour);
-            }
-        }
-    }
-
-    /// Digits and points, 3 x 5 dots each. Gives the width.
-    fn number(&mut self, [mut x, y]: [usize; 2], text: &str) {
-        for glyph in text.chars() {
-            // Rows from the top, three bits each.
-            let rows: [u8; 5] = match glyph {
-                '0' => [7, 5, 5, 5, 7],
-                '1' => [2, 6, 2, 2, 7],
-                _ => [0, 0, 0, 0, 2],
-            };
-            for (r, row) in rows.iter().enumerate() {
-                for c in (0..3).filter(|c| row >> (2 - c) & 1 == 1) {
-                    self.fill([x + c * DOT, y + r * DOT], [DOT; 2], [255; 3]);
-                }
-            }
-            x += 4 * DOT;
-        }
-    }
+    viridis(libm::log(e.max(lo) / lo) / libm::log(hi / lo))
 }
 
 /// The picture left, its error right, the scale below.
 fn draw(picture: &Picture, background: Background, blocks: &[(Rect, [u8; 3])]) -> Canvas {
     let [w, h] = picture.size.map(|n| n as usize);
     let width = 2 * w + GAP;
-    let mut canvas = Canvas::new([width, h + GAP + BAR + GAP / 2 + 5 * DOT + GAP / 2]);
-    let behind = match background {
-        Background::Transparent => Background::Colour([0.0; 3]),
-        colour => colour,
-    };
-    let bytes = picture.encode(PixelFormat::Rgb8, behind);
-    for (y, row) in bytes.chunks_exact(w * 3).enumerate() {
-        canvas.bytes[y * width * 3..][..w * 3].copy_from_slice(row);
-    }
+    let mut canvas = Canvas::new([width, h + GAP + BAR + GAP / 2 + LINE * DOT]);
+    canvas.picture([0, 0], picture, background);
     for (r, colour) in blocks {
         canvas.fill([w + GAP + r.x0 as usize, r.y0 as usize], [r.width(), r.height()], *colour);
     }
@@ -150,11 +84,11 @@ fn draw(picture: &Picture, background: Background, blocks: &[(Rect, [u8; 3])]) -
     }
     if width >= NUMBERED {
         for (i, text) in ["0.01", "0.1", "1", "10"].into_iter().enumerate() {
-            let long = text.len() * 4 * DOT - DOT;
+            let long = canvas::width(text, DOT);
             let x = (width - 1) * i / 3;
-            canvas.fill([x, bar], [1, BAR + GAP / 2], [255; 3]);
+            canvas.fill([x, bar], [1, BAR + GAP / 2], WHITE);
             let x = x.saturating_sub(long / 2).min(width - long);
-            canvas.number([x, bar + BAR + GAP / 2], text);
+            canvas.text([x, bar + BAR + GAP / 2], DOT, text, WHITE);
         }
     }
     canvas
@@ -166,29 +100,13 @@ pub(super) fn write(path: &Path, found: &Found) -> Result<(), Fail> {
     let blocks: Vec<_> =
         cells.into_iter().zip(errors(found)).map(|(cell, e)| (cell, colour(e))).collect();
     let canvas = draw(&found.picture, found.still.background, &blocks);
-    write_atomic(path, |out| encode(&canvas, found, out))
-}
-
-fn encode(canvas: &Canvas, found: &Found, out: &mut impl Write) -> std::io::Result<()> {
-    let [w, h] = canvas.size.map(|n| n as u32);
-    let mut png = png::Encoder::new(out, w, h);
-    png.set_color(png::ColorType::Rgb);
-    png.set_depth(png::BitDepth::Eight);
-    png.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
-    png.set_compression(png::Compression::Balanced);
     let figures = found.whole[0].figures;
-    for (key, text) in [
-        ("Software", concat!("slabcast ", env!("CARGO_PKG_VERSION")).to_string()),
+    let about = [
         ("slabcast error scale", scale()),
         ("slabcast error figures", format!("RMSE {} max {} of 1/255", figures.rmse, figures.max)),
         ("slabcast pixels_sha256", found.picture.sha256().to_string()),
-    ] {
-        png.add_text_chunk(key.into(), text)?;
-    }
-    let mut png = png.write_header()?;
-    png.write_image_data(&canvas.bytes)?;
-    png.finish()?;
-    Ok(())
+    ];
+    write_atomic(path, |out| canvas.png(out, &about))
 }
 
 fn scale() -> String {
@@ -209,6 +127,7 @@ pub(super) fn caption(path: &Path, found: &Found) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::canvas::{PAPER, VIRIDIS};
 
     #[test]
     fn the_scale_ascends_in_lightness_and_has_no_grey() {

@@ -1,0 +1,127 @@
+//! Text that grows line by line beside the frames: `--stats` and `--trace`.
+
+use super::file::{Growing, Patience, beside};
+use crate::fail::Fail;
+use std::fs::File;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Bytes that are gathered before they are written: some hundred frames' statistics.
+const GATHER: usize = 1 << 20;
+
+/// A file of lines that gets its name at the end.
+pub(crate) struct Kept {
+    path: PathBuf,
+    file: Option<Growing>,
+    gathered: Vec<u8>,
+    patience: Arc<Patience>,
+}
+
+impl Kept {
+    fn write(&mut self) -> Result<(), Fail> {
+        let mut add = || {
+            let file = match &mut self.file {
+                Some(file) => file,
+                none => none.insert(Growing::new(&self.path)?),
+            };
+            file.add(&self.gathered, &self.patience)
+        };
+        add().map_err(|e: std::io::Error| Fail::io(&self.path, "writing", &e))?;
+        self.gathered.clear();
+        Ok(())
+    }
+}
+
+/// Text that is written line by line and gets its name only when the run ends: `--stats`,
+/// `--trace`. A pipe, a device or stdout (`-`) gets it at once.
+pub(crate) enum Lines {
+    None,
+    Stdout {
+        open: bool,
+    },
+    Stream(PathBuf, File),
+    /// Made with the first line, so that a run that fails before has nothing to clean up.
+    Kept(Kept),
+}
+
+impl Lines {
+    /// Opens what the flag says; refuses places where no file can be made, and `inputs`.
+    pub(crate) fn open(
+        path: Option<&Path>,
+        flag: &str,
+        inputs: &[&Path],
+        patience: &Arc<Patience>,
+    ) -> Result<Self, Fail> {
+        let Some(path) = path else { return Ok(Lines::None) };
+        if path == Path::new("-") {
+            return Ok(Lines::Stdout { open: true });
+        }
+        super::not_an_input(path, flag, inputs)?;
+        match std::fs::metadata(path) {
+            Ok(meta) if meta.is_dir() => {
+                Err(Fail::failed(format!("{}: is a folder; give a file", path.display())))
+            }
+            Ok(meta) if !meta.is_file() => {
+                let file = File::options()
+                    .write(true)
+                    .open(path)
+                    .map_err(|e| Fail::io(path, "opening", &e))?;
+                Ok(Lines::Stream(path.into(), file))
+            }
+            _ => {
+                beside(path).map_err(|e| Fail::io(path, "making the file", &e))?;
+                let (path, patience) = (path.to_path_buf(), patience.clone());
+                Ok(Lines::Kept(Kept { path, file: None, gathered: Vec::new(), patience }))
+            }
+        }
+    }
+
+    /// Adds text as it is.
+    pub(crate) fn put(&mut self, text: &str) -> Result<(), Fail> {
+        match self {
+            Lines::None | Lines::Stdout { open: false } => Ok(()),
+            Lines::Stdout { open } => match crate::fail::say(text) {
+                // Whoever read the lines has seen enough; the frames go on.
+                Err(e) if e.line().is_none() => {
+                    *open = false;
+                    Ok(())
+                }
+                other => other,
+            },
+            Lines::Stream(path, file) => match file.write_all(text.as_bytes()) {
+                Err(e) if e.kind() == std::io::ErrorKind::BrokenPipe => {
+                    *self = Lines::None;
+                    Ok(())
+                }
+                other => other.map_err(|e| Fail::io(path, "writing", &e)),
+            },
+            Lines::Kept(kept) => {
+                kept.gathered.extend_from_slice(text.as_bytes());
+                if kept.gathered.len() >= GATHER { kept.write() } else { Ok(()) }
+            }
+        }
+    }
+
+    /// Whether lines go to stdout.
+    pub(crate) fn on_stdout(&self) -> bool {
+        matches!(self, Lines::Stdout { .. })
+    }
+
+    /// Whether lines are wanted.
+    pub(crate) fn wanted(&self) -> bool {
+        !matches!(self, Lines::None)
+    }
+
+    /// Puts the file under its name.
+    pub(crate) fn keep(self) -> Result<(), Fail> {
+        match self {
+            Lines::Kept(mut kept) => {
+                kept.write()?;
+                let Kept { path, file: Some(file), .. } = kept else { return Ok(()) };
+                file.settle().map_err(|e| Fail::io(&path, "writing", &e))
+            }
+            _ => Ok(()),
+        }
+    }
+}

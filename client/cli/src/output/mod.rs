@@ -1,0 +1,564 @@
+//! What a run leaves: pictures in a folder, one picture, a moving one, or video in a pipe.
+//!
+//! [`Output`] is where and as what, checked before any work; [`Writer`] takes the frames as they
+//! come and encodes them on threads of its own beside rendering. [`mod@file`] keeps the promise that
+//! a file is whole or not there.
+
+mod contact;
+pub(crate) mod exr;
+mod file;
+mod folder;
+mod lines;
+pub(crate) mod png;
+pub(crate) mod provenance;
+mod y4m;
+
+pub(crate) use file::{Patience, write_atomic};
+pub(crate) use lines::Lines;
+
+use crate::fail::Fail;
+use crate::parse;
+use contact::Contact;
+use file::Growing;
+use folder::Folder;
+use serde::{Deserialize, Serialize};
+use slabcast_common::image::{Background, PixelFormat};
+use std::io::{ErrorKind, Write};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+use tokio::task::JoinSet;
+
+/// Who made a file, for programs that show that.
+pub(crate) const SOFTWARE: &str = concat!("slabcast ", env!("CARGO_PKG_VERSION"));
+
+/// A finished frame on its way to disk.
+#[derive(Clone, Debug)]
+pub(crate) struct Frame {
+    pub(crate) number: u64,
+    pub(crate) size: [u32; 2],
+    pub(crate) format: PixelFormat,
+    pub(crate) bytes: bytes::Bytes,
+}
+
+/// What frames become.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Format {
+    /// 8-bit PNG
+    Png,
+    /// 16-bit PNG
+    Png16,
+    /// OpenEXR: linear premultiplied floats, no background
+    Exr,
+    /// One moving PNG of all frames
+    Apng,
+    /// One uncompressed video of all frames (YUV4MPEG2), for ffmpeg and others
+    Y4m,
+}
+
+impl Format {
+    /// What the master sends.
+    pub(crate) fn pixels(self, background: Background) -> PixelFormat {
+        match (self, background) {
+            (Format::Png16, _) => PixelFormat::Rgba16,
+            (Format::Exr, _) => PixelFormat::Rgba32F,
+            (Format::Y4m, _) | (_, Background::Colour(_)) => PixelFormat::Rgb8,
+            (_, Background::Transparent) => PixelFormat::Rgba8,
+        }
+    }
+
+    fn extension(self) -> &'static str {
+        match self {
+            Format::Png | Format::Png16 => "png",
+            Format::Exr => "exr",
+            Format::Apng => "apng",
+            Format::Y4m => "y4m",
+        }
+    }
+
+    fn moves(self) -> bool {
+        matches!(self, Format::Apng | Format::Y4m)
+    }
+
+    fn name(self) -> &'static str {
+        if self == Format::Png16 { "png16" } else { self.extension() }
+    }
+}
+
+/// `-o` and what belongs to it.
+#[derive(clap::Args, Clone, Debug)]
+#[command(next_help_heading = "Output")]
+pub(crate) struct OutputArgs {
+    /// A folder for frame_0000.png and so on, made if missing; or one file: NAME.png or NAME.exr
+    /// of one frame, NAME.apng or NAME.y4m of all; - writes Y4M video to stdout
+    #[arg(short, long, value_name = "DIR|FILE|-", default_value = "slabcast-out/")]
+    pub(crate) output: PathBuf,
+    /// What frames become [default: by the name of the file, png in a folder]
+    #[arg(
+        long,
+        value_name = "FORMAT",
+        hide_possible_values = true,
+        value_enum,
+        long_help = "What frames become: png (8 bits), png16 (16 bits), exr (linear \
+                       premultiplied floats without background), apng or y4m (one moving picture) \
+                       [default: by the name of the file, png in a folder]"
+    )]
+    pub(crate) format: Option<Format>,
+    /// Frames a second of a moving picture
+    #[arg(long, value_name = "N", default_value = "12",
+          value_parser = clap::value_parser!(u16).range(1..=240))]
+    pub(crate) fps: u16,
+    /// Also all frames, small, on one PNG
+    #[arg(long, value_name = "FILE.png", value_parser = parse::png)]
+    pub(crate) contact_sheet: Option<PathBuf>,
+    /// Replace files that are there already
+    #[arg(long)]
+    pub(crate) force: bool,
+}
+
+/// Where frames go.
+#[derive(Debug)]
+enum Target {
+    /// A file each.
+    Folder(Folder),
+    /// One frame in one file.
+    Still(PathBuf),
+    /// All frames in one file.
+    Movie(PathBuf),
+    /// All frames into a pipe; `None` is stdout.
+    Pipe(Option<PathBuf>),
+}
+
+/// Where frames go and as what.
+#[derive(Debug)]
+pub(crate) struct Output {
+    target: Target,
+    pub(crate) format: Format,
+    fps: u16,
+    contact: Option<PathBuf>,
+}
+
+/// Refuses a file to write that is one of those to read.
+fn not_an_input(path: &Path, flag: &str, inputs: &[&Path]) -> Result<(), Fail> {
+    let same = |input: &&Path| matches!((path.canonicalize(), input.canonicalize()), (Ok(a), Ok(b)) if a == b);
+    if inputs.iter().any(same) {
+        return Err(Fail::usage(format!(
+            "--{flag}: {} is an input of this run; give another file",
+            path.display()
+        )));
+    }
+    Ok(())
+}
+
+/// Refuses a file that is there, unless `force`, and places where none can be made.
+fn may_write(path: &Path, flag: &str, inputs: &[&Path], force: bool) -> Result<(), Fail> {
+    not_an_input(path, flag, inputs)?;
+    match std::fs::metadata(path) {
+        Ok(meta) if meta.is_dir() => {
+            Err(Fail::failed(format!("{}: is a folder; give a file", path.display())))
+        }
+        Ok(_) if !force => Err(Fail::failed(format!(
+            "{}: is there already; add --force to replace it, or give another file",
+            path.display()
+        ))),
+        _ => file::beside(path).map(drop).map_err(|e| Fail::io(path, "making the file", &e)),
+    }
+}
+
+/// Whether a name is that of a pipe or a device.
+fn is_pipe(path: &Path) -> bool {
+    std::fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir())
+}
+
+impl Output {
+    /// Looks at what is there, refuses what would be spoilt or cannot be, and writes nothing. Also
+    /// says which files of an earlier run will stay beside the new ones.
+    pub(crate) fn look(
+        args: &OutputArgs,
+        stem: &'static str,
+        frames: u64,
+        background: Background,
+        inputs: &[&Path],
+    ) -> Result<(Output, Option<String>), Fail> {
+        let path = &args.output;
+        let shown = path.display();
+        let ends = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
+        // A name with a slash at its end is a folder's, and so is that of a folder.
+        let folder = path.is_dir() || path.to_string_lossy().ends_with('/');
+        let named = match ends.as_deref() {
+            _ if folder => None,
+            Some("png") => Some(Format::Png),
+            Some("exr") => Some(Format::Exr),
+            Some("apng") => Some(Format::Apng),
+            Some("y4m") => Some(Format::Y4m),
+            _ => None,
+        };
+        let stdout = path == Path::new("-");
+        let pipe = stdout || is_pipe(path);
+        let format = args.format.or(named).unwrap_or(if pipe { Format::Y4m } else { Format::Png });
+        let name = format.name();
+        if pipe && format != Format::Y4m {
+            return Err(Fail::usage(format!(
+                "--format: {name} does not go into a pipe; leave it out for y4m, or give a file or \
+                 folder with -o"
+            )));
+        }
+        let fits = |ends: &str| match format {
+            // A moving PNG is a PNG.
+            Format::Png16 => ends == "png",
+            Format::Apng => ends == "png" || ends == "apng",
+            _ => ends == format.extension(),
+        };
+        if let (Some(_), Some(ends)) = (named, &ends)
+            && !fits(ends)
+        {
+            return Err(Fail::usage(format!(
+                "--format, -o: {shown} is no name for {name}; end it in .{}",
+                format.extension()
+            )));
+        }
+        match (format, background) {
+            (Format::Y4m, Background::Transparent) => {
+                return Err(Fail::usage(
+                    "--background: video has no transparency; give a colour, or --format apng",
+                ));
+            }
+            (Format::Exr, Background::Colour(c)) if c != [0.0; 3] => {
+                return Err(Fail::usage(
+                    "--background: an EXR holds the picture before any background; leave it out",
+                ));
+            }
+            _ => {}
+        }
+        if let Some(contact) = &args.contact_sheet {
+            may_write(contact, "contact-sheet", inputs, args.force)?;
+        }
+        let mut stays = None;
+        let target = if stdout {
+            Target::Pipe(None)
+        } else if pipe {
+            Target::Pipe(Some(path.clone()))
+        } else if format.moves() {
+            if named.is_none() {
+                return Err(Fail::usage(format!(
+                    "-o: {name} is one file of all frames; give its name, like -o turn.{name}"
+                )));
+            }
+            may_write(path, "output", inputs, args.force)?;
+            Target::Movie(path.clone())
+        } else if named.is_some() {
+            if frames > 1 {
+                return Err(Fail::usage(format!(
+                    "-o: {shown} is one picture, and the path has {frames} views; give a folder, \
+                     --azimuth for one view, or turn.apng or turn.y4m for a moving picture"
+                )));
+            }
+            may_write(path, "output", inputs, args.force)?;
+            Target::Still(path.clone())
+        } else {
+            let names = (stem, format.extension());
+            let (folder, beside) = Folder::look(path, names, frames, args.force)?;
+            stays = beside;
+            Target::Folder(folder)
+        };
+        let contact = args.contact_sheet.clone();
+        Ok((Output { target, format, fps: args.fps, contact }, stays))
+    }
+
+    /// Frames a second, where there is such a thing.
+    pub(crate) fn fps(&self) -> Option<u16> {
+        self.format.moves().then_some(self.fps)
+    }
+
+    /// Makes what must be there before the first frame.
+    pub(crate) fn make(&mut self) -> Result<(), Fail> {
+        match &mut self.target {
+            Target::Folder(folder) => folder.make(),
+            _ => Ok(()),
+        }
+    }
+
+    /// Whether frames go to stdout, where nothing else may be written then.
+    pub(crate) fn on_stdout(&self) -> bool {
+        matches!(self.target, Target::Pipe(None))
+    }
+
+    /// `slabcast-out/ (frame_0000.png ... frame_0017.png)`, `turn.y4m`, `stdout`.
+    pub(crate) fn shown(&self, written: &[u64]) -> String {
+        match &self.target {
+            Target::Folder(folder) => format!("{} ({})", folder.shown(), folder.list(written)),
+            Target::Still(path) | Target::Movie(path) | Target::Pipe(Some(path)) => {
+                path.display().to_string()
+            }
+            Target::Pipe(None) => "stdout".into(),
+        }
+    }
+}
+
+/// A moving picture in the making.
+struct Movie {
+    coder: Coder,
+    sink: Sink,
+    frames: u64,
+}
+
+enum Coder {
+    Apng(png::Moving),
+    Y4m { fps: u16 },
+}
+
+enum Sink {
+    /// Not begun: the file is made with the first frame, so that a run that fails before has
+    /// nothing to clean up.
+    New(PathBuf),
+    File(Growing),
+    Pipe(Box<dyn Write + Send>, String),
+}
+
+impl Movie {
+    fn add(&mut self, frame: &Frame, provenance: &str, patience: &Patience) -> std::io::Result<()> {
+        let piece = match &mut self.coder {
+            Coder::Apng(moving) => moving.frame(frame, provenance)?,
+            Coder::Y4m { fps } => {
+                let mut piece = Vec::new();
+                if self.frames == 0 {
+                    piece = y4m::head(frame.size, *fps);
+                }
+                piece.extend(y4m::frame(frame)?);
+                piece
+            }
+        };
+        if let Sink::New(path) = &self.sink {
+            self.sink = Sink::File(Growing::new(path)?);
+        }
+        match &mut self.sink {
+            Sink::New(_) => unreachable!("begun above"),
+            Sink::File(file) => file.add(&piece, patience)?,
+            Sink::Pipe(pipe, _) => {
+                pipe.write_all(&piece)?;
+                pipe.flush()?;
+            }
+        }
+        self.frames += 1;
+        Ok(())
+    }
+
+    /// Ends it with as many frames as there are; none leave nothing.
+    fn end(self, patience: &Patience) -> std::io::Result<()> {
+        let Sink::File(mut file) = self.sink else { return Ok(()) };
+        if let Coder::Apng(moving) = &self.coder {
+            let (tail, (at, patch)) = moving.end();
+            file.add(&tail, patience)?;
+            file.patch(at, &patch)?;
+        }
+        file.settle()
+    }
+
+    fn path(&self) -> String {
+        match &self.sink {
+            Sink::New(path) => path.display().to_string(),
+            Sink::File(file) => file.path().display().to_string(),
+            Sink::Pipe(_, name) => name.clone(),
+        }
+    }
+
+    fn fail(name: &str, e: &std::io::Error) -> Fail {
+        if e.kind() == ErrorKind::BrokenPipe {
+            return Fail::failed(format!("{name}: whoever read the frames has gone away"));
+        }
+        Fail::io(Path::new(name), "writing", e)
+    }
+}
+
+/// Frames on their way out, encoded on blocking threads of the runtime.
+pub(crate) struct Writer {
+    output: Arc<Output>,
+    movie: Option<Arc<Mutex<Movie>>>,
+    contact: Option<Arc<Mutex<Contact>>>,
+    patience: Arc<Patience>,
+    busy: JoinSet<Result<u64, Fail>>,
+    written: Vec<u64>,
+}
+
+/// Frames that are encoded at once or wait for it. Encoding takes a hundredth of rendering; what
+/// takes time is the sync to disk, during which a second one encodes. Each holds a frame's
+/// pixels (200 MB at 8192x8192), so not many more.
+const AT_ONCE: usize = 2;
+
+impl Writer {
+    /// For `frames` frames of this size. Opens pipes.
+    pub(crate) fn new(
+        output: Arc<Output>,
+        (frames, size): (u64, [u32; 2]),
+        patience: Arc<Patience>,
+    ) -> Result<Self, Fail> {
+        let coder = || match output.format {
+            Format::Apng => Coder::Apng(png::Moving::new(output.fps)),
+            _ => Coder::Y4m { fps: output.fps },
+        };
+        let sink = match &output.target {
+            Target::Folder(_) | Target::Still(_) => None,
+            Target::Movie(path) => Some(Sink::New(path.clone())),
+            Target::Pipe(None) => Some(Sink::Pipe(Box::new(std::io::stdout()), "stdout".into())),
+            Target::Pipe(Some(path)) => {
+                let pipe = std::fs::File::options().write(true).open(path);
+                let pipe = pipe.map_err(|e| Fail::io(path, "opening", &e))?;
+                Some(Sink::Pipe(Box::new(pipe), path.display().to_string()))
+            }
+        };
+        let movie =
+            sink.map(|sink| Arc::new(Mutex::new(Movie { coder: coder(), sink, frames: 0 })));
+        let contact =
+            output.contact.as_ref().map(|_| Arc::new(Mutex::new(Contact::new(frames, size))));
+        Ok(Writer { output, movie, contact, patience, busy: JoinSet::new(), written: Vec::new() })
+    }
+
+    /// Whether another frame may come.
+    pub(crate) fn has_room(&self) -> bool {
+        // Frames of a moving picture follow each other.
+        self.busy.len() < if self.movie.is_some() { 1 } else { AT_ONCE }
+    }
+
+    /// Whether a frame is on its way.
+    pub(crate) fn is_busy(&self) -> bool {
+        !self.busy.is_empty()
+    }
+
+    /// Takes a frame, the next one in order. Call [`Writer::has_room`] first.
+    pub(crate) fn put(&mut self, frame: Frame, provenance: String) {
+        let (output, movie) = (self.output.clone(), self.movie.clone());
+        let (contact, patience) = (self.contact.clone(), self.patience.clone());
+        self.busy.spawn_blocking(move || {
+            if let Some(contact) = contact {
+                contact.lock().expect("no thread panics with it").add(&frame);
+            }
+            let to = |path: &Path| {
+                patience.write_atomic(path, |out| match output.format {
+                    Format::Exr => exr::encode(&frame, &provenance, out),
+                    _ => png::encode(&frame, &provenance, out),
+                })
+            };
+            match (&output.target, movie) {
+                (Target::Folder(folder), _) => to(&folder.file(frame.number))?,
+                (Target::Still(path), _) => to(path)?,
+                (_, Some(movie)) => {
+                    let mut movie = movie.lock().expect("no thread panics with it");
+                    let added = movie.add(&frame, &provenance, &patience);
+                    added.map_err(|e| Movie::fail(&movie.path(), &e))?;
+                }
+                (_, None) => unreachable!("made with the writer"),
+            }
+            Ok(frame.number)
+        });
+    }
+
+    /// Waits for the next frame to be on disk. Pending for ever where none is on its way.
+    pub(crate) async fn next_written(&mut self) -> Result<u64, Fail> {
+        match self.busy.join_next().await {
+            None => std::future::pending().await,
+            Some(Ok(done)) => {
+                let number = done?;
+                self.written.push(number);
+                Ok(number)
+            }
+            Some(Err(e)) => Err(Fail::failed(format!("writing a frame failed: {e}"))),
+        }
+    }
+
+    /// Waits for all that are on their way; the first failure counts, the others go on. Then ends
+    /// what is in one file, with as many frames as there are, and the contact sheet.
+    pub(crate) async fn end(&mut self) -> Result<(), Fail> {
+        let mut first = Ok(());
+        while self.is_busy() {
+            if let Err(e) = self.next_written().await
+                && first.is_ok()
+            {
+                first = Err(e);
+            }
+        }
+        if self.written.is_empty() {
+            return first;
+        }
+        let (movie, contact) = (self.movie.take(), self.contact.take());
+        let (output, patience) = (self.output.clone(), self.patience.clone());
+        let ended = tokio::task::spawn_blocking(move || {
+            if let Some(movie) = movie.and_then(Arc::into_inner) {
+                let movie = movie.into_inner().expect("no thread panics with it");
+                let name = movie.path();
+                movie.end(&patience).map_err(|e| Movie::fail(&name, &e))?;
+            }
+            if let (Some(contact), Some(path)) = (contact, &output.contact) {
+                let sheet = contact.lock().expect("no thread panics with it").draw();
+                patience.write_atomic(path, |out| sheet.png(out, &[]))?;
+            }
+            Ok(())
+        });
+        let ended = ended.await;
+        first.and(ended.unwrap_or_else(|e| Err(Fail::failed(format!("writing failed: {e}")))))
+    }
+
+    /// Frames on disk, ascending.
+    pub(crate) fn written(&mut self) -> &[u64] {
+        self.written.sort_unstable();
+        &self.written
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A frame of two pixels side by side.
+    pub(super) fn frame(number: u64, format: PixelFormat, bytes: &[u8]) -> Frame {
+        Frame { number, size: [2, 1], format, bytes: bytes.to_vec().into() }
+    }
+
+    fn look(output: &str, format: Option<Format>, frames: u64) -> Result<Output, String> {
+        let args = OutputArgs {
+            output: output.into(),
+            format,
+            fps: 12,
+            contact_sheet: None,
+            force: false,
+        };
+        Output::look(&args, "frame", frames, Background::Colour([0.0; 3]), &[])
+            .map(|(output, _)| output)
+            .map_err(|e| e.line().unwrap_or_default().to_string())
+    }
+
+    #[test]
+    fn names_say_what_frames_become() {
+        for (name, format, frames, want, shown) in [
+            ("nowhere-at-all/", None, 3, Format::Png, "nowhere-at-all/ (frame_0000.png)"),
+            (
+                "nowhere-at-all",
+                Some(Format::Exr),
+                3,
+                Format::Exr,
+                "nowhere-at-all/ (frame_0000.exr)",
+            ),
+            ("a.PNG", None, 1, Format::Png, "a.PNG"),
+            ("a.png", Some(Format::Png16), 1, Format::Png16, "a.png"),
+            ("a.png", Some(Format::Apng), 9, Format::Apng, "a.png"),
+            ("a.exr", None, 1, Format::Exr, "a.exr"),
+            ("a.y4m", None, 9, Format::Y4m, "a.y4m"),
+            ("-", None, 9, Format::Y4m, "stdout"),
+        ] {
+            let output = look(name, format, frames).unwrap_or_else(|e| panic!("{name}: {e}"));
+            assert_eq!((output.format, &*output.shown(&[0])), (want, shown), "{name}");
+        }
+        for (name, format, frames, says) in [
+            ("a.png", None, 2, "--azimuth"),
+            ("a.png", Some(Format::Exr), 1, ".exr"),
+            ("a.exr", Some(Format::Y4m), 1, ".y4m"),
+            ("out", Some(Format::Y4m), 1, "-o turn.y4m"),
+            ("-", Some(Format::Png), 1, "--format"),
+            ("/dev/null", Some(Format::Apng), 1, "--format"),
+            ("nowhere-at-all/a.png", None, 1, "nowhere-at-all/a.png"),
+        ] {
+            let said =
+                look(name, format, frames).err().unwrap_or_else(|| panic!("{name} is taken"));
+            assert!(said.contains(says), "{name}: {said}");
+        }
+    }
+}

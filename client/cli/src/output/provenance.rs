@@ -1,0 +1,207 @@
+//! What made a picture, as JSON inside it: all that `slabcast rerender` needs beside the volume.
+//!
+//! Nothing in it says who, where or when: a picture of a patient that is passed on tells the
+//! volume's digest and no name, and the same picture made elsewhere has the same bytes.
+
+use super::{Format, exr, png};
+use crate::fail::Fail;
+use crate::request::Asked;
+use serde::{Deserialize, Serialize};
+use slabcast_common::PIXELS_VERSION;
+use slabcast_common::image::Background;
+use slabcast_common::message::PathRequest;
+use slabcast_common::path::{Orientation, ViewPath};
+use slabcast_common::quality::{Quality, Sums};
+use slabcast_common::stats::FrameStats;
+use slabcast_common::transfer::TransferFunction;
+use slabcast_common::volume::VolumeInfo;
+use std::path::Path;
+
+/// Largest picture that is read: one of 8192x8192 in floats that do not compress.
+const MAX_BYTES: u64 = 2 << 30;
+
+/// All that decides a picture's bytes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Provenance {
+    /// Format version, 1.
+    version: u32,
+    /// The program's version.
+    pub(crate) slabcast: String,
+    pub(crate) pixels_version: u32,
+    /// The volume's digest.
+    pub(crate) volume_sha256: String,
+    /// The view; the whole path of a moving picture.
+    pub(crate) path: ViewPath,
+    /// The preset that the transfer function came from.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) preset: Option<String>,
+    pub(crate) transfer: TransferFunction,
+    /// Sums decided.
+    pub(crate) quality: Quality,
+    background: Ground,
+    pub(crate) format: Format,
+    /// Frames a second of a moving picture.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) fps: Option<u16>,
+    /// Hash of the view and all else that decides the pixels, and of the pixels.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    view_sha256: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) pixels_sha256: Option<String>,
+}
+
+/// `"transparent"`, or sRGB numbers from 0 to 1.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+enum Ground {
+    Word(String),
+    Colour([f64; 3]),
+}
+
+impl Provenance {
+    pub(crate) fn background(&self) -> Background {
+        match self.background {
+            Ground::Word(_) => Background::Transparent,
+            Ground::Colour(c) => Background::Colour(c),
+        }
+    }
+
+    /// What made the picture in a file.
+    pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Provenance, Fail> {
+        let file = path.display();
+        let text = if bytes.starts_with(b"\x89PNG") {
+            png::provenance(bytes)
+        } else if bytes.starts_with(b"\x76\x2f\x31\x01") {
+            exr::provenance(bytes)
+        } else {
+            return Err(Fail::failed(format!("{file}: is neither a PNG nor an EXR")));
+        };
+        let text = text
+            .map_err(|e| Fail::failed(format!("{file}: {e}; the file is damaged")))?
+            .ok_or_else(|| {
+                Fail::failed(format!(
+                    "{file}: does not say what made it; only pictures as slabcast wrote them do \
+                     (many programs drop that when they save)"
+                ))
+            })?;
+        let p: Provenance = serde_json::from_str(&text)
+            .map_err(|e| Fail::failed(format!("{file}: what made it is not understood: {e}")))?;
+        if p.version != 1 {
+            return Err(Fail::failed(format!(
+                "{file}: says what made it in version {}; this slabcast knows version 1: take the \
+                 one that made it, {}",
+                p.version, p.slabcast
+            )));
+        }
+        if p.pixels_version != PIXELS_VERSION {
+            return Err(Fail::failed(format!(
+                "{file}: has pixels of version {}, this slabcast draws those of {PIXELS_VERSION}; \
+                 take the one that made it, slabcast {}",
+                p.pixels_version, p.slabcast
+            )));
+        }
+        let refused = |e| Fail::field(path, "what made it", &e);
+        p.path.check().map_err(refused)?;
+        p.transfer.check().map_err(refused)?;
+        p.quality.check().map_err(refused)?;
+        Ok(p)
+    }
+}
+
+/// The bytes of a picture's file, if it is no larger than pictures are.
+pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Fail> {
+    let fail = |e: std::io::Error| Fail::io(path, "reading", &e);
+    let meta = std::fs::metadata(path).map_err(fail)?;
+    if meta.is_dir() {
+        return Err(Fail::failed(format!("{}: is a folder; give a picture", path.display())));
+    }
+    if meta.len() > MAX_BYTES {
+        return Err(Fail::failed(format!(
+            "{}: has {} bytes, more than any picture of ours",
+            path.display(),
+            meta.len()
+        )));
+    }
+    std::fs::read(path).map_err(fail)
+}
+
+/// Says of each frame of a run what made it.
+pub(crate) struct Recipe {
+    base: Provenance,
+}
+
+impl Recipe {
+    /// For a run on the volume that `info` describes.
+    pub(crate) fn new(
+        asked: &Asked,
+        info: &VolumeInfo,
+        orientation: Orientation,
+        (format, fps): (Format, Option<u16>),
+    ) -> Result<Recipe, Fail> {
+        // A field that is new must be thought about here: does it decide pixels?
+        let PathRequest {
+            client_key: _,
+            path,
+            transfer: _,
+            quality,
+            work: _,
+            format: _,
+            background,
+            want_trace: _,
+        } = asked.request(format.pixels(asked.background), false);
+        let mut path = path;
+        if let Some(t) = &mut path.turntable {
+            // Another machine may have been told of other axes.
+            let front =
+                (t.up.is_none() || t.up == Some(orientation.up)).then_some(orientation.front);
+            t.front = t.front.or(front);
+            t.up = t.up.or(Some(orientation.up));
+        }
+        Ok(Recipe {
+            base: Provenance {
+                version: 1,
+                slabcast: env!("CARGO_PKG_VERSION").into(),
+                pixels_version: PIXELS_VERSION,
+                volume_sha256: info.digest.to_string(),
+                path,
+                preset: asked.transfer.preset().map(String::from),
+                transfer: asked.transfer.function(info).map_err(|e| asked.blame(&e))?,
+                // Culling never changes a byte.
+                quality: Quality { cull: true, ..quality },
+                background: match background {
+                    Background::Transparent => Ground::Word("transparent".into()),
+                    Background::Colour(c) => Ground::Colour(c),
+                },
+                format,
+                fps,
+                view_sha256: None,
+                pixels_sha256: None,
+            },
+        })
+    }
+
+    /// What made the frame of these statistics, alone.
+    pub(crate) fn frame(&self, stats: &FrameStats) -> String {
+        let mut p = self.whole(stats.quality.sums);
+        p.path = p.path.only(stats.frame as usize);
+        p.view_sha256 = Some(stats.view_sha256.clone());
+        p.pixels_sha256 = Some(stats.pixels_sha256.clone());
+        written(&p)
+    }
+
+    /// What makes all frames, with sums as the master decided them.
+    pub(crate) fn movie(&self, stats: &FrameStats) -> String {
+        written(&self.whole(stats.quality.sums))
+    }
+
+    fn whole(&self, sums: Sums) -> Provenance {
+        let mut p = self.base.clone();
+        p.quality.sums = sums;
+        p
+    }
+}
+
+fn written(p: &Provenance) -> String {
+    serde_json::to_string(p).expect("numbers and strings can be written")
+}

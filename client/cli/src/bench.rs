@@ -67,7 +67,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
     let views = asked.path.frames();
     let mut progress = Progress::new(false).of("frame");
     progress.frames(views as u64, &format!("{views} views"));
-    let (mut ms, mut counters, mut middle) = (Vec::new(), Counters::default(), None);
+    let (mut each, mut counters, mut middle) = (Vec::new(), Counters::default(), None);
     for i in 0..views {
         let view = asked
             .path
@@ -78,8 +78,8 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
         let frame = Frame::new(scene.clone(), view);
         let (picture, counted) = local::counted_picture(&frame, &bricks, cut);
         let took = began.elapsed().as_secs_f64() * 1e3;
+        each.push(took);
         if i > 0 || views == 1 {
-            ms.push(took);
             counters += counted;
         }
         if i == views / 2 {
@@ -88,6 +88,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
         progress.step(progress::Step { frames: i as u64 + 1, ..Default::default() });
     }
     progress.end();
+    let mut ms = each[usize::from(views > 1)..].to_vec();
     ms.sort_by(f64::total_cmp);
     let n = ms.len() as u64;
     let (median, least, most) = (ms[ms.len() / 2], ms[0], ms[ms.len() - 1]);
@@ -113,6 +114,9 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
             "version": env!("CARGO_PKG_VERSION"),
             "pixels_version": slabcast_common::PIXELS_VERSION,
             "median_ms": median, "min_ms": least, "max_ms": most, "views": n,
+            // In the order of the path, the warming-up first: whoever runs this several times can
+            // tell a slow view from a machine that was disturbed.
+            "each_ms": each,
             "threads": threads, "tile": args.tile, "simd": simd, "size": asked.path.size,
             "quality": spec.quality, "relevant": relevant,
             "tossed": counters.tossed / n, "splatted": counters.splatted / n,

@@ -59,7 +59,12 @@ def there(result, names):
 
 
 def error(figures):
-    return f"{figures['rmse']:.2f} ({figures['max']:.1f})" if figures else "-"
+    if not figures:
+        return "-"
+    text = f"{figures['rmse']:.2f} ({figures['max']:.1f})"
+    if figures.get("shift", [0, 0]) != [0, 0]:
+        text += f"; {figures['rmse_shifted']:.2f} moved by {figures['shift'][0]}, {figures['shift'][1]}"
+    return text
 
 
 def main_table(rows, results):
@@ -205,7 +210,8 @@ def report(groups, results):
     """All tables, as Markdown. `groups`: the rows by what they are for."""
     kept, some = list(results.values()), next(iter(results.values()))
     dates, loads = sorted(r["date"] for r in kept), sorted(x for r in kept for x in r["load"])
-    out = [f"{measure.machine()}; {some['rounds']} rounds, {some['frames']} frames a run; slabcast "
+    runs = sorted({f"{r['rounds']} rounds of {r['frames']} frames" for r in kept})
+    out = [f"{measure.machine()}; {', '.join(runs)}; slabcast "
            f"{some['version']}, binary {some['binary'][:12]}; {dates[0]} to {dates[-1]}; load "
            f"{loads[0]:.1f} to {loads[-1]:.1f}; {sum(r['stolen_s'] for r in kept):.0f} s stolen by "
            f"other machines in {sum(r['timed_s'] for r in kept):.0f} s of timing.", ""]

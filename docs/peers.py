@@ -143,7 +143,7 @@ def run_row(bench, row, stamp):
         try:
             result["pictures"] = bench.pictures(row, row.contenders, got)
         except peers_run.Missing as e:
-            result["pictures"] = {"own": {}, "beside": {}, "missing": {"all pictures": str(e)}}
+            result["pictures"] = {"own": {}, "beside": {}, "missing": {"every renderer": str(e)}}
     result["took_s"] = time.monotonic() - began
     return result
 

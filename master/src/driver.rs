@@ -322,7 +322,7 @@ impl Handle {
 }
 
 /// Wall time, for people: nothing is decided by it.
-fn unix_ms() -> i64 {
+pub(crate) fn unix_ms() -> i64 {
     let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
     since.map_or(0, |d| d.as_millis() as i64)
 }

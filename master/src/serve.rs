@@ -580,6 +580,7 @@ impl v1::render_server::Render for RenderService {
             orientation: v.orientation,
             pixels_version: slabcast_common::PIXELS_VERSION,
             protocol_version: slabcast_common::PROTOCOL_VERSION,
+            now_unix_ms: crate::driver::unix_ms(),
         })))
     }
 

@@ -103,6 +103,8 @@ pub struct VolumeDescription {
     pub pixels_version: u32,
     /// `PROTOCOL_VERSION` of the master.
     pub protocol_version: u32,
+    /// The master's clock, milliseconds since 1970; 0 where it does not say.
+    pub now_unix_ms: i64,
 }
 
 /// A worker as the master knows it.

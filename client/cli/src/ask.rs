@@ -32,6 +32,10 @@ pub(crate) struct StatusArgs {
 
 /// Lists the jobs that a master remembers, newest first.
 #[derive(clap::Args, Clone, Debug)]
+#[command(after_help = "\
+Examples:
+  slabcast jobs
+  slabcast jobs --master node1:7433 --limit 100 --json")]
 pub(crate) struct JobsArgs {
     #[command(flatten)]
     master: MasterArg,
@@ -46,6 +50,10 @@ pub(crate) struct JobsArgs {
 
 /// Cancels a job.
 #[derive(clap::Args, Clone, Debug)]
+#[command(after_help = "\
+Examples:
+  slabcast cancel job-7
+  slabcast cancel job-7 --master node1:7433")]
 pub(crate) struct CancelArgs {
     /// The job, as `slabcast jobs` names it (job-7)
     job: String,

@@ -1,8 +1,8 @@
 //! `slabcast master` and `slabcast worker`: processes that somebody else looks after.
 //!
 //! Both say READY to systemd, answer its watchdog, stop gracefully on SIGTERM or Ctrl-C within
-//! ten seconds and end with 0. Every flag has an environment variable, so that a unit file
-//! needs none.
+//! ten seconds and end with 0. Every flag has a variable of the environment ([`crate::config`]),
+//! so that a unit file needs none.
 
 use crate::embedded::{cores, start_master};
 use crate::fail::{Fail, reason, say};
@@ -36,32 +36,19 @@ Examples:
 #[command(after_help = MASTER_EXAMPLES)]
 pub(crate) struct MasterArgs {
     /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
-    #[arg(long, value_name = "FILE", env = "SLABCAST_VOLUME", hide_env_values = true)]
+    #[arg(long, value_name = "FILE")]
     volume: PathBuf,
     /// World axis that is up: x, y or z with + or - [default: +z]
-    #[arg(
-        long,
-        value_name = "AXIS",
-        allow_hyphen_values = true,
-        env = "SLABCAST_UP",
-        hide_env_values = true
-    )]
+    #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
     up: Option<Axis>,
     /// World axis that faces the eye at azimuth 0 [default: +y, or +z where up lies along y]
-    #[arg(
-        long,
-        value_name = "AXIS",
-        allow_hyphen_values = true,
-        env = "SLABCAST_FRONT",
-        hide_env_values = true
-    )]
+    #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
     front: Option<Axis>,
     /// Where workers and clients call; port 0 takes any free one and says which
-    #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:7433",
-          env = "SLABCAST_LISTEN", hide_env_values = true, value_parser = parse::listen)]
+    #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:7433", value_parser = parse::listen)]
     listen: String,
     /// Listen beyond this machine although nothing is encrypted and nobody is asked who they are
-    #[arg(long, env = "SLABCAST_INSECURE", hide_env_values = true,
+    #[arg(long,
           value_parser = clap::builder::FalseyValueParser::new())]
     insecure: bool,
 }
@@ -79,17 +66,17 @@ until the master is back.";
 #[command(after_help = WORKER_EXAMPLES)]
 pub(crate) struct WorkerArgs {
     /// The master
-    #[arg(long, value_name = "HOST:PORT", env = "SLABCAST_MASTER", hide_env_values = true, value_parser = parse::master)]
+    #[arg(long, value_name = "HOST:PORT", value_parser = parse::master)]
     master: String,
     /// A name for people [default: host and process number]
-    #[arg(long, value_name = "NAME", env = "SLABCAST_NAME", hide_env_values = true, value_parser = parse::worker_name)]
+    #[arg(long, value_name = "NAME", value_parser = parse::worker_name)]
     name: Option<String>,
     /// Render threads [default: all cores]
-    #[arg(long, value_name = "N", env = "SLABCAST_THREADS", hide_env_values = true,
+    #[arg(long, value_name = "N",
           value_parser = clap::value_parser!(u32).range(1..=1024))]
     threads: Option<u32>,
     /// Memory for bricks; the process takes some 30 MiB beside them
-    #[arg(long, value_name = "BYTES", default_value = "512MiB", env = "SLABCAST_MEMORY", hide_env_values = true,
+    #[arg(long, value_name = "BYTES", default_value = "512MiB",
           value_parser = parse::memory)]
     memory: u64,
 }

@@ -61,6 +61,11 @@ impl Fail {
         Fail::failed(format!("{}: {doing} failed: {}{remedy}", path.display(), reason(e)))
     }
 
+    /// The same with more said.
+    pub(crate) fn add(self, more: &str) -> Self {
+        Fail { line: self.line.map(|l| l + more), ..self }
+    }
+
     /// The line, for tests and for lines about it.
     pub(crate) fn line(&self) -> Option<&str> {
         self.line.as_deref()

@@ -4,8 +4,10 @@
 //!   ([`remote`]); [`request`] turns flags into a request, [`output`] frames into files,
 //!   [`progress`] shows what goes on meanwhile; [`rerender`] makes a picture again from what it
 //!   says of itself.
-//! - [`daemon`] is `master` and `worker`.
+//! - [`daemon`] is `master` and `worker`; [`doctor`] says whether a machine is fit for them, and
+//!   [`demo`] needs no file.
 //! - [`info`] looks into files, [`ask`] at a running master.
+//! - [`config`] lays flags, environment and file over each other.
 //! - [`check`] compares pictures with the oracle over every way to make them; [`error`] says how
 //!   far one is from the truth, [`explain`] why a pixel is as it is. [`local`] draws for the
 //!   first two, [`still`] reads one view for the last two.
@@ -17,7 +19,10 @@ mod ask;
 mod bench;
 mod canvas;
 mod check;
+mod config;
 mod daemon;
+mod demo;
+mod doctor;
 mod embedded;
 mod error;
 mod explain;
@@ -40,7 +45,7 @@ mod style;
 mod volume;
 
 use clap::error::ErrorKind;
-use clap::{CommandFactory, Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use fail::Fail;
 use std::process::ExitCode;
 
@@ -54,6 +59,7 @@ use std::process::ExitCode;
     subcommand_value_name = "COMMAND",
     after_help = "\
 Examples:
+  slabcast demo                                  pictures without any file
   slabcast render brain.nii.gz                   18 pictures of a turn, in slabcast-out/
   slabcast info brain.nii.gz                     what is in the file
   slabcast master --volume brain.nii.gz          a cluster: a master,
@@ -67,10 +73,14 @@ struct Cli {
     command: Command,
     #[command(flatten)]
     log: logging::LogArgs,
+    /// TOML file with values for render, master and worker; see `slabcast config --help`
+    #[arg(long, global = true, value_name = "FILE", help_heading = "Values")]
+    config: Option<std::path::PathBuf>,
 }
 
 #[derive(Subcommand, Debug)]
 enum Command {
+    Demo(demo::DemoArgs),
     Render(Box<render::RenderArgs>),
     Rerender(rerender::RerenderArgs),
     Info(info::InfoArgs),
@@ -83,6 +93,8 @@ enum Command {
     Explain(Box<explain::ExplainArgs>),
     Bench(Box<bench::BenchArgs>),
     Check(check::CheckArgs),
+    Config(config::ConfigArgs),
+    Doctor(doctor::DoctorArgs),
     /// Prints completions for a shell.
     #[command(after_help = "\
 Examples:
@@ -105,13 +117,17 @@ Examples:
 
 fn main() -> ExitCode {
     std::panic::set_hook(Box::new(on_panic));
-    let cli = match Cli::try_parse() {
+    let line: Vec<std::ffi::OsString> = std::env::args_os().collect();
+    let cli = config::parse(Cli::command(), &line)
+        .and_then(|matches| Ok(Cli::from_arg_matches(&matches)?));
+    let cli = match cli {
         Ok(cli) => cli,
-        Err(e) => return ExitCode::from(not_understood(&e)),
+        Err(config::Trouble::Clap(e)) => return ExitCode::from(not_understood(&e)),
+        Err(config::Trouble::Layer(fail)) => return ExitCode::from(fail.end()),
     };
     match run(&cli) {
         Ok(()) => ExitCode::SUCCESS,
-        Err(fail) => ExitCode::from(fail.end()),
+        Err(fail) => ExitCode::from(config::blame(fail).end()),
     }
 }
 
@@ -119,6 +135,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
     let daemon = matches!(cli.command, Command::Master(_) | Command::Worker(_));
     logging::begin(&cli.log, if daemon { "info" } else { "warn" })?;
     match &cli.command {
+        Command::Demo(args) => demo::run(args),
         Command::Render(args) => render::run(args),
         Command::Rerender(args) => rerender::run(args),
         Command::Info(args) => info::run(args),
@@ -131,6 +148,10 @@ fn run(cli: &Cli) -> Result<(), Fail> {
         Command::Explain(args) => explain::run(args),
         Command::Bench(args) => bench::run(args),
         Command::Check(args) => check::run(args),
+        Command::Doctor(args) => {
+            doctor::run(args, config::path(cli.config.as_deref(), Cli::command()))
+        }
+        Command::Config(args) => config::run::<Cli>(args, cli.config.as_deref(), understood),
         Command::Completions { shell } => {
             let mut script = Vec::new();
             clap_complete::generate(*shell, &mut Cli::command(), "slabcast", &mut script);
@@ -160,11 +181,14 @@ fn not_understood(e: &clap::Error) -> u8 {
             let _ = e.print();
             2
         }
-        _ => {
-            let typed: Vec<String> = std::env::args().skip(1).collect();
-            Fail::usage(one_sentence(&e.to_string(), &typed)).end()
-        }
+        _ => understood(e).end(),
     }
+}
+
+/// What clap did not understand, as one line.
+fn understood(e: &clap::Error) -> Fail {
+    let typed = std::env::args_os().skip(1).map(|a| a.to_string_lossy().into_owned());
+    Fail::usage(one_sentence(&e.to_string(), &typed.collect::<Vec<_>>()))
 }
 
 /// Clap's paragraphs as one line: what is wrong, its tips, and where to read on.
@@ -259,13 +283,47 @@ mod tests {
         assert!(!says("slabcast rendr x").contains('\n'));
     }
 
-    #[test]
-    fn every_help_ends_with_an_example() {
-        let cli = Cli::command();
-        for name in ["render", "info", "master", "worker", "status", "check", "error", "explain"] {
-            let sub = cli.find_subcommand(name).unwrap_or_else(|| panic!("{name} is there"));
-            let help = sub.clone().render_help().to_string();
-            assert!(help.contains("slabcast "), "{name}");
+    /// A command and all below it, each with the words that lead to it.
+    fn all(command: &clap::Command, words: &[String], into: &mut Vec<(Vec<String>, String)>) {
+        for sub in command.get_subcommands() {
+            let words = [words, &[sub.get_name().to_string()]].concat();
+            into.push((words.clone(), sub.clone().render_long_help().to_string()));
+            all(sub, &words, into);
         }
+    }
+
+    /// The words of an example: without variables before it, and without what is piped, redirected
+    /// or said behind it.
+    fn example(line: &str) -> Option<Vec<String>> {
+        let line = line.trim();
+        let line = line.split("  ").next()?.split(" | ").next()?.split(" > ").next()?;
+        let words = line.split(' ').skip_while(|w| w.starts_with("SLABCAST_") && w.contains('='));
+        let words: Vec<String> = words.map(String::from).collect();
+        (words.len() > 1 && words[0] == "slabcast").then_some(words)
+    }
+
+    #[test]
+    fn every_help_has_examples_that_are_understood() {
+        let (mut helps, mut count) = (Vec::new(), 0);
+        let mut cli = Cli::command().max_term_width(0).term_width(0);
+        cli.build();
+        all(&cli, &[], &mut helps);
+        assert!(helps.len() > 18, "{}", helps.len());
+        for (words, help) in helps {
+            let name = words.join(" ");
+            let (_, after) = help
+                .split_once("Examples:")
+                .unwrap_or_else(|| panic!("`slabcast {name} --help` has no section Examples"));
+            let examples: Vec<_> = after.lines().filter_map(example).collect();
+            let own = |e: &Vec<String>| words.iter().all(|w| e.contains(w));
+            assert!(examples.iter().any(own), "no example of `slabcast {name}` in its help");
+            for line in examples {
+                count += 1;
+                if let Err(e) = Cli::try_parse_from(&line) {
+                    panic!("in the help of `{name}`: `{}`: {e}", line.join(" "));
+                }
+            }
+        }
+        assert!(count > 50, "{count} examples");
     }
 }

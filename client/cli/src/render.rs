@@ -48,13 +48,13 @@ A path file looks like this:
   {\"version\":1,\"size\":[512,512],\"views\":[{\"eye\":[0,400,0],\"target\":[0,0,0],\"up\":[0,0,1],
    \"projection\":\"persp\",\"fov\":30}]}";
 
-/// Renders a view path of a volume to PNGs.
+/// Renders a view path of a volume to pictures.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct RenderArgs {
     /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
     volume: Option<PathBuf>,
-    /// Render on this master's cluster [env: SLABCAST_MASTER, where no VOLUME is given]
+    /// Render on this master's cluster
     #[arg(long, value_name = "HOST:PORT", value_parser = crate::parse::master)]
     master: Option<String>,
     #[command(flatten)]
@@ -148,18 +148,12 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         }
         (Some(_), None) => None,
         (None, Some(master)) => Some(master.clone()),
-        (None, None) => match std::env::var("SLABCAST_MASTER") {
-            Ok(text) => Some(
-                crate::parse::master(&text)
-                    .map_err(|e| Fail::usage(format!("SLABCAST_MASTER=`{text}`: {e}")))?,
-            ),
-            Err(_) => {
-                return Err(Fail::usage(
-                    "VOLUME: nothing to render; give a file (or formula:spheres), or --master \
-                     HOST:PORT; see `slabcast render --help`",
-                ));
-            }
-        },
+        (None, None) => {
+            return Err(Fail::usage(
+                "VOLUME: nothing to render; give a file (or formula:spheres), or --master \
+                 HOST:PORT; see `slabcast render --help`",
+            ));
+        }
     };
     if master.is_some() {
         for (given, flag) in [(args.workers, "workers"), (args.threads, "threads")] {

@@ -232,6 +232,17 @@ fn daemons_say_where_they_are_and_leave_when_told() {
     assert!(status.contains("helper") && status.contains("formula:spheres:24"), "{status}");
     let jobs = text(&run(dir.path(), &["jobs", "--master", &address]).stdout);
     assert!(jobs.contains("done") && jobs.contains("2/2"), "{jobs}");
+    // A cluster's pictures say what made them, too; and its master has the time.
+    let again = ["rerender", "slabcast-out/frame_0001.png", "formula:spheres:24", "-o", "a.png"];
+    assert!(program::good(dir.path(), &again).contains("a.png: the same "));
+    std::fs::remove_file(dir.path().join("a.png")).unwrap();
+    let said = program::good(dir.path(), &["doctor", "--master", &address, "--json"]);
+    let said: serde_json::Value = serde_json::from_str(&said).unwrap();
+    for name in ["master", "versions", "clock"] {
+        let checks = said["checks"].as_array().unwrap();
+        let check = checks.iter().find(|c| c["name"] == name).unwrap();
+        assert_eq!(check["state"], "ok", "{said}");
+    }
     // A flag that the master's volume makes wrong is named like one that is wrong in itself.
     let out = run(dir.path(), &["render", "--master", &address, "--elevation", "95", "-o", "x"]);
     assert!(text(&out.stderr).starts_with("error: --elevation:"), "{}", text(&out.stderr));

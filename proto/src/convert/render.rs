@@ -366,6 +366,7 @@ pub fn volume_to_wire(volume: &VolumeDescription) -> v1::VolumeDescription {
         front: volume.orientation.front.to_string(),
         pixels_version: volume.pixels_version,
         protocol_version: volume.protocol_version,
+        now_unix_ms: volume.now_unix_ms,
     }
 }
 
@@ -386,6 +387,7 @@ pub fn volume_from_wire(volume: v1::VolumeDescription) -> Result<VolumeDescripti
         orientation: Orientation::new(Some(up), Some(front))?,
         pixels_version: volume.pixels_version,
         protocol_version: volume.protocol_version,
+        now_unix_ms: volume.now_unix_ms,
     })
 }
 

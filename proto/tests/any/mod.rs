@@ -460,6 +460,7 @@ pub fn volume() -> impl Strategy<Value = model::VolumeDescription> {
                 orientation: Orientation { up, front },
                 pixels_version: p,
                 protocol_version: q,
+                now_unix_ms: i64::from(p) * 1_000_003,
             }
         },
     )

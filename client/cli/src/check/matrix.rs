@@ -25,6 +25,10 @@ const LINKS: [&str; 2] = ["embedded", "tcp"];
 /// Compares pixels over workers (1, 2, 3, 5), tiles (16 to 256, auto), slabs (1, 3, 5), threads
 /// (1, 2), culling (on, off) and links (embedded, TCP) with those of the serial renderer.
 #[derive(clap::Args, Clone, Debug)]
+#[command(after_help = "\
+Examples:
+  slabcast check matrix --pairwise
+  slabcast check matrix brain.nii.gz")]
 pub(crate) struct MatrixArgs {
     /// A volume to check beside formula volumes [default: samples/mni152_t1.nii.gz, if there]
     volume: Option<PathBuf>,

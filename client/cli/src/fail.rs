@@ -66,6 +66,11 @@ impl Fail {
         Fail { line: self.line.map(|l| l + more), ..self }
     }
 
+    /// The same, but a file is to blame and not the command line.
+    pub(crate) fn of_a_file(self) -> Self {
+        Fail { code: 1, ..self }
+    }
+
     /// The line, for tests and for lines about it.
     pub(crate) fn line(&self) -> Option<&str> {
         self.line.as_deref()

@@ -3,7 +3,7 @@
 //! - [`render`] makes pictures, by this process alone ([`embedded`]) or by a cluster
 //!   ([`remote`]); [`request`] turns flags into a request, [`output`] frames into files,
 //!   [`progress`] shows what goes on meanwhile; [`rerender`] makes a picture again from what it
-//!   says of itself.
+//!   says of itself, and [`show`] draws how it came about.
 //! - [`daemon`] is `master` and `worker`; [`doctor`] says whether a machine is fit for them, and
 //!   [`demo`] needs no file.
 //! - [`info`] looks into files, [`ask`] at a running master.
@@ -39,6 +39,7 @@ mod render;
 mod request;
 mod rerender;
 mod runtime;
+mod show;
 mod signals;
 mod still;
 mod style;

@@ -140,7 +140,7 @@ async fn follow(
                                 format: f.format,
                                 bytes: f.bytes.into(),
                             },
-                            stats: Box::new(f.stats),
+                            stats: Some(Box::new(f.stats)),
                             stats_json: f.stats_json,
                             trace_json: f.trace_json.unwrap_or_default(),
                         }

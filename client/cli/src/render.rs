@@ -8,6 +8,7 @@ use crate::output::provenance::Recipe;
 use crate::output::{Format, Frame, Lines, Output, OutputArgs, Patience, Writer};
 use crate::progress::{self, Progress, Step};
 use crate::request::{self, Asked, LookArgs, WorkArgs};
+use crate::show::{self, Show, Stage};
 use crate::{remote, runtime, signals, volume};
 use slabcast_common::ids::JobId;
 use slabcast_common::message::PathRequest;
@@ -39,6 +40,10 @@ Examples:
       slabcast render brain.nii.gz --azimuth 0 --size 2048x2048 --background white -o front/
   A full turn in perspective, bones only:
       slabcast render ct.nrrd --tf bone --frames 72 --projection persp -o turn/
+  Where each pixel was shut, how much work it was, how far off it may be:
+      slabcast render brain.nii.gz --azimuth 0 --show depth
+  Video, to be encoded by another program:
+      slabcast render brain.nii.gz --frames 72 -o - | ffmpeg -i - -pix_fmt yuv420p turn.mp4
   On a cluster (see `slabcast master --help`):
       slabcast render --master node1:7433 --tf vessels -o out/
 
@@ -71,6 +76,16 @@ pub(crate) struct RenderArgs {
     threads: Option<u32>,
     #[command(flatten)]
     output: OutputArgs,
+    /// Instead of the volume, how its pictures come about: depth (where pixels were shut), owner
+    /// (who drew which tile), work, sheets, error (an estimate); each with a legend
+    #[arg(
+        long,
+        value_name = "WHAT",
+        hide_possible_values = true,
+        value_enum,
+        help_heading = "Output"
+    )]
+    show: Option<Show>,
     /// Statistics, one line of JSON a frame; - writes them to stdout
     #[arg(long, value_name = "FILE|-", help_heading = "Output")]
     stats: Option<PathBuf>,
@@ -87,7 +102,13 @@ pub(crate) enum Update {
     /// Where it stands.
     Step(Step),
     /// A frame, its statistics, those as JSON, and its trace.
-    Frame { frame: Frame, stats: Box<FrameStats>, stats_json: String, trace_json: String },
+    Frame {
+        frame: Frame,
+        /// Where a master made the frame.
+        stats: Option<Box<FrameStats>>,
+        stats_json: String,
+        trace_json: String,
+    },
     /// It ended with all frames delivered.
     Done,
 }
@@ -101,6 +122,8 @@ pub(crate) struct Source {
 
 /// How a job is cancelled.
 pub(crate) enum Cancel {
+    /// Nobody waits for it.
+    None,
     Embedded(slabcast_master::Handle, JobId),
     Remote(remote::Cancel),
 }
@@ -110,6 +133,7 @@ impl Cancel {
     async fn now(self) {
         let cancelled = async {
             match self {
+                Cancel::None => {}
                 Cancel::Embedded(handle, job) => {
                     handle.cancel(job).await;
                 }
@@ -126,6 +150,7 @@ struct Run {
     /// Whether somebody said what is up, or it does not matter.
     stands: bool,
     output: Output,
+    show: Option<Show>,
     patience: Arc<Patience>,
     /// What to mention once nothing is refused any more.
     notes: Vec<String>,
@@ -168,11 +193,15 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     let crew = Crew::new(args.workers.unwrap_or(1), args.threads)?;
     let asked = args.look.asked(args.work.work()?)?;
     let frames = asked.path.frames() as u64;
+    let stem = args.show.map_or("frame", Show::stem);
     let inputs: Vec<&Path> =
         [&args.volume, &args.look.view.path].into_iter().flatten().map(PathBuf::as_path).collect();
-    let (output, stays) = Output::look(&args.output, "frame", frames, asked.background, &inputs)?;
+    let (output, stays) = Output::look(&args.output, stem, frames, asked.background, &inputs)?;
     if output.on_stdout() && args.stats.as_deref() == Some(Path::new("-")) {
         return Err(Fail::usage("--stats: stdout has the frames; give a file"));
+    }
+    if let Some(show) = args.show {
+        showable(show, args, output.format, &asked)?;
     }
     let patience = Arc::new(Patience::default());
     let run = Run {
@@ -186,6 +215,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
             || args.look.view.axes.front.is_some(),
         asked,
         output,
+        show: args.show,
         patience,
         notes: stays.into_iter().collect(),
         tell: true,
@@ -197,7 +227,12 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
             let mut run = run;
             run.progress.stage(&format!("reading {}", file.display()));
             let volume = volume::open(file)?;
-            runtime.block_on(embedded(run, volume, orientation, crew))
+            match args.show {
+                None | Some(Show::Owner) => {
+                    runtime.block_on(embedded(run, volume, orientation, crew))
+                }
+                Some(show) => runtime.block_on(drawn(run, volume, orientation, show, crew)),
+            }
         }
         (None, Some(master)) => runtime.block_on(cluster(run, master)),
         (None, None) => unreachable!("settled above"),
@@ -212,6 +247,7 @@ pub(crate) fn again(asked: Asked, output: Output, volume: Volume, quiet: bool) -
         asked,
         stands: true,
         output,
+        show: None,
         patience: Arc::default(),
         notes: Vec::new(),
         stats: Lines::None,
@@ -267,7 +303,7 @@ async fn embedded(
                             format: f.format,
                             bytes: f.bytes.clone(),
                         },
-                        stats: Box::new(f.stats.clone()),
+                        stats: Some(Box::new(f.stats.clone())),
                         stats_json: f.stats_json.clone(),
                         trace_json: f.trace_json.clone().unwrap_or_default(),
                     })
@@ -304,6 +340,66 @@ async fn embedded(
     };
     cluster.end().await;
     result
+}
+
+/// What can be shown how.
+fn showable(show: Show, args: &RenderArgs, format: Format, asked: &Asked) -> Result<(), Fail> {
+    if show == Show::Error {
+        show::can_estimate(&asked.quality)?;
+    }
+    if matches!(format, Format::Png16 | Format::Exr) {
+        return Err(Fail::usage("--format: what --show draws has 8 bits; give png, apng or y4m"));
+    }
+    if show == Show::Owner {
+        return Ok(());
+    }
+    for (given, flag) in [
+        (args.master.is_some(), "master"),
+        (args.stats.is_some(), "stats"),
+        (args.trace.is_some(), "trace"),
+    ] {
+        if given {
+            return Err(Fail::usage(format!(
+                "--{flag}: --show {} is drawn by this process alone, without a master; leave one \
+                 of the two out",
+                show.stem()
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// Pictures about pictures, drawn by this process without any master.
+async fn drawn(
+    mut run: Run,
+    volume: Volume,
+    orientation: Orientation,
+    show: Show,
+    crew: Crew,
+) -> Result<(), Fail> {
+    let info = volume.info(volume.digest());
+    let recipe = run.ready(&info, orientation)?;
+    let threads = (crew.workers * crew.threads) as usize;
+    let stage = Stage::new(&volume, &info, (&run.asked, orientation), threads)?;
+    let what = format!("{}, showing {}", volume.name, show.stem());
+    drop(volume);
+    let (to, updates) = mpsc::channel(1);
+    let frames = run.asked.path.frames();
+    tokio::task::spawn_blocking(move || {
+        for i in 0..frames {
+            let update = stage.draw(show, i).map(|frame| {
+                let (stats_json, trace_json) = (String::new(), String::new());
+                Update::Frame { frame, stats: None, stats_json, trace_json }
+            });
+            let failed = update.is_err();
+            // Nobody takes more after Ctrl-C.
+            if to.blocking_send(update).is_err() || failed {
+                return;
+            }
+        }
+        let _ = to.blocking_send(Ok(Update::Done));
+    });
+    run.go(Source { updates, cancel: Cancel::None }, &what, &info, &recipe).await
 }
 
 async fn cluster(mut run: Run, master: String) -> Result<(), Fail> {
@@ -347,13 +443,15 @@ impl Run {
         info: &VolumeInfo,
         recipe: &Recipe,
     ) -> Result<(), Fail> {
-        let Run { asked, output, patience, mut stats, trace, mut progress, began, tell, .. } = self;
+        let Run {
+            asked, output, show, patience, mut stats, trace, mut progress, began, tell, ..
+        } = self;
         let total = asked.path.frames() as u64;
         let [w, h] = asked.path.size;
         let s = if total == 1 { "" } else { "s" };
         progress.frames(total, &format!("rendering {total} frame{s} of {w}x{h} of {what}"));
         let output = Arc::new(output);
-        let mut writer = Writer::new(output.clone(), (total, asked.path.size), patience.clone())?;
+        let mut writer = Writer::new(output.clone(), total, patience.clone())?;
         let mut trace = Trace::new(trace);
         let mut look = Look::default();
         let (mut first, mut last) = (None, Instant::now());
@@ -373,12 +471,21 @@ impl Run {
                         Some(Ok(Update::Frame { frame, stats: facts, stats_json, trace_json })) => {
                             last = Instant::now();
                             first.get_or_insert(last);
+                            step.frames = step.frames.max(frame.number + 1);
+                            step = Step { frames: step.frames, ..Step::default() };
+                            let Some(facts) = facts else {
+                                progress.step(step.clone());
+                                writer.put(frame, String::new());
+                                continue;
+                            };
                             look.at(&frame, &facts, info, &asked);
                             stats.put(&format!("{stats_json}\n"))?;
                             trace.put(&trace_json)?;
-                            step.frames = step.frames.max(frame.number + 1);
-                            step = Step { frames: step.frames, ..Step::default() };
                             progress.step(step.clone());
+                            if show == Some(Show::Owner) {
+                                writer.put(show::owner(&frame, &facts), String::new());
+                                continue;
+                            }
                             let made = match output.format {
                                 Format::Apng if frame.number == 0 => recipe.movie(&facts),
                                 Format::Apng | Format::Y4m => String::new(),

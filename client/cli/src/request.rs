@@ -384,6 +384,19 @@ impl Asked {
         })
     }
 
+    /// A path under a preset, all else as it is by itself.
+    #[cfg(test)]
+    pub(crate) fn plain(path: ViewPath, tf: &str) -> Result<Self, Fail> {
+        Ok(Asked {
+            path,
+            path_file: None,
+            transfer: Transfer::parse(tf)?,
+            quality: Quality::default(),
+            work: Work::default(),
+            background: Background::Colour([0.0; 3]),
+        })
+    }
+
     /// What made a picture, to make it again.
     pub(crate) fn again(p: &Provenance) -> Self {
         Asked {

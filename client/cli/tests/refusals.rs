@@ -95,6 +95,8 @@ fn world() -> tempfile::TempDir {
     std::fs::create_dir(dir.path().join("full")).expect("a folder");
     put("full/frame_0000.png", b"mine");
     put("full/frame_0003.png", b"mine");
+    put("there.png", b"\x89PNG, but no more of it");
+    put("there.y4m", b"mine");
     dir
 }
 
@@ -115,10 +117,9 @@ fn refused(dir: &Path, args: &[&str], code: i32, names: &[&str]) {
     assert_eq!(tree(dir), before, "files are left by {what}");
 }
 
-#[test]
-fn bad_files_are_named_with_the_remedy() {
-    let dir = world();
-    for (args, names) in [
+/// Bad files: what is typed, and what the one line names. Each ends with code 1.
+fn files() -> Vec<(&'static [&'static str], &'static [&'static str])> {
+    vec![
         (&["render", "missing.nrrd"][..], &["missing.nrrd"][..]),
         (&["render", "."], &["."]),
         (&["render", "text.txt"], &["text.txt", "NRRD"]),
@@ -148,16 +149,21 @@ fn bad_files_are_named_with_the_remedy() {
         (&["check", "golden", "--verify", "text.txt"], &["text.txt", "line 1"]),
         (&["check", "golden", "--sample", "missing.nii.gz"], &["missing.nii.gz"]),
         (&["check", "matrix", "missing.nrrd"], &["missing.nrrd"]),
-    ] {
+    ]
+}
+
+#[test]
+fn bad_files_are_named_with_the_remedy() {
+    let dir = world();
+    for (args, names) in files() {
         refused(dir.path(), args, 1, names);
     }
 }
 
-#[test]
-fn bad_flags_are_named_with_the_remedy() {
-    let dir = world();
+/// Bad flags, likewise. Each ends with code 2.
+fn flags() -> Vec<(Vec<&'static str>, &'static [&'static str])> {
     let with = |more: &[&'static str]| [&["render", "good.nrrd"], more].concat();
-    for (args, names) in [
+    vec![
         (vec!["render"], &["VOLUME", "--master"][..]),
         (vec!["render", "good.nrrd", "--master", "127.0.0.1:1"], &["VOLUME", "--master"]),
         (vec!["render", "--master", "127.0.0.1:1", "--workers", "2"], &["--workers"]),
@@ -204,9 +210,136 @@ fn bad_flags_are_named_with_the_remedy() {
         (vec!["worker"], &["--master"]),
         (vec!["worker", "--master", "a:1", "--memory", "1"], &["--memory", "512MiB"]),
         (vec!["worker", "--master", "a:1", "--threads", "9999"], &["--threads", "1024"]),
-    ] {
+    ]
+}
+
+#[test]
+fn bad_flags_are_named_with_the_remedy() {
+    let dir = world();
+    for (args, names) in flags() {
         refused(dir.path(), &args, 2, names);
     }
+}
+
+/// Bad places and formats to write to: code, flags of `render`, and what the line names.
+const OUTPUTS: &[(i32, &[&str], &[&str])] = &[
+    (2, &["-o", "a.png"], &["a.png", "18 views", "--azimuth"]),
+    (2, &["-o", "a.exr", "--azimuth", "0", "--format", "png"], &["--format", ".png"]),
+    (2, &["-o", "a.png", "--azimuth", "0", "--format", "y4m"], &["--format", ".y4m"]),
+    (2, &["-o", "out", "--format", "y4m"], &["-o turn.y4m"]),
+    (2, &["-o", "out", "--format", "gif"], &["--format", "apng"]),
+    (2, &["-o", "-", "--format", "png"], &["--format", "pipe"]),
+    (2, &["-o", "-", "--stats", "-"], &["--stats", "stdout"]),
+    (2, &["-o", "a.y4m", "--background", "transparent"], &["--background", "colour"]),
+    (2, &["-o", "a.exr", "--azimuth", "0", "--background", "1,0,0"], &["--background", "EXR"]),
+    (2, &["-o", "good.nrrd", "--format", "y4m"], &["-o", "turn.y4m"]),
+    (2, &["--fps", "0"], &["--fps", "240"]),
+    (2, &["--contact-sheet", "all.txt"], &["--contact-sheet", ".png"]),
+    (1, &["--contact-sheet", "nowhere/all.png"], &["nowhere/all.png"]),
+    (1, &["-o", "nowhere/a.png", "--azimuth", "0"], &["nowhere/a.png"]),
+    (1, &["-o", "there.png", "--azimuth", "0"], &["there.png", "--force"]),
+    (1, &["-o", "there.y4m"], &["there.y4m", "--force"]),
+    (2, &["--show", "dept"], &["--show", "depth"]),
+    (2, &["--show", "depth", "--format", "exr"], &["--format", "--show"]),
+    (2, &["--show", "work", "--stats", "s.jsonl"], &["--stats", "--show"]),
+    (2, &["--show", "error", "--thickness", "0.016"], &["--thickness"]),
+];
+
+#[test]
+fn bad_outputs_are_named_with_the_remedy() {
+    let dir = world();
+    for (code, more, names) in OUTPUTS {
+        refused(dir.path(), &[&["render", "good.nrrd"], *more].concat(), *code, names);
+    }
+}
+
+/// Bad pictures to make again, and other commands: code, line, and what the answer names.
+const OTHERS: &[(i32, &[&str], &[&str])] = &[
+    (2, &["rerender"], &["PICTURE"]),
+    (2, &["rerender", "there.png"], &["VOLUME"]),
+    (1, &["rerender", "missing.png", "good.nrrd"], &["missing.png"]),
+    (1, &["rerender", "full", "good.nrrd"], &["full", "folder"]),
+    (1, &["rerender", "text.txt", "good.nrrd"], &["text.txt", "PNG"]),
+    (1, &["rerender", "there.png", "good.nrrd"], &["there.png", "damaged"]),
+    (2, &["config", "show", "check"], &["check", "render"]),
+    (2, &["config", "show", "render", "--sise", "3x3"], &["--sise", "--size"]),
+    (2, &["doctor", "--master", "nowhere"], &["--master", "HOST:PORT"]),
+    (1, &["demo", "-o", "text.txt"], &["text.txt", "-o"]),
+    (2, &["completions", "tcsh"], &["tcsh", "bash"]),
+    (1, &["man", "text.txt"], &["text.txt"]),
+];
+
+#[test]
+fn other_bad_lines_are_named_with_the_remedy() {
+    let dir = world();
+    for (code, line, names) in OTHERS {
+        refused(dir.path(), line, *code, names);
+    }
+}
+
+/// Bad files of values, and what the line names. Each ends with code 1.
+const VALUES: &[(&str, &[&str])] = &[
+    ("[render]\nthicknes = 1\n", &["[render] thicknes", "did you mean `thickness`"]),
+    ("[rendr]\nsize = \"9x9\"\n", &["rendr", "did you mean [render]"]),
+    ("[status]\n", &["status", "[worker]"]),
+    ("size = \"9x9\"\n", &["size", "[render]"]),
+    ("render = 3\n", &["render", "section"]),
+    ("[render]\nsize = [9, 9]\n", &["[render] size", "quotes"]),
+    ("[render]\nsize = 9\n", &["`size`", "512x512"]),
+    ("[render]\nthickness = -1\n", &["--thickness", "`thickness` in c.toml"]),
+    ("[render]\nkernel = \"box\"\n", &["`kernel`", "gaussian"]),
+    ("[render]\nforce = \"maybe\"\n", &["`force`", "true"]),
+    ("[render]\nframes = 3\nazimuth = 2\n", &["`frames`", "`azimuth`", "exclude"]),
+    ("[render]\nsize = \n", &["line 2"]),
+    ("[render]\ntf = \"a\"\ntf = \"b\"\n", &["line 3"]),
+];
+
+#[test]
+fn bad_values_of_a_file_are_named_with_section_and_key() {
+    let dir = world();
+    for (text, names) in VALUES {
+        std::fs::write(dir.path().join("c.toml"), text).expect("a file");
+        let line = ["render", "good.nrrd", "--config", "c.toml"];
+        refused(dir.path(), &line, 1, &[&["c.toml"], *names].concat());
+    }
+    refused(dir.path(), &["render", "good.nrrd", "--config", "missing.toml"], 1, &["missing.toml"]);
+    refused(dir.path(), &["worker", "--config", "full"], 1, &["full", "TOML"]);
+    std::fs::write(dir.path().join("c.toml"), "[master]\nvolume = \"missing.nrrd\"\n").unwrap();
+    let line = ["master", "--config", "c.toml", "--listen", "127.0.0.1:0"];
+    refused(dir.path(), &line, 1, &["missing.nrrd"]);
+}
+
+/// Bad variables of the environment. Each ends with code 2.
+const VARIABLES: &[(&str, &str, &[&str])] = &[
+    ("SLABCAST_SIZE", "9", &["SLABCAST_SIZE", "512x512"]),
+    ("SLABCAST_FRAMES", "many", &["SLABCAST_FRAMES", "many"]),
+    ("SLABCAST_KERNEL", "box", &["SLABCAST_KERNEL", "gaussian"]),
+    ("SLABCAST_FORCE", "maybe", &["SLABCAST_FORCE", "true"]),
+    ("SLABCAST_EPS", "0.9", &["--eps", "SLABCAST_EPS"]),
+    ("SLABCAST_LOG", "loud", &["--log-level", "SLABCAST_LOG"]),
+];
+
+#[test]
+fn bad_variables_are_named() {
+    let dir = world();
+    for (name, value, names) in VARIABLES {
+        let out = slabcast(dir.path(), &["render", "good.nrrd"]).env(name, value).output().unwrap();
+        let said = String::from_utf8_lossy(&out.stderr);
+        assert_eq!((out.status.code(), said.lines().count()), (Some(2), 1), "{name}: {said}");
+        assert!(names.iter().all(|n| said.contains(n)), "{name}: {said}");
+    }
+    // What only looks like one of ours is mentioned, and no more.
+    let line = ["render", "formula:one", "--azimuth", "0", "--size", "8x8", "-o", "a.png", "-q"];
+    let out = slabcast(dir.path(), &line).env("SLABCAST_THREDS", "2").output().unwrap();
+    let said = String::from_utf8_lossy(&out.stderr);
+    assert!(out.status.success() && said.contains("did you mean SLABCAST_THREADS?"), "{said}");
+}
+
+#[test]
+fn the_tables_hold_what_was_promised() {
+    let rows = files().len() + flags().len() + OUTPUTS.len() + OTHERS.len();
+    let rows = rows + VALUES.len() + VARIABLES.len();
+    assert!(rows >= 60, "at least 60 bad inputs were promised, {rows} are there");
 }
 
 #[test]

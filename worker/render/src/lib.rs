@@ -9,7 +9,7 @@
 //! Beside them [`mod@reference`] judges how far both are from the limit: a gather along true rays
 //! in f64 that shares none of their arithmetic, and [`closed`] has the pictures that can be
 //! worked out on paper, with derived bounds of what rounding may do to them. [`mod@explain`]
-//! shows one pixel of theirs sheet by sheet.
+//! shows one pixel of theirs sheet by sheet, and [`mod@survey`] what each pixel took.
 //!
 //! The two share what a pixel *is*: the kernel's profile and sections ([`footprint`]) and the
 //! arithmetic of a closing sheet ([`sheet`]). This crate refuses to know threads, networks and
@@ -26,6 +26,7 @@ pub mod selftest;
 pub mod serial;
 pub mod sheet;
 pub mod splat;
+pub mod survey;
 pub mod tile;
 
 pub use scene::{Frame, Scene};

@@ -9,6 +9,7 @@
 use crate::footprint::Footprint;
 use crate::scene::Frame;
 use crate::sheet::Sum;
+use crate::survey::Survey;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{FrameState, Picture, TilePixels};
 use slabcast_common::occlusion::Rect;
@@ -18,13 +19,18 @@ use std::sync::Arc;
 
 /// Renders `frame` from all bricks of its scene.
 pub fn render(frame: &Frame, bricks: &[Arc<Brick>]) -> Picture {
+    watched(frame, bricks, None)
+}
+
+/// The same; `notes` are taken on the way.
+pub(crate) fn watched(frame: &Frame, bricks: &[Arc<Brick>], notes: Option<&mut Survey>) -> Picture {
     match frame.scene.quality.sums {
-        Sums::F32 => render_sums::<f32>(frame, bricks, |to, p| {
+        Sums::F32 => render_sums::<f32>(frame, bricks, notes, |to, p| {
             floats(p, |pixel, c, v| to[pixel][c] += v);
         }),
-        Sums::I16 => render_sums::<i16>(frame, bricks, fixed),
+        Sums::I16 => render_sums::<i16>(frame, bricks, notes, fixed),
         // Round to nearest, as the splat loop says; saturating, as it is.
-        Sums::I32 | Sums::Auto => render_sums::<i32>(frame, bricks, |to, p| {
+        Sums::I32 | Sums::Auto => render_sums::<i32>(frame, bricks, notes, |to, p| {
             floats(p, |pixel, c, v| to[pixel][c] = to[pixel][c].wrapping_add((v + 0.5) as i32));
         }),
     }
@@ -39,6 +45,17 @@ struct Part<'a> {
     payload: [f32; 4],
     footprint: Footprint<'a>,
     at: [i64; 2],
+}
+
+impl Part<'_> {
+    /// The pixels that it adds to.
+    fn covers(&self) -> Rect {
+        let [w, h] = self.frame.view.size.map(|n| n as i32);
+        let (mut bx, mut by) = (Vec::new(), Vec::new());
+        let (x, wx) = self.footprint.weights(0, self.at[0], (0, w), &mut bx);
+        let (y, wy) = self.footprint.weights(1, self.at[1], (0, h), &mut by);
+        Rect::new(x, y, x + wx.len() as i32, y + wy.len() as i32)
+    }
 }
 
 /// `((payload * wz) * wy) * wx` for every pixel and channel.
@@ -82,6 +99,7 @@ fn fixed(to: &mut [[i16; 4]], p: &Part<'_>) {
 fn render_sums<S: Sum>(
     frame: &Frame,
     bricks: &[Arc<Brick>],
+    mut notes: Option<&mut Survey>,
     add: impl Fn(&mut [[S; 4]], &Part<'_>),
 ) -> Picture {
     let [w, h] = frame.view.size.map(|n| n as usize);
@@ -139,7 +157,11 @@ fn render_sums<S: Sum>(
                 let Some(footprint) = frame.footprints.at(sheet) else { continue };
                 let at = frame.view.screen(eye.x, eye.y, footprint.scale);
                 let section = (sheet - first) as usize;
-                add(to, &Part { frame, z, section, payload, footprint, at });
+                let part = Part { frame, z, section, payload, footprint, at };
+                add(to, &part);
+                if let Some(notes) = notes.as_mut().filter(|_| sheet == k) {
+                    notes.section(part.covers());
+                }
             }
         }
         for y in 0..h {
@@ -149,6 +171,9 @@ fn render_sums<S: Sum>(
                 if !frame.rule.is_shut(*a) {
                     let secant = frame.view.secant(x as i32, y as i32);
                     frame.rule.close(before[i], here[i], peek[i], secant, a, &mut pixels.colour[i]);
+                    if let Some(notes) = notes.as_mut().filter(|_| here[i][0].value() > 0.0) {
+                        notes.closed(i, k, frame.rule.is_shut(*a));
+                    }
                 }
             }
         }

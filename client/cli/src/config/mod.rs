@@ -103,7 +103,10 @@ pub(crate) fn blame(fail: Fail) -> Fail {
     let flag = said.strip_prefix("--").and_then(|s| s.split([':', ',', ' ']).next());
     let given = GIVEN.get().into_iter().flatten().find(|g| flag == Some(g.key.as_str()));
     match given {
-        Some(g) => fail.add(&format!("; it comes from {}", g.named())),
+        Some(g) => {
+            let fail = fail.add(&format!("; it comes from {}", g.named()));
+            if matches!(g.source, Source::File(_)) { fail.of_a_file() } else { fail }
+        }
         None => fail,
     }
 }

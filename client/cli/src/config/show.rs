@@ -12,12 +12,12 @@ use std::fmt::Write;
 /// The variable of a flag is its name in capitals: SLABCAST_SIZE for --size (SLABCAST_LOG for
 /// --log-level, SLABCAST_LOG_FORMAT for --log). The file is TOML, one section a command:
 ///
-///   [render]
-///   tf = "bone"
-///   size = "1024x1024"
+///     [render]
+///     tf = "bone"
+///     size = "1024x1024"
 ///
-///   [worker]
-///   master = "node1:7433"
+///     [worker]
+///     master = "node1:7433"
 ///
 /// It is the one that --config or SLABCAST_CONFIG names, or slabcast/slabcast.toml in
 /// $XDG_CONFIG_HOME (~/.config). An empty name means none.

@@ -22,7 +22,8 @@ use contact::Contact;
 use file::Growing;
 use folder::Folder;
 use serde::{Deserialize, Serialize};
-use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::image::{Background, Picture, PixelFormat};
+use slabcast_common::math::{linear_from_srgb, srgb_from_linear};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
@@ -38,6 +39,35 @@ pub(crate) struct Frame {
     pub(crate) size: [u32; 2],
     pub(crate) format: PixelFormat,
     pub(crate) bytes: bytes::Bytes,
+}
+
+impl Frame {
+    /// As 8-bit sRGB, over black where it is transparent.
+    pub(crate) fn rgb8(&self) -> Vec<u8> {
+        let over = |c: u8, a: u8| {
+            let light = linear_from_srgb(f64::from(c) / 255.0) * f64::from(a) / 255.0;
+            (srgb_from_linear(light) * 255.0 + 0.5) as u8
+        };
+        let b = &self.bytes;
+        match self.format {
+            PixelFormat::Rgb8 => b.to_vec(),
+            PixelFormat::Rgba8 => {
+                b.chunks_exact(4).flat_map(|p| [0, 1, 2].map(|c| over(p[c], p[3]))).collect()
+            }
+            // Little endian: the high bytes.
+            PixelFormat::Rgba16 => {
+                b.chunks_exact(8).flat_map(|p| [1, 3, 5].map(|c| over(p[c], p[7]))).collect()
+            }
+            PixelFormat::Rgba32F => {
+                let float =
+                    |p: &[u8], c: usize| f32::from_le_bytes(std::array::from_fn(|i| p[c * 4 + i]));
+                let pixels =
+                    b.chunks_exact(16).map(|p| std::array::from_fn(|c| float(p, c))).collect();
+                let picture = Picture { size: self.size, pixels };
+                picture.encode(PixelFormat::Rgb8, Background::Colour([0.0; 3]))
+            }
+        }
+    }
 }
 
 /// What frames become.
@@ -93,16 +123,9 @@ pub(crate) struct OutputArgs {
     /// of one frame, NAME.apng or NAME.y4m of all; - writes Y4M video to stdout
     #[arg(short, long, value_name = "DIR|FILE|-", default_value = "slabcast-out/")]
     pub(crate) output: PathBuf,
-    /// What frames become [default: by the name of the file, png in a folder]
-    #[arg(
-        long,
-        value_name = "FORMAT",
-        hide_possible_values = true,
-        value_enum,
-        long_help = "What frames become: png (8 bits), png16 (16 bits), exr (linear \
-                       premultiplied floats without background), apng or y4m (one moving picture) \
-                       [default: by the name of the file, png in a folder]"
-    )]
+    /// png, png16 (16 bits), exr (linear floats, no background), apng or y4m (one moving picture)
+    /// [default: by the name of the file, png in a folder]
+    #[arg(long, value_name = "FORMAT", hide_possible_values = true, value_enum)]
     pub(crate) format: Option<Format>,
     /// Frames a second of a moving picture
     #[arg(long, value_name = "N", default_value = "12",
@@ -386,10 +409,10 @@ pub(crate) struct Writer {
 const AT_ONCE: usize = 2;
 
 impl Writer {
-    /// For `frames` frames of this size. Opens pipes.
+    /// For `frames` frames. Opens pipes.
     pub(crate) fn new(
         output: Arc<Output>,
-        (frames, size): (u64, [u32; 2]),
+        frames: u64,
         patience: Arc<Patience>,
     ) -> Result<Self, Fail> {
         let coder = || match output.format {
@@ -408,8 +431,7 @@ impl Writer {
         };
         let movie =
             sink.map(|sink| Arc::new(Mutex::new(Movie { coder: coder(), sink, frames: 0 })));
-        let contact =
-            output.contact.as_ref().map(|_| Arc::new(Mutex::new(Contact::new(frames, size))));
+        let contact = output.contact.as_ref().map(|_| Arc::new(Mutex::new(Contact::new(frames))));
         Ok(Writer { output, movie, contact, patience, busy: JoinSet::new(), written: Vec::new() })
     }
 

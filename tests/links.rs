@@ -11,9 +11,11 @@ use slabcast_common::path::{Orientation, ProjectionKind, Turntable, ViewPath};
 use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Sums, Work};
 use slabcast_common::stats::FrameStats;
-use slabcast_common::transfer::Classifier;
+use slabcast_common::transfer::TransferFunction;
+use slabcast_common::tween::Tween;
 use slabcast_common::view::View;
 use slabcast_common::volume::Volume;
+use slabcast_common::wanted::Wanted;
 use slabcast_master::jobs::{JobState, WatchItem};
 use slabcast_master::{Handle, Master, MasterConfig};
 use slabcast_proto::convert::{self, Bricks, Down};
@@ -54,8 +56,8 @@ fn truth(request: &PathRequest) -> Vec<String> {
     let info = volume.info(digest);
     let transfer = presets::by_name("auto", &info.summary).unwrap();
     let quality = Quality { sums: Sums::I32, ..request.quality };
-    let support = Classifier::new(&transfer, &info, quality.compositing).support();
-    let store = BrickStore::build(&volume, digest, &support, transfer.shading.on);
+    let wanted = Wanted::of(&transfer, &info, quality.compositing);
+    let store = BrickStore::build(&volume, digest, &wanted);
     let bricks: Vec<_> = store.infos().iter().map(|i| store.brick(i.id).unwrap().clone()).collect();
     let spec = SceneSpec { id: SceneId(1), volume: info, transfer, quality, bricks: store.key() };
     let scene = Arc::new(Scene::new(&spec));
@@ -214,6 +216,69 @@ async fn the_codec_inside_the_embedded_link_changes_nothing() {
     let ask = request("1", ProjectionKind::Ortho, work);
     let want = truth(&ask);
     assert_eq!(hashes(&run(&handle, ask).await), want);
+    master.shutdown().await;
+}
+
+/// The hashes of the serial renderer when each frame is a job of its own: bricks of its own
+/// transfer function, and no more.
+fn truth_of_each(path: &ViewPath, default: &TransferFunction) -> Vec<String> {
+    let volume = volume();
+    let info = volume.info(volume.digest());
+    let tween = Tween::of(path, &info.summary).unwrap();
+    let cameras = path.prepare(&info.lattice, orientation()).unwrap();
+    let frame = |i: usize| {
+        let at = (path.first_frame() + i) as f64;
+        let transfer = tween.as_ref().map_or(default.clone(), |t| t.at(at));
+        let quality = Quality { sums: Sums::I32, ..Quality::default() };
+        let crop = path.crop.map(|c| c.of(&info.lattice).unwrap());
+        let wanted = Wanted { crop, ..Wanted::of(&transfer, &info, quality.compositing) };
+        let store = BrickStore::build(&volume, info.digest, &wanted);
+        let bricks: Vec<_> =
+            store.infos().iter().map(|i| store.brick(i.id).unwrap().clone()).collect();
+        let volume = info.clone();
+        let spec = SceneSpec { id: SceneId(1), volume, transfer, quality, bricks: store.key() };
+        let view = View::new(&info.lattice, &cameras.camera(i).unwrap(), path.size, &quality);
+        let frame = Frame::new(Arc::new(Scene::new(&spec)), view.unwrap());
+        serial::render(&frame, &bricks).sha256().to_string()
+    };
+    (0..path.frames()).map(frame).collect()
+}
+
+/// Three functions on one set of bricks, a box, a range, and a look that hangs on gradients: every
+/// frame has the bytes of a job that knew of nothing else.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_tween_a_crop_and_gradients_give_each_frame_the_bytes_of_its_own_job() {
+    let path = ViewPath::from_json(
+        r#"{"version":1,"size":[150,110],"crop":{"x":[null,25],"z":[8,null]},"range":[1,5],
+        "keyframes":{"frames":7,"keys":[{"view":"left","tf":"bone"},
+        {"azimuth":80,"elevation":30,"height":30,"tf":"glass"},
+        {"azimuth":120,"target":[20,20,24],"tf":"grey"}]}}"#,
+    )
+    .unwrap();
+    let grey = presets::by_name("grey", &volume().summary).unwrap();
+    let want = truth_of_each(&path, &grey);
+    assert_eq!(want.len(), 5);
+    assert!((1..5).all(|i| want[i] != want[i - 1]), "each frame differs");
+    let whole = ViewPath { crop: None, ..path.clone() };
+    assert_ne!(truth_of_each(&whole, &grey)[0], want[0], "the box cuts something away");
+
+    let master = master();
+    let handle = master.handle();
+    let _embedded = embed(&handle, config("embedded", 1));
+    let link = through_codec(&handle);
+    let (_stop, stopped) = watch::channel(false);
+    tokio::spawn(async move {
+        let mut cache = BrickCache::default();
+        slabcast_worker::run(&config("codec", 1), link, &mut cache, stopped).await
+    });
+    let ask = PathRequest { path, ..request("tween", ProjectionKind::Ortho, Work::default()) };
+    let frames = run(&handle, ask).await;
+    assert_eq!(hashes(&frames), want);
+    let numbers: Vec<u64> = frames.iter().map(|f| f.frame).collect();
+    assert_eq!(numbers, [1, 2, 3, 4, 5], "people count on the whole path");
+    let views: std::collections::BTreeSet<&str> =
+        frames.iter().map(|f| f.view_sha256.as_str()).collect();
+    assert_eq!(views.len(), 5);
     master.shutdown().await;
 }
 

@@ -406,7 +406,7 @@ async fn a_request_too_long_is_refused_before_it_is_sent() {
         fov: None,
     };
     let views = vec![view; 100_000];
-    let path = ViewPath { version: 1, size: [64, 64], views, turntable: None };
+    let path = ViewPath::of_views([64, 64], views);
     let e = client.submit(&PathRequest { path, ..request("a") }).await.unwrap_err();
     assert!(matches!(e, ClientError::TooLong { .. }), "{e}");
 }

@@ -1,7 +1,7 @@
 //! Bricks: 8x8x8 voxels of which only the relevant ones are kept (paper section 4.2).
 //!
-//! A brick holds values and normals, never colours or opacities, so a change of light or colour
-//! needs no new bricks (CONTRACTS.md, Wire). The paper spends 16 bytes a voxel; here an 8-bit
+//! A brick holds values, normals and, where asked for, magnitudes of gradients, never colours or
+//! opacities, so a change of light or colour needs no new bricks (CONTRACTS.md, Wire). The paper spends 16 bytes a voxel; here an 8-bit
 //! shaded voxel takes 5 in memory (index, value, normal) and 3 to 5 on the wire.
 
 use crate::ids::BrickId;
@@ -89,6 +89,8 @@ pub struct Brick {
     pub values: Samples,
     /// Octahedral normal of each voxel; `None` where the scene is unshaded.
     pub normals: Option<Vec<u16>>,
+    /// Magnitude of each voxel's gradient ([`crate::gradient`]); `None` where no opacity hangs on it.
+    pub gradients: Option<Vec<u8>>,
     /// Tight box inside the brick, lowest and highest: asked for in every frame, so kept.
     tight: [[u8; 3]; 2],
 }
@@ -142,7 +144,17 @@ impl Brick {
                 hi[a] = hi[a].max(p[a] as u8);
             }
         }
-        Brick { id, index, values, normals, tight: [lo, hi] }
+        Brick { id, index, values, normals, gradients: None, tight: [lo, hi] }
+    }
+
+    /// The same with a magnitude of the gradient for each voxel, or without.
+    ///
+    /// # Panics
+    /// If there are more or fewer than voxels.
+    #[must_use]
+    pub fn with_gradients(self, gradients: Option<Vec<u8>>) -> Self {
+        assert!(gradients.as_ref().is_none_or(|g| g.len() == self.len()), "a gradient a voxel");
+        Brick { gradients, ..self }
     }
 
     /// Number of voxels.
@@ -167,17 +179,25 @@ impl Brick {
     pub fn bytes_in_memory(&self) -> usize {
         let n = self.len();
         std::mem::size_of::<Brick>()
-            + n * (2 + self.values.kind().bytes() + if self.normals.is_some() { 2 } else { 0 })
+            + n * (2
+                + self.values.kind().bytes()
+                + if self.normals.is_some() { 2 } else { 0 }
+                + usize::from(self.gradients.is_some()))
     }
 
     /// Bytes that [`Brick::encode`] makes.
     pub fn encoded_len(&self) -> usize {
-        encoded_len(self.len(), self.values.kind(), self.normals.is_some())
+        encoded_len(
+            self.len(),
+            self.values.kind(),
+            self.normals.is_some(),
+            self.gradients.is_some(),
+        )
     }
 
     /// Appends the encoding: id (u32), voxels (u16), flags (u8: bits 0-1 value type, bit 2
-    /// normals), which voxels (nothing when all 512; a 64-byte mask from 32 voxels on; else u16
-    /// each), values, normals, CRC-32C over all before it. Little endian.
+    /// normals, bit 3 gradients), which voxels (nothing when all 512; a 64-byte mask from 32 voxels on; else u16
+    /// each), values, normals, gradients, CRC-32C over all before it. Little endian.
     pub fn encode(&self, out: &mut Vec<u8>) {
         let start = out.len();
         let n = self.len();
@@ -189,7 +209,9 @@ impl Brick {
             SampleKind::U16 => 1,
             SampleKind::F32 => 2,
         };
-        out.push(kind | if self.normals.is_some() { 4 } else { 0 });
+        let with_normals = if self.normals.is_some() { 4 } else { 0 };
+        let with_gradients = if self.gradients.is_some() { 8 } else { 0 };
+        out.push(kind | with_normals | with_gradients);
         if n < MASK_FROM {
             out.extend(self.index.iter().flat_map(|i| i.to_le_bytes()));
         } else if n < BRICK_VOXELS {
@@ -206,6 +228,9 @@ impl Brick {
         }
         if let Some(normals) = &self.normals {
             out.extend(normals.iter().flat_map(|x| x.to_le_bytes()));
+        }
+        if let Some(gradients) = &self.gradients {
+            out.extend(gradients);
         }
         let crc = crc32c::crc32c(&out[start..]);
         out.extend(crc.to_le_bytes());
@@ -229,11 +254,11 @@ impl Brick {
             2 => SampleKind::F32,
             _ => return Err(BrickError::Field { field: "flags" }),
         };
-        if flags & !7 != 0 {
+        if flags & !15 != 0 {
             return Err(BrickError::Field { field: "flags" });
         }
-        let with_normals = flags & 4 != 0;
-        let need = encoded_len(n, kind, with_normals);
+        let (with_normals, with_gradients) = (flags & 4 != 0, flags & 8 != 0);
+        let need = encoded_len(n, kind, with_normals, with_gradients);
         if have != need {
             return Err(BrickError::Length { have, need });
         }
@@ -272,7 +297,8 @@ impl Brick {
             ),
         };
         let normals = with_normals.then(|| u16s(take(2 * n)));
-        Ok(Brick::new(id, index, values, normals))
+        let gradients = with_gradients.then(|| take(n).to_vec());
+        Ok(Brick::new(id, index, values, normals).with_gradients(gradients))
     }
 }
 
@@ -288,7 +314,7 @@ fn u16s(bytes: &[u8]) -> Vec<u16> {
 }
 
 /// Bytes of the encoding of a brick of `n` voxels.
-pub fn encoded_len(n: usize, kind: SampleKind, normals: bool) -> usize {
+pub fn encoded_len(n: usize, kind: SampleKind, normals: bool, gradients: bool) -> usize {
     let which = if n < MASK_FROM {
         2 * n
     } else if n < BRICK_VOXELS {
@@ -296,7 +322,9 @@ pub fn encoded_len(n: usize, kind: SampleKind, normals: bool) -> usize {
     } else {
         0
     };
-    HEAD + which + n * kind.bytes() + if normals { 2 * n } else { 0 } + TAIL
+    let normals = if normals { 2 * n } else { 0 };
+    let gradients = if gradients { n } else { 0 };
+    HEAD + which + n * kind.bytes() + normals + gradients + TAIL
 }
 
 #[cfg(test)]
@@ -317,7 +345,8 @@ mod tests {
             _ => Samples::F32((0..n).map(|i| hash(i) as f32 * 0.37).collect()),
         };
         let normals = normals.then(|| (0..n).map(|i| hash(i + 9) as u16).collect());
-        Some(Brick::new(BrickId(seed), index, values, normals))
+        let gradients = (seed % 2 == 1).then(|| (0..n).map(|i| hash(i + 5) as u8).collect());
+        Some(Brick::new(BrickId(seed), index, values, normals).with_gradients(gradients))
     }
 
     proptest! {
@@ -346,8 +375,10 @@ mod tests {
 
     #[test]
     fn a_full_brick_takes_three_bytes_a_shaded_voxel_and_a_few() {
-        let b = brick(&[true; 512], 0, true, 5).unwrap();
+        let b = brick(&[true; 512], 0, true, 4).unwrap();
         assert_eq!(b.encoded_len(), 512 * 3 + 11);
+        let b = brick(&[true; 512], 0, true, 5).unwrap();
+        assert_eq!(b.encoded_len(), 512 * 4 + 11, "and one more for its gradient");
     }
 
     #[test]

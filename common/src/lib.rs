@@ -10,11 +10,14 @@
 
 pub mod bounds;
 pub mod brick;
+pub mod colour;
+pub mod gradient;
 pub mod ids;
 pub mod image;
 pub mod math;
 pub mod message;
 pub mod occlusion;
+pub mod paraview;
 pub mod path;
 pub mod presets;
 pub mod quality;
@@ -22,8 +25,10 @@ pub mod shade;
 pub mod slab;
 pub mod stats;
 pub mod transfer;
+pub mod tween;
 pub mod view;
 pub mod volume;
+pub mod wanted;
 
 /// Version of the arithmetic behind the pixels. Two programs that agree on it give the same
 /// bytes for the same view; a change of any golden hash raises it (CONTRACTS.md, Exactness).

@@ -11,6 +11,7 @@ use crate::occlusion::Rect;
 use crate::path::ViewPath;
 use crate::quality::{Quality, Work};
 use crate::slab::SheetRange;
+pub use crate::transfer::TransferChoice;
 use crate::transfer::TransferFunction;
 use crate::view::View;
 use crate::volume::VolumeInfo;
@@ -233,15 +234,6 @@ pub struct BrickBatch {
     pub bricks: Vec<Arc<Brick>>,
     /// Bricks whose bytes were not whole.
     pub broken: Vec<BrickId>,
-}
-
-/// A transfer function by name or in full.
-#[derive(Clone, Debug, PartialEq)]
-pub enum TransferChoice {
-    /// A preset, fitted to the master's volume.
-    Name(String),
-    /// In full.
-    Function(Box<TransferFunction>),
 }
 
 /// What a client asks for.

@@ -108,6 +108,21 @@ impl Refused {
     }
 }
 
+/// The refusal of a JSON text. An unknown key names the nearest one that there is: serde lists all of
+/// them, which is long, and the one that was meant is not easily found.
+pub(crate) fn json_error(whole: &str, e: &serde_json::Error) -> Refused {
+    let said = e.to_string();
+    let quoted: Vec<&str> = said.split('`').skip(1).step_by(2).collect();
+    let meant = match quoted[..] {
+        [wrong, ref known @ ..] if said.starts_with("unknown ") => {
+            crate::presets::nearest(wrong, known)
+        }
+        _ => None,
+    };
+    let meant = meant.map(|m| format!("; did you mean `{m}`?")).unwrap_or_default();
+    Refused::new(whole, format!("not valid: {said}{meant}"))
+}
+
 fn within(field: &str, x: f64, lo: f64, hi: f64) -> Result<(), Refused> {
     if x >= lo && x <= hi {
         Ok(())

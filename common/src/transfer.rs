@@ -1,12 +1,12 @@
 //! Transfer functions: from values to colour and opacity (CONTRACTS.md, Transfer functions).
 
-use crate::brick::BrickSetKey;
+use crate::brick::Brick;
+use crate::gradient::decode_magnitude;
 use crate::math::linear_from_srgb;
-use crate::quality::{Compositing, Refused, Sums};
+use crate::quality::{Compositing, Refused, Sums, json_error};
 use crate::shade::Shading;
-use crate::volume::{Digest32, SampleKind, Samples, ValueSummary, VolumeInfo};
+use crate::volume::{SampleKind, Samples, ValueSummary, VolumeInfo};
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 
 /// Cap of the extinction per vox: 16 ln 2, an alpha of `1 - 2^-16` (DESIGN.md section 1). It is
 /// part of the definition of the picture: silhouettes grow with the logarithm of sigma, so
@@ -84,7 +84,8 @@ pub struct TransferFunction {
     /// Look of NaN.
     #[serde(default)]
     pub nan: NanLook,
-    /// `[gradient magnitude, factor]`; not drawn by this version.
+    /// `[gradient magnitude, factor]`: what opacities are multiplied by. Magnitudes are the change
+    /// of value over one vox as a share of the range, or, over file values, per world unit.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub gradient_opacity: Vec<[f64; 2]>,
     /// Light on voxels.
@@ -95,8 +96,8 @@ pub struct TransferFunction {
 impl TransferFunction {
     /// Reads and checks the JSON of CONTRACTS.md.
     pub fn from_json(text: &str) -> Result<Self, Refused> {
-        let tf: TransferFunction = serde_json::from_str(text)
-            .map_err(|e| Refused::new("transfer function", format!("not valid: {e}")))?;
+        let tf: TransferFunction =
+            serde_json::from_str(text).map_err(|e| json_error("transfer function", &e))?;
         tf.check()?;
         Ok(tf)
     }
@@ -120,12 +121,6 @@ impl TransferFunction {
         }
         if self.colors.len() > MAX_POINTS || self.opacities.len() > MAX_POINTS {
             return refuse("colors, opacities".into(), "more than 65536 points; give fewer");
-        }
-        if !self.gradient_opacity.is_empty() {
-            return refuse(
-                "gradient_opacity".into(),
-                "this version does not modulate by gradient; remove it",
-            );
         }
         let unit = |x: f64| (0.0..=1.0).contains(&x);
         for (i, c) in self.colors.iter().enumerate() {
@@ -158,6 +153,23 @@ impl TransferFunction {
                 );
             }
         }
+        if self.gradient_opacity.len() > MAX_POINTS {
+            return refuse("gradient_opacity".into(), "more than 65536 points; give fewer");
+        }
+        for (i, g) in self.gradient_opacity.iter().enumerate() {
+            if !(g[0].is_finite() && g[0] >= 0.0 && unit(g[1])) {
+                return refuse(
+                    format!("gradient_opacity[{i}]"),
+                    "magnitude must be finite and not negative, factor in 0 to 1",
+                );
+            }
+            if i > 0 && g[0] < self.gradient_opacity[i - 1][0] {
+                return refuse(
+                    format!("gradient_opacity[{i}]"),
+                    "magnitude is smaller than the one before; sort them",
+                );
+            }
+        }
         if !opacity_ok(self.nan.opacity) || !self.nan.color.iter().all(|&x| unit(x)) {
             return refuse("nan".into(), "color must be in 0 to 1 and opacity in its unit's range");
         }
@@ -175,6 +187,38 @@ impl TransferFunction {
             }
         }
         Ok(())
+    }
+}
+
+/// A transfer function by name or in full. As JSON: a string, or the function.
+#[derive(Clone, Debug, PartialEq)]
+pub enum TransferChoice {
+    /// A preset, fitted to the volume.
+    Name(String),
+    /// In full.
+    Function(Box<TransferFunction>),
+}
+
+impl Serialize for TransferChoice {
+    fn serialize<S: serde::Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        match self {
+            TransferChoice::Name(name) => to.serialize_str(name),
+            TransferChoice::Function(tf) => tf.serialize(to),
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for TransferChoice {
+    fn deserialize<D: serde::Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
+        use serde::de::Error;
+        // Not `untagged`: that would lose what is wrong inside of the function.
+        match serde_json::Value::deserialize(from)? {
+            serde_json::Value::String(name) => Ok(TransferChoice::Name(name)),
+            object @ serde_json::Value::Object(_) => serde_json::from_value(object)
+                .map(|tf| TransferChoice::Function(Box::new(tf)))
+                .map_err(|e| D::Error::custom(format!("tf: {e}"))),
+            _ => Err(D::Error::custom("tf: must be a preset's name or a transfer function")),
+        }
     }
 }
 
@@ -228,10 +272,13 @@ pub struct Classifier {
     summary: ValueSummary,
     payload_max: f64,
     uncapped: bool,
+    /// What opacities are multiplied by, by code of the gradient's magnitude; empty where by
+    /// nothing.
+    factors: Vec<f64>,
 }
 
 /// Value of the piecewise linear function through `points` at `x`.
-fn interpolate<const N: usize>(points: &[[f64; N]], x: f64) -> [f64; N] {
+pub(crate) fn interpolate<const N: usize>(points: &[[f64; N]], x: f64) -> [f64; N] {
     // The number of points at or left of x: of two points at one x the later one holds there.
     let after = points.partition_point(|p| p[0] <= x);
     if after == 0 {
@@ -279,7 +326,18 @@ impl Classifier {
             summary,
             payload_max: rule.payload(largest),
             uncapped: rule.sigma(largest) > SIGMA_MAX && compositing != Compositing::Paper,
+            factors: Vec::new(),
         };
+        if !tf.gradient_opacity.is_empty() {
+            let (lo, hi) = info.summary.range();
+            let one = match tf.domain {
+                Domain::Unit => 1.0,
+                Domain::Value => (hi - lo) / info.lattice.vox(),
+            };
+            let factor =
+                |code: u8| interpolate(&tf.gradient_opacity, decode_magnitude(code) * one)[1];
+            c.factors = (0..=255).map(factor).collect();
+        }
         c.table = (0..codes).map(|code| c.evaluate(code as f64)).collect();
         c
     }
@@ -315,6 +373,26 @@ impl Classifier {
             Samples::U16(v) => self.table[v[i] as usize],
             Samples::F32(v) => self.evaluate(v[i] as f64),
         }
+    }
+
+    /// The look of voxel `i` of a brick of this volume, its gradient counted.
+    #[inline]
+    pub fn look_of(&self, brick: &Brick, i: usize) -> Look {
+        let look = self.look(&brick.values, i);
+        if self.factors.is_empty() { look } else { self.modulated(look, brick, i) }
+    }
+
+    fn modulated(&self, look: Look, brick: &Brick, i: usize) -> Look {
+        let code = brick.values.code(i);
+        // Not a number has no border either.
+        if code.is_nan() || look.sigma == 0.0 {
+            return look;
+        }
+        let x = self.x_of(code.clamp(self.summary.min_code, self.summary.max_code));
+        let [_, a] = interpolate(&self.opacities, x);
+        let magnitude = brick.gradients.as_ref().map_or(0, |g| g[i]);
+        let factor = self.factors[usize::from(magnitude)];
+        Look { sigma: self.rule.payload(a * factor) as f32, ..look }
     }
 
     /// The looks by code of an 8-bit (256) or 16-bit (65536) volume; empty for floats.
@@ -437,17 +515,20 @@ impl Support {
                 .all(|o| self.intervals.iter().any(|s| s.0 <= o.0 && o.1 <= s.1))
     }
 
-    /// The key of the brick set of a volume with this support, with or without normals.
-    pub fn key(&self, volume: Digest32, normals: bool) -> BrickSetKey {
-        let mut h = Sha256::new();
-        h.update(b"slabcast bricks 1");
-        h.update(volume.0);
-        h.update([u8::from(self.nan), u8::from(normals)]);
-        for (a, b) in &self.intervals {
-            h.update(a.to_le_bytes());
-            h.update(b.to_le_bytes());
+    /// What either sees.
+    #[must_use]
+    pub fn union(&self, other: &Support) -> Support {
+        let mut all: Vec<(f64, f64)> =
+            self.intervals.iter().chain(&other.intervals).copied().collect();
+        all.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let mut intervals: Vec<(f64, f64)> = Vec::new();
+        for (a, b) in all {
+            match intervals.last_mut() {
+                Some((_, hi)) if a <= *hi => *hi = hi.max(b),
+                _ => intervals.push((a, b)),
+            }
         }
-        BrickSetKey(Digest32(h.finalize().into()))
+        Support { intervals, nan: self.nan || other.nan }
     }
 }
 
@@ -456,7 +537,7 @@ mod tests {
     use super::*;
     use crate::math::srgb_from_linear;
     use crate::presets;
-    use crate::volume::{Lattice, ValueMap, Volume};
+    use crate::volume::{Digest32, Lattice, ValueMap, Volume};
     use proptest::prelude::*;
 
     fn info(samples: Samples) -> VolumeInfo {
@@ -642,6 +723,31 @@ mod tests {
     }
 
     #[test]
+    fn gradients_multiply_opacities() {
+        let volume = Volume::from_fn_u8("v", [8, 1, 1], |i, _, _| (i * 30) as u8);
+        let info = volume.info(Digest32::default());
+        let mut tf = tf(vec![[0.0, 0.0], [200.0, 0.8]]);
+        // Of 210 values a vox: none at 0, half from 52.5 on.
+        tf.gradient_opacity = vec![[0.0, 0.0], [52.5, 0.5]];
+        tf.check().unwrap();
+        let c = Classifier::new(&tf, &info, Compositing::Linear);
+        let values = Samples::U8(vec![100, 100, 100, 0]);
+        let brick = Brick::new(crate::ids::BrickId(0), vec![0, 1, 2, 3], values, None);
+        // A quarter of the range is half of the root.
+        let brick = brick.with_gradients(Some(vec![0, 128, 255, 255]));
+        let alpha = |i: usize| -libm::expm1(-f64::from(c.look_of(&brick, i).sigma));
+        assert_eq!(alpha(0), 0.0);
+        assert!((alpha(1) - 0.2).abs() < 1e-6 && (alpha(2) - 0.2).abs() < 1e-6, "{}", alpha(1));
+        assert_eq!(alpha(3), 0.0, "what is invisible stays so");
+        assert_eq!(c.look_of(&brick, 1).rgb, c.look(&brick.values, 1).rgb);
+        tf.domain = Domain::Unit;
+        tf.gradient_opacity = vec![[0.5, 1.0], [0.25, 1.0]];
+        assert_eq!(tf.check().unwrap_err().field, "gradient_opacity[1]");
+        tf.gradient_opacity = vec![[0.5, 1.5]];
+        assert_eq!(tf.check().unwrap_err().field, "gradient_opacity[0]");
+    }
+
+    #[test]
     fn json_round_trip_and_unknown_keys() {
         let summary = info(Samples::U8((0..=255).collect())).summary;
         let tf = presets::by_name("peer-opaque", &summary).unwrap();
@@ -661,6 +767,7 @@ mod tests {
         assert!(big.covers(&small) && !small.covers(&big));
         let across = Support { intervals: vec![(45.0, 65.0)], nan: false };
         assert!(!big.covers(&across));
-        assert_ne!(big.key(Digest32::default(), true), big.key(Digest32::default(), false));
+        assert!(big.union(&across).covers(&across) && big.union(&across).covers(&big));
+        assert_eq!(big.union(&across).intervals, [(10.0, 255.0)]);
     }
 }

@@ -17,9 +17,11 @@ use slabcast_common::path::Orientation;
 use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Refused};
 use slabcast_common::stats::FrameStats;
-use slabcast_common::transfer::{Classifier, Support, TransferFunction};
+use slabcast_common::transfer::{Classifier, TransferFunction};
+use slabcast_common::tween::Tween;
 use slabcast_common::view::View;
 use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_common::wanted::Wanted;
 use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
 use slabcast_proto::model::Worker;
 use slabcast_schedule::{Action, Clock, Event as Happened, FrameJob, Micros, Scheduler};
@@ -338,12 +340,36 @@ impl Clock for RealClock {
 /// A job in progress.
 struct Running {
     request: Arc<PathRequest>,
+    /// Of all frames, or of those of a tween but for the transfer function.
     scene: Arc<SceneSpec>,
-    support: Support,
+    tween: Option<Tween>,
+    wanted: Wanted,
     views: Vec<View>,
     store: Option<Arc<BrickStore>>,
     /// The next frame that was never rendered.
     next: u64,
+}
+
+/// Scenes of single frames of a tween have the frame's number and this bit, jobs' scenes do not.
+const ONE_FRAME: u64 = 1 << 63;
+
+impl Running {
+    /// What frame `number` is drawn with. Each frame of a tween is a scene of its own on the same
+    /// bricks.
+    fn scene_of(&self, number: u64, frame: FrameId) -> Arc<SceneSpec> {
+        let Some(tween) = &self.tween else { return self.scene.clone() };
+        let transfer = tween.at((self.request.path.first_frame() as u64 + number) as f64);
+        let base = &self.scene;
+        let classifier = Classifier::new(&transfer, &base.volume, base.quality.compositing);
+        // The keys were asked at submission; no mean of two is less capped than both.
+        let sums = classifier.sums(self.request.quality.sums).unwrap_or(base.quality.sums);
+        Arc::new(SceneSpec {
+            id: SceneId(frame.0 | ONE_FRAME),
+            transfer,
+            quality: Quality { sums, ..base.quality },
+            ..(**base).clone()
+        })
+    }
 }
 
 /// A worker's link and what the scheduler need not know of it.
@@ -362,6 +388,7 @@ struct Attached {
 struct Flight {
     job: JobId,
     number: u64,
+    scene: Arc<SceneSpec>,
     /// What is logged about it is logged inside these.
     frame_span: tracing::Span,
     slab_span: Option<(u32, tracing::Span)>,
@@ -640,24 +667,24 @@ impl Driver {
                 (**tf).clone()
             }
         };
+        let cameras = request.path.prepare(&info.lattice, self.served.orientation)?;
         let views = (0..request.path.frames())
             .map(|i| {
-                let camera = request.path.camera(i, &info.lattice, self.served.orientation)?;
-                View::new(&info.lattice, &camera, request.path.size, &request.quality)
+                View::new(&info.lattice, &cameras.camera(i)?, request.path.size, &request.quality)
             })
             .collect::<Result<Vec<View>, Refused>>()?;
-        let classifier = Classifier::new(&transfer, info, request.quality.compositing);
-        let sums = classifier.sums(request.quality.sums)?;
+        let compositing = request.quality.compositing;
+        let tween = Tween::of(&request.path, &info.summary)?;
+        let mut sums = request.quality.sums;
+        for tf in tween.iter().flat_map(Tween::ends).chain([&transfer]) {
+            sums = Classifier::new(tf, info, compositing).sums(request.quality.sums)?;
+        }
         let quality = Quality { sums, ..request.quality };
-        let support = classifier.support();
-        let normals = transfer.shading.on;
-        let held = self
-            .stores
-            .iter()
-            .find(|s| s.support().covers(&support) && (s.has_normals() || !normals));
+        let wanted = Wanted::of_path(&request.path, &transfer, tween.as_ref(), info, compositing)?;
+        let held = self.stores.iter().find(|s| s.wanted().covers(&wanted));
         let (bricks, store) = match held {
             Some(store) => (store.key(), Some(store.clone())),
-            None => (support.key(info.digest, normals), None),
+            None => (wanted.key(info.digest), None),
         };
         if let Some(store) = &store {
             self.keep(store);
@@ -699,11 +726,11 @@ impl Driver {
 
         if store.is_none() {
             let (volume, digest, wanted) =
-                (self.volume.clone(), self.served.info.digest, support.clone());
+                (self.volume.clone(), self.served.info.digest, wanted.clone());
             let inbox = self.inbox.clone();
             let built =
                 std::thread::Builder::new().name("slabcast-bricks".into()).spawn(move || {
-                    let store = Arc::new(BrickStore::build(&volume, digest, &wanted, normals));
+                    let store = Arc::new(BrickStore::build(&volume, digest, &wanted));
                     let _ = inbox.blocking_send(Event::Prepared { job: id, store });
                 });
             if let Err(e) = built {
@@ -720,7 +747,7 @@ impl Driver {
         };
         self.running.insert(
             id,
-            Running { request, scene: Arc::new(scene), support, views, store, next: 0 },
+            Running { request, scene: Arc::new(scene), tween, wanted, views, store, next: 0 },
         );
         self.order.push_back(id);
         self.refresh_states();
@@ -749,7 +776,7 @@ impl Driver {
         let stores = &self.stores;
         for r in self.running.values_mut().filter(|r| r.store.is_none()) {
             let fits =
-                |s: &&Arc<BrickStore>| s.key() == r.scene.bricks && s.support().covers(&r.support);
+                |s: &&Arc<BrickStore>| s.key() == r.scene.bricks && s.wanted().covers(&r.wanted);
             r.store = stores.iter().find(fits).cloned();
         }
         while self.flights.len() < FRAMES_IN_FLIGHT {
@@ -769,16 +796,23 @@ impl Driver {
             let frame = FrameId(self.next_frame);
             self.next_frame += 1;
             let frame_span = tracing::info_span!("frame", %job, number, id = %frame);
-            self.flights.insert(frame, Flight { job, number, frame_span, slab_span: None });
+            let scene = r.scene_of(number, frame);
+            let flight = Flight { job, number, scene: scene.clone(), frame_span, slab_span: None };
+            self.flights.insert(frame, flight);
+            let only_this = r.tween.is_some().then_some(scene.id);
             let queued = FrameJob {
                 frame,
                 number,
-                scene: r.scene.clone(),
+                scene,
                 bricks: store.infos().clone(),
                 view: r.views[number as usize],
                 work: r.request.work,
             };
             self.scheduler.handle(&self.clock, Happened::FrameQueued(Box::new(queued)));
+            if let Some(scene) = only_this {
+                // It ends with its frame.
+                self.scheduler.handle(&self.clock, Happened::SceneEnded { scene });
+            }
         }
     }
 
@@ -881,13 +915,14 @@ impl Driver {
             job: flight.job,
             frame,
             request: r.request.clone(),
-            scene: r.scene.clone(),
+            scene: flight.scene.clone(),
+            crop: r.wanted.crop,
             view,
             state,
             stats,
             spans,
             voxels: r.store.as_ref().map_or(0, |s| s.relevant_voxels()),
-            normals: r.store.as_ref().is_some_and(|s| s.has_normals()),
+            normals: r.store.as_ref().is_some_and(|s| s.wanted().normals),
         };
         // The finisher ends only with the driver.
         let _ = self.finisher.send((frame, sums));

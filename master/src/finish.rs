@@ -9,6 +9,7 @@ use slabcast_common::bounds;
 use slabcast_common::ids::{FrameId, JobId};
 use slabcast_common::image::FrameState;
 use slabcast_common::message::{PathRequest, SceneSpec};
+use slabcast_common::path::CropBox;
 use slabcast_common::stats::{Bound, ErrorStats, FrameStats, LeftOut};
 use slabcast_common::view::View;
 use slabcast_common::volume::Digest32;
@@ -21,6 +22,7 @@ pub(crate) struct FrameSums {
     pub(crate) frame: FrameId,
     pub(crate) request: Arc<PathRequest>,
     pub(crate) scene: Arc<SceneSpec>,
+    pub(crate) crop: Option<CropBox>,
     pub(crate) view: View,
     pub(crate) state: Box<FrameState>,
     pub(crate) stats: Box<FrameStats>,
@@ -30,8 +32,9 @@ pub(crate) struct FrameSums {
     pub(crate) normals: bool,
 }
 
-/// Hash of everything that decides a frame's pixels: volume, transfer function, quality, view.
-pub fn view_sha256(scene: &SceneSpec, view: &View) -> Digest32 {
+/// Hash of everything that decides a frame's pixels: volume, cropping box, transfer function,
+/// quality, view.
+pub fn view_sha256(scene: &SceneSpec, crop: Option<&CropBox>, view: &View) -> Digest32 {
     let mut h = Sha256::new();
     h.update(b"slabcast view 1");
     h.update(slabcast_common::PIXELS_VERSION.to_le_bytes());
@@ -59,6 +62,9 @@ pub fn view_sha256(scene: &SceneSpec, view: &View) -> Digest32 {
     for x in numbers {
         h.update(x.to_le_bytes());
     }
+    for x in crop.into_iter().flat_map(|c| c.lo.to_array().into_iter().chain(c.hi.to_array())) {
+        h.update(x.to_le_bytes());
+    }
     Digest32(h.finalize().into())
 }
 
@@ -79,7 +85,10 @@ fn error(scene: &SceneSpec, view: &View) -> ErrorStats {
 pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
     let picture = s.state.finish();
     let mut stats = *s.stats;
-    stats.view_sha256 = view_sha256(&s.scene, &s.view).to_string();
+    // Frames of a job count from its first; people count those of the path.
+    let number = stats.frame;
+    stats.frame += s.request.path.first_frame() as u64;
+    stats.view_sha256 = view_sha256(&s.scene, s.crop.as_ref(), &s.view).to_string();
     stats.pixels_sha256 = picture.sha256().to_string();
     stats.pixels_version = slabcast_common::PIXELS_VERSION;
     stats.error = error(&s.scene, &s.view);
@@ -93,7 +102,7 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
     }
     let bytes = picture.encode(s.request.format, s.request.background).into();
     FinishedFrame {
-        number: stats.frame,
+        number,
         size: picture.size,
         format: s.request.format,
         bytes,

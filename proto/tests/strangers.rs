@@ -7,7 +7,7 @@ use proptest::prelude::*;
 use prost::Message;
 use slabcast_common::brick::{BrickGrid, TightBox};
 use slabcast_common::message::ToWorker;
-use slabcast_common::transfer::Classifier;
+use slabcast_common::wanted::Wanted;
 use slabcast_proto::convert::{self, Bricks, Down};
 use slabcast_proto::{FILE_DESCRIPTOR_SET, v1};
 
@@ -39,8 +39,8 @@ fn work_with(message: ToWorker) {
     match message {
         ToWorker::Scene(scene) => {
             let volume = &scene.volume;
-            let classifier = Classifier::new(&scene.transfer, volume, scene.quality.compositing);
-            let _ = classifier.support().key(volume.digest, true);
+            let _ =
+                Wanted::of(&scene.transfer, volume, scene.quality.compositing).key(volume.digest);
             let _ = (volume.summary.total(), volume.summary.range(), volume.summary.bin(0.0));
             assert!(BrickGrid::of(volume.lattice.dims).len() <= 1 << 27);
         }

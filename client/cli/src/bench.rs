@@ -55,12 +55,11 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
     let threads = args.threads.count();
     let volume = volume::open(&args.of.volume)?;
     let info = volume.info(volume.digest());
-    asked.fit(&info, orientation)?;
+    asked.fit(&info, orientation, volume.anatomical)?;
     if let Some(notice) = lattice_notice(&info) {
         progress::note(&notice);
     }
-    let transfer = asked.transfer.function(&info).map_err(|e| asked.blame(&e))?;
-    let Drawn { spec, bricks } = Drawn::new(&volume, &info, &transfer, asked.quality)?;
+    let Drawn { spec, bricks } = asked.drawn(&volume, &info)?;
     drop(volume);
     let scene = Arc::new(Scene::new(&spec));
     let cut = Cut { threads, tile: args.tile, slabs: 1 };

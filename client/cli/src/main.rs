@@ -6,6 +6,7 @@
 //!   says of itself, and [`show`] draws how it came about.
 //! - [`daemon`] is `master` and `worker`; [`doctor`] says whether a machine is fit for them, and
 //!   [`demo`] needs no file.
+//! - [`transfer`] is colours and opacities, and [`tf`] writes them down.
 //! - [`info`] looks into files, [`ask`] at a running master.
 //! - [`config`] lays flags, environment and file over each other.
 //! - [`check`] compares pictures with the oracle over every way to make them; [`error`] says how
@@ -43,6 +44,8 @@ mod show;
 mod signals;
 mod still;
 mod style;
+mod tf;
+mod transfer;
 mod volume;
 
 use clap::error::ErrorKind;
@@ -85,6 +88,7 @@ enum Command {
     Render(Box<render::RenderArgs>),
     Rerender(rerender::RerenderArgs),
     Info(info::InfoArgs),
+    Tf(Box<tf::TfArgs>),
     Master(daemon::MasterArgs),
     Worker(daemon::WorkerArgs),
     Status(ask::StatusArgs),
@@ -140,6 +144,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
         Command::Render(args) => render::run(args),
         Command::Rerender(args) => rerender::run(args),
         Command::Info(args) => info::run(args),
+        Command::Tf(args) => tf::run(args),
         Command::Master(args) => daemon::master(args),
         Command::Worker(args) => daemon::worker(args),
         Command::Status(args) => ask::status(args),

@@ -1,6 +1,9 @@
 //! Values of flags: from text to what is meant, or what to give instead.
 
 use slabcast_common::image::Background;
+use slabcast_common::path::MAX_FRAMES;
+use slabcast_common::shade::{HeadWord, Light};
+use slabcast_common::transfer::NanLook;
 use slabcast_common::view::MAX_EDGE;
 
 /// A finite number.
@@ -206,6 +209,60 @@ pub(crate) fn png(text: &str) -> Result<std::path::PathBuf, String> {
     }
 }
 
+/// How many frames, or which.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Frames {
+    /// As many.
+    Count(u32),
+    /// The first and the last, both wanted.
+    Range([u32; 2]),
+}
+
+/// `18` or `30..60`.
+pub(crate) fn frames(text: &str) -> Result<Frames, String> {
+    let bad =
+        || format!("give 1..={MAX_FRAMES} frames, or the first and last wanted, as in 30..60");
+    let number = |t: &str| {
+        t.trim().parse::<u32>().ok().filter(|&n| (n as usize) < MAX_FRAMES + 1).ok_or_else(bad)
+    };
+    match text.split_once("..") {
+        None => number(text).and_then(|n| if n == 0 { Err(bad()) } else { Ok(Frames::Count(n)) }),
+        Some((first, last)) => {
+            let range = [number(first)?, number(last)?];
+            if range[0] > range[1] || range[1] as usize >= MAX_FRAMES {
+                return Err(bad());
+            }
+            Ok(Frames::Range(range))
+        }
+    }
+}
+
+/// `head` or `X,Y,Z`.
+pub(crate) fn light(text: &str) -> Result<Light, String> {
+    if text == "head" {
+        return Ok(Light::Head(HeadWord::Head));
+    }
+    let bad = || "give head, or a direction X,Y,Z in world axes that is not zero".to_string();
+    let parts: Vec<f64> =
+        text.split(',').map(number).collect::<Result<_, _>>().map_err(|_| bad())?;
+    match parts[..] {
+        [x, y, z] if x != 0.0 || y != 0.0 || z != 0.0 => Ok(Light::Direction([x, y, z])),
+        _ => Err(bad()),
+    }
+}
+
+/// `COLOUR` or `COLOUR:OPACITY`.
+pub(crate) fn nan(text: &str) -> Result<NanLook, String> {
+    let bad = || {
+        "give a colour, R,G,B (0 to 1) or #rrggbb, and after a colon its opacity (0 to 1)"
+            .to_string()
+    };
+    let (colour, opacity) = text.split_once(':').unwrap_or((text, "1"));
+    let Ok(Background::Colour(color)) = background(colour) else { return Err(bad()) };
+    let opacity = number(opacity).ok().filter(|a| (0.0..=1.0).contains(a)).ok_or_else(bad)?;
+    Ok(NanLook { color, opacity })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -236,6 +293,30 @@ mod tests {
         assert!(background("255,128,0").unwrap_err().contains("#ff8000"));
         for bad in ["", "red", "1,1", "1,1,1,1", "#12345", "#+12345", "nan,0,0", "1,2,-3"] {
             assert!(background(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn frames_are_a_number_or_a_range_with_both_ends() {
+        assert_eq!(frames("18"), Ok(Frames::Count(18)));
+        assert_eq!(frames("30..60"), Ok(Frames::Range([30, 60])));
+        assert_eq!(frames("0..0"), Ok(Frames::Range([0, 0])));
+        for bad in ["", "0", "-1", "5..3", "3..", "..3", "1..2..3", "100001", "0..100000", "x"] {
+            assert!(frames(bad).unwrap_err().contains("30..60"), "{bad}");
+        }
+    }
+
+    #[test]
+    fn light_and_nan_are_said_in_words_and_numbers() {
+        assert_eq!(light("head"), Ok(Light::Head(HeadWord::Head)));
+        assert_eq!(light("-1,0,2.5"), Ok(Light::Direction([-1.0, 0.0, 2.5])));
+        for bad in ["", "0,0,0", "1,2", "1,2,3,4", "nan,0,0", "up"] {
+            assert!(light(bad).is_err(), "{bad}");
+        }
+        assert_eq!(nan("1,0,0").map(|n| n.opacity), Ok(1.0));
+        assert_eq!(nan("#ff0000:0.25").map(|n| (n.color, n.opacity)), Ok(([1.0, 0.0, 0.0], 0.25)));
+        for bad in ["", "transparent", "1,0,0:2", "1,0,0:", "red"] {
+            assert!(nan(bad).is_err(), "{bad}");
         }
     }
 

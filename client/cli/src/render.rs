@@ -192,7 +192,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     }
     let crew = Crew::new(args.workers.unwrap_or(1), args.threads)?;
     let asked = args.look.asked(args.work.work()?)?;
-    let frames = asked.path.frames() as u64;
+    let frames = asked.frames();
     let stem = args.show.map_or("frame", Show::stem);
     let inputs: Vec<&Path> =
         [&args.volume, &args.look.view.path].into_iter().flatten().map(PathBuf::as_path).collect();
@@ -276,11 +276,12 @@ async fn embedded(
             orientation.up, orientation.front
         ));
     }
+    let anatomical = volume.anatomical;
     let mut cluster = Cluster::start(volume, orientation, crew)?;
     let handle = cluster.handle();
     let info = handle.volume().info.clone();
-    let recipe = run.ready(&info, orientation)?;
-    let request = run.request();
+    let recipe = run.ready(&info, orientation, anatomical)?;
+    let request = run.request(&info);
     let job = handle.submit(request).await.map_err(|e| match e {
         SubmitError::Refused(refused) => run.asked.blame(&refused),
         other => Fail::failed(format!("the master of this process takes no job: {other:?}")),
@@ -378,7 +379,7 @@ async fn drawn(
     crew: Crew,
 ) -> Result<(), Fail> {
     let info = volume.info(volume.digest());
-    let recipe = run.ready(&info, orientation)?;
+    let recipe = run.ready(&info, orientation, volume.anatomical)?;
     let threads = (crew.workers * crew.threads) as usize;
     let stage = Stage::new(&volume, &info, (&run.asked, orientation), threads)?;
     let what = format!("{}, showing {}", volume.name, show.stem());
@@ -406,8 +407,8 @@ async fn cluster(mut run: Run, master: String) -> Result<(), Fail> {
     run.progress.stage(&format!("dialling {master}"));
     let client = remote::connect(&master).await?;
     let served = remote::describe(&client).await?;
-    let recipe = run.ready(&served.info, served.orientation)?;
-    let request = run.request();
+    let recipe = run.ready(&served.info, served.orientation, served.anatomical)?;
+    let request = run.request(&served.info);
     let source = tokio::select! {
         source = remote::submit(client, &run.asked, request) => source?,
         code = signals::stopped() => return Err(Fail::silent(code)),
@@ -417,16 +418,21 @@ async fn cluster(mut run: Run, master: String) -> Result<(), Fail> {
 }
 
 impl Run {
-    fn request(&self) -> PathRequest {
+    fn request(&self, info: &VolumeInfo) -> PathRequest {
         let format = self.output.format.pixels(self.asked.background);
-        self.asked.request(format, self.trace.wanted())
+        self.asked.request(info, format, self.trace.wanted())
     }
 
     /// All that can be refused is; the folder is there.
-    fn ready(&mut self, info: &VolumeInfo, orientation: Orientation) -> Result<Recipe, Fail> {
+    fn ready(
+        &mut self,
+        info: &VolumeInfo,
+        orientation: Orientation,
+        anatomical: bool,
+    ) -> Result<Recipe, Fail> {
         // From here on there may be files to clean up.
         signals::listen();
-        self.asked.fit(info, orientation)?;
+        self.asked.fit(info, orientation, anatomical)?;
         let as_what = (self.output.format, self.output.fps());
         let recipe = Recipe::new(&self.asked, info, orientation, as_what)?;
         self.output.make()?;
@@ -469,9 +475,13 @@ impl Run {
                             progress.step(step.clone());
                         }
                         Some(Ok(Update::Frame { frame, stats: facts, stats_json, trace_json })) => {
+                            let begins = frame.number == 0;
+                            step.frames = step.frames.max(frame.number + 1);
+                            // People count frames of the whole path.
+                            let number = frame.number + asked.path.first_frame() as u64;
+                            let frame = Frame { number, ..frame };
                             last = Instant::now();
                             first.get_or_insert(last);
-                            step.frames = step.frames.max(frame.number + 1);
                             step = Step { frames: step.frames, ..Step::default() };
                             let Some(facts) = facts else {
                                 progress.step(step.clone());
@@ -487,7 +497,7 @@ impl Run {
                                 continue;
                             }
                             let made = match output.format {
-                                Format::Apng if frame.number == 0 => recipe.movie(&facts),
+                                Format::Apng if begins => recipe.movie(&facts),
                                 Format::Apng | Format::Y4m => String::new(),
                                 Format::Png | Format::Png16 | Format::Exr => recipe.frame(&facts),
                             };
@@ -612,6 +622,8 @@ impl Look {
         let tf = asked.transfer.name();
         let why = if facts.voxels.relevant == 0 && lo == hi {
             format!("every value of the volume is {lo}, and `--tf {tf}` leaves that invisible")
+        } else if facts.voxels.relevant == 0 && asked.path.crop.is_some() {
+            format!("no voxel in the cropping box is visible under `--tf {tf}`; widen --crop")
         } else if facts.voxels.relevant == 0 {
             format!(
                 "no voxel is visible under `--tf {tf}` (values go from {lo} to {hi}); try another \

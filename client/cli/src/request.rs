@@ -4,25 +4,25 @@
 //! before anything is read or dialled; what needs the lattice is refused by [`Asked::fit`],
 //! which names the flag (or the file and its field) that is to blame.
 
+use crate::check::shot::Drawn;
 use crate::fail::Fail;
 use crate::output::provenance::Provenance;
-use crate::parse::{self, Tile};
+use crate::parse::{self, Frames, Tile};
+use crate::transfer::{LookFlags, Transfer, read_json};
 use clap::builder::{PossibleValuesParser, TypedValueParser, ValueParser};
 use slabcast_common::image::{Background, PixelFormat};
-use slabcast_common::message::{PathRequest, TransferChoice};
-use slabcast_common::path::{Axis, MAX_FRAMES, Orientation, ProjectionKind, Turntable, ViewPath};
-use slabcast_common::presets;
+use slabcast_common::message::PathRequest;
+use slabcast_common::path::{
+    Axis, Crop, Key, KeyFrames, Orientation, ProjectionKind, Side, Turntable, ViewPath,
+};
 use slabcast_common::quality::{
     Compositing, Kernel, Quality, Refused, Schedule, Splat, Sums, Work,
 };
-use slabcast_common::transfer::TransferFunction;
+use slabcast_common::tween::Tween;
 use slabcast_common::view::View;
-use slabcast_common::volume::VolumeInfo;
-use std::io::Read;
-use std::path::{Path, PathBuf};
-
-/// Largest transfer function or path file that is read: a path of 100,000 views has 20 MB.
-const MAX_JSON_BYTES: u64 = 64 << 20;
+use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_common::wanted::Wanted;
+use std::path::PathBuf;
 
 /// One word of a closed list, as a value of ours.
 fn words<T: Copy + Send + Sync + 'static>(list: &'static [(&'static str, T)]) -> ValueParser {
@@ -62,14 +62,19 @@ pub(crate) struct ViewArgs {
     #[arg(long, value_name = "DEG", default_value = "5", value_parser = parse::number,
           allow_negative_numbers = true)]
     step: f64,
-    /// Number of frames
-    #[arg(long, value_name = "N", default_value = "18",
-          value_parser = clap::value_parser!(u32).range(1..=MAX_FRAMES as i64))]
-    frames: u32,
+    /// Number of frames, or the first and last wanted of a path (30..60), which keep their
+    /// numbers [default: 18, of a path all]
+    #[arg(long, value_name = "N|A..B", value_parser = parse::frames)]
+    frames: Option<Frames>,
     /// One frame at this azimuth: short for --start DEG --frames 1
     #[arg(long, value_name = "DEG", value_parser = parse::number, allow_negative_numbers = true,
           conflicts_with_all = ["start", "step", "frames"])]
     azimuth: Option<f64>,
+    /// One frame from a side of the body: anterior, left, superior, posterior, right or inferior.
+    /// Where the file does not say which is which, --front is anterior and --up superior
+    #[arg(long, value_name = "SIDE", value_parser = words(&Side::NAMES),
+          conflicts_with_all = ["start", "step", "frames", "azimuth", "elevation"])]
+    view: Option<Side>,
     /// Degrees towards up, -90 to 90
     #[arg(long, value_name = "DEG", default_value = "0", value_parser = parse::number,
           allow_negative_numbers = true)]
@@ -87,20 +92,28 @@ pub(crate) struct ViewArgs {
     fov: f64,
     #[command(flatten)]
     pub(crate) axes: AxisArgs,
-    /// Views or a turntable from a file instead; its size holds unless --size is given
+    /// Views, a turntable, key frames or a flight from a file instead; its size holds unless --size
+    /// is given
     #[arg(long, value_name = "FILE.json", conflicts_with_all = [
-        "start", "step", "frames", "azimuth", "elevation", "height", "projection", "fov"])]
+        "start", "step", "azimuth", "view", "elevation", "height", "projection", "fov"])]
     pub(crate) path: Option<PathBuf>,
+    /// Only what lies in a box: FROM:TO along x, y and z, in mm or in percent of the volume's box; an
+    /// empty end does not crop (-40:40,:,50:)
+    #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true)]
+    crop: Option<Crop>,
 }
 
 /// What the picture shows.
 #[derive(clap::Args, Clone, Debug)]
 #[command(next_help_heading = "Picture")]
 pub(crate) struct PictureArgs {
-    /// Transfer function: a preset (auto, skin, bone, vessels, brain, grey, peer-...) or a
-    /// JSON file; `slabcast info VOLUME` shows what each preset would draw
+    /// Transfer function: a preset (auto, skin, bone, vessels, ...), a colour map (viridis, ...) or a
+    /// JSON file, ours or ParaView's; `slabcast tf --list` has all names, `slabcast info VOLUME`
+    /// shows what each preset would draw
     #[arg(long, value_name = "NAME|FILE", default_value = "auto")]
     tf: String,
+    #[command(flatten)]
+    look: LookFlags,
     /// Size in pixels [default: 512x512]
     #[arg(long, value_name = "WxH", value_parser = parse::size)]
     size: Option<[u32; 2]>,
@@ -247,99 +260,13 @@ impl WorkArgs {
     }
 }
 
-/// A transfer function and where it came from.
-#[derive(Clone, Debug)]
-pub(crate) struct Transfer {
-    pub(crate) choice: TransferChoice,
-    file: Option<PathBuf>,
-    /// The preset that a function came from, where only that is known.
-    preset: Option<String>,
-}
-
-impl Transfer {
-    /// A preset by name, or a file if it exists or its name ends in `.json`. A preset's name
-    /// means the preset even beside a file of that name; `./bone` means the file.
-    pub(crate) fn parse(text: &str) -> Result<Self, Fail> {
-        if presets::NAMES.iter().any(|(name, _)| *name == text) {
-            return Ok(Transfer {
-                choice: TransferChoice::Name(text.into()),
-                file: None,
-                preset: None,
-            });
-        }
-        let path = Path::new(text);
-        // A pipe (`<(...)` of a shell) is a file, too.
-        let there = path.metadata().is_ok_and(|m| !m.is_dir());
-        if !(there || text.ends_with(".json")) {
-            return Err(Fail::flag(&unknown_preset(text)));
-        }
-        let json = read_json(path)?;
-        let tf = TransferFunction::from_json(&json)
-            .map_err(|e| Fail::field(path, "transfer function", &e))?;
-        Ok(Transfer {
-            choice: TransferChoice::Function(Box::new(tf)),
-            file: Some(path.to_path_buf()),
-            preset: None,
-        })
-    }
-
-    /// The preset that it is or came from.
-    pub(crate) fn preset(&self) -> Option<&str> {
-        match &self.choice {
-            TransferChoice::Name(name) => Some(name),
-            TransferChoice::Function(_) => self.preset.as_deref(),
-        }
-    }
-
-    /// What it is called in messages.
-    pub(crate) fn name(&self) -> String {
-        match (&self.choice, &self.file) {
-            (TransferChoice::Name(name), _) => name.clone(),
-            (_, Some(file)) => file.display().to_string(),
-            (_, None) => "given".into(),
-        }
-    }
-
-    /// In full, for a volume with these values.
-    pub(crate) fn function(&self, info: &VolumeInfo) -> Result<TransferFunction, Refused> {
-        match &self.choice {
-            TransferChoice::Name(name) => presets::by_name(name, &info.summary),
-            TransferChoice::Function(tf) => Ok((**tf).clone()),
-        }
-    }
-}
-
-/// The refusal of a name that is no preset, with the nearest one.
-fn unknown_preset(name: &str) -> Refused {
-    use slabcast_common::volume::{Samples, ValueMap, ValueSummary};
-    let any = ValueSummary::of(&Samples::U8(vec![0, 255]), ValueMap::IDENTITY);
-    presets::by_name(name, &any).err().unwrap_or_else(|| Refused::new("tf", "unknown"))
-}
-
-fn read_json(path: &Path) -> Result<String, Fail> {
-    let fail = |e: &std::io::Error| Fail::io(path, "reading", e);
-    let file = std::fs::File::open(path).map_err(|e| fail(&e))?;
-    if file.metadata().map_err(|e| fail(&e))?.is_dir() {
-        return Err(Fail::failed(format!("{}: is a folder; give a JSON file", path.display())));
-    }
-    let mut bytes = Vec::new();
-    file.take(MAX_JSON_BYTES + 1).read_to_end(&mut bytes).map_err(|e| fail(&e))?;
-    if bytes.len() as u64 > MAX_JSON_BYTES {
-        return Err(Fail::failed(format!(
-            "{}: has more than {} MB, which is no view path or transfer function",
-            path.display(),
-            MAX_JSON_BYTES / 1_000_000
-        )));
-    }
-    String::from_utf8(bytes)
-        .map_err(|_| Fail::failed(format!("{}: is not text; give a JSON file", path.display())))
-}
-
 /// A request as far as the command line tells it.
 #[derive(Clone, Debug)]
 pub(crate) struct Asked {
     pub(crate) path: ViewPath,
     pub(crate) path_file: Option<PathBuf>,
+    /// The axes that were given, if a side of the body was asked for.
+    side: Option<AxisArgs>,
     pub(crate) transfer: Transfer,
     pub(crate) quality: Quality,
     pub(crate) work: Work,
@@ -356,28 +283,20 @@ impl Asked {
     ) -> Result<Self, Fail> {
         let quality = quality.quality()?;
         view.axes.orientation()?;
-        let path = match &view.path {
-            Some(file) => {
-                let mut path = ViewPath::from_json(&read_json(file)?)
-                    .map_err(|e| Fail::field(file, "view path", &e))?;
-                path.size = picture.size.unwrap_or(path.size);
-                if let Some(t) = &mut path.turntable {
-                    t.up = view.axes.up.or(t.up);
-                    t.front = view.axes.front.or(t.front);
-                } else if view.axes.up.is_some() || view.axes.front.is_some() {
-                    return Err(Fail::usage(format!(
-                        "--up, --front: each view of {} has its own `up`; leave them out",
-                        file.display()
-                    )));
-                }
-                path
-            }
-            None => ViewPath::turn(picture.size.unwrap_or([512, 512]), view.turntable()),
+        let mut path = match &view.path {
+            Some(file) => view.of_file(file, picture)?,
+            None => view.of_flags(picture.size.unwrap_or([512, 512]))?,
         };
+        path.crop = view.crop.or(path.crop);
+        path.check().map_err(|e| match &view.path {
+            Some(file) => Fail::field(file, "view path", &e),
+            None => Fail::flag(&e),
+        })?;
         Ok(Asked {
             path,
             path_file: view.path.clone(),
-            transfer: Transfer::parse(&picture.tf)?,
+            side: view.view.is_some().then(|| view.axes.clone()),
+            transfer: Transfer::parse(&picture.tf, &picture.look)?,
             quality,
             work,
             background: picture.background,
@@ -390,11 +309,18 @@ impl Asked {
         Ok(Asked {
             path,
             path_file: None,
-            transfer: Transfer::parse(tf)?,
+            side: None,
+            transfer: Transfer::plain(tf)?,
             quality: Quality::default(),
             work: Work::default(),
             background: Background::Colour([0.0; 3]),
         })
+    }
+
+    /// The numbers of its frames on the whole path.
+    pub(crate) fn frames(&self) -> std::ops::Range<u64> {
+        let first = self.path.first_frame() as u64;
+        first..first + self.path.frames() as u64
     }
 
     /// What made a picture, to make it again.
@@ -402,32 +328,75 @@ impl Asked {
         Asked {
             path: p.path.clone(),
             path_file: None,
-            transfer: Transfer {
-                choice: TransferChoice::Function(Box::new(p.transfer.clone())),
-                file: None,
-                preset: p.preset.clone(),
-            },
+            side: None,
+            transfer: Transfer::again(&p.transfer, p.preset.clone()),
             quality: p.quality,
             work: Work::default(),
             background: p.background(),
         }
     }
 
-    /// Whether all of it can be drawn of this volume.
-    pub(crate) fn fit(&self, info: &VolumeInfo, orientation: Orientation) -> Result<(), Fail> {
-        self.transfer.function(info).map_err(|e| self.blame(&e))?;
+    /// Whether all of it can be drawn of this volume; `anatomical` says whether its file knows
+    /// left from right.
+    pub(crate) fn fit(
+        &self,
+        info: &VolumeInfo,
+        orientation: Orientation,
+        anatomical: bool,
+    ) -> Result<(), Fail> {
+        if let Some(axes) = &self.side {
+            let usual = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
+            let given = axes.up.is_some() || axes.front.is_some();
+            if anatomical && orientation != usual {
+                return Err(Fail::usage(
+                    "--view: the volume itself says where anterior and superior are; leave --up and \
+                     --front out",
+                ));
+            }
+            if !anatomical && !given && orientation == usual {
+                return Err(Fail::usage(
+                    "--view: the volume does not say where anterior is; give --up and --front for \
+                     superior and anterior, or --azimuth instead",
+                ));
+            }
+        }
+        let function = self.transfer.function(info).map_err(|e| self.blame(&e))?;
+        let blame = |e| self.blame(&e);
+        let tween = Tween::of(&self.path, &info.summary).map_err(blame)?;
+        let compositing = self.quality.compositing;
+        Wanted::of_path(&self.path, &function, tween.as_ref(), info, compositing).map_err(blame)?;
+        let cameras = self.path.prepare(&info.lattice, orientation).map_err(blame)?;
         for i in 0..self.path.frames() {
-            let camera =
-                self.path.camera(i, &info.lattice, orientation).map_err(|e| self.blame(&e))?;
+            let camera = cameras.camera(i).map_err(blame)?;
             View::new(&info.lattice, &camera, self.path.size, &self.quality).map_err(|mut e| {
                 // A view speaks of itself; a path has many.
-                if !self.path.views.is_empty() && e.field != "size" {
-                    e.field = format!("views[{i}].{}", e.field);
+                let n = self.path.first_frame() + i;
+                if e.field != "size" && self.path_file.is_some() {
+                    if !self.path.views.is_empty() {
+                        e.field = format!("views[{n}].{}", e.field);
+                    } else if self.path.keyframes.is_some() {
+                        e.field = format!("keyframes, frame {n}: {}", e.field);
+                    } else if self.path.flythrough.is_some() {
+                        e.field = format!("flythrough, frame {n}: {}", e.field);
+                    }
                 }
                 self.blame(&e)
             })?;
         }
         Ok(())
+    }
+
+    /// The scene of the path's first frame, for commands that draw in this process alone: these take
+    /// all frames with its transfer function.
+    pub(crate) fn drawn(&self, volume: &Volume, info: &VolumeInfo) -> Result<Drawn, Fail> {
+        let blame = |e| self.blame(&e);
+        let tween = Tween::of(&self.path, &info.summary).map_err(blame)?;
+        let transfer = match tween {
+            Some(tween) => tween.at(self.path.first_frame() as f64),
+            None => self.transfer.function(info).map_err(blame)?,
+        };
+        let crop = self.path.crop.map(|c| c.of(&info.lattice)).transpose().map_err(blame)?;
+        Drawn::cropped(volume, info, &transfer, self.quality, crop)
     }
 
     /// Puts a refusal where the user wrote what is refused: at a flag or in a file.
@@ -458,8 +427,22 @@ impl Asked {
             "up",
             "front",
         ];
-        const OF_PATHS: [&str; 9] =
-            ["size", "start", "step", "frames", "elevation", "height", "fov", "up", "front"];
+        // A box names its axis.
+        if refused.field.starts_with("crop") || refused.field.starts_with("path.crop") {
+            return Fail::usage(format!("--crop: {}", refused.problem));
+        }
+        const OF_PATHS: [&str; 10] = [
+            "range",
+            "size",
+            "start",
+            "step",
+            "frames",
+            "elevation",
+            "height",
+            "fov",
+            "up",
+            "front",
+        ];
         // Refusals that crossed the wire carry where in the message the field was.
         let inner = refused.field.rsplit('.').next().unwrap_or_default();
         let field = match inner {
@@ -469,12 +452,13 @@ impl Asked {
             field => field,
         };
         if let Some(file) = &self.path_file
-            && (refused.field.starts_with("views") || OF_PATHS.contains(&field))
+            && (["views", "keyframes", "flythrough"].iter().any(|w| refused.field.contains(w))
+                || OF_PATHS.contains(&field))
         {
             return Fail::field(file, "view path", refused);
         }
         if refused.field.starts_with("transfer_json")
-            && let Some(file) = &self.transfer.file
+            && let Some(file) = self.transfer.file()
         {
             return Fail::field(file, "transfer_json", refused);
         }
@@ -484,12 +468,17 @@ impl Asked {
         Fail::usage(refused.to_string())
     }
 
-    /// The request, under a name that no other has.
-    pub(crate) fn request(&self, format: PixelFormat, want_trace: bool) -> PathRequest {
+    /// The request, under a name that no other has, for a volume with these values.
+    pub(crate) fn request(
+        &self,
+        info: &VolumeInfo,
+        format: PixelFormat,
+        want_trace: bool,
+    ) -> PathRequest {
         PathRequest {
             client_key: client_key(),
             path: self.path.clone(),
-            transfer: self.transfer.choice.clone(),
+            transfer: self.transfer.choice(info),
             quality: self.quality,
             work: self.work,
             format,
@@ -500,12 +489,66 @@ impl Asked {
 }
 
 impl ViewArgs {
-    fn turntable(&self) -> Turntable {
-        let (start, frames) = match self.azimuth {
-            Some(azimuth) => (azimuth, 1),
-            None => (self.start, self.frames),
+    /// The path of a file, as far as flags do not change it.
+    fn of_file(&self, file: &std::path::Path, picture: &PictureArgs) -> Result<ViewPath, Fail> {
+        let mut path = ViewPath::from_json(&read_json(file)?)
+            .map_err(|e| Fail::field(file, "view path", &e))?;
+        path.size = picture.size.unwrap_or(path.size);
+        match self.frames {
+            None => {}
+            Some(Frames::Range(range)) => path.range = Some(range),
+            Some(Frames::Count(_)) => {
+                return Err(Fail::usage(format!(
+                    "--frames, --path: {} says how many; give the first and last wanted, as in 0..9",
+                    file.display()
+                )));
+            }
+        }
+        if let Some(t) = &mut path.turntable {
+            t.up = self.axes.up.or(t.up);
+            t.front = self.axes.front.or(t.front);
+        } else if let Some(k) = &mut path.keyframes {
+            k.up = self.axes.up.or(k.up);
+            k.front = self.axes.front.or(k.front);
+        } else if self.axes.up.is_some() || self.axes.front.is_some() {
+            return Err(Fail::usage(format!(
+                "--up, --front: {} has an `up` of its own; leave them out",
+                file.display()
+            )));
+        }
+        Ok(path)
+    }
+
+    /// The path of the flags.
+    fn of_flags(&self, size: [u32; 2]) -> Result<ViewPath, Fail> {
+        if let Some(side) = self.view {
+            let persp = self.projection == ProjectionKind::Persp;
+            let key = Key {
+                view: Some(side),
+                projection: self.projection,
+                height: self.height,
+                fov: persp.then_some(self.fov),
+                ..Key::default()
+            };
+            let one = KeyFrames {
+                frames: 1,
+                easing: Default::default(),
+                up: self.axes.up,
+                front: self.axes.front,
+                keys: vec![key],
+            };
+            return Ok(ViewPath { keyframes: Some(one), ..ViewPath::of_views(size, Vec::new()) });
+        }
+        let (start, frames) = match (self.azimuth, self.frames) {
+            (Some(azimuth), _) => (azimuth, Frames::Count(1)),
+            (None, frames) => (self.start, frames.unwrap_or(Frames::Count(18))),
         };
-        Turntable {
+        // A turn goes on for ever: a range of it is one of as many frames as it needs.
+        let (frames, range) = match frames {
+            Frames::Count(n) => (n, None),
+            Frames::Range([first, last]) => (last + 1, Some([first, last])),
+        };
+        let turntable = Turntable {
             start,
             step: self.step,
             frames,
@@ -515,7 +558,8 @@ impl ViewArgs {
             fov: self.fov,
             up: self.axes.up,
             front: self.axes.front,
-        }
+        };
+        Ok(ViewPath { range, ..ViewPath::turn(size, turntable) })
     }
 }
 
@@ -556,7 +600,8 @@ pub(crate) fn lattice_notice(info: &VolumeInfo) -> Option<String> {
 mod tests {
     use super::*;
     use clap::Parser;
-    use slabcast_common::volume::{Digest32, Volume};
+    use slabcast_common::message::TransferChoice;
+    use slabcast_common::volume::Digest32;
 
     #[derive(Parser)]
     struct Flags {
@@ -584,7 +629,7 @@ mod tests {
         let a = asked("").unwrap();
         assert_eq!(a.path, ViewPath::turn([512, 512], Turntable::default()));
         assert_eq!((a.quality, a.work), (Quality::default(), Work::default()));
-        let request = a.request(PixelFormat::Rgb8, false);
+        let request = a.request(&cube(), PixelFormat::Rgb8, false);
         assert_eq!(request.transfer, TransferChoice::Name("auto".into()));
         assert_eq!(request.background, Background::Colour([0.0; 3]));
     }
@@ -624,7 +669,16 @@ mod tests {
             ("--up z --front=-z", "--front:"),
             ("--tf bonee", "did you mean `bone`"),
             ("--azimuth 3 --step 2", "--azimuth"),
-            ("--path no.json --frames 2", "--path"),
+            ("--path no.json --start 2", "--path"),
+            ("--frames 5..3", "--frames"),
+            ("--frames 3..", "--frames"),
+            ("--view top", "--view"),
+            ("--view left --azimuth 3", "--view"),
+            ("--crop 1:2", "--crop"),
+            ("--crop 9:2,:,:", "--crop"),
+            ("--light 0,0,0", "--light"),
+            ("--nan red", "--nan"),
+            ("--colors virids", "did you mean `viridis`"),
             ("--path no.json", "no.json:"),
         ] {
             let said = asked(line).err().unwrap_or_else(|| panic!("`{line}` was taken"));
@@ -641,7 +695,7 @@ mod tests {
             ("--projection persp --fov 180", "--fov:"),
             ("--projection persp --height 1e30", "--height:"),
         ] {
-            let said = asked(line).unwrap().fit(&cube(), o).unwrap_err();
+            let said = asked(line).unwrap().fit(&cube(), o, false).unwrap_err();
             assert!(said.line().unwrap().starts_with(says), "`{line}` says: {said:?}");
         }
         let dir = tempfile::tempdir().unwrap();
@@ -652,7 +706,7 @@ mod tests {
             "up":[0,0,0],"projection":"ortho"}]}"#,
         )
         .unwrap();
-        let said = asked(&format!("--path {}", file.display())).unwrap().fit(&cube(), o);
+        let said = asked(&format!("--path {}", file.display())).unwrap().fit(&cube(), o, false);
         let said = said.unwrap_err().line().unwrap().to_string();
         assert!(said.contains("p.json: views[0].up:"), "{said}");
     }

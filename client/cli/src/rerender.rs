@@ -60,7 +60,7 @@ pub(crate) fn run(args: &RerenderArgs) -> Result<(), Fail> {
         contact_sheet: None,
         force: args.force,
     };
-    let frames = asked.path.frames() as u64;
+    let frames = asked.frames();
     let inputs = [args.picture.as_path(), file.as_path()];
     let (output, _) = Output::look(&output, "frame", frames, asked.background, &inputs)?;
     let volume = volume::open(file)?;

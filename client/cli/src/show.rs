@@ -94,8 +94,7 @@ impl Stage {
         (asked, orientation): (&Asked, Orientation),
         threads: usize,
     ) -> Result<Stage, Fail> {
-        let transfer = asked.transfer.function(info).map_err(|e| asked.blame(&e))?;
-        let drawn = Drawn::new(volume, info, &transfer, asked.quality)?;
+        let drawn = asked.drawn(volume, info)?;
         let (spec, asked) = (drawn.spec.clone(), asked.clone());
         Ok(Stage { spec, drawn, asked, orientation, threads })
     }

@@ -37,16 +37,15 @@ impl Still {
         check(size)?;
         let volume = volume::open(&of.volume)?;
         let info = volume.info(volume.digest());
-        asked.fit(&info, orientation)?;
+        asked.fit(&info, orientation, volume.anatomical)?;
         if let Some(notice) = lattice_notice(&info) {
             progress::note(&notice);
         }
-        let transfer = asked.transfer.function(&info).map_err(|e| asked.blame(&e))?;
         let camera =
             asked.path.camera(0, &info.lattice, orientation).map_err(|e| asked.blame(&e))?;
         let view =
             View::new(&info.lattice, &camera, size, &asked.quality).map_err(|e| asked.blame(&e))?;
-        let Drawn { spec, bricks } = Drawn::new(&volume, &info, &transfer, asked.quality)?;
+        let Drawn { spec, bricks } = asked.drawn(&volume, &info)?;
         Ok(Still { spec, view, bricks, background: asked.background })
     }
 

@@ -91,6 +91,27 @@ fn world() -> tempfile::TempDir {
     put("nan-eye.json", view("[NaN,0,0]").as_bytes());
     put("endless-eye.json", view("[1e999,0,0]").as_bytes());
     put("eye-is-target.json", view("[0,0,0]").as_bytes());
+    let path = |rest: &str| format!("{{\"version\":1,\"size\":[9,9],{rest}}}");
+    put("near-key.json", path("\"keyframe\":{}").as_bytes());
+    put(
+        "two-kinds.json",
+        path(r#""turntable":{},"keyframes":{"frames":2,"keys":[{}]}"#).as_bytes(),
+    );
+    put(
+        "bad-keys.json",
+        path(r#""keyframes":{"frames":2,"keys":[{},{"eye":[0,0,99],"target":[0,0,0],"up":[0,0,1]}]}"#)
+            .as_bytes(),
+    );
+    put("bad-fly.json", path(r#""flythrough":{"frames":2,"eyes":[[0,0,0],[0,0,0]]}"#).as_bytes());
+    put("bad-tween.json", path(r#""keyframes":{"frames":2,"keys":[{"tf":"bonee"}]}"#).as_bytes());
+    put("short.json", path(r#""turntable":{"frames":5}"#).as_bytes());
+    put(
+        "slope.json",
+        br#"{"version":1,"domain":"unit","colors":[[0,1,1,1]],"opacities":[[0,1]],"gradient_opacity":[[-1,0]]}"#,
+    );
+    put("pv-log.json", br#"[{"RGBPoints":[0,0,0,1],"UseLogScale":1}]"#);
+    put("pv-map.json", br#"[{"RGBPoints":[0,0,0,1]}]"#);
+    put("pv-space.json", br#"[{"RGBPoints":[0,0,0,1],"ColorSpace":"Prolab"}]"#);
     put("big.json", br#"{"version":1,"size":[99999,9],"turntable":{}}"#);
     std::fs::create_dir(dir.path().join("full")).expect("a folder");
     put("full/frame_0000.png", b"mine");
@@ -141,6 +162,28 @@ fn files() -> Vec<(&'static [&'static str], &'static [&'static str])> {
         (&["render", "good.nrrd", "--path", "eye-is-target.json"], &["views[0].eye", "move"]),
         (&["render", "good.nrrd", "--path", "big.json"], &["big.json", "size"]),
         (&["render", "good.nrrd", "--path", "text.txt"], &["text.txt"]),
+        (&["render", "good.nrrd", "--path", "near-key.json"], &["near-key.json", "`keyframes`"]),
+        (&["render", "good.nrrd", "--path", "two-kinds.json"], &["two-kinds.json", "turntable"]),
+        (&["render", "good.nrrd", "--path", "bad-keys.json"], &["bad-keys.json", "keys[1].up"]),
+        (&["render", "good.nrrd", "--path", "bad-fly.json"], &["bad-fly.json", "eyes[1]"]),
+        (
+            &["render", "good.nrrd", "--path", "bad-tween.json"],
+            &["bad-tween.json", "keys[0].tf", "bone"],
+        ),
+        (
+            &["render", "good.nrrd", "--path", "short.json", "--frames", "3..9"],
+            &["short.json", "range"],
+        ),
+        (&["render", "good.nrrd", "--tf", "slope.json"], &["slope.json", "gradient_opacity[0]"]),
+        (&["render", "good.nrrd", "--tf", "pv-log.json"], &["pv-log.json", "UseLogScale"]),
+        (&["render", "good.nrrd", "--tf", "pv-map.json"], &["pv-map.json", "Points", "--colors"]),
+        (
+            &["render", "good.nrrd", "--colors", "pv-space.json"],
+            &["pv-space.json", "ColorSpace", "Lab"],
+        ),
+        (&["render", "good.nrrd", "--colors", "bad-tf.json"], &["bad-tf.json", "--tf"]),
+        (&["tf", "bone", "-o", "big.json"], &["big.json", "--force"]),
+        (&["tf", "missing.json"], &["missing.json"]),
         (&["render", "good.nrrd", "-o", "full"], &["full", "frame_0000.png", "--force"]),
         (&["render", "good.nrrd", "-o", "text.txt"], &["text.txt", "-o"]),
         (&["render", "good.nrrd", "-o", "/proc/slabcast/out"], &["/proc/slabcast"]),
@@ -177,6 +220,19 @@ fn flags() -> Vec<(Vec<&'static str>, &'static [&'static str])> {
         (with(&["--size", "99999999999x9"]), &["--size"]),
         (with(&["--frames", "0"]), &["--frames", "1..=100000"]),
         (with(&["--frames", "1000000000"]), &["--frames"]),
+        (with(&["--frames", "9..3"]), &["--frames", "30..60"]),
+        (with(&["--frames", "3", "--path", "short.json"]), &["--frames", "short.json"]),
+        (with(&["--view", "top"]), &["--view", "superior"]),
+        (with(&["--view", "left"]), &["--view", "--up", "--azimuth"]),
+        (with(&["--view", "left", "--azimuth", "3"]), &["--view", "--azimuth"]),
+        (with(&["--crop", "1:2"]), &["--crop", "FROM:TO"]),
+        (with(&["--crop", "99:,:,:"]), &["--crop", "outside"]),
+        (with(&["--light", "up"]), &["--light", "head"]),
+        (with(&["--shading", "maybe"]), &["--shading"]),
+        (with(&["--nan", "red"]), &["--nan", "#rrggbb"]),
+        (with(&["--colors", "virids"]), &["--colors", "did you mean `viridis`"]),
+        (vec!["tf"], &["TF"]),
+        (vec!["tf", "bonee"], &["--tf", "did you mean `bone`"]),
         (with(&["--eps", "1/0"]), &["--eps", "1/512"]),
         (with(&["--eps", "tiny"]), &["--eps", "1/512"]),
         (with(&["--eps", "2"]), &["--eps", "0.5"]),

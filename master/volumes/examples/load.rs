@@ -4,7 +4,7 @@
 
 use slabcast_common::presets;
 use slabcast_common::quality::Compositing;
-use slabcast_common::transfer::Classifier;
+use slabcast_common::wanted::Wanted;
 use slabcast_volumes::{BrickStore, histogram_sketch, open};
 use std::path::Path;
 use std::time::Instant;
@@ -36,9 +36,9 @@ fn main() {
             std::process::exit(1);
         }
     };
-    let support = Classifier::new(&tf, &volume.info(digest), Compositing::Linear).support();
+    let wanted = Wanted::of(&tf, &volume.info(digest), Compositing::Linear);
     let start = Instant::now();
-    let store = BrickStore::build(&volume, digest, &support, tf.shading.on);
+    let store = BrickStore::build(&volume, digest, &wanted);
     let built = ms(start);
     let start = Instant::now();
     for info in store.infos().iter() {

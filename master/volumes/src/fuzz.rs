@@ -10,6 +10,7 @@ use flate2::Compression;
 use flate2::write::GzEncoder;
 use slabcast_common::transfer::Support;
 use slabcast_common::volume::Digest32;
+use slabcast_common::wanted::Wanted;
 use std::io::Write;
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -149,6 +150,7 @@ fn mutants() -> u64 {
 
 fn survive(what: &str, folder: &Path, mut mutant: impl FnMut(&mut Rng) -> Vec<u8>) {
     let support = Support { intervals: vec![(0.0, f64::MAX)], nan: true };
+    let wanted = Wanted { support, normals: true, gradients: true, crop: None };
     let peak_before = peak_kib();
     let (mut opened, mut slowest) = (0, Duration::ZERO);
     for seed in 1..=mutants() {
@@ -165,7 +167,7 @@ fn survive(what: &str, folder: &Path, mut mutant: impl FnMut(&mut Rng) -> Vec<u8
                 assert!(lo.is_finite() && hi.is_finite(), "{what} seed {seed}: {lo} to {hi}");
                 assert!(volume.lattice.check().is_ok(), "{what} seed {seed}");
                 if seed % 64 == 0 {
-                    BrickStore::build(&volume, Digest32::default(), &support, true);
+                    BrickStore::build(&volume, Digest32::default(), &wanted);
                 }
             }
             Err(problem) => {

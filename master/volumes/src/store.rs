@@ -9,17 +9,18 @@ use rayon::prelude::*;
 use slabcast_common::brick::{
     BRICK, BRICK_VOXELS, Brick, BrickGrid, BrickInfo, BrickSetKey, TightBox,
 };
+use slabcast_common::gradient::encode_magnitude;
 use slabcast_common::ids::BrickId;
 use slabcast_common::shade::encode_normal;
 use slabcast_common::transfer::Support;
 use slabcast_common::volume::{Digest32, Samples, Volume};
+use slabcast_common::wanted::Wanted;
 use std::sync::{Arc, OnceLock};
 
 /// The relevant bricks of a volume for one support, in ascending id.
 pub struct BrickStore {
     key: BrickSetKey,
-    support: Support,
-    normals: bool,
+    wanted: Wanted,
     infos: Arc<[BrickInfo]>,
     bricks: Vec<Arc<Brick>>,
     encoded: Vec<OnceLock<Bytes>>,
@@ -29,26 +30,26 @@ pub struct BrickStore {
 
 impl BrickStore {
     /// Cuts a volume on all cores. `digest` is [`Volume::digest`]; bricks without a relevant
-    /// voxel are left out; normals are made only where `normals` asks for them.
-    pub fn build(volume: &Volume, digest: Digest32, support: &Support, normals: bool) -> Self {
+    /// voxel are left out, and so is all that `wanted` does not ask for.
+    pub fn build(volume: &Volume, digest: Digest32, wanted: &Wanted) -> Self {
+        let support = &wanted.support;
         let cut = match &volume.samples {
             Samples::U8(v) => {
                 let relevant = table(support, 256);
-                cut(volume, v, normals, Samples::U8, |c| relevant[usize::from(c)])
+                cut(volume, v, wanted, Samples::U8, |c| relevant[usize::from(c)])
             }
             Samples::U16(v) => {
                 let relevant = table(support, 65536);
-                cut(volume, v, normals, Samples::U16, |c| relevant[usize::from(c)])
+                cut(volume, v, wanted, Samples::U16, |c| relevant[usize::from(c)])
             }
             Samples::F32(v) => {
-                cut(volume, v, normals, Samples::F32, |c| support.contains(f64::from(c)))
+                cut(volume, v, wanted, Samples::F32, |c| support.contains(f64::from(c)))
             }
         };
         let (infos, bricks): (Vec<BrickInfo>, Vec<Arc<Brick>>) = cut.into_iter().unzip();
         BrickStore {
-            key: support.key(digest, normals),
-            support: support.clone(),
-            normals,
+            key: wanted.key(digest),
+            wanted: wanted.clone(),
             relevant_voxels: infos.iter().map(|b| u64::from(b.voxels)).sum(),
             bytes: infos.iter().map(|b| u64::from(b.bytes)).sum(),
             encoded: infos.iter().map(|_| OnceLock::new()).collect(),
@@ -62,14 +63,9 @@ impl BrickStore {
         self.key
     }
 
-    /// Which codes are relevant.
-    pub fn support(&self) -> &Support {
-        &self.support
-    }
-
-    /// Whether the bricks hold normals.
-    pub fn has_normals(&self) -> bool {
-        self.normals
+    /// What the bricks hold.
+    pub fn wanted(&self) -> &Wanted {
+        &self.wanted
     }
 
     /// The directory of bricks, in ascending id.
@@ -137,7 +133,7 @@ fn table(support: &Support, codes: usize) -> Vec<bool> {
 fn cut<T: Copy + Into<f64> + Sync>(
     volume: &Volume,
     codes: &[T],
-    normals: bool,
+    wanted: &Wanted,
     samples: fn(Vec<T>) -> Samples,
     relevant: impl Fn(T) -> bool + Sync,
 ) -> Vec<(BrickInfo, Arc<Brick>)> {
@@ -150,23 +146,25 @@ fn cut<T: Copy + Into<f64> + Sync>(
         for x in 0..grid.dims[0] {
             let id = grid.id([x, y, z]);
             let mut found = Found::default();
-            field.search([x, y, z].map(|n| n * BRICK), &relevant, &mut found);
+            let inside = |at| wanted.crop.is_none_or(|c| c.holds(&volume.lattice, at));
+            field.search([x, y, z].map(|n| n * BRICK), &relevant, &inside, &mut found);
             let index = &found.index[..found.voxels];
             if index.is_empty() {
                 continue;
             }
             let offsets = &found.offset[..found.voxels];
-            let normals = normals.then(|| {
-                let corner = grid.corner(id);
-                let normal = |(&i, &offset)| {
-                    let local = slabcast_common::brick::local(i);
-                    let at = std::array::from_fn(|a| corner[a] + local[a]);
-                    encode_normal(gradient_matrix * field.difference(at, offset))
-                };
-                index.iter().zip(offsets).map(normal).collect()
-            });
+            let corner = grid.corner(id);
+            let gradient = |(&i, &offset)| {
+                let local = slabcast_common::brick::local(i);
+                let at = std::array::from_fn(|a| corner[a] + local[a]);
+                gradient_matrix * field.difference(at, offset)
+            };
+            let all = || index.iter().zip(offsets).map(gradient);
+            let normals = wanted.normals.then(|| all().map(encode_normal).collect());
+            let magnitude = |g: glam::DVec3| encode_magnitude(g.length(), &volume.summary);
+            let gradients = wanted.gradients.then(|| all().map(magnitude).collect());
             let values = samples(offsets.iter().map(|&o| codes[o]).collect());
-            let brick = Brick::new(id, index.to_vec(), values, normals);
+            let brick = Brick::new(id, index.to_vec(), values, normals).with_gradients(gradients);
             let info = BrickInfo {
                 id,
                 tight: found.tight(),
@@ -217,7 +215,13 @@ struct Field<'a, T> {
 }
 
 impl<T: Copy + Into<f64>> Field<'_, T> {
-    fn search(&self, corner: [u32; 3], relevant: &impl Fn(T) -> bool, found: &mut Found) {
+    fn search(
+        &self,
+        corner: [u32; 3],
+        relevant: &impl Fn(T) -> bool,
+        inside: &impl Fn([u32; 3]) -> bool,
+        found: &mut Found,
+    ) {
         let [nx, ny, _] = self.dims.map(|n| n as usize);
         let end: [u32; 3] = std::array::from_fn(|a| (corner[a] + BRICK).min(self.dims[a]));
         for z in corner[2]..end[2] {
@@ -227,7 +231,7 @@ impl<T: Copy + Into<f64>> Field<'_, T> {
                 let row = (y - corner[1]) * 8 + (z - corner[2]) * 64;
                 let before = found.voxels;
                 for (x, &code) in run.iter().enumerate() {
-                    if relevant(code) {
+                    if relevant(code) && inside([corner[0] + x as u32, y, z]) {
                         found.index[found.voxels] = (row + x as u32) as u16;
                         found.offset[found.voxels] = start + x;
                         found.voxels += 1;
@@ -273,6 +277,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
     use slabcast_common::brick::local;
+    use slabcast_common::path::{Crop, CropUnit};
     use slabcast_common::shade::NO_NORMAL;
     use slabcast_common::volume::{Lattice, ValueMap};
 
@@ -282,12 +287,18 @@ mod tests {
 
     /// Looks at every voxel of a volume, plainly, and compares with what the store holds.
     fn check(volume: &Volume, support: &Support, normals: bool) -> BrickStore {
+        let support = support.clone();
+        check_all(volume, &Wanted { support, normals, gradients: false, crop: None })
+    }
+
+    fn check_all(volume: &Volume, wanted: &Wanted) -> BrickStore {
+        let (support, normals) = (&wanted.support, wanted.normals);
         let digest = volume.digest();
-        let store = BrickStore::build(volume, digest, support, normals);
+        let store = BrickStore::build(volume, digest, wanted);
         let dims = volume.lattice.dims;
         let grid = BrickGrid::of(dims);
         let m = volume.gradient_matrix();
-        assert_eq!(store.key(), support.key(digest, normals));
+        assert_eq!(store.key(), wanted.key(digest));
         assert!(store.infos().windows(2).all(|w| w[0].id < w[1].id), "ids ascend");
         let mut seen = std::collections::BTreeMap::new();
         let mut bytes = 0;
@@ -298,6 +309,7 @@ mod tests {
             assert!(!brick.is_empty() && brick.index.windows(2).all(|w| w[0] < w[1]));
             assert_eq!(brick.tight(&grid), info.tight);
             assert_eq!(brick.normals.is_some(), normals);
+            assert_eq!(brick.gradients.is_some(), wanted.gradients);
             let encoded = store.encoded(info.id).expect("every info has an encoding");
             assert_eq!(encoded.len(), info.bytes as usize);
             let again = store.encoded(info.id).expect("as before");
@@ -313,6 +325,10 @@ mod tests {
                 let l = local(i);
                 let at: [u32; 3] = std::array::from_fn(|a| corner[a] + l[a]);
                 let normal = brick.normals.as_ref().map(|v| v[n]);
+                if let Some(g) = &brick.gradients {
+                    let want = volume.gradient(at, &m).length();
+                    assert_eq!(g[n], encode_magnitude(want, &volume.summary), "gradient at {at:?}");
+                }
                 let before = seen.insert([at[2], at[1], at[0]], (brick.values.code(n), normal));
                 assert_eq!(before, None, "voxel {at:?} is in two bricks");
             }
@@ -325,7 +341,8 @@ mod tests {
                     let offset = ((k * dims[1] + j) * dims[0] + i) as usize;
                     let code = volume.samples.code(offset);
                     let found = seen.remove(&[k, j, i]);
-                    if !support.contains(code) {
+                    let inside = wanted.crop.is_none_or(|c| c.holds(&volume.lattice, [i, j, k]));
+                    if !support.contains(code) || !inside {
                         assert!(found.is_none(), "({i}, {j}, {k}) is not relevant");
                         continue;
                     }
@@ -348,7 +365,7 @@ mod tests {
         #[test]
         fn every_relevant_voxel_is_in_one_brick_with_its_value_and_normal(
             dims in [1u32..20, 1u32..20, 1u32..20], kind in 0u8..3, normals in any::<bool>(),
-            seed in any::<u32>(), cut in 0.0..1.2f64, shear in -0.5..0.5f64,
+            seed in any::<u32>(), cut in 0.0..1.2f64, shear in -0.5..0.5f64, crop in any::<bool>(),
         ) {
             let n = dims.iter().product::<u32>();
             let hash = |i: u32| (seed ^ i).wrapping_mul(2_654_435_761).rotate_left(13) >> 5;
@@ -368,7 +385,12 @@ mod tests {
                 intervals: vec![(0.1 * top * cut, 0.2 * top * cut), (top * cut, top)],
                 nan: seed % 2 == 0,
             };
-            check(&volume, &support, normals);
+            let crop = crop.then(|| {
+                let share = Some(f64::from(seed % 7) / 10.0);
+                let crop = Crop { unit: CropUnit::Unit, x: [None, share.map(|s| s + 0.2)], y: [share, None], ..Crop::default() };
+                crop.of(&volume.lattice).unwrap()
+            });
+            check_all(&volume, &Wanted { support, normals, gradients: seed % 3 == 0, crop });
         }
     }
 
@@ -399,8 +421,8 @@ mod tests {
         let support = span(3.0, 4.0);
         let (with, without) = (check(&v, &support, true), check(&v, &support, false));
         assert_ne!(with.key(), without.key());
-        assert!(with.has_normals() && !without.has_normals());
-        assert_eq!(*with.support(), support);
+        assert!(with.wanted().normals && !without.wanted().normals);
+        assert_eq!(with.wanted().support, support);
         assert!(with.bytes() > without.bytes());
     }
 
@@ -423,7 +445,7 @@ mod tests {
     #[test]
     fn many_threads_get_the_same_bytes() {
         let v = Volume::from_fn_u8("v", [32; 3], |i, j, k| (i * j + k) as u8 | 1);
-        let store = Arc::new(BrickStore::build(&v, v.digest(), &span(1.0, 255.0), true));
+        let store = Arc::new(check(&v, &span(1.0, 255.0), true));
         let id = store.infos()[7].id;
         let seen: Vec<usize> = std::thread::scope(|s| {
             let ask = || store.encoded(id).expect("it is relevant").as_ptr() as usize;

@@ -5,8 +5,8 @@ use glam::DVec3;
 use slabcast_common::presets;
 use slabcast_common::quality::Compositing;
 use slabcast_common::shade::encode_normal;
-use slabcast_common::transfer::Classifier;
 use slabcast_common::volume::{Samples, Volume};
+use slabcast_common::wanted::Wanted;
 use slabcast_volumes::{BrickStore, OpenErrorKind, open};
 use std::path::{Path, PathBuf};
 
@@ -145,8 +145,8 @@ fn a_head_is_cut_as_the_plain_loop_says() {
     let v = volume(&path);
     let digest = v.digest();
     let tf = presets::by_name("peer-opaque", &v.summary).unwrap();
-    let support = Classifier::new(&tf, &v.info(digest), Compositing::Linear).support();
-    let store = BrickStore::build(&v, digest, &support, true);
+    let wanted = Wanted::of(&tf, &v.info(digest), Compositing::Linear);
+    let store = BrickStore::build(&v, digest, &wanted);
     println!("mri256: open, digest, build {:?}", start.elapsed());
     let m = v.gradient_matrix();
     let grid = slabcast_common::brick::BrickGrid::of(v.lattice.dims);

@@ -415,7 +415,7 @@ pub fn brick_batches_to_wire(
     bricks: impl IntoIterator<Item = Bytes>,
 ) -> Vec<v1::BricksDown> {
     // Of the batch: one tag and three bytes of length in `BricksDown`, 2 + 32 of the set. Of a
-    // brick: a tag and at most two bytes of length (a brick has at most 3083 bytes).
+    // brick: a tag and at most two bytes of length (a brick has at most 3595 bytes).
     const OF_BATCH: usize = 4 + 34;
     const OF_BRICK: usize = 3;
     let set = key_to_wire(set);

@@ -1,8 +1,8 @@
 //! Messages between client and master (`render.proto`).
 
+use super::path::{axis_from_wire, path_from_wire, path_to_wire};
 use super::scene::{
-    enum_doors, finite, info_from_wire, info_to_wire, quality_from_wire, quality_to_wire,
-    size_from_wire, triple_from_wire,
+    enum_doors, info_from_wire, info_to_wire, quality_from_wire, quality_to_wire, size_from_wire,
 };
 use super::{
     MAX_NAME, WireError, cut, name_from_wire, optional_name_from_wire, reason_from_wire,
@@ -14,11 +14,9 @@ use bytes::Bytes;
 use slabcast_common::ids::WorkerId;
 use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::message::{PathRequest, TransferChoice};
-use slabcast_common::path::{Axis, Orientation, PathView, ProjectionKind, Turntable, ViewPath};
+use slabcast_common::path::Orientation;
 use slabcast_common::quality::{Schedule, Work};
 
-enum_doors!(projection_to_wire, projection_from_wire, ProjectionKind, v1::ProjectionKind,
-    Some(ProjectionKind::Ortho), { Ortho <=> Ortho, Persp <=> Persp });
 enum_doors!(schedule_to_wire, schedule_from_wire, Schedule, v1::Schedule, Some(Schedule::Auto),
     { Auto <=> Auto, Region <=> Region, Slab <=> Slab });
 enum_doors!(wanted_format_to_wire, wanted_format_from_wire, PixelFormat, v1::PixelFormat,
@@ -120,87 +118,6 @@ fn background_from_wire(background: v1::Background) -> Result<Background, WireEr
             Ok(Background::Colour([r, g, b]))
         }
     }
-}
-
-fn path_to_wire(path: &ViewPath) -> v1::ViewPath {
-    let view = |v: &PathView| v1::PathView {
-        eye: v.eye.to_vec(),
-        target: v.target.to_vec(),
-        up: v.up.to_vec(),
-        projection: projection_to_wire(v.projection),
-        height: v.height,
-        fov: v.fov,
-    };
-    v1::ViewPath {
-        width: path.size[0],
-        height: path.size[1],
-        views: path.views.iter().map(view).collect(),
-        turntable: path.turntable.map(|t| v1::Turntable {
-            start: Some(t.start),
-            step: Some(t.step),
-            frames: Some(t.frames),
-            elevation: Some(t.elevation),
-            height: t.height,
-            projection: projection_to_wire(t.projection),
-            fov: Some(t.fov),
-            up: t.up.map(|a| a.to_string()),
-            front: t.front.map(|a| a.to_string()),
-        }),
-    }
-}
-
-fn path_from_wire(path: v1::ViewPath) -> Result<ViewPath, WireError> {
-    let size = size_from_wire(path.width, path.height)?;
-    let views = path
-        .views
-        .iter()
-        .enumerate()
-        .map(|(i, v)| view_from_wire(v).map_err(|e| e.within(&format!("views[{i}]"))));
-    let turntable = path.turntable.map(turntable_from_wire).transpose();
-    let path = ViewPath {
-        // The JSON's version; here the package has it.
-        version: 1,
-        size,
-        views: views.collect::<Result<_, _>>()?,
-        turntable: turntable.map_err(|e| e.within("turntable"))?,
-    };
-    path.check()?;
-    Ok(path)
-}
-
-fn view_from_wire(view: &v1::PathView) -> Result<PathView, WireError> {
-    Ok(PathView {
-        eye: triple_from_wire("eye", &view.eye)?,
-        target: triple_from_wire("target", &view.target)?,
-        up: triple_from_wire("up", &view.up)?,
-        projection: projection_from_wire("projection", view.projection)?,
-        height: view.height.map(|x| finite("height", x)).transpose()?,
-        fov: view.fov.map(|x| finite("fov", x)).transpose()?,
-    })
-}
-
-fn axis_from_wire(field: &str, axis: &str) -> Result<Axis, WireError> {
-    if axis.len() > 2 {
-        return Err(WireError::value(field, "is not an axis; give x, y or z with + or -"));
-    }
-    axis.parse().map_err(|problem: String| WireError::value(field, problem))
-}
-
-fn turntable_from_wire(t: v1::Turntable) -> Result<Turntable, WireError> {
-    let d = Turntable::default();
-    let axis =
-        |field: &str, axis: Option<String>| axis.map(|a| axis_from_wire(field, &a)).transpose();
-    Ok(Turntable {
-        start: finite("start", t.start.unwrap_or(d.start))?,
-        step: finite("step", t.step.unwrap_or(d.step))?,
-        frames: t.frames.unwrap_or(d.frames),
-        elevation: finite("elevation", t.elevation.unwrap_or(d.elevation))?,
-        height: t.height.map(|x| finite("height", x)).transpose()?,
-        projection: projection_from_wire("projection", t.projection)?,
-        fov: finite("fov", t.fov.unwrap_or(d.fov))?,
-        up: axis("up", t.up)?,
-        front: axis("front", t.front)?,
-    })
 }
 
 // ---------------------------------------------------------------------------------------------

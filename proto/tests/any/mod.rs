@@ -9,7 +9,10 @@ use slabcast_common::ids::*;
 use slabcast_common::image::{Background, PixelFormat, TilePixels, TileState};
 use slabcast_common::message::*;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::path::{Axis, Orientation, PathView, ProjectionKind, Turntable, ViewPath};
+use slabcast_common::path::{
+    Axis, Crop, CropUnit, Easing, FlyThrough, Key, KeyFrames, Orientation, PathView,
+    ProjectionKind, Side, Turntable, ViewPath,
+};
 use slabcast_common::quality::{Compositing, Quality, Schedule, Sums, Work};
 use slabcast_common::shade::{Light, Shading};
 use slabcast_common::slab::SheetRange;
@@ -316,7 +319,9 @@ pub fn brick() -> impl Strategy<Value = Brick> {
             let index: Vec<u16> = index.into_iter().collect();
             let n = index.len();
             let values = Samples::U8(index.iter().map(|i| *i as u8).collect());
+            let gradients = (id % 2 == 1).then(|| vec![9; n]);
             Brick::new(BrickId(id), index, values, normals.then(|| vec![7; n]))
+                .with_gradients(gradients)
         },
     )
 }
@@ -336,6 +341,70 @@ pub fn format() -> impl Strategy<Value = PixelFormat> {
         Just(PixelFormat::Rgba16),
         Just(PixelFormat::Rgba32F)
     ]
+}
+
+/// Keys that pass their own check: whole ones, each of its kind.
+fn keyframes() -> impl Strategy<Value = KeyFrames> {
+    let point = || prop::option::of(triple());
+    let side = prop::sample::select(Side::NAMES.map(|(_, side)| side).to_vec());
+    let place = prop_oneof![
+        side.prop_map(|side| Key { view: Some(side), ..Key::default() }),
+        (number(), number()).prop_map(|(a, e)| Key {
+            azimuth: Some(a),
+            elevation: Some(e),
+            ..Key::default()
+        }),
+        (triple(), point()).prop_map(|(eye, up)| Key { eye: Some(eye), up, ..Key::default() }),
+    ];
+    let tf = prop_oneof![
+        Just(None),
+        "[a-z]{1,9}".prop_map(|n| Some(TransferChoice::Name(n))),
+        transfer().prop_map(|t| Some(TransferChoice::Function(Box::new(t)))),
+    ];
+    let key = (place, point(), number(), tf);
+    let axes = || prop::option::of(axis());
+    (vec(key, 1..5), projection(), any::<bool>(), any::<bool>(), axes(), axes()).prop_map(
+        |(keys, projection, timed, smooth, up, front)| {
+            let keys = keys.into_iter().enumerate().map(|(i, (key, target, x, tf))| Key {
+                at: timed.then_some(i as f64 * 1.5),
+                target,
+                projection,
+                height: (projection == ProjectionKind::Ortho).then_some(x),
+                fov: (projection == ProjectionKind::Persp).then_some(x),
+                tf,
+                ..key
+            });
+            let easing = if smooth { Easing::Smooth } else { Easing::Linear };
+            KeyFrames { frames: 9, easing, up, front, keys: keys.collect() }
+        },
+    )
+}
+
+fn flythrough() -> impl Strategy<Value = FlyThrough> {
+    let eyes = vec(triple(), 3..6)
+        .prop_filter("points apart", |p| (0..p.len()).all(|i| p[i] != p[(i + 1) % p.len()]));
+    let point = || prop::option::of(triple().prop_filter("a direction", |p| *p != [0.0; 3]));
+    (1u32..=100_000, eyes, point(), point(), prop::option::of(0.01..179.0f64), any::<bool>())
+        .prop_map(|(frames, eyes, target, up, fov, closed)| FlyThrough {
+            frames,
+            eyes,
+            target,
+            up,
+            fov,
+            closed,
+        })
+}
+
+fn crop() -> impl Strategy<Value = Crop> {
+    let axis = || {
+        (prop::option::of(-9.0..0.0f64), prop::option::of(0.5..9.0f64)).prop_map(|(a, b)| [a, b])
+    };
+    (axis(), axis(), axis(), any::<bool>()).prop_map(|(x, y, z, unit)| Crop {
+        unit: if unit { CropUnit::Unit } else { CropUnit::World },
+        x,
+        y,
+        z,
+    })
 }
 
 pub fn path_request() -> impl Strategy<Value = PathRequest> {
@@ -362,11 +431,23 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
     let path = (
         size(),
         prop_oneof![
-            vec(view, 1..5).prop_map(|views| (views, None)),
-            turntable.prop_map(|t| (vec![], Some(t)))
+            vec(view, 1..5).prop_map(|views| ViewPath::of_views([1, 1], views)),
+            turntable.prop_map(|t| ViewPath::turn([1, 1], t)),
+            keyframes().prop_map(|k| {
+                ViewPath { keyframes: Some(k), ..ViewPath::of_views([1, 1], vec![]) }
+            }),
+            flythrough().prop_map(|f| {
+                ViewPath { flythrough: Some(f), ..ViewPath::of_views([1, 1], vec![]) }
+            }),
         ],
+        prop::option::of(crop()),
+        any::<bool>(),
     )
-        .prop_map(|(size, (views, turntable))| ViewPath { version: 1, size, views, turntable });
+        .prop_map(|(size, path, crop, range)| {
+            let last = path.frames() as u32 - 1;
+            let range = range.then_some([last / 3, last]);
+            ViewPath { size, crop, range, ..path }
+        });
     let transfer = prop_oneof![
         "[a-z-]{1,20}".prop_map(TransferChoice::Name),
         transfer().prop_map(|t| TransferChoice::Function(Box::new(t)))

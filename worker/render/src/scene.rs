@@ -130,7 +130,7 @@ impl Frame {
     /// raw units: extinction and the three sigma-weighted shaded colours.
     #[inline]
     pub fn payload(&self, brick: &Brick, i: usize, eye: DVec3) -> [f32; 4] {
-        let look = self.scene.classifier.look(&brick.values, i);
+        let look = self.scene.classifier.look_of(brick, i);
         let rgb = match &self.scene.shader {
             None => look.rgb,
             Some(shader) => {

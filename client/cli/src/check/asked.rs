@@ -74,7 +74,7 @@ impl Scene {
         match self {
             Scene::Opaque => {}
             Scene::Translucent => transfer.shading.on = false,
-            Scene::Stiff => transfer = cases::uncapped(&volume.info(volume.digest())),
+            Scene::Stiff => transfer = cases::uncapped(),
             Scene::Boxes => {
                 volume.lattice = Lattice::from_spacing([n; 3], [0.75, 1.0, 2.25]);
                 transfer.shading.light = Light::Direction([0.5, 1.0, 0.25]);

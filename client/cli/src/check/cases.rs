@@ -1,8 +1,8 @@
 //! What is rendered for comparison: volumes, looks, two cameras; and the serial renderer's
 //! answer to each.
 
-use super::cluster;
 use super::shot::Drawn;
+use super::{cluster, looks};
 use crate::fail::Fail;
 use crate::volume;
 use glam::DVec3;
@@ -10,7 +10,7 @@ use slabcast_common::message::PathRequest;
 use slabcast_common::path::{Orientation, PathView, ProjectionKind, ViewPath};
 use slabcast_common::presets;
 use slabcast_common::quality::{Compositing, Quality, Sums, Work};
-use slabcast_common::transfer::{Domain, OpacityUnit, TransferFunction};
+use slabcast_common::transfer::{OpacityUnit, TransferFunction};
 use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
 use slabcast_render::{Frame, Scene, serial};
@@ -40,7 +40,7 @@ type Formula = (&'static str, &'static str, &'static str, Tweak);
 /// What formula volumes are there for: shaded and opaque; faint and unlit, where nothing hides
 /// anything; 16-bit; float with a ramp of opacity; step edges in thin sheets; one voxel; a line
 /// longer than any picture; each compositing rule; sums in floats; nothing shut at all; 16-bit sums.
-const FORMULAS: [Formula; 11] = [
+const FORMULAS: [Formula; 12] = [
     ("formula:spheres", "spheres/auto", "auto", |_| {}),
     ("formula:fog", "fog/grey", "grey", |_| {}),
     ("formula:blob", "blob/extinction", "extinction", |_| {}),
@@ -53,6 +53,8 @@ const FORMULAS: [Formula; 11] = [
         q.eps = 0.0;
     }),
     ("formula:spheres", "spheres/auto/i16", "auto", |q| q.sums = Sums::I16),
+    // Bricks that hold gradients.
+    ("formula:spheres", "spheres/glass", "glass", |_| {}),
     ("formula:wall", "wall/peer-vessels/paper", "peer-vessels", |q| {
         q.compositing = Compositing::Paper;
     }),
@@ -66,7 +68,7 @@ const FORMULAS: [Formula; 11] = [
 
 /// How many of [`FORMULAS`] the matrix takes: those that differ in how they are rendered. The
 /// others differ in arithmetic alone, which golden frames watch.
-const IN_MATRIX: usize = 7;
+const IN_MATRIX: usize = 8;
 
 /// The cases of the matrix: the volume (if any), and formula volumes.
 pub(crate) fn of_matrix(file: Option<&Path>, size: [u32; 2]) -> Result<Vec<Case>, Fail> {
@@ -122,8 +124,11 @@ impl Case {
     ) -> Result<Case, Fail> {
         let info = volume.info(volume.digest());
         let transfer = match tf {
-            "extinction" => uncapped(&info),
-            name => presets::by_name(name, &info.summary).map_err(|e| Fail::flag(&e))?,
+            "extinction" => uncapped(),
+            tf => match looks::of(&name) {
+                Some(fixed) => fixed,
+                None => presets::by_name(tf, &info.summary).map_err(|e| Fail::flag(&e))?,
+            },
         };
         let mut quality = Quality::default();
         tweak(&mut quality);
@@ -146,15 +151,11 @@ impl Case {
             height: None,
             fov: (projection == ProjectionKind::Persp).then_some(40.0),
         };
-        ViewPath {
-            version: 1,
-            size: self.size,
-            views: vec![
-                view(DVec3::new(0.75, 1.5, 0.625), ProjectionKind::Ortho),
-                view(DVec3::new(-0.75, 0.625, -0.375), ProjectionKind::Persp),
-            ],
-            turntable: None,
-        }
+        let views = vec![
+            view(DVec3::new(0.75, 1.5, 0.625), ProjectionKind::Ortho),
+            view(DVec3::new(-0.75, 0.625, -0.375), ProjectionKind::Persp),
+        ];
+        ViewPath::of_views(self.size, views)
     }
 
     /// The request for both views.
@@ -182,12 +183,10 @@ impl Case {
 }
 
 /// Extinctions far beyond the cap of opacities, so that sums are floats.
-pub(super) fn uncapped(info: &VolumeInfo) -> TransferFunction {
-    let grey = presets::by_name("grey", &info.summary).expect("a preset of ours");
+pub(super) fn uncapped() -> TransferFunction {
+    let grey = looks::grey(vec![[0.0, 0.0], [0.2, 0.0], [0.6, 0.8], [0.9, 5.0], [1.0, 400.0]]);
     TransferFunction {
-        domain: Domain::Unit,
         opacity_unit: OpacityUnit::Extinction,
-        opacities: vec![[0.0, 0.0], [0.2, 0.0], [0.6, 0.8], [0.9, 5.0], [1.0, 400.0]],
         shading: slabcast_common::shade::Shading::default(),
         ..grey
     }

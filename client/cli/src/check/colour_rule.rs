@@ -104,7 +104,7 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
     let threads = args.threads.count();
     let volume = volume::open(&args.of.volume)?;
     let info = volume.info(volume.digest());
-    asked.fit(&info, orientation)?;
+    asked.fit(&info, orientation, volume.anatomical)?;
     if let Some(notice) = lattice_notice(&info) {
         progress::note(&notice);
     }

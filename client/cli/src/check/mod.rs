@@ -19,6 +19,7 @@ mod enclose;
 mod extreme;
 mod golden;
 mod invariance;
+mod looks;
 mod matrix;
 mod pairwise;
 mod scenes;

@@ -12,11 +12,12 @@ use slabcast_common::brick::Brick;
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::Picture;
 use slabcast_common::message::{PathRequest, SceneSpec};
-use slabcast_common::path::{Orientation, PathView, ViewPath};
+use slabcast_common::path::{CropBox, Orientation, PathView, ViewPath};
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::view::View;
 use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_common::wanted::Wanted;
 use slabcast_render::reference::{Reference, stratified};
 use slabcast_render::{Frame, Scene, serial};
 use slabcast_volumes::BrickStore;
@@ -63,10 +64,21 @@ impl Drawn {
         transfer: &TransferFunction,
         quality: Quality,
     ) -> Result<Drawn, Fail> {
+        Drawn::cropped(volume, info, transfer, quality, None)
+    }
+
+    /// The same of what lies in a box.
+    pub(crate) fn cropped(
+        volume: &Volume,
+        info: &VolumeInfo,
+        transfer: &TransferFunction,
+        quality: Quality,
+        crop: Option<CropBox>,
+    ) -> Result<Drawn, Fail> {
         let classifier = Classifier::new(transfer, info, quality.compositing);
         let sums = classifier.sums(quality.sums).map_err(|e| Fail::flag(&e))?;
-        let (support, normals) = (classifier.support(), transfer.shading.on);
-        let store = BrickStore::build(volume, info.digest, &support, normals);
+        let wanted = Wanted { crop, ..Wanted::of(transfer, info, quality.compositing) };
+        let store = BrickStore::build(volume, info.digest, &wanted);
         let bricks = store.infos().iter().filter_map(|i| store.brick(i.id).cloned()).collect();
         let spec = SceneSpec {
             id: SceneId(0),
@@ -90,7 +102,7 @@ pub(crate) struct Ready {
 
 impl Shot {
     fn path(&self) -> ViewPath {
-        ViewPath { version: 1, size: self.size, views: vec![self.view], turntable: None }
+        ViewPath::of_views(self.size, vec![self.view])
     }
 
     /// The request that has a cluster draw it.

@@ -2,6 +2,7 @@
 
 use super::file::hidden;
 use crate::fail::Fail;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 /// Where the frames of one run go.
@@ -23,10 +24,10 @@ impl Folder {
     pub(crate) fn look(
         path: &Path,
         (stem, extension): (&'static str, &'static str),
-        frames: u64,
+        frames: Range<u64>,
         force: bool,
     ) -> Result<(Folder, Option<String>), Fail> {
-        let digits = (frames.saturating_sub(1)).to_string().len().max(4);
+        let digits = (frames.end.saturating_sub(1)).to_string().len().max(4);
         let folder = Folder { path: path.to_path_buf(), stem, extension, digits, made: Vec::new() };
         let entries = match std::fs::read_dir(path) {
             Ok(entries) => entries,
@@ -48,7 +49,8 @@ impl Folder {
             })
             .collect();
         there.sort_unstable();
-        let (ours, beyond): (Vec<u64>, Vec<u64>) = there.into_iter().partition(|n| *n < frames);
+        let (ours, beyond): (Vec<u64>, Vec<u64>) =
+            there.into_iter().partition(|n| frames.contains(n));
         if !ours.is_empty() && !force {
             return Err(Fail::failed(format!(
                 "{}: holds {} already; add --force to replace {}, or give another folder with -o",
@@ -146,23 +148,23 @@ mod tests {
         for n in [0, 3, 20] {
             std::fs::write(dir.path().join(format!("frame_{n:04}.png")), "x").unwrap();
         }
-        let e = Folder::look(dir.path(), PNG, 18, false).unwrap_err();
+        let e = Folder::look(dir.path(), PNG, 0..18, false).unwrap_err();
         let said = e.line().unwrap();
         assert!(
             said.contains("frame_0000.png ... frame_0003.png (2 of them)")
                 && said.contains("--force"),
             "{said}"
         );
-        let (_, stay) = Folder::look(dir.path(), PNG, 18, true).unwrap();
+        let (_, stay) = Folder::look(dir.path(), PNG, 0..18, true).unwrap();
         assert!(stay.unwrap().starts_with("frame_0020.png of an earlier run stays"));
-        assert!(Folder::look(dir.path(), ("frame", "exr"), 18, false).is_ok());
+        assert!(Folder::look(dir.path(), ("frame", "exr"), 0..18, false).is_ok());
     }
 
     #[test]
     fn a_folder_that_was_made_in_vain_goes_again() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a/b");
-        let (mut folder, _) = Folder::look(&path, PNG, 1, false).unwrap();
+        let (mut folder, _) = Folder::look(&path, PNG, 0..1, false).unwrap();
         folder.make().unwrap();
         assert!(path.is_dir());
         drop(folder);
@@ -171,7 +173,8 @@ mod tests {
 
     #[test]
     fn names_sort_however_many_there_are() {
-        let (folder, _) = Folder::look(Path::new("nowhere-at-all"), PNG, 100_000, false).unwrap();
+        let (folder, _) =
+            Folder::look(Path::new("nowhere-at-all"), PNG, 0..100_000, false).unwrap();
         assert_eq!(folder.name(7), "frame_00007.png");
         assert_eq!(folder.list(&[2]), "frame_00002.png");
     }

@@ -199,7 +199,7 @@ impl Output {
     pub(crate) fn look(
         args: &OutputArgs,
         stem: &'static str,
-        frames: u64,
+        frames: std::ops::Range<u64>,
         background: Background,
         inputs: &[&Path],
     ) -> Result<(Output, Option<String>), Fail> {
@@ -270,7 +270,8 @@ impl Output {
             may_write(path, "output", inputs, args.force)?;
             Target::Movie(path.clone())
         } else if named.is_some() {
-            if frames > 1 {
+            if frames.end - frames.start > 1 {
+                let frames = frames.end - frames.start;
                 return Err(Fail::usage(format!(
                     "-o: {shown} is one picture, and the path has {frames} views; give a folder, \
                      --azimuth for one view, or turn.apng or turn.y4m for a moving picture"
@@ -543,7 +544,7 @@ mod tests {
             contact_sheet: None,
             force: false,
         };
-        Output::look(&args, "frame", frames, Background::Colour([0.0; 3]), &[])
+        Output::look(&args, "frame", 0..frames, Background::Colour([0.0; 3]), &[])
             .map(|(output, _)| output)
             .map_err(|e| e.line().unwrap_or_default().to_string())
     }

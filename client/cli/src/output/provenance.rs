@@ -14,6 +14,7 @@ use slabcast_common::path::{Orientation, ViewPath};
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::stats::FrameStats;
 use slabcast_common::transfer::TransferFunction;
+use slabcast_common::tween::Tween;
 use slabcast_common::volume::VolumeInfo;
 use std::path::Path;
 
@@ -149,7 +150,7 @@ impl Recipe {
             format: _,
             background,
             want_trace: _,
-        } = asked.request(format.pixels(asked.background), false);
+        } = asked.request(info, format.pixels(asked.background), false);
         let mut path = path;
         if let Some(t) = &mut path.turntable {
             // Another machine may have been told of other axes.
@@ -157,6 +158,17 @@ impl Recipe {
                 (t.up.is_none() || t.up == Some(orientation.up)).then_some(orientation.front);
             t.front = t.front.or(front);
             t.up = t.up.or(Some(orientation.up));
+        }
+        if let Some(k) = &mut path.keyframes {
+            let front =
+                (k.up.is_none() || k.up == Some(orientation.up)).then_some(orientation.front);
+            k.front = k.front.or(front);
+            k.up = k.up.or(Some(orientation.up));
+            // Presets may get better; the picture stays.
+            Tween::fix(k, &info.summary).map_err(|e| asked.blame(&e))?;
+        }
+        if let Some(f) = &mut path.flythrough {
+            f.up = f.up.or(Some(orientation.up.vector().to_array()));
         }
         Ok(Recipe {
             base: Provenance {

@@ -246,7 +246,7 @@ impl<'a> Walk<'a> {
         for (i, &local) in brick.index.iter().enumerate() {
             let eye = corner + self.of.offsets[local as usize];
             let Some((enter, leave)) = self.ray.inside(eye, eye, self.of_use) else { continue };
-            let look = self.looks.look(&brick.values, i);
+            let look = self.looks.look_of(brick, i);
             if look.sigma <= 0.0 {
                 continue;
             }

@@ -148,7 +148,7 @@ fn subjects<'a>(
             Some(json) => TransferFunction::from_json(json)
                 .map_err(|e| Fail::failed(format!("{name}: {e}")))?,
             None => {
-                asked.fit(&info, orientation)?;
+                asked.fit(&info, orientation, volume.anatomical)?;
                 if let Some(notice) = lattice_notice(&info) {
                     progress::note(&notice);
                 }

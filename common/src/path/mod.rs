@@ -1,6 +1,19 @@
 //! View paths: what a client submits and the cameras that follow from it (CONTRACTS.md).
+//!
+//! A path is one of four: explicit [`views`](ViewPath::views), a [`Turntable`], [`KeyFrames`], a
+//! [`FlyThrough`]. Beside it stand what holds for all frames: a [`Crop`], and a range of frames
+//! that keep their numbers.
 
-use crate::quality::Refused;
+mod crop;
+mod fly;
+mod keys;
+mod turn;
+
+pub use crop::{Crop, CropBox, CropUnit};
+pub use fly::FlyThrough;
+pub use keys::{Easing, Key, KeyFrames, MAX_KEYS, Side};
+
+use crate::quality::{Refused, json_error};
 use crate::view::{Camera, CameraProjection};
 use crate::volume::Lattice;
 use glam::DVec3;
@@ -158,6 +171,19 @@ pub struct ViewPath {
     /// Or a turn.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub turntable: Option<Turntable>,
+    /// Or key frames.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub keyframes: Option<KeyFrames>,
+    /// Or a flight.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub flythrough: Option<FlyThrough>,
+    /// What of the volume is there at all; all of it if missing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub crop: Option<Crop>,
+    /// The first and the last frame that are wanted, both included; all if missing. Numbers stay
+    /// those of the whole path.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub range: Option<[u32; 2]>,
 }
 
 /// Which axes of a volume are up and front.
@@ -183,64 +209,128 @@ impl Orientation {
         }
         Ok(Orientation { up, front })
     }
+
+    /// These axes, unless a path has others of its own.
+    fn or_else(self, up: Option<Axis>, front: Option<Axis>) -> Result<Self, Refused> {
+        let same_up = up.is_none_or(|up| up == self.up);
+        Orientation::new(up.or(Some(self.up)), front.or(same_up.then_some(self.front)))
+    }
 }
 
 impl ViewPath {
+    /// Explicit views.
+    pub fn of_views(size: [u32; 2], views: Vec<PathView>) -> Self {
+        ViewPath {
+            version: 1,
+            size,
+            views,
+            turntable: None,
+            keyframes: None,
+            flythrough: None,
+            crop: None,
+            range: None,
+        }
+    }
+
     /// A turntable.
     pub fn turn(size: [u32; 2], turntable: Turntable) -> Self {
-        ViewPath { version: 1, size, views: Vec::new(), turntable: Some(turntable) }
+        ViewPath { turntable: Some(turntable), ..ViewPath::of_views(size, Vec::new()) }
     }
 
     /// Reads the JSON of CONTRACTS.md.
     pub fn from_json(text: &str) -> Result<Self, Refused> {
-        let path: ViewPath = serde_json::from_str(text)
-            .map_err(|e| Refused::new("view path", format!("not valid: {e}")))?;
+        let path: ViewPath = serde_json::from_str(text).map_err(|e| json_error("view path", &e))?;
         path.check()?;
         Ok(path)
     }
 
-    /// Checks version and counts.
+    /// Checks version, counts, and whatever needs no volume.
     pub fn check(&self) -> Result<(), Refused> {
         if self.version != 1 {
             return Err(Refused::new("version", "this program knows version 1; set it to 1"));
         }
-        match (&self.turntable, self.views.len()) {
-            (None, 0) => Err(Refused::new("views", "no view; give views or a turntable")),
-            (Some(_), 1..) => {
-                Err(Refused::new("turntable", "given beside views; leave one of them out"))
+        let kinds = [
+            ("views", !self.views.is_empty()),
+            ("turntable", self.turntable.is_some()),
+            ("keyframes", self.keyframes.is_some()),
+            ("flythrough", self.flythrough.is_some()),
+        ];
+        let given: Vec<&str> = kinds.iter().filter(|k| k.1).map(|k| k.0).collect();
+        match given[..] {
+            [] => {
+                return Err(Refused::new(
+                    "views",
+                    "no view; give views, a turntable, keyframes or a flythrough",
+                ));
             }
-            (Some(t), _) if t.frames == 0 || t.frames as usize > MAX_FRAMES => {
-                Err(Refused::new("frames", format!("{} frames; give 1 to {MAX_FRAMES}", t.frames)))
+            [first, second, ..] => {
+                let problem = format!("given beside {first}; leave one of them out");
+                return Err(Refused::new(second, problem));
             }
-            (None, n) if n > MAX_FRAMES => {
-                Err(Refused::new("views", format!("{n} views; give at most {MAX_FRAMES}")))
-            }
-            _ => Ok(()),
+            [_] => {}
         }
+        let n = self.all_frames();
+        if n > MAX_FRAMES && !self.views.is_empty() {
+            return Err(Refused::new("views", format!("{n} views; give at most {MAX_FRAMES}")));
+        }
+        if n == 0 || n > MAX_FRAMES {
+            return Err(Refused::new("frames", format!("{n} frames; give 1 to {MAX_FRAMES}")));
+        }
+        self.keyframes.as_ref().map_or(Ok(()), KeyFrames::check)?;
+        self.flythrough.as_ref().map_or(Ok(()), FlyThrough::check)?;
+        self.crop.as_ref().map_or(Ok(()), Crop::check)?;
+        if let Some([first, last]) = self.range
+            && (first > last || last as usize >= self.all_frames())
+        {
+            return Err(Refused::new(
+                "range",
+                format!("{first}..{last}; the path has frames 0 to {}", self.all_frames() - 1),
+            ));
+        }
+        Ok(())
     }
 
-    /// Number of frames.
+    /// Frames of the whole path.
+    fn all_frames(&self) -> usize {
+        let counts = [
+            self.turntable.map(|t| t.frames),
+            self.keyframes.as_ref().map(|k| k.frames),
+            self.flythrough.as_ref().map(|f| f.frames),
+        ];
+        counts.into_iter().flatten().next().map_or(self.views.len(), |n| n as usize)
+    }
+
+    /// Number of frames that are wanted.
     pub fn frames(&self) -> usize {
-        self.turntable.map_or(self.views.len(), |t| t.frames as usize)
+        self.range.map_or(self.all_frames(), |[first, last]| (last - first) as usize + 1)
     }
 
-    /// The path of frame `i` alone: the same view, to the bit.
+    /// The number that the first wanted frame has on the whole path.
+    pub fn first_frame(&self) -> usize {
+        self.range.map_or(0, |[first, _]| first as usize)
+    }
+
+    /// The path of one frame alone, by its number on the whole path: the same view, to the bit.
     ///
     /// # Panics
-    /// If there is no such frame.
-    pub fn only(&self, i: usize) -> ViewPath {
-        assert!(i < self.frames(), "frame {i} of {}", self.frames());
+    /// If that frame is not wanted.
+    pub fn only(&self, number: usize) -> ViewPath {
+        let first = self.first_frame();
+        assert!((first..first + self.frames()).contains(&number), "frame {number}");
+        let one = ViewPath { range: None, ..self.clone() };
         match self.turntable {
             // What `camera` adds up for this frame; nothing is added to it for the first.
             Some(t) => {
-                let start = t.start + t.step * i as f64;
-                ViewPath::turn(self.size, Turntable { start, frames: 1, ..t })
+                let start = t.start + t.step * number as f64;
+                ViewPath { turntable: Some(Turntable { start, frames: 1, ..t }), ..one }
             }
-            None => ViewPath { views: vec![self.views[i]], ..self.clone() },
+            None if !self.views.is_empty() => ViewPath { views: vec![self.views[number]], ..one },
+            // What lies between keys hangs on all of them.
+            None => ViewPath { range: Some([number as u32; 2]), ..one },
         }
     }
 
-    /// The camera of frame `i`.
+    /// The camera of frame `i` of those that are wanted.
     ///
     /// # Errors
     /// Names the field that is not finite or has no meaning.
@@ -250,35 +340,96 @@ impl ViewPath {
         lattice: &Lattice,
         orientation: Orientation,
     ) -> Result<Camera, Refused> {
-        let whole = 1.25 * lattice.largest_extent();
-        let Some(t) = &self.turntable else {
-            let v = &self.views[i];
-            let name = |f: &str| format!("views[{i}].{f}");
-            let finite = |field: &str, x: [f64; 3]| {
-                let v = DVec3::from_array(x);
-                if v.is_finite() {
-                    Ok(v)
-                } else {
-                    Err(Refused::new(name(field), "must be finite numbers"))
-                }
-            };
-            let (eye, target) = (finite("eye", v.eye)?, finite("target", v.target)?);
-            let up = finite("up", v.up)?;
-            let to_eye = eye - target;
-            let projection = match v.projection {
-                ProjectionKind::Ortho => {
-                    CameraProjection::Ortho { height: v.height.unwrap_or(whole) }
-                }
-                ProjectionKind::Persp => CameraProjection::Persp {
-                    fov: v.fov.unwrap_or(30.0),
-                    distance: to_eye.length(),
-                },
-            };
-            if to_eye.length() == 0.0 {
-                return Err(Refused::new(name("eye"), "is the target; move one of them"));
-            }
-            return Ok(Camera { to_eye, up, target: target - lattice.centre(), projection });
+        self.prepare(lattice, orientation)?.camera(i)
+    }
+
+    /// Makes what all cameras share ready, once for a path.
+    ///
+    /// # Errors
+    /// Names the field that has no meaning.
+    pub fn prepare(
+        &self,
+        lattice: &Lattice,
+        orientation: Orientation,
+    ) -> Result<Cameras<'_>, Refused> {
+        let curve = if let Some(keys) = &self.keyframes {
+            Curve::Keys(keys.prepare(lattice, orientation)?)
+        } else if let Some(f) = &self.flythrough {
+            Curve::Flight(f.prepare(lattice, orientation)?, f.frames as usize)
+        } else {
+            Curve::None
         };
+        Ok(Cameras { path: self, lattice: *lattice, orientation, curve })
+    }
+}
+
+enum Curve {
+    None,
+    Keys(keys::KeyedPath),
+    Flight(fly::Flight, usize),
+}
+
+/// A path's cameras, in any order.
+pub struct Cameras<'a> {
+    path: &'a ViewPath,
+    lattice: Lattice,
+    orientation: Orientation,
+    curve: Curve,
+}
+
+impl Cameras<'_> {
+    /// The camera of frame `i` of those that are wanted.
+    ///
+    /// # Errors
+    /// Names the field that is not finite or has no meaning.
+    pub fn camera(&self, i: usize) -> Result<Camera, Refused> {
+        let i = self.path.first_frame() + i;
+        match (&self.curve, &self.path.turntable) {
+            (Curve::Keys(keys), _) => Ok(keys.at(i as f64)),
+            (Curve::Flight(flight, frames), _) => Ok(flight.frame(i, *frames)),
+            (Curve::None, Some(t)) => t.camera(i, &self.lattice, self.orientation),
+            (Curve::None, None) => self.path.views[i].camera(i, &self.lattice),
+        }
+    }
+}
+
+impl PathView {
+    fn camera(&self, i: usize, lattice: &Lattice) -> Result<Camera, Refused> {
+        let name = |f: &str| format!("views[{i}].{f}");
+        let finite = |field: &str, x: [f64; 3]| {
+            let v = DVec3::from_array(x);
+            if v.is_finite() {
+                Ok(v)
+            } else {
+                Err(Refused::new(name(field), "must be finite numbers"))
+            }
+        };
+        let (eye, target) = (finite("eye", self.eye)?, finite("target", self.target)?);
+        let up = finite("up", self.up)?;
+        let to_eye = eye - target;
+        let projection = match self.projection {
+            ProjectionKind::Ortho => CameraProjection::Ortho {
+                height: self.height.unwrap_or(1.25 * lattice.largest_extent()),
+            },
+            ProjectionKind::Persp => {
+                CameraProjection::Persp { fov: self.fov.unwrap_or(30.0), distance: to_eye.length() }
+            }
+        };
+        if to_eye.length() == 0.0 {
+            return Err(Refused::new(name("eye"), "is the target; move one of them"));
+        }
+        Ok(Camera { to_eye, up, target: target - lattice.centre(), projection })
+    }
+}
+
+impl Turntable {
+    fn camera(
+        &self,
+        i: usize,
+        lattice: &Lattice,
+        orientation: Orientation,
+    ) -> Result<Camera, Refused> {
+        let t = self;
         for (field, x) in [("start", t.start), ("step", t.step)] {
             if x.is_nan() || x.abs() > 1e9 {
                 return Err(Refused::new(field, format!("{x} degrees; give a finite angle")));
@@ -290,19 +441,8 @@ impl ViewPath {
                 format!("{} degrees; give -90 to 90", t.elevation),
             ));
         }
-        let o = Orientation::new(
-            t.up.or(Some(orientation.up)),
-            t.front
-                .or((t.up.is_none() || t.up == Some(orientation.up)).then_some(orientation.front)),
-        )?;
-        let side = Axis::positive(3 - o.up.index - o.front.index).vector();
-        let (front, up) = (o.front.vector(), o.up.vector());
-        // Whole turns are taken off in degrees, where that is exact.
-        let azimuth = libm::fmod(t.start + t.step * i as f64, 360.0);
-        let (sin_a, cos_a) = sin_cos_degrees(azimuth);
-        let (sin_e, cos_e) = sin_cos_degrees(t.elevation);
-        let level = front * cos_a + side * sin_a;
-        let height = t.height.unwrap_or(whole);
+        let o = orientation.or_else(t.up, t.front)?;
+        let height = t.height.unwrap_or(1.25 * lattice.largest_extent());
         let projection = match t.projection {
             ProjectionKind::Ortho => CameraProjection::Ortho { height },
             ProjectionKind::Persp => CameraProjection::Persp {
@@ -310,14 +450,21 @@ impl ViewPath {
                 distance: height / 2.0 / libm::tan(t.fov.to_radians() / 2.0),
             },
         };
-        Ok(Camera {
-            to_eye: level * cos_e + up * sin_e,
-            // At right angles to the eye's direction: no pole.
-            up: up * cos_e - level * sin_e,
-            target: DVec3::ZERO,
-            projection,
-        })
+        let (to_eye, up) = direction(o, t.start + t.step * i as f64, t.elevation);
+        Ok(Camera { to_eye, up, target: DVec3::ZERO, projection })
     }
+}
+
+/// The direction to the eye and the picture's up, for an azimuth and an elevation in degrees.
+fn direction(o: Orientation, azimuth: f64, elevation: f64) -> (DVec3, DVec3) {
+    let side = Axis::positive(3 - o.up.index - o.front.index).vector();
+    let (front, up) = (o.front.vector(), o.up.vector());
+    // Whole turns are taken off in degrees, where that is exact.
+    let (sin_a, cos_a) = sin_cos_degrees(libm::fmod(azimuth, 360.0));
+    let (sin_e, cos_e) = sin_cos_degrees(elevation);
+    let level = front * cos_a + side * sin_a;
+    // Up is at right angles to the eye's direction: no pole.
+    (level * cos_e + up * sin_e, up * cos_e - level * sin_e)
 }
 
 /// Sine and cosine of an angle in degrees, exact at multiples of 90.

@@ -1,0 +1,218 @@
+//! Which values have which colour and opacity: a preset, a map or a file, and what flags change of
+//! it.
+
+use crate::fail::Fail;
+use crate::parse;
+use slabcast_common::message::TransferChoice;
+use slabcast_common::paraview;
+use slabcast_common::presets;
+use slabcast_common::quality::Refused;
+use slabcast_common::shade::Light;
+use slabcast_common::transfer::{ColorSpace, Domain, NanLook, TransferFunction};
+use slabcast_common::volume::VolumeInfo;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+/// Largest transfer function or path file that is read: a path of 100,000 views has 20 MB.
+const MAX_JSON_BYTES: u64 = 64 << 20;
+
+/// What flags change of a transfer function.
+#[derive(clap::Args, Clone, Debug)]
+pub(crate) struct LookFlags {
+    /// Colours of a map (viridis, inferno, magma, plasma, cividis, turbo, cool-warm, greys) or of a
+    /// ParaView file, spread over what the transfer function shows
+    #[arg(long, value_name = "MAP|FILE")]
+    colors: Option<String>,
+    /// Where light comes from: head (the eye), or a direction in world axes
+    #[arg(long, value_name = "head|X,Y,Z", value_parser = parse::light, allow_hyphen_values = true)]
+    light: Option<Light>,
+    /// Light on voxels: on or off
+    #[arg(long, value_name = "on|off", value_parser = parse::on_off)]
+    shading: Option<bool>,
+    /// Look of NaN: a colour, and after a colon its opacity [default: invisible]
+    #[arg(long, value_name = "COLOUR[:A]", value_parser = parse::nan)]
+    nan: Option<NanLook>,
+}
+
+/// A transfer function and where it came from.
+#[derive(Clone, Debug)]
+pub(crate) struct Transfer {
+    base: TransferChoice,
+    file: Option<PathBuf>,
+    /// The preset that a function came from, where only that is known.
+    preset: Option<String>,
+    /// Over 0 to 1, sRGB numbers.
+    colours: Option<Vec<[f64; 4]>>,
+    light: Option<Light>,
+    shading: Option<bool>,
+    nan: Option<NanLook>,
+}
+
+impl Transfer {
+    /// A preset or map by name, or a file if it exists or its name ends in `.json`. A preset's name
+    /// means the preset even beside a file of that name; `./bone` means the file.
+    pub(crate) fn parse(text: &str, flags: &LookFlags) -> Result<Self, Fail> {
+        let colours = flags.colors.as_deref().map(colours).transpose()?;
+        let LookFlags { light, shading, nan, .. } = *flags;
+        let (base, file) = if is_name(text) {
+            (TransferChoice::Name(text.into()), None)
+        } else {
+            let path = Path::new(text);
+            if !is_file(path) {
+                return Err(Fail::flag(&presets::unknown(text)));
+            }
+            let json = read_json(path)?;
+            let tf = if paraview::is(&json) {
+                paraview::read(&json)
+                    .and_then(paraview::Read::function)
+                    .map_err(|e| Fail::field(path, "colour map", &e))?
+            } else {
+                TransferFunction::from_json(&json)
+                    .map_err(|e| Fail::field(path, "transfer function", &e))?
+            };
+            (TransferChoice::Function(Box::new(tf)), Some(path.to_path_buf()))
+        };
+        Ok(Transfer { base, file, preset: None, colours, light, shading, nan })
+    }
+
+    /// A preset as it is by itself.
+    #[cfg(test)]
+    pub(crate) fn plain(name: &str) -> Result<Self, Fail> {
+        let flags = LookFlags { colors: None, light: None, shading: None, nan: None };
+        Transfer::parse(name, &flags)
+    }
+
+    /// What a picture says that it was drawn with.
+    pub(crate) fn again(tf: &TransferFunction, preset: Option<String>) -> Self {
+        let base = TransferChoice::Function(Box::new(tf.clone()));
+        Transfer { base, file: None, preset, colours: None, light: None, shading: None, nan: None }
+    }
+
+    /// The preset that it is or came from.
+    pub(crate) fn preset(&self) -> Option<&str> {
+        match &self.base {
+            TransferChoice::Name(name) => Some(name),
+            TransferChoice::Function(_) => self.preset.as_deref(),
+        }
+    }
+
+    /// Its file, if it has one.
+    pub(crate) fn file(&self) -> Option<&Path> {
+        self.file.as_deref()
+    }
+
+    /// What it is called in messages.
+    pub(crate) fn name(&self) -> String {
+        match (&self.base, &self.file) {
+            (TransferChoice::Name(name), _) => name.clone(),
+            (_, Some(file)) => file.display().to_string(),
+            (_, None) => "given".into(),
+        }
+    }
+
+    /// In full, for a volume with these values.
+    pub(crate) fn function(&self, info: &VolumeInfo) -> Result<TransferFunction, Refused> {
+        let mut tf = match &self.base {
+            TransferChoice::Name(name) => presets::by_name(name, &info.summary)?,
+            TransferChoice::Function(tf) => (**tf).clone(),
+        };
+        if let Some(colours) = &self.colours {
+            let (from, to) = shown(&tf, info);
+            tf.colors = presets::spread(colours, from, to);
+            tf.color_space = ColorSpace::Srgb;
+        }
+        if let Some(light) = self.light {
+            tf.shading.light = light;
+            tf.shading.on = true;
+        }
+        tf.shading.on = self.shading.unwrap_or(tf.shading.on);
+        tf.nan = self.nan.unwrap_or(tf.nan);
+        tf.check()?;
+        Ok(tf)
+    }
+
+    /// What is sent: a name as it is, so that a master may know it better, unless flags change it.
+    pub(crate) fn choice(&self, info: &VolumeInfo) -> TransferChoice {
+        let changed = self.colours.is_some()
+            || self.light.is_some()
+            || self.shading.is_some()
+            || self.nan.is_some();
+        match self.function(info) {
+            Ok(tf) if changed => TransferChoice::Function(Box::new(tf)),
+            // What can't be made is refused by the master in the words of `fit`.
+            _ => self.base.clone(),
+        }
+    }
+}
+
+/// The x between which a function shows anything, within the volume's values.
+fn shown(tf: &TransferFunction, info: &VolumeInfo) -> (f64, f64) {
+    let (lo, hi) = match tf.domain {
+        Domain::Unit => (0.0, 1.0),
+        Domain::Value => info.summary.range(),
+    };
+    let seen: Vec<usize> = (0..tf.opacities.len()).filter(|&i| tf.opacities[i][1] > 0.0).collect();
+    let (Some(&first), Some(&last)) = (seen.first(), seen.last()) else { return (lo, hi) };
+    // From the point before, where a line begins to rise, to where colours of the function end:
+    // a few bright voxels should not take half of a map.
+    let from = tf.opacities[first.saturating_sub(1)][0].clamp(lo, hi);
+    let to = tf.opacities[(last + 1).min(tf.opacities.len() - 1)][0].clamp(lo, hi);
+    let end = tf.colors.last().map_or(to, |c| c[0]);
+    let to = if end > from { to.min(end) } else { to };
+    if to > from { (from, to) } else { (lo, hi) }
+}
+
+fn is_name(text: &str) -> bool {
+    presets::NAMES.iter().chain(&presets::MAPS).any(|(name, _)| *name == text)
+}
+
+/// A pipe (`<(...)` of a shell) is a file, too.
+fn is_file(path: &Path) -> bool {
+    path.metadata().is_ok_and(|m| !m.is_dir()) || path.extension().is_some_and(|e| e == "json")
+}
+
+/// Colours of a map or a ParaView file, over 0 to 1.
+fn colours(text: &str) -> Result<Vec<[f64; 4]>, Fail> {
+    if let Some(colours) = presets::map_colours(text) {
+        return Ok(colours);
+    }
+    let path = Path::new(text);
+    if !is_file(path) {
+        let names = presets::MAPS.map(|(name, _)| name);
+        let meant = presets::nearest(text, &names)
+            .map(|n| format!("did you mean `{n}`? "))
+            .unwrap_or_default();
+        return Err(Fail::usage(format!(
+            "--colors: `{text}` is neither a map nor a file; {meant}maps are {}",
+            names.join(", ")
+        )));
+    }
+    let json = read_json(path)?;
+    if !paraview::is(&json) {
+        return Err(Fail::failed(format!(
+            "{}: is no colour map of ParaView; a transfer function goes with --tf",
+            path.display()
+        )));
+    }
+    let read = paraview::read(&json).map_err(|e| Fail::field(path, "colour map", &e))?;
+    Ok(read.unit_colours())
+}
+
+pub(crate) fn read_json(path: &Path) -> Result<String, Fail> {
+    let fail = |e: &std::io::Error| Fail::io(path, "reading", e);
+    let file = std::fs::File::open(path).map_err(|e| fail(&e))?;
+    if file.metadata().map_err(|e| fail(&e))?.is_dir() {
+        return Err(Fail::failed(format!("{}: is a folder; give a JSON file", path.display())));
+    }
+    let mut bytes = Vec::new();
+    file.take(MAX_JSON_BYTES + 1).read_to_end(&mut bytes).map_err(|e| fail(&e))?;
+    if bytes.len() as u64 > MAX_JSON_BYTES {
+        return Err(Fail::failed(format!(
+            "{}: has more than {} MB, which is no view path or transfer function",
+            path.display(),
+            MAX_JSON_BYTES / 1_000_000
+        )));
+    }
+    String::from_utf8(bytes)
+        .map_err(|_| Fail::failed(format!("{}: is not text; give a JSON file", path.display())))
+}

@@ -1,0 +1,645 @@
+//! Key frames: cameras that a path passes, and what lies between.
+//!
+//! A camera is taken apart into what people move: the turn of the eye's axes (a quaternion), the
+//! target, and the logarithm of the world height shown there, so that a zoom from 400 to 4 mm takes
+//! as long for each halving. `smooth` joins them by curves whose speed does not jump at a key,
+//! `linear` by arcs and lines of constant speed. Keys themselves are drawn exactly as they are
+//! written. Between two keys the eye turns the short way: a whole turn takes three keys.
+
+use super::{Axis, Orientation, ProjectionKind, turn};
+use crate::quality::Refused;
+use crate::transfer::TransferChoice;
+use crate::view::{Camera, CameraProjection};
+use crate::volume::Lattice;
+use glam::{DMat3, DQuat, DVec3};
+use serde::{Deserialize, Serialize};
+
+/// Most keys of a path.
+pub const MAX_KEYS: usize = 10_000;
+
+/// What lies between two keys.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Easing {
+    /// Curves: speeds do not jump at keys.
+    #[default]
+    Smooth,
+    /// Arcs and lines of constant speed.
+    Linear,
+}
+
+/// A side of the body, from which it is looked at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Side {
+    /// From the front.
+    Anterior,
+    /// From behind.
+    Posterior,
+    /// From the body's own left.
+    Left,
+    /// From its right.
+    Right,
+    /// From above, front up.
+    Superior,
+    /// From below, front up.
+    Inferior,
+}
+
+impl Side {
+    /// Every name.
+    pub const NAMES: [(&'static str, Side); 6] = [
+        ("anterior", Side::Anterior),
+        ("left", Side::Left),
+        ("superior", Side::Superior),
+        ("posterior", Side::Posterior),
+        ("right", Side::Right),
+        ("inferior", Side::Inferior),
+    ];
+
+    /// Azimuth and elevation in degrees of a volume that stands like this. Front is anterior and
+    /// up superior; right is what then lies to the right hand of the body.
+    pub fn angles(self, o: Orientation) -> (f64, f64) {
+        // Azimuths grow towards the positive side axis, which is the right only if front, up
+        // and side are turned like anterior, superior and right.
+        let right = o.front.vector().cross(o.up.vector());
+        let towards_right = if right.max_element() > 0.5 { 90.0 } else { -90.0 };
+        match self {
+            Side::Anterior => (0.0, 0.0),
+            Side::Posterior => (180.0, 0.0),
+            Side::Right => (towards_right, 0.0),
+            Side::Left => (-towards_right, 0.0),
+            Side::Superior => (180.0, 90.0),
+            Side::Inferior => (0.0, -90.0),
+        }
+    }
+}
+
+/// One key: a camera, and what it is seen with.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Key {
+    /// The frame at which the path is here; need not be whole. All keys have it, or none: then
+    /// they lie evenly between the first and the last frame.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub at: Option<f64>,
+    /// The eye's side; or `azimuth` and `elevation`; or `eye`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub view: Option<Side>,
+    /// Degrees from the front.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub azimuth: Option<f64>,
+    /// Degrees towards up.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub elevation: Option<f64>,
+    /// Where the eye is, in world units.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub eye: Option<[f64; 3]>,
+    /// Where it looks; default the volume's centre.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub target: Option<[f64; 3]>,
+    /// What is up, beside `eye`; default the volume's up.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub up: Option<[f64; 3]>,
+    /// Projection, the same for all keys.
+    pub projection: ProjectionKind,
+    /// World height shown at the target; default 1.25 times the largest extent. Not beside `eye`
+    /// in perspective, where the distance says it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub height: Option<f64>,
+    /// Vertical full field of view in degrees (`persp`; default 30).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fov: Option<f64>,
+    /// Transfer function from here on, tweened to the next key that has one; default the path's.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tf: Option<TransferChoice>,
+}
+
+/// Key frames.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct KeyFrames {
+    /// Frames of the path.
+    pub frames: u32,
+    /// What lies between keys.
+    #[serde(default)]
+    pub easing: Easing,
+    /// Up; default what the volume was opened with.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub up: Option<Axis>,
+    /// Front; default what the volume was opened with.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub front: Option<Axis>,
+    /// The keys.
+    pub keys: Vec<Key>,
+}
+
+impl KeyFrames {
+    /// Checks counts and times.
+    pub fn check(&self) -> Result<(), Refused> {
+        let refuse = |field: String, problem: String| Err(Refused::new(field, problem));
+        if self.keys.is_empty() || self.keys.len() > MAX_KEYS {
+            return refuse(
+                "keyframes.keys".into(),
+                format!("{} keys; give 1 to {MAX_KEYS}", self.keys.len()),
+            );
+        }
+        let timed = self.keys.iter().filter(|k| k.at.is_some()).count();
+        if timed != 0 && timed != self.keys.len() {
+            return refuse(
+                "keyframes.keys".into(),
+                "some have `at`, some not; give it to all or to none".into(),
+            );
+        }
+        let kind = self.keys[0].projection;
+        for (i, k) in self.keys.iter().enumerate() {
+            let field = |name: &str| format!("keyframes.keys[{i}].{name}");
+            if let Some(at) = k.at
+                && !(at.is_finite() && at >= 0.0 && at <= f64::from(self.frames.max(1) - 1))
+            {
+                return refuse(
+                    field("at"),
+                    format!("{at}; give a frame from 0 to {}", self.frames.max(1) - 1),
+                );
+            }
+            if i > 0 && k.at.is_some() && k.at <= self.keys[i - 1].at {
+                return refuse(field("at"), "is not after the key before; sort them".into());
+            }
+            if k.projection != kind {
+                return refuse(
+                    field("projection"),
+                    "differs from the first key's; give one projection".into(),
+                );
+            }
+            let angles = k.azimuth.is_some() || k.elevation.is_some();
+            if [k.view.is_some(), angles, k.eye.is_some()].iter().filter(|&&x| x).count() > 1 {
+                return refuse(field("eye"), "give one of view, azimuth and elevation, eye".into());
+            }
+            if k.up.is_some() && k.eye.is_none() {
+                return refuse(field("up"), "goes with `eye`; leave it out".into());
+            }
+            if k.fov.is_some() && kind == ProjectionKind::Ortho {
+                return refuse(
+                    field("fov"),
+                    "goes with \"projection\": \"persp\"; leave it out".into(),
+                );
+            }
+            if k.height.is_some() && k.eye.is_some() && kind == ProjectionKind::Persp {
+                return refuse(field("height"), "the eye's distance says it; leave it out".into());
+            }
+        }
+        Ok(())
+    }
+
+    /// The time of key `i`, in frames.
+    pub(crate) fn time(&self, i: usize) -> f64 {
+        let last = f64::from(self.frames.max(1) - 1);
+        self.keys[i].at.unwrap_or_else(|| match self.keys.len() {
+            1 => 0.0,
+            n => last * i as f64 / (n - 1) as f64,
+        })
+    }
+
+    /// Makes all cameras ready.
+    ///
+    /// # Errors
+    /// Names the key and its field.
+    pub(super) fn prepare(
+        &self,
+        lattice: &Lattice,
+        orientation: Orientation,
+    ) -> Result<KeyedPath, Refused> {
+        let orientation = orientation.or_else(self.up, self.front)?;
+        let mut keys = Vec::with_capacity(self.keys.len());
+        for (i, k) in self.keys.iter().enumerate() {
+            let camera = k
+                .camera(lattice, orientation)
+                .map_err(|e| Refused::new(format!("keyframes.keys[{i}].{}", e.field), e.problem))?;
+            let pose = Pose::of(&camera).ok_or_else(|| {
+                Refused::new(
+                    format!("keyframes.keys[{i}].up"),
+                    "lies along the line of sight; give another",
+                )
+            })?;
+            keys.push(Stop { time: self.time(i), camera, pose });
+        }
+        // Of the two quaternions of a turn the nearer to the one before: no flips.
+        for i in 1..keys.len() {
+            if keys[i].pose.turn.dot(keys[i - 1].pose.turn) < 0.0 {
+                keys[i].pose.turn = -keys[i].pose.turn;
+            }
+        }
+        Ok(KeyedPath { easing: self.easing, keys })
+    }
+}
+
+impl Key {
+    fn camera(&self, lattice: &Lattice, o: Orientation) -> Result<Camera, Refused> {
+        let finite = |field: &str, x: [f64; 3]| match DVec3::from_array(x) {
+            v if v.is_finite() => Ok(v),
+            _ => Err(Refused::new(field, "must be finite numbers")),
+        };
+        let target = match self.target {
+            Some(t) => finite("target", t)? - lattice.centre(),
+            None => DVec3::ZERO,
+        };
+        let height = self.height.unwrap_or(1.25 * lattice.largest_extent());
+        if !(height.is_finite() && height > 0.0) {
+            return Err(Refused::new("height", "must be finite and above zero"));
+        }
+        let fov = self.fov.unwrap_or(30.0);
+        if !(0.01..=179.0).contains(&fov) {
+            return Err(Refused::new("fov", format!("{fov} degrees; give 0.01 to 179")));
+        }
+        let mut distance = height / 2.0 / libm::tan(fov.to_radians() / 2.0);
+        let (to_eye, up) = match self.eye {
+            Some(eye) => {
+                let to_eye = finite("eye", eye)? - lattice.centre() - target;
+                distance = to_eye.length();
+                if distance == 0.0 {
+                    return Err(Refused::new("eye", "is the target; move one of them"));
+                }
+                let up = self.up.map_or(Ok(o.up.vector()), |up| finite("up", up))?;
+                (to_eye, up)
+            }
+            None => {
+                let (azimuth, elevation) = match self.view {
+                    Some(side) => side.angles(o),
+                    None => (self.azimuth.unwrap_or(0.0), self.elevation.unwrap_or(0.0)),
+                };
+                if !azimuth.is_finite() || azimuth.abs() > 1e9 {
+                    return Err(Refused::new("azimuth", "must be a finite angle in degrees"));
+                }
+                if !(-90.0..=90.0).contains(&elevation) {
+                    return Err(Refused::new(
+                        "elevation",
+                        format!("{elevation} degrees; give -90 to 90"),
+                    ));
+                }
+                super::direction(o, azimuth, elevation)
+            }
+        };
+        let projection = match self.projection {
+            ProjectionKind::Ortho => CameraProjection::Ortho { height },
+            ProjectionKind::Persp => CameraProjection::Persp { fov, distance },
+        };
+        Ok(Camera { to_eye, up, target, projection })
+    }
+}
+
+/// A camera taken apart.
+#[derive(Clone, Copy, Debug)]
+struct Pose {
+    /// From world to eye axes.
+    turn: DQuat,
+    target: DVec3,
+    /// Logarithm of the world height shown at the target.
+    size: f64,
+    /// Logarithm of the tangent of half the field of view; nothing for parallel rays.
+    lens: Option<f64>,
+}
+
+impl Pose {
+    /// `None` if up lies along the line of sight.
+    fn of(c: &Camera) -> Option<Pose> {
+        let unit = |v: DVec3| v / v.abs().max_element();
+        let forward = -unit(c.to_eye) / unit(c.to_eye).length();
+        let up = unit(c.up) / unit(c.up).length();
+        let right = forward.cross(up);
+        if right.is_nan() || right.length() < 1e-9 {
+            return None;
+        }
+        let right = right / right.length();
+        let down = forward.cross(right);
+        let turn = turn::of_matrix(&DMat3::from_cols(right, down, forward).transpose());
+        let (size, lens) = match c.projection {
+            CameraProjection::Ortho { height } => (libm::log(height), None),
+            CameraProjection::Persp { fov, distance } => {
+                let tan = libm::tan(fov.to_radians() / 2.0);
+                (libm::log(2.0 * distance * tan), Some(libm::log(tan)))
+            }
+        };
+        Some(Pose { turn, target: c.target, size, lens })
+    }
+
+    fn camera(&self) -> Camera {
+        // Rows of the rotation are the eye's axes in the world.
+        let world_from_eye = self.turn.conjugate();
+        let projection = match self.lens {
+            None => CameraProjection::Ortho { height: libm::exp(self.size) },
+            Some(lens) => {
+                let tan = libm::exp(lens);
+                CameraProjection::Persp {
+                    fov: (2.0 * libm::atan(tan)).to_degrees(),
+                    distance: libm::exp(self.size) / (2.0 * tan),
+                }
+            }
+        };
+        Camera {
+            to_eye: world_from_eye * -DVec3::Z,
+            up: world_from_eye * -DVec3::Y,
+            target: self.target,
+            projection,
+        }
+    }
+}
+
+struct Stop {
+    time: f64,
+    camera: Camera,
+    pose: Pose,
+}
+
+/// A path through key frames, ready to be asked for any time.
+pub(super) struct KeyedPath {
+    easing: Easing,
+    keys: Vec<Stop>,
+}
+
+impl KeyedPath {
+    /// The camera at a time in frames.
+    pub(super) fn at(&self, time: f64) -> Camera {
+        let after = self.keys.partition_point(|k| k.time <= time);
+        let Some(i) = after.checked_sub(1) else { return self.keys[0].camera };
+        let a = &self.keys[i];
+        let Some(b) = self.keys.get(after).filter(|_| a.time < time) else { return a.camera };
+        let width = b.time - a.time;
+        let t = (time - a.time) / width;
+        let (p, q) = (&a.pose, &b.pose);
+        if let Easing::Linear = self.easing {
+            let mix = |x: f64, y: f64| x * (1.0 - t) + y * t;
+            return Pose {
+                turn: turn::slerp(p.turn, q.turn, t),
+                target: p.target * (1.0 - t) + q.target * t,
+                size: mix(p.size, q.size),
+                lens: p.lens.zip(q.lens).map(|(x, y)| mix(x, y)),
+            }
+            .camera();
+        }
+        let (from, to) = (self.speed(i), self.speed(i + 1));
+        Pose {
+            turn: turn::curve(p.turn, q.turn, from.turn * width, to.turn * width, t),
+            target: hermite(p.target, q.target, from.target * width, to.target * width, t),
+            size: hermite(p.size, q.size, from.size * width, to.size * width, t),
+            lens: p
+                .lens
+                .zip(q.lens)
+                .map(|(x, y)| hermite(x, y, from.lens * width, to.lens * width, t)),
+        }
+        .camera()
+    }
+
+    /// How fast everything changes at key `i`, per frame: the speed of the parabola through it and its
+    /// neighbours; at the ends that of the only side there is. A key that repeats its neighbour
+    /// is a halt.
+    fn speed(&self, i: usize) -> Speed {
+        let side = |a: usize, b: usize| {
+            let (p, q) = (&self.keys[a].pose, &self.keys[b].pose);
+            let width = self.keys[b].time - self.keys[a].time;
+            Speed {
+                turn: turn::from_to(p.turn, q.turn) / width,
+                target: (q.target - p.target) / width,
+                size: (q.size - p.size) / width,
+                lens: (q.lens.unwrap_or(0.0) - p.lens.unwrap_or(0.0)) / width,
+            }
+        };
+        match (i > 0, i + 1 < self.keys.len()) {
+            (false, false) => Speed::default(),
+            (false, true) => side(i, i + 1),
+            (true, false) => side(i - 1, i),
+            (true, true) => {
+                let (before, after) = (side(i - 1, i), side(i, i + 1));
+                let [w, v] = [i, i + 1].map(|k| self.keys[k].time - self.keys[k - 1].time);
+                // The nearer neighbour counts more.
+                let mix = v / (w + v);
+                Speed {
+                    turn: halt(before.turn, after.turn, mix),
+                    target: halt(before.target, after.target, mix),
+                    size: halt_1d(before.size, after.size, mix),
+                    lens: halt_1d(before.lens, after.lens, mix),
+                }
+            }
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug, Default)]
+struct Speed {
+    turn: DVec3,
+    target: DVec3,
+    size: f64,
+    lens: f64,
+}
+
+/// The mean of two speeds; none where one of them is none, so that what rests stays at rest.
+fn halt(before: DVec3, after: DVec3, mix: f64) -> DVec3 {
+    if before == DVec3::ZERO || after == DVec3::ZERO {
+        DVec3::ZERO
+    } else {
+        before * mix + after * (1.0 - mix)
+    }
+}
+
+/// The same for a number, which also turns round without running over.
+fn halt_1d(before: f64, after: f64, mix: f64) -> f64 {
+    if before * after <= 0.0 {
+        return 0.0;
+    }
+    let mean = before * mix + after * (1.0 - mix);
+    // Three times the slower side at most: beyond that a cubic overshoots (Fritsch and Carlson).
+    let most = 3.0 * before.abs().min(after.abs());
+    mean.clamp(-most, most)
+}
+
+/// A cubic from `a` to `b` with the speeds `from` and `to` (over its whole width).
+fn hermite<T>(a: T, b: T, from: T, to: T, t: f64) -> T
+where
+    T: Copy + std::ops::Add<Output = T> + std::ops::Mul<f64, Output = T>,
+{
+    let u = 1.0 - t;
+    a * (u * u * (1.0 + 2.0 * t))
+        + b * (t * t * (1.0 + 2.0 * u))
+        + from * (t * u * u)
+        + to * (-t * t * u)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::path::ViewPath;
+    use proptest::prelude::*;
+
+    fn lattice() -> Lattice {
+        Lattice::from_spacing([64; 3], [1.0; 3])
+    }
+
+    fn standing() -> Orientation {
+        Orientation::new(None, None).unwrap()
+    }
+
+    fn path(frames: u32, easing: Easing, keys: Vec<Key>) -> ViewPath {
+        ViewPath {
+            keyframes: Some(KeyFrames { frames, easing, up: None, front: None, keys }),
+            ..ViewPath::of_views([64; 2], vec![])
+        }
+    }
+
+    fn turned(azimuth: f64, elevation: f64) -> Key {
+        Key { azimuth: Some(azimuth), elevation: Some(elevation), ..Key::default() }
+    }
+
+    fn cameras(p: &ViewPath) -> Vec<Camera> {
+        p.check().unwrap();
+        let ready = p.prepare(&lattice(), standing()).unwrap();
+        (0..p.frames()).map(|i| ready.camera(i).unwrap()).collect()
+    }
+
+    fn pose(c: &Camera) -> Pose {
+        Pose::of(c).unwrap()
+    }
+
+    fn any_key() -> impl Strategy<Value = Key> {
+        (-400.0..400.0f64, -80.0..80.0f64, [-9.0..9.0f64, -9.0..9.0, -9.0..9.0], 1.0..500.0f64)
+            .prop_map(|(azimuth, elevation, target, height)| Key {
+                target: Some(target),
+                height: Some(height),
+                ..turned(azimuth, elevation)
+            })
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(48))]
+        #[test]
+        fn keys_are_hit_exactly_and_nothing_flips_or_jumps(
+            keys in prop::collection::vec(any_key(), 2..6), smooth in any::<bool>(), persp in any::<bool>(),
+        ) {
+            let projection = if persp { ProjectionKind::Persp } else { ProjectionKind::Ortho };
+            let keys: Vec<Key> = keys.into_iter().map(|k| Key { projection, ..k }).collect();
+            let easing = if smooth { Easing::Smooth } else { Easing::Linear };
+            let (n, each) = (keys.len(), 60);
+            let frames = each * (n as u32 - 1) + 1;
+            let all = cameras(&path(frames, easing, keys.clone()));
+            for (i, k) in keys.iter().enumerate() {
+                let want = k.camera(&lattice(), standing()).unwrap();
+                prop_assert_eq!(all[each as usize * i], want, "key {}", i);
+            }
+            for pair in all.windows(2) {
+                let (a, b) = (pose(&pair[0]), pose(&pair[1]));
+                // Half a turn in 60 frames is 3 degrees each; a curve is at most a few times
+                // faster. A flip would be half a turn at once.
+                prop_assert!(turn::angle(a.turn, b.turn) < 0.6);
+                prop_assert!((a.size - b.size).abs() < 0.6 && (a.target - b.target).length() < 4.0);
+            }
+        }
+
+        #[test]
+        fn linear_paths_turn_and_zoom_at_constant_speed(a in any_key(), b in any_key()) {
+            let all: Vec<Pose> = cameras(&path(33, Easing::Linear, vec![a, b])).iter().map(pose).collect();
+            let steps: Vec<(f64, f64)> = all.windows(2)
+                .map(|w| (turn::angle(w[0].turn, w[1].turn), w[1].size - w[0].size)).collect();
+            for s in &steps {
+                prop_assert!((s.0 - steps[0].0).abs() < 1e-8, "{steps:?}");
+                prop_assert!((s.1 - steps[0].1).abs() < 1e-9, "{steps:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_smooth_path_has_no_jump_of_speed_at_its_keys() {
+        let keys =
+            vec![turned(0.0, 0.0), turned(90.0, 30.0), turned(120.0, -20.0), turned(260.0, 0.0)];
+        let all: Vec<Pose> = cameras(&path(601, Easing::Smooth, keys)).iter().map(pose).collect();
+        let speed = |i: usize| turn::from_to(all[i].turn, all[i + 1].turn);
+        for key in [200, 400] {
+            let (before, after) = (speed(key - 1), speed(key));
+            assert!((before - after).length() < 0.1 * before.length(), "{before} {after}");
+        }
+    }
+
+    #[test]
+    fn a_key_that_repeats_is_a_halt_and_a_zoom_does_not_overshoot() {
+        let near = |h: f64| Key { height: Some(h), ..turned(10.0, 0.0) };
+        let all =
+            cameras(&path(91, Easing::Smooth, vec![near(400.0), near(4.0), near(4.0), near(40.0)]));
+        let height = |c: &Camera| match c.projection {
+            CameraProjection::Ortho { height } => height,
+            CameraProjection::Persp { .. } => panic!("parallel"),
+        };
+        assert!(all[30..=60].iter().all(|c| (height(c) - 4.0).abs() < 1e-9));
+        assert!(all.iter().all(|c| (3.999..=400.001).contains(&height(c))));
+        // Half of the zoom in logarithms is done half-way, but for the curve's ends.
+        assert!(libm::log(height(&all[15]) / 40.0).abs() < 0.7, "{}", height(&all[15]));
+    }
+
+    #[test]
+    fn times_may_be_given_and_hold_outside() {
+        let at = |at: f64, azimuth: f64| Key { at: Some(at), ..turned(azimuth, 0.0) };
+        let p = path(11, Easing::Linear, vec![at(2.0, 0.0), at(6.0, 40.0)]);
+        let all = cameras(&p);
+        assert_eq!(all[0], all[2]);
+        assert_eq!(all[6], all[10]);
+        let turn_of = |i: usize| turn::angle(pose(&all[2]).turn, pose(&all[i]).turn).to_degrees();
+        assert!((turn_of(3) - 10.0).abs() < 1e-9 && (turn_of(5) - 30.0).abs() < 1e-9);
+        let one = path(3, Easing::Smooth, vec![turned(5.0, 6.0)]);
+        assert!(cameras(&one).windows(2).all(|w| w[0] == w[1]));
+    }
+
+    #[test]
+    fn sides_are_those_of_the_body_whichever_way_it_lies() {
+        let axis = |a: &str| a.parse::<Axis>().unwrap();
+        // RAS, then a head that lies with its crown towards -y and its face towards +z.
+        for (up, front) in [("z", "y"), ("-y", "z"), ("x", "-z"), ("-z", "-y"), ("y", "x")] {
+            let o = Orientation::new(Some(axis(up)), Some(axis(front))).unwrap();
+            let right = o.front.vector().cross(o.up.vector());
+            for (side, eye, top) in [
+                (Side::Anterior, o.front.vector(), o.up.vector()),
+                (Side::Posterior, -o.front.vector(), o.up.vector()),
+                (Side::Right, right, o.up.vector()),
+                (Side::Left, -right, o.up.vector()),
+                (Side::Superior, o.up.vector(), o.front.vector()),
+                (Side::Inferior, -o.up.vector(), o.front.vector()),
+            ] {
+                let (azimuth, elevation) = side.angles(o);
+                let (to_eye, up) = super::super::direction(o, azimuth, elevation);
+                assert!((to_eye - eye).length() < 1e-12, "{side:?} of {o:?}: {to_eye}");
+                assert!((up - top).length() < 1e-12, "{side:?} of {o:?}: {up}");
+            }
+        }
+        let ras = standing();
+        let right = ras.front.vector().cross(ras.up.vector());
+        assert_eq!(right, DVec3::X, "+x is the right of RAS");
+    }
+
+    #[test]
+    fn wrong_keys_are_named() {
+        let bad = |keys: &str| {
+            let text = format!(
+                r#"{{"version":1,"size":[9,9],"keyframes":{{"frames":9,"keys":[{keys}]}}}}"#
+            );
+            match ViewPath::from_json(&text) {
+                Err(e) => e.to_string(),
+                Ok(p) => p.prepare(&lattice(), standing()).err().expect("refused").to_string(),
+            }
+        };
+        for (keys, says) in [
+            ("", "keyframes.keys"),
+            (r#"{"view":"top"}"#, "top"),
+            (r#"{"azimut":3}"#, "did you mean `azimuth`"),
+            (r#"{"view":"left","eye":[0,0,1]}"#, "keys[0].eye"),
+            (r#"{"at":0},{}"#, "`at`"),
+            (r#"{"at":5},{"at":5}"#, "keys[1].at"),
+            (r#"{"at":9}"#, "keys[0].at"),
+            (r#"{},{"projection":"persp"}"#, "keys[1].projection"),
+            (r#"{"up":[0,0,1]}"#, "keys[0].up"),
+            (r#"{"eye":[0,0,99],"target":[0,0,0],"up":[0,0,1]}"#, "keys[0].up"),
+            (r#"{"eye":[1,1,1],"target":[1,1,1]}"#, "keys[0].eye"),
+            (r#"{"height":-3}"#, "keys[0].height"),
+            (r#"{"elevation":100}"#, "keys[0].elevation"),
+            (r#"{"fov":30}"#, "keys[0].fov"),
+            (r#"{"tf":3}"#, "tf"),
+        ] {
+            let said = bad(keys);
+            assert!(said.contains(says), "{keys}: {said}");
+        }
+    }
+}

@@ -1,0 +1,354 @@
+//! What a histogram tells of a volume: where its air ends, where its solid begins, how dense it
+//! gets.
+//!
+//! A preset that knew only the smallest and the largest value would show nothing of most files:
+//! scanners leave noise around the body, saturated voxels at the top, a background of 77. Otsu's
+//! threshold, the usual answer, cuts in the middle of what is there: at 100 of 255 in a flame
+//! whose cloud begins at 5, and through the skin of a head. So the end of the air is looked for where
+//! the eye finds it: at the foot of the background's peak, or in the valley behind it if there is
+//! one.
+//!
+//! 1. The background is the fullest bin; its foot is where counts have fallen to a hundredth.
+//! 2. Behind the foot, the smoothed histogram has valleys. Of those with half of the foreground
+//!    above them the deepest counts (half: so that leaves are not cut off with the air because the
+//!    trunk is denser). There the content is *solid*: a surface can be drawn.
+//! 3. Without a valley the histogram falls all the way. Little foreground is *sparse*: vessels, a
+//!    wire, a shell; much of it is a *cloud*, which an opaque surface would hide.
+//!
+//! All numbers are shares of the range: 0 the smallest value, 1 the largest.
+
+use crate::volume::{SampleKind, ValueSummary};
+
+/// Bins are averaged over this share of the range to either side when valleys are looked for.
+/// At half of it the noise of 8-bit histograms has valleys of its own; at double the gap between
+/// the leaves and the air of a plant is gone.
+const SMOOTH: f64 = 0.015;
+
+/// How much higher both sides of a valley must be.
+const DEPTH: f64 = 1.5;
+
+/// Foreground above this share is a cloud if no valley parts it from the air.
+const CLOUD: f64 = 0.15;
+
+/// What kind of thing the foreground is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Content {
+    /// A valley parts it from the air.
+    Solid,
+    /// No valley, and less than 15 % of the volume.
+    Sparse,
+    /// No valley, and more of the volume.
+    Cloud,
+    /// No bin stands out as air: something is everywhere.
+    Everywhere,
+    /// One value, or none.
+    Constant,
+}
+
+/// What a histogram tells.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Levels {
+    /// What is there.
+    pub content: Content,
+    /// Where the air ends: nothing is drawn below.
+    pub air: f64,
+    /// From where on a surface is opaque; above `air`.
+    pub solid: f64,
+    /// Median of what is above the air.
+    pub mid: f64,
+    /// What the densest quarter of it exceeds.
+    pub dense: f64,
+    /// What the densest tenth of it exceeds.
+    pub densest: f64,
+    /// What 0.2 % of it exceed: where colours end.
+    pub top: f64,
+    /// The value of water, where values are Hounsfield units but for an offset.
+    pub water: Option<f64>,
+}
+
+impl Levels {
+    /// Looks at a histogram.
+    pub fn of(summary: &ValueSummary) -> Levels {
+        let bins = unit_histogram(summary);
+        let nothing = Levels {
+            content: Content::Constant,
+            air: 0.0,
+            solid: 0.5,
+            mid: 0.5,
+            dense: 0.75,
+            densest: 0.9,
+            top: 1.0,
+            water: None,
+        };
+        if bins.len() < 2 {
+            return nothing;
+        }
+        let (content, air, solid) = ramp(&bins);
+        let above = |share: f64| quantile(&bins, air, share);
+        Levels {
+            content,
+            air,
+            solid,
+            mid: above(0.5).max(air),
+            dense: above(0.75).max(solid),
+            densest: above(0.9).max(solid),
+            top: above(0.998).max(air + 0.02).max(solid).min(1.0),
+            water: water(summary),
+        }
+    }
+}
+
+/// Histogram in unit coordinates, ascending, without empty bins: `(centre, count)`.
+fn unit_histogram(s: &ValueSummary) -> Vec<(f64, f64)> {
+    let span = s.max_code - s.min_code;
+    let mut bins: Vec<(f64, f64)> = (0..256)
+        .filter(|&b| s.histogram[b] > 0)
+        .map(|b| {
+            let centre =
+                if s.kind == SampleKind::U8 { s.bin_code(b) } else { s.bin_code(b) + span / 512.0 };
+            let t = if span > 0.0 { (centre - s.min_code) / span } else { 0.0 };
+            (if s.map.scale < 0.0 { 1.0 - t } else { t }, s.histogram[b] as f64)
+        })
+        .collect();
+    bins.sort_by(|a, b| a.0.total_cmp(&b.0));
+    bins
+}
+
+/// What `share` of the samples at or above `from` do not exceed.
+fn quantile(bins: &[(f64, f64)], from: f64, share: f64) -> f64 {
+    let above = || bins.iter().filter(|b| b.0 >= from);
+    let all: f64 = above().map(|b| b.1).sum();
+    let mut seen = 0.0;
+    for (x, n) in above() {
+        seen += n;
+        if seen >= all * share {
+            return *x;
+        }
+    }
+    1.0
+}
+
+/// What is there, where the air ends and where a surface is opaque. At least two bins.
+fn ramp(bins: &[(f64, f64)]) -> (Content, f64, f64) {
+    let total: f64 = bins.iter().map(|b| b.1).sum();
+    // Saturated samples pile up in the last bin and are no hill of their own.
+    let mut n: Vec<f64> = bins.iter().map(|b| b.1).collect();
+    let last = n.len() - 1;
+    if n.len() > 2 {
+        n[last] = n[last].min(2.0 * n[last - 1]);
+    }
+    let x = |i: usize| bins[i].0;
+    let mut peak = 0;
+    for i in 1..n.len() {
+        if n[i] > n[peak] {
+            peak = i;
+        }
+    }
+    let Some(foot) = (peak + 1..n.len()).find(|&i| n[i] <= n[peak] * 0.01) else {
+        // Counts never fall: there is no air, or two values alone.
+        return if n.len() == 2 {
+            (Content::Solid, x(0) + (x(1) - x(0)) * 0.25, x(0) + (x(1) - x(0)) * 0.75)
+        } else {
+            (Content::Everywhere, 0.0, 1.0)
+        };
+    };
+    let below: f64 = bins[..foot].iter().map(|b| b.1).sum();
+    if below < 0.1 * total {
+        return (Content::Everywhere, 0.0, 1.0);
+    }
+    let foreground = total - below;
+    // Smoothed counts behind the foot, and how much is above.
+    let tail: Vec<(f64, f64)> = (foot..n.len())
+        .map(|i| {
+            let near = (foot..n.len()).filter(|&j| (x(j) - x(i)).abs() <= SMOOTH);
+            let (sum, count) = near.fold((0.0, 0.0), |(s, c), j| (s + n[j], c + 1.0));
+            (x(i), sum / count)
+        })
+        .collect();
+    let top = quantile(bins, x(foot), 0.98);
+    if let Some((valley, hill)) = valley(&tail, &bins[foot..], foreground) {
+        // Opaque halfway up to what lies behind the valley, and soon: a wide ramp would show a
+        // body as a haze.
+        let step = (0.5 * (hill - valley)).min(0.12 * (top - valley)).max(0.004);
+        return (Content::Solid, valley, valley + step);
+    }
+    if foreground > CLOUD * total {
+        return (Content::Cloud, x(foot), quantile(bins, x(foot), 0.5).max(x(foot) + 0.01));
+    }
+    let gap = x(foot) - x(foot - 1);
+    if gap > 0.1 {
+        // Nothing in between: what lies behind it is whole, and not the tail of anything.
+        return (Content::Sparse, x(foot) - 0.75 * gap, x(foot) - 0.25 * gap);
+    }
+    // A little way up the tail: what is just above the foot is noise.
+    let from = x(foot) + 0.02;
+    let (a, b) = (quantile(bins, from, 0.35), quantile(bins, from, 0.6));
+    if b <= a {
+        return (Content::Sparse, x(foot), (x(foot) + 0.02).max(a));
+    }
+    (Content::Sparse, a, b)
+}
+
+/// The deepest valley of a smoothed tail with half of the foreground above it, and the highest
+/// hill behind it. The foot itself is one where counts rise from there.
+fn valley(tail: &[(f64, f64)], raw: &[(f64, f64)], foreground: f64) -> Option<(f64, f64)> {
+    let mut best: Option<(f64, usize)> = None;
+    let mut above = foreground;
+    let mut left = f64::INFINITY;
+    for i in 0..tail.len() {
+        if above < 0.5 * foreground {
+            break;
+        }
+        let right = tail[i..].iter().map(|t| t.1).fold(0.0, f64::max);
+        let depth = left.min(right) / tail[i].1;
+        if depth >= DEPTH && best.is_none_or(|(d, _)| depth > d) {
+            best = Some((depth, i));
+        }
+        left = if left.is_finite() { left.max(tail[i].1) } else { tail[i].1 };
+        above -= raw[i].1;
+    }
+    let (_, at) = best?;
+    let hill = tail[at..].iter().fold(
+        (0.0, 0.0),
+        |best: (f64, f64), t| {
+            if t.1 > best.1 { *t } else { best }
+        },
+    );
+    Some((tail[at].0, hill.0))
+}
+
+/// The value of water, if the values are those of a CT: Hounsfield units, or these with 1000 or
+/// 1024 added, as older files store them. Told by three hills: air, soft tissue, and little
+/// between the two. 8-bit volumes have lost their scale.
+fn water(s: &ValueSummary) -> Option<f64> {
+    let (lo, hi) = s.range();
+    if s.kind == SampleKind::U8 || hi - lo < 1200.0 || hi - lo > 20_000.0 {
+        return None;
+    }
+    let total: u64 = s.histogram.iter().sum();
+    let share = |from: f64, to: f64| {
+        let inside = (0..256).filter(|&b| {
+            let centre = 0.5 * (s.bin_code(b) + s.bin_code(b + 1));
+            (from..=to).contains(&s.map.value(centre))
+        });
+        inside.map(|b| s.histogram[b]).sum::<u64>() as f64 / total.max(1) as f64
+    };
+    [0.0, 1000.0, 1024.0].into_iter().find(|water| {
+        let between = |from: f64, to: f64| share(water + from, water + to);
+        let (air, soft, gap) =
+            (between(-1060.0, -900.0), between(-160.0, 120.0), between(-600.0, -300.0));
+        lo >= water - 3100.0
+            && lo <= water - 900.0
+            && hi >= water + 300.0
+            && air >= 0.03
+            && soft >= 0.05
+            && gap < 0.5 * soft
+            && gap < air
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::volume::{Samples, ValueMap};
+
+    fn levels(samples: Samples) -> Levels {
+        Levels::of(&ValueSummary::of(&samples, ValueMap::IDENTITY))
+    }
+
+    /// `n` samples spread evenly over a span.
+    fn spread(from: u32, to: u32, n: u32) -> impl Iterator<Item = u16> {
+        (0..n).map(move |i| (from + (to - from) * i / n.max(1)) as u16)
+    }
+
+    fn bytes(parts: &[(u32, u32, u32)]) -> Samples {
+        let all = parts.iter().flat_map(|&(a, b, n)| spread(a, b, n)).map(|x| x as u8);
+        Samples::U8(all.collect())
+    }
+
+    #[test]
+    fn a_body_in_air_is_cut_in_the_valley() {
+        // Air at 0, a little noise, a gap, tissue from 60 on.
+        let l = levels(bytes(&[(0, 1, 70_000), (1, 40, 800), (60, 140, 29_000), (255, 256, 1)]));
+        assert_eq!(l.content, Content::Solid);
+        let at = |t: f64| t * 255.0;
+        assert!((1.0..60.0).contains(&at(l.air)), "{l:?}");
+        assert!(l.air < l.solid && at(l.solid) < 90.0 && l.solid < l.top, "{l:?}");
+        assert!((100.0..150.0).contains(&at(l.top)), "one bright voxel is not the top: {l:?}");
+    }
+
+    #[test]
+    fn a_background_that_is_not_zero_is_still_air() {
+        // As in a tooth's scan: background about 77, dark streaks below it.
+        let l = levels(bytes(&[
+            (0, 70, 200),
+            (72, 83, 60_000),
+            (83, 130, 600),
+            (140, 190, 30_000),
+            (230, 250, 5_000),
+        ]));
+        assert_eq!(l.content, Content::Solid);
+        let air = l.air * 249.0;
+        assert!((83.0..140.0).contains(&air), "{l:?} cuts at {air}");
+    }
+
+    #[test]
+    fn a_thin_object_in_a_sea_of_air_is_sparse_and_a_falling_tail_a_cloud() {
+        let tail = |each: u32| -> Samples {
+            let mut v = vec![0u8; 90_000];
+            for x in 1..255u32 {
+                v.extend(std::iter::repeat_n(x as u8, (each * 8 / (x + 7)) as usize));
+            }
+            Samples::U8(v)
+        };
+        let thin = levels(tail(20));
+        assert_eq!(thin.content, Content::Sparse);
+        assert!((5.0..80.0).contains(&(thin.air * 254.0)), "{thin:?}");
+        assert!(thin.solid > thin.air && thin.solid < 0.6, "{thin:?}");
+        let cloud = levels(tail(800));
+        assert_eq!(cloud.content, Content::Cloud);
+        assert!(cloud.air < 0.1, "{cloud:?}");
+    }
+
+    #[test]
+    fn a_ramp_has_no_air_and_one_value_has_nothing() {
+        assert_eq!(levels(bytes(&[(0, 256, 25_600)])).content, Content::Everywhere);
+        assert_eq!(levels(bytes(&[(9, 10, 500)])).content, Content::Constant);
+        assert_eq!(levels(Samples::F32(vec![f32::NAN; 9])).content, Content::Constant);
+        let two = levels(bytes(&[(0, 1, 900), (200, 201, 100)]));
+        assert_eq!(two.content, Content::Solid);
+        assert!(two.air > 0.0 && two.solid < 1.0, "{two:?}");
+    }
+
+    #[test]
+    fn a_ct_is_known_by_its_hills_with_any_of_the_usual_offsets() {
+        let ct = |water: f64| {
+            let mut v = Vec::new();
+            v.extend(spread(0, 40, 50_000).map(|x| f64::from(x) - 1010.0));
+            v.extend(spread(0, 100, 3_000).map(|x| f64::from(x) - 500.0));
+            v.extend(spread(0, 220, 40_000).map(|x| f64::from(x) - 120.0));
+            v.extend(spread(200, 1500, 3_000).map(f64::from));
+            Samples::F32(v.into_iter().map(|x| (x + water) as f32).collect())
+        };
+        for water in [0.0, 1000.0, 1024.0] {
+            let found = levels(ct(water)).water.expect("a CT");
+            assert!((found - water).abs() <= 24.0, "{found} for {water}");
+        }
+        // An MR of the same range: nothing at the place of water.
+        let mr: Vec<f32> =
+            spread(0, 30, 50_000).chain(spread(200, 700, 40_000)).map(f32::from).collect();
+        assert_eq!(levels(Samples::F32([mr, vec![2000.0]].concat())).water, None);
+    }
+
+    #[test]
+    fn values_that_fall_with_the_code_are_turned_first() {
+        let up = levels(bytes(&[(0, 1, 70_000), (60, 140, 30_000)]));
+        let down = ValueSummary::of(
+            &bytes(&[(255, 256, 70_000), (116, 196, 30_000)]),
+            ValueMap { scale: -1.0, offset: 255.0 },
+        );
+        let down = Levels::of(&down);
+        assert_eq!(down.content, up.content);
+        assert!((down.air - up.air).abs() < 0.02, "{down:?} {up:?}");
+    }
+}

@@ -1,0 +1,424 @@
+//! Transfer functions by name.
+//!
+//! For people: `auto`, named looks and perceptual maps, whose ranges follow the volume's histogram
+//! ([`Levels`]), or Hounsfield units where the values are those of a CT. For measuring: the
+//! `peer-*` ramps on raw 8-bit values (other types scaled from their smallest to their largest
+//! value), the same that other renderers are measured with.
+//!
+//! Each look has three parts (docs/colours.md has them as a table): a *range rule*, where opacity
+//! begins and how it grows; a *technique*, a surface (opaque within a few voxels), layers (what is
+//! outside is translucent over what is dense) or a fog (nothing hides anything); and its *light*.
+
+mod levels;
+mod maps;
+
+pub use levels::{Content, Levels};
+pub use maps::{MAPS, colours as map_colours};
+
+use crate::quality::Refused;
+use crate::shade::Shading;
+use crate::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
+use crate::volume::{SampleKind, ValueSummary};
+
+/// Every name but those of [`MAPS`], and what it is for, in the order of the help text.
+pub const NAMES: [(&str, &str); 20] = [
+    ("auto", "cuts the air and draws what is there as surface or cloud"),
+    ("skin", "the outermost surface, in a skin's colours"),
+    ("bone", "what is dense: bone of a CT, the upper half above the air else"),
+    ("vessels", "bright, thin structures in red"),
+    ("brain", "soft tissue, in a brain's colours"),
+    ("muscle", "translucent flesh over what is dense"),
+    ("lung", "what is hardly denser than air, translucent, over bone"),
+    ("teeth", "translucent dentine over enamel: the densest quarter"),
+    ("engine", "a translucent casting over the densest tenth in orange"),
+    ("metal", "the densest tenth alone, as polished steel"),
+    ("plant", "green where thin, brown where dense"),
+    ("glass", "borders between materials alone, as of clear glass"),
+    ("fog", "white fog, unlit: denser is whiter"),
+    ("fire", "black, red, yellow, unlit: as of something that glows"),
+    ("xray", "faint all through, unlit: dark bones on light film turned over"),
+    ("grey", "translucent grey of everything above the air, unlit"),
+    ("peer-opaque", "for measuring: opaque from 38 to 64"),
+    ("peer-semi", "for measuring: at most 0.05 a voxel"),
+    ("peer-vessels", "for measuring: 0 at 60, 0.8 at 120, 1 at 255"),
+    ("peer-skull", "for measuring: 0 at 25, 1 at 45"),
+];
+
+/// Colours over 0 to 255, spread over a range.
+type Colours = [[f64; 4]];
+
+const WARM: [[f64; 4]; 4] = [
+    [0.0, 0.90, 0.68, 0.55],
+    [64.0, 0.93, 0.73, 0.60],
+    [128.0, 0.97, 0.86, 0.76],
+    [255.0, 1.0, 0.97, 0.92],
+];
+const RED: [[f64; 4]; 4] = [
+    [0.0, 0.7, 0.1, 0.1],
+    [60.0, 0.8, 0.2, 0.15],
+    [160.0, 0.95, 0.45, 0.35],
+    [255.0, 1.0, 0.9, 0.8],
+];
+const IVORY: [[f64; 4]; 3] =
+    [[0.0, 0.78, 0.70, 0.58], [128.0, 0.93, 0.89, 0.80], [255.0, 1.0, 0.99, 0.96]];
+const PINK: [[f64; 4]; 4] = [
+    [0.0, 0.70, 0.42, 0.40],
+    [110.0, 0.86, 0.62, 0.57],
+    [190.0, 0.95, 0.82, 0.76],
+    [255.0, 1.0, 0.95, 0.90],
+];
+const FLESH: [[f64; 4]; 4] = [
+    [0.0, 0.95, 0.78, 0.55],
+    [80.0, 0.80, 0.30, 0.24],
+    [150.0, 0.90, 0.55, 0.45],
+    [255.0, 1.0, 0.98, 0.94],
+];
+const BREATH: [[f64; 4]; 3] =
+    [[0.0, 0.55, 0.70, 0.90], [120.0, 0.85, 0.62, 0.65], [255.0, 1.0, 0.97, 0.90]];
+const DENTINE: [[f64; 4]; 3] =
+    [[0.0, 0.75, 0.50, 0.32], [150.0, 0.95, 0.85, 0.62], [255.0, 1.0, 1.0, 0.98]];
+const CASTING: [[f64; 4]; 4] = [
+    [0.0, 0.55, 0.60, 0.66],
+    [120.0, 0.72, 0.77, 0.82],
+    [160.0, 0.98, 0.55, 0.12],
+    [255.0, 1.0, 0.80, 0.35],
+];
+const STEEL: [[f64; 4]; 2] = [[0.0, 0.62, 0.65, 0.70], [255.0, 0.92, 0.94, 0.96]];
+const LEAVES: [[f64; 4]; 4] = [
+    [0.0, 0.30, 0.55, 0.16],
+    [70.0, 0.45, 0.66, 0.22],
+    [120.0, 0.58, 0.42, 0.24],
+    [255.0, 0.86, 0.72, 0.54],
+];
+const EMBERS: [[f64; 4]; 5] = [
+    [0.0, 0.10, 0.02, 0.02],
+    [60.0, 0.65, 0.10, 0.03],
+    [130.0, 0.95, 0.45, 0.08],
+    [200.0, 1.0, 0.85, 0.35],
+    [255.0, 1.0, 1.0, 0.90],
+];
+const GLASS: [[f64; 4]; 3] =
+    [[0.0, 0.55, 0.70, 0.90], [128.0, 0.95, 0.90, 0.85], [255.0, 1.0, 1.0, 1.0]];
+const MIST: [[f64; 4]; 2] = [[0.0, 0.75, 0.80, 0.86], [255.0, 1.0, 1.0, 1.0]];
+const FILM: [[f64; 4]; 2] = [[0.0, 0.55, 0.62, 0.70], [255.0, 0.97, 0.99, 1.0]];
+const GREY: [[f64; 4]; 2] = [[0.0, 0.35, 0.35, 0.35], [255.0, 1.0, 1.0, 1.0]];
+
+/// The transfer function called `name`, fitted to a volume with these values.
+///
+/// # Errors
+/// If there is none of that name; says what there is.
+pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, Refused> {
+    let l = Levels::of(summary);
+    let at = hounsfield(summary, &l);
+    let (air, solid, top) = (l.air, l.solid, l.top);
+    let unlit = |tf: TransferFunction| TransferFunction {
+        shading: Shading { on: false, ..Shading::default() },
+        ..tf
+    };
+    let fog = |colours: &Colours, alpha: f64| {
+        unlit(look(colours, [air, top], &[[air, 0.0], [top, alpha]]))
+    };
+    // Where what is dense begins, for those volumes that have no Hounsfield units to say so.
+    let dense = air + (top - air) * 0.55;
+    let tf = match name {
+        // Of a CT the skin hides the bones, and the couch the body.
+        "auto" if at.is_some() => return by_name("muscle", summary),
+        "auto" => auto(&l),
+        "skin" => match &at {
+            Some(hu) => surface(&WARM, [hu(-500.0), hu(400.0)], hu(-420.0), hu(-180.0)),
+            None => surface(&WARM, [air, top], air, solid),
+        },
+        "bone" => match &at {
+            Some(hu) => surface(&IVORY, [hu(100.0), hu(1400.0)], hu(140.0), hu(320.0)),
+            None => surface(&IVORY, [air, top], dense * 0.92, dense + (top - air) * 0.1),
+        },
+        "vessels" => match (&at, l.content) {
+            (Some(hu), _) => surface(&RED, [hu(80.0), hu(600.0)], hu(120.0), hu(280.0)),
+            (None, Content::Sparse) => surface(&RED, [air, top], air, solid),
+            (None, _) => {
+                let cut = air + (top - air) * 0.2;
+                look(&RED, [air, top], &[[air, 0.0], [cut, 0.5], [top.max(cut), 0.95]])
+            }
+        },
+        "brain" => match &at {
+            Some(hu) => surface(&PINK, [hu(-20.0), hu(100.0)], hu(-10.0), hu(25.0)),
+            None => surface(&PINK, [air, top], air, solid),
+        },
+        "muscle" => match &at {
+            Some(hu) => layers(
+                &FLESH,
+                [hu(-150.0), hu(700.0)],
+                [hu(-80.0), hu(20.0)],
+                0.04,
+                [hu(170.0), hu(320.0)],
+            ),
+            None => layers(&FLESH, [air, top], [air, solid], 0.04, [dense * 0.95, l.densest]),
+        },
+        "lung" => match &at {
+            Some(hu) => look(
+                &BREATH,
+                [hu(-950.0), hu(500.0)],
+                &[
+                    [hu(-960.0), 0.0],
+                    [hu(-850.0), 0.010],
+                    [hu(-650.0), 0.025],
+                    [hu(-450.0), 0.0],
+                    [hu(150.0), 0.0],
+                    [hu(400.0), 0.30],
+                ],
+            ),
+            // A shell about the end of the air, and what is dense inside.
+            None => look(
+                &BREATH,
+                [air * 0.5, top],
+                &[
+                    [air * 0.5, 0.0],
+                    [air.max(0.01), 0.03],
+                    [solid, 0.004],
+                    [dense, 0.004],
+                    [l.densest.max(dense), 0.30],
+                ],
+            ),
+        },
+        "teeth" => match &at {
+            Some(hu) => layers(
+                &DENTINE,
+                [hu(400.0), hu(2600.0)],
+                [hu(500.0), hu(900.0)],
+                0.05,
+                [hu(1500.0), hu(1900.0)],
+            ),
+            None => layers(&DENTINE, [air, top], [air, solid], 0.05, [l.dense, l.densest]),
+        },
+        "engine" => {
+            let inside = l.densest.max(solid + (top - solid) * 0.3);
+            layers(
+                &CASTING,
+                [air, top],
+                [air, solid],
+                0.04,
+                [inside, inside + (top - inside) * 0.3],
+            )
+        }
+        "metal" => {
+            let cut = match &at {
+                Some(hu) => hu(1800.0).min(top),
+                None => l.densest,
+            };
+            let mut tf = surface(&STEEL, [cut, top], cut * 0.97, cut + (top - cut) * 0.2);
+            let gloss = Shading { diffuse: 0.6, specular: 0.4, power: 40.0, ..Shading::default() };
+            tf.shading = gloss;
+            tf
+        }
+        "plant" => surface(&LEAVES, [air, top], air, solid),
+        "glass" => TransferFunction {
+            gradient_opacity: vec![[0.02, 0.0], [0.12, 0.25], [0.3, 1.0]],
+            ..look(&GLASS, [air, top], &[[air, 0.0], [solid, 0.5], [top, 0.7]])
+        },
+        "fog" => fog(&MIST, 0.03),
+        "fire" => {
+            let mid = (air + top) * 0.5;
+            unlit(look(&EMBERS, [air, top], &[[air, 0.0], [mid, 0.02], [top, 0.12]]))
+        }
+        "xray" => fog(&FILM, 0.012),
+        "grey" => fog(&GREY, 0.06),
+        "peer-opaque" => {
+            peer(summary, &WARM, &[[0.0, 0.0], [38.0, 0.0], [64.0, 1.0], [255.0, 1.0]])
+        }
+        "peer-semi" => {
+            peer(summary, &WARM, &[[0.0, 0.0], [38.0, 0.0], [128.0, 0.05], [255.0, 0.05]])
+        }
+        "peer-vessels" => {
+            peer(summary, &RED, &[[0.0, 0.0], [60.0, 0.0], [120.0, 0.8], [255.0, 1.0]])
+        }
+        "peer-skull" => peer(summary, &WARM, &[[0.0, 0.0], [25.0, 0.0], [45.0, 1.0], [255.0, 1.0]]),
+        map => {
+            let Some(colours) = map_colours(map) else { return Err(unknown(map)) };
+            // Unlit, since light would change what a colour says; thin enough to see through.
+            let mut tf = unlit(look(&[], [air, top], &[[air, 0.0], [solid, 0.03], [top, 0.10]]));
+            tf.colors = spread(&colours, air, top);
+            tf
+        }
+    };
+    Ok(tf)
+}
+
+/// The refusal of a name that is neither a preset nor a map, with the nearest one.
+pub fn unknown(name: &str) -> Refused {
+    let names: Vec<&str> = NAMES.iter().chain(&MAPS).map(|(n, _)| *n).collect();
+    let meant = nearest(name, &names).map(|n| format!("did you mean `{n}`? ")).unwrap_or_default();
+    let (presets, maps) = names.split_at(NAMES.len());
+    Refused::new(
+        "tf",
+        format!(
+            "`{name}` is neither a preset nor a file; {meant}presets are {}; maps are {}",
+            presets.join(", "),
+            maps.join(", ")
+        ),
+    )
+}
+
+/// The word of a list that is two edits away at most, if there is one.
+pub fn nearest<'a>(word: &str, list: &[&'a str]) -> Option<&'a str> {
+    let near = list.iter().filter(|n| distance(word, n) <= 2);
+    near.min_by_key(|n| distance(word, n)).copied()
+}
+
+/// A fitting look for whatever there is: a surface where there is one, a cloud that can be seen
+/// through where there is none.
+fn auto(l: &Levels) -> TransferFunction {
+    let (air, solid, top) = (l.air, l.solid, l.top);
+    match l.content {
+        Content::Solid | Content::Sparse => surface(&WARM, [air * 0.5, top], air, solid),
+        Content::Cloud => look(
+            &EMBERS,
+            [air, top],
+            &[[air, 0.0], [l.mid, 0.02], [l.dense.max(l.mid), 0.08], [top, 0.4]],
+        ),
+        // Nothing is air, so everything is shown, the lowest hardly.
+        Content::Everywhere => look(&WARM, [0.0, 1.0], &[[0.0, 0.0], [1.0, 0.08]]),
+        // By `Classifier`, the one value is 0 of the range: nothing to see, and the caller says
+        // so. An opaque block would be no better.
+        Content::Constant => surface(&WARM, [0.0, 1.0], 0.25, 0.75),
+    }
+}
+
+/// From Hounsfield units to shares of the range, where the values are those of a CT.
+fn hounsfield(summary: &ValueSummary, l: &Levels) -> Option<impl Fn(f64) -> f64> {
+    let water = l.water?;
+    let (lo, hi) = summary.range();
+    Some(move |hu: f64| ((hu + water - lo) / (hi - lo)).clamp(0.0, 1.0))
+}
+
+/// Opaque within a short ramp, and lit.
+fn surface(colours: &Colours, range: [f64; 2], from: f64, to: f64) -> TransferFunction {
+    look(colours, range, &[[from, 0.0], [to, 1.0]])
+}
+
+/// A translucent outside of at most `alpha` over an opaque inside.
+fn layers(
+    colours: &Colours,
+    range: [f64; 2],
+    outside: [f64; 2],
+    alpha: f64,
+    inside: [f64; 2],
+) -> TransferFunction {
+    let [a, b] = outside;
+    let [c, d] = inside;
+    look(colours, range, &[[a, 0.0], [b, alpha], [c.max(b), alpha], [d.max(c), 0.9]])
+}
+
+/// Colours over a range and opacities, over `[0, 1]` from the smallest to the largest value; lit.
+fn look(colours: &Colours, range: [f64; 2], opacities: &[[f64; 2]]) -> TransferFunction {
+    let over_bytes: Vec<[f64; 4]> =
+        colours.iter().map(|c| [c[0] / 255.0, c[1], c[2], c[3]]).collect();
+    let mut ascending: Vec<[f64; 2]> = vec![[0.0, opacities.first().map_or(0.0, |o| o[1])]];
+    for o in opacities {
+        let before = ascending.last().map_or(0.0, |o| o[0]);
+        ascending.push([o[0].clamp(before, 1.0), o[1]]);
+    }
+    ascending.push([1.0, opacities.last().map_or(0.0, |o| o[1])]);
+    TransferFunction {
+        version: 1,
+        domain: Domain::Unit,
+        colors: spread(&over_bytes, range[0], range[1]),
+        opacities: ascending,
+        color_space: ColorSpace::Srgb,
+        opacity_unit: OpacityUnit::AlphaPerVox,
+        nan: NanLook::default(),
+        gradient_opacity: Vec::new(),
+        shading: Shading::default(),
+    }
+}
+
+/// Colours given over 0 to 1, spread from `lo` to `hi`.
+pub fn spread(colours: &Colours, lo: f64, hi: f64) -> Vec<[f64; 4]> {
+    let width = (hi - lo).max(1e-6);
+    colours.iter().map(|c| [lo + width * c[0], c[1], c[2], c[3]]).collect()
+}
+
+/// The measuring ramps: x are raw 8-bit values; other types are scaled to 0..255.
+fn peer(summary: &ValueSummary, colors: &Colours, opacities: &[[f64; 2]]) -> TransferFunction {
+    let raw = summary.kind == SampleKind::U8;
+    let x = |x: f64| if raw { summary.map.value(x) } else { x / 255.0 };
+    let mut tf = look(colors, [0.0, 1.0], &[]);
+    tf.domain = if raw { Domain::Value } else { Domain::Unit };
+    tf.colors = colors.iter().map(|c| [x(c[0]), c[1], c[2], c[3]]).collect();
+    tf.opacities = opacities.iter().map(|o| [x(o[0]), o[1]]).collect();
+    if raw && summary.map.scale < 0.0 {
+        tf.colors.reverse();
+        tf.opacities.reverse();
+    }
+    tf
+}
+
+/// Where the air ends, as a share of the range.
+pub fn air_cut(summary: &ValueSummary) -> f64 {
+    Levels::of(summary).air
+}
+
+/// Edits between two short words (Levenshtein).
+pub fn distance(a: &str, b: &str) -> usize {
+    let b: Vec<char> = b.chars().collect();
+    let mut row: Vec<usize> = (0..=b.len()).collect();
+    for (i, ca) in a.chars().enumerate() {
+        let mut diagonal = row[0];
+        row[0] = i + 1;
+        for (j, cb) in b.iter().enumerate() {
+            let change = diagonal + usize::from(ca != *cb);
+            diagonal = row[j + 1];
+            row[j + 1] = change.min(diagonal + 1).min(row[j] + 1);
+        }
+    }
+    row[b.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::volume::{Samples, ValueMap};
+
+    #[test]
+    fn every_preset_passes_its_own_check_on_every_kind_of_volume() {
+        let volumes = [
+            Samples::U8((0..=255).collect()),
+            Samples::U8(vec![7; 100]),
+            Samples::U8([vec![0; 5000], vec![200; 50]].concat()),
+            Samples::U16((0..9000u16).map(|i| i.wrapping_mul(7)).collect()),
+            Samples::F32(vec![f32::NAN, -3.0, 8.5, 1e30]),
+            Samples::F32(vec![f32::NAN]),
+        ];
+        for v in volumes {
+            for map in [ValueMap::IDENTITY, ValueMap { scale: -2.5, offset: 10.0 }] {
+                let s = ValueSummary::of(&v, map);
+                for (name, _) in NAMES.iter().chain(&MAPS) {
+                    let tf = by_name(name, &s).unwrap();
+                    tf.check().unwrap_or_else(|e| panic!("{name} on {s:?}: {e}"));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn unknown_names_are_told_what_there_is() {
+        let s = ValueSummary::of(&Samples::U8(vec![0, 255]), ValueMap::IDENTITY);
+        let e = by_name("bonee", &s).unwrap_err().to_string();
+        assert!(e.contains("did you mean `bone`") && e.contains("peer-opaque"), "{e}");
+        assert!(!by_name("/no/such/file", &s).unwrap_err().to_string().contains("mean"));
+    }
+
+    #[test]
+    fn air_cut_finds_a_thin_object_in_a_sea_of_air() {
+        // Less than 1 % bright voxels, as in an angiogram.
+        let mut v = vec![0u8; 100_000];
+        for i in 0..20_000 {
+            v[i] = (i % 12) as u8;
+        }
+        for i in 0..600 {
+            v[i] = 90 + (i % 160) as u8;
+        }
+        let s = ValueSummary::of(&Samples::U8(v), ValueMap::IDENTITY);
+        let cut = air_cut(&s) * 249.0;
+        assert!((11.0..100.0).contains(&cut), "cut at {cut}");
+    }
+}

@@ -1,0 +1,325 @@
+//! Transfer functions between transfer functions, for paths whose keys have several.
+//!
+//! Half-way between two functions, each value has the mean of the two opacities and of the two
+//! colours in linear light. As both are made of lines, so is their mean: it has the points of both.
+//! The ends are the functions themselves, bit for bit.
+//!
+//! What is visible in between is visible at one of the ends: where both opacities are zero, so is every
+//! mean of them. So the bricks of a path are those of the union of its functions' supports
+//! ([`Tween::ends`]), and no frame of it needs a brick more. A voxel that a frame holds and does not
+//! see has an extinction of zero and adds nothing: the frame is that of a job of its own, to the
+//! byte.
+
+use crate::math::{linear_from_srgb, srgb_from_linear};
+use crate::path::{KeyFrames, ViewPath};
+use crate::presets;
+use crate::quality::Refused;
+use crate::shade::{Light, Shading};
+use crate::transfer::{ColorSpace, Domain, NanLook, TransferChoice, TransferFunction, interpolate};
+use crate::volume::ValueSummary;
+
+/// The transfer functions of a path's frames.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Tween {
+    /// Frame, the function as it is written, and the same over file values in linear light.
+    keys: Vec<(f64, TransferFunction, TransferFunction)>,
+}
+
+impl Tween {
+    /// The functions of a path; `None` if no key has one. Before the first that has one its
+    /// function holds, behind the last that one's.
+    ///
+    /// # Errors
+    /// Names the key whose function is wrong or can't be tweened.
+    pub fn of(path: &ViewPath, summary: &ValueSummary) -> Result<Option<Tween>, Refused> {
+        let Some(mut frames) = path.keyframes.clone() else { return Ok(None) };
+        Tween::fix(&mut frames, summary)?;
+        let mut keys = Vec::new();
+        for (i, key) in frames.keys.iter().enumerate() {
+            let Some(TransferChoice::Function(tf)) = &key.tf else { continue };
+            let within =
+                |e: Refused| Refused::new(format!("keyframes.keys[{i}].tf.{}", e.field), e.problem);
+            tf.check().map_err(within)?;
+            keys.push((frames.time(i), i, (**tf).clone()));
+        }
+        let Some((_, _, first)) = keys.first() else { return Ok(None) };
+        let unit = first.opacity_unit;
+        if let Some((_, i, _)) = keys.iter().find(|(_, _, tf)| tf.opacity_unit != unit) {
+            return Err(Refused::new(
+                format!("keyframes.keys[{i}].tf.opacity_unit"),
+                "differs from the one before; give all keys one unit",
+            ));
+        }
+        let keys = keys.into_iter().map(|(at, _, tf)| (at, tf.clone(), plain(&tf, summary)));
+        Ok(Some(Tween { keys: keys.collect() }))
+    }
+
+    /// Puts functions in place of presets' names.
+    ///
+    /// # Errors
+    /// Names the key whose preset there is not.
+    pub fn fix(keys: &mut KeyFrames, summary: &ValueSummary) -> Result<(), Refused> {
+        for (i, key) in keys.keys.iter_mut().enumerate() {
+            if let Some(TransferChoice::Name(name)) = &key.tf {
+                let tf = presets::by_name(name, summary)
+                    .map_err(|e| Refused::new(format!("keyframes.keys[{i}].tf"), e.problem))?;
+                key.tf = Some(TransferChoice::Function(Box::new(tf)));
+            }
+        }
+        Ok(())
+    }
+
+    /// The function of a frame.
+    pub fn at(&self, frame: f64) -> TransferFunction {
+        let after = self.keys.partition_point(|k| k.0 <= frame);
+        let Some(i) = after.checked_sub(1) else { return self.keys[0].1.clone() };
+        let (from, exact, a) = &self.keys[i];
+        match self.keys.get(after) {
+            Some((to, _, b)) if from < &frame => blend(a, b, (frame - from) / (to - from)),
+            _ => exact.clone(),
+        }
+    }
+
+    /// The functions whose supports together hold that of every frame.
+    pub fn ends(&self) -> impl Iterator<Item = &TransferFunction> {
+        // Moving a point from shares to file values rounds it: both count.
+        self.keys.iter().flat_map(|(_, exact, plain)| [exact, plain])
+    }
+}
+
+/// The same function over file values, with colours in linear light.
+fn plain(tf: &TransferFunction, summary: &ValueSummary) -> TransferFunction {
+    let (lo, hi) = summary.range();
+    let x = |x: f64| match tf.domain {
+        Domain::Value => x,
+        Domain::Unit => lo + x * (hi - lo),
+    };
+    let c = |c: f64| match tf.color_space {
+        ColorSpace::Srgb => linear_from_srgb(c),
+        ColorSpace::Linear => c,
+    };
+    TransferFunction {
+        domain: Domain::Value,
+        color_space: ColorSpace::Linear,
+        colors: tf.colors.iter().map(|p| [x(p[0]), c(p[1]), c(p[2]), c(p[3])]).collect(),
+        opacities: tf.opacities.iter().map(|p| [x(p[0]), p[1]]).collect(),
+        nan: NanLook { color: tf.nan.color.map(c), opacity: tf.nan.opacity },
+        gradient_opacity: tf.gradient_opacity.clone(),
+        ..tf.clone()
+    }
+}
+
+/// `t` of the way from one plain function to another.
+fn blend(a: &TransferFunction, b: &TransferFunction, t: f64) -> TransferFunction {
+    let mix = |x: f64, y: f64| (x * (1.0 - t) + y * t).clamp(x.min(y), x.max(y));
+    let nan = NanLook {
+        color: std::array::from_fn(|i| mix(a.nan.color[i], b.nan.color[i])),
+        opacity: mix(a.nan.opacity, b.nan.opacity),
+    };
+    let modulated = |tf: &TransferFunction| {
+        if tf.gradient_opacity.is_empty() { vec![[0.0, 1.0]] } else { tf.gradient_opacity.clone() }
+    };
+    let gradient_opacity = if a.gradient_opacity.is_empty() && b.gradient_opacity.is_empty() {
+        Vec::new()
+    } else {
+        lines(&modulated(a), &modulated(b), mix)
+    };
+    TransferFunction {
+        version: 1,
+        domain: Domain::Value,
+        colors: lines(&a.colors, &b.colors, mix),
+        opacities: lines(&a.opacities, &b.opacities, mix),
+        color_space: ColorSpace::Linear,
+        opacity_unit: a.opacity_unit,
+        nan,
+        gradient_opacity,
+        shading: shading(&a.shading, &b.shading, t),
+    }
+}
+
+/// The points of both, each at the mean of both. Two points at one x are a step: its left side and
+/// its right side are taken apart.
+fn lines<const N: usize>(
+    a: &[[f64; N]],
+    b: &[[f64; N]],
+    mix: impl Fn(f64, f64) -> f64,
+) -> Vec<[f64; N]> {
+    let mut xs: Vec<f64> = a.iter().chain(b).map(|p| p[0]).collect();
+    xs.sort_by(f64::total_cmp);
+    xs.dedup();
+    let both = |x: f64, p: [f64; N], q: [f64; N]| -> [f64; N] {
+        std::array::from_fn(|i| if i == 0 { x } else { mix(p[i], q[i]) })
+    };
+    let mut points = Vec::with_capacity(xs.len() + 2);
+    for x in xs {
+        let (left, right) =
+            (both(x, before(a, x), before(b, x)), both(x, interpolate(a, x), interpolate(b, x)));
+        if left != right {
+            points.push(left);
+        }
+        points.push(right);
+    }
+    points
+}
+
+/// The value just left of x.
+fn before<const N: usize>(points: &[[f64; N]], x: f64) -> [f64; N] {
+    match points.iter().position(|p| p[0] == x) {
+        // The first of the points at x is the end of the line that comes from the left.
+        Some(i) => points[i],
+        None => interpolate(points, x),
+    }
+}
+
+/// Light between two lights. No light at all is light that is ambient alone.
+fn shading(a: &Shading, b: &Shading, t: f64) -> Shading {
+    if !a.on && !b.on {
+        return *a;
+    }
+    let lit = |s: &Shading| match s.on {
+        true => *s,
+        false => Shading { ambient: 1.0, diffuse: 0.0, specular: 0.0, ..*s },
+    };
+    let (p, q) = (lit(a), lit(b));
+    let mix = |x: f64, y: f64| x * (1.0 - t) + y * t;
+    let unit = |v: [f64; 3]| {
+        let v = glam::DVec3::from_array(v);
+        v / v.length()
+    };
+    let light = match (p.light, q.light) {
+        (Light::Direction(x), Light::Direction(y)) => {
+            let v = unit(x) * (1.0 - t) + unit(y) * t;
+            if v.length() > 1e-3 { Light::Direction(v.to_array()) } else { p.light }
+        }
+        // Between a head light and a fixed one lies nothing: the nearer key's.
+        (x, y) => {
+            if t < 0.5 {
+                x
+            } else {
+                y
+            }
+        }
+    };
+    Shading {
+        on: true,
+        ambient: mix(p.ambient, q.ambient),
+        diffuse: mix(p.diffuse, q.diffuse),
+        specular: mix(p.specular, q.specular),
+        power: mix(p.power, q.power),
+        light,
+    }
+}
+
+/// Colours as sRGB numbers, whatever a function keeps them in.
+pub fn srgb_colours(tf: &TransferFunction) -> Vec<[f64; 4]> {
+    let c = |c: f64| match tf.color_space {
+        ColorSpace::Srgb => c,
+        ColorSpace::Linear => srgb_from_linear(c),
+    };
+    tf.colors.iter().map(|p| [p[0], c(p[1]), c(p[2]), c(p[3])]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::path::Key;
+    use crate::quality::Compositing;
+    use crate::transfer::Classifier;
+    use crate::volume::{Digest32, Samples, Volume, VolumeInfo};
+    use proptest::prelude::*;
+
+    fn info() -> VolumeInfo {
+        Volume::from_fn_u8("v", [256, 1, 1], |i, _, _| i as u8).info(Digest32::default())
+    }
+
+    fn path(choices: Vec<TransferChoice>) -> ViewPath {
+        let keys = choices.into_iter().map(|tf| Key { tf: Some(tf), ..Key::default() }).collect();
+        let frames =
+            KeyFrames { frames: 11, easing: Default::default(), up: None, front: None, keys };
+        ViewPath { keyframes: Some(frames), ..ViewPath::of_views([8, 8], vec![]) }
+    }
+
+    fn names(names: &[&str]) -> ViewPath {
+        path(names.iter().map(|n| TransferChoice::Name((*n).into())).collect())
+    }
+
+    fn tween(p: &ViewPath) -> Tween {
+        Tween::of(p, &info().summary).unwrap().unwrap()
+    }
+
+    fn classify(tf: &TransferFunction) -> Classifier {
+        tf.check().unwrap();
+        Classifier::new(tf, &info(), Compositing::Linear)
+    }
+
+    #[test]
+    fn ends_are_the_functions_themselves() {
+        let t = tween(&names(&["bone", "peer-semi", "fog"]));
+        let named = |n: &str| presets::by_name(n, &info().summary).unwrap();
+        assert_eq!(t.at(0.0), named("bone"));
+        assert_eq!(t.at(5.0), named("peer-semi"));
+        assert_eq!(t.at(10.0), named("fog"));
+        assert_eq!(t.at(99.0), named("fog"));
+        assert_ne!(t.at(1.0), named("bone"));
+    }
+
+    #[test]
+    fn half_way_every_value_is_half_way() {
+        let t = tween(&names(&["peer-opaque", "peer-vessels"]));
+        let [a, m, b] = [0.0, 5.0, 10.0].map(|x| classify(&t.at(x)));
+        for v in 0..=255u8 {
+            let at = |c: &Classifier| c.look(&Samples::U8(vec![v]), 0);
+            let alpha = |c: &Classifier| -libm::expm1(-f64::from(at(c).sigma));
+            // The cap of opacity one is 2^-16 below it.
+            assert!((alpha(&m) - (alpha(&a) + alpha(&b)) / 2.0).abs() < 2e-5, "alpha at {v}");
+            for i in 0..3 {
+                let want = (at(&a).rgb[i] + at(&b).rgb[i]) / 2.0;
+                assert!((at(&m).rgb[i] - want).abs() < 1e-6, "colour at {v}");
+            }
+        }
+    }
+
+    proptest! {
+        /// What a frame sees, one of the ends sees.
+        #[test]
+        fn nothing_in_between_is_outside_of_the_union(
+            a in prop::collection::vec((0u32..64, 0u32..3), 1..6),
+            b in prop::collection::vec((0u32..64, 0u32..3), 1..6),
+            unit in any::<bool>(), frame in 0.0..10.0f64,
+        ) {
+            let of = |points: &[(u32, u32)], unit: bool| {
+                let mut tf = presets::by_name("fog", &info().summary).unwrap();
+                let mut points: Vec<(u32, u32)> = points.to_vec();
+                points.sort();
+                tf.domain = if unit { Domain::Unit } else { Domain::Value };
+                let scale = if unit { 1.0 / 63.0 } else { 4.0 };
+                tf.opacities = points.iter().map(|p| [f64::from(p.0) * scale, f64::from(p.1) * 0.3]).collect();
+                TransferChoice::Function(Box::new(tf))
+            };
+            let t = tween(&path(vec![of(&a, unit), of(&b, false)]));
+            let seen = classify(&t.at(frame)).support();
+            let union = t.ends().map(|tf| classify(tf).support())
+                .reduce(|a, b| a.union(&b)).unwrap();
+            prop_assert!(union.covers(&seen), "{seen:?} of {union:?}");
+        }
+    }
+
+    #[test]
+    fn light_fades_in() {
+        let t = tween(&names(&["fog", "bone"]));
+        let s = t.at(5.0).shading;
+        assert!(
+            s.on && (s.ambient - 0.6).abs() < 1e-12 && (s.diffuse - 0.35).abs() < 1e-12,
+            "{s:?}"
+        );
+        assert!(!t.at(0.0).shading.on);
+    }
+
+    #[test]
+    fn a_path_without_functions_has_no_tween_and_wrong_ones_are_named() {
+        let of = |p: &ViewPath| Tween::of(p, &info().summary);
+        assert_eq!(of(&ViewPath::of_views([8, 8], vec![])), Ok(None));
+        let e = of(&names(&["bone", "bonee"])).unwrap_err();
+        assert!(e.field == "keyframes.keys[1].tf" && e.problem.contains("`bone`"), "{e}");
+    }
+}

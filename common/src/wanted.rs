@@ -1,0 +1,128 @@
+//! What the bricks of a job must hold: which voxels, and what of each.
+//!
+//! Bricks are kept from job to job and from worker to worker, so a set of them has a key that says
+//! what is in it. A set serves every job that wants no more.
+
+use crate::brick::BrickSetKey;
+use crate::path::{CropBox, ViewPath};
+use crate::quality::{Compositing, Refused};
+use crate::transfer::{Classifier, Support, TransferFunction};
+use crate::tween::Tween;
+use crate::volume::{Digest32, VolumeInfo};
+use sha2::{Digest, Sha256};
+
+/// What bricks must hold.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Wanted {
+    /// Codes that are visible.
+    pub support: Support,
+    /// A normal of each voxel.
+    pub normals: bool,
+    /// The magnitude of each voxel's gradient.
+    pub gradients: bool,
+    /// Voxels inside this box alone.
+    pub crop: Option<CropBox>,
+}
+
+impl Wanted {
+    /// What one transfer function sees of the whole volume.
+    pub fn of(tf: &TransferFunction, info: &VolumeInfo, compositing: Compositing) -> Wanted {
+        Wanted {
+            support: Classifier::new(tf, info, compositing).support(),
+            normals: tf.shading.on,
+            gradients: !tf.gradient_opacity.is_empty(),
+            crop: None,
+        }
+    }
+
+    /// What the frames of a path see: its cropping box, and the union over its functions.
+    ///
+    /// # Errors
+    /// If the box holds nothing.
+    pub fn of_path(
+        path: &ViewPath,
+        tf: &TransferFunction,
+        tween: Option<&Tween>,
+        info: &VolumeInfo,
+        compositing: Compositing,
+    ) -> Result<Wanted, Refused> {
+        let crop = path.crop.as_ref().map(|c| c.of(&info.lattice)).transpose()?;
+        let all: Vec<&TransferFunction> = match tween {
+            Some(tween) => tween.ends().collect(),
+            None => vec![tf],
+        };
+        let all = all.into_iter().map(|tf| Wanted::of(tf, info, compositing));
+        let union = all.reduce(|a, b| Wanted {
+            support: a.support.union(&b.support),
+            normals: a.normals || b.normals,
+            gradients: a.gradients || b.gradients,
+            crop: None,
+        });
+        Ok(Wanted { crop, ..union.unwrap_or_default() })
+    }
+
+    /// Whether bricks made for this serve a job that wants `other`. A box must be the same: what
+    /// lies outside of a smaller one would be drawn.
+    pub fn covers(&self, other: &Wanted) -> bool {
+        self.support.covers(&other.support)
+            && (self.normals || !other.normals)
+            && (self.gradients || !other.gradients)
+            && self.crop == other.crop
+    }
+
+    /// The key of the brick set of a volume.
+    pub fn key(&self, volume: Digest32) -> BrickSetKey {
+        let mut h = Sha256::new();
+        h.update(b"slabcast bricks 1");
+        h.update(volume.0);
+        h.update([u8::from(self.support.nan), u8::from(self.normals)]);
+        for (a, b) in &self.support.intervals {
+            h.update(a.to_le_bytes());
+            h.update(b.to_le_bytes());
+        }
+        if self.gradients {
+            h.update(b"gradients");
+        }
+        if let Some(crop) = &self.crop {
+            h.update(b"crop");
+            for x in crop.lo.to_array().into_iter().chain(crop.hi.to_array()) {
+                h.update(x.to_le_bytes());
+            }
+        }
+        BrickSetKey(Digest32(h.finalize().into()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::path::Crop;
+    use crate::volume::Lattice;
+
+    #[test]
+    fn bricks_serve_whoever_wants_no_more() {
+        let wanted = |lo: f64, normals, crop: Option<&str>| Wanted {
+            support: Support { intervals: vec![(lo, 255.0)], nan: false },
+            normals,
+            gradients: false,
+            crop: crop.map(|c| {
+                let lattice = Lattice::from_spacing([9; 3], [1.0; 3]);
+                c.parse::<Crop>().unwrap().of(&lattice).unwrap()
+            }),
+        };
+        let all = wanted(10.0, true, None);
+        assert!(all.covers(&wanted(20.0, false, None)) && all.covers(&all));
+        assert!(!all.covers(&wanted(5.0, false, None)));
+        assert!(!wanted(10.0, false, None).covers(&all), "normals are missing");
+        let edges = Wanted { gradients: true, ..all.clone() };
+        assert!(edges.covers(&all) && !all.covers(&edges), "gradients are missing");
+        let half = wanted(10.0, true, Some("50%:,:,:"));
+        assert!(half.covers(&wanted(12.0, true, Some("50%:,:,:"))));
+        assert!(!all.covers(&half) && !half.covers(&all), "a box is part of what is drawn");
+        let keys = [&all, &half, &edges, &wanted(10.0, false, None), &wanted(11.0, true, None)]
+            .map(|w| w.key(Digest32::default()));
+        for i in 0..keys.len() {
+            assert!(!keys[..i].contains(&keys[i]));
+        }
+    }
+}

@@ -36,6 +36,30 @@ pub struct TilePixels {
     pub last: Option<Vec<RawSums>>,
 }
 
+/// A finished pixel: linear premultiplied RGBA.
+#[inline(always)]
+fn finished(a: f32, colour: [u32; 3]) -> [f32; 4] {
+    let [r, g, b] = colour.map(|c| c as f32 * COLOUR_UNIT);
+    [r, g, b, a]
+}
+
+impl TilePixels {
+    /// Writes the pixels of `tile`, which one slab made, into the rows of a picture of `size`.
+    ///
+    /// # Panics
+    /// If the tile leaves the picture.
+    pub fn write(&self, tile: Rect, size: [u32; 2], pixels: &mut [[f32; 4]]) {
+        for (y, (a, colour)) in
+            self.a.chunks(tile.width()).zip(self.colour.chunks(tile.width())).enumerate()
+        {
+            let row = (tile.y0 as usize + y) * size[0] as usize + tile.x0 as usize;
+            for ((to, &a), &colour) in pixels[row..row + a.len()].iter_mut().zip(a).zip(colour) {
+                *to = finished(a, colour);
+            }
+        }
+    }
+}
+
 /// A frame while its slabs are rendered.
 #[derive(Clone, Debug)]
 pub struct FrameState {
@@ -125,15 +149,7 @@ impl FrameState {
 
     /// The finished picture.
     pub fn finish(&self) -> Picture {
-        let pixels = self
-            .a
-            .iter()
-            .zip(&self.colour)
-            .map(|(&a, c)| {
-                let [r, g, b] = c.map(|c| c as f32 * COLOUR_UNIT);
-                [r, g, b, a]
-            })
-            .collect();
+        let pixels = self.a.iter().zip(&self.colour).map(|(&a, &c)| finished(a, c)).collect();
         Picture { size: self.size, pixels }
     }
 }

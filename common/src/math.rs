@@ -36,6 +36,17 @@ pub fn exp_neg(x: f32) -> f32 {
 /// `tau` (NUMERICS.md section 2). `tau >= 0`.
 #[inline(always)]
 pub fn opacity(tau: f32) -> f32 {
+    let (small, large) = opacities(tau);
+    if tau < SWITCH { small } else { large }
+}
+
+/// Below this optical depth series take over from closed forms.
+pub const SWITCH: f32 = 0.25;
+
+/// Both forms of [`opacity`]: for depths below [`SWITCH`], and for others. Who needs them on lanes
+/// works out both and then chooses.
+#[inline(always)]
+pub fn opacities(tau: f32) -> (f32, f32) {
     let small = {
         // Six terms; at the switch (.25) the seventh is 4e-8 of the whole.
         let p = -1.0 / 720.0;
@@ -46,14 +57,20 @@ pub fn opacity(tau: f32) -> f32 {
         let p = p * tau + 1.0;
         p * tau
     };
-    let large = 1.0 - exp_neg(-tau);
-    if tau < 0.25 { small } else { large }
+    (small, 1.0 - exp_neg(-tau))
 }
 
 /// The weight of a colour's change through a sheet: `phi = a / tau + a / 2 - 1` (NUMERICS.md
-/// section 1.1). `a` must be `opacity(tau)`; `tau > 0`.
+/// section 1.1). `a` must be `opacity(tau)` and `per_tau` 1 / tau to some digits; `tau > 0`.
 #[inline(always)]
-pub fn phi(tau: f32, a: f32) -> f32 {
+pub fn phi(tau: f32, per_tau: f32, a: f32) -> f32 {
+    let (small, large) = phis(tau, per_tau, a);
+    if tau < SWITCH { small } else { large }
+}
+
+/// Both forms of [`phi`], as [`opacities`] has those of opacity.
+#[inline(always)]
+pub fn phis(tau: f32, per_tau: f32, a: f32) -> (f32, f32) {
     // The closed form loses all digits below tau = 1e-3; the series takes over where both are
     // good to 1e-7 absolute.
     let small = {
@@ -64,8 +81,7 @@ pub fn phi(tau: f32, a: f32) -> f32 {
         let p = p * tau + -1.0 / 12.0;
         p * tau * tau
     };
-    let large = a / tau + a * 0.5 - 1.0;
-    if tau < 0.25 { small } else { large }
+    (small, a * per_tau + a * 0.5 - 1.0)
 }
 
 /// sRGB to linear light for one component in `[0, 1]` (IEC 61966-2-1).
@@ -121,7 +137,7 @@ mod tests {
             } else {
                 a / t + a / 2.0 - 1.0
             };
-            let got = phi(tau, opacity(tau)) as f64;
+            let got = phi(tau, 1.0 / tau, opacity(tau)) as f64;
             assert!((got - want).abs() < 3e-7, "phi({tau:e}) = {got}, want {want}");
             tau *= 1.07;
         }

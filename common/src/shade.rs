@@ -29,7 +29,7 @@ pub fn encode_normal(v: DVec3) -> u16 {
 }
 
 /// The unit vector of a code other than [`NO_NORMAL`].
-#[inline]
+#[inline(always)]
 pub fn decode_normal(code: u16) -> Vec3 {
     let x = ((code >> 8) as f32 - 127.0) / 127.0;
     let y = ((code & 255) as f32 - 127.0) / 127.0;
@@ -102,15 +102,16 @@ pub struct Shader {
     specular: f32,
     /// Unit direction towards the light in world axes; `None` for a head light.
     light: Option<Vec3>,
-    power: Vec<f32>,
+    power: Box<[f32; POWER_STEPS + 2]>,
 }
 
 impl Shader {
     /// The shader of `shading`.
     pub fn new(shading: &Shading) -> Self {
-        let power = (0..=POWER_STEPS + 1)
-            .map(|i| libm::pow((i as f64 / POWER_STEPS as f64).min(1.0), shading.power) as f32)
-            .collect();
+        let mut power = Box::new([0.0; POWER_STEPS + 2]);
+        for (i, p) in power.iter_mut().enumerate() {
+            *p = libm::pow((i as f64 / POWER_STEPS as f64).min(1.0), shading.power) as f32;
+        }
         let light = match shading.light {
             Light::Head(_) => None,
             Light::Direction(d) => {
@@ -128,44 +129,88 @@ impl Shader {
         }
     }
 
-    /// `x^power` for `x` in `[0, 1]`.
-    #[inline]
-    fn pow(&self, x: f32) -> f32 {
-        let at = x.clamp(0.0, 1.0) * POWER_STEPS as f32;
-        let i = at as usize;
-        let t = at - i as f32;
-        self.power[i] * (1.0 - t) + self.power[i + 1] * t
-    }
-
     /// The colour of a voxel with the given base colour and normal code; `to_eye` is the unit
     /// direction towards the eye in world axes. Linear RGB in `[0, 1]`.
     #[inline]
     pub fn shade(&self, base: [f32; 3], normal: u16, to_eye: Vec3) -> [f32; 3] {
-        if normal == NO_NORMAL {
-            return base;
-        }
-        let n = decode_normal(normal);
-        let n_eye = n.x * to_eye.x + n.y * to_eye.y + n.z * to_eye.z;
-        // n = -gradient/|gradient| turned towards the eye: the sign of the stored vector drops
-        // out, since it is turned anyway.
-        let side = if n_eye < 0.0 { -1.0 } else { 1.0 };
-        let (n_light, n_half) = match self.light {
-            None => (n_eye * side, n_eye * side),
+        let light = self.light(normal, to_eye);
+        base.map(|c| light.on(c))
+    }
+
+    /// The light on a voxel with this normal code.
+    #[inline]
+    pub fn light(&self, normal: u16, to_eye: Vec3) -> Lit {
+        let mut lit = [[0.0]; 2];
+        self.light_all(&[normal], to_eye, &mut lit);
+        Lit { lambert: lit[0][0], gloss: lit[1][0] }
+    }
+
+    /// [`Shader::light`] of many voxels that see the eye in one direction: what their base colours
+    /// are multiplied by, and what is added. Loops over plain arrays of a length that compilers do
+    /// not know, so that they run them on lanes.
+    #[inline(always)]
+    pub fn light_all<const MOST: usize>(
+        &self,
+        normals: &[u16],
+        to_eye: Vec3,
+        lit: &mut [[f32; MOST]; 2],
+    ) {
+        let n = normals.len().min(MOST);
+        let normals = &normals[..n];
+        let [light, half] = lit;
+        match self.light {
+            None => {
+                for i in 0..n {
+                    let normal = decode_normal(normals[i]);
+                    // n = -gradient/|gradient| turned towards the eye: the sign of the stored
+                    // vector drops out, since it is turned anyway.
+                    let n_eye = normal.x * to_eye.x + normal.y * to_eye.y + normal.z * to_eye.z;
+                    light[i] = n_eye.abs();
+                    half[i] = light[i];
+                }
+            }
             Some(l) => {
-                let n_l = (n.x * l.x + n.y * l.y + n.z * l.z) * side;
                 let h = l + to_eye;
                 let len2 = h.x * h.x + h.y * h.y + h.z * h.z;
-                let n_h = if len2 > 1e-12 {
-                    (n.x * h.x + n.y * h.y + n.z * h.z) * side / len2.sqrt()
-                } else {
-                    0.0
-                };
-                (n_l, n_h)
+                let per_len = if len2 > 1e-12 { 1.0 / len2.sqrt() } else { 0.0 };
+                for i in 0..n {
+                    let n = decode_normal(normals[i]);
+                    let n_eye = n.x * to_eye.x + n.y * to_eye.y + n.z * to_eye.z;
+                    let side = if n_eye < 0.0 { -1.0 } else { 1.0 };
+                    light[i] = (n.x * l.x + n.y * l.y + n.z * l.z) * side;
+                    half[i] = (n.x * h.x + n.y * h.y + n.z * h.z) * side * per_len;
+                }
             }
-        };
-        let lambert = self.ambient + self.diffuse * n_light.max(0.0);
-        let gloss = self.specular * self.pow(n_half.max(0.0));
-        base.map(|c| (c * lambert + gloss).clamp(0.0, 1.0))
+        }
+        for i in 0..n {
+            // x^power between two steps of the table.
+            let at = half[i].clamp(0.0, 1.0) * POWER_STEPS as f32;
+            let step = at as i32;
+            let part = at - step as f32;
+            let step = (step as usize).min(POWER_STEPS);
+            let power = self.power[step] * (1.0 - part) + self.power[step + 1] * part;
+            let diffuse = self.ambient + self.diffuse * light[i].max(0.0);
+            let gloss = self.specular * power;
+            light[i] = if normals[i] != NO_NORMAL { diffuse } else { 1.0 };
+            half[i] = if normals[i] != NO_NORMAL { gloss } else { 0.0 };
+        }
+    }
+}
+
+/// The light on a voxel: what its base colour is multiplied by, and what is added in white.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Lit {
+    /// Ambient and diffuse.
+    pub lambert: f32,
+    /// Specular.
+    pub gloss: f32,
+}
+
+impl Lit {
+    /// One component of the colour, in `[0, 1]`.
+    #[inline(always)]
+    pub fn on(self, base: f32) -> f32 {
+        (base * self.lambert + self.gloss).clamp(0.0, 1.0)
     }
 }
 

@@ -395,6 +395,20 @@ impl Classifier {
         Look { sigma: self.rule.payload(a * factor) as f32, ..look }
     }
 
+    /// Whether opacities hang on gradients: then a sample alone does not say how a voxel looks.
+    pub fn is_modulated(&self) -> bool {
+        !self.factors.is_empty()
+    }
+
+    /// [`Classifier::look`] of a sample's bits ([`Samples::bits`]).
+    #[inline]
+    pub fn look_of_bits(&self, bits: u32) -> Look {
+        if self.table.is_empty() {
+            return self.evaluate(f64::from(f32::from_bits(bits)));
+        }
+        self.table[bits as usize]
+    }
+
     /// The looks by code of an 8-bit (256) or 16-bit (65536) volume; empty for floats.
     pub fn table(&self) -> &[Look] {
         &self.table

@@ -287,16 +287,19 @@ impl View {
     /// (x, y) on a plane with `scale` pixels a vox.
     #[inline]
     pub fn screen(&self, x: f64, y: f64, scale: f64) -> [i64; 2] {
+        [self.screen_along(0, x, scale), self.screen_along(1, y, scale)]
+    }
+
+    /// [`View::screen`] along one axis (0: x, 1: y).
+    #[inline(always)]
+    pub fn screen_along(&self, axis: usize, v: f64, scale: f64) -> i64 {
         // 2^42 pixels off the picture is farther than any footprint reaches: `View::new` refuses
         // cameras that magnify more than 2^39 pixels a vox.
         const FAR: f64 = (1u64 << 42) as f64;
-        let at = |v: f64, n: u32| {
-            let p = v * scale + f64::from(n) * 0.5;
-            let p = if p > -FAR { p } else { -FAR };
-            let p = if p < FAR { p } else { FAR };
-            round_i64(p * f64::from(SUBPIXELS))
-        };
-        [at(x, self.size[0]), at(y, self.size[1])]
+        let p = v * scale + f64::from(self.size[axis]) * 0.5;
+        let p = if p > -FAR { p } else { -FAR };
+        let p = if p < FAR { p } else { FAR };
+        round_i64(p * f64::from(SUBPIXELS))
     }
 
     /// Length of the ray of pixel (x, y) between two planes one apart.

@@ -159,6 +159,16 @@ impl Samples {
         self.len() == 0
     }
 
+    /// Samples as bits: their codes, or those of floats. As many as there are and fit.
+    #[inline(always)]
+    pub fn bits(&self, to: &mut [u32]) {
+        match self {
+            Samples::U8(v) => to.iter_mut().zip(v).for_each(|(to, &s)| *to = s.into()),
+            Samples::U16(v) => to.iter_mut().zip(v).for_each(|(to, &s)| *to = s.into()),
+            Samples::F32(v) => to.iter_mut().zip(v).for_each(|(to, &s)| *to = s.to_bits()),
+        }
+    }
+
     /// Their type.
     pub fn kind(&self) -> SampleKind {
         match self {

@@ -150,11 +150,11 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
             if p.rect.intersect(&here).is_empty() {
                 continue;
             }
-            let corner = view.corner_in_eye(frame.scene.grid.corner(brick.id));
+            let corner = frame.corner(brick.id);
             for (i, &local) in brick.index.iter().enumerate() {
-                let eye = frame.eye(corner, local);
-                let (first, _) = frame.sections.of(view.depth_in_phases(eye.z));
-                found.push((first, brick.id, i as u16, b as u32, eye));
+                let placed = frame.place(&corner, local);
+                let (first, _) = frame.sections.of(placed.z);
+                found.push((first, brick.id, i as u16, b as u32, placed));
             }
         }
         found.sort_unstable_by_key(|&(first, id, i, ..)| (first, id, i));
@@ -162,22 +162,23 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
         let (mut bx, mut by) = (Vec::new(), Vec::new());
         let (mut tx, mut ty) = (Vec::new(), Vec::new());
         let (columns, rows) = ((at[0], at[0] + 1), (at[1], at[1] + 1));
-        for (first, _, i, b, eye) in found {
-            let z = view.depth_in_phases(eye.z);
+        for (first, _, i, b, placed) in found {
+            let z = placed.z;
             let (_, sections) = frame.sections.of(z);
             let mut payload = None;
             for (n, &wz) in sections.iter().enumerate() {
                 let k = first + n as i32;
                 let Some(f) = frame.footprints.at(k) else { continue };
-                let [x, y] = view.screen(eye.x, eye.y, f.scale);
+                let [x, y] = frame.screen(&placed, &f);
                 let (_, wx) = S::Weight::of(&f, 0, x, columns, &mut bx);
                 let (_, wy) = S::Weight::of(&f, 1, y, rows, &mut by);
                 let (&[wx], &[wy]) = (wx, wy) else { continue };
                 let (_, real_x) = f.weights(0, x, columns, &mut tx);
                 let (_, real_y) = f.weights(1, y, rows, &mut ty);
                 let (&[real_x], &[real_y]) = (real_x, real_y) else { continue };
-                let payload = *payload
-                    .get_or_insert_with(|| frame.payload(&bricks[b as usize], i.into(), eye));
+                let payload = *payload.get_or_insert_with(|| {
+                    frame.payload(&bricks[b as usize], i.into(), placed.eye)
+                });
                 if payload[0] <= 0.0 {
                     break;
                 }

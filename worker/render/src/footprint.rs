@@ -17,7 +17,8 @@ use crate::splat::Tap;
 use glam::DVec3;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, View};
-use std::sync::OnceLock;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 /// One axis of the kernel. Lengths in vox.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -71,11 +72,10 @@ impl Profile {
 pub struct Sections {
     phases: i32,
     shift: u32,
-    /// First sheet of each phase, relative to the sheet that holds the voxel's centre.
-    first: Vec<i32>,
-    /// Sections of each phase.
-    count: Vec<u32>,
-    /// Row of `stride` weights a phase.
+    /// Radius of the kernel in phases, rounded up: a voxel at depth z reaches from the sheet of
+    /// z - radius to that of z + radius - 1, both by integer division.
+    radius: i32,
+    /// Row of `stride` weights a phase; those that a phase does not need are zero.
     weights: Vec<f32>,
     /// The same over the thickness, in steps of the lattice, as [`fixed`] point.
     fixed: Vec<i16>,
@@ -90,61 +90,77 @@ fn fixed(w: f64) -> i16 {
 impl Sections {
     /// For sheets of `thickness` and a kernel profile along z, both in vox.
     pub fn new(profile: &Profile, thickness: f64, phases: i32) -> Self {
-        let reach = profile.radius / thickness;
-        let (mut first, mut count) = (Vec::new(), Vec::new());
+        // What f64 leaves above an integer is not a phase more.
+        let radius = libm::ceil(profile.radius / thickness * f64::from(phases) * (1.0 - 1e-12));
+        let radius = radius as i32;
+        let shift = phases.trailing_zeros();
+        let mut sections =
+            Sections { phases, shift, radius, weights: vec![], fixed: vec![], stride: 1 };
+        let most = (0..phases).map(|p| sections.span(p).1).max().unwrap_or(1);
+        sections.stride = most as usize;
         for p in 0..phases {
+            let (first, count) = sections.span(p);
             let at = f64::from(p) / f64::from(phases);
-            let f = libm::floor(at - reach) as i32;
-            // A voxel that ends on a sheet's plane has nothing behind it.
-            let l = libm::ceil(at + reach) as i32 - 1;
-            first.push(f);
-            count.push((l - f + 1) as u32);
-        }
-        let stride = count.iter().copied().max().unwrap_or(1) as usize;
-        let mut weights = vec![0.0; stride * phases as usize];
-        let mut fixed_weights = vec![0; weights.len()];
-        for p in 0..phases as usize {
-            let at = p as f64 / f64::from(phases);
-            for s in 0..count[p] as usize {
-                let lo = (f64::from(first[p]) + s as f64 - at) * thickness;
+            for s in 0..most {
+                let lo = (f64::from(first) + f64::from(s) - at) * thickness;
                 let w = profile.integral_to(lo + thickness) - profile.integral_to(lo);
-                weights[p * stride + s] = w as f32;
-                fixed_weights[p * stride + s] = fixed(w * profile.spread / thickness);
+                let w = if s < count { w } else { 0.0 };
+                sections.weights.push(w as f32);
+                sections.fixed.push(fixed(w * profile.spread / thickness));
             }
         }
-        let shift = phases.trailing_zeros();
-        Sections { phases, shift, first, count, weights, fixed: fixed_weights, stride }
+        sections
     }
 
     /// First sheet of a voxel at depth `z` (in phases) and its weights in the sheets from there.
     #[inline]
     pub fn of(&self, z: i32) -> (i32, &[f32]) {
-        let p = (z & (self.phases - 1)) as usize;
-        let first = (z >> self.shift) + self.first[p];
-        let row = p * self.stride;
-        (first, &self.weights[row..row + self.count[p] as usize])
+        let (row, count) = self.row(z);
+        (self.first(z), &self.weights[row..row + count])
     }
 
     /// [`Sections::of`] with weights over the thickness, in steps of the lattice, in units of 2^-15.
     #[inline]
     pub fn of_fixed(&self, z: i32) -> (i32, &[i16]) {
-        let p = (z & (self.phases - 1)) as usize;
-        let first = (z >> self.shift) + self.first[p];
-        let row = p * self.stride;
-        (first, &self.fixed[row..row + self.count[p] as usize])
+        let (row, count) = self.row(z);
+        (self.first(z), &self.fixed[row..row + count])
+    }
+
+    /// Where the weights of depth `z` begin, and how many there are.
+    #[inline(always)]
+    fn row(&self, z: i32) -> (usize, usize) {
+        ((z & (self.phases - 1)) as usize * self.stride, self.span(z).1 as usize)
     }
 
     /// First sheet of a voxel at depth `z` (in phases), and in how many it lies.
     #[inline(always)]
     pub fn span(&self, z: i32) -> (i32, u32) {
-        let p = (z & (self.phases - 1)) as usize;
-        ((z >> self.shift) + self.first[p], self.count[p])
+        let first = self.first(z);
+        (first, (((z + self.radius - 1) >> self.shift) - first + 1) as u32)
     }
 
     /// First sheet of a voxel at depth `z` (in phases).
-    #[inline]
+    #[inline(always)]
     pub fn first(&self, z: i32) -> i32 {
-        (z >> self.shift) + self.first[(z & (self.phases - 1)) as usize]
+        (z - self.radius) >> self.shift
+    }
+
+    /// Weights of [`Sections::of`] by phase, [`Sections::most`] a phase, those that a phase does not
+    /// need zero.
+    pub(crate) fn all(&self) -> &[f32] {
+        &self.weights
+    }
+
+    /// Weights of [`Sections::of_fixed`] by phase, [`Sections::most`] a phase, those that a phase does
+    /// not need zero.
+    pub(crate) fn all_fixed(&self) -> &[i16] {
+        &self.fixed
+    }
+
+    /// Phases of a sheet.
+    #[inline(always)]
+    pub(crate) fn phases(&self) -> i32 {
+        self.phases
     }
 
     /// Most sheets that one voxel touches.
@@ -159,6 +175,7 @@ struct AxisTable {
     /// First pixel of each phase, relative to the pixel that holds the centre.
     first: Vec<i32>,
     count: Vec<u32>,
+    /// With `stride` zeros before and after those of each phase.
     weights: Vec<Tap>,
     /// The same in steps of the lattice, as fixed point.
     fixed: Vec<i16>,
@@ -199,13 +216,13 @@ impl AxisTable {
         let first: Vec<i32> = spans.iter().map(|s| near(s.0)).collect();
         let count: Vec<u32> = spans.iter().map(|s| (s.1 - s.0 + 1).max(0) as u32).collect();
         let stride = count.iter().copied().max().unwrap_or(0) as usize;
-        let mut weights = vec![Tap::default(); stride * SUBPIXELS as usize];
+        let mut weights = vec![Tap::default(); 3 * stride * SUBPIXELS as usize];
         let mut fixed_weights = vec![0; weights.len()];
         for p in 0..SUBPIXELS as usize {
             for t in 0..count[p] as usize {
                 let w = weight(profile, scale, p as i32, spans[p].0 + t as i64);
-                weights[p * stride + t] = Tap::new(w as f32);
-                fixed_weights[p * stride + t] = fixed(w * profile.spread);
+                weights[(3 * p + 1) * stride + t] = Tap::new(w as f32);
+                fixed_weights[(3 * p + 1) * stride + t] = fixed(w * profile.spread);
             }
         }
         let far = |s: &(i64, i64)| near((-s.0).max(s.1));
@@ -221,7 +238,7 @@ const TABLE_TAPS: f64 = 1024.0;
 /// voxels a side. Beyond it weights are evaluated where they are drawn, which costs a voxel some 20
 /// exponentials a section instead of a look-up: minutes a picture instead of seconds. Only tables of
 /// sheets that are drawn are made.
-const TABLE_BYTES: f64 = 256.0 * 1024.0 * 1024.0;
+const TABLE_BYTES: f64 = 768.0 * 1024.0 * 1024.0;
 
 /// Tables of one scale, x and y. Where the profiles are the same (cubic lattices) there is one.
 #[derive(Debug)]
@@ -251,9 +268,50 @@ pub struct Footprints {
     y: Profile,
     /// Tables of the sheets from `first`, made when first asked for; one for all sheets in an
     /// orthographic view; none where they would be too large.
-    tables: Vec<OnceLock<Tables>>,
+    tables: Vec<OnceLock<Arc<Tables>>>,
     first: i32,
+    last: i32,
     view: View,
+    shelf: Arc<Shelf>,
+}
+
+/// Tables by scale that frames of one scene share: along a turn a sheet's scale is the same in all.
+#[derive(Debug, Default)]
+pub struct Shelf {
+    tables: Mutex<BTreeMap<Key, Arc<Tables>>>,
+}
+
+/// Two profiles and a scale, as bits.
+type Key = [u64; 7];
+
+/// Tables that a shelf keeps: some 1000 are 40 MB at two pixels a vox. A turn of a volume of 256
+/// voxels a side has 450. A shelf that is full is cleared: what frames use they hold themselves.
+const SHELF: usize = 1024;
+
+/// Tables are made for scales rounded to this many bits, so that those of frames from one distance
+/// are the same whatever the last bits say. It is a 2^17th of a footprint's width.
+const SCALE_BITS: u32 = 16;
+
+impl Shelf {
+    fn get(&self, x: &Profile, y: &Profile, scale: f64) -> Arc<Tables> {
+        let drop = 52 - SCALE_BITS;
+        let rounded = (scale.to_bits() + (1 << (drop - 1))) >> drop << drop;
+        let scale = f64::from_bits(rounded);
+        let profile = |p: &Profile| [p.std, p.radius, p.spread].map(f64::to_bits);
+        let ([a, b, c], [d, e, f]) = (profile(x), profile(y));
+        let key = [a, b, c, d, e, f, rounded];
+        let tables = || self.tables.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(found) = tables().get(&key) {
+            return found.clone();
+        }
+        // Not under the lock: it takes a tenth of a millisecond, and threads want others.
+        let made = Arc::new(Tables::new(x, y, scale));
+        let mut tables = tables();
+        if tables.len() >= SHELF {
+            tables.clear();
+        }
+        tables.entry(key).or_insert(made).clone()
+    }
 }
 
 /// Weights along one axis, inside a clip: the first pixel and one weight a pixel.
@@ -261,8 +319,9 @@ pub type Span<'a> = (i32, &'a [Tap]);
 
 impl Footprints {
     /// The footprints of `view` for sheets in `range`; `spread` is the length of a lattice step
-    /// along the eye's axes in vox ([`Profile::with_spread`]).
-    pub fn new(view: &View, range: SheetRange, spread: DVec3) -> Self {
+    /// along the eye's axes in vox ([`Profile::with_spread`]). Tables are
+    /// taken from `shelf`.
+    pub fn new(view: &View, range: SheetRange, spread: DVec3, shelf: Arc<Shelf>) -> Self {
         let x = Profile::new(view.kernel_std.x, view.kernel_radius.x).with_spread(spread.x);
         let y = Profile::new(view.kernel_std.y, view.kernel_radius.y).with_spread(spread.y);
         let reach = view.kernel_radius.x.max(view.kernel_radius.y);
@@ -272,12 +331,18 @@ impl Footprints {
         };
         let largest = (range.first..range.end).find_map(|k| view.scale_at(k)).unwrap_or(1.0);
         let taps = 2.0 * reach * largest + 2.0;
-        // Two kinds of weights, along one axis or two.
+        // Two kinds of weights with zeros on both sides, along one axis or two.
         let axes = if x == y { 1.0 } else { 2.0 };
-        let bytes = taps * f64::from(SUBPIXELS) * 6.0 * axes * sheets as f64;
+        let bytes = taps * f64::from(SUBPIXELS) * 18.0 * axes * sheets as f64;
         let kept = taps <= TABLE_TAPS && bytes <= TABLE_BYTES;
         let tables = (0..if kept { sheets } else { 0 }).map(|_| OnceLock::new()).collect();
-        Footprints { x, y, tables, first: range.first, view: *view }
+        let (first, last) = (range.first, range.end - 1);
+        Footprints { x, y, tables, first, last, view: *view, shelf }
+    }
+
+    /// The last sheet that anything of the volume may reach.
+    pub(crate) fn last(&self) -> i32 {
+        self.last
     }
 
     /// The footprints of sheet `k`; `None` where the near plane clips it.
@@ -288,7 +353,7 @@ impl Footprints {
             Projection::Ortho { .. } => self.tables.first(),
             Projection::Persp { .. } => self.tables.get((k - self.first) as usize),
         };
-        let table = slot.map(|t| t.get_or_init(|| Tables::new(&self.x, &self.y, scale)));
+        let table = slot.map(|t| &**t.get_or_init(|| self.shelf.get(&self.x, &self.y, scale)));
         Some(Footprint { scale, table, profiles: [&self.x, &self.y] })
     }
 }
@@ -302,7 +367,7 @@ pub struct Footprint<'a> {
     profiles: [&'a Profile; 2],
 }
 
-impl Footprint<'_> {
+impl<'a> Footprint<'a> {
     /// Pixels that it reaches at most from the one that holds its centre, where its weights are in
     /// a table; otherwise they are worked out where they are drawn.
     #[inline]
@@ -338,7 +403,8 @@ impl Footprint<'_> {
         clip: (i32, i32),
         buffer: &'b mut Vec<Tap>,
     ) -> Span<'b> {
-        self.window(axis, pos, clip, buffer, |t| &t.weights, |w, _| Tap::new(w as f32))
+        let row = |t: &'b AxisTable, p: usize| &t.weights[(3 * p + 1) * t.stride..][..t.stride];
+        self.window(axis, pos, clip, buffer, row, |w, _| Tap::new(w as f32))
     }
 
     /// [`Footprint::weights`] in steps of the lattice, in units of 2^-15.
@@ -350,7 +416,25 @@ impl Footprint<'_> {
         clip: (i32, i32),
         buffer: &'b mut Vec<i16>,
     ) -> (i32, &'b [i16]) {
-        self.window(axis, pos, clip, buffer, |t| &t.fixed, |w, spread| fixed(w * spread))
+        let row = |t: &'b AxisTable, p: usize| &t.fixed[(3 * p + 1) * t.stride..][..t.stride];
+        self.window(axis, pos, clip, buffer, row, |w, spread| fixed(w * spread))
+    }
+
+    /// Weights along `axis` by phase, each with as many zeros before and after: a window that is
+    /// moved to lie inside a part reads zeros outside. `None` where they are not in a table.
+    pub(crate) fn padded(&self, axis: usize) -> Option<&'a [Tap]> {
+        self.table.map(|t| &t.along(axis).weights[..])
+    }
+
+    /// [`Footprint::padded`] in steps of the lattice, in units of 2^-15.
+    pub(crate) fn padded_fixed(&self, axis: usize) -> Option<&'a [i16]> {
+        self.table.map(|t| &t.along(axis).fixed[..])
+    }
+
+    /// First pixel of each phase, relative to the one that holds the centre, and how many pixels
+    /// one has at most; where weights are in a table.
+    pub(crate) fn firsts(&self, axis: usize) -> Option<(&'a [i32], usize)> {
+        self.table.map(|t| t.along(axis)).map(|t| (&t.first[..], t.stride))
     }
 
     #[inline(always)]
@@ -360,7 +444,7 @@ impl Footprint<'_> {
         pos: i64,
         (lo, hi): (i32, i32),
         buffer: &'b mut Vec<W>,
-        column: impl Fn(&'b AxisTable) -> &'b [W],
+        row: impl Fn(&'b AxisTable, usize) -> &'b [W],
         make: impl Fn(f64, f64) -> W,
     ) -> (i32, &'b [W]) {
         let (first, end) = self.extent(axis, pos);
@@ -371,9 +455,8 @@ impl Footprint<'_> {
         let (base, p) = split(pos);
         match self.table {
             Some(t) => {
-                let t = t.along(axis);
-                let row = p as usize * t.stride;
-                (from, &column(t)[row + (from - first) as usize..row + (to - first) as usize])
+                let row = row(t.along(axis), p as usize);
+                (from, &row[(from - first) as usize..(to - first) as usize])
             }
             None => {
                 let profile = self.profiles[axis];

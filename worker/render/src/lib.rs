@@ -16,16 +16,21 @@
 //! clocks; whoever calls it has those.
 
 pub mod closed;
+mod deep;
 pub mod explain;
+mod flat;
 pub mod footprint;
+mod general;
 mod mask;
+mod place;
+mod planes;
 pub mod reference;
-mod ring;
 pub mod scene;
 pub mod selftest;
 pub mod serial;
 pub mod sheet;
 pub mod splat;
+mod stack;
 pub mod survey;
 pub mod tile;
 

@@ -7,6 +7,7 @@
 //! be open around this centre? Most voxels need no more.
 
 use slabcast_common::occlusion::Rect;
+use slabcast_common::view::SUBPIXEL_BITS;
 
 /// Open pixels of a part of at most 64x64 pixels.
 #[derive(Clone, Debug)]
@@ -31,10 +32,10 @@ impl OpenMask {
         OpenMask { rect, rows: [0; 64], grown: [0; 64], reach: 0 }
     }
 
-    /// Opens pixel (x, y) of the part.
+    /// Opens the pixels of row `y` whose bits are set.
     #[inline(always)]
-    pub(crate) fn open(&mut self, x: usize, y: usize) {
-        self.rows[y & 63] |= 1 << x;
+    pub(crate) fn open_row(&mut self, y: usize, bits: u64) {
+        self.rows[y & 63] |= bits;
     }
 
     /// Shuts the pixels of row `y` whose bits are set.
@@ -71,19 +72,25 @@ impl OpenMask {
         }
     }
 
-    /// Whether a footprint of the mask's reach, centred in pixel (x, y) of the part, may touch it.
+    /// The nearest pixels of the part to many centres in subpixels, and whether a footprint of the
+    /// mask's reach around them may touch the part (1) or an open pixel of it, too (3).
     #[inline(always)]
-    pub(crate) fn reaches(&self, x: i32, y: i32) -> bool {
-        let inside = |p: i32| p >= -self.reach && p < 64 + self.reach;
-        inside(x) && inside(y)
+    pub(crate) fn near_all(&self, x: &[i32], y: &[i32], cells: &mut [u32], fate: &mut [u32]) {
+        let span = (64 + 2 * self.reach) as u32;
+        for (((x, y), cell), fate) in x.iter().zip(y).zip(cells).zip(fate) {
+            let (x, y) = (x >> SUBPIXEL_BITS, y >> SUBPIXEL_BITS);
+            let inside = |p: i32| u32::from(((p + self.reach) as u32) < span);
+            let (cx, cy) = (x.clamp(0, 63), y.clamp(0, 63));
+            *cell = (cy << 6 | cx) as u32;
+            *fate =
+                (inside(x) & inside(y)) * (1 + 2 * ((self.grown[cy as usize] >> cx) as u32 & 1));
+        }
     }
 
-    /// Whether a footprint of the mask's reach, centred in pixel (x, y) of the part (which may lie
-    /// outside), may touch an open pixel. Never wrongly no.
+    /// Whether something may be open near the pixel of the part that [`OpenMask::near_all`] named.
     #[inline(always)]
-    pub(crate) fn near(&self, x: i32, y: i32) -> bool {
-        let bit = self.grown[y.clamp(0, 63) as usize] >> x.clamp(0, 63) & 1;
-        self.reaches(x, y) && bit == 1
+    pub(crate) fn is_near(&self, cell: u32) -> bool {
+        self.grown[(cell >> 6 & 63) as usize] >> (cell & 63) & 1 == 1
     }
 
     /// Number of open pixels.
@@ -126,7 +133,7 @@ mod tests {
             let mut mask = OpenMask::shut(part);
             let open: Vec<_> = open.into_iter().filter(|&(i, j)| i < w && j < h).collect();
             for &(i, j) in &open {
-                mask.open(i as usize, j as usize);
+                mask.open_row(j as usize, 1 << i);
             }
             for (x0, y0, dx, dy) in rects {
                 let r = Rect::new(x0, y0, x0 + dx, y0 + dy);
@@ -136,9 +143,13 @@ mod tests {
                 let square = Rect::new(
                     x + cx - reach, y + cy - reach, x + cx + reach + 1, y + cy + reach + 1,
                 );
-                prop_assert!(mask.near(cx, cy) || !mask.any(&square), "{square:?} in {part:?}");
+                let (mut cell, mut fate) = ([0], [9]);
+                mask.near_all(&[cx * 256 + 255], &[cy * 256], &mut cell, &mut fate);
+                let near = fate[0] == 3;
+                prop_assert!(near || !mask.any(&square), "{square:?} in {part:?}");
                 let inside = (0..64).contains(&cx) && (0..64).contains(&cy);
-                prop_assert!(!inside || mask.near(cx, cy) == mask.any(&square));
+                prop_assert!(!inside || near == mask.any(&square));
+                prop_assert!(fate[0] == 0 || near == mask.is_near(cell[0]));
                 let inside = |&(i, j): &(i32, i32)| {
                     let (i, j) = (i + x, j + y);
                     r.x0 <= i && i < r.x1 && r.y0 <= j && j < r.y1

@@ -1,13 +1,16 @@
 //! A scene and a frame of it, made ready for drawing: tables that tiles share.
 
-use crate::footprint::{Footprints, Profile, Sections};
+use crate::footprint::{Footprint, Footprints, Profile, Sections, Shelf};
+use crate::mask::REACH_MOST;
+use crate::place::{FlatCorner, Places};
 use crate::sheet::Rule;
 use glam::{DVec3, Vec3};
 use slabcast_common::bounds::{raw_per_payload, short_per_payload};
 use slabcast_common::brick::{Brick, BrickGrid, TightBox, local};
+use slabcast_common::ids::BrickId;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Compositing, Quality, Sums};
-use slabcast_common::shade::{NO_NORMAL, Shader};
+use slabcast_common::shade::{Lit, NO_NORMAL, Shader};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::Classifier;
 use slabcast_common::view::{Projection, View};
@@ -28,6 +31,8 @@ pub struct Scene {
     pub dims: [u32; 3],
     /// Largest extinction per vox (or alpha, for the paper's compositing).
     pub payload_max: f64,
+    /// Footprints that its frames share.
+    shelf: Arc<Shelf>,
 }
 
 impl Scene {
@@ -42,6 +47,7 @@ impl Scene {
             grid: BrickGrid::of(spec.volume.lattice.dims),
             dims: spec.volume.lattice.dims,
             payload_max,
+            shelf: Arc::default(),
         }
     }
 
@@ -70,7 +76,38 @@ pub struct Frame {
     /// Eye offsets of the 512 voxels of a brick.
     offsets: Vec<DVec3>,
     /// Unit direction to the eye in world axes, where it is the same for all voxels.
-    to_eye: Option<Vec3>,
+    pub(crate) to_eye: Option<Vec3>,
+    /// Positions, where all sections of all voxels share one footprint.
+    pub(crate) flat: Option<Flat>,
+}
+
+/// What an orthographic view has whose footprints are in a table and small enough for masks.
+#[derive(Debug)]
+pub(crate) struct Flat {
+    /// Where voxels land.
+    pub(crate) places: Places,
+    /// Pixels that a footprint reaches at most from the one that holds its centre.
+    pub(crate) reach: i32,
+}
+
+/// A brick's corner, seen by the eye.
+#[derive(Clone, Copy, Debug)]
+pub struct Corner {
+    /// Eye coordinates in vox.
+    pub eye: DVec3,
+    /// Where the view is flat.
+    pub(crate) flat: FlatCorner,
+}
+
+/// A voxel, seen by the eye.
+#[derive(Clone, Copy, Debug)]
+pub struct Placed {
+    /// Eye coordinates in vox.
+    pub eye: DVec3,
+    /// Depth in phases of a sheet ([`View::depth_phases`]).
+    pub z: i32,
+    /// Screen position in subpixels, where it is the same in all sheets.
+    screen: Option<[i64; 2]>,
 }
 
 impl Frame {
@@ -103,9 +140,13 @@ impl Frame {
             Projection::Persp { .. } => None,
         };
         let rule = Rule::new(q.compositing, unit, d / view.kernel_std.z, q.eps as f32);
+        let footprints = Footprints::new(&view, range, spread, scene.shelf.clone());
+        let reach = footprints.at(0).and_then(|f| f.reach()).filter(|&r| r <= REACH_MOST);
+        let flat = reach.and_then(|reach| Some(Flat { places: Places::new(&view)?, reach }));
         Frame {
+            flat,
             sections: Sections::new(&profile, d, view.depth_phases()),
-            footprints: Footprints::new(&view, range, spread),
+            footprints,
             rule,
             raw_scale,
             offsets: (0..512).map(|i| view.offset_in_eye(local(i))).collect(),
@@ -120,10 +161,82 @@ impl Frame {
         self.scene.quality.compositing == Compositing::Linear
     }
 
-    /// Eye position of a voxel: its brick's corner and its local index.
+    /// Offsets of a brick's voxels from its corner, in vox along the eye's axes.
+    pub(crate) fn offsets(&self) -> &[DVec3] {
+        &self.offsets
+    }
+
+    /// The corner of brick `id`.
+    pub fn corner(&self, id: BrickId) -> Corner {
+        let eye = self.view.corner_in_eye(self.scene.grid.corner(id));
+        Corner { eye, flat: self.flat.as_ref().map_or([0; 3], |f| f.places.corner(eye)) }
+    }
+
+    /// Where a voxel lies: its brick's corner and its local index. The one definition of a
+    /// position, for every renderer.
     #[inline]
-    pub fn eye(&self, corner: DVec3, local: u16) -> DVec3 {
-        corner + self.offsets[local as usize]
+    pub fn place(&self, corner: &Corner, local: u16) -> Placed {
+        let eye = corner.eye + self.offsets[local as usize];
+        match &self.flat {
+            Some(flat) => {
+                let (screen, z) = flat.places.at(corner.flat, local);
+                Placed { eye, z, screen: Some(screen) }
+            }
+            None => Placed { eye, z: self.view.depth_in_phases(eye.z), screen: None },
+        }
+    }
+
+    /// Screen position, in 1/256 pixel of absolute image coordinates, of a voxel's footprint.
+    #[inline]
+    pub fn screen(&self, placed: &Placed, footprint: &Footprint<'_>) -> [i64; 2] {
+        match placed.screen {
+            Some(at) => at,
+            None => self.view.screen(placed.eye.x, placed.eye.y, footprint.scale),
+        }
+    }
+
+    /// [`Frame::payload`] of many voxels by their samples' bits and normals (opacities do not hang on
+    /// gradients), in a view whose
+    /// direction to the eye is the same for all: extinctions, then each colour. Loops of a length
+    /// that compilers do not know, so that they run them on lanes.
+    ///
+    /// # Panics
+    /// In a perspective view, or if there are not as many normals as samples.
+    #[inline(always)]
+    pub(crate) fn payloads<const MOST: usize>(
+        &self,
+        samples: &[u32],
+        normals: &[u16],
+        out: &mut [[f32; MOST]; 4],
+    ) {
+        let n = samples.len().min(MOST);
+        assert_eq!(samples.len(), normals.len(), "a normal a sample");
+        let [sigma, colours @ ..] = out;
+        for i in 0..n {
+            let look = self.scene.classifier.look_of_bits(samples[i]);
+            sigma[i] = look.sigma;
+            for c in 0..3 {
+                colours[c][i] = look.rgb[c];
+            }
+        }
+        if let Some(shader) = &self.scene.shader {
+            let to_eye = self.to_eye.expect("an orthographic view");
+            let mut lit = [[0.0; MOST]; 2];
+            shader.light_all(normals, to_eye, &mut lit);
+            for colour in &mut *colours {
+                for i in 0..n {
+                    colour[i] = Lit { lambert: lit[0][i], gloss: lit[1][i] }.on(colour[i]);
+                }
+            }
+        }
+        for sigma in &mut sigma[..n] {
+            *sigma = (f64::from(*sigma) * self.view.cell) as f32 * self.raw_scale;
+        }
+        for colour in colours {
+            for i in 0..n {
+                colour[i] *= sigma[i];
+            }
+        }
     }
 
     /// What voxel `i` of `brick` at eye position `eye` adds to a sheet per unit of weight, in

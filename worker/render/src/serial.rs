@@ -107,11 +107,9 @@ fn render_sums<S: Sum>(
     let mut voxels = Vec::new();
     let mut range = SheetRange::default();
     for (b, brick) in bricks.iter().enumerate() {
-        let corner = frame.view.corner_in_eye(frame.scene.grid.corner(brick.id));
+        let corner = frame.corner(brick.id);
         for (i, &local) in brick.index.iter().enumerate() {
-            let eye = frame.eye(corner, local);
-            let z = frame.view.depth_in_phases(eye.z);
-            let (first, weights) = frame.sections.of(z);
+            let (first, weights) = frame.sections.of(frame.place(&corner, local).z);
             range = range.union(SheetRange::new(first, first + weights.len() as i32));
             voxels.push((first, brick.id, i as u16, b as u32));
         }
@@ -121,9 +119,8 @@ fn render_sums<S: Sum>(
     let mut buckets: Vec<Vec<u32>> = vec![Vec::new(); range.len() as usize];
     for (v, &(first, _, i, b)) in voxels.iter().enumerate() {
         let brick = &bricks[b as usize];
-        let corner = frame.view.corner_in_eye(frame.scene.grid.corner(brick.id));
-        let eye = frame.eye(corner, brick.index[i as usize]);
-        let (_, weights) = frame.sections.of(frame.view.depth_in_phases(eye.z));
+        let placed = frame.place(&frame.corner(brick.id), brick.index[i as usize]);
+        let (_, weights) = frame.sections.of(placed.z);
         for k in first..first + weights.len() as i32 {
             buckets[(k - range.first) as usize].push(v as u32);
         }
@@ -140,13 +137,12 @@ fn render_sums<S: Sum>(
         for &v in &buckets[(k - range.first) as usize] {
             let (first, _, i, b) = voxels[v as usize];
             let brick = &bricks[b as usize];
-            let corner = frame.view.corner_in_eye(frame.scene.grid.corner(brick.id));
-            let eye = frame.eye(corner, brick.index[i as usize]);
-            let payload = frame.payload(brick, i as usize, eye);
+            let placed = frame.place(&frame.corner(brick.id), brick.index[i as usize]);
+            let payload = frame.payload(brick, i as usize, placed.eye);
             if payload[0] <= 0.0 {
                 continue;
             }
-            let z = frame.view.depth_in_phases(eye.z);
+            let z = placed.z;
             let count = frame.sections.of(z).1.len() as i32;
             // Its section here, and the one behind: a voxel in this bucket begins no later than
             // this sheet, so what it puts into the next one is what the rule may peek at.
@@ -155,7 +151,7 @@ fn render_sums<S: Sum>(
                     continue;
                 }
                 let Some(footprint) = frame.footprints.at(sheet) else { continue };
-                let at = frame.view.screen(eye.x, eye.y, footprint.scale);
+                let at = frame.screen(&placed, &footprint);
                 let section = (sheet - first) as usize;
                 let part = Part { frame, z, section, payload, footprint, at };
                 add(to, &part);

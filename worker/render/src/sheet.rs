@@ -8,11 +8,14 @@
 //! latency, and is the same for every tile, order and culling, since "begins no later" is a
 //! matter of the absolute sheet grid (NUMERICS.md section 1.2).
 
-use slabcast_common::math::{opacity, phi};
+use crate::splat::truncate;
+use slabcast_common::math::{SWITCH, opacities, opacity, phi, phis};
 use slabcast_common::quality::Compositing;
 
 /// A sum of a sheet: integers, whose sum has no order, or floats, added in one order.
 pub trait Sum: Copy + Default + PartialEq {
+    /// Whether sums are whole numbers below 2^31.
+    const WHOLE: bool;
     /// The sum as a number.
     fn value(self) -> f32;
     /// Its bits.
@@ -22,6 +25,7 @@ pub trait Sum: Copy + Default + PartialEq {
 }
 
 impl Sum for i32 {
+    const WHOLE: bool = true;
     #[inline(always)]
     fn value(self) -> f32 {
         self as f32
@@ -37,6 +41,7 @@ impl Sum for i32 {
 }
 
 impl Sum for i16 {
+    const WHOLE: bool = true;
     #[inline(always)]
     fn value(self) -> f32 {
         f32::from(self)
@@ -52,6 +57,7 @@ impl Sum for i16 {
 }
 
 impl Sum for f32 {
+    const WHOLE: bool = false;
     #[inline(always)]
     fn value(self) -> f32 {
         self
@@ -74,8 +80,9 @@ const FAINTEST: f32 = 1e-30;
 #[derive(Clone, Copy, Debug)]
 pub struct Rule {
     compositing: Compositing,
-    /// Optical depth of one raw unit.
+    /// Optical depth of one raw unit, and raw units of one of optical depth.
     unit: f32,
+    per_unit: f32,
     /// Weight of the sheet before and of the one behind.
     gain_before: f32,
     gain_behind: f32,
@@ -92,6 +99,7 @@ impl Rule {
         Rule {
             compositing,
             unit,
+            per_unit: 1.0 / unit,
             // Sheets far thicker than the kernel have no slope to speak of; the clamp below
             // holds the rest.
             gain_before: gain_before.min(2.0) as f32,
@@ -130,46 +138,101 @@ impl Rule {
             return;
         }
         let tau = self.optical_depth(raw, secant);
+        let per_raw = 1.0 / raw;
+        let per_tau = per_raw * self.per_unit * (1.0 / secant);
         let (sheet_a, weight) = match self.compositing {
             Compositing::Paper => (tau.min(1.0), 0.0),
             Compositing::Constant => (opacity(tau), 0.0),
             Compositing::Linear => {
                 let o = opacity(tau);
-                (o, if tau > 0.0 { phi(tau, o) } else { 0.0 })
+                (o, if tau > 0.0 { phi(tau, per_tau, o) } else { 0.0 })
             }
         };
         let transmittance = 1.0 - *a;
-        let per_raw = 1.0 / raw;
         if weight == 0.0 {
             for ch in 0..3 {
                 let c = here[ch + 1].value() * per_raw;
-                add_colour(&mut colour[ch], transmittance * (c * sheet_a));
+                colour[ch] = colour[ch].wrapping_add(fixed_light(transmittance * (c * sheet_a)));
             }
         } else {
             let (tl, tn) = (before[0].value(), behind[0].value());
-            // Ratios before squares: sums reach 1e15.
-            let ml = 1.0 / tl.max(raw);
-            let (ql, qh) = (tl * ml, raw * ml);
-            // The sheet before counts unless it is below 2 % of this one.
-            let wl = self.gain_before * (ql * ql) / (ql * ql + 4e-4 * (qh * qh));
-            let per_tl = if tl > FAINTEST { 1.0 / tl } else { 0.0 };
-            // A thin, noisy sheet behind fades out.
-            let mn = 1.0 / tn.max(raw);
-            let (rn, rh) = (tn * mn, raw * mn);
-            let wr = self.gain_behind / (rn + 0.05 * rh);
+            let slopes =
+                if S::WHOLE { self.slopes_whole(tl, raw, tn) } else { self.slopes(tl, raw, tn) };
             for ch in 0..3 {
                 let c = here[ch + 1].value() * per_raw;
-                let cl = before[ch + 1].value() * per_tl;
-                let en = behind[ch + 1].value() * mn;
-                let change = wl * (c - cl) + wr * (en - c * rn);
-                // The colour stays between 0 and 1 through the sheet, so 0 <= C <= A.
-                let most = 2.0 * c.min(1.0 - c).max(0.0);
-                let change = change.min(most).max(-most);
-                add_colour(&mut colour[ch], transmittance * (c * sheet_a + change * weight));
+                let (el, en) = (before[ch + 1].value(), behind[ch + 1].value());
+                let light = c * sheet_a + slopes.change(c, el, tn, en) * weight;
+                colour[ch] = colour[ch].wrapping_add(fixed_light(transmittance * light));
             }
         }
         *a += transmittance * sheet_a;
     }
+
+    /// How the colour changes through a sheet with sum `h` between one of `tl` before it and one of
+    /// `tn` behind, of any size. Ratios before squares: sums reach 1e15.
+    #[inline(always)]
+    fn slopes(&self, tl: f32, h: f32, tn: f32) -> Slopes {
+        let ml = 1.0 / tl.max(h);
+        let (ql, qh) = (tl * ml, h * ml);
+        // The sheet before counts unless it is below 2 % of this one.
+        let before = self.gain_before * (ql * ql) / (ql * ql + 4e-4 * (qh * qh));
+        let seen = tl > FAINTEST;
+        let per_tl = 1.0 / if seen { tl } else { 1.0 };
+        let per_tl = if seen { per_tl } else { 0.0 };
+        // A thin, noisy sheet behind fades out.
+        let unit = 1.0 / tn.max(h);
+        let behind = self.gain_behind / (tn * unit + 0.05 * (h * unit));
+        Slopes { before, per_tl, behind, unit }
+    }
+
+    /// [`Rule::slopes`] for whole numbers from 1 to 2^31 (the neighbours from 0): one division
+    /// instead of five, since their products stay below 2e37 and above 2e-5.
+    #[inline(always)]
+    fn slopes_whole(&self, tl: f32, h: f32, tn: f32) -> Slopes {
+        let squares = tl * tl + 4e-4 * (h * h);
+        let sum = tn + 0.05 * h;
+        let some = tl.max(1.0);
+        let per_all = 1.0 / (some * (squares * sum));
+        Slopes {
+            before: self.gain_before * (tl * tl) * ((some * sum) * per_all),
+            // Nothing over 1 is nothing, too.
+            per_tl: (squares * sum) * per_all,
+            behind: self.gain_behind * ((some * squares) * per_all),
+            unit: 1.0,
+        }
+    }
+}
+
+/// What [`Rule::slopes`] gives.
+struct Slopes {
+    /// Weight of the sheet before, and what makes a colour of its sums.
+    before: f32,
+    per_tl: f32,
+    /// Weight of the sheet behind, for its sums times `unit`.
+    behind: f32,
+    unit: f32,
+}
+
+impl Slopes {
+    /// Change of one component through a sheet of colour `c`, whose neighbours sum to `el` and,
+    /// for an optical depth of `tn`, to `en`.
+    #[inline(always)]
+    fn change(&self, c: f32, el: f32, tn: f32, en: f32) -> f32 {
+        let ahead = en * self.unit - c * (tn * self.unit);
+        let change = self.before * (c - el * self.per_tl) + self.behind * ahead;
+        // The colour stays between 0 and 1 through the sheet, so 0 <= C <= A.
+        let most = 2.0 * c.min(1.0 - c).max(0.0);
+        change.min(most).max(-most)
+    }
+}
+
+/// Light in fixed point. One rounding a sheet: colour of any cut into slabs adds up to the same
+/// integers.
+#[inline(always)]
+fn fixed_light(light: f32) -> u32 {
+    const ONE: f32 = (1u32 << 28) as f32;
+    // Not negative but for the last bits of f32.
+    truncate(light * ONE + 0.5)
 }
 
 /// Sums and state of up to [`LANES`] pixels beside each other, channel by channel: what
@@ -182,16 +245,19 @@ pub struct Row {
     pub here: [[f32; LANES]; 4],
     /// Of sheet k+1 as it stands.
     pub behind: [[f32; LANES]; 4],
-    /// Length of the rays in the sheet over its thickness.
+    /// Length of the rays in the sheet over its thickness, and one over it.
     pub secant: [f32; LANES],
+    /// See there.
+    pub cosine: [f32; LANES],
     /// Opacity before, and after.
     pub a: [f32; LANES],
     /// What the sheet adds to the fixed-point colour.
     pub light: [[u32; LANES]; 3],
 }
 
-/// Pixels of a [`Row`]: a block's row. More would be filled with pixels that nothing touched.
-pub const LANES: usize = 8;
+/// Pixels of a [`Row`]: two strips of eight, which need not be neighbours; a register of AVX-512 or
+/// two of AVX2. Strips of sixteen would be filled with pixels that nothing touched.
+pub const LANES: usize = 16;
 
 impl Default for Row {
     fn default() -> Self {
@@ -200,6 +266,7 @@ impl Default for Row {
             here: [[0.0; LANES]; 4],
             behind: [[0.0; LANES]; 4],
             secant: [1.0; LANES],
+            cosine: [1.0; LANES],
             a: [0.0; LANES],
             light: [[0; LANES]; 3],
         }
@@ -207,69 +274,92 @@ impl Default for Row {
 }
 
 impl Rule {
-    /// [`Rule::close`] for pixels beside each other, without a branch a pixel: the same
-    /// operations in the same order, so the same bytes.
+    /// [`Rule::close`] of sums `S` for pixels beside each other, without a branch a pixel: the same
+    /// operations in the same order, so the same bytes. `live` has a bit for each pixel that is
+    /// open; others keep their opacity and get no light. Returns those that are shut now.
     #[inline(always)]
-    pub fn close_row(&self, row: &mut Row) {
-        match self.compositing {
-            Compositing::Linear => self.close_lanes::<true, false>(row),
-            Compositing::Constant => self.close_lanes::<false, false>(row),
-            Compositing::Paper => self.close_lanes::<false, true>(row),
+    pub fn close_row<S: Sum>(&self, row: &mut Row, live: u32) -> u32 {
+        match (self.compositing, S::WHOLE) {
+            (Compositing::Linear, true) => self.close_lanes::<true, true, false>(row, live),
+            (Compositing::Linear, false) => self.close_lanes::<true, false, false>(row, live),
+            (Compositing::Constant, _) => self.close_lanes::<false, true, false>(row, live),
+            (Compositing::Paper, _) => self.close_lanes::<false, true, true>(row, live),
         }
     }
 
     #[inline(always)]
-    fn close_lanes<const LINEAR: bool, const PAPER: bool>(&self, row: &mut Row) {
-        const ONE: f32 = (1u32 << 28) as f32;
+    fn close_lanes<const LINEAR: bool, const WHOLE: bool, const PAPER: bool>(
+        &self,
+        row: &mut Row,
+        live: u32,
+    ) -> u32 {
+        // Several short loops over plain arrays: of one long one compilers make scalar code for AVX2.
+        let [mut taus, mut per_raws, mut small, mut large] = [[0.0f32; LANES]; 4];
         for i in 0..LANES {
             let filled = row.here[0][i] >= FAINTEST;
             let raw = if filled { row.here[0][i] } else { 1.0 };
             let tau = raw * self.unit * row.secant[i];
-            let tau = if filled { tau } else { 0.0 };
-            let sheet_a = if PAPER { tau.min(1.0) } else { opacity(tau) };
-            let transmittance = 1.0 - row.a[i];
-            let per_raw = 1.0 / raw;
-            if LINEAR {
-                let weight = phi(tau, sheet_a);
-                let weight = if tau > 0.0 { weight } else { 0.0 };
-                let (tl, tn) = (row.before[0][i], row.behind[0][i]);
-                let ml = 1.0 / tl.max(raw);
-                let (ql, qh) = (tl * ml, raw * ml);
-                let wl = self.gain_before * (ql * ql) / (ql * ql + 4e-4 * (qh * qh));
-                let seen = tl > FAINTEST;
-                let per_tl = 1.0 / if seen { tl } else { 1.0 };
-                let per_tl = if seen { per_tl } else { 0.0 };
-                let mn = 1.0 / tn.max(raw);
-                let (rn, rh) = (tn * mn, raw * mn);
-                let wr = self.gain_behind / (rn + 0.05 * rh);
-                for ch in 0..3 {
-                    let c = row.here[ch + 1][i] * per_raw;
-                    let cl = row.before[ch + 1][i] * per_tl;
-                    let en = row.behind[ch + 1][i] * mn;
-                    let change = wl * (c - cl) + wr * (en - c * rn);
-                    let most = 2.0 * c.min(1.0 - c).max(0.0);
-                    let change = change.min(most).max(-most);
-                    let light = transmittance * (c * sheet_a + change * weight);
-                    row.light[ch][i] = (light * ONE + 0.5).max(0.0) as i32 as u32;
-                }
-            } else {
-                for ch in 0..3 {
-                    let c = row.here[ch + 1][i] * per_raw;
-                    let light = transmittance * (c * sheet_a);
-                    row.light[ch][i] = (light * ONE + 0.5).max(0.0) as i32 as u32;
-                }
-            }
-            row.a[i] += transmittance * sheet_a;
+            taus[i] = if filled { tau } else { 0.0 };
+            per_raws[i] = 1.0 / raw;
         }
+        for i in 0..LANES {
+            (small[i], large[i]) = opacities(taus[i]);
+        }
+        let [mut sheet, mut weights, mut light] = [[0.0f32; LANES]; 3];
+        for i in 0..LANES {
+            let thin = taus[i] < SWITCH;
+            sheet[i] = if thin { small[i] } else { large[i] };
+            if PAPER {
+                sheet[i] = taus[i].min(1.0);
+            }
+            let (small, large) =
+                phis(taus[i], per_raws[i] * self.per_unit * row.cosine[i], sheet[i]);
+            let weight = if thin { small } else { large };
+            weights[i] = if taus[i] > 0.0 { weight } else { 0.0 };
+        }
+        // Where there is nothing, colours are nothing too, and neighbours may be anything.
+        let mut slopes = [[0.0f32; LANES]; 4];
+        if LINEAR {
+            for i in 0..LANES {
+                let (tl, tn) = (row.before[0][i], row.behind[0][i]);
+                let raw = row.here[0][i];
+                let raw = if raw >= FAINTEST { raw } else { 1.0 };
+                let s =
+                    if WHOLE { self.slopes_whole(tl, raw, tn) } else { self.slopes(tl, raw, tn) };
+                (slopes[0][i], slopes[1][i]) = (s.before, s.per_tl);
+                (slopes[2][i], slopes[3][i]) = (s.behind, s.unit);
+            }
+        }
+        for i in 0..LANES {
+            light[i] = (1.0 - row.a[i]) * (live >> i & 1) as f32;
+            row.a[i] += light[i] * sheet[i];
+        }
+        for ch in 0..3 {
+            let [here, before, behind] =
+                [&row.here, &row.before, &row.behind].map(|sums| &sums[ch + 1]);
+            let out = &mut row.light[ch];
+            for i in 0..LANES {
+                let c = here[i] * per_raws[i];
+                let mut of_sheet = c * sheet[i];
+                if LINEAR {
+                    let s = Slopes {
+                        before: slopes[0][i],
+                        per_tl: slopes[1][i],
+                        behind: slopes[2][i],
+                        unit: slopes[3][i],
+                    };
+                    let change = s.change(c, before[i], row.behind[0][i], behind[i]);
+                    of_sheet += change * weights[i];
+                }
+                out[i] = fixed_light(light[i] * of_sheet);
+            }
+        }
+        let mut shut = 0;
+        for i in 0..LANES {
+            shut |= u32::from(self.is_shut(row.a[i])) << i;
+        }
+        shut & live
     }
-}
-
-/// One rounding a sheet: colour of any cut into slabs adds up to the same integers.
-#[inline(always)]
-fn add_colour(to: &mut u32, light: f32) {
-    const ONE: f32 = (1u32 << 28) as f32;
-    // Not negative but for the last bits of f32; `as` takes those to zero.
-    *to = to.wrapping_add((light * ONE + 0.5) as u32);
 }
 
 #[cfg(test)]
@@ -294,6 +384,7 @@ mod tests {
                 let mut row = Row::default();
                 for i in 0..LANES {
                     row.secant[i] = secant[i];
+                    row.cosine[i] = 1.0 / secant[i];
                     row.a[i] = a[i];
                     for (k, (e, full, c)) in sheets[i].iter().enumerate() {
                         let t = if *full { libm::expf(*e) } else { 0.0 };
@@ -304,18 +395,40 @@ mod tests {
                         }
                     }
                 }
-                let was = row.clone();
-                rule.close_row(&mut row);
-                for i in 0..LANES {
-                    let of = |p: &[[f32; LANES]; 4]| p.map(|ch| ch[i]);
-                    let (mut a, mut colour) = (was.a[i], [0u32; 3]);
-                    let (b, h, n) = (of(&was.before), of(&was.here), of(&was.behind));
-                    rule.close(b, h, n, was.secant[i], &mut a, &mut colour);
-                    prop_assert_eq!(row.a[i].to_bits(), a.to_bits());
-                    prop_assert_eq!(row.light.map(|l| l[i]), colour, "{:?} {:?} {:?}", b, h, n);
+                let live = 0xfffb;
+                check::<f32>(&rule, &row, live, |t| t)?;
+                // Whole numbers: the same sums in units, so that the faintest are nothing.
+                for sheet in [&mut row.before, &mut row.here, &mut row.behind] {
+                    for sum in sheet.as_flattened_mut() {
+                        *sum = (*sum * 1e3).min(2e9).round();
+                    }
                 }
+                check::<i32>(&rule, &row, live, |t| t as i32)?;
             }
         }
+    }
+
+    /// A row closed at once against its pixels one by one, bit by bit.
+    fn check<S: Sum>(
+        rule: &Rule,
+        row: &Row,
+        live: u32,
+        sum: impl Fn(f32) -> S,
+    ) -> Result<(), TestCaseError> {
+        let mut closed = row.clone();
+        let shut = rule.close_row::<S>(&mut closed, live);
+        for i in 0..LANES {
+            let of = |p: &[[f32; LANES]; 4]| p.map(|ch| sum(ch[i]));
+            let (mut a, mut colour) = (row.a[i], [0u32; 3]);
+            let (b, h, n) = (of(&row.before), of(&row.here), of(&row.behind));
+            if live >> i & 1 == 1 {
+                rule.close(b, h, n, row.secant[i], &mut a, &mut colour);
+                prop_assert_eq!(shut >> i & 1 == 1, rule.is_shut(a));
+            }
+            prop_assert_eq!(closed.a[i].to_bits(), a.to_bits());
+            prop_assert_eq!(closed.light.map(|l| l[i]), colour);
+        }
+        Ok(())
     }
 
     fn stack(compositing: Compositing, d: f64, sheets: &[[f32; 4]], eps: f32) -> (f32, [f64; 3]) {

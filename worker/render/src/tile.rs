@@ -14,86 +14,86 @@
 //! A part is left as soon as all its pixels are shut. Bytes do not depend on any of this: sums
 //! are integers (or floats in one order), an open pixel gets every voxel that covers it, and
 //! what a shut pixel gets is never read.
+//!
+//! Three rooms do that: [`crate::general`] for every view and every kind of sums; far faster, in
+//! whole numbers, [`crate::flat`] for most orthographic views and [`crate::deep`] for most
+//! perspective ones.
 
-use crate::footprint::Footprint;
-use crate::mask::{OpenMask, REACH_MOST};
-use crate::ring::{self, BLOCK, Planes, Records, Ring, SLOTS, Window};
-use crate::scene::Frame;
+use crate::deep::{self, RenderDeep};
+use crate::flat::{self, RenderFlat};
+use crate::general::{GeneralScratch, RenderGeneral};
+use crate::mask::OpenMask;
+use crate::planes;
+use crate::scene::{Corner, Frame};
 use crate::sheet::Row;
-use crate::splat::{Accumulate, Simd, Tap, Weight, Work};
-use glam::DVec3;
+use crate::splat::Simd;
+use crate::stack::Store;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{RawSums, TilePixels, TileState};
 use slabcast_common::message::Counters;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Sums;
 use slabcast_common::slab::SheetRange;
-use slabcast_common::view::{Projected, Projection, SUBPIXEL_BITS};
+use slabcast_common::view::{Projected, Projection};
 use std::sync::Arc;
 
-/// Edge of a tile part. 64 gives 8x8 blocks of 8x8 pixels, one bit each in a word, and six open
-/// sheets of 64 KiB, which fit a second cache of 512 KiB. At 32 a head takes 12 % more splats
-/// (286 k instead of 256 k a frame) for their overlap and no less time (docs/measurements.md);
-/// at 128 the blocks would need four words, and the sheets 1.5 MiB.
-const PART: i32 = ring::PART as i32;
+/// Edge of a tile part. 64 gives a word for a row of the mask, and open sheets that fit a second
+/// cache of 512 KiB. At 32 a head takes 12 % more splats (286 k instead of 256 k a frame) for their
+/// overlap and no less time (docs/measurements.md); at 128 a row would need two words, and the
+/// sheets 1.5 MiB.
+pub(crate) const PART: i32 = planes::PART as i32;
 
-/// A voxel waiting in the bucket of its first sheet.
-#[derive(Clone, Copy)]
-struct Waiting {
-    /// Which of the part's bricks.
-    brick: u32,
-    /// Which voxel of it.
-    voxel: u16,
-    /// Depth in phases.
-    z: i32,
-    /// Screen position in subpixels, where all its sections share it (orthographic views).
-    x: i32,
-    y: i32,
+/// A brick as a frame sees it: what all tiles ask of it, worked out once.
+#[derive(Clone, Debug)]
+pub struct Seen {
+    /// The brick.
+    pub brick: Arc<Brick>,
+    /// Where its voxels may land.
+    pub projected: Projected,
+    pub(crate) corner: Corner,
 }
 
-/// A brick as a part sees it.
-struct PartBrick<'a> {
-    brick: &'a Brick,
-    corner: DVec3,
-    projected: Projected,
+impl Seen {
+    /// `brick` in `frame`; `None` if it is off the picture or behind the near plane.
+    pub fn new(frame: &Frame, brick: &Arc<Brick>) -> Option<Seen> {
+        let projected = frame.view.project(&brick.tight(&frame.scene.grid))?;
+        Some(Seen { brick: brick.clone(), projected, corner: frame.corner(brick.id) })
+    }
+
+    /// `seen` front to back; those that begin together in ascending id.
+    pub fn front_to_back(seen: &[Seen]) -> Vec<&Seen> {
+        // Numbers and places are sorted, not bricks: a third of the time.
+        let key = |s: &Seen| (s.projected.sheets.first, s.brick.id);
+        let mut order: Vec<_> = seen.iter().enumerate().map(|(i, s)| (key(s), i as u32)).collect();
+        order.sort_unstable();
+        order.into_iter().map(|(_, i)| &seen[i as usize]).collect()
+    }
 }
 
 /// Memory that a render thread keeps from tile to tile.
 #[derive(Default)]
 pub struct Scratch {
-    ints: Planes<i32>,
-    floats: Planes<f32>,
-    shorts: Planes<i16>,
-    records: Records,
-    taps: [Vec<Tap>; 2],
-    units: [Vec<i16>; 2],
-    shared: Shared,
+    general: GeneralScratch,
+    flat: flat::Waiting,
+    deep: deep::Waiting,
+    stores: Stores,
+    pixels: Pixels,
+    /// Which of a tile's bricks lie in a part.
+    inside: Vec<u32>,
 }
 
-/// A part's pixels and buckets. Planes have rows of [`PART`] pixels, whatever the part's width.
-struct Shared {
-    buckets: Vec<Vec<Waiting>>,
-    carried: Vec<Waiting>,
-    secants: Vec<f32>,
-    a: Vec<f32>,
-    colour: [Vec<u32>; 3],
+/// Memory for sums in records.
+#[derive(Default)]
+struct Stores {
+    shorts: Store<i16>,
+    longs: Store<i32>,
 }
 
-impl Default for Shared {
-    fn default() -> Self {
-        let n = (PART * PART) as usize;
-        Shared {
-            buckets: Vec::new(),
-            carried: Vec::new(),
-            secants: vec![1.0; n],
-            a: vec![0.0; n],
-            colour: std::array::from_fn(|_| vec![0; n]),
-        }
-    }
-}
+/// What a part starts from, what it gives back, and what it counts.
+pub(crate) type Io<'a> = (&'a TileState, &'a mut TilePixels, &'a mut Counters);
 
-/// Renders the sheets of `slab` on `tile`, from `state`, with `bricks` (ascending id; at least
-/// all that the tile and slab need).
+/// Renders the sheets of `slab` on `tile`, from `state`, with `bricks` (at least all that the tile
+/// and slab need).
 ///
 /// # Panics
 /// If the planes of `state` do not have the tile's size.
@@ -106,6 +106,23 @@ pub fn render(
     state: &TileState,
     scratch: &mut Scratch,
 ) -> (TilePixels, Counters) {
+    let seen: Vec<Seen> = bricks.iter().filter_map(|b| Seen::new(frame, b)).collect();
+    render_seen(frame, simd, tile, slab, &Seen::front_to_back(&seen), state, scratch)
+}
+
+/// [`render`] with bricks that were looked at before and lie [front to back](Seen::front_to_back).
+///
+/// # Panics
+/// If the planes of `state` do not have the tile's size.
+pub fn render_seen(
+    frame: &Frame,
+    simd: Simd,
+    tile: Rect,
+    slab: SheetRange,
+    bricks: &[&Seen],
+    state: &TileState,
+    scratch: &mut Scratch,
+) -> (TilePixels, Counters) {
     assert_eq!(state.a.len(), tile.area(), "one A a pixel");
     let neighbours = frame.looks_at_neighbours();
     let mut out = TilePixels {
@@ -115,94 +132,134 @@ pub fn render(
     };
     let mut counted = Counters::default();
     let counters = &mut counted;
-    let mut seen: Vec<PartBrick<'_>> = bricks
-        .iter()
-        .filter_map(|b| {
-            let projected = frame.view.project(&b.tight(&frame.scene.grid))?;
-            let corner = frame.view.corner_in_eye(frame.scene.grid.corner(b.id));
-            (projected.sheets.overlaps(slab) && !projected.rect.intersect(&tile).is_empty())
-                .then_some(PartBrick { brick: b, corner, projected })
-        })
-        .collect();
-    // Front to back; bricks that begin together stay in ascending id.
-    seen.sort_by_key(|b| (b.projected.sheets.first, b.brick.id));
+    let mut inside = std::mem::take(&mut scratch.inside);
     for y0 in (tile.y0..tile.y1).step_by(PART as usize) {
         for x0 in (tile.x0..tile.x1).step_by(PART as usize) {
             let rect = Rect::new(x0, y0, x0 + PART, y0 + PART).intersect(&tile);
-            let inside: Vec<&PartBrick<'_>> =
-                seen.iter().filter(|b| !b.projected.rect.intersect(&rect).is_empty()).collect();
+            inside.clear();
+            for (i, b) in bricks.iter().enumerate() {
+                let p = &b.projected;
+                if p.sheets.overlaps(slab) && !p.rect.intersect(&rect).is_empty() {
+                    inside.push(i as u32);
+                }
+            }
             if inside.is_empty() {
                 continue;
             }
-            let part = Part { frame, rect, tile, slab, bricks: &inside };
-            let Scratch { ints, floats, shorts, records, taps, units, shared } = scratch;
-            let planes = (state, &mut out, &mut *counters);
-            match frame.scene.quality.sums {
-                Sums::F32 => {
-                    simd.run(RenderPart { part, simd, ring: floats, buffers: taps, shared, planes })
+            let part = Part { frame, rect, tile, slab, bricks, inside: &inside };
+            let Scratch { general, flat: waiting, deep: near, stores, pixels, .. } = scratch;
+            let io = (state, &mut out, &mut *counters);
+            let Stores { shorts, longs } = stores;
+            let GeneralScratch { kinds, queues } = general;
+            if frame.scene.quality.sums != Sums::F32
+                && let Some(view) = deep::takes(&part)
+            {
+                let waiting = &mut *near;
+                if frame.scene.quality.sums == Sums::I16 {
+                    let store = shorts;
+                    simd.run(RenderDeep { part, deep: view, simd, store, waiting, pixels, io });
+                } else {
+                    let store = longs;
+                    simd.run(RenderDeep { part, deep: view, simd, store, waiting, pixels, io });
                 }
-                Sums::I16 if frame.sections.most() < SLOTS && part.flat().is_some() => {
-                    simd.run(RenderPart {
-                        part,
-                        simd,
-                        ring: records,
-                        buffers: units,
-                        shared,
-                        planes,
-                    });
+                continue;
+            }
+            match (frame.scene.quality.sums, flat::takes(frame)) {
+                (Sums::I16, Some(view)) => {
+                    simd.run(RenderFlat { part, view, simd, store: shorts, waiting, pixels, io });
                 }
-                Sums::I16 => simd.run(RenderPart {
-                    part,
-                    simd,
-                    ring: shorts,
-                    buffers: units,
-                    shared,
-                    planes,
-                }),
-                Sums::I32 | Sums::Auto => {
-                    simd.run(RenderPart { part, simd, ring: ints, buffers: taps, shared, planes });
+                (Sums::I32 | Sums::Auto, Some(view)) => {
+                    simd.run(RenderFlat { part, view, simd, store: longs, waiting, pixels, io });
+                }
+                (Sums::I16, None) => {
+                    let kind = &mut kinds.shorts;
+                    simd.run(RenderGeneral { part, kind, queues, pixels, io });
+                }
+                (Sums::I32 | Sums::Auto, None) => {
+                    let kind = &mut kinds.longs;
+                    simd.run(RenderGeneral { part, kind, queues, pixels, io });
+                }
+                (Sums::F32, _) => {
+                    let kind = &mut kinds.floats;
+                    simd.run(RenderGeneral { part, kind, queues, pixels, io });
                 }
             }
         }
     }
+    scratch.inside = inside;
     if out.last.as_ref().is_some_and(|l| l.iter().all(|s| *s == [0; 4])) {
         out.last = None;
     }
     (out, counted)
 }
 
-struct Part<'a> {
-    frame: &'a Frame,
-    rect: Rect,
-    tile: Rect,
-    slab: SheetRange,
-    bricks: &'a [&'a PartBrick<'a>],
+/// A part of a tile.
+pub(crate) struct Part<'a> {
+    pub(crate) frame: &'a Frame,
+    pub(crate) rect: Rect,
+    pub(crate) tile: Rect,
+    pub(crate) slab: SheetRange,
+    /// The tile's bricks.
+    bricks: &'a [&'a Seen],
+    /// Those of the part, front to back.
+    inside: &'a [u32],
 }
 
-/// A part with what it works on: compiled for each instruction set as a whole.
-struct RenderPart<'a, R: Ring> {
-    part: Part<'a>,
-    simd: Simd,
-    ring: &'a mut R,
-    buffers: &'a mut [Buffer<R>; 2],
-    shared: &'a mut Shared,
-    planes: (&'a TileState, &'a mut TilePixels, &'a mut Counters),
+/// A part's pixels, in rows of [`PART`] whatever the part's width.
+pub(crate) struct Pixels {
+    pub(crate) secants: Vec<f32>,
+    pub(crate) a: Vec<f32>,
+    pub(crate) colour: [Vec<u32>; 3],
 }
 
-/// Memory for weights of one axis.
-type Buffer<R> = Vec<<<R as Ring>::Sum as Accumulate>::Weight>;
+impl Default for Pixels {
+    fn default() -> Self {
+        let n = planes::PART * planes::PART;
+        Pixels {
+            secants: vec![1.0; n],
+            a: vec![0.0; n],
+            colour: std::array::from_fn(|_| vec![0; n]),
+        }
+    }
+}
 
-impl<R: Ring> Work for RenderPart<'_, R> {
-    type Out = ();
+/// Pixels that are written together.
+const STRIP: usize = planes::BLOCK;
+
+impl Pixels {
+    /// Takes over what a closed row says of [`STRIP`] pixels from `at`, which are its lanes from
+    /// `lane`.
     #[inline(always)]
-    fn run(self) {
-        let RenderPart { part, simd, ring, buffers, shared, planes } = self;
-        ring.reset(part.frame.sections.most() + 1, simd);
-        part.render(ring, buffers, shared, planes);
+    pub(crate) fn put(&mut self, at: usize, row: &Row, lane: usize) {
+        self.a[at..at + STRIP].copy_from_slice(&row.a[lane..lane + STRIP]);
+        for (plane, light) in self.colour.iter_mut().zip(&row.light) {
+            let plane = plane[at..].first_chunk_mut::<STRIP>().expect("a strip");
+            let light = light[lane..].first_chunk::<STRIP>().expect("a strip");
+            for i in 0..STRIP {
+                plane[i] = plane[i].wrapping_add(light[i]);
+            }
+        }
     }
 }
 
 impl Part<'_> {
+    /// The part's brick `i`, front to back.
+    #[inline(always)]
+    pub(crate) fn brick(&self, i: usize) -> &Seen {
+        self.bricks[self.inside[i] as usize]
+    }
+
+    /// How many bricks it has.
+    #[inline(always)]
+    pub(crate) fn bricks(&self) -> usize {
+        self.inside.len()
+    }
+
+    /// Voxels of the bricks from `i` on.
+    pub(crate) fn voxels_from(&self, i: usize) -> u64 {
+        (i..self.bricks()).map(|i| self.brick(i).brick.len() as u64).sum()
+    }
+
     /// Index in the tile's planes of the first pixel of the part's row `y`.
     fn tile_row(&self, y: usize) -> usize {
         (self.rect.y0 - self.tile.y0) as usize * self.tile.width()
@@ -210,100 +267,41 @@ impl Part<'_> {
             + (self.rect.x0 - self.tile.x0) as usize
     }
 
-    #[inline(always)]
-    fn render<R: Ring>(
-        &self,
-        ring: &mut R,
-        buffers: &mut [Buffer<R>; 2],
-        s: &mut Shared,
-        (state, out, counters): (&TileState, &mut TilePixels, &mut Counters),
-    ) {
-        let mut open = self.begin(ring, s, state);
-        let sheets = self.slab.len() as usize;
-        if s.buckets.len() < sheets {
-            s.buckets.resize_with(sheets, Vec::new);
+    /// Calls `f` with each pixel's column and row in the part and index in the tile.
+    pub(crate) fn each_pixel(&self, mut f: impl FnMut(usize, usize, usize)) {
+        for y in 0..self.rect.height() {
+            let row = self.tile_row(y);
+            for x in 0..self.rect.width() {
+                f(x, y, row + x);
+            }
         }
-        for bucket in &mut s.buckets {
-            bucket.clear();
-        }
-        s.carried.clear();
-
-        let float_sums = self.frame.scene.float_sums();
-        let flat = self.flat();
-        let reach = flat.as_ref().map(|(_, reach)| *reach);
-        if let Some(reach) = reach {
-            open.grow(reach);
-        }
-        let mut next = 0;
-        let mut any_open = open.count() > 0;
-        for k in self.slab.first..self.slab.end {
-            if !any_open {
-                break;
-            }
-            while next < self.bricks.len() && self.bricks[next].projected.sheets.first <= k {
-                if !self.admit(next, flat.as_ref(), &open, s, counters) {
-                    let brick = self.bricks[next].brick;
-                    counters.culled += brick.len() as u64;
-                }
-                next += 1;
-            }
-            if k == self.slab.first && !s.carried.is_empty() {
-                // Voxels that begin before the slab come first, as they do without the cut.
-                let mut carried = std::mem::take(&mut s.carried);
-                if float_sums {
-                    let sections = &self.frame.sections;
-                    let id = |v: &Waiting| self.bricks[v.brick as usize].brick.id;
-                    carried.sort_by_key(|v| (sections.first(v.z), id(v), v.voxel));
-                }
-                self.splat_all(&carried, k, ring, buffers, &open, counters);
-                carried.clear();
-                s.carried = carried;
-            }
-            let mut bucket = std::mem::take(&mut s.buckets[(k - self.slab.first) as usize]);
-            if float_sums {
-                bucket.sort_by_key(|v| (self.bricks[v.brick as usize].brick.id, v.voxel));
-            }
-            self.splat_all(&bucket, k, ring, buffers, &open, counters);
-            bucket.clear();
-            s.buckets[(k - self.slab.first) as usize] = bucket;
-            if self.close(k, ring, &mut open, s) {
-                any_open = open.count() > 0;
-                if let Some(reach) = reach {
-                    open.grow(reach);
-                }
-            }
-            ring.clear(k - 1);
-        }
-        // Whatever the part did not come to is hidden.
-        counters.culled += self.bricks[next..].iter().map(|b| b.brick.len() as u64).sum::<u64>();
-        counters.culled += s.buckets.iter().map(|b| b.len() as u64).sum::<u64>();
-        self.end(ring, s, &open, out);
     }
 
     /// Takes the part's pixels out of the tile's; returns which are open.
-    fn begin<R: Ring>(&self, ring: &mut R, s: &mut Shared, state: &TileState) -> OpenMask {
+    pub(crate) fn begin(&self, pixels: &mut Pixels, state: &TileState) -> OpenMask {
         let (w, h) = (self.rect.width(), self.rect.height());
-        let stride = PART as usize;
+        let stride = planes::PART;
         let mut open = OpenMask::shut(self.rect);
-        for plane in &mut s.colour {
+        for plane in &mut pixels.colour {
             plane.fill(0);
         }
         for y in 0..h {
             let (row, to) = (self.tile_row(y), y * stride);
-            s.a[to..to + w].copy_from_slice(&state.a[row..row + w]);
+            pixels.a[to..to + w].copy_from_slice(&state.a[row..row + w]);
+            let mut bits = 0u64;
             for x in 0..w {
-                let (px, py) = (self.rect.x0 + x as i32, self.rect.y0 + y as i32);
-                s.secants[to + x] = self.frame.view.secant(px, py);
-                if !self.frame.rule.is_shut(s.a[to + x]) {
-                    open.open(x, y);
-                }
+                bits |= u64::from(!self.frame.rule.is_shut(pixels.a[to + x])) << x;
             }
-        }
-        if let Some(last) = &state.last {
-            for y in 0..h {
-                let row = self.tile_row(y);
-                for x in 0..w {
-                    ring.put(self.slab.first - 1, y * stride + x, last[row + x]);
+            open.open_row(y, bits);
+            let view = &self.frame.view;
+            let (px, py) = (self.rect.x0, self.rect.y0 + y as i32);
+            let secants = &mut pixels.secants[to..to + w];
+            match view.projection {
+                Projection::Ortho { .. } => secants.fill(1.0),
+                Projection::Persp { .. } => {
+                    for (x, secant) in secants.iter_mut().enumerate() {
+                        *secant = view.secant(px + x as i32, py);
+                    }
                 }
             }
         }
@@ -311,235 +309,16 @@ impl Part<'_> {
     }
 
     /// Puts the part's pixels into the tile's.
-    fn end<R: Ring>(&self, ring: &R, s: &Shared, open: &OpenMask, out: &mut TilePixels) {
+    pub(crate) fn end(&self, pixels: &Pixels, out: &mut TilePixels) {
         let (w, h) = (self.rect.width(), self.rect.height());
-        let stride = PART as usize;
         for y in 0..h {
-            let (row, from) = (self.tile_row(y), y * stride);
-            out.a[row..row + w].copy_from_slice(&s.a[from..from + w]);
-            for x in 0..w {
-                out.colour[row + x] = std::array::from_fn(|c| s.colour[c][from + x]);
-            }
-            if let Some(last) = &mut out.last {
-                for x in 0..w {
-                    // Nobody reads a shut pixel's sums; they may be anything, so they are none.
-                    if open.row(y) >> x & 1 == 1 {
-                        last[row + x] = ring.raw(self.slab.end - 1, from + x);
-                    }
-                }
+            let (row, from) = (self.tile_row(y), y * planes::PART);
+            out.a[row..row + w].copy_from_slice(&pixels.a[from..from + w]);
+            let [r, g, b] = pixels.colour.each_ref().map(|plane| &plane[from..from + w]);
+            for (x, colour) in out.colour[row..row + w].iter_mut().enumerate() {
+                *colour = [r[x], g[x], b[x]];
             }
         }
-    }
-
-    /// Where a voxel's footprints lie, all sections together, a pixel more at most.
-    #[inline(always)]
-    fn extent(&self, eye: DVec3, z: i32) -> Option<Rect> {
-        let (first, count) = self.frame.sections.span(z);
-        let last = first + count as i32 - 1;
-        let view = &self.frame.view;
-        let at = |k: i32| {
-            let f = self.frame.footprints.at(k)?;
-            let [x, y] = view.screen(eye.x, eye.y, f.scale);
-            let ((x0, x1), (y0, y1)) = (f.extent(0, x), f.extent(1, y));
-            Some(Rect::new(x0, y0, x1, y1))
-        };
-        match view.projection {
-            Projection::Ortho { .. } => at(first),
-            Projection::Persp { .. } => {
-                // Edges move one way with depth, so the first and last visible sections hold
-                // the others. An end's rounding may put one a pixel farther out: grow by one.
-                let front = (first..=last).find_map(at)?;
-                let back = at(last)?;
-                let r = front.union(&back);
-                Some(Rect::new(r.x0 - 1, r.y0 - 1, r.x1 + 1, r.y1 + 1))
-            }
-        }
-    }
-
-    /// Tests a brick, then its voxels, and tosses what is left into buckets. Whether the brick
-    /// passed.
-    #[inline(always)]
-    fn admit(
-        &self,
-        which: usize,
-        flat: Option<&(Footprint<'_>, i32)>,
-        open: &OpenMask,
-        s: &mut Shared,
-        counters: &mut Counters,
-    ) -> bool {
-        let PartBrick { brick, corner, projected } = self.bricks[which];
-        let cull = self.frame.scene.quality.cull;
-        if cull && !open.any(&projected.rect) {
-            return false;
-        }
-        let view = &self.frame.view;
-        let (sections, slab) = (&self.frame.sections, self.slab);
-        for (voxel, &local) in brick.index.iter().enumerate() {
-            let eye = self.frame.eye(*corner, local);
-            let z = view.depth_in_phases(eye.z);
-            let (first, count) = sections.span(z);
-            if first >= slab.end || first + count as i32 <= slab.first {
-                continue;
-            }
-            let (mut x, mut y) = (0, 0);
-            if let Some((f, _)) = flat {
-                let at = view.screen(eye.x, eye.y, f.scale);
-                // Tables are of footprints of a thousand pixels at most, and this brick is near.
-                [x, y] = at.map(|p| p as i32);
-                let centre = [x, y].map(|p| p >> SUBPIXEL_BITS);
-                let (cx, cy) = (centre[0] - self.rect.x0, centre[1] - self.rect.y0);
-                if cull && !open.near(cx, cy) {
-                    counters.culled += u64::from(open.reaches(cx, cy));
-                    continue;
-                }
-                if !cull && !open.reaches(cx, cy) {
-                    continue;
-                }
-            } else {
-                let Some(extent) = self.extent(eye, z) else { continue };
-                let inside = !extent.intersect(&self.rect).is_empty();
-                if !inside || cull && !open.any(&extent) {
-                    counters.culled += u64::from(inside);
-                    continue;
-                }
-            }
-            counters.tossed += 1;
-            let waiting = Waiting { brick: which as u32, voxel: voxel as u16, z, x, y };
-            if first < slab.first {
-                s.carried.push(waiting);
-            } else {
-                s.buckets[(first - slab.first) as usize].push(waiting);
-            }
-        }
-        true
-    }
-
-    /// The footprint that all sections of all voxels share, and its reach in pixels: orthographic
-    /// views whose weights are in tables and that masks can be grown by.
-    #[inline(always)]
-    fn flat(&self) -> Option<(Footprint<'_>, i32)> {
-        match self.frame.view.projection {
-            Projection::Ortho { .. } => {
-                let f = self.frame.footprints.at(0)?;
-                let reach = f.reach().filter(|&r| r <= REACH_MOST)?;
-                Some((f, reach))
-            }
-            Projection::Persp { .. } => None,
-        }
-    }
-
-    #[inline(always)]
-    fn splat_all<R: Ring>(
-        &self,
-        bucket: &[Waiting],
-        k: i32,
-        ring: &mut R,
-        buffers: &mut [Buffer<R>; 2],
-        open: &OpenMask,
-        counters: &mut Counters,
-    ) {
-        let frame = self.frame;
-        // The sheet behind the slab is filled as far as the colour rule peeks.
-        let end = self.slab.end + i32::from(frame.looks_at_neighbours());
-        let flat = self.flat();
-        for v in bucket {
-            let PartBrick { brick, corner, .. } = self.bricks[v.brick as usize];
-            let eye = frame.eye(*corner, brick.index[v.voxel as usize]);
-            if frame.scene.quality.cull {
-                let extent = match &flat {
-                    Some((f, _)) => {
-                        let (x, y) = (f.extent(0, i64::from(v.x)), f.extent(1, i64::from(v.y)));
-                        Some(Rect::new(x.0, y.0, x.1, y.1))
-                    }
-                    None => self.extent(eye, v.z),
-                };
-                if extent.is_none_or(|e| !open.any(&e)) {
-                    counters.culled += 1;
-                    continue;
-                }
-            }
-            let payload = frame.payload(brick, v.voxel as usize, eye);
-            if payload[0] <= 0.0 {
-                continue;
-            }
-            counters.splatted += 1;
-            let (first, count) = frame.sections.span(v.z);
-            let sheets = first.max(k).max(self.slab.first)..(first + count as i32).min(end);
-            if let Some((f, _)) = &flat {
-                let at = [i64::from(v.x), i64::from(v.y)];
-                if let Some(window) = self.window::<R::Sum>(f, at, buffers) {
-                    ring.add_all(&frame.sections, v.z, sheets, window, &payload);
-                }
-            } else {
-                for sheet in sheets {
-                    let Some(f) = frame.footprints.at(sheet) else { continue };
-                    let at = frame.view.screen(eye.x, eye.y, f.scale);
-                    if let Some(window) = self.window::<R::Sum>(&f, at, buffers) {
-                        let i = (sheet - first) as usize;
-                        ring.add(sheet, window, R::Sum::section(&frame.sections, v.z, i, &payload));
-                    }
-                }
-            }
-        }
-    }
-
-    /// A footprint inside the part, or nothing.
-    #[inline(always)]
-    fn window<'b, S: Accumulate>(
-        &self,
-        f: &'b Footprint<'_>,
-        [x, y]: [i64; 2],
-        [bx, by]: &'b mut [Vec<S::Weight>; 2],
-    ) -> Option<Window<'b, S::Weight>> {
-        let (x0, wx) = S::Weight::of(f, 0, x, (self.rect.x0, self.rect.x1), bx);
-        let (y0, wy) = S::Weight::of(f, 1, y, (self.rect.y0, self.rect.y1), by);
-        let inside = !wx.is_empty() && !wy.is_empty();
-        let at = |p: i32, origin: i32| (p - origin) as usize;
-        inside.then(|| ((at(x0, self.rect.x0), wx), (at(y0, self.rect.y0), wy)))
-    }
-
-    /// Closes sheet `k` where it was touched; whether pixels were shut.
-    #[inline(always)]
-    fn close<R: Ring>(&self, k: i32, ring: &R, open: &mut OpenMask, s: &mut Shared) -> bool {
-        let rule = self.frame.rule;
-        let mut mask = ring.touched(k);
-        let mut any_shut = false;
-        let mut row = Row::default();
-        while mask != 0 {
-            let b = mask.trailing_zeros() as usize;
-            mask &= mask - 1;
-            let (x0, y0) = (b % 8 * BLOCK, b / 8 * BLOCK);
-            for y in y0..y0 + BLOCK {
-                let live = open.row(y) >> x0 & 0xff;
-                if live == 0 {
-                    continue;
-                }
-                let at = y * PART as usize + x0;
-                ring.load(k, at, &mut row);
-                row.secant.copy_from_slice(&s.secants[at..at + BLOCK]);
-                row.a.copy_from_slice(&s.a[at..at + BLOCK]);
-                rule.close_row(&mut row);
-                // Shut pixels keep what they have.
-                let mut shut = 0u64;
-                for i in 0..BLOCK {
-                    let is_live = live >> i & 1 == 1;
-                    let a = &mut s.a[at + i];
-                    *a = if is_live { row.a[i] } else { *a };
-                    shut |= u64::from(rule.is_shut(*a)) << i;
-                }
-                for (plane, light) in s.colour.iter_mut().zip(&row.light) {
-                    for i in 0..BLOCK {
-                        let add = if live >> i & 1 == 1 { light[i] } else { 0 };
-                        plane[at + i] = plane[at + i].wrapping_add(add);
-                    }
-                }
-                if shut & live != 0 {
-                    open.close(y, (shut & live) << x0);
-                    any_shut = true;
-                }
-            }
-        }
-        any_shut
     }
 }
 

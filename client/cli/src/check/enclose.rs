@@ -160,7 +160,9 @@ impl<'a> Enclosure<'a> {
         let radius = view.kernel_radius.z;
         let across = |profile: &Profile, p: f64, at: f64, scale: f64| {
             // f64 itself may be off by as much as the second term.
-            let off = (0.5 / f64::from(SUBPIXELS) + 1e-9 * (1.0 + at.abs() * scale)) / scale;
+            let off = ((0.5 + 1.0 / 256.0) / f64::from(SUBPIXELS)
+                + 1e-9 * (1.0 + at.abs() * scale))
+                / scale;
             let u = (p / scale - at).abs();
             Span::new(profile.at(u + off), profile.at((u - off).max(0.0)))
         };
@@ -170,9 +172,9 @@ impl<'a> Enclosure<'a> {
             if !(rect.x0 <= ix && ix < rect.x1 && rect.y0 <= iy && iy < rect.y1) {
                 continue;
             }
-            let corner = view.corner_in_eye(self.frame.scene.grid.corner(brick.id));
+            let corner = self.frame.corner(brick.id);
             for (i, &local) in brick.index.iter().enumerate() {
-                let eye = self.frame.eye(corner, local);
+                let eye = self.frame.place(&corner, local).eye;
                 let first = |z: f64| libm::floor((z - radius) / d) as i32;
                 let (f_lo, f_hi) = (first(eye.z - dz), first(eye.z + dz));
                 let end = libm::ceil((eye.z + dz + radius) / d) as i32;

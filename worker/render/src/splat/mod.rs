@@ -7,10 +7,12 @@
 //! This module is the wall: the only place with `unsafe`. It holds two things: the call of a
 //! function compiled for instructions that were seen on this machine, and the conversion of a
 //! float to an integer without the range check that would double the loop's cost.
-#![expect(unsafe_code, reason = "the one wall: run-time dispatch and unchecked conversion")]
+#![expect(unsafe_code, reason = "the one wall: run-time dispatch, unchecked conversion, lanes")]
+
+pub(crate) mod records;
 
 use crate::footprint::{Footprint, Sections};
-use crate::sheet::{LANES, Sum};
+use crate::sheet::Sum;
 
 /// Pixels of one open sheet of a tile part.
 pub type Pixels<S> = [[S; 4]];
@@ -36,7 +38,7 @@ impl Tap {
 }
 
 /// A weight across the view axis, as sums of one kind want it.
-pub trait Weight: Copy + std::fmt::Debug {
+pub trait Weight: Copy + Default + std::fmt::Debug {
     /// Weights along `axis`: see [`Footprint::weights`].
     fn of<'b>(
         footprint: &'b Footprint<'_>,
@@ -94,6 +96,15 @@ pub trait Accumulate: Sum {
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Section(f32);
 
+impl Section {
+    /// What is negative or not a number is nothing.
+    #[inline(always)]
+    fn new(section: f32) -> Self {
+        // A select, so that NaN too ends inside.
+        Section(if section > 0.0 { section } else { 0.0 })
+    }
+}
+
 /// The largest f32 below 2^31.
 const LARGEST: f32 = 2_147_483_520.0;
 
@@ -106,11 +117,7 @@ impl Accumulate for i32 {
     #[inline(always)]
     fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Section; 4] {
         let wz = sections.of(z).1[i];
-        payload.map(|p| {
-            let section = p * wz;
-            // A select, so that NaN too ends inside.
-            Section(if section > 0.0 { section } else { 0.0 })
-        })
+        payload.map(|p| Section::new(p * wz))
     }
 
     #[inline(always)]
@@ -189,7 +196,24 @@ pub(crate) fn section_fixed(payload: [i16; 4], wz: i16) -> [i16; 4] {
 /// A payload of 16-bit sums: rounded to nearest, 0 to 32767.
 #[inline(always)]
 pub(crate) fn whole(payload: f32) -> i16 {
-    (payload + 0.5).max(0.0) as i16
+    let bounded = bounded(payload + 0.5, 32767.0);
+    // SAFETY: it is 0 to 32767.
+    unsafe { bounded.to_int_unchecked::<i32>() as i16 }
+}
+
+/// `x` from 0 to `most`, 0 if it is not a number: two selects.
+#[inline(always)]
+fn bounded(x: f32, most: f32) -> f32 {
+    let x = if x > 0.0 { x } else { 0.0 };
+    if x < most { x } else { most }
+}
+
+/// The whole number below `x`, 0 to 2^31: of what is negative or not a number 0.
+#[inline(always)]
+pub(crate) fn truncate(x: f32) -> u32 {
+    let bounded = bounded(x, LARGEST);
+    // SAFETY: it is 0 to the largest f32 below 2^31.
+    unsafe { bounded.to_int_unchecked::<i32>() as u32 }
 }
 
 /// An instruction set that was seen on this machine. Holding the value is the proof.
@@ -310,195 +334,6 @@ pub fn splat<S: Accumulate>(
     }
 }
 
-/// The sums of eight sheets at one pixel.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-#[repr(C, align(64))]
-pub(crate) struct Record(pub(crate) [[i16; 4]; 8]);
-
-/// Adds the sections of a voxel to records: [`splat`] for all eight sheets at once. `wz`: the
-/// section's weight in each of them.
-///
-/// # Panics
-/// If the footprint leaves the sheet.
-#[inline(always)]
-pub(crate) fn splat_record(
-    simd: Simd,
-    pixels: &mut [Record],
-    stride: usize,
-    x: (usize, &[i16]),
-    y: (usize, &[i16]),
-    payload: [i16; 4],
-    wz: [i16; 8],
-) {
-    match simd.0 {
-        Level::Plain => {
-            records(pixels, stride, x, y, &Record(wz.map(|w| section_fixed(payload, w))));
-        }
-        // SAFETY: the value proves that the instructions are there; AVX-512 has AVX2 in it.
-        #[cfg(target_arch = "x86_64")]
-        Level::Avx2 | Level::Avx512 => unsafe { records_avx2(pixels, stride, x, y, payload, wz) },
-    }
-}
-
-/// The plain loop: what the fast one must equal.
-fn records(
-    pixels: &mut [Record],
-    stride: usize,
-    (x0, wx): (usize, &[i16]),
-    (y0, wy): (usize, &[i16]),
-    sections: &Record,
-) {
-    for (j, &wy) in wy.iter().enumerate() {
-        let row = (y0 + j) * stride + x0;
-        let rows = sections.0.map(|s| s.map(|c| times(c, wy)));
-        for (pixel, &wx) in pixels[row..row + wx.len()].iter_mut().zip(wx) {
-            for (sums, row) in pixel.0.iter_mut().zip(&rows) {
-                for c in 0..4 {
-                    sums[c] = sums[c].saturating_add(times(row[c], wx));
-                }
-            }
-        }
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn records_avx2(
-    pixels: &mut [Record],
-    stride: usize,
-    (x0, wx): (usize, &[i16]),
-    y: (usize, &[i16]),
-    [p, q, r, s]: [i16; 4],
-    [a, b, c, d, e, f, g, h]: [i16; 8],
-) {
-    use std::arch::x86_64::{_mm256_mulhrs_epi16, _mm256_setr_epi16};
-    // Four channels of four sheets: the payload times each sheet's weight.
-    let payload = _mm256_setr_epi16(p, q, r, s, p, q, r, s, p, q, r, s, p, q, r, s);
-    let low = _mm256_setr_epi16(a, a, a, a, b, b, b, b, c, c, c, c, d, d, d, d);
-    let high = _mm256_setr_epi16(e, e, e, e, f, f, f, f, g, g, g, g, h, h, h, h);
-    let sections = [_mm256_mulhrs_epi16(payload, low), _mm256_mulhrs_epi16(payload, high)];
-    // Columns in groups whose weights stay in registers.
-    for (i, wx) in wx.chunks(8).enumerate() {
-        let x0 = x0 + 8 * i;
-        match *wx {
-            [a, b, c, d, e, f, g, h] => {
-                columns([a, b, c, d, e, f, g, h], pixels, stride, x0, y, sections);
-            }
-            [a, b, c, d, e, f, g] => {
-                columns([a, b, c, d, e, f, g], pixels, stride, x0, y, sections);
-            }
-            [a, b, c, d, e, f] => {
-                columns([a, b, c, d, e, f], pixels, stride, x0, y, sections);
-            }
-            _ => {
-                for (i, &w) in wx.iter().enumerate() {
-                    columns([w], pixels, stride, x0 + i, y, sections);
-                }
-            }
-        }
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-#[inline]
-fn columns<const N: usize>(
-    wx: [i16; N],
-    pixels: &mut [Record],
-    stride: usize,
-    x0: usize,
-    (y0, wy): (usize, &[i16]),
-    [low, high]: [std::arch::x86_64::__m256i; 2],
-) {
-    use std::arch::x86_64::{
-        __m256i, _mm256_adds_epi16, _mm256_load_si256, _mm256_mulhrs_epi16, _mm256_set1_epi16,
-        _mm256_setzero_si256, _mm256_store_si256,
-    };
-    let mut columns = [_mm256_setzero_si256(); N];
-    for i in 0..N {
-        columns[i] = _mm256_set1_epi16(wx[i]);
-    }
-    for (j, &wy) in wy.iter().enumerate() {
-        let wy = _mm256_set1_epi16(wy);
-        let (low, high) = (_mm256_mulhrs_epi16(low, wy), _mm256_mulhrs_epi16(high, wy));
-        let row = (y0 + j) * stride + x0;
-        let row = &mut pixels[row..row + N];
-        for i in 0..N {
-            let at: *mut __m256i = std::ptr::from_mut(&mut row[i]).cast();
-            // SAFETY: a record is 64 bytes, aligned to 64, and borrowed for us alone.
-            unsafe {
-                let [l, h] = [_mm256_load_si256(at), _mm256_load_si256(at.add(1))];
-                _mm256_store_si256(at, _mm256_adds_epi16(l, _mm256_mulhrs_epi16(low, columns[i])));
-                let h = _mm256_adds_epi16(h, _mm256_mulhrs_epi16(high, columns[i]));
-                _mm256_store_si256(at.add(1), h);
-            }
-        }
-    }
-}
-
-/// The four sums of eight pixels in one sheet of their records, by channel.
-///
-/// # Panics
-/// If there are not eight pixels, or no such sheet.
-#[inline(always)]
-pub(crate) fn load_records(
-    simd: Simd,
-    pixels: &[Record],
-    sheet: usize,
-    to: &mut [[f32; LANES]; 4],
-) {
-    match simd.0 {
-        Level::Plain => lanes(pixels, sheet, to),
-        // SAFETY: the value proves that the instructions are there; AVX-512 has AVX2 in it.
-        #[cfg(target_arch = "x86_64")]
-        Level::Avx2 | Level::Avx512 => unsafe { lanes_avx2(pixels, sheet, to) },
-    }
-}
-
-/// The plain loop: what the fast one must equal.
-fn lanes(pixels: &[Record], sheet: usize, to: &mut [[f32; LANES]; 4]) {
-    for (i, record) in pixels[..LANES].iter().enumerate() {
-        for c in 0..4 {
-            to[c][i] = f32::from(record.0[sheet][c]);
-        }
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-#[inline]
-fn lanes_avx2(pixels: &[Record], sheet: usize, to: &mut [[f32; LANES]; 4]) {
-    use std::arch::x86_64::{
-        __m128i, _mm_loadl_epi64, _mm_setzero_si128, _mm_unpackhi_epi32, _mm_unpackhi_epi64,
-        _mm_unpacklo_epi16, _mm_unpacklo_epi32, _mm_unpacklo_epi64, _mm256_cvtepi16_epi32,
-        _mm256_cvtepi32_ps, _mm256_storeu_ps,
-    };
-    let mut sums = [_mm_setzero_si128(); LANES];
-    for (to, record) in sums.iter_mut().zip(&pixels[..LANES]) {
-        let at: *const __m128i = std::ptr::from_ref(&record.0[sheet]).cast();
-        // SAFETY: four 16-bit sums are the 8 bytes that are loaded.
-        *to = unsafe { _mm_loadl_epi64(at) };
-    }
-    // 8 pixels of 4 channels, turned over: pairs, quadruples, all eight.
-    let pair = |i: usize| _mm_unpacklo_epi16(sums[2 * i], sums[2 * i + 1]);
-    let (a, b, c, d) = (pair(0), pair(1), pair(2), pair(3));
-    let (low, high) = (
-        [_mm_unpacklo_epi32(a, b), _mm_unpackhi_epi32(a, b)],
-        [_mm_unpacklo_epi32(c, d), _mm_unpackhi_epi32(c, d)],
-    );
-    let channels = [
-        _mm_unpacklo_epi64(low[0], high[0]),
-        _mm_unpackhi_epi64(low[0], high[0]),
-        _mm_unpacklo_epi64(low[1], high[1]),
-        _mm_unpackhi_epi64(low[1], high[1]),
-    ];
-    for (to, channel) in to.iter_mut().zip(channels) {
-        let wide = _mm256_cvtepi32_ps(_mm256_cvtepi16_epi32(channel));
-        // SAFETY: eight floats are the 32 bytes that are stored.
-        unsafe { _mm256_storeu_ps(to.as_mut_ptr(), wide) };
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -542,53 +377,6 @@ mod tests {
             let want = run(Simd::plain());
             for simd in Simd::all() {
                 assert!(run(simd) == want, "{} differs at width {n}", simd.name());
-            }
-        }
-    }
-
-    #[test]
-    fn records_add_as_planes_do() {
-        for n in 0..30usize {
-            let wx: Vec<i16> = (0..n).map(|i| (i * 4001 % 22_000) as i16).collect();
-            let wy: Vec<i16> = (0..7).map(|i| 22_000 / (1 + i)).collect();
-            let payload = [31_000, 17_003, 77, 3];
-            let wz: [i16; 8] = std::array::from_fn(|k| (k * 4003) as i16);
-            let mut planes = vec![vec![[11i16; 4]; 64 * 9]; 8];
-            for (plane, wz) in planes.iter_mut().zip(wz) {
-                splat(plane, 64, (3, &wx), (1, &wy), section_fixed(payload, wz));
-            }
-            for simd in Simd::all() {
-                let mut got = vec![Record([[11; 4]; 8]); 64 * 9];
-                splat_record(simd, &mut got, 64, (3, &wx), (1, &wy), payload, wz);
-                for (i, record) in got.iter().enumerate() {
-                    let want: [[i16; 4]; 8] = std::array::from_fn(|k| planes[k][i]);
-                    assert_eq!(record.0, want, "{} differs at width {n}", simd.name());
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn records_are_turned_over() {
-        let pixels: Vec<Record> = (0..8i16)
-            .map(|p| {
-                Record(std::array::from_fn(|k| [1, 2, 3, 4].map(|c| p * 100 + k as i16 * 10 + c)))
-            })
-            .collect();
-        for simd in Simd::all() {
-            for sheet in 0..8 {
-                let mut to = [[0.0; LANES]; 4];
-                load_records(simd, &pixels, sheet, &mut to);
-                for c in 0..4 {
-                    for p in 0..8 {
-                        assert_eq!(
-                            to[c][p],
-                            (p * 100 + sheet * 10 + c + 1) as f32,
-                            "{}",
-                            simd.name()
-                        );
-                    }
-                }
             }
         }
     }

@@ -1,0 +1,297 @@
+//! A tile part of a flat view in whole sums: the fast way.
+//!
+//! Flat is a view whose voxels have one footprint in all their sheets: orthographic, with
+//! footprints in a table ([`crate::place`]). Then a voxel is a handful of integers, which are
+//! worked out sixteen at a time:
+//!
+//! 1. **Toss.** Positions are a corner and an offset; one bit of the mask says
+//!    whether a footprint may touch an open pixel. What is left waits in the bucket of its first
+//!    sheet with all that drawing it takes, so that nobody goes back to the brick.
+//! 2. **Splat.** The bit is looked at once more, since pixels have shut meanwhile; light falls on
+//!    sixteen voxels at once; each is added to the records of its footprint with all its sections
+//!    ([`crate::splat::records`]). A footprint that leaves the part is moved inside and reads zeros.
+//! 3. **Close.** Strips of eight pixels that something was added to are composited two at a time.
+//!
+//! The bytes are those of [`crate::serial`], which knows none of this.
+
+use crate::mask::OpenMask;
+use crate::scene::{Flat, Frame};
+use crate::splat::records::{Recorded, SLOTS, Splat, Table, Tables, splat};
+use crate::splat::{Simd, Work};
+use crate::stack::{Queues, Sheets, Stage, Store, slot, walk};
+use crate::tile::{Io, PART, Part, Pixels, Seen};
+use slabcast_common::message::Counters;
+use slabcast_common::shade::NO_NORMAL;
+use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
+
+/// Memory for voxels that a render thread keeps from part to part.
+#[derive(Default)]
+pub(crate) struct Waiting {
+    queues: Queues<Splat>,
+    tossing: Tossing,
+    batch: Batch,
+}
+
+/// Voxels of a brick on their way to buckets.
+struct Tossing {
+    /// Positions and depths: [`crate::place::Places::all`].
+    at: [[i32; 512]; 3],
+    /// First sheets.
+    first: [i32; 512],
+    /// Whether they may touch the part or an open pixel, and near which: [`OpenMask::near_all`].
+    fate: [u32; 512],
+    cells: [u32; 512],
+    /// Those that are kept.
+    kept: [u32; 512],
+    /// First pixels of the footprints of those, and where weights begin.
+    windows: [[u32; 512]; 4],
+    samples: [u32; 512],
+}
+
+impl Default for Tossing {
+    fn default() -> Self {
+        Tossing {
+            at: [[0; 512]; 3],
+            first: [0; 512],
+            fate: [0; 512],
+            cells: [0; 512],
+            kept: [0; 512],
+            windows: [[0; 512]; 4],
+            samples: [0; 512],
+        }
+    }
+}
+
+/// Voxels that are shaded and splatted together. A bucket of a part has some 50; at 16 loops are
+/// too short for lanes, at 1024 this is more than a first cache.
+const BATCH: usize = 128;
+
+/// Voxels on their way from a bucket to the records.
+struct Batch {
+    voxels: [Splat; BATCH],
+    samples: [u32; BATCH],
+    normals: [u16; BATCH],
+    light: [[f32; BATCH]; 4],
+}
+
+impl Default for Batch {
+    fn default() -> Self {
+        Batch {
+            voxels: [Splat::default(); BATCH],
+            samples: [0; BATCH],
+            normals: [0; BATCH],
+            light: [[0.0; BATCH]; 4],
+        }
+    }
+}
+
+/// Renders a part: compiled for each instruction set as a whole.
+pub(crate) struct RenderFlat<'a, S: Recorded> {
+    pub(crate) part: Part<'a>,
+    pub(crate) view: &'a Flat,
+    pub(crate) simd: Simd,
+    pub(crate) store: &'a mut Store<S>,
+    pub(crate) waiting: &'a mut Waiting,
+    pub(crate) pixels: &'a mut Pixels,
+    pub(crate) io: Io<'a>,
+}
+
+/// Whether parts of `frame` may be rendered here. A voxel waits with its sample and normal; where
+/// its gradient counts, too, the general way looks into the brick.
+pub(crate) fn takes(frame: &Frame) -> Option<&Flat> {
+    let flat = frame.flat.as_ref()?;
+    let fits = frame.sections.most() <= SLOTS && 2 * flat.reach < PART;
+    (fits && !frame.scene.classifier.is_modulated()).then_some(flat)
+}
+
+impl<S: Recorded> Work for RenderFlat<'_, S> {
+    type Out = ();
+    #[inline(always)]
+    fn run(self) {
+        let RenderFlat { part, view: flat, simd, store, waiting, pixels, io } = self;
+        let footprint = part.frame.footprints.at(0).expect("a flat view's sheets are all drawn");
+        let axis = |axis| {
+            let (firsts, len) = footprint.firsts(axis)?;
+            Some((firsts, Table { weights: S::across(&footprint, axis)?, len }))
+        };
+        let [(first_x, x), (first_y, y)] =
+            [0, 1].map(|a| axis(a).expect("a flat view's footprints have tables"));
+        let sections = &part.frame.sections;
+        let deep = Table { weights: S::deep(sections), len: sections.most() };
+        let tables = Tables { across: [x, y], deep };
+        let Waiting { queues, tossing, batch } = waiting;
+        let first = [first_x, first_y];
+        let stage = FlatStage { part: &part, flat, first, tables, tossing, batch };
+        walk(&part, stage, (simd, store), queues, pixels, io);
+    }
+}
+
+struct FlatStage<'a, S: Recorded> {
+    part: &'a Part<'a>,
+    flat: &'a Flat,
+    /// First pixel of each phase across.
+    first: [&'a [i32]; 2],
+    tables: Tables<'a, S>,
+    tossing: &'a mut Tossing,
+    batch: &'a mut Batch,
+}
+
+impl<S: Recorded> Stage<S> for FlatStage<'_, S> {
+    type Voxel = Splat;
+
+    #[inline(always)]
+    fn reach(&self) -> i32 {
+        self.flat.reach
+    }
+
+    #[inline(always)]
+    fn toss(
+        &mut self,
+        which: usize,
+        open: &OpenMask,
+        queues: &mut Queues<Splat>,
+        counters: &mut Counters,
+    ) {
+        let Part { frame, rect, slab, .. } = self.part;
+        let Seen { brick, corner, projected } = self.part.brick(which);
+        let cull = frame.scene.quality.cull;
+        if cull && !open.any(&projected.rect) {
+            counters.culled += brick.len() as u64;
+            return;
+        }
+        let sections = &frame.sections;
+        let phases = sections.phases();
+        let base = projected.sheets.first;
+        let origin = [
+            i64::from(rect.x0 * SUBPIXELS),
+            i64::from(rect.y0 * SUBPIXELS),
+            i64::from(base) * i64::from(phases),
+        ];
+        let n = brick.len();
+        let Tossing { at, first, fate, cells, kept, windows, samples } = &mut *self.tossing;
+        self.flat.places.all(corner.flat, origin, &brick.index, at);
+        let [x, y, z] = at;
+        open.near_all(&x[..n], &y[..n], cells, fate);
+        for i in 0..n {
+            let (begin, count) = sections.span(z[i]);
+            first[i] = base + begin;
+            let end = first[i] + count as i32;
+            let here = u32::from(first[i] < slab.end) & u32::from(end > slab.first);
+            fate[i] *= here;
+        }
+        let wanted = if cull { 3 } else { 1 };
+        let (mut reached, mut some) = (0, 0);
+        for i in 0..n {
+            kept[some] = i as u32;
+            some += usize::from(fate[i] >= wanted);
+            reached += u64::from(fate[i] != 0);
+        }
+        counters.tossed += some as u64;
+        counters.culled += reached - some as u64;
+        let kept = &kept[..some];
+        let [x0, from_x, y0, from_y] = windows;
+        let [wide, high] = self.tables.across.map(|t| t.len as i32);
+        move_inside((self.first[0], wide), x, kept, x0, from_x);
+        move_inside((self.first[1], high), y, kept, y0, from_y);
+        brick.values.bits(samples);
+        let normals = brick.normals.as_deref();
+        for (j, &i) in kept.iter().enumerate() {
+            let i = i as usize % 512;
+            let voxel = Splat {
+                first: [x0[j] as u8, y0[j] as u8],
+                cell: cells[i] as u16,
+                rows: [from_x[j] as u16, from_y[j] as u16],
+                z: (z[i] & (phases - 1)) as u16,
+                normal: normals.map_or(NO_NORMAL, |n| n[i]),
+                sample: samples[i],
+            };
+            if first[i] < slab.first {
+                queues.carried.push((voxel, first[i]));
+            } else {
+                queues.buckets[(first[i] - slab.first) as usize].push(voxel);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn splat(
+        &mut self,
+        bucket: &[Splat],
+        k: i32,
+        sheets: &mut Sheets<'_, S>,
+        open: &OpenMask,
+        counters: &mut Counters,
+    ) {
+        let cull = self.part.frame.scene.quality.cull;
+        let Batch { voxels, samples, normals, light } = &mut *self.batch;
+        let mut payloads = [S::Payload::default(); BATCH];
+        let [wide, high] = self.tables.across.map(|t| t.len);
+        for some in bucket.chunks(BATCH) {
+            let mut n = 0;
+            for v in some {
+                voxels[n] = *v;
+                n += usize::from(!cull | open.is_near(v.cell.into()));
+            }
+            let voxels = &voxels[..n];
+            for (i, v) in voxels.iter().enumerate() {
+                (samples[i], normals[i]) = (v.sample, v.normal);
+                sheets.touch(k, v.first, [wide, high]);
+            }
+            self.part.frame.payloads(&samples[..n], &normals[..n], light);
+            let [sigma, r, g, b] = light;
+            let payloads = &mut payloads[..n];
+            for (i, payload) in payloads.iter_mut().enumerate() {
+                *payload = S::payload([sigma[i], r[i], g[i], b[i]]);
+            }
+            counters.culled += (some.len() - n) as u64;
+            counters.splatted += n as u64;
+            S::splat_all(sheets.simd, sheets.records, (voxels, payloads), slot(k), &self.tables);
+        }
+    }
+
+    #[inline(always)]
+    fn splat_rest(
+        &mut self,
+        v: &Splat,
+        first: i32,
+        sheets: &mut Sheets<'_, S>,
+        open: &OpenMask,
+        counters: &mut Counters,
+    ) {
+        if self.part.frame.scene.quality.cull && !open.is_near(v.cell.into()) {
+            counters.culled += 1;
+            return;
+        }
+        counters.splatted += 1;
+        let mut light = [[0.0]; 4];
+        self.part.frame.payloads(&[v.sample], &[v.normal], &mut light);
+        let payload = S::payload(light.map(|[c]| c));
+        let k = self.part.slab.first;
+        let (x, y, z) = v.weights(&self.tables);
+        let left = &z[(k - first) as usize..];
+        splat(sheets.records, v.at(), (x, y, left), payload, slot(k));
+        sheets.touch(k, v.first, [x.len(), y.len()]);
+    }
+}
+
+/// First pixels of the footprints of some voxels along an axis, moved inside the part, and where their weights then
+/// begin: below 2^16, since rows of a table are at most three times 63 long.
+#[inline(always)]
+fn move_inside(
+    (firsts, len): (&[i32], i32),
+    at: &[i32; 512],
+    kept: &[u32],
+    inside: &mut [u32; 512],
+    from: &mut [u32; 512],
+) {
+    let firsts: &[i32; SUBPIXELS as usize] = firsts.first_chunk().expect("a first pixel a phase");
+    for ((&i, inside), from) in kept.iter().zip(inside).zip(from) {
+        let at = at[i as usize % 512];
+        let (pixel, phase) = (at >> SUBPIXEL_BITS, at & (SUBPIXELS - 1));
+        let first = pixel + firsts[phase as usize];
+        let moved = first.clamp(0, PART - len);
+        *inside = moved as u32;
+        // Moved farther than a footprint is long, it reads zeros only.
+        *from = ((3 * phase + 1) * len + (moved - first).clamp(-len, len)) as u32;
+    }
+}

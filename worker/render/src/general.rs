@@ -1,0 +1,313 @@
+//! A tile part of any view in any sums: the general way ([`crate::tile`] tells what it does).
+//!
+//! Each section of a voxel has a footprint of its own, and sheets lie one after the other in
+//! [`Planes`]. Voxels wait as brick and index, so that float sums can be sorted into their one order.
+
+use crate::footprint::Footprint;
+use crate::mask::OpenMask;
+use crate::planes::{BLOCK, Planes, Window};
+use crate::scene::Placed;
+use crate::sheet::{LANES, Row};
+use crate::splat::{Accumulate, Weight, Work};
+use crate::tile::{Io, PART, Part, Pixels, Seen};
+use slabcast_common::message::Counters;
+use slabcast_common::occlusion::Rect;
+use slabcast_common::view::Projection;
+
+/// A voxel waiting in the bucket of its first sheet.
+#[derive(Clone, Copy)]
+struct Waiting {
+    /// Which of the part's bricks.
+    brick: u32,
+    /// Which voxel of it.
+    voxel: u16,
+    /// Where it lies.
+    placed: Placed,
+}
+
+/// Memory that a render thread keeps from part to part.
+#[derive(Default)]
+pub(crate) struct GeneralScratch {
+    pub(crate) kinds: Kinds,
+    pub(crate) queues: Queues,
+}
+
+/// Memory for sums of every kind.
+#[derive(Default)]
+pub(crate) struct Kinds {
+    pub(crate) shorts: Kind<i16>,
+    pub(crate) longs: Kind<i32>,
+    pub(crate) floats: Kind<f32>,
+}
+
+/// Memory for sums of one kind.
+pub(crate) struct Kind<S: Accumulate> {
+    planes: Planes<S>,
+    /// For weights that are in no table.
+    weights: [Vec<S::Weight>; 2],
+}
+
+impl<S: Accumulate> Default for Kind<S> {
+    fn default() -> Self {
+        Kind { planes: Planes::default(), weights: [Vec::new(), Vec::new()] }
+    }
+}
+
+/// Voxels that wait.
+#[derive(Default)]
+pub(crate) struct Queues {
+    buckets: Vec<Vec<Waiting>>,
+    carried: Vec<Waiting>,
+}
+
+/// A part with what it works on: compiled for each instruction set as a whole.
+pub(crate) struct RenderGeneral<'a, S: Accumulate> {
+    pub(crate) part: Part<'a>,
+    pub(crate) kind: &'a mut Kind<S>,
+    pub(crate) queues: &'a mut Queues,
+    pub(crate) pixels: &'a mut Pixels,
+    pub(crate) io: Io<'a>,
+}
+
+impl<S: Accumulate> Work for RenderGeneral<'_, S> {
+    type Out = ();
+    #[inline(always)]
+    fn run(self) {
+        let RenderGeneral { part, kind, queues, pixels, io } = self;
+        kind.planes.reset(part.frame.sections.most() + 1);
+        General { part: &part }.render(kind, queues, pixels, io);
+    }
+}
+
+struct General<'a> {
+    part: &'a Part<'a>,
+}
+
+impl General<'_> {
+    #[inline(always)]
+    fn render<S: Accumulate>(
+        &self,
+        kind: &mut Kind<S>,
+        queues: &mut Queues,
+        pixels: &mut Pixels,
+        (state, out, counters): Io<'_>,
+    ) {
+        let part = self.part;
+        let Part { frame, slab, .. } = part;
+        let mut open = self.part.begin(pixels, state);
+        if let Some(last) = &state.last {
+            self.part.each_pixel(|x, y, tile| {
+                kind.planes.put(slab.first - 1, y * PART as usize + x, last[tile]);
+            });
+        }
+        let sheets = slab.len() as usize;
+        if queues.buckets.len() < sheets {
+            queues.buckets.resize_with(sheets, Vec::new);
+        }
+        for bucket in &mut queues.buckets {
+            bucket.clear();
+        }
+        queues.carried.clear();
+
+        let float_sums = frame.scene.float_sums();
+        let mut next = 0;
+        let mut any_open = open.count() > 0;
+        for k in slab.first..slab.end {
+            if !any_open {
+                break;
+            }
+            while next < part.bricks() && part.brick(next).projected.sheets.first <= k {
+                self.admit(next, &open, queues, counters);
+                next += 1;
+            }
+            if k == slab.first && !queues.carried.is_empty() {
+                // Voxels that begin before the slab come first, as they do without the cut.
+                let mut carried = std::mem::take(&mut queues.carried);
+                if float_sums {
+                    let sections = &frame.sections;
+                    let id = |v: &Waiting| part.brick(v.brick as usize).brick.id;
+                    carried.sort_by_key(|v| (sections.first(v.placed.z), id(v), v.voxel));
+                }
+                self.splat_all(&carried, k, kind, &open, counters);
+                carried.clear();
+                queues.carried = carried;
+            }
+            let mut bucket = std::mem::take(&mut queues.buckets[(k - slab.first) as usize]);
+            if float_sums {
+                bucket.sort_by_key(|v| (part.brick(v.brick as usize).brick.id, v.voxel));
+            }
+            self.splat_all(&bucket, k, kind, &open, counters);
+            bucket.clear();
+            queues.buckets[(k - slab.first) as usize] = bucket;
+            if self.close(k, &kind.planes, &mut open, pixels) {
+                any_open = open.count() > 0;
+            }
+            kind.planes.clear(k - 1);
+        }
+        // Whatever the part did not come to is hidden.
+        counters.culled += part.voxels_from(next);
+        counters.culled += queues.buckets.iter().map(|b| b.len() as u64).sum::<u64>();
+        self.part.end(pixels, out);
+        if let Some(last) = &mut out.last {
+            // Nobody reads a shut pixel's sums; they may be anything, so they are none.
+            self.part.each_pixel(|x, y, tile| {
+                if open.row(y) >> x & 1 == 1 {
+                    last[tile] = kind.planes.raw(slab.end - 1, y * PART as usize + x);
+                }
+            });
+        }
+    }
+
+    /// Where a voxel's footprints lie, all sections together, a pixel more at most.
+    #[inline(always)]
+    fn extent(&self, placed: &Placed) -> Option<Rect> {
+        let frame = self.part.frame;
+        let (first, count) = frame.sections.span(placed.z);
+        let last = first + count as i32 - 1;
+        let at = |k: i32| {
+            let f = frame.footprints.at(k)?;
+            let [x, y] = frame.screen(placed, &f);
+            let ((x0, x1), (y0, y1)) = (f.extent(0, x), f.extent(1, y));
+            Some(Rect::new(x0, y0, x1, y1))
+        };
+        match frame.view.projection {
+            Projection::Ortho { .. } => at(first),
+            Projection::Persp { .. } => {
+                // Edges move one way with depth, so the first and last visible sections hold
+                // the others. An end's rounding may put one a pixel farther out: grow by one.
+                let front = (first..=last).find_map(at)?;
+                let back = at(last)?;
+                let r = front.union(&back);
+                Some(Rect::new(r.x0 - 1, r.y0 - 1, r.x1 + 1, r.y1 + 1))
+            }
+        }
+    }
+
+    /// Tests a brick, then its voxels, and tosses what is left into buckets.
+    #[inline(always)]
+    fn admit(&self, which: usize, open: &OpenMask, queues: &mut Queues, counters: &mut Counters) {
+        let Part { frame, rect, slab, .. } = self.part;
+        let Seen { brick, corner, projected } = self.part.brick(which);
+        let cull = frame.scene.quality.cull;
+        if cull && !open.any(&projected.rect) {
+            counters.culled += brick.len() as u64;
+            return;
+        }
+        for (voxel, &local) in brick.index.iter().enumerate() {
+            let placed = frame.place(corner, local);
+            let (first, count) = frame.sections.span(placed.z);
+            if first >= slab.end || first + count as i32 <= slab.first {
+                continue;
+            }
+            let Some(extent) = self.extent(&placed) else { continue };
+            let inside = !extent.intersect(rect).is_empty();
+            if !inside || cull && !open.any(&extent) {
+                counters.culled += u64::from(inside);
+                continue;
+            }
+            counters.tossed += 1;
+            let waiting = Waiting { brick: which as u32, voxel: voxel as u16, placed };
+            if first < slab.first {
+                queues.carried.push(waiting);
+            } else {
+                queues.buckets[(first - slab.first) as usize].push(waiting);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn splat_all<S: Accumulate>(
+        &self,
+        bucket: &[Waiting],
+        k: i32,
+        Kind { planes, weights }: &mut Kind<S>,
+        open: &OpenMask,
+        counters: &mut Counters,
+    ) {
+        let Part { frame, slab, .. } = self.part;
+        // The sheet behind the slab is filled as far as the colour rule peeks.
+        let end = slab.end + i32::from(frame.looks_at_neighbours());
+        for Waiting { brick, voxel, placed } in bucket {
+            let brick = &self.part.brick(*brick as usize).brick;
+            if frame.scene.quality.cull && self.extent(placed).is_none_or(|e| !open.any(&e)) {
+                counters.culled += 1;
+                continue;
+            }
+            let payload = frame.payload(brick, usize::from(*voxel), placed.eye);
+            if payload[0] <= 0.0 {
+                continue;
+            }
+            counters.splatted += 1;
+            let (first, count) = frame.sections.span(placed.z);
+            for sheet in first.max(k).max(slab.first)..(first + count as i32).min(end) {
+                let Some(f) = frame.footprints.at(sheet) else { continue };
+                let at = frame.screen(placed, &f);
+                if let Some(window) = self.window::<S>(&f, at, weights) {
+                    let i = (sheet - first) as usize;
+                    planes.add(sheet, window, S::section(&frame.sections, placed.z, i, &payload));
+                }
+            }
+        }
+    }
+
+    /// A footprint inside the part, or nothing.
+    #[inline(always)]
+    fn window<'b, S: Accumulate>(
+        &self,
+        f: &'b Footprint<'_>,
+        [x, y]: [i64; 2],
+        [bx, by]: &'b mut [Vec<S::Weight>; 2],
+    ) -> Option<Window<'b, S::Weight>> {
+        let rect = self.part.rect;
+        let (x0, wx) = S::Weight::of(f, 0, x, (rect.x0, rect.x1), bx);
+        let (y0, wy) = S::Weight::of(f, 1, y, (rect.y0, rect.y1), by);
+        let inside = !wx.is_empty() && !wy.is_empty();
+        let at = |p: i32, origin: i32| (p - origin) as usize;
+        inside.then(|| ((at(x0, rect.x0), wx), (at(y0, rect.y0), wy)))
+    }
+
+    /// Closes sheet `k` where it was touched; whether pixels were shut.
+    #[inline(always)]
+    fn close<S: Accumulate>(
+        &self,
+        k: i32,
+        planes: &Planes<S>,
+        open: &mut OpenMask,
+        pixels: &mut Pixels,
+    ) -> bool {
+        const { assert!(LANES == 2 * BLOCK) };
+        let rule = self.part.frame.rule;
+        let mut mask = planes.touched(k);
+        let mut any_shut = false;
+        let mut row = Row::default();
+        while mask != 0 {
+            let b = mask.trailing_zeros() as usize;
+            mask &= mask - 1;
+            let (x0, y0) = (b % 8 * BLOCK, b / 8 * BLOCK);
+            for y in (y0..y0 + BLOCK).step_by(2) {
+                let live = [y, y + 1].map(|y| open.row(y) >> x0 & 0xff);
+                if live == [0, 0] {
+                    continue;
+                }
+                for half in 0..2 {
+                    let (at, lane) = ((y + half) * PART as usize + x0, half * BLOCK);
+                    planes.load(k, at, &mut row, lane);
+                    let secants = &pixels.secants[at..at + BLOCK];
+                    for (i, secant) in secants.iter().enumerate() {
+                        (row.secant[lane + i], row.cosine[lane + i]) = (*secant, 1.0 / secant);
+                    }
+                    row.a[lane..lane + BLOCK].copy_from_slice(&pixels.a[at..at + BLOCK]);
+                }
+                let shut = rule.close_row::<S>(&mut row, (live[0] | live[1] << BLOCK) as u32);
+                for half in 0..2 {
+                    let (at, lane) = ((y + half) * PART as usize + x0, half * BLOCK);
+                    pixels.put(at, &row, lane);
+                    let shut = u64::from(shut >> lane & 0xff);
+                    open.close(y + half, shut << x0);
+                    any_shut |= shut != 0;
+                }
+            }
+        }
+        any_shut
+    }
+}

@@ -1,0 +1,318 @@
+//! The open sheets of a part in records, and the walk through them, front to back.
+//!
+//! What differs between views is how voxels get there: [`crate::flat`] and [`crate::deep`] toss and
+//! splat; this room closes. Rows of strips of eight pixels that something was added to are known by
+//! a bit each; a sheet that closes looks at those alone, two strips at a time.
+
+use crate::mask::OpenMask;
+use crate::sheet::{LANES, Row};
+use crate::splat::Simd;
+use crate::splat::records::{Record, Recorded, SLOTS, STRIDE, STRIP, Strip};
+use crate::tile::{Io, PART, Part, Pixels};
+use slabcast_common::message::Counters;
+use slabcast_common::view::Projection;
+
+pub(crate) const EDGE: usize = PART as usize;
+/// Strips of a row.
+const STRIPS: usize = EDGE / STRIP;
+
+/// Memory for sums of one kind.
+pub(crate) struct Store<S: Recorded> {
+    records: Vec<Record<S>>,
+    /// Sums of the sheet before, where it was touched.
+    before: Vec<[S; 4]>,
+}
+
+impl<S: Recorded> Default for Store<S> {
+    fn default() -> Self {
+        Store { records: Vec::new(), before: Vec::new() }
+    }
+}
+
+/// Voxels that wait.
+pub(crate) struct Queues<V> {
+    pub(crate) buckets: Vec<Vec<V>>,
+    /// Voxels that begin before the slab, and where.
+    pub(crate) carried: Vec<(V, i32)>,
+}
+
+impl<V> Default for Queues<V> {
+    fn default() -> Self {
+        Queues { buckets: Vec::new(), carried: Vec::new() }
+    }
+}
+
+/// How voxels of one kind of view get into sheets.
+pub(crate) trait Stage<S: Recorded> {
+    /// A voxel waiting in the bucket of its first sheet.
+    type Voxel: Copy;
+
+    /// Pixels that a footprint reaches at most from the one that holds its centre.
+    fn reach(&self) -> i32;
+    /// Tests brick `which` of the part, then its voxels, and tosses what is left into buckets.
+    fn toss(
+        &mut self,
+        which: usize,
+        open: &OpenMask,
+        queues: &mut Queues<Self::Voxel>,
+        counters: &mut Counters,
+    );
+    /// Shades the voxels that begin at sheet `k` and adds them to their sheets.
+    fn splat(
+        &mut self,
+        bucket: &[Self::Voxel],
+        k: i32,
+        sheets: &mut Sheets<'_, S>,
+        open: &OpenMask,
+        counters: &mut Counters,
+    );
+    /// Adds a voxel that begins before the slab, at `first`, to those of its sheets that are left.
+    fn splat_rest(
+        &mut self,
+        voxel: &Self::Voxel,
+        first: i32,
+        sheets: &mut Sheets<'_, S>,
+        open: &OpenMask,
+        counters: &mut Counters,
+    );
+}
+
+/// Walks through the sheets of `part`'s slab.
+#[inline(always)]
+pub(crate) fn walk<S: Recorded, T: Stage<S>>(
+    part: &Part<'_>,
+    mut stage: T,
+    (simd, store): (Simd, &mut Store<S>),
+    queues: &mut Queues<T::Voxel>,
+    pixels: &mut Pixels,
+    (state, out, counters): Io<'_>,
+) {
+    let mut sheets = Sheets::new(simd, store, part.frame.sections.most());
+    let slab = part.slab;
+    let mut open = part.begin(pixels, state);
+    if let Some(last) = &state.last {
+        part.each_pixel(|x, y, tile| {
+            sheets.before[y * EDGE + x] = last[tile].map(S::from_bits);
+        });
+        sheets.was = [u64::MAX; STRIPS];
+    }
+    if queues.buckets.len() < slab.len() as usize {
+        queues.buckets.resize_with(slab.len() as usize, Vec::new);
+    }
+    open.grow(stage.reach());
+    let mut any_open = open.count() > 0;
+    let (mut next, mut k) = (0, slab.first);
+    while k < slab.end && any_open {
+        while next < part.bricks() && part.brick(next).projected.sheets.first <= k {
+            stage.toss(next, &open, queues, counters);
+            next += 1;
+        }
+        sheets.added[slot(k)] = [0; STRIPS];
+        for (voxel, first) in queues.carried.drain(..) {
+            stage.splat_rest(&voxel, first, &mut sheets, &open, counters);
+        }
+        let bucket = &mut queues.buckets[(k - slab.first) as usize];
+        stage.splat(bucket, k, &mut sheets, &open, counters);
+        bucket.clear();
+        if sheets.close(k, part, &mut open, pixels) {
+            any_open = open.count() > 0;
+            open.grow(stage.reach());
+        }
+        k += 1;
+    }
+    // Whatever the part did not come to is hidden.
+    counters.culled += part.voxels_from(next);
+    queues.carried.clear();
+    for bucket in &mut queues.buckets {
+        counters.culled += bucket.len() as u64;
+        bucket.clear();
+    }
+    part.end(pixels, out);
+    if let Some(last) = &mut out.last {
+        // Nobody reads a shut pixel's sums; they may be anything, so they are none.
+        part.each_pixel(|x, y, tile| {
+            let touched = sheets.was[x / STRIP] >> y & open.row(y) >> x & 1 == 1;
+            let none = [S::default(); 4];
+            let sums = if touched { sheets.before[y * EDGE + x] } else { none };
+            last[tile] = sums.map(S::bits);
+        });
+    }
+    sheets.empty(k);
+}
+
+/// Rows of each strip that something was added to, one bit each.
+type Rows = [u64; STRIPS];
+
+/// The open sheets of a part.
+pub(crate) struct Sheets<'a, S: Recorded> {
+    pub(crate) simd: Simd,
+    pub(crate) records: &'a mut [Record<S>],
+    before: &'a mut [[S; 4]],
+    /// By slot of their first sheet: rows that voxels touch.
+    added: [Rows; SLOTS],
+    /// Rows of `before` that may not be zero.
+    was: Rows,
+    /// Rows with records of shut pixels that are not zero.
+    dead: Rows,
+    /// Sheets that a voxel touches at most.
+    most: usize,
+}
+
+#[inline(always)]
+pub(crate) fn slot(k: i32) -> usize {
+    k as usize % SLOTS
+}
+
+impl<'a, S: Recorded> Sheets<'a, S> {
+    fn new(simd: Simd, store: &'a mut Store<S>, most: usize) -> Self {
+        store.records.resize(STRIDE * EDGE, Record::default());
+        store.before.resize(EDGE * EDGE, [S::default(); 4]);
+        Sheets {
+            simd,
+            records: &mut store.records,
+            before: &mut store.before,
+            added: [[0; STRIPS]; SLOTS],
+            was: [0; STRIPS],
+            dead: [0; STRIPS],
+            most,
+        }
+    }
+
+    /// Notes that a voxel that begins at sheet `k` touches so many columns and rows from (x, y).
+    #[inline(always)]
+    pub(crate) fn touch(&mut self, k: i32, [x, y]: [u8; 2], [wide, high]: [usize; 2]) {
+        let (x, y) = (usize::from(x), y & 63);
+        let rows = (u64::MAX >> (64 - high)) << y;
+        let added = &mut self.added[slot(k)];
+        let (first, last) = (x / STRIP % STRIPS, (x + wide - 1) / STRIP % STRIPS);
+        added[first] |= rows;
+        added[last] |= rows;
+        for strip in first + 1..last {
+            added[strip] |= rows;
+        }
+    }
+
+    /// Rows that voxels which begin at sheets `from` to `k` touch.
+    fn touched(&self, from: i32, k: i32) -> Rows {
+        let mut rows = [0; STRIPS];
+        for first in from..=k {
+            for (row, added) in rows.iter_mut().zip(self.added[slot(first)]) {
+                *row |= added;
+            }
+        }
+        rows
+    }
+
+    /// Closes sheet `k` where it was touched; whether pixels were shut.
+    #[inline(always)]
+    fn close(&mut self, k: i32, part: &Part<'_>, open: &mut OpenMask, pixels: &mut Pixels) -> bool {
+        let touched = self.touched(k + 1 - self.most as i32, k);
+        for strip in 0..STRIPS {
+            // What the sheet before has where this one has nothing.
+            let mut stale = self.was[strip] & !touched[strip];
+            while stale != 0 {
+                let y = stale.trailing_zeros() as usize;
+                stale &= stale - 1;
+                self.before[y * EDGE + strip * STRIP..][..STRIP].fill([S::default(); 4]);
+            }
+        }
+        self.was = touched;
+        let mut closing = Closing { k, part, open, pixels, row: Row::default(), any_shut: false };
+        let mut pending = None;
+        for strip in 0..STRIPS {
+            let mut rows = touched[strip];
+            while rows != 0 {
+                let y = rows.trailing_zeros() as usize;
+                rows &= rows - 1;
+                if closing.open.row(y) >> (strip * STRIP) & 0xff == 0 {
+                    // Nobody looks at these pixels again in this part.
+                    self.dead[strip] |= 1 << y;
+                    continue;
+                }
+                let here = (strip, y);
+                match pending.take() {
+                    None => pending = Some(here),
+                    Some(other) => {
+                        self.take([other, here], &mut closing);
+                        closing.close::<S>(&[other, here]);
+                    }
+                }
+            }
+        }
+        if let Some(one) = pending {
+            self.take([one, one], &mut closing);
+            closing.close::<S>(&[one]);
+        }
+        closing.any_shut
+    }
+
+    #[inline(always)]
+    fn take(&mut self, strips: [(usize, usize); 2], to: &mut Closing<'_>) {
+        let strips = strips.map(|(strip, y)| Strip {
+            record: y * STRIDE + strip * STRIP,
+            pixel: y * EDGE + strip * STRIP,
+        });
+        let sums = (&mut *self.records, &mut *self.before);
+        S::take(self.simd, sums, &to.pixels.a, strips, slot(to.k), &mut to.row);
+    }
+
+    /// Leaves nothing behind, where sheets before `k` are closed.
+    fn empty(&mut self, k: i32) {
+        let left = self.touched(k + 1 - self.most as i32, k - 1);
+        for strip in 0..STRIPS {
+            for y in 0..EDGE {
+                let at = strip * STRIP;
+                if (left[strip] | self.dead[strip]) >> y & 1 == 1 {
+                    self.records[y * STRIDE + at..][..STRIP].fill(Record::default());
+                }
+                if self.was[strip] >> y & 1 == 1 {
+                    self.before[y * EDGE + at..][..STRIP].fill([S::default(); 4]);
+                }
+            }
+        }
+    }
+}
+
+/// A sheet that is being closed.
+struct Closing<'a> {
+    k: i32,
+    part: &'a Part<'a>,
+    open: &'a mut OpenMask,
+    pixels: &'a mut Pixels,
+    row: Row,
+    any_shut: bool,
+}
+
+impl Closing<'_> {
+    /// Composites one strip or two, whose sums are in the row.
+    #[inline(always)]
+    fn close<S: Recorded>(&mut self, strips: &[(usize, usize)]) {
+        let Closing { part, open, pixels, row, .. } = self;
+        // A voxel touches a sheet or two with nothing, where its kernel ends or is cut.
+        if row.here[0] == [0.0; LANES] {
+            return;
+        }
+        let mut live = 0;
+        for (half, &(strip, y)) in strips.iter().enumerate() {
+            live |= (open.row(y) >> (strip * STRIP) & 0xff) << (half * STRIP);
+        }
+        // Where rays are parallel, the row's secants stay 1.
+        if let Projection::Persp { .. } = part.frame.view.projection {
+            for (half, &(strip, y)) in strips.iter().enumerate() {
+                let secants = &pixels.secants[y * EDGE + strip * STRIP..][..STRIP];
+                for (i, secant) in secants.iter().enumerate() {
+                    let lane = half * STRIP + i;
+                    (row.secant[lane], row.cosine[lane]) = (*secant, 1.0 / secant);
+                }
+            }
+        }
+        let shut = part.frame.rule.close_row::<S>(row, live as u32);
+        for (half, &(strip, y)) in strips.iter().enumerate() {
+            let at = y * EDGE + strip * STRIP;
+            pixels.put(at, row, half * STRIP);
+            let shut = u64::from(shut >> (half * STRIP) & 0xff);
+            open.close(y, shut << (strip * STRIP));
+            self.any_shut |= shut != 0;
+        }
+    }
+}

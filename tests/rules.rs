@@ -120,3 +120,16 @@ fn unsafe_stands_behind_one_wall() {
          for the wall"
     );
 }
+
+/// Golden frames: one line a frame, each name once, each a SHA-256.
+#[test]
+fn golden_lines_are_well_formed() {
+    let text = std::fs::read_to_string(root().join("tests/golden.txt")).expect("golden frames");
+    let mut names = BTreeMap::new();
+    for line in text.lines().filter(|l| !l.is_empty() && !l.starts_with('#')) {
+        let (name, hash) = line.rsplit_once(' ').expect("NAME SHA256");
+        assert!(hash.len() == 64 && hash.bytes().all(|b| b.is_ascii_hexdigit()), "{line}");
+        assert!(names.insert(name.trim(), hash).is_none(), "{name} stands twice");
+    }
+    assert!(names.len() >= 8, "only {} golden frames", names.len());
+}

@@ -15,9 +15,8 @@
 //! are integers (or floats in one order), an open pixel gets every voxel that covers it, and
 //! what a shut pixel gets is never read.
 //!
-//! Three rooms do that: [`crate::general`] for every view and every kind of sums; far faster, in
-//! whole numbers, [`crate::flat`] for most orthographic views and [`crate::deep`] for most
-//! perspective ones.
+//! Three rooms do that: `general` for every view and every kind of sums; far faster, in whole numbers,
+//! `flat` for most orthographic views and `deep` for most perspective ones.
 
 use crate::deep::{self, RenderDeep};
 use crate::flat::{self, RenderFlat};

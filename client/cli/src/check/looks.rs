@@ -11,7 +11,7 @@ use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, Transf
 pub(super) fn of(case: &str) -> Option<TransferFunction> {
     let tf = match case {
         "mni152_t1/auto" => surface(
-            [0.2147058823529412, 0.39211457131871857, 0.569523260284506, 0.9215686274509803],
+            [0.2147058823529412, 0.392_114_571_318_718_6, 0.569523260284506, 0.9215686274509803],
             [0.3220588235294118, 0.536764705882353],
         ),
         "spheres/auto" | "spheres/auto/i16" => surface(

@@ -141,14 +141,14 @@ fn info_tells_a_person_and_a_program() {
     let out = run(dir.path(), &["info", "formula:blob", "--json"]);
     let json: serde_json::Value = serde_json::from_slice(&out.stdout).unwrap();
     assert_eq!(json["dims"], serde_json::json!([64, 64, 64]));
-    assert_eq!(json["presets"].as_array().unwrap().len(), 10);
+    assert!(json["presets"].as_array().unwrap().len() >= 20);
 }
 
 #[test]
 fn logs_are_json_on_request_and_plain_for_the_journal() {
     let dir = tempfile::tempdir().unwrap();
     let args =
-        ["render", "formula:one", "--azimuth", "0", "--size", "8x8", "-q", "--log-level", "info"];
+        ["render", "formula:blob", "--azimuth", "0", "--size", "8x8", "-q", "--log-level", "info"];
     let out = run(dir.path(), &[&args[..], &["--log", "json", "-o", "a"]].concat());
     let said = text(&out.stderr);
     let mut logs = said.lines().map(serde_json::from_str::<serde_json::Value>);

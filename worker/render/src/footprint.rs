@@ -288,18 +288,21 @@ type Key = [u64; 7];
 /// voxels a side has 450. A shelf that is full is cleared: what frames use they hold themselves.
 const SHELF: usize = 1024;
 
-/// Tables are made for scales rounded to this many bits, so that those of frames from one distance
-/// are the same whatever the last bits say. It is a 2^17th of a footprint's width.
+/// Footprints are as wide as scales rounded to this many bits say, so that those of frames from one
+/// distance are the same whatever the last bits are. It is a 2^17th of a footprint's width.
 const SCALE_BITS: u32 = 16;
+
+/// `scale` rounded to [`SCALE_BITS`].
+fn rounded(scale: f64) -> f64 {
+    let drop = 52 - SCALE_BITS;
+    f64::from_bits((scale.to_bits() + (1 << (drop - 1))) >> drop << drop)
+}
 
 impl Shelf {
     fn get(&self, x: &Profile, y: &Profile, scale: f64) -> Arc<Tables> {
-        let drop = 52 - SCALE_BITS;
-        let rounded = (scale.to_bits() + (1 << (drop - 1))) >> drop << drop;
-        let scale = f64::from_bits(rounded);
         let profile = |p: &Profile| [p.std, p.radius, p.spread].map(f64::to_bits);
         let ([a, b, c], [d, e, f]) = (profile(x), profile(y));
-        let key = [a, b, c, d, e, f, rounded];
+        let key = [a, b, c, d, e, f, scale.to_bits()];
         let tables = || self.tables.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(found) = tables().get(&key) {
             return found.clone();
@@ -353,16 +356,19 @@ impl Footprints {
             Projection::Ortho { .. } => self.tables.first(),
             Projection::Persp { .. } => self.tables.get((k - self.first) as usize),
         };
-        let table = slot.map(|t| &**t.get_or_init(|| self.shelf.get(&self.x, &self.y, scale)));
-        Some(Footprint { scale, table, profiles: [&self.x, &self.y] })
+        let wide = rounded(scale);
+        let table = slot.map(|t| &**t.get_or_init(|| self.shelf.get(&self.x, &self.y, wide)));
+        Some(Footprint { scale, wide, table, profiles: [&self.x, &self.y] })
     }
 }
 
 /// The footprints of one sheet.
 #[derive(Clone, Copy, Debug)]
 pub struct Footprint<'a> {
-    /// Pixels a vox.
+    /// Pixels a vox, which says where it lies.
     pub scale: f64,
+    /// The same, rounded, which says how wide it is.
+    wide: f64,
     table: Option<&'a Tables>,
     profiles: [&'a Profile; 2],
 }
@@ -387,7 +393,7 @@ impl<'a> Footprint<'a> {
                 (first, first + t.count[p as usize] as i32)
             }
             None => {
-                let (a, b) = reach(p, self.profiles[axis].radius * self.scale);
+                let (a, b) = reach(p, self.profiles[axis].radius * self.wide);
                 (near(base + a), near(base + (b + 1).max(a)))
             }
         }
@@ -460,7 +466,7 @@ impl<'a> Footprint<'a> {
             }
             None => {
                 let profile = self.profiles[axis];
-                let at = |i| weight(profile, self.scale, p, i64::from(i) - base);
+                let at = |i| weight(profile, self.wide, p, i64::from(i) - base);
                 buffer.clear();
                 buffer.extend((from..to).map(|i| make(at(i), profile.spread)));
                 (from, &buffer[..])

@@ -10,7 +10,6 @@ use crate::fail::{Fail, say};
 use crate::local::{self, Cut};
 use crate::progress::{self, Progress};
 use crate::request::{PictureOf, ThreadArg, lattice_notice};
-use crate::volume;
 use slabcast_common::message::Counters;
 use slabcast_common::quality::Work;
 use slabcast_common::view::View;
@@ -53,7 +52,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
     let asked = args.of.look.asked(Work::default())?;
     let orientation = args.of.look.view.axes.orientation()?;
     let threads = args.threads.count();
-    let volume = volume::open(&args.of.volume)?;
+    let volume = args.of.open()?;
     let info = volume.info(volume.digest());
     asked.fit(&info, orientation, volume.anatomical)?;
     if let Some(notice) = lattice_notice(&info) {

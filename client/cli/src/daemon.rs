@@ -35,9 +35,10 @@ Examples:
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = MASTER_EXAMPLES)]
 pub(crate) struct MasterArgs {
-    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", help = volume::VOLUME)]
     volume: PathBuf,
+    #[command(flatten)]
+    input: volume::InputArgs,
     /// World axis that is up: x, y or z with + or - [default: +z]
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
     up: Option<Axis>,
@@ -89,7 +90,7 @@ pub(crate) fn master(args: &MasterArgs) -> Result<(), Fail> {
     // The address is taken before the volume is read, so that a port in use is told at once;
     // it is opened after, so that whoever gets through gets an answer.
     let socket = runtime.block_on(bind(&args.listen, args.insecure))?;
-    let volume = volume::open(&args.volume)?;
+    let volume = args.input.open(&args.volume)?;
     let (name, lattice) = (volume.name.clone(), volume.lattice);
     let config = MasterConfig::new(volume, orientation);
     let result = runtime.block_on(async {

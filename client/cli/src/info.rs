@@ -21,10 +21,12 @@ Examples:
   slabcast info brain.nii.gz
   slabcast info brain.nii.gz --json | jq .presets")]
 pub(crate) struct InfoArgs {
-    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
+    #[arg(help = volume::VOLUME)]
     volume: PathBuf,
     #[command(flatten)]
     axes: AxisArgs,
+    #[command(flatten)]
+    input: volume::InputArgs,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -42,7 +44,7 @@ struct Share {
 /// Runs the command.
 pub(crate) fn run(args: &InfoArgs) -> Result<(), Fail> {
     let orientation = args.axes.orientation()?;
-    let volume = volume::open(&args.volume)?;
+    let volume = args.input.open(&args.volume)?;
     let info = volume.info(volume.digest());
     let shares = shares(&volume, &info)?;
     if args.json {

@@ -7,7 +7,8 @@
 //! - [`daemon`] is `master` and `worker`; [`doctor`] says whether a machine is fit for them, and
 //!   [`demo`] needs no file.
 //! - [`transfer`] is colours and opacities, and [`tf`] writes them down.
-//! - [`info`] looks into files, [`ask`] at a running master.
+//! - [`info`] looks into files, [`convert`] writes them in another format, [`ask`] looks at a running
+//!   master.
 //! - [`config`] lays flags, environment and file over each other.
 //! - [`check`] compares pictures with the oracle over every way to make them; [`error`] says how
 //!   far one is from the truth, [`explain`] why a pixel is as it is. [`local`] draws for the
@@ -21,6 +22,7 @@ mod bench;
 mod canvas;
 mod check;
 mod config;
+mod convert;
 mod daemon;
 mod demo;
 mod doctor;
@@ -89,6 +91,7 @@ enum Command {
     Rerender(rerender::RerenderArgs),
     Info(info::InfoArgs),
     Tf(Box<tf::TfArgs>),
+    Convert(convert::ConvertArgs),
     Master(daemon::MasterArgs),
     Worker(daemon::WorkerArgs),
     Status(ask::StatusArgs),
@@ -100,6 +103,8 @@ enum Command {
     Check(check::CheckArgs),
     Config(config::ConfigArgs),
     Doctor(doctor::DoctorArgs),
+    #[command(hide = true)]
+    ReadDicom(volume::DicomArgs),
     /// Prints completions for a shell.
     #[command(after_help = "\
 Examples:
@@ -145,6 +150,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
         Command::Rerender(args) => rerender::run(args),
         Command::Info(args) => info::run(args),
         Command::Tf(args) => tf::run(args),
+        Command::Convert(args) => convert::run(args),
         Command::Master(args) => daemon::master(args),
         Command::Worker(args) => daemon::worker(args),
         Command::Status(args) => ask::status(args),
@@ -158,6 +164,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
             doctor::run(args, config::path(cli.config.as_deref(), Cli::command()))
         }
         Command::Config(args) => config::run::<Cli>(args, cli.config.as_deref(), understood),
+        Command::ReadDicom(args) => volume::read_dicom(args),
         Command::Completions { shell } => {
             let mut script = Vec::new();
             clap_complete::generate(*shell, &mut Cli::command(), "slabcast", &mut script);

@@ -154,6 +154,41 @@ pub(crate) fn worker_name(text: &str) -> Result<String, String> {
     }
 }
 
+/// Three sizes, `AxBxC`.
+pub(crate) fn dims(text: &str) -> Result<[u64; 3], String> {
+    three(text, |n: &u64| (1..=16384).contains(n))
+        .ok_or_else(|| "give AxBxC, like 256x256x128, each from 1 to 16384".into())
+}
+
+/// Three lengths, `AxBxC`.
+pub(crate) fn spacing(text: &str) -> Result<[f64; 3], String> {
+    three(text, |x: &f64| x.is_normal() && *x > 0.0)
+        .ok_or_else(|| "give three lengths above 0 as AxBxC, like 0.5x0.5x1.25".into())
+}
+
+fn three<T: std::str::FromStr>(text: &str, good: impl Fn(&T) -> bool) -> Option<[T; 3]> {
+    let numbers: Option<Vec<T>> = text.split(['x', 'X']).map(|w| w.trim().parse().ok()).collect();
+    numbers.filter(|n| n.iter().all(good))?.try_into().ok()
+}
+
+/// The type of raw numbers.
+pub(crate) fn number_type(text: &str) -> Result<String, String> {
+    let types = slabcast_volumes::RawHints::TYPES;
+    match slabcast_volumes::RawHints::default().with_type(text) {
+        Some(_) => Ok(text.into()),
+        None => Err(format!("give one of {types}")),
+    }
+}
+
+/// `little` or `big`; true is big.
+pub(crate) fn byte_order(text: &str) -> Result<bool, String> {
+    match text {
+        "little" => Ok(false),
+        "big" => Ok(true),
+        _ => Err("give little or big".into()),
+    }
+}
+
 /// `on` or `off`.
 pub(crate) fn on_off(text: &str) -> Result<bool, String> {
     match text {

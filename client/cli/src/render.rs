@@ -57,8 +57,10 @@ A path file looks like this:
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = EXAMPLES)]
 pub(crate) struct RenderArgs {
-    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
+    #[arg(help = volume::VOLUME)]
     volume: Option<PathBuf>,
+    #[command(flatten)]
+    input: volume::InputArgs,
     /// Render on this master's cluster
     #[arg(long, value_name = "HOST:PORT", value_parser = crate::parse::master)]
     master: Option<String>,
@@ -181,6 +183,12 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         }
     };
     if master.is_some() {
+        if !args.input.is_empty() {
+            return Err(Fail::usage(
+                "--dims, --type and the like say what is in a file, and with --master the master \
+                 has read it; leave them out",
+            ));
+        }
         for (given, flag) in [(args.workers, "workers"), (args.threads, "threads")] {
             if given.is_some() {
                 return Err(Fail::usage(format!(
@@ -226,7 +234,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
             let orientation = args.look.view.axes.orientation()?;
             let mut run = run;
             run.progress.stage(&format!("reading {}", file.display()));
-            let volume = volume::open(file)?;
+            let volume = args.input.open(file)?;
             match args.show {
                 None | Some(Show::Owner) => {
                     runtime.block_on(embedded(run, volume, orientation, crew))

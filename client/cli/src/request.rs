@@ -9,6 +9,7 @@ use crate::fail::Fail;
 use crate::output::provenance::Provenance;
 use crate::parse::{self, Frames, Tile};
 use crate::transfer::{LookFlags, Transfer, read_json};
+use crate::volume::InputArgs;
 use clap::builder::{PossibleValuesParser, TypedValueParser, ValueParser};
 use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::message::PathRequest;
@@ -205,10 +206,19 @@ impl LookArgs {
 /// A picture of a volume, for commands that look closely at one.
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct PictureOf {
-    /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file, or formula:NAME
+    #[arg(help = crate::volume::VOLUME)]
     pub(crate) volume: PathBuf,
     #[command(flatten)]
     pub(crate) look: LookArgs,
+    #[command(flatten)]
+    input: InputArgs,
+}
+
+impl PictureOf {
+    /// Opens the volume.
+    pub(crate) fn open(&self) -> Result<Volume, Fail> {
+        self.input.open(&self.volume)
+    }
 }
 
 /// `--threads` of commands that draw in this process alone.

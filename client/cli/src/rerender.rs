@@ -27,6 +27,8 @@ pub(crate) struct RerenderArgs {
     /// The volume that it shows
     #[arg(required_unless_present = "show")]
     volume: Option<PathBuf>,
+    #[command(flatten)]
+    input: volume::InputArgs,
     /// File for the new picture [default: again.png, with the ending of PICTURE]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
@@ -63,7 +65,7 @@ pub(crate) fn run(args: &RerenderArgs) -> Result<(), Fail> {
     let frames = asked.frames();
     let inputs = [args.picture.as_path(), file.as_path()];
     let (output, _) = Output::look(&output, "frame", frames, asked.background, &inputs)?;
-    let volume = volume::open(file)?;
+    let volume = args.input.open(file)?;
     let digest = volume.digest().to_string();
     if digest != made.volume_sha256 {
         return Err(Fail::failed(format!(

@@ -51,26 +51,49 @@ pub(crate) async fn stopped() -> u8 {
     }
 }
 
+/// Whether the process was told to stop, for work that looks now and then.
+pub(crate) fn told() -> bool {
+    CODE.load(Ordering::SeqCst) != 0
+}
+
 /// Does `work` on a thread of its own and waits for it, or for Ctrl-C or SIGTERM, which end the
 /// command at once (code 130 or 143; the thread ends with the process). So `work` must leave
 /// nothing half done on disk; who writes files does so with what comes back.
 pub(crate) fn unless_stopped<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, Fail> + Send + 'static,
 ) -> Result<T, Fail> {
+    watched(work, false)
+}
+
+/// As [`unless_stopped`], but a stop waits for `work`, which asks [`told`] often, ends early and
+/// takes its half-written files away.
+pub(crate) fn to_its_end<T: Send + 'static>(
+    work: impl FnOnce() -> Result<T, Fail> + Send + 'static,
+) -> Result<T, Fail> {
+    watched(work, true)
+}
+
+fn watched<T: Send + 'static>(
+    work: impl FnOnce() -> Result<T, Fail> + Send + 'static,
+    to_its_end: bool,
+) -> Result<T, Fail> {
     let failed = |e: std::io::Error| Fail::failed(format!("starting threads failed: {e}"));
     let runtime =
         tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(failed)?;
     runtime.block_on(async {
         listen();
-        let (done, result) = tokio::sync::oneshot::channel();
+        let (done, mut result) = tokio::sync::oneshot::channel();
         std::thread::Builder::new()
             .name("slabcast-work".into())
             // Nobody waits for the result of a command that was stopped.
             .spawn(move || drop(done.send(work())))
             .map_err(failed)?;
         tokio::select! {
-            result = result => result.unwrap_or_else(|_| Err(Fail::silent(1))),
+            result = &mut result => result.unwrap_or_else(|_| Err(Fail::silent(1))),
             code = stopped() => {
+                if to_its_end {
+                    let _ = result.await;
+                }
                 progress::end();
                 Err(Fail::silent(code))
             }

@@ -6,7 +6,6 @@ use crate::fail::Fail;
 use crate::local::{self, Cut};
 use crate::progress;
 use crate::request::{PictureOf, lattice_notice};
-use crate::volume;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::message::SceneSpec;
@@ -35,7 +34,7 @@ impl Still {
         let orientation = of.look.view.axes.orientation()?;
         let size = asked.path.size;
         check(size)?;
-        let volume = volume::open(&of.volume)?;
+        let volume = of.open()?;
         let info = volume.info(volume.digest());
         asked.fit(&info, orientation, volume.anatomical)?;
         if let Some(notice) = lattice_notice(&info) {

@@ -61,6 +61,80 @@ fn nifti(n: i16) -> Vec<u8> {
     b
 }
 
+/// A grey 8-bit TIFF picture.
+fn tiff(width: u16, height: u16) -> Vec<u8> {
+    let mut b = b"II*\0\x08\0\0\0".to_vec();
+    let pixels = u32::from(width) * u32::from(height);
+    let entries: [(u16, u32); 8] = [
+        (256, width.into()),
+        (257, height.into()),
+        (258, 8),
+        (259, 1),
+        (262, 1),
+        (273, 8 + 2 + 8 * 12 + 4),
+        (278, height.into()),
+        (279, pixels),
+    ];
+    b.extend((entries.len() as u16).to_le_bytes());
+    for (tag, value) in entries {
+        b.extend(tag.to_le_bytes());
+        b.extend(4u16.to_le_bytes());
+        b.extend(1u32.to_le_bytes());
+        b.extend(value.to_le_bytes());
+    }
+    b.extend([0; 4]);
+    b.extend((0..pixels).map(|i| i as u8));
+    b
+}
+
+/// Files of every format with one thing wrong.
+fn files_of_other_formats(put: &dyn Fn(&str, &[u8])) {
+    let nrrd = |more: &str, data: &[u8]| {
+        let head = format!("NRRD0004\ntype: uint8\ndimension: 3\nsizes: 2 2 2\n{more}");
+        [head.as_bytes(), data].concat()
+    };
+    put("hex.nrrd", &nrrd("encoding: hex\n\n", b"00zz"));
+    put("ascii.nrrd", &nrrd("encoding: ascii\n\n", b"1 2 3 4 5 6 7 300"));
+    put("bzip2.nrrd", &nrrd("encoding: bzip2\n\n", b"no bzip2"));
+    put("zrl.nrrd", &nrrd("encoding: zrl\n\n", b""));
+    put("list.nhdr", &nrrd("encoding: raw\ndata file: LIST\nok.raw\nlost.raw\n", b""));
+    put("count.nhdr", &nrrd("encoding: raw\ndata file: x%d.raw 1 9 1\n", b""));
+    put("out.nhdr", &nrrd("encoding: raw\ndata file: ../../etc/passwd\n", b""));
+    put("ok.raw", &[0; 4]);
+    let meta = |more: &str, data: &[u8]| {
+        let head = format!("ObjectType = Image\nNDims = 3\nDimSize = 2 2 2\n{more}");
+        [head.as_bytes(), data].concat()
+    };
+    put("type.mha", &meta("ElementType = MET_STRING\nElementDataFile = LOCAL\n", b""));
+    put("end.mha", &meta("ElementType = MET_UCHAR\n", b""));
+    put("short.mha", &meta("ElementType = MET_SHORT\nElementDataFile = LOCAL\n", &[0; 8]));
+    put("lost.mhd", &meta("ElementType = MET_UCHAR\nElementDataFile = lost.raw\n", b""));
+    put(
+        "channels.mha",
+        &meta(
+            "ElementNumberOfChannels = 3\nElementType = MET_UCHAR\nElementDataFile = LOCAL\n",
+            b"",
+        ),
+    );
+    let vti = |file: &str, image: &str, array: &str| {
+        format!(
+            "<VTKFile type=\"{file}\" byte_order=\"LittleEndian\"><ImageData {image}><Piece>\
+             <PointData><DataArray type=\"UInt8\" Name=\"v\" {array}</DataArray>"
+        )
+    };
+    let extent = "WholeExtent=\"0 1 0 1 0 1\"";
+    put("poly.vti", vti("PolyData", extent, "format=\"ascii\">").as_bytes());
+    put("extent.vti", vti("ImageData", "", "format=\"ascii\">").as_bytes());
+    put("word.vti", vti("ImageData", extent, "format=\"ascii\">1 2 x").as_bytes());
+    put("offset.vti", vti("ImageData", extent, "format=\"appended\" offset=\"9\">").as_bytes());
+    put("base64.vti", vti("ImageData", extent, "format=\"binary\">CAAAAA==?").as_bytes());
+    put("size_4x4x4_uint8.raw", &[0; 128]);
+    put("type_4x4x4.raw", &[0; 128]);
+    put("bare.raw", &[0; 27]);
+    put("cut.tif", &tiff(4, 4)[..60]);
+    put("good.tif", &tiff(4, 4));
+}
+
 /// A folder with everything that the table below speaks of.
 fn world() -> tempfile::TempDir {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -113,7 +187,20 @@ fn world() -> tempfile::TempDir {
     put("pv-map.json", br#"[{"RGBPoints":[0,0,0,1]}]"#);
     put("pv-space.json", br#"[{"RGBPoints":[0,0,0,1],"ColorSpace":"Prolab"}]"#);
     put("big.json", br#"{"version":1,"size":[99999,9],"turntable":{}}"#);
-    std::fs::create_dir(dir.path().join("full")).expect("a folder");
+    files_of_other_formats(&put);
+    for folder in ["full", "none", "mixed", "scans", "array", "group"] {
+        std::fs::create_dir(dir.path().join(folder)).expect("a folder");
+    }
+    put("mixed/a.tif", &tiff(2, 2));
+    put("mixed/b.tif", &tiff(3, 2));
+    put("none/notes.txt", b"hello");
+    put("none/good.nrrd", b"");
+    put(
+        "scans/1.dcm",
+        &[&[0; 128][..], b"DICM\x02\0\x10\0UI\x16\x001.2.840.10008.1.2.4.50"].concat(),
+    );
+    put("array/.zarray", br#"{"zarr_format":2,"shape":[9,9,9],"chunks":[9,9,9],"dtype":"<c8"}"#);
+    put("group/.zgroup", b"{}");
     put("full/frame_0000.png", b"mine");
     put("full/frame_0003.png", b"mine");
     put("there.png", b"\x89PNG, but no more of it");
@@ -192,6 +279,37 @@ fn files() -> Vec<(&'static [&'static str], &'static [&'static str])> {
         (&["check", "golden", "--verify", "text.txt"], &["text.txt", "line 1"]),
         (&["check", "golden", "--sample", "missing.nii.gz"], &["missing.nii.gz"]),
         (&["check", "matrix", "missing.nrrd"], &["missing.nrrd"]),
+        (&["info", "hex.nrrd"], &["hex.nrrd", "data", "hexadecimal", "correct"]),
+        (&["info", "ascii.nrrd"], &["ascii.nrrd", "number 8", "300", "uint8"]),
+        (&["info", "bzip2.nrrd"], &["bzip2.nrrd", "bzip2", "get the file again"]),
+        (&["info", "zrl.nrrd"], &["zrl.nrrd", "encoding (line 5)", "save it again"]),
+        (&["info", "list.nhdr"], &["list.nhdr", "data file", "lost.raw", "beside its header"]),
+        (&["info", "count.nhdr"], &["count.nhdr", "9 files where the sizes want 2"]),
+        (&["info", "out.nhdr"], &["out.nhdr", "data file", "put the data file beside"]),
+        (&["info", "type.mha"], &["type.mha", "ElementType (line 4)", "MET_STRING", "MET_UCHAR"]),
+        (&["info", "end.mha"], &["end.mha", "ElementDataFile", "LOCAL"]),
+        (&["info", "short.mha"], &["short.mha", "16 bytes are needed and 8 are there"]),
+        (&["info", "lost.mhd"], &["lost.mhd", "ElementDataFile", "lost.raw"]),
+        (&["info", "channels.mha"], &["channels.mha", "ElementNumberOfChannels", "one channel"]),
+        (&["info", "poly.vti"], &["poly.vti", "VTKFile type", "Resample To Image"]),
+        (&["info", "extent.vti"], &["extent.vti", "ImageData WholeExtent", "is missing"]),
+        (&["info", "word.vti"], &["word.vti", "DataArray `v`", "number 3 is `x`"]),
+        (&["info", "offset.vti"], &["offset.vti", "AppendedData", "whole file"]),
+        (&["info", "base64.vti"], &["base64.vti", "DataArray `v`", "get the whole file"]),
+        (&["info", "size_4x4x4_uint8.raw"], &["size", "128 bytes", "--type uint16"]),
+        (&["info", "type_4x4x4.raw"], &["--type", "4x4x4", "uint16"]),
+        (&["info", "bare.raw"], &["bare.raw", "--dims 3x3x3 --type uint8"]),
+        (&["info", "bare.raw", "--dims", "3x3x4", "--type", "uint8"], &["--dims 3x3x3 would fit"]),
+        (&["info", "good.nrrd", "--type", "uint8"], &["good.nrrd", "--type", "leave them out"]),
+        (&["info", "cut.tif"], &["cut.tif", "truncated", "get the whole file"]),
+        (&["info", "mixed"], &["mixed", "`b.tif`", "3 x 2 uint8", "2 x 2 uint8"]),
+        (&["info", "none"], &["none", "folder", "`good.nrrd`"]),
+        (&["info", "scans"], &["scans", "1.dcm", "TransferSyntaxUID", "JPEG", "dcm2niix"]),
+        (&["info", "array"], &["array", "dtype", "<i2"]),
+        (&["info", "group"], &["group", "multiscales", "give the folder of an array"]),
+        (&["convert", "missing.nrrd", "new.nii"], &["missing.nrrd"]),
+        (&["convert", "good.tif", "good.nrrd"], &["good.nrrd", "--force"]),
+        (&["convert", "good.tif", "nowhere/x.nrrd"], &["nowhere/x.nrrd", "check the path"]),
     ]
 }
 
@@ -212,6 +330,17 @@ fn flags() -> Vec<(Vec<&'static str>, &'static [&'static str])> {
         (vec!["render", "--master", "127.0.0.1:1", "--workers", "2"], &["--workers"]),
         (vec!["render", "--master", "nowhere"], &["--master", "HOST:PORT"]),
         (vec!["rendr"], &["rendr", "render"]),
+        (vec!["convert", "good.nrrd"], &["OUT"]),
+        (vec!["convert", "good.nrrd", "x.png"], &["OUT", "x.png", ".nii.gz"]),
+        (vec!["convert", "good.nrrd", "good.nrrd"], &["OUT", "is the volume itself"]),
+        (vec!["convert", "good.nrrd", "x.nii", "--encoding", "gzip"], &["--encoding", ".nii.gz"]),
+        (with(&["--dims", "3x3"]), &["--dims", "256x256x128"]),
+        (with(&["--dims", "0x3x3"]), &["--dims", "from 1"]),
+        (with(&["--type", "colour"]), &["--type", "uint8, int8"]),
+        (with(&["--spacing", "1x1x0"]), &["--spacing", "0.5x0.5x1.25"]),
+        (with(&["--byte-order", "middle"]), &["--byte-order", "little or big"]),
+        (with(&["--skip", "-1"]), &["--skip"]),
+        (vec!["render", "--master", "a:1", "--dims", "1x1x1"], &["--dims", "--master"]),
         (with(&["--elevatoin", "3"]), &["--elevatoin", "--elevation"]),
         (with(&["--tf", "bonee"]), &["--tf", "did you mean `bone`"]),
         (with(&["--tf", "/tmp"]), &["--tf", "preset"]),

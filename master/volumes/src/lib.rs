@@ -11,60 +11,168 @@
 //! This crate refuses to know the network, tasks, views and colours. The clock is not here
 //! either; threads are, since cutting bricks is work for all cores.
 //!
-//! Read: NRRD attached and detached, raw and gzip; NIfTI-1 and -2, plain and gzip. Out of scope
-//! so far: MetaImage, VTI, DICOM, headerless raw, ASCII and bzip2 NRRD, NIfTI pairs, colours,
-//! time series, and volumes that are larger than memory.
+//! Read: NRRD, MetaImage, NIfTI-1 and -2, VTK image data, TIFF stacks, raw numbers (docs/files.md says what
+//! of each). Out of scope so far: NIfTI pairs, colours, time series, and volumes that are larger
+//! than memory.
 
+mod data;
+#[cfg(feature = "dicom")]
+pub mod dicom;
 mod error;
+mod folder;
 pub mod formula;
 #[cfg(test)]
 mod fuzz;
+mod metaimage;
 mod nifti;
 mod nrrd;
+#[cfg(test)]
+mod phantom;
+mod raw;
 mod samples;
 mod sketch;
 mod source;
 mod store;
+mod tiff_stack;
+mod unpack;
+mod vti;
+mod wide;
+pub mod write;
+#[cfg(feature = "zarr")]
+mod zarr;
 
 pub use error::{OpenError, OpenErrorKind, Problem};
+pub use raw::RawHints;
 pub use sketch::histogram_sketch;
 pub use store::BrickStore;
 
 use slabcast_common::volume::Volume;
 use source::Source;
 use std::io::Read;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// What this version reads, for remedies.
-const READS: &str = "give an NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) file";
+const READS: &str = "give NRRD (.nrrd, .nhdr), NIfTI (.nii, .nii.gz), MetaImage (.mha, .mhd), VTK \
+                     image data (.vti), TIFF pages (.tif) or a folder of them, or raw numbers with \
+                     --dims and --type";
+
+/// What whoever opens a file knows of it beside its path.
+#[derive(Clone, Debug, Default)]
+pub struct Hints {
+    /// Of files without a header.
+    pub raw: RawHints,
+    /// Which of several DICOM series: its number, description, name or UID.
+    pub series: Option<String>,
+    /// Program and first arguments of the process that parses DICOM: what runs `dicom::serve`.
+    /// Without one a thread does so, unconfined.
+    pub dicom_reader: Option<Vec<std::ffi::OsString>>,
+    /// Which level of a Zarr pyramid; 0 is the finest.
+    pub level: Option<u32>,
+    /// Most bytes that the samples of a Zarr array may have.
+    pub max_bytes: Option<u64>,
+}
+
+/// A volume, and what its reader wants a person to know of how it was read.
+#[derive(Clone, Debug)]
+pub struct Opened {
+    /// The volume.
+    pub volume: Volume,
+    /// Choices that were made, one sentence each.
+    pub notes: Vec<String>,
+}
 
 /// Opens a volume: a file, told by its content rather than its name, or `formula:NAME[:SIZE]`.
 pub fn open(path: &Path) -> Result<Volume, OpenError> {
+    open_with(path, &Hints::default()).map(|opened| opened.volume)
+}
+
+/// Opens a volume as [`open`] does, with hints.
+pub fn open_with(path: &Path, hints: &Hints) -> Result<Opened, OpenError> {
     let shown = path.to_string_lossy();
     let volume = match shown.strip_prefix(formula::PREFIX) {
-        Some(_) => formula::open(&shown),
-        None => open_file(path),
+        Some(_) => formula::open(&shown).map(Opened::from),
+        None => open_file(path, hints),
     };
     volume.map_err(|problem| OpenError { file: shown.into_owned(), problem })
 }
 
-fn open_file(path: &Path) -> Result<Volume, Problem> {
-    let source = Source::open(path, "file")?;
+impl From<Volume> for Opened {
+    fn from(volume: Volume) -> Self {
+        Opened { volume, notes: Vec::new() }
+    }
+}
+
+fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
+    if path.is_dir() {
+        return folder::open(path, hints);
+    }
+    #[cfg_attr(not(feature = "dicom"), expect(unused_mut, reason = "nobody looks into it"))]
+    let mut source = Source::open(path, "file")?;
+    #[cfg(feature = "dicom")]
+    if dicom::sniff(source.head()?) && hints.raw.dims.is_none() {
+        return folder::open_series_of(path, hints);
+    }
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     let folder = path.parent().unwrap_or(Path::new("."));
-    read(source, folder, &name)
+    let error = match read(source, folder, &name, hints) {
+        Ok(volume) => return Ok(volume.into()),
+        Err(e) => e,
+    };
+    // Data whose header lies beside them are opened by it.
+    if error.kind == OpenErrorKind::NotAVolume
+        && let Some(header) = header_beside(path)
+    {
+        let source = Source::open(&header, "file")?;
+        let called = header.file_name().unwrap_or_default().to_string_lossy();
+        let volume = read(source, folder, &called, hints).map_err(|mut p| {
+            p.field = format!("its header {}: {}", error::quoted(&called), p.field);
+            p
+        })?;
+        let note = format!("{name} is raw data; its header {called} beside it was read");
+        return Ok(Opened { volume, notes: vec![note] });
+    }
+    Err(error)
+}
+
+/// The header of the same name as a data file, if it names that file.
+fn header_beside(path: &Path) -> Option<PathBuf> {
+    let name = path.file_name()?.to_str()?;
+    let stem = name.split('.').next().filter(|stem| !stem.is_empty())?;
+    ["mhd", "nhdr"].iter().find_map(|end| {
+        let header = path.with_file_name(format!("{stem}.{end}"));
+        let mut source = Source::open(&header, "file").ok()?;
+        let head = source.head().ok()?;
+        let names = head.windows(name.len()).any(|w| w == name.as_bytes());
+        (header != path && names).then_some(header)
+    })
 }
 
 /// Reads a volume from a source, by content.
-fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volume, Problem> {
+fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<Volume, Problem> {
     let head = source.head()?;
     if head.is_empty() {
         return Err(Problem::new(OpenErrorKind::NotAVolume, "content", "is empty", READS));
     }
+    // Flags say that these are numbers, whatever they look like.
+    if hints.raw.dims.is_some() {
+        let gzip = head.starts_with(GZIP);
+        return raw::read(source, gzip, name, &hints.raw);
+    }
+    let has_header = head.starts_with(nrrd::MAGIC)
+        || nifti::sniff(head)
+        || metaimage::sniff(head)
+        || vti::sniff(head);
+    if has_header && !hints.raw.is_empty() {
+        return Err(Problem::malformed(
+            "--type, --spacing, --skip, --byte-order",
+            "are for raw numbers, and this file has a header that says all that",
+            "leave them out",
+        ));
+    }
     if head.starts_with(nrrd::MAGIC) {
         return nrrd::read(source, folder, name);
     }
-    if head.starts_with(&[0x1f, 0x8b]) {
+    if head.starts_with(GZIP) {
         let mut start = Vec::new();
         // An early end or damage inside the first bytes is the reader's to report.
         let _ = flate2::read::MultiGzDecoder::new(head).take(4).read_to_end(&mut start);
@@ -78,6 +186,9 @@ fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volume, Problem
                 "unpack it with gunzip (`encoding: gzip` inside an NRRD is read)",
             ));
         }
+        if raw::is_described(name, &hints.raw) {
+            return raw::read(source, true, name, &hints.raw);
+        }
         return Err(Problem::new(
             OpenErrorKind::NotAVolume,
             "content",
@@ -88,7 +199,28 @@ fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volume, Problem
     if nifti::sniff(head) {
         return nifti::read(source, false, name);
     }
+    if metaimage::sniff(head) {
+        return metaimage::read(source, folder, name);
+    }
+    if vti::sniff(head) {
+        return vti::read(source, name);
+    }
+    if tiff_stack::sniff(head) {
+        return tiff_stack::read(source, name, &hints.raw);
+    }
+    if raw::is_described(name, &hints.raw) || is_raw(name) {
+        return raw::read(source, false, name, &hints.raw);
+    }
     Err(Problem::new(OpenErrorKind::NotAVolume, "content", describe(head, name), READS))
+}
+
+/// What gzip begins with.
+const GZIP: &[u8] = &[0x1f, 0x8b];
+
+/// Whether a name says that its file is numbers alone.
+fn is_raw(name: &str) -> bool {
+    let name = name.to_ascii_lowercase();
+    [".raw", ".zraw", ".img", ".dat", ".bin"].iter().any(|end| name.ends_with(end))
 }
 
 /// What a file that we can't read seems to be.
@@ -98,19 +230,17 @@ fn describe(head: &[u8], name: &str) -> String {
     let what = if is(b"\x89PNG") || is(b"\xff\xd8\xff") || is(b"GIF8") || is(b"BM") {
         "is a picture, not a volume"
     } else if head.get(128..132) == Some(b"DICM") || ends(".dcm") {
-        "is DICOM, which this version does not read"
-    } else if is(b"ObjectType") || is(b"NDims") || ends(".mhd") || ends(".mha") {
-        "is MetaImage, which this version does not read"
-    } else if is(b"<?xml") || is(b"<VTKFile") || is(b"# vtk") || ends(".vti") {
-        "is VTK or XML, which this version does not read"
-    } else if is(b"II*\0") || is(b"MM\0*") {
-        "is TIFF, which this version does not read"
+        "is DICOM, which this build does not read (feature `dicom`)"
+    } else if ends(".mhd") || ends(".mha") {
+        "does not begin with a MetaImage header, so it is damaged or something else"
+    } else if is(b"# vtk") {
+        "is a legacy VTK file; save it as .vti"
+    } else if is(b"<?xml") || ends(".vti") {
+        "is XML, but not of VTK"
     } else if is(b"\x89HDF") {
         "is HDF5, which this version does not read"
     } else if is(b"BZh") || is(b"PK\x03\x04") || is(b"\x28\xb5\x2f\xfd") || is(b"\xfd7zXZ") {
         "is packed; unpack it first"
-    } else if ends(".raw") {
-        "is raw numbers without a header: write a .nhdr file beside it that names it"
     } else if ends(".nrrd") || ends(".nhdr") {
         "does not begin with `NRRD`, so it is damaged or something else"
     } else if ends(".nii") || ends(".nii.gz") {

@@ -56,7 +56,7 @@ pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Pro
         ));
     }
     let supply = match gzip {
-        true => Supply::Gzip { compressed: len },
+        true => Supply::deflate("gzip", len),
         false => Supply::Plain { have: len.saturating_sub(size as u64 + skip) },
     };
     let (samples, stored) = samples::read(reader, supply, &layout)?;
@@ -437,7 +437,7 @@ pub(crate) mod tests {
     }
 
     fn open(bytes: Vec<u8>) -> Result<Volume, Problem> {
-        crate::read(Source::memory(bytes), Path::new("."), "test.nii")
+        crate::read(Source::memory(bytes), Path::new("."), "test.nii", &crate::Hints::default())
     }
 
     fn put(bytes: &[u8], at: usize, with: &[u8]) -> Vec<u8> {

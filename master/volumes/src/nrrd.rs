@@ -1,22 +1,21 @@
-//! NRRD, attached (`.nrrd`) and detached (`.nhdr` over one data file).
+//! NRRD, attached (`.nrrd`) and detached (`.nhdr` over one data file, or a list of them).
 //!
 //! The format is told at teem.sourceforge.net/nrrd/format.html. A header is lines of
 //! `field: value`, `key:=value` and `# comment` up to an empty line. We collect the fields
 //! first and interpret them afterwards, in no particular order, which reads every file that
 //! the specification allows and some that it doesn't (fields before `dimension`).
 //!
-//! Encodings are raw and gzip (inflated by miniz_oxide, which has no unsafe code; zlib-rs was
-//! 16 % faster on mri256.nrrd and 30 % on a 512x512x275 chest, 49 against 41 ms and 0.79
-//! against 0.53 s to open, which did not seem worth the difference in trust). ASCII, hex, bzip2 and lists of data files are refused by name.
+//! All encodings but `zrl` are read (`unpack`).
 
+use crate::data::{self, Form, Skip};
 use crate::error::{Problem, quoted};
-use crate::samples::{self, Endian, Layout, Number, SKIP_MAX_BYTES, Supply};
-use crate::source::{self, Source};
-use flate2::bufread::MultiGzDecoder;
+use crate::samples::{Endian, Layout, Number};
+use crate::source::Source;
+use crate::unpack::Encoding;
 use glam::DVec3;
-use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
+use slabcast_common::volume::{Lattice, Volume};
 use std::collections::BTreeMap;
-use std::io::{BufRead, Read, Seek, SeekFrom};
+use std::io::{BufRead, Read};
 use std::path::Path;
 
 /// What an NRRD file starts with, before its version.
@@ -35,89 +34,31 @@ const RESAVE: &str = "save it again with `encoding: gzip` or `encoding: raw`";
 pub(crate) fn read(mut source: Source, folder: &Path, name: &str) -> Result<Volume, Problem> {
     let (fields, header_bytes) = Fields::read(&mut source)?;
     let header = Header::of(&fields)?;
-    let samples = match &header.data_file {
+    let samples = match &header.data_files {
         None => {
             let len = source.len.saturating_sub(header_bytes);
-            read_data(&mut source, len, &header)
+            data::read(source, len, &header.form, &header.layout)
         }
-        Some(file) => {
-            let path = source::beside(folder, file, "data file")?;
-            let mut data = Source::open(&path, "data file")?;
-            let len = data.len;
-            read_data(&mut data, len, &header).map_err(|mut p| {
-                p.field = format!("data file {}", quoted(file));
-                p
-            })
-        }
+        Some(files) => data::read_files(folder, files, "data file", &header.form, &header.layout),
     };
     let (samples, map) = samples?;
     let file_type = header.layout.number.name();
     Ok(Volume::new(name, file_type, header.anatomical, header.lattice, samples, map))
 }
 
-/// Reads the samples from a source that stands at the first of its `len` bytes of data.
-fn read_data(
-    source: &mut Source,
-    len: u64,
-    header: &Header,
-) -> Result<(Samples, ValueMap), Problem> {
-    let ends_early = |field: &str| {
-        Problem::malformed(field, "skips past the end of the data", "correct the skip")
-    };
-    let io = |e: std::io::Error| Problem::io("data", &e);
-    let reader = &mut source.reader;
-    let skipped = source::skip_lines(reader, header.line_skip)
-        .map_err(io)?
-        .ok_or_else(|| ends_early("line skip"))?;
-    let left = len.saturating_sub(skipped);
-    let need = header.layout.bytes();
-    if header.gzip {
-        let Skip::Bytes(skip) = header.byte_skip else {
-            return Err(Problem::malformed(
-                "byte skip",
-                "-1 counts from the end, which gzip does not know",
-                "give the number of bytes, or save it with `encoding: raw`",
-            ));
-        };
-        if skip > SKIP_MAX_BYTES {
-            return Err(Problem::unsupported(
-                "byte skip",
-                format!("{skip} is more than the {SKIP_MAX_BYTES} that are skipped inside gzip"),
-                "save it again without a skip",
-            ));
-        }
-        let mut reader = MultiGzDecoder::new(reader);
-        if !source::skip_bytes(&mut reader, skip).map_err(io)? {
-            return Err(ends_early("byte skip"));
-        }
-        return samples::read(&mut reader, Supply::Gzip { compressed: left }, &header.layout);
-    }
-    let skip = match header.byte_skip {
-        Skip::Bytes(skip) if skip > left => return Err(ends_early("byte skip")),
-        Skip::Bytes(skip) => skip,
-        Skip::FromEnd => left.saturating_sub(need),
-    };
-    if skip > 0 {
-        reader.seek(SeekFrom::Current(skip as i64)).map_err(io)?;
-    }
-    samples::read(reader, Supply::Plain { have: left - skip }, &header.layout)
-}
-
-/// `byte skip`.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Skip {
-    Bytes(u64),
-    /// -1: the samples are the last bytes of the file.
-    FromEnd,
-}
-
 /// The fields as written: name to line number and value.
-struct Fields(BTreeMap<String, (usize, String)>);
+struct Fields {
+    lines: BTreeMap<String, (usize, String)>,
+    /// Names of data files, where `data file: LIST` announced them.
+    list: Vec<String>,
+}
 
 impl Fields {
     /// Reads the lines of a header; also says how many bytes they take.
     fn read(source: &mut Source) -> Result<(Fields, u64), Problem> {
         let mut fields = BTreeMap::new();
+        let mut list = Vec::new();
+        let mut in_list = false;
         let mut consumed = 0u64;
         let mut line = Vec::new();
         for number in 1.. {
@@ -147,6 +88,10 @@ impl Fields {
             if text.is_empty() {
                 break;
             }
+            if in_list {
+                list.push(text.trim().to_string());
+                continue;
+            }
             if text.starts_with('#') {
                 continue;
             }
@@ -168,13 +113,15 @@ impl Fields {
                     "remove one of them",
                 ));
             }
+            // File names follow, up to the end.
+            in_list = name == "data file" && value.split_ascii_whitespace().next() == Some("LIST");
             fields.insert(name, (number, value.trim().to_string()));
         }
-        Ok((Fields(fields), consumed))
+        Ok((Fields { lines: fields, list }, consumed))
     }
 
     fn get(&self, name: &str) -> Option<&str> {
-        self.0.get(name).map(|(_, v)| v.as_str())
+        self.lines.get(name).map(|(_, v)| v.as_str())
     }
 
     fn required(&self, name: &str, example: &str) -> Result<&str, Problem> {
@@ -189,7 +136,7 @@ impl Fields {
 
     /// The field's name with its line, for errors.
     fn place(&self, name: &str) -> String {
-        match self.0.get(name) {
+        match self.lines.get(name) {
             Some((line, _)) => format!("{name} (line {line})"),
             None => name.to_string(),
         }
@@ -242,17 +189,15 @@ struct Header {
     layout: Layout,
     lattice: Lattice,
     anatomical: bool,
-    gzip: bool,
-    data_file: Option<String>,
-    line_skip: u64,
-    byte_skip: Skip,
+    form: Form,
+    data_files: Option<Vec<String>>,
 }
 
 impl Header {
     fn of(fields: &Fields) -> Result<Header, Problem> {
         let number = number_type(fields)?;
-        let gzip = encoding(fields)?;
-        let endian = endian(fields, number)?;
+        let encoding = encoding(fields)?;
+        let endian = endian(fields, number, encoding)?;
         let axes = Axes::of(fields)?;
         let layout = Layout::new(axes.sizes, number, endian, &fields.place("sizes"))?;
         let (lattice, anatomical) = place(fields, &axes, layout.dims)?;
@@ -271,8 +216,9 @@ impl Header {
                     fields.malformed("byte skip", "is below -1", "give -1, 0 or more")
                 })?),
             };
-        let data_file = data_file(fields)?;
-        Ok(Header { layout, lattice, anatomical, gzip, data_file, line_skip, byte_skip })
+        let data_files = data_files(fields, &axes)?;
+        let form = Form { encoding, line_skip, byte_skip, skip_field: "byte skip" };
+        Ok(Header { layout, lattice, anatomical, form, data_files })
     }
 }
 
@@ -315,31 +261,32 @@ fn number_type(fields: &Fields) -> Result<Number, Problem> {
     })
 }
 
-/// Whether the encoding is gzip (else raw).
-fn encoding(fields: &Fields) -> Result<bool, Problem> {
-    let later = |name: &str| {
-        Err(Problem::unsupported(
-            fields.place("encoding"),
-            format!("{name} is not read by this version"),
-            RESAVE,
-        ))
-    };
-    match fields.required("encoding", "gzip")?.to_ascii_lowercase().as_str() {
-        "raw" => Ok(false),
-        "gz" | "gzip" => Ok(true),
-        "txt" | "text" | "ascii" => later("ascii"),
-        "hex" => later("hex"),
-        "bz2" | "bzip2" => later("bzip2"),
-        "zrl" => later("zrl"),
-        _ => Err(fields.malformed("encoding", "is not an encoding of the NRRD format", RESAVE)),
-    }
+fn encoding(fields: &Fields) -> Result<Encoding, Problem> {
+    Ok(match fields.required("encoding", "gzip")?.to_ascii_lowercase().as_str() {
+        "raw" => Encoding::Raw,
+        "gz" | "gzip" => Encoding::Gzip,
+        "bz2" | "bzip2" => Encoding::Bzip2,
+        "txt" | "text" | "ascii" => Encoding::Ascii,
+        "hex" => Encoding::Hex,
+        // A scheme of teem's own that nothing else writes.
+        "zrl" => {
+            return Err(Problem::unsupported(fields.place("encoding"), "zrl is not read", RESAVE));
+        }
+        _ => {
+            return Err(fields.malformed(
+                "encoding",
+                "is not an encoding of the NRRD format",
+                RESAVE,
+            ));
+        }
+    })
 }
 
-fn endian(fields: &Fields, number: Number) -> Result<Endian, Problem> {
+fn endian(fields: &Fields, number: Number, encoding: Encoding) -> Result<Endian, Problem> {
     match fields.get("endian").map(str::to_ascii_lowercase).as_deref() {
         Some("little") => Ok(Endian::Little),
         Some("big") => Ok(Endian::Big),
-        None if number.bytes() == 1 => Ok(Endian::Little),
+        None if number.bytes() == 1 || !encoding.has_order() => Ok(Endian::Little),
         None => Err(Problem::malformed(
             "endian",
             format!("is missing, and {} has {} bytes", number.name(), number.bytes()),
@@ -349,25 +296,52 @@ fn endian(fields: &Fields, number: Number) -> Result<Endian, Problem> {
     }
 }
 
-fn data_file(fields: &Fields) -> Result<Option<String>, Problem> {
+/// The data files of a detached header: one, `LIST [dim]` with names in lines of their own, or
+/// `name%03d.raw min max step [dim]`.
+fn data_files(fields: &Fields, axes: &Axes) -> Result<Option<Vec<String>>, Problem> {
     let Some(value) = fields.get("data file") else { return Ok(None) };
     let words: Vec<&str> = value.split_ascii_whitespace().collect();
-    // `LIST` (file names follow, one a line) and `name%03d.raw 1 40 1`.
-    let list = words.first() == Some(&"LIST");
-    let pattern = words.len() > 3
-        && words[0].contains('%')
-        && words[1..4].iter().all(|w| w.parse::<i64>().is_ok());
-    if list || pattern {
-        return Err(Problem::unsupported(
+    let bad = |why: &str, remedy: &str| Err(fields.malformed("data file", why, remedy));
+    let (names, dim) = match words[..] {
+        [] => return bad("is empty", "name the data file"),
+        ["LIST"] => (fields.list.clone(), None),
+        ["LIST", dim] => (fields.list.clone(), Some(dim)),
+        [pattern, min, max, step, ref rest @ ..]
+            if rest.len() < 2
+                && pattern.contains('%')
+                && [min, max, step].iter().all(|w| w.parse::<i64>().is_ok()) =>
+        {
+            let n = |w: &str| w.parse().expect("it was looked at");
+            match data::numbered(pattern, n(min), n(max), n(step)) {
+                Some(names) => (names, rest.first().copied()),
+                None => {
+                    return bad(
+                        "numbers its files in a way that is not known",
+                        "give one number as %d or %03d, and a step other than 0",
+                    );
+                }
+            }
+        }
+        _ => return Ok(Some(vec![value.to_string()])),
+    };
+    // Each file holds the first `dim` axes; by default all but the last.
+    let dim = match dim.map(str::parse::<usize>) {
+        None => axes.all.len() - 1,
+        Some(Ok(dim)) if (1..=axes.all.len()).contains(&dim) => dim,
+        Some(_) => return bad("ends in no number of axes", "give the axes that a file holds"),
+    };
+    // A file may also hold a part of the last of its axes, as long as all hold the same.
+    let whole = dim == axes.all.len();
+    let want = axes.all[dim..].iter().try_fold(1u64, |n, &size| n.checked_mul(size));
+    if names.is_empty() || !whole && want != Some(names.len() as u64) {
+        let want = want.filter(|_| !whole).map_or("some".into(), |n| n.to_string());
+        return Err(Problem::malformed(
             fields.place("data file"),
-            format!("{} names several files", quoted(value)),
-            "save it as one file",
+            format!("names {} files where the sizes want {want}", names.len()),
+            "correct the list, or the sizes",
         ));
     }
-    if value.is_empty() {
-        return Err(fields.malformed("data file", "is empty", "name the data file"));
-    }
-    Ok(Some(value.to_string()))
+    Ok(Some(names))
 }
 
 /// The three axes that are kept, out of those that the file has.
@@ -377,6 +351,8 @@ struct Axes {
     /// Which three, ascending.
     kept: [usize; 3],
     sizes: [u64; 3],
+    /// Sizes of all axes of the file.
+    all: Vec<u64>,
 }
 
 impl Axes {
@@ -432,7 +408,7 @@ impl Axes {
                 "save it with three axes",
             ));
         };
-        Ok(Axes { count, kept, sizes: kept.map(|a| sizes[a]) })
+        Ok(Axes { count, kept, sizes: kept.map(|a| sizes[a]), all: sizes })
     }
 }
 
@@ -598,7 +574,7 @@ mod tests {
 
     fn open(header: &str, data: &[u8]) -> Result<Volume, Problem> {
         let bytes = [b"NRRD0004\n", header.as_bytes(), b"\n", data].concat();
-        crate::read(Source::memory(bytes), Path::new("."), "test.nrrd")
+        crate::read(Source::memory(bytes), Path::new("."), "test.nrrd", &crate::Hints::default())
     }
 
     const RAW: &str = "type: uint8\ndimension: 3\nsizes: 3 2 1\nencoding: raw\n";
@@ -723,12 +699,96 @@ mod tests {
     }
 
     #[test]
+    fn every_encoding_gives_the_same_samples() {
+        let data = [0, 7, 255, 16, 1, 9];
+        let want = slabcast_common::volume::Samples::U8(data.to_vec());
+        for (name, bytes) in [
+            ("raw", data.to_vec()),
+            ("gzip", gzip(&data)),
+            ("bz2", crate::fuzz::bzip2(&data)),
+            ("bzip2", [crate::fuzz::bzip2(&data[..2]), crate::fuzz::bzip2(&data[2..])].concat()),
+            ("ascii", b"0 7\t255\n16, 1 9 \n".to_vec()),
+            ("text", b"0 7 255 16 1 9".to_vec()),
+            ("hex", b"0007fF 10\n01 09\n".to_vec()),
+        ] {
+            let v =
+                open(&RAW.replace("raw", name), &bytes).unwrap_or_else(|e| panic!("{name}: {e}"));
+            assert_eq!(v.samples, want, "{name}");
+        }
+        // Text has no byte order, hexadecimal digits have.
+        let short = |name: &str| RAW.replace("uint8", "short").replace("raw", name);
+        let v = open(&(short("ascii") + "endian: big\n"), b"1 -2 3 4 5 6").unwrap();
+        assert_eq!(v.summary.range(), (-2.0, 6.0));
+        let v = open(&(short("hex") + "endian: big\n"), b"0001 fffe 0003 0004 0005 0006").unwrap();
+        assert_eq!(v.summary.range(), (-2.0, 6.0));
+        let double = RAW.replace("uint8", "double").replace("raw", "txt");
+        let v = open(&double, b"1e-3 -inf nan 2.5 0 1").unwrap();
+        assert_eq!((v.summary.nan, v.summary.infinite, v.summary.range().1), (1, 1, 2.5));
+        for (name, bytes, say) in [
+            ("ascii", &b"1 2 3 4 5"[..], "6 bytes are needed and 5 are there"),
+            ("ascii", b"1 2 3 4 5 6 7", "goes on after the 6 bytes"),
+            ("ascii", b"1 2 3 4 5 256", "number 6 is `256`, which is no uint8"),
+            ("hex", b"00112233445", "a byte has one hexadecimal digit"),
+            ("hex", b"0011223344556677", "goes on after the 6 bytes"),
+        ] {
+            let e = open(&RAW.replace("raw", name), bytes).unwrap_err().to_string();
+            assert!(e.contains(say), "want {say:?} in {e}");
+        }
+    }
+
+    #[test]
+    fn lists_of_data_files_are_one_volume() {
+        let dir = tempfile::tempdir().unwrap();
+        let put = |name: &str, bytes: &[u8]| std::fs::write(dir.path().join(name), bytes).unwrap();
+        put("s08.raw", &[0, 1, 2, 3, 4, 5, 99]);
+        put("s10.raw", &[6, 7, 8, 9, 10, 11]);
+        put("s08.gz", &gzip(&[b'x', 0, 1, 2, 3, 4, 5]));
+        put("s10.gz", &gzip(&[b'x', 6, 7, 8, 9, 10, 11]));
+        put("long.gz", &gzip(&[b'x', 6, 7, 8, 9, 10, 11, 12]));
+        for i in 0..4 {
+            put(&format!("row{i}"), &[3 * i, 3 * i + 1, 3 * i + 2]);
+        }
+        let head = |encoding: &str, more: &str| {
+            let head = RAW.replace("3 2 1", "3 2 2").replace("raw", encoding);
+            [b"NRRD0004\n", head.as_bytes(), more.as_bytes()].concat()
+        };
+        let open = |bytes| read(Source::memory(bytes), dir.path(), "v.nhdr");
+        for (encoding, files) in [
+            ("raw", "data file: LIST\ns08.raw\ns10.raw\n"),
+            ("raw", "data file: s%02d.raw 8 10 2\n"),
+            ("raw", "data file: s%02d.raw 8 10 2 2\n"),
+            ("raw", "data file: row%d 0 3 1 1\n"),
+            ("raw", "data file: LIST 1\nrow0\nrow1\nrow2\nrow3\n"),
+            ("gzip", "byte skip: 1\ndata file: LIST\ns08.gz\ns10.gz\n"),
+        ] {
+            let v = open(head(encoding, files)).unwrap_or_else(|e| panic!("{files}: {e}"));
+            let want = slabcast_common::volume::Samples::U8((0..12).collect());
+            assert_eq!(v.samples, want, "{files}");
+        }
+        for (encoding, files, say) in [
+            ("raw", "data file: LIST\ns08.raw\nnone\n", "data file: `none` is not there"),
+            ("raw", "data file: LIST\ns08.raw\nrow1\n", "data file `row1`: truncated: 6 bytes"),
+            ("raw", "data file: LIST\ns08.raw\n../x\n", "data file: `../x`"),
+            (
+                "gzip",
+                "byte skip: 1\ndata file: LIST\ns08.gz\nlong.gz\n",
+                "data file `long.gz`: goes on after its share of 6 bytes",
+            ),
+            ("gzip", "byte skip: 1\ndata file: LIST\ns08.gz\nrow1\n", "data file `row1`: "),
+        ] {
+            let e = open(head(encoding, files)).unwrap_err().to_string();
+            assert!(e.contains(say), "want {say:?} in {e}");
+        }
+    }
+
+    #[test]
     fn what_is_not_read_is_refused_by_field_and_remedy() {
         let with = |from: &str, to: &str| RAW.replace(from, to);
         for (header, say) in [
-            (with("raw", "bzip2"), "encoding (line 5): bzip2 is not read by this version; save"),
-            (with("raw", "txt"), "ascii is not read"),
-            (with("raw", "hex"), "hex is not read"),
+            (with("raw", "zrl"), "encoding (line 5): zrl is not read; save"),
+            (with("raw", "bzip2"), "data: the bzip2 stream is damaged after 0 of 6 bytes"),
+            (with("raw", "txt"), "data: number 1 is `"),
+            (with("raw", "hex"), "is no hexadecimal digit"),
             (with("raw", "zip"), "`zip` is not an encoding"),
             (with("uint8", "block"), "type (line 2): `block` samples are not numbers"),
             (with("uint8", "char8"), "`char8` is not a type"),
@@ -752,8 +812,12 @@ mod tests {
             (format!("{RAW}space directions: (1,0) (0,1) (0,0)\n"), "is not made of vectors"),
             (format!("{RAW}space directions: (1,0,0) (0,1,0) (2,0,0)\n"), "would be flat"),
             (format!("{RAW}space directions: (1,0,0) (0,1,0) none\n"), "no direction for axis 2"),
-            (format!("{RAW}data file: LIST\n"), "`LIST` names several files"),
-            (format!("{RAW}data file: a%03d.raw 1 9 1\n"), "names several files"),
+            (format!("{RAW}data file: LIST\n"), "names 0 files where the sizes want 1"),
+            (format!("{RAW}data file: LIST 2 3\na b\n"), "`LIST 2 3` is not there"),
+            (format!("{RAW}data file: LIST 4\na\n"), "ends in no number of axes"),
+            (format!("{RAW}data file: LIST\na\nb\n"), "names 2 files where the sizes want 1"),
+            (format!("{RAW}data file: a%03d.raw 1 9 1\n"), "names 9 files where the sizes want 1"),
+            (format!("{RAW}data file: a%s.raw 1 9 1\n"), "in a way that is not known"),
             (format!("{RAW}data file: no/such.raw\n"), "data file: `no/such.raw` is not there"),
         ] {
             let e = open(&header, &[0; 6]).unwrap_err().to_string();

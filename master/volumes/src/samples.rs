@@ -15,6 +15,7 @@
 //! that samples floats. What it must not lose is the span, hence the shift by the minimum.
 
 use crate::error::{OpenErrorKind, Problem};
+use crate::wide;
 use slabcast_common::brick::{BrickGrid, MAX_BRICKS};
 use slabcast_common::volume::{Samples, ValueMap};
 use std::io::Read;
@@ -28,9 +29,6 @@ pub(crate) const SAMPLES_MAX: u64 = 1 << 33;
 /// Dense deflate gives 240 MB/s (`examples/load` on 64 MiB of noise in 4 bits: 0.27 s), so this
 /// is 0.07 s of the 0.1 s that PROMISES R13 allows a file that turns out bad.
 pub(crate) const SKIP_MAX_BYTES: u64 = 16 << 20;
-/// Bytes that one byte of deflate can at most become: a match of 258 bytes takes at least two
-/// bits. Lets a liar be refused before anything is inflated.
-const DEFLATE_RATIO: u64 = 1032;
 /// Bytes decoded at a time; a multiple of every type's size. Fits the second-level cache.
 const CHUNK_BYTES: usize = 128 << 10;
 
@@ -57,6 +55,33 @@ impl Number {
             Number::U32 | Number::I32 | Number::F32 => 4,
             Number::U64 | Number::I64 | Number::F64 => 8,
         }
+    }
+
+    /// Integers, the smaller first, unsigned before signed.
+    pub(crate) const INTEGERS: [Number; 8] = [
+        Number::U8,
+        Number::I8,
+        Number::U16,
+        Number::I16,
+        Number::U32,
+        Number::I32,
+        Number::U64,
+        Number::I64,
+    ];
+
+    /// Smallest and largest value of an integer type.
+    pub(crate) fn limits(self) -> Option<(f64, f64)> {
+        Some(match self {
+            Number::U8 => (0.0, u8::MAX.into()),
+            Number::I8 => (i8::MIN.into(), i8::MAX.into()),
+            Number::U16 => (0.0, u16::MAX.into()),
+            Number::I16 => (i16::MIN.into(), i16::MAX.into()),
+            Number::U32 => (0.0, u32::MAX.into()),
+            Number::I32 => (i32::MIN.into(), i32::MAX.into()),
+            Number::U64 => (0.0, u64::MAX as f64),
+            Number::I64 => (i64::MIN as f64, i64::MAX as f64),
+            Number::F32 | Number::F64 => return None,
+        })
     }
 
     /// Its name for people.
@@ -91,11 +116,23 @@ pub(crate) enum Supply {
         /// Bytes from the first sample on.
         have: u64,
     },
-    /// A gzip stream of this many compressed bytes, at most.
-    Gzip {
-        /// Bytes of the file from the start of the stream on.
-        compressed: u64,
+    /// Samples that come out of other bytes: packed, or written as text.
+    Encoded {
+        /// What the encoding is called.
+        name: &'static str,
+        /// Bytes of the file from its start on, at most.
+        bytes: u64,
+        /// Bytes that one of them can at most become.
+        ratio: u64,
     },
+}
+
+impl Supply {
+    /// A deflate stream, with the header of gzip or of zlib: a match of 258 bytes takes at least
+    /// two bits. Lets a liar be refused before anything is inflated.
+    pub(crate) fn deflate(name: &'static str, bytes: u64) -> Supply {
+        Supply::Encoded { name, bytes, ratio: 1032 }
+    }
 }
 
 /// What a header says of its samples; the sizes are checked.
@@ -168,31 +205,31 @@ pub(crate) fn read(
     let need = layout.bytes();
     match supply {
         Supply::Plain { have } if have < need => return Err(short(need, have)),
-        Supply::Gzip { compressed } if need / DEFLATE_RATIO > compressed => {
+        Supply::Encoded { name, bytes, ratio } if need / ratio > bytes => {
             return Err(Problem::new(
                 OpenErrorKind::Damaged,
                 "data",
                 format!(
-                    "truncated: {need} bytes are declared, and {compressed} compressed bytes \
-                     can't hold so many"
+                    "truncated: {need} bytes are declared, and {bytes} bytes of {name} can't hold \
+                     so many"
                 ),
                 "get the whole file, or correct the sizes",
             ));
         }
         _ => {}
     }
-    let mut data = Data { reader, supply, count: layout.count(), need };
+    let mut data = Data { reader, supply, size: layout.number.bytes() as usize, need };
     let big = layout.endian == Endian::Big;
-    macro_rules! numbers {
+    macro_rules! words {
         ($t:ty) => {
-            data.collect::<$t>(|bytes, out| {
+            |bytes: &[u8], out: &mut Vec<$t>| {
                 let words = bytes.chunks_exact(size_of::<$t>());
                 if big {
                     out.extend(words.map(|w| <$t>::from_be_bytes(w.try_into().expect("a word"))));
                 } else {
                     out.extend(words.map(|w| <$t>::from_le_bytes(w.try_into().expect("a word"))));
                 }
-            })?
+            }
         };
     }
     // Flipping the top bit adds half the range.
@@ -206,55 +243,94 @@ pub(crate) fn read(
             let v = data.collect(|bytes, out| out.extend(bytes.iter().map(|b| b ^ 0x80)))?;
             (Samples::U8(v), shifted(-128.0))
         }
-        Number::U16 => (Samples::U16(numbers!(u16)), ValueMap::IDENTITY),
+        Number::U16 => (Samples::U16(data.collect(words!(u16))?), ValueMap::IDENTITY),
         Number::I16 => {
-            let mut v = numbers!(u16);
-            v.iter_mut().for_each(|x| *x ^= 0x8000);
+            let v = data.collect(|bytes, out| {
+                let from = out.len();
+                words!(u16)(bytes, out);
+                out[from..].iter_mut().for_each(|x| *x ^= 0x8000);
+            })?;
             (Samples::U16(v), shifted(-32768.0))
         }
-        Number::U32 => narrow(numbers!(u32), i128::from)?,
-        Number::I32 => narrow(numbers!(i32), i128::from)?,
-        Number::U64 => narrow(numbers!(u64), i128::from)?,
-        Number::I64 => narrow(numbers!(i64), i128::from)?,
-        Number::F32 => (Samples::F32(numbers!(f32)), ValueMap::IDENTITY),
-        Number::F64 => single(&numbers!(f64))?,
+        Number::F32 => (Samples::F32(data.collect(words!(f32))?), ValueMap::IDENTITY),
+        Number::U32 => wide::narrow(data.pieces(words!(u32))?, i128::from)?,
+        Number::I32 => wide::narrow(data.pieces(words!(i32))?, i128::from)?,
+        Number::U64 => wide::narrow(data.pieces(words!(u64))?, i128::from)?,
+        Number::I64 => wide::narrow(data.pieces(words!(i64))?, i128::from)?,
+        Number::F64 => wide::single(data.pieces(words!(f64))?)?,
     })
 }
 
 struct Data<'a> {
     reader: &'a mut dyn Read,
     supply: Supply,
-    count: usize,
+    /// Bytes of a number.
+    size: usize,
     need: u64,
 }
 
 impl Data<'_> {
+    /// All numbers in one list.
     fn collect<T>(&mut self, decode: impl Fn(&[u8], &mut Vec<T>)) -> Result<Vec<T>, Problem> {
-        let size = (self.need / self.count as u64) as usize;
+        let count = (self.need / self.size as u64) as usize;
         let mut out = Vec::new();
         if matches!(self.supply, Supply::Plain { .. }) {
-            reserve(&mut out, self.count)?;
+            reserve(&mut out, count)?;
         }
-        let mut chunk = vec![0; CHUNK_BYTES.min(self.need as usize)];
-        while out.len() < self.count {
-            let want = chunk.len().min((self.count - out.len()) * size);
-            let got = self.fill(&mut chunk[..want], (out.len() * size) as u64)?;
-            let numbers = got / size;
+        let size = self.size;
+        self.each(|bytes| {
+            let numbers = bytes.len() / size;
             if out.capacity() - out.len() < numbers {
                 // Never more than twice of what has come, nor more than was declared.
-                let room = (2 * (out.len() + numbers)).min(self.count) - out.len();
+                let room = (2 * (out.len() + numbers)).min(count) - out.len();
                 reserve(&mut out, room)?;
             }
-            decode(&chunk[..got], &mut out);
-        }
-        if matches!(self.supply, Supply::Gzip { .. }) {
-            self.end()?;
-        }
+            decode(bytes, &mut out);
+            Ok(())
+        })?;
         Ok(out)
     }
 
+    /// All numbers in pieces, which [`wide`] gives back one by one.
+    fn pieces<T>(&mut self, decode: impl Fn(&[u8], &mut Vec<T>)) -> Result<Vec<Vec<T>>, Problem> {
+        let mut pieces: Vec<Vec<T>> = Vec::new();
+        let (size, mut left) = (self.size, (self.need / self.size as u64) as usize);
+        self.each(|bytes| {
+            let numbers = bytes.len() / size;
+            let full = |p: &Vec<T>| p.len() * size >= wide::PIECE_BYTES;
+            if pieces.last().is_none_or(full) {
+                pieces.push(Vec::new());
+            }
+            let piece = pieces.last_mut().expect("one was put there");
+            if piece.capacity() - piece.len() < numbers {
+                let most = left.min(wide::PIECE_BYTES / size - piece.len());
+                reserve(piece, (piece.len() + 2 * numbers).min(most).max(numbers))?;
+            }
+            decode(bytes, piece);
+            left -= numbers;
+            Ok(())
+        })?;
+        Ok(pieces)
+    }
+
+    /// All bytes, in chunks that end between numbers.
+    fn each(&mut self, mut take: impl FnMut(&[u8]) -> Result<(), Problem>) -> Result<(), Problem> {
+        let mut chunk = vec![0; (CHUNK_BYTES as u64).min(self.need) as usize];
+        let mut before = 0;
+        while before < self.need {
+            let want = (chunk.len() as u64).min(self.need - before) as usize;
+            self.fill(&mut chunk[..want], before)?;
+            before += want as u64;
+            take(&chunk[..want])?;
+        }
+        if matches!(self.supply, Supply::Encoded { .. }) {
+            self.end()?;
+        }
+        Ok(())
+    }
+
     /// Fills `chunk` or says what is missing; `before` bytes came before it.
-    fn fill(&mut self, chunk: &mut [u8], before: u64) -> Result<usize, Problem> {
+    fn fill(&mut self, chunk: &mut [u8], before: u64) -> Result<(), Problem> {
         let mut at = 0;
         while at < chunk.len() {
             match self.reader.read(&mut chunk[at..]) {
@@ -264,10 +340,11 @@ impl Data<'_> {
                 Err(e) => return Err(self.broken(&e, before + at as u64)),
             }
         }
-        Ok(at)
+        Ok(())
     }
 
-    /// One byte past the declared size: none may come, and gzip checks its sum on the way.
+    /// One byte past the declared size: none may come, and a packed stream checks its sum on the
+    /// way.
     fn end(&mut self) -> Result<(), Problem> {
         loop {
             match self.reader.read(&mut [0]) {
@@ -287,12 +364,16 @@ impl Data<'_> {
     }
 
     fn broken(&self, e: &std::io::Error, have: u64) -> Problem {
+        // What our own readers say travels inside the error as it is.
+        if let Some(problem) = e.get_ref().and_then(|inner| inner.downcast_ref::<Problem>()) {
+            return problem.clone();
+        }
         match (self.supply, e.kind()) {
-            (Supply::Gzip { .. }, std::io::ErrorKind::UnexpectedEof) => short(self.need, have),
-            (Supply::Gzip { .. }, _) => Problem::new(
+            (Supply::Encoded { .. }, std::io::ErrorKind::UnexpectedEof) => short(self.need, have),
+            (Supply::Encoded { name, .. }, _) => Problem::new(
                 OpenErrorKind::Damaged,
                 "data",
-                format!("the gzip stream is damaged after {have} of {} bytes ({e})", self.need),
+                format!("the {name} stream is damaged after {have} of {} bytes ({e})", self.need),
                 "get the file again",
             ),
             _ => Problem::io("data", e),
@@ -300,7 +381,7 @@ impl Data<'_> {
     }
 }
 
-fn short(need: u64, have: u64) -> Problem {
+pub(crate) fn short(need: u64, have: u64) -> Problem {
     Problem::new(
         OpenErrorKind::Damaged,
         "data",
@@ -309,7 +390,7 @@ fn short(need: u64, have: u64) -> Problem {
     )
 }
 
-fn reserve<T>(out: &mut Vec<T>, more: usize) -> Result<(), Problem> {
+pub(crate) fn reserve<T>(out: &mut Vec<T>, more: usize) -> Result<(), Problem> {
     out.try_reserve_exact(more).map_err(|_| {
         Problem::new(
             OpenErrorKind::TooLarge,
@@ -318,62 +399,6 @@ fn reserve<T>(out: &mut Vec<T>, more: usize) -> Result<(), Problem> {
             "use a machine with more memory, or crop or downsample it",
         )
     })
-}
-
-/// 32- and 64-bit integers in 16 bits where they fit, else in f32.
-fn narrow<T: Copy + Ord>(
-    numbers: Vec<T>,
-    wide: impl Fn(T) -> i128,
-) -> Result<(Samples, ValueMap), Problem> {
-    let min = wide(*numbers.iter().min().expect("a volume has a sample"));
-    let max = wide(*numbers.iter().max().expect("a volume has a sample"));
-    // 64-bit integers are never more than 2^64 apart, so i128 can't overflow.
-    let span = max - min;
-    if span <= i128::from(u16::MAX) {
-        let mut codes: Vec<u16> = Vec::new();
-        reserve(&mut codes, numbers.len())?;
-        codes.extend(numbers.iter().map(|&v| (wide(v) - min) as u16));
-        return Ok((Samples::U16(codes), ValueMap { scale: 1.0, offset: min as f64 }));
-    }
-    let mut codes: Vec<f32> = Vec::new();
-    reserve(&mut codes, numbers.len())?;
-    codes.extend(numbers.iter().map(|&v| ((wide(v) - min) as f64 / span as f64) as f32));
-    Ok((Samples::F32(codes), ValueMap { scale: span as f64, offset: min as f64 }))
-}
-
-/// f64 as f32, by way of a map where f32 would overflow, flush to zero or be too coarse.
-fn single(numbers: &[f64]) -> Result<(Samples, ValueMap), Problem> {
-    let finite = || numbers.iter().copied().filter(|v| v.is_finite());
-    let (lo, hi) =
-        finite().fold((f64::INFINITY, f64::NEG_INFINITY), |(lo, hi), v| (lo.min(v), hi.max(v)));
-    let map = if lo > hi || held_by_f32(lo, hi) {
-        ValueMap::IDENTITY
-    } else if hi == lo {
-        ValueMap { scale: 1.0, offset: lo }
-    } else if (hi - lo).is_finite() {
-        ValueMap { scale: hi - lo, offset: lo }
-    } else {
-        // The span itself is beyond f64: codes are -1..1 around the middle.
-        ValueMap { scale: hi / 2.0 - lo / 2.0, offset: hi / 2.0 + lo / 2.0 }
-    };
-    let mut codes: Vec<f32> = Vec::new();
-    reserve(&mut codes, numbers.len())?;
-    codes.extend(numbers.iter().map(|&v| ((v - map.offset) / map.scale) as f32));
-    Ok((Samples::F32(codes), map))
-}
-
-/// Whether f32 holds values from `lo` to `hi` as they are: none overflows, and rounding (2^-24
-/// of the largest) or flushing stays below a 65536th of the span, a 16-bit scanner's step.
-fn held_by_f32(lo: f64, hi: f64) -> bool {
-    let largest = lo.abs().max(hi.abs());
-    let span = hi - lo;
-    if largest > f64::from(f32::MAX) {
-        return false;
-    }
-    if span == 0.0 {
-        return f64::from(lo as f32) == lo;
-    }
-    largest <= 256.0 * span && span >= 65536.0 * f64::from(f32::MIN_POSITIVE)
 }
 
 #[cfg(test)]

@@ -31,13 +31,14 @@ fn no_volume_no_panic() {
     use OpenErrorKind::{Damaged, Malformed, NotAVolume, Unreadable, Unsupported};
     for (path, kind, say) in [
         (dir.path().join("nowhere.nrrd"), Unreadable, "no such file"),
-        (dir.path().to_path_buf(), Unreadable, "is a folder"),
+        (dir.path().to_path_buf(), NotAVolume, "folder: holds no slices or pictures"),
         (file("empty.nii", b""), NotAVolume, "is empty"),
         (file("a.png", b"\x89PNG\r\n\x1a\n0000"), NotAVolume, "is a picture"),
         (file("a.nrrd", b"hello"), NotAVolume, "does not begin with `NRRD`"),
         (file("a.nii", b"hello"), NotAVolume, "does not begin with a NIfTI header"),
         (file("a.txt", b"some words\n"), NotAVolume, "is text"),
-        (file("a.bin", &[0xee; 99]), NotAVolume, "is no volume that we know"),
+        (file("a.xyz", &[0xee; 99]), NotAVolume, "is no volume that we know"),
+        (file("a.bin", &[0xee; 99]), NotAVolume, "is raw numbers without a header"),
         (file("a.gz", &[0x1f, 0x8b]), NotAVolume, "is gzip, but not NIfTI"),
         (file("b.nrrd", b"NRRD0004\n"), Malformed, "type: is missing"),
         (file("c.nrrd", b"NRRD"), Unsupported, "is not NRRD0001"),

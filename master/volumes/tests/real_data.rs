@@ -5,7 +5,7 @@ use glam::DVec3;
 use slabcast_common::presets;
 use slabcast_common::quality::Compositing;
 use slabcast_common::shade::encode_normal;
-use slabcast_common::volume::{Samples, Volume};
+use slabcast_common::volume::Volume;
 use slabcast_common::wanted::Wanted;
 use slabcast_volumes::{BrickStore, OpenErrorKind, open};
 use std::path::{Path, PathBuf};
@@ -83,9 +83,30 @@ fn twins_in_other_formats_are_equal() {
     assert_eq!(twin("tooth.nrrd").samples, twin("formats/nrrd/tooth_attached_raw.nrrd").samples);
     assert_eq!(twin("ct_avm.nrrd").samples, twin("formats/nifti/CT_AVM.nii.gz").samples);
     assert_eq!(twin("chris_t1.nrrd").samples, twin("formats/nifti/chris_t1.nii.gz").samples);
-    let Samples::U8(aneurism) = twin("aneurism.nrrd").samples else { panic!("it is uint8") };
-    let raw = data("formats/raw/aneurism_256x256x256_uint8.raw").expect("the folder is there");
-    assert!(aneurism == std::fs::read(raw).unwrap());
+    let aneurism = twin("aneurism.nrrd");
+    for file in ["raw/aneurism_256x256x256_uint8.raw", "vti/aneurism.vti"] {
+        assert_eq!(twin(&format!("formats/{file}")).digest(), aneurism.digest(), "{file}");
+    }
+    let stent = twin("stent.nrrd").samples;
+    for file in ["stent_int16.mhd", "stent_int16_z.mhd", "stent_int16.raw", "stent_int16_z.zraw"] {
+        assert_eq!(twin(&format!("formats/metaimage/{file}")).samples, stent, "{file}");
+    }
+    let packed = twin("formats/nrrd/engine_256x256x128_uint8.raw.gz");
+    assert_eq!(packed.digest(), engine.digest(), "size and type from its name, gzip inside");
+    assert_eq!(twin("lidc2.nrrd").samples, twin("formats/metaimage/LIDC2.mha").samples);
+}
+
+#[test]
+fn metaimage_flips_become_ras() {
+    let Some(path) = data("formats/metaimage/LIDC2.mha") else { return };
+    let v = volume(&path);
+    assert!(v.anatomical);
+    // Rows of its matrix: left, anterior (y down in LPS), inferior.
+    let want = [DVec3::X * -1.40625, DVec3::Y * 1.40625, DVec3::Z * -2.5];
+    for (got, want) in v.lattice.steps.iter().zip(want) {
+        assert!((*got - want).length() < 1e-9, "{got} against {want}");
+    }
+    assert!((v.lattice.origin - DVec3::new(0.0, -360.0, 332.5)).length() < 1e-9);
 }
 
 #[test]
@@ -164,19 +185,15 @@ fn a_head_is_cut_as_the_plain_loop_says() {
 }
 
 #[test]
-fn formats_that_come_later_are_named() {
-    for (file, say) in [
-        ("formats/metaimage/stent_int16.mhd", "is MetaImage"),
-        ("formats/metaimage/LIDC2.mha", "is MetaImage"),
-        ("formats/vti/aneurism.vti", "is VTK"),
-        ("formats/dicom/1-041.dcm", "is DICOM"),
-        ("formats/raw/aneurism_256x256x256_uint8.raw", "write a .nhdr"),
-        ("formats/nrrd/engine_256x256x128_uint8.raw.gz", "is gzip, but not NIfTI"),
-        ("README.md", "is text"),
+fn what_is_no_volume_is_named() {
+    for (file, kind, say) in [
+        ("README.md", OpenErrorKind::NotAVolume, "is text"),
+        ("formats", OpenErrorKind::NotAVolume, "holds no slices or pictures"),
+        ("formats/nrrd", OpenErrorKind::NotAVolume, "give one file in it, such as `A_J_attached"),
     ] {
         let Some(path) = data(file) else { return };
         let e = open(&path).unwrap_err();
-        assert_eq!(e.problem.kind, OpenErrorKind::NotAVolume);
+        assert_eq!(e.problem.kind, kind);
         let line = e.to_string();
         assert!(line.contains(say) && line.contains(file), "{line}");
     }

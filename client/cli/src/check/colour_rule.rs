@@ -12,7 +12,6 @@ use crate::fail::{Fail, say};
 use crate::local::{self, Cut};
 use crate::progress::{self, Progress};
 use crate::request::{PictureOf, ThreadArg, lattice_notice};
-use crate::volume;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::quality::{Compositing, Quality, Work};
 use slabcast_common::view::{Camera, CameraProjection, View};
@@ -102,7 +101,7 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
     }
     let orientation = args.of.look.view.axes.orientation()?;
     let threads = args.threads.count();
-    let volume = volume::open(&args.of.volume)?;
+    let volume = args.of.open()?;
     let info = volume.info(volume.digest());
     asked.fit(&info, orientation, volume.anatomical)?;
     if let Some(notice) = lattice_notice(&info) {

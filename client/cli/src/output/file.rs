@@ -33,6 +33,11 @@ pub(super) fn beside(path: &Path) -> Result<NamedTempFile> {
     hidden(folder, &path.file_name().unwrap_or_default().to_string_lossy())
 }
 
+/// Sees whether a file can be made beside `path`.
+pub(crate) fn probe(path: &Path) -> std::result::Result<(), Fail> {
+    beside(path).map(drop).map_err(|e| Fail::io(path, "making the file", &e))
+}
+
 /// Gives a filled file its name.
 pub(super) fn settle(file: NamedTempFile, path: &Path) -> Result<()> {
     file.as_file().sync_all()?;

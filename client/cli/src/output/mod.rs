@@ -13,7 +13,7 @@ pub(crate) mod png;
 pub(crate) mod provenance;
 mod y4m;
 
-pub(crate) use file::{Patience, write_atomic};
+pub(crate) use file::{Patience, probe, write_atomic};
 pub(crate) use lines::Lines;
 
 use crate::fail::Fail;

@@ -1,0 +1,111 @@
+//! `slabcast convert`: a volume of any format as NRRD or NIfTI.
+
+use crate::fail::{Fail, say};
+use crate::progress::{self, Progress};
+use crate::{output, signals, volume};
+use slabcast_common::volume::Volume;
+use slabcast_volumes::write::{self, Format};
+use std::path::{Path, PathBuf};
+
+/// Writes a volume as NRRD or NIfTI, with its values, place and orientation.
+#[derive(clap::Args, Clone, Debug)]
+#[command(after_help = "\
+The file is whole or not there. Values keep their type; where they have a slope, NRRD gets floats.
+
+Examples:
+  slabcast convert scan.mha scan.nii.gz
+  slabcast convert head.raw head.nrrd --dims 256x256x128 --type uint8 --spacing 1x1x1.5
+  slabcast convert slices/ slices.nrrd --encoding raw")]
+pub(crate) struct ConvertArgs {
+    #[arg(help = volume::VOLUME)]
+    volume: PathBuf,
+    /// File to write; its name says how: .nrrd, .nii or .nii.gz
+    #[arg(value_name = "OUT")]
+    output: PathBuf,
+    #[command(flatten)]
+    input: volume::InputArgs,
+    /// How samples are stored: raw or gzip [default: gzip for .nrrd and .nii.gz, raw for .nii]
+    #[arg(long, value_name = "HOW", value_parser = ["raw", "gzip"])]
+    encoding: Option<String>,
+    /// Replace the file if it is there already
+    #[arg(long)]
+    force: bool,
+    /// No progress, only warnings and the result
+    #[arg(short, long)]
+    quiet: bool,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &ConvertArgs) -> Result<(), Fail> {
+    let shown = args.output.display();
+    let name = args.output.file_name().unwrap_or_default().to_string_lossy();
+    let Some(mut format) = Format::of_name(&name) else {
+        return Err(Fail::usage(format!(
+            "OUT: `{shown}` names no format that is written; end it with .nrrd, .nii or .nii.gz"
+        )));
+    };
+    if let Some(encoding) = &args.encoding {
+        let gzip = encoding == "gzip";
+        if format.packed(gzip) != format && matches!(format, Format::Nifti { .. }) {
+            return Err(Fail::usage(format!(
+                "--encoding: {encoding} does not go with `{name}`; a packed NIfTI file ends in \
+                 .nii.gz, any other in .nii"
+            )));
+        }
+        format = format.packed(gzip);
+    }
+    if args.output.is_dir() {
+        return Err(Fail::failed(format!("{shown}: is a folder; give a file")));
+    }
+    if args.output.exists() {
+        if let (Ok(a), Ok(b)) = (args.output.canonicalize(), args.volume.canonicalize())
+            && a == b
+        {
+            return Err(Fail::usage(format!(
+                "OUT: `{shown}` is the volume itself; give another file"
+            )));
+        }
+        if !args.force {
+            return Err(Fail::failed(format!(
+                "{shown}: is there already; add --force to replace it, or give another name"
+            )));
+        }
+    }
+    // Better now than after a long read.
+    output::probe(&args.output)?;
+    let mut bar = Progress::new(args.quiet).of("slice");
+    bar.stage(&format!("reading {}", args.volume.display()));
+    let (input, file) = (args.input.clone(), args.volume.clone());
+    let volume = signals::unless_stopped(move || input.open(&file))?;
+    if let Some(lost) = write::loses(&volume, format) {
+        progress::warn(&lost);
+    }
+    let (to, what) = (args.output.clone(), format!("writing {shown}"));
+    let bytes = signals::to_its_end(move || write_to(&to, &volume, format, bar, &what))?;
+    if args.quiet {
+        return Ok(());
+    }
+    say(&format!("{shown}: {}\n", progress::bytes(bytes)))
+}
+
+/// Writes the file; gives its bytes.
+fn write_to(
+    path: &Path,
+    volume: &Volume,
+    format: Format,
+    mut bar: Progress,
+    what: &str,
+) -> Result<u64, Fail> {
+    let [nx, ny, nz] = volume.lattice.dims.map(u64::from);
+    bar.frames(nz, what);
+    let mut went_on = |samples: u64| {
+        bar.step(progress::Step { frames: samples / (nx * ny), ..Default::default() });
+        match signals::told() {
+            true => Err(std::io::Error::other("stopped")),
+            false => Ok(()),
+        }
+    };
+    output::write_atomic(path, |out| write::write(volume, format, out, &mut went_on))?;
+    bar.end();
+    std::fs::metadata(path).map(|m| m.len()).map_err(|e| Fail::io(path, "looking at it", &e))
+}

@@ -1,0 +1,447 @@
+//! From the files of a folder to one series in order: grouping, sorting, place, and the samples.
+
+use super::elements::{File, Pixels, Tag};
+use super::rle;
+use super::wire::Preface;
+use crate::error::{OpenErrorKind, Problem, quoted};
+use crate::samples::{DIM_MAX, Endian, Layout, Number};
+use crate::source::Source;
+use glam::DVec3;
+use slabcast_common::volume::Lattice;
+use std::collections::BTreeMap;
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+
+/// One picture: what of it must agree with its neighbours, and where it lies.
+struct Slice {
+    path: PathBuf,
+    form: Form,
+    rescale: [f64; 2],
+    /// Of the middle of the first pixel, and steps to its neighbours in the row and the column.
+    place: Option<(DVec3, [DVec3; 2])>,
+    /// Pixel distances where no place is said, and of slices.
+    spacing: [f64; 3],
+    instance: f64,
+}
+
+/// How pixels are stored.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Form {
+    columns: u16,
+    rows: u16,
+    /// 8, 16 or 32.
+    allocated: u16,
+    stored: u16,
+    high: u16,
+    signed: bool,
+}
+
+/// A series by what people call it.
+struct Series {
+    uid: String,
+    number: String,
+    description: String,
+    modality: String,
+    slices: Vec<Slice>,
+}
+
+impl Series {
+    fn name(&self) -> String {
+        let words = [&self.modality, &self.number, &self.description];
+        let words: Vec<&str> = words.iter().map(|w| w.as_str()).filter(|w| !w.is_empty()).collect();
+        if words.is_empty() { self.uid.clone() } else { words.join(" ") }
+    }
+
+    fn is_called(&self, name: &str) -> bool {
+        [&self.uid, &self.number, &self.description, &self.name()].iter().any(|n| *n == name)
+    }
+}
+
+/// What to read.
+pub(crate) struct Wish<'a> {
+    /// Which series, by its number, description, name or UID.
+    pub(crate) series: Option<&'a str>,
+    /// A file whose series is meant.
+    pub(crate) file: Option<&'a Path>,
+}
+
+/// Writes the wished series of these files: a preface, then samples in little-endian order.
+pub(super) fn write(
+    files: &[PathBuf],
+    wish: &Wish<'_>,
+    out: &mut dyn Write,
+) -> Result<(), Problem> {
+    let (all, left_out, unread) = gather(files)?;
+    let total = all.len();
+    if let (0, Some(problem)) = (total, unread.first()) {
+        return Err(problem.clone());
+    }
+    let mut series = choose(all, wish)?;
+    let name = series.name();
+    let mut notes = Vec::new();
+    if total > 1 {
+        notes.push(format!("series {} of {total} was read", quoted(&name)));
+    }
+    if left_out > 0 {
+        notes.push(format!("{left_out} DICOM files without a picture were left out"));
+    }
+    if let Some(first) = unread.first() {
+        notes.push(format!("{} DICOM files were left out: {first}", unread.len()));
+    }
+    let preface = arrange(&mut series, &mut notes)?;
+    preface.write(out).map_err(|e| Problem::io("pipe", &e))?;
+    for slice in &series.slices {
+        let bytes = pixels(slice, preface.float).map_err(|p| at(&slice.path, p))?;
+        out.write_all(&bytes).map_err(|e| Problem::io("pipe", &e))?;
+    }
+    out.flush().map_err(|e| Problem::io("pipe", &e))
+}
+
+/// The problem, with the file's name before its field.
+fn at(path: &Path, mut p: Problem) -> Problem {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    p.field = format!("{} {}", quoted(&name), p.field);
+    p
+}
+
+/// Looks at all files; also says how many have no picture, and what is wrong with those that are
+/// of a sort that is not read. A damaged one ends it: it may be a slice of what is wanted.
+fn gather(files: &[PathBuf]) -> Result<(Vec<Series>, usize, Vec<Problem>), Problem> {
+    let mut all: BTreeMap<(String, u16, u16, String), Series> = BTreeMap::new();
+    let (mut left_out, mut unread) = (0, Vec::new());
+    for path in files {
+        let source = Source::open(path, "file").map_err(|p| at(path, p))?;
+        let file = match File::open(source) {
+            Ok(file) => file,
+            // DICOMDIR, reports and the like.
+            Err(p) if p.kind == OpenErrorKind::NotAVolume => {
+                left_out += 1;
+                continue;
+            }
+            Err(p) if p.kind == OpenErrorKind::Unsupported => {
+                unread.push(at(path, p));
+                continue;
+            }
+            Err(p) => return Err(at(path, p)),
+        };
+        let slice = match Slice::of(path, &file) {
+            Ok(slice) => slice,
+            Err(p) if p.kind == OpenErrorKind::Unsupported => {
+                unread.push(at(path, p));
+                continue;
+            }
+            Err(p) => return Err(at(path, p)),
+        };
+        let get = |tag: Tag| file.text(tag).unwrap_or_default();
+        // A localizer has pictures across each other under one UID.
+        let across = slice.place.map(|(_, [r, c])| {
+            let n = r.normalize_or_zero().cross(c.normalize_or_zero());
+            format!("{:.2} {:.2} {:.2}", n.x + 0.0, n.y + 0.0, n.z + 0.0)
+        });
+        let uid = get((0x0020, 0x000e));
+        let key = (uid.clone(), slice.form.columns, slice.form.rows, across.unwrap_or_default());
+        let series = all.entry(key).or_insert_with(|| Series {
+            uid,
+            number: get((0x0020, 0x0011)),
+            description: get((0x0008, 0x103e)),
+            modality: get((0x0008, 0x0060)),
+            slices: Vec::new(),
+        });
+        series.slices.push(slice);
+    }
+    Ok((all.into_values().collect(), left_out, unread))
+}
+
+fn choose(mut all: Vec<Series>, wish: &Wish<'_>) -> Result<Series, Problem> {
+    // By size, so that localizers stand last in what is listed.
+    all.sort_by_key(|s| std::cmp::Reverse(s.slices.len()));
+    let list = |all: &[Series]| {
+        let name = |s: &Series| format!("{} ({} slices)", quoted(&s.name()), s.slices.len());
+        let mut names: Vec<String> = all.iter().take(12).map(name).collect();
+        if all.len() > 12 {
+            names.push(format!("and {} more", all.len() - 12));
+        }
+        names.join(", ")
+    };
+    if all.is_empty() {
+        return Err(Problem::new(
+            OpenErrorKind::NotAVolume,
+            "folder",
+            "holds DICOM files, but no picture",
+            "give the folder of a series",
+        ));
+    }
+    if let Some(file) = wish.file {
+        let holds = |s: &Series| s.slices.iter().any(|slice| slice.path == file);
+        if let Some(found) = all.iter().position(holds) {
+            return Ok(all.swap_remove(found));
+        }
+    }
+    match wish.series {
+        None if all.len() < 2 => Ok(all.swap_remove(0)),
+        None => Err(Problem::malformed(
+            "--series",
+            format!("the folder holds {} series: {}", all.len(), list(&all)),
+            "name one of them, or its number",
+        )),
+        Some(name) => {
+            let called: Vec<usize> = (0..all.len()).filter(|&i| all[i].is_called(name)).collect();
+            match called[..] {
+                [one] => Ok(all.swap_remove(one)),
+                [] => Err(Problem::malformed(
+                    "--series",
+                    format!("there is no {} among {}", quoted(name), list(&all)),
+                    "name one of them, or its number",
+                )),
+                _ => Err(Problem::malformed(
+                    "--series",
+                    format!("{} series are called {}: {}", called.len(), quoted(name), list(&all)),
+                    "give the whole name, or the UID",
+                )),
+            }
+        }
+    }
+}
+
+impl Slice {
+    fn of(path: &Path, file: &File) -> Result<Slice, Problem> {
+        let need = |tag: Tag| {
+            file.short(tag).ok_or_else(|| {
+                Problem::malformed(super::elements::name(tag), "is missing", "get the file again")
+            })
+        };
+        let refuse = |field: &str, what: String, remedy: &str| {
+            Err(Problem::unsupported(field, what, remedy))
+        };
+        if file.text((0x0028, 0x0008)).is_some_and(|n| n != "1") {
+            return refuse(
+                "NumberOfFrames",
+                "is above 1: many pictures in one file are not read".into(),
+                "convert it, for instance with dcm2niix",
+            );
+        }
+        if file.short((0x0028, 0x0002)).unwrap_or(1) != 1 {
+            return refuse(
+                "SamplesPerPixel",
+                "is above 1: colours are no volume".into(),
+                "leave it out",
+            );
+        }
+        let allocated = need((0x0028, 0x0100))?;
+        let stored = file.short((0x0028, 0x0101)).unwrap_or(allocated);
+        let high = file.short((0x0028, 0x0102)).unwrap_or(stored.saturating_sub(1));
+        let form = Form {
+            columns: need((0x0028, 0x0011))?,
+            rows: need((0x0028, 0x0010))?,
+            allocated,
+            stored,
+            high,
+            signed: file.short((0x0028, 0x0103)) == Some(1),
+        };
+        if !matches!(allocated, 8 | 16 | 32) {
+            return refuse("BitsAllocated", format!("{allocated} are not read"), "convert it");
+        }
+        if stored == 0 || stored > allocated || high >= allocated || high + 1 < stored {
+            return Err(Problem::malformed(
+                "BitsStored",
+                format!("{stored} bits up to bit {high} do not fit into {allocated}"),
+                "get the file again",
+            ));
+        }
+        let sizes = [form.columns.into(), form.rows.into(), 1];
+        Layout::new(sizes, Number::U8, Endian::Little, "Rows, Columns")?;
+        let [between_rows, between_columns] = match file.numbers::<2>((0x0028, 0x0030))? {
+            Some(spacing) => spacing,
+            None => file.numbers::<2>((0x0018, 0x1164))?.unwrap_or([1.0; 2]),
+        };
+        let positive = |x: f64| if x > 0.0 { x } else { 1.0 };
+        let thick = match file.numbers::<1>((0x0018, 0x0088))? {
+            Some([x]) if x.abs() > 0.0 => Some(x.abs()),
+            _ => file.numbers::<1>((0x0018, 0x0050))?.map(|[x]| x.abs()),
+        };
+        let spacing =
+            [positive(between_columns), positive(between_rows), positive(thick.unwrap_or(1.0))];
+        let position = file.numbers::<3>((0x0020, 0x0032))?;
+        let directions = file.numbers::<6>((0x0020, 0x0037))?;
+        let place = position.zip(directions).map(|(p, d)| {
+            // The first direction is that of a row: from column to column.
+            let row = DVec3::new(d[0], d[1], d[2]) * spacing[0];
+            let column = DVec3::new(d[3], d[4], d[5]) * spacing[1];
+            (DVec3::from_array(p), [row, column])
+        });
+        let [slope] = file.numbers::<1>((0x0028, 0x1053))?.unwrap_or([1.0]);
+        let [intercept] = file.numbers::<1>((0x0028, 0x1052))?.unwrap_or([0.0]);
+        let rescale = if slope == 0.0 { [1.0, 0.0] } else { [slope, intercept] };
+        let instance = file.numbers::<1>((0x0020, 0x0013)).ok().flatten().map_or(0.0, |[n]| n);
+        Ok(Slice { path: path.into(), form, rescale, place, spacing, instance })
+    }
+}
+
+/// Sorts the slices and says where they lie.
+fn arrange(series: &mut Series, notes: &mut Vec<String>) -> Result<Preface, Problem> {
+    let name = series.name();
+    let count = series.slices.len();
+    let slices = &mut series.slices;
+    let first = &slices[0];
+    let form = first.form;
+    let n = slices.len() as u64;
+    if n > DIM_MAX {
+        return Err(Problem::new(
+            OpenErrorKind::TooLarge,
+            "series",
+            format!("{n} slices are more than {DIM_MAX}"),
+            "leave some out",
+        ));
+    }
+    if let Some(other) = slices.iter().find(|s| s.form != form) {
+        let wrong = Problem::malformed(
+            "BitsStored",
+            "is not what the first slice of its series has",
+            "leave it out, or convert the series",
+        );
+        return Err(at(&other.path, wrong));
+    }
+    let dims = [u32::from(form.columns), u32::from(form.rows), count as u32];
+    let placed = slices.iter().all(|s| s.place.is_some());
+    let lattice = if placed {
+        let (_, [row, column]) = first.place.expect("all have one");
+        let normal = row.cross(column).normalize_or_zero();
+        let along = |s: &Slice| s.place.map_or(0.0, |(p, _)| p.dot(normal));
+        slices
+            .sort_by(|a, b| along(a).total_cmp(&along(b)).then(a.instance.total_cmp(&b.instance)));
+        let gaps: Vec<f64> = slices.windows(2).map(|w| along(&w[1]) - along(&w[0])).collect();
+        let (least, most) =
+            gaps.iter().fold((f64::INFINITY, 0.0f64), |(a, b), g| (a.min(*g), b.max(*g)));
+        if least <= 1e-4 * most || !gaps.is_empty() && most == 0.0 {
+            return Err(Problem::unsupported(
+                "ImagePositionPatient",
+                "is the same for two slices: there are several times or echoes",
+                "give a folder with one of them",
+            ));
+        }
+        if most > 1.05 * least {
+            notes.push(format!(
+                "the slices of {} are {least:.3} to {most:.3} mm apart, and are drawn as if they \
+                 were even; some may be missing",
+                quoted(&name)
+            ));
+        }
+        let origin = slices[0].place.expect("all have one").0;
+        let step = match slices[..] {
+            [ref a, .., ref b] => {
+                let ends = [a, b].map(|s| s.place.expect("all have one").0);
+                (ends[1] - ends[0]) / (count as f64 - 1.0)
+            }
+            _ => normal * slices[0].spacing[2],
+        };
+        // LPS to RAS; `+ 0.0` makes of -0.0 a 0.0.
+        let ras = |v: DVec3| v * DVec3::new(-1.0, -1.0, 1.0) + DVec3::ZERO;
+        Lattice { dims, steps: [ras(row), ras(column), ras(step)], origin: ras(origin) }
+    } else {
+        slices.sort_by(|a, b| a.instance.total_cmp(&b.instance).then(a.path.cmp(&b.path)));
+        notes.push(format!(
+            "the slices of {} do not say where they lie; they are in the order of their numbers",
+            quoted(&name)
+        ));
+        Lattice::from_spacing(dims, slices[0].spacing)
+    };
+    lattice
+        .check()
+        .map_err(|e| Problem::malformed("ImageOrientationPatient", e, "get the series again"))?;
+    // One rescale for all can wait for its turn; several make floats of all samples.
+    let rescale = slices[0].rescale;
+    let float = slices.iter().any(|s| s.rescale != rescale);
+    let number = match (float, form.allocated, form.signed) {
+        (true, ..) => Number::F32,
+        (_, 8, false) => Number::U8,
+        (_, 8, true) => Number::I8,
+        (_, 16, false) => Number::U16,
+        (_, 16, true) => Number::I16,
+        (_, _, false) => Number::U32,
+        (_, _, true) => Number::I32,
+    };
+    Ok(Preface {
+        name,
+        number,
+        lattice,
+        anatomical: placed,
+        rescale: if float { [1.0, 0.0] } else { rescale },
+        float,
+        notes: std::mem::take(notes),
+    })
+}
+
+/// The samples of a slice, little-endian, as stored or, where `float` says so, rescaled.
+fn pixels(slice: &Slice, float: bool) -> Result<Vec<u8>, Problem> {
+    let source = Source::open(&slice.path, "file")?;
+    let len = source.len;
+    let file = File::open(source)?;
+    if Slice::of(&slice.path, &file)?.form != slice.form {
+        return Err(Problem::malformed("file", "changed while it was read", "try again"));
+    }
+    pixels_of(slice, file, len, float)
+}
+
+/// A file's samples, for those who try to break it.
+#[cfg(test)]
+pub(crate) fn one_slice(source: Source) -> Result<Vec<u8>, Problem> {
+    let len = source.len;
+    let file = File::open(source)?;
+    pixels_of(&Slice::of(Path::new("slice"), &file)?, file, len, true)
+}
+
+/// The samples of an open file of `len` bytes.
+fn pixels_of(slice: &Slice, mut file: File, len: u64, float: bool) -> Result<Vec<u8>, Problem> {
+    let form = slice.form;
+    let size = usize::from(form.allocated / 8);
+    let count = usize::from(form.columns) * usize::from(form.rows);
+    let bytes = match file.pixels {
+        Pixels::Rle => rle::unpack(&mut *file.rest, count, size)?,
+        Pixels::Native(have) => {
+            let need = (count * size) as u64;
+            // An odd number of bytes has one more.
+            if have < need || have > need + need % 2 || need / 1032 > len {
+                return Err(Problem::new(
+                    OpenErrorKind::Damaged,
+                    "PixelData",
+                    format!("has {have} bytes, where Rows and Columns want {need}"),
+                    "get the file again",
+                ));
+            }
+            let mut bytes = Vec::new();
+            file.rest
+                .take(need)
+                .read_to_end(&mut bytes)
+                .map_err(|e| Problem::io("PixelData", &e))?;
+            if bytes.len() as u64 != need {
+                return Err(crate::samples::short(need, bytes.len() as u64));
+            }
+            if file.endian == Endian::Big {
+                bytes.chunks_exact_mut(size).for_each(<[u8]>::reverse);
+            }
+            bytes
+        }
+    };
+    let whole = form.stored == form.allocated && form.high + 1 == form.allocated;
+    if whole && !float {
+        return Ok(bytes);
+    }
+    // Bits above and below those that are stored may hold anything (overlays, once).
+    let lift = 32 - u32::from(form.high) - 1;
+    let drop = 32 - u32::from(form.stored);
+    let value = |word: &[u8]| -> i64 {
+        let mut wide = [0; 4];
+        wide[..size].copy_from_slice(word);
+        let raised = u32::from_le_bytes(wide) << lift;
+        match form.signed {
+            true => (raised as i32 >> drop).into(),
+            false => (raised >> drop).into(),
+        }
+    };
+    let [slope, intercept] = slice.rescale;
+    let words = bytes.chunks_exact(size).map(value);
+    Ok(match float {
+        true => words.flat_map(|v| ((v as f64 * slope + intercept) as f32).to_le_bytes()).collect(),
+        false => words.flat_map(|v| v.to_le_bytes().into_iter().take(size)).collect(),
+    })
+}

@@ -1,0 +1,255 @@
+//! DICOM files written here, in every transfer syntax that is read.
+
+use super::*;
+use glam::DVec3;
+use slabcast_common::volume::Samples;
+
+/// A transfer syntax that is read.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Syntax {
+    Implicit,
+    Explicit,
+    Big,
+    Deflated,
+    Rle,
+}
+
+pub(crate) const ALL: [Syntax; 5] =
+    [Syntax::Implicit, Syntax::Explicit, Syntax::Big, Syntax::Deflated, Syntax::Rle];
+
+fn element(
+    out: &mut Vec<u8>,
+    explicit: bool,
+    big: bool,
+    tag: (u16, u16),
+    kind: &str,
+    value: &[u8],
+) {
+    let short = |n: u16| if big { n.to_be_bytes() } else { n.to_le_bytes() };
+    let long = |n: u32| if big { n.to_be_bytes() } else { n.to_le_bytes() };
+    out.extend(short(tag.0));
+    out.extend(short(tag.1));
+    let mut value = value.to_vec();
+    if value.len() % 2 == 1 {
+        value.push(if kind == "UI" { 0 } else { b' ' });
+    }
+    if explicit {
+        out.extend(kind.as_bytes());
+        if matches!(kind, "OB" | "OW" | "SQ") {
+            out.extend([0, 0]);
+            out.extend(long(value.len() as u32));
+        } else {
+            out.extend(short(value.len() as u16));
+        }
+    } else {
+        out.extend(long(value.len() as u32));
+    }
+    out.extend(value);
+}
+
+/// PackBits by literals alone.
+fn literals(bytes: &[u8]) -> Vec<u8> {
+    bytes.chunks(128).flat_map(|c| [&[c.len() as u8 - 1][..], c].concat()).collect()
+}
+
+/// A slice of 16-bit `pixels`, 3 columns wide, at `z` of series `uid`.
+pub(crate) fn slice(
+    syntax: Syntax,
+    uid: &str,
+    z: f64,
+    pixels: &[i16],
+    more: &[(&str, &str)],
+) -> Vec<u8> {
+    let big = syntax == Syntax::Big;
+    let explicit = syntax != Syntax::Implicit;
+    let mut meta = vec![0u8; 128];
+    meta.extend(b"DICM");
+    let name = match syntax {
+        Syntax::Implicit => "1.2.840.10008.1.2",
+        Syntax::Explicit => "1.2.840.10008.1.2.1",
+        Syntax::Deflated => "1.2.840.10008.1.2.1.99",
+        Syntax::Big => "1.2.840.10008.1.2.2",
+        Syntax::Rle => "1.2.840.10008.1.2.5",
+    };
+    element(&mut meta, true, false, (2, 0x10), "UI", name.as_bytes());
+    let mut body = Vec::new();
+    let mut put =
+        |tag, kind: &str, value: &[u8]| element(&mut body, explicit, big, tag, kind, value);
+    let short = |n: u16| if big { n.to_be_bytes() } else { n.to_le_bytes() };
+    let get = |key: &str, or: &str| {
+        more.iter().find(|(k, _)| *k == key).map_or(or, |(_, v)| v).as_bytes().to_vec()
+    };
+    put((8, 0x60), "CS", b"CT");
+    put((8, 0x103e), "LO", &get("description", "thorax"));
+    put((0x18, 0x50), "DS", b"9");
+    put((0x20, 0xe), "UI", uid.as_bytes());
+    put((0x20, 0x11), "IS", &get("number", "7"));
+    put((0x20, 0x13), "IS", &get("instance", "1"));
+    put((0x20, 0x32), "DS", &get("position", &format!("-4\\5\\{z}")));
+    put((0x20, 0x37), "DS", &get("orientation", "1\\0\\0\\0\\1\\0"));
+    put((0x28, 2), "US", &short(1));
+    put((0x28, 8), "IS", &get("frames", "1"));
+    put((0x28, 0x10), "US", &short(pixels.len() as u16 / 3));
+    put((0x28, 0x11), "US", &short(3));
+    put((0x28, 0x30), "DS", &get("pixel_spacing", "2\\0.5"));
+    put((0x28, 0x100), "US", &short(16));
+    let stored: u16 = String::from_utf8(get("stored", "16")).unwrap().parse().unwrap();
+    put((0x28, 0x101), "US", &short(stored));
+    put((0x28, 0x102), "US", &short(stored - 1));
+    put((0x28, 0x103), "US", &short(1));
+    put((0x28, 0x1052), "DS", &get("intercept", "-1024"));
+    put((0x28, 0x1053), "DS", &get("slope", "1"));
+    let words: Vec<u8> = pixels.iter().flat_map(|p| short(*p as u16)).collect();
+    if syntax == Syntax::Rle {
+        let halves =
+            [1, 0].map(|b| literals(&words.iter().skip(b).step_by(2).copied().collect::<Vec<_>>()));
+        let mut fragment = vec![0; 64];
+        fragment[..4].copy_from_slice(&2u32.to_le_bytes());
+        fragment[4..8].copy_from_slice(&64u32.to_le_bytes());
+        fragment[8..12].copy_from_slice(&(64 + halves[0].len() as u32).to_le_bytes());
+        fragment.extend(halves.concat());
+        body.extend([0xe0, 0x7f, 0x10, 0, b'O', b'B', 0, 0, 0xff, 0xff, 0xff, 0xff]);
+        for item in [&[][..], &fragment] {
+            body.extend([0xfe, 0xff, 0, 0xe0]);
+            body.extend((item.len() as u32).to_le_bytes());
+            body.extend(item);
+        }
+        body.extend([0xfe, 0xff, 0xdd, 0xe0, 0, 0, 0, 0]);
+    } else {
+        put((0x7fe0, 0x10), "OW", &words);
+    }
+    if syntax == Syntax::Deflated {
+        let mut z = flate2::write::DeflateEncoder::new(Vec::new(), flate2::Compression::fast());
+        z.write_all(&body).unwrap();
+        body = z.finish().unwrap();
+    }
+    [meta, body].concat()
+}
+
+fn folder(files: &[(&str, Vec<u8>)]) -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    files.iter().for_each(|(name, bytes)| std::fs::write(dir.path().join(name), bytes).unwrap());
+    dir
+}
+
+fn pixels(from: i16) -> Vec<i16> {
+    (from..from + 6).collect()
+}
+
+#[test]
+fn every_syntax_gives_the_same_sorted_series() {
+    let mut first = None;
+    for syntax in ALL {
+        // Named against their order in space.
+        let s = |z, from| slice(syntax, "1.2.3", z, &pixels(from), &[]);
+        let dir = folder(&[("a.dcm", s(4.0, 20)), ("b", s(1.0, -10)), ("c.ima", s(2.5, 5))]);
+        let v = crate::open(dir.path()).unwrap_or_else(|e| panic!("{syntax:?}: {e}"));
+        assert_eq!(v.name, "CT 7 thorax");
+        assert_eq!((v.lattice.dims, v.file_type.as_str()), ([3, 2, 3], "int16"));
+        assert!(v.anatomical);
+        // Columns 0.5 apart, rows 2; LPS became RAS.
+        assert_eq!(v.lattice.steps, [DVec3::X * -0.5, DVec3::Y * -2.0, DVec3::Z * 1.5]);
+        assert_eq!(v.lattice.origin, DVec3::new(4.0, -5.0, 1.0));
+        let values: Vec<f64> = (0..18).map(|i| v.summary.map.value(v.samples.code(i))).collect();
+        let want = [-10, 5, 20].into_iter().flat_map(pixels);
+        let want: Vec<f64> = want.map(|p| f64::from(p) - 1024.0).collect();
+        assert_eq!(values, want, "{syntax:?}");
+        assert_eq!(*first.get_or_insert(v.digest()), v.digest());
+        // One of its files means the series.
+        let opened = crate::open_with(&dir.path().join("c.ima"), &crate::Hints::default()).unwrap();
+        assert_eq!(opened.volume.digest(), v.digest());
+        assert!(opened.notes[0].contains("one of 3 slices"), "{:?}", opened.notes);
+    }
+}
+
+#[test]
+fn several_series_are_listed_and_one_is_taken_by_name() {
+    let s = |uid, z, number, description| {
+        slice(
+            Syntax::Implicit,
+            uid,
+            z,
+            &pixels(0),
+            &[("number", number), ("description", description)],
+        )
+    };
+    let dir = folder(&[
+        ("1", s("1.1", 0.0, "1", "scout")),
+        ("2", s("1.2", 0.0, "2", "thorax")),
+        ("3", s("1.2", 1.0, "2", "thorax")),
+    ]);
+    let e = crate::open(dir.path()).unwrap_err().to_string();
+    let list = "2 series: `CT 2 thorax` (2 slices), `CT 1 scout` (1 slices); name one of them";
+    assert!(e.contains("--series") && e.contains(list), "{e}");
+    for (series, count) in [("1", 1), ("2", 2), ("thorax", 2), ("CT 2 thorax", 2), ("1.2", 2)] {
+        let hints = crate::Hints { series: Some(series.into()), ..crate::Hints::default() };
+        let opened = crate::open_with(dir.path(), &hints).unwrap();
+        assert_eq!(opened.volume.lattice.dims[2], count, "{series}");
+        assert!(opened.notes[0].contains("of 2 was read"), "{:?}", opened.notes);
+    }
+    let hints = crate::Hints { series: Some("brain".into()), ..crate::Hints::default() };
+    let e = crate::open_with(dir.path(), &hints).unwrap_err().to_string();
+    assert!(e.contains("there is no `brain` among `CT 2 thorax`"), "{e}");
+}
+
+#[test]
+fn a_rescale_of_each_slice_and_unused_bits_are_honoured() {
+    let s = |z, slope| {
+        slice(Syntax::Explicit, "1", z, &[0, 1, 2], &[("slope", slope), ("intercept", "0")])
+    };
+    let dir = folder(&[("1", s(0.0, "0.5")), ("2", s(1.0, "2"))]);
+    let v = crate::open(dir.path()).unwrap();
+    assert_eq!(v.samples, Samples::F32(vec![0.0, 0.5, 1.0, 0.0, 2.0, 4.0]));
+    // 12 bits: what stands above them is not the value's; bit 11 is its sign.
+    let s = |z| slice(Syntax::Implicit, "1", z, &[0x7001, 0x0fff, 0x0800], &[("stored", "12")]);
+    let dir = folder(&[("1", s(0.0)), ("2", s(1.0))]);
+    let v = crate::open(dir.path()).unwrap();
+    let values: Vec<f64> = (0..3).map(|i| v.summary.map.value(v.samples.code(i))).collect();
+    assert_eq!(values, [1.0 - 1024.0, -1.0 - 1024.0, -2048.0 - 1024.0]);
+}
+
+#[test]
+fn what_is_not_read_is_refused_by_file_field_and_remedy() {
+    let good = |z| slice(Syntax::Explicit, "1", z, &pixels(0), &[]);
+    let with = |z, key, value| slice(Syntax::Explicit, "1", z, &pixels(0), &[(key, value)]);
+    let swap = |bytes: Vec<u8>, from: &str, to: &str| {
+        let at = bytes.windows(from.len()).position(|w| w == from.as_bytes()).unwrap();
+        let mut bytes = bytes;
+        bytes[at..at + to.len()].copy_from_slice(to.as_bytes());
+        bytes
+    };
+    for (second, say) in [
+        (good(0.0), "ImagePositionPatient: is the same for two slices"),
+        (good(1.0)[..good(1.0).len() - 3].to_vec(), "truncated: 12 bytes are needed and 9"),
+        (good(1.0)[..300].to_vec(), "`2` elements: truncated"),
+        (swap(good(1.0), "1\\0\\0\\0\\1\\0", "1\\0\\0\\x\\1\\0"), "is not 6 numbers"),
+        (with(1.0, "stored", "12"), "BitsStored: is not what the first slice"),
+    ] {
+        let dir = folder(&[("1", good(0.0)), ("2", second)]);
+        let e = crate::open(dir.path()).unwrap_err().to_string();
+        assert!(e.contains(say), "want {say:?} in {e}");
+    }
+    let dir = folder(&[("1", swap(good(0.0), "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.9"))]);
+    let e = crate::open(dir.path()).unwrap_err().to_string();
+    assert!(e.contains("`1.2.840.10008.1.2.9` is no encoding that is known; convert it"), "{e}");
+    let dir = folder(&[("1", with(0.0, "frames", "30"))]);
+    let e = crate::open(dir.path()).unwrap_err().to_string();
+    assert!(e.contains("`1` NumberOfFrames: is above 1"), "{e}");
+    // Gaps are drawn as if they were even, and said.
+    let dir = folder(&[("1", good(0.0)), ("2", good(1.0)), ("3", good(3.0))]);
+    let opened = crate::open_with(dir.path(), &crate::Hints::default()).unwrap();
+    assert!(opened.notes[0].contains("1.000 to 2.000 mm apart"), "{:?}", opened.notes);
+}
+
+#[test]
+fn a_reader_that_dies_is_told_of() {
+    let dir = folder(&[("1", slice(Syntax::Implicit, "1", 0.0, &pixels(0), &[]))]);
+    for (program, say) in
+        [(&["false"][..], "exit status: 1"), (&["/no/such"], "could not be started")]
+    {
+        let reader = program.iter().map(OsString::from).collect();
+        let hints = crate::Hints { dicom_reader: Some(reader), ..crate::Hints::default() };
+        let e = crate::open_with(dir.path(), &hints).unwrap_err().to_string();
+        assert!(e.contains(say) && e.contains("512 MiB"), "{e}");
+    }
+}

@@ -1,0 +1,600 @@
+//! Stacks of TIFF pictures: the pages of one file, or the files of a folder in the order of the
+//! numbers in their names.
+//!
+//! The `tiff` crate reads strips and tiles; we ask for one band of them at a time, so that no
+//! page is ever held whole, and see to it that a band is no larger than the file can account for.
+//! TIFF has no word for the distance of pages. Where ImageJ or OME have written theirs into the
+//! description it is taken; resolutions alone are not, since picture programs fill in 72 dpi.
+
+use crate::error::{OpenErrorKind, Problem, quoted};
+use crate::raw::RawHints;
+use crate::samples::{self, DIM_MAX, Endian, Layout, Number, Supply};
+use crate::source::{Source, Stream};
+use crate::unpack::wrapped;
+use slabcast_common::volume::{Lattice, Volume};
+use std::collections::VecDeque;
+use std::io::{BufReader, Read};
+use std::path::{Path, PathBuf};
+use tiff::decoder::{ChunkType, Decoder, Limits};
+use tiff::tags::Tag;
+use tiff::{ColorType, TiffError};
+
+/// Bytes of a band (the strip, or the row of tiles, that is unpacked at a time): room for most
+/// whole pages, and below the 64 MiB that reading may take beside the voxels.
+const BAND_MAX_BYTES: u64 = 48 << 20;
+/// A band of this size is taken at a file's word; a larger one needs half as many bytes in the
+/// file, so that a small file can't make us take much.
+const BAND_FREE_BYTES: u64 = 8 << 20;
+
+/// Whether these first bytes are TIFF or BigTIFF.
+pub(crate) fn sniff(head: &[u8]) -> bool {
+    [&b"II*\0"[..], b"MM\0*", b"II+\0", b"MM\0+"].iter().any(|magic| head.starts_with(magic))
+}
+
+/// Reads the pages of one file.
+pub(crate) fn read(source: Source, name: &str, hints: &RawHints) -> Result<Volume, Problem> {
+    let len = source.len;
+    let mut pages = File::open(source)?;
+    let first = pages.page()?;
+    let mut count = 1;
+    while pages.next()? {
+        let page = pages.page()?;
+        if page != first {
+            return Err(differs(&format!("page {}", count + 1), &page, &first));
+        }
+        count += 1;
+        if count > DIM_MAX {
+            return Err(too_many(count));
+        }
+    }
+    let spacing = pages.first_spacing(count)?;
+    pages.rewind()?;
+    let stack = Stack {
+        now: Some(pages),
+        files: VecDeque::new(),
+        page: first,
+        band: Vec::new(),
+        at: 0,
+        row: 0,
+    };
+    finish(stack, count, len, name, hints.spacing.or(spacing))
+}
+
+/// Reads the files of a folder, which are TIFF and in order. `name` is what to call the volume.
+pub(crate) fn read_files(
+    files: Vec<PathBuf>,
+    name: &str,
+    hints: &RawHints,
+) -> Result<Volume, Problem> {
+    let (mut first, mut spacing, mut total) = (None, None, 0);
+    let count = files.len() as u64;
+    if count > DIM_MAX {
+        return Err(too_many(count));
+    }
+    for path in &files {
+        let shown = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let here = |mut p: Problem| {
+            p.field = format!("{} {}", quoted(&shown), p.field);
+            p
+        };
+        let source = Source::open(path, "file").map_err(here)?;
+        total += source.len;
+        let mut file = File::open(source).map_err(here)?;
+        let page = file.page().map_err(here)?;
+        match &first {
+            None => {
+                spacing = file.first_spacing(count)?;
+                first = Some(page);
+            }
+            Some(first) if page != *first => return Err(differs(&quoted(&shown), &page, first)),
+            Some(_) => {}
+        }
+        if file.next().map_err(here)? {
+            return Err(Problem::unsupported(
+                quoted(&shown),
+                "has several pages, and is not the only file of its folder",
+                "give one file with all pages, or files of one page each",
+            ));
+        }
+    }
+    let page = first.expect("whoever calls has seen a file");
+    let stack =
+        Stack { now: None, files: files.into(), page, band: Vec::new(), at: 0, row: page.height };
+    finish(stack, count, total, name, hints.spacing.or(spacing))
+}
+
+fn finish(
+    mut stack: Stack,
+    count: u64,
+    len: u64,
+    name: &str,
+    spacing: Option<[f64; 3]>,
+) -> Result<Volume, Problem> {
+    let Page { width, height, number } = stack.page;
+    let endian = if cfg!(target_endian = "big") { Endian::Big } else { Endian::Little };
+    let dims = [width.into(), height.into(), count];
+    let layout = Layout::new(dims, number, endian, "pages")?;
+    let lattice = Lattice::from_spacing(layout.dims, spacing.unwrap_or([1.0; 3]));
+    lattice.check().map_err(|e| Problem::malformed("spacing", e, "give it with --spacing"))?;
+    // A code of 12 bits stands for at most 4096 bytes in LZW, the densest of what is read.
+    let supply = Supply::Encoded { name: "TIFF", bytes: len, ratio: 4096 };
+    let (samples, map) = samples::read(&mut stack, supply, &layout)?;
+    Ok(Volume::new(name, number.name(), false, lattice, samples, map))
+}
+
+fn too_many(count: u64) -> Problem {
+    Problem::new(
+        OpenErrorKind::TooLarge,
+        "pages",
+        format!("{count} or more are more than {DIM_MAX}"),
+        "leave some out",
+    )
+}
+
+fn differs(which: &str, page: &Page, first: &Page) -> Problem {
+    Problem::malformed(
+        which,
+        format!("is {page}, where the first is {first}"),
+        "make all of one size and type, or leave it out",
+    )
+}
+
+/// What all pages of a stack have in common.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Page {
+    width: u32,
+    height: u32,
+    number: Number,
+}
+
+impl std::fmt::Display for Page {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} x {} {}", self.width, self.height, self.number.name())
+    }
+}
+
+/// One TIFF file, at one of its pages.
+struct File {
+    decoder: Decoder<BufReader<Box<dyn Stream>>>,
+    band_max: u64,
+}
+
+impl File {
+    fn open(source: Source) -> Result<File, Problem> {
+        let band_max = BAND_MAX_BYTES.min(BAND_FREE_BYTES.max(2 * source.len));
+        let mut limits = Limits::unlimited();
+        limits.decoding_buffer_size = band_max as usize;
+        limits.intermediate_buffer_size = band_max as usize;
+        limits.ifd_value_size = 1 << 20;
+        let decoder = Decoder::new(source.reader).map_err(|e| trouble(&e))?.with_limits(limits);
+        Ok(File { decoder, band_max })
+    }
+
+    /// Goes to the next page that is no thumbnail; false where there is none.
+    fn next(&mut self) -> Result<bool, Problem> {
+        while self.decoder.more_images() {
+            self.decoder.next_image().map_err(|e| trouble(&e))?;
+            if !self.is_reduced() {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    /// Whether the page is a smaller version of another one.
+    fn is_reduced(&mut self) -> bool {
+        let kind = self.decoder.find_tag_unsigned::<u32>(Tag::NewSubfileType);
+        kind.ok().flatten().is_some_and(|kind| kind & 1 == 1)
+    }
+
+    fn rewind(&mut self) -> Result<(), Problem> {
+        self.decoder.seek_to_image(0).map_err(|e| trouble(&e))
+    }
+
+    /// What the page is, if it can be part of a volume.
+    fn page(&mut self) -> Result<Page, Problem> {
+        let (width, height) = self.decoder.dimensions().map_err(|e| trouble(&e))?;
+        let bits = match self.decoder.colortype().map_err(|e| trouble(&e))? {
+            ColorType::Gray(bits) => bits,
+            other => {
+                return Err(Problem::unsupported(
+                    "PhotometricInterpretation",
+                    format!("{other:?} is no grey picture"),
+                    "save it in shades of grey, one number a pixel",
+                ));
+            }
+        };
+        let format = self.decoder.find_tag_unsigned_vec::<u16>(Tag::SampleFormat);
+        let format = format.ok().flatten().and_then(|f| f.first().copied()).unwrap_or(1);
+        let number = match (bits, format) {
+            (8, 1) => Number::U8,
+            (16, 1) => Number::U16,
+            (32, 1) => Number::U32,
+            (64, 1) => Number::U64,
+            (8, 2) => Number::I8,
+            (16, 2) => Number::I16,
+            (32, 2) => Number::I32,
+            (64, 2) => Number::I64,
+            (32, 3) => Number::F32,
+            (64, 3) => Number::F64,
+            _ => {
+                return Err(Problem::unsupported(
+                    "BitsPerSample",
+                    format!("{bits} bits of SampleFormat {format} are not read"),
+                    "save it with 8, 16 or 32 bits",
+                ));
+            }
+        };
+        // Looked at here, since the first look should refuse what the second could not read.
+        Layout::new([width.into(), height.into(), 1], number, Endian::Little, "ImageWidth")?;
+        let (chunk_width, chunk_height) = self.decoder.chunk_dimensions();
+        let tiled = self.decoder.get_chunk_type() == ChunkType::Tile;
+        let rows = u64::from(chunk_height.min(height));
+        // A tile is unpacked beside its band.
+        let tile = if tiled { u64::from(chunk_width) * u64::from(chunk_height) } else { 0 };
+        let band = (rows * u64::from(width) + tile).saturating_mul(number.bytes());
+        if chunk_width == 0 || chunk_height == 0 || band > self.band_max {
+            return Err(Problem::new(
+                OpenErrorKind::TooLarge,
+                if tiled { "TileLength" } else { "RowsPerStrip" },
+                format!("bands of {band} bytes are more than the {} that are read", self.band_max),
+                "save it with smaller strips or tiles",
+            ));
+        }
+        Ok(Page { width, height, number })
+    }
+
+    /// The next band of a page from `row` on: its bytes in the machine's order, rows in order.
+    fn band(&mut self, page: &Page, row: u32, band: &mut Vec<u8>) -> Result<u32, Problem> {
+        let (chunk_width, chunk_height) = self.decoder.chunk_dimensions();
+        let rows = chunk_height.min(page.height - row);
+        let size = page.number.bytes() as usize;
+        let stride = page.width as usize * size;
+        band.clear();
+        samples::reserve(band, stride * rows as usize)?;
+        band.resize(stride * rows as usize, 0);
+        let across = match self.decoder.get_chunk_type() {
+            ChunkType::Strip => 1,
+            ChunkType::Tile => page.width.div_ceil(chunk_width),
+        };
+        let first = row / chunk_height * across;
+        if across == 1 && chunk_width >= page.width {
+            let index = first;
+            self.has(index)?;
+            let (w, h) = self.decoder.chunk_data_dimensions(index);
+            if (w, h) == (page.width, rows) {
+                self.decoder.read_chunk_bytes(index, band).map_err(|e| trouble(&e))?;
+                return Ok(rows);
+            }
+        }
+        let mut tile = Vec::new();
+        for x in 0..across {
+            let index = first + x;
+            self.has(index)?;
+            let (w, h) = self.decoder.chunk_data_dimensions(index);
+            let (w, h) = (w as usize, h as usize);
+            let from = (x * chunk_width) as usize * size;
+            if h < rows as usize || from + w * size > stride {
+                return Err(Problem::malformed("TileLength", "does not fit the page", RESAVE));
+            }
+            tile.clear();
+            samples::reserve(&mut tile, w * h * size)?;
+            tile.resize(w * h * size, 0);
+            self.decoder.read_chunk_bytes(index, &mut tile).map_err(|e| trouble(&e))?;
+            for (to, from_tile) in band.chunks_exact_mut(stride).zip(tile.chunks_exact(w * size)) {
+                to[from..from + w * size].copy_from_slice(from_tile);
+            }
+        }
+        Ok(rows)
+    }
+
+    /// Refuses a chunk that the file does not list; the library panics.
+    fn has(&mut self, index: u32) -> Result<(), Problem> {
+        let count = match self.decoder.get_chunk_type() {
+            ChunkType::Strip => self.decoder.strip_count(),
+            ChunkType::Tile => self.decoder.tile_count(),
+        };
+        if index < count.map_err(|e| trouble(&e))? {
+            return Ok(());
+        }
+        Err(Problem::malformed("StripOffsets", "has fewer entries than the page needs", RESAVE))
+    }
+
+    /// What the page's description says of the distances of samples, in mm; refuses channels and
+    /// pages that are not there.
+    fn first_spacing(&mut self, pages: u64) -> Result<Option<[f64; 3]>, Problem> {
+        // It stands on the first page.
+        self.rewind()?;
+        let Ok(text) = self.decoder.get_tag_ascii_string(Tag::ImageDescription) else {
+            return Ok(None);
+        };
+        let resolution = |d: &mut Decoder<_>, tag| match d.find_tag(tag).ok().flatten() {
+            Some(tiff::decoder::ifd::Value::Rational(a, b)) if a > 0 && b > 0 => {
+                Some(f64::from(b) / f64::from(a))
+            }
+            _ => None,
+        };
+        let said = Description::of(&text);
+        if said.channels > 1 || said.images > pages {
+            return Err(Problem::unsupported(
+                "ImageDescription",
+                format!(
+                    "says {} channels or times of {} pictures, and {pages} pages are there",
+                    said.channels, said.images
+                ),
+                "save one channel and one time, a page for each slice",
+            ));
+        }
+        let flat = match said.flat {
+            Some(flat) => Some(flat),
+            // OME has no unit of pixels; ImageJ's counts for them.
+            None if text.contains("<OME") => None,
+            None => resolution(&mut self.decoder, Tag::XResolution)
+                .zip(resolution(&mut self.decoder, Tag::YResolution)),
+        };
+        let spacing =
+            said.mm.zip(flat).map(|(mm, (x, y))| [x * mm, y * mm, said.depth.unwrap_or(1.0) * mm]);
+        Ok(spacing.filter(|s| s.iter().all(|x| x.is_finite() && *x > 0.0)))
+    }
+}
+
+const RESAVE: &str = "save it again, for instance with ImageJ";
+
+/// What ImageJ and OME write into the description of the first page.
+#[derive(Debug, Default, PartialEq)]
+struct Description {
+    /// Millimetres of its unit, where it names one.
+    mm: Option<f64>,
+    /// Distance of pixels, where it says it itself.
+    flat: Option<(f64, f64)>,
+    depth: Option<f64>,
+    /// Channels times points of time.
+    channels: u64,
+    images: u64,
+}
+
+impl Description {
+    fn of(text: &str) -> Description {
+        let mut said = Description { channels: 1, ..Description::default() };
+        if text.starts_with("ImageJ=") {
+            let get = |key: &str| {
+                text.lines().find_map(|l| l.strip_prefix(key)?.strip_prefix('=').map(str::trim))
+            };
+            let number = |key| get(key).and_then(|v| v.parse::<u64>().ok());
+            said.images = number("images").unwrap_or(0);
+            let product =
+                number("channels").unwrap_or(1).checked_mul(number("frames").unwrap_or(1));
+            said.channels = product.unwrap_or(u64::MAX);
+            said.mm = get("unit").and_then(millimetres);
+            said.depth = get("spacing").and_then(|v| v.parse().ok());
+        } else if text.contains("<OME") {
+            let get = |key: &str| {
+                let after = text.split_once(&format!(" {key}=\""))?.1;
+                after.split_once('"').map(|(value, _)| value)
+            };
+            let number = |key| get(key).and_then(|v| v.parse::<u64>().ok()).unwrap_or(1);
+            said.channels = number("SizeC").saturating_mul(number("SizeT"));
+            said.images = number("SizeZ");
+            let size = |key: &str| {
+                let mm = millimetres(get(&format!("{key}Unit")).unwrap_or("um"))?;
+                Some(get(key)?.parse::<f64>().ok()? * mm)
+            };
+            // In mm already, each by its own unit.
+            said.flat = size("PhysicalSizeX").zip(size("PhysicalSizeY"));
+            said.depth = size("PhysicalSizeZ");
+            said.mm = Some(1.0);
+        }
+        said
+    }
+}
+
+fn millimetres(unit: &str) -> Option<f64> {
+    Some(match unit {
+        "m" => 1000.0,
+        "cm" => 10.0,
+        "mm" => 1.0,
+        "um" | "\u{b5}m" | "\u{3bc}m" | "\\u00B5m" | "micron" | "microns" => 1e-3,
+        "nm" => 1e-6,
+        _ => return None,
+    })
+}
+
+fn trouble(e: &TiffError) -> Problem {
+    let short = |text: String| {
+        let text: String = text.chars().take(120).collect();
+        text
+    };
+    match e {
+        TiffError::IoError(e) if e.kind() == std::io::ErrorKind::UnexpectedEof => Problem::new(
+            OpenErrorKind::Damaged,
+            "pages",
+            "truncated: the file ends before its pictures",
+            "get the whole file",
+        ),
+        TiffError::UnsupportedError(e) => Problem::unsupported(
+            "TIFF",
+            short(e.to_string()),
+            "save it uncompressed, or with LZW or deflate",
+        ),
+        TiffError::LimitsExceeded => Problem::new(
+            OpenErrorKind::TooLarge,
+            "TIFF",
+            "asks for more memory than the file can account for",
+            RESAVE,
+        ),
+        e => Problem::new(
+            OpenErrorKind::Damaged,
+            "TIFF",
+            format!("is damaged ({})", short(e.to_string())),
+            "get the file again",
+        ),
+    }
+}
+
+/// The samples of all pages, one after another.
+struct Stack {
+    now: Option<File>,
+    /// Files of which none was opened yet.
+    files: VecDeque<PathBuf>,
+    page: Page,
+    band: Vec<u8>,
+    /// What of the band was handed out.
+    at: usize,
+    /// The first row of the page that was not unpacked.
+    row: u32,
+}
+
+impl Stack {
+    /// Unpacks the next band; false at the end.
+    fn fill(&mut self) -> Result<bool, Problem> {
+        if self.row >= self.page.height {
+            let more = match &mut self.now {
+                Some(file) if self.files.is_empty() => file.next()?,
+                _ => false,
+            };
+            if !more {
+                let Some(path) = self.files.pop_front() else { return Ok(false) };
+                self.now = Some(File::open(Source::open(&path, "file")?)?);
+            }
+            self.row = 0;
+        }
+        let Some(file) = &mut self.now else { return Ok(false) };
+        // The file may have changed since it was looked at.
+        let page = file.page()?;
+        if page != self.page {
+            return Err(differs("a page", &page, &self.page));
+        }
+        self.row += file.band(&page, self.row, &mut self.band)?;
+        self.at = 0;
+        Ok(true)
+    }
+}
+
+impl Read for Stack {
+    fn read(&mut self, buf: &mut [u8]) -> std::io::Result<usize> {
+        if self.at == self.band.len() && !self.fill().map_err(wrapped)? {
+            return Ok(0);
+        }
+        let n = (self.band.len() - self.at).min(buf.len());
+        buf[..n].copy_from_slice(&self.band[self.at..self.at + n]);
+        self.at += n;
+        Ok(n)
+    }
+}
+
+/// Names in the order that people mean: numbers in them by their size.
+pub(crate) fn by_number(a: &Path, b: &Path) -> std::cmp::Ordering {
+    let key = |p: &Path| {
+        let name = p.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+        let mut words: Vec<(String, String)> = Vec::new();
+        let mut rest = name.as_str();
+        while !rest.is_empty() {
+            let digits = rest.starts_with(|c: char| c.is_ascii_digit());
+            let end = rest.find(|c: char| c.is_ascii_digit() != digits).unwrap_or(rest.len());
+            let word = &rest[..end];
+            rest = &rest[end..];
+            // Numbers compare by length, then digits; leading zeros don't count.
+            let bare = if digits { word.trim_start_matches('0') } else { word };
+            let rank = if digits { format!("0{:04}", bare.len()) } else { "1".into() };
+            words.push((rank, bare.to_string()));
+        }
+        words
+    };
+    key(a).cmp(&key(b)).then_with(|| a.cmp(b))
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use slabcast_common::volume::Samples;
+    use std::io::Cursor;
+    use tiff::encoder::{Compression, TiffEncoder, colortype};
+
+    /// Pages of 5 x 4 samples 0, 1, 2, ...
+    pub(crate) fn pages(count: u16, compression: Compression) -> Vec<u8> {
+        let mut out = Cursor::new(Vec::new());
+        let mut tiff = TiffEncoder::new(&mut out).unwrap().with_compression(compression);
+        for page in 0..count {
+            let data: Vec<u16> = (0..20).map(|i| page * 20 + i).collect();
+            let mut image = tiff.new_image::<colortype::Gray16>(5, 4).unwrap();
+            image.rows_per_strip(3).unwrap();
+            image.write_data(&data).unwrap();
+        }
+        out.into_inner()
+    }
+
+    fn one<C: colortype::ColorType>(w: u32, h: u32, data: &[C::Inner], text: &str) -> Vec<u8>
+    where
+        [C::Inner]: tiff::encoder::TiffValue,
+    {
+        let mut out = Cursor::new(Vec::new());
+        let mut tiff = TiffEncoder::new(&mut out).unwrap();
+        let mut image = tiff.new_image::<C>(w, h).unwrap();
+        image.encoder().write_tag(Tag::ImageDescription, text).unwrap();
+        image.x_resolution(tiff::encoder::Rational { n: 4, d: 1 });
+        image.y_resolution(tiff::encoder::Rational { n: 2, d: 1 });
+        image.write_data(data).unwrap();
+        out.into_inner()
+    }
+
+    fn open(bytes: Vec<u8>) -> Result<Volume, Problem> {
+        crate::read(Source::memory(bytes), Path::new("."), "t.tif", &crate::Hints::default())
+    }
+
+    #[test]
+    fn pages_are_slices_however_packed() {
+        for compression in [
+            Compression::Uncompressed,
+            Compression::Lzw,
+            Compression::Packbits,
+            Compression::Deflate(tiff::encoder::DeflateLevel::Fast),
+        ] {
+            let v = open(pages(3, compression)).unwrap();
+            assert_eq!((v.lattice.dims, v.file_type.as_str()), ([5, 4, 3], "uint16"));
+            assert_eq!(v.samples, Samples::U16((0..60).collect()));
+            assert_eq!(v.lattice.spacing(), [1.0; 3], "a resolution alone says nothing");
+        }
+    }
+
+    #[test]
+    fn types_and_descriptions_are_honoured() {
+        let ij = "ImageJ=1.53\nimages=1\nunit=micron\nspacing=3\n";
+        let v = open(one::<colortype::Gray32Float>(2, 1, &[-1.5, 2.0], ij)).unwrap();
+        assert_eq!((v.file_type.as_str(), v.summary.range()), ("float32", (-1.5, 2.0)));
+        let near = |got: [f64; 3], want: [f64; 3]| (0..3).all(|a| (got[a] - want[a]).abs() < 1e-12);
+        assert!(near(v.lattice.spacing(), [0.25e-3, 0.5e-3, 3e-3]), "{:?}", v.lattice.spacing());
+        let ome = "<?xml?><OME><Pixels SizeC=\"1\" SizeT=\"1\" SizeZ=\"1\" PhysicalSizeX=\"2\" \
+                   PhysicalSizeY=\"3\" PhysicalSizeZ=\"4\" PhysicalSizeZUnit=\"mm\"/></OME>";
+        let v = open(one::<colortype::GrayI8>(2, 1, &[-1, 2], ome)).unwrap();
+        assert_eq!(v.summary.range(), (-1.0, 2.0));
+        assert!(near(v.lattice.spacing(), [2e-3, 3e-3, 4.0]), "{:?}", v.lattice.spacing());
+        let e = open(one::<colortype::Gray8>(1, 1, &[1], "ImageJ=1\nimages=9\n")).unwrap_err();
+        assert!(e.to_string().contains("9 pictures, and 1 pages"), "{e}");
+        let e = open(one::<colortype::RGB8>(1, 1, &[1, 2, 3], "")).unwrap_err().to_string();
+        assert!(e.contains("RGB(8) is no grey picture; save it in shades of grey"), "{e}");
+        let all = pages(2, Compression::Lzw);
+        for cut in [8, 20, 60, all.len() / 2, all.len() - 1] {
+            let e = open(all[..cut].to_vec()).unwrap_err();
+            assert!(matches!(e.kind, OpenErrorKind::Damaged), "{cut}: {e}");
+        }
+    }
+
+    #[test]
+    fn a_folder_is_sorted_by_number_and_must_be_of_one_kind() {
+        let dir = tempfile::tempdir().unwrap();
+        let put = |name: &str, bytes: &[u8]| std::fs::write(dir.path().join(name), bytes).unwrap();
+        for (name, value) in [("s 10.tif", 3), ("s 9.tif", 2), ("S 1.tiff", 1)] {
+            put(name, &one::<colortype::Gray8>(2, 1, &[value, value], ""));
+        }
+        put("notes.txt", b"hello");
+        let v = crate::open(dir.path()).unwrap();
+        assert_eq!(v.lattice.dims, [2, 1, 3]);
+        assert_eq!(v.samples, Samples::U8(vec![1, 1, 2, 2, 3, 3]));
+        put("s 11.tif", &one::<colortype::Gray8>(1, 1, &[9], ""));
+        let e = crate::open(dir.path()).unwrap_err().to_string();
+        assert!(e.contains("`s 11.tif`: is 1 x 1 uint8, where the first is 2 x 1 uint8"), "{e}");
+        put("s 11.tif", &pages(2, Compression::Lzw));
+        let e = crate::open(dir.path()).unwrap_err().to_string();
+        assert!(e.contains("s 11.tif"), "{e}");
+    }
+}

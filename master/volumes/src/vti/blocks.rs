@@ -1,0 +1,113 @@
+//! zlib blocks one after another, each of a size that is known before and after packing; and text
+//! that ends with the next tag.
+
+use crate::error::{OpenErrorKind, Problem};
+use crate::unpack::wrapped;
+use flate2::read::ZlibDecoder;
+use std::io::{BufRead, Read, Take};
+
+/// Where a block's bytes come from: between two blocks, or through the one that is unpacked.
+enum State {
+    Between(Box<dyn Read>),
+    Inside(ZlibDecoder<Take<Box<dyn Read>>>),
+    Done,
+}
+
+pub(super) struct Blocks {
+    state: State,
+    /// Packed size of each block.
+    packed: Vec<u64>,
+    /// Unpacked size of each but the last; and of the last, 0 where it is whole.
+    size: u64,
+    last: u64,
+    /// The block that is unpacked or comes next, and what of it has not come yet.
+    at: usize,
+    left: u64,
+}
+
+impl Blocks {
+    pub(super) fn new(inner: Box<dyn Read>, packed: Vec<u64>, size: u64, last: u64) -> Self {
+        Blocks { state: State::Between(inner), packed, size, last, at: 0, left: 0 }
+    }
+
+    fn damaged(&self, what: &str) -> std::io::Error {
+        wrapped(Problem::new(
+            OpenErrorKind::Damaged,
+            format!("block {} of {}", self.at + 1, self.packed.len()),
+            what,
+            "get the file again",
+        ))
+    }
+}
+
+impl Read for Blocks {
+    fn read(&mut self, buf: &mut [u8]) -> std::io::Result<usize> {
+        if buf.is_empty() {
+            return Ok(0);
+        }
+        loop {
+            match std::mem::replace(&mut self.state, State::Done) {
+                State::Done => return Ok(0),
+                State::Between(inner) => {
+                    let Some(&packed) = self.packed.get(self.at) else { return Ok(0) };
+                    let last = self.at + 1 == self.packed.len() && self.last > 0;
+                    self.left = if last { self.last } else { self.size };
+                    self.state = State::Inside(ZlibDecoder::new(inner.take(packed)));
+                }
+                State::Inside(mut decoder) if self.left > 0 => {
+                    let want = (buf.len() as u64).min(self.left) as usize;
+                    let n = match decoder.read(&mut buf[..want]) {
+                        Ok(0) => return Err(self.damaged("ends before its size")),
+                        Ok(n) => n,
+                        Err(e) if e.get_ref().is_some_and(|inner| inner.is::<Problem>()) => {
+                            return Err(e);
+                        }
+                        Err(_) => return Err(self.damaged("is damaged")),
+                    };
+                    self.left -= n as u64;
+                    self.state = State::Inside(decoder);
+                    return Ok(n);
+                }
+                State::Inside(mut decoder) => {
+                    // Its checksum is looked at on the way to its end.
+                    match decoder.read(&mut [0]) {
+                        Ok(0) => {}
+                        Ok(_) => return Err(self.damaged("goes on after its size")),
+                        Err(_) => return Err(self.damaged("is damaged")),
+                    }
+                    let mut rest = decoder.into_inner();
+                    std::io::copy(&mut rest, &mut std::io::sink())?;
+                    self.state = State::Between(rest.into_inner());
+                    self.at += 1;
+                }
+            }
+        }
+    }
+}
+
+/// What stands before the next `<`.
+pub(super) struct UntilTag<R> {
+    pub(super) inner: R,
+}
+
+impl<R: BufRead> BufRead for UntilTag<R> {
+    fn fill_buf(&mut self) -> std::io::Result<&[u8]> {
+        let chunk = self.inner.fill_buf()?;
+        let end = chunk.iter().position(|b| *b == b'<').unwrap_or(chunk.len());
+        Ok(&chunk[..end])
+    }
+
+    fn consume(&mut self, n: usize) {
+        self.inner.consume(n);
+    }
+}
+
+impl<R: BufRead> Read for UntilTag<R> {
+    fn read(&mut self, buf: &mut [u8]) -> std::io::Result<usize> {
+        let chunk = self.fill_buf()?;
+        let n = chunk.len().min(buf.len());
+        buf[..n].copy_from_slice(&chunk[..n]);
+        self.consume(n);
+        Ok(n)
+    }
+}

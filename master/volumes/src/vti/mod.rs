@@ -1,0 +1,371 @@
+//! VTK's XML image data (`.vti`): ascii, base64 and appended, plain or in zlib blocks.
+//!
+//! With raw appended data the file is no XML, so it is read as a stream of tags, and the one
+//! array that is drawn is read where it stands: the active scalars of the points, else the first
+//! array of one number a point, else of the cells.
+//!
+//! Binary data begin with a header of 32- or 64-bit numbers (`header_type`): the number of bytes;
+//! or where blocks are packed, their number, the size of a whole one, the size of the last, and
+//! each packed size. In base64 a packed array's header is encoded apart from its blocks.
+
+mod blocks;
+mod tags;
+
+use crate::error::{Problem, quoted};
+use crate::samples::{self, Endian, Layout, Number, Supply};
+use crate::source::{Source, Stream};
+use crate::unpack::{Base64, Encoding};
+use blocks::Blocks;
+use glam::{DMat3, DVec3};
+use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use tags::{Tag, Tags};
+
+const RESAVE: &str = "save it again as one ImageData piece with VTK or ParaView";
+
+/// Whether these first bytes are VTK XML; of what type is seen later.
+pub(crate) fn sniff(head: &[u8]) -> bool {
+    let text = &head[..head.len().min(4096)];
+    let text = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text).trim_ascii_start();
+    let named = || text.windows(8).any(|w| w == b"<VTKFile");
+    text.starts_with(b"<VTKFile") || text.starts_with(b"<?xml") && named()
+}
+
+/// Reads a volume from a source at its beginning.
+pub(crate) fn read(source: Source, name: &str) -> Result<Volume, Problem> {
+    let len = source.len;
+    let mut tags = Tags::new(source.reader);
+    let (mut file, mut image, mut section) = (None, None, None);
+    // The array that is drawn, where its data are appended further down, and its offset there.
+    let mut appended: Option<(Array, u64)> = None;
+    let outside = |tag: &Tag| {
+        Problem::malformed(tag.name.as_str(), "does not stand inside ImageData", RESAVE)
+    };
+    while let Some(tag) = tags.next()? {
+        match tag.name.as_str() {
+            "VTKFile" => file = Some(File::of(&tag)?),
+            "ImageData" => image = Some(Image::of(&tag)?),
+            "Piece" => image.as_mut().ok_or_else(|| outside(&tag))?.piece(&tag)?,
+            "PointData" => section = Some(Section::of(&tag, false)),
+            "CellData" => section = Some(Section::of(&tag, true)),
+            "/PointData" | "/CellData" => section = None,
+            "DataArray" if appended.is_none() => {
+                let Some(section) = &section else { continue };
+                let Some(array) = section.wants(&tag)? else { continue };
+                let file = file.as_ref().ok_or_else(|| outside(&tag))?;
+                let image = image.as_ref().ok_or_else(|| outside(&tag))?;
+                let stands = match tag.required("format")? {
+                    "appended" => {
+                        tag.required("offset")?;
+                        let [offset] = tag.numbers::<u64, 1>("offset")?.unwrap_or_default();
+                        appended = Some((array, offset));
+                        continue;
+                    }
+                    "ascii" => Stands::Text,
+                    "binary" => Stands::Base64,
+                    _ => return Err(tag.bad("format", "ascii, binary or appended")),
+                };
+                let left = len.saturating_sub(tags.at);
+                return finish(file, image, &array, (stands, tags.reader, left), name);
+            }
+            "AppendedData" => {
+                let Some((array, offset)) = &appended else { break };
+                let file = file.as_ref().ok_or_else(|| outside(&tag))?;
+                let image = image.as_ref().ok_or_else(|| outside(&tag))?;
+                let stands = match tag.required("encoding")? {
+                    "raw" => Stands::Raw,
+                    "base64" => Stands::Base64,
+                    _ => return Err(tag.bad("encoding", "raw or base64")),
+                };
+                let left = if tags.skip_past(b'_')? { len.saturating_sub(tags.at) } else { 0 };
+                if *offset >= left {
+                    return Err(Problem::malformed(
+                        format!("DataArray {} offset", quoted(&array.name)),
+                        format!("{offset} lies past the end of the file"),
+                        "get the whole file",
+                    ));
+                }
+                let mut reader = tags.reader;
+                reader
+                    .seek(SeekFrom::Current(*offset as i64))
+                    .map_err(|e| Problem::io("AppendedData", &e))?;
+                return finish(file, image, array, (stands, reader, left - offset), name);
+            }
+            _ => {}
+        }
+    }
+    Err(match (file, appended) {
+        (None, _) => Problem::malformed("VTKFile", "is missing", RESAVE),
+        (_, Some(_)) => Problem::malformed("AppendedData", "is missing", "get the whole file"),
+        _ => Problem::unsupported(
+            "DataArray",
+            "there is none with one number a point or cell",
+            "save a volume with one component",
+        ),
+    })
+}
+
+/// What `VTKFile` says.
+struct File {
+    endian: Endian,
+    /// Bytes of a number in a header of data.
+    word: usize,
+    packed: bool,
+}
+
+impl File {
+    fn of(tag: &Tag) -> Result<File, Problem> {
+        if tag.required("type")? != "ImageData" {
+            return Err(Problem::unsupported(
+                "VTKFile type",
+                format!("{} is no ImageData", quoted(tag.get("type").unwrap_or_default())),
+                "resample it to an image (ParaView: Resample To Image)",
+            ));
+        }
+        let endian = match tag.get("byte_order") {
+            None | Some("LittleEndian") => Endian::Little,
+            Some("BigEndian") => Endian::Big,
+            Some(_) => return Err(tag.bad("byte_order", "LittleEndian or BigEndian")),
+        };
+        let word = match tag.get("header_type") {
+            None | Some("UInt32") => 4,
+            Some("UInt64") => 8,
+            Some(_) => return Err(tag.bad("header_type", "UInt32 or UInt64")),
+        };
+        let packed = match tag.get("compressor") {
+            None | Some("") => false,
+            Some("vtkZLibDataCompressor") => true,
+            Some(_) => {
+                return Err(tag.bad("compressor", "vtkZLibDataCompressor, or leave it out"));
+            }
+        };
+        Ok(File { endian, word, packed })
+    }
+}
+
+/// What `ImageData` and its piece say of where the points lie.
+struct Image {
+    extent: [i64; 6],
+    pieces: u32,
+    origin: DVec3,
+    /// From index to world, without the origin.
+    steps: DMat3,
+}
+
+impl Image {
+    fn of(tag: &Tag) -> Result<Image, Problem> {
+        tag.required("WholeExtent")?;
+        let extent = tag.numbers("WholeExtent")?.unwrap_or_default();
+        let spacing = DVec3::from_array(tag.numbers("Spacing")?.unwrap_or([1.0; 3]));
+        let origin = DVec3::from_array(tag.numbers("Origin")?.unwrap_or([0.0; 3]));
+        let mut steps = DMat3::from_diagonal(spacing);
+        if let Some(rows) = tag.numbers::<f64, 9>("Direction")? {
+            steps = DMat3::from_cols_array(&rows).transpose() * steps;
+        }
+        Ok(Image { extent, pieces: 0, origin, steps })
+    }
+
+    fn piece(&mut self, tag: &Tag) -> Result<(), Problem> {
+        self.pieces += 1;
+        let whole = tag.numbers::<i64, 6>("Extent")?.is_none_or(|e| e == self.extent);
+        if self.pieces > 1 || !whole {
+            return Err(Problem::unsupported("Piece", "is one of several", RESAVE));
+        }
+        Ok(())
+    }
+
+    /// Sizes and place of the samples of points or cells.
+    fn place(&self, cells: bool) -> Result<([u64; 3], DVec3), Problem> {
+        let e = self.extent;
+        let (mut dims, mut first) = ([0; 3], DVec3::ZERO);
+        for a in 0..3 {
+            let points = e[2 * a + 1].checked_sub(e[2 * a]).and_then(|n| n.checked_add(1));
+            let Some(points) = points.and_then(|n| u64::try_from(n).ok()) else {
+                return Err(Problem::malformed(
+                    "ImageData WholeExtent",
+                    format!("{} to {} has no points", e[2 * a], e[2 * a + 1]),
+                    "save a volume that is not empty",
+                ));
+            };
+            // A flat image has one layer of cells. A cell's value is its middle's.
+            let halved = cells && points > 1;
+            dims[a] = points - u64::from(halved);
+            first[a] = e[2 * a] as f64 + if halved { 0.5 } else { 0.0 };
+        }
+        Ok((dims, self.origin + self.steps * first))
+    }
+}
+
+/// `PointData` or `CellData`.
+struct Section {
+    scalars: Option<String>,
+    cells: bool,
+}
+
+/// An array that can be drawn.
+struct Array {
+    name: String,
+    number: Number,
+    cells: bool,
+}
+
+impl Section {
+    fn of(tag: &Tag, cells: bool) -> Section {
+        let scalars = tag.get("Scalars").filter(|s| !s.is_empty()).map(String::from);
+        Section { scalars, cells }
+    }
+
+    /// The array, if it is the one to draw.
+    fn wants(&self, tag: &Tag) -> Result<Option<Array>, Problem> {
+        let name = tag.get("Name").unwrap_or_default();
+        let one = matches!(tag.get("NumberOfComponents"), None | Some("" | "0" | "1"));
+        match &self.scalars {
+            Some(scalars) if scalars != name => return Ok(None),
+            Some(_) if !one => {
+                return Err(Problem::unsupported(
+                    format!("DataArray {}", quoted(name)),
+                    "has several numbers a point",
+                    "save one component as the active scalars",
+                ));
+            }
+            None if !one => return Ok(None),
+            _ => {}
+        }
+        let number = match tag.required("type")? {
+            "Int8" => Number::I8,
+            "UInt8" => Number::U8,
+            "Int16" => Number::I16,
+            "UInt16" => Number::U16,
+            "Int32" => Number::I32,
+            "UInt32" => Number::U32,
+            "Int64" => Number::I64,
+            "UInt64" => Number::U64,
+            "Float32" => Number::F32,
+            "Float64" => Number::F64,
+            _ => return Err(tag.bad("type", "an integer or float type such as UInt8 or Float32")),
+        };
+        Ok(Some(Array { name: name.to_string(), number, cells: self.cells }))
+    }
+}
+
+/// How an array's data stand in the file.
+#[derive(Clone, Copy, PartialEq)]
+enum Stands {
+    Text,
+    Base64,
+    Raw,
+}
+
+/// Reads the array and makes the volume.
+fn finish(
+    file: &File,
+    image: &Image,
+    array: &Array,
+    (stands, reader, left): (Stands, BufReader<Box<dyn Stream>>, u64),
+    name: &str,
+) -> Result<Volume, Problem> {
+    let (dims, origin) = image.place(array.cells)?;
+    let layout = Layout::new(dims, array.number, file.endian, "ImageData WholeExtent")?;
+    let steps = [image.steps.x_axis, image.steps.y_axis, image.steps.z_axis];
+    // `+ 0.0` makes of -0.0 a 0.0, so that a digest does not depend on it.
+    let lattice = Lattice {
+        dims: layout.dims,
+        steps: steps.map(|s| s + DVec3::ZERO),
+        origin: origin + DVec3::ZERO,
+    };
+    lattice.check().map_err(|e| {
+        Problem::malformed("ImageData Spacing", e, "correct the spacing or the axes")
+    })?;
+    let (samples, map) = read_array(file, &layout, (stands, reader, left)).map_err(|mut p| {
+        p.field = format!("DataArray {} {}", quoted(&array.name), p.field);
+        p
+    })?;
+    Ok(Volume::new(name, array.number.name(), false, lattice, samples, map))
+}
+
+fn read_array(
+    file: &File,
+    layout: &Layout,
+    (stands, reader, left): (Stands, BufReader<Box<dyn Stream>>, u64),
+) -> Result<(Samples, ValueMap), Problem> {
+    if stands == Stands::Text {
+        let text = Box::new(blocks::UntilTag { inner: reader });
+        let (mut reader, supply) =
+            Encoding::Ascii.open(text, left, layout.number).map_err(|e| Problem::io("data", &e))?;
+        return samples::read(&mut *reader, supply, &Layout { endian: Endian::Little, ..*layout });
+    }
+    let mut data = match stands {
+        Stands::Raw => Bytes::Raw(reader),
+        _ => Bytes::Base64(Base64::new(reader)),
+    };
+    let need = layout.bytes();
+    let word = |data: &mut Bytes| -> Result<u64, Problem> {
+        let mut bytes = [0; 8];
+        data.read_exact(&mut bytes[..file.word])
+            .map_err(|_| Problem::malformed("header", "is cut off", "get the whole file"))?;
+        Ok(match (file.word, file.endian) {
+            (4, Endian::Big) => u64::from_be_bytes(bytes) >> 32,
+            (_, Endian::Big) => u64::from_be_bytes(bytes),
+            (_, Endian::Little) => u64::from_le_bytes(bytes),
+        })
+    };
+    let differs = |got: u64| {
+        Problem::malformed(
+            "header",
+            format!("says {got} bytes, where the extent and the type want {need}"),
+            "get the file again, or correct header_type",
+        )
+    };
+    if !file.packed {
+        let bytes = word(&mut data)?;
+        if bytes != need {
+            return Err(differs(bytes));
+        }
+        let supply = match stands {
+            Stands::Raw => Supply::Plain { have: left.saturating_sub(file.word as u64) },
+            _ => Supply::Encoded { name: "base64", bytes: left, ratio: 1 },
+        };
+        return samples::read(&mut data.take(need), supply, layout);
+    }
+    let [count, size, last] = [word(&mut data)?, word(&mut data)?, word(&mut data)?];
+    let whole = if last == 0 { count } else { count.saturating_sub(1) };
+    let total = whole.saturating_mul(size).saturating_add(last);
+    if total != need {
+        return Err(differs(total));
+    }
+    // Before the list of sizes takes memory: it must be there.
+    if count.saturating_mul(file.word as u64) > left {
+        return Err(Problem::malformed("header", "is cut off", "get the whole file"));
+    }
+    let mut packed = Vec::new();
+    for _ in 0..count {
+        packed.push(word(&mut data)?);
+    }
+    if let Bytes::Base64(data) = &mut data {
+        data.restart();
+    }
+    let bytes = packed.iter().fold(0u64, |sum, &n| sum.saturating_add(n));
+    if bytes > left {
+        return Err(samples::short(bytes, left));
+    }
+    let mut blocks = Blocks::new(Box::new(data), packed, size, last);
+    samples::read(&mut blocks, Supply::deflate("zlib", bytes), layout)
+}
+
+/// Binary data as they are, or out of base64.
+enum Bytes {
+    Raw(BufReader<Box<dyn Stream>>),
+    Base64(Base64<BufReader<Box<dyn Stream>>>),
+}
+
+impl Read for Bytes {
+    fn read(&mut self, buf: &mut [u8]) -> std::io::Result<usize> {
+        match self {
+            Bytes::Raw(data) => data.read(buf),
+            Bytes::Base64(data) => data.read(buf),
+        }
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests;

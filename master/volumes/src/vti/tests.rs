@@ -1,0 +1,163 @@
+//! VTI files written here, every way that VTK writes them.
+
+use super::*;
+use crate::fuzz::{base64, zlib};
+use std::path::Path;
+
+/// How a test's array stands in its file.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Way {
+    Ascii,
+    Inline { packed: bool },
+    Appended { packed: bool, base64: bool },
+}
+
+pub(crate) const WAYS: [Way; 7] = [
+    Way::Ascii,
+    Way::Inline { packed: false },
+    Way::Inline { packed: true },
+    Way::Appended { packed: false, base64: false },
+    Way::Appended { packed: true, base64: false },
+    Way::Appended { packed: false, base64: true },
+    Way::Appended { packed: true, base64: true },
+];
+
+/// An array with its header, `word` bytes a number, in blocks of 16 bytes where packed.
+fn binary(data: &[u8], packed: bool, base: bool, word: usize, big: bool) -> Vec<u8> {
+    let number = |n: usize| match big {
+        true => (n as u64).to_be_bytes()[8 - word..].to_vec(),
+        false => (n as u64).to_le_bytes()[..word].to_vec(),
+    };
+    let (mut head, mut body) = (Vec::new(), Vec::new());
+    if packed {
+        let blocks: Vec<Vec<u8>> = data.chunks(16).map(zlib).collect();
+        head.extend([number(blocks.len()), number(16), number(data.len() % 16)].concat());
+        for block in blocks {
+            head.extend(number(block.len()));
+            body.extend(block);
+        }
+    } else {
+        head = number(data.len());
+        body = data.to_vec();
+    }
+    match (base, packed) {
+        (false, _) => [head, body].concat(),
+        (true, true) => [base64(&head), base64(&body)].concat(),
+        (true, false) => base64(&[head, body].concat()),
+    }
+}
+
+/// A file of bytes `data` as 5 x 3 x 2 samples of `kind`, with another array before it.
+pub(crate) fn vti(way: Way, kind: &str, data: &[u8], word: usize, big: bool) -> Vec<u8> {
+    let order = if big { "BigEndian" } else { "LittleEndian" };
+    let packed = matches!(way, Way::Inline { packed: true } | Way::Appended { packed: true, .. });
+    let compressor = if packed { " compressor=\"vtkZLibDataCompressor\"" } else { "" };
+    let head = format!(
+        "<?xml version=\"1.0\"?>\n<!-- made <here> -->\n<VTKFile type=\"ImageData\" \
+         version=\"1.0\" byte_order=\"{order}\" header_type=\"UInt{}\"{compressor}>\n<ImageData \
+         WholeExtent=\"1 5 0 2 0 1\" Origin=\"10 20 30\" Spacing=\"1 2 3\" Direction=\"0 -1 0 1 0 \
+         0 0 0 1\">\n<Piece Extent=\"1 5 0 2 0 1\"><PointData Scalars=\"v\">\n",
+        8 * word
+    );
+    let tail = "</PointData><CellData></CellData></Piece></ImageData>\n";
+    let array = |name: &str, attributes: &str, content: &[u8]| {
+        let tag = format!("<DataArray type=\"{kind}\" Name=\"{name}\" {attributes}>");
+        [tag.as_bytes(), content, b"</DataArray>\n"].concat()
+    };
+    let other = array("other", "NumberOfComponents=\"3\" format=\"ascii\"", b"1 2 3");
+    let (inside, behind) = match way {
+        Way::Ascii => {
+            let text: Vec<String> = data.iter().map(u8::to_string).collect();
+            (array("v", "format='ascii'", text.join(" ").as_bytes()), Vec::new())
+        }
+        Way::Inline { packed } => {
+            let data = [b"\n  ", &binary(data, packed, true, word, big)[..], b"\n"].concat();
+            (array("v", "format=\"binary\"", &data), Vec::new())
+        }
+        Way::Appended { packed, base64 } => {
+            let array = array("v", "format=\"appended\" offset=\"8\"", b"");
+            let encoding = if base64 { "base64" } else { "raw" };
+            let tag = format!("<AppendedData encoding=\"{encoding}\">\n   _AAAAAAAA");
+            let data = binary(data, packed, base64, word, big);
+            (array, [tag.as_bytes(), &data, b"\n</AppendedData>"].concat())
+        }
+    };
+    [head.as_bytes(), &other, &inside, tail.as_bytes(), &behind, b"</VTKFile>\n"].concat()
+}
+
+fn open(bytes: Vec<u8>) -> Result<Volume, Problem> {
+    crate::read(Source::memory(bytes), Path::new("."), "test.vti", &crate::Hints::default())
+}
+
+#[test]
+fn every_way_in_which_vtk_writes_gives_the_same_samples() {
+    let data: Vec<u8> = (0..30).map(|i| i * 7).collect();
+    for way in WAYS {
+        for (word, big) in [(4, false), (8, false), (4, true), (8, true)] {
+            let v = open(vti(way, "UInt8", &data, word, big))
+                .unwrap_or_else(|e| panic!("{way:?} {word} {big}: {e}"));
+            assert_eq!(v.samples, Samples::U8(data.clone()), "{way:?} {word} {big}");
+            assert_eq!(v.lattice.dims, [5, 3, 2]);
+            // i runs along y, j along -x; the first point is one step from the origin.
+            assert_eq!(v.lattice.steps, [DVec3::Y, DVec3::X * -2.0, DVec3::Z * 3.0]);
+            assert_eq!(v.lattice.origin, DVec3::new(10.0, 21.0, 30.0));
+        }
+    }
+    let wide: Vec<u8> = (0..30u16).flat_map(|i| (i * 300).to_be_bytes()).collect();
+    let v = open(vti(WAYS[4], "UInt16", &wide, 4, true)).unwrap();
+    assert_eq!(v.samples, Samples::U16((0..30).map(|i| i * 300).collect()));
+}
+
+#[test]
+fn values_of_cells_lie_between_the_points() {
+    let file = String::from_utf8(vti(Way::Ascii, "UInt8", &[1, 2, 3, 4, 5, 6, 7, 8], 4, false));
+    let file = file.unwrap().replace("PointData", "CellData");
+    let v = open(file.replace("Direction", "Dropped").into()).unwrap();
+    assert_eq!(v.lattice.dims, [4, 2, 1]);
+    assert_eq!(v.lattice.origin, DVec3::new(11.5, 21.0, 31.5));
+}
+
+#[test]
+fn what_is_not_read_is_refused_by_field_and_remedy() {
+    let data: Vec<u8> = (0..30).collect();
+    let text = String::from_utf8(vti(Way::Ascii, "UInt8", &data, 4, false)).unwrap();
+    let appended = String::from_utf8(vti(WAYS[6], "UInt8", &data, 4, false)).unwrap();
+    let with = |from: &str, to: &str| text.replace(from, to);
+    for (file, say) in [
+        (with("ImageData\" v", "PolyData\" v"), "VTKFile type: `PolyData` is no ImageData"),
+        (with("LittleEndian", "Middle"), "VTKFile byte_order: `Middle`"),
+        (with("UInt32", "UInt16"), "VTKFile header_type"),
+        (with("WholeExtent", "Extents"), "ImageData WholeExtent: is missing"),
+        (with("1 5 0 2 0 1\" O", "1 5 0 2 0\" O"), "give 6 numbers"),
+        (with("\"1 5 0 2 0 1\"", "\"1 -2 0 2 0 1\""), "1 to -2 has no points"),
+        (with("\"1 5 0 2 0 1\"", "\"1 99999 0 2 0 1\""), "is longer than 16384"),
+        (with("Extent=\"1 5 0 2 0 1\"><", "Extent=\"1 3 0 2 0 1\"><"), "Piece: is one of several"),
+        (with("Spacing=\"1 2 3\"", "Spacing=\"1 0 3\""), "Spacing: a spacing is zero"),
+        (with("UInt8\" Name=\"v", "String\" Name=\"v"), "DataArray type: `String`"),
+        (with("Scalars=\"v\"", "Scalars=\"other\""), "`other`: has several numbers a point"),
+        (with("Scalars=\"v\"", "Scalars=\"none\""), "DataArray: there is none with one number"),
+        (with("29<", "299<"), "number 30 is `299`, which is no uint8"),
+        (with("28 29<", "28<"), "`v` data: truncated: 30 bytes are needed and 29"),
+        (with("29<", "29 30<"), "goes on after the 30 bytes"),
+        (with("format='ascii'", "format='zip'"), "format: `zip`"),
+        (appended.replace("offset=\"8\"", "offset=\"88888\""), "`v` offset: 88888 lies past"),
+        (appended.replace("offset=\"8\"", "offset=\"x\""), "offset: `x`"),
+        (
+            appended.replace("offset=\"8\"", "offset=\"0\""),
+            "bytes, where the extent and the type want 30",
+        ),
+        (appended.replace("vtkZLib", "vtkLZ4"), "VTKFile compressor"),
+        (appended.split("<AppendedData").next().unwrap().into(), "AppendedData: is missing"),
+    ] {
+        let e = open(file.into()).unwrap_err().to_string();
+        assert!(e.contains(say), "want {say:?} in {e}");
+    }
+    let raw = vti(WAYS[4], "UInt8", &data, 4, false);
+    let mut spoilt = raw.clone();
+    let at = raw.len() - 60;
+    spoilt[at] ^= 0xff;
+    let e = open(spoilt).unwrap_err().to_string();
+    assert!(e.contains("of 2: is damaged; get the file again"), "{e}");
+    let e = open(raw[..at].to_vec()).unwrap_err().to_string();
+    assert!(e.contains("truncated"), "{e}");
+}

@@ -1,0 +1,368 @@
+//! Volumes to files: NRRD and NIfTI.
+//!
+//! What is written is what the file had: the type that holds the values exactly, and the lattice
+//! in RAS+. NIfTI has a slope and an intercept for codes; NRRD has none, so values that are no
+//! whole numbers become floats there.
+
+use crate::samples::Number;
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use slabcast_common::volume::{Samples, ValueMap, Volume};
+use std::io::{self, Write};
+
+/// A format that is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Format {
+    /// `.nrrd`, attached.
+    Nrrd {
+        /// Packed with gzip.
+        gzip: bool,
+    },
+    /// `.nii` or `.nii.gz`, NIfTI-1.
+    Nifti {
+        /// Packed with gzip.
+        gzip: bool,
+    },
+}
+
+impl Format {
+    /// The format that a file's name asks for, NRRD packed; `None` for any other.
+    pub fn of_name(name: &str) -> Option<Format> {
+        let name = name.to_ascii_lowercase();
+        if name.ends_with(".nrrd") {
+            Some(Format::Nrrd { gzip: true })
+        } else if name.ends_with(".nii.gz") {
+            Some(Format::Nifti { gzip: true })
+        } else if name.ends_with(".nii") {
+            Some(Format::Nifti { gzip: false })
+        } else {
+            None
+        }
+    }
+
+    /// The same, packed or not.
+    pub fn packed(self, gzip: bool) -> Format {
+        match self {
+            Format::Nrrd { .. } => Format::Nrrd { gzip },
+            Format::Nifti { .. } => Format::Nifti { gzip },
+        }
+    }
+}
+
+/// Samples between two looks at `went_on`: some ms.
+const STEP: usize = 1 << 16;
+
+/// Writes a volume. `went_on` is told from time to time how many samples are written, and may
+/// end it with an error.
+pub fn write(
+    volume: &Volume,
+    format: Format,
+    out: &mut dyn Write,
+    went_on: &mut dyn FnMut(u64) -> io::Result<()>,
+) -> io::Result<()> {
+    let form = Form::of(volume, format);
+    let gzip = match format {
+        Format::Nrrd { gzip } => {
+            out.write_all(nrrd_header(volume, form.number, gzip).as_bytes())?;
+            gzip
+        }
+        Format::Nifti { gzip } => gzip,
+    };
+    let header = match format {
+        Format::Nrrd { .. } => Vec::new(),
+        Format::Nifti { .. } => nifti_header(volume, &form),
+    };
+    if !gzip {
+        out.write_all(&header)?;
+        return samples(volume, &form, out, went_on);
+    }
+    // Fast: on mri256 4 times as quick as the default for 6 % more bytes.
+    let mut packed = GzEncoder::new(out, Compression::fast());
+    packed.write_all(&header)?;
+    samples(volume, &form, &mut packed, went_on)?;
+    packed.finish()?;
+    Ok(())
+}
+
+/// Whether the lattice can be told in a format without loss of its meaning; else what is lost.
+pub fn loses(volume: &Volume, format: Format) -> Option<String> {
+    let l = &volume.lattice;
+    let plain =
+        (0..3).all(|a| (0..3).all(|b| a == b || l.steps[a][b] == 0.0) && l.steps[a][a] > 0.0);
+    let nifti = matches!(format, Format::Nifti { .. });
+    (nifti && !volume.anatomical && (!plain || l.origin != glam::DVec3::ZERO)).then(|| {
+        "the file does not say where right, anterior and superior are, and NIfTI has no other \
+         axes: x, y, z are written as these"
+            .to_string()
+    })
+}
+
+/// The numbers that are written: `value = offset + scale * number`, which is the identity in
+/// NRRD.
+struct Form {
+    number: Number,
+    /// From a code to what is written, before rounding to the type.
+    written: ValueMap,
+    /// From what is written to the value.
+    map: ValueMap,
+}
+
+impl Form {
+    fn of(volume: &Volume, format: Format) -> Form {
+        let s = &volume.summary;
+        let as_value = |number| Form { number, written: s.map, map: ValueMap::IDENTITY };
+        let integers = !matches!(volume.samples, Samples::F32(_));
+        if integers && s.map.scale == 1.0 && s.map.offset.fract() == 0.0 {
+            let (lo, hi) = s.range();
+            // The file's own type if it holds all, else the smallest that does.
+            let holds = |n: &Number| n.limits().is_some_and(|(a, b)| a <= lo && hi <= b);
+            let own = Number::INTEGERS.iter().find(|n| n.name() == volume.file_type);
+            let fits = own.into_iter().chain(&Number::INTEGERS).find(|n| holds(n));
+            if let Some(number) = fits {
+                return as_value(*number);
+            }
+        }
+        // NIfTI keeps slope and intercept in f32.
+        let exact = |x: f64| f64::from(x as f32) == x && x.is_finite();
+        let nifti = matches!(format, Format::Nifti { .. });
+        if nifti && integers && exact(s.map.scale) && exact(s.map.offset) && s.map.scale != 0.0 {
+            let number = if let Samples::U8(_) = volume.samples { Number::U8 } else { Number::U16 };
+            return Form { number, written: ValueMap::IDENTITY, map: s.map };
+        }
+        match volume.samples {
+            Samples::F32(_) if s.map == ValueMap::IDENTITY => as_value(Number::F32),
+            _ => as_value(Number::F64),
+        }
+    }
+
+    /// One written number's bytes.
+    fn put(&self, code: f64, out: &mut Vec<u8>) {
+        let x = self.written.value(code);
+        match self.number {
+            Number::U8 => out.push(x as u8),
+            Number::I8 => out.push(x as i8 as u8),
+            Number::U16 => out.extend((x as u16).to_le_bytes()),
+            Number::I16 => out.extend((x as i16).to_le_bytes()),
+            Number::U32 => out.extend((x as u32).to_le_bytes()),
+            Number::I32 => out.extend((x as i32).to_le_bytes()),
+            Number::U64 => out.extend((x as u64).to_le_bytes()),
+            Number::I64 => out.extend((x as i64).to_le_bytes()),
+            Number::F32 => out.extend((x as f32).to_le_bytes()),
+            Number::F64 => out.extend(x.to_le_bytes()),
+        }
+    }
+}
+
+fn samples(
+    volume: &Volume,
+    form: &Form,
+    out: &mut dyn Write,
+    went_on: &mut dyn FnMut(u64) -> io::Result<()>,
+) -> io::Result<()> {
+    let n = volume.samples.len();
+    let mut bytes = Vec::with_capacity(STEP * form.number.bytes() as usize);
+    for from in (0..n).step_by(STEP) {
+        bytes.clear();
+        let to = (from + STEP).min(n);
+        (from..to).for_each(|i| form.put(volume.samples.code(i), &mut bytes));
+        out.write_all(&bytes)?;
+        went_on(to as u64)?;
+    }
+    Ok(())
+}
+
+fn nrrd_header(volume: &Volume, number: Number, gzip: bool) -> String {
+    let l = &volume.lattice;
+    let vector = |v: glam::DVec3| format!("({:?},{:?},{:?})", v.x, v.y, v.z);
+    let space = match volume.anatomical {
+        true => "space: right-anterior-superior",
+        false => "space dimension: 3",
+    };
+    format!(
+        "NRRD0004\n# written by slabcast {}\ntype: {}\ndimension: 3\n{space}\nsizes: {} {} {}\n\
+         space directions: {} {} {}\nkinds: domain domain domain\nendian: little\nencoding: {}\n\
+         space origin: {}\n\n",
+        env!("CARGO_PKG_VERSION"),
+        match number {
+            Number::F32 => "float",
+            Number::F64 => "double",
+            other => other.name(),
+        },
+        l.dims[0],
+        l.dims[1],
+        l.dims[2],
+        vector(l.steps[0]),
+        vector(l.steps[1]),
+        vector(l.steps[2]),
+        if gzip { "gzip" } else { "raw" },
+        vector(l.origin),
+    )
+}
+
+/// 352 bytes: the header and four that say that no extension follows.
+fn nifti_header(volume: &Volume, form: &Form) -> Vec<u8> {
+    let l = &volume.lattice;
+    let mut b = vec![0u8; 352];
+    let mut put = |at: usize, bytes: &[u8]| b[at..at + bytes.len()].copy_from_slice(bytes);
+    let code: i16 = match form.number {
+        Number::U8 => 2,
+        Number::I16 => 4,
+        Number::I32 => 8,
+        Number::F32 => 16,
+        Number::F64 => 64,
+        Number::I8 => 256,
+        Number::U16 => 512,
+        Number::U32 => 768,
+        Number::I64 => 1024,
+        Number::U64 => 1280,
+    };
+    put(0, &348i32.to_le_bytes());
+    put(70, &code.to_le_bytes());
+    put(72, &(8 * form.number.bytes() as i16).to_le_bytes());
+    put(40, &3i16.to_le_bytes());
+    put(76, &1f32.to_le_bytes());
+    let spacing = l.spacing();
+    for a in 0..7 {
+        // At most 16384 along an axis.
+        let n = l.dims.get(a).map_or(1, |&n| n as i16);
+        put(42 + 2 * a, &n.to_le_bytes());
+        let s = spacing.get(a).copied().unwrap_or(1.0) as f32;
+        put(80 + 4 * a, &s.to_le_bytes());
+    }
+    put(108, &352f32.to_le_bytes());
+    put(112, &(form.map.scale as f32).to_le_bytes());
+    put(116, &(form.map.offset as f32).to_le_bytes());
+    put(123, &[2]); // mm
+    let text = concat!("slabcast ", env!("CARGO_PKG_VERSION"));
+    put(148, &text.as_bytes()[..text.len().min(79)]);
+    // A lattice that spacings alone describe needs no affine, and has none where nobody knows
+    // where its axes point.
+    if volume.anatomical || loses(volume, Format::Nifti { gzip: false }).is_some() {
+        put(254, &1i16.to_le_bytes());
+        for r in 0..3 {
+            for c in 0..3 {
+                put(280 + 16 * r + 4 * c, &(l.steps[c][r] as f32).to_le_bytes());
+            }
+            put(280 + 16 * r + 12, &(l.origin[r] as f32).to_le_bytes());
+        }
+    }
+    put(344, b"n+1\0");
+    b
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::source::Source;
+    use glam::DVec3;
+    use slabcast_common::volume::Lattice;
+    use std::path::Path;
+
+    const ALL: [Format; 4] = [
+        Format::Nrrd { gzip: false },
+        Format::Nrrd { gzip: true },
+        Format::Nifti { gzip: false },
+        Format::Nifti { gzip: true },
+    ];
+
+    fn again(volume: &Volume, format: Format) -> Volume {
+        let (mut bytes, mut seen) = (Vec::new(), 0);
+        let went_on = &mut |n| {
+            seen = n;
+            Ok(())
+        };
+        write(volume, format, &mut bytes, went_on).unwrap();
+        assert_eq!(seen, volume.samples.len() as u64);
+        let source = Source::memory(bytes);
+        crate::read(source, Path::new("."), "x", &crate::Hints::default())
+            .unwrap_or_else(|e| panic!("{format:?}: {e}"))
+    }
+
+    fn volume(samples: Samples, map: ValueMap, file_type: &str) -> Volume {
+        // Numbers of f32, so that NIfTI keeps them.
+        let lattice = Lattice {
+            dims: [3, 2, 1],
+            steps: [DVec3::new(0.0, -1.5, 0.0), DVec3::new(0.75, 0.0, 0.25), DVec3::Z * 3.0],
+            origin: DVec3::new(-7.5, 8.0, 0.125),
+        };
+        Volume::new("v", file_type, true, lattice, samples, map)
+    }
+
+    #[test]
+    fn what_is_written_is_read_with_the_same_digest() {
+        let shift = |offset| ValueMap { scale: 1.0, offset };
+        let bytes = || Samples::U8(vec![0, 1, 2, 128, 254, 255]);
+        let words = || Samples::U16(vec![0, 1, 255, 256, 40000, 65535]);
+        for (samples, map, name) in [
+            (bytes(), ValueMap::IDENTITY, "uint8"),
+            (bytes(), shift(-128.0), "int8"),
+            (words(), ValueMap::IDENTITY, "uint16"),
+            (words(), shift(-32768.0), "int16"),
+            (words(), shift(4e9 as u32 as f64), "uint32"),
+            (words(), shift(-2147483648.0), "int32"),
+            (words(), shift(-9007199254740992.0), "int64"),
+            (
+                Samples::F32(vec![-1.5, 0.0, 1e-40, 3e38, f32::NAN, f32::INFINITY]),
+                ValueMap::IDENTITY,
+                "float32",
+            ),
+        ] {
+            let v = volume(samples, map, name);
+            for format in ALL {
+                let back = again(&v, format);
+                assert_eq!(back.file_type, name, "{format:?}");
+                assert_eq!(back.digest(), v.digest(), "{name} {format:?}");
+                assert!(back.anatomical);
+            }
+        }
+    }
+
+    #[test]
+    fn codes_with_a_slope_keep_their_values() {
+        let half = ValueMap { scale: 0.5, offset: -3.25 };
+        let odd = ValueMap { scale: 0.1, offset: 1.0 / 3.0 };
+        let wide = ValueMap { scale: 4e9, offset: -2e9 };
+        for (samples, map) in [
+            (Samples::U8(vec![0, 1, 2, 128, 254, 255]), half),
+            (Samples::U16(vec![0, 1, 2, 128, 254, 65535]), odd),
+            (Samples::F32(vec![0.0, 0.25, 0.5, 1.0, 0.125, 0.75]), wide),
+        ] {
+            let v = volume(samples, map, "whatever");
+            for format in ALL {
+                let back = again(&v, format);
+                let (lo, hi) = v.summary.range();
+                for i in 0..6 {
+                    let a = v.summary.map.value(v.samples.code(i));
+                    let b = back.summary.map.value(back.samples.code(i));
+                    assert!((a - b).abs() <= (hi - lo) * 1e-6, "{format:?}: {a} became {b}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_lattice_without_anatomy_stays_without_where_the_format_can_say_so() {
+        let samples = || Samples::U8(vec![0; 6]);
+        let mut v = volume(samples(), ValueMap::IDENTITY, "uint8");
+        v.anatomical = false;
+        assert_eq!(loses(&v, ALL[0]), None);
+        assert!(loses(&v, ALL[2]).unwrap().contains("right, anterior"));
+        let back = again(&v, ALL[0]);
+        assert!(!back.anatomical && back.lattice == v.lattice);
+        assert_eq!(again(&v, ALL[2]).lattice, v.lattice);
+        v.lattice = Lattice::from_spacing([3, 2, 1], [1.0, 2.0, 3.0]);
+        for format in ALL {
+            let back = again(&v, format);
+            assert!(!back.anatomical && back.lattice == v.lattice, "{format:?}");
+            assert_eq!(loses(&v, format), None);
+        }
+    }
+
+    #[test]
+    fn writing_ends_when_it_is_told_to() {
+        let v = volume(Samples::U8(vec![0; 6]), ValueMap::IDENTITY, "uint8");
+        let stop = &mut |_| Err(io::Error::other("stopped"));
+        let e = write(&v, ALL[0], &mut Vec::new(), stop).unwrap_err();
+        assert_eq!(e.to_string(), "stopped");
+    }
+}

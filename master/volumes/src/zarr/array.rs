@@ -1,0 +1,414 @@
+//! One Zarr array: what its metadata say, and its chunks into a volume.
+
+use super::Placed;
+use super::codec::{Codecs, Shard};
+use super::json::Json;
+use crate::error::{OpenErrorKind, Problem};
+use crate::samples::{Endian, Number, reserve};
+use crate::wide;
+use rayon::prelude::*;
+use slabcast_common::volume::{Samples, ValueMap};
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+/// Largest chunk once decoded. Two of them (packed and not) stay below the 64 MiB that reading
+/// may take beside the voxels.
+const CHUNK_MAX_BYTES: u64 = 32 << 20;
+/// Bytes of chunks that are decoded at once on all threads together.
+const AT_ONCE_BYTES: u64 = 48 << 20;
+/// Most axes.
+const RANK_MAX: usize = 16;
+
+pub(super) fn is_array(folder: &Path) -> bool {
+    if folder.join(".zarray").is_file() {
+        return true;
+    }
+    let meta = Json::read(&folder.join("zarr.json")).ok();
+    meta.and_then(|m| m.get("node_type")).is_some_and(|t| t.value == "array")
+}
+
+/// An array by its metadata.
+pub(super) struct Array {
+    folder: PathBuf,
+    pub(super) shape: Vec<u64>,
+    /// Of the files; inner chunks of shards are smaller.
+    grid: Vec<u64>,
+    pub(super) number: Number,
+    pub(super) endian: Endian,
+    /// What stands where a chunk is missing, as bytes of a sample, little-endian.
+    fill: [u8; 8],
+    key: Key,
+    codecs: Codecs,
+    shard: Option<Shard>,
+}
+
+/// How chunks are called.
+struct Key {
+    /// `c/` in version 3, nothing in 2.
+    prefix: &'static str,
+    separator: char,
+}
+
+impl Array {
+    pub(super) fn open(folder: &Path) -> Result<Array, Problem> {
+        let v2 = folder.join(".zarray");
+        let array = if v2.is_file() {
+            Array::version_2(folder, &Json::read(&v2)?)?
+        } else {
+            Array::version_3(folder, &Json::read(&folder.join("zarr.json"))?)?
+        };
+        let (rank, inner) = (array.shape.len(), array.inner());
+        if rank == 0 || rank > RANK_MAX || array.grid.len() != rank || inner.len() != rank {
+            return Err(Problem::malformed(
+                "shape",
+                format!("has {rank} axes and chunks of {}", array.grid.len()),
+                "write the array again",
+            ));
+        }
+        let whole =
+            array.grid.iter().zip(inner).all(|(g, i)| *g > 0 && *i > 0 && g.is_multiple_of(*i));
+        let bytes = inner.iter().try_fold(array.number.bytes(), |n, &s| n.checked_mul(s));
+        match bytes {
+            Some(bytes) if whole && bytes <= CHUNK_MAX_BYTES => Ok(array),
+            Some(_) if !whole => Err(Problem::malformed(
+                "chunk_shape",
+                format!("{:?} in {:?} is not even", inner, array.grid),
+                "write the array again",
+            )),
+            _ => Err(Problem::new(
+                OpenErrorKind::TooLarge,
+                "chunk_shape",
+                format!(
+                    "chunks of {inner:?} take more than the {CHUNK_MAX_BYTES} bytes that are read"
+                ),
+                "write the array again with smaller chunks, or in shards",
+            )),
+        }
+    }
+
+    /// Shape of what is decoded at a time.
+    fn inner(&self) -> &[u64] {
+        self.shard.as_ref().map_or(&self.grid, |s| &s.inner)
+    }
+
+    fn version_3(folder: &Path, meta: &Json) -> Result<Array, Problem> {
+        if meta.required("zarr_format")?.value != 3 || meta.required("node_type")?.value != "array"
+        {
+            return Err(meta.required("node_type")?.bad("an array of Zarr version 3"));
+        }
+        let grid = meta.required("chunk_grid")?;
+        if grid.required("name")?.text()? != "regular" {
+            return Err(grid.required("name")?.bad("regular"));
+        }
+        let grid = grid.required("configuration")?.required("chunk_shape")?.sizes()?;
+        let kind = meta.required("data_type")?;
+        let number = kind
+            .value
+            .as_str()
+            .and_then(number)
+            .ok_or_else(|| kind.bad("an integer or float type such as uint8 or float32"))?;
+        let encoding = meta.required("chunk_key_encoding")?;
+        let asked = encoding.get("configuration").and_then(|c| c.get("separator"));
+        let (prefix, usual) = match encoding.required("name")?.text()? {
+            "default" => ("c", '/'),
+            "v2" => ("", '.'),
+            _ => return Err(encoding.bad("default or v2")),
+        };
+        let separator = separator(asked, usual)?;
+        let (codecs, shard) = Codecs::version_3(&meta.required("codecs")?, &grid)?;
+        Ok(Array {
+            folder: folder.into(),
+            shape: meta.required("shape")?.sizes()?,
+            grid,
+            number,
+            endian: codecs.endian,
+            fill: fill(meta.get("fill_value"), number)?,
+            key: Key { prefix, separator },
+            codecs,
+            shard,
+        })
+    }
+
+    fn version_2(folder: &Path, meta: &Json) -> Result<Array, Problem> {
+        let kind = meta.required("dtype")?;
+        let bad = || kind.bad("an integer or float type such as |u1, <i2 or <f4");
+        let text = kind.value.as_str().ok_or_else(bad)?;
+        let endian = if text.starts_with('>') { Endian::Big } else { Endian::Little };
+        let number = match text.get(1..).unwrap_or_default() {
+            "u1" => Number::U8,
+            "i1" => Number::I8,
+            "u2" => Number::U16,
+            "i2" => Number::I16,
+            "u4" => Number::U32,
+            "i4" => Number::I32,
+            "u8" => Number::U64,
+            "i8" => Number::I64,
+            "f4" => Number::F32,
+            "f8" => Number::F64,
+            _ => return Err(bad()),
+        };
+        let grid = meta.required("chunks")?.sizes()?;
+        let codecs = Codecs::version_2(meta, endian, grid.len())?;
+        Ok(Array {
+            folder: folder.into(),
+            shape: meta.required("shape")?.sizes()?,
+            grid,
+            number,
+            endian,
+            fill: fill(meta.get("fill_value"), number)?,
+            key: Key { prefix: "", separator: separator(meta.get("dimension_separator"), '.')? },
+            codecs,
+            shard: None,
+        })
+    }
+
+    /// The samples where `placed` has them.
+    pub(super) fn read(&self, placed: &Placed) -> Result<(Samples, ValueMap), Problem> {
+        let shifted = |offset| ValueMap { scale: 1.0, offset };
+        macro_rules! le {
+            ($t:ty) => {
+                |b: &[u8]| <$t>::from_le_bytes(b.try_into().expect("a word"))
+            };
+        }
+        Ok(match self.number {
+            Number::U8 => (Samples::U8(self.place(placed, |b| b[0])?), ValueMap::IDENTITY),
+            Number::I8 => (Samples::U8(self.place(placed, |b| b[0] ^ 0x80)?), shifted(-128.0)),
+            Number::U16 => (Samples::U16(self.place(placed, le!(u16))?), ValueMap::IDENTITY),
+            Number::I16 => {
+                let code = |b: &[u8]| le!(u16)(b) ^ 0x8000;
+                (Samples::U16(self.place(placed, code)?), shifted(-32768.0))
+            }
+            Number::F32 => (Samples::F32(self.place(placed, le!(f32))?), ValueMap::IDENTITY),
+            // Their range decides how they are kept, so that they are all held for a moment.
+            Number::U32 => wide::narrow(vec![self.place(placed, le!(u32))?], i128::from)?,
+            Number::I32 => wide::narrow(vec![self.place(placed, le!(i32))?], i128::from)?,
+            Number::U64 => wide::narrow(vec![self.place(placed, le!(u64))?], i128::from)?,
+            Number::I64 => wide::narrow(vec![self.place(placed, le!(i64))?], i128::from)?,
+            Number::F64 => wide::single(vec![self.place(placed, le!(f64))?])?,
+        })
+    }
+
+    /// All chunks, decoded into their places. A layer of chunks along z is a task of its own.
+    fn place<T: Copy + Send + Sync>(
+        &self,
+        placed: &Placed,
+        code: impl Fn(&[u8]) -> T + Sync,
+    ) -> Result<Vec<T>, Problem> {
+        let size = self.number.bytes() as usize;
+        let [nx, ny, nz] = placed.dims.map(|n| n as usize);
+        let mut out = Vec::new();
+        reserve(&mut out, nx * ny * nz)?;
+        out.resize(nx * ny * nz, code(&self.fill[..size]));
+        let depth = placed.axes[2].map_or(1, |a| self.grid[a] as usize);
+        let layer = |(z, out): (usize, &mut [T])| self.layer(placed, z, out, &code);
+        let chunk = 2 * self.inner().iter().product::<u64>() * self.number.bytes();
+        if chunk * rayon::current_num_threads() as u64 <= AT_ONCE_BYTES {
+            out.par_chunks_mut(nx * ny * depth).enumerate().try_for_each(layer)?;
+        } else {
+            out.chunks_mut(nx * ny * depth).enumerate().try_for_each(layer)?;
+        }
+        Ok(out)
+    }
+
+    /// The chunks of one layer along z.
+    fn layer<T: Copy>(
+        &self,
+        placed: &Placed,
+        z: usize,
+        out: &mut [T],
+        code: &impl Fn(&[u8]) -> T,
+    ) -> Result<(), Problem> {
+        let mut at = vec![0u64; self.shape.len()];
+        if let Some(a) = placed.axes[2] {
+            at[a] = z as u64;
+        }
+        let count =
+            |axis: usize| placed.axes[axis].map_or(1, |a| self.shape[a].div_ceil(self.grid[a]));
+        for y in 0..count(1) {
+            for x in 0..count(0) {
+                for (axis, n) in [(0, x), (1, y)] {
+                    if let Some(a) = placed.axes[axis] {
+                        at[a] = n;
+                    }
+                }
+                self.file(placed, &at, out, code).map_err(|mut p| {
+                    p.field = format!("chunk {} {}", self.key.of(&at), p.field);
+                    p
+                })?;
+            }
+        }
+        Ok(())
+    }
+
+    /// The chunk or shard at a place of the grid.
+    fn file<T: Copy>(
+        &self,
+        placed: &Placed,
+        at: &[u64],
+        out: &mut [T],
+        code: &impl Fn(&[u8]) -> T,
+    ) -> Result<(), Problem> {
+        let path = self.folder.join(self.key.of(at));
+        let io = |e: std::io::Error| Problem::io("file", &e);
+        let mut file = match std::fs::metadata(&path) {
+            // A chunk that was never written is all fill value.
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(()),
+            Err(e) => return Err(io(e)),
+            Ok(m) if !m.is_file() => {
+                return Err(Problem::new(
+                    OpenErrorKind::Forbidden,
+                    "file",
+                    "is a pipe, a folder or a device, and was not read",
+                    "get the array again",
+                ));
+            }
+            Ok(_) => File::open(&path).map_err(io)?,
+        };
+        let len = file.metadata().map_err(io)?.len();
+        let bytes = (self.inner().iter().product::<u64>() * self.number.bytes()) as usize;
+        let first: Vec<u64> = at.iter().zip(&self.grid).map(|(a, g)| a * g).collect();
+        let Some(shard) = &self.shard else {
+            let decoded = self.codecs.decode(&mut file, len, bytes)?;
+            self.copy(placed, &first, decoded, out, code);
+            return Ok(());
+        };
+        let index = shard.index(&mut file, len, &self.grid)?;
+        let counts: Vec<u64> = self.grid.iter().zip(&shard.inner).map(|(g, i)| g / i).collect();
+        for (n, (offset, size)) in index.into_iter().enumerate() {
+            // Marked as never written.
+            if (offset, size) == (u64::MAX, u64::MAX) {
+                continue;
+            }
+            let mut corner = first.clone();
+            let mut rest = n as u64;
+            for a in (0..counts.len()).rev() {
+                corner[a] += rest % counts[a] * shard.inner[a];
+                rest /= counts[a];
+            }
+            let wanted = (0..corner.len()).all(|a| match placed.axes.contains(&Some(a)) {
+                true => corner[a] < self.shape[a],
+                false => corner[a] == 0,
+            });
+            if !wanted {
+                continue;
+            }
+            if offset.checked_add(size).is_none_or(|end| end > len) {
+                return Err(Problem::new(
+                    OpenErrorKind::Damaged,
+                    "index",
+                    format!("says that inner chunk {n} lies beyond the file's {len} bytes"),
+                    "get the array again",
+                ));
+            }
+            file.seek(SeekFrom::Start(offset)).map_err(io)?;
+            let decoded = self.codecs.decode(&mut (&file).take(size), size, bytes)?;
+            self.copy(placed, &corner, decoded, out, code);
+        }
+        Ok(())
+    }
+
+    /// A decoded chunk whose first sample stands at `first` of the array, to its place in `out`,
+    /// which begins with a layer of the grid.
+    fn copy<T: Copy>(
+        &self,
+        placed: &Placed,
+        first: &[u64],
+        mut decoded: Vec<u8>,
+        out: &mut [T],
+        code: &impl Fn(&[u8]) -> T,
+    ) {
+        let size = self.number.bytes() as usize;
+        if self.endian == Endian::Big {
+            decoded.chunks_exact_mut(size).for_each(<[u8]>::reverse);
+        }
+        let strides = self.codecs.strides(self.inner());
+        // For each of x, y, z: where the chunk begins, how many of its samples are inside, and
+        // how far apart they stand in it.
+        let along = |axis: usize| match placed.axes[axis] {
+            None => (0, 1, 0),
+            Some(a) => {
+                let inside = self.shape[a].saturating_sub(first[a]).min(self.inner()[a]);
+                (first[a] as usize, inside as usize, strides[a])
+            }
+        };
+        let [(x0, nx, sx), (y0, ny, sy), (z0, nz, sz)] = [along(0), along(1), along(2)];
+        let [width, height, _] = placed.dims.map(|n| n as usize);
+        let depth = placed.axes[2].map_or(1, |a| self.grid[a] as usize);
+        for z in 0..nz {
+            for y in 0..ny {
+                let to = (((z0 + z) % depth) * height + y0 + y) * width + x0;
+                let row = &mut out[to..to + nx];
+                let mut from = (z * sz + y * sy) * size;
+                for sample in row {
+                    *sample = code(&decoded[from..from + size]);
+                    from += sx * size;
+                }
+            }
+        }
+    }
+}
+
+impl Key {
+    fn of(&self, at: &[u64]) -> String {
+        let numbers = at.iter().map(u64::to_string);
+        let prefix = (!self.prefix.is_empty()).then(|| self.prefix.to_string());
+        prefix.into_iter().chain(numbers).collect::<Vec<_>>().join(&self.separator.to_string())
+    }
+}
+
+fn separator(asked: Option<Json>, usual: char) -> Result<char, Problem> {
+    match &asked {
+        None => Ok(usual),
+        Some(json) => match json.value.as_str() {
+            Some("/") => Ok('/'),
+            Some(".") => Ok('.'),
+            _ => Err(json.bad("/ or .")),
+        },
+    }
+}
+
+/// A type of version 3 by its name.
+fn number(name: &str) -> Option<Number> {
+    let floats = [Number::F32, Number::F64];
+    Number::INTEGERS.into_iter().chain(floats).find(|n| n.name() == name)
+}
+
+/// The fill value's bytes.
+fn fill(value: Option<Json>, number: Number) -> Result<[u8; 8], Problem> {
+    let mut bytes = [0; 8];
+    let Some(json) = value else { return Ok(bytes) };
+    let text = json.value.as_str();
+    let float = match text {
+        Some("NaN") => Some(f64::NAN),
+        Some("Infinity") => Some(f64::INFINITY),
+        Some("-Infinity") => Some(f64::NEG_INFINITY),
+        Some(_) => None,
+        None => json.value.as_f64(),
+    };
+    let bad = || json.bad(&format!("a value of {}", number.name()));
+    let float = float.ok_or_else(bad)?;
+    match number.limits() {
+        Some((lo, hi)) if !(lo..=hi).contains(&float) => return Err(bad()),
+        _ => {}
+    }
+    macro_rules! put {
+        ($x:expr) => {{
+            let le = $x.to_le_bytes();
+            bytes[..le.len()].copy_from_slice(&le);
+        }};
+    }
+    match number {
+        Number::U8 => put!(float as u8),
+        Number::I8 => put!(float as i8),
+        Number::U16 => put!(float as u16),
+        Number::I16 => put!(float as i16),
+        Number::U32 => put!(float as u32),
+        Number::I32 => put!(float as i32),
+        Number::U64 => put!(json.value.as_u64().unwrap_or(float as u64)),
+        Number::I64 => put!(json.value.as_i64().unwrap_or(float as i64)),
+        Number::F32 => put!(float as f32),
+        Number::F64 => put!(float),
+    }
+    Ok(bytes)
+}

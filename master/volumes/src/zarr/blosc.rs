@@ -1,0 +1,198 @@
+//! Blosc 1 containers: blocks of lz4, zstd or zlib, their bytes or bits shuffled.
+
+use super::codec::zstd;
+use crate::error::{OpenErrorKind, Problem};
+use flate2::read::ZlibDecoder;
+use std::io::Read;
+
+fn bad(what: impl Into<String>) -> Problem {
+    Problem::new(OpenErrorKind::Damaged, "blosc", what, "get the array again")
+}
+
+/// Decodes a container; it may become `most` bytes.
+pub(super) fn decode(data: &[u8], most: usize) -> Result<Vec<u8>, Problem> {
+    let head: &[u8; 16] = data.first_chunk().ok_or_else(|| bad("is cut off"))?;
+    let word = |at: usize| u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
+    let (flags, type_size) = (head[2], usize::from(head[3]).max(1));
+    let (bytes, block, packed) = (word(4) as usize, word(8) as usize, word(12) as usize);
+    if bytes > most || packed > data.len() || block == 0 && bytes > 0 {
+        return Err(bad(format!("says {bytes} bytes out of {packed}")));
+    }
+    let data = &data[..packed];
+    if bytes == 0 {
+        return Ok(Vec::new());
+    }
+    let mut out = Vec::with_capacity(bytes);
+    // Stored as they are, not even shuffled.
+    if flags & 2 != 0 {
+        out.extend(data.get(16..16 + bytes).ok_or_else(|| bad("is cut off"))?);
+        return Ok(out);
+    }
+    let at = |at: usize| -> Result<usize, Problem> {
+        let bytes = data.get(at..at + 4).and_then(|b| b.try_into().ok());
+        let n = bytes.map(i32::from_le_bytes).and_then(|n| usize::try_from(n).ok());
+        n.ok_or_else(|| bad("is cut off"))
+    };
+    let block = block.min(bytes);
+    let mut plain = vec![0; block];
+    for (i, from) in (0..bytes).step_by(block).enumerate() {
+        let size = block.min(bytes - from);
+        let whole = size == block;
+        // c-blosc packs the bytes of a type apart where blocks are whole and long enough, and
+        // since 1.11 says so where it does not.
+        let split = flags & 0x10 == 0 && type_size <= 16 && block / type_size >= 128 && whole;
+        let parts = if split { type_size } else { 1 };
+        let mut next = at(16 + 4 * i)?;
+        let plain = &mut plain[..size];
+        if !size.is_multiple_of(parts) {
+            return Err(bad("has blocks that are not even"));
+        }
+        for part in plain.chunks_exact_mut(size / parts) {
+            let packed = at(next)?;
+            let bytes = data.get(next + 4..next + 4 + packed).ok_or_else(|| bad("is cut off"))?;
+            next += 4 + packed;
+            if packed == part.len() {
+                part.copy_from_slice(bytes);
+                continue;
+            }
+            unpack(flags >> 5, bytes, part)?;
+        }
+        let shuffled = type_size > 1 && flags & 1 != 0;
+        match (shuffled, flags & 4 != 0) {
+            (true, _) => unshuffle(plain, type_size, &mut out),
+            (false, true) => unshuffle_bits(plain, type_size, &mut out),
+            (false, false) => out.extend_from_slice(plain),
+        }
+    }
+    Ok(out)
+}
+
+fn unpack(kind: u8, from: &[u8], to: &mut [u8]) -> Result<(), Problem> {
+    let came = match kind {
+        1 => lz4_flex::block::decompress_into(from, to)
+            .map_err(|e| bad(format!("has a damaged lz4 block ({e})")))?,
+        3 => {
+            let mut z = ZlibDecoder::new(from);
+            z.read_exact(to).map_err(|e| bad(format!("has a damaged zlib block ({e})")))?;
+            to.len()
+        }
+        4 => {
+            let plain = zstd(from, to.len())?;
+            to[..plain.len()].copy_from_slice(&plain);
+            plain.len()
+        }
+        _ => {
+            return Err(Problem::unsupported(
+                "blosc",
+                "is packed with blosclz or snappy",
+                "write the array again with lz4 or zstd",
+            ));
+        }
+    };
+    match came == to.len() {
+        true => Ok(()),
+        false => Err(bad("has a block that ends early")),
+    }
+}
+
+/// First bytes of all, then second bytes of all; what is left over stands as it is.
+fn unshuffle(plain: &[u8], size: usize, out: &mut Vec<u8>) {
+    let n = plain.len() / size;
+    for i in 0..n {
+        out.extend((0..size).map(|byte| plain[byte * n + i]));
+    }
+    out.extend(&plain[n * size..]);
+}
+
+/// First bits of all and so on, for multiples of eight; what is left over stands as it is.
+fn unshuffle_bits(plain: &[u8], size: usize, out: &mut Vec<u8>) {
+    let n = plain.len() / size / 8 * 8;
+    let start = out.len();
+    out.resize(start + n * size, 0);
+    let to = &mut out[start..];
+    for row in 0..8 * size {
+        for i in 0..n {
+            let bit = plain[row * (n / 8) + i / 8] >> (i % 8) & 1;
+            to[i * size + row / 8] |= bit << (row % 8);
+        }
+    }
+    out.extend(&plain[n * size..]);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn container(flags: u8, size: u8, plain: usize, block: usize, blocks: &[Vec<u8>]) -> Vec<u8> {
+        let mut out = vec![2, 1, flags, size];
+        let starts = 16 + 4 * blocks.len();
+        let total = starts + blocks.iter().map(Vec::len).sum::<usize>();
+        for n in [plain, block, total] {
+            out.extend((n as u32).to_le_bytes());
+        }
+        let mut at = starts;
+        for b in blocks {
+            out.extend((at as u32).to_le_bytes());
+            at += b.len();
+        }
+        blocks.iter().for_each(|b| out.extend(b));
+        out
+    }
+
+    fn part(bytes: &[u8]) -> Vec<u8> {
+        [&(bytes.len() as u32).to_le_bytes()[..], bytes].concat()
+    }
+
+    #[test]
+    fn blocks_splits_and_shuffles_are_undone() {
+        let plain: Vec<u8> = (0..1024u32).map(|i| (i * i / 64) as u8).collect();
+        let n = 512;
+        let shuffled: Vec<u8> =
+            (0..2).flat_map(|b| (0..n).map(move |i| 2 * i + b)).map(|i| plain[i]).collect();
+        let pack = lz4_flex::block::compress;
+        // Two bytes apart, each half packed for itself.
+        let halves = [part(&pack(&shuffled[..n])), part(&pack(&shuffled[n..]))].concat();
+        let split = container(1 | 1 << 5, 2, 1024, 1024, &[halves]);
+        assert_eq!(decode(&split, 1024).unwrap(), plain);
+        let whole = container(1 | 0x10 | 1 << 5, 2, 1024, 1024, &[part(&pack(&shuffled))]);
+        assert_eq!(decode(&whole, 1024).unwrap(), plain);
+        // Two blocks, the second shorter, one stored as it is.
+        let blocks = [part(&pack(&plain[..600])), part(&plain[600..])];
+        let two = container(0x10 | 1 << 5, 1, 1024, 600, &blocks);
+        assert_eq!(decode(&two, 1024).unwrap(), plain);
+        let stored = [&container(2, 2, 1024, 1024, &[])[..], &plain].concat();
+        let mut stored = stored;
+        stored[12..16].copy_from_slice(&(1040u32).to_le_bytes());
+        assert_eq!(decode(&stored, 1024).unwrap(), plain);
+        let z = ruzstd::encoding::compress_to_vec(
+            &shuffled[..],
+            ruzstd::encoding::CompressionLevel::Fastest,
+        );
+        let zstd = container(1 | 0x10 | 4 << 5, 2, 1024, 1024, &[part(&z)]);
+        assert_eq!(decode(&zstd, 1024).unwrap(), plain);
+        for (bytes, say) in [(&split[..60], "says 1024 bytes out of"), (&split[..10], "is cut off")]
+        {
+            assert!(decode(bytes, 1024).unwrap_err().to_string().contains(say));
+        }
+        assert!(decode(&split, 1023).is_err());
+        let lz = container(0x10, 1, 1024, 1024, &[part(&[1, 2, 3])]);
+        assert!(decode(&lz, 1024).unwrap_err().to_string().contains("blosclz"));
+    }
+
+    #[test]
+    fn bits_are_shuffled_back() {
+        let plain: Vec<u8> = (0..34u8).map(|i| i.wrapping_mul(37)).collect();
+        // 17 numbers of two bytes: 16 are shuffled, one is left over.
+        let mut bits = vec![0u8; 32];
+        for row in 0..16 {
+            for i in 0..16 {
+                let bit = plain[2 * i + row / 8] >> (row % 8) & 1;
+                bits[row * 2 + i / 8] |= bit << (i % 8);
+            }
+        }
+        bits.extend(&plain[32..]);
+        let mut out = Vec::new();
+        unshuffle_bits(&bits, 2, &mut out);
+        assert_eq!(out, plain);
+    }
+}

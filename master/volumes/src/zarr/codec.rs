@@ -1,0 +1,317 @@
+//! From a chunk's bytes to its samples: the codecs of both versions, and the index of a shard.
+
+use super::blosc;
+use super::json::Json;
+use crate::error::{OpenErrorKind, Problem};
+use crate::samples::{Endian, SKIP_MAX_BYTES};
+use flate2::read::{MultiGzDecoder, ZlibDecoder};
+use ruzstd::decoding::StreamingDecoder;
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+
+/// A codec of bytes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Codec {
+    Gzip,
+    Zlib,
+    Zstd,
+    Blosc,
+    /// numcodecs' lz4: the size, then a block.
+    Lz4,
+    /// Four bytes at the end.
+    Crc32c,
+}
+
+/// What is done to a chunk, last codec first.
+#[derive(Clone, Debug)]
+pub(super) struct Codecs {
+    pub(super) endian: Endian,
+    /// As written: the first was applied first.
+    list: Vec<Codec>,
+    /// The array's axes in the order in which a chunk stores them, the slowest first.
+    order: Option<Vec<usize>>,
+}
+
+/// A shard: a file of inner chunks with an index.
+#[derive(Clone, Debug)]
+pub(super) struct Shard {
+    pub(super) inner: Vec<u64>,
+    /// Where in the file the index stands.
+    at_end: bool,
+    /// Whether a checksum follows it.
+    checked: bool,
+}
+
+impl Codecs {
+    /// The codecs of version 3; those inside a shard where there is one.
+    pub(super) fn version_3(list: &Json, grid: &[u64]) -> Result<(Codecs, Option<Shard>), Problem> {
+        let (mut codecs, mut shard) =
+            (Codecs { endian: Endian::Little, list: Vec::new(), order: None }, None);
+        for i in 0..list.len() {
+            let codec = list.at(i);
+            let name = codec.required("name")?;
+            let config = codec.get("configuration");
+            let get = |key: &str| config.as_ref().and_then(|c| c.get(key));
+            match name.text()? {
+                "bytes" | "endian" => match get("endian") {
+                    None => {}
+                    Some(e) if e.value == "little" => {}
+                    Some(e) if e.value == "big" => codecs.endian = Endian::Big,
+                    Some(e) => return Err(e.bad("little or big")),
+                },
+                "transpose" => {
+                    let order =
+                        get("order").ok_or_else(|| codec.bad("a transpose with an order"))?;
+                    codecs.order = Some(permutation(&order, grid.len())?);
+                }
+                "gzip" => codecs.list.push(Codec::Gzip),
+                "zstd" => codecs.list.push(Codec::Zstd),
+                "blosc" => codecs.list.push(Codec::Blosc),
+                "crc32c" => codecs.list.push(Codec::Crc32c),
+                "sharding_indexed" if list.len() == 1 => {
+                    let config = codec.required("configuration")?;
+                    let inner = config.required("chunk_shape")?.sizes()?;
+                    let (inside, nested) = Codecs::version_3(&config.required("codecs")?, &inner)?;
+                    if nested.is_some() {
+                        return Err(name.bad("a shard of chunks, not of shards"));
+                    }
+                    shard = Some(Shard::of(&config, inner)?);
+                    codecs = inside;
+                }
+                "sharding_indexed" => return Err(name.bad("the only codec")),
+                _ => {
+                    return Err(
+                        name.bad("bytes, transpose, gzip, zstd, blosc, crc32c or sharding_indexed")
+                    );
+                }
+            }
+        }
+        Ok((codecs, shard))
+    }
+
+    /// The compressor of version 2.
+    pub(super) fn version_2(meta: &Json, endian: Endian, rank: usize) -> Result<Codecs, Problem> {
+        if let Some(filters) = meta.get("filters").filter(|f| f.len() > 0) {
+            return Err(filters.bad("no filters"));
+        }
+        let order = match meta.get("order") {
+            None => None,
+            Some(o) if o.value == "C" => None,
+            Some(o) if o.value == "F" => Some((0..rank).rev().collect()),
+            Some(o) => return Err(o.bad("C or F")),
+        };
+        let list = match meta.get("compressor") {
+            None => Vec::new(),
+            Some(c) => {
+                let id = c.required("id")?;
+                vec![match id.text()? {
+                    "gzip" => Codec::Gzip,
+                    "zlib" => Codec::Zlib,
+                    "zstd" => Codec::Zstd,
+                    "blosc" => Codec::Blosc,
+                    "lz4" => Codec::Lz4,
+                    _ => return Err(id.bad("blosc, zstd, gzip, zlib or lz4")),
+                }]
+            }
+        };
+        Ok(Codecs { endian, list, order })
+    }
+
+    /// How far apart, in samples of a chunk, neighbours along each axis of the array stand.
+    pub(super) fn strides(&self, shape: &[u64]) -> Vec<usize> {
+        let mut strides = vec![1; shape.len()];
+        let mut step = 1;
+        for k in (0..shape.len()).rev() {
+            let axis = self.order.as_ref().map_or(k, |order| order[k]);
+            strides[axis] = step;
+            step *= shape[axis] as usize;
+        }
+        strides
+    }
+
+    /// Decodes what a reader of `len` bytes has; it must become `bytes` bytes.
+    pub(super) fn decode(
+        &self,
+        from: &mut dyn Read,
+        len: u64,
+        bytes: usize,
+    ) -> Result<Vec<u8>, Problem> {
+        // No packing makes much more of anything; what a file has beyond that is not read.
+        let most = 2 * bytes as u64 + 4096;
+        if len > most {
+            return Err(damaged(format!("has {len} bytes for {bytes} of samples")));
+        }
+        let mut data = Vec::new();
+        from.take(len).read_to_end(&mut data).map_err(|e| Problem::io("file", &e))?;
+        for (i, codec) in self.list.iter().enumerate().rev() {
+            // Between two codecs it may still be packed.
+            let want = if self.list[..i].iter().all(|c| *c == Codec::Crc32c) {
+                bytes + 4 * i
+            } else {
+                most as usize
+            };
+            data = codec.decode(data, want)?;
+        }
+        match data.len() == bytes {
+            true => Ok(data),
+            false => Err(damaged(format!("has {} bytes of samples, not {bytes}", data.len()))),
+        }
+    }
+}
+
+fn damaged(what: String) -> Problem {
+    Problem::new(OpenErrorKind::Damaged, "data", what, "get the array again")
+}
+
+impl Codec {
+    /// Decodes; at most `most` bytes come out.
+    fn decode(self, mut data: Vec<u8>, most: usize) -> Result<Vec<u8>, Problem> {
+        let bad = |e: &dyn std::fmt::Display| {
+            let text: String = e.to_string().chars().take(100).collect();
+            damaged(format!("can't be unpacked ({text})"))
+        };
+        match self {
+            Codec::Gzip => all(MultiGzDecoder::new(&data[..]), most),
+            Codec::Zlib => all(ZlibDecoder::new(&data[..]), most),
+            Codec::Zstd => zstd(&data, most),
+            Codec::Blosc => blosc::decode(&data, most),
+            Codec::Lz4 => {
+                let (head, block) =
+                    data.split_first_chunk().ok_or_else(|| bad(&"it is cut off"))?;
+                let size = u32::from_le_bytes(*head) as usize;
+                if size > most {
+                    return Err(damaged(format!("says that it becomes {size} bytes")));
+                }
+                let mut out = vec![0; size];
+                let n = lz4_flex::block::decompress_into(block, &mut out).map_err(|e| bad(&e))?;
+                out.truncate(n);
+                Ok(out)
+            }
+            Codec::Crc32c => {
+                let Some(at) = data.len().checked_sub(4) else {
+                    return Err(bad(&"its checksum is cut off"));
+                };
+                if crc32c::crc32c(&data[..at]).to_le_bytes() != data[at..] {
+                    return Err(damaged("does not have its checksum".into()));
+                }
+                data.truncate(at);
+                Ok(data)
+            }
+        }
+    }
+}
+
+/// All that a reader gives, at most `most` bytes.
+fn all(from: impl Read, most: usize) -> Result<Vec<u8>, Problem> {
+    let mut out = Vec::new();
+    let read = from.take(most as u64 + 1).read_to_end(&mut out);
+    read.map_err(|e| {
+        let text: String = e.to_string().chars().take(100).collect();
+        damaged(format!("can't be unpacked ({text})"))
+    })?;
+    match out.len() > most {
+        true => Err(damaged(format!("goes on after {most} bytes"))),
+        false => Ok(out),
+    }
+}
+
+/// One zstd frame. Its window is memory that a header of six bytes can ask for, so it is looked
+/// at first (RFC 8878, 3.1.1.1).
+pub(super) fn zstd(data: &[u8], most: usize) -> Result<Vec<u8>, Problem> {
+    let cut = || damaged("has no whole zstd header".into());
+    if data.get(..4) != Some(&[0x28, 0xb5, 0x2f, 0xfd]) {
+        return Err(damaged("does not begin as zstd".into()));
+    }
+    let descriptor = *data.get(4).ok_or_else(cut)?;
+    let window = if descriptor & 0x20 == 0 {
+        let byte = *data.get(5).ok_or_else(cut)?;
+        let base = 1u64 << (10 + (byte >> 3));
+        base + base / 8 * u64::from(byte & 7)
+    } else {
+        // A single segment: the window is the content, whose size stands after the dictionary.
+        let at = 5 + [0, 1, 2, 4][usize::from(descriptor & 3)];
+        let field = [1, 2, 4, 8][usize::from(descriptor >> 6)];
+        let bytes = data.get(at..at + field).ok_or_else(cut)?;
+        let size = bytes.iter().rev().fold(0u64, |n, b| n << 8 | u64::from(*b));
+        size + if field == 2 { 256 } else { 0 }
+    };
+    // Encoders give small contents windows of up to 8 MiB.
+    if window > (most as u64).max(SKIP_MAX_BYTES) {
+        return Err(damaged(format!("asks for a window of {window} bytes")));
+    }
+    let decoder = StreamingDecoder::new(data).map_err(|e| {
+        let text: String = e.to_string().chars().take(100).collect();
+        damaged(format!("can't be unpacked ({text})"))
+    })?;
+    all(decoder, most)
+}
+
+fn permutation(order: &Json, rank: usize) -> Result<Vec<usize>, Problem> {
+    let list = order.sizes()?;
+    let mut seen = vec![false; rank];
+    for &a in &list {
+        match seen.get_mut(a as usize) {
+            Some(s) if !*s => *s = true,
+            _ => return Err(order.bad("each axis once")),
+        }
+    }
+    match list.len() == rank {
+        true => Ok(list.into_iter().map(|a| a as usize).collect()),
+        false => Err(order.bad("each axis once")),
+    }
+}
+
+impl Shard {
+    fn of(config: &Json, inner: Vec<u64>) -> Result<Shard, Problem> {
+        let at_end = match config.get("index_location") {
+            None => true,
+            Some(l) if l.value == "end" => true,
+            Some(l) if l.value == "start" => false,
+            Some(l) => return Err(l.bad("start or end")),
+        };
+        let codecs = config.required("index_codecs")?;
+        let mut checked = false;
+        for i in 0..codecs.len() {
+            let codec = codecs.at(i);
+            match codec.required("name")?.text()? {
+                "bytes" => {
+                    let endian = codec.get("configuration").and_then(|c| c.get("endian"));
+                    if let Some(e) = endian.filter(|e| e.value != "little") {
+                        return Err(e.bad("little"));
+                    }
+                }
+                "crc32c" => checked = true,
+                _ => return Err(codec.bad("bytes and crc32c")),
+            }
+        }
+        Ok(Shard { inner, at_end, checked })
+    }
+
+    /// Offset and size of each inner chunk of a file of `len` bytes.
+    pub(super) fn index(
+        &self,
+        file: &mut File,
+        len: u64,
+        grid: &[u64],
+    ) -> Result<Vec<(u64, u64)>, Problem> {
+        let counts = grid.iter().zip(&self.inner).map(|(g, i)| g / i);
+        let count = counts.into_iter().try_fold(1u64, u64::checked_mul);
+        let bytes = count.and_then(|n| n.checked_mul(16)?.checked_add(4 * u64::from(self.checked)));
+        let Some(bytes) = bytes.filter(|b| *b <= len) else {
+            return Err(damaged(format!("has {len} bytes, less than its index takes")));
+        };
+        let io = |e: std::io::Error| Problem::io("index", &e);
+        let at = if self.at_end { len - bytes } else { 0 };
+        file.seek(SeekFrom::Start(at)).map_err(io)?;
+        let mut data = Vec::new();
+        file.take(bytes).read_to_end(&mut data).map_err(io)?;
+        if data.len() as u64 != bytes {
+            return Err(damaged("changed while it was read".into()));
+        }
+        if self.checked {
+            data = Codec::Crc32c.decode(data, usize::MAX)?;
+        }
+        let word = |b: &[u8]| u64::from_le_bytes(b.try_into().expect("eight bytes"));
+        Ok(data.chunks_exact(16).map(|e| (word(&e[..8]), word(&e[8..]))).collect())
+    }
+}

@@ -1,0 +1,94 @@
+//! Metadata files: JSON that remembers where it stands, so that a refusal can name the field.
+
+use crate::error::{Problem, quoted};
+use crate::source::{self, Source};
+use serde_json::Value;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+/// Longest metadata file; those of real pictures have some KiB.
+const MAX_BYTES: u64 = 1 << 20;
+
+/// A value and its place in its file.
+#[derive(Clone, Debug)]
+pub(super) struct Json {
+    pub(super) value: Value,
+    place: String,
+}
+
+impl Json {
+    pub(super) fn read(path: &Path) -> Result<Json, Problem> {
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let source = Source::open(path, &name)?;
+        let mut text = Vec::new();
+        let read = source.reader.take(MAX_BYTES + 1).read_to_end(&mut text);
+        read.map_err(|e| Problem::io(&name, &e))?;
+        if text.len() as u64 > MAX_BYTES {
+            let what = format!("has more than {MAX_BYTES} bytes");
+            return Err(Problem::malformed(name, what, "give a Zarr folder of pictures"));
+        }
+        let value = serde_json::from_slice(&text).map_err(|e| {
+            Problem::malformed(&name, format!("is no JSON ({e})"), "get the folder again")
+        })?;
+        Ok(Json { value, place: name })
+    }
+
+    fn inside(&self, key: &str, value: &Value) -> Json {
+        Json { value: value.clone(), place: format!("{} {key}", self.place) }
+    }
+
+    pub(super) fn get(&self, key: &str) -> Option<Json> {
+        self.value.get(key).filter(|v| !v.is_null()).map(|v| self.inside(key, v))
+    }
+
+    pub(super) fn required(&self, key: &str) -> Result<Json, Problem> {
+        self.get(key).ok_or_else(|| {
+            Problem::malformed(
+                format!("{} {key}", self.place),
+                "is missing",
+                "correct the metadata, or write the array again",
+            )
+        })
+    }
+
+    /// Entries of a list; none for anything else.
+    pub(super) fn len(&self) -> usize {
+        self.value.as_array().map_or(0, Vec::len)
+    }
+
+    /// An entry that is there.
+    pub(super) fn at(&self, i: usize) -> Json {
+        self.inside(&format!("[{i}]"), &self.value[i])
+    }
+
+    pub(super) fn bad(&self, want: &str) -> Problem {
+        let text: String = self.value.to_string().chars().take(60).collect();
+        Problem::malformed(
+            self.place.as_str(),
+            format!("{} is not read here", quoted(&text)),
+            format!("it should be {want}"),
+        )
+    }
+
+    pub(super) fn text(&self) -> Result<&str, Problem> {
+        self.value.as_str().ok_or_else(|| self.bad("a text"))
+    }
+
+    /// Whole numbers.
+    pub(super) fn sizes(&self) -> Result<Vec<u64>, Problem> {
+        let list = self.value.as_array().map(|l| l.iter().map(Value::as_u64).collect());
+        list.flatten().ok_or_else(|| self.bad("a list of sizes"))
+    }
+
+    /// `count` finite numbers.
+    pub(super) fn numbers(&self, count: usize) -> Result<Vec<f64>, Problem> {
+        let list: Option<Vec<f64>> =
+            self.value.as_array().and_then(|l| l.iter().map(Value::as_f64).collect());
+        list.filter(|l| l.len() == count).ok_or_else(|| self.bad(&format!("{count} numbers")))
+    }
+}
+
+/// A folder below `folder` that metadata name.
+pub(super) fn path_in(folder: &Path, name: &str) -> Result<PathBuf, Problem> {
+    source::beside(folder, name, "datasets path")
+}

@@ -200,7 +200,7 @@ impl Array {
         let mut out = Vec::new();
         reserve(&mut out, nx * ny * nz)?;
         out.resize(nx * ny * nz, code(&self.fill[..size]));
-        let depth = placed.axes[2].map_or(1, |a| self.grid[a] as usize);
+        let depth = self.depth(placed);
         let layer = |(z, out): (usize, &mut [T])| self.layer(placed, z, out, &code);
         let chunk = 2 * self.inner().iter().product::<u64>() * self.number.bytes();
         if chunk * rayon::current_num_threads() as u64 <= AT_ONCE_BYTES {
@@ -209,6 +209,11 @@ impl Array {
             out.chunks_mut(nx * ny * depth).enumerate().try_for_each(layer)?;
         }
         Ok(out)
+    }
+
+    /// Samples along z of a layer of chunks. (A shard may well be deeper than the array.)
+    fn depth(&self, placed: &Placed) -> usize {
+        placed.axes[2].map_or(1, |a| self.grid[a].min(placed.dims[2]) as usize)
     }
 
     /// The chunks of one layer along z.
@@ -334,7 +339,7 @@ impl Array {
         };
         let [(x0, nx, sx), (y0, ny, sy), (z0, nz, sz)] = [along(0), along(1), along(2)];
         let [width, height, _] = placed.dims.map(|n| n as usize);
-        let depth = placed.axes[2].map_or(1, |a| self.grid[a] as usize);
+        let depth = self.depth(placed);
         for z in 0..nz {
             for y in 0..ny {
                 let to = (((z0 + z) % depth) * height + y0 + y) * width + x0;

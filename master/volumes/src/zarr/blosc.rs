@@ -145,7 +145,7 @@ mod tests {
 
     #[test]
     fn blocks_splits_and_shuffles_are_undone() {
-        let plain: Vec<u8> = (0..1024u32).map(|i| (i * i / 64) as u8).collect();
+        let plain: Vec<u8> = (0..1024u32).map(|i| (i * i / 256) as u8).collect();
         let n = 512;
         let shuffled: Vec<u8> =
             (0..2).flat_map(|b| (0..n).map(move |i| 2 * i + b)).map(|i| plain[i]).collect();

@@ -29,13 +29,13 @@ pub(crate) struct InputArgs {
     #[arg(long, value_name = "AxBxC", value_parser = parse::spacing, help_heading = HEADING)]
     spacing: Option<[f64; 3]>,
     /// Bytes before the first of raw numbers [default: 0]
-    #[arg(long, value_name = "BYTES", help_heading = HEADING)]
+    #[arg(long, value_name = "BYTES", allow_negative_numbers = true, help_heading = HEADING)]
     skip: Option<u64>,
     /// Which DICOM series of a folder: its number, description or UID [default: the only one]
     #[arg(long, value_name = "NAME", help_heading = HEADING)]
     series: Option<String>,
     /// Which level of an OME-Zarr pyramid, 0 the finest [default: the finest that fits]
-    #[arg(long, value_name = "N", help_heading = HEADING)]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, help_heading = HEADING)]
     level: Option<u32>,
     /// Most bytes of samples that a Zarr level may have [default: a quarter of the free memory]
     #[arg(long, value_name = "BYTES", value_parser = parse::memory, help_heading = HEADING)]

@@ -11,6 +11,7 @@ use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, Transf
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_render::explain::{Explained, explain};
+use slabcast_render::survey::survey;
 use slabcast_render::{Frame, Scene, serial};
 use std::sync::Arc;
 use world::bricks_of;
@@ -105,6 +106,31 @@ fn the_explained_pixel_is_the_rendered_pixel_to_the_bit() {
             }
             assert!(seen > 10 && (shut > 3) == (quality.eps > 0.0), "{seen} seen, {shut} shut");
         }
+    }
+}
+
+#[test]
+fn a_survey_counts_what_explain_lists() {
+    let volume = onion();
+    let bricks = bricks_of(&volume);
+    for (sums, projection) in [(Sums::I32, PROJECTIONS[0]), (Sums::F32, PROJECTIONS[1])] {
+        let quality = Quality { sums, ..Quality::default() };
+        let frame = frame(&volume, quality, projection);
+        let (picture, notes) = survey(&frame, &bricks);
+        assert_eq!(picture, serial::render(&frame, &bricks));
+        let mut most = 0;
+        for [x, y] in places() {
+            let e = explain(&frame, &bricks, [x, y], 0);
+            let i = (y * SIZE + x) as usize;
+            assert_eq!((notes.shut_in[i], notes.sheets[i] as usize), (e.shut_in, e.sheets.len()));
+            let listed: usize = e.sheets.iter().map(|s| s.sections).sum();
+            most = most.max(listed);
+            let noted = notes.sections[i] as usize;
+            // Integers round the faintest sections to nothing; they were added all the same.
+            assert!(noted >= listed && (sums == Sums::I32 || noted == listed), "{noted} {listed}");
+            assert!(e.sheets.first().is_none_or(|s| notes.first.unwrap() <= s.k));
+        }
+        assert!(most > 100, "{most}");
     }
 }
 

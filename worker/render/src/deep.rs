@@ -6,7 +6,8 @@
 //! are tested at the place where their own depth puts them, in a mask grown by what sections may lie
 //! aside of it. Where that is far, as very near the eye, [`crate::general`] takes over.
 
-use crate::mask::OpenMask;
+use crate::footprint::Phases;
+use crate::mask::{OpenMask, REACH_MOST};
 use crate::splat::records::{BySlot, Recorded, SLOTS, STRIDE};
 use crate::splat::{Accumulate, Simd, Work};
 use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
@@ -87,7 +88,7 @@ pub(crate) fn takes(part: &Part<'_>) -> Option<Deep> {
     // x / (z + dz) lies within |x / z| dz / z of x / z.
     let apart = farthest * depth_apart * front / focal;
     let reach = f64::from(own) + libm::ceil(apart) + 2.0;
-    let fits = reach <= f64::from(crate::mask::REACH_MOST) && 2.0 * reach + 2.0 < WINDOW as f64;
+    let fits = reach <= f64::from(REACH_MOST) && 2.0 * reach + 2.0 < WINDOW as f64;
     fits.then_some(Deep { focal, distance, reach: reach as i32 })
 }
 
@@ -129,9 +130,8 @@ struct Layer<'a, S: Recorded> {
     axes: [Axis<'a, S>; 2],
 }
 
-/// Along one axis: first pixel of each phase, weights with zeros before and after, and how many a
-/// phase has.
-type Axis<'a, S> = (&'a [i32], &'a [<S as Accumulate>::Weight], usize);
+/// Weights along one axis, and where they lie.
+type Axis<'a, S> = (Phases<'a>, &'a [<S as Accumulate>::Weight]);
 
 /// A footprint along one axis: the first pixel, from the part's corner, and where weights begin.
 #[derive(Clone, Copy, Debug, Default)]
@@ -231,18 +231,20 @@ impl<S: Recorded> Stage<S> for DeepStage<'_, S> {
     }
 
     #[inline(always)]
-    fn splat_rest(
+    fn splat_carried(
         &mut self,
-        v: &DeepVoxel,
-        first: i32,
+        carried: &[(DeepVoxel, i32)],
         sheets: &mut Sheets<'_, S>,
         open: &OpenMask,
         counters: &mut Counters,
     ) {
         let k = self.part.slab.first;
-        let added = self.add(v, (first, k), &layers(self.part, k), sheets, open);
-        counters.splatted += u64::from(added);
-        counters.culled += u64::from(!added);
+        let layers = layers(self.part, k);
+        for (v, first) in carried {
+            let added = self.add(v, (*first, k), &layers, sheets, open);
+            counters.splatted += u64::from(added);
+            counters.culled += u64::from(!added);
+        }
     }
 }
 
@@ -255,8 +257,7 @@ fn layers<'a, S: Recorded>(part: &'a Part<'_>, k: i32) -> [Layer<'a, S>; SLOTS] 
         let sheet = (k + i as i32).min(last);
         let footprint = part.frame.footprints.at(sheet).expect("no sheet of the part is clipped");
         let axes = [0, 1].map(|axis| {
-            let (firsts, len) = footprint.firsts(axis).expect("footprints have tables");
-            (firsts, S::across(&footprint, axis).expect("footprints have tables"), len)
+            footprint.phases(axis).zip(S::across(&footprint, axis)).expect("footprints have tables")
         });
         Layer { scale: footprint.scale, axes }
     })
@@ -289,13 +290,13 @@ impl<S: Recorded> DeepStage<'_, S> {
         for (layer, window) in layers[..count].iter().zip(&mut windows) {
             for axis in 0..2 {
                 let at = frame.view.screen_along(axis, eye[axis], layer.scale);
-                let (firsts, _, len) = layer.axes[axis];
+                let phases = &layer.axes[axis].0;
                 let (pixel, phase) = ((at >> SUBPIXEL_BITS) as i32, at as usize & PHASES);
-                let begins = pixel - origin[axis] + firsts[phase];
-                window[axis] =
-                    Window { first: begins, from: (3 * phase + 1) * len, len: len as i32 };
-                lo[axis] = lo[axis].min(begins);
-                hi[axis] = hi[axis].max(begins + len as i32);
+                let first = pixel - origin[axis] + phases.firsts[phase];
+                let len = phases.len as i32;
+                window[axis] = Window { first, from: phases.begin(phase), len };
+                lo[axis] = lo[axis].min(first);
+                hi[axis] = hi[axis].max(first + len);
             }
         }
         // Inside the part.

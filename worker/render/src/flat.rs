@@ -14,6 +14,7 @@
 //!
 //! The bytes are those of [`crate::serial`], which knows none of this.
 
+use crate::footprint::Phases;
 use crate::mask::OpenMask;
 use crate::scene::{Flat, Frame};
 use crate::splat::records::{Recorded, SLOTS, Splat, Table, Tables, splat};
@@ -111,17 +112,17 @@ impl<S: Recorded> Work for RenderFlat<'_, S> {
         let RenderFlat { part, view: flat, simd, store, waiting, pixels, io } = self;
         let footprint = part.frame.footprints.at(0).expect("a flat view's sheets are all drawn");
         let axis = |axis| {
-            let (firsts, len) = footprint.firsts(axis)?;
-            Some((firsts, Table { weights: S::across(&footprint, axis)?, len }))
+            let phases = footprint.phases(axis)?;
+            Some((phases, Table { weights: S::across(&footprint, axis)?, len: phases.len }))
         };
-        let [(first_x, x), (first_y, y)] =
+        let [(phases_x, x), (phases_y, y)] =
             [0, 1].map(|a| axis(a).expect("a flat view's footprints have tables"));
         let sections = &part.frame.sections;
         let deep = Table { weights: S::deep(sections), len: sections.most() };
         let tables = Tables { across: [x, y], deep };
         let Waiting { queues, tossing, batch } = waiting;
-        let first = [first_x, first_y];
-        let stage = FlatStage { part: &part, flat, first, tables, tossing, batch };
+        let phases = [phases_x, phases_y];
+        let stage = FlatStage { part: &part, flat, phases, tables, tossing, batch };
         walk(&part, stage, (simd, store), queues, pixels, io);
     }
 }
@@ -129,8 +130,8 @@ impl<S: Recorded> Work for RenderFlat<'_, S> {
 struct FlatStage<'a, S: Recorded> {
     part: &'a Part<'a>,
     flat: &'a Flat,
-    /// First pixel of each phase across.
-    first: [&'a [i32]; 2],
+    /// Where weights across and down lie.
+    phases: [Phases<'a>; 2],
     tables: Tables<'a, S>,
     tossing: &'a mut Tossing,
     batch: &'a mut Batch,
@@ -190,9 +191,8 @@ impl<S: Recorded> Stage<S> for FlatStage<'_, S> {
         counters.culled += reached - some as u64;
         let kept = &kept[..some];
         let [x0, from_x, y0, from_y] = windows;
-        let [wide, high] = self.tables.across.map(|t| t.len as i32);
-        move_inside((self.first[0], wide), x, kept, x0, from_x);
-        move_inside((self.first[1], high), y, kept, y0, from_y);
+        move_inside(&self.phases[0], x, kept, x0, from_x);
+        move_inside(&self.phases[1], y, kept, y0, from_y);
         brick.values.bits(samples);
         let normals = brick.normals.as_deref();
         for (j, &i) in kept.iter().enumerate() {
@@ -222,6 +222,9 @@ impl<S: Recorded> Stage<S> for FlatStage<'_, S> {
         open: &OpenMask,
         counters: &mut Counters,
     ) {
+        if bucket.is_empty() {
+            return;
+        }
         let cull = self.part.frame.scene.quality.cull;
         let Batch { voxels, samples, normals, light } = &mut *self.batch;
         let mut payloads = [S::Payload::default(); BATCH];
@@ -250,41 +253,45 @@ impl<S: Recorded> Stage<S> for FlatStage<'_, S> {
     }
 
     #[inline(always)]
-    fn splat_rest(
+    fn splat_carried(
         &mut self,
-        v: &Splat,
-        first: i32,
+        carried: &[(Splat, i32)],
         sheets: &mut Sheets<'_, S>,
         open: &OpenMask,
         counters: &mut Counters,
     ) {
-        if self.part.frame.scene.quality.cull && !open.is_near(v.cell.into()) {
-            counters.culled += 1;
-            return;
+        let Part { frame, slab, .. } = self.part;
+        for (v, first) in carried {
+            if frame.scene.quality.cull && !open.is_near(v.cell.into()) {
+                counters.culled += 1;
+                continue;
+            }
+            counters.splatted += 1;
+            let mut light = [[0.0]; 4];
+            frame.payloads(&[v.sample], &[v.normal], &mut light);
+            let payload = S::payload(light.map(|[c]| c));
+            let (x, y, z) = v.weights(&self.tables);
+            let left = &z[(slab.first - first) as usize..];
+            splat(sheets.records, v.at(), (x, y, left), payload, slot(slab.first));
+            sheets.touch(slab.first, v.first, [x.len(), y.len()]);
         }
-        counters.splatted += 1;
-        let mut light = [[0.0]; 4];
-        self.part.frame.payloads(&[v.sample], &[v.normal], &mut light);
-        let payload = S::payload(light.map(|[c]| c));
-        let k = self.part.slab.first;
-        let (x, y, z) = v.weights(&self.tables);
-        let left = &z[(k - first) as usize..];
-        splat(sheets.records, v.at(), (x, y, left), payload, slot(k));
-        sheets.touch(k, v.first, [x.len(), y.len()]);
     }
 }
 
-/// First pixels of the footprints of some voxels along an axis, moved inside the part, and where their weights then
-/// begin: below 2^16, since rows of a table are at most three times 63 long.
+/// First pixels of the footprints of some voxels along an axis, moved inside the part, and where
+/// their weights then begin: below 2^16, since rows of a padded table are at most three times 63
+/// long.
 #[inline(always)]
 fn move_inside(
-    (firsts, len): (&[i32], i32),
+    phases: &Phases<'_>,
     at: &[i32; 512],
     kept: &[u32],
     inside: &mut [u32; 512],
     from: &mut [u32; 512],
 ) {
-    let firsts: &[i32; SUBPIXELS as usize] = firsts.first_chunk().expect("a first pixel a phase");
+    let len = phases.len as i32;
+    let firsts: &[i32; SUBPIXELS as usize] =
+        phases.firsts.first_chunk().expect("a first pixel a phase");
     for ((&i, inside), from) in kept.iter().zip(inside).zip(from) {
         let at = at[i as usize % 512];
         let (pixel, phase) = (at >> SUBPIXEL_BITS, at & (SUBPIXELS - 1));
@@ -292,6 +299,7 @@ fn move_inside(
         let moved = first.clamp(0, PART - len);
         *inside = moved as u32;
         // Moved farther than a footprint is long, it reads zeros only.
-        *from = ((3 * phase + 1) * len + (moved - first).clamp(-len, len)) as u32;
+        let begin = phases.begin(phase as usize) as i32;
+        *from = (begin + (moved - first).clamp(-len, len)) as u32;
     }
 }

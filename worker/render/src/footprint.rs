@@ -175,11 +175,13 @@ struct AxisTable {
     /// First pixel of each phase, relative to the pixel that holds the centre.
     first: Vec<i32>,
     count: Vec<u32>,
-    /// With `stride` zeros before and after those of each phase.
     weights: Vec<Tap>,
     /// The same in steps of the lattice, as fixed point.
     fixed: Vec<i16>,
+    /// Weights of a phase at most.
     stride: usize,
+    /// Zeros before and after those of each phase.
+    margin: usize,
     /// Pixels that a footprint reaches at most from the one that holds its centre.
     reach: i32,
 }
@@ -209,25 +211,55 @@ fn weight(profile: &Profile, scale: f64, p: i32, i: i64) -> f64 {
     profile.at(u)
 }
 
+/// Where the weights of each phase lie in a table along one axis.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Phases<'a> {
+    /// First pixel of each, relative to the one that holds the centre.
+    pub(crate) firsts: &'a [i32],
+    /// Pixels of one at most.
+    pub(crate) len: usize,
+    /// Zeros before and after the weights of each.
+    margin: usize,
+}
+
+impl Phases<'_> {
+    /// Where the weights of phase `p` begin.
+    #[inline(always)]
+    pub(crate) fn begin(&self, p: usize) -> usize {
+        p * (self.len + 2 * self.margin) + self.margin
+    }
+}
+
 impl AxisTable {
-    fn new(profile: &Profile, scale: f64) -> Self {
+    /// Weights of `profile` at `scale`; `padded`: with as many zeros around each phase's as it has
+    /// weights.
+    fn new(profile: &Profile, scale: f64, padded: bool) -> Self {
         let radius = profile.radius * scale;
         let spans: Vec<(i64, i64)> = (0..SUBPIXELS).map(|p| reach(p, radius)).collect();
         let first: Vec<i32> = spans.iter().map(|s| near(s.0)).collect();
         let count: Vec<u32> = spans.iter().map(|s| (s.1 - s.0 + 1).max(0) as u32).collect();
         let stride = count.iter().copied().max().unwrap_or(0) as usize;
-        let mut weights = vec![Tap::default(); 3 * stride * SUBPIXELS as usize];
-        let mut fixed_weights = vec![0; weights.len()];
-        for p in 0..SUBPIXELS as usize {
-            for t in 0..count[p] as usize {
-                let w = weight(profile, scale, p as i32, spans[p].0 + t as i64);
-                weights[(3 * p + 1) * stride + t] = Tap::new(w as f32);
-                fixed_weights[(3 * p + 1) * stride + t] = fixed(w * profile.spread);
-            }
-        }
+        let margin = if padded { stride } else { 0 };
         let far = |s: &(i64, i64)| near((-s.0).max(s.1));
         let reach = spans.iter().map(far).max().unwrap_or(0);
-        AxisTable { first, count, weights, fixed: fixed_weights, stride, reach }
+        let n = (stride + 2 * margin) * SUBPIXELS as usize;
+        let (weights, fixed_weights) = (vec![Tap::default(); n], vec![0; n]);
+        let mut table =
+            AxisTable { first, count, weights, fixed: fixed_weights, stride, margin, reach };
+        for p in 0..SUBPIXELS as usize {
+            let begin = table.phases().begin(p);
+            for t in 0..table.count[p] as usize {
+                let w = weight(profile, scale, p as i32, spans[p].0 + t as i64);
+                table.weights[begin + t] = Tap::new(w as f32);
+                table.fixed[begin + t] = fixed(w * profile.spread);
+            }
+        }
+        table
+    }
+
+    #[inline(always)]
+    fn phases(&self) -> Phases<'_> {
+        Phases { firsts: &self.first, len: self.stride, margin: self.margin }
     }
 }
 
@@ -238,7 +270,7 @@ const TABLE_TAPS: f64 = 1024.0;
 /// voxels a side. Beyond it weights are evaluated where they are drawn, which costs a voxel some 20
 /// exponentials a section instead of a look-up: minutes a picture instead of seconds. Only tables of
 /// sheets that are drawn are made.
-const TABLE_BYTES: f64 = 768.0 * 1024.0 * 1024.0;
+const TABLE_BYTES: f64 = 256.0 * 1024.0 * 1024.0;
 
 /// Tables of one scale, x and y. Where the profiles are the same (cubic lattices) there is one.
 #[derive(Debug)]
@@ -248,8 +280,9 @@ struct Tables {
 }
 
 impl Tables {
-    fn new(x: &Profile, y: &Profile, scale: f64) -> Self {
-        Tables { x: AxisTable::new(x, scale), y: (x != y).then(|| AxisTable::new(y, scale)) }
+    fn new(x: &Profile, y: &Profile, scale: f64, padded: bool) -> Self {
+        let along = |profile| AxisTable::new(profile, scale, padded);
+        Tables { x: along(x), y: (x != y).then(|| along(y)) }
     }
 
     #[inline]
@@ -281,10 +314,10 @@ pub struct Shelf {
     tables: Mutex<BTreeMap<Key, Arc<Tables>>>,
 }
 
-/// Two profiles and a scale, as bits.
-type Key = [u64; 7];
+/// Two profiles and a scale, as bits, and whether weights are padded.
+type Key = ([u64; 7], bool);
 
-/// Tables that a shelf keeps: some 1000 are 40 MB at two pixels a vox. A turn of a volume of 256
+/// Tables that a shelf keeps: some 1000 are 14 MB at two pixels a vox. A turn of a volume of 256
 /// voxels a side has 450. A shelf that is full is cleared: what frames use they hold themselves.
 const SHELF: usize = 1024;
 
@@ -299,16 +332,16 @@ fn rounded(scale: f64) -> f64 {
 }
 
 impl Shelf {
-    fn get(&self, x: &Profile, y: &Profile, scale: f64) -> Arc<Tables> {
+    fn get(&self, x: &Profile, y: &Profile, scale: f64, padded: bool) -> Arc<Tables> {
         let profile = |p: &Profile| [p.std, p.radius, p.spread].map(f64::to_bits);
         let ([a, b, c], [d, e, f]) = (profile(x), profile(y));
-        let key = [a, b, c, d, e, f, scale.to_bits()];
+        let key = ([a, b, c, d, e, f, scale.to_bits()], padded);
         let tables = || self.tables.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(found) = tables().get(&key) {
             return found.clone();
         }
         // Not under the lock: it takes a tenth of a millisecond, and threads want others.
-        let made = Arc::new(Tables::new(x, y, scale));
+        let made = Arc::new(Tables::new(x, y, scale, padded));
         let mut tables = tables();
         if tables.len() >= SHELF {
             tables.clear();
@@ -322,8 +355,7 @@ pub type Span<'a> = (i32, &'a [Tap]);
 
 impl Footprints {
     /// The footprints of `view` for sheets in `range`; `spread` is the length of a lattice step
-    /// along the eye's axes in vox ([`Profile::with_spread`]). Tables are
-    /// taken from `shelf`.
+    /// along the eye's axes in vox ([`Profile::with_spread`]). Tables are taken from `shelf`.
     pub fn new(view: &View, range: SheetRange, spread: DVec3, shelf: Arc<Shelf>) -> Self {
         let x = Profile::new(view.kernel_std.x, view.kernel_radius.x).with_spread(spread.x);
         let y = Profile::new(view.kernel_std.y, view.kernel_radius.y).with_spread(spread.y);
@@ -334,9 +366,9 @@ impl Footprints {
         };
         let largest = (range.first..range.end).find_map(|k| view.scale_at(k)).unwrap_or(1.0);
         let taps = 2.0 * reach * largest + 2.0;
-        // Two kinds of weights with zeros on both sides, along one axis or two.
+        // Two kinds of weights, along one axis or two.
         let axes = if x == y { 1.0 } else { 2.0 };
-        let bytes = taps * f64::from(SUBPIXELS) * 18.0 * axes * sheets as f64;
+        let bytes = taps * f64::from(SUBPIXELS) * 6.0 * axes * sheets as f64;
         let kept = taps <= TABLE_TAPS && bytes <= TABLE_BYTES;
         let tables = (0..if kept { sheets } else { 0 }).map(|_| OnceLock::new()).collect();
         let (first, last) = (range.first, range.end - 1);
@@ -352,12 +384,14 @@ impl Footprints {
     #[inline]
     pub fn at(&self, k: i32) -> Option<Footprint<'_>> {
         let scale = self.view.scale_at(k)?;
-        let slot = match self.view.projection {
-            Projection::Ortho { .. } => self.tables.first(),
-            Projection::Persp { .. } => self.tables.get((k - self.first) as usize),
+        // Where one table serves all sheets, windows are moved to lie inside a part.
+        let (slot, padded) = match self.view.projection {
+            Projection::Ortho { .. } => (self.tables.first(), true),
+            Projection::Persp { .. } => (self.tables.get((k - self.first) as usize), false),
         };
         let wide = rounded(scale);
-        let table = slot.map(|t| &**t.get_or_init(|| self.shelf.get(&self.x, &self.y, wide)));
+        let make = || self.shelf.get(&self.x, &self.y, wide, padded);
+        let table = slot.map(|t| &**t.get_or_init(make));
         Some(Footprint { scale, wide, table, profiles: [&self.x, &self.y] })
     }
 }
@@ -409,7 +443,7 @@ impl<'a> Footprint<'a> {
         clip: (i32, i32),
         buffer: &'b mut Vec<Tap>,
     ) -> Span<'b> {
-        let row = |t: &'b AxisTable, p: usize| &t.weights[(3 * p + 1) * t.stride..][..t.stride];
+        let row = |t: &'b AxisTable, p: usize| &t.weights[t.phases().begin(p)..][..t.stride];
         self.window(axis, pos, clip, buffer, row, |w, _| Tap::new(w as f32))
     }
 
@@ -422,25 +456,24 @@ impl<'a> Footprint<'a> {
         clip: (i32, i32),
         buffer: &'b mut Vec<i16>,
     ) -> (i32, &'b [i16]) {
-        let row = |t: &'b AxisTable, p: usize| &t.fixed[(3 * p + 1) * t.stride..][..t.stride];
+        let row = |t: &'b AxisTable, p: usize| &t.fixed[t.phases().begin(p)..][..t.stride];
         self.window(axis, pos, clip, buffer, row, |w, spread| fixed(w * spread))
     }
 
-    /// Weights along `axis` by phase, each with as many zeros before and after: a window that is
-    /// moved to lie inside a part reads zeros outside. `None` where they are not in a table.
-    pub(crate) fn padded(&self, axis: usize) -> Option<&'a [Tap]> {
+    /// All weights along `axis`, where they are in a table; orthographic ones padded, so that a
+    /// window that is moved to lie inside a part reads zeros outside.
+    pub(crate) fn all(&self, axis: usize) -> Option<&'a [Tap]> {
         self.table.map(|t| &t.along(axis).weights[..])
     }
 
-    /// [`Footprint::padded`] in steps of the lattice, in units of 2^-15.
-    pub(crate) fn padded_fixed(&self, axis: usize) -> Option<&'a [i16]> {
+    /// [`Footprint::all`] in steps of the lattice, in units of 2^-15.
+    pub(crate) fn all_fixed(&self, axis: usize) -> Option<&'a [i16]> {
         self.table.map(|t| &t.along(axis).fixed[..])
     }
 
-    /// First pixel of each phase, relative to the one that holds the centre, and how many pixels
-    /// one has at most; where weights are in a table.
-    pub(crate) fn firsts(&self, axis: usize) -> Option<(&'a [i32], usize)> {
-        self.table.map(|t| t.along(axis)).map(|t| (&t.first[..], t.stride))
+    /// Where they lie.
+    pub(crate) fn phases(&self, axis: usize) -> Option<Phases<'a>> {
+        self.table.map(|t| t.along(axis).phases())
     }
 
     #[inline(always)]

@@ -66,11 +66,11 @@ pub(crate) trait Stage<S: Recorded> {
         open: &OpenMask,
         counters: &mut Counters,
     );
-    /// Adds a voxel that begins before the slab, at `first`, to those of its sheets that are left.
-    fn splat_rest(
+    /// Adds voxels that begin before the slab, with their first sheets, to those of their sheets that
+    /// are left.
+    fn splat_carried(
         &mut self,
-        voxel: &Self::Voxel,
-        first: i32,
+        carried: &[(Self::Voxel, i32)],
         sheets: &mut Sheets<'_, S>,
         open: &OpenMask,
         counters: &mut Counters,
@@ -108,8 +108,9 @@ pub(crate) fn walk<S: Recorded, T: Stage<S>>(
             next += 1;
         }
         sheets.added[slot(k)] = [0; STRIPS];
-        for (voxel, first) in queues.carried.drain(..) {
-            stage.splat_rest(&voxel, first, &mut sheets, &open, counters);
+        if !queues.carried.is_empty() {
+            stage.splat_carried(&queues.carried, &mut sheets, &open, counters);
+            queues.carried.clear();
         }
         let bucket = &mut queues.buckets[(k - slab.first) as usize];
         stage.splat(bucket, k, &mut sheets, &open, counters);

@@ -20,12 +20,13 @@
 
 use crate::deep::{self, RenderDeep};
 use crate::flat::{self, RenderFlat};
-use crate::general::{GeneralScratch, RenderGeneral};
+use crate::general::{GeneralScratch, Kind, Queues, RenderGeneral};
 use crate::mask::OpenMask;
 use crate::planes;
 use crate::scene::{Corner, Frame};
 use crate::sheet::Row;
 use crate::splat::Simd;
+use crate::splat::records::Recorded;
 use crate::stack::Store;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{RawSums, TilePixels, TileState};
@@ -73,9 +74,7 @@ impl Seen {
 #[derive(Default)]
 pub struct Scratch {
     general: GeneralScratch,
-    flat: flat::Waiting,
-    deep: deep::Waiting,
-    stores: Stores,
+    whole: Whole,
     pixels: Pixels,
     /// Which of a tile's bricks lie in a part.
     inside: Vec<u32>,
@@ -83,9 +82,17 @@ pub struct Scratch {
 
 /// Memory for sums in records.
 #[derive(Default)]
-struct Stores {
+struct Whole {
     shorts: Store<i16>,
     longs: Store<i32>,
+    waiting: Waiting,
+}
+
+/// Memory for voxels on their way to records.
+#[derive(Default)]
+struct Waiting {
+    flat: flat::Waiting,
+    deep: deep::Waiting,
 }
 
 /// What a part starts from, what it gives back, and what it counts.
@@ -146,41 +153,21 @@ pub fn render_seen(
                 continue;
             }
             let part = Part { frame, rect, tile, slab, bricks, inside: &inside };
-            let Scratch { general, flat: waiting, deep: near, stores, pixels, .. } = scratch;
             let io = (state, &mut out, &mut *counters);
-            let Stores { shorts, longs } = stores;
+            let Scratch { general, whole, pixels, .. } = scratch;
             let GeneralScratch { kinds, queues } = general;
-            if frame.scene.quality.sums != Sums::F32
-                && let Some(view) = deep::takes(&part)
-            {
-                let waiting = &mut *near;
-                if frame.scene.quality.sums == Sums::I16 {
-                    let store = shorts;
-                    simd.run(RenderDeep { part, deep: view, simd, store, waiting, pixels, io });
-                } else {
-                    let store = longs;
-                    simd.run(RenderDeep { part, deep: view, simd, store, waiting, pixels, io });
-                }
-                continue;
-            }
-            match (frame.scene.quality.sums, flat::takes(frame)) {
-                (Sums::I16, Some(view)) => {
-                    simd.run(RenderFlat { part, view, simd, store: shorts, waiting, pixels, io });
-                }
-                (Sums::I32 | Sums::Auto, Some(view)) => {
-                    simd.run(RenderFlat { part, view, simd, store: longs, waiting, pixels, io });
-                }
-                (Sums::I16, None) => {
-                    let kind = &mut kinds.shorts;
-                    simd.run(RenderGeneral { part, kind, queues, pixels, io });
-                }
-                (Sums::I32 | Sums::Auto, None) => {
-                    let kind = &mut kinds.longs;
-                    simd.run(RenderGeneral { part, kind, queues, pixels, io });
-                }
-                (Sums::F32, _) => {
+            match frame.scene.quality.sums {
+                Sums::F32 => {
                     let kind = &mut kinds.floats;
                     simd.run(RenderGeneral { part, kind, queues, pixels, io });
+                }
+                Sums::I16 => {
+                    let (store, waiting) = (&mut whole.shorts, &mut whole.waiting);
+                    part.render(simd, store, waiting, (&mut kinds.shorts, queues), pixels, io);
+                }
+                Sums::I32 | Sums::Auto => {
+                    let (store, waiting) = (&mut whole.longs, &mut whole.waiting);
+                    part.render(simd, store, waiting, (&mut kinds.longs, queues), pixels, io);
                 }
             }
         }
@@ -242,6 +229,28 @@ impl Pixels {
 }
 
 impl Part<'_> {
+    /// Renders it in whole sums, in the fastest room that takes it.
+    fn render<S: Recorded>(
+        self,
+        simd: Simd,
+        store: &mut Store<S>,
+        waiting: &mut Waiting,
+        (kind, queues): (&mut Kind<S>, &mut Queues),
+        pixels: &mut Pixels,
+        io: Io<'_>,
+    ) {
+        let part = self;
+        if let Some(view) = flat::takes(part.frame) {
+            let waiting = &mut waiting.flat;
+            simd.run(RenderFlat { part, view, simd, store, waiting, pixels, io });
+        } else if let Some(deep) = deep::takes(&part) {
+            let waiting = &mut waiting.deep;
+            simd.run(RenderDeep { part, deep, simd, store, waiting, pixels, io });
+        } else {
+            simd.run(RenderGeneral { part, kind, queues, pixels, io });
+        }
+    }
+
     /// The part's brick `i`, front to back.
     #[inline(always)]
     pub(crate) fn brick(&self, i: usize) -> &Seen {

@@ -107,6 +107,21 @@ pub(crate) type BySlot<W> = [W; SLOTS];
 /// Weights by column and slot, and by row and slot.
 pub(crate) type Across<'a, W> = (&'a [BySlot<W>], &'a [BySlot<W>]);
 
+/// Calls the one of three functions that belongs to the level of `simd`.
+macro_rules! at_level {
+    ($simd:expr, $args:tt, $plain:path, $avx2:path, $avx512:path) => {
+        match $simd.0 {
+            Level::Plain => $plain $args,
+            // SAFETY: the value proves that the instructions are there; AVX-512 has AVX2 in it.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe { $avx2 $args },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => unsafe { $avx512 $args },
+        }
+    };
+}
+
 /// Sums that records are made of.
 pub(crate) trait Recorded: Accumulate {
     /// A weight in depth.
@@ -114,7 +129,7 @@ pub(crate) trait Recorded: Accumulate {
     /// Extinction and colours of a voxel.
     type Payload: Copy + Default;
 
-    /// The weights across of a footprint with tables, each with as many zeros before and after.
+    /// The weights of a footprint with tables across an axis.
     fn across<'a>(footprint: &Footprint<'a>, axis: usize) -> Option<&'a [Self::Weight]>;
     /// The weights in depth, [`Sections::most`] a phase.
     fn deep(sections: &Sections) -> &[Self::Depth];
@@ -176,7 +191,7 @@ impl Recorded for i16 {
     type Payload = u64;
 
     fn across<'a>(footprint: &Footprint<'a>, axis: usize) -> Option<&'a [i16]> {
-        footprint.padded_fixed(axis)
+        footprint.all_fixed(axis)
     }
 
     fn deep(sections: &Sections) -> &[i16] {
@@ -203,15 +218,13 @@ impl Recorded for i16 {
         tables: &Tables<'_, i16>,
     ) {
         assert_eq!(voxels.0.len(), voxels.1.len(), "a payload a voxel");
-        match simd.0 {
-            Level::Plain => splat_plain(records, voxels, slot, tables),
-            // SAFETY: the value proves that the instructions are there.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => unsafe { short::avx2::splat_all(records, voxels, slot, tables) },
-            // SAFETY: as above.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe { short::avx512::splat_all(records, voxels, slot, tables) },
-        }
+        at_level!(
+            simd,
+            (records, voxels, slot, tables),
+            splat_plain,
+            short::avx2::splat_all,
+            short::avx512::splat_all
+        );
     }
 
     #[inline(always)]
@@ -223,15 +236,13 @@ impl Recorded for i16 {
         payload: u64,
         z: &BySlot<i16>,
     ) {
-        match simd.0 {
-            Level::Plain => splat_deep(records, at, across, payload, z),
-            // SAFETY: the value proves that the instructions are there.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => unsafe { short::avx2::splat_deep(records, at, across, payload, z) },
-            // SAFETY: as above.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe { short::avx512::splat_deep(records, at, across, payload, z) },
-        }
+        at_level!(
+            simd,
+            (records, at, across, payload, z),
+            splat_deep,
+            short::avx2::splat_deep,
+            short::avx512::splat_deep
+        );
     }
 
     #[inline(always)]
@@ -243,15 +254,13 @@ impl Recorded for i16 {
         slot: usize,
         row: &mut Row,
     ) {
-        match simd.0 {
-            Level::Plain => take_plain(sums, a, strips, slot, row),
-            // SAFETY: the value proves that the instructions are there.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => unsafe { short::avx2::take(sums, a, strips, slot, row) },
-            // SAFETY: as above.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe { short::avx512::take(sums, a, strips, slot, row) },
-        }
+        at_level!(
+            simd,
+            (sums, a, strips, slot, row),
+            take_plain,
+            short::avx2::take,
+            short::avx512::take
+        );
     }
 }
 
@@ -260,7 +269,7 @@ impl Recorded for i32 {
     type Payload = [f32; 4];
 
     fn across<'a>(footprint: &Footprint<'a>, axis: usize) -> Option<&'a [Tap]> {
-        footprint.padded(axis)
+        footprint.all(axis)
     }
 
     fn deep(sections: &Sections) -> &[f32] {
@@ -286,15 +295,13 @@ impl Recorded for i32 {
         tables: &Tables<'_, i32>,
     ) {
         assert_eq!(voxels.0.len(), voxels.1.len(), "a payload a voxel");
-        match simd.0 {
-            Level::Plain => splat_plain(records, voxels, slot, tables),
-            // SAFETY: the value proves that the instructions are there.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => unsafe { long::avx2::splat_all(records, voxels, slot, tables) },
-            // SAFETY: as above.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe { long::avx512::splat_all(records, voxels, slot, tables) },
-        }
+        at_level!(
+            simd,
+            (records, voxels, slot, tables),
+            splat_plain,
+            long::avx2::splat_all,
+            long::avx512::splat_all
+        );
     }
 
     #[inline(always)]
@@ -306,14 +313,13 @@ impl Recorded for i32 {
         slot: usize,
         row: &mut Row,
     ) {
-        match simd.0 {
-            Level::Plain => take_plain(sums, a, strips, slot, row),
-            // SAFETY: the value proves that the instructions are there; AVX-512 has AVX2 in it.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx2 | Level::Avx512 => unsafe {
-                long::avx2::take(sums, a, strips, slot, row);
-            },
-        }
+        at_level!(
+            simd,
+            (sums, a, strips, slot, row),
+            take_plain,
+            long::avx2::take,
+            long::avx2::take
+        );
     }
 }
 

@@ -1,5 +1,5 @@
-//! The samples of a header's data file or files: skips, encoding, and lists of files. What NRRD
-//! and MetaImage have in common.
+//! The lines of a header, and the samples of its data file or files: skips, encoding, and lists of
+//! files. What NRRD and MetaImage have in common.
 
 use crate::error::{OpenErrorKind, Problem, quoted};
 use crate::samples::{self, DIM_MAX, Layout, SKIP_MAX_BYTES, Supply};
@@ -7,8 +7,54 @@ use crate::source::{self, Source};
 use crate::unpack::{Encoding, wrapped};
 use slabcast_common::volume::{Samples, ValueMap};
 use std::collections::VecDeque;
-use std::io::{Read, Seek, SeekFrom};
+use std::io::{BufRead, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
+
+/// Longest header: room for ten thousand lines; some programs write thousands of DICOM fields into
+/// one. It bounds the memory that a file whose header does not end can take.
+const HEADER_MAX_BYTES: u64 = 1 << 20;
+
+/// The lines of a header.
+pub(crate) struct HeaderLines<'a> {
+    source: &'a mut Source,
+    /// How a header is ended, for messages.
+    remedy: &'static str,
+    number: usize,
+    consumed: u64,
+    line: Vec<u8>,
+}
+
+impl<'a> HeaderLines<'a> {
+    /// Those of `source`, from where it stands.
+    pub(crate) fn of(source: &'a mut Source, remedy: &'static str) -> Self {
+        HeaderLines { source, remedy, number: 0, consumed: 0, line: Vec::new() }
+    }
+
+    /// The next line without its end, and its number from 1; `None` at the end of the file.
+    pub(crate) fn next(&mut self) -> Result<Option<(usize, String)>, Problem> {
+        self.line.clear();
+        let left = HEADER_MAX_BYTES - self.consumed;
+        let mut reader = self.source.reader.by_ref().take(left);
+        let n = reader.read_until(b'\n', &mut self.line).map_err(|e| Problem::io("header", &e))?;
+        self.consumed += n as u64;
+        self.number += 1;
+        if self.consumed == HEADER_MAX_BYTES {
+            return Err(Problem::malformed(
+                "header",
+                format!("does not end within {HEADER_MAX_BYTES} bytes"),
+                self.remedy,
+            ));
+        }
+        let text = String::from_utf8_lossy(&self.line);
+        let text = text.trim_end_matches(['\n', '\r']);
+        Ok((n > 0).then(|| (self.number, text.to_string())))
+    }
+
+    /// Bytes of the lines so far.
+    pub(crate) fn consumed(&self) -> u64 {
+        self.consumed
+    }
+}
 
 /// Bytes before the samples.
 #[derive(Clone, Copy, Debug, PartialEq)]

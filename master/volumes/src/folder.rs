@@ -47,11 +47,11 @@ pub(crate) fn open(folder: &Path, hints: &Hints) -> Result<Opened, Problem> {
         ENDS.iter().any(|end| name.to_ascii_lowercase().ends_with(end)).then(|| quoted(&name))
     });
     let remedy = match (volumes.next(), volumes.next()) {
-        (None, _) => "give a file, or a folder with the pictures of one stack".into(),
+        (None, _) => "give a file, or a folder with the slices or pictures of one volume".into(),
         (Some(one), None) => format!("give the file {one} in it"),
         (Some(one), Some(two)) => format!("give one file in it, such as {one} or {two}"),
     };
-    Err(Problem::new(OpenErrorKind::NotAVolume, "folder", "holds no TIFF pictures", remedy))
+    Err(Problem::new(OpenErrorKind::NotAVolume, "folder", "holds no slices or pictures", remedy))
 }
 
 /// Opens the series that a DICOM file is a slice of.

@@ -5,7 +5,7 @@
 //! ITK writes nearly all such files: rows of `TransformMatrix` are the directions of the index
 //! axes, space is LPS, and `CenterOfRotation` is not looked at.
 
-use crate::data::{self, Form, Skip};
+use crate::data::{self, Form, HeaderLines, Skip};
 use crate::error::{Problem, quoted};
 use crate::samples::{Endian, Layout, Number};
 use crate::source::Source;
@@ -13,11 +13,7 @@ use crate::unpack::Encoding;
 use glam::DVec3;
 use slabcast_common::volume::{Lattice, Volume};
 use std::collections::BTreeMap;
-use std::io::{BufRead, Read};
 use std::path::Path;
-
-/// Longest header; some programs write thousands of lines of DICOM fields into it.
-const HEADER_MAX_BYTES: u64 = 1 << 20;
 
 /// The key that ends the header, in small letters.
 const DATA_FILE: &str = "elementdatafile";
@@ -58,36 +54,16 @@ impl Fields {
     fn read(source: &mut Source) -> Result<(Fields, u64), Problem> {
         let mut lines = BTreeMap::new();
         let (mut list, mut in_list) = (Vec::new(), false);
-        let mut consumed = 0u64;
-        let mut line = Vec::new();
-        for number in 1.. {
-            line.clear();
-            let n = source
-                .reader
-                .by_ref()
-                .take(HEADER_MAX_BYTES - consumed)
-                .read_until(b'\n', &mut line)
-                .map_err(|e| Problem::io("header", &e))?;
-            consumed += n as u64;
-            if consumed == HEADER_MAX_BYTES {
-                return Err(Problem::malformed(
-                    "header",
-                    format!("does not end within {HEADER_MAX_BYTES} bytes"),
-                    "end it with `ElementDataFile = LOCAL` or the data file's name",
-                ));
-            }
-            let text = String::from_utf8_lossy(&line);
-            let text = text.trim();
-            if n == 0 {
+        const END: &str = "end the header with `ElementDataFile = LOCAL` or the data file's name";
+        let mut header = HeaderLines::of(source, END);
+        loop {
+            let Some((number, text)) = header.next()? else {
                 if in_list {
                     break;
                 }
-                return Err(Problem::malformed(
-                    "ElementDataFile",
-                    "is missing",
-                    "end the header with `ElementDataFile = LOCAL` or the data file's name",
-                ));
-            }
+                return Err(Problem::malformed("ElementDataFile", "is missing", END));
+            };
+            let text = text.trim();
             if text.is_empty() {
                 continue;
             }
@@ -117,7 +93,7 @@ impl Fields {
                 break;
             }
         }
-        Ok((Fields { lines, list }, consumed))
+        Ok((Fields { lines, list }, header.consumed()))
     }
 
     /// The value of the first of these keys that is there, and the key.

@@ -7,7 +7,7 @@
 //!
 //! All encodings but `zrl` are read (`unpack`).
 
-use crate::data::{self, Form, Skip};
+use crate::data::{self, Form, HeaderLines, Skip};
 use crate::error::{Problem, quoted};
 use crate::samples::{Endian, Layout, Number};
 use crate::source::Source;
@@ -15,15 +15,10 @@ use crate::unpack::Encoding;
 use glam::DVec3;
 use slabcast_common::volume::{Lattice, Volume};
 use std::collections::BTreeMap;
-use std::io::{BufRead, Read};
 use std::path::Path;
 
 /// What an NRRD file starts with, before its version.
 pub(crate) const MAGIC: &[u8] = b"NRRD";
-
-/// Longest header: room for ten thousand lines of key:=value pairs. It bounds the memory that a
-/// file without an empty line can take.
-const HEADER_MAX_BYTES: u64 = 1 << 20;
 
 /// Most axes that teem knows (`NRRD_DIM_MAX`).
 const AXES_MAX: usize = 16;
@@ -59,34 +54,13 @@ impl Fields {
         let mut fields = BTreeMap::new();
         let mut list = Vec::new();
         let mut in_list = false;
-        let mut consumed = 0u64;
-        let mut line = Vec::new();
-        for number in 1.. {
-            line.clear();
-            let left = HEADER_MAX_BYTES - consumed;
-            let n = source
-                .reader
-                .by_ref()
-                .take(left)
-                .read_until(b'\n', &mut line)
-                .map_err(|e| Problem::io("header", &e))?;
-            consumed += n as u64;
-            if consumed == HEADER_MAX_BYTES {
-                return Err(Problem::malformed(
-                    "header",
-                    format!("does not end within {HEADER_MAX_BYTES} bytes"),
-                    "end it with an empty line",
-                ));
-            }
-            let text = String::from_utf8_lossy(&line);
-            let text = text.trim_end_matches(['\n', '\r']);
+        let mut header = HeaderLines::of(source, "end it with an empty line");
+        // An empty line ends the header; so does the end of a detached one.
+        while let Some((number, text)) = header.next()?.filter(|(n, t)| *n == 1 || !t.is_empty()) {
+            let text = text.as_str();
             if number == 1 {
                 check_magic(text)?;
                 continue;
-            }
-            // An empty line ends the header; so does the end of a detached one.
-            if text.is_empty() {
-                break;
             }
             if in_list {
                 list.push(text.trim().to_string());
@@ -117,7 +91,7 @@ impl Fields {
             in_list = name == "data file" && value.split_ascii_whitespace().next() == Some("LIST");
             fields.insert(name, (number, value.trim().to_string()));
         }
-        Ok((Fields { lines: fields, list }, consumed))
+        Ok((Fields { lines: fields, list }, header.consumed()))
     }
 
     fn get(&self, name: &str) -> Option<&str> {

@@ -158,12 +158,10 @@ impl<S: Recorded> Stage<S> for DeepStage<'_, S> {
         counters: &mut Counters,
     ) {
         let Part { frame, rect, slab, .. } = self.part;
-        let Seen { brick, corner, projected } = self.part.brick(which);
-        let cull = frame.scene.quality.cull;
-        if cull && !open.any(&projected.rect) {
-            counters.culled += brick.len() as u64;
+        let Some(Seen { brick, corner, .. }) = self.part.open_brick(which, open, counters) else {
             return;
-        }
+        };
+        let cull = frame.scene.quality.cull;
         let (sections, view, n) = (&frame.sections, &frame.view, brick.len());
         let Tossing { eye, at, cells, fate } = &mut *self.tossing;
         for (i, &local) in brick.index.iter().enumerate() {

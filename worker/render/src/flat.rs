@@ -154,12 +154,11 @@ impl<S: Recorded> Stage<S> for FlatStage<'_, S> {
         counters: &mut Counters,
     ) {
         let Part { frame, rect, slab, .. } = self.part;
-        let Seen { brick, corner, projected } = self.part.brick(which);
-        let cull = frame.scene.quality.cull;
-        if cull && !open.any(&projected.rect) {
-            counters.culled += brick.len() as u64;
+        let Some(Seen { brick, corner, projected }) = self.part.open_brick(which, open, counters)
+        else {
             return;
-        }
+        };
+        let cull = frame.scene.quality.cull;
         let sections = &frame.sections;
         let phases = sections.phases();
         let base = projected.sheets.first;

@@ -187,12 +187,10 @@ impl General<'_> {
     #[inline(always)]
     fn admit(&self, which: usize, open: &OpenMask, queues: &mut Queues, counters: &mut Counters) {
         let Part { frame, rect, slab, .. } = self.part;
-        let Seen { brick, corner, projected } = self.part.brick(which);
-        let cull = frame.scene.quality.cull;
-        if cull && !open.any(&projected.rect) {
-            counters.culled += brick.len() as u64;
+        let Some(Seen { brick, corner, .. }) = self.part.open_brick(which, open, counters) else {
             return;
-        }
+        };
+        let cull = frame.scene.quality.cull;
         for (voxel, &local) in brick.index.iter().enumerate() {
             let placed = frame.place(corner, local);
             let (first, count) = frame.sections.span(placed.z);

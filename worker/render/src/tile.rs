@@ -257,6 +257,20 @@ impl Part<'_> {
         self.bricks[self.inside[i] as usize]
     }
 
+    /// The part's brick `i`, unless it is culled: all that it may touch is shut.
+    #[inline(always)]
+    pub(crate) fn open_brick(
+        &self,
+        i: usize,
+        open: &OpenMask,
+        counters: &mut Counters,
+    ) -> Option<&Seen> {
+        let seen = self.brick(i);
+        let passes = !self.frame.scene.quality.cull || open.any(&seen.projected.rect);
+        counters.culled += if passes { 0 } else { seen.brick.len() as u64 };
+        passes.then_some(seen)
+    }
+
     /// How many bricks it has.
     #[inline(always)]
     pub(crate) fn bricks(&self) -> usize {

@@ -175,10 +175,13 @@ impl General<'_> {
             Projection::Persp { .. } => {
                 // Edges move one way with depth, so the first and last visible sections hold
                 // the others. An end's rounding may put one a pixel farther out: grow by one.
+                // One that holds no pixel's centre still says where the edges are, which
+                // `Rect::union` would forget.
                 let front = (first..=last).find_map(at)?;
                 let back = at(last)?;
-                let r = front.union(&back);
-                Some(Rect::new(r.x0 - 1, r.y0 - 1, r.x1 + 1, r.y1 + 1))
+                let (x0, y0) = (front.x0.min(back.x0), front.y0.min(back.y0));
+                let (x1, y1) = (front.x1.max(back.x1), front.y1.max(back.y1));
+                Some(Rect::new(x0 - 1, y0 - 1, x1 + 1, y1 + 1))
             }
         }
     }

@@ -32,7 +32,7 @@ pub mod wanted;
 
 /// Version of the arithmetic behind the pixels. Two programs that agree on it give the same
 /// bytes for the same view; a change of any golden hash raises it (CONTRACTS.md, Exactness).
-pub const PIXELS_VERSION: u32 = 3;
+pub const PIXELS_VERSION: u32 = 4;
 
 /// Version of the messages between master, worker and client.
 pub const PROTOCOL_VERSION: u32 = 1;
@@ -40,4 +40,4 @@ pub const PROTOCOL_VERSION: u32 = 1;
 /// SHA-256 of the self-test tile that every worker draws before it says hello
 /// (`slabcast_render::selftest`, which also has the test that keeps this constant true).
 pub const SELF_TEST_SHA256: &str =
-    "d0ea1ae21135ca8c768c8e5443d94eb1b70a9ac367ad18b7e0b536ba6706b02c";
+    "fad7858f8ca76741e8478bafb5758a5ae070bfe8a3dd0b6028dc4a87d3cf2f46";

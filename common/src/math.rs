@@ -1,15 +1,15 @@
 //! Elementary functions with one result on every machine.
 //!
 //! `f32::exp` asks the platform's maths library, which differs between machines in the last
-//! bit. The two functions here use additions and multiplications alone, in one written order,
+//! bit. The functions here use additions and multiplications alone, in one written order,
 //! without contraction; they are branch-free but for one select, so that compilers can run them
 //! on lanes. Formulas: Cody-Waite reduction and the Taylor series of degree 7 on
 //! `|r| <= ln 2 / 2`, whose remainder (5e-9) is below half an ulp of f32.
 
-/// `exp(x)` for `x <= 0`, clamped below at -87 (where f32 results would be denormal).
-/// Relative error at most 2 ulp.
+/// `exp(x)` as `s * (1 + q)` with a power of two s and `q` small, for `x <= 0`, clamped below at -87
+/// (where f32 results would be denormal). For `x` near 0, s is 1 and q keeps all its digits.
 #[inline(always)]
-pub fn exp_neg(x: f32) -> f32 {
+fn exp_parts(x: f32) -> (f32, f32) {
     let x = if x > -87.0 { x } else { -87.0 };
     // Adding 1.5 * 2^23 rounds to the nearest integer, ties to even, and leaves that integer in
     // the low bits: no conversion instruction, the same on every machine.
@@ -27,38 +27,28 @@ pub fn exp_neg(x: f32) -> f32 {
     let p = p * r + 1.0 / 6.0;
     let p = p * r + 0.5;
     let p = p * r + 1.0;
-    let p = p * r + 1.0;
     let exponent = (shifted.to_bits() as i32).wrapping_sub(MAGIC.to_bits() as i32);
-    p * f32::from_bits(((exponent + 127) as u32) << 23)
+    (f32::from_bits(((exponent + 127) as u32) << 23), p * r)
+}
+
+/// `exp(x)` for `x <= 0`, clamped below at -87. Relative error at most 2 ulp.
+#[inline(always)]
+pub fn exp_neg(x: f32) -> f32 {
+    let (s, q) = exp_parts(x);
+    (q + 1.0) * s
 }
 
 /// Opacity of a sheet: `a = 1 - exp(-tau)`, with full relative accuracy down to the smallest
 /// `tau` (NUMERICS.md section 2). `tau >= 0`.
 #[inline(always)]
 pub fn opacity(tau: f32) -> f32 {
-    let (small, large) = opacities(tau);
-    if tau < SWITCH { small } else { large }
+    let (s, q) = exp_parts(-tau);
+    // The first difference is exact, and nothing where tau is small: then -q is all there is.
+    (1.0 - s) - s * q
 }
 
-/// Below this optical depth series take over from closed forms.
+/// Below this optical depth the series of [`phi`] takes over from its closed form.
 pub const SWITCH: f32 = 0.25;
-
-/// Both forms of [`opacity`]: for depths below [`SWITCH`], and for others. Who needs them on lanes
-/// works out both and then chooses.
-#[inline(always)]
-pub fn opacities(tau: f32) -> (f32, f32) {
-    let small = {
-        // Six terms; at the switch (.25) the seventh is 4e-8 of the whole.
-        let p = -1.0 / 720.0;
-        let p = p * tau + 1.0 / 120.0;
-        let p = p * tau + -1.0 / 24.0;
-        let p = p * tau + 1.0 / 6.0;
-        let p = p * tau + -0.5;
-        let p = p * tau + 1.0;
-        p * tau
-    };
-    (small, 1.0 - exp_neg(-tau))
-}
 
 /// The weight of a colour's change through a sheet: `phi = a / tau + a / 2 - 1` (NUMERICS.md
 /// section 1.1). `a` must be `opacity(tau)` and `per_tau` 1 / tau to some digits; `tau > 0`.
@@ -68,7 +58,8 @@ pub fn phi(tau: f32, per_tau: f32, a: f32) -> f32 {
     if tau < SWITCH { small } else { large }
 }
 
-/// Both forms of [`phi`], as [`opacities`] has those of opacity.
+/// Both forms of [`phi`]: for depths below [`SWITCH`], and for others. Who needs them on lanes works
+/// out both and then chooses.
 #[inline(always)]
 pub fn phis(tau: f32, per_tau: f32, a: f32) -> (f32, f32) {
     // The closed form loses all digits below tau = 1e-3; the series takes over where both are

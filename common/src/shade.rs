@@ -141,18 +141,18 @@ impl Shader {
     #[inline]
     pub fn light(&self, normal: u16, to_eye: Vec3) -> Lit {
         let mut lit = [[0.0]; 2];
-        self.light_all(&[normal], to_eye, &mut lit);
+        self.light_all(&[normal], |_| to_eye, &mut lit);
         Lit { lambert: lit[0][0], gloss: lit[1][0] }
     }
 
-    /// [`Shader::light`] of many voxels that see the eye in one direction: what their base colours
-    /// are multiplied by, and what is added. Loops over plain arrays of a length that compilers do
-    /// not know, so that they run them on lanes.
+    /// [`Shader::light`] of many voxels, of which the `i`th sees the eye in direction `to_eye(i)`: what
+    /// their base colours are multiplied by, and what is added. Loops over plain arrays of a length
+    /// that compilers do not know, so that they run them on lanes.
     #[inline(always)]
     pub fn light_all<const MOST: usize>(
         &self,
         normals: &[u16],
-        to_eye: Vec3,
+        to_eye: impl Fn(usize) -> Vec3,
         lit: &mut [[f32; MOST]; 2],
     ) {
         let n = normals.len().min(MOST);
@@ -161,7 +161,7 @@ impl Shader {
         match self.light {
             None => {
                 for i in 0..n {
-                    let normal = decode_normal(normals[i]);
+                    let (normal, to_eye) = (decode_normal(normals[i]), to_eye(i));
                     // n = -gradient/|gradient| turned towards the eye: the sign of the stored
                     // vector drops out, since it is turned anyway.
                     let n_eye = normal.x * to_eye.x + normal.y * to_eye.y + normal.z * to_eye.z;
@@ -170,11 +170,11 @@ impl Shader {
                 }
             }
             Some(l) => {
-                let h = l + to_eye;
-                let len2 = h.x * h.x + h.y * h.y + h.z * h.z;
-                let per_len = if len2 > 1e-12 { 1.0 / len2.sqrt() } else { 0.0 };
                 for i in 0..n {
-                    let n = decode_normal(normals[i]);
+                    let (n, to_eye) = (decode_normal(normals[i]), to_eye(i));
+                    let h = l + to_eye;
+                    let len2 = h.x * h.x + h.y * h.y + h.z * h.z;
+                    let per_len = if len2 > 1e-12 { 1.0 / len2.sqrt() } else { 0.0 };
                     let n_eye = n.x * to_eye.x + n.y * to_eye.y + n.z * to_eye.z;
                     let side = if n_eye < 0.0 { -1.0 } else { 1.0 };
                     light[i] = (n.x * l.x + n.y * l.y + n.z * l.z) * side;

@@ -331,6 +331,40 @@ impl View {
         Vec3::new(w.x as f32, w.y as f32, w.z as f32)
     }
 
+    /// [`View::to_eye`] of many eye positions, by axis, in a perspective view; the same in every bit.
+    ///
+    /// # Panics
+    /// In an orthographic view, where one direction is all there is.
+    #[inline(always)]
+    pub fn to_eye_all<const MOST: usize>(
+        &self,
+        [x, y, z]: [&[f64]; 3],
+        out: &mut [[f32; MOST]; 3],
+    ) {
+        let Projection::Persp { distance, .. } = self.projection else {
+            panic!("one direction to the eye of an orthographic view");
+        };
+        let turn = self.eye_from_world.transpose();
+        let n = x.len().min(y.len()).min(z.len()).min(MOST);
+        for i in 0..n {
+            let v = [-x[i], -y[i], -(z[i] + distance)];
+            // glam's square root is a call; this one is an instruction, and rounds as exactly.
+            let len = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
+            let far = len > 1e-12;
+            let len = if far { len } else { 1.0 };
+            let d = v.map(|v| v / len);
+            let d = [
+                if far { d[0] } else { 0.0 },
+                if far { d[1] } else { 0.0 },
+                if far { d[2] } else { -1.0 },
+            ];
+            for axis in 0..3 {
+                let w = turn.x_axis[axis] * d[0] + turn.y_axis[axis] * d[1];
+                out[axis][i] = (w + turn.z_axis[axis] * d[2]) as f32;
+            }
+        }
+    }
+
     /// Box in eye space of the voxel centres of a box in index space.
     fn eye_box(&self, b: &TightBox) -> (DVec3, DVec3) {
         let lo = DVec3::from_array(b.lo.map(f64::from));
@@ -419,6 +453,29 @@ mod tests {
         for (x, want) in [(0.4, 0), (0.6, 1), (-0.6, -1), (1e9 + 0.3, 1_000_000_000), (-7.49, -7)] {
             assert_eq!(round_i32(x), want, "{x}");
             assert_eq!(round_i64(x), i64::from(want), "{x}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn many_directions_to_the_eye_are_those_of_each(
+            azimuth in 0.0..6.3f64, tilt in -1.5..1.5f64, distance in 0.01..1e3f64,
+            at in prop::collection::vec(prop::array::uniform3(-50.0..50.0f64), 1..20),
+        ) {
+            let l = Lattice::from_spacing([9, 7, 5], [2.0; 3]);
+            let c = camera(azimuth, tilt, CameraProjection::Persp { fov: 30.0, distance });
+            let v = View::new(&l, &c, [64, 48], &Quality::default()).unwrap();
+            // The eye itself sees no direction to it.
+            let Projection::Persp { distance, .. } = v.projection else { unreachable!() };
+            let at = [at, vec![[0.0, 0.0, -distance]]].concat();
+            let axis = |i: usize| at.iter().map(|p| p[i]).collect::<Vec<_>>();
+            let (x, y, z) = (axis(0), axis(1), axis(2));
+            let mut out = [[0.0; 32]; 3];
+            v.to_eye_all([&x, &y, &z], &mut out);
+            for (i, p) in at.iter().enumerate() {
+                let want = v.to_eye(DVec3::from_array(*p)).to_array();
+                prop_assert_eq!(out.map(|axis| axis[i].to_bits()), want.map(f32::to_bits));
+            }
         }
     }
 

@@ -8,12 +8,12 @@
 
 use crate::footprint::Phases;
 use crate::mask::{OpenMask, REACH_MOST};
-use crate::splat::records::{BySlot, Recorded, SLOTS, STRIDE};
+use crate::splat::records::{BySlot, MOST, Recorded, STRIDE};
 use crate::splat::{Accumulate, Simd, Work};
 use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels, Seen};
-use slabcast_common::brick::Brick;
 use slabcast_common::message::Counters;
+use slabcast_common::shade::NO_NORMAL;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, round_i32};
 
 /// Phases of a subpixel as a mask.
@@ -22,12 +22,15 @@ const PHASES: usize = SUBPIXELS as usize - 1;
 /// Pixels of a window at most, along an axis: a footprint of eight pixels a vox.
 const WINDOW: usize = 40;
 
-/// A voxel waiting in the bucket of its first sheet.
+/// A voxel waiting in the bucket of its first sheet, with all that drawing it takes: nobody goes back
+/// to the brick.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct DeepVoxel {
-    /// Which of the part's bricks, and which voxel of it.
-    brick: u32,
-    voxel: u16,
+    /// Eye coordinates in vox.
+    eye: [f64; 3],
+    /// Its sample's bits.
+    sample: u32,
+    normal: u16,
     /// The pixel of the part that is nearest to its centre: [`OpenMask::near_all`].
     cell: u16,
 }
@@ -37,6 +40,7 @@ pub(crate) struct DeepVoxel {
 pub(crate) struct Waiting {
     queues: Queues<DeepVoxel>,
     tossing: Box<Tossing>,
+    batch: Box<Batch>,
 }
 
 /// Voxels of a brick on their way to buckets.
@@ -47,11 +51,73 @@ struct Tossing {
     at: [[i32; 512]; 3],
     cells: [u32; 512],
     fate: [u32; 512],
+    samples: [u32; 512],
 }
 
 impl Default for Tossing {
     fn default() -> Self {
-        Tossing { eye: [[0.0; 512]; 3], at: [[0; 512]; 3], cells: [0; 512], fate: [0; 512] }
+        Tossing {
+            eye: [[0.0; 512]; 3],
+            at: [[0; 512]; 3],
+            cells: [0; 512],
+            fate: [0; 512],
+            samples: [0; 512],
+        }
+    }
+}
+
+/// Voxels that are placed, shaded and splatted together.
+const BATCH: usize = 64;
+
+/// A number a voxel.
+type Each<T> = [T; BATCH];
+
+/// Voxels on their way from a bucket to the records.
+struct Batch {
+    eye: [Each<f64>; 3],
+    samples: Each<u32>,
+    normals: Each<u16>,
+    /// Sheets that a voxel has left, from the one at hand.
+    left: Each<i32>,
+    /// Depths in phases.
+    z: Each<i32>,
+    /// First pixels of footprints, from the part's corner, and where weights begin: by axis and slot.
+    first: [[Each<i32>; MOST]; 2],
+    from: [[Each<u32>; MOST]; 2],
+    /// By axis, the window that holds all footprints of a voxel.
+    lo: [Each<i32>; 2],
+    hi: [Each<i32>; 2],
+    /// Voxels that touch an open pixel.
+    kept: Each<u32>,
+    light: [Each<f32>; 4],
+}
+
+impl Default for Batch {
+    fn default() -> Self {
+        Batch {
+            eye: [[0.0; BATCH]; 3],
+            samples: [0; BATCH],
+            normals: [0; BATCH],
+            left: [0; BATCH],
+            z: [0; BATCH],
+            first: [[[0; BATCH]; MOST]; 2],
+            from: [[[0; BATCH]; MOST]; 2],
+            lo: [[0; BATCH]; 2],
+            hi: [[0; BATCH]; 2],
+            kept: [0; BATCH],
+            light: [[0.0; BATCH]; 4],
+        }
+    }
+}
+
+impl Batch {
+    /// Takes over `v`, which has `left` sheets left, as voxel `i`.
+    #[inline(always)]
+    fn put(&mut self, i: usize, v: &DeepVoxel, left: i32) {
+        for axis in 0..3 {
+            self.eye[axis][i] = v.eye[axis];
+        }
+        (self.samples[i], self.normals[i], self.left[i]) = (v.sample, v.normal, left);
     }
 }
 
@@ -69,7 +135,7 @@ pub(crate) fn takes(part: &Part<'_>) -> Option<Deep> {
     let (frame, view) = (part.frame, &part.frame.view);
     let Projection::Persp { focal, distance } = view.projection else { return None };
     let most = frame.sections.most();
-    if most > SLOTS || part.bricks() == 0 {
+    if part.bricks() == 0 {
         return None;
     }
     // Scales fall with depth: those of the nearest sheet and of a voxel's length in front of it
@@ -93,7 +159,7 @@ pub(crate) fn takes(part: &Part<'_>) -> Option<Deep> {
 }
 
 /// Renders a part: compiled for each instruction set as a whole.
-pub(crate) struct RenderDeep<'a, S: Recorded> {
+pub(crate) struct RenderDeep<'a, S: Recorded, const N: usize> {
     pub(crate) part: Part<'a>,
     pub(crate) deep: Deep,
     pub(crate) simd: Simd,
@@ -103,24 +169,25 @@ pub(crate) struct RenderDeep<'a, S: Recorded> {
     pub(crate) io: Io<'a>,
 }
 
-impl<S: Recorded> Work for RenderDeep<'_, S> {
+impl<S: Recorded, const N: usize> Work for RenderDeep<'_, S, N> {
     type Out = ();
     #[inline(always)]
     fn run(self) {
         let RenderDeep { part, deep, simd, store, waiting, pixels, io } = self;
-        let Waiting { queues, tossing } = waiting;
-        let [x, y] = [[[S::Weight::default(); SLOTS]; WINDOW]; 2];
-        let stage = DeepStage { part: &part, deep, tossing, across: [x, y] };
-        walk(&part, stage, (simd, store), queues, pixels, io);
+        let Waiting { queues, tossing, batch } = waiting;
+        let [x, y] = [[[S::Weight::default(); N]; WINDOW]; 2];
+        let stage = DeepStage { part: &part, deep, tossing, batch, across: [x, y] };
+        walk::<S, N, _>(&part, stage, (simd, store), queues, pixels, io);
     }
 }
 
-struct DeepStage<'a, S: Recorded> {
+struct DeepStage<'a, S: Recorded, const N: usize> {
     part: &'a Part<'a>,
     deep: Deep,
     tossing: &'a mut Tossing,
+    batch: &'a mut Batch,
     /// Weights of the voxel at hand by column and by row.
-    across: [[BySlot<S::Weight>; WINDOW]; 2],
+    across: [[BySlot<S::Weight, N>; WINDOW]; 2],
 }
 
 /// Footprints of one sheet.
@@ -133,15 +200,7 @@ struct Layer<'a, S: Recorded> {
 /// Weights along one axis, and where they lie.
 type Axis<'a, S> = (Phases<'a>, &'a [<S as Accumulate>::Weight]);
 
-/// A footprint along one axis: the first pixel, from the part's corner, and where weights begin.
-#[derive(Clone, Copy, Debug, Default)]
-struct Window {
-    first: i32,
-    from: usize,
-    len: i32,
-}
-
-impl<S: Recorded> Stage<S> for DeepStage<'_, S> {
+impl<S: Recorded, const N: usize> Stage<S, N> for DeepStage<'_, S, N> {
     type Voxel = DeepVoxel;
 
     #[inline(always)]
@@ -163,7 +222,7 @@ impl<S: Recorded> Stage<S> for DeepStage<'_, S> {
         };
         let cull = frame.scene.quality.cull;
         let (sections, view, n) = (&frame.sections, &frame.view, brick.len());
-        let Tossing { eye, at, cells, fate } = &mut *self.tossing;
+        let Tossing { eye, at, cells, fate, samples } = &mut *self.tossing;
         for (i, &local) in brick.index.iter().enumerate() {
             let v = corner.eye + frame.offsets()[usize::from(local)];
             (eye[0][i], eye[1][i], eye[2][i]) = (v.x, v.y, v.z);
@@ -183,6 +242,8 @@ impl<S: Recorded> Stage<S> for DeepStage<'_, S> {
         }
         let [x, y, z] = at;
         open.near_all(&x[..n], &y[..n], cells, fate);
+        brick.values.bits(samples);
+        let normals = brick.normals.as_deref();
         let wanted = if cull { 3 } else { 1 };
         let (mut reached, mut kept) = (0, 0);
         for i in 0..n {
@@ -195,7 +256,12 @@ impl<S: Recorded> Stage<S> for DeepStage<'_, S> {
                 continue;
             }
             kept += 1;
-            let voxel = DeepVoxel { brick: which as u32, voxel: i as u16, cell: cells[i] as u16 };
+            let voxel = DeepVoxel {
+                eye: eye.each_ref().map(|e| e[i]),
+                sample: samples[i],
+                normal: normals.map_or(NO_NORMAL, |n| n[i]),
+                cell: cells[i] as u16,
+            };
             if first < slab.first {
                 queues.carried.push((voxel, first));
             } else {
@@ -211,7 +277,7 @@ impl<S: Recorded> Stage<S> for DeepStage<'_, S> {
         &mut self,
         bucket: &[DeepVoxel],
         k: i32,
-        sheets: &mut Sheets<'_, S>,
+        sheets: &mut Sheets<'_, S, N>,
         open: &OpenMask,
         counters: &mut Counters,
     ) {
@@ -219,12 +285,17 @@ impl<S: Recorded> Stage<S> for DeepStage<'_, S> {
             return;
         }
         let layers = layers(self.part, k);
+        let most = self.part.frame.sections.most() as i32;
         let cull = self.part.frame.scene.quality.cull;
-        for v in bucket {
-            let added = (!cull || open.is_near(v.cell.into()))
-                && self.add(v, (k, k), &layers, sheets, open);
-            counters.splatted += u64::from(added);
-            counters.culled += u64::from(!added);
+        for some in bucket.chunks(BATCH) {
+            let mut n = 0;
+            for v in some {
+                self.batch.put(n, v, most);
+                n += usize::from(!cull || open.is_near(v.cell.into()));
+            }
+            let added = self.add(n, k, &layers, sheets, open);
+            counters.splatted += added;
+            counters.culled += some.len() as u64 - added;
         }
     }
 
@@ -232,27 +303,31 @@ impl<S: Recorded> Stage<S> for DeepStage<'_, S> {
     fn splat_carried(
         &mut self,
         carried: &[(DeepVoxel, i32)],
-        sheets: &mut Sheets<'_, S>,
+        sheets: &mut Sheets<'_, S, N>,
         open: &OpenMask,
         counters: &mut Counters,
     ) {
         let k = self.part.slab.first;
         let layers = layers(self.part, k);
-        for (v, first) in carried {
-            let added = self.add(v, (*first, k), &layers, sheets, open);
-            counters.splatted += u64::from(added);
-            counters.culled += u64::from(!added);
+        let most = self.part.frame.sections.most() as i32;
+        for some in carried.chunks(BATCH) {
+            for (i, (v, first)) in some.iter().enumerate() {
+                self.batch.put(i, v, most - (k - first));
+            }
+            let added = self.add(some.len(), k, &layers, sheets, open);
+            counters.splatted += added;
+            counters.culled += some.len() as u64 - added;
         }
     }
 }
 
-/// Footprints of the sheets from `k` that a voxel may reach.
+/// Footprints of the sheets from `k` that a voxel may reach, by slot.
 #[inline(always)]
-fn layers<'a, S: Recorded>(part: &'a Part<'_>, k: i32) -> [Layer<'a, S>; SLOTS] {
+fn layers<'a, S: Recorded, const N: usize>(part: &'a Part<'_>, k: i32) -> [Layer<'a, S>; N] {
     let last = (k + part.frame.sections.most() as i32 - 1).min(part.frame.footprints.last());
-    std::array::from_fn(|i| {
+    std::array::from_fn(|at| {
         // Sheets farther back than a voxel reaches are not asked for; any will do.
-        let sheet = (k + i as i32).min(last);
+        let sheet = (k + after::<N>(k, at)).min(last);
         let footprint = part.frame.footprints.at(sheet).expect("no sheet of the part is clipped");
         let axes = [0, 1].map(|axis| {
             footprint.phases(axis).zip(S::across(&footprint, axis)).expect("footprints have tables")
@@ -261,89 +336,114 @@ fn layers<'a, S: Recorded>(part: &'a Part<'_>, k: i32) -> [Layer<'a, S>; SLOTS] 
     })
 }
 
-impl<S: Recorded> DeepStage<'_, S> {
-    /// Adds a voxel that begins at sheet `first` to its sheets from `k` on, which `layers` are of;
-    /// not where all that it would touch is shut. Whether it did.
+/// How many sheets behind sheet `k` is the next one that `at` is the slot of.
+#[inline(always)]
+fn after<const N: usize>(k: i32, at: usize) -> i32 {
+    ((at + N - slot::<N>(k)) % N) as i32
+}
+
+impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
+    /// Adds the first `n` voxels of the batch to their sheets from `k` on, which `layers` are of; not
+    /// those around which all is shut. How many it added.
     #[inline(always)]
     fn add(
         &mut self,
-        v: &DeepVoxel,
-        (first, k): (i32, i32),
-        layers: &[Layer<'_, S>; SLOTS],
-        sheets: &mut Sheets<'_, S>,
+        n: usize,
+        k: i32,
+        layers: &[Layer<'_, S>; N],
+        sheets: &mut Sheets<'_, S, N>,
         open: &OpenMask,
-    ) -> bool {
+    ) -> u64 {
         let Part { frame, rect, .. } = self.part;
-        let Seen { brick, corner, .. } = self.part.brick(v.brick as usize);
-        let brick: &Brick = brick;
-        let voxel = usize::from(v.voxel);
-        let placed = frame.place(corner, brick.index[voxel]);
-        let (_, count) = frame.sections.span(placed.z);
-        let count = (count as i32 - (k - first)) as usize % (SLOTS + 1);
-
-        // Where each section lies, and the window that holds them all.
-        let mut windows = [[Window::default(); 2]; SLOTS];
-        let (mut lo, mut hi) = ([i32::MAX; 2], [i32::MIN; 2]);
-        let (origin, eye) = ([rect.x0, rect.y0], [placed.eye.x, placed.eye.y]);
-        for (layer, window) in layers[..count].iter().zip(&mut windows) {
-            for axis in 0..2 {
-                let at = frame.view.screen_along(axis, eye[axis], layer.scale);
+        let Batch { eye, samples, normals, left, z, first, from, lo, hi, kept, light } =
+            &mut *self.batch;
+        let view = &frame.view;
+        for (z, &depth) in z[..n].iter_mut().zip(&eye[2]) {
+            *z = view.depth_in_phases(depth);
+        }
+        // Where each section lies, and the windows that hold all of a voxel's.
+        let most = frame.sections.most() as i32;
+        for (axis, origin) in [rect.x0, rect.y0].into_iter().enumerate() {
+            let (eye, lo, hi) = (&eye[axis][..n], &mut lo[axis][..n], &mut hi[axis][..n]);
+            lo.fill(i32::MAX);
+            hi.fill(i32::MIN);
+            for (at, layer) in layers.iter().enumerate() {
+                let sheet = after::<N>(k, at);
+                if sheet >= most {
+                    continue;
+                }
                 let phases = &layer.axes[axis].0;
-                let (pixel, phase) = ((at >> SUBPIXEL_BITS) as i32, at as usize & PHASES);
-                let first = pixel - origin[axis] + phases.firsts[phase];
-                let len = phases.len as i32;
-                window[axis] = Window { first, from: phases.begin(phase), len };
-                lo[axis] = lo[axis].min(first);
-                hi[axis] = hi[axis].max(first + len);
-            }
-        }
-        // Inside the part.
-        let lo = lo.map(|p| p.max(0));
-        let hi = hi.map(|p| p.min(PART));
-        if lo[0] >= hi[0] || lo[1] >= hi[1] {
-            return false;
-        }
-        if frame.scene.quality.cull {
-            let rows = (lo[1]..hi[1]).fold(0, |rows, y| rows | open.row(y as usize));
-            if rows & (u64::MAX >> (64 - (hi[0] - lo[0]))) << lo[0] == 0 {
-                return false;
-            }
-        }
-        let payload = S::payload(frame.payload(brick, voxel, placed.eye));
-        let wide = [0, 1].map(|axis| (hi[axis] - lo[axis]) as usize);
-        for axis in 0..2 {
-            self.across[axis][..wide[axis]].fill([S::Weight::default(); SLOTS]);
-        }
-        let mut deep = [S::Depth::default(); SLOTS];
-        let z = &S::deep(&frame.sections)[self.row(placed.z)..][(k - first) as usize..];
-        for i in 0..count {
-            let slot = slot(k + i as i32);
-            deep[slot] = z[i];
-            for axis in 0..2 {
-                let w = &windows[i][axis];
-                // Its own part of the window.
-                let begin = (w.first - lo[axis]).max(0);
-                let skip = (lo[axis] - w.first).clamp(0, w.len);
-                let n = (w.len - skip).min(wide[axis] as i32 - begin).max(0) as usize;
-                let weights = &layers[i].axes[axis].1[w.from + skip as usize..][..n];
-                let to = &mut self.across[axis][begin as usize..][..n];
-                for j in 0..n {
-                    to[j][slot] = weights[j];
+                let firsts: &[i32; SUBPIXELS as usize] =
+                    phases.firsts.first_chunk().expect("a first pixel a phase");
+                let (len, scale) = (phases.len as i32, layer.scale);
+                let (first, from) = (&mut first[axis][at][..n], &mut from[axis][at][..n]);
+                for i in 0..n {
+                    let at = view.screen_along(axis, eye[i], scale);
+                    let (pixel, phase) = ((at >> SUBPIXEL_BITS) as i32, at as usize & PHASES);
+                    first[i] = pixel - origin + firsts[phase];
+                    from[i] = phases.begin(phase) as u32;
+                }
+                for i in 0..n {
+                    let here = sheet < left[i];
+                    lo[i] = if here { lo[i].min(first[i]) } else { lo[i] };
+                    hi[i] = if here { hi[i].max(first[i] + len) } else { hi[i] };
                 }
             }
+            // Inside the part.
+            for i in 0..n {
+                (lo[i], hi[i]) = (lo[i].max(0), hi[i].min(PART));
+            }
         }
-        let [columns, lines] = [0, 1].map(|axis| &self.across[axis][..wide[axis]]);
-        let at = lo[1] as usize * STRIDE + lo[0] as usize;
-        S::splat_deep(sheets.simd, sheets.records, at, (columns, lines), payload, &deep);
-        sheets.touch(k, [lo[0] as u8, lo[1] as u8], wide);
-        true
-    }
-
-    /// Where the weights of depth `z` begin.
-    #[inline(always)]
-    fn row(&self, z: i32) -> usize {
-        let sections = &self.part.frame.sections;
-        (z & (sections.phases() - 1)) as usize * sections.most()
+        let (mut some, cull) = (0, frame.scene.quality.cull);
+        for i in 0..n {
+            let ([x0, y0], [x1, y1]) = ([lo[0][i], lo[1][i]], [hi[0][i], hi[1][i]]);
+            if x0 >= x1 || y0 >= y1 {
+                continue;
+            }
+            let columns = (u64::MAX >> (64 - (x1 - x0))) << x0;
+            if cull && (y0..y1).fold(0, |rows, y| rows | open.row(y as usize)) & columns == 0 {
+                continue;
+            }
+            kept[some] = i as u32;
+            for eye in &mut *eye {
+                eye[some] = eye[i];
+            }
+            (samples[some], normals[some]) = (samples[i], normals[i]);
+            some += 1;
+        }
+        let eyes = eye.each_ref().map(|e| &e[..some]);
+        frame.payloads(&samples[..some], &normals[..some], Some(eyes), light);
+        let sections = S::deep(&frame.sections);
+        for (j, &i) in kept[..some].iter().enumerate() {
+            let i = i as usize % BATCH;
+            // From an even column, and as many: two of them may lie in one register.
+            let lo = [lo[0][i] & !1, lo[1][i]];
+            let wide = [(hi[0][i] - lo[0] + 1) & !1, hi[1][i] - lo[1]].map(|n| n as usize);
+            let mut deep = [S::Depth::default(); N];
+            let gone = (most - left[i]) as usize;
+            let row = (z[i] & (frame.sections.phases() - 1)) as usize * most as usize;
+            for (sheet, &w) in sections[row..][..most as usize][gone..].iter().enumerate() {
+                deep[(slot::<N>(k) + sheet) % N] = w;
+            }
+            for axis in 0..2 {
+                // Loops, since closures of arrays are compiled for the baseline.
+                let mut rows: [(&[S::Weight], i32); N] = [(&[], 0); N];
+                for (at, row) in rows.iter_mut().enumerate() {
+                    if after::<N>(k, at) < left[i] {
+                        let (phases, weights) = &layers[at].axes[axis];
+                        let weights = &weights[from[axis][at][i] as usize..][..phases.len];
+                        *row = (weights, first[axis][at][i] - lo[axis]);
+                    }
+                }
+                S::weave(sheets.simd, rows, wide[axis], &mut self.across[axis]);
+            }
+            let [columns, lines] = [0, 1].map(|axis| &self.across[axis][..wide[axis]]);
+            let at = lo[1] as usize * STRIDE + lo[0] as usize;
+            let payload = S::payload(light.each_ref().map(|c| c[j]));
+            S::splat_deep(sheets.simd, sheets.records, at, (columns, lines), payload, &deep);
+            sheets.touch(k, lo.map(|p| p as usize), wide);
+        }
+        some as u64
     }
 }
 

@@ -17,8 +17,8 @@
 use crate::footprint::Phases;
 use crate::mask::OpenMask;
 use crate::scene::{Flat, Frame};
-use crate::splat::records::{Recorded, SLOTS, Splat, Table, Tables, splat};
-use crate::splat::{Simd, Work};
+use crate::splat::records::{Recorded, Splat, Table, Tables, splat};
+use crate::splat::{Simd, Work, select};
 use crate::stack::{Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels, Seen};
 use slabcast_common::message::Counters;
@@ -43,10 +43,13 @@ struct Tossing {
     fate: [u32; 512],
     cells: [u32; 512],
     /// Those that are kept.
-    kept: [u32; 512],
+    kept: [u32; 528],
     /// First pixels of the footprints of those, and where weights begin.
     windows: [[u32; 512]; 4],
     samples: [u32; 512],
+    normals: [u16; 512],
+    /// Those that are kept, ready for their buckets.
+    ready: [Splat; 512],
 }
 
 impl Default for Tossing {
@@ -56,9 +59,11 @@ impl Default for Tossing {
             first: [0; 512],
             fate: [0; 512],
             cells: [0; 512],
-            kept: [0; 512],
+            kept: [0; 528],
             windows: [[0; 512]; 4],
             samples: [0; 512],
+            normals: [NO_NORMAL; 512],
+            ready: [Splat::default(); 512],
         }
     }
 }
@@ -87,7 +92,7 @@ impl Default for Batch {
 }
 
 /// Renders a part: compiled for each instruction set as a whole.
-pub(crate) struct RenderFlat<'a, S: Recorded> {
+pub(crate) struct RenderFlat<'a, S: Recorded, const N: usize> {
     pub(crate) part: Part<'a>,
     pub(crate) view: &'a Flat,
     pub(crate) simd: Simd,
@@ -97,15 +102,12 @@ pub(crate) struct RenderFlat<'a, S: Recorded> {
     pub(crate) io: Io<'a>,
 }
 
-/// Whether parts of `frame` may be rendered here. A voxel waits with its sample and normal; where
-/// its gradient counts, too, the general way looks into the brick.
+/// Whether parts of `frame` may be rendered here.
 pub(crate) fn takes(frame: &Frame) -> Option<&Flat> {
-    let flat = frame.flat.as_ref()?;
-    let fits = frame.sections.most() <= SLOTS && 2 * flat.reach < PART;
-    (fits && !frame.scene.classifier.is_modulated()).then_some(flat)
+    frame.flat.as_ref().filter(|flat| 2 * flat.reach < PART)
 }
 
-impl<S: Recorded> Work for RenderFlat<'_, S> {
+impl<S: Recorded, const N: usize> Work for RenderFlat<'_, S, N> {
     type Out = ();
     #[inline(always)]
     fn run(self) {
@@ -122,13 +124,14 @@ impl<S: Recorded> Work for RenderFlat<'_, S> {
         let tables = Tables { across: [x, y], deep };
         let Waiting { queues, tossing, batch } = waiting;
         let phases = [phases_x, phases_y];
-        let stage = FlatStage { part: &part, flat, phases, tables, tossing, batch };
-        walk(&part, stage, (simd, store), queues, pixels, io);
+        let stage = FlatStage { part: &part, simd, flat, phases, tables, tossing, batch };
+        walk::<S, N, _>(&part, stage, (simd, store), queues, pixels, io);
     }
 }
 
 struct FlatStage<'a, S: Recorded> {
     part: &'a Part<'a>,
+    simd: Simd,
     flat: &'a Flat,
     /// Where weights across and down lie.
     phases: [Phases<'a>; 2],
@@ -137,7 +140,7 @@ struct FlatStage<'a, S: Recorded> {
     batch: &'a mut Batch,
 }
 
-impl<S: Recorded> Stage<S> for FlatStage<'_, S> {
+impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
     type Voxel = Splat;
 
     #[inline(always)]
@@ -168,7 +171,8 @@ impl<S: Recorded> Stage<S> for FlatStage<'_, S> {
             i64::from(base) * i64::from(phases),
         ];
         let n = brick.len();
-        let Tossing { at, first, fate, cells, kept, windows, samples } = &mut *self.tossing;
+        let Tossing { at, first, fate, cells, kept, windows, samples, normals, ready } =
+            &mut *self.tossing;
         self.flat.places.all(corner.flat, origin, &brick.index, at);
         let [x, y, z] = at;
         open.near_all(&x[..n], &y[..n], cells, fate);
@@ -179,13 +183,8 @@ impl<S: Recorded> Stage<S> for FlatStage<'_, S> {
             let here = u32::from(first[i] < slab.end) & u32::from(end > slab.first);
             fate[i] *= here;
         }
-        let wanted = if cull { 3 } else { 1 };
-        let (mut reached, mut some) = (0, 0);
-        for i in 0..n {
-            kept[some] = i as u32;
-            some += usize::from(fate[i] >= wanted);
-            reached += u64::from(fate[i] != 0);
-        }
+        let reached: u64 = fate[..n].iter().map(|&fate| u64::from(fate != 0)).sum();
+        let some = select(self.simd, &fate[..n], if cull { 3 } else { 1 }, kept);
         counters.tossed += some as u64;
         counters.culled += reached - some as u64;
         let kept = &kept[..some];
@@ -193,21 +192,23 @@ impl<S: Recorded> Stage<S> for FlatStage<'_, S> {
         move_inside(&self.phases[0], x, kept, x0, from_x);
         move_inside(&self.phases[1], y, kept, y0, from_y);
         brick.values.bits(samples);
-        let normals = brick.normals.as_deref();
-        for (j, &i) in kept.iter().enumerate() {
+        match &brick.normals {
+            Some(of) => normals[..n].copy_from_slice(of),
+            None => normals.fill(NO_NORMAL),
+        }
+        for (j, (&i, ready)) in kept.iter().zip(&mut *ready).enumerate() {
             let i = i as usize % 512;
-            let voxel = Splat {
-                first: [x0[j] as u8, y0[j] as u8],
-                cell: cells[i] as u16,
-                rows: [from_x[j] as u16, from_y[j] as u16],
-                z: (z[i] & (phases - 1)) as u16,
-                normal: normals.map_or(NO_NORMAL, |n| n[i]),
-                sample: samples[i],
-            };
-            if first[i] < slab.first {
-                queues.carried.push((voxel, first[i]));
+            ready.place = x0[j] | y0[j] << 8 | cells[i] << 16;
+            ready.rows = from_x[j] | from_y[j] << 16;
+            ready.deep = (z[i] & (phases - 1)) as u32 | u32::from(normals[i]) << 16;
+            ready.sample = samples[i];
+        }
+        for (&i, voxel) in kept.iter().zip(ready) {
+            let first = first[i as usize % 512];
+            if first < slab.first {
+                queues.carried.push((*voxel, first));
             } else {
-                queues.buckets[(first[i] - slab.first) as usize].push(voxel);
+                queues.buckets[(first - slab.first) as usize].push(*voxel);
             }
         }
     }
@@ -217,7 +218,7 @@ impl<S: Recorded> Stage<S> for FlatStage<'_, S> {
         &mut self,
         bucket: &[Splat],
         k: i32,
-        sheets: &mut Sheets<'_, S>,
+        sheets: &mut Sheets<'_, S, N>,
         open: &OpenMask,
         counters: &mut Counters,
     ) {
@@ -232,14 +233,14 @@ impl<S: Recorded> Stage<S> for FlatStage<'_, S> {
             let mut n = 0;
             for v in some {
                 voxels[n] = *v;
-                n += usize::from(!cull | open.is_near(v.cell.into()));
+                n += usize::from(!cull | open.is_near(v.cell()));
             }
             let voxels = &voxels[..n];
             for (i, v) in voxels.iter().enumerate() {
-                (samples[i], normals[i]) = (v.sample, v.normal);
-                sheets.touch(k, v.first, [wide, high]);
+                (samples[i], normals[i]) = (v.sample, v.normal());
+                sheets.touch(k, v.first(), [wide, high]);
             }
-            self.part.frame.payloads(&samples[..n], &normals[..n], light);
+            self.part.frame.payloads(&samples[..n], &normals[..n], None, light);
             let [sigma, r, g, b] = light;
             let payloads = &mut payloads[..n];
             for (i, payload) in payloads.iter_mut().enumerate() {
@@ -247,7 +248,13 @@ impl<S: Recorded> Stage<S> for FlatStage<'_, S> {
             }
             counters.culled += (some.len() - n) as u64;
             counters.splatted += n as u64;
-            S::splat_all(sheets.simd, sheets.records, (voxels, payloads), slot(k), &self.tables);
+            S::splat_all(
+                sheets.simd,
+                sheets.records,
+                (voxels, payloads),
+                slot::<N>(k),
+                &self.tables,
+            );
         }
     }
 
@@ -255,24 +262,24 @@ impl<S: Recorded> Stage<S> for FlatStage<'_, S> {
     fn splat_carried(
         &mut self,
         carried: &[(Splat, i32)],
-        sheets: &mut Sheets<'_, S>,
+        sheets: &mut Sheets<'_, S, N>,
         open: &OpenMask,
         counters: &mut Counters,
     ) {
         let Part { frame, slab, .. } = self.part;
         for (v, first) in carried {
-            if frame.scene.quality.cull && !open.is_near(v.cell.into()) {
+            if frame.scene.quality.cull && !open.is_near(v.cell()) {
                 counters.culled += 1;
                 continue;
             }
             counters.splatted += 1;
             let mut light = [[0.0]; 4];
-            frame.payloads(&[v.sample], &[v.normal], &mut light);
+            frame.payloads(&[v.sample], &[v.normal()], None, &mut light);
             let payload = S::payload(light.map(|[c]| c));
             let (x, y, z) = v.weights(&self.tables);
             let left = &z[(slab.first - first) as usize..];
-            splat(sheets.records, v.at(), (x, y, left), payload, slot(slab.first));
-            sheets.touch(slab.first, v.first, [x.len(), y.len()]);
+            splat(sheets.records, v.at(), (x, y, left), payload, slot::<N>(slab.first));
+            sheets.touch(slab.first, v.first(), [x.len(), y.len()]);
         }
     }
 }

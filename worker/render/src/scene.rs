@@ -145,7 +145,7 @@ impl Frame {
         let flat = reach.and_then(|reach| Some(Flat { places: Places::new(&view)?, reach }));
         Frame {
             flat,
-            sections: Sections::new(&profile, d, view.depth_phases()),
+            sections: Sections::new(&profile, d, view.depth_phases(), q.sums == Sums::I16),
             footprints,
             rule,
             raw_scale,
@@ -195,18 +195,19 @@ impl Frame {
         }
     }
 
-    /// [`Frame::payload`] of many voxels by their samples' bits and normals (opacities do not hang on
-    /// gradients), in a view whose
-    /// direction to the eye is the same for all: extinctions, then each colour. Loops of a length
-    /// that compilers do not know, so that they run them on lanes.
+    /// [`Frame::payload`] of many voxels by their samples' bits, normals and, where each sees the eye
+    /// in a direction of its own, eye coordinates by axis (opacities do not hang on gradients):
+    /// extinctions, then each colour. Loops of a length that compilers do not know, so that they run
+    /// them on lanes.
     ///
     /// # Panics
-    /// In a perspective view, or if there are not as many normals as samples.
+    /// If there are not as many normals or eyes as samples; in a perspective view without eyes.
     #[inline(always)]
     pub(crate) fn payloads<const MOST: usize>(
         &self,
         samples: &[u32],
         normals: &[u16],
+        eyes: Option<[&[f64]; 3]>,
         out: &mut [[f32; MOST]; 4],
     ) {
         let n = samples.len().min(MOST);
@@ -220,9 +221,16 @@ impl Frame {
             }
         }
         if let Some(shader) = &self.scene.shader {
-            let to_eye = self.to_eye.expect("an orthographic view");
             let mut lit = [[0.0; MOST]; 2];
-            shader.light_all(normals, to_eye, &mut lit);
+            match (self.to_eye, eyes) {
+                (Some(to_eye), _) => shader.light_all(normals, |_| to_eye, &mut lit),
+                (None, eyes) => {
+                    let mut to_eye = [[0.0; MOST]; 3];
+                    self.view.to_eye_all(eyes.expect("eyes in perspective"), &mut to_eye);
+                    let [x, y, z] = &to_eye;
+                    shader.light_all(normals, |i| Vec3::new(x[i], y[i], z[i]), &mut lit);
+                }
+            }
             for colour in &mut *colours {
                 for i in 0..n {
                     colour[i] = Lit { lambert: lit[0][i], gloss: lit[1][i] }.on(colour[i]);

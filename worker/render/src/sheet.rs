@@ -9,7 +9,7 @@
 //! matter of the absolute sheet grid (NUMERICS.md section 1.2).
 
 use crate::splat::truncate;
-use slabcast_common::math::{SWITCH, opacities, opacity, phi, phis};
+use slabcast_common::math::{SWITCH, opacity, phi, phis};
 use slabcast_common::quality::Compositing;
 
 /// A sum of a sheet: integers, whose sum has no order, or floats, added in one order.
@@ -294,7 +294,7 @@ impl Rule {
         live: u32,
     ) -> u32 {
         // Several short loops over plain arrays: of one long one compilers make scalar code for AVX2.
-        let [mut taus, mut per_raws, mut small, mut large] = [[0.0f32; LANES]; 4];
+        let [mut taus, mut per_raws, mut sheet] = [[0.0f32; LANES]; 3];
         for i in 0..LANES {
             let filled = row.here[0][i] >= FAINTEST;
             let raw = if filled { row.here[0][i] } else { 1.0 };
@@ -303,18 +303,13 @@ impl Rule {
             per_raws[i] = 1.0 / raw;
         }
         for i in 0..LANES {
-            (small[i], large[i]) = opacities(taus[i]);
+            sheet[i] = if PAPER { taus[i].min(1.0) } else { opacity(taus[i]) };
         }
-        let [mut sheet, mut weights, mut light] = [[0.0f32; LANES]; 3];
+        let [mut weights, mut light] = [[0.0f32; LANES]; 2];
         for i in 0..LANES {
-            let thin = taus[i] < SWITCH;
-            sheet[i] = if thin { small[i] } else { large[i] };
-            if PAPER {
-                sheet[i] = taus[i].min(1.0);
-            }
             let (small, large) =
                 phis(taus[i], per_raws[i] * self.per_unit * row.cosine[i], sheet[i]);
-            let weight = if thin { small } else { large };
+            let weight = if taus[i] < SWITCH { small } else { large };
             weights[i] = if taus[i] > 0.0 { weight } else { 0.0 };
         }
         // Where there is nothing, colours are nothing too, and neighbours may be anything.

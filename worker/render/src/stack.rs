@@ -7,7 +7,7 @@
 use crate::mask::OpenMask;
 use crate::sheet::{LANES, Row};
 use crate::splat::Simd;
-use crate::splat::records::{Record, Recorded, SLOTS, STRIDE, STRIP, Strip};
+use crate::splat::records::{Line, Record, Recorded, STRIDE, STRIP, Strip};
 use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
 use slabcast_common::view::Projection;
@@ -18,7 +18,8 @@ const STRIPS: usize = EDGE / STRIP;
 
 /// Memory for sums of one kind.
 pub(crate) struct Store<S: Recorded> {
-    records: Vec<Record<S>>,
+    /// Records of any number of sheets; nothing in them between parts.
+    records: Vec<Line>,
     /// Sums of the sheet before, where it was touched.
     before: Vec<[S; 4]>,
 }
@@ -43,7 +44,7 @@ impl<V> Default for Queues<V> {
 }
 
 /// How voxels of one kind of view get into sheets.
-pub(crate) trait Stage<S: Recorded> {
+pub(crate) trait Stage<S: Recorded, const N: usize> {
     /// A voxel waiting in the bucket of its first sheet.
     type Voxel: Copy;
 
@@ -62,7 +63,7 @@ pub(crate) trait Stage<S: Recorded> {
         &mut self,
         bucket: &[Self::Voxel],
         k: i32,
-        sheets: &mut Sheets<'_, S>,
+        sheets: &mut Sheets<'_, S, N>,
         open: &OpenMask,
         counters: &mut Counters,
     );
@@ -71,7 +72,7 @@ pub(crate) trait Stage<S: Recorded> {
     fn splat_carried(
         &mut self,
         carried: &[(Self::Voxel, i32)],
-        sheets: &mut Sheets<'_, S>,
+        sheets: &mut Sheets<'_, S, N>,
         open: &OpenMask,
         counters: &mut Counters,
     );
@@ -79,7 +80,7 @@ pub(crate) trait Stage<S: Recorded> {
 
 /// Walks through the sheets of `part`'s slab.
 #[inline(always)]
-pub(crate) fn walk<S: Recorded, T: Stage<S>>(
+pub(crate) fn walk<S: Recorded, const N: usize, T: Stage<S, N>>(
     part: &Part<'_>,
     mut stage: T,
     (simd, store): (Simd, &mut Store<S>),
@@ -87,7 +88,7 @@ pub(crate) fn walk<S: Recorded, T: Stage<S>>(
     pixels: &mut Pixels,
     (state, out, counters): Io<'_>,
 ) {
-    let mut sheets = Sheets::new(simd, store, part.frame.sections.most());
+    let mut sheets = Sheets::<S, N>::new(simd, store, part.frame.sections.most());
     let slab = part.slab;
     let mut open = part.begin(pixels, state);
     if let Some(last) = &state.last {
@@ -107,7 +108,7 @@ pub(crate) fn walk<S: Recorded, T: Stage<S>>(
             stage.toss(next, &open, queues, counters);
             next += 1;
         }
-        sheets.added[slot(k)] = [0; STRIPS];
+        sheets.added[slot::<N>(k)] = [0; STRIPS];
         if !queues.carried.is_empty() {
             stage.splat_carried(&queues.carried, &mut sheets, &open, counters);
             queues.carried.clear();
@@ -145,12 +146,12 @@ pub(crate) fn walk<S: Recorded, T: Stage<S>>(
 type Rows = [u64; STRIPS];
 
 /// The open sheets of a part.
-pub(crate) struct Sheets<'a, S: Recorded> {
+pub(crate) struct Sheets<'a, S: Recorded, const N: usize> {
     pub(crate) simd: Simd,
-    pub(crate) records: &'a mut [Record<S>],
+    pub(crate) records: &'a mut [Record<S, N>],
     before: &'a mut [[S; 4]],
     /// By slot of their first sheet: rows that voxels touch.
-    added: [Rows; SLOTS],
+    added: [Rows; N],
     /// Rows of `before` that may not be zero.
     was: Rows,
     /// Rows with records of shut pixels that are not zero.
@@ -160,19 +161,22 @@ pub(crate) struct Sheets<'a, S: Recorded> {
 }
 
 #[inline(always)]
-pub(crate) fn slot(k: i32) -> usize {
-    k as usize % SLOTS
+pub(crate) fn slot<const N: usize>(k: i32) -> usize {
+    k as usize % N
 }
 
-impl<'a, S: Recorded> Sheets<'a, S> {
+impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
     fn new(simd: Simd, store: &'a mut Store<S>, most: usize) -> Self {
-        store.records.resize(STRIDE * EDGE, Record::default());
+        let lines = STRIDE * EDGE * size_of::<Record<S, N>>() / size_of::<Line>();
+        if store.records.len() < lines {
+            store.records.resize(lines, Line::ZERO);
+        }
         store.before.resize(EDGE * EDGE, [S::default(); 4]);
         Sheets {
             simd,
-            records: &mut store.records,
+            records: bytemuck::cast_slice_mut(&mut store.records[..lines]),
             before: &mut store.before,
-            added: [[0; STRIPS]; SLOTS],
+            added: [[0; STRIPS]; N],
             was: [0; STRIPS],
             dead: [0; STRIPS],
             most,
@@ -181,10 +185,9 @@ impl<'a, S: Recorded> Sheets<'a, S> {
 
     /// Notes that a voxel that begins at sheet `k` touches so many columns and rows from (x, y).
     #[inline(always)]
-    pub(crate) fn touch(&mut self, k: i32, [x, y]: [u8; 2], [wide, high]: [usize; 2]) {
-        let (x, y) = (usize::from(x), y & 63);
-        let rows = (u64::MAX >> (64 - high)) << y;
-        let added = &mut self.added[slot(k)];
+    pub(crate) fn touch(&mut self, k: i32, [x, y]: [usize; 2], [wide, high]: [usize; 2]) {
+        let rows = (u64::MAX >> (64 - high)) << (y & 63);
+        let added = &mut self.added[slot::<N>(k)];
         let (first, last) = (x / STRIP % STRIPS, (x + wide - 1) / STRIP % STRIPS);
         added[first] |= rows;
         added[last] |= rows;
@@ -197,7 +200,7 @@ impl<'a, S: Recorded> Sheets<'a, S> {
     fn touched(&self, from: i32, k: i32) -> Rows {
         let mut rows = [0; STRIPS];
         for first in from..=k {
-            for (row, added) in rows.iter_mut().zip(self.added[slot(first)]) {
+            for (row, added) in rows.iter_mut().zip(self.added[slot::<N>(first)]) {
                 *row |= added;
             }
         }
@@ -254,7 +257,7 @@ impl<'a, S: Recorded> Sheets<'a, S> {
             pixel: y * EDGE + strip * STRIP,
         });
         let sums = (&mut *self.records, &mut *self.before);
-        S::take(self.simd, sums, &to.pixels.a, strips, slot(to.k), &mut to.row);
+        S::take(self.simd, sums, &to.pixels.a, strips, slot::<N>(to.k), &mut to.row);
     }
 
     /// Leaves nothing behind, where sheets before `k` are closed.
@@ -264,7 +267,7 @@ impl<'a, S: Recorded> Sheets<'a, S> {
             for y in 0..EDGE {
                 let at = strip * STRIP;
                 if (left[strip] | self.dead[strip]) >> y & 1 == 1 {
-                    self.records[y * STRIDE + at..][..STRIP].fill(Record::default());
+                    self.records[y * STRIDE + at..][..STRIP].fill([[S::default(); 4]; N]);
                 }
                 if self.was[strip] >> y & 1 == 1 {
                     self.before[y * EDGE + at..][..STRIP].fill([S::default(); 4]);

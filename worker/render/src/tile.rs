@@ -26,7 +26,7 @@ use crate::planes;
 use crate::scene::{Corner, Frame};
 use crate::sheet::Row;
 use crate::splat::Simd;
-use crate::splat::records::Recorded;
+use crate::splat::records::{MOST, Recorded};
 use crate::stack::Store;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{RawSums, TilePixels, TileState};
@@ -239,13 +239,36 @@ impl Part<'_> {
         pixels: &mut Pixels,
         io: Io<'_>,
     ) {
+        // Voxels wait with their samples and normals; where gradients count, too, the general way looks
+        // into the brick.
+        let modulated = self.frame.scene.classifier.is_modulated();
+        match self.frame.sections.most() {
+            _ if modulated => simd.run(RenderGeneral { part: self, kind, queues, pixels, io }),
+            0..=4 => self.render_records::<S, 4>(simd, store, waiting, (kind, queues), pixels, io),
+            5..=MOST => {
+                self.render_records::<S, MOST>(simd, store, waiting, (kind, queues), pixels, io);
+            }
+            _ => simd.run(RenderGeneral { part: self, kind, queues, pixels, io }),
+        }
+    }
+
+    /// The same with records of N sheets.
+    fn render_records<S: Recorded, const N: usize>(
+        self,
+        simd: Simd,
+        store: &mut Store<S>,
+        waiting: &mut Waiting,
+        (kind, queues): (&mut Kind<S>, &mut Queues),
+        pixels: &mut Pixels,
+        io: Io<'_>,
+    ) {
         let part = self;
         if let Some(view) = flat::takes(part.frame) {
             let waiting = &mut waiting.flat;
-            simd.run(RenderFlat { part, view, simd, store, waiting, pixels, io });
+            simd.run(RenderFlat::<S, N> { part, view, simd, store, waiting, pixels, io });
         } else if let Some(deep) = deep::takes(&part) {
             let waiting = &mut waiting.deep;
-            simd.run(RenderDeep { part, deep, simd, store, waiting, pixels, io });
+            simd.run(RenderDeep::<S, N> { part, deep, simd, store, waiting, pixels, io });
         } else {
             simd.run(RenderGeneral { part, kind, queues, pixels, io });
         }

@@ -39,7 +39,8 @@ const MODEL_TOLERANCE: f64 = 1e-5;
 /// the 8-bit sRGB pictures.
 ///
 /// Between the picture and the limit of infinitely thin sheets lie thickness, cut-off (--eps),
-/// quantisation (sums of integers) and rounding (of positions, and f32 arithmetic). Between the
+/// quantisation (sums of integers, 16-bit ones with slivers of a kernel that its outermost sheets do
+/// not get) and rounding (of positions, and f32 arithmetic). Between the
 /// limit and an ideal lie two errors of the model, which are no part of that sum: truncation (the
 /// limit with the whole Gaussian, neither cut at the radius nor lowered by its edge value) and
 /// ripple (the limit of a field in which a constant comes back constant).

@@ -10,9 +10,11 @@
 #![expect(unsafe_code, reason = "the one wall: run-time dispatch, unchecked conversion, lanes")]
 
 pub(crate) mod records;
+mod select;
 
 use crate::footprint::{Footprint, Sections};
 use crate::sheet::Sum;
+pub(crate) use select::select;
 
 /// Pixels of one open sheet of a tile part.
 pub type Pixels<S> = [[S; 4]];

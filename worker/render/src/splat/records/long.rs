@@ -8,22 +8,25 @@
 pub(super) mod avx2 {
     use crate::sheet::{LANES, Row};
     use crate::splat::Tap;
-    use crate::splat::records::{Record, SLOTS, STRIDE, STRIP, Splat, Strip, Tables};
+    use crate::splat::records::{MOST, Record, STRIDE, STRIP, Splat, Strip, Tables};
     use std::arch::x86_64::*;
+
+    /// Registers of a record at most: two sheets each.
+    const PARTS: usize = MOST / 2;
 
     /// The section of a voxel in two sheets a register.
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn sections(payload: &[f32; 4], z: &[f32], slot: usize) -> [__m256; SLOTS / 2] {
-        let mut wz = [[0f32; 4]; SLOTS];
+    fn sections<const N: usize>(payload: &[f32; 4], z: &[f32], slot: usize) -> [__m256; PARTS] {
+        let mut wz = [[0f32; 4]; N];
         for (i, &w) in z.iter().enumerate() {
-            wz[(slot + i) % SLOTS] = [w; 4];
+            wz[(slot + i) % N] = [w; 4];
         }
         // SAFETY: four floats are 16 bytes.
         let payload = unsafe { _mm_loadu_ps(payload.as_ptr()) };
         let payload = _mm256_set_m128(payload, payload);
-        let mut sections = [_mm256_setzero_ps(); SLOTS / 2];
-        for i in 0..SLOTS / 2 {
+        let mut sections = [_mm256_setzero_ps(); PARTS];
+        for i in 0..N / 2 {
             // SAFETY: two slots are 32 bytes. Negative sections there are none.
             let w = unsafe { _mm256_loadu_ps(wz[2 * i].as_ptr()) };
             sections[i] = _mm256_max_ps(_mm256_mul_ps(payload, w), _mm256_setzero_ps());
@@ -32,8 +35,8 @@ pub(super) mod avx2 {
     }
 
     #[target_feature(enable = "avx2")]
-    pub(in super::super) fn splat_all(
-        records: &mut [Record<i32>],
+    pub(in super::super) fn splat_all<const N: usize>(
+        records: &mut [Record<i32, N>],
         (voxels, payloads): (&[Splat], &[[f32; 4]]),
         slot: usize,
         tables: &Tables<'_, i32>,
@@ -41,23 +44,23 @@ pub(super) mod avx2 {
         let half = _mm256_set1_ps(0.5);
         for (v, payload) in voxels.iter().zip(payloads) {
             let (x, y, z) = v.weights(tables);
-            let sections = sections(payload, z, slot);
+            let sections = sections::<N>(payload, z, slot);
             for (row, wy) in records[v.at()..].chunks_mut(STRIDE).zip(y) {
                 let wy = _mm256_set1_ps(wy.get());
                 let mut rows = sections;
-                for row in &mut rows {
+                for row in &mut rows[..N / 2] {
                     *row = _mm256_mul_ps(*row, wy);
                 }
                 for (record, wx) in row[..x.len()].iter_mut().zip(x) {
                     let wx = _mm256_set1_ps(Tap::get(*wx));
-                    let at: *mut __m256i = std::ptr::from_mut(record).cast();
-                    for (i, row) in rows.iter().enumerate() {
+                    let at: *mut __m256i = record.as_mut_ptr().cast();
+                    for (i, row) in rows[..N / 2].iter().enumerate() {
                         let add = _mm256_add_ps(_mm256_mul_ps(*row, wx), half);
-                        // SAFETY: a record is 128 bytes, aligned to 64, and borrowed for us alone.
+                        // SAFETY: two slots are 32 bytes, and borrowed for us alone.
                         unsafe {
-                            let sums = _mm256_load_si256(at.add(i));
+                            let sums = _mm256_loadu_si256(at.add(i));
                             let sums = _mm256_add_epi32(sums, _mm256_cvttps_epi32(add));
-                            _mm256_store_si256(at.add(i), sums);
+                            _mm256_storeu_si256(at.add(i), sums);
                         }
                     }
                 }
@@ -81,15 +84,15 @@ pub(super) mod avx2 {
 
     #[target_feature(enable = "avx2")]
     #[inline]
-    pub(in super::super) fn take(
-        (records, before): (&mut [Record<i32>], &mut [[i32; 4]]),
+    pub(in super::super) fn take<const N: usize>(
+        (records, before): (&mut [Record<i32, N>], &mut [[i32; 4]]),
         a: &[f32],
         strips: [Strip; 2],
         slot: usize,
         row: &mut Row,
     ) {
         const { assert!(LANES == 2 * STRIP) };
-        let behind = (slot + 1) % SLOTS;
+        let behind = (slot + 1) % N;
         let twice = strips[0].pixel == strips[1].pixel;
         for (half, strip) in strips.iter().enumerate() {
             let lane = half * STRIP;
@@ -102,14 +105,14 @@ pub(super) mod avx2 {
             let mut sheets = [[_mm256_setzero_si256(); 4]; 3];
             for i in 0..4 {
                 sheets[0][i] = _mm256_set_m128i(load(&before[i + 4]), load(&before[i]));
-                let pair = [&records[i + 4].0, &records[i].0];
+                let pair = [&records[i + 4], &records[i]];
                 sheets[1][i] = _mm256_set_m128i(load(&pair[0][slot]), load(&pair[1][slot]));
                 sheets[2][i] = _mm256_set_m128i(load(&pair[0][behind]), load(&pair[1][behind]));
             }
             if !(twice && half == 0) {
                 for (before, record) in before.iter_mut().zip(records) {
-                    *before = record.0[slot];
-                    record.0[slot] = [0; 4];
+                    *before = record[slot];
+                    record[slot] = [0; 4];
                 }
             }
             let to = [&mut row.before, &mut row.here, &mut row.behind];
@@ -127,84 +130,92 @@ pub(super) mod avx2 {
 
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx512 {
-    use crate::splat::records::{Record, SLOTS, STRIDE, Splat, Tables};
+    use crate::splat::records::{MOST, Record, STRIDE, Splat, Tables};
     use std::arch::x86_64::*;
 
+    /// Registers of a record at most: four sheets each.
+    const PARTS: usize = MOST / 4;
+
+    type At<'a, const N: usize> =
+        (&'a mut [Record<i32, N>], (&'a [Splat], &'a [[f32; 4]]), usize, &'a Tables<'a, i32>);
+
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    pub(in super::super) fn splat_all(
-        records: &mut [Record<i32>],
+    pub(in super::super) fn splat_all<const N: usize>(
+        records: &mut [Record<i32, N>],
         voxels: (&[Splat], &[[f32; 4]]),
         slot: usize,
         tables: &Tables<'_, i32>,
     ) {
+        let at = (records, voxels, slot, tables);
         match tables.across[0].len {
-            4 => all::<4>(records, voxels, slot, tables),
-            5 => all::<5>(records, voxels, slot, tables),
-            6 => all::<6>(records, voxels, slot, tables),
-            7 => all::<7>(records, voxels, slot, tables),
-            8 => all::<8>(records, voxels, slot, tables),
-            9 => all::<9>(records, voxels, slot, tables),
-            13 => all::<13>(records, voxels, slot, tables),
-            14 => all::<14>(records, voxels, slot, tables),
-            _ => super::avx2::splat_all(records, voxels, slot, tables),
+            4 => all::<4, N>(at),
+            5 => all::<5, N>(at),
+            6 => all::<6, N>(at),
+            7 => all::<7, N>(at),
+            8 => all::<8, N>(at),
+            9 => all::<9, N>(at),
+            13 => all::<13, N>(at),
+            14 => all::<14, N>(at),
+            _ => {
+                let (records, voxels, slot, tables) = at;
+                super::avx2::splat_all(records, voxels, slot, tables);
+            }
         }
     }
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn all<const N: usize>(
-        records: &mut [Record<i32>],
-        (voxels, payloads): (&[Splat], &[[f32; 4]]),
-        slot: usize,
-        tables: &Tables<'_, i32>,
-    ) {
+    fn all<const C: usize, const N: usize>((records, (voxels, payloads), slot, tables): At<'_, N>) {
         // Which of a row's weights each of the 16 lanes of four slots takes: that of its slot.
-        let turn = |from: usize| {
+        let turn = |part: usize| {
             let mut turn = [0i32; 16];
             for (lane, turn) in turn.iter_mut().enumerate() {
-                *turn = ((from + lane / 4 + SLOTS - slot) % SLOTS) as i32;
+                *turn = ((4 * part + lane / 4 + 2 * N - slot) % N) as i32;
             }
-            turn
+            // SAFETY: 64 bytes.
+            unsafe { _mm512_loadu_si512(turn.as_ptr().cast()) }
         };
-        // SAFETY: 64 bytes each.
-        let turns = unsafe {
-            [
-                _mm512_loadu_si512(turn(0).as_ptr().cast()),
-                _mm512_loadu_si512(turn(4).as_ptr().cast()),
-            ]
-        };
-        let present = (1u16 << tables.deep.len.min(SLOTS)).wrapping_sub(1);
+        let mut turns = [_mm512_setzero_si512(); PARTS];
+        for (part, to) in turns[..N / 4].iter_mut().enumerate() {
+            *to = turn(part);
+        }
+        let present = (1u16 << tables.deep.len.min(N)).wrapping_sub(1);
         let (half, zero) = (_mm512_set1_ps(0.5), _mm512_setzero_ps());
         for (v, payload) in voxels.iter().zip(payloads) {
             let (x, y, z) = v.weights(tables);
-            let x = x.first_chunk::<N>().expect("a row of the table");
+            let x = x.first_chunk::<C>().expect("a row of the table");
             // SAFETY: lanes that are not present are not read; four floats are 16 bytes.
             let (z, payload) = unsafe {
                 (_mm512_maskz_loadu_ps(present, z.as_ptr()), _mm_loadu_ps(payload.as_ptr()))
             };
             let payload = _mm512_broadcast_f32x4(payload);
-            let cut =
-                |turn| _mm512_max_ps(_mm512_mul_ps(payload, _mm512_permutexvar_ps(turn, z)), zero);
-            let (low, high) = (cut(turns[0]), cut(turns[1]));
-            let mut wx = [zero; N];
-            for i in 0..N {
+            let mut sections = [zero; PARTS];
+            for (section, turn) in sections[..N / 4].iter_mut().zip(turns) {
+                let wz = _mm512_permutexvar_ps(turn, z);
+                *section = _mm512_max_ps(_mm512_mul_ps(payload, wz), zero);
+            }
+            let mut wx = [zero; C];
+            for i in 0..C {
                 wx[i] = _mm512_set1_ps(x[i].get());
             }
             for (row, wy) in records[v.at()..].chunks_mut(STRIDE).zip(y) {
                 let wy = _mm512_set1_ps(wy.get());
-                let (low, high) = (_mm512_mul_ps(low, wy), _mm512_mul_ps(high, wy));
-                let row = row.first_chunk_mut::<N>().expect("a footprint inside the part");
-                for i in 0..N {
-                    let at: *mut __m512i = std::ptr::from_mut(&mut row[i]).cast();
-                    let [l, h] = [
-                        _mm512_cvttps_epi32(_mm512_add_ps(_mm512_mul_ps(low, wx[i]), half)),
-                        _mm512_cvttps_epi32(_mm512_add_ps(_mm512_mul_ps(high, wx[i]), half)),
-                    ];
-                    // SAFETY: a record is 128 bytes, aligned to 64, and borrowed for us alone.
-                    unsafe {
-                        _mm512_store_si512(at, _mm512_add_epi32(_mm512_load_si512(at), l));
-                        let at = at.add(1);
-                        _mm512_store_si512(at, _mm512_add_epi32(_mm512_load_si512(at), h));
+                let mut rows = sections;
+                for row in &mut rows[..N / 4] {
+                    *row = _mm512_mul_ps(*row, wy);
+                }
+                let row = row.first_chunk_mut::<C>().expect("a footprint inside the part");
+                for i in 0..C {
+                    let at: *mut __m512i = row[i].as_mut_ptr().cast();
+                    for (part, row) in rows[..N / 4].iter().enumerate() {
+                        let add = _mm512_add_ps(_mm512_mul_ps(*row, wx[i]), half);
+                        // SAFETY: four slots are 64 bytes, and borrowed for us alone.
+                        unsafe {
+                            let at = at.add(part);
+                            let sums = _mm512_loadu_si512(at);
+                            let sums = _mm512_add_epi32(sums, _mm512_cvttps_epi32(add));
+                            _mm512_storeu_si512(at, sums);
+                        }
                     }
                 }
             }

@@ -1,9 +1,9 @@
-//! Sums of eight sheets of a pixel beside each other: a voxel adds all its sections at once.
+//! Sums of some sheets of a pixel beside each other: a voxel adds all its sections at once.
 //!
-//! For flat views (orthographic, footprints in a table), where a voxel's sections share one
-//! footprint. A record of 16-bit sums is 64 bytes: one AVX-512 operation a pixel or two of AVX2
-//! ([`short`]); one of 32-bit sums twice that ([`long`]). Every loop is written plainly here; what
-//! is written in lanes there must equal it.
+//! A record has N sheets, four or eight: as many as a voxel has sections, which for sheets of a vox
+//! are four. Four sheets of 16-bit sums are 32 bytes: one operation of AVX2, and one of AVX-512 for
+//! two pixels ([`short`]); 32-bit sums take twice that ([`long`]). Every loop is written plainly
+//! here; what is written in lanes there must equal it.
 
 mod long;
 mod short;
@@ -12,18 +12,32 @@ use super::{Accumulate, Level, Simd, Tap, section_fixed, whole};
 use crate::footprint::{Footprint, Sections};
 use crate::sheet::{LANES, Row};
 
-/// Sheets of a record.
-pub(crate) const SLOTS: usize = 8;
+/// Sheets of a record at most.
+pub(crate) const MOST: usize = 8;
 
-/// Records from a row of a part to the next: one more than a part has columns. Rows of 64 records
-/// would lie 4096 bytes apart, where a footprint's rows fall into one set of the cache and loads
-/// wait for stores of the row before, which they are mistaken for.
-pub(crate) const STRIDE: usize = 65;
+/// Records from a row of a part to the next: two more than a part has columns. Rows of 64 records
+/// would lie 2048 or 4096 bytes apart, where a footprint's rows fall into few sets of the cache and
+/// loads wait for stores of the row before, which they are mistaken for. Even, so that two records
+/// that begin at an even column never lie across two lines of the cache.
+pub(crate) const STRIDE: usize = 66;
 
-/// The sums of eight sheets at one pixel: extinction and three colours each.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+/// The sums of N sheets at one pixel: extinction and three colours each.
+pub(crate) type Record<S, const N: usize> = [[S; 4]; N];
+
+/// Memory of records: a line of the cache.
+#[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
-pub(crate) struct Record<S>(pub(crate) [[S; 4]; SLOTS]);
+pub(crate) struct Line([u8; 64]);
+
+impl Line {
+    /// Nothing.
+    pub(crate) const ZERO: Line = Line([0; 64]);
+}
+
+// SAFETY: 64 bytes and no padding, zero among their values.
+unsafe impl bytemuck::Zeroable for Line {}
+// SAFETY: as above; any bytes will do.
+unsafe impl bytemuck::Pod for Line {}
 
 /// Weights along one axis: wherever a row begins, `len` of them are one's.
 #[derive(Clone, Copy, Debug)]
@@ -49,19 +63,18 @@ pub(crate) struct Tables<'a, S: Recorded> {
     pub(crate) deep: Table<'a, S::Depth>,
 }
 
-/// A voxel whose footprint, moved if need be, lies inside the part.
+/// A voxel whose footprint, moved if need be, lies inside the part: sixteen bytes, packed as they are
+/// so that many are made on lanes.
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(16))]
 pub(crate) struct Splat {
-    /// First column and row of its footprint, and the pixel of the part that is nearest to its
-    /// centre: 64 times the row, and the column.
-    pub(crate) first: [u8; 2],
-    pub(crate) cell: u16,
-    /// Where its weights across begin.
-    pub(crate) rows: [u16; 2],
-    /// Depth in phases from its sheet's front.
-    pub(crate) z: u16,
-    pub(crate) normal: u16,
+    /// First column and row of its footprint, a byte each, and above them the pixel of the part that
+    /// is nearest to its centre: 64 times the row, and the column.
+    pub(crate) place: u32,
+    /// Where its weights across begin and, above that, those down.
+    pub(crate) rows: u32,
+    /// Depth in phases from its sheet's front and, above that, its normal.
+    pub(crate) deep: u32,
     /// Its sample's bits.
     pub(crate) sample: u32,
 }
@@ -74,18 +87,38 @@ type Weights<'a, S> = (
 );
 
 impl Splat {
+    /// First column and row.
+    #[inline(always)]
+    pub(crate) fn first(&self) -> [usize; 2] {
+        [(self.place & 0xff) as usize, (self.place >> 8 & 0xff) as usize]
+    }
+
+    /// The pixel of the part that is nearest to its centre.
+    #[inline(always)]
+    pub(crate) fn cell(&self) -> u32 {
+        self.place >> 16
+    }
+
+    /// Its normal.
+    #[inline(always)]
+    pub(crate) fn normal(&self) -> u16 {
+        (self.deep >> 16) as u16
+    }
+
     /// Record of its first row and column.
     #[inline(always)]
     pub(crate) fn at(&self) -> usize {
-        usize::from(self.first[1]) * STRIDE + usize::from(self.first[0])
+        let [x, y] = self.first();
+        y * STRIDE + x
     }
 
     /// Its weights.
     #[inline(always)]
     pub(crate) fn weights<'a, S: Recorded>(&self, tables: &Tables<'a, S>) -> Weights<'a, S> {
         let [x, y] = &tables.across;
-        let z = usize::from(self.z) * tables.deep.len;
-        (x.row(usize::from(self.rows[0])), y.row(usize::from(self.rows[1])), tables.deep.row(z))
+        let z = (self.deep & 0xffff) as usize * tables.deep.len;
+        let rows = [self.rows & 0xffff, self.rows >> 16].map(|row| row as usize);
+        (x.row(rows[0]), y.row(rows[1]), tables.deep.row(z))
     }
 }
 
@@ -102,10 +135,10 @@ pub(crate) struct Strip {
 pub(crate) const STRIP: usize = 8;
 
 /// A weight for each slot.
-pub(crate) type BySlot<W> = [W; SLOTS];
+pub(crate) type BySlot<W, const N: usize> = [W; N];
 
 /// Weights by column and slot, and by row and slot.
-pub(crate) type Across<'a, W> = (&'a [BySlot<W>], &'a [BySlot<W>]);
+pub(crate) type Across<'a, W, const N: usize> = (&'a [BySlot<W, N>], &'a [BySlot<W, N>]);
 
 /// Calls the one of three functions that belongs to the level of `simd`.
 macro_rules! at_level {
@@ -123,7 +156,7 @@ macro_rules! at_level {
 }
 
 /// Sums that records are made of.
-pub(crate) trait Recorded: Accumulate {
+pub(crate) trait Recorded: Accumulate + bytemuck::Pod {
     /// A weight in depth.
     type Depth: Copy + Default;
     /// Extinction and colours of a voxel.
@@ -143,13 +176,30 @@ pub(crate) trait Recorded: Accumulate {
     ///
     /// # Panics
     /// If a footprint leaves the records, or if there are not as many payloads as voxels.
-    fn splat_all(
+    fn splat_all<const N: usize>(
         simd: Simd,
-        records: &mut [Record<Self>],
+        records: &mut [Record<Self, N>],
         voxels: (&[Splat], &[Self::Payload]),
         slot: usize,
         tables: &Tables<'_, Self>,
     );
+
+    /// Puts weights of N rows, one a slot, beside each other: the `j`th of a row belongs to column
+    /// `j` plus its offset, wherever that is one of the first `wide`; elsewhere in those there are
+    /// zeros. What the columns behind are then is not said.
+    ///
+    /// # Panics
+    /// If there are not as many columns.
+    #[inline(always)]
+    fn weave<const N: usize>(
+        simd: Simd,
+        rows: [(&[Self::Weight], i32); N],
+        wide: usize,
+        to: &mut [BySlot<Self::Weight, N>],
+    ) {
+        let _ = simd;
+        weave(rows, wide, to);
+    }
 
     /// Adds a voxel whose sections have footprints of their own: weights by column, row and slot,
     /// zero in slots that it does not reach.
@@ -157,13 +207,13 @@ pub(crate) trait Recorded: Accumulate {
     /// # Panics
     /// If a footprint leaves the records.
     #[inline(always)]
-    fn splat_deep(
+    fn splat_deep<const N: usize>(
         simd: Simd,
-        records: &mut [Record<Self>],
+        records: &mut [Record<Self, N>],
         at: usize,
-        across: Across<'_, Self::Weight>,
+        across: Across<'_, Self::Weight, N>,
         payload: Self::Payload,
-        z: &BySlot<Self::Depth>,
+        z: &BySlot<Self::Depth, N>,
     ) {
         let _ = simd;
         splat_deep(records, at, across, payload, z);
@@ -175,9 +225,9 @@ pub(crate) trait Recorded: Accumulate {
     ///
     /// # Panics
     /// If a strip leaves the part.
-    fn take(
+    fn take<const N: usize>(
         simd: Simd,
-        sums: (&mut [Record<Self>], &mut [[Self; 4]]),
+        sums: (&mut [Record<Self, N>], &mut [[Self; 4]]),
         a: &[f32],
         strips: [Strip; 2],
         slot: usize,
@@ -210,9 +260,9 @@ impl Recorded for i16 {
     }
 
     #[inline(always)]
-    fn splat_all(
+    fn splat_all<const N: usize>(
         simd: Simd,
-        records: &mut [Record<i16>],
+        records: &mut [Record<i16, N>],
         voxels: (&[Splat], &[u64]),
         slot: usize,
         tables: &Tables<'_, i16>,
@@ -222,33 +272,48 @@ impl Recorded for i16 {
             simd,
             (records, voxels, slot, tables),
             splat_plain,
-            short::avx2::splat_all,
-            short::avx512::splat_all
+            short::avx2::splat_all::<N>,
+            short::avx512::splat_all::<N>
         );
     }
 
     #[inline(always)]
-    fn splat_deep(
+    fn weave<const N: usize>(
         simd: Simd,
-        records: &mut [Record<i16>],
+        rows: [(&[i16], i32); N],
+        wide: usize,
+        to: &mut [BySlot<i16, N>],
+    ) {
+        match simd.0 {
+            // SAFETY: the value proves that the instructions are there.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => unsafe { short::avx512::weave(rows, wide, to) },
+            _ => weave(rows, wide, to),
+        }
+    }
+
+    #[inline(always)]
+    fn splat_deep<const N: usize>(
+        simd: Simd,
+        records: &mut [Record<i16, N>],
         at: usize,
-        across: Across<'_, i16>,
+        across: Across<'_, i16, N>,
         payload: u64,
-        z: &BySlot<i16>,
+        z: &BySlot<i16, N>,
     ) {
         at_level!(
             simd,
             (records, at, across, payload, z),
             splat_deep,
-            short::avx2::splat_deep,
-            short::avx512::splat_deep
+            short::avx2::splat_deep::<N>,
+            short::avx512::splat_deep::<N>
         );
     }
 
     #[inline(always)]
-    fn take(
+    fn take<const N: usize>(
         simd: Simd,
-        sums: (&mut [Record<i16>], &mut [[i16; 4]]),
+        sums: (&mut [Record<i16, N>], &mut [[i16; 4]]),
         a: &[f32],
         strips: [Strip; 2],
         slot: usize,
@@ -258,8 +323,8 @@ impl Recorded for i16 {
             simd,
             (sums, a, strips, slot, row),
             take_plain,
-            short::avx2::take,
-            short::avx512::take
+            short::avx2::take::<N>,
+            short::avx512::take::<N>
         );
     }
 }
@@ -287,9 +352,9 @@ impl Recorded for i32 {
     }
 
     #[inline(always)]
-    fn splat_all(
+    fn splat_all<const N: usize>(
         simd: Simd,
-        records: &mut [Record<i32>],
+        records: &mut [Record<i32, N>],
         voxels: (&[Splat], &[[f32; 4]]),
         slot: usize,
         tables: &Tables<'_, i32>,
@@ -299,15 +364,15 @@ impl Recorded for i32 {
             simd,
             (records, voxels, slot, tables),
             splat_plain,
-            long::avx2::splat_all,
-            long::avx512::splat_all
+            long::avx2::splat_all::<N>,
+            long::avx512::splat_all::<N>
         );
     }
 
     #[inline(always)]
-    fn take(
+    fn take<const N: usize>(
         simd: Simd,
-        sums: (&mut [Record<i32>], &mut [[i32; 4]]),
+        sums: (&mut [Record<i32, N>], &mut [[i32; 4]]),
         a: &[f32],
         strips: [Strip; 2],
         slot: usize,
@@ -317,15 +382,15 @@ impl Recorded for i32 {
             simd,
             (sums, a, strips, slot, row),
             take_plain,
-            long::avx2::take,
-            long::avx2::take
+            long::avx2::take::<N>,
+            long::avx2::take::<N>
         );
     }
 }
 
 /// [`Recorded::splat_all`] plainly.
-fn splat_plain<S: Recorded>(
-    records: &mut [Record<S>],
+fn splat_plain<S: Recorded, const N: usize>(
+    records: &mut [Record<S, N>],
     (voxels, payloads): (&[Splat], &[S::Payload]),
     slot: usize,
     tables: &Tables<'_, S>,
@@ -337,8 +402,8 @@ fn splat_plain<S: Recorded>(
 }
 
 /// Adds one voxel to the records from `at`, plainly; its first weight in depth belongs to `slot`.
-pub(crate) fn splat<S: Recorded>(
-    records: &mut [Record<S>],
+pub(crate) fn splat<S: Recorded, const N: usize>(
+    records: &mut [Record<S, N>],
     at: usize,
     (x, y, z): Weights<'_, S>,
     payload: S::Payload,
@@ -346,36 +411,54 @@ pub(crate) fn splat<S: Recorded>(
 ) {
     for (i, &wz) in z.iter().enumerate() {
         let section = S::cut(payload, wz);
-        let slot = (slot + i) % SLOTS;
+        let slot = (slot + i) % N;
         for (j, &wy) in y.iter().enumerate() {
             let row = section.map(|c| S::row(c, wy));
             let from = at + j * STRIDE;
             for (record, &wx) in records[from..from + x.len()].iter_mut().zip(x) {
                 for c in 0..4 {
-                    record.0[slot][c] = record.0[slot][c].plus(row[c], wx);
+                    record[slot][c] = record[slot][c].plus(row[c], wx);
                 }
             }
         }
     }
 }
 
+/// [`Recorded::weave`] plainly.
+#[inline(always)]
+fn weave<W: Copy + Default, const N: usize>(
+    rows: [(&[W], i32); N],
+    wide: usize,
+    to: &mut [BySlot<W, N>],
+) {
+    let to = &mut to[..wide];
+    to.fill([W::default(); N]);
+    for (slot, (row, offset)) in rows.into_iter().enumerate() {
+        let begin = offset.clamp(0, to.len() as i32) as usize;
+        let skip = (-offset).clamp(0, row.len() as i32) as usize;
+        for (to, w) in to[begin..].iter_mut().zip(&row[skip..]) {
+            to[slot] = *w;
+        }
+    }
+}
+
 /// [`Recorded::splat_deep`] plainly.
 #[inline(always)]
-fn splat_deep<S: Recorded>(
-    records: &mut [Record<S>],
+fn splat_deep<S: Recorded, const N: usize>(
+    records: &mut [Record<S, N>],
     at: usize,
-    (x, y): Across<'_, S::Weight>,
+    (x, y): Across<'_, S::Weight, N>,
     payload: S::Payload,
-    z: &BySlot<S::Depth>,
+    z: &BySlot<S::Depth, N>,
 ) {
     let sections = z.map(|wz| S::cut(payload, wz));
     for (j, wy) in y.iter().enumerate() {
         let from = at + j * STRIDE;
         for (record, wx) in records[from..from + x.len()].iter_mut().zip(x) {
-            for slot in 0..SLOTS {
+            for slot in 0..N {
                 for c in 0..4 {
                     let row = S::row(sections[slot][c], wy[slot]);
-                    record.0[slot][c] = record.0[slot][c].plus(row, wx[slot]);
+                    record[slot][c] = record[slot][c].plus(row, wx[slot]);
                 }
             }
         }
@@ -383,8 +466,8 @@ fn splat_deep<S: Recorded>(
 }
 
 /// [`Recorded::take`] plainly.
-fn take_plain<S: Recorded>(
-    (records, before): (&mut [Record<S>], &mut [[S; 4]]),
+fn take_plain<S: Recorded, const N: usize>(
+    (records, before): (&mut [Record<S, N>], &mut [[S; 4]]),
     a: &[f32],
     strips: [Strip; 2],
     slot: usize,
@@ -393,10 +476,10 @@ fn take_plain<S: Recorded>(
     const { assert!(LANES == 2 * STRIP) };
     // A strip may stand there twice, where there is none to pair it with.
     let was = strips.map(|s| std::array::from_fn::<_, STRIP, _>(|i| before[s.pixel + i]));
-    let here = strips.map(|s| std::array::from_fn::<_, STRIP, _>(|i| records[s.record + i].0));
+    let here = strips.map(|s| std::array::from_fn::<_, STRIP, _>(|i| records[s.record + i]));
     for (half, strip) in strips.iter().enumerate() {
         for i in 0..STRIP {
-            let sheets = [was[half][i], here[half][i][slot], here[half][i][(slot + 1) % SLOTS]];
+            let sheets = [was[half][i], here[half][i][slot], here[half][i][(slot + 1) % N]];
             let to = [&mut row.before, &mut row.here, &mut row.behind];
             for (to, sums) in to.into_iter().zip(sheets) {
                 for c in 0..4 {
@@ -405,7 +488,7 @@ fn take_plain<S: Recorded>(
             }
             row.a[half * STRIP + i] = a[strip.pixel + i];
             before[strip.pixel + i] = here[half][i][slot];
-            records[strip.record + i].0[slot] = [S::default(); 4];
+            records[strip.record + i][slot] = [S::default(); 4];
         }
     }
 }
@@ -416,7 +499,7 @@ mod tests {
     use proptest::prelude::*;
 
     /// Nine voxels with odd weights, by every instruction set.
-    fn splat_everywhere<S: Recorded + std::fmt::Debug>(
+    fn splat_everywhere<S: Recorded + std::fmt::Debug, const N: usize>(
         across: usize,
         deep: usize,
         w: [&[S::Weight]; 2],
@@ -427,25 +510,25 @@ mod tests {
             across: [Table { weights: w[0], len: across }, Table { weights: w[1], len: high }],
             deep: Table { weights: z, len: deep },
         };
-        let voxels: Vec<Splat> = (0..9u16)
+        let voxels: Vec<Splat> = (0..9u32)
             .map(|i| Splat {
-                first: [3 + i as u8, i as u8],
-                rows: [i % 4, i / 2 % 4],
-                z: i / 3 % 4,
+                place: (3 + i) | i << 8,
+                rows: (i % 4) | ((i / 2 % 4) << 16),
+                deep: i / 3 % 4,
                 ..Splat::default()
             })
             .collect();
         let light = |i: usize| [31_000.0 - 700.0 * i as f32, 17_003.4, 77.7, i as f32];
         let payloads: Vec<S::Payload> = (0..9).map(|i| S::payload(light(i))).collect();
         let run = |simd| {
-            let mut records = vec![Record([[S::from_bits(11); 4]; SLOTS]); STRIDE * 24];
-            S::splat_all(simd, &mut records, (&voxels, &payloads), deep * 3 % SLOTS, &tables);
+            let mut records: Vec<Record<S, N>> = vec![[[S::from_bits(11); 4]; N]; STRIDE * 24];
+            S::splat_all(simd, &mut records, (&voxels, &payloads), deep * 3 % N, &tables);
             records
         };
         let want = run(Simd::plain());
-        assert!(want.iter().any(|r| r.0 != [[S::from_bits(11); 4]; SLOTS]));
+        assert!(want.iter().any(|r| *r != [[S::from_bits(11); 4]; N]));
         for simd in Simd::all() {
-            assert!(run(simd) == want, "{} differs at {across}, {deep}", simd.name());
+            assert!(run(simd) == want, "{} differs at {across}, {deep} of {N}", simd.name());
         }
     }
 
@@ -453,47 +536,87 @@ mod tests {
     fn every_instruction_set_adds_what_the_plain_loop_adds() {
         let fixed = |n: usize| (0..n).map(|i| (i * 7919 % 23_000) as i16).collect::<Vec<_>>();
         for across in 1..20 {
-            for deep in 1..=SLOTS {
+            for deep in 1..=MOST {
                 let [x, y, z] = [across, 1 + across % 7, deep].map(|n| fixed(4 * n));
-                splat_everywhere::<i16>(across, deep, [&x, &y], &z);
                 let real = |w: &[i16]| w.iter().map(|&w| f32::from(w) * 7.1e-5).collect::<Vec<_>>();
                 let taps = |w: &[i16]| real(w).into_iter().map(Tap::new).collect::<Vec<_>>();
-                splat_everywhere::<i32>(across, deep, [&taps(&x), &taps(&y)], &real(&z));
+                if deep <= 4 {
+                    splat_everywhere::<i16, 4>(across, deep, [&x, &y], &z);
+                    splat_everywhere::<i32, 4>(across, deep, [&taps(&x), &taps(&y)], &real(&z));
+                }
+                splat_everywhere::<i16, MOST>(across, deep, [&x, &y], &z);
+                splat_everywhere::<i32, MOST>(across, deep, [&taps(&x), &taps(&y)], &real(&z));
+            }
+        }
+    }
+
+    /// Sections with footprints of their own, by every instruction set.
+    fn splat_deep_everywhere<const N: usize>() {
+        let by_slot = |i: usize| -> BySlot<i16, N> {
+            std::array::from_fn(|slot| ((i * 7919 + slot * 3001) % 23_000) as i16)
+        };
+        for (columns, rows) in [(1, 1), (2, 3), (5, 3), (8, 8), (9, 7), (16, 9), (18, 12)] {
+            let x: Vec<_> = (0..columns).map(by_slot).collect();
+            let y: Vec<_> = (0..rows).map(|i| by_slot(i + 5)).collect();
+            let payload = i16::payload([31_000.0, 17_003.4, 77.7, 3.0]);
+            let run = |simd| {
+                let mut records: Vec<Record<i16, N>> = vec![[[11; 4]; N]; STRIDE * 24];
+                i16::splat_deep(simd, &mut records, 6, (&x, &y), payload, &by_slot(3));
+                records
+            };
+            let want = run(Simd::plain());
+            assert!(want[6] != [[11; 4]; N]);
+            for simd in Simd::all() {
+                assert!(run(simd) == want, "{} differs at {columns}x{rows} of {N}", simd.name());
             }
         }
     }
 
     #[test]
     fn sections_with_footprints_of_their_own_are_added_as_the_plain_loop_adds_them() {
-        let by_slot = |i: usize| -> BySlot<i16> {
-            std::array::from_fn(|slot| ((i * 7919 + slot * 3001) % 23_000) as i16)
-        };
-        for (columns, rows) in [(1, 1), (5, 3), (8, 8), (9, 7), (17, 12)] {
-            let x: Vec<_> = (0..columns).map(by_slot).collect();
-            let y: Vec<_> = (0..rows).map(|i| by_slot(i + 5)).collect();
-            let payload = i16::payload([31_000.0, 17_003.4, 77.7, 3.0]);
-            let run = |simd| {
-                let mut records = vec![Record([[11; 4]; SLOTS]); STRIDE * 24];
-                i16::splat_deep(simd, &mut records, 7, (&x, &y), payload, &by_slot(3));
-                records
-            };
-            let want = run(Simd::plain());
-            assert!(want[7].0 != [[11; 4]; SLOTS]);
-            for simd in Simd::all() {
-                assert!(run(simd) == want, "{} differs at {columns}x{rows}", simd.name());
+        splat_deep_everywhere::<4>();
+        splat_deep_everywhere::<MOST>();
+    }
+
+    #[test]
+    fn rows_are_woven_as_the_plain_loop_weaves_them() {
+        let weights: Vec<i16> = (1..200).collect();
+        for wide in 1..24usize {
+            for i in 0..60i32 {
+                let mut rows: [(&[i16], i32); 4] = [(&[], 0); 4];
+                for (slot, row) in rows.iter_mut().enumerate() {
+                    // Rows before, across and behind the window; one is none at all.
+                    let len = (i as usize * 5 + slot * 3) % 14;
+                    *row = (&weights[40 * slot..][..len], (i * 7 + slot as i32 * 2) % 40 - 16);
+                }
+                let run = |simd| {
+                    let mut to = [[99i16; 4]; 40];
+                    i16::weave(simd, rows, wide, &mut to);
+                    to[..wide].to_vec()
+                };
+                let want = run(Simd::plain());
+                let column = |slot: usize, j: i32| -> i16 {
+                    let (row, offset) = rows[slot];
+                    usize::try_from(j - offset).ok().and_then(|k| row.get(k)).copied().unwrap_or(0)
+                };
+                for (j, got) in want.iter().enumerate() {
+                    assert_eq!(*got, [0, 1, 2, 3].map(|slot| column(slot, j as i32)));
+                }
+                for simd in Simd::all() {
+                    assert_eq!(run(simd), want, "{} at {wide}, {i}", simd.name());
+                }
             }
         }
     }
 
     /// Two strips, taken by every instruction set.
-    fn take_everywhere<S: Recorded>(
+    fn take_everywhere<S: Recorded, const N: usize>(
         strips: [usize; 2],
         slot: usize,
         mut next: impl FnMut() -> S,
     ) -> Result<(), TestCaseError> {
         let mut sums = || [(); 4].map(|()| next());
-        let records: Vec<Record<S>> =
-            (0..48).map(|_| Record([(); SLOTS].map(|()| sums()))).collect();
+        let records: Vec<Record<S, N>> = (0..48).map(|_| [(); N].map(|()| sums())).collect();
         let before: Vec<[S; 4]> = (0..48).map(|_| sums()).collect();
         let opacity: Vec<f32> = (0..48).map(|i| i as f32).collect();
         let [a, b] = strips;
@@ -505,8 +628,8 @@ mod tests {
             (records, before, row.before, row.here, row.behind, row.a)
         };
         let want = run(Simd::plain());
-        prop_assert_eq!(want.3[1][0], records[a].0[slot][1].value());
-        prop_assert_eq!(want.4[2][9], records[b + 1].0[(slot + 1) % SLOTS][2].value());
+        prop_assert_eq!(want.3[1][0], records[a][slot][1].value());
+        prop_assert_eq!(want.4[2][9], records[b + 1][(slot + 1) % N][2].value());
         prop_assert_eq!(want.2[3][7], before[a + 7][3].value());
         prop_assert_eq!(want.5[10], (b + 2) as f32);
         for simd in Simd::all() {
@@ -518,7 +641,7 @@ mod tests {
     proptest! {
         #[test]
         fn strips_are_taken_as_the_plain_loop_takes_them(
-            seed in any::<u32>(), slot in 0..SLOTS, a in 0..40usize, b in 0..40usize,
+            seed in any::<u32>(), slot in 0..MOST, a in 0..40usize, b in 0..40usize,
         ) {
             let mut state = u64::from(seed) | 1 << 40;
             let mut next = || {
@@ -527,8 +650,10 @@ mod tests {
             };
             // Apart, or the same strip twice.
             prop_assume!(a == b || a.abs_diff(b) >= STRIP);
-            take_everywhere::<i16>([a, b], slot, || next() as i16)?;
-            take_everywhere::<i32>([a, b], slot, &mut next)?;
+            take_everywhere::<i16, 4>([a, b], slot % 4, || next() as i16)?;
+            take_everywhere::<i16, MOST>([a, b], slot, || next() as i16)?;
+            take_everywhere::<i32, 4>([a, b], slot % 4, &mut next)?;
+            take_everywhere::<i32, MOST>([a, b], slot, &mut next)?;
         }
     }
 }

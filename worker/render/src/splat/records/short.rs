@@ -4,133 +4,149 @@
 pub(super) mod avx2 {
     use crate::sheet::{LANES, Row};
     use crate::splat::records::{
-        Across, BySlot, Record, SLOTS, STRIDE, STRIP, Splat, Strip, Tables,
+        Across, BySlot, MOST, Record, STRIDE, STRIP, Splat, Strip, Tables,
     };
     use std::arch::x86_64::*;
 
+    /// Registers of a record at most: four sheets each.
+    const PARTS: usize = MOST / 4;
+
     #[target_feature(enable = "avx2")]
-    pub(in super::super) fn splat_all(
-        records: &mut [Record<i16>],
+    pub(in super::super) fn splat_all<const N: usize>(
+        records: &mut [Record<i16, N>],
         (voxels, payloads): (&[Splat], &[u64]),
         slot: usize,
         tables: &Tables<'_, i16>,
     ) {
         for (v, &payload) in voxels.iter().zip(payloads) {
             let (x, y, z) = v.weights(tables);
-            // Each slot's weight four times, beside the payload twice.
-            let mut wz = [[0i16; 4]; SLOTS];
+            // Each slot's weight four times, beside the payload four times.
+            let mut wz = [[0i16; 4]; N];
             for (i, &w) in z.iter().enumerate() {
-                wz[(slot + i) % SLOTS] = [w; 4];
+                wz[(slot + i) % N] = [w; 4];
             }
             let payload = _mm256_set1_epi64x(payload as i64);
-            // SAFETY: 64 bytes, two loads of 32.
-            let wz = unsafe {
-                let at: *const __m256i = wz.as_ptr().cast();
-                [_mm256_loadu_si256(at), _mm256_loadu_si256(at.add(1))]
-            };
-            let sections =
-                [_mm256_mulhrs_epi16(payload, wz[0]), _mm256_mulhrs_epi16(payload, wz[1])];
+            let mut sections = [_mm256_setzero_si256(); PARTS];
+            for (i, section) in sections[..N / 4].iter_mut().enumerate() {
+                // SAFETY: four slots are 32 bytes.
+                let wz = unsafe { _mm256_loadu_si256(wz[4 * i..4 * i + 4].as_ptr().cast()) };
+                *section = _mm256_mulhrs_epi16(payload, wz);
+            }
             let at = v.at();
             match x.len() {
-                4 => columns::<4>(records, at, x, y, sections),
-                5 => columns::<5>(records, at, x, y, sections),
-                6 => columns::<6>(records, at, x, y, sections),
-                7 => columns::<7>(records, at, x, y, sections),
-                8 => columns::<8>(records, at, x, y, sections),
+                4 => columns::<4, N>(records, at, x, y, sections),
+                5 => columns::<5, N>(records, at, x, y, sections),
+                6 => columns::<6, N>(records, at, x, y, sections),
+                7 => columns::<7, N>(records, at, x, y, sections),
+                8 => columns::<8, N>(records, at, x, y, sections),
                 _ => {
                     // Columns in groups whose weights stay in registers.
                     let (fours, rest) = x.as_chunks::<4>();
                     for (i, four) in fours.iter().enumerate() {
-                        columns::<4>(records, at + 4 * i, four, y, sections);
+                        columns::<4, N>(records, at + 4 * i, four, y, sections);
                     }
                     for (i, one) in rest.iter().enumerate() {
-                        columns::<1>(records, at + 4 * fours.len() + i, &[*one], y, sections);
+                        let at = at + 4 * fours.len() + i;
+                        columns::<1, N>(records, at, &[*one], y, sections);
                     }
                 }
             }
         }
     }
 
-    /// Each slot's weight for its four channels: slots 0 to 3, and 4 to 7.
+    /// Each slot's weight for its four channels: four slots a register.
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn spread(weights: &BySlot<i16>) -> [__m256i; 2] {
-        // SAFETY: eight weights are 16 bytes.
-        let weights = unsafe { _mm_loadu_si128(weights.as_ptr().cast()) };
-        let weights = _mm256_broadcastsi128_si256(weights);
-        let low = _mm256_setr_epi8(
-            0, 1, 0, 1, 0, 1, 0, 1, 2, 3, 2, 3, 2, 3, 2, 3, 4, 5, 4, 5, 4, 5, 4, 5, 6, 7, 6, 7, 6,
-            7, 6, 7,
-        );
-        let high = _mm256_add_epi8(low, _mm256_set1_epi8(8));
-        [_mm256_shuffle_epi8(weights, low), _mm256_shuffle_epi8(weights, high)]
+    fn spread<const N: usize>(weights: &BySlot<i16, N>) -> [__m256i; PARTS] {
+        let mut spread = [_mm256_setzero_si256(); PARTS];
+        for (i, spread) in spread[..N / 4].iter_mut().enumerate() {
+            // SAFETY: four weights are 8 bytes.
+            let weights = unsafe { _mm_loadl_epi64(weights[4 * i..4 * i + 4].as_ptr().cast()) };
+            let weights = _mm256_broadcastsi128_si256(weights);
+            let turn = _mm256_setr_epi8(
+                0, 1, 0, 1, 0, 1, 0, 1, 2, 3, 2, 3, 2, 3, 2, 3, 4, 5, 4, 5, 4, 5, 4, 5, 6, 7, 6, 7,
+                6, 7, 6, 7,
+            );
+            *spread = _mm256_shuffle_epi8(weights, turn);
+        }
+        spread
     }
 
+    /// Adds `row * w`, register by register, to a record.
     #[target_feature(enable = "avx2")]
     #[inline]
-    pub(in super::super) fn splat_deep(
-        records: &mut [Record<i16>],
-        at: usize,
-        (x, y): Across<'_, i16>,
-        payload: u64,
-        z: &BySlot<i16>,
+    fn add<const N: usize>(
+        record: &mut Record<i16, N>,
+        row: &[__m256i; PARTS],
+        w: &[__m256i; PARTS],
     ) {
-        let payload = _mm256_set1_epi64x(payload as i64);
-        let [low, high] = spread(z);
-        let section = [_mm256_mulhrs_epi16(payload, low), _mm256_mulhrs_epi16(payload, high)];
-        for (row, wy) in records[at..].chunks_mut(STRIDE).zip(y) {
-            let [low, high] = spread(wy);
-            let low = _mm256_mulhrs_epi16(section[0], low);
-            let high = _mm256_mulhrs_epi16(section[1], high);
-            for (record, wx) in row[..x.len()].iter_mut().zip(x) {
-                let wx = spread(wx);
-                let at: *mut __m256i = std::ptr::from_mut(record).cast();
-                // SAFETY: a record is 64 bytes, aligned to 64, and borrowed for us alone.
-                unsafe {
-                    let [l, h] = [_mm256_load_si256(at), _mm256_load_si256(at.add(1))];
-                    _mm256_store_si256(at, _mm256_adds_epi16(l, _mm256_mulhrs_epi16(low, wx[0])));
-                    let h = _mm256_adds_epi16(h, _mm256_mulhrs_epi16(high, wx[1]));
-                    _mm256_store_si256(at.add(1), h);
-                }
+        let at: *mut __m256i = record.as_mut_ptr().cast();
+        for i in 0..N / 4 {
+            // SAFETY: four slots are 32 bytes, and borrowed for us alone.
+            unsafe {
+                let at = at.add(i);
+                let sums = _mm256_loadu_si256(at);
+                let sums = _mm256_adds_epi16(sums, _mm256_mulhrs_epi16(row[i], w[i]));
+                _mm256_storeu_si256(at, sums);
             }
         }
     }
 
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn columns<const N: usize>(
-        records: &mut [Record<i16>],
+    fn times<const N: usize>(a: &[__m256i; PARTS], b: &[__m256i; PARTS]) -> [__m256i; PARTS] {
+        let mut all = [_mm256_setzero_si256(); PARTS];
+        for i in 0..N / 4 {
+            all[i] = _mm256_mulhrs_epi16(a[i], b[i]);
+        }
+        all
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    pub(in super::super) fn splat_deep<const N: usize>(
+        records: &mut [Record<i16, N>],
+        at: usize,
+        (x, y): Across<'_, i16, N>,
+        payload: u64,
+        z: &BySlot<i16, N>,
+    ) {
+        let payload = [_mm256_set1_epi64x(payload as i64); PARTS];
+        let section = times::<N>(&payload, &spread(z));
+        for (row, wy) in records[at..].chunks_mut(STRIDE).zip(y) {
+            let section = times::<N>(&section, &spread(wy));
+            for (record, wx) in row[..x.len()].iter_mut().zip(x) {
+                add(record, &section, &spread(wx));
+            }
+        }
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn columns<const C: usize, const N: usize>(
+        records: &mut [Record<i16, N>],
         at: usize,
         x: &[i16],
         y: &[i16],
-        [low, high]: [__m256i; 2],
+        sections: [__m256i; PARTS],
     ) {
-        let mut wx = [_mm256_setzero_si256(); N];
-        for i in 0..N {
+        let mut wx = [_mm256_setzero_si256(); C];
+        for i in 0..C {
             wx[i] = _mm256_set1_epi16(x[i]);
         }
-        for (j, &wy) in y.iter().enumerate() {
-            let wy = _mm256_set1_epi16(wy);
-            let (low, high) = (_mm256_mulhrs_epi16(low, wy), _mm256_mulhrs_epi16(high, wy));
-            let row = at + j * STRIDE;
-            let row = &mut records[row..row + N];
-            for i in 0..N {
-                let at: *mut __m256i = std::ptr::from_mut(&mut row[i]).cast();
-                // SAFETY: a record is 64 bytes, aligned to 64, and borrowed for us alone.
-                unsafe {
-                    let [l, h] = [_mm256_load_si256(at), _mm256_load_si256(at.add(1))];
-                    _mm256_store_si256(at, _mm256_adds_epi16(l, _mm256_mulhrs_epi16(low, wx[i])));
-                    let h = _mm256_adds_epi16(h, _mm256_mulhrs_epi16(high, wx[i]));
-                    _mm256_store_si256(at.add(1), h);
-                }
+        for (row, &wy) in records[at..].chunks_mut(STRIDE).zip(y) {
+            let section = times::<N>(&sections, &[_mm256_set1_epi16(wy); PARTS]);
+            let row = row.first_chunk_mut::<C>().expect("a footprint inside the part");
+            for i in 0..C {
+                add(&mut row[i], &section, &[wx[i]; PARTS]);
             }
         }
     }
 
     #[target_feature(enable = "avx2")]
     #[inline]
-    pub(in super::super) fn take(
-        sums: (&mut [Record<i16>], &mut [[i16; 4]]),
+    pub(in super::super) fn take<const N: usize>(
+        sums: (&mut [Record<i16, N>], &mut [[i16; 4]]),
         a: &[f32],
         strips: [Strip; 2],
         slot: usize,
@@ -157,8 +173,8 @@ pub(super) mod avx2 {
     /// channel: sixteen pixels a register. Leaves what [`super::take`] says.
     #[target_feature(enable = "avx2")]
     #[inline]
-    pub(super) fn turned(
-        (records, before): (&mut [Record<i16>], &mut [[i16; 4]]),
+    pub(super) fn turned<const N: usize>(
+        (records, before): (&mut [Record<i16, N>], &mut [[i16; 4]]),
         [a, b]: [Strip; 2],
         slot: usize,
     ) -> [[__m256i; 4]; 3] {
@@ -166,10 +182,10 @@ pub(super) mod avx2 {
         let records_a = &records[a.record..a.record + STRIP];
         let records_b = &records[b.record..b.record + STRIP];
         // Slots k and k+1 of pixel i, side by side, strip b above strip a.
-        let behind = (slot + 1) % SLOTS;
-        let one = |record: &Record<i16>| -> __m128i {
+        let behind = (slot + 1) % N;
+        let one = |record: &Record<i16, N>| -> __m128i {
             // SAFETY: four sums are 8 bytes.
-            let sums = |slot: usize| unsafe { _mm_loadl_epi64(record.0[slot].as_ptr().cast()) };
+            let sums = |slot: usize| unsafe { _mm_loadl_epi64(record[slot].as_ptr().cast()) };
             _mm_unpacklo_epi64(sums(slot), sums(behind))
         };
         let mut here = [_mm256_setzero_si256(); STRIP];
@@ -199,7 +215,7 @@ pub(super) mod avx2 {
                 unsafe { _mm_storeu_si128(to.as_mut_ptr().cast::<__m128i>().add(i), half) };
             }
             for record in &mut records[strip.record..strip.record + STRIP] {
-                record.0[slot] = [0; 4];
+                record[slot] = [0; 4];
             }
         }
         // Eight by eight, turned over: pairs, quadruples, all eight.
@@ -243,78 +259,226 @@ pub(super) mod avx2 {
 pub(super) mod avx512 {
     use super::avx2::turned;
     use crate::sheet::Row;
-    use crate::splat::records::{Across, BySlot, Record, SLOTS, STRIDE, Splat, Strip, Tables};
+    use crate::splat::records::{Across, BySlot, Record, STRIDE, Splat, Strip, Tables};
     use std::arch::x86_64::*;
 
+    /// 16-bit numbers of a register.
+    const WORDS: usize = 32;
+
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    pub(in super::super) fn splat_all(
-        records: &mut [Record<i16>],
+    pub(in super::super) fn splat_all<const N: usize>(
+        records: &mut [Record<i16, N>],
         voxels: (&[Splat], &[u64]),
         slot: usize,
         tables: &Tables<'_, i16>,
     ) {
-        // Which of a row's weights each of the 32 lanes takes: that of its slot.
-        let mut turn = [0i16; 4 * SLOTS];
-        for (lane, from) in turn.iter_mut().enumerate() {
-            *from = ((lane / 4 + SLOTS - slot) % SLOTS) as i16;
-        }
-        // SAFETY: 64 bytes.
-        let turn = unsafe { _mm512_loadu_si512(turn.as_ptr().cast()) };
-        let present = (1u32 << tables.deep.len) - 1;
-        match tables.across[0].len {
-            4 => all::<4>(records, voxels, tables, turn, present),
-            5 => all::<5>(records, voxels, tables, turn, present),
-            6 => all::<6>(records, voxels, tables, turn, present),
-            7 => all::<7>(records, voxels, tables, turn, present),
-            8 => all::<8>(records, voxels, tables, turn, present),
-            9 => all::<9>(records, voxels, tables, turn, present),
-            10 => all::<10>(records, voxels, tables, turn, present),
-            11 => all::<11>(records, voxels, tables, turn, present),
-            12 => all::<12>(records, voxels, tables, turn, present),
-            13 => all::<13>(records, voxels, tables, turn, present),
-            14 => all::<14>(records, voxels, tables, turn, present),
+        let at = (records, voxels, slot, tables);
+        // Registers of a row: where two records share one, a footprint that begins in the middle of
+        // the first ends in the middle of the last.
+        let units = if N == 8 { tables.across[0].len } else { tables.across[0].len / 2 + 1 };
+        match units {
+            2 => all::<2, N>(at),
+            3 => all::<3, N>(at),
+            4 => all::<4, N>(at),
+            5 => all::<5, N>(at),
+            6 => all::<6, N>(at),
+            7 => all::<7, N>(at),
+            8 => all::<8, N>(at),
+            9 => all::<9, N>(at),
+            10 => all::<10, N>(at),
+            11 => all::<11, N>(at),
+            12 => all::<12, N>(at),
+            13 => all::<13, N>(at),
+            14 => all::<14, N>(at),
             // A footprint of ten pixels a voxel and more: loops of AVX2.
-            _ => super::avx2::splat_all(records, voxels, slot, tables),
+            _ => {
+                let (records, voxels, slot, tables) = at;
+                super::avx2::splat_all(records, voxels, slot, tables);
+            }
         }
     }
 
-    /// Each slot's weight for its four channels.
+    /// A register of 16-bit numbers.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn spread(weights: &BySlot<i16>) -> __m512i {
-        // SAFETY: eight weights are 16 bytes.
-        let weights = unsafe { _mm_loadu_si128(weights.as_ptr().cast()) };
+    fn words(of: impl Fn(usize) -> usize) -> __m512i {
+        let mut words = [0i16; WORDS];
+        for (lane, word) in words.iter_mut().enumerate() {
+            *word = of(lane) as i16;
+        }
+        // SAFETY: 64 bytes.
+        unsafe { _mm512_loadu_si512(words.as_ptr().cast()) }
+    }
+
+    /// The first of `weights`, at most 32, and zeros.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn load(weights: &[i16]) -> __m512i {
+        let present = (1u64 << weights.len().min(WORDS)) - 1;
+        // SAFETY: lanes that are not present are not read.
+        unsafe { _mm512_maskz_loadu_epi16(present as u32, weights.as_ptr()) }
+    }
+
+    /// Adds `row * w` to the register at `at`.
+    ///
+    /// # Safety
+    /// The 64 bytes from `at` may be written.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    unsafe fn add(at: *mut __m512i, row: __m512i, w: __m512i) {
+        // SAFETY: see above.
+        unsafe {
+            let sums = _mm512_loadu_si512(at);
+            let sums = _mm512_adds_epi16(sums, _mm512_mulhrs_epi16(row, w));
+            _mm512_storeu_si512(at, sums);
+        }
+    }
+
+    type At<'a, const N: usize> =
+        (&'a mut [Record<i16, N>], (&'a [Splat], &'a [u64]), usize, &'a Tables<'a, i16>);
+
+    /// Rows of `U` registers, of one record of eight sheets or of two of four.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn all<const U: usize, const N: usize>((records, (voxels, payloads), slot, tables): At<'_, N>) {
+        let pixels = 8 / N;
+        // Which of a voxel's weights in depth each lane takes: that of its slot.
+        let turn = words(|lane| (lane / 4 + 2 * N - slot) % N);
+        // Which weights across: the two records' of a register, moved where a footprint begins with
+        // the second of them. What is before the first comes from the last lane, which is zero.
+        let across = [0, 1].map(|odd| words(|lane| (lane / (4 * N) + WORDS - odd) % WORDS));
+        for (v, &payload) in voxels.iter().zip(payloads) {
+            let (x, y, z) = v.weights(tables);
+            let section = _mm512_set1_epi64(payload as i64);
+            let section = _mm512_mulhrs_epi16(section, _mm512_permutexvar_epi16(turn, load(z)));
+            let mut wx = [_mm512_setzero_si512(); U];
+            let odd = if N == 8 { 0 } else { v.at() % 2 };
+            if N == 8 {
+                for i in 0..U {
+                    wx[i] = _mm512_set1_epi16(x[i]);
+                }
+            } else {
+                let (x, mut from) = (load(x), across[odd]);
+                for wx in &mut wx {
+                    *wx = _mm512_permutexvar_epi16(from, x);
+                    from = _mm512_add_epi16(from, _mm512_set1_epi16(2));
+                }
+            }
+            let rows = records[v.at() - odd..].chunks_mut(STRIDE);
+            for (row, &wy) in rows.zip(y) {
+                let section = _mm512_mulhrs_epi16(section, _mm512_set1_epi16(wy));
+                let row = &mut row[..U * pixels];
+                let at: *mut __m512i = row.as_mut_ptr().cast();
+                for (i, wx) in wx.into_iter().enumerate() {
+                    // SAFETY: so many registers are the records of `row`, borrowed for us alone.
+                    unsafe { add(at.add(i), section, wx) };
+                }
+            }
+        }
+    }
+
+    /// Four rows and sixteen columns at a time.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    pub(in super::super) fn weave<const N: usize>(
+        rows: [(&[i16], i32); N],
+        wide: usize,
+        to: &mut [BySlot<i16, N>],
+    ) {
+        let fits = N == 4 && wide <= 16;
+        let Some(sixteen) = to.as_flattened_mut().first_chunk_mut::<64>().filter(|_| fits) else {
+            return super::super::weave(rows, wide, to);
+        };
+        let mut lines = [_mm256_setzero_si256(); 4];
+        for (line, (row, offset)) in lines.iter_mut().zip(rows) {
+            // Lane j is column j. A row of more than 31 weights has more than are looked at.
+            let present = (1u64 << row.len().min(31)) - 1;
+            let present = if offset >= 0 {
+                present.checked_shl(offset as u32).unwrap_or(0)
+            } else {
+                present.checked_shr(offset.unsigned_abs()).unwrap_or(0)
+            };
+            let from = row.as_ptr().wrapping_offset(-(offset as isize));
+            // SAFETY: lanes that are not present are not read; those that are lie in the row.
+            *line = unsafe { _mm256_maskz_loadu_epi16(present as u16, from) };
+        }
+        let low =
+            [_mm256_unpacklo_epi16(lines[0], lines[1]), _mm256_unpacklo_epi16(lines[2], lines[3])];
+        let high =
+            [_mm256_unpackhi_epi16(lines[0], lines[1]), _mm256_unpackhi_epi16(lines[2], lines[3])];
+        // Two columns a half: 0 1 and 8 9, 2 3 and 10 11, and so on.
+        let pairs = [
+            _mm256_unpacklo_epi32(low[0], low[1]),
+            _mm256_unpackhi_epi32(low[0], low[1]),
+            _mm256_unpacklo_epi32(high[0], high[1]),
+            _mm256_unpackhi_epi32(high[0], high[1]),
+        ];
+        let (low, high) = sixteen.as_chunks_mut::<8>().0.split_at_mut(4);
+        for (i, pair) in pairs.into_iter().enumerate() {
+            // SAFETY: eight weights are 16 bytes.
+            unsafe {
+                _mm_storeu_si128(low[i].as_mut_ptr().cast(), _mm256_castsi256_si128(pair));
+                let pair = _mm256_extracti128_si256::<1>(pair);
+                _mm_storeu_si128(high[i].as_mut_ptr().cast(), pair);
+            }
+        }
+    }
+
+    /// Each slot's weight for its four channels, of one pixel of eight sheets or two of four.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn spread(weights: &[i16]) -> __m512i {
         // Words 0 0 0 0 1 1 1 1 and so on, from the lowest up.
         let turn = _mm512_set_epi64(7, 6, 5, 4, 3, 2, 1, 0);
         let turn = _mm512_mullo_epi64(turn, _mm512_set1_epi64(0x0001_0001_0001_0001));
+        let weights = weights.first_chunk::<8>().expect("the weights of a register");
+        // SAFETY: eight weights are 16 bytes.
+        let weights = unsafe { _mm_loadu_si128(weights.as_ptr().cast()) };
         _mm512_permutexvar_epi16(turn, _mm512_castsi128_si512(weights))
     }
 
+    /// The same weights for all pixels of a register.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    pub(in super::super) fn splat_deep(
-        records: &mut [Record<i16>],
+    fn spread_same<const N: usize>(weights: &BySlot<i16, N>) -> __m512i {
+        let mut both = [0; 8];
+        for part in both.chunks_mut(N) {
+            part.copy_from_slice(weights);
+        }
+        spread(&both)
+    }
+
+    /// Columns come in registers: an even number of them from an even one, where there are two in
+    /// one.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    pub(in super::super) fn splat_deep<const N: usize>(
+        records: &mut [Record<i16, N>],
         at: usize,
-        (x, y): Across<'_, i16>,
+        (x, y): Across<'_, i16, N>,
         payload: u64,
-        z: &BySlot<i16>,
+        z: &BySlot<i16, N>,
     ) {
-        let section = _mm512_mulhrs_epi16(_mm512_set1_epi64(payload as i64), spread(z));
+        let pixels = 8 / N;
+        if x.len() % pixels != 0 {
+            return super::avx2::splat_deep(records, at, (x, y), payload, z);
+        }
+        let section = _mm512_mulhrs_epi16(_mm512_set1_epi64(payload as i64), spread_same(z));
         // Columns in groups whose weights stay in registers.
-        for (i, x) in x.chunks(8).enumerate() {
+        for (i, x) in x.chunks(8 * pixels).enumerate() {
             let mut columns = [_mm512_setzero_si512(); 8];
-            for (column, x) in columns.iter_mut().zip(x) {
+            let units = x.len() / pixels;
+            for (column, x) in columns.iter_mut().zip(x.as_flattened().chunks(8)) {
                 *column = spread(x);
             }
-            for (row, wy) in records[at + 8 * i..].chunks_mut(STRIDE).zip(y) {
-                let section = _mm512_mulhrs_epi16(section, spread(wy));
-                for (record, wx) in row[..x.len()].iter_mut().zip(columns) {
-                    let at: *mut __m512i = std::ptr::from_mut(record).cast();
-                    // SAFETY: a record is 64 bytes, aligned to 64, and borrowed for us alone.
-                    unsafe {
-                        let add = _mm512_mulhrs_epi16(section, wx);
-                        _mm512_store_si512(at, _mm512_adds_epi16(_mm512_load_si512(at), add));
-                    }
+            let rows = records[at + 8 * pixels * i..].chunks_mut(STRIDE);
+            for (row, wy) in rows.zip(y) {
+                let section = _mm512_mulhrs_epi16(section, spread_same(wy));
+                let row = &mut row[..x.len()];
+                let at: *mut __m512i = row.as_mut_ptr().cast();
+                for (i, wx) in columns[..units].iter().enumerate() {
+                    // SAFETY: so many registers are the records of `row`, borrowed for us alone.
+                    unsafe { add(at.add(i), section, *wx) };
                 }
             }
         }
@@ -322,8 +486,8 @@ pub(super) mod avx512 {
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    pub(in super::super) fn take(
-        sums: (&mut [Record<i16>], &mut [[i16; 4]]),
+    pub(in super::super) fn take<const N: usize>(
+        sums: (&mut [Record<i16, N>], &mut [[i16; 4]]),
         a: &[f32],
         strips: [Strip; 2],
         slot: usize,
@@ -348,42 +512,5 @@ pub(super) mod avx512 {
         let both = _mm512_insertf32x8::<1>(both, half(strips[1]));
         // SAFETY: sixteen floats are 64 bytes.
         unsafe { _mm512_storeu_ps(row.a.as_mut_ptr(), both) };
-    }
-
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    fn all<const N: usize>(
-        records: &mut [Record<i16>],
-        (voxels, payloads): (&[Splat], &[u64]),
-        tables: &Tables<'_, i16>,
-        turn: __m512i,
-        present: u32,
-    ) {
-        for (v, &payload) in voxels.iter().zip(payloads) {
-            let (x, y, z) = v.weights(tables);
-            let x = x.first_chunk::<N>().expect("a row of the table");
-            // SAFETY: lanes that are not present are not read.
-            let z = unsafe { _mm512_maskz_loadu_epi16(present, z.as_ptr()) };
-            let wz = _mm512_permutexvar_epi16(turn, z);
-            let section = _mm512_mulhrs_epi16(_mm512_set1_epi64(payload as i64), wz);
-            let mut wx = [_mm512_setzero_si512(); N];
-            for i in 0..N {
-                wx[i] = _mm512_set1_epi16(x[i]);
-            }
-            let rows = records[v.at()..].chunks_mut(STRIDE);
-            for (row, &wy) in rows.zip(y) {
-                let section = _mm512_mulhrs_epi16(section, _mm512_set1_epi16(wy));
-                let row = row.first_chunk_mut::<N>().expect("a footprint inside the part");
-                for i in 0..N {
-                    let at: *mut __m512i = std::ptr::from_mut(&mut row[i]).cast();
-                    // SAFETY: a record is 64 bytes, aligned to 64, and borrowed for us alone.
-                    unsafe {
-                        let sums = _mm512_load_si512(at);
-                        let add = _mm512_mulhrs_epi16(section, wx[i]);
-                        _mm512_store_si512(at, _mm512_adds_epi16(sums, add));
-                    }
-                }
-            }
-        }
     }
 }

@@ -71,7 +71,7 @@ impl Profile {
 ///
 /// A kernel that is m sheets long lies in m + 1 of them wherever it does not begin at a plane, and of
 /// the outermost one it has a sliver. For 16-bit sums slivers that hold next to nothing
-/// ([`SLIVER`]) are each given to the sheet beside them: every voxel then lies in m sheets, its weights
+/// (half a percent) are each given to the sheet beside them: every voxel then lies in m sheets, its weights
 /// still add up to one, and at sheets of a vox four fit a register where five do not.
 #[derive(Clone, Debug)]
 pub struct Sections {

@@ -23,11 +23,13 @@ use serde::Deserialize;
 /// How far off a line may be, in sRGB numbers and alphas: half an 8-bit step.
 const OFF: f64 = 0.5 / 255.0;
 
-/// A colour map: what is read of it. Keys that do not change colours (names, creators,
-/// annotations) may be there.
+/// A colour map: what is read of it. Keys that do not change colours (creators, annotations) may
+/// be there.
 #[derive(Deserialize)]
 #[serde(rename_all = "PascalCase")]
 struct Map {
+    #[serde(default)]
+    name: Option<serde_json::Value>,
     #[serde(default, rename = "RGBPoints")]
     rgb_points: Vec<f64>,
     #[serde(default)]
@@ -47,6 +49,8 @@ struct Map {
 /// A map as it was read.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Read {
+    /// What ParaView calls it.
+    pub name: Option<String>,
     /// Colours over file values; opacities only if the file has `Points`.
     pub colours: Vec<[f64; 4]>,
     /// `[x, alpha]`; empty where the file has none.
@@ -130,6 +134,7 @@ pub fn read(text: &str) -> Result<Read, Refused> {
         return Err(Refused::new("NanColor, NanOpacity", "must be in 0 to 1"));
     }
     let read = Read {
+        name: map.name.and_then(|name| name.as_str().map(String::from)),
         colours: colours(&points, space),
         opacities: alphas(&opacities),
         nan: NanLook { color, opacity },

@@ -11,11 +11,14 @@
 //! byte.
 
 use crate::math::{linear_from_srgb, srgb_from_linear};
+use crate::message::SceneSpec;
 use crate::path::{KeyFrames, ViewPath};
 use crate::presets;
-use crate::quality::Refused;
+use crate::quality::{Quality, Refused, Sums};
 use crate::shade::{Light, Shading};
-use crate::transfer::{ColorSpace, Domain, NanLook, TransferChoice, TransferFunction, interpolate};
+use crate::transfer::{
+    Classifier, ColorSpace, Domain, NanLook, TransferChoice, TransferFunction, interpolate,
+};
 use crate::volume::ValueSummary;
 
 /// The transfer functions of a path's frames.
@@ -78,6 +81,16 @@ impl Tween {
             Some((to, _, b)) if from < &frame => blend(a, b, (frame - from) / (to - from)),
             _ => exact.clone(),
         }
+    }
+
+    /// The scene of a frame, on the bricks of `base`, which is that of all frames but for the
+    /// function. `sums` as they were asked for: the keys can have them, and no mean of two keys is
+    /// less capped than both.
+    pub fn scene(&self, base: &SceneSpec, sums: Sums, frame: f64) -> SceneSpec {
+        let transfer = self.at(frame);
+        let classifier = Classifier::new(&transfer, &base.volume, base.quality.compositing);
+        let sums = classifier.sums(sums).unwrap_or(base.quality.sums);
+        SceneSpec { transfer, quality: Quality { sums, ..base.quality }, ..base.clone() }
     }
 
     /// The functions whose supports together hold that of every frame.

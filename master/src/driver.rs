@@ -200,6 +200,7 @@ impl Master {
             served,
             budget: config.frame_budget_bytes,
             clock: RealClock(Instant::now()),
+            silence: config.schedule.silence,
             scheduler: Scheduler::new(config.schedule),
             links: BTreeMap::new(),
             next_worker: 1,
@@ -358,17 +359,9 @@ impl Running {
     /// bricks.
     fn scene_of(&self, number: u64, frame: FrameId) -> Arc<SceneSpec> {
         let Some(tween) = &self.tween else { return self.scene.clone() };
-        let transfer = tween.at((self.request.path.first_frame() as u64 + number) as f64);
-        let base = &self.scene;
-        let classifier = Classifier::new(&transfer, &base.volume, base.quality.compositing);
-        // The keys were asked at submission; no mean of two is less capped than both.
-        let sums = classifier.sums(self.request.quality.sums).unwrap_or(base.quality.sums);
-        Arc::new(SceneSpec {
-            id: SceneId(frame.0 | ONE_FRAME),
-            transfer,
-            quality: Quality { sums, ..base.quality },
-            ..(**base).clone()
-        })
+        let at = (self.request.path.first_frame() as u64 + number) as f64;
+        let scene = tween.scene(&self.scene, self.request.quality.sums, at);
+        Arc::new(SceneSpec { id: SceneId(frame.0 | ONE_FRAME), ..scene })
     }
 }
 
@@ -399,6 +392,7 @@ struct Driver {
     served: Arc<ServedVolume>,
     budget: usize,
     clock: RealClock,
+    silence: Micros,
     scheduler: Scheduler,
     links: BTreeMap<WorkerId, Attached>,
     next_worker: u64,
@@ -548,7 +542,8 @@ impl Driver {
             %worker, name, threads = hello.threads, simd = hello.simd,
             held = hello.held.iter().map(|h| h.1.len()).sum::<usize>(), "worker joined"
         );
-        let heartbeat_ms = 1000;
+        // Workers give a master up after three of these, as it does them after its own silence.
+        let heartbeat_ms = (self.silence / 3000).min(u32::MAX.into()) as u32;
         let _ = link.control.send(ToWorker::Welcome { worker, heartbeat_ms });
         let now = Instant::now();
         let attached = Attached {

@@ -5,19 +5,17 @@
 //! warms up and is left out; every view is another one, so nothing can be kept from one to the
 //! next but what a worker keeps, too.
 
-use crate::check::shot::Drawn;
 use crate::fail::{Fail, say};
 use crate::local::{self, Cut};
 use crate::progress::{self, Progress};
 use crate::request::{PictureOf, ThreadArg, lattice_notice};
+use crate::stage::Stage;
 use slabcast_common::message::Counters;
 use slabcast_common::quality::Work;
-use slabcast_common::view::View;
+use slabcast_render::Frame;
 use slabcast_render::reference::{ErrorFigures, Reference, stratified};
 use slabcast_render::splat::Simd;
-use slabcast_render::{Frame, Scene};
 use std::fmt::Write;
-use std::sync::Arc;
 use std::time::Instant;
 
 /// Times the frames of a view path in this process: milliseconds, counts and error of one run.
@@ -50,31 +48,27 @@ pub(crate) struct BenchArgs {
 /// Runs the command.
 pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
     let asked = args.of.look.asked(Work::default())?;
-    let orientation = args.of.look.view.axes.orientation()?;
     let threads = args.threads.count();
     let volume = args.of.open()?;
+    let orientation = args.of.look.view.axes.of(&volume)?;
     let info = volume.info(volume.digest());
     asked.fit(&info, orientation, volume.anatomical)?;
     if let Some(notice) = lattice_notice(&info) {
         progress::note(&notice);
     }
-    let Drawn { spec, bricks } = asked.drawn(&volume, &info)?;
+    let stage = Stage::new(&volume, &info, &asked, orientation)?;
+    let bricks = &stage.bricks;
     drop(volume);
-    let scene = Arc::new(Scene::new(&spec));
     let cut = Cut { threads, tile: args.tile, slabs: 1 };
     let views = asked.path.frames();
     let mut progress = Progress::new(false).of("frame");
     progress.frames(views as u64, &format!("{views} views"));
     let (mut each, mut counters, mut middle) = (Vec::new(), Counters::default(), None);
     for i in 0..views {
-        let view = asked
-            .path
-            .camera(i, &info.lattice, orientation)
-            .and_then(|c| View::new(&info.lattice, &c, asked.path.size, &asked.quality))
-            .map_err(|e| asked.blame(&e))?;
+        let (view, scene) = (stage.view(i, &asked.quality)?, stage.scene(i));
         let began = Instant::now();
-        let frame = Frame::new(scene.clone(), view);
-        let (picture, counted) = local::counted_picture(&frame, &bricks, cut);
+        let frame = Frame::new(scene, view);
+        let (picture, counted) = local::counted_picture(&frame, bricks, cut);
         let took = began.elapsed().as_secs_f64() * 1e3;
         each.push(took);
         if i > 0 || views == 1 {
@@ -86,6 +80,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
         progress.step(progress::Step { frames: i as u64 + 1, ..Default::default() });
     }
     progress.end();
+    let quality = stage.spec(views / 2).quality;
     let mut ms = each[usize::from(views > 1)..].to_vec();
     ms.sort_by(f64::total_cmp);
     let n = ms.len() as u64;
@@ -93,7 +88,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
     let relevant: u64 = bricks.iter().map(|b| b.len() as u64).sum();
     let errors = middle.filter(|_| args.pixels > 0).map(|(view, picture)| {
         let sample = stratified(asked.path.size, args.pixels as usize, 1);
-        let reference = Reference::new(&spec, view, &bricks);
+        let reference = Reference::new(&stage.spec(views / 2), view, bricks);
         let mut progress = Progress::new(false).of("pixel");
         progress.frames(sample.len() as u64, "the reference");
         let truth = local::judge(&sample, threads, (&mut progress, 0), |[x, y]| {
@@ -116,7 +111,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
             // tell a slow view from a machine that was disturbed.
             "each_ms": each,
             "threads": threads, "tile": args.tile, "simd": simd, "size": asked.path.size,
-            "quality": spec.quality, "relevant": relevant,
+            "quality": quality, "relevant": relevant,
             "tossed": counters.tossed / n, "splatted": counters.splatted / n,
             "culled": counters.culled / n,
             "limit": errors.as_ref().map(|e| figures(&e[0])),
@@ -128,7 +123,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
         "{median:.2} ms a frame: median of {n} views ({least:.2} to {most:.2}), {threads} {}, \
          {simd}, {} sums\n{relevant} relevant voxels; a frame tosses {}, splats {}, culls {}\n",
         if threads == 1 { "thread" } else { "threads" },
-        format!("{:?}", spec.quality.sums).to_lowercase(),
+        format!("{:?}", quality.sums).to_lowercase(),
         counters.tossed / n,
         counters.splatted / n,
         counters.culled / n,

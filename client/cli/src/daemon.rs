@@ -42,7 +42,8 @@ pub(crate) struct MasterArgs {
     /// World axis that is up: x, y or z with + or - [default: +z]
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
     up: Option<Axis>,
-    /// World axis that faces the eye at azimuth 0 [default: +y, or +z where up lies along y]
+    /// World axis that faces the eye at azimuth 0 [default: +y, or +z where up lies along y; -y of
+    /// a CT whose file has no anatomical axes, as slices are stored]
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
     front: Option<Axis>,
     /// Where workers and clients call; port 0 takes any free one and says which
@@ -85,13 +86,14 @@ pub(crate) struct WorkerArgs {
 /// Runs `slabcast master`.
 pub(crate) fn master(args: &MasterArgs) -> Result<(), Fail> {
     let axes = AxisArgs { up: args.up, front: args.front };
-    let orientation = axes.orientation()?;
+    axes.orientation()?;
     let runtime = runtime::start()?;
     // The address is taken before the volume is read, so that a port in use is told at once;
     // it is opened after, so that whoever gets through gets an answer.
     let socket = runtime.block_on(bind(&args.listen, args.insecure))?;
     let volume = args.input.open(&args.volume)?;
     let (name, lattice) = (volume.name.clone(), volume.lattice);
+    let orientation = axes.of(&volume)?;
     let config = MasterConfig::new(volume, orientation);
     let result = runtime.block_on(async {
         let listener = listen(socket, &args.listen)?;

@@ -47,7 +47,7 @@ pub(crate) fn run(args: &DemoArgs) -> Result<(), Fail> {
     let flags = FLAGS.join(" ");
     say(&format!(
         "\nThat was: slabcast render {VOLUME} {flags}\n\
-         Next:     slabcast render FILE              NRRD or NIfTI, like brain.nii.gz\n\
+         Next:     slabcast render FILE              any volume, like brain.nii.gz\n\
          \x20         slabcast info FILE                what is in it\n\
          \x20         slabcast render --help            views, colours, formats\n"
     ))

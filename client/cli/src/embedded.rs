@@ -20,6 +20,12 @@ const LEAVE: Duration = Duration::from_secs(2);
 /// Brick budget of a worker that shares the master's bricks: none of its own is used.
 const SHARED: u64 = 1 << 40;
 
+/// Silence after which a worker of this process would be lost, in microseconds: a day. A thread
+/// that dies ends its link; silence only says that the process was stopped for a while (Ctrl-Z, a
+/// debugger) or got no processor. With a cluster's three seconds a run of 30 frames failed after
+/// `kill -STOP`, six seconds and `kill -CONT`.
+const SILENCE: u64 = 86_400_000_000;
+
 /// What embedded workers are like.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Crew {
@@ -69,7 +75,9 @@ impl Cluster {
         orientation: Orientation,
         crew: Crew,
     ) -> Result<Cluster, Fail> {
-        let master = start_master(MasterConfig::new(volume, orientation))?;
+        let mut config = MasterConfig::new(volume, orientation);
+        config.schedule.silence = SILENCE;
+        let master = start_master(config)?;
         let (stop, stopped) = watch::channel(false);
         let mut workers = JoinSet::new();
         for n in 1..=crew.workers {

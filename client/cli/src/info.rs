@@ -43,8 +43,9 @@ struct Share {
 
 /// Runs the command.
 pub(crate) fn run(args: &InfoArgs) -> Result<(), Fail> {
-    let orientation = args.axes.orientation()?;
+    args.axes.orientation()?;
     let volume = args.input.open(&args.volume)?;
+    let orientation = args.axes.of(&volume)?;
     let info = volume.info(volume.digest());
     let shares = shares(&volume, &info)?;
     if args.json {

@@ -12,7 +12,8 @@
 //! - [`config`] lays flags, environment and file over each other.
 //! - [`check`] compares pictures with the oracle over every way to make them; [`error`] says how
 //!   far one is from the truth, [`explain`] why a pixel is as it is. [`local`] draws for the
-//!   first two, [`still`] reads one view for the last two.
+//!   first two, [`stage`] has the scenes and views of a path, [`still`] one of them for the last
+//!   two.
 //!
 //! This is the only crate that sees all others. It decides nothing about pixels and schedules.
 //! Results go to stdout, everything else to stderr; every failure is one line ([`fail`]).
@@ -44,6 +45,7 @@ mod rerender;
 mod runtime;
 mod show;
 mod signals;
+mod stage;
 mod still;
 mod style;
 mod tf;
@@ -236,6 +238,13 @@ fn one_sentence(text: &str, typed: &[String]) -> String {
                 _ => parts.push(line.replace('\'', "`")),
             }
         }
+    }
+    // Who gives a file alone wants to see it.
+    if let Some(word) = typed.first()
+        && parts.first().is_some_and(|p| p.starts_with("unrecognized subcommand"))
+        && (std::path::Path::new(word).exists() || word.starts_with("formula:"))
+    {
+        parts.push(format!("to see it, `slabcast render {word}`"));
     }
     format!("{}; see `{help}`", parts.join("; "))
 }

@@ -8,7 +8,8 @@ use crate::output::provenance::Recipe;
 use crate::output::{Format, Frame, Lines, Output, OutputArgs, Patience, Writer};
 use crate::progress::{self, Progress, Step};
 use crate::request::{self, Asked, LookArgs, WorkArgs};
-use crate::show::{self, Show, Stage};
+use crate::show::{self, Show};
+use crate::stage::Stage;
 use crate::{remote, runtime, signals, volume};
 use slabcast_common::ids::JobId;
 use slabcast_common::message::PathRequest;
@@ -43,7 +44,8 @@ Examples:
   Where each pixel was shut, how much work it was, how far off it may be:
       slabcast render brain.nii.gz --azimuth 0 --show depth
   Video, to be encoded by another program:
-      slabcast render brain.nii.gz --frames 72 -o - | ffmpeg -i - -pix_fmt yuv420p turn.mp4
+      slabcast render brain.nii.gz --frames 72 -o - | ffmpeg -i - -pix_fmt yuv420p \\
+          -colorspace bt709 -color_primaries bt709 -color_trc iec61966-2-1 turn.mp4
   On a cluster (see `slabcast master --help`):
       slabcast render --master node1:7433 --tf vessels -o out/
 
@@ -231,10 +233,10 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     let runtime = runtime::start()?;
     let result = match (&args.volume, master) {
         (Some(file), _) => {
-            let orientation = args.look.view.axes.orientation()?;
             let mut run = run;
             run.progress.stage(&format!("reading {}", file.display()));
             let volume = args.input.open(file)?;
+            let orientation = args.look.view.axes.of(&volume)?;
             match args.show {
                 None | Some(Show::Owner) => {
                     runtime.block_on(embedded(run, volume, orientation, crew))
@@ -389,14 +391,14 @@ async fn drawn(
     let info = volume.info(volume.digest());
     let recipe = run.ready(&info, orientation, volume.anatomical)?;
     let threads = (crew.workers * crew.threads) as usize;
-    let stage = Stage::new(&volume, &info, (&run.asked, orientation), threads)?;
+    let stage = Stage::new(&volume, &info, &run.asked, orientation)?;
     let what = format!("{}, showing {}", volume.name, show.stem());
     drop(volume);
     let (to, updates) = mpsc::channel(1);
     let frames = run.asked.path.frames();
     tokio::task::spawn_blocking(move || {
         for i in 0..frames {
-            let update = stage.draw(show, i).map(|frame| {
+            let update = show::draw(&stage, show, i, threads).map(|frame| {
                 let (stats_json, trace_json) = (String::new(), String::new());
                 Update::Frame { frame, stats: None, stats_json, trace_json }
             });

@@ -4,7 +4,6 @@
 //! before anything is read or dialled; what needs the lattice is refused by [`Asked::fit`],
 //! which names the flag (or the file and its field) that is to blame.
 
-use crate::check::shot::Drawn;
 use crate::fail::Fail;
 use crate::output::provenance::Provenance;
 use crate::parse::{self, Frames, Tile};
@@ -39,7 +38,8 @@ pub(crate) struct AxisArgs {
     /// World axis that is up: x, y or z with + or - [default: +z]
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
     pub(crate) up: Option<Axis>,
-    /// World axis that faces the eye at azimuth 0 [default: +y, or +z where up lies along y]
+    /// World axis that faces the eye at azimuth 0 [default: +y, or +z where up lies along y; -y of
+    /// a CT whose file has no anatomical axes, as slices are stored]
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
     pub(crate) front: Option<Axis>,
 }
@@ -48,6 +48,12 @@ impl AxisArgs {
     /// Both, with defaults for what is missing.
     pub(crate) fn orientation(&self) -> Result<Orientation, Fail> {
         Orientation::new(self.up, self.front).map_err(|e| Fail::flag(&e))
+    }
+
+    /// Both, with the defaults that fit a volume.
+    pub(crate) fn of(&self, volume: &Volume) -> Result<Orientation, Fail> {
+        Orientation::of(self.up, self.front, &volume.summary, volume.anatomical)
+            .map_err(|e| Fail::flag(&e))
     }
 }
 
@@ -355,7 +361,8 @@ impl Asked {
         anatomical: bool,
     ) -> Result<(), Fail> {
         if let Some(axes) = &self.side {
-            let usual = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
+            let usual = Orientation::of(None, None, &info.summary, anatomical)
+                .map_err(|e| Fail::flag(&e))?;
             let given = axes.up.is_some() || axes.front.is_some();
             if anatomical && orientation != usual {
                 return Err(Fail::usage(
@@ -394,19 +401,6 @@ impl Asked {
             })?;
         }
         Ok(())
-    }
-
-    /// The scene of the path's first frame, for commands that draw in this process alone: these take
-    /// all frames with its transfer function.
-    pub(crate) fn drawn(&self, volume: &Volume, info: &VolumeInfo) -> Result<Drawn, Fail> {
-        let blame = |e| self.blame(&e);
-        let tween = Tween::of(&self.path, &info.summary).map_err(blame)?;
-        let transfer = match tween {
-            Some(tween) => tween.at(self.path.first_frame() as f64),
-            None => self.transfer.function(info).map_err(blame)?,
-        };
-        let crop = self.path.crop.map(|c| c.of(&info.lattice)).transpose().map_err(blame)?;
-        Drawn::cropped(volume, info, &transfer, self.quality, crop)
     }
 
     /// Puts a refusal where the user wrote what is refused: at a flag or in a file.

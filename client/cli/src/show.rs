@@ -6,21 +6,14 @@
 //! frame would be, with a legend below that says what the colours mean.
 
 use crate::canvas::{Canvas, LINE, WHITE, viridis, width};
-use crate::check::shot::Drawn;
 use crate::fail::Fail;
 use crate::local::{self, Cut};
 use crate::output::Frame;
-use crate::request::Asked;
+use crate::stage::Stage;
 use slabcast_common::image::{Picture, PixelFormat};
-use slabcast_common::message::SceneSpec;
-use slabcast_common::path::Orientation;
 use slabcast_common::quality::{Compositing, Quality};
 use slabcast_common::stats::FrameStats;
-use slabcast_common::view::View;
-use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_render::survey::{Survey, survey};
-use slabcast_render::{Frame as Tables, Scene};
-use std::sync::Arc;
 
 /// What is shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -51,13 +44,13 @@ impl Show {
 }
 
 /// Sheets of half the thickness.
-fn half(quality: &Quality) -> Quality {
-    Quality { thickness: quality.thickness / 2.0, ..*quality }
+fn half(quality: Quality) -> Quality {
+    Quality { thickness: quality.thickness / 2.0, ..quality }
 }
 
 /// Whether an error can be estimated at this quality.
 pub(crate) fn can_estimate(quality: &Quality) -> Result<(), Fail> {
-    half(quality).check().map_err(|_| {
+    half(*quality).check().map_err(|_| {
         Fail::usage(format!(
             "--thickness: --show error compares with sheets of half the thickness, and half of {} \
              is too thin; give a larger one",
@@ -77,66 +70,29 @@ const BAR: usize = 10;
 /// Ends of the error's scale in 1/255, as in `slabcast error --map`.
 const ERRORS: [f64; 2] = [0.01, 10.0];
 
-/// A scene that is drawn view by view in this process.
-pub(crate) struct Stage {
-    spec: SceneSpec,
-    drawn: Drawn,
-    asked: Asked,
-    orientation: Orientation,
-    threads: usize,
-}
-
-impl Stage {
-    /// Cuts the bricks of a volume.
-    pub(crate) fn new(
-        volume: &Volume,
-        info: &VolumeInfo,
-        (asked, orientation): (&Asked, Orientation),
-        threads: usize,
-    ) -> Result<Stage, Fail> {
-        let drawn = asked.drawn(volume, info)?;
-        let (spec, asked) = (drawn.spec.clone(), asked.clone());
-        Ok(Stage { spec, drawn, asked, orientation, threads })
-    }
-
-    fn view(&self, i: usize, quality: &Quality) -> Result<View, Fail> {
-        let lattice = &self.spec.volume.lattice;
-        let camera = self.asked.path.camera(i, lattice, self.orientation);
-        let view = camera.and_then(|c| View::new(lattice, &c, self.asked.path.size, quality));
-        view.map_err(|e| self.asked.blame(&e))
-    }
-
-    fn tables(&self, i: usize, quality: Quality) -> Result<Tables, Fail> {
-        let spec = SceneSpec { quality, ..self.spec.clone() };
-        Ok(Tables::new(Arc::new(Scene::new(&spec)), self.view(i, &quality)?))
-    }
-
-    /// The picture about view `i`.
-    pub(crate) fn draw(&self, show: Show, i: usize) -> Result<Frame, Fail> {
-        let quality = self.spec.quality;
-        let tables = self.tables(i, quality)?;
-        let canvas = if show == Show::Error {
-            let picture = local::picture(&tables, &self.drawn.bricks, Cut::on(self.threads));
-            let half = half(&quality);
-            let finer = self.tables(i, half)?;
-            let finer = local::picture(&finer, &self.drawn.bricks, Cut::on(self.threads));
-            error(&picture, &estimate(&picture, &finer, quality.compositing))
-        } else {
-            let (picture, notes) = survey(&tables, &self.drawn.bricks);
-            match show {
-                Show::Depth => depth(&picture, &notes, quality.thickness),
-                Show::Sheets => {
-                    counted(&picture, &notes.sheets, "Sheets read at each pixel until it was shut")
-                }
-                _ => counted(
-                    &picture,
-                    &notes.sections,
-                    "Work: voxel sections added at each pixel until it was shut",
-                ),
+/// The picture about frame `i` of a path.
+pub(crate) fn draw(stage: &Stage, show: Show, i: usize, threads: usize) -> Result<Frame, Fail> {
+    let tables = stage.frame(i)?;
+    let quality = tables.scene.quality;
+    let canvas = if show == Show::Error {
+        let picture = local::picture(&tables, &stage.bricks, Cut::on(threads));
+        let finer = local::picture(&stage.other(i, half)?, &stage.bricks, Cut::on(threads));
+        error(&picture, &estimate(&picture, &finer, quality.compositing))
+    } else {
+        let (picture, notes) = survey(&tables, &stage.bricks);
+        match show {
+            Show::Depth => depth(&picture, &notes, quality.thickness),
+            Show::Sheets => {
+                counted(&picture, &notes.sheets, "Sheets read at each pixel until it was shut")
             }
-        };
-        Ok(frame(i as u64, canvas))
-    }
+            _ => counted(
+                &picture,
+                &notes.sections,
+                "Work: voxel sections added at each pixel until it was shut",
+            ),
+        }
+    };
+    Ok(frame(i as u64, canvas))
 }
 
 fn frame(number: u64, canvas: Canvas) -> Frame {
@@ -341,7 +297,8 @@ pub(crate) fn owner(picture: &Frame, stats: &FrameStats) -> Frame {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use slabcast_common::path::ViewPath;
+    use crate::request::Asked;
+    use slabcast_common::path::{Orientation, ViewPath};
     use slabcast_render::reference::{Reference, stratified};
 
     fn stage(tf: &str) -> Stage {
@@ -350,7 +307,7 @@ mod tests {
         let path = r#"{"version":1,"size":[64,64],"turntable":{"frames":1}}"#;
         let asked = Asked::plain(ViewPath::from_json(path).unwrap(), tf).unwrap();
         let o = Orientation::new(None, None).unwrap();
-        Stage::new(&volume, &info, (&asked, o), 2).unwrap()
+        Stage::new(&volume, &info, &asked, o).unwrap()
     }
 
     #[test]
@@ -358,15 +315,15 @@ mod tests {
         // Sheets so thick that rounding is nothing beside them.
         for tf in ["peer-opaque", "skin"] {
             let stage = stage(tf);
-            let quality = Quality { eps: 0.0, ..stage.spec.quality };
+            let quality = Quality { eps: 0.0, ..stage.spec(0).quality };
             let draw = |thickness: f64| {
-                let tables = stage.tables(0, Quality { thickness, ..quality }).unwrap();
-                local::picture(&tables, &stage.drawn.bricks, Cut::on(2))
+                let tables = stage.other(0, |_| Quality { thickness, ..quality }).unwrap();
+                local::picture(&tables, &stage.bricks, Cut::on(2))
             };
             let (picture, finer) = (draw(2.0), draw(1.0));
             let guess = estimate(&picture, &finer, quality.compositing);
             let view = stage.view(0, &quality).unwrap();
-            let reference = Reference::new(&stage.spec, view, &stage.drawn.bricks);
+            let reference = Reference::new(&stage.spec(0), view, &stage.bricks);
             let (mut guessed, mut true_) = (0.0, 0.0);
             for [x, y] in stratified([64, 64], 400, 1) {
                 let i = (y * 64 + x) as usize;
@@ -385,7 +342,7 @@ mod tests {
     fn every_kind_has_a_picture_with_a_legend_below() {
         let stage = stage("skin");
         for show in [Show::Depth, Show::Work, Show::Sheets, Show::Error] {
-            let f = stage.draw(show, 0).unwrap();
+            let f = draw(&stage, show, 0, 2).unwrap();
             assert!(f.size[0] as usize == LEAST && f.size[1] > 64 + 30, "{show:?}: {:?}", f.size);
             let colours: std::collections::BTreeSet<_> = f.bytes.chunks_exact(3).collect();
             assert!(colours.len() > 40, "{show:?}: {}", colours.len());

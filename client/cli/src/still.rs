@@ -1,11 +1,11 @@
 //! One view of one volume, for commands that look closely at a single picture: `error` and
 //! `explain`.
 
-use crate::check::shot::Drawn;
 use crate::fail::Fail;
 use crate::local::{self, Cut};
 use crate::progress;
 use crate::request::{PictureOf, lattice_notice};
+use crate::stage::Stage;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::message::SceneSpec;
@@ -31,21 +31,17 @@ impl Still {
         check: impl FnOnce([u32; 2]) -> Result<(), Fail>,
     ) -> Result<Still, Fail> {
         let asked = of.look.asked(Work::default())?;
-        let orientation = of.look.view.axes.orientation()?;
-        let size = asked.path.size;
-        check(size)?;
+        check(asked.path.size)?;
         let volume = of.open()?;
+        let orientation = of.look.view.axes.of(&volume)?;
         let info = volume.info(volume.digest());
         asked.fit(&info, orientation, volume.anatomical)?;
         if let Some(notice) = lattice_notice(&info) {
             progress::note(&notice);
         }
-        let camera =
-            asked.path.camera(0, &info.lattice, orientation).map_err(|e| asked.blame(&e))?;
-        let view =
-            View::new(&info.lattice, &camera, size, &asked.quality).map_err(|e| asked.blame(&e))?;
-        let Drawn { spec, bricks } = asked.drawn(&volume, &info)?;
-        Ok(Still { spec, view, bricks, background: asked.background })
+        let stage = Stage::new(&volume, &info, &asked, orientation)?;
+        let (spec, view) = (stage.spec(0), stage.view(0, &asked.quality)?);
+        Ok(Still { spec, view, bricks: stage.bricks, background: asked.background })
     }
 
     /// The frame at another quality (the same sheets and kernel).

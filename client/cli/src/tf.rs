@@ -3,14 +3,14 @@
 use crate::fail::{Fail, say};
 use crate::output::write_atomic;
 use crate::transfer::{LookFlags, Transfer};
-use crate::volume;
+use crate::volume::InputArgs;
 use slabcast_common::paraview;
 use slabcast_common::presets;
 use slabcast_common::transfer::{Domain, TransferFunction};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_common::volume::{Samples, ValueMap, ValueSummary, VolumeInfo};
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Writes a transfer function as JSON: a preset or map fitted to a volume, or a file of ours or of
 /// ParaView's, with what flags change of it.
@@ -22,6 +22,7 @@ Examples:
   slabcast tf bone ct.nrrd --paraview -o bone-pv.json   for ParaView's colour map editor
   slabcast tf from-paraview.json > ours.json            and back; --tf takes either
   slabcast tf vessels ct.nrrd --colors plasma -o hot.json
+  slabcast tf engine scan.raw --dims 256x256x128 --type uint8
 
 In a file without a volume, 0 is the smallest and 1 the largest value. ParaView's files hold
 colours, opacities and the colour of NaN; light and gradients stay with ours.")]
@@ -31,6 +32,8 @@ pub(crate) struct TfArgs {
     tf: Option<String>,
     /// The volume that it is fitted to; its values are x then
     volume: Option<PathBuf>,
+    #[command(flatten)]
+    input: InputArgs,
     #[command(flatten)]
     look: LookFlags,
     /// For ParaView: a list of one colour map, with RGBPoints and Points
@@ -61,14 +64,19 @@ pub(crate) fn run(args: &TfArgs) -> Result<(), Fail> {
         )));
     }
     let info = match &args.volume {
-        Some(file) => Some(volume::open(file)?.info(Digest32::default())),
+        Some(file) => Some(args.input.open(file)?.info(Digest32::default())),
+        None if !args.input.is_empty() => {
+            return Err(Fail::usage(
+                "VOLUME: flags say how to read it, but none is given; give the file, too",
+            ));
+        }
         None => None,
     };
     let refused = |e| Fail::failed(format!("{name}: {e}"));
     let mut tf = transfer.function(info.as_ref().unwrap_or(&any())).map_err(refused)?;
     let range = info.as_ref().map(|i| i.summary.range());
     let text = if args.paraview {
-        paraview::write(&tf, &title(name), range).map_err(refused)?
+        paraview::write(&tf, &transfer.title(), range).map_err(refused)?
     } else {
         if let Some((lo, hi)) = range {
             in_values(&mut tf, lo, hi);
@@ -127,12 +135,6 @@ fn pretty(tf: &TransferFunction) -> String {
         lines.push(format!("  \"{key}\": {text}"));
     }
     format!("{{\n{}\n}}\n", lines.join(",\n"))
-}
-
-/// What the map is called in ParaView.
-fn title(name: &str) -> String {
-    let stem = Path::new(name).file_stem().map_or(name.into(), |s| s.to_string_lossy());
-    format!("slabcast {stem}")
 }
 
 fn list() -> String {

@@ -39,6 +39,8 @@ pub(crate) struct LookFlags {
 pub(crate) struct Transfer {
     base: TransferChoice,
     file: Option<PathBuf>,
+    /// What ParaView calls it, if it is ParaView's.
+    title: Option<String>,
     /// The preset that a function came from, where only that is known.
     preset: Option<String>,
     /// Over 0 to 1, sRGB numbers.
@@ -54,6 +56,7 @@ impl Transfer {
     pub(crate) fn parse(text: &str, flags: &LookFlags) -> Result<Self, Fail> {
         let colours = flags.colors.as_deref().map(colours).transpose()?;
         let LookFlags { light, shading, nan, .. } = *flags;
+        let mut title = None;
         let (base, file) = if is_name(text) {
             (TransferChoice::Name(text.into()), None)
         } else {
@@ -63,16 +66,17 @@ impl Transfer {
             }
             let json = read_json(path)?;
             let tf = if paraview::is(&json) {
-                paraview::read(&json)
-                    .and_then(paraview::Read::function)
-                    .map_err(|e| Fail::field(path, "colour map", &e))?
+                let wrong = |e| Fail::field(path, "colour map", &e);
+                let mut map = paraview::read(&json).map_err(wrong)?;
+                title = map.name.take();
+                map.function().map_err(wrong)?
             } else {
                 TransferFunction::from_json(&json)
                     .map_err(|e| Fail::field(path, "transfer function", &e))?
             };
             (TransferChoice::Function(Box::new(tf)), Some(path.to_path_buf()))
         };
-        Ok(Transfer { base, file, preset: None, colours, light, shading, nan })
+        Ok(Transfer { base, file, title, preset: None, colours, light, shading, nan })
     }
 
     /// A preset as it is by itself.
@@ -85,7 +89,16 @@ impl Transfer {
     /// What a picture says that it was drawn with.
     pub(crate) fn again(tf: &TransferFunction, preset: Option<String>) -> Self {
         let base = TransferChoice::Function(Box::new(tf.clone()));
-        Transfer { base, file: None, preset, colours: None, light: None, shading: None, nan: None }
+        Transfer {
+            base,
+            file: None,
+            title: None,
+            preset,
+            colours: None,
+            light: None,
+            shading: None,
+            nan: None,
+        }
     }
 
     /// The preset that it is or came from.
@@ -99,6 +112,16 @@ impl Transfer {
     /// Its file, if it has one.
     pub(crate) fn file(&self) -> Option<&Path> {
         self.file.as_deref()
+    }
+
+    /// What it is called in ParaView: as there, else after the preset or the file.
+    pub(crate) fn title(&self) -> String {
+        let own = || {
+            let name = self.name();
+            let stem = Path::new(&name).file_stem().map(|s| s.to_string_lossy().into_owned());
+            format!("slabcast {}", stem.unwrap_or(name))
+        };
+        self.title.clone().unwrap_or_else(own)
     }
 
     /// What it is called in messages.

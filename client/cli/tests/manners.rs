@@ -203,6 +203,29 @@ fn ctrl_c_keeps_whole_frames_and_says_so() {
     assert_eq!(names(dir.path()), ["s.jsonl", "slabcast-out"]);
 }
 
+/// Longer than a cluster lets a worker be silent.
+#[cfg(unix)]
+#[test]
+fn a_run_that_is_stopped_for_a_while_goes_on() {
+    let dir = tempfile::tempdir().unwrap();
+    let args = ["render", "formula:spheres:48", "--size", "160x160", "--frames", "40"];
+    let args = [&args[..], &["--thickness", "0.25"]].concat();
+    let mut child =
+        slabcast(dir.path(), &args).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let until = Instant::now() + Duration::from_secs(60);
+    while !dir.path().join("slabcast-out/frame_0000.png").exists() {
+        assert!(Instant::now() < until, "no frames: {:?}", child.try_wait());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    signal(&child, "-STOP");
+    std::thread::sleep(Duration::from_millis(3500));
+    signal(&child, "-CONT");
+    let code = end(&mut child, Duration::from_secs(60));
+    let mut said = String::new();
+    child.stderr.take().unwrap().read_to_string(&mut said).unwrap();
+    assert_eq!(code, 0, "{said}");
+}
+
 #[cfg(unix)]
 #[test]
 fn daemons_say_where_they_are_and_leave_when_told() {

@@ -413,6 +413,8 @@ const OUTPUTS: &[(i32, &[&str], &[&str])] = &[
     (2, &["-o", "a.png", "--azimuth", "0", "--format", "y4m"], &["--format", ".y4m"]),
     (2, &["-o", "out", "--format", "y4m"], &["-o turn.y4m"]),
     (2, &["-o", "out", "--format", "gif"], &["--format", "apng"]),
+    (2, &["-o", "turn.mp4"], &["-o", "turn.mp4", "ffmpeg"]),
+    (2, &["-o", "a.JPG", "--azimuth", "0"], &["-o", "a.JPG", ".png"]),
     (2, &["-o", "-", "--format", "png"], &["--format", "pipe"]),
     (2, &["-o", "-", "--stats", "-"], &["--stats", "stdout"]),
     (2, &["-o", "a.y4m", "--background", "transparent"], &["--background", "colour"]),
@@ -440,6 +442,9 @@ fn bad_outputs_are_named_with_the_remedy() {
 
 /// Bad pictures to make again, and other commands: code, line, and what the answer names.
 const OTHERS: &[(i32, &[&str], &[&str])] = &[
+    (2, &["good.nrrd"], &["good.nrrd", "`slabcast render good.nrrd`"]),
+    (2, &["tf", "bone", "--dims", "4x4x4"], &["VOLUME", "give the file"]),
+    (1, &["info", "text.txt", "--dims", "2x2x2"], &["--type", "is missing", "2x2x2", "uint8"]),
     (2, &["rerender"], &["PICTURE"]),
     (2, &["rerender", "there.png"], &["VOLUME"]),
     (1, &["rerender", "missing.png", "good.nrrd"], &["missing.png"]),

@@ -13,9 +13,10 @@ pub use crop::{Crop, CropBox, CropUnit};
 pub use fly::FlyThrough;
 pub use keys::{Easing, Key, KeyFrames, MAX_KEYS, Side};
 
+use crate::presets::Levels;
 use crate::quality::{Refused, json_error};
 use crate::view::{Camera, CameraProjection};
-use crate::volume::Lattice;
+use crate::volume::{Lattice, ValueSummary};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
@@ -208,6 +209,22 @@ impl Orientation {
             ));
         }
         Ok(Orientation { up, front })
+    }
+
+    /// The same for a volume with these values; `anatomical` says whether its file knows how it
+    /// lies. A CT that does not is taken as scanners store its slices (patient on the back, rows
+    /// from anterior to posterior, DICOM's axes): its front is -y. Seen from +y, a couch hides the
+    /// patient.
+    pub fn of(
+        up: Option<Axis>,
+        front: Option<Axis>,
+        summary: &ValueSummary,
+        anatomical: bool,
+    ) -> Result<Self, Refused> {
+        let upright = up.is_none_or(|up| up == Axis::positive(2));
+        let scanned = !anatomical && upright && Levels::of(summary).water.is_some();
+        let usual = scanned.then_some(Axis { index: 1, negative: true });
+        Orientation::new(up, front.or(usual))
     }
 
     /// These axes, unless a path has others of its own.
@@ -483,6 +500,7 @@ fn sin_cos_degrees(degrees: f64) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::volume::{Samples, ValueMap};
 
     fn cameras(t: Turntable, up: Option<Axis>) -> Camera {
         let l = Lattice::from_spacing([256; 3], [1.0; 3]);
@@ -502,6 +520,30 @@ mod tests {
             assert_eq!(path.camera(i, &l, o), one.camera(0, &l, o), "{i}");
             assert_eq!(one.only(0), one);
         }
+    }
+
+    #[test]
+    fn a_ct_without_axes_is_seen_from_anterior() {
+        // Air, soft tissue and bone in Hounsfield units.
+        let values = [(-1000.0, 500), (-40.0, 250), (60.0, 250), (900.0, 40)];
+        let ct: Vec<f32> =
+            values.iter().flat_map(|&(hu, n)| std::iter::repeat_n(hu as f32, n)).collect();
+        let summary = |v: Vec<f32>| ValueSummary::of(&Samples::F32(v), ValueMap::IDENTITY);
+        let mr = summary(ct.iter().map(|v| v + 5000.0).collect());
+        let ct = summary(ct);
+        let front = |up: Option<&str>, summary, anatomical| {
+            let up = up.map(|a| a.parse().unwrap());
+            Orientation::of(up, None, summary, anatomical).unwrap().front.to_string()
+        };
+        assert_eq!(front(None, &ct, false), "-y");
+        assert_eq!(front(Some("z"), &ct, false), "-y");
+        // Who says what is up, or knows, has no scanner's slices; other values are no CT's.
+        assert_eq!(front(Some("-z"), &ct, false), "+y");
+        assert_eq!(front(Some("y"), &ct, false), "+z");
+        assert_eq!(front(None, &ct, true), "+y");
+        assert_eq!(front(None, &mr, false), "+y");
+        let given = Orientation::of(None, Some(Axis::positive(0)), &ct, false).unwrap();
+        assert_eq!(given.front, Axis::positive(0));
     }
 
     #[test]

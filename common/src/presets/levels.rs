@@ -8,7 +8,10 @@
 //! the eye finds it: at the foot of the background's peak, or in the valley behind it if there is
 //! one.
 //!
-//! 1. The background is the fullest bin; its foot is where counts have fallen to a hundredth.
+//! 1. The background is the fullest bin; its foot is where counts have fallen to a hundredth, or,
+//!    where a hill rises before that, in the middle of the valley's floor. (Noise about the body of
+//!    an MR falls off slowly and is still above a hundredth where the body begins: the foot would be
+//!    behind nearly all of it.)
 //! 2. Behind the foot, the smoothed histogram has valleys. Of those with half of the foreground
 //!    above them the deepest counts (half: so that leaves are not cut off with the air because the
 //!    trunk is denser). There the content is *solid*: a surface can be drawn.
@@ -18,6 +21,7 @@
 //! All numbers are shares of the range: 0 the smallest value, 1 the largest.
 
 use crate::volume::{SampleKind, ValueSummary};
+use std::ops::Range;
 
 /// Bins are averaged over this share of the range to either side when valleys are looked for.
 /// At half of it the noise of 8-bit histograms has valleys of its own; at double the gap between
@@ -26,6 +30,9 @@ const SMOOTH: f64 = 0.015;
 
 /// How much higher both sides of a valley must be.
 const DEPTH: f64 = 1.5;
+
+/// What is lower than this many times its lowest is the floor of a valley.
+const FLOOR: f64 = 1.25;
 
 /// Foreground above this share is a cloud if no valley parts it from the air.
 const CLOUD: f64 = 0.15;
@@ -144,7 +151,10 @@ fn ramp(bins: &[(f64, f64)]) -> (Content, f64, f64) {
             peak = i;
         }
     }
-    let Some(foot) = (peak + 1..n.len()).find(|&i| n[i] <= n[peak] * 0.01) else {
+    let fallen = (peak + 1..n.len()).find(|&i| n[i] <= n[peak] * 0.01);
+    let slope = smooth(bins, &n, peak..fallen.unwrap_or(n.len()));
+    let foot = deepest(&slope, slope.len()).map(|at| peak + middle_of_floor(&slope, at));
+    let Some(foot) = foot.or(fallen) else {
         // Counts never fall: there is no air, or two values alone.
         return if n.len() == 2 {
             (Content::Solid, x(0) + (x(1) - x(0)) * 0.25, x(0) + (x(1) - x(0)) * 0.75)
@@ -158,13 +168,7 @@ fn ramp(bins: &[(f64, f64)]) -> (Content, f64, f64) {
     }
     let foreground = total - below;
     // Smoothed counts behind the foot, and how much is above.
-    let tail: Vec<(f64, f64)> = (foot..n.len())
-        .map(|i| {
-            let near = (foot..n.len()).filter(|&j| (x(j) - x(i)).abs() <= SMOOTH);
-            let (sum, count) = near.fold((0.0, 0.0), |(s, c), j| (s + n[j], c + 1.0));
-            (x(i), sum / count)
-        })
-        .collect();
+    let tail = smooth(bins, &n, foot..n.len());
     let top = quantile(bins, x(foot), 0.98);
     if let Some((valley, hill)) = valley(&tail, &bins[foot..], foreground) {
         // Opaque halfway up to what lies behind the valley, and soon: a wide ramp would show a
@@ -189,25 +193,51 @@ fn ramp(bins: &[(f64, f64)]) -> (Content, f64, f64) {
     (Content::Sparse, a, b)
 }
 
-/// The deepest valley of a smoothed tail with half of the foreground above it, and the highest
-/// hill behind it. The foot itself is one where counts rise from there.
-fn valley(tail: &[(f64, f64)], raw: &[(f64, f64)], foreground: f64) -> Option<(f64, f64)> {
+/// Some of the counts `n`, each the mean of those near it: `(centre, count)`.
+fn smooth(bins: &[(f64, f64)], n: &[f64], part: Range<usize>) -> Vec<(f64, f64)> {
+    let of = |i: usize| {
+        let near = part.clone().filter(|&j| (bins[j].0 - bins[i].0).abs() <= SMOOTH);
+        let (sum, count) = near.fold((0.0, 0.0), |(s, c), j| (s + n[j], c + 1.0));
+        (bins[i].0, sum / count)
+    };
+    part.clone().map(of).collect()
+}
+
+/// Where the deepest valley of smoothed counts is, looked for in the first `among` of them. The
+/// first of all is one where counts rise from there.
+fn deepest(counts: &[(f64, f64)], among: usize) -> Option<usize> {
     let mut best: Option<(f64, usize)> = None;
-    let mut above = foreground;
     let mut left = f64::INFINITY;
-    for i in 0..tail.len() {
-        if above < 0.5 * foreground {
-            break;
-        }
-        let right = tail[i..].iter().map(|t| t.1).fold(0.0, f64::max);
-        let depth = left.min(right) / tail[i].1;
+    for i in 0..among {
+        let right = counts[i..].iter().map(|t| t.1).fold(0.0, f64::max);
+        let depth = left.min(right) / counts[i].1;
         if depth >= DEPTH && best.is_none_or(|(d, _)| depth > d) {
             best = Some((depth, i));
         }
-        left = if left.is_finite() { left.max(tail[i].1) } else { tail[i].1 };
-        above -= raw[i].1;
+        left = if left.is_finite() { left.max(counts[i].1) } else { counts[i].1 };
     }
-    let (_, at) = best?;
+    best.map(|(_, at)| at)
+}
+
+/// As far from the air in front of a valley as from what is behind: its lowest bin may be anywhere
+/// on a flat floor.
+fn middle_of_floor(counts: &[(f64, f64)], lowest: usize) -> usize {
+    let floor = |t: &&(f64, f64)| t.1 <= FLOOR * counts[lowest].1;
+    let before = counts[..lowest].iter().rev().take_while(floor).count();
+    let behind = counts[lowest + 1..].iter().take_while(floor).count();
+    (2 * lowest + behind - before) / 2
+}
+
+/// The deepest valley of a smoothed tail with half of the foreground above it, and the highest
+/// hill behind it.
+fn valley(tail: &[(f64, f64)], raw: &[(f64, f64)], foreground: f64) -> Option<(f64, f64)> {
+    let mut above = foreground;
+    let enough = |bin: &&(f64, f64)| {
+        let here = above >= 0.5 * foreground;
+        above -= bin.1;
+        here
+    };
+    let at = deepest(tail, raw.iter().take_while(enough).count())?;
     let hill = tail[at..].iter().fold(
         (0.0, 0.0),
         |best: (f64, f64), t| {
@@ -308,6 +338,22 @@ mod tests {
         let cloud = levels(tail(800));
         assert_eq!(cloud.content, Content::Cloud);
         assert!(cloud.air < 0.1, "{cloud:?}");
+    }
+
+    #[test]
+    fn noise_that_runs_into_the_body_ends_where_the_body_begins() {
+        // As in a series of MR slices: noise falls off to a twentieth of its peak, and no further
+        // before tissue rises.
+        let noise = (0..14).map(|i| (i, i + 1, 50_000 >> (i / 3)));
+        let floor = [(14, 40, 26 * 3_000)];
+        let tissue = (40..80).map(|i| (i, i + 1, 12_000 - 400 * 20u32.abs_diff(i - 40)));
+        let tail = (80..255).map(|i| (i, i + 1, 4 * (255 - i)));
+        let parts: Vec<_> = noise.chain(floor).chain(tissue).chain(tail).collect();
+        let l = levels(bytes(&parts));
+        let at = |t: f64| t * 254.0;
+        assert_eq!(l.content, Content::Solid);
+        assert!((14.0..42.0).contains(&at(l.air)), "{l:?} cuts at {}", at(l.air));
+        assert!(at(l.solid) < 60.0, "{l:?}");
     }
 
     #[test]

@@ -5,7 +5,7 @@
 //! `peer-*` ramps on raw 8-bit values (other types scaled from their smallest to their largest
 //! value), the same that other renderers are measured with.
 //!
-//! Each look has three parts (docs/colours.md has them as a table): a *range rule*, where opacity
+//! Each look has three parts (docs/colours-and-cameras.md has them as a table): a *range rule*, where opacity
 //! begins and how it grows; a *technique*, a surface (opaque within a few voxels), layers (what is
 //! outside is translucent over what is dense) or a fog (nothing hides anything); and its *light*.
 
@@ -142,7 +142,12 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, R
         },
         "brain" => match &at {
             Some(hu) => surface(&PINK, [hu(-20.0), hu(100.0)], hu(-10.0), hu(25.0)),
-            None => surface(&PINK, [air, top], air, solid),
+            // Between what fills the furrows and what they are in: at the end of the air stands
+            // the brain's envelope.
+            None => {
+                let way = |share: f64| air + (l.mid - air) * share;
+                surface(&PINK, [air, top], way(0.45), way(0.8))
+            }
         },
         "muscle" => match &at {
             Some(hu) => layers(
@@ -258,10 +263,11 @@ pub fn unknown(name: &str) -> Refused {
     )
 }
 
-/// The word of a list that is two edits away at most, if there is one.
+/// The word of a list that is two edits away at most, if there is one; of several, one that begins
+/// alike.
 pub fn nearest<'a>(word: &str, list: &[&'a str]) -> Option<&'a str> {
     let near = list.iter().filter(|n| distance(word, n) <= 2);
-    near.min_by_key(|n| distance(word, n)).copied()
+    near.min_by_key(|n| (distance(word, n), word.chars().next() != n.chars().next())).copied()
 }
 
 /// A fitting look for whatever there is: a surface where there is one, a cloud that can be seen
@@ -400,10 +406,25 @@ mod tests {
     }
 
     #[test]
+    fn a_brain_shows_its_furrows() {
+        // As in an average brain: a little of all that fills the furrows, then grey and white.
+        let hills = [(0, 80_000), (40, 800), (170, 9_000), (220, 6_000)];
+        let v = hills.iter().flat_map(|&(at, n)| (0..n).map(move |i| (at + i % 30) as u8));
+        let v = v.map(|x| if x < 30 { 0 } else { x }).collect();
+        let s = ValueSummary::of(&Samples::U8(v), ValueMap::IDENTITY);
+        let opacity = |x: f64| {
+            let tf = by_name("brain", &s).unwrap();
+            crate::transfer::interpolate(&tf.opacities, x / 249.0)[1]
+        };
+        assert_eq!((opacity(55.0), opacity(175.0)), (0.0, 1.0));
+    }
+
+    #[test]
     fn unknown_names_are_told_what_there_is() {
         let s = ValueSummary::of(&Samples::U8(vec![0, 255]), ValueMap::IDENTITY);
         let e = by_name("bonee", &s).unwrap_err().to_string();
         assert!(e.contains("did you mean `bone`") && e.contains("peer-opaque"), "{e}");
+        assert!(by_name("gray", &s).unwrap_err().to_string().contains("did you mean `grey`"));
         assert!(!by_name("/no/such/file", &s).unwrap_err().to_string().contains("mean"));
     }
 

@@ -116,7 +116,12 @@ pub(crate) fn read(
     let Some(number) = told.number else {
         return Err(Problem::malformed(
             "--type",
-            format!("the file's name says {}, but no type", shown(dims)),
+            match hints.dims {
+                Some(dims) => {
+                    format!("is missing, and the file's name has none, for {}", shown(dims))
+                }
+                None => format!("the file's name says {}, but no type", shown(dims)),
+            },
             match (gzip, types_that_fit(len, dims)) {
                 (false, Some(types)) => format!("give {types}, which would fit the {len} bytes"),
                 _ => format!("give one of {}", RawHints::TYPES),

@@ -46,7 +46,7 @@ impl Source {
             Err(e) => return refused(e),
         };
         if meta.is_dir() {
-            return unreadable("is a folder".into(), "give one NRRD or NIfTI file in it");
+            return unreadable("is a folder".into(), "give a file");
         }
         if !meta.is_file() {
             return Err(Problem::new(

@@ -99,9 +99,9 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
             return Err(Fail::usage(format!("--{flag}: is what is compared; leave it out")));
         }
     }
-    let orientation = args.of.look.view.axes.orientation()?;
     let threads = args.threads.count();
     let volume = args.of.open()?;
+    let orientation = args.of.look.view.axes.of(&volume)?;
     let info = volume.info(volume.digest());
     asked.fit(&info, orientation, volume.anatomical)?;
     if let Some(notice) = lattice_notice(&info) {

@@ -12,7 +12,7 @@ use slabcast_common::brick::Brick;
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::Picture;
 use slabcast_common::message::{PathRequest, SceneSpec};
-use slabcast_common::path::{CropBox, Orientation, PathView, ViewPath};
+use slabcast_common::path::{Orientation, PathView, ViewPath};
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::view::View;
@@ -64,21 +64,21 @@ impl Drawn {
         transfer: &TransferFunction,
         quality: Quality,
     ) -> Result<Drawn, Fail> {
-        Drawn::cropped(volume, info, transfer, quality, None)
+        let wanted = Wanted::of(transfer, info, quality.compositing);
+        Drawn::holding(volume, info, transfer, quality, &wanted)
     }
 
-    /// The same of what lies in a box.
-    pub(crate) fn cropped(
+    /// The same with bricks that hold what is wanted.
+    pub(crate) fn holding(
         volume: &Volume,
         info: &VolumeInfo,
         transfer: &TransferFunction,
         quality: Quality,
-        crop: Option<CropBox>,
+        wanted: &Wanted,
     ) -> Result<Drawn, Fail> {
         let classifier = Classifier::new(transfer, info, quality.compositing);
         let sums = classifier.sums(quality.sums).map_err(|e| Fail::flag(&e))?;
-        let wanted = Wanted { crop, ..Wanted::of(transfer, info, quality.compositing) };
-        let store = BrickStore::build(volume, info.digest, &wanted);
+        let store = BrickStore::build(volume, info.digest, wanted);
         let bricks = store.infos().iter().filter_map(|i| store.brick(i.id).cloned()).collect();
         let spec = SceneSpec {
             id: SceneId(0),

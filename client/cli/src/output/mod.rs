@@ -193,6 +193,27 @@ fn is_pipe(path: &Path) -> bool {
     std::fs::metadata(path).is_ok_and(|m| !m.is_file() && !m.is_dir())
 }
 
+/// Refuses names that ask for a format which others write: a folder called `turn.mp4` is a
+/// surprise.
+fn other_programs(path: &Path, ends: &str) -> Result<(), Fail> {
+    const PICTURES: [&str; 9] = ["jpg", "jpeg", "tif", "tiff", "bmp", "gif", "webp", "avif", "ppm"];
+    const VIDEOS: [&str; 7] = ["mp4", "m4v", "mov", "avi", "mkv", "webm", "mpg"];
+    let shown = path.display();
+    if PICTURES.contains(&ends) {
+        return Err(Fail::usage(format!(
+            "-o: {shown}: no {ends} is written; give a folder or a name that ends in .png, .exr or \
+             .apng"
+        )));
+    }
+    if VIDEOS.contains(&ends) {
+        return Err(Fail::usage(format!(
+            "-o: {shown}: no {ends} is written; pipe frames to an encoder: -o - | ffmpeg -i - \
+             {shown}, or give turn.y4m or turn.apng"
+        )));
+    }
+    Ok(())
+}
+
 impl Output {
     /// Looks at what is there, refuses what would be spoilt or cannot be, and writes nothing. Also
     /// says which files of an earlier run will stay beside the new ones.
@@ -216,6 +237,9 @@ impl Output {
             Some("y4m") => Some(Format::Y4m),
             _ => None,
         };
+        if let (None, Some(ends), false) = (named, ends.as_deref(), folder) {
+            other_programs(path, ends)?;
+        }
         let stdout = path == Path::new("-");
         let pipe = stdout || is_pipe(path);
         let format = args.format.or(named).unwrap_or(if pipe { Format::Y4m } else { Format::Png });

@@ -156,7 +156,13 @@ fn choose(mut all: Vec<Series>, wish: &Wish<'_>) -> Result<Series, Problem> {
     // By size, so that localizers stand last in what is listed.
     all.sort_by_key(|s| std::cmp::Reverse(s.slices.len()));
     let list = |all: &[Series]| {
-        let name = |s: &Series| format!("{} ({} slices)", quoted(&s.name()), s.slices.len());
+        let name = |s: &Series| {
+            let (name, n) = (s.name(), s.slices.len());
+            // Some scanners call all series alike.
+            let twins = all.iter().filter(|other| other.name() == name).count() > 1;
+            let uid = if twins { format!(", UID {}", quoted(&s.uid)) } else { String::new() };
+            format!("{} ({n} slice{}{uid})", quoted(&name), if n == 1 { "" } else { "s" })
+        };
         let mut names: Vec<String> = all.iter().take(12).map(name).collect();
         if all.len() > 12 {
             names.push(format!("and {} more", all.len() - 12));
@@ -182,7 +188,7 @@ fn choose(mut all: Vec<Series>, wish: &Wish<'_>) -> Result<Series, Problem> {
         None => Err(Problem::malformed(
             "--series",
             format!("the folder holds {} series: {}", all.len(), list(&all)),
-            "name one of them, or its number",
+            "name one of them, its number or its UID",
         )),
         Some(name) => {
             let called: Vec<usize> = (0..all.len()).filter(|&i| all[i].is_called(name)).collect();
@@ -191,7 +197,7 @@ fn choose(mut all: Vec<Series>, wish: &Wish<'_>) -> Result<Series, Problem> {
                 [] => Err(Problem::malformed(
                     "--series",
                     format!("there is no {} among {}", quoted(name), list(&all)),
-                    "name one of them, or its number",
+                    "name one of them, its number or its UID",
                 )),
                 _ => Err(Problem::malformed(
                     "--series",

@@ -179,7 +179,7 @@ fn several_series_are_listed_and_one_is_taken_by_name() {
         ("3", s("1.2", 1.0, "2", "thorax")),
     ]);
     let e = crate::open(dir.path()).unwrap_err().to_string();
-    let list = "2 series: `CT 2 thorax` (2 slices), `CT 1 scout` (1 slices); name one of them";
+    let list = "2 series: `CT 2 thorax` (2 slices), `CT 1 scout` (1 slice); name one of them";
     assert!(e.contains("--series") && e.contains(list), "{e}");
     for (series, count) in [("1", 1), ("2", 2), ("thorax", 2), ("CT 2 thorax", 2), ("1.2", 2)] {
         let hints = crate::Hints { series: Some(series.into()), ..crate::Hints::default() };
@@ -190,6 +190,18 @@ fn several_series_are_listed_and_one_is_taken_by_name() {
     let hints = crate::Hints { series: Some("brain".into()), ..crate::Hints::default() };
     let e = crate::open_with(dir.path(), &hints).unwrap_err().to_string();
     assert!(e.contains("there is no `brain` among `CT 2 thorax`"), "{e}");
+}
+
+#[test]
+fn series_that_are_called_alike_are_listed_with_their_uids() {
+    let more = [("number", "2"), ("description", "t1")];
+    let s = |uid, z| slice(Syntax::Explicit, uid, z, &pixels(0), &more);
+    let dir = folder(&[("1", s("1.1", 0.0)), ("2", s("1.2", 0.0)), ("3", s("1.2", 1.0))]);
+    let e = crate::open(dir.path()).unwrap_err().to_string();
+    let list = "`CT 2 t1` (2 slices, UID `1.2`), `CT 2 t1` (1 slice, UID `1.1`); name one";
+    assert!(e.contains(list), "{e}");
+    let hints = crate::Hints { series: Some("1.1".into()), ..crate::Hints::default() };
+    assert_eq!(crate::open_with(dir.path(), &hints).unwrap().volume.lattice.dims[2], 1);
 }
 
 #[test]

@@ -1,0 +1,124 @@
+//! The frames of a path, to be drawn by this process alone: what `bench`, `error`, `explain` and
+//! `render --show` share. Each frame is what a cluster would draw, also where transfer functions
+//! change on the way.
+
+use crate::check::shot::Drawn;
+use crate::fail::Fail;
+use crate::request::Asked;
+use slabcast_common::brick::Brick;
+use slabcast_common::message::SceneSpec;
+use slabcast_common::path::Orientation;
+use slabcast_common::quality::Quality;
+use slabcast_common::tween::Tween;
+use slabcast_common::view::View;
+use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_common::wanted::Wanted;
+use slabcast_render::{Frame, Scene};
+use std::sync::Arc;
+
+/// A path's bricks, scenes and views.
+pub(crate) struct Stage {
+    asked: Asked,
+    orientation: Orientation,
+    /// Of all frames, or of those of a tween but for the transfer function.
+    base: SceneSpec,
+    tween: Option<Tween>,
+    /// What frames share if there is no tween: they keep footprints in it.
+    shared: Arc<Scene>,
+    /// Enough for all frames.
+    pub(crate) bricks: Vec<Arc<Brick>>,
+}
+
+impl Stage {
+    /// Cuts the bricks of a volume, which fits what is asked.
+    pub(crate) fn new(
+        volume: &Volume,
+        info: &VolumeInfo,
+        asked: &Asked,
+        orientation: Orientation,
+    ) -> Result<Stage, Fail> {
+        let blame = |e| asked.blame(&e);
+        let transfer = asked.transfer.function(info).map_err(blame)?;
+        let tween = Tween::of(&asked.path, &info.summary).map_err(blame)?;
+        let compositing = asked.quality.compositing;
+        let wanted = Wanted::of_path(&asked.path, &transfer, tween.as_ref(), info, compositing)
+            .map_err(blame)?;
+        let Drawn { spec: base, bricks } =
+            Drawn::holding(volume, info, &transfer, asked.quality, &wanted)?;
+        let shared = Arc::new(Scene::new(&base));
+        Ok(Stage { asked: asked.clone(), orientation, base, tween, shared, bricks })
+    }
+
+    /// What frame `i` of those that are wanted is drawn with; sums decided.
+    pub(crate) fn spec(&self, i: usize) -> SceneSpec {
+        let Some(tween) = &self.tween else { return self.base.clone() };
+        let at = (self.asked.path.first_frame() + i) as f64;
+        tween.scene(&self.base, self.asked.quality.sums, at)
+    }
+
+    /// The same, made ready.
+    pub(crate) fn scene(&self, i: usize) -> Arc<Scene> {
+        match self.tween {
+            None => self.shared.clone(),
+            Some(_) => Arc::new(Scene::new(&self.spec(i))),
+        }
+    }
+
+    /// The view of frame `i` at a quality.
+    pub(crate) fn view(&self, i: usize, quality: &Quality) -> Result<View, Fail> {
+        let lattice = &self.base.volume.lattice;
+        let camera = self.asked.path.camera(i, lattice, self.orientation);
+        let view = camera.and_then(|c| View::new(lattice, &c, self.asked.path.size, quality));
+        view.map_err(|e| self.asked.blame(&e))
+    }
+
+    /// Tables of frame `i`.
+    pub(crate) fn frame(&self, i: usize) -> Result<Frame, Fail> {
+        Ok(Frame::new(self.scene(i), self.view(i, &self.base.quality)?))
+    }
+
+    /// The same at another quality.
+    pub(crate) fn other(
+        &self,
+        i: usize,
+        change: impl FnOnce(Quality) -> Quality,
+    ) -> Result<Frame, Fail> {
+        let spec = self.spec(i);
+        let quality = change(spec.quality);
+        let scene = Arc::new(Scene::new(&SceneSpec { quality, ..spec }));
+        Ok(Frame::new(scene, self.view(i, &quality)?))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::local::{self, Cut};
+    use slabcast_common::path::ViewPath;
+
+    #[test]
+    fn each_frame_of_a_tween_is_drawn_with_its_own_function() {
+        let volume = crate::volume::open("formula:spheres:32".as_ref()).unwrap();
+        let info = volume.info(volume.digest());
+        let o = Orientation::new(None, None).unwrap();
+        let picture = |path: &str, tf: &str, i: usize| {
+            let asked = Asked::plain(ViewPath::from_json(path).unwrap(), tf).unwrap();
+            let stage = Stage::new(&volume, &info, &asked, o).unwrap();
+            local::picture(&stage.frame(i).unwrap(), &stage.bricks, Cut::on(2)).sha256()
+        };
+        let path = |range: &str| {
+            format!(
+                r#"{{"version":1,"size":[48,48]{range},"keyframes":{{"frames":3,"keys":[
+                {{"azimuth":0,"tf":"fog"}},{{"azimuth":40,"tf":"bone"}}]}}}}"#
+            )
+        };
+        let plain = r#"{"version":1,"size":[48,48],"keyframes":{"frames":3,"keys":[
+            {"azimuth":0},{"azimuth":40}]}}"#;
+        let of_tween: Vec<_> = (0..3).map(|i| picture(&path(""), "skin", i)).collect();
+        assert_eq!(of_tween[0], picture(plain, "fog", 0));
+        assert_eq!(of_tween[2], picture(plain, "bone", 2));
+        assert!(!of_tween[..1].contains(&of_tween[1]) && of_tween[1] != of_tween[2]);
+        // Frames of a range keep their place in the tween.
+        assert_eq!(of_tween[2], picture(&path(r#","range":[2,2]"#), "skin", 0));
+    }
+}

@@ -58,7 +58,7 @@ fn truth(request: &PathRequest) -> Vec<String> {
     let quality = Quality { sums: Sums::I32, ..request.quality };
     let wanted = Wanted::of(&transfer, &info, quality.compositing);
     let store = BrickStore::build(&volume, digest, &wanted);
-    let bricks: Vec<_> = store.infos().iter().map(|i| store.brick(i.id).unwrap().clone()).collect();
+    let bricks: Vec<_> = store.infos().iter().map(|i| store.brick(i.id).unwrap()).collect();
     let spec = SceneSpec { id: SceneId(1), volume: info, transfer, quality, bricks: store.key() };
     let scene = Arc::new(Scene::new(&spec));
     (0..request.path.frames())
@@ -233,8 +233,7 @@ fn truth_of_each(path: &ViewPath, default: &TransferFunction) -> Vec<String> {
         let crop = path.crop.map(|c| c.of(&info.lattice).unwrap());
         let wanted = Wanted { crop, ..Wanted::of(&transfer, &info, quality.compositing) };
         let store = BrickStore::build(&volume, info.digest, &wanted);
-        let bricks: Vec<_> =
-            store.infos().iter().map(|i| store.brick(i.id).unwrap().clone()).collect();
+        let bricks: Vec<_> = store.infos().iter().map(|i| store.brick(i.id).unwrap()).collect();
         let volume = info.clone();
         let spec = SceneSpec { id: SceneId(1), volume, transfer, quality, bricks: store.key() };
         let view = View::new(&info.lattice, &cameras.camera(i).unwrap(), path.size, &quality);

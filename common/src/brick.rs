@@ -276,9 +276,11 @@ impl Brick {
             u16s(take(2 * n))
         } else if n < BRICK_VOXELS {
             let mask = take(MASK_BYTES);
-            (0..BRICK_VOXELS as u16)
-                .filter(|&i| mask[i as usize / 8] & (1 << (i % 8)) != 0)
-                .collect()
+            // Room for those alone: it stays for as long as the brick.
+            let mut index = Vec::with_capacity(n);
+            let marked = |&i: &u16| mask[i as usize / 8] & (1 << (i % 8)) != 0;
+            index.extend((0..BRICK_VOXELS as u16).filter(marked).take(n + 1));
+            index
         } else {
             (0..BRICK_VOXELS as u16).collect()
         };

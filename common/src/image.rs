@@ -26,7 +26,7 @@ pub struct TileState {
 }
 
 /// What a task gives back.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct TilePixels {
     /// A after the slab, row-major in the tile.
     pub a: Vec<f32>,

@@ -24,7 +24,8 @@ pub fn encode_normal(v: DVec3) -> u16 {
         (x, y) = ((1.0 - v.y.abs()) * sign(v.x), (1.0 - v.x.abs()) * sign(v.y));
     }
     // 0..=254, 127 is the centre; 255 never occurs, which leaves NO_NORMAL free.
-    let level = |a: f64| libm::floor(a * 127.0 + 127.5).clamp(0.0, 254.0) as u16;
+    // Truncation is `floor` here: what lies below 0 (a rounding below -1) becomes 0 by either.
+    let level = |a: f64| ((a * 127.0 + 127.5) as u16).min(254);
     (level(x) << 8) | level(y)
 }
 

@@ -79,7 +79,7 @@ pub fn embedded(handle: crate::Handle) -> EmbeddedEnd {
                 }
                 BrickOrder::Send { set, store, bricks } => {
                     for ids in bricks.chunks(BATCH_BRICKS) {
-                        let bricks = ids.iter().filter_map(|id| store.brick(*id).cloned());
+                        let bricks = ids.iter().filter_map(|id| store.brick(*id));
                         let batch =
                             BrickBatch { set, bricks: bricks.collect(), broken: Vec::new() };
                         if batch_tx.send(Bricks::Batch(batch)).await.is_err() {

@@ -237,7 +237,7 @@ fn text(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
         out,
         "{:<12} master about {}, each worker up to {} for --tf auto at 512x512",
         "memory",
-        bytes(sample_bytes(info) + 2 * auto + MASTER_BASE),
+        bytes(sample_bytes(info) + auto + MASTER_BASE),
         bytes(auto + WORKER_BASE),
     );
     if let Some(notice) = lattice_notice(info) {

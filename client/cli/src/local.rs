@@ -2,14 +2,16 @@
 //! `check` compare with each other. No cluster, no scheduler.
 
 use crate::progress::{self, Progress};
+use rayon::{ThreadPool, ThreadPoolBuilder};
 use slabcast_common::brick::Brick;
-use slabcast_common::image::{FrameState, Picture};
+use slabcast_common::image::{FrameState, Picture, TilePixels, TileState};
 use slabcast_common::message::Counters;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::slab::SheetRange;
 use slabcast_render::Frame;
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch, Seen};
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -77,22 +79,31 @@ pub(crate) fn counted_picture(
     let mut counters = Counters::default();
     if cut.slabs == 1 {
         let mut picture = Picture { size: frame.view.size, pixels: vec![[0.0; 4]; whole.area()] };
-        let drawn = shared(tiles.len(), cut.threads, |i, Kept(scratch): &mut Kept| {
+        // A row of tiles is a band of the picture; who has drawn a tile writes it there.
+        let rows = picture.pixels.chunks_mut((whole.x1 * edge) as usize);
+        let bands: Vec<_> = rows.map(Mutex::new).collect();
+        let drawn = shared(tiles.len(), cut.threads, |i, Kept(memory): &mut Kept| {
             let (tile, bricks) = &tiles[i];
-            tile::render_seen(frame, simd, *tile, sheets, bricks, &tile::blank(*tile), scratch)
+            let Memory { scratch, pixels, blank } = memory;
+            blank.a.resize(tile.area(), 0.0);
+            let counted =
+                tile::render_into(frame, simd, *tile, sheets, bricks, blank, scratch, pixels);
+            let band = tile.y0 / edge;
+            let in_band = Rect { y0: tile.y0 - band * edge, y1: tile.y1 - band * edge, ..*tile };
+            let mut rows = bands[band as usize].lock().unwrap_or_else(PoisonError::into_inner);
+            pixels.write(in_band, frame.view.size, &mut rows);
+            counted
         });
-        for ((tile, _), (pixels, counted)) in tiles.iter().zip(&drawn) {
-            pixels.write(*tile, picture.size, &mut picture.pixels);
-            counters += *counted;
-        }
+        drop(bands);
+        drawn.into_iter().for_each(|counted| counters += counted);
         return (picture, counters);
     }
     let mut state = FrameState::new(frame.view.size);
     for slab in sheets.slabs(cut.slabs) {
-        let done = shared(tiles.len(), cut.threads, |i, Kept(scratch): &mut Kept| {
+        let done = shared(tiles.len(), cut.threads, |i, Kept(memory): &mut Kept| {
             let (tile, bricks) = &tiles[i];
             let before = state.tile(*tile);
-            tile::render_seen(frame, simd, *tile, slab, bricks, &before, scratch)
+            tile::render_seen(frame, simd, *tile, slab, bricks, &before, &mut memory.scratch)
         });
         for ((tile, _), (pixels, counted)) in tiles.iter().zip(&done) {
             state.put(*tile, pixels);
@@ -103,11 +114,26 @@ pub(crate) fn counted_picture(
     (state.finish(), counters)
 }
 
-/// A thread's memory, taken over from a thread of the frame before and left to one of the next: a
-/// frame allocates none of it.
-struct Kept(Scratch);
+/// What a thread draws in.
+struct Memory {
+    scratch: Scratch,
+    pixels: TilePixels,
+    /// What is behind every tile.
+    blank: TileState,
+}
 
-static SPARE: Mutex<Vec<Scratch>> = Mutex::new(Vec::new());
+impl Default for Memory {
+    fn default() -> Self {
+        let (scratch, pixels) = Default::default();
+        Memory { scratch, pixels, blank: tile::blank(Rect::new(0, 0, 0, 0)) }
+    }
+}
+
+/// A thread's memory, taken over from a thread of the frame before and left to one of the next: a
+/// tile allocates none of it (`worker/render/tests/allocations.rs`).
+struct Kept(Memory);
+
+static SPARE: Mutex<Vec<Memory>> = Mutex::new(Vec::new());
 
 impl Default for Kept {
     fn default() -> Self {
@@ -120,8 +146,8 @@ impl Drop for Kept {
     fn drop(&mut self) {
         // What a panic left half done is not for the next frame.
         if !std::thread::panicking() {
-            let scratch = std::mem::take(&mut self.0);
-            SPARE.lock().unwrap_or_else(PoisonError::into_inner).push(scratch);
+            let memory = std::mem::take(&mut self.0);
+            SPARE.lock().unwrap_or_else(PoisonError::into_inner).push(memory);
         }
     }
 }
@@ -130,7 +156,7 @@ impl Drop for Kept {
 const PROJECTED: usize = 512;
 
 /// `work` for each of `n` items on `threads` threads; results in order. Each thread has an `S`
-/// of its own.
+/// of its own. Not to be called inside `work`.
 pub(crate) fn shared<S: Default, T: Send>(
     n: usize,
     threads: usize,
@@ -147,18 +173,26 @@ pub(crate) fn shared<S: Default, T: Send>(
             done.push((i, work(i, &mut own)));
         }
     };
-    let mut all: Vec<(usize, T)> = std::thread::scope(|scope| {
-        if threads.min(n) <= 1 {
-            return run();
-        }
-        let threads: Vec<_> = (0..threads.min(n)).map(|_| scope.spawn(run)).collect();
-        let join = |t: std::thread::ScopedJoinHandle<'_, Vec<(usize, T)>>| {
-            t.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
-        };
-        threads.into_iter().flat_map(join).collect()
-    });
+    let pool = if threads.min(n) > 1 { pool(threads) } else { None };
+    let mut all: Vec<(usize, T)> = match pool {
+        Some(pool) => pool.broadcast(|_| run()).into_iter().flatten().collect(),
+        None => run(),
+    };
     all.sort_by_key(|(i, _)| *i);
     all.into_iter().map(|(_, t)| t).collect()
+}
+
+/// `threads` threads that live until the process ends, so that no frame waits for its threads to
+/// start. `None` where the system gives none.
+fn pool(threads: usize) -> Option<Arc<ThreadPool>> {
+    static POOLS: Mutex<BTreeMap<usize, Arc<ThreadPool>>> = Mutex::new(BTreeMap::new());
+    let mut pools = POOLS.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(pool) = pools.get(&threads) {
+        return Some(pool.clone());
+    }
+    let pool = Arc::new(ThreadPoolBuilder::new().num_threads(threads).build().ok()?);
+    pools.insert(threads, pool.clone());
+    Some(pool)
 }
 
 /// Pixels between two looks at the progress, for each thread: a second or so of the slowest.
@@ -216,6 +250,21 @@ mod tests {
             assert_eq!(got, (0..100).map(|i| i * i).collect::<Vec<_>>());
         }
         assert!(shared(0, 3, |i, _: &mut ()| i).is_empty());
+    }
+
+    #[test]
+    fn threads_live_across_frames() {
+        let who = || {
+            // Each waits for the others, so that all take part.
+            let barrier = std::sync::Barrier::new(3);
+            let mut who = shared(3, 3, |_, _: &mut ()| {
+                barrier.wait();
+                std::thread::current().id()
+            });
+            who.sort_by_key(|id| format!("{id:?}"));
+            who
+        };
+        assert_eq!(who(), who());
     }
 
     #[test]

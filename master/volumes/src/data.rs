@@ -168,7 +168,7 @@ fn open<'a>(
     form: &Form,
     layout: &Layout,
     share: u64,
-) -> Result<(Box<dyn Read + 'a>, Supply), Problem> {
+) -> Result<(Box<dyn Read + Send + 'a>, Supply), Problem> {
     let ends_early = |field: &str| {
         Problem::malformed(field, "skips past the end of the data", "correct the skip")
     };
@@ -237,7 +237,7 @@ struct Files<'a> {
     layout: &'a Layout,
     share: u64,
     /// The file that is read: its name, its reader, and how many bytes are still to come.
-    open: Option<(String, Box<dyn Read>, u64)>,
+    open: Option<(String, Box<dyn Read + Send>, u64)>,
 }
 
 impl Read for Files<'_> {

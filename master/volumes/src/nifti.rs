@@ -26,7 +26,7 @@ pub(crate) fn sniff(head: &[u8]) -> bool {
 /// Reads a volume from a source at its beginning.
 pub(crate) fn read(source: Source, gzip: bool, name: &str) -> Result<Volume, Problem> {
     let len = source.len;
-    let mut reader: Box<dyn Read> =
+    let mut reader: Box<dyn Read + Send> =
         if gzip { Box::new(MultiGzDecoder::new(source.reader)) } else { Box::new(source.reader) };
     let reader = &mut *reader;
     let mut bytes = [0u8; HEADER_2];

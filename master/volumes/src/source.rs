@@ -10,8 +10,8 @@ use std::io::{BufRead, BufReader, Read, Seek};
 use std::path::{Path, PathBuf};
 
 /// What a [`Source`] reads from.
-pub(crate) trait Stream: Read + Seek {}
-impl<T: Read + Seek> Stream for T {}
+pub(crate) trait Stream: Read + Seek + Send {}
+impl<T: Read + Seek + Send> Stream for T {}
 
 /// An open file, or a test's bytes.
 pub(crate) struct Source {

@@ -1,8 +1,11 @@
-//! The bricks of one volume that a transfer function can see, each encoded once.
+//! The bricks of one volume that a transfer function can see, each held once.
 //!
-//! A store is built once and never changes, so an [`std::sync::Arc`] of it is shared by all
-//! that send. A brick's bytes are made when the first worker asks and are the same `Bytes` for
-//! every later one: sending to sixty workers copies a pointer sixty times.
+//! A store is built once and what it says never changes, so an [`std::sync::Arc`] of it is shared by
+//! all that send. Bricks are packed as they are cut: a worker elsewhere gets these bytes, and sending
+//! to sixty copies a pointer sixty times. A brick that a worker of this process asks for is unpacked
+//! then, and shared from then on. Both forms beside each other would take 10 bytes a voxel of 8 bits
+//! where the promise is 8, so a brick has one or the other; a master with workers of both kinds
+//! packs a brick anew for each that is elsewhere.
 
 use bytes::Bytes;
 use rayon::prelude::*;
@@ -15,17 +18,25 @@ use slabcast_common::shade::encode_normal;
 use slabcast_common::transfer::Support;
 use slabcast_common::volume::{Digest32, Samples, Volume};
 use slabcast_common::wanted::Wanted;
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// The relevant bricks of a volume for one support, in ascending id.
 pub struct BrickStore {
     key: BrickSetKey,
     wanted: Wanted,
     infos: Arc<[BrickInfo]>,
-    bricks: Vec<Arc<Brick>>,
-    encoded: Vec<OnceLock<Bytes>>,
+    /// The bricks, in the order of `infos`.
+    held: Vec<Mutex<Held>>,
     relevant_voxels: u64,
     bytes: u64,
+}
+
+/// A brick in the form in which it was last wanted.
+enum Held {
+    /// Encoded.
+    Packed(Bytes),
+    /// As workers of this process share it.
+    Open(Arc<Brick>),
 }
 
 impl BrickStore {
@@ -46,15 +57,14 @@ impl BrickStore {
                 cut(volume, v, wanted, Samples::F32, |c| support.contains(f64::from(c)))
             }
         };
-        let (infos, bricks): (Vec<BrickInfo>, Vec<Arc<Brick>>) = cut.into_iter().unzip();
+        let (infos, held): (Vec<BrickInfo>, Vec<Mutex<Held>>) = cut.into_iter().unzip();
         BrickStore {
             key: wanted.key(digest),
             wanted: wanted.clone(),
             relevant_voxels: infos.iter().map(|b| u64::from(b.voxels)).sum(),
             bytes: infos.iter().map(|b| u64::from(b.bytes)).sum(),
-            encoded: infos.iter().map(|_| OnceLock::new()).collect(),
             infos: infos.into(),
-            bricks,
+            held,
         }
     }
 
@@ -73,20 +83,25 @@ impl BrickStore {
         &self.infos
     }
 
-    /// A brick, if it has a relevant voxel.
-    pub fn brick(&self, id: BrickId) -> Option<&Arc<Brick>> {
-        Some(&self.bricks[self.at(id)?])
+    /// A brick, if it has a relevant voxel: unpacked once, then shared.
+    pub fn brick(&self, id: BrickId) -> Option<Arc<Brick>> {
+        let mut held = self.held(id)?;
+        let brick = match &*held {
+            Held::Open(brick) => return Some(brick.clone()),
+            Held::Packed(bytes) => Brick::decode(bytes).expect("we packed it ourselves"),
+        };
+        let brick = Arc::new(brick);
+        *held = Held::Open(brick.clone());
+        Some(brick)
     }
 
-    /// A brick's encoding ([`Brick::encode`]): made once, then shared.
+    /// A brick's encoding ([`Brick::encode`]): shared, unless a worker of this process has asked for
+    /// the brick itself.
     pub fn encoded(&self, id: BrickId) -> Option<Bytes> {
-        let at = self.at(id)?;
-        let bytes = self.encoded[at].get_or_init(|| {
-            let mut out = Vec::new();
-            self.bricks[at].encode(&mut out);
-            out.into()
-        });
-        Some(bytes.clone())
+        Some(match &*self.held(id)? {
+            Held::Packed(bytes) => bytes.clone(),
+            Held::Open(brick) => packed(brick),
+        })
     }
 
     /// Voxels in all bricks.
@@ -99,8 +114,9 @@ impl BrickStore {
         self.bytes
     }
 
-    fn at(&self, id: BrickId) -> Option<usize> {
-        self.infos.binary_search_by_key(&id, |b| b.id).ok()
+    fn held(&self, id: BrickId) -> Option<MutexGuard<'_, Held>> {
+        let at = self.infos.binary_search_by_key(&id, |b| b.id).ok()?;
+        Some(self.held[at].lock().unwrap_or_else(PoisonError::into_inner))
     }
 }
 
@@ -108,11 +124,18 @@ impl std::fmt::Debug for BrickStore {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("BrickStore")
             .field("key", &self.key)
-            .field("bricks", &self.bricks.len())
+            .field("bricks", &self.held.len())
             .field("relevant_voxels", &self.relevant_voxels)
             .field("bytes", &self.bytes)
             .finish_non_exhaustive()
     }
+}
+
+/// A brick's encoding.
+fn packed(brick: &Brick) -> Bytes {
+    let mut out = Vec::new();
+    brick.encode(&mut out);
+    out.into()
 }
 
 /// Which of `codes` codes are relevant. Filled by interval: asking for each code would take
@@ -136,16 +159,17 @@ fn cut<T: Copy + Into<f64> + Sync>(
     wanted: &Wanted,
     samples: fn(Vec<T>) -> Samples,
     relevant: impl Fn(T) -> bool + Sync,
-) -> Vec<(BrickInfo, Arc<Brick>)> {
+) -> Vec<(BrickInfo, Mutex<Held>)> {
     let field = Field { codes, dims: volume.lattice.dims };
     let grid = BrickGrid::of(field.dims);
     let gradient_matrix = volume.gradient_matrix();
     let row = |row: u32| {
         let mut bricks = Vec::new();
         let (y, z) = (row % grid.dims[1], row / grid.dims[1]);
+        let mut found = Found::default();
         for x in 0..grid.dims[0] {
             let id = grid.id([x, y, z]);
-            let mut found = Found::default();
+            found.clear();
             let inside = |at| wanted.crop.is_none_or(|c| c.holds(&volume.lattice, at));
             field.search([x, y, z].map(|n| n * BRICK), &relevant, &inside, &mut found);
             let index = &found.index[..found.voxels];
@@ -171,7 +195,7 @@ fn cut<T: Copy + Into<f64> + Sync>(
                 voxels: found.voxels as u16,
                 bytes: brick.encoded_len() as u32,
             };
-            bricks.push((info, Arc::new(brick)));
+            bricks.push((info, Mutex::new(Held::Packed(packed(&brick)))));
         }
         bricks
     };
@@ -203,6 +227,10 @@ impl Default for Found {
 }
 
 impl Found {
+    fn clear(&mut self) {
+        (self.voxels, self.lo, self.hi) = (0, [u32::MAX; 3], [0; 3]);
+    }
+
     fn tight(&self) -> TightBox {
         TightBox { lo: self.lo, hi: self.hi }
     }
@@ -230,12 +258,12 @@ impl<T: Copy + Into<f64>> Field<'_, T> {
                 let run = &self.codes[start..start + (end[0] - corner[0]) as usize];
                 let row = (y - corner[1]) * 8 + (z - corner[2]) * 64;
                 let before = found.voxels;
+                // Each is put there and counted if it is to stay: no branch hangs on the data.
                 for (x, &code) in run.iter().enumerate() {
-                    if relevant(code) && inside([corner[0] + x as u32, y, z]) {
-                        found.index[found.voxels] = (row + x as u32) as u16;
-                        found.offset[found.voxels] = start + x;
-                        found.voxels += 1;
-                    }
+                    found.index[found.voxels] = (row + x as u32) as u16;
+                    found.offset[found.voxels] = start + x;
+                    let stays = relevant(code) && inside([corner[0] + x as u32, y, z]);
+                    found.voxels += usize::from(stays);
                 }
                 if found.voxels > before {
                     let x = |i: usize| corner[0] + u32::from(found.index[i] & 7);
@@ -262,7 +290,8 @@ impl<T: Copy + Into<f64>> Field<'_, T> {
             }
             let hi: f64 = self.codes[offset + above * stride].into();
             let lo: f64 = self.codes[offset - below * stride].into();
-            (hi - lo) / (below + above) as f64
+            // A product with a half is that quotient to the bit.
+            (hi - lo) * if below + above == 2 { 0.5 } else { 1.0 }
         };
         glam::DVec3::new(
             along(at[0], nx, 1),
@@ -303,17 +332,20 @@ mod tests {
         let mut seen = std::collections::BTreeMap::new();
         let mut bytes = 0;
         for info in store.infos().iter() {
+            let encoded = store.encoded(info.id).expect("every info has an encoding");
+            assert_eq!(encoded.len(), info.bytes as usize);
+            let again = store.encoded(info.id).expect("as before");
+            assert_eq!(again.as_ptr(), encoded.as_ptr(), "encoded once, then shared");
             let brick = store.brick(info.id).expect("every info has a brick");
+            let again = store.brick(info.id).expect("as before");
+            assert!(Arc::ptr_eq(&brick, &again), "unpacked once, then shared");
+            assert_eq!(store.encoded(info.id).expect("as before"), encoded, "packed anew");
             assert_eq!(brick.id, info.id);
             assert_eq!(brick.len(), usize::from(info.voxels));
             assert!(!brick.is_empty() && brick.index.windows(2).all(|w| w[0] < w[1]));
             assert_eq!(brick.tight(&grid), info.tight);
             assert_eq!(brick.normals.is_some(), normals);
             assert_eq!(brick.gradients.is_some(), wanted.gradients);
-            let encoded = store.encoded(info.id).expect("every info has an encoding");
-            assert_eq!(encoded.len(), info.bytes as usize);
-            let again = store.encoded(info.id).expect("as before");
-            assert_eq!(again.as_ptr(), encoded.as_ptr(), "encoded once, then shared");
             // NaN is not equal to itself; its bytes are.
             let decoded = Brick::decode(&encoded).expect("our own bytes are good");
             let mut re_encoded = Vec::new();
@@ -400,8 +432,8 @@ mod tests {
         let store = check(&full, &span(1.0, 255.0), true);
         assert_eq!((store.infos().len(), store.relevant_voxels()), (6, 17 * 9 * 8));
         let flat = store.infos().iter().all(|b| {
-            let normals = store.brick(b.id).unwrap().normals.as_ref().unwrap();
-            normals.iter().all(|&n| n == NO_NORMAL)
+            let brick = store.brick(b.id).unwrap();
+            brick.normals.as_ref().unwrap().iter().all(|&n| n == NO_NORMAL)
         });
         assert!(flat, "a constant field has no normals");
         let none = check(&full, &span(201.0, 255.0), true);
@@ -445,7 +477,9 @@ mod tests {
     #[test]
     fn many_threads_get_the_same_bytes() {
         let v = Volume::from_fn_u8("v", [32; 3], |i, j, k| (i * j + k) as u8 | 1);
-        let store = Arc::new(check(&v, &span(1.0, 255.0), true));
+        let wanted =
+            Wanted { support: span(1.0, 255.0), normals: true, gradients: false, crop: None };
+        let store = BrickStore::build(&v, Digest32::default(), &wanted);
         let id = store.infos()[7].id;
         let seen: Vec<usize> = std::thread::scope(|s| {
             let ask = || store.encoded(id).expect("it is relevant").as_ptr() as usize;

@@ -27,10 +27,10 @@ impl Encoding {
     /// little-endian order whatever the header says ([`Encoding::has_order`]).
     pub(crate) fn open<'a>(
         self,
-        mut inner: Box<dyn BufRead + 'a>,
+        mut inner: Box<dyn BufRead + Send + 'a>,
         bytes: u64,
         number: Number,
-    ) -> std::io::Result<(Box<dyn Read + 'a>, Supply)> {
+    ) -> std::io::Result<(Box<dyn Read + Send + 'a>, Supply)> {
         let encoded = |name, ratio| Supply::Encoded { name, bytes, ratio };
         Ok(match self {
             Encoding::Raw => (Box::new(inner), Supply::Plain { have: bytes }),
@@ -71,7 +71,7 @@ fn damaged(what: String, remedy: &str) -> std::io::Error {
 
 /// Decimal numbers as bytes.
 struct Text<'a> {
-    inner: Box<dyn BufRead + 'a>,
+    inner: Box<dyn BufRead + Send + 'a>,
     number: Number,
     word: Vec<u8>,
     /// The number that is handed out, at the end of the eight bytes.
@@ -176,7 +176,7 @@ impl Read for Text<'_> {
 
 /// Pairs of hexadecimal digits as bytes.
 struct Hex<'a> {
-    inner: Box<dyn BufRead + 'a>,
+    inner: Box<dyn BufRead + Send + 'a>,
 }
 
 impl Read for Hex<'_> {

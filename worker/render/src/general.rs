@@ -126,7 +126,7 @@ impl General<'_> {
                 if float_sums {
                     let sections = &frame.sections;
                     let id = |v: &Waiting| part.brick(v.brick as usize).brick.id;
-                    carried.sort_by_key(|v| (sections.first(v.placed.z), id(v), v.voxel));
+                    carried.sort_unstable_by_key(|v| (sections.first(v.placed.z), id(v), v.voxel));
                 }
                 self.splat_all(&carried, k, kind, &open, counters);
                 carried.clear();
@@ -134,7 +134,7 @@ impl General<'_> {
             }
             let mut bucket = std::mem::take(&mut queues.buckets[(k - slab.first) as usize]);
             if float_sums {
-                bucket.sort_by_key(|v| (part.brick(v.brick as usize).brick.id, v.voxel));
+                bucket.sort_unstable_by_key(|v| (part.brick(v.brick as usize).brick.id, v.voxel));
             }
             self.splat_all(&bucket, k, kind, &open, counters);
             bucket.clear();

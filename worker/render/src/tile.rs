@@ -78,6 +78,8 @@ pub struct Scratch {
     pixels: Pixels,
     /// Which of a tile's bricks lie in a part.
     inside: Vec<u32>,
+    /// Sums of a last sheet, while no tile has them.
+    last: Vec<RawSums>,
 }
 
 /// Memory for sums in records.
@@ -129,13 +131,40 @@ pub fn render_seen(
     state: &TileState,
     scratch: &mut Scratch,
 ) -> (TilePixels, Counters) {
+    let mut out = TilePixels::default();
+    let counted = render_into(frame, simd, tile, slab, bricks, state, scratch, &mut out);
+    (out, counted)
+}
+
+/// [`render_seen`] into the pixels of another tile, whose memory it takes over: once scratch and
+/// pixels have grown to a frame's largest tile, drawing allocates nothing (`tests/allocations.rs`).
+///
+/// # Panics
+/// If the planes of `state` do not have the tile's size.
+pub fn render_into(
+    frame: &Frame,
+    simd: Simd,
+    tile: Rect,
+    slab: SheetRange,
+    bricks: &[&Seen],
+    state: &TileState,
+    scratch: &mut Scratch,
+    out: &mut TilePixels,
+) -> Counters {
     assert_eq!(state.a.len(), tile.area(), "one A a pixel");
-    let neighbours = frame.looks_at_neighbours();
-    let mut out = TilePixels {
-        a: state.a.clone(),
-        colour: vec![[0; 3]; tile.area()],
-        last: neighbours.then(|| vec![[0; 4]; tile.area()]),
-    };
+    out.a.clear();
+    out.a.extend_from_slice(&state.a);
+    out.colour.clear();
+    out.colour.resize(tile.area(), [0; 3]);
+    if let Some(last) = out.last.take() {
+        scratch.last = last;
+    }
+    if frame.looks_at_neighbours() {
+        let mut last = std::mem::take(&mut scratch.last);
+        last.clear();
+        last.resize(tile.area(), [0; 4]);
+        out.last = Some(last);
+    }
     let mut counted = Counters::default();
     let counters = &mut counted;
     let mut inside = std::mem::take(&mut scratch.inside);
@@ -153,7 +182,7 @@ pub fn render_seen(
                 continue;
             }
             let part = Part { frame, rect, tile, slab, bricks, inside: &inside };
-            let io = (state, &mut out, &mut *counters);
+            let io = (state, &mut *out, &mut *counters);
             let Scratch { general, whole, pixels, .. } = scratch;
             let GeneralScratch { kinds, queues } = general;
             match frame.scene.quality.sums {
@@ -173,10 +202,10 @@ pub fn render_seen(
         }
     }
     scratch.inside = inside;
-    if out.last.as_ref().is_some_and(|l| l.iter().all(|s| *s == [0; 4])) {
-        out.last = None;
+    if let Some(last) = out.last.take_if(|l| l.iter().all(|s| *s == [0; 4])) {
+        scratch.last = last;
     }
-    (out, counted)
+    counted
 }
 
 /// A part of a tile.

@@ -79,7 +79,7 @@ impl Drawn {
         let classifier = Classifier::new(transfer, info, quality.compositing);
         let sums = classifier.sums(quality.sums).map_err(|e| Fail::flag(&e))?;
         let store = BrickStore::build(volume, info.digest, wanted);
-        let bricks = store.infos().iter().filter_map(|i| store.brick(i.id).cloned()).collect();
+        let bricks = store.infos().iter().filter_map(|i| store.brick(i.id)).collect();
         let spec = SceneSpec {
             id: SceneId(0),
             volume: info.clone(),

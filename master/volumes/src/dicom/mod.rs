@@ -117,7 +117,7 @@ fn ended(how: &str) -> Problem {
 }
 
 /// Reads what comes through the pipe; `None` where it says nothing, or nonsense.
-fn received(from: impl Read, bytes: u64) -> Option<Result<Opened, Problem>> {
+fn received(from: impl Read + Send, bytes: u64) -> Option<Result<Opened, Problem>> {
     let mut from = BufReader::with_capacity(128 << 10, from);
     let preface = match Preface::read(&mut from)? {
         Ok(preface) => preface,
@@ -126,7 +126,7 @@ fn received(from: impl Read, bytes: u64) -> Option<Result<Opened, Problem>> {
     Some(volume(preface, &mut from, bytes))
 }
 
-fn volume(preface: Preface, from: &mut dyn Read, bytes: u64) -> Result<Opened, Problem> {
+fn volume(preface: Preface, from: &mut (dyn Read + Send), bytes: u64) -> Result<Opened, Problem> {
     let Preface { name, number, lattice, anatomical, rescale: [slope, intercept], notes, .. } =
         preface;
     let layout = Layout::new(lattice.dims.map(u64::from), number, Endian::Little, "slices")?;

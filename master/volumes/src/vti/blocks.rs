@@ -8,8 +8,8 @@ use std::io::{BufRead, Read, Take};
 
 /// Where a block's bytes come from: between two blocks, or through the one that is unpacked.
 enum State {
-    Between(Box<dyn Read>),
-    Inside(ZlibDecoder<Take<Box<dyn Read>>>),
+    Between(Box<dyn Read + Send>),
+    Inside(ZlibDecoder<Take<Box<dyn Read + Send>>>),
     Done,
 }
 
@@ -26,7 +26,7 @@ pub(super) struct Blocks {
 }
 
 impl Blocks {
-    pub(super) fn new(inner: Box<dyn Read>, packed: Vec<u64>, size: u64, last: u64) -> Self {
+    pub(super) fn new(inner: Box<dyn Read + Send>, packed: Vec<u64>, size: u64, last: u64) -> Self {
         Blocks { state: State::Between(inner), packed, size, last, at: 0, left: 0 }
     }
 

@@ -10,6 +10,7 @@ use rayon::prelude::*;
 use slabcast_common::volume::{Samples, ValueMap};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 /// Largest chunk once decoded. Two of them (packed and not) stay below the 64 MiB that reading
@@ -180,28 +181,55 @@ impl Array {
                 (Samples::U16(self.place(placed, code)?), shifted(-32768.0))
             }
             Number::F32 => (Samples::F32(self.place(placed, le!(f32))?), ValueMap::IDENTITY),
-            // Their range decides how they are kept, so that they are all held for a moment.
-            Number::U32 => wide::narrow(vec![self.place(placed, le!(u32))?], i128::from)?,
-            Number::I32 => wide::narrow(vec![self.place(placed, le!(i32))?], i128::from)?,
-            Number::U64 => wide::narrow(vec![self.place(placed, le!(u64))?], i128::from)?,
-            Number::I64 => wide::narrow(vec![self.place(placed, le!(i64))?], i128::from)?,
-            Number::F64 => wide::single(vec![self.place(placed, le!(f64))?])?,
+            // Their range decides how they are kept, so that all are there for a moment.
+            Number::U32 => wide::narrow(self.pieces(placed, le!(u32))?, i128::from)?,
+            Number::I32 => wide::narrow(self.pieces(placed, le!(i32))?, i128::from)?,
+            Number::U64 => wide::narrow(self.pieces(placed, le!(u64))?, i128::from)?,
+            Number::I64 => wide::narrow(self.pieces(placed, le!(i64))?, i128::from)?,
+            Number::F64 => wide::single(self.pieces(placed, le!(f64))?)?,
         })
     }
 
-    /// All chunks, decoded into their places. A layer of chunks along z is a task of its own.
+    /// All samples in one list.
     fn place<T: Copy + Send + Sync>(
         &self,
         placed: &Placed,
         code: impl Fn(&[u8]) -> T + Sync,
     ) -> Result<Vec<T>, Problem> {
+        self.layers(placed, 0..self.layer_count(placed), &code)
+    }
+
+    /// All samples in pieces of whole layers, which [`wide`] gives back one by one.
+    fn pieces<T: Copy + Send + Sync>(
+        &self,
+        placed: &Placed,
+        code: impl Fn(&[u8]) -> T + Sync,
+    ) -> Result<Vec<Vec<T>>, Problem> {
+        let [nx, ny, _] = placed.dims.map(|n| n as usize);
+        let count = self.layer_count(placed);
+        let layer = nx * ny * self.depth(placed) * size_of::<T>();
+        let at_once = wide::PIECE_BYTES.div_ceil(layer);
+        let starts = (0..count).step_by(at_once);
+        starts.map(|z| self.layers(placed, z..count.min(z + at_once), &code)).collect()
+    }
+
+    /// Some layers of chunks, decoded chunk by chunk into their places. A layer is a task of its
+    /// own.
+    fn layers<T: Copy + Send + Sync>(
+        &self,
+        placed: &Placed,
+        layers: Range<usize>,
+        code: &(impl Fn(&[u8]) -> T + Sync),
+    ) -> Result<Vec<T>, Problem> {
         let size = self.number.bytes() as usize;
         let [nx, ny, nz] = placed.dims.map(|n| n as usize);
-        let mut out = Vec::new();
-        reserve(&mut out, nx * ny * nz)?;
-        out.resize(nx * ny * nz, code(&self.fill[..size]));
         let depth = self.depth(placed);
-        let layer = |(z, out): (usize, &mut [T])| self.layer(placed, z, out, &code);
+        let samples = nx * ny * (nz.min(layers.end * depth) - layers.start * depth);
+        let mut out = Vec::new();
+        reserve(&mut out, samples)?;
+        out.resize(samples, code(&self.fill[..size]));
+        let layer = |(z, out): (usize, &mut [T])| self.layer(placed, layers.start + z, out, code);
+        // Packed and not.
         let chunk = 2 * self.inner().iter().product::<u64>() * self.number.bytes();
         if chunk * rayon::current_num_threads() as u64 <= AT_ONCE_BYTES {
             out.par_chunks_mut(nx * ny * depth).enumerate().try_for_each(layer)?;
@@ -211,9 +239,20 @@ impl Array {
         Ok(out)
     }
 
-    /// Samples along z of a layer of chunks. (A shard may well be deeper than the array.)
+    /// Samples along z of a layer: of chunks, or of inner chunks of a shard, and then of some that
+    /// lie behind each other, since a shard's index is read for each layer. (A chunk may well
+    /// be deeper than the array.)
     fn depth(&self, placed: &Placed) -> usize {
-        placed.axes[2].map_or(1, |a| self.grid[a].min(placed.dims[2]) as usize)
+        let Some(a) = placed.axes[2] else { return 1 };
+        let (inner, grid) = (self.inner()[a], self.grid[a]);
+        // Layers end where shards do.
+        let fits = |n: &u64| (grid / inner).is_multiple_of(*n) && inner.saturating_mul(*n) >= 16;
+        let some = (1..=64).find(fits).unwrap_or(1);
+        inner.saturating_mul(some).min(placed.dims[2]) as usize
+    }
+
+    fn layer_count(&self, placed: &Placed) -> usize {
+        (placed.dims[2] as usize).div_ceil(self.depth(placed))
     }
 
     /// The chunks of one layer along z.
@@ -225,8 +264,10 @@ impl Array {
         code: &impl Fn(&[u8]) -> T,
     ) -> Result<(), Problem> {
         let mut at = vec![0u64; self.shape.len()];
+        let depth = self.depth(placed) as u64;
+        let layer = z as u64 * depth..(z as u64 + 1) * depth;
         if let Some(a) = placed.axes[2] {
-            at[a] = z as u64;
+            at[a] = layer.start / self.grid[a];
         }
         let count =
             |axis: usize| placed.axes[axis].map_or(1, |a| self.shape[a].div_ceil(self.grid[a]));
@@ -237,7 +278,7 @@ impl Array {
                         at[a] = n;
                     }
                 }
-                self.file(placed, &at, out, code).map_err(|mut p| {
+                self.file(placed, &at, &layer, out, code).map_err(|mut p| {
                     p.field = format!("chunk {} {}", self.key.of(&at), p.field);
                     p
                 })?;
@@ -246,11 +287,12 @@ impl Array {
         Ok(())
     }
 
-    /// The chunk or shard at a place of the grid.
+    /// The chunk at a place of the grid, or what of the shard there lies in a layer.
     fn file<T: Copy>(
         &self,
         placed: &Placed,
         at: &[u64],
+        layer: &Range<u64>,
         out: &mut [T],
         code: &impl Fn(&[u8]) -> T,
     ) -> Result<(), Problem> {
@@ -291,9 +333,10 @@ impl Array {
                 corner[a] += rest % counts[a] * shard.inner[a];
                 rest /= counts[a];
             }
-            let wanted = (0..corner.len()).all(|a| match placed.axes.contains(&Some(a)) {
-                true => corner[a] < self.shape[a],
-                false => corner[a] == 0,
+            let wanted = (0..corner.len()).all(|a| match placed.axes {
+                [.., Some(z)] if z == a => layer.contains(&corner[a]) && corner[a] < self.shape[a],
+                axes if axes.contains(&Some(a)) => corner[a] < self.shape[a],
+                _ => corner[a] == 0,
             });
             if !wanted {
                 continue;
@@ -314,7 +357,7 @@ impl Array {
     }
 
     /// A decoded chunk whose first sample stands at `first` of the array, to its place in `out`,
-    /// which begins with a layer of the grid.
+    /// which is a layer.
     fn copy<T: Copy>(
         &self,
         placed: &Placed,

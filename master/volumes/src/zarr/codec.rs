@@ -141,7 +141,7 @@ impl Codecs {
         if len > most {
             return Err(damaged(format!("has {len} bytes for {bytes} of samples")));
         }
-        let mut data = Vec::new();
+        let mut data = Vec::with_capacity(len as usize + 1);
         from.take(len).read_to_end(&mut data).map_err(|e| Problem::io("file", &e))?;
         for (i, codec) in self.list.iter().enumerate().rev() {
             // Between two codecs it may still be packed.
@@ -203,7 +203,8 @@ impl Codec {
 
 /// All that a reader gives, at most `most` bytes.
 fn all(from: impl Read, most: usize) -> Result<Vec<u8>, Problem> {
-    let mut out = Vec::new();
+    // Chunks are small enough to ask for at once; what is not filled is never touched.
+    let mut out = Vec::with_capacity(most + 1);
     let read = from.take(most as u64 + 1).read_to_end(&mut out);
     read.map_err(|e| {
         let text: String = e.to_string().chars().take(100).collect();

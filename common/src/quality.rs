@@ -9,9 +9,11 @@ use serde::{Deserialize, Serialize};
 pub enum Kernel {
     /// Gaussian with its edge value subtracted.
     Gaussian,
-    /// Cubic B-spline.
+    /// Cubic B-spline: a constant field stays constant along the lattice's axes, and within 1 %
+    /// from any side.
     Bspline,
-    /// Tent, radial only.
+    /// Tent, the linear B-spline. Sharpest, and of a constant field from a slanted side up to 39 %
+    /// ripple (NUMERICS.md section 4).
     Tent,
 }
 
@@ -61,9 +63,9 @@ pub struct Quality {
     pub eps: f64,
     /// Reconstruction kernel.
     pub kernel: Kernel,
-    /// Standard deviation of the Gaussian, in lattice steps.
+    /// Standard deviation of the Gaussian, in lattice steps; other kernels have their own.
     pub std: f64,
-    /// Support radius, in lattice steps.
+    /// Support radius of the Gaussian, in lattice steps; other kernels have their own.
     pub radius: f64,
     /// Compositing rule.
     pub compositing: Compositing,
@@ -132,6 +134,15 @@ fn within(field: &str, x: f64, lo: f64, hi: f64) -> Result<(), Refused> {
 }
 
 impl Quality {
+    /// Standard deviation and support radius of the kernel, in lattice steps.
+    pub fn shape(&self) -> [f64; 2] {
+        match self.kernel {
+            Kernel::Gaussian => [self.std, self.radius],
+            Kernel::Bspline => [(1.0f64 / 3.0).sqrt(), 2.0],
+            Kernel::Tent => [(1.0f64 / 6.0).sqrt(), 1.0],
+        }
+    }
+
     /// Checks ranges and names what this version does not draw yet.
     pub fn check(&self) -> Result<(), Refused> {
         // From vox/64 to thicker than any volume (DESIGN.md section 5).
@@ -142,7 +153,23 @@ impl Quality {
         within("std", self.std, 0.4, 1.0)?;
         within("radius", self.radius, 1.0, 3.0)?;
         if self.kernel != Kernel::Gaussian {
-            return Err(Refused::new("kernel", "this version draws `gaussian` only; use it"));
+            let d = Quality::default();
+            for (field, given) in [("std", self.std != d.std), ("radius", self.radius != d.radius)]
+            {
+                if given {
+                    return Err(Refused::new(
+                        field,
+                        "is of the `gaussian` kernel; the others have one width. Leave it out, or \
+                         use `gaussian`",
+                    ));
+                }
+            }
+        }
+        if self.kernel == Kernel::Tent && self.sums == Sums::I16 {
+            return Err(Refused::new(
+                "sums",
+                "`i16` has no room for the ripple of the `tent` kernel; use `i32` or `auto`",
+            ));
         }
         if self.splat != Splat::Direct {
             return Err(Refused::new("splat", "this version draws `direct` splats only; use it"));

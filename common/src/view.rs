@@ -212,6 +212,7 @@ impl View {
             let spread = DVec3::new(row(&|s| s.x), row(&|s| s.y), row(&|s| s.z));
             (spread, eye_from_index.determinant().abs())
         };
+        let [std, radius] = quality.shape();
         let view = View {
             size,
             eye_from_index,
@@ -219,8 +220,8 @@ impl View {
             eye_from_world,
             projection,
             thickness: quality.thickness,
-            kernel_std: spread * quality.std,
-            kernel_radius: spread * quality.radius,
+            kernel_std: spread * std,
+            kernel_radius: spread * radius,
             cell,
         };
         // Depths in phases must fit i32, screen positions 26 bits.

@@ -23,9 +23,8 @@ use tiff::{ColorType, TiffError};
 /// whole pages, and below the 64 MiB that reading may take beside the voxels.
 const BAND_MAX_BYTES: u64 = 48 << 20;
 /// A band of this size is taken at a file's word; a larger one needs half as many bytes in the
-/// file, so that a small file can't make us take much. The band, what the library unpacks it from and
-/// the samples may be there together: three times this stays below 16 MiB.
-const BAND_FREE_BYTES: u64 = 5 << 20;
+/// file, so that a small file can't make us take much.
+const BAND_FREE_BYTES: u64 = 8 << 20;
 
 /// Whether these first bytes are TIFF or BigTIFF.
 pub(crate) fn sniff(head: &[u8]) -> bool {

@@ -13,7 +13,7 @@ use slabcast_common::path::{
     Axis, Crop, CropUnit, Easing, FlyThrough, Key, KeyFrames, Orientation, PathView,
     ProjectionKind, Side, Turntable, ViewPath,
 };
-use slabcast_common::quality::{Compositing, Quality, Schedule, Sums, Work};
+use slabcast_common::quality::{Compositing, Kernel, Quality, Schedule, Sums, Work};
 use slabcast_common::shade::{Light, Shading};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
@@ -168,17 +168,24 @@ pub fn quality(sums: impl Strategy<Value = Sums>) -> impl Strategy<Value = Quali
         Just(Compositing::Constant),
         Just(Compositing::Paper)
     ];
-    (0.02..100.0f64, 0.0..=0.5f64, 0.4..1.0f64, 1.0..3.0f64, compositing, sums, any::<bool>())
-        .prop_map(|(thickness, eps, std, radius, compositing, sums, cull)| Quality {
+    let d = Quality::default();
+    let kernel = prop_oneof![
+        (Just(Kernel::Gaussian), 0.4..1.0f64, 1.0..3.0f64),
+        (prop_oneof![Just(Kernel::Bspline), Just(Kernel::Tent)], Just(d.std), Just(d.radius)),
+    ];
+    (0.02..100.0f64, 0.0..=0.5f64, kernel, compositing, sums, any::<bool>()).prop_map(
+        |(thickness, eps, (kernel, std, radius), compositing, sums, cull)| Quality {
             thickness,
             eps,
+            kernel,
             std,
             radius,
             compositing,
             sums,
             cull,
             ..Quality::default()
-        })
+        },
+    )
 }
 
 fn scene() -> impl Strategy<Value = SceneSpec> {

@@ -3,15 +3,17 @@
 //! The kernel turns a block of voxels whose looks depend on their layer alone (a [`Stack`]) into
 //! the field `Sx(x) Sy(y) sum_j sigma_j g(z - j)`, with S the sum of the profile g over the
 //! block's lattice points. Along a parallel ray down z, Sx and Sy stay, and the integral of g is a
-//! difference of error functions. So optical depth between any two depths is a sum of those,
-//! edges and ripple included. A Gaussian of voxels (a [`Bell`]) is a product of three sums along an
-//! axis, and a product of convolutions from any other side.
+//! difference of error functions, or of truncated powers where g is a spline. So optical depth
+//! between any two depths is a sum of those, edges and ripple included. A Gaussian of voxels (a
+//! [`Bell`]) is a product of three sums along an axis, and, of the Gaussian kernel, a product of
+//! convolutions from any other side.
 //!
 //! A rendered picture differs from these by what [`Rounding`] adds up: each term is a bound
 //! derived from the number of roundings, not from what was seen. The profile is written down here
 //! anew, for the third time: neither footprints nor the reference are leant on.
 
 use glam::DMat3;
+use slabcast_common::quality::{Kernel, Quality};
 use std::f64::consts::PI;
 use std::ops::Range;
 
@@ -19,41 +21,66 @@ use std::ops::Range;
 /// at most, as a share.
 const ULP: f64 = 1.0 / 16_777_216.0;
 
-/// One axis of the kernel: a Gaussian cut at a radius, its edge value subtracted, its integral
-/// one. Lengths in vox.
+/// One axis of the kernel. Lengths in vox.
 #[derive(Clone, Copy, Debug)]
 pub struct Profile {
     std: f64,
     radius: f64,
     norm: f64,
+    /// Degree, where it is a B-spline of steps of one vox.
+    degree: Option<i32>,
 }
 
 impl Profile {
-    /// Of deviation `std`, cut at `radius`.
+    /// A Gaussian of deviation `std`, cut at `radius`, its edge value subtracted, its integral one.
     pub fn new(std: f64, radius: f64) -> Profile {
-        let bare = Profile { std, radius, norm: 1.0 };
+        let bare = Profile { std, radius, norm: 1.0, degree: None };
         Profile { norm: bare.unnormalised(radius), ..bare }
+    }
+
+    /// The kernel of a quality, on a lattice of steps of one vox.
+    pub fn of(quality: &Quality) -> Profile {
+        let [std, radius] = quality.shape();
+        match quality.kernel {
+            Kernel::Gaussian => Profile::new(std, radius),
+            Kernel::Bspline => Profile { std, radius, norm: 1.0, degree: Some(3) },
+            Kernel::Tent => Profile { std, radius, norm: 1.0, degree: Some(1) },
+        }
     }
 
     fn bell(&self, u: f64) -> f64 {
         libm::exp(-u * u / (2.0 * self.std * self.std))
     }
 
+    /// A B-spline of `degree` as a difference of truncated powers, here of `power`: with `power`
+    /// one more it is its integral, with one less its slope.
+    fn spline(&self, u: f64, degree: i32, power: i32) -> f64 {
+        let (mut binomial, mut sum) = (1.0, 0.0);
+        for k in 0..=degree + 1 {
+            let x = u + self.radius - f64::from(k);
+            if x > 0.0 {
+                sum += binomial * x.powi(power);
+            }
+            binomial *= -f64::from(degree + 1 - k) / f64::from(k + 1);
+        }
+        sum / (1..=power).map(f64::from).product::<f64>()
+    }
+
     /// g(u), per vox.
     pub fn at(&self, u: f64) -> f64 {
-        if u.abs() < self.radius {
-            (self.bell(u) - self.bell(self.radius)) / self.norm
-        } else {
-            0.0
+        match self.degree {
+            _ if u.abs() >= self.radius => 0.0,
+            None => (self.bell(u) - self.bell(self.radius)) / self.norm,
+            Some(degree) => self.spline(u, degree, degree),
         }
     }
 
     /// `|g'(u)|`.
     fn steepness(&self, u: f64) -> f64 {
-        if u.abs() <= self.radius {
-            u.abs() / (self.std * self.std) * self.bell(u) / self.norm
-        } else {
-            0.0
+        match self.degree {
+            _ if u.abs() > self.radius => 0.0,
+            None => u.abs() / (self.std * self.std) * self.bell(u) / self.norm,
+            Some(degree) => self.spline(u, degree, degree - 1).abs(),
         }
     }
 
@@ -66,7 +93,11 @@ impl Profile {
 
     /// The integral of g up to `u`: 0 to 1.
     pub fn integral_to(&self, u: f64) -> f64 {
-        self.unnormalised(u.clamp(-self.radius, self.radius)) / self.norm
+        let u = u.clamp(-self.radius, self.radius);
+        match self.degree {
+            None => self.unnormalised(u) / self.norm,
+            Some(degree) => self.spline(u, degree, degree + 1),
+        }
     }
 
     /// Lattice points whose kernels reach `u`, of those in `of`.

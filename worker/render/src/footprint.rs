@@ -8,6 +8,9 @@
 //! g(u) = (exp(-u^2 / 2 s^2) - exp(-R^2 / 2 s^2)) / Z,   |u| < R
 //! ```
 //!
+//! or a B-spline of the lattice's steps, the cubic one or the tent, which add up to one wherever
+//! along a lattice's axis one looks.
+//!
 //! A voxel's *section* in a sheet is the integral of g between the sheet's planes (the paper's
 //! array of footprints, section 3); its footprint on the screen is g(x) g(y) at pixel centres.
 //! Positions come in phases (1/256 pixel, 1/256 sheet or finer), so both are tables, filled in
@@ -15,6 +18,7 @@
 
 use crate::splat::Tap;
 use glam::DVec3;
+use slabcast_common::quality::Kernel;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, View};
 use std::collections::BTreeMap;
@@ -23,6 +27,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 /// One axis of the kernel. Lengths in vox.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Profile {
+    kernel: Kernel,
     std: f64,
     radius: f64,
     /// What weights are multiplied by before they become 16-bit fixed point.
@@ -32,13 +37,27 @@ pub struct Profile {
 }
 
 impl Profile {
+    /// `kernel` of deviation `std` and `radius`, which are those of [`Quality::shape`] times the
+    /// length of a step of the lattice.
+    ///
+    /// [`Quality::shape`]: slabcast_common::quality::Quality::shape
+    pub fn new(kernel: Kernel, std: f64, radius: f64) -> Self {
+        match kernel {
+            Kernel::Gaussian => Profile::gaussian(std, radius),
+            Kernel::Bspline | Kernel::Tent => {
+                Profile { kernel, std, radius, spread: 1.0, edge: 0.0, norm: 1.0 }
+            }
+        }
+    }
+
     /// Gaussian of `std`, cut at `radius`.
-    pub fn new(std: f64, radius: f64) -> Self {
+    pub fn gaussian(std: f64, radius: f64) -> Self {
         let edge = libm::exp(-radius * radius / (2.0 * std * std));
         let bell = std
             * (2.0 * std::f64::consts::PI).sqrt()
             * libm::erf(radius / (std * std::f64::consts::SQRT_2));
-        Profile { std, radius, spread: 1.0, edge, norm: bell - 2.0 * radius * edge }
+        let norm = bell - 2.0 * radius * edge;
+        Profile { kernel: Kernel::Gaussian, std, radius, spread: 1.0, edge, norm }
     }
 
     /// The same for a lattice whose steps are `spread` vox along this axis: weights in fixed point
@@ -53,17 +72,42 @@ impl Profile {
         if u.abs() >= self.radius {
             return 0.0;
         }
-        (libm::exp(-u * u / (2.0 * self.std * self.std)) - self.edge) / self.norm
+        match self.kernel {
+            Kernel::Gaussian => {
+                (libm::exp(-u * u / (2.0 * self.std * self.std)) - self.edge) / self.norm
+            }
+            Kernel::Bspline => {
+                let step = 0.5 * self.radius;
+                let (t, rest) = (u.abs() / step, 2.0 - u.abs() / step);
+                let near = 2.0 / 3.0 + t * t * (0.5 * t - 1.0);
+                (if t < 1.0 { near } else { rest * rest * rest / 6.0 }) / step
+            }
+            Kernel::Tent => (1.0 - u.abs() / self.radius) / self.radius,
+        }
     }
 
     /// The integral of g from -radius to `u`: 0 to 1.
     pub fn integral_to(&self, u: f64) -> f64 {
         let u = u.clamp(-self.radius, self.radius);
-        let root2 = std::f64::consts::SQRT_2;
-        let bell = self.std
-            * (std::f64::consts::PI / 2.0).sqrt()
-            * (libm::erf(u / (self.std * root2)) + libm::erf(self.radius / (self.std * root2)));
-        (bell - self.edge * (u + self.radius)) / self.norm
+        // What lies between the middle and `t` steps of a spline.
+        let half = |t: f64| match self.kernel {
+            Kernel::Tent => t * (1.0 - 0.5 * t),
+            _ if t < 1.0 => t * (2.0 / 3.0 + t * t * (0.125 * t - 1.0 / 3.0)),
+            _ => 0.5 - (2.0 - t) * (2.0 - t) * (2.0 - t) * (2.0 - t) / 24.0,
+        };
+        let steps = match self.kernel {
+            Kernel::Gaussian => {
+                let root2 = std::f64::consts::SQRT_2;
+                let bell = self.std
+                    * (std::f64::consts::PI / 2.0).sqrt()
+                    * (libm::erf(u / (self.std * root2))
+                        + libm::erf(self.radius / (self.std * root2)));
+                return (bell - self.edge * (u + self.radius)) / self.norm;
+            }
+            Kernel::Bspline => u / (0.5 * self.radius),
+            Kernel::Tent => u / self.radius,
+        };
+        if steps < 0.0 { 0.5 - half(-steps) } else { 0.5 + half(steps) }
     }
 }
 
@@ -331,7 +375,8 @@ pub struct Footprints {
     shelf: Arc<Shelf>,
 }
 
-/// Tables by scale that frames of one scene share: along a turn a sheet's scale is the same in all.
+/// Tables by scale that frames of one scene share, which has one kernel: along a turn a sheet's scale
+/// is the same in all.
 #[derive(Debug, Default)]
 pub struct Shelf {
     tables: Mutex<BTreeMap<Key, Arc<Tables>>>,
@@ -377,11 +422,19 @@ impl Shelf {
 pub type Span<'a> = (i32, &'a [Tap]);
 
 impl Footprints {
-    /// The footprints of `view` for sheets in `range`; `spread` is the length of a lattice step
-    /// along the eye's axes in vox ([`Profile::with_spread`]). Tables are taken from `shelf`.
-    pub fn new(view: &View, range: SheetRange, spread: DVec3, shelf: Arc<Shelf>) -> Self {
-        let x = Profile::new(view.kernel_std.x, view.kernel_radius.x).with_spread(spread.x);
-        let y = Profile::new(view.kernel_std.y, view.kernel_radius.y).with_spread(spread.y);
+    /// The footprints of `view` with `kernel` for sheets in `range`; `spread` is the length of a
+    /// lattice step along the eye's axes in vox ([`Profile::with_spread`]). Tables are taken from
+    /// `shelf`.
+    pub fn new(
+        view: &View,
+        kernel: Kernel,
+        range: SheetRange,
+        spread: DVec3,
+        shelf: Arc<Shelf>,
+    ) -> Self {
+        let (std, radius) = (view.kernel_std, view.kernel_radius);
+        let x = Profile::new(kernel, std.x, radius.x).with_spread(spread.x);
+        let y = Profile::new(kernel, std.y, radius.y).with_spread(spread.y);
         let reach = view.kernel_radius.x.max(view.kernel_radius.y);
         let sheets = match view.projection {
             Projection::Ortho { .. } => 1,
@@ -534,15 +587,36 @@ impl<'a> Footprint<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use proptest::prelude::*;
+    use slabcast_common::quality::Quality;
+
+    /// Each kernel, in several widths.
+    fn profiles() -> Vec<Profile> {
+        let gaussians = [(0.6, 2.0), (0.5, 2.0), (0.7, 2.0), (0.4, 1.0), (1.0, 3.0)];
+        let mut all: Vec<_> = gaussians.map(|(std, r)| Profile::gaussian(std, r)).to_vec();
+        for kernel in [Kernel::Bspline, Kernel::Tent] {
+            let [std, radius] = Quality { kernel, ..Quality::default() }.shape();
+            all.extend([1.0, 2.5].map(|step| Profile::new(kernel, std * step, radius * step)));
+        }
+        all
+    }
 
     #[test]
     fn the_profile_integrates_to_one_and_ends_at_zero() {
-        for (std, radius) in [(0.6, 2.0), (0.5, 2.0), (0.7, 2.0), (0.4, 1.0), (1.0, 3.0)] {
-            let p = Profile::new(std, radius);
-            let n = 20_000;
-            let h = 2.0 * radius / n as f64;
-            let sum: f64 = (0..n).map(|i| p.at(-radius + (i as f64 + 0.5) * h) * h).sum();
-            assert!((sum - 1.0).abs() < 1e-7, "std {std}: {sum}");
+        for p in profiles() {
+            let (radius, n) = (p.radius, 20_000);
+            let h = 2.0 * radius / f64::from(n);
+            let (mut sum, mut square) = (0.0, 0.0);
+            for i in 0..n {
+                let u = -radius + (f64::from(i) + 0.5) * h;
+                assert!((p.integral_to(u - 0.5 * h) - sum).abs() < 1e-7, "{p:?} at {u}");
+                sum += p.at(u) * h;
+                square += p.at(u) * h * u * u;
+            }
+            assert!((sum - 1.0).abs() < 1e-7, "{p:?}: {sum}");
+            // A Gaussian's is that before it was cut.
+            let cut = if p.kernel == Kernel::Gaussian { 0.2 * p.std } else { 1e-7 };
+            assert!((square.sqrt() - p.std).abs() < cut, "{p:?}: {square}");
             assert!((p.integral_to(radius) - 1.0).abs() < 1e-12);
             assert!(p.integral_to(-radius).abs() < 1e-12);
             assert!((p.integral_to(0.0) - 0.5).abs() < 1e-12);
@@ -550,10 +624,33 @@ mod tests {
         }
     }
 
+    proptest! {
+        #[test]
+        fn splines_add_up_to_one_on_the_lattice_at_any_phase(
+            phase in 0.0..1.0f64, step in 0.1..50.0f64, tent in any::<bool>(),
+        ) {
+            let kernel = if tent { Kernel::Tent } else { Kernel::Bspline };
+            let [std, radius] = Quality { kernel, ..Quality::default() }.shape();
+            let p = Profile::new(kernel, std * step, radius * step);
+            let at = |k: i32| (f64::from(k) + phase) * step;
+            let sum: f64 = (-3..=3).map(|k| p.at(at(k)) * step).sum();
+            prop_assert!((sum - 1.0).abs() < 1e-14, "{sum}");
+            // And so do their sections, of any thickness.
+            let d = step * (0.01 + phase * 3.0);
+            let sheet: f64 =
+                (-9..=9).map(|k| p.integral_to(at(k) + d) - p.integral_to(at(k))).sum();
+            prop_assert!((sheet * step / d - 1.0).abs() < 1e-12, "{sheet}");
+        }
+    }
+
     #[test]
     fn sections_of_a_voxel_add_up_to_it() {
-        let p = Profile::new(0.6, 2.0);
-        for d in [1.0 / 64.0, 0.25, 1.0, 1.7, 5.0, 300.0] {
+        let all = [Kernel::Gaussian, Kernel::Bspline, Kernel::Tent];
+        let all = all.map(|kernel| Quality { kernel, ..Quality::default() });
+        let thick = [1.0 / 64.0, 0.25, 1.0, 1.7, 5.0, 300.0];
+        for (q, d) in all.iter().flat_map(|q| thick.map(|d| (q, d))) {
+            let [std, radius] = q.shape();
+            let p = Profile::new(q.kernel, std, radius);
             let [whole, merged] = [false, true].map(|merged| Sections::new(&p, d, 256, merged));
             for z in [-5000, -257, -256, -1, 0, 1, 77, 255, 256, 9999] {
                 for s in [&whole, &merged] {
@@ -567,8 +664,8 @@ mod tests {
                 let at = f64::from(z) / 256.0;
                 let (front, w) = whole.of(z);
                 let end = front + w.len() as i32;
-                assert_eq!(front, (at - 2.0 / d).floor() as i32);
-                assert_eq!(end, (at + 2.0 / d).ceil() as i32);
+                assert_eq!(front, (at - radius / d).floor() as i32);
+                assert_eq!(end, (at + radius / d).ceil() as i32);
                 // Or those but for slivers.
                 let (first, w) = merged.of(z);
                 let last = first + w.len() as i32;
@@ -582,7 +679,7 @@ mod tests {
 
     #[test]
     fn without_slivers_a_voxel_lies_in_four_sheets_of_a_vox() {
-        let p = Profile::new(0.6, 2.0);
+        let p = Profile::gaussian(0.6, 2.0);
         let most =
             |merged| [0.25, 0.5, 1.0, 2.0, 40.0].map(|d| Sections::new(&p, d, 256, merged).most());
         assert_eq!(most(false), [17, 9, 5, 3, 2]);
@@ -593,7 +690,7 @@ mod tests {
     /// section 4: at most 0.6 % in any direction; here along the lattice and on a diagonal.
     #[test]
     fn a_constant_field_comes_back_with_little_ripple() {
-        let p = Profile::new(0.6, 2.0);
+        let p = Profile::gaussian(0.6, 2.0);
         let mut worst = 0.0f64;
         for i in 0..200 {
             let x = i as f64 / 200.0;

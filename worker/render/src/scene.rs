@@ -118,8 +118,9 @@ impl Frame {
         let range = view.project(&whole).map_or(SheetRange::new(0, 0), |p| p.sheets);
         // One sheet farther for the peek.
         let range = SheetRange::new(range.first, range.end + 1);
-        let spread = view.kernel_std / q.std;
-        let profile = Profile::new(view.kernel_std.z, view.kernel_radius.z).with_spread(spread.z);
+        let spread = view.kernel_std / q.shape()[0];
+        let profile = Profile::new(q.kernel, view.kernel_std.z, view.kernel_radius.z);
+        let profile = profile.with_spread(spread.z);
         let d = view.thickness;
         let (raw_scale, unit) = match q.sums {
             Sums::F32 => (1.0, 1.0),
@@ -140,7 +141,7 @@ impl Frame {
             Projection::Persp { .. } => None,
         };
         let rule = Rule::new(q.compositing, unit, d / view.kernel_std.z, q.eps as f32);
-        let footprints = Footprints::new(&view, range, spread, scene.shelf.clone());
+        let footprints = Footprints::new(&view, q.kernel, range, spread, scene.shelf.clone());
         let reach = footprints.at(0).and_then(|f| f.reach()).filter(|&r| r <= REACH_MOST);
         let flat = reach.and_then(|reach| Some(Flat { places: Places::new(&view)?, reach }));
         Frame {

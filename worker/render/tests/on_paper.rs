@@ -8,7 +8,7 @@ use slabcast_common::ids::SceneId;
 use slabcast_common::image::{FrameState, Picture, TilePixels};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::quality::{Compositing, Quality, Sums};
+use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
 use slabcast_common::shade::Shading;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{
@@ -103,6 +103,28 @@ fn block(across: u32, deep: u32) -> Volume {
 fn stack(across: u32, layers: Vec<Layer>) -> Stack {
     let n = across as i32;
     Stack { profile: profile(), across: [0..n, 0..n], layers }
+}
+
+/// The tent only where no position is rounded: its slope jumps, and what a shift does to it is not
+/// bounded by the slope where it was.
+#[test]
+fn walls_of_splines_keep_their_bounds() {
+    let n = 8;
+    for (kernel, scale) in [(Kernel::Bspline, 4.0), (Kernel::Bspline, 3.7), (Kernel::Tent, 4.0)] {
+        for (sigma, thickness) in [(0.05, 1.0), (2.0, 1.0), (2.0, 0.3), (0.5, 3.5)] {
+            let tf = extinctions(vec![[0.0, 1.0, 0.5, 0.25]], vec![[0.0, sigma]]);
+            let q = Quality { kernel, thickness, ..Quality::default() };
+            let shot = Shot::new(block(n, 6), tf, q, DVec3::Y, (n, scale));
+            let scale = f64::from(shot.view.size[1]) / (f64::from(shot.view.size[1]) / scale);
+            let layers = vec![Layer { sigma, rgb: [1.0, 0.5, 0.25] }; 6];
+            let stack = Stack { profile: Profile::of(&q), ..stack(n, layers) };
+            let shift = if scale == 4.0 { 0.0 } else { 0.5 / f64::from(SUBPIXELS) / scale };
+            let what = format!("{kernel:?}, {sigma} in sheets of {thickness}");
+            let most = judge(&shot, &shot.picture(), &stack, scale, shift, &what);
+            println!("{what}: {most:.3} of the bound");
+            assert!(most > 0.01, "a bound that nothing comes near says nothing: {most}");
+        }
+    }
 }
 
 /// Pixels of `picture` against the stack; the largest share of its bound that an error takes.

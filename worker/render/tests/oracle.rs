@@ -12,7 +12,7 @@ use slabcast_common::ids::SceneId;
 use slabcast_common::image::{FrameState, Picture};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::quality::{Compositing, Quality, Sums};
+use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
 use slabcast_common::shade::Shading;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
@@ -83,6 +83,8 @@ proptest! {
         cuts in prop::collection::vec(0.0..1.0f64, 0..5),
         spacing in prop::sample::select(vec![1.0, 1.0, 2.5]),
         zoom in prop::sample::select(vec![0.3, 1.25, 1.25, 6.0]),
+        kernel in prop::sample::select(
+            vec![Kernel::Gaussian, Kernel::Gaussian, Kernel::Bspline, Kernel::Tent]),
     ) {
         // Blobs: correlated values, with empty space between.
         let hash = |i: u32, j: u32, k: u32| {
@@ -96,7 +98,7 @@ proptest! {
             if h < 110 { 0 } else { h.wrapping_add((i * 7 + j * 3 + k) as u8 & 31) }
         });
         v.lattice = Lattice::from_spacing(v.lattice.dims, [1.0, spacing, 1.0]);
-        let quality = Quality { thickness, eps, compositing, sums, ..Quality::default() };
+        let quality = Quality { thickness, eps, compositing, sums, kernel, ..Quality::default() };
         let camera = Camera {
             to_eye: DVec3::new(azimuth.sin(), azimuth.cos(), tilt),
             up: DVec3::Z,

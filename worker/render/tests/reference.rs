@@ -7,11 +7,12 @@ use glam::DVec3;
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::message::SceneSpec;
-use slabcast_common::quality::{Compositing, Quality, Sums};
+use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
 use slabcast_common::shade::Shading;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
+use slabcast_render::closed::{Layer, Profile, Stack};
 use slabcast_render::reference::{ErrorFigures, Reference, Section, Sheets, stratified};
 use slabcast_render::{Frame, Scene, serial};
 use std::f64::consts::PI;
@@ -668,4 +669,37 @@ fn without_truncation_a_voxel_is_a_gaussian() {
         }
     }
     assert!(beyond > 10, "the tail was looked at: {beyond}");
+}
+
+/// Walls under B-splines, against truncated powers.
+#[test]
+fn splines_are_judged_by_what_is_known_on_paper() {
+    for kernel in [Kernel::Bspline, Kernel::Tent] {
+        let quality = Quality { kernel, ..i32_sums() };
+        let (n, deep) = (8, 6);
+        let volume = Volume::from_fn_u8("wall", [n, deep, n], |_, _, _| 100);
+        let (camera, size) = front(&volume);
+        let tf = alpha(vec![[0.0, 0.25, 0.5, 1.0]], vec![[0.0, 0.4]]);
+        let asked = Asked::new(volume, tf, quality, camera, size);
+        let reference = asked.reference();
+        let layer = Layer { sigma: -libm::log1p(-0.4), rgb: [0.25, 0.5, 1.0] };
+        let stack = Stack {
+            profile: Profile::of(&quality),
+            across: [0..n as i32, 0..n as i32],
+            layers: vec![layer; deep as usize],
+        };
+        for (x, y) in (0..size).step_by(3).flat_map(|x| (0..size).step_by(5).map(move |y| (x, y))) {
+            let (u, v) = looks_at(&asked.volume, size, x, y);
+            let want = stack.pixel([u, v]);
+            let what = format!("{kernel:?} at {x},{y}");
+            assert_near(reference.pixel(x, y), want, 1e-7, &what);
+            assert_near(reference.at_same_thickness(x, y), want, 1e-7, &what);
+            // Nothing is cut off, and along the axes nothing ripples.
+            let whole = asked.reference().without_truncation();
+            assert_eq!(whole.pixel(x, y), reference.pixel(x, y), "{what}");
+        }
+        let inside = (size / 2, size / 2);
+        let level = asked.reference().without_ripple().pixel(inside.0, inside.1);
+        assert_near(level, reference.pixel(inside.0, inside.1), 1e-7, "without ripple");
+    }
 }

@@ -9,7 +9,7 @@ use glam::DVec3;
 use slabcast_common::message::PathRequest;
 use slabcast_common::path::{Orientation, PathView, ProjectionKind, ViewPath};
 use slabcast_common::presets;
-use slabcast_common::quality::{Compositing, Quality, Sums, Work};
+use slabcast_common::quality::{Compositing, Kernel, Quality, Sums, Work};
 use slabcast_common::transfer::{OpacityUnit, TransferFunction};
 use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
@@ -39,8 +39,9 @@ type Formula = (&'static str, &'static str, &'static str, Tweak);
 
 /// What formula volumes are there for: shaded and opaque; faint and unlit, where nothing hides
 /// anything; 16-bit; float with a ramp of opacity; step edges in thin sheets; one voxel; a line
-/// longer than any picture; each compositing rule; sums in floats; nothing shut at all; 16-bit sums.
-const FORMULAS: [Formula; 12] = [
+/// longer than any picture; each compositing rule; sums in floats; nothing shut at all; 16-bit
+/// sums; each kernel.
+const FORMULAS: [Formula; 14] = [
     ("formula:spheres", "spheres/auto", "auto", |_| {}),
     ("formula:fog", "fog/grey", "grey", |_| {}),
     ("formula:blob", "blob/extinction", "extinction", |_| {}),
@@ -64,6 +65,8 @@ const FORMULAS: [Formula; 12] = [
     }),
     ("formula:line", "line/bone", "bone", |_| {}),
     ("formula:one", "one/peer-opaque", "peer-opaque", |_| {}),
+    ("formula:spheres", "spheres/auto/bspline", "auto", |q| q.kernel = Kernel::Bspline),
+    ("formula:spheres", "spheres/auto/tent", "auto", |q| q.kernel = Kernel::Tent),
 ];
 
 /// How many of [`FORMULAS`] the matrix takes: those that differ in how they are rendered. The

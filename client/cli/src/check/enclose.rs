@@ -125,12 +125,13 @@ impl<'a> Enclosure<'a> {
         let whole = TightBox { lo: [0; 3], hi: frame.scene.dims.map(|n| n - 1) };
         let range = view.project(&whole).map_or(SheetRange::default(), |p| p.sheets);
         let y = view.thickness / view.kernel_std.z;
-        let (std, radius) = (view.kernel_std, view.kernel_radius);
+        let (kernel, std, radius) =
+            (ready.spec.quality.kernel, view.kernel_std, view.kernel_radius);
         Enclosure {
             kernel: [
-                Profile::new(std.x, radius.x),
-                Profile::new(std.y, radius.y),
-                Profile::new(std.z, radius.z),
+                Profile::new(kernel, std.x, radius.x),
+                Profile::new(kernel, std.y, radius.y),
+                Profile::new(kernel, std.z, radius.z),
             ],
             rects,
             range: SheetRange::new(range.first - 1, range.end + 1),

@@ -108,7 +108,7 @@ impl Reference {
             })
             .collect();
         bricks.sort_by_key(|(brick, _)| brick.id);
-        let (std, radius) = (view.kernel_std, view.kernel_radius);
+        let (kernel, std, radius) = (spec.quality.kernel, view.kernel_std, view.kernel_radius);
         let classifier = |c| Classifier::new(&spec.transfer, &spec.volume, c);
         Reference {
             view,
@@ -118,9 +118,9 @@ impl Reference {
             compositing: spec.quality.compositing,
             shader: spec.transfer.shading.on.then(|| Shader::new(&spec.transfer.shading)),
             kernel: [
-                Profile::new(std.x, radius.x),
-                Profile::new(std.y, radius.y),
-                Profile::new(std.z, radius.z),
+                Profile::new(kernel, std.x, radius.x),
+                Profile::new(kernel, std.y, radius.y),
+                Profile::new(kernel, std.z, radius.z),
             ],
             index_from_eye: m.inverse(),
             bricks,

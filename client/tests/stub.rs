@@ -144,6 +144,7 @@ fn stats(frame: u64) -> FrameStats {
         retries: 0,
         dropped_results: 0,
         poisoned: vec![],
+        critical_path: None,
     }
 }
 

@@ -189,6 +189,9 @@ pub struct FrameStats {
     /// Tiles given up after three workers were lost with them: `slab`, tile.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub poisoned: Vec<PoisonedTile>,
+    /// What the frame waited for, in one sentence for people.
+    #[serde(default)]
+    pub critical_path: Option<String>,
 }
 
 /// A macrotile that took three workers with it. Its pixels stay as the slabs before left them.

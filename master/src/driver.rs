@@ -11,6 +11,7 @@ use crate::finish;
 use crate::jobs::{FinishedFrame, Job, JobState, JobView, Jobs, Watch};
 use crate::link::{BrickOrder, WorkerLink};
 use crate::memory;
+use crate::record::{Recorder, Watched};
 use slabcast_common::ids::{FrameId, JobId, SceneId, WorkerId};
 use slabcast_common::message::{Hello, PathRequest, SceneSpec, ToMaster, ToWorker, TransferChoice};
 use slabcast_common::path::Orientation;
@@ -24,7 +25,7 @@ use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_common::wanted::Wanted;
 use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
 use slabcast_proto::model::Worker;
-use slabcast_schedule::{Action, Clock, Event as Happened, FrameJob, Micros, Scheduler};
+use slabcast_schedule::{Action, Clock, Event as Happened, FrameJob, Micros};
 use slabcast_volumes::BrickStore;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -53,6 +54,8 @@ pub struct MasterConfig {
     pub frame_budget_bytes: usize,
     /// The scheduler's settings.
     pub schedule: slabcast_schedule::Config,
+    /// Where what the scheduler is told and decides is written down ([`crate::record::start`]).
+    pub record: Option<Recorder>,
 }
 
 impl MasterConfig {
@@ -63,6 +66,7 @@ impl MasterConfig {
             orientation,
             frame_budget_bytes: 256 << 20,
             schedule: slabcast_schedule::Config::default(),
+            record: None,
         }
     }
 }
@@ -201,7 +205,7 @@ impl Master {
             budget: config.frame_budget_bytes,
             clock: RealClock(Instant::now()),
             silence: config.schedule.silence,
-            scheduler: Scheduler::new(config.schedule),
+            scheduler: Watched::new(config.schedule, config.record),
             links: BTreeMap::new(),
             next_worker: 1,
             next_frame: 1,
@@ -393,7 +397,7 @@ struct Driver {
     budget: usize,
     clock: RealClock,
     silence: Micros,
-    scheduler: Scheduler,
+    scheduler: Watched,
     links: BTreeMap<WorkerId, Attached>,
     next_worker: u64,
     next_frame: u64,

@@ -88,6 +88,9 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
     // Frames of a job count from its first; people count those of the path.
     let number = stats.frame;
     stats.frame += s.request.path.first_frame() as u64;
+    if let Some(path) = &mut stats.critical_path {
+        *path = format!("frame {}: {path}", stats.frame);
+    }
     stats.view_sha256 = view_sha256(&s.scene, s.crop.as_ref(), &s.view).to_string();
     stats.pixels_sha256 = picture.sha256().to_string();
     stats.pixels_version = slabcast_common::PIXELS_VERSION;

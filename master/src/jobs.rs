@@ -299,6 +299,7 @@ mod tests {
             retries: 0,
             dropped_results: 0,
             poisoned: vec![],
+            critical_path: None,
         };
         Arc::new(FinishedFrame {
             number,

@@ -7,6 +7,7 @@
 //!   for them.
 //! - [`finish`] turns finished sums into pictures, hashes and bytes, beside the driver.
 //! - [`link`] is a worker's end at the master, and the embedded link that needs no network.
+//! - [`record`] writes down what the scheduler is told and decides, and replays it.
 //! - [`serve`] is gRPC: the only part that knows TCP.
 //!
 //! The master never draws and never multiplies colours; `render` is not among its crates.
@@ -16,6 +17,7 @@ pub mod finish;
 pub mod jobs;
 pub mod link;
 mod memory;
+pub mod record;
 pub mod serve;
 
 pub use driver::{Handle, Master, MasterConfig, SubmitError};

@@ -7,7 +7,7 @@
 use crate::embedded::{cores, start_master};
 use crate::fail::{Fail, reason, say};
 use crate::request::{AxisArgs, lattice_notice};
-use crate::{parse, runtime, signals, volume};
+use crate::{parse, record, runtime, signals, volume};
 use slabcast_common::path::Axis;
 use slabcast_master::{Handle, MasterConfig};
 use slabcast_render::splat::Simd;
@@ -53,6 +53,9 @@ pub(crate) struct MasterArgs {
     #[arg(long,
           value_parser = clap::builder::FalseyValueParser::new())]
     insecure: bool,
+    /// What the scheduler is told and decides, for `slabcast replay`; some 25 KB a frame
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
 }
 
 const WORKER_EXAMPLES: &str = "\
@@ -94,10 +97,19 @@ pub(crate) fn master(args: &MasterArgs) -> Result<(), Fail> {
     let volume = args.input.open(&args.volume)?;
     let (name, lattice) = (volume.name.clone(), volume.lattice);
     let orientation = axes.of(&volume)?;
-    let config = MasterConfig::new(volume, orientation);
+    let mut config = MasterConfig::new(volume, orientation);
+    if let Some(path) = &args.record {
+        record::may(path, &[&args.volume])?;
+    }
+    let mut recording = None;
     let result = runtime.block_on(async {
         let listener = listen(socket, &args.listen)?;
         let address = local(&listener)?;
+        if let Some(path) = &args.record {
+            let (recorder, begun) = record::begin(path)?;
+            config.record = Some(recorder);
+            recording = Some(begun);
+        }
         let master = start_master(config)?;
         let handle = master.handle();
         signals::listen();
@@ -142,11 +154,15 @@ pub(crate) fn master(args: &MasterArgs) -> Result<(), Fail> {
         if tokio::time::timeout(DRAIN, drained).await.is_err() {
             warn!("gave up waiting for connections to end");
         }
-        info!("stopped");
         Ok(())
     });
     runtime::end(runtime);
-    result
+    // The driver has ended, or has given up within its time: then its record is not whole.
+    let recorded = recording.map_or(Ok(()), record::Recording::end);
+    result?;
+    recorded?;
+    info!("stopped");
+    Ok(())
 }
 
 /// Takes the address without opening it. Refuses what others can reach, unless `insecure`.

@@ -6,6 +6,7 @@
 use crate::fail::Fail;
 use slabcast_common::path::Orientation;
 use slabcast_common::volume::Volume;
+use slabcast_master::record::Recorder;
 use slabcast_master::{Handle, Master, MasterConfig, link};
 use slabcast_render::splat::Simd;
 use slabcast_worker::{BrickCache, Config, Ended, Link};
@@ -74,9 +75,11 @@ impl Cluster {
         volume: Volume,
         orientation: Orientation,
         crew: Crew,
+        record: Option<Recorder>,
     ) -> Result<Cluster, Fail> {
         let mut config = MasterConfig::new(volume, orientation);
         config.schedule.silence = SILENCE;
+        config.record = record;
         let master = start_master(config)?;
         let (stop, stopped) = watch::channel(false);
         let mut workers = JoinSet::new();

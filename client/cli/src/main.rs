@@ -6,6 +6,7 @@
 //!   says of itself, and [`show`] draws how it came about.
 //! - [`daemon`] is `master` and `worker`; [`doctor`] says whether a machine is fit for them, and
 //!   [`demo`] needs no file.
+//! - [`record`] writes a scheduler's decisions down and makes them again.
 //! - [`transfer`] is colours and opacities, and [`tf`] writes them down.
 //! - [`info`] looks into files, [`convert`] writes them in another format, [`ask`] looks at a running
 //!   master.
@@ -38,6 +39,7 @@ mod output;
 mod parse;
 mod plot;
 mod progress;
+mod record;
 mod remote;
 mod render;
 mod request;
@@ -99,6 +101,7 @@ enum Command {
     Status(ask::StatusArgs),
     Jobs(ask::JobsArgs),
     Cancel(ask::CancelArgs),
+    Replay(record::ReplayArgs),
     Error(Box<error::ErrorArgs>),
     Explain(Box<explain::ExplainArgs>),
     Bench(Box<bench::BenchArgs>),
@@ -158,6 +161,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
         Command::Status(args) => ask::status(args),
         Command::Jobs(args) => ask::jobs(args),
         Command::Cancel(args) => ask::cancel(args),
+        Command::Replay(args) => record::run(args),
         Command::Error(args) => error::run(args),
         Command::Explain(args) => explain::run(args),
         Command::Bench(args) => bench::run(args),

@@ -7,6 +7,7 @@ use crate::fail::{Fail, say};
 use crate::output::provenance::Recipe;
 use crate::output::{Format, Frame, Lines, Output, OutputArgs, Patience, Writer};
 use crate::progress::{self, Progress, Step};
+use crate::record::{self, Recording};
 use crate::request::{self, Asked, LookArgs, WorkArgs};
 use crate::show::{self, Show};
 use crate::stage::Stage;
@@ -96,6 +97,9 @@ pub(crate) struct RenderArgs {
     /// Time line of all workers for Perfetto or chrome://tracing
     #[arg(long, value_name = "FILE.json", help_heading = "Output")]
     trace: Option<PathBuf>,
+    /// What the scheduler of this process is told and decides, for `slabcast replay`
+    #[arg(long, value_name = "FILE", help_heading = "Output")]
+    record: Option<PathBuf>,
     /// No progress, only warnings and the result
     #[arg(short, long, help_heading = "Output")]
     quiet: bool,
@@ -160,6 +164,7 @@ struct Run {
     notes: Vec<String>,
     stats: Lines,
     trace: Lines,
+    record: Option<PathBuf>,
     progress: Progress,
     began: Instant,
     /// Whether it ends with a line that says where the pictures are.
@@ -185,6 +190,12 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         }
     };
     if master.is_some() {
+        if args.record.is_some() {
+            return Err(Fail::usage(
+                "--record: the scheduler of a cluster is its master's; give --record to `slabcast \
+                 master`",
+            ));
+        }
         if !args.input.is_empty() {
             return Err(Fail::usage(
                 "--dims, --type and the like say what is in a file, and with --master the master \
@@ -213,10 +224,14 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     if let Some(show) = args.show {
         showable(show, args, output.format, &asked)?;
     }
+    if let Some(path) = &args.record {
+        record::may(path, &inputs)?;
+    }
     let patience = Arc::new(Patience::default());
     let run = Run {
         stats: Lines::open(args.stats.as_deref(), "stats", &inputs, &patience)?,
         trace: Lines::open(args.trace.as_deref(), "trace", &inputs, &patience)?,
+        record: args.record.clone(),
         progress: Progress::new(args.quiet),
         began: Instant::now(),
         stands: args.quiet
@@ -262,6 +277,7 @@ pub(crate) fn again(asked: Asked, output: Output, volume: Volume, quiet: bool) -
         notes: Vec::new(),
         stats: Lines::None,
         trace: Lines::None,
+        record: None,
         progress: Progress::new(quiet),
         began: Instant::now(),
         tell: false,
@@ -287,7 +303,8 @@ async fn embedded(
         ));
     }
     let anatomical = volume.anatomical;
-    let mut cluster = Cluster::start(volume, orientation, crew)?;
+    let (recorder, recording) = run.record.take().map(|p| record::begin(&p)).transpose()?.unzip();
+    let mut cluster = Cluster::start(volume, orientation, crew, recorder)?;
     let handle = cluster.handle();
     let info = handle.volume().info.clone();
     let recipe = run.ready(&info, orientation, anatomical)?;
@@ -350,7 +367,8 @@ async fn embedded(
         trouble = cluster.trouble() => Err(trouble),
     };
     cluster.end().await;
-    result
+    let recorded = recording.map_or(Ok(()), Recording::end);
+    result.and(recorded)
 }
 
 /// What can be shown how.
@@ -368,6 +386,7 @@ fn showable(show: Show, args: &RenderArgs, format: Format, asked: &Asked) -> Res
         (args.master.is_some(), "master"),
         (args.stats.is_some(), "stats"),
         (args.trace.is_some(), "trace"),
+        (args.record.is_some(), "record"),
     ] {
         if given {
             return Err(Fail::usage(format!(

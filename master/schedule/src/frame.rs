@@ -11,6 +11,7 @@
 //! A frame waits, with nothing lost, while there is no worker. It refuses to know who is silent
 //! (`roster`), which copy of a result counts (`queue`) and where bricks are (`residency`).
 
+use crate::critical::Piece;
 use crate::ledger::{Ledger, Rendered, ms, place_in_time};
 use crate::macrotile::{self, Cut, LEAF, LEVELS};
 use crate::queue::{End, Queue, Verdict};
@@ -61,6 +62,8 @@ struct Slab {
     served: BTreeSet<WorkerId>,
     /// End of each render thread's last task.
     dry: BTreeMap<(WorkerId, u32), Micros>,
+    /// Tiles that counted.
+    pieces: Vec<Piece>,
 }
 
 impl Slab {
@@ -206,6 +209,7 @@ impl Frame {
             order: order.into_iter().map(|(_, i)| i).collect(),
             served: BTreeSet::new(),
             dry: BTreeMap::new(),
+            pieces: Vec::new(),
         });
         self.ledger.cull_us += clock.now().saturating_sub(began);
     }
@@ -241,6 +245,7 @@ impl Frame {
                 waited += idle * now.saturating_sub(slab.began.max(worker.since));
             }
         }
+        self.ledger.phase(&slab.pieces, slab.began);
         self.ledger.retries += slab.queue.retries;
         self.ledger.slabs.push(SlabStats {
             tiles: slab.queue.tasks.iter().map(tile).collect(),
@@ -518,6 +523,15 @@ impl Frame {
         let dry = slab.dry.entry((worker, thread)).or_insert(r.end);
         *dry = r.end.max(*dry);
         let Rendered { start, end, .. } = r;
+        slab.pieces.push(Piece {
+            corner: [tile.x0, tile.y0],
+            edge: slab.cut.edge,
+            thread: (worker, thread),
+            lacked: result.times.ready_us.saturating_sub(result.times.received_us),
+            start,
+            end,
+            came: now,
+        });
         self.ledger.spans.push(Span {
             name: format!("{},{}", tile.x0, tile.y0),
             category: "tile",

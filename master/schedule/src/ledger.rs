@@ -5,6 +5,7 @@
 //! lease's going and the result's coming. So no figure is negative or longer than it can be,
 //! whatever a worker's clock does.
 
+use crate::critical::{Path, Piece};
 use crate::residency::Flight;
 use crate::roster::Worker;
 use crate::{Micros, Span};
@@ -49,6 +50,7 @@ pub(crate) struct Ledger {
     pub(crate) retries: u64,
     pub(crate) dropped_results: u64,
     pub(crate) poisoned: Vec<PoisonedTile>,
+    path: Path,
 }
 
 /// Where a task's rendering lies on the master's clock.
@@ -86,7 +88,15 @@ impl Ledger {
             retries: 0,
             dropped_results: 0,
             poisoned: Vec::new(),
+            path: Path::default(),
         }
+    }
+
+    /// A phase of the frame ended: what these tiles say of its critical path.
+    pub(crate) fn phase(&mut self, pieces: &[Piece], began: Micros) {
+        let accounts = &self.accounts;
+        let name = |id| accounts.get(&id).map_or_else(String::new, |a| a.name.clone());
+        self.path.phase(pieces, began, name);
     }
 
     /// A worker takes part from now on.
@@ -221,6 +231,7 @@ impl Ledger {
             retries: self.retries,
             dropped_results: self.dropped_results,
             poisoned: self.poisoned,
+            critical_path: Some(self.path.sentence(now.saturating_sub(self.began), self.cull_us)),
         };
         (stats, self.spans)
     }

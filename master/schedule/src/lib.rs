@@ -31,7 +31,7 @@
 //!
 //! [`frame`](is_shut) the states of one frame, [`macrotile`] the quadtree and its workload,
 //! `queue` leases with epochs, `residency` who holds which brick, `roster` workers and every
-//! deadline, `ledger` what a frame cost. The `region` schedule will stand beside `frame`; the
+//! deadline, `ledger` what a frame cost, `critical` what it waited for. The `region` schedule will stand beside `frame`; the
 //! others know nothing of slabs but the queue's and the residency's rounds.
 
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
@@ -44,6 +44,7 @@ use slabcast_common::view::View;
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 
+mod critical;
 mod frame;
 mod ledger;
 pub mod macrotile;

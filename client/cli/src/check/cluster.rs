@@ -65,7 +65,7 @@ impl Either {
             let handle = tcp.master.handle();
             (Either::Tcp(Box::new(tcp)), handle)
         } else {
-            let cluster = Cluster::start(volume, orientation, crew)?;
+            let cluster = Cluster::start(volume, orientation, crew, None)?;
             let handle = cluster.handle();
             (Either::Embedded(cluster), handle)
         };

@@ -43,7 +43,7 @@ pub(crate) fn run(args: &GoldenArgs) -> Result<(), Fail> {
         let hashes = runtime.block_on(async {
             let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
             let crew = Crew::new(1, None)?;
-            let mut cluster = Cluster::start((*case.volume).clone(), orientation, crew)?;
+            let mut cluster = Cluster::start((*case.volume).clone(), orientation, crew, None)?;
             let request = case.request(true, Work::default());
             let hashes = tokio::select! {
                 hashes = embedded_hashes(cluster.handle(), request) => hashes,

@@ -162,7 +162,7 @@ pub(crate) struct Output {
 }
 
 /// Refuses a file to write that is one of those to read.
-fn not_an_input(path: &Path, flag: &str, inputs: &[&Path]) -> Result<(), Fail> {
+pub(crate) fn not_an_input(path: &Path, flag: &str, inputs: &[&Path]) -> Result<(), Fail> {
     let same = |input: &&Path| matches!((path.canonicalize(), input.canonicalize()), (Ok(a), Ok(b)) if a == b);
     if inputs.iter().any(same) {
         return Err(Fail::usage(format!(

@@ -1,0 +1,157 @@
+//! A frame's critical path: what it waited for, from its last pixel back to its first event.
+//!
+//! How should one say why a frame took as long as it did? Sums over workers do not: a frame of 40
+//! ms with 300 ms of rendering on ten workers may have waited for one tile or for bricks. So each
+//! phase (a slab, or the whole frame where there are no barriers) is walked back from the result
+//! that ended it: its message, its rendering, what its thread rendered before, until the phase
+//! began. What lies between two tiles is bricks on their way, as far as the worker says that the
+//! tile lacked some, and else messages and queues. All of it is on the master's clock
+//! ([`place_in_time`](crate::ledger::place_in_time)), so the parts add up to the frame's time.
+
+use crate::Micros;
+use crate::ledger::ms;
+use slabcast_common::ids::WorkerId;
+
+/// A tile that counted.
+#[derive(Clone, Debug)]
+pub(crate) struct Piece {
+    /// Left column and top row.
+    pub(crate) corner: [i32; 2],
+    pub(crate) edge: u32,
+    /// Who rendered it.
+    pub(crate) thread: (WorkerId, u32),
+    /// How long it lay at the worker without its bricks.
+    pub(crate) lacked: Micros,
+    pub(crate) start: Micros,
+    pub(crate) end: Micros,
+    /// When its result came.
+    pub(crate) came: Micros,
+}
+
+/// The longest tile on the path.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Longest {
+    corner: [i32; 2],
+    edge: u32,
+    phase: usize,
+    worker: String,
+    us: Micros,
+}
+
+/// What a frame waited for, phase after phase.
+#[derive(Debug, Default)]
+pub(crate) struct Path {
+    phases: usize,
+    render: Micros,
+    bricks: Micros,
+    messages: Micros,
+    longest: Option<Longest>,
+}
+
+impl Path {
+    /// A phase ended. `name` says who a worker is.
+    pub(crate) fn phase(
+        &mut self,
+        pieces: &[Piece],
+        began: Micros,
+        name: impl Fn(WorkerId) -> String,
+    ) {
+        let phase = self.phases;
+        self.phases += 1;
+        let Some(last) = pieces.iter().max_by_key(|p| p.came) else { return };
+        self.messages += last.came.saturating_sub(last.end.max(began));
+        let mut piece = last;
+        loop {
+            let us = piece.end.saturating_sub(piece.start.max(began));
+            self.render += us;
+            if self.longest.as_ref().is_none_or(|l| us > l.us) {
+                let (corner, edge, worker) = (piece.corner, piece.edge, name(piece.thread.0));
+                self.longest = Some(Longest { corner, edge, phase, worker, us });
+            }
+            let before = pieces
+                .iter()
+                .filter(|p| p.thread == piece.thread && p.end <= piece.start && p.start < p.end)
+                .max_by_key(|p| p.end);
+            let since = before.map_or(began, |p| p.end.max(began));
+            let gap = piece.start.saturating_sub(since);
+            let bricks = gap.min(piece.lacked);
+            self.bricks += bricks;
+            self.messages += gap - bricks;
+            match before {
+                Some(before) if before.end > began => piece = before,
+                _ => return,
+            }
+        }
+    }
+
+    /// In one sentence: of `total`, of which the master spent `cull` on culling and queues while
+    /// nobody rendered.
+    pub(crate) fn sentence(&self, total: Micros, cull: Micros) -> String {
+        let mut parts = Vec::new();
+        let mut part = |us: Micros, what: &str| {
+            if us >= 50 {
+                parts.push(format!("{:.1} ms {what}", ms(us)));
+            }
+        };
+        let where_ = self.longest.as_ref().map_or(String::new(), |l| {
+            let slab =
+                if self.phases > 1 { format!(" of slab {}", l.phase) } else { String::new() };
+            let [x, y] = l.corner;
+            format!(
+                " (longest: tile ({x},{y}) {} px{slab} on {}, {:.1} ms)",
+                l.edge,
+                l.worker,
+                ms(l.us)
+            )
+        });
+        part(self.render, &format!("rendering{where_}"));
+        part(self.bricks, "bricks on their way");
+        part(self.messages, "messages and queues");
+        part(cull, "culling at the master");
+        let known = self.render + self.bricks + self.messages + cull;
+        part(total.saturating_sub(known), "the master's other work or no worker there");
+        let of = if parts.is_empty() { String::new() } else { ", of which ".to_string() };
+        format!("{:.1} ms{of}{}", ms(total), parts.join(", "))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn piece(w: u64, x: i32, lacked: Micros, start: Micros, end: Micros, came: Micros) -> Piece {
+        let thread = (WorkerId(w), 0);
+        Piece { corner: [x, 64], edge: 64, thread, lacked, start, end, came }
+    }
+
+    #[test]
+    fn a_frame_that_waits_for_one_tile_says_which() {
+        let mut path = Path::default();
+        let name = |w: WorkerId| format!("host-{}", w.0);
+        // Worker 1 is done early; worker 2 lacks bricks for 3 ms, then draws two tiles.
+        let first = [
+            piece(1, 0, 0, 1_200, 6_000, 6_200),
+            piece(2, 64, 3_000, 4_200, 9_200, 9_400),
+            piece(2, 128, 0, 9_300, 39_300, 39_500),
+        ];
+        path.phase(&first, 1_000, name);
+        path.phase(&[piece(1, 0, 0, 41_600, 42_600, 42_700)], 41_500, name);
+        assert_eq!(
+            path.sentence(43_000, 3_000),
+            "43.0 ms, of which 36.0 ms rendering (longest: tile (128,64) 64 px of slab 0 on \
+             host-2, 30.0 ms), 3.0 ms bricks on their way, 0.7 ms messages and queues, 3.0 ms \
+             culling at the master, 0.3 ms the master's other work or no worker there"
+        );
+    }
+
+    #[test]
+    fn a_frame_without_tiles_and_clocks_gone_mad_have_a_sentence() {
+        let mut path = Path::default();
+        path.phase(&[], 5, |_| String::new());
+        assert_eq!(path.sentence(400, 400), "0.4 ms, of which 0.4 ms culling at the master");
+        // Tiles without length on one thread: no circle.
+        let odd = [piece(1, 0, 9, 7, 7, 7), piece(1, 1, 9, 7, 7, 7), piece(1, 2, 9, 3, 3, 8)];
+        path.phase(&odd, 5, |_| "w".into());
+        assert!(path.sentence(8, 0).starts_with("0.0 ms"));
+    }
+}

@@ -1,0 +1,384 @@
+//! What a scheduler was told and what it decided, as a file; and the same decisions made again.
+//!
+//! The scheduler is pure: the same events at the same times give the same actions. So a run that
+//! went wrong on forty machines can be looked at on one: `--record` writes down each event with
+//! every reading of the clock that was taken while it was handled, and a line for each decision;
+//! [`replay()`] hands the events to a new scheduler and compares.
+//!
+//! # The file
+//!
+//! Lines of JSON, so that a person can read, cut and search it:
+//!
+//! | line | what |
+//! |--|--|
+//! | `{"record":{..}}` | first: version of this format, of the program, the scheduler's settings |
+//! | `{"bricks":{..}}` | a brick set, before its first frame |
+//! | `{"scene":{..}}` | a scene as workers get it (`proto`, in hexadecimal), before its first frame |
+//! | `{"event":{"t":[..],"e":{..}}}` | an event; `t` are the readings of the clock in microseconds, the first in full, the others as differences |
+//! | `{"out":[..]}` | the decisions since the line before, as text |
+//! | `{"end":{..}}` | last: how many of both; `cut` where the file could not keep up |
+//!
+//! **Pixels are not stored.** Of a result's planes the scheduler looks at two things: whether
+//! they have the tile's size and are finite, and which pixels are shut. So a result keeps its
+//! lengths and one bit a pixel, as runs. What leases carry of other pixels is not compared either:
+//! a decision is who gets which tile, with which bricks, when.
+//!
+//! **The driver never waits for the disk.** It puts down what it has in hand and goes on; a thread
+//! writes. Between them is a buffer of [`ROOM`] entries; if the disk falls behind that far, the
+//! record ends there, says so, and rendering goes on.
+//!
+//! What it costs is in docs/scaling.md.
+
+mod read;
+#[cfg(test)]
+mod tests;
+mod write;
+
+pub use read::{Broken, Difference, Replayed, replay};
+pub(crate) use write::Watched;
+pub use write::{Recorder, Written, start};
+
+use serde::{Deserialize, Serialize};
+use slabcast_common::brick::BrickInfo;
+use slabcast_common::message::{TileResult, ToWorker};
+use slabcast_common::stats::FrameStats;
+use slabcast_schedule::{Action, Event};
+use std::fmt;
+
+/// Version of the file's format.
+const VERSION: u32 = 1;
+
+/// Entries between driver and disk: some twenty frames' of 512x512, 4 MiB where tiles are shut in
+/// patterns. At a tenth, one slow `fsync` of somebody else's cuts the record.
+const ROOM: usize = 16384;
+
+/// One line.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Line {
+    Record(Head),
+    Bricks { set: String, bricks: Vec<[u32; 9]> },
+    Scene { id: u64, wire: String },
+    Event { t: Vec<u64>, e: Noted },
+    Out(Vec<String>),
+    End { events: u64, decisions: u64, cut: Option<String> },
+}
+
+/// The first line.
+#[derive(Debug, Serialize, Deserialize)]
+struct Head {
+    version: u32,
+    program: String,
+    pixels_version: u32,
+    protocol_version: u32,
+    heartbeat: u64,
+    silence: u64,
+    lease: u64,
+    poison_after: u32,
+    queue_ahead: u32,
+}
+
+/// An event without its pixels.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Noted {
+    Joined { w: u64, name: String, threads: u32, memory: u64, held: Vec<(String, Vec<u32>)> },
+    Heard { w: u64 },
+    Lost { w: u64, reason: String },
+    Leaving { w: u64 },
+    Queued(NotedJob),
+    Cancelled { frame: u64 },
+    SceneEnded { scene: u64 },
+    Result(NotedResult),
+    Failed { w: u64, task: u64, epoch: u32, reason: String },
+    BricksIn { w: u64, set: String, bricks: u32 },
+    BricksBroken { w: u64, set: String, bricks: Vec<u32> },
+    Pong { w: u64, nonce: u64, clock_us: u64 },
+    Tick,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+struct NotedJob {
+    frame: u64,
+    number: u64,
+    scene: u64,
+    view: String,
+    work: slabcast_common::quality::Work,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+struct NotedResult {
+    w: u64,
+    task: u64,
+    epoch: u32,
+    /// Pixels of its planes: a, colour, last (`None`: it has none).
+    planes: (usize, usize, Option<usize>),
+    /// Whether all opacities are finite.
+    finite: bool,
+    /// Runs of open and shut pixels in turn, the open first, as varints in hexadecimal; empty
+    /// where all are open.
+    shut: String,
+    /// Tossed, splatted, culled.
+    voxels: [u64; 3],
+    /// Received, ready, start, end, on the worker's clock.
+    us: [u64; 4],
+    thread: u32,
+}
+
+impl NotedResult {
+    fn of(worker: u64, result: &TileResult, shut: impl Fn(f32) -> bool) -> Self {
+        let (p, c, t) = (&result.pixels, &result.counters, &result.times);
+        NotedResult {
+            w: worker,
+            task: result.task.0,
+            epoch: result.epoch.0,
+            planes: (p.a.len(), p.colour.len(), p.last.as_ref().map(Vec::len)),
+            finite: p.a.iter().all(|a| a.is_finite()),
+            shut: runs(p.a.iter().map(|&a| shut(a))),
+            voxels: [c.tossed, c.splatted, c.culled],
+            us: [t.received_us, t.ready_us, t.start_us, t.end_us],
+            thread: t.thread,
+        }
+    }
+}
+
+/// What the scheduler decided, as far as it is compared.
+#[derive(Debug)]
+enum Decision {
+    Message { worker: u64, what: String },
+    Lease { worker: u64, lease: LeaseOf },
+    Bricks { worker: u64, count: usize, hash: u64 },
+    Drop { worker: u64, reason: String },
+    Progress { frame: u64, tiles: (u32, u32), slab: (u32, u32) },
+    Done { frame: u64, stats: Box<FrameStats> },
+    Failed { frame: u64, reason: String },
+}
+
+#[derive(Debug)]
+struct LeaseOf {
+    task: u64,
+    epoch: u32,
+    frame: u64,
+    tile: [i32; 4],
+    sheets: [i32; 2],
+    bricks: usize,
+    hash: u64,
+}
+
+/// FNV-1a: what tells lists of bricks apart.
+fn hash(bytes: impl IntoIterator<Item = u8>) -> u64 {
+    bytes
+        .into_iter()
+        .fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3))
+}
+
+fn hash_of(bricks: &[slabcast_common::ids::BrickId]) -> u64 {
+    hash(bricks.iter().flat_map(|b| b.0.to_le_bytes()))
+}
+
+impl Decision {
+    fn of(action: &Action) -> Self {
+        match action {
+            Action::Send { worker, message } => match message {
+                ToWorker::Lease(l) => Decision::Lease {
+                    worker: worker.0,
+                    lease: LeaseOf {
+                        task: l.task.0,
+                        epoch: l.epoch.0,
+                        frame: l.frame.0,
+                        tile: [l.tile.x0, l.tile.y0, l.tile.x1, l.tile.y1],
+                        sheets: [l.slab.first, l.slab.end],
+                        bricks: l.bricks.len(),
+                        hash: hash_of(&l.bricks),
+                    },
+                },
+                other => Decision::Message { worker: worker.0, what: say(other) },
+            },
+            Action::SendBricks { worker, bricks, .. } => {
+                let (count, hash) = (bricks.len(), hash_of(bricks));
+                Decision::Bricks { worker: worker.0, count, hash }
+            }
+            Action::Drop { worker, reason } => {
+                Decision::Drop { worker: worker.0, reason: reason.clone() }
+            }
+            Action::Progress { frame, done, total, slab, slabs } => {
+                Decision::Progress { frame: frame.0, tiles: (*done, *total), slab: (*slab, *slabs) }
+            }
+            Action::FrameDone { frame, stats, .. } => {
+                Decision::Done { frame: frame.0, stats: stats.clone() }
+            }
+            Action::FrameFailed { frame, reason } => {
+                Decision::Failed { frame: frame.0, reason: reason.clone() }
+            }
+        }
+    }
+}
+
+/// A message but a lease, in words.
+fn say(message: &ToWorker) -> String {
+    match message {
+        ToWorker::Scene(scene) => format!("{}", scene.id),
+        ToWorker::Frame { frame, scene, .. } => format!("{frame} of {scene}"),
+        ToWorker::EndFrame { frame } => format!("end of {frame}"),
+        ToWorker::EndScene { scene } => format!("end of {scene}"),
+        ToWorker::DropBricks { bricks, .. } => {
+            format!("forget {} bricks {:016x}", bricks.len(), hash_of(bricks))
+        }
+        ToWorker::Ping { nonce } => format!("ping {nonce}"),
+        ToWorker::Lease(_) | ToWorker::Welcome { .. } | ToWorker::Refused { .. } => {
+            unreachable!("leases are told apart; the driver greets")
+        }
+        ToWorker::Leave { .. } => "leave".into(),
+    }
+}
+
+impl fmt::Display for Decision {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Decision::Message { worker, what } => write!(f, "w{worker}: {what}"),
+            Decision::Lease { worker, lease: l } => write!(
+                f,
+                "w{worker}: lease t{} e{} of f{}, ({},{}) to ({},{}), sheets {}..{}, {} bricks \
+                 {:016x}",
+                l.task,
+                l.epoch,
+                l.frame,
+                l.tile[0],
+                l.tile[1],
+                l.tile[2],
+                l.tile[3],
+                l.sheets[0],
+                l.sheets[1],
+                l.bricks,
+                l.hash
+            ),
+            Decision::Bricks { worker, count, hash } => {
+                write!(f, "w{worker}: {count} bricks {hash:016x}")
+            }
+            Decision::Drop { worker, reason } => write!(f, "w{worker}: dropped, {reason}"),
+            Decision::Progress { frame, tiles, slab } => {
+                write!(f, "f{frame}: {}/{} of slab {}/{}", tiles.0, tiles.1, slab.0, slab.1)
+            }
+            Decision::Done { frame, stats } => {
+                let text = serde_json::to_string(stats).unwrap_or_default();
+                let (ms, hash) = (stats.ms.total, hash(text.bytes()));
+                write!(f, "f{frame}: done in {ms} ms, statistics {hash:016x}")
+            }
+            Decision::Failed { frame, reason } => write!(f, "f{frame}: failed, {reason}"),
+        }
+    }
+}
+
+fn brick_to_line(b: &BrickInfo) -> [u32; 9] {
+    let (lo, hi) = (b.tight.lo, b.tight.hi);
+    [b.id.0, lo[0], lo[1], lo[2], hi[0], hi[1], hi[2], u32::from(b.voxels), b.bytes]
+}
+
+/// Lengths of runs, the first of `false`, as varints in hexadecimal.
+fn runs(bits: impl Iterator<Item = bool>) -> String {
+    let (mut bytes, mut at, mut run) = (Vec::new(), false, 0u32);
+    let mut put = |mut n: u32| {
+        while n >= 0x80 {
+            bytes.push(n as u8 | 0x80);
+            n >>= 7;
+        }
+        bytes.push(n as u8);
+    };
+    for bit in bits {
+        if bit != at {
+            put(run);
+            (at, run) = (bit, 0);
+        }
+        run += 1;
+    }
+    // The last run is what is left; one of open pixels says nothing.
+    if at {
+        put(run);
+    }
+    to_hex(&bytes)
+}
+
+/// The `n` bits behind [`runs`]; `None` where they are not that many.
+fn bits(runs: &str, n: usize) -> Option<Vec<bool>> {
+    let (mut out, mut at) = (Vec::with_capacity(n), false);
+    let bytes = from_hex(runs)?;
+    let mut bytes = bytes.iter();
+    while let Some(&first) = bytes.next() {
+        let (mut byte, mut run, mut shift) = (first, 0u64, 0);
+        loop {
+            run |= u64::from(byte & 0x7f) << shift;
+            if byte & 0x80 == 0 {
+                break;
+            }
+            shift += 7;
+            byte = *bytes.next().filter(|_| shift < 35)?;
+        }
+        if run > (n - out.len()) as u64 {
+            return None;
+        }
+        out.resize(out.len() + run as usize, at);
+        at = !at;
+    }
+    out.resize(n, false);
+    Some(out)
+}
+
+fn to_hex(bytes: &[u8]) -> String {
+    const DIGITS: &[u8; 16] = b"0123456789abcdef";
+    bytes
+        .iter()
+        .flat_map(|b| [DIGITS[usize::from(b >> 4)], DIGITS[usize::from(b & 15)]])
+        .map(char::from)
+        .collect()
+}
+
+fn from_hex(text: &str) -> Option<Vec<u8>> {
+    let digit = |b: u8| char::from(b).to_digit(16).map(|d| d as u8);
+    let bytes = text.as_bytes();
+    if !bytes.len().is_multiple_of(2) {
+        return None;
+    }
+    bytes.chunks_exact(2).map(|p| Some(digit(p[0])? << 4 | digit(p[1])?)).collect()
+}
+
+/// What of an event can be said without its frame's cut-off and its scene's bytes.
+fn noted(event: &Event, shut: impl Fn(&TileResult, f32) -> bool) -> Option<Noted> {
+    let set = |key: &slabcast_common::brick::BrickSetKey| key.0.to_string();
+    Some(match event {
+        Event::WorkerJoined { worker, name, threads, memory_budget_bytes, held } => Noted::Joined {
+            w: worker.0,
+            name: name.clone(),
+            threads: *threads,
+            memory: *memory_budget_bytes,
+            held: held
+                .iter()
+                .map(|(key, ids)| (set(key), ids.iter().map(|b| b.0).collect()))
+                .collect(),
+        },
+        Event::WorkerHeard { worker } => Noted::Heard { w: worker.0 },
+        Event::WorkerLost { worker, reason } => Noted::Lost { w: worker.0, reason: reason.clone() },
+        Event::WorkerLeaving { worker } => Noted::Leaving { w: worker.0 },
+        // Its scene and bricks are written once; the thread that writes has seen which.
+        Event::FrameQueued(_) => return None,
+        Event::CancelFrame { frame } => Noted::Cancelled { frame: frame.0 },
+        Event::SceneEnded { scene } => Noted::SceneEnded { scene: scene.0 },
+        Event::Result { worker, result } => {
+            Noted::Result(NotedResult::of(worker.0, result, |a| shut(result, a)))
+        }
+        Event::Failed { worker, task, epoch, reason } => {
+            Noted::Failed { w: worker.0, task: task.0, epoch: epoch.0, reason: reason.clone() }
+        }
+        Event::BricksIn { worker, set: key, bricks } => {
+            Noted::BricksIn { w: worker.0, set: set(key), bricks: *bricks }
+        }
+        Event::BricksBroken { worker, set: key, bricks } => Noted::BricksBroken {
+            w: worker.0,
+            set: set(key),
+            bricks: bricks.iter().map(|b| b.0).collect(),
+        },
+        Event::Pong { worker, nonce, clock_us } => {
+            Noted::Pong { w: worker.0, nonce: *nonce, clock_us: *clock_us }
+        }
+        Event::Tick => Noted::Tick,
+    })
+}

@@ -1,0 +1,405 @@
+//! Reading a record, and making its decisions again.
+//!
+//! A record is a stranger's file: every line is checked before the scheduler sees it, and what is
+//! wrong is named by its line.
+
+use super::{Decision, Head, Line, Noted, NotedJob, NotedResult, VERSION, bits, from_hex};
+use prost::Message;
+use slabcast_common::PIXELS_VERSION;
+use slabcast_common::brick::{BRICK_VOXELS, BrickInfo, BrickSetKey, TightBox};
+use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
+use slabcast_common::image::TilePixels;
+use slabcast_common::message::{Counters, SceneSpec, TaskTimes, TileResult};
+use slabcast_common::volume::Digest32;
+use slabcast_proto::{convert, v1};
+use slabcast_schedule::{Clock, Config, Event, FrameJob, Micros, Scheduler};
+use std::cell::{Cell, RefCell};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::io::{BufRead, Read};
+use std::sync::Arc;
+
+/// Bytes of the longest line: the bricks of a volume of 2048^3 that is relevant everywhere take
+/// 0.9 GB. Above that it is no record.
+const LONGEST: u64 = 1 << 30;
+
+/// A file that is no whole record.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("line {line}: {problem}")]
+pub struct Broken {
+    /// Counted from 1.
+    pub line: u64,
+    /// What is wrong, and what to do.
+    pub problem: String,
+}
+
+/// Where a scheduler decided something else.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Difference {
+    /// Line of the decision, counted from 1.
+    pub line: u64,
+    /// What the record says.
+    pub recorded: String,
+    /// What the scheduler says now.
+    pub replayed: String,
+}
+
+/// What came of it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Replayed {
+    /// Events handed in.
+    pub events: u64,
+    /// Decisions that are the same.
+    pub decisions: u64,
+    /// Frames that were finished.
+    pub frames: u64,
+    /// Version of the program that recorded it.
+    pub program: String,
+    /// Why the record ends early, if it does.
+    pub cut: Option<String>,
+    /// The first difference, if there is one.
+    pub difference: Option<Difference>,
+}
+
+/// The readings that were taken.
+struct Taken {
+    left: RefCell<VecDeque<Micros>>,
+    last: Cell<Micros>,
+    too_many: Cell<bool>,
+}
+
+impl Clock for Taken {
+    fn now(&self) -> Micros {
+        match self.left.borrow_mut().pop_front() {
+            Some(now) => self.last.set(now),
+            None => self.too_many.set(true),
+        }
+        self.last.get()
+    }
+}
+
+struct Reader<R> {
+    from: R,
+    line: u64,
+    text: Vec<u8>,
+}
+
+impl<R: BufRead> Reader<R> {
+    fn broken(&self, problem: impl Into<String>) -> Broken {
+        Broken { line: self.line, problem: problem.into() }
+    }
+
+    /// The next line; `None` at the end of the file.
+    fn next(&mut self) -> Result<Option<Line>, Broken> {
+        self.line += 1;
+        self.text.clear();
+        let read = (&mut self.from).take(LONGEST).read_until(b'\n', &mut self.text);
+        let n = read.map_err(|e| self.broken(format!("reading failed: {e}")))?;
+        if n == 0 {
+            return Ok(None);
+        }
+        if self.text.last() != Some(&b'\n') {
+            let problem = if n as u64 == LONGEST {
+                "is longer than a record's lines are; give a file of --record"
+            } else {
+                "ends in the middle; the recording was cut off there"
+            };
+            return Err(self.broken(problem));
+        }
+        match serde_json::from_slice(&self.text) {
+            Ok(line) => Ok(Some(line)),
+            Err(_) if self.line == 1 => {
+                Err(self.broken("is not a record's first line; give a file of --record"))
+            }
+            Err(e) => {
+                let (said, _) = split_place(&e.to_string());
+                Err(self.broken(format!("is no line of a record: {said}, column {}", e.column())))
+            }
+        }
+    }
+}
+
+/// serde's message without its own idea of the place.
+fn split_place(text: &str) -> (String, String) {
+    match text.rsplit_once(" at line ") {
+        Some((said, place)) => (said.into(), place.into()),
+        None => (text.into(), String::new()),
+    }
+}
+
+/// What was read so far that later lines lean on.
+#[derive(Default)]
+struct Seen {
+    sets: BTreeMap<BrickSetKey, Arc<[BrickInfo]>>,
+    scenes: BTreeMap<SceneId, Arc<SceneSpec>>,
+    workers: BTreeSet<u64>,
+    frames: BTreeSet<u64>,
+    now: Micros,
+}
+
+/// Hands a record's events to a new scheduler, and compares its decisions with the record's until
+/// the first difference.
+///
+/// # Errors
+/// [`Broken`] names the line that is not as the recorder writes it.
+pub fn replay(from: impl BufRead) -> Result<Replayed, Broken> {
+    let mut reader = Reader { from, line: 0, text: Vec::new() };
+    let head = match reader.next()? {
+        Some(Line::Record(head)) => head,
+        Some(_) | None => {
+            return Err(reader.broken("is not a record's first line; give a file of --record"));
+        }
+    };
+    let mut scheduler = Scheduler::new(config(&head).map_err(|e| reader.broken(e))?);
+    let mut seen = Seen::default();
+    let mut done = Replayed {
+        events: 0,
+        decisions: 0,
+        frames: 0,
+        program: head.program,
+        cut: Some("its last line is missing".into()),
+        difference: None,
+    };
+    loop {
+        let line = match reader.next() {
+            Ok(Some(line)) => line,
+            Ok(None) => return Ok(done),
+            // Whoever was killed in the middle of a line wrote all before it.
+            Err(e) if e.problem.contains("was cut off there") => {
+                done.cut = Some(format!("line {} {}", e.line, e.problem));
+                return Ok(done);
+            }
+            Err(e) => return Err(e),
+        };
+        match line {
+            Line::Record(_) => return Err(reader.broken("is a first line, and not the first")),
+            Line::Bricks { set, bricks } => {
+                let set = key(&set).map_err(|e| reader.broken(e))?;
+                let infos = infos(&bricks).map_err(|e| reader.broken(e))?;
+                if seen.sets.insert(set, infos).is_some() {
+                    return Err(reader.broken("names a brick set that came before"));
+                }
+            }
+            Line::Scene { id, wire } => {
+                let scene = scene(SceneId(id), &wire).map_err(|e| reader.broken(e))?;
+                if seen.scenes.insert(SceneId(id), scene).is_some() {
+                    return Err(reader.broken("names a scene that came before"));
+                }
+            }
+            Line::Event { t, e } => {
+                let event = event(e, &mut seen).map_err(|e| reader.broken(e))?;
+                let clock = taken(t, &mut seen).map_err(|e| reader.broken(e))?;
+                scheduler.handle(&clock, event);
+                done.events += 1;
+                let left = clock.left.borrow().len();
+                if clock.too_many.get() || left > 0 {
+                    let more = if clock.too_many.get() { "more often" } else { "less often" };
+                    done.difference = Some(Difference {
+                        line: reader.line,
+                        recorded: "the readings of the clock in this line".into(),
+                        replayed: format!("it is read {more}"),
+                    });
+                    return Ok(done);
+                }
+            }
+            Line::Out(recorded) => {
+                let mut recorded = recorded.into_iter();
+                loop {
+                    let action = scheduler.next_action();
+                    let replayed = action.as_ref().map(|a| Decision::of(a).to_string());
+                    let recorded = recorded.next();
+                    if replayed.is_none() && recorded.is_none() {
+                        break;
+                    }
+                    if recorded != replayed {
+                        let or_nothing = |d: Option<String>| d.unwrap_or("nothing".into());
+                        done.difference = Some(Difference {
+                            line: reader.line,
+                            recorded: or_nothing(recorded),
+                            replayed: or_nothing(replayed),
+                        });
+                        return Ok(done);
+                    }
+                    done.decisions += 1;
+                    if matches!(action, Some(slabcast_schedule::Action::FrameDone { .. })) {
+                        done.frames += 1;
+                    }
+                }
+            }
+            Line::End { events, decisions, cut } => {
+                if (events, decisions) != (done.events, done.decisions) {
+                    return Err(reader.broken(format!(
+                        "counts {events} events and {decisions} decisions, before it stand {} and \
+                         {}; lines are missing",
+                        done.events, done.decisions
+                    )));
+                }
+                if let Some(action) = scheduler.next_action().filter(|_| cut.is_none()) {
+                    done.difference = Some(Difference {
+                        line: reader.line,
+                        recorded: "nothing".into(),
+                        replayed: Decision::of(&action).to_string(),
+                    });
+                }
+                done.cut = cut;
+                if reader.next()?.is_some() {
+                    return Err(reader.broken("comes after the last one"));
+                }
+                return Ok(done);
+            }
+        }
+    }
+}
+
+fn config(head: &Head) -> Result<Config, String> {
+    if head.version != VERSION {
+        return Err(format!(
+            "is a record of version {}, this program reads {VERSION}; replay it with slabcast {}",
+            head.version, head.program
+        ));
+    }
+    if head.pixels_version != PIXELS_VERSION {
+        return Err(format!(
+            "was recorded with pixels of version {}, this program has {PIXELS_VERSION}; replay it \
+             with slabcast {}",
+            head.pixels_version, head.program
+        ));
+    }
+    let &Head { heartbeat, silence, lease, poison_after, queue_ahead, .. } = head;
+    let sane = 1..=1 << 50;
+    if ![heartbeat, silence, lease].iter().all(|t| sane.contains(t)) || queue_ahead > 1 << 20 {
+        return Err("has settings that no master has".into());
+    }
+    Ok(Config { heartbeat, silence, lease, poison_after, queue_ahead })
+}
+
+fn key(text: &str) -> Result<BrickSetKey, String> {
+    let bytes = from_hex(text).and_then(|b| <[u8; 32]>::try_from(b).ok());
+    bytes
+        .map(|b| BrickSetKey(Digest32(b)))
+        .ok_or_else(|| "`set` is not 64 hexadecimal digits".into())
+}
+
+fn infos(bricks: &[[u32; 9]]) -> Result<Arc<[BrickInfo]>, String> {
+    if !bricks.windows(2).all(|w| w[0][0] < w[1][0]) {
+        return Err("its bricks do not ascend".into());
+    }
+    bricks
+        .iter()
+        .map(|&[id, lx, ly, lz, hx, hy, hz, voxels, bytes]| {
+            let (lo, hi) = ([lx, ly, lz], [hx, hy, hz]);
+            let voxels = u16::try_from(voxels).ok().filter(|v| usize::from(*v) <= BRICK_VOXELS);
+            let sane = (0..3).all(|a| lo[a] <= hi[a] && hi[a] < 1 << 20);
+            match voxels.filter(|_| sane) {
+                Some(voxels) => {
+                    Ok(BrickInfo { id: BrickId(id), tight: TightBox { lo, hi }, voxels, bytes })
+                }
+                None => Err(format!("brick {id} is none")),
+            }
+        })
+        .collect()
+}
+
+fn scene(id: SceneId, wire: &str) -> Result<Arc<SceneSpec>, String> {
+    let bytes = from_hex(wire).ok_or("`wire` is not hexadecimal")?;
+    let scene = v1::Scene::decode(&bytes[..]).map_err(|e| format!("`wire` is no scene: {e}"))?;
+    let scene = convert::scene_from_wire(scene).map_err(|e| format!("`wire`: {e}"))?;
+    if scene.id != id {
+        return Err(format!("`id` is {id}, the scene says {}", scene.id));
+    }
+    Ok(Arc::new(scene))
+}
+
+fn taken(t: Vec<u64>, seen: &mut Seen) -> Result<Taken, String> {
+    let (mut at, mut left) = (0u64, VecDeque::with_capacity(t.len()));
+    for t in t {
+        at = at.checked_add(t).filter(|t| *t < 1 << 62).ok_or("`t` overflows")?;
+        left.push_back(at);
+    }
+    if left.front().is_some_and(|first| *first < seen.now) {
+        return Err("`t` is before the line before; time never goes back".into());
+    }
+    seen.now = at.max(seen.now);
+    let last = Cell::new(seen.now);
+    Ok(Taken { left: RefCell::new(left), last, too_many: Cell::new(false) })
+}
+
+fn event(e: Noted, seen: &mut Seen) -> Result<Event, String> {
+    let ids = |ids: Vec<u32>| ids.into_iter().map(BrickId).collect::<Vec<_>>();
+    Ok(match e {
+        Noted::Joined { w, name, threads, memory, held } => {
+            if !seen.workers.insert(w) {
+                return Err(format!("w{w} joined before; a worker's name is never used again"));
+            }
+            let held = held
+                .into_iter()
+                .map(|(set, bricks)| Ok((key(&set)?, ids(bricks))))
+                .collect::<Result<_, String>>()?;
+            let worker = WorkerId(w);
+            Event::WorkerJoined { worker, name, threads, memory_budget_bytes: memory, held }
+        }
+        Noted::Heard { w } => Event::WorkerHeard { worker: WorkerId(w) },
+        Noted::Lost { w, reason } => Event::WorkerLost { worker: WorkerId(w), reason },
+        Noted::Leaving { w } => Event::WorkerLeaving { worker: WorkerId(w) },
+        Noted::Queued(job) => Event::FrameQueued(Box::new(queued(job, seen)?)),
+        Noted::Cancelled { frame } => Event::CancelFrame { frame: FrameId(frame) },
+        Noted::SceneEnded { scene } => Event::SceneEnded { scene: SceneId(scene) },
+        Noted::Result(r) => Event::Result { worker: WorkerId(r.w), result: Box::new(result(&r)?) },
+        Noted::Failed { w, task, epoch, reason } => {
+            Event::Failed { worker: WorkerId(w), task: TaskId(task), epoch: Epoch(epoch), reason }
+        }
+        Noted::BricksIn { w, set, bricks } => {
+            Event::BricksIn { worker: WorkerId(w), set: key(&set)?, bricks }
+        }
+        Noted::BricksBroken { w, set, bricks } => {
+            Event::BricksBroken { worker: WorkerId(w), set: key(&set)?, bricks: ids(bricks) }
+        }
+        Noted::Pong { w, nonce, clock_us } => Event::Pong { worker: WorkerId(w), nonce, clock_us },
+        Noted::Tick => Event::Tick,
+    })
+}
+
+fn queued(job: NotedJob, seen: &mut Seen) -> Result<FrameJob, String> {
+    if !seen.frames.insert(job.frame) {
+        return Err(format!(
+            "f{} was queued before; a frame's name is never used again",
+            job.frame
+        ));
+    }
+    let scene = seen.scenes.get(&SceneId(job.scene)).cloned();
+    let scene = scene.ok_or_else(|| format!("its scene {} has no line", job.scene))?;
+    let bricks = seen.sets.get(&scene.bricks).cloned().ok_or("its brick set has no line")?;
+    let bytes = from_hex(&job.view).ok_or("`view` is not hexadecimal")?;
+    let view = v1::View::decode(&bytes[..]).map_err(|e| format!("`view` is none: {e}"))?;
+    let view = convert::view_from_wire(view).map_err(|e| format!("`view`: {e}"))?;
+    convert::check_view(&scene.volume.lattice, &view).map_err(|e| format!("`view`: {e}"))?;
+    job.work.check().map_err(|e| format!("`work`: {}: {}", e.field, e.problem))?;
+    let (frame, number, work) = (FrameId(job.frame), job.number, job.work);
+    Ok(FrameJob { frame, number, scene, bricks, view, work })
+}
+
+/// A result that the scheduler takes for the one that was recorded: shut pixels have opacity 1,
+/// open ones 0, and there is no light.
+fn result(r: &NotedResult) -> Result<TileResult, String> {
+    let (a, colour, last) = r.planes;
+    // A liar's planes may have any length; it is compared, no more.
+    if [a, colour, last.unwrap_or(0)].iter().any(|n| *n > 2 * convert::MAX_TILE_PIXELS) {
+        return Err("its planes are larger than the wire lets through".into());
+    }
+    let shut = bits(&r.shut, a).ok_or("`shut` does not fit its plane")?;
+    let mut pixels = TilePixels {
+        a: shut.into_iter().map(|s| if s { 1.0 } else { 0.0 }).collect(),
+        colour: vec![[0; 3]; colour],
+        last: last.map(|n| vec![[0; 4]; n]),
+    };
+    if !r.finite {
+        *pixels.a.first_mut().ok_or("`finite` of a plane without pixels")? = f32::NAN;
+    }
+    let ([tossed, splatted, culled], [received_us, ready_us, start_us, end_us]) = (r.voxels, r.us);
+    Ok(TileResult {
+        task: TaskId(r.task),
+        epoch: Epoch(r.epoch),
+        pixels,
+        counters: Counters { tossed, splatted, culled },
+        times: TaskTimes { received_us, ready_us, start_us, end_us, thread: r.thread },
+    })
+}

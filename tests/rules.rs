@@ -17,7 +17,10 @@ const ARROWS: [(&str, &[&str]); 9] = [
     ("worker", &["common", "proto", "render"]),
     ("master", &["common", "proto", "schedule", "volumes"]),
     ("client", &["common", "proto"]),
-    ("client/cli", &["client", "common", "master", "proto", "render", "volumes", "worker"]),
+    (
+        "client/cli",
+        &["client", "common", "master", "proto", "render", "schedule", "volumes", "worker"],
+    ),
 ];
 
 /// Crates that only the three libraries with a network, and the program, may use.

@@ -24,6 +24,7 @@ pub mod quality;
 pub mod shade;
 pub mod slab;
 pub mod stats;
+pub mod trace;
 pub mod transfer;
 pub mod tween;
 pub mod view;

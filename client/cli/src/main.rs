@@ -6,6 +6,7 @@
 //!   says of itself, and [`show`] draws how it came about.
 //! - [`daemon`] is `master` and `worker`; [`doctor`] says whether a machine is fit for them, and
 //!   [`demo`] needs no file.
+//! - [`plan`] predicts what a cluster would do that is not there.
 //! - [`record`] writes a scheduler's decisions down and makes them again.
 //! - [`transfer`] is colours and opacities, and [`tf`] writes them down.
 //! - [`info`] looks into files, [`convert`] writes them in another format, [`ask`] looks at a running
@@ -37,6 +38,7 @@ mod local;
 mod logging;
 mod output;
 mod parse;
+mod plan;
 mod plot;
 mod progress;
 mod record;
@@ -101,6 +103,7 @@ enum Command {
     Status(ask::StatusArgs),
     Jobs(ask::JobsArgs),
     Cancel(ask::CancelArgs),
+    Plan(Box<plan::PlanArgs>),
     Replay(record::ReplayArgs),
     Error(Box<error::ErrorArgs>),
     Explain(Box<explain::ExplainArgs>),
@@ -161,6 +164,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
         Command::Status(args) => ask::status(args),
         Command::Jobs(args) => ask::jobs(args),
         Command::Cancel(args) => ask::cancel(args),
+        Command::Plan(args) => plan::run(args),
         Command::Replay(args) => record::run(args),
         Command::Error(args) => error::run(args),
         Command::Explain(args) => explain::run(args),

@@ -198,6 +198,80 @@ pub(crate) fn on_off(text: &str) -> Result<bool, String> {
     }
 }
 
+/// Numbers of workers, ascending.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Workers(pub(crate) Vec<u32>);
+
+/// `16`, `1..64`, `1,2,4,8` or a mixture.
+pub(crate) fn workers(text: &str) -> Result<Workers, String> {
+    let bad = || "give numbers from 1 to 1024, as 1..64 or 1,2,4,8".to_string();
+    let number = |t: &str| {
+        let n = t.trim().parse::<u32>().ok();
+        n.filter(|n| (1..=1024).contains(n)).ok_or_else(bad)
+    };
+    let mut all = Vec::new();
+    for part in text.split(',') {
+        match part.split_once("..") {
+            None => all.push(number(part)?),
+            Some((first, last)) => {
+                let (first, last) = (number(first)?, number(last)?);
+                if first > last {
+                    return Err(bad());
+                }
+                all.extend(first..=last);
+            }
+        }
+    }
+    all.sort_unstable();
+    all.dedup();
+    Ok(Workers(all))
+}
+
+/// Bits a second; `None`: no limit.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Rate(pub(crate) Option<f64>);
+
+impl std::fmt::Display for Rate {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self.0 {
+            None => write!(f, "unlimited rate"),
+            Some(bits) if bits >= 1e9 => write!(f, "{} Gbit/s", bits / 1e9),
+            Some(bits) => write!(f, "{} Mbit/s", bits / 1e6),
+        }
+    }
+}
+
+/// `1gbit`, `2.5gbit`, `100mbit` or `unlimited`.
+pub(crate) fn link(text: &str) -> Result<Rate, String> {
+    let bad = || "give a rate, as 1gbit, 10gbit or 100mbit, or unlimited".to_string();
+    if text == "unlimited" {
+        return Ok(Rate(None));
+    }
+    let lower = text.to_ascii_lowercase();
+    let (digits, unit) = match (lower.strip_suffix("gbit"), lower.strip_suffix("mbit")) {
+        (Some(digits), _) => (digits, 1e9),
+        (_, Some(digits)) => (digits, 1e6),
+        _ => return Err(bad()),
+    };
+    let rate = number(digits.trim()).map_err(|_| bad())? * unit;
+    // A modem, and ten times the fastest card sold.
+    if (1e6..=1e13).contains(&rate) { Ok(Rate(Some(rate))) } else { Err(bad()) }
+}
+
+/// `100us`, `1.5ms`, `0`: in nanoseconds.
+pub(crate) fn latency(text: &str) -> Result<u64, String> {
+    let bad = || "give a time, as 50us or 1ms, at most 10s".to_string();
+    let (digits, unit) = match text {
+        "0" => ("0", 1.0),
+        _ => [("us", 1e3), ("ms", 1e6), ("ns", 1.0), ("s", 1e9)]
+            .into_iter()
+            .find_map(|(end, unit)| Some((text.strip_suffix(end)?, unit)))
+            .ok_or_else(bad)?,
+    };
+    let ns = number(digits.trim()).map_err(|_| bad())? * unit;
+    if (0.0..=1e10).contains(&ns) { Ok(ns as u64) } else { Err(bad()) }
+}
+
 /// How many pixels are looked at.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Pixels {
@@ -374,6 +448,28 @@ mod tests {
         assert!(listen("localhost:0").is_ok() && master("localhost:0").is_err());
         for bad in ["", "host", "host:", ":7433", "host:70000", "::1:7433", "http://a:1", "a b:1"] {
             assert!(master(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn workers_links_and_latencies_are_strict() {
+        assert_eq!(workers("1..4,8,2"), Ok(Workers(vec![1, 2, 3, 4, 8])));
+        assert_eq!(workers("64").unwrap().0, [64]);
+        for bad in ["", "0", "4..1", "1..", "..3", "1,,2", "1-4", "1025", "a", "1..2..3", "-1"] {
+            assert!(workers(bad).unwrap_err().contains("1..64"), "{bad}");
+        }
+        assert_eq!(link("1gbit"), Ok(Rate(Some(1e9))));
+        assert_eq!(link("2.5Gbit").unwrap().to_string(), "2.5 Gbit/s");
+        assert_eq!(link("100mbit").unwrap().to_string(), "100 Mbit/s");
+        assert_eq!(link("unlimited"), Ok(Rate(None)));
+        for bad in ["", "1", "1gb", "gbit", "-1gbit", "0gbit", "nangbit", "1e9", "fast", "1 tbit"] {
+            assert!(link(bad).unwrap_err().contains("10gbit"), "{bad}");
+        }
+        assert_eq!(latency("100us"), Ok(100_000));
+        assert_eq!(latency("1.5ms"), Ok(1_500_000));
+        assert_eq!(latency("0"), Ok(0));
+        for bad in ["", "100", "us", "-1us", "11s", "nanus", "1m"] {
+            assert!(latency(bad).unwrap_err().contains("50us"), "{bad}");
         }
     }
 

@@ -51,6 +51,7 @@ pub mod macrotile;
 mod queue;
 mod residency;
 mod roster;
+pub mod sim;
 
 pub use frame::is_shut;
 

@@ -1,0 +1,115 @@
+//! What messages cost a processor.
+//!
+//! Two parts: what is done to bytes here (planes to messages and back) is timed on this machine;
+//! what gRPC, TCP and the kernel take is a constant, since it needs two machines to be measured.
+
+use prost::Message;
+use slabcast_common::ids::{Epoch, FrameId, TaskId};
+use slabcast_common::image::{TilePixels, TileState};
+use slabcast_common::message::{Counters, Lease, TaskTimes, TileResult, ToMaster, ToWorker};
+use slabcast_common::occlusion::Rect;
+use slabcast_common::slab::SheetRange;
+use slabcast_common::trace::Trace;
+use slabcast_proto::convert::{self, Down};
+use slabcast_proto::v1;
+use slabcast_schedule::sim::Costs;
+use std::time::Instant;
+
+/// A message through gRPC, TCP and the kernel, in ns, and a byte of it. From rehearsals of 2 and 8
+/// workers on 2 vCPU, where a waking costs 20 us (TRANSPORT.md has half of it for a busy master);
+/// docs/scaling.md has what comes of it at 15 and 32.
+const WIRE: (f64, f64) = (18_000.0, 0.45);
+/// From a message's coming to a thread's working on it, where it slept: TRANSPORT.md, section 7.
+const WAKE: f64 = 20_000.0;
+
+/// Nanoseconds of the best of some runs.
+fn best(mut run: impl FnMut()) -> f64 {
+    let mut timed = || {
+        let began = Instant::now();
+        run();
+        began.elapsed().as_nanos() as f64
+    };
+    (0..15).map(|_| timed()).fold(f64::INFINITY, f64::min)
+}
+
+/// What messages cost here. Tiles are filled as those of the trace are, on average.
+pub(super) fn messages(trace: &Trace) -> Costs {
+    let tiles = trace.frames.iter().flat_map(|f| &f.slabs).flat_map(|s| &s.levels);
+    let (mut bytes, mut pixels) = (0u64, 0u64);
+    for level in tiles {
+        bytes += level.tiles.iter().map(|t| u64::from(t.result_bytes)).sum::<u64>();
+        pixels += level.tiles.len() as u64 * u64::from(level.edge) * u64::from(level.edge);
+    }
+    // 64x64 pixels of which as many are there.
+    let there = (bytes as f64 / pixels.max(1) as f64 / 32.0).clamp(0.05, 1.0);
+    let n = 64 * 64;
+    let pixel = |i: usize| (i as f64) < there * n as f64;
+    let pixels = TilePixels {
+        a: (0..n).map(|i| if pixel(i) { 0.5 + i as f32 * 1e-5 } else { 0.0 }).collect(),
+        colour: (0..n).map(|i| if pixel(i) { [i as u32 + 9; 3] } else { [0; 3] }).collect(),
+        last: Some((0..n).map(|i| if pixel(i) { [i as u32 + 9; 4] } else { [0; 4] }).collect()),
+    };
+    let lease = ToWorker::Lease(Box::new(Lease {
+        task: TaskId(5),
+        epoch: Epoch(0),
+        frame: FrameId(1),
+        tile: Rect::new(0, 0, 64, 64),
+        slab: SheetRange::new(0, 90),
+        bricks: Vec::new(),
+        state: TileState { a: pixels.a.clone(), last: pixels.last.clone() },
+    }));
+    let result = ToMaster::Result(Box::new(TileResult {
+        task: TaskId(5),
+        epoch: Epoch(0),
+        pixels,
+        counters: Counters::default(),
+        times: TaskTimes::default(),
+    }));
+    let down = |m: &ToWorker| match convert::to_worker_to_wire(m, 0) {
+        Down::Control(m) => m.encode_to_vec(),
+        Down::Bricks(_) => Vec::new(),
+    };
+    let up = |m: &ToMaster| convert::from_worker_to_wire(m).encode_to_vec();
+    let (lease_bytes, result_bytes) = (down(&lease), up(&result));
+    let byte = |ns: f64, bytes: &[u8]| WIRE.1 + ns / bytes.len().max(1) as f64;
+    let send = best(|| drop(down(&lease)));
+    let worker_send = best(|| drop(up(&result)));
+    let receive = best(|| {
+        let message = v1::FromWorker::decode(&result_bytes[..]).expect("written above");
+        drop(convert::from_worker_from_wire(message));
+    });
+    let worker_receive = best(|| {
+        let message = v1::ToWorker::decode(&lease_bytes[..]).expect("written above");
+        drop(convert::to_worker_from_wire(message));
+    });
+    Costs {
+        send: (WIRE.0, byte(send, &lease_bytes)),
+        receive: (WIRE.0, byte(receive, &result_bytes)),
+        bricks: (WIRE.0, WIRE.1),
+        worker_receive: (WIRE.0, byte(worker_receive, &lease_bytes)),
+        worker_send: (WIRE.0, byte(worker_send, &result_bytes)),
+        // Bricks are decoded and put into the cache: some 3 ns a byte (docs/performance.md).
+        worker_bricks: (WIRE.0, WIRE.1 + 3.0),
+        finish_pixel: finish(trace),
+        wake: WAKE,
+        ..Costs::default()
+    }
+}
+
+/// To hash and encode a pixel, in nanoseconds.
+fn finish(trace: &Trace) -> f64 {
+    use slabcast_common::image::{Background, FrameState, PixelFormat};
+    let size = trace.about.size;
+    let state = FrameState::new(size);
+    let ns = (0..3)
+        .map(|_| {
+            let began = Instant::now();
+            let picture = state.finish();
+            let hash = picture.sha256();
+            let bytes = picture.encode(PixelFormat::Rgb8, Background::Colour([0.0; 3]));
+            std::hint::black_box((hash, bytes));
+            began.elapsed().as_nanos() as f64
+        })
+        .fold(f64::INFINITY, f64::min);
+    ns / (f64::from(size[0]) * f64::from(size[1]))
+}

@@ -1,0 +1,305 @@
+//! The measured half of a prediction: each tile that a schedule may ask for, drawn on one core.
+//!
+//! Every tile of a level is drawn as a worker draws it, from the same bricks and the same state,
+//! several times, and its shortest time counts: what disturbs a tile (another program, a page that
+//! is touched for the first time) only ever makes it longer.
+
+use crate::fail::Fail;
+use crate::progress::{Progress, Step};
+use crate::stage::Stage;
+use prost::Message;
+use slabcast_common::PIXELS_VERSION;
+use slabcast_common::brick::{Brick, BrickGrid, BrickInfo};
+use slabcast_common::ids::{Epoch, FrameId, TaskId};
+use slabcast_common::image::{FrameState, TilePixels};
+use slabcast_common::message::{Counters, Lease, TaskTimes, TileResult, ToMaster, ToWorker};
+use slabcast_common::occlusion::{Rect, ShutMap};
+use slabcast_common::quality::Work;
+use slabcast_common::slab::SheetRange;
+use slabcast_common::trace::{
+    About, FrameTrace, Level, SlabTrace, TileTrace, Trace, VERSION, view_sha256,
+};
+use slabcast_common::view::Projected;
+use slabcast_proto::convert::{self, Down};
+use slabcast_render::Frame;
+use slabcast_render::splat::Simd;
+use slabcast_render::tile::{self, Scratch, Seen};
+use slabcast_schedule::{FrameJob, is_shut, macrotile};
+use std::collections::BTreeSet;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// What is measured.
+pub(super) struct Path<'a> {
+    pub(super) stage: &'a Stage,
+    pub(super) frames: usize,
+    pub(super) work: Work,
+    /// Numbers of tiles that schedules will want: they decide which levels are drawn.
+    pub(super) wanted: Vec<u64>,
+    pub(super) repeats: u32,
+    pub(super) names: (String, String),
+}
+
+/// The bricks as a master knows them.
+fn infos(stage: &Stage) -> Arc<[BrickInfo]> {
+    let grid = BrickGrid::of(stage.spec(0).volume.lattice.dims);
+    let info = |b: &Arc<Brick>| BrickInfo {
+        id: b.id,
+        tight: b.tight(&grid),
+        voxels: b.len() as u16,
+        bytes: b.encoded_len() as u32,
+    };
+    stage.bricks.iter().map(info).collect()
+}
+
+/// The path's frames as the scheduler gets them.
+pub(super) fn jobs(stage: &Stage, frames: usize, work: Work) -> Result<Vec<FrameJob>, Fail> {
+    let bricks = infos(stage);
+    let mut scene = Arc::new(stage.spec(0));
+    (0..frames)
+        .map(|i| {
+            let spec = stage.spec(i);
+            if spec != *scene {
+                scene = Arc::new(spec);
+            }
+            let view = stage.view(i, &scene.quality)?;
+            let (frame, number) = (FrameId(i as u64 + 1), i as u64);
+            let (scene, bricks) = (scene.clone(), bricks.clone());
+            Ok(FrameJob { frame, number, scene, bricks, view, work })
+        })
+        .collect()
+}
+
+/// Draws the tiles.
+pub(super) fn measure(path: &Path<'_>, progress: &mut Progress) -> Result<Trace, Fail> {
+    let jobs = jobs(path.stage, path.frames, path.work)?;
+    let mut bench = Bench { scratch: Scratch::default(), repeats: path.repeats };
+    let mut frames = Vec::with_capacity(jobs.len());
+    // What a worker has after its first frame: footprints in the scene, memory that has grown.
+    bench.frame(path, 0, &jobs[0])?;
+    for (i, job) in jobs.iter().enumerate() {
+        frames.push(bench.frame(path, i, job)?);
+        progress.step(Step { frames: i as u64 + 1, ..Step::default() });
+    }
+    let about = About {
+        volume: path.names.0.clone(),
+        transfer: path.names.1.clone(),
+        simd: Simd::detect().name().into(),
+        pixels_version: PIXELS_VERSION,
+        program: env!("CARGO_PKG_VERSION").into(),
+        size: jobs[0].view.size,
+        slabs: path.work.slabs,
+        repeats: path.repeats,
+    };
+    Ok(Trace { version: VERSION, about, frames })
+}
+
+struct Bench {
+    scratch: Scratch,
+    repeats: u32,
+}
+
+/// The shortest of some runs, in nanoseconds, and what the last one gave.
+fn shortest<T>(repeats: u32, mut run: impl FnMut() -> T) -> (u64, T) {
+    let mut timed = || {
+        let began = Instant::now();
+        let out = run();
+        (began.elapsed().as_nanos() as u64, out)
+    };
+    let (mut best, mut last) = timed();
+    for _ in 1..repeats {
+        let (ns, out) = timed();
+        (best, last) = (best.min(ns), out);
+    }
+    (best, last)
+}
+
+impl Bench {
+    fn frame(&mut self, path: &Path<'_>, i: usize, job: &FrameJob) -> Result<FrameTrace, Fail> {
+        let scene = path.stage.scene(i);
+        let (setup_ns, frame) = shortest(self.repeats, || Frame::new(scene.clone(), job.view));
+        let (seen_ns, seen) = shortest(self.repeats, || {
+            let bricks = path.stage.bricks.iter();
+            bricks.map(|b| Seen::new(&frame, b)).collect::<Vec<_>>()
+        });
+        let projected: Vec<Option<Projected>> =
+            seen.iter().map(|s| s.as_ref().map(|s| s.projected)).collect();
+        let sheets =
+            projected.iter().flatten().fold(SheetRange::default(), |all, p| all.union(p.sheets));
+        let (alone_edge, alone_ns) = self.alone(&frame, &seen, sheets, job.view.size);
+        let size = job.view.size;
+        let mut state = FrameState::new(size);
+        let mut shut = ShutMap::open(Rect::of_size(size));
+        let mut slabs = Vec::new();
+        for range in sheets.slabs(path.work.slabs) {
+            let drawn = self.slab(path, job, &frame, &projected, range, &state, &shut);
+            let (levels, pixels) = drawn;
+            for (rect, pixels) in &pixels {
+                state.put(*rect, pixels);
+            }
+            state.end_slab();
+            let eps = job.scene.quality.eps;
+            let bits: Vec<bool> = state.a().iter().map(|&a| is_shut(a, eps)).collect();
+            for (i, _) in bits.iter().enumerate().filter(|(_, s)| **s) {
+                shut.shut(i);
+            }
+            shut.refresh();
+            let runs = SlabTrace::runs(bits);
+            slabs.push(SlabTrace { first: range.first, end: range.end, shut: runs, levels });
+        }
+        Ok(FrameTrace {
+            view: view_sha256(&job.scene, &job.view).to_string(),
+            setup_ns,
+            alone_ns: setup_ns + seen_ns + alone_ns,
+            alone_edge,
+            slabs,
+        })
+    }
+
+    /// All levels that may be wanted of a slab; the pixels are those of the first.
+    fn slab(
+        &mut self,
+        path: &Path<'_>,
+        job: &FrameJob,
+        frame: &Frame,
+        projected: &[Option<Projected>],
+        range: SheetRange,
+        state: &FrameState,
+        shut: &ShutMap,
+    ) -> (Vec<Level>, Vec<(Rect, TilePixels)>) {
+        let cull = job.scene.quality.cull;
+        // As the schedule does (`schedule::frame`).
+        let (mut needed, mut rects) = (Vec::new(), Vec::new());
+        for (i, p) in projected.iter().enumerate() {
+            let Some(p) = p.filter(|p| p.sheets.overlaps(range)) else { continue };
+            if !(cull && shut.all_shut(&p.rect)) {
+                needed.push(i);
+                rects.push(p.rect);
+            }
+        }
+        if needed.is_empty() {
+            return (Vec::new(), Vec::new());
+        }
+        let size = job.view.size;
+        let edges: BTreeSet<u32> = match path.work.tile {
+            Some(edge) => [edge].into(),
+            None => path
+                .wanted
+                .iter()
+                .map(|&w| macrotile::cut(size, &rects, shut, cull, w, None).edge)
+                .collect(),
+        };
+        let (mut levels, mut first) = (Vec::new(), Vec::new());
+        for &edge in edges.iter().rev() {
+            let cut = macrotile::cut(size, &rects, shut, cull, 0, Some(edge));
+            let mut tiles = Vec::with_capacity(cut.tiles.len());
+            for t in &cut.tiles {
+                let over = |r: &Rect| !r.intersect(&t.rect).is_empty();
+                let places = needed.iter().zip(&rects).filter(|(_, r)| over(r));
+                let bricks: Vec<Arc<Brick>> =
+                    places.map(|(&i, _)| path.stage.bricks[i].clone()).collect();
+                let before = state.tile(t.rect);
+                let (simd, scratch) = (Simd::detect(), &mut self.scratch);
+                let (ns, (pixels, counters)) = shortest(self.repeats, || {
+                    tile::render(frame, simd, t.rect, range, &bricks, &before, scratch)
+                });
+                let lease = Lease {
+                    task: TaskId(tiles.len() as u64),
+                    epoch: Epoch(0),
+                    frame: job.frame,
+                    tile: t.rect,
+                    slab: range,
+                    bricks: bricks.iter().map(|b| b.id).collect(),
+                    state: before,
+                };
+                let (lease_bytes, result_bytes, pixels) = weigh(lease, pixels, counters);
+                let (x, y) = (t.rect.x0 as u32, t.rect.y0 as u32);
+                tiles.push(TileTrace { x, y, ns, lease_bytes, result_bytes });
+                if levels.is_empty() {
+                    first.push((t.rect, pixels));
+                }
+            }
+            tiles.sort_by_key(|t| (t.y, t.x));
+            levels.push(Level { edge, tiles });
+        }
+        (levels, first)
+    }
+
+    /// The best cut of one core through all depths: edge and time.
+    fn alone(
+        &mut self,
+        frame: &Frame,
+        seen: &[Option<Seen>],
+        sheets: SheetRange,
+        size: [u32; 2],
+    ) -> (u32, u64) {
+        let seen: Vec<Seen> = seen.iter().flatten().cloned().collect();
+        let order = Seen::front_to_back(&seen);
+        let whole = Rect::of_size(size);
+        let simd = Simd::detect();
+        let mut pixels = TilePixels::default();
+        let of = |edge: u32, bench: &mut Bench, pixels: &mut TilePixels| {
+            let mut sum = 0;
+            let step = edge as usize;
+            let corners = (0..whole.y1)
+                .step_by(step)
+                .flat_map(|y| (0..whole.x1).step_by(step).map(move |x| (x, y)));
+            for (x, y) in corners {
+                let edge = edge as i32;
+                let tile = Rect::new(x, y, x + edge, y + edge).intersect(&whole);
+                let over = |s: &&&Seen| !s.projected.rect.intersect(&tile).is_empty();
+                let bricks: Vec<&Seen> = order.iter().filter(over).copied().collect();
+                if bricks.is_empty() {
+                    continue;
+                }
+                let blank = tile::blank(tile);
+                let (ns, _) = shortest(bench.repeats, || {
+                    let scratch = &mut bench.scratch;
+                    tile::render_into(frame, simd, tile, sheets, &bricks, &blank, scratch, pixels)
+                });
+                sum += ns;
+            }
+            sum
+        };
+        let edges = [64, 128, 256].into_iter().filter(|e| *e as i32 <= whole.x1.max(whole.y1) * 2);
+        let timed = edges.map(|edge| (edge, of(edge, self, &mut pixels)));
+        timed.min_by_key(|t| t.1).unwrap_or((64, 0))
+    }
+}
+
+/// Bytes of a lease and of its result as they cross.
+fn weigh(lease: Lease, pixels: TilePixels, counters: Counters) -> (u32, u32, TilePixels) {
+    let (task, epoch) = (lease.task, lease.epoch);
+    let lease = match convert::to_worker_to_wire(&ToWorker::Lease(Box::new(lease)), 0) {
+        Down::Control(message) => message.encoded_len(),
+        Down::Bricks(_) => unreachable!("a lease goes on Control"),
+    };
+    // Times as they are after some hours: five bytes each.
+    let us = 1 << 33;
+    let times = TaskTimes { received_us: us, ready_us: us, start_us: us, end_us: us, thread: 0 };
+    let result = ToMaster::Result(Box::new(TileResult { task, epoch, pixels, counters, times }));
+    let bytes = convert::from_worker_to_wire(&result).encoded_len();
+    let ToMaster::Result(result) = result else { unreachable!("made above") };
+    (lease as u32, bytes as u32, result.pixels)
+}
+
+/// Whether a trace is of this path, frame by frame.
+pub(super) fn fits(trace: &Trace, jobs: &[FrameJob]) -> Result<(), String> {
+    if trace.frames.len() != jobs.len() {
+        return Err(format!(
+            "has {} frames, the path {}; measure it again",
+            trace.frames.len(),
+            jobs.len()
+        ));
+    }
+    for (i, (frame, job)) in trace.frames.iter().zip(jobs).enumerate() {
+        if frame.view != view_sha256(&job.scene, &job.view).to_string() {
+            return Err(format!(
+                "frame {i} was measured of another volume, view, transfer function or quality ({}, \
+                 {}); give the flags that it was measured with, or another file",
+                trace.about.volume, trace.about.transfer
+            ));
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,331 @@
+//! `slabcast plan`: what a cluster would do that is not there.
+//!
+//! Two halves, and it says which is which: [`measure`] draws every tile of the path here, on one
+//! core, and weighs its messages; [`predict`] runs the scheduler itself with these tiles against
+//! virtual workers and links (`slabcast_schedule::sim`). [`costs`] has what messages cost a
+//! processor, [`chart`] draws.
+
+mod chart;
+mod costs;
+mod measure;
+mod predict;
+
+use crate::fail::{Fail, say};
+use crate::output::write_atomic;
+use crate::progress::{self, Progress};
+use crate::request::{PictureOf, WorkArgs, lattice_notice};
+use crate::stage::Stage;
+use crate::{embedded, parse};
+use predict::{Question, Row};
+use slabcast_common::trace::{MAX_BYTES, Trace};
+use slabcast_schedule::FrameJob;
+use slabcast_schedule::sim::{Link, alone_ms};
+use std::fmt::Write as _;
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+
+/// What a stream gets through of a link's nominal rate: heads of Ethernet, IP, TCP, HTTP/2. 118 MB/s
+/// were measured on an emulated link of 1 Gbit/s (TRANSPORT.md, answer 7).
+const GOODPUT: f64 = 0.94;
+
+/// Predicts time, efficiency and bytes of a cluster before it is there.
+///
+/// The path's tiles are drawn here once, on one core, and timed; then the scheduler itself runs with
+/// them against virtual workers and links. The table says what was measured and what is predicted.
+#[derive(clap::Args, Clone, Debug)]
+#[command(after_help = "\
+Examples:
+  slabcast plan brain.nii.gz --workers 1..64 --link 1gbit
+  slabcast plan ct.nrrd --tf bone --size 1024x1024 --workers 8,16,32 --link 10gbit --threads 16 -o plan/
+  slabcast plan ct.nrrd --tf bone --trace ct.trace --workers 40 --link 1gbit --latency 500us
+
+The first command with --trace FILE measures and writes FILE; later ones read it, and only predict.")]
+pub(crate) struct PlanArgs {
+    #[command(flatten)]
+    of: PictureOf,
+    #[command(flatten)]
+    work: WorkArgs,
+    /// Workers: numbers and ranges, as 1..64 or 1,2,4,8
+    #[arg(long, value_name = "LIST", default_value = "1,2,4,8,16,32,64",
+          value_parser = parse::workers, help_heading = "Cluster")]
+    workers: parse::Workers,
+    /// Render threads of each worker, with a core each
+    #[arg(long, value_name = "N", default_value = "1", help_heading = "Cluster",
+          value_parser = clap::value_parser!(u32).range(1..=1024))]
+    threads: u32,
+    /// Every machine's link, the master's too: 1gbit, 10gbit, 100mbit or unlimited
+    #[arg(long, value_name = "RATE", default_value = "1gbit", value_parser = parse::link,
+          help_heading = "Cluster")]
+    link: parse::Rate,
+    /// From one machine to another, one way
+    #[arg(long, value_name = "TIME", default_value = "50us", value_parser = parse::latency,
+          help_heading = "Cluster")]
+    latency: u64,
+    /// Times that each tile is drawn; its shortest time counts
+    #[arg(long, value_name = "N", default_value = "3", help_heading = "Measuring",
+          value_parser = clap::value_parser!(u32).range(1..=100))]
+    repeats: u32,
+    /// Tiles that were measured before; where the file is not there yet, it is written
+    #[arg(long, value_name = "FILE", help_heading = "Measuring")]
+    trace: Option<PathBuf>,
+    /// Folder for plan.svg, plan.png, plan.json and plan.csv
+    #[arg(short = 'o', long = "output", value_name = "DIR", help_heading = "Output")]
+    output: Option<PathBuf>,
+    /// As JSON
+    #[arg(long, help_heading = "Output")]
+    json: bool,
+    /// No progress
+    #[arg(short, long, help_heading = "Output")]
+    quiet: bool,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
+    let work = args.work.work()?;
+    let asked = args.of.look.asked(work)?;
+    let workers = &args.workers.0;
+    let most = workers.iter().copied().max().unwrap_or(1);
+    if u64::from(most) * u64::from(args.threads) > 65536 {
+        return Err(Fail::usage(format!(
+            "--workers, --threads: {most} x {} threads; give 65536 in all at most",
+            args.threads
+        )));
+    }
+    let mut progress = Progress::new(args.quiet);
+    let volume = args.of.open()?;
+    let orientation = args.of.look.view.axes.of(&volume)?;
+    let info = volume.info(volume.digest());
+    asked.fit(&info, orientation, volume.anatomical)?;
+    if let Some(notice) = lattice_notice(&info) {
+        progress::note(&notice);
+    }
+    progress.stage("cutting the volume into bricks");
+    let names = (volume.name.clone(), asked.transfer.name().to_string());
+    let stage = Stage::new(&volume, &info, &asked, orientation)?;
+    drop(volume);
+    let frames = asked.path.frames();
+    let jobs = measure::jobs(&stage, frames, work)?;
+    let wanted = workers.iter().map(|n| {
+        let threads = f64::from(*n) * f64::from(args.threads);
+        (work.tiles_per_worker * threads).ceil() as u64
+    });
+    let measured = match &args.trace {
+        Some(file) if file.exists() => {
+            let trace = read(file)?;
+            measure::fits(&trace, &jobs)
+                .map_err(|e| Fail::failed(format!("{}: {e}", file.display())))?;
+            Measured { trace, now: false }
+        }
+        file => {
+            progress.frames(frames as u64, &format!("drawing the tiles of {frames} frames"));
+            let path = measure::Path {
+                stage: &stage,
+                frames,
+                work,
+                wanted: wanted.collect(),
+                repeats: args.repeats,
+                names,
+            };
+            let trace = measure::measure(&path, &mut progress)?;
+            if let Some(file) = file {
+                write_atomic(file, |out| out.write_all(trace.to_json().as_bytes()))?;
+            }
+            Measured { trace, now: true }
+        }
+    };
+    progress.end();
+    drop(stage);
+    let costs = predict::measured_costs(&jobs, &measured.trace)?;
+    let link = Link {
+        bytes_per_s: args.link.0.map(|bits| bits / 8.0 * GOODPUT),
+        latency_ns: args.latency,
+    };
+    let question = Question { threads: args.threads, link, cores: None, stretch: 1.0 };
+    let threads = embedded::cores() as usize;
+    let rows = predict::rows(&jobs, &measured.trace, workers, &question, costs, threads)?;
+    let said = Said { args, jobs: &jobs, measured: &measured, rows: &rows };
+    if let Some(dir) = &args.output {
+        said.write(dir)?;
+    }
+    say(&if args.json { format!("{}\n", said.json()) } else { said.table() })
+}
+
+/// Reads a trace.
+pub(crate) fn read(file: &Path) -> Result<Trace, Fail> {
+    let mut bytes = Vec::new();
+    std::fs::File::open(file)
+        .and_then(|f| f.take(MAX_BYTES + 1).read_to_end(&mut bytes))
+        .map_err(|e| Fail::io(file, "reading", &e))?;
+    if bytes.len() as u64 > MAX_BYTES {
+        return Err(Fail::failed(format!("{}: is larger than a trace", file.display())));
+    }
+    Trace::from_json(&bytes).map_err(|e| Fail::failed(format!("{}: {e}", file.display())))
+}
+
+/// The measured half.
+struct Measured {
+    trace: Trace,
+    /// Whether it was measured by this command.
+    now: bool,
+}
+
+/// All that is said.
+struct Said<'a> {
+    args: &'a PlanArgs,
+    jobs: &'a [FrameJob],
+    measured: &'a Measured,
+    rows: &'a [Row],
+}
+
+impl Said<'_> {
+    fn tiles(&self) -> usize {
+        let levels = self.measured.trace.frames.iter().flat_map(|f| &f.slabs);
+        levels.flat_map(|s| &s.levels).map(|l| l.tiles.len()).sum()
+    }
+
+    fn title(&self) -> String {
+        let about = &self.measured.trace.about;
+        let [w, h] = about.size;
+        format!("{} {}, {} frames of {w}x{h}", about.volume, about.transfer, self.jobs.len())
+    }
+
+    fn cluster(&self) -> String {
+        let s = if self.args.threads == 1 { "" } else { "s" };
+        let slabs = self.measured.trace.about.slabs;
+        format!(
+            "slab schedule ({slabs} slabs), workers of {} thread{s}, links of {}, {} us one way",
+            self.args.threads,
+            self.args.link,
+            self.args.latency as f64 / 1e3
+        )
+    }
+
+    fn table(&self) -> String {
+        let trace = &self.measured.trace;
+        let edge = trace.frames.last().map_or(64, |f| f.alone_edge);
+        let when = if self.measured.now { "measured here" } else { "measured before (--trace)" };
+        let mut text = format!(
+            "{}; {}\n{when}: {} tiles, each {} times; alone, one core takes {:.2} ms a frame (tiles \
+             of {edge} pixels)\npredicted from that, by the scheduler itself against virtual \
+             workers and links:\n\n{:>7} {:>9} {:>9} {:>6} {:>9} {:>6} {:>9} {:>9}  {}\n",
+            self.title(),
+            self.cluster(),
+            self.tiles(),
+            trace.about.repeats,
+            alone_ms(trace),
+            "workers",
+            "first ms",
+            "ms",
+            "eff.",
+            "frames/s",
+            "eff.",
+            "KB",
+            "brick KB",
+            "bound by"
+        );
+        for r in self.rows {
+            let _ = writeln!(
+                text,
+                "{:>7} {:>9.1} {:>9.2} {:>4.0} % {:>9.1} {:>4.0} % {:>9.0} {:>9.1}  {} {:.0} %",
+                r.workers,
+                r.first_ms,
+                r.frame_ms,
+                r.latency_efficiency * 100.0,
+                r.frames_per_s,
+                r.throughput_efficiency * 100.0,
+                (r.bytes[0] + r.bytes[1]) / 1e3,
+                r.bytes[2] / 1e3,
+                r.bound.0.name(),
+                r.bound.1 * 100.0,
+            );
+        }
+        text += "\nfirst ms: with all bricks. ms: a later frame, one in flight. frames/s: three in \
+                 flight. eff.: against\none core's time alone over all render threads. KB, brick \
+                 KB: a later frame's leases and results, and\nbricks. bound by: where most of a \
+                 frame's time goes: cores (rendering, spread evenly), straggler\n(waiting for the \
+                 last tile), link, or master.\n";
+        text
+    }
+
+    fn json(&self) -> serde_json::Value {
+        let trace = &self.measured.trace;
+        let rows: Vec<_> = self
+            .rows
+            .iter()
+            .map(|r| {
+                let ms = |i: usize| r.parts[i];
+                serde_json::json!({
+                    "workers": r.workers, "first_ms": r.first_ms, "frame_ms": r.frame_ms,
+                    "latency_efficiency": r.latency_efficiency,
+                    "frames_per_s": r.frames_per_s,
+                    "throughput_efficiency": r.throughput_efficiency,
+                    "bytes_down": r.bytes[0], "bytes_up": r.bytes[1], "brick_bytes": r.bytes[2],
+                    "leases": r.leases, "bound_by": r.bound.0.name(), "bound_part": r.bound.1,
+                    "parts_ms": { "cores": ms(0), "straggler": ms(1), "link": ms(2),
+                                  "master": ms(3) },
+                    "master_ms": { "driver": r.master_ms[0], "streams": r.master_ms[1],
+                                   "finisher": r.master_ms[2] },
+                })
+            })
+            .collect();
+        serde_json::json!({
+            "version": 1,
+            "measured": {
+                "volume": trace.about.volume, "transfer": trace.about.transfer,
+                "size": trace.about.size, "frames": trace.frames.len(), "tiles": self.tiles(),
+                "repeats": trace.about.repeats, "simd": trace.about.simd,
+                "slabs": trace.about.slabs, "alone_ms": alone_ms(trace),
+            },
+            "cluster": {
+                "threads": self.args.threads, "link": self.args.link.to_string(),
+                "latency_us": self.args.latency as f64 / 1e3, "schedule": "slab",
+            },
+            "predicted": rows,
+        })
+    }
+
+    fn csv(&self) -> String {
+        let mut text = "workers,first_ms,frame_ms,latency_efficiency,frames_per_s,\
+                        throughput_efficiency,bytes_down,bytes_up,brick_bytes,bound_by,cores_ms,\
+                        straggler_ms,link_ms,master_ms\n"
+            .to_string();
+        for r in self.rows {
+            let _ = writeln!(
+                text,
+                "{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+                r.workers,
+                r.first_ms,
+                r.frame_ms,
+                r.latency_efficiency,
+                r.frames_per_s,
+                r.throughput_efficiency,
+                r.bytes[0],
+                r.bytes[1],
+                r.bytes[2],
+                r.bound.0.name(),
+                r.parts[0],
+                r.parts[1],
+                r.parts[2],
+                r.parts[3],
+            );
+        }
+        text
+    }
+
+    fn write(&self, dir: &Path) -> Result<(), Fail> {
+        std::fs::create_dir_all(dir).map_err(|e| Fail::io(dir, "making the folder", &e))?;
+        let chart = chart::Chart::new(
+            &format!("{}: predicted efficiency", self.title()),
+            &self.cluster(),
+            self.rows,
+        );
+        let text = |name: &str, text: String| {
+            write_atomic(&dir.join(name), |out| out.write_all(text.as_bytes()))
+        };
+        text("plan.svg", chart.svg())?;
+        text("plan.json", format!("{:#}\n", self.json()))?;
+        text("plan.csv", self.csv())?;
+        let about = [("Description", format!("{}; {}; predicted", self.title(), self.cluster()))];
+        write_atomic(&dir.join("plan.png"), |out| chart.canvas().png(out, &about))
+    }
+}

@@ -1,0 +1,86 @@
+//! `slabcast plan`: what is measured, what is predicted, and what is refused.
+
+mod program;
+
+use program::{good, names, run, text};
+use serde_json::Value;
+
+const SMALL: [&str; 7] =
+    ["plan", "formula:spheres:32", "--size", "128x128", "--frames", "3", "--quiet"];
+
+fn json(text: &str) -> Value {
+    serde_json::from_str(text).expect("JSON")
+}
+
+#[test]
+fn a_plan_says_what_is_measured_and_what_is_predicted() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let cluster = ["--workers", "1..3,8", "--link", "1gbit", "--latency", "100us"];
+    let files = ["--trace", "s.trace", "-o", "out"];
+    let said = good(dir, &[&SMALL[..], &cluster, &files].concat());
+    assert!(said.contains("measured here: ") && said.contains("alone, one core takes"), "{said}");
+    assert!(said.contains("predicted from that"), "{said}");
+    assert!(said.contains("links of 1 Gbit/s, 100 us one way"), "{said}");
+    let rows: Vec<&str> = said.lines().filter(|l| l.trim_end().ends_with(" %")).collect();
+    assert_eq!(rows.len(), 4, "{said}");
+    assert_eq!(names(&dir.join("out")), ["plan.csv", "plan.json", "plan.png", "plan.svg"]);
+    let svg = std::fs::read_to_string(dir.join("out/plan.svg")).unwrap();
+    assert!(svg.contains("predicted efficiency") && svg.contains("<circle"));
+    let csv = std::fs::read_to_string(dir.join("out/plan.csv")).unwrap();
+    assert_eq!(csv.lines().count(), 5);
+    let plan = json(&std::fs::read_to_string(dir.join("out/plan.json")).unwrap());
+    assert_eq!(plan["measured"]["frames"], 3);
+    let workers: Vec<u64> = plan["predicted"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|r| r["workers"].as_u64().unwrap())
+        .collect();
+    assert_eq!(workers, [1, 2, 3, 8]);
+    for row in plan["predicted"].as_array().unwrap() {
+        let n = |key: &str| row[key].as_f64().unwrap();
+        assert!(n("frame_ms") > 0.0 && n("first_ms") > 0.0 && n("bytes_up") > 0.0, "{row}");
+        assert!(n("latency_efficiency") <= 1.0, "nobody is faster than all cores: {row}");
+        let named = ["cores", "straggler", "link", "master"];
+        assert!(named.contains(&row["bound_by"].as_str().unwrap()), "{row}");
+    }
+    // What was measured is read again; a slow link then binds.
+    let slow = ["--workers", "8", "--link", "1mbit", "--trace", "s.trace", "--json"];
+    let plan = json(&good(dir, &[&SMALL[..], &slow].concat()));
+    assert_eq!(plan["predicted"][0]["bound_by"], "link", "{plan}");
+    // And is not taken for another picture's.
+    let other = ["--tf", "bone", "--trace", "s.trace"];
+    let out = run(dir, &[&SMALL[..], &other].concat());
+    assert_eq!(out.status.code(), Some(1));
+    let said = text(&out.stderr);
+    assert!(said.contains("s.trace: frame 0 was measured of another volume, view"), "{said}");
+    std::fs::write(dir.join("bad.trace"), "{}").unwrap();
+    let out = run(dir, &[&SMALL[..], &["--trace", "bad.trace"]].concat());
+    assert_eq!(out.status.code(), Some(1));
+    assert!(text(&out.stderr).contains("bad.trace: is no trace"), "{}", text(&out.stderr));
+}
+
+#[test]
+fn flags_of_a_plan_are_refused_by_name_and_with_a_remedy() {
+    let dir = tempfile::tempdir().unwrap();
+    for (flag, value, remedy) in [
+        ("--workers", "4..1", "1..64"),
+        ("--workers", "0", "1..64"),
+        ("--link", "1gb", "10gbit"),
+        ("--latency", "5", "50us"),
+        ("--threads", "0", "1..=1024"),
+        ("--repeats", "0", "1..=100"),
+    ] {
+        let out = run(dir.path(), &["plan", "formula:spheres:16", flag, value]);
+        let said = text(&out.stderr);
+        assert_eq!(out.status.code(), Some(2), "{flag} {value}: {said}");
+        assert!(said.contains(flag) && said.contains(remedy), "{flag} {value}: {said}");
+        assert_eq!(said.lines().count(), 1, "{said}");
+    }
+    let many = ["plan", "formula:spheres:16", "--workers", "1000", "--threads", "1000"];
+    let out = run(dir.path(), &many);
+    assert_eq!(out.status.code(), Some(2));
+    assert!(text(&out.stderr).contains("--workers, --threads"), "{}", text(&out.stderr));
+    assert!(names(dir.path()).is_empty());
+}

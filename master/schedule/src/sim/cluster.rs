@@ -1,0 +1,599 @@
+//! The virtual cluster: master, links and workers.
+
+use super::pipe::{Cores, Pipe, through};
+use super::{Cluster, FrameOutcome, Nanos, Outcome, Stopwatch, Took, Unknown, micros};
+use crate::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
+use slabcast_common::brick::BrickSetKey;
+use slabcast_common::ids::{BrickId, FrameId, WorkerId};
+use slabcast_common::image::TilePixels;
+use slabcast_common::message::{Counters, Lease, TaskTimes, TileResult, ToWorker};
+use slabcast_common::trace::Trace;
+use std::cell::Cell;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+/// Bytes of a message that carries nothing large: head, ids, framing.
+const SMALL: u64 = 64;
+/// Bytes of a view, and of all other messages of a frame and worker.
+const FRAME: u64 = 600;
+/// Bytes of a batch of bricks, as over TCP.
+const BATCH: u64 = 64 << 10;
+/// Batches under way to one worker.
+const BATCHES: usize = 2;
+/// Threads that carry the master's streams (`client/cli/src/runtime.rs`).
+const STREAMS: u32 = 2;
+
+struct VirtualClock(Cell<Nanos>);
+
+impl Clock for VirtualClock {
+    fn now(&self) -> Micros {
+        micros(self.0.get())
+    }
+}
+
+/// What reaches somebody at a time.
+#[expect(clippy::large_enum_variant, reason = "a view in a message; few are on their way at once")]
+enum Coming {
+    /// A message is at the master's end of the link, so many bytes.
+    AtMaster(Event, u64),
+    /// It is decoded and lies before the driver.
+    Inbox(Event),
+    /// The driver is free again.
+    Free,
+    /// A message is at a worker.
+    AtWorker(WorkerId, ToWorker),
+    /// A batch of bricks is at a worker.
+    Batch(WorkerId, BrickSetKey, Vec<BrickId>, u64),
+    /// A lease is decoded.
+    Lease(WorkerId, Box<Lease>),
+    /// A tile has had its time.
+    TaskEnd(WorkerId, usize),
+    /// A frame is hashed and encoded.
+    Finished(FrameId),
+}
+
+struct Running {
+    lease: Box<Lease>,
+    received: Nanos,
+    ready: Nanos,
+    start: Nanos,
+    result_bytes: u64,
+}
+
+struct Worker {
+    down: Pipe,
+    up: Pipe,
+    /// What receives and sends, where the machine is its own.
+    io: Cores,
+    /// What that took of a core that a render thread had.
+    stolen: Nanos,
+    present: BTreeSet<(BrickSetKey, BrickId)>,
+    leases: VecDeque<(Box<Lease>, Nanos)>,
+    running: Vec<Option<Running>>,
+    /// When its tables of a frame are made.
+    tables: BTreeMap<FrameId, Nanos>,
+    batches: VecDeque<(BrickSetKey, Vec<BrickId>, u64)>,
+    under_way: usize,
+}
+
+struct World<'a> {
+    cluster: &'a Cluster,
+    trace: &'a Trace,
+    jobs: &'a [FrameJob],
+    clock: VirtualClock,
+    scheduler: Scheduler,
+    coming: BTreeMap<(Nanos, u64), Coming>,
+    order: u64,
+    workers: BTreeMap<WorkerId, Worker>,
+    down: Pipe,
+    up: Pipe,
+    inbox: Vec<Event>,
+    driver_busy: bool,
+    driver: Cores,
+    streams: Cores,
+    finisher: Cores,
+    /// Where everything runs on one machine.
+    machine: Option<Cores>,
+    /// Shut pixels behind each slab of frames in hand.
+    shut: BTreeMap<(usize, i32), Vec<bool>>,
+    queued: usize,
+    in_hand: u32,
+    /// The frame at hand, and the slab that was begun last.
+    at: usize,
+    last_slab: Option<(FrameId, i32)>,
+    outcome: Outcome,
+    finished: usize,
+    worker_work: Nanos,
+}
+
+/// Runs a path's frames, one after another, on a cluster. `jobs` are the frames of the trace in its
+/// order, with frame ids from 1 and numbers from 0. `watch` measures the scheduler itself.
+///
+/// # Errors
+/// [`Unknown`]: the scheduler wants what the trace does not know.
+///
+/// # Panics
+/// If frame ids are others.
+pub fn run(
+    jobs: &[FrameJob],
+    trace: &Trace,
+    cluster: &Cluster,
+    watch: &mut dyn Stopwatch,
+) -> Result<(Outcome, Took), Unknown> {
+    if jobs.len() != trace.frames.len() {
+        return Err(Unknown::Frames { have: trace.frames.len(), need: jobs.len() });
+    }
+    for (i, job) in jobs.iter().enumerate() {
+        assert_eq!((job.frame.0, job.number), (i as u64 + 1, i as u64), "frames in order");
+    }
+    let bandwidth = cluster.link.bytes_per_s;
+    let mut w = World {
+        cluster,
+        trace,
+        jobs,
+        clock: VirtualClock(Cell::new(1_000_000)),
+        scheduler: Scheduler::new(Config::default()),
+        coming: BTreeMap::new(),
+        order: 0,
+        workers: BTreeMap::new(),
+        down: Pipe::new(bandwidth),
+        up: Pipe::new(bandwidth),
+        inbox: Vec::new(),
+        driver_busy: false,
+        driver: Cores::new(1),
+        streams: Cores::new(STREAMS),
+        finisher: Cores::new(1),
+        machine: cluster.cores.map(Cores::new),
+        shut: BTreeMap::new(),
+        queued: 0,
+        in_hand: 0,
+        at: 0,
+        last_slab: None,
+        outcome: Outcome {
+            frames: vec![FrameOutcome::default(); jobs.len()],
+            ..Outcome::default()
+        },
+        finished: 0,
+        worker_work: 0,
+    };
+    let mut took = Took::default();
+    for id in 1..=u64::from(cluster.workers) {
+        let worker = Worker {
+            down: Pipe::new(bandwidth),
+            up: Pipe::new(bandwidth),
+            io: Cores::new(1),
+            stolen: 0,
+            present: BTreeSet::new(),
+            leases: VecDeque::new(),
+            running: (0..cluster.threads).map(|_| None).collect(),
+            tables: BTreeMap::new(),
+            batches: VecDeque::new(),
+            under_way: 0,
+        };
+        w.workers.insert(WorkerId(id), worker);
+        w.inbox.push(Event::WorkerJoined {
+            worker: WorkerId(id),
+            name: format!("w{id}"),
+            threads: cluster.threads,
+            memory_budget_bytes: u64::MAX,
+            held: Vec::new(),
+        });
+    }
+    w.feed();
+    w.drive(&mut took, watch)?;
+    while w.finished < jobs.len() {
+        let next = w.coming.first_key_value().map(|(k, _)| k.0);
+        let due = w.scheduler.next_deadline().map(|d| d * 1000);
+        match (next, due) {
+            (Some(t), Some(d)) if d < t && !w.driver_busy => {
+                w.clock.0.set(d.max(w.now()));
+                w.inbox.push(Event::Tick);
+                w.drive(&mut took, watch)?;
+            }
+            (Some(_), _) => {
+                let ((t, _), what) = w.coming.pop_first().expect("just seen");
+                w.clock.0.set(t.max(w.now()));
+                w.happen(what, &mut took, watch)?;
+            }
+            (None, Some(d)) => {
+                w.clock.0.set(d.max(w.now()));
+                w.inbox.push(Event::Tick);
+                w.drive(&mut took, watch)?;
+            }
+            (None, None) => unreachable!("workers are pinged as long as they are there"),
+        }
+    }
+    w.outcome.driver = w.driver.work;
+    w.outcome.streams = w.streams.work;
+    w.outcome.finisher = w.finisher.work;
+    w.outcome.workers = w.worker_work;
+    Ok((w.outcome, took))
+}
+
+impl World<'_> {
+    fn now(&self) -> Nanos {
+        self.clock.0.get()
+    }
+
+    fn later(&mut self, when: Nanos, what: Coming) {
+        self.order += 1;
+        self.coming.insert((when.max(self.now()), self.order), what);
+    }
+
+    /// Gives the scheduler frames while there is room for them.
+    fn feed(&mut self) {
+        while self.in_hand < self.cluster.in_flight.max(1) && self.queued < self.jobs.len() {
+            self.inbox.push(Event::FrameQueued(Box::new(self.jobs[self.queued].clone())));
+            if self.in_hand == 0 {
+                self.outcome.frames[self.queued].began = self.now();
+            }
+            self.queued += 1;
+            self.in_hand += 1;
+        }
+    }
+
+    /// Work of a thread of the master.
+    fn master(&mut self, which: fn(&mut Self) -> &mut Cores, at: Nanos, ns: f64) -> Nanos {
+        let alone = which(self).run(at, ns);
+        match &mut self.machine {
+            Some(machine) => machine.run(at, ns).max(alone),
+            None => alone,
+        }
+    }
+
+    /// Work of a worker beside rendering.
+    fn worker(&mut self, id: WorkerId, at: Nanos, ns: f64) -> Nanos {
+        self.worker_work += ns as Nanos;
+        match &mut self.machine {
+            Some(machine) => machine.run(at, ns),
+            None => self.workers.get_mut(&id).map_or(at, |w| {
+                if w.running.iter().any(Option::is_some) {
+                    w.stolen += ns as Nanos;
+                }
+                w.io.run(at, ns)
+            }),
+        }
+    }
+
+    /// A worker's message goes up.
+    fn up(&mut self, id: WorkerId, event: Event, bytes: u64, at: Nanos) {
+        let costs = &self.cluster.costs.worker_send;
+        let at = self.worker(id, at, costs.0 + costs.1 * bytes as f64);
+        let w = self.workers.get_mut(&id).expect("a worker that speaks is there");
+        let there = through(&mut w.up, &mut self.up, at, bytes);
+        self.outcome.frames[self.at].up += bytes;
+        let when = there + self.cluster.link.latency_ns + self.cluster.costs.wake as Nanos;
+        self.later(when, Coming::AtMaster(event, bytes));
+    }
+
+    /// The master's message goes down, when the driver is done with it.
+    fn down(&mut self, id: WorkerId, message: ToWorker, bytes: u64, at: Nanos) {
+        let (fixed, byte) = self.cluster.costs.send;
+        let at = self.master(|w| &mut w.streams, at, fixed + byte * bytes as f64);
+        let Some(w) = self.workers.get_mut(&id) else { return };
+        let there = through(&mut self.down, &mut w.down, at, bytes);
+        self.outcome.frames[self.at].down += bytes;
+        let when = there + self.cluster.link.latency_ns + self.cluster.costs.wake as Nanos;
+        self.later(when, Coming::AtWorker(id, message));
+    }
+
+    /// Batches of bricks go while there is room on the way.
+    fn batches(&mut self, id: WorkerId, at: Nanos) {
+        loop {
+            let w = self.workers.get_mut(&id).expect("a worker that gets bricks is there");
+            if w.under_way == BATCHES {
+                return;
+            }
+            let Some((set, bricks, bytes)) = w.batches.pop_front() else { return };
+            w.under_way += 1;
+            let (fixed, byte) = self.cluster.costs.bricks;
+            let at = self.master(|w| &mut w.streams, at, fixed + byte * bytes as f64);
+            let w = self.workers.get_mut(&id).expect("as before");
+            let there = through(&mut self.down, &mut w.down, at, bytes);
+            self.outcome.frames[self.at].bricks += bytes;
+            let when = there + self.cluster.link.latency_ns + self.cluster.costs.wake as Nanos;
+            self.later(when, Coming::Batch(id, set, bricks, bytes));
+        }
+    }
+
+    fn happen(
+        &mut self,
+        what: Coming,
+        took: &mut Took,
+        watch: &mut dyn Stopwatch,
+    ) -> Result<(), Unknown> {
+        let now = self.now();
+        match what {
+            Coming::AtMaster(event, bytes) => {
+                let (fixed, byte) = self.cluster.costs.receive;
+                let at = self.master(|w| &mut w.streams, now, fixed + byte * bytes as f64);
+                self.later(at, Coming::Inbox(event));
+            }
+            Coming::Inbox(event) => {
+                self.inbox.push(event);
+                self.drive(took, watch)?;
+            }
+            Coming::Free => {
+                self.driver_busy = false;
+                self.drive(took, watch)?;
+            }
+            Coming::AtWorker(id, message) => self.told(id, message)?,
+            Coming::Batch(id, set, bricks, bytes) => {
+                let (fixed, byte) = self.cluster.costs.worker_bricks;
+                let at = self.worker(id, now, fixed + byte * bytes as f64);
+                let w = self.workers.get_mut(&id).expect("a worker stays");
+                w.under_way -= 1;
+                let count = bricks.len() as u32;
+                w.present.extend(bricks.into_iter().map(|b| (set, b)));
+                self.batches(id, now);
+                self.up(id, Event::BricksIn { worker: id, set, bricks: count }, SMALL, at);
+                self.begin(id)?;
+            }
+            Coming::Lease(id, lease) => {
+                let w = self.workers.get_mut(&id).expect("a worker stays");
+                w.leases.push_back((lease, now));
+                self.begin(id)?;
+            }
+            Coming::TaskEnd(id, thread) => {
+                let w = self.workers.get_mut(&id).expect("a worker stays");
+                let stolen = std::mem::take(&mut w.stolen);
+                if stolen > 0 {
+                    self.later(now + stolen, Coming::TaskEnd(id, thread));
+                    return Ok(());
+                }
+                self.end_task(id, thread);
+                self.begin(id)?;
+            }
+            Coming::Finished(frame) => {
+                self.outcome.frames[frame.0 as usize - 1].delivered = now;
+                self.finished += 1;
+                self.in_hand -= 1;
+                self.feed();
+                self.drive(took, watch)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn told(&mut self, id: WorkerId, message: ToWorker) -> Result<(), Unknown> {
+        let now = self.now();
+        let (fixed, byte) = self.cluster.costs.worker_receive;
+        match message {
+            ToWorker::Lease(lease) => {
+                let bytes = self.known(&lease)?.1;
+                let at = self.worker(id, now, fixed + byte * bytes as f64);
+                self.later(at, Coming::Lease(id, lease));
+            }
+            ToWorker::EndFrame { frame } => {
+                let w = self.workers.get_mut(&id).expect("a worker stays");
+                w.leases.retain(|(l, _)| l.frame != frame);
+                w.tables.remove(&frame);
+            }
+            ToWorker::Ping { nonce } => {
+                let pong = Event::Pong { worker: id, nonce, clock_us: micros(now) };
+                self.up(id, pong, SMALL, now);
+            }
+            ToWorker::DropBricks { set, bricks } => {
+                let w = self.workers.get_mut(&id).expect("a worker stays");
+                for b in bricks {
+                    w.present.remove(&(set, b));
+                }
+            }
+            _ => {
+                self.worker(id, now, fixed + byte * FRAME as f64);
+            }
+        }
+        Ok(())
+    }
+
+    /// Time, lease bytes and result bytes of a tile.
+    fn known(&self, lease: &Lease) -> Result<(u64, u64, u64), Unknown> {
+        let frame = lease.frame.0 as usize - 1;
+        let slab = self.trace.frames[frame].slab(lease.slab);
+        let tile = slab.and_then(|s| s.tile(&lease.tile, self.trace.about.size));
+        match tile {
+            Some(t) => Ok((t.ns, t.lease_bytes.into(), t.result_bytes.into())),
+            None => {
+                let (first, end) = (lease.slab.first, lease.slab.end);
+                Err(Unknown::Tile { frame, tile: lease.tile, first, end })
+            }
+        }
+    }
+
+    /// Free threads begin leases whose bricks are there.
+    fn begin(&mut self, id: WorkerId) -> Result<(), Unknown> {
+        let now = self.now();
+        loop {
+            let w = self.workers.get_mut(&id).expect("a worker stays");
+            let Some(thread) = w.running.iter().position(Option::is_none) else { return Ok(()) };
+            let ready = w.leases.iter().position(|(l, _)| {
+                let set = self.jobs[l.frame.0 as usize - 1].scene.bricks;
+                l.bricks.iter().all(|&b| w.present.contains(&(set, b)))
+            });
+            let Some(i) = ready else { return Ok(()) };
+            let (lease, received) = w.leases.remove(i).expect("just found");
+            let (ns, _, result_bytes) = self.known(&lease)?;
+            let frame = lease.frame;
+            let setup = self.trace.frames[frame.0 as usize - 1].setup_ns as f64;
+            let stretch = self.cluster.stretch;
+            let w = self.workers.get_mut(&id).expect("a worker stays");
+            // The first tile of a frame makes its tables; others wait for them.
+            let made = *w.tables.entry(frame).or_insert(now + (setup * stretch) as Nanos);
+            let end = made.max(now) + (ns as f64 * stretch) as Nanos;
+            self.outcome.frames[frame.0 as usize - 1].render += end - now;
+            let w = self.workers.get_mut(&id).expect("a worker stays");
+            w.running[thread] =
+                Some(Running { lease, received, ready: now, start: now, result_bytes });
+            self.later(end, Coming::TaskEnd(id, thread));
+        }
+    }
+
+    fn end_task(&mut self, id: WorkerId, thread: usize) {
+        let now = self.now();
+        let w = self.workers.get_mut(&id).expect("a worker stays");
+        let r = w.running[thread].take().expect("a task that ends has begun");
+        let (l, frame) = (&r.lease, r.lease.frame.0 as usize - 1);
+        let size = self.trace.about.size;
+        let shut = self.shut.entry((frame, l.slab.first)).or_insert_with(|| {
+            self.trace.frames[frame].slab(l.slab).map_or_else(Vec::new, |s| s.shut(size))
+        });
+        let mut a = Vec::with_capacity(l.tile.area());
+        for y in l.tile.y0..l.tile.y1 {
+            let row = y as usize * size[0] as usize;
+            let row = &shut[row + l.tile.x0 as usize..row + l.tile.x1 as usize];
+            a.extend(row.iter().map(|&s| f32::from(u8::from(s))));
+        }
+        let result = Box::new(TileResult {
+            task: l.task,
+            epoch: l.epoch,
+            pixels: TilePixels { a, colour: vec![[0; 3]; l.tile.area()], last: None },
+            counters: Counters::default(),
+            times: TaskTimes {
+                received_us: micros(r.received),
+                ready_us: micros(r.ready),
+                start_us: micros(r.start),
+                end_us: micros(now),
+                thread: thread as u32,
+            },
+        });
+        self.up(id, Event::Result { worker: id, result }, r.result_bytes, now);
+    }
+
+    /// The driver: everything that lies before it, then the wishes.
+    fn drive(&mut self, took: &mut Took, watch: &mut dyn Stopwatch) -> Result<(), Unknown> {
+        if self.driver_busy || self.inbox.is_empty() {
+            return Ok(());
+        }
+        let now = self.now();
+        let costs = self.cluster.costs;
+        let mut cost = 0.0;
+        let mut actions = Vec::new();
+        for event in std::mem::take(&mut self.inbox) {
+            let result = match &event {
+                Event::Result { result, .. } => Some(result.pixels.a.len()),
+                _ => None,
+            };
+            cost += match result {
+                Some(pixels) => costs.result + costs.result_pixel * pixels as f64,
+                None => costs.event,
+            };
+            let before = watch.read();
+            self.scheduler.handle(&self.clock, event);
+            let from = actions.len();
+            while let Some(action) = self.scheduler.next_action() {
+                actions.push(action);
+            }
+            let after = watch.read();
+            let (mut frames, mut slabs) = (0, 0);
+            let (mut leases, mut lease_pixels) = (0, 0);
+            for action in &actions[from..] {
+                match action {
+                    Action::Send { message: ToWorker::Lease(lease), .. } => {
+                        leases += 1;
+                        lease_pixels += lease.tile.area() as u64;
+                        let before = self.last_slab.replace((lease.frame, lease.slab.first));
+                        if before != self.last_slab {
+                            slabs += 1;
+                            frames += u64::from(before.is_none_or(|b| b.0 != lease.frame));
+                        }
+                    }
+                    Action::FrameDone { frame, .. } => {
+                        // Before the next is begun, which the same event may do.
+                        self.outcome.frames[frame.0 as usize - 1].done = now + cost as Nanos;
+                        self.at = (frame.0 as usize).min(self.jobs.len() - 1);
+                    }
+                    _ => {}
+                }
+            }
+            let job = &self.jobs[self.at];
+            let bricks = job.bricks.len() as f64;
+            let pixels = job.view.size[0] as f64 * job.view.size[1] as f64;
+            // What begins a frame or a slab gives its first leases, too.
+            cost += if frames > 0 {
+                costs.frame_brick * bricks
+            } else if slabs > 0 {
+                costs.slab_brick * bricks + costs.slab_pixel * pixels
+            } else {
+                costs.lease * leases as f64 + costs.lease_pixel * lease_pixels as f64
+            };
+            if let (Some(before), Some(after)) = (before, after) {
+                let ns = after - before;
+                if frames > 0 {
+                    took.frames.0 += job.bricks.len() as u64;
+                    took.frames.1 += ns;
+                } else if slabs > 0 {
+                    took.slabs.0 += job.bricks.len() as u64;
+                    took.slabs.1 += ns;
+                    took.slab_pixels += pixels as u64;
+                } else if let Some(pixels) = result {
+                    took.results.0 += pixels as u64;
+                    took.results.1 += ns;
+                    took.result_count += 1;
+                    took.lease_count += leases;
+                    took.lease_pixels += lease_pixels;
+                } else {
+                    took.others.0 += 1;
+                    took.others.1 += ns;
+                }
+            }
+        }
+        let end = self.master(|w| &mut w.driver, now, cost);
+        self.driver_busy = true;
+        self.later(end, Coming::Free);
+        for action in actions {
+            self.carry_out(action, end)?;
+        }
+        Ok(())
+    }
+
+    fn carry_out(&mut self, action: Action, at: Nanos) -> Result<(), Unknown> {
+        match action {
+            Action::Send { worker, message } => {
+                let bytes = match &message {
+                    ToWorker::Lease(lease) => {
+                        self.outcome.frames[lease.frame.0 as usize - 1].leases += 1;
+                        self.known(lease)?.1
+                    }
+                    ToWorker::Frame { .. } | ToWorker::Scene(_) => FRAME,
+                    _ => SMALL,
+                };
+                self.down(worker, message, bytes, at);
+            }
+            Action::SendBricks { worker, set, bricks } => {
+                let job = self.jobs.iter().find(|j| j.scene.bricks == set);
+                let infos = job.map_or(&[][..], |j| &j.bricks[..]);
+                let w = self.workers.get_mut(&worker).expect("a worker stays");
+                let (mut batch, mut bytes) = (Vec::new(), 0u64);
+                for id in bricks {
+                    let at = infos.binary_search_by_key(&id, |b| b.id);
+                    bytes += at.map_or(0, |i| u64::from(infos[i].bytes));
+                    batch.push(id);
+                    if bytes >= BATCH {
+                        w.batches.push_back((set, std::mem::take(&mut batch), bytes));
+                        bytes = 0;
+                    }
+                }
+                if !batch.is_empty() {
+                    w.batches.push_back((set, batch, bytes));
+                }
+                self.batches(worker, at);
+            }
+            Action::FrameDone { frame, .. } => {
+                let i = frame.0 as usize - 1;
+                self.shut.retain(|(f, _), _| *f != i);
+                // The scheduler goes on with the next at once, where there is one.
+                if i + 1 < self.queued {
+                    self.outcome.frames[i + 1].began = self.outcome.frames[i].done;
+                }
+                let [w, h] = self.jobs[i].view.size.map(f64::from);
+                let ns = self.cluster.costs.finish_pixel * w * h;
+                let finished = self.master(|w| &mut w.finisher, at, ns);
+                self.later(finished, Coming::Finished(frame));
+            }
+            Action::FrameFailed { frame, reason } => {
+                return Err(Unknown::Failed { frame: frame.0 as usize - 1, reason });
+            }
+            Action::Drop { .. } | Action::Progress { .. } => {}
+        }
+        Ok(())
+    }
+}

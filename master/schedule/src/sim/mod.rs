@@ -1,0 +1,255 @@
+//! A cluster that is not there yet: the scheduler itself, against virtual workers on a virtual
+//! clock, with tiles that take as long as a [`Trace`] says.
+//!
+//! How long will a frame take on 40 machines? A formula knows tiles and bandwidth, and nothing of
+//! the order in which leases are given, who waits at a barrier, what is lent ahead, or which copy
+//! of a late tile counts. All of that is decided by [`Scheduler`], which is pure: so it decides here
+//! too, and only what it can't know is a model:
+//!
+//! ```text
+//!  driver (one thread) -> streams (encode) -> the master's link -> a worker's link -> decode
+//!     ^                                                                                 |
+//!     |                                                                          render threads
+//!  decode <- the master's link <- a worker's link <- encode <--------------------------'
+//! ```
+//!
+//! Each arrow is a queue that serves in order. A link carries so many bytes a second each way, the
+//! master's is shared by all; bricks go in batches of 64 KiB, two under way to a worker at once, so
+//! that a lease never waits behind many. What a message costs a processor is a constant and a part
+//! for each byte ([`Costs`]), measured on the machine that predicts.
+//!
+//! It refuses to know what is in a picture, and where times come from. It leaves out: lost packets,
+//! other traffic, memory that cores share, slow disks, and workers that are lost.
+
+mod cluster;
+mod pipe;
+
+pub use cluster::run;
+
+use crate::Micros;
+use slabcast_common::occlusion::Rect;
+use slabcast_common::trace::Trace;
+
+/// Nanoseconds since the cluster began.
+pub type Nanos = u64;
+
+/// What lies between two machines, each way.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Link {
+    /// Bytes a second that a stream gets through; `None`: as many as there are.
+    pub bytes_per_s: Option<f64>,
+    /// From one end to the other.
+    pub latency_ns: Nanos,
+}
+
+impl Link {
+    /// No limit and no delay.
+    pub const NONE: Link = Link { bytes_per_s: None, latency_ns: 0 };
+}
+
+/// What messages and decisions cost a processor, in nanoseconds.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Costs {
+    /// Driver: to begin a frame, a brick of it.
+    pub frame_brick: f64,
+    /// Driver: to begin a slab, a brick of the frame.
+    pub slab_brick: f64,
+    /// Driver: to begin a slab, a pixel of the picture.
+    pub slab_pixel: f64,
+    /// Driver: a lease.
+    pub lease: f64,
+    /// Driver: a pixel of a lease.
+    pub lease_pixel: f64,
+    /// Driver: a result.
+    pub result: f64,
+    /// Driver: a pixel of a result.
+    pub result_pixel: f64,
+    /// Driver: anything else that happens.
+    pub event: f64,
+    /// The master's streams: a message out, and a byte of it.
+    pub send: (f64, f64),
+    /// The master's streams: a message in, and a byte of it.
+    pub receive: (f64, f64),
+    /// The master's streams: a batch of bricks, and a byte of it.
+    pub bricks: (f64, f64),
+    /// The master's finisher: a pixel of a picture (hash, encoding, statistics).
+    pub finish_pixel: f64,
+    /// Worker: a message in, and a byte of it.
+    pub worker_receive: (f64, f64),
+    /// Worker: a message out, and a byte of it.
+    pub worker_send: (f64, f64),
+    /// Worker: a batch of bricks, and a byte of it.
+    pub worker_bricks: (f64, f64),
+    /// From a message's coming to somebody's working on it, where he slept.
+    pub wake: f64,
+}
+
+/// A cluster to be tried.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Cluster {
+    /// Workers.
+    pub workers: u32,
+    /// Render threads of each, with a core each.
+    pub threads: u32,
+    /// Every worker's link, and the master's own.
+    pub link: Link,
+    /// What messages and decisions cost.
+    pub costs: Costs,
+    /// Everything on one machine of so many cores, with rendering that takes time but no core: a
+    /// rehearsal. `None`: machines of their own, and the master's has a core for each of its threads.
+    pub cores: Option<u32>,
+    /// Frames that the master has in hand at once.
+    pub in_flight: u32,
+    /// What rendering times are multiplied with.
+    pub stretch: f64,
+}
+
+/// What became of a frame.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct FrameOutcome {
+    /// When the scheduler began with it: when it was queued, or when the one before was done.
+    pub began: Nanos,
+    /// When its last pixel was there.
+    pub done: Nanos,
+    /// When it was hashed and encoded.
+    pub delivered: Nanos,
+    /// Sum of its rendering.
+    pub render: Nanos,
+    /// Bytes from the master, bricks left out.
+    pub down: u64,
+    /// Bytes to the master.
+    pub up: u64,
+    /// Bytes of bricks.
+    pub bricks: u64,
+    /// Leases.
+    pub leases: u64,
+}
+
+/// What became of all.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Outcome {
+    /// Frames in the order of the path.
+    pub frames: Vec<FrameOutcome>,
+    /// Work of the driver.
+    pub driver: Nanos,
+    /// Work of the master's streams.
+    pub streams: Nanos,
+    /// Work of the finisher.
+    pub finisher: Nanos,
+    /// Work of all workers but rendering.
+    pub workers: Nanos,
+}
+
+/// Why nothing can be predicted.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Unknown {
+    /// The scheduler wants a tile that was not measured.
+    #[error(
+        "frame {frame}: the trace has no tile ({},{}) to ({},{}) of sheets {first} to {end}; measure \
+         it again with these flags", tile.x0, tile.y0, tile.x1, tile.y1
+    )]
+    Tile {
+        /// Number of the frame.
+        frame: usize,
+        /// Its pixels.
+        tile: Rect,
+        /// First sheet.
+        first: i32,
+        /// One past the last.
+        end: i32,
+    },
+    /// There are more or fewer frames than jobs.
+    #[error("the trace has {have} frames, the path {need}; measure it again with these flags")]
+    Frames {
+        /// In the trace.
+        have: usize,
+        /// Of the path.
+        need: usize,
+    },
+    /// The scheduler gave a frame up.
+    #[error("frame {frame} failed: {reason}")]
+    Failed {
+        /// Number of the frame.
+        frame: usize,
+        /// In its words.
+        reason: String,
+    },
+}
+
+/// Measures what the scheduler takes of the real machine while a simulation runs.
+pub trait Stopwatch {
+    /// Nanoseconds since some moment; `None`: nobody measures.
+    fn read(&mut self) -> Option<Nanos>;
+}
+
+/// Nobody measures.
+pub struct Unmeasured;
+
+impl Stopwatch for Unmeasured {
+    fn read(&mut self) -> Option<Nanos> {
+        None
+    }
+}
+
+/// What the scheduler took by kind of work: counts and nanoseconds.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Took {
+    /// Frames that were begun, and what that took, in bricks.
+    pub frames: (u64, Nanos),
+    /// Slabs that were begun, in bricks of their frames.
+    pub slabs: (u64, Nanos),
+    /// Pixels of slabs that were begun.
+    pub slab_pixels: u64,
+    /// Pixels of results, of which nothing was begun.
+    pub results: (u64, Nanos),
+    /// Results among them.
+    pub result_count: u64,
+    /// Leases given with them.
+    pub lease_count: u64,
+    /// Pixels of those.
+    pub lease_pixels: u64,
+    /// All else.
+    pub others: (u64, Nanos),
+}
+
+impl Outcome {
+    /// Mean time of a frame from its beginning to its last pixel, in ms; the first is left out, which
+    /// also brings the bricks.
+    pub fn frame_ms(&self) -> f64 {
+        let frames = &self.frames[usize::from(self.frames.len() > 1)..];
+        let sum: u64 = frames.iter().map(|f| f.done - f.began).sum();
+        sum as f64 / 1e6 / frames.len().max(1) as f64
+    }
+
+    /// The first frame's time, in ms.
+    pub fn first_ms(&self) -> f64 {
+        self.frames.first().map_or(0.0, |f| (f.done - f.began) as f64 / 1e6)
+    }
+
+    /// Milliseconds from one delivered frame to the next.
+    pub fn each_ms(&self) -> f64 {
+        match &self.frames[..] {
+            [first, .., last] => {
+                (last.delivered - first.delivered) as f64 / 1e6 / (self.frames.len() - 1) as f64
+            }
+            [only] => (only.delivered - only.began) as f64 / 1e6,
+            [] => 0.0,
+        }
+    }
+
+    /// Mean of a figure over the frames but the first.
+    pub fn mean(&self, of: impl Fn(&FrameOutcome) -> u64) -> f64 {
+        let frames = &self.frames[usize::from(self.frames.len() > 1)..];
+        frames.iter().map(|f| of(f) as f64).sum::<f64>() / frames.len().max(1) as f64
+    }
+}
+
+/// One worker's time for the path through the best cut, mean of the frames but the first, in ms.
+pub fn alone_ms(trace: &Trace) -> f64 {
+    let frames = &trace.frames[usize::from(trace.frames.len() > 1)..];
+    frames.iter().map(|f| f.alone_ns as f64).sum::<f64>() / 1e6 / frames.len().max(1) as f64
+}
+
+fn micros(ns: Nanos) -> Micros {
+    ns / 1000
+}

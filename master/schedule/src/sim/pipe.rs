@@ -1,0 +1,76 @@
+//! Queues that serve in order: links and processors.
+
+use super::Nanos;
+
+/// One direction of a link.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Pipe {
+    ns_per_byte: f64,
+    free: Nanos,
+}
+
+impl Pipe {
+    pub(super) fn new(bytes_per_s: Option<f64>) -> Self {
+        Pipe { ns_per_byte: bytes_per_s.map_or(0.0, |b| 1e9 / b), free: 0 }
+    }
+
+    /// A message that is there at `at`: when its last byte is through. The first may go on while
+    /// others follow: see [`through`].
+    fn send(&mut self, at: Nanos, bytes: u64) -> Nanos {
+        let end = self.free.max(at) + (bytes as f64 * self.ns_per_byte) as Nanos;
+        self.free = end;
+        end
+    }
+}
+
+/// A message through two pipes: packets leave the first while others are still before it.
+pub(super) fn through(a: &mut Pipe, b: &mut Pipe, at: Nanos, bytes: u64) -> Nanos {
+    let out = a.send(at, bytes);
+    let first = out - (bytes as f64 * a.ns_per_byte) as Nanos;
+    b.send(first, bytes).max(out)
+}
+
+/// Threads that take work in the order in which it comes.
+#[derive(Clone, Debug)]
+pub(super) struct Cores {
+    free: Vec<Nanos>,
+    pub(super) work: Nanos,
+}
+
+impl Cores {
+    pub(super) fn new(n: u32) -> Self {
+        Cores { free: vec![0; n.max(1) as usize], work: 0 }
+    }
+
+    /// Work that is there at `at`: when it is done.
+    pub(super) fn run(&mut self, at: Nanos, ns: f64) -> Nanos {
+        let ns = ns as Nanos;
+        self.work += ns;
+        let core = self.free.iter_mut().min().expect("there is at least one");
+        *core = (*core).max(at) + ns;
+        *core
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_shared_link_is_shared_and_two_in_a_row_take_the_time_of_one() {
+        let mut master = Pipe::new(Some(1e6));
+        let (mut one, mut two) = (Pipe::new(Some(1e6)), Pipe::new(Some(1e6)));
+        assert_eq!(through(&mut master, &mut one, 0, 1000), 1_000_000);
+        assert_eq!(through(&mut master, &mut two, 0, 1000), 2_000_000);
+        assert_eq!(through(&mut master, &mut one, 5_000_000, 1000), 6_000_000);
+        let (mut a, mut b) = (Pipe::new(None), Pipe::new(None));
+        assert_eq!(through(&mut a, &mut b, 7, 1 << 30), 7);
+    }
+
+    #[test]
+    fn cores_work_side_by_side() {
+        let mut cores = Cores::new(2);
+        assert_eq!([5.0, 5.0, 5.0].map(|ns| cores.run(10, ns)), [15, 15, 20]);
+        assert_eq!(cores.work, 15);
+    }
+}

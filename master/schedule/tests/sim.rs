@@ -1,0 +1,231 @@
+//! Simulated clusters whose times can be worked out by hand.
+
+use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox};
+use slabcast_common::ids::{BrickId, FrameId, SceneId};
+use slabcast_common::message::SceneSpec;
+use slabcast_common::occlusion::{Rect, ShutMap};
+use slabcast_common::presets;
+use slabcast_common::quality::{Quality, Work};
+use slabcast_common::slab::SheetRange;
+use slabcast_common::trace::{
+    About, FrameTrace, Level, SlabTrace, TileTrace, Trace, VERSION, view_sha256,
+};
+use slabcast_common::view::{Camera, CameraProjection, View};
+use slabcast_common::volume::{Digest32, Volume};
+use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Unknown, Unmeasured};
+use slabcast_schedule::{FrameJob, macrotile};
+use std::sync::Arc;
+
+const SIZE: [u32; 2] = [256, 200];
+const BRICK_BYTES: u32 = 1000;
+
+/// Frames of a solid cube, and a trace in which a pixel takes 10 ns and two bytes each way. Half of
+/// the picture is shut behind the first slab.
+fn world(frames: usize) -> (Vec<FrameJob>, Trace) {
+    let dims = [64; 3];
+    let info = Volume::from_fn_u8("v", dims, |i, _, _| i as u8).info(Digest32([1; 32]));
+    let transfer = presets::by_name("grey", &info.summary).expect("a known name");
+    let quality = Quality::default();
+    let grid = BrickGrid::of(dims);
+    let bricks: Arc<[BrickInfo]> = (0..grid.len() as u32)
+        .map(|id| {
+            let lo = grid.corner(BrickId(id));
+            let tight = TightBox { lo, hi: lo.map(|x| x + BRICK - 1) };
+            BrickInfo { id: BrickId(id), tight, voxels: 512, bytes: BRICK_BYTES }
+        })
+        .collect();
+    let set = BrickSetKey(Digest32([2; 32]));
+    let scene = SceneSpec { id: SceneId(1), volume: info, transfer, quality, bricks: set };
+    let scene = Arc::new(scene);
+    let jobs: Vec<FrameJob> = (0..frames)
+        .map(|i| {
+            let camera = Camera {
+                to_eye: [0.1 * i as f64, 0.3, 1.0].into(),
+                up: [0.0, 1.0, 0.0].into(),
+                target: [0.0; 3].into(),
+                projection: CameraProjection::Ortho { height: 90.0 },
+            };
+            let lattice = &scene.volume.lattice;
+            let view = View::new(lattice, &camera, SIZE, &quality).expect("drawable");
+            let (frame, number) = (FrameId(i as u64 + 1), i as u64);
+            let (scene, bricks, work) = (scene.clone(), bricks.clone(), Work::default());
+            FrameJob { frame, number, scene, bricks, view, work }
+        })
+        .collect();
+    let frames = jobs.iter().map(|job| frame(job, &quality)).collect();
+    let about = About {
+        volume: "v".into(),
+        transfer: "grey".into(),
+        simd: "none".into(),
+        pixels_version: slabcast_common::PIXELS_VERSION,
+        program: "0".into(),
+        size: SIZE,
+        slabs: 3,
+        repeats: 1,
+    };
+    (jobs, Trace { version: VERSION, about, frames })
+}
+
+fn frame(job: &FrameJob, quality: &Quality) -> FrameTrace {
+    let projected: Vec<_> = job.bricks.iter().map(|b| job.view.project(&b.tight)).collect();
+    let sheets = projected.iter().flatten().fold(SheetRange::default(), |s, p| s.union(p.sheets));
+    let mut shut = ShutMap::open(Rect::of_size(SIZE));
+    let mut slabs = Vec::new();
+    for (n, range) in sheets.slabs(3).into_iter().enumerate() {
+        let rects: Vec<Rect> = projected
+            .iter()
+            .flatten()
+            .filter(|p| p.sheets.overlaps(range) && !shut.all_shut(&p.rect))
+            .map(|p| p.rect)
+            .collect();
+        let levels = [16, 32, 64, 128, 256].map(|edge| {
+            let cut = macrotile::cut(SIZE, &rects, &shut, quality.cull, 0, Some(edge));
+            let mut tiles: Vec<TileTrace> = cut
+                .tiles
+                .iter()
+                .map(|t| TileTrace {
+                    x: t.rect.x0 as u32,
+                    y: t.rect.y0 as u32,
+                    ns: 10 * t.rect.area() as u64,
+                    lease_bytes: 2 * t.rect.area() as u32,
+                    result_bytes: 2 * t.rect.area() as u32,
+                })
+                .collect();
+            tiles.sort_by_key(|t| (t.y, t.x));
+            Level { edge, tiles }
+        });
+        if n == 0 {
+            (0..SIZE[0] as usize * 100).for_each(|i| shut.shut(i));
+            shut.refresh();
+        }
+        let bits = (0..SIZE[0] as usize * SIZE[1] as usize).map(|i| shut.is_shut(i));
+        let runs = SlabTrace::runs(bits);
+        slabs.push(SlabTrace {
+            first: range.first,
+            end: range.end,
+            shut: runs,
+            levels: levels.into(),
+        });
+    }
+    FrameTrace {
+        view: view_sha256(&job.scene, &job.view).to_string(),
+        setup_ns: 5_000,
+        alone_ns: 300_000,
+        alone_edge: 128,
+        slabs,
+    }
+}
+
+fn cluster(workers: u32) -> Cluster {
+    Cluster {
+        workers,
+        threads: 1,
+        link: Link::NONE,
+        costs: Costs::default(),
+        cores: None,
+        in_flight: 1,
+        stretch: 1.0,
+    }
+}
+
+fn run(jobs: &[FrameJob], trace: &Trace, cluster: &Cluster) -> Outcome {
+    sim::run(jobs, trace, cluster, &mut Unmeasured).expect("it can be predicted").0
+}
+
+#[test]
+fn one_worker_without_any_cost_takes_the_sum_of_its_tiles() {
+    let (jobs, trace) = world(3);
+    let outcome = run(&jobs, &trace, &cluster(1));
+    for f in &outcome.frames {
+        assert_eq!(f.done - f.began, f.render);
+        assert_eq!(f.delivered, f.done);
+        // Each pixel of a drawn tile costs 10 ns and 2 bytes; a frame's tables 5 us.
+        let pixels = (f.render - 5_000) / 10;
+        assert!(f.up >= 2 * pixels && f.up < 2 * pixels + 64 * 200, "{f:?}");
+    }
+    // Those behind the shut half are never sent.
+    let sent = outcome.frames[0].bricks / u64::from(BRICK_BYTES);
+    assert!((257..512).contains(&sent), "{sent} of 512 bricks");
+    let later = outcome.frames[1].bricks / u64::from(BRICK_BYTES);
+    assert!(later < 10, "they are held from then on, but {later} came with the new view");
+}
+
+#[test]
+fn more_workers_share_the_work_and_nothing_is_won_beyond_it() {
+    let (jobs, trace) = world(3);
+    let mut before = u64::MAX;
+    for workers in [1, 2, 4, 8] {
+        let outcome = run(&jobs, &trace, &cluster(workers));
+        let f = outcome.frames[1];
+        let took = f.done - f.began;
+        assert!(took * u64::from(workers) >= f.render, "{workers}: {f:?}");
+        assert!(took < before, "{workers} workers: {took} ns, {before} with half as many");
+        before = took;
+    }
+}
+
+#[test]
+fn the_masters_link_is_shared_by_all_workers() {
+    let (jobs, trace) = world(2);
+    let at = |workers, bytes_per_s| {
+        let link = Link { bytes_per_s: Some(bytes_per_s), latency_ns: 20_000 };
+        run(&jobs, &trace, &Cluster { link, ..cluster(workers) }).frames[0]
+    };
+    // 384 kB of bricks for each worker at 10 MB/s: 38 ms each, one after another.
+    let (two, four) = (at(2, 1e7), at(4, 1e7));
+    assert_eq!([two.bricks, four.bricks], [768_000, 1_536_000]);
+    let ms = |f: &sim::FrameOutcome| (f.done - f.began) as f64 / 1e6;
+    assert!((77.0..120.0).contains(&ms(&two)), "{two:?}");
+    assert!((154.0..220.0).contains(&ms(&four)), "{four:?}");
+    assert!(ms(&at(4, 1e8)) < 0.2 * ms(&four));
+}
+
+#[test]
+fn what_the_master_costs_shows_in_frames_and_overlaps_where_it_may() {
+    let (jobs, trace) = world(4);
+    let free = run(&jobs, &trace, &cluster(4));
+    let costs = Costs { finish_pixel: 20.0, receive: (30_000.0, 0.0), ..Costs::default() };
+    let one = run(&jobs, &trace, &Cluster { costs, ..cluster(4) });
+    let three = run(&jobs, &trace, &Cluster { costs, in_flight: 3, ..cluster(4) });
+    assert!(one.frame_ms() > free.frame_ms());
+    // 51,200 pixels at 20 ns are finished while the next frame is drawn.
+    assert!(one.each_ms() > one.frame_ms() + 1.0, "{} {}", one.each_ms(), one.frame_ms());
+    assert!(three.each_ms() < one.each_ms() - 0.5);
+    // On one machine with two cores there is less to overlap with.
+    let rehearsal =
+        run(&jobs, &trace, &Cluster { costs, in_flight: 3, cores: Some(1), ..cluster(4) });
+    assert!(rehearsal.each_ms() > three.each_ms());
+}
+
+#[test]
+fn the_same_cluster_behaves_the_same() {
+    let (jobs, trace) = world(3);
+    let costs = Costs {
+        send: (9_000.0, 0.7),
+        receive: (8_000.0, 0.4),
+        worker_send: (10_000.0, 1.1),
+        wake: 15_000.0,
+        result_pixel: 1.3,
+        slab_brick: 30.0,
+        ..Costs::default()
+    };
+    let link = Link { bytes_per_s: Some(1.2e8), latency_ns: 50_000 };
+    let c = Cluster { costs, link, threads: 2, in_flight: 3, ..cluster(7) };
+    assert_eq!(run(&jobs, &trace, &c), run(&jobs, &trace, &c));
+}
+
+#[test]
+fn a_tile_that_was_not_measured_is_named() {
+    let (jobs, mut trace) = world(1);
+    trace.frames[0].slabs[1].levels.retain(|l| l.edge > 64);
+    let c = cluster(30);
+    match sim::run(&jobs, &trace, &c, &mut Unmeasured) {
+        Err(Unknown::Tile { frame: 0, first, .. }) => {
+            assert_eq!(first, trace.frames[0].slabs[1].first);
+        }
+        other => panic!("{other:?}"),
+    }
+    let (two, _) = world(2);
+    let none = sim::run(&two, &trace, &c, &mut Unmeasured);
+    assert_eq!(none.unwrap_err(), Unknown::Frames { have: 1, need: 2 });
+}

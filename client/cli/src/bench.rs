@@ -6,6 +6,8 @@
 //! next but what a worker keeps, too.
 
 use crate::fail::{Fail, say};
+use crate::front::choose::settle;
+use crate::front::magnify::magnified;
 use crate::local::{self, Cut};
 use crate::progress::{self, Progress};
 use crate::request::{PictureOf, ThreadArg, lattice_notice};
@@ -40,6 +42,9 @@ pub(crate) struct BenchArgs {
     #[arg(long, value_name = "N", default_value = "1024",
           value_parser = clap::value_parser!(u32).range(0..=1 << 26))]
     pixels: u32,
+    /// Which sample of pixels
+    #[arg(long, value_name = "N", default_value = "1")]
+    seed: u64,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -47,12 +52,13 @@ pub(crate) struct BenchArgs {
 
 /// Runs the command.
 pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
-    let asked = args.of.look.asked(Work::default())?;
+    let mut asked = args.of.look.aimed(Work::default())?;
     let threads = args.threads.count();
     let volume = args.of.open()?;
     let orientation = args.of.look.view.axes.of(&volume)?;
     let info = volume.info(volume.digest());
     asked.fit(&info, orientation, volume.anatomical)?;
+    let volume = settle(volume, &mut asked, orientation, threads, false)?;
     if let Some(notice) = lattice_notice(&info) {
         progress::note(&notice);
     }
@@ -69,13 +75,14 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
         let began = Instant::now();
         let frame = Frame::new(scene, view);
         let (picture, counted) = local::counted_picture(&frame, bricks, cut);
+        let picture = magnified(picture, asked.magnify, threads);
         let took = began.elapsed().as_secs_f64() * 1e3;
         each.push(took);
         if i > 0 || views == 1 {
             counters += counted;
         }
         if i == views / 2 {
-            middle = Some((view, picture));
+            middle = Some((stage.view_of(i, &asked.quality, asked.size())?, picture));
         }
         progress.step(progress::Step { frames: i as u64 + 1, ..Default::default() });
     }
@@ -87,7 +94,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
     let (median, least, most) = (ms[ms.len() / 2], ms[0], ms[ms.len() - 1]);
     let relevant: u64 = bricks.iter().map(|b| b.len() as u64).sum();
     let errors = middle.filter(|_| args.pixels > 0).map(|(view, picture)| {
-        let sample = stratified(asked.path.size, args.pixels as usize, 1);
+        let sample = stratified(asked.size(), args.pixels as usize, args.seed);
         let reference = Reference::new(&stage.spec(views / 2), view, bricks);
         let mut progress = Progress::new(false).of("pixel");
         progress.frames(sample.len() as u64, "the reference");
@@ -96,13 +103,13 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
         });
         progress.end();
         let (limit, same): (Vec<_>, Vec<_>) = truth.into_iter().unzip();
-        let at = |p: &[u32; 2]| picture.pixels[(p[1] * asked.path.size[0] + p[0]) as usize];
+        let at = |p: &[u32; 2]| picture.pixels[(p[1] * asked.size()[0] + p[0]) as usize];
         let got: Vec<_> = sample.iter().map(at).collect();
         [limit, same].map(|want| ErrorFigures::compare(&got, &want, asked.background))
     });
     let simd = Simd::detect().name();
     if args.json {
-        let figures = |e: &ErrorFigures| serde_json::json!({ "rmse": e.rmse, "max": e.max });
+        let figures = |e: &ErrorFigures| serde_json::json!({ "rmse": e.rmse, "max": e.max, "most_999": e.most_999 });
         let json = serde_json::json!({
             "version": env!("CARGO_PKG_VERSION"),
             "pixels_version": slabcast_common::PIXELS_VERSION,
@@ -110,7 +117,8 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
             // In the order of the path, the warming-up first: whoever runs this several times can
             // tell a slow view from a machine that was disturbed.
             "each_ms": each,
-            "threads": threads, "tile": args.tile, "simd": simd, "size": asked.path.size,
+            "threads": threads, "tile": args.tile, "simd": simd, "size": asked.size(),
+            "magnify": asked.magnify,
             "quality": quality, "relevant": relevant,
             "tossed": counters.tossed / n, "splatted": counters.splatted / n,
             "culled": counters.culled / n,

@@ -84,7 +84,9 @@ pub(crate) fn run(args: &ExplainArgs) -> Result<(), Fail> {
 }
 
 fn find(args: &ExplainArgs, at: [u32; 2]) -> Result<Found, Fail> {
-    let still = Still::read(&args.of, |[w, h]| {
+    // A pixel that was magnified comes from no sheets of its own.
+    args.of.look.asked(Default::default())?;
+    let still = Still::read(&args.of, 1, |[w, h]| {
         if at[0] < w && at[1] < h {
             return Ok(());
         }

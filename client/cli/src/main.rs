@@ -12,6 +12,8 @@
 //! - [`info`] looks into files, [`convert`] writes them in another format, [`ask`] looks at a running
 //!   master.
 //! - [`config`] lays flags, environment and file over each other.
+//! - [`report`] sweeps the knobs of quality for error against run time; [`front`] measures, and
+//!   [`chart`] draws.
 //! - [`check`] compares pictures with the oracle over every way to make them; [`error`] says how
 //!   far one is from the truth, [`explain`] why a pixel is as it is. [`local`] draws for the
 //!   first two, [`stage`] has the scenes and views of a path, [`still`] one of them for the last
@@ -23,6 +25,7 @@
 mod ask;
 mod bench;
 mod canvas;
+mod chart;
 mod check;
 mod config;
 mod convert;
@@ -33,9 +36,11 @@ mod embedded;
 mod error;
 mod explain;
 mod fail;
+mod front;
 mod info;
 mod local;
 mod logging;
+mod machine;
 mod output;
 mod parse;
 mod plan;
@@ -44,6 +49,7 @@ mod progress;
 mod record;
 mod remote;
 mod render;
+mod report;
 mod request;
 mod rerender;
 mod runtime;
@@ -108,6 +114,7 @@ enum Command {
     Error(Box<error::ErrorArgs>),
     Explain(Box<explain::ExplainArgs>),
     Bench(Box<bench::BenchArgs>),
+    Report(Box<report::ReportArgs>),
     Check(check::CheckArgs),
     Config(config::ConfigArgs),
     Doctor(doctor::DoctorArgs),
@@ -169,6 +176,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
         Command::Error(args) => error::run(args),
         Command::Explain(args) => explain::run(args),
         Command::Bench(args) => bench::run(args),
+        Command::Report(args) => report::run(args),
         Command::Check(args) => check::run(args),
         Command::Doctor(args) => {
             doctor::run(args, config::path(cli.config.as_deref(), Cli::command()))

@@ -39,6 +39,20 @@ pub(crate) fn fraction(text: &str) -> Result<f64, String> {
     if x.is_finite() { Ok(x) } else { Err(bad()) }
 }
 
+/// A time with its unit (`100ms`, `0.5s`), in milliseconds.
+pub(crate) fn time(text: &str) -> Result<f64, String> {
+    let bad = || "give a time above 0 with its unit, like 100ms or 0.5s".to_string();
+    let digits = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
+    let (count, unit) = text.split_at(digits);
+    let factor = match unit.trim() {
+        "ms" => 1.0,
+        "s" => 1e3,
+        _ => return Err(bad()),
+    };
+    let ms = count.parse::<f64>().map_err(|_| bad())? * factor;
+    if ms > 0.0 && ms.is_finite() { Ok(ms) } else { Err(bad()) }
+}
+
 /// `WxH` in pixels.
 pub(crate) fn size(text: &str) -> Result<[u32; 2], String> {
     let bad = || format!("give WIDTHxHEIGHT in pixels, 1 to {MAX_EDGE} each, like 512x512");

@@ -1,12 +1,13 @@
 //! Figures: errors against what they depend on, as SVG.
 //!
-//! By plotters (MIT, the most used plotting library of Rust), with its SVG writer and the line
-//! series alone: three small crates and no C library; text is set by whoever shows the file. Its
-//! measure of text is a guess then, so nothing here relies on it: ticks are few, the legend has a
-//! place of its own below the panels, and slopes are named where their lines end.
+//! By plotters (MIT, the most used plotting library of Rust), with its SVG writer; text is set by
+//! whoever shows the file, perhaps in another font than it was measured in ([`crate::chart`]). So
+//! nothing here relies on that: ticks are few, the legend has a place of its own below the panels, and
+//! slopes are named where their lines end.
 //!
 //! The ground is opaque and light, so that a figure reads the same in a light page and a dark one.
 
+use crate::chart::family;
 use plotters::coord::Shift;
 use plotters::coord::ranged1d::{KeyPointHint, NoDefaultFormatting, Ranged, ValueFormatter};
 use plotters::prelude::*;
@@ -130,7 +131,7 @@ impl LogLog {
         root.fill(&GROUND)?;
         let (top, rest) = root.split_vertically(TITLE);
         let (middle, bottom) = rest.split_vertically(PANEL.1);
-        let font = ("sans-serif", 17).into_font().color(&INK);
+        let font = (family(), 17).into_font().color(&INK);
         top.draw(&Text::new(self.title.clone(), (16, 10), font))?;
         let (x, y) = self.ranges();
         for (area, panel) in middle.split_evenly((1, n as usize)).iter().zip(&self.panels) {
@@ -180,7 +181,7 @@ impl LogLog {
         x: [f64; 2],
         y: [f64; 2],
     ) -> Result<(), Failed> {
-        let style = |size: i32, colour: &RGBColor| ("sans-serif", size).into_font().color(colour);
+        let style = |size: i32, colour: &RGBColor| (family(), size).into_font().color(colour);
         let mut chart = ChartBuilder::on(area)
             .caption(&panel.title, style(14, &INK))
             .margin_right(14)
@@ -269,7 +270,7 @@ fn legend(area: &DrawingArea<SVGBackend<'_>, Shift>, series: &[Series]) -> Resul
                 _ => area.draw(&Circle::new((x + 12, y), 4, colour.filled()))?,
             }
         }
-        let font = ("sans-serif", 13).into_font().color(&INK);
+        let font = (family(), 13).into_font().color(&INK);
         area.draw(&Text::new(s.name.clone(), (x + 30, y - 6), font))?;
         x += wide(s) + gap;
     }

@@ -4,6 +4,7 @@
 
 use crate::embedded::{Cluster, Crew};
 use crate::fail::{Fail, say};
+use crate::front::choose::settle;
 use crate::output::provenance::Recipe;
 use crate::output::{Format, Frame, Lines, Output, OutputArgs, Patience, Writer};
 use crate::progress::{self, Progress, Step};
@@ -212,7 +213,22 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         }
     }
     let crew = Crew::new(args.workers.unwrap_or(1), args.threads)?;
-    let asked = args.look.asked(args.work.work()?)?;
+    let asked = args.look.aimed(args.work.work()?)?;
+    if !asked.aim.is_empty() {
+        let flags = asked.aim.flags();
+        if master.is_some() {
+            return Err(Fail::usage(format!(
+                "{flags}: is chosen by measuring the volume, which the master has; run `slabcast \
+                 report` where the file is, and give the flags that it names"
+            )));
+        }
+        if args.show.is_some() {
+            return Err(Fail::usage(format!(
+                "{flags}, --show: shows how pictures of a given quality come about; leave one of \
+                 the two out"
+            )));
+        }
+    }
     let frames = asked.frames();
     let stem = args.show.map_or("frame", Show::stem);
     let inputs: Vec<&Path> =
@@ -250,8 +266,14 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         (Some(file), _) => {
             let mut run = run;
             run.progress.stage(&format!("reading {}", file.display()));
-            let volume = args.input.open(file)?;
+            let mut volume = args.input.open(file)?;
             let orientation = args.look.view.axes.of(&volume)?;
+            if !run.asked.aim.is_empty() {
+                let info = volume.info(volume.digest());
+                run.asked.fit(&info, orientation, volume.anatomical)?;
+                let threads = (crew.workers * crew.threads) as usize;
+                volume = settle(volume, &mut run.asked, orientation, threads, args.quiet)?;
+            }
             match args.show {
                 None | Some(Show::Owner) => {
                     runtime.block_on(embedded(run, volume, orientation, crew))
@@ -447,8 +469,8 @@ async fn cluster(mut run: Run, master: String) -> Result<(), Fail> {
 }
 
 impl Run {
-    fn request(&self, info: &VolumeInfo) -> PathRequest {
-        let format = self.output.format.pixels(self.asked.background);
+    fn request(&mut self, info: &VolumeInfo) -> PathRequest {
+        let format = self.output.takes(self.asked.magnify, self.asked.background);
         self.asked.request(info, format, self.trace.wanted())
     }
 
@@ -482,7 +504,7 @@ impl Run {
             asked, output, show, patience, mut stats, trace, mut progress, began, tell, ..
         } = self;
         let total = asked.path.frames() as u64;
-        let [w, h] = asked.path.size;
+        let [w, h] = asked.size();
         let s = if total == 1 { "" } else { "s" };
         progress.frames(total, &format!("rendering {total} frame{s} of {w}x{h} of {what}"));
         let output = Arc::new(output);

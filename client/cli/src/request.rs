@@ -5,6 +5,7 @@
 //! which names the flag (or the file and its field) that is to blame.
 
 use crate::fail::Fail;
+use crate::front::choose::Aim;
 use crate::output::provenance::Provenance;
 use crate::parse::{self, Frames, Tile};
 use crate::transfer::{LookFlags, Transfer, read_json};
@@ -172,6 +173,8 @@ pub(crate) struct QualityArgs {
     #[arg(long, default_value = "on", value_name = "on|off", value_parser = parse::on_off,
           action = clap::ArgAction::Set)]
     cull: bool,
+    #[command(flatten)]
+    aim: Aim,
 }
 
 impl QualityArgs {
@@ -204,8 +207,21 @@ pub(crate) struct LookArgs {
 }
 
 impl LookArgs {
-    /// What the flags ask for.
+    /// What the flags ask for, of a command that draws in the quality that is given.
     pub(crate) fn asked(&self, work: Work) -> Result<Asked, Fail> {
+        let aim = &self.quality.aim;
+        if aim.is_empty() {
+            return self.aimed(work);
+        }
+        Err(Fail::usage(format!(
+            "{}: this command compares qualities that are given; leave it out (render, bench and \
+             error choose by it)",
+            aim.flags()
+        )))
+    }
+
+    /// The same where quality may still have to be chosen (`front::choose::settle`).
+    pub(crate) fn aimed(&self, work: Work) -> Result<Asked, Fail> {
         Asked::new(&self.view, &self.picture, &self.quality, work)
     }
 }
@@ -286,6 +302,10 @@ pub(crate) struct Asked {
     side: Option<AxisArgs>,
     pub(crate) transfer: Transfer,
     pub(crate) quality: Quality,
+    /// What quality is to be chosen by, if anything.
+    pub(crate) aim: Aim,
+    /// Pictures are magnified so many times; the path's size is what is drawn.
+    pub(crate) magnify: u32,
     pub(crate) work: Work,
     pub(crate) background: Background,
 }
@@ -295,10 +315,10 @@ impl Asked {
     pub(crate) fn new(
         view: &ViewArgs,
         picture: &PictureArgs,
-        quality: &QualityArgs,
+        parsed: &QualityArgs,
         work: Work,
     ) -> Result<Self, Fail> {
-        let quality = quality.quality()?;
+        let quality = parsed.quality()?;
         view.axes.orientation()?;
         let mut path = match &view.path {
             Some(file) => view.of_file(file, picture)?,
@@ -315,6 +335,8 @@ impl Asked {
             side: view.view.is_some().then(|| view.axes.clone()),
             transfer: Transfer::parse(&picture.tf, &picture.look)?,
             quality,
+            aim: parsed.aim,
+            magnify: 1,
             work,
             background: picture.background,
         })
@@ -329,9 +351,16 @@ impl Asked {
             side: None,
             transfer: Transfer::plain(tf)?,
             quality: Quality::default(),
+            aim: Aim::default(),
+            magnify: 1,
             work: Work::default(),
             background: Background::Colour([0.0; 3]),
         })
+    }
+
+    /// Size of the pictures that come out.
+    pub(crate) fn size(&self) -> [u32; 2] {
+        self.path.size.map(|n| n * self.magnify)
     }
 
     /// The numbers of its frames on the whole path.
@@ -348,6 +377,8 @@ impl Asked {
             side: None,
             transfer: Transfer::again(&p.transfer, p.preset.clone()),
             quality: p.quality,
+            aim: Aim::default(),
+            magnify: p.magnify,
             work: Work::default(),
             background: p.background(),
         }

@@ -66,10 +66,25 @@ impl Stage {
 
     /// The view of frame `i` at a quality.
     pub(crate) fn view(&self, i: usize, quality: &Quality) -> Result<View, Fail> {
+        self.view_of(i, quality, self.asked.path.size)
+    }
+
+    /// The same in a picture of another size.
+    pub(crate) fn view_of(
+        &self,
+        i: usize,
+        quality: &Quality,
+        size: [u32; 2],
+    ) -> Result<View, Fail> {
         let lattice = &self.base.volume.lattice;
         let camera = self.asked.path.camera(i, lattice, self.orientation);
-        let view = camera.and_then(|c| View::new(lattice, &c, self.asked.path.size, quality));
+        let view = camera.and_then(|c| View::new(lattice, &c, size, quality));
         view.map_err(|e| self.asked.blame(&e))
+    }
+
+    /// Whether frames have transfer functions of their own.
+    pub(crate) fn is_tween(&self) -> bool {
+        self.tween.is_some()
     }
 
     /// Tables of frame `i`.

@@ -2,6 +2,8 @@
 //! `explain`.
 
 use crate::fail::Fail;
+use crate::front::choose::settle;
+use crate::front::magnify::magnified;
 use crate::local::{self, Cut};
 use crate::progress;
 use crate::request::{PictureOf, lattice_notice};
@@ -20,6 +22,9 @@ pub(crate) struct Still {
     /// Sums decided.
     pub(crate) spec: SceneSpec,
     pub(crate) view: View,
+    /// What is drawn, and how many times it is magnified.
+    small: View,
+    magnify: u32,
     pub(crate) bricks: Vec<Arc<Brick>>,
     pub(crate) background: Background,
 }
@@ -28,9 +33,10 @@ impl Still {
     /// Reads the volume and cuts its bricks. `check` is asked before anything is read.
     pub(crate) fn read(
         of: &PictureOf,
+        threads: usize,
         check: impl FnOnce([u32; 2]) -> Result<(), Fail>,
     ) -> Result<Still, Fail> {
-        let asked = of.look.asked(Work::default())?;
+        let mut asked = of.look.aimed(Work::default())?;
         check(asked.path.size)?;
         let volume = of.open()?;
         let orientation = of.look.view.axes.of(&volume)?;
@@ -39,20 +45,24 @@ impl Still {
         if let Some(notice) = lattice_notice(&info) {
             progress::note(&notice);
         }
+        let volume = settle(volume, &mut asked, orientation, threads, false)?;
         let stage = Stage::new(&volume, &info, &asked, orientation)?;
-        let (spec, view) = (stage.spec(0), stage.view(0, &asked.quality)?);
-        Ok(Still { spec, view, bricks: stage.bricks, background: asked.background })
+        let (spec, small) = (stage.spec(0), stage.view(0, &asked.quality)?);
+        let view = stage.view_of(0, &asked.quality, asked.size())?;
+        let (background, magnify) = (asked.background, asked.magnify);
+        Ok(Still { spec, view, small, magnify, bricks: stage.bricks, background })
     }
 
     /// The frame at another quality (the same sheets and kernel).
     pub(crate) fn frame(&self, quality: Quality) -> Frame {
         let spec = SceneSpec { quality, ..self.spec.clone() };
-        Frame::new(Arc::new(Scene::new(&spec)), self.view)
+        Frame::new(Arc::new(Scene::new(&spec)), self.small)
     }
 
     /// The picture at another quality (the same sheets and kernel).
     pub(crate) fn draw(&self, quality: Quality, threads: usize) -> Picture {
-        local::picture(&self.frame(quality), &self.bricks, Cut::on(threads))
+        let picture = local::picture(&self.frame(quality), &self.bricks, Cut::on(threads));
+        magnified(picture, self.magnify, threads)
     }
 
     /// What judges it.

@@ -101,6 +101,11 @@ impl Transfer {
         }
     }
 
+    /// The same without light.
+    pub(crate) fn unshaded(&self) -> Self {
+        Transfer { light: None, shading: Some(false), ..self.clone() }
+    }
+
     /// The preset that it is or came from.
     pub(crate) fn preset(&self) -> Option<&str> {
         match &self.base {

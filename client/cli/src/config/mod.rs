@@ -36,7 +36,8 @@ const EXCLUDE: [(&str, &str); 3] =
     [("volume", "master"), ("workers", "master"), ("threads", "master")];
 
 /// Variables that are no flag's: the file, and those of deploy/compose.yaml.
-const OTHERS: [&str; 6] = [
+const OTHERS: [&str; 7] = [
+    "SLABCAST_CACHE",
     "SLABCAST_CONFIG",
     "SLABCAST_DATA",
     "SLABCAST_FILE",

@@ -54,8 +54,8 @@ Examples:
   slabcast error brain.nii.gz --compositing paper --pixels 16384 --json
 
 JSON: one object. Each of limit, same_thickness, thickness, cutoff, quantisation, rounding,
-rounding_positions, rounding_arithmetic, truncation and ripple is {rmse, max, share_above_1,
-rmse_srgb8, pixels}: 1/255, the share from 0 to 1, and the pixels that are not blank; what is not
+rounding_positions, rounding_arithmetic, truncation and ripple is {rmse, max, most_999,
+share_above_1, rmse_srgb8, pixels}: 1/255 (most_999 is kept by 99.9 % of the pixels), the share from 0 to 1, and the pixels that are not blank; what is not
 finite is null. sum: {squares, plain, measured}, of thickness to rounding against limit. sampled
 and sampled_model: pixels looked at, blank ones included, for the sum and for truncation and
 ripple. size; pixels_sha256 of the picture; quality; draw_ms, judge_ms, total_ms; map: the file,
@@ -140,7 +140,7 @@ fn shut(picture: &Picture, eps: f64) -> bool {
 
 fn find(args: &ErrorArgs) -> Result<Found, Fail> {
     let threads = args.threads.count();
-    let still = Still::read(&args.of, |_| Ok(()))?;
+    let still = Still::read(&args.of, threads, |_| Ok(()))?;
     let size = still.view.size;
 
     let mut progress = Progress::new(false).of("pixel");

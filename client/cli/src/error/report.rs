@@ -80,7 +80,7 @@ pub(super) fn json(found: &Found, map: Option<&Path>) -> String {
     for r in rows {
         let f = &r.figures;
         let figures = serde_json::json!({
-            "rmse": f.rmse, "max": f.max, "share_above_1": f.share_above_1,
+            "rmse": f.rmse, "max": f.max, "most_999": f.most_999, "share_above_1": f.share_above_1,
             "rmse_srgb8": f.rmse_srgb8, "pixels": f.n_pixels
         });
         out.insert(r.name.into(), figures);

@@ -17,6 +17,7 @@ pub(crate) use file::{Patience, probe, write_atomic};
 pub(crate) use lines::Lines;
 
 use crate::fail::Fail;
+use crate::front::magnify::magnified;
 use crate::parse;
 use contact::Contact;
 use file::Growing;
@@ -59,14 +60,16 @@ impl Frame {
                 b.chunks_exact(8).flat_map(|p| [1, 3, 5].map(|c| over(p[c], p[7]))).collect()
             }
             PixelFormat::Rgba32F => {
-                let float =
-                    |p: &[u8], c: usize| f32::from_le_bytes(std::array::from_fn(|i| p[c * 4 + i]));
-                let pixels =
-                    b.chunks_exact(16).map(|p| std::array::from_fn(|c| float(p, c))).collect();
-                let picture = Picture { size: self.size, pixels };
-                picture.encode(PixelFormat::Rgb8, Background::Colour([0.0; 3]))
+                self.picture().encode(PixelFormat::Rgb8, Background::Colour([0.0; 3]))
             }
         }
+    }
+
+    /// The picture of a frame of floats.
+    fn picture(&self) -> Picture {
+        let float = |p: &[u8], c: usize| f32::from_le_bytes(std::array::from_fn(|i| p[c * 4 + i]));
+        let pixels = self.bytes.chunks_exact(16).map(|p| std::array::from_fn(|c| float(p, c)));
+        Picture { size: self.size, pixels: pixels.collect() }
     }
 }
 
@@ -159,6 +162,15 @@ pub(crate) struct Output {
     pub(crate) format: Format,
     fps: u16,
     contact: Option<PathBuf>,
+    /// What frames that come as small pictures of floats become.
+    magnify: Option<Magnify>,
+}
+
+/// How a small picture becomes a frame.
+#[derive(Clone, Copy, Debug)]
+struct Magnify {
+    times: u32,
+    background: Background,
 }
 
 /// Refuses a file to write that is one of those to read.
@@ -310,7 +322,23 @@ impl Output {
             Target::Folder(folder)
         };
         let contact = args.contact_sheet.clone();
-        Ok((Output { target, format, fps: args.fps, contact }, stays))
+        Ok((Output { target, format, fps: args.fps, contact, magnify: None }, stays))
+    }
+
+    /// What the master should send for pictures over `background` that are drawn `times` smaller
+    /// than they come out.
+    pub(crate) fn takes(&mut self, times: u32, background: Background) -> PixelFormat {
+        self.magnify = (times > 1).then_some(Magnify { times, background });
+        if times > 1 { PixelFormat::Rgba32F } else { self.format.pixels(background) }
+    }
+
+    /// A frame as it is written.
+    fn full(&self, frame: Frame) -> Frame {
+        let Some(Magnify { times, background }) = self.magnify else { return frame };
+        let large = magnified(frame.picture(), times, 1);
+        let format = self.format.pixels(background);
+        let bytes = large.encode(format, background).into();
+        Frame { number: frame.number, size: large.size, format, bytes }
     }
 
     /// Frames a second, where there is such a thing.
@@ -476,6 +504,7 @@ impl Writer {
         let (output, movie) = (self.output.clone(), self.movie.clone());
         let (contact, patience) = (self.contact.clone(), self.patience.clone());
         self.busy.spawn_blocking(move || {
+            let frame = output.full(frame);
             if let Some(contact) = contact {
                 contact.lock().expect("no thread panics with it").add(&frame);
             }

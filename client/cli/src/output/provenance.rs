@@ -15,6 +15,7 @@ use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::stats::FrameStats;
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::tween::Tween;
+use slabcast_common::view::MAX_EDGE;
 use slabcast_common::volume::VolumeInfo;
 use std::path::Path;
 
@@ -40,6 +41,9 @@ pub(crate) struct Provenance {
     pub(crate) transfer: TransferFunction,
     /// Sums decided.
     pub(crate) quality: Quality,
+    /// The picture was drawn at the path's size and is so many times as large.
+    #[serde(default = "one", skip_serializing_if = "is_one")]
+    pub(crate) magnify: u32,
     background: Ground,
     pub(crate) format: Format,
     /// Frames a second of a moving picture.
@@ -50,6 +54,14 @@ pub(crate) struct Provenance {
     view_sha256: Option<String>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) pixels_sha256: Option<String>,
+}
+
+fn one() -> u32 {
+    1
+}
+
+fn is_one(n: &u32) -> bool {
+    *n == 1
 }
 
 /// `"transparent"`, or sRGB numbers from 0 to 1.
@@ -106,6 +118,13 @@ impl Provenance {
         p.path.check().map_err(refused)?;
         p.transfer.check().map_err(refused)?;
         p.quality.check().map_err(refused)?;
+        let fits = |edge: u32| edge.checked_mul(p.magnify).is_some_and(|n| n <= MAX_EDGE);
+        if p.magnify == 0 || !p.path.size.into_iter().all(fits) {
+            return Err(Fail::failed(format!(
+                "{file}: magnify: {} times {}x{} is no size of a picture; the file is damaged",
+                p.magnify, p.path.size[0], p.path.size[1]
+            )));
+        }
         Ok(p)
     }
 }
@@ -181,6 +200,7 @@ impl Recipe {
                 transfer: asked.transfer.function(info).map_err(|e| asked.blame(&e))?,
                 // Culling never changes a byte.
                 quality: Quality { cull: true, ..quality },
+                magnify: asked.magnify,
                 background: match background {
                     Background::Transparent => Ground::Word("transparent".into()),
                     Background::Colour(c) => Ground::Colour(c),

@@ -22,6 +22,8 @@ pub struct ErrorFigures {
     pub rmse: f64,
     /// Largest over all four channels; infinite if a number is not finite.
     pub max: f64,
+    /// What 99.9 % of the pixels keep to in all four channels: of fewer than 1000, the maximum.
+    pub most_999: f64,
     /// Share of the pixels off by more than 1 in a channel.
     pub share_above_1: f64,
     /// Root of the mean square over RGB of the 8-bit sRGB pictures, in their steps.
@@ -41,6 +43,7 @@ impl ErrorFigures {
         let mut figures = ErrorFigures::default();
         let (mut squares, mut above) = (0.0, 0usize);
         let (mut left, mut right) = (Vec::new(), Vec::new());
+        let mut each = Vec::new();
         for (got, want) in got.iter().zip(want) {
             let blank = |a: f64| a <= 0.0;
             if blank(f64::from(got[3])) && blank(want[3]) {
@@ -55,6 +58,7 @@ impl ErrorFigures {
                 worst = f64::max(worst, off);
             }
             figures.max = figures.max.max(worst);
+            each.push(worst);
             above += usize::from(worst > 1.0);
         }
         figures.n_pixels = left.len();
@@ -64,6 +68,8 @@ impl ErrorFigures {
         let n = figures.n_pixels as f64;
         figures.rmse = (squares / (4.0 * n)).sqrt();
         figures.share_above_1 = above as f64 / n;
+        each.sort_unstable_by(f64::total_cmp);
+        figures.most_999 = each[each.len() - 1 - each.len() / 1000];
         let bytes = |pixels: Vec<[f32; 4]>| {
             Picture { size: [pixels.len() as u32, 1], pixels }.encode(PixelFormat::Rgb8, background)
         };
@@ -98,6 +104,13 @@ mod tests {
         assert!((f.rmse - (4.25f64 / 12.0).sqrt()).abs() < 1e-12, "{}", f.rmse);
         // Linear 0.5 is level 187.5, rounded to 188; 2/255 more is 189.
         assert!((f.rmse_srgb8 - (1.0f64 / 9.0).sqrt()).abs() < 1e-12, "{}", f.rmse_srgb8);
+        let many = vec![[0.0f32, 0.0, 0.0, 1.0]; 2000];
+        let mut want = many.iter().map(|p| p.map(f64::from)).collect::<Vec<_>>();
+        for (i, p) in want.iter_mut().take(3).enumerate() {
+            p[1] += (3 - i) as f64 / 255.0;
+        }
+        let f = ErrorFigures::compare(&many, &want, black);
+        assert!((f.most_999 - 1.0).abs() < 1e-12, "two of two thousand are off by more: {f:?}");
         let spoiled = [[f32::NAN, 0.0, 0.0, 1.0]];
         let f = ErrorFigures::compare(&spoiled, &[[0.0, 0.0, 0.0, 1.0]], black);
         assert_eq!((f.max, f.share_above_1), (f64::INFINITY, 1.0));

@@ -1,0 +1,386 @@
+//! Settings that keep a word: an error that is not passed, a time that is not overrun.
+//!
+//! A ladder of settings is climbed from fast to near. For an error: until some rungs keep it, and
+//! the fastest of these is taken; for a time: until some rungs overrun it, and the nearest of those
+//! before is taken. Rungs are measured when they are needed, and [`super::kept`] remembers them.
+//!
+//! The word is kept with room to spare: views between those that are judged, and pixels between
+//! those that are looked at, may be worse. How often it holds is in docs/accuracy.md.
+
+use super::kept::Kept;
+use super::lab::{Effort, Lab, Off, Truth};
+use super::setting::{Setting, fraction};
+use crate::fail::Fail;
+use crate::local::Cut;
+use crate::progress::{self, Progress};
+use crate::request::Asked;
+use crate::{parse, signals};
+use slabcast_common::path::Orientation;
+use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
+use slabcast_common::volume::Volume;
+use std::time::Instant;
+
+/// Views that are judged. The third changed no choice on the shared volumes that two had not.
+const VIEWS: usize = 3;
+/// Pixels of each. The RMSE of half as many differed by a tenth between samples.
+const PIXELS: usize = 4096;
+/// What is measured may be so much below what is promised.
+const ROOM_RMSE: f64 = 1.15;
+/// The same of the error that 99.9 % of the pixels keep: of 4096 pixels a third is not blank, and
+/// the second worst of those is all that tells.
+const ROOM_MOST: f64 = 1.5;
+/// The same of time: a cluster in this process, files that are written beside.
+const ROOM_TIME: f64 = 1.08;
+/// Rungs beyond the first that keeps an error, of which one may be faster.
+const BEYOND: usize = 3;
+
+/// What a person wants of a picture.
+#[derive(clap::Args, Clone, Copy, Debug, Default, PartialEq)]
+#[command(
+    next_help_heading = "Quality by what it should come to (chooses --thickness, --eps, --sums)"
+)]
+pub(crate) struct Aim {
+    /// Largest RMSE against the limit over the pixels that are not blank, of full intensity (1/255);
+    /// the fastest setting that keeps it is chosen, from measurements of this volume and transfer
+    /// function that are kept for the next time
+    #[arg(long, value_name = "X", value_parser = error_bound,
+          conflicts_with_all = ["thickness", "eps", "sums"])]
+    pub(crate) error: Option<f64>,
+    /// The same for each channel of 99.9 % of the pixels
+    #[arg(long, value_name = "X", value_parser = error_bound,
+          conflicts_with_all = ["thickness", "eps", "sums"])]
+    pub(crate) error_max: Option<f64>,
+    /// Longest time a frame may take (100ms); the nearest setting to the limit that keeps it is chosen,
+    /// if need be in a smaller picture, magnified
+    #[arg(long, value_name = "TIME", value_parser = parse::time,
+          conflicts_with_all = ["thickness", "eps", "sums"])]
+    pub(crate) budget: Option<f64>,
+}
+
+/// An error from 0 to 1, not 0.
+fn error_bound(text: &str) -> Result<f64, String> {
+    match parse::fraction(text)? {
+        x if x > 0.0 && x <= 1.0 => Ok(x),
+        _ => Err("give a number above 0, at most 1, like 1/255".into()),
+    }
+}
+
+impl Aim {
+    pub(crate) fn is_empty(&self) -> bool {
+        *self == Aim::default()
+    }
+
+    /// The flags that are given, for messages.
+    pub(crate) fn flags(&self) -> String {
+        let given = [
+            ("--error", self.error.is_some()),
+            ("--error-max", self.error_max.is_some()),
+            ("--budget", self.budget.is_some()),
+        ];
+        given.iter().filter(|g| g.1).map(|g| g.0).collect::<Vec<_>>().join(", ")
+    }
+
+    fn keeps_error(&self, off: &Off) -> bool {
+        let under =
+            |bound: Option<f64>, got: f64, room: f64| bound.is_none_or(|b| got * room <= b * 255.0);
+        under(self.error, off.rmse, ROOM_RMSE) && under(self.error_max, off.most_999, ROOM_MOST)
+    }
+
+    fn keeps_time(&self, ms: f64) -> bool {
+        self.budget.is_none_or(|b| ms * ROOM_TIME <= b)
+    }
+}
+
+/// What was chosen, and by what.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Chosen {
+    pub(crate) setting: Setting,
+    pub(crate) off: Off,
+    /// Median of a frame.
+    pub(crate) ms: f64,
+}
+
+/// The rungs, each as fast as the ones before or nearer to the limit.
+///
+/// From the fronts of `slabcast report` (docs/accuracy.md): 16-bit sums with eps falling as sheets
+/// become thin, then 32 bits where those round too much. 16 bits are tried only where they have room
+/// for a sheet.
+pub(super) fn ladder(base: &Setting, size: [u32; 2]) -> Vec<Setting> {
+    let b = base.quality;
+    let short = b.compositing != Compositing::Paper
+        && b.kernel != Kernel::Tent
+        && (b.kernel != Kernel::Gaussian || (b.std >= 0.5 && b.radius <= 2.0));
+    let few = if short { Sums::I16 } else { Sums::Auto };
+    let rungs: [(u32, f64, f64, Sums); 16] = [
+        (4, 4.0, 1.0 / 16.0, few),
+        (4, 2.0, 1.0 / 64.0, few),
+        (2, 4.0, 1.0 / 64.0, few),
+        (2, 2.0, 1.0 / 64.0, few),
+        (2, 1.0, 1.0 / 256.0, few),
+        (1, 4.0, 1.0 / 64.0, few),
+        (1, 2.0, 1.0 / 64.0, few),
+        (1, 2.0, 1.0 / 512.0, few),
+        (1, 1.5, 1.0 / 512.0, few),
+        (1, 1.0, 1.0 / 512.0, few),
+        (1, 0.75, 1.0 / 1024.0, few),
+        (1, 0.5, 1.0 / 4096.0, few),
+        (1, 1.0, 1.0 / 4096.0, Sums::Auto),
+        (1, 0.5, 1.0 / 4096.0, Sums::Auto),
+        (1, 0.25, 1.0 / 16384.0, Sums::Auto),
+        (1, 0.125, 1.0 / 65536.0, Sums::Auto),
+    ];
+    let settings = rungs.into_iter().map(|(shrink, thickness, eps, sums)| Setting {
+        quality: Quality { thickness, eps, sums, ..b },
+        shrink,
+        ..*base
+    });
+    let mut all: Vec<Setting> =
+        settings.filter(|s| s.quality.check().is_ok() && s.drawn_size(size).is_some()).collect();
+    all.dedup();
+    all
+}
+
+/// Measures what is not known yet.
+struct Climb<'a> {
+    lab: &'a mut Lab,
+    kept: &'a mut Kept,
+    truths: Vec<Truth>,
+    progress: Progress,
+    cut: Cut,
+    measured: usize,
+}
+
+impl Climb<'_> {
+    fn stopped(&self) -> Result<(), Fail> {
+        if signals::told() { Err(Fail::failed("stopped while choosing")) } else { Ok(()) }
+    }
+
+    fn off(&mut self, setting: &Setting) -> Result<Off, Fail> {
+        if let Some(off) = self.kept.off(setting) {
+            return Ok(off);
+        }
+        self.stopped()?;
+        if self.truths.is_empty() {
+            let views = self.lab.views();
+            let n = VIEWS.min(views);
+            self.progress.frames((n * PIXELS) as u64, "");
+            for i in 0..n {
+                let view = (2 * i + 1) * views / (2 * n);
+                let told = (&mut self.progress, i * PIXELS);
+                self.truths.push(self.lab.truth(view, PIXELS, 1, told)?);
+                self.stopped()?;
+            }
+            self.progress.stage("trying settings");
+        }
+        let off = self.lab.judge(setting, &self.truths, None)?.off;
+        self.measured += 1;
+        self.kept.put_off(setting, off);
+        Ok(off)
+    }
+
+    fn ms(&mut self, setting: &Setting) -> Result<f64, Fail> {
+        if let Some(ms) = self.kept.ms(setting) {
+            return Ok(ms);
+        }
+        self.stopped()?;
+        let effort = Effort { cut: self.cut, seconds: 0.25 };
+        let timing = self.lab.time(setting, effort)?;
+        self.measured += 1;
+        self.kept.put_ms(setting, timing.median);
+        Ok(timing.median)
+    }
+
+    fn chosen(&mut self, setting: Setting) -> Result<Chosen, Fail> {
+        let (off, ms) = (self.off(&setting)?, self.ms(&setting)?);
+        Ok(Chosen { setting, off, ms })
+    }
+
+    /// The fastest of those that keep an error.
+    fn by_error(&mut self, aim: &Aim, rungs: &[Setting]) -> Result<Chosen, Fail> {
+        let (mut best, mut beyond): (Option<Chosen>, usize) = (None, 0);
+        let mut nearest: Option<(f64, f64)> = None;
+        for setting in rungs {
+            let off = self.off(setting)?;
+            let least = nearest.get_or_insert((off.rmse, off.most_999));
+            *least = (least.0.min(off.rmse), least.1.min(off.most_999));
+            if aim.keeps_error(&off) {
+                let chosen = self.chosen(*setting)?;
+                if best.is_none_or(|b| chosen.ms < b.ms) {
+                    best = Some(chosen);
+                }
+            }
+            beyond += usize::from(best.is_some());
+            if beyond > BEYOND {
+                break;
+            }
+        }
+        let Some(best) = best else {
+            let (rmse, most) = nearest.unwrap_or_default();
+            let (flag, least) = match (aim.error, aim.error_max) {
+                (Some(e), _) if rmse * ROOM_RMSE > e * 255.0 => ("error", rmse * ROOM_RMSE),
+                _ => ("error-max", most * ROOM_MOST),
+            };
+            return Err(Fail::usage(format!(
+                "--{flag}: no setting comes so near in this scene; the nearest may promise \
+                 {:.3}/255: give {:.5} or more",
+                least,
+                least / 255.0 * 1.005
+            )));
+        };
+        if !aim.keeps_time(best.ms) {
+            return Err(Fail::usage(format!(
+                "--budget: the fastest setting that keeps {} takes {:.1} ms ({}); give {:.0}ms or \
+                 more, a larger error or a smaller --size",
+                Aim { budget: None, ..*aim }.flags(),
+                best.ms,
+                best.setting.name(&self.lab.base),
+                (best.ms * ROOM_TIME).ceil()
+            )));
+        }
+        Ok(best)
+    }
+
+    /// The nearest of those that keep a time.
+    fn by_time(&mut self, aim: &Aim, rungs: &[Setting]) -> Result<Chosen, Fail> {
+        let (mut within, mut over) = (Vec::new(), 0);
+        let mut fastest = f64::INFINITY;
+        for setting in rungs {
+            let ms = self.ms(setting)?;
+            fastest = fastest.min(ms);
+            if aim.keeps_time(ms) {
+                within.push(*setting);
+                over = 0;
+            } else {
+                over += 1;
+            }
+            // Rungs come in the order of their usual cost, and this scene may be unusual.
+            if over > BEYOND {
+                break;
+            }
+        }
+        // Finer ones are nearer, but for those whose eps or sums stand out.
+        let last = within.len().saturating_sub(BEYOND + 1);
+        let mut best: Option<Chosen> = None;
+        for setting in within.split_off(last) {
+            let chosen = self.chosen(setting)?;
+            if best.is_none_or(|b| chosen.off.rmse < b.off.rmse) {
+                best = Some(chosen);
+            }
+        }
+        best.ok_or_else(|| {
+            Fail::usage(format!(
+                "--budget: the fastest setting of this scene takes {fastest:.1} ms on {} threads; \
+                 give {:.0}ms or more, a smaller --size or more --threads",
+                self.cut.threads,
+                (fastest * ROOM_TIME).ceil()
+            ))
+        })
+    }
+}
+
+/// Chooses the settings of a scene by what they should come to, and says so.
+///
+/// # Errors
+/// Nothing keeps it: names what would.
+pub(crate) fn choose(lab: &mut Lab, aim: &Aim, cut: Cut, quiet: bool) -> Result<Chosen, Fail> {
+    let began = Instant::now();
+    let mut kept = Kept::of(lab, cut);
+    let rungs = ladder(&lab.base, lab.size());
+    let known = kept.len();
+    let mut progress = Progress::new(quiet).of("pixel");
+    progress.stage("choosing a setting");
+    if known == 0 && !quiet {
+        progress::note(&format!(
+            "{}: this scene is measured first; that is kept for the next time",
+            aim.flags()
+        ));
+    }
+    let mut climb = Climb { lab, kept: &mut kept, truths: Vec::new(), progress, cut, measured: 0 };
+    let by_error = aim.error.is_some() || aim.error_max.is_some();
+    let chosen = if by_error { climb.by_error(aim, &rungs) } else { climb.by_time(aim, &rungs) };
+    let (measured, base) = (climb.measured, climb.lab.base);
+    climb.progress.end();
+    // What was measured serves also where nothing was found.
+    if measured > 0 {
+        kept.save();
+    }
+    let chosen = chosen?;
+    if !quiet {
+        let how = if measured == 0 {
+            "as measured before".to_string()
+        } else {
+            format!("measured in {}", progress::time(began.elapsed()))
+        };
+        let q = &chosen.setting.quality;
+        let size = match chosen.setting.drawn_size(lab.size()) {
+            Some([w, h]) if chosen.setting.shrink > 1 => format!(", drawn at {w}x{h}"),
+            _ => String::new(),
+        };
+        progress::note(&format!(
+            "{}: thickness {}, eps {}, sums {}{size}{}; RMSE {:.3}/255, 99.9 % within {:.2}/255, {:.1} \
+             ms a frame ({how})",
+            aim.flags(),
+            q.thickness,
+            fraction(q.eps),
+            super::setting::lower(&q.sums),
+            if chosen.setting == base { " (the default)" } else { "" },
+            chosen.off.rmse,
+            chosen.off.most_999,
+            chosen.ms,
+        ));
+    }
+    Ok(chosen)
+}
+
+/// Chooses the quality of what was asked for if it names none but what it should come to. `volume`
+/// fits it and is given back.
+pub(crate) fn settle(
+    volume: Volume,
+    asked: &mut Asked,
+    orientation: Orientation,
+    threads: usize,
+    quiet: bool,
+) -> Result<Volume, Fail> {
+    let aim = std::mem::take(&mut asked.aim);
+    if aim.is_empty() {
+        return Ok(volume);
+    }
+    let mut lab = Lab::new(volume, asked, orientation, threads)?;
+    let Chosen { setting, .. } =
+        choose(&mut lab, &aim, Cut { tile: 64, ..Cut::on(threads) }, quiet)?;
+    asked.quality = setting.quality;
+    if let Some(size) = setting.drawn_size(asked.path.size) {
+        asked.path.size = size;
+        asked.magnify = setting.shrink;
+    }
+    Ok(lab.into_volume())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_ladder_goes_from_coarse_to_fine_and_may_be_drawn() {
+        let base = Setting::asked(Quality::default());
+        let all = ladder(&base, [512, 512]);
+        assert_eq!(all.len(), 16);
+        assert!(all.iter().all(|s| s.quality.check().is_ok()));
+        let odd = ladder(&base, [511, 512]);
+        assert!(odd.iter().all(|s| s.shrink == 1) && odd.len() == 11);
+        let tent = Setting::asked(Quality { kernel: Kernel::Tent, ..Quality::default() });
+        assert!(ladder(&tent, [512, 512]).iter().all(|s| s.quality.sums == Sums::Auto));
+    }
+
+    #[test]
+    fn room_is_left() {
+        let aim = Aim { error: Some(1.0 / 255.0), ..Aim::default() };
+        let off = |rmse| Off { rmse, ..Off::default() };
+        assert!(aim.keeps_error(&off(0.8)) && !aim.keeps_error(&off(0.95)));
+        let aim = Aim { budget: Some(100.0), error_max: Some(2.0 / 255.0), ..aim };
+        assert!(aim.keeps_time(90.0) && !aim.keeps_time(95.0));
+        assert_eq!(aim.flags(), "--error, --error-max, --budget");
+        let most = Off { rmse: 0.1, most_999: 1.9, ..Off::default() };
+        assert!(!aim.keeps_error(&most) && Aim::default().keeps_error(&most));
+    }
+}

@@ -1,0 +1,377 @@
+//! `slabcast report`: error against run time, as a table, a chart and files for programs.
+//!
+//! [`sweep`] says which settings are drawn, [`chart`] draws what came out, [`write`](mod@write) puts
+//! it down. What measures is `front`.
+
+mod chart;
+mod sweep;
+mod write;
+
+use crate::fail::{Fail, say};
+use crate::front::lab::{Effort, Judged, Lab, Off, Timing, Truth};
+use crate::front::pareto::{self, Point};
+use crate::front::setting::{Setting, lower};
+use crate::local::Cut;
+use crate::progress::{self, Progress};
+use crate::request::{PictureOf, ThreadArg, lattice_notice};
+use crate::signals;
+use serde::Serialize;
+use slabcast_common::quality::{Quality, Sums, Work};
+use std::path::PathBuf;
+use std::time::Instant;
+use sweep::{Group, Knob, Trial};
+
+/// Says what each knob of quality costs and what it buys: error against the limit and time a frame,
+/// for many settings of one scene; marks those that no other beats.
+///
+/// Errors are of the middle view of the path (of --views, spread over it), at a sample of its
+/// pixels, against the limit of what was asked for: its kernel, its light, its size. Times are from
+/// camera set to picture in memory, of several views, on one thread and on all; other work on the
+/// machine shows in them. Ctrl-C ends the sweep and keeps what is measured.
+#[derive(clap::Args, Clone, Debug)]
+#[command(after_help = "\
+Examples:
+  slabcast report brain.nii.gz
+  slabcast report head.nrrd --up=-y --tf peer-opaque -o report/
+  slabcast report ct.nrrd --tf bone --size 1024x1024 --only thickness,eps,sums --seconds 0.3
+
+Files: report.json (all of it), report.csv (a line a setting), report.svg, report-dark.svg,
+report.png, report-dark.png (error down, time across).
+The front is what no other setting beats in both error and time; its knee is where more time stops
+to pay. `slabcast render --error` and `--budget` choose by the same measure.
+JSON: {version, slabcast, pixels_version, volume, digest, tf, size, projection, views, judged_views,
+pixels, machine: {cpu, cores, simd, threads}, complete, skipped, settings: [{name, group, knob, flags,
+quality, shrink, shaded, sums, work: {tile, slabs, threads}, error: {rmse, max, most_999,
+share_above_1, rmse_srgb8, pixels}, own_error, ms: {one: {median, min, max, frames}, all}, voxels:
+{relevant, tossed, splatted, culled}, pixels, bytes, pixels_sha256, front, knee, default}]}. Errors in
+1/255; own_error is against the limit of the setting's own model, null where that is the same; bytes
+are those of its bricks as they are sent; front and knee are by the time on all threads; skipped
+settings have sheets so thin that thinner ones bought nothing any more.")]
+pub(crate) struct ReportArgs {
+    #[command(flatten)]
+    of: PictureOf,
+    /// Folder for the files; it is made
+    #[arg(short, long, value_name = "DIR", default_value = "slabcast-report")]
+    out: PathBuf,
+    /// Replaces a report that is there
+    #[arg(long)]
+    force: bool,
+    /// Pixels of each judged view to compare with the reference
+    #[arg(long, value_name = "N", default_value = "4096",
+          value_parser = clap::value_parser!(u32).range(16..=1 << 24))]
+    pixels: u32,
+    /// Views to judge, spread over the path; the worst counts
+    #[arg(long, value_name = "N", default_value = "1",
+          value_parser = clap::value_parser!(u32).range(1..=64))]
+    views: u32,
+    /// Which sample of pixels
+    #[arg(long, value_name = "N", default_value = "1")]
+    seed: u64,
+    /// Seconds of drawing for each time; three frames are timed at least
+    #[arg(long, value_name = "S", default_value = "0.6", value_parser = crate::parse::positive)]
+    seconds: f64,
+    /// Knobs to turn, of thickness, eps, kernel, sums, compositing, shading, size, combinations and
+    /// work [default: all]
+    #[arg(long, value_name = "KNOB,...", value_delimiter = ',', value_enum)]
+    only: Vec<Group>,
+    #[command(flatten)]
+    threads: ThreadArg,
+    /// The table as JSON on stdout, beside the files
+    #[arg(long)]
+    json: bool,
+}
+
+/// What a setting came to.
+#[derive(Clone, Debug, Serialize)]
+struct Line {
+    name: String,
+    group: Group,
+    knob: String,
+    flags: String,
+    #[serde(flatten)]
+    setting: Setting,
+    /// Decided.
+    sums: Sums,
+    work: WorkUsed,
+    error: Off,
+    own_error: Option<Off>,
+    ms: Times,
+    voxels: Voxels,
+    /// Pixels that are drawn.
+    pixels: u64,
+    /// Of its bricks as they are sent.
+    bytes: u64,
+    pixels_sha256: String,
+    front: bool,
+    knee: bool,
+    default: bool,
+}
+
+#[derive(Clone, Copy, Debug, Serialize)]
+struct WorkUsed {
+    tile: u32,
+    slabs: u32,
+    threads: usize,
+}
+
+#[derive(Clone, Copy, Debug, Serialize)]
+struct Times {
+    /// On one thread; `null` for a trial of work on several.
+    one: Option<Timing>,
+    all: Timing,
+}
+
+#[derive(Clone, Copy, Debug, Serialize)]
+struct Voxels {
+    relevant: u64,
+    tossed: u64,
+    splatted: u64,
+    culled: u64,
+}
+
+#[derive(Clone, Debug, Serialize)]
+struct Machine {
+    cpu: String,
+    cores: usize,
+    simd: &'static str,
+    threads: usize,
+}
+
+/// All that was found out.
+#[derive(Clone, Debug, Serialize)]
+struct Report {
+    version: u32,
+    slabcast: &'static str,
+    pixels_version: u32,
+    volume: String,
+    digest: String,
+    tf: String,
+    size: [u32; 2],
+    views: usize,
+    judged_views: Vec<usize>,
+    /// Compared of each judged view.
+    pixels: usize,
+    machine: Machine,
+    /// Whether all that was to be drawn is in it.
+    complete: bool,
+    /// Settings that were not drawn: sheets twice as thick or more were as near to the limit as still
+    /// thicker ones.
+    skipped: Vec<String>,
+    settings: Vec<Line>,
+}
+
+impl Report {
+    /// Marks the front of quality, and its knee.
+    fn mark(&mut self) {
+        // Work changes no error: its trials are copies of the default's place.
+        let of: Vec<usize> =
+            (0..self.settings.len()).filter(|&i| self.settings[i].group != Group::Work).collect();
+        let points: Vec<Point> = of
+            .iter()
+            .map(|&i| &self.settings[i])
+            .map(|l| Point { ms: l.ms.all.median, error: l.error.rmse })
+            .collect();
+        let front = pareto::front(&points);
+        let knee = pareto::knee(&points, &front);
+        for line in &mut self.settings {
+            (line.front, line.knee) = (false, false);
+        }
+        for &i in &front {
+            self.settings[of[i]].front = true;
+        }
+        if let Some(i) = knee {
+            self.settings[of[i]].knee = true;
+        }
+    }
+
+    /// The front, from fast to slow.
+    fn front(&self) -> Vec<&Line> {
+        let mut front: Vec<&Line> = self.settings.iter().filter(|l| l.front).collect();
+        front.sort_by(|a, b| a.ms.all.median.total_cmp(&b.ms.all.median));
+        front
+    }
+
+    fn default(&self) -> Option<&Line> {
+        self.settings.iter().find(|l| l.default)
+    }
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &ReportArgs) -> Result<(), Fail> {
+    write::check(args)?;
+    let args = args.clone();
+    signals::to_its_end(move || {
+        let report = measure(&args)?;
+        write::files(&args.out, &report)?;
+        if args.json {
+            return say(&write::json(&report));
+        }
+        say(&write::text(&report, &args.out))
+    })
+}
+
+fn measure(args: &ReportArgs) -> Result<Report, Fail> {
+    let asked = args.of.look.asked(Work::default())?;
+    let threads = args.threads.count();
+    let mut progress = Progress::new(false).of("setting");
+    progress.stage(&format!("reading {}", args.of.volume.display()));
+    let volume = args.of.open()?;
+    let orientation = args.of.look.view.axes.of(&volume)?;
+    let info = volume.info(volume.digest());
+    asked.fit(&info, orientation, volume.anatomical)?;
+    if let Some(notice) = lattice_notice(&info) {
+        progress::note(&notice);
+    }
+    let name = volume.name.clone();
+    let mut lab = Lab::new(volume, &asked, orientation, threads)?;
+    let trials = sweep::trials(&lab, &args.only);
+
+    let views = lab.views();
+    let judged: Vec<usize> = spread(views, args.views as usize);
+    let mut truths = Vec::new();
+    let mut judging = Progress::new(false).of("pixel");
+    let all = args.pixels as usize * judged.len();
+    judging.frames(all as u64, "what the picture should be, by the reference");
+    for (n, &view) in judged.iter().enumerate() {
+        let told = (&mut judging, n * args.pixels as usize);
+        truths.push(lab.truth(view, args.pixels as usize, args.seed, told)?);
+        if signals::told() {
+            break;
+        }
+    }
+    judging.end();
+
+    let mut report = Report {
+        version: 1,
+        slabcast: env!("CARGO_PKG_VERSION"),
+        pixels_version: slabcast_common::PIXELS_VERSION,
+        volume: name,
+        digest: info.digest.to_string(),
+        tf: asked.transfer.name(),
+        size: lab.size(),
+        views,
+        judged_views: judged,
+        pixels: args.pixels as usize,
+        machine: Machine {
+            cpu: crate::machine::cpu(),
+            cores: crate::embedded::cores() as usize,
+            simd: slabcast_render::splat::Simd::detect().name(),
+            threads,
+        },
+        complete: false,
+        skipped: Vec::new(),
+        settings: Vec::new(),
+    };
+    progress.frames(trials.len() as u64, &format!("{} settings", trials.len()));
+    let began = Instant::now();
+    for (n, trial) in trials.iter().enumerate() {
+        if signals::told() {
+            progress.end();
+            progress::note(&format!("stopped after {n} of {} settings", trials.len()));
+            report.mark();
+            return Ok(report);
+        }
+        if pointless(&report.settings, trial) {
+            report.skipped.push(trial.setting.name(&lab.base));
+        } else {
+            report.settings.push(line(&mut lab, trial, &truths, args)?);
+        }
+        progress.step(progress::Step {
+            frames: n as u64 + 1,
+            detail: trial.setting.name(&lab.base),
+            ..Default::default()
+        });
+    }
+    progress.end();
+    tracing::info!(seconds = began.elapsed().as_secs_f64(), "swept");
+    report.complete = true;
+    report.mark();
+    Ok(report)
+}
+
+/// `n` numbers below `views`, spread evenly and off the ends.
+fn spread(views: usize, n: usize) -> Vec<usize> {
+    let n = n.min(views);
+    let mut all: Vec<usize> = (0..n).map(|i| (2 * i + 1) * views / (2 * n)).collect();
+    all.dedup();
+    all
+}
+
+/// Whether thinner sheets buy nothing any more: of the same setting in thicker sheets, two are known
+/// and the thinner of them is no nearer to the limit.
+fn pointless(known: &[Line], trial: &Trial) -> bool {
+    let thickness = trial.setting.quality.thickness;
+    let mut alike: Vec<(f64, f64)> = known
+        .iter()
+        .filter(|l| {
+            let q = Quality { thickness, ..l.setting.quality };
+            Setting { quality: q, ..l.setting } == trial.setting
+        })
+        .map(|l| (l.setting.quality.thickness, l.error.rmse))
+        .filter(|(d, _)| *d > thickness)
+        .collect();
+    alike.sort_by(|a, b| a.0.total_cmp(&b.0));
+    matches!(&alike[..], [thin, thick, ..] if thin.1 >= thick.1 * (1.0 - pareto::WORTH))
+}
+
+fn line(lab: &mut Lab, trial: &Trial, truths: &[Truth], args: &ReportArgs) -> Result<Line, Fail> {
+    let base = lab.base;
+    let setting = &trial.setting;
+    let own = if setting.same_model(&base) {
+        None
+    } else {
+        let of = truths.iter().map(|t| lab.own_truth(setting, t));
+        Some(of.collect::<Result<Vec<_>, _>>()?)
+    };
+    let Judged { sums, off, own, counters, sha256 } = lab.judge(setting, truths, own.as_deref())?;
+    let effort = |cut| Effort { cut, seconds: args.seconds };
+    let all = lab.time(setting, effort(trial.cut))?;
+    let one = match trial.cut.threads {
+        1 => Some(all),
+        _ if trial.group == Group::Work => None,
+        _ => Some(lab.time(setting, effort(Cut { threads: 1, ..trial.cut }))?),
+    };
+    let (relevant, bytes) = lab.bricks(setting)?;
+    let drawn = setting.drawn_size(lab.size()).unwrap_or(lab.size());
+    let is_base = *setting == base;
+    Ok(Line {
+        name: match trial.knob {
+            Knob::Quality => setting.name(&base),
+            Knob::Work(what) => what.to_string(),
+        },
+        group: trial.group,
+        knob: lower(&trial.group),
+        flags: setting.flags(&base, lab.size()),
+        setting: *setting,
+        sums,
+        work: WorkUsed { tile: trial.cut.tile, slabs: trial.cut.slabs, threads: trial.cut.threads },
+        error: off,
+        own_error: own,
+        ms: Times { one, all },
+        voxels: Voxels {
+            relevant,
+            tossed: counters.tossed,
+            splatted: counters.splatted,
+            culled: counters.culled,
+        },
+        pixels: drawn.map(u64::from).iter().product(),
+        bytes,
+        pixels_sha256: sha256,
+        front: false,
+        knee: false,
+        default: is_base && trial.group == Group::Default,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn judged_views_are_spread_over_the_path() {
+        assert_eq!(spread(18, 1), [9]);
+        assert_eq!(spread(18, 3), [3, 9, 15]);
+        assert_eq!(spread(2, 5), [0, 1]);
+        assert_eq!(spread(1, 1), [0]);
+    }
+}

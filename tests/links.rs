@@ -71,7 +71,13 @@ fn truth(request: &PathRequest) -> Vec<String> {
 }
 
 fn config(name: &str, threads: u32) -> Config {
-    Config { name: name.into(), threads, memory_budget_bytes: 64 << 20, simd: Simd::detect() }
+    Config {
+        name: name.into(),
+        threads,
+        memory_budget_bytes: 64 << 20,
+        simd: Simd::detect(),
+        rehearsal: None,
+    }
 }
 
 fn master() -> Master {

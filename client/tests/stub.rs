@@ -145,6 +145,7 @@ fn stats(frame: u64) -> FrameStats {
         dropped_results: 0,
         poisoned: vec![],
         critical_path: None,
+        rehearsed: false,
     }
 }
 

@@ -129,6 +129,8 @@ pub struct Hello {
     pub self_test_sha256: String,
     /// Bricks it still holds from before.
     pub held: Vec<(BrickSetKey, Vec<BrickId>)>,
+    /// It holds tiles for a recorded time instead of drawing them.
+    pub rehearses: bool,
 }
 
 /// What became of a task's voxels (see `stats::VoxelStats`).

@@ -192,6 +192,9 @@ pub struct FrameStats {
     /// What the frame waited for, in one sentence for people.
     #[serde(default)]
     pub critical_path: Option<String>,
+    /// Workers held tiles for recorded times; there is no picture.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub rehearsed: bool,
 }
 
 /// A macrotile that took three workers with it. Its pixels stay as the slabs before left them.

@@ -56,6 +56,8 @@ pub struct MasterConfig {
     pub schedule: slabcast_schedule::Config,
     /// Where what the scheduler is told and decides is written down ([`crate::record::start`]).
     pub record: Option<Recorder>,
+    /// Only workers that rehearse are let in, and pictures are marked.
+    pub rehearse: bool,
 }
 
 impl MasterConfig {
@@ -67,6 +69,7 @@ impl MasterConfig {
             frame_budget_bytes: 256 << 20,
             schedule: slabcast_schedule::Config::default(),
             record: None,
+            rehearse: false,
         }
     }
 }
@@ -205,6 +208,7 @@ impl Master {
             budget: config.frame_budget_bytes,
             clock: RealClock(Instant::now()),
             silence: config.schedule.silence,
+            rehearse: config.rehearse,
             scheduler: Watched::new(config.schedule, config.record),
             links: BTreeMap::new(),
             next_worker: 1,
@@ -397,6 +401,7 @@ struct Driver {
     budget: usize,
     clock: RealClock,
     silence: Micros,
+    rehearse: bool,
     scheduler: Watched,
     links: BTreeMap<WorkerId, Attached>,
     next_worker: u64,
@@ -533,6 +538,16 @@ impl Driver {
             ));
         } else if hello.threads == 0 || hello.threads > 4096 {
             refuse = Some(format!("{} render threads; give 1 to 4096", hello.threads));
+        } else if hello.rehearses != self.rehearse {
+            refuse = Some(if hello.rehearses {
+                "the worker rehearses: it holds tiles for a recorded time and draws nothing; start it \
+                 without --rehearse, or rehearse with a master of its own (slabcast master --rehearse)"
+                    .into()
+            } else {
+                "this master rehearses and marks its pictures; start the worker with --rehearse \
+                 TRACE, or the master without"
+                    .into()
+            });
         }
         if let Some(reason) = refuse {
             warn!(worker = hello.name, reason, "worker refused");
@@ -922,6 +937,7 @@ impl Driver {
             spans,
             voxels: r.store.as_ref().map_or(0, |s| s.relevant_voxels()),
             normals: r.store.as_ref().is_some_and(|s| s.wanted().normals),
+            rehearsed: self.rehearse,
         };
         // The finisher ends only with the driver.
         let _ = self.finisher.send((frame, sums));

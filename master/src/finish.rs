@@ -7,7 +7,7 @@ use crate::jobs::FinishedFrame;
 use sha2::{Digest, Sha256};
 use slabcast_common::bounds;
 use slabcast_common::ids::{FrameId, JobId};
-use slabcast_common::image::FrameState;
+use slabcast_common::image::{FrameState, Picture};
 use slabcast_common::message::{PathRequest, SceneSpec};
 use slabcast_common::path::CropBox;
 use slabcast_common::stats::{Bound, ErrorStats, FrameStats, LeftOut};
@@ -30,6 +30,8 @@ pub(crate) struct FrameSums {
     /// Voxels stored, for what normals would have taken.
     pub(crate) voxels: u64,
     pub(crate) normals: bool,
+    /// Nobody drew it.
+    pub(crate) rehearsed: bool,
 }
 
 /// Hash of everything that decides a frame's pixels: volume, cropping box, transfer function,
@@ -81,9 +83,21 @@ fn error(scene: &SceneSpec, view: &View) -> ErrorStats {
     }
 }
 
+/// Stripes over the whole picture: what was not drawn is not to be taken for a picture.
+fn mark(picture: &mut Picture) {
+    let w = picture.size[0].max(1) as usize;
+    for (i, pixel) in picture.pixels.iter_mut().enumerate() {
+        let stripe = (i % w + i / w) / 16 % 2;
+        *pixel = if stripe == 0 { [1.0, 0.0, 1.0, 1.0] } else { [0.0, 0.0, 0.0, 1.0] };
+    }
+}
+
 /// Makes the frame.
 pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
-    let picture = s.state.finish();
+    let mut picture = s.state.finish();
+    if s.rehearsed {
+        mark(&mut picture);
+    }
     let mut stats = *s.stats;
     // Frames of a job count from its first; people count those of the path.
     let number = stats.frame;
@@ -93,6 +107,10 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
     }
     stats.view_sha256 = view_sha256(&s.scene, s.crop.as_ref(), &s.view).to_string();
     stats.pixels_sha256 = picture.sha256().to_string();
+    if s.rehearsed {
+        stats.rehearsed = true;
+        stats.pixels_sha256 = "none: rehearsed".into();
+    }
     stats.pixels_version = slabcast_common::PIXELS_VERSION;
     stats.error = error(&s.scene, &s.view);
     if !s.normals {

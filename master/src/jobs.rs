@@ -300,6 +300,7 @@ mod tests {
             dropped_results: 0,
             poisoned: vec![],
             critical_path: None,
+            rehearsed: false,
         };
         Arc::new(FinishedFrame {
             number,

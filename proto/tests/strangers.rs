@@ -247,6 +247,7 @@ fn the_bytes_of_a_hello_never_change() {
                 set: vec![9].into(),
                 bricks: Some(v1::BrickIds { differences: vec![5, 1, -1] }),
             }],
+            rehearses: false,
         })),
     }
     .encode_to_vec();

@@ -6,6 +6,7 @@
 
 use crate::cache::BrickCache;
 use crate::pool::{FrameSlot, Pool, Ready, Rendered, SceneSlot};
+use crate::rehearse::Rehearsal;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, FrameId, SceneId, TaskId};
 use slabcast_common::message::{
@@ -38,6 +39,8 @@ pub struct Config {
     pub memory_budget_bytes: u64,
     /// Instruction set.
     pub simd: Simd,
+    /// Tiles are held for the times of this trace, and nothing is drawn.
+    pub rehearsal: Option<Arc<Rehearsal>>,
 }
 
 /// A link to a master, over a network or not.
@@ -74,6 +77,7 @@ pub fn hello(config: &Config, cache: &BrickCache) -> Hello {
         simd: config.simd.name().into(),
         self_test_sha256: slabcast_render::selftest::run(config.simd).to_string(),
         held: cache.held(),
+        rehearses: config.rehearsal.is_some(),
     }
 }
 
@@ -85,7 +89,7 @@ pub async fn run(
     cache: &mut BrickCache,
     mut stop: watch::Receiver<bool>,
 ) -> std::io::Result<Ended> {
-    let (pool, mut results) = Pool::start(config.threads, config.simd)?;
+    let (pool, mut results) = Pool::start(config.threads, config.simd, config.rehearsal.as_ref())?;
     let hello = {
         // The self-test draws: not on the runtime's thread.
         let (config, held) = (config.clone(), cache.held());
@@ -425,6 +429,7 @@ mod tests {
                     threads: 1,
                     memory_budget_bytes: 1 << 20,
                     simd: Simd::plain(),
+                    rehearsal: None,
                 };
                 let link = Link { control: control_rx, replies: replies_tx, bricks: bricks_rx };
                 run(&config, link, &mut BrickCache::default(), stopped).await

@@ -1,6 +1,7 @@
 //! Render threads. They take ready tasks from one queue and hand results back; they know
 //! nothing of links.
 
+use crate::rehearse::Rehearsal;
 use crossbeam_channel::{Receiver, Sender, unbounded};
 use slabcast_common::brick::Brick;
 use slabcast_common::image::TilePixels;
@@ -30,15 +31,25 @@ impl SceneSlot {
 /// A frame that tiles share.
 pub(crate) struct FrameSlot {
     pub(crate) scene: Arc<SceneSlot>,
-    view: View,
+    pub(crate) view: View,
     frame: OnceLock<Frame>,
+    /// Of a rehearsal: its place in the trace, and when its tables are made.
+    pub(crate) rehearsed: OnceLock<Option<usize>>,
+    pub(crate) made: OnceLock<Instant>,
     /// Set when the master ends the frame: tasks of it that have not begun are dropped.
     pub(crate) over: AtomicBool,
 }
 
 impl FrameSlot {
     pub(crate) fn new(scene: Arc<SceneSlot>, view: View) -> Self {
-        FrameSlot { scene, view, frame: OnceLock::new(), over: AtomicBool::new(false) }
+        FrameSlot {
+            scene,
+            view,
+            frame: OnceLock::new(),
+            rehearsed: OnceLock::new(),
+            made: OnceLock::new(),
+            over: AtomicBool::new(false),
+        }
     }
 
     fn get(&self) -> &Frame {
@@ -81,14 +92,18 @@ impl Pool {
     pub(crate) fn start(
         threads: u32,
         simd: Simd,
+        rehearsal: Option<&Arc<Rehearsal>>,
     ) -> std::io::Result<(Pool, mpsc::UnboundedReceiver<Rendered>)> {
         let (queue, tasks) = unbounded::<Ready>();
         let (out, results) = mpsc::unbounded_channel();
         for thread in 0..threads {
             let (tasks, out) = (tasks.clone(), out.clone());
-            std::thread::Builder::new()
-                .name(format!("slabcast-render-{thread}"))
-                .spawn(move || work(thread, simd, &tasks, &out))?;
+            let rehearsal = rehearsal.cloned();
+            let work = move || match rehearsal {
+                Some(rehearsal) => hold(thread, &rehearsal, &tasks, &out),
+                None => work(thread, simd, &tasks, &out),
+            };
+            std::thread::Builder::new().name(format!("slabcast-render-{thread}")).spawn(work)?;
         }
         Ok((Pool { queue }, results))
     }
@@ -135,6 +150,29 @@ fn work(thread: u32, simd: Simd, tasks: &Receiver<Ready>, out: &mpsc::UnboundedS
         tracing::debug!(ms = (end - start).as_secs_f64() * 1e3, "rendered");
         let done = Rendered { lease, received, ready, start, end, thread, outcome };
         if out.send(done).is_err() {
+            return;
+        }
+    }
+}
+
+/// Holds tasks for the time that they took to draw.
+fn hold(
+    thread: u32,
+    rehearsal: &Rehearsal,
+    tasks: &Receiver<Ready>,
+    out: &mpsc::UnboundedSender<Rendered>,
+) {
+    let mut free = Instant::now();
+    for task in tasks {
+        let (mut start, mut end) = (free.max(task.ready), free.max(task.ready));
+        let outcome = (!task.frame.over.load(Ordering::Relaxed)).then(|| {
+            let (held, pixels) = rehearsal.task(&task, free)?;
+            (start, end) = (held.start, held.end);
+            Ok((pixels, held.wait()))
+        });
+        free = end;
+        let Ready { lease, received, ready, .. } = task;
+        if out.send(Rendered { lease, received, ready, start, end, thread, outcome }).is_err() {
             return;
         }
     }

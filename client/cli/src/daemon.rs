@@ -7,13 +7,14 @@
 use crate::embedded::{cores, start_master};
 use crate::fail::{Fail, reason, say};
 use crate::request::{AxisArgs, lattice_notice};
-use crate::{parse, record, runtime, signals, volume};
+use crate::{parse, plan, record, runtime, signals, volume};
 use slabcast_common::path::Axis;
 use slabcast_master::{Handle, MasterConfig};
 use slabcast_render::splat::Simd;
-use slabcast_worker::{Config, Ended};
+use slabcast_worker::{Config, Ended, Rehearsal};
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 use tokio::net::{TcpListener, TcpSocket};
 use tokio::sync::watch;
@@ -56,12 +57,17 @@ pub(crate) struct MasterArgs {
     /// What the scheduler is told and decides, for `slabcast replay`; some 25 KB a frame
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
+    /// Take workers that hold tiles for recorded times (`slabcast worker --rehearse`), and no others;
+    /// pictures are marked all over
+    #[arg(long, value_parser = clap::builder::FalseyValueParser::new())]
+    rehearse: bool,
 }
 
 const WORKER_EXAMPLES: &str = "\
 Examples:
   slabcast worker --master node1:7433
   slabcast worker --master node1:7433 --threads 8 --memory 4GiB --name node2
+  slabcast worker --master 127.0.0.1:7433 --threads 1 --rehearse ct.trace
 
 A worker may come and go at any time, also in mid-frame. When its master is away it dials again
 until the master is back.";
@@ -84,6 +90,10 @@ pub(crate) struct WorkerArgs {
     #[arg(long, value_name = "BYTES", default_value = "512MiB",
           value_parser = parse::memory)]
     memory: u64,
+    /// Draw nothing, but hold each tile for the time that this file of `slabcast plan --trace` says; for
+    /// a master with --rehearse
+    #[arg(long, value_name = "TRACE")]
+    rehearse: Option<PathBuf>,
 }
 
 /// Runs `slabcast master`.
@@ -98,6 +108,10 @@ pub(crate) fn master(args: &MasterArgs) -> Result<(), Fail> {
     let (name, lattice) = (volume.name.clone(), volume.lattice);
     let orientation = axes.of(&volume)?;
     let mut config = MasterConfig::new(volume, orientation);
+    config.rehearse = args.rehearse;
+    if args.rehearse {
+        warn!("--rehearse: this master's pictures are stripes, whatever is asked for");
+    }
     if let Some(path) = &args.record {
         record::may(path, &[&args.volume])?;
     }
@@ -221,7 +235,12 @@ fn local(listener: &TcpListener) -> Result<SocketAddr, Fail> {
 
 /// Runs `slabcast worker`.
 pub(crate) fn worker(args: &WorkerArgs) -> Result<(), Fail> {
+    let rehearsal = match &args.rehearse {
+        Some(file) => Some(Arc::new(Rehearsal::new(plan::read(file)?))),
+        None => None,
+    };
     let config = Config {
+        rehearsal,
         name: args.name.clone().unwrap_or_else(host_and_process),
         threads: args.threads.unwrap_or_else(cores),
         memory_budget_bytes: args.memory,

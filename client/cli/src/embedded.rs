@@ -91,6 +91,7 @@ impl Cluster {
                 threads: crew.threads,
                 memory_budget_bytes: SHARED,
                 simd: Simd::detect(),
+                rehearsal: None,
             };
             let stop = stopped.clone();
             workers.spawn(async move {

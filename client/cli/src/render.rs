@@ -660,10 +660,12 @@ struct Look {
     blank: Vec<u64>,
     why: Option<String>,
     incomplete: Vec<u64>,
+    rehearsed: bool,
 }
 
 impl Look {
     fn at(&mut self, frame: &Frame, facts: &FrameStats, info: &VolumeInfo, asked: &Asked) {
+        self.rehearsed |= facts.rehearsed;
         if !facts.poisoned.is_empty() {
             self.incomplete.push(frame.number);
         }
@@ -698,6 +700,12 @@ impl Look {
     }
 
     fn warn(&self) {
+        if self.rehearsed {
+            progress::warn(
+                "the master rehearses: nothing was drawn, and the pictures are stripes; render on a \
+                 master without --rehearse",
+            );
+        }
         if let Some(why) = &self.why {
             let which = match &self.blank[..] {
                 [one] => format!("frame {one} is"),

@@ -238,6 +238,11 @@ pub(crate) struct PictureOf {
 }
 
 impl PictureOf {
+    /// Whether nothing is said of what is in the file.
+    pub(crate) fn input_is_empty(&self) -> bool {
+        self.input.is_empty()
+    }
+
     /// Opens the volume.
     pub(crate) fn open(&self) -> Result<Volume, Fail> {
         self.input.open(&self.volume)

@@ -232,6 +232,7 @@ impl Ledger {
             dropped_results: self.dropped_results,
             poisoned: self.poisoned,
             critical_path: Some(self.path.sentence(now.saturating_sub(self.began), self.cull_us)),
+            rehearsed: false,
         };
         (stats, self.spans)
     }

@@ -133,6 +133,7 @@ fn hello_to_wire(hello: &Hello) -> v1::Hello {
         simd: hello.simd.clone(),
         self_test_sha256: hello.self_test_sha256.clone(),
         held,
+        rehearses: hello.rehearses,
     }
 }
 
@@ -167,6 +168,7 @@ fn hello_from_wire(hello: v1::Hello) -> Result<Hello, WireError> {
         simd: optional_name_from_wire("simd", hello.simd)?,
         self_test_sha256: hash,
         held,
+        rehearses: hello.rehearses,
     })
 }
 

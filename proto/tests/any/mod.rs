@@ -279,6 +279,7 @@ pub fn hello() -> impl Strategy<Value = Hello> {
                 simd: simd.clone(),
                 self_test_sha256: hash.clone(),
                 held,
+                rehearses: threads % 5 == 0,
             })
         })
 }

@@ -157,6 +157,7 @@ impl Tcp {
                 threads: crew.threads,
                 memory_budget_bytes: 1 << 30,
                 simd: Simd::detect(),
+                rehearsal: None,
             };
             let run = slabcast_worker::dial::run(config, address.clone(), stopped.clone());
             tasks.spawn(async move { run.await.map(|_| ()) });

@@ -9,7 +9,7 @@ use slabcast_common::image::{TilePixels, TileState};
 use slabcast_common::message::{Counters, Lease, TaskTimes, TileResult, ToMaster, ToWorker};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::slab::SheetRange;
-use slabcast_common::trace::Trace;
+use slabcast_common::trace::{self, Trace};
 use slabcast_proto::convert::{self, Down};
 use slabcast_proto::v1;
 use slabcast_schedule::sim::Costs;
@@ -91,6 +91,8 @@ pub(super) fn messages(trace: &Trace) -> Costs {
         // Bricks are decoded and put into the cache: some 3 ns a byte (docs/performance.md).
         worker_bricks: (WIRE.0, WIRE.1 + 3.0),
         finish_pixel: finish(trace),
+        hold: (0.0, fill()),
+        late: late(),
         wake: WAKE,
         ..Costs::default()
     }
@@ -112,4 +114,24 @@ fn finish(trace: &Trace) -> f64 {
         })
         .fold(f64::INFINITY, f64::min);
     ns / (f64::from(size[0]) * f64::from(size[1]))
+}
+
+/// To fill a pixel of a result that is held, in nanoseconds.
+fn fill() -> f64 {
+    let (rect, size) = (Rect::new(0, 0, 64, 64), [64, 64]);
+    let shut = vec![false; 64 * 64];
+    best(|| drop(std::hint::black_box(trace::filled(&rect, &shut, size, 100_000)))) / 4096.0
+}
+
+/// How late a thread wakes that sleeps for a tile's time, in nanoseconds.
+fn late() -> f64 {
+    let nap = std::time::Duration::from_micros(200);
+    let sum: f64 = (0..50)
+        .map(|_| {
+            let began = Instant::now();
+            std::thread::sleep(nap);
+            (began.elapsed() - nap).as_nanos() as f64
+        })
+        .sum();
+    sum / 50.0
 }

@@ -3,12 +3,13 @@
 //! Two halves, and it says which is which: [`measure`] draws every tile of the path here, on one
 //! core, and weighs its messages; [`predict`] runs the scheduler itself with these tiles against
 //! virtual workers and links (`slabcast_schedule::sim`). [`costs`] has what messages cost a
-//! processor, [`chart`] draws.
+//! processor, [`chart`] draws. [`rehearse`] puts it to the test with processes on this machine.
 
 mod chart;
 mod costs;
 mod measure;
 mod predict;
+mod rehearse;
 
 use crate::fail::{Fail, say};
 use crate::output::write_atomic;
@@ -38,6 +39,7 @@ Examples:
   slabcast plan brain.nii.gz --workers 1..64 --link 1gbit
   slabcast plan ct.nrrd --tf bone --size 1024x1024 --workers 8,16,32 --link 10gbit --threads 16 -o plan/
   slabcast plan ct.nrrd --tf bone --trace ct.trace --workers 40 --link 1gbit --latency 500us
+  slabcast plan ct.nrrd --tf bone --trace ct.trace --rehearse 2,8,15
 
 The first command with --trace FILE measures and writes FILE; later ones read it, and only predict.")]
 pub(crate) struct PlanArgs {
@@ -68,6 +70,11 @@ pub(crate) struct PlanArgs {
     /// Tiles that were measured before; where the file is not there yet, it is written
     #[arg(long, value_name = "FILE", help_heading = "Measuring")]
     trace: Option<PathBuf>,
+    /// Then see: start a master and so many workers as processes here, which hold tiles for their
+    /// times, and compare (needs --trace)
+    #[arg(long, value_name = "LIST", value_parser = parse::workers, requires = "trace",
+          help_heading = "Measuring")]
+    rehearse: Option<parse::Workers>,
     /// Folder for plan.svg, plan.png, plan.json and plan.csv
     #[arg(short = 'o', long = "output", value_name = "DIR", help_heading = "Output")]
     output: Option<PathBuf>,
@@ -91,6 +98,20 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
             args.threads
         )));
     }
+    if let Some(parse::Workers(list)) = &args.rehearse {
+        if list.iter().any(|n| n * args.threads > 512) {
+            return Err(Fail::usage(
+                "--rehearse, --threads: give 512 threads in all at most; each is one of this \
+                 machine's",
+            ));
+        }
+        if !args.of.input_is_empty() {
+            return Err(Fail::usage(
+                "--rehearse: its master reads the volume without --dims, --type and the like; \
+                 `slabcast convert` it first",
+            ));
+        }
+    }
     let mut progress = Progress::new(args.quiet);
     let volume = args.of.open()?;
     let orientation = args.of.look.view.axes.of(&volume)?;
@@ -105,7 +126,8 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
     drop(volume);
     let frames = asked.path.frames();
     let jobs = measure::jobs(&stage, frames, work)?;
-    let wanted = workers.iter().map(|n| {
+    let more = args.rehearse.iter().flat_map(|list| &list.0);
+    let wanted = workers.iter().chain(more).map(|n| {
         let threads = f64::from(*n) * f64::from(args.threads);
         (work.tiles_per_worker * threads).ceil() as u64
     });
@@ -135,7 +157,7 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
     };
     progress.end();
     drop(stage);
-    let costs = predict::measured_costs(&jobs, &measured.trace)?;
+    let costs = predict::measured_costs(&jobs, &measured.trace, (most, args.threads))?;
     let link = Link {
         bytes_per_s: args.link.0.map(|bits| bits / 8.0 * GOODPUT),
         latency_ns: args.latency,
@@ -143,7 +165,26 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
     let question = Question { threads: args.threads, link, cores: None, stretch: 1.0 };
     let threads = embedded::cores() as usize;
     let rows = predict::rows(&jobs, &measured.trace, workers, &question, costs, threads)?;
-    let said = Said { args, jobs: &jobs, measured: &measured, rows: &rows };
+    let rehearsed = match (&args.rehearse, &args.trace) {
+        (Some(list), Some(file)) => {
+            let stage = rehearse::Stage {
+                volume: &args.of.volume,
+                file,
+                trace: &measured.trace,
+                jobs: &jobs,
+                asked: &asked,
+                axes: &args.of.look.view.axes,
+                threads: args.threads,
+                costs,
+            };
+            let mut progress = Progress::new(args.quiet);
+            let rehearsed = stage.run(&list.0, &mut progress);
+            progress.end();
+            rehearsed?
+        }
+        _ => Vec::new(),
+    };
+    let said = Said { args, jobs: &jobs, measured: &measured, rows: &rows, rehearsed: &rehearsed };
     if let Some(dir) = &args.output {
         said.write(dir)?;
     }
@@ -175,6 +216,7 @@ struct Said<'a> {
     jobs: &'a [FrameJob],
     measured: &'a Measured,
     rows: &'a [Row],
+    rehearsed: &'a [rehearse::Rehearsed],
 }
 
 impl Said<'_> {
@@ -244,6 +286,9 @@ impl Said<'_> {
                  KB: a later frame's leases and results, and\nbricks. bound by: where most of a \
                  frame's time goes: cores (rendering, spread evenly), straggler\n(waiting for the \
                  last tile), link, or master.\n";
+        if !self.rehearsed.is_empty() {
+            text += &rehearse::table(self.rehearsed);
+        }
         text
     }
 
@@ -281,6 +326,7 @@ impl Said<'_> {
                 "latency_us": self.args.latency as f64 / 1e3, "schedule": "slab",
             },
             "predicted": rows,
+            "rehearsed": rehearse::json(self.rehearsed),
         })
     }
 

@@ -161,12 +161,17 @@ impl Stopwatch for Wall {
     }
 }
 
-/// What deciding costs on this machine: the scheduler runs the path once on 8 workers, and is timed.
-pub(super) fn measured_costs(jobs: &[FrameJob], trace: &Trace) -> Result<Costs, Fail> {
+/// What deciding costs on this machine: the scheduler runs the path once on `workers` (whose tiles are
+/// in the trace), and is timed.
+pub(super) fn measured_costs(
+    jobs: &[FrameJob],
+    trace: &Trace,
+    (workers, threads): (u32, u32),
+) -> Result<Costs, Fail> {
     let messages = costs::messages(trace);
-    let question = Question { threads: 1, link: Link::NONE, cores: None, stretch: 1.0 };
+    let question = Question { threads, link: Link::NONE, cores: None, stretch: 1.0 };
     let mut watch = Wall(Instant::now());
-    let cluster = question.cluster(8, messages, 1);
+    let cluster = question.cluster(workers, messages, 1);
     let (_, took) =
         sim::run(jobs, trace, &cluster, &mut watch).map_err(|e| Fail::failed(e.to_string()))?;
     let per = |(n, ns): (u64, u64)| if n == 0 { 0.0 } else { ns as f64 / n as f64 };

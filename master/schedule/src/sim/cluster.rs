@@ -57,6 +57,8 @@ struct Running {
     ready: Nanos,
     start: Nanos,
     result_bytes: u64,
+    /// When its pixels are there.
+    pixels: Nanos,
 }
 
 struct Worker {
@@ -420,9 +422,18 @@ impl World<'_> {
             let made = *w.tables.entry(frame).or_insert(now + (setup * stretch) as Nanos);
             let end = made.max(now) + (ns as f64 * stretch) as Nanos;
             self.outcome.frames[frame.0 as usize - 1].render += end - now;
+            let pixels = match &mut self.machine {
+                Some(machine) => {
+                    let (fixed, pixel) = self.cluster.costs.hold;
+                    let ns = fixed + pixel * lease.tile.area() as f64;
+                    self.worker_work += ns as Nanos;
+                    machine.run(now, ns).max(end + self.cluster.costs.late as Nanos)
+                }
+                None => end,
+            };
             let w = self.workers.get_mut(&id).expect("a worker stays");
-            w.running[thread] =
-                Some(Running { lease, received, ready: now, start: now, result_bytes });
+            let running = Running { lease, received, ready: now, start: now, result_bytes, pixels };
+            w.running[thread] = Some(running);
             self.later(end, Coming::TaskEnd(id, thread));
         }
     }
@@ -455,7 +466,7 @@ impl World<'_> {
                 thread: thread as u32,
             },
         });
-        self.up(id, Event::Result { worker: id, result }, r.result_bytes, now);
+        self.up(id, Event::Result { worker: id, result }, r.result_bytes, r.pixels.max(now));
     }
 
     /// The driver: everything that lies before it, then the wishes.

@@ -80,6 +80,10 @@ pub struct Costs {
     pub worker_send: (f64, f64),
     /// Worker: a batch of bricks, and a byte of it.
     pub worker_bricks: (f64, f64),
+    /// A rehearsing worker: to fill the planes of a result, and a pixel of them.
+    pub hold: (f64, f64),
+    /// A rehearsing worker: how late the system wakes a thread that holds a tile.
+    pub late: f64,
     /// From a message's coming to somebody's working on it, where he slept.
     pub wake: f64,
 }

@@ -1,0 +1,308 @@
+//! A prediction put to the test: a master and workers as processes of this machine, which speak as
+//! they would in a cluster and hold each tile for its time instead of drawing it.
+//!
+//! What is compared is what the scheduler, gRPC and the system do with these tiles. All processes
+//! share this machine's cores, and the simulation is told so; where messages alone fill them, the
+//! rehearsal is no cluster any more, and the table says that too.
+
+use super::predict::{self, Question};
+use crate::fail::Fail;
+use crate::progress::Progress;
+use crate::request::{Asked, AxisArgs};
+use crate::{embedded, remote, runtime};
+use slabcast_client::{Client, Update};
+use slabcast_common::image::PixelFormat;
+use slabcast_common::message::PathRequest;
+use slabcast_common::stats::FrameStats;
+use slabcast_common::trace::Trace;
+use slabcast_schedule::FrameJob;
+use slabcast_schedule::sim::{Costs, Link};
+use std::fmt::Write as _;
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// How long workers may take to come.
+const COME: Duration = Duration::from_secs(60);
+/// How long a path may take.
+const PLAY: Duration = Duration::from_secs(240);
+
+/// What a rehearsal was.
+#[derive(Clone, Debug)]
+pub(super) struct Rehearsed {
+    pub(super) workers: u32,
+    /// Measured: mean of the frames but the first, in ms.
+    pub(super) frame_ms: f64,
+    /// Predicted for this machine.
+    pub(super) predicted_ms: f64,
+    /// Measured: from one frame's coming to the next, in ms.
+    pub(super) each_ms: f64,
+    pub(super) predicted_each_ms: f64,
+    /// Processor time of the master a frame, in ms; `None` where the system does not say.
+    pub(super) master_ms: Option<f64>,
+    pub(super) predicted_master_ms: f64,
+    /// Of all workers.
+    pub(super) workers_ms: Option<f64>,
+    pub(super) predicted_workers_ms: f64,
+    /// Which part of the machine's cores all of them had.
+    pub(super) busy: Option<f64>,
+}
+
+/// A process that ends with this value.
+struct Process(Child);
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+impl Process {
+    fn start(args: &[String]) -> Result<Process, Fail> {
+        let program = std::env::current_exe()
+            .map_err(|e| Fail::failed(format!("finding this program failed: {e}")))?;
+        let mut command = Command::new(program);
+        command.args(args).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
+        for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("SLABCAST_")) {
+            command.env_remove(name);
+        }
+        let child = command.spawn();
+        child.map(Process).map_err(|e| {
+            Fail::failed(format!("starting `slabcast {}` failed: {e}", args.join(" ")))
+        })
+    }
+
+    /// Processor time of all its threads so far.
+    fn cpu(&self) -> Option<Duration> {
+        let tasks = std::fs::read_dir(format!("/proc/{}/task", self.0.id())).ok()?;
+        let mut ns = 0u64;
+        for task in tasks.flatten() {
+            let text = std::fs::read_to_string(task.path().join("schedstat")).ok()?;
+            ns += text.split(' ').next()?.parse::<u64>().ok()?;
+        }
+        Some(Duration::from_nanos(ns))
+    }
+}
+
+/// What all rehearsals of a command share.
+pub(super) struct Stage<'a> {
+    pub(super) volume: &'a Path,
+    /// The trace's file, and what is in it.
+    pub(super) file: &'a Path,
+    pub(super) trace: &'a Trace,
+    pub(super) jobs: &'a [FrameJob],
+    pub(super) asked: &'a Asked,
+    pub(super) axes: &'a AxisArgs,
+    pub(super) threads: u32,
+    pub(super) costs: Costs,
+}
+
+impl Stage<'_> {
+    /// Rehearses with each number of workers.
+    pub(super) fn run(
+        &self,
+        workers: &[u32],
+        progress: &mut Progress,
+    ) -> Result<Vec<Rehearsed>, Fail> {
+        let runtime = runtime::start()?;
+        let result = workers.iter().map(|&n| {
+            progress.stage(&format!("rehearsing with {n} workers"));
+            runtime.block_on(self.one(n))
+        });
+        let result = result.collect();
+        runtime::end(runtime);
+        result
+    }
+
+    async fn one(&self, n: u32) -> Result<Rehearsed, Fail> {
+        let mut args: Vec<String> =
+            ["master", "--listen", "127.0.0.1:0", "--rehearse", "--log-level", "error", "--volume"]
+                .map(String::from)
+                .into();
+        args.push(self.volume.display().to_string());
+        for (flag, axis) in [("--up", self.axes.up), ("--front", self.axes.front)] {
+            args.extend(axis.map(|axis| format!("{flag}={axis}")));
+        }
+        let mut master = Process::start(&args)?;
+        let out = master.0.stdout.take().ok_or_else(|| Fail::failed("the master has no stdout"))?;
+        let mut line = String::new();
+        let read = BufReader::new(out).read_line(&mut line);
+        let address = line.trim().strip_prefix("listening on ").map(String::from);
+        let (Ok(_), Some(address)) = (read, address) else {
+            return Err(Fail::failed(
+                "the master of the rehearsal did not start; try `slabcast master --rehearse \
+                 --volume` with the same file",
+            ));
+        };
+        let file = self.file.display().to_string();
+        let workers = (1..=n)
+            .map(|i| {
+                let (threads, name) = (self.threads.to_string(), format!("rehearsal-{i}"));
+                let args = [
+                    "worker",
+                    "--master",
+                    &address,
+                    "--threads",
+                    &threads,
+                    "--name",
+                    &name,
+                    "--rehearse",
+                    &file,
+                    "--log-level",
+                    "error",
+                ];
+                Process::start(&args.map(String::from))
+            })
+            .collect::<Result<Vec<_>, _>>()?;
+        let client = remote::connect(&address).await?;
+        let come = Instant::now();
+        while client.workers().await.map_err(|e| remote::fail(&e))?.len() < n as usize {
+            if come.elapsed() > COME {
+                return Err(Fail::failed(format!("not all of {n} workers came within a minute")));
+            }
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+        let served = remote::describe(&client).await?;
+        let request = self.asked.request(&served.info, PixelFormat::Rgb8, false);
+        let played = tokio::time::timeout(PLAY, play(&client, request, &master, &workers)).await;
+        let played =
+            played.map_err(|_| Fail::failed("the rehearsal took more than 4 minutes"))??;
+        self.beside(n, &played)
+    }
+
+    /// What was measured, beside what is predicted for this machine.
+    fn beside(&self, workers: u32, played: &Played) -> Result<Rehearsed, Fail> {
+        let cores = embedded::cores();
+        let question =
+            Question { threads: self.threads, link: Link::NONE, cores: Some(cores), stretch: 1.0 };
+        let cluster = question.cluster(workers, self.costs, predict::IN_FLIGHT);
+        let predicted = predict::simulate(self.jobs, self.trace, &cluster)?;
+        let frames = self.jobs.len() as f64;
+        let later = &played.frames[usize::from(played.frames.len() > 1)..];
+        let mean = later.iter().map(|f| f.ms.total).sum::<f64>() / later.len().max(1) as f64;
+        let ms = |ns: u64| ns as f64 / 1e6 / frames;
+        let cpu = |d: Option<Duration>| d.map(|d| d.as_secs_f64() * 1e3 / frames);
+        let (master_ms, workers_ms) = (cpu(played.master), cpu(played.workers));
+        let whole = played.took.as_secs_f64() * 1e3 / frames * f64::from(cores);
+        let busy = master_ms.zip(workers_ms).map(|(m, w)| (m + w) / whole);
+        Ok(Rehearsed {
+            workers,
+            frame_ms: mean,
+            predicted_ms: predicted.frame_ms(),
+            each_ms: played.each_ms,
+            predicted_each_ms: predicted.each_ms(),
+            master_ms,
+            predicted_master_ms: ms(predicted.driver + predicted.streams + predicted.finisher),
+            workers_ms,
+            predicted_workers_ms: ms(predicted.workers),
+            busy,
+        })
+    }
+}
+
+/// What was seen of a path.
+struct Played {
+    frames: Vec<FrameStats>,
+    each_ms: f64,
+    took: Duration,
+    master: Option<Duration>,
+    workers: Option<Duration>,
+}
+
+/// Has the path played, and looks at frames and processes.
+async fn play(
+    client: &Client,
+    request: PathRequest,
+    master: &Process,
+    workers: &[Process],
+) -> Result<Played, Fail> {
+    let of_workers =
+        || workers.iter().map(Process::cpu).try_fold(Duration::ZERO, |sum, d| Some(sum + d?));
+    let job = client.submit(&request).await.map_err(|e| remote::fail(&e))?;
+    let mut stream = client.watch(&job, 0).await.map_err(|e| remote::fail(&e))?;
+    // Bricks are made before the first frame; from then on it counts.
+    let (mut frames, mut came) = (Vec::new(), Vec::new());
+    let (began, before) = (Instant::now(), (master.cpu(), of_workers()));
+    while let Some(update) = stream.next().await.map_err(|e| remote::fail(&e))? {
+        let Update::Frame(frame) = update else { continue };
+        came.push(Instant::now());
+        let stats: FrameStats = serde_json::from_str(&frame.stats_json)
+            .map_err(|e| Fail::failed(format!("a frame's statistics can't be read: {e}")))?;
+        if !stats.rehearsed {
+            return Err(Fail::failed("the master drew instead of rehearsing"));
+        }
+        frames.push(stats);
+    }
+    let after = (master.cpu(), of_workers());
+    let spent = |a: Option<Duration>, b: Option<Duration>| Some(a?.saturating_sub(b?));
+    let each = match came[..] {
+        [first, .., last] => (last - first).as_secs_f64() * 1e3 / (came.len() - 1) as f64,
+        _ => began.elapsed().as_secs_f64() * 1e3,
+    };
+    Ok(Played {
+        frames,
+        each_ms: each,
+        took: began.elapsed(),
+        master: spent(after.0, before.0),
+        workers: spent(after.1, before.1),
+    })
+}
+
+/// The comparison, for people.
+pub(super) fn table(rows: &[Rehearsed]) -> String {
+    let mut text = format!(
+        "\nrehearsed on this machine (loopback, {} cores for all), measured beside predicted:\n\n\
+         {:>7} {:>9} {:>9} {:>6} {:>9} {:>9} {:>6} {:>13} {:>13} {:>6}\n",
+        embedded::cores(),
+        "workers",
+        "ms",
+        "pred.",
+        "off",
+        "each ms",
+        "pred.",
+        "off",
+        "master CPU ms",
+        "workers' CPU",
+        "busy"
+    );
+    let number = |x: Option<f64>, y: f64| match x {
+        Some(x) => format!("{x:.1} ({y:.1})"),
+        None => format!("? ({y:.1})"),
+    };
+    for r in rows {
+        let off = |measured: f64, predicted: f64| (predicted / measured - 1.0) * 100.0;
+        let _ = writeln!(
+            text,
+            "{:>7} {:>9.2} {:>9.2} {:>+4.0} % {:>9.2} {:>9.2} {:>+4.0} % {:>13} {:>13} {:>6}",
+            r.workers,
+            r.frame_ms,
+            r.predicted_ms,
+            off(r.frame_ms, r.predicted_ms),
+            r.each_ms,
+            r.predicted_each_ms,
+            off(r.each_ms, r.predicted_each_ms),
+            number(r.master_ms, r.predicted_master_ms),
+            number(r.workers_ms, r.predicted_workers_ms),
+            r.busy.map_or("?".into(), |b| format!("{:.0} %", b * 100.0)),
+        );
+    }
+    text += "\nCPU: a frame, predicted in brackets. busy: of all cores. Above some 80 % the machine \
+             rehearses itself\nrather than a cluster.\n";
+    text
+}
+
+/// The same for programs.
+pub(super) fn json(rows: &[Rehearsed]) -> Vec<serde_json::Value> {
+    let row = |r: &Rehearsed| {
+        serde_json::json!({
+            "workers": r.workers, "frame_ms": r.frame_ms, "predicted_ms": r.predicted_ms,
+            "each_ms": r.each_ms, "predicted_each_ms": r.predicted_each_ms,
+            "master_cpu_ms": r.master_ms, "predicted_master_cpu_ms": r.predicted_master_ms,
+            "workers_cpu_ms": r.workers_ms, "predicted_workers_cpu_ms": r.predicted_workers_ms,
+            "busy": r.busy, "cores": embedded::cores(),
+        })
+    };
+    rows.iter().map(row).collect()
+}

@@ -1,0 +1,109 @@
+//! Workers that hold tiles instead of drawing them, and masters that know it.
+
+mod program;
+
+use program::{good, run, slabcast, text};
+use serde_json::Value;
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Stdio};
+
+const SCENE: [&str; 6] = ["formula:spheres:32", "--size", "128x128", "--frames", "4", "--quiet"];
+
+/// A process that does not outlive its test.
+struct Process(Child);
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+fn master(dir: &Path, more: &[&str]) -> (Process, String) {
+    let args = ["master", "--listen", "127.0.0.1:0", "--volume", "formula:spheres:32"];
+    let mut child = slabcast(dir, &[&args[..], more].concat())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+    let address = line.trim().rsplit(' ').next().unwrap().to_string();
+    (Process(child), address)
+}
+
+#[test]
+fn a_cluster_of_two_is_rehearsed_beside_its_prediction() {
+    let dir = tempfile::tempdir().unwrap();
+    let more = ["--trace", "s.trace", "--workers", "2", "--rehearse", "2", "--json"];
+    let plan: Value =
+        serde_json::from_str(&good(dir.path(), &[&["plan"][..], &SCENE, &more].concat())).unwrap();
+    let row = &plan["rehearsed"][0];
+    assert_eq!(row["workers"], 2, "{plan}");
+    let n = |key: &str| row[key].as_f64().unwrap_or_else(|| panic!("{key}: {row}"));
+    // Two workers hold what was measured: no frame is shorter than half of it.
+    let alone = plan["measured"]["alone_ms"].as_f64().unwrap();
+    assert!(n("frame_ms") > 0.3 * alone, "{row}");
+    assert!(n("predicted_ms") > 0.3 * alone && n("each_ms") > 0.0, "{row}");
+    if cfg!(target_os = "linux") {
+        assert!(n("master_cpu_ms") > 0.0 && n("workers_cpu_ms") > 0.0, "{row}");
+    }
+    let without = ["plan", "formula:spheres:16", "--rehearse", "2"];
+    let out = run(dir.path(), &without);
+    assert_eq!(out.status.code(), Some(2));
+    assert!(text(&out.stderr).contains("--trace"), "{}", text(&out.stderr));
+}
+
+#[test]
+fn what_is_rehearsed_is_never_taken_for_a_picture() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let plan = ["--trace", "s.trace", "--workers", "1"];
+    good(dir, &[&["plan"][..], &SCENE, &plan].concat());
+    let worker = |address: &str, more: &[&str]| {
+        let args = ["worker", "--master", address, "--threads", "1", "--log-level", "error"];
+        slabcast(dir, &[&args[..], more].concat())
+    };
+
+    // A master that draws does not take a worker that does not.
+    let (_drawing, address) = master(dir, &[]);
+    let out = worker(&address, &["--rehearse", "s.trace"]).output().unwrap();
+    assert_eq!(out.status.code(), Some(1));
+    let said = text(&out.stderr);
+    assert!(said.contains("the worker rehearses") && said.contains("without --rehearse"), "{said}");
+
+    // Nor the other way round.
+    let (_rehearsing, address) = master(dir, &["--rehearse"]);
+    let out = worker(&address, &[]).output().unwrap();
+    assert_eq!(out.status.code(), Some(1));
+    assert!(text(&out.stderr).contains("this master rehearses"), "{}", text(&out.stderr));
+
+    // And what comes of a rehearsal says so, in words, in numbers and to the eye.
+    let mut command = worker(&address, &["--rehearse", "s.trace"]);
+    let _held = Process(command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap());
+    let render = ["render", "--master", &address, "--size", "128x128", "--frames", "4", "-q"];
+    let files = ["--stats", "s.jsonl", "-o", "out"];
+    let out = run(dir, &[&render[..], &files].concat());
+    assert!(out.status.success(), "{}", text(&out.stderr));
+    assert!(text(&out.stderr).contains("the pictures are stripes"), "{}", text(&out.stderr));
+    for line in std::fs::read_to_string(dir.join("s.jsonl")).unwrap().lines() {
+        let stats: Value = serde_json::from_str(line).unwrap();
+        assert_eq!(stats["rehearsed"], true);
+        assert_eq!(stats["pixels_sha256"], "none: rehearsed");
+        assert!(stats["ms"]["render"].as_f64().unwrap() > 0.0);
+    }
+    let picture = |n: u32| std::fs::read(dir.join(format!("out/frame_{n:04}.png"))).unwrap();
+    let decoder = png::Decoder::new(std::io::Cursor::new(picture(2)));
+    let mut reader = decoder.read_info().unwrap();
+    let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+    reader.next_frame(&mut pixels).unwrap();
+    assert_eq!(pixels[..3], [255, 0, 255]);
+    assert_eq!(pixels[3 * 16..3 * 17], [0, 0, 0]);
+
+    // Another picture than the trace's can't be rehearsed.
+    let other = ["render", "--master", &address, "--size", "96x96", "--frames", "1", "-q"];
+    let out = run(dir, &[&other[..], &["-o", "other"]].concat());
+    assert_eq!(out.status.code(), Some(1));
+    assert!(text(&out.stderr).contains("the trace that is rehearsed"), "{}", text(&out.stderr));
+}

@@ -190,6 +190,19 @@ pub enum Schedule {
     Slab,
 }
 
+/// What bricks hold although the scene does not need it: to see what leaving it out saves. Never
+/// changes a byte.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Keep {
+    /// Voxels that nothing shows.
+    pub empty: bool,
+    /// Normals that nothing shades.
+    pub normals: bool,
+    /// Gradient magnitudes that modulate nothing.
+    pub gradients: bool,
+}
+
 /// How the work is cut. Never changes a byte.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -202,11 +215,19 @@ pub struct Work {
     pub tile: Option<u32>,
     /// Schedule.
     pub schedule: Schedule,
+    /// What is kept although nothing needs it.
+    pub keep: Keep,
 }
 
 impl Default for Work {
     fn default() -> Self {
-        Work { slabs: 3, tiles_per_worker: 2.5, tile: None, schedule: Schedule::Auto }
+        Work {
+            slabs: 3,
+            tiles_per_worker: 2.5,
+            tile: None,
+            schedule: Schedule::Auto,
+            keep: Keep::default(),
+        }
     }
 }
 

@@ -5,7 +5,7 @@
 
 use crate::brick::BrickSetKey;
 use crate::path::{CropBox, ViewPath};
-use crate::quality::{Compositing, Refused};
+use crate::quality::{Compositing, Keep, Refused};
 use crate::transfer::{Classifier, Support, TransferFunction};
 use crate::tween::Tween;
 use crate::volume::{Digest32, VolumeInfo};
@@ -59,6 +59,23 @@ impl Wanted {
             crop: None,
         });
         Ok(Wanted { crop, ..union.unwrap_or_default() })
+    }
+
+    /// The same with what is kept although nothing needs it.
+    #[must_use]
+    pub fn keeping(mut self, keep: Keep) -> Wanted {
+        if keep.empty {
+            let all = (f64::NEG_INFINITY, f64::INFINITY);
+            self.support = Support { intervals: vec![all], nan: true };
+        }
+        self.normals |= keep.normals;
+        self.gradients |= keep.gradients;
+        self
+    }
+
+    /// Whether voxels that nothing shows are in the bricks.
+    pub fn keeps_empty(&self) -> bool {
+        self.support.nan && self.support.intervals.contains(&(f64::NEG_INFINITY, f64::INFINITY))
     }
 
     /// Whether bricks made for this serve a job that wants `other`. A box must be the same: what

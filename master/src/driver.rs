@@ -694,7 +694,8 @@ impl Driver {
             sums = Classifier::new(tf, info, compositing).sums(request.quality.sums)?;
         }
         let quality = Quality { sums, ..request.quality };
-        let wanted = Wanted::of_path(&request.path, &transfer, tween.as_ref(), info, compositing)?;
+        let wanted = Wanted::of_path(&request.path, &transfer, tween.as_ref(), info, compositing)?
+            .keeping(request.work.keep);
         let held = self.stores.iter().find(|s| s.wanted().covers(&wanted));
         let (bricks, store) = match held {
             Some(store) => (store.key(), Some(store.clone())),
@@ -935,8 +936,7 @@ impl Driver {
             state,
             stats,
             spans,
-            voxels: r.store.as_ref().map_or(0, |s| s.relevant_voxels()),
-            normals: r.store.as_ref().is_some_and(|s| s.wanted().normals),
+            store: r.store.clone(),
             rehearsed: self.rehearse,
         };
         // The finisher ends only with the driver.

@@ -7,13 +7,14 @@ use crate::jobs::FinishedFrame;
 use sha2::{Digest, Sha256};
 use slabcast_common::bounds;
 use slabcast_common::ids::{FrameId, JobId};
-use slabcast_common::image::{FrameState, Picture};
+use slabcast_common::image::{FrameState, Picture, PixelFormat};
 use slabcast_common::message::{PathRequest, SceneSpec};
 use slabcast_common::path::CropBox;
-use slabcast_common::stats::{Bound, ErrorStats, FrameStats, LeftOut};
-use slabcast_common::view::View;
+use slabcast_common::stats::{Bound, BrickStats, ErrorStats, FrameStats, LeftOut};
+use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::Digest32;
 use slabcast_schedule::Span;
+use slabcast_volumes::BrickStore;
 use std::sync::Arc;
 
 /// Everything that makes a frame.
@@ -27,9 +28,8 @@ pub(crate) struct FrameSums {
     pub(crate) state: Box<FrameState>,
     pub(crate) stats: Box<FrameStats>,
     pub(crate) spans: Vec<Span>,
-    /// Voxels stored, for what normals would have taken.
-    pub(crate) voxels: u64,
-    pub(crate) normals: bool,
+    /// Where its bricks come from.
+    pub(crate) store: Option<Arc<BrickStore>>,
     /// Nobody drew it.
     pub(crate) rehearsed: bool,
 }
@@ -83,6 +83,46 @@ fn error(scene: &SceneSpec, view: &View) -> ErrorStats {
     }
 }
 
+/// What the frame did not need, by name, with the bytes that it saved. Milliseconds are not measured
+/// in passing: `slabcast explain` draws with and without.
+///
+/// Of bricks the bytes are those of one copy: the master's, and each worker's that holds them.
+fn left_out(
+    store: &BrickStore,
+    scene: &SceneSpec,
+    view: &View,
+    request: &PathRequest,
+    bricks: &BrickStats,
+) -> Vec<LeftOut> {
+    let (wanted, voxels) = (store.wanted(), store.relevant_voxels());
+    let all: u64 = scene.volume.lattice.dims.iter().map(|&n| u64::from(n)).product();
+    // Of voxels as they are stored, their place and their brick's head included.
+    let bytes = |n: u64| (n as f64 * store.bytes() as f64 / voxels.max(1) as f64) as u64;
+    let mut list = Vec::new();
+    let mut put = |name: &str, saved_bytes: Option<u64>| {
+        list.push(LeftOut { name: name.into(), saved_ms: None, saved_bytes });
+    };
+    if !wanted.keeps_empty() {
+        put("empty", Some(bytes(all.saturating_sub(voxels))));
+    }
+    if bricks.needed < bricks.relevant {
+        put("hidden", Some(bytes(voxels.saturating_sub(bricks.needed_voxels))));
+    }
+    if !wanted.normals {
+        put("normals", Some(2 * voxels));
+    }
+    if !wanted.gradients {
+        put("gradients", Some(voxels));
+    }
+    if matches!(view.projection, Projection::Ortho { .. }) {
+        put("scale", None);
+    }
+    if request.format == PixelFormat::Rgb8 {
+        put("alpha", Some(view.size.iter().map(|&n| u64::from(n)).product()));
+    }
+    list
+}
+
 /// Stripes over the whole picture: what was not drawn is not to be taken for a picture.
 fn mark(picture: &mut Picture) {
     let w = picture.size[0].max(1) as usize;
@@ -113,14 +153,10 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
     }
     stats.pixels_version = slabcast_common::PIXELS_VERSION;
     stats.error = error(&s.scene, &s.view);
-    if !s.normals {
-        stats.left_out.push(LeftOut {
-            name: "normals".into(),
-            saved_ms: None,
-            // Two bytes a stored voxel, in the master's memory and on every worker that holds it.
-            saved_bytes: Some(2 * s.voxels),
-        });
-    }
+    stats.left_out = match &s.store {
+        Some(store) => left_out(store, &s.scene, &s.view, &s.request, &stats.bricks),
+        None => Vec::new(),
+    };
     let bytes = picture.encode(s.request.format, s.request.background).into();
     FinishedFrame {
         number,

@@ -10,7 +10,7 @@ use crate::front::choose::settle;
 use crate::front::magnify::magnified;
 use crate::local::{self, Cut};
 use crate::progress::{self, Progress};
-use crate::request::{PictureOf, ThreadArg, lattice_notice};
+use crate::request::{KeepArg, PictureOf, ThreadArg, lattice_notice};
 use crate::stage::Stage;
 use slabcast_common::message::Counters;
 use slabcast_common::quality::Work;
@@ -34,6 +34,8 @@ pub(crate) struct BenchArgs {
     of: PictureOf,
     #[command(flatten)]
     threads: ThreadArg,
+    #[command(flatten)]
+    keep: KeepArg,
     /// Edge of the tiles that threads share, in pixels
     #[arg(long, value_name = "N", default_value = "64",
           value_parser = clap::value_parser!(u32).range(16..=256))]
@@ -52,7 +54,8 @@ pub(crate) struct BenchArgs {
 
 /// Runs the command.
 pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
-    let mut asked = args.of.look.aimed(Work::default())?;
+    let work = Work { keep: args.keep.keep(), ..Work::default() };
+    let mut asked = args.of.look.aimed(work)?;
     let threads = args.threads.count();
     let volume = args.of.open()?;
     let orientation = args.of.look.view.axes.of(&volume)?;
@@ -70,6 +73,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
     let mut progress = Progress::new(false).of("frame");
     progress.frames(views as u64, &format!("{views} views"));
     let (mut each, mut counters, mut middle) = (Vec::new(), Counters::default(), None);
+    let mut sha256 = String::new();
     for i in 0..views {
         let (view, scene) = (stage.view(i, &asked.quality)?, stage.scene(i));
         let began = Instant::now();
@@ -82,6 +86,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
             counters += counted;
         }
         if i == views / 2 {
+            sha256 = picture.sha256().to_string();
             middle = Some((stage.view_of(i, &asked.quality, asked.size())?, picture));
         }
         progress.step(progress::Step { frames: i as u64 + 1, ..Default::default() });
@@ -119,7 +124,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
             "each_ms": each,
             "threads": threads, "tile": args.tile, "simd": simd, "size": asked.size(),
             "magnify": asked.magnify,
-            "quality": quality, "relevant": relevant,
+            "quality": quality, "relevant": relevant, "pixels_sha256": sha256,
             "tossed": counters.tossed / n, "splatted": counters.splatted / n,
             "culled": counters.culled / n,
             "limit": errors.as_ref().map(|e| figures(&e[0])),

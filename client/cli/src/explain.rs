@@ -1,4 +1,4 @@
-//! `slabcast explain`: why a pixel is as it is.
+//! `slabcast explain`: why a pixel is as it is, and what a scene does not need ([`crate::needs`]).
 //!
 //! The numbers are the renderer's own ([`slabcast_render::explain`]): the pixel that they lead to
 //! is the pixel of the picture, to the bit. Beside each sheet stands what the same sheets are in
@@ -6,18 +6,20 @@
 
 use crate::fail::{Fail, say};
 use crate::parse;
-use crate::request::PictureOf;
-use crate::signals;
+use crate::request::{PictureOf, ThreadArg};
 use crate::still::Still;
+use crate::{needs, signals};
 use slabcast_common::volume::ValueMap;
 use slabcast_render::explain::{Explained, Section, SheetHere, explain};
 use slabcast_render::reference::{Sheet, Sheets};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
-/// Explains a pixel sheet by sheet: what is in it, which voxels made it, where it was shut.
+/// Explains what a scene does not need and what leaving it out saves; with --pixel, a pixel sheet by
+/// sheet: what is in it, which voxels made it, where it was shut.
 ///
-/// The first view of the path is taken. For each sheet that holds something at the pixel, front to
+/// The first view of the path is taken. Without --pixel the scene is drawn as it is and with each
+/// thing kept that it leaves out, in turn, and the pictures are compared. With it, for each sheet that holds something at the pixel, front to
 /// back: transmittance T behind it, its optical depth tau, its colour, the same T from f64 sheets
 /// that round nothing and shut nothing, and how many voxels of how many bricks made it, the
 /// strongest first. All numbers but those are the renderer's own, in its arithmetic: they lead to
@@ -26,6 +28,7 @@ use std::fmt::Write;
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
+  slabcast explain brain.nii.gz --tf fog
   slabcast explain brain.nii.gz --pixel 256,200
   slabcast explain brain.nii.gz --tf peer-semi --azimuth 30 --pixel 256,200 --voxels 0
   slabcast explain brain.nii.gz --thickness 0.5 --pixel 256,200 --json | jq .sheets[0]
@@ -34,7 +37,11 @@ Depths are in vox behind the target; sheet k lies between k and k + 1 thicknesse
 linear, from 0 to 1; pixels linear, premultiplied. A voxel's weights are those of its footprint
 along x and y and of its section in the sheet.
 
-JSON: {pixel: [x, y], size, rgba, same_thickness, limit, error: {limit, same_thickness}, shut_in,
+JSON of a scene: {scene, size, threads, ms, voxels, bytes, rows: [{name, left_out, why, saved_bytes,
+saved_ms, saved_cut_ms, same_pixels, force}]}: bytes of one copy of the bricks or of a picture, ms of
+a frame, ms of cutting bricks once a volume, null where it is not measured; force: the flag that keeps
+it all the same.
+JSON of a pixel: {pixel: [x, y], size, rgba, same_thickness, limit, error: {limit, same_thickness}, shut_in,
 voxels, bricks, hidden: {voxels, bricks}, sheets: [{k, depth: [from, to], tau, colour, t, light,
 raw, peek, sections, bricks, reference: {tau, colour, t}, voxels: [{voxel, brick, value, weights,
 tau, colour}]}]}. rgba, same_thickness and limit are linear, premultiplied; errors are the largest
@@ -49,6 +56,8 @@ pub(crate) struct ExplainArgs {
     /// Voxels to list for each sheet, strongest first
     #[arg(long, value_name = "N", default_value = "3")]
     voxels: usize,
+    #[command(flatten)]
+    threads: ThreadArg,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -71,10 +80,11 @@ struct Found {
 /// Runs the command.
 pub(crate) fn run(args: &ExplainArgs) -> Result<(), Fail> {
     let Some(pixel) = args.pixel else {
-        return Err(Fail::usage(
-            "--pixel: say which pixel to explain, X,Y from 0,0 at the top left; see `slabcast \
-             explain --help`",
-        ));
+        let needs = {
+            let args = args.clone();
+            signals::unless_stopped(move || needs::find(&args.of, args.threads.count()))?
+        };
+        return say(&if args.json { needs::json(&needs) } else { needs::text(&needs) });
     };
     let found = {
         let args = args.clone();

@@ -15,7 +15,8 @@
 //! - [`report`] sweeps the knobs of quality for error against run time; [`front`] measures, and
 //!   [`chart`] draws.
 //! - [`check`] compares pictures with the oracle over every way to make them; [`error`] says how
-//!   far one is from the truth, [`explain`] why a pixel is as it is. [`local`] draws for the
+//!   far one is from the truth, [`explain`] why a pixel is as it is and ([`needs`]) what a scene leaves
+//!   out. [`local`] draws for the
 //!   first two, [`stage`] has the scenes and views of a path, [`still`] one of them for the last
 //!   two.
 //!
@@ -41,6 +42,7 @@ mod info;
 mod local;
 mod logging;
 mod machine;
+mod needs;
 mod output;
 mod parse;
 mod plan;

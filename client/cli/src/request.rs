@@ -17,7 +17,7 @@ use slabcast_common::path::{
     Axis, Crop, Key, KeyFrames, Orientation, ProjectionKind, Side, Turntable, ViewPath,
 };
 use slabcast_common::quality::{
-    Compositing, Kernel, Quality, Refused, Schedule, Splat, Sums, Work,
+    Compositing, Keep, Kernel, Quality, Refused, Schedule, Splat, Sums, Work,
 };
 use slabcast_common::tween::Tween;
 use slabcast_common::view::View;
@@ -283,6 +283,41 @@ pub(crate) struct WorkArgs {
     #[arg(long, default_value = "auto", value_name = "NAME", value_parser = words(
         &[("auto", Schedule::Auto), ("region", Schedule::Region), ("slab", Schedule::Slab)]))]
     schedule: Schedule,
+    #[command(flatten)]
+    keep: KeepArg,
+}
+
+/// What bricks hold although nothing needs it.
+#[derive(clap::Args, Clone, Debug, Default)]
+pub(crate) struct KeepArg {
+    /// Puts into bricks what the scene does not need, to see what leaving it out saves: empty (voxels
+    /// that nothing shows), normals (that nothing shades), gradients (that modulate nothing)
+    #[arg(
+        long,
+        value_name = "WHAT,...",
+        value_delimiter = ',',
+        value_enum,
+        hide_possible_values = true
+    )]
+    keep: Vec<Kept>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Kept {
+    Empty,
+    Normals,
+    Gradients,
+}
+
+impl KeepArg {
+    pub(crate) fn keep(&self) -> Keep {
+        let has = |kept| self.keep.contains(&kept);
+        Keep {
+            empty: has(Kept::Empty),
+            normals: has(Kept::Normals),
+            gradients: has(Kept::Gradients),
+        }
+    }
 }
 
 impl WorkArgs {
@@ -292,6 +327,7 @@ impl WorkArgs {
             tiles_per_worker: self.tiles_per_worker,
             tile: self.tile.0,
             schedule: self.schedule,
+            keep: self.keep.keep(),
         };
         w.check().map_err(|e| Fail::flag(&e))?;
         Ok(w)

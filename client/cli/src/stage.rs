@@ -42,7 +42,8 @@ impl Stage {
         let tween = Tween::of(&asked.path, &info.summary).map_err(blame)?;
         let compositing = asked.quality.compositing;
         let wanted = Wanted::of_path(&asked.path, &transfer, tween.as_ref(), info, compositing)
-            .map_err(blame)?;
+            .map_err(blame)?
+            .keeping(asked.work.keep);
         let Drawn { spec: base, bricks } =
             Drawn::holding(volume, info, &transfer, asked.quality, &wanted)?;
         let shared = Arc::new(Scene::new(&base));

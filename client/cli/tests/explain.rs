@@ -53,8 +53,7 @@ fn text_says_where_it_was_shut_and_what_it_should_be() {
 #[test]
 fn what_cannot_be_explained_is_a_usage_error() {
     for (arguments, want) in [
-        (&["formula:spheres"][..], "say which pixel"),
-        (&["no-such-file.nrrd", "--pixel", "512,0"], "which has 512x512 pixels"),
+        (&["no-such-file.nrrd", "--pixel", "512,0"][..], "which has 512x512 pixels"),
         (&["formula:spheres", "--pixel", "3"], "X,Y"),
     ] {
         let out = run(arguments);
@@ -62,4 +61,74 @@ fn what_cannot_be_explained_is_a_usage_error() {
         assert_eq!(out.status.code(), Some(2), "{said}");
         assert!(said.contains(want), "{said}");
     }
+}
+
+#[test]
+fn what_a_scene_leaves_out_changes_no_pixel() {
+    for (scene, left_out, needed) in [
+        (
+            &["--tf", "fog"][..],
+            &["empty", "normals", "gradients", "scale", "alpha"][..],
+            &["hidden"][..],
+        ),
+        (
+            &["--tf", "skin", "--projection", "persp", "--background", "transparent"],
+            &["empty", "gradients", "hidden"],
+            &["normals", "scale", "alpha"],
+        ),
+    ] {
+        let line = [&["formula:spheres:40", "--size", "80x80", "--json"], scene].concat();
+        let out = run(&line);
+        assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+        let e: serde_json::Value = serde_json::from_slice(&out.stdout).expect("JSON");
+        let row = |name: &str| {
+            let mut rows = e["rows"].as_array().unwrap().iter();
+            rows.find(|r| r["name"] == name).unwrap_or_else(|| panic!("{name}: {e}"))
+        };
+        for name in left_out {
+            assert_eq!(row(name)["left_out"], true, "{name}: {e}");
+        }
+        for name in needed {
+            assert_eq!(row(name)["left_out"], false, "{name}: {e}");
+        }
+        for name in ["empty", "gradients", "hidden"] {
+            assert_eq!(row(name)["same_pixels"], true, "{name}: {e}");
+        }
+        assert!(row("empty")["saved_bytes"].as_u64().unwrap() > e["bytes"].as_u64().unwrap() / 4);
+    }
+}
+
+/// What `--keep` keeps is kept by a master and its workers too; the statistics no longer name it, and
+/// the picture is the same.
+#[test]
+fn what_is_kept_is_not_named_as_left_out() {
+    let dir = tempfile::tempdir().unwrap();
+    let frame = |keep: &[&str]| -> serde_json::Value {
+        let line = ["render", "formula:spheres:40", "--tf", "fog", "--azimuth", "30"];
+        let rest = ["--size", "80x80", "--stats", "s.jsonl", "--force", "-o", "a.png"];
+        let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
+            .args(line)
+            .args(rest)
+            .args(keep)
+            .current_dir(dir.path())
+            .output()
+            .expect("slabcast runs");
+        assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+        let text = std::fs::read_to_string(dir.path().join("s.jsonl")).unwrap();
+        serde_json::from_str(&text).expect("JSON")
+    };
+    let names = |frame: &serde_json::Value| -> Vec<String> {
+        let list = frame["left_out"].as_array().unwrap();
+        list.iter().map(|l| l["name"].as_str().unwrap().to_string()).collect()
+    };
+    let (lean, full) = (frame(&[]), frame(&["--keep", "empty,normals,gradients"]));
+    assert_eq!(lean["pixels_sha256"], full["pixels_sha256"]);
+    let (lean, full) = (names(&lean), names(&full));
+    for name in ["empty", "normals", "gradients"] {
+        assert!(
+            lean.iter().any(|n| n == name) && !full.iter().any(|n| n == name),
+            "{lean:?} {full:?}"
+        );
+    }
+    assert!(full.iter().any(|n| n == "alpha"));
 }

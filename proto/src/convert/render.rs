@@ -15,7 +15,7 @@ use slabcast_common::ids::WorkerId;
 use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::message::{PathRequest, TransferChoice};
 use slabcast_common::path::Orientation;
-use slabcast_common::quality::{Schedule, Work};
+use slabcast_common::quality::{Keep, Schedule, Work};
 
 enum_doors!(schedule_to_wire, schedule_from_wire, Schedule, v1::Schedule, Some(Schedule::Auto),
     { Auto <=> Auto, Region <=> Region, Slab <=> Slab });
@@ -47,6 +47,9 @@ pub fn path_request_to_wire(request: &PathRequest) -> v1::PathRequest {
             tiles_per_worker: Some(request.work.tiles_per_worker),
             tile: request.work.tile,
             schedule: schedule_to_wire(request.work.schedule),
+            keep_empty: request.work.keep.empty,
+            keep_normals: request.work.keep.normals,
+            keep_gradients: request.work.keep.gradients,
         }),
         format: wanted_format_to_wire(request.format),
         background: Some(background_to_wire(request.background)),
@@ -87,6 +90,11 @@ fn work_from_wire(work: v1::Work) -> Result<Work, WireError> {
         tiles_per_worker: work.tiles_per_worker.unwrap_or(d.tiles_per_worker),
         tile: work.tile,
         schedule: schedule_from_wire("schedule", work.schedule)?,
+        keep: Keep {
+            empty: work.keep_empty,
+            normals: work.keep_normals,
+            gradients: work.keep_gradients,
+        },
     };
     work.check()?;
     Ok(work)

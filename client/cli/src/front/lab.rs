@@ -150,8 +150,8 @@ impl Lab {
         let path = &self.asked.path;
         let how = match &path.turntable {
             Some(t) => format!(
-                "{:?} {:?} {} {:?} {:?} {:?}",
-                t.projection, t.height, t.fov, path.size, path.crop, self.orientation
+                "{:?} {:?} {} {} {:?} {:?} {:?}",
+                t.projection, t.height, t.fov, t.elevation, path.size, path.crop, self.orientation
             ),
             None => serde_json::to_string(path).unwrap_or_default(),
         };

@@ -1,0 +1,332 @@
+//! What a scene does not need, and what leaving it out saves: `slabcast explain` without a pixel.
+//!
+//! Each row is measured: the scene is drawn as it is and with the thing kept (or the test switched
+//! off), in turn, and the two pictures are compared, to the bit.
+
+use crate::fail::Fail;
+use crate::local::{self, Cut};
+use crate::progress::{self, Progress};
+use crate::request::{Asked, PictureOf};
+use crate::stage::Stage;
+use slabcast_common::brick::Brick;
+use slabcast_common::image::{Background, Picture};
+use slabcast_common::path::Orientation;
+use slabcast_common::quality::{Keep, Quality, Work};
+use slabcast_common::view::Projection;
+use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_render::{Frame, Scene};
+use std::fmt::Write;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// Frames of each way, in turn.
+const TURNS: usize = 5;
+
+/// Voxels of a volume that is cut a second time with everything in it: some 5 bytes each.
+const MOST_VOXELS: u64 = 1 << 26;
+
+/// One thing that a scene may need or not.
+struct Row {
+    name: &'static str,
+    left_out: bool,
+    why: String,
+    /// In one copy of the bricks, or in a picture.
+    bytes: Option<u64>,
+    /// Of a frame: drawn with it, less drawn without.
+    ms: Option<f64>,
+    /// Of cutting the bricks, once a volume.
+    cut_ms: Option<f64>,
+    /// Whether the picture with it has the same bytes.
+    same: Option<bool>,
+    force: &'static str,
+}
+
+/// All of it.
+pub(crate) struct Needs {
+    scene: String,
+    size: [u32; 2],
+    threads: usize,
+    /// A frame as it is drawn.
+    ms: f64,
+    relevant: u64,
+    bytes: u64,
+    rows: Vec<Row>,
+}
+
+/// A scene that is ready, and what it took to cut it.
+struct Way {
+    stage: Stage,
+    frame_of: Quality,
+    cut_ms: f64,
+}
+
+impl Way {
+    fn new(
+        volume: &Volume,
+        info: &VolumeInfo,
+        asked: &Asked,
+        o: Orientation,
+        keep: Keep,
+    ) -> Result<Way, Fail> {
+        let mut asked = asked.clone();
+        asked.work.keep = keep;
+        let asked = asked;
+        let began = Instant::now();
+        let stage = Stage::new(volume, info, &asked, o)?;
+        let cut_ms = began.elapsed().as_secs_f64() * 1e3;
+        let frame_of = stage.spec(0).quality;
+        Ok(Way { stage, frame_of, cut_ms })
+    }
+
+    fn bytes(&self) -> u64 {
+        self.stage.bricks.iter().map(|b| b.encoded_len() as u64).sum()
+    }
+
+    fn voxels(&self) -> u64 {
+        self.stage.bricks.iter().map(|b: &Arc<Brick>| b.len() as u64).sum()
+    }
+}
+
+/// Draws two ways in turn; their medians in milliseconds, and whether the pictures are the same.
+fn in_turn(ways: [(&Way, Quality); 2], threads: usize) -> Result<([f64; 2], bool), Fail> {
+    let cut = Cut { tile: 64, ..Cut::on(threads) };
+    let scenes = ways.map(|(way, quality)| {
+        let spec = way.stage.spec(0);
+        Arc::new(Scene::new(&slabcast_common::message::SceneSpec { quality, ..spec }))
+    });
+    let mut ms = [Vec::new(), Vec::new()];
+    let mut pictures: [Option<Picture>; 2] = [None, None];
+    for turn in 0..=TURNS {
+        for i in 0..2 {
+            let (way, quality) = ways[i];
+            let view = way.stage.view(0, &quality)?;
+            let began = Instant::now();
+            let frame = Frame::new(scenes[i].clone(), view);
+            let picture = local::picture(&frame, &way.stage.bricks, cut);
+            // The first fills tables and caches.
+            if turn > 0 {
+                ms[i].push(began.elapsed().as_secs_f64() * 1e3);
+            }
+            pictures[i] = Some(picture);
+        }
+    }
+    let median = |mut ms: Vec<f64>| {
+        ms.sort_by(f64::total_cmp);
+        ms[ms.len() / 2]
+    };
+    let [a, b] = pictures.map(|p| p.map(|p| p.sha256()));
+    Ok((ms.map(median), a == b))
+}
+
+/// Finds it out.
+pub(crate) fn find(of: &PictureOf, threads: usize) -> Result<Needs, Fail> {
+    let asked = of.look.asked(Work::default())?;
+    let volume = of.open()?;
+    let orientation = of.look.view.axes.of(&volume)?;
+    let info = volume.info(volume.digest());
+    asked.fit(&info, orientation, volume.anatomical)?;
+    let mut progress = Progress::new(false);
+    progress.stage("drawing with and without");
+    let way = |keep| Way::new(&volume, &info, &asked, orientation, keep);
+    let base = way(Keep::default())?;
+    let spec = base.stage.spec(0);
+    let quality = base.frame_of;
+    let (voxels, bytes) = (base.voxels(), base.bytes());
+    let all: u64 = info.lattice.dims.iter().map(|&n| u64::from(n)).product();
+    let mut rows = Vec::new();
+
+    // Keeping something in the bricks.
+    let mut kept = |name, why: String, keep: Keep, force| -> Result<(), Fail> {
+        let with = way(keep)?;
+        let ([less, more], same) = in_turn([(&base, quality), (&with, quality)], threads)?;
+        rows.push(Row {
+            name,
+            left_out: true,
+            why,
+            bytes: Some(with.bytes().saturating_sub(bytes)),
+            ms: Some(more - less),
+            cut_ms: Some(with.cut_ms - base.cut_ms),
+            same: Some(same),
+            force,
+        });
+        Ok(())
+    };
+    let needed = |name, why: &str| Row {
+        name,
+        left_out: false,
+        why: why.into(),
+        bytes: None,
+        ms: None,
+        cut_ms: None,
+        same: None,
+        force: "",
+    };
+    let empty = format!("{voxels} of {all} voxels are visible under this transfer function");
+    let mut later = Vec::new();
+    if all <= MOST_VOXELS {
+        kept("empty", empty, Keep { empty: true, ..Keep::default() }, "--keep empty")?;
+    } else {
+        let estimate = (all - voxels) as f64 * bytes as f64 / voxels.max(1) as f64;
+        later.push(Row {
+            left_out: true,
+            bytes: Some(estimate as u64),
+            force: "--keep empty",
+            ..needed("empty", &(empty + "; not drawn with them, the volume is large"))
+        });
+    }
+    if spec.transfer.shading.on {
+        later.push(needed("normals", "the scene is shaded"));
+    } else {
+        let keep = Keep { normals: true, ..Keep::default() };
+        kept("normals", "no light falls on the scene".into(), keep, "--keep normals")?;
+    }
+    if spec.transfer.gradient_opacity.is_empty() {
+        let keep = Keep { gradients: true, ..Keep::default() };
+        kept("gradients", "no opacity hangs on them".into(), keep, "--keep gradients")?;
+    } else {
+        later.push(needed("gradients", "they modulate opacity"));
+    }
+    rows.append(&mut later);
+
+    // Looking at what is hidden.
+    let look = Quality { cull: false, ..quality };
+    let ([ms, blind], same) = in_turn([(&base, quality), (&base, look)], threads)?;
+    let frame = base.stage.frame(0)?;
+    let picture = local::picture(&frame, &base.stage.bricks, Cut::on(threads));
+    let shut = picture.pixels.iter().filter(|p| 1.0 - p[3] < quality.eps as f32).count();
+    let covered = picture.pixels.iter().filter(|p| p[3] > 0.0).count();
+    if shut > 0 {
+        rows.push(Row {
+            name: "hidden",
+            left_out: true,
+            why: format!(
+                "{:.0} % of the pixels that show anything are shut before their last voxel",
+                100.0 * shut as f64 / covered.max(1) as f64
+            ),
+            bytes: None,
+            ms: Some(blind - ms),
+            cut_ms: None,
+            same: Some(same),
+            force: "--cull off",
+        });
+    } else {
+        let most = picture.pixels.iter().fold(0.0, |m, p| p[3].max(m));
+        let why = format!(
+            "nothing is hidden: the most opaque pixel lets {:.1} % through; looking costs {:.1} ms",
+            100.0 * (1.0 - most),
+            ms - blind
+        );
+        rows.push(Row { same: Some(same), force: "--cull off", ..needed("hidden", &why) });
+    }
+    let view = base.stage.view(0, &quality)?;
+    let flat = matches!(view.projection, Projection::Ortho { .. });
+    rows.push(Row {
+        left_out: flat,
+        ..needed(
+            "scale",
+            if flat {
+                "rays are parallel: all footprints of a frame are of one size"
+            } else {
+                "footprints shrink with depth in perspective"
+            },
+        )
+    });
+    let opaque = asked.background != Background::Transparent;
+    rows.push(Row {
+        left_out: opaque,
+        bytes: opaque.then(|| view.size.iter().map(|&n| u64::from(n)).product()),
+        force: "--background transparent",
+        ..needed(
+            "alpha",
+            if opaque { "the background is opaque" } else { "the background is transparent" },
+        )
+    });
+    rows.push(Row {
+        left_out: true,
+        bytes: Some(bytes),
+        force: "slabcast worker",
+        ..needed("transfer", "workers inside the master's process share its bricks")
+    });
+    let grey = spec.transfer.colors.iter().all(|c| c[1] == c[2] && c[2] == c[3]);
+    rows.push(needed(
+        "colour",
+        if grey {
+            "grey scenes are drawn in three channels like others"
+        } else {
+            "the scene has hues"
+        },
+    ));
+    progress.end();
+    Ok(Needs {
+        scene: format!("{}, {}", volume.name, asked.transfer.name()),
+        size: view.size,
+        threads,
+        ms,
+        relevant: voxels,
+        bytes,
+        rows,
+    })
+}
+
+/// For people.
+pub(crate) fn text(needs: &Needs) -> String {
+    let [w, h] = needs.size;
+    let mut out = format!(
+        "{}, {w}x{h}: {:.1} ms a frame on {} thread{}; {} visible voxels in {} of bricks\n\n",
+        needs.scene,
+        needs.ms,
+        needs.threads,
+        if needs.threads == 1 { "" } else { "s" },
+        needs.relevant,
+        progress::bytes(needs.bytes)
+    );
+    out.push_str("left out      saves, ms a frame      bytes   ms of cutting  same picture\n");
+    for r in needs.rows.iter().filter(|r| r.left_out) {
+        let number = |x: Option<f64>| x.map_or_else(|| "-".into(), |x| format!("{x:.1}"));
+        let _ = writeln!(
+            out,
+            "{:<13} {:>17} {:>10} {:>15}  {:<12}  {}{}",
+            r.name,
+            number(r.ms),
+            r.bytes.map_or_else(|| "-".into(), progress::bytes),
+            number(r.cut_ms),
+            match r.same {
+                Some(true) => "to the bit",
+                Some(false) => "NO",
+                None => "-",
+            },
+            r.why,
+            if r.force.is_empty() { String::new() } else { format!(" ({})", r.force) }
+        );
+    }
+    out.push_str("\nneeded, or not left out\n");
+    for r in needs.rows.iter().filter(|r| !r.left_out) {
+        let _ = writeln!(out, "{:<13} {}", r.name, r.why);
+    }
+    out.push_str(
+        "\nIn brackets: what keeps it all the same. Times are medians of five frames, drawn in turn\n\
+         with and without; differences below some percent of a frame are noise.\n",
+    );
+    out
+}
+
+/// For programs.
+pub(crate) fn json(needs: &Needs) -> String {
+    let rows: Vec<_> = needs
+        .rows
+        .iter()
+        .map(|r| {
+            serde_json::json!({
+                "name": r.name, "left_out": r.left_out, "why": r.why, "saved_bytes": r.bytes,
+                "saved_ms": r.ms, "saved_cut_ms": r.cut_ms, "same_pixels": r.same,
+                "force": if r.force.is_empty() { None } else { Some(r.force) },
+            })
+        })
+        .collect();
+    serde_json::json!({
+        "scene": needs.scene, "size": needs.size, "threads": needs.threads, "ms": needs.ms,
+        "voxels": needs.relevant, "bytes": needs.bytes, "rows": rows,
+    })
+    .to_string()
+        + "\n"
+}

@@ -73,6 +73,7 @@ fn master() -> (Process, String) {
 fn worker(master: &str, name: &str) -> Process {
     let child = Command::new(SLABCAST)
         .args(["worker", "--master", master, "--name", name, "--threads", "1"])
+        .args(["--memory", "16MiB"])
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn()
@@ -95,11 +96,11 @@ fn run(command: &mut Command) -> Output {
     out
 }
 
-/// The same views inside one process.
+/// The same views inside one process, under the paper's schedule.
 fn embedded(dir: &Path) -> Vec<String> {
     let file = dir.join("embedded.jsonl");
     run(Command::new(SLABCAST)
-        .args(["render", VOLUME, "--workers", "1", "--threads", "1"])
+        .args(["render", VOLUME, "--workers", "1", "--threads", "1", "--schedule", "slab"])
         .args(VIEWS)
         .arg("-o")
         .arg(dir.join("embedded"))
@@ -108,10 +109,10 @@ fn embedded(dir: &Path) -> Vec<String> {
     hashes(&stats(&file))
 }
 
-fn render(dir: &Path, master: &str, name: &str) -> (Process, PathBuf) {
+fn render(dir: &Path, master: &str, name: &str, schedule: &str) -> (Process, PathBuf) {
     let file = dir.join(format!("{name}.jsonl"));
     let child = Command::new(SLABCAST)
-        .args(["render", "--master", master])
+        .args(["render", "--master", master, "--schedule", schedule])
         .args(VIEWS)
         .arg("-o")
         .arg(dir.join(name))
@@ -143,6 +144,15 @@ async fn lent(client: &Client, name: &str) -> Option<u32> {
 
 #[tokio::test]
 async fn a_worker_killed_with_a_tile_in_its_hands_costs_no_pixel() {
+    killed_with_a_tile("slab").await;
+}
+
+#[tokio::test]
+async fn a_worker_killed_with_a_region_in_its_hands_costs_no_pixel() {
+    killed_with_a_tile("region").await;
+}
+
+async fn killed_with_a_tile(schedule: &str) {
     let dir = tempfile::tempdir().unwrap();
     let want = embedded(dir.path());
     let (_master, address) = master();
@@ -152,7 +162,7 @@ async fn a_worker_killed_with_a_tile_in_its_hands_costs_no_pixel() {
     until("three workers", async || (client.workers().await.unwrap().len() == 3).then_some(()))
         .await;
 
-    let (mut rendering, file) = render(dir.path(), &address, "out");
+    let (mut rendering, file) = render(dir.path(), &address, "out", schedule);
     until("a tile lent to the victim", async || lent(&client, "victim").await.filter(|&n| n > 0))
         .await;
     victim.signal("-STOP");
@@ -184,7 +194,7 @@ async fn a_job_waits_for_workers_and_goes_on_with_those_that_come() {
     let want = embedded(dir.path());
     let (_master, address) = master();
     let client = Client::connect(&address).await.unwrap();
-    let (mut rendering, file) = render(dir.path(), &address, "out");
+    let (mut rendering, file) = render(dir.path(), &address, "out", "auto");
     let job = until("a job that waits for workers", async || {
         let jobs = client.jobs(1).await.unwrap();
         jobs.into_iter().find(|j| j.state == slabcast_proto::model::JobState::WaitingForWorkers)

@@ -9,7 +9,7 @@ use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::message::{PathRequest, SceneSpec, ToWorker, TransferChoice};
 use slabcast_common::path::{Orientation, ProjectionKind, Turntable, ViewPath};
 use slabcast_common::presets;
-use slabcast_common::quality::{Quality, Sums, Work};
+use slabcast_common::quality::{Quality, Schedule, Sums, Work};
 use slabcast_common::stats::FrameStats;
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::tween::Tween;
@@ -121,7 +121,8 @@ async fn embedded_workers_give_the_serial_bytes_and_true_statistics() {
     let master = master();
     let handle = master.handle();
     let _stops = [embed(&handle, config("a", 1)), embed(&handle, config("b", 2))];
-    let ask = request("1", ProjectionKind::Persp, Work::default());
+    let slab = Work { schedule: Schedule::Slab, ..Work::default() };
+    let ask = request("1", ProjectionKind::Persp, slab);
     let want = truth(&ask);
     let frames = run(&handle, ask).await;
     assert_eq!(hashes(&frames), want);
@@ -140,7 +141,37 @@ async fn embedded_workers_give_the_serial_bytes_and_true_statistics() {
     assert!(sent(&frames[1]) * 4 < sent(first), "{} then {}", sent(first), sent(&frames[1]));
 
     // Another light or colour needs no new brick; neither does the same path again.
-    let again = run(&handle, request("2", ProjectionKind::Persp, Work::default())).await;
+    let again = run(&handle, request("2", ProjectionKind::Persp, slab)).await;
+    assert_eq!(hashes(&again), want);
+    assert_eq!(again.iter().map(sent).sum::<u64>(), 0, "bricks are kept from job to job");
+
+    // And a path in regions, which draws from fewer, and from none that the slabs did not.
+    let regions = run(&handle, request("3", ProjectionKind::Persp, Work::default())).await;
+    assert_eq!(hashes(&regions), want);
+    assert_eq!(regions.iter().map(sent).sum::<u64>(), 0, "slabs need no less");
+    for (by_region, by_slab) in regions.iter().zip(&frames) {
+        let (r, s) = (by_region.bricks, by_slab.bricks);
+        assert!(0 < r.needed && r.needed <= s.needed && r.relevant == s.relevant, "{r:?} {s:?}");
+        assert_eq!((by_region.schedule, by_region.slabs.len()), (Schedule::Region, 1));
+        assert!(by_region.workers.iter().all(|w| w.stalls == 0));
+    }
+    master.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn regions_ask_for_what_they_lack_over_an_embedded_link() {
+    let master = master();
+    let handle = master.handle();
+    let _stop = embed(&handle, config("a", 2));
+    let ask = request("1", ProjectionKind::Ortho, Work::default());
+    let want = truth(&ask);
+    let frames = run(&handle, ask).await;
+    assert_eq!(hashes(&frames), want);
+    let sent = |f: &FrameStats| f.workers.iter().map(|w| w.bricks_sent).sum::<u64>();
+    let first = &frames[0];
+    assert!(first.workers[0].stalls > 0 && first.workers[0].parked_ms > 0.0);
+    assert!(sent(first) >= first.bricks.needed && first.bricks.needed > 0);
+    let again = run(&handle, request("2", ProjectionKind::Ortho, Work::default())).await;
     assert_eq!(hashes(&again), want);
     assert_eq!(again.iter().map(sent).sum::<u64>(), 0, "bricks are kept from job to job");
     master.shutdown().await;
@@ -156,13 +187,17 @@ fn through_codec(handle: &Handle) -> Link {
     let to_bricks = bricks_tx.clone();
     tokio::spawn(async move {
         while let Some(message) = end.control.recv().await {
-            let Down::Control(wire) = convert::to_worker_to_wire(&message, 7) else {
-                panic!("only bricks go on the other stream")
+            let wires = match convert::to_worker_to_wire(&message, 7) {
+                Down::Control(wire) => vec![wire],
+                Down::Parts(wires) => wires,
+                Down::Bricks(_) => panic!("only bricks go on the other stream"),
             };
-            let wire = v1::ToWorker::decode(&wire.encode_to_vec()[..]).unwrap();
-            let (message, _) = convert::to_worker_from_wire(wire).expect("our own message");
-            if control_tx.send(message).is_err() {
-                return;
+            for wire in wires {
+                let wire = v1::ToWorker::decode(&wire.encode_to_vec()[..]).unwrap();
+                let (message, _) = convert::to_worker_from_wire(wire).expect("our own message");
+                if control_tx.send(message).is_err() {
+                    return;
+                }
             }
         }
     });
@@ -180,7 +215,7 @@ fn through_codec(handle: &Handle) -> Link {
                 Bricks::Message(message @ ToWorker::DropBricks { .. }) => {
                     match convert::to_worker_to_wire(&message, 7) {
                         Down::Bricks(wires) => wires,
-                        Down::Control(_) => panic!("keeps its place among the bricks"),
+                        _ => panic!("keeps its place among the bricks"),
                     }
                 }
                 Bricks::Message(m) => panic!("{m:?} among bricks"),
@@ -218,10 +253,12 @@ async fn the_codec_inside_the_embedded_link_changes_nothing() {
         let mut cache = BrickCache::default();
         slabcast_worker::run(&config("codec", 2), link, &mut cache, stopped).await
     });
-    let work = Work { slabs: 5, tile: Some(32), ..Work::default() };
-    let ask = request("1", ProjectionKind::Ortho, work);
-    let want = truth(&ask);
-    assert_eq!(hashes(&run(&handle, ask).await), want);
+    for schedule in [Schedule::Slab, Schedule::Region] {
+        let work = Work { slabs: 5, tile: Some(32), schedule, ..Work::default() };
+        let ask = request(&format!("{schedule:?}"), ProjectionKind::Ortho, work);
+        let want = truth(&ask);
+        assert_eq!(hashes(&run(&handle, ask).await), want);
+    }
     master.shutdown().await;
 }
 

@@ -130,6 +130,7 @@ fn stats(frame: u64) -> FrameStats {
     FrameStats {
         v: 1,
         frame,
+        schedule: slabcast_common::quality::Schedule::Region,
         view_sha256: String::new(),
         pixels_sha256: String::new(),
         pixels_version: 1,

@@ -4,7 +4,7 @@
 //! embedded link passes them as they are, and neither side can tell. Bricks travel beside
 //! them on a path of their own ([`BrickBatch`]), so that control never queues behind data.
 
-use crate::brick::{Brick, BrickSetKey};
+use crate::brick::{Brick, BrickGrid, BrickInfo, BrickSetKey};
 use crate::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use crate::image::{Background, PixelFormat, TilePixels, TileState};
 use crate::occlusion::Rect;
@@ -52,6 +52,24 @@ pub struct Lease {
     pub state: TileState,
 }
 
+/// One tile through all sheets of its frame, lent to one worker. It starts from nothing, and the
+/// worker asks for the bricks that it turns out to need.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RegionLease {
+    /// Which task.
+    pub task: TaskId,
+    /// Which attempt at it.
+    pub epoch: Epoch,
+    /// Of which frame; the worker was sent its view and the directory of its bricks before.
+    pub frame: FrameId,
+    /// The tile, inside the picture.
+    pub tile: Rect,
+}
+
+/// Sets whose directories a worker keeps: as many as a master keeps brick sets, and one for a job that
+/// is just ending. Master and worker count alike, by what was sent, so that neither has to say.
+pub const DIRECTORIES: usize = 4;
+
 /// From master to worker.
 #[derive(Clone, Debug, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "a view is 400 bytes once a frame and worker")]
@@ -79,8 +97,25 @@ pub enum ToWorker {
         /// Its view.
         view: View,
     },
+    /// Bricks that there are of a set, some of them or all: from the `first`, ascending by id. The
+    /// parts of a directory come in order, and before the first region of the set. Those of the
+    /// [`DIRECTORIES`] sets that came last are kept.
+    Directory {
+        /// Of which set.
+        set: BrickSetKey,
+        /// How its volume is cut into bricks.
+        grid: BrickGrid,
+        /// How many came before.
+        first: u32,
+        /// How many there are in all.
+        total: u32,
+        /// These.
+        bricks: Arc<[BrickInfo]>,
+    },
     /// Work.
     Lease(Box<Lease>),
+    /// Work through all depths.
+    Region(RegionLease),
     /// A frame is over (finished or cancelled): leases of it that have not begun are dropped.
     EndFrame {
         /// The frame.
@@ -167,6 +202,20 @@ pub struct TaskTimes {
     pub thread: u32,
 }
 
+/// What a region took beside its drawing.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct RegionCost {
+    /// The bricks that it drew from: places in the directory, ascending.
+    pub touched: Vec<u32>,
+    /// How often it stood still for want of bricks.
+    pub stalls: u32,
+    /// For how long (microseconds). Others may have been drawn meanwhile.
+    pub parked_us: u64,
+    /// For how long render threads had nothing to do since the last result of the link, while some
+    /// region stood still.
+    pub idle_us: u64,
+}
+
 /// A rendered task.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TileResult {
@@ -178,8 +227,10 @@ pub struct TileResult {
     pub pixels: TilePixels,
     /// Its voxels.
     pub counters: Counters,
-    /// Its times.
+    /// Its times. Of a region, from `start_us` to `end_us` is drawing alone.
     pub times: TaskTimes,
+    /// Of a region.
+    pub region: Option<RegionCost>,
 }
 
 /// From worker to master.
@@ -208,6 +259,21 @@ pub enum ToMaster {
     },
     /// A brick failed its checksum; send it again.
     BricksBroken {
+        /// Of which set.
+        set: BrickSetKey,
+        /// Which.
+        bricks: Vec<BrickId>,
+    },
+    /// Regions lack bricks; send them, in this order. None is asked for twice on a link unless it was
+    /// forgotten or broken meanwhile.
+    BricksWanted {
+        /// Of which set.
+        set: BrickSetKey,
+        /// Which.
+        bricks: Vec<BrickId>,
+    },
+    /// Bricks were forgotten to make room for others.
+    BricksForgotten {
         /// Of which set.
         set: BrickSetKey,
         /// Which.

@@ -182,7 +182,7 @@ impl Quality {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Schedule {
-    /// The master decides.
+    /// The master decides: `region`.
     Auto,
     /// One task is one region through all depths.
     Region,
@@ -232,7 +232,7 @@ impl Default for Work {
 }
 
 impl Work {
-    /// Checks ranges and names what this version does not do yet.
+    /// Checks ranges.
     pub fn check(&self) -> Result<(), Refused> {
         if !(1..=1000).contains(&self.slabs) {
             return Err(Refused::new("slabs", format!("{} slabs; give 1 to 1000", self.slabs)));
@@ -244,12 +244,6 @@ impl Work {
             return Err(Refused::new(
                 "tile",
                 format!("{tile} is not a quadtree level; give 16, 32, 64, 128, 256 or auto"),
-            ));
-        }
-        if self.schedule == Schedule::Region {
-            return Err(Refused::new(
-                "schedule",
-                "this version has the `slab` schedule only; use `slab` or `auto`",
             ));
         }
         Ok(())

@@ -1,7 +1,7 @@
 //! Statistics of a frame: one line of JSON (CONTRACTS.md, Statistics). Figures that nobody
 //! measured are `null`, never zero.
 
-use crate::quality::Quality;
+use crate::quality::{Quality, Schedule};
 use serde::{Deserialize, Serialize};
 
 /// Milliseconds of a frame by what they went into, as the master saw it.
@@ -22,6 +22,9 @@ pub struct FrameMs {
     /// Time during which bricks were on their way while some worker rendered.
     #[serde(default)]
     pub overlap: f64,
+    /// Sum of the workers' `stall_ms`.
+    #[serde(default)]
+    pub stall: f64,
 }
 
 /// One worker's part in a frame.
@@ -35,8 +38,17 @@ pub struct WorkerStats {
     pub distribute_ms: f64,
     /// Leases and results on their way, and waiting in queues.
     pub p2p_ms: f64,
-    /// Its render threads' time without a task while the frame lasted.
+    /// Its render threads' time without a task while the frame lasted, of this frame or another.
     pub wait_ms: f64,
+    /// How often a region stood still for want of bricks.
+    #[serde(default)]
+    pub stalls: u64,
+    /// Regions' time standing still, summed; render threads drew others meanwhile if there were any.
+    #[serde(default)]
+    pub parked_ms: f64,
+    /// Its render threads' time with nothing to draw while some region stood still.
+    #[serde(default)]
+    pub stall_ms: f64,
     /// Bricks it holds of this scene's set at the frame's end.
     pub bricks_held: u64,
     /// Their encoded bytes.
@@ -68,7 +80,8 @@ pub struct VoxelStats {
 pub struct BrickStats {
     /// Bricks with a relevant voxel.
     pub relevant: u64,
-    /// Bricks that the view touches and the front slabs do not hide.
+    /// Bricks that the view touches and the front slabs do not hide; under the `region` schedule,
+    /// those that were drawn from.
     pub needed: u64,
     /// Relevant voxels in needed bricks.
     #[serde(default)]
@@ -84,7 +97,8 @@ pub struct TileStats {
     pub y: u32,
     /// Edge in pixels.
     pub size: u32,
-    /// Estimated workload: open pixels under brick boxes (paper section 4.3).
+    /// Estimated workload: open pixels under brick boxes (paper section 4.3). Under the `region`
+    /// schedule, once the tile was drawn in a frame before, what it took then in these units.
     pub est: u64,
     /// Render time.
     pub ms: f64,
@@ -158,6 +172,9 @@ pub struct FrameStats {
     pub v: u32,
     /// Frame number in its path.
     pub frame: u64,
+    /// Which schedule it was rendered under.
+    #[serde(default = "slab")]
+    pub schedule: Schedule,
     /// Hash of the view and everything else that decides the pixels.
     pub view_sha256: String,
     /// Hash of the pixels.
@@ -172,7 +189,8 @@ pub struct FrameStats {
     pub voxels: VoxelStats,
     /// Bricks.
     pub bricks: BrickStats,
-    /// Slabs, front to back.
+    /// Slabs, front to back. A frame of the `region` schedule has one, through all depths; its tiles
+    /// are the regions.
     pub slabs: Vec<SlabStats>,
     /// Quality, with the sums that were used.
     pub quality: Quality,
@@ -210,4 +228,9 @@ pub struct PoisonedTile {
     pub size: u32,
     /// The workers that were lost with it.
     pub workers: Vec<String>,
+}
+
+/// What every frame was rendered under before its statistics said so.
+fn slab() -> Schedule {
+    Schedule::Slab
 }

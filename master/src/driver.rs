@@ -33,9 +33,9 @@ use std::time::{Duration, Instant, SystemTime};
 use tokio::sync::{mpsc, oneshot};
 use tracing::{debug, info, warn};
 
-/// Frames that the scheduler has or the finisher works at: one to render, one behind it so that
+/// Frames that the scheduler has or the finisher works at: two in the making, one behind them so that
 /// workers never run dry between frames, one being finished.
-const FRAMES_IN_FLIGHT: usize = 3;
+const FRAMES_IN_FLIGHT: usize = 4;
 
 /// Brick sets that are kept beside each other (a change of transfer function and back costs
 /// nothing then); more would only fill the master's memory.
@@ -610,6 +610,12 @@ impl Driver {
             ToMaster::BricksBroken { set, bricks } => {
                 warn!(%worker, bricks = bricks.len(), "bricks broken on the way, sent again");
                 Happened::BricksBroken { worker, set, bricks }
+            }
+            ToMaster::BricksWanted { set, bricks } => {
+                Happened::BricksWanted { worker, set, bricks }
+            }
+            ToMaster::BricksForgotten { set, bricks } => {
+                Happened::BricksForgotten { worker, set, bricks }
             }
             ToMaster::Pong { nonce, clock_us } => Happened::Pong { worker, nonce, clock_us },
             ToMaster::Leaving { reason } => {

@@ -285,6 +285,7 @@ mod tests {
         let stats = FrameStats {
             v: 1,
             frame: number,
+            schedule: slabcast_common::quality::Schedule::Slab,
             view_sha256: String::new(),
             pixels_sha256: String::new(),
             pixels_version: 1,

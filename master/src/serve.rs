@@ -304,7 +304,7 @@ fn brick_messages(order: BrickOrder) -> Vec<v1::BricksDown> {
         BrickOrder::Drop { set, bricks } => {
             match convert::to_worker_to_wire(&ToWorker::DropBricks { set, bricks }, 0) {
                 Down::Bricks(messages) => messages,
-                Down::Control(_) => Vec::new(),
+                Down::Control(_) | Down::Parts(_) => Vec::new(),
             }
         }
     }
@@ -341,8 +341,11 @@ async fn control(
     tokio::spawn(async move { serve_link(handle, hello, from, link, &mut reply_rx).await });
     let down = async {
         while let Some(message) = control_rx.recv().await {
-            if let Down::Control(message) = convert::to_worker_to_wire(&message, session) {
-                let _ = out.send(Ok(message));
+            match convert::to_worker_to_wire(&message, session) {
+                Down::Control(message) => drop(out.send(Ok(message))),
+                Down::Parts(messages) => messages.into_iter().for_each(|m| drop(out.send(Ok(m)))),
+                // The driver sends these with the bricks.
+                Down::Bricks(_) => {}
             }
         }
     };

@@ -52,6 +52,14 @@ fn work_with(message: ToWorker) {
                 let _ = view.scale_at(0);
             }
         }
+        ToWorker::Directory { grid, first, total, bricks, .. } => {
+            assert!(first as usize + bricks.len() <= total as usize);
+            for b in bricks.iter() {
+                let corner = grid.corner(b.id);
+                let inside = |p: [u32; 3]| (0..3).all(|a| p[a] / 8 == corner[a] / 8);
+                assert!(inside(b.tight.lo) && inside(b.tight.hi) && b.voxels <= 512, "{b:?}");
+            }
+        }
         _ => {}
     }
 }
@@ -90,6 +98,7 @@ proptest! {
         all_doors(&spoil(convert::from_worker_to_wire(&from_worker).encode_to_vec(), &how));
         let bytes = match convert::to_worker_to_wire(&to_worker, 5) {
             Down::Control(m) => m.encode_to_vec(),
+            Down::Parts(m) => m[0].encode_to_vec(),
             Down::Bricks(m) => m[0].encode_to_vec(),
         };
         all_doors(&spoil(bytes, &how));
@@ -127,6 +136,49 @@ fn leases_are_refused_by_field_before_memory_is_set_aside() {
         |bytes: usize| Some(v1::Plane { values: vec![1; bytes].into(), ..v1::Plane::default() });
     assert_eq!(refused_lease(v1::Lease { a: plane(1000), ..lease() }), "lease.a.values");
     assert_eq!(refused_lease(v1::Lease { last: plane(4), ..lease() }), "lease.last.values");
+}
+
+#[test]
+fn directories_are_refused_by_field() {
+    let good = v1::Directory {
+        set: vec![0; 32].into(),
+        grid: vec![2, 3, 4],
+        first: 1,
+        total: 3,
+        bricks: Some(v1::BrickIds { differences: vec![3, 20] }),
+        boxes: vec![0; 8].into(),
+        sizes: vec![15, 3595],
+    };
+    let open = |directory: v1::Directory| {
+        let message = Some(v1::to_worker::Message::Directory(directory));
+        convert::to_worker_from_wire(v1::ToWorker { message })
+    };
+    assert!(open(good.clone()).is_ok());
+    let field = |directory| open(directory).unwrap_err().field().to_owned();
+    let ids = |differences| Some(v1::BrickIds { differences });
+    let word = |word: u32| [word.to_le_bytes(), [0; 4]].concat();
+    assert_eq!(field(v1::Directory { grid: vec![2, 3], ..good.clone() }), "directory.grid");
+    assert_eq!(field(v1::Directory { grid: vec![1 << 30; 3], ..good.clone() }), "directory.grid");
+    assert_eq!(field(v1::Directory { grid: vec![2, 3, 0], ..good.clone() }), "directory.grid");
+    assert_eq!(field(v1::Directory { total: u32::MAX, ..good.clone() }), "directory.total");
+    assert_eq!(field(v1::Directory { first: 2, ..good.clone() }), "directory.first");
+    assert_eq!(field(v1::Directory { first: u32::MAX, ..good.clone() }), "directory.first");
+    assert_eq!(
+        field(v1::Directory { bricks: ids(vec![3, 0]), ..good.clone() }),
+        "directory.bricks"
+    );
+    assert_eq!(
+        field(v1::Directory { bricks: ids(vec![3, 21]), ..good.clone() }),
+        "directory.bricks"
+    );
+    assert_eq!(field(v1::Directory { bricks: ids(vec![3]), ..good.clone() }), "directory.boxes");
+    // The smallest index behind the largest; 1024 voxels.
+    let boxed = |word: Vec<u8>| v1::Directory { boxes: word.into(), ..good.clone() };
+    assert_eq!(field(boxed(word(1))), "directory.boxes");
+    assert_eq!(field(boxed(word(1023 << 18))), "directory.boxes");
+    assert_eq!(field(v1::Directory { sizes: vec![15, 0], ..good.clone() }), "directory.sizes");
+    assert_eq!(field(v1::Directory { sizes: vec![15, 3596], ..good.clone() }), "directory.sizes");
+    assert_eq!(field(v1::Directory { sizes: vec![15], ..good }), "directory.sizes");
 }
 
 #[test]

@@ -60,6 +60,13 @@ proptest! {
                 prop_assert_eq!(got, is_welcome.then_some(session));
                 back
             }
+            Down::Parts(m) => {
+                prop_assert_eq!(m.len(), 1);
+                let (back, got) = convert::to_worker_from_wire(wire(m[0].clone()))
+                    .map_err(|e| TestCaseError::fail(e.to_string()))?;
+                prop_assert_eq!(got, None);
+                back
+            }
             Down::Bricks(m) => {
                 prop_assert_eq!(m.len(), 1);
                 let m = wire(m[0].clone());
@@ -185,10 +192,35 @@ fn the_largest_lease_and_result_fit_a_control_message() {
         pixels: TilePixels { a, colour, last: Some(last) },
         counters: Default::default(),
         times: Default::default(),
+        region: None,
     };
     let m = convert::from_worker_to_wire(&ToMaster::Result(Box::new(result)));
     assert!(m.encoded_len() < 2_100_000, "{}", m.encoded_len());
     assert!(convert::from_worker_from_wire(wire(m)).is_ok());
+}
+
+#[test]
+fn a_large_directory_goes_in_parts_that_follow_each_other() {
+    use slabcast_common::brick::{BrickGrid, BrickInfo, BrickSetKey, TightBox};
+    let grid = BrickGrid { dims: [40, 40, 40] };
+    let info = |id: u32| {
+        let lo = grid.corner(BrickId(id));
+        BrickInfo { id: BrickId(id), tight: TightBox { lo, hi: lo }, voxels: 1, bytes: 15 }
+    };
+    let all: Vec<BrickInfo> = (0..20_000).map(|i| info(3 * i)).collect();
+    let set = BrickSetKey::default();
+    let message =
+        ToWorker::Directory { set, grid, first: 0, total: 20_000, bricks: all.clone().into() };
+    let Down::Parts(parts) = convert::to_worker_to_wire(&message, 0) else { panic!() };
+    let mut back = Vec::new();
+    for part in parts {
+        assert!(part.encoded_len() < 120_000, "{}", part.encoded_len());
+        let (part, _) = convert::to_worker_from_wire(wire(part)).expect("it is good");
+        let ToWorker::Directory { first, total, bricks, .. } = part else { panic!() };
+        assert_eq!((first as usize, total), (back.len(), 20_000));
+        back.extend_from_slice(&bricks);
+    }
+    assert_eq!(back, all);
 }
 
 #[test]

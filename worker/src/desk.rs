@@ -2,16 +2,19 @@
 //!
 //! One task on the runtime; it decides and never computes. A lease waits here until its last
 //! brick is there and then goes to the render threads; so the first tiles render while bricks
-//! of the others are still on their way.
+//! of the others are still on their way. A region goes to them at once, and comes back when it lacks
+//! bricks: [`crate::parking`] says what is asked for.
 
 use crate::cache::BrickCache;
-use crate::pool::{FrameSlot, Pool, Ready, Rendered, SceneSlot};
+use crate::parking::{Parking, Say, Who};
+use crate::pool::{Came, FrameSlot, Going, Gone, Outcome, Pool, Ready, Rendered, SceneSlot, Task};
 use crate::rehearse::Rehearsal;
-use slabcast_common::brick::BrickSetKey;
+use slabcast_common::brick::{BrickGrid, BrickSetKey};
 use slabcast_common::ids::{BrickId, FrameId, SceneId, TaskId};
 use slabcast_common::message::{
-    BrickBatch, Hello, Lease, TaskTimes, TileResult, ToMaster, ToWorker,
+    BrickBatch, Hello, Lease, RegionCost, RegionLease, TaskTimes, TileResult, ToMaster, ToWorker,
 };
+use slabcast_common::occlusion::Rect;
 use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION};
 use slabcast_proto::convert::{self, Bricks};
 use slabcast_render::splat::Simd;
@@ -101,9 +104,12 @@ pub async fn run(
     if link.replies.send(ToMaster::Hello(hello)).await.is_err() {
         return Ok(Ended::Lost("the master closed the link before the hello".into()));
     }
+    cache.forget_directories();
     let mut desk = Desk {
         pool,
         cache,
+        parking: Parking::new(config.memory_budget_bytes),
+        parked: BTreeMap::new(),
         scenes: BTreeMap::new(),
         frames: BTreeMap::new(),
         waiting: BTreeMap::new(),
@@ -118,7 +124,7 @@ pub async fn run(
     let mut drain_until: Option<tokio::time::Instant> = None;
     let mut bricks_open = true;
     loop {
-        if desk.leaving && desk.in_pool == 0 {
+        if desk.leaving && desk.in_pool == 0 && desk.parked.is_empty() {
             return Ok(Ended::Stopped);
         }
         let drained = async {
@@ -145,7 +151,13 @@ pub async fn run(
                 Some(Bricks::Message(message)) => desk.told(message),
                 None => bricks_open = false,
             },
-            Some(done) = results.recv() => desk.rendered(done),
+            Some(outcome) = results.recv() => {
+                desk.came_back(outcome);
+                // What regions lack together is asked for together.
+                while let Ok(outcome) = results.try_recv() {
+                    desk.came_back(outcome);
+                }
+            }
             changed = stop.changed(), if !desk.leaving => {
                 if changed.is_err() || *stop.borrow() {
                     info!("stopping: finishing what has begun");
@@ -158,6 +170,7 @@ pub async fn run(
                 return Ok(Ended::Stopped);
             }
         }
+        desk.ask();
         for reply in desk.replies.drain(..) {
             if link.replies.send(reply).await.is_err() {
                 return Ok(Ended::Lost("the master closed the link".into()));
@@ -177,6 +190,9 @@ struct Waiting {
 struct Desk<'a> {
     pool: Pool,
     cache: &'a mut BrickCache,
+    parking: Parking,
+    /// Regions that stand still.
+    parked: BTreeMap<Who, Box<Going>>,
     scenes: BTreeMap<SceneId, Arc<SceneSlot>>,
     frames: BTreeMap<FrameId, Arc<FrameSlot>>,
     waiting: BTreeMap<TaskId, Waiting>,
@@ -225,12 +241,23 @@ impl Desk<'_> {
                     }
                 }
             }
+            ToWorker::Directory { set, grid, first, total, bricks } => {
+                debug!(bricks = bricks.len(), first, total, "directory");
+                if let Err(problem) = self.cache.directory(set, grid, (first, total), bricks) {
+                    warn!(first, total, problem, "the master sent a directory that is wrong");
+                }
+            }
             ToWorker::Lease(lease) => self.lease(lease),
+            ToWorker::Region(lease) => self.region(lease),
             ToWorker::EndFrame { frame } => {
                 if let Some(slot) = self.frames.remove(&frame) {
                     slot.over.store(true, Ordering::Relaxed);
                 }
                 self.waiting.retain(|_, w| w.lease.frame != frame);
+                for who in self.parking.end_frame(frame) {
+                    self.parked.remove(&who);
+                }
+                self.pool.parked(!self.parked.is_empty());
             }
             ToWorker::EndScene { scene } => {
                 self.scenes.remove(&scene);
@@ -240,18 +267,7 @@ impl Desk<'_> {
                 self.cache.remove(set, &bricks);
                 // A lease may have come before this message although it was written after it:
                 // control and bricks have no order. Its bricks come again.
-                for (task, w) in &mut self.waiting {
-                    let needs = |id: &&BrickId| w.lease.bricks.binary_search(id).is_ok();
-                    if w.frame.scene.spec.bricks == set {
-                        for id in bricks.iter().filter(needs) {
-                            let waiters = self.missing.entry((set, *id)).or_default();
-                            if !waiters.contains(task) {
-                                waiters.push(*task);
-                                w.missing += 1;
-                            }
-                        }
-                    }
-                }
+                self.wait_again(set, &bricks);
             }
             ToWorker::Ping { nonce } => {
                 let clock_us = self.us(Instant::now());
@@ -298,6 +314,128 @@ impl Desk<'_> {
         }
     }
 
+    fn region(&mut self, lease: RegionLease) {
+        let received = Instant::now();
+        let refuse = |reason: &str| ToMaster::Failed {
+            task: lease.task,
+            epoch: lease.epoch,
+            reason: reason.into(),
+        };
+        if self.leaving {
+            self.replies.push(refuse("the worker is leaving"));
+            return;
+        }
+        let Some(frame) = self.frames.get(&lease.frame).cloned() else {
+            self.replies.push(refuse("its frame was never announced"));
+            return;
+        };
+        let (tile, spec) = (lease.tile, &frame.scene.spec);
+        let picture = Rect::of_size(frame.view.size);
+        if tile.is_empty() || tile.intersect(&picture) != tile {
+            self.replies.push(refuse("its tile is not inside the picture"));
+            return;
+        }
+        let grid = BrickGrid::of(spec.volume.lattice.dims);
+        let Some(shelf) = self.cache.shelf(spec.bricks).filter(|s| s.grid() == grid).cloned()
+        else {
+            self.replies.push(refuse("the directory of its bricks never came"));
+            return;
+        };
+        self.parking.enter((lease.frame, lease.task), spec.bricks, shelf.clone());
+        self.go_on(Box::new(Going::new(lease, frame, shelf, received)));
+    }
+
+    fn go_on(&mut self, mut going: Box<Going>) {
+        if let Some(at) = going.parked_at.take() {
+            going.parked += at.elapsed();
+        }
+        self.in_pool += 1;
+        self.pool.submit(Task::Region(going));
+    }
+
+    fn came_back(&mut self, outcome: Outcome) {
+        match outcome {
+            Outcome::Slab(done) => self.rendered(done),
+            Outcome::Region(gone) => self.went(gone),
+        }
+    }
+
+    /// Leases that wait have these bricks no longer.
+    fn wait_again(&mut self, set: BrickSetKey, bricks: &[BrickId]) {
+        for (task, w) in &mut self.waiting {
+            let needs = |id: &&BrickId| w.lease.bricks.binary_search(id).is_ok();
+            if w.frame.scene.spec.bricks == set {
+                for id in bricks.iter().filter(needs) {
+                    let waiters = self.missing.entry((set, *id)).or_default();
+                    if !waiters.contains(task) {
+                        waiters.push(*task);
+                        w.missing += 1;
+                    }
+                }
+            }
+        }
+    }
+
+    /// A region came to its end, or stands still.
+    fn went(&mut self, gone: Gone) {
+        self.in_pool -= 1;
+        let Gone { mut going, end, thread, came } = gone;
+        let RegionLease { task, epoch, frame, .. } = going.lease;
+        let who = (frame, task);
+        match came {
+            Came::Lacks(lacks, farther) if self.frames.contains_key(&frame) => {
+                going.stalls += 1;
+                if self.parking.park(who, &lacks, farther) {
+                    self.go_on(going);
+                } else {
+                    going.parked_at = Some(Instant::now());
+                    self.parked.insert(who, going);
+                    self.pool.parked(true);
+                }
+            }
+            Came::Over | Came::Lacks(..) => self.parking.leave(who, &[]),
+            Came::Done(done) => {
+                self.parking.leave(who, &done.touched);
+                let times = TaskTimes {
+                    received_us: self.us(going.received),
+                    ready_us: self.us(going.received + going.parked),
+                    start_us: self.us(end - going.drawn),
+                    end_us: self.us(end),
+                    thread,
+                };
+                let region = Some(RegionCost {
+                    touched: done.touched,
+                    stalls: going.stalls,
+                    parked_us: going.parked.as_micros() as u64,
+                    idle_us: self.pool.waited().as_micros() as u64,
+                });
+                let (pixels, counters) = (done.pixels, done.counters);
+                let result = TileResult { task, epoch, pixels, counters, times, region };
+                self.replies.push(ToMaster::Result(Box::new(result)));
+            }
+            Came::Failed(reason) => {
+                self.parking.leave(who, &[]);
+                warn!(%task, reason, "region failed");
+                self.replies.push(ToMaster::Failed { task, epoch, reason });
+            }
+        }
+    }
+
+    /// Asks for what regions lack, after making room.
+    fn ask(&mut self) {
+        for say in self.parking.ask(self.cache) {
+            let reply = match say {
+                Say::Forgotten(set, bricks) => {
+                    debug!(bricks = bricks.len(), "bricks forgotten");
+                    self.wait_again(set, &bricks);
+                    ToMaster::BricksForgotten { set, bricks }
+                }
+                Say::Wanted(set, bricks) => ToMaster::BricksWanted { set, bricks },
+            };
+            self.replies.push(reply);
+        }
+    }
+
     fn start(&mut self, w: Waiting) {
         let set = w.frame.scene.spec.bricks;
         let bricks = w.lease.bricks.iter().filter_map(|id| self.cache.get(set, *id).cloned());
@@ -311,22 +449,25 @@ impl Desk<'_> {
             return;
         }
         self.in_pool += 1;
-        self.pool.submit(Ready {
+        self.pool.submit(Task::Slab(Ready {
             lease: w.lease,
             frame: w.frame,
             bricks,
             received: w.received,
             ready: Instant::now(),
-        });
+        }));
     }
 
     fn bricks_in(&mut self, batch: BrickBatch) {
         let set = batch.set;
-        let mut whole = 0;
+        let (mut whole, mut on) = (0, Vec::new());
         for brick in batch.bricks {
             let id = brick.id;
             self.cache.put(set, brick);
             whole += 1;
+            if let Some(shelf) = self.cache.shelf(set) {
+                self.parking.came(set, shelf, id, &mut on);
+            }
             for task in self.missing.remove(&(set, id)).unwrap_or_default() {
                 let Some(w) = self.waiting.get_mut(&task) else { continue };
                 w.missing -= 1;
@@ -337,6 +478,12 @@ impl Desk<'_> {
                 }
             }
         }
+        for who in on {
+            if let Some(going) = self.parked.remove(&who) {
+                self.go_on(going);
+            }
+        }
+        self.pool.parked(!self.parked.is_empty());
         if whole > 0 {
             self.replies.push(ToMaster::BricksIn { set, bricks: whole });
         }
@@ -363,6 +510,7 @@ impl Desk<'_> {
                     end_us: self.us(done.end),
                     thread: done.thread,
                 },
+                region: None,
             })),
             Err(reason) => {
                 warn!(%task, reason, "task failed");
@@ -371,7 +519,7 @@ impl Desk<'_> {
         });
     }
 
-    /// Takes no more work. Tasks whose bricks are here are finished.
+    /// Takes no more work. Tasks whose bricks are here are finished, and regions that have begun.
     fn leave(&mut self) {
         self.leaving = true;
         self.waiting.clear();
@@ -386,7 +534,7 @@ impl Desk<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use slabcast_common::brick::{Brick, BrickGrid};
+    use slabcast_common::brick::{Brick, BrickInfo};
     use slabcast_common::ids::{Epoch, WorkerId};
     use slabcast_common::image::TileState;
     use slabcast_common::message::SceneSpec;
@@ -483,6 +631,30 @@ mod tests {
             })));
         }
 
+        /// The directory of both bricks.
+        fn directory(&self) {
+            let grid = BrickGrid { dims: [2, 1, 1] };
+            let info = |id| {
+                let b = brick(id);
+                let bytes = b.encoded_len() as u32;
+                BrickInfo { id: b.id, tight: b.tight(&grid), voxels: 512, bytes }
+            };
+            let bricks = [info(0), info(1)].into();
+            self.say(ToWorker::Directory { set: SET, grid, first: 0, total: 2, bricks });
+        }
+
+        fn region(&self, task: u64, tile: Rect) {
+            let (task, epoch) = (TaskId(task), Epoch(0));
+            self.say(ToWorker::Region(RegionLease { task, epoch, frame: FRAME, tile }));
+        }
+
+        async fn result(&mut self) -> Box<TileResult> {
+            match self.hear().await {
+                ToMaster::Result(result) => result,
+                other => panic!("a result, not {other:?}"),
+            }
+        }
+
         /// All that was said before this has been handled when the pong comes.
         async fn settle(&mut self) {
             self.say(ToWorker::Ping { nonce: 77 });
@@ -519,6 +691,122 @@ mod tests {
         world.settle().await;
         world.send(0).await;
         assert!(matches!(world.hear().await, ToMaster::Result(_)));
+    }
+
+    /// Wishes of regions until so many bricks were asked for.
+    async fn wishes(world: &mut World, bricks: usize) -> Vec<u32> {
+        let mut asked = Vec::new();
+        while asked.len() < bricks {
+            let ToMaster::BricksWanted { set, bricks } = world.hear().await else {
+                panic!("a wish")
+            };
+            assert_eq!(set, SET);
+            asked.extend(bricks.iter().map(|b| b.0));
+        }
+        asked
+    }
+
+    #[tokio::test]
+    async fn regions_ask_for_each_brick_once_and_go_on_when_it_is_there() {
+        let mut world = World::new().await;
+        world.directory();
+        // Both halves of the picture lie under both bricks.
+        world.region(1, Rect::new(0, 0, 32, 16));
+        world.region(2, Rect::new(0, 16, 32, 32));
+        let mut asked = wishes(&mut world, 2).await;
+        asked.sort_unstable();
+        assert_eq!(asked, [0, 1]);
+        world.settle().await;
+        world.send(1).await;
+        world.settle().await;
+        world.send(0).await;
+        let results = [world.result().await, world.result().await];
+        for (result, task) in results.iter().zip([1, 2]) {
+            assert_eq!((result.task, result.pixels.a.len()), (TaskId(task), 512));
+            assert!(result.pixels.a.iter().any(|&a| a > 0.9) && result.pixels.last.is_none());
+            let cost = result.region.as_ref().expect("of a region");
+            assert_eq!(cost.touched, [0, 1]);
+            // The second may have been begun when all was here.
+            assert_eq!(cost.stalls > 0, cost.parked_us > 0);
+            assert!(cost.stalls == 1 || task == 2 && cost.stalls == 0);
+        }
+        // What is here is not asked for, and nothing stands still.
+        world.region(3, Rect::new(0, 0, 32, 32));
+        let result = world.result().await;
+        assert_eq!(result.region.as_ref().map(|c| (c.stalls, c.parked_us)), Some((0, 0)));
+        let halves = results.iter().flat_map(|r| r.pixels.a.clone());
+        assert!(halves.eq(result.pixels.a.iter().copied()), "stopping changes no byte");
+    }
+
+    #[tokio::test]
+    async fn a_region_that_stands_still_ends_with_its_frame() {
+        let mut world = World::new().await;
+        world.directory();
+        world.region(1, Rect::new(0, 0, 32, 32));
+        wishes(&mut world, 2).await;
+        world.say(ToWorker::EndFrame { frame: FRAME });
+        world.send(0).await;
+        world.send(1).await;
+        world.settle().await;
+        world.stop.send(true).unwrap();
+        assert!(matches!(world.hear().await, ToMaster::Leaving { .. }));
+        assert_eq!(world.ended.await.unwrap().unwrap(), Ended::Stopped, "nothing is waited for");
+    }
+
+    #[tokio::test]
+    async fn a_worker_that_is_told_to_stop_finishes_regions_that_stand_still() {
+        let mut world = World::new().await;
+        world.directory();
+        world.region(1, Rect::new(0, 0, 32, 32));
+        wishes(&mut world, 2).await;
+        world.stop.send(true).unwrap();
+        assert!(matches!(world.hear().await, ToMaster::Leaving { .. }));
+        world.region(2, Rect::new(0, 0, 32, 32));
+        assert!(matches!(world.hear().await, ToMaster::Failed { task: TaskId(2), .. }));
+        world.send(0).await;
+        world.send(1).await;
+        assert_eq!(world.result().await.task, TaskId(1));
+        assert_eq!(world.ended.await.unwrap().unwrap(), Ended::Stopped);
+    }
+
+    #[tokio::test]
+    async fn a_brick_that_a_region_stands_on_may_be_dropped_and_is_asked_for_again() {
+        let mut world = World::new().await;
+        world.directory();
+        world.region(1, Rect::new(0, 0, 32, 32));
+        wishes(&mut world, 2).await;
+        world.send(0).await;
+        let drop = ToWorker::DropBricks { set: SET, bricks: vec![BrickId(0)] };
+        world.bricks.send(Bricks::Message(drop)).await.unwrap();
+        world.send(1).await;
+        assert_eq!(wishes(&mut world, 1).await, [0]);
+        world.send(0).await;
+        let result = world.result().await;
+        assert_eq!(result.region.map(|c| (c.touched, c.stalls)), Some((vec![0, 1], 2)));
+    }
+
+    #[tokio::test]
+    async fn regions_that_make_no_sense_are_answered_not_obeyed() {
+        let mut world = World::new().await;
+        let refused = |message| match message {
+            ToMaster::Failed { reason, .. } => reason,
+            other => panic!("not refused: {other:?}"),
+        };
+        world.region(1, Rect::new(0, 0, 32, 32));
+        assert!(refused(world.hear().await).contains("directory"));
+        let set = SET;
+        let (grid, bricks) = (BrickGrid { dims: [1, 2, 1] }, Vec::new().into());
+        world.say(ToWorker::Directory { set, grid, first: 0, total: 0, bricks });
+        world.region(1, Rect::new(0, 0, 32, 32));
+        assert!(refused(world.hear().await).contains("directory"), "of another volume");
+        world.directory();
+        world.region(2, Rect::new(0, 0, 33, 32));
+        assert!(refused(world.hear().await).contains("inside the picture"));
+        world.region(3, Rect::new(4, 4, 4, 9));
+        assert!(refused(world.hear().await).contains("inside the picture"));
+        world.say(ToWorker::EndFrame { frame: FRAME });
+        world.region(4, Rect::new(0, 0, 32, 32));
+        assert!(refused(world.hear().await).contains("never announced"));
     }
 
     #[tokio::test]

@@ -1,20 +1,31 @@
 //! Render threads. They take ready tasks from one queue and hand results back; they know
 //! nothing of links.
+//!
+//! The queue is in order of frames, since a frame that is late holds up those behind it; in a frame a
+//! region that goes on comes before one that begins.
 
 use crate::rehearse::Rehearsal;
-use crossbeam_channel::{Receiver, Sender, unbounded};
-use slabcast_common::brick::Brick;
+use crate::shelf::Shelf;
+use slabcast_common::brick::{Brick, BrickInfo};
+use slabcast_common::ids::FrameId;
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::{Counters, Lease, SceneSpec};
+use slabcast_common::message::{Counters, Lease, RegionLease, SceneSpec};
 use slabcast_common::view::View;
+use slabcast_render::region::{Finished, Outlook, Region, Sight};
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch};
 use slabcast_render::{Frame, Scene};
+use std::collections::BTreeMap;
 use std::panic::AssertUnwindSafe;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, OnceLock};
-use std::time::Instant;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
+
+/// Sheets beyond the one at which a region lacks a brick that it looks for more: a brick's thickness.
+/// Half as many ask twice as often; with twice as many a head's region is sent bricks that what lies
+/// in front of them then hides (docs/scaling.md).
+const AHEAD: u32 = 8;
 
 /// A scene that tiles share; its tables are made by the first thread that needs them.
 pub(crate) struct SceneSlot {
@@ -33,6 +44,7 @@ pub(crate) struct FrameSlot {
     pub(crate) scene: Arc<SceneSlot>,
     pub(crate) view: View,
     frame: OnceLock<Frame>,
+    looking: Looking,
     /// Of a rehearsal: its place in the trace, and when its tables are made.
     pub(crate) rehearsed: OnceLock<Option<usize>>,
     pub(crate) made: OnceLock<Instant>,
@@ -42,14 +54,8 @@ pub(crate) struct FrameSlot {
 
 impl FrameSlot {
     pub(crate) fn new(scene: Arc<SceneSlot>, view: View) -> Self {
-        FrameSlot {
-            scene,
-            view,
-            frame: OnceLock::new(),
-            rehearsed: OnceLock::new(),
-            made: OnceLock::new(),
-            over: AtomicBool::new(false),
-        }
+        let (frame, looking, rehearsed, made, over) = Default::default();
+        FrameSlot { scene, view, frame, looking, rehearsed, made, over }
     }
 
     fn get(&self) -> &Frame {
@@ -58,6 +64,73 @@ impl FrameSlot {
             Frame::new(scene.clone(), self.view)
         })
     }
+}
+
+/// Bricks of a directory that a thread looks at before it asks whether there are more: some 0.1 ms.
+const PORTION: usize = 512;
+
+/// The directory as a frame sees it, in the making: every thread that needs it takes its portions.
+#[derive(Default)]
+struct Looking {
+    next: AtomicUsize,
+    seen: Mutex<Seen>,
+    bell: Condvar,
+    outlook: OnceLock<Outlook>,
+}
+
+#[derive(Default)]
+struct Seen {
+    portions: Vec<Vec<Sight>>,
+    done: usize,
+    /// A thread panicked over a portion.
+    broken: bool,
+}
+
+impl Looking {
+    fn get(&self, frame: &Frame, bricks: &[BrickInfo]) -> &Outlook {
+        if let Some(outlook) = self.outlook.get() {
+            return outlook;
+        }
+        /// Tells those who wait when a thread does not come back.
+        struct Guard<'a>(&'a Looking, bool);
+        impl Drop for Guard<'_> {
+            fn drop(&mut self) {
+                if !self.1 {
+                    locked(&self.0.seen).broken = true;
+                    self.0.bell.notify_all();
+                }
+            }
+        }
+        let all = bricks.len().div_ceil(PORTION);
+        loop {
+            let i = self.next.fetch_add(1, Ordering::Relaxed);
+            if i >= all {
+                break;
+            }
+            let mut guard = Guard(self, false);
+            let first = i * PORTION;
+            let portion = &bricks[first..bricks.len().min(first + PORTION)];
+            let sights = Outlook::look(frame, portion, first as u32);
+            let mut seen = locked(&self.seen);
+            seen.portions.resize_with(all, Vec::new);
+            seen.portions[i] = sights;
+            seen.done += 1;
+            guard.1 = true;
+            drop(seen);
+            self.bell.notify_all();
+        }
+        let mut seen = locked(&self.seen);
+        while seen.done < all && !seen.broken {
+            seen = self.bell.wait(seen).unwrap_or_else(PoisonError::into_inner);
+        }
+        assert!(!seen.broken, "another thread failed to look at the bricks");
+        self.outlook
+            .get_or_init(|| Outlook::new(frame.view.size, &std::mem::take(&mut seen.portions)))
+    }
+}
+
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// A task whose bricks are all here.
@@ -81,9 +154,114 @@ pub(crate) struct Rendered {
     pub(crate) outcome: Option<Result<(TilePixels, Counters), String>>,
 }
 
+/// A region on its way.
+pub(crate) struct Going {
+    pub(crate) lease: RegionLease,
+    pub(crate) frame: Arc<FrameSlot>,
+    pub(crate) shelf: Arc<Shelf>,
+    pub(crate) received: Instant,
+    /// When it stood still last.
+    pub(crate) parked_at: Option<Instant>,
+    pub(crate) parked: Duration,
+    pub(crate) stalls: u32,
+    /// Time of its drawing so far.
+    pub(crate) drawn: Duration,
+    /// What is drawn so far; `None` before it began.
+    region: Option<Region>,
+}
+
+impl Going {
+    pub(crate) fn new(
+        lease: RegionLease,
+        frame: Arc<FrameSlot>,
+        shelf: Arc<Shelf>,
+        received: Instant,
+    ) -> Going {
+        let (parked_at, parked, stalls, drawn, region) = Default::default();
+        Going { lease, frame, shelf, received, parked_at, parked, stalls, drawn, region }
+    }
+}
+
+/// Where a region came to.
+pub(crate) enum Came {
+    /// Its frame was over.
+    Over,
+    /// To its end.
+    Done(Box<Finished>),
+    /// To a sheet at which it lacks bricks; whether that is farther than before.
+    Lacks(Vec<u32>, bool),
+    /// Nowhere.
+    Failed(String),
+}
+
+/// What became of a region.
+pub(crate) struct Gone {
+    pub(crate) going: Box<Going>,
+    pub(crate) end: Instant,
+    pub(crate) thread: u32,
+    pub(crate) came: Came,
+}
+
+/// What threads take.
+pub(crate) enum Task {
+    Slab(Ready),
+    Region(Box<Going>),
+}
+
+/// What they give back.
+pub(crate) enum Outcome {
+    Slab(Rendered),
+    Region(Gone),
+}
+
+/// Frame, whether it begins, and the order of coming.
+type Place = (FrameId, bool, u64);
+
+#[derive(Default)]
+struct State {
+    tasks: BTreeMap<Place, Task>,
+    order: u64,
+    closed: bool,
+    /// Threads with nothing to do.
+    idle: u32,
+    /// Whether regions stand still.
+    parked: bool,
+    /// Up to when `waited` is counted.
+    since: Option<Instant>,
+    waited: Duration,
+}
+
+impl State {
+    /// Counts the time that threads had nothing to do while regions stood still.
+    fn count(&mut self) {
+        let now = Instant::now();
+        if let Some(since) = self.since.replace(now)
+            && self.parked
+        {
+            self.waited += (now - since) * self.idle;
+        }
+    }
+}
+
+#[derive(Default)]
+struct Queue {
+    state: Mutex<State>,
+    bell: Condvar,
+}
+
 /// The threads and their queue. Dropping it lets the threads end after the task at hand.
 pub(crate) struct Pool {
-    queue: Sender<Ready>,
+    queue: Arc<Queue>,
+}
+
+impl Drop for Pool {
+    fn drop(&mut self) {
+        let mut state = locked(&self.queue.state);
+        state.closed = true;
+        state.tasks.clear();
+        drop(state);
+        self.queue.bell.notify_all();
+    }
 }
 
 impl Pool {
@@ -93,87 +271,172 @@ impl Pool {
         threads: u32,
         simd: Simd,
         rehearsal: Option<&Arc<Rehearsal>>,
-    ) -> std::io::Result<(Pool, mpsc::UnboundedReceiver<Rendered>)> {
-        let (queue, tasks) = unbounded::<Ready>();
+    ) -> std::io::Result<(Pool, mpsc::UnboundedReceiver<Outcome>)> {
+        let queue = Arc::<Queue>::default();
+        let pool = Pool { queue: queue.clone() };
         let (out, results) = mpsc::unbounded_channel();
         for thread in 0..threads {
-            let (tasks, out) = (tasks.clone(), out.clone());
+            let (queue, out) = (queue.clone(), out.clone());
             let rehearsal = rehearsal.cloned();
             let work = move || match rehearsal {
-                Some(rehearsal) => hold(thread, &rehearsal, &tasks, &out),
-                None => work(thread, simd, &tasks, &out),
+                Some(rehearsal) => hold(thread, &rehearsal, &queue, &out),
+                None => work(thread, simd, &queue, &out),
             };
             std::thread::Builder::new().name(format!("slabcast-render-{thread}")).spawn(work)?;
         }
-        Ok((Pool { queue }, results))
+        Ok((pool, results))
     }
 
-    pub(crate) fn submit(&self, task: Ready) {
-        // Threads end only when this sender does.
-        let _ = self.queue.send(task);
+    pub(crate) fn submit(&self, task: Task) {
+        let (frame, begins) = match &task {
+            Task::Slab(ready) => (ready.lease.frame, true),
+            Task::Region(going) => (going.lease.frame, going.region.is_none()),
+        };
+        let mut state = locked(&self.queue.state);
+        state.order += 1;
+        let place = (frame, begins, state.order);
+        state.tasks.insert(place, task);
+        drop(state);
+        self.queue.bell.notify_one();
+    }
+
+    /// Whether regions stand still now.
+    pub(crate) fn parked(&self, parked: bool) {
+        let mut state = locked(&self.queue.state);
+        if state.parked != parked {
+            state.count();
+            state.parked = parked;
+        }
+    }
+
+    /// Time that threads had nothing to do while regions stood still, since this was asked last.
+    pub(crate) fn waited(&self) -> Duration {
+        let mut state = locked(&self.queue.state);
+        state.count();
+        std::mem::take(&mut state.waited)
     }
 }
 
-fn work(thread: u32, simd: Simd, tasks: &Receiver<Ready>, out: &mpsc::UnboundedSender<Rendered>) {
+/// The next task; `None`: there will be none.
+fn next(queue: &Queue) -> Option<Task> {
+    let mut state = locked(&queue.state);
+    loop {
+        if state.closed {
+            return None;
+        }
+        if let Some((_, task)) = state.tasks.pop_first() {
+            return Some(task);
+        }
+        state.count();
+        state.idle += 1;
+        state = queue.bell.wait(state).unwrap_or_else(PoisonError::into_inner);
+        state.count();
+        state.idle -= 1;
+    }
+}
+
+fn work(thread: u32, simd: Simd, queue: &Queue, out: &mpsc::UnboundedSender<Outcome>) {
     let mut scratch = Scratch::default();
-    for task in tasks {
-        let Ready { lease, frame, bricks, received, ready } = task;
-        let span = tracing::debug_span!(
-            "tile", frame = %lease.frame, task = %lease.task, x = lease.tile.x0, y = lease.tile.y0,
-            slab = lease.slab.first
-        );
-        let _in = span.enter();
-        let start = Instant::now();
-        let outcome = (!frame.over.load(Ordering::Relaxed)).then(|| {
-            std::panic::catch_unwind(AssertUnwindSafe(|| {
-                tile::render(
-                    frame.get(),
-                    simd,
-                    lease.tile,
-                    lease.slab,
-                    &bricks,
-                    &lease.state,
-                    &mut scratch,
-                )
-            }))
-            .map_err(|panic| {
-                scratch = Scratch::default();
-                let text = panic
-                    .downcast_ref::<String>()
-                    .map(String::as_str)
-                    .or_else(|| panic.downcast_ref::<&str>().copied())
-                    .unwrap_or("a panic without words");
-                format!("the renderer failed: {text}")
-            })
-        });
-        let end = Instant::now();
-        tracing::debug!(ms = (end - start).as_secs_f64() * 1e3, "rendered");
-        let done = Rendered { lease, received, ready, start, end, thread, outcome };
-        if out.send(done).is_err() {
+    while let Some(task) = next(queue) {
+        let outcome = match task {
+            Task::Slab(ready) => Outcome::Slab(render(thread, simd, ready, &mut scratch)),
+            Task::Region(going) => Outcome::Region(advance(thread, simd, going, &mut scratch)),
+        };
+        if out.send(outcome).is_err() {
             return;
         }
     }
 }
 
 /// Holds tasks for the time that they took to draw.
-fn hold(
-    thread: u32,
-    rehearsal: &Rehearsal,
-    tasks: &Receiver<Ready>,
-    out: &mpsc::UnboundedSender<Rendered>,
-) {
+fn hold(thread: u32, rehearsal: &Rehearsal, queue: &Queue, out: &mpsc::UnboundedSender<Outcome>) {
     let mut free = Instant::now();
-    for task in tasks {
-        let (mut start, mut end) = (free.max(task.ready), free.max(task.ready));
-        let outcome = (!task.frame.over.load(Ordering::Relaxed)).then(|| {
-            let (held, pixels) = rehearsal.task(&task, free)?;
-            (start, end) = (held.start, held.end);
-            Ok((pixels, held.wait()))
-        });
-        free = end;
-        let Ready { lease, received, ready, .. } = task;
-        if out.send(Rendered { lease, received, ready, start, end, thread, outcome }).is_err() {
+    while let Some(task) = next(queue) {
+        let outcome = match task {
+            Task::Slab(task) => {
+                let (mut start, mut end) = (free.max(task.ready), free.max(task.ready));
+                let outcome = (!task.frame.over.load(Ordering::Relaxed)).then(|| {
+                    let (held, pixels) = rehearsal.task(&task, free)?;
+                    (start, end) = (held.start, held.end);
+                    Ok((pixels, held.wait()))
+                });
+                free = end;
+                let Ready { lease, received, ready, .. } = task;
+                Outcome::Slab(Rendered { lease, received, ready, start, end, thread, outcome })
+            }
+            Task::Region(going) => {
+                let came = Came::Failed("a trace has tiles of slabs, and no regions".into());
+                Outcome::Region(Gone { going, end: Instant::now(), thread, came })
+            }
+        };
+        if out.send(outcome).is_err() {
             return;
         }
+    }
+}
+
+/// What `work` gives, or in words how the renderer failed; its memory is not used again then.
+fn caught<T>(scratch: &mut Scratch, work: impl FnOnce(&mut Scratch) -> T) -> Result<T, String> {
+    std::panic::catch_unwind(AssertUnwindSafe(|| work(scratch))).map_err(|panic| {
+        *scratch = Scratch::default();
+        let text = panic
+            .downcast_ref::<String>()
+            .map(String::as_str)
+            .or_else(|| panic.downcast_ref::<&str>().copied())
+            .unwrap_or("a panic without words");
+        format!("the renderer failed: {text}")
+    })
+}
+
+fn render(thread: u32, simd: Simd, task: Ready, scratch: &mut Scratch) -> Rendered {
+    let Ready { lease, frame, bricks, received, ready } = task;
+    let span = tracing::debug_span!(
+        "tile", frame = %lease.frame, task = %lease.task, x = lease.tile.x0, y = lease.tile.y0,
+        slab = lease.slab.first
+    );
+    let _in = span.enter();
+    let start = Instant::now();
+    let (tile, slab, state) = (lease.tile, lease.slab, &lease.state);
+    let outcome = (!frame.over.load(Ordering::Relaxed)).then(|| {
+        caught(scratch, |scratch| {
+            tile::render(frame.get(), simd, tile, slab, &bricks, state, scratch)
+        })
+    });
+    let end = Instant::now();
+    tracing::debug!(ms = (end - start).as_secs_f64() * 1e3, "rendered");
+    Rendered { lease, received, ready, start, end, thread, outcome }
+}
+
+fn advance(thread: u32, simd: Simd, mut going: Box<Going>, scratch: &mut Scratch) -> Gone {
+    let span = tracing::debug_span!(
+        "region", frame = %going.lease.frame, task = %going.lease.task, x = going.lease.tile.x0,
+        y = going.lease.tile.y0
+    );
+    let _in = span.enter();
+    let came = if going.frame.over.load(Ordering::Relaxed) {
+        Came::Over
+    } else {
+        caught(scratch, |scratch| go(simd, &mut going, scratch)).unwrap_or_else(Came::Failed)
+    };
+    Gone { going, end: Instant::now(), thread, came }
+}
+
+fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch) -> Came {
+    let Going { lease, frame: slot, shelf, drawn, region, .. } = going;
+    let frame = slot.get();
+    let outlook = slot.looking.get(frame, shelf.bricks());
+    let start = Instant::now();
+    let before = region.as_ref().and_then(Region::depth);
+    let on = region.get_or_insert_with(|| Region::new(outlook, lease.tile));
+    let lacks = on.advance(frame, simd, outlook, &**shelf, AHEAD, scratch);
+    *drawn += start.elapsed();
+    tracing::debug!(ms = start.elapsed().as_secs_f64() * 1e3, lacks = lacks.len(), "drawn");
+    if !lacks.is_empty() {
+        let farther = on.depth() != before;
+        return Came::Lacks(lacks, farther);
+    }
+    match region.take() {
+        Some(region) => Came::Done(Box::new(region.finish())),
+        None => Came::Over,
     }
 }

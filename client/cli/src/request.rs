@@ -736,7 +736,7 @@ mod tests {
             ("--eps 0.9", "--eps:"),
             ("--kernel tent --std 0.5", "--std:"),
             ("--splat deposit", "--splat:"),
-            ("--schedule region", "--schedule:"),
+            ("--schedule regions", "--schedule"),
             ("--std nan", "--std"),
             ("--frames 0", "--frames"),
             ("--frames 100001", "--frames"),

@@ -29,7 +29,7 @@ fn a_run_of_this_process_is_recorded_and_replays_identically() {
     }
     // One digit of one decision.
     let record = std::fs::read_to_string(dir.join("events.log")).unwrap();
-    let at = record.match_indices(": lease t").nth(20).unwrap().0;
+    let at = record.match_indices(": region t").nth(20).unwrap().0;
     let line = record[..at].lines().count();
     let bad = format!("{}{}", &record[..at], record[at..].replacen(" e0 of", " e1 of", 1));
     std::fs::write(dir.join("bad.log"), bad).unwrap();

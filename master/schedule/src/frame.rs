@@ -1,4 +1,4 @@
-//! One frame under the paper's schedule: slab after slab, with a barrier (section 4.5).
+//! One frame. Under the paper's schedule: slab after slab, with a barrier (section 4.5).
 //!
 //! ```text
 //! queued -> [slab 0] -> [slab 1] -> ... -> done
@@ -8,6 +8,11 @@
 //!             | no task open: occlusion map updated           (end_slab)
 //! ```
 //!
+//! Under the `region` schedule it is one slab through all depths of which the master knows nothing but
+//! where something may be seen: `region` cuts it and shares it out, workers cull it and ask for bricks.
+//! Leases, results, stragglers and the lost are the same, and so is the code. Several such frames may
+//! be in the making at a time; what a worker has of the others comes as a [`Turn`].
+//!
 //! A frame waits, with nothing lost, while there is no worker. It refuses to know who is silent
 //! (`roster`), which copy of a result counts (`queue`) and where bricks are (`residency`).
 
@@ -15,12 +20,15 @@ use crate::critical::Piece;
 use crate::ledger::{Ledger, Rendered, ms, place_in_time};
 use crate::macrotile::{self, Cut, LEAF, LEVELS};
 use crate::queue::{End, Queue, Verdict};
+use crate::region::Regions;
 use crate::residency::{Errand, Flight};
 use crate::{Action, Clock, Cluster, FrameJob, Micros, Span};
+use slabcast_common::brick::BrickGrid;
 use slabcast_common::ids::{BrickId, Epoch, TaskId, WorkerId};
 use slabcast_common::image::{FrameState, TilePixels};
-use slabcast_common::message::{Lease, TileResult, ToWorker};
+use slabcast_common::message::{Lease, RegionCost, RegionLease, TileResult, ToWorker};
 use slabcast_common::occlusion::{Rect, ShutMap};
+use slabcast_common::quality::Schedule;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::stats::{BrickStats, PoisonedTile, SlabStats, TileStats};
 use slabcast_common::view::Projected;
@@ -58,6 +66,8 @@ struct Slab {
     rects: Vec<Rect>,
     /// Needed bricks in the order in which the queue's tiles come to them.
     order: Vec<u32>,
+    /// Whose its tiles are, under the `region` schedule.
+    regions: Option<Regions>,
     /// Workers that the slab's bricks were queued for.
     served: BTreeSet<WorkerId>,
     /// End of each render thread's last task.
@@ -85,6 +95,8 @@ pub(crate) struct Frame {
     state: FrameState,
     shut: ShutMap,
     slab: Option<Slab>,
+    /// When its last slab ended.
+    ended: Option<Micros>,
     first_task: TaskId,
     /// Workers that were sent the frame's view.
     told: BTreeSet<WorkerId>,
@@ -110,26 +122,57 @@ pub(crate) enum Step {
     Failed(String),
 }
 
+/// What the other frames in the making mean to one.
+#[derive(Debug, Default)]
+pub(crate) struct Turn {
+    /// Leases that workers have of them.
+    pub(crate) elsewhere: BTreeMap<WorkerId, u64>,
+    /// No frame comes after it whose tasks could keep idle threads busy at its end.
+    pub(crate) last: bool,
+    /// Threads may take what is another worker's.
+    pub(crate) others: bool,
+}
+
+impl Turn {
+    fn elsewhere(&self, id: WorkerId) -> u64 {
+        self.elsewhere.get(&id).copied().unwrap_or(0)
+    }
+}
+
+/// Whether a frame is rendered under the `region` schedule. `auto` is that, always: where nothing hides
+/// anything it needs as many bricks as the other and has no barriers.
+pub(crate) fn goes_by_region(job: &FrameJob) -> bool {
+    job.work.schedule != Schedule::Slab
+}
+
 impl Frame {
     pub(crate) fn start(job: Box<FrameJob>, cluster: &mut Cluster, clock: &dyn Clock) -> Self {
         let began = clock.now();
         let ascending = job.bricks.windows(2).all(|w| w[0].id < w[1].id);
         assert!(ascending, "a job's bricks ascend by id");
-        let view = &job.view;
-        let projected: Vec<_> = job.bricks.iter().map(|b| view.project(&b.tight)).collect();
-        let sheets =
-            projected.iter().flatten().fold(SheetRange::default(), |all, p| all.union(p.sheets));
-        cluster.residency.open(job.scene.bricks, &job.bricks);
+        let (view, by_region) = (&job.view, goes_by_region(&job));
+        let mut projected = Vec::new();
+        let slabs = if by_region {
+            // Workers know its depths.
+            vec![SheetRange::default()]
+        } else {
+            projected.extend(job.bricks.iter().map(|b| view.project(&b.tight)));
+            let seen = projected.iter().flatten();
+            seen.fold(SheetRange::default(), |all, p| all.union(p.sheets)).slabs(job.work.slabs)
+        };
+        cluster.residency.open(job.scene.bricks, &job.bricks, by_region);
         let mut ledger = Ledger::new(began);
         for (id, worker) in cluster.roster.iter() {
             ledger.enrol(id, worker, began);
         }
         let mut frame = Frame {
-            slabs: sheets.slabs(job.work.slabs),
+            slabs,
             at: 0,
             state: FrameState::new(view.size),
-            shut: ShutMap::open(Rect::of_size(view.size)),
+            // Regions shut their pixels at the workers.
+            shut: ShutMap::open(Rect::of_size(if by_region { [0; 2] } else { view.size })),
             slab: None,
+            ended: None,
             first_task: TaskId(cluster.next_task),
             told: BTreeSet::new(),
             lent: BTreeMap::new(),
@@ -148,11 +191,11 @@ impl Frame {
     }
 
     /// Goes as far as it can.
-    pub(crate) fn step(&mut self, cluster: &mut Cluster, clock: &dyn Clock) -> Step {
+    pub(crate) fn step(&mut self, cluster: &mut Cluster, turn: &Turn, clock: &dyn Clock) -> Step {
         loop {
             match &self.slab {
                 Some(slab) if slab.queue.open() > 0 => {
-                    self.dispatch(cluster, clock.now());
+                    self.dispatch(cluster, turn, clock.now());
                     return Step::Waits;
                 }
                 Some(slab) => {
@@ -165,9 +208,28 @@ impl Frame {
                 None if self.at == self.slabs.len() => return Step::Done,
                 // The level of the quadtree depends on how many there are.
                 None if cluster.roster.threads() == 0 => return Step::Waits,
+                None if self.by_region() => self.begin_regions(cluster, clock),
                 None => self.begin_slab(cluster, clock),
             }
         }
+    }
+
+    /// Whether its last slab ended.
+    pub(crate) fn is_done(&self) -> bool {
+        self.slab.is_none() && self.at == self.slabs.len()
+    }
+
+    /// Whether it can go beside other frames of its set.
+    pub(crate) fn by_region(&self) -> bool {
+        goes_by_region(&self.job)
+    }
+
+    /// Cuts the whole depth into regions.
+    fn begin_regions(&mut self, cluster: &mut Cluster, clock: &dyn Clock) {
+        let began = clock.now();
+        let (cut, regions) = Regions::cut(&self.job, &cluster.roster, &mut cluster.memory);
+        self.put_on(cluster, began, cut, (Vec::new(), Vec::new()), Some(regions));
+        self.ledger.cull_us += clock.now().saturating_sub(began);
     }
 
     /// Culls bricks, cuts the slab into macrotiles and sorts them.
@@ -193,32 +255,47 @@ impl Frame {
         let size = self.job.view.size;
         let cut = macrotile::cut(size, &rects, &self.shut, cull, wanted, forced);
 
+        cluster.residency.round(&needed);
+        self.put_on(cluster, began, cut, (needed, rects), None);
+        self.ledger.cull_us += clock.now().saturating_sub(began);
+    }
+
+    /// Queues a cut's tiles. With the bricks that they need, and their rectangles.
+    fn put_on(
+        &mut self,
+        cluster: &mut Cluster,
+        began: Micros,
+        cut: Cut,
+        (needed, rects): (Vec<u32>, Vec<Rect>),
+        regions: Option<Regions>,
+    ) {
         let mut order: Vec<(u32, u32)> =
             needed.iter().zip(&rects).filter_map(|(&i, r)| Some((cut.first_in(r)?, i))).collect();
         order.sort_unstable();
-        cluster.residency.round(&needed);
         let queue = Queue::new(TaskId(cluster.next_task), &cut.tiles);
         cluster.next_task += cut.tiles.len() as u64;
         self.slab = Some(Slab {
-            sheets,
+            sheets: self.slabs[self.at],
             began,
             cut,
             queue,
             needed,
             rects,
             order: order.into_iter().map(|(_, i)| i).collect(),
+            regions,
             served: BTreeSet::new(),
             dry: BTreeMap::new(),
             pieces: Vec::new(),
         });
-        self.ledger.cull_us += clock.now().saturating_sub(began);
     }
 
     /// The barrier: the picture moves on to the next slab.
     fn end_slab(&mut self, cluster: &Cluster, now: Micros) {
         let slab = self.slab.take().expect("a slab that ends has begun");
-        self.state.end_slab();
-        self.shut.refresh();
+        if slab.regions.is_none() {
+            self.state.end_slab();
+            self.shut.refresh();
+        }
         let tile = |task: &crate::queue::Task| {
             let (worker, us) = match &task.end {
                 End::Done { worker, render_us } => (worker.clone(), *render_us),
@@ -234,7 +311,8 @@ impl Frame {
             }
         };
         let mut waited = 0;
-        if !slab.queue.tasks.is_empty() {
+        // Regions have no barrier: threads go on with the next frame.
+        if !slab.queue.tasks.is_empty() && slab.regions.is_none() {
             for (id, worker) in cluster.roster.staying() {
                 let mut busy = 0;
                 for (_, end) in slab.dry.range((id, 0)..=(id, u32::MAX)) {
@@ -267,6 +345,9 @@ impl Frame {
             ],
         });
         self.at += 1;
+        if self.at == self.slabs.len() {
+            self.ended = Some(now);
+        }
     }
 
     /// Lends tasks to free threads, and sends bricks.
@@ -275,15 +356,19 @@ impl Frame {
     /// need not wait for a round trip between two (TRANSPORT.md: two in flight a thread hide
     /// the latency of 64x64 tiles), but not the last ones, as many as there are threads: those
     /// go one by one to whoever runs dry, since a task that waits behind another on one worker
-    /// can't be taken by an idle one.
-    fn dispatch(&mut self, cluster: &mut Cluster, now: Micros) {
+    /// can't be taken by an idle one. Where another frame comes after, nothing is held back.
+    ///
+    /// Of regions a worker gets its own; those of others only when it is their turn, and then only
+    /// threads that are dry.
+    fn dispatch(&mut self, cluster: &mut Cluster, turn: &Turn, now: Micros) {
         let slab = self.slab.as_mut().expect("a slab that is dispatched has begun");
         let ahead = u64::from(cluster.config.queue_ahead.max(1));
         let all_threads = cluster.roster.threads();
         let mut leases: Vec<(WorkerId, u32)> = Vec::new();
         let mut refused = BTreeSet::new();
         while slab.queue.waiting() > 0 {
-            let load = |id: WorkerId| self.lent.get(&id).map_or(0, |l| l.len() as u64);
+            let here = |id: WorkerId| self.lent.get(&id).map_or(0, |l| l.len() as u64);
+            let load = |id: WorkerId| here(id) + turn.elsewhere(id);
             let takers = || cluster.roster.staying().filter(|(id, _)| !refused.contains(id));
             let dry = takers()
                 .filter(|(id, w)| load(*id) < u64::from(w.threads))
@@ -291,7 +376,8 @@ impl Frame {
             let next = dry.or_else(|| {
                 // a/b < c/d as a d < c b.
                 takers()
-                    .filter(|_| slab.queue.waiting() as u64 > all_threads)
+                    .filter(|_| !turn.others)
+                    .filter(|_| !turn.last || slab.queue.waiting() as u64 > all_threads)
                     .filter(|(id, w)| load(*id) < u64::from(w.threads).saturating_mul(ahead))
                     .reduce(|a, b| {
                         let (x, y) = (u128::from(load(a.0)), u128::from(load(b.0)));
@@ -310,6 +396,9 @@ impl Frame {
             // A worker short of memory may have any of the first few that fit.
             let tries = Cell::new(0);
             let suits = |place| {
+                if let Some(regions) = &slab.regions {
+                    return turn.others || regions.is_for(place, id, &cluster.roster);
+                }
                 if lent.is_empty() || !cluster.residency.is_lazy(id) {
                     return true;
                 }
@@ -323,9 +412,13 @@ impl Frame {
             let epoch = slab.queue.lease(place, id, now, &cluster.config);
             lent.push(lend(cluster, slab, place, id, epoch, now));
             leases.push((id, place));
+            if let Some(regions) = &mut slab.regions {
+                regions.moves(place, id);
+            }
         }
         self.outlived = None;
-        while let Some((place, id)) = self.next_outlived(cluster, now) {
+        let may_double = slab.regions.is_none() || turn.others;
+        while may_double && let Some((place, id)) = self.next_outlived(cluster, turn, now) {
             let slab = self.slab.as_mut().expect("as before");
             let epoch = slab.queue.lend_again(place, id, now, &cluster.config);
             let lent = lend(cluster, slab, place, id, epoch, now);
@@ -344,6 +437,16 @@ impl Frame {
             slab.served.insert(id);
             if !cluster.residency.is_lazy(id) {
                 cluster.residency.want(id, slab.order.iter().copied());
+            }
+        }
+        let set = self.job.scene.bricks;
+        if let Some(regions) = &slab.regions {
+            // What a tile was drawn from goes with it.
+            for &(id, place) in &leases {
+                let tile = slab.cut.tiles[place as usize].rect;
+                if let Some(bricks) = cluster.memory.moving(regions, &tile, id) {
+                    cluster.residency.owe(id, set, bricks.iter().copied());
+                }
             }
         }
         let to_flush: BTreeSet<_> =
@@ -372,6 +475,23 @@ impl Frame {
                 cluster.send(id, message);
             }
             let tile = slab.cut.tiles[place as usize].rect;
+            if slab.regions.is_some() {
+                let worker = cluster.roster.get_mut(id).expect("it was just lent a task");
+                if worker.lacks_directory(set) {
+                    let (grid, bricks) = (self.job.scene.volume.lattice.dims, &self.job.bricks);
+                    let message = ToWorker::Directory {
+                        set,
+                        grid: BrickGrid::of(grid),
+                        first: 0,
+                        total: bricks.len() as u32,
+                        bricks: bricks.clone(),
+                    };
+                    cluster.send(id, message);
+                }
+                let (task, epoch, frame) = (lent.task, lent.epoch, self.job.frame);
+                cluster.send(id, ToWorker::Region(RegionLease { task, epoch, frame, tile }));
+                continue;
+            }
             let name = |&i: &u32| -> BrickId { self.job.bricks[i as usize].id };
             let lease = Lease {
                 task: lent.task,
@@ -393,12 +513,17 @@ impl Frame {
     /// that tasks of its workload take is run twice, and so is what waits behind it on the
     /// same worker. Its own lease stays live: whichever is first counts. The price is at most
     /// one task for each idle thread. Suspects are left out, lest they take two workers at once.
-    fn next_outlived(&mut self, cluster: &Cluster, now: Micros) -> Option<(u32, WorkerId)> {
+    fn next_outlived(
+        &mut self,
+        cluster: &Cluster,
+        turn: &Turn,
+        now: Micros,
+    ) -> Option<(u32, WorkerId)> {
         let slab = self.slab.as_ref()?;
         let idle: Vec<(WorkerId, u64)> = cluster
             .roster
             .staying()
-            .map(|(id, w)| (id, self.leases(id).into(), w.threads))
+            .map(|(id, w)| (id, u64::from(self.leases(id)) + turn.elsewhere(id), w.threads))
             .filter(|(_, load, threads)| *load < u64::from(*threads))
             .map(|(id, load, _)| (id, load))
             .collect();
@@ -467,14 +592,20 @@ impl Frame {
         Some(lent)
     }
 
-    /// A result came. An error is the worker's lie.
+    /// Whether a worker has this lease of it, or had.
+    pub(crate) fn has_lent(&self, worker: WorkerId, task: TaskId, epoch: Epoch) -> bool {
+        let lent = self.lent.get(&worker).into_iter().flatten();
+        lent.into_iter().any(|l| l.task == task && l.epoch == epoch)
+    }
+
+    /// A result came. An error is the worker's lie. When its tile was rendered, if it counts.
     pub(crate) fn result(
         &mut self,
         cluster: &mut Cluster,
         worker: WorkerId,
         result: &TileResult,
         clock: &dyn Clock,
-    ) -> Result<(), String> {
+    ) -> Result<Option<(Micros, Micros)>, String> {
         let now = clock.now();
         let before = self.answered.insert(worker, now).unwrap_or(0);
         let lent = self.take_answered(cluster, worker, result.task, result.epoch);
@@ -487,11 +618,13 @@ impl Frame {
             if result.task >= self.first_task {
                 self.ledger.dropped_results += 1;
             }
-            return Ok(());
+            return Ok(None);
         };
         let slab = self.slab.as_mut().expect("a lease that counts is of this slab");
         let tile = slab.cut.tiles[place as usize].rect;
-        if let Err(lie) = check(tile, &result.pixels) {
+        let cost = slab.regions.as_ref().and(result.region.as_ref());
+        let bricks = self.job.bricks.len();
+        if let Err(lie) = check(tile, &result.pixels).and_then(|()| check_cost(cost, bricks)) {
             // Its other leases go back when it is dropped; this one it has just answered.
             let given_up =
                 slab.queue.lose(worker, "", &[(place, result.epoch)], 0, &cluster.config);
@@ -502,7 +635,7 @@ impl Frame {
         self.state.put(tile, &result.pixels);
         let width = self.job.view.size[0] as usize;
         let eps = self.job.scene.quality.eps;
-        if eps > 0.0 {
+        if eps > 0.0 && slab.regions.is_none() {
             for (row, y) in result.pixels.a.chunks(tile.width()).zip(tile.y0..) {
                 for (&a, x) in row.iter().zip(tile.x0..) {
                     if is_shut(a, eps) {
@@ -532,6 +665,16 @@ impl Frame {
             end,
             came: now,
         });
+        let mut drawn_from = lent.map_or(0, |l| l.bricks.len());
+        if let (Some(regions), Some(cost)) = (&slab.regions, cost) {
+            drawn_from = cost.touched.len();
+            for &i in &cost.touched {
+                self.needed_ever[i as usize] = true;
+            }
+            self.ledger.stalled(worker, cost);
+            cluster.residency.touched(self.job.scene.bricks, &cost.touched);
+            cluster.memory.learn(regions, &tile, worker, end - start, &cost.touched);
+        }
         self.ledger.spans.push(Span {
             name: format!("{},{}", tile.x0, tile.y0),
             category: "tile",
@@ -543,13 +686,13 @@ impl Frame {
                 ("slab", self.at.to_string()),
                 ("edge", slab.cut.edge.to_string()),
                 ("est", slab.cut.tiles[place as usize].est.to_string()),
-                ("bricks", lent.map_or(0, |l| l.bricks.len()).to_string()),
+                ("bricks", drawn_from.to_string()),
                 ("attempt", result.epoch.0.to_string()),
             ],
         });
         slab.queue.finish(place, End::Done { worker: who.name.clone(), render_us: end - start });
         self.progress(cluster);
-        Ok(())
+        Ok(Some((start, end)))
     }
 
     fn progress(&self, cluster: &mut Cluster) {
@@ -653,17 +796,17 @@ impl Frame {
         }
     }
 
-    /// A worker is gone. `blame` says whether a task may have killed it. The caller has not
-    /// taken its bricks off the books yet.
+    /// A worker is gone. `blame` says whether a task may have killed it; as many as it had `threads`
+    /// for were probably running. The caller has not taken its bricks off the books yet.
     pub(crate) fn lost(
         &mut self,
         cluster: &mut Cluster,
         id: WorkerId,
         worker: &crate::roster::Worker,
-        blame: bool,
+        (blame, threads): (bool, u32),
         now: Micros,
     ) {
-        let (leases, running) = self.probably(id, worker.threads);
+        let (leases, running) = self.probably(id, threads);
         self.lent.remove(&id);
         self.told.remove(&id);
         if let Some(flight) = cluster.residency.flight(id) {
@@ -691,8 +834,9 @@ impl Frame {
 
     /// The next lease deadline.
     pub(crate) fn next_deadline(&self) -> Option<Micros> {
-        let lease = self.slab.as_ref().and_then(|s| s.queue.next_deadline());
-        lease.into_iter().chain(self.outlived).min()
+        // A frame that is done and waits for one before it has none.
+        let slab = self.slab.as_ref()?;
+        slab.queue.next_deadline().into_iter().chain(self.outlived).min()
     }
 
     /// Leases that a worker has.
@@ -715,13 +859,14 @@ impl Frame {
 
     /// The finished picture with what it cost.
     pub(crate) fn finish(mut self, cluster: &mut Cluster, now: Micros) -> Action {
+        let now = self.ended.unwrap_or(now);
         for (id, flight) in cluster.residency.cut_flights(now) {
             if flight.since < now {
                 self.ledger.landed(id, flight, now);
             }
         }
         for (id, _) in cluster.roster.iter() {
-            self.ledger.holds(id, cluster.residency.held_of_current(id));
+            self.ledger.holds(id, cluster.residency.held_of(id, self.job.scene.bricks));
         }
         let mut bricks =
             BrickStats { relevant: self.job.bricks.len() as u64, ..BrickStats::default() };
@@ -731,7 +876,9 @@ impl Frame {
         }
         let relevant = self.job.bricks.iter().map(|b| u64::from(b.voxels)).sum();
         let quality = self.job.scene.quality;
-        let (stats, spans) = self.ledger.close(self.job.number, quality, relevant, bricks, now);
+        let schedule = if self.by_region() { Schedule::Region } else { Schedule::Slab };
+        let (stats, spans) =
+            self.ledger.close(self.job.number, schedule, quality, relevant, bricks, now);
         let frame = self.job.frame;
         Action::FrameDone { frame, state: Box::new(self.state), stats: Box::new(stats), spans }
     }
@@ -829,6 +976,15 @@ impl Measured {
     fn patience(&self, est: u64) -> Micros {
         let expected = ((self.render * u128::from(est.max(1))) >> 20) + self.beside;
         Pace::FLOOR.saturating_add((2 * expected).min(u128::from(Micros::MAX)) as Micros)
+    }
+}
+
+/// Whether what a stranger says of a region can be counted.
+fn check_cost(cost: Option<&RegionCost>, bricks: usize) -> Result<(), String> {
+    let beyond = cost.and_then(|c| c.touched.iter().max()).filter(|&&i| i as usize >= bricks);
+    match beyond {
+        Some(i) => Err(format!("a result touched brick {i} of {bricks}")),
+        None => Ok(()),
     }
 }
 

@@ -11,8 +11,8 @@ use crate::roster::Worker;
 use crate::{Micros, Span};
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::ids::WorkerId;
-use slabcast_common::message::{Counters, TaskTimes};
-use slabcast_common::quality::Quality;
+use slabcast_common::message::{Counters, RegionCost, TaskTimes};
+use slabcast_common::quality::{Quality, Schedule};
 use slabcast_common::stats::{
     BrickStats, ErrorStats, FrameMs, FrameStats, PoisonedTile, SlabStats, VoxelStats, WorkerStats,
 };
@@ -35,6 +35,11 @@ struct Account {
     held: (u64, u64),
     bricks_sent: u64,
     bytes_sent: u64,
+    /// Drawing for other frames meanwhile.
+    elsewhere_us: Micros,
+    stalls: u64,
+    parked_us: Micros,
+    stall_us: Micros,
 }
 
 /// The books of one frame.
@@ -113,6 +118,10 @@ impl Ledger {
             held: (0, 0),
             bricks_sent: 0,
             bytes_sent: 0,
+            elsewhere_us: 0,
+            stalls: 0,
+            parked_us: 0,
+            stall_us: 0,
         });
     }
 
@@ -129,6 +138,22 @@ impl Ledger {
             a.render_us += r.end - r.start;
             a.p2p_us += r.p2p_us;
             a.renders.push((r.start, r.end));
+        }
+    }
+
+    /// A worker drew for another frame while this one was in the making.
+    pub(crate) fn elsewhere(&mut self, id: WorkerId, (start, end): Interval) {
+        if let Some(a) = self.accounts.get_mut(&id) {
+            a.elsewhere_us += end.saturating_sub(start.max(a.from));
+        }
+    }
+
+    /// What a region waited for. A stranger's figures: they are added up and no more.
+    pub(crate) fn stalled(&mut self, id: WorkerId, cost: &RegionCost) {
+        if let Some(a) = self.accounts.get_mut(&id) {
+            a.stalls += u64::from(cost.stalls);
+            a.parked_us = a.parked_us.saturating_add(cost.parked_us);
+            a.stall_us = a.stall_us.saturating_add(cost.idle_us);
         }
     }
 
@@ -165,6 +190,7 @@ impl Ledger {
     pub(crate) fn close(
         mut self,
         number: u64,
+        schedule: Schedule,
         quality: Quality,
         relevant_voxels: u64,
         bricks: BrickStats,
@@ -183,7 +209,10 @@ impl Ledger {
                     render_ms: ms(a.render_us),
                     distribute_ms: ms(length(&union(a.flights))),
                     p2p_ms: ms(a.p2p_us),
-                    wait_ms: ms(threads_us.saturating_sub(a.render_us)),
+                    wait_ms: ms(threads_us.saturating_sub(a.render_us + a.elsewhere_us)),
+                    stalls: a.stalls,
+                    parked_ms: ms(a.parked_us),
+                    stall_ms: ms(a.stall_us),
                     bricks_held: a.held.0,
                     bytes_held: a.held.1,
                     bricks_sent: a.bricks_sent,
@@ -204,6 +233,7 @@ impl Ledger {
         let stats = FrameStats {
             v: 1,
             frame: number,
+            schedule,
             view_sha256: String::new(),
             pixels_sha256: String::new(),
             pixels_version: PIXELS_VERSION,
@@ -215,6 +245,7 @@ impl Ledger {
                 composite: ms(self.composite_us),
                 wait: self.slabs.iter().map(|s| s.barrier_wait_ms).sum(),
                 overlap: ms(length(&both(&flights, &renders))),
+                stall: workers.iter().map(|w| w.stall_ms).sum(),
             },
             workers,
             voxels: VoxelStats {

@@ -29,10 +29,10 @@
 //!
 //! # Rooms
 //!
-//! [`frame`](is_shut) the states of one frame, [`macrotile`] the quadtree and its workload,
-//! `queue` leases with epochs, `residency` who holds which brick, `roster` workers and every
-//! deadline, `ledger` what a frame cost, `critical` what it waited for. The `region` schedule will stand beside `frame`; the
-//! others know nothing of slabs but the queue's and the residency's rounds.
+//! [`frame`](is_shut) the states of one frame, under either schedule; `region` what is the `region`
+//! schedule's own; [`macrotile`] the quadtree and its workload, `queue` leases with epochs,
+//! `residency` who holds which brick, `roster` workers and every deadline, `ledger` what a frame cost, `critical`
+//! what it waited for.
 
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
@@ -49,13 +49,15 @@ mod frame;
 mod ledger;
 pub mod macrotile;
 mod queue;
+mod region;
 mod residency;
 mod roster;
 pub mod sim;
 
 pub use frame::is_shut;
 
-use frame::{Frame, Step, carry};
+use frame::{Frame, Step, Turn, carry, goes_by_region};
+use region::Memory;
 use residency::Residency;
 use roster::Roster;
 
@@ -153,7 +155,8 @@ pub enum Event {
         /// Which.
         worker: WorkerId,
     },
-    /// Somebody wants a frame. Frames are rendered in this order, one at a time.
+    /// Somebody wants a frame. Frames are done in this order. Under the `slab` schedule they are
+    /// rendered one at a time; under `region`, two of one brick set may be in the making.
     FrameQueued(Box<FrameJob>),
     /// Nobody wants it any more. There is no answer.
     CancelFrame {
@@ -197,6 +200,24 @@ pub enum Event {
     /// Bricks arrived broken. They are sent again.
     BricksBroken {
         /// Where.
+        worker: WorkerId,
+        /// Of which set.
+        set: BrickSetKey,
+        /// Which.
+        bricks: Vec<BrickId>,
+    },
+    /// Its regions lack bricks.
+    BricksWanted {
+        /// Whose.
+        worker: WorkerId,
+        /// Of which set.
+        set: BrickSetKey,
+        /// Which, the most urgent first.
+        bricks: Vec<BrickId>,
+    },
+    /// It forgot bricks, to make room.
+    BricksForgotten {
+        /// Who.
         worker: WorkerId,
         /// Of which set.
         set: BrickSetKey,
@@ -330,12 +351,18 @@ pub struct Totals {
     pub lost_workers: u64,
 }
 
+/// Frames of the `region` schedule in the making. With two, no thread runs dry at the end of a frame
+/// while the next one's tasks are there; a third would only take memory (28 bytes a pixel, and
+/// its picture as long as a frame before it is late).
+const FRAMES_AT_ONCE: usize = 2;
+
 /// All but the frames.
 #[derive(Debug)]
 struct Cluster {
     config: Config,
     roster: Roster,
     residency: Residency,
+    memory: Memory,
     out: VecDeque<Action>,
     next_task: u64,
     totals: Totals,
@@ -352,7 +379,8 @@ impl Cluster {
 pub struct Scheduler {
     cluster: Cluster,
     waiting: VecDeque<Box<FrameJob>>,
-    current: Option<Frame>,
+    /// Frames in the making, in their order.
+    active: VecDeque<Frame>,
     /// Scenes to be forgotten when their frames are done.
     ended: BTreeSet<SceneId>,
 }
@@ -365,12 +393,13 @@ impl Scheduler {
                 config,
                 roster: Roster::default(),
                 residency: Residency::default(),
+                memory: Memory::default(),
                 out: VecDeque::new(),
                 next_task: 0,
                 totals: Totals::default(),
             },
             waiting: VecDeque::new(),
-            current: None,
+            active: VecDeque::new(),
             ended: BTreeSet::new(),
         }
     }
@@ -384,7 +413,7 @@ impl Scheduler {
             Event::WorkerJoined { worker, name, threads, memory_budget_bytes, held } => {
                 cluster.residency.join(worker, memory_budget_bytes, held);
                 cluster.roster.join(worker, name, threads, now);
-                if let Some(frame) = &mut self.current {
+                for frame in &mut self.active {
                     frame.joined(cluster, worker, now);
                 }
             }
@@ -394,16 +423,21 @@ impl Scheduler {
                 cluster.roster.heard(worker, now);
                 if let Some(w) = cluster.roster.get_mut(worker)
                     && !std::mem::replace(&mut w.leaving, true)
-                    && let Some(frame) = &mut self.current
                 {
-                    frame.leaving(worker, w.threads);
+                    let mut threads = w.threads;
+                    for frame in &mut self.active {
+                        frame.leaving(worker, threads);
+                        threads = threads.saturating_sub(frame.leases(worker));
+                    }
                 }
             }
             Event::FrameQueued(job) => self.waiting.push_back(job),
             Event::CancelFrame { frame } => {
                 self.waiting.retain(|job| job.frame != frame);
-                if let Some(mut current) = self.current.take_if(|c| c.job.frame == frame) {
-                    current.end(&mut self.cluster);
+                if let Some(i) = self.active.iter().position(|f| f.job.frame == frame)
+                    && let Some(mut cancelled) = self.active.remove(i)
+                {
+                    cancelled.end(&mut self.cluster);
                 }
             }
             Event::SceneEnded { scene } => {
@@ -412,13 +446,19 @@ impl Scheduler {
             Event::Result { worker, result } => {
                 cluster.roster.heard(worker, now);
                 let known = cluster.roster.get(worker).is_some();
-                match &mut self.current {
+                let lent = |f: &Frame| f.has_lent(worker, result.task, result.epoch);
+                let whose = self.active.iter().position(lent).unwrap_or(0);
+                match self.active.get_mut(whose) {
                     Some(frame) if known => {
                         let outcome = frame.result(cluster, worker, &result, clock);
-                        if let Err(reason) = outcome {
-                            self.drop_worker(worker, reason, false, now);
-                        } else if cluster.residency.is_lazy(worker) {
-                            carry(cluster, Some(&mut frame.ledger), worker, now);
+                        match outcome {
+                            Err(reason) => self.drop_worker(worker, reason, false, now),
+                            Ok(rendered) => {
+                                if cluster.residency.is_lazy(worker) {
+                                    carry(cluster, Some(&mut frame.ledger), worker, now);
+                                }
+                                self.rendered_elsewhere(whose, worker, rendered);
+                            }
                         }
                     }
                     _ => cluster.totals.dropped_results += 1,
@@ -426,7 +466,8 @@ impl Scheduler {
             }
             Event::Failed { worker, task, epoch, reason } => {
                 cluster.roster.heard(worker, now);
-                if let Some(frame) = &mut self.current {
+                let lent = |f: &&mut Frame| f.has_lent(worker, task, epoch);
+                if let Some(frame) = self.active.iter_mut().find(lent) {
                     frame.failed(cluster, worker, task, epoch, reason);
                 }
             }
@@ -440,6 +481,17 @@ impl Scheduler {
                 let landed = cluster.residency.broken(worker, set, &bricks);
                 self.after_bricks(worker, landed, now);
             }
+            Event::BricksWanted { worker, set, bricks } => {
+                cluster.roster.heard(worker, now);
+                let places = cluster.residency.places(set, &bricks);
+                cluster.residency.owe(worker, set, places);
+                self.after_bricks(worker, None, now);
+            }
+            Event::BricksForgotten { worker, set, bricks } => {
+                cluster.roster.heard(worker, now);
+                cluster.residency.forgotten(worker, set, &bricks);
+                self.after_bricks(worker, None, now);
+            }
             Event::Pong { worker, nonce, clock_us } => {
                 cluster.roster.heard(worker, now);
                 if cluster.roster.pong(worker, nonce, clock_us, now) {
@@ -452,20 +504,40 @@ impl Scheduler {
         self.advance(clock);
     }
 
+    /// Bricks are on the account of the first frame in the making, whichever of several asked.
     fn after_bricks(&mut self, worker: WorkerId, landed: Option<residency::Flight>, now: Micros) {
-        if let (Some(frame), Some(flight)) = (&mut self.current, landed) {
+        if let (Some(frame), Some(flight)) = (self.active.front_mut(), landed) {
             frame.landed(worker, flight, now);
         }
-        let ledger = self.current.as_mut().map(|f| &mut f.ledger);
+        let ledger = self.active.front_mut().map(|f| &mut f.ledger);
         carry(&mut self.cluster, ledger, worker, now);
+    }
+
+    /// A worker drew for one frame while the others were in the making.
+    fn rendered_elsewhere(
+        &mut self,
+        whose: usize,
+        worker: WorkerId,
+        rendered: Option<(Micros, Micros)>,
+    ) {
+        let Some(when) = rendered else { return };
+        for (i, frame) in self.active.iter_mut().enumerate() {
+            if i != whose && !frame.is_done() {
+                frame.ledger.elsewhere(worker, when);
+            }
+        }
     }
 
     /// A worker is gone.
     fn lose(&mut self, id: WorkerId, blame: bool, now: Micros) {
         let Some(worker) = self.cluster.roster.remove(id) else { return };
         self.cluster.totals.lost_workers += 1;
-        if let Some(frame) = &mut self.current {
-            frame.lost(&mut self.cluster, id, &worker, blame && !worker.leaving, now);
+        let mut threads = worker.threads;
+        for frame in &mut self.active {
+            let leases = frame.leases(id);
+            let blame = (blame && !worker.leaving, threads);
+            frame.lost(&mut self.cluster, id, &worker, blame, now);
+            threads = threads.saturating_sub(leases);
         }
         self.cluster.residency.leave(id);
     }
@@ -485,42 +557,93 @@ impl Scheduler {
         for (worker, nonce) in self.cluster.roster.beat(now, &self.cluster.config) {
             self.cluster.send(worker, ToWorker::Ping { nonce });
         }
-        if let Some(frame) = &mut self.current {
+        for frame in &mut self.active {
             frame.tick(now);
         }
+        while self.go_on(clock) {}
+        self.forget_scenes();
+    }
+
+    /// Lends what can be lent, each worker its own first, frame after frame; then, to threads that are
+    /// still dry, what is others'. Whether a frame came to its end, so that there is more to do.
+    fn go_on(&mut self, clock: &dyn Clock) -> bool {
+        let mut ended = false;
+        let mut i = 0;
         loop {
-            let mut frame = match self.current.take() {
-                Some(frame) => frame,
-                None => match self.waiting.pop_front() {
-                    Some(job) => Frame::start(job, &mut self.cluster, clock),
-                    None => break,
-                },
-            };
-            match frame.step(&mut self.cluster, clock) {
-                Step::Waits => {
-                    self.current = Some(frame);
+            if i == self.active.len() {
+                if !self.may_begin() {
                     break;
                 }
-                Step::Done => {
-                    frame.end(&mut self.cluster);
-                    let done = frame.finish(&mut self.cluster, clock.now());
-                    self.cluster.out.push_back(done);
-                }
+                let Some(job) = self.waiting.pop_front() else { break };
+                self.active.push_back(Frame::start(job, &mut self.cluster, clock));
+            }
+            let turn = self.turn(i, false);
+            match self.active[i].step(&mut self.cluster, &turn, clock) {
+                Step::Waits | Step::Done => i += 1,
                 Step::Failed(reason) => {
-                    frame.end(&mut self.cluster);
-                    let frame = frame.job.frame;
+                    let mut failed = self.active.remove(i).expect("it was just stepped");
+                    failed.end(&mut self.cluster);
+                    let frame = failed.job.frame;
                     self.cluster.out.push_back(Action::FrameFailed { frame, reason });
+                    ended = true;
                 }
             }
         }
-        self.forget_scenes();
+        for i in 0..self.active.len() {
+            if self.active[i].by_region() && !self.active[i].is_done() {
+                let turn = self.turn(i, true);
+                self.active[i].step(&mut self.cluster, &turn, clock);
+            }
+        }
+        while self.active.front().is_some_and(Frame::is_done) {
+            let Some(mut done) = self.active.pop_front() else { break };
+            done.end(&mut self.cluster);
+            let done = done.finish(&mut self.cluster, clock.now());
+            self.cluster.out.push_back(done);
+            ended = true;
+        }
+        ended
+    }
+
+    /// Whether the next frame may begin beside those in the making: both go by region and share their
+    /// bricks, and some thread has nothing more to do.
+    fn may_begin(&self) -> bool {
+        if self.active.is_empty() {
+            return true;
+        }
+        if self.active.len() >= FRAMES_AT_ONCE || !self.follows() {
+            return false;
+        }
+        let ahead = u64::from(self.cluster.config.queue_ahead.max(1));
+        let load = |id| self.active.iter().map(|f| u64::from(f.leases(id))).sum::<u64>();
+        self.cluster.roster.staying().any(|(id, w)| load(id) < u64::from(w.threads) * ahead)
+    }
+
+    /// Whether the next frame in the queue goes by region on the bricks of those in the making.
+    fn follows(&self) -> bool {
+        let next = self.waiting.front().filter(|job| goes_by_region(job));
+        let beside =
+            |f: &Frame, job: &FrameJob| f.by_region() && f.job.scene.bricks == job.scene.bricks;
+        next.is_some_and(|job| self.active.iter().all(|f| beside(f, job)))
+    }
+
+    /// What the others mean to frame `i`.
+    fn turn(&self, i: usize, others: bool) -> Turn {
+        let mut turn = Turn { others, ..Turn::default() };
+        turn.last = i + 1 == self.active.len() && !self.follows();
+        for (_, frame) in self.active.iter().enumerate().filter(|(at, _)| *at != i) {
+            for (id, _) in self.cluster.roster.iter() {
+                *turn.elsewhere.entry(id).or_default() += u64::from(frame.leases(id));
+            }
+        }
+        turn
     }
 
     /// Ends scenes that have no frame left.
     fn forget_scenes(&mut self) {
         let used = |scene: SceneId| {
             let waiting = self.waiting.iter().map(|job| job.scene.id);
-            waiting.chain(self.current.as_ref().map(|f| f.job.scene.id)).any(|s| s == scene)
+            waiting.chain(self.active.iter().map(|f| f.job.scene.id)).any(|s| s == scene)
         };
         let over: Vec<_> = self.ended.iter().copied().filter(|&s| !used(s)).collect();
         for scene in over {
@@ -542,7 +665,7 @@ impl Scheduler {
 
     /// When [`Event::Tick`] is due at the latest.
     pub fn next_deadline(&self) -> Option<Micros> {
-        let frame = self.current.as_ref().and_then(Frame::next_deadline);
+        let frame = self.active.iter().filter_map(Frame::next_deadline).min();
         let roster = self.cluster.roster.next_deadline(&self.cluster.config);
         roster.into_iter().chain(frame).min()
     }
@@ -550,7 +673,7 @@ impl Scheduler {
     /// The workers, by id.
     pub fn workers(&self) -> Vec<WorkerView> {
         let view = |(id, w): (WorkerId, &roster::Worker)| {
-            let leases = self.current.as_ref().map_or(0, |f| f.leases(id));
+            let leases = self.active.iter().map(|f| f.leases(id)).sum::<u32>();
             let (bricks_held, bytes_held) = self.cluster.residency.held(id);
             WorkerView {
                 id,
@@ -574,7 +697,7 @@ impl Scheduler {
 
     /// Whether there is no frame to render.
     pub fn is_idle(&self) -> bool {
-        self.current.is_none() && self.waiting.is_empty()
+        self.active.is_empty() && self.waiting.is_empty()
     }
 
     /// Whether there is a worker, leaving or not.

@@ -136,25 +136,99 @@ pub fn cut(
     forced: Option<u32>,
 ) -> Cut {
     let to_render = |n: &Node| if cull { n.open > 0 } else { n.covered > 0 };
-    let mut tree = vec![leaves(size, rects, shut)];
+    let tree = tree(leaves(size, rects, shut));
+    let level = forced_level(forced).or_else(|| coarsest(&tree, &to_render, wanted)).unwrap_or(0);
+    list(size, &tree[level], level, &to_render, |rect| shut.all_shut(rect))
+}
+
+/// Cuts a picture for tasks that go through all depths: nothing is shut, and pixels count as covered
+/// by leaves, which costs rectangles + leaves and no look at a pixel. So `rects` may be those of
+/// blocks of bricks.
+///
+/// A tile's size does not change what drawing it takes until it is smaller than a part of 64 pixels
+/// (docs/scaling.md), while each task costs its messages. So the coarsest level is chosen that still
+/// gives `many` tiles; one finer than that of 64 pixels only where there would be no more than
+/// `wanted`.
+pub fn cut_through(
+    size: [u32; 2],
+    rects: &[Rect],
+    (wanted, many): (u64, u64),
+    forced: Option<u32>,
+) -> Cut {
+    const PART: usize = 2;
+    let to_render = |n: &Node| n.covered > 0;
+    let tree = tree(covered_leaves(size, rects));
+    let level = forced_level(forced)
+        .or_else(|| coarsest(&tree, &to_render, many).filter(|&level| level >= PART))
+        .or_else(|| coarsest(&tree, &to_render, wanted).map(|level| level.min(PART)))
+        .unwrap_or(0);
+    list(size, &tree[level], level, &to_render, |_| false)
+}
+
+/// Levels of the quadtree above these leaves.
+fn tree(leaves: Grid<Node>) -> Vec<Grid<Node>> {
+    let mut tree = vec![leaves];
     for level in 1..LEVELS {
         let join =
             |a: Node, b: Node| Node { covered: a.covered + b.covered, open: a.open + b.open };
         let up = tree[level - 1].parent(Node::default(), join);
         tree.push(up);
     }
-    let level = match forced {
-        Some(edge) => {
-            let level = (0..LEVELS).find(|&l| LEAF << l == edge);
-            level.expect("Work::check lets only quadtree levels through")
+    tree
+}
+
+fn forced_level(forced: Option<u32>) -> Option<usize> {
+    let level = |edge| (0..LEVELS).find(|&l| LEAF << l == edge);
+    forced.map(|edge| level(edge).expect("Work::check lets only quadtree levels through"))
+}
+
+/// The coarsest level at which more than `wanted` tiles are to be rendered.
+fn coarsest(tree: &[Grid<Node>], to_render: &impl Fn(&Node) -> bool, wanted: u64) -> Option<usize> {
+    let count = |l: usize| tree[l].cells.iter().filter(|n| to_render(n)).count() as u64;
+    (0..LEVELS).rev().find(|&l| count(l) > wanted)
+}
+
+/// Counts the pixels of leaves that a rectangle lies over, each leaf as a whole.
+fn covered_leaves(size: [u32; 2], rects: &[Rect]) -> Grid<Node> {
+    let [columns, rows] = size.map(|n| n.div_ceil(LEAF) as usize);
+    // A rectangle adds one to its corner leaf and takes it back behind its last column and row.
+    let mut over = Grid::new(columns + 1, rows + 1, 0i64);
+    for r in rects {
+        let first = |p: i32| (p / LEAF as i32) as usize;
+        let end = |p: i32| ((p - 1) / LEAF as i32) as usize + 1;
+        let (x0, x1, y0, y1) = (first(r.x0), end(r.x1), first(r.y0), end(r.y1));
+        for (x, y, add) in [(x0, y0, 1), (x1, y0, -1), (x0, y1, -1), (x1, y1, 1)] {
+            over.cells[y * over.columns + x] += add;
         }
-        None => (0..LEVELS)
-            .rev()
-            .find(|&l| tree[l].cells.iter().filter(|n| to_render(n)).count() as u64 > wanted)
-            .unwrap_or(0),
-    };
+    }
+    let picture = Rect::of_size(size);
+    let mut grid = Grid::new(columns, rows, Node::default());
+    let mut above = vec![0; columns];
+    for y in 0..rows {
+        let mut run = 0;
+        for (x, above) in above.iter_mut().enumerate() {
+            run += over.cells[y * over.columns + x];
+            *above += run;
+            if *above > 0 {
+                let (x0, y0) = (x as i32 * LEAF as i32, y as i32 * LEAF as i32);
+                let leaf = Rect::new(x0, y0, x0 + LEAF as i32, y0 + LEAF as i32);
+                let pixels = leaf.intersect(&picture).area() as u64;
+                grid.cells[y * columns + x] = Node { covered: pixels, open: pixels };
+            }
+        }
+    }
+    grid
+}
+
+/// The tiles of one level.
+fn list(
+    size: [u32; 2],
+    grid: &Grid<Node>,
+    level: usize,
+    to_render: &impl Fn(&Node) -> bool,
+    is_shut: impl Fn(&Rect) -> bool,
+) -> Cut {
     let edge = LEAF << level;
-    let grid = &tree[level];
     let picture = Rect::of_size(size);
     let (mut empty, mut all_shut) = (0, 0);
     let mut tiles = Vec::new();
@@ -165,28 +239,36 @@ pub fn cut(
             let node = &grid.cells[y * grid.columns + x];
             if to_render(node) {
                 tiles.push(Macrotile { rect, est: node.open });
-            } else if shut.all_shut(&rect) {
+            } else if is_shut(&rect) {
                 all_shut += 1;
             } else {
                 empty += 1;
             }
         }
     }
-    // Stable: equal workloads stay in the order of the picture.
-    tiles.sort_by_key(|t| std::cmp::Reverse(t.est));
-    let mut first = vec![Grid::new(grid.columns, grid.rows, u32::MAX)];
-    for (place, tile) in tiles.iter().enumerate() {
-        let (x, y) = (tile.rect.x0 as usize >> edge.ilog2(), tile.rect.y0 as usize >> edge.ilog2());
-        first[0].cells[y * grid.columns + x] = place as u32;
-    }
-    while first.last().is_some_and(|g| g.cells.len() > 1) {
-        let up = first.last().expect("there is one").parent(u32::MAX, u32::min);
-        first.push(up);
-    }
-    Cut { edge, tiles, empty, shut: all_shut, first }
+    let mut cut = Cut { edge, tiles, empty, shut: all_shut, first: Vec::new() };
+    cut.sort(size);
+    cut
 }
 
 impl Cut {
+    /// Puts the tiles in the order of their workload; equal ones stay in that of the picture, or in
+    /// the one they have.
+    pub fn sort(&mut self, size: [u32; 2]) {
+        self.tiles.sort_by_key(|t| std::cmp::Reverse(t.est));
+        let [columns, rows] = size.map(|n| n.div_ceil(self.edge) as usize);
+        let mut first = vec![Grid::new(columns, rows, u32::MAX)];
+        for (place, tile) in self.tiles.iter().enumerate() {
+            let [x, y] = [tile.rect.x0, tile.rect.y0].map(|p| p as usize >> self.edge.ilog2());
+            first[0].cells[y * columns + x] = place as u32;
+        }
+        while first.last().is_some_and(|g| g.cells.len() > 1) {
+            let up = first.last().expect("there is one").parent(u32::MAX, u32::min);
+            first.push(up);
+        }
+        self.first = first;
+    }
+
     /// The first place in `tiles` of a tile that `rect` (not empty, inside the picture) touches.
     /// Descends the quadtree and turns back where nothing better can lie below, so a brick over
     /// the whole picture costs one look and not one for every tile.
@@ -293,6 +375,20 @@ mod tests {
         assert!(all.iter().all(|r| c.first_in(r) == Some(0)));
     }
 
+    #[test]
+    fn a_cut_through_all_depths_is_as_coarse_as_drawing_allows() {
+        let size = [512, 512];
+        let all = [Rect::of_size(size)];
+        let edge = |wanted, many| cut_through(size, &all, (wanted, many), None).edge;
+        assert_eq!(edge(5, 32), 64);
+        assert_eq!(edge(2, 3), 256, "few threads, few tiles");
+        assert_eq!(edge(40, 256), 64, "64 are not many, but more than wanted");
+        assert_eq!(edge(100, 512), 32, "64 are too few");
+        assert_eq!(edge(100_000, 1 << 40), 16);
+        assert_eq!(cut_through(size, &all, (9, 9), Some(128)).tiles.len(), 16);
+        assert!(cut_through(size, &[], (9, 9), None).tiles.is_empty());
+    }
+
     fn rects(w: i32, h: i32) -> impl Strategy<Value = Vec<Rect>> {
         let one = (0..w, 0..h, 1..=w, 1..=h)
             .prop_map(move |(x, y, dx, dy)| Rect::new(x, y, (x + dx).min(w), (y + dy).min(h)));
@@ -338,6 +434,20 @@ mod tests {
             tiles.sort_by_key(|t| std::cmp::Reverse(t.est));
             prop_assert_eq!(&c.tiles, &tiles);
             prop_assert_eq!(c.empty + c.shut + tiles.len() as u64, total);
+            // Through all depths a leaf counts as a whole, in rows and columns of any length.
+            let through = cut_through(size, &rects, (0, 0), Some(16));
+            let leaf = |r: &Rect| {
+                let under = |b: &Rect| !b.intersect(r).is_empty();
+                rects.iter().any(under).then_some(r.area() as u64)
+            };
+            let whole = Rect::of_size(size);
+            for y0 in (0..h).step_by(16) {
+                for x0 in (0..w).step_by(16) {
+                    let r = Rect::new(x0, y0, x0 + 16, y0 + 16).intersect(&whole);
+                    let got = through.tiles.iter().find(|t| t.rect == r).map(|t| t.est);
+                    prop_assert_eq!(got, leaf(&r), "{:?}", r);
+                }
+            }
             for r in &rects {
                 let want = tiles.iter().position(|t| !t.rect.intersect(r).is_empty());
                 prop_assert_eq!(c.first_in(r), want.map(|p| p as u32));

@@ -15,6 +15,10 @@
 //!   those of its other leases. One lease that is larger than the budget alone goes anyway, and
 //!   is counted: the picture comes first.
 //!
+//! - **On request.** Under the `region` schedule workers ask for what they need, when they need it,
+//!   and make room themselves: only they know what their regions stand on. Then this room sends what
+//!   was asked for and not sent, notes what they say they forgot, and evicts nothing.
+//!
 //! The measure of memory is a brick's encoded size. A worker's own representation is larger or
 //! smaller by its own factor, which it knows when it states its budget.
 
@@ -72,6 +76,17 @@ pub(crate) struct Flight {
     pub(crate) bytes: u64,
 }
 
+/// How a worker comes by bricks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Mode {
+    /// It gets all that a slab needs.
+    Broadcast,
+    /// It gets those of its leases.
+    Lazy,
+    /// It asks, and makes room itself.
+    Asks,
+}
+
 /// One worker's memory.
 #[derive(Debug)]
 struct Shelf {
@@ -89,7 +104,9 @@ struct Shelf {
     leaving: VecDeque<(u64, BrickSetKey, Vec<u32>)>,
     /// What is to be sent, in order; of the current set.
     wanted: VecDeque<u32>,
-    lazy: bool,
+    /// What it asked for and can't be sent before its drop is confirmed, or has to go again.
+    owed: VecDeque<(BrickSetKey, u32)>,
+    mode: Mode,
     flight: Option<Flight>,
 }
 
@@ -120,6 +137,8 @@ pub(crate) struct Residency {
     current: BrickSetKey,
     /// Bytes that the round's needed bricks take.
     round_bytes: u64,
+    /// Whether workers ask for the bricks of the current set.
+    asks: bool,
 }
 
 fn place_of(bricks: &[BrickInfo], id: BrickId) -> Option<u32> {
@@ -142,7 +161,8 @@ impl Residency {
             told: BTreeMap::new(),
             leaving: VecDeque::new(),
             wanted: VecDeque::new(),
-            lazy: false,
+            owed: VecDeque::new(),
+            mode: Mode::Broadcast,
             flight: None,
         };
         let before = self.shelves.insert(worker, shelf);
@@ -181,8 +201,16 @@ impl Residency {
         }
     }
 
-    /// Makes `key` the set that tasks are drawn from.
-    pub(crate) fn open(&mut self, key: BrickSetKey, bricks: &Arc<[BrickInfo]>) {
+    /// Makes `key` the set that tasks are drawn from. `asks`: workers ask for its bricks; then a set
+    /// that is open stays as it is, since frames that overlap share it.
+    pub(crate) fn open(&mut self, key: BrickSetKey, bricks: &Arc<[BrickInfo]>, asks: bool) {
+        if asks {
+            self.round += 1;
+            if self.asks && self.current == key && self.sets.contains_key(&key) {
+                return;
+            }
+        }
+        self.asks = asks;
         self.rest();
         for shelf in self.shelves.values_mut() {
             // Books without an entry.
@@ -234,20 +262,26 @@ impl Residency {
     /// to be sent for the slab before, but for leases it has not given back.
     fn settle_mode(&mut self, worker: WorkerId) {
         let shelf = self.shelves.get_mut(&worker).expect("a worker with a shelf");
-        shelf.lazy = self.round_bytes.saturating_add(shelf.pinned_bytes) > shelf.budget;
+        shelf.mode = if self.asks {
+            Mode::Asks
+        } else if self.round_bytes.saturating_add(shelf.pinned_bytes) > shelf.budget {
+            Mode::Lazy
+        } else {
+            Mode::Broadcast
+        };
         shelf.keep_wanted(self.current, |pins| pins > 0);
     }
 
     /// Whether a worker gets only the bricks of its leases.
     pub(crate) fn is_lazy(&self, worker: WorkerId) -> bool {
-        self.shelves[&worker].lazy
+        self.shelves[&worker].mode == Mode::Lazy
     }
 
     /// Whether a lease's bricks fit beside those of the worker's other leases. Always so for a
     /// worker that gets the whole slab.
     pub(crate) fn fits(&self, worker: WorkerId, lease: &[u32]) -> bool {
         let shelf = &self.shelves[&worker];
-        if !shelf.lazy {
+        if shelf.mode != Mode::Lazy {
             return true;
         }
         let books = shelf.sets.get(&self.current);
@@ -314,7 +348,8 @@ impl Residency {
         let mut errands = Vec::new();
         let key = self.current;
         let Some(shelf) = self.shelves.get_mut(&worker) else { return errands };
-        if shelf.lazy {
+        pay(&self.sets, shelf, now, &mut errands);
+        if shelf.mode == Mode::Lazy {
             // Of a lease that ended without its bricks.
             shelf.keep_wanted(key, |pins| pins > 0);
         }
@@ -336,9 +371,14 @@ impl Residency {
         let mut stay = VecDeque::new();
         while let Some(i) = shelf.wanted.pop_front() {
             let at = i as usize;
+            if matches!(books.place[at], Place::Flying | Place::Held) {
+                // The worker asked for it meanwhile.
+                books.wanted[at] = false;
+                continue;
+            }
             let fits = shelf.bytes + size(i) <= shelf.budget;
             // Nothing more can be made room for: a lease larger than the budget.
-            let force = !fits && alone && shelf.lazy && books.pins[at] > 0;
+            let force = !fits && alone && shelf.mode == Mode::Lazy && books.pins[at] > 0;
             if books.place[at] == Place::Leaving || !(fits || force) {
                 stay.push_back(i);
                 continue;
@@ -353,9 +393,7 @@ impl Residency {
         }
         shelf.wanted = stay;
         if !send.is_empty() {
-            let flight = shelf.flight.get_or_insert(Flight { since: now, bricks: 0, bytes: 0 });
-            flight.bricks += send.len() as u64;
-            flight.bytes += bytes;
+            shelf.departs(now, send.len() as u64, bytes);
             errands.push(Errand::Send { set: key, bricks: send, bytes, over_budget });
         }
         errands
@@ -416,17 +454,73 @@ impl Residency {
             shelf.bytes -= bytes;
             again.push(i);
         }
-        if key == self.current {
+        if shelf.mode == Mode::Asks {
+            shelf.owed.extend(again.into_iter().map(|i| (key, i)));
+        } else if key == self.current {
             // Those that somebody waits for are in front of all others.
             let round = self.round;
             for &i in again.iter().rev() {
-                if books.pins[i as usize] > 0 || (!shelf.lazy && set.needed[i as usize] == round) {
+                let broadcast = shelf.mode == Mode::Broadcast;
+                if books.pins[i as usize] > 0 || (broadcast && set.needed[i as usize] == round) {
                     books.wanted[i as usize] = true;
                     shelf.wanted.push_front(i);
                 }
             }
         }
         shelf.landed()
+    }
+
+    /// A worker asks for these, or is to have them because it will: what it neither has nor will get
+    /// is sent by the next flush. Sets that are not open and ids that a set does not have are left
+    /// out.
+    pub(crate) fn owe(
+        &mut self,
+        worker: WorkerId,
+        key: BrickSetKey,
+        bricks: impl IntoIterator<Item = u32>,
+    ) {
+        let (Some(set), Some(shelf)) = (self.sets.get(&key), self.shelves.get_mut(&worker)) else {
+            return;
+        };
+        shelf.sets.entry(key).or_insert_with(|| Books::new(set.bricks.len()));
+        shelf.owed.extend(bricks.into_iter().map(|i| (key, i)));
+    }
+
+    /// Places of these bricks in their set, as far as it has them.
+    pub(crate) fn places(&self, key: BrickSetKey, ids: &[BrickId]) -> Vec<u32> {
+        let Some(set) = self.sets.get(&key) else { return Vec::new() };
+        ids.iter().filter_map(|&id| place_of(&set.bricks, id)).collect()
+    }
+
+    /// These were drawn from, somewhere.
+    pub(crate) fn touched(&mut self, key: BrickSetKey, places: &[u32]) {
+        let Some(set) = self.sets.get_mut(&key) else { return };
+        for &i in places {
+            set.needed[i as usize] = self.round;
+        }
+    }
+
+    /// A worker forgot these. What a lease of its needs goes again.
+    pub(crate) fn forgotten(&mut self, worker: WorkerId, key: BrickSetKey, ids: &[BrickId]) {
+        let (Some(set), Some(shelf)) = (self.sets.get(&key), self.shelves.get_mut(&worker)) else {
+            return;
+        };
+        let Some(books) = shelf.sets.get_mut(&key) else { return };
+        for &id in ids {
+            let Some(i) = place_of(&set.bricks, id) else { continue };
+            if books.place[i as usize] != Place::Held {
+                continue;
+            }
+            let bytes = u64::from(set.bricks[i as usize].bytes);
+            books.place[i as usize] = Place::Absent;
+            books.held_count -= 1;
+            books.held_bytes -= bytes;
+            shelf.bytes -= bytes;
+            if books.pins[i as usize] > 0 && key == self.current {
+                books.wanted[i as usize] = true;
+                shelf.wanted.push_back(i);
+            }
+        }
     }
 
     /// All control messages up to the ping `nonce` were read: what left before it is gone.
@@ -444,9 +538,9 @@ impl Residency {
         }
     }
 
-    /// Bricks and bytes that a worker has of the current set.
-    pub(crate) fn held_of_current(&self, worker: WorkerId) -> (u64, u64) {
-        let books = self.shelves.get(&worker).and_then(|s| s.sets.get(&self.current));
+    /// Bricks and bytes that a worker has of a set.
+    pub(crate) fn held_of(&self, worker: WorkerId, key: BrickSetKey) -> (u64, u64) {
+        let books = self.shelves.get(&worker).and_then(|s| s.sets.get(&key));
         books.map_or((0, 0), |b| (b.held_count, b.held_bytes))
     }
 
@@ -485,9 +579,55 @@ impl Shelf {
         });
     }
 
+    /// Bricks leave for the worker.
+    fn departs(&mut self, now: Micros, bricks: u64, bytes: u64) {
+        let flight = self.flight.get_or_insert(Flight { since: now, bricks: 0, bytes: 0 });
+        flight.bricks += bricks;
+        flight.bytes += bytes;
+    }
+
     /// The flight, when nothing is on its way any more.
     fn landed(&mut self) -> Option<Flight> {
         if self.sets.values().all(|b| b.flying.is_empty()) { self.flight.take() } else { None }
+    }
+}
+
+/// Sends what a worker asked for, as far as it neither has it nor will get it. What it is to forget
+/// waits until it has.
+fn pay(
+    sets: &BTreeMap<BrickSetKey, Set>,
+    shelf: &mut Shelf,
+    now: Micros,
+    errands: &mut Vec<Errand>,
+) {
+    for (key, i) in std::mem::take(&mut shelf.owed) {
+        // A set may be closed before its last bricks are asked for.
+        let (Some(set), Some(books)) = (sets.get(&key), shelf.sets.get_mut(&key)) else { continue };
+        let info = &set.bricks[i as usize];
+        match books.place[i as usize] {
+            Place::Flying | Place::Held => continue,
+            Place::Leaving => {
+                shelf.owed.push_back((key, i));
+                continue;
+            }
+            Place::Absent => {}
+        }
+        books.place[i as usize] = Place::Flying;
+        books.flying.push_back(i);
+        shelf.bytes += u64::from(info.bytes);
+        shelf.departs(now, 1, info.bytes.into());
+        match errands.last_mut() {
+            Some(Errand::Send { set, bricks, bytes, .. }) if *set == key => {
+                bricks.push(info.id);
+                *bytes += u64::from(info.bytes);
+            }
+            _ => errands.push(Errand::Send {
+                set: key,
+                bricks: vec![info.id],
+                bytes: info.bytes.into(),
+                over_budget: false,
+            }),
+        }
     }
 }
 
@@ -505,7 +645,7 @@ fn evict(
     for (key, books) in &shelf.sets {
         let needed = &sets[key].needed;
         for (i, place) in books.place.iter().enumerate() {
-            let spare = shelf.lazy || needed[i] < round;
+            let spare = shelf.mode == Mode::Lazy || needed[i] < round;
             if *place == Place::Held && books.pins[i] == 0 && spare {
                 victims.push((needed[i], *key, i as u32));
             }
@@ -555,7 +695,7 @@ mod tests {
             .collect();
         let mut r = Residency::default();
         r.join(W, budget, vec![(KEY, vec![BrickId(0), BrickId(0), BrickId(3)])]);
-        r.open(KEY, &bricks);
+        r.open(KEY, &bricks, false);
         r
     }
 

@@ -16,7 +16,9 @@
 //! to everybody's account.
 
 use crate::{Config, Micros};
+use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{SceneId, WorkerId};
+use slabcast_common::message::DIRECTORIES;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 /// How fast two machines' clocks may drift apart: 100 ppm, twice what quartz is sold with. A
@@ -41,6 +43,8 @@ pub(crate) struct Worker {
     pub(crate) leaving: bool,
     /// Scenes it was sent.
     pub(crate) scenes: BTreeSet<SceneId>,
+    /// Sets whose directories it was sent and keeps, the last one last.
+    directories: VecDeque<BrickSetKey>,
     heard: Micros,
     next_ping: Micros,
     /// Pings without pong, oldest first.
@@ -58,6 +62,18 @@ struct Offset {
 }
 
 impl Worker {
+    /// Whether it has to be sent the directory of a set, which it then is.
+    pub(crate) fn lacks_directory(&mut self, set: BrickSetKey) -> bool {
+        if self.directories.contains(&set) {
+            return false;
+        }
+        self.directories.push_back(set);
+        if self.directories.len() > DIRECTORIES {
+            self.directories.pop_front();
+        }
+        true
+    }
+
     /// A time on the worker's clock on the master's; `None` before the first pong.
     pub(crate) fn to_master(&self, worker_us: u64) -> Option<Micros> {
         let o = self.offset?;
@@ -81,6 +97,7 @@ impl Roster {
             since: now,
             leaving: false,
             scenes: BTreeSet::new(),
+            directories: VecDeque::new(),
             heard: now,
             next_ping: now,
             pings: VecDeque::new(),

@@ -7,7 +7,7 @@ use slabcast_common::ids::{BrickId, FrameId, SceneId, WorkerId};
 use slabcast_common::image::TilePixels;
 use slabcast_common::message::{SceneSpec, TaskTimes, TileResult, ToWorker};
 use slabcast_common::presets;
-use slabcast_common::quality::{Quality, Work};
+use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
@@ -20,6 +20,10 @@ impl Clock for Wall {
     fn now(&self) -> Micros {
         self.0.elapsed().as_micros() as Micros
     }
+}
+
+fn slab() -> Work {
+    Work { schedule: Schedule::Slab, ..Work::default() }
 }
 
 /// A frame of `edge` pixels over a cube of `n` bricks each way, on `workers` workers that answer
@@ -78,7 +82,7 @@ fn cost(n: u32, edge: u32, height: f64, workers: u64, work: Work) -> f64 {
                     let times = TaskTimes::default();
                     let counters = Default::default();
                     let (task, epoch) = (l.task, l.epoch);
-                    let result = TileResult { task, epoch, pixels, counters, times };
+                    let result = TileResult { task, epoch, pixels, counters, times, region: None };
                     events.push(Event::Result { worker, result: Box::new(result) });
                 }
                 Action::SendBricks { worker, set, bricks } => {
@@ -102,20 +106,20 @@ fn cost(n: u32, edge: u32, height: f64, workers: u64, work: Work) -> f64 {
 
 #[test]
 fn planning_a_slab_of_15000_bricks_takes_milliseconds() {
-    let best = (0..3).map(|_| cost(25, 512, 1.7, 4, Work::default())).fold(f64::MAX, f64::min);
+    let best = (0..3).map(|_| cost(25, 512, 1.7, 4, slab())).fold(f64::MAX, f64::min);
     // 20 times what it takes on an idle machine; a quadratic mistake takes more.
     assert!(best < 40.0, "{best} ms");
 }
 
 #[test]
 fn many_workers_and_tiles_take_no_more_than_their_number() {
-    cost(25, 512, 1.7, 100, Work { tile: Some(16), ..Work::default() });
+    cost(25, 512, 1.7, 100, Work { tile: Some(16), ..slab() });
     // Each brick covers a large part of the picture: 4,096 tiles of thousands of bricks.
-    cost(12, 1024, 0.05, 4, Work { tile: Some(16), slabs: 2, ..Work::default() });
+    cost(12, 1024, 0.05, 4, Work { tile: Some(16), slabs: 2, ..slab() });
 }
 
 #[test]
 #[ignore = "takes 4 GiB: a frame's state is 48 bytes a pixel"]
 fn the_largest_picture_works() {
-    cost(25, 8192, 1.7, 4, Work::default());
+    cost(25, 8192, 1.7, 4, slab());
 }

@@ -93,6 +93,8 @@ enum Noted {
     Failed { w: u64, task: u64, epoch: u32, reason: String },
     BricksIn { w: u64, set: String, bricks: u32 },
     BricksBroken { w: u64, set: String, bricks: Vec<u32> },
+    BricksWanted { w: u64, set: String, bricks: Vec<u32> },
+    BricksForgotten { w: u64, set: String, bricks: Vec<u32> },
     Pong { w: u64, nonce: u64, clock_us: u64 },
     Tick,
 }
@@ -123,6 +125,9 @@ struct NotedResult {
     /// Received, ready, start, end, on the worker's clock.
     us: [u64; 4],
     thread: u32,
+    /// Of a region: places that it touched; stalls, parked, idle.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    region: Option<(Vec<u32>, u32, u64, u64)>,
 }
 
 impl NotedResult {
@@ -138,6 +143,10 @@ impl NotedResult {
             voxels: [c.tossed, c.splatted, c.culled],
             us: [t.received_us, t.ready_us, t.start_us, t.end_us],
             thread: t.thread,
+            region: result
+                .region
+                .as_ref()
+                .map(|r| (r.touched.clone(), r.stalls, r.parked_us, r.idle_us)),
         }
     }
 }
@@ -221,6 +230,16 @@ fn say(message: &ToWorker) -> String {
         ToWorker::Frame { frame, scene, .. } => format!("{frame} of {scene}"),
         ToWorker::EndFrame { frame } => format!("end of {frame}"),
         ToWorker::EndScene { scene } => format!("end of {scene}"),
+        ToWorker::Region(l) => {
+            let ([x0, y0], [x1, y1]) = ([l.tile.x0, l.tile.y0], [l.tile.x1, l.tile.y1]);
+            let (task, epoch, frame) = (l.task, l.epoch, l.frame);
+            format!("region {task} {epoch} of {frame}, ({x0},{y0}) to ({x1},{y1})")
+        }
+        ToWorker::Directory { set, bricks, .. } => {
+            let ids: Vec<_> = bricks.iter().map(|b| b.id).collect();
+            let set = &set.0.to_string()[..16];
+            format!("directory of {set}, {} bricks {:016x}", ids.len(), hash_of(&ids))
+        }
         ToWorker::DropBricks { bricks, .. } => {
             format!("forget {} bricks {:016x}", bricks.len(), hash_of(bricks))
         }
@@ -372,6 +391,16 @@ fn noted(event: &Event, shut: impl Fn(&TileResult, f32) -> bool) -> Option<Noted
             Noted::BricksIn { w: worker.0, set: set(key), bricks: *bricks }
         }
         Event::BricksBroken { worker, set: key, bricks } => Noted::BricksBroken {
+            w: worker.0,
+            set: set(key),
+            bricks: bricks.iter().map(|b| b.0).collect(),
+        },
+        Event::BricksWanted { worker, set: key, bricks } => Noted::BricksWanted {
+            w: worker.0,
+            set: set(key),
+            bricks: bricks.iter().map(|b| b.0).collect(),
+        },
+        Event::BricksForgotten { worker, set: key, bricks } => Noted::BricksForgotten {
             w: worker.0,
             set: set(key),
             bricks: bricks.iter().map(|b| b.0).collect(),

@@ -9,7 +9,7 @@ use slabcast_common::PIXELS_VERSION;
 use slabcast_common::brick::{BRICK_VOXELS, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::{Counters, SceneSpec, TaskTimes, TileResult};
+use slabcast_common::message::{Counters, RegionCost, SceneSpec, TaskTimes, TileResult};
 use slabcast_common::volume::Digest32;
 use slabcast_proto::{convert, v1};
 use slabcast_schedule::{Clock, Config, Event, FrameJob, Micros, Scheduler};
@@ -353,6 +353,12 @@ fn event(e: Noted, seen: &mut Seen) -> Result<Event, String> {
         Noted::BricksBroken { w, set, bricks } => {
             Event::BricksBroken { worker: WorkerId(w), set: key(&set)?, bricks: ids(bricks) }
         }
+        Noted::BricksWanted { w, set, bricks } => {
+            Event::BricksWanted { worker: WorkerId(w), set: key(&set)?, bricks: ids(bricks) }
+        }
+        Noted::BricksForgotten { w, set, bricks } => {
+            Event::BricksForgotten { worker: WorkerId(w), set: key(&set)?, bricks: ids(bricks) }
+        }
         Noted::Pong { w, nonce, clock_us } => Event::Pong { worker: WorkerId(w), nonce, clock_us },
         Noted::Tick => Event::Tick,
     })
@@ -401,5 +407,11 @@ fn result(r: &NotedResult) -> Result<TileResult, String> {
         pixels,
         counters: Counters { tossed, splatted, culled },
         times: TaskTimes { received_us, ready_us, start_us, end_us, thread: r.thread },
+        region: r.region.clone().map(|(touched, stalls, parked_us, idle_us)| RegionCost {
+            touched,
+            stalls,
+            parked_us,
+            idle_us,
+        }),
     })
 }

@@ -4,11 +4,11 @@ use super::{Broken, Difference, Replayed, Watched, Written, bits, replay, runs, 
 use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId, WorkerId};
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::{Counters, Lease, SceneSpec, TaskTimes, TileResult, ToWorker};
+use slabcast_common::message::{Counters, RegionCost, SceneSpec, TaskTimes, TileResult, ToWorker};
 use slabcast_common::path::Orientation;
 use slabcast_common::path::{Turntable, ViewPath};
 use slabcast_common::presets;
-use slabcast_common::quality::{Quality, Sums, Work};
+use slabcast_common::quality::{Quality, Schedule, Sums, Work};
 use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros};
@@ -51,7 +51,7 @@ impl Rng {
     }
 }
 
-fn jobs(rng: &mut Rng) -> Vec<FrameJob> {
+fn jobs(rng: &mut Rng, schedule: Schedule) -> Vec<FrameJob> {
     let volume = Volume::from_fn_u8("v", [40, 32, 24], |i, j, k| (i * 3 + j + k) as u8);
     let info = volume.info(Digest32([3; 32]));
     let transfer = presets::by_name("grey", &info.summary).expect("a known name");
@@ -78,7 +78,8 @@ fn jobs(rng: &mut Rng) -> Vec<FrameJob> {
         .map(|i| {
             let camera = path.camera(i, &info.lattice, orientation).expect("a camera");
             let view = View::new(&info.lattice, &camera, [96, 80], &quality).expect("a view");
-            let work = Work { slabs: 1 + rng.below(4) as u32, ..Work::default() };
+            let slabs = 1 + rng.below(4) as u32;
+            let work = Work { slabs, schedule, ..Work::default() };
             let (frame, number) = (FrameId(i as u64 + 1), i as u64);
             let (scene, bricks) = (scene.clone(), bricks.clone());
             FrameJob { frame, number, scene, bricks, view, work }
@@ -87,7 +88,7 @@ fn jobs(rng: &mut Rng) -> Vec<FrameJob> {
 }
 
 /// A run of one seed, recorded.
-fn recorded(seed: u64) -> (Vec<u8>, Written) {
+fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
     let mut rng = Rng(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
     let out = Shared::default();
     let (recorder, thread) = start(out.clone()).expect("a thread");
@@ -96,9 +97,14 @@ fn recorded(seed: u64) -> (Vec<u8>, Written) {
     let clock = Virtual(Cell::new(1000));
     let mut workers: Vec<WorkerId> = Vec::new();
     let mut next = 1;
-    let mut leases: Vec<(WorkerId, Box<Lease>)> = Vec::new();
-    let mut coming: Vec<Event> =
-        jobs(&mut rng).into_iter().rev().map(|job| Event::FrameQueued(Box::new(job))).collect();
+    let by_region = schedule == Schedule::Region;
+    // Task, epoch and pixels.
+    let mut leases = Vec::new();
+    let mut coming: Vec<Event> = jobs(&mut rng, schedule)
+        .into_iter()
+        .rev()
+        .map(|job| Event::FrameQueued(Box::new(job)))
+        .collect();
     let mut over = 0;
     for step in 0..20_000 {
         clock.0.set(clock.0.get() + rng.below(3_000));
@@ -119,9 +125,18 @@ fn recorded(seed: u64) -> (Vec<u8>, Written) {
                 Some(Event::WorkerLost { worker, reason: "its link closed".into() })
             }
             4 => Some(Event::Tick),
+            5 if by_region && !workers.is_empty() => {
+                let worker = workers[rng.below(workers.len() as u64) as usize];
+                let set = BrickSetKey(Digest32([9; 32]));
+                let bricks = vec![BrickId(rng.below(70) as u32), BrickId(rng.below(20) as u32)];
+                Some(match rng.below(3) {
+                    0 => Event::BricksForgotten { worker, set, bricks },
+                    _ => Event::BricksWanted { worker, set, bricks },
+                })
+            }
             _ if !leases.is_empty() => {
-                let (worker, l) = leases.remove(rng.below(leases.len() as u64) as usize);
-                let n = l.tile.area();
+                let which = rng.below(leases.len() as u64) as usize;
+                let (worker, (task, epoch), n): (WorkerId, _, usize) = leases.remove(which);
                 let mut pixels = TilePixels {
                     a: (0..n).map(|i| ((i as u64 + rng.0) % 7) as f32 / 6.0).collect(),
                     colour: vec![[5; 3]; n],
@@ -134,12 +149,19 @@ fn recorded(seed: u64) -> (Vec<u8>, Written) {
                 }
                 let start_us = clock.0.get().saturating_sub(900);
                 let times = TaskTimes { start_us, end_us: start_us + 700, ..TaskTimes::default() };
-                let (task, epoch) = (l.task, l.epoch);
+                let touched =
+                    (0..60).filter(|i| (i + rng.0).is_multiple_of(5)).map(|i| i as u32).collect();
+                let region = by_region.then_some(RegionCost {
+                    touched,
+                    stalls: 1,
+                    parked_us: 20,
+                    idle_us: 5,
+                });
                 let counters = Counters { tossed: 3, splatted: 2, culled: 1 };
                 if rng.below(50) == 0 {
                     Some(Event::Failed { worker, task, epoch, reason: "no \"reason\"".into() })
                 } else {
-                    let result = TileResult { task, epoch, pixels, counters, times };
+                    let result = TileResult { task, epoch, pixels, counters, times, region };
                     Some(Event::Result { worker, result: Box::new(result) })
                 }
             }
@@ -154,7 +176,12 @@ fn recorded(seed: u64) -> (Vec<u8>, Written) {
         let mut arrived = Vec::new();
         while let Some(action) = s.next_action() {
             match action {
-                Action::Send { worker, message: ToWorker::Lease(l) } => leases.push((worker, l)),
+                Action::Send { worker, message: ToWorker::Lease(l) } => {
+                    leases.push((worker, (l.task, l.epoch), l.tile.area()));
+                }
+                Action::Send { worker, message: ToWorker::Region(l) } => {
+                    leases.push((worker, (l.task, l.epoch), l.tile.area()));
+                }
                 Action::SendBricks { worker, set, bricks } => {
                     let bricks = bricks.len() as u32;
                     arrived.push(Event::BricksIn { worker, set, bricks });
@@ -183,8 +210,9 @@ fn recorded(seed: u64) -> (Vec<u8>, Written) {
 #[test]
 fn a_recorded_run_replays_identically() {
     let (mut frames, mut dropped) = (0, 0);
-    for seed in 0..12 {
-        let (bytes, written) = recorded(seed);
+    for seed in 0..24 {
+        let schedule = if seed % 2 == 0 { Schedule::Slab } else { Schedule::Region };
+        let (bytes, written) = recorded(seed, schedule);
         let done = replay(&bytes[..]).unwrap_or_else(|e| panic!("seed {seed}: {e}"));
         assert_eq!(done.difference, None, "seed {seed}");
         assert_eq!((done.events, done.decisions), (written.events, written.decisions));
@@ -192,7 +220,7 @@ fn a_recorded_run_replays_identically() {
         frames += done.frames;
         dropped += String::from_utf8_lossy(&bytes).matches("plane has").count();
     }
-    assert!(frames > 30 && dropped > 0, "{frames} frames, {dropped} liars");
+    assert!(frames > 60 && dropped > 0, "{frames} frames, {dropped} liars");
 }
 
 /// A record with one line changed.
@@ -218,7 +246,7 @@ fn tampered(
 
 #[test]
 fn a_changed_decision_is_found_at_its_line() {
-    let (bytes, _) = recorded(3);
+    let (bytes, _) = recorded(3, Schedule::Slab);
     let lease = |l: &str| l.starts_with("{\"out\"") && l.contains("lease t");
     let (line, changed) = tampered(&bytes, lease, |l| l.replacen("lease t", "lease t9", 1));
     let Replayed { difference: Some(d), .. } = replay(&changed[..]).expect("it can be read") else {
@@ -231,7 +259,7 @@ fn a_changed_decision_is_found_at_its_line() {
 
 #[test]
 fn a_changed_event_shows_in_what_is_decided() {
-    let (bytes, _) = recorded(5);
+    let (bytes, _) = recorded(5, Schedule::Slab);
     let result = |l: &str| l.contains("\"result\"") && l.contains("\"shut\":\"0");
     let (line, changed) = tampered(&bytes, result, |l| {
         let at = l.find("\"shut\":\"").expect("it has one") + 8;
@@ -250,7 +278,7 @@ fn a_changed_event_shows_in_what_is_decided() {
 
 #[test]
 fn broken_files_are_refused_with_their_line() {
-    let (bytes, _) = recorded(1);
+    let (bytes, _) = recorded(1, Schedule::Slab);
     let says = |bytes: &[u8]| replay(bytes).expect_err("it is broken").to_string();
     assert!(says(b"").starts_with("line 1: is not a record's first line"));
     assert!(says(b"PNG\n").starts_with("line 1: is not a record's first line"));

@@ -176,6 +176,9 @@ impl Tape {
             Action::Send { message: ToWorker::Lease(lease), .. } => {
                 self.frames.insert(lease.task, lease.frame);
             }
+            Action::Send { message: ToWorker::Region(lease), .. } => {
+                self.frames.insert(lease.task, lease.frame);
+            }
             Action::FrameDone { frame, .. } | Action::FrameFailed { frame, .. } => {
                 self.forget(*frame);
             }

@@ -7,11 +7,14 @@ use super::{
 };
 use crate::{MAX_BRICKS_MESSAGE, v1};
 use bytes::Bytes;
-use slabcast_common::brick::{Brick, BrickSetKey, MAX_BRICKS};
+use slabcast_common::brick::{
+    BRICK, BRICK_VOXELS, Brick, BrickGrid, BrickInfo, BrickSetKey, MAX_BRICKS, TightBox,
+};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::{RawSums, TilePixels, TileState};
 use slabcast_common::message::{
-    BrickBatch, Counters, Hello, Lease, TaskTimes, TileResult, ToMaster, ToWorker,
+    BrickBatch, Counters, Hello, Lease, RegionCost, RegionLease, TaskTimes, TileResult, ToMaster,
+    ToWorker,
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::slab::SheetRange;
@@ -24,6 +27,8 @@ use std::sync::Arc;
 pub enum Down {
     /// On Control.
     Control(v1::ToWorker),
+    /// On Control, one after the other.
+    Parts(Vec<v1::ToWorker>),
     /// On Bricks, in this order: bricks to forget keep their place among the bricks that are
     /// sent.
     Bricks(Vec<v1::BricksDown>),
@@ -73,6 +78,16 @@ pub fn from_worker_to_wire(message: &ToMaster) -> v1::FromWorker {
             set: key_to_wire(set),
             bricks: Some(bricks_to_wire(bricks)),
         }),
+        ToMaster::BricksWanted { set, bricks } => Message::BricksWanted(v1::BricksWanted {
+            set: key_to_wire(set),
+            bricks: Some(bricks_to_wire(bricks)),
+        }),
+        ToMaster::BricksForgotten { set, bricks } => {
+            Message::BricksForgotten(v1::BricksForgotten {
+                set: key_to_wire(set),
+                bricks: Some(bricks_to_wire(bricks)),
+            })
+        }
         ToMaster::Pong { nonce, clock_us } => {
             Message::Pong(v1::Pong { nonce: *nonce, clock_us: *clock_us })
         }
@@ -105,6 +120,14 @@ pub fn from_worker_from_wire(message: v1::FromWorker) -> Result<ToMaster, WireEr
         Message::BricksBroken(broken) => ToMaster::BricksBroken {
             set: key_from_wire("bricks_broken.set", &broken.set)?,
             bricks: bricks_list_from_wire("bricks_broken.bricks", broken.bricks)?,
+        },
+        Message::BricksWanted(wanted) => ToMaster::BricksWanted {
+            set: key_from_wire("bricks_wanted.set", &wanted.set)?,
+            bricks: bricks_list_from_wire("bricks_wanted.bricks", wanted.bricks)?,
+        },
+        Message::BricksForgotten(gone) => ToMaster::BricksForgotten {
+            set: key_from_wire("bricks_forgotten.set", &gone.set)?,
+            bricks: bricks_list_from_wire("bricks_forgotten.bricks", gone.bricks)?,
         },
         Message::Pong(pong) => ToMaster::Pong { nonce: pong.nonce, clock_us: pong.clock_us },
         Message::Leaving(leaving) => {
@@ -213,7 +236,30 @@ fn result_to_wire(result: &TileResult) -> v1::TileResult {
         start_us: t.start_us,
         end_us: t.end_us,
         thread: t.thread,
+        region: result.region.as_ref().map(|r| v1::RegionCost {
+            // Figures, not pixels: those beyond what fits are left out.
+            touched: Some(bricks_to_wire(
+                &r.touched
+                    .iter()
+                    .take(super::MAX_BRICK_LIST)
+                    .map(|&i| BrickId(i))
+                    .collect::<Vec<_>>(),
+            )),
+            stalls: r.stalls,
+            parked_us: r.parked_us,
+            idle_us: r.idle_us,
+        }),
     }
+}
+
+fn region_cost_from_wire(cost: v1::RegionCost) -> Result<RegionCost, WireError> {
+    let touched = bricks_list_from_wire("touched", cost.touched)?;
+    if touched.windows(2).any(|w| w[0] >= w[1]) {
+        return Err(WireError::value("touched", "do not ascend"));
+    }
+    let touched = touched.into_iter().map(|id| id.0).collect();
+    let v1::RegionCost { stalls, parked_us, idle_us, .. } = cost;
+    Ok(RegionCost { touched, stalls, parked_us, idle_us })
 }
 
 fn result_from_wire(result: v1::TileResult) -> Result<TileResult, WireError> {
@@ -243,6 +289,10 @@ fn result_from_wire(result: v1::TileResult) -> Result<TileResult, WireError> {
             end_us: result.end_us,
             thread: result.thread,
         },
+        region: result
+            .region
+            .map(|cost| region_cost_from_wire(cost).map_err(|e| e.within("region")))
+            .transpose()?,
     })
 }
 
@@ -279,7 +329,11 @@ pub fn to_worker_to_wire(message: &ToWorker, session: u64) -> Down {
             scene: scene.0,
             view: Some(view_to_wire(view)),
         }),
+        ToWorker::Directory { set, grid, first, total, bricks } => {
+            return Down::Parts(directory_to_wire(set, *grid, (*first, *total), bricks));
+        }
         ToWorker::Lease(lease) => Message::Lease(lease_to_wire(lease)),
+        ToWorker::Region(lease) => Message::Region(region_to_wire(lease)),
         ToWorker::EndFrame { frame } => Message::EndFrame(v1::EndFrame { frame: frame.0 }),
         ToWorker::EndScene { scene } => Message::EndScene(v1::EndScene { scene: scene.0 }),
         ToWorker::DropBricks { set, bricks } => return Down::Bricks(drop_to_wire(set, bricks)),
@@ -320,6 +374,12 @@ pub fn to_worker_from_wire(message: v1::ToWorker) -> Result<(ToWorker, Option<u6
         Message::Lease(lease) => {
             ToWorker::Lease(Box::new(lease_from_wire(lease).map_err(|e| e.within("lease"))?))
         }
+        Message::Directory(directory) => {
+            directory_from_wire(directory).map_err(|e| e.within("directory"))?
+        }
+        Message::Region(lease) => {
+            ToWorker::Region(region_from_wire(&lease).map_err(|e| e.within("region"))?)
+        }
         Message::EndFrame(end) => ToWorker::EndFrame { frame: FrameId(end.frame) },
         Message::EndScene(end) => ToWorker::EndScene { scene: SceneId(end.scene) },
         Message::Ping(ping) => ToWorker::Ping { nonce: ping.nonce },
@@ -350,10 +410,9 @@ fn lease_to_wire(lease: &Lease) -> v1::Lease {
     }
 }
 
-fn lease_from_wire(lease: v1::Lease) -> Result<Lease, WireError> {
-    for (from, length, at, n) in
-        [("x", "width", lease.x, lease.width), ("y", "height", lease.y, lease.height)]
-    {
+/// A tile that lies inside some picture.
+fn tile_from_wire(x: u32, y: u32, width: u32, height: u32) -> Result<Rect, WireError> {
+    for (from, length, at, n) in [("x", "width", x, width), ("y", "height", y, height)] {
         if at >= MAX_EDGE {
             return Err(WireError::value(from, format!("{at}; pictures have {MAX_EDGE} pixels")));
         }
@@ -361,12 +420,17 @@ fn lease_from_wire(lease: v1::Lease) -> Result<Lease, WireError> {
             return Err(WireError::value(length, format!("{n}; give 1 to {}", MAX_EDGE - at)));
         }
     }
-    let n = lease.width as usize * lease.height as usize;
+    let n = width as usize * height as usize;
     if n > MAX_TILE_PIXELS {
         return Err(WireError::too_long("width, height", n, MAX_TILE_PIXELS));
     }
-    let (x, y) = (lease.x as i32, lease.y as i32);
-    let tile = Rect::new(x, y, x + lease.width as i32, y + lease.height as i32);
+    let (x0, y0) = (x as i32, y as i32);
+    Ok(Rect::new(x0, y0, x0 + width as i32, y0 + height as i32))
+}
+
+fn lease_from_wire(lease: v1::Lease) -> Result<Lease, WireError> {
+    let tile = tile_from_wire(lease.x, lease.y, lease.width, lease.height)?;
+    let n = tile.area();
     if lease.first_sheet >= lease.end_sheet {
         return Err(WireError::value("end_sheet", "is not behind first_sheet"));
     }
@@ -385,8 +449,123 @@ fn lease_from_wire(lease: v1::Lease) -> Result<Lease, WireError> {
     })
 }
 
+fn region_to_wire(lease: &RegionLease) -> v1::Region {
+    assert!(lease.tile.x0 >= 0 && lease.tile.y0 >= 0, "tiles lie inside the picture");
+    v1::Region {
+        task: lease.task.0,
+        epoch: lease.epoch.0,
+        frame: lease.frame.0,
+        x: lease.tile.x0 as u32,
+        y: lease.tile.y0 as u32,
+        width: lease.tile.width() as u32,
+        height: lease.tile.height() as u32,
+    }
+}
+
+fn region_from_wire(lease: &v1::Region) -> Result<RegionLease, WireError> {
+    Ok(RegionLease {
+        task: TaskId(lease.task),
+        epoch: Epoch(lease.epoch),
+        frame: FrameId(lease.frame),
+        tile: tile_from_wire(lease.x, lease.y, lease.width, lease.height)?,
+    })
+}
+
+/// Bricks of one message of a directory: some 100 KB, a millisecond at 1 Gb/s. At double, pings and
+/// leases wait twice as long behind it; at half it is twice as many messages of a job's first frame.
+const DIRECTORY_PART: usize = 8192;
+
+fn directory_to_wire(
+    set: &BrickSetKey,
+    grid: BrickGrid,
+    (first, total): (u32, u32),
+    bricks: &[BrickInfo],
+) -> Vec<v1::ToWorker> {
+    let word = |b: &BrickInfo| {
+        let local = |at: [u32; 3]| at.iter().rev().fold(0, |word, x| (word << 3) | (x % BRICK));
+        local(b.tight.lo) | local(b.tight.hi) << 9 | (u32::from(b.voxels) - 1) << 18
+    };
+    let part = |(i, bricks): (usize, &[BrickInfo])| {
+        let ids: Vec<BrickId> = bricks.iter().map(|b| b.id).collect();
+        let boxes: Vec<u8> = bricks.iter().flat_map(|b| word(b).to_le_bytes()).collect();
+        let directory = v1::Directory {
+            set: key_to_wire(set),
+            grid: grid.dims.to_vec(),
+            first: first + (i * DIRECTORY_PART) as u32,
+            total,
+            bricks: Some(bricks_to_wire(&ids)),
+            boxes: boxes.into(),
+            sizes: bricks.iter().map(|b| b.bytes).collect(),
+        };
+        v1::ToWorker { message: Some(v1::to_worker::Message::Directory(directory)) }
+    };
+    bricks.chunks(DIRECTORY_PART).enumerate().map(part).collect()
+}
+
+fn directory_from_wire(directory: v1::Directory) -> Result<ToWorker, WireError> {
+    let Ok(dims) = <[u32; 3]>::try_from(directory.grid.as_slice()) else {
+        return Err(WireError::length("grid", directory.grid.len(), 3));
+    };
+    let cells = dims.iter().try_fold(1u64, |n, &d| n.checked_mul(d.into()));
+    if !cells.is_some_and(|n| (1..=MAX_BRICKS).contains(&n)) {
+        return Err(WireError::value("grid", format!("{dims:?}; give 1 to 2^27 bricks")));
+    }
+    let grid = BrickGrid { dims };
+    if u64::from(directory.total) > MAX_BRICKS {
+        return Err(WireError::too_long("total", directory.total as usize, MAX_BRICKS as usize));
+    }
+    let ids = bricks_list_from_wire("bricks", directory.bricks)?;
+    let n = ids.len();
+    if n > DIRECTORY_PART {
+        return Err(WireError::too_long("bricks", n, DIRECTORY_PART));
+    }
+    if u64::from(directory.first) + n as u64 > u64::from(directory.total) {
+        return Err(WireError::value("first", "goes beyond total"));
+    }
+    if ids.windows(2).any(|w| w[0] >= w[1]) {
+        return Err(WireError::value("bricks", "do not ascend"));
+    }
+    if ids.last().is_some_and(|id| id.0 as usize >= grid.len()) {
+        return Err(WireError::value("bricks", "lie outside the grid"));
+    }
+    let boxes = &directory.boxes;
+    if boxes.len() != 4 * n {
+        return Err(WireError::length("boxes", boxes.len(), 4 * n));
+    }
+    if directory.sizes.len() != n {
+        return Err(WireError::length("sizes", directory.sizes.len(), n));
+    }
+    let words = boxes.as_chunks::<4>().0.iter().map(|b| u32::from_le_bytes(*b));
+    let bricks = ids.into_iter().zip(words).zip(directory.sizes).map(|((id, word), bytes)| {
+        let corner = grid.corner(id);
+        let local =
+            |from: u32| std::array::from_fn(|a| corner[a] + (word >> (from + 3 * a as u32) & 7));
+        let tight = TightBox { lo: local(0), hi: local(9) };
+        let voxels = (word >> 18) + 1;
+        if voxels as usize > BRICK_VOXELS || (0..3).any(|a| tight.lo[a] > tight.hi[a]) {
+            return Err(WireError::value("boxes", format!("brick {id} has a box that is none")));
+        }
+        if !(1..=MAX_BRICK_BYTES).contains(&bytes) {
+            let problem = format!("brick {id} of {bytes} bytes; give 1 to {MAX_BRICK_BYTES}");
+            return Err(WireError::value("sizes", problem));
+        }
+        Ok(BrickInfo { id, tight, voxels: voxels as u16, bytes })
+    });
+    Ok(ToWorker::Directory {
+        set: key_from_wire("set", &directory.set)?,
+        grid,
+        first: directory.first,
+        total: directory.total,
+        bricks: bricks.collect::<Result<Vec<_>, _>>()?.into(),
+    })
+}
+
 // ---------------------------------------------------------------------------------------------
 // Bricks
+
+/// Bytes of the longest encoding: a head of 7, 512 voxels of value (4), normal (2) and gradient (1),
+/// and a checksum of 4.
+const MAX_BRICK_BYTES: u32 = 7 + 512 * (4 + 2 + 1) + 4;
 
 fn session_from_wire(field: &str, session: u64) -> Result<u64, WireError> {
     match session {

@@ -4,7 +4,7 @@
 use glam::{DMat3, DVec3};
 use proptest::collection::vec;
 use proptest::prelude::*;
-use slabcast_common::brick::{Brick, BrickSetKey};
+use slabcast_common::brick::{Brick, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::*;
 use slabcast_common::image::{Background, PixelFormat, TilePixels, TileState};
 use slabcast_common::message::*;
@@ -239,11 +239,50 @@ pub fn lease() -> impl Strategy<Value = Lease> {
     })
 }
 
+pub fn region() -> impl Strategy<Value = RegionLease> {
+    lease().prop_map(|l| RegionLease { task: l.task, epoch: l.epoch, frame: l.frame, tile: l.tile })
+}
+
+/// Some bricks of a grid of 7 x 9 x 11.
+pub fn directory() -> impl Strategy<Value = ToWorker> {
+    let grid = BrickGrid { dims: [7, 9, 11] };
+    let boxes = vec((any::<[[u32; 2]; 3]>(), 1u16..=512, 1u32..=3595), 1..60);
+    (key(), boxes, 0u32..600, any::<[u32; 2]>()).prop_map(
+        move |(set, boxes, from, [first, more])| {
+            let bricks: Vec<BrickInfo> = (from..)
+                .zip(boxes)
+                .map(|(id, (ends, voxels, bytes))| {
+                    let corner = grid.corner(BrickId(id));
+                    let [lo, hi] = [true, false].map(|low| {
+                        std::array::from_fn(|a| {
+                            let [x, y] = ends[a].map(|x| x % 8);
+                            corner[a] + if low { x.min(y) } else { x.max(y) }
+                        })
+                    });
+                    BrickInfo { id: BrickId(id), tight: TightBox { lo, hi }, voxels, bytes }
+                })
+                .collect();
+            let first = first % (1 << 20);
+            let total = first + bricks.len() as u32 + more % (1 << 20);
+            ToWorker::Directory { set, grid, first, total, bricks: bricks.into() }
+        },
+    )
+}
+
 pub fn result() -> impl Strategy<Value = TileResult> {
     (1usize..600).prop_flat_map(|n| {
         let ids = (any::<u64>(), any::<u32>());
-        (ids, planes(n), words::<3>(n), any::<[u64; 7]>(), any::<u32>()).prop_map(
-            |((task, epoch), (a, last), colour, c, thread)| TileResult {
+        let cost = (ascending(40), any::<u32>(), any::<[u64; 2]>()).prop_map(
+            |(touched, stalls, [parked_us, idle_us])| RegionCost {
+                touched: touched.into_iter().map(|id| id.0).collect(),
+                stalls,
+                parked_us,
+                idle_us,
+            },
+        );
+        let more = (any::<u32>(), prop::option::of(cost));
+        (ids, planes(n), words::<3>(n), any::<[u64; 7]>(), more).prop_map(
+            |((task, epoch), (a, last), colour, c, (thread, region))| TileResult {
                 task: TaskId(task),
                 epoch: Epoch(epoch),
                 pixels: TilePixels { a, colour, last },
@@ -255,6 +294,7 @@ pub fn result() -> impl Strategy<Value = TileResult> {
                     end_us: c[6],
                     thread,
                 },
+                region,
             },
         )
     })
@@ -295,6 +335,8 @@ pub fn to_master() -> impl Strategy<Value = ToMaster> {
         }),
         (key(), any::<u32>()).prop_map(|(set, bricks)| ToMaster::BricksIn { set, bricks }),
         (key(), ids(50)).prop_map(|(set, bricks)| ToMaster::BricksBroken { set, bricks }),
+        (key(), ids(50)).prop_map(|(set, bricks)| ToMaster::BricksWanted { set, bricks }),
+        (key(), ids(50)).prop_map(|(set, bricks)| ToMaster::BricksForgotten { set, bricks }),
         any::<[u64; 2]>().prop_map(|[nonce, clock_us]| ToMaster::Pong { nonce, clock_us }),
         ".{0,50}".prop_map(|reason| ToMaster::Leaving { reason }),
     ]
@@ -312,6 +354,8 @@ pub fn to_worker() -> impl Strategy<Value = ToWorker> {
             view
         }),
         lease().prop_map(|l| ToWorker::Lease(Box::new(l))),
+        directory(),
+        region().prop_map(ToWorker::Region),
         any::<u64>().prop_map(|f| ToWorker::EndFrame { frame: FrameId(f) }),
         any::<u64>().prop_map(|s| ToWorker::EndScene { scene: SceneId(s) }),
         (key(), vec((0u32..1 << 27).prop_map(BrickId), 1..60))

@@ -11,7 +11,7 @@ use crate::mask::{OpenMask, REACH_MOST};
 use crate::splat::records::{BySlot, MOST, Recorded, STRIDE};
 use crate::splat::{Accumulate, Simd, Work};
 use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
-use crate::tile::{Io, PART, Part, Pixels, Seen};
+use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
 use slabcast_common::shade::NO_NORMAL;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, round_i32};
@@ -140,7 +140,7 @@ pub(crate) fn takes(part: &Part<'_>) -> Option<Deep> {
     }
     // Scales fall with depth: those of the nearest sheet and of a voxel's length in front of it
     // bound all others, and show that no sheet is clipped.
-    let nearest = part.brick(0).projected.sheets.first;
+    let nearest = part.projected(0).sheets.first;
     let footprint = frame.footprints.at(nearest)?;
     let own = footprint.reach()?;
     let front = view.scale_at(nearest - most as i32 - 1)?;
@@ -217,9 +217,7 @@ impl<S: Recorded, const N: usize> Stage<S, N> for DeepStage<'_, S, N> {
         counters: &mut Counters,
     ) {
         let Part { frame, rect, slab, .. } = self.part;
-        let Some(Seen { brick, corner, .. }) = self.part.open_brick(which, open, counters) else {
-            return;
-        };
+        let Some((brick, corner)) = self.part.open_brick(which, open, counters) else { return };
         let cull = frame.scene.quality.cull;
         let (sections, view, n) = (&frame.sections, &frame.view, brick.len());
         let Tossing { eye, at, cells, fate, samples } = &mut *self.tossing;

@@ -20,7 +20,7 @@ use crate::scene::{Flat, Frame};
 use crate::splat::records::{Recorded, Splat, Table, Tables, splat};
 use crate::splat::{Simd, Work, select};
 use crate::stack::{Queues, Sheets, Stage, Store, slot, walk};
-use crate::tile::{Io, PART, Part, Pixels, Seen};
+use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
 use slabcast_common::shade::NO_NORMAL;
 use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
@@ -157,14 +157,11 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
         counters: &mut Counters,
     ) {
         let Part { frame, rect, slab, .. } = self.part;
-        let Some(Seen { brick, corner, projected }) = self.part.open_brick(which, open, counters)
-        else {
-            return;
-        };
+        let Some((brick, corner)) = self.part.open_brick(which, open, counters) else { return };
         let cull = frame.scene.quality.cull;
         let sections = &frame.sections;
         let phases = sections.phases();
-        let base = projected.sheets.first;
+        let base = self.part.projected(which).sheets.first;
         let origin = [
             i64::from(rect.x0 * SUBPIXELS),
             i64::from(rect.y0 * SUBPIXELS),

@@ -9,7 +9,7 @@ use crate::planes::{BLOCK, Planes, Window};
 use crate::scene::Placed;
 use crate::sheet::{LANES, Row};
 use crate::splat::{Accumulate, Weight, Work};
-use crate::tile::{Io, PART, Part, Pixels, Seen};
+use crate::tile::{Io, PART, Part, Pixels, keep_last};
 use slabcast_common::message::Counters;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::view::Projection;
@@ -90,12 +90,12 @@ impl General<'_> {
         kind: &mut Kind<S>,
         queues: &mut Queues,
         pixels: &mut Pixels,
-        (state, out, counters): Io<'_>,
+        (out, counters): Io<'_>,
     ) {
         let part = self.part;
         let Part { frame, slab, .. } = part;
-        let mut open = self.part.begin(pixels, state);
-        if let Some(last) = &state.last {
+        let mut open = self.part.begin(pixels, out);
+        if let Some(last) = &out.last {
             self.part.each_pixel(|x, y, tile| {
                 kind.planes.put(slab.first - 1, y * PART as usize + x, last[tile]);
             });
@@ -112,11 +112,16 @@ impl General<'_> {
         let float_sums = frame.scene.float_sums();
         let mut next = 0;
         let mut any_open = open.count() > 0;
+        let mut end = slab.end;
         for k in slab.first..slab.end {
             if !any_open {
                 break;
             }
-            while next < part.bricks() && part.brick(next).projected.sheets.first <= k {
+            if !part.is_supplied(next, k, &open) {
+                end = k;
+                break;
+            }
+            while next < part.bricks() && part.projected(next).sheets.first <= k {
                 self.admit(next, &open, queues, counters);
                 next += 1;
             }
@@ -125,7 +130,7 @@ impl General<'_> {
                 let mut carried = std::mem::take(&mut queues.carried);
                 if float_sums {
                     let sections = &frame.sections;
-                    let id = |v: &Waiting| part.brick(v.brick as usize).brick.id;
+                    let id = |v: &Waiting| part.brick(v.brick as usize).0.id;
                     carried.sort_unstable_by_key(|v| (sections.first(v.placed.z), id(v), v.voxel));
                 }
                 self.splat_all(&carried, k, kind, &open, counters);
@@ -134,7 +139,7 @@ impl General<'_> {
             }
             let mut bucket = std::mem::take(&mut queues.buckets[(k - slab.first) as usize]);
             if float_sums {
-                bucket.sort_unstable_by_key(|v| (part.brick(v.brick as usize).brick.id, v.voxel));
+                bucket.sort_unstable_by_key(|v| (part.brick(v.brick as usize).0.id, v.voxel));
             }
             self.splat_all(&bucket, k, kind, &open, counters);
             bucket.clear();
@@ -144,15 +149,18 @@ impl General<'_> {
             }
             kind.planes.clear(k - 1);
         }
-        // Whatever the part did not come to is hidden.
-        counters.culled += part.voxels_from(next);
-        counters.culled += queues.buckets.iter().map(|b| b.len() as u64).sum::<u64>();
+        // Whatever the part did not come to is hidden, unless it goes on later.
+        let stopped = end < slab.end;
+        if !stopped {
+            counters.culled += part.voxels_from(next);
+            counters.culled += queues.buckets.iter().map(|b| b.len() as u64).sum::<u64>();
+        }
         self.part.end(pixels, out);
-        if let Some(last) = &mut out.last {
+        if let Some(last) = keep_last(part, stopped, out) {
             // Nobody reads a shut pixel's sums; they may be anything, so they are none.
             self.part.each_pixel(|x, y, tile| {
                 if open.row(y) >> x & 1 == 1 {
-                    last[tile] = kind.planes.raw(slab.end - 1, y * PART as usize + x);
+                    last[tile] = kind.planes.raw(end - 1, y * PART as usize + x);
                 }
             });
         }
@@ -190,9 +198,7 @@ impl General<'_> {
     #[inline(always)]
     fn admit(&self, which: usize, open: &OpenMask, queues: &mut Queues, counters: &mut Counters) {
         let Part { frame, rect, slab, .. } = self.part;
-        let Some(Seen { brick, corner, .. }) = self.part.open_brick(which, open, counters) else {
-            return;
-        };
+        let Some((brick, corner)) = self.part.open_brick(which, open, counters) else { return };
         let cull = frame.scene.quality.cull;
         for (voxel, &local) in brick.index.iter().enumerate() {
             let placed = frame.place(corner, local);
@@ -229,7 +235,7 @@ impl General<'_> {
         // The sheet behind the slab is filled as far as the colour rule peeks.
         let end = slab.end + i32::from(frame.looks_at_neighbours());
         for Waiting { brick, voxel, placed } in bucket {
-            let brick = &self.part.brick(*brick as usize).brick;
+            let (brick, _) = self.part.brick(*brick as usize);
             if frame.scene.quality.cull && self.extent(placed).is_none_or(|e| !open.any(&e)) {
                 counters.culled += 1;
                 continue;

@@ -6,6 +6,8 @@
 //! - [`tile`] is what workers run: lazy bucket toss, a ring of open sheets, bricks and voxels
 //!   tested against the occlusion map. It must give the oracle's bytes, always.
 //!
+//! [`region`] takes a tile through all depths while bricks are still coming.
+//!
 //! Beside them [`mod@reference`] judges how far both are from the limit: a gather along true rays
 //! in f64 that shares none of their arithmetic, and [`closed`] has the pictures that can be
 //! worked out on paper, with derived bounds of what rounding may do to them. [`mod@explain`]
@@ -25,6 +27,7 @@ mod mask;
 mod place;
 mod planes;
 pub mod reference;
+pub mod region;
 pub mod scene;
 pub mod selftest;
 pub mod serial;

@@ -8,7 +8,7 @@ use crate::mask::OpenMask;
 use crate::sheet::{LANES, Row};
 use crate::splat::Simd;
 use crate::splat::records::{Line, Record, Recorded, STRIDE, STRIP, Strip};
-use crate::tile::{Io, PART, Part, Pixels};
+use crate::tile::{Io, PART, Part, Pixels, keep_last};
 use slabcast_common::message::Counters;
 use slabcast_common::view::Projection;
 
@@ -86,12 +86,12 @@ pub(crate) fn walk<S: Recorded, const N: usize, T: Stage<S, N>>(
     (simd, store): (Simd, &mut Store<S>),
     queues: &mut Queues<T::Voxel>,
     pixels: &mut Pixels,
-    (state, out, counters): Io<'_>,
+    (out, counters): Io<'_>,
 ) {
     let mut sheets = Sheets::<S, N>::new(simd, store, part.frame.sections.most());
     let slab = part.slab;
-    let mut open = part.begin(pixels, state);
-    if let Some(last) = &state.last {
+    let mut open = part.begin(pixels, out);
+    if let Some(last) = &out.last {
         part.each_pixel(|x, y, tile| {
             sheets.before[y * EDGE + x] = last[tile].map(S::from_bits);
         });
@@ -103,8 +103,13 @@ pub(crate) fn walk<S: Recorded, const N: usize, T: Stage<S, N>>(
     open.grow(stage.reach());
     let mut any_open = open.count() > 0;
     let (mut next, mut k) = (0, slab.first);
+    let mut stopped = false;
     while k < slab.end && any_open {
-        while next < part.bricks() && part.brick(next).projected.sheets.first <= k {
+        if !part.is_supplied(next, k, &open) {
+            stopped = true;
+            break;
+        }
+        while next < part.bricks() && part.projected(next).sheets.first <= k {
             stage.toss(next, &open, queues, counters);
             next += 1;
         }
@@ -122,15 +127,16 @@ pub(crate) fn walk<S: Recorded, const N: usize, T: Stage<S, N>>(
         }
         k += 1;
     }
-    // Whatever the part did not come to is hidden.
-    counters.culled += part.voxels_from(next);
+    // Whatever the part did not come to is hidden, unless it goes on later.
+    let hidden = u64::from(!stopped);
+    counters.culled += hidden * part.voxels_from(next);
     queues.carried.clear();
     for bucket in &mut queues.buckets {
-        counters.culled += bucket.len() as u64;
+        counters.culled += hidden * bucket.len() as u64;
         bucket.clear();
     }
     part.end(pixels, out);
-    if let Some(last) = &mut out.last {
+    if let Some(last) = keep_last(part, stopped, out) {
         // Nobody reads a shut pixel's sums; they may be anything, so they are none.
         part.each_pixel(|x, y, tile| {
             let touched = sheets.was[x / STRIP] >> y & open.row(y) >> x & 1 == 1;

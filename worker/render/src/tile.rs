@@ -15,6 +15,9 @@
 //! are integers (or floats in one order), an open pixel gets every voxel that covers it, and
 //! what a shut pixel gets is never read.
 //!
+//! [`crate::region`] takes a tile through all sheets of a frame while bricks are still coming: a part
+//! then stops before the first sheet at which it lacks one, and goes on from there later.
+//!
 //! Three rooms do that: `general` for every view and every kind of sums; far faster, in whole numbers,
 //! `flat` for most orthographic views and `deep` for most perspective ones.
 
@@ -23,6 +26,7 @@ use crate::flat::{self, RenderFlat};
 use crate::general::{GeneralScratch, Kind, Queues, RenderGeneral};
 use crate::mask::OpenMask;
 use crate::planes;
+use crate::region::{Coming, Loaded};
 use crate::scene::{Corner, Frame};
 use crate::sheet::Row;
 use crate::splat::Simd;
@@ -77,7 +81,9 @@ pub struct Scratch {
     whole: Whole,
     pixels: Pixels,
     /// Which of a tile's bricks lie in a part.
-    inside: Vec<u32>,
+    pub(crate) inside: Vec<u32>,
+    /// Bricks of a part that came one by one.
+    pub(crate) loaded: Vec<Loaded>,
     /// Sums of a last sheet, while no tile has them.
     last: Vec<RawSums>,
 }
@@ -97,8 +103,8 @@ struct Waiting {
     deep: deep::Waiting,
 }
 
-/// What a part starts from, what it gives back, and what it counts.
-pub(crate) type Io<'a> = (&'a TileState, &'a mut TilePixels, &'a mut Counters);
+/// The tile's pixels, from which a part starts and which it takes farther, and what it counts.
+pub(crate) type Io<'a> = (&'a mut TilePixels, &'a mut Counters);
 
 /// Renders the sheets of `slab` on `tile`, from `state`, with `bricks` (at least all that the tile
 /// and slab need).
@@ -162,6 +168,7 @@ pub fn render_into(
     if frame.looks_at_neighbours() {
         let mut last = std::mem::take(&mut scratch.last);
         last.clear();
+        last.extend_from_slice(state.last.as_deref().unwrap_or_default());
         last.resize(tile.area(), [0; 4]);
         out.last = Some(last);
     }
@@ -178,27 +185,16 @@ pub fn render_into(
                     inside.push(i as u32);
                 }
             }
+            let among = Among::Here(bricks);
+            let part = Part { frame, rect, tile, slab, among, inside: &inside };
             if inside.is_empty() {
+                // The slab's last sheet is empty here.
+                if let Some(last) = &mut out.last {
+                    part.each_pixel(|_, _, tile| last[tile] = [0; 4]);
+                }
                 continue;
             }
-            let part = Part { frame, rect, tile, slab, bricks, inside: &inside };
-            let io = (state, &mut *out, &mut *counters);
-            let Scratch { general, whole, pixels, .. } = scratch;
-            let GeneralScratch { kinds, queues } = general;
-            match frame.scene.quality.sums {
-                Sums::F32 => {
-                    let kind = &mut kinds.floats;
-                    simd.run(RenderGeneral { part, kind, queues, pixels, io });
-                }
-                Sums::I16 => {
-                    let (store, waiting) = (&mut whole.shorts, &mut whole.waiting);
-                    part.render(simd, store, waiting, (&mut kinds.shorts, queues), pixels, io);
-                }
-                Sums::I32 | Sums::Auto => {
-                    let (store, waiting) = (&mut whole.longs, &mut whole.waiting);
-                    part.render(simd, store, waiting, (&mut kinds.longs, queues), pixels, io);
-                }
-            }
+            part.draw(simd, scratch, (&mut *out, &mut *counters));
         }
     }
     scratch.inside = inside;
@@ -208,16 +204,24 @@ pub fn render_into(
     counted
 }
 
+/// Where a part's bricks are.
+#[derive(Clone, Copy)]
+pub(crate) enum Among<'a> {
+    /// All of the tile's are here.
+    Here(&'a [&'a Seen]),
+    /// They come when they are looked at, if they can be had.
+    Coming(&'a Coming<'a>),
+}
+
 /// A part of a tile.
 pub(crate) struct Part<'a> {
     pub(crate) frame: &'a Frame,
     pub(crate) rect: Rect,
     pub(crate) tile: Rect,
     pub(crate) slab: SheetRange,
-    /// The tile's bricks.
-    bricks: &'a [&'a Seen],
+    pub(crate) among: Among<'a>,
     /// Those of the part, front to back.
-    inside: &'a [u32],
+    pub(crate) inside: &'a [u32],
 }
 
 /// A part's pixels, in rows of [`PART`] whatever the part's width.
@@ -258,6 +262,27 @@ impl Pixels {
 }
 
 impl Part<'_> {
+    /// Renders it.
+    pub(crate) fn draw(self, simd: Simd, scratch: &mut Scratch, io: Io<'_>) {
+        let part = self;
+        let Scratch { general, whole, pixels, .. } = scratch;
+        let GeneralScratch { kinds, queues } = general;
+        match part.frame.scene.quality.sums {
+            Sums::F32 => {
+                let kind = &mut kinds.floats;
+                simd.run(RenderGeneral { part, kind, queues, pixels, io });
+            }
+            Sums::I16 => {
+                let (store, waiting) = (&mut whole.shorts, &mut whole.waiting);
+                part.render(simd, store, waiting, (&mut kinds.shorts, queues), pixels, io);
+            }
+            Sums::I32 | Sums::Auto => {
+                let (store, waiting) = (&mut whole.longs, &mut whole.waiting);
+                part.render(simd, store, waiting, (&mut kinds.longs, queues), pixels, io);
+            }
+        }
+    }
+
     /// Renders it in whole sums, in the fastest room that takes it.
     fn render<S: Recorded>(
         self,
@@ -303,10 +328,46 @@ impl Part<'_> {
         }
     }
 
-    /// The part's brick `i`, front to back.
+    /// Where brick `i` of the part, front to back, may land.
     #[inline(always)]
-    pub(crate) fn brick(&self, i: usize) -> &Seen {
-        self.bricks[self.inside[i] as usize]
+    pub(crate) fn projected(&self, i: usize) -> &Projected {
+        let at = self.inside[i] as usize;
+        match self.among {
+            Among::Here(bricks) => &bricks[at].projected,
+            Among::Coming(coming) => coming.projected(at),
+        }
+    }
+
+    /// Brick `i` of the part with its corner. It was [admitted](Part::open_brick).
+    #[inline(always)]
+    pub(crate) fn brick(&self, i: usize) -> (&Brick, &Corner) {
+        match self.among {
+            Among::Here(bricks) => {
+                let Seen { brick, corner, .. } = bricks[self.inside[i] as usize];
+                (brick, corner)
+            }
+            Among::Coming(coming) => coming.loaded(i),
+        }
+    }
+
+    /// Voxels of brick `i` of the part.
+    #[inline(always)]
+    fn voxels(&self, i: usize) -> u64 {
+        let at = self.inside[i] as usize;
+        match self.among {
+            Among::Here(bricks) => bricks[at].brick.len() as u64,
+            Among::Coming(coming) => coming.voxels(at),
+        }
+    }
+
+    /// Whether sheet `k` can be drawn: all bricks from `next` on that begin there and may touch an
+    /// open pixel are here. If not, what is lacked is noted.
+    #[inline(always)]
+    pub(crate) fn is_supplied(&self, next: usize, k: i32, open: &OpenMask) -> bool {
+        match self.among {
+            Among::Here(_) => true,
+            Among::Coming(coming) => coming.is_supplied(self, next, k, open),
+        }
     }
 
     /// The part's brick `i`, unless it is culled: all that it may touch is shut.
@@ -316,11 +377,20 @@ impl Part<'_> {
         i: usize,
         open: &OpenMask,
         counters: &mut Counters,
-    ) -> Option<&Seen> {
-        let seen = self.brick(i);
-        let passes = !self.frame.scene.quality.cull || open.any(&seen.projected.rect);
-        counters.culled += if passes { 0 } else { seen.brick.len() as u64 };
-        passes.then_some(seen)
+    ) -> Option<(&Brick, &Corner)> {
+        let passes = match self.among {
+            Among::Here(bricks) => {
+                let seen = bricks[self.inside[i] as usize];
+                !self.frame.scene.quality.cull || open.any(&seen.projected.rect)
+            }
+            // The question was asked when it was looked for.
+            Among::Coming(coming) => coming.is_loaded(i),
+        };
+        if !passes {
+            counters.culled += self.voxels(i);
+            return None;
+        }
+        Some(self.brick(i))
     }
 
     /// How many bricks it has.
@@ -331,7 +401,7 @@ impl Part<'_> {
 
     /// Voxels of the bricks from `i` on.
     pub(crate) fn voxels_from(&self, i: usize) -> u64 {
-        (i..self.bricks()).map(|i| self.brick(i).brick.len() as u64).sum()
+        (i..self.bricks()).map(|i| self.voxels(i)).sum()
     }
 
     /// Index in the tile's planes of the first pixel of the part's row `y`.
@@ -352,7 +422,7 @@ impl Part<'_> {
     }
 
     /// Takes the part's pixels out of the tile's; returns which are open.
-    pub(crate) fn begin(&self, pixels: &mut Pixels, state: &TileState) -> OpenMask {
+    pub(crate) fn begin(&self, pixels: &mut Pixels, tile: &TilePixels) -> OpenMask {
         let (w, h) = (self.rect.width(), self.rect.height());
         let stride = planes::PART;
         let mut open = OpenMask::shut(self.rect);
@@ -361,7 +431,7 @@ impl Part<'_> {
         }
         for y in 0..h {
             let (row, to) = (self.tile_row(y), y * stride);
-            pixels.a[to..to + w].copy_from_slice(&state.a[row..row + w]);
+            pixels.a[to..to + w].copy_from_slice(&tile.a[row..row + w]);
             let mut bits = 0u64;
             for x in 0..w {
                 bits |= u64::from(!self.frame.rule.is_shut(pixels.a[to + x])) << x;
@@ -390,10 +460,26 @@ impl Part<'_> {
             out.a[row..row + w].copy_from_slice(&pixels.a[from..from + w]);
             let [r, g, b] = pixels.colour.each_ref().map(|plane| &plane[from..from + w]);
             for (x, colour) in out.colour[row..row + w].iter_mut().enumerate() {
-                *colour = [r[x], g[x], b[x]];
+                for (sum, more) in colour.iter_mut().zip([r[x], g[x], b[x]]) {
+                    *sum = sum.wrapping_add(more);
+                }
             }
         }
     }
+}
+
+/// Takes the sums of a part's last sheet to where the next sheet's drawing finds them.
+///
+/// Where a part stops before its slab does, they are wanted though nobody asked for them at first.
+pub(crate) fn keep_last<'a>(
+    part: &Part<'_>,
+    stopped: bool,
+    out: &'a mut TilePixels,
+) -> Option<&'a mut Vec<RawSums>> {
+    if stopped && out.last.is_none() && part.frame.looks_at_neighbours() {
+        out.last = Some(vec![[0; 4]; out.a.len()]);
+    }
+    out.last.as_mut()
 }
 
 /// Planes as they are before the first slab.

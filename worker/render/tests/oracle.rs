@@ -7,7 +7,7 @@ mod world;
 
 use glam::DVec3;
 use proptest::prelude::*;
-use slabcast_common::brick::Brick;
+use slabcast_common::brick::{Brick, BrickInfo};
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::{FrameState, Picture};
 use slabcast_common::message::SceneSpec;
@@ -18,9 +18,11 @@ use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
+use slabcast_render::region::{Outlook, Region, Supply};
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch};
 use slabcast_render::{Frame, Scene, serial};
+use std::cell::RefCell;
 use std::sync::Arc;
 use world::bricks_of;
 
@@ -61,6 +63,83 @@ fn tiled(
         state.end_slab();
     }
     state.finish()
+}
+
+/// A worker's bricks, some of which are not here yet, and some of which go again.
+struct Store<'a> {
+    bricks: &'a [Arc<Brick>],
+    here: RefCell<Vec<bool>>,
+}
+
+impl Supply for Store<'_> {
+    fn get(&self, place: u32) -> Option<Arc<Brick>> {
+        let place = place as usize;
+        self.here.borrow()[place].then(|| self.bricks[place].clone())
+    }
+}
+
+/// The frame in regions, of whose bricks a worker holds one in `held_in` at first; one in
+/// `lost_in` rounds it forgets half of them. With what was asked for and what was touched.
+fn in_regions(
+    frame: &Frame,
+    simd: Simd,
+    bricks: &[Arc<Brick>],
+    edge: i32,
+    ahead: u32,
+    (held_in, lost_in): (u64, u64),
+    seed: u64,
+) -> (Picture, Vec<u32>, Vec<u32>) {
+    let mut state = seed | 1;
+    let mut once_in = |n: u64| {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        state.is_multiple_of(n)
+    };
+    let size = frame.view.size;
+    let info = |b: &Arc<Brick>| BrickInfo {
+        id: b.id,
+        tight: b.tight(&frame.scene.grid),
+        voxels: b.len() as u16,
+        bytes: b.encoded_len() as u32,
+    };
+    let directory: Vec<BrickInfo> = bricks.iter().map(info).collect();
+    let portion = |i: usize| {
+        let part = &directory[i..directory.len().min(i + 5)];
+        Outlook::look(frame, part, i as u32)
+    };
+    let portions: Vec<_> = (0..directory.len()).step_by(5).map(portion).collect();
+    let outlook = Outlook::new(size, &portions);
+    let here = RefCell::new(bricks.iter().map(|_| once_in(held_in)).collect());
+    let store = Store { bricks, here };
+    let mut picture = Picture { size, pixels: vec![[0.0; 4]; (size[0] * size[1]) as usize] };
+    let mut scratch = Scratch::default();
+    let (mut asked, mut touched) = (Vec::new(), Vec::new());
+    for y in (0..size[1] as i32).step_by(edge as usize) {
+        for x in (0..size[0] as i32).step_by(edge as usize) {
+            let rect = Rect::new(x, y, x + edge, y + edge).intersect(&Rect::of_size(size));
+            let mut region = Region::new(&outlook, rect);
+            loop {
+                let lacks = region.advance(frame, simd, &outlook, &store, ahead, &mut scratch);
+                if lacks.is_empty() {
+                    break;
+                }
+                let mut here = store.here.borrow_mut();
+                if once_in(lost_in) {
+                    here.iter_mut().for_each(|h| *h &= once_in(2));
+                }
+                for &place in &lacks {
+                    assert!(!std::mem::replace(&mut here[place as usize], true), "it was here");
+                }
+                asked.extend(lacks);
+            }
+            let done = region.finish();
+            assert!(done.touched.windows(2).all(|p| p[0] < p[1]) && done.pixels.last.is_none());
+            touched.extend(done.touched);
+            done.pixels.write(rect, size, &mut picture.pixels);
+        }
+    }
+    (picture, asked, touched)
 }
 
 proptest! {
@@ -140,6 +219,22 @@ proptest! {
         prop_assert!(pixel.is_none(), "{} slabs, {edge} pixel tiles: got, want {pixel:?}", slabs.len());
         let got = tiled(&make(false), Simd::plain(), &bricks, 64, &[run]);
         prop_assert!(got == want, "without culling");
+
+        // All bricks here, none here at first, and coming and going.
+        let simd = Simd::detect();
+        for (held_in, lost_in, ahead) in [(1, 1 << 40, 8), (3, 1 << 40, 0), (2, 4, 3)] {
+            let holds = (held_in, lost_in);
+            let (got, asked, touched) =
+                in_regions(&frame, simd, &bricks, edge, ahead, holds, seed);
+            prop_assert!(got == want, "in regions of {edge} pixels, {holds:?}");
+            prop_assert!(held_in > 1 || asked.is_empty());
+            if ahead == 0 && lost_in > 1000 {
+                prop_assert!(asked.iter().all(|a| touched.contains(a)), "asked for in vain");
+            }
+            let frame = make(false);
+            let (got, ..) = in_regions(&frame, Simd::plain(), &bricks, edge, ahead, holds, seed);
+            prop_assert!(got == want, "in regions without culling");
+        }
     }
 }
 

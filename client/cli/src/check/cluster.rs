@@ -41,6 +41,27 @@ pub(super) fn request(
     }
 }
 
+/// How master and workers of this process speak.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Link {
+    /// Through channels; bricks are shared.
+    Embedded,
+    /// gRPC over loopback.
+    Tcp,
+    /// The same, to workers that may hold 32 KiB of bricks: some twenty, less than any view needs.
+    TcpShort,
+}
+
+impl std::fmt::Display for Link {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Link::Embedded => "embedded",
+            Link::Tcp => "tcp",
+            Link::TcpShort => "tcp, 32 KiB",
+        })
+    }
+}
+
 /// A cluster over either link.
 pub(crate) enum Either {
     Embedded(Cluster),
@@ -56,12 +77,17 @@ pub(crate) struct Tcp {
 }
 
 impl Either {
-    /// Starts one for `volume` and waits until its workers are there. `tcp`: over loopback.
-    pub(crate) async fn start(volume: &Volume, tcp: bool, crew: Crew) -> Result<Either, Fail> {
+    /// Starts one for `volume` and waits until its workers are there.
+    pub(crate) async fn start(volume: &Volume, link: Link, crew: Crew) -> Result<Either, Fail> {
         let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
         let volume = volume.clone();
-        let (cluster, handle) = if tcp {
-            let tcp = Tcp::start(MasterConfig::new(volume, orientation), crew).await?;
+        let memory = match link {
+            Link::Embedded => None,
+            Link::Tcp => Some(1 << 30),
+            Link::TcpShort => Some(32 << 10),
+        };
+        let (cluster, handle) = if let Some(memory) = memory {
+            let tcp = Tcp::start(MasterConfig::new(volume, orientation), crew, memory).await?;
             let handle = tcp.master.handle();
             (Either::Tcp(Box::new(tcp)), handle)
         } else {
@@ -142,7 +168,7 @@ async fn joined(handle: &Handle, workers: u32) -> Result<(), Fail> {
 }
 
 impl Tcp {
-    async fn start(config: MasterConfig, crew: Crew) -> Result<Tcp, Fail> {
+    async fn start(config: MasterConfig, crew: Crew, memory: u64) -> Result<Tcp, Fail> {
         let io = |e: std::io::Error| Fail::failed(format!("listening on 127.0.0.1 failed: {e}"));
         let listener = TcpListener::bind("127.0.0.1:0").await.map_err(io)?;
         let address = listener.local_addr().map_err(io)?.to_string();
@@ -155,7 +181,7 @@ impl Tcp {
             let config = slabcast_worker::Config {
                 name: format!("tcp-{n}"),
                 threads: crew.threads,
-                memory_budget_bytes: 1 << 30,
+                memory_budget_bytes: memory,
                 simd: Simd::detect(),
                 rehearsal: None,
             };

@@ -1,12 +1,12 @@
 //! One hash a view: over workers, tiles, slabs, threads, culling and links.
 
 use super::cases::{self, Case};
-use super::cluster::Either;
+use super::cluster::{Either, Link};
 use super::pairwise;
 use crate::embedded::Crew;
 use crate::fail::{Fail, say};
 use crate::progress::{self, Progress};
-use slabcast_common::quality::Work;
+use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::volume::Digest32;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -20,10 +20,12 @@ const TILES: [Option<u32>; 6] = [Some(16), Some(32), Some(64), Some(128), Some(2
 const SLABS: [u32; 3] = [1, 3, 5];
 const THREADS: [u32; 2] = [1, 2];
 const CULL: [bool; 2] = [true, false];
-const LINKS: [&str; 2] = ["embedded", "tcp"];
+const LINKS: [Link; 3] = [Link::Embedded, Link::Tcp, Link::TcpShort];
+const SCHEDULES: [Schedule; 2] = [Schedule::Slab, Schedule::Region];
 
-/// Compares pixels over workers (1, 2, 3, 5), tiles (16 to 256, auto), slabs (1, 3, 5), threads
-/// (1, 2), culling (on, off) and links (embedded, TCP) with those of the serial renderer.
+/// Compares pixels over workers (1, 2, 3, 5), tiles (16 to 256, auto), slabs (1, 3, 5) or regions,
+/// threads (1, 2), culling (on, off) and links (embedded, TCP, TCP to workers of 32 KiB) with those of the
+/// serial renderer.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -44,9 +46,10 @@ pub(crate) struct MatrixArgs {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Setting {
     // A cluster is started for each of the first three, so rows are sorted by them.
-    tcp: bool,
+    link: Link,
     workers: u32,
     threads: u32,
+    by_region: bool,
     tile: Option<u32>,
     slabs: u32,
     cull: bool,
@@ -54,21 +57,34 @@ struct Setting {
 
 impl Setting {
     fn all(pairwise: bool) -> Vec<Setting> {
-        let levels =
-            [WORKERS.len(), TILES.len(), SLABS.len(), THREADS.len(), CULL.len(), LINKS.len()];
+        let levels = [
+            WORKERS.len(),
+            TILES.len(),
+            SLABS.len(),
+            THREADS.len(),
+            CULL.len(),
+            LINKS.len(),
+            SCHEDULES.len(),
+        ];
         let rows = if pairwise { pairwise::rows(&levels) } else { pairwise::product(&levels) };
         let mut settings: Vec<Setting> = rows
             .iter()
-            .map(|r| Setting {
-                workers: WORKERS[r[0]],
-                tile: TILES[r[1]],
-                slabs: SLABS[r[2]],
-                threads: THREADS[r[3]],
-                cull: CULL[r[4]],
-                tcp: r[5] == 1,
+            .map(|r| {
+                let by_region = SCHEDULES[r[6]] == Schedule::Region;
+                Setting {
+                    workers: WORKERS[r[0]],
+                    tile: TILES[r[1]],
+                    // Regions go through all depths.
+                    slabs: if by_region { SLABS[0] } else { SLABS[r[2]] },
+                    threads: THREADS[r[3]],
+                    cull: CULL[r[4]],
+                    link: LINKS[r[5]],
+                    by_region,
+                }
             })
             .collect();
         settings.sort_unstable();
+        settings.dedup();
         settings
     }
 
@@ -77,7 +93,8 @@ impl Setting {
     }
 
     fn work(&self) -> Work {
-        Work { slabs: self.slabs, tile: self.tile, ..Work::default() }
+        let schedule = SCHEDULES[usize::from(self.by_region)];
+        Work { slabs: self.slabs, tile: self.tile, schedule, ..Work::default() }
     }
 }
 
@@ -85,13 +102,13 @@ impl std::fmt::Display for Setting {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(
             f,
-            "workers {} threads {} tile {} slabs {} cull {} {}",
+            "workers {} threads {} tile {} {} cull {} {}",
             self.workers,
             self.threads,
             self.tile.map_or("auto".into(), |t| t.to_string()),
-            self.slabs,
+            if self.by_region { "regions".into() } else { format!("slabs {}", self.slabs) },
             if self.cull { "on" } else { "off" },
-            LINKS[usize::from(self.tcp)]
+            self.link
         )
     }
 }
@@ -129,9 +146,9 @@ pub(crate) fn run(args: &MatrixArgs) -> Result<(), Fail> {
         let truth = case.truth()?;
         let mut verdicts: Vec<Verdict> =
             truth.iter().map(|&want| Verdict { want, pictures: 0, wrong: Vec::new() }).collect();
-        let mut groups: BTreeMap<(bool, u32, u32), Vec<Setting>> = BTreeMap::new();
+        let mut groups: BTreeMap<(Link, u32, u32), Vec<Setting>> = BTreeMap::new();
         for s in &settings {
-            groups.entry((s.tcp, s.workers, s.threads)).or_default().push(*s);
+            groups.entry((s.link, s.workers, s.threads)).or_default().push(*s);
         }
         for group in groups.values() {
             runtime.block_on(check(case, group, &mut verdicts, || {
@@ -185,7 +202,7 @@ async fn check(
     mut done: impl FnMut(),
 ) -> Result<(), Fail> {
     let Some(first) = settings.first() else { return Ok(()) };
-    let mut cluster = Either::start(&case.volume, first.tcp, first.crew()).await?;
+    let mut cluster = Either::start(&case.volume, first.link, first.crew()).await?;
     for setting in settings {
         let request = case.request(setting.cull, setting.work());
         let hashes = cluster
@@ -223,9 +240,10 @@ mod tests {
     #[test]
     fn the_matrix_has_every_setting_of_the_promise() {
         let all = Setting::all(false);
-        assert_eq!(all.len(), 4 * 6 * 3 * 2 * 2 * 2);
+        assert_eq!(all.len(), 4 * 6 * (3 + 1) * 2 * 2 * 3);
         let few = Setting::all(true);
         assert!(few.len() < 40 && few.iter().all(|s| all.contains(s)));
-        assert!(few.iter().any(|s| s.tcp && s.workers == 5));
+        assert!(few.iter().any(|s| s.link == Link::Tcp && s.workers == 5));
+        assert!(few.iter().any(|s| s.by_region && s.link == Link::TcpShort));
     }
 }

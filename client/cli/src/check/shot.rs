@@ -4,7 +4,7 @@
 //! [`Ready`], and ask for what they need: the serial picture, one on threads, the hashes of
 //! clusters, the reference.
 
-use super::cluster::{self, Either};
+use super::cluster::{self, Either, Link};
 use crate::embedded::Crew;
 use crate::fail::Fail;
 use crate::local::{self, Cut};
@@ -167,7 +167,8 @@ impl Shot {
         work: Work,
     ) -> Result<String, Fail> {
         let drawn = async {
-            let mut cluster = Either::start(&self.volume, tcp, crew).await?;
+            let link = if tcp { Link::Tcp } else { Link::Embedded };
+            let mut cluster = Either::start(&self.volume, link, crew).await?;
             let hashes = cluster.hashes(self.request(cull, work)).await;
             cluster.end().await;
             hashes?.pop().ok_or_else(|| Fail::failed("no frame came"))

@@ -64,10 +64,11 @@ pub(super) fn messages(trace: &Trace) -> Costs {
         pixels,
         counters: Counters::default(),
         times: TaskTimes::default(),
+        region: None,
     }));
     let down = |m: &ToWorker| match convert::to_worker_to_wire(m, 0) {
         Down::Control(m) => m.encode_to_vec(),
-        Down::Bricks(_) => Vec::new(),
+        Down::Parts(_) | Down::Bricks(_) => Vec::new(),
     };
     let up = |m: &ToMaster| convert::from_worker_to_wire(m).encode_to_vec();
     let (lease_bytes, result_bytes) = (down(&lease), up(&result));

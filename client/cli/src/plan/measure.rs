@@ -272,12 +272,14 @@ fn weigh(lease: Lease, pixels: TilePixels, counters: Counters) -> (u32, u32, Til
     let (task, epoch) = (lease.task, lease.epoch);
     let lease = match convert::to_worker_to_wire(&ToWorker::Lease(Box::new(lease)), 0) {
         Down::Control(message) => message.encoded_len(),
-        Down::Bricks(_) => unreachable!("a lease goes on Control"),
+        Down::Parts(_) | Down::Bricks(_) => unreachable!("a lease goes on Control"),
     };
     // Times as they are after some hours: five bytes each.
     let us = 1 << 33;
     let times = TaskTimes { received_us: us, ready_us: us, start_us: us, end_us: us, thread: 0 };
-    let result = ToMaster::Result(Box::new(TileResult { task, epoch, pixels, counters, times }));
+    let region = None;
+    let result = TileResult { task, epoch, pixels, counters, times, region };
+    let result = ToMaster::Result(Box::new(result));
     let bytes = convert::from_worker_to_wire(&result).encoded_len();
     let ToMaster::Result(result) = result else { unreachable!("made above") };
     (lease as u32, bytes as u32, result.pixels)

@@ -18,6 +18,7 @@ use crate::request::{PictureOf, WorkArgs, lattice_notice};
 use crate::stage::Stage;
 use crate::{embedded, parse};
 use predict::{Question, Row};
+use slabcast_common::quality::Schedule;
 use slabcast_common::trace::{MAX_BYTES, Trace};
 use slabcast_schedule::FrameJob;
 use slabcast_schedule::sim::{Link, alone_ms};
@@ -88,7 +89,13 @@ pub(crate) struct PlanArgs {
 
 /// Runs the command.
 pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
-    let work = args.work.work()?;
+    let mut work = args.work.work()?;
+    if work.schedule == Schedule::Region {
+        return Err(Fail::usage(
+            "--schedule: `plan` predicts the `slab` schedule; use that, or `auto`",
+        ));
+    }
+    work.schedule = Schedule::Slab;
     let asked = args.of.look.asked(work)?;
     let workers = &args.workers.0;
     let most = workers.iter().copied().max().unwrap_or(1);

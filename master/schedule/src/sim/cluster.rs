@@ -465,6 +465,7 @@ impl World<'_> {
                 end_us: micros(now),
                 thread: thread as u32,
             },
+            region: None,
         });
         self.up(id, Event::Result { worker: id, result }, r.result_bytes, r.pixels.max(now));
     }

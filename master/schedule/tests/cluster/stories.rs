@@ -5,12 +5,20 @@ use crate::rng::Rng;
 use crate::world::{Nature, Script, World};
 use slabcast_common::brick::BrickInfo;
 use slabcast_common::ids::{FrameId, SceneId, WorkerId};
-use slabcast_common::quality::{Quality, Work};
+use slabcast_common::quality::{Quality, Schedule, Work};
+use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
 use std::cell::Cell;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 const DIMS: [u32; 3] = [48, 48, 48];
+const BOTH: [Schedule; 2] = [Schedule::Slab, Schedule::Region];
+
+/// The paper's schedule; what a story says of both it says with a loop.
+fn slab() -> Work {
+    Work { schedule: Schedule::Slab, ..Work::default() }
+}
 
 fn bricks() -> Arc<[BrickInfo]> {
     fake::bricks(&mut Rng::new(1), DIMS, 6)
@@ -22,7 +30,11 @@ fn job_with(frame: u64, work: Work, quality: Quality) -> Box<FrameJob> {
 }
 
 fn job(frame: u64) -> Box<FrameJob> {
-    let work = Work { tile: Some(32), ..Work::default() };
+    job_by(frame, Schedule::Slab)
+}
+
+fn job_by(frame: u64, schedule: Schedule) -> Box<FrameJob> {
+    let work = Work { tile: Some(32), schedule, ..slab() };
     job_with(frame, work, Quality { thickness: 2.0, ..Quality::default() })
 }
 
@@ -49,7 +61,7 @@ fn leases(w: &World) -> Vec<u32> {
 #[test]
 fn bytes_do_not_depend_on_workers_tiles_slabs_or_culling() {
     let quality = Quality { thickness: 2.0, eps: 0.2, ..Quality::default() };
-    let want = fake::serial(&job_with(0, Work::default(), quality)).sha256();
+    let want = fake::serial(&job_with(0, slab(), quality)).sha256();
     for n in [1, 3, 7] {
         for tile in [None, Some(16), Some(128), Some(256)] {
             for slabs in [1, 3, 40] {
@@ -58,8 +70,12 @@ fn bytes_do_not_depend_on_workers_tiles_slabs_or_culling() {
                     for i in 0..n {
                         w.join(Nature { threads: 1 + i % 3, ..Nature::default() });
                     }
-                    let work = Work { tile, slabs, ..Work::default() };
+                    let work = Work { tile, slabs, ..slab() };
                     w.queue(job_with(0, work, Quality { cull, ..quality }));
+                    if slabs == 1 {
+                        let work = Work { schedule: Schedule::Region, ..work };
+                        w.queue(job_with(1, work, Quality { cull, ..quality }));
+                    }
                     w.finish();
                     assert_eq!(w.done[&FrameId(0)].picture.sha256(), want);
                 }
@@ -108,16 +124,18 @@ fn without_workers_a_frame_waits_and_nothing_is_lost() {
 
 #[test]
 fn who_joins_mid_frame_gets_bricks_and_leases_at_once() {
-    let mut w = world();
-    workers(&mut w, 1);
-    w.queue(job(0));
-    w.run_until(|w| w.leases_given > 3);
-    let id = w.join(Nature::default());
-    let view = w.scheduler.workers().pop().expect("it joined");
-    assert_eq!((view.id, view.leases > 0), (id, true));
-    w.finish();
-    let stats = &w.done[&FrameId(0)].stats;
-    assert!(stats.workers.iter().all(|w| w.render_ms > 0.0 && w.bricks_sent > 0));
+    for schedule in BOTH {
+        let mut w = world();
+        workers(&mut w, 1);
+        w.queue(job_by(0, schedule));
+        w.run_until(|w| w.leases_given > 3);
+        let id = w.join(Nature::default());
+        let view = w.scheduler.workers().pop().expect("it joined");
+        assert_eq!((view.id, view.leases > 0), (id, true));
+        w.finish();
+        let stats = &w.done[&FrameId(0)].stats;
+        assert!(stats.workers.iter().all(|w| w.render_ms > 0.0 && w.bricks_sent > 0));
+    }
 }
 
 #[test]
@@ -153,12 +171,16 @@ fn a_busy_worker_that_answers_pings_is_never_dropped() {
 
 #[test]
 fn a_tile_that_kills_its_workers_is_given_up_after_three_and_the_rest_is_delivered() {
+    BOTH.into_iter().for_each(a_deadly_tile);
+}
+
+fn a_deadly_tile(schedule: Schedule) {
     let mut w = world();
     let deadly = Nature { threads: 2, deadly: Some([32, 32]), ..Nature::default() };
     for _ in 0..6 {
         w.join(deadly.clone());
     }
-    let work = Work { tile: Some(32), slabs: 1, ..Work::default() };
+    let work = Work { tile: Some(32), slabs: 1, schedule, ..slab() };
     w.queue(job_with(0, work, Quality { thickness: 2.0, ..Quality::default() }));
     w.run_until(|w| w.scheduler.is_idle());
     let done = &w.done[&FrameId(0)];
@@ -183,7 +205,8 @@ fn seven_of_eight_workers_killed_mid_frame_leave_the_same_bytes_and_no_tile_accu
         let mut rng = Rng::new(seed);
         let mut w = World::new(seed, Config::default());
         workers(&mut w, 8);
-        let work = Work { tile: Some(16), ..Work::default() };
+        let schedule = BOTH[seed as usize % 2];
+        let work = Work { tile: Some(16), schedule, ..slab() };
         w.queue(job_with(0, work, Quality { thickness: 2.0, ..Quality::default() }));
         let kills = rng.pick(&[1, 4, 7]);
         for id in 1..=kills {
@@ -210,13 +233,15 @@ fn a_frame_of_nothing_but_failures_fails_with_the_reason() {
 
 #[test]
 fn a_thread_that_hangs_costs_one_more_run_of_its_tile() {
-    let mut w = world();
-    workers(&mut w, 2);
-    w.join(Nature { hangs_at: Some([64, 64]), ..Nature::default() });
-    w.queue(job(0));
-    w.finish();
-    let at = w.done[&FrameId(0)].at;
-    assert!(at < 1_000_000, "nobody waited for the lease's 60 s: {at} us");
+    for schedule in BOTH {
+        let mut w = world();
+        workers(&mut w, 2);
+        w.join(Nature { hangs_at: Some([64, 64]), ..Nature::default() });
+        w.queue(job_by(0, schedule));
+        w.finish();
+        let at = w.done[&FrameId(0)].at;
+        assert!(at < 1_000_000, "nobody waited for the lease's 60 s: {at} us");
+    }
 }
 
 #[test]
@@ -225,7 +250,7 @@ fn without_idle_threads_a_late_lease_goes_to_another_worker_at_its_deadline() {
     let mut w = world();
     w.join(Nature { hangs_at: Some([0, 0]), ..Nature::default() });
     workers(&mut w, 1);
-    let work = Work { tile: Some(256), slabs: 1, ..Work::default() };
+    let work = Work { tile: Some(256), slabs: 1, ..slab() };
     w.queue(job_with(0, work, Quality::default()));
     let time = time(&mut w);
     assert!((60_000_000..61_500_000).contains(&time), "{time} us");
@@ -236,23 +261,27 @@ fn without_idle_threads_a_late_lease_goes_to_another_worker_at_its_deadline() {
 #[test]
 fn a_straggler_holds_up_a_frame_by_less_than_a_third() {
     // PROMISES.md R4: one of 8 workers at a tenth of the speed, against 7 healthy ones.
-    let run = |slow: bool, tile: Option<u32>| {
+    let run = |slow: bool, tile: Option<u32>, schedule: Schedule| {
         let mut w = world();
         workers(&mut w, 7);
         if slow {
             w.join(Nature { us_per_pixel_sheet: 5.0, ..Nature::default() });
         }
-        let work = Work { tile, ..Work::default() };
+        let work = Work { tile, schedule, ..slab() };
         w.queue(job_with(0, work, Quality { thickness: 1.0, ..Quality::default() }));
         let time = time(&mut w);
         w.finish();
         time
     };
     let mut worst = 0.0f64;
-    for tile in [Some(16), Some(32)] {
-        let (healthy, slow) = (run(false, tile), run(true, tile));
+    for (tile, schedule) in
+        [Some(16), Some(32)].into_iter().zip([BOTH; 2]).flat_map(|(t, b)| b.map(|b| (t, b)))
+    {
+        let (healthy, slow) = (run(false, tile, schedule), run(true, tile, schedule));
         let ratio = slow as f64 / healthy as f64;
-        println!("straggler: tile {tile:?}, {slow} us, healthy {healthy} us, {ratio:.2} x");
+        println!(
+            "straggler: {schedule:?}, {tile:?}, {slow} us, healthy {healthy} us, {ratio:.2} x"
+        );
         worst = worst.max(ratio);
     }
     assert!(worst <= 1.3, "{worst:.2} x");
@@ -290,11 +319,11 @@ fn only_what_is_lacked_is_sent() {
 
 #[test]
 fn a_cancelled_frame_ends_at_once_in_any_state() {
-    for when in (0..40_000).step_by(500) {
+    for (when, schedule) in (0..40_000).step_by(250).zip(BOTH.into_iter().cycle()) {
         let mut w = world();
         workers(&mut w, 2);
-        w.queue(job(0));
-        w.queue(job(1));
+        w.queue(job_by(0, schedule));
+        w.queue(job_by(1, schedule));
         w.script(when, Script::Cancel(FrameId(0)));
         w.script(when, Script::EndScene(SceneId(0)));
         w.finish();
@@ -308,6 +337,86 @@ fn a_cancelled_frame_ends_at_once_in_any_state() {
     w.script(now, Script::Cancel(FrameId(0)));
     w.finish();
     assert!(w.scheduler.is_idle());
+}
+
+#[test]
+fn regions_are_sent_what_they_ask_for_and_no_more() {
+    let mut w = world();
+    workers(&mut w, 2);
+    w.queue(job_by(0, Schedule::Region));
+    w.run_until(|w| w.scheduler.is_idle());
+    let first = w.done[&FrameId(0)].stats.clone();
+    assert!(first.workers.iter().all(|w| w.stalls > 0 && w.parked_ms > 0.0), "{first:?}");
+    assert!(first.bricks.needed <= first.workers.iter().map(|w| w.bricks_held).sum());
+    assert_eq!(first.slabs.len(), 1);
+    // The same view again: everybody takes the same tiles, and holds what they need.
+    let mut again = job_by(0, Schedule::Region);
+    again.frame = FrameId(1);
+    w.queue(again);
+    w.finish();
+    let second = &w.done[&FrameId(1)].stats;
+    assert_eq!(second.bricks, first.bricks);
+    for worker in &second.workers {
+        assert_eq!((worker.bricks_sent, worker.stalls), (0, 0), "{worker:?}");
+    }
+    let owners = |s: &FrameStats| -> BTreeMap<(u32, u32), String> {
+        s.slabs[0].tiles.iter().map(|t| ((t.x, t.y), t.worker.clone())).collect()
+    };
+    assert_eq!(owners(second), owners(&first));
+    let guesses = |s: &FrameStats| s.slabs[0].tiles.iter().map(|t| t.est).collect::<Vec<_>>();
+    assert_ne!(guesses(second), guesses(&first), "what they took is known");
+}
+
+#[test]
+fn frames_of_a_path_go_on_beside_each_other_and_end_in_order() {
+    let mut w = world();
+    workers(&mut w, 3);
+    for frame in 0..4 {
+        w.queue(job_by(frame, Schedule::Region));
+    }
+    // All three have as many leases as they are lent, of two frames.
+    w.run_until(|w| w.leases_given > 16);
+    assert!(w.done.is_empty() && leases(&w) == [2, 2, 2]);
+    w.finish();
+    let all = w.now();
+    let mut alone = world();
+    workers(&mut alone, 3);
+    for frame in 0..4 {
+        alone.queue(job_by(frame, Schedule::Region));
+        alone.run_until(|w| w.scheduler.is_idle());
+    }
+    assert!(all < alone.now(), "{all} us, one after the other {} us", alone.now());
+}
+
+#[test]
+fn a_tile_that_moves_takes_its_bricks_along() {
+    let mut w = world();
+    let gone = w.join(Nature::default());
+    w.queue(job_by(0, Schedule::Region));
+    w.run_until(|w| w.scheduler.is_idle());
+    w.kill(gone);
+    w.join(Nature::default());
+    let mut again = job_by(0, Schedule::Region);
+    again.frame = FrameId(1);
+    w.queue(again);
+    w.finish();
+    let [first, second] = [0, 1].map(|f| &w.done[&FrameId(f)].stats.workers[0]);
+    assert!(second.bricks_sent > 0 && second.stalls < first.stalls / 2, "{first:?} {second:?}");
+}
+
+#[test]
+fn a_worker_short_of_memory_makes_room_itself() {
+    let mut w = world();
+    let all: u64 = bricks().iter().map(|b| u64::from(b.bytes)).sum();
+    w.join(Nature { budget: all / 3, ..Nature::default() });
+    w.join(Nature { threads: 2, budget: 1, ..Nature::default() });
+    for frame in 0..4 {
+        w.queue(job_by(frame, Schedule::Region));
+    }
+    w.finish();
+    let view = &w.scheduler.workers()[0];
+    assert!(view.bytes_held <= all / 3, "{view:?}");
+    assert_eq!(w.done.len(), 4);
 }
 
 #[test]
@@ -326,14 +435,16 @@ fn broken_bricks_are_sent_again_and_nothing_else() {
 
 #[test]
 fn a_liar_is_dropped_and_its_tiles_are_rendered_by_others() {
-    let mut w = world();
-    workers(&mut w, 1);
-    w.join(Nature { lie_in: 1, ..Nature::default() });
-    w.queue(job(0));
-    w.finish();
-    assert_eq!(w.drops.len(), 1);
-    assert!(w.drops[0].1.contains("plane"), "{}", w.drops[0].1);
-    assert!(w.done[&FrameId(0)].stats.poisoned.is_empty(), "a lie is not the tile's fault");
+    for schedule in BOTH {
+        let mut w = world();
+        workers(&mut w, 1);
+        w.join(Nature { lie_in: 1, ..Nature::default() });
+        w.queue(job_by(0, schedule));
+        w.finish();
+        assert_eq!(w.drops.len(), 1);
+        assert!(w.drops[0].1.contains("plane"), "{}", w.drops[0].1);
+        assert!(w.done[&FrameId(0)].stats.poisoned.is_empty(), "a lie is not the tile's fault");
+    }
 }
 
 #[test]
@@ -357,7 +468,7 @@ fn a_worker_short_of_memory_gets_what_its_leases_need() {
     let all: u64 = bricks().iter().map(|b| u64::from(b.bytes)).sum();
     w.join(Nature { budget: all / 2, ..Nature::default() });
     w.join(Nature { threads: 2, budget: all * 2 / 3, ..Nature::default() });
-    let work = Work { tile: Some(32), slabs: 1, ..Work::default() };
+    let work = Work { tile: Some(32), slabs: 1, ..slab() };
     for frame in 0..4 {
         w.queue(job_with(frame, work, Quality { thickness: 2.0, ..Quality::default() }));
     }
@@ -390,7 +501,7 @@ fn statistics_of_a_frame_worked_out_by_hand() {
     let joined =
         Event::WorkerJoined { worker, name, threads: 1, memory_budget_bytes: u64::MAX, held };
     s.handle(&clock, joined);
-    let work = Work { tile: Some(256), slabs: 2, ..Work::default() };
+    let work = Work { tile: Some(256), slabs: 2, ..slab() };
     let job = job_with(3, work, Quality { thickness: 2.0, eps: 0.0, ..Quality::default() });
     let projections = fake::projections(&job);
     s.handle(&clock, Event::FrameQueued(job.clone()));
@@ -429,6 +540,7 @@ fn statistics_of_a_frame_worked_out_by_hand() {
                         pixels,
                         counters,
                         times,
+                        region: None,
                     };
                     results += 1;
                     events.push(Event::Result { worker, result: Box::new(result) });

@@ -4,13 +4,18 @@
 
 use crate::fake;
 use crate::rng::Rng;
-use slabcast_common::brick::{BrickInfo, BrickSetKey};
+use slabcast_common::brick::{BrickGrid, BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::Picture;
-use slabcast_common::message::{Counters, Lease, TaskTimes, TileResult, ToWorker};
+use slabcast_common::image::{TilePixels, TileState};
+use slabcast_common::message::{
+    Counters, DIRECTORIES, Lease, RegionCost, RegionLease, TaskTimes, TileResult, ToWorker,
+};
+use slabcast_common::occlusion::Rect;
+use slabcast_common::slab::SheetRange;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::view::Projected;
-use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler, Span};
+use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler, Span, is_shut};
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -93,9 +98,61 @@ pub(crate) enum Script {
     Rejoin(Nature, Vec<(BrickSetKey, Vec<BrickId>)>),
 }
 
+/// What a worker was lent.
+#[derive(Clone, Debug)]
+enum Loan {
+    Slab(Box<Lease>),
+    Region(RegionLease, Box<Going>),
+}
+
+impl Loan {
+    fn task(&self) -> (TaskId, Epoch) {
+        match self {
+            Loan::Slab(l) => (l.task, l.epoch),
+            Loan::Region(l, _) => (l.task, l.epoch),
+        }
+    }
+
+    fn frame(&self) -> FrameId {
+        match self {
+            Loan::Slab(l) => l.frame,
+            Loan::Region(l, _) => l.frame,
+        }
+    }
+
+    fn tile(&self) -> Rect {
+        match self {
+            Loan::Slab(l) => l.tile,
+            Loan::Region(l, _) => l.tile,
+        }
+    }
+
+    /// What has to be there before it can go on.
+    fn bricks(&self) -> Vec<BrickId> {
+        match self {
+            Loan::Slab(l) => l.bricks.clone(),
+            Loan::Region(_, going) => going.lacks.iter().copied().collect(),
+        }
+    }
+}
+
+/// How far a region has come: what the real worker does in `render::region` and `parking`, plainly.
+#[derive(Clone, Debug, Default)]
+struct Going {
+    /// Pixels after the sheets before `at`; nothing before it began.
+    drawn: Option<(i32, TilePixels)>,
+    touched: BTreeSet<BrickId>,
+    lacks: BTreeSet<BrickId>,
+    keeps: BTreeSet<BrickId>,
+    us: Micros,
+    stalls: u32,
+    parked_at: Micros,
+    parked_us: Micros,
+}
+
 #[derive(Debug)]
 struct Running {
-    lease: Box<Lease>,
+    loan: Loan,
     received: Micros,
     ready: Micros,
     start: Micros,
@@ -111,7 +168,8 @@ struct Worker {
     up: Micros,
     bricks_down: Micros,
     present: BTreeSet<(BrickSetKey, BrickId)>,
-    leases: Vec<(Box<Lease>, Micros)>,
+    leases: Vec<(Loan, Micros)>,
+    directories: Vec<BrickSetKey>,
     running: Vec<Option<Running>>,
     // What the master did, as the checks see it.
     sent: BTreeSet<(BrickSetKey, BrickId)>,
@@ -208,6 +266,7 @@ impl World {
             sent: present.clone(),
             present,
             leases: Vec::new(),
+            directories: Vec::new(),
             running: (0..nature.threads).map(|_| None).collect(),
             scenes: BTreeSet::new(),
             frames: BTreeSet::new(),
@@ -255,6 +314,13 @@ impl World {
             && let Some(w) = self.workers.get_mut(worker)
         {
             w.outstanding.remove(&(*task, *epoch));
+        }
+        if let Event::BricksForgotten { worker, set, bricks } = &event
+            && let Some(w) = self.workers.get_mut(worker)
+        {
+            for &b in bricks {
+                w.sent.remove(&(*set, b));
+            }
         }
         if let Event::BricksBroken { worker, set, bricks } = &event
             && let Some(w) = self.workers.get_mut(worker)
@@ -338,6 +404,31 @@ impl World {
                         let sizes = &self.jobs[&lease.frame].sizes;
                         let bytes = lease.bricks.iter().map(|b| u64::from(sizes[b].bytes)).sum();
                         w.ever_over_lease = w.ever_over_lease.max(bytes);
+                        self.leases_given += 1;
+                    }
+                    ToWorker::Directory { set, grid, first, total, bricks } => {
+                        let known = self.jobs.values().find(|j| j.job.scene.bricks == *set);
+                        let known = &known.expect("a set of some job").job;
+                        assert_eq!((*first, *total as usize), (0, bricks.len()), "seed {seed}");
+                        assert_eq!(*bricks, known.bricks, "seed {seed}");
+                        let dims = known.scene.volume.lattice.dims;
+                        assert_eq!(*grid, BrickGrid::of(dims), "seed {seed}");
+                        assert!(!w.directories.contains(set), "seed {seed}: directory twice");
+                        w.directories.push(*set);
+                        if w.directories.len() > DIRECTORIES {
+                            w.directories.remove(0);
+                        }
+                    }
+                    ToWorker::Region(lease) => {
+                        assert!(!w.leaving, "seed {seed}: region to {id}, which leaves");
+                        assert!(w.frames.contains(&lease.frame), "seed {seed}: before its frame");
+                        let set = self.jobs[&lease.frame].job.scene.bricks;
+                        assert!(w.directories.contains(&set), "seed {seed}: before its directory");
+                        let key = (lease.task, lease.epoch);
+                        let what = (lease.frame, Vec::new());
+                        assert!(w.outstanding.insert(key, what).is_none(), "seed {seed}: twice");
+                        let same = w.outstanding.keys().filter(|k| k.0 == lease.task).count();
+                        assert_eq!(same, 1, "seed {seed}: {} twice to {id}", lease.task);
                         self.leases_given += 1;
                     }
                     ToWorker::EndFrame { frame } => {
@@ -513,14 +604,20 @@ impl World {
                 match message {
                     ToWorker::Lease(lease) if !w.leaving => {
                         let now = self.clock.now();
-                        w.leases.push((lease, now));
+                        w.leases.push((Loan::Slab(lease), now));
                         self.begin(id);
                     }
-                    ToWorker::EndFrame { frame } => w.leases.retain(|(l, _)| l.frame != frame),
+                    ToWorker::Region(lease) if !w.leaving => {
+                        let now = self.clock.now();
+                        w.leases.push((Loan::Region(lease, Box::default()), now));
+                        self.begin(id);
+                    }
+                    ToWorker::EndFrame { frame } => w.leases.retain(|(l, _)| l.frame() != frame),
                     ToWorker::DropBricks { set, bricks } => {
                         for b in bricks {
                             let was = w.present.remove(&(set, b));
-                            let was = was || w.nature.broken_in > 0;
+                            // It may have forgotten it while the message came.
+                            let was = was || w.nature.broken_in > 0 || !w.directories.is_empty();
                             assert!(was, "seed {seed}: {id} is to drop {b}, which it has not");
                         }
                     }
@@ -566,7 +663,8 @@ impl World {
 
     fn check_budget(&self, id: WorkerId) {
         let w = &self.workers[&id];
-        if w.nature.budget == u64::MAX {
+        // Who draws regions makes room itself (`slabcast-worker`'s tests look at that).
+        if w.nature.budget == u64::MAX || !w.directories.is_empty() {
             return;
         }
         let size = |(set, b): &(BrickSetKey, BrickId)| {
@@ -590,16 +688,25 @@ impl World {
             let Some(w) = self.workers.get_mut(&id) else { return };
             let Some(thread) = w.running.iter().position(|r| r.is_none()) else { return };
             let ready = w.leases.iter().position(|(l, _)| {
-                let set = self.jobs[&l.frame].job.scene.bricks;
-                l.bricks.iter().all(|&b| w.present.contains(&(set, b)))
+                let set = self.jobs[&l.frame()].job.scene.bricks;
+                l.bricks().iter().all(|&b| w.present.contains(&(set, b)))
             });
             let Some(i) = ready else { return };
-            let (lease, received) = w.leases.remove(i);
-            let corner = Some([lease.tile.x0, lease.tile.y0]);
+            let (mut loan, received) = w.leases.remove(i);
+            let corner = Some([loan.tile().x0, loan.tile().y0]);
             let (deadly, hangs) = (w.nature.deadly == corner, w.nature.hangs_at == corner);
-            let cost = lease.tile.area() as f64 * f64::from(lease.slab.len());
-            let time = (cost * w.nature.us_per_pixel_sheet) as Micros + 50;
-            w.running[thread] = Some(Running { lease, received, ready: now, start: now });
+            let area = loan.tile().area() as f64;
+            let sheets = match &mut loan {
+                Loan::Slab(l) => l.slab.len(),
+                Loan::Region(l, going) => {
+                    if going.parked_at > 0 {
+                        going.parked_us += now - going.parked_at;
+                    }
+                    going.advance(&self.jobs[&l.frame], l.tile, &w.present)
+                }
+            };
+            let time = (area * f64::from(sheets) * w.nature.us_per_pixel_sheet) as Micros + 50;
+            w.running[thread] = Some(Running { loan, received, ready: now, start: now });
             if deadly {
                 self.at(now + time / 2, Coming::Scripted(Script::Kill(id)));
             } else if !hangs {
@@ -612,13 +719,42 @@ impl World {
     fn end_task(&mut self, id: WorkerId, thread: usize) {
         let now = self.clock.now();
         let Some(w) = self.workers.get_mut(&id) else { return };
-        let r = w.running[thread].take().expect("a task that ends has begun");
+        let mut r = w.running[thread].take().expect("a task that ends has begun");
         let nature = w.nature.clone();
-        let job = &self.jobs[&r.lease.frame];
-        let l = &r.lease;
-        let quality = &job.job.scene.quality;
-        let mut pixels =
-            fake::render(&job.projections, quality, l.tile, l.slab, &l.bricks, &l.state);
+        let is_over = !w.frames.contains(&r.loan.frame());
+        let job = &self.jobs[&r.loan.frame()];
+        let mut cost = None;
+        let mut start = r.start;
+        let mut pixels = match &mut r.loan {
+            Loan::Slab(l) => {
+                let quality = &job.job.scene.quality;
+                fake::render(&job.projections, quality, l.tile, l.slab, &l.bricks, &l.state)
+            }
+            Loan::Region(_, going) => {
+                going.us += now - r.start;
+                if !going.lacks.is_empty() {
+                    if !is_over {
+                        self.park(id, r);
+                    }
+                    self.maybe_gone(id);
+                    self.begin(id);
+                    return;
+                }
+                start = now.saturating_sub(going.us);
+                let place = |b: &BrickId| {
+                    let at = job.job.bricks.binary_search_by_key(b, |b| b.id);
+                    at.expect("a brick of the set") as u32
+                };
+                let mut touched: Vec<u32> = going.touched.iter().map(place).collect();
+                if nature.lie_in > 0 && self.rng.once_in(4 * nature.lie_in) {
+                    touched.push(job.job.bricks.len() as u32);
+                }
+                let (stalls, parked_us) = (going.stalls, going.parked_us);
+                cost = Some(RegionCost { touched, stalls, parked_us, idle_us: 0 });
+                let (_, pixels) = going.drawn.take().expect("it was drawn to its end");
+                TilePixels { last: None, ..pixels }
+            }
+        };
         if nature.lie_in > 0 && self.rng.once_in(nature.lie_in) {
             match self.rng.below(4) {
                 0 => pixels.a.truncate(3),
@@ -628,23 +764,24 @@ impl World {
             }
         }
         let clock = |t: Micros| t + nature.clock_ahead;
-        let n = l.tile.area() as u64;
+        let n = r.loan.tile().area() as u64;
+        let (task, epoch) = r.loan.task();
         let result = Box::new(TileResult {
-            task: l.task,
-            epoch: l.epoch,
+            task,
+            epoch,
             pixels,
             counters: Counters { tossed: 2 * n, splatted: n, culled: 0 },
             times: TaskTimes {
                 received_us: clock(r.received),
                 ready_us: clock(r.ready),
-                start_us: clock(r.start),
+                start_us: clock(start),
                 end_us: clock(now),
                 thread: thread as u32,
             },
+            region: cost,
         });
         if nature.fail_in > 0 && self.rng.once_in(nature.fail_in) {
             let reason = "no reason".to_string();
-            let (task, epoch) = (l.task, l.epoch);
             self.up(id, Event::Failed { worker: id, task, epoch, reason });
         } else {
             if nature.twice_in > 0 && self.rng.once_in(nature.twice_in) {
@@ -654,6 +791,64 @@ impl World {
         }
         self.maybe_gone(id);
         self.begin(id);
+    }
+
+    /// A region stands still: it makes room and asks for what it lacks.
+    fn park(&mut self, id: WorkerId, mut r: Running) {
+        let now = self.clock.now();
+        let Some(w) = self.workers.get_mut(&id) else { return };
+        let Loan::Region(lease, going) = &mut r.loan else { panic!("a slab's tile is not parked") };
+        let job = &self.jobs[&lease.frame];
+        let set = job.job.scene.bricks;
+        going.parked_at = now;
+        going.stalls += 1;
+        // What others wait for already is not asked for again.
+        let waited: BTreeSet<BrickId> = w
+            .leases
+            .iter()
+            .filter_map(|(l, _)| match l {
+                Loan::Region(other, g) if self.jobs[&other.frame].job.scene.bricks == set => {
+                    Some(g.lacks.iter().copied())
+                }
+                _ => None,
+            })
+            .flatten()
+            .collect();
+        let absent = |b: &&BrickId| !w.present.contains(&(set, **b)) && !waited.contains(b);
+        let asked: Vec<BrickId> = going.lacks.iter().filter(absent).copied().collect();
+        let mut forgotten = Vec::new();
+        if w.nature.budget < u64::MAX {
+            let size = |(k, b): &(BrickSetKey, BrickId)| {
+                let job = self.jobs.values().find(|j| j.job.scene.bricks == *k);
+                job.map_or(0, |j| u64::from(j.sizes[b].bytes))
+            };
+            let kept = |b: &(BrickSetKey, BrickId)| {
+                let keeps = |l: &Loan| matches!(l, Loan::Region(_, g) if g.keeps.contains(&b.1));
+                let running = w.running.iter().flatten().any(|r| keeps(&r.loan));
+                b.0 == set && (going.keeps.contains(&b.1) || running)
+                    || w.leases.iter().any(|(l, _)| keeps(l))
+            };
+            let on_their_way: u64 = w.sent.difference(&w.present).map(size).sum::<u64>();
+            let new: u64 = asked.iter().map(|&b| size(&(set, b))).sum();
+            let mut bytes = w.present.iter().map(size).sum::<u64>() + on_their_way + new;
+            for b in w.present.clone() {
+                if bytes <= w.nature.budget {
+                    break;
+                }
+                if !kept(&b) {
+                    bytes -= size(&b);
+                    w.present.remove(&b);
+                    forgotten.push(b);
+                }
+            }
+        }
+        w.leases.push((r.loan, r.received));
+        for (k, b) in forgotten {
+            self.up(id, Event::BricksForgotten { worker: id, set: k, bricks: vec![b] });
+        }
+        if !asked.is_empty() {
+            self.up(id, Event::BricksWanted { worker: id, set, bricks: asked });
+        }
     }
 
     /// Lets time run until `until` says so. Panics when nothing happens any more.
@@ -755,6 +950,79 @@ impl World {
     }
 }
 
+impl Going {
+    /// Draws sheet after sheet with what is there, as far as nothing is lacked that may touch an open
+    /// pixel. How many sheets that are.
+    fn advance(
+        &mut self,
+        job: &Known,
+        tile: Rect,
+        present: &BTreeSet<(BrickSetKey, BrickId)>,
+    ) -> u32 {
+        let (set, quality) = (job.job.scene.bricks, &job.job.scene.quality);
+        let over: Vec<(BrickId, Projected)> = job
+            .projections
+            .iter()
+            .filter(|(_, p)| !p.rect.intersect(&tile).is_empty())
+            .map(|(id, p)| (*id, *p))
+            .collect();
+        let sheets = over.iter().fold(SheetRange::default(), |all, (_, p)| all.union(p.sheets));
+        let n = tile.area();
+        let (mut k, mut pixels) = self.drawn.take().unwrap_or_else(|| {
+            let blank = TilePixels { a: vec![0.0; n], colour: vec![[0; 3]; n], last: None };
+            (sheets.first, blank)
+        });
+        let from = k;
+        self.lacks.clear();
+        while k < sheets.end && self.lacks.is_empty() {
+            let visible = |p: &Projected| {
+                let r = p.rect.intersect(&tile);
+                let mut any = !quality.cull;
+                for y in r.y0..r.y1 {
+                    for x in r.x0..r.x1 {
+                        let i = (y - tile.y0) as usize * tile.width() + (x - tile.x0) as usize;
+                        any |= !is_shut(pixels.a[i], quality.eps);
+                    }
+                }
+                any
+            };
+            let lacks = |&(id, p): &(BrickId, Projected), until: i32| {
+                let begun = p.sheets.first <= until && p.sheets.end > k;
+                begun && !present.contains(&(set, id)) && visible(&p)
+            };
+            if over.iter().any(|b| lacks(b, k)) {
+                let ahead = over.iter().filter(|b| lacks(b, k + 3)).map(|b| b.0);
+                self.lacks.extend(ahead);
+                break;
+            }
+            let drawn: Vec<BrickId> = over
+                .iter()
+                .filter(|(id, p)| {
+                    p.sheets.first <= k && present.contains(&(set, *id)) && visible(p)
+                })
+                .map(|b| b.0)
+                .collect();
+            let one = SheetRange::new(k, k + 1);
+            let state = TileState { a: pixels.a.clone(), last: pixels.last.take() };
+            let more = fake::render(&job.projections, quality, tile, one, &drawn, &state);
+            for (sum, add) in pixels.colour.iter_mut().zip(&more.colour) {
+                for c in 0..3 {
+                    sum[c] = sum[c].wrapping_add(add[c]);
+                }
+            }
+            (pixels.a, pixels.last) = (more.a, more.last);
+            self.touched.extend(drawn);
+            k += 1;
+        }
+        if k > from {
+            self.keeps.clear();
+        }
+        self.keeps.extend(self.lacks.iter().copied());
+        self.drawn = Some((k, pixels));
+        k.abs_diff(from)
+    }
+}
+
 impl Script {
     fn matters(&self) -> bool {
         !matches!(self, Script::Kill(_) | Script::Cancel(FrameId(u64::MAX)))
@@ -767,6 +1035,8 @@ fn sender(event: &Event) -> WorkerId {
         | Event::Failed { worker, .. }
         | Event::BricksIn { worker, .. }
         | Event::BricksBroken { worker, .. }
+        | Event::BricksWanted { worker, .. }
+        | Event::BricksForgotten { worker, .. }
         | Event::Pong { worker, .. } => *worker,
         other => panic!("{other:?} is no worker's message"),
     }

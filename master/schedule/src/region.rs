@@ -1,0 +1,366 @@
+//! The `region` schedule's own part of a frame: where the picture is cut, who takes which tile, and
+//! what the frames before teach about both (DESIGN.md section 3).
+//!
+//! A task is one tile through all depths. There is no barrier, the master culls nothing and sends no
+//! brick that was not asked for: workers do both, sheet by sheet. What is left to decide is how much
+//! work a tile is and who gets it.
+//!
+//! **How much.** The paper's workload, pixels under bricks, is the first guess; here those of blocks
+//! of 4x4x4 bricks and of whole leaves, since nothing hangs on it but the order of the first frame. From
+//! then on a tile's estimate is what it took in the frame before (half of that, half of what was
+//! estimated then: one disturbed measurement moves nothing), which knows what hides what, and which
+//! worker was slow.
+//!
+//! **Who.** Whoever drew a tile last holds its bricks, so it gets it again. A tile moves only when one
+//! worker would else be done more than [`SLACK`] later than the mean, and the bricks that it was drawn
+//! from go along at once. When all of a worker's tiles are lent it takes tiles of the next frame of
+//! the path; another's tile of this frame only where there is no next one.
+//!
+//! It refuses to know what time it is and which copy of a result counts.
+
+use crate::macrotile::{Cut, Macrotile, cut_through};
+use crate::roster::Roster;
+use crate::{FrameJob, Micros};
+use slabcast_common::brick::{BrickInfo, BrickSetKey, TightBox};
+use slabcast_common::ids::WorkerId;
+use slabcast_common::occlusion::Rect;
+use std::collections::BTreeMap;
+
+/// How much later than the mean a worker may be done before a tile of it moves, as a fraction. Tiles of
+/// 64 pixels are 2 % of a frame of 512 each. At half, noise of the measurement moves tiles and their
+/// bricks to and fro; at double, 15 workers wait for the slowest for a tenth of a frame.
+const SLACK: f64 = 0.06;
+
+/// Tiles for a thread beyond which a coarser cut is taken: messages of 12 tiles of 64 pixels cost a
+/// thread half a millisecond (TRANSPORT.md).
+const MANY: u64 = 12;
+
+/// Most blocks that stand for bricks: 60 us to project. Twice as many know the outline better by half a
+/// leaf and cost twice that on the master's one thread.
+const BLOCKS: usize = 2048;
+
+/// What is known of a tile from the frame before.
+#[derive(Clone, Debug)]
+struct Known {
+    owner: WorkerId,
+    /// What it takes its owner.
+    us: f64,
+    /// Places of the bricks that it was drawn from.
+    touched: Vec<u32>,
+}
+
+/// What frames of one kind (a brick set, a size of pictures, a size of tiles) teach the next one.
+#[derive(Debug)]
+struct Lessons {
+    kind: (BrickSetKey, [u32; 2], u32),
+    tiles: BTreeMap<(i32, i32), Known>,
+}
+
+/// What the schedule remembers.
+#[derive(Debug, Default)]
+pub(crate) struct Memory {
+    blocks: Option<(BrickSetKey, Vec<TightBox>)>,
+    lessons: Option<Lessons>,
+}
+
+impl Memory {
+    /// Boxes around neighbouring bricks, together around all: where anything may be seen.
+    fn blocks(&mut self, key: BrickSetKey, bricks: &[BrickInfo]) -> &[TightBox] {
+        if self.blocks.as_ref().is_none_or(|(k, _)| *k != key) {
+            self.blocks = Some((key, blocks_of(bricks)));
+        }
+        self.blocks.as_ref().map_or(&[], |(_, blocks)| blocks)
+    }
+
+    fn known(&self, kind: (BrickSetKey, [u32; 2], u32), tile: &Rect) -> Option<&Known> {
+        let lessons = self.lessons.as_ref().filter(|l| l.kind == kind)?;
+        lessons.tiles.get(&(tile.x0, tile.y0))
+    }
+
+    /// The bricks that a tile was drawn from in the frame before, if by another worker.
+    pub(crate) fn moving(
+        &self,
+        regions: &Regions,
+        tile: &Rect,
+        worker: WorkerId,
+    ) -> Option<&[u32]> {
+        let known = self.known(regions.kind, tile)?;
+        (known.owner != worker).then_some(&known.touched[..])
+    }
+
+    /// A tile was drawn.
+    pub(crate) fn learn(
+        &mut self,
+        regions: &Regions,
+        tile: &Rect,
+        owner: WorkerId,
+        us: Micros,
+        touched: &[u32],
+    ) {
+        let before = self.known(regions.kind, tile).filter(|k| k.owner == owner).map(|k| k.us);
+        let us = us as f64;
+        let us = before.map_or(us, |before| 0.5 * (before + us));
+        let lessons = match &mut self.lessons {
+            Some(lessons) if lessons.kind == regions.kind => lessons,
+            other => other.insert(Lessons { kind: regions.kind, tiles: BTreeMap::new() }),
+        };
+        let known = Known { owner, us, touched: touched.to_vec() };
+        lessons.tiles.insert((tile.x0, tile.y0), known);
+    }
+}
+
+fn blocks_of(bricks: &[BrickInfo]) -> Vec<TightBox> {
+    // Edge of a block as a power of two, from 4 bricks.
+    for shift in 5..32 {
+        let mut blocks: BTreeMap<[u32; 3], TightBox> = BTreeMap::new();
+        for b in bricks {
+            let block = blocks.entry(b.tight.lo.map(|x| x >> shift)).or_insert(b.tight);
+            for a in 0..3 {
+                block.lo[a] = block.lo[a].min(b.tight.lo[a]);
+                block.hi[a] = block.hi[a].max(b.tight.hi[a]);
+            }
+        }
+        if blocks.len() <= BLOCKS || shift == 31 {
+            return blocks.into_values().collect();
+        }
+    }
+    Vec::new()
+}
+
+/// A frame's regions.
+#[derive(Debug)]
+pub(crate) struct Regions {
+    kind: (BrickSetKey, [u32; 2], u32),
+    /// Whose each tile is, by its place in the queue.
+    owners: Vec<WorkerId>,
+}
+
+impl Regions {
+    /// Cuts a frame's picture, estimates its tiles and shares them out among those who stay.
+    pub(crate) fn cut(job: &FrameJob, roster: &Roster, memory: &mut Memory) -> (Cut, Regions) {
+        let (key, size) = (job.scene.bricks, job.view.size);
+        let blocks = memory.blocks(key, &job.bricks);
+        let rects: Vec<Rect> =
+            blocks.iter().filter_map(|b| Some(job.view.project(b)?.rect)).collect();
+        let threads = roster.threads();
+        let wanted = (job.work.tiles_per_worker * threads as f64).ceil() as u64;
+        let many = wanted.max(MANY * threads);
+        let mut cut = cut_through(size, &rects, (wanted, many), job.work.tile);
+        let kind = (key, size, cut.edge);
+        let known = |t: &Macrotile| memory.known(kind, &t.rect).map(|k| (k.owner, k.us));
+        let pace = Pace::of(&cut.tiles, &known);
+        pace.correct(&mut cut.tiles, &known);
+        cut.sort(size);
+        let owners = share(&cut.tiles, roster, &pace, &known);
+        (cut, Regions { kind, owners })
+    }
+
+    /// Whether a task is this worker's to take first: it owns it, or its owner is gone.
+    pub(crate) fn is_for(&self, place: u32, worker: WorkerId, roster: &Roster) -> bool {
+        let owner = self.owners[place as usize];
+        owner == worker || roster.get(owner).is_none_or(|w| w.leaving)
+    }
+
+    /// Another worker takes a task.
+    pub(crate) fn moves(&mut self, place: u32, worker: WorkerId) {
+        self.owners[place as usize] = worker;
+    }
+}
+
+/// How long guessed units take.
+#[derive(Debug, Default)]
+struct Pace {
+    /// Of each worker whose tiles are known: guessed units and microseconds.
+    workers: BTreeMap<WorkerId, (f64, f64)>,
+}
+
+/// How much slower or faster than the mean a worker must look before that is believed. The guess alone
+/// makes equal workers look different by a third; a core shared with somebody is slower by half.
+const BELIEVED: f64 = 2.0;
+
+impl Pace {
+    fn of(tiles: &[Macrotile], known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>) -> Pace {
+        let mut pace = Pace::default();
+        for t in tiles {
+            if let Some((owner, us)) = known(t) {
+                let (units, took) = pace.workers.entry(owner).or_default();
+                *units += t.est as f64;
+                *took += us;
+            }
+        }
+        pace
+    }
+
+    /// Microseconds that a unit takes, in the mean; 1 before anything is known.
+    fn mean(&self) -> f64 {
+        let (units, us) =
+            self.workers.values().fold((0.0, 0.0), |(a, b), (units, us)| (a + units, b + us));
+        if units > 0.0 && us > 0.0 { us / units } else { 1.0 }
+    }
+
+    /// How many times longer than in the mean it takes a worker, as far as that is believed.
+    fn slowness(&self, worker: WorkerId) -> f64 {
+        let Some(&(units, us)) = self.workers.get(&worker) else { return 1.0 };
+        let slow = if units > 0.0 { us / units / self.mean() } else { 1.0 };
+        if (1.0 / BELIEVED..=BELIEVED).contains(&slow) { 1.0 } else { slow.clamp(0.01, 100.0) }
+    }
+
+    /// Puts what tiles took in the place of what they are guessed to take: in guessed units, so that
+    /// the two can stand beside each other.
+    fn correct(
+        &self,
+        tiles: &mut [Macrotile],
+        known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>,
+    ) {
+        let mean = self.mean();
+        for t in tiles {
+            if let Some((_, us)) = known(t) {
+                t.est = ((us / mean) as u64).max(1);
+            }
+        }
+    }
+}
+
+/// Whose each tile is: its last owner's, unless that one would be done late; a new one's the least
+/// loaded worker's. Loads are times.
+fn share(
+    tiles: &[Macrotile],
+    roster: &Roster,
+    pace: &Pace,
+    known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>,
+) -> Vec<WorkerId> {
+    let staying: Vec<(WorkerId, f64)> =
+        roster.staying().map(|(id, w)| (id, f64::from(w.threads))).collect();
+    if staying.is_empty() {
+        return vec![WorkerId(0); tiles.len()];
+    }
+    let place = |id: WorkerId| staying.binary_search_by_key(&id, |s| s.0).ok();
+    let mean = pace.mean();
+    let slowness: Vec<f64> = staying.iter().map(|s| pace.slowness(s.0)).collect();
+    let cost = |t: &Macrotile, w: usize| {
+        let us = match known(t) {
+            Some((owner, us)) => us * slowness[w] / pace.slowness(owner),
+            None => t.est as f64 * mean * slowness[w],
+        };
+        us / staying[w].1
+    };
+    let mut load = vec![0.0; staying.len()];
+    let mut owners: Vec<usize> = Vec::with_capacity(tiles.len());
+    for t in tiles {
+        let w = known(t).and_then(|(owner, _)| place(owner)).unwrap_or_else(|| {
+            let after = |w: &usize| load[*w] + cost(t, *w);
+            (0..staying.len()).min_by(|a, b| after(a).total_cmp(&after(b))).unwrap_or(0)
+        });
+        load[w] += cost(t, w);
+        owners.push(w);
+    }
+    for _ in 0..tiles.len() {
+        let by = |a: &usize, b: &usize| load[*a].total_cmp(&load[*b]);
+        let ends = ((0..load.len()).max_by(by), (0..load.len()).min_by(by));
+        let (Some(most), Some(least)) = ends else { break };
+        if load[most] <= (1.0 + SLACK) * load.iter().sum::<f64>() / load.len() as f64 {
+            break;
+        }
+        // The largest that leaves both earlier than the later one was, by enough to be worth it.
+        let better = |&i: &usize| {
+            let (from, to) = (cost(&tiles[i], most), cost(&tiles[i], least));
+            owners[i] == most && load[least] + to < load[most] - 0.5 * from
+        };
+        let Some(i) = (0..tiles.len()).find(better) else { break };
+        load[most] -= cost(&tiles[i], most);
+        load[least] += cost(&tiles[i], least);
+        owners[i] = least;
+    }
+    owners.into_iter().map(|w| staying[w].0).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn roster(threads: &[u32]) -> Roster {
+        let mut roster = Roster::default();
+        for (i, &threads) in threads.iter().enumerate() {
+            roster.join(WorkerId(i as u64 + 1), format!("w{i}"), threads, 0);
+        }
+        roster
+    }
+
+    fn tiles(n: i32) -> Vec<Macrotile> {
+        let rect = |i| Rect::new(64 * i, 0, 64 * i + 64, 64);
+        (0..n).map(|i| Macrotile { rect: rect(i), est: 4096 }).collect()
+    }
+
+    fn shares(owners: &[WorkerId]) -> Vec<usize> {
+        let count = |w: u64| owners.iter().filter(|o| o.0 == w).count();
+        (1..=3).map(count).collect()
+    }
+
+    #[test]
+    fn first_shares_are_as_threads_and_later_ones_stay() {
+        let (tiles, roster) = (tiles(24), roster(&[1, 2, 3]));
+        let owners = share(&tiles, &roster, &Pace::default(), &|_| None);
+        assert_eq!(shares(&owners), [4, 8, 12]);
+        let at = |t: &Macrotile| (t.rect.x0 / 64) as usize;
+        // Each took what it was guessed to, or nearly.
+        let known = |t: &Macrotile| Some((owners[at(t)], 1000.0 + at(t) as f64));
+        let again = share(&tiles, &roster, &Pace::of(&tiles, &known), &known);
+        assert_eq!(again, owners);
+    }
+
+    #[test]
+    fn a_tenth_of_the_speed_gets_a_tenth_of_the_work() {
+        let (tiles, roster) = (tiles(42), roster(&[1, 1, 1]));
+        let owners = share(&tiles, &roster, &Pace::default(), &|_| None);
+        assert_eq!(shares(&owners), [14, 14, 14]);
+        let at = |t: &Macrotile| (t.rect.x0 / 64) as usize;
+        let known = |t: &Macrotile| {
+            let owner = owners[at(t)];
+            Some((owner, if owner.0 == 2 { 10_000.0 } else { 1000.0 }))
+        };
+        let again = share(&tiles, &roster, &Pace::of(&tiles, &known), &known);
+        assert_eq!(shares(&again), [20, 2, 20]);
+    }
+
+    #[test]
+    fn whose_owner_is_gone_is_shared_and_who_comes_gets_a_share() {
+        let tiles = tiles(30);
+        let at = |t: &Macrotile| t.rect.x0 / 64;
+        let known = |t: &Macrotile| Some((WorkerId(if at(t) < 20 { 1 } else { 9 }), 500.0));
+        let owners = share(&tiles, &roster(&[1, 1, 1]), &Pace::of(&tiles, &known), &known);
+        let counts = shares(&owners);
+        assert!(counts.iter().all(|n| (9..=11).contains(n)), "{counts:?}");
+        let kept = owners[..20].iter().filter(|o| o.0 == 1).count();
+        assert_eq!(kept, counts[0], "it keeps of its own");
+    }
+
+    #[test]
+    fn estimates_are_corrected_in_units_of_the_guess() {
+        let mut tiles = tiles(3);
+        let known = |t: &Macrotile| match t.rect.x0 {
+            0 => Some((WorkerId(1), 300.0)),
+            64 => Some((WorkerId(1), 100.0)),
+            _ => None,
+        };
+        Pace::of(&tiles, &known).correct(&mut tiles, &known);
+        assert_eq!(tiles.iter().map(|t| t.est).collect::<Vec<_>>(), [6144, 2048, 4096]);
+    }
+
+    #[test]
+    fn blocks_hold_their_bricks_and_are_few() {
+        let brick = |i: u32| {
+            let lo = [i % 50 * 8, i / 50 % 50 * 8, i / 2500 * 8];
+            let tight = TightBox { lo, hi: lo.map(|x| x + 7) };
+            BrickInfo { id: slabcast_common::ids::BrickId(i), tight, voxels: 512, bytes: 99 }
+        };
+        let bricks: Vec<_> = (0..125_000).filter(|i| i % 3 > 0).map(brick).collect();
+        let blocks = blocks_of(&bricks);
+        assert!(blocks.len() <= BLOCKS && blocks.len() > BLOCKS / 16, "{}", blocks.len());
+        for b in &bricks {
+            let holds =
+                |o: &TightBox| (0..3).all(|a| o.lo[a] <= b.tight.lo[a] && b.tight.hi[a] <= o.hi[a]);
+            assert!(blocks.iter().any(holds), "{b:?}");
+        }
+        assert!(blocks_of(&[]).is_empty());
+    }
+}

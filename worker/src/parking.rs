@@ -1,0 +1,447 @@
+//! Regions that stand still for want of bricks: what is asked for, what makes room, who goes on.
+//!
+//! A region that lacks bricks is *parked* here, and its render thread takes another. What all parked
+//! regions lack is asked for together, each brick once; a region goes on when all that it asked for is
+//! here.
+//!
+//! **Memory.** Under this schedule the worker keeps its own budget: nobody else knows what its regions
+//! stand on. Before bricks are asked for, room is made: least recently drawn first, of any set. What a
+//! parked region waited for, and a region that goes on has not got past yet, is *kept*. So a region that
+//! comes to the same sheet again waits for more and loses nothing. Where all that is here is kept, a
+//! region's wish is put off until another ends, except the oldest one's: that goes over the budget,
+//! since the picture comes first, and is counted.
+//!
+//! It refuses to know threads, links and time.
+
+use crate::cache::BrickCache;
+use crate::shelf::Shelf;
+use slabcast_common::brick::BrickSetKey;
+use slabcast_common::ids::{BrickId, FrameId, TaskId};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+/// A region, the older frame's first.
+pub(crate) type Who = (FrameId, TaskId);
+
+/// A brick: its set, and its place in the directory.
+type Which = (BrickSetKey, u32);
+
+/// Part of the budget that is freed beyond what is needed, as a divisor, so that not every wish looks
+/// through all bricks. At twice this each look frees 3 %; at half, an eighth of the memory lies idle.
+const SPARE: u64 = 16;
+
+/// A region that the worker has.
+struct Stay {
+    set: BrickSetKey,
+    shelf: Arc<Shelf>,
+    /// What it waited for since it last came farther.
+    keeps: BTreeSet<u32>,
+    /// What it waits for.
+    lacks: BTreeSet<u32>,
+    /// All of that was asked for.
+    asked: bool,
+}
+
+/// What is to be said to the master, in this order.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Say {
+    Forgotten(BrickSetKey, Vec<BrickId>),
+    Wanted(BrickSetKey, Vec<BrickId>),
+}
+
+/// See the head of the file.
+pub(crate) struct Parking {
+    budget: u64,
+    stays: BTreeMap<Who, Stay>,
+    /// Bricks that were asked for and are not here, with those who wait.
+    coming: BTreeMap<Which, BTreeSet<Who>>,
+    /// Encoded bytes of those.
+    coming_bytes: u64,
+    /// How many regions keep a brick.
+    kept: BTreeMap<Which, u32>,
+    /// When a brick was drawn last, or came.
+    drawn: BTreeMap<BrickSetKey, Vec<u64>>,
+    clock: u64,
+    /// Wishes that went over the budget.
+    pub(crate) over_budget: u64,
+}
+
+impl Parking {
+    pub(crate) fn new(budget: u64) -> Parking {
+        Parking {
+            budget,
+            stays: BTreeMap::new(),
+            coming: BTreeMap::new(),
+            coming_bytes: 0,
+            kept: BTreeMap::new(),
+            drawn: BTreeMap::new(),
+            clock: 0,
+            over_budget: 0,
+        }
+    }
+
+    /// A region comes.
+    pub(crate) fn enter(&mut self, who: Who, set: BrickSetKey, shelf: Arc<Shelf>) {
+        let (keeps, lacks) = Default::default();
+        self.stays.insert(who, Stay { set, shelf, keeps, lacks, asked: true });
+    }
+
+    /// A region lacks bricks (places in its directory). `farther`: it came farther since it last did.
+    /// True: they came meanwhile, it goes on. False: it is parked.
+    pub(crate) fn park(&mut self, who: Who, lacks: &[u32], farther: bool) -> bool {
+        let Some(stay) = self.stays.get_mut(&who) else { return false };
+        let before = if farther { std::mem::take(&mut stay.keeps) } else { BTreeSet::new() };
+        for &place in lacks {
+            if stay.keeps.insert(place) {
+                *self.kept.entry((stay.set, place)).or_default() += 1;
+            }
+            if !stay.shelf.holds(place) {
+                stay.lacks.insert(place);
+            }
+        }
+        stay.asked = stay.lacks.is_empty();
+        let (set, on) = (stay.set, stay.lacks.is_empty());
+        self.let_go(set, before);
+        on
+    }
+
+    fn let_go(&mut self, set: BrickSetKey, places: impl IntoIterator<Item = u32>) {
+        for place in places {
+            if let Some(n) = self.kept.get_mut(&(set, place)) {
+                *n -= 1;
+                if *n == 0 {
+                    self.kept.remove(&(set, place));
+                }
+            }
+        }
+    }
+
+    /// A region is at its end, having drawn from these; or its frame is, in whatever way.
+    pub(crate) fn leave(&mut self, who: Who, touched: &[u32]) {
+        let Some(stay) = self.stays.remove(&who) else { return };
+        self.clock += 1;
+        let drawn = self.drawn.entry(stay.set).or_default();
+        drawn.resize(stay.shelf.bricks().len().max(drawn.len()), 0);
+        for &place in touched {
+            drawn[place as usize] = self.clock;
+        }
+        for place in stay.lacks {
+            let which = (stay.set, place);
+            if let Some(waiting) = self.coming.get_mut(&which) {
+                waiting.remove(&who);
+                // Nobody waits for it. It may come all the same, or be asked for again.
+                if waiting.is_empty() {
+                    self.coming.remove(&which);
+                    self.coming_bytes -= u64::from(stay.shelf.bricks()[place as usize].bytes);
+                }
+            }
+        }
+        self.let_go(stay.set, stay.keeps);
+    }
+
+    /// A frame is over: those of its regions that were parked.
+    pub(crate) fn end_frame(&mut self, frame: FrameId) -> Vec<Who> {
+        let range = (frame, TaskId(0))..=(frame, TaskId(u64::MAX));
+        let parked: Vec<Who> = self
+            .stays
+            .range(range)
+            .filter(|(_, s)| !s.lacks.is_empty())
+            .map(|(who, _)| *who)
+            .collect();
+        for &who in &parked {
+            self.leave(who, &[]);
+        }
+        parked
+    }
+
+    /// A brick came and is on its shelf. Who goes on now is added to `on`.
+    pub(crate) fn came(&mut self, set: BrickSetKey, shelf: &Shelf, id: BrickId, on: &mut Vec<Who>) {
+        let Some(place) = shelf.place(id) else { return };
+        self.clock += 1;
+        let drawn = self.drawn.entry(set).or_default();
+        drawn.resize(shelf.bricks().len().max(drawn.len()), 0);
+        drawn[place as usize] = self.clock;
+        if self.coming.remove(&(set, place)).is_some() {
+            self.coming_bytes -= u64::from(shelf.bricks()[place as usize].bytes);
+        }
+        // Those whose wish was put off as well as those who asked.
+        for (who, stay) in self.stays.iter_mut().filter(|(_, s)| s.set == set) {
+            if stay.lacks.remove(&place) && stay.lacks.is_empty() {
+                stay.asked = true;
+                on.push(*who);
+            }
+        }
+    }
+
+    /// Asks for what is lacked, as far as there is room or can be made; forgets what makes it.
+    pub(crate) fn ask(&mut self, cache: &mut BrickCache) -> Vec<Say> {
+        let mut say = Vec::new();
+        if self.stays.is_empty() {
+            // The master keeps the budget: under the other schedule, it knows what is needed.
+            return say;
+        }
+        // What came without being asked for may be too much, too.
+        self.make_room(cache, 0, true, &mut say);
+        let oldest = self.stays.keys().next().copied();
+        let wishes: Vec<Who> =
+            self.stays.iter().filter(|(_, s)| !s.asked).map(|(who, _)| *who).collect();
+        for who in wishes {
+            let stay = &self.stays[&who];
+            let (set, shelf) = (stay.set, stay.shelf.clone());
+            let fresh: Vec<u32> = stay
+                .lacks
+                .iter()
+                .filter(|&&place| !self.coming.contains_key(&(set, place)))
+                .copied()
+                .collect();
+            let bytes: u64 =
+                fresh.iter().map(|&i| u64::from(shelf.bricks()[i as usize].bytes)).sum();
+            let urgent = Some(who) == oldest;
+            if !self.make_room(cache, bytes, urgent, &mut say) {
+                if !urgent {
+                    continue;
+                }
+                self.over_budget += 1;
+            }
+            self.coming_bytes += bytes;
+            let stay = self.stays.get_mut(&who).expect("it wishes");
+            stay.asked = true;
+            for &place in &stay.lacks {
+                self.coming.entry((set, place)).or_default().insert(who);
+            }
+            let ids = fresh.iter().map(|&i| shelf.bricks()[i as usize].id);
+            match say.last_mut() {
+                Some(Say::Wanted(of, wanted)) if *of == set => wanted.extend(ids),
+                _ if fresh.is_empty() => {}
+                _ => say.push(Say::Wanted(set, ids.collect())),
+            }
+        }
+        say
+    }
+
+    /// Whether so many bytes fit, after forgetting what can be forgotten. Nothing is where that would
+    /// be in vain, unless it is urgent.
+    fn make_room(
+        &mut self,
+        cache: &mut BrickCache,
+        bytes: u64,
+        urgent: bool,
+        say: &mut Vec<Say>,
+    ) -> bool {
+        let after = cache.encoded_bytes() + self.coming_bytes + bytes;
+        if after <= self.budget {
+            return true;
+        }
+        let excess = (after - self.budget) + self.budget / SPARE;
+        let mut victims: Vec<(u64, BrickSetKey, BrickId, u64)> = Vec::new();
+        for (set, ids) in cache.held() {
+            let shelf = cache.shelf(set);
+            let drawn = self.drawn.get(&set);
+            for id in ids {
+                // Where there is no directory, no region stands on it.
+                let place = shelf.and_then(|s| s.place(id));
+                if place.is_some_and(|place| self.kept.contains_key(&(set, place))) {
+                    continue;
+                }
+                let last = place.and_then(|p| drawn?.get(p as usize).copied()).unwrap_or(0);
+                let size = cache.get(set, id).map_or(0, |b| b.encoded_len() as u64);
+                victims.push((last, set, id, size));
+            }
+        }
+        let all: u64 = victims.iter().map(|v| v.3).sum();
+        if !urgent && after - all.min(after) > self.budget {
+            return false;
+        }
+        victims.sort_unstable();
+        let mut freed = 0;
+        let mut gone: BTreeMap<BrickSetKey, Vec<BrickId>> = BTreeMap::new();
+        for (_, set, id, size) in victims {
+            if freed >= excess {
+                break;
+            }
+            freed += size;
+            gone.entry(set).or_default().push(id);
+        }
+        for (set, ids) in gone {
+            cache.remove(set, &ids);
+            say.push(Say::Forgotten(set, ids));
+        }
+        after - freed.min(after) <= self.budget
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use slabcast_common::brick::{Brick, BrickGrid};
+    use slabcast_common::volume::{Digest32, Samples};
+
+    const SET: BrickSetKey = BrickSetKey(Digest32([5; 32]));
+    const GRID: BrickGrid = BrickGrid { dims: [12, 1, 1] };
+
+    fn brick(id: u32) -> Arc<Brick> {
+        Arc::new(Brick::new(BrickId(id), (0..512).collect(), Samples::U8(vec![1; 512]), None))
+    }
+
+    /// Twelve bricks of one size, and a budget of so many.
+    struct World {
+        cache: BrickCache,
+        parking: Parking,
+    }
+
+    fn who(n: u64) -> Who {
+        (FrameId(n / 10), TaskId(n))
+    }
+
+    fn forgotten(ids: &[u32]) -> Say {
+        Say::Forgotten(SET, ids.iter().map(|&i| BrickId(i)).collect())
+    }
+
+    fn wanted(ids: &[u32]) -> Say {
+        Say::Wanted(SET, ids.iter().map(|&i| BrickId(i)).collect())
+    }
+
+    impl World {
+        fn new(budget: u64) -> World {
+            let info = |id| {
+                let b = brick(id);
+                let bytes = b.encoded_len() as u32;
+                let tight = b.tight(&GRID);
+                slabcast_common::brick::BrickInfo { id: b.id, tight, voxels: 512, bytes }
+            };
+            let mut cache = BrickCache::default();
+            let bricks = (0..12).map(info).collect();
+            assert!(cache.directory(SET, GRID, (0, 12), bricks).is_ok());
+            let parking = Parking::new(budget * brick(0).encoded_len() as u64);
+            World { cache, parking }
+        }
+
+        fn enter(&mut self, n: u64) {
+            let shelf = self.cache.shelf(SET).expect("its directory came").clone();
+            self.parking.enter(who(n), SET, shelf);
+        }
+
+        fn ask(&mut self) -> Vec<Say> {
+            self.parking.ask(&mut self.cache)
+        }
+
+        /// Bricks come; who goes on.
+        fn come(&mut self, ids: &[u32]) -> Vec<Who> {
+            let mut on = Vec::new();
+            for &id in ids {
+                self.cache.put(SET, brick(id));
+                let shelf = self.cache.shelf(SET).expect("its directory came").clone();
+                self.parking.came(SET, &shelf, BrickId(id), &mut on);
+            }
+            on
+        }
+
+        fn held(&self) -> Vec<u32> {
+            self.cache.held().iter().flat_map(|(_, ids)| ids.iter().map(|b| b.0)).collect()
+        }
+    }
+
+    #[test]
+    fn wishes_are_put_together_and_a_brick_is_asked_for_once() {
+        let mut w = World::new(12);
+        (1..=3).for_each(|n| w.enter(n));
+        w.come(&[7]);
+        assert!(!w.parking.park(who(1), &[0, 1], true));
+        assert!(!w.parking.park(who(2), &[1, 2, 7], true));
+        assert!(w.parking.park(who(3), &[7], true), "it came meanwhile");
+        assert_eq!(w.ask(), [wanted(&[0, 1, 2])]);
+        assert!(w.ask().is_empty());
+        assert_eq!(w.come(&[1]), []);
+        assert_eq!(w.come(&[0, 2]), [who(1), who(2)]);
+        // A brick that nobody waits for any more may be asked for again.
+        w.parking.park(who(1), &[4], true);
+        assert_eq!(w.ask(), [wanted(&[4])]);
+        w.parking.leave(who(1), &[]);
+        w.parking.park(who(2), &[4], true);
+        assert_eq!(w.ask(), [wanted(&[4])]);
+    }
+
+    #[test]
+    fn what_was_drawn_longest_ago_makes_room() {
+        let mut w = World::new(4);
+        w.enter(1);
+        w.come(&[0, 1, 2, 3]);
+        w.parking.leave(who(1), &[0, 2]);
+        w.enter(2);
+        w.parking.park(who(2), &[8], true);
+        // One, and what is spared beyond it.
+        assert_eq!(w.ask(), [forgotten(&[1, 3]), wanted(&[8])]);
+        assert_eq!(w.held(), [0, 2]);
+        assert_eq!(w.come(&[8]), [who(2)]);
+        assert_eq!(w.parking.over_budget, 0);
+    }
+
+    #[test]
+    fn what_comes_unasked_makes_room_for_itself() {
+        let mut w = World::new(3);
+        w.come(&[0, 1, 2, 3, 4]);
+        assert!(w.ask().is_empty(), "no region is here: the master keeps the budget");
+        w.enter(1);
+        let Say::Forgotten(_, gone) = &w.ask()[0] else { panic!("room is made") };
+        assert_eq!(gone[0], BrickId(0));
+        assert!(w.held().len() <= 3);
+    }
+
+    #[test]
+    fn wishes_beyond_the_budget_are_put_off_but_for_the_oldest() {
+        let mut w = World::new(4);
+        w.enter(1);
+        w.enter(2);
+        w.parking.park(who(2), &[5, 6, 7], true);
+        assert_eq!(w.ask(), [wanted(&[5, 6, 7])]);
+        w.come(&[5, 6]);
+        w.parking.park(who(1), &[0, 1], true);
+        assert_eq!(w.ask(), [wanted(&[0, 1])], "all that is here is kept");
+        assert_eq!(w.parking.over_budget, 1);
+        w.enter(3);
+        w.parking.park(who(3), &[9], true);
+        assert!(w.ask().is_empty(), "it can wait");
+        assert_eq!(w.come(&[0, 1, 7]), [who(1), who(2)]);
+        w.parking.leave(who(1), &[0, 1]);
+        w.parking.leave(who(2), &[5, 6, 7]);
+        let says = w.ask();
+        assert!(matches!(&says[..], [Say::Forgotten(..), Say::Wanted(..)]), "{says:?}");
+        assert_eq!(w.come(&[9]), [who(3)]);
+        assert_eq!(w.parking.over_budget, 1);
+    }
+
+    #[test]
+    fn a_region_that_comes_to_the_same_sheet_again_keeps_what_it_waited_for() {
+        // One brick fits, its sheet needs three: it must not lose one for the other for ever.
+        let mut w = World::new(1);
+        w.enter(1);
+        w.parking.park(who(1), &[0], true);
+        assert_eq!(w.ask(), [wanted(&[0])]);
+        w.come(&[0]);
+        w.parking.park(who(1), &[1], false);
+        assert_eq!(w.ask(), [wanted(&[1])]);
+        w.come(&[1]);
+        w.parking.park(who(1), &[2], false);
+        assert_eq!(w.ask(), [wanted(&[2])]);
+        assert_eq!(w.come(&[2]), [who(1)]);
+        assert_eq!(w.held(), [0, 1, 2]);
+        // Farther on they are not kept any longer.
+        w.parking.park(who(1), &[3], true);
+        assert_eq!(w.ask(), [forgotten(&[0, 1, 2]), wanted(&[3])]);
+    }
+
+    #[test]
+    fn a_frame_takes_its_parked_regions_along() {
+        let mut w = World::new(2);
+        [1, 2, 11].iter().for_each(|&n| w.enter(n));
+        w.parking.park(who(1), &[0], true);
+        w.parking.park(who(11), &[0, 1], true);
+        assert_eq!(w.ask(), [wanted(&[0, 1])]);
+        assert_eq!(w.parking.end_frame(FrameId(0)), [who(1)], "the second is being drawn");
+        w.parking.leave(who(2), &[]);
+        assert_eq!(w.come(&[0, 1]), [who(11)]);
+        w.parking.leave(who(11), &[0, 1]);
+        assert!(w.parking.kept.is_empty() && w.parking.coming.is_empty());
+        assert_eq!((w.parking.coming_bytes, w.parking.stays.len()), (0, 0));
+    }
+}

@@ -3,6 +3,7 @@
 //! Two parts: what is done to bytes here (planes to messages and back) is timed on this machine;
 //! what gRPC, TCP and the kernel take is a constant, since it needs two machines to be measured.
 
+use super::clock::cpu_ns;
 use prost::Message;
 use slabcast_common::ids::{Epoch, FrameId, TaskId};
 use slabcast_common::image::{TilePixels, TileState};
@@ -15,19 +16,22 @@ use slabcast_proto::v1;
 use slabcast_schedule::sim::Costs;
 use std::time::Instant;
 
-/// A message through gRPC, TCP and the kernel, in ns, and a byte of it. From rehearsals of 2 and 8
-/// workers on 2 vCPU, where a waking costs 20 us (TRANSPORT.md has half of it for a busy master);
-/// docs/scaling.md has what comes of it at 15 and 32.
-const WIRE: (f64, f64) = (18_000.0, 0.45);
+/// A message through gRPC, TCP and the kernel, in ns: at a master, and at a worker, which also wakes
+/// a render thread for it. A rehearsal measures both (`slabcast plan --rehearse`, [`calibrated`]); these
+/// are what it found on 2 vCPU, where waking a core costs 20 us (TRANSPORT.md). At half, 32 workers
+/// look a third better than they are.
+const MESSAGE: (f64, f64) = (20_000.0, 45_000.0);
+/// A byte of it: TRANSPORT.md has 4.4 us for 16 KiB in company.
+const BYTE: f64 = 0.3;
 /// From a message's coming to a thread's working on it, where it slept: TRANSPORT.md, section 7.
 const WAKE: f64 = 20_000.0;
 
 /// Nanoseconds of the best of some runs.
 fn best(mut run: impl FnMut()) -> f64 {
     let mut timed = || {
-        let began = Instant::now();
+        let began = cpu_ns();
         run();
-        began.elapsed().as_nanos() as f64
+        (cpu_ns() - began) as f64
     };
     (0..15).map(|_| timed()).fold(f64::INFINITY, f64::min)
 }
@@ -72,7 +76,7 @@ pub(super) fn messages(trace: &Trace) -> Costs {
     };
     let up = |m: &ToMaster| convert::from_worker_to_wire(m).encode_to_vec();
     let (lease_bytes, result_bytes) = (down(&lease), up(&result));
-    let byte = |ns: f64, bytes: &[u8]| WIRE.1 + ns / bytes.len().max(1) as f64;
+    let byte = |ns: f64, bytes: &[u8]| BYTE + ns / bytes.len().max(1) as f64;
     let send = best(|| drop(down(&lease)));
     let worker_send = best(|| drop(up(&result)));
     let receive = best(|| {
@@ -84,19 +88,47 @@ pub(super) fn messages(trace: &Trace) -> Costs {
         drop(convert::to_worker_from_wire(message));
     });
     Costs {
-        send: (WIRE.0, byte(send, &lease_bytes)),
-        receive: (WIRE.0, byte(receive, &result_bytes)),
-        bricks: (WIRE.0, WIRE.1),
-        worker_receive: (WIRE.0, byte(worker_receive, &lease_bytes)),
-        worker_send: (WIRE.0, byte(worker_send, &result_bytes)),
+        send: (MESSAGE.0, byte(send, &lease_bytes)),
+        receive: (MESSAGE.0, byte(receive, &result_bytes)),
+        bricks: (MESSAGE.0, BYTE),
+        worker_receive: (MESSAGE.1, byte(worker_receive, &lease_bytes)),
+        worker_send: (MESSAGE.1, byte(worker_send, &result_bytes)),
         // Bricks are decoded and put into the cache: some 3 ns a byte (docs/performance.md).
-        worker_bricks: (WIRE.0, WIRE.1 + 3.0),
+        worker_bricks: (MESSAGE.1, BYTE + 3.0),
         finish_pixel: finish(trace),
         hold: (0.0, fill()),
         late: late(),
         wake: WAKE,
         ..Costs::default()
     }
+}
+
+/// The same where a message costs so much at a master and at a worker, whatever it carries.
+pub(super) fn with_messages(costs: Costs, [master, worker]: [f64; 2]) -> Costs {
+    Costs {
+        send: (master, costs.send.1),
+        receive: (master, costs.receive.1),
+        bricks: (master, costs.bricks.1),
+        worker_receive: (worker, costs.worker_receive.1),
+        worker_send: (worker, costs.worker_send.1),
+        worker_bricks: (worker, costs.worker_bricks.1),
+        ..costs
+    }
+}
+
+/// What a message costs here, from the processor time that a rehearsal took of a master and its
+/// workers. `predicted` says what both take if messages cost so much.
+pub(super) fn calibrated(
+    measured: [f64; 2],
+    predicted: impl Fn([f64; 2]) -> Result<[f64; 2], crate::fail::Fail>,
+) -> Result<[f64; 2], crate::fail::Fail> {
+    // Both are straight lines: the work of each message is what it is, whenever it is done.
+    const STEP: f64 = 10_000.0;
+    let (none, some) = (predicted([0.0; 2])?, predicted([STEP; 2])?);
+    Ok(std::array::from_fn(|i| {
+        let slope = (some[i] - none[i]) / STEP;
+        if slope > 0.0 { ((measured[i] - none[i]) / slope).clamp(1_000.0, 500_000.0) } else { STEP }
+    }))
 }
 
 /// To hash and encode a pixel, in nanoseconds.
@@ -106,12 +138,12 @@ fn finish(trace: &Trace) -> f64 {
     let state = FrameState::new(size);
     let ns = (0..3)
         .map(|_| {
-            let began = Instant::now();
+            let began = cpu_ns();
             let picture = state.finish();
             let hash = picture.sha256();
             let bytes = picture.encode(PixelFormat::Rgb8, Background::Colour([0.0; 3]));
             std::hint::black_box((hash, bytes));
-            began.elapsed().as_nanos() as f64
+            (cpu_ns() - began) as f64
         })
         .fold(f64::INFINITY, f64::min);
     ns / (f64::from(size[0]) * f64::from(size[1]))

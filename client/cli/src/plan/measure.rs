@@ -1,9 +1,10 @@
 //! The measured half of a prediction: each tile that a schedule may ask for, drawn on one core.
 //!
 //! Every tile of a level is drawn as a worker draws it, from the same bricks and the same state,
-//! several times, and its shortest time counts: what disturbs a tile (another program, a page that
-//! is touched for the first time) only ever makes it longer.
+//! several times, and its shortest time on the processor counts: what disturbs a tile (a cache that
+//! another program has filled, a page that is touched for the first time) only ever makes it longer.
 
+use super::clock::cpu_ns;
 use crate::fail::Fail;
 use crate::progress::{Progress, Step};
 use crate::stage::Stage;
@@ -27,7 +28,6 @@ use slabcast_render::tile::{self, Scratch, Seen};
 use slabcast_schedule::{FrameJob, is_shut, macrotile};
 use std::collections::BTreeSet;
 use std::sync::Arc;
-use std::time::Instant;
 
 /// What is measured.
 pub(super) struct Path<'a> {
@@ -102,9 +102,9 @@ struct Bench {
 /// The shortest of some runs, in nanoseconds, and what the last one gave.
 fn shortest<T>(repeats: u32, mut run: impl FnMut() -> T) -> (u64, T) {
     let mut timed = || {
-        let began = Instant::now();
+        let began = cpu_ns();
         let out = run();
-        (began.elapsed().as_nanos() as u64, out)
+        (cpu_ns() - began, out)
     };
     let (mut best, mut last) = timed();
     for _ in 1..repeats {

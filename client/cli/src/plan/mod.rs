@@ -6,6 +6,7 @@
 //! processor, [`chart`] draws. [`rehearse`] puts it to the test with processes on this machine.
 
 mod chart;
+mod clock;
 mod costs;
 mod measure;
 mod predict;
@@ -21,7 +22,7 @@ use predict::{Question, Row};
 use slabcast_common::quality::Schedule;
 use slabcast_common::trace::{MAX_BYTES, Trace};
 use slabcast_schedule::FrameJob;
-use slabcast_schedule::sim::{Link, alone_ms};
+use slabcast_schedule::sim::{Costs, Link, alone_ms};
 use std::fmt::Write as _;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
@@ -165,14 +166,7 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
     progress.end();
     drop(stage);
     let costs = predict::measured_costs(&jobs, &measured.trace, (most, args.threads))?;
-    let link = Link {
-        bytes_per_s: args.link.0.map(|bits| bits / 8.0 * GOODPUT),
-        latency_ns: args.latency,
-    };
-    let question = Question { threads: args.threads, link, cores: None, stretch: 1.0 };
-    let threads = embedded::cores() as usize;
-    let rows = predict::rows(&jobs, &measured.trace, workers, &question, costs, threads)?;
-    let rehearsed = match (&args.rehearse, &args.trace) {
+    let (rehearsed, costs) = match (&args.rehearse, &args.trace) {
         (Some(list), Some(file)) => {
             let stage = rehearse::Stage {
                 volume: &args.of.volume,
@@ -189,9 +183,17 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
             progress.end();
             rehearsed?
         }
-        _ => Vec::new(),
+        _ => (Vec::new(), costs),
     };
-    let said = Said { args, jobs: &jobs, measured: &measured, rows: &rows, rehearsed: &rehearsed };
+    let link = Link {
+        bytes_per_s: args.link.0.map(|bits| bits / 8.0 * GOODPUT),
+        latency_ns: args.latency,
+    };
+    let question = Question { threads: args.threads, link, cores: None, stretch: 1.0 };
+    let threads = embedded::cores() as usize;
+    let rows = predict::rows(&jobs, &measured.trace, workers, &question, costs, threads)?;
+    let said =
+        Said { args, jobs: &jobs, measured: &measured, rows: &rows, rehearsed: &rehearsed, costs };
     if let Some(dir) = &args.output {
         said.write(dir)?;
     }
@@ -224,6 +226,7 @@ struct Said<'a> {
     measured: &'a Measured,
     rows: &'a [Row],
     rehearsed: &'a [rehearse::Rehearsed],
+    costs: Costs,
 }
 
 impl Said<'_> {
@@ -294,7 +297,7 @@ impl Said<'_> {
                  frame's time goes: cores (rendering, spread evenly), straggler\n(waiting for the \
                  last tile), link, or master.\n";
         if !self.rehearsed.is_empty() {
-            text += &rehearse::table(self.rehearsed);
+            text += &rehearse::table(self.rehearsed, &self.costs);
         }
         text
     }

@@ -1,12 +1,12 @@
 //! The predicted half: the scheduler against clusters that are not there.
 
+use super::clock::cpu_ns;
 use super::costs;
 use crate::fail::Fail;
 use crate::local::shared;
 use slabcast_common::trace::Trace;
 use slabcast_schedule::FrameJob;
 use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Stopwatch, Took, Unmeasured};
-use std::time::Instant;
 
 /// What a frame's time goes into.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -153,11 +153,11 @@ fn row(
     })
 }
 
-struct Wall(Instant);
+struct Cpu;
 
-impl Stopwatch for Wall {
+impl Stopwatch for Cpu {
     fn read(&mut self) -> Option<u64> {
-        Some(self.0.elapsed().as_nanos() as u64)
+        Some(cpu_ns())
     }
 }
 
@@ -170,7 +170,7 @@ pub(super) fn measured_costs(
 ) -> Result<Costs, Fail> {
     let messages = costs::messages(trace);
     let question = Question { threads, link: Link::NONE, cores: None, stretch: 1.0 };
-    let mut watch = Wall(Instant::now());
+    let mut watch = Cpu;
     let cluster = question.cluster(workers, messages, 1);
     let (_, took) =
         sim::run(jobs, trace, &cluster, &mut watch).map_err(|e| Fail::failed(e.to_string()))?;

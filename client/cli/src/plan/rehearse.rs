@@ -5,6 +5,7 @@
 //! share this machine's cores, and the simulation is told so; where messages alone fill them, the
 //! rehearsal is no cluster any more, and the table says that too.
 
+use super::costs;
 use super::predict::{self, Question};
 use crate::fail::Fail;
 use crate::progress::Progress;
@@ -16,7 +17,7 @@ use slabcast_common::message::PathRequest;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::trace::Trace;
 use slabcast_schedule::FrameJob;
-use slabcast_schedule::sim::{Costs, Link};
+use slabcast_schedule::sim::{Costs, Link, Outcome};
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -100,23 +101,27 @@ pub(super) struct Stage<'a> {
 }
 
 impl Stage<'_> {
-    /// Rehearses with each number of workers.
+    /// Rehearses with each number of workers, and says what messages cost here.
     pub(super) fn run(
         &self,
         workers: &[u32],
         progress: &mut Progress,
-    ) -> Result<Vec<Rehearsed>, Fail> {
+    ) -> Result<(Vec<Rehearsed>, Costs), Fail> {
         let runtime = runtime::start()?;
-        let result = workers.iter().map(|&n| {
-            progress.stage(&format!("rehearsing with {n} workers"));
-            runtime.block_on(self.one(n))
-        });
-        let result = result.collect();
+        let result = (|| {
+            progress.stage("rehearsing with one worker: what messages cost here");
+            let costs = self.calibrate(&runtime.block_on(self.one(1))?)?;
+            let rehearsed = workers.iter().map(|&n| {
+                progress.stage(&format!("rehearsing with {n} workers"));
+                self.beside(n, &runtime.block_on(self.one(n))?, costs)
+            });
+            Ok((rehearsed.collect::<Result<_, Fail>>()?, costs))
+        })();
         runtime::end(runtime);
         result
     }
 
-    async fn one(&self, n: u32) -> Result<Rehearsed, Fail> {
+    async fn one(&self, n: u32) -> Result<Played, Fail> {
         let mut args: Vec<String> =
             ["master", "--listen", "127.0.0.1:0", "--rehearse", "--log-level", "error", "--volume"]
                 .map(String::from)
@@ -167,18 +172,35 @@ impl Stage<'_> {
         let served = remote::describe(&client).await?;
         let request = self.asked.request(&served.info, PixelFormat::Rgb8, false);
         let played = tokio::time::timeout(PLAY, play(&client, request, &master, &workers)).await;
-        let played =
-            played.map_err(|_| Fail::failed("the rehearsal took more than 4 minutes"))??;
-        self.beside(n, &played)
+        played.map_err(|_| Fail::failed("the rehearsal took more than 4 minutes"))?
     }
 
-    /// What was measured, beside what is predicted for this machine.
-    fn beside(&self, workers: u32, played: &Played) -> Result<Rehearsed, Fail> {
+    /// What is predicted for this machine.
+    fn predict(&self, workers: u32, costs: Costs) -> Result<Outcome, Fail> {
+        let cores = Some(embedded::cores());
+        let question = Question { threads: self.threads, link: Link::NONE, cores, stretch: 1.0 };
+        let cluster = question.cluster(workers, costs, predict::IN_FLIGHT);
+        predict::simulate(self.jobs, self.trace, &cluster)
+    }
+
+    /// What messages cost here, by a rehearsal with one worker.
+    fn calibrate(&self, played: &Played) -> Result<Costs, Fail> {
+        let (Some(master), Some(workers)) = (played.master, played.workers) else {
+            return Ok(self.costs);
+        };
+        let measured = [master, workers].map(|d| d.as_nanos() as f64);
+        let messages = costs::calibrated(measured, |messages| {
+            let outcome = self.predict(1, costs::with_messages(self.costs, messages))?;
+            let master = outcome.driver + outcome.streams + outcome.finisher;
+            Ok([master as f64, outcome.workers as f64])
+        })?;
+        Ok(costs::with_messages(self.costs, messages))
+    }
+
+    /// What was measured, beside what is predicted.
+    fn beside(&self, workers: u32, played: &Played, costs: Costs) -> Result<Rehearsed, Fail> {
         let cores = embedded::cores();
-        let question =
-            Question { threads: self.threads, link: Link::NONE, cores: Some(cores), stretch: 1.0 };
-        let cluster = question.cluster(workers, self.costs, predict::IN_FLIGHT);
-        let predicted = predict::simulate(self.jobs, self.trace, &cluster)?;
+        let predicted = self.predict(workers, costs)?;
         let frames = self.jobs.len() as f64;
         let later = &played.frames[usize::from(played.frames.len() > 1)..];
         let mean = later.iter().map(|f| f.ms.total).sum::<f64>() / later.len().max(1) as f64;
@@ -251,11 +273,15 @@ async fn play(
 }
 
 /// The comparison, for people.
-pub(super) fn table(rows: &[Rehearsed]) -> String {
+pub(super) fn table(rows: &[Rehearsed], costs: &Costs) -> String {
     let mut text = format!(
-        "\nrehearsed on this machine (loopback, {} cores for all), measured beside predicted:\n\n\
+        "\nrehearsed on this machine (loopback, {} cores for all), measured beside predicted; a \
+         message costs a\nmaster {:.0} us and a worker {:.0} us here, by a rehearsal with one \
+         worker:\n\n\
          {:>7} {:>9} {:>9} {:>6} {:>9} {:>9} {:>6} {:>13} {:>13} {:>6}\n",
         embedded::cores(),
+        costs.send.0 / 1e3,
+        costs.worker_send.0 / 1e3,
         "workers",
         "ms",
         "pred.",

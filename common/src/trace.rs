@@ -18,6 +18,7 @@ use crate::view::{Projection, View};
 use crate::volume::Digest32;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use std::borrow::Cow;
 
 /// Version of the format.
 pub const VERSION: u32 = 1;
@@ -72,8 +73,15 @@ pub struct FrameTrace {
     pub alone_ns: u64,
     /// Edge of the tiles of that cut.
     pub alone_edge: u32,
-    /// Its slabs, front to back.
+    /// Its slabs, front to back: for the `slab` schedule.
     pub slabs: Vec<SlabTrace>,
+    /// To look at the directory of bricks, which each worker does once a frame under the `region`
+    /// schedule, in nanoseconds.
+    #[serde(default)]
+    pub outlook_ns: u64,
+    /// Tiles through all depths: for the `region` schedule.
+    #[serde(default)]
+    pub regions: Vec<RegionLevel>,
 }
 
 /// One slab.
@@ -99,6 +107,52 @@ pub struct Level {
     pub edge: u32,
     /// Those that are drawn, by row and column.
     pub tiles: Vec<TileTrace>,
+}
+
+/// Tiles of one edge through all depths.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RegionLevel {
+    /// Edge in pixels.
+    pub edge: u32,
+    /// Those that anything lies in, by row and column.
+    pub tiles: Vec<RegionTile>,
+}
+
+/// One tile through all depths: `[x, y, ns, result bytes, touched]`.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "(u32, u32, u64, u32, Vec<u32>)", into = "(u32, u32, u64, u32, Vec<u32>)")]
+pub struct RegionTile {
+    /// Left column.
+    pub x: u32,
+    /// Top row.
+    pub y: u32,
+    /// Time to draw it, in nanoseconds.
+    pub ns: u64,
+    /// Its result on the wire.
+    pub result_bytes: u32,
+    /// Places of the bricks that it is drawn from, in the list of the set's bricks; ascending.
+    pub touched: Vec<u32>,
+}
+
+impl From<(u32, u32, u64, u32, Vec<u32>)> for RegionTile {
+    fn from((x, y, ns, result_bytes, mut touched): (u32, u32, u64, u32, Vec<u32>)) -> Self {
+        // Written as differences to the one before.
+        for i in 1..touched.len() {
+            touched[i] = touched[i].saturating_add(touched[i - 1]);
+        }
+        RegionTile { x, y, ns, result_bytes, touched }
+    }
+}
+
+impl From<RegionTile> for (u32, u32, u64, u32, Vec<u32>) {
+    fn from(t: RegionTile) -> Self {
+        let mut touched = t.touched;
+        for i in (1..touched.len()).rev() {
+            touched[i] -= touched[i - 1];
+        }
+        (t.x, t.y, t.ns, t.result_bytes, touched)
+    }
 }
 
 /// One tile: `[x, y, ns, lease bytes, result bytes]`.
@@ -170,8 +224,13 @@ impl Trace {
             // A minute for each is beyond any tile; sums of a million stay far inside 64 bits.
             const LONG: u64 = 60_000_000_000;
             let times = frame.slabs.iter().flat_map(|s| &s.levels).flat_map(|l| &l.tiles);
-            if frame.setup_ns > LONG || times.clone().any(|t| t.ns > LONG) {
+            let through = frame.regions.iter().flat_map(|l| &l.tiles).map(|t| t.ns);
+            let setup = [frame.setup_ns, frame.outlook_ns];
+            if times.map(|t| t.ns).chain(through).chain(setup).any(|ns| ns > LONG) {
                 return no(format!("frames[{i}]: a time is longer than a minute"));
+            }
+            if frame.regions.iter().any(|l| !l.tiles.is_sorted_by_key(|t| (t.y, t.x))) {
+                return no(format!("frames[{i}].regions: tiles are not by row and column"));
             }
             for (s, slab) in frame.slabs.iter().enumerate() {
                 if slab.shut.iter().map(|r| u64::from(*r)).sum::<u64>() > pixels {
@@ -210,16 +269,38 @@ impl FrameTrace {
     pub fn slab(&self, sheets: SheetRange) -> Option<&SlabTrace> {
         self.slabs.iter().find(|s| s.first == sheets.first && s.end == sheets.end)
     }
+
+    /// What is known of a tile through all depths; one that nothing lies in takes no time. `size` is
+    /// the picture's.
+    pub fn region(&self, rect: &Rect, size: [u32; 2]) -> Option<Cow<'_, RegionTile>> {
+        self.regions.iter().find_map(|level| {
+            if !is_of(rect, level.edge, size) {
+                return None;
+            }
+            let (x, y) = (rect.x0 as u32, rect.y0 as u32);
+            Some(match level.tiles.binary_search_by_key(&(y, x), |t| (t.y, t.x)) {
+                Ok(at) => Cow::Borrowed(&level.tiles[at]),
+                Err(_) => {
+                    Cow::Owned(RegionTile { x, y, result_bytes: 40, ..RegionTile::default() })
+                }
+            })
+        })
+    }
+}
+
+/// Whether a rectangle is a tile of this edge, cut at the picture's border.
+fn is_of(rect: &Rect, edge: u32, size: [u32; 2]) -> bool {
+    let edge = edge as i32;
+    let whole = Rect::new(rect.x0, rect.y0, rect.x0 + edge, rect.y0 + edge);
+    let cut = whole.intersect(&Rect::of_size(size));
+    cut == *rect && rect.x0 % edge == 0 && rect.y0 % edge == 0
 }
 
 impl SlabTrace {
     /// What is known of a tile; `size` is the picture's.
     pub fn tile(&self, rect: &Rect, size: [u32; 2]) -> Option<&TileTrace> {
-        let picture = Rect::of_size(size);
         self.levels.iter().find_map(|level| {
-            let edge = level.edge as i32;
-            let whole = Rect::new(rect.x0, rect.y0, rect.x0 + edge, rect.y0 + edge);
-            if whole.intersect(&picture) != *rect || rect.x0 % edge != 0 || rect.y0 % edge != 0 {
+            if !is_of(rect, level.edge, size) {
                 return None;
             }
             let key = (rect.y0 as u32, rect.x0 as u32);
@@ -290,6 +371,21 @@ pub fn filled(rect: &Rect, shut: &[bool], size: [u32; 2], bytes: u32) -> TilePix
     pixels
 }
 
+/// Pixels for a result of a tile through all depths that was not drawn: they weigh about `bytes` on the
+/// wire. Nobody may take them for a picture's.
+pub fn filled_through(rect: &Rect, bytes: u32) -> TilePixels {
+    let n = rect.area();
+    let mut pixels = TilePixels { a: vec![0.0; n], colour: vec![[0; 3]; n], last: None };
+    // Two planes of 4 and 12 bytes a pixel, and a bit for each pixel of both.
+    let left = (bytes as usize).saturating_sub(60 + 2 * n.div_ceil(8));
+    for i in 0..(left / 16).min(n) {
+        let word = (i as u32).wrapping_mul(0x9e37_79b9) & 0xffff | 1;
+        pixels.a[i] = 0.25 + word as f32 * 1e-6;
+        pixels.colour[i] = [word; 3];
+    }
+    pixels
+}
+
 /// What a frame's times hang on: transfer function, quality and view. (Not the hash in a frame's
 /// statistics, which knows the cropping box and not whether culling is on.)
 pub fn view_sha256(scene: &SceneSpec, view: &View) -> Digest32 {
@@ -348,6 +444,20 @@ mod tests {
                 alone_ns: 800,
                 alone_edge: 128,
                 slabs,
+                outlook_ns: 40,
+                regions: vec![RegionLevel {
+                    edge: 64,
+                    tiles: vec![
+                        RegionTile {
+                            x: 0,
+                            y: 0,
+                            ns: 1500,
+                            result_bytes: 900,
+                            touched: vec![3, 4, 70],
+                        },
+                        RegionTile { x: 64, y: 0, ns: 7, result_bytes: 40, touched: vec![] },
+                    ],
+                }],
             }],
         }
     }
@@ -368,6 +478,11 @@ mod tests {
         assert_eq!(ns(0, 0, 100, 70), Some(900));
         assert_eq!(ns(64, 64, 100, 70), None, "it is empty");
         assert_eq!(ns(0, 0, 63, 64), None);
+        let region = |x0, y0, x1, y1| frame.region(&Rect::new(x0, y0, x1, y1), [100, 70]);
+        assert_eq!(region(0, 0, 64, 64).expect("it is there").touched, [3, 4, 70]);
+        assert_eq!(region(64, 0, 100, 64).expect("it is there").ns, 7);
+        assert_eq!(region(0, 64, 64, 70).expect("nothing lies in it").ns, 0);
+        assert!(region(0, 0, 100, 70).is_none(), "a level that was not drawn");
     }
 
     #[test]

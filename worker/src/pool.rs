@@ -4,7 +4,7 @@
 //! The queue is in order of frames, since a frame that is late holds up those behind it; in a frame a
 //! region that goes on comes before one that begins.
 
-use crate::rehearse::Rehearsal;
+use crate::rehearse::{Rehearsal, Through};
 use crate::shelf::Shelf;
 use slabcast_common::brick::{Brick, BrickInfo};
 use slabcast_common::ids::FrameId;
@@ -348,10 +348,18 @@ fn work(thread: u32, simd: Simd, queue: &Queue, out: &mpsc::UnboundedSender<Outc
     }
 }
 
+/// A task that is taken so soon was there before the thread was free.
+const AT_ONCE: Duration = Duration::from_micros(20);
+
 /// Holds tasks for the time that they took to draw.
 fn hold(thread: u32, rehearsal: &Rehearsal, queue: &Queue, out: &mpsc::UnboundedSender<Outcome>) {
     let mut free = Instant::now();
-    while let Some(task) = next(queue) {
+    loop {
+        let asked = Instant::now();
+        let Some(task) = next(queue) else { return };
+        // Whether it waited for the task, or the task for it.
+        let came = Instant::now();
+        let from = if came - asked < AT_ONCE { free } else { free.max(came) };
         let outcome = match task {
             Task::Slab(task) => {
                 let (mut start, mut end) = (free.max(task.ready), free.max(task.ready));
@@ -364,9 +372,21 @@ fn hold(thread: u32, rehearsal: &Rehearsal, queue: &Queue, out: &mpsc::Unbounded
                 let Ready { lease, received, ready, .. } = task;
                 Outcome::Slab(Rendered { lease, received, ready, start, end, thread, outcome })
             }
-            Task::Region(going) => {
-                let came = Came::Failed("a trace has tiles of slabs, and no regions".into());
-                Outcome::Region(Gone { going, end: Instant::now(), thread, came })
+            Task::Region(mut going) => {
+                let (mut end, over) = (from, going.frame.over.load(Ordering::Relaxed));
+                let came = match (!over).then(|| rehearsal.region(&going, from)) {
+                    None => Came::Over,
+                    Some(Err(why)) => Came::Failed(why),
+                    Some(Ok(Through::Lacks(lacks))) => Came::Lacks(lacks, true),
+                    Some(Ok(Through::Held { held, took, finished })) => {
+                        held.wait();
+                        going.drawn += took;
+                        end = held.end;
+                        Came::Done(finished)
+                    }
+                };
+                free = end;
+                Outcome::Region(Gone { going, end, thread, came })
             }
         };
         if out.send(outcome).is_err() {

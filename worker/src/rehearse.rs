@@ -10,11 +10,12 @@
 //! late; over a thousand tiles that is a frame. So a thread's next tile begins when the one before
 //! should have ended, or when it came, and only a result is late, never the work behind it.
 
-use crate::pool::{FrameSlot, Ready};
+use crate::pool::{FrameSlot, Going, Ready};
 use slabcast_common::image::TilePixels;
 use slabcast_common::message::Counters;
 use slabcast_common::slab::SheetRange;
-use slabcast_common::trace::{Trace, filled, view_sha256};
+use slabcast_common::trace::{Trace, filled, filled_through, view_sha256};
+use slabcast_render::region::Finished;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -79,6 +80,49 @@ impl Rehearsal {
         let pixels = filled(&lease.tile, &self.shut[at][slab], size, tile.result_bytes);
         Ok((Held { start, end }, pixels))
     }
+
+    /// The same of a region that a thread has come to at `start`: which bricks it lacks, or when it
+    /// ends and what comes of it. All of them are lacked at once, where drawing finds one after the
+    /// other.
+    pub(crate) fn region(&self, going: &Going, start: Instant) -> Result<Through, String> {
+        let Going { lease, frame, shelf, .. } = going;
+        let tile = lease.tile;
+        let unknown = || {
+            format!(
+                "the trace that is rehearsed has no tile ({},{}) to ({},{}) through all depths of \
+                 this view",
+                tile.x0, tile.y0, tile.x1, tile.y1
+            )
+        };
+        let at = *frame.rehearsed.get_or_init(|| self.find(frame));
+        let traced = &self.trace.frames[at.ok_or_else(unknown)?];
+        let known = traced.region(&tile, self.trace.about.size).ok_or_else(unknown)?;
+        let bricks = shelf.bricks().len() as u32;
+        if known.touched.last().is_some_and(|&last| last >= bricks) {
+            return Err(unknown());
+        }
+        let lacks: Vec<u32> =
+            known.touched.iter().copied().filter(|&place| !shelf.holds(place)).collect();
+        if !lacks.is_empty() {
+            return Ok(Through::Lacks(lacks));
+        }
+        let setup = Duration::from_nanos(traced.setup_ns + traced.outlook_ns);
+        let made = *frame.made.get_or_init(|| start + setup);
+        let took = Duration::from_nanos(known.ns);
+        let held = Held { start, end: made.max(start) + took };
+        let finished = Finished {
+            pixels: filled_through(&tile, known.result_bytes),
+            counters: Counters::default(),
+            touched: known.into_owned().touched,
+        };
+        Ok(Through::Held { held, took, finished: Box::new(finished) })
+    }
+}
+
+/// Where a region came to that is held.
+pub(crate) enum Through {
+    Lacks(Vec<u32>),
+    Held { held: Held, took: Duration, finished: Box<Finished> },
 }
 
 /// When a task is held.

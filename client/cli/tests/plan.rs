@@ -23,12 +23,13 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
     assert!(said.contains("predicted from that"), "{said}");
     assert!(said.contains("links of 1 Gbit/s, 100 us one way"), "{said}");
     let rows: Vec<&str> = said.lines().filter(|l| l.trim_end().ends_with(" %")).collect();
-    assert_eq!(rows.len(), 4, "{said}");
+    assert_eq!(rows.len(), 8, "both schedules: {said}");
+    assert!(said.contains("region schedule") && said.contains("slab schedule, 3 slabs"), "{said}");
     assert_eq!(names(&dir.join("out")), ["plan.csv", "plan.json", "plan.png", "plan.svg"]);
     let svg = std::fs::read_to_string(dir.join("out/plan.svg")).unwrap();
     assert!(svg.contains("predicted efficiency") && svg.contains("<circle"));
     let csv = std::fs::read_to_string(dir.join("out/plan.csv")).unwrap();
-    assert_eq!(csv.lines().count(), 5);
+    assert_eq!(csv.lines().count(), 9);
     let plan = json(&std::fs::read_to_string(dir.join("out/plan.json")).unwrap());
     assert_eq!(plan["measured"]["frames"], 3);
     let workers: Vec<u64> = plan["predicted"]
@@ -37,7 +38,7 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
         .iter()
         .map(|r| r["workers"].as_u64().unwrap())
         .collect();
-    assert_eq!(workers, [1, 2, 3, 8]);
+    assert_eq!(workers, [1, 2, 3, 8, 1, 2, 3, 8]);
     for row in plan["predicted"].as_array().unwrap() {
         let n = |key: &str| row[key].as_f64().unwrap();
         assert!(n("frame_ms") > 0.0 && n("first_ms") > 0.0 && n("bytes_up") > 0.0, "{row}");
@@ -46,7 +47,8 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
         assert!(named.contains(&row["bound_by"].as_str().unwrap()), "{row}");
     }
     // What was measured is read again; a slow link then binds.
-    let slow = ["--workers", "8", "--link", "1mbit", "--trace", "s.trace", "--json"];
+    let slow =
+        ["--workers", "8", "--link", "1mbit", "--trace", "s.trace", "--json", "--schedule", "slab"];
     let plan = json(&good(dir, &[&SMALL[..], &slow].concat()));
     assert_eq!(plan["predicted"][0]["bound_by"], "link", "{plan}");
     // And is not taken for another picture's.

@@ -39,15 +39,18 @@ fn a_cluster_of_two_is_rehearsed_beside_its_prediction() {
     let more = ["--trace", "s.trace", "--workers", "2", "--rehearse", "2", "--json"];
     let plan: Value =
         serde_json::from_str(&good(dir.path(), &[&["plan"][..], &SCENE, &more].concat())).unwrap();
-    let row = &plan["rehearsed"][0];
-    assert_eq!(row["workers"], 2, "{plan}");
-    let n = |key: &str| row[key].as_f64().unwrap_or_else(|| panic!("{key}: {row}"));
-    // Two workers hold what was measured: no frame is shorter than half of it.
-    let alone = plan["measured"]["alone_ms"].as_f64().unwrap();
-    assert!(n("frame_ms") > 0.3 * alone, "{row}");
-    assert!(n("predicted_ms") > 0.3 * alone && n("each_ms") > 0.0, "{row}");
-    if cfg!(target_os = "linux") {
-        assert!(n("master_cpu_ms") > 0.0 && n("workers_cpu_ms") > 0.0, "{row}");
+    for (i, schedule) in ["region", "slab"].into_iter().enumerate() {
+        let row = &plan["rehearsed"][i];
+        assert_eq!(row["schedule"], schedule, "{plan}");
+        assert_eq!(row["workers"], 2, "{plan}");
+        let n = |key: &str| row[key].as_f64().unwrap_or_else(|| panic!("{key}: {row}"));
+        // Two workers hold what was measured: no frame is shorter than half of it.
+        let alone = plan["measured"]["alone_ms"].as_f64().unwrap();
+        assert!(n("frame_ms") > 0.3 * alone, "{row}");
+        assert!(n("predicted_ms") > 0.3 * alone && n("each_ms") > 0.0, "{row}");
+        if cfg!(target_os = "linux") {
+            assert!(n("master_cpu_ms") > 0.0 && n("workers_cpu_ms") > 0.0, "{row}");
+        }
     }
     let without = ["plan", "formula:spheres:16", "--rehearse", "2"];
     let out = run(dir.path(), &without);
@@ -83,15 +86,17 @@ fn what_is_rehearsed_is_never_taken_for_a_picture() {
     let mut command = worker(&address, &["--rehearse", "s.trace"]);
     let _held = Process(command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap());
     let render = ["render", "--master", &address, "--size", "128x128", "--frames", "4", "-q"];
-    let files = ["--stats", "s.jsonl", "-o", "out"];
-    let out = run(dir, &[&render[..], &files].concat());
-    assert!(out.status.success(), "{}", text(&out.stderr));
-    assert!(text(&out.stderr).contains("the pictures are stripes"), "{}", text(&out.stderr));
-    for line in std::fs::read_to_string(dir.join("s.jsonl")).unwrap().lines() {
-        let stats: Value = serde_json::from_str(line).unwrap();
-        assert_eq!(stats["rehearsed"], true);
-        assert_eq!(stats["pixels_sha256"], "none: rehearsed");
-        assert!(stats["ms"]["render"].as_f64().unwrap() > 0.0);
+    for schedule in ["slab", "region"] {
+        let files = ["--stats", "s.jsonl", "-o", "out", "--schedule", schedule, "--force"];
+        let out = run(dir, &[&render[..], &files].concat());
+        assert!(out.status.success(), "{schedule}: {}", text(&out.stderr));
+        assert!(text(&out.stderr).contains("the pictures are stripes"), "{}", text(&out.stderr));
+        for line in std::fs::read_to_string(dir.join("s.jsonl")).unwrap().lines() {
+            let stats: Value = serde_json::from_str(line).unwrap();
+            assert_eq!(stats["rehearsed"], true);
+            assert_eq!(stats["pixels_sha256"], "none: rehearsed");
+            assert!(stats["ms"]["render"].as_f64().unwrap() > 0.0, "{schedule}");
+        }
     }
     let picture = |n: u32| std::fs::read(dir.join(format!("out/frame_{n:04}.png"))).unwrap();
     let decoder = png::Decoder::new(std::io::Cursor::new(picture(2)));

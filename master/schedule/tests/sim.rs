@@ -5,12 +5,13 @@ use slabcast_common::ids::{BrickId, FrameId, SceneId};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::presets;
-use slabcast_common::quality::{Quality, Work};
+use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::trace::{
-    About, FrameTrace, Level, SlabTrace, TileTrace, Trace, VERSION, view_sha256,
+    About, FrameTrace, Level, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace, VERSION,
+    view_sha256,
 };
-use slabcast_common::view::{Camera, CameraProjection, View};
+use slabcast_common::view::{Camera, CameraProjection, Projected, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Unknown, Unmeasured};
 use slabcast_schedule::{FrameJob, macrotile};
@@ -48,7 +49,8 @@ fn world(frames: usize) -> (Vec<FrameJob>, Trace) {
             let lattice = &scene.volume.lattice;
             let view = View::new(lattice, &camera, SIZE, &quality).expect("drawable");
             let (frame, number) = (FrameId(i as u64 + 1), i as u64);
-            let (scene, bricks, work) = (scene.clone(), bricks.clone(), Work::default());
+            let work = Work { schedule: Schedule::Slab, ..Work::default() };
+            let (scene, bricks) = (scene.clone(), bricks.clone());
             FrameJob { frame, number, scene, bricks, view, work }
         })
         .collect();
@@ -107,13 +109,45 @@ fn frame(job: &FrameJob, quality: &Quality) -> FrameTrace {
             levels: levels.into(),
         });
     }
+    let rects: Vec<Rect> = projected.iter().flatten().map(|p| p.rect).collect();
+    let regions = [32, 64, 128, 256].map(|edge| through(edge, &rects, &projected));
     FrameTrace {
+        outlook_ns: 2_000,
+        regions: regions.into(),
         view: view_sha256(&job.scene, &job.view).to_string(),
         setup_ns: 5_000,
         alone_ns: 300_000,
         alone_edge: 128,
         slabs,
     }
+}
+
+/// Tiles through all depths, at 20 ns a pixel, from the front half of the bricks over them.
+fn through(edge: u32, rects: &[Rect], projected: &[Option<Projected>]) -> RegionLevel {
+    let cut = macrotile::cut_through(SIZE, rects, (0, 0), Some(edge));
+    let mut tiles: Vec<RegionTile> = cut
+        .tiles
+        .iter()
+        .map(|t| {
+            let over = |p: &Projected| !p.rect.intersect(&t.rect).is_empty() && p.sheets.first < 0;
+            let touched = (0u32..).zip(projected).filter(|(_, p)| p.is_some_and(|p| over(&p)));
+            RegionTile {
+                x: t.rect.x0 as u32,
+                y: t.rect.y0 as u32,
+                ns: 20 * t.rect.area() as u64,
+                result_bytes: 2 * t.rect.area() as u32,
+                touched: touched.map(|(i, _)| i).collect(),
+            }
+        })
+        .collect();
+    tiles.sort_by_key(|t| (t.y, t.x));
+    RegionLevel { edge, tiles }
+}
+
+/// The same frames under another schedule.
+fn under(schedule: Schedule, jobs: &[FrameJob]) -> Vec<FrameJob> {
+    let work = |job: &FrameJob| Work { schedule, ..job.work };
+    jobs.iter().map(|job| FrameJob { work: work(job), ..job.clone() }).collect()
 }
 
 fn cluster(workers: u32) -> Cluster {
@@ -228,4 +262,28 @@ fn a_tile_that_was_not_measured_is_named() {
     let (two, _) = world(2);
     let none = sim::run(&two, &trace, &c, &mut Unmeasured);
     assert_eq!(none.unwrap_err(), Unknown::Frames { have: 1, need: 2 });
+}
+
+#[test]
+fn regions_have_no_barrier_and_bricks_come_where_they_are_asked_for() {
+    let (slab, trace) = world(5);
+    let region = under(Schedule::Region, &slab);
+    let alone = run(&region, &trace, &cluster(1));
+    for f in &alone.frames[1..] {
+        // Each pixel of a drawn tile costs 20 ns; a frame's tables and outlook 7 us.
+        assert_eq!((f.render - 7_000) % 20, 0, "{f:?}");
+        assert!(f.done - f.began >= f.render, "{f:?}");
+    }
+    // The front half of the bricks, and each of them once.
+    let sent = alone.frames.iter().map(|f| f.bricks).sum::<u64>() / u64::from(BRICK_BYTES);
+    assert!((100..512).contains(&sent), "{sent} bricks");
+    // Several workers get what their tiles need, not all that the frame needs.
+    let eight = run(&region, &trace, &cluster(8));
+    let all = eight.frames[0].bricks / u64::from(BRICK_BYTES);
+    assert!(all < 8 * sent && all >= sent, "{all} bricks for eight, {sent} for one");
+    assert_eq!(eight, run(&region, &trace, &cluster(8)));
+    // Two frames in the making leave nobody waiting at the end of one.
+    let three =
+        |jobs: &[FrameJob]| run(jobs, &trace, &Cluster { in_flight: 3, ..cluster(8) }).each_ms();
+    assert!(three(&region) < eight.each_ms(), "{} {}", three(&region), eight.each_ms());
 }

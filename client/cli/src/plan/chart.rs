@@ -11,7 +11,7 @@ const GROUND: [u8; 3] = [252, 252, 248];
 const INK: [u8; 3] = [40, 40, 40];
 const FAINT: [u8; 3] = [222, 222, 216];
 /// Okabe and Ito's colours, which most colour-blind readers tell apart.
-const COLOURS: [[u8; 3]; 2] = [[213, 94, 0], [0, 114, 178]];
+const COLOURS: [[u8; 3]; 4] = [[213, 94, 0], [0, 114, 178], [0, 140, 100], [110, 60, 130]];
 /// What binds is told by the shape of a point's middle: its letter, below the axis.
 const LETTER: usize = 6;
 
@@ -31,17 +31,18 @@ pub(super) struct Chart {
 }
 
 impl Chart {
-    /// The efficiencies of some clusters, by number of workers.
-    pub(super) fn new(title: &str, note: &str, rows: &[Row]) -> Chart {
+    /// The efficiencies of some clusters under some schedules (two at most), by number of workers.
+    pub(super) fn new(title: &str, note: &str, schedules: &[(&str, &[Row])]) -> Chart {
         let mut c = Chart { strokes: Vec::new() };
         let [left, top, right, bottom] = BOX;
         c.text([16.0, 14.0], title, INK, 2);
         c.text([16.0, 36.0], note, INK, 1);
-        let most = rows.iter().map(|r| r.workers).max().unwrap_or(1).max(2);
+        let all = || schedules.iter().flat_map(|s| s.1);
+        let most = all().map(|r| r.workers).max().unwrap_or(1).max(2);
         // Even steps for each doubling.
         let x =
             |n: u32| left + (right - left) * libm::log2(f64::from(n)) / libm::log2(f64::from(most));
-        let top_value = rows.iter().flat_map(|r| [r.latency_efficiency, r.throughput_efficiency]);
+        let top_value = all().flat_map(|r| [r.latency_efficiency, r.throughput_efficiency]);
         let ceiling = top_value.fold(1.0, f64::max);
         let y = |e: f64| bottom - (bottom - top) * e / ceiling;
         for tenth in (0..=10).step_by(2) {
@@ -56,29 +57,32 @@ impl Chart {
             c.text([x(n) - 3.0 * word.len() as f64, bottom + 8.0], &word, INK, 1);
             n *= 2;
         }
-        c.text([right - 44.0, bottom + 46.0], "workers", INK, 1);
-        let mut before = None;
-        for r in rows {
-            // Where another resource begins to bind, its name stands below.
-            let kind = r.bound.0;
-            if before.replace(kind) != Some(kind) {
-                let at = x(r.workers).min(right - (LETTER * kind.name().len()) as f64);
-                c.text([at, bottom + 22.0], kind.name(), COLOURS[0], 1);
+        c.text([right - 44.0, bottom + 48.0], "workers", INK, 1);
+        let of: [(&str, Figure); 2] =
+            [("latency", |r| r.latency_efficiency), ("throughput", |r| r.throughput_efficiency)];
+        for (i, (schedule, rows)) in schedules.iter().enumerate() {
+            let mut before = None;
+            for r in rows.iter() {
+                // Where another resource begins to bind, its name stands below.
+                let kind = r.bound.0;
+                if before.replace(kind) != Some(kind) {
+                    let at = x(r.workers).min(right - (LETTER * kind.name().len()) as f64);
+                    let below = bottom + 22.0 + 11.0 * i as f64;
+                    c.text([at, below], kind.name(), COLOURS[2 * i % 4], 1);
+                }
             }
-        }
-        let of: [(&str, Figure); 2] = [
-            ("one frame in flight (latency)", |r| r.latency_efficiency),
-            ("three frames in flight (throughput)", |r| r.throughput_efficiency),
-        ];
-        for (i, (name, value)) in of.into_iter().enumerate() {
-            let points: Vec<[f64; 2]> = rows.iter().map(|r| [x(r.workers), y(value(r))]).collect();
-            for w in points.windows(2) {
-                c.line(w[0], w[1], COLOURS[i], 2.0);
+            for (j, (name, value)) in of.iter().enumerate() {
+                let colour = COLOURS[(2 * i + j) % 4];
+                let points: Vec<[f64; 2]> =
+                    rows.iter().map(|r| [x(r.workers), y(value(r))]).collect();
+                for w in points.windows(2) {
+                    c.line(w[0], w[1], colour, 2.0);
+                }
+                points.iter().for_each(|p| c.strokes.push(Stroke::Dot(*p, colour)));
+                let at = [left + 10.0 + 160.0 * (2 * i + j) as f64, bottom + 48.0];
+                c.strokes.push(Stroke::Dot([at[0] - 6.0, at[1] + 3.0], colour));
+                c.text(at, &format!("{schedule}, {name}"), colour, 1);
             }
-            points.iter().for_each(|p| c.strokes.push(Stroke::Dot(*p, COLOURS[i])));
-            let at = [left + 10.0 + 330.0 * i as f64, bottom + 46.0];
-            c.strokes.push(Stroke::Dot([at[0] - 6.0, at[1] + 3.0], COLOURS[i]));
-            c.text(at, name, COLOURS[i], 1);
         }
         c
     }

@@ -18,11 +18,13 @@ use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::quality::Work;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::trace::{
-    About, FrameTrace, Level, SlabTrace, TileTrace, Trace, VERSION, view_sha256,
+    About, FrameTrace, Level, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace, VERSION,
+    view_sha256,
 };
 use slabcast_common::view::Projected;
 use slabcast_proto::convert::{self, Down};
 use slabcast_render::Frame;
+use slabcast_render::region::{Finished, Outlook, Region, Supply};
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch, Seen};
 use slabcast_schedule::{FrameJob, is_shut, macrotile};
@@ -36,6 +38,9 @@ pub(super) struct Path<'a> {
     pub(super) work: Work,
     /// Numbers of tiles that schedules will want: they decide which levels are drawn.
     pub(super) wanted: Vec<u64>,
+    /// For which schedules.
+    pub(super) slab: bool,
+    pub(super) region: bool,
     pub(super) repeats: u32,
     pub(super) names: (String, String),
 }
@@ -94,6 +99,15 @@ pub(super) fn measure(path: &Path<'_>, progress: &mut Progress) -> Result<Trace,
     Ok(Trace { version: VERSION, about, frames })
 }
 
+/// Every brick is here.
+struct All<'a>(&'a [Arc<Brick>]);
+
+impl Supply for All<'_> {
+    fn get(&self, place: u32) -> Option<Arc<Brick>> {
+        self.0.get(place as usize).cloned()
+    }
+}
+
 struct Bench {
     scratch: Scratch,
     repeats: u32,
@@ -127,11 +141,13 @@ impl Bench {
         let sheets =
             projected.iter().flatten().fold(SheetRange::default(), |all, p| all.union(p.sheets));
         let (alone_edge, alone_ns) = self.alone(&frame, &seen, sheets, job.view.size);
+        let (outlook_ns, regions) = self.regions(path, job, &frame, &projected);
         let size = job.view.size;
         let mut state = FrameState::new(size);
         let mut shut = ShutMap::open(Rect::of_size(size));
         let mut slabs = Vec::new();
-        for range in sheets.slabs(path.work.slabs) {
+        let cuts = if path.slab { sheets.slabs(path.work.slabs) } else { Vec::new() };
+        for range in cuts {
             let drawn = self.slab(path, job, &frame, &projected, range, &state, &shut);
             let (levels, pixels) = drawn;
             for (rect, pixels) in &pixels {
@@ -153,6 +169,8 @@ impl Bench {
             alone_ns: setup_ns + seen_ns + alone_ns,
             alone_edge,
             slabs,
+            outlook_ns,
+            regions,
         })
     }
 
@@ -223,6 +241,64 @@ impl Bench {
             levels.push(Level { edge, tiles });
         }
         (levels, first)
+    }
+
+    /// Tiles through all depths, and what it takes to look at the directory.
+    fn regions(
+        &mut self,
+        path: &Path<'_>,
+        job: &FrameJob,
+        frame: &Frame,
+        projected: &[Option<Projected>],
+    ) -> (u64, Vec<RegionLevel>) {
+        if !path.region {
+            return (0, Vec::new());
+        }
+        let size = job.view.size;
+        let (outlook_ns, outlook) =
+            shortest(self.repeats, || Outlook::new(size, &[Outlook::look(frame, &job.bricks, 0)]));
+        let supply = All(&path.stage.bricks);
+        let rects: Vec<Rect> = projected.iter().flatten().map(|p| p.rect).collect();
+        // The schedule goes by blocks of bricks, whose outline is a little larger: it may take the level
+        // beside the one that bricks alone say.
+        let mut edges: BTreeSet<u32> = match job.work.tile {
+            Some(edge) => [edge].into(),
+            None => [64, 128, 256].into(),
+        };
+        for &wanted in path.wanted.iter().filter(|_| job.work.tile.is_none()) {
+            let edge =
+                macrotile::cut_through(size, &rects, (wanted + wanted / 4, 1 << 40), None).edge;
+            edges.insert(edge);
+        }
+        let mut levels = Vec::new();
+        for edge in edges {
+            let cut = macrotile::cut_through(size, &rects, (0, 0), Some(edge));
+            let mut tiles: Vec<RegionTile> = Vec::with_capacity(cut.tiles.len());
+            for t in &cut.tiles {
+                let (simd, scratch) = (Simd::detect(), &mut self.scratch);
+                let (ns, done) = shortest(self.repeats, || {
+                    let mut region = Region::new(&outlook, t.rect);
+                    region.advance(frame, simd, &outlook, &supply, 0, scratch);
+                    region.finish()
+                });
+                let Finished { pixels, counters, touched } = done;
+                let lease = Lease {
+                    task: TaskId(0),
+                    epoch: Epoch(0),
+                    frame: job.frame,
+                    tile: t.rect,
+                    slab: SheetRange::default(),
+                    bricks: Vec::new(),
+                    state: tile::blank(t.rect),
+                };
+                let (_, result_bytes, _) = weigh(lease, pixels, counters);
+                let (x, y) = (t.rect.x0 as u32, t.rect.y0 as u32);
+                tiles.push(RegionTile { x, y, ns, result_bytes, touched });
+            }
+            tiles.sort_by_key(|t| (t.y, t.x));
+            levels.push(RegionLevel { edge, tiles });
+        }
+        (outlook_ns, levels)
     }
 
     /// The best cut of one core through all depths: edge and time.

@@ -15,11 +15,11 @@ mod rehearse;
 use crate::fail::{Fail, say};
 use crate::output::write_atomic;
 use crate::progress::{self, Progress};
-use crate::request::{PictureOf, WorkArgs, lattice_notice};
+use crate::request::{Asked, PictureOf, WorkArgs, lattice_notice};
 use crate::stage::Stage;
 use crate::{embedded, parse};
 use predict::{Question, Row};
-use slabcast_common::quality::Schedule;
+use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::trace::{MAX_BYTES, Trace};
 use slabcast_schedule::FrameJob;
 use slabcast_schedule::sim::{Costs, Link, alone_ms};
@@ -90,13 +90,12 @@ pub(crate) struct PlanArgs {
 
 /// Runs the command.
 pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
-    let mut work = args.work.work()?;
-    if work.schedule == Schedule::Region {
-        return Err(Fail::usage(
-            "--schedule: `plan` predicts the `slab` schedule; use that, or `auto`",
-        ));
-    }
-    work.schedule = Schedule::Slab;
+    let work = args.work.work()?;
+    // Whoever leaves it to the master sees what there is to choose from.
+    let schedules = match work.schedule {
+        Schedule::Auto => vec![Schedule::Region, Schedule::Slab],
+        one => vec![one],
+    };
     let asked = args.of.look.asked(work)?;
     let workers = &args.workers.0;
     let most = workers.iter().copied().max().unwrap_or(1);
@@ -153,6 +152,8 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
                 frames,
                 work,
                 wanted: wanted.collect(),
+                slab: schedules.contains(&Schedule::Slab),
+                region: schedules.contains(&Schedule::Region),
                 repeats: args.repeats,
                 names,
             };
@@ -165,35 +166,44 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
     };
     progress.end();
     drop(stage);
-    let costs = predict::measured_costs(&jobs, &measured.trace, (most, args.threads))?;
-    let (rehearsed, costs) = match (&args.rehearse, &args.trace) {
-        (Some(list), Some(file)) => {
-            let stage = rehearse::Stage {
-                volume: &args.of.volume,
-                file,
-                trace: &measured.trace,
-                jobs: &jobs,
-                asked: &asked,
-                axes: &args.of.look.view.axes,
-                threads: args.threads,
-                costs,
-            };
-            let mut progress = Progress::new(args.quiet);
-            let rehearsed = stage.run(&list.0, &mut progress);
-            progress.end();
-            rehearsed?
-        }
-        _ => (Vec::new(), costs),
-    };
     let link = Link {
         bytes_per_s: args.link.0.map(|bits| bits / 8.0 * GOODPUT),
         latency_ns: args.latency,
     };
     let question = Question { threads: args.threads, link, cores: None, stretch: 1.0 };
     let threads = embedded::cores() as usize;
-    let rows = predict::rows(&jobs, &measured.trace, workers, &question, costs, threads)?;
-    let said =
-        Said { args, jobs: &jobs, measured: &measured, rows: &rows, rehearsed: &rehearsed, costs };
+    let mut predicted = Vec::new();
+    for schedule in schedules {
+        let under = |job: &FrameJob| Work { schedule, ..job.work };
+        let jobs: Vec<FrameJob> =
+            jobs.iter().map(|job| FrameJob { work: under(job), ..job.clone() }).collect();
+        let trace = &measured.trace;
+        let costs = predict::measured_costs(&jobs, trace, (most, args.threads))?;
+        let (rehearsed, costs) = match (&args.rehearse, &args.trace) {
+            (Some(list), Some(file)) => {
+                let mut asked: Asked = asked.clone();
+                asked.work.schedule = schedule;
+                let stage = rehearse::Stage {
+                    volume: &args.of.volume,
+                    file,
+                    trace,
+                    jobs: &jobs,
+                    asked: &asked,
+                    axes: &args.of.look.view.axes,
+                    threads: args.threads,
+                    costs,
+                };
+                let mut progress = Progress::new(args.quiet);
+                let rehearsed = stage.run(&list.0, &mut progress);
+                progress.end();
+                rehearsed?
+            }
+            _ => (Vec::new(), costs),
+        };
+        let rows = predict::rows(&jobs, trace, workers, &question, costs, threads)?;
+        predicted.push(Predicted { schedule, rows, rehearsed, costs });
+    }
+    let said = Said { args, frames, measured: &measured, predicted: &predicted };
     if let Some(dir) = &args.output {
         said.write(dir)?;
     }
@@ -219,33 +229,49 @@ struct Measured {
     now: bool,
 }
 
+/// What is predicted of a schedule.
+struct Predicted {
+    schedule: Schedule,
+    rows: Vec<Row>,
+    rehearsed: Vec<rehearse::Rehearsed>,
+    costs: Costs,
+}
+
+impl Predicted {
+    fn name(&self) -> &'static str {
+        match self.schedule {
+            Schedule::Slab => "slab",
+            Schedule::Region | Schedule::Auto => "region",
+        }
+    }
+}
+
 /// All that is said.
 struct Said<'a> {
     args: &'a PlanArgs,
-    jobs: &'a [FrameJob],
+    frames: usize,
     measured: &'a Measured,
-    rows: &'a [Row],
-    rehearsed: &'a [rehearse::Rehearsed],
-    costs: Costs,
+    predicted: &'a [Predicted],
 }
 
 impl Said<'_> {
     fn tiles(&self) -> usize {
-        let levels = self.measured.trace.frames.iter().flat_map(|f| &f.slabs);
-        levels.flat_map(|s| &s.levels).map(|l| l.tiles.len()).sum()
+        let frames = &self.measured.trace.frames;
+        let slabs = frames.iter().flat_map(|f| &f.slabs).flat_map(|s| &s.levels);
+        let regions = frames.iter().flat_map(|f| &f.regions).map(|l| l.tiles.len());
+        slabs.map(|l| l.tiles.len()).chain(regions).sum()
     }
 
     fn title(&self) -> String {
         let about = &self.measured.trace.about;
         let [w, h] = about.size;
-        format!("{} {}, {} frames of {w}x{h}", about.volume, about.transfer, self.jobs.len())
+        format!("{} {}, {} frames of {w}x{h}", about.volume, about.transfer, self.frames)
     }
 
     fn cluster(&self) -> String {
         let s = if self.args.threads == 1 { "" } else { "s" };
-        let slabs = self.measured.trace.about.slabs;
         format!(
-            "slab schedule ({slabs} slabs), workers of {} thread{s}, links of {}, {} us one way",
+            "workers of {} thread{s}, links of {}, {} us one way",
             self.args.threads,
             self.args.link,
             self.args.latency as f64 / 1e3
@@ -259,58 +285,68 @@ impl Said<'_> {
         let mut text = format!(
             "{}; {}\n{when}: {} tiles, each {} times; alone, one core takes {:.2} ms a frame (tiles \
              of {edge} pixels)\npredicted from that, by the scheduler itself against virtual \
-             workers and links:\n\n{:>7} {:>9} {:>9} {:>6} {:>9} {:>6} {:>9} {:>9}  {}\n",
+             workers and links:\n",
             self.title(),
             self.cluster(),
             self.tiles(),
             trace.about.repeats,
             alone_ms(trace),
-            "workers",
-            "first ms",
-            "ms",
-            "eff.",
-            "frames/s",
-            "eff.",
-            "KB",
-            "brick KB",
-            "bound by"
         );
-        for r in self.rows {
+        for p in self.predicted {
+            let slabs = match p.schedule {
+                Schedule::Slab => format!(", {} slabs", trace.about.slabs),
+                Schedule::Region | Schedule::Auto => String::new(),
+            };
             let _ = writeln!(
                 text,
-                "{:>7} {:>9.1} {:>9.2} {:>4.0} % {:>9.1} {:>4.0} % {:>9.0} {:>9.1}  {} {:.0} %",
-                r.workers,
-                r.first_ms,
-                r.frame_ms,
-                r.latency_efficiency * 100.0,
-                r.frames_per_s,
-                r.throughput_efficiency * 100.0,
-                (r.bytes[0] + r.bytes[1]) / 1e3,
-                r.bytes[2] / 1e3,
-                r.bound.0.name(),
-                r.bound.1 * 100.0,
+                "\n{} schedule{slabs}\n{:>7} {:>9} {:>9} {:>6} {:>9} {:>6} {:>9} {:>9}  {}",
+                p.name(),
+                "workers",
+                "first ms",
+                "ms",
+                "eff.",
+                "frames/s",
+                "eff.",
+                "KB",
+                "brick KB",
+                "bound by"
             );
+            for r in &p.rows {
+                let _ = writeln!(
+                    text,
+                    "{:>7} {:>9.1} {:>9.2} {:>4.0} % {:>9.1} {:>4.0} % {:>9.0} {:>9.1}  {} {:.0} %",
+                    r.workers,
+                    r.first_ms,
+                    r.frame_ms,
+                    r.latency_efficiency * 100.0,
+                    r.frames_per_s,
+                    r.throughput_efficiency * 100.0,
+                    (r.bytes[0] + r.bytes[1]) / 1e3,
+                    r.bytes[2] / 1e3,
+                    r.bound.0.name(),
+                    r.bound.1 * 100.0,
+                );
+            }
         }
         text += "\nfirst ms: with all bricks. ms: a later frame, one in flight. frames/s: three in \
                  flight. eff.: against\none core's time alone over all render threads. KB, brick \
                  KB: a later frame's leases and results, and\nbricks. bound by: where most of a \
                  frame's time goes: cores (rendering, spread evenly), straggler\n(waiting for the \
                  last tile), link, or master.\n";
-        if !self.rehearsed.is_empty() {
-            text += &rehearse::table(self.rehearsed, &self.costs);
+        for p in self.predicted.iter().filter(|p| !p.rehearsed.is_empty()) {
+            text += &rehearse::table(p.name(), &p.rehearsed, &p.costs);
         }
         text
     }
 
     fn json(&self) -> serde_json::Value {
         let trace = &self.measured.trace;
-        let rows: Vec<_> = self
-            .rows
-            .iter()
-            .map(|r| {
+        let rows = self.predicted.iter().flat_map(|p| p.rows.iter().map(move |r| (p.name(), r)));
+        let rows: Vec<_> = rows
+            .map(|(schedule, r)| {
                 let ms = |i: usize| r.parts[i];
                 serde_json::json!({
-                    "workers": r.workers, "first_ms": r.first_ms, "frame_ms": r.frame_ms,
+                    "schedule": schedule, "workers": r.workers, "first_ms": r.first_ms, "frame_ms": r.frame_ms,
                     "latency_efficiency": r.latency_efficiency,
                     "frames_per_s": r.frames_per_s,
                     "throughput_efficiency": r.throughput_efficiency,
@@ -323,6 +359,7 @@ impl Said<'_> {
                 })
             })
             .collect();
+        let rehearsed = self.predicted.iter().flat_map(|p| rehearse::json(p.name(), &p.rehearsed));
         serde_json::json!({
             "version": 1,
             "measured": {
@@ -333,22 +370,23 @@ impl Said<'_> {
             },
             "cluster": {
                 "threads": self.args.threads, "link": self.args.link.to_string(),
-                "latency_us": self.args.latency as f64 / 1e3, "schedule": "slab",
+                "latency_us": self.args.latency as f64 / 1e3,
             },
             "predicted": rows,
-            "rehearsed": rehearse::json(self.rehearsed),
+            "rehearsed": rehearsed.collect::<Vec<_>>(),
         })
     }
 
     fn csv(&self) -> String {
-        let mut text = "workers,first_ms,frame_ms,latency_efficiency,frames_per_s,\
+        let mut text = "schedule,workers,first_ms,frame_ms,latency_efficiency,frames_per_s,\
                         throughput_efficiency,bytes_down,bytes_up,brick_bytes,bound_by,cores_ms,\
                         straggler_ms,link_ms,master_ms\n"
             .to_string();
-        for r in self.rows {
+        let rows = self.predicted.iter().flat_map(|p| p.rows.iter().map(move |r| (p.name(), r)));
+        for (schedule, r) in rows {
             let _ = writeln!(
                 text,
-                "{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+                "{schedule},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
                 r.workers,
                 r.first_ms,
                 r.frame_ms,
@@ -373,7 +411,7 @@ impl Said<'_> {
         let chart = chart::Chart::new(
             &format!("{}: predicted efficiency", self.title()),
             &self.cluster(),
-            self.rows,
+            &self.predicted.iter().map(|p| (p.name(), &p.rows[..])).collect::<Vec<_>>(),
         );
         let text = |name: &str, text: String| {
             write_atomic(&dir.join(name), |out| out.write_all(text.as_bytes()))

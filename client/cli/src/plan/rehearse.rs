@@ -273,9 +273,9 @@ async fn play(
 }
 
 /// The comparison, for people.
-pub(super) fn table(rows: &[Rehearsed], costs: &Costs) -> String {
+pub(super) fn table(schedule: &str, rows: &[Rehearsed], costs: &Costs) -> String {
     let mut text = format!(
-        "\nrehearsed on this machine (loopback, {} cores for all), measured beside predicted; a \
+        "\n{schedule} schedule, rehearsed on this machine (loopback, {} cores for all), measured beside predicted; a \
          message costs a\nmaster {:.0} us and a worker {:.0} us here, by a rehearsal with one \
          worker:\n\n\
          {:>7} {:>9} {:>9} {:>6} {:>9} {:>9} {:>6} {:>13} {:>13} {:>6}\n",
@@ -320,10 +320,10 @@ pub(super) fn table(rows: &[Rehearsed], costs: &Costs) -> String {
 }
 
 /// The same for programs.
-pub(super) fn json(rows: &[Rehearsed]) -> Vec<serde_json::Value> {
+pub(super) fn json(schedule: &str, rows: &[Rehearsed]) -> Vec<serde_json::Value> {
     let row = |r: &Rehearsed| {
         serde_json::json!({
-            "workers": r.workers, "frame_ms": r.frame_ms, "predicted_ms": r.predicted_ms,
+            "schedule": schedule, "workers": r.workers, "frame_ms": r.frame_ms, "predicted_ms": r.predicted_ms,
             "each_ms": r.each_ms, "predicted_each_ms": r.predicted_each_ms,
             "master_cpu_ms": r.master_ms, "predicted_master_cpu_ms": r.predicted_master_ms,
             "workers_cpu_ms": r.workers_ms, "predicted_workers_cpu_ms": r.predicted_workers_ms,

@@ -4,9 +4,13 @@ use super::pipe::{Cores, Pipe, through};
 use super::{Cluster, FrameOutcome, Nanos, Outcome, Stopwatch, Took, Unknown, micros};
 use crate::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
 use slabcast_common::brick::BrickSetKey;
-use slabcast_common::ids::{BrickId, FrameId, WorkerId};
+use slabcast_common::ids::{BrickId, Epoch, FrameId, TaskId, WorkerId};
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::{Counters, Lease, TaskTimes, TileResult, ToWorker};
+use slabcast_common::message::{
+    Counters, Lease, RegionCost, RegionLease, TaskTimes, TileResult, ToWorker,
+};
+use slabcast_common::occlusion::Rect;
+use slabcast_common::slab::SheetRange;
 use slabcast_common::trace::Trace;
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -44,15 +48,64 @@ enum Coming {
     /// A batch of bricks is at a worker.
     Batch(WorkerId, BrickSetKey, Vec<BrickId>, u64),
     /// A lease is decoded.
-    Lease(WorkerId, Box<Lease>),
+    Lease(WorkerId, Task),
     /// A tile has had its time.
     TaskEnd(WorkerId, usize),
     /// A frame is hashed and encoded.
     Finished(FrameId),
 }
 
+/// What a worker was lent.
+enum Task {
+    Slab(Box<Lease>),
+    Region(RegionLease),
+}
+
+impl Task {
+    fn frame(&self) -> FrameId {
+        match self {
+            Task::Slab(l) => l.frame,
+            Task::Region(l) => l.frame,
+        }
+    }
+
+    fn name(&self) -> (TaskId, Epoch) {
+        match self {
+            Task::Slab(l) => (l.task, l.epoch),
+            Task::Region(l) => (l.task, l.epoch),
+        }
+    }
+
+    fn tile(&self) -> Rect {
+        match self {
+            Task::Slab(l) => l.tile,
+            Task::Region(l) => l.tile,
+        }
+    }
+
+    /// Its sheets; a region has all.
+    fn sheets(&self) -> SheetRange {
+        match self {
+            Task::Slab(l) => l.slab,
+            Task::Region(_) => SheetRange::new(i32::MIN, i32::MAX),
+        }
+    }
+}
+
+/// What a trace says of a task.
+struct Known {
+    ns: u64,
+    lease_bytes: u64,
+    result_bytes: u64,
+    /// Of a region: places of the bricks that it is drawn from.
+    touched: Vec<u32>,
+}
+
 struct Running {
-    lease: Box<Lease>,
+    lease: Task,
+    /// Of a region.
+    touched: Vec<u32>,
+    stood: Option<Nanos>,
     received: Nanos,
     ready: Nanos,
     start: Nanos,
@@ -69,7 +122,10 @@ struct Worker {
     /// What that took of a core that a render thread had.
     stolen: Nanos,
     present: BTreeSet<(BrickSetKey, BrickId)>,
-    leases: VecDeque<(Box<Lease>, Nanos)>,
+    leases: VecDeque<(Task, Nanos)>,
+    /// Bricks that regions asked for, and since when regions stand still.
+    asked: BTreeSet<(BrickSetKey, BrickId)>,
+    stands: BTreeMap<(TaskId, Epoch), Nanos>,
     running: Vec<Option<Running>>,
     /// When its tables of a frame are made.
     tables: BTreeMap<FrameId, Nanos>,
@@ -102,6 +158,8 @@ struct World<'a> {
     /// The frame at hand, and the slab that was begun last.
     at: usize,
     last_slab: Option<(FrameId, i32)>,
+    /// Frames of which a region was lent.
+    begun: BTreeSet<FrameId>,
     outcome: Outcome,
     finished: usize,
     worker_work: Nanos,
@@ -150,6 +208,7 @@ pub fn run(
         in_hand: 0,
         at: 0,
         last_slab: None,
+        begun: BTreeSet::new(),
         outcome: Outcome {
             frames: vec![FrameOutcome::default(); jobs.len()],
             ..Outcome::default()
@@ -166,6 +225,8 @@ pub fn run(
             stolen: 0,
             present: BTreeSet::new(),
             leases: VecDeque::new(),
+            asked: BTreeSet::new(),
+            stands: BTreeMap::new(),
             running: (0..cluster.threads).map(|_| None).collect(),
             tables: BTreeMap::new(),
             batches: VecDeque::new(),
@@ -325,7 +386,10 @@ impl World<'_> {
                 let w = self.workers.get_mut(&id).expect("a worker stays");
                 w.under_way -= 1;
                 let count = bricks.len() as u32;
-                w.present.extend(bricks.into_iter().map(|b| (set, b)));
+                for b in bricks {
+                    w.asked.remove(&(set, b));
+                    w.present.insert((set, b));
+                }
                 self.batches(id, now);
                 self.up(id, Event::BricksIn { worker: id, set, bricks: count }, SMALL, at);
                 self.begin(id)?;
@@ -361,13 +425,18 @@ impl World<'_> {
         let (fixed, byte) = self.cluster.costs.worker_receive;
         match message {
             ToWorker::Lease(lease) => {
-                let bytes = self.known(&lease)?.1;
+                let task = Task::Slab(lease);
+                let bytes = self.known(&task)?.lease_bytes;
                 let at = self.worker(id, now, fixed + byte * bytes as f64);
-                self.later(at, Coming::Lease(id, lease));
+                self.later(at, Coming::Lease(id, task));
+            }
+            ToWorker::Region(lease) => {
+                let at = self.worker(id, now, fixed + byte * SMALL as f64);
+                self.later(at, Coming::Lease(id, Task::Region(lease)));
             }
             ToWorker::EndFrame { frame } => {
                 let w = self.workers.get_mut(&id).expect("a worker stays");
-                w.leases.retain(|(l, _)| l.frame != frame);
+                w.leases.retain(|(l, _)| l.frame() != frame);
                 w.tables.remove(&frame);
             }
             ToWorker::Ping { nonce } => {
@@ -387,18 +456,77 @@ impl World<'_> {
         Ok(())
     }
 
-    /// Time, lease bytes and result bytes of a tile.
-    fn known(&self, lease: &Lease) -> Result<(u64, u64, u64), Unknown> {
-        let frame = lease.frame.0 as usize - 1;
-        let slab = self.trace.frames[frame].slab(lease.slab);
-        let tile = slab.and_then(|s| s.tile(&lease.tile, self.trace.about.size));
-        match tile {
-            Some(t) => Ok((t.ns, t.lease_bytes.into(), t.result_bytes.into())),
-            None => {
-                let (first, end) = (lease.slab.first, lease.slab.end);
-                Err(Unknown::Tile { frame, tile: lease.tile, first, end })
+    /// What is known of a task.
+    fn known(&self, task: &Task) -> Result<Known, Unknown> {
+        let frame = task.frame().0 as usize - 1;
+        let (size, traced) = (self.trace.about.size, &self.trace.frames[frame]);
+        let known = match task {
+            Task::Slab(l) => {
+                let slab = traced.slab(l.slab);
+                slab.and_then(|s| s.tile(&l.tile, size)).map(|t| Known {
+                    ns: t.ns,
+                    lease_bytes: t.lease_bytes.into(),
+                    result_bytes: t.result_bytes.into(),
+                    touched: Vec::new(),
+                })
+            }
+            Task::Region(l) => traced.region(&l.tile, size).map(|t| Known {
+                ns: t.ns,
+                lease_bytes: SMALL,
+                // A bit or so for each touched brick, and the cost's other figures.
+                result_bytes: u64::from(t.result_bytes) + 20 + t.touched.len() as u64,
+                touched: t.into_owned().touched,
+            }),
+        };
+        known.ok_or_else(|| {
+            let SheetRange { first, end } = task.sheets();
+            Unknown::Tile { frame, tile: task.tile(), first, end }
+        })
+    }
+
+    /// The bricks at these places of a frame's set that a worker lacks.
+    fn lacks(&self, id: WorkerId, frame: FrameId, places: &[u32]) -> Vec<BrickId> {
+        let job = &self.jobs[frame.0 as usize - 1];
+        let set = job.scene.bricks;
+        let names = places.iter().filter_map(|&p| job.bricks.get(p as usize)).map(|b| b.id);
+        let present = &self.workers[&id].present;
+        names.filter(|b| !present.contains(&(set, *b))).collect()
+    }
+
+    /// The first task in the queue whose bricks are there. Regions before it that lack some ask for
+    /// them: a thread has come to them, and takes another meanwhile.
+    fn take(&mut self, id: WorkerId) -> Result<Option<(Task, Nanos, Known)>, Unknown> {
+        let now = self.now();
+        for i in 0..self.workers[&id].leases.len() {
+            let w = &self.workers[&id];
+            let task = &w.leases[i].0;
+            let (frame, name) = (task.frame(), task.name());
+            let set = self.jobs[frame.0 as usize - 1].scene.bricks;
+            let known = self.known(task)?;
+            let lacks = match task {
+                Task::Slab(l) => {
+                    let here = |b: &BrickId| w.present.contains(&(set, *b));
+                    if !l.bricks.iter().all(here) {
+                        continue;
+                    }
+                    Vec::new()
+                }
+                Task::Region(_) => self.lacks(id, frame, &known.touched),
+            };
+            let w = self.workers.get_mut(&id).expect("a worker stays");
+            if lacks.is_empty() {
+                let (task, received) = w.leases.remove(i).expect("just seen");
+                return Ok(Some((task, received, known)));
+            }
+            w.stands.entry(name).or_insert(now);
+            let bricks: Vec<BrickId> =
+                lacks.into_iter().filter(|b| w.asked.insert((set, *b))).collect();
+            if !bricks.is_empty() {
+                let bytes = SMALL + 2 * bricks.len() as u64;
+                self.up(id, Event::BricksWanted { worker: id, set, bricks }, bytes, now);
             }
         }
+        Ok(None)
     }
 
     /// Free threads begin leases whose bricks are there.
@@ -407,32 +535,35 @@ impl World<'_> {
         loop {
             let w = self.workers.get_mut(&id).expect("a worker stays");
             let Some(thread) = w.running.iter().position(Option::is_none) else { return Ok(()) };
-            let ready = w.leases.iter().position(|(l, _)| {
-                let set = self.jobs[l.frame.0 as usize - 1].scene.bricks;
-                l.bricks.iter().all(|&b| w.present.contains(&(set, b)))
-            });
-            let Some(i) = ready else { return Ok(()) };
-            let (lease, received) = w.leases.remove(i).expect("just found");
-            let (ns, _, result_bytes) = self.known(&lease)?;
-            let frame = lease.frame;
-            let setup = self.trace.frames[frame.0 as usize - 1].setup_ns as f64;
+            let Some((lease, received, known)) = self.take(id)? else { return Ok(()) };
+            let frame = lease.frame();
+            let traced = &self.trace.frames[frame.0 as usize - 1];
+            let mut setup = traced.setup_ns;
+            if matches!(lease, Task::Region(_)) {
+                // All threads look at the directory together.
+                setup += traced.outlook_ns / u64::from(self.cluster.threads.max(1));
+            }
             let stretch = self.cluster.stretch;
             let w = self.workers.get_mut(&id).expect("a worker stays");
             // The first tile of a frame makes its tables; others wait for them.
-            let made = *w.tables.entry(frame).or_insert(now + (setup * stretch) as Nanos);
-            let end = made.max(now) + (ns as f64 * stretch) as Nanos;
+            let made = *w.tables.entry(frame).or_insert(now + (setup as f64 * stretch) as Nanos);
+            let end = made.max(now) + (known.ns as f64 * stretch) as Nanos;
             self.outcome.frames[frame.0 as usize - 1].render += end - now;
             let pixels = match &mut self.machine {
                 Some(machine) => {
                     let (fixed, pixel) = self.cluster.costs.hold;
-                    let ns = fixed + pixel * lease.tile.area() as f64;
+                    let ns = fixed + pixel * lease.tile().area() as f64;
                     self.worker_work += ns as Nanos;
                     machine.run(now, ns).max(end + self.cluster.costs.late as Nanos)
                 }
                 None => end,
             };
             let w = self.workers.get_mut(&id).expect("a worker stays");
-            let running = Running { lease, received, ready: now, start: now, result_bytes, pixels };
+            let stood = w.stands.remove(&lease.name()).map(|since| now - since);
+            let Known { result_bytes, touched, .. } = known;
+            let (ready, start) = (now, now);
+            let running =
+                Running { lease, touched, stood, received, ready, start, result_bytes, pixels };
             w.running[thread] = Some(running);
             self.later(end, Coming::TaskEnd(id, thread));
         }
@@ -442,21 +573,36 @@ impl World<'_> {
         let now = self.now();
         let w = self.workers.get_mut(&id).expect("a worker stays");
         let r = w.running[thread].take().expect("a task that ends has begun");
-        let (l, frame) = (&r.lease, r.lease.frame.0 as usize - 1);
+        let (tile, frame) = (r.lease.tile(), r.lease.frame().0 as usize - 1);
         let size = self.trace.about.size;
-        let shut = self.shut.entry((frame, l.slab.first)).or_insert_with(|| {
-            self.trace.frames[frame].slab(l.slab).map_or_else(Vec::new, |s| s.shut(size))
-        });
-        let mut a = Vec::with_capacity(l.tile.area());
-        for y in l.tile.y0..l.tile.y1 {
-            let row = y as usize * size[0] as usize;
-            let row = &shut[row + l.tile.x0 as usize..row + l.tile.x1 as usize];
-            a.extend(row.iter().map(|&s| f32::from(u8::from(s))));
+        let mut a = Vec::with_capacity(tile.area());
+        let mut region = None;
+        match &r.lease {
+            Task::Slab(l) => {
+                let shut = self.shut.entry((frame, l.slab.first)).or_insert_with(|| {
+                    self.trace.frames[frame].slab(l.slab).map_or_else(Vec::new, |s| s.shut(size))
+                });
+                for y in tile.y0..tile.y1 {
+                    let row = y as usize * size[0] as usize;
+                    let row = &shut[row + tile.x0 as usize..row + tile.x1 as usize];
+                    a.extend(row.iter().map(|&s| f32::from(u8::from(s))));
+                }
+            }
+            Task::Region(_) => {
+                a.resize(tile.area(), 0.0);
+                region = Some(RegionCost {
+                    touched: r.touched,
+                    stalls: u32::from(r.stood.is_some()),
+                    parked_us: micros(r.stood.unwrap_or(0)),
+                    idle_us: 0,
+                });
+            }
         }
+        let (task, epoch) = r.lease.name();
         let result = Box::new(TileResult {
-            task: l.task,
-            epoch: l.epoch,
-            pixels: TilePixels { a, colour: vec![[0; 3]; l.tile.area()], last: None },
+            task,
+            epoch,
+            pixels: TilePixels { a, colour: vec![[0; 3]; tile.area()], last: None },
             counters: Counters::default(),
             times: TaskTimes {
                 received_us: micros(r.received),
@@ -465,9 +611,10 @@ impl World<'_> {
                 end_us: micros(now),
                 thread: thread as u32,
             },
-            region: None,
+            region,
         });
-        self.up(id, Event::Result { worker: id, result }, r.result_bytes, r.pixels.max(now));
+        let event = Event::Result { worker: id, result };
+        self.up(id, event, r.result_bytes, r.pixels.max(now));
     }
 
     /// The driver: everything that lies before it, then the wishes.
@@ -506,6 +653,14 @@ impl World<'_> {
                         if before != self.last_slab {
                             slabs += 1;
                             frames += u64::from(before.is_none_or(|b| b.0 != lease.frame));
+                        }
+                    }
+                    Action::Send { message: ToWorker::Region(lease), .. } => {
+                        leases += 1;
+                        // Two frames may be in the making: each begins once.
+                        if self.begun.insert(lease.frame) {
+                            slabs += 1;
+                            frames += 1;
                         }
                     }
                     Action::FrameDone { frame, .. } => {
@@ -563,8 +718,17 @@ impl World<'_> {
                 let bytes = match &message {
                     ToWorker::Lease(lease) => {
                         self.outcome.frames[lease.frame.0 as usize - 1].leases += 1;
-                        self.known(lease)?.1
+                        let tile = self.trace.frames[lease.frame.0 as usize - 1]
+                            .slab(lease.slab)
+                            .and_then(|s| s.tile(&lease.tile, self.trace.about.size));
+                        tile.map_or(SMALL, |t| t.lease_bytes.into())
                     }
+                    ToWorker::Region(lease) => {
+                        self.outcome.frames[lease.frame.0 as usize - 1].leases += 1;
+                        SMALL
+                    }
+                    // Twelve bytes a brick and some more.
+                    ToWorker::Directory { bricks, .. } => SMALL + 13 * bricks.len() as u64,
                     ToWorker::Frame { .. } | ToWorker::Scene(_) => FRAME,
                     _ => SMALL,
                 };

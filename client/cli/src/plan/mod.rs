@@ -133,7 +133,8 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
     drop(volume);
     let frames = asked.path.frames();
     let jobs = measure::jobs(&stage, frames, work)?;
-    let more = args.rehearse.iter().flat_map(|list| &list.0);
+    // One worker says what messages cost.
+    let more = args.rehearse.iter().flat_map(|list| list.0.iter().chain([&1]));
     let wanted = workers.iter().chain(more).map(|n| {
         let threads = f64::from(*n) * f64::from(args.threads);
         (work.tiles_per_worker * threads).ceil() as u64
@@ -299,7 +300,7 @@ impl Said<'_> {
             };
             let _ = writeln!(
                 text,
-                "\n{} schedule{slabs}\n{:>7} {:>9} {:>9} {:>6} {:>9} {:>6} {:>9} {:>9}  {}",
+                "\n{} schedule{slabs}\n{:>7} {:>9} {:>9} {:>6} {:>9} {:>6} {:>9} {:>9}  bound by",
                 p.name(),
                 "workers",
                 "first ms",
@@ -308,8 +309,7 @@ impl Said<'_> {
                 "frames/s",
                 "eff.",
                 "KB",
-                "brick KB",
-                "bound by"
+                "brick KB"
             );
             for r in &p.rows {
                 let _ = writeln!(

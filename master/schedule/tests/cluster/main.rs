@@ -83,6 +83,7 @@ fn chaos(seed: u64, schedules: Schedules) -> World {
             tiles_per_worker: rng.pick(&[0.5, 2.5, 2.5, 6.0]),
             tile: rng.pick(&[None, None, None, Some(16), Some(64)]),
             schedule: schedules[frame as usize % schedules.len()],
+            ..Work::default()
         };
         let size = [rng.between(1, 130) as u32, rng.between(1, 130) as u32];
         let job = fake::job(&mut rng, frame, &scene, bricks, size, work);

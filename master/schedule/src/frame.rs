@@ -106,6 +106,8 @@ pub(crate) struct Frame {
     pace: Pace,
     /// When the next task outlives its estimate, while a thread is idle.
     outlived: Option<Micros>,
+    /// When the next region may be taken from an owner that is silent, while a thread is idle.
+    forborne: Option<Micros>,
     needed_ever: Vec<bool>,
     any_result: bool,
     last_reason: String,
@@ -179,6 +181,7 @@ impl Frame {
             answered: BTreeMap::new(),
             pace: Pace::default(),
             outlived: None,
+            forborne: None,
             needed_ever: vec![false; job.bricks.len()],
             any_result: false,
             last_reason: String::new(),
@@ -366,6 +369,22 @@ impl Frame {
         let all_threads = cluster.roster.threads();
         let mut leases: Vec<(WorkerId, u32)> = Vec::new();
         let mut refused = BTreeSet::new();
+        // What workers have left to do when the others look for more.
+        let open = |slab: &Slab| {
+            let tasks = slab.queue.tasks.iter().zip(0..);
+            tasks.filter(|(t, _)| t.end == End::Open).map(|(_, p)| p).collect::<Vec<u32>>()
+        };
+        let left = slab
+            .regions
+            .as_ref()
+            .filter(|_| turn.others)
+            .map(|regions| regions.left(open(slab).into_iter(), &cluster.roster));
+        let (answered, began) = (&self.answered, slab.began);
+        let until = |regions: &Regions, place: u32| {
+            let (owner, us) = regions.forbearance(place);
+            let heard = answered.get(&owner).copied().unwrap_or(0).max(began);
+            heard.saturating_add(us)
+        };
         while slab.queue.waiting() > 0 {
             let here = |id: WorkerId| self.lent.get(&id).map_or(0, |l| l.len() as u64);
             let load = |id: WorkerId| here(id) + turn.elsewhere(id);
@@ -397,7 +416,13 @@ impl Frame {
             let tries = Cell::new(0);
             let suits = |place| {
                 if let Some(regions) = &slab.regions {
-                    return turn.others || regions.is_for(place, id, &cluster.roster);
+                    if regions.is_for(place, id, &cluster.roster) {
+                        return true;
+                    }
+                    let Some(left) = &left else { return false };
+                    return slab.queue.tasks[place as usize].was_lent()
+                        || regions.is_worth_taking(place, id, left)
+                        || until(regions, place) <= now;
                 }
                 if lent.is_empty() || !cluster.residency.is_lazy(id) {
                     return true;
@@ -416,6 +441,12 @@ impl Frame {
                 regions.moves(place, id);
             }
         }
+        self.forborne = slab
+            .regions
+            .as_ref()
+            .filter(|_| turn.others)
+            .and_then(|regions| slab.queue.all_waiting().map(|p| until(regions, p)).min())
+            .filter(|at| *at > now);
         self.outlived = None;
         let may_double = slab.regions.is_none() || turn.others;
         while may_double && let Some((place, id)) = self.next_outlived(cluster, turn, now) {
@@ -836,7 +867,7 @@ impl Frame {
     pub(crate) fn next_deadline(&self) -> Option<Micros> {
         // A frame that is done and waits for one before it has none.
         let slab = self.slab.as_ref()?;
-        slab.queue.next_deadline().into_iter().chain(self.outlived).min()
+        slab.queue.next_deadline().into_iter().chain(self.outlived).chain(self.forborne).min()
     }
 
     /// Leases that a worker has.

@@ -61,6 +61,11 @@ impl Task {
         self.live.len() == 1 && !self.queued && !self.is_suspect() && self.failed.is_empty()
     }
 
+    /// Whether somebody had it before.
+    pub(crate) fn was_lent(&self) -> bool {
+        self.attempts > 0
+    }
+
     fn is_suspect(&self) -> bool {
         !self.blamed.is_empty()
     }
@@ -120,6 +125,11 @@ impl Queue {
     /// Tasks waiting for a worker.
     pub(crate) fn waiting(&self) -> usize {
         self.waiting.len()
+    }
+
+    /// Those that wait.
+    pub(crate) fn all_waiting(&self) -> impl Iterator<Item = u32> {
+        self.waiting.iter().copied()
     }
 
     /// A task's name.

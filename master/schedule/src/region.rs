@@ -11,10 +11,12 @@
 //! estimated then: one disturbed measurement moves nothing), which knows what hides what, and which
 //! worker was slow.
 //!
-//! **Who.** Whoever drew a tile last holds its bricks, so it gets it again. A tile moves only when one
-//! worker would else be done more than [`SLACK`] later than the mean, and the bricks that it was drawn
-//! from go along at once. When all of a worker's tiles are lent it takes tiles of the next frame of
-//! the path; another's tile of this frame only where there is no next one.
+//! **Who.** At first each worker gets a band of rows: bricks at a border are sent to both sides, and when
+//! a path turns about the upright axis, bricks stay in their rows. Whoever drew a tile last holds its
+//! bricks, so it gets it again. A tile moves only when one worker would else be done more than
+//! [`SLACK`] later than the mean, and the bricks that it was drawn from go along at once. When all of a
+//! worker's tiles are lent it takes tiles of the next frame of the path; another's tile only where there
+//! is no next one and its owner has work for longer than two such tiles.
 //!
 //! It refuses to know what time it is and which copy of a result counts.
 
@@ -30,6 +32,14 @@ use std::collections::BTreeMap;
 /// 64 pixels are 2 % of a frame of 512 each. At half, noise of the measurement moves tiles and their
 /// bricks to and fro; at double, 15 workers wait for the slowest for a tenth of a frame.
 const SLACK: f64 = 0.06;
+
+/// Above this a worker is late enough for many tiles to move at once; below, one does. A worker of half
+/// the speed among four is late by 60 %; what the system does on the side makes one late by a tenth.
+const LATE: f64 = 0.25;
+
+/// How long an owner that says nothing keeps its tiles from those who have nothing to do, beyond twice
+/// what the tile takes: the scheduling of two busy machines, as for tasks that are late.
+const FORBEARANCE: Micros = 5_000;
 
 /// Tiles for a thread beyond which a coarser cut is taken: messages of 12 tiles of 64 pixels cost a
 /// thread half a millisecond (TRANSPORT.md).
@@ -133,6 +143,9 @@ pub(crate) struct Regions {
     kind: (BrickSetKey, [u32; 2], u32),
     /// Whose each tile is, by its place in the queue.
     owners: Vec<WorkerId>,
+    /// What each took its last owner, if that is known.
+    took: Vec<Option<(WorkerId, f64)>>,
+    pace: Pace,
 }
 
 impl Regions {
@@ -152,7 +165,45 @@ impl Regions {
         pace.correct(&mut cut.tiles, &known);
         cut.sort(size);
         let owners = share(&cut.tiles, roster, &pace, &known);
-        (cut, Regions { kind, owners })
+        let took = cut.tiles.iter().map(known).collect();
+        (cut, Regions { kind, owners, took, pace })
+    }
+
+    /// How long each worker has to do with what of these tasks is its own, in microseconds.
+    pub(crate) fn left(
+        &self,
+        open: impl Iterator<Item = u32>,
+        roster: &Roster,
+    ) -> BTreeMap<WorkerId, f64> {
+        let mut left = BTreeMap::new();
+        for place in open {
+            if let Some((_, us)) = self.took[place as usize] {
+                let owner = self.owners[place as usize];
+                let threads = roster.get(owner).map_or(1, |w| w.threads);
+                *left.entry(owner).or_default() += us / f64::from(threads);
+            }
+        }
+        left
+    }
+
+    /// Whether a worker without work should take another's task, whose owner has to do for so long. Of
+    /// what was never drawn nobody holds the bricks.
+    pub(crate) fn is_worth_taking(
+        &self,
+        place: u32,
+        worker: WorkerId,
+        left: &BTreeMap<WorkerId, f64>,
+    ) -> bool {
+        let Some((last, us)) = self.took[place as usize] else { return true };
+        let owner = self.owners[place as usize];
+        let here = us * self.pace.slowness(worker) / self.pace.slowness(last);
+        left.get(&owner).is_none_or(|left| *left > 2.0 * here)
+    }
+
+    /// Whose a task is, and how long its owner may be silent before it is anybody's.
+    pub(crate) fn forbearance(&self, place: u32) -> (WorkerId, Micros) {
+        let us = self.took[place as usize].map_or(0.0, |(_, us)| us);
+        (self.owners[place as usize], FORBEARANCE + (2.0 * us) as Micros)
     }
 
     /// Whether a task is this worker's to take first: it owns it, or its owner is gone.
@@ -221,8 +272,8 @@ impl Pace {
     }
 }
 
-/// Whose each tile is: its last owner's, unless that one would be done late; a new one's the least
-/// loaded worker's. Loads are times.
+/// Whose each tile is: at first in bands, then its last owner's, unless that one would be done late; a
+/// new one's the least loaded worker's. Loads are times.
 fn share(
     tiles: &[Macrotile],
     roster: &Roster,
@@ -245,28 +296,65 @@ fn share(
         us / staying[w].1
     };
     let mut load = vec![0.0; staying.len()];
-    let mut owners: Vec<usize> = Vec::with_capacity(tiles.len());
-    for t in tiles {
-        let w = known(t).and_then(|(owner, _)| place(owner)).unwrap_or_else(|| {
-            let after = |w: &usize| load[*w] + cost(t, *w);
-            (0..staying.len()).min_by(|a, b| after(a).total_cmp(&after(b))).unwrap_or(0)
-        });
-        load[w] += cost(t, w);
-        owners.push(w);
+    // In the order of rows.
+    let mut order: Vec<usize> = (0..tiles.len()).collect();
+    order.sort_by_key(|&i| (tiles[i].rect.y0, tiles[i].rect.x0));
+    let owner = |i: usize| known(&tiles[i]).and_then(|(owner, _)| place(owner));
+    let mut owners = vec![0; tiles.len()];
+    if (0..tiles.len()).all(|i| owner(i).is_none()) {
+        // Bands of rows, as high as each is fast.
+        let fast = |w: usize| staying[w].1 / slowness[w];
+        let all = (0..staying.len()).map(fast).sum::<f64>();
+        let work = tiles.iter().map(|t| t.est as f64).sum::<f64>();
+        let (mut w, mut until, mut done) = (0, fast(0) / all * work, 0.0);
+        for &i in &order {
+            let half = 0.5 * tiles[i].est as f64;
+            while done + half > until && w + 1 < staying.len() {
+                w += 1;
+                until += fast(w) / all * work;
+            }
+            done += 2.0 * half;
+            owners[i] = w;
+            load[w] += cost(&tiles[i], w);
+        }
+    } else {
+        for &i in &order {
+            if let Some(w) = owner(i) {
+                owners[i] = w;
+                load[w] += cost(&tiles[i], w);
+            }
+        }
+        for &i in order.iter().filter(|&&i| owner(i).is_none()) {
+            let after = |w: &usize| load[*w] + cost(&tiles[i], *w);
+            let least = (0..staying.len()).min_by(|a, b| after(a).total_cmp(&after(b)));
+            owners[i] = least.unwrap_or(0);
+            load[owners[i]] += cost(&tiles[i], owners[i]);
+        }
     }
-    for _ in 0..tiles.len() {
+    for moved in 0..tiles.len() {
         let by = |a: &usize, b: &usize| load[*a].total_cmp(&load[*b]);
         let ends = ((0..load.len()).max_by(by), (0..load.len()).min_by(by));
         let (Some(most), Some(least)) = ends else { break };
-        if load[most] <= (1.0 + SLACK) * load.iter().sum::<f64>() / load.len() as f64 {
+        let mean = load.iter().sum::<f64>() / load.len() as f64;
+        let late = load[most] / mean - 1.0;
+        // Not a number where nothing takes time.
+        if !(late > LATE || late > SLACK && moved == 0) {
             break;
         }
-        // The largest that leaves both earlier than the later one was, by enough to be worth it.
-        let better = |&i: &usize| {
-            let (from, to) = (cost(&tiles[i], most), cost(&tiles[i], least));
-            owners[i] == most && load[least] + to < load[most] - 0.5 * from
+        // Of those that leave both earlier than the later one was, by enough to be worth it, the one
+        // nearest to what the other has; else the largest.
+        let better = |i: &usize| {
+            let (from, to) = (cost(&tiles[*i], most), cost(&tiles[*i], least));
+            owners[*i] == most && load[least] + to < load[most] - 0.5 * from
         };
-        let Some(i) = (0..tiles.len()).find(better) else { break };
+        let apart = |i: usize| {
+            let near = |j: usize| {
+                let (a, b) = (&tiles[i].rect, &tiles[j].rect);
+                a.x0.abs_diff(b.x0) + a.y0.abs_diff(b.y0)
+            };
+            (0..tiles.len()).filter(|&j| owners[j] == least).map(near).min().unwrap_or(0)
+        };
+        let Some(i) = (0..tiles.len()).filter(better).min_by_key(|&i| apart(i)) else { break };
         load[most] -= cost(&tiles[i], most);
         load[least] += cost(&tiles[i], least);
         owners[i] = least;
@@ -301,6 +389,7 @@ mod tests {
         let (tiles, roster) = (tiles(24), roster(&[1, 2, 3]));
         let owners = share(&tiles, &roster, &Pace::default(), &|_| None);
         assert_eq!(shares(&owners), [4, 8, 12]);
+        assert!(owners.is_sorted(), "in bands");
         let at = |t: &Macrotile| (t.rect.x0 / 64) as usize;
         // Each took what it was guessed to, or nearly.
         let known = |t: &Macrotile| Some((owners[at(t)], 1000.0 + at(t) as f64));
@@ -329,7 +418,7 @@ mod tests {
         let known = |t: &Macrotile| Some((WorkerId(if at(t) < 20 { 1 } else { 9 }), 500.0));
         let owners = share(&tiles, &roster(&[1, 1, 1]), &Pace::of(&tiles, &known), &known);
         let counts = shares(&owners);
-        assert!(counts.iter().all(|n| (9..=11).contains(n)), "{counts:?}");
+        assert!(counts.iter().all(|n| (9..=12).contains(n)), "{counts:?}");
         let kept = owners[..20].iter().filter(|o| o.0 == 1).count();
         assert_eq!(kept, counts[0], "it keeps of its own");
     }

@@ -222,6 +222,10 @@ fn what_the_master_costs_shows_in_frames_and_overlaps_where_it_may() {
     let one = run(&jobs, &trace, &Cluster { costs, ..cluster(4) });
     let three = run(&jobs, &trace, &Cluster { costs, in_flight: 3, ..cluster(4) });
     assert!(one.frame_ms() > free.frame_ms());
+    assert_eq!(free.later_work(), [0, 0]);
+    // Three later pictures are finished, and each tile's result is received.
+    let later: u64 = one.frames[1..].iter().map(|f| f.leases).sum();
+    assert!(one.later_work()[0] >= 3 * 20 * 256 * 200 + later * 30_000);
     // 51,200 pixels at 20 ns are finished while the next frame is drawn.
     assert!(one.each_ms() > one.frame_ms() + 1.0, "{} {}", one.each_ms(), one.frame_ms());
     assert!(three.each_ms() < one.each_ms() - 0.5);

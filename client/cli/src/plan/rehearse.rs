@@ -191,8 +191,7 @@ impl Stage<'_> {
         let measured = [master, workers].map(|d| d.as_nanos() as f64);
         let messages = costs::calibrated(measured, |messages| {
             let outcome = self.predict(1, costs::with_messages(self.costs, messages))?;
-            let master = outcome.driver + outcome.streams + outcome.finisher;
-            Ok([master as f64, outcome.workers as f64])
+            Ok(outcome.later_work().map(|ns| ns as f64))
         })?;
         Ok(costs::with_messages(self.costs, messages))
     }
@@ -201,7 +200,9 @@ impl Stage<'_> {
     fn beside(&self, workers: u32, played: &Played, costs: Costs) -> Result<Rehearsed, Fail> {
         let cores = embedded::cores();
         let predicted = self.predict(workers, costs)?;
-        let frames = self.jobs.len() as f64;
+        // The first frame is left out on both sides.
+        let frames = self.jobs.len().saturating_sub(1).max(1) as f64;
+        let [master, others] = predicted.later_work();
         let later = &played.frames[usize::from(played.frames.len() > 1)..];
         let mean = later.iter().map(|f| f.ms.total).sum::<f64>() / later.len().max(1) as f64;
         let ms = |ns: u64| ns as f64 / 1e6 / frames;
@@ -216,9 +217,9 @@ impl Stage<'_> {
             each_ms: played.each_ms,
             predicted_each_ms: predicted.each_ms(),
             master_ms,
-            predicted_master_ms: ms(predicted.driver + predicted.streams + predicted.finisher),
+            predicted_master_ms: ms(master),
             workers_ms,
-            predicted_workers_ms: ms(predicted.workers),
+            predicted_workers_ms: ms(others),
             busy,
         })
     }
@@ -244,12 +245,16 @@ async fn play(
         || workers.iter().map(Process::cpu).try_fold(Duration::ZERO, |sum, d| Some(sum + d?));
     let job = client.submit(&request).await.map_err(|e| remote::fail(&e))?;
     let mut stream = client.watch(&job, 0).await.map_err(|e| remote::fail(&e))?;
-    // Bricks are made before the first frame; from then on it counts.
     let (mut frames, mut came) = (Vec::new(), Vec::new());
-    let (began, before) = (Instant::now(), (master.cpu(), of_workers()));
+    let (mut began, mut before) = (Instant::now(), (master.cpu(), of_workers()));
     while let Some(update) = stream.next().await.map_err(|e| remote::fail(&e))? {
         let Update::Frame(frame) = update else { continue };
         came.push(Instant::now());
+        if came.len() == 1 {
+            // Before the first frame the volume is cut into bricks and all of them are sent: from here
+            // on it counts.
+            (began, before) = (Instant::now(), (master.cpu(), of_workers()));
+        }
         let stats: FrameStats = serde_json::from_str(&frame.stats_json)
             .map_err(|e| Fail::failed(format!("a frame's statistics can't be read: {e}")))?;
         if !stats.rehearsed {

@@ -412,6 +412,10 @@ impl World<'_> {
             Coming::Finished(frame) => {
                 self.outcome.frames[frame.0 as usize - 1].delivered = now;
                 self.finished += 1;
+                if self.finished == 1 {
+                    let (driver, streams) = (self.driver.work, self.streams.work);
+                    self.outcome.first = [driver, streams, self.finisher.work, self.worker_work];
+                }
                 self.in_hand -= 1;
                 self.feed();
                 self.drive(took, watch)?;

@@ -142,6 +142,8 @@ pub struct Outcome {
     pub finisher: Nanos,
     /// Work of all workers but rendering.
     pub workers: Nanos,
+    /// Work up to the first frame's delivery, with all its bricks: driver, streams, finisher, workers.
+    pub first: [Nanos; 4],
 }
 
 /// Why nothing can be predicted.
@@ -223,6 +225,13 @@ impl Outcome {
         let frames = &self.frames[usize::from(self.frames.len() > 1)..];
         let sum: u64 = frames.iter().map(|f| f.done - f.began).sum();
         sum as f64 / 1e6 / frames.len().max(1) as f64
+    }
+
+    /// Work for the frames but the first, in nanoseconds: the master's, and the workers' but rendering.
+    pub fn later_work(&self) -> [Nanos; 2] {
+        let [driver, streams, finisher, workers] = self.first;
+        let master = self.driver + self.streams + self.finisher;
+        [master - (driver + streams + finisher), self.workers - workers]
     }
 
     /// The first frame's time, in ms.

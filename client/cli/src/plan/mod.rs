@@ -332,7 +332,8 @@ impl Said<'_> {
                  flight. eff.: against\none core's time alone over all render threads. KB, brick \
                  KB: a later frame's leases and results, and\nbricks. bound by: where most of a \
                  frame's time goes: cores (rendering, spread evenly), straggler\n(waiting for the \
-                 last tile), link, or master.\n";
+                 last tile), link, or master (messages cost the same alone and in company here: \
+                 a bound from the slow side).\n";
         for p in self.predicted.iter().filter(|p| !p.rehearsed.is_empty()) {
             text += &rehearse::table(p.name(), &p.rehearsed, &p.costs);
         }

@@ -837,6 +837,8 @@ impl Frame {
         (blame, threads): (bool, u32),
         now: Micros,
     ) {
+        // A frame that is done and waits for one before it is over.
+        let now = self.ended.unwrap_or(now);
         let (leases, running) = self.probably(id, threads);
         self.lent.remove(&id);
         self.told.remove(&id);

@@ -190,6 +190,17 @@ pub enum Schedule {
     Slab,
 }
 
+/// Where the slabs of the slab schedule end. Never changes a byte.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Borders {
+    /// Where the data have been passed that hide what is behind.
+    #[default]
+    Data,
+    /// All slabs are of one thickness, as in the paper.
+    Equal,
+}
+
 /// What bricks hold although the scene does not need it: to see what leaving it out saves. Never
 /// changes a byte.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -217,6 +228,8 @@ pub struct Work {
     pub schedule: Schedule,
     /// What is kept although nothing needs it.
     pub keep: Keep,
+    /// Where slabs end.
+    pub borders: Borders,
 }
 
 impl Default for Work {
@@ -227,6 +240,7 @@ impl Default for Work {
             tile: None,
             schedule: Schedule::Auto,
             keep: Keep::default(),
+            borders: Borders::default(),
         }
     }
 }

@@ -17,7 +17,7 @@ use slabcast_common::path::{
     Axis, Crop, Key, KeyFrames, Orientation, ProjectionKind, Side, Turntable, ViewPath,
 };
 use slabcast_common::quality::{
-    Compositing, Keep, Kernel, Quality, Refused, Schedule, Splat, Sums, Work,
+    Borders, Compositing, Keep, Kernel, Quality, Refused, Schedule, Splat, Sums, Work,
 };
 use slabcast_common::tween::Tween;
 use slabcast_common::view::View;
@@ -283,6 +283,11 @@ pub(crate) struct WorkArgs {
     #[arg(long, default_value = "auto", value_name = "NAME", value_parser = words(
         &[("auto", Schedule::Auto), ("region", Schedule::Region), ("slab", Schedule::Slab)]))]
     schedule: Schedule,
+    /// Where slabs of the slab schedule end: data (where what hides the rest has been passed) or equal
+    /// (all of one thickness, as in the paper)
+    #[arg(long, default_value = "data", value_name = "NAME", value_parser = words(
+        &[("data", Borders::Data), ("equal", Borders::Equal)]))]
+    slab_borders: Borders,
     #[command(flatten)]
     keep: KeepArg,
 }
@@ -328,6 +333,7 @@ impl WorkArgs {
             tile: self.tile.0,
             schedule: self.schedule,
             keep: self.keep.keep(),
+            borders: self.slab_borders,
         };
         w.check().map_err(|e| Fail::flag(&e))?;
         Ok(w)

@@ -16,6 +16,7 @@
 //! A frame waits, with nothing lost, while there is no worker. It refuses to know who is silent
 //! (`roster`), which copy of a result counts (`queue`) and where bricks are (`residency`).
 
+use crate::borders;
 use crate::critical::Piece;
 use crate::ledger::{Ledger, Rendered, ms, place_in_time};
 use crate::macrotile::{self, Cut, LEAF, LEVELS};
@@ -159,8 +160,7 @@ impl Frame {
             vec![SheetRange::default()]
         } else {
             projected.extend(job.bricks.iter().map(|b| view.project(&b.tight)));
-            let seen = projected.iter().flatten();
-            seen.fold(SheetRange::default(), |all, p| all.union(p.sheets)).slabs(job.work.slabs)
+            borders::slabs(view, &projected, &|i| job.bricks[i].voxels, &job.work)
         };
         cluster.residency.open(job.scene.bricks, &job.bricks, by_region);
         let mut ledger = Ledger::new(began);

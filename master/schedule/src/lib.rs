@@ -44,6 +44,7 @@ use slabcast_common::view::View;
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 
+mod borders;
 mod critical;
 mod frame;
 mod ledger;
@@ -54,6 +55,7 @@ mod residency;
 mod roster;
 pub mod sim;
 
+pub use borders::slabs;
 pub use frame::is_shut;
 
 use frame::{Frame, Step, Turn, carry, goes_by_region};

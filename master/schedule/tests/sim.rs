@@ -5,8 +5,7 @@ use slabcast_common::ids::{BrickId, FrameId, SceneId};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::presets;
-use slabcast_common::quality::{Quality, Schedule, Work};
-use slabcast_common::slab::SheetRange;
+use slabcast_common::quality::{Borders, Quality, Schedule, Work};
 use slabcast_common::trace::{
     About, FrameTrace, Level, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace, VERSION,
     view_sha256,
@@ -14,7 +13,7 @@ use slabcast_common::trace::{
 use slabcast_common::view::{Camera, CameraProjection, Projected, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Unknown, Unmeasured};
-use slabcast_schedule::{FrameJob, macrotile};
+use slabcast_schedule::{FrameJob, macrotile, slabs as slabs_of};
 use std::sync::Arc;
 
 const SIZE: [u32; 2] = [256, 200];
@@ -49,7 +48,9 @@ fn world(frames: usize) -> (Vec<FrameJob>, Trace) {
             let lattice = &scene.volume.lattice;
             let view = View::new(lattice, &camera, SIZE, &quality).expect("drawable");
             let (frame, number) = (FrameId(i as u64 + 1), i as u64);
-            let work = Work { schedule: Schedule::Slab, ..Work::default() };
+            // What the cube's second view needs anew can be worked out for equal slabs alone.
+            let (schedule, borders) = (Schedule::Slab, Borders::Equal);
+            let work = Work { schedule, borders, ..Work::default() };
             let (scene, bricks) = (scene.clone(), bricks.clone());
             FrameJob { frame, number, scene, bricks, view, work }
         })
@@ -70,10 +71,12 @@ fn world(frames: usize) -> (Vec<FrameJob>, Trace) {
 
 fn frame(job: &FrameJob, quality: &Quality) -> FrameTrace {
     let projected: Vec<_> = job.bricks.iter().map(|b| job.view.project(&b.tight)).collect();
-    let sheets = projected.iter().flatten().fold(SheetRange::default(), |s, p| s.union(p.sheets));
     let mut shut = ShutMap::open(Rect::of_size(SIZE));
     let mut slabs = Vec::new();
-    for (n, range) in sheets.slabs(3).into_iter().enumerate() {
+    for (n, range) in slabs_of(&job.view, &projected, &|i| job.bricks[i].voxels, &job.work)
+        .into_iter()
+        .enumerate()
+    {
         let rects: Vec<Rect> = projected
             .iter()
             .flatten()

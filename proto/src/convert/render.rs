@@ -15,7 +15,7 @@ use slabcast_common::ids::WorkerId;
 use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::message::{PathRequest, TransferChoice};
 use slabcast_common::path::Orientation;
-use slabcast_common::quality::{Keep, Schedule, Work};
+use slabcast_common::quality::{Borders, Keep, Schedule, Work};
 
 enum_doors!(schedule_to_wire, schedule_from_wire, Schedule, v1::Schedule, Some(Schedule::Auto),
     { Auto <=> Auto, Region <=> Region, Slab <=> Slab });
@@ -50,6 +50,7 @@ pub fn path_request_to_wire(request: &PathRequest) -> v1::PathRequest {
             keep_empty: request.work.keep.empty,
             keep_normals: request.work.keep.normals,
             keep_gradients: request.work.keep.gradients,
+            equal_slabs: request.work.borders == Borders::Equal,
         }),
         format: wanted_format_to_wire(request.format),
         background: Some(background_to_wire(request.background)),
@@ -95,6 +96,7 @@ fn work_from_wire(work: v1::Work) -> Result<Work, WireError> {
             normals: work.keep_normals,
             gradients: work.keep_gradients,
         },
+        borders: if work.equal_slabs { Borders::Equal } else { Borders::Data },
     };
     work.check()?;
     Ok(work)

@@ -13,7 +13,7 @@ use slabcast_common::path::{
     Axis, Crop, CropUnit, Easing, FlyThrough, Key, KeyFrames, Orientation, PathView,
     ProjectionKind, Side, Turntable, ViewPath,
 };
-use slabcast_common::quality::{Compositing, Keep, Kernel, Quality, Schedule, Sums, Work};
+use slabcast_common::quality::{Borders, Compositing, Keep, Kernel, Quality, Schedule, Sums, Work};
 use slabcast_common::shade::{Light, Shading};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
@@ -509,15 +509,18 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
         0.1..1000.0f64,
         prop::option::of((4u32..=8).prop_map(|p| 1 << p)),
         prop_oneof![Just(Schedule::Auto), Just(Schedule::Slab)],
-        any::<[bool; 3]>(),
+        any::<[bool; 4]>(),
     )
-        .prop_map(|(slabs, tiles_per_worker, tile, schedule, [empty, normals, gradients])| Work {
-            slabs,
-            tiles_per_worker,
-            tile,
-            schedule,
-            keep: Keep { empty, normals, gradients },
-        });
+        .prop_map(
+            |(slabs, tiles_per_worker, tile, schedule, [empty, normals, gradients, equal])| Work {
+                slabs,
+                tiles_per_worker,
+                tile,
+                schedule,
+                keep: Keep { empty, normals, gradients },
+                borders: if equal { Borders::Equal } else { Borders::Data },
+            },
+        );
     let background = prop_oneof![
         Just(Background::Transparent),
         [0.0..=1.0f64, 0.0..=1.0, 0.0..=1.0].prop_map(Background::Colour)

@@ -146,7 +146,12 @@ impl Bench {
         let mut state = FrameState::new(size);
         let mut shut = ShutMap::open(Rect::of_size(size));
         let mut slabs = Vec::new();
-        let cuts = if path.slab { sheets.slabs(path.work.slabs) } else { Vec::new() };
+        let voxels = |i: usize| job.bricks[i].voxels;
+        let cuts = if path.slab {
+            slabcast_schedule::slabs(&job.view, &projected, &voxels, &path.work)
+        } else {
+            Vec::new()
+        };
         for range in cuts {
             let drawn = self.slab(path, job, &frame, &projected, range, &state, &shut);
             let (levels, pixels) = drawn;

@@ -7,7 +7,7 @@ mod world;
 
 use rng::Rng;
 use slabcast_common::ids::{FrameId, SceneId, WorkerId};
-use slabcast_common::quality::{Quality, Schedule, Work};
+use slabcast_common::quality::{Borders, Quality, Schedule, Work};
 use slabcast_schedule::Config;
 use world::{Nature, Script, World};
 
@@ -83,6 +83,7 @@ fn chaos(seed: u64, schedules: Schedules) -> World {
             tiles_per_worker: rng.pick(&[0.5, 2.5, 2.5, 6.0]),
             tile: rng.pick(&[None, None, None, Some(16), Some(64)]),
             schedule: schedules[frame as usize % schedules.len()],
+            borders: rng.pick(&[Borders::Data, Borders::Equal]),
             ..Work::default()
         };
         let size = [rng.between(1, 130) as u32, rng.between(1, 130) as u32];

@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 /// Bricks by set and id. Under the `slab` schedule the master decides what stays and what goes
 /// (`DropBricks`), since it decides what is needed; under `region` the worker does, and tells it
-/// ([`crate::parking`]). So both always agree on what is here.
+/// (`parking`). So both always agree on what is here.
 #[derive(Default)]
 pub struct BrickCache {
     sets: BTreeMap<BrickSetKey, BTreeMap<BrickId, Arc<Brick>>>,

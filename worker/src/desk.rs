@@ -3,7 +3,7 @@
 //! One task on the runtime; it decides and never computes. A lease waits here until its last
 //! brick is there and then goes to the render threads; so the first tiles render while bricks
 //! of the others are still on their way. A region goes to them at once, and comes back when it lacks
-//! bricks: [`crate::parking`] says what is asked for.
+//! bricks: `parking` says what is asked for.
 
 use crate::cache::BrickCache;
 use crate::parking::{Parking, Say, Who};

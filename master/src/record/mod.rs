@@ -24,7 +24,7 @@
 //! a decision is who gets which tile, with which bricks, when.
 //!
 //! **The driver never waits for the disk.** It puts down what it has in hand and goes on; a thread
-//! writes. Between them is a buffer of [`ROOM`] entries; if the disk falls behind that far, the
+//! writes. Between them is a buffer of `ROOM` entries; if the disk falls behind that far, the
 //! record ends there, says so, and rendering goes on.
 //!
 //! What it costs is in docs/scaling.md.

@@ -3,7 +3,7 @@
 //!
 //! How long will a frame take on 40 machines? A formula knows tiles and bandwidth, and nothing of
 //! the order in which leases are given, who waits at a barrier, what is lent ahead, or which copy
-//! of a late tile counts. All of that is decided by [`Scheduler`], which is pure: so it decides here
+//! of a late tile counts. All of that is decided by [`Scheduler`](crate::Scheduler), which is pure: so it decides here
 //! too, and only what it can't know is a model:
 //!
 //! ```text

@@ -30,8 +30,9 @@ const ROOM_RMSE: f64 = 1.2;
 /// The same of the error that 99.9 % of the pixels keep: of 3072 pixels a third is not blank, and
 /// the second worst of those is all that tells.
 const ROOM_MOST: f64 = 1.5;
-/// The same of time: a cluster in this process, files that are written beside.
-const ROOM_TIME: f64 = 1.08;
+/// The same of time. A frame of the cluster in this process took 1.1 to 1.45 times as long as plain
+/// drawing, which is what is measured (docs/scaling.md); less when that is mended.
+const ROOM_TIME: f64 = 1.4;
 /// Rungs beyond the first that keeps an error, of which one may be faster.
 const BEYOND: usize = 3;
 
@@ -390,7 +391,7 @@ mod tests {
         let off = |rmse| Off { rmse, ..Off::default() };
         assert!(aim.keeps_error(&off(0.8)) && !aim.keeps_error(&off(0.95)));
         let aim = Aim { budget: Some(100.0), error_max: Some(2.0 / 255.0), ..aim };
-        assert!(aim.keeps_time(90.0) && !aim.keeps_time(95.0));
+        assert!(aim.keeps_time(70.0) && !aim.keeps_time(73.0));
         assert_eq!(aim.flags(), "--error, --error-max, --budget");
         let most = Off { rmse: 0.1, most_999: 1.9, ..Off::default() };
         assert!(!aim.keeps_error(&most) && Aim::default().keeps_error(&most));

@@ -217,19 +217,20 @@ impl Picture {
             return out;
         }
         let srgb = Srgb8::new();
+        let behind = match background {
+            Background::Colour(bg) => Some(bg.map(linear_from_srgb)),
+            Background::Transparent => None,
+        };
         for p in &self.pixels {
             // f64 from here on: these are the last roundings of the picture.
             let [r, g, b, a] = p.map(f64::from);
-            let (c, alpha) = match background {
-                Background::Colour(bg) => {
-                    let bg = bg.map(linear_from_srgb);
+            let (c, alpha) = match behind {
+                Some(bg) => {
                     let over = |c: f64, b: f64| (c + (1.0 - a) * b).clamp(0.0, 1.0);
                     ([over(r, bg[0]), over(g, bg[1]), over(b, bg[2])], 1.0)
                 }
-                Background::Transparent if a > 0.0 => {
-                    ([r, g, b].map(|c| (c / a).clamp(0.0, 1.0)), a)
-                }
-                Background::Transparent => ([0.0; 3], 0.0),
+                None if a > 0.0 => ([r, g, b].map(|c| (c / a).clamp(0.0, 1.0)), a),
+                None => ([0.0; 3], 0.0),
             };
             match format {
                 PixelFormat::Rgb8 => out.extend(c.map(|c| srgb.encode(c))),

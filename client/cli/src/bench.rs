@@ -10,7 +10,7 @@ use crate::front::choose::settle;
 use crate::front::magnify::magnified;
 use crate::local::{self, Cut};
 use crate::progress::{self, Progress};
-use crate::request::{KeepArg, PictureOf, ThreadArg, lattice_notice};
+use crate::request::{KeepArg, Opened, PictureOf, ThreadArg};
 use crate::stage::Stage;
 use slabcast_common::message::Counters;
 use slabcast_common::quality::Work;
@@ -57,14 +57,8 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
     let work = Work { keep: args.keep.keep(), ..Work::default() };
     let mut asked = args.of.look.aimed(work)?;
     let threads = args.threads.count();
-    let volume = args.of.open()?;
-    let orientation = args.of.look.view.axes.of(&volume)?;
-    let info = volume.info(volume.digest());
-    asked.fit(&info, orientation, volume.anatomical)?;
-    let volume = settle(volume, &mut asked, orientation, threads, false)?;
-    if let Some(notice) = lattice_notice(&info) {
-        progress::note(&notice);
-    }
+    let Opened { volume, info, orientation } = args.of.open(&asked)?;
+    let volume = settle(volume, &info, &mut asked, orientation, threads, false)?;
     let stage = Stage::new(&volume, &info, &asked, orientation)?;
     let bricks = &stage.bricks;
     drop(volume);

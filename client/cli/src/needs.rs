@@ -6,7 +6,7 @@
 use crate::fail::Fail;
 use crate::local::{self, Cut};
 use crate::progress::{self, Progress};
-use crate::request::{Asked, PictureOf};
+use crate::request::{Asked, Opened, PictureOf};
 use crate::stage::Stage;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{Background, Picture};
@@ -121,10 +121,7 @@ fn in_turn(ways: [(&Way, Quality); 2], threads: usize) -> Result<([f64; 2], bool
 /// Finds it out.
 pub(crate) fn find(of: &PictureOf, threads: usize) -> Result<Needs, Fail> {
     let asked = of.look.asked(Work::default())?;
-    let volume = of.open()?;
-    let orientation = of.look.view.axes.of(&volume)?;
-    let info = volume.info(volume.digest());
-    asked.fit(&info, orientation, volume.anatomical)?;
+    let Opened { volume, info, orientation } = of.open(&asked)?;
     let mut progress = Progress::new(false);
     progress.stage("drawing with and without");
     let way = |keep| Way::new(&volume, &info, &asked, orientation, keep);

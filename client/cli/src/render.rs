@@ -272,7 +272,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
                 let info = volume.info(volume.digest());
                 run.asked.fit(&info, orientation, volume.anatomical)?;
                 let threads = (crew.workers * crew.threads) as usize;
-                volume = settle(volume, &mut run.asked, orientation, threads, args.quiet)?;
+                volume = settle(volume, &info, &mut run.asked, orientation, threads, args.quiet)?;
             }
             match args.show {
                 None | Some(Show::Owner) => {

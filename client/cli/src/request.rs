@@ -8,6 +8,7 @@ use crate::fail::Fail;
 use crate::front::choose::Aim;
 use crate::output::provenance::Provenance;
 use crate::parse::{self, Frames, Tile};
+use crate::progress;
 use crate::transfer::{LookFlags, Transfer, read_json};
 use crate::volume::InputArgs;
 use clap::builder::{PossibleValuesParser, TypedValueParser, ValueParser};
@@ -243,10 +244,26 @@ impl PictureOf {
         self.input.is_empty()
     }
 
-    /// Opens the volume.
-    pub(crate) fn open(&self) -> Result<Volume, Fail> {
-        self.input.open(&self.volume)
+    /// Opens the volume, sees whether what was asked for can be drawn of it, and says so if its lattice
+    /// is drawn by an approximation.
+    pub(crate) fn open(&self, asked: &Asked) -> Result<Opened, Fail> {
+        let volume = self.input.open(&self.volume)?;
+        let orientation = self.look.view.axes.of(&volume)?;
+        let info = volume.info(volume.digest());
+        asked.fit(&info, orientation, volume.anatomical)?;
+        if let Some(notice) = lattice_notice(&info) {
+            progress::note(&notice);
+        }
+        Ok(Opened { volume, info, orientation })
     }
+}
+
+/// A volume that what was asked for can be drawn of.
+pub(crate) struct Opened {
+    pub(crate) volume: Volume,
+    /// With its digest.
+    pub(crate) info: VolumeInfo,
+    pub(crate) orientation: Orientation,
 }
 
 /// `--threads` of commands that draw in this process alone.

@@ -5,8 +5,7 @@ use crate::fail::Fail;
 use crate::front::choose::settle;
 use crate::front::magnify::magnified;
 use crate::local::{self, Cut};
-use crate::progress;
-use crate::request::{PictureOf, lattice_notice};
+use crate::request::{Opened, PictureOf};
 use crate::stage::Stage;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{Background, Picture};
@@ -38,14 +37,8 @@ impl Still {
     ) -> Result<Still, Fail> {
         let mut asked = of.look.aimed(Work::default())?;
         check(asked.path.size)?;
-        let volume = of.open()?;
-        let orientation = of.look.view.axes.of(&volume)?;
-        let info = volume.info(volume.digest());
-        asked.fit(&info, orientation, volume.anatomical)?;
-        if let Some(notice) = lattice_notice(&info) {
-            progress::note(&notice);
-        }
-        let volume = settle(volume, &mut asked, orientation, threads, false)?;
+        let Opened { volume, info, orientation } = of.open(&asked)?;
+        let volume = settle(volume, &info, &mut asked, orientation, threads, false)?;
         let stage = Stage::new(&volume, &info, &asked, orientation)?;
         let (spec, small) = (stage.spec(0), stage.view(0, &asked.quality)?);
         let view = stage.view_of(0, &asked.quality, asked.size())?;

@@ -373,6 +373,8 @@ fn flags() -> Vec<(Vec<&'static str>, &'static [&'static str])> {
         (vec!["explain", "good.nrrd", "--pixel", "1,1", "--error", "0.1"], &["--error", "render"]),
         (vec!["report", "good.nrrd", "--only", "colour"], &["--only", "thickness"]),
         (vec!["report", "good.nrrd", "--seconds", "0"], &["--seconds", "above 0"]),
+        (vec!["report", "good.nrrd", "--elevation", "91"], &["--elevation", "90"]),
+        (vec!["plan", "good.nrrd", "-o", "p", "--elevation", "91"], &["--elevation", "90"]),
         (with(&["--eps", "1/0"]), &["--eps", "1/512"]),
         (with(&["--eps", "tiny"]), &["--eps", "1/512"]),
         (with(&["--eps", "2"]), &["--eps", "0.5"]),

@@ -11,7 +11,7 @@ use super::table::number;
 use crate::fail::{Fail, say};
 use crate::local::{self, Cut};
 use crate::progress::{self, Progress};
-use crate::request::{PictureOf, ThreadArg, lattice_notice};
+use crate::request::{Opened, PictureOf, ThreadArg};
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::quality::{Compositing, Quality, Work};
 use slabcast_common::view::{Camera, CameraProjection, View};
@@ -100,13 +100,7 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
         }
     }
     let threads = args.threads.count();
-    let volume = args.of.open()?;
-    let orientation = args.of.look.view.axes.of(&volume)?;
-    let info = volume.info(volume.digest());
-    asked.fit(&info, orientation, volume.anatomical)?;
-    if let Some(notice) = lattice_notice(&info) {
-        progress::note(&notice);
-    }
+    let Opened { volume, info, orientation } = args.of.open(&asked)?;
     let transfer = asked.transfer.function(&info).map_err(|e| asked.blame(&e))?;
     let camera = asked.path.camera(0, &info.lattice, orientation).map_err(|e| asked.blame(&e))?;
     let size = asked.path.size;

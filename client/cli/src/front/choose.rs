@@ -17,7 +17,7 @@ use crate::request::Asked;
 use crate::{parse, signals};
 use slabcast_common::path::Orientation;
 use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
-use slabcast_common::volume::Volume;
+use slabcast_common::volume::{Volume, VolumeInfo};
 use std::time::Instant;
 
 /// Views that are judged. By three, sheets of 4 vox were taken for bonsai in `peer-semi`, whose error
@@ -349,6 +349,7 @@ fn all_around(asked: &Asked) -> Asked {
 /// fits it and is given back.
 pub(crate) fn settle(
     volume: Volume,
+    info: &VolumeInfo,
     asked: &mut Asked,
     orientation: Orientation,
     threads: usize,
@@ -358,7 +359,7 @@ pub(crate) fn settle(
     if aim.is_empty() {
         return Ok(volume);
     }
-    let mut lab = Lab::new(volume, &all_around(asked), orientation, threads)?;
+    let mut lab = Lab::new(volume, info.clone(), &all_around(asked), orientation, threads)?;
     let Chosen { setting, .. } =
         choose(&mut lab, &aim, Cut { tile: 64, ..Cut::on(threads) }, quiet)?;
     asked.quality = setting.quality;

@@ -125,11 +125,11 @@ impl Lab {
     /// Cuts the bricks of what was asked for; `volume` fits it.
     pub(crate) fn new(
         volume: Volume,
+        info: VolumeInfo,
         asked: &Asked,
         orientation: Orientation,
         threads: usize,
     ) -> Result<Lab, Fail> {
-        let info = volume.info(volume.digest());
         let stage = Stage::new(&volume, &info, asked, orientation)?;
         let base = Setting::asked(asked.quality);
         let ground = ground(&base);
@@ -354,7 +354,8 @@ mod tests {
         let volume = crate::volume::open("formula:spheres:32".as_ref()).unwrap();
         let path = ViewPath::turn([64, 64], Turntable { frames: 3, ..Turntable::default() });
         let asked = Asked::plain(path, tf).unwrap();
-        Lab::new(volume, &asked, Orientation::new(None, None).unwrap(), 2).unwrap()
+        let info = volume.info(volume.digest());
+        Lab::new(volume, info, &asked, Orientation::new(None, None).unwrap(), 2).unwrap()
     }
 
     #[test]

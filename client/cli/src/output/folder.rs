@@ -1,6 +1,6 @@
 //! A folder of frames: what may be written there, and what the files are called.
 
-use super::file::hidden;
+use super::made::Made;
 use crate::fail::Fail;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -14,8 +14,8 @@ pub(crate) struct Folder {
     extension: &'static str,
     /// Digits of a frame's number: at least four, so that names sort.
     digits: usize,
-    /// Folders that this run made, outermost first.
-    made: Vec<PathBuf>,
+    /// Once it was made.
+    made: Option<Made>,
 }
 
 impl Folder {
@@ -28,7 +28,7 @@ impl Folder {
         force: bool,
     ) -> Result<(Folder, Option<String>), Fail> {
         let digits = (frames.end.saturating_sub(1)).to_string().len().max(4);
-        let folder = Folder { path: path.to_path_buf(), stem, extension, digits, made: Vec::new() };
+        let folder = Folder { path: path.to_path_buf(), stem, extension, digits, made: None };
         let entries = match std::fs::read_dir(path) {
             Ok(entries) => entries,
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok((folder, None)),
@@ -73,24 +73,8 @@ impl Folder {
     /// Makes the folder if it is missing, and sees whether files can be made in it: better now
     /// than after the first frame.
     pub(crate) fn make(&mut self) -> Result<(), Fail> {
-        let mut missing: Vec<PathBuf> = self
-            .path
-            .ancestors()
-            .take_while(|p| !p.as_os_str().is_empty() && !p.exists())
-            .map(Path::to_path_buf)
-            .collect();
-        missing.reverse();
-        for dir in missing {
-            match std::fs::create_dir(&dir) {
-                Ok(()) => self.made.push(dir),
-                // Somebody else was quicker.
-                Err(e) if e.kind() == std::io::ErrorKind::AlreadyExists => {}
-                Err(e) => return Err(Fail::io(&dir, "making the folder", &e)),
-            }
-        }
-        hidden(&self.path, "probe")
-            .map(drop)
-            .map_err(|e| Fail::io(&self.path, "making a file in it", &e))
+        self.made = Some(Made::new(&self.path)?);
+        Ok(())
     }
 
     /// A frame's file name.
@@ -120,17 +104,6 @@ impl Folder {
                 let gaps = last - first + 1 != numbers.len() as u64;
                 let count = if gaps { format!(" ({} of them)", numbers.len()) } else { "".into() };
                 format!("{} ... {}{count}", self.name(*first), self.name(*last))
-            }
-        }
-    }
-}
-
-impl Drop for Folder {
-    /// Folders that this run made and left empty go again.
-    fn drop(&mut self) {
-        for dir in self.made.iter().rev() {
-            if std::fs::remove_dir(dir).is_err() {
-                return;
             }
         }
     }

@@ -9,12 +9,14 @@ pub(crate) mod exr;
 mod file;
 mod folder;
 mod lines;
+mod made;
 pub(crate) mod png;
 pub(crate) mod provenance;
 mod y4m;
 
 pub(crate) use file::{Patience, probe, write_atomic};
 pub(crate) use lines::Lines;
+pub(crate) use made::Made;
 
 use crate::fail::Fail;
 use crate::front::magnify::magnified;

@@ -13,9 +13,9 @@ mod predict;
 mod rehearse;
 
 use crate::fail::{Fail, say};
-use crate::output::write_atomic;
-use crate::progress::{self, Progress};
-use crate::request::{Asked, PictureOf, WorkArgs, lattice_notice};
+use crate::output::{Made, write_atomic};
+use crate::progress::Progress;
+use crate::request::{Asked, Opened, PictureOf, WorkArgs};
 use crate::stage::Stage;
 use crate::{embedded, parse};
 use predict::{Question, Row};
@@ -120,13 +120,11 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
         }
     }
     let mut progress = Progress::new(args.quiet);
-    let volume = args.of.open()?;
-    let orientation = args.of.look.view.axes.of(&volume)?;
-    let info = volume.info(volume.digest());
-    asked.fit(&info, orientation, volume.anatomical)?;
-    if let Some(notice) = lattice_notice(&info) {
-        progress::note(&notice);
+    if let Some(dir) = &args.output {
+        // Refused before minutes of measuring, and gone again until there is something to write.
+        drop(Made::new(dir)?);
     }
+    let Opened { volume, info, orientation } = args.of.open(&asked)?;
     progress.stage("cutting the volume into bricks");
     let names = (volume.name.clone(), asked.transfer.name().to_string());
     let stage = Stage::new(&volume, &info, &asked, orientation)?;
@@ -408,7 +406,7 @@ impl Said<'_> {
     }
 
     fn write(&self, dir: &Path) -> Result<(), Fail> {
-        std::fs::create_dir_all(dir).map_err(|e| Fail::io(dir, "making the folder", &e))?;
+        let _made = Made::new(dir)?;
         let chart = chart::Chart::new(
             &format!("{}: predicted efficiency", self.title()),
             &self.cluster(),

@@ -13,7 +13,7 @@ use crate::front::pareto::{self, Point};
 use crate::front::setting::{Setting, lower};
 use crate::local::Cut;
 use crate::progress::{self, Progress};
-use crate::request::{PictureOf, ThreadArg, lattice_notice};
+use crate::request::{Opened, PictureOf, ThreadArg};
 use crate::signals;
 use serde::Serialize;
 use slabcast_common::quality::{Quality, Sums, Work};
@@ -198,9 +198,11 @@ impl Report {
 
 /// Runs the command.
 pub(crate) fn run(args: &ReportArgs) -> Result<(), Fail> {
-    write::check(args)?;
+    let made = write::check(args)?;
     let args = args.clone();
     signals::to_its_end(move || {
+        // Held until the files are there.
+        let _made = made;
         let report = measure(&args)?;
         write::files(&args.out, &report)?;
         if args.json {
@@ -215,15 +217,9 @@ fn measure(args: &ReportArgs) -> Result<Report, Fail> {
     let threads = args.threads.count();
     let mut progress = Progress::new(false).of("setting");
     progress.stage(&format!("reading {}", args.of.volume.display()));
-    let volume = args.of.open()?;
-    let orientation = args.of.look.view.axes.of(&volume)?;
-    let info = volume.info(volume.digest());
-    asked.fit(&info, orientation, volume.anatomical)?;
-    if let Some(notice) = lattice_notice(&info) {
-        progress::note(&notice);
-    }
-    let name = volume.name.clone();
-    let mut lab = Lab::new(volume, &asked, orientation, threads)?;
+    let Opened { volume, info, orientation } = args.of.open(&asked)?;
+    let (name, digest) = (volume.name.clone(), info.digest.to_string());
+    let mut lab = Lab::new(volume, info, &asked, orientation, threads)?;
     let trials = sweep::trials(&lab, &args.only);
 
     let views = lab.views();
@@ -246,7 +242,7 @@ fn measure(args: &ReportArgs) -> Result<Report, Fail> {
         slabcast: env!("CARGO_PKG_VERSION"),
         pixels_version: slabcast_common::PIXELS_VERSION,
         volume: name,
-        digest: info.digest.to_string(),
+        digest,
         tf: asked.transfer.name(),
         size: lab.size(),
         views,

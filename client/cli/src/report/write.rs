@@ -6,7 +6,7 @@ use super::{Line, Report, ReportArgs};
 use crate::chart::{self, DARK, LIGHT};
 use crate::fail::Fail;
 use crate::front::setting::{fraction, lower};
-use crate::output::write_atomic;
+use crate::output::{Made, write_atomic};
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::Path;
@@ -15,7 +15,8 @@ const FILES: [&str; 6] =
     ["report.json", "report.csv", "report.svg", "report-dark.svg", "report.png", "report-dark.png"];
 
 /// Refuses, before anything is measured, what could not be written.
-pub(super) fn check(args: &ReportArgs) -> Result<(), Fail> {
+/// The folder goes again if nothing comes into it.
+pub(super) fn check(args: &ReportArgs) -> Result<Made, Fail> {
     let out = &args.out;
     let there = FILES.iter().map(|f| out.join(f)).find(|f| f.exists());
     if let (Some(file), false) = (there, args.force) {
@@ -25,8 +26,7 @@ pub(super) fn check(args: &ReportArgs) -> Result<(), Fail> {
             file.file_name().unwrap_or_default().to_string_lossy()
         )));
     }
-    std::fs::create_dir_all(out).map_err(|e| Fail::io(out, "making the folder", &e))?;
-    crate::output::probe(&out.join(FILES[0]))
+    Made::new(out)
 }
 
 /// Writes all files.

@@ -8,6 +8,7 @@ use crate::math::{linear_from_srgb, srgb_from_linear};
 use crate::occlusion::Rect;
 use crate::volume::Digest32;
 use sha2::{Digest, Sha256};
+use std::sync::OnceLock;
 
 /// Unit of fixed-point premultiplied colour.
 pub const COLOUR_UNIT: f32 = 1.0 / (1u32 << 28) as f32;
@@ -39,8 +40,8 @@ pub struct TilePixels {
 /// A finished pixel: linear premultiplied RGBA.
 #[inline(always)]
 fn finished(a: f32, colour: [u32; 3]) -> [f32; 4] {
-    let [r, g, b] = colour.map(|c| c as f32 * COLOUR_UNIT);
-    [r, g, b, a]
+    let [r, g, b] = colour;
+    [r as f32 * COLOUR_UNIT, g as f32 * COLOUR_UNIT, b as f32 * COLOUR_UNIT, a]
 }
 
 impl TilePixels {
@@ -53,39 +54,40 @@ impl TilePixels {
             self.a.chunks(tile.width()).zip(self.colour.chunks(tile.width())).enumerate()
         {
             let row = (tile.y0 as usize + y) * size[0] as usize + tile.x0 as usize;
-            for ((to, &a), &colour) in pixels[row..row + a.len()].iter_mut().zip(a).zip(colour) {
-                *to = finished(a, colour);
-            }
+            draw(&mut pixels[row..row + a.len()], a, colour);
         }
     }
 }
 
-/// A frame while its slabs are rendered.
+/// A frame while its tiles are rendered: slab after slab ([`FrameState::put`]), or each tile at once
+/// ([`FrameState::lay`]).
 #[derive(Clone, Debug)]
 pub struct FrameState {
     size: [u32; 2],
+    /// Tiles that one task made whole, in the order in which they came; nothing was put where they are.
+    laid: Vec<(Rect, TilePixels)>,
+    /// Of all pixels; none before something was put.
     a: Vec<f32>,
     colour: Vec<[u32; 3]>,
-    /// Sums of the last sheet of the slab before this one.
+    /// Sums of the last sheet of the slab before this one; no pixels while all are zero, which they
+    /// stay where one task goes through all sheets.
     last: Vec<RawSums>,
-    /// Sums of the last sheet of this slab, as its tiles come in.
+    /// Sums of the last sheet of this slab, as its tiles come in; likewise.
     next: Vec<RawSums>,
 }
 
 impl FrameState {
-    /// What a pixel takes: A, three colours, and two sheets' sums.
+    /// What a pixel takes at most: A, three colours, and two sheets' sums.
     pub const BYTES_A_PIXEL: u64 = 4 + 12 + 2 * 16;
 
     /// Nothing drawn yet.
     pub fn new(size: [u32; 2]) -> Self {
-        let n = size[0] as usize * size[1] as usize;
-        FrameState {
-            size,
-            a: vec![0.0; n],
-            colour: vec![[0; 3]; n],
-            last: vec![[0; 4]; n],
-            next: vec![[0; 4]; n],
-        }
+        let (laid, a, colour, last, next) = Default::default();
+        FrameState { size, laid, a, colour, last, next }
+    }
+
+    fn pixels(&self) -> usize {
+        self.size[0] as usize * self.size[1] as usize
     }
 
     /// Width and height in pixels.
@@ -93,9 +95,9 @@ impl FrameState {
         self.size
     }
 
-    /// A of every pixel, row-major.
-    pub fn a(&self) -> &[f32] {
-        &self.a
+    /// A of every pixel as the slabs that were put left it, row-major.
+    pub fn a(&self) -> impl ExactSizeIterator<Item = f32> {
+        (0..self.pixels()).map(|i| self.a.get(i).copied().unwrap_or(0.0))
     }
 
     fn rows(&self, r: Rect) -> impl Iterator<Item = std::ops::Range<usize>> + use<> {
@@ -109,10 +111,19 @@ impl FrameState {
     /// What a task on `tile` starts from.
     pub fn tile(&self, tile: Rect) -> TileState {
         let mut a = Vec::with_capacity(tile.area());
-        let mut last = Vec::with_capacity(tile.area());
-        for row in self.rows(tile) {
-            a.extend_from_slice(&self.a[row.clone()]);
-            last.extend_from_slice(&self.last[row]);
+        if self.a.is_empty() {
+            a.resize(tile.area(), 0.0);
+        } else {
+            for row in self.rows(tile) {
+                a.extend_from_slice(&self.a[row]);
+            }
+        }
+        let mut last = Vec::new();
+        if !self.last.is_empty() {
+            last.reserve_exact(tile.area());
+            for row in self.rows(tile) {
+                last.extend_from_slice(&self.last[row]);
+            }
         }
         let blank = last.iter().all(|s| *s == [0; 4]);
         TileState { a, last: (!blank).then_some(last) }
@@ -126,6 +137,13 @@ impl FrameState {
         let n = tile.area();
         assert!(pixels.a.len() == n && pixels.colour.len() == n, "planes of the tile's size");
         let w = tile.width();
+        if self.a.is_empty() {
+            self.a = vec![0.0; self.pixels()];
+            self.colour = vec![[0; 3]; self.pixels()];
+        }
+        if pixels.last.is_some() && self.next.is_empty() {
+            self.next = vec![[0; 4]; self.a.len()];
+        }
         for (i, row) in self.rows(tile).enumerate() {
             let from = i * w..(i + 1) * w;
             self.a[row.clone()].copy_from_slice(&pixels.a[from.clone()]);
@@ -140,6 +158,18 @@ impl FrameState {
         }
     }
 
+    /// Takes in a tile that one task drew through all sheets. Nothing is copied: its pixels are read
+    /// when the picture is.
+    ///
+    /// # Panics
+    /// As [`FrameState::put`], and if the tile leaves the picture.
+    pub fn lay(&mut self, tile: Rect, pixels: TilePixels) {
+        let n = tile.area();
+        assert!(pixels.a.len() == n && pixels.colour.len() == n, "planes of the tile's size");
+        assert!(tile.intersect(&Rect::of_size(self.size)) == tile, "inside the picture");
+        self.laid.push((tile, pixels));
+    }
+
     /// Ends a slab: what came in as last sums is what the next slab starts from. A pixel that
     /// no task touched had an empty last sheet.
     pub fn end_slab(&mut self) {
@@ -149,8 +179,52 @@ impl FrameState {
 
     /// The finished picture.
     pub fn finish(&self) -> Picture {
-        let pixels = self.a.iter().zip(&self.colour).map(|(&a, &c)| finished(a, c)).collect();
+        let mut pixels = Vec::with_capacity(self.pixels());
+        self.each_row(|row| pixels.extend_from_slice(row));
         Picture { size: self.size, pixels }
+    }
+
+    /// The finished picture's hash and its bytes, without a picture in between.
+    pub fn encode(&self, format: PixelFormat, background: Background) -> Encoded {
+        let mut encoding = Encoding::new(self.pixels(), format, background);
+        self.each_row(|row| encoding.put(row));
+        encoding.end()
+    }
+
+    /// Makes the picture row by row, from the top.
+    fn each_row(&self, mut take: impl FnMut(&[[f32; 4]])) {
+        let width = self.size[0] as usize;
+        let mut row = vec![[0.0; 4]; width];
+        // By their first rows; those that have begun and not ended.
+        let mut coming: Vec<&(Rect, TilePixels)> = self.laid.iter().collect();
+        coming.sort_by_key(|(tile, _)| std::cmp::Reverse(tile.y0));
+        let mut here: Vec<&(Rect, TilePixels)> = Vec::new();
+        for y in 0..self.size[1] as usize {
+            if self.a.is_empty() {
+                row.fill([0.0; 4]);
+            } else {
+                let of = y * width..(y + 1) * width;
+                draw(&mut row, &self.a[of.clone()], &self.colour[of]);
+            }
+            here.retain(|(tile, _)| y < tile.y1 as usize);
+            while let Some(tile) = coming.pop_if(|(tile, _)| tile.y0 as usize <= y) {
+                here.push(tile);
+            }
+            for (tile, pixels) in &here {
+                let from = (y - tile.y0 as usize) * tile.width();
+                let of = from..from + tile.width();
+                let to = &mut row[tile.x0 as usize..tile.x1 as usize];
+                draw(to, &pixels.a[of.clone()], &pixels.colour[of]);
+            }
+            take(&row);
+        }
+    }
+}
+
+/// Pixels of a row.
+fn draw(row: &mut [[f32; 4]], a: &[f32], colour: &[[u32; 3]]) {
+    for ((to, &a), &colour) in row.iter_mut().zip(a).zip(colour) {
+        *to = finished(a, colour);
     }
 }
 
@@ -202,76 +276,166 @@ impl Picture {
     /// The hash of CONTRACTS.md: over row-major linear premultiplied RGBA f32, little endian.
     pub fn sha256(&self) -> Digest32 {
         let mut h = Sha256::new();
-        for chunk in self.pixels.chunks(4096) {
-            let bytes: Vec<u8> = chunk.iter().flatten().flat_map(|x| x.to_le_bytes()).collect();
-            h.update(bytes);
-        }
+        hash(&mut h, &self.pixels);
         Digest32(h.finalize().into())
     }
 
     /// The pixels in `format`.
     pub fn encode(&self, format: PixelFormat, background: Background) -> Vec<u8> {
         let mut out = Vec::with_capacity(self.pixels.len() * format.bytes());
-        if format == PixelFormat::Rgba32F {
-            out.extend(self.pixels.iter().flatten().flat_map(|x| x.to_le_bytes()));
-            return out;
-        }
-        let srgb = Srgb8::new();
-        let behind = match background {
-            Background::Colour(bg) => Some(bg.map(linear_from_srgb)),
+        Encoder::new(format, background).put(&self.pixels, &mut out);
+        out
+    }
+}
+
+/// A picture as it leaves the master.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Encoded {
+    /// As [`Picture::sha256`].
+    pub sha256: Digest32,
+    /// As [`Picture::encode`].
+    pub bytes: Vec<u8>,
+}
+
+/// A picture that is hashed and encoded as its pixels come.
+struct Encoding {
+    hash: Sha256,
+    encoder: Encoder,
+    bytes: Vec<u8>,
+}
+
+impl Encoding {
+    fn new(pixels: usize, format: PixelFormat, background: Background) -> Encoding {
+        let bytes = Vec::with_capacity(pixels * format.bytes());
+        Encoding { hash: Sha256::new(), encoder: Encoder::new(format, background), bytes }
+    }
+
+    fn put(&mut self, pixels: &[[f32; 4]]) {
+        hash(&mut self.hash, pixels);
+        self.encoder.put(pixels, &mut self.bytes);
+    }
+
+    fn end(self) -> Encoded {
+        Encoded { sha256: Digest32(self.hash.finalize().into()), bytes: self.bytes }
+    }
+}
+
+fn hash(h: &mut Sha256, pixels: &[[f32; 4]]) {
+    if cfg!(target_endian = "little") {
+        h.update(bytemuck::cast_slice::<[f32; 4], u8>(pixels));
+    } else {
+        pixels.iter().flatten().for_each(|x| h.update(x.to_le_bytes()));
+    }
+}
+
+/// Pixels to bytes of a format, over a background.
+struct Encoder {
+    format: PixelFormat,
+    /// The background's linear light.
+    background: Option<[f64; 3]>,
+}
+
+impl Encoder {
+    fn new(format: PixelFormat, background: Background) -> Encoder {
+        let background = match background {
+            Background::Colour(colour) => Some(colour.map(linear_from_srgb)),
             Background::Transparent => None,
         };
-        for p in &self.pixels {
-            // f64 from here on: these are the last roundings of the picture.
-            let [r, g, b, a] = p.map(f64::from);
-            let (c, alpha) = match behind {
-                Some(bg) => {
-                    let over = |c: f64, b: f64| (c + (1.0 - a) * b).clamp(0.0, 1.0);
-                    ([over(r, bg[0]), over(g, bg[1]), over(b, bg[2])], 1.0)
+        Encoder { format, background }
+    }
+
+    fn put(&self, pixels: &[[f32; 4]], out: &mut Vec<u8>) {
+        let first = out.len();
+        out.resize(first + pixels.len() * self.format.bytes(), 0);
+        let out = &mut out[first..];
+        match self.format {
+            PixelFormat::Rgb8 => self.each(pixels, out, |srgb, [r, g, b, _]| {
+                [srgb.encode(r), srgb.encode(g), srgb.encode(b)]
+            }),
+            PixelFormat::Rgba8 => self.each(pixels, out, |srgb, [r, g, b, a]| {
+                [srgb.encode(r), srgb.encode(g), srgb.encode(b), (a * 255.0 + 0.5) as u8]
+            }),
+            PixelFormat::Rgba16 => self.each(pixels, out, |_, [r, g, b, a]| {
+                let to16 = |x: f64| ((x * 65535.0 + 0.5) as u16).to_le_bytes();
+                let light = |c: f64| to16(srgb_from_linear(c));
+                let [[r0, r1], [g0, g1], [b0, b1]] = [light(r), light(g), light(b)];
+                let [a0, a1] = to16(a);
+                [r0, r1, g0, g1, b0, b1, a0, a1]
+            }),
+            PixelFormat::Rgba32F => {
+                for (to, x) in out.chunks_exact_mut(4).zip(pixels.iter().flatten()) {
+                    to.copy_from_slice(&x.to_le_bytes());
                 }
-                None if a > 0.0 => ([r, g, b].map(|c| (c / a).clamp(0.0, 1.0)), a),
-                None => ([0.0; 3], 0.0),
-            };
-            match format {
-                PixelFormat::Rgb8 => out.extend(c.map(|c| srgb.encode(c))),
-                PixelFormat::Rgba8 => {
-                    out.extend(c.map(|c| srgb.encode(c)));
-                    out.push((alpha * 255.0 + 0.5) as u8);
-                }
-                PixelFormat::Rgba16 => {
-                    let to16 = |x: f64| ((x * 65535.0 + 0.5) as u16).to_le_bytes();
-                    out.extend(c.iter().flat_map(|&c| to16(srgb_from_linear(c))));
-                    out.extend(to16(alpha));
-                }
-                PixelFormat::Rgba32F => unreachable!("returned above"),
             }
         }
-        out
+    }
+
+    #[inline(always)]
+    fn each<const N: usize>(
+        &self,
+        pixels: &[[f32; 4]],
+        out: &mut [u8],
+        bytes: impl Fn(&Srgb8, [f64; 4]) -> [u8; N],
+    ) {
+        let srgb = Srgb8::get();
+        let blank = bytes(srgb, self.over([0.0; 4]));
+        for (to, &p) in out.as_chunks_mut::<N>().0.iter_mut().zip(pixels) {
+            *to = if p == [0.0; 4] { blank } else { bytes(srgb, self.over(p)) };
+        }
+    }
+
+    /// Linear light over the background, straight, and its alpha.
+    #[inline(always)]
+    fn over(&self, p: [f32; 4]) -> [f64; 4] {
+        // f64 from here on: these are the last roundings of the picture. Channels one by one, since
+        // `map` of an array is a call in builds without link-time optimisation.
+        let [r, g, b, a] = [f64::from(p[0]), f64::from(p[1]), f64::from(p[2]), f64::from(p[3])];
+        match self.background {
+            Some(bg) => {
+                let over = |c: f64, b: f64| (c + (1.0 - a) * b).clamp(0.0, 1.0);
+                [over(r, bg[0]), over(g, bg[1]), over(b, bg[2]), 1.0]
+            }
+            None if a > 0.0 => {
+                let straight = |c: f64| (c / a).clamp(0.0, 1.0);
+                [straight(r), straight(g), straight(b), a]
+            }
+            None => [0.0; 4],
+        }
     }
 }
 
 /// Linear to 8-bit sRGB by thresholds: what rounding the formula gives, without its power.
 struct Srgb8 {
-    /// Linear value from which level `i + 1` is the nearest.
-    thresholds: [f64; 255],
-    /// A level at or below the right one for each 1/1024 of linear light.
-    start: [u8; 1025],
+    /// Linear value from which level `i + 1` is the nearest; none for level 256.
+    thresholds: [f64; 256],
+    /// The level at the beginning of each part of linear light; at most one threshold is in it.
+    start: [u8; Srgb8::PARTS + 1],
 }
 
 impl Srgb8 {
-    fn new() -> Self {
-        let thresholds = std::array::from_fn(|i| linear_from_srgb((i as f64 + 0.5) / 255.0));
-        let start =
-            std::array::from_fn(|i| thresholds.partition_point(|&t| t <= i as f64 / 1024.0) as u8);
-        Srgb8 { thresholds, start }
+    /// The curve's steepest slope is 12.92, at black: 0.81 levels a part.
+    const PARTS: usize = 4096;
+
+    fn get() -> &'static Srgb8 {
+        static TABLE: OnceLock<Srgb8> = OnceLock::new();
+        TABLE.get_or_init(|| {
+            let light = |i: usize| match i {
+                255 => f64::INFINITY,
+                i => linear_from_srgb((i as f64 + 0.5) / 255.0),
+            };
+            let thresholds: [f64; 256] = std::array::from_fn(light);
+            let start = std::array::from_fn(|i| {
+                thresholds.partition_point(|&t| t <= i as f64 / Srgb8::PARTS as f64) as u8
+            });
+            Srgb8 { thresholds, start }
+        })
     }
 
+    /// `linear` in `[0, 1]`.
+    #[inline(always)]
     fn encode(&self, linear: f64) -> u8 {
-        let mut level = self.start[(linear * 1024.0) as usize] as usize;
-        while level < 255 && self.thresholds[level] <= linear {
-            level += 1;
-        }
-        level as u8
+        let level = self.start[(linear * Srgb8::PARTS as f64) as usize];
+        level + u8::from(self.thresholds[usize::from(level)] <= linear)
     }
 }
 
@@ -281,11 +445,74 @@ mod tests {
 
     #[test]
     fn thresholds_give_what_the_formula_rounds_to() {
-        let s = Srgb8::new();
-        for i in 0..=100_000 {
-            let l = i as f64 / 100_000.0;
+        let s = Srgb8::get();
+        let even = (0..=100_000).map(|i| f64::from(i) / 100_000.0);
+        let next = s.thresholds[..255].iter().flat_map(|t| [t.next_down(), *t, t.next_up()]);
+        let parts = (0..=Srgb8::PARTS).map(|i| i as f64 / Srgb8::PARTS as f64);
+        for l in parts.clone().chain(even) {
             let want = (srgb_from_linear(l) * 255.0 + 0.5).floor() as u8;
             assert_eq!(s.encode(l), want, "{l}");
+        }
+        for l in next.chain(parts) {
+            assert_eq!(usize::from(s.encode(l)), s.thresholds.partition_point(|&t| t <= l), "{l}");
+        }
+    }
+
+    #[test]
+    fn a_frame_is_encoded_as_its_picture_is() {
+        // Two portions and some, of every kind of pixel.
+        let size = [90, 13];
+        let mut f = FrameState::new(size);
+        let (tile, mut x) = (Rect::new(7, 2, 83, 13), 7u32);
+        let mut next = || {
+            x = x.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            x >> 4
+        };
+        let n = tile.area();
+        let a: Vec<f32> = (0..n).map(|i| [0.0, 1.0, next() as f32 * COLOUR_UNIT][i % 3]).collect();
+        let colour = a.iter().map(|a| [0; 3].map(|_: u32| (next() as f32 * a) as u32)).collect();
+        let pixels = TilePixels { a, colour, last: None };
+        f.put(tile, &pixels);
+        let picture = f.finish();
+        let mut laid = FrameState::new(size);
+        laid.lay(tile, pixels.clone());
+        assert_eq!(laid.finish(), picture);
+        for format in
+            [PixelFormat::Rgb8, PixelFormat::Rgba8, PixelFormat::Rgba16, PixelFormat::Rgba32F]
+        {
+            for background in [Background::Transparent, Background::Colour([0.2, 0.5, 1.0])] {
+                let encoded = f.encode(format, background);
+                assert_eq!(encoded, laid.encode(format, background));
+                assert_eq!(encoded.sha256, picture.sha256());
+                assert_eq!(encoded.bytes, picture.encode(format, background));
+                assert_eq!(encoded.bytes.len(), picture.pixels.len() * format.bytes());
+            }
+        }
+    }
+
+    #[test]
+    fn tiles_lie_where_they_belong_in_whatever_order_they_come() {
+        let size = [7, 5];
+        // Edges of 3: whole tiles and cut ones, and one that never came.
+        let tiles: Vec<Rect> = [(0, 0), (3, 0), (6, 0), (0, 3), (6, 3)]
+            .map(|(x, y)| Rect::new(x, y, (x + 3).min(7), (y + 3).min(5)))
+            .into();
+        let mark = |x: i32, y: i32| (1 + x + 7 * y) as f32;
+        let pixels = |t: &Rect| TilePixels {
+            a: (t.y0..t.y1).flat_map(|y| (t.x0..t.x1).map(move |x| mark(x, y))).collect(),
+            colour: vec![[1 << 28; 3]; t.area()],
+            last: None,
+        };
+        for order in [[0, 1, 2, 3, 4], [4, 3, 2, 1, 0], [2, 4, 0, 3, 1]] {
+            let mut f = FrameState::new(size);
+            order.iter().for_each(|&i| f.lay(tiles[i], pixels(&tiles[i])));
+            let picture = f.finish();
+            for (i, p) in picture.pixels.iter().enumerate() {
+                let (x, y) = (i as i32 % 7, i as i32 / 7);
+                let missing = (3..6).contains(&x) && y >= 3;
+                let want = if missing { [0.0; 4] } else { [1.0, 1.0, 1.0, mark(x, y)] };
+                assert_eq!(*p, want, "{x},{y}");
+            }
         }
     }
 

@@ -270,14 +270,15 @@ impl Handle {
 
     /// Watches a job from frame `from`; `None` if there is no such job.
     pub fn watch(&self, job: JobId, from: u64) -> Option<Watch> {
-        let bell = self.jobs.listen();
+        let bells = self.jobs.listen();
         self.jobs.lock().jobs.get(&job)?;
         Some(Watch {
             jobs: self.jobs.clone(),
             job,
             next: from,
-            bell,
+            bells,
             last_notice: None,
+            quiet: None,
             taken: self.inbox.clone(),
             over: false,
         })
@@ -901,7 +902,7 @@ impl Driver {
                             job.view.tiles = (done, total);
                             job.view.slab = (slab, slabs);
                         }
-                        self.jobs.ring();
+                        self.jobs.ring_tile();
                     }
                 }
                 Action::FrameDone { frame, state, stats, spans } => {

@@ -7,7 +7,7 @@ use crate::jobs::FinishedFrame;
 use sha2::{Digest, Sha256};
 use slabcast_common::bounds;
 use slabcast_common::ids::{FrameId, JobId};
-use slabcast_common::image::{FrameState, Picture, PixelFormat};
+use slabcast_common::image::{Encoded, FrameState, Picture, PixelFormat};
 use slabcast_common::message::{PathRequest, SceneSpec};
 use slabcast_common::path::CropBox;
 use slabcast_common::stats::{Bound, BrickStats, ErrorStats, FrameStats, LeftOut};
@@ -134,10 +134,14 @@ fn mark(picture: &mut Picture) {
 
 /// Makes the frame.
 pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
-    let mut picture = s.state.finish();
-    if s.rehearsed {
+    let (size, format, background) = (s.state.size(), s.request.format, s.request.background);
+    let Encoded { sha256, bytes } = if s.rehearsed {
+        let mut picture = s.state.finish();
         mark(&mut picture);
-    }
+        Encoded { sha256: picture.sha256(), bytes: picture.encode(format, background) }
+    } else {
+        s.state.encode(format, background)
+    };
     let mut stats = *s.stats;
     // Frames of a job count from its first; people count those of the path.
     let number = stats.frame;
@@ -146,7 +150,7 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
         *path = format!("frame {}: {path}", stats.frame);
     }
     stats.view_sha256 = view_sha256(&s.scene, s.crop.as_ref(), &s.view).to_string();
-    stats.pixels_sha256 = picture.sha256().to_string();
+    stats.pixels_sha256 = sha256.to_string();
     if s.rehearsed {
         stats.rehearsed = true;
         stats.pixels_sha256 = "none: rehearsed".into();
@@ -157,12 +161,11 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
         Some(store) => left_out(store, &s.scene, &s.view, &s.request, &stats.bricks),
         None => Vec::new(),
     };
-    let bytes = picture.encode(s.request.format, s.request.background).into();
     FinishedFrame {
         number,
-        size: picture.size,
-        format: s.request.format,
-        bytes,
+        size,
+        format,
+        bytes: bytes.into(),
         stats_json: serde_json::to_string(&stats).unwrap_or_default(),
         trace_json: s.request.want_trace.then(|| chrome_trace(&s.spans, s.job, s.frame)),
         stats,

@@ -13,7 +13,9 @@ use slabcast_common::message::PathRequest;
 use slabcast_common::stats::FrameStats;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard};
-use tokio::sync::watch;
+use std::time::Duration;
+use tokio::sync::watch::{self, error::RecvError};
+use tokio::time::Instant;
 
 /// Most jobs that are remembered; the oldest ended ones are forgotten beyond it.
 pub const MAX_JOBS: usize = 1000;
@@ -113,17 +115,18 @@ pub(crate) struct Table {
     pub(crate) next: u64,
 }
 
-/// The table, and a bell that rings when it changes.
+/// The table, and two bells: one rings at each tile, the other when anything else changes.
 pub(crate) struct Jobs {
     table: Mutex<Table>,
     bell: watch::Sender<u64>,
+    tiles: watch::Sender<u64>,
 }
 
 impl Jobs {
     /// A table whose first job has the number after `next`.
     pub(crate) fn starting_at(next: u64) -> Self {
         let table = Table { next, ..Table::default() };
-        Jobs { table: Mutex::new(table), bell: watch::channel(0).0 }
+        Jobs { table: Mutex::new(table), bell: watch::channel(0).0, tiles: watch::channel(0).0 }
     }
 
     /// The table. Held for moments only, never across an await.
@@ -136,8 +139,14 @@ impl Jobs {
         self.bell.send_modify(|n| *n += 1);
     }
 
-    pub(crate) fn listen(&self) -> watch::Receiver<u64> {
-        self.bell.subscribe()
+    /// A tile was done: watchers look when they next have time for such news ([`NEWS`]).
+    pub(crate) fn ring_tile(&self) {
+        self.tiles.send_modify(|n| *n += 1);
+    }
+
+    /// Both bells.
+    pub(crate) fn listen(&self) -> (watch::Receiver<u64>, watch::Receiver<u64>) {
+        (self.bell.subscribe(), self.tiles.subscribe())
     }
 }
 
@@ -206,6 +215,10 @@ pub enum WatchItem {
     Frame(Arc<FinishedFrame>),
 }
 
+/// How often a watcher hears of tiles. A frame of 64 tiles may take 20 ms: a notice each woke a thread
+/// some 3000 times a second, and was 3 % of a processor.
+pub(crate) const NEWS: Duration = Duration::from_millis(40);
+
 /// What a notice tells: state, frames done, tiles, slab, workers.
 pub(crate) type Told = (JobState, u64, (u32, u32), (u32, u32), u32);
 
@@ -214,8 +227,10 @@ pub struct Watch {
     pub(crate) jobs: Arc<Jobs>,
     pub(crate) job: JobId,
     pub(crate) next: u64,
-    pub(crate) bell: watch::Receiver<u64>,
+    pub(crate) bells: (watch::Receiver<u64>, watch::Receiver<u64>),
     pub(crate) last_notice: Option<Told>,
+    /// Until when it does not listen to tiles.
+    pub(crate) quiet: Option<Instant>,
     pub(crate) taken: tokio::sync::mpsc::Sender<crate::driver::Event>,
     pub(crate) over: bool,
 }
@@ -230,7 +245,11 @@ impl Watch {
             }
             let poke = {
                 // Seen before the table is read, so that no ring is missed.
-                self.bell.borrow_and_update();
+                self.bells.0.borrow_and_update();
+                let quiet = self.quiet.is_some_and(|until| Instant::now() < until);
+                if !quiet {
+                    self.bells.1.borrow_and_update();
+                }
                 let mut table = self.jobs.lock();
                 let Some(job) = table.jobs.get_mut(&self.job) else {
                     self.over = true;
@@ -254,8 +273,13 @@ impl Watch {
                     self.over = true;
                     return Some(WatchItem::Notice(v.clone()));
                 }
-                if self.last_notice.as_ref() != Some(&now) {
+                let news = |last: &Told| {
+                    let (was, is) = ((&last.0, last.1, last.4), (&now.0, now.1, now.4));
+                    was != is || !quiet && (last.2, last.3) != (now.2, now.3)
+                };
+                if self.last_notice.as_ref().is_none_or(news) {
                     self.last_notice = Some(now);
+                    self.quiet = Some(Instant::now() + NEWS);
                     return Some(WatchItem::Notice(v.clone()));
                 }
                 // Done once and gone since: ask for it again.
@@ -265,10 +289,26 @@ impl Watch {
                 self.over = true;
                 return None;
             }
-            if self.bell.changed().await.is_err() {
+            if self.rung().await.is_err() {
                 self.over = true;
                 return None;
             }
+        }
+    }
+
+    /// Waits until there may be something new.
+    async fn rung(&mut self) -> Result<(), RecvError> {
+        let (bell, tiles) = &mut self.bells;
+        let quiet = self.quiet;
+        let tile = async {
+            if let Some(until) = quiet {
+                tokio::time::sleep_until(until).await;
+            }
+            tiles.changed().await
+        };
+        tokio::select! {
+            rung = bell.changed() => rung,
+            rung = tile => rung,
         }
     }
 }
@@ -364,8 +404,9 @@ mod tests {
             jobs: jobs.clone(),
             job: JobId(1),
             next: from,
-            bell: jobs.listen(),
+            bells: jobs.listen(),
             last_notice: None,
+            quiet: None,
             taken,
             over: false,
         };
@@ -434,6 +475,38 @@ mod tests {
         jobs.ring();
         let Some(WatchItem::Frame(f)) = waiting.await.unwrap() else { panic!("frame 0") };
         assert_eq!(f.number, 0);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn of_tiles_a_watcher_hears_now_and_then_and_of_the_last_one() {
+        let jobs = Arc::new(table(JobState::Running, &[0]));
+        let (mut watch, _events) = watch(&jobs, 1);
+        assert!(matches!(watch.next().await, Some(WatchItem::Notice(_))));
+        let drawn = jobs.clone();
+        let drawing = tokio::spawn(async move {
+            for tile in 1..=1000 {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+                drawn.lock().jobs.get_mut(&JobId(1)).unwrap().view.tiles = (tile, 1000);
+                drawn.ring_tile();
+            }
+            // A frame waits for nobody.
+            drawn.lock().jobs.get_mut(&JobId(1)).unwrap().frames.insert(1, frame(1, 1));
+            drawn.ring();
+        });
+        let began = Instant::now();
+        let (mut notices, mut last) = (0, 0);
+        while let Some(WatchItem::Notice(view)) = watch.next().await {
+            (notices, last) = (notices + 1, view.tiles.0);
+        }
+        assert!((20..=26).contains(&notices), "{notices} notices of 1000 tiles in a second");
+        assert!(last >= 950, "the last was of tile {last}");
+        assert_eq!(began.elapsed(), Duration::from_secs(1), "the frame came at once");
+        drawing.await.unwrap();
+        // A tile after which nothing happens is told of.
+        jobs.lock().jobs.get_mut(&JobId(1)).unwrap().view.tiles = (1, 64);
+        jobs.ring_tile();
+        let Some(WatchItem::Notice(view)) = watch.next().await else { panic!("a notice") };
+        assert_eq!(view.tiles, (1, 64));
     }
 
     #[tokio::test]

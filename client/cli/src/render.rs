@@ -261,7 +261,8 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         notes: stays.into_iter().collect(),
         tell: true,
     };
-    let runtime = runtime::start()?;
+    let runtime =
+        if args.volume.is_some() { runtime::start_embedded()? } else { runtime::start()? };
     let result = match (&args.volume, master) {
         (Some(file), _) => {
             let mut run = run;
@@ -305,7 +306,7 @@ pub(crate) fn again(asked: Asked, output: Output, volume: Volume, quiet: bool) -
         tell: false,
     };
     let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
-    let runtime = runtime::start()?;
+    let runtime = runtime::start_embedded()?;
     let result = runtime.block_on(embedded(run, volume, orientation, Crew::new(1, None)?));
     runtime::end(runtime);
     result

@@ -1,14 +1,24 @@
-//! The runtime of every command that has a network or a cluster: two threads that talk, while
+//! The runtime of every command that has a network or a cluster: a thread or two that talk, while
 //! render threads draw.
 
 use crate::fail::{Fail, reason};
 use std::time::Duration;
 use tokio::runtime::{Builder, Runtime};
 
-/// Starts it.
+/// Starts it, for a command with streams.
 pub(crate) fn start() -> Result<Runtime, Fail> {
+    with_threads(2)
+}
+
+/// Starts it for a cluster in this process. Messages are passed on and nothing is encoded: a second
+/// thread would be woken for each of them to look for work, and take the render threads' cores.
+pub(crate) fn start_embedded() -> Result<Runtime, Fail> {
+    with_threads(1)
+}
+
+fn with_threads(threads: usize) -> Result<Runtime, Fail> {
     Builder::new_multi_thread()
-        .worker_threads(2)
+        .worker_threads(threads)
         .thread_name("slabcast-io")
         .enable_all()
         .build()

@@ -634,7 +634,7 @@ impl Frame {
         &mut self,
         cluster: &mut Cluster,
         worker: WorkerId,
-        result: &TileResult,
+        mut result: TileResult,
         clock: &dyn Clock,
     ) -> Result<Option<(Micros, Micros)>, String> {
         let now = clock.now();
@@ -663,17 +663,22 @@ impl Frame {
             return Err(lie);
         }
 
-        self.state.put(tile, &result.pixels);
+        let pixels = std::mem::take(&mut result.pixels);
         let width = self.job.view.size[0] as usize;
         let eps = self.job.scene.quality.eps;
         if eps > 0.0 && slab.regions.is_none() {
-            for (row, y) in result.pixels.a.chunks(tile.width()).zip(tile.y0..) {
+            for (row, y) in pixels.a.chunks(tile.width()).zip(tile.y0..) {
                 for (&a, x) in row.iter().zip(tile.x0..) {
                     if is_shut(a, eps) {
                         self.shut.shut(y as usize * width + x as usize);
                     }
                 }
             }
+        }
+        if slab.regions.is_some() {
+            self.state.lay(tile, pixels);
+        } else {
+            self.state.put(tile, &pixels);
         }
         self.any_result = true;
         self.ledger.composite_us += clock.now().saturating_sub(now);

@@ -452,7 +452,7 @@ impl Scheduler {
                 let whose = self.active.iter().position(lent).unwrap_or(0);
                 match self.active.get_mut(whose) {
                     Some(frame) if known => {
-                        let outcome = frame.result(cluster, worker, &result, clock);
+                        let outcome = frame.result(cluster, worker, *result, clock);
                         match outcome {
                             Err(reason) => self.drop_worker(worker, reason, false, now),
                             Ok(rendered) => {

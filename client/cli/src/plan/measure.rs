@@ -160,7 +160,7 @@ impl Bench {
             }
             state.end_slab();
             let eps = job.scene.quality.eps;
-            let bits: Vec<bool> = state.a().iter().map(|&a| is_shut(a, eps)).collect();
+            let bits: Vec<bool> = state.a().map(|a| is_shut(a, eps)).collect();
             for (i, _) in bits.iter().enumerate().filter(|(_, s)| **s) {
                 shut.shut(i);
             }

@@ -47,7 +47,7 @@ const MAX_OPEN_JOBS: usize = 200;
 /// What a master is started with.
 pub struct MasterConfig {
     /// The volume it serves.
-    pub volume: Volume,
+    pub volume: Arc<Volume>,
     /// Which of its axes are up and front.
     pub orientation: Orientation,
     /// Bytes of finished frames that are kept.
@@ -62,9 +62,9 @@ pub struct MasterConfig {
 
 impl MasterConfig {
     /// The defaults for `volume`: 256 MiB of finished frames (64 frames of 1024x1024 RGBA8).
-    pub fn new(volume: Volume, orientation: Orientation) -> Self {
+    pub fn new(volume: impl Into<Arc<Volume>>, orientation: Orientation) -> Self {
         MasterConfig {
-            volume,
+            volume: volume.into(),
             orientation,
             frame_budget_bytes: 256 << 20,
             schedule: slabcast_schedule::Config::default(),
@@ -203,7 +203,7 @@ impl Master {
             }
         })?;
         let driver = Driver {
-            volume: Arc::new(config.volume),
+            volume: config.volume,
             served,
             budget: config.frame_budget_bytes,
             clock: RealClock(Instant::now()),

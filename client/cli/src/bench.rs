@@ -18,6 +18,7 @@ use slabcast_render::Frame;
 use slabcast_render::reference::{ErrorFigures, Reference, stratified};
 use slabcast_render::splat::Simd;
 use std::fmt::Write;
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Times the frames of a view path in this process: milliseconds, counts and error of one run.
@@ -58,7 +59,8 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
     let mut asked = args.of.look.aimed(work)?;
     let threads = args.threads.count();
     let Opened { volume, info, orientation } = args.of.open(&asked)?;
-    let volume = settle(volume, &info, &mut asked, orientation, threads, false)?;
+    let volume = Arc::new(volume);
+    settle(&volume, &info, &mut asked, orientation, threads)?;
     let stage = Stage::new(&volume, &info, &asked, orientation)?;
     let bricks = &stage.bricks;
     drop(volume);

@@ -4,14 +4,22 @@
 //! (DESIGN.md section 2). Bricks are shared, not copied.
 
 use crate::fail::Fail;
+use crate::output::Frame;
+use crate::progress::Step;
+use crate::request::Asked;
+use crate::source::{Cancel, Source, Update};
+use slabcast_common::message::PathRequest;
 use slabcast_common::path::Orientation;
 use slabcast_common::volume::Volume;
+use slabcast_master::driver::SubmitError;
+use slabcast_master::jobs::{JobState, WatchItem};
 use slabcast_master::record::Recorder;
 use slabcast_master::{Handle, Master, MasterConfig, link};
 use slabcast_render::splat::Simd;
 use slabcast_worker::{BrickCache, Config, Ended, Link};
+use std::sync::Arc;
 use std::time::Duration;
-use tokio::sync::watch;
+use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 
 /// How long workers may take to leave. They finish the tile at hand, some 50 ms at most; what
@@ -72,7 +80,7 @@ pub(crate) struct Cluster {
 impl Cluster {
     /// Starts it. Must be called inside a tokio runtime.
     pub(crate) fn start(
-        volume: Volume,
+        volume: impl Into<Arc<Volume>>,
         orientation: Orientation,
         crew: Crew,
         record: Option<Recorder>,
@@ -136,4 +144,64 @@ pub(crate) fn start_master(config: MasterConfig) -> Result<Master, Fail> {
     Master::start(config).map_err(|e| {
         Fail::failed(format!("starting the master's threads failed: {}", crate::fail::reason(&e)))
     })
+}
+
+/// Submits a path to a master of this process and follows it.
+pub(crate) async fn submit(
+    handle: &Handle,
+    asked: &Asked,
+    request: PathRequest,
+) -> Result<Source, Fail> {
+    let job = handle.submit(request).await.map_err(|e| match e {
+        SubmitError::Refused(refused) => asked.blame(&refused),
+        other => Fail::failed(format!("the master of this process takes no job: {other:?}")),
+    })?;
+    let Some(mut watch) = handle.watch(job, 0) else {
+        return Err(Fail::failed(format!("{job} was forgotten by the master of this process")));
+    };
+    let (to, updates) = mpsc::channel(1);
+    let total = asked.path.frames() as u64;
+    tokio::spawn(async move {
+        let mut taken = 0;
+        loop {
+            let update = match watch.next().await {
+                Some(WatchItem::Frame(f)) => {
+                    taken += 1;
+                    Ok(Update::Frame {
+                        frame: Frame {
+                            number: f.number,
+                            size: f.size,
+                            format: f.format,
+                            bytes: f.bytes.clone(),
+                        },
+                        stats: Some(Box::new(f.stats.clone())),
+                        stats_json: f.stats_json.clone(),
+                        trace_json: f.trace_json.clone().unwrap_or_default(),
+                    })
+                }
+                Some(WatchItem::Notice(view)) => match view.state {
+                    JobState::Failed(reason) => Err(Fail::failed(reason)),
+                    JobState::Cancelled => Err(Fail::failed("the job was cancelled")),
+                    state => Ok(Update::Step(Step {
+                        waiting: String::new(),
+                        detail: match state {
+                            JobState::Preparing => "cutting the volume into bricks".into(),
+                            JobState::WaitingForWorkers => "workers are starting".into(),
+                            _ => String::new(),
+                        },
+                        frames: view.frames_done,
+                        tiles: view.tiles,
+                        slab: view.slab,
+                    })),
+                },
+                None if taken == total => Ok(Update::Done),
+                None => Err(Fail::failed("the job ended before its last frame")),
+            };
+            let over = matches!(update, Ok(Update::Done) | Err(_));
+            if to.send(update).await.is_err() || over {
+                return;
+            }
+        }
+    });
+    Ok(Source { updates, cancel: Cancel::Embedded(handle.clone(), job) })
 }

@@ -57,6 +57,7 @@ mod rerender;
 mod runtime;
 mod show;
 mod signals;
+mod source;
 mod stage;
 mod still;
 mod style;

@@ -3,8 +3,8 @@
 use crate::fail::Fail;
 use crate::output::Frame;
 use crate::progress::Step;
-use crate::render::{self, Source, Update};
 use crate::request::Asked;
+use crate::source::{self, Source, Update};
 use slabcast_client::{Client, ClientError, JobState, PATIENCE, VolumeDescription};
 use slabcast_common::message::PathRequest;
 use slabcast_common::quality::Refused;
@@ -70,7 +70,7 @@ pub(crate) async fn submit(
             let _ = to.send(Err(e)).await;
         }
     });
-    Ok(Source { updates, cancel: render::Cancel::Remote(cancel) })
+    Ok(Source { updates, cancel: source::Cancel::Remote(cancel) })
 }
 
 /// Passes a job's updates on until its last frame.

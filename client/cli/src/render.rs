@@ -2,31 +2,31 @@
 //!
 //! Both ways are one loop over [`Update`]s; only where these come from differs ([`Source`]).
 
-use crate::embedded::{Cluster, Crew};
+use crate::embedded::{self, Cluster, Crew};
 use crate::fail::{Fail, say};
-use crate::front::choose::settle;
+use crate::front::choose::{choose, lab};
+use crate::front::cluster::{There, Through, Wire};
+use crate::front::place::{Clock, Here};
+use crate::local::Cut;
 use crate::output::provenance::Recipe;
 use crate::output::{Format, Frame, Lines, Output, OutputArgs, Patience, Writer};
 use crate::progress::{self, Progress, Step};
 use crate::record::{self, Recording};
 use crate::request::{self, Asked, LookArgs, WorkArgs};
 use crate::show::{self, Show};
+use crate::source::{Cancel, Source, Update};
 use crate::stage::Stage;
 use crate::{remote, runtime, signals, volume};
-use slabcast_common::ids::JobId;
+use slabcast_client::{Client, VolumeDescription};
 use slabcast_common::message::PathRequest;
 use slabcast_common::path::Orientation;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::volume::{Volume, VolumeInfo};
-use slabcast_master::driver::SubmitError;
-use slabcast_master::jobs::{JobState, WatchItem};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use tokio::runtime::Runtime;
 use tokio::sync::mpsc;
-
-/// How long cancelling may take before the command ends without the master's word.
-const CANCEL: Duration = Duration::from_secs(2);
 
 /// How long what is being written may take once the run has failed or was stopped: ten times what
 /// the largest picture takes on a slow disk.
@@ -106,53 +106,6 @@ pub(crate) struct RenderArgs {
     quiet: bool,
 }
 
-/// News of the job.
-pub(crate) enum Update {
-    /// Where it stands.
-    Step(Step),
-    /// A frame, its statistics, those as JSON, and its trace.
-    Frame {
-        frame: Frame,
-        /// Where a master made the frame.
-        stats: Option<Box<FrameStats>>,
-        stats_json: String,
-        trace_json: String,
-    },
-    /// It ended with all frames delivered.
-    Done,
-}
-
-/// Where updates come from, and how to cancel. One message of room: frames wait at the master,
-/// not here.
-pub(crate) struct Source {
-    pub(crate) updates: mpsc::Receiver<Result<Update, Fail>>,
-    pub(crate) cancel: Cancel,
-}
-
-/// How a job is cancelled.
-pub(crate) enum Cancel {
-    /// Nobody waits for it.
-    None,
-    Embedded(slabcast_master::Handle, JobId),
-    Remote(remote::Cancel),
-}
-
-impl Cancel {
-    /// Cancels, in bounded time, whether the master hears it or not.
-    async fn now(self) {
-        let cancelled = async {
-            match self {
-                Cancel::None => {}
-                Cancel::Embedded(handle, job) => {
-                    handle.cancel(job).await;
-                }
-                Cancel::Remote(cancel) => cancel.now().await,
-            }
-        };
-        let _ = tokio::time::timeout(CANCEL, cancelled).await;
-    }
-}
-
 /// What all of a run shares.
 struct Run {
     asked: Asked,
@@ -214,20 +167,11 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     }
     let crew = Crew::new(args.workers.unwrap_or(1), args.threads)?;
     let asked = args.look.aimed(args.work.work()?)?;
-    if !asked.aim.is_empty() {
-        let flags = asked.aim.flags();
-        if master.is_some() {
-            return Err(Fail::usage(format!(
-                "{flags}: is chosen by measuring the volume, which the master has; run `slabcast \
-                 report` where the file is, and give the flags that it names"
-            )));
-        }
-        if args.show.is_some() {
-            return Err(Fail::usage(format!(
-                "{flags}, --show: shows how pictures of a given quality come about; leave one of \
-                 the two out"
-            )));
-        }
+    if !asked.aim.is_empty() && args.show.is_some() {
+        return Err(Fail::usage(format!(
+            "{}, --show: shows how pictures of a given quality come about; leave one of the two out",
+            asked.aim.flags()
+        )));
     }
     let frames = asked.frames();
     let stem = args.show.map_or("frame", Show::stem);
@@ -267,13 +211,10 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         (Some(file), _) => {
             let mut run = run;
             run.progress.stage(&format!("reading {}", file.display()));
-            let mut volume = args.input.open(file)?;
+            let volume = Arc::new(args.input.open(file)?);
             let orientation = args.look.view.axes.of(&volume)?;
             if !run.asked.aim.is_empty() {
-                let info = volume.info(volume.digest());
-                run.asked.fit(&info, orientation, volume.anatomical)?;
-                let threads = (crew.workers * crew.threads) as usize;
-                volume = settle(volume, &info, &mut run.asked, orientation, threads, args.quiet)?;
+                aim_here(&mut run, &volume, orientation, crew, &runtime, args.quiet)?;
             }
             match args.show {
                 None | Some(Show::Owner) => {
@@ -282,11 +223,69 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
                 Some(show) => runtime.block_on(drawn(run, volume, orientation, show, crew)),
             }
         }
-        (None, Some(master)) => runtime.block_on(cluster(run, master)),
+        (None, Some(master)) => {
+            let mut run = run;
+            run.progress.stage(&format!("dialling {master}"));
+            let client = runtime.block_on(remote::connect(&master))?;
+            let served = runtime.block_on(remote::describe(&client))?;
+            if !run.asked.aim.is_empty() {
+                aim_there(&mut run, &client, &served, &master, &runtime, args.quiet)?;
+            }
+            runtime.block_on(cluster(run, client, served, &master))
+        }
         (None, None) => unreachable!("settled above"),
     };
     runtime::end(runtime);
     result
+}
+
+/// Chooses the quality by what it should come to: errors by the reference, times by a cluster like the
+/// one that is to draw.
+fn aim_here(
+    run: &mut Run,
+    volume: &Arc<Volume>,
+    orientation: Orientation,
+    crew: Crew,
+    runtime: &Runtime,
+    quiet: bool,
+) -> Result<(), Fail> {
+    let info = volume.info(volume.digest());
+    run.asked.fit(&info, orientation, volume.anatomical)?;
+    let (aim, threads) = (run.asked.aim, (crew.workers * crew.threads) as usize);
+    let lab = lab(volume, &info, &run.asked, orientation, threads)?;
+    let chosen = if aim.budget.is_some() {
+        let cluster =
+            runtime.block_on(async { Cluster::start(volume.clone(), orientation, crew, None) })?;
+        let (handle, asked) = (cluster.handle(), run.asked.clone());
+        let wire = Wire::Embedded(&handle);
+        let through = Through { runtime, wire, info, asked, crew: crew.to_string() };
+        let chosen = choose(&mut Here::new(lab, Clock::Cluster(Box::new(through))), &aim, quiet);
+        runtime.block_on(cluster.end());
+        chosen
+    } else {
+        let clock = Clock::Plain(Cut { tile: 64, ..Cut::on(threads) });
+        choose(&mut Here::new(lab, clock), &aim, quiet)
+    };
+    chosen?.settle(&mut run.asked);
+    Ok(())
+}
+
+/// The same where the volume is at a master: by its pictures.
+fn aim_there(
+    run: &mut Run,
+    client: &Client,
+    served: &VolumeDescription,
+    master: &str,
+    runtime: &Runtime,
+    quiet: bool,
+) -> Result<(), Fail> {
+    let info = served.info.clone();
+    run.asked.fit(&info, served.orientation, served.anatomical)?;
+    let (aim, asked) = (run.asked.aim, run.asked.clone());
+    let crew = format!("the cluster of {master}");
+    let through = Through { runtime, wire: Wire::Remote(client), info, asked, crew };
+    choose(&mut There::new(through), &aim, quiet)?.settle(&mut run.asked);
+    Ok(())
 }
 
 /// Draws what a picture says of itself, by this process alone. Says nothing at the end.
@@ -307,14 +306,15 @@ pub(crate) fn again(asked: Asked, output: Output, volume: Volume, quiet: bool) -
     };
     let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
     let runtime = runtime::start_embedded()?;
-    let result = runtime.block_on(embedded(run, volume, orientation, Crew::new(1, None)?));
+    let result =
+        runtime.block_on(embedded(run, Arc::new(volume), orientation, Crew::new(1, None)?));
     runtime::end(runtime);
     result
 }
 
 async fn embedded(
     mut run: Run,
-    volume: Volume,
+    volume: Arc<Volume>,
     orientation: Orientation,
     crew: Crew,
 ) -> Result<(), Fail> {
@@ -332,58 +332,7 @@ async fn embedded(
     let info = handle.volume().info.clone();
     let recipe = run.ready(&info, orientation, anatomical)?;
     let request = run.request(&info);
-    let job = handle.submit(request).await.map_err(|e| match e {
-        SubmitError::Refused(refused) => run.asked.blame(&refused),
-        other => Fail::failed(format!("the master of this process takes no job: {other:?}")),
-    })?;
-    let Some(mut watch) = handle.watch(job, 0) else {
-        return Err(Fail::failed(format!("{job} was forgotten by the master of this process")));
-    };
-    let (to, updates) = mpsc::channel(1);
-    let total = run.asked.path.frames() as u64;
-    tokio::spawn(async move {
-        let mut taken = 0;
-        loop {
-            let update = match watch.next().await {
-                Some(WatchItem::Frame(f)) => {
-                    taken += 1;
-                    Ok(Update::Frame {
-                        frame: Frame {
-                            number: f.number,
-                            size: f.size,
-                            format: f.format,
-                            bytes: f.bytes.clone(),
-                        },
-                        stats: Some(Box::new(f.stats.clone())),
-                        stats_json: f.stats_json.clone(),
-                        trace_json: f.trace_json.clone().unwrap_or_default(),
-                    })
-                }
-                Some(WatchItem::Notice(view)) => match view.state {
-                    JobState::Failed(reason) => Err(Fail::failed(reason)),
-                    JobState::Cancelled => Err(Fail::failed("the job was cancelled")),
-                    state => Ok(Update::Step(Step {
-                        waiting: String::new(),
-                        detail: match state {
-                            JobState::Preparing => "cutting the volume into bricks".into(),
-                            JobState::WaitingForWorkers => "workers are starting".into(),
-                            _ => String::new(),
-                        },
-                        frames: view.frames_done,
-                        tiles: view.tiles,
-                        slab: view.slab,
-                    })),
-                },
-                None if taken == total => Ok(Update::Done),
-                None => Err(Fail::failed("the job ended before its last frame")),
-            };
-            let over = matches!(update, Ok(Update::Done) | Err(_));
-            if to.send(update).await.is_err() || over {
-                return;
-            }
-        }
-    });
-    let source = Source { updates, cancel: Cancel::Embedded(handle, job) };
+    let source = embedded::submit(&handle, &run.asked, request).await?;
     let what = format!("{name} by {crew}");
     let result = tokio::select! {
         result = run.go(source, &what, &info, &recipe) => result,
@@ -425,7 +374,7 @@ fn showable(show: Show, args: &RenderArgs, format: Format, asked: &Asked) -> Res
 /// Pictures about pictures, drawn by this process without any master.
 async fn drawn(
     mut run: Run,
-    volume: Volume,
+    volume: Arc<Volume>,
     orientation: Orientation,
     show: Show,
     crew: Crew,
@@ -455,10 +404,12 @@ async fn drawn(
     run.go(Source { updates, cancel: Cancel::None }, &what, &info, &recipe).await
 }
 
-async fn cluster(mut run: Run, master: String) -> Result<(), Fail> {
-    run.progress.stage(&format!("dialling {master}"));
-    let client = remote::connect(&master).await?;
-    let served = remote::describe(&client).await?;
+async fn cluster(
+    mut run: Run,
+    client: Client,
+    served: VolumeDescription,
+    master: &str,
+) -> Result<(), Fail> {
     let recipe = run.ready(&served.info, served.orientation, served.anatomical)?;
     let request = run.request(&served.info);
     let source = tokio::select! {

@@ -38,7 +38,8 @@ impl Still {
         let mut asked = of.look.aimed(Work::default())?;
         check(asked.path.size)?;
         let Opened { volume, info, orientation } = of.open(&asked)?;
-        let volume = settle(volume, &info, &mut asked, orientation, threads, false)?;
+        let volume = Arc::new(volume);
+        settle(&volume, &info, &mut asked, orientation, threads)?;
         let stage = Stage::new(&volume, &info, &asked, orientation)?;
         let (spec, small) = (stage.spec(0), stage.view(0, &asked.quality)?);
         let view = stage.view_of(0, &asked.quality, asked.size())?;

@@ -3,7 +3,7 @@
 
 mod program;
 
-use program::slabcast;
+use program::{Process, master, slabcast};
 use serde_json::Value;
 use std::path::Path;
 use std::process::Output;
@@ -143,4 +143,40 @@ fn a_picture_that_was_magnified_is_made_again_byte_by_byte() {
     let out = run(dir.path(), &[&["rerender", "half.png", SCENE[0], "-o", "again.png"]]);
     let said = String::from_utf8_lossy(&out.stdout).into_owned();
     assert!(out.status.success() && said.contains("the same"), "{said}");
+}
+
+/// The volume is at the master: errors are found by comparing its pictures.
+#[test]
+fn a_cluster_keeps_an_error_that_is_asked_for() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let (_master, address) = master(dir, SCENE[0], &[]);
+    let worker = ["worker", "--master", &address, "--threads", "1", "--log-level", "error"];
+    let _worker = Process(slabcast(dir, &worker).spawn().unwrap());
+    let render = |rest: &[&str]| {
+        let how =
+            ["render", "--master", &address, "--frames", "2", "--force", "--stats", "s.jsonl"];
+        let out = run(dir, &[&how, &SCENE[1..], rest]);
+        let said = String::from_utf8_lossy(&out.stderr).into_owned();
+        assert!(out.status.success(), "{said}");
+        let stats = std::fs::read_to_string(dir.join("s.jsonl")).unwrap();
+        let first: Value = serde_json::from_str(stats.lines().next().unwrap()).unwrap();
+        (first["quality"].clone(), said)
+    };
+    for asked in [2.0, 0.3] {
+        let (quality, said) = render(&["--error", &format!("{asked}/255")]);
+        assert!(said.contains("RMSE"), "{said}");
+        // Judged where the volume is.
+        let flags = [("--thickness", "thickness"), ("--eps", "eps")]
+            .map(|(flag, name)| [flag.to_string(), quality[name].to_string()]);
+        let sums = quality["sums"].as_str().unwrap();
+        let words = [&flags.as_flattened()[..], &["--sums".into(), sums.into()]].concat();
+        let (rmse, ..) = bench(dir, &words.iter().map(String::as_str).collect::<Vec<_>>());
+        assert!(rmse <= asked, "{rmse} of {asked}: {said}");
+    }
+    let (_, said) = render(&["--error", "2/255"]);
+    assert!(!said.contains("measured first"), "errors are kept, times are not: {said}");
+    let (quality, said) = render(&["--budget", "100s"]);
+    assert!(said.contains("ms a frame"), "{said}");
+    assert!(quality["thickness"].as_f64().unwrap() <= 0.25, "all the time in the world: {quality}");
 }

@@ -2,35 +2,15 @@
 
 mod program;
 
-use program::{good, run, slabcast, text};
+use program::{Process, good, run, slabcast, text};
 use serde_json::Value;
-use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::{Child, Stdio};
+use std::process::Stdio;
 
 const SCENE: [&str; 6] = ["formula:spheres:32", "--size", "128x128", "--frames", "4", "--quiet"];
 
-/// A process that does not outlive its test.
-struct Process(Child);
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
 fn master(dir: &Path, more: &[&str]) -> (Process, String) {
-    let args = ["master", "--listen", "127.0.0.1:0", "--volume", "formula:spheres:32"];
-    let mut child = slabcast(dir, &[&args[..], more].concat())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
-    let mut line = String::new();
-    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-    let address = line.trim().rsplit(' ').next().unwrap().to_string();
-    (Process(child), address)
+    program::master(dir, "formula:spheres:32", more)
 }
 
 #[test]

@@ -7,32 +7,29 @@
 //! The word is kept with room to spare: views between those that are judged, and pixels between
 //! those that are looked at, may be worse. How often it holds is in docs/accuracy.md.
 
+use super::cluster::all_around;
 use super::kept::Kept;
-use super::lab::{Effort, Lab, Off, Truth};
+use super::lab::{Lab, Off};
+use super::place::{Clock, Here, Place, stopped};
 use super::setting::{Setting, fraction};
 use crate::fail::Fail;
 use crate::local::Cut;
+use crate::parse;
 use crate::progress::{self, Progress};
 use crate::request::Asked;
-use crate::{parse, signals};
 use slabcast_common::path::Orientation;
 use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
 use slabcast_common::volume::{Volume, VolumeInfo};
+use std::sync::Arc;
 use std::time::Instant;
 
-/// Views that are judged. By three, sheets of 4 vox were taken for bonsai in `peer-semi`, whose error
-/// is twice as large from other sides.
-const VIEWS: usize = 5;
-/// Pixels of each. The RMSE of half as many differed by a tenth between samples.
-const PIXELS: usize = 3072;
 /// What is measured is so much below what is promised, at least.
 const ROOM_RMSE: f64 = 1.2;
 /// The same of the error that 99.9 % of the pixels keep: of 3072 pixels a third is not blank, and
 /// the second worst of those is all that tells.
 const ROOM_MOST: f64 = 1.5;
-/// The same of time. A frame of the cluster in this process took 1.1 to 1.45 times as long as plain
-/// drawing, which is what is measured (docs/scaling.md); less when that is mended.
-const ROOM_TIME: f64 = 1.4;
+/// The same of time: a few frames stand for all.
+const ROOM_TIME: f64 = 1.06;
 /// Rungs beyond the first that keeps an error, of which one may be faster.
 const BEYOND: usize = 3;
 
@@ -144,52 +141,45 @@ pub(super) fn ladder(base: &Setting, size: [u32; 2]) -> Vec<Setting> {
 
 /// Measures what is not known yet.
 struct Climb<'a> {
-    lab: &'a mut Lab,
+    place: &'a mut dyn Place,
     kept: &'a mut Kept,
-    truths: Vec<Truth>,
+    /// Times of a place that does not keep them.
+    times: Vec<(Setting, f64)>,
     progress: Progress,
-    cut: Cut,
     measured: usize,
 }
 
 impl Climb<'_> {
-    fn stopped(&self) -> Result<(), Fail> {
-        if signals::told() { Err(Fail::failed("stopped while choosing")) } else { Ok(()) }
-    }
-
     fn off(&mut self, setting: &Setting) -> Result<Off, Fail> {
         if let Some(off) = self.kept.off(setting) {
             return Ok(off);
         }
-        self.stopped()?;
-        if self.truths.is_empty() {
-            let views = self.lab.views();
-            let n = VIEWS.min(views);
-            self.progress.frames((n * PIXELS) as u64, "");
-            for i in 0..n {
-                let view = (2 * i + 1) * views / (2 * n);
-                let told = (&mut self.progress, i * PIXELS);
-                self.truths.push(self.lab.truth(view, PIXELS, 1, told)?);
-                self.stopped()?;
-            }
-            self.progress.stage("trying settings");
-        }
-        let off = self.lab.judge(setting, &self.truths, None)?.off;
+        stopped()?;
+        let off = self.place.off(setting, &mut self.progress)?;
         self.measured += 1;
         self.kept.put_off(setting, off);
         Ok(off)
     }
 
     fn ms(&mut self, setting: &Setting) -> Result<f64, Fail> {
-        if let Some(ms) = self.kept.ms(setting) {
+        let keeps = self.place.keeps_times();
+        let known = if keeps {
+            self.kept.ms(setting)
+        } else {
+            self.times.iter().find(|(s, _)| s == setting).map(|(_, ms)| *ms)
+        };
+        if let Some(ms) = known {
             return Ok(ms);
         }
-        self.stopped()?;
-        let effort = Effort { cut: self.cut, seconds: 0.25 };
-        let timing = self.lab.time(setting, effort)?;
+        stopped()?;
+        let ms = self.place.ms(setting)?;
         self.measured += 1;
-        self.kept.put_ms(setting, timing.median);
-        Ok(timing.median)
+        if keeps {
+            self.kept.put_ms(setting, ms);
+        } else {
+            self.times.push((*setting, ms));
+        }
+        Ok(ms)
     }
 
     fn chosen(&mut self, setting: Setting) -> Result<Chosen, Fail> {
@@ -235,7 +225,7 @@ impl Climb<'_> {
                  more, a larger error or a smaller --size",
                 Aim { budget: None, ..*aim }.flags(),
                 best.ms,
-                best.setting.name(&self.lab.base),
+                best.setting.name(&self.place.base()),
                 (best.ms * ROOM_TIME).ceil()
             )));
         }
@@ -271,9 +261,9 @@ impl Climb<'_> {
         }
         best.ok_or_else(|| {
             Fail::usage(format!(
-                "--budget: the fastest setting of this scene takes {fastest:.1} ms on {} threads; \
-                 give {:.0}ms or more, a smaller --size or more --threads",
-                self.cut.threads,
+                "--budget: the fastest setting of this scene takes {fastest:.1} ms on {}; give {:.0}ms \
+                 or more, a smaller --size or more threads",
+                self.place.crew(),
                 (fastest * ROOM_TIME).ceil()
             ))
         })
@@ -284,10 +274,11 @@ impl Climb<'_> {
 ///
 /// # Errors
 /// Nothing keeps it: names what would.
-pub(crate) fn choose(lab: &mut Lab, aim: &Aim, cut: Cut, quiet: bool) -> Result<Chosen, Fail> {
+pub(crate) fn choose(place: &mut dyn Place, aim: &Aim, quiet: bool) -> Result<Chosen, Fail> {
     let began = Instant::now();
-    let mut kept = Kept::of(lab, cut);
-    let rungs = ladder(&lab.base, lab.size());
+    let mut kept = Kept::of(place.identity());
+    let (base, size) = (place.base(), place.size());
+    let rungs = ladder(&base, size);
     let known = kept.len();
     let mut progress = Progress::new(quiet).of("pixel");
     progress.stage("choosing a setting");
@@ -297,10 +288,11 @@ pub(crate) fn choose(lab: &mut Lab, aim: &Aim, cut: Cut, quiet: bool) -> Result<
             aim.flags()
         ));
     }
-    let mut climb = Climb { lab, kept: &mut kept, truths: Vec::new(), progress, cut, measured: 0 };
+    let times = Vec::new();
+    let mut climb = Climb { place, kept: &mut kept, times, progress, measured: 0 };
     let by_error = aim.error.is_some() || aim.error_max.is_some();
     let chosen = if by_error { climb.by_error(aim, &rungs) } else { climb.by_time(aim, &rungs) };
-    let (measured, base) = (climb.measured, climb.lab.base);
+    let measured = climb.measured;
     climb.progress.end();
     // What was measured serves also where nothing was found.
     if measured > 0 {
@@ -314,7 +306,7 @@ pub(crate) fn choose(lab: &mut Lab, aim: &Aim, cut: Cut, quiet: bool) -> Result<
             format!("measured in {}", progress::time(began.elapsed()))
         };
         let q = &chosen.setting.quality;
-        let size = match chosen.setting.drawn_size(lab.size()) {
+        let size = match chosen.setting.drawn_size(size) {
             Some([w, h]) if chosen.setting.shrink > 1 => format!(", drawn at {w}x{h}"),
             _ => String::new(),
         };
@@ -334,40 +326,47 @@ pub(crate) fn choose(lab: &mut Lab, aim: &Aim, cut: Cut, quiet: bool) -> Result<
     Ok(chosen)
 }
 
-/// What stands for a turn: views far apart all around, wherever the turn itself goes, so that what is
-/// measured serves any turn of the scene. Other paths stand for themselves.
-fn all_around(asked: &Asked) -> Asked {
-    let mut asked = asked.clone();
-    if let Some(turn) = &mut asked.path.turntable {
-        (turn.start, turn.step, turn.frames) = (20.0, 71.0, VIEWS as u32);
-        asked.path.range = None;
+impl Chosen {
+    /// Puts it into what was asked for.
+    pub(crate) fn settle(&self, asked: &mut Asked) {
+        asked.aim = Aim::default();
+        asked.quality = self.setting.quality;
+        if let Some(size) = self.setting.drawn_size(asked.path.size) {
+            asked.path.size = size;
+            asked.magnify = self.setting.shrink;
+        }
     }
-    asked
 }
 
-/// Chooses the quality of what was asked for if it names none but what it should come to. `volume`
-/// fits it and is given back.
+/// A scene that is asked for with an aim, to be tried out by this process.
+pub(crate) fn lab(
+    volume: &Arc<Volume>,
+    info: &VolumeInfo,
+    asked: &Asked,
+    orientation: Orientation,
+    threads: usize,
+) -> Result<Lab, Fail> {
+    let mut around = asked.clone();
+    around.path = all_around(&asked.path);
+    Lab::new(volume.clone(), info.clone(), &around, orientation, threads)
+}
+
+/// Chooses the quality of what was asked for if it names none but what it should come to, by plain
+/// drawing. `volume` fits it.
 pub(crate) fn settle(
-    volume: Volume,
+    volume: &Arc<Volume>,
     info: &VolumeInfo,
     asked: &mut Asked,
     orientation: Orientation,
     threads: usize,
-    quiet: bool,
-) -> Result<Volume, Fail> {
-    let aim = std::mem::take(&mut asked.aim);
-    if aim.is_empty() {
-        return Ok(volume);
+) -> Result<(), Fail> {
+    if asked.aim.is_empty() {
+        return Ok(());
     }
-    let mut lab = Lab::new(volume, info.clone(), &all_around(asked), orientation, threads)?;
-    let Chosen { setting, .. } =
-        choose(&mut lab, &aim, Cut { tile: 64, ..Cut::on(threads) }, quiet)?;
-    asked.quality = setting.quality;
-    if let Some(size) = setting.drawn_size(asked.path.size) {
-        asked.path.size = size;
-        asked.magnify = setting.shrink;
-    }
-    Ok(lab.into_volume())
+    let lab = lab(volume, info, asked, orientation, threads)?;
+    let clock = Clock::Plain(Cut { tile: 64, ..Cut::on(threads) });
+    choose(&mut Here::new(lab, clock), &asked.aim.clone(), false)?.settle(asked);
+    Ok(())
 }
 
 #[cfg(test)]

@@ -3,9 +3,8 @@
 //! A file's name is a hash of all that the figures hang on, so nothing in it is ever out of date; a
 //! file that can't be read or written costs a measurement and nothing else.
 
-use super::lab::{Lab, Off};
+use super::lab::Off;
 use super::setting::Setting;
-use crate::local::Cut;
 use crate::progress;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -40,9 +39,9 @@ pub(crate) struct Kept {
 }
 
 impl Kept {
-    /// What is known of a lab's scene on this machine.
-    pub(crate) fn of(lab: &Lab, cut: Cut) -> Kept {
-        Kept::at(folder(), lab.identity() + &format!(" {} {cut:?}", crate::machine::cpu()))
+    /// What is known of what has this identity.
+    pub(crate) fn of(identity: String) -> Kept {
+        Kept::at(folder(), identity)
     }
 
     fn at(folder: Option<PathBuf>, of: String) -> Kept {

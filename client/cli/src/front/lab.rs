@@ -73,7 +73,8 @@ pub(crate) struct Off {
 }
 
 impl Off {
-    fn with(self, f: &ErrorFigures) -> Off {
+    /// The worse of each figure.
+    pub(super) fn with(self, f: &ErrorFigures) -> Off {
         Off {
             rmse: self.rmse.max(f.rmse),
             max: self.max.max(f.max),
@@ -112,7 +113,7 @@ type Ground = (bool, bool);
 
 /// One volume and path, to be drawn in many ways.
 pub(crate) struct Lab {
-    volume: Volume,
+    volume: Arc<Volume>,
     info: VolumeInfo,
     asked: Asked,
     orientation: Orientation,
@@ -124,22 +125,18 @@ pub(crate) struct Lab {
 impl Lab {
     /// Cuts the bricks of what was asked for; `volume` fits it.
     pub(crate) fn new(
-        volume: Volume,
+        volume: impl Into<Arc<Volume>>,
         info: VolumeInfo,
         asked: &Asked,
         orientation: Orientation,
         threads: usize,
     ) -> Result<Lab, Fail> {
+        let volume = volume.into();
         let stage = Stage::new(&volume, &info, asked, orientation)?;
         let base = Setting::asked(asked.quality);
         let ground = ground(&base);
         let asked = asked.clone();
         Ok(Lab { volume, info, asked, orientation, base, threads, grounds: vec![(ground, stage)] })
-    }
-
-    /// The volume, when all is measured.
-    pub(crate) fn into_volume(self) -> Volume {
-        self.volume
     }
 
     /// All that the figures of a setting hang on but the machine. Where on its path a view of a turn

@@ -68,7 +68,7 @@ impl Frame {
     }
 
     /// The picture of a frame of floats.
-    fn picture(&self) -> Picture {
+    pub(crate) fn picture(&self) -> Picture {
         let float = |p: &[u8], c: usize| f32::from_le_bytes(std::array::from_fn(|i| p[c * 4 + i]));
         let pixels = self.bytes.chunks_exact(16).map(|p| std::array::from_fn(|c| float(p, c)));
         Picture { size: self.size, pixels: pixels.collect() }

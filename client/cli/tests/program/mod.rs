@@ -1,6 +1,7 @@
 //! The real program, run by tests in folders of their own.
 #![allow(dead_code, reason = "each test program uses a part of it")]
 
+use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -58,4 +59,28 @@ pub(crate) fn end(child: &mut Child, within: Duration) -> i32 {
 pub(crate) fn signal(child: &Child, name: &str) {
     let status = Command::new("kill").args([name, &child.id().to_string()]).status().unwrap();
     assert!(status.success());
+}
+
+/// A process that does not outlive its test.
+pub(crate) struct Process(pub(crate) Child);
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A master of a volume at a free port, and its address.
+pub(crate) fn master(dir: &Path, volume: &str, more: &[&str]) -> (Process, String) {
+    let args = ["master", "--listen", "127.0.0.1:0", "--volume", volume];
+    let mut child = slabcast(dir, &[&args[..], more].concat())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+    let address = line.trim().rsplit(' ').next().unwrap().to_string();
+    (Process(child), address)
 }

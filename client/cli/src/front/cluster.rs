@@ -1,0 +1,295 @@
+//! A cluster that tries settings: how long a frame takes there, and, where the volume is not here, how
+//! far its pictures are from its own finest.
+//!
+//! What is timed is what a person waits for: frames of the path, as they arrive, one after the other.
+
+use super::lab::Off;
+use super::place::{Place, VIEWS};
+use super::setting::Setting;
+use crate::fail::Fail;
+use crate::front::magnify::magnified;
+use crate::output::Frame;
+use crate::progress::{self, Progress};
+use crate::request::Asked;
+use crate::source::{Source, Update};
+use crate::{embedded, remote, signals};
+use slabcast_client::Client;
+use slabcast_common::image::{Picture, PixelFormat};
+use slabcast_common::path::ViewPath;
+use slabcast_common::quality::{Quality, Sums};
+use slabcast_common::volume::VolumeInfo;
+use slabcast_master::Handle;
+use slabcast_render::reference::ErrorFigures;
+use std::time::Instant;
+use tokio::runtime::Runtime;
+
+/// Frames that are timed of a setting, after the first.
+const FRAMES: u32 = 4;
+/// The same of one whose time is near the budget.
+const MORE: u32 = 12;
+/// What counts as near: within this factor.
+const NEAR: f64 = 1.6;
+
+/// The finest setting, whose pictures are the truth where there is no reference. It was at most 0.05 of
+/// 1/255 from the limit in all scenes of docs/accuracy.md.
+const FINEST: Finest = Finest { thickness: 0.125, eps: 1.0 / 65536.0, off: 0.05 };
+
+struct Finest {
+    thickness: f64,
+    eps: f64,
+    /// RMSE of it in 1/255, which is added to what is found.
+    off: f64,
+}
+
+/// Whom frames are asked of.
+pub(crate) enum Wire<'a> {
+    /// A master of this process.
+    Embedded(&'a Handle),
+    /// One behind a network.
+    Remote(&'a Client),
+}
+
+/// A cluster, and the job that it is to be tried with.
+pub(crate) struct Through<'a> {
+    pub(crate) runtime: &'a Runtime,
+    pub(crate) wire: Wire<'a>,
+    pub(crate) info: VolumeInfo,
+    /// What was asked for; it fits the volume.
+    pub(crate) asked: Asked,
+    /// What the cluster is, for messages.
+    pub(crate) crew: String,
+}
+
+impl Through<'_> {
+    pub(crate) fn crew(&self) -> &str {
+        &self.crew
+    }
+
+    /// Milliseconds from one frame of the path to the next. Views are far apart, so that a few stand for
+    /// all; the first is left out, for which bricks are cut and sent.
+    pub(crate) fn ms(&self, setting: &Setting) -> Result<f64, Fail> {
+        let few = self.each(setting, FRAMES)?;
+        let budget = self.asked.aim.budget.unwrap_or(f64::INFINITY);
+        let near = few < NEAR * budget && few * NEAR > budget;
+        if near { self.each(setting, MORE) } else { Ok(few) }
+    }
+
+    fn each(&self, setting: &Setting, frames: u32) -> Result<f64, Fail> {
+        let path = spread(&self.asked.path, frames + 1);
+        // Floats are what small pictures are sent as.
+        let format = if setting.shrink > 1 { PixelFormat::Rgba32F } else { PixelFormat::Rgb8 };
+        let came: Vec<f64> = self.frames(setting, path, format)?.iter().map(|f| f.1).collect();
+        let n = came.len() - 1;
+        Ok((came[n] - came[0]) * 1e3 / n.max(1) as f64)
+    }
+
+    /// The frames of a path at a setting, and when each came, in seconds.
+    fn frames(
+        &self,
+        setting: &Setting,
+        path: ViewPath,
+        format: PixelFormat,
+    ) -> Result<Vec<(Frame, f64)>, Fail> {
+        let mut asked = self.asked.clone();
+        asked.quality = setting.quality;
+        asked.path = path;
+        asked.path.size = setting.drawn_size(asked.path.size).unwrap_or(asked.path.size);
+        let request = asked.request(&self.info, format, false);
+        self.runtime.block_on(async {
+            let mut source = match &self.wire {
+                Wire::Embedded(handle) => embedded::submit(handle, &asked, request).await?,
+                Wire::Remote(client) => remote::submit((*client).clone(), &asked, request).await?,
+            };
+            let taken = take(&mut source).await;
+            if taken.is_err() {
+                source.cancel.now().await;
+            }
+            taken
+        })
+    }
+}
+
+async fn take(source: &mut Source) -> Result<Vec<(Frame, f64)>, Fail> {
+    let (began, mut frames, mut told) = (Instant::now(), Vec::new(), false);
+    loop {
+        let update = tokio::select! {
+            code = signals::stopped() => return Err(Fail::silent(code)),
+            update = source.updates.recv() => update,
+        };
+        match update {
+            None => return Err(Fail::failed("the job ended before its last frame")),
+            Some(Err(e)) => return Err(e),
+            Some(Ok(Update::Done)) => return Ok(frames),
+            Some(Ok(Update::Frame { frame, .. })) => {
+                frames.push((frame, began.elapsed().as_secs_f64()));
+            }
+            Some(Ok(Update::Step(step))) => {
+                if !step.waiting.is_empty() && !told {
+                    progress::note(&step.waiting);
+                    told = true;
+                }
+            }
+        }
+    }
+}
+
+/// So many views that stand for a path: a turn's, far apart; of others the first ones.
+fn spread(path: &ViewPath, views: u32) -> ViewPath {
+    let mut path = path.clone();
+    let frames = path.frames().max(1) as u32;
+    let first = path.first_frame();
+    match &mut path.turntable {
+        Some(turn) => {
+            turn.start += turn.step * first as f64;
+            // A single picture is timed beside others like it.
+            let over = turn.step * f64::from(frames - 1);
+            turn.step = if over == 0.0 { 1.0 } else { over / f64::from(views - 1) };
+            turn.frames = views;
+            path.range = None;
+        }
+        None => {
+            let last = first as u32 + views.min(frames) - 1;
+            path.range = Some([first as u32, last]);
+        }
+    }
+    path
+}
+
+/// A cluster whose volume is not here.
+pub(crate) struct There<'a> {
+    through: Through<'a>,
+    base: Setting,
+    /// Pictures of the finest setting.
+    truths: Vec<(ViewPath, Vec<[f64; 4]>)>,
+}
+
+impl<'a> There<'a> {
+    pub(crate) fn new(through: Through<'a>) -> There<'a> {
+        let base = Setting::asked(through.asked.quality);
+        There { through, base, truths: Vec::new() }
+    }
+
+    fn picture(&self, setting: &Setting, path: &ViewPath) -> Result<Picture, Fail> {
+        let frames = self.through.frames(setting, path.clone(), PixelFormat::Rgba32F)?;
+        let [(frame, _)] = &frames[..] else {
+            return Err(Fail::failed(format!("one frame was asked for, {} came", frames.len())));
+        };
+        Ok(magnified(frame.picture(), setting.shrink, embedded::cores() as usize))
+    }
+
+    fn finest(&self) -> Setting {
+        let base = self.base.quality;
+        Setting {
+            quality: Quality {
+                thickness: FINEST.thickness.min(base.thickness),
+                eps: FINEST.eps.min(base.eps),
+                sums: Sums::Auto,
+                ..base
+            },
+            ..self.base
+        }
+    }
+}
+
+impl Place for There<'_> {
+    fn base(&self) -> Setting {
+        self.base
+    }
+
+    fn size(&self) -> [u32; 2] {
+        self.through.asked.path.size
+    }
+
+    fn crew(&self) -> String {
+        self.through.crew.clone()
+    }
+
+    fn identity(&self) -> String {
+        let Through { asked, info, .. } = &self.through;
+        let around = all_around(&asked.path);
+        format!(
+            "judged by its finest pictures: volume {} transfer {:?} path {} quality {:?} background \
+             {:?} pixels {} slabcast {}",
+            info.digest,
+            asked.transfer.choice(info),
+            serde_json::to_string(&around).unwrap_or_default(),
+            asked.quality,
+            asked.background,
+            slabcast_common::PIXELS_VERSION,
+            env!("CARGO_PKG_VERSION")
+        )
+    }
+
+    /// Workers come and go.
+    fn keeps_times(&self) -> bool {
+        false
+    }
+
+    fn off(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Off, Fail> {
+        if self.truths.is_empty() {
+            let path = all_around(&self.through.asked.path);
+            let (views, finest) = (path.frames(), self.finest());
+            let n = VIEWS.min(views);
+            for i in 0..n {
+                progress.stage(&format!("drawing what it should be, view {} of {n}", i + 1));
+                let view = path.only(path.first_frame() + (2 * i + 1) * views / (2 * n));
+                let picture = self.picture(&finest, &view)?;
+                let truth = picture.pixels.iter().map(|p| p.map(f64::from)).collect();
+                self.truths.push((view, truth));
+            }
+            progress.stage("trying settings");
+        }
+        let mut off = Off::default();
+        for (view, truth) in &self.truths {
+            let picture = self.picture(setting, view)?;
+            let figures =
+                ErrorFigures::compare(&picture.pixels, truth, self.through.asked.background);
+            off = off.with(&figures);
+        }
+        off.rmse = libm::hypot(off.rmse, FINEST.off);
+        Ok(Off {
+            most_999: off.most_999 + 2.0 * FINEST.off,
+            max: off.max + 2.0 * FINEST.off,
+            ..off
+        })
+    }
+
+    fn ms(&mut self, setting: &Setting) -> Result<f64, Fail> {
+        self.through.ms(setting)
+    }
+}
+
+/// What stands for a turn: views far apart all around, wherever the turn itself goes, so that what is
+/// measured serves any turn of the scene. Other paths stand for themselves.
+pub(crate) fn all_around(path: &ViewPath) -> ViewPath {
+    let mut path = path.clone();
+    if let Some(turn) = &mut path.turntable {
+        (turn.start, turn.step, turn.frames) = (20.0, 71.0, VIEWS as u32);
+        path.range = None;
+    }
+    path
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use slabcast_common::path::Turntable;
+
+    #[test]
+    fn few_views_stand_for_a_path() {
+        let turn = |frames, step| {
+            let turn = Turntable { frames, step, start: 10.0, ..Turntable::default() };
+            ViewPath::turn([64, 64], turn)
+        };
+        let few = spread(&turn(18, 5.0), 6).turntable.unwrap();
+        assert_eq!((few.start, few.step, few.frames), (10.0, 17.0, 6));
+        let one = spread(&turn(1, 5.0), 5).turntable.unwrap();
+        assert_eq!((one.start, one.step, one.frames), (10.0, 1.0, 5));
+        let mut part = turn(18, 5.0);
+        part.range = Some([4, 6]);
+        let part = spread(&part, 3);
+        assert_eq!(part.range, None);
+        let part = part.turntable.unwrap();
+        assert_eq!((part.start, part.step, part.frames), (30.0, 5.0, 3));
+    }
+}

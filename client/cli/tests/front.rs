@@ -170,7 +170,7 @@ fn a_cluster_keeps_an_error_that_is_asked_for() {
         let flags = [("--thickness", "thickness"), ("--eps", "eps")]
             .map(|(flag, name)| [flag.to_string(), quality[name].to_string()]);
         let sums = quality["sums"].as_str().unwrap();
-        let words = [&flags.as_flattened()[..], &["--sums".into(), sums.into()]].concat();
+        let words = [flags.as_flattened(), &["--sums".into(), sums.into()]].concat();
         let (rmse, ..) = bench(dir, &words.iter().map(String::as_str).collect::<Vec<_>>());
         assert!(rmse <= asked, "{rmse} of {asked}: {said}");
     }

@@ -64,6 +64,8 @@ pub struct RegionLease {
     pub frame: FrameId,
     /// The tile, inside the picture.
     pub tile: Rect,
+    /// Some of its pixels are drawn in thinner sheets, too.
+    pub estimate: bool,
 }
 
 /// Sets whose directories a worker keeps: as many as a master keeps brick sets, and one for a job that
@@ -212,8 +214,42 @@ pub struct RegionCost {
     /// For how long (microseconds). Others may have been drawn meanwhile.
     pub parked_us: u64,
     /// For how long render threads had nothing to do since the last result of the link, while some
-    /// region stood still.
     pub idle_us: u64,
+    /// What thinner sheets changed, where that was asked for.
+    pub sampled: Sampled,
+}
+
+/// How far pixels are from those of thinner sheets. Integers, since their sum has no order.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Sampled {
+    /// Pixels that are not blank in both.
+    pub pixels: u32,
+    /// Sum of the squares of their differences, over all four channels, in units of 2^-48.
+    pub squares: u64,
+}
+
+impl Sampled {
+    const UNIT: f64 = (1u64 << 48) as f64;
+
+    /// Counts a pixel, unless it is blank in both; squares of at most 4.
+    pub fn put(&mut self, there: bool, squares: f64) {
+        if there {
+            self.pixels += 1;
+            self.squares += (squares.clamp(0.0, 4.0) * Sampled::UNIT) as u64;
+        }
+    }
+
+    /// Adds others'.
+    pub fn add(&mut self, other: Sampled) {
+        self.pixels = self.pixels.saturating_add(other.pixels);
+        self.squares = self.squares.saturating_add(other.squares);
+    }
+
+    /// Root of the mean square over pixels and channels, in 1/255; `None` of no pixel.
+    pub fn rmse(&self) -> Option<f64> {
+        let n = 4.0 * f64::from(self.pixels);
+        (self.pixels > 0).then(|| (self.squares as f64 / Sampled::UNIT / n).sqrt() * 255.0)
+    }
 }
 
 /// A rendered task.

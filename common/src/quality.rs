@@ -230,6 +230,9 @@ pub struct Work {
     pub keep: Keep,
     /// Where slabs end.
     pub borders: Borders,
+    /// One pixel in 64 is drawn in thinner sheets, too, for the statistics' estimate of what the
+    /// thickness costs (`region` schedule).
+    pub estimate: bool,
 }
 
 impl Default for Work {
@@ -241,6 +244,7 @@ impl Default for Work {
             schedule: Schedule::Auto,
             keep: Keep::default(),
             borders: Borders::default(),
+            estimate: false,
         }
     }
 }

@@ -156,7 +156,7 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
         stats.pixels_sha256 = "none: rehearsed".into();
     }
     stats.pixels_version = slabcast_common::PIXELS_VERSION;
-    stats.error = error(&s.scene, &s.view);
+    stats.error = ErrorStats { thickness: stats.error.thickness, ..error(&s.scene, &s.view) };
     stats.left_out = match &s.store {
         Some(store) => left_out(store, &s.scene, &s.view, &s.request, &stats.bricks),
         None => Vec::new(),

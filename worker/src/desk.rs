@@ -394,7 +394,7 @@ impl Desk<'_> {
                 }
             }
             Came::Over | Came::Lacks(..) => self.parking.leave(who, &[]),
-            Came::Done(done) => {
+            Came::Done(done, sampled) => {
                 self.parking.leave(who, &done.touched);
                 let times = TaskTimes {
                     received_us: self.us(going.received),
@@ -408,6 +408,7 @@ impl Desk<'_> {
                     stalls: going.stalls,
                     parked_us: going.parked.as_micros() as u64,
                     idle_us: self.pool.waited().as_micros() as u64,
+                    sampled,
                 });
                 let (pixels, counters) = (done.pixels, done.counters);
                 let result = TileResult { task, epoch, pixels, counters, times, region };
@@ -645,7 +646,13 @@ mod tests {
 
         fn region(&self, task: u64, tile: Rect) {
             let (task, epoch) = (TaskId(task), Epoch(0));
-            self.say(ToWorker::Region(RegionLease { task, epoch, frame: FRAME, tile }));
+            self.say(ToWorker::Region(RegionLease {
+                task,
+                epoch,
+                frame: FRAME,
+                tile,
+                estimate: false,
+            }));
         }
 
         async fn result(&mut self) -> Box<TileResult> {

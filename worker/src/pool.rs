@@ -9,9 +9,10 @@ use crate::shelf::Shelf;
 use slabcast_common::brick::{Brick, BrickInfo};
 use slabcast_common::ids::FrameId;
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::{Counters, Lease, RegionLease, SceneSpec};
+use slabcast_common::message::{Counters, Lease, RegionLease, Sampled, SceneSpec};
 use slabcast_common::view::View;
-use slabcast_render::region::{Finished, Outlook, Region, Sight};
+use slabcast_render::estimate::{self, Pair};
+use slabcast_render::region::{Finished, Outlook, Region, Sight, Supply};
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch};
 use slabcast_render::{Frame, Scene};
@@ -31,11 +32,13 @@ const AHEAD: u32 = 8;
 pub(crate) struct SceneSlot {
     pub(crate) spec: Arc<SceneSpec>,
     scene: OnceLock<Arc<Scene>>,
+    /// What the thickness costs is found by; `None` where sheets can't be thinner.
+    pair: OnceLock<Option<Pair>>,
 }
 
 impl SceneSlot {
     pub(crate) fn new(spec: Arc<SceneSpec>) -> Self {
-        SceneSlot { spec, scene: OnceLock::new() }
+        SceneSlot { spec, scene: OnceLock::new(), pair: OnceLock::new() }
     }
 }
 
@@ -44,6 +47,7 @@ pub(crate) struct FrameSlot {
     pub(crate) scene: Arc<SceneSlot>,
     pub(crate) view: View,
     frame: OnceLock<Frame>,
+    pair: OnceLock<Option<[Frame; 2]>>,
     looking: Looking,
     /// Of a rehearsal: its place in the trace, and when its tables are made.
     pub(crate) rehearsed: OnceLock<Option<usize>>,
@@ -54,8 +58,8 @@ pub(crate) struct FrameSlot {
 
 impl FrameSlot {
     pub(crate) fn new(scene: Arc<SceneSlot>, view: View) -> Self {
-        let (frame, looking, rehearsed, made, over) = Default::default();
-        FrameSlot { scene, view, frame, looking, rehearsed, made, over }
+        let (frame, pair, looking, rehearsed, made, over) = Default::default();
+        FrameSlot { scene, view, frame, pair, looking, rehearsed, made, over }
     }
 
     fn get(&self) -> &Frame {
@@ -63,6 +67,15 @@ impl FrameSlot {
             let scene = self.scene.scene.get_or_init(|| Arc::new(Scene::new(&self.scene.spec)));
             Frame::new(scene.clone(), self.view)
         })
+    }
+
+    /// The frame twice, for [`estimate`].
+    fn pair(&self) -> Option<&[Frame; 2]> {
+        let frames = self.pair.get_or_init(|| {
+            let pair = self.scene.pair.get_or_init(|| Pair::of(&self.scene.spec)).as_ref()?;
+            Some(pair.frames(&self.view))
+        });
+        frames.as_ref()
     }
 }
 
@@ -186,8 +199,8 @@ impl Going {
 pub(crate) enum Came {
     /// Its frame was over.
     Over,
-    /// To its end.
-    Done(Box<Finished>),
+    /// To its end; what thinner sheets changed, where that was asked for.
+    Done(Box<Finished>, Sampled),
     /// To a sheet at which it lacks bricks; whether that is farther than before.
     Lacks(Vec<u32>, bool),
     /// Nowhere.
@@ -382,7 +395,7 @@ fn hold(thread: u32, rehearsal: &Rehearsal, queue: &Queue, out: &mpsc::Unbounded
                         held.wait();
                         going.drawn += took;
                         end = held.end;
-                        Came::Done(finished)
+                        Came::Done(finished, Sampled::default())
                     }
                 };
                 free = end;
@@ -456,7 +469,18 @@ fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch) -> Came {
         return Came::Lacks(lacks, farther);
     }
     match region.take() {
-        Some(region) => Came::Done(Box::new(region.finish())),
+        Some(region) => {
+            let (done, mut sampled) = (region.finish(), Sampled::default());
+            if lease.estimate {
+                let bricks = done.touched.iter().map(|&place| shelf.get(place));
+                // One that was forgotten since is not sent again for this.
+                let bricks: Option<Vec<_>> = bricks.collect();
+                if let (Some(frames), Some(bricks)) = (slot.pair(), bricks) {
+                    sampled = estimate::sample(frames, simd, lease.tile, &bricks, scratch);
+                }
+            }
+            Came::Done(Box::new(done), sampled)
+        }
         None => Came::Over,
     }
 }

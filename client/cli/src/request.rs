@@ -351,6 +351,7 @@ impl WorkArgs {
             schedule: self.schedule,
             keep: self.keep.keep(),
             borders: self.slab_borders,
+            ..Work::default()
         };
         w.check().map_err(|e| Fail::flag(&e))?;
         Ok(w)

@@ -180,3 +180,45 @@ fn a_cluster_keeps_an_error_that_is_asked_for() {
     assert!(said.contains("ms a frame"), "{said}");
     assert!(quality["thickness"].as_f64().unwrap() <= 0.25, "all the time in the world: {quality}");
 }
+
+/// The estimate in a frame's statistics beside the reference's word.
+#[test]
+fn statistics_estimate_what_the_thickness_costs() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let (mut near, mut all) = (0, 0);
+    for (volume, tf, thickness) in [
+        ("formula:spheres:48", "skin", "1"),
+        ("formula:spheres:48", "skin", "2"),
+        ("formula:spheres:48", "fog", "2"),
+        ("formula:spheres:48", "bone", "0.5"),
+    ] {
+        let scene = [volume, "--tf", tf, "--thickness", thickness, "--size", "256x256"];
+        let draw = |out: &str, more: &[&str]| {
+            let how = ["--start", "33", "--step", "77", "--frames", "2", "-o", out];
+            let done = run(dir, &[&["render"], &scene, &how, more]);
+            assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+            std::fs::read(dir.join(out).join("frame_0001.png")).unwrap()
+        };
+        let out = format!("{tf}{thickness}");
+        let with = draw(&out, &["--stats", "s.jsonl"]);
+        let without = draw(&format!("{out}-plain"), &[]);
+        assert!(with == without, "an estimate changes no byte");
+        let stats = std::fs::read_to_string(dir.join("s.jsonl")).unwrap();
+        for (line, azimuth) in stats.lines().zip(["33", "110"]) {
+            let stats: Value = serde_json::from_str(line).unwrap();
+            let estimate = stats["error"]["thickness"]["estimate"].as_f64().unwrap();
+            let judged = run(dir, &[&["error"], &scene, &["--azimuth", azimuth, "--json"]]);
+            let judged: Value = serde_json::from_slice(&judged.stdout).unwrap();
+            let truth = judged["thickness"]["rmse"].as_f64().unwrap();
+            all += 1;
+            near += usize::from(estimate < 2.0 * truth && truth < 2.0 * estimate);
+            println!("{volume} {tf} {thickness} {azimuth}: {estimate} of {truth}");
+        }
+        draw(&format!("{out}-slab"), &["--stats", "s.jsonl", "--schedule", "slab"]);
+        let stats = std::fs::read_to_string(dir.join("s.jsonl")).unwrap();
+        let stats: Value = serde_json::from_str(stats.lines().next().unwrap()).unwrap();
+        assert!(stats["error"]["thickness"]["estimate"].is_null(), "never a number of nothing");
+    }
+    assert_eq!((near, all), (all, 8), "of eight frames within a factor of two");
+}

@@ -520,7 +520,9 @@ impl Frame {
                     cluster.send(id, message);
                 }
                 let (task, epoch, frame) = (lent.task, lent.epoch, self.job.frame);
-                cluster.send(id, ToWorker::Region(RegionLease { task, epoch, frame, tile }));
+                let estimate = self.job.work.estimate;
+                let lease = RegionLease { task, epoch, frame, tile, estimate };
+                cluster.send(id, ToWorker::Region(lease));
                 continue;
             }
             let name = |&i: &u32| -> BrickId { self.job.bricks[i as usize].id };
@@ -655,7 +657,8 @@ impl Frame {
         let tile = slab.cut.tiles[place as usize].rect;
         let cost = slab.regions.as_ref().and(result.region.as_ref());
         let bricks = self.job.bricks.len();
-        if let Err(lie) = check(tile, &result.pixels).and_then(|()| check_cost(cost, bricks)) {
+        if let Err(lie) = check(tile, &result.pixels).and_then(|()| check_cost(cost, tile, bricks))
+        {
             // Its other leases go back when it is dropped; this one it has just answered.
             let given_up =
                 slab.queue.lose(worker, "", &[(place, result.epoch)], 0, &cluster.config);
@@ -1018,7 +1021,13 @@ impl Measured {
 }
 
 /// Whether what a stranger says of a region can be counted.
-fn check_cost(cost: Option<&RegionCost>, bricks: usize) -> Result<(), String> {
+fn check_cost(cost: Option<&RegionCost>, tile: Rect, bricks: usize) -> Result<(), String> {
+    if let Some(sampled) = cost.map(|c| c.sampled)
+        && sampled.pixels as usize > tile.area()
+    {
+        let (n, area) = (sampled.pixels, tile.area());
+        return Err(format!("a result sampled {n} pixels of a tile of {area}"));
+    }
     let beyond = cost.and_then(|c| c.touched.iter().max()).filter(|&&i| i as usize >= bricks);
     match beyond {
         Some(i) => Err(format!("a result touched brick {i} of {bricks}")),

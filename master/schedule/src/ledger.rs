@@ -11,10 +11,11 @@ use crate::roster::Worker;
 use crate::{Micros, Span};
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::ids::WorkerId;
-use slabcast_common::message::{Counters, RegionCost, TaskTimes};
+use slabcast_common::message::{Counters, RegionCost, Sampled, TaskTimes};
 use slabcast_common::quality::{Quality, Schedule};
 use slabcast_common::stats::{
-    BrickStats, ErrorStats, FrameMs, FrameStats, PoisonedTile, SlabStats, VoxelStats, WorkerStats,
+    BrickStats, EXTRAPOLATION, ErrorStats, Estimate, FrameMs, FrameStats, PoisonedTile, SlabStats,
+    VoxelStats, WorkerStats,
 };
 use std::collections::BTreeMap;
 
@@ -50,6 +51,8 @@ pub(crate) struct Ledger {
     pub(crate) composite_us: Micros,
     accounts: BTreeMap<WorkerId, Account>,
     pub(crate) counters: Counters,
+    /// What thinner sheets changed.
+    sampled: Sampled,
     pub(crate) slabs: Vec<SlabStats>,
     pub(crate) spans: Vec<Span>,
     pub(crate) retries: u64,
@@ -88,6 +91,7 @@ impl Ledger {
             composite_us: 0,
             accounts: BTreeMap::new(),
             counters: Counters::default(),
+            sampled: Sampled::default(),
             slabs: Vec::new(),
             spans: Vec::new(),
             retries: 0,
@@ -155,6 +159,7 @@ impl Ledger {
             a.parked_us = a.parked_us.saturating_add(cost.parked_us);
             a.stall_us = a.stall_us.saturating_add(cost.idle_us);
         }
+        self.sampled.add(cost.sampled);
     }
 
     pub(crate) fn sent(&mut self, id: WorkerId, bricks: u64, bytes: u64) {
@@ -258,7 +263,10 @@ impl Ledger {
             slabs: self.slabs,
             quality,
             left_out: Vec::new(),
-            error: ErrorStats::default(),
+            error: ErrorStats {
+                thickness: Estimate { estimate: self.sampled.rmse().map(|e| e * EXTRAPOLATION) },
+                ..ErrorStats::default()
+            },
             retries: self.retries,
             dropped_results: self.dropped_results,
             poisoned: self.poisoned,

@@ -9,7 +9,7 @@ use slabcast_common::PIXELS_VERSION;
 use slabcast_common::brick::{BRICK_VOXELS, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::{Counters, RegionCost, SceneSpec, TaskTimes, TileResult};
+use slabcast_common::message::{Counters, RegionCost, Sampled, SceneSpec, TaskTimes, TileResult};
 use slabcast_common::volume::Digest32;
 use slabcast_proto::{convert, v1};
 use slabcast_schedule::{Clock, Config, Event, FrameJob, Micros, Scheduler};
@@ -412,6 +412,8 @@ fn result(r: &NotedResult) -> Result<TileResult, String> {
             stalls,
             parked_us,
             idle_us,
+            // Figures, on which no decision hangs.
+            sampled: Sampled::default(),
         }),
     })
 }

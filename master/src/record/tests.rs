@@ -4,7 +4,9 @@ use super::{Broken, Difference, Replayed, Watched, Written, bits, replay, runs, 
 use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId, WorkerId};
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::{Counters, RegionCost, SceneSpec, TaskTimes, TileResult, ToWorker};
+use slabcast_common::message::{
+    Counters, RegionCost, Sampled, SceneSpec, TaskTimes, TileResult, ToWorker,
+};
 use slabcast_common::path::Orientation;
 use slabcast_common::path::{Turntable, ViewPath};
 use slabcast_common::presets;
@@ -156,6 +158,7 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
                     stalls: 1,
                     parked_us: 20,
                     idle_us: 5,
+                    sampled: Sampled::default(),
                 });
                 let counters = Counters { tossed: 3, splatted: 2, culled: 1 };
                 if rng.below(50) == 0 {

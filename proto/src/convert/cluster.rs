@@ -13,8 +13,8 @@ use slabcast_common::brick::{
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::{RawSums, TilePixels, TileState};
 use slabcast_common::message::{
-    BrickBatch, Counters, Hello, Lease, RegionCost, RegionLease, TaskTimes, TileResult, ToMaster,
-    ToWorker,
+    BrickBatch, Counters, Hello, Lease, RegionCost, RegionLease, Sampled, TaskTimes, TileResult,
+    ToMaster, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::slab::SheetRange;
@@ -248,6 +248,8 @@ fn result_to_wire(result: &TileResult) -> v1::TileResult {
             stalls: r.stalls,
             parked_us: r.parked_us,
             idle_us: r.idle_us,
+            sampled_pixels: r.sampled.pixels,
+            sampled_squares: r.sampled.squares,
         }),
     }
 }
@@ -259,7 +261,8 @@ fn region_cost_from_wire(cost: v1::RegionCost) -> Result<RegionCost, WireError> 
     }
     let touched = touched.into_iter().map(|id| id.0).collect();
     let v1::RegionCost { stalls, parked_us, idle_us, .. } = cost;
-    Ok(RegionCost { touched, stalls, parked_us, idle_us })
+    let sampled = Sampled { pixels: cost.sampled_pixels, squares: cost.sampled_squares };
+    Ok(RegionCost { touched, stalls, parked_us, idle_us, sampled })
 }
 
 fn result_from_wire(result: v1::TileResult) -> Result<TileResult, WireError> {
@@ -459,6 +462,7 @@ fn region_to_wire(lease: &RegionLease) -> v1::Region {
         y: lease.tile.y0 as u32,
         width: lease.tile.width() as u32,
         height: lease.tile.height() as u32,
+        estimate: lease.estimate,
     }
 }
 
@@ -468,6 +472,7 @@ fn region_from_wire(lease: &v1::Region) -> Result<RegionLease, WireError> {
         epoch: Epoch(lease.epoch),
         frame: FrameId(lease.frame),
         tile: tile_from_wire(lease.x, lease.y, lease.width, lease.height)?,
+        estimate: lease.estimate,
     })
 }
 

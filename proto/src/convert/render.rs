@@ -51,6 +51,7 @@ pub fn path_request_to_wire(request: &PathRequest) -> v1::PathRequest {
             keep_normals: request.work.keep.normals,
             keep_gradients: request.work.keep.gradients,
             equal_slabs: request.work.borders == Borders::Equal,
+            estimate: request.work.estimate,
         }),
         format: wanted_format_to_wire(request.format),
         background: Some(background_to_wire(request.background)),
@@ -97,6 +98,7 @@ fn work_from_wire(work: v1::Work) -> Result<Work, WireError> {
             gradients: work.keep_gradients,
         },
         borders: if work.equal_slabs { Borders::Equal } else { Borders::Data },
+        estimate: work.estimate,
     };
     work.check()?;
     Ok(work)

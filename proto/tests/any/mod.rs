@@ -240,7 +240,10 @@ pub fn lease() -> impl Strategy<Value = Lease> {
 }
 
 pub fn region() -> impl Strategy<Value = RegionLease> {
-    lease().prop_map(|l| RegionLease { task: l.task, epoch: l.epoch, frame: l.frame, tile: l.tile })
+    (lease(), any::<bool>()).prop_map(|(l, estimate)| {
+        let (task, epoch, frame, tile) = (l.task, l.epoch, l.frame, l.tile);
+        RegionLease { task, epoch, frame, tile, estimate }
+    })
 }
 
 /// Some bricks of a grid of 7 x 9 x 11.
@@ -272,12 +275,13 @@ pub fn directory() -> impl Strategy<Value = ToWorker> {
 pub fn result() -> impl Strategy<Value = TileResult> {
     (1usize..600).prop_flat_map(|n| {
         let ids = (any::<u64>(), any::<u32>());
-        let cost = (ascending(40), any::<u32>(), any::<[u64; 2]>()).prop_map(
-            |(touched, stalls, [parked_us, idle_us])| RegionCost {
+        let cost = (ascending(40), any::<[u32; 2]>(), any::<[u64; 3]>()).prop_map(
+            |(touched, [stalls, pixels], [parked_us, idle_us, squares])| RegionCost {
                 touched: touched.into_iter().map(|id| id.0).collect(),
                 stalls,
                 parked_us,
                 idle_us,
+                sampled: Sampled { pixels, squares },
             },
         );
         let more = (any::<u32>(), prop::option::of(cost));
@@ -509,18 +513,20 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
         0.1..1000.0f64,
         prop::option::of((4u32..=8).prop_map(|p| 1 << p)),
         prop_oneof![Just(Schedule::Auto), Just(Schedule::Slab)],
-        any::<[bool; 4]>(),
+        any::<[bool; 5]>(),
     )
-        .prop_map(
-            |(slabs, tiles_per_worker, tile, schedule, [empty, normals, gradients, equal])| Work {
+        .prop_map(|(slabs, tiles_per_worker, tile, schedule, flags)| {
+            let [empty, normals, gradients, equal, estimate] = flags;
+            Work {
                 slabs,
                 tiles_per_worker,
                 tile,
                 schedule,
                 keep: Keep { empty, normals, gradients },
                 borders: if equal { Borders::Equal } else { Borders::Data },
-            },
-        );
+                estimate,
+            }
+        });
     let background = prop_oneof![
         Just(Background::Transparent),
         [0.0..=1.0f64, 0.0..=1.0, 0.0..=1.0].prop_map(Background::Colour)

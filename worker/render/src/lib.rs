@@ -19,6 +19,7 @@
 
 pub mod closed;
 mod deep;
+pub mod estimate;
 pub mod explain;
 mod flat;
 pub mod footprint;

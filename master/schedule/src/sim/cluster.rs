@@ -598,7 +598,7 @@ impl World<'_> {
                     touched: r.touched,
                     stalls: u32::from(r.stood.is_some()),
                     parked_us: micros(r.stood.unwrap_or(0)),
-                    idle_us: 0,
+                    ..RegionCost::default()
                 });
             }
         }

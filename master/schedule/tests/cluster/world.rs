@@ -750,7 +750,7 @@ impl World {
                     touched.push(job.job.bricks.len() as u32);
                 }
                 let (stalls, parked_us) = (going.stalls, going.parked_us);
-                cost = Some(RegionCost { touched, stalls, parked_us, idle_us: 0 });
+                cost = Some(RegionCost { touched, stalls, parked_us, ..RegionCost::default() });
                 let (_, pixels) = going.drawn.take().expect("it was drawn to its end");
                 TilePixels { last: None, ..pixels }
             }

@@ -1,0 +1,130 @@
+//! How far a tile is from sheets of half the thickness, at a few of its pixels.
+//!
+//! What thin sheets come to is not known where a frame is drawn; how much a picture changes when they
+//! become thinner is, and it tells: an error that falls with the power p of the thickness is
+//! 1 / (1 - 2^-p) of that change (Richardson's extrapolation; [`slabcast_common::stats::EXTRAPOLATION`]).
+//! One pixel in 64 is drawn twice, in blocks, since neighbours share footprints.
+
+use crate::scene::{Frame, Scene};
+use crate::splat::Simd;
+use crate::tile::{self, Scratch};
+use slabcast_common::brick::{Brick, TightBox};
+use slabcast_common::image::{COLOUR_UNIT, TilePixels, TileState};
+use slabcast_common::message::{Sampled, SceneSpec};
+use slabcast_common::occlusion::Rect;
+use slabcast_common::quality::Quality;
+use slabcast_common::slab::SheetRange;
+use slabcast_common::view::View;
+use std::sync::Arc;
+
+/// Edge of a block in pixels. A footprint of 3 pixels to each side is drawn for a block of 8 some three
+/// times as often as for a tile; for single pixels fifty times.
+const BLOCK: i32 = 8;
+
+/// Of so many pixels one is drawn again, in a picture of some size.
+const ONE_IN: u32 = 64;
+
+/// Blocks of a small picture at least. From half as many the estimate was off by more than two.
+const AT_LEAST: u32 = 32;
+
+/// Of eps, what is left where thickness alone is to show: a shut pixel is as far off as thickness makes it.
+const EPS: f64 = 1.0 / 16.0;
+
+/// A scene in sheets of its thickness and of half of it.
+pub struct Pair([Arc<Scene>; 2]);
+
+impl Pair {
+    /// `None` where half as thick is thinner than sheets may be.
+    pub fn of(spec: &SceneSpec) -> Option<Pair> {
+        let q = spec.quality;
+        let [whole, half] = [1.0, 0.5].map(|times| {
+            let quality = Quality { thickness: q.thickness * times, eps: q.eps * EPS, ..q };
+            quality.check().ok()?;
+            Some(Arc::new(Scene::new(&SceneSpec { quality, ..spec.clone() })))
+        });
+        Some(Pair([whole?, half?]))
+    }
+
+    /// A view of it.
+    pub fn frames(&self, view: &View) -> [Frame; 2] {
+        let Pair([whole, half]) = self;
+        let thin = View { thickness: view.thickness * 0.5, ..*view };
+        [Frame::new(whole.clone(), *view), Frame::new(half.clone(), thin)]
+    }
+}
+
+/// The blocks of a tile that are drawn again: of a large picture one of 8x8 pixels in a tile of 64x64, as
+/// many more in a larger one, and in a smaller one sometimes.
+fn blocks(tile: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
+    let [w, h] = [tile.x1 - tile.x0, tile.y1 - tile.y0].map(|n| n / BLOCK);
+    let all = (w * h) as u32;
+    // A number that only the tile decides: all workers and frames agree.
+    let mut x =
+        (tile.x0 as u32).wrapping_mul(0x9e37_79b1) ^ (tile.y0 as u32).wrapping_mul(0x85eb_ca6b);
+    let mut next = move || {
+        x = x.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        x >> 8
+    };
+    let there = size[0] * size[1] / (BLOCK * BLOCK) as u32;
+    let each = (there / AT_LEAST).clamp(1, ONE_IN);
+    let n = all / each + u32::from(next() % each < all % each);
+    (0..n).map(move |_| {
+        let i = (next() % all) as i32;
+        let (x0, y0) = (tile.x0 + i % w * BLOCK, tile.y0 + i / w * BLOCK);
+        Rect::new(x0, y0, x0 + BLOCK, y0 + BLOCK)
+    })
+}
+
+/// Draws some pixels of a tile twice and compares; `bricks` are those that the tile was drawn from.
+pub fn sample(
+    frames: &[Frame; 2],
+    simd: Simd,
+    tile: Rect,
+    bricks: &[Arc<Brick>],
+    scratch: &mut Scratch,
+) -> Sampled {
+    let mut sampled = Sampled::default();
+    for block in blocks(tile, frames[0].view.size) {
+        let [coarse, fine] = frames.each_ref().map(|frame| {
+            let whole = TightBox { lo: [0; 3], hi: frame.scene.dims.map(|n| n - 1) };
+            let sheets = frame.view.project(&whole).map_or_else(SheetRange::default, |p| p.sheets);
+            let state = TileState { a: vec![0.0; block.area()], last: None };
+            tile::render(frame, simd, block, sheets, bricks, &state, scratch).0
+        });
+        for i in 0..block.area() {
+            let light =
+                |p: &TilePixels, k: usize| f64::from(p.colour[i][k]) * f64::from(COLOUR_UNIT);
+            let (a, b) = (f64::from(coarse.a[i]), f64::from(fine.a[i]));
+            let colours = (0..3).map(|k| light(&coarse, k) - light(&fine, k));
+            let squares = colours.fold((a - b) * (a - b), |sum, off| sum + off * off);
+            sampled.put(a > 0.0 || b > 0.0, squares);
+        }
+    }
+    sampled
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_pixel_in_sixty_four_is_drawn_again_whatever_the_tiles() {
+        for edge in [16, 32, 64, 128, 256] {
+            let mut pixels = 0;
+            for y in (0..2048).step_by(edge as usize) {
+                for x in (0..2048).step_by(edge as usize) {
+                    let tile = Rect::new(x, y, x + edge, y + edge);
+                    for block in blocks(tile, [2048; 2]) {
+                        assert!(block.intersect(&tile) == block, "{block:?} in {tile:?}");
+                        pixels += block.area();
+                    }
+                }
+            }
+            let share = pixels as f64 / (2048.0 * 2048.0) * f64::from(ONE_IN);
+            assert!((0.9..1.1).contains(&share), "{share} of what was meant at {edge}");
+        }
+        assert_eq!(blocks(Rect::new(0, 0, 7, 7), [7; 2]).count(), 0, "no block fits");
+        let small = (0..4).flat_map(|i| blocks(Rect::new(64 * i, 0, 64 * i + 64, 64), [256, 64]));
+        assert_eq!(small.count(), AT_LEAST as usize, "an eighth of a small picture");
+    }
+}

@@ -14,6 +14,7 @@
 //! - [`config`] lays flags, environment and file over each other.
 //! - [`report`] sweeps the knobs of quality for error against run time; [`front`] measures, and
 //!   [`chart`] draws.
+//! - [`study`] does the paper's evaluation again.
 //! - [`check`] compares pictures with the oracle over every way to make them; [`error`] says how
 //!   far one is from the truth, [`explain`] why a pixel is as it is and ([`needs`]) what a scene leaves
 //!   out. [`local`] draws for the
@@ -60,6 +61,7 @@ mod signals;
 mod source;
 mod stage;
 mod still;
+mod study;
 mod style;
 mod tf;
 mod transfer;
@@ -118,6 +120,7 @@ enum Command {
     Explain(Box<explain::ExplainArgs>),
     Bench(Box<bench::BenchArgs>),
     Report(Box<report::ReportArgs>),
+    Study(Box<study::StudyArgs>),
     Check(check::CheckArgs),
     Config(config::ConfigArgs),
     Doctor(doctor::DoctorArgs),
@@ -180,6 +183,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
         Command::Explain(args) => explain::run(args),
         Command::Bench(args) => bench::run(args),
         Command::Report(args) => report::run(args),
+        Command::Study(args) => study::run(args),
         Command::Check(args) => check::run(args),
         Command::Doctor(args) => {
             doctor::run(args, config::path(cli.config.as_deref(), Cli::command()))

@@ -256,8 +256,12 @@ impl Frame {
         // A slab without bricks has no best level; the coarsest tells it shortest.
         let forced = work.tile.or(needed.is_empty().then_some(LEAF << (LEVELS - 1)));
         let size = self.job.view.size;
-        let cut = macrotile::cut(size, &rects, &self.shut, cull, wanted, forced);
-
+        let cut = if cluster.config.mixed {
+            let whole = cluster.roster.threads() as usize;
+            macrotile::cut_mixed(size, &rects, &self.shut, cull, (wanted, forced), whole)
+        } else {
+            macrotile::cut(size, &rects, &self.shut, cull, wanted, forced)
+        };
         cluster.residency.round(&needed);
         self.put_on(cluster, began, cut, (needed, rects), None);
         self.ledger.cull_us += clock.now().saturating_sub(began);
@@ -307,7 +311,7 @@ impl Frame {
             TileStats {
                 x: task.tile.rect.x0 as u32,
                 y: task.tile.rect.y0 as u32,
-                size: slab.cut.edge,
+                size: slab.cut.edge_of(&task.tile.rect),
                 est: task.tile.est,
                 ms: ms(us),
                 worker,

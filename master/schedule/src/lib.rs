@@ -86,6 +86,10 @@ pub struct Config {
     pub poison_after: u32,
     /// Leases a render thread has in flight, the one it renders included.
     pub queue_ahead: u32,
+    /// Under the `slab` schedule, each render thread begins with a whole macrotile, and those that
+    /// follow are quarters ([`macrotile::cut_mixed`]): an experiment of the paper's, which
+    /// `slabcast study` repeats by [`sim`]. No master sets it, and records do not have it.
+    pub mixed: bool,
 }
 
 impl Default for Config {
@@ -103,6 +107,7 @@ impl Default for Config {
             lease: 60_000_000,
             poison_after: 3,
             queue_ahead: 2,
+            mixed: false,
         }
     }
 }

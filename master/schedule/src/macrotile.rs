@@ -33,7 +33,7 @@ pub struct Macrotile {
 /// How one slab is cut.
 #[derive(Clone, Debug)]
 pub struct Cut {
-    /// Edge of the level's tiles in pixels.
+    /// Edge of the level's tiles in pixels; of a mixed cut, of the smaller ones.
     pub edge: u32,
     /// Tiles to render, largest workload first; equal ones from the top left.
     pub tiles: Vec<Macrotile>,
@@ -139,6 +139,30 @@ pub fn cut(
     let tree = tree(leaves(size, rects, shut));
     let level = forced_level(forced).or_else(|| coarsest(&tree, &to_render, wanted)).unwrap_or(0);
     list(size, &tree[level], level, &to_render, |rect| shut.all_shut(rect))
+}
+
+/// The same, with all tiles but the `whole` largest cut once more, into quarters: the paper's mix of
+/// tiles of 64 and 32 pixels (section 5.1), which levels loads and costs more than it gains.
+pub fn cut_mixed(
+    size: [u32; 2],
+    rects: &[Rect],
+    shut: &ShutMap,
+    cull: bool,
+    (wanted, forced): (u64, Option<u32>),
+    whole: usize,
+) -> Cut {
+    let mut coarse = cut(size, rects, shut, cull, wanted, forced);
+    if coarse.edge == LEAF || coarse.tiles.len() <= whole {
+        return coarse;
+    }
+    let fine = cut(size, rects, shut, cull, 0, Some(coarse.edge / 2));
+    coarse.tiles.truncate(whole);
+    let kept: Vec<Rect> = coarse.tiles.iter().map(|t| t.rect).collect();
+    let apart = |t: &Macrotile| kept.iter().all(|k| k.intersect(&t.rect).is_empty());
+    coarse.tiles.extend(fine.tiles.into_iter().filter(apart));
+    coarse.edge = fine.edge;
+    coarse.index(size);
+    coarse
 }
 
 /// Cuts a picture for tasks that go through all depths: nothing is shut, and pixels count as covered
@@ -256,11 +280,26 @@ impl Cut {
     /// the one they have.
     pub fn sort(&mut self, size: [u32; 2]) {
         self.tiles.sort_by_key(|t| std::cmp::Reverse(t.est));
+        self.index(size);
+    }
+
+    /// Edge of one of the tiles: the least level's that it fits.
+    pub fn edge_of(&self, rect: &Rect) -> u32 {
+        let long = rect.width().max(rect.height()) as u32;
+        long.next_power_of_two().max(self.edge)
+    }
+
+    /// Notes the place of each tile.
+    fn index(&mut self, size: [u32; 2]) {
         let [columns, rows] = size.map(|n| n.div_ceil(self.edge) as usize);
         let mut first = vec![Grid::new(columns, rows, u32::MAX)];
         for (place, tile) in self.tiles.iter().enumerate() {
-            let [x, y] = [tile.rect.x0, tile.rect.y0].map(|p| p as usize >> self.edge.ilog2());
-            first[0].cells[y * columns + x] = place as u32;
+            let cell = |p: i32| p as usize >> self.edge.ilog2();
+            for y in cell(tile.rect.y0)..=cell(tile.rect.y1 - 1) {
+                for x in cell(tile.rect.x0)..=cell(tile.rect.x1 - 1) {
+                    first[0].cells[y * columns + x] = place as u32;
+                }
+            }
         }
         while first.last().is_some_and(|g| g.cells.len() > 1) {
             let up = first.last().expect("there is one").parent(u32::MAX, u32::min);
@@ -330,6 +369,26 @@ mod tests {
         assert_eq!(edge(256), 16);
         assert_eq!(edge(100_000), 16, "the leaves, when even they are too few");
         assert_eq!(cut(size, &all, &open(size), true, 0, Some(64)).tiles.len(), 64);
+    }
+
+    #[test]
+    fn a_mixed_cut_keeps_the_largest_tiles_whole() {
+        // Three tiles of 64: two full, one with a brick of 20 pixels in a corner.
+        let size = [256, 64];
+        let rects = [Rect::new(0, 0, 128, 64), Rect::new(130, 2, 150, 22)];
+        let open = open(size);
+        let cut = cut_mixed(size, &rects, &open, true, (0, Some(64)), 1);
+        assert_eq!((cut.edge, cut.tiles.len()), (32, 1 + 4 + 1));
+        assert_eq!(cut.tiles[0].rect, Rect::new(0, 0, 64, 64));
+        assert!(cut.tiles[1..].iter().all(|t| t.rect.width() == 32));
+        let edges: Vec<u32> = cut.tiles.iter().map(|t| cut.edge_of(&t.rect)).collect();
+        assert_eq!(edges, [64, 32, 32, 32, 32, 32]);
+        // Every pixel is found in the tile that has it.
+        assert_eq!(cut.first_in(&Rect::new(40, 40, 41, 41)), Some(0));
+        assert_eq!(cut.first_in(&Rect::new(140, 10, 150, 20)), Some(5));
+        assert_eq!(cut.first_in(&Rect::new(60, 0, 70, 9)), Some(0));
+        // Nothing is left to cut.
+        assert_eq!(cut_mixed(size, &rects, &open, true, (0, Some(64)), 3).edge, 64);
     }
 
     #[test]

@@ -6,6 +6,7 @@ use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::presets;
 use slabcast_common::quality::{Borders, Quality, Schedule, Work};
+use slabcast_common::stats::FrameStats;
 use slabcast_common::trace::{
     About, FrameTrace, Level, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace, VERSION,
     view_sha256,
@@ -13,7 +14,7 @@ use slabcast_common::trace::{
 use slabcast_common::view::{Camera, CameraProjection, Projected, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Unknown, Unmeasured};
-use slabcast_schedule::{FrameJob, macrotile, slabs as slabs_of};
+use slabcast_schedule::{FrameJob, Span, macrotile, slabs as slabs_of};
 use std::sync::Arc;
 
 const SIZE: [u32; 2] = [256, 200];
@@ -162,6 +163,7 @@ fn cluster(workers: u32) -> Cluster {
         cores: None,
         in_flight: 1,
         stretch: 1.0,
+        mixed: false,
     }
 }
 
@@ -293,4 +295,39 @@ fn regions_have_no_barrier_and_bricks_come_where_they_are_asked_for() {
     let three =
         |jobs: &[FrameJob]| run(jobs, &trace, &Cluster { in_flight: 3, ..cluster(8) }).each_ms();
     assert!(three(&region) < eight.each_ms(), "{} {}", three(&region), eight.each_ms());
+}
+
+/// Keeps what is told of frames.
+#[derive(Default)]
+struct Listener(Vec<(FrameStats, Vec<Span>)>);
+
+impl sim::Stopwatch for Listener {
+    fn read(&mut self) -> Option<sim::Nanos> {
+        None
+    }
+
+    fn done(&mut self, stats: FrameStats, spans: Vec<Span>) {
+        self.0.push((stats, spans));
+    }
+}
+
+#[test]
+fn a_mixed_queue_begins_with_whole_tiles_and_goes_on_with_quarters() {
+    let (mut jobs, trace) = world(2);
+    for job in &mut jobs {
+        job.work.tile = Some(64);
+    }
+    let mut heard = Listener::default();
+    let mixed = Cluster { mixed: true, ..cluster(4) };
+    sim::run(&jobs, &trace, &mixed, &mut heard).expect("it can be predicted");
+    assert_eq!(heard.0.len(), 2);
+    for (stats, spans) in &heard.0 {
+        for slab in &stats.slabs {
+            let edges: Vec<u32> = slab.tiles.iter().map(|t| t.size).collect();
+            assert_eq!(edges[..4], [64; 4], "a whole tile for each thread");
+            assert!(edges.len() > 4 && edges[4..].iter().all(|e| *e == 32), "{edges:?}");
+        }
+        let tiles: usize = stats.slabs.iter().map(|s| s.tiles.len()).sum();
+        assert_eq!(spans.iter().filter(|s| s.category == "tile").count(), tiles);
+    }
 }

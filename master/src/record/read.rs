@@ -269,7 +269,7 @@ fn config(head: &Head) -> Result<Config, String> {
     if ![heartbeat, silence, lease].iter().all(|t| sane.contains(t)) || queue_ahead > 1 << 20 {
         return Err("has settings that no master has".into());
     }
-    Ok(Config { heartbeat, silence, lease, poison_after, queue_ahead })
+    Ok(Config { heartbeat, silence, lease, poison_after, queue_ahead, mixed: false })
 }
 
 fn key(text: &str) -> Result<BrickSetKey, String> {

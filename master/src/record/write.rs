@@ -123,7 +123,7 @@ fn write(mut out: impl Write, entries: &Receiver<Entry>) -> std::io::Result<Writ
 
 /// The first line.
 fn head(config: &Config) -> Head {
-    let &Config { heartbeat, silence, lease, poison_after, queue_ahead } = config;
+    let &Config { heartbeat, silence, lease, poison_after, queue_ahead, mixed: _ } = config;
     Head {
         version: VERSION,
         program: env!("CARGO_PKG_VERSION").into(),

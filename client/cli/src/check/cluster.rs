@@ -11,7 +11,7 @@ use slabcast_common::quality::{Quality, Work};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_master::driver::SubmitError;
-use slabcast_master::jobs::{JobState, WatchItem};
+use slabcast_master::jobs::{FinishedFrame, JobState, WatchItem};
 use slabcast_master::{Handle, Master, MasterConfig};
 use slabcast_render::splat::Simd;
 use std::time::Duration;
@@ -134,18 +134,25 @@ pub(super) async fn embedded_hashes(
     handle: Handle,
     request: PathRequest,
 ) -> Result<Vec<String>, Fail> {
+    embedded_frames(handle, request, |f| hash(f.number, &f.bytes, &f.stats.pixels_sha256)).await
+}
+
+/// What `of` makes of each frame of a request, by a master of this process.
+pub(crate) async fn embedded_frames<T>(
+    handle: Handle,
+    request: PathRequest,
+    mut of: impl FnMut(&FinishedFrame) -> Result<T, Fail>,
+) -> Result<Vec<T>, Fail> {
     let job = handle.submit(request).await.map_err(|e| match e {
         SubmitError::Refused(e) => Fail::failed(e.to_string()),
         other => Fail::failed(format!("the master takes no job: {other:?}")),
     })?;
     let mut watch =
         handle.watch(job, 0).ok_or_else(|| Fail::failed(format!("{job} was forgotten")))?;
-    let mut hashes = Vec::new();
+    let mut frames = Vec::new();
     while let Some(item) = watch.next().await {
         match item {
-            WatchItem::Frame(f) => {
-                hashes.push(hash(f.number, &f.bytes, &f.stats.pixels_sha256)?);
-            }
+            WatchItem::Frame(f) => frames.push(of(&f)?),
             WatchItem::Notice(view) => {
                 if let JobState::Failed(reason) = view.state {
                     return Err(Fail::failed(reason));
@@ -153,10 +160,11 @@ pub(super) async fn embedded_hashes(
             }
         }
     }
-    Ok(hashes)
+    Ok(frames)
 }
 
-async fn joined(handle: &Handle, workers: u32) -> Result<(), Fail> {
+/// Waits until so many workers are there.
+pub(crate) async fn joined(handle: &Handle, workers: u32) -> Result<(), Fail> {
     let all = async {
         while handle.workers().await.len() < workers as usize {
             tokio::time::sleep(Duration::from_millis(5)).await;

@@ -12,7 +12,7 @@ mod asked;
 mod cases;
 mod changes;
 mod closed;
-mod cluster;
+pub(crate) mod cluster;
 mod colour_rule;
 mod convergence;
 mod enclose;

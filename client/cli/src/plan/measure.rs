@@ -7,6 +7,7 @@
 use super::clock::cpu_ns;
 use crate::fail::Fail;
 use crate::progress::{Progress, Step};
+use crate::signals;
 use crate::stage::Stage;
 use prost::Message;
 use slabcast_common::PIXELS_VERSION;
@@ -32,17 +33,19 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 /// What is measured.
-pub(super) struct Path<'a> {
-    pub(super) stage: &'a Stage,
-    pub(super) frames: usize,
-    pub(super) work: Work,
+pub(crate) struct Path<'a> {
+    pub(crate) stage: &'a Stage,
+    pub(crate) frames: usize,
+    pub(crate) work: Work,
     /// Numbers of tiles that schedules will want: they decide which levels are drawn.
-    pub(super) wanted: Vec<u64>,
+    pub(crate) wanted: Vec<u64>,
+    /// Edges that are drawn whatever schedules will want.
+    pub(crate) edges: Vec<u32>,
     /// For which schedules.
-    pub(super) slab: bool,
-    pub(super) region: bool,
-    pub(super) repeats: u32,
-    pub(super) names: (String, String),
+    pub(crate) slab: bool,
+    pub(crate) region: bool,
+    pub(crate) repeats: u32,
+    pub(crate) names: (String, String),
 }
 
 /// The bricks as a master knows them.
@@ -58,7 +61,7 @@ fn infos(stage: &Stage) -> Arc<[BrickInfo]> {
 }
 
 /// The path's frames as the scheduler gets them.
-pub(super) fn jobs(stage: &Stage, frames: usize, work: Work) -> Result<Vec<FrameJob>, Fail> {
+pub(crate) fn jobs(stage: &Stage, frames: usize, work: Work) -> Result<Vec<FrameJob>, Fail> {
     let bricks = infos(stage);
     let mut scene = Arc::new(stage.spec(0));
     (0..frames)
@@ -75,16 +78,23 @@ pub(super) fn jobs(stage: &Stage, frames: usize, work: Work) -> Result<Vec<Frame
         .collect()
 }
 
-/// Draws the tiles.
-pub(super) fn measure(path: &Path<'_>, progress: &mut Progress) -> Result<Trace, Fail> {
+/// Draws the tiles. `progress` counts frames; so many were done before. Who is told to stop has fewer
+/// frames in the trace than were asked for.
+pub(crate) fn measure(
+    path: &Path<'_>,
+    (progress, before): (&mut Progress, usize),
+) -> Result<Trace, Fail> {
     let jobs = jobs(path.stage, path.frames, path.work)?;
     let mut bench = Bench { scratch: Scratch::default(), repeats: path.repeats };
     let mut frames = Vec::with_capacity(jobs.len());
     // What a worker has after its first frame: footprints in the scene, memory that has grown.
     bench.frame(path, 0, &jobs[0])?;
     for (i, job) in jobs.iter().enumerate() {
+        if signals::told() {
+            break;
+        }
         frames.push(bench.frame(path, i, job)?);
-        progress.step(Step { frames: i as u64 + 1, ..Step::default() });
+        progress.step(Step { frames: (before + i) as u64 + 1, ..Step::default() });
     }
     let about = About {
         volume: path.names.0.clone(),
@@ -206,11 +216,10 @@ impl Bench {
         let size = job.view.size;
         let edges: BTreeSet<u32> = match path.work.tile {
             Some(edge) => [edge].into(),
-            None => path
-                .wanted
-                .iter()
-                .map(|&w| macrotile::cut(size, &rects, shut, cull, w, None).edge)
-                .collect(),
+            None => {
+                let of = |w: &u64| macrotile::cut(size, &rects, shut, cull, *w, None).edge;
+                path.wanted.iter().map(of).chain(path.edges.iter().copied()).collect()
+            }
         };
         let (mut levels, mut first) = (Vec::new(), Vec::new());
         for &edge in edges.iter().rev() {
@@ -367,7 +376,7 @@ fn weigh(lease: Lease, pixels: TilePixels, counters: Counters) -> (u32, u32, Til
 }
 
 /// Whether a trace is of this path, frame by frame.
-pub(super) fn fits(trace: &Trace, jobs: &[FrameJob]) -> Result<(), String> {
+pub(crate) fn fits(trace: &Trace, jobs: &[FrameJob]) -> Result<(), String> {
     if trace.frames.len() != jobs.len() {
         return Err(format!(
             "has {} frames, the path {}; measure it again",

@@ -6,10 +6,10 @@
 //! processor, [`chart`] draws. [`rehearse`] puts it to the test with processes on this machine.
 
 mod chart;
-mod clock;
+pub(crate) mod clock;
 mod costs;
-mod measure;
-mod predict;
+pub(crate) mod measure;
+pub(crate) mod predict;
 mod rehearse;
 
 use crate::fail::{Fail, say};
@@ -29,7 +29,7 @@ use std::path::{Path, PathBuf};
 
 /// What a stream gets through of a link's nominal rate: heads of Ethernet, IP, TCP, HTTP/2. 118 MB/s
 /// were measured on an emulated link of 1 Gbit/s (TRANSPORT.md, answer 7).
-const GOODPUT: f64 = 0.94;
+pub(crate) const GOODPUT: f64 = 0.94;
 
 /// Predicts time, efficiency and bytes of a cluster before it is there.
 ///
@@ -151,12 +151,13 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
                 frames,
                 work,
                 wanted: wanted.collect(),
+                edges: Vec::new(),
                 slab: schedules.contains(&Schedule::Slab),
                 region: schedules.contains(&Schedule::Region),
                 repeats: args.repeats,
                 names,
             };
-            let trace = measure::measure(&path, &mut progress)?;
+            let trace = measure::measure(&path, (&mut progress, 0))?;
             if let Some(file) = file {
                 write_atomic(file, |out| out.write_all(trace.to_json().as_bytes()))?;
             }
@@ -169,7 +170,8 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
         bytes_per_s: args.link.0.map(|bits| bits / 8.0 * GOODPUT),
         latency_ns: args.latency,
     };
-    let question = Question { threads: args.threads, link, cores: None, stretch: 1.0 };
+    let question =
+        Question { threads: args.threads, link, cores: None, stretch: 1.0, mixed: false };
     let threads = embedded::cores() as usize;
     let mut predicted = Vec::new();
     for schedule in schedules {

@@ -10,7 +10,7 @@ use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Stopwatch, Too
 
 /// What a frame's time goes into.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Bound {
+pub(crate) enum Bound {
     /// Rendering, spread evenly.
     Cores,
     /// Waiting for whoever has the last tile.
@@ -22,7 +22,7 @@ pub(super) enum Bound {
 }
 
 impl Bound {
-    pub(super) fn name(self) -> &'static str {
+    pub(crate) fn name(self) -> &'static str {
         match self {
             Bound::Cores => "cores",
             Bound::Straggler => "straggler",
@@ -34,59 +34,70 @@ impl Bound {
 
 /// What is said of a cluster.
 #[derive(Clone, Debug)]
-pub(super) struct Row {
-    pub(super) workers: u32,
+pub(crate) struct Row {
+    pub(crate) workers: u32,
     /// The first frame, with all its bricks, in ms.
-    pub(super) first_ms: f64,
+    pub(crate) first_ms: f64,
     /// A later frame, one in flight, in ms.
-    pub(super) frame_ms: f64,
+    pub(crate) frame_ms: f64,
     /// Against one worker's best time over the number of render threads.
-    pub(super) latency_efficiency: f64,
+    pub(crate) latency_efficiency: f64,
     /// Frames a second, as many in flight as a master has.
-    pub(super) frames_per_s: f64,
-    pub(super) throughput_efficiency: f64,
+    pub(crate) frames_per_s: f64,
+    pub(crate) throughput_efficiency: f64,
     /// Bytes of a later frame: down, up, bricks.
-    pub(super) bytes: [f64; 3],
+    pub(crate) bytes: [f64; 3],
     /// Leases of a later frame.
-    pub(super) leases: f64,
+    pub(crate) leases: f64,
     /// The resource that a frame's time goes into before all, and which part.
-    pub(super) bound: (Bound, f64),
+    pub(crate) bound: (Bound, f64),
     /// All parts: cores, straggler, link, master, in ms.
-    pub(super) parts: [f64; 4],
+    pub(crate) parts: [f64; 4],
     /// Work of the master a frame, in ms: driver, streams, finisher.
-    pub(super) master_ms: [f64; 3],
+    pub(crate) master_ms: [f64; 3],
 }
 
 /// Frames that a master has in hand (`master::driver`).
-pub(super) const IN_FLIGHT: u32 = 3;
+pub(crate) const IN_FLIGHT: u32 = 3;
 
 /// What is asked.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Question {
-    pub(super) threads: u32,
-    pub(super) link: Link,
-    pub(super) cores: Option<u32>,
-    pub(super) stretch: f64,
+pub(crate) struct Question {
+    pub(crate) threads: u32,
+    pub(crate) link: Link,
+    pub(crate) cores: Option<u32>,
+    pub(crate) stretch: f64,
+    pub(crate) mixed: bool,
 }
 
 impl Question {
-    pub(super) fn cluster(&self, workers: u32, costs: Costs, in_flight: u32) -> Cluster {
-        let &Question { threads, link, cores, stretch } = self;
-        Cluster { workers, threads, link, costs, cores, in_flight, stretch }
+    pub(crate) fn cluster(&self, workers: u32, costs: Costs, in_flight: u32) -> Cluster {
+        let &Question { threads, link, cores, stretch, mixed } = self;
+        Cluster { workers, threads, link, costs, cores, in_flight, stretch, mixed }
     }
 }
 
-pub(super) fn simulate(
+pub(crate) fn simulate(
     jobs: &[FrameJob],
     trace: &Trace,
     cluster: &Cluster,
 ) -> Result<Outcome, Fail> {
-    let ran = sim::run(jobs, trace, cluster, &mut Unmeasured);
+    watched(jobs, trace, cluster, &mut Unmeasured)
+}
+
+/// The same while somebody looks on.
+pub(crate) fn watched(
+    jobs: &[FrameJob],
+    trace: &Trace,
+    cluster: &Cluster,
+    watch: &mut dyn Stopwatch,
+) -> Result<Outcome, Fail> {
+    let ran = sim::run(jobs, trace, cluster, watch);
     ran.map(|r| r.0).map_err(|e| Fail::failed(e.to_string()))
 }
 
 /// Predicts every number of workers, on `threads` threads of this machine.
-pub(super) fn rows(
+pub(crate) fn rows(
     jobs: &[FrameJob],
     trace: &Trace,
     workers: &[u32],
@@ -163,13 +174,13 @@ impl Stopwatch for Cpu {
 
 /// What deciding costs on this machine: the scheduler runs the path once on `workers` (whose tiles are
 /// in the trace), and is timed.
-pub(super) fn measured_costs(
+pub(crate) fn measured_costs(
     jobs: &[FrameJob],
     trace: &Trace,
     (workers, threads): (u32, u32),
 ) -> Result<Costs, Fail> {
     let messages = costs::messages(trace);
-    let question = Question { threads, link: Link::NONE, cores: None, stretch: 1.0 };
+    let question = Question { threads, link: Link::NONE, cores: None, stretch: 1.0, mixed: false };
     let mut watch = Cpu;
     let cluster = question.cluster(workers, messages, 1);
     let (_, took) =

@@ -178,7 +178,8 @@ impl Stage<'_> {
     /// What is predicted for this machine.
     fn predict(&self, workers: u32, costs: Costs) -> Result<Outcome, Fail> {
         let cores = Some(embedded::cores());
-        let question = Question { threads: self.threads, link: Link::NONE, cores, stretch: 1.0 };
+        let question =
+            Question { threads: self.threads, link: Link::NONE, cores, stretch: 1.0, mixed: false };
         let cluster = question.cluster(workers, costs, predict::IN_FLIGHT);
         predict::simulate(self.jobs, self.trace, &cluster)
     }

@@ -191,7 +191,7 @@ pub fn run(
         trace,
         jobs,
         clock: VirtualClock(Cell::new(1_000_000)),
-        scheduler: Scheduler::new(Config::default()),
+        scheduler: Scheduler::new(Config { mixed: cluster.mixed, ..Config::default() }),
         coming: BTreeMap::new(),
         order: 0,
         workers: BTreeMap::new(),
@@ -711,12 +711,17 @@ impl World<'_> {
         self.driver_busy = true;
         self.later(end, Coming::Free);
         for action in actions {
-            self.carry_out(action, end)?;
+            self.carry_out(action, end, watch)?;
         }
         Ok(())
     }
 
-    fn carry_out(&mut self, action: Action, at: Nanos) -> Result<(), Unknown> {
+    fn carry_out(
+        &mut self,
+        action: Action,
+        at: Nanos,
+        watch: &mut dyn Stopwatch,
+    ) -> Result<(), Unknown> {
         match action {
             Action::Send { worker, message } => {
                 let bytes = match &message {
@@ -757,7 +762,8 @@ impl World<'_> {
                 }
                 self.batches(worker, at);
             }
-            Action::FrameDone { frame, .. } => {
+            Action::FrameDone { frame, stats, spans, .. } => {
+                watch.done(*stats, spans);
                 let i = frame.0 as usize - 1;
                 self.shut.retain(|(f, _), _| *f != i);
                 // The scheduler goes on with the next at once, where there is one.

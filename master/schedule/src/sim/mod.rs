@@ -26,8 +26,9 @@ mod pipe;
 
 pub use cluster::run;
 
-use crate::Micros;
+use crate::{Micros, Span};
 use slabcast_common::occlusion::Rect;
+use slabcast_common::stats::FrameStats;
 use slabcast_common::trace::Trace;
 
 /// Nanoseconds since the cluster began.
@@ -106,6 +107,8 @@ pub struct Cluster {
     pub in_flight: u32,
     /// What rendering times are multiplied with.
     pub stretch: f64,
+    /// [`Config::mixed`](crate::Config::mixed).
+    pub mixed: bool,
 }
 
 /// What became of a frame.
@@ -182,10 +185,16 @@ pub enum Unknown {
     },
 }
 
-/// Measures what the scheduler takes of the real machine while a simulation runs.
+/// Looks on while a simulation runs.
 pub trait Stopwatch {
-    /// Nanoseconds since some moment; `None`: nobody measures.
+    /// What the scheduler takes of the real machine: nanoseconds since some moment; `None`: nobody
+    /// measures.
     fn read(&mut self) -> Option<Nanos>;
+
+    /// A frame is done: its statistics and what happened when, as a master would have them.
+    fn done(&mut self, stats: FrameStats, spans: Vec<Span>) {
+        drop((stats, spans));
+    }
 }
 
 /// Nobody measures.

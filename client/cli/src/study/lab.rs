@@ -1,0 +1,284 @@
+//! What a study measures, and in what order: so that what is finished stands by itself when somebody
+//! stops it.
+
+use super::paper::{self, NODES};
+use super::simulate::{Bed, Pace};
+use super::{
+    Effects, Machine, Study, StudyArgs, effects, live, nodes, order, runs, verdict, write,
+};
+use crate::embedded;
+use crate::fail::Fail;
+use crate::plan::GOODPUT;
+use crate::plan::measure::{self, Path as Measured};
+use crate::progress::{self, Progress, Step};
+use crate::request::{Asked, Opened};
+use crate::signals;
+use crate::stage::Stage;
+use slabcast_common::quality::{Borders, Kernel, Quality, Schedule, Work};
+use slabcast_common::view::MAX_EDGE;
+use slabcast_schedule::sim::Link;
+
+/// Frames of a setting of radius or size.
+const EFFECT_FRAMES: usize = 3;
+/// Views of a first look.
+const QUICK_VIEWS: usize = 6;
+/// Wanted ratio of macrotiles to rendering nodes: the middle of the paper's 2 to 3 (4.3).
+const TILES_A_NODE: f64 = 2.5;
+
+/// The work of the slab schedule in so many slabs of one thickness, as in the paper.
+fn work(slabs: u32) -> Work {
+    Work {
+        slabs,
+        tiles_per_worker: TILES_A_NODE,
+        schedule: Schedule::Slab,
+        borders: Borders::Equal,
+        ..Work::default()
+    }
+}
+
+/// What a study is made with.
+pub(super) struct Lab<'a> {
+    args: &'a StudyArgs,
+    asked: Asked,
+    opened: Opened,
+    link: Link,
+    repeats: u32,
+    views: usize,
+    /// Rendering nodes that are run for real.
+    live: Vec<u32>,
+    progress: Progress,
+    done: usize,
+}
+
+impl Lab<'_> {
+    /// Opens the volume and refuses what can't be drawn of it.
+    pub(super) fn open(args: &StudyArgs) -> Result<Lab<'_>, Fail> {
+        let mut asked = args.of.look.asked(work(paper::SLABS[0]))?;
+        if args.quick && asked.path.frames() > QUICK_VIEWS {
+            let first = asked.path.first_frame() as u32;
+            asked.path.range = Some([first, first + QUICK_VIEWS as u32 - 1]);
+        }
+        let mut progress = Progress::new(false).of("view");
+        progress.stage(&format!("reading {}", args.of.volume.display()));
+        let opened = args.of.open(&asked)?;
+        let cores = embedded::cores();
+        let views = asked.path.frames();
+        // 2, 4, 8, 12 and 15 rendering nodes, and one.
+        let live = std::iter::once(1).chain(NODES.map(|n| n - 1)).filter(|n| *n <= cores).collect();
+        Ok(Lab {
+            args,
+            asked,
+            opened,
+            link: Link {
+                bytes_per_s: args.link.0.map(|bits| bits / 8.0 * GOODPUT),
+                latency_ns: args.latency,
+            },
+            repeats: if args.quick { 1 } else { args.repeats },
+            views,
+            live,
+            progress,
+            done: 0,
+        })
+    }
+
+    fn stage(&self, asked: &Asked) -> Result<Stage, Fail> {
+        Stage::new(&self.opened.volume, &self.opened.info, asked, self.opened.orientation)
+    }
+
+    /// Draws the tiles of some views and makes them ready to be simulated.
+    fn bed(
+        &mut self,
+        stage: &Stage,
+        asked: &Asked,
+        views: usize,
+        schedules: &[Schedule],
+        repeats: u32,
+    ) -> Result<Bed, Fail> {
+        let most = NODES.iter().map(|n| n - 1).chain(self.live.iter().copied());
+        let wanted = most.chain([paper::FIGURE_1_WORKERS]);
+        let path = Measured {
+            stage,
+            frames: views,
+            work: asked.work,
+            wanted: wanted.map(|n| (TILES_A_NODE * f64::from(n)).ceil() as u64).collect(),
+            edges: vec![32, 64],
+            slab: true,
+            region: schedules.contains(&Schedule::Region),
+            repeats,
+            names: (self.opened.volume.name.clone(), asked.transfer.name()),
+        };
+        let jobs = measure::jobs(stage, views, asked.work)?;
+        let trace = measure::measure(&path, (&mut self.progress, self.done))?;
+        self.done += views;
+        Bed::new(jobs, trace, self.link, schedules, NODES[4] - 1)
+    }
+
+    /// All of it, or what was finished when somebody said stop.
+    pub(super) fn study(mut self) -> Result<Study, Fail> {
+        let threads = embedded::cores() as usize;
+        let mut asked = self.asked.clone();
+        self.progress.stage("cutting the volume into bricks");
+        let stage = self.stage(&asked)?;
+        let settings = self.settings();
+        let of_effects: usize = settings.iter().map(|_| EFFECT_FRAMES.min(self.views)).sum();
+        let of_live = self.live.len() * 2 * self.asked.path.frames();
+        let total = 2 * self.views + of_live + of_effects;
+        self.progress.frames(total as u64, &format!("drawing the tiles of {total} views"));
+
+        let schedules = [Schedule::Slab, Schedule::Region];
+        let views = self.views;
+        let bed = self.bed(&stage, &asked, views, &schedules, self.repeats)?;
+        let mut study = self.empty(&stage, &bed);
+        if bed.trace.frames.len() < 2.min(views) {
+            self.progress.end();
+            return Err(Fail::failed(
+                "stopped before two views were drawn: there is nothing to say",
+            ));
+        }
+        let stopped = bed.trace.frames.len() < views;
+        study.views = bed.trace.frames.len();
+        study.figure_1 = order::find(&bed)?;
+        study.table_1 = nodes::table_1(&bed)?;
+        study.figure_3 = nodes::breakdowns(&bed)?;
+        study.runs = runs::simulated(&bed, Schedule::Slab, &self.live, threads)?;
+        study.runs.extend(runs::simulated(&bed, Schedule::Region, &self.live, threads)?);
+        study.effects.bricks = effects::bricks(&stage, &bed);
+
+        let alone = bed.alone_ms(Pace::Here);
+        if !(stopped || signals::told()) {
+            let works = paper::SLABS.map(work);
+            for workers in self.live.clone() {
+                self.progress.step(Step {
+                    frames: self.done as u64,
+                    detail: format!("{workers} workers of this machine"),
+                    ..Step::default()
+                });
+                let told = live::run(&self.opened, &self.asked, workers, &works)?;
+                for (slabs, frames) in paper::SLABS.into_iter().zip(&told) {
+                    study.runs.push(runs::measured(slabs, workers, alone, frames));
+                }
+                self.done += 2 * self.asked.path.frames();
+                if signals::told() {
+                    break;
+                }
+            }
+        }
+        if !(stopped || signals::told()) {
+            asked.work = work(paper::SLABS[1]);
+            let five = self.bed(&stage, &asked, views, &[Schedule::Slab], self.repeats)?;
+            if five.trace.frames.len() == views {
+                study.runs.extend(runs::simulated(&five, Schedule::Slab, &self.live, threads)?);
+            }
+            study.effects.culling = Some(effects::culling(&stage, views)?);
+        }
+        drop(stage);
+        let stretch = bed.stretch(Pace::Paper);
+        for (name, asked) in settings {
+            if stopped || signals::told() {
+                break;
+            }
+            let stage = self.stage(&asked)?;
+            let n = EFFECT_FRAMES.min(views);
+            let bed = self.bed(&stage, &asked, n, &[Schedule::Slab], 1)?;
+            if bed.trace.frames.len() == n {
+                let is_radius = name.starts_with("radius");
+                let setting = effects::Setting::new(name, &bed, stretch)?;
+                let of = &mut study.effects;
+                if is_radius { of.radii.push(setting) } else { of.sizes.push(setting) }
+            }
+        }
+        self.progress.end();
+        if stopped || signals::told() {
+            progress::note("stopped: what is finished is written down");
+            study.left_out.push("Stopped before the end: later parts are missing.".into());
+        } else {
+            study.complete = true;
+        }
+        study.figure_4 = runs::data(&study.runs, study.voxels, study.bytes);
+        study.verdicts = verdict::verdicts(&study);
+        Ok(study)
+    }
+
+    /// Radius and size, one at a time: a name and what is asked for.
+    fn settings(&self) -> Vec<(String, Asked)> {
+        let mut all = Vec::new();
+        let base = &self.asked;
+        if base.quality.kernel == Kernel::Gaussian {
+            for radius in [1.0, 1.5, 2.0] {
+                let quality = Quality { radius, ..base.quality };
+                if quality.check().is_ok() {
+                    let mut asked = base.clone();
+                    asked.quality = quality;
+                    all.push((format!("radius {radius}"), asked));
+                }
+            }
+        }
+        // The paper's 512, 1024 and 2048 where nobody asks for another size.
+        let times: &[u32] = if self.args.quick { &[1, 2] } else { &[1, 2, 4] };
+        for n in times {
+            let [w, h] = base.path.size.map(|x| x * n);
+            if w.max(h) <= MAX_EDGE {
+                let mut asked = base.clone();
+                asked.path.size = [w, h];
+                all.push((format!("{w}x{h}"), asked));
+            }
+        }
+        all
+    }
+
+    /// A study without figures.
+    fn empty(&self, stage: &Stage, bed: &Bed) -> Study {
+        let mut left_out = vec![
+            "Bricks of 4 and 16 voxels are counted, not drawn: slabcast's bricks are 8. The paper has \
+             no numbers for them either."
+                .to_string(),
+        ];
+        if self.asked.quality.kernel != Kernel::Gaussian {
+            left_out.push("The kernel has one radius: only --kernel gaussian has several.".into());
+        }
+        if self.args.quick {
+            left_out.push(
+                "--quick: six views at most, each tile drawn once, not four times the size.".into(),
+            );
+        }
+        let q = &self.asked.quality;
+        let [std, radius] = q.shape();
+        Study {
+            version: 1,
+            slabcast: env!("CARGO_PKG_VERSION"),
+            pixels_version: slabcast_common::PIXELS_VERSION,
+            command: write::command(),
+            volume: self.opened.volume.name.clone(),
+            digest: self.opened.info.digest.to_string(),
+            tf: self.asked.transfer.name(),
+            size: self.asked.path.size,
+            views: self.views,
+            kernel: format!(
+                "{}, {std:.2} wide, cut at {radius}",
+                crate::front::setting::lower(&q.kernel)
+            ),
+            machine: Machine {
+                cpu: crate::machine::cpu(),
+                cores: embedded::cores() as usize,
+                simd: slabcast_render::splat::Simd::detect().name(),
+            },
+            link: self.args.link.to_string(),
+            latency_us: self.args.latency as f64 / 1e3,
+            repeats: self.repeats,
+            voxels: stage.bricks.iter().map(|b| b.len() as u64).sum(),
+            bytes: stage.bricks.iter().map(|b| b.encoded_len() as u64).sum(),
+            alone_ms: bed.alone_ms(Pace::Here),
+            stretch: bed.stretch(Pace::Paper),
+            complete: false,
+            left_out,
+            verdicts: Vec::new(),
+            table_1: Vec::new(),
+            table_1_of_the_paper: paper::TABLE_1,
+            figure_1: None,
+            figure_3: Vec::new(),
+            figure_4: Vec::new(),
+            runs: Vec::new(),
+            effects: Effects::default(),
+        }
+    }
+}

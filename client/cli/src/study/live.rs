@@ -1,0 +1,44 @@
+//! The paper's schedule for real, as far as this machine has cores: a master and workers of one
+//! thread each inside this process.
+//!
+//! The master has no core of its own here: with as many workers as cores, it takes from theirs.
+
+use crate::check::cluster::{embedded_frames, joined};
+use crate::embedded::{Cluster, Crew};
+use crate::fail::Fail;
+use crate::request::{Asked, Opened};
+use crate::runtime;
+use slabcast_common::image::PixelFormat;
+use slabcast_common::quality::Work;
+use slabcast_common::stats::FrameStats;
+
+/// Renders the path with `workers`, once for each of `works`; the frames' statistics.
+pub(super) fn run(
+    opened: &Opened,
+    asked: &Asked,
+    workers: u32,
+    works: &[Work],
+) -> Result<Vec<Vec<FrameStats>>, Fail> {
+    let runtime = runtime::start()?;
+    let (volume, info) = (opened.volume.clone(), &opened.info);
+    let all = runtime.block_on(async {
+        let crew = Crew::new(workers, Some(1))?;
+        let mut cluster = Cluster::start(volume, opened.orientation, crew, None)?;
+        joined(&cluster.handle(), workers).await?;
+        let mut all = Vec::new();
+        for &work in works {
+            let mut asked = asked.clone();
+            asked.work = work;
+            let request = asked.request(info, PixelFormat::Rgb8, false);
+            let frames = embedded_frames(cluster.handle(), request, |f| Ok(f.stats.clone()));
+            all.push(tokio::select! {
+                frames = frames => frames?,
+                trouble = cluster.trouble() => return Err(trouble),
+            });
+        }
+        cluster.end().await;
+        Ok(all)
+    });
+    runtime::end(runtime);
+    all
+}

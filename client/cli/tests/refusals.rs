@@ -372,7 +372,6 @@ fn flags() -> Vec<(Vec<&'static str>, &'static [&'static str])> {
         (with(&["--budget", "0s"]), &["--budget", "0.5s"]),
         (with(&["--budget", "1s", "--thickness", "2"]), &["--budget", "--thickness"]),
         (with(&["--error", "0.1", "--show", "work"]), &["--error", "--show"]),
-        (vec!["render", "--master", "a:1", "--error", "1/255"], &["--error", "slabcast report"]),
         (vec!["explain", "good.nrrd", "--pixel", "1,1", "--error", "0.1"], &["--error", "render"]),
         (vec!["report", "good.nrrd", "--only", "colour"], &["--only", "thickness"]),
         (vec!["report", "good.nrrd", "--seconds", "0"], &["--seconds", "above 0"]),

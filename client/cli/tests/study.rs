@@ -134,6 +134,13 @@ fn a_study_agrees_with_itself() {
     for origin in ["measured", "predicted", "paper"] {
         assert!(page.contains(&format!("<td>{origin}</td>")) || page.contains(origin), "{origin}");
     }
+    // Of nothing there is none, and no folder of it.
+    let nothing = ["study", name, "-o", "none", "--quick", "--crop", "0%:1%,0%:1%,0%:1%"];
+    let out = run(dir, &[&nothing[..], &SMALL[..2]].concat());
+    let said = text(&out.stderr);
+    assert_eq!(out.status.code(), Some(1), "{said}");
+    assert!(said.contains("no view shows anything") && said.contains("--tf"), "{said}");
+    assert!(!dir.join("none").exists());
     // A study is not written over.
     let again = run(dir, &[&["study", name, "-o", "out/s"], &SMALL[..]].concat());
     let said = text(&again.stderr);

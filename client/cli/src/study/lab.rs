@@ -135,6 +135,13 @@ impl Lab<'_> {
                 "stopped before two views were drawn: there is nothing to say",
             ));
         }
+        if bed.trace.frames.iter().flat_map(|f| &f.slabs).all(|s| s.levels.is_empty()) {
+            self.progress.end();
+            return Err(Fail::failed(
+                "no view shows anything: there is nothing to time; give another --tf or --crop \
+                 (`slabcast info VOLUME` has the range of values)",
+            ));
+        }
         let stopped = bed.trace.frames.len() < views;
         study.views = bed.trace.frames.len();
         study.figure_1 = order::find(&bed)?;

@@ -230,7 +230,7 @@ pub struct Work {
     pub keep: Keep,
     /// Where slabs end.
     pub borders: Borders,
-    /// One pixel in 64 is drawn in thinner sheets, too, for the statistics' estimate of what the
+    /// One pixel in 128 is drawn in thinner sheets, too, for the statistics' estimate of what the
     /// thickness costs (`region` schedule).
     pub estimate: bool,
 }

@@ -3,7 +3,7 @@
 //! What thin sheets come to is not known where a frame is drawn; how much a picture changes when they
 //! become thinner is, and it tells: an error that falls with the power p of the thickness is
 //! 1 / (1 - 2^-p) of that change (Richardson's extrapolation; [`slabcast_common::stats::EXTRAPOLATION`]).
-//! One pixel in 64 is drawn twice, in blocks, since neighbours share footprints.
+//! One pixel in 128 is drawn twice, in blocks, since neighbours share footprints.
 
 use crate::scene::{Frame, Scene};
 use crate::splat::Simd;
@@ -22,7 +22,7 @@ use std::sync::Arc;
 const BLOCK: i32 = 8;
 
 /// Of so many pixels one is drawn again, in a picture of some size.
-const ONE_IN: u32 = 64;
+const ONE_IN: u32 = 128;
 
 /// Blocks of a small picture at least. From half as many the estimate was off by more than two.
 const AT_LEAST: u32 = 32;
@@ -53,8 +53,8 @@ impl Pair {
     }
 }
 
-/// The blocks of a tile that are drawn again: of a large picture one of 8x8 pixels in a tile of 64x64, as
-/// many more in a larger one, and in a smaller one sometimes.
+/// The blocks of a tile that are drawn again: of a large picture one of 8x8 pixels in every other tile of 64x64,
+/// more in a larger one, and in a smaller one sometimes.
 fn blocks(tile: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
     let [w, h] = [tile.x1 - tile.x0, tile.y1 - tile.y0].map(|n| n / BLOCK);
     let all = (w * h) as u32;
@@ -108,7 +108,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_pixel_in_sixty_four_is_drawn_again_whatever_the_tiles() {
+    fn so_many_pixels_are_drawn_again_whatever_the_tiles() {
         for edge in [16, 32, 64, 128, 256] {
             let mut pixels = 0;
             for y in (0..2048).step_by(edge as usize) {

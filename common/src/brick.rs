@@ -236,6 +236,20 @@ impl Brick {
         out.extend(crc.to_le_bytes());
     }
 
+    /// The name of a brick whose encoding is broken, to ask for it again; `None` where there is none. If a
+    /// single bit of the name is what is wrong, the checksum tells which one.
+    pub fn name(bytes: &[u8]) -> Option<BrickId> {
+        let (body, crc) = bytes.split_at_checked(bytes.len().checked_sub(TAIL)?)?;
+        let id = u32::from_le_bytes(*bytes.first_chunk()?);
+        let (Ok(crc), Some(rest)) = (crc.try_into(), body.get(4..)) else {
+            return Some(BrickId(id));
+        };
+        let crc = u32::from_le_bytes(crc);
+        let fits = |id: &u32| crc32c::crc32c_append(crc32c::crc32c(&id.to_le_bytes()), rest) == crc;
+        let near = (0..u32::BITS).map(|bit| id ^ 1 << bit);
+        Some(BrickId(near.into_iter().find(fits).unwrap_or(id)))
+    }
+
     /// The brick that [`Brick::encode`] wrote as exactly these bytes.
     pub fn decode(bytes: &[u8]) -> Result<Brick, BrickError> {
         let have = bytes.len();

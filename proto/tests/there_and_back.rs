@@ -9,6 +9,7 @@ use slabcast_common::brick::Brick;
 use slabcast_common::ids::BrickId;
 use slabcast_common::image::{PixelFormat, RawSums};
 use slabcast_common::message::{ToMaster, ToWorker};
+use slabcast_common::volume::Samples;
 use slabcast_proto::convert::{self, Bricks, Down};
 use slabcast_proto::model::FrameChunk;
 use slabcast_proto::{MAX_BRICKS_MESSAGE, MAX_CONTROL_MESSAGE, MAX_FRAME_CHUNK, v1};
@@ -124,7 +125,7 @@ proptest! {
 fn a_broken_brick_is_named_and_the_others_are_taken() {
     let encode = |id| {
         let mut bytes = Vec::new();
-        let values = slabcast_common::volume::Samples::U8(vec![8, 9]);
+        let values = Samples::U8(vec![8, 9]);
         let brick = Brick::new(BrickId(id), vec![3, 4], values, None);
         brick.encode(&mut bytes);
         bytes
@@ -250,4 +251,46 @@ fn a_frame_of_any_length_is_cut_and_put_together() {
     assert_eq!(put_together(MAX_FRAME_CHUNK - 255, "{}", "[]"), 2);
     let long = "\u{20ac}\"a".repeat(600_000);
     assert_eq!(put_together(5, &long, &long), 6);
+}
+
+#[test]
+fn whatever_bit_is_flipped_on_the_way_one_brick_is_sent_again() {
+    let mut state = 0x9e37_79b9_7f4a_7c15u64;
+    let mut next = move |below: usize| {
+        state =
+            state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        ((state >> 33) % below as u64) as usize
+    };
+    let bricks: Vec<Brick> = (0..9u32)
+        .map(|i| {
+            let n = [1, 17, 512][i as usize % 3];
+            let voxels = (0..n as u16).collect();
+            let values = Samples::U8((0..n).map(|_| next(256) as u8).collect());
+            let normals = (i % 2 == 0).then(|| (0..n).map(|_| next(1 << 16) as u16).collect());
+            Brick::new(BrickId(700 + i), voxels, values, normals)
+        })
+        .collect();
+    let encoded: Vec<Bytes> = bricks
+        .iter()
+        .map(|b| {
+            let mut bytes = Vec::new();
+            b.encode(&mut bytes);
+            bytes.into()
+        })
+        .collect();
+    for flip in 0..100_000 {
+        let which = next(bricks.len());
+        let mut spoilt = encoded[which].to_vec();
+        let at = next(spoilt.len() * 8);
+        spoilt[at / 8] ^= 1 << (at % 8);
+        let mut batch = encoded.clone();
+        batch[which] = spoilt.into();
+        let message = convert::brick_batches_to_wire(&Default::default(), batch).remove(0);
+        let Ok(Bricks::Batch(batch)) = convert::bricks_from_wire(message) else {
+            panic!("flip {flip}: all bricks were refused for one")
+        };
+        assert!(batch.bricks.iter().all(|b| b.id != bricks[which].id), "flip {flip} was not seen");
+        assert_eq!(batch.bricks.len(), bricks.len() - 1, "flip {flip}: the others are taken");
+        assert_eq!(batch.broken, [bricks[which].id], "flip {flip}");
+    }
 }

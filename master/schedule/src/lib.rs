@@ -485,8 +485,15 @@ impl Scheduler {
             }
             Event::BricksBroken { worker, set, bricks } => {
                 cluster.roster.heard(worker, now);
-                let landed = cluster.residency.broken(worker, set, &bricks);
-                self.after_bricks(worker, landed, now);
+                if cluster.residency.was_sent(worker, set, &bricks) {
+                    let landed = cluster.residency.broken(worker, set, &bricks);
+                    self.after_bricks(worker, landed, now);
+                } else {
+                    // Its name was spoilt, too: nobody knows which one it lacks. When it dials again it
+                    // says which it holds.
+                    let reason = "it named a broken brick that was not sent to it".to_string();
+                    self.drop_worker(worker, reason, false, now);
+                }
             }
             Event::BricksWanted { worker, set, bricks } => {
                 cluster.roster.heard(worker, now);

@@ -418,6 +418,15 @@ impl Residency {
         shelf.landed()
     }
 
+    /// Whether a worker holds these, as far as is known here, or they are on their way to it or back.
+    pub(crate) fn was_sent(&self, worker: WorkerId, key: BrickSetKey, ids: &[BrickId]) -> bool {
+        let books = self.shelves.get(&worker).and_then(|s| s.sets.get(&key));
+        // Of a set that is gone nothing is lacked.
+        let (Some(set), Some(books)) = (self.sets.get(&key), books) else { return true };
+        let known = |i: u32| books.place[i as usize] != Place::Absent;
+        ids.iter().all(|id| place_of(&set.bricks, *id).is_some_and(known))
+    }
+
     /// These arrived broken and are not counted among those that arrived. They go again.
     pub(crate) fn broken(
         &mut self,

@@ -650,13 +650,15 @@ pub fn bricks_from_wire(message: v1::BricksDown) -> Result<Bricks, WireError> {
             for (i, bytes) in batch.bricks.iter().enumerate() {
                 let wrong =
                     |problem: &str| Err(WireError::value(format!("batch.bricks[{i}]"), problem));
-                let Some(id) = bytes.first_chunk().map(|id| u32::from_le_bytes(*id)) else {
-                    return wrong("is too short to have an id");
-                };
-                match Brick::decode(bytes) {
-                    _ if u64::from(id) >= MAX_BRICKS => return wrong("has an id beyond 2^27"),
-                    Ok(brick) => bricks.push(Arc::new(brick)),
-                    Err(_) => broken.push(BrickId(id)),
+                let decoded = Brick::decode(bytes);
+                let name = decoded.as_ref().map_or_else(|_| Brick::name(bytes), |b| Some(b.id));
+                match (name, decoded) {
+                    (None, _) => return wrong("is too short to have an id"),
+                    (Some(id), _) if u64::from(id.0) >= MAX_BRICKS => {
+                        return wrong("has an id beyond 2^27");
+                    }
+                    (Some(_), Ok(brick)) => bricks.push(Arc::new(brick)),
+                    (Some(id), Err(_)) => broken.push(id),
                 }
             }
             Ok(Bricks::Batch(BrickBatch { set, bricks, broken }))

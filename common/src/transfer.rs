@@ -275,6 +275,7 @@ pub struct Classifier {
     /// What opacities are multiplied by, by code of the gradient's magnitude; empty where by
     /// nothing.
     factors: Vec<f64>,
+    grey: bool,
 }
 
 /// Value of the piecewise linear function through `points` at `x`.
@@ -327,6 +328,7 @@ impl Classifier {
             payload_max: rule.payload(largest),
             uncapped: rule.sigma(largest) > SIGMA_MAX && compositing != Compositing::Paper,
             factors: Vec::new(),
+            grey: false,
         };
         if !tf.gradient_opacity.is_empty() {
             let (lo, hi) = info.summary.range();
@@ -339,7 +341,25 @@ impl Classifier {
             c.factors = (0..=255).map(factor).collect();
         }
         c.table = (0..codes).map(|code| c.evaluate(code as f64)).collect();
+        c.grey = c.all_grey();
         c
+    }
+
+    fn all_grey(&self) -> bool {
+        let is_grey = |look: &Look| {
+            let [r, g, b] = look.rgb;
+            look.sigma == 0.0 || r == g && g == b
+        };
+        // Between grey points all is grey, to the bit.
+        let points = || self.colors.iter().all(|[_, r, g, b]| r == g && g == b);
+        let seen = if self.table.is_empty() { points() } else { self.table.iter().all(is_grey) };
+        seen && is_grey(&self.nan)
+    }
+
+    /// Whether whatever is seen has one colour in all three channels, to the bit. Light is white, so
+    /// that holds of shaded voxels, too.
+    pub fn is_grey(&self) -> bool {
+        self.grey
     }
 
     /// The x of the transfer function that belongs to a finite code.
@@ -587,6 +607,26 @@ mod tests {
         assert_eq!(alpha(200), 0.0);
         assert_eq!(c.support().intervals, vec![(11.0, 29.0)]);
         assert!((c.look(&Samples::U8(vec![50]), 0).rgb[1] - 0.5).abs() < 1e-6);
+    }
+
+    #[test]
+    fn what_is_seen_is_grey_whatever_colour_is_not() {
+        let codes = || info(Samples::U8((0..=255).collect()));
+        let floats = || info(Samples::F32(vec![0.0, 50.0, 100.0]));
+        let mut tf = tf(vec![[10.0, 0.0], [20.0, 0.5], [60.0, 0.5], [70.0, 0.0]]);
+        let grey =
+            |tf: &TransferFunction, info| Classifier::new(tf, &info, Compositing::Linear).is_grey();
+        assert!(grey(&tf, codes()) && grey(&tf, floats()));
+        // Red from 80 on, where nothing is seen.
+        tf.colors = vec![[0.0; 4], [79.0, 0.9, 0.9, 0.9], [80.0, 0.9, 0.1, 0.1]];
+        assert!(grey(&tf, codes()) && !grey(&tf, floats()), "of floats the points alone are known");
+        tf.colors[1][2] = 0.8;
+        assert!(!grey(&tf, codes()));
+        // A colour of what is not a number counts where there is some.
+        let mut tf = self::tf(vec![[0.0, 0.5]]);
+        tf.nan = NanLook { color: [1.0, 0.0, 1.0], opacity: 0.5 };
+        assert!(grey(&tf, floats()));
+        assert!(!grey(&tf, info(Samples::F32(vec![0.0, f32::NAN, 100.0]))));
     }
 
     #[test]

@@ -275,7 +275,7 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
             let payload = S::payload(light.map(|[c]| c));
             let (x, y, z) = v.weights(&self.tables);
             let left = &z[(slab.first - first) as usize..];
-            splat(sheets.records, v.at(), (x, y, left), payload, slot::<N>(slab.first));
+            splat::<S, N>(sheets.records, v.at(), (x, y, left), payload, slot::<N>(slab.first));
             sheets.touch(slab.first, v.first(), [x.len(), y.len()]);
         }
     }

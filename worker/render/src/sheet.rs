@@ -16,6 +16,8 @@ use slabcast_common::quality::Compositing;
 pub trait Sum: Copy + Default + PartialEq {
     /// Whether sums are whole numbers below 2^31.
     const WHOLE: bool;
+    /// Whether the three colours are one: sums of the second and third are not looked at.
+    const GREY: bool = false;
     /// The sum as a number.
     fn value(self) -> f32;
     /// Its bits.
@@ -279,16 +281,25 @@ impl Rule {
     /// open; others keep their opacity and get no light. Returns those that are shut now.
     #[inline(always)]
     pub fn close_row<S: Sum>(&self, row: &mut Row, live: u32) -> u32 {
-        match (self.compositing, S::WHOLE) {
-            (Compositing::Linear, true) => self.close_lanes::<true, true, false>(row, live),
-            (Compositing::Linear, false) => self.close_lanes::<true, false, false>(row, live),
-            (Compositing::Constant, _) => self.close_lanes::<false, true, false>(row, live),
-            (Compositing::Paper, _) => self.close_lanes::<false, true, true>(row, live),
+        use Compositing::{Constant, Linear, Paper};
+        match (self.compositing, S::WHOLE, S::GREY) {
+            (Linear, true, false) => self.close_lanes::<true, true, false, 3>(row, live),
+            (Linear, true, true) => self.close_lanes::<true, true, false, 1>(row, live),
+            (Linear, false, _) => self.close_lanes::<true, false, false, 3>(row, live),
+            (Constant, _, false) => self.close_lanes::<false, true, false, 3>(row, live),
+            (Constant, _, true) => self.close_lanes::<false, true, false, 1>(row, live),
+            (Paper, _, false) => self.close_lanes::<false, true, true, 3>(row, live),
+            (Paper, _, true) => self.close_lanes::<false, true, true, 1>(row, live),
         }
     }
 
     #[inline(always)]
-    fn close_lanes<const LINEAR: bool, const WHOLE: bool, const PAPER: bool>(
+    fn close_lanes<
+        const LINEAR: bool,
+        const WHOLE: bool,
+        const PAPER: bool,
+        const COLOURS: usize,
+    >(
         &self,
         row: &mut Row,
         live: u32,
@@ -329,7 +340,7 @@ impl Rule {
             light[i] = (1.0 - row.a[i]) * (live >> i & 1) as f32;
             row.a[i] += light[i] * sheet[i];
         }
-        for ch in 0..3 {
+        for ch in 0..COLOURS {
             let [here, before, behind] =
                 [&row.here, &row.before, &row.behind].map(|sums| &sums[ch + 1]);
             let out = &mut row.light[ch];
@@ -348,6 +359,9 @@ impl Rule {
                 }
                 out[i] = fixed_light(light[i] * of_sheet);
             }
+        }
+        if COLOURS == 1 {
+            row.light = [row.light[0]; 3];
         }
         let mut shut = 0;
         for i in 0..LANES {

@@ -21,7 +21,7 @@ pub(crate) struct Store<S: Recorded> {
     /// Records of any number of sheets; nothing in them between parts.
     records: Vec<Line>,
     /// Sums of the sheet before, where it was touched.
-    before: Vec<[S; 4]>,
+    before: Vec<S::Pixel>,
 }
 
 impl<S: Recorded> Default for Store<S> {
@@ -93,7 +93,7 @@ pub(crate) fn walk<S: Recorded, const N: usize, T: Stage<S, N>>(
     let mut open = part.begin(pixels, out);
     if let Some(last) = &out.last {
         part.each_pixel(|x, y, tile| {
-            sheets.before[y * EDGE + x] = last[tile].map(S::from_bits);
+            sheets.before[y * EDGE + x] = S::from_raw(last[tile]);
         });
         sheets.was = [u64::MAX; STRIPS];
     }
@@ -140,9 +140,7 @@ pub(crate) fn walk<S: Recorded, const N: usize, T: Stage<S, N>>(
         // Nobody reads a shut pixel's sums; they may be anything, so they are none.
         part.each_pixel(|x, y, tile| {
             let touched = sheets.was[x / STRIP] >> y & open.row(y) >> x & 1 == 1;
-            let none = [S::default(); 4];
-            let sums = if touched { sheets.before[y * EDGE + x] } else { none };
-            last[tile] = sums.map(S::bits);
+            last[tile] = if touched { S::raw(&sheets.before[y * EDGE + x]) } else { [0; 4] };
         });
     }
     sheets.empty(k);
@@ -155,7 +153,7 @@ type Rows = [u64; STRIPS];
 pub(crate) struct Sheets<'a, S: Recorded, const N: usize> {
     pub(crate) simd: Simd,
     pub(crate) records: &'a mut [Record<S, N>],
-    before: &'a mut [[S; 4]],
+    before: &'a mut [S::Pixel],
     /// By slot of their first sheet: rows that voxels touch.
     added: [Rows; N],
     /// Rows of `before` that may not be zero.
@@ -177,7 +175,7 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
         if store.records.len() < lines {
             store.records.resize(lines, Line::ZERO);
         }
-        store.before.resize(EDGE * EDGE, [S::default(); 4]);
+        store.before.resize(EDGE * EDGE, S::Pixel::default());
         Sheets {
             simd,
             records: bytemuck::cast_slice_mut(&mut store.records[..lines]),
@@ -223,7 +221,7 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
             while stale != 0 {
                 let y = stale.trailing_zeros() as usize;
                 stale &= stale - 1;
-                self.before[y * EDGE + strip * STRIP..][..STRIP].fill([S::default(); 4]);
+                self.before[y * EDGE + strip * STRIP..][..STRIP].fill(S::Pixel::default());
             }
         }
         self.was = touched;
@@ -273,10 +271,10 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
             for y in 0..EDGE {
                 let at = strip * STRIP;
                 if (left[strip] | self.dead[strip]) >> y & 1 == 1 {
-                    self.records[y * STRIDE + at..][..STRIP].fill([[S::default(); 4]; N]);
+                    self.records[y * STRIDE + at..][..STRIP].fill([S::Pixel::default(); N]);
                 }
                 if self.was[strip] >> y & 1 == 1 {
-                    self.before[y * EDGE + at..][..STRIP].fill([S::default(); 4]);
+                    self.before[y * EDGE + at..][..STRIP].fill(S::Pixel::default());
                 }
             }
         }

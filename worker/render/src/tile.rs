@@ -29,8 +29,8 @@ use crate::planes;
 use crate::region::{Coming, Loaded};
 use crate::scene::{Corner, Frame};
 use crate::sheet::Row;
-use crate::splat::Simd;
 use crate::splat::records::{MOST, Recorded};
+use crate::splat::{Grey, Simd};
 use crate::stack::Store;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{RawSums, TilePixels, TileState};
@@ -93,6 +93,7 @@ pub struct Scratch {
 struct Whole {
     shorts: Store<i16>,
     longs: Store<i32>,
+    greys: Store<Grey>,
     waiting: Waiting,
 }
 
@@ -276,10 +277,40 @@ impl Part<'_> {
                 let (store, waiting) = (&mut whole.shorts, &mut whole.waiting);
                 part.render(simd, store, waiting, (&mut kinds.shorts, queues), pixels, io);
             }
+            Sums::I32 | Sums::Auto if part.is_grey() => {
+                let Whole { greys: store, waiting, .. } = whole;
+                part.render_grey(simd, store, &mut waiting.flat, pixels, io);
+            }
             Sums::I32 | Sums::Auto => {
                 let (store, waiting) = (&mut whole.longs, &mut whole.waiting);
                 part.render(simd, store, waiting, (&mut kinds.longs, queues), pixels, io);
             }
+        }
+    }
+
+    /// Whether its three colours are one, and it is drawn where that is made use of.
+    fn is_grey(&self) -> bool {
+        let Frame { scene, sections, .. } = self.frame;
+        let classifier = &scene.classifier;
+        let fits = !classifier.is_modulated() && sections.most() <= MOST;
+        fits && classifier.is_grey() && flat::takes(self.frame).is_some()
+    }
+
+    /// Renders it where it [is grey](Self::is_grey).
+    fn render_grey(
+        self,
+        simd: Simd,
+        store: &mut Store<Grey>,
+        waiting: &mut flat::Waiting,
+        pixels: &mut Pixels,
+        io: Io<'_>,
+    ) {
+        let part = self;
+        let view = flat::takes(part.frame).expect("a flat view");
+        if part.frame.sections.most() <= 4 {
+            simd.run(RenderFlat::<Grey, 4> { part, view, simd, store, waiting, pixels, io });
+        } else {
+            simd.run(RenderFlat::<Grey, MOST> { part, view, simd, store, waiting, pixels, io });
         }
     }
 

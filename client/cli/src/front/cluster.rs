@@ -1,20 +1,21 @@
 //! A cluster that tries settings: how long a frame takes there, and, where the volume is not here, how
 //! far its pictures are from its own finest.
 //!
-//! What is timed is what a person waits for: frames of the path, as they arrive, one after the other.
+//! What is timed is what a person waits for: frames of the path, one after the other, magnified and made
+//! PNGs as they arrive, which takes the same cores where the cluster is in this process.
 
 use super::lab::Off;
 use super::place::{Place, VIEWS};
 use super::setting::Setting;
 use crate::fail::Fail;
 use crate::front::magnify::magnified;
-use crate::output::Frame;
+use crate::output::{Frame, png};
 use crate::progress::{self, Progress};
 use crate::request::Asked;
 use crate::source::{Source, Update};
 use crate::{embedded, remote, signals};
 use slabcast_client::Client;
-use slabcast_common::image::{Picture, PixelFormat};
+use slabcast_common::image::{Background, Picture, PixelFormat};
 use slabcast_common::path::ViewPath;
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::volume::VolumeInfo;
@@ -22,6 +23,7 @@ use slabcast_master::Handle;
 use slabcast_render::reference::ErrorFigures;
 use std::time::Instant;
 use tokio::runtime::Runtime;
+use tokio::task::JoinSet;
 
 /// Frames that are timed of a setting, after the first.
 const FRAMES: u32 = 4;
@@ -78,17 +80,22 @@ impl Through<'_> {
         let path = spread(&self.asked.path, frames + 1);
         // Floats are what small pictures are sent as.
         let format = if setting.shrink > 1 { PixelFormat::Rgba32F } else { PixelFormat::Rgb8 };
-        let came: Vec<f64> = self.frames(setting, path, format)?.iter().map(|f| f.1).collect();
+        let written = Some((setting.shrink, self.asked.background));
+        let mut came: Vec<f64> =
+            self.frames(setting, path, format, written)?.iter().map(|f| f.1).collect();
+        came.sort_unstable_by(f64::total_cmp);
         let n = came.len() - 1;
         Ok((came[n] - came[0]) * 1e3 / n.max(1) as f64)
     }
 
-    /// The frames of a path at a setting, and when each came, in seconds.
+    /// The frames of a path at a setting, and when each came, in seconds; or, if they are to be `written`
+    /// (so many times larger, over this background), when that would be done.
     fn frames(
         &self,
         setting: &Setting,
         path: ViewPath,
         format: PixelFormat,
+        written: Option<(u32, Background)>,
     ) -> Result<Vec<(Frame, f64)>, Fail> {
         let mut asked = self.asked.clone();
         asked.quality = setting.quality;
@@ -100,7 +107,7 @@ impl Through<'_> {
                 Wire::Embedded(handle) => embedded::submit(handle, &asked, request).await?,
                 Wire::Remote(client) => remote::submit((*client).clone(), &asked, request).await?,
             };
-            let taken = take(&mut source).await;
+            let taken = take(&mut source, written).await;
             if taken.is_err() {
                 source.cancel.now().await;
             }
@@ -109,8 +116,12 @@ impl Through<'_> {
     }
 }
 
-async fn take(source: &mut Source) -> Result<Vec<(Frame, f64)>, Fail> {
+async fn take(
+    source: &mut Source,
+    written: Option<(u32, Background)>,
+) -> Result<Vec<(Frame, f64)>, Fail> {
     let (began, mut frames, mut told) = (Instant::now(), Vec::new(), false);
+    let mut writing = JoinSet::new();
     loop {
         let update = tokio::select! {
             code = signals::stopped() => return Err(Fail::silent(code)),
@@ -119,10 +130,16 @@ async fn take(source: &mut Source) -> Result<Vec<(Frame, f64)>, Fail> {
         match update {
             None => return Err(Fail::failed("the job ended before its last frame")),
             Some(Err(e)) => return Err(e),
-            Some(Ok(Update::Done)) => return Ok(frames),
-            Some(Ok(Update::Frame { frame, .. })) => {
-                frames.push((frame, began.elapsed().as_secs_f64()));
-            }
+            Some(Ok(Update::Done)) => break,
+            Some(Ok(Update::Frame { frame, .. })) => match written {
+                None => frames.push((frame, began.elapsed().as_secs_f64())),
+                Some((times, background)) => {
+                    writing.spawn_blocking(move || {
+                        write(&frame, times, background);
+                        (frame, began.elapsed().as_secs_f64())
+                    });
+                }
+            },
             Some(Ok(Update::Step(step))) => {
                 if !step.waiting.is_empty() && !told {
                     progress::note(&step.waiting);
@@ -131,6 +148,21 @@ async fn take(source: &mut Source) -> Result<Vec<(Frame, f64)>, Fail> {
             }
         }
     }
+    frames.extend(writing.join_all().await);
+    Ok(frames)
+}
+
+/// What writing a frame takes but for the disk.
+fn write(frame: &Frame, times: u32, background: Background) {
+    let large = (times > 1).then(|| {
+        let picture = magnified(frame.picture(), times, 1);
+        let bytes = picture.encode(PixelFormat::Rgb8, background).into();
+        Frame { size: picture.size, format: PixelFormat::Rgb8, bytes, ..frame.clone() }
+    });
+    let mut file = Vec::new();
+    // Into memory: nothing to fail.
+    let _ = png::encode(large.as_ref().unwrap_or(frame), "", &mut file);
+    std::hint::black_box(file);
 }
 
 /// So many views that stand for a path: a turn's, far apart; of others the first ones.
@@ -170,7 +202,7 @@ impl<'a> There<'a> {
     }
 
     fn picture(&self, setting: &Setting, path: &ViewPath) -> Result<Picture, Fail> {
-        let frames = self.through.frames(setting, path.clone(), PixelFormat::Rgba32F)?;
+        let frames = self.through.frames(setting, path.clone(), PixelFormat::Rgba32F, None)?;
         let [(frame, _)] = &frames[..] else {
             return Err(Fail::failed(format!("one frame was asked for, {} came", frames.len())));
         };

@@ -138,6 +138,47 @@ impl Accumulate for i32 {
     }
 }
 
+/// 32-bit fixed point of scenes whose three colours are one: as [`i32`], bit for bit.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Grey(i32);
+
+impl Sum for Grey {
+    const WHOLE: bool = true;
+    const GREY: bool = true;
+    #[inline(always)]
+    fn value(self) -> f32 {
+        self.0.value()
+    }
+    #[inline(always)]
+    fn bits(self) -> u32 {
+        self.0.bits()
+    }
+    #[inline(always)]
+    fn from_bits(bits: u32) -> Self {
+        Grey(i32::from_bits(bits))
+    }
+}
+
+impl Accumulate for Grey {
+    type Weight = Tap;
+    type Section = Section;
+
+    #[inline(always)]
+    fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Section; 4] {
+        i32::section(sections, z, i, payload)
+    }
+
+    #[inline(always)]
+    fn row(section: Section, wy: Tap) -> Section {
+        i32::row(section, wy)
+    }
+
+    #[inline(always)]
+    fn plus(self, row: Section, wx: Tap) -> Self {
+        Grey(self.0.plus(row, wx))
+    }
+}
+
 /// Floats, in one order.
 impl Accumulate for f32 {
     type Weight = Tap;

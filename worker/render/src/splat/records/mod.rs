@@ -8,9 +8,10 @@
 mod long;
 mod short;
 
-use super::{Accumulate, Level, Simd, Tap, section_fixed, whole};
+use super::{Accumulate, Grey, Level, Section, Simd, Tap, section_fixed, whole};
 use crate::footprint::{Footprint, Sections};
-use crate::sheet::{LANES, Row};
+use crate::sheet::{LANES, Row, Sum};
+use slabcast_common::image::RawSums;
 
 /// Sheets of a record at most.
 pub(crate) const MOST: usize = 8;
@@ -21,8 +22,8 @@ pub(crate) const MOST: usize = 8;
 /// that begin at an even column never lie across two lines of the cache.
 pub(crate) const STRIDE: usize = 66;
 
-/// The sums of N sheets at one pixel: extinction and three colours each.
-pub(crate) type Record<S, const N: usize> = [[S; 4]; N];
+/// The sums of N sheets at one pixel: extinction and three colours each, or extinction and grey.
+pub(crate) type Record<S, const N: usize> = [<S as Recorded>::Pixel; N];
 
 /// Memory of records: a line of the cache.
 #[derive(Clone, Copy, Debug)]
@@ -156,7 +157,9 @@ macro_rules! at_level {
 }
 
 /// Sums that records are made of.
-pub(crate) trait Recorded: Accumulate + bytemuck::Pod {
+pub(crate) trait Recorded: Accumulate {
+    /// Sums of one sheet at a pixel.
+    type Pixel: bytemuck::Pod + Default + PartialEq + std::fmt::Debug;
     /// A weight in depth.
     type Depth: Copy + Default;
     /// Extinction and colours of a voxel.
@@ -170,6 +173,12 @@ pub(crate) trait Recorded: Accumulate + bytemuck::Pod {
     fn payload(light: [f32; 4]) -> Self::Payload;
     /// `payload * wz`.
     fn cut(payload: Self::Payload, wz: Self::Depth) -> [Self::Section; 4];
+    /// Adds `row * wx`.
+    fn add(to: &mut Self::Pixel, row: &[Self::Section; 4], wx: Self::Weight);
+    /// Bits of extinction and three colours.
+    fn raw(pixel: &Self::Pixel) -> RawSums;
+    /// From those.
+    fn from_raw(raw: RawSums) -> Self::Pixel;
 
     /// Adds `voxels` with `payloads`, which all begin at the sheet that `slot` holds: the section of
     /// each in a sheet is `payload * z`, a row `section * y`, what is added to a pixel `row * x`.
@@ -216,7 +225,7 @@ pub(crate) trait Recorded: Accumulate + bytemuck::Pod {
         z: &BySlot<Self::Depth, N>,
     ) {
         let _ = simd;
-        splat_deep(records, at, across, payload, z);
+        splat_deep::<Self, N>(records, at, across, payload, z);
     }
 
     /// Takes the sums of sheet k, which `slot` holds, of two strips for a row that is to be closed:
@@ -227,7 +236,7 @@ pub(crate) trait Recorded: Accumulate + bytemuck::Pod {
     /// If a strip leaves the part.
     fn take<const N: usize>(
         simd: Simd,
-        sums: (&mut [Record<Self, N>], &mut [[Self; 4]]),
+        sums: (&mut [Record<Self, N>], &mut [Self::Pixel]),
         a: &[f32],
         strips: [Strip; 2],
         slot: usize,
@@ -235,8 +244,33 @@ pub(crate) trait Recorded: Accumulate + bytemuck::Pod {
     );
 }
 
+/// What pixels of four sums have in common.
+macro_rules! four_sums {
+    () => {
+        type Pixel = [Self; 4];
+
+        #[inline(always)]
+        fn add(to: &mut [Self; 4], row: &[Self::Section; 4], wx: Self::Weight) {
+            for c in 0..4 {
+                to[c] = to[c].plus(row[c], wx);
+            }
+        }
+
+        #[inline(always)]
+        fn raw(pixel: &[Self; 4]) -> RawSums {
+            pixel.map(Self::bits)
+        }
+
+        #[inline(always)]
+        fn from_raw(raw: RawSums) -> [Self; 4] {
+            raw.map(Self::from_bits)
+        }
+    };
+}
+
 /// 64 bits: extinction in the lowest 16.
 impl Recorded for i16 {
+    four_sums!();
     type Depth = i16;
     type Payload = u64;
 
@@ -271,7 +305,7 @@ impl Recorded for i16 {
         at_level!(
             simd,
             (records, voxels, slot, tables),
-            splat_plain,
+            splat_plain::<i16, N>,
             short::avx2::splat_all::<N>,
             short::avx512::splat_all::<N>
         );
@@ -304,7 +338,7 @@ impl Recorded for i16 {
         at_level!(
             simd,
             (records, at, across, payload, z),
-            splat_deep,
+            splat_deep::<i16, N>,
             short::avx2::splat_deep::<N>,
             short::avx512::splat_deep::<N>
         );
@@ -322,7 +356,7 @@ impl Recorded for i16 {
         at_level!(
             simd,
             (sums, a, strips, slot, row),
-            take_plain,
+            take_plain::<i16, N>,
             short::avx2::take::<N>,
             short::avx512::take::<N>
         );
@@ -330,6 +364,7 @@ impl Recorded for i16 {
 }
 
 impl Recorded for i32 {
+    four_sums!();
     type Depth = f32;
     type Payload = [f32; 4];
 
@@ -363,9 +398,9 @@ impl Recorded for i32 {
         at_level!(
             simd,
             (records, voxels, slot, tables),
-            splat_plain,
-            long::avx2::splat_all::<N>,
-            long::avx512::splat_all::<N>
+            splat_plain::<i32, N>,
+            long::avx2::splat_all::<4, N>,
+            long::avx512::splat_all::<4, N>
         );
     }
 
@@ -381,11 +416,102 @@ impl Recorded for i32 {
         at_level!(
             simd,
             (sums, a, strips, slot, row),
-            take_plain,
+            take_plain::<i32, N>,
             long::avx2::take::<N>,
             long::avx2::take::<N>
         );
     }
+}
+
+/// Extinction and grey: half the memory, and half the work.
+impl Recorded for Grey {
+    type Pixel = [i32; 2];
+    type Depth = f32;
+    type Payload = [f32; 2];
+
+    fn across<'a>(footprint: &Footprint<'a>, axis: usize) -> Option<&'a [Tap]> {
+        i32::across(footprint, axis)
+    }
+
+    fn deep(sections: &Sections) -> &[f32] {
+        sections.all()
+    }
+
+    #[inline(always)]
+    fn payload([sigma, grey, ..]: [f32; 4]) -> [f32; 2] {
+        [sigma, grey]
+    }
+
+    #[inline(always)]
+    fn cut([sigma, grey]: [f32; 2], wz: f32) -> [Section; 4] {
+        i32::cut([sigma, grey, grey, grey], wz)
+    }
+
+    #[inline(always)]
+    fn add(to: &mut [i32; 2], row: &[Section; 4], wx: Tap) {
+        for c in 0..2 {
+            to[c] = to[c].plus(row[c], wx);
+        }
+    }
+
+    #[inline(always)]
+    fn raw([sigma, grey]: &[i32; 2]) -> RawSums {
+        [*sigma, *grey, *grey, *grey].map(i32::bits)
+    }
+
+    #[inline(always)]
+    fn from_raw([sigma, grey, ..]: RawSums) -> [i32; 2] {
+        [sigma, grey].map(i32::from_bits)
+    }
+
+    #[inline(always)]
+    fn splat_all<const N: usize>(
+        simd: Simd,
+        records: &mut [Record<Grey, N>],
+        voxels: (&[Splat], &[[f32; 2]]),
+        slot: usize,
+        tables: &Tables<'_, Grey>,
+    ) {
+        assert_eq!(voxels.0.len(), voxels.1.len(), "a payload a voxel");
+        let Tables { across, deep } = *tables;
+        let tables = &Tables::<i32> { across, deep };
+        at_level!(
+            simd,
+            (records, voxels, slot, tables),
+            splat_grey,
+            long::avx2::splat_all::<2, N>,
+            long::avx512::splat_all::<2, N>
+        );
+    }
+
+    #[inline(always)]
+    fn take<const N: usize>(
+        simd: Simd,
+        sums: (&mut [Record<Grey, N>], &mut [[i32; 2]]),
+        a: &[f32],
+        strips: [Strip; 2],
+        slot: usize,
+        row: &mut Row,
+    ) {
+        at_level!(
+            simd,
+            (sums, a, strips, slot, row),
+            take_plain::<Grey, N>,
+            long::avx2::take_grey::<N>,
+            long::avx2::take_grey::<N>
+        );
+    }
+}
+
+/// [`splat_plain`] with the tables of the sums that grey ones are bit for bit.
+fn splat_grey<const N: usize>(
+    records: &mut [Record<Grey, N>],
+    voxels: (&[Splat], &[[f32; 2]]),
+    slot: usize,
+    tables: &Tables<'_, i32>,
+) {
+    let Tables { across, deep } = *tables;
+    splat_plain::<Grey, N>(records, voxels, slot, &Tables { across, deep });
 }
 
 /// [`Recorded::splat_all`] plainly.
@@ -397,7 +523,7 @@ fn splat_plain<S: Recorded, const N: usize>(
 ) {
     for (v, payload) in voxels.iter().zip(payloads) {
         let weights = v.weights(tables);
-        splat(records, v.at(), weights, *payload, slot);
+        splat::<S, N>(records, v.at(), weights, *payload, slot);
     }
 }
 
@@ -416,9 +542,7 @@ pub(crate) fn splat<S: Recorded, const N: usize>(
             let row = section.map(|c| S::row(c, wy));
             let from = at + j * STRIDE;
             for (record, &wx) in records[from..from + x.len()].iter_mut().zip(x) {
-                for c in 0..4 {
-                    record[slot][c] = record[slot][c].plus(row[c], wx);
-                }
+                S::add(&mut record[slot], &row, wx);
             }
         }
     }
@@ -456,10 +580,8 @@ fn splat_deep<S: Recorded, const N: usize>(
         let from = at + j * STRIDE;
         for (record, wx) in records[from..from + x.len()].iter_mut().zip(x) {
             for slot in 0..N {
-                for c in 0..4 {
-                    let row = S::row(sections[slot][c], wy[slot]);
-                    record[slot][c] = record[slot][c].plus(row, wx[slot]);
-                }
+                let row = sections[slot].map(|c| S::row(c, wy[slot]));
+                S::add(&mut record[slot], &row, wx[slot]);
             }
         }
     }
@@ -467,7 +589,7 @@ fn splat_deep<S: Recorded, const N: usize>(
 
 /// [`Recorded::take`] plainly.
 fn take_plain<S: Recorded, const N: usize>(
-    (records, before): (&mut [Record<S, N>], &mut [[S; 4]]),
+    (records, before): (&mut [Record<S, N>], &mut [S::Pixel]),
     a: &[f32],
     strips: [Strip; 2],
     slot: usize,
@@ -482,13 +604,13 @@ fn take_plain<S: Recorded, const N: usize>(
             let sheets = [was[half][i], here[half][i][slot], here[half][i][(slot + 1) % N]];
             let to = [&mut row.before, &mut row.here, &mut row.behind];
             for (to, sums) in to.into_iter().zip(sheets) {
-                for c in 0..4 {
-                    to[c][half * STRIP + i] = sums[c].value();
+                for (to, bits) in to.iter_mut().zip(S::raw(&sums)) {
+                    to[half * STRIP + i] = S::from_bits(bits).value();
                 }
             }
             row.a[half * STRIP + i] = a[strip.pixel + i];
             before[strip.pixel + i] = here[half][i][slot];
-            records[strip.record + i][slot] = [S::default(); 4];
+            records[strip.record + i][slot] = S::Pixel::default();
         }
     }
 }
@@ -521,12 +643,12 @@ mod tests {
         let light = |i: usize| [31_000.0 - 700.0 * i as f32, 17_003.4, 77.7, i as f32];
         let payloads: Vec<S::Payload> = (0..9).map(|i| S::payload(light(i))).collect();
         let run = |simd| {
-            let mut records: Vec<Record<S, N>> = vec![[[S::from_bits(11); 4]; N]; STRIDE * 24];
+            let mut records: Vec<Record<S, N>> = vec![[S::from_raw([11; 4]); N]; STRIDE * 24];
             S::splat_all(simd, &mut records, (&voxels, &payloads), deep * 3 % N, &tables);
             records
         };
         let want = run(Simd::plain());
-        assert!(want.iter().any(|r| *r != [[S::from_bits(11); 4]; N]));
+        assert!(want.iter().any(|r| *r != [S::from_raw([11; 4]); N]));
         for simd in Simd::all() {
             assert!(run(simd) == want, "{} differs at {across}, {deep} of {N}", simd.name());
         }
@@ -546,6 +668,10 @@ mod tests {
                 }
                 splat_everywhere::<i16, MOST>(across, deep, [&x, &y], &z);
                 splat_everywhere::<i32, MOST>(across, deep, [&taps(&x), &taps(&y)], &real(&z));
+                if deep <= 4 {
+                    splat_everywhere::<Grey, 4>(across, deep, [&taps(&x), &taps(&y)], &real(&z));
+                }
+                splat_everywhere::<Grey, MOST>(across, deep, [&taps(&x), &taps(&y)], &real(&z));
             }
         }
     }
@@ -615,9 +741,9 @@ mod tests {
         slot: usize,
         mut next: impl FnMut() -> S,
     ) -> Result<(), TestCaseError> {
-        let mut sums = || [(); 4].map(|()| next());
+        let mut sums = || S::from_raw([(); 4].map(|()| S::bits(next())));
         let records: Vec<Record<S, N>> = (0..48).map(|_| [(); N].map(|()| sums())).collect();
-        let before: Vec<[S; 4]> = (0..48).map(|_| sums()).collect();
+        let before: Vec<S::Pixel> = (0..48).map(|_| sums()).collect();
         let opacity: Vec<f32> = (0..48).map(|i| i as f32).collect();
         let [a, b] = strips;
         let strips = strips.map(|at| Strip { record: at, pixel: at });
@@ -628,12 +754,21 @@ mod tests {
             (records, before, row.before, row.here, row.behind, row.a)
         };
         let want = run(Simd::plain());
-        prop_assert_eq!(want.3[1][0], records[a][slot][1].value());
-        prop_assert_eq!(want.4[2][9], records[b + 1][(slot + 1) % N][2].value());
-        prop_assert_eq!(want.2[3][7], before[a + 7][3].value());
+        let value = |pixel: &S::Pixel, c: usize| S::from_bits(S::raw(pixel)[c]).value();
+        for c in 0..if S::GREY { 2 } else { 4 } {
+            prop_assert_eq!(want.3[c][0], value(&records[a][slot], c));
+            prop_assert_eq!(want.4[c][9], value(&records[b + 1][(slot + 1) % N], c));
+            prop_assert_eq!(want.2[c][7], value(&before[a + 7], c));
+        }
         prop_assert_eq!(want.5[10], (b + 2) as f32);
         for simd in Simd::all() {
-            prop_assert!(run(simd) == want, "{}", simd.name());
+            let got = run(simd);
+            prop_assert!(got.0 == want.0 && got.1 == want.1 && got.5 == want.5, "{}", simd.name());
+            // Of grey sums nobody looks at the second and third colour.
+            let there = if S::GREY { 2 } else { 4 };
+            for (got, want) in [(&got.2, &want.2), (&got.3, &want.3), (&got.4, &want.4)] {
+                prop_assert!(got[..there] == want[..there], "{}", simd.name());
+            }
         }
         Ok(())
     }
@@ -654,6 +789,8 @@ mod tests {
             take_everywhere::<i16, MOST>([a, b], slot, || next() as i16)?;
             take_everywhere::<i32, 4>([a, b], slot % 4, &mut next)?;
             take_everywhere::<i32, MOST>([a, b], slot, &mut next)?;
+            take_everywhere::<Grey, 4>([a, b], slot % 4, || Grey::from_bits(next() as u32))?;
+            take_everywhere::<Grey, MOST>([a, b], slot, || Grey::from_bits(next() as u32))?;
         }
     }
 }

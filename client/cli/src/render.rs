@@ -215,12 +215,14 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
             run.progress.stage(&format!("reading {}", file.display()));
             let volume = Arc::new(args.input.open(file)?);
             let orientation = args.look.view.axes.of(&volume)?;
-            if !run.asked.aim.is_empty() {
-                aim_here(&mut run, &volume, orientation, crew, &runtime, args.quiet)?;
-            }
+            let tried = if run.asked.aim.is_empty() {
+                None
+            } else {
+                aim_here(&mut run, &volume, orientation, crew, &runtime, args.quiet)?
+            };
             match args.show {
                 None | Some(Show::Owner) => {
-                    runtime.block_on(embedded(run, volume, orientation, crew))
+                    runtime.block_on(embedded(run, volume, orientation, crew, tried))
                 }
                 Some(show) => runtime.block_on(drawn(run, volume, orientation, show, crew)),
             }
@@ -242,7 +244,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
 }
 
 /// Chooses the quality by what it should come to: errors by the reference, times by a cluster like the
-/// one that is to draw.
+/// one that is to draw, which then draws: it has the bricks.
 fn aim_here(
     run: &mut Run,
     volume: &Arc<Volume>,
@@ -250,26 +252,33 @@ fn aim_here(
     crew: Crew,
     runtime: &Runtime,
     quiet: bool,
-) -> Result<(), Fail> {
+) -> Result<Option<Cluster>, Fail> {
     let info = volume.info(volume.digest());
     run.asked.fit(&info, orientation, volume.anatomical)?;
     let (aim, threads) = (run.asked.aim, (crew.workers * crew.threads) as usize);
     let lab = lab(volume, &info, &run.asked, orientation, threads)?;
-    let chosen = if aim.budget.is_some() {
-        let cluster =
-            runtime.block_on(async { Cluster::start(volume.clone(), orientation, crew, None) })?;
-        let (handle, asked) = (cluster.handle(), run.asked.clone());
-        let wire = Wire::Embedded(&handle);
-        let through = Through { runtime, wire, info, asked, crew: crew.to_string() };
-        let chosen = choose(&mut Here::new(lab, Clock::Cluster(Box::new(through))), &aim, quiet);
-        runtime.block_on(cluster.end());
-        chosen
-    } else {
+    if aim.budget.is_none() {
         let clock = Clock::Plain(Cut { tile: 64, ..Cut::on(threads) });
-        choose(&mut Here::new(lab, clock), &aim, quiet)
-    };
-    chosen?.settle(&mut run.asked);
-    Ok(())
+        choose(&mut Here::new(lab, clock), &aim, quiet)?.settle(&mut run.asked);
+        return Ok(None);
+    }
+    let cluster =
+        runtime.block_on(async { Cluster::start(volume.clone(), orientation, crew, None) })?;
+    let (handle, asked) = (cluster.handle(), run.asked.clone());
+    let wire = Wire::Embedded(&handle);
+    let through = Through { runtime, wire, info, asked, crew: crew.to_string() };
+    match choose(&mut Here::new(lab, Clock::Cluster(Box::new(through))), &aim, quiet) {
+        // A record begins with the first worker.
+        Ok(chosen) if run.record.is_none() => {
+            chosen.settle(&mut run.asked);
+            Ok(Some(cluster))
+        }
+        chosen => {
+            runtime.block_on(cluster.end());
+            chosen?.settle(&mut run.asked);
+            Ok(None)
+        }
+    }
 }
 
 /// The same where the volume is at a master: by its pictures.
@@ -309,7 +318,7 @@ pub(crate) fn again(asked: Asked, output: Output, volume: Volume, quiet: bool) -
     let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
     let runtime = runtime::start_embedded()?;
     let result =
-        runtime.block_on(embedded(run, Arc::new(volume), orientation, Crew::new(1, None)?));
+        runtime.block_on(embedded(run, Arc::new(volume), orientation, Crew::new(1, None)?, None));
     runtime::end(runtime);
     result
 }
@@ -319,6 +328,7 @@ async fn embedded(
     volume: Arc<Volume>,
     orientation: Orientation,
     crew: Crew,
+    tried: Option<Cluster>,
 ) -> Result<(), Fail> {
     let name = volume.name.clone();
     if !volume.anatomical && !run.stands && !name.starts_with("formula:") {
@@ -329,7 +339,10 @@ async fn embedded(
     }
     let anatomical = volume.anatomical;
     let (recorder, recording) = run.record.take().map(|p| record::begin(&p)).transpose()?.unzip();
-    let mut cluster = Cluster::start(volume, orientation, crew, recorder)?;
+    let mut cluster = match tried {
+        Some(cluster) => cluster,
+        None => Cluster::start(volume, orientation, crew, recorder)?,
+    };
     let handle = cluster.handle();
     let info = handle.volume().info.clone();
     let recipe = run.ready(&info, orientation, anatomical)?;

@@ -391,7 +391,7 @@ mod tests {
         let off = |rmse| Off { rmse, ..Off::default() };
         assert!(aim.keeps_error(&off(0.8)) && !aim.keeps_error(&off(0.95)));
         let aim = Aim { budget: Some(100.0), error_max: Some(2.0 / 255.0), ..aim };
-        assert!(aim.keeps_time(70.0) && !aim.keeps_time(73.0));
+        assert!(aim.keeps_time(90.0) && !aim.keeps_time(91.5));
         assert_eq!(aim.flags(), "--error, --error-max, --budget");
         let most = Off { rmse: 0.1, most_999: 1.9, ..Off::default() };
         assert!(!aim.keeps_error(&most) && Aim::default().keeps_error(&most));

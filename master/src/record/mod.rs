@@ -40,7 +40,7 @@ pub use write::{Recorder, Written, start};
 
 use serde::{Deserialize, Serialize};
 use slabcast_common::brick::BrickInfo;
-use slabcast_common::message::{TileResult, ToWorker};
+use slabcast_common::message::{Sampled, TileResult, ToWorker};
 use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{Action, Event};
 use std::fmt;
@@ -128,6 +128,9 @@ struct NotedResult {
     /// Of a region: places that it touched; stalls, parked, idle.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     region: Option<(Vec<u32>, u32, u64, u64)>,
+    /// Pixels that were drawn in thinner sheets, too, and the sum of squares of what that changed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    sampled: Option<(u32, u64)>,
 }
 
 impl NotedResult {
@@ -147,6 +150,11 @@ impl NotedResult {
                 .region
                 .as_ref()
                 .map(|r| (r.touched.clone(), r.stalls, r.parked_us, r.idle_us)),
+            sampled: result
+                .region
+                .as_ref()
+                .filter(|r| r.sampled != Sampled::default())
+                .map(|r| (r.sampled.pixels, r.sampled.squares)),
         }
     }
 }

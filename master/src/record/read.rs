@@ -400,6 +400,8 @@ fn result(r: &NotedResult) -> Result<TileResult, String> {
     if !r.finite {
         *pixels.a.first_mut().ok_or("`finite` of a plane without pixels")? = f32::NAN;
     }
+    let sampled =
+        r.sampled.map_or_else(Sampled::default, |(pixels, squares)| Sampled { pixels, squares });
     let ([tossed, splatted, culled], [received_us, ready_us, start_us, end_us]) = (r.voxels, r.us);
     Ok(TileResult {
         task: TaskId(r.task),
@@ -412,8 +414,7 @@ fn result(r: &NotedResult) -> Result<TileResult, String> {
             stalls,
             parked_us,
             idle_us,
-            // Figures, on which no decision hangs.
-            sampled: Sampled::default(),
+            sampled,
         }),
     })
 }

@@ -158,7 +158,7 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
                     stalls: 1,
                     parked_us: 20,
                     idle_us: 5,
-                    sampled: Sampled::default(),
+                    sampled: Sampled { pixels: 9, squares: 1 << 50 | rng.below(99) },
                 });
                 let counters = Counters { tossed: 3, splatted: 2, culled: 1 };
                 if rng.below(50) == 0 {

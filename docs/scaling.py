@@ -1,8 +1,9 @@
-"""Tables of docs/scaling.md: `python3 docs/scaling.py SLABCAST DATA [--frames N] [--rehearse LIST]`.
+"""Tables of docs/scaling.md: `python3 docs/scaling.py SLABCAST DATA [--frames N] [--large] [--rehearse LIST]`.
 
-For the three scenes of the paper's kind, `slabcast plan` measures tiles once and predicts both
-schedules at 1 and 10 Gbit/s and without limit; with --rehearse, processes on this machine are compared
-with what is predicted for them. Prints Markdown. DATA is the folder with mri256.nrrd and the others.
+For the three scenes of the paper's kind, or the two large ones, `slabcast plan` measures tiles once and
+predicts both schedules at 1 and 10 Gbit/s and without limit; with --rehearse, processes on this machine
+are compared with what is predicted for them. Prints Markdown. DATA is the folder with mri256.nrrd and the
+others.
 """
 
 import argparse
@@ -12,17 +13,23 @@ import subprocess
 import tempfile
 
 SCENES = [
-    ("mri256", "mri256.nrrd", "-y", "peer-opaque"),
-    ("mouse_skull", "mouse_skull.nrrd", "z", "peer-skull"),
-    ("aneurism", "aneurism.nrrd", "z", "peer-vessels"),
+    ("mri256", "mri256.nrrd", ["--up=-y", "--tf", "peer-opaque"]),
+    ("mouse_skull", "mouse_skull.nrrd", ["--up=z", "--tf", "peer-skull"]),
+    ("aneurism", "aneurism.nrrd", ["--up=z", "--tf", "peer-vessels"]),
 ]
-LINKS = ["1gbit", "10gbit", "unlimited"]
+LARGE = [
+    ("mri256 at 1024", "mri256.nrrd",
+     ["--up=-y", "--tf", "peer-semi", "--size", "1024x1024", "--repeats", "1"]),
+    ("lidc0314_ct at 2048", "large/lidc0314_ct.nrrd",
+     ["--tf", "skin", "--size", "2048x2048", "--repeats", "1"]),
+]
+LINKS = [("1gbit", 0.94e9 / 8), ("10gbit", 9.4e9 / 8), ("unlimited", float("inf"))]
 WORKERS = [1, 2, 4, 8, 15, 16, 32, 64]
 
 
 def plan(args, scene, trace, more):
-    name, file, up, tf = scene
-    command = [args.slabcast, "plan", os.path.join(args.data, file), f"--up={up}", "--tf", tf,
+    _, file, flags = scene
+    command = [args.slabcast, "plan", os.path.join(args.data, file), *flags,
                "--frames", str(args.frames), "--workers", ",".join(map(str, WORKERS)),
                "--trace", trace, "-q", "--json", *more]
     out = subprocess.run(command, capture_output=True, text=True)
@@ -31,27 +38,46 @@ def plan(args, scene, trace, more):
     return json.loads(out.stdout)
 
 
+def cell(row, alone, rate, large):
+    """Latency beside what is asked for, throughput, and what binds."""
+    n = row["workers"]
+    through = f"{100 * row['throughput_efficiency']:.0f} %"
+    if large:
+        return f"{100 * row['latency_efficiency']:.0f} % / {through} {row['bound_by']}"
+    asked = alone / n + 1.2 + 1e3 * (row["bytes_down"] + row["bytes_up"] + row["brick_bytes"]) / rate
+    limit = f" ({asked:.1f})" if n <= 15 else ""
+    return f"{row['frame_ms']:.1f}{limit} / {through} {row['bound_by']}"
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("slabcast")
     parser.add_argument("data")
     parser.add_argument("--frames", type=int, default=18)
+    parser.add_argument("--large", action="store_true")
     parser.add_argument("--rehearse")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        for scene in SCENES:
-            trace = os.path.join(folder, scene[0] + ".trace")
-            print(f"**{scene[0]} `{scene[3]}`**", flush=True)
-            for i, link in enumerate(LINKS):
+        for scene in LARGE if args.large else SCENES:
+            trace = os.path.join(folder, "trace")
+            if os.path.exists(trace):
+                os.remove(trace)
+            print(f"**{scene[0]}** `{' '.join(scene[2])}`", flush=True)
+            for i, (link, rate) in enumerate(LINKS):
                 got = plan(args, scene, trace, ["--link", link])
+                alone = got["measured"]["alone_ms"]
                 if i == 0:
-                    print(f"(measured: {got['measured']['alone_ms']:.1f} ms alone on one core)\n")
+                    order = got["rank_correlation"] or {"plain": float("nan"), "learned": float("nan")}
+                    region = [r for r in got["predicted"] if r["schedule"] == "region"]
+                    kb = {r["workers"]: (r["bytes_down"] + r["bytes_up"]) / 1e3 for r in region}
+                    print(f"(measured: {alone:.1f} ms alone on one core; {kb[15]:.0f} KB a frame at 15 "
+                          f"workers; rank correlation {order['plain']:.2f} plain, "
+                          f"{order['learned']:.2f} learned)\n")
                     print("| link | schedule | " + " | ".join(map(str, WORKERS)) + " |")
                     print("|---|---|" + "---|" * len(WORKERS))
                 for schedule in ["region", "slab"]:
                     rows = [r for r in got["predicted"] if r["schedule"] == schedule]
-                    cells = [f"{100 * r['latency_efficiency']:.0f} / "
-                             f"{100 * r['throughput_efficiency']:.0f} {r['bound_by']}" for r in rows]
+                    cells = [cell(r, alone, rate, args.large) for r in rows]
                     print(f"| {link} | {schedule} | " + " | ".join(cells) + " |", flush=True)
             print(flush=True)
             if args.rehearse:
@@ -62,8 +88,9 @@ def main():
                 for r in got["rehearsed"]:
                     off = 100 * (r["predicted_each_ms"] / r["each_ms"] - 1)
                     print(f"| {r['schedule']} | {r['workers']} | {r['each_ms']:.1f} | "
-                          f"{r['predicted_each_ms']:.1f} | {off:+.0f} % | {r['master_cpu_ms']:.1f} | "
-                          f"{r['workers_cpu_ms']:.1f} | {100 * r['busy']:.0f} % |", flush=True)
+                          f"{r['predicted_each_ms']:.1f} | {off:+.0f} % | {r['master_cpu_ms']:.1f} "
+                          f"({r['predicted_master_cpu_ms']:.1f}) | {r['workers_cpu_ms']:.1f} "
+                          f"({r['predicted_workers_cpu_ms']:.1f}) | {100 * r['busy']:.0f} % |", flush=True)
                 print(flush=True)
 
 

@@ -387,7 +387,7 @@ impl View {
         let (lo, hi) = self.eye_box(b);
         let r = self.kernel_radius;
         let phase = self.thickness / f64::from(self.depth_phases());
-        let sheet = |z: f64| libm::floor(z / self.thickness) as i32;
+        let sheet = |z: f64| floor(z / self.thickness) as i32;
         let mut sheets =
             SheetRange::new(sheet(lo.z - r.z - 2.0 * phase), sheet(hi.z + r.z + 2.0 * phase) + 1);
         // Scales at which sections may be drawn: those of the sheets' mid-planes.
@@ -411,8 +411,8 @@ impl View {
             let at_hi = (hi * scales.0).max(hi * scales.1) + f64::from(n) * 0.5;
             // A pixel is touched when its centre (+0.5) is inside; 1/32 covers the rounding of
             // positions.
-            let first = libm::ceil(at_lo - 0.5 - 1.0 / 32.0).max(0.0);
-            let last = libm::floor(at_hi - 0.5 + 1.0 / 32.0).min(f64::from(n) - 1.0);
+            let first = ceil(at_lo - 0.5 - 1.0 / 32.0).max(0.0);
+            let last = floor(at_hi - 0.5 + 1.0 / 32.0).min(f64::from(n) - 1.0);
             (first as i32, last as i32 + 1)
         };
         let (x0, x1) = span(lo.x - r.x, hi.x + r.x, self.size[0]);
@@ -432,6 +432,24 @@ pub fn round_i32(x: f64) -> i32 {
     (x + MAGIC).to_bits() as i32
 }
 
+/// The largest integer that is not above `x`. Six calls of the library were a third of what projecting a
+/// box takes.
+#[inline(always)]
+fn floor(x: f64) -> f64 {
+    let near = (x + MAGIC) - MAGIC;
+    if x.abs() < 2_251_799_813_685_248.0 {
+        near - f64::from(u8::from(near > x))
+    } else {
+        libm::floor(x)
+    }
+}
+
+/// The least integer that is not below `x`.
+#[inline(always)]
+fn ceil(x: f64) -> f64 {
+    -floor(-x)
+}
+
 /// Nearest integer, ties to even, without a library call. `|x| < 2^51`.
 #[inline(always)]
 pub fn round_i64(x: f64) -> i64 {
@@ -446,6 +464,16 @@ mod tests {
     fn camera(azimuth: f64, tilt: f64, projection: CameraProjection) -> Camera {
         let (s, c) = (libm::sin(azimuth), libm::cos(azimuth));
         Camera { to_eye: DVec3::new(s, c, tilt), up: DVec3::Z, target: DVec3::ZERO, projection }
+    }
+
+    #[test]
+    fn floors_are_the_librarys() {
+        let ones = [0.0, -0.0, 0.5, 1.5, 2.5, 1e-300, 2f64.powi(50) + 0.5, 2f64.powi(51), 1e300];
+        let near = ones.iter().flat_map(|x| [x.next_down(), *x, x.next_up()]);
+        for x in near.flat_map(|x| [x, -x]).chain([f64::INFINITY, f64::NEG_INFINITY]) {
+            assert!(floor(x) == libm::floor(x) && ceil(x) == libm::ceil(x), "{x}");
+        }
+        assert!(floor(f64::NAN).is_nan() && ceil(f64::NAN).is_nan());
     }
 
     #[test]

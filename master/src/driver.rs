@@ -28,7 +28,7 @@ use slabcast_proto::model::Worker;
 use slabcast_schedule::{Action, Clock, Event as Happened, FrameJob, Micros};
 use slabcast_volumes::BrickStore;
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 use tokio::sync::{mpsc, oneshot};
 use tracing::{debug, info, warn};
@@ -36,6 +36,10 @@ use tracing::{debug, info, warn};
 /// Frames that the scheduler has or the finisher works at: two in the making, one behind them so that
 /// workers never run dry between frames, one being finished.
 const FRAMES_IN_FLIGHT: usize = 4;
+
+/// Threads that finish frames, each a frame at a time: 3 ms for one of 512x512 (the hash alone 2). With one,
+/// 15 workers that draw a frame in 3 ms wait for it; a third would have no frame to finish.
+const FINISHERS: usize = 2;
 
 /// Brick sets that are kept beside each other (a change of transfer function and back costs
 /// nothing then); more would only fill the master's memory.
@@ -192,16 +196,20 @@ impl Master {
         let handle = Handle { inbox: inbox.clone(), jobs: jobs.clone(), served: served.clone() };
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build()?;
         let (to_finisher, sums) = std::sync::mpsc::channel::<(FrameId, finish::FrameSums)>();
-        let done = inbox.clone();
-        std::thread::Builder::new().name("slabcast-finish".into()).spawn(move || {
-            for (flight, sums) in sums {
-                let job = sums.job;
-                let frame = finish::finish(sums);
-                if done.blocking_send(Event::Finished { job, flight, frame }).is_err() {
-                    return;
+        let sums = Arc::new(Mutex::new(sums));
+        for _ in 0..FINISHERS {
+            let (sums, done) = (sums.clone(), inbox.clone());
+            let next = move || sums.lock().unwrap_or_else(PoisonError::into_inner).recv();
+            std::thread::Builder::new().name("slabcast-finish".into()).spawn(move || {
+                while let Ok((flight, sums)) = next() {
+                    let job = sums.job;
+                    let frame = finish::finish(sums);
+                    if done.blocking_send(Event::Finished { job, flight, frame }).is_err() {
+                        return;
+                    }
                 }
-            }
-        })?;
+            })?;
+        }
         let driver = Driver {
             volume: config.volume,
             served,
@@ -596,7 +604,6 @@ impl Driver {
         attached.heard = Instant::now();
         attached.tasks_done += u64::from(matches!(message, ToMaster::Result(_)));
         let clock = &self.clock;
-        self.scheduler.handle(clock, Happened::WorkerHeard { worker });
         let happened = match message {
             ToMaster::Hello(_) => {
                 self.drop_link(worker, "said hello twice");

@@ -376,8 +376,24 @@ struct Cluster {
 }
 
 impl Cluster {
+    /// Tells a worker something, and before it which frames are over.
     fn send(&mut self, worker: WorkerId, message: ToWorker) {
+        let over = self.roster.get_mut(worker).map(|w| std::mem::take(&mut w.over));
+        for frame in over.into_iter().flatten() {
+            self.out.push_back(Action::Send { worker, message: ToWorker::EndFrame { frame } });
+        }
         self.out.push_back(Action::Send { worker, message });
+    }
+
+    /// Nothing is left that it could be told along with.
+    fn tell_what_is_over(&mut self) {
+        let told = self.roster.iter().filter(|(_, w)| !w.over.is_empty());
+        for id in told.map(|(id, _)| id).collect::<Vec<_>>() {
+            let over = self.roster.get_mut(id).and_then(|w| w.over.pop());
+            if let Some(frame) = over {
+                self.send(id, ToWorker::EndFrame { frame });
+            }
+        }
     }
 }
 
@@ -414,6 +430,17 @@ impl Scheduler {
     /// Takes in what happened. Events of workers that are not known (any more) do nothing.
     pub fn handle(&mut self, clock: &dyn Clock, event: Event) {
         let now = clock.now();
+        // Regions hang on leases and results alone, not on what bricks do meanwhile.
+        let quiet = match &event {
+            Event::WorkerHeard { .. } => true,
+            Event::BricksIn { .. }
+            | Event::BricksWanted { .. }
+            | Event::BricksForgotten { .. }
+            | Event::Pong { .. } => {
+                !self.active.is_empty() && self.active.iter().all(Frame::by_region)
+            }
+            _ => false,
+        };
         let cluster = &mut self.cluster;
         cluster.roster.watch(now, &cluster.config);
         match event {
@@ -515,7 +542,9 @@ impl Scheduler {
             }
             Event::Tick => {}
         }
-        self.advance(clock);
+        if !(quiet && self.next_deadline().is_none_or(|due| now < due)) {
+            self.advance(clock);
+        }
     }
 
     /// Bricks are on the account of the first frame in the making, whichever of several asked.
@@ -575,6 +604,9 @@ impl Scheduler {
             frame.tick(now);
         }
         while self.go_on(clock) {}
+        if self.is_idle() {
+            self.cluster.tell_what_is_over();
+        }
         self.forget_scenes();
     }
 
@@ -592,7 +624,7 @@ impl Scheduler {
                 self.active.push_back(Frame::start(job, &mut self.cluster, clock));
             }
             let turn = self.turn(i, false);
-            match self.active[i].step(&mut self.cluster, &turn, clock) {
+            match self.active[i].step(&mut self.cluster, turn, clock) {
                 Step::Waits | Step::Done => i += 1,
                 Step::Failed(reason) => {
                     let mut failed = self.active.remove(i).expect("it was just stepped");
@@ -606,7 +638,7 @@ impl Scheduler {
         for i in 0..self.active.len() {
             if self.active[i].by_region() && !self.active[i].is_done() {
                 let turn = self.turn(i, true);
-                self.active[i].step(&mut self.cluster, &turn, clock);
+                self.active[i].step(&mut self.cluster, turn, clock);
             }
         }
         while self.active.front().is_some_and(Frame::is_done) {
@@ -629,8 +661,7 @@ impl Scheduler {
             return false;
         }
         let ahead = u64::from(self.cluster.config.queue_ahead.max(1));
-        let load = |id| self.active.iter().map(|f| u64::from(f.leases(id))).sum::<u64>();
-        self.cluster.roster.staying().any(|(id, w)| load(id) < u64::from(w.threads) * ahead)
+        self.cluster.roster.staying().any(|(_, w)| w.leases < u64::from(w.threads) * ahead)
     }
 
     /// Whether the next frame in the queue goes by region on the bricks of those in the making.
@@ -643,14 +674,7 @@ impl Scheduler {
 
     /// What the others mean to frame `i`.
     fn turn(&self, i: usize, others: bool) -> Turn {
-        let mut turn = Turn { others, ..Turn::default() };
-        turn.last = i + 1 == self.active.len() && !self.follows();
-        for (_, frame) in self.active.iter().enumerate().filter(|(at, _)| *at != i) {
-            for (id, _) in self.cluster.roster.iter() {
-                *turn.elsewhere.entry(id).or_default() += u64::from(frame.leases(id));
-            }
-        }
-        turn
+        Turn { others, last: i + 1 == self.active.len() && !self.follows() }
     }
 
     /// Ends scenes that have no frame left.

@@ -143,17 +143,19 @@ impl Queue {
         (place < self.tasks.len() as u64).then_some(place as u32)
     }
 
-    /// The first waiting task that `worker` may have, if `suits` it. `mine` are the tasks of
-    /// this slab that it has leases of; `others` says whether some other worker could have it.
+    /// The first waiting task among those of which `worker` may have any, if it `suits` it. `mine` are
+    /// the tasks of this slab that it has leases of; `others` says whether some other worker could have
+    /// it.
     pub(crate) fn next_for(
         &self,
         worker: WorkerId,
         mine: &[u32],
+        among: impl Fn(u32) -> bool,
         others: impl Fn(&Task) -> bool,
         suits: impl Fn(u32) -> bool,
     ) -> Option<u32> {
         let has_suspect = mine.iter().any(|&p| self.tasks[p as usize].is_suspect());
-        self.waiting.iter().copied().find(|&place| {
+        self.waiting.iter().copied().filter(|&place| among(place)).find(|&place| {
             let task = &self.tasks[place as usize];
             let has_it = mine.contains(&place);
             let failed = task.failed.iter().any(|(w, ..)| *w == worker) && others(task);
@@ -350,7 +352,7 @@ mod tests {
     }
 
     fn next(q: &Queue, w: u64, mine: &[u32]) -> Option<u32> {
-        q.next_for(WorkerId(w), mine, |_| true, |_| true)
+        q.next_for(WorkerId(w), mine, |_| true, |_| true, |_| true)
     }
 
     fn take(q: &mut Queue, w: u64, mine: &[u32], now: Micros) -> (u32, Epoch) {
@@ -471,10 +473,10 @@ mod tests {
             // Worker 1 gets it again only while there is nobody else.
             let alone = w == 1;
             assert_eq!(
-                q.next_for(WorkerId(1), &[], |_| true, |_| true).is_none(),
+                q.next_for(WorkerId(1), &[], |_| true, |_| true, |_| true).is_none(),
                 !q.tasks[0].failed.is_empty(),
             );
-            let place = q.next_for(WorkerId(w), &[], |_| !alone, |_| true).unwrap();
+            let place = q.next_for(WorkerId(w), &[], |_| true, |_| !alone, |_| true).unwrap();
             let epoch = q.lease(place, WorkerId(w), 0, &c);
             let given_up = q.fail(0, epoch, WorkerId(w), "x", "no".into(), &c);
             assert_eq!(given_up.len(), usize::from(w == 2));

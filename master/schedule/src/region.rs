@@ -26,7 +26,7 @@ use crate::{FrameJob, Micros};
 use slabcast_common::brick::{BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::WorkerId;
 use slabcast_common::occlusion::Rect;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// How much later than the mean a worker may be done before a tile of it moves, as a fraction. Tiles of
 /// 64 pixels are 2 % of a frame of 512 each. At half, noise of the measurement moves tiles and their
@@ -143,6 +143,8 @@ pub(crate) struct Regions {
     kind: (BrickSetKey, [u32; 2], u32),
     /// Whose each tile is, by its place in the queue.
     owners: Vec<WorkerId>,
+    /// All who own or owned one.
+    who: BTreeSet<WorkerId>,
     /// What each took its last owner, if that is known.
     took: Vec<Option<(WorkerId, f64)>>,
     pace: Pace,
@@ -166,7 +168,24 @@ impl Regions {
         cut.sort(size);
         let owners = share(&cut.tiles, roster, &pace, &known);
         let took = cut.tiles.iter().map(known).collect();
-        (cut, Regions { kind, owners, took, pace })
+        let who = owners.iter().copied().collect();
+        (cut, Regions { kind, owners, who, took, pace })
+    }
+
+    /// Those whose tiles these are and who are gone, or leave.
+    pub(crate) fn orphaning(&self, roster: &Roster) -> Vec<WorkerId> {
+        let gone = |id: &WorkerId| roster.get(*id).is_none_or(|w| w.leaving);
+        self.who.iter().copied().filter(gone).collect()
+    }
+
+    /// Whose a task is.
+    pub(crate) fn owner(&self, place: u32) -> WorkerId {
+        self.owners[place as usize]
+    }
+
+    /// What a task took its last owner, in microseconds.
+    pub(crate) fn took(&self, place: u32) -> Option<f64> {
+        self.took[place as usize].map(|(_, us)| us)
     }
 
     /// How long each worker has to do with what of these tasks is its own, in microseconds.
@@ -206,15 +225,10 @@ impl Regions {
         (self.owners[place as usize], FORBEARANCE + (2.0 * us) as Micros)
     }
 
-    /// Whether a task is this worker's to take first: it owns it, or its owner is gone.
-    pub(crate) fn is_for(&self, place: u32, worker: WorkerId, roster: &Roster) -> bool {
-        let owner = self.owners[place as usize];
-        owner == worker || roster.get(owner).is_none_or(|w| w.leaving)
-    }
-
     /// Another worker takes a task.
     pub(crate) fn moves(&mut self, place: u32, worker: WorkerId) {
         self.owners[place as usize] = worker;
+        self.who.insert(worker);
     }
 }
 

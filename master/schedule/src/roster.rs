@@ -17,7 +17,7 @@
 
 use crate::{Config, Micros};
 use slabcast_common::brick::BrickSetKey;
-use slabcast_common::ids::{SceneId, WorkerId};
+use slabcast_common::ids::{FrameId, SceneId, WorkerId};
 use slabcast_common::message::DIRECTORIES;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -43,6 +43,10 @@ pub(crate) struct Worker {
     pub(crate) leaving: bool,
     /// Scenes it was sent.
     pub(crate) scenes: BTreeSet<SceneId>,
+    /// Leases of frames in the making that it has not answered.
+    pub(crate) leases: u64,
+    /// Frames that are over, which it will be told with the next message.
+    pub(crate) over: Vec<FrameId>,
     /// Sets whose directories it was sent and keeps, the last one last.
     directories: VecDeque<BrickSetKey>,
     heard: Micros,
@@ -97,6 +101,8 @@ impl Roster {
             since: now,
             leaving: false,
             scenes: BTreeSet::new(),
+            leases: 0,
+            over: Vec::new(),
             directories: VecDeque::new(),
             heard: now,
             next_ping: now,

@@ -13,7 +13,7 @@ use slabcast_common::trace::{
 };
 use slabcast_common::view::{Camera, CameraProjection, Projected, View};
 use slabcast_common::volume::{Digest32, Volume};
-use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Unknown, Unmeasured};
+use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Toll, Unknown, Unmeasured};
 use slabcast_schedule::{FrameJob, Span, macrotile, slabs as slabs_of};
 use std::sync::Arc;
 
@@ -223,7 +223,8 @@ fn the_masters_link_is_shared_by_all_workers() {
 fn what_the_master_costs_shows_in_frames_and_overlaps_where_it_may() {
     let (jobs, trace) = world(4);
     let free = run(&jobs, &trace, &cluster(4));
-    let costs = Costs { finish_pixel: 20.0, receive: (30_000.0, 0.0), ..Costs::default() };
+    let master = Toll { receive: (30_000.0, 0.0), ..Toll::default() };
+    let costs = Costs { finish_pixel: 20.0, master, ..Costs::default() };
     let one = run(&jobs, &trace, &Cluster { costs, ..cluster(4) });
     let three = run(&jobs, &trace, &Cluster { costs, in_flight: 3, ..cluster(4) });
     assert!(one.frame_ms() > free.frame_ms());
@@ -244,10 +245,14 @@ fn what_the_master_costs_shows_in_frames_and_overlaps_where_it_may() {
 fn the_same_cluster_behaves_the_same() {
     let (jobs, trace) = world(3);
     let costs = Costs {
-        send: (9_000.0, 0.7),
-        receive: (8_000.0, 0.4),
-        worker_send: (10_000.0, 1.1),
-        wake: 15_000.0,
+        master: Toll {
+            woken: 15_000.0,
+            call: 5_000.0,
+            send: (900.0, 0.7),
+            receive: (800.0, 0.4),
+            bricks: (700.0, 0.3),
+        },
+        worker: Toll { send: (1_000.0, 1.1), ..Toll::default() },
         result_pixel: 1.3,
         slab_brick: 30.0,
         ..Costs::default()

@@ -1,7 +1,7 @@
 //! What messages cost a processor.
 //!
-//! Two parts: what is done to bytes here (planes to messages and back) is timed on this machine;
-//! what gRPC, TCP and the kernel take is a constant, since it needs two machines to be measured.
+//! Two parts: what is done to bytes here (planes to messages and back) is timed by the command; what
+//! gRPC, TCP and the kernel take is a constant that `tests/messages.rs` measured.
 
 use super::clock::cpu_ns;
 use prost::Message;
@@ -13,18 +13,22 @@ use slabcast_common::slab::SheetRange;
 use slabcast_common::trace::{self, Trace};
 use slabcast_proto::convert::{self, Down};
 use slabcast_proto::v1;
-use slabcast_schedule::sim::Costs;
+use slabcast_schedule::sim::{Costs, Toll};
 use std::time::Instant;
 
-/// A message through gRPC, TCP and the kernel, in ns: at a master, and at a worker, which also wakes
-/// a render thread for it. A rehearsal measures both (`slabcast plan --rehearse`, [`calibrated`]); these
-/// are what it found on 2 vCPU, where waking a core costs 20 us (TRANSPORT.md). At half, 32 workers
-/// look a third better than they are.
-const MESSAGE: (f64, f64) = (20_000.0, 45_000.0);
+/// A thread of a master, or of a worker, that slept begins to work, in ns. `tests/messages.rs` has a ping
+/// and its pong cost the master's streams 40 us and a worker 36 us alone, and 7.6 and 7.0 us in the company
+/// of 31 others (2 vCPU, on which waking a core costs 20 us): each end is woken once for either.
+const WOKEN: (f64, f64) = (16_000.0, 28_000.0);
+/// A socket is read from or written to: what is left of that in company, less [`EACH`].
+const CALL: f64 = 3_000.0;
+/// A message through gRPC in company: TRANSPORT.md, answer 1.
+const EACH: f64 = 800.0;
 /// A byte of it: TRANSPORT.md has 4.4 us for 16 KiB in company.
 const BYTE: f64 = 0.3;
-/// From a message's coming to a thread's working on it, where it slept: TRANSPORT.md, section 7.
-const WAKE: f64 = 20_000.0;
+/// To send a pixel of three bytes to the client, and to receive it: TRANSPORT.md, answer 1, has 14 and 17
+/// us for 64 KiB.
+const DELIVER: [f64; 2] = [0.65, 0.8];
 
 /// Nanoseconds of the best of some runs.
 fn best(mut run: impl FnMut()) -> f64 {
@@ -88,56 +92,45 @@ pub(super) fn messages(trace: &Trace) -> Costs {
         drop(convert::to_worker_from_wire(message));
     });
     Costs {
-        send: (MESSAGE.0, byte(send, &lease_bytes)),
-        receive: (MESSAGE.0, byte(receive, &result_bytes)),
-        bricks: (MESSAGE.0, BYTE),
-        worker_receive: (MESSAGE.1, byte(worker_receive, &lease_bytes)),
-        worker_send: (MESSAGE.1, byte(worker_send, &result_bytes)),
-        // Bricks are decoded and put into the cache: some 3 ns a byte (docs/performance.md).
-        worker_bricks: (MESSAGE.1, BYTE + 3.0),
+        master: Toll {
+            woken: WOKEN.0,
+            call: CALL,
+            send: (EACH, byte(send, &lease_bytes)),
+            receive: (EACH, byte(receive, &result_bytes)),
+            bricks: (EACH, BYTE),
+        },
+        worker: Toll {
+            woken: WOKEN.1,
+            call: CALL,
+            send: (EACH, byte(worker_send, &result_bytes)),
+            receive: (EACH, byte(worker_receive, &lease_bytes)),
+            // Bricks are decoded and put into the cache: some 3 ns a byte (docs/performance.md).
+            bricks: (EACH, BYTE + 3.0),
+        },
         finish_pixel: finish(trace),
+        mark_pixel: mark(trace.about.size),
+        deliver: DELIVER,
         hold: (0.0, fill()),
         late: late(),
-        wake: WAKE,
         ..Costs::default()
     }
 }
 
-/// The same where a message costs so much at a master and at a worker, whatever it carries.
-pub(super) fn with_messages(costs: Costs, [master, worker]: [f64; 2]) -> Costs {
-    Costs {
-        send: (master, costs.send.1),
-        receive: (master, costs.receive.1),
-        bricks: (master, costs.bricks.1),
-        worker_receive: (worker, costs.worker_receive.1),
-        worker_send: (worker, costs.worker_send.1),
-        worker_bricks: (worker, costs.worker_bricks.1),
-        ..costs
-    }
-}
-
-/// What a message costs here, from the processor time that a rehearsal took of a master and its
-/// workers. `predicted` says what both take if messages cost so much.
-pub(super) fn calibrated(
-    measured: [f64; 2],
-    predicted: impl Fn([f64; 2]) -> Result<[f64; 2], crate::fail::Fail>,
-) -> Result<[f64; 2], crate::fail::Fail> {
-    // Both are straight lines: the work of each message is what it is, whenever it is done.
-    const STEP: f64 = 10_000.0;
-    let (none, some) = (predicted([0.0; 2])?, predicted([STEP; 2])?);
-    Ok(std::array::from_fn(|i| {
-        let slope = (some[i] - none[i]) / STEP;
-        if slope > 0.0 { ((measured[i] - none[i]) / slope).clamp(1_000.0, 500_000.0) } else { STEP }
-    }))
-}
-
-/// To hash and encode a pixel, in nanoseconds.
+/// To hash and encode a pixel, in nanoseconds, of pictures as full as those of the trace.
 fn finish(trace: &Trace) -> f64 {
     use slabcast_common::image::{Background, FrameState, PixelFormat, TilePixels};
     let size = trace.about.size;
     let mut state = FrameState::new(size);
     let whole = Rect::of_size(size);
-    let (a, colour) = (vec![0.5; whole.area()], vec![[1 << 27; 3]; whole.area()]);
+    let frames = trace.frames.iter().filter_map(|f| f.regions.first());
+    let bytes =
+        frames.clone().flat_map(|l| &l.tiles).map(|t| f64::from(t.result_bytes)).sum::<f64>();
+    let pixels = frames.count() as f64 * whole.area() as f64;
+    // 16 bytes a pixel that is there; slabs alone do not say.
+    let there = if pixels > 0.0 { (bytes / 16.0 / pixels).min(1.0) } else { 1.0 };
+    let full = |i: usize| (i as f64) < there * whole.area() as f64;
+    let a = (0..whole.area()).map(|i| if full(i) { 0.5 } else { 0.0 }).collect();
+    let colour = (0..whole.area()).map(|i| if full(i) { [1 << 27; 3] } else { [0; 3] }).collect();
     state.lay(whole, TilePixels { a, colour, last: None });
     let ns = (0..3)
         .map(|_| {
@@ -147,6 +140,19 @@ fn finish(trace: &Trace) -> f64 {
             (cpu_ns() - began) as f64
         })
         .fold(f64::INFINITY, f64::min);
+    ns / (f64::from(size[0]) * f64::from(size[1]))
+}
+
+/// To mark a pixel of a picture that nobody drew, to hash and encode it.
+fn mark(size: [u32; 2]) -> f64 {
+    use slabcast_common::image::{Background, FrameState, PixelFormat};
+    let state = FrameState::new(size);
+    let ns = best(|| {
+        let mut picture = state.finish();
+        picture.pixels.fill([0.5; 4]);
+        std::hint::black_box(picture.sha256());
+        drop(picture.encode(PixelFormat::Rgb8, Background::Colour([0.0; 3])));
+    });
     ns / (f64::from(size[0]) * f64::from(size[1]))
 }
 

@@ -22,7 +22,7 @@ use predict::{Question, Row};
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::trace::{MAX_BYTES, Trace};
 use slabcast_schedule::FrameJob;
-use slabcast_schedule::sim::{Costs, Link, alone_ms};
+use slabcast_schedule::sim::{Link, alone_ms};
 use std::fmt::Write as _;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
@@ -131,8 +131,7 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
     drop(volume);
     let frames = asked.path.frames();
     let jobs = measure::jobs(&stage, frames, work)?;
-    // One worker says what messages cost.
-    let more = args.rehearse.iter().flat_map(|list| list.0.iter().chain([&1]));
+    let more = args.rehearse.iter().flat_map(|list| &list.0);
     let wanted = workers.iter().chain(more).map(|n| {
         let threads = f64::from(*n) * f64::from(args.threads);
         (work.tiles_per_worker * threads).ceil() as u64
@@ -179,8 +178,8 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
         let jobs: Vec<FrameJob> =
             jobs.iter().map(|job| FrameJob { work: under(job), ..job.clone() }).collect();
         let trace = &measured.trace;
-        let costs = predict::measured_costs(&jobs, trace, (most, args.threads))?;
-        let (rehearsed, costs) = match (&args.rehearse, &args.trace) {
+        let costs = costs::messages(trace);
+        let rehearsed = match (&args.rehearse, &args.trace) {
             (Some(list), Some(file)) => {
                 let mut asked: Asked = asked.clone();
                 asked.work.schedule = schedule;
@@ -199,10 +198,15 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
                 progress.end();
                 rehearsed?
             }
-            _ => (Vec::new(), costs),
+            _ => Vec::new(),
         };
         let rows = predict::rows(&jobs, trace, workers, &question, costs, threads)?;
-        predicted.push(Predicted { schedule, rows, rehearsed, costs });
+        let orders = match schedule {
+            // Of a cluster whose tiles are of 64 pixels, as the paper's are.
+            Schedule::Region => predict::orders(&jobs, trace, most.min(8))?,
+            Schedule::Slab | Schedule::Auto => None,
+        };
+        predicted.push(Predicted { schedule, rows, rehearsed, orders });
     }
     let said = Said { args, frames, measured: &measured, predicted: &predicted };
     if let Some(dir) = &args.output {
@@ -235,7 +239,8 @@ struct Predicted {
     schedule: Schedule,
     rows: Vec<Row>,
     rehearsed: Vec<rehearse::Rehearsed>,
-    costs: Costs,
+    /// How well tiles' estimates tell the order of their times: plainly, and learned.
+    orders: Option<[f64; 2]>,
 }
 
 impl Predicted {
@@ -328,14 +333,20 @@ impl Said<'_> {
                 );
             }
         }
-        text += "\nfirst ms: with all bricks. ms: a later frame, one in flight. frames/s: three in \
+        for [plain, learned] in self.predicted.iter().filter_map(|p| p.orders) {
+            let _ = writeln!(
+                text,
+                "\nOrder of tiles by estimate and by measured time (Spearman, 1 is the same): {plain:.2} by \
+                 pixels under bricks, {learned:.2} by what\nthe views before took."
+            );
+        }
+        text += "\nfirst ms: with all bricks. ms: a later frame, one in flight. frames/s: four in \
                  flight. eff.: against\none core's time alone over all render threads. KB, brick \
                  KB: a later frame's leases and results, and\nbricks. bound by: where most of a \
                  frame's time goes: cores (rendering, spread evenly), straggler\n(waiting for the \
-                 last tile), link, or master (messages cost the same alone and in company here: \
-                 a bound from the slow side).\n";
+                 last tile), link, or master (decisions and messages).\n";
         for p in self.predicted.iter().filter(|p| !p.rehearsed.is_empty()) {
-            text += &rehearse::table(p.name(), &p.rehearsed, &p.costs);
+            text += &rehearse::table(p.name(), &p.rehearsed);
         }
         text
     }
@@ -352,7 +363,9 @@ impl Said<'_> {
                     "frames_per_s": r.frames_per_s,
                     "throughput_efficiency": r.throughput_efficiency,
                     "bytes_down": r.bytes[0], "bytes_up": r.bytes[1], "brick_bytes": r.bytes[2],
-                    "leases": r.leases, "bound_by": r.bound.0.name(), "bound_part": r.bound.1,
+                    "leases": r.leases,
+                    "messages": { "down": r.messages[0], "writes": r.messages[1], "up": r.messages[2] },
+                    "bound_by": r.bound.0.name(), "bound_part": r.bound.1,
                     "parts_ms": { "cores": ms(0), "straggler": ms(1), "link": ms(2),
                                   "master": ms(3) },
                     "master_ms": { "driver": r.master_ms[0], "streams": r.master_ms[1],
@@ -374,6 +387,9 @@ impl Said<'_> {
                 "latency_us": self.args.latency as f64 / 1e3,
             },
             "predicted": rows,
+            "rank_correlation": self.predicted.iter().find_map(|p| p.orders).map(|[plain, learned]| {
+                serde_json::json!({ "plain": plain, "learned": learned })
+            }),
             "rehearsed": rehearsed.collect::<Vec<_>>(),
         })
     }

@@ -4,9 +4,13 @@ use super::clock::cpu_ns;
 use super::costs;
 use crate::fail::Fail;
 use crate::local::shared;
+use crate::study::order::spearman;
+use slabcast_common::ids::FrameId;
+use slabcast_common::occlusion::Rect;
+use slabcast_common::stats::FrameStats;
 use slabcast_common::trace::Trace;
-use slabcast_schedule::FrameJob;
 use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Stopwatch, Took, Unmeasured};
+use slabcast_schedule::{FrameJob, Span};
 
 /// What a frame's time goes into.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,12 +57,14 @@ pub(crate) struct Row {
     pub(crate) bound: (Bound, f64),
     /// All parts: cores, straggler, link, master, in ms.
     pub(crate) parts: [f64; 4],
-    /// Work of the master a frame, in ms: driver, streams, finisher.
+    /// Work of the master a later frame, in ms: driver, streams, finisher.
     pub(crate) master_ms: [f64; 3],
+    /// Messages of a later frame: from the master, how often some of those left together, to the master.
+    pub(crate) messages: [f64; 3],
 }
 
 /// Frames that a master has in hand (`master::driver`).
-pub(crate) const IN_FLIGHT: u32 = 3;
+pub(crate) const IN_FLIGHT: u32 = 4;
 
 /// What is asked.
 #[derive(Clone, Copy, Debug)]
@@ -96,16 +102,18 @@ pub(crate) fn watched(
     ran.map(|r| r.0).map_err(|e| Fail::failed(e.to_string()))
 }
 
-/// Predicts every number of workers, on `threads` threads of this machine.
+/// Predicts every number of workers, on `threads` threads of this machine. `messages` are what messages
+/// cost; what deciding costs is measured for each number.
 pub(crate) fn rows(
     jobs: &[FrameJob],
     trace: &Trace,
     workers: &[u32],
     question: &Question,
-    costs: Costs,
+    messages: Costs,
     threads: usize,
 ) -> Result<Vec<Row>, Fail> {
     let rows = shared(workers.len(), threads, |i, _: &mut ()| {
+        let costs = decided(jobs, trace, (workers[i], question.threads), messages)?;
         row(jobs, trace, workers[i], question, costs)
     });
     rows.into_iter().collect()
@@ -128,12 +136,7 @@ fn row(
     let throughput = run(question.link, costs, IN_FLIGHT)?;
     // What a resource costs is what a frame is shorter by where there is plenty of it.
     let no_link = run(Link::NONE, costs, 1)?;
-    let free = Costs {
-        worker_receive: costs.worker_receive,
-        worker_send: costs.worker_send,
-        worker_bricks: costs.worker_bricks,
-        ..Costs::default()
-    };
+    let free = Costs { worker: costs.worker, ..Costs::default() };
     let neither = run(Link::NONE, free, 1)?;
     let frame_ms = latency.frame_ms();
     let cores = neither.mean(|f| f.render) / 1e6 / threads;
@@ -159,9 +162,73 @@ fn row(
         leases: latency.mean(|f| f.leases),
         bound: (kinds[most], parts[most] / all),
         parts,
-        master_ms: [latency.driver, latency.streams, latency.finisher]
-            .map(|ns| ns as f64 / 1e6 / frames),
+        master_ms: std::array::from_fn(|i| {
+            let all = [latency.driver, latency.streams, latency.finisher][i];
+            (all - latency.first[i]) as f64 / 1e6 / (frames - 1.0).max(1.0)
+        }),
+        messages: [
+            latency.mean(|f| f.messages_down),
+            latency.mean(|f| f.writes_down),
+            latency.mean(|f| f.messages_up),
+        ],
     })
+}
+
+/// How well tiles' estimates tell the order of their times under the `region` schedule, on so many workers:
+/// Spearman's rank correlation, mean of the views but the first. First of pixels under blocks of bricks,
+/// which is all that is known of a first view (the paper's Figure 1); then of what the views before
+/// taught. `None` where no view has three tiles.
+pub(crate) fn orders(
+    jobs: &[FrameJob],
+    trace: &Trace,
+    workers: u32,
+) -> Result<Option<[f64; 2]>, Fail> {
+    let question =
+        Question { threads: 1, link: Link::NONE, cores: None, stretch: 1.0, mixed: false };
+    let cluster = question.cluster(workers, Costs::default(), 1);
+    let told = |jobs: &[FrameJob], trace: &Trace| -> Result<Vec<FrameStats>, Fail> {
+        let mut heard = Heard::default();
+        watched(jobs, trace, &cluster, &mut heard)?;
+        Ok(heard.0)
+    };
+    let correlation = |stats: &FrameStats, i: usize| {
+        let tiles = stats.slabs.first().map_or(&[][..], |slab| &slab.tiles[..]);
+        let pairs = tiles.iter().filter_map(|t| {
+            let [x, y, edge] = [t.x, t.y, t.size].map(|n| n as i32);
+            let rect =
+                Rect::new(x, y, x + edge, y + edge).intersect(&Rect::of_size(jobs[i].view.size));
+            let known = trace.frames[i].region(&rect, trace.about.size)?;
+            Some((t.est as f64, known.ns as f64))
+        });
+        spearman(&pairs.collect::<Vec<_>>())
+    };
+    let learned = told(jobs, trace)?;
+    let (mut sum, mut views) = ([0.0; 2], 0);
+    for i in 1..jobs.len() {
+        // By itself it is a first view.
+        let job = FrameJob { frame: FrameId(1), number: 0, ..jobs[i].clone() };
+        let one = Trace { frames: vec![trace.frames[i].clone()], ..trace.clone() };
+        let plain = told(&[job], &one)?;
+        let of = |stats: Option<&FrameStats>| stats.and_then(|s| correlation(s, i));
+        if let (Some(plain), Some(learned)) = (of(plain.first()), of(learned.get(i))) {
+            sum = [sum[0] + plain, sum[1] + learned];
+            views += 1;
+        }
+    }
+    Ok((views > 0).then(|| sum.map(|s| s / f64::from(views))))
+}
+
+#[derive(Default)]
+struct Heard(Vec<FrameStats>);
+
+impl Stopwatch for Heard {
+    fn read(&mut self) -> Option<u64> {
+        None
+    }
+
+    fn done(&mut self, stats: FrameStats, _: Vec<Span>) {
+        self.0.push(stats);
+    }
 }
 
 struct Cpu;
@@ -172,14 +239,23 @@ impl Stopwatch for Cpu {
     }
 }
 
-/// What deciding costs on this machine: the scheduler runs the path once on `workers` (whose tiles are
-/// in the trace), and is timed.
+/// What messages and deciding cost on this machine.
 pub(crate) fn measured_costs(
     jobs: &[FrameJob],
     trace: &Trace,
-    (workers, threads): (u32, u32),
+    cluster: (u32, u32),
 ) -> Result<Costs, Fail> {
-    let messages = costs::messages(trace);
+    decided(jobs, trace, cluster, costs::messages(trace))
+}
+
+/// What deciding costs on this machine: the scheduler runs the path once on so many workers of so many
+/// threads (whose tiles are in the trace), and is timed.
+pub(crate) fn decided(
+    jobs: &[FrameJob],
+    trace: &Trace,
+    (workers, threads): (u32, u32),
+    messages: Costs,
+) -> Result<Costs, Fail> {
     let question = Question { threads, link: Link::NONE, cores: None, stretch: 1.0, mixed: false };
     let mut watch = Cpu;
     let cluster = question.cluster(workers, messages, 1);

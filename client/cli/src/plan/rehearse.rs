@@ -5,19 +5,20 @@
 //! share this machine's cores, and the simulation is told so; where messages alone fill them, the
 //! rehearsal is no cluster any more, and the table says that too.
 
-use super::costs;
 use super::predict::{self, Question};
 use crate::fail::Fail;
 use crate::progress::Progress;
 use crate::request::{Asked, AxisArgs};
 use crate::{embedded, remote, runtime};
 use slabcast_client::{Client, Update};
+use slabcast_common::ids::FrameId;
 use slabcast_common::image::PixelFormat;
 use slabcast_common::message::PathRequest;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::trace::Trace;
-use slabcast_schedule::FrameJob;
-use slabcast_schedule::sim::{Costs, Link, Outcome};
+use slabcast_schedule::sim::{Costs, Link, Nanos, Outcome, Stopwatch};
+use slabcast_schedule::{FrameJob, Span};
+use std::collections::VecDeque;
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -28,6 +29,8 @@ use std::time::{Duration, Instant};
 const COME: Duration = Duration::from_secs(60);
 /// How long a path may take.
 const PLAY: Duration = Duration::from_secs(240);
+/// So many frames are played at least, one path after another: a frame of 10 ms measures nothing.
+const FRAMES: usize = 60;
 
 /// What a rehearsal was.
 #[derive(Clone, Debug)]
@@ -101,22 +104,18 @@ pub(super) struct Stage<'a> {
 }
 
 impl Stage<'_> {
-    /// Rehearses with each number of workers, and says what messages cost here.
+    /// Rehearses with each number of workers.
     pub(super) fn run(
         &self,
         workers: &[u32],
         progress: &mut Progress,
-    ) -> Result<(Vec<Rehearsed>, Costs), Fail> {
+    ) -> Result<Vec<Rehearsed>, Fail> {
         let runtime = runtime::start()?;
-        let result = (|| {
-            progress.stage("rehearsing with one worker: what messages cost here");
-            let costs = self.calibrate(&runtime.block_on(self.one(1))?)?;
-            let rehearsed = workers.iter().map(|&n| {
-                progress.stage(&format!("rehearsing with {n} workers"));
-                self.beside(n, &runtime.block_on(self.one(n))?, costs)
-            });
-            Ok((rehearsed.collect::<Result<_, Fail>>()?, costs))
-        })();
+        let rehearsed = workers.iter().map(|&n| {
+            progress.stage(&format!("rehearsing with {n} workers"));
+            self.beside(n, &runtime.block_on(self.one(n))?)
+        });
+        let result = rehearsed.collect::<Result<_, Fail>>();
         runtime::end(runtime);
         result
     }
@@ -170,42 +169,44 @@ impl Stage<'_> {
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
         let served = remote::describe(&client).await?;
-        let request = self.asked.request(&served.info, PixelFormat::Rgb8, false);
-        let played = tokio::time::timeout(PLAY, play(&client, request, &master, &workers)).await;
+        let paths = FRAMES.div_ceil(self.jobs.len().max(1));
+        let requests: Vec<PathRequest> = (0..paths)
+            .map(|_| self.asked.request(&served.info, PixelFormat::Rgb8, false))
+            .collect();
+        let played = tokio::time::timeout(PLAY, play(&client, &requests, &master, &workers)).await;
         played.map_err(|_| Fail::failed("the rehearsal took more than 4 minutes"))?
     }
 
-    /// What is predicted for this machine.
-    fn predict(&self, workers: u32, costs: Costs) -> Result<Outcome, Fail> {
+    /// What is predicted for this machine, and what the scheduler says there that a later frame takes, in ms.
+    fn predict(&self, workers: u32) -> Result<(Outcome, f64), Fail> {
         let cores = Some(embedded::cores());
+        let costs = predict::decided(self.jobs, self.trace, (workers, self.threads), self.costs)?;
         let question =
             Question { threads: self.threads, link: Link::NONE, cores, stretch: 1.0, mixed: false };
         let cluster = question.cluster(workers, costs, predict::IN_FLIGHT);
-        predict::simulate(self.jobs, self.trace, &cluster)
-    }
-
-    /// What messages cost here, by a rehearsal with one worker.
-    fn calibrate(&self, played: &Played) -> Result<Costs, Fail> {
-        let (Some(master), Some(workers)) = (played.master, played.workers) else {
-            return Ok(self.costs);
+        // The path again and again, as it is played.
+        let frames = self.jobs.len();
+        let all = frames * FRAMES.div_ceil(frames.max(1));
+        let again = |i: usize| FrameJob {
+            frame: FrameId(i as u64 + 1),
+            number: i as u64,
+            ..self.jobs[i % frames].clone()
         };
-        let measured = [master, workers].map(|d| d.as_nanos() as f64);
-        let messages = costs::calibrated(measured, |messages| {
-            let outcome = self.predict(1, costs::with_messages(self.costs, messages))?;
-            Ok(outcome.later_work().map(|ns| ns as f64))
-        })?;
-        Ok(costs::with_messages(self.costs, messages))
+        let jobs: Vec<FrameJob> = (0..all).map(again).collect();
+        let traced = (0..all).map(|i| self.trace.frames[i % frames].clone()).collect();
+        let trace = Trace { frames: traced, ..self.trace.clone() };
+        let mut heard = Totals::default();
+        let outcome = predict::watched(&jobs, &trace, &cluster, &mut heard)?;
+        Ok((outcome, mean(&heard.0)))
     }
 
     /// What was measured, beside what is predicted.
-    fn beside(&self, workers: u32, played: &Played, costs: Costs) -> Result<Rehearsed, Fail> {
+    fn beside(&self, workers: u32, played: &Played) -> Result<Rehearsed, Fail> {
         let cores = embedded::cores();
-        let predicted = self.predict(workers, costs)?;
+        let (predicted, predicted_ms) = self.predict(workers)?;
         // The first frame is left out on both sides.
-        let frames = self.jobs.len().saturating_sub(1).max(1) as f64;
+        let frames = played.totals.len().saturating_sub(1).max(1) as f64;
         let [master, others] = predicted.later_work();
-        let later = &played.frames[usize::from(played.frames.len() > 1)..];
-        let mean = later.iter().map(|f| f.ms.total).sum::<f64>() / later.len().max(1) as f64;
         let ms = |ns: u64| ns as f64 / 1e6 / frames;
         let cpu = |d: Option<Duration>| d.map(|d| d.as_secs_f64() * 1e3 / frames);
         let (master_ms, workers_ms) = (cpu(played.master), cpu(played.workers));
@@ -213,8 +214,8 @@ impl Stage<'_> {
         let busy = master_ms.zip(workers_ms).map(|(m, w)| (m + w) / whole);
         Ok(Rehearsed {
             workers,
-            frame_ms: mean,
-            predicted_ms: predicted.frame_ms(),
+            frame_ms: mean(&played.totals),
+            predicted_ms,
             each_ms: played.each_ms,
             predicted_each_ms: predicted.each_ms(),
             master_ms,
@@ -226,42 +227,73 @@ impl Stage<'_> {
     }
 }
 
+/// Mean of all but the first.
+fn mean(totals: &[f64]) -> f64 {
+    let later = &totals[usize::from(totals.len() > 1)..];
+    later.iter().sum::<f64>() / later.len().max(1) as f64
+}
+
+/// What frames take, as their statistics say, in ms.
+#[derive(Default)]
+struct Totals(Vec<f64>);
+
+impl Stopwatch for Totals {
+    fn read(&mut self) -> Option<Nanos> {
+        None
+    }
+
+    fn done(&mut self, stats: FrameStats, _: Vec<Span>) {
+        self.0.push(stats.ms.total);
+    }
+}
+
 /// What was seen of a path.
 struct Played {
-    frames: Vec<FrameStats>,
+    /// What frames took, as their statistics say, in ms.
+    totals: Vec<f64>,
     each_ms: f64,
     took: Duration,
     master: Option<Duration>,
     workers: Option<Duration>,
 }
 
-/// Has the path played, and looks at frames and processes.
+/// Has paths played, and looks at frames and processes.
 async fn play(
     client: &Client,
-    request: PathRequest,
+    requests: &[PathRequest],
     master: &Process,
     workers: &[Process],
 ) -> Result<Played, Fail> {
     let of_workers =
         || workers.iter().map(Process::cpu).try_fold(Duration::ZERO, |sum, d| Some(sum + d?));
-    let job = client.submit(&request).await.map_err(|e| remote::fail(&e))?;
-    let mut stream = client.watch(&job, 0).await.map_err(|e| remote::fail(&e))?;
-    let (mut frames, mut came) = (Vec::new(), Vec::new());
+    // The others when the bricks are made: each job that finds none makes them.
+    let mut jobs = VecDeque::new();
+    let mut rest = requests.iter();
+    if let Some(first) = rest.next() {
+        jobs.push_back(client.submit(first).await.map_err(|e| remote::fail(&e))?);
+    }
+    let (mut totals, mut came) = (Vec::new(), Vec::new());
     let (mut began, mut before) = (Instant::now(), (master.cpu(), of_workers()));
-    while let Some(update) = stream.next().await.map_err(|e| remote::fail(&e))? {
-        let Update::Frame(frame) = update else { continue };
-        came.push(Instant::now());
-        if came.len() == 1 {
-            // Before the first frame the volume is cut into bricks and all of them are sent: from here
-            // on it counts.
-            (began, before) = (Instant::now(), (master.cpu(), of_workers()));
+    while let Some(job) = jobs.pop_front() {
+        let mut stream = client.watch(&job, 0).await.map_err(|e| remote::fail(&e))?;
+        while let Some(update) = stream.next().await.map_err(|e| remote::fail(&e))? {
+            let Update::Frame(frame) = update else { continue };
+            came.push(Instant::now());
+            if came.len() == 1 {
+                // Before the first frame the volume is cut into bricks and all of them are sent: from
+                // here on it counts.
+                for request in rest.by_ref() {
+                    jobs.push_back(client.submit(request).await.map_err(|e| remote::fail(&e))?);
+                }
+                (began, before) = (Instant::now(), (master.cpu(), of_workers()));
+            }
+            let stats: FrameStats = serde_json::from_str(&frame.stats_json)
+                .map_err(|e| Fail::failed(format!("a frame's statistics can't be read: {e}")))?;
+            if !stats.rehearsed {
+                return Err(Fail::failed("the master drew instead of rehearsing"));
+            }
+            totals.push(stats.ms.total);
         }
-        let stats: FrameStats = serde_json::from_str(&frame.stats_json)
-            .map_err(|e| Fail::failed(format!("a frame's statistics can't be read: {e}")))?;
-        if !stats.rehearsed {
-            return Err(Fail::failed("the master drew instead of rehearsing"));
-        }
-        frames.push(stats);
     }
     let after = (master.cpu(), of_workers());
     let spent = |a: Option<Duration>, b: Option<Duration>| Some(a?.saturating_sub(b?));
@@ -270,7 +302,7 @@ async fn play(
         _ => began.elapsed().as_secs_f64() * 1e3,
     };
     Ok(Played {
-        frames,
+        totals,
         each_ms: each,
         took: began.elapsed(),
         master: spent(after.0, before.0),
@@ -279,15 +311,12 @@ async fn play(
 }
 
 /// The comparison, for people.
-pub(super) fn table(schedule: &str, rows: &[Rehearsed], costs: &Costs) -> String {
+pub(super) fn table(schedule: &str, rows: &[Rehearsed]) -> String {
     let mut text = format!(
-        "\n{schedule} schedule, rehearsed on this machine (loopback, {} cores for all), measured beside predicted; a \
-         message costs a\nmaster {:.0} us and a worker {:.0} us here, by a rehearsal with one \
-         worker:\n\n\
+        "\n{schedule} schedule, rehearsed on this machine (loopback, {} cores for all), measured \
+         beside predicted:\n\n\
          {:>7} {:>9} {:>9} {:>6} {:>9} {:>9} {:>6} {:>13} {:>13} {:>6}\n",
         embedded::cores(),
-        costs.send.0 / 1e3,
-        costs.worker_send.0 / 1e3,
         "workers",
         "ms",
         "pred.",

@@ -13,7 +13,7 @@ mod effects;
 mod lab;
 mod live;
 mod nodes;
-mod order;
+pub(crate) mod order;
 mod page;
 mod paper;
 mod parts;

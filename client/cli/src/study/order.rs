@@ -129,7 +129,7 @@ pub(super) fn find(bed: &Bed) -> Result<Option<Order>, Fail> {
 
 /// Spearman's rank correlation of pairs; ties share the mean of their ranks. `None` of fewer than
 /// three pairs, or where one side is all the same.
-pub(super) fn spearman(pairs: &[(f64, f64)]) -> Option<f64> {
+pub(crate) fn spearman(pairs: &[(f64, f64)]) -> Option<f64> {
     let n = pairs.len();
     if n < 3 {
         return None;

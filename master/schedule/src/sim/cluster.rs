@@ -1,7 +1,7 @@
 //! The virtual cluster: master, links and workers.
 
 use super::pipe::{Cores, Pipe, through};
-use super::{Cluster, FrameOutcome, Nanos, Outcome, Stopwatch, Took, Unknown, micros};
+use super::{Cluster, Costs, FrameOutcome, Nanos, Outcome, Stopwatch, Took, Unknown, micros};
 use crate::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, Epoch, FrameId, TaskId, WorkerId};
@@ -23,8 +23,10 @@ const FRAME: u64 = 600;
 const BATCH: u64 = 64 << 10;
 /// Batches under way to one worker.
 const BATCHES: usize = 2;
-/// Threads that carry the master's streams (`client/cli/src/runtime.rs`).
+/// Threads that carry the master's streams (`client/cli/src/runtime.rs`), and that finish frames
+/// (`master/src/driver.rs`).
 const STREAMS: u32 = 2;
+const FINISHERS: u32 = 2;
 
 struct VirtualClock(Cell<Nanos>);
 
@@ -35,10 +37,9 @@ impl Clock for VirtualClock {
 }
 
 /// What reaches somebody at a time.
-#[expect(clippy::large_enum_variant, reason = "a view in a message; few are on their way at once")]
 enum Coming {
     /// A message is at the master's end of the link, so many bytes.
-    AtMaster(Event, u64),
+    AtMaster(WorkerId, Event, u64),
     /// It is decoded and lies before the driver.
     Inbox(Event),
     /// The driver is free again.
@@ -117,8 +118,12 @@ struct Running {
 struct Worker {
     down: Pipe,
     up: Pipe,
-    /// What receives and sends, where the machine is its own.
+    /// What receives and sends.
     io: Cores,
+    /// When what came last is read, what went last is written, and what the master heard last read.
+    read: Nanos,
+    wrote: Nanos,
+    heard: Nanos,
     /// What that took of a core that a render thread had.
     stolen: Nanos,
     present: BTreeSet<(BrickSetKey, BrickId)>,
@@ -201,7 +206,7 @@ pub fn run(
         driver_busy: false,
         driver: Cores::new(1),
         streams: Cores::new(STREAMS),
-        finisher: Cores::new(1),
+        finisher: Cores::new(FINISHERS),
         machine: cluster.cores.map(Cores::new),
         shut: BTreeMap::new(),
         queued: 0,
@@ -222,6 +227,9 @@ pub fn run(
             down: Pipe::new(bandwidth),
             up: Pipe::new(bandwidth),
             io: Cores::new(1),
+            read: 0,
+            wrote: 0,
+            heard: 0,
             stolen: 0,
             present: BTreeSet::new(),
             leases: VecDeque::new(),
@@ -296,6 +304,8 @@ impl World<'_> {
 
     /// Work of a thread of the master.
     fn master(&mut self, which: fn(&mut Self) -> &mut Cores, at: Nanos, ns: f64) -> Nanos {
+        let woken = if which(self).sleeps(at) { self.cluster.costs.master.woken } else { 0.0 };
+        let ns = ns + woken;
         let alone = which(self).run(at, ns);
         match &mut self.machine {
             Some(machine) => machine.run(at, ns).max(alone),
@@ -305,38 +315,57 @@ impl World<'_> {
 
     /// Work of a worker beside rendering.
     fn worker(&mut self, id: WorkerId, at: Nanos, ns: f64) -> Nanos {
+        let sleeps = self.workers[&id].io.sleeps(at);
+        let ns = ns + if sleeps { self.cluster.costs.worker.woken } else { 0.0 };
         self.worker_work += ns as Nanos;
+        let w = self.workers.get_mut(&id).expect("a worker that works is there");
+        let alone = w.io.run(at, ns);
         match &mut self.machine {
-            Some(machine) => machine.run(at, ns),
-            None => self.workers.get_mut(&id).map_or(at, |w| {
+            Some(machine) => machine.run(at, ns).max(alone),
+            None => {
                 if w.running.iter().any(Option::is_some) {
                     w.stolen += ns as Nanos;
                 }
-                w.io.run(at, ns)
-            }),
+                alone
+            }
         }
     }
 
-    /// A worker's message goes up.
+    /// A worker's message goes up. What is there before the one before is written goes along with it.
     fn up(&mut self, id: WorkerId, event: Event, bytes: u64, at: Nanos) {
-        let costs = &self.cluster.costs.worker_send;
-        let at = self.worker(id, at, costs.0 + costs.1 * bytes as f64);
+        let toll = &self.cluster.costs.worker;
+        let call = if at <= self.workers[&id].wrote { 0.0 } else { toll.call };
+        let at = self.worker(id, at, call + toll.send.0 + toll.send.1 * bytes as f64);
         let w = self.workers.get_mut(&id).expect("a worker that speaks is there");
+        w.wrote = at;
         let there = through(&mut w.up, &mut self.up, at, bytes);
         self.outcome.frames[self.at].up += bytes;
-        let when = there + self.cluster.link.latency_ns + self.cluster.costs.wake as Nanos;
-        self.later(when, Coming::AtMaster(event, bytes));
+        self.outcome.frames[self.at].messages_up += 1;
+        self.later(there + self.cluster.link.latency_ns, Coming::AtMaster(id, event, bytes));
     }
 
-    /// The master's message goes down, when the driver is done with it.
-    fn down(&mut self, id: WorkerId, message: ToWorker, bytes: u64, at: Nanos) {
-        let (fixed, byte) = self.cluster.costs.send;
-        let at = self.master(|w| &mut w.streams, at, fixed + byte * bytes as f64);
+    /// The master's message goes down, when the driver is done with it. Of those that leave together to
+    /// one worker only the first pays the call.
+    fn down(&mut self, id: WorkerId, message: ToWorker, bytes: u64, at: Nanos, first: bool) {
+        let toll = &self.cluster.costs.master;
+        let call = if first { toll.call } else { 0.0 };
+        let ns = call + toll.send.0 + toll.send.1 * bytes as f64;
+        let at = self.master(|w| &mut w.streams, at, ns);
         let Some(w) = self.workers.get_mut(&id) else { return };
         let there = through(&mut self.down, &mut w.down, at, bytes);
         self.outcome.frames[self.at].down += bytes;
-        let when = there + self.cluster.link.latency_ns + self.cluster.costs.wake as Nanos;
-        self.later(when, Coming::AtWorker(id, message));
+        self.outcome.frames[self.at].messages_down += 1;
+        self.outcome.frames[self.at].writes_down += u64::from(first);
+        self.later(there + self.cluster.link.latency_ns, Coming::AtWorker(id, message));
+    }
+
+    /// A worker has read a message.
+    fn read(&mut self, id: WorkerId, bytes: u64) -> Nanos {
+        let (now, toll) = (self.now(), &self.cluster.costs.worker);
+        let call = if now <= self.workers[&id].read { 0.0 } else { toll.call };
+        let at = self.worker(id, now, call + toll.receive.0 + toll.receive.1 * bytes as f64);
+        self.workers.get_mut(&id).expect("a worker stays").read = at;
+        at
     }
 
     /// Batches of bricks go while there is room on the way.
@@ -348,12 +377,13 @@ impl World<'_> {
             }
             let Some((set, bricks, bytes)) = w.batches.pop_front() else { return };
             w.under_way += 1;
-            let (fixed, byte) = self.cluster.costs.bricks;
-            let at = self.master(|w| &mut w.streams, at, fixed + byte * bytes as f64);
+            let toll = &self.cluster.costs.master;
+            let ns = toll.call + toll.bricks.0 + toll.bricks.1 * bytes as f64;
+            let at = self.master(|w| &mut w.streams, at, ns);
             let w = self.workers.get_mut(&id).expect("as before");
             let there = through(&mut self.down, &mut w.down, at, bytes);
             self.outcome.frames[self.at].bricks += bytes;
-            let when = there + self.cluster.link.latency_ns + self.cluster.costs.wake as Nanos;
+            let when = there + self.cluster.link.latency_ns;
             self.later(when, Coming::Batch(id, set, bricks, bytes));
         }
     }
@@ -366,9 +396,12 @@ impl World<'_> {
     ) -> Result<(), Unknown> {
         let now = self.now();
         match what {
-            Coming::AtMaster(event, bytes) => {
-                let (fixed, byte) = self.cluster.costs.receive;
-                let at = self.master(|w| &mut w.streams, now, fixed + byte * bytes as f64);
+            Coming::AtMaster(id, event, bytes) => {
+                let toll = &self.cluster.costs.master;
+                let call = if now <= self.workers[&id].heard { 0.0 } else { toll.call };
+                let ns = call + toll.receive.0 + toll.receive.1 * bytes as f64;
+                let at = self.master(|w| &mut w.streams, now, ns);
+                self.workers.get_mut(&id).expect("a worker stays").heard = at;
                 self.later(at, Coming::Inbox(event));
             }
             Coming::Inbox(event) => {
@@ -381,8 +414,9 @@ impl World<'_> {
             }
             Coming::AtWorker(id, message) => self.told(id, message)?,
             Coming::Batch(id, set, bricks, bytes) => {
-                let (fixed, byte) = self.cluster.costs.worker_bricks;
-                let at = self.worker(id, now, fixed + byte * bytes as f64);
+                let toll = &self.cluster.costs.worker;
+                let ns = toll.call + toll.bricks.0 + toll.bricks.1 * bytes as f64;
+                let at = self.worker(id, now, ns);
                 let w = self.workers.get_mut(&id).expect("a worker stays");
                 w.under_way -= 1;
                 let count = bricks.len() as u32;
@@ -392,12 +426,12 @@ impl World<'_> {
                 }
                 self.batches(id, now);
                 self.up(id, Event::BricksIn { worker: id, set, bricks: count }, SMALL, at);
-                self.begin(id)?;
+                self.begin(id, None)?;
             }
             Coming::Lease(id, lease) => {
                 let w = self.workers.get_mut(&id).expect("a worker stays");
                 w.leases.push_back((lease, now));
-                self.begin(id)?;
+                self.begin(id, None)?;
             }
             Coming::TaskEnd(id, thread) => {
                 let w = self.workers.get_mut(&id).expect("a worker stays");
@@ -407,7 +441,7 @@ impl World<'_> {
                     return Ok(());
                 }
                 self.end_task(id, thread);
-                self.begin(id)?;
+                self.begin(id, Some(thread))?;
             }
             Coming::Finished(frame) => {
                 self.outcome.frames[frame.0 as usize - 1].delivered = now;
@@ -425,27 +459,27 @@ impl World<'_> {
     }
 
     fn told(&mut self, id: WorkerId, message: ToWorker) -> Result<(), Unknown> {
-        let now = self.now();
-        let (fixed, byte) = self.cluster.costs.worker_receive;
         match message {
             ToWorker::Lease(lease) => {
                 let task = Task::Slab(lease);
                 let bytes = self.known(&task)?.lease_bytes;
-                let at = self.worker(id, now, fixed + byte * bytes as f64);
+                let at = self.read(id, bytes);
                 self.later(at, Coming::Lease(id, task));
             }
             ToWorker::Region(lease) => {
-                let at = self.worker(id, now, fixed + byte * SMALL as f64);
+                let at = self.read(id, SMALL);
                 self.later(at, Coming::Lease(id, Task::Region(lease)));
             }
             ToWorker::EndFrame { frame } => {
+                self.read(id, SMALL);
                 let w = self.workers.get_mut(&id).expect("a worker stays");
                 w.leases.retain(|(l, _)| l.frame() != frame);
                 w.tables.remove(&frame);
             }
             ToWorker::Ping { nonce } => {
-                let pong = Event::Pong { worker: id, nonce, clock_us: micros(now) };
-                self.up(id, pong, SMALL, now);
+                let at = self.read(id, SMALL);
+                let pong = Event::Pong { worker: id, nonce, clock_us: micros(at) };
+                self.up(id, pong, SMALL, at);
             }
             ToWorker::DropBricks { set, bricks } => {
                 let w = self.workers.get_mut(&id).expect("a worker stays");
@@ -454,7 +488,7 @@ impl World<'_> {
                 }
             }
             _ => {
-                self.worker(id, now, fixed + byte * FRAME as f64);
+                self.read(id, FRAME);
             }
         }
         Ok(())
@@ -533,13 +567,20 @@ impl World<'_> {
         Ok(None)
     }
 
-    /// Free threads begin leases whose bricks are there.
-    fn begin(&mut self, id: WorkerId) -> Result<(), Unknown> {
-        let now = self.now();
+    /// Free threads begin leases whose bricks are there. One of them is `awake`: it has just ended another.
+    fn begin(&mut self, id: WorkerId, mut awake: Option<usize>) -> Result<(), Unknown> {
+        let woken = self.cluster.costs.worker.woken;
         loop {
             let w = self.workers.get_mut(&id).expect("a worker stays");
-            let Some(thread) = w.running.iter().position(Option::is_none) else { return Ok(()) };
+            let free = awake.or_else(|| w.running.iter().position(Option::is_none));
+            let Some(thread) = free else { return Ok(()) };
             let Some((lease, received, known)) = self.take(id)? else { return Ok(()) };
+            let mut now = self.now();
+            if awake.take().is_none() {
+                let at = now + woken as Nanos;
+                now = self.machine.as_mut().map_or(at, |m| m.run(now, woken));
+                self.worker_work += woken as Nanos;
+            }
             let frame = lease.frame();
             let traced = &self.trace.frames[frame.0 as usize - 1];
             let mut setup = traced.setup_ns;
@@ -710,8 +751,13 @@ impl World<'_> {
         let end = self.master(|w| &mut w.driver, now, cost);
         self.driver_busy = true;
         self.later(end, Coming::Free);
+        let mut written = BTreeSet::new();
         for action in actions {
-            self.carry_out(action, end, watch)?;
+            let first = match &action {
+                Action::Send { worker, .. } => written.insert(*worker),
+                _ => false,
+            };
+            self.carry_out(action, end, first, watch)?;
         }
         Ok(())
     }
@@ -720,6 +766,7 @@ impl World<'_> {
         &mut self,
         action: Action,
         at: Nanos,
+        first: bool,
         watch: &mut dyn Stopwatch,
     ) -> Result<(), Unknown> {
         match action {
@@ -741,7 +788,7 @@ impl World<'_> {
                     ToWorker::Frame { .. } | ToWorker::Scene(_) => FRAME,
                     _ => SMALL,
                 };
-                self.down(worker, message, bytes, at);
+                self.down(worker, message, bytes, at, first);
             }
             Action::SendBricks { worker, set, bricks } => {
                 let job = self.jobs.iter().find(|j| j.scene.bricks == set);
@@ -771,8 +818,14 @@ impl World<'_> {
                     self.outcome.frames[i + 1].began = self.outcome.frames[i].done;
                 }
                 let [w, h] = self.jobs[i].view.size.map(f64::from);
-                let ns = self.cluster.costs.finish_pixel * w * h;
-                let finished = self.master(|w| &mut w.finisher, at, ns);
+                let Costs { finish_pixel, mark_pixel, deliver: [out, client], .. } =
+                    self.cluster.costs;
+                let ns = if self.machine.is_some() { mark_pixel } else { finish_pixel };
+                let finished = self.master(|w| &mut w.finisher, at, ns * w * h);
+                let sent = self.master(|w| &mut w.streams, finished, out * w * h);
+                if let Some(machine) = &mut self.machine {
+                    machine.run(sent, client * w * h);
+                }
                 self.later(finished, Coming::Finished(frame));
             }
             Action::FrameFailed { frame, reason } => {

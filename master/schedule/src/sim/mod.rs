@@ -48,6 +48,25 @@ impl Link {
     pub const NONE: Link = Link { bytes_per_s: None, latency_ns: 0 };
 }
 
+/// What messages cost one end of a link, in nanoseconds of a processor.
+///
+/// A message in company costs a tenth of one alone (TRANSPORT.md, answer 1): the sleeper is woken for
+/// the first, and what lies together is read and written in one call. So waking is charged where
+/// somebody slept, and a call where there was none at hand to go along with.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Toll {
+    /// A thread that slept begins to work; as long, nothing happens.
+    pub woken: f64,
+    /// A socket is read from or written to.
+    pub call: f64,
+    /// A message out, and a byte of it.
+    pub send: (f64, f64),
+    /// A message in, and a byte of it.
+    pub receive: (f64, f64),
+    /// A batch of bricks, and a byte of it.
+    pub bricks: (f64, f64),
+}
+
 /// What messages and decisions cost a processor, in nanoseconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Costs {
@@ -67,26 +86,21 @@ pub struct Costs {
     pub result_pixel: f64,
     /// Driver: anything else that happens.
     pub event: f64,
-    /// The master's streams: a message out, and a byte of it.
-    pub send: (f64, f64),
-    /// The master's streams: a message in, and a byte of it.
-    pub receive: (f64, f64),
-    /// The master's streams: a batch of bricks, and a byte of it.
-    pub bricks: (f64, f64),
-    /// The master's finisher: a pixel of a picture (hash, encoding, statistics).
+    /// To send a pixel of a picture to who asked for it: the master's streams, and the client on the
+    /// machine of a rehearsal.
+    pub deliver: [f64; 2],
+    /// The master's streams. Its driver is woken as they are.
+    pub master: Toll,
+    /// The master's finishers: a pixel of a picture (hash, encoding).
     pub finish_pixel: f64,
-    /// Worker: a message in, and a byte of it.
-    pub worker_receive: (f64, f64),
-    /// Worker: a message out, and a byte of it.
-    pub worker_send: (f64, f64),
-    /// Worker: a batch of bricks, and a byte of it.
-    pub worker_bricks: (f64, f64),
+    /// The same in a rehearsal, whose pictures are marked all over.
+    pub mark_pixel: f64,
+    /// A worker's stream. Its render threads are woken as it is.
+    pub worker: Toll,
     /// A rehearsing worker: to fill the planes of a result, and a pixel of them.
     pub hold: (f64, f64),
     /// A rehearsing worker: how late the system wakes a thread that holds a tile.
     pub late: f64,
-    /// From a message's coming to somebody's working on it, where he slept.
-    pub wake: f64,
 }
 
 /// A cluster to be tried.
@@ -130,6 +144,12 @@ pub struct FrameOutcome {
     pub bricks: u64,
     /// Leases.
     pub leases: u64,
+    /// Messages from the master, and how often some of them left together; bricks left out.
+    pub messages_down: u64,
+    /// See above.
+    pub writes_down: u64,
+    /// Messages to the master.
+    pub messages_up: u64,
 }
 
 /// What became of all.

@@ -42,6 +42,11 @@ impl Cores {
         Cores { free: vec![0; n.max(1) as usize], work: 0 }
     }
 
+    /// Whether whoever takes work that is there at `at` has slept.
+    pub(super) fn sleeps(&self, at: Nanos) -> bool {
+        self.free.iter().any(|free| *free < at)
+    }
+
     /// Work that is there at `at`: when it is done.
     pub(super) fn run(&mut self, at: Nanos, ns: f64) -> Nanos {
         let ns = ns as Nanos;
@@ -72,5 +77,6 @@ mod tests {
         let mut cores = Cores::new(2);
         assert_eq!([5.0, 5.0, 5.0].map(|ns| cores.run(10, ns)), [15, 15, 20]);
         assert_eq!(cores.work, 15);
+        assert_eq!([19, 15, 14].map(|at| cores.sleeps(at + 1)), [true, true, false]);
     }
 }

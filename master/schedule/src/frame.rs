@@ -839,7 +839,8 @@ impl Frame {
             }
             self.ledger.stalled(worker, cost);
             cluster.residency.touched(self.job.scene.bricks, &cost.touched);
-            cluster.memory.learn(regions, &tile, worker, end - start, &cost.touched);
+            let whose = (worker, regions.home(place, worker, &cluster.roster));
+            cluster.memory.learn(regions, &tile, whose, end - start, &cost.touched);
         }
         self.ledger.spans.push(Span {
             name: format!("{},{}", tile.x0, tile.y0),

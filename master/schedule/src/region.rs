@@ -13,8 +13,9 @@
 //!
 //! **Who.** At first each worker gets a band of rows: bricks at a border are sent to both sides, and when
 //! a path turns about the upright axis, bricks stay in their rows. Whoever drew a tile last holds its
-//! bricks, so it gets it again. A tile moves only when one worker would else be done more than
-//! [`SLACK`] later than the mean, and the bricks that it was drawn from go along at once. When all of a
+//! bricks, so it gets it again, unless it took it from another for once. A tile moves only when one worker would else be done more than
+//! [`SLACK`] later than the mean and the frame is shorter by more than its bricks take; those go along at
+//! once. When all of a
 //! worker's tiles are lent it takes tiles of the next frame of the path; another's tile only where there
 //! is no next one and its owner has work for longer than two such tiles.
 //!
@@ -37,6 +38,10 @@ const SLACK: f64 = 0.06;
 /// the speed among four is late by 60 %; what the system does on the side makes one late by a tenth.
 const LATE: f64 = 0.25;
 
+/// What moving a brick costs, in microseconds: 1.2 KB of it at 1 Gbit/s. A tile of 64 pixels is drawn from
+/// some 100 in 1 ms, so it moves when a frame is shorter by most of that.
+const BRICK: f64 = 9.0;
+
 /// How long an owner that says nothing keeps its tiles from those who have nothing to do, beyond twice
 /// what the tile takes: the scheduling of two busy machines, as for tasks that are late.
 const FORBEARANCE: Micros = 5_000;
@@ -52,7 +57,11 @@ const BLOCKS: usize = 2048;
 /// What is known of a tile from the frame before.
 #[derive(Clone, Debug)]
 struct Known {
+    /// Who drew it last.
     owner: WorkerId,
+    /// Whose it was to be. Who has nothing to do takes a tile for once: next time it is drawn where its
+    /// neighbours are, lest borders, and with them bricks that two workers hold, become more and more.
+    home: WorkerId,
     /// What it takes its owner.
     us: f64,
     /// Places of the bricks that it was drawn from.
@@ -103,7 +112,7 @@ impl Memory {
         &mut self,
         regions: &Regions,
         tile: &Rect,
-        owner: WorkerId,
+        (owner, home): (WorkerId, WorkerId),
         us: Micros,
         touched: &[u32],
     ) {
@@ -114,7 +123,7 @@ impl Memory {
             Some(lessons) if lessons.kind == regions.kind => lessons,
             other => other.insert(Lessons { kind: regions.kind, tiles: BTreeMap::new() }),
         };
-        let known = Known { owner, us, touched: touched.to_vec() };
+        let known = Known { owner, home, us, touched: touched.to_vec() };
         lessons.tiles.insert((tile.x0, tile.y0), known);
     }
 }
@@ -143,6 +152,8 @@ pub(crate) struct Regions {
     kind: (BrickSetKey, [u32; 2], u32),
     /// Whose each tile is, by its place in the queue.
     owners: Vec<WorkerId>,
+    /// Whose it was before anybody took it from them.
+    homes: Vec<WorkerId>,
     /// All who own or owned one.
     who: BTreeSet<WorkerId>,
     /// What each took its last owner, if that is known.
@@ -166,16 +177,24 @@ impl Regions {
         let pace = Pace::of(&cut.tiles, &known);
         pace.correct(&mut cut.tiles, &known);
         cut.sort(size);
-        let owners = share(&cut.tiles, roster, &pace, &known);
+        let bricks = |t: &Macrotile| memory.known(kind, &t.rect).map_or(0, |k| k.touched.len());
+        let home = |t: &Macrotile| memory.known(kind, &t.rect).map(|k| k.home);
+        let owners = share(&cut.tiles, roster, &pace, &known, (&home, &bricks));
         let took = cut.tiles.iter().map(known).collect();
         let who = owners.iter().copied().collect();
-        (cut, Regions { kind, owners, who, took, pace })
+        (cut, Regions { kind, homes: owners.clone(), owners, who, took, pace })
     }
 
     /// Those whose tiles these are and who are gone, or leave.
     pub(crate) fn orphaning(&self, roster: &Roster) -> Vec<WorkerId> {
         let gone = |id: &WorkerId| roster.get(*id).is_none_or(|w| w.leaving);
         self.who.iter().copied().filter(gone).collect()
+    }
+
+    /// Whose a task is next time, if this worker drew it now.
+    pub(crate) fn home(&self, place: u32, drew: WorkerId, roster: &Roster) -> WorkerId {
+        let home = self.homes[place as usize];
+        if roster.get(home).is_some_and(|w| !w.leaving) { home } else { drew }
     }
 
     /// Whose a task is.
@@ -293,6 +312,7 @@ fn share(
     roster: &Roster,
     pace: &Pace,
     known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>,
+    (home, bricks): (&impl Fn(&Macrotile) -> Option<WorkerId>, &impl Fn(&Macrotile) -> usize),
 ) -> Vec<WorkerId> {
     let staying: Vec<(WorkerId, f64)> =
         roster.staying().map(|(id, w)| (id, f64::from(w.threads))).collect();
@@ -313,7 +333,7 @@ fn share(
     // In the order of rows.
     let mut order: Vec<usize> = (0..tiles.len()).collect();
     order.sort_by_key(|&i| (tiles[i].rect.y0, tiles[i].rect.x0));
-    let owner = |i: usize| known(&tiles[i]).and_then(|(owner, _)| place(owner));
+    let owner = |i: usize| home(&tiles[i]).and_then(place);
     let mut owners = vec![0; tiles.len()];
     if (0..tiles.len()).all(|i| owner(i).is_none()) {
         // Bands of rows, as high as each is fast.
@@ -355,11 +375,14 @@ fn share(
         if !(late > LATE || late > SLACK && moved == 0) {
             break;
         }
-        // Of those that leave both earlier than the later one was, by enough to be worth it, the one
-        // nearest to what the other has; else the largest.
+        // Of those that leave both earlier than the later one was, by enough to be worth it and to pay for
+        // the bricks that move, the one nearest to what the other has; else the largest.
         let better = |i: &usize| {
             let (from, to) = (cost(&tiles[*i], most), cost(&tiles[*i], least));
-            owners[*i] == most && load[least] + to < load[most] - 0.5 * from
+            let after = (load[most] - from).max(load[least] + to);
+            owners[*i] == most
+                && load[least] + to < load[most] - 0.5 * from
+                && load[most] - after > BRICK * bricks(&tiles[*i]) as f64
         };
         let apart = |i: usize| {
             let near = |j: usize| {
@@ -393,6 +416,13 @@ mod tests {
         (0..n).map(|i| Macrotile { rect: rect(i), est: 4096 }).collect()
     }
 
+    /// Each was drawn where it belongs.
+    fn at_home(
+        known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>,
+    ) -> impl Fn(&Macrotile) -> Option<WorkerId> {
+        |t| known(t).map(|k| k.0)
+    }
+
     fn shares(owners: &[WorkerId]) -> Vec<usize> {
         let count = |w: u64| owners.iter().filter(|o| o.0 == w).count();
         (1..=3).map(count).collect()
@@ -401,28 +431,44 @@ mod tests {
     #[test]
     fn first_shares_are_as_threads_and_later_ones_stay() {
         let (tiles, roster) = (tiles(24), roster(&[1, 2, 3]));
-        let owners = share(&tiles, &roster, &Pace::default(), &|_| None);
+        let owners = share(&tiles, &roster, &Pace::default(), &|_| None, (&|_| None, &|_| 0));
         assert_eq!(shares(&owners), [4, 8, 12]);
         assert!(owners.is_sorted(), "in bands");
         let at = |t: &Macrotile| (t.rect.x0 / 64) as usize;
         // Each took what it was guessed to, or nearly.
         let known = |t: &Macrotile| Some((owners[at(t)], 1000.0 + at(t) as f64));
-        let again = share(&tiles, &roster, &Pace::of(&tiles, &known), &known);
+        let again =
+            share(&tiles, &roster, &Pace::of(&tiles, &known), &known, (&at_home(&known), &|_| 0));
         assert_eq!(again, owners);
     }
 
     #[test]
     fn a_tenth_of_the_speed_gets_a_tenth_of_the_work() {
         let (tiles, roster) = (tiles(42), roster(&[1, 1, 1]));
-        let owners = share(&tiles, &roster, &Pace::default(), &|_| None);
+        let owners = share(&tiles, &roster, &Pace::default(), &|_| None, (&|_| None, &|_| 0));
         assert_eq!(shares(&owners), [14, 14, 14]);
         let at = |t: &Macrotile| (t.rect.x0 / 64) as usize;
         let known = |t: &Macrotile| {
             let owner = owners[at(t)];
             Some((owner, if owner.0 == 2 { 10_000.0 } else { 1000.0 }))
         };
-        let again = share(&tiles, &roster, &Pace::of(&tiles, &known), &known);
+        let again =
+            share(&tiles, &roster, &Pace::of(&tiles, &known), &known, (&at_home(&known), &|_| 0));
         assert_eq!(shares(&again), [20, 2, 20]);
+    }
+
+    #[test]
+    fn a_tile_moves_only_if_that_pays_for_its_bricks() {
+        let (tiles, roster) = (tiles(12), roster(&[1, 1]));
+        let at = |t: &Macrotile| t.rect.x0 / 64;
+        // Seven tiles of 1 ms against five: half of a millisecond is won by moving one.
+        let known = |t: &Macrotile| Some((WorkerId(if at(t) < 7 { 1 } else { 2 }), 1000.0));
+        let pace = Pace::of(&tiles, &known);
+        let moved = |bricks: usize| {
+            let owners = share(&tiles, &roster, &pace, &known, (&at_home(&known), &|_| bricks));
+            owners.iter().filter(|o| o.0 == 1).count()
+        };
+        assert_eq!([moved(0), moved(100), moved(120)], [6, 6, 7]);
     }
 
     #[test]
@@ -430,7 +476,13 @@ mod tests {
         let tiles = tiles(30);
         let at = |t: &Macrotile| t.rect.x0 / 64;
         let known = |t: &Macrotile| Some((WorkerId(if at(t) < 20 { 1 } else { 9 }), 500.0));
-        let owners = share(&tiles, &roster(&[1, 1, 1]), &Pace::of(&tiles, &known), &known);
+        let owners = share(
+            &tiles,
+            &roster(&[1, 1, 1]),
+            &Pace::of(&tiles, &known),
+            &known,
+            (&at_home(&known), &|_| 0),
+        );
         let counts = shares(&owners);
         assert!(counts.iter().all(|n| (9..=12).contains(n)), "{counts:?}");
         let kept = owners[..20].iter().filter(|o| o.0 == 1).count();

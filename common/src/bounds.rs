@@ -2,13 +2,15 @@
 //! integers cost, at most, on any pixel.
 //!
 //! These are bounds, argued below, not estimates. They are in a frame's statistics, and
-//! `slabcast check` holds pictures against them. In 1/255.
+//! `slabcast check` holds pictures against them. In 1/255. `within`: where visible voxels are.
 
 use crate::brick::TightBox;
+use crate::kernel::Profile;
 use crate::message::SceneSpec;
-use crate::quality::{Compositing, Quality, Sums};
+use crate::quality::{Compositing, Kernel, Quality, Sums};
 use crate::transfer::Classifier;
-use crate::view::{Projection, View};
+use crate::view::{Projected, Projection, SUBPIXELS, View};
+use std::f64::consts::PI;
 
 /// What integer sums leave free above a solid of the largest extinction: ripple takes at most
 /// 5 % for every kernel that `Quality::check` lets through but the narrowest, and the factor of
@@ -57,15 +59,14 @@ pub fn cutoff(quality: &Quality) -> f64 {
 ///
 /// m: a voxel belongs to a cell, and cells of voxels in a box lie in the box grown by half a cell
 /// at each face; so there are no more than the grown box has cells.
-pub fn quantisation(scene: &SceneSpec, view: &View) -> f64 {
-    let whole = TightBox { lo: [0; 3], hi: scene.volume.lattice.dims.map(|n| n - 1) };
-    let sheets = view.project(&whole).map_or(0.0, |p| f64::from(p.sheets.len()));
+pub fn quantisation(scene: &SceneSpec, view: &View, within: &TightBox) -> f64 {
+    let sheets = view.project(within).map_or(0.0, |p| f64::from(p.sheets.len()));
     let fixed_point = sheets * 0.5 / f64::from(1u32 << 28);
     let q = &scene.quality;
     if q.sums == Sums::F32 {
         return 255.0 * fixed_point;
     }
-    let payload_max = Classifier::new(&scene.transfer, &scene.volume, q.compositing).payload_max();
+    let payload_max = Classifier::largest_payload(&scene.transfer, &scene.volume, q.compositing);
     let d = view.thickness;
     let m = &view.eye_from_index;
     let cell = m.x_axis.abs() + m.y_axis.abs() + m.z_axis.abs();
@@ -92,10 +93,232 @@ pub fn quantisation(scene: &SceneSpec, view: &View) -> f64 {
 /// shrinks with every sheet that follows, so after N sheets it is at most N 2^-25. Colour adds
 /// T a c with that T: the errors of T times a telescope to those of A once more, 2 N 2^-25 in all.
 /// A million sheets make 15/255; a view of some hundred sheets 0.01.
-pub fn accumulation(scene: &SceneSpec, view: &View) -> f64 {
-    let whole = TightBox { lo: [0; 3], hi: scene.volume.lattice.dims.map(|n| n - 1) };
-    let sheets = view.project(&whole).map_or(0.0, |p| f64::from(p.sheets.len()));
+pub fn accumulation(view: &View, within: &TightBox) -> f64 {
+    let sheets = view.project(within).map_or(0.0, |p| f64::from(p.sheets.len()));
     255.0 * 2.0 * sheets / f64::from(1u32 << 25)
+}
+
+/// How far a picture is at most from one whose kernels differ from the drawn ones, by a bound that holds
+/// on every pixel, in 1/255. See [`rounding`] and [`truncation`].
+///
+/// Let a change of the field take sigma to sigma' and sigma C to sigma' C' along a ray, T be what is let
+/// through before it and R' the light that comes from behind after it. Then the pixel changes by exactly
+///
+/// ```text
+/// int T (d(sigma C) - R' d(sigma)) ds = sum over voxels of int T sigma_v (C_v - R') dg_v ds,
+/// ```
+///
+/// and by at most `D = int T sum(sigma_v |dg_v|) ds`, as colours lie between zero and one; opacity, too.
+/// On each axis `|dg| <= lambda g + sum of c_j g(x - s_j)`: a share of the kernel itself, and shifted
+/// kernels where it ends. The product of the three axes is then a share `s` of g itself, of which no
+/// more than the light that there is can be lost, `int T sigma ds <= 1`, and shifted kernels of weight `w`
+/// in all. Of these T is taken for one, and their sum over a ray is `w` times
+///
+/// - at most the largest extinction times the way through the volume times [`ripple`];
+/// - where shifts across the ray are whole pixels of a parallel view and no pixel is shut: at most
+///   the largest optical depth that any pixel has, which is -ln(1 - alpha). Shifts along the ray move
+///   nothing then, and their cover is as heavy as what it covers.
+struct Change<'a> {
+    view: &'a View,
+    /// The drawn kernel by axis, and how far beyond its radius the other one reaches.
+    drawn: [Profile; 3],
+    beyond: [f64; 3],
+    /// Largest extinction per vox, and the longest way through the volume in vox.
+    solid: f64,
+    way: f64,
+    /// The largest optical depth of any pixel, if it is known.
+    deepest: Option<f64>,
+}
+
+/// What the sum over a lattice of ones is at most: one and the kernel's ripple, which is below 0.6 % for
+/// Gaussians of 0.6 (NUMERICS.md section 4) and grows to either side. A tent's is 39 %.
+fn ripple(quality: &Quality) -> f64 {
+    let [std, _] = quality.shape();
+    let even = quality.kernel != Kernel::Tent && std >= 0.55;
+    if even { HEADROOM } else { 1.6 }
+}
+
+impl Change<'_> {
+    fn new<'a>(
+        scene: &SceneSpec,
+        view: &'a View,
+        within: &TightBox,
+        alpha_most: Option<f64>,
+        beyond: [f64; 3],
+    ) -> Change<'a> {
+        let q = &scene.quality;
+        let sheets = view.project(within).map_or(0, |p| p.sheets.len());
+        let (std, radius) = (view.kernel_std.to_array(), view.kernel_radius.to_array());
+        let payload = Classifier::largest_payload(&scene.transfer, &scene.volume, q.compositing);
+        // Beyond the picture there is nothing: all that a voxel reaches is in it.
+        let [w, h] = view.size.map(|n| n as i32);
+        let inside = view
+            .project(within)
+            .is_some_and(|Projected { rect: r, .. }| r.x0 > 0 && r.y0 > 0 && r.x1 < w && r.y1 < h);
+        let parallel = matches!(view.projection, Projection::Ortho { .. });
+        let open = alpha_most.filter(|&a| parallel && inside && 1.0 - a > q.eps.max(1e-6));
+        Change {
+            view,
+            drawn: std::array::from_fn(|a| Profile::new(q.kernel, std[a], radius[a])),
+            beyond,
+            solid: payload * ripple(q),
+            way: f64::from(sheets) * view.thickness * longest_secant(view),
+            deepest: open.map(|a| -libm::log1p(-a)),
+        }
+    }
+
+    /// The least of what it comes to for several shares. `change(axis, x)`: |dg| at a distance; `share`
+    /// times the light and `sheet` (for what a sheet is changed by beyond that) as they count in the
+    /// rule of colours.
+    fn bound(&self, change: impl Fn(usize, f64) -> f64, share: f64, sheet: f64) -> f64 {
+        let light = |[a, b, c]: [f64; 3]| a * b * c;
+        let mut best = 1.0;
+        for i in 0..14 {
+            let lambda = 0.001 * f64::from(1u32 << i);
+            // By the volume's extent, and by the pixels' optical depth.
+            for by_pixels in [false, true] {
+                let deep = if by_pixels {
+                    let Some(deepest) = self.deepest else { continue };
+                    deepest
+                } else {
+                    self.solid * self.way
+                };
+                let covers = [0, 1, 2].map(|a| {
+                    let p = &self.drawn[a];
+                    let lambda = lambda / p.std * self.view.kernel_std.min_element();
+                    let near = 0.5 * p.std;
+                    let cell = match self.view.projection {
+                        Projection::Ortho { scale } if by_pixels && a < 2 => {
+                            (near * scale).floor().max(1.0) / scale
+                        }
+                        _ => near,
+                    };
+                    let reach = p.radius + self.beyond[a];
+                    let (cover, mass) = cover(|x| change(a, x), p, reach, lambda, cell);
+                    [1.0 + lambda, if by_pixels && a == 2 { mass } else { cover }]
+                });
+                let own = covers.map(|[own, _]| own);
+                let s = light(own) - 1.0;
+                let w = light(covers.map(|[own, cover]| own + cover)) - light(own);
+                let sheets = self.solid * self.view.thickness;
+                let bound = s * share + w * (deep + sheet * sheets);
+                if bound < best {
+                    best = bound;
+                }
+            }
+        }
+        255.0 * best
+    }
+}
+
+/// The weights and the integral of shifted kernels `p`, a cell apart, that cover what `lambda p` leaves of
+/// `change` up to `reach`, on both sides.
+fn cover(
+    change: impl Fn(f64) -> f64,
+    p: &Profile,
+    reach: f64,
+    lambda: f64,
+    cell: f64,
+) -> (f64, f64) {
+    // The change is looked at in so many places; between them it moves by less than what is added.
+    const PLACES: usize = 2000;
+    const BETWEEN: f64 = 1.02;
+    if cell >= 2.0 * p.radius {
+        return (f64::INFINITY, f64::INFINITY);
+    }
+    let step = reach / PLACES as f64;
+    let (mut sum, mut mass) = (0.0, 0.0);
+    let (mut at, mut worst) = (0u32, 0.0f64);
+    for i in 0..=PLACES {
+        let x = i as f64 * step;
+        let excess = change(x) - lambda * p.at(x);
+        let here = libm::floor(x / cell + 0.5) as u32;
+        if here != at {
+            sum += if at == 0 { worst } else { 2.0 * worst };
+            (at, worst) = (here, 0.0);
+        }
+        if excess > 0.0 {
+            worst = worst.max(excess / p.at(x - f64::from(here) * cell));
+            mass += 2.0 * step * excess;
+        }
+    }
+    sum += if at == 0 { worst } else { 2.0 * worst };
+    (sum * BETWEEN, mass * BETWEEN)
+}
+
+/// Bound of rounded positions: half a part of a pixel across and half a phase in depth. `alpha_most` is the
+/// picture's largest opacity, where it is known. `None` for the paper's opacities, which add up to another
+/// picture.
+///
+/// By [`Change`]; sheets hold light as a field does that is constant in each. Where colours have a slope,
+/// their sums and those of the sheets beside have a part in it: a share s of all sums moves c and its
+/// neighbours by 2 s and the weights by 4 s, so the slope by at most (5 G + 6 H) s, and light by |phi| / a of
+/// that, at most half and at most a twelfth of a sheet's optical depth; what is beyond that share counts 17
+/// times, once, as in [`quantisation`].
+pub fn rounding(
+    scene: &SceneSpec,
+    view: &View,
+    within: &TightBox,
+    alpha_most: Option<f64>,
+) -> Option<f64> {
+    let q = &scene.quality;
+    if q.compositing == Compositing::Paper {
+        return None;
+    }
+    let Some(p) = view.project(within) else { return Some(0.0) };
+    // The farthest sheet has the largest subpixels.
+    let scale = view.scale_at(p.sheets.end).unwrap_or(f64::MIN_POSITIVE);
+    let across = 0.5 / (f64::from(SUBPIXELS) * scale);
+    // In perspective a footprint's width is rounded, too, to 16 bits.
+    let width = match view.projection {
+        Projection::Ortho { .. } => 0.0,
+        Projection::Persp { .. } => 1.0 / 32768.0,
+    };
+    let aside = |a: usize| across + width * view.kernel_radius[a];
+    let off = [aside(0), aside(1), 0.5 * view.thickness / f64::from(view.depth_phases())];
+    let change = Change::new(scene, view, within, alpha_most, off);
+    let moved = |a: usize, x: f64| {
+        let p = &change.drawn[a];
+        let here = p.at(x);
+        (p.at(x - off[a]) - here).abs().max((p.at(x + off[a]) - here).abs())
+    };
+    let y = view.thickness / view.kernel_std.z;
+    let slope = 5.0 * (0.5 + 0.20 * y).min(2.0) + 6.0 * (0.5 - 0.07 * y).max(0.25);
+    let fullest = change.solid * view.thickness * longest_secant(view);
+    let (share, sheet) = match q.compositing {
+        Compositing::Linear => (1.0 + slope * (fullest / 12.0).min(0.5), 17.0),
+        _ => (1.0, 0.0),
+    };
+    Some(change.bound(moved, share, sheet))
+}
+
+/// Bound of the kernel's cut: against a picture with whole Gaussians, in the limit of thin sheets. Zero for
+/// splines, of which nothing is cut.
+///
+/// By [`Change`]. The largest of all pictures' differences, 255, is what it comes to wherever solid matter
+/// may lie just beyond a ray's reach all along it.
+pub fn truncation(
+    scene: &SceneSpec,
+    view: &View,
+    within: &TightBox,
+    alpha_most: Option<f64>,
+) -> Option<f64> {
+    let q = &scene.quality;
+    if q.compositing == Compositing::Paper {
+        return None;
+    }
+    if q.kernel != Kernel::Gaussian {
+        return Some(0.0);
+    }
+    // Beyond 6.5 deviations a Gaussian has 1e-10 of its integral.
+    let beyond = [0, 1, 2].map(|a| (6.5 * view.kernel_std[a] - view.kernel_radius[a]).max(0.0));
+    let change = Change::new(scene, view, within, alpha_most, beyond);
+    let cut = |a: usize, x: f64| {
+        let std = view.kernel_std[a];
+        let bell = libm::exp(-0.5 * x * x / (std * std)) / (std * (2.0 * PI).sqrt());
+        (bell - change.drawn[a].at(x)).abs()
+    };
+    Some(change.bound(cut, 1.0, 0.0))
 }
 
 /// Of all pixels' rays, the longest between two planes one apart.

@@ -60,6 +60,22 @@ pub struct TightBox {
     pub hi: [u32; 3],
 }
 
+impl TightBox {
+    /// All of a lattice.
+    pub fn whole(dims: [u32; 3]) -> TightBox {
+        TightBox { lo: [0; 3], hi: dims.map(|n| n.saturating_sub(1)) }
+    }
+
+    /// The smallest box around both.
+    #[must_use]
+    pub fn union(self, other: TightBox) -> TightBox {
+        TightBox {
+            lo: std::array::from_fn(|a| self.lo[a].min(other.lo[a])),
+            hi: std::array::from_fn(|a| self.hi[a].max(other.hi[a])),
+        }
+    }
+}
+
 /// What the scheduler knows of a relevant brick.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BrickInfo {

@@ -100,6 +100,12 @@ impl FrameState {
         (0..self.pixels()).map(|i| self.a.get(i).copied().unwrap_or(0.0))
     }
 
+    /// The largest opacity of any pixel.
+    pub fn alpha_most(&self) -> f32 {
+        let laid = self.laid.iter().flat_map(|(_, tile)| &tile.a);
+        self.a.iter().chain(laid).fold(0.0, |most, &a| a.max(most))
+    }
+
     fn rows(&self, r: Rect) -> impl Iterator<Item = std::ops::Range<usize>> + use<> {
         let w = self.size[0] as usize;
         (r.y0..r.y1).map(move |y| {

@@ -215,11 +215,44 @@ pub struct RegionCost {
     pub parked_us: u64,
     /// For how long render threads had nothing to do since the last result of the link, while some
     pub idle_us: u64,
-    /// What thinner sheets changed, where that was asked for.
-    pub sampled: Sampled,
+    /// How far some of its pixels are off, where that was asked for.
+    pub sampled: Sampling,
 }
 
-/// How far pixels are from those of thinner sheets. Integers, since their sum has no order.
+/// How far pixels that were looked at are off, by source.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Sampling {
+    /// What sheets of half the thickness change.
+    pub thickness: Sampled,
+    /// What rounding of positions changes.
+    pub positions: Sampled,
+    /// What the kernel's cut changes.
+    pub truncation: Sampled,
+    /// What the kernel's ripple changes.
+    pub ripple: Sampled,
+}
+
+impl Sampling {
+    /// Each, in order.
+    pub fn each(self) -> [Sampled; 4] {
+        [self.thickness, self.positions, self.truncation, self.ripple]
+    }
+
+    /// From each, in order.
+    pub fn of([thickness, positions, truncation, ripple]: [Sampled; 4]) -> Sampling {
+        Sampling { thickness, positions, truncation, ripple }
+    }
+
+    /// Adds others'.
+    pub fn add(&mut self, other: Sampling) {
+        self.thickness.add(other.thickness);
+        self.positions.add(other.positions);
+        self.truncation.add(other.truncation);
+        self.ripple.add(other.ripple);
+    }
+}
+
+/// How far pixels are off. Integers, since their sum has no order.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Sampled {
     /// Pixels that are not blank in both.

@@ -75,6 +75,14 @@ pub struct Quality {
     pub sums: Sums,
     /// Whether bricks and voxels are tested against the occlusion map. Never changes a byte.
     pub cull: bool,
+    /// Whether grey scenes are drawn in two channels where that can be. Never changes a byte.
+    #[serde(skip_serializing_if = "is_true")]
+    pub grey: bool,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks so")]
+fn is_true(b: &bool) -> bool {
+    *b
 }
 
 impl Default for Quality {
@@ -89,6 +97,7 @@ impl Default for Quality {
             splat: Splat::Direct,
             sums: Sums::Auto,
             cull: true,
+            grey: true,
         }
     }
 }
@@ -201,8 +210,8 @@ pub enum Borders {
     Equal,
 }
 
-/// What bricks hold although the scene does not need it: to see what leaving it out saves. Never
-/// changes a byte.
+/// What is kept although the scene does not need it: to see what leaving it out saves. Never changes
+/// a byte.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Keep {
@@ -212,6 +221,8 @@ pub struct Keep {
     pub normals: bool,
     /// Gradient magnitudes that modulate nothing.
     pub gradients: bool,
+    /// Three colours of a scene that is grey: [`Quality::grey`] is off then.
+    pub colours: bool,
 }
 
 /// How the work is cut. Never changes a byte.

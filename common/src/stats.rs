@@ -137,6 +137,16 @@ pub struct Bound {
     pub bound: Option<f64>,
 }
 
+/// Both, in 1/255; each `null` where there is none.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct BoundAndEstimate {
+    /// What holds on every pixel.
+    pub bound: Option<f64>,
+    /// RMSE over the pixels that were looked at.
+    #[serde(default)]
+    pub estimate: Option<f64>,
+}
+
 /// An estimate, in 1/255; `null` where none was made.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Estimate {
@@ -157,13 +167,13 @@ pub struct ErrorStats {
     /// Rounding of contributions to the integers of the sums.
     pub quantisation: Bound,
     /// Rounding of positions and of f32 arithmetic.
-    pub rounding: Bound,
+    pub rounding: BoundAndEstimate,
     /// Of f32 arithmetic the part that grows with the number of sheets: opacity stands still where
     /// a sheet adds less than half its last bit.
     #[serde(default)]
     pub accumulation: Bound,
     /// Kernel tails cut off.
-    pub truncation: Bound,
+    pub truncation: BoundAndEstimate,
     /// Sheets of finite thickness.
     pub thickness: Estimate,
     /// The kernel's ripple on a constant field.

@@ -94,6 +94,14 @@ pub struct TransferFunction {
 }
 
 impl TransferFunction {
+    /// Whether all that is seen has one colour in all three channels, to the bit. Light is white,
+    /// so that holds of shaded voxels, too.
+    pub fn is_grey(&self) -> bool {
+        let one = |[r, g, b]: [f64; 3]| r == g && g == b;
+        let nan = self.nan.opacity == 0.0 || one(self.nan.color);
+        nan && self.colors.iter().all(|&[_, r, g, b]| one([r, g, b]))
+    }
+
     /// Reads and checks the JSON of CONTRACTS.md.
     pub fn from_json(text: &str) -> Result<Self, Refused> {
         let tf: TransferFunction =
@@ -275,7 +283,6 @@ pub struct Classifier {
     /// What opacities are multiplied by, by code of the gradient's magnitude; empty where by
     /// nothing.
     factors: Vec<f64>,
-    grey: bool,
 }
 
 /// Value of the piecewise linear function through `points` at `x`.
@@ -292,7 +299,27 @@ pub(crate) fn interpolate<const N: usize>(points: &[[f64; N]], x: f64) -> [f64; 
     std::array::from_fn(|i| a[i] * (1.0 - t) + b[i] * t)
 }
 
+/// A NaN look counts only where the volume has a NaN.
+fn nan_opacity(tf: &TransferFunction, info: &VolumeInfo) -> f64 {
+    if info.summary.nan > 0 { tf.nan.opacity } else { 0.0 }
+}
+
+fn largest_opacity(tf: &TransferFunction, info: &VolumeInfo) -> f64 {
+    tf.opacities.iter().map(|o| o[1]).fold(nan_opacity(tf, info), f64::max)
+}
+
 impl Classifier {
+    /// The largest payload that `tf` (which passed its check) gives a voxel of a volume: what
+    /// [`Classifier::payload_max`] says, without a table.
+    pub fn largest_payload(
+        tf: &TransferFunction,
+        info: &VolumeInfo,
+        compositing: Compositing,
+    ) -> f64 {
+        let rule = OpacityRule { unit: tf.opacity_unit, vox: info.lattice.vox(), compositing };
+        rule.payload(largest_opacity(tf, info))
+    }
+
     /// Makes `tf` (which passed its check) ready for a volume.
     pub fn new(tf: &TransferFunction, info: &VolumeInfo, compositing: Compositing) -> Self {
         let summary = info.summary.clone();
@@ -301,10 +328,7 @@ impl Classifier {
             ColorSpace::Srgb => linear_from_srgb(c),
             ColorSpace::Linear => c,
         };
-        // A NaN look counts only where the volume has a NaN.
-        let nan_opacity = if summary.nan > 0 { tf.nan.opacity } else { 0.0 };
-        let opacities = tf.opacities.iter().map(|o| o[1]);
-        let largest = opacities.clone().fold(nan_opacity, f64::max);
+        let largest = largest_opacity(tf, info);
         let codes = match summary.kind {
             SampleKind::U8 => 256,
             SampleKind::U16 => 65536,
@@ -320,7 +344,7 @@ impl Classifier {
             opacities: tf.opacities.clone(),
             rule,
             nan: Look {
-                sigma: rule.payload(nan_opacity) as f32,
+                sigma: rule.payload(nan_opacity(tf, info)) as f32,
                 rgb: tf.nan.color.map(|c| decode(c) as f32),
             },
             domain: tf.domain,
@@ -328,7 +352,6 @@ impl Classifier {
             payload_max: rule.payload(largest),
             uncapped: rule.sigma(largest) > SIGMA_MAX && compositing != Compositing::Paper,
             factors: Vec::new(),
-            grey: false,
         };
         if !tf.gradient_opacity.is_empty() {
             let (lo, hi) = info.summary.range();
@@ -341,25 +364,7 @@ impl Classifier {
             c.factors = (0..=255).map(factor).collect();
         }
         c.table = (0..codes).map(|code| c.evaluate(code as f64)).collect();
-        c.grey = c.all_grey();
         c
-    }
-
-    fn all_grey(&self) -> bool {
-        let is_grey = |look: &Look| {
-            let [r, g, b] = look.rgb;
-            look.sigma == 0.0 || r == g && g == b
-        };
-        // Between grey points all is grey, to the bit.
-        let points = || self.colors.iter().all(|[_, r, g, b]| r == g && g == b);
-        let seen = if self.table.is_empty() { points() } else { self.table.iter().all(is_grey) };
-        seen && is_grey(&self.nan)
-    }
-
-    /// Whether whatever is seen has one colour in all three channels, to the bit. Light is white, so
-    /// that holds of shaded voxels, too.
-    pub fn is_grey(&self) -> bool {
-        self.grey
     }
 
     /// The x of the transfer function that belongs to a finite code.
@@ -610,23 +615,16 @@ mod tests {
     }
 
     #[test]
-    fn what_is_seen_is_grey_whatever_colour_is_not() {
-        let codes = || info(Samples::U8((0..=255).collect()));
-        let floats = || info(Samples::F32(vec![0.0, 50.0, 100.0]));
-        let mut tf = tf(vec![[10.0, 0.0], [20.0, 0.5], [60.0, 0.5], [70.0, 0.0]]);
-        let grey =
-            |tf: &TransferFunction, info| Classifier::new(tf, &info, Compositing::Linear).is_grey();
-        assert!(grey(&tf, codes()) && grey(&tf, floats()));
-        // Red from 80 on, where nothing is seen.
-        tf.colors = vec![[0.0; 4], [79.0, 0.9, 0.9, 0.9], [80.0, 0.9, 0.1, 0.1]];
-        assert!(grey(&tf, codes()) && !grey(&tf, floats()), "of floats the points alone are known");
-        tf.colors[1][2] = 0.8;
-        assert!(!grey(&tf, codes()));
-        // A colour of what is not a number counts where there is some.
-        let mut tf = self::tf(vec![[0.0, 0.5]]);
-        tf.nan = NanLook { color: [1.0, 0.0, 1.0], opacity: 0.5 };
-        assert!(grey(&tf, floats()));
-        assert!(!grey(&tf, info(Samples::F32(vec![0.0, f32::NAN, 100.0]))));
+    fn grey_is_one_colour_in_all_channels_of_all_that_is_seen() {
+        let mut tf = tf(vec![[10.0, 0.0], [20.0, 0.5]]);
+        tf.nan = NanLook { color: [1.0, 0.0, 1.0], opacity: 0.0 };
+        assert!(tf.is_grey(), "nothing shows the colour of what is not a number");
+        tf.nan.opacity = 0.5;
+        assert!(!tf.is_grey());
+        tf.nan.color = [0.5; 3];
+        assert!(tf.is_grey());
+        tf.colors.push([80.0, 0.9, 0.9, 0.8]);
+        assert!(!tf.is_grey());
     }
 
     #[test]

@@ -6,11 +6,13 @@
 use crate::jobs::FinishedFrame;
 use sha2::{Digest, Sha256};
 use slabcast_common::bounds;
+use slabcast_common::brick::TightBox;
 use slabcast_common::ids::{FrameId, JobId};
 use slabcast_common::image::{Encoded, FrameState, Picture, PixelFormat};
 use slabcast_common::message::{PathRequest, SceneSpec};
 use slabcast_common::path::CropBox;
-use slabcast_common::stats::{Bound, BrickStats, ErrorStats, FrameStats, LeftOut};
+use slabcast_common::quality::{Quality, Sums};
+use slabcast_common::stats::{BrickStats, ErrorStats, FrameStats, LeftOut};
 use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::Digest32;
 use slabcast_schedule::Span;
@@ -42,8 +44,8 @@ pub fn view_sha256(scene: &SceneSpec, crop: Option<&CropBox>, view: &View) -> Di
     h.update(slabcast_common::PIXELS_VERSION.to_le_bytes());
     h.update(scene.volume.digest.0);
     h.update(scene.transfer.to_json());
-    // Culling never changes a byte.
-    let quality = slabcast_common::quality::Quality { cull: true, ..scene.quality };
+    // Neither changes a byte.
+    let quality = Quality { cull: true, grey: true, ..scene.quality };
     h.update(serde_json::to_string(&quality).unwrap_or_default());
     h.update(view.size[0].to_le_bytes());
     h.update(view.size[1].to_le_bytes());
@@ -70,16 +72,26 @@ pub fn view_sha256(scene: &SceneSpec, crop: Option<&CropBox>, view: &View) -> Di
     Digest32(h.finalize().into())
 }
 
-/// The bounds that are known without a reference (DESIGN.md section 5), in 1/255.
-fn error(scene: &SceneSpec, view: &View) -> ErrorStats {
-    ErrorStats {
-        cutoff: Bound { bound: Some(bounds::cutoff(&scene.quality)) },
-        // Above 255 it says nothing (16-bit sums, whose errors are a thousandth of it).
-        quantisation: Bound {
-            bound: Some(bounds::quantisation(scene, view)).filter(|&bound| bound < 255.0),
-        },
-        accumulation: Bound { bound: Some(bounds::accumulation(scene, view)) },
-        ..ErrorStats::default()
+/// The bounds that are known without a reference (DESIGN.md section 5), in 1/255; `within`: where voxels
+/// are, `alpha_most`: the largest opacity of a pixel.
+fn error(
+    stats: &mut ErrorStats,
+    scene: &SceneSpec,
+    view: &View,
+    within: &TightBox,
+    alpha_most: f64,
+) {
+    // Above 255 one says nothing (16-bit sums, whose errors are a thousandth of it).
+    let says = |bound: f64| Some(bound).filter(|&bound| bound < 255.0);
+    let alpha_most = Some(alpha_most);
+    stats.cutoff.bound = Some(bounds::cutoff(&scene.quality));
+    stats.quantisation.bound = says(bounds::quantisation(scene, view, within));
+    stats.accumulation.bound = Some(bounds::accumulation(view, within));
+    stats.rounding.bound = bounds::rounding(scene, view, within, alpha_most).and_then(says);
+    stats.truncation.bound = bounds::truncation(scene, view, within, alpha_most).and_then(says);
+    // Where solids hide what is behind, few pixels at their edges decide, and a sample misses them.
+    if alpha_most.is_some_and(|a| 1.0 - a < scene.quality.eps) {
+        stats.truncation.estimate = None;
     }
 }
 
@@ -116,6 +128,11 @@ fn left_out(
     }
     if matches!(view.projection, Projection::Ortho { .. }) {
         put("scale", None);
+        let whole = matches!(scene.quality.sums, Sums::I32 | Sums::Auto);
+        let plain = scene.transfer.gradient_opacity.is_empty();
+        if scene.quality.grey && whole && plain && scene.transfer.is_grey() {
+            put("colour", None);
+        }
     }
     if request.format == PixelFormat::Rgb8 {
         put("alpha", Some(view.size.iter().map(|&n| u64::from(n)).product()));
@@ -135,6 +152,7 @@ fn mark(picture: &mut Picture) {
 /// Makes the frame.
 pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
     let (size, format, background) = (s.state.size(), s.request.format, s.request.background);
+    let alpha_most = f64::from(s.state.alpha_most());
     let Encoded { sha256, bytes } = if s.rehearsed {
         let mut picture = s.state.finish();
         mark(&mut picture);
@@ -156,7 +174,9 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
         stats.pixels_sha256 = "none: rehearsed".into();
     }
     stats.pixels_version = slabcast_common::PIXELS_VERSION;
-    stats.error = ErrorStats { thickness: stats.error.thickness, ..error(&s.scene, &s.view) };
+    let within = s.store.as_ref().and_then(|store| store.extent());
+    let within = within.unwrap_or_else(|| TightBox::whole(s.scene.volume.lattice.dims));
+    error(&mut stats.error, &s.scene, &s.view, &within, alpha_most);
     stats.left_out = match &s.store {
         Some(store) => left_out(store, &s.scene, &s.view, &s.request, &stats.bricks),
         None => Vec::new(),

@@ -9,9 +9,9 @@ use crate::shelf::Shelf;
 use slabcast_common::brick::{Brick, BrickInfo};
 use slabcast_common::ids::FrameId;
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::{Counters, Lease, RegionLease, Sampled, SceneSpec};
+use slabcast_common::message::{Counters, Lease, RegionLease, Sampling, SceneSpec};
 use slabcast_common::view::View;
-use slabcast_render::estimate::{self, Pair};
+use slabcast_render::estimate::{Pair, Probe};
 use slabcast_render::region::{Finished, Outlook, Region, Sight, Supply};
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch};
@@ -47,7 +47,7 @@ pub(crate) struct FrameSlot {
     pub(crate) scene: Arc<SceneSlot>,
     pub(crate) view: View,
     frame: OnceLock<Frame>,
-    pair: OnceLock<Option<[Frame; 2]>>,
+    probe: OnceLock<Probe>,
     looking: Looking,
     /// Of a rehearsal: its place in the trace, and when its tables are made.
     pub(crate) rehearsed: OnceLock<Option<usize>>,
@@ -58,8 +58,8 @@ pub(crate) struct FrameSlot {
 
 impl FrameSlot {
     pub(crate) fn new(scene: Arc<SceneSlot>, view: View) -> Self {
-        let (frame, pair, looking, rehearsed, made, over) = Default::default();
-        FrameSlot { scene, view, frame, pair, looking, rehearsed, made, over }
+        let (frame, probe, looking, rehearsed, made, over) = Default::default();
+        FrameSlot { scene, view, frame, probe, looking, rehearsed, made, over }
     }
 
     fn get(&self) -> &Frame {
@@ -69,13 +69,12 @@ impl FrameSlot {
         })
     }
 
-    /// The frame twice, for [`estimate`].
-    fn pair(&self) -> Option<&[Frame; 2]> {
-        let frames = self.pair.get_or_init(|| {
-            let pair = self.scene.pair.get_or_init(|| Pair::of(&self.scene.spec)).as_ref()?;
-            Some(pair.frames(&self.view))
-        });
-        frames.as_ref()
+    /// What tells how far its pixels are off.
+    fn probe(&self) -> &Probe {
+        self.probe.get_or_init(|| {
+            let pair = self.scene.pair.get_or_init(|| Pair::of(&self.scene.spec));
+            Probe::new(self.get(), pair.as_ref())
+        })
     }
 }
 
@@ -199,8 +198,8 @@ impl Going {
 pub(crate) enum Came {
     /// Its frame was over.
     Over,
-    /// To its end; what thinner sheets changed, where that was asked for.
-    Done(Box<Finished>, Sampled),
+    /// To its end; how far some of its pixels are off, where that was asked for.
+    Done(Box<Finished>, Sampling),
     /// To a sheet at which it lacks bricks; whether that is farther than before.
     Lacks(Vec<u32>, bool),
     /// Nowhere.
@@ -395,7 +394,7 @@ fn hold(thread: u32, rehearsal: &Rehearsal, queue: &Queue, out: &mpsc::Unbounded
                         held.wait();
                         going.drawn += took;
                         end = held.end;
-                        Came::Done(finished, Sampled::default())
+                        Came::Done(finished, Sampling::default())
                     }
                 };
                 free = end;
@@ -470,13 +469,13 @@ fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch) -> Came {
     }
     match region.take() {
         Some(region) => {
-            let (done, mut sampled) = (region.finish(), Sampled::default());
+            let (done, mut sampled) = (region.finish(), Sampling::default());
             if lease.estimate {
                 let bricks = done.touched.iter().map(|&place| shelf.get(place));
                 // One that was forgotten since is not sent again for this.
                 let bricks: Option<Vec<_>> = bricks.collect();
-                if let (Some(frames), Some(bricks)) = (slot.pair(), bricks) {
-                    sampled = estimate::sample(frames, simd, lease.tile, &bricks, scratch);
+                if let Some(bricks) = bricks {
+                    sampled = slot.probe().sample(frame, simd, lease.tile, &bricks, scratch);
                 }
             }
             Came::Done(Box::new(done), sampled)

@@ -10,6 +10,7 @@ use crate::request::{Asked, Opened, PictureOf};
 use crate::stage::Stage;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{Background, Picture};
+use slabcast_common::message::SceneSpec;
 use slabcast_common::path::Orientation;
 use slabcast_common::quality::{Keep, Quality, Work};
 use slabcast_common::view::Projection;
@@ -90,18 +91,18 @@ impl Way {
 /// Draws two ways in turn; their medians in milliseconds, and whether the pictures are the same.
 fn in_turn(ways: [(&Way, Quality); 2], threads: usize) -> Result<([f64; 2], bool), Fail> {
     let cut = Cut { tile: 64, ..Cut::on(threads) };
-    let scenes = ways.map(|(way, quality)| {
-        let spec = way.stage.spec(0);
-        Arc::new(Scene::new(&slabcast_common::message::SceneSpec { quality, ..spec }))
+    let ways = ways.map(|(way, quality)| {
+        let spec = SceneSpec { quality, ..way.stage.spec(0) };
+        (way, Arc::new(Scene::new(&spec)))
     });
     let mut ms = [Vec::new(), Vec::new()];
     let mut pictures: [Option<Picture>; 2] = [None, None];
     for turn in 0..=TURNS {
         for i in 0..2 {
-            let (way, quality) = ways[i];
-            let view = way.stage.view(0, &quality)?;
+            let (way, scene) = &ways[i];
+            let view = way.stage.view(0, &scene.quality)?;
             let began = Instant::now();
-            let frame = Frame::new(scenes[i].clone(), view);
+            let frame = Frame::new(scene.clone(), view);
             let picture = local::picture(&frame, &way.stage.bricks, cut);
             // The first fills tables and caches.
             if turn > 0 {
@@ -244,15 +245,26 @@ pub(crate) fn find(of: &PictureOf, threads: usize) -> Result<Needs, Fail> {
         force: "slabcast worker",
         ..needed("transfer", "workers inside the master's process share its bricks")
     });
-    let grey = spec.transfer.colors.iter().all(|c| c[1] == c[2] && c[2] == c[3]);
-    rows.push(needed(
-        "colour",
-        if grey {
-            "grey scenes are drawn in three channels like others"
-        } else {
-            "the scene has hues"
-        },
-    ));
+    if frame.has_two_channels() {
+        let three = Quality { grey: false, ..quality };
+        let ([less, more], same) = in_turn([(&base, quality), (&base, three)], threads)?;
+        rows.push(Row {
+            left_out: true,
+            ms: Some(more - less),
+            same: Some(same),
+            force: "--keep colours",
+            ..needed("colour", "all that is seen is grey: two channels instead of four")
+        });
+    } else {
+        rows.push(needed(
+            "colour",
+            if spec.transfer.is_grey() {
+                "grey is drawn in two channels where rays are parallel and sums have 32 bits"
+            } else {
+                "the scene has hues"
+            },
+        ));
+    }
     progress.end();
     Ok(Needs {
         scene: format!("{}, {}", volume.name, asked.transfer.name()),

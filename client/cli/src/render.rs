@@ -92,8 +92,8 @@ pub(crate) struct RenderArgs {
         help_heading = "Output"
     )]
     show: Option<Show>,
-    /// Statistics, one line of JSON a frame; - writes them to stdout. For their estimate of the error by
-    /// the sheets' thickness one pixel in 128 is drawn twice more, a tenth of the time
+    /// Statistics, one line of JSON a frame; - writes them to stdout. For their estimates of errors
+    /// one pixel in 128 is drawn again in other ways: some tenth of the time
     #[arg(long, value_name = "FILE|-", help_heading = "Output")]
     stats: Option<PathBuf>,
     /// Time line of all workers for Perfetto or chrome://tracing

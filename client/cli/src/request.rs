@@ -190,6 +190,7 @@ impl QualityArgs {
             splat: self.splat,
             sums: self.sums,
             cull: self.cull,
+            ..Quality::default()
         };
         q.check().map_err(|e| Fail::flag(&e))?;
         Ok(q)
@@ -309,11 +310,12 @@ pub(crate) struct WorkArgs {
     keep: KeepArg,
 }
 
-/// What bricks hold although nothing needs it.
+/// What is kept although nothing needs it.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub(crate) struct KeepArg {
-    /// Puts into bricks what the scene does not need, to see what leaving it out saves: empty (voxels
-    /// that nothing shows), normals (that nothing shades), gradients (that modulate nothing)
+    /// Keeps what the scene does not need, to see what leaving it out saves: in bricks empty (voxels that
+    /// nothing shows), normals (that nothing shades), gradients (that modulate nothing); of a grey
+    /// scene all three colours
     #[arg(
         long,
         value_name = "WHAT,...",
@@ -329,6 +331,8 @@ enum Kept {
     Empty,
     Normals,
     Gradients,
+    #[value(alias = "colors")]
+    Colours,
 }
 
 impl KeepArg {
@@ -338,6 +342,7 @@ impl KeepArg {
             empty: has(Kept::Empty),
             normals: has(Kept::Normals),
             gradients: has(Kept::Gradients),
+            colours: has(Kept::Colours),
         }
     }
 }
@@ -383,7 +388,7 @@ impl Asked {
         parsed: &QualityArgs,
         work: Work,
     ) -> Result<Self, Fail> {
-        let quality = parsed.quality()?;
+        let quality = Quality { grey: !work.keep.colours, ..parsed.quality()? };
         view.axes.orientation()?;
         let mut path = match &view.path {
             Some(file) => view.of_file(file, picture)?,

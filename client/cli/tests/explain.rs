@@ -74,7 +74,12 @@ fn what_a_scene_leaves_out_changes_no_pixel() {
         (
             &["--tf", "skin", "--projection", "persp", "--background", "transparent"],
             &["empty", "gradients", "hidden"],
-            &["normals", "scale", "alpha"],
+            &["normals", "scale", "alpha", "colour"],
+        ),
+        (
+            &["--tf", "skin", "--colors", "greys"],
+            &["empty", "gradients", "hidden", "colour"],
+            &["normals"],
         ),
     ] {
         let line = [&["formula:spheres:40", "--size", "80x80", "--json"], scene].concat();
@@ -94,6 +99,9 @@ fn what_a_scene_leaves_out_changes_no_pixel() {
         for name in ["empty", "gradients", "hidden"] {
             assert_eq!(row(name)["same_pixels"], true, "{name}: {e}");
         }
+        if left_out.contains(&"colour") {
+            assert_eq!(row("colour")["same_pixels"], true, "{e}");
+        }
         assert!(row("empty")["saved_bytes"].as_u64().unwrap() > e["bytes"].as_u64().unwrap() / 4);
     }
 }
@@ -104,7 +112,7 @@ fn what_a_scene_leaves_out_changes_no_pixel() {
 fn what_is_kept_is_not_named_as_left_out() {
     let dir = tempfile::tempdir().unwrap();
     let frame = |keep: &[&str]| -> serde_json::Value {
-        let line = ["render", "formula:spheres:40", "--tf", "fog", "--azimuth", "30"];
+        let line = ["render", "formula:spheres:40", "--tf", "grey", "--azimuth", "30"];
         let rest = ["--size", "80x80", "--stats", "s.jsonl", "--force", "-o", "a.png"];
         let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
             .args(line)
@@ -121,10 +129,10 @@ fn what_is_kept_is_not_named_as_left_out() {
         let list = frame["left_out"].as_array().unwrap();
         list.iter().map(|l| l["name"].as_str().unwrap().to_string()).collect()
     };
-    let (lean, full) = (frame(&[]), frame(&["--keep", "empty,normals,gradients"]));
+    let (lean, full) = (frame(&[]), frame(&["--keep", "empty,normals,gradients,colours"]));
     assert_eq!(lean["pixels_sha256"], full["pixels_sha256"]);
     let (lean, full) = (names(&lean), names(&full));
-    for name in ["empty", "normals", "gradients"] {
+    for name in ["empty", "normals", "gradients", "colour"] {
         assert!(
             lean.iter().any(|n| n == name) && !full.iter().any(|n| n == name),
             "{lean:?} {full:?}"

@@ -181,12 +181,15 @@ fn a_cluster_keeps_an_error_that_is_asked_for() {
     assert!(quality["thickness"].as_f64().unwrap() <= 0.25, "all the time in the world: {quality}");
 }
 
-/// The estimate in a frame's statistics beside the reference's word.
+/// What a frame's statistics say of errors, beside the reference's word: estimates of RMSE, and bounds that
+/// hold on every pixel.
 #[test]
-fn statistics_estimate_what_the_thickness_costs() {
+fn statistics_tell_errors_by_source() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
-    let (mut near, mut all) = (0, 0);
+    let sources =
+        [("thickness", "thickness"), ("rounding", "rounding_positions"), ("ripple", "ripple")];
+    let (mut near, mut all, mut bounded) = ([0; 3], 0, 0);
     for (volume, tf, thickness) in [
         ("formula:spheres:48", "skin", "1"),
         ("formula:spheres:48", "skin", "2"),
@@ -207,18 +210,43 @@ fn statistics_estimate_what_the_thickness_costs() {
         let stats = std::fs::read_to_string(dir.join("s.jsonl")).unwrap();
         for (line, azimuth) in stats.lines().zip(["33", "110"]) {
             let stats: Value = serde_json::from_str(line).unwrap();
-            let estimate = stats["error"]["thickness"]["estimate"].as_f64().unwrap();
-            let judged = run(dir, &[&["error"], &scene, &["--azimuth", azimuth, "--json"]]);
+            let said = &stats["error"];
+            let how = ["--azimuth", azimuth, "--model-pixels", "1024", "--json"];
+            let judged = run(dir, &[&["error"], &scene, &how]);
             let judged: Value = serde_json::from_slice(&judged.stdout).unwrap();
-            let truth = judged["thickness"]["rmse"].as_f64().unwrap();
             all += 1;
-            near += usize::from(estimate < 2.0 * truth && truth < 2.0 * estimate);
-            println!("{volume} {tf} {thickness} {azimuth}: {estimate} of {truth}");
+            for (near, (name, found)) in near.iter_mut().zip(sources) {
+                let estimate = said[name]["estimate"].as_f64().unwrap();
+                let truth = judged[found]["rmse"].as_f64().unwrap();
+                *near += usize::from(estimate < 2.0 * truth && truth < 2.0 * estimate);
+                println!("{tf} {thickness} {azimuth} {name}: {estimate} of {truth}");
+            }
+            let edges = said["truncation"]["estimate"].as_f64();
+            assert!(if tf == "fog" { edges > Some(0.0) } else { edges.is_none() }, "{said}");
+            for (name, found) in [
+                ("cutoff", "cutoff"),
+                ("quantisation", "quantisation"),
+                ("rounding", "rounding_positions"),
+                ("truncation", "truncation"),
+            ] {
+                let Some(bound) = said[name]["bound"].as_f64() else { continue };
+                let found = judged[found]["max"].as_f64().unwrap();
+                println!("{tf} {thickness} {azimuth} {name}: {found} of at most {bound}");
+                // What is found of integers is found with floats, which round, too.
+                assert!(found <= bound + 1e-4, "{name}: {found} of at most {bound}");
+                bounded += 1;
+            }
         }
         draw(&format!("{out}-slab"), &["--stats", "s.jsonl", "--schedule", "slab"]);
         let stats = std::fs::read_to_string(dir.join("s.jsonl")).unwrap();
         let stats: Value = serde_json::from_str(stats.lines().next().unwrap()).unwrap();
-        assert!(stats["error"]["thickness"]["estimate"].is_null(), "never a number of nothing");
+        for (name, _) in sources {
+            assert!(stats["error"][name]["estimate"].is_null(), "never a number of nothing");
+        }
     }
-    assert_eq!((near, all), (all, 8), "of eight frames within a factor of two");
+    // Rounded positions show at edges, of which few are looked at in so small a picture.
+    let [thickness, rounding, ripple] = near;
+    assert_eq!((thickness, ripple, all), (8, 8, 8), "of eight frames within a factor of two");
+    assert!(rounding >= 7, "{rounding} of eight frames within a factor of two");
+    assert!(bounded >= 18, "fog has all four, what is stiff two: {bounded}");
 }

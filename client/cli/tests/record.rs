@@ -3,7 +3,6 @@
 mod program;
 
 use program::{end, good, names, run, signal, slabcast, text};
-use std::io::{BufRead, BufReader};
 use std::process::Stdio;
 use std::time::Duration;
 
@@ -52,15 +51,8 @@ fn a_run_of_this_process_is_recorded_and_replays_identically() {
 fn a_master_records_until_it_is_told_to_stop() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
-    let record = ["--record", "events.log", "--volume", "formula:spheres:24"];
-    let mut master = slabcast(dir, &[&["master", "--listen", "127.0.0.1:0"][..], &record].concat())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
-    let mut line = String::new();
-    BufReader::new(master.stdout.take().unwrap()).read_line(&mut line).unwrap();
-    let address = line.trim().rsplit(' ').next().unwrap().to_string();
+    let (mut master, address) =
+        program::master(dir, "formula:spheres:24", &["--record", "events.log"]);
     let worker = |name: &str| {
         let args = ["worker", "--master", &address, "--threads", "1", "--name", name];
         slabcast(dir, &args).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap()
@@ -76,8 +68,8 @@ fn a_master_records_until_it_is_told_to_stop() {
     workers[0].wait().unwrap();
     std::thread::sleep(Duration::from_millis(300));
     assert!(names(dir).contains(&"events.log.part".to_string()), "{:?}", names(dir));
-    signal(&master, "-TERM");
-    assert_eq!(end(&mut master, Duration::from_secs(12)), 0);
+    signal(&master.0, "-TERM");
+    assert_eq!(end(&mut master.0, Duration::from_secs(12)), 0);
     workers[1].kill().unwrap();
     workers[1].wait().unwrap();
     let said = good(dir, &["replay", "events.log"]);

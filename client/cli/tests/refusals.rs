@@ -369,6 +369,7 @@ fn flags() -> Vec<(Vec<&'static str>, &'static [&'static str])> {
         (with(&["--error", "2"]), &["--error", "at most 1"]),
         (with(&["--error-max", "none"]), &["--error-max", "1/512"]),
         (with(&["--budget", "100"]), &["--budget", "100ms"]),
+        (with(&["--budget", "-5ms"]), &["--budget", "above 0"]),
         (with(&["--budget", "0s"]), &["--budget", "0.5s"]),
         (with(&["--budget", "1s", "--thickness", "2"]), &["--budget", "--thickness"]),
         (with(&["--error", "0.1", "--show", "work"]), &["--error", "--show"]),

@@ -1166,10 +1166,10 @@ impl Measured {
 
 /// Whether what a stranger says of a region can be counted.
 fn check_cost(cost: Option<&RegionCost>, tile: Rect, bricks: usize) -> Result<(), String> {
-    if let Some(sampled) = cost.map(|c| c.sampled)
-        && sampled.pixels as usize > tile.area()
-    {
-        let (n, area) = (sampled.pixels, tile.area());
+    let sampled =
+        cost.map_or(0, |c| c.sampled.each().map(|s| s.pixels).into_iter().max().unwrap_or(0));
+    if sampled as usize > tile.area() {
+        let (n, area) = (sampled, tile.area());
         return Err(format!("a result sampled {n} pixels of a tile of {area}"));
     }
     let beyond = cost.and_then(|c| c.touched.iter().max()).filter(|&&i| i as usize >= bricks);

@@ -11,11 +11,11 @@ use crate::roster::Worker;
 use crate::{Micros, Span};
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::ids::WorkerId;
-use slabcast_common::message::{Counters, RegionCost, Sampled, TaskTimes};
+use slabcast_common::message::{Counters, RegionCost, Sampling, TaskTimes};
 use slabcast_common::quality::{Quality, Schedule};
 use slabcast_common::stats::{
-    BrickStats, EXTRAPOLATION, ErrorStats, Estimate, FrameMs, FrameStats, PoisonedTile, SlabStats,
-    VoxelStats, WorkerStats,
+    BoundAndEstimate, BrickStats, EXTRAPOLATION, ErrorStats, Estimate, FrameMs, FrameStats,
+    PoisonedTile, SlabStats, VoxelStats, WorkerStats,
 };
 use std::collections::BTreeMap;
 
@@ -51,8 +51,8 @@ pub(crate) struct Ledger {
     pub(crate) composite_us: Micros,
     accounts: BTreeMap<WorkerId, Account>,
     pub(crate) counters: Counters,
-    /// What thinner sheets changed.
-    sampled: Sampled,
+    /// How far pixels are off that were looked at.
+    sampled: Sampling,
     pub(crate) slabs: Vec<SlabStats>,
     pub(crate) spans: Vec<Span>,
     pub(crate) retries: u64,
@@ -91,7 +91,7 @@ impl Ledger {
             composite_us: 0,
             accounts: BTreeMap::new(),
             counters: Counters::default(),
-            sampled: Sampled::default(),
+            sampled: Sampling::default(),
             slabs: Vec::new(),
             spans: Vec::new(),
             retries: 0,
@@ -264,7 +264,18 @@ impl Ledger {
             quality,
             left_out: Vec::new(),
             error: ErrorStats {
-                thickness: Estimate { estimate: self.sampled.rmse().map(|e| e * EXTRAPOLATION) },
+                thickness: Estimate {
+                    estimate: self.sampled.thickness.rmse().map(|e| e * EXTRAPOLATION),
+                },
+                rounding: BoundAndEstimate {
+                    estimate: self.sampled.positions.rmse(),
+                    ..BoundAndEstimate::default()
+                },
+                truncation: BoundAndEstimate {
+                    estimate: self.sampled.truncation.rmse(),
+                    ..BoundAndEstimate::default()
+                },
+                ripple: Estimate { estimate: self.sampled.ripple.rmse() },
                 ..ErrorStats::default()
             },
             retries: self.retries,

@@ -40,7 +40,7 @@ pub use write::{Recorder, Written, start};
 
 use serde::{Deserialize, Serialize};
 use slabcast_common::brick::BrickInfo;
-use slabcast_common::message::{Sampled, TileResult, ToWorker};
+use slabcast_common::message::{Sampling, TileResult, ToWorker};
 use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{Action, Event};
 use std::fmt;
@@ -128,9 +128,9 @@ struct NotedResult {
     /// Of a region: places that it touched; stalls, parked, idle.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     region: Option<(Vec<u32>, u32, u64, u64)>,
-    /// Pixels that were drawn in thinner sheets, too, and the sum of squares of what that changed.
+    /// Of each source of error: pixels looked at, and the sum of squares of how far they are off.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    sampled: Option<(u32, u64)>,
+    sampled: Option<Box<[(u32, u64); 4]>>,
 }
 
 impl NotedResult {
@@ -153,8 +153,8 @@ impl NotedResult {
             sampled: result
                 .region
                 .as_ref()
-                .filter(|r| r.sampled != Sampled::default())
-                .map(|r| (r.sampled.pixels, r.sampled.squares)),
+                .filter(|r| r.sampled != Sampling::default())
+                .map(|r| Box::new(r.sampled.each().map(|s| (s.pixels, s.squares)))),
         }
     }
 }

@@ -9,7 +9,9 @@ use slabcast_common::PIXELS_VERSION;
 use slabcast_common::brick::{BRICK_VOXELS, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::{Counters, RegionCost, Sampled, SceneSpec, TaskTimes, TileResult};
+use slabcast_common::message::{
+    Counters, RegionCost, Sampled, Sampling, SceneSpec, TaskTimes, TileResult,
+};
 use slabcast_common::volume::Digest32;
 use slabcast_proto::{convert, v1};
 use slabcast_schedule::{Clock, Config, Event, FrameJob, Micros, Scheduler};
@@ -400,8 +402,13 @@ fn result(r: &NotedResult) -> Result<TileResult, String> {
     if !r.finite {
         *pixels.a.first_mut().ok_or("`finite` of a plane without pixels")? = f32::NAN;
     }
-    let sampled =
-        r.sampled.map_or_else(Sampled::default, |(pixels, squares)| Sampled { pixels, squares });
+    let sampled = r
+        .sampled
+        .as_deref()
+        .copied()
+        .unwrap_or_default()
+        .map(|(pixels, squares)| Sampled { pixels, squares });
+    let sampled = Sampling::of(sampled);
     let ([tossed, splatted, culled], [received_us, ready_us, start_us, end_us]) = (r.voxels, r.us);
     Ok(TileResult {
         task: TaskId(r.task),

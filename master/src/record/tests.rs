@@ -5,7 +5,7 @@ use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox}
 use slabcast_common::ids::{BrickId, FrameId, SceneId, WorkerId};
 use slabcast_common::image::TilePixels;
 use slabcast_common::message::{
-    Counters, RegionCost, Sampled, SceneSpec, TaskTimes, TileResult, ToWorker,
+    Counters, RegionCost, Sampled, Sampling, SceneSpec, TaskTimes, TileResult, ToWorker,
 };
 use slabcast_common::path::Orientation;
 use slabcast_common::path::{Turntable, ViewPath};
@@ -158,7 +158,10 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
                     stalls: 1,
                     parked_us: 20,
                     idle_us: 5,
-                    sampled: Sampled { pixels: 9, squares: 1 << 50 | rng.below(99) },
+                    sampled: Sampling::of(
+                        [0, 1, 2, 3]
+                            .map(|i| Sampled { pixels: 9 - i, squares: 1 << 50 | rng.below(99) }),
+                    ),
                 });
                 let counters = Counters { tossed: 3, splatted: 2, culled: 1 };
                 if rng.below(50) == 0 {

@@ -109,6 +109,11 @@ impl BrickStore {
         self.relevant_voxels
     }
 
+    /// Where they are; `None` without bricks.
+    pub fn extent(&self) -> Option<TightBox> {
+        self.infos.iter().map(|info| info.tight).reduce(TightBox::union)
+    }
+
     /// Bytes of all encodings.
     pub fn bytes(&self) -> u64 {
         self.bytes

@@ -13,8 +13,8 @@ use slabcast_common::brick::{
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::{RawSums, TilePixels, TileState};
 use slabcast_common::message::{
-    BrickBatch, Counters, Hello, Lease, RegionCost, RegionLease, Sampled, TaskTimes, TileResult,
-    ToMaster, ToWorker,
+    BrickBatch, Counters, Hello, Lease, RegionCost, RegionLease, Sampled, Sampling, TaskTimes,
+    TileResult, ToMaster, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::slab::SheetRange;
@@ -248,10 +248,17 @@ fn result_to_wire(result: &TileResult) -> v1::TileResult {
             stalls: r.stalls,
             parked_us: r.parked_us,
             idle_us: r.idle_us,
-            sampled_pixels: r.sampled.pixels,
-            sampled_squares: r.sampled.squares,
+            thickness: sampled_to_wire(r.sampled.thickness),
+            positions: sampled_to_wire(r.sampled.positions),
+            truncation: sampled_to_wire(r.sampled.truncation),
+            ripple: sampled_to_wire(r.sampled.ripple),
         }),
     }
+}
+
+/// `None` where nothing was looked at.
+fn sampled_to_wire(s: Sampled) -> Option<v1::Sampled> {
+    (s != Sampled::default()).then_some(v1::Sampled { pixels: s.pixels, squares: s.squares })
 }
 
 fn region_cost_from_wire(cost: v1::RegionCost) -> Result<RegionCost, WireError> {
@@ -261,7 +268,10 @@ fn region_cost_from_wire(cost: v1::RegionCost) -> Result<RegionCost, WireError> 
     }
     let touched = touched.into_iter().map(|id| id.0).collect();
     let v1::RegionCost { stalls, parked_us, idle_us, .. } = cost;
-    let sampled = Sampled { pixels: cost.sampled_pixels, squares: cost.sampled_squares };
+    let each = [cost.thickness, cost.positions, cost.truncation, cost.ripple];
+    let sampled = Sampling::of(each.map(|s| {
+        s.map_or_else(Sampled::default, |s| Sampled { pixels: s.pixels, squares: s.squares })
+    }));
     Ok(RegionCost { touched, stalls, parked_us, idle_us, sampled })
 }
 

@@ -105,6 +105,7 @@ pub(super) fn quality_to_wire(q: &Quality) -> v1::Quality {
         splat: splat_to_wire(q.splat),
         sums: sums_to_wire(q.sums),
         cull: Some(q.cull),
+        three_colours: !q.grey,
     }
 }
 
@@ -121,6 +122,7 @@ pub(super) fn quality_from_wire(q: v1::Quality) -> Result<Quality, WireError> {
         splat: splat_from_wire("splat", q.splat)?,
         sums: sums_from_wire("sums", q.sums)?,
         cull: q.cull.unwrap_or(d.cull),
+        grey: !q.three_colours,
     };
     quality.check()?;
     Ok(quality)

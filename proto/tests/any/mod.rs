@@ -275,13 +275,16 @@ pub fn directory() -> impl Strategy<Value = ToWorker> {
 pub fn result() -> impl Strategy<Value = TileResult> {
     (1usize..600).prop_flat_map(|n| {
         let ids = (any::<u64>(), any::<u32>());
-        let cost = (ascending(40), any::<[u32; 2]>(), any::<[u64; 3]>()).prop_map(
-            |(touched, [stalls, pixels], [parked_us, idle_us, squares])| RegionCost {
+        let cost = (ascending(40), any::<[u32; 5]>(), any::<[u64; 6]>()).prop_map(
+            |(touched, [stalls, pixels @ ..], [parked_us, idle_us, squares @ ..])| RegionCost {
                 touched: touched.into_iter().map(|id| id.0).collect(),
                 stalls,
                 parked_us,
                 idle_us,
-                sampled: Sampled { pixels, squares },
+                sampled: Sampling::of(std::array::from_fn(|i| Sampled {
+                    pixels: pixels[i],
+                    squares: squares[i],
+                })),
             },
         );
         let more = (any::<u32>(), prop::option::of(cost));
@@ -513,16 +516,16 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
         0.1..1000.0f64,
         prop::option::of((4u32..=8).prop_map(|p| 1 << p)),
         prop_oneof![Just(Schedule::Auto), Just(Schedule::Slab)],
-        any::<[bool; 5]>(),
+        any::<[bool; 6]>(),
     )
         .prop_map(|(slabs, tiles_per_worker, tile, schedule, flags)| {
-            let [empty, normals, gradients, equal, estimate] = flags;
+            let [empty, normals, gradients, colours, equal, estimate] = flags;
             Work {
                 slabs,
                 tiles_per_worker,
                 tile,
                 schedule,
-                keep: Keep { empty, normals, gradients },
+                keep: Keep { empty, normals, gradients, colours },
                 borders: if equal { Borders::Equal } else { Borders::Data },
                 estimate,
             }

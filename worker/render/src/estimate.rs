@@ -1,16 +1,18 @@
-//! How far a tile is from sheets of half the thickness, at a few of its pixels.
+//! How far a tile is off, at a few of its pixels: from sheets of half the thickness, and (by [`Model`]) from
+//! what the model would be without rounded positions, the kernel's cut and its ripple.
 //!
 //! What thin sheets come to is not known where a frame is drawn; how much a picture changes when they
 //! become thinner is, and it tells: an error that falls with the power p of the thickness is
 //! 1 / (1 - 2^-p) of that change (Richardson's extrapolation; [`slabcast_common::stats::EXTRAPOLATION`]).
 //! One pixel in 128 is drawn twice, in blocks, since neighbours share footprints.
 
+use crate::model::Model;
 use crate::scene::{Frame, Scene};
 use crate::splat::Simd;
 use crate::tile::{self, Scratch};
 use slabcast_common::brick::{Brick, TightBox};
 use slabcast_common::image::{COLOUR_UNIT, TilePixels, TileState};
-use slabcast_common::message::{Sampled, SceneSpec};
+use slabcast_common::message::{Sampled, Sampling, SceneSpec};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Quality;
 use slabcast_common::slab::SheetRange;
@@ -75,32 +77,62 @@ fn blocks(tile: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
     })
 }
 
-/// Draws some pixels of a tile twice and compares; `bricks` are those that the tile was drawn from.
-pub fn sample(
+/// What tells how far pixels of a frame are off.
+pub struct Probe {
+    pair: Option<[Frame; 2]>,
+    model: Option<Model>,
+}
+
+impl Probe {
+    /// For `frame`, whose scene has this pair.
+    pub fn new(frame: &Frame, pair: Option<&Pair>) -> Probe {
+        Probe { pair: pair.map(|p| p.frames(&frame.view)), model: Model::of(frame) }
+    }
+
+    /// Looks at some pixels of a tile; `bricks` are those that the tile was drawn from.
+    pub fn sample(
+        &self,
+        frame: &Frame,
+        simd: Simd,
+        tile: Rect,
+        bricks: &[Arc<Brick>],
+        scratch: &mut Scratch,
+    ) -> Sampling {
+        let mut samples = Sampling::default();
+        for block in blocks(tile, frame.view.size) {
+            if let Some(pair) = &self.pair {
+                thinner(pair, simd, block, bricks, scratch, &mut samples.thickness);
+            }
+            if let Some(model) = &self.model {
+                model.sample(frame, block, bricks, &mut samples);
+            }
+        }
+        samples
+    }
+}
+
+/// Draws a block twice and compares.
+fn thinner(
     frames: &[Frame; 2],
     simd: Simd,
-    tile: Rect,
+    block: Rect,
     bricks: &[Arc<Brick>],
     scratch: &mut Scratch,
-) -> Sampled {
-    let mut sampled = Sampled::default();
-    for block in blocks(tile, frames[0].view.size) {
-        let [coarse, fine] = frames.each_ref().map(|frame| {
-            let whole = TightBox { lo: [0; 3], hi: frame.scene.dims.map(|n| n - 1) };
-            let sheets = frame.view.project(&whole).map_or_else(SheetRange::default, |p| p.sheets);
-            let state = TileState { a: vec![0.0; block.area()], last: None };
-            tile::render(frame, simd, block, sheets, bricks, &state, scratch).0
-        });
-        for i in 0..block.area() {
-            let light =
-                |p: &TilePixels, k: usize| f64::from(p.colour[i][k]) * f64::from(COLOUR_UNIT);
-            let (a, b) = (f64::from(coarse.a[i]), f64::from(fine.a[i]));
-            let colours = (0..3).map(|k| light(&coarse, k) - light(&fine, k));
-            let squares = colours.fold((a - b) * (a - b), |sum, off| sum + off * off);
-            sampled.put(a > 0.0 || b > 0.0, squares);
-        }
+    sampled: &mut Sampled,
+) {
+    let [coarse, fine] = frames.each_ref().map(|frame| {
+        let whole = TightBox { lo: [0; 3], hi: frame.scene.dims.map(|n| n - 1) };
+        let sheets = frame.view.project(&whole).map_or_else(SheetRange::default, |p| p.sheets);
+        let state = TileState { a: vec![0.0; block.area()], last: None };
+        tile::render(frame, simd, block, sheets, bricks, &state, scratch).0
+    });
+    for i in 0..block.area() {
+        let light = |p: &TilePixels, k: usize| f64::from(p.colour[i][k]) * f64::from(COLOUR_UNIT);
+        let (a, b) = (f64::from(coarse.a[i]), f64::from(fine.a[i]));
+        let colours = (0..3).map(|k| light(&coarse, k) - light(&fine, k));
+        let squares = colours.fold((a - b) * (a - b), |sum, off| sum + off * off);
+        sampled.put(a > 0.0 || b > 0.0, squares);
     }
-    sampled
 }
 
 #[cfg(test)]

@@ -25,6 +25,7 @@ mod flat;
 pub mod footprint;
 mod general;
 mod mask;
+mod model;
 mod place;
 mod planes;
 pub mod reference;

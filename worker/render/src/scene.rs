@@ -31,6 +31,8 @@ pub struct Scene {
     pub dims: [u32; 3],
     /// Largest extinction per vox (or alpha, for the paper's compositing).
     pub payload_max: f64,
+    /// Whether all that is seen is grey, and that is made use of.
+    pub grey: bool,
     /// Footprints that its frames share.
     shelf: Arc<Shelf>,
 }
@@ -47,6 +49,7 @@ impl Scene {
             grid: BrickGrid::of(spec.volume.lattice.dims),
             dims: spec.volume.lattice.dims,
             payload_max,
+            grey: spec.quality.grey && spec.transfer.is_grey(),
             shelf: Arc::default(),
         }
     }

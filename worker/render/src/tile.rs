@@ -262,6 +262,17 @@ impl Pixels {
     }
 }
 
+impl Frame {
+    /// Whether its three colours are one and it is drawn where that is made use of: opacity and one
+    /// colour, half of what others add up and close.
+    pub fn has_two_channels(&self) -> bool {
+        let crate::Scene { grey, quality, ref classifier, .. } = *self.scene;
+        let fits = !classifier.is_modulated() && self.sections.most() <= MOST;
+        let whole = matches!(quality.sums, Sums::I32 | Sums::Auto);
+        grey && whole && fits && flat::takes(self).is_some()
+    }
+}
+
 impl Part<'_> {
     /// Renders it.
     pub(crate) fn draw(self, simd: Simd, scratch: &mut Scratch, io: Io<'_>) {
@@ -277,7 +288,7 @@ impl Part<'_> {
                 let (store, waiting) = (&mut whole.shorts, &mut whole.waiting);
                 part.render(simd, store, waiting, (&mut kinds.shorts, queues), pixels, io);
             }
-            Sums::I32 | Sums::Auto if part.is_grey() => {
+            Sums::I32 | Sums::Auto if part.frame.has_two_channels() => {
                 let Whole { greys: store, waiting, .. } = whole;
                 part.render_grey(simd, store, &mut waiting.flat, pixels, io);
             }
@@ -288,15 +299,7 @@ impl Part<'_> {
         }
     }
 
-    /// Whether its three colours are one, and it is drawn where that is made use of.
-    fn is_grey(&self) -> bool {
-        let Frame { scene, sections, .. } = self.frame;
-        let classifier = &scene.classifier;
-        let fits = !classifier.is_modulated() && sections.most() <= MOST;
-        fits && classifier.is_grey() && flat::takes(self.frame).is_some()
-    }
-
-    /// Renders it where it [is grey](Self::is_grey).
+    /// Renders it where the frame [has two channels](Frame::has_two_channels).
     fn render_grey(
         self,
         simd: Simd,

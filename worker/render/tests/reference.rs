@@ -4,6 +4,8 @@
 mod world;
 
 use glam::DVec3;
+use slabcast_common::bounds;
+use slabcast_common::brick::TightBox;
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::message::SceneSpec;
@@ -702,4 +704,90 @@ fn splines_are_judged_by_what_is_known_on_paper() {
         let level = asked.reference().without_ripple().pixel(inside.0, inside.1);
         assert_near(level, reference.pixel(inside.0, inside.1), 1e-7, "without ripple");
     }
+}
+
+/// What rounded positions and the kernel's cut cost at most, held against every pixel of scenes that are
+/// soft and stiff, even and rough, seen along an axis (walls that rays graze), from anywhere and in
+/// perspective.
+#[test]
+fn bounds_of_the_model_hold_on_every_pixel() {
+    let rough = |i: u32, j: u32, k: u32| {
+        let h = (i * 73_856_093) ^ (j * 19_349_663) ^ (k * 83_492_791);
+        if h % 7 < 3 { 0 } else { (40 + h % 200) as u8 }
+    };
+    let scenes: [(&str, Volume); 2] = [
+        ("even", Volume::from_fn_u8("even", [9, 11, 10], |_, _, _| 100)),
+        ("rough", Volume::from_fn_u8("rough", [9, 11, 10], rough)),
+    ];
+    let colors = vec![[0.0, 0.1, 0.3, 0.9], [120.0, 0.9, 0.8, 0.1], [255.0, 0.2, 1.0, 0.6]];
+    let (mut said, mut widest) = (0, [0.0f64; 2]);
+    for (name, volume) in &scenes {
+        let axis = front(volume).0;
+        let cameras = [
+            axis,
+            oblique(CameraProjection::Ortho { height: 22.0 }),
+            oblique(CameraProjection::Persp { fov: 30.0, distance: 40.0 }),
+        ];
+        for (c, camera) in cameras.into_iter().enumerate() {
+            for (opacity, thickness, compositing) in [
+                (0.005, 1.0, Compositing::Linear),
+                (0.06, 2.0, Compositing::Linear),
+                (0.06, 0.5, Compositing::Constant),
+                (0.99, 1.0, Compositing::Linear),
+                (1.0, 0.5, Compositing::Linear),
+            ] {
+                let tf = alpha(colors.clone(), vec![[0.0, 0.0], [40.0, opacity]]);
+                let quality = Quality { thickness, compositing, ..i32_sums() };
+                let n = 29;
+                let asked = Asked::new(volume.clone(), tf, quality, camera, n);
+                let reference = asked.reference();
+                let whole = asked.reference().without_truncation();
+                let rounded = Sheets { rounded: true, ..Sheets::default() };
+                let mut found = [0.0f64; 2];
+                let mut most = 0.0f64;
+                for (x, y) in (0..n * n).map(|i| (i % n, i / n)) {
+                    let sheets = reference.at_same_thickness(x, y);
+                    most = most.max(sheets[3]);
+                    let pairs = [
+                        (sheets, reference.by_sheets(x, y, rounded)),
+                        (reference.pixel(x, y), whole.pixel(x, y)),
+                    ];
+                    for (worst, (a, b)) in found.iter_mut().zip(pairs) {
+                        for c in 0..4 {
+                            *worst = worst.max((a[c] - b[c]).abs() * 255.0);
+                        }
+                    }
+                }
+                let within = TightBox::whole(volume.lattice.dims);
+                let (spec, view) = (&asked.spec, &asked.view);
+                for alpha_most in [None, Some(most)] {
+                    let bounds = [
+                        bounds::rounding(spec, view, &within, alpha_most),
+                        bounds::truncation(spec, view, &within, alpha_most),
+                    ];
+                    for (i, (bound, found)) in bounds.into_iter().zip(found).enumerate() {
+                        let bound = bound.expect("extinctions");
+                        let what = ["rounding", "truncation"][i];
+                        let scene = format!("{name} {c} {opacity} {thickness} {compositing:?}");
+                        println!("{scene}, {what}: {found:.4} of at most {bound:.4}");
+                        // The reference itself is this near to the limit.
+                        assert!(found <= bound + 1e-3, "{scene}: {what} {found} above {bound}");
+                        if bound < 255.0 && alpha_most.is_some() && opacity < 0.1 {
+                            said += 1;
+                            widest[i] = widest[i].max(bound / found);
+                        }
+                    }
+                }
+            }
+        }
+    }
+    assert!(said >= 30, "they say something of what is translucent: {said} of 36");
+    println!("at most {:.0} and {:.0} times the largest error", widest[0], widest[1]);
+    // A picture of another compositing has another limit.
+    let tf = alpha(colors, vec![[0.0, 0.5]]);
+    let paper = Quality { compositing: Compositing::Paper, ..i32_sums() };
+    let asked = Asked::new(scenes[0].1.clone(), tf, paper, front(&scenes[0].1).0, 8);
+    let within = TightBox::whole(scenes[0].1.lattice.dims);
+    assert_eq!(bounds::rounding(&asked.spec, &asked.view, &within, None), None);
+    assert_eq!(bounds::truncation(&asked.spec, &asked.view, &within, None), None);
 }

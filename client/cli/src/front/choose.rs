@@ -51,7 +51,7 @@ pub(crate) struct Aim {
     pub(crate) error_max: Option<f64>,
     /// Longest time a frame may take (100ms); the nearest setting to the limit that keeps it is chosen,
     /// if need be in a smaller picture, magnified
-    #[arg(long, value_name = "TIME", value_parser = parse::time,
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true, value_parser = parse::time,
           conflicts_with_all = ["thickness", "eps", "sums"])]
     pub(crate) budget: Option<f64>,
 }

@@ -198,8 +198,8 @@ impl Recipe {
                 path,
                 preset: asked.transfer.preset().map(String::from),
                 transfer: asked.transfer.function(info).map_err(|e| asked.blame(&e))?,
-                // Culling never changes a byte.
-                quality: Quality { cull: true, ..quality },
+                // Neither changes a byte.
+                quality: Quality { cull: true, grey: true, ..quality },
                 magnify: asked.magnify,
                 background: match background {
                     Background::Transparent => Ground::Word("transparent".into()),

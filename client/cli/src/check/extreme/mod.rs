@@ -17,6 +17,7 @@ use scene::{
     apart, cutoff, extinction, from, judge, look, on_lattice, persp, ramp, rough, shaded, shot,
 };
 use slabcast_common::bounds;
+use slabcast_common::brick::TightBox;
 use slabcast_common::path::PathView;
 use slabcast_common::quality::{Compositing, Quality, Sums, Work};
 use slabcast_common::transfer::TransferFunction;
@@ -233,8 +234,9 @@ fn settings() -> Vec<Case> {
     // and half an ulp for each of at most 300 that a sheet adds, in tau and in colour.
     all.push(Case::new("integer sums against floats", move |_| {
         let [ints, floats] = [scene(0.0, Sums::I32).ready()?, scene(0.0, Sums::F32).ready()?];
-        let bound = bounds::quantisation(&ints.spec, &ints.view)
-            + bounds::quantisation(&floats.spec, &floats.view)
+        let within = TightBox::whole(ints.spec.volume.lattice.dims);
+        let bound = bounds::quantisation(&ints.spec, &ints.view, &within)
+            + bounds::quantisation(&floats.spec, &floats.view, &within)
             + 255.0 * 2.0 * 315.0 * 6e-8;
         let apart = apart(&ints.serial(), &floats.serial());
         Ok(vec![Row::new("max of the difference", apart, bound)])

@@ -250,7 +250,7 @@ fn cover(
 /// picture's largest opacity, where it is known. `None` for the paper's opacities, which add up to another
 /// picture.
 ///
-/// By [`Change`]; sheets hold light as a field does that is constant in each. Where colours have a slope,
+/// By what is said at `Change`; sheets hold light as a field does that is constant in each. Where colours have a slope,
 /// their sums and those of the sheets beside have a part in it: a share s of all sums moves c and its
 /// neighbours by 2 s and the weights by 4 s, so the slope by at most (5 G + 6 H) s, and light by |phi| / a of
 /// that, at most half and at most a twelfth of a sheet's optical depth; what is beyond that share counts 17
@@ -295,7 +295,7 @@ pub fn rounding(
 /// Bound of the kernel's cut: against a picture with whole Gaussians, in the limit of thin sheets. Zero for
 /// splines, of which nothing is cut.
 ///
-/// By [`Change`]. The largest of all pictures' differences, 255, is what it comes to wherever solid matter
+/// By what is said at `Change`. The largest of all pictures' differences, 255, is what it comes to wherever solid matter
 /// may lie just beyond a ray's reach all along it.
 pub fn truncation(
     scene: &SceneSpec,

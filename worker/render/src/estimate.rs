@@ -1,4 +1,4 @@
-//! How far a tile is off, at a few of its pixels: from sheets of half the thickness, and (by [`Model`]) from
+//! How far a tile is off, at a few of its pixels: from sheets of half the thickness, and (by `model`) from
 //! what the model would be without rounded positions, the kernel's cut and its ripple.
 //!
 //! What thin sheets come to is not known where a frame is drawn; how much a picture changes when they

@@ -25,7 +25,7 @@ impl Profile {
     /// `kernel` of deviation `std` and `radius`, which are those of [`Quality::shape`] times the
     /// length of a step of the lattice.
     ///
-    /// [`Quality::shape`]: slabcast_common::quality::Quality::shape
+    /// [`Quality::shape`]: crate::quality::Quality::shape
     pub fn new(kernel: Kernel, std: f64, radius: f64) -> Self {
         match kernel {
             Kernel::Gaussian => Profile::gaussian(std, radius),

@@ -93,7 +93,7 @@ pub(crate) struct RenderArgs {
     )]
     show: Option<Show>,
     /// Statistics, one line of JSON a frame; - writes them to stdout. For their estimates of errors
-    /// one pixel in 128 is drawn again in other ways: some tenth of the time
+    /// one pixel in 128 is drawn again in other ways: up to a quarter more time
     #[arg(long, value_name = "FILE|-", help_heading = "Output")]
     stats: Option<PathBuf>,
     /// Time line of all workers for Perfetto or chrome://tracing

@@ -42,6 +42,7 @@ fn request(key: &str, projection: ProjectionKind, work: Work) -> PathRequest {
         format: PixelFormat::Rgba32F,
         background: Background::Transparent,
         want_trace: true,
+        want_hash: true,
     }
 }
 

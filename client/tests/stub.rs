@@ -138,6 +138,7 @@ fn stats(frame: u64) -> FrameStats {
         workers: vec![],
         voxels: Default::default(),
         bricks: Default::default(),
+        result_bytes: None,
         slabs: vec![],
         quality: Quality::default(),
         left_out: vec![],
@@ -225,6 +226,7 @@ fn request(key: &str) -> PathRequest {
         format: PixelFormat::Rgba8,
         background: Background::Transparent,
         want_trace: false,
+        want_hash: true,
     }
 }
 

@@ -4,9 +4,11 @@
 //! its tile's A and the last sheet's raw sums and goes on; its colour is fixed point and is
 //! added to what stood there. So any cut into slabs and tiles gives the same integers.
 
+use crate::leaves::{Finish, Leaves, compose};
 use crate::math::{linear_from_srgb, srgb_from_linear};
 use crate::occlusion::Rect;
 use crate::volume::Digest32;
+use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::sync::OnceLock;
 
@@ -39,7 +41,7 @@ pub struct TilePixels {
 
 /// A finished pixel: linear premultiplied RGBA.
 #[inline(always)]
-fn finished(a: f32, colour: [u32; 3]) -> [f32; 4] {
+pub(crate) fn finished(a: f32, colour: [u32; 3]) -> [f32; 4] {
     let [r, g, b] = colour;
     [r as f32 * COLOUR_UNIT, g as f32 * COLOUR_UNIT, b as f32 * COLOUR_UNIT, a]
 }
@@ -59,13 +61,15 @@ impl TilePixels {
     }
 }
 
-/// A frame while its tiles are rendered: slab after slab ([`FrameState::put`]), or each tile at once
-/// ([`FrameState::lay`]).
+/// A frame while its tiles are rendered: slab after slab ([`FrameState::put`]), or each tile at once, as
+/// sums ([`FrameState::lay`]) or finished ([`FrameState::lay_finished`]).
 #[derive(Clone, Debug)]
 pub struct FrameState {
     size: [u32; 2],
     /// Tiles that one task made whole, in the order in which they came; nothing was put where they are.
     laid: Vec<(Rect, TilePixels)>,
+    /// Tiles that came finished, likewise. A frame that has some has no others.
+    done: Vec<(Rect, Leaves)>,
     /// Of all pixels; none before something was put.
     a: Vec<f32>,
     colour: Vec<[u32; 3]>,
@@ -82,8 +86,8 @@ impl FrameState {
 
     /// Nothing drawn yet.
     pub fn new(size: [u32; 2]) -> Self {
-        let (laid, a, colour, last, next) = Default::default();
-        FrameState { size, laid, a, colour, last, next }
+        let (laid, done, a, colour, last, next) = Default::default();
+        FrameState { size, laid, done, a, colour, last, next }
     }
 
     fn pixels(&self) -> usize {
@@ -103,7 +107,8 @@ impl FrameState {
     /// The largest opacity of any pixel.
     pub fn alpha_most(&self) -> f32 {
         let laid = self.laid.iter().flat_map(|(_, tile)| &tile.a);
-        self.a.iter().chain(laid).fold(0.0, |most, &a| a.max(most))
+        let done = self.done.iter().map(|(_, tile)| &tile.alpha_most);
+        self.a.iter().chain(laid).chain(done).fold(0.0, |most, &a| a.max(most))
     }
 
     fn rows(&self, r: Rect) -> impl Iterator<Item = std::ops::Range<usize>> + use<> {
@@ -176,6 +181,19 @@ impl FrameState {
         self.laid.push((tile, pixels));
     }
 
+    /// Takes in a tile that came finished.
+    ///
+    /// # Panics
+    /// If its parts do not fit each other ([`Leaves::check`]) or the tile, or if the tile leaves the
+    /// picture.
+    pub fn lay_finished(&mut self, tile: Rect, leaves: Leaves) {
+        let [w, h] = leaves.size.map(|n| n as usize);
+        assert!([w, h] == [tile.width(), tile.height()], "leaves of the tile's size");
+        assert_eq!(leaves.check(), Ok(()));
+        assert!(tile.intersect(&Rect::of_size(self.size)) == tile, "inside the picture");
+        self.done.push((tile, leaves));
+    }
+
     /// Ends a slab: what came in as last sums is what the next slab starts from. A pixel that
     /// no task touched had an empty last sheet.
     pub fn end_slab(&mut self) {
@@ -184,15 +202,27 @@ impl FrameState {
     }
 
     /// The finished picture.
+    ///
+    /// # Panics
+    /// If tiles came finished: sums can't be had from them.
     pub fn finish(&self) -> Picture {
+        assert!(self.done.is_empty(), "tiles as sums");
         let mut pixels = Vec::with_capacity(self.pixels());
         self.each_row(|row| pixels.extend_from_slice(row));
         Picture { size: self.size, pixels }
     }
 
-    /// The finished picture's hash and its bytes, without a picture in between.
-    pub fn encode(&self, format: PixelFormat, background: Background) -> Encoded {
-        let mut encoding = Encoding::new(self.pixels(), format, background);
+    /// The finished picture's bytes, and its hash if it is to be `hashed`, without a picture in between.
+    ///
+    /// # Panics
+    /// If tiles came finished and it is to be hashed, or some came in another format or as sums.
+    pub fn encode(&self, finish: &Finish, hashed: bool) -> Encoded {
+        if !self.done.is_empty() {
+            assert!(!hashed, "the hash is of the linear picture");
+            assert!(self.laid.is_empty() && self.a.is_empty(), "all tiles came finished");
+            return Encoded { sha256: None, bytes: compose(self.size, &self.done, finish) };
+        }
+        let mut encoding = Encoding::new(self.pixels(), finish, hashed);
         self.each_row(|row| encoding.put(row));
         encoding.end()
     }
@@ -245,7 +275,8 @@ pub struct Picture {
 }
 
 /// What lies behind the volume.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Background {
     /// Nothing: the picture has straight alpha.
     Transparent,
@@ -254,7 +285,8 @@ pub enum Background {
 }
 
 /// How pixels leave the master.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum PixelFormat {
     /// 8-bit sRGB over the background.
     Rgb8,
@@ -297,32 +329,36 @@ impl Picture {
 /// A picture as it leaves the master.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Encoded {
-    /// As [`Picture::sha256`].
-    pub sha256: Digest32,
+    /// As [`Picture::sha256`]; `None` where nobody asked.
+    pub sha256: Option<Digest32>,
     /// As [`Picture::encode`].
     pub bytes: Vec<u8>,
 }
 
-/// A picture that is hashed and encoded as its pixels come.
+/// A picture that is encoded, and perhaps hashed, as its pixels come.
 struct Encoding {
-    hash: Sha256,
+    hash: Option<Sha256>,
     encoder: Encoder,
     bytes: Vec<u8>,
 }
 
 impl Encoding {
-    fn new(pixels: usize, format: PixelFormat, background: Background) -> Encoding {
-        let bytes = Vec::with_capacity(pixels * format.bytes());
-        Encoding { hash: Sha256::new(), encoder: Encoder::new(format, background), bytes }
+    fn new(pixels: usize, finish: &Finish, hashed: bool) -> Encoding {
+        let bytes = Vec::with_capacity(pixels * finish.format.bytes());
+        let encoder = Encoder::new(finish.format, finish.background);
+        Encoding { hash: hashed.then(Sha256::new), encoder, bytes }
     }
 
     fn put(&mut self, pixels: &[[f32; 4]]) {
-        hash(&mut self.hash, pixels);
+        if let Some(h) = &mut self.hash {
+            hash(h, pixels);
+        }
         self.encoder.put(pixels, &mut self.bytes);
     }
 
     fn end(self) -> Encoded {
-        Encoded { sha256: Digest32(self.hash.finalize().into()), bytes: self.bytes }
+        let sha256 = self.hash.map(|h| Digest32(h.finalize().into()));
+        Encoded { sha256, bytes: self.bytes }
     }
 }
 
@@ -335,14 +371,14 @@ fn hash(h: &mut Sha256, pixels: &[[f32; 4]]) {
 }
 
 /// Pixels to bytes of a format, over a background.
-struct Encoder {
+pub(crate) struct Encoder {
     format: PixelFormat,
     /// The background's linear light.
     background: Option<[f64; 3]>,
 }
 
 impl Encoder {
-    fn new(format: PixelFormat, background: Background) -> Encoder {
+    pub(crate) fn new(format: PixelFormat, background: Background) -> Encoder {
         let background = match background {
             Background::Colour(colour) => Some(colour.map(linear_from_srgb)),
             Background::Transparent => None,
@@ -350,7 +386,7 @@ impl Encoder {
         Encoder { format, background }
     }
 
-    fn put(&self, pixels: &[[f32; 4]], out: &mut Vec<u8>) {
+    pub(crate) fn put(&self, pixels: &[[f32; 4]], out: &mut Vec<u8>) {
         let first = out.len();
         out.resize(first + pixels.len() * self.format.bytes(), 0);
         let out = &mut out[first..];
@@ -487,9 +523,10 @@ mod tests {
             [PixelFormat::Rgb8, PixelFormat::Rgba8, PixelFormat::Rgba16, PixelFormat::Rgba32F]
         {
             for background in [Background::Transparent, Background::Colour([0.2, 0.5, 1.0])] {
-                let encoded = f.encode(format, background);
-                assert_eq!(encoded, laid.encode(format, background));
-                assert_eq!(encoded.sha256, picture.sha256());
+                let finish = Finish { format, background };
+                let encoded = f.encode(&finish, true);
+                assert_eq!(encoded, laid.encode(&finish, true));
+                assert_eq!(encoded.sha256, Some(picture.sha256()));
                 assert_eq!(encoded.bytes, picture.encode(format, background));
                 assert_eq!(encoded.bytes.len(), picture.pixels.len() * format.bytes());
             }

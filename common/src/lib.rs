@@ -15,6 +15,7 @@ pub mod gradient;
 pub mod ids;
 pub mod image;
 pub mod kernel;
+pub mod leaves;
 pub mod math;
 pub mod message;
 pub mod occlusion;
@@ -37,7 +38,7 @@ pub mod wanted;
 pub const PIXELS_VERSION: u32 = 4;
 
 /// Version of the messages between master, worker and client.
-pub const PROTOCOL_VERSION: u32 = 3;
+pub const PROTOCOL_VERSION: u32 = 4;
 
 /// SHA-256 of the self-test tile that every worker draws before it says hello
 /// (`slabcast_render::selftest`, which also has the test that keeps this constant true).

@@ -7,6 +7,7 @@
 use crate::brick::{Brick, BrickGrid, BrickInfo, BrickSetKey};
 use crate::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use crate::image::{Background, PixelFormat, TilePixels, TileState};
+use crate::leaves::{Finish, Leaves};
 use crate::occlusion::Rect;
 use crate::path::ViewPath;
 use crate::quality::{Quality, Work};
@@ -98,6 +99,9 @@ pub enum ToWorker {
         scene: SceneId,
         /// Its view.
         view: View,
+        /// What its regions are finished to; `None`: their results are sums. Those of leases are sums
+        /// always.
+        finish: Option<Finish>,
     },
     /// Bricks that there are of a set, some of them or all: from the `first`, ascending by id. The
     /// parts of a directory come in order, and before the first region of the set. Those of the
@@ -285,6 +289,30 @@ impl Sampled {
     }
 }
 
+/// What a task gave.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Pixels {
+    /// What it adds to the picture, which the master finishes.
+    Sums(TilePixels),
+    /// A piece of the picture as it leaves the master.
+    Finished(Leaves),
+}
+
+impl Pixels {
+    /// How many there are.
+    pub fn len(&self) -> usize {
+        match self {
+            Pixels::Sums(sums) => sums.a.len(),
+            Pixels::Finished(leaves) => leaves.pixels(),
+        }
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
 /// A rendered task.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TileResult {
@@ -293,7 +321,9 @@ pub struct TileResult {
     /// Which attempt.
     pub epoch: Epoch,
     /// Its pixels.
-    pub pixels: TilePixels,
+    pub pixels: Pixels,
+    /// Bytes of the message that it came in; `None` of one that crossed no network.
+    pub bytes: Option<u32>,
     /// Its voxels.
     pub counters: Counters,
     /// Its times. Of a region, from `start_us` to `end_us` is drawing alone.
@@ -392,4 +422,14 @@ pub struct PathRequest {
     pub background: Background,
     /// Whether each frame's statistics come with spans for a trace.
     pub want_trace: bool,
+    /// Whether each frame's statistics have the hash of its linear picture. Without it tiles travel as
+    /// finished pixels, which are fewer bytes.
+    pub want_hash: bool,
+}
+
+impl PathRequest {
+    /// What frames are finished to.
+    pub fn finish(&self) -> Finish {
+        Finish { format: self.format, background: self.background }
+    }
 }

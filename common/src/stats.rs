@@ -193,6 +193,9 @@ pub struct FrameStats {
     /// Hash of the view and everything else that decides the pixels.
     pub view_sha256: String,
     /// Hash of the pixels.
+    ///
+    /// Empty where the job did not ask for it: tiles then came as finished pixels, and the master never
+    /// has the linear picture.
     pub pixels_sha256: String,
     /// `PIXELS_VERSION` of the programs.
     pub pixels_version: u32,
@@ -204,6 +207,9 @@ pub struct FrameStats {
     pub voxels: VoxelStats,
     /// Bricks.
     pub bricks: BrickStats,
+    /// Bytes of the results that counted, as messages; `null` where none crossed a network.
+    #[serde(default)]
+    pub result_bytes: Option<u64>,
     /// Slabs, front to back. A frame of the `region` schedule has one, through all depths; its tiles
     /// are the regions.
     pub slabs: Vec<SlabStats>,

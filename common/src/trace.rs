@@ -11,6 +11,7 @@
 //! one machine share its memory and may take longer; a trace does not know that.
 
 use crate::image::TilePixels;
+use crate::leaves::{Finish, LEAF, Leaves};
 use crate::message::SceneSpec;
 use crate::occlusion::Rect;
 use crate::slab::SheetRange;
@@ -20,8 +21,8 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
 
-/// Version of the format.
-pub const VERSION: u32 = 1;
+/// Version of the format. Since 2 regions' results weigh what finished pixels do.
+pub const VERSION: u32 = 2;
 
 /// Largest trace that is read, in bytes: 1000 frames with tiles of 16 pixels.
 pub const MAX_BYTES: u64 = 1 << 30;
@@ -129,7 +130,7 @@ pub struct RegionTile {
     pub y: u32,
     /// Time to draw it, in nanoseconds.
     pub ns: u64,
-    /// Its result on the wire.
+    /// Its result on the wire, as finished pixels.
     pub result_bytes: u32,
     /// Places of the bricks that it is drawn from, in the list of the set's bricks; ascending.
     pub touched: Vec<u32>,
@@ -386,6 +387,34 @@ pub fn filled_through(rect: &Rect, bytes: u32) -> TilePixels {
     pixels
 }
 
+/// The same of a result of finished pixels.
+///
+/// Leaves come one after the other until they weigh enough; their bytes have no pattern, so that nothing
+/// packs them, and the rest of the last leaf is zeros, which pack to nearly nothing.
+pub fn finished_through(rect: &Rect, bytes: u32, finish: &Finish) -> Leaves {
+    let size = [rect.width() as u32, rect.height() as u32];
+    let mut leaves = Leaves::blank(size, finish.format);
+    let left = (bytes as usize).saturating_sub(70 + leaves.mask.len());
+    let columns = (size[0] as usize).div_ceil(LEAF);
+    for i in 0..columns * (size[1] as usize).div_ceil(LEAF) {
+        if Leaves::data_len(size, finish.format, &leaves.mask) >= left {
+            break;
+        }
+        leaves.mask[i / 8] |= 1 << (i % 8);
+    }
+    let mut x = 0x9e37_79b9_7f4a_7c15u64;
+    let noise = std::iter::repeat_with(|| {
+        x ^= x << 13;
+        x ^= x >> 7;
+        x ^= x << 17;
+        (x >> 32) as u8
+    });
+    leaves.data.extend(noise.take(left));
+    leaves.data.resize(Leaves::data_len(size, finish.format, &leaves.mask), 0);
+    leaves.alpha_most = if left > 0 { 0.25 } else { 0.0 };
+    leaves
+}
+
 /// What a frame's times hang on: transfer function, quality and view. (Not the hash in a frame's
 /// statistics, which knows the cropping box and not whether culling is on.)
 pub fn view_sha256(scene: &SceneSpec, view: &View) -> Digest32 {
@@ -499,7 +528,7 @@ mod tests {
         let says = |text: &str| Trace::from_json(text.as_bytes()).unwrap_err().to_string();
         let good = trace().to_json();
         assert!(says("{}").contains("slabcast plan --trace"));
-        assert!(says(&good.replacen("\"version\":1", "\"version\":2", 1)).contains("version 2"));
+        assert!(says(&good.replacen("\"version\":2", "\"version\":3", 1)).contains("version 3"));
         assert!(says(&good.replace("[100,70]", "[100,0]")).starts_with("about.size"));
         assert!(says(&good.replace("[100,70]", "[10,7]")).contains("more pixels"));
         assert!(says(&good.replace("\"edge\":64", "\"edge\":65")).contains("65 is no edge"));
@@ -520,5 +549,26 @@ mod tests {
         }
         assert_eq!((pixels.a.len(), pixels.colour.len()), (2304, 2304));
         assert!(filled(&rect, &shut, size, 0).last.is_none());
+    }
+
+    #[test]
+    fn finished_pixels_that_nobody_drew_fit_their_tile() {
+        use crate::image::{Background, PixelFormat};
+        for format in [PixelFormat::Rgb8, PixelFormat::Rgba32F] {
+            let finish = Finish { format, background: Background::Transparent };
+            for (w, h) in [(64, 64), (37, 5)] {
+                let rect = Rect::new(100, 0, 100 + w, h);
+                for bytes in [0, 60, 100, 3_000, 12_000, 10_000_000] {
+                    let leaves = finished_through(&rect, bytes, &finish);
+                    assert_eq!(leaves.check(), Ok(()));
+                    assert_eq!(leaves.pixels(), rect.area());
+                    let all = rect.area() * format.bytes();
+                    let leaf = LEAF * LEAF * format.bytes();
+                    let most = (bytes as usize + leaf).min(all);
+                    assert!(leaves.data.len() <= most, "{} of {bytes}", leaves.data.len());
+                    assert!(leaves.data.len() + 80 >= all.min(bytes as usize));
+                }
+            }
+        }
     }
 }

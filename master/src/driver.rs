@@ -836,6 +836,7 @@ impl Driver {
                 bricks: store.infos().clone(),
                 view: r.views[number as usize],
                 work: r.request.work,
+                finish: (!r.request.want_hash).then(|| r.request.finish()),
             };
             self.scheduler.handle(&self.clock, Happened::FrameQueued(Box::new(queued)));
             if let Some(scene) = only_this {

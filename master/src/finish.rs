@@ -141,24 +141,23 @@ fn left_out(
 }
 
 /// Stripes over the whole picture: what was not drawn is not to be taken for a picture.
-fn mark(picture: &mut Picture) {
-    let w = picture.size[0].max(1) as usize;
-    for (i, pixel) in picture.pixels.iter_mut().enumerate() {
-        let stripe = (i % w + i / w) / 16 % 2;
-        *pixel = if stripe == 0 { [1.0, 0.0, 1.0, 1.0] } else { [0.0, 0.0, 0.0, 1.0] };
-    }
+fn marked(size: [u32; 2]) -> Picture {
+    let [w, h] = size.map(|n| n as usize);
+    let stripe = |i: usize| match (i % w + i / w) / 16 % 2 {
+        0 => [1.0, 0.0, 1.0, 1.0],
+        _ => [0.0, 0.0, 0.0, 1.0],
+    };
+    Picture { size, pixels: (0..w * h).map(stripe).collect() }
 }
 
 /// Makes the frame.
 pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
-    let (size, format, background) = (s.state.size(), s.request.format, s.request.background);
+    let (size, finish) = (s.state.size(), s.request.finish());
     let alpha_most = f64::from(s.state.alpha_most());
     let Encoded { sha256, bytes } = if s.rehearsed {
-        let mut picture = s.state.finish();
-        mark(&mut picture);
-        Encoded { sha256: picture.sha256(), bytes: picture.encode(format, background) }
+        Encoded { sha256: None, bytes: marked(size).encode(finish.format, finish.background) }
     } else {
-        s.state.encode(format, background)
+        s.state.encode(&finish, s.request.want_hash)
     };
     let mut stats = *s.stats;
     // Frames of a job count from its first; people count those of the path.
@@ -168,7 +167,7 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
         *path = format!("frame {}: {path}", stats.frame);
     }
     stats.view_sha256 = view_sha256(&s.scene, s.crop.as_ref(), &s.view).to_string();
-    stats.pixels_sha256 = sha256.to_string();
+    stats.pixels_sha256 = sha256.map_or_else(String::new, |hash| hash.to_string());
     if s.rehearsed {
         stats.rehearsed = true;
         stats.pixels_sha256 = "none: rehearsed".into();
@@ -184,7 +183,7 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
     FinishedFrame {
         number,
         size,
-        format,
+        format: finish.format,
         bytes: bytes.into(),
         stats_json: serde_json::to_string(&stats).unwrap_or_default(),
         trace_json: s.request.want_trace.then(|| chrome_trace(&s.spans, s.job, s.frame)),

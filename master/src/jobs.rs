@@ -333,6 +333,7 @@ mod tests {
             workers: vec![],
             voxels: Default::default(),
             bricks: Default::default(),
+            result_bytes: None,
             slabs: vec![],
             quality: Quality::default(),
             left_out: vec![],
@@ -367,6 +368,7 @@ mod tests {
             format: PixelFormat::Rgb8,
             background: Background::Transparent,
             want_trace: false,
+            want_hash: true,
         };
         let view = JobView {
             id,

@@ -8,7 +8,7 @@ use prost::Message;
 use slabcast_common::brick::Brick;
 use slabcast_common::ids::BrickId;
 use slabcast_common::image::{PixelFormat, RawSums};
-use slabcast_common::message::{ToMaster, ToWorker};
+use slabcast_common::message::{Pixels, ToMaster, ToWorker};
 use slabcast_common::volume::Samples;
 use slabcast_proto::convert::{self, Bricks, Down};
 use slabcast_proto::model::FrameChunk;
@@ -44,10 +44,16 @@ proptest! {
     #[test]
     fn to_master(message in any::to_master()) {
         let back = convert::from_worker_from_wire(wire(convert::from_worker_to_wire(&message)));
-        let back = back.map_err(|e| TestCaseError::fail(e.to_string()))?;
+        let mut back = back.map_err(|e| TestCaseError::fail(e.to_string()))?;
+        if let ToMaster::Result(b) = &mut back {
+            let bytes = convert::from_worker_to_wire(&message).encoded_len() as u32;
+            prop_assert_eq!(b.bytes.take(), Some(bytes));
+        }
         prop_assert_eq!(shown(&back), shown(&message));
-        if let (ToMaster::Result(b), ToMaster::Result(m)) = (&back, &message) {
-            same_planes((&b.pixels.a, &b.pixels.last), (&m.pixels.a, &m.pixels.last))?;
+        if let (ToMaster::Result(b), ToMaster::Result(m)) = (&back, &message)
+            && let (Pixels::Sums(b), Pixels::Sums(m)) = (&b.pixels, &m.pixels)
+        {
+            same_planes((&b.a, &b.last), (&m.a, &m.last))?;
         }
     }
 
@@ -190,7 +196,8 @@ fn the_largest_lease_and_result_fit_a_control_message() {
     let result = TileResult {
         task: TaskId(1),
         epoch: Epoch(1),
-        pixels: TilePixels { a, colour, last: Some(last) },
+        pixels: Pixels::Sums(TilePixels { a, colour, last: Some(last) }),
+        bytes: None,
         counters: Default::default(),
         times: Default::default(),
         region: None,

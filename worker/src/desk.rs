@@ -12,7 +12,8 @@ use crate::rehearse::Rehearsal;
 use slabcast_common::brick::{BrickGrid, BrickSetKey};
 use slabcast_common::ids::{BrickId, FrameId, SceneId, TaskId};
 use slabcast_common::message::{
-    BrickBatch, Hello, Lease, RegionCost, RegionLease, TaskTimes, TileResult, ToMaster, ToWorker,
+    BrickBatch, Hello, Lease, Pixels, RegionCost, RegionLease, TaskTimes, TileResult, ToMaster,
+    ToWorker,
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION};
@@ -229,12 +230,12 @@ impl Desk<'_> {
             ToWorker::Scene(spec) => {
                 self.scenes.insert(spec.id, Arc::new(SceneSlot::new(spec)));
             }
-            ToWorker::Frame { frame, scene, view } => {
+            ToWorker::Frame { frame, scene, view, finish } => {
                 if let Some(scene) = self.scenes.get(&scene) {
                     // A view alone looks right; only with its volume can its depths be judged.
                     match convert::check_view(&scene.spec.volume.lattice, &view) {
                         Ok(()) => {
-                            let slot = FrameSlot::new(scene.clone(), view);
+                            let slot = FrameSlot::new(scene.clone(), view, finish);
                             self.frames.insert(frame, Arc::new(slot));
                         }
                         Err(e) => warn!(%frame, error = %e, "the master sent a view that is wrong"),
@@ -394,7 +395,7 @@ impl Desk<'_> {
                 }
             }
             Came::Over | Came::Lacks(..) => self.parking.leave(who, &[]),
-            Came::Done(done, sampled) => {
+            Came::Done(done) => {
                 self.parking.leave(who, &done.touched);
                 let times = TaskTimes {
                     received_us: self.us(going.received),
@@ -408,10 +409,10 @@ impl Desk<'_> {
                     stalls: going.stalls,
                     parked_us: going.parked.as_micros() as u64,
                     idle_us: self.pool.waited().as_micros() as u64,
-                    sampled,
+                    sampled: done.sampled,
                 });
-                let (pixels, counters) = (done.pixels, done.counters);
-                let result = TileResult { task, epoch, pixels, counters, times, region };
+                let (pixels, counters, bytes) = (done.pixels, done.counters, None);
+                let result = TileResult { task, epoch, pixels, bytes, counters, times, region };
                 self.replies.push(ToMaster::Result(Box::new(result)));
             }
             Came::Failed(reason) => {
@@ -502,7 +503,8 @@ impl Desk<'_> {
             Ok((pixels, counters)) => ToMaster::Result(Box::new(TileResult {
                 task,
                 epoch,
-                pixels,
+                pixels: Pixels::Sums(pixels),
+                bytes: None,
                 counters,
                 times: TaskTimes {
                     received_us: self.us(done.received),
@@ -537,7 +539,8 @@ mod tests {
     use super::*;
     use slabcast_common::brick::{Brick, BrickInfo};
     use slabcast_common::ids::{Epoch, WorkerId};
-    use slabcast_common::image::TileState;
+    use slabcast_common::image::{Background, PixelFormat, TilePixels, TileState};
+    use slabcast_common::leaves::{Finish, Leaves};
     use slabcast_common::message::SceneSpec;
     use slabcast_common::occlusion::Rect;
     use slabcast_common::path::{Orientation, Turntable, ViewPath};
@@ -548,6 +551,10 @@ mod tests {
     use slabcast_common::volume::{Digest32, Samples, Volume};
 
     const FRAME: FrameId = FrameId(5);
+    /// A frame of the same view whose regions are finished.
+    const FINISHED: FrameId = FrameId(9);
+    const FINISH: Finish =
+        Finish { format: PixelFormat::Rgb8, background: Background::Colour([1.0, 0.5, 0.0]) };
     const SET: BrickSetKey = BrickSetKey(Digest32([7; 32]));
 
     /// A master's end of a link, and a worker behind it.
@@ -600,7 +607,9 @@ mod tests {
             let spec = SceneSpec { id, volume, transfer, quality, bricks: SET };
             world.say(ToWorker::Welcome { worker: WorkerId(1), heartbeat_ms: 60_000 });
             world.say(ToWorker::Scene(Arc::new(spec)));
-            world.say(ToWorker::Frame { frame: FRAME, scene: id, view });
+            for (frame, finish) in [(FRAME, None), (FINISHED, Some(FINISH))] {
+                world.say(ToWorker::Frame { frame, scene: id, view, finish });
+            }
             world
         }
 
@@ -621,10 +630,14 @@ mod tests {
         }
 
         fn lease(&self, task: u64, bricks: &[u32]) {
+            self.lease_of(FRAME, task, bricks);
+        }
+
+        fn lease_of(&self, frame: FrameId, task: u64, bricks: &[u32]) {
             self.say(ToWorker::Lease(Box::new(Lease {
                 task: TaskId(task),
                 epoch: Epoch(0),
-                frame: FRAME,
+                frame,
                 tile: Rect::new(0, 0, 32, 32),
                 slab: SheetRange::new(-20, 20),
                 bricks: bricks.iter().map(|&id| BrickId(id)).collect(),
@@ -645,11 +658,15 @@ mod tests {
         }
 
         fn region(&self, task: u64, tile: Rect) {
+            self.region_of(FRAME, task, tile);
+        }
+
+        fn region_of(&self, frame: FrameId, task: u64, tile: Rect) {
             let (task, epoch) = (TaskId(task), Epoch(0));
             self.say(ToWorker::Region(RegionLease {
                 task,
                 epoch,
-                frame: FRAME,
+                frame,
                 tile,
                 estimate: false,
             }));
@@ -670,6 +687,13 @@ mod tests {
         }
     }
 
+    fn sums(result: &TileResult) -> &TilePixels {
+        match &result.pixels {
+            Pixels::Sums(sums) => sums,
+            Pixels::Finished(_) => panic!("sums"),
+        }
+    }
+
     #[tokio::test]
     async fn a_lease_waits_for_its_last_brick() {
         let mut world = World::new().await;
@@ -679,8 +703,8 @@ mod tests {
         world.settle().await;
         world.send(0).await;
         let ToMaster::Result(result) = world.hear().await else { panic!("a result") };
-        assert_eq!((result.task, result.pixels.a.len()), (TaskId(1), 32 * 32));
-        assert!(result.pixels.a.iter().any(|&a| a > 0.9), "both bricks were drawn");
+        assert_eq!((result.task, result.pixels.len()), (TaskId(1), 32 * 32));
+        assert!(sums(&result).a.iter().any(|&a| a > 0.9), "both bricks were drawn");
         assert!(result.times.ready_us >= result.times.received_us);
     }
 
@@ -729,8 +753,8 @@ mod tests {
         world.send(0).await;
         let results = [world.result().await, world.result().await];
         for (result, task) in results.iter().zip([1, 2]) {
-            assert_eq!((result.task, result.pixels.a.len()), (TaskId(task), 512));
-            assert!(result.pixels.a.iter().any(|&a| a > 0.9) && result.pixels.last.is_none());
+            assert_eq!((result.task, result.pixels.len()), (TaskId(task), 512));
+            assert!(sums(&result).a.iter().any(|&a| a > 0.9) && sums(result).last.is_none());
             let cost = result.region.as_ref().expect("of a region");
             assert_eq!(cost.touched, [0, 1]);
             // The second may have been begun when all was here.
@@ -741,8 +765,28 @@ mod tests {
         world.region(3, Rect::new(0, 0, 32, 32));
         let result = world.result().await;
         assert_eq!(result.region.as_ref().map(|c| (c.stalls, c.parked_us)), Some((0, 0)));
-        let halves = results.iter().flat_map(|r| r.pixels.a.clone());
-        assert!(halves.eq(result.pixels.a.iter().copied()), "stopping changes no byte");
+        let halves = results.iter().flat_map(|r| sums(r).a.clone());
+        assert!(halves.eq(sums(&result).a.iter().copied()), "stopping changes no byte");
+    }
+
+    #[tokio::test]
+    async fn a_region_is_finished_where_its_frame_asks_for_it_and_a_slab_never() {
+        let mut world = World::new().await;
+        world.directory();
+        let tile = Rect::new(0, 0, 32, 32);
+        world.region(1, tile);
+        wishes(&mut world, 2).await;
+        world.send(0).await;
+        world.send(1).await;
+        let raw = world.result().await;
+        world.region_of(FINISHED, 2, tile);
+        let finished = world.result().await;
+        let want = Leaves::of(sums(&raw), [32, 32], &FINISH);
+        assert!(!want.data.is_empty());
+        assert_eq!(finished.pixels, Pixels::Finished(want));
+        world.lease_of(FINISHED, 3, &[0, 1]);
+        let slab = world.result().await;
+        assert_eq!(sums(&slab).a, sums(&raw).a);
     }
 
     #[tokio::test]

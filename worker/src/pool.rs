@@ -9,7 +9,8 @@ use crate::shelf::Shelf;
 use slabcast_common::brick::{Brick, BrickInfo};
 use slabcast_common::ids::FrameId;
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::{Counters, Lease, RegionLease, Sampling, SceneSpec};
+use slabcast_common::leaves::{Finish, Leaves};
+use slabcast_common::message::{Counters, Lease, Pixels, RegionLease, Sampling, SceneSpec};
 use slabcast_common::view::View;
 use slabcast_render::estimate::{Pair, Probe};
 use slabcast_render::region::{Finished, Outlook, Region, Sight, Supply};
@@ -46,6 +47,8 @@ impl SceneSlot {
 pub(crate) struct FrameSlot {
     pub(crate) scene: Arc<SceneSlot>,
     pub(crate) view: View,
+    /// What its regions are finished to.
+    pub(crate) finish: Option<Finish>,
     frame: OnceLock<Frame>,
     probe: OnceLock<Probe>,
     looking: Looking,
@@ -57,9 +60,9 @@ pub(crate) struct FrameSlot {
 }
 
 impl FrameSlot {
-    pub(crate) fn new(scene: Arc<SceneSlot>, view: View) -> Self {
+    pub(crate) fn new(scene: Arc<SceneSlot>, view: View, finish: Option<Finish>) -> Self {
         let (frame, probe, looking, rehearsed, made, over) = Default::default();
-        FrameSlot { scene, view, frame, probe, looking, rehearsed, made, over }
+        FrameSlot { scene, view, finish, frame, probe, looking, rehearsed, made, over }
     }
 
     fn get(&self) -> &Frame {
@@ -194,12 +197,22 @@ impl Going {
     }
 }
 
+/// A region that was drawn to its end.
+pub(crate) struct Drawn {
+    pub(crate) pixels: Pixels,
+    pub(crate) counters: Counters,
+    /// Places in the directory of the bricks that it touched, ascending.
+    pub(crate) touched: Vec<u32>,
+    /// How far some of its pixels are off, where that was asked for.
+    pub(crate) sampled: Sampling,
+}
+
 /// Where a region came to.
 pub(crate) enum Came {
     /// Its frame was over.
     Over,
-    /// To its end; how far some of its pixels are off, where that was asked for.
-    Done(Box<Finished>, Sampling),
+    /// To its end.
+    Done(Box<Drawn>),
     /// To a sheet at which it lacks bricks; whether that is farther than before.
     Lacks(Vec<u32>, bool),
     /// Nowhere.
@@ -390,11 +403,11 @@ fn hold(thread: u32, rehearsal: &Rehearsal, queue: &Queue, out: &mpsc::Unbounded
                     None => Came::Over,
                     Some(Err(why)) => Came::Failed(why),
                     Some(Ok(Through::Lacks(lacks))) => Came::Lacks(lacks, true),
-                    Some(Ok(Through::Held { held, took, finished })) => {
+                    Some(Ok(Through::Held { held, took, drawn })) => {
                         held.wait();
                         going.drawn += took;
                         end = held.end;
-                        Came::Done(finished, Sampling::default())
+                        Came::Done(drawn)
                     }
                 };
                 free = end;
@@ -469,16 +482,24 @@ fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch) -> Came {
     }
     match region.take() {
         Some(region) => {
-            let (done, mut sampled) = (region.finish(), Sampling::default());
+            let begun = Instant::now();
+            let Finished { pixels, counters, touched } = region.finish();
+            let size = [lease.tile.width() as u32, lease.tile.height() as u32];
+            let pixels = match &slot.finish {
+                Some(finish) => Pixels::Finished(Leaves::of(&pixels, size, finish)),
+                None => Pixels::Sums(pixels),
+            };
+            *drawn += begun.elapsed();
+            let mut sampled = Sampling::default();
             if lease.estimate {
-                let bricks = done.touched.iter().map(|&place| shelf.get(place));
+                let bricks = touched.iter().map(|&place| shelf.get(place));
                 // One that was forgotten since is not sent again for this.
                 let bricks: Option<Vec<_>> = bricks.collect();
                 if let Some(bricks) = bricks {
                     sampled = slot.probe().sample(frame, simd, lease.tile, &bricks, scratch);
                 }
             }
-            Came::Done(Box::new(done), sampled)
+            Came::Done(Box::new(Drawn { pixels, counters, touched, sampled }))
         }
         None => Came::Over,
     }

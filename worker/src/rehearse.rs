@@ -10,12 +10,11 @@
 //! late; over a thousand tiles that is a frame. So a thread's next tile begins when the one before
 //! should have ended, or when it came, and only a result is late, never the work behind it.
 
-use crate::pool::{FrameSlot, Going, Ready};
+use crate::pool::{Drawn, FrameSlot, Going, Ready};
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::Counters;
+use slabcast_common::message::{Counters, Pixels, Sampling};
 use slabcast_common::slab::SheetRange;
-use slabcast_common::trace::{Trace, filled, filled_through, view_sha256};
-use slabcast_render::region::Finished;
+use slabcast_common::trace::{Trace, filled, filled_through, finished_through, view_sha256};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -110,19 +109,20 @@ impl Rehearsal {
         let made = *frame.made.get_or_init(|| start + setup);
         let took = Duration::from_nanos(known.ns);
         let held = Held { start, end: made.max(start) + took };
-        let finished = Finished {
-            pixels: filled_through(&tile, known.result_bytes),
-            counters: Counters::default(),
-            touched: known.into_owned().touched,
+        let pixels = match &frame.finish {
+            Some(finish) => Pixels::Finished(finished_through(&tile, known.result_bytes, finish)),
+            None => Pixels::Sums(filled_through(&tile, known.result_bytes)),
         };
-        Ok(Through::Held { held, took, finished: Box::new(finished) })
+        let (counters, sampled) = (Counters::default(), Sampling::default());
+        let drawn = Drawn { pixels, counters, touched: known.into_owned().touched, sampled };
+        Ok(Through::Held { held, took, drawn: Box::new(drawn) })
     }
 }
 
 /// Where a region came to that is held.
 pub(crate) enum Through {
     Lacks(Vec<u32>),
-    Held { held: Held, took: Duration, finished: Box<Finished> },
+    Held { held: Held, took: Duration, drawn: Box<Drawn> },
 }
 
 /// When a task is held.

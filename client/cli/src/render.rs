@@ -169,6 +169,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     let crew = Crew::new(args.workers.unwrap_or(1), args.threads)?;
     let mut asked = args.look.aimed(args.work.work()?)?;
     asked.work.estimate = args.stats.is_some();
+    asked.hashed = args.stats.is_some();
     if !asked.aim.is_empty() && args.show.is_some() {
         return Err(Fail::usage(format!(
             "{}, --show: shows how pictures of a given quality come about; leave one of the two out",
@@ -503,7 +504,7 @@ impl Run {
                             step = Step { frames: step.frames, ..Step::default() };
                             let Some(facts) = facts else {
                                 progress.step(step.clone());
-                                writer.put(frame, String::new());
+                                writer.put(frame, None);
                                 continue;
                             };
                             look.at(&frame, &facts, info, &asked);
@@ -511,13 +512,15 @@ impl Run {
                             trace.put(&trace_json)?;
                             progress.step(step.clone());
                             if show == Some(Show::Owner) {
-                                writer.put(show::owner(&frame, &facts), String::new());
+                                writer.put(show::owner(&frame, &facts), None);
                                 continue;
                             }
                             let made = match output.format {
-                                Format::Apng if begins => recipe.movie(&facts),
-                                Format::Apng | Format::Y4m => String::new(),
-                                Format::Png | Format::Png16 | Format::Exr => recipe.frame(&facts),
+                                Format::Apng if begins => Some(recipe.movie(&facts)),
+                                Format::Apng | Format::Y4m => None,
+                                Format::Png | Format::Png16 | Format::Exr => {
+                                    Some(recipe.frame(&facts))
+                                }
                             };
                             writer.put(frame, made);
                         }

@@ -378,6 +378,10 @@ pub(crate) struct Asked {
     pub(crate) magnify: u32,
     pub(crate) work: Work,
     pub(crate) background: Background,
+    /// Statistics are to have the hash of the linear picture.
+    pub(crate) hashed: bool,
+    /// Pictures are to say it of themselves, as they did once.
+    pub(crate) hash_inside: bool,
 }
 
 impl Asked {
@@ -409,6 +413,8 @@ impl Asked {
             magnify: 1,
             work,
             background: picture.background,
+            hashed: true,
+            hash_inside: false,
         })
     }
 
@@ -425,6 +431,8 @@ impl Asked {
             magnify: 1,
             work: Work::default(),
             background: Background::Colour([0.0; 3]),
+            hashed: true,
+            hash_inside: false,
         })
     }
 
@@ -451,6 +459,8 @@ impl Asked {
             magnify: p.magnify,
             work: Work::default(),
             background: p.background(),
+            hashed: p.pixels_sha256.is_some(),
+            hash_inside: p.pixels_sha256.is_some(),
         }
     }
 
@@ -590,6 +600,7 @@ impl Asked {
             format,
             background: self.background,
             want_trace,
+            want_hash: self.hashed,
         }
     }
 }

@@ -82,13 +82,13 @@ pub(crate) fn run(args: &RerenderArgs) -> Result<(), Fail> {
         return say(&format!("{new}: the same {} bytes as {old}\n", after.len()));
     }
     let again = Provenance::read(&target, &after)?;
-    if again.pixels_sha256 == made.pixels_sha256 && made.slabcast != again.slabcast {
+    if again.same_pixels(&made) && made.slabcast != again.slabcast {
         progress::note(&format!(
             "{old} was written by slabcast {}, this is {}",
             made.slabcast, again.slabcast
         ));
     }
-    Err(Fail::failed(if again.pixels_sha256 == made.pixels_sha256 {
+    Err(Fail::failed(if again.same_pixels(&made) {
         format!(
             "{new}: the same pixels as {old}, but other bytes around them; another program may \
                  have saved it since"

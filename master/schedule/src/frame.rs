@@ -27,7 +27,8 @@ use crate::{Action, Clock, Cluster, FrameJob, Micros, Span};
 use slabcast_common::brick::BrickGrid;
 use slabcast_common::ids::{BrickId, Epoch, TaskId, WorkerId};
 use slabcast_common::image::{FrameState, TilePixels};
-use slabcast_common::message::{Lease, RegionCost, RegionLease, TileResult, ToWorker};
+use slabcast_common::leaves::{Finish, Leaves};
+use slabcast_common::message::{Lease, Pixels, RegionCost, RegionLease, TileResult, ToWorker};
 use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::quality::Schedule;
 use slabcast_common::slab::SheetRange;
@@ -430,7 +431,9 @@ impl Frame {
                     cluster.send(id, ToWorker::Scene(scene.clone()));
                 }
                 let view = self.job.view;
-                let message = ToWorker::Frame { frame: self.job.frame, scene: scene.id, view };
+                let (frame, scene) = (self.job.frame, scene.id);
+                let finish = finish_of(&self.job);
+                let message = ToWorker::Frame { frame, scene, view, finish };
                 cluster.send(id, message);
             }
             let tile = slab.cut.tiles[place as usize].rect;
@@ -763,7 +766,7 @@ impl Frame {
         &mut self,
         cluster: &mut Cluster,
         worker: WorkerId,
-        mut result: TileResult,
+        result: TileResult,
         clock: &dyn Clock,
     ) -> Result<Option<(Micros, Micros)>, String> {
         let now = clock.now();
@@ -784,8 +787,12 @@ impl Frame {
         let tile = slab.cut.tiles[place as usize].rect;
         let cost = slab.regions.as_ref().and(result.region.as_ref());
         let bricks = self.job.bricks.len();
-        if let Err(lie) = check(tile, &result.pixels).and_then(|()| check_cost(cost, tile, bricks))
-        {
+        let finish = finish_of(&self.job);
+        let checked = match &result.pixels {
+            Pixels::Sums(sums) => check(tile, sums, finish),
+            Pixels::Finished(leaves) => check_leaves(tile, leaves, finish),
+        };
+        if let Err(lie) = checked.and_then(|()| check_cost(cost, tile, bricks)) {
             // Its other leases go back when it is dropped; this one it has just answered.
             let given_up =
                 slab.queue.lose(worker, "", &[(place, result.epoch)], 0, &cluster.config);
@@ -793,24 +800,25 @@ impl Frame {
             return Err(lie);
         }
 
-        let pixels = std::mem::take(&mut result.pixels);
-        let width = self.job.view.size[0] as usize;
-        let eps = self.job.scene.quality.eps;
-        if eps > 0.0 && slab.regions.is_none() {
-            for (row, y) in pixels.a.chunks(tile.width()).zip(tile.y0..) {
-                for (&a, x) in row.iter().zip(tile.x0..) {
-                    if is_shut(a, eps) {
-                        self.shut.shut(y as usize * width + x as usize);
+        match result.pixels {
+            Pixels::Finished(leaves) => self.state.lay_finished(tile, leaves),
+            Pixels::Sums(sums) if slab.regions.is_some() => self.state.lay(tile, sums),
+            Pixels::Sums(sums) => {
+                let width = self.job.view.size[0] as usize;
+                let eps = self.job.scene.quality.eps;
+                let rows = sums.a.chunks(tile.width()).zip(tile.y0..);
+                for (row, y) in rows.filter(|_| eps > 0.0) {
+                    for (&a, x) in row.iter().zip(tile.x0..) {
+                        if is_shut(a, eps) {
+                            self.shut.shut(y as usize * width + x as usize);
+                        }
                     }
                 }
+                self.state.put(tile, &sums);
             }
         }
-        if slab.regions.is_some() {
-            self.state.lay(tile, pixels);
-        } else {
-            self.state.put(tile, &pixels);
-        }
         self.any_result = true;
+        self.ledger.came(result.bytes);
         self.ledger.composite_us += clock.now().saturating_sub(now);
 
         let who = cluster.roster.get(worker).expect("a worker whose result came is known");
@@ -1179,8 +1187,36 @@ fn check_cost(cost: Option<&RegionCost>, tile: Rect, bricks: usize) -> Result<()
     }
 }
 
+/// What the results of a frame's tasks are finished to.
+fn finish_of(job: &FrameJob) -> Option<Finish> {
+    job.finish.filter(|_| goes_by_region(job))
+}
+
+/// Whether a stranger's finished pixels are those of a tile.
+fn check_leaves(tile: Rect, leaves: &Leaves, finish: Option<Finish>) -> Result<(), String> {
+    let Some(finish) = finish else {
+        return Err("a result is finished where sums were asked for".into());
+    };
+    if leaves.format != finish.format {
+        return Err(format!("a result in {:?}, its frame in {:?}", leaves.format, finish.format));
+    }
+    let [w, h] = leaves.size;
+    if [w as usize, h as usize] != [tile.width(), tile.height()] {
+        return Err(format!(
+            "a result of {w}x{h} pixels, its tile has {}x{}",
+            tile.width(),
+            tile.height()
+        ));
+    }
+    // In one sentence, whatever it is: a record says no more either.
+    leaves.check().map_err(|_| "a result's leaves do not fit each other".into())
+}
+
 /// Whether a stranger's pixels are those of a tile.
-fn check(tile: Rect, pixels: &TilePixels) -> Result<(), String> {
+fn check(tile: Rect, pixels: &TilePixels, finish: Option<Finish>) -> Result<(), String> {
+    if finish.is_some() {
+        return Err("a result has sums where finished pixels were asked for".into());
+    }
     let n = tile.area();
     let plane = |name: &str, len: usize| {
         if len == n {

@@ -53,6 +53,7 @@ pub(crate) struct Ledger {
     pub(crate) counters: Counters,
     /// How far pixels are off that were looked at.
     sampled: Sampling,
+    result_bytes: Option<u64>,
     pub(crate) slabs: Vec<SlabStats>,
     pub(crate) spans: Vec<Span>,
     pub(crate) retries: u64,
@@ -92,6 +93,7 @@ impl Ledger {
             accounts: BTreeMap::new(),
             counters: Counters::default(),
             sampled: Sampling::default(),
+            result_bytes: None,
             slabs: Vec::new(),
             spans: Vec::new(),
             retries: 0,
@@ -142,6 +144,13 @@ impl Ledger {
             a.render_us += r.end - r.start;
             a.p2p_us += r.p2p_us;
             a.renders.push((r.start, r.end));
+        }
+    }
+
+    /// A result came that counts, in a message of so many bytes if it crossed a network.
+    pub(crate) fn came(&mut self, bytes: Option<u32>) {
+        if let Some(bytes) = bytes {
+            self.result_bytes = Some(self.result_bytes.unwrap_or(0) + u64::from(bytes));
         }
     }
 
@@ -260,6 +269,7 @@ impl Ledger {
                 culled: self.counters.culled,
             },
             bricks,
+            result_bytes: self.result_bytes,
             slabs: self.slabs,
             quality,
             left_out: Vec::new(),

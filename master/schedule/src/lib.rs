@@ -37,6 +37,7 @@
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::FrameState;
+use slabcast_common::leaves::Finish;
 use slabcast_common::message::{SceneSpec, TileResult, ToWorker};
 use slabcast_common::quality::Work;
 use slabcast_common::stats::FrameStats;
@@ -127,6 +128,8 @@ pub struct FrameJob {
     pub view: View,
     /// How the work is cut.
     pub work: Work,
+    /// What workers finish its regions to; `None`: their results are sums. Those of slabs always are.
+    pub finish: Option<Finish>,
 }
 
 /// What happens to the scheduler.

@@ -5,7 +5,7 @@
 use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId, WorkerId};
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::{SceneSpec, TaskTimes, TileResult, ToWorker};
+use slabcast_common::message::{Pixels, SceneSpec, TaskTimes, TileResult, ToWorker};
 use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_common::view::{Camera, CameraProjection, View};
@@ -54,7 +54,7 @@ fn cost(n: u32, edge: u32, height: f64, workers: u64, work: Work) -> f64 {
     let scene =
         Arc::new(SceneSpec { id: SceneId(1), volume: info, transfer, quality, bricks: set });
     let count = bricks.len();
-    let job = FrameJob { frame: FrameId(1), number: 0, scene, bricks, view, work };
+    let job = FrameJob { frame: FrameId(1), number: 0, scene, bricks, view, work, finish: None };
 
     let clock = Wall(Instant::now());
     let mut s = Scheduler::new(Config::default());
@@ -82,7 +82,8 @@ fn cost(n: u32, edge: u32, height: f64, workers: u64, work: Work) -> f64 {
                     let times = TaskTimes::default();
                     let counters = Default::default();
                     let (task, epoch) = (l.task, l.epoch);
-                    let result = TileResult { task, epoch, pixels, counters, times, region: None };
+                    let (pixels, bytes, region) = (Pixels::Sums(pixels), None, None);
+                    let result = TileResult { task, epoch, pixels, bytes, counters, times, region };
                     events.push(Event::Result { worker, result: Box::new(result) });
                 }
                 Action::SendBricks { worker, set, bricks } => {

@@ -53,7 +53,7 @@ fn world(frames: usize) -> (Vec<FrameJob>, Trace) {
             let (schedule, borders) = (Schedule::Slab, Borders::Equal);
             let work = Work { schedule, borders, ..Work::default() };
             let (scene, bricks) = (scene.clone(), bricks.clone());
-            FrameJob { frame, number, scene, bricks, view, work }
+            FrameJob { frame, number, scene, bricks, view, work, finish: None }
         })
         .collect();
     let frames = jobs.iter().map(|job| frame(job, &quality)).collect();

@@ -40,7 +40,9 @@ pub use write::{Recorder, Written, start};
 
 use serde::{Deserialize, Serialize};
 use slabcast_common::brick::BrickInfo;
-use slabcast_common::message::{Sampling, TileResult, ToWorker};
+use slabcast_common::image::PixelFormat;
+use slabcast_common::leaves::Finish;
+use slabcast_common::message::{Pixels, Sampling, TileResult, ToWorker};
 use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{Action, Event};
 use std::fmt;
@@ -106,6 +108,9 @@ struct NotedJob {
     scene: u64,
     view: String,
     work: slabcast_common::quality::Work,
+    /// What its regions are finished to.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    finish: Option<Finish>,
 }
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -113,7 +118,7 @@ struct NotedResult {
     w: u64,
     task: u64,
     epoch: u32,
-    /// Pixels of its planes: a, colour, last (`None`: it has none).
+    /// Pixels of its planes: a, colour, last (`None`: it has none). Of finished pixels the first only.
     planes: (usize, usize, Option<usize>),
     /// Whether all opacities are finite.
     finite: bool,
@@ -131,18 +136,36 @@ struct NotedResult {
     /// Of each source of error: pixels looked at, and the sum of squares of how far they are off.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     sampled: Option<Box<[(u32, u64); 4]>>,
+    /// Bytes of its message.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    bytes: Option<u32>,
+    /// Of finished pixels: columns and rows, format, and whether its parts fit each other.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    finished: Option<([u32; 2], PixelFormat, bool)>,
 }
 
 impl NotedResult {
     fn of(worker: u64, result: &TileResult, shut: impl Fn(f32) -> bool) -> Self {
-        let (p, c, t) = (&result.pixels, &result.counters, &result.times);
+        let (c, t) = (&result.counters, &result.times);
+        let (planes, finite, shut, finished) = match &result.pixels {
+            Pixels::Sums(p) => (
+                (p.a.len(), p.colour.len(), p.last.as_ref().map(Vec::len)),
+                p.a.iter().all(|a| a.is_finite()),
+                runs(p.a.iter().map(|&a| shut(a))),
+                None,
+            ),
+            Pixels::Finished(leaves) => {
+                let noted = (leaves.size, leaves.format, leaves.check().is_ok());
+                ((leaves.pixels(), 0, None), true, String::new(), Some(noted))
+            }
+        };
         NotedResult {
             w: worker,
             task: result.task.0,
             epoch: result.epoch.0,
-            planes: (p.a.len(), p.colour.len(), p.last.as_ref().map(Vec::len)),
-            finite: p.a.iter().all(|a| a.is_finite()),
-            shut: runs(p.a.iter().map(|&a| shut(a))),
+            planes,
+            finite,
+            shut,
             voxels: [c.tossed, c.splatted, c.culled],
             us: [t.received_us, t.ready_us, t.start_us, t.end_us],
             thread: t.thread,
@@ -155,6 +178,8 @@ impl NotedResult {
                 .as_ref()
                 .filter(|r| r.sampled != Sampling::default())
                 .map(|r| Box::new(r.sampled.each().map(|s| (s.pixels, s.squares)))),
+            bytes: result.bytes,
+            finished,
         }
     }
 }

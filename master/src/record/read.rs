@@ -9,8 +9,9 @@ use slabcast_common::PIXELS_VERSION;
 use slabcast_common::brick::{BRICK_VOXELS, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::TilePixels;
+use slabcast_common::leaves::Leaves;
 use slabcast_common::message::{
-    Counters, RegionCost, Sampled, Sampling, SceneSpec, TaskTimes, TileResult,
+    Counters, Pixels, RegionCost, Sampled, Sampling, SceneSpec, TaskTimes, TileResult,
 };
 use slabcast_common::volume::Digest32;
 use slabcast_proto::{convert, v1};
@@ -382,7 +383,22 @@ fn queued(job: NotedJob, seen: &mut Seen) -> Result<FrameJob, String> {
     convert::check_view(&scene.volume.lattice, &view).map_err(|e| format!("`view`: {e}"))?;
     job.work.check().map_err(|e| format!("`work`: {}: {}", e.field, e.problem))?;
     let (frame, number, work) = (FrameId(job.frame), job.number, job.work);
-    Ok(FrameJob { frame, number, scene, bricks, view, work })
+    let finish = job.finish;
+    Ok(FrameJob { frame, number, scene, bricks, view, work, finish })
+}
+
+/// Finished pixels that the scheduler takes for those that were recorded: none is there.
+fn finished(r: &NotedResult) -> Result<Option<Leaves>, String> {
+    let Some((size, format, fits)) = r.finished else { return Ok(None) };
+    let n = u64::from(size[0]) * u64::from(size[1]);
+    if n > 2 * convert::MAX_TILE_PIXELS as u64 {
+        return Err("its leaves are more than the wire lets through".into());
+    }
+    let mut leaves = Leaves::blank(size, format);
+    if !fits {
+        leaves.data.push(0);
+    }
+    Ok(Some(leaves))
 }
 
 /// A result that the scheduler takes for the one that was recorded: shut pixels have opacity 1,
@@ -413,7 +429,8 @@ fn result(r: &NotedResult) -> Result<TileResult, String> {
     Ok(TileResult {
         task: TaskId(r.task),
         epoch: Epoch(r.epoch),
-        pixels,
+        pixels: finished(r)?.map_or(Pixels::Sums(pixels), Pixels::Finished),
+        bytes: r.bytes,
         counters: Counters { tossed, splatted, culled },
         times: TaskTimes { received_us, ready_us, start_us, end_us, thread: r.thread },
         region: r.region.clone().map(|(touched, stalls, parked_us, idle_us)| RegionCost {

@@ -3,10 +3,12 @@
 use super::{Broken, Difference, Replayed, Watched, Written, bits, replay, runs, start};
 use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId, WorkerId};
-use slabcast_common::image::TilePixels;
+use slabcast_common::image::{Background, PixelFormat, TilePixels};
+use slabcast_common::leaves::{Finish, Leaves};
 use slabcast_common::message::{
-    Counters, RegionCost, Sampled, Sampling, SceneSpec, TaskTimes, TileResult, ToWorker,
+    Counters, Pixels, RegionCost, Sampled, Sampling, SceneSpec, TaskTimes, TileResult, ToWorker,
 };
+use slabcast_common::occlusion::Rect;
 use slabcast_common::path::Orientation;
 use slabcast_common::path::{Turntable, ViewPath};
 use slabcast_common::presets;
@@ -53,6 +55,12 @@ impl Rng {
     }
 }
 
+/// What every other frame is finished to.
+fn finish(frame: FrameId) -> Option<Finish> {
+    let (format, background) = (PixelFormat::Rgb8, Background::Colour([0.5; 3]));
+    frame.0.is_multiple_of(2).then_some(Finish { format, background })
+}
+
 fn jobs(rng: &mut Rng, schedule: Schedule) -> Vec<FrameJob> {
     let volume = Volume::from_fn_u8("v", [40, 32, 24], |i, j, k| (i * 3 + j + k) as u8);
     let info = volume.info(Digest32([3; 32]));
@@ -84,7 +92,8 @@ fn jobs(rng: &mut Rng, schedule: Schedule) -> Vec<FrameJob> {
             let work = Work { slabs, schedule, ..Work::default() };
             let (frame, number) = (FrameId(i as u64 + 1), i as u64);
             let (scene, bricks) = (scene.clone(), bricks.clone());
-            FrameJob { frame, number, scene, bricks, view, work }
+            let finish = finish(frame);
+            FrameJob { frame, number, scene, bricks, view, work, finish }
         })
         .collect()
 }
@@ -138,7 +147,9 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
             }
             _ if !leases.is_empty() => {
                 let which = rng.below(leases.len() as u64) as usize;
-                let (worker, (task, epoch), n): (WorkerId, _, usize) = leases.remove(which);
+                let (worker, (task, epoch), tile, finish): (WorkerId, _, Rect, Option<Finish>) =
+                    leases.remove(which);
+                let n = tile.area();
                 let mut pixels = TilePixels {
                     a: (0..n).map(|i| ((i as u64 + rng.0) % 7) as f32 / 6.0).collect(),
                     colour: vec![[5; 3]; n],
@@ -149,6 +160,23 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
                     1 => pixels.colour.truncate(3),
                     _ => {}
                 }
+                let pixels = match finish {
+                    Some(finish) => {
+                        let size = [tile.width() as u32, tile.height() as u32];
+                        let mut leaves = Leaves::blank(size, finish.format);
+                        leaves.mask[0] = 1;
+                        let len = Leaves::data_len(size, finish.format, &leaves.mask);
+                        leaves.data.resize(len, 7);
+                        match rng.below(60) {
+                            0 => leaves.alpha_most = f32::NAN,
+                            1 => leaves = Leaves::blank([3, 1], finish.format),
+                            2 => leaves = Leaves::blank(size, PixelFormat::Rgba8),
+                            _ => {}
+                        }
+                        Pixels::Finished(leaves)
+                    }
+                    None => Pixels::Sums(pixels),
+                };
                 let start_us = clock.0.get().saturating_sub(900);
                 let times = TaskTimes { start_us, end_us: start_us + 700, ..TaskTimes::default() };
                 let touched =
@@ -167,7 +195,8 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
                 if rng.below(50) == 0 {
                     Some(Event::Failed { worker, task, epoch, reason: "no \"reason\"".into() })
                 } else {
-                    let result = TileResult { task, epoch, pixels, counters, times, region };
+                    let bytes = (rng.below(2) == 0).then_some(99 + n as u32);
+                    let result = TileResult { task, epoch, pixels, bytes, counters, times, region };
                     Some(Event::Result { worker, result: Box::new(result) })
                 }
             }
@@ -183,10 +212,10 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
         while let Some(action) = s.next_action() {
             match action {
                 Action::Send { worker, message: ToWorker::Lease(l) } => {
-                    leases.push((worker, (l.task, l.epoch), l.tile.area()));
+                    leases.push((worker, (l.task, l.epoch), l.tile, None));
                 }
                 Action::Send { worker, message: ToWorker::Region(l) } => {
-                    leases.push((worker, (l.task, l.epoch), l.tile.area()));
+                    leases.push((worker, (l.task, l.epoch), l.tile, finish(l.frame)));
                 }
                 Action::SendBricks { worker, set, bricks } => {
                     let bricks = bricks.len() as u32;
@@ -215,8 +244,8 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
 
 #[test]
 fn a_recorded_run_replays_identically() {
-    let (mut frames, mut dropped) = (0, 0);
-    for seed in 0..24 {
+    let (mut frames, mut dropped, mut dropped_finished) = (0, 0, [0; 3]);
+    for seed in 0..48 {
         let schedule = if seed % 2 == 0 { Schedule::Slab } else { Schedule::Region };
         let (bytes, written) = recorded(seed, schedule);
         let done = replay(&bytes[..]).unwrap_or_else(|e| panic!("seed {seed}: {e}"));
@@ -224,9 +253,15 @@ fn a_recorded_run_replays_identically() {
         assert_eq!((done.events, done.decisions), (written.events, written.decisions));
         assert_eq!(done.cut, None, "seed {seed}");
         frames += done.frames;
-        dropped += String::from_utf8_lossy(&bytes).matches("plane has").count();
+        let text = String::from_utf8_lossy(&bytes);
+        dropped += text.matches("plane has").count();
+        let lies = ["do not fit", "its tile has", "a result in Rgba8"];
+        for (n, lie) in dropped_finished.iter_mut().zip(lies) {
+            *n += text.matches(lie).count();
+        }
     }
-    assert!(frames > 60 && dropped > 0, "{frames} frames, {dropped} liars");
+    let all = dropped > 0 && dropped_finished.iter().all(|n| *n > 0);
+    assert!(frames > 120 && all, "{frames} frames, {dropped} and {dropped_finished:?} liars");
 }
 
 /// A record with one line changed.

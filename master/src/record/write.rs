@@ -101,6 +101,7 @@ fn write(mut out: impl Write, entries: &Receiver<Entry>) -> std::io::Result<Writ
                     scene: job.scene.id.0,
                     view: to_hex(&convert::view_to_wire(&job.view).encode_to_vec()),
                     work: job.work,
+                    finish: job.finish,
                 };
                 written.events += 1;
                 put(&mut out, &Line::Event { t: differences(t), e: Noted::Queued(queued) })?;

@@ -1,20 +1,23 @@
 //! Messages between master and worker (`cluster.proto`).
 
+use super::render::{background_from_wire, background_to_wire, format_from_wire, format_to_wire};
 use super::{
-    MAX_TILE_PIXELS, WireError, bricks_list_from_wire, bricks_to_wire, digest_from_wire,
+    MAX_TILE_PIXELS, WireError, bricks_list_from_wire, bricks_to_wire, digest_from_wire, leaves,
     name_from_wire, optional_name_from_wire, plane, reason_from_wire, reason_to_wire, required,
     scene_from_wire, scene_to_wire, view_from_wire, view_to_wire,
 };
 use crate::{MAX_BRICKS_MESSAGE, v1};
 use bytes::Bytes;
+use prost::Message as _;
 use slabcast_common::brick::{
     BRICK, BRICK_VOXELS, Brick, BrickGrid, BrickInfo, BrickSetKey, MAX_BRICKS, TightBox,
 };
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::{RawSums, TilePixels, TileState};
+use slabcast_common::leaves::Finish;
 use slabcast_common::message::{
-    BrickBatch, Counters, Hello, Lease, RegionCost, RegionLease, Sampled, Sampling, TaskTimes,
-    TileResult, ToMaster, ToWorker,
+    BrickBatch, Counters, Hello, Lease, Pixels, RegionCost, RegionLease, Sampled, Sampling,
+    TaskTimes, TileResult, ToMaster, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::slab::SheetRange;
@@ -98,16 +101,17 @@ pub fn from_worker_to_wire(message: &ToMaster) -> v1::FromWorker {
     v1::FromWorker { message: Some(message) }
 }
 
-/// A worker's message, or the field that is wrong.
+/// A worker's message, or the field that is wrong. A result says how many bytes its message has.
 pub fn from_worker_from_wire(message: v1::FromWorker) -> Result<ToMaster, WireError> {
     use v1::from_worker::Message;
+    let bytes = message.encoded_len() as u32;
     Ok(match required("message", message.message)? {
         Message::Hello(hello) => {
             ToMaster::Hello(hello_from_wire(hello).map_err(|e| e.within("hello"))?)
         }
-        Message::Result(result) => {
-            ToMaster::Result(Box::new(result_from_wire(result).map_err(|e| e.within("result"))?))
-        }
+        Message::Result(result) => ToMaster::Result(Box::new(
+            result_from_wire(result, bytes).map_err(|e| e.within("result"))?,
+        )),
         Message::Failed(failed) => ToMaster::Failed {
             task: TaskId(failed.task),
             epoch: Epoch(failed.epoch),
@@ -218,16 +222,24 @@ fn last_from_wire(last: Option<v1::Plane>, n: usize) -> Result<Option<Vec<RawSum
 }
 
 fn result_to_wire(result: &TileResult) -> v1::TileResult {
-    let (p, c, t) = (&result.pixels, &result.counters, &result.times);
-    let n = p.a.len();
-    assert_eq!(p.colour.len(), n, "colour has its tile's size");
+    let (c, t) = (&result.counters, &result.times);
+    let n = result.pixels.len();
+    let (a, colour, last, finished) = match &result.pixels {
+        Pixels::Sums(p) => {
+            assert_eq!(p.colour.len(), n, "colour has its tile's size");
+            let colour = plane::to_wire(n, |i| p.colour[i]);
+            (Some(a_to_wire(&p.a)), Some(colour), last_to_wire(&p.last, n), None)
+        }
+        Pixels::Finished(tile) => (None, None, None, Some(leaves::to_wire(tile))),
+    };
     v1::TileResult {
         task: result.task.0,
         epoch: result.epoch.0,
         pixels: n as u32,
-        a: Some(a_to_wire(&p.a)),
-        colour: Some(plane::to_wire(n, |i| p.colour[i])),
-        last: last_to_wire(&p.last, n),
+        a,
+        colour,
+        last,
+        finished,
         tossed: c.tossed,
         splatted: c.splatted,
         culled: c.culled,
@@ -275,21 +287,32 @@ fn region_cost_from_wire(cost: v1::RegionCost) -> Result<RegionCost, WireError> 
     Ok(RegionCost { touched, stalls, parked_us, idle_us, sampled })
 }
 
-fn result_from_wire(result: v1::TileResult) -> Result<TileResult, WireError> {
+fn result_from_wire(result: v1::TileResult, bytes: u32) -> Result<TileResult, WireError> {
     let n = result.pixels as usize;
     if n == 0 || n > MAX_TILE_PIXELS {
         return Err(WireError::value("pixels", format!("{n}; give 1 to {MAX_TILE_PIXELS}")));
     }
-    let colour = plane::from_wire(Some(result.colour.unwrap_or_default()), n, |p: [u32; 3]| p)
-        .map_err(|e| e.within("colour"))?;
+    let pixels = match result.finished {
+        Some(finished) => {
+            let leaves = leaves::from_wire(finished).map_err(|e| e.within("finished"))?;
+            if leaves.pixels() != n {
+                return Err(WireError::length("pixels", n, leaves.pixels()));
+            }
+            Pixels::Finished(leaves)
+        }
+        None => {
+            let colour = result.colour.unwrap_or_default();
+            let colour = plane::from_wire(Some(colour), n, |p: [u32; 3]| p)
+                .map_err(|e| e.within("colour"))?;
+            let (a, last) = (a_from_wire(result.a, n)?, last_from_wire(result.last, n)?);
+            Pixels::Sums(TilePixels { a, colour, last })
+        }
+    };
     Ok(TileResult {
         task: TaskId(result.task),
         epoch: Epoch(result.epoch),
-        pixels: TilePixels {
-            a: a_from_wire(result.a, n)?,
-            colour,
-            last: last_from_wire(result.last, n)?,
-        },
+        pixels,
+        bytes: Some(bytes),
         counters: Counters {
             tossed: result.tossed,
             splatted: result.splatted,
@@ -312,7 +335,7 @@ fn result_from_wire(result: v1::TileResult) -> Result<TileResult, WireError> {
 /// Whether a result has its lease's size. A message alone can't tell; who knows the lease MUST
 /// ask before the planes are put into a frame. Costs nothing.
 pub fn check_result(tile: Rect, result: &TileResult) -> Result<(), WireError> {
-    let have = result.pixels.a.len();
+    let have = result.pixels.len();
     if have != tile.area() {
         return Err(WireError::length("result.pixels", have, tile.area()));
     }
@@ -337,10 +360,14 @@ pub fn to_worker_to_wire(message: &ToWorker, session: u64) -> Down {
             Message::Refused(v1::Refused { reason: reason_to_wire(reason) })
         }
         ToWorker::Scene(scene) => Message::Scene(scene_to_wire(scene)),
-        ToWorker::Frame { frame, scene, view } => Message::Frame(v1::Frame {
+        ToWorker::Frame { frame, scene, view, finish } => Message::Frame(v1::Frame {
             frame: frame.0,
             scene: scene.0,
             view: Some(view_to_wire(view)),
+            finish: finish.map(|finish| v1::Finish {
+                format: format_to_wire(finish.format),
+                background: Some(background_to_wire(finish.background)),
+            }),
         }),
         ToWorker::Directory { set, grid, first, total, bricks } => {
             return Down::Parts(directory_to_wire(set, *grid, (*first, *total), bricks));
@@ -383,6 +410,10 @@ pub fn to_worker_from_wire(message: v1::ToWorker) -> Result<(ToWorker, Option<u6
             scene: SceneId(frame.scene),
             view: view_from_wire(required("frame.view", frame.view)?)
                 .map_err(|e| e.within("frame.view"))?,
+            finish: frame
+                .finish
+                .map(|finish| finish_from_wire(finish).map_err(|e| e.within("frame.finish")))
+                .transpose()?,
         },
         Message::Lease(lease) => {
             ToWorker::Lease(Box::new(lease_from_wire(lease).map_err(|e| e.within("lease"))?))
@@ -401,6 +432,13 @@ pub fn to_worker_from_wire(message: v1::ToWorker) -> Result<(ToWorker, Option<u6
         }
     };
     Ok((message, None))
+}
+
+fn finish_from_wire(finish: v1::Finish) -> Result<Finish, WireError> {
+    Ok(Finish {
+        format: format_from_wire("format", finish.format)?,
+        background: background_from_wire(required("background", finish.background)?)?,
+    })
 }
 
 fn lease_to_wire(lease: &Lease) -> v1::Lease {

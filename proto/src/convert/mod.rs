@@ -17,6 +17,7 @@
 
 mod cluster;
 mod error;
+mod leaves;
 mod path;
 mod plane;
 mod render;

@@ -57,6 +57,7 @@ pub fn path_request_to_wire(request: &PathRequest) -> v1::PathRequest {
         format: wanted_format_to_wire(request.format),
         background: Some(background_to_wire(request.background)),
         want_trace: request.want_trace,
+        without_hash: !request.want_hash,
     }
 }
 
@@ -83,6 +84,7 @@ pub fn path_request_from_wire(request: v1::PathRequest) -> Result<PathRequest, W
         format: wanted_format_from_wire("format", request.format)?,
         background: background_from_wire(request.background.unwrap_or_default())?,
         want_trace: request.want_trace,
+        want_hash: !request.without_hash,
     })
 }
 
@@ -106,7 +108,7 @@ fn work_from_wire(work: v1::Work) -> Result<Work, WireError> {
     Ok(work)
 }
 
-fn background_to_wire(background: Background) -> v1::Background {
+pub(super) fn background_to_wire(background: Background) -> v1::Background {
     use v1::background::Kind;
     let kind = match background {
         Background::Transparent => Kind::Transparent(v1::Transparent {}),
@@ -115,7 +117,7 @@ fn background_to_wire(background: Background) -> v1::Background {
     v1::Background { kind: Some(kind) }
 }
 
-fn background_from_wire(background: v1::Background) -> Result<Background, WireError> {
+pub(super) fn background_from_wire(background: v1::Background) -> Result<Background, WireError> {
     use v1::background::Kind;
     match background.kind {
         None => Ok(Background::Colour([0.0; 3])),

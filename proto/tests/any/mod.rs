@@ -7,6 +7,7 @@ use proptest::prelude::*;
 use slabcast_common::brick::{Brick, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::*;
 use slabcast_common::image::{Background, PixelFormat, TilePixels, TileState};
+use slabcast_common::leaves::{Finish, Leaves};
 use slabcast_common::message::*;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::path::{
@@ -272,6 +273,32 @@ pub fn directory() -> impl Strategy<Value = ToWorker> {
     )
 }
 
+/// Some leaves of a tile of one row or more, from words that mean nothing.
+fn leaves(pixels: &TilePixels, format: u64) -> Leaves {
+    let n = pixels.a.len() as u32;
+    let rows = if n.is_multiple_of(7) { 7 } else { 1 };
+    let formats =
+        [PixelFormat::Rgb8, PixelFormat::Rgba8, PixelFormat::Rgba16, PixelFormat::Rgba32F];
+    let mut leaves = Leaves::blank([n / rows, rows], formats[format as usize]);
+    let columns = (n / rows).div_ceil(16);
+    for (i, word) in (0..columns as usize).zip(pixels.colour.iter().flatten()) {
+        leaves.mask[i / 8] |= (word.count_ones() as u8 & 1) << (i % 8);
+    }
+    let bytes = pixels.colour.iter().flatten().flat_map(|w| w.to_le_bytes()).cycle();
+    leaves.data.extend(bytes.take(Leaves::data_len(leaves.size, leaves.format, &leaves.mask)));
+    leaves.alpha_most = n as f32 * 1e-3;
+    leaves
+}
+
+/// What frames are finished to.
+fn finish() -> impl Strategy<Value = Finish> {
+    let background = prop_oneof![
+        Just(Background::Transparent),
+        [0.0..=1.0f64, 0.0..=1.0, 0.0..=1.0].prop_map(Background::Colour)
+    ];
+    (format(), background).prop_map(|(format, background)| Finish { format, background })
+}
+
 pub fn result() -> impl Strategy<Value = TileResult> {
     (1usize..600).prop_flat_map(|n| {
         let ids = (any::<u64>(), any::<u32>());
@@ -292,7 +319,12 @@ pub fn result() -> impl Strategy<Value = TileResult> {
             |((task, epoch), (a, last), colour, c, (thread, region))| TileResult {
                 task: TaskId(task),
                 epoch: Epoch(epoch),
-                pixels: TilePixels { a, colour, last },
+                // What a message says of itself, nobody writes.
+                bytes: None,
+                pixels: match c[6] % 2 {
+                    0 => Pixels::Sums(TilePixels { a, colour, last }),
+                    _ => Pixels::Finished(leaves(&TilePixels { a, colour, last }, c[5] % 4)),
+                },
                 counters: Counters { tossed: c[0], splatted: c[1], culled: c[2] },
                 times: TaskTimes {
                     received_us: c[3],
@@ -355,11 +387,11 @@ pub fn to_worker() -> impl Strategy<Value = ToWorker> {
             .prop_map(|(w, heartbeat_ms)| ToWorker::Welcome { worker: WorkerId(w), heartbeat_ms }),
         ".{0,50}".prop_map(|reason| ToWorker::Refused { reason }),
         scene().prop_map(|s| ToWorker::Scene(Arc::new(s))),
-        (any::<[u64; 2]>(), view()).prop_map(|([f, s], view)| ToWorker::Frame {
-            frame: FrameId(f),
-            scene: SceneId(s),
-            view
-        }),
+        (any::<[u64; 2]>(), view(), prop::option::of(finish())).prop_map(
+            |([f, s], view, finish)| {
+                ToWorker::Frame { frame: FrameId(f), scene: SceneId(s), view, finish }
+            }
+        ),
         lease().prop_map(|l| ToWorker::Lease(Box::new(l))),
         directory(),
         region().prop_map(ToWorker::Region),
@@ -537,10 +569,10 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
     let sums = prop_oneof![Just(Sums::Auto), Just(Sums::I32), Just(Sums::F32)];
     (
         ("[A-Za-z0-9-]{1,60}", path, transfer, quality(sums)),
-        (work, format(), background, any::<bool>()),
+        (work, format(), background, any::<[bool; 2]>()),
     )
         .prop_map(
-            |((client_key, path, transfer, quality), (work, format, background, trace))| {
+            |((client_key, path, transfer, quality), (work, format, background, [trace, hash]))| {
                 PathRequest {
                     client_key,
                     path,
@@ -550,6 +582,7 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
                     format,
                     background,
                     want_trace: trace,
+                    want_hash: hash,
                 }
             },
         )

@@ -38,6 +38,7 @@ pub(super) fn request(
         format: PixelFormat::Rgba32F,
         background: Background::Transparent,
         want_trace: false,
+        want_hash: true,
     }
 }
 

@@ -24,6 +24,7 @@ use crate::parse;
 use contact::Contact;
 use file::Growing;
 use folder::Folder;
+use provenance::Provenance;
 use serde::{Deserialize, Serialize};
 use slabcast_common::image::{Background, Picture, PixelFormat};
 use slabcast_common::math::{linear_from_srgb, srgb_from_linear};
@@ -502,11 +503,12 @@ impl Writer {
     }
 
     /// Takes a frame, the next one in order. Call [`Writer::has_room`] first.
-    pub(crate) fn put(&mut self, frame: Frame, provenance: String) {
+    pub(crate) fn put(&mut self, frame: Frame, made: Option<Provenance>) {
         let (output, movie) = (self.output.clone(), self.movie.clone());
         let (contact, patience) = (self.contact.clone(), self.patience.clone());
         self.busy.spawn_blocking(move || {
             let frame = output.full(frame);
+            let provenance = made.map_or_else(String::new, |made| made.written(&frame));
             if let Some(contact) = contact {
                 contact.lock().expect("no thread panics with it").add(&frame);
             }

@@ -3,10 +3,11 @@
 //! Nothing in it says who, where or when: a picture of a patient that is passed on tells the
 //! volume's digest and no name, and the same picture made elsewhere has the same bytes.
 
-use super::{Format, exr, png};
+use super::{Format, Frame, exr, png};
 use crate::fail::Fail;
 use crate::request::Asked;
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::image::Background;
 use slabcast_common::message::PathRequest;
@@ -16,7 +17,7 @@ use slabcast_common::stats::FrameStats;
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::tween::Tween;
 use slabcast_common::view::MAX_EDGE;
-use slabcast_common::volume::VolumeInfo;
+use slabcast_common::volume::{Digest32, VolumeInfo};
 use std::path::Path;
 
 /// Largest picture that is read: one of 8192x8192 in floats that do not compress.
@@ -49,11 +50,16 @@ pub(crate) struct Provenance {
     /// Frames a second of a moving picture.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) fps: Option<u16>,
-    /// Hash of the view and all else that decides the pixels, and of the pixels.
+    /// Hash of the view and all else that decides the pixels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     view_sha256: Option<String>,
+    /// Hash of the linear picture. Pictures said it while masters hashed each; who draws one of them again
+    /// has it hashed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) pixels_sha256: Option<String>,
+    /// Hash of the pixels that are in the file, as bytes of the format that a master sends for it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) picture_sha256: Option<String>,
 }
 
 fn one() -> u32 {
@@ -78,6 +84,21 @@ impl Provenance {
             Ground::Word(_) => Background::Transparent,
             Ground::Colour(c) => Background::Colour(c),
         }
+    }
+
+    /// As it stands in a picture's file, or in that of a moving picture.
+    pub(super) fn written(mut self, frame: &Frame) -> String {
+        // Of a single frame, that does not say it in another way.
+        if self.view_sha256.is_some() && self.pixels_sha256.is_none() {
+            self.picture_sha256 = Some(Digest32(Sha256::digest(&frame.bytes).into()).to_string());
+        }
+        serde_json::to_string(&self).expect("numbers and strings can be written")
+    }
+
+    /// Whether two pictures say that they have the same pixels.
+    pub(crate) fn same_pixels(&self, other: &Provenance) -> bool {
+        let hashes = |p: &Provenance| (p.pixels_sha256.clone(), p.picture_sha256.clone());
+        hashes(self) == hashes(other)
     }
 
     /// What made the picture in a file.
@@ -149,6 +170,8 @@ pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Fail> {
 /// Says of each frame of a run what made it.
 pub(crate) struct Recipe {
     base: Provenance,
+    /// With the hash of the linear picture instead of the file's own.
+    hash_inside: bool,
 }
 
 impl Recipe {
@@ -169,6 +192,7 @@ impl Recipe {
             format: _,
             background,
             want_trace: _,
+            want_hash: _,
         } = asked.request(info, format.pixels(asked.background), false);
         let mut path = path;
         if let Some(t) = &mut path.turntable {
@@ -209,22 +233,24 @@ impl Recipe {
                 fps,
                 view_sha256: None,
                 pixels_sha256: None,
+                picture_sha256: None,
             },
+            hash_inside: asked.hash_inside,
         })
     }
 
     /// What made the frame of these statistics, alone.
-    pub(crate) fn frame(&self, stats: &FrameStats) -> String {
+    pub(crate) fn frame(&self, stats: &FrameStats) -> Provenance {
         let mut p = self.whole(stats.quality.sums);
         p.path = p.path.only(stats.frame as usize);
         p.view_sha256 = Some(stats.view_sha256.clone());
-        p.pixels_sha256 = Some(stats.pixels_sha256.clone());
-        written(&p)
+        p.pixels_sha256 = self.hash_inside.then(|| stats.pixels_sha256.clone());
+        p
     }
 
     /// What makes all frames, with sums as the master decided them.
-    pub(crate) fn movie(&self, stats: &FrameStats) -> String {
-        written(&self.whole(stats.quality.sums))
+    pub(crate) fn movie(&self, stats: &FrameStats) -> Provenance {
+        self.whole(stats.quality.sums)
     }
 
     fn whole(&self, sums: Sums) -> Provenance {
@@ -232,8 +258,4 @@ impl Recipe {
         p.quality.sums = sums;
         p
     }
-}
-
-fn written(p: &Provenance) -> String {
-    serde_json::to_string(p).expect("numbers and strings can be written")
 }

@@ -4,11 +4,16 @@
 //! gRPC, TCP and the kernel take is a constant that `tests/messages.rs` measured.
 
 use super::clock::cpu_ns;
+use super::measure::FINISH;
 use prost::Message;
 use slabcast_common::ids::{Epoch, FrameId, TaskId};
-use slabcast_common::image::{TilePixels, TileState};
-use slabcast_common::message::{Counters, Lease, TaskTimes, TileResult, ToMaster, ToWorker};
+use slabcast_common::image::{Picture, TilePixels, TileState};
+use slabcast_common::leaves::Leaves;
+use slabcast_common::message::{
+    Counters, Lease, Pixels, TaskTimes, TileResult, ToMaster, ToWorker,
+};
 use slabcast_common::occlusion::Rect;
+use slabcast_common::quality::Schedule;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::trace::{self, Trace};
 use slabcast_proto::convert::{self, Down};
@@ -40,8 +45,10 @@ fn best(mut run: impl FnMut()) -> f64 {
     (0..15).map(|_| timed()).fold(f64::INFINITY, f64::min)
 }
 
-/// What messages cost here. Tiles are filled as those of the trace are, on average.
-pub(super) fn messages(trace: &Trace) -> Costs {
+/// What messages cost here under a schedule: tiles of slabs are sums, regions come finished. They are
+/// filled as those of the trace are, on average.
+pub(super) fn messages(trace: &Trace, schedule: Schedule) -> Costs {
+    let by_region = schedule != Schedule::Slab;
     let tiles = trace.frames.iter().flat_map(|f| &f.slabs).flat_map(|s| &s.levels);
     let (mut bytes, mut pixels) = (0u64, 0u64);
     for level in tiles {
@@ -66,10 +73,15 @@ pub(super) fn messages(trace: &Trace) -> Costs {
         bricks: Vec::new(),
         state: TileState { a: pixels.a.clone(), last: pixels.last.clone() },
     }));
+    let pixels = match by_region {
+        true => Pixels::Finished(region(trace)),
+        false => Pixels::Sums(pixels),
+    };
     let result = ToMaster::Result(Box::new(TileResult {
         task: TaskId(5),
         epoch: Epoch(0),
         pixels,
+        bytes: None,
         counters: Counters::default(),
         times: TaskTimes::default(),
         region: None,
@@ -107,60 +119,86 @@ pub(super) fn messages(trace: &Trace) -> Costs {
             // Bricks are decoded and put into the cache: some 3 ns a byte (docs/performance.md).
             bricks: (EACH, BYTE + 3.0),
         },
-        finish_pixel: finish(trace),
+        finish_pixel: finish(trace, by_region),
         mark_pixel: mark(trace.about.size),
         deliver: DELIVER,
-        hold: (0.0, fill()),
+        hold: (0.0, fill(by_region)),
         late: late(),
         ..Costs::default()
     }
 }
 
-/// To hash and encode a pixel, in nanoseconds, of pictures as full as those of the trace.
-fn finish(trace: &Trace) -> f64 {
-    use slabcast_common::image::{Background, FrameState, PixelFormat, TilePixels};
+/// Bytes of regions' results a pixel of their tiles; `None` of a trace of slabs alone.
+fn region_bytes(trace: &Trace) -> Option<f64> {
+    let levels = trace.frames.iter().filter_map(|f| f.regions.first());
+    let (mut bytes, mut pixels) = (0.0, 0.0);
+    for level in levels {
+        bytes += level.tiles.iter().map(|t| f64::from(t.result_bytes)).sum::<f64>();
+        pixels += level.tiles.len() as f64 * f64::from(level.edge).powi(2);
+    }
+    (pixels > 0.0).then(|| bytes / pixels)
+}
+
+/// A region of 64x64 pixels that weighs what those of the trace do, half of it packed away: what is
+/// inside the outline of what is drawn packs to some half.
+fn region(trace: &Trace) -> Leaves {
+    let bytes = region_bytes(trace).unwrap_or(0.5) * 64.0 * 64.0;
+    let tile = Rect::new(0, 0, 64, 64);
+    let mut leaves = trace::finished_through(&tile, (2.0 * bytes) as u32, &FINISH);
+    leaves.data.iter_mut().skip(1).step_by(2).for_each(|b| *b = 0);
+    let mid = leaves.data.len() / 2;
+    let (first, rest) = leaves.data.split_at_mut(mid);
+    rest[..mid].copy_from_slice(first);
+    leaves
+}
+
+/// To finish a pixel, in nanoseconds, of pictures as full as those of the trace.
+fn finish(trace: &Trace, by_region: bool) -> f64 {
+    use slabcast_common::image::{FrameState, TilePixels};
     let size = trace.about.size;
     let mut state = FrameState::new(size);
     let whole = Rect::of_size(size);
-    let frames = trace.frames.iter().filter_map(|f| f.regions.first());
-    let bytes =
-        frames.clone().flat_map(|l| &l.tiles).map(|t| f64::from(t.result_bytes)).sum::<f64>();
-    let pixels = frames.count() as f64 * whole.area() as f64;
-    // 16 bytes a pixel that is there; slabs alone do not say.
-    let there = if pixels > 0.0 { (bytes / 16.0 / pixels).min(1.0) } else { 1.0 };
-    let full = |i: usize| (i as f64) < there * whole.area() as f64;
-    let a = (0..whole.area()).map(|i| if full(i) { 0.5 } else { 0.0 }).collect();
-    let colour = (0..whole.area()).map(|i| if full(i) { [1 << 27; 3] } else { [0; 3] }).collect();
-    state.lay(whole, TilePixels { a, colour, last: None });
+    if by_region {
+        let leaves = region(trace);
+        for y in (0..whole.y1 - 63).step_by(64) {
+            for x in (0..whole.x1 - 63).step_by(64) {
+                state.lay_finished(Rect::new(x, y, x + 64, y + 64), leaves.clone());
+            }
+        }
+    } else {
+        // Slabs do not say how many pixels are there: half.
+        let full = |i: usize| i < whole.area() / 2;
+        let a = (0..whole.area()).map(|i| if full(i) { 0.5 } else { 0.0 }).collect();
+        let colour =
+            (0..whole.area()).map(|i| if full(i) { [1 << 27; 3] } else { [0; 3] }).collect();
+        state.lay(whole, TilePixels { a, colour, last: None });
+    }
     let ns = (0..3)
         .map(|_| {
             let began = cpu_ns();
-            let encoded = state.encode(PixelFormat::Rgb8, Background::Colour([0.0; 3]));
-            std::hint::black_box(encoded);
+            std::hint::black_box(state.encode(&FINISH, false));
             (cpu_ns() - began) as f64
         })
         .fold(f64::INFINITY, f64::min);
     ns / (f64::from(size[0]) * f64::from(size[1]))
 }
 
-/// To mark a pixel of a picture that nobody drew, to hash and encode it.
+/// To mark a pixel of a picture that nobody drew, and to encode it.
 fn mark(size: [u32; 2]) -> f64 {
-    use slabcast_common::image::{Background, FrameState, PixelFormat};
-    let state = FrameState::new(size);
     let ns = best(|| {
-        let mut picture = state.finish();
-        picture.pixels.fill([0.5; 4]);
-        std::hint::black_box(picture.sha256());
-        drop(picture.encode(PixelFormat::Rgb8, Background::Colour([0.0; 3])));
+        let pixels = vec![[0.5; 4]; size[0] as usize * size[1] as usize];
+        drop(Picture { size, pixels }.encode(FINISH.format, FINISH.background));
     });
     ns / (f64::from(size[0]) * f64::from(size[1]))
 }
 
 /// To fill a pixel of a result that is held, in nanoseconds.
-fn fill() -> f64 {
+fn fill(by_region: bool) -> f64 {
     let (rect, size) = (Rect::new(0, 0, 64, 64), [64, 64]);
     let shut = vec![false; 64 * 64];
-    best(|| drop(std::hint::black_box(trace::filled(&rect, &shut, size, 100_000)))) / 4096.0
+    let sums = || drop(std::hint::black_box(trace::filled(&rect, &shut, size, 100_000)));
+    let finished = || drop(std::hint::black_box(trace::finished_through(&rect, 4_000, &FINISH)));
+    (if by_region { best(finished) } else { best(sums) }) / 4096.0
 }
 
 /// How late a thread wakes that sleeps for a tile's time, in nanoseconds.

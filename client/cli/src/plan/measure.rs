@@ -13,8 +13,11 @@ use prost::Message;
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::brick::{Brick, BrickGrid, BrickInfo};
 use slabcast_common::ids::{Epoch, FrameId, TaskId};
-use slabcast_common::image::{FrameState, TilePixels};
-use slabcast_common::message::{Counters, Lease, TaskTimes, TileResult, ToMaster, ToWorker};
+use slabcast_common::image::{Background, FrameState, PixelFormat, TilePixels};
+use slabcast_common::leaves::{Finish, Leaves};
+use slabcast_common::message::{
+    Counters, Lease, Pixels, TaskTimes, TileResult, ToMaster, ToWorker,
+};
 use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::quality::Work;
 use slabcast_common::slab::SheetRange;
@@ -60,6 +63,11 @@ fn infos(stage: &Stage) -> Arc<[BrickInfo]> {
     stage.bricks.iter().map(info).collect()
 }
 
+/// What a plain `slabcast render` has tiles finished to, over the usual background: others weigh about the
+/// same.
+pub(crate) const FINISH: Finish =
+    Finish { format: PixelFormat::Rgb8, background: Background::Colour([0.0; 3]) };
+
 /// The path's frames as the scheduler gets them.
 pub(crate) fn jobs(stage: &Stage, frames: usize, work: Work) -> Result<Vec<FrameJob>, Fail> {
     let bricks = infos(stage);
@@ -73,7 +81,7 @@ pub(crate) fn jobs(stage: &Stage, frames: usize, work: Work) -> Result<Vec<Frame
             let view = stage.view(i, &scene.quality)?;
             let (frame, number) = (FrameId(i as u64 + 1), i as u64);
             let (scene, bricks) = (scene.clone(), bricks.clone());
-            Ok(FrameJob { frame, number, scene, bricks, view, work })
+            Ok(FrameJob { frame, number, scene, bricks, view, work, finish: Some(FINISH) })
         })
         .collect()
 }
@@ -244,7 +252,9 @@ impl Bench {
                     bricks: bricks.iter().map(|b| b.id).collect(),
                     state: before,
                 };
-                let (lease_bytes, result_bytes, pixels) = weigh(lease, pixels, counters);
+                let lease_bytes = lease_weighs(lease);
+                let (result_bytes, result) = weigh(Pixels::Sums(pixels), counters);
+                let Pixels::Sums(pixels) = result else { unreachable!("given above") };
                 let (x, y) = (t.rect.x0 as u32, t.rect.y0 as u32);
                 tiles.push(TileTrace { x, y, ns, lease_bytes, result_bytes });
                 if levels.is_empty() {
@@ -293,19 +303,12 @@ impl Bench {
                 let (ns, done) = shortest(self.repeats, || {
                     let mut region = Region::new(&outlook, t.rect);
                     region.advance(frame, simd, &outlook, &supply, 0, scratch);
-                    region.finish()
+                    let Finished { pixels, counters, touched } = region.finish();
+                    let size = [t.rect.width() as u32, t.rect.height() as u32];
+                    (Leaves::of(&pixels, size, &FINISH), counters, touched)
                 });
-                let Finished { pixels, counters, touched } = done;
-                let lease = Lease {
-                    task: TaskId(0),
-                    epoch: Epoch(0),
-                    frame: job.frame,
-                    tile: t.rect,
-                    slab: SheetRange::default(),
-                    bricks: Vec::new(),
-                    state: tile::blank(t.rect),
-                };
-                let (_, result_bytes, _) = weigh(lease, pixels, counters);
+                let (leaves, counters, touched) = done;
+                let (result_bytes, _) = weigh(Pixels::Finished(leaves), counters);
                 let (x, y) = (t.rect.x0 as u32, t.rect.y0 as u32);
                 tiles.push(RegionTile { x, y, ns, result_bytes, touched });
             }
@@ -357,22 +360,26 @@ impl Bench {
     }
 }
 
-/// Bytes of a lease and of its result as they cross.
-fn weigh(lease: Lease, pixels: TilePixels, counters: Counters) -> (u32, u32, TilePixels) {
-    let (task, epoch) = (lease.task, lease.epoch);
-    let lease = match convert::to_worker_to_wire(&ToWorker::Lease(Box::new(lease)), 0) {
-        Down::Control(message) => message.encoded_len(),
+/// Bytes of a lease as it crosses.
+fn lease_weighs(lease: Lease) -> u32 {
+    match convert::to_worker_to_wire(&ToWorker::Lease(Box::new(lease)), 0) {
+        Down::Control(message) => message.encoded_len() as u32,
         Down::Parts(_) | Down::Bricks(_) => unreachable!("a lease goes on Control"),
-    };
+    }
+}
+
+/// Bytes of a result as it crosses.
+fn weigh(pixels: Pixels, counters: Counters) -> (u32, Pixels) {
+    let (task, epoch) = (TaskId(1 << 12), Epoch(0));
     // Times as they are after some hours: five bytes each.
     let us = 1 << 33;
     let times = TaskTimes { received_us: us, ready_us: us, start_us: us, end_us: us, thread: 0 };
-    let region = None;
-    let result = TileResult { task, epoch, pixels, counters, times, region };
+    let (bytes, region) = (None, None);
+    let result = TileResult { task, epoch, pixels, bytes, counters, times, region };
     let result = ToMaster::Result(Box::new(result));
     let bytes = convert::from_worker_to_wire(&result).encoded_len();
     let ToMaster::Result(result) = result else { unreachable!("made above") };
-    (lease as u32, bytes as u32, result.pixels)
+    (bytes as u32, result.pixels)
 }
 
 /// Whether a trace is of this path, frame by frame.

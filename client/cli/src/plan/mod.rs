@@ -178,7 +178,7 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
         let jobs: Vec<FrameJob> =
             jobs.iter().map(|job| FrameJob { work: under(job), ..job.clone() }).collect();
         let trace = &measured.trace;
-        let costs = costs::messages(trace);
+        let costs = costs::messages(trace, schedule);
         let rehearsed = match (&args.rehearse, &args.trace) {
             (Some(list), Some(file)) => {
                 let mut asked: Asked = asked.clone();

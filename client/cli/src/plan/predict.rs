@@ -7,6 +7,7 @@ use crate::local::shared;
 use crate::study::order::spearman;
 use slabcast_common::ids::FrameId;
 use slabcast_common::occlusion::Rect;
+use slabcast_common::quality::Schedule;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::trace::Trace;
 use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Stopwatch, Took, Unmeasured};
@@ -245,7 +246,8 @@ pub(crate) fn measured_costs(
     trace: &Trace,
     cluster: (u32, u32),
 ) -> Result<Costs, Fail> {
-    decided(jobs, trace, cluster, costs::messages(trace))
+    let schedule = jobs.first().map_or(Schedule::Auto, |job| job.work.schedule);
+    decided(jobs, trace, cluster, costs::messages(trace, schedule))
 }
 
 /// What deciding costs on this machine: the scheduler runs the path once on so many workers of so many

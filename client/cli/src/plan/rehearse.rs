@@ -5,6 +5,7 @@
 //! share this machine's cores, and the simulation is told so; where messages alone fill them, the
 //! rehearsal is no cluster any more, and the table says that too.
 
+use super::measure::FINISH;
 use super::predict::{self, Question};
 use crate::fail::Fail;
 use crate::progress::Progress;
@@ -12,7 +13,7 @@ use crate::request::{Asked, AxisArgs};
 use crate::{embedded, remote, runtime};
 use slabcast_client::{Client, Update};
 use slabcast_common::ids::FrameId;
-use slabcast_common::image::PixelFormat;
+use slabcast_common::leaves::Finish;
 use slabcast_common::message::PathRequest;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::trace::Trace;
@@ -171,7 +172,13 @@ impl Stage<'_> {
         let served = remote::describe(&client).await?;
         let paths = FRAMES.div_ceil(self.jobs.len().max(1));
         let requests: Vec<PathRequest> = (0..paths)
-            .map(|_| self.asked.request(&served.info, PixelFormat::Rgb8, false))
+            .map(|_| {
+                // As a plain `render` asks.
+                let Finish { format, background } = FINISH;
+                let mut asked = self.asked.clone();
+                (asked.hashed, asked.background) = (false, background);
+                asked.request(&served.info, format, false)
+            })
             .collect();
         let played = tokio::time::timeout(PLAY, play(&client, &requests, &master, &workers)).await;
         played.map_err(|_| Fail::failed("the rehearsal took more than 4 minutes"))?

@@ -6,8 +6,9 @@ use crate::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, Epoch, FrameId, TaskId, WorkerId};
 use slabcast_common::image::TilePixels;
+use slabcast_common::leaves::Leaves;
 use slabcast_common::message::{
-    Counters, Lease, RegionCost, RegionLease, TaskTimes, TileResult, ToWorker,
+    Counters, Lease, Pixels, RegionCost, RegionLease, TaskTimes, TileResult, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::slab::SheetRange;
@@ -634,7 +635,9 @@ impl World<'_> {
                 }
             }
             Task::Region(_) => {
-                a.resize(tile.area(), 0.0);
+                if self.jobs[frame].finish.is_none() {
+                    a.resize(tile.area(), 0.0);
+                }
                 region = Some(RegionCost {
                     touched: r.touched,
                     stalls: u32::from(r.stood.is_some()),
@@ -644,10 +647,17 @@ impl World<'_> {
             }
         }
         let (task, epoch) = r.lease.name();
+        let pixels = match (&r.lease, self.jobs[frame].finish) {
+            (Task::Region(_), Some(finish)) => {
+                let size = [tile.width() as u32, tile.height() as u32];
+                Pixels::Finished(Leaves::blank(size, finish.format))
+            }
+            _ => Pixels::Sums(TilePixels { a, colour: vec![[0; 3]; tile.area()], last: None }),
+        };
         let result = Box::new(TileResult {
             task,
             epoch,
-            pixels: TilePixels { a, colour: vec![[0; 3]; tile.area()], last: None },
+            pixels,
             counters: Counters::default(),
             times: TaskTimes {
                 received_us: micros(r.received),
@@ -657,6 +667,7 @@ impl World<'_> {
                 thread: thread as u32,
             },
             region,
+            bytes: Some(r.result_bytes.min(u64::from(u32::MAX)) as u32),
         });
         let event = Event::Result { worker: id, result };
         self.up(id, event, r.result_bytes, r.pixels.max(now));
@@ -673,7 +684,7 @@ impl World<'_> {
         let mut actions = Vec::new();
         for event in std::mem::take(&mut self.inbox) {
             let result = match &event {
-                Event::Result { result, .. } => Some(result.pixels.a.len()),
+                Event::Result { result, .. } => Some(result.pixels.len()),
                 _ => None,
             };
             cost += match result {

@@ -5,7 +5,8 @@
 use crate::rng::Rng;
 use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId};
-use slabcast_common::image::{FrameState, Picture, TilePixels, TileState};
+use slabcast_common::image::{Background, FrameState, Picture, PixelFormat, TilePixels, TileState};
+use slabcast_common::leaves::Finish;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::presets;
@@ -74,7 +75,11 @@ pub(crate) fn job(
 ) -> Box<FrameJob> {
     let view = view(rng, scene, size);
     let (scene, bricks) = (scene.clone(), bricks.clone());
-    Box::new(FrameJob { frame: FrameId(frame), number: frame, scene, bricks, view, work })
+    // Nobody's dice: seeds stay the stories that they were.
+    let finish = [None, Some(PixelFormat::Rgb8), None, Some(PixelFormat::Rgba32F)]
+        [(frame % 4) as usize]
+        .map(|format| Finish { format, background: Background::Colour([0.1, 0.7, 0.4]) });
+    Box::new(FrameJob { frame: FrameId(frame), number: frame, scene, bricks, view, work, finish })
 }
 
 /// Where each brick of a job lands.

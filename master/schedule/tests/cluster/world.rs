@@ -8,10 +8,12 @@ use slabcast_common::brick::{BrickGrid, BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::Picture;
 use slabcast_common::image::{TilePixels, TileState};
+use slabcast_common::leaves::Leaves;
 use slabcast_common::message::{
-    Counters, DIRECTORIES, Lease, RegionCost, RegionLease, TaskTimes, TileResult, ToWorker,
+    Counters, DIRECTORIES, Lease, Pixels, RegionCost, RegionLease, TaskTimes, TileResult, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
+use slabcast_common::quality::Schedule;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::view::Projected;
@@ -186,7 +188,10 @@ struct Known {
 }
 
 pub(crate) struct Done {
-    pub(crate) picture: Picture,
+    /// Of a frame of sums.
+    pub(crate) picture: Option<Picture>,
+    /// Of one whose workers may finish it.
+    pub(crate) bytes: Option<Vec<u8>>,
     pub(crate) stats: FrameStats,
     pub(crate) spans: Vec<Span>,
     pub(crate) at: Micros,
@@ -373,7 +378,10 @@ impl World {
                     ToWorker::Scene(scene) => {
                         assert!(w.scenes.insert(scene.id), "seed {seed}: scene twice to {id}");
                     }
-                    ToWorker::Frame { frame, scene, .. } => {
+                    ToWorker::Frame { frame, scene, finish, .. } => {
+                        let job = &self.jobs[frame].job;
+                        let regions = job.work.schedule != Schedule::Slab;
+                        assert_eq!(*finish, job.finish.filter(|_| regions), "seed {seed}");
                         assert!(w.scenes.contains(scene), "seed {seed}: frame before its scene");
                         assert!(w.frames.insert(*frame), "seed {seed}: frame twice to {id}");
                     }
@@ -487,9 +495,11 @@ impl World {
             Action::FrameDone { frame, state, stats, spans } => {
                 self.note("done", frame.0, 0);
                 assert!(!self.cancelled.contains(&frame), "seed {seed}: {frame} was cancelled");
-                let picture = state.finish();
-                let at = self.now();
-                let before = self.done.insert(frame, Done { picture, stats: *stats, spans, at });
+                let finish = self.jobs[&frame].job.finish;
+                let bytes = finish.map(|finish| state.encode(&finish, false).bytes);
+                let picture = finish.is_none().then(|| state.finish());
+                let (at, stats) = (self.now(), *stats);
+                let before = self.done.insert(frame, Done { picture, bytes, stats, spans, at });
                 assert!(before.is_none(), "seed {seed}: {frame} done twice");
                 let first = *self.jobs.keys().find(|f| !self.is_over(**f)).unwrap_or(&frame);
                 assert!(first >= frame, "seed {seed}: {frame} before {first}");
@@ -763,6 +773,20 @@ impl World {
                 _ => pixels.a[0] = f32::NAN,
             }
         }
+        let regions = matches!(r.loan, Loan::Region(..));
+        let pixels = match job.job.finish.filter(|_| regions) {
+            // A lie about sums stays one.
+            Some(finish) if pixels.a.len() == pixels.colour.len() && pixels.last.is_none() => {
+                let tile = r.loan.tile();
+                let size = [tile.width() as u32, tile.height() as u32];
+                let mut leaves = Leaves::of(&pixels, size, &finish);
+                if pixels.a[0].is_nan() {
+                    leaves.alpha_most = f32::NAN;
+                }
+                Pixels::Finished(leaves)
+            }
+            _ => Pixels::Sums(pixels),
+        };
         let clock = |t: Micros| t + nature.clock_ahead;
         let n = r.loan.tile().area() as u64;
         let (task, epoch) = r.loan.task();
@@ -770,6 +794,7 @@ impl World {
             task,
             epoch,
             pixels,
+            bytes: Some(n as u32),
             counters: Counters { tossed: 2 * n, splatted: n, culled: 0 },
             times: TaskTimes {
                 received_us: clock(r.received),
@@ -910,10 +935,13 @@ impl World {
         }
         for (frame, done) in &self.done {
             let want = fake::serial(&self.jobs[frame].job);
-            if done.picture != want {
-                let bad = done.picture.pixels.iter().zip(&want.pixels).filter(|(a, b)| a != b);
+            if let Some(picture) = done.picture.as_ref().filter(|picture| **picture != want) {
+                let bad = picture.pixels.iter().zip(&want.pixels).filter(|(a, b)| a != b);
                 panic!("seed {seed}: {frame} differs in {} pixels", bad.count());
             }
+            let finish = self.jobs[frame].job.finish;
+            let bytes = finish.map(|finish| want.encode(finish.format, finish.background));
+            assert!(done.bytes == bytes, "seed {seed}: {frame} has other bytes");
             self.check_stats(*frame, done);
         }
     }

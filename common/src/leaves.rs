@@ -1,0 +1,280 @@
+//! Finished pixels of a tile, without those leaves that show nothing but the background.
+//!
+//! Sums of a pixel are 16 bytes, a finished pixel in 8-bit sRGB is 3; and what a client gets is made of
+//! finished pixels alone. So where nobody asks for the hash of the linear picture, workers finish their
+//! tiles themselves, by the same code as a master ([`Encoder`]): pixels are finished one by one, and
+//! whoever does it does it to the same bytes. A leaf of 16x16 pixels whose every byte is that of a pixel
+//! without a volume is left out, whatever its sums are: what is put back in its place is the same.
+
+use crate::image::{Background, Encoder, PixelFormat, TilePixels, finished};
+use crate::occlusion::Rect;
+use serde::{Deserialize, Serialize};
+
+/// Edge of a leaf in pixels: that of the smallest macrotile. Of 8 pixels four times as many are looked
+/// at to save a rim of empty ones, which pack to nearly nothing anyway.
+pub const LEAF: usize = 16;
+
+/// What finished pixels are.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Finish {
+    /// How they are written.
+    pub format: PixelFormat,
+    /// Over what.
+    pub background: Background,
+}
+
+/// Finished pixels of a tile.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Leaves {
+    /// Columns and rows of the tile, in pixels.
+    pub size: [u32; 2],
+    /// How pixels are written.
+    pub format: PixelFormat,
+    /// Which leaves are there: a bit each, row-major, leaf i at bit i % 8 of byte i / 8. Leaves at the
+    /// right and at the bottom are cut by the tile.
+    pub mask: Vec<u8>,
+    /// Pixels of the leaves that are there, one leaf after the other, row-major in each.
+    pub data: Vec<u8>,
+    /// The largest opacity of a pixel of the tile.
+    pub alpha_most: f32,
+}
+
+/// The leaves of a tile of so many pixels, in order: columns and rows of pixels.
+fn leaves(size: [u32; 2]) -> impl Iterator<Item = [std::ops::Range<usize>; 2]> {
+    let [w, h] = size.map(|n| n as usize);
+    let cut = |at: usize, end: usize| at..(at + LEAF).min(end);
+    (0..h)
+        .step_by(LEAF)
+        .flat_map(move |y| (0..w).step_by(LEAF).map(move |x| [cut(x, w), cut(y, h)]))
+}
+
+fn there(mask: &[u8], leaf: usize) -> bool {
+    mask.get(leaf / 8).is_some_and(|byte| byte >> (leaf % 8) & 1 == 1)
+}
+
+impl Finish {
+    /// Bytes of a pixel that shows nothing but the background.
+    fn blank(&self) -> Vec<u8> {
+        let mut blank = Vec::new();
+        Encoder::new(self.format, self.background).put(&[[0.0; 4]], &mut blank);
+        blank
+    }
+}
+
+impl Leaves {
+    /// Finishes a tile of sums that went through all sheets.
+    ///
+    /// # Panics
+    /// If the planes do not have the tile's size.
+    pub fn of(pixels: &TilePixels, size: [u32; 2], finish: &Finish) -> Leaves {
+        let width = size[0] as usize;
+        let n = width * size[1] as usize;
+        assert!(pixels.a.len() == n && pixels.colour.len() == n, "planes of the tile's size");
+        let encoder = Encoder::new(finish.format, finish.background);
+        let blank = finish.blank().repeat(LEAF * LEAF);
+        let mut mask = vec![0; Leaves::mask_len(size)];
+        let mut data = Vec::new();
+        let mut leaf = Vec::with_capacity(LEAF * LEAF);
+        for (i, [xs, ys]) in leaves(size).enumerate() {
+            leaf.clear();
+            for y in ys {
+                let row = y * width + xs.start..y * width + xs.end;
+                let (a, colour) = (&pixels.a[row.clone()], &pixels.colour[row]);
+                leaf.extend(a.iter().zip(colour).map(|(&a, &colour)| finished(a, colour)));
+            }
+            let from = data.len();
+            encoder.put(&leaf, &mut data);
+            if data[from..] == blank[..data.len() - from] {
+                data.truncate(from);
+            } else {
+                mask[i / 8] |= 1 << (i % 8);
+            }
+        }
+        let alpha_most = pixels.a.iter().fold(0.0, |most, &a| a.max(most));
+        Leaves { size, format: finish.format, mask, data, alpha_most }
+    }
+
+    /// A tile without a leaf.
+    pub fn blank(size: [u32; 2], format: PixelFormat) -> Leaves {
+        let mask = vec![0; Leaves::mask_len(size)];
+        Leaves { size, format, mask, data: Vec::new(), alpha_most: 0.0 }
+    }
+
+    /// Bytes of the mask of a tile of so many pixels.
+    pub fn mask_len(size: [u32; 2]) -> usize {
+        let [columns, rows] = size.map(|n| (n as usize).div_ceil(LEAF));
+        (columns * rows).div_ceil(8)
+    }
+
+    /// Bytes of the pixels of a mask's leaves; at most all of the tile.
+    pub fn data_len(size: [u32; 2], format: PixelFormat, mask: &[u8]) -> usize {
+        let leaves = leaves(size).enumerate().filter(|(i, _)| there(mask, *i));
+        format.bytes() * leaves.map(|(_, [xs, ys])| xs.len() * ys.len()).sum::<usize>()
+    }
+
+    /// Number of pixels of the tile.
+    pub fn pixels(&self) -> usize {
+        self.size[0] as usize * self.size[1] as usize
+    }
+
+    /// Whether the parts fit each other; says what does not.
+    pub fn check(&self) -> Result<(), &'static str> {
+        let leaves = leaves(self.size).count();
+        if self.mask.len() != Leaves::mask_len(self.size) {
+            return Err("a mask that is not of its tile");
+        }
+        if (leaves..8 * self.mask.len()).any(|i| there(&self.mask, i)) {
+            return Err("a leaf beyond its tile");
+        }
+        if self.data.len() != Leaves::data_len(self.size, self.format, &self.mask) {
+            return Err("more or fewer bytes than its leaves have");
+        }
+        if !self.alpha_most.is_finite() {
+            return Err("an opacity that is not finite");
+        }
+        Ok(())
+    }
+
+    /// Writes the leaves that are there into the rows of a picture of `width` pixels.
+    ///
+    /// # Panics
+    /// If the parts do not fit each other, or the tile leaves the picture.
+    fn write(&self, tile: Rect, width: usize, picture: &mut [u8]) {
+        let bytes = self.format.bytes();
+        let mut data = &self.data[..];
+        for (_, [xs, ys]) in leaves(self.size).enumerate().filter(|(i, _)| there(&self.mask, *i)) {
+            for y in ys {
+                let (row, rest) = data.split_at(xs.len() * bytes);
+                let at = (tile.y0 as usize + y) * width + tile.x0 as usize + xs.start;
+                picture[at * bytes..at * bytes + row.len()].copy_from_slice(row);
+                data = rest;
+            }
+        }
+    }
+}
+
+/// A picture of finished tiles; the background is where none is.
+///
+/// # Panics
+/// As [`Leaves::write`], and if a tile has another format.
+pub(crate) fn compose(size: [u32; 2], tiles: &[(Rect, Leaves)], finish: &Finish) -> Vec<u8> {
+    let [w, h] = size.map(|n| n as usize);
+    let blank = finish.blank();
+    let mut picture = if blank.iter().all(|b| *b == blank[0]) {
+        vec![blank[0]; w * h * blank.len()]
+    } else {
+        blank.repeat(w * h)
+    };
+    for (tile, leaves) in tiles {
+        assert!(leaves.format == finish.format, "a frame has one format");
+        leaves.write(*tile, w, &mut picture);
+    }
+    picture
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::image::{COLOUR_UNIT, FrameState};
+
+    const FORMATS: [PixelFormat; 4] =
+        [PixelFormat::Rgb8, PixelFormat::Rgba8, PixelFormat::Rgba16, PixelFormat::Rgba32F];
+
+    /// Pixels of every kind, some leaves without any; the last pixels of a leaf are almost nothing.
+    fn pixels(tile: Rect, seed: u32) -> TilePixels {
+        let mut x = seed;
+        let mut next = move || {
+            x = x.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            x >> 4
+        };
+        let (mut a, mut colour) = (Vec::new(), Vec::new());
+        for y in 0..tile.height() {
+            for x in 0..tile.width() {
+                let there = match (x / LEAF + y / LEAF) % 4 {
+                    0 => 0.0,
+                    1 => 1.0,
+                    2 => [0.0, 1.0, next() as f32 * COLOUR_UNIT][(x + y) % 3],
+                    // Rounds to the background in 8 bits.
+                    _ => 1e-7,
+                };
+                a.push(there);
+                colour.push([0; 3].map(|_: u32| (next() as f32 * there) as u32));
+            }
+        }
+        TilePixels { a, colour, last: None }
+    }
+
+    #[test]
+    fn tiles_that_workers_finish_make_the_bytes_of_the_masters_picture() {
+        let size = [90, 61];
+        let tiles = [
+            Rect::new(0, 0, 64, 32),
+            Rect::new(64, 0, 90, 32),
+            Rect::new(0, 32, 64, 61),
+            // One that never came: (64, 32) to (90, 61); and one that lies over it in part.
+            Rect::new(70, 40, 75, 59),
+        ];
+        for format in FORMATS {
+            for background in [
+                Background::Transparent,
+                Background::Colour([0.0; 3]),
+                Background::Colour([0.2, 0.5, 1.0]),
+            ] {
+                let finish = Finish { format, background };
+                let (mut sums, mut done) = (FrameState::new(size), FrameState::new(size));
+                let (mut left_out, mut all) = (0, 0);
+                for (tile, seed) in tiles.into_iter().zip(1..) {
+                    let pixels = pixels(tile, seed);
+                    let size = [tile.width() as u32, tile.height() as u32];
+                    let leaves = Leaves::of(&pixels, size, &finish);
+                    assert_eq!(leaves.check(), Ok(()));
+                    assert_eq!(leaves.pixels(), tile.area());
+                    left_out += tile.area() - leaves.data.len() / format.bytes();
+                    all += tile.area();
+                    sums.lay(tile, pixels);
+                    done.lay_finished(tile, leaves);
+                }
+                assert!(left_out > all / 8 && left_out < all, "{left_out} of {all} pixels");
+                let want = sums.encode(&finish, true);
+                assert_eq!(want.bytes, sums.finish().encode(format, background));
+                assert_eq!(want.sha256, Some(sums.finish().sha256()));
+                let plain = sums.encode(&finish, false);
+                assert_eq!((plain.bytes, plain.sha256), (want.bytes.clone(), None));
+                let composed = done.encode(&finish, false);
+                assert_eq!((composed.bytes, composed.sha256), (want.bytes, None));
+                assert_eq!(done.alpha_most(), sums.alpha_most());
+            }
+        }
+    }
+
+    #[test]
+    fn a_frame_that_nothing_came_of_is_background() {
+        let finish =
+            Finish { format: PixelFormat::Rgb8, background: Background::Colour([1.0, 0.5, 0.0]) };
+        let state = FrameState::new([33, 5]);
+        assert_eq!(state.encode(&finish, false).bytes, state.encode(&finish, true).bytes);
+        let mut laid = FrameState::new([33, 5]);
+        let tile = Rect::new(0, 0, 33, 5);
+        laid.lay_finished(tile, Leaves::blank([33, 5], PixelFormat::Rgb8));
+        assert_eq!(laid.encode(&finish, false).bytes, state.encode(&finish, true).bytes);
+    }
+
+    #[test]
+    fn parts_that_do_not_fit_are_named() {
+        let tile = Rect::new(0, 0, 40, 20);
+        let finish = Finish { format: PixelFormat::Rgba8, background: Background::Transparent };
+        let good = Leaves::of(&pixels(tile, 3), [40, 20], &finish);
+        assert_eq!(good.mask.len(), 1, "six leaves");
+        let broken = |change: fn(&mut Leaves)| {
+            let mut leaves = good.clone();
+            change(&mut leaves);
+            leaves.check().unwrap_err()
+        };
+        assert!(broken(|l| l.mask.push(0)).contains("mask"));
+        assert!(broken(|l| l.mask[0] |= 1 << 6).contains("beyond"));
+        assert!(broken(|l| drop(l.data.pop())).contains("bytes"));
+        assert!(broken(|l| l.mask[0] ^= 1).contains("bytes"));
+        assert!(broken(|l| l.alpha_most = f32::NAN).contains("finite"));
+        assert!(broken(|l| l.format = PixelFormat::Rgb8).contains("bytes"));
+    }
+}

@@ -16,7 +16,7 @@ use slabcast_common::tween::Tween;
 use slabcast_common::view::View;
 use slabcast_common::volume::Volume;
 use slabcast_common::wanted::Wanted;
-use slabcast_master::jobs::{JobState, WatchItem};
+use slabcast_master::jobs::{FinishedFrame, JobState, WatchItem};
 use slabcast_master::{Handle, Master, MasterConfig};
 use slabcast_proto::convert::{self, Bricks, Down};
 use slabcast_proto::v1;
@@ -263,6 +263,76 @@ async fn the_codec_inside_the_embedded_link_changes_nothing() {
         assert_eq!(hashes(&run(&handle, ask).await), want);
     }
     master.shutdown().await;
+}
+
+/// Runs a job to its end; its frames in order.
+async fn frames(handle: &Handle, request: PathRequest) -> Vec<Arc<FinishedFrame>> {
+    let job = handle.submit(request).await.expect("a good request");
+    let mut watch = handle.watch(job, 0).expect("a job that was just submitted");
+    let mut frames = Vec::new();
+    while let Some(item) = watch.next().await {
+        if let WatchItem::Frame(f) = item {
+            frames.push(f);
+        }
+    }
+    frames
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn tiles_that_come_finished_make_the_bytes_of_those_that_come_as_sums() {
+    let formats =
+        [PixelFormat::Rgb8, PixelFormat::Rgba8, PixelFormat::Rgba16, PixelFormat::Rgba32F];
+    let (mut of_sums, mut of_finished) = (0, 0);
+    for over_codec in [false, true] {
+        let master = master();
+        let handle = master.handle();
+        let (_stop, stopped) = watch::channel(false);
+        let _embedded = (!over_codec).then(|| embed(&handle, config("a", 2)));
+        if over_codec {
+            let link = through_codec(&handle);
+            tokio::spawn(async move {
+                let mut cache = BrickCache::default();
+                slabcast_worker::run(&config("codec", 2), link, &mut cache, stopped).await
+            });
+        }
+        for (i, format) in formats.into_iter().enumerate() {
+            let backgrounds = [
+                Background::Transparent,
+                Background::Colour([0.0; 3]),
+                Background::Colour([0.3, 0.9, 0.1]),
+            ];
+            for (j, background) in backgrounds.into_iter().enumerate() {
+                let ask = |schedule: Schedule, want_hash: bool| {
+                    let key = format!("{over_codec} {i} {j} {schedule:?} {want_hash}");
+                    let work = Work { schedule, ..Work::default() };
+                    let ask = request(&key, ProjectionKind::Ortho, work);
+                    PathRequest { format, background, want_hash, ..ask }
+                };
+                let sums = frames(&handle, ask(Schedule::Region, true)).await;
+                let finished = frames(&handle, ask(Schedule::Region, false)).await;
+                let slabs = frames(&handle, ask(Schedule::Slab, false)).await;
+                assert_eq!(sums.len(), 3);
+                for ((sums, finished), slabs) in sums.iter().zip(&finished).zip(&slabs) {
+                    assert_eq!(sums.bytes.len(), 150 * 110 * format.bytes());
+                    assert!(sums.bytes == finished.bytes, "{format:?} over {background:?}");
+                    assert!(sums.bytes == slabs.bytes, "{format:?} over {background:?}");
+                    assert_eq!(sums.stats.pixels_sha256.len(), 64);
+                    assert_eq!(finished.stats.pixels_sha256, "");
+                    assert_eq!(slabs.stats.pixels_sha256, "");
+                    assert_eq!(finished.stats.view_sha256, sums.stats.view_sha256);
+                    assert_eq!(finished.stats.error, sums.stats.error, "bounds know A's most");
+                    let bytes = [&sums.stats, &finished.stats].map(|s| s.result_bytes);
+                    assert!(bytes.iter().all(|b| b.is_some() == over_codec), "{bytes:?}");
+                    if format == PixelFormat::Rgb8 {
+                        of_sums += bytes[0].unwrap_or(0);
+                        of_finished += bytes[1].unwrap_or(0);
+                    }
+                }
+            }
+        }
+        master.shutdown().await;
+    }
+    assert!(of_finished * 3 < of_sums, "{of_finished} bytes, and {of_sums} of sums");
 }
 
 /// The hashes of the serial renderer when each frame is a job of its own: bricks of its own

@@ -663,13 +663,7 @@ mod tests {
 
         fn region_of(&self, frame: FrameId, task: u64, tile: Rect) {
             let (task, epoch) = (TaskId(task), Epoch(0));
-            self.say(ToWorker::Region(RegionLease {
-                task,
-                epoch,
-                frame,
-                tile,
-                estimate: false,
-            }));
+            self.say(ToWorker::Region(RegionLease { task, epoch, frame, tile, estimate: false }));
         }
 
         async fn result(&mut self) -> Box<TileResult> {

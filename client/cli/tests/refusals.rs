@@ -439,6 +439,7 @@ const OUTPUTS: &[(i32, &[&str], &[&str])] = &[
     (2, &["-o", "a.JPG", "--azimuth", "0"], &["-o", "a.JPG", ".png"]),
     (2, &["-o", "-", "--format", "png"], &["--format", "pipe"]),
     (2, &["-o", "-", "--stats", "-"], &["--stats", "stdout"]),
+    (2, &["--no-hash"], &["--stats"]),
     (2, &["-o", "a.y4m", "--background", "transparent"], &["--background", "colour"]),
     (2, &["-o", "a.exr", "--azimuth", "0", "--background", "1,0,0"], &["--background", "EXR"]),
     (2, &["-o", "good.nrrd", "--format", "y4m"], &["-o", "turn.y4m"]),

@@ -58,6 +58,36 @@ fn rerender_gives_the_same_bytes_of_the_whole_file() {
 }
 
 #[test]
+fn a_picture_is_the_same_file_whether_it_is_hashed_or_not() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    for (ending, format) in [("png", "png"), ("png", "png16"), ("exr", "exr")] {
+        let file = |name: &str| format!("{format}-{name}.{ending}");
+        let view = ["--azimuth", "7", "--format", format, "--stats"];
+        let hashed = file("hashed");
+        render(dir, &[&view[..], &["s.jsonl", "-o", &hashed]].concat());
+        let plain = file("plain");
+        render(dir, &[&view[..4], &["-o", &plain]].concat());
+        let by_slabs = file("slabs");
+        render(dir, &[&view[..4], &["--schedule", "slab", "-o", &by_slabs]].concat());
+        let read = |name: &str| std::fs::read(dir.join(name)).unwrap();
+        assert!(read(&hashed) == read(&plain) && read(&plain) == read(&by_slabs), "{format}");
+        let stats: serde_json::Value = serde_json::from_slice(&read("s.jsonl")).unwrap();
+        assert_eq!(stats["pixels_sha256"].as_str().map(str::len), Some(64));
+        // Nothing crossed a network.
+        assert_eq!(stats["result_bytes"], serde_json::Value::Null);
+        let said = good(dir, &["rerender", &plain, "--show"]);
+        let said: serde_json::Value = serde_json::from_str(&said).unwrap();
+        assert_eq!(said["picture_sha256"].as_str().map(str::len), Some(64));
+        assert_eq!(said.get("pixels_sha256"), None);
+        // Floats are what the linear picture's hash is over.
+        if format == "exr" {
+            assert_eq!(said["picture_sha256"], stats["pixels_sha256"]);
+        }
+    }
+}
+
+#[test]
 fn another_volume_is_refused_with_both_digests() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();

@@ -20,7 +20,7 @@
 //!
 //! **Pixels are not stored.** Of a result's planes the scheduler looks at two things: whether
 //! they have the tile's size and are finite, and which pixels are shut. So a result keeps its
-//! lengths and one bit a pixel, as runs. What leases carry of other pixels is not compared either:
+//! lengths and one bit a pixel, as runs; of finished pixels it keeps their size and format. What leases carry of other pixels is not compared either:
 //! a decision is who gets which tile, with which bricks, when.
 //!
 //! **The driver never waits for the disk.** It puts down what it has in hand and goes on; a thread
@@ -47,8 +47,8 @@ use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{Action, Event};
 use std::fmt;
 
-/// Version of the file's format.
-const VERSION: u32 = 1;
+/// Version of the file's format. Since 2 results may be finished, and statistics count their bytes.
+const VERSION: u32 = 2;
 
 /// Entries between driver and disk: some twenty frames' of 512x512, 4 MiB where tiles are shut in
 /// patterns. At a tenth, one slow `fsync` of somebody else's cuts the record.

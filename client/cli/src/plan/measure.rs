@@ -402,3 +402,111 @@ pub(crate) fn fits(trace: &Trace, jobs: &[FrameJob]) -> Result<(), String> {
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::local::{self, Cut};
+    use crate::request::Asked;
+    use slabcast_common::path::{Axis, Orientation, Turntable, ViewPath};
+
+    /// Bytes of a frame's results and what a tile takes to write and to read, for docs/scaling.md.
+    #[test]
+    #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_a_tile -- --ignored --nocapture"]
+    fn what_a_tile_weighs_and_takes_to_pack() {
+        let data = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
+        println!(
+            "KB a frame: sums, finished, packed. us a tile: sums written, sums read, finished,"
+        );
+        println!("packed and written, noise written, read. ms a frame: composed");
+        for (file, axis, tf) in [
+            ("mri256.nrrd", "-y", "peer-opaque"),
+            ("mouse_skull.nrrd", "+z", "peer-skull"),
+            ("aneurism.nrrd", "+z", "peer-vessels"),
+        ] {
+            let file = data.join(file);
+            if !file.exists() {
+                println!("skipped: {} is not here", file.display());
+                continue;
+            }
+            let volume = crate::volume::open(&file).expect("a volume");
+            let info = volume.info(volume.digest());
+            let up = axis.parse::<Axis>().expect("an axis");
+            let orientation = Orientation::new(Some(up), None).expect("axes");
+            let turn = Turntable { frames: 4, step: 22.5, ..Turntable::default() };
+            let asked = Asked::plain(ViewPath::turn([512, 512], turn), tf).expect("a request");
+            let stage = Stage::new(&volume, &info, &asked, orientation).expect("a stage");
+            let (mut bytes, mut ns, mut composed, mut tiles) = ([0; 3], [0; 6], 0, 0);
+            for i in 0..4 {
+                let frame = stage.frame(i).expect("a frame");
+                let picture = local::picture(&frame, &stage.bricks, Cut::on(2));
+                let mut state = FrameState::new([512, 512]);
+                for (rect, sums) in tiles_of(&picture.pixels) {
+                    tiles += 1;
+                    let (finishing, leaves) = shortest(9, || Leaves::of(&sums, [64, 64], &FINISH));
+                    let noise = Leaves { data: noise(leaves.data.len()), ..leaves.clone() };
+                    let (sums_ns, of_sums) = write(Pixels::Sums(sums));
+                    let (packing, packed) = write(Pixels::Finished(leaves.clone()));
+                    let (hopeless, _) = write(Pixels::Finished(noise));
+                    let each =
+                        [sums_ns, read(&of_sums), finishing, packing, hopeless, read(&packed)];
+                    ns.iter_mut().zip(each).for_each(|(sum, one)| *sum += one);
+                    let plain = leaves.data.len() + leaves.mask.len() + 40;
+                    let each = [of_sums.len(), plain, packed.len()];
+                    bytes.iter_mut().zip(each).for_each(|(sum, one)| *sum += one);
+                    state.lay_finished(rect, leaves);
+                }
+                composed += shortest(9, || state.encode(&FINISH, false)).0;
+            }
+            println!(
+                "{tf}, {} tiles: {:.0?}; {:.1?}; {:.2}",
+                tiles / 4,
+                bytes.map(|b| b as f64 / 4e3),
+                ns.map(|n| n as f64 / 1e3 / f64::from(tiles)),
+                composed as f64 / 4e6
+            );
+        }
+    }
+
+    /// The tiles of a picture of 512x512 in which something is, as sums.
+    fn tiles_of(picture: &[[f32; 4]]) -> Vec<(Rect, TilePixels)> {
+        let corners = (0..512).step_by(64).flat_map(|y| (0..512).step_by(64).map(move |x| (x, y)));
+        let tile = |(x, y): (i32, i32)| {
+            let at = |i: usize| picture[(y as usize + i / 64) * 512 + x as usize + i % 64];
+            let fixed = |c: f32| (c * (1u32 << 28) as f32) as u32;
+            let a: Vec<f32> = (0..64 * 64).map(|i| at(i)[3]).collect();
+            let colour = (0..64 * 64).map(|i| [0, 1, 2].map(|c| fixed(at(i)[c]))).collect();
+            let there = a.iter().any(|a| *a > 0.0);
+            there.then(|| (Rect::new(x, y, x + 64, y + 64), TilePixels { a, colour, last: None }))
+        };
+        corners.filter_map(tile).collect()
+    }
+
+    fn write(pixels: Pixels) -> (u64, Vec<u8>) {
+        let (task, epoch, times) = (TaskId(1 << 12), Epoch(0), TaskTimes::default());
+        let (bytes, counters, region) = (None, Counters::default(), None);
+        let result = TileResult { task, epoch, pixels, bytes, counters, times, region };
+        let result = ToMaster::Result(Box::new(result));
+        shortest(9, || convert::from_worker_to_wire(&result).encode_to_vec())
+    }
+
+    fn read(bytes: &[u8]) -> u64 {
+        let read = || {
+            let message = slabcast_proto::v1::FromWorker::decode(bytes).expect("written above");
+            convert::from_worker_from_wire(message).expect("written above")
+        };
+        shortest(9, read).0
+    }
+
+    /// Bytes that nothing packs.
+    fn noise(n: usize) -> Vec<u8> {
+        let mut x = 1u64;
+        let next = || {
+            x ^= x << 13;
+            x ^= x >> 7;
+            x ^= x << 17;
+            (x >> 32) as u8
+        };
+        std::iter::repeat_with(next).take(n).collect()
+    }
+}

@@ -748,7 +748,7 @@ mod tests {
         let results = [world.result().await, world.result().await];
         for (result, task) in results.iter().zip([1, 2]) {
             assert_eq!((result.task, result.pixels.len()), (TaskId(task), 512));
-            assert!(sums(&result).a.iter().any(|&a| a > 0.9) && sums(result).last.is_none());
+            assert!(sums(result).a.iter().any(|&a| a > 0.9) && sums(result).last.is_none());
             let cost = result.region.as_ref().expect("of a region");
             assert_eq!(cost.touched, [0, 1]);
             // The second may have been begun when all was here.

@@ -38,6 +38,7 @@ pub enum Down {
 }
 
 /// What comes down the Bricks stream.
+#[expect(clippy::large_enum_variant, reason = "it is taken apart where it comes")]
 #[derive(Clone, Debug)]
 pub enum Bricks {
     /// Bricks.

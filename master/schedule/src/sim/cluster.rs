@@ -38,6 +38,7 @@ impl Clock for VirtualClock {
 }
 
 /// What reaches somebody at a time.
+#[expect(clippy::large_enum_variant, reason = "a frame's view, once a frame and worker")]
 enum Coming {
     /// A message is at the master's end of the link, so many bytes.
     AtMaster(WorkerId, Event, u64),

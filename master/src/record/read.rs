@@ -391,8 +391,8 @@ fn queued(job: NotedJob, seen: &mut Seen) -> Result<FrameJob, String> {
 fn finished(r: &NotedResult) -> Result<Option<Leaves>, String> {
     let Some((size, format, fits)) = r.finished else { return Ok(None) };
     let n = u64::from(size[0]) * u64::from(size[1]);
-    if n > 2 * convert::MAX_TILE_PIXELS as u64 {
-        return Err("its leaves are more than the wire lets through".into());
+    if n == 0 || n > 2 * convert::MAX_TILE_PIXELS as u64 {
+        return Err("its leaves are none, or more than the wire lets through".into());
     }
     let mut leaves = Leaves::blank(size, format);
     if !fits {

@@ -152,6 +152,13 @@ impl Quality {
         }
     }
 
+    /// Whether 16-bit sums have room for a sheet's ripple: not that of a tent, of a Gaussian that is
+    /// narrow or wide, or of opacities that add up to more than one.
+    pub fn fits_short(&self) -> bool {
+        let even = self.kernel != Kernel::Gaussian || (self.std >= 0.5 && self.radius <= 2.0);
+        self.compositing != Compositing::Paper && self.kernel != Kernel::Tent && even
+    }
+
     /// Checks ranges and names what this version does not draw yet.
     pub fn check(&self) -> Result<(), Refused> {
         // From vox/64 to thicker than any volume (DESIGN.md section 5).

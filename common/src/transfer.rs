@@ -3,9 +3,9 @@
 use crate::brick::Brick;
 use crate::gradient::decode_magnitude;
 use crate::math::linear_from_srgb;
-use crate::quality::{Compositing, Refused, Sums, json_error};
+use crate::quality::{Compositing, Quality, Refused, Sums, json_error};
 use crate::shade::Shading;
-use crate::volume::{SampleKind, Samples, ValueSummary, VolumeInfo};
+use crate::volume::{Lattice, SampleKind, Samples, ValueSummary, VolumeInfo};
 use serde::{Deserialize, Serialize};
 
 /// Cap of the extinction per vox: 16 ln 2, an alpha of `1 - 2^-16` (DESIGN.md section 1). It is
@@ -449,14 +449,54 @@ impl Classifier {
         self.uncapped
     }
 
-    /// What sheets add in, decided from what was asked for: integers wherever extinctions are
-    /// capped, else floats.
+    /// About how far a picture is off at most because sheets of `thickness` vox add 16-bit integers, in
+    /// 1/255, where rays go through `depth` vox of the volume: for a largest extinction s and a faintest f
+    /// that occur, per vox,
+    ///
+    /// ```text
+    /// s (0.25 sqrt(thickness) + 0.006 min(depth, 1 / f))
+    /// ```
+    ///
+    /// (NUMERICS.md section 3; fitted to real volumes, not a bound.) What is faint beside the strongest is
+    /// rounded most, and the same way sheet after sheet, until little is seen of what is behind it.
+    pub fn short_error(&self, thickness: f64, depth: f64) -> f64 {
+        let seen = self.faintest().map_or(depth, |f| depth.min(1.0 / f));
+        self.payload_max * (0.25 * thickness.sqrt() + 0.006 * seen)
+    }
+
+    /// The smallest extinction above zero that the volume's samples have, per vox, where a table and a
+    /// histogram say so.
+    fn faintest(&self) -> Option<f64> {
+        if self.table.is_empty() || self.is_modulated() {
+            return None;
+        }
+        let occurs = |code: usize| {
+            let code = code as f64;
+            let range = self.summary.min_code..=self.summary.max_code;
+            range.contains(&code) && self.summary.histogram[self.summary.bin(code)] > 0
+        };
+        let seen = self.table.iter().enumerate().filter(|(code, l)| l.sigma > 0.0 && occurs(*code));
+        seen.map(|(_, l)| f64::from(l.sigma)).min_by(f64::total_cmp)
+    }
+
+    /// What sheets add in, decided from `quality` and the volume's `lattice`: what was asked for, or
+    /// floats where extinctions are not capped, 16-bit integers where they have room
+    /// ([`Quality::fits_short`]) and [round away](Classifier::short_error) at most twice what the cut-off
+    /// may cost (so a 255th at the default eps of 1/512, and never more than three), and 32-bit integers
+    /// else. Thinner sheets are there to be nearer to the limit: for these it is that times the square of
+    /// their thickness.
     ///
     /// # Errors
     /// Integers asked for where they can't hold the extinction.
-    pub fn sums(&self, asked: Sums) -> Result<Sums, Refused> {
-        match asked {
+    pub fn sums(&self, quality: &Quality, lattice: &Lattice) -> Result<Sums, Refused> {
+        let d = quality.thickness;
+        let enough = (2.0 * 255.0 * quality.eps).min(3.0) * (d * d).min(1.0);
+        let depth = lattice.diagonal() / lattice.vox();
+        match quality.sums {
             Sums::Auto if self.uncapped => Ok(Sums::F32),
+            Sums::Auto if quality.fits_short() && self.short_error(d, depth) <= enough => {
+                Ok(Sums::I16)
+            }
             Sums::Auto => Ok(Sums::I32),
             Sums::I32 | Sums::I16 if self.uncapped => Err(Refused::new(
                 "sums",
@@ -576,7 +616,8 @@ mod tests {
     use super::*;
     use crate::math::srgb_from_linear;
     use crate::presets;
-    use crate::volume::{Digest32, Lattice, ValueMap, Volume};
+    use crate::quality::Kernel;
+    use crate::volume::{Digest32, ValueMap, Volume};
     use proptest::prelude::*;
 
     fn info(samples: Samples) -> VolumeInfo {
@@ -639,8 +680,47 @@ mod tests {
         let c = Classifier::new(&tf, &info, Compositing::Linear);
         assert_eq!(c.look(&Samples::U8(vec![3]), 0).sigma, 1e6);
         assert!(c.uncapped());
-        assert_eq!(c.sums(Sums::Auto), Ok(Sums::F32));
-        assert_eq!(c.sums(Sums::I32).unwrap_err().field, "sums");
+        let sums = |sums| c.sums(&Quality { sums, ..Quality::default() }, &info.lattice);
+        assert_eq!(sums(Sums::Auto), Ok(Sums::F32));
+        assert_eq!(sums(Sums::I32).unwrap_err().field, "sums");
+    }
+
+    #[test]
+    fn sixteen_bits_are_for_scenes_that_they_round_little_of() {
+        // All codes occur; 100 vox from corner to corner.
+        let mut info = info(Samples::U8((0..=255).collect()));
+        info.lattice = Lattice::from_spacing([58; 3], [2.0; 3]);
+        let sums = |points: Vec<[f64; 2]>, quality: Quality| {
+            Classifier::new(&tf(points), &info, quality.compositing).sums(&quality, &info.lattice)
+        };
+        let q = Quality::default();
+        let ramp = |top| vec![[0.0, 0.0], [255.0, top]];
+        // One opacity: nothing is faint beside it.
+        let step = |top| vec![[100.0, 0.0], [100.0, top]];
+        assert_eq!(sums(ramp(0.06), q), Ok(Sums::I16));
+        assert_eq!(sums(ramp(0.9), q), Ok(Sums::I32));
+        assert_eq!(sums(step(0.9), q), Ok(Sums::I16));
+        assert_eq!(sums(step(0.9999), q), Ok(Sums::I32));
+        // Fog before a solid.
+        assert_eq!(
+            sums(vec![[50.0, 0.0], [50.0, 0.01], [200.0, 0.01], [200.0, 0.9]], q),
+            Ok(Sums::I32)
+        );
+        // Nearer to the limit: less may be lost.
+        for finer in [
+            Quality { eps: 0.0, ..q },
+            Quality { eps: 1.0 / 65536.0, ..q },
+            Quality { thickness: 0.125, ..q },
+            Quality { compositing: Compositing::Paper, ..q },
+            Quality { kernel: Kernel::Tent, ..q },
+            Quality { std: 0.4, ..q },
+        ] {
+            assert_eq!(sums(ramp(0.06), finer), Ok(Sums::I32), "{finer:?}");
+        }
+        assert_eq!(sums(ramp(0.9), Quality { eps: 1.0 / 32.0, ..q }), Ok(Sums::I16));
+        // What was asked for is kept.
+        assert_eq!(sums(ramp(0.9), Quality { sums: Sums::I16, ..q }), Ok(Sums::I16));
+        assert_eq!(sums(ramp(0.06), Quality { sums: Sums::I32, ..q }), Ok(Sums::I32));
     }
 
     #[test]

@@ -85,11 +85,12 @@ impl Tween {
 
     /// The scene of a frame, on the bricks of `base`, which is that of all frames but for the
     /// function. `sums` as they were asked for: the keys can have them, and no mean of two keys is
-    /// less capped than both.
+    /// less capped than both. Where they are decided it is for each frame.
     pub fn scene(&self, base: &SceneSpec, sums: Sums, frame: f64) -> SceneSpec {
         let transfer = self.at(frame);
         let classifier = Classifier::new(&transfer, &base.volume, base.quality.compositing);
-        let sums = classifier.sums(sums).unwrap_or(base.quality.sums);
+        let asked = Quality { sums, ..base.quality };
+        let sums = classifier.sums(&asked, &base.volume.lattice).unwrap_or(base.quality.sums);
         SceneSpec { transfer, quality: Quality { sums, ..base.quality }, ..base.clone() }
     }
 

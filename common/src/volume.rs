@@ -73,6 +73,16 @@ impl Lattice {
         (0..3).map(|a| s[a] * self.dims[a] as f64).fold(0.0, f64::max)
     }
 
+    /// The longest way through the volume, from corner to corner, in world units (N samples count as N
+    /// spacings).
+    pub fn diagonal(&self) -> f64 {
+        let [a, b, c] = [0, 1, 2].map(|i| self.steps[i] * f64::from(self.dims[i]));
+        [a + b + c, a + b - c, a - b + c, -a + b + c]
+            .map(DVec3::length)
+            .into_iter()
+            .fold(0.0, f64::max)
+    }
+
     /// Whether the lattice is cubic: equal spacings and right angles, to 1 part in 1000 (files
     /// carry spacings rounded to some digits). Other lattices are drawn with a kernel that is
     /// only the projection of the true one on the eye's axes, until footprint tables come.

@@ -705,7 +705,8 @@ impl Driver {
         let tween = Tween::of(&request.path, &info.summary)?;
         let mut sums = request.quality.sums;
         for tf in tween.iter().flat_map(Tween::ends).chain([&transfer]) {
-            sums = Classifier::new(tf, info, compositing).sums(request.quality.sums)?;
+            let classifier = Classifier::new(tf, info, compositing);
+            sums = classifier.sums(&request.quality, &info.lattice)?;
         }
         let quality = Quality { sums, ..request.quality };
         let wanted = Wanted::of_path(&request.path, &transfer, tween.as_ref(), info, compositing)?

@@ -58,7 +58,8 @@ impl Shot {
         (wide, scale): (u32, f64),
     ) -> Shot {
         let info = volume.info(Digest32::default());
-        let sums = Classifier::new(&transfer, &info, quality.compositing).sums(Sums::Auto).unwrap();
+        let sums = Classifier::new(&transfer, &info, quality.compositing);
+        let sums = sums.sums(&Quality { eps: 0.0, ..quality }, &info.lattice).unwrap();
         let quality = Quality { eps: 0.0, sums, ..quality };
         let n = (f64::from(wide + 8) * scale) as u32;
         let projection = CameraProjection::Ortho { height: f64::from(n) / scale };

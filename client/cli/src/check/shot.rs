@@ -77,7 +77,7 @@ impl Drawn {
         wanted: &Wanted,
     ) -> Result<Drawn, Fail> {
         let classifier = Classifier::new(transfer, info, quality.compositing);
-        let sums = classifier.sums(quality.sums).map_err(|e| Fail::flag(&e))?;
+        let sums = classifier.sums(&quality, &info.lattice).map_err(|e| Fail::flag(&e))?;
         let store = BrickStore::build(volume, info.digest, wanted);
         let bricks = store.infos().iter().filter_map(|i| store.brick(i.id)).collect();
         let spec = SceneSpec {

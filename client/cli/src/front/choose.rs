@@ -18,7 +18,7 @@ use crate::parse;
 use crate::progress::{self, Progress};
 use crate::request::Asked;
 use slabcast_common::path::Orientation;
-use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
+use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::volume::{Volume, VolumeInfo};
 use std::sync::Arc;
 use std::time::Instant;
@@ -106,9 +106,7 @@ pub(crate) struct Chosen {
 /// for a sheet.
 pub(super) fn ladder(base: &Setting, size: [u32; 2]) -> Vec<Setting> {
     let b = base.quality;
-    let short = b.compositing != Compositing::Paper
-        && b.kernel != Kernel::Tent
-        && (b.kernel != Kernel::Gaussian || (b.std >= 0.5 && b.radius <= 2.0));
+    let short = b.fits_short();
     let few = if short { Sums::I16 } else { Sums::Auto };
     let rungs: [(u32, f64, f64, Sums); 16] = [
         (4, 4.0, 1.0 / 16.0, few),
@@ -372,6 +370,7 @@ pub(crate) fn settle(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use slabcast_common::quality::Kernel;
 
     #[test]
     fn the_ladder_goes_from_coarse_to_fine_and_may_be_drawn() {

@@ -308,7 +308,7 @@ impl Lab {
         let info = self.info.clone();
         let spec = self.stage(setting)?.spec(view);
         let classifier = Classifier::new(&spec.transfer, &info, quality.compositing);
-        let sums = classifier.sums(quality.sums).map_err(|e| Fail::flag(&e))?;
+        let sums = classifier.sums(&quality, &info.lattice).map_err(|e| Fail::flag(&e))?;
         let quality = Quality { sums, ..quality };
         Ok(Way { scene: Arc::new(Scene::new(&SceneSpec { quality, ..spec })), quality })
     }

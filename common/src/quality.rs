@@ -43,7 +43,7 @@ pub enum Splat {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Sums {
-    /// The master decides from transfer function and quality.
+    /// The master decides from transfer function and quality (`Classifier::sums`).
     Auto,
     /// 16-bit fixed point.
     I16,
@@ -188,7 +188,10 @@ impl Quality {
             ));
         }
         if self.splat != Splat::Direct {
-            return Err(Refused::new("splat", "this version draws `direct` splats only; use it"));
+            return Err(Refused::new(
+                "splat",
+                "this version draws `direct` splats only, which were faster; use them",
+            ));
         }
         Ok(())
     }

@@ -112,7 +112,9 @@ fn what_a_scene_leaves_out_changes_no_pixel() {
 fn what_is_kept_is_not_named_as_left_out() {
     let dir = tempfile::tempdir().unwrap();
     let frame = |keep: &[&str]| -> serde_json::Value {
-        let line = ["render", "formula:spheres:40", "--tf", "grey", "--azimuth", "30"];
+        // In 16-bit sums, which `auto` would take, grey is no less than three colours.
+        let line =
+            ["render", "formula:spheres:40", "--tf", "grey", "--sums", "i32", "--azimuth", "30"];
         let rest = ["--size", "80x80", "--stats", "s.jsonl", "--force", "-o", "a.png"];
         let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
             .args(line)

@@ -11,7 +11,7 @@ use slabcast_common::path::{Orientation, ProjectionKind, Turntable, ViewPath};
 use slabcast_common::presets;
 use slabcast_common::quality::{Borders, Quality, Schedule, Sums, Work};
 use slabcast_common::stats::FrameStats;
-use slabcast_common::transfer::TransferFunction;
+use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::tween::Tween;
 use slabcast_common::view::View;
 use slabcast_common::volume::Volume;
@@ -345,7 +345,9 @@ fn truth_of_each(path: &ViewPath, default: &TransferFunction) -> Vec<String> {
     let frame = |i: usize| {
         let at = (path.first_frame() + i) as f64;
         let transfer = tween.as_ref().map_or(default.clone(), |t| t.at(at));
-        let quality = Quality { sums: Sums::I32, ..Quality::default() };
+        let classifier = Classifier::new(&transfer, &info, Quality::default().compositing);
+        let sums = classifier.sums(&Quality::default(), &info.lattice).unwrap();
+        let quality = Quality { sums, ..Quality::default() };
         let crop = path.crop.map(|c| c.of(&info.lattice).unwrap());
         let wanted = Wanted { crop, ..Wanted::of(&transfer, &info, quality.compositing) };
         let store = BrickStore::build(&volume, info.digest, &wanted);

@@ -53,7 +53,7 @@ fn rerender_gives_the_same_bytes_of_the_whole_file() {
     let said = good(dir, &["rerender", "deep/frame_0000.png", "--show"]);
     let json: serde_json::Value = serde_json::from_str(&said).unwrap();
     assert_eq!(json["pixels_version"], slabcast_common::PIXELS_VERSION);
-    assert_eq!((&json["format"], &json["quality"]["sums"]), (&"png16".into(), &"i32".into()));
+    assert_eq!((&json["format"], &json["quality"]["sums"]), (&"png16".into(), &"i16".into()));
     assert!(!said.contains("spheres") && !said.contains("t.json"), "{said}");
 }
 

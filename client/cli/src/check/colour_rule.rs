@@ -6,7 +6,7 @@
 //! with the eye where it was, moves the sheets through the volume and nothing else; what then
 //! changes in the picture is seen as flicker on a slow path.
 
-use super::shot::Drawn;
+use super::shot::{Drawn, finely};
 use super::table::number;
 use crate::fail::{Fail, say};
 use crate::local::{self, Cut};
@@ -114,7 +114,7 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
     let mut limits = Vec::new();
     for (_, compositing) in [RULES[0], RULES[2]] {
         let quality = Quality { compositing, ..asked.quality };
-        let drawn = Drawn::new(&volume, &info, &transfer, quality)?;
+        let drawn = Drawn::new(&volume, &info, &transfer, finely(quality, &transfer, &info))?;
         let reference = Reference::new(&drawn.spec, view(&camera, &quality)?, &drawn.bricks);
         let reference = reference.with_what_sheets_add();
         let told = (&mut progress, limits.len() * sample.len());
@@ -129,7 +129,7 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
     for (rule, compositing) in RULES {
         for thickness in THICKNESSES {
             let quality = Quality { compositing, thickness, ..asked.quality };
-            let drawn = Drawn::new(&volume, &info, &transfer, quality)?;
+            let drawn = Drawn::new(&volume, &info, &transfer, finely(quality, &transfer, &info))?;
             let scene = Arc::new(Scene::new(&drawn.spec));
             let cut = Cut::on(if args.times { 1 } else { threads });
             let (mut pictures, mut times) = (Vec::new(), Vec::new());

@@ -13,10 +13,10 @@ use slabcast_common::ids::SceneId;
 use slabcast_common::image::Picture;
 use slabcast_common::message::{PathRequest, SceneSpec};
 use slabcast_common::path::{Orientation, PathView, ViewPath};
-use slabcast_common::quality::{Quality, Work};
+use slabcast_common::quality::{Quality, Sums, Work};
 use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::view::View;
-use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
 use slabcast_common::wanted::Wanted;
 use slabcast_render::reference::{Reference, stratified};
 use slabcast_render::{Frame, Scene, serial};
@@ -54,6 +54,16 @@ pub(crate) struct Shot {
 pub(crate) struct Drawn {
     pub(crate) spec: SceneSpec,
     pub(crate) bricks: Vec<Arc<Brick>>,
+}
+
+/// `quality` with sums of 32 bits or floats where they are for the program to decide: what is judged
+/// here is off by so little that 16 bits would show.
+pub(crate) fn finely(quality: Quality, transfer: &TransferFunction, info: &VolumeInfo) -> Quality {
+    let classifier = Classifier::new(transfer, info, quality.compositing);
+    match (quality.sums, classifier.sums(&quality, &info.lattice)) {
+        (Sums::Auto, Ok(Sums::I16)) => Quality { sums: Sums::I32, ..quality },
+        _ => quality,
+    }
 }
 
 impl Drawn {
@@ -107,7 +117,9 @@ impl Shot {
 
     /// The request that has a cluster draw it.
     pub(crate) fn request(&self, cull: bool, work: Work) -> PathRequest {
-        cluster::request(self.path(), &self.transfer, Quality { cull, ..self.quality }, work)
+        let info = self.volume.info(Digest32::default());
+        let quality = Quality { cull, ..finely(self.quality, &self.transfer, &info) };
+        cluster::request(self.path(), &self.transfer, quality, work)
     }
 
     /// Makes it ready.
@@ -123,7 +135,8 @@ impl Shot {
         let orientation = Orientation::new(None, None).map_err(refused)?;
         let camera = self.path().camera(0, &info.lattice, orientation).map_err(refused)?;
         let view = View::new(&info.lattice, &camera, self.size, &self.quality).map_err(refused)?;
-        let Drawn { spec, bricks } = Drawn::new(&self.volume, &info, &self.transfer, self.quality)?;
+        let quality = finely(self.quality, &self.transfer, &info);
+        let Drawn { spec, bricks } = Drawn::new(&self.volume, &info, &self.transfer, quality)?;
         Ok(Ready { spec, view, bricks })
     }
 

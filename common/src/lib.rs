@@ -8,6 +8,7 @@
 //! Everything here that ends up in a pixel has one result on every machine: no fused
 //! multiply-add, no platform maths library, sums in one order or in integers.
 
+pub mod blocks;
 pub mod bounds;
 pub mod brick;
 pub mod colour;

@@ -71,7 +71,8 @@ pub struct VoxelStats {
     /// Candidates that were drawn.
     pub splatted: u64,
     /// Candidates that were dropped because all they could touch was shut: with their brick at
-    /// the master or the worker, or alone.
+    /// the master or the worker, or alone. Of a block of bricks that a part of the picture never looked
+    /// into, the part counts as much as it has of the block's rectangle.
     pub culled: u64,
 }
 

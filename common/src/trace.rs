@@ -21,8 +21,9 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
 
-/// Version of the format. Since 2 regions' results weigh what finished pixels do.
-pub const VERSION: u32 = 2;
+/// Version of the format. Since 2 regions' results weigh what finished pixels do, since 3 their times have
+/// no look at bricks in them.
+pub const VERSION: u32 = 3;
 
 /// Largest trace that is read, in bytes: 1000 frames with tiles of 16 pixels.
 pub const MAX_BYTES: u64 = 1 << 30;
@@ -76,10 +77,14 @@ pub struct FrameTrace {
     pub alone_edge: u32,
     /// Its slabs, front to back: for the `slab` schedule.
     pub slabs: Vec<SlabTrace>,
-    /// To look at the directory of bricks, which each worker does once a frame under the `region`
+    /// To look at the directory's blocks of bricks, which each worker does once a frame under the `region`
     /// schedule, in nanoseconds.
     #[serde(default)]
     pub outlook_ns: u64,
+    /// To look at one block's bricks, in nanoseconds: a mean. A worker does so for each block that its
+    /// tiles open, once a frame.
+    #[serde(default)]
+    pub block_ns: u64,
     /// Tiles through all depths: for the `region` schedule.
     #[serde(default)]
     pub regions: Vec<RegionLevel>,
@@ -120,39 +125,47 @@ pub struct RegionLevel {
     pub tiles: Vec<RegionTile>,
 }
 
-/// One tile through all depths: `[x, y, ns, result bytes, touched]`.
+/// A tile as it is written: places as differences to the one before.
+type Written = (u32, u32, u64, u32, Vec<u32>, Vec<u32>);
+
+/// One tile through all depths: `[x, y, ns, result bytes, touched, opened]`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(from = "(u32, u32, u64, u32, Vec<u32>)", into = "(u32, u32, u64, u32, Vec<u32>)")]
+#[serde(from = "Written", into = "Written")]
 pub struct RegionTile {
     /// Left column.
     pub x: u32,
     /// Top row.
     pub y: u32,
-    /// Time to draw it, in nanoseconds.
+    /// Time to draw it where its blocks were looked at before, in nanoseconds.
     pub ns: u64,
     /// Its result on the wire, as finished pixels.
     pub result_bytes: u32,
     /// Places of the bricks that it is drawn from, in the list of the set's bricks; ascending.
     pub touched: Vec<u32>,
+    /// Numbers of the blocks whose bricks it looks at, front to back in its frame; ascending.
+    pub opened: Vec<u32>,
 }
 
-impl From<(u32, u32, u64, u32, Vec<u32>)> for RegionTile {
-    fn from((x, y, ns, result_bytes, mut touched): (u32, u32, u64, u32, Vec<u32>)) -> Self {
-        // Written as differences to the one before.
-        for i in 1..touched.len() {
-            touched[i] = touched[i].saturating_add(touched[i - 1]);
+impl From<Written> for RegionTile {
+    fn from((x, y, ns, result_bytes, mut touched, mut opened): Written) -> Self {
+        for places in [&mut touched, &mut opened] {
+            for i in 1..places.len() {
+                places[i] = places[i].saturating_add(places[i - 1]);
+            }
         }
-        RegionTile { x, y, ns, result_bytes, touched }
+        RegionTile { x, y, ns, result_bytes, touched, opened }
     }
 }
 
-impl From<RegionTile> for (u32, u32, u64, u32, Vec<u32>) {
+impl From<RegionTile> for Written {
     fn from(t: RegionTile) -> Self {
-        let mut touched = t.touched;
-        for i in (1..touched.len()).rev() {
-            touched[i] -= touched[i - 1];
+        let RegionTile { x, y, ns, result_bytes, mut touched, mut opened } = t;
+        for places in [&mut touched, &mut opened] {
+            for i in (1..places.len()).rev() {
+                places[i] -= places[i - 1];
+            }
         }
-        (t.x, t.y, t.ns, t.result_bytes, touched)
+        (x, y, ns, result_bytes, touched, opened)
     }
 }
 
@@ -226,7 +239,7 @@ impl Trace {
             const LONG: u64 = 60_000_000_000;
             let times = frame.slabs.iter().flat_map(|s| &s.levels).flat_map(|l| &l.tiles);
             let through = frame.regions.iter().flat_map(|l| &l.tiles).map(|t| t.ns);
-            let setup = [frame.setup_ns, frame.outlook_ns];
+            let setup = [frame.setup_ns, frame.outlook_ns, frame.block_ns];
             if times.map(|t| t.ns).chain(through).chain(setup).any(|ns| ns > LONG) {
                 return no(format!("frames[{i}]: a time is longer than a minute"));
             }
@@ -474,6 +487,7 @@ mod tests {
                 alone_edge: 128,
                 slabs,
                 outlook_ns: 40,
+                block_ns: 3,
                 regions: vec![RegionLevel {
                     edge: 64,
                     tiles: vec![
@@ -483,8 +497,9 @@ mod tests {
                             ns: 1500,
                             result_bytes: 900,
                             touched: vec![3, 4, 70],
+                            opened: vec![0, 9],
                         },
-                        RegionTile { x: 64, y: 0, ns: 7, result_bytes: 40, touched: vec![] },
+                        RegionTile { x: 64, ns: 7, result_bytes: 40, ..RegionTile::default() },
                     ],
                 }],
             }],
@@ -528,7 +543,7 @@ mod tests {
         let says = |text: &str| Trace::from_json(text.as_bytes()).unwrap_err().to_string();
         let good = trace().to_json();
         assert!(says("{}").contains("slabcast plan --trace"));
-        assert!(says(&good.replacen("\"version\":2", "\"version\":3", 1)).contains("version 3"));
+        assert!(says(&good.replacen("\"version\":3", "\"version\":4", 1)).contains("version 4"));
         assert!(says(&good.replace("[100,70]", "[100,0]")).starts_with("about.size"));
         assert!(says(&good.replace("[100,70]", "[10,7]")).contains("more pixels"));
         assert!(says(&good.replace("\"edge\":64", "\"edge\":65")).contains("65 is no edge"));

@@ -6,20 +6,21 @@
 
 use crate::rehearse::{Rehearsal, Through};
 use crate::shelf::Shelf;
-use slabcast_common::brick::{Brick, BrickInfo};
+use slabcast_common::brick::Brick;
 use slabcast_common::ids::FrameId;
 use slabcast_common::image::TilePixels;
 use slabcast_common::leaves::{Finish, Leaves};
 use slabcast_common::message::{Counters, Lease, Pixels, RegionLease, Sampling, SceneSpec};
 use slabcast_common::view::View;
 use slabcast_render::estimate::{Pair, Probe};
-use slabcast_render::region::{Finished, Outlook, Region, Sight, Supply};
+use slabcast_render::outlook::{Directory, Outlook};
+use slabcast_render::region::{Finished, Region, Supply};
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch};
 use slabcast_render::{Frame, Scene};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::panic::AssertUnwindSafe;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
@@ -51,18 +52,20 @@ pub(crate) struct FrameSlot {
     pub(crate) finish: Option<Finish>,
     frame: OnceLock<Frame>,
     probe: OnceLock<Probe>,
-    looking: Looking,
+    outlook: OnceLock<Outlook>,
     /// Of a rehearsal: its place in the trace, and when its tables are made.
     pub(crate) rehearsed: OnceLock<Option<usize>>,
     pub(crate) made: OnceLock<Instant>,
+    /// Of a rehearsal: blocks of bricks that its tiles opened.
+    pub(crate) held: Mutex<BTreeSet<u32>>,
     /// Set when the master ends the frame: tasks of it that have not begun are dropped.
     pub(crate) over: AtomicBool,
 }
 
 impl FrameSlot {
     pub(crate) fn new(scene: Arc<SceneSlot>, view: View, finish: Option<Finish>) -> Self {
-        let (frame, probe, looking, rehearsed, made, over) = Default::default();
-        FrameSlot { scene, view, finish, frame, probe, looking, rehearsed, made, over }
+        let (frame, probe, outlook, rehearsed, made, held, over) = Default::default();
+        FrameSlot { scene, view, finish, frame, probe, outlook, rehearsed, made, held, over }
     }
 
     fn get(&self) -> &Frame {
@@ -70,6 +73,11 @@ impl FrameSlot {
             let scene = self.scene.scene.get_or_init(|| Arc::new(Scene::new(&self.scene.spec)));
             Frame::new(scene.clone(), self.view)
         })
+    }
+
+    /// What it sees of a directory.
+    fn outlook(&self, directory: &Arc<Directory>) -> &Outlook {
+        self.outlook.get_or_init(|| Outlook::new(self.get(), directory))
     }
 
     /// What tells how far its pixels are off.
@@ -81,70 +89,7 @@ impl FrameSlot {
     }
 }
 
-/// Bricks of a directory that a thread looks at before it asks whether there are more: some 0.1 ms.
-const PORTION: usize = 512;
-
-/// The directory as a frame sees it, in the making: every thread that needs it takes its portions.
-#[derive(Default)]
-struct Looking {
-    next: AtomicUsize,
-    seen: Mutex<Seen>,
-    bell: Condvar,
-    outlook: OnceLock<Outlook>,
-}
-
-#[derive(Default)]
-struct Seen {
-    portions: Vec<Vec<Sight>>,
-    done: usize,
-    /// A thread panicked over a portion.
-    broken: bool,
-}
-
-impl Looking {
-    fn get(&self, frame: &Frame, bricks: &[BrickInfo]) -> &Outlook {
-        if let Some(outlook) = self.outlook.get() {
-            return outlook;
-        }
-        /// Tells those who wait when a thread does not come back.
-        struct Guard<'a>(&'a Looking, bool);
-        impl Drop for Guard<'_> {
-            fn drop(&mut self) {
-                if !self.1 {
-                    locked(&self.0.seen).broken = true;
-                    self.0.bell.notify_all();
-                }
-            }
-        }
-        let all = bricks.len().div_ceil(PORTION);
-        loop {
-            let i = self.next.fetch_add(1, Ordering::Relaxed);
-            if i >= all {
-                break;
-            }
-            let mut guard = Guard(self, false);
-            let first = i * PORTION;
-            let portion = &bricks[first..bricks.len().min(first + PORTION)];
-            let sights = Outlook::look(frame, portion, first as u32);
-            let mut seen = locked(&self.seen);
-            seen.portions.resize_with(all, Vec::new);
-            seen.portions[i] = sights;
-            seen.done += 1;
-            guard.1 = true;
-            drop(seen);
-            self.bell.notify_all();
-        }
-        let mut seen = locked(&self.seen);
-        while seen.done < all && !seen.broken {
-            seen = self.bell.wait(seen).unwrap_or_else(PoisonError::into_inner);
-        }
-        assert!(!seen.broken, "another thread failed to look at the bricks");
-        self.outlook
-            .get_or_init(|| Outlook::new(frame.view.size, &std::mem::take(&mut seen.portions)))
-    }
-}
-
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+pub(crate) fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -469,7 +414,7 @@ fn advance(thread: u32, simd: Simd, mut going: Box<Going>, scratch: &mut Scratch
 fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch) -> Came {
     let Going { lease, frame: slot, shelf, drawn, region, .. } = going;
     let frame = slot.get();
-    let outlook = slot.looking.get(frame, shelf.bricks());
+    let outlook = slot.outlook(shelf.directory());
     let start = Instant::now();
     let before = region.as_ref().and_then(Region::depth);
     let on = region.get_or_insert_with(|| Region::new(outlook, lease.tile));

@@ -10,7 +10,7 @@
 //! late; over a thousand tiles that is a frame. So a thread's next tile begins when the one before
 //! should have ended, or when it came, and only a result is late, never the work behind it.
 
-use crate::pool::{Drawn, FrameSlot, Going, Ready};
+use crate::pool::{Drawn, FrameSlot, Going, Ready, locked};
 use slabcast_common::image::TilePixels;
 use slabcast_common::message::{Counters, Pixels, Sampling};
 use slabcast_common::slab::SheetRange;
@@ -107,7 +107,11 @@ impl Rehearsal {
         }
         let setup = Duration::from_nanos(traced.setup_ns + traced.outlook_ns);
         let made = *frame.made.get_or_init(|| start + setup);
-        let took = Duration::from_nanos(known.ns);
+        let mut opened = locked(&frame.held);
+        let fresh = known.opened.iter().filter(|b| opened.insert(**b)).count();
+        drop(opened);
+        let opening = traced.block_ns.saturating_mul(fresh as u64);
+        let took = Duration::from_nanos(known.ns.saturating_add(opening));
         let held = Held { start, end: made.max(start) + took };
         let pixels = match &frame.finish {
             Some(finish) => Pixels::Finished(finished_through(&tile, known.result_bytes, finish)),

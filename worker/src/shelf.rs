@@ -6,20 +6,22 @@
 
 use slabcast_common::brick::{Brick, BrickGrid, BrickInfo};
 use slabcast_common::ids::BrickId;
+use slabcast_render::outlook::Directory;
 use slabcast_render::region::Supply;
-use std::sync::{Arc, PoisonError, RwLock};
+use std::sync::{Arc, OnceLock, PoisonError, RwLock};
 
 /// See the head of the file.
 pub(crate) struct Shelf {
     grid: BrickGrid,
     bricks: Arc<[BrickInfo]>,
+    directory: OnceLock<Arc<Directory>>,
     held: RwLock<Vec<Option<Arc<Brick>>>>,
 }
 
 impl Shelf {
     pub(crate) fn new(grid: BrickGrid, bricks: Arc<[BrickInfo]>) -> Shelf {
         let held = RwLock::new(vec![None; bricks.len()]);
-        Shelf { grid, bricks, held }
+        Shelf { grid, bricks, directory: OnceLock::new(), held }
     }
 
     /// How the volume is cut.
@@ -30,6 +32,11 @@ impl Shelf {
     /// All bricks of the set, here or not, ascending by id.
     pub(crate) fn bricks(&self) -> &[BrickInfo] {
         &self.bricks
+    }
+
+    /// The same in blocks. The first thread that asks puts them into these.
+    pub(crate) fn directory(&self) -> &Arc<Directory> {
+        self.directory.get_or_init(|| Arc::new(Directory::new(self.bricks.clone())))
     }
 
     /// A brick's place in the directory.

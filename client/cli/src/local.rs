@@ -3,15 +3,19 @@
 
 use crate::progress::{self, Progress};
 use rayon::{ThreadPool, ThreadPoolBuilder};
-use slabcast_common::brick::Brick;
-use slabcast_common::image::{FrameState, Picture, TilePixels, TileState};
+use slabcast_common::brick::{Brick, BrickInfo};
+use slabcast_common::image::{FrameState, Picture, TilePixels};
 use slabcast_common::message::Counters;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::slab::SheetRange;
 use slabcast_render::Frame;
+use slabcast_render::outlook::{Directory, Outlook};
+use slabcast_render::region::{self, Supply};
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch, Seen};
+use slabcast_volumes::BrickStore;
 use std::collections::BTreeMap;
+use std::ops::Deref;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -33,17 +37,92 @@ impl Cut {
     }
 }
 
+/// Bricks of a scene, by id, and what tells which of them lie where.
+#[derive(Clone)]
+pub(crate) struct Bricks {
+    all: Vec<Arc<Brick>>,
+    directory: Arc<Directory>,
+}
+
+impl Bricks {
+    /// Those of a store.
+    pub(crate) fn of(store: &BrickStore) -> Bricks {
+        let brick = |i: &BrickInfo| store.brick(i.id).expect("a brick that the store knows");
+        let all = store.infos().iter().map(brick).collect();
+        Bricks { all, directory: Arc::new(Directory::new(store.infos().clone())) }
+    }
+
+    /// The directory of them.
+    pub(crate) fn directory(&self) -> &Arc<Directory> {
+        &self.directory
+    }
+}
+
+impl Deref for Bricks {
+    type Target = [Arc<Brick>];
+
+    fn deref(&self) -> &[Arc<Brick>] {
+        &self.all
+    }
+}
+
+impl Supply for Bricks {
+    fn get(&self, place: u32) -> Option<Arc<Brick>> {
+        self.all.get(place as usize).cloned()
+    }
+}
+
 /// A whole frame by the tile renderer.
-pub(crate) fn picture(frame: &Frame, bricks: &[Arc<Brick>], cut: Cut) -> Picture {
+pub(crate) fn picture(frame: &Frame, bricks: &Bricks, cut: Cut) -> Picture {
     counted_picture(frame, bricks, cut).0
 }
 
 /// A whole frame by the tile renderer, and what it took.
-pub(crate) fn counted_picture(
-    frame: &Frame,
-    bricks: &[Arc<Brick>],
-    cut: Cut,
-) -> (Picture, Counters) {
+pub(crate) fn counted_picture(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
+    if cut.slabs > 1 { in_slabs(frame, bricks, cut) } else { through(frame, bricks, cut) }
+}
+
+/// Tiles of a picture, row by row.
+pub(crate) fn tiles(whole: Rect, edge: u32) -> impl Iterator<Item = Rect> {
+    let (step, edge) = (edge as usize, edge as i32);
+    let corners = (0..whole.y1)
+        .step_by(step)
+        .flat_map(move |y| (0..whole.x1).step_by(step).map(move |x| (x, y)));
+    corners.map(move |(x, y)| Rect::new(x, y, x + edge, y + edge).intersect(&whole))
+}
+
+/// Each tile through all sheets, as a cluster's workers draw it.
+fn through(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
+    let whole = Rect::of_size(frame.view.size);
+    let edge = cut.tile as i32;
+    let outlook = Outlook::new(frame, &bricks.directory);
+    // What nothing lies in is not drawn; what may have most to draw comes first.
+    let weighed = tiles(whole, cut.tile).map(|tile| (outlook.weight(&tile), tile));
+    let mut tiles: Vec<(u64, Rect)> = weighed.filter(|(weight, _)| *weight > 0).collect();
+    tiles.sort_by_key(|&(weight, tile)| (std::cmp::Reverse(weight), tile.y0, tile.x0));
+    let simd = Simd::detect();
+    let mut picture = Picture { size: frame.view.size, pixels: vec![[0.0; 4]; whole.area()] };
+    // A row of tiles is a band of the picture; who has drawn a tile writes it there.
+    let rows = picture.pixels.chunks_mut((whole.x1 * edge) as usize);
+    let bands: Vec<_> = rows.map(Mutex::new).collect();
+    let drawn = shared(tiles.len(), cut.threads, |i, Kept(memory): &mut Kept| {
+        let (_, tile) = tiles[i];
+        let Memory { scratch, pixels } = memory;
+        let counted = region::draw((frame, &outlook, bricks), simd, tile, scratch, pixels);
+        let band = tile.y0 / edge;
+        let in_band = Rect { y0: tile.y0 - band * edge, y1: tile.y1 - band * edge, ..tile };
+        let mut rows = bands[band as usize].lock().unwrap_or_else(PoisonError::into_inner);
+        pixels.write(in_band, frame.view.size, &mut rows);
+        counted
+    });
+    drop(bands);
+    let mut counters = Counters::default();
+    drawn.into_iter().for_each(|counted| counters += counted);
+    (picture, counters)
+}
+
+/// Slab after slab, as under the paper's schedule.
+fn in_slabs(frame: &Frame, bricks: &[Arc<Brick>], cut: Cut) -> (Picture, Counters) {
     let whole = Rect::of_size(frame.view.size);
     let edge = cut.tile as i32;
     let across = (whole.x1 + edge - 1) / edge;
@@ -54,14 +133,8 @@ pub(crate) fn counted_picture(
         portion.iter().filter_map(|b| Seen::new(frame, b)).collect::<Vec<_>>()
     });
     let seen: Vec<Seen> = seen.into_iter().flatten().collect();
-    let mut tiles: Vec<(Rect, Vec<&Seen>)> = (0..whole.y1)
-        .step_by(cut.tile as usize)
-        .flat_map(|y| {
-            let row = (0..whole.x1).step_by(cut.tile as usize);
-            row.map(move |x| Rect::new(x, y, x + edge, y + edge).intersect(&whole))
-        })
-        .map(|tile| (tile, Vec::new()))
-        .collect();
+    let mut tiles: Vec<(Rect, Vec<&Seen>)> =
+        tiles(whole, cut.tile).map(|tile| (tile, Vec::new())).collect();
     let mut sheets = SheetRange::default();
     for brick in Seen::front_to_back(&seen) {
         let p = &brick.projected;
@@ -72,32 +145,10 @@ pub(crate) fn counted_picture(
             }
         }
     }
-    // What nothing lies in is not drawn; what has most to draw comes first.
     tiles.retain(|(_, bricks)| !bricks.is_empty());
     tiles.sort_by_key(|(tile, bricks)| (std::cmp::Reverse(bricks.len()), tile.y0, tile.x0));
     let simd = Simd::detect();
     let mut counters = Counters::default();
-    if cut.slabs == 1 {
-        let mut picture = Picture { size: frame.view.size, pixels: vec![[0.0; 4]; whole.area()] };
-        // A row of tiles is a band of the picture; who has drawn a tile writes it there.
-        let rows = picture.pixels.chunks_mut((whole.x1 * edge) as usize);
-        let bands: Vec<_> = rows.map(Mutex::new).collect();
-        let drawn = shared(tiles.len(), cut.threads, |i, Kept(memory): &mut Kept| {
-            let (tile, bricks) = &tiles[i];
-            let Memory { scratch, pixels, blank } = memory;
-            blank.a.resize(tile.area(), 0.0);
-            let counted =
-                tile::render_into(frame, simd, *tile, sheets, bricks, blank, scratch, pixels);
-            let band = tile.y0 / edge;
-            let in_band = Rect { y0: tile.y0 - band * edge, y1: tile.y1 - band * edge, ..*tile };
-            let mut rows = bands[band as usize].lock().unwrap_or_else(PoisonError::into_inner);
-            pixels.write(in_band, frame.view.size, &mut rows);
-            counted
-        });
-        drop(bands);
-        drawn.into_iter().for_each(|counted| counters += counted);
-        return (picture, counters);
-    }
     let mut state = FrameState::new(frame.view.size);
     for slab in sheets.slabs(cut.slabs) {
         let done = shared(tiles.len(), cut.threads, |i, Kept(memory): &mut Kept| {
@@ -115,18 +166,10 @@ pub(crate) fn counted_picture(
 }
 
 /// What a thread draws in.
+#[derive(Default)]
 struct Memory {
     scratch: Scratch,
     pixels: TilePixels,
-    /// What is behind every tile.
-    blank: TileState,
-}
-
-impl Default for Memory {
-    fn default() -> Self {
-        let (scratch, pixels) = Default::default();
-        Memory { scratch, pixels, blank: tile::blank(Rect::new(0, 0, 0, 0)) }
-    }
 }
 
 /// A thread's memory, taken over from a thread of the frame before and left to one of the next: a

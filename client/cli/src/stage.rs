@@ -4,8 +4,8 @@
 
 use crate::check::shot::Drawn;
 use crate::fail::Fail;
+use crate::local::Bricks;
 use crate::request::Asked;
-use slabcast_common::brick::Brick;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::path::Orientation;
 use slabcast_common::quality::Quality;
@@ -26,7 +26,7 @@ pub(crate) struct Stage {
     /// What frames share if there is no tween: they keep footprints in it.
     shared: Arc<Scene>,
     /// Enough for all frames.
-    pub(crate) bricks: Vec<Arc<Brick>>,
+    pub(crate) bricks: Bricks,
 }
 
 impl Stage {

@@ -4,10 +4,9 @@
 use crate::fail::Fail;
 use crate::front::choose::settle;
 use crate::front::magnify::magnified;
-use crate::local::{self, Cut};
+use crate::local::{self, Bricks, Cut};
 use crate::request::{Opened, PictureOf};
 use crate::stage::Stage;
-use slabcast_common::brick::Brick;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Quality, Work};
@@ -24,7 +23,7 @@ pub(crate) struct Still {
     /// What is drawn, and how many times it is magnified.
     small: View,
     magnify: u32,
-    pub(crate) bricks: Vec<Arc<Brick>>,
+    pub(crate) bricks: Bricks,
     pub(crate) background: Background,
 }
 

@@ -24,7 +24,8 @@
 use crate::macrotile::{Cut, Macrotile, cut_through};
 use crate::roster::Roster;
 use crate::{FrameJob, Micros};
-use slabcast_common::brick::{BrickInfo, BrickSetKey, TightBox};
+use slabcast_common::blocks::{Block, Blocks};
+use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::WorkerId;
 use slabcast_common::occlusion::Rect;
 use std::collections::{BTreeMap, BTreeSet};
@@ -54,6 +55,9 @@ const MANY: u64 = 12;
 /// leaf and cost twice that on the master's one thread.
 const BLOCKS: usize = 2048;
 
+/// Edge of the smallest, four bricks, as a power of two.
+const SMALLEST: u32 = 5;
+
 /// What is known of a tile from the frame before.
 #[derive(Clone, Debug)]
 struct Known {
@@ -78,17 +82,17 @@ struct Lessons {
 /// What the schedule remembers.
 #[derive(Debug, Default)]
 pub(crate) struct Memory {
-    blocks: Option<(BrickSetKey, Vec<TightBox>)>,
+    blocks: Option<(BrickSetKey, Blocks)>,
     lessons: Option<Lessons>,
 }
 
 impl Memory {
     /// Boxes around neighbouring bricks, together around all: where anything may be seen.
-    fn blocks(&mut self, key: BrickSetKey, bricks: &[BrickInfo]) -> &[TightBox] {
+    fn blocks(&mut self, key: BrickSetKey, bricks: &[BrickInfo]) -> &[Block] {
         if self.blocks.as_ref().is_none_or(|(k, _)| *k != key) {
-            self.blocks = Some((key, blocks_of(bricks)));
+            self.blocks = Some((key, Blocks::of(bricks, SMALLEST, BLOCKS)));
         }
-        self.blocks.as_ref().map_or(&[], |(_, blocks)| blocks)
+        self.blocks.as_ref().map_or(&[], |(_, blocks)| blocks.all())
     }
 
     fn known(&self, kind: (BrickSetKey, [u32; 2], u32), tile: &Rect) -> Option<&Known> {
@@ -128,24 +132,6 @@ impl Memory {
     }
 }
 
-fn blocks_of(bricks: &[BrickInfo]) -> Vec<TightBox> {
-    // Edge of a block as a power of two, from 4 bricks.
-    for shift in 5..32 {
-        let mut blocks: BTreeMap<[u32; 3], TightBox> = BTreeMap::new();
-        for b in bricks {
-            let block = blocks.entry(b.tight.lo.map(|x| x >> shift)).or_insert(b.tight);
-            for a in 0..3 {
-                block.lo[a] = block.lo[a].min(b.tight.lo[a]);
-                block.hi[a] = block.hi[a].max(b.tight.hi[a]);
-            }
-        }
-        if blocks.len() <= BLOCKS || shift == 31 {
-            return blocks.into_values().collect();
-        }
-    }
-    Vec::new()
-}
-
 /// A frame's regions.
 #[derive(Debug)]
 pub(crate) struct Regions {
@@ -167,7 +153,7 @@ impl Regions {
         let (key, size) = (job.scene.bricks, job.view.size);
         let blocks = memory.blocks(key, &job.bricks);
         let rects: Vec<Rect> =
-            blocks.iter().filter_map(|b| Some(job.view.project(b)?.rect)).collect();
+            blocks.iter().filter_map(|b| Some(job.view.project(&b.tight)?.rect)).collect();
         let threads = roster.threads();
         let wanted = (job.work.tiles_per_worker * threads as f64).ceil() as u64;
         let many = wanted.max(MANY * threads);
@@ -499,23 +485,5 @@ mod tests {
         };
         Pace::of(&tiles, &known).correct(&mut tiles, &known);
         assert_eq!(tiles.iter().map(|t| t.est).collect::<Vec<_>>(), [6144, 2048, 4096]);
-    }
-
-    #[test]
-    fn blocks_hold_their_bricks_and_are_few() {
-        let brick = |i: u32| {
-            let lo = [i % 50 * 8, i / 50 % 50 * 8, i / 2500 * 8];
-            let tight = TightBox { lo, hi: lo.map(|x| x + 7) };
-            BrickInfo { id: slabcast_common::ids::BrickId(i), tight, voxels: 512, bytes: 99 }
-        };
-        let bricks: Vec<_> = (0..125_000).filter(|i| i % 3 > 0).map(brick).collect();
-        let blocks = blocks_of(&bricks);
-        assert!(blocks.len() <= BLOCKS && blocks.len() > BLOCKS / 16, "{}", blocks.len());
-        for b in &bricks {
-            let holds =
-                |o: &TightBox| (0..3).all(|a| o.lo[a] <= b.tight.lo[a] && b.tight.hi[a] <= o.hi[a]);
-            assert!(blocks.iter().any(holds), "{b:?}");
-        }
-        assert!(blocks_of(&[]).is_empty());
     }
 }

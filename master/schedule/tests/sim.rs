@@ -117,6 +117,7 @@ fn frame(job: &FrameJob, quality: &Quality) -> FrameTrace {
     let regions = [32, 64, 128, 256].map(|edge| through(edge, &rects, &projected));
     FrameTrace {
         outlook_ns: 2_000,
+        block_ns: 0,
         regions: regions.into(),
         view: view_sha256(&job.scene, &job.view).to_string(),
         setup_ns: 5_000,
@@ -141,6 +142,8 @@ fn through(edge: u32, rects: &[Rect], projected: &[Option<Projected>]) -> Region
                 ns: 20 * t.rect.area() as u64,
                 result_bytes: 2 * t.rect.area() as u32,
                 touched: touched.map(|(i, _)| i).collect(),
+                // A block to the left, and one for all.
+                opened: vec![t.rect.x0 as u32 / 128, 7],
             }
         })
         .collect();
@@ -300,6 +303,27 @@ fn regions_have_no_barrier_and_bricks_come_where_they_are_asked_for() {
     let three =
         |jobs: &[FrameJob]| run(jobs, &trace, &Cluster { in_flight: 3, ..cluster(8) }).each_ms();
     assert!(three(&region) < eight.each_ms(), "{} {}", three(&region), eight.each_ms());
+}
+
+#[test]
+fn a_worker_looks_at_a_block_once_a_frame() {
+    let (slab, mut trace) = world(3);
+    let region = under(Schedule::Region, &slab);
+    let render = |trace: &Trace, n: u32| {
+        let outcome = run(&region, trace, &cluster(n));
+        outcome.frames.iter().map(|f| f.render).collect::<Vec<_>>()
+    };
+    let drawn = [1, 4].map(|n| render(&trace, n));
+    for frame in &mut trace.frames {
+        frame.block_ns = 100;
+    }
+    let looked = [1, 4].map(|n| render(&trace, n));
+    let more = |i: usize| looked[i].iter().zip(&drawn[i]).map(|(l, d)| l - d).collect::<Vec<_>>();
+    let columns = SIZE[0].div_ceil(128) as u64;
+    assert!(more(0).iter().all(|ns| *ns == 100 * (columns + 1)), "{:?}", more(0));
+    // Four look at some of them each.
+    let (least, most) = (100 * (columns + 4), 400 * (columns + 1));
+    assert!(more(1).iter().all(|ns| (least..=most).contains(ns)), "{:?}", more(1));
 }
 
 /// Keeps what is told of frames.

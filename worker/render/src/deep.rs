@@ -135,12 +135,9 @@ pub(crate) fn takes(part: &Part<'_>) -> Option<Deep> {
     let (frame, view) = (part.frame, &part.frame.view);
     let Projection::Persp { focal, distance } = view.projection else { return None };
     let most = frame.sections.most();
-    if part.bricks() == 0 {
-        return None;
-    }
     // Scales fall with depth: those of the nearest sheet and of a voxel's length in front of it
     // bound all others, and show that no sheet is clipped.
-    let nearest = part.projected(0).sheets.first;
+    let nearest = part.nearest()?;
     let footprint = frame.footprints.at(nearest)?;
     let own = footprint.reach()?;
     let front = view.scale_at(nearest - most as i32 - 1)?;

@@ -161,7 +161,7 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
         let cull = frame.scene.quality.cull;
         let sections = &frame.sections;
         let phases = sections.phases();
-        let base = self.part.projected(which).sheets.first;
+        let base = self.part.first_sheet(which);
         let origin = [
             i64::from(rect.x0 * SUBPIXELS),
             i64::from(rect.y0 * SUBPIXELS),

@@ -117,11 +117,11 @@ impl General<'_> {
             if !any_open {
                 break;
             }
-            if !part.is_supplied(next, k, &open) {
+            if !part.is_supplied(k, &open, counters) {
                 end = k;
                 break;
             }
-            while next < part.bricks() && part.projected(next).sheets.first <= k {
+            while part.begins(next, k) {
                 self.admit(next, &open, queues, counters);
                 next += 1;
             }

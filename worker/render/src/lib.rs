@@ -6,7 +6,8 @@
 //! - [`tile`] is what workers run: lazy bucket toss, a ring of open sheets, bricks and voxels
 //!   tested against the occlusion map. It must give the oracle's bytes, always.
 //!
-//! [`region`] takes a tile through all depths while bricks are still coming.
+//! [`region`] takes a tile through all depths while bricks are still coming; [`outlook`] looks at no brick
+//! that no tile needs.
 //!
 //! Beside them [`mod@reference`] judges how far both are from the limit: a gather along true rays
 //! in f64 that shares none of their arithmetic, and [`closed`] has the pictures that can be
@@ -26,6 +27,7 @@ pub mod footprint;
 mod general;
 mod mask;
 mod model;
+pub mod outlook;
 mod place;
 mod planes;
 pub mod reference;

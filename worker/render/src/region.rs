@@ -6,12 +6,12 @@
 //! if it may touch a pixel that is open there. What hides it is then drawn already.
 //!
 //! ```text
-//! Outlook::look, Outlook::new    the directory as a frame sees it: once a frame, on all threads
-//! Region::new                    a tile before its first sheet
-//! Region::advance                to the end, or to the first sheet that lacks a brick
+//! Outlook::new       the directory as a frame sees it: once a frame
+//! Region::new        a tile before its first sheet
+//! Region::advance    to the end, or to the first sheet that lacks a brick
 //!   .. names the bricks that it lacks there and a little farther; others render meanwhile
-//! Region::advance                from that sheet on
-//! Region::finish                 pixels, counts, and which bricks it touched
+//! Region::advance    from that sheet on
+//! Region::finish     pixels, counts, and which bricks it touched
 //! ```
 //!
 //! **Why stopping changes no byte.** It is a cut between two slabs, made where it is needed: opacity
@@ -20,11 +20,11 @@
 //! costs what a tile of one slab costs.
 
 use crate::mask::OpenMask;
+use crate::outlook::{Outlook, Sight};
 use crate::scene::{Corner, Frame};
 use crate::splat::Simd;
-use crate::tile::{Among, PART, Part, Scratch};
-use slabcast_common::brick::{Brick, BrickInfo};
-use slabcast_common::ids::BrickId;
+use crate::tile::{Among, Io, PART, Part, Scratch};
+use slabcast_common::brick::Brick;
 use slabcast_common::image::TilePixels;
 use slabcast_common::message::Counters;
 use slabcast_common::occlusion::Rect;
@@ -39,193 +39,392 @@ pub trait Supply {
     fn get(&self, place: u32) -> Option<Arc<Brick>>;
 }
 
-/// A brick of the directory as a frame sees it, whether it is here or not.
-#[derive(Clone, Copy, Debug)]
-pub struct Sight {
+/// A brick that a part took.
+pub(crate) struct Taken {
+    brick: Arc<Brick>,
+    corner: Corner,
     place: u32,
-    id: BrickId,
-    voxels: u16,
-    projected: Projected,
+    /// Its first sheet.
+    first: i32,
 }
 
-/// The directory as a frame sees it: its bricks front to back, and which of them lie over each
-/// part of the picture.
-#[derive(Debug)]
-pub struct Outlook {
-    /// Those that begin together in ascending id.
-    sights: Vec<Sight>,
-    sheets: SheetRange,
-    /// Parts in a row of the picture.
-    columns: usize,
-    /// Where each part's entries begin; one more than there are parts.
-    starts: Vec<usize>,
-    /// Places in `sights`, front to back in each part.
-    entries: Vec<u32>,
+/// A list that grows while what is in it is looked at. Its memory stays when it is emptied.
+pub(crate) struct Growing<T> {
+    len: Cell<usize>,
+    /// Each twice as long as the one before.
+    chunks: [OnceCell<Vec<OnceCell<T>>>; 26],
 }
 
-impl Outlook {
-    /// Looks at a portion of the directory, whose first brick has the place `first`. Portions may be
-    /// looked at by different threads.
-    pub fn look(frame: &Frame, bricks: &[BrickInfo], first: u32) -> Vec<Sight> {
-        let sight = |(place, b): (u32, &BrickInfo)| {
-            let projected = frame.view.project(&b.tight)?;
-            Some(Sight { place, id: b.id, voxels: b.voxels, projected })
-        };
-        (first..).zip(bricks).filter_map(sight).collect()
-    }
+/// Items of the first chunk: what a part of a head takes fits two or three.
+const CHUNK: usize = 64;
 
-    /// Puts all portions, in the order of the directory, together.
-    pub fn new(size: [u32; 2], portions: &[Vec<Sight>]) -> Outlook {
-        let seen = || portions.iter().flatten();
-        let sheets = seen().fold(SheetRange::default(), |all, s| all.union(s.projected.sheets));
-        let sights = front_to_back(portions, sheets);
-
-        let edge = PART as u32;
-        let columns = size[0].div_ceil(edge) as usize;
-        let parts = columns * size[1].div_ceil(edge) as usize;
-        let over = |s: &Sight| {
-            let r = s.projected.rect;
-            let (x0, x1) = (r.x0 / PART, (r.x1 - 1) / PART);
-            (r.y0 / PART..=(r.y1 - 1) / PART)
-                .flat_map(move |y| (x0..=x1).map(move |x| y as usize * columns + x as usize))
-        };
-        let mut starts = vec![0usize; parts + 1];
-        for part in sights.iter().flat_map(over) {
-            starts[part + 1] += 1;
-        }
-        for i in 0..parts {
-            starts[i + 1] += starts[i];
-        }
-        let mut entries = vec![0u32; starts[parts]];
-        let mut next = starts.clone();
-        for (s, i) in sights.iter().zip(0u32..) {
-            for part in over(s) {
-                entries[next[part]] = i;
-                next[part] += 1;
-            }
-        }
-        Outlook { sights, sheets, columns, starts, entries }
-    }
-
-    /// Sheets that anything lies in.
-    pub fn sheets(&self) -> SheetRange {
-        self.sheets
-    }
-
-    /// What lies over the part of the picture that holds the pixel (x, y), front to back.
-    fn over(&self, x: i32, y: i32) -> &[u32] {
-        let part = (y / PART) as usize * self.columns + (x / PART) as usize;
-        &self.entries[self.starts[part]..self.starts[part + 1]]
+impl<T> Default for Growing<T> {
+    fn default() -> Self {
+        Growing { len: Cell::new(0), chunks: [const { OnceCell::new() }; 26] }
     }
 }
 
-/// Those that begin first in front; portions ascend by id, and so do those that begin together. Where
-/// sheets are not many more than bricks each counts its own, in a third of the time that sorting takes.
-fn front_to_back(portions: &[Vec<Sight>], sheets: SheetRange) -> Vec<Sight> {
-    let seen = || portions.iter().flatten();
-    let depth = |s: &Sight| s.projected.sheets.first.abs_diff(sheets.first) as usize;
-    let (n, Some(first)) = (seen().count(), seen().next()) else { return Vec::new() };
-    let deepest = seen().map(depth).max().unwrap_or(0);
-    if deepest > 4 * n {
-        let mut sights: Vec<Sight> = seen().copied().collect();
-        sights.sort_by_key(depth);
-        return sights;
+impl<T> Growing<T> {
+    pub(crate) fn len(&self) -> usize {
+        self.len.get()
     }
-    let mut next = vec![0usize; deepest + 2];
-    for s in seen() {
-        next[depth(s) + 1] += 1;
+
+    /// Chunk of an item, and its place there.
+    fn place(i: usize) -> (usize, usize) {
+        let chunk = (i / CHUNK + 1).ilog2() as usize;
+        (chunk, i + CHUNK - (CHUNK << chunk))
     }
-    for i in 1..next.len() {
-        next[i] += next[i - 1];
+
+    fn push(&self, item: T) {
+        let (chunk, at) = Self::place(self.len.replace(self.len.get() + 1));
+        let chunk = self.chunks[chunk]
+            .get_or_init(|| std::iter::repeat_with(OnceCell::new).take(CHUNK << chunk).collect());
+        chunk[at].get_or_init(|| item);
     }
-    let mut sights = vec![*first; n];
-    for s in seen() {
-        let at = &mut next[depth(s)];
-        sights[*at] = *s;
-        *at += 1;
+
+    fn get(&self, i: usize) -> &T {
+        let (chunk, at) = Self::place(i);
+        let chunk = self.chunks[chunk].get();
+        chunk.and_then(|c| c[at].get()).expect("what is in the list")
     }
-    sights
+
+    fn iter(&self) -> impl Iterator<Item = &T> {
+        (0..self.len()).map(|i| self.get(i))
+    }
+
+    fn clear(&mut self) {
+        let used = self.chunks.iter_mut().filter_map(OnceCell::get_mut).flatten();
+        used.take(self.len.replace(0)).for_each(|item| *item = OnceCell::new());
+    }
 }
 
-/// A brick that a part took, and its corner as the frame sees it.
-pub(crate) type Loaded = OnceCell<(Arc<Brick>, Corner)>;
+/// What a part has before it, by the sheet at which it begins.
+#[derive(Default)]
+pub(crate) struct Waiting {
+    /// The last brick of each sheet, from the first on.
+    heads: Vec<u32>,
+    bricks: Vec<Waits>,
+    /// Voxels of those that wait.
+    voxels: u64,
+    /// Blocks of the part that were come to.
+    blocks: usize,
+}
 
-/// Bricks of a part that come when they are looked at.
+/// A brick of an open block.
+#[derive(Clone, Copy)]
+struct Waits {
+    block: u32,
+    /// Its place in the block.
+    brick: u32,
+    /// Another that begins at the same sheet.
+    next: u32,
+}
+
+/// No brick.
+const NONE: u32 = u32::MAX;
+
+/// Memory that a thread keeps for parts whose bricks come one by one.
+#[derive(Default)]
+pub(crate) struct Memory {
+    waiting: Waiting,
+    taken: Growing<Taken>,
+}
+
+/// Bricks of a part that come when they are needed.
 pub(crate) struct Coming<'a> {
     frame: &'a Frame,
-    sights: &'a [Sight],
+    outlook: &'a Outlook,
     supply: &'a dyn Supply,
-    /// Those that came, by their place in the part.
-    loaded: &'a [Loaded],
+    rect: Rect,
+    /// Sheets that are left.
+    slab: SheetRange,
+    /// Blocks over the part, front to back.
+    blocks: &'a [u32],
+    waiting: RefCell<Waiting>,
+    taken: &'a Growing<Taken>,
     /// How many sheets beyond the one at which something is lacked are looked at, too.
     ahead: u32,
     /// The first sheet that could not be drawn.
     stop: Cell<Option<i32>>,
     /// What was lacked: places in the directory, in order of depth.
     lacks: RefCell<Vec<u32>>,
+    /// The first sheet that any brick begins at.
+    nearest: Option<i32>,
 }
 
-impl Coming<'_> {
+impl<'a> Coming<'a> {
+    /// What lies over a part's sheets from `at` on.
+    fn new(
+        (frame, outlook, supply): (&'a Frame, &'a Outlook, &'a dyn Supply),
+        (rect, at, ahead): (Rect, i32, u32),
+        mut waiting: Waiting,
+        taken: &'a Growing<Taken>,
+    ) -> Coming<'a> {
+        let blocks = outlook.over(rect.x0, rect.y0);
+        let ends = blocks.iter().map(|&i| outlook.block(i).projected.sheets.end);
+        let slab = SheetRange::new(at, ends.max().unwrap_or(at));
+        waiting.heads.clear();
+        waiting.heads.resize(slab.len() as usize, NONE);
+        waiting.bricks.clear();
+        (waiting.voxels, waiting.blocks) = (0, 0);
+        let (stop, lacks, nearest) = Default::default();
+        let waiting = RefCell::new(waiting);
+        let mut coming = Coming {
+            frame,
+            outlook,
+            supply,
+            rect,
+            slab,
+            blocks,
+            waiting,
+            taken,
+            ahead,
+            stop,
+            lacks,
+            nearest,
+        };
+        coming.nearest = coming.find_nearest();
+        coming
+    }
+
+    /// Opens blocks up to the first brick that is left: what hides a block that begins before it would
+    /// have begun before it.
+    fn find_nearest(&self) -> Option<i32> {
+        let waiting = &mut *self.waiting.borrow_mut();
+        let mut nearest = i32::MAX;
+        while let Some(&i) = self.blocks.get(waiting.blocks)
+            && self.outlook.block(i).projected.sheets.first < nearest
+        {
+            waiting.blocks += 1;
+            if self.is_over(&self.outlook.block(i).projected) {
+                nearest = nearest.min(self.open(i, self.slab.first, waiting));
+            }
+        }
+        (nearest < i32::MAX).then_some(nearest)
+    }
+
+    /// Whether something may lie in the part's sheets.
+    fn is_over(&self, p: &Projected) -> bool {
+        p.sheets.overlaps(self.slab) && !p.rect.intersect(&self.rect).is_empty()
+    }
+
+    fn passes(&self, rect: &Rect, open: &OpenMask) -> bool {
+        !self.frame.scene.quality.cull || open.any(rect)
+    }
+
+    fn sight(&self, waits: &Waits) -> &'a Sight {
+        &self.outlook.bricks(waits.block)[waits.brick as usize]
+    }
+
+    /// Has a block's bricks wait for their first sheets, at `k` soonest; the first of these.
+    fn open(&self, block: u32, k: i32, waiting: &mut Waiting) -> i32 {
+        let mut nearest = i32::MAX;
+        for (sight, brick) in self.outlook.bricks(block).iter().zip(0..) {
+            if !self.is_over(&sight.projected) {
+                continue;
+            }
+            let first = sight.projected.sheets.first;
+            nearest = nearest.min(first);
+            let head = &mut waiting.heads[first.max(k).abs_diff(self.slab.first) as usize];
+            waiting.bricks.push(Waits { block, brick, next: *head });
+            *head = waiting.bricks.len() as u32 - 1;
+            waiting.voxels += u64::from(sight.voxels);
+        }
+        nearest
+    }
+
+    /// Voxels of a block that is not opened, as far as it lies over the part: as its rectangle does.
+    fn share(&self, block: u32) -> u64 {
+        let seen = self.outlook.block(block);
+        if !self.is_over(&seen.projected) {
+            return 0;
+        }
+        let rect = seen.projected.rect;
+        seen.voxels * rect.intersect(&self.rect).area() as u64 / rect.area() as u64
+    }
+
+    /// Opens the blocks that begin at sheet `until` or before and may touch what is open; voxels of the
+    /// others.
+    fn look(&self, until: i32, k: i32, open: &OpenMask, waiting: &mut Waiting) -> u64 {
+        let mut culled = 0;
+        while let Some(&i) = self.blocks.get(waiting.blocks) {
+            let projected = &self.outlook.block(i).projected;
+            if projected.sheets.first > until {
+                break;
+            }
+            waiting.blocks += 1;
+            if !self.passes(&projected.rect, open) {
+                culled += self.share(i);
+            } else if self.is_over(projected) {
+                self.open(i, k, waiting);
+            }
+        }
+        culled
+    }
+
+    /// Takes the bricks that begin at sheet `k` and may touch what is open; voxels of the others are
+    /// culled. If one is not here, notes what is lacked.
+    pub(crate) fn is_supplied(&self, k: i32, open: &OpenMask, counters: &mut Counters) -> bool {
+        let waiting = &mut *self.waiting.borrow_mut();
+        let mut culled = self.look(k, k, open, waiting);
+        let head = k.abs_diff(self.slab.first) as usize;
+        let mut next = waiting.heads[head];
+        while let Some(waits) = waiting.bricks.get(next as usize) {
+            let sight = self.sight(waits);
+            let voxels = u64::from(sight.voxels);
+            if !self.passes(&sight.projected.rect, open) {
+                culled += voxels;
+            } else if let Some(brick) = self.supply.get(sight.place) {
+                let corner = self.frame.corner(brick.id);
+                let (place, first) = (sight.place, sight.projected.sheets.first);
+                self.taken.push(Taken { brick, corner, place, first });
+            } else {
+                self.note(k, open, waiting);
+                return false;
+            }
+            waiting.voxels -= voxels;
+            next = waits.next;
+        }
+        waiting.heads[head] = NONE;
+        counters.culled += culled;
+        true
+    }
+
+    /// Notes what is lacked at sheet `k` and a little farther.
+    fn note(&self, k: i32, open: &OpenMask, waiting: &mut Waiting) {
+        self.stop.set(Some(k));
+        let until = k.saturating_add_unsigned(self.ahead).min(self.slab.end - 1);
+        self.look(until, k, open, waiting);
+        let mut lacked: Vec<(i32, u32)> = Vec::new();
+        for k in k..=until {
+            let mut next = waiting.heads[k.abs_diff(self.slab.first) as usize];
+            while let Some(waits) = waiting.bricks.get(next as usize) {
+                let &Sight { projected, place, .. } = self.sight(waits);
+                if self.passes(&projected.rect, open) && self.supply.get(place).is_none() {
+                    lacked.push((projected.sheets.first, place));
+                }
+                next = waits.next;
+            }
+        }
+        lacked.sort_unstable();
+        self.lacks.borrow_mut().extend(lacked.into_iter().map(|(_, place)| place));
+    }
+
+    /// The first sheet that any of its bricks begins at; `None`: nothing lies over it.
+    pub(crate) fn nearest(&self) -> Option<i32> {
+        self.nearest
+    }
+
+    /// How many bricks came.
+    pub(crate) fn came(&self) -> usize {
+        self.taken.len()
+    }
+
+    /// The first sheet of one that came.
     #[inline]
-    pub(crate) fn projected(&self, sight: usize) -> &Projected {
-        &self.sights[sight].projected
+    pub(crate) fn first_sheet(&self, i: usize) -> i32 {
+        self.taken.get(i).first
     }
 
-    pub(crate) fn voxels(&self, sight: usize) -> u64 {
-        self.sights[sight].voxels.into()
-    }
-
-    pub(crate) fn is_loaded(&self, i: usize) -> bool {
-        self.loaded[i].get().is_some()
-    }
-
-    pub(crate) fn loaded(&self, i: usize) -> (&Brick, &Corner) {
-        let (brick, corner) = self.loaded[i].get().expect("an admitted brick is here");
+    /// One that came.
+    pub(crate) fn brick(&self, i: usize) -> (&Brick, &Corner) {
+        let Taken { brick, corner, .. } = self.taken.get(i);
         (brick, corner)
     }
 
-    /// Takes the bricks from `next` on that begin at sheet `k` or before and may touch what is open;
-    /// if one is not here, notes what is lacked.
-    pub(crate) fn is_supplied(
-        &self,
-        part: &Part<'_>,
-        next: usize,
-        k: i32,
-        open: &OpenMask,
-    ) -> bool {
-        let passes = |p: &Projected| !self.frame.scene.quality.cull || open.any(&p.rect);
-        let sight = |i: usize| &self.sights[part.inside[i] as usize];
-        for i in next..part.bricks() {
-            let s = sight(i);
-            if s.projected.sheets.first > k {
-                break;
-            }
-            if self.is_loaded(i) || !passes(&s.projected) {
-                continue;
-            }
-            let Some(brick) = self.supply.get(s.place) else {
-                self.stop.set(Some(k));
-                break;
-            };
-            self.loaded[i].get_or_init(|| (brick, self.frame.corner(s.id)));
-        }
-        if self.stop.get().is_none() {
-            return true;
-        }
-        let mut lacks = self.lacks.borrow_mut();
-        let until = k.saturating_add_unsigned(self.ahead);
-        for i in next..part.bricks() {
-            let s = sight(i);
-            if s.projected.sheets.first > until {
-                break;
-            }
-            let here = || self.is_loaded(i) || self.supply.get(s.place).is_some();
-            if passes(&s.projected) && !here() {
-                lacks.push(s.place);
-            }
-        }
-        false
+    /// Voxels of what was not come to.
+    pub(crate) fn voxels_left(&self) -> u64 {
+        let waiting = self.waiting.borrow();
+        let blocks = self.blocks[waiting.blocks..].iter();
+        waiting.voxels + blocks.map(|&i| self.share(i)).sum::<u64>()
     }
+}
+
+/// What a part is drawn from.
+#[derive(Clone, Copy)]
+struct From<'a> {
+    frame: &'a Frame,
+    simd: Simd,
+    outlook: &'a Outlook,
+    supply: &'a dyn Supply,
+    /// Sheets beyond one that lacks a brick that are looked at.
+    ahead: u32,
+}
+
+/// How a part went.
+struct Went {
+    /// The sheet before which it stopped for what it lacks.
+    stop: Option<i32>,
+    lacks: Vec<u32>,
+}
+
+/// Draws the sheets of a part of `tile` from `at` on, as far as bricks are here; `came` is told the places
+/// of those that it took.
+fn go_through(
+    from: From<'_>,
+    (tile, rect, at): (Rect, Rect, i32),
+    scratch: &mut Scratch,
+    io: Io<'_>,
+    mut came: impl FnMut(u32),
+) -> Went {
+    let From { frame, simd, outlook, supply, ahead } = from;
+    let mut memory = std::mem::take(&mut scratch.coming);
+    let Memory { waiting, taken } = &mut memory;
+    let (seen, place) = ((frame, outlook, supply), (rect, at, ahead));
+    let coming = Coming::new(seen, place, std::mem::take(waiting), taken);
+    if let Some(nearest) = coming.nearest {
+        let mut slab = coming.slab;
+        if at == outlook.sheets().first {
+            // Nothing is drawn yet, and nothing lies before the first brick.
+            slab.first = nearest.max(at);
+        }
+        let among = Among::Coming(&coming);
+        Part { frame, rect, tile, slab, among, inside: &[] }.draw(simd, scratch, io);
+    }
+    let went = Went { stop: coming.stop.get(), lacks: coming.lacks.take() };
+    *waiting = coming.waiting.into_inner();
+    taken.iter().for_each(|t| came(t.place));
+    taken.clear();
+    scratch.coming = memory;
+    went
+}
+
+/// A tile's parts: no part of it lies in two of the picture's.
+fn parts(tile: Rect) -> impl Iterator<Item = Rect> {
+    let cut = |from: i32, to: i32| {
+        let parts = from.div_euclid(PART)..=(to - 1).div_euclid(PART);
+        parts.map(move |i| ((i * PART).max(from), ((i + 1) * PART).min(to)))
+    };
+    cut(tile.y0, tile.y1).flat_map(move |(y0, y1)| {
+        cut(tile.x0, tile.x1).map(move |(x0, x1)| Rect::new(x0, y0, x1, y1))
+    })
+}
+
+/// Draws a tile whose bricks are all here through all sheets, into the pixels of another, whose memory
+/// it takes over: once that and scratch have grown, nothing is allocated (`tests/allocations.rs`).
+///
+/// # Panics
+/// If a brick is not here.
+pub fn draw(
+    (frame, outlook, supply): (&Frame, &Outlook, &dyn Supply),
+    simd: Simd,
+    tile: Rect,
+    scratch: &mut Scratch,
+    out: &mut TilePixels,
+) -> Counters {
+    out.a.clear();
+    out.a.resize(tile.area(), 0.0);
+    out.colour.clear();
+    out.colour.resize(tile.area(), [0; 3]);
+    out.last = None;
+    let mut counted = Counters::default();
+    let from = From { frame, simd, outlook, supply, ahead: 0 };
+    for rect in parts(tile) {
+        let at = (tile, rect, outlook.sheets().first);
+        let went = go_through(from, at, scratch, (&mut *out, &mut counted), |_| ());
+        assert!(went.stop.is_none(), "a brick is not here");
+    }
+    counted
 }
 
 /// A part of a region.
@@ -262,19 +461,8 @@ pub struct Finished {
 impl Region {
     /// `tile`, which lies inside the picture, before the first sheet.
     pub fn new(outlook: &Outlook, tile: Rect) -> Region {
-        let next = |at: i32, end: i32| ((at / PART + 1) * PART).min(end);
-        let mut open = Vec::new();
-        let mut y0 = tile.y0;
-        while y0 < tile.y1 {
-            let y1 = next(y0, tile.y1);
-            let mut x0 = tile.x0;
-            while x0 < tile.x1 {
-                let x1 = next(x0, tile.x1);
-                open.push(Strand { rect: Rect::new(x0, y0, x1, y1), at: outlook.sheets.first });
-                x0 = x1;
-            }
-            y0 = y1;
-        }
+        let at = outlook.sheets().first;
+        let open = parts(tile).map(|rect| Strand { rect, at }).collect();
         let n = tile.area();
         let pixels = TilePixels { a: vec![0.0; n], colour: vec![[0; 3]; n], last: None };
         Region { tile, open, pixels, counters: Counters::default(), touched: Vec::new() }
@@ -323,49 +511,18 @@ impl Region {
         scratch: &mut Scratch,
     ) -> Vec<u32> {
         let mut lacks = Vec::new();
-        let mut inside = std::mem::take(&mut scratch.inside);
-        let mut loaded = std::mem::take(&mut scratch.loaded);
         let mut open = std::mem::take(&mut self.open);
+        let from = From { frame, simd, outlook, supply, ahead };
         open.retain_mut(|strand| {
-            let slab = SheetRange::new(strand.at, outlook.sheets.end);
-            inside.clear();
-            inside.extend(outlook.over(strand.rect.x0, strand.rect.y0).iter().filter(|&&s| {
-                let p = &outlook.sights[s as usize].projected;
-                p.sheets.overlaps(slab) && !p.rect.intersect(&strand.rect).is_empty()
-            }));
-            if inside.is_empty() {
-                return false;
-            }
-            loaded.clear();
-            loaded.resize_with(inside.len(), OnceCell::new);
-            let coming = Coming {
-                frame,
-                sights: &outlook.sights,
-                supply,
-                loaded: &loaded,
-                ahead,
-                stop: Cell::new(None),
-                lacks: RefCell::default(),
-            };
-            let among = Among::Coming(&coming);
-            let part =
-                Part { frame, rect: strand.rect, tile: self.tile, slab, among, inside: &inside };
-            part.draw(simd, scratch, (&mut self.pixels, &mut self.counters));
-            let came = loaded.iter().zip(&inside).filter(|(l, _)| l.get().is_some());
-            self.touched.extend(came.map(|(_, &s)| outlook.sights[s as usize].place));
-            lacks.append(&mut coming.lacks.borrow_mut());
-            match coming.stop.get() {
-                Some(k) => {
-                    strand.at = k;
-                    true
-                }
-                None => false,
-            }
+            let at = (self.tile, strand.rect, strand.at);
+            let io = (&mut self.pixels, &mut self.counters);
+            let touched = |place| self.touched.push(place);
+            let went = go_through(from, at, scratch, io, touched);
+            lacks.extend(went.lacks);
+            strand.at = went.stop.unwrap_or(strand.at);
+            went.stop.is_some()
         });
-        loaded.clear();
         self.open = open;
-        scratch.inside = inside;
-        scratch.loaded = loaded;
         if self.tile.width() > PART as usize || self.tile.height() > PART as usize {
             // Parts lack the same brick; the first to name it says how urgent it is.
             let mut named = std::collections::BTreeSet::new();
@@ -381,5 +538,35 @@ impl Region {
         touched.dedup();
         pixels.last = None;
         Finished { pixels, counters, touched }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_list_grows_and_is_emptied_while_its_memory_stays() {
+        let mut list = Growing::default();
+        for n in [0, 1, 63, 64, 65, 191, 192, 1000, 5] {
+            let first = (n > 0).then(|| {
+                list.push(7);
+                list.get(0)
+            });
+            (1..n).for_each(|i| list.push(i * 3 + 7));
+            assert!(first.is_none_or(|f| *f == 7));
+            assert_eq!(list.len(), n);
+            assert!(list.iter().copied().eq((0..n).map(|i| i * 3 + 7)));
+            list.clear();
+            assert_eq!(list.iter().count(), 0);
+        }
+        assert_eq!(list.chunks.iter().filter(|c| c.get().is_some()).count(), 5);
+    }
+
+    #[test]
+    fn parts_of_a_tile_are_those_of_the_picture() {
+        let got: Vec<Rect> = parts(Rect::new(48, 64, 130, 100)).collect();
+        let of = |x0, x1| Rect::new(x0, 64, x1, 100);
+        assert_eq!(got, [of(48, 64), of(64, 128), of(128, 130)]);
     }
 }

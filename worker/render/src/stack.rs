@@ -105,11 +105,11 @@ pub(crate) fn walk<S: Recorded, const N: usize, T: Stage<S, N>>(
     let (mut next, mut k) = (0, slab.first);
     let mut stopped = false;
     while k < slab.end && any_open {
-        if !part.is_supplied(next, k, &open) {
+        if !part.is_supplied(k, &open, counters) {
             stopped = true;
             break;
         }
-        while next < part.bricks() && part.projected(next).sheets.first <= k {
+        while part.begins(next, k) {
             stage.toss(next, &open, queues, counters);
             next += 1;
         }

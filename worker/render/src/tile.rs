@@ -26,7 +26,7 @@ use crate::flat::{self, RenderFlat};
 use crate::general::{GeneralScratch, Kind, Queues, RenderGeneral};
 use crate::mask::OpenMask;
 use crate::planes;
-use crate::region::{Coming, Loaded};
+use crate::region::{Coming, Memory};
 use crate::scene::{Corner, Frame};
 use crate::sheet::Row;
 use crate::splat::records::{MOST, Recorded};
@@ -81,9 +81,9 @@ pub struct Scratch {
     whole: Whole,
     pixels: Pixels,
     /// Which of a tile's bricks lie in a part.
-    pub(crate) inside: Vec<u32>,
-    /// Bricks of a part that came one by one.
-    pub(crate) loaded: Vec<Loaded>,
+    inside: Vec<u32>,
+    /// What lies over a part whose bricks come one by one.
+    pub(crate) coming: Memory,
     /// Sums of a last sheet, while no tile has them.
     last: Vec<RawSums>,
 }
@@ -221,7 +221,7 @@ pub(crate) struct Part<'a> {
     pub(crate) tile: Rect,
     pub(crate) slab: SheetRange,
     pub(crate) among: Among<'a>,
-    /// Those of the part, front to back.
+    /// Those of the part that are here, front to back.
     pub(crate) inside: &'a [u32],
 }
 
@@ -362,13 +362,30 @@ impl Part<'_> {
         }
     }
 
-    /// Where brick `i` of the part, front to back, may land.
-    #[inline(always)]
-    pub(crate) fn projected(&self, i: usize) -> &Projected {
-        let at = self.inside[i] as usize;
+    /// The first sheet that any of its bricks begins at; `None`: it has none.
+    pub(crate) fn nearest(&self) -> Option<i32> {
         match self.among {
-            Among::Here(bricks) => &bricks[at].projected,
-            Among::Coming(coming) => coming.projected(at),
+            Among::Here(_) => (!self.inside.is_empty()).then(|| self.first_sheet(0)),
+            Among::Coming(coming) => coming.nearest(),
+        }
+    }
+
+    /// The first sheet of brick `i` of the part, front to back.
+    #[inline(always)]
+    pub(crate) fn first_sheet(&self, i: usize) -> i32 {
+        match self.among {
+            Among::Here(bricks) => bricks[self.inside[i] as usize].projected.sheets.first,
+            Among::Coming(coming) => coming.first_sheet(i),
+        }
+    }
+
+    /// Whether there is a brick `i` of the part that begins at sheet `k` or before. Of those that come,
+    /// there are the ones that [came](Part::is_supplied).
+    #[inline(always)]
+    pub(crate) fn begins(&self, i: usize, k: i32) -> bool {
+        match self.among {
+            Among::Here(_) => i < self.inside.len() && self.first_sheet(i) <= k,
+            Among::Coming(coming) => i < coming.came(),
         }
     }
 
@@ -380,27 +397,17 @@ impl Part<'_> {
                 let Seen { brick, corner, .. } = bricks[self.inside[i] as usize];
                 (brick, corner)
             }
-            Among::Coming(coming) => coming.loaded(i),
+            Among::Coming(coming) => coming.brick(i),
         }
     }
 
-    /// Voxels of brick `i` of the part.
+    /// Whether sheet `k`, the one behind the last that this was asked of, can be drawn: all bricks that
+    /// begin there and may touch an open pixel are here. If not, what is lacked is noted.
     #[inline(always)]
-    fn voxels(&self, i: usize) -> u64 {
-        let at = self.inside[i] as usize;
-        match self.among {
-            Among::Here(bricks) => bricks[at].brick.len() as u64,
-            Among::Coming(coming) => coming.voxels(at),
-        }
-    }
-
-    /// Whether sheet `k` can be drawn: all bricks from `next` on that begin there and may touch an
-    /// open pixel are here. If not, what is lacked is noted.
-    #[inline(always)]
-    pub(crate) fn is_supplied(&self, next: usize, k: i32, open: &OpenMask) -> bool {
+    pub(crate) fn is_supplied(&self, k: i32, open: &OpenMask, counters: &mut Counters) -> bool {
         match self.among {
             Among::Here(_) => true,
-            Among::Coming(coming) => coming.is_supplied(self, next, k, open),
+            Among::Coming(coming) => coming.is_supplied(k, open, counters),
         }
     }
 
@@ -412,30 +419,26 @@ impl Part<'_> {
         open: &OpenMask,
         counters: &mut Counters,
     ) -> Option<(&Brick, &Corner)> {
-        let passes = match self.among {
-            Among::Here(bricks) => {
-                let seen = bricks[self.inside[i] as usize];
-                !self.frame.scene.quality.cull || open.any(&seen.projected.rect)
+        // Of one that came the question was asked when it was looked for.
+        if let Among::Here(bricks) = self.among {
+            let seen = bricks[self.inside[i] as usize];
+            if self.frame.scene.quality.cull && !open.any(&seen.projected.rect) {
+                counters.culled += seen.brick.len() as u64;
+                return None;
             }
-            // The question was asked when it was looked for.
-            Among::Coming(coming) => coming.is_loaded(i),
-        };
-        if !passes {
-            counters.culled += self.voxels(i);
-            return None;
         }
         Some(self.brick(i))
     }
 
-    /// How many bricks it has.
-    #[inline(always)]
-    pub(crate) fn bricks(&self) -> usize {
-        self.inside.len()
-    }
-
-    /// Voxels of the bricks from `i` on.
+    /// Voxels of the bricks from `i` on; where they come one by one, of those that did not.
     pub(crate) fn voxels_from(&self, i: usize) -> u64 {
-        (i..self.bricks()).map(|i| self.voxels(i)).sum()
+        match self.among {
+            Among::Here(bricks) => {
+                let left = self.inside[i..].iter();
+                left.map(|&at| bricks[at as usize].brick.len() as u64).sum()
+            }
+            Among::Coming(coming) => coming.voxels_left(),
+        }
     }
 
     /// Index in the tile's planes of the first pixel of the part's row `y`.

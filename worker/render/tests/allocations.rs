@@ -19,11 +19,13 @@ use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
+use slabcast_render::outlook::{Directory, Outlook};
+use slabcast_render::region::{self, Supply};
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch, Seen};
 use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
-use world::bricks_of;
+use world::{bricks_of, infos_of};
 
 /// Views of a turn.
 const VIEWS: u32 = 10;
@@ -57,13 +59,26 @@ fn transfer(unit: OpacityUnit) -> TransferFunction {
     }
 }
 
+/// Every brick is here.
+struct All<'a>(&'a [Arc<Brick>]);
+
+impl Supply for All<'_> {
+    fn get(&self, place: u32) -> Option<Arc<Brick>> {
+        self.0.get(place as usize).cloned()
+    }
+}
+
 /// What one thread keeps from frame to frame.
 struct Kept {
     simd: Simd,
+    directory: Arc<Directory>,
     scratch: Scratch,
     pixels: TilePixels,
     blank: Vec<TileState>,
+    /// Voxels of tiles with their bricks.
     drawn: u64,
+    /// Voxels of tiles through all sheets, which look for theirs.
+    through: u64,
 }
 
 fn tiles() -> Vec<Rect> {
@@ -100,7 +115,18 @@ fn draw(scene: &Arc<Scene>, view: View, bricks: &[Arc<Brick>], kept: &mut Kept) 
             kept.drawn += counted.splatted;
         }
     });
-    [making.count_total + ordering.count_total, drawing.count_total]
+    let mut outlook = None;
+    let looking = measure(|| outlook = Some(Outlook::new(&frame, &kept.directory)));
+    let outlook = outlook.expect("it was made");
+    let through = measure(|| {
+        for tile in &tiles {
+            let (scratch, pixels) = (&mut kept.scratch, &mut kept.pixels);
+            let from: (_, _, &dyn Supply) = (&frame, &outlook, &All(bricks));
+            kept.through += region::draw(from, kept.simd, *tile, scratch, pixels).splatted;
+        }
+    });
+    let made = making.count_total + ordering.count_total + looking.count_total;
+    [made, drawing.count_total + through.count_total]
 }
 
 #[test]
@@ -146,11 +172,14 @@ fn a_second_turn_allocates_nothing_while_it_draws() {
             pixels: TilePixels::default(),
             blank: Vec::new(),
             drawn: 0,
+            through: 0,
+            directory: Arc::new(Directory::new(infos_of(&bricks, &scene.grid).into())),
         };
         let first: u64 = (0..VIEWS).map(|i| draw(&scene, view(i), &bricks, &mut kept)[1]).sum();
         assert!(first > 0, "{room}: the counter does not count");
         let drawn = std::mem::take(&mut kept.drawn);
-        assert!(drawn > 0, "{room}: nothing was drawn");
+        let through = std::mem::take(&mut kept.through);
+        assert!(drawn > 0 && through > 0, "{room}: nothing was drawn");
         for i in 0..VIEWS {
             let [made, drawing] = draw(&scene, view(i), &bricks, &mut kept);
             let what = format!("{room}, perspective {persp}, {sums:?}, {compositing:?}, view {i}");
@@ -158,6 +187,6 @@ fn a_second_turn_allocates_nothing_while_it_draws() {
             assert_eq!(drawing, 0, "allocations while drawing: {what}");
             assert!(made <= FRAME_MOST, "{made} allocations to make a frame: {what}");
         }
-        assert_eq!(kept.drawn, drawn, "{room}: the same turn again");
+        assert_eq!([kept.drawn, kept.through], [drawn, through], "{room}: the same turn again");
     }
 }

@@ -7,10 +7,10 @@ mod world;
 
 use glam::DVec3;
 use proptest::prelude::*;
-use slabcast_common::brick::{Brick, BrickInfo};
+use slabcast_common::brick::Brick;
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::{FrameState, Picture};
-use slabcast_common::message::SceneSpec;
+use slabcast_common::message::{Counters, SceneSpec};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
 use slabcast_common::shade::Shading;
@@ -18,13 +18,14 @@ use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
-use slabcast_render::region::{Outlook, Region, Supply};
+use slabcast_render::outlook::{Directory, Outlook};
+use slabcast_render::region::{Region, Supply};
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch};
 use slabcast_render::{Frame, Scene, serial};
 use std::cell::RefCell;
 use std::sync::Arc;
-use world::bricks_of;
+use world::{bricks_of, infos_of};
 
 fn transfer(top: f64, unit: OpacityUnit) -> TransferFunction {
     TransferFunction {
@@ -46,8 +47,9 @@ fn tiled(
     bricks: &[Arc<Brick>],
     edge: i32,
     slabs: &[SheetRange],
-) -> Picture {
+) -> (Picture, Counters) {
     let size = frame.view.size;
+    let mut counted = Counters::default();
     let mut state = FrameState::new(size);
     let mut scratch = Scratch::default();
     for &slab in slabs {
@@ -55,14 +57,15 @@ fn tiled(
             for x in (0..size[0] as i32).step_by(edge as usize) {
                 let rect = Rect::new(x, y, x + edge, y + edge).intersect(&Rect::of_size(size));
                 let from = state.tile(rect);
-                let (pixels, _) =
+                let (pixels, counters) =
                     tile::render(frame, simd, rect, slab, bricks, &from, &mut scratch);
                 state.put(rect, &pixels);
+                counted += counters;
             }
         }
         state.end_slab();
     }
-    state.finish()
+    (state.finish(), counted)
 }
 
 /// A worker's bricks, some of which are not here yet, and some of which go again.
@@ -88,7 +91,7 @@ fn in_regions(
     ahead: u32,
     (held_in, lost_in): (u64, u64),
     seed: u64,
-) -> (Picture, Vec<u32>, Vec<u32>) {
+) -> (Picture, Counters, Vec<u32>, Vec<u32>) {
     let mut state = seed | 1;
     let mut once_in = |n: u64| {
         state ^= state << 13;
@@ -97,24 +100,15 @@ fn in_regions(
         state.is_multiple_of(n)
     };
     let size = frame.view.size;
-    let info = |b: &Arc<Brick>| BrickInfo {
-        id: b.id,
-        tight: b.tight(&frame.scene.grid),
-        voxels: b.len() as u16,
-        bytes: b.encoded_len() as u32,
-    };
-    let directory: Vec<BrickInfo> = bricks.iter().map(info).collect();
-    let portion = |i: usize| {
-        let part = &directory[i..directory.len().min(i + 5)];
-        Outlook::look(frame, part, i as u32)
-    };
-    let portions: Vec<_> = (0..directory.len()).step_by(5).map(portion).collect();
-    let outlook = Outlook::new(size, &portions);
+    let directory = infos_of(bricks, &frame.scene.grid).into();
+    // A brick a block, eight, or more than there are.
+    let directory = Directory::in_blocks(directory, 3 + (seed % 3) as u32, 1 << 20);
+    let outlook = Outlook::new(frame, &Arc::new(directory));
     let here = RefCell::new(bricks.iter().map(|_| once_in(held_in)).collect());
     let store = Store { bricks, here };
     let mut picture = Picture { size, pixels: vec![[0.0; 4]; (size[0] * size[1]) as usize] };
     let mut scratch = Scratch::default();
-    let (mut asked, mut touched) = (Vec::new(), Vec::new());
+    let (mut asked, mut touched, mut counted) = (Vec::new(), Vec::new(), Counters::default());
     for y in (0..size[1] as i32).step_by(edge as usize) {
         for x in (0..size[0] as i32).step_by(edge as usize) {
             let rect = Rect::new(x, y, x + edge, y + edge).intersect(&Rect::of_size(size));
@@ -136,10 +130,11 @@ fn in_regions(
             let done = region.finish();
             assert!(done.touched.windows(2).all(|p| p[0] < p[1]) && done.pixels.last.is_none());
             touched.extend(done.touched);
+            counted += done.counters;
             done.pixels.write(rect, size, &mut picture.pixels);
         }
     }
-    (picture, asked, touched)
+    (picture, counted, asked, touched)
 }
 
 proptest! {
@@ -218,20 +213,25 @@ proptest! {
         at.sort_unstable();
         at.dedup();
         let slabs: Vec<SheetRange> = at.windows(2).map(|w| SheetRange::new(w[0], w[1])).collect();
-        let got = tiled(&frame, Simd::detect(), &bricks, edge, &slabs);
+        let (got, _) = tiled(&frame, Simd::detect(), &bricks, edge, &slabs);
         let off = got.pixels.iter().zip(&want.pixels).position(|(a, b)| a != b);
         let pixel = off.map(|i| (i, got.pixels[i], want.pixels[i]));
         prop_assert!(pixel.is_none(), "{} slabs, {edge} pixel tiles: got, want {pixel:?}", slabs.len());
-        let got = tiled(&make(false), Simd::plain(), &bricks, 64, &[run]);
+        let (got, _) = tiled(&make(false), Simd::plain(), &bricks, 64, &[run]);
         prop_assert!(got == want, "without culling");
+        let (got, counted) = tiled(&frame, Simd::detect(), &bricks, edge, &[run]);
+        prop_assert!(got == want, "in one slab");
 
         // All bricks here, none here at first, and coming and going.
         let simd = Simd::detect();
         for (held_in, lost_in, ahead) in [(1, 1 << 40, 8), (3, 1 << 40, 0), (2, 4, 3)] {
             let holds = (held_in, lost_in);
-            let (got, asked, touched) =
+            let (got, counters, asked, touched) =
                 in_regions(&frame, simd, &bricks, edge, ahead, holds, seed);
             prop_assert!(got == want, "in regions of {edge} pixels, {holds:?}");
+            // Who looks at fewer bricks draws from the same ones.
+            let figures = |c: &Counters| [c.tossed, c.splatted];
+            prop_assert!(held_in > 1 || figures(&counters) == figures(&counted));
             prop_assert!(held_in > 1 || asked.is_empty());
             if ahead == 0 && lost_in > 1000 {
                 prop_assert!(asked.iter().all(|a| touched.contains(a)), "asked for in vain");

@@ -7,8 +7,7 @@
 use super::cluster::{self, Either, Link};
 use crate::embedded::Crew;
 use crate::fail::Fail;
-use crate::local::{self, Cut};
-use slabcast_common::brick::Brick;
+use crate::local::{self, Bricks, Cut};
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::Picture;
 use slabcast_common::message::{PathRequest, SceneSpec};
@@ -53,7 +52,7 @@ pub(crate) struct Shot {
 #[derive(Clone)]
 pub(crate) struct Drawn {
     pub(crate) spec: SceneSpec,
-    pub(crate) bricks: Vec<Arc<Brick>>,
+    pub(crate) bricks: Bricks,
 }
 
 /// `quality` with sums of 32 bits or floats where they are for the program to decide: what is judged
@@ -89,7 +88,7 @@ impl Drawn {
         let classifier = Classifier::new(transfer, info, quality.compositing);
         let sums = classifier.sums(&quality, &info.lattice).map_err(|e| Fail::flag(&e))?;
         let store = BrickStore::build(volume, info.digest, wanted);
-        let bricks = store.infos().iter().filter_map(|i| store.brick(i.id)).collect();
+        let bricks = Bricks::of(&store);
         let spec = SceneSpec {
             id: SceneId(0),
             volume: info.clone(),
@@ -107,7 +106,7 @@ pub(crate) struct Ready {
     /// Sums decided.
     pub(crate) spec: SceneSpec,
     pub(crate) view: View,
-    pub(crate) bricks: Vec<Arc<Brick>>,
+    pub(crate) bricks: Bricks,
 }
 
 impl Shot {

@@ -3,15 +3,21 @@
 //! Every tile of a level is drawn as a worker draws it, from the same bricks and the same state,
 //! several times, and its shortest time on the processor counts: what disturbs a tile (a cache that
 //! another program has filled, a page that is touched for the first time) only ever makes it longer.
+//!
+//! Which bricks lie where a worker finds out once a frame, whatever its tiles: blocks of bricks when it
+//! begins, a block's bricks when one of its tiles first needs them ([`slabcast_render::outlook`]). So a
+//! tile's time is that with its blocks looked at; it names them, and a block's price is measured apart.
+//! Whoever runs the tiles charges a worker each block of a frame once, to the tile that comes first.
 
 use super::clock::cpu_ns;
 use crate::fail::Fail;
+use crate::local;
 use crate::progress::{Progress, Step};
 use crate::signals;
 use crate::stage::Stage;
 use prost::Message;
 use slabcast_common::PIXELS_VERSION;
-use slabcast_common::brick::{Brick, BrickGrid, BrickInfo};
+use slabcast_common::brick::Brick;
 use slabcast_common::ids::{Epoch, FrameId, TaskId};
 use slabcast_common::image::{Background, FrameState, PixelFormat, TilePixels};
 use slabcast_common::leaves::{Finish, Leaves};
@@ -28,9 +34,10 @@ use slabcast_common::trace::{
 use slabcast_common::view::Projected;
 use slabcast_proto::convert::{self, Down};
 use slabcast_render::Frame;
-use slabcast_render::region::{Finished, Outlook, Region, Supply};
+use slabcast_render::outlook::Outlook;
+use slabcast_render::region::{self, Finished, Region, Supply};
 use slabcast_render::splat::Simd;
-use slabcast_render::tile::{self, Scratch, Seen};
+use slabcast_render::tile::{self, Scratch};
 use slabcast_schedule::{FrameJob, is_shut, macrotile};
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -51,18 +58,6 @@ pub(crate) struct Path<'a> {
     pub(crate) names: (String, String),
 }
 
-/// The bricks as a master knows them.
-fn infos(stage: &Stage) -> Arc<[BrickInfo]> {
-    let grid = BrickGrid::of(stage.spec(0).volume.lattice.dims);
-    let info = |b: &Arc<Brick>| BrickInfo {
-        id: b.id,
-        tight: b.tight(&grid),
-        voxels: b.len() as u16,
-        bytes: b.encoded_len() as u32,
-    };
-    stage.bricks.iter().map(info).collect()
-}
-
 /// What a plain `slabcast render` has tiles finished to, over the usual background: others weigh about the
 /// same.
 pub(crate) const FINISH: Finish =
@@ -70,7 +65,7 @@ pub(crate) const FINISH: Finish =
 
 /// The path's frames as the scheduler gets them.
 pub(crate) fn jobs(stage: &Stage, frames: usize, work: Work) -> Result<Vec<FrameJob>, Fail> {
-    let bricks = infos(stage);
+    let bricks = stage.bricks.directory().bricks();
     let mut scene = Arc::new(stage.spec(0));
     (0..frames)
         .map(|i| {
@@ -117,15 +112,6 @@ pub(crate) fn measure(
     Ok(Trace { version: VERSION, about, frames })
 }
 
-/// Every brick is here.
-struct All<'a>(&'a [Arc<Brick>]);
-
-impl Supply for All<'_> {
-    fn get(&self, place: u32) -> Option<Arc<Brick>> {
-        self.0.get(place as usize).cloned()
-    }
-}
-
 struct Bench {
     scratch: Scratch,
     repeats: u32,
@@ -150,16 +136,12 @@ impl Bench {
     fn frame(&mut self, path: &Path<'_>, i: usize, job: &FrameJob) -> Result<FrameTrace, Fail> {
         let scene = path.stage.scene(i);
         let (setup_ns, frame) = shortest(self.repeats, || Frame::new(scene.clone(), job.view));
-        let (seen_ns, seen) = shortest(self.repeats, || {
-            let bricks = path.stage.bricks.iter();
-            bricks.map(|b| Seen::new(&frame, b)).collect::<Vec<_>>()
-        });
+        let looked = self.look(path, &frame);
+        let (alone_edge, alone_ns) = self.alone(path, &frame, &looked);
+        // As the schedule does (`schedule::frame`).
         let projected: Vec<Option<Projected>> =
-            seen.iter().map(|s| s.as_ref().map(|s| s.projected)).collect();
-        let sheets =
-            projected.iter().flatten().fold(SheetRange::default(), |all, p| all.union(p.sheets));
-        let (alone_edge, alone_ns) = self.alone(&frame, &seen, sheets, job.view.size);
-        let (outlook_ns, regions) = self.regions(path, job, &frame, &projected);
+            job.bricks.iter().map(|b| job.view.project(&b.tight)).collect();
+        let regions = self.regions(path, job, &frame, &projected);
         let size = job.view.size;
         let mut state = FrameState::new(size);
         let mut shut = ShutMap::open(Rect::of_size(size));
@@ -189,10 +171,11 @@ impl Bench {
         Ok(FrameTrace {
             view: view_sha256(&job.scene, &job.view).to_string(),
             setup_ns,
-            alone_ns: setup_ns + seen_ns + alone_ns,
+            alone_ns: setup_ns + looked.outlook_ns + alone_ns,
             alone_edge,
             slabs,
-            outlook_ns,
+            outlook_ns: looked.outlook_ns,
+            block_ns: looked.block_ns,
             regions,
         })
     }
@@ -267,21 +250,34 @@ impl Bench {
         (levels, first)
     }
 
-    /// Tiles through all depths, and what it takes to look at the directory.
+    /// What it takes to look at the directory, and at a block of it.
+    fn look(&mut self, path: &Path<'_>, frame: &Frame) -> Looked {
+        let directory = path.stage.bricks.directory();
+        let (outlook_ns, _) = shortest(self.repeats, || Outlook::new(frame, directory));
+        let mut block_ns = u64::MAX;
+        for _ in 0..self.repeats {
+            let outlook = Outlook::new(frame, directory);
+            let began = cpu_ns();
+            let blocks = outlook.blocks();
+            (0..blocks).for_each(|block| outlook.open(block));
+            block_ns = block_ns.min((cpu_ns() - began) / u64::from(blocks.max(1)));
+        }
+        Looked { outlook_ns, block_ns }
+    }
+
+    /// Tiles through all depths.
     fn regions(
         &mut self,
         path: &Path<'_>,
         job: &FrameJob,
         frame: &Frame,
         projected: &[Option<Projected>],
-    ) -> (u64, Vec<RegionLevel>) {
+    ) -> Vec<RegionLevel> {
         if !path.region {
-            return (0, Vec::new());
+            return Vec::new();
         }
         let size = job.view.size;
-        let (outlook_ns, outlook) =
-            shortest(self.repeats, || Outlook::new(size, &[Outlook::look(frame, &job.bricks, 0)]));
-        let supply = All(&path.stage.bricks);
+        let bricks = &path.stage.bricks;
         let rects: Vec<Rect> = projected.iter().flatten().map(|p| p.rect).collect();
         // The schedule goes by blocks of bricks, whose outline is a little larger: it may take the level
         // beside the one that bricks alone say.
@@ -300,9 +296,11 @@ impl Bench {
             let mut tiles: Vec<RegionTile> = Vec::with_capacity(cut.tiles.len());
             for t in &cut.tiles {
                 let (simd, scratch) = (Simd::detect(), &mut self.scratch);
-                let (ns, done) = shortest(self.repeats, || {
+                // The first time opens blocks; a later one counts.
+                let outlook = Outlook::new(frame, bricks.directory());
+                let (ns, done) = shortest(self.repeats.max(2), || {
                     let mut region = Region::new(&outlook, t.rect);
-                    region.advance(frame, simd, &outlook, &supply, 0, scratch);
+                    region.advance(frame, simd, &outlook, bricks, 0, scratch);
                     let Finished { pixels, counters, touched } = region.finish();
                     let size = [t.rect.width() as u32, t.rect.height() as u32];
                     (Leaves::of(&pixels, size, &FINISH), counters, touched)
@@ -310,54 +308,46 @@ impl Bench {
                 let (leaves, counters, touched) = done;
                 let (result_bytes, _) = weigh(Pixels::Finished(leaves), counters);
                 let (x, y) = (t.rect.x0 as u32, t.rect.y0 as u32);
-                tiles.push(RegionTile { x, y, ns, result_bytes, touched });
+                let opened = outlook.opened().collect();
+                tiles.push(RegionTile { x, y, ns, result_bytes, touched, opened });
             }
             tiles.sort_by_key(|t| (t.y, t.x));
             levels.push(RegionLevel { edge, tiles });
         }
-        (outlook_ns, levels)
+        levels
     }
 
-    /// The best cut of one core through all depths: edge and time.
-    fn alone(
-        &mut self,
-        frame: &Frame,
-        seen: &[Option<Seen>],
-        sheets: SheetRange,
-        size: [u32; 2],
-    ) -> (u32, u64) {
-        let seen: Vec<Seen> = seen.iter().flatten().cloned().collect();
-        let order = Seen::front_to_back(&seen);
-        let whole = Rect::of_size(size);
+    /// The best cut of one core through all depths: edge and time, looks at blocks included.
+    fn alone(&mut self, path: &Path<'_>, frame: &Frame, looked: &Looked) -> (u32, u64) {
+        let bricks = &path.stage.bricks;
+        let whole = Rect::of_size(frame.view.size);
         let simd = Simd::detect();
+        let repeats = self.repeats.max(2);
         let mut pixels = TilePixels::default();
-        let of = |edge: u32, bench: &mut Bench, pixels: &mut TilePixels| {
+        let mut of = |edge: u32| {
+            let outlook = Outlook::new(frame, bricks.directory());
+            let from: (_, _, &dyn Supply) = (frame, &outlook, bricks);
             let mut sum = 0;
-            let step = edge as usize;
-            let corners = (0..whole.y1)
-                .step_by(step)
-                .flat_map(|y| (0..whole.x1).step_by(step).map(move |x| (x, y)));
-            for (x, y) in corners {
-                let edge = edge as i32;
-                let tile = Rect::new(x, y, x + edge, y + edge).intersect(&whole);
-                let over = |s: &&&Seen| !s.projected.rect.intersect(&tile).is_empty();
-                let bricks: Vec<&Seen> = order.iter().filter(over).copied().collect();
-                if bricks.is_empty() {
-                    continue;
-                }
-                let blank = tile::blank(tile);
-                let (ns, _) = shortest(bench.repeats, || {
-                    let scratch = &mut bench.scratch;
-                    tile::render_into(frame, simd, tile, sheets, &bricks, &blank, scratch, pixels)
-                });
-                sum += ns;
+            for tile in local::tiles(whole, edge).filter(|tile| outlook.weight(tile) > 0) {
+                let scratch = &mut self.scratch;
+                // The first time opens blocks; a later one counts.
+                let draw = || region::draw(from, simd, tile, scratch, &mut pixels);
+                sum += shortest(repeats, draw).0;
             }
-            sum
+            sum + outlook.opened().count() as u64 * looked.block_ns
         };
         let edges = [64, 128, 256].into_iter().filter(|e| *e as i32 <= whole.x1.max(whole.y1) * 2);
-        let timed = edges.map(|edge| (edge, of(edge, self, &mut pixels)));
+        let timed = edges.map(|edge| (edge, of(edge)));
         timed.min_by_key(|t| t.1).unwrap_or((64, 0))
     }
+}
+
+/// What it takes to look at bricks, in nanoseconds.
+struct Looked {
+    /// At all blocks.
+    outlook_ns: u64,
+    /// At the bricks of one block, on the average.
+    block_ns: u64,
 }
 
 /// Bytes of a lease as it crosses.
@@ -406,9 +396,11 @@ pub(crate) fn fits(trace: &Trace, jobs: &[FrameJob]) -> Result<(), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::local::{self, Cut};
+    use crate::local::Cut;
     use crate::request::Asked;
     use slabcast_common::path::{Axis, Orientation, Turntable, ViewPath};
+    use slabcast_render::outlook::Directory;
+    use slabcast_render::tile::Seen;
 
     /// Bytes of a frame's results and what a tile takes to write and to read, for docs/scaling.md.
     #[test]
@@ -465,6 +457,75 @@ mod tests {
                 ns.map(|n| n as f64 / 1e3 / f64::from(tiles)),
                 composed as f64 / 4e6
             );
+        }
+    }
+
+    /// What looking at bricks takes: all of a volume, those that a frame needs, and those that a worker
+    /// of fifteen needs which draws neighbouring tiles of it. For docs/scaling.md.
+    #[test]
+    #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_looking -- --ignored --nocapture"]
+    fn what_looking_at_bricks_takes() {
+        let data = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
+        println!(
+            "edge of blocks: blocks; us, bricks that are looked at: a worker of 15, the frame"
+        );
+        for (file, axis, tf) in [
+            ("mri256.nrrd", "-y", "peer-opaque"),
+            ("mri256.nrrd", "-y", "peer-semi"),
+            ("mouse_skull.nrrd", "+z", "peer-skull"),
+            ("aneurism.nrrd", "+z", "peer-vessels"),
+        ] {
+            let file = data.join(file);
+            if !file.exists() {
+                println!("skipped: {} is not here", file.display());
+                continue;
+            }
+            let volume = crate::volume::open(&file).expect("a volume");
+            let info = volume.info(volume.digest());
+            let up = axis.parse::<Axis>().expect("an axis");
+            let orientation = Orientation::new(Some(up), None).expect("axes");
+            let turn = Turntable { frames: 4, step: 22.5, ..Turntable::default() };
+            let asked = Asked::plain(ViewPath::turn([512, 512], turn), tf).expect("a request");
+            let stage = Stage::new(&volume, &info, &asked, orientation).expect("a stage");
+            let frame = stage.frame(1).expect("a frame");
+            let bricks = &stage.bricks;
+            let (ns, n) = shortest(9, || {
+                let seen: Vec<Seen> = bricks.iter().filter_map(|b| Seen::new(&frame, b)).collect();
+                Seen::front_to_back(&seen).len()
+            });
+            println!("{tf}, every brick: {:.0}, {n}", ns as f64 / 1e3);
+            for shift in 4..7 {
+                let infos = bricks.directory().bricks().clone();
+                let directory = Arc::new(Directory::in_blocks(infos, shift, usize::MAX));
+                let all = Outlook::new(&frame, &directory);
+                let tiles = local::tiles(Rect::of_size([512; 2]), 64);
+                let tiles: Vec<Rect> = tiles.filter(|tile| all.weight(tile) > 0).collect();
+                let (mut scratch, mut pixels) = Default::default();
+                let mut look = |tiles: &[Rect]| {
+                    let drawn = Outlook::new(&frame, &directory);
+                    for tile in tiles {
+                        let from: (_, _, &dyn Supply) = (&frame, &drawn, bricks);
+                        region::draw(from, Simd::detect(), *tile, &mut scratch, &mut pixels);
+                    }
+                    let blocks: Vec<u32> = drawn.opened().collect();
+                    let (ns, _) = shortest(9, || {
+                        let outlook = Outlook::new(&frame, &directory);
+                        blocks.iter().for_each(|block| outlook.open(*block));
+                    });
+                    [ns as f64 / 1e3, drawn.looked_at() as f64]
+                };
+                let [whole_us, whole] = look(&tiles);
+                let each: Vec<[f64; 2]> =
+                    tiles.chunks(tiles.len().div_ceil(15)).map(&mut look).collect();
+                let mean = |i: usize| each.iter().map(|e| e[i]).sum::<f64>() / each.len() as f64;
+                println!(
+                    "{}: {}; {:.0}, {:.0}; {whole_us:.0}, {whole:.0}",
+                    1 << shift,
+                    all.blocks(),
+                    mean(0),
+                    mean(1)
+                );
+            }
         }
     }
 

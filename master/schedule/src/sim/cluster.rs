@@ -12,7 +12,7 @@ use slabcast_common::message::{
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::slab::SheetRange;
-use slabcast_common::trace::Trace;
+use slabcast_common::trace::{RegionTile, Trace};
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -102,6 +102,8 @@ struct Known {
     result_bytes: u64,
     /// Of a region: places of the bricks that it is drawn from.
     touched: Vec<u32>,
+    /// Of a region: blocks whose bricks it looks at.
+    opened: Vec<u32>,
 }
 
 struct Running {
@@ -136,6 +138,8 @@ struct Worker {
     running: Vec<Option<Running>>,
     /// When its tables of a frame are made.
     tables: BTreeMap<FrameId, Nanos>,
+    /// Blocks of bricks that its tiles of a frame opened.
+    opened: BTreeMap<FrameId, BTreeSet<u32>>,
     batches: VecDeque<(BrickSetKey, Vec<BrickId>, u64)>,
     under_way: usize,
 }
@@ -239,6 +243,7 @@ pub fn run(
             stands: BTreeMap::new(),
             running: (0..cluster.threads).map(|_| None).collect(),
             tables: BTreeMap::new(),
+            opened: BTreeMap::new(),
             batches: VecDeque::new(),
             under_way: 0,
         };
@@ -477,6 +482,7 @@ impl World<'_> {
                 let w = self.workers.get_mut(&id).expect("a worker stays");
                 w.leases.retain(|(l, _)| l.frame() != frame);
                 w.tables.remove(&frame);
+                w.opened.remove(&frame);
             }
             ToWorker::Ping { nonce } => {
                 let at = self.read(id, SMALL);
@@ -508,14 +514,14 @@ impl World<'_> {
                     lease_bytes: t.lease_bytes.into(),
                     result_bytes: t.result_bytes.into(),
                     touched: Vec::new(),
+                    opened: Vec::new(),
                 })
             }
-            Task::Region(l) => traced.region(&l.tile, size).map(|t| Known {
-                ns: t.ns,
-                lease_bytes: SMALL,
+            Task::Region(l) => traced.region(&l.tile, size).map(|t| {
                 // A bit or so for each touched brick, and the cost's other figures.
-                result_bytes: u64::from(t.result_bytes) + 20 + t.touched.len() as u64,
-                touched: t.into_owned().touched,
+                let result_bytes = u64::from(t.result_bytes) + 20 + t.touched.len() as u64;
+                let RegionTile { ns, touched, opened, .. } = t.into_owned();
+                Known { ns, lease_bytes: SMALL, result_bytes, touched, opened }
             }),
         };
         known.ok_or_else(|| {
@@ -587,14 +593,17 @@ impl World<'_> {
             let traced = &self.trace.frames[frame.0 as usize - 1];
             let mut setup = traced.setup_ns;
             if matches!(lease, Task::Region(_)) {
-                // All threads look at the directory together.
-                setup += traced.outlook_ns / u64::from(self.cluster.threads.max(1));
+                setup += traced.outlook_ns;
             }
             let stretch = self.cluster.stretch;
             let w = self.workers.get_mut(&id).expect("a worker stays");
+            // Its threads share what they looked at.
+            let known_of = w.opened.entry(frame).or_default();
+            let fresh = known.opened.iter().filter(|b| known_of.insert(**b)).count();
+            let ns = known.ns.saturating_add(traced.block_ns.saturating_mul(fresh as u64));
             // The first tile of a frame makes its tables; others wait for them.
             let made = *w.tables.entry(frame).or_insert(now + (setup as f64 * stretch) as Nanos);
-            let end = made.max(now) + (known.ns as f64 * stretch) as Nanos;
+            let end = made.max(now) + (ns as f64 * stretch) as Nanos;
             self.outcome.frames[frame.0 as usize - 1].render += end - now;
             let pixels = match &mut self.machine {
                 Some(machine) => {

@@ -1,7 +1,7 @@
 //! Small worlds for the renderer's tests.
 #![allow(dead_code, reason = "each test file uses its part")]
 
-use slabcast_common::brick::{Brick, BrickGrid, local};
+use slabcast_common::brick::{Brick, BrickGrid, BrickInfo, local};
 use slabcast_common::ids::BrickId;
 use slabcast_common::shade::encode_normal;
 use slabcast_common::volume::{Samples, Volume};
@@ -35,4 +35,16 @@ pub fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
         }
     }
     out
+}
+
+/// The directory of these bricks.
+#[allow(unreachable_pub, reason = "a module of several test programs")]
+pub fn infos_of(bricks: &[Arc<Brick>], grid: &BrickGrid) -> Vec<BrickInfo> {
+    let info = |b: &Arc<Brick>| BrickInfo {
+        id: b.id,
+        tight: b.tight(grid),
+        voxels: b.len() as u16,
+        bytes: b.encoded_len() as u32,
+    };
+    bricks.iter().map(info).collect()
 }

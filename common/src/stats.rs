@@ -165,7 +165,8 @@ pub const EXTRAPOLATION: f64 = 8.0 / 7.0;
 pub struct ErrorStats {
     /// Pixels shut before they are opaque: at most eps times the brightest colour.
     pub cutoff: Bound,
-    /// Rounding of contributions to the integers of the sums.
+    /// Rounding of contributions to the integers of the sums. What slivers of kernels take to another sheet
+    /// is not in it.
     pub quantisation: Bound,
     /// Rounding of positions and of f32 arithmetic.
     pub rounding: BoundAndEstimate,

@@ -58,6 +58,12 @@ impl Still {
         magnified(picture, self.magnify, threads)
     }
 
+    /// The picture with no pixel ever shut.
+    pub(crate) fn draw_open(&self, threads: usize) -> Picture {
+        let frame = self.frame(self.spec.quality).never_shut();
+        magnified(local::picture(&frame, &self.bricks, Cut::on(threads)), self.magnify, threads)
+    }
+
     /// What judges it.
     pub(crate) fn reference(&self) -> Reference {
         Reference::new(&self.spec, self.view, &self.bricks)

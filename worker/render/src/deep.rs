@@ -8,7 +8,7 @@
 
 use crate::footprint::Phases;
 use crate::mask::{OpenMask, REACH_MOST};
-use crate::splat::records::{BySlot, MOST, Recorded, STRIDE};
+use crate::splat::records::{BySlot, MOST, Recorded, RowAt, STRIDE};
 use crate::splat::{Accumulate, Simd, Work};
 use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels};
@@ -422,12 +422,12 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
             }
             for axis in 0..2 {
                 // Loops, since closures of arrays are compiled for the baseline.
-                let mut rows: [(&[S::Weight], i32); N] = [(&[], 0); N];
+                let mut rows = [RowAt::NONE; N];
                 for (at, row) in rows.iter_mut().enumerate() {
                     if after::<N>(k, at) < left[i] {
-                        let (phases, weights) = &layers[at].axes[axis];
-                        let weights = &weights[from[axis][at][i] as usize..][..phases.len];
-                        *row = (weights, first[axis][at][i] - lo[axis]);
+                        let (phases, table) = layers[at].axes[axis];
+                        let (from, len) = (from[axis][at][i] as usize, phases.len);
+                        *row = RowAt { table, from, len, column: first[axis][at][i] - lo[axis] };
                     }
                 }
                 S::weave(sheets.simd, rows, wide[axis], &mut self.across[axis]);

@@ -28,9 +28,9 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 /// Sections by depth phase: which sheets a voxel touches and how much of it lies in each.
 ///
 /// A kernel that is m sheets long lies in m + 1 of them wherever it does not begin at a plane, and of
-/// the outermost one it has a sliver. For 16-bit sums slivers that hold next to nothing
-/// (half a percent) are each given to the sheet beside them: every voxel then lies in m sheets, its weights
-/// still add up to one, and at sheets of a vox four fit a register where five do not.
+/// one of the outermost it has a sliver. Where slivers hold next to nothing each may be given to the sheet
+/// beside it: every voxel then lies in m sheets, its weights still add up to one, and at sheets of a vox
+/// a pixel's four fit a record where five do not ([`Sections::given_away`] says what that may cost).
 #[derive(Clone, Debug)]
 pub struct Sections {
     phases: i32,
@@ -46,30 +46,48 @@ pub struct Sections {
     stride: usize,
 }
 
-/// The share of a voxel that may be moved into the next sheet at most. The default kernel has 0.0045
-/// beyond 1.5 vox from its centre, which a few voxels lose at sheets of 1 vox; most lose less. Of the
-/// largest extinction that 16-bit sums hold it is 0.05, and the picture of mri256 (`peer-opaque`) is
-/// off by 0.22 of 1/255 at the same thickness instead of 0.21. At 2 vox it would be 0.05 of a voxel,
-/// and the picture of other sheets.
+/// The share of a voxel beyond the m - 1 sheets in its middle up to which slivers are given away: the
+/// default kernel has 0.0045 beyond 1.5 vox from its centre, which is as much as a sliver can be at sheets
+/// of 1 vox; at 2 vox it would be 0.05, and the picture of other sheets.
 const SLIVER: f64 = 0.005;
+
+/// By how much of a sheet the sheets that are kept lie before a voxel's middle, as a divisor. What is in front
+/// of an opaque voxel's first sheet is seen whole, what is behind its last one through all of the voxel:
+/// with a quarter, the default kernel loses 0.0007 in front at most and 0.016 behind, with none 0.0045 on
+/// either side, and the picture of mri256 (`peer-opaque`) is off by 0.16 of 1/255 instead of 0.05.
+const AHEAD: i32 = 4;
 
 /// A weight from 0 to 1 in 16-bit fixed point: 2^-15 a unit, rounded to nearest.
 fn fixed(w: f64) -> i16 {
     libm::floor(w * 32768.0 + 0.5).clamp(0.0, 32767.0) as i16
 }
 
+/// How far a kernel reaches, in phases.
+fn whole_phases(profile: &Profile, thickness: f64, phases: i32) -> i32 {
+    // What f64 leaves above an integer is not a phase more.
+    libm::ceil(profile.radius / thickness * f64::from(phases) * (1.0 - 1e-12)) as i32
+}
+
+/// How far before and behind a voxel's depth, in phases, it is drawn where slivers are given away; `None`
+/// where they are no slivers.
+fn kept(profile: &Profile, thickness: f64, phases: i32) -> Option<(i32, i32)> {
+    let radius = whole_phases(profile, thickness, phases);
+    // As many whole sheets as are shorter than the kernel, in its middle.
+    let inner = (2 * radius - 1) / phases * (phases / 2);
+    let beyond = profile.integral_to(-f64::from(inner) / f64::from(phases) * thickness);
+    let ahead = (phases / AHEAD).min(radius - inner);
+    (beyond <= SLIVER).then_some((inner + ahead, inner - ahead))
+}
+
 impl Sections {
     /// For sheets of `thickness` and a kernel profile along z, both in vox; `merged`: with slivers given
     /// to their neighbours.
     pub fn new(profile: &Profile, thickness: f64, phases: i32, merged: bool) -> Self {
-        // What f64 leaves above an integer is not a phase more.
-        let radius = libm::ceil(profile.radius / thickness * f64::from(phases) * (1.0 - 1e-12));
-        let radius = radius as i32;
-        // As many whole sheets as are shorter than the kernel, in its middle.
-        let inner = (2 * radius - 1) / phases * (phases / 2);
-        let moved = profile.integral_to(-f64::from(inner) / f64::from(phases) * thickness);
-        let (front, back) =
-            if merged && moved <= SLIVER { (inner, inner) } else { (radius, radius - 1) };
+        let radius = whole_phases(profile, thickness, phases);
+        let (front, back) = match kept(profile, thickness, phases) {
+            Some(kept) if merged => kept,
+            _ => (radius, radius - 1),
+        };
         let shift = phases.trailing_zeros();
         let mut sections =
             Sections { phases, shift, front, back, weights: vec![], fixed: vec![], stride: 1 };
@@ -91,6 +109,18 @@ impl Sections {
             }
         }
         sections
+    }
+
+    /// How much of a pixel's light may change its sheet where slivers are given away, at most, by voxels of
+    /// extinction up to `most` per vox: 0 to 1. In front that is a sliver's opacity; behind, what shows of it
+    /// through its voxel, `t exp(-t)` of the sliver for an optical depth t of the voxel.
+    pub fn given_away(profile: &Profile, thickness: f64, phases: i32, most: f64) -> f64 {
+        let Some((front, back)) = kept(profile, thickness, phases) else { return 0.0 };
+        let beyond = |reach: i32| {
+            profile.integral_to(-f64::from(reach) / f64::from(phases) * thickness).max(0.0)
+        };
+        let shows = most.min(1.0) * libm::exp(-most.min(1.0));
+        (beyond(front) * most).max(beyond(back) * shows)
     }
 
     /// First sheet of a voxel at depth `z` (in phases) and its weights in the sheets from there.
@@ -586,7 +616,8 @@ mod tests {
                 assert!(front <= first && last <= end && end - front - 1 <= last - first);
                 let before = p.integral_to((f64::from(first) - at) * d);
                 let behind = 1.0 - p.integral_to((f64::from(last) - at) * d);
-                assert!(before.max(behind) < SLIVER, "d {d}, z {z}: {before}, {behind}");
+                assert!(before < SLIVER / 5.0, "d {d}, z {z}: {before}");
+                assert!(behind < SLIVER * 4.0, "d {d}, z {z}: {behind}");
             }
         }
     }

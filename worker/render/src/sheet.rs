@@ -110,6 +110,12 @@ impl Rule {
         }
     }
 
+    /// The same, but no pixel is ever shut.
+    #[must_use]
+    pub(crate) fn never_shut(self) -> Self {
+        Rule { eps: 0.0, ..self }
+    }
+
     /// Whether a pixel with opacity `a` is shut for good.
     #[inline(always)]
     pub fn is_shut(&self, a: f32) -> bool {

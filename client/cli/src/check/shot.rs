@@ -225,6 +225,11 @@ impl Ready {
         local::picture(&self.frame(), &self.bricks, cut)
     }
 
+    /// The same with no pixel ever shut.
+    pub(crate) fn never_shut(&self, cut: Cut) -> Picture {
+        local::picture(&self.frame().never_shut(), &self.bricks, cut)
+    }
+
     /// A seeded sample of at most `n` pixels, one from each of about `n` equal cells.
     pub(crate) fn sample(&self, n: usize) -> Vec<[u32; 2]> {
         stratified(self.view.size, n, 1)

@@ -39,11 +39,11 @@ const MODEL_TOLERANCE: f64 = 1e-5;
 /// the 8-bit sRGB pictures.
 ///
 /// Between the picture and the limit of infinitely thin sheets lie thickness, cut-off (--eps),
-/// quantisation (sums of integers, 16-bit ones with slivers of a kernel that its outermost sheets do
-/// not get) and rounding (of positions, and f32 arithmetic). Between the
-/// limit and an ideal lie two errors of the model, which are no part of that sum: truncation (the
-/// limit with the whole Gaussian, neither cut at the radius nor lowered by its edge value) and
-/// ripple (the limit of a field in which a constant comes back constant).
+/// quantisation (sums of integers, with slivers of a kernel that its outermost sheets do not get)
+/// and rounding (of positions, and f32 arithmetic). Between the limit and an ideal lie two errors of
+/// the model, which are no part of that sum: truncation (the limit with the whole Gaussian, neither
+/// cut at the radius nor lowered by its edge value) and ripple (the limit of a field in which a
+/// constant comes back constant).
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -152,7 +152,7 @@ fn find(args: &ErrorArgs) -> Result<Found, Fail> {
     // What nothing tells apart need not be drawn twice.
     let open = Quality { eps: 0.0, ..quality };
     let floats = Quality { sums: Sums::F32, ..open };
-    let opened = shut(&picture, quality.eps).then(|| still.draw(open, threads));
+    let opened = shut(&picture, quality.eps).then(|| still.draw_open(threads));
     let opened = opened.as_ref().unwrap_or(&picture);
     let floated = (floats != open).then(|| still.draw(floats, threads));
     let floated = floated.as_ref().unwrap_or(opened);

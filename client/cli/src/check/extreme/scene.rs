@@ -108,7 +108,7 @@ pub(super) fn persp(volume: &Volume, eye: [f64; 3], target: [f64; 3], fov: f64) 
     }
 }
 
-/// Draws `shot` everywhere, and once more with nothing shut; judges a sample of `pixels`.
+/// Draws `shot` everywhere, and twice more with nothing shut; judges a sample of `pixels`.
 ///
 /// Three things must hold. What the cut-off leaves out is within its bound, on every pixel. With
 /// nothing shut, a pixel is no farther from its own sheets in f64 than its enclosure says. And
@@ -119,7 +119,7 @@ pub(super) fn judge(shot: &Shot, pixels: usize, tools: &Tools) -> Result<Vec<Row
     let (picture, trouble) = shot.everywhere(&ready, tools)?;
     let open = ready.with(Quality { eps: 0.0, ..ready.spec.quality });
     let never_shut = open.picture(Cut::on(tools.threads));
-    let left_out = apart(&picture, &never_shut);
+    let left_out = apart(&picture, &ready.never_shut(Cut::on(tools.threads)));
     let mut rows = vec![
         Row::new("max that the cut-off leaves out", left_out, cutoff(&ready))
             .with(trouble)

@@ -8,57 +8,86 @@
 pub(super) mod avx2 {
     use crate::sheet::{LANES, Row};
     use crate::splat::Tap;
-    use crate::splat::records::{MOST, Record, STRIDE, STRIP, Splat, Strip, Tables};
+    use crate::splat::records::{
+        Across, BySlot, MOST, Record, RowAt, STRIDE, STRIP, Splat, Strip, Tables,
+    };
     use std::arch::x86_64::*;
 
     /// Registers of a record at most: eight sums each.
     const PARTS: usize = MOST / 2;
 
-    /// The section of a voxel of C channels, eight sums a register.
+    /// Which of a row's weights in depth each of the eight lanes of a register takes: that of its slot.
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn sections<const C: usize, const N: usize>(
-        payload: &[f32; C],
-        z: &[f32],
-        slot: usize,
-    ) -> [__m256; PARTS] {
+    fn turns<const C: usize, const N: usize>(slot: usize) -> [__m256i; PARTS] {
         const { assert!(C == 2 || C == 4) };
-        let mut wz = [[0f32; C]; N];
-        for (i, &w) in z.iter().enumerate() {
-            wz[(slot + i) % N] = [w; C];
+        let mut turns = [_mm256_setzero_si256(); PARTS];
+        for (part, turn) in turns[..N * C / 8].iter_mut().enumerate() {
+            let lanes: [i32; 8] =
+                std::array::from_fn(|lane| (((8 * part + lane) / C + 2 * N - slot) % N) as i32);
+            // SAFETY: eight numbers are 32 bytes.
+            *turn = unsafe { _mm256_loadu_si256(lanes.as_ptr().cast()) };
         }
-        let payload: [f32; 8] = std::array::from_fn(|i| payload[i % C]);
-        // SAFETY: eight floats are 32 bytes.
-        let payload = unsafe { _mm256_loadu_ps(payload.as_ptr()) };
-        let mut sections = [_mm256_setzero_ps(); PARTS];
-        let wz = wz.as_flattened();
-        for i in 0..N * C / 8 {
-            // SAFETY: eight floats are 32 bytes. Negative sections there are none.
-            let w = unsafe { _mm256_loadu_ps(wz[8 * i..8 * i + 8].as_ptr()) };
-            sections[i] = _mm256_max_ps(_mm256_mul_ps(payload, w), _mm256_setzero_ps());
-        }
-        sections
+        turns
     }
+
+    type At<'a, const C: usize, const N: usize> =
+        (&'a mut [[[i32; C]; N]], (&'a [Splat], &'a [[f32; C]]), usize, &'a Tables<'a, i32>);
 
     #[target_feature(enable = "avx2")]
     pub(in super::super) fn splat_all<const C: usize, const N: usize>(
         records: &mut [[[i32; C]; N]],
-        (voxels, payloads): (&[Splat], &[[f32; C]]),
+        voxels: (&[Splat], &[[f32; C]]),
         slot: usize,
         tables: &Tables<'_, i32>,
     ) {
-        let half = _mm256_set1_ps(0.5);
+        let at = (records, voxels, slot, tables);
+        match tables.across[0].len {
+            4 => all::<4, C, N>(at),
+            5 => all::<5, C, N>(at),
+            6 => all::<6, C, N>(at),
+            7 => all::<7, C, N>(at),
+            8 => all::<8, C, N>(at),
+            9 => all::<9, C, N>(at),
+            13 => all::<13, C, N>(at),
+            14 => all::<14, C, N>(at),
+            _ => all::<0, C, N>(at),
+        }
+    }
+
+    /// Footprints of `WIDE` columns, or of any number where that is 0.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn all<const WIDE: usize, const C: usize, const N: usize>(
+        (records, (voxels, payloads), slot, tables): At<'_, C, N>,
+    ) {
+        let (half, zero) = (_mm256_set1_ps(0.5), _mm256_setzero_ps());
+        let turns = turns::<C, N>(slot);
+        let present: [i32; 8] =
+            std::array::from_fn(|i| if i < tables.deep.len.min(N) { -1 } else { 0 });
+        // SAFETY: eight numbers are 32 bytes.
+        let present = unsafe { _mm256_loadu_si256(present.as_ptr().cast()) };
         for (v, payload) in voxels.iter().zip(payloads) {
             let (x, y, z) = v.weights(tables);
-            let sections = sections::<C, N>(payload, z, slot);
+            let four: [f32; 4] = std::array::from_fn(|i| payload[i % C]);
+            // SAFETY: lanes that are not present are not read; four floats are 16 bytes.
+            let (z, payload) =
+                unsafe { (_mm256_maskload_ps(z.as_ptr(), present), _mm_loadu_ps(four.as_ptr())) };
+            let payload = _mm256_set_m128(payload, payload);
+            let mut sections = [zero; PARTS];
+            for (section, turn) in sections[..N * C / 8].iter_mut().zip(turns) {
+                let wz = _mm256_permutevar8x32_ps(z, turn);
+                // Negative sections there are none.
+                *section = _mm256_max_ps(_mm256_mul_ps(payload, wz), zero);
+            }
             for (row, wy) in records[v.at()..].chunks_mut(STRIDE).zip(y) {
                 let wy = _mm256_set1_ps(wy.get());
                 let mut rows = sections;
                 for row in &mut rows[..N * C / 8] {
                     *row = _mm256_mul_ps(*row, wy);
                 }
-                for (record, wx) in row[..x.len()].iter_mut().zip(x) {
-                    let wx = _mm256_set1_ps(Tap::get(*wx));
+                let add = |record: &mut [[i32; C]; N], wx: &Tap| {
+                    let wx = _mm256_set1_ps(wx.get());
                     let at: *mut __m256i = record.as_mut_ptr().cast();
                     for (i, row) in rows[..N * C / 8].iter().enumerate() {
                         let add = _mm256_add_ps(_mm256_mul_ps(*row, wx), half);
@@ -68,6 +97,123 @@ pub(super) mod avx2 {
                             let sums = _mm256_add_epi32(sums, _mm256_cvttps_epi32(add));
                             _mm256_storeu_si256(at.add(i), sums);
                         }
+                    }
+                };
+                if WIDE == 0 {
+                    row[..x.len()].iter_mut().zip(x).for_each(|(record, wx)| add(record, wx));
+                } else {
+                    let row = row.first_chunk_mut::<WIDE>().expect("a footprint inside the part");
+                    let x = x.first_chunk::<WIDE>().expect("a row of the table");
+                    for i in 0..WIDE {
+                        add(&mut row[i], &x[i]);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Four rows and eight columns at a time.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    pub(in super::super) fn weave<const N: usize>(
+        rows: [RowAt<'_, Tap>; N],
+        wide: usize,
+        to: &mut [BySlot<Tap, N>],
+    ) {
+        let eights = wide.div_ceil(8);
+        if N != 4 || to.len() < 8 * eights {
+            return super::super::weave(rows, wide, to);
+        }
+        for (eight, to) in to.chunks_exact_mut(8).take(eights).enumerate() {
+            let first = 8 * eight as i32;
+            let columns = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
+            let columns = _mm256_add_epi32(columns, _mm256_set1_epi32(first));
+            let mut lines = [_mm256_setzero_ps(); 4];
+            for (line, at) in lines.iter_mut().zip(rows) {
+                let row = at.row();
+                let (begin, end) = (at.column, at.column + row.len() as i32);
+                let behind = _mm256_cmpgt_epi32(columns, _mm256_set1_epi32(begin - 1));
+                let before = _mm256_cmpgt_epi32(_mm256_set1_epi32(end), columns);
+                let from = row.as_ptr().wrapping_offset(first as isize - begin as isize);
+                // SAFETY: a tap is a float; lanes that are not present are not read, and those that are
+                // lie in the row.
+                *line =
+                    unsafe { _mm256_maskload_ps(from.cast(), _mm256_and_si256(behind, before)) };
+            }
+            let low =
+                [_mm256_unpacklo_ps(lines[0], lines[1]), _mm256_unpacklo_ps(lines[2], lines[3])];
+            let high =
+                [_mm256_unpackhi_ps(lines[0], lines[1]), _mm256_unpackhi_ps(lines[2], lines[3])];
+            // Columns 0 and 4, 1 and 5, and so on.
+            let pairs = [
+                _mm256_shuffle_ps::<0b01_00_01_00>(low[0], low[1]),
+                _mm256_shuffle_ps::<0b11_10_11_10>(low[0], low[1]),
+                _mm256_shuffle_ps::<0b01_00_01_00>(high[0], high[1]),
+                _mm256_shuffle_ps::<0b11_10_11_10>(high[0], high[1]),
+            ];
+            let (low, high) = to.split_at_mut(4);
+            for (i, pair) in pairs.into_iter().enumerate() {
+                // SAFETY: four taps are four floats, 16 bytes; no weight is negative.
+                unsafe {
+                    _mm_storeu_ps(low[i].as_mut_ptr().cast(), _mm256_castps256_ps128(pair));
+                    _mm_storeu_ps(high[i].as_mut_ptr().cast(), _mm256_extractf128_ps::<1>(pair));
+                }
+            }
+        }
+    }
+
+    /// Each slot's weight for its four channels: two slots a register.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn spread<const N: usize>(weights: &[f32; N]) -> [__m256; PARTS] {
+        let mut spread = [_mm256_setzero_ps(); PARTS];
+        if N == 4 {
+            // SAFETY: four floats are 16 bytes.
+            let weights = unsafe { _mm_loadu_ps(weights.as_ptr()) };
+            let weights = _mm256_set_m128(weights, weights);
+            spread[0] = _mm256_permutevar_ps(weights, _mm256_setr_epi32(0, 0, 0, 0, 1, 1, 1, 1));
+            spread[1] = _mm256_permutevar_ps(weights, _mm256_setr_epi32(2, 2, 2, 2, 3, 3, 3, 3));
+        } else {
+            for (two, spread) in weights.as_chunks::<2>().0.iter().zip(&mut spread) {
+                *spread = _mm256_set_m128(_mm_set1_ps(two[1]), _mm_set1_ps(two[0]));
+            }
+        }
+        spread
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    pub(in super::super) fn splat_deep<const N: usize>(
+        records: &mut [Record<i32, N>],
+        at: usize,
+        (x, y): Across<'_, Tap, N>,
+        payload: [f32; 4],
+        z: &BySlot<f32, N>,
+    ) {
+        let (half, zero) = (_mm256_set1_ps(0.5), _mm256_setzero_ps());
+        // SAFETY: four floats are 16 bytes.
+        let payload = unsafe { _mm_loadu_ps(payload.as_ptr()) };
+        let payload = _mm256_set_m128(payload, payload);
+        let mut sections = spread::<N>(z);
+        for section in &mut sections[..N / 2] {
+            // Negative sections there are none.
+            *section = _mm256_max_ps(_mm256_mul_ps(payload, *section), zero);
+        }
+        for (row, wy) in records[at..].chunks_mut(STRIDE).zip(y) {
+            let mut rows = spread::<N>(&wy.map(Tap::get));
+            for (row, section) in rows[..N / 2].iter_mut().zip(sections) {
+                *row = _mm256_mul_ps(section, *row);
+            }
+            for (record, wx) in row[..x.len()].iter_mut().zip(x) {
+                let wx = spread::<N>(&wx.map(Tap::get));
+                let at: *mut __m256i = record.as_mut_ptr().cast();
+                for i in 0..N / 2 {
+                    let add = _mm256_add_ps(_mm256_mul_ps(rows[i], wx[i]), half);
+                    // SAFETY: eight sums are 32 bytes, and borrowed for us alone.
+                    unsafe {
+                        let sums = _mm256_loadu_si256(at.add(i));
+                        let sums = _mm256_add_epi32(sums, _mm256_cvttps_epi32(add));
+                        _mm256_storeu_si256(at.add(i), sums);
                     }
                 }
             }

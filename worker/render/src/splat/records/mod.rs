@@ -141,6 +141,26 @@ pub(crate) type BySlot<W, const N: usize> = [W; N];
 /// Weights by column and slot, and by row and slot.
 pub(crate) type Across<'a, W, const N: usize> = (&'a [BySlot<W, N>], &'a [BySlot<W, N>]);
 
+/// A row of weights among others, and which column its first belongs to.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct RowAt<'a, W> {
+    pub(crate) table: &'a [W],
+    pub(crate) from: usize,
+    pub(crate) len: usize,
+    pub(crate) column: i32,
+}
+
+impl<'a, W> RowAt<'a, W> {
+    /// No weights.
+    pub(crate) const NONE: Self = RowAt { table: &[], from: 0, len: 0, column: 0 };
+
+    /// The weights.
+    #[inline(always)]
+    fn row(&self) -> &'a [W] {
+        &self.table[self.from..self.from + self.len]
+    }
+}
+
 /// Calls the one of three functions that belongs to the level of `simd`.
 macro_rules! at_level {
     ($simd:expr, $args:tt, $plain:path, $avx2:path, $avx512:path) => {
@@ -194,7 +214,7 @@ pub(crate) trait Recorded: Accumulate {
     );
 
     /// Puts weights of N rows, one a slot, beside each other: the `j`th of a row belongs to column
-    /// `j` plus its offset, wherever that is one of the first `wide`; elsewhere in those there are
+    /// `j` plus that of its first, wherever that is one of the first `wide`; elsewhere in those there are
     /// zeros. What the columns behind are then is not said.
     ///
     /// # Panics
@@ -202,7 +222,7 @@ pub(crate) trait Recorded: Accumulate {
     #[inline(always)]
     fn weave<const N: usize>(
         simd: Simd,
-        rows: [(&[Self::Weight], i32); N],
+        rows: [RowAt<'_, Self::Weight>; N],
         wide: usize,
         to: &mut [BySlot<Self::Weight, N>],
     ) {
@@ -314,16 +334,11 @@ impl Recorded for i16 {
     #[inline(always)]
     fn weave<const N: usize>(
         simd: Simd,
-        rows: [(&[i16], i32); N],
+        rows: [RowAt<'_, i16>; N],
         wide: usize,
         to: &mut [BySlot<i16, N>],
     ) {
-        match simd.0 {
-            // SAFETY: the value proves that the instructions are there.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe { short::avx512::weave(rows, wide, to) },
-            _ => weave(rows, wide, to),
-        }
+        at_level!(simd, (rows, wide, to), weave, short::avx2::weave, short::avx512::weave);
     }
 
     #[inline(always)]
@@ -419,6 +434,34 @@ impl Recorded for i32 {
             take_plain::<i32, N>,
             long::avx2::take::<N>,
             long::avx2::take::<N>
+        );
+    }
+
+    #[inline(always)]
+    fn weave<const N: usize>(
+        simd: Simd,
+        rows: [RowAt<'_, Tap>; N],
+        wide: usize,
+        to: &mut [BySlot<Tap, N>],
+    ) {
+        at_level!(simd, (rows, wide, to), weave, long::avx2::weave, long::avx2::weave);
+    }
+
+    #[inline(always)]
+    fn splat_deep<const N: usize>(
+        simd: Simd,
+        records: &mut [Record<i32, N>],
+        at: usize,
+        across: Across<'_, Tap, N>,
+        payload: [f32; 4],
+        z: &BySlot<f32, N>,
+    ) {
+        at_level!(
+            simd,
+            (records, at, across, payload, z),
+            splat_deep::<i32, N>,
+            long::avx2::splat_deep::<N>,
+            long::avx2::splat_deep::<N>
         );
     }
 }
@@ -551,15 +594,16 @@ pub(crate) fn splat<S: Recorded, const N: usize>(
 /// [`Recorded::weave`] plainly.
 #[inline(always)]
 fn weave<W: Copy + Default, const N: usize>(
-    rows: [(&[W], i32); N],
+    rows: [RowAt<'_, W>; N],
     wide: usize,
     to: &mut [BySlot<W, N>],
 ) {
     let to = &mut to[..wide];
     to.fill([W::default(); N]);
-    for (slot, (row, offset)) in rows.into_iter().enumerate() {
-        let begin = offset.clamp(0, to.len() as i32) as usize;
-        let skip = (-offset).clamp(0, row.len() as i32) as usize;
+    for (slot, at) in rows.into_iter().enumerate() {
+        let (row, column) = (at.row(), at.column);
+        let begin = column.clamp(0, to.len() as i32) as usize;
+        let skip = (-column).clamp(0, row.len() as i32) as usize;
         for (to, w) in to[begin..].iter_mut().zip(&row[skip..]) {
             to[slot] = *w;
         }
@@ -677,21 +721,25 @@ mod tests {
     }
 
     /// Sections with footprints of their own, by every instruction set.
-    fn splat_deep_everywhere<const N: usize>() {
-        let by_slot = |i: usize| -> BySlot<i16, N> {
-            std::array::from_fn(|slot| ((i * 7919 + slot * 3001) % 23_000) as i16)
-        };
+    fn splat_deep_everywhere<S: Recorded, const N: usize>(
+        weight: impl Fn(i16) -> S::Weight,
+        depth: impl Fn(i16) -> S::Depth,
+    ) {
+        let number = |i: usize, slot: usize| ((i * 7919 + slot * 3001) % 23_000) as i16;
+        let by_slot = |i: usize| std::array::from_fn(|slot| weight(number(i, slot)));
+        let z = std::array::from_fn(|slot| depth(number(3, slot)));
         for (columns, rows) in [(1, 1), (2, 3), (5, 3), (8, 8), (9, 7), (16, 9), (18, 12)] {
-            let x: Vec<_> = (0..columns).map(by_slot).collect();
+            let x: Vec<BySlot<S::Weight, N>> = (0..columns).map(by_slot).collect();
             let y: Vec<_> = (0..rows).map(|i| by_slot(i + 5)).collect();
-            let payload = i16::payload([31_000.0, 17_003.4, 77.7, 3.0]);
+            let payload = S::payload([31_000.0, 17_003.4, 77.7, 3.0]);
+            let before = [S::from_raw([11; 4]); N];
             let run = |simd| {
-                let mut records: Vec<Record<i16, N>> = vec![[[11; 4]; N]; STRIDE * 24];
-                i16::splat_deep(simd, &mut records, 6, (&x, &y), payload, &by_slot(3));
+                let mut records: Vec<Record<S, N>> = vec![before; STRIDE * 24];
+                S::splat_deep(simd, &mut records, 6, (&x, &y), payload, &z);
                 records
             };
             let want = run(Simd::plain());
-            assert!(want[6] != [[11; 4]; N]);
+            assert!(want[6] != before);
             for simd in Simd::all() {
                 assert!(run(simd) == want, "{} differs at {columns}x{rows} of {N}", simd.name());
             }
@@ -700,39 +748,59 @@ mod tests {
 
     #[test]
     fn sections_with_footprints_of_their_own_are_added_as_the_plain_loop_adds_them() {
-        splat_deep_everywhere::<4>();
-        splat_deep_everywhere::<MOST>();
+        let real = |w| f32::from(w) * 7.1e-5;
+        splat_deep_everywhere::<i16, 4>(|w| w, |w| w);
+        splat_deep_everywhere::<i16, MOST>(|w| w, |w| w);
+        splat_deep_everywhere::<i32, 4>(|w| Tap::new(real(w)), real);
+        splat_deep_everywhere::<i32, MOST>(|w| Tap::new(real(w)), real);
+    }
+
+    /// Rows woven by every instruction set, of weights that are none of them zero.
+    fn weave_everywhere<S: Recorded, const N: usize>(weights: &[S::Weight])
+    where
+        S::Weight: PartialEq,
+    {
+        let (none, other) = (S::Weight::default(), weights[98]);
+        for wide in 1..24usize {
+            for i in 0..60i32 {
+                let mut rows = [RowAt::NONE; N];
+                for (slot, row) in rows.iter_mut().enumerate() {
+                    // Rows before, across and behind the window, at the table's ends and in its middle;
+                    // one is none at all.
+                    let len = (i as usize * 5 + slot * 3) % 14;
+                    let from = (weights.len() - len) * slot / (N - 1);
+                    let column = (i * 7 + slot as i32 * 2) % 40 - 16;
+                    *row = RowAt { table: weights, from, len, column };
+                }
+                let run = |simd| {
+                    let mut to = [[other; N]; 40];
+                    S::weave(simd, rows, wide, &mut to);
+                    to[..wide].to_vec()
+                };
+                let want = run(Simd::plain());
+                let weight = |slot: usize, j: i32| {
+                    let k = usize::try_from(j - rows[slot].column);
+                    k.ok().and_then(|k| rows[slot].row().get(k)).copied().unwrap_or(none)
+                };
+                for (j, got) in want.iter().enumerate() {
+                    let want: [_; N] = std::array::from_fn(|slot| weight(slot, j as i32));
+                    assert_eq!(*got, want);
+                }
+                for simd in Simd::all() {
+                    assert_eq!(run(simd), want, "{} at {wide}, {i} of {N}", simd.name());
+                }
+            }
+        }
     }
 
     #[test]
     fn rows_are_woven_as_the_plain_loop_weaves_them() {
-        let weights: Vec<i16> = (1..200).collect();
-        for wide in 1..24usize {
-            for i in 0..60i32 {
-                let mut rows: [(&[i16], i32); 4] = [(&[], 0); 4];
-                for (slot, row) in rows.iter_mut().enumerate() {
-                    // Rows before, across and behind the window; one is none at all.
-                    let len = (i as usize * 5 + slot * 3) % 14;
-                    *row = (&weights[40 * slot..][..len], (i * 7 + slot as i32 * 2) % 40 - 16);
-                }
-                let run = |simd| {
-                    let mut to = [[99i16; 4]; 40];
-                    i16::weave(simd, rows, wide, &mut to);
-                    to[..wide].to_vec()
-                };
-                let want = run(Simd::plain());
-                let column = |slot: usize, j: i32| -> i16 {
-                    let (row, offset) = rows[slot];
-                    usize::try_from(j - offset).ok().and_then(|k| row.get(k)).copied().unwrap_or(0)
-                };
-                for (j, got) in want.iter().enumerate() {
-                    assert_eq!(*got, [0, 1, 2, 3].map(|slot| column(slot, j as i32)));
-                }
-                for simd in Simd::all() {
-                    assert_eq!(run(simd), want, "{} at {wide}, {i}", simd.name());
-                }
-            }
-        }
+        let short: Vec<i16> = (1..200).collect();
+        let long: Vec<Tap> = short.iter().map(|&w| Tap::new(f32::from(w))).collect();
+        weave_everywhere::<i16, 4>(&short);
+        weave_everywhere::<i16, MOST>(&short);
+        weave_everywhere::<i32, 4>(&long);
+        weave_everywhere::<i32, MOST>(&long);
     }
 
     /// Two strips, taken by every instruction set.

@@ -4,7 +4,7 @@
 pub(super) mod avx2 {
     use crate::sheet::{LANES, Row};
     use crate::splat::records::{
-        Across, BySlot, MOST, Record, STRIDE, STRIP, Splat, Strip, Tables,
+        Across, BySlot, MOST, Record, RowAt, STRIDE, STRIP, Splat, Strip, Tables,
     };
     use std::arch::x86_64::*;
 
@@ -18,19 +18,26 @@ pub(super) mod avx2 {
         slot: usize,
         tables: &Tables<'_, i16>,
     ) {
+        let turns = turns::<N>(slot);
         for (v, &payload) in voxels.iter().zip(payloads) {
             let (x, y, z) = v.weights(tables);
-            // Each slot's weight four times, beside the payload four times.
-            let mut wz = [[0i16; 4]; N];
-            for (i, &w) in z.iter().enumerate() {
-                wz[(slot + i) % N] = [w; 4];
-            }
+            let z = match z.first_chunk::<N>() {
+                // SAFETY: four weights are 8 bytes, eight 16.
+                Some(z) if N == 4 => unsafe { _mm_loadl_epi64(z.as_ptr().cast()) },
+                // SAFETY: as above.
+                Some(z) => unsafe { _mm_loadu_si128(z.as_ptr().cast()) },
+                None => {
+                    let mut all = [0i16; 8];
+                    all[..z.len()].copy_from_slice(z);
+                    // SAFETY: eight weights are 16 bytes.
+                    unsafe { _mm_loadu_si128(all.as_ptr().cast()) }
+                }
+            };
+            let z = _mm256_broadcastsi128_si256(z);
             let payload = _mm256_set1_epi64x(payload as i64);
             let mut sections = [_mm256_setzero_si256(); PARTS];
-            for (i, section) in sections[..N / 4].iter_mut().enumerate() {
-                // SAFETY: four slots are 32 bytes.
-                let wz = unsafe { _mm256_loadu_si256(wz[4 * i..4 * i + 4].as_ptr().cast()) };
-                *section = _mm256_mulhrs_epi16(payload, wz);
+            for (section, turn) in sections[..N / 4].iter_mut().zip(turns) {
+                *section = _mm256_mulhrs_epi16(payload, _mm256_shuffle_epi8(z, turn));
             }
             let at = v.at();
             match x.len() {
@@ -54,6 +61,22 @@ pub(super) mod avx2 {
         }
     }
 
+    /// Which of a voxel's weights in depth each lane takes, that of its slot, by bytes.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn turns<const N: usize>(slot: usize) -> [__m256i; PARTS] {
+        let mut turns = [_mm256_setzero_si256(); PARTS];
+        for (part, turn) in turns[..N / 4].iter_mut().enumerate() {
+            let bytes: [u8; 32] = std::array::from_fn(|byte| {
+                let weight = (4 * part + byte / 8 + 2 * N - slot) % N;
+                (2 * weight + byte % 2) as u8
+            });
+            // SAFETY: 32 bytes.
+            *turn = unsafe { _mm256_loadu_si256(bytes.as_ptr().cast()) };
+        }
+        turns
+    }
+
     /// Each slot's weight for its four channels: four slots a register.
     #[target_feature(enable = "avx2")]
     #[inline]
@@ -70,6 +93,64 @@ pub(super) mod avx2 {
             *spread = _mm256_shuffle_epi8(weights, turn);
         }
         spread
+    }
+
+    /// Four rows of sixteen columns, written column by column.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    pub(super) fn by_column(lines: [__m256i; 4], to: &mut [i16; 64]) {
+        let low =
+            [_mm256_unpacklo_epi16(lines[0], lines[1]), _mm256_unpacklo_epi16(lines[2], lines[3])];
+        let high =
+            [_mm256_unpackhi_epi16(lines[0], lines[1]), _mm256_unpackhi_epi16(lines[2], lines[3])];
+        // Two columns a half: 0 1 and 8 9, 2 3 and 10 11, and so on.
+        let pairs = [
+            _mm256_unpacklo_epi32(low[0], low[1]),
+            _mm256_unpackhi_epi32(low[0], low[1]),
+            _mm256_unpacklo_epi32(high[0], high[1]),
+            _mm256_unpackhi_epi32(high[0], high[1]),
+        ];
+        let (low, high) = to.as_chunks_mut::<8>().0.split_at_mut(4);
+        for (i, pair) in pairs.into_iter().enumerate() {
+            // SAFETY: eight weights are 16 bytes.
+            unsafe {
+                _mm_storeu_si128(low[i].as_mut_ptr().cast(), _mm256_castsi256_si128(pair));
+                let pair = _mm256_extracti128_si256::<1>(pair);
+                _mm_storeu_si128(high[i].as_mut_ptr().cast(), pair);
+            }
+        }
+    }
+
+    /// Four rows and sixteen columns at a time.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    pub(in super::super) fn weave<const N: usize>(
+        rows: [RowAt<'_, i16>; N],
+        wide: usize,
+        to: &mut [BySlot<i16, N>],
+    ) {
+        let fits = N == 4 && wide <= 16;
+        let Some(sixteen) = to.as_flattened_mut().first_chunk_mut::<64>().filter(|_| fits) else {
+            return super::super::weave(rows, wide, to);
+        };
+        let columns = _mm256_setr_epi16(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+        let mut lines = [_mm256_setzero_si256(); 4];
+        for (line, at) in lines.iter_mut().zip(rows) {
+            let (begin, end) = (at.column, at.column + at.len as i32);
+            if begin >= 16 || end <= 0 || at.len == 0 {
+                continue;
+            }
+            // What lies around the row in its table is read, too, and cut off.
+            let from = at.from as isize - begin as isize;
+            let around = usize::try_from(from).ok().and_then(|from| at.table.get(from..from + 16));
+            let Some(around) = around else { return super::super::weave(rows, wide, to) };
+            let behind = _mm256_cmpgt_epi16(columns, _mm256_set1_epi16((begin - 1).max(-1) as i16));
+            let before = _mm256_cmpgt_epi16(_mm256_set1_epi16(end.min(16) as i16), columns);
+            // SAFETY: sixteen weights are 32 bytes.
+            let around = unsafe { _mm256_loadu_si256(around.as_ptr().cast()) };
+            *line = _mm256_and_si256(around, _mm256_and_si256(behind, before));
+        }
+        by_column(lines, sixteen);
     }
 
     /// Adds `row * w`, register by register, to a record.
@@ -257,9 +338,9 @@ pub(super) mod avx2 {
 
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx512 {
-    use super::avx2::turned;
+    use super::avx2::{by_column, turned};
     use crate::sheet::Row;
-    use crate::splat::records::{Across, BySlot, Record, STRIDE, Splat, Strip, Tables};
+    use crate::splat::records::{Across, BySlot, Record, RowAt, STRIDE, Splat, Strip, Tables};
     use std::arch::x86_64::*;
 
     /// 16-bit numbers of a register.
@@ -381,7 +462,7 @@ pub(super) mod avx512 {
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
     pub(in super::super) fn weave<const N: usize>(
-        rows: [(&[i16], i32); N],
+        rows: [RowAt<'_, i16>; N],
         wide: usize,
         to: &mut [BySlot<i16, N>],
     ) {
@@ -390,38 +471,20 @@ pub(super) mod avx512 {
             return super::super::weave(rows, wide, to);
         };
         let mut lines = [_mm256_setzero_si256(); 4];
-        for (line, (row, offset)) in lines.iter_mut().zip(rows) {
+        for (line, at) in lines.iter_mut().zip(rows) {
+            let (row, column) = (at.row(), at.column);
             // Lane j is column j. A row of more than 31 weights has more than are looked at.
             let present = (1u64 << row.len().min(31)) - 1;
-            let present = if offset >= 0 {
-                present.checked_shl(offset as u32).unwrap_or(0)
+            let present = if column >= 0 {
+                present.checked_shl(column as u32).unwrap_or(0)
             } else {
-                present.checked_shr(offset.unsigned_abs()).unwrap_or(0)
+                present.checked_shr(column.unsigned_abs()).unwrap_or(0)
             };
-            let from = row.as_ptr().wrapping_offset(-(offset as isize));
+            let from = row.as_ptr().wrapping_offset(-(column as isize));
             // SAFETY: lanes that are not present are not read; those that are lie in the row.
             *line = unsafe { _mm256_maskz_loadu_epi16(present as u16, from) };
         }
-        let low =
-            [_mm256_unpacklo_epi16(lines[0], lines[1]), _mm256_unpacklo_epi16(lines[2], lines[3])];
-        let high =
-            [_mm256_unpackhi_epi16(lines[0], lines[1]), _mm256_unpackhi_epi16(lines[2], lines[3])];
-        // Two columns a half: 0 1 and 8 9, 2 3 and 10 11, and so on.
-        let pairs = [
-            _mm256_unpacklo_epi32(low[0], low[1]),
-            _mm256_unpackhi_epi32(low[0], low[1]),
-            _mm256_unpacklo_epi32(high[0], high[1]),
-            _mm256_unpackhi_epi32(high[0], high[1]),
-        ];
-        let (low, high) = sixteen.as_chunks_mut::<8>().0.split_at_mut(4);
-        for (i, pair) in pairs.into_iter().enumerate() {
-            // SAFETY: eight weights are 16 bytes.
-            unsafe {
-                _mm_storeu_si128(low[i].as_mut_ptr().cast(), _mm256_castsi256_si128(pair));
-                let pair = _mm256_extracti128_si256::<1>(pair);
-                _mm_storeu_si128(high[i].as_mut_ptr().cast(), pair);
-            }
-        }
+        by_column(lines, sixteen);
     }
 
     /// Each slot's weight for its four channels, of one pixel of eight sheets or two of four.

@@ -33,8 +33,11 @@ fn sources_add_up_to_the_whole_and_the_cutoff_keeps_its_bound() {
     let bound = 255.0 / 512.0;
     let cutoff = f["cutoff"]["max"].as_f64().unwrap();
     assert!(cutoff > 0.0 && cutoff <= bound, "{cutoff} of {bound}");
-    let quantisation = f["quantisation"]["max"].as_f64().unwrap();
-    assert!(quantisation < 0.01, "{quantisation}");
+    // Slivers of kernels are among it, unless nothing is to be lost.
+    let quantisation = |f: &serde_json::Value| f["quantisation"]["max"].as_f64().unwrap();
+    assert!((0.01..1.0).contains(&quantisation(&f)), "{}", quantisation(&f));
+    let whole = error(&["--eps", "0"]);
+    assert!(quantisation(&whole) < 0.01, "{}", quantisation(&whole));
 }
 
 #[test]

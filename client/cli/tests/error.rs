@@ -24,7 +24,7 @@ fn sources_add_up_to_the_whole_and_the_cutoff_keeps_its_bound() {
     let f = error(&[]);
     let whole = rmse(&f, "limit");
     assert!(whole > 0.0 && whole < 2.0, "{whole}/255");
-    let squares: f64 = ["thickness", "cutoff", "quantisation", "rounding"]
+    let squares: f64 = ["thickness", "cutoff", "slivers", "quantisation", "rounding"]
         .iter()
         .map(|s| rmse(&f, s) * rmse(&f, s))
         .sum();
@@ -33,11 +33,11 @@ fn sources_add_up_to_the_whole_and_the_cutoff_keeps_its_bound() {
     let bound = 255.0 / 512.0;
     let cutoff = f["cutoff"]["max"].as_f64().unwrap();
     assert!(cutoff > 0.0 && cutoff <= bound, "{cutoff} of {bound}");
-    // Slivers of kernels are among it, unless nothing is to be lost.
-    let quantisation = |f: &serde_json::Value| f["quantisation"]["max"].as_f64().unwrap();
-    assert!((0.01..1.0).contains(&quantisation(&f)), "{}", quantisation(&f));
-    let whole = error(&["--eps", "0"]);
-    assert!(quantisation(&whole) < 0.01, "{}", quantisation(&whole));
+    let quantisation = f["quantisation"]["max"].as_f64().unwrap();
+    assert!(quantisation < 0.01, "{quantisation}");
+    let slivers = |f: &serde_json::Value| f["slivers"]["max"].as_f64().unwrap();
+    assert!((0.01..1.0).contains(&slivers(&f)), "{}", slivers(&f));
+    assert_eq!(slivers(&error(&["--eps", "0"])), 0.0, "nothing is to be lost");
 }
 
 #[test]

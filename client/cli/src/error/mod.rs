@@ -4,7 +4,7 @@
 //! splatter) at a stratified sample of pixels, or at all. Sources are found by switching the
 //! others off: each row of the table compares two pictures that differ in that source alone.
 //!
-//! Two kinds of sources. Thickness, cut-off, quantisation and rounding lie between a picture and
+//! Two kinds of sources. Thickness, cut-off, slivers, quantisation and rounding lie between a picture and
 //! the limit, and add up to its error. Truncation and ripple lie between the limit and an ideal:
 //! they are errors of the model, stand beside the sum, and no quality but the kernel's changes
 //! them.
@@ -39,8 +39,8 @@ const MODEL_TOLERANCE: f64 = 1e-5;
 /// the 8-bit sRGB pictures.
 ///
 /// Between the picture and the limit of infinitely thin sheets lie thickness, cut-off (--eps),
-/// quantisation (sums of integers, with slivers of a kernel that its outermost sheets do not get)
-/// and rounding (of positions, and f32 arithmetic). Between the limit and an ideal lie two errors of
+/// slivers (of kernels, which the sheet beside theirs gets), quantisation (sums of integers; in 16 bits
+/// with their slivers) and rounding (of positions, and f32 arithmetic). Between the limit and an ideal lie two errors of
 /// the model, which are no part of that sum: truncation (the limit with the whole Gaussian, neither
 /// cut at the radius nor lowered by its edge value) and ripple (the limit of a field in which a
 /// constant comes back constant).
@@ -53,7 +53,7 @@ Examples:
   slabcast error brain.nii.gz --map error.png --pixels all     pixel by pixel (minutes)
   slabcast error brain.nii.gz --compositing paper --pixels 16384 --json
 
-JSON: one object. Each of limit, same_thickness, thickness, cutoff, quantisation, rounding,
+JSON: one object. Each of limit, same_thickness, thickness, cutoff, slivers, quantisation, rounding,
 rounding_positions, rounding_arithmetic, truncation and ripple is {rmse, max, most_999,
 share_above_1, rmse_srgb8, pixels}: 1/255 (most_999 is kept by 99.9 % of the pixels), the share from 0 to 1, and the pixels that are not blank; what is not
 finite is null. sum: {squares, plain, measured}, of thickness to rounding against limit. sampled
@@ -102,7 +102,7 @@ struct Found {
     /// The whole, and that at the same thickness.
     whole: [Row; 2],
     /// What lies between the picture and the limit: adds up to the whole.
-    sources: [Row; 4],
+    sources: [Row; 5],
     /// Rounding, parted.
     rounding: [Row; 2],
     /// What lies between the limit and an ideal.
@@ -154,8 +154,11 @@ fn find(args: &ErrorArgs) -> Result<Found, Fail> {
     let floats = Quality { sums: Sums::F32, ..open };
     let opened = shut(&picture, quality.eps).then(|| still.draw_open(threads));
     let opened = opened.as_ref().unwrap_or(&picture);
+    // Sums of 32 bits that may lose nothing give no sliver away.
+    let entire = (open != quality && quality.sums == Sums::I32).then(|| still.draw(open, threads));
+    let entire = entire.as_ref().unwrap_or(opened);
     let floated = (floats != open).then(|| still.draw(floats, threads));
-    let floated = floated.as_ref().unwrap_or(opened);
+    let floated = floated.as_ref().unwrap_or(entire);
 
     let sample = stratified(size, args.pixels.count(size), args.seed);
     let model = stratified(size, sample.len().min(args.model_pixels.count(size)), args.seed);
@@ -191,7 +194,7 @@ fn find(args: &ErrorArgs) -> Result<Found, Fail> {
         what,
         figures: ErrorFigures::compare(got, want, still.background),
     };
-    let (got, opened, floated) = (at(&picture), at(opened), at(floated));
+    let (got, opened, entire, floated) = (at(&picture), at(opened), at(entire), at(floated));
     let found = Found {
         whole: [
             row("limit", "against the limit: all of it", &got, &limit),
@@ -200,7 +203,8 @@ fn find(args: &ErrorArgs) -> Result<Found, Fail> {
         sources: [
             row("thickness", "sheets of finite thickness", &narrow(&sheets), &limit),
             row("cutoff", "pixels shut before they are opaque", &got, &widen(&opened)),
-            row("quantisation", "sums of integers", &opened, &widen(&floated)),
+            row("slivers", "of kernels, in the sheet beside theirs", &opened, &widen(&entire)),
+            row("quantisation", "sums of integers", &entire, &widen(&floated)),
             row("rounding", "of positions and in f32", &floated, &sheets),
         ],
         rounding: [

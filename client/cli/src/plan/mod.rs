@@ -18,7 +18,7 @@ use crate::progress::Progress;
 use crate::request::{Asked, Opened, PictureOf, WorkArgs};
 use crate::stage::Stage;
 use crate::{embedded, parse};
-use predict::{Question, Row};
+use predict::{LOSSES, Question, Row};
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::trace::{MAX_BYTES, Trace};
 use slabcast_schedule::FrameJob;
@@ -252,6 +252,24 @@ impl Predicted {
     }
 }
 
+/// Where the render threads' time goes.
+fn losses(name: &str, rows: &[Row]) -> String {
+    let mut text = format!("\n{name} schedule, four in flight: render threads' time in %\n");
+    let _ = write!(text, "{:>7} {:>8}", "workers", "alone");
+    for (name, _) in LOSSES {
+        let _ = write!(text, " {name:>8}");
+    }
+    let _ = writeln!(text, " | {:>6} {:>7}", "driver", "streams");
+    for r in rows {
+        let _ = write!(text, "{:>7} {:>8.1}", r.workers, 100.0 * r.throughput_efficiency);
+        for part in r.lost {
+            let _ = write!(text, " {:>8.1}", 100.0 * part);
+        }
+        let _ = writeln!(text, " | {:>6.1} {:>7.1}", 100.0 * r.busy[0], 100.0 * r.busy[1]);
+    }
+    text
+}
+
 /// All that is said.
 struct Said<'a> {
     args: &'a PlanArgs,
@@ -333,6 +351,9 @@ impl Said<'_> {
                 );
             }
         }
+        for p in self.predicted {
+            text += &losses(p.name(), &p.rows);
+        }
         for [plain, learned] in self.predicted.iter().filter_map(|p| p.orders) {
             let _ = writeln!(
                 text,
@@ -364,6 +385,9 @@ impl Said<'_> {
                     "throughput_efficiency": r.throughput_efficiency,
                     "bytes_down": r.bytes[0], "bytes_up": r.bytes[1], "brick_bytes": r.bytes[2],
                     "leases": r.leases,
+                    "render_threads": r.lost.iter().zip(LOSSES).map(|(part, (_, name))| (name.to_string(), (*part).into()))
+                        .collect::<serde_json::Map<_, _>>(),
+                    "master_busy": { "driver": r.busy[0], "streams": r.busy[1] },
                     "messages": { "down": r.messages[0], "writes": r.messages[1], "up": r.messages[2] },
                     "bound_by": r.bound.0.name(), "bound_part": r.bound.1,
                     "parts_ms": { "cores": ms(0), "straggler": ms(1), "link": ms(2),

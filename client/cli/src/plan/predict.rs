@@ -62,7 +62,23 @@ pub(crate) struct Row {
     pub(crate) master_ms: [f64; 3],
     /// Messages of a later frame: from the master, how often some of those left together, to the master.
     pub(crate) messages: [f64; 3],
+    /// Of the render threads' time with several frames in flight, the parts that [`LOSSES`] names.
+    pub(crate) lost: [f64; LOSSES.len()],
+    /// Of the time with several frames in flight, how much the driver is busy, and each of the streams.
+    pub(crate) busy: [f64; 2],
 }
+
+/// What render threads' time goes into beside what drawing takes one core alone, by a word for tables and
+/// one for JSON.
+pub(crate) const LOSSES: [(&str, &str); 7] = [
+    ("drawing", "drawing"),
+    ("tables", "tables"),
+    ("messages", "messages"),
+    ("bricks", "bricks"),
+    ("on way", "on_the_way"),
+    ("dry", "nothing_to_lend"),
+    ("end", "end_of_path"),
+];
 
 /// Frames that a master has in hand (`master::driver`).
 pub(crate) const IN_FLIGHT: u32 = 4;
@@ -152,6 +168,12 @@ fn row(
     let most = (0..4).max_by(|&a, &b| parts[a].total_cmp(&parts[b])).unwrap_or(0);
     let frames = jobs.len() as f64;
     let each_ms = throughput.each_ms();
+    let spent = throughput.spent;
+    let all_spent = spent.all().max(1) as f64;
+    let part = |ns: u64| ns as f64 / all_spent;
+    let drawing = part(spent.tiles + spent.tables + spent.blocks);
+    let window = all_spent / threads;
+    let later = |all: u64, first: u64, of: u32| (all - first) as f64 / window / f64::from(of);
     Ok(Row {
         workers,
         first_ms: latency.first_ms(),
@@ -171,6 +193,19 @@ fn row(
             latency.mean(|f| f.messages_down),
             latency.mean(|f| f.writes_down),
             latency.mean(|f| f.messages_up),
+        ],
+        lost: [
+            drawing - part(spent.tables) - alone / threads / each_ms,
+            part(spent.tables),
+            part(spent.messages),
+            part(spent.bricks),
+            part(spent.way),
+            part(spent.dry),
+            part(spent.tail),
+        ],
+        busy: [
+            later(throughput.driver, throughput.first[0], 1),
+            later(throughput.streams, throughput.first[1], 2),
         ],
     })
 }

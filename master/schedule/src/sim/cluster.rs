@@ -1,7 +1,9 @@
 //! The virtual cluster: master, links and workers.
 
 use super::pipe::{Cores, Pipe, through};
-use super::{Cluster, Costs, FrameOutcome, Nanos, Outcome, Stopwatch, Took, Unknown, micros};
+use super::{
+    Cluster, Costs, FrameOutcome, Nanos, Outcome, Spent, Stopwatch, Took, Unknown, micros,
+};
 use crate::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, Epoch, FrameId, TaskId, WorkerId};
@@ -106,14 +108,27 @@ struct Known {
     opened: Vec<u32>,
 }
 
+/// A thread that has nothing to draw.
+#[derive(Clone, Copy, Default)]
+struct Idle {
+    since: Nanos,
+    /// When the master was done with what it heard of its worker after that, and lent it nothing.
+    heard: Option<Nanos>,
+}
+
 struct Running {
     lease: Task,
+    /// What of its time is not the tile itself: tables, and blocks.
+    tables: Nanos,
+    blocks: Nanos,
     /// Of a region.
     touched: Vec<u32>,
     stood: Option<Nanos>,
     received: Nanos,
     ready: Nanos,
     start: Nanos,
+    /// But for messages meanwhile.
+    end: Nanos,
     result_bytes: u64,
     /// When its pixels are there.
     pixels: Nanos,
@@ -136,6 +151,7 @@ struct Worker {
     asked: BTreeSet<(BrickSetKey, BrickId)>,
     stands: BTreeMap<(TaskId, Epoch), Nanos>,
     running: Vec<Option<Running>>,
+    idle: Vec<Idle>,
     /// When its tables of a frame are made.
     tables: BTreeMap<FrameId, Nanos>,
     /// Blocks of bricks that its tiles of a frame opened.
@@ -172,6 +188,10 @@ struct World<'a> {
     /// Frames of which a region was lent.
     begun: BTreeSet<FrameId>,
     outcome: Outcome,
+    /// When the first frame was delivered: from then on time is accounted for.
+    watched: Option<Nanos>,
+    /// When the driver lent what has not begun yet.
+    decided: BTreeMap<(WorkerId, TaskId, Epoch), Nanos>,
     finished: usize,
     worker_work: Nanos,
 }
@@ -224,6 +244,8 @@ pub fn run(
             frames: vec![FrameOutcome::default(); jobs.len()],
             ..Outcome::default()
         },
+        watched: None,
+        decided: BTreeMap::new(),
         finished: 0,
         worker_work: 0,
     };
@@ -242,6 +264,7 @@ pub fn run(
             asked: BTreeSet::new(),
             stands: BTreeMap::new(),
             running: (0..cluster.threads).map(|_| None).collect(),
+            idle: vec![Idle::default(); cluster.threads as usize],
             tables: BTreeMap::new(),
             opened: BTreeMap::new(),
             batches: VecDeque::new(),
@@ -280,6 +303,7 @@ pub fn run(
             (None, None) => unreachable!("workers are pinged as long as they are there"),
         }
     }
+    w.close();
     w.outcome.driver = w.driver.work;
     w.outcome.streams = w.streams.work;
     w.outcome.finisher = w.finisher.work;
@@ -295,6 +319,46 @@ impl World<'_> {
     fn later(&mut self, when: Nanos, what: Coming) {
         self.order += 1;
         self.coming.insert((when.max(self.now()), self.order), what);
+    }
+
+    /// A stretch of a render thread's time is over.
+    fn spend(&mut self, from: Nanos, to: Nanos, what: fn(&mut Spent) -> &mut Nanos) {
+        let Some(watched) = self.watched else { return };
+        *what(&mut self.outcome.spent) += to.saturating_sub(from.max(watched));
+    }
+
+    /// A thread was idle until now, and what it begins was `decided` upon then; bricks have been lacking since
+    /// `lacking`. `None`: the path ends.
+    fn was_idle(&mut self, idle: Idle, decided: Option<Nanos>, lacking: Option<Nanos>, now: Nanos) {
+        let Idle { since, heard } = idle;
+        let stood = lacking.unwrap_or(now).clamp(since, now);
+        self.spend(stood, now, |s| &mut s.bricks);
+        let decided = decided.unwrap_or(now).clamp(since, stood);
+        let heard = heard.unwrap_or(decided).clamp(since, decided);
+        let ends = self.begun.len() == self.jobs.len();
+        self.spend(since, heard, |s| &mut s.way);
+        if ends {
+            self.spend(heard, decided, |s| &mut s.tail);
+        } else {
+            self.spend(heard, decided, |s| &mut s.dry);
+        }
+        self.spend(decided, stood, |s| &mut s.way);
+    }
+
+    /// The last frame is delivered.
+    fn close(&mut self) {
+        let now = self.now();
+        let ids: Vec<WorkerId> = self.workers.keys().copied().collect();
+        for id in ids {
+            for thread in 0..self.cluster.threads as usize {
+                let w = &self.workers[&id];
+                match &w.running[thread] {
+                    // What nobody waits for.
+                    Some(r) => self.spend(r.start, now, |s| &mut s.tiles),
+                    None => self.was_idle(w.idle[thread], None, None, now),
+                }
+            }
+        }
     }
 
     /// Gives the scheduler frames while there is room for them.
@@ -444,6 +508,7 @@ impl World<'_> {
                 let w = self.workers.get_mut(&id).expect("a worker stays");
                 let stolen = std::mem::take(&mut w.stolen);
                 if stolen > 0 {
+                    self.spend(now, now + stolen, |s| &mut s.messages);
                     self.later(now + stolen, Coming::TaskEnd(id, thread));
                     return Ok(());
                 }
@@ -454,6 +519,7 @@ impl World<'_> {
                 self.outcome.frames[frame.0 as usize - 1].delivered = now;
                 self.finished += 1;
                 if self.finished == 1 {
+                    self.watched = Some(now);
                     let (driver, streams) = (self.driver.work, self.streams.work);
                     self.outcome.first = [driver, streams, self.finisher.work, self.worker_work];
                 }
@@ -584,10 +650,18 @@ impl World<'_> {
             let Some(thread) = free else { return Ok(()) };
             let Some((lease, received, known)) = self.take(id)? else { return Ok(()) };
             let mut now = self.now();
+            let w = &self.workers[&id];
+            let (task, epoch) = lease.name();
+            let here = w.leases.iter().map(|(l, _)| l.name()).chain([(task, epoch)]);
+            let lacking = here.filter_map(|name| w.stands.get(&name).copied()).min();
+            let idle = w.idle[thread];
+            let decided = self.decided.remove(&(id, task, epoch));
             if awake.take().is_none() {
                 let at = now + woken as Nanos;
                 now = self.machine.as_mut().map_or(at, |m| m.run(now, woken));
                 self.worker_work += woken as Nanos;
+                self.was_idle(idle, decided, lacking, self.now());
+                self.spend(self.now(), now, |s| &mut s.way);
             }
             let frame = lease.frame();
             let traced = &self.trace.frames[frame.0 as usize - 1];
@@ -600,7 +674,8 @@ impl World<'_> {
             // Its threads share what they looked at.
             let known_of = w.opened.entry(frame).or_default();
             let fresh = known.opened.iter().filter(|b| known_of.insert(**b)).count();
-            let ns = known.ns.saturating_add(traced.block_ns.saturating_mul(fresh as u64));
+            let blocks = traced.block_ns.saturating_mul(fresh as u64);
+            let ns = known.ns.saturating_add(blocks);
             // The first tile of a frame makes its tables; others wait for them.
             let made = *w.tables.entry(frame).or_insert(now + (setup as f64 * stretch) as Nanos);
             let end = made.max(now) + (ns as f64 * stretch) as Nanos;
@@ -618,8 +693,20 @@ impl World<'_> {
             let stood = w.stands.remove(&lease.name()).map(|since| now - since);
             let Known { result_bytes, touched, .. } = known;
             let (ready, start) = (now, now);
-            let running =
-                Running { lease, touched, stood, received, ready, start, result_bytes, pixels };
+            let (tables, blocks) = (made.saturating_sub(now), (blocks as f64 * stretch) as Nanos);
+            let running = Running {
+                lease,
+                tables,
+                blocks,
+                touched,
+                stood,
+                received,
+                ready,
+                start,
+                end,
+                result_bytes,
+                pixels,
+            };
             w.running[thread] = Some(running);
             self.later(end, Coming::TaskEnd(id, thread));
         }
@@ -629,6 +716,11 @@ impl World<'_> {
         let now = self.now();
         let w = self.workers.get_mut(&id).expect("a worker stays");
         let r = w.running[thread].take().expect("a task that ends has begun");
+        w.idle[thread] = Idle { since: now, heard: None };
+        let (tables, blocks) = (r.start + r.tables, r.start + r.tables + r.blocks);
+        self.spend(r.start, tables, |s| &mut s.tables);
+        self.spend(tables, blocks, |s| &mut s.blocks);
+        self.spend(blocks, r.end, |s| &mut s.tiles);
         let (tile, frame) = (r.lease.tile(), r.lease.frame().0 as usize - 1);
         let size = self.trace.about.size;
         let mut a = Vec::with_capacity(tile.area());
@@ -692,6 +784,7 @@ impl World<'_> {
         let costs = self.cluster.costs;
         let mut cost = 0.0;
         let mut actions = Vec::new();
+        let mut heard = BTreeSet::new();
         for event in std::mem::take(&mut self.inbox) {
             let result = match &event {
                 Event::Result { result, .. } => Some(result.pixels.len()),
@@ -701,6 +794,9 @@ impl World<'_> {
                 Some(pixels) => costs.result + costs.result_pixel * pixels as f64,
                 None => costs.event,
             };
+            if let Event::Result { worker, .. } = &event {
+                heard.insert(*worker);
+            }
             let before = watch.read();
             self.scheduler.handle(&self.clock, event);
             let from = actions.len();
@@ -773,6 +869,19 @@ impl World<'_> {
         self.driver_busy = true;
         self.later(end, Coming::Free);
         let mut written = BTreeSet::new();
+        for action in &actions {
+            let lent = match action {
+                Action::Send { worker, message: ToWorker::Lease(l) } => (*worker, l.task, l.epoch),
+                Action::Send { worker, message: ToWorker::Region(l) } => (*worker, l.task, l.epoch),
+                _ => continue,
+            };
+            self.decided.insert(lent, now);
+            heard.remove(&lent.0);
+        }
+        for id in heard {
+            let idle = self.workers.get_mut(&id).map_or(&mut [][..], |w| &mut w.idle);
+            idle.iter_mut().for_each(|i| i.heard = i.heard.or(Some(end)));
+        }
         for action in actions {
             let first = match &action {
                 Action::Send { worker, .. } => written.insert(*worker),

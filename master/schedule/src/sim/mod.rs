@@ -152,6 +152,36 @@ pub struct FrameOutcome {
     pub messages_up: u64,
 }
 
+/// What the render threads' time went into, from the first frame's delivery to the last's: sums over all of
+/// them, in nanoseconds. They make up the whole.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Spent {
+    /// Tiles.
+    pub tiles: Nanos,
+    /// A frame's tables, and the look at its blocks of bricks.
+    pub tables: Nanos,
+    /// Blocks that tiles opened.
+    pub blocks: Nanos,
+    /// Messages that were read and written on a core that was drawing.
+    pub messages: Nanos,
+    /// Idle: regions lack bricks.
+    pub bricks: Nanos,
+    /// Idle: a result is on its way to the master, or a lease back, or the thread wakes.
+    pub way: Nanos,
+    /// Idle: the master heard, and has nothing that it lends.
+    pub dry: Nanos,
+    /// The same when all frames have begun: the end of the path.
+    pub tail: Nanos,
+}
+
+impl Spent {
+    /// All of it.
+    pub fn all(&self) -> Nanos {
+        let Spent { tiles, tables, blocks, messages, bricks, way, dry, tail } = *self;
+        tiles + tables + blocks + messages + bricks + way + dry + tail
+    }
+}
+
 /// What became of all.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Outcome {
@@ -167,6 +197,8 @@ pub struct Outcome {
     pub workers: Nanos,
     /// Work up to the first frame's delivery, with all its bricks: driver, streams, finisher, workers.
     pub first: [Nanos; 4],
+    /// Where render threads' time went.
+    pub spent: Spent,
 }
 
 /// Why nothing can be predicted.

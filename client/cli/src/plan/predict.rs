@@ -148,6 +148,7 @@ fn row(
         simulate(jobs, trace, &question.cluster(workers, costs, in_flight))
     };
     let alone = sim::alone_ms(trace) * question.stretch;
+    let steadily = sim::steadily_alone_ms(trace, IN_FLIGHT) * question.stretch;
     let threads = f64::from(workers * question.threads);
     let latency = run(question.link, costs, 1)?;
     let throughput = run(question.link, costs, IN_FLIGHT)?;
@@ -167,20 +168,19 @@ fn row(
     let kinds = [Bound::Cores, Bound::Straggler, Bound::Link, Bound::Master];
     let most = (0..4).max_by(|&a, &b| parts[a].total_cmp(&parts[b])).unwrap_or(0);
     let frames = jobs.len() as f64;
-    let each_ms = throughput.each_ms();
+    let each_ms = throughput.steady_ms(IN_FLIGHT);
     let spent = throughput.spent;
     let all_spent = spent.all().max(1) as f64;
     let part = |ns: u64| ns as f64 / all_spent;
     let drawing = part(spent.tiles + spent.tables + spent.blocks);
     let window = all_spent / threads;
-    let later = |all: u64, first: u64, of: u32| (all - first) as f64 / window / f64::from(of);
     Ok(Row {
         workers,
         first_ms: latency.first_ms(),
         frame_ms,
         latency_efficiency: alone / threads / frame_ms,
         frames_per_s: 1e3 / each_ms,
-        throughput_efficiency: alone / threads / each_ms,
+        throughput_efficiency: steadily / threads / each_ms,
         bytes: [latency.mean(|f| f.down), latency.mean(|f| f.up), latency.mean(|f| f.bricks)],
         leases: latency.mean(|f| f.leases),
         bound: (kinds[most], parts[most] / all),
@@ -195,7 +195,7 @@ fn row(
             latency.mean(|f| f.messages_up),
         ],
         lost: [
-            drawing - part(spent.tables) - alone / threads / each_ms,
+            drawing - part(spent.tables) - steadily / threads / each_ms,
             part(spent.tables),
             part(spent.messages),
             part(spent.bricks),
@@ -204,8 +204,8 @@ fn row(
             part(spent.tail),
         ],
         busy: [
-            later(throughput.driver, throughput.first[0], 1),
-            later(throughput.streams, throughput.first[1], 2),
+            throughput.steady[0] as f64 / window,
+            throughput.steady[1] as f64 / window / 2.0,
         ],
     })
 }

@@ -190,6 +190,7 @@ struct World<'a> {
     outcome: Outcome,
     /// When the first frame was delivered: from then on time is accounted for.
     watched: Option<Nanos>,
+    closed: bool,
     /// When the driver lent what has not begun yet.
     decided: BTreeMap<(WorkerId, TaskId, Epoch), Nanos>,
     finished: usize,
@@ -245,6 +246,7 @@ pub fn run(
             ..Outcome::default()
         },
         watched: None,
+        closed: false,
         decided: BTreeMap::new(),
         finished: 0,
         worker_work: 0,
@@ -323,7 +325,7 @@ impl World<'_> {
 
     /// A stretch of a render thread's time is over.
     fn spend(&mut self, from: Nanos, to: Nanos, what: fn(&mut Spent) -> &mut Nanos) {
-        let Some(watched) = self.watched else { return };
+        let Some(watched) = self.watched.filter(|_| !self.closed) else { return };
         *what(&mut self.outcome.spent) += to.saturating_sub(from.max(watched));
     }
 
@@ -345,9 +347,12 @@ impl World<'_> {
         self.spend(decided, stood, |s| &mut s.way);
     }
 
-    /// The last frame is delivered.
+    /// Time is no longer accounted for.
     fn close(&mut self) {
         let now = self.now();
+        if self.closed {
+            return;
+        }
         let ids: Vec<WorkerId> = self.workers.keys().copied().collect();
         for id in ids {
             for thread in 0..self.cluster.threads as usize {
@@ -359,6 +364,9 @@ impl World<'_> {
                 }
             }
         }
+        self.closed = true;
+        let work = [self.driver.work, self.streams.work];
+        self.outcome.steady = std::array::from_fn(|i| work[i] - self.outcome.first[i]);
     }
 
     /// Gives the scheduler frames while there is room for them.
@@ -522,6 +530,11 @@ impl World<'_> {
                     self.watched = Some(now);
                     let (driver, streams) = (self.driver.work, self.streams.work);
                     self.outcome.first = [driver, streams, self.finisher.work, self.worker_work];
+                }
+                // Frames may end in another order; those before are delivered all the same.
+                let steady = Outcome::steady(self.jobs.len(), self.cluster.in_flight);
+                if self.finished == steady + 1 {
+                    self.close();
                 }
                 self.in_hand -= 1;
                 self.feed();

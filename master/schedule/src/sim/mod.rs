@@ -152,8 +152,8 @@ pub struct FrameOutcome {
     pub messages_up: u64,
 }
 
-/// What the render threads' time went into, from the first frame's delivery to the last's: sums over all of
-/// them, in nanoseconds. They make up the whole.
+/// What the render threads' time went into while frames were delivered steadily ([`Outcome::steady`]): sums
+/// over all of them, in nanoseconds. They make up the whole.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Spent {
     /// Tiles.
@@ -197,6 +197,8 @@ pub struct Outcome {
     pub workers: Nanos,
     /// Work up to the first frame's delivery, with all its bricks: driver, streams, finisher, workers.
     pub first: [Nanos; 4],
+    /// Work of the driver and of the streams while [`Spent`] was accounted for.
+    pub steady: [Nanos; 2],
     /// Where render threads' time went.
     pub spent: Spent,
 }
@@ -300,6 +302,14 @@ impl Outcome {
         self.frames.first().map_or(0.0, |f| (f.done - f.began) as f64 / 1e6)
     }
 
+    /// Frames that are delivered, one after another, while all the others that a master of so many in flight
+    /// has are in the making: from the first's delivery to that of the last one after which another was
+    /// begun. To count to the last of all would flatter, since work on those after the first has been done
+    /// by then and is not paid for.
+    pub fn steady(frames: usize, in_flight: u32) -> usize {
+        frames.saturating_sub(in_flight.max(1) as usize)
+    }
+
     /// Milliseconds from one delivered frame to the next.
     pub fn each_ms(&self) -> f64 {
         match &self.frames[..] {
@@ -308,6 +318,14 @@ impl Outcome {
             }
             [only] => (only.delivered - only.began) as f64 / 1e6,
             [] => 0.0,
+        }
+    }
+
+    /// The same of the frames that are delivered steadily, if there are any.
+    pub fn steady_ms(&self, in_flight: u32) -> f64 {
+        match Self::steady(self.frames.len(), in_flight) {
+            0 => self.each_ms(),
+            n => (self.frames[n].delivered - self.frames[0].delivered) as f64 / 1e6 / n as f64,
         }
     }
 
@@ -322,6 +340,14 @@ impl Outcome {
 pub fn alone_ms(trace: &Trace) -> f64 {
     let frames = &trace.frames[usize::from(trace.frames.len() > 1)..];
     frames.iter().map(|f| f.alone_ns as f64).sum::<f64>() / 1e6 / frames.len().max(1) as f64
+}
+
+/// The same of the frames that are delivered steadily.
+pub fn steadily_alone_ms(trace: &Trace, in_flight: u32) -> f64 {
+    match Outcome::steady(trace.frames.len(), in_flight) {
+        0 => alone_ms(trace),
+        n => trace.frames[1..=n].iter().map(|f| f.alone_ns as f64).sum::<f64>() / 1e6 / n as f64,
+    }
 }
 
 fn micros(ns: Nanos) -> Micros {

@@ -72,7 +72,7 @@ pub struct Frame {
     /// The view.
     pub view: View,
     /// Sections in depth.
-    pub sections: Sections,
+    pub sections: Arc<Sections>,
     /// Footprints on the screen.
     pub footprints: Footprints,
     /// Arithmetic of a closing sheet.
@@ -170,7 +170,7 @@ impl Frame {
         let flat = reach.and_then(|reach| Some(Flat { places: Places::new(&view)?, reach }));
         Frame {
             flat,
-            sections: Sections::new(&profile, d, phases, merged),
+            sections: scene.shelf.sections(&profile, d, phases, merged),
             footprints,
             rule,
             raw_scale,

@@ -33,8 +33,9 @@ use std::time::{Duration, Instant, SystemTime};
 use tokio::sync::{mpsc, oneshot};
 use tracing::{debug, info, warn};
 
-/// Frames that the scheduler has or the finisher works at: two in the making, one behind them so that
-/// workers never run dry between frames, one being finished.
+/// Frames that the scheduler has in the making or the finisher works at. All that are not being finished are
+/// drawn side by side: who is done with its tiles of one goes on with those of the next
+/// (`slabcast_schedule`).
 const FRAMES_IN_FLIGHT: usize = 4;
 
 /// Threads that finish frames, each a frame at a time: 3 ms for one of 512x512 (the hash alone 2). With one,

@@ -7,9 +7,9 @@
 use slabcast_common::image::{FrameState, PixelFormat};
 use slabcast_common::quality::Refused;
 
-/// Frames of more bytes than this are made one at a time, not three: workers then run dry between
+/// Frames of more bytes than this are made one at a time, not four: workers then run dry between
 /// two frames for as long as one is encoded, some seconds of minutes. At half, pictures of
-/// 4096x4096 lose their overlap; at double, three of them take 6.4 GB.
+/// 4096x4096 lose their overlap; four of just under this take 8.6 GB, and at double twice that.
 const ONE_AT_A_TIME: u64 = 2 << 30;
 
 /// Bytes of a picture in the making and of what is made of it.

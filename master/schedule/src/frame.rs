@@ -21,7 +21,7 @@ use crate::critical::Piece;
 use crate::ledger::{Ledger, Rendered, ms, place_in_time};
 use crate::macrotile::{self, Cut, LEAF, LEVELS};
 use crate::queue::{End, Queue, Verdict};
-use crate::region::Regions;
+use crate::region::{Crew, Regions};
 use crate::residency::{Errand, Flight};
 use crate::{Action, Clock, Cluster, FrameJob, Micros, Span};
 use slabcast_common::brick::BrickGrid;
@@ -62,6 +62,12 @@ struct Lent {
 /// and 5.3 ms at 1.5 ms, and 23.2, 13.0 and 5.1 at this; threads wait less often, and fewer tiles move.
 const HORIZON: f64 = 4_000.0;
 
+/// While a worker has so much of that left, and a lease beyond those that its threads draw, it is lent no more: each
+/// lending wakes it, which takes as long as a tenth of a small tile, and three tiles in one message are as
+/// quickly there as one. At half the horizon a message takes what is drawn in 2 ms, and a latency of one would
+/// not leave a thread dry.
+pub(crate) const REFILL: f64 = 0.5 * HORIZON;
+
 /// Leases that a thread has at most, however short they are: a stranger's clock says how short.
 const MOST_AHEAD: u64 = 8;
 
@@ -81,6 +87,10 @@ struct Slab {
     regions: Option<Regions>,
     /// Workers that the slab's bricks were queued for.
     served: BTreeSet<WorkerId>,
+    /// [`Roster::changes`](crate::roster::Roster::changes) up to which it was looked at.
+    changes: Option<u64>,
+    /// Whether some of its owners were gone then, or leaving.
+    orphaned: bool,
     /// End of each render thread's last task.
     dry: BTreeMap<(WorkerId, u32), Micros>,
     /// Tiles that counted.
@@ -100,6 +110,8 @@ impl Slab {
 #[derive(Debug)]
 pub(crate) struct Frame {
     pub(crate) job: Box<FrameJob>,
+    /// Which crew draws it, if not everybody has to.
+    beside: Option<u32>,
     projected: Vec<Option<Projected>>,
     slabs: Vec<SheetRange>,
     at: usize,
@@ -142,6 +154,8 @@ pub(crate) struct Turn {
     pub(crate) last: bool,
     /// Threads may take what is another worker's.
     pub(crate) others: bool,
+    /// Only this worker's threads can have come free since the frame was asked last.
+    pub(crate) only: Option<WorkerId>,
 }
 
 /// Whether a frame is rendered under the `region` schedule. `auto` is that, always: where nothing hides
@@ -151,7 +165,12 @@ pub(crate) fn goes_by_region(job: &FrameJob) -> bool {
 }
 
 impl Frame {
-    pub(crate) fn start(job: Box<FrameJob>, cluster: &mut Cluster, clock: &dyn Clock) -> Self {
+    pub(crate) fn start(
+        job: Box<FrameJob>,
+        beside: Option<u32>,
+        cluster: &mut Cluster,
+        clock: &dyn Clock,
+    ) -> Self {
         let began = clock.now();
         let ascending = job.bricks.windows(2).all(|w| w[0].id < w[1].id);
         assert!(ascending, "a job's bricks ascend by id");
@@ -190,6 +209,7 @@ impl Frame {
             ledger,
             projected,
             job,
+            beside,
         };
         frame.ledger.cull_us += clock.now().saturating_sub(began);
         frame
@@ -229,10 +249,16 @@ impl Frame {
         goes_by_region(&self.job)
     }
 
+    /// Who draws it.
+    pub(crate) fn crew(&self) -> Option<Crew> {
+        self.slab.as_ref()?.regions.as_ref().map(Regions::crew)
+    }
+
     /// Cuts the whole depth into regions.
     fn begin_regions(&mut self, cluster: &mut Cluster, clock: &dyn Clock) {
         let began = clock.now();
-        let (cut, regions) = Regions::cut(&self.job, &cluster.roster, &mut cluster.memory);
+        let (cut, regions) =
+            Regions::cut(&self.job, self.beside, &cluster.roster, &mut cluster.memory);
         self.put_on(cluster, began, cut, (Vec::new(), Vec::new()), Some(regions));
         self.ledger.cull_us += clock.now().saturating_sub(began);
     }
@@ -293,6 +319,8 @@ impl Frame {
             order: order.into_iter().map(|(_, i)| i).collect(),
             regions,
             served: BTreeSet::new(),
+            changes: None,
+            orphaned: false,
             dry: BTreeMap::new(),
             pieces: Vec::new(),
         });
@@ -374,10 +402,14 @@ impl Frame {
         let mut leases = match (by_region, turn.others) {
             (false, _) => self.choose(cluster, turn, now),
             (true, false) => self.choose_own(cluster, turn, now),
-            (true, true) => self.choose_others(cluster, now),
+            (true, true) => self.choose_others(cluster, turn, now),
         };
-        self.outlived = None;
-        let may_double = !by_region || turn.others;
+        // Nobody's estimate is outlived before the time that was found last.
+        let known = by_region && turn.only.is_some() && self.outlived.is_some_and(|at| now < at);
+        let may_double = (!by_region || turn.others) && !known && cluster.roster.any_dry();
+        if !known {
+            self.outlived = None;
+        }
         while may_double && let Some((place, id)) = self.next_outlived(cluster, now) {
             let slab = self.slab.as_mut().expect("as before");
             let epoch = slab.queue.lend_again(place, id, now, &cluster.config);
@@ -387,12 +419,14 @@ impl Frame {
         }
         let slab = self.slab.as_mut().expect("as before");
 
-        let newcomers: Vec<_> = cluster
-            .roster
-            .staying()
-            .map(|(id, _)| id)
-            .filter(|id| !slab.served.contains(id))
-            .collect();
+        let changes = cluster.roster.changes();
+        let mut newcomers = Vec::new();
+        if slab.changes.replace(changes) != Some(changes) {
+            let staying = cluster.roster.staying().map(|(id, _)| id);
+            newcomers.extend(staying.filter(|id| !slab.served.contains(id)));
+            let orphaning = slab.regions.as_ref().map(|r| r.orphaning(&cluster.roster));
+            slab.orphaned = orphaning.is_some_and(|gone| !gone.is_empty());
+        }
         for &id in &newcomers {
             slab.served.insert(id);
             if !cluster.residency.is_lazy(id) {
@@ -551,10 +585,10 @@ impl Frame {
         (waiting > 0).then_some(waiting as u64)
     }
 
-    /// What a worker was lent of this frame and how long that takes it, as far as it is known: infinitely
-    /// long, where it is not.
-    fn lent_us(&self, id: WorkerId) -> f64 {
-        let Some(Slab { queue, regions: Some(regions), .. }) = &self.slab else { return f64::MAX };
+    /// How long what a worker was lent of this frame takes it, as far as that is known: infinitely long, where
+    /// it is not.
+    pub(crate) fn lent_us(&self, id: WorkerId) -> f64 {
+        let Some(Slab { queue, regions: Some(regions), .. }) = &self.slab else { return 0.0 };
         let lent = self.lent.get(&id).into_iter().flatten();
         let places = lent.filter_map(|l| queue.place(l.task));
         places.map(|place| regions.took(place).unwrap_or(f64::INFINITY)).sum()
@@ -571,23 +605,41 @@ impl Frame {
     ) -> Vec<(WorkerId, u32)> {
         let ahead = u64::from(cluster.config.queue_ahead.max(1));
         let mut leases = Vec::new();
-        let Some(Slab { queue, regions: Some(regions), .. }) = &self.slab else { return leases };
-        let room = |w: &crate::roster::Worker| {
-            w.leases < u64::from(w.threads).saturating_mul(ahead.max(MOST_AHEAD))
+        let Some(Slab { queue, regions: Some(regions), changes, orphaned, .. }) = &self.slab else {
+            return leases;
         };
-        if queue.waiting() == 0 || !cluster.roster.staying().any(|(_, w)| room(w)) {
+        let sated = &cluster.sated;
+        let room = |id: WorkerId, w: &crate::roster::Worker| {
+            w.leases < u64::from(w.threads).saturating_mul(ahead.max(MOST_AHEAD))
+                && !sated.contains(&id)
+        };
+        if queue.waiting() == 0 {
             return leases;
         }
-        let orphaning = regions.orphaning(&cluster.roster);
-        let owners: BTreeSet<WorkerId> = queue.all_waiting().map(|p| regions.owner(p)).collect();
-        let orphans = orphaning.iter().any(|id| owners.contains(id));
+        let orphaning = match turn.only {
+            // They have nothing to wait for: all that was theirs was lent, or waits for room.
+            Some(_) if *changes == Some(cluster.roster.changes()) && !*orphaned => Vec::new(),
+            _ => regions.orphaning(&cluster.roster),
+        };
         let all_threads = cluster.roster.threads();
-        let takers: Vec<(WorkerId, u64)> = cluster
-            .roster
-            .staying()
-            .filter(|(id, w)| room(w) && (orphans || owners.contains(id)))
-            .map(|(id, w)| (id, u64::from(w.threads)))
-            .collect();
+        let (takers, orphans): (Vec<(WorkerId, u64)>, bool) = match turn.only {
+            Some(id) if orphaning.is_empty() => {
+                let worker = cluster.roster.get(id).filter(|w| !w.leaving && room(id, w));
+                (worker.map(|w| (id, u64::from(w.threads))).into_iter().collect(), false)
+            }
+            _ => {
+                let owners: BTreeSet<WorkerId> =
+                    queue.all_waiting().map(|p| regions.owner(p)).collect();
+                let orphans = orphaning.iter().any(|id| owners.contains(id));
+                let takers = cluster
+                    .roster
+                    .staying()
+                    .filter(|(id, w)| room(*id, w) && (orphans || owners.contains(id)))
+                    .map(|(id, w)| (id, u64::from(w.threads)))
+                    .collect();
+                (takers, orphans)
+            }
+        };
         // All threads have something before any has more.
         for first in [true, false] {
             for &(id, threads) in &takers {
@@ -622,14 +674,27 @@ impl Frame {
     }
 
     /// Lends threads that have nothing to do what others own.
-    fn choose_others(&mut self, cluster: &mut Cluster, now: Micros) -> Vec<(WorkerId, u32)> {
+    fn choose_others(
+        &mut self,
+        cluster: &mut Cluster,
+        turn: Turn,
+        now: Micros,
+    ) -> Vec<(WorkerId, u32)> {
         let mut leases = Vec::new();
-        self.forborne = None;
+        // Owners that are heard are forborne longer, and nobody shorter: the time that was found last is
+        // looked at when it has come.
+        let known = turn.only.is_some() && self.forborne.is_some_and(|at| now < at);
+        if !known {
+            self.forborne = None;
+        }
+        if !cluster.roster.any_dry() {
+            return leases;
+        }
         let mut refused = BTreeSet::new();
         let mut left = None;
         while self.waiting().is_some() {
             let dry = cluster.roster.staying().filter(|(id, _)| !refused.contains(id));
-            let dry = dry.filter(|(_, w)| w.leases < u64::from(w.threads));
+            let dry = dry.filter(|(id, w)| w.is_dry() && turn.only.is_none_or(|only| only == *id));
             let Some((id, _)) = dry.min_by_key(|(_, w)| w.leases) else { break };
             let Some(slab) = &self.slab else { break };
             let Some(regions) = &slab.regions else { break };
@@ -654,7 +719,8 @@ impl Frame {
                 }
             }
         }
-        if !refused.is_empty()
+        if !known
+            && !refused.is_empty()
             && let Some(slab) = &self.slab
             && let Some(regions) = &slab.regions
         {
@@ -749,9 +815,7 @@ impl Frame {
         let at = lent.iter().position(|l| l.task == task && l.epoch == epoch)?;
         let lent = lent.remove(at);
         cluster.residency.unpin(worker, &lent.bricks);
-        if let Some(w) = cluster.roster.get_mut(worker) {
-            w.leases -= 1;
-        }
+        cluster.roster.ends(worker, 1);
         Some(lent)
     }
 
@@ -1025,10 +1089,8 @@ impl Frame {
     pub(crate) fn end(&mut self, cluster: &mut Cluster) {
         let mut busy = BTreeSet::new();
         for (id, lent) in std::mem::take(&mut self.lent) {
-            if let Some(w) = cluster.roster.get_mut(id)
-                && !lent.is_empty()
-            {
-                w.leases -= lent.len() as u64;
+            if cluster.roster.get(id).is_some() && !lent.is_empty() {
+                cluster.roster.ends(id, lent.len() as u64);
                 busy.insert(id);
             }
             for lent in lent {
@@ -1109,9 +1171,7 @@ fn lend(
     epoch: Epoch,
     now: Micros,
 ) -> Lent {
-    if let Some(w) = cluster.roster.get_mut(id) {
-        w.leases += 1;
-    }
+    cluster.roster.lends(id);
     let bricks = slab.bricks_of(place);
     cluster.residency.pin(id, &bricks);
     cluster.residency.want(id, bricks.iter().copied());

@@ -16,8 +16,9 @@
 //! bricks, so it gets it again, unless it took it from another for once. A tile moves only when one worker would else be done more than
 //! [`SLACK`] later than the mean and the frame is shorter by more than its bricks take; those go along at
 //! once. When all of a
-//! worker's tiles are lent it takes tiles of the next frame of the path; another's tile only where there
-//! is no next one and its owner has work for longer than two such tiles.
+//! worker's tiles are lent it takes tiles of the next frames of the path; another's tile only where there
+//! is none and its owner has work for longer than two such tiles. Where a path's frames have few tiles for so
+//! many threads, each is one [`Crew`]'s.
 //!
 //! It refuses to know what time it is and which copy of a result counts.
 
@@ -39,17 +40,31 @@ const SLACK: f64 = 0.06;
 /// the speed among four is late by 60 %; what the system does on the side makes one late by a tenth.
 const LATE: f64 = 0.25;
 
-/// What moving a brick costs, in microseconds: 1.2 KB of it at 1 Gbit/s. A tile of 64 pixels is drawn from
-/// some 100 in 1 ms, so it moves when a frame is shorter by most of that.
-const BRICK: f64 = 9.0;
+/// What moving a brick costs a frame, in microseconds: 1.2 KB of it at 1 Gbit/s take 9, once, and what is gained is
+/// gained in each frame until the view has turned away; so a third. A tile of 64 pixels is drawn from some 100 in
+/// 0.6 ms, and moves when a frame is shorter by half of that. At 9 no tile ever moved where 15 workers have 1.6 ms
+/// each of a frame: it took 3.3 ms (mri256 `peer-opaque`, 512x512), and 2.9 at this, for 8 % more bricks.
+const BRICK: f64 = 3.0;
 
 /// How long an owner that says nothing keeps its tiles from those who have nothing to do, beyond twice
 /// what the tile takes: the scheduling of two busy machines, as for tasks that are late.
 const FORBEARANCE: Micros = 5_000;
 
-/// Tiles for a thread beyond which a coarser cut is taken: messages of 12 tiles of 64 pixels cost a
-/// thread half a millisecond (TRANSPORT.md).
-const MANY: u64 = 12;
+/// Tiles for a thread beyond which a coarser cut is taken. Messages of a tile of 64 pixels cost a thread some
+/// 40 us of its 600; one of 128 takes a tenth longer to draw than four of 64 (mri256 `peer-opaque`, EPYC). At 12 one
+/// worker drew that in tiles of 128, at 84 % of what it could; now at 89.
+const MANY: u64 = 64;
+
+/// The edge at which tiles are counted for that.
+const PLAIN: u32 = 64;
+
+/// Crews that share out the frames of a path ([`Crew`]).
+pub(crate) const CREWS: u32 = 2;
+
+/// With fewer tiles of 64 pixels for a thread, crews draw frames in turn. At 2.6 tiles (mri256 at 512x512 on 15
+/// workers) crews have 79 % of n times one worker's frames, and all together 68; at 4.8 (8 workers) and 8.8 (at
+/// 1024x1024, 15 workers) one has as many as the other, and a frame is there in half the time without.
+const FEW: f64 = 4.0;
 
 /// Most blocks that stand for bricks: 60 us to project. Twice as many know the outline better by half a
 /// leaf and cost twice that on the master's one thread.
@@ -75,7 +90,7 @@ struct Known {
 /// What frames of one kind (a brick set, a size of pictures, a size of tiles) teach the next one.
 #[derive(Debug)]
 struct Lessons {
-    kind: (BrickSetKey, [u32; 2], u32),
+    kind: Kind,
     tiles: BTreeMap<(i32, i32), Known>,
 }
 
@@ -83,7 +98,7 @@ struct Lessons {
 #[derive(Debug, Default)]
 pub(crate) struct Memory {
     blocks: Option<(BrickSetKey, Blocks)>,
-    lessons: Option<Lessons>,
+    lessons: Vec<Lessons>,
 }
 
 impl Memory {
@@ -95,8 +110,8 @@ impl Memory {
         self.blocks.as_ref().map_or(&[], |(_, blocks)| blocks.all())
     }
 
-    fn known(&self, kind: (BrickSetKey, [u32; 2], u32), tile: &Rect) -> Option<&Known> {
-        let lessons = self.lessons.as_ref().filter(|l| l.kind == kind)?;
+    fn known(&self, kind: Kind, tile: &Rect) -> Option<&Known> {
+        let lessons = self.lessons.iter().find(|l| l.kind == kind)?;
         lessons.tiles.get(&(tile.x0, tile.y0))
     }
 
@@ -123,19 +138,76 @@ impl Memory {
         let before = self.known(regions.kind, tile).filter(|k| k.owner == owner).map(|k| k.us);
         let us = us as f64;
         let us = before.map_or(us, |before| 0.5 * (before + us));
-        let lessons = match &mut self.lessons {
-            Some(lessons) if lessons.kind == regions.kind => lessons,
-            other => other.insert(Lessons { kind: regions.kind, tiles: BTreeMap::new() }),
-        };
+        let at = self.lessons.iter().position(|l| l.kind == regions.kind).unwrap_or_else(|| {
+            if self.lessons.len() == KINDS {
+                self.lessons.remove(0);
+            }
+            self.lessons.push(Lessons { kind: regions.kind, tiles: BTreeMap::new() });
+            self.lessons.len() - 1
+        });
+        let lessons = &mut self.lessons[at];
         let known = Known { owner, home, us, touched: touched.to_vec() };
         lessons.tiles.insert((tile.x0, tile.y0), known);
     }
 }
 
+/// Which workers draw a frame: all, or one crew of several, while the others draw the frames beside it.
+///
+/// A frame in the making alone is everybody's, and soonest there. Of a path of which several are in the making it
+/// matters how many are done in a second, and there each worker of half of them does with half as many frames
+/// twice as much of each: it makes its tables and opens its blocks half as often, has twice as many tiles to choose
+/// from, so that they may be larger, and the master has half as many leases and messages. What it costs is a
+/// frame that takes twice as long, and bricks: both crews hold what the view needs.
+///
+/// Whose crew a worker is in hangs on its name alone, so that nobody changes sides when another leaves.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Crew {
+    index: u32,
+    of: u32,
+}
+
+impl Crew {
+    /// Everybody.
+    const ALL: Crew = Crew { index: 0, of: 1 };
+
+    /// Whether a worker is in it.
+    fn has(self, id: WorkerId) -> bool {
+        id.0 % u64::from(self.of) == u64::from(self.index)
+    }
+
+    /// Whether it is, or has in it, the crew of this number.
+    pub(crate) fn is_busy_as(self, index: u32) -> bool {
+        self.of == 1 || self.index == index
+    }
+
+    /// Who stays of it.
+    fn members(self, roster: &Roster) -> impl Iterator<Item = (WorkerId, u64)> {
+        let threads = roster.staying().map(|(id, w)| (id, u64::from(w.threads)));
+        threads.filter(move |(id, _)| self.has(*id))
+    }
+
+    /// Whose a frame is that comes to so many tiles of 64 pixels: the `beside`th crew's, where there is more than
+    /// one frame.
+    fn of_frame(beside: Option<u32>, tiles: usize, roster: &Roster) -> Crew {
+        let Some(index) = beside else { return Crew::ALL };
+        let few = (tiles as f64) < FEW * roster.threads() as f64;
+        let crew = |index| Crew { index, of: CREWS };
+        // A crew of one has nobody to share with.
+        let all = (0..CREWS).all(|i| crew(i).members(roster).count() > 1);
+        if few && all { crew(index) } else { Crew::ALL }
+    }
+}
+
+/// What frames learn from each other by: a brick set, a size of pictures and one of tiles, and who draws.
+type Kind = (BrickSetKey, [u32; 2], u32, Crew);
+
+/// Kinds that are remembered: crews each, and everybody, at the beginning or the end of a path.
+const KINDS: usize = 1 + CREWS as usize;
+
 /// A frame's regions.
 #[derive(Debug)]
 pub(crate) struct Regions {
-    kind: (BrickSetKey, [u32; 2], u32),
+    kind: Kind,
     /// Whose each tile is, by its place in the queue.
     owners: Vec<WorkerId>,
     /// Whose it was before anybody took it from them.
@@ -148,27 +220,40 @@ pub(crate) struct Regions {
 }
 
 impl Regions {
-    /// Cuts a frame's picture, estimates its tiles and shares them out among those who stay.
-    pub(crate) fn cut(job: &FrameJob, roster: &Roster, memory: &mut Memory) -> (Cut, Regions) {
+    /// Cuts a frame's picture, estimates its tiles and shares them out among those who stay, or among the
+    /// `beside`th crew of them.
+    pub(crate) fn cut(
+        job: &FrameJob,
+        beside: Option<u32>,
+        roster: &Roster,
+        memory: &mut Memory,
+    ) -> (Cut, Regions) {
         let (key, size) = (job.scene.bricks, job.view.size);
         let blocks = memory.blocks(key, &job.bricks);
         let rects: Vec<Rect> =
             blocks.iter().filter_map(|b| Some(job.view.project(&b.tight)?.rect)).collect();
-        let threads = roster.threads();
+        let plain = cut_through(size, &rects, (0, 0), Some(PLAIN)).tiles.len();
+        let crew = Crew::of_frame(beside, plain, roster);
+        let threads = crew.members(roster).map(|m| m.1).sum::<u64>();
         let wanted = (job.work.tiles_per_worker * threads as f64).ceil() as u64;
         let many = wanted.max(MANY * threads);
         let mut cut = cut_through(size, &rects, (wanted, many), job.work.tile);
-        let kind = (key, size, cut.edge);
+        let kind = (key, size, cut.edge, crew);
         let known = |t: &Macrotile| memory.known(kind, &t.rect).map(|k| (k.owner, k.us));
         let pace = Pace::of(&cut.tiles, &known);
         pace.correct(&mut cut.tiles, &known);
         cut.sort(size);
         let bricks = |t: &Macrotile| memory.known(kind, &t.rect).map_or(0, |k| k.touched.len());
         let home = |t: &Macrotile| memory.known(kind, &t.rect).map(|k| k.home);
-        let owners = share(&cut.tiles, roster, &pace, &known, (&home, &bricks));
+        let owners = share(&cut.tiles, roster, crew, &pace, &known, (&home, &bricks));
         let took = cut.tiles.iter().map(known).collect();
         let who = owners.iter().copied().collect();
         (cut, Regions { kind, homes: owners.clone(), owners, who, took, pace })
+    }
+
+    /// Who draws it.
+    pub(crate) fn crew(&self) -> Crew {
+        self.kind.3
     }
 
     /// Those whose tiles these are and who are gone, or leave.
@@ -238,10 +323,12 @@ impl Regions {
 }
 
 /// How long guessed units take.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Pace {
     /// Of each worker whose tiles are known: guessed units and microseconds.
     workers: BTreeMap<WorkerId, (f64, f64)>,
+    /// Microseconds that a unit takes, in the mean; 1 before anything is known.
+    mean: f64,
 }
 
 /// How much slower or faster than the mean a worker must look before that is believed. The guess alone
@@ -250,28 +337,24 @@ const BELIEVED: f64 = 2.0;
 
 impl Pace {
     fn of(tiles: &[Macrotile], known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>) -> Pace {
-        let mut pace = Pace::default();
+        let mut workers = BTreeMap::<WorkerId, (f64, f64)>::new();
         for t in tiles {
             if let Some((owner, us)) = known(t) {
-                let (units, took) = pace.workers.entry(owner).or_default();
+                let (units, took) = workers.entry(owner).or_default();
                 *units += t.est as f64;
                 *took += us;
             }
         }
-        pace
-    }
-
-    /// Microseconds that a unit takes, in the mean; 1 before anything is known.
-    fn mean(&self) -> f64 {
         let (units, us) =
-            self.workers.values().fold((0.0, 0.0), |(a, b), (units, us)| (a + units, b + us));
-        if units > 0.0 && us > 0.0 { us / units } else { 1.0 }
+            workers.values().fold((0.0, 0.0), |(a, b), (units, us)| (a + units, b + us));
+        let mean = if units > 0.0 && us > 0.0 { us / units } else { 1.0 };
+        Pace { workers, mean }
     }
 
     /// How many times longer than in the mean it takes a worker, as far as that is believed.
     fn slowness(&self, worker: WorkerId) -> f64 {
         let Some(&(units, us)) = self.workers.get(&worker) else { return 1.0 };
-        let slow = if units > 0.0 { us / units / self.mean() } else { 1.0 };
+        let slow = if units > 0.0 { us / units / self.mean } else { 1.0 };
         if (1.0 / BELIEVED..=BELIEVED).contains(&slow) { 1.0 } else { slow.clamp(0.01, 100.0) }
     }
 
@@ -282,7 +365,7 @@ impl Pace {
         tiles: &mut [Macrotile],
         known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>,
     ) {
-        let mean = self.mean();
+        let mean = self.mean;
         for t in tiles {
             if let Some((_, us)) = known(t) {
                 t.est = ((us / mean) as u64).max(1);
@@ -296,17 +379,18 @@ impl Pace {
 fn share(
     tiles: &[Macrotile],
     roster: &Roster,
+    crew: Crew,
     pace: &Pace,
     known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>,
     (home, bricks): (&impl Fn(&Macrotile) -> Option<WorkerId>, &impl Fn(&Macrotile) -> usize),
 ) -> Vec<WorkerId> {
     let staying: Vec<(WorkerId, f64)> =
-        roster.staying().map(|(id, w)| (id, f64::from(w.threads))).collect();
+        crew.members(roster).map(|(id, threads)| (id, threads as f64)).collect();
     if staying.is_empty() {
         return vec![WorkerId(0); tiles.len()];
     }
     let place = |id: WorkerId| staying.binary_search_by_key(&id, |s| s.0).ok();
-    let mean = pace.mean();
+    let mean = pace.mean;
     let slowness: Vec<f64> = staying.iter().map(|s| pace.slowness(s.0)).collect();
     let cost = |t: &Macrotile, w: usize| {
         let us = match known(t) {
@@ -417,29 +501,55 @@ mod tests {
     #[test]
     fn first_shares_are_as_threads_and_later_ones_stay() {
         let (tiles, roster) = (tiles(24), roster(&[1, 2, 3]));
-        let owners = share(&tiles, &roster, &Pace::default(), &|_| None, (&|_| None, &|_| 0));
+        let owners = share(
+            &tiles,
+            &roster,
+            Crew::ALL,
+            &Pace::of(&[], &|_| None),
+            &|_| None,
+            (&|_| None, &|_| 0),
+        );
         assert_eq!(shares(&owners), [4, 8, 12]);
         assert!(owners.is_sorted(), "in bands");
         let at = |t: &Macrotile| (t.rect.x0 / 64) as usize;
         // Each took what it was guessed to, or nearly.
         let known = |t: &Macrotile| Some((owners[at(t)], 1000.0 + at(t) as f64));
-        let again =
-            share(&tiles, &roster, &Pace::of(&tiles, &known), &known, (&at_home(&known), &|_| 0));
+        let again = share(
+            &tiles,
+            &roster,
+            Crew::ALL,
+            &Pace::of(&tiles, &known),
+            &known,
+            (&at_home(&known), &|_| 0),
+        );
         assert_eq!(again, owners);
     }
 
     #[test]
     fn a_tenth_of_the_speed_gets_a_tenth_of_the_work() {
         let (tiles, roster) = (tiles(42), roster(&[1, 1, 1]));
-        let owners = share(&tiles, &roster, &Pace::default(), &|_| None, (&|_| None, &|_| 0));
+        let owners = share(
+            &tiles,
+            &roster,
+            Crew::ALL,
+            &Pace::of(&[], &|_| None),
+            &|_| None,
+            (&|_| None, &|_| 0),
+        );
         assert_eq!(shares(&owners), [14, 14, 14]);
         let at = |t: &Macrotile| (t.rect.x0 / 64) as usize;
         let known = |t: &Macrotile| {
             let owner = owners[at(t)];
             Some((owner, if owner.0 == 2 { 10_000.0 } else { 1000.0 }))
         };
-        let again =
-            share(&tiles, &roster, &Pace::of(&tiles, &known), &known, (&at_home(&known), &|_| 0));
+        let again = share(
+            &tiles,
+            &roster,
+            Crew::ALL,
+            &Pace::of(&tiles, &known),
+            &known,
+            (&at_home(&known), &|_| 0),
+        );
         assert_eq!(shares(&again), [20, 2, 20]);
     }
 
@@ -451,10 +561,11 @@ mod tests {
         let known = |t: &Macrotile| Some((WorkerId(if at(t) < 7 { 1 } else { 2 }), 1000.0));
         let pace = Pace::of(&tiles, &known);
         let moved = |bricks: usize| {
-            let owners = share(&tiles, &roster, &pace, &known, (&at_home(&known), &|_| bricks));
+            let owners =
+                share(&tiles, &roster, Crew::ALL, &pace, &known, (&at_home(&known), &|_| bricks));
             owners.iter().filter(|o| o.0 == 1).count()
         };
-        assert_eq!([moved(0), moved(100), moved(120)], [6, 6, 7]);
+        assert_eq!([moved(0), moved(300), moved(360)], [6, 6, 7]);
     }
 
     #[test]
@@ -465,6 +576,7 @@ mod tests {
         let owners = share(
             &tiles,
             &roster(&[1, 1, 1]),
+            Crew::ALL,
             &Pace::of(&tiles, &known),
             &known,
             (&at_home(&known), &|_| 0),

@@ -78,6 +78,11 @@ impl Worker {
         true
     }
 
+    /// Whether one of its threads has no lease.
+    pub(crate) fn is_dry(&self) -> bool {
+        self.leases < u64::from(self.threads)
+    }
+
     /// A time on the worker's clock on the master's; `None` before the first pong.
     pub(crate) fn to_master(&self, worker_us: u64) -> Option<Micros> {
         let o = self.offset?;
@@ -91,6 +96,13 @@ pub(crate) struct Roster {
     workers: BTreeMap<WorkerId, Worker>,
     next_nonce: u64,
     watched: Option<Micros>,
+    /// No ping is due before, and nobody silent for too long. What is heard moves that, which is found out
+    /// when the time has come: to look at all workers at each message is what would take longest of all.
+    quiet_until: Micros,
+    /// Workers that have fewer leases than threads, leaving ones among them.
+    dry: usize,
+    /// Grows when somebody comes, leaves or is lost.
+    changes: u64,
 }
 
 impl Roster {
@@ -110,10 +122,49 @@ impl Roster {
             offset: None,
         };
         self.workers.insert(id, worker);
+        self.dry += 1;
+        self.changes += 1;
+        self.quiet_until = self.quiet_until.min(now);
     }
 
     pub(crate) fn remove(&mut self, id: WorkerId) -> Option<Worker> {
-        self.workers.remove(&id)
+        let worker = self.workers.remove(&id)?;
+        self.dry -= usize::from(worker.is_dry());
+        self.changes += 1;
+        Some(worker)
+    }
+
+    /// A worker takes no more leases. Whether that is news.
+    pub(crate) fn leaves(&mut self, id: WorkerId) -> bool {
+        let news = self.get_mut(id).is_some_and(|w| !std::mem::replace(&mut w.leaving, true));
+        self.changes += u64::from(news);
+        news
+    }
+
+    /// A worker has another lease.
+    pub(crate) fn lends(&mut self, id: WorkerId) {
+        let Some(w) = self.workers.get_mut(&id) else { return };
+        let before = w.is_dry();
+        w.leases += 1;
+        self.dry -= usize::from(before && !w.is_dry());
+    }
+
+    /// A worker has so many leases less.
+    pub(crate) fn ends(&mut self, id: WorkerId, leases: u64) {
+        let Some(w) = self.workers.get_mut(&id) else { return };
+        let before = w.is_dry();
+        w.leases -= leases;
+        self.dry += usize::from(!before && w.is_dry());
+    }
+
+    /// Whether some thread has nothing to do, as far as is known; of workers that leave, too.
+    pub(crate) fn any_dry(&self) -> bool {
+        self.dry > 0
+    }
+
+    /// Another number than before: somebody came, leaves or was lost.
+    pub(crate) fn changes(&self) -> u64 {
+        self.changes
     }
 
     pub(crate) fn get(&self, id: WorkerId) -> Option<&Worker> {
@@ -164,6 +215,9 @@ impl Roster {
 
     /// Workers that were silent too long.
     pub(crate) fn silent(&self, now: Micros, config: &Config) -> Vec<WorkerId> {
+        if now < self.quiet_until {
+            return Vec::new();
+        }
         let late = |w: &Worker| now >= w.heard.saturating_add(config.silence);
         self.iter().filter(|(_, w)| late(w)).map(|(id, _)| id).collect()
     }
@@ -182,14 +236,21 @@ impl Roster {
 
     /// The pings that are due.
     pub(crate) fn beat(&mut self, now: Micros, config: &Config) -> Vec<(WorkerId, u64)> {
+        if now < self.quiet_until {
+            return Vec::new();
+        }
         let due = |w: &Worker| w.next_ping <= now;
         let ids: Vec<_> = self.iter().filter(|(_, w)| due(w)).map(|(id, _)| id).collect();
-        ids.into_iter()
+        let beaten = ids
+            .into_iter()
             .map(|id| {
                 self.workers.get_mut(&id).expect("just seen").next_ping = now + config.heartbeat;
                 (id, self.ping(id, now))
             })
-            .collect()
+            .collect();
+        let of = |w: &Worker| w.next_ping.min(w.heard.saturating_add(config.silence));
+        self.quiet_until = self.workers.values().map(of).min().unwrap_or(0);
+        beaten
     }
 
     /// A pong came. Whether its ping was ours and not answered before.
@@ -210,10 +271,9 @@ impl Roster {
         true
     }
 
-    /// The next ping or silence.
-    pub(crate) fn next_deadline(&self, config: &Config) -> Option<Micros> {
-        let of = |w: &Worker| w.next_ping.min(w.heard.saturating_add(config.silence));
-        self.workers.values().map(of).min()
+    /// The next ping or silence, or a time before at which it is looked for.
+    pub(crate) fn next_deadline(&self) -> Option<Micros> {
+        (!self.workers.is_empty()).then_some(self.quiet_until)
     }
 }
 

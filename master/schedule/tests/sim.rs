@@ -299,10 +299,58 @@ fn regions_have_no_barrier_and_bricks_come_where_they_are_asked_for() {
     let all = eight.frames[0].bricks / u64::from(BRICK_BYTES);
     assert!(all < 8 * sent && all >= sent, "{all} bricks for eight, {sent} for one");
     assert_eq!(eight, run(&region, &trace, &cluster(8)));
-    // Two frames in the making leave nobody waiting at the end of one.
-    let three =
-        |jobs: &[FrameJob]| run(jobs, &trace, &Cluster { in_flight: 3, ..cluster(8) }).each_ms();
-    assert!(three(&region) < eight.each_ms(), "{} {}", three(&region), eight.each_ms());
+    // Several frames in the making leave nobody waiting at the end of one.
+    let (slab, trace) = world(16);
+    let mut region = under(Schedule::Region, &slab);
+    // Of one size: here a tile takes as long as it is large, whatever lies in it.
+    region.iter_mut().for_each(|job| job.work.tile = Some(32));
+    let ms = |in_flight| {
+        let c = Cluster { in_flight, ..cluster(8) };
+        run(&region, &trace, &c).steady_ms(in_flight)
+    };
+    let each = [1, 2, 4].map(ms);
+    assert!(each[1] < each[0] && each[2] < each[1], "{each:?}");
+}
+
+#[test]
+fn crews_draw_in_turn_where_tiles_are_few_and_frames_many() {
+    let (slab, trace) = world(16);
+    let region = under(Schedule::Region, &slab);
+    let drew = |in_flight, workers| {
+        let mut heard = Listener::default();
+        let c = Cluster { in_flight, ..cluster(workers) };
+        sim::run(&region, &trace, &c, &mut heard).expect("it can be predicted");
+        let busy = |s: &FrameStats| s.workers.iter().filter(|w| w.render_ms > 0.0).count();
+        heard.0[8..].iter().map(|(stats, _)| busy(stats)).collect::<Vec<_>>()
+    };
+    assert!(drew(1, 8).iter().all(|n| *n > 4), "alone, a frame is everybody's: {:?}", drew(1, 8));
+    let four = drew(4, 8);
+    assert!(four.iter().filter(|n| **n <= 5).count() > 4, "beside others, a crew's: {four:?}");
+}
+
+#[test]
+fn what_threads_time_goes_into_is_all_of_it() {
+    let (slab, trace) = world(9);
+    let region = under(Schedule::Region, &slab);
+    let toll = Toll {
+        woken: 5_000.0,
+        call: 500.0,
+        send: (300.0, 0.1),
+        receive: (300.0, 0.1),
+        bricks: (300.0, 0.1),
+    };
+    let costs = Costs { master: toll, worker: toll, result: 2_000.0, ..Costs::default() };
+    let link = Link { bytes_per_s: Some(1.2e8), latency_ns: 50_000 };
+    for (workers, threads, in_flight) in [(1, 1, 1), (3, 2, 4), (8, 1, 4)] {
+        let c = Cluster { costs, link, threads, in_flight, ..cluster(workers) };
+        let outcome = run(&region, &trace, &c);
+        let frames = sim::Outcome::steady(9, in_flight);
+        let ms = outcome.steady_ms(in_flight) * frames as f64 * f64::from(workers * threads);
+        let all = outcome.spent.all() as f64 / 1e6;
+        assert!((all / ms - 1.0).abs() < 0.02, "{workers}x{threads}: {all} of {ms}");
+        let drawn = outcome.spent.tiles + outcome.spent.tables + outcome.spent.blocks;
+        assert!(drawn > 0 && outcome.spent.bricks > 0, "{:?}", outcome.spent);
+    }
 }
 
 #[test]

@@ -280,15 +280,16 @@ impl Bench {
         let bricks = &path.stage.bricks;
         let rects: Vec<Rect> = projected.iter().flatten().map(|p| p.rect).collect();
         // The schedule goes by blocks of bricks, whose outline is a little larger: it may take the level
-        // beside the one that bricks alone say.
+        // beside the one that bricks alone say. And a frame beside others may be one of two crews'.
         let mut edges: BTreeSet<u32> = match job.work.tile {
             Some(edge) => [edge].into(),
             None => [64, 128, 256].into(),
         };
         for &wanted in path.wanted.iter().filter(|_| job.work.tile.is_none()) {
-            let edge =
-                macrotile::cut_through(size, &rects, (wanted + wanted / 4, 1 << 40), None).edge;
-            edges.insert(edge);
+            for wanted in [wanted + wanted / 4, wanted / 2 + wanted / 8, wanted / 2 - wanted / 8] {
+                let edge = macrotile::cut_through(size, &rects, (wanted, 1 << 40), None).edge;
+                edges.insert(edge);
+            }
         }
         let mut levels = Vec::new();
         for edge in edges {

@@ -130,8 +130,10 @@ pub(crate) fn rows(
     threads: usize,
 ) -> Result<Vec<Row>, Fail> {
     let rows = shared(workers.len(), threads, |i, _: &mut ()| {
-        let costs = decided(jobs, trace, (workers[i], question.threads), messages)?;
-        row(jobs, trace, workers[i], question, costs)
+        let cluster = (workers[i], question.threads);
+        let one = decided(jobs, trace, cluster, messages, 1)?;
+        let several = decided(jobs, trace, cluster, messages, IN_FLIGHT)?;
+        row(jobs, trace, workers[i], question, [one, several])
     });
     rows.into_iter().collect()
 }
@@ -141,7 +143,7 @@ fn row(
     trace: &Trace,
     workers: u32,
     question: &Question,
-    costs: Costs,
+    [costs, several]: [Costs; 2],
 ) -> Result<Row, Fail> {
     let run = |link: Link, costs: Costs, in_flight: u32| {
         let question = Question { link, ..*question };
@@ -151,7 +153,7 @@ fn row(
     let steadily = sim::steadily_alone_ms(trace, IN_FLIGHT) * question.stretch;
     let threads = f64::from(workers * question.threads);
     let latency = run(question.link, costs, 1)?;
-    let throughput = run(question.link, costs, IN_FLIGHT)?;
+    let throughput = run(question.link, several, IN_FLIGHT)?;
     // What a resource costs is what a frame is shorter by where there is plenty of it.
     let no_link = run(Link::NONE, costs, 1)?;
     let free = Costs { worker: costs.worker, ..Costs::default() };
@@ -203,10 +205,7 @@ fn row(
             part(spent.dry),
             part(spent.tail),
         ],
-        busy: [
-            throughput.steady[0] as f64 / window,
-            throughput.steady[1] as f64 / window / 2.0,
-        ],
+        busy: [throughput.steady[0] as f64 / window, throughput.steady[1] as f64 / window / 2.0],
     })
 }
 
@@ -282,29 +281,38 @@ pub(crate) fn measured_costs(
     cluster: (u32, u32),
 ) -> Result<Costs, Fail> {
     let schedule = jobs.first().map_or(Schedule::Auto, |job| job.work.schedule);
-    decided(jobs, trace, cluster, costs::messages(trace, schedule))
+    decided(jobs, trace, cluster, costs::messages(trace, schedule), 1)
 }
 
 /// What deciding costs on this machine: the scheduler runs the path once on so many workers of so many
-/// threads (whose tiles are in the trace), and is timed.
+/// threads (whose tiles are in the trace), with so many frames in flight, and is timed.
 pub(crate) fn decided(
     jobs: &[FrameJob],
     trace: &Trace,
     (workers, threads): (u32, u32),
     messages: Costs,
+    in_flight: u32,
 ) -> Result<Costs, Fail> {
     let question = Question { threads, link: Link::NONE, cores: None, stretch: 1.0, mixed: false };
     let mut watch = Cpu;
-    let cluster = question.cluster(workers, messages, 1);
+    let cluster = question.cluster(workers, messages, in_flight);
     let (_, took) =
         sim::run(jobs, trace, &cluster, &mut watch).map_err(|e| Fail::failed(e.to_string()))?;
     let per = |(n, ns): (u64, u64)| if n == 0 { 0.0 } else { ns as f64 / n as f64 };
-    let Took { frames, slabs, results, others, .. } = took;
+    let Took { frames, slabs, results, others, result_count, .. } = took;
+    // Sums go by their pixels, which the scheduler keeps; it keeps finished tiles as they come.
+    let finished =
+        jobs.first().is_some_and(|j| j.work.schedule != Schedule::Slab && j.finish.is_some());
+    let (each, pixel) = match finished {
+        true => (per((result_count, results.1)), 0.0),
+        false => (0.0, per(results)),
+    };
     Ok(Costs {
         frame_brick: per(frames),
         slab_brick: per(slabs),
-        // A result and the lease that follows it are handled in one go; both go by their pixels.
-        result_pixel: per(results),
+        // A result and the lease that follows it are handled in one go.
+        result: each,
+        result_pixel: pixel,
         event: per(others),
         ..messages
     })

@@ -187,7 +187,8 @@ impl Stage<'_> {
     /// What is predicted for this machine, and what the scheduler says there that a later frame takes, in ms.
     fn predict(&self, workers: u32) -> Result<(Outcome, f64), Fail> {
         let cores = Some(embedded::cores());
-        let costs = predict::decided(self.jobs, self.trace, (workers, self.threads), self.costs)?;
+        let of = (workers, self.threads);
+        let costs = predict::decided(self.jobs, self.trace, of, self.costs, predict::IN_FLIGHT)?;
         let question =
             Question { threads: self.threads, link: Link::NONE, cores, stretch: 1.0, mixed: false };
         let cluster = question.cluster(workers, costs, predict::IN_FLIGHT);

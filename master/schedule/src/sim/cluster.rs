@@ -832,7 +832,7 @@ impl World<'_> {
                     }
                     Action::Send { message: ToWorker::Region(lease), .. } => {
                         leases += 1;
-                        // Two frames may be in the making: each begins once.
+                        // Several frames may be in the making: each begins once.
                         if self.begun.insert(lease.frame) {
                             slabs += 1;
                             frames += 1;

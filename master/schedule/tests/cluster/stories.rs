@@ -379,7 +379,7 @@ fn frames_of_a_path_go_on_beside_each_other_and_end_in_order() {
     for frame in 0..4 {
         w.queue(job_by(frame, Schedule::Region));
     }
-    // All three have as many leases as they are lent, of two frames: more, where they are known to be
+    // All three have as many leases as they are lent, of several frames: more, where they are known to be
     // short.
     w.run_until(|w| w.leases_given > 16);
     assert!(w.done.is_empty() && leases(&w).iter().all(|n| (2..=8).contains(n)));

@@ -192,9 +192,12 @@ impl Crew {
         let Some(index) = beside else { return Crew::ALL };
         let few = (tiles as f64) < FEW * roster.threads() as f64;
         let crew = |index| Crew { index, of: CREWS };
-        // A crew of one has nobody to share with.
+        // A crew of one has nobody to share with, and frames come in their order: a weak crew would hold the
+        // strong one up. Names that are odd and even need not come in equal numbers.
         let all = (0..CREWS).all(|i| crew(i).members(roster).count() > 1);
-        if few && all { crew(index) } else { Crew::ALL }
+        let strong = || (0..CREWS).map(|i| crew(i).members(roster).map(|m| m.1).sum::<u64>());
+        let (least, most) = (strong().min().unwrap_or(0), strong().max().unwrap_or(0));
+        if few && all && 5 * least >= 3 * most { crew(index) } else { Crew::ALL }
     }
 }
 
@@ -523,6 +526,20 @@ mod tests {
             (&at_home(&known), &|_| 0),
         );
         assert_eq!(again, owners);
+    }
+
+    #[test]
+    fn a_frame_is_a_crews_only_beside_others_and_where_crews_are_as_strong() {
+        let of = |threads: &[u32], beside, tiles| Crew::of_frame(beside, tiles, &roster(threads));
+        let odd = Crew { index: 1, of: CREWS };
+        assert_eq!(of(&[1; 15], Some(1), 38), odd);
+        assert_eq!(of(&[1; 15], None, 38), Crew::ALL, "alone, it is everybody's");
+        assert_eq!(of(&[1; 9], Some(1), 38), Crew::ALL, "tiles enough for all");
+        assert_eq!(of(&[4, 4, 4, 4], Some(1), 38), odd, "threads count");
+        assert_eq!(of(&[8, 1, 8, 1], Some(1), 38), Crew::ALL, "one crew is weak");
+        assert_eq!(of(&[9, 9], Some(1), 38), Crew::ALL, "a crew of one");
+        let members: Vec<u64> = odd.members(&roster(&[1; 5])).map(|m| m.0.0).collect();
+        assert_eq!(members, [1, 3, 5]);
     }
 
     #[test]

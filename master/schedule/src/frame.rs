@@ -1144,6 +1144,7 @@ pub(crate) fn carry(
     now: Micros,
 ) {
     let roster = &mut cluster.roster;
+    let mut grounded = cluster.residency.flight(id).is_none();
     let errands = cluster.residency.flush(id, now, &mut || roster.ping(id, now));
     for errand in errands {
         match errand {
@@ -1152,6 +1153,7 @@ pub(crate) fn carry(
                 cluster.send(id, ToWorker::Ping { nonce });
             }
             Errand::Send { set, bricks, bytes, over_budget } => {
+                cluster.traffic.leave(bytes, std::mem::take(&mut grounded), now);
                 if let Some(ledger) = &mut ledger {
                     ledger.sent(id, bricks.len() as u64, bytes);
                 }

@@ -31,8 +31,8 @@
 //!
 //! [`frame`](is_shut) the states of one frame, under either schedule; `region` what is the `region`
 //! schedule's own; [`macrotile`] the quadtree and its workload, `queue` leases with epochs,
-//! `residency` who holds which brick, `roster` workers and every deadline, `ledger` what a frame cost, `critical`
-//! what it waited for.
+//! `residency` who holds which brick, `roster` workers and every deadline, `traffic` whether the link bears more,
+//! `ledger` what a frame cost, `critical` what it waited for.
 
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
@@ -55,6 +55,7 @@ mod region;
 mod residency;
 mod roster;
 pub mod sim;
+mod traffic;
 
 pub use borders::slabs;
 pub use frame::is_shut;
@@ -63,6 +64,7 @@ use frame::{Frame, Step, Turn, carry, goes_by_region};
 use region::Memory;
 use residency::Residency;
 use roster::Roster;
+use traffic::Traffic;
 
 /// Microseconds on the master's clock, which never goes back.
 pub type Micros = u64;
@@ -376,6 +378,7 @@ struct Cluster {
     roster: Roster,
     residency: Residency,
     memory: Memory,
+    traffic: Traffic,
     out: VecDeque<Action>,
     next_task: u64,
     totals: Totals,
@@ -425,6 +428,7 @@ impl Scheduler {
                 roster: Roster::default(),
                 residency: Residency::default(),
                 memory: Memory::default(),
+                traffic: Traffic::default(),
                 out: VecDeque::new(),
                 next_task: 0,
                 totals: Totals::default(),
@@ -518,13 +522,17 @@ impl Scheduler {
             }
             Event::BricksIn { worker, set, bricks } => {
                 cluster.roster.heard(worker, now);
+                let before = cluster.residency.held_of(worker, set).1;
                 let landed = cluster.residency.arrived(worker, set, bricks);
+                let bytes = cluster.residency.held_of(worker, set).1 - before;
+                cluster.traffic.land(bytes, landed.is_some(), now);
                 self.after_bricks(worker, landed, now);
             }
             Event::BricksBroken { worker, set, bricks } => {
                 cluster.roster.heard(worker, now);
                 if cluster.residency.was_sent(worker, set, &bricks) {
                     let landed = cluster.residency.broken(worker, set, &bricks);
+                    cluster.traffic.land(0, landed.is_some(), now);
                     self.after_bricks(worker, landed, now);
                 } else {
                     // Its name was spoilt, too: nobody knows which one it lacks. When it dials again it
@@ -593,6 +601,9 @@ impl Scheduler {
             frame.lost(&mut self.cluster, id, &worker, blame, now);
             threads = threads.saturating_sub(leases);
         }
+        if self.cluster.residency.flight(id).is_some() {
+            self.cluster.traffic.land(0, true, now);
+        }
         self.cluster.residency.leave(id);
     }
 
@@ -640,6 +651,9 @@ impl Scheduler {
                     break;
                 }
                 let Some(job) = self.waiting.pop_front() else { break };
+                if self.active.is_empty() {
+                    self.cluster.traffic.begin(clock.now());
+                }
                 let beside = self.beside();
                 self.active.push_back(Frame::start(job, beside, &mut self.cluster, clock));
                 // To it, all are new, and to the one before it is no longer the last.
@@ -668,6 +682,7 @@ impl Scheduler {
         while self.active.front().is_some_and(Frame::is_done) {
             let Some(mut done) = self.active.pop_front() else { break };
             done.end(&mut self.cluster);
+            self.cluster.traffic.done(!self.active.is_empty(), clock.now());
             let done = done.finish(&mut self.cluster, clock.now());
             self.cluster.out.push_back(done);
             ended = true;
@@ -675,14 +690,16 @@ impl Scheduler {
         ended
     }
 
-    /// Which crew has the least frames in the making and may draw the next one; `None` where it is the only one.
+    /// Which crew has the least frames in the making and may draw the next one; `None` where it is the only one, and
+    /// where the link does not bear crews.
     fn beside(&self) -> Option<u32> {
         let frames = |i: &u32| {
             let crews = self.active.iter().filter_map(Frame::crew);
             crews.filter(|c| c.is_busy_as(*i)).count()
         };
         let alone = self.active.is_empty() && self.waiting.is_empty();
-        (0..region::CREWS).min_by_key(frames).filter(|_| !alone)
+        let bears = self.cluster.traffic.bears_crews();
+        (0..region::CREWS).min_by_key(frames).filter(|_| !alone && bears)
     }
 
     /// Who has enough to draw for a while ([`frame::REFILL`]), among all or of one worker.

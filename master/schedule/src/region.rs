@@ -18,7 +18,7 @@
 //! once. When all of a
 //! worker's tiles are lent it takes tiles of the next frames of the path; another's tile only where there
 //! is none and its owner has work for longer than two such tiles. Where a path's frames have few tiles for so
-//! many threads, each is one [`Crew`]'s.
+//! many threads, and the link bears it (`traffic`), each is one [`Crew`]'s.
 //!
 //! It refuses to know what time it is and which copy of a result counts.
 

@@ -300,7 +300,7 @@ fn regions_have_no_barrier_and_bricks_come_where_they_are_asked_for() {
     assert!(all < 8 * sent && all >= sent, "{all} bricks for eight, {sent} for one");
     assert_eq!(eight, run(&region, &trace, &cluster(8)));
     // Several frames in the making leave nobody waiting at the end of one.
-    let (slab, trace) = world(16);
+    let (slab, trace) = world(40);
     let mut region = under(Schedule::Region, &slab);
     // Of one size: here a tile takes as long as it is large, whatever lies in it.
     region.iter_mut().for_each(|job| job.work.tile = Some(32));
@@ -316,16 +316,19 @@ fn regions_have_no_barrier_and_bricks_come_where_they_are_asked_for() {
 fn crews_draw_in_turn_where_tiles_are_few_and_frames_many() {
     let (slab, trace) = world(16);
     let region = under(Schedule::Region, &slab);
-    let drew = |in_flight, workers| {
+    let drew = |in_flight, bytes_per_s| {
         let mut heard = Listener::default();
-        let c = Cluster { in_flight, ..cluster(workers) };
+        let link = Link { bytes_per_s, latency_ns: 50_000 };
+        let c = Cluster { in_flight, link, ..cluster(8) };
         sim::run(&region, &trace, &c, &mut heard).expect("it can be predicted");
         let busy = |s: &FrameStats| s.workers.iter().filter(|w| w.render_ms > 0.0).count();
-        heard.0[8..].iter().map(|(stats, _)| busy(stats)).collect::<Vec<_>>()
+        heard.0[4..].iter().map(|(stats, _)| busy(stats)).collect::<Vec<_>>()
     };
-    assert!(drew(1, 8).iter().all(|n| *n > 4), "alone, a frame is everybody's: {:?}", drew(1, 8));
-    let four = drew(4, 8);
-    assert!(four.iter().filter(|n| **n <= 5).count() > 4, "beside others, a crew's: {four:?}");
+    let crews = |drew: &[usize]| drew.iter().filter(|n| **n <= 5).count();
+    let (alone, four, slow) = (drew(1, None), drew(4, None), drew(4, Some(1e6)));
+    assert_eq!(crews(&alone), 0, "alone, a frame is everybody's: {alone:?}");
+    assert_eq!(crews(&four), four.len(), "beside others, a crew's: {four:?}");
+    assert_eq!(crews(&slow[..6]), 0, "but not while bricks fill the link: {slow:?}");
 }
 
 #[test]

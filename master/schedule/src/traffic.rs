@@ -1,0 +1,161 @@
+//! Whether the link bears crews (`region`), each of which is sent what a view needs: most of it when they are
+//! formed, and more a frame than all together.
+//!
+//! Nobody tells the scheduler how fast the link is; it sees when bricks leave and when workers say that they have
+//! them. From the moment at which some are on their way to anybody until none are, what has landed by now in the
+//! time since is never more than the link carries, however few they are and however long words take; and
+//! where many leave at once, as for the first frame, it comes near. So the **rate** is the highest that was
+//! seen. What the last frames were sent takes a **share** of their time at that rate:
+//!
+//! | mri256 at 512x512, 15 and 32 workers | rate seen, MB/s | share, all together | share, crews |
+//! |---|--:|--:|--:|
+//! | 1 Gbit/s  | 86 to 101, 80 to 95   | 0.85 to 0.98, 0.87 to 1.0 | |
+//! | 10 Gbit/s | 896, 990   | 0.55 to 0.6, 0.58 to 0.63 | 0.3 to 0.2, 0.8 to 0.4 |
+//! | unlimited | 1487, 2304 | 0.4, 0.3                  | 0.4 to 0.2, 0.5 to 0.2 |
+//!
+//! It refuses to forget: that a link has become slower it never learns.
+
+use crate::Micros;
+
+/// Crews are formed where the share is below this. At 0.7 they come and go at 1 Gbit/s, at 0.5 they come late at 10
+/// (70 % of n times one worker's frames with 15 workers, where 74 are with this).
+const FORM: f64 = 0.6;
+
+/// They are dissolved where it is above this. Between the two lies what forming them is sent.
+const DISSOLVE: f64 = 0.8;
+
+/// What frames before count against one. Of four that are in the making two may be done at once.
+const KEEP: f64 = 0.75;
+
+/// Frames that nothing changes for after a change: bricks that it brings are sent in the first four.
+const SETTLE: u32 = 8;
+
+/// What bricks on their way tell.
+#[derive(Debug, Default)]
+pub(crate) struct Traffic {
+    /// Workers that some are on their way to.
+    aloft: usize,
+    /// Since when any are, and bytes that landed since.
+    since: Micros,
+    landed: u64,
+    /// Bytes a microsecond, the most that was seen.
+    rate: f64,
+    /// Bytes that left since a frame was done, or began alone, and when that was.
+    sent: u64,
+    done: Micros,
+    /// How long what the last frames were sent takes at that rate, and how long they took, in microseconds; each
+    /// frame weighs less than the one after it.
+    carried: f64,
+    took: f64,
+    crews: bool,
+    settling: u32,
+}
+
+impl Traffic {
+    /// Bricks leave for a worker; whether none were on their way to it.
+    pub(crate) fn leave(&mut self, bytes: u64, first: bool, now: Micros) {
+        self.sent += bytes;
+        if first {
+            if self.aloft == 0 {
+                (self.since, self.landed) = (now, 0);
+            }
+            self.aloft += 1;
+        }
+    }
+
+    /// So many bytes are there; whether no more are on their way to that worker.
+    pub(crate) fn land(&mut self, bytes: u64, last: bool, now: Micros) {
+        self.landed += bytes;
+        let time = now.saturating_sub(self.since).max(1);
+        self.rate = self.rate.max(self.landed as f64 / time as f64);
+        self.aloft -= usize::from(last);
+    }
+
+    /// A frame begins, and none is in the making.
+    pub(crate) fn begin(&mut self, now: Micros) {
+        (self.sent, self.done) = (0, now);
+    }
+
+    /// A frame is done; whether others are in the making. Crews are for those that have others beside them, and learn
+    /// from these alone.
+    pub(crate) fn done(&mut self, beside: bool, now: Micros) {
+        let took = now.saturating_sub(self.done) as f64;
+        if beside {
+            let carried = if self.sent == 0 { 0.0 } else { self.sent as f64 / self.rate };
+            self.carried = KEEP * self.carried + carried.min(took);
+            self.took = KEEP * self.took + took;
+            self.settling = self.settling.saturating_sub(1);
+            let bearable = if self.crews { DISSOLVE } else { FORM };
+            if (self.carried < bearable * self.took) != self.crews && self.settling == 0 {
+                self.crews = !self.crews;
+                self.settling = SETTLE;
+            }
+        }
+        (self.sent, self.done) = (0, now);
+    }
+
+    /// Whether crews are to draw.
+    pub(crate) fn bears_crews(&self) -> bool {
+        self.crews
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Frames of 2 ms or longer, each sent so many bytes in two halves, over a link that carries so many a
+    /// microsecond and takes 100 us besides. The first is sent 3 MB. How often crews were there, and changes.
+    fn frames(n: usize, bytes: u64, link: f64) -> (usize, usize) {
+        let mut traffic = Traffic::default();
+        let (mut now, mut with, mut changes) = (0, 0, 0);
+        traffic.begin(now);
+        for i in 0..n {
+            let bytes = if i == 0 { 3_000_000 } else { bytes };
+            let on_way = 100 + (bytes as f64 / link) as Micros;
+            traffic.leave(bytes / 2, true, now);
+            traffic.leave(bytes / 2, true, now);
+            traffic.land(bytes / 2, true, now + on_way / 2 + 50);
+            traffic.land(bytes / 2, true, now + on_way);
+            assert!(traffic.rate <= link, "{} of {link}", traffic.rate);
+            now += on_way.max(2_000);
+            let before = traffic.bears_crews();
+            traffic.done(true, now);
+            with += usize::from(traffic.bears_crews());
+            changes += usize::from(before != traffic.bears_crews());
+        }
+        (with, changes)
+    }
+
+    #[test]
+    fn crews_are_formed_where_the_link_bears_them() {
+        assert_eq!(frames(40, 300_000, 120.0), (0, 0), "1 Gbit/s and full");
+        let (with, changes) = frames(40, 300_000, 1200.0);
+        assert!(with > 25 && changes == 1, "10 Gbit/s: {with}, {changes}");
+        let (with, changes) = frames(40, 10_000, 120.0);
+        assert!(with > 15 && changes == 1, "1 Gbit/s and little to carry: {with}, {changes}");
+    }
+
+    #[test]
+    fn crews_are_dissolved_where_they_fill_the_link() {
+        let mut traffic = Traffic { rate: 100.0, ..Traffic::default() };
+        let mut frame = |i: u64, bytes| {
+            traffic.leave(bytes, false, i * 2_000);
+            traffic.done(true, (i + 1) * 2_000);
+            traffic.bears_crews()
+        };
+        assert!(frame(0, 50_000));
+        let full: Vec<bool> = (1..10).map(|i| frame(i, 200_000)).collect();
+        assert_eq!(full.iter().filter(|c| **c).count(), SETTLE as usize - 1, "{full:?}");
+        assert!(!frame(10, 130_000), "and between the two nothing changes");
+    }
+
+    #[test]
+    fn frames_alone_say_nothing() {
+        let mut traffic = Traffic::default();
+        traffic.done(false, 1_000);
+        assert!(!traffic.bears_crews());
+        traffic.done(true, 2_000);
+        assert!(traffic.bears_crews(), "nothing had to be sent");
+    }
+}

@@ -21,6 +21,13 @@ use crate::Micros;
 /// (70 % of n times one worker's frames with 15 workers, where 74 are with this).
 const FORM: f64 = 0.6;
 
+/// The same once the first frames are over, which were sent all that the view needs: the share of those that follow is
+/// half as large. At 1 Gbit/s it is 0.5 to 1 on a turn, where crews come and go if this is as large as [`FORM`].
+const FORM_LATER: f64 = 0.3;
+
+/// How many frames are the first.
+const FIRST: u32 = 8;
+
 /// They are dissolved where it is above this. Between the two lies what forming them is sent.
 const DISSOLVE: f64 = 0.8;
 
@@ -47,6 +54,8 @@ pub(crate) struct Traffic {
     /// frame weighs less than the one after it.
     carried: f64,
     took: f64,
+    /// How many, up to [`FIRST`].
+    frames: u32,
     crews: bool,
     settling: u32,
 }
@@ -85,7 +94,9 @@ impl Traffic {
             self.carried = KEEP * self.carried + carried.min(took);
             self.took = KEEP * self.took + took;
             self.settling = self.settling.saturating_sub(1);
-            let bearable = if self.crews { DISSOLVE } else { FORM };
+            self.frames = FIRST.min(self.frames + 1);
+            let form = if self.frames < FIRST { FORM } else { FORM_LATER };
+            let bearable = if self.crews { DISSOLVE } else { form };
             if (self.carried < bearable * self.took) != self.crews && self.settling == 0 {
                 self.crews = !self.crews;
                 self.settling = SETTLE;

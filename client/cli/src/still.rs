@@ -54,14 +54,17 @@ impl Still {
 
     /// The picture at another quality (the same sheets and kernel).
     pub(crate) fn draw(&self, quality: Quality, threads: usize) -> Picture {
-        let picture = local::picture(&self.frame(quality), &self.bricks, Cut::on(threads));
-        magnified(picture, self.magnify, threads)
+        self.draw_frame(&self.frame(quality), threads)
     }
 
     /// The picture with no pixel ever shut.
     pub(crate) fn draw_open(&self, threads: usize) -> Picture {
-        let frame = self.frame(self.spec.quality).never_shut();
-        magnified(local::picture(&frame, &self.bricks, Cut::on(threads)), self.magnify, threads)
+        self.draw_frame(&self.frame(self.spec.quality).never_shut(), threads)
+    }
+
+    fn draw_frame(&self, frame: &Frame, threads: usize) -> Picture {
+        let picture = local::picture(frame, &self.bricks, Cut::on(threads));
+        magnified(picture, self.magnify, threads)
     }
 
     /// What judges it.

@@ -4,10 +4,10 @@
 //! splatter) at a stratified sample of pixels, or at all. Sources are found by switching the
 //! others off: each row of the table compares two pictures that differ in that source alone.
 //!
-//! Two kinds of sources. Thickness, cut-off, slivers, quantisation and rounding lie between a picture and
-//! the limit, and add up to its error. Truncation and ripple lie between the limit and an ideal:
-//! they are errors of the model, stand beside the sum, and no quality but the kernel's changes
-//! them.
+//! Two kinds of sources. Thickness, cut-off, slivers, quantisation and rounding lie between a
+//! picture and the limit, and add up to its error. Truncation and ripple lie between the limit and
+//! an ideal: they are errors of the model, stand beside the sum, and no quality but the kernel's
+//! changes them.
 //!
 //! [`report`] says it as text or JSON, [`map`] as a picture.
 
@@ -39,11 +39,11 @@ const MODEL_TOLERANCE: f64 = 1e-5;
 /// the 8-bit sRGB pictures.
 ///
 /// Between the picture and the limit of infinitely thin sheets lie thickness, cut-off (--eps),
-/// slivers (of kernels, which the sheet beside theirs gets), quantisation (sums of integers; in 16 bits
-/// with their slivers) and rounding (of positions, and f32 arithmetic). Between the limit and an ideal lie two errors of
-/// the model, which are no part of that sum: truncation (the limit with the whole Gaussian, neither
-/// cut at the radius nor lowered by its edge value) and ripple (the limit of a field in which a
-/// constant comes back constant).
+/// slivers (of kernels, which the sheet beside theirs gets), quantisation (sums of integers; in 16
+/// bits with their slivers) and rounding (of positions, and f32 arithmetic). Between the limit and
+/// an ideal lie two errors of the model, which are no part of that sum: truncation (the limit with
+/// the whole Gaussian, neither cut at the radius nor lowered by its edge value) and ripple (the
+/// limit of a field in which a constant comes back constant).
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -55,10 +55,10 @@ Examples:
 
 JSON: one object. Each of limit, same_thickness, thickness, cutoff, slivers, quantisation, rounding,
 rounding_positions, rounding_arithmetic, truncation and ripple is {rmse, max, most_999,
-share_above_1, rmse_srgb8, pixels}: 1/255 (most_999 is kept by 99.9 % of the pixels), the share from 0 to 1, and the pixels that are not blank; what is not
-finite is null. sum: {squares, plain, measured}, of thickness to rounding against limit. sampled
-and sampled_model: pixels looked at, blank ones included, for the sum and for truncation and
-ripple. size; pixels_sha256 of the picture; quality; draw_ms, judge_ms, total_ms; map: the file,
+share_above_1, rmse_srgb8, pixels}: 1/255 (most_999 is kept by 99.9 % of the pixels), the share from
+0 to 1, and the pixels that are not blank; what is not finite is null. sum: {squares, plain,
+measured}, of thickness to rounding against limit. sampled and sampled_model: pixels looked at,
+blank ones included, for the sum and for truncation and ripple. size; pixels_sha256 of the picture; quality; draw_ms, judge_ms, total_ms; map: the file,
 if any.")]
 pub(crate) struct ErrorArgs {
     #[command(flatten)]

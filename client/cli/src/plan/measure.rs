@@ -403,32 +403,42 @@ mod tests {
     use slabcast_render::outlook::Directory;
     use slabcast_render::tile::Seen;
 
+    /// Volume, axis that is up, and transfer function.
+    type Named = (&'static str, &'static str, &'static str);
+
+    const OPAQUE: [Named; 3] = [
+        ("mri256.nrrd", "-y", "peer-opaque"),
+        ("mouse_skull.nrrd", "+z", "peer-skull"),
+        ("aneurism.nrrd", "+z", "peer-vessels"),
+    ];
+
+    /// Four views of 512x512 of it, or nothing, which is said, where the volume is not here.
+    fn staged((file, axis, tf): Named) -> Option<Stage> {
+        let data = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
+        let file = data.join(file);
+        if !file.exists() {
+            println!("skipped: {} is not here", file.display());
+            return None;
+        }
+        let volume = crate::volume::open(&file).expect("a volume");
+        let info = volume.info(volume.digest());
+        let up = axis.parse::<Axis>().expect("an axis");
+        let orientation = Orientation::new(Some(up), None).expect("axes");
+        let turn = Turntable { frames: 4, step: 22.5, ..Turntable::default() };
+        let asked = Asked::plain(ViewPath::turn([512, 512], turn), tf).expect("a request");
+        Some(Stage::new(&volume, &info, &asked, orientation).expect("a stage"))
+    }
+
     /// Bytes of a frame's results and what a tile takes to write and to read, for docs/scaling.md.
     #[test]
     #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_a_tile -- --ignored --nocapture"]
     fn what_a_tile_weighs_and_takes_to_pack() {
-        let data = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
         println!(
             "KB a frame: sums, finished, packed. us a tile: sums written, sums read, finished,"
         );
         println!("packed and written, noise written, read. ms a frame: composed");
-        for (file, axis, tf) in [
-            ("mri256.nrrd", "-y", "peer-opaque"),
-            ("mouse_skull.nrrd", "+z", "peer-skull"),
-            ("aneurism.nrrd", "+z", "peer-vessels"),
-        ] {
-            let file = data.join(file);
-            if !file.exists() {
-                println!("skipped: {} is not here", file.display());
-                continue;
-            }
-            let volume = crate::volume::open(&file).expect("a volume");
-            let info = volume.info(volume.digest());
-            let up = axis.parse::<Axis>().expect("an axis");
-            let orientation = Orientation::new(Some(up), None).expect("axes");
-            let turn = Turntable { frames: 4, step: 22.5, ..Turntable::default() };
-            let asked = Asked::plain(ViewPath::turn([512, 512], turn), tf).expect("a request");
-            let stage = Stage::new(&volume, &info, &asked, orientation).expect("a stage");
+        for scene in OPAQUE {
+            let Some(stage) = staged(scene) else { continue };
             let (mut bytes, mut ns, mut composed, mut tiles) = ([0; 3], [0; 6], 0, 0);
             for i in 0..4 {
                 let frame = stage.frame(i).expect("a frame");
@@ -452,7 +462,8 @@ mod tests {
                 composed += shortest(9, || state.encode(&FINISH, false)).0;
             }
             println!(
-                "{tf}, {} tiles: {:.0?}; {:.1?}; {:.2}",
+                "{}, {} tiles: {:.0?}; {:.1?}; {:.2}",
+                scene.2,
                 tiles / 4,
                 bytes.map(|b| b as f64 / 4e3),
                 ns.map(|n| n as f64 / 1e3 / f64::from(tiles)),
@@ -466,35 +477,19 @@ mod tests {
     #[test]
     #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_looking -- --ignored --nocapture"]
     fn what_looking_at_bricks_takes() {
-        let data = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
         println!(
             "edge of blocks: blocks; us, bricks that are looked at: a worker of 15, the frame"
         );
-        for (file, axis, tf) in [
-            ("mri256.nrrd", "-y", "peer-opaque"),
-            ("mri256.nrrd", "-y", "peer-semi"),
-            ("mouse_skull.nrrd", "+z", "peer-skull"),
-            ("aneurism.nrrd", "+z", "peer-vessels"),
-        ] {
-            let file = data.join(file);
-            if !file.exists() {
-                println!("skipped: {} is not here", file.display());
-                continue;
-            }
-            let volume = crate::volume::open(&file).expect("a volume");
-            let info = volume.info(volume.digest());
-            let up = axis.parse::<Axis>().expect("an axis");
-            let orientation = Orientation::new(Some(up), None).expect("axes");
-            let turn = Turntable { frames: 4, step: 22.5, ..Turntable::default() };
-            let asked = Asked::plain(ViewPath::turn([512, 512], turn), tf).expect("a request");
-            let stage = Stage::new(&volume, &info, &asked, orientation).expect("a stage");
+        let [mri, others @ ..] = OPAQUE;
+        for scene in [mri, (mri.0, mri.1, "peer-semi")].into_iter().chain(others) {
+            let Some(stage) = staged(scene) else { continue };
             let frame = stage.frame(1).expect("a frame");
             let bricks = &stage.bricks;
             let (ns, n) = shortest(9, || {
                 let seen: Vec<Seen> = bricks.iter().filter_map(|b| Seen::new(&frame, b)).collect();
                 Seen::front_to_back(&seen).len()
             });
-            println!("{tf}, every brick: {:.0}, {n}", ns as f64 / 1e3);
+            println!("{}, every brick: {:.0}, {n}", scene.2, ns as f64 / 1e3);
             for shift in 4..7 {
                 let infos = bricks.directory().bricks().clone();
                 let directory = Arc::new(Directory::in_blocks(infos, shift, usize::MAX));

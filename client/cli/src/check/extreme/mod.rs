@@ -13,6 +13,7 @@ mod values;
 use super::shot::Shot;
 use super::table::{Case, Row};
 use crate::embedded::Crew;
+use crate::local::{self, Cut};
 use scene::{
     apart, cutoff, extinction, from, judge, look, on_lattice, persp, ramp, rough, shaded, shot,
 };
@@ -22,7 +23,6 @@ use slabcast_common::path::PathView;
 use slabcast_common::quality::{Compositing, Quality, Sums, Work};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::volume::Volume;
-use slabcast_render::serial;
 
 /// Pixels of a case that are judged: one cell in eleven of a picture of 61x47.
 const PIXELS: usize = 256;
@@ -225,10 +225,11 @@ fn settings() -> Vec<Case> {
     };
     let mut all = Vec::new();
     for (name, eps) in [("1/2", 0.5), ("1/16", 1.0 / 16.0), ("1/4096", 1.0 / 4096.0)] {
-        all.push(Case::new(format!("eps {name} against eps 0"), move |_| {
+        all.push(Case::new(format!("eps {name} against eps 0"), move |tools| {
             let shut = scene(eps, Sums::Auto).ready()?;
-            let left_out =
-                apart(&shut.serial(), &serial::render(&shut.frame().never_shut(), &shut.bricks));
+            let frame = shut.frame().never_shut();
+            let open = local::picture(&frame, &shut.bricks, Cut::on(tools.threads));
+            let left_out = apart(&shut.serial(), &open);
             Ok(vec![Row::new("max that the cut-off leaves out", left_out, cutoff(&shut))])
         }));
     }

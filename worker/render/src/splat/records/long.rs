@@ -4,6 +4,25 @@
 //! clamps: a payload times weights stays below 2^31 (`bounds::raw_per_payload`), and what would not
 //! turns into i32's smallest number here and its largest there.
 
+/// `all` for footprints as wide as common ones are, so that a row's loop is of known length, or
+/// `others`.
+#[cfg(target_arch = "x86_64")]
+macro_rules! by_width {
+    ($wide:expr, $at:expr, $others:expr) => {
+        match $wide {
+            4 => all::<4, C, N>($at),
+            5 => all::<5, C, N>($at),
+            6 => all::<6, C, N>($at),
+            7 => all::<7, C, N>($at),
+            8 => all::<8, C, N>($at),
+            9 => all::<9, C, N>($at),
+            13 => all::<13, C, N>($at),
+            14 => all::<14, C, N>($at),
+            _ => $others,
+        }
+    };
+}
+
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx2 {
     use crate::sheet::{LANES, Row};
@@ -31,7 +50,8 @@ pub(super) mod avx2 {
         turns
     }
 
-    type At<'a, const C: usize, const N: usize> =
+    /// What `splat_all` is called with, in one.
+    pub(super) type At<'a, const C: usize, const N: usize> =
         (&'a mut [[[i32; C]; N]], (&'a [Splat], &'a [[f32; C]]), usize, &'a Tables<'a, i32>);
 
     #[target_feature(enable = "avx2")]
@@ -42,17 +62,7 @@ pub(super) mod avx2 {
         tables: &Tables<'_, i32>,
     ) {
         let at = (records, voxels, slot, tables);
-        match tables.across[0].len {
-            4 => all::<4, C, N>(at),
-            5 => all::<5, C, N>(at),
-            6 => all::<6, C, N>(at),
-            7 => all::<7, C, N>(at),
-            8 => all::<8, C, N>(at),
-            9 => all::<9, C, N>(at),
-            13 => all::<13, C, N>(at),
-            14 => all::<14, C, N>(at),
-            _ => all::<0, C, N>(at),
-        }
+        by_width!(tables.across[0].len, at, all::<0, C, N>(at))
     }
 
     /// Footprints of `WIDE` columns, or of any number where that is 0.
@@ -345,14 +355,12 @@ pub(super) mod avx2 {
 
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx512 {
+    use super::avx2::At;
     use crate::splat::records::{MOST, STRIDE, Splat, Tables};
     use std::arch::x86_64::*;
 
     /// Registers of a record at most: sixteen sums each.
     const PARTS: usize = MOST / 4;
-
-    type At<'a, const C: usize, const N: usize> =
-        (&'a mut [[[i32; C]; N]], (&'a [Splat], &'a [[f32; C]]), usize, &'a Tables<'a, i32>);
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     pub(in super::super) fn splat_all<const C: usize, const N: usize>(
@@ -361,26 +369,18 @@ pub(super) mod avx512 {
         slot: usize,
         tables: &Tables<'_, i32>,
     ) {
-        let at = (records, voxels, slot, tables);
-        match tables.across[0].len {
-            // Half a register.
-            _ if N * C < 16 => {
-                let (records, voxels, slot, tables) = at;
-                super::avx2::splat_all(records, voxels, slot, tables);
-            }
-            4 => all::<4, C, N>(at),
-            5 => all::<5, C, N>(at),
-            6 => all::<6, C, N>(at),
-            7 => all::<7, C, N>(at),
-            8 => all::<8, C, N>(at),
-            9 => all::<9, C, N>(at),
-            13 => all::<13, C, N>(at),
-            14 => all::<14, C, N>(at),
-            _ => {
-                let (records, voxels, slot, tables) = at;
-                super::avx2::splat_all(records, voxels, slot, tables);
-            }
+        // Half a register.
+        if N * C < 16 {
+            return super::avx2::splat_all(records, voxels, slot, tables);
         }
+        let at = (records, voxels, slot, tables);
+        by_width!(tables.across[0].len, at, any_width(at))
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn any_width<const C: usize, const N: usize>((records, voxels, slot, tables): At<'_, C, N>) {
+        super::avx2::splat_all(records, voxels, slot, tables);
     }
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]

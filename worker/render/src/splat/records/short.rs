@@ -121,6 +121,16 @@ pub(super) mod avx2 {
         }
     }
 
+    /// Sixteen columns of four rows, where so many are enough.
+    #[inline]
+    pub(super) fn sixteen<const N: usize>(
+        wide: usize,
+        to: &mut [BySlot<i16, N>],
+    ) -> Option<&mut [i16; 64]> {
+        let fits = N == 4 && wide <= 16;
+        to.as_flattened_mut().first_chunk_mut().filter(|_| fits)
+    }
+
     /// Four rows and sixteen columns at a time.
     #[target_feature(enable = "avx2")]
     #[inline]
@@ -129,8 +139,7 @@ pub(super) mod avx2 {
         wide: usize,
         to: &mut [BySlot<i16, N>],
     ) {
-        let fits = N == 4 && wide <= 16;
-        let Some(sixteen) = to.as_flattened_mut().first_chunk_mut::<64>().filter(|_| fits) else {
+        let Some(sixteen) = sixteen(wide, to) else {
             return super::super::weave(rows, wide, to);
         };
         let columns = _mm256_setr_epi16(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
@@ -338,7 +347,7 @@ pub(super) mod avx2 {
 
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx512 {
-    use super::avx2::{by_column, turned};
+    use super::avx2::{by_column, sixteen, turned};
     use crate::sheet::Row;
     use crate::splat::records::{Across, BySlot, Record, RowAt, STRIDE, Splat, Strip, Tables};
     use std::arch::x86_64::*;
@@ -466,8 +475,7 @@ pub(super) mod avx512 {
         wide: usize,
         to: &mut [BySlot<i16, N>],
     ) {
-        let fits = N == 4 && wide <= 16;
-        let Some(sixteen) = to.as_flattened_mut().first_chunk_mut::<64>().filter(|_| fits) else {
+        let Some(sixteen) = sixteen(wide, to) else {
             return super::super::weave(rows, wide, to);
         };
         let mut lines = [_mm256_setzero_si256(); 4];

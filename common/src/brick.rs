@@ -109,6 +109,8 @@ pub struct Brick {
     pub gradients: Option<Vec<u8>>,
     /// Tight box inside the brick, lowest and highest: asked for in every frame, so kept.
     tight: [[u8; 3]; 2],
+    /// `index` as bits: likewise.
+    present: [u64; BRICK_VOXELS / 64],
 }
 
 /// Why bytes are not a brick.
@@ -153,14 +155,17 @@ impl Brick {
         assert_eq!(values.len(), n, "a value a voxel");
         assert!(normals.as_ref().is_none_or(|v| v.len() == n), "a normal a voxel");
         let (mut lo, mut hi) = ([7u8; 3], [0u8; 3]);
+        let mut present = [0u64; BRICK_VOXELS / 64];
         for &i in &index {
+            let i = i % BRICK_VOXELS as u16;
+            present[usize::from(i) / 64] |= 1 << (i % 64);
             let p = local(i);
             for a in 0..3 {
                 lo[a] = lo[a].min(p[a] as u8);
                 hi[a] = hi[a].max(p[a] as u8);
             }
         }
-        Brick { id, index, values, normals, gradients: None, tight: [lo, hi] }
+        Brick { id, index, values, normals, gradients: None, tight: [lo, hi], present }
     }
 
     /// The same with a magnitude of the gradient for each voxel, or without.
@@ -181,6 +186,12 @@ impl Brick {
     /// Whether there is none (never so in a brick set).
     pub fn is_empty(&self) -> bool {
         self.index.is_empty()
+    }
+
+    /// Which of its 512 voxels there are: a bit each, by local index.
+    #[inline]
+    pub fn present(&self) -> &[u64; BRICK_VOXELS / 64] {
+        &self.present
     }
 
     /// The tight box, in index coordinates of the volume.

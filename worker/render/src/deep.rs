@@ -16,9 +16,6 @@ use slabcast_common::message::Counters;
 use slabcast_common::shade::NO_NORMAL;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, round_i32};
 
-/// Phases of a subpixel as a mask.
-const PHASES: usize = SUBPIXELS as usize - 1;
-
 /// Pixels of a window at most, along an axis: a footprint of eight pixels a vox.
 const WINDOW: usize = 40;
 
@@ -195,7 +192,7 @@ struct Layer<'a, S: Recorded> {
 }
 
 /// Weights along one axis, and where they lie.
-type Axis<'a, S> = (Phases<'a>, &'a [<S as Accumulate>::Weight]);
+type Axis<'a, S> = (Phases, &'a [<S as Accumulate>::Weight]);
 
 impl<S: Recorded, const N: usize> Stage<S, N> for DeepStage<'_, S, N> {
     type Voxel = DeepVoxel;
@@ -368,15 +365,14 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
                     continue;
                 }
                 let phases = &layer.axes[axis].0;
-                let firsts: &[i32; SUBPIXELS as usize] =
-                    phases.firsts.first_chunk().expect("a first pixel a phase");
                 let (len, scale) = (phases.len as i32, layer.scale);
                 let (first, from) = (&mut first[axis][at][..n], &mut from[axis][at][..n]);
                 for i in 0..n {
                     let at = view.screen_along(axis, eye[i], scale);
-                    let (pixel, phase) = ((at >> SUBPIXEL_BITS) as i32, at as usize & PHASES);
-                    first[i] = pixel - origin + firsts[phase];
-                    from[i] = phases.begin(phase) as u32;
+                    let (pixel, phase) =
+                        ((at >> SUBPIXEL_BITS) as i32, at as i32 & (SUBPIXELS - 1));
+                    first[i] = pixel - origin + phases.first(phase);
+                    from[i] = phases.begin(phase as usize) as u32;
                 }
                 for i in 0..n {
                     let here = sheet < left[i];

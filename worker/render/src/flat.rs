@@ -16,14 +16,15 @@
 
 use crate::footprint::Phases;
 use crate::mask::OpenMask;
+use crate::place::Places;
 use crate::scene::{Flat, Frame};
 use crate::splat::records::{Recorded, Splat, Table, Tables, splat};
-use crate::splat::{Simd, Work, select};
+use crate::splat::toss::{Sieve, Sifted, Tossing, prefetch};
+use crate::splat::{Simd, Work};
 use crate::stack::{Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
-use slabcast_common::shade::NO_NORMAL;
-use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
+use slabcast_common::view::SUBPIXELS;
 
 /// Memory for voxels that a render thread keeps from part to part.
 #[derive(Default)]
@@ -31,41 +32,6 @@ pub(crate) struct Waiting {
     queues: Queues<Splat>,
     tossing: Tossing,
     batch: Batch,
-}
-
-/// Voxels of a brick on their way to buckets.
-struct Tossing {
-    /// Positions and depths: [`crate::place::Places::all`].
-    at: [[i32; 512]; 3],
-    /// First sheets.
-    first: [i32; 512],
-    /// Whether they may touch the part or an open pixel, and near which: [`OpenMask::near_all`].
-    fate: [u32; 512],
-    cells: [u32; 512],
-    /// Those that are kept.
-    kept: [u32; 528],
-    /// First pixels of the footprints of those, and where weights begin.
-    windows: [[u32; 512]; 4],
-    samples: [u32; 512],
-    normals: [u16; 512],
-    /// Those that are kept, ready for their buckets.
-    ready: [Splat; 512],
-}
-
-impl Default for Tossing {
-    fn default() -> Self {
-        Tossing {
-            at: [[0; 512]; 3],
-            first: [0; 512],
-            fate: [0; 512],
-            cells: [0; 512],
-            kept: [0; 528],
-            windows: [[0; 512]; 4],
-            samples: [0; 512],
-            normals: [NO_NORMAL; 512],
-            ready: [Splat::default(); 512],
-        }
-    }
 }
 
 /// Voxels that are shaded and splatted together. A bucket of a part has some 50; at 16 loops are
@@ -134,7 +100,7 @@ struct FlatStage<'a, S: Recorded> {
     simd: Simd,
     flat: &'a Flat,
     /// Where weights across and down lie.
-    phases: [Phases<'a>; 2],
+    phases: [Phases; 2],
     tables: Tables<'a, S>,
     tossing: &'a mut Tossing,
     batch: &'a mut Batch,
@@ -158,50 +124,30 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
     ) {
         let Part { frame, rect, slab, .. } = self.part;
         let Some((brick, corner)) = self.part.open_brick(which, open, counters) else { return };
-        let cull = frame.scene.quality.cull;
-        let sections = &frame.sections;
-        let phases = sections.phases();
+        if let Some(next) = self.part.peek(which + 1) {
+            prefetch(next);
+        }
         let base = self.part.first_sheet(which);
         let origin = [
             i64::from(rect.x0 * SUBPIXELS),
             i64::from(rect.y0 * SUBPIXELS),
-            i64::from(base) * i64::from(phases),
+            i64::from(base) * i64::from(frame.sections.phases()),
         ];
-        let n = brick.len();
-        let Tossing { at, first, fate, cells, kept, windows, samples, normals, ready } =
-            &mut *self.tossing;
-        self.flat.places.all(corner.flat, origin, &brick.index, at);
-        let [x, y, z] = at;
-        open.near_all(&x[..n], &y[..n], cells, fate);
-        for i in 0..n {
-            let (begin, count) = sections.span(z[i]);
-            first[i] = base + begin;
-            let end = first[i] + count as i32;
-            let here = u32::from(first[i] < slab.end) & u32::from(end > slab.first);
-            fate[i] *= here;
-        }
-        let reached: u64 = fate[..n].iter().map(|&fate| u64::from(fate != 0)).sum();
-        let some = select(self.simd, &fate[..n], if cull { 3 } else { 1 }, kept);
-        counters.tossed += some as u64;
-        counters.culled += reached - some as u64;
-        let kept = &kept[..some];
-        let [x0, from_x, y0, from_y] = windows;
-        move_inside(&self.phases[0], x, kept, x0, from_x);
-        move_inside(&self.phases[1], y, kept, y0, from_y);
-        brick.values.bits(samples);
-        match &brick.normals {
-            Some(of) => normals[..n].copy_from_slice(of),
-            None => normals.fill(NO_NORMAL),
-        }
-        for (j, (&i, ready)) in kept.iter().zip(&mut *ready).enumerate() {
-            let i = i as usize % 512;
-            ready.place = x0[j] | y0[j] << 8 | cells[i] << 16;
-            ready.rows = from_x[j] | from_y[j] << 16;
-            ready.deep = (z[i] & (phases - 1)) as u32 | u32::from(normals[i]) << 16;
-            ready.sample = samples[i];
-        }
-        for (&i, voxel) in kept.iter().zip(ready) {
-            let first = first[i as usize % 512];
+        let sieve = Sieve {
+            places: &self.flat.places,
+            from: Places::from(corner.flat, origin),
+            open,
+            cull: frame.scene.quality.cull,
+            sections: &frame.sections,
+            // From the sheet that depths are counted from.
+            sheets: [slab.first, slab.end].map(|k| k - base),
+            phases: self.phases,
+        };
+        let Sifted { reached, kept } = sieve.sift(self.simd, brick, self.tossing);
+        counters.tossed += kept as u64;
+        counters.culled += (reached - kept) as u64;
+        for (first, voxel) in self.tossing.kept(kept) {
+            let first = base + *first;
             if first < slab.first {
                 queues.carried.push((*voxel, first));
             } else {
@@ -278,31 +224,5 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
             splat::<S, N>(sheets.records, v.at(), (x, y, left), payload, slot::<N>(slab.first));
             sheets.touch(slab.first, v.first(), [x.len(), y.len()]);
         }
-    }
-}
-
-/// First pixels of the footprints of some voxels along an axis, moved inside the part, and where
-/// their weights then begin: below 2^16, since rows of a padded table are at most three times 63
-/// long.
-#[inline(always)]
-fn move_inside(
-    phases: &Phases<'_>,
-    at: &[i32; 512],
-    kept: &[u32],
-    inside: &mut [u32; 512],
-    from: &mut [u32; 512],
-) {
-    let len = phases.len as i32;
-    let firsts: &[i32; SUBPIXELS as usize] =
-        phases.firsts.first_chunk().expect("a first pixel a phase");
-    for ((&i, inside), from) in kept.iter().zip(inside).zip(from) {
-        let at = at[i as usize % 512];
-        let (pixel, phase) = (at >> SUBPIXEL_BITS, at & (SUBPIXELS - 1));
-        let first = pixel + firsts[phase as usize];
-        let moved = first.clamp(0, PART - len);
-        *inside = moved as u32;
-        // Moved farther than a footprint is long, it reads zeros only.
-        let begin = phases.begin(phase as usize) as i32;
-        *from = (begin + (moved - first).clamp(-len, len)) as u32;
     }
 }

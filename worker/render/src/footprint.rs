@@ -150,6 +150,13 @@ impl Sections {
         (first, (((z + self.back) >> self.shift) - first + 1) as u32)
     }
 
+    /// Phases that a voxel reaches to the front and to the back, and phases of a sheet as a shift: see
+    /// [`Sections::span`].
+    #[inline(always)]
+    pub(crate) fn reach(&self) -> (i32, i32, u32) {
+        (self.front, self.back, self.shift)
+    }
+
     /// First sheet of a voxel at depth `z` (in phases).
     #[inline(always)]
     pub fn first(&self, z: i32) -> i32 {
@@ -183,8 +190,7 @@ impl Sections {
 /// Footprint weights along one screen axis for one scale, by subpixel phase.
 #[derive(Clone, Debug)]
 struct AxisTable {
-    /// First pixel of each phase, relative to the pixel that holds the centre.
-    first: Vec<i32>,
+    first: First,
     count: Vec<u32>,
     weights: Vec<Tap>,
     /// The same in steps of the lattice, as fixed point.
@@ -222,18 +228,46 @@ fn weight(profile: &Profile, scale: f64, p: i32, i: i64) -> f64 {
     profile.at(u)
 }
 
+/// First pixel of a footprint, relative to the one that holds the centre: as the centre goes through that,
+/// it goes one farther at most.
+#[derive(Clone, Copy, Debug)]
+struct First {
+    /// That of the first phases.
+    near: i32,
+    /// The phase from which it is one more.
+    more_from: i32,
+}
+
+impl First {
+    #[inline(always)]
+    fn of(self, p: i32) -> i32 {
+        self.near + i32::from(p >= self.more_from)
+    }
+}
+
 /// Where the weights of each phase lie in a table along one axis.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Phases<'a> {
-    /// First pixel of each, relative to the one that holds the centre.
-    pub(crate) firsts: &'a [i32],
+pub(crate) struct Phases {
+    first: First,
     /// Pixels of one at most.
     pub(crate) len: usize,
     /// Zeros before and after the weights of each.
     margin: usize,
 }
 
-impl Phases<'_> {
+impl Phases {
+    /// First pixel of phase `p`, relative to the one that holds the centre.
+    #[inline(always)]
+    pub(crate) fn first(&self, p: i32) -> i32 {
+        self.first.of(p)
+    }
+
+    /// The phase from which on the first pixel is one farther.
+    #[inline(always)]
+    pub(crate) fn more_from(&self) -> i32 {
+        self.first.more_from
+    }
+
     /// Where the weights of phase `p` begin.
     #[inline(always)]
     pub(crate) fn begin(&self, p: usize) -> usize {
@@ -247,7 +281,9 @@ impl AxisTable {
     fn new(profile: &Profile, scale: f64, padded: bool) -> Self {
         let radius = profile.radius * scale;
         let spans: Vec<(i64, i64)> = (0..SUBPIXELS).map(|p| reach(p, radius)).collect();
-        let first: Vec<i32> = spans.iter().map(|s| near(s.0)).collect();
+        let firsts: Vec<i32> = spans.iter().map(|s| near(s.0)).collect();
+        let more_from = firsts.partition_point(|first| *first == firsts[0]) as i32;
+        let first = First { near: firsts[0], more_from };
         let count: Vec<u32> = spans.iter().map(|s| (s.1 - s.0 + 1).max(0) as u32).collect();
         let stride = count.iter().copied().max().unwrap_or(0) as usize;
         let margin = if padded { stride } else { 0 };
@@ -269,8 +305,8 @@ impl AxisTable {
     }
 
     #[inline(always)]
-    fn phases(&self) -> Phases<'_> {
-        Phases { firsts: &self.first, len: self.stride, margin: self.margin }
+    fn phases(&self) -> Phases {
+        Phases { first: self.first, len: self.stride, margin: self.margin }
     }
 }
 
@@ -474,7 +510,7 @@ impl<'a> Footprint<'a> {
         match self.table {
             Some(t) => {
                 let t = t.along(axis);
-                let first = near(base) + t.first[p as usize];
+                let first = near(base) + t.first.of(p);
                 (first, first + t.count[p as usize] as i32)
             }
             None => {
@@ -523,7 +559,7 @@ impl<'a> Footprint<'a> {
     }
 
     /// Where they lie.
-    pub(crate) fn phases(&self, axis: usize) -> Option<Phases<'a>> {
+    pub(crate) fn phases(&self, axis: usize) -> Option<Phases> {
         self.table.map(|t| t.along(axis).phases())
     }
 

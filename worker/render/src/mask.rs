@@ -87,6 +87,12 @@ impl OpenMask {
         }
     }
 
+    /// What [`OpenMask::near_all`] looks at: the grown mask and its reach.
+    #[inline(always)]
+    pub(crate) fn grown(&self) -> (&[u64; 64], i32) {
+        (&self.grown, self.reach)
+    }
+
     /// Whether something may be open near the pixel of the part that [`OpenMask::near_all`] named.
     #[inline(always)]
     pub(crate) fn is_near(&self, cell: u32) -> bool {

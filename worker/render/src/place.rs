@@ -12,7 +12,7 @@ use slabcast_common::brick::local;
 use slabcast_common::view::{Projection, SUBPIXELS, View, round_i64};
 
 /// Parts of a subpixel, and of a phase of depth, that corners and offsets are kept in.
-const FINER_BITS: u32 = 24;
+pub(crate) const FINER_BITS: u32 = 24;
 const FINER: f64 = (1u32 << FINER_BITS) as f64;
 
 /// What rounds a sum of a corner and an offset to the nearest subpixel or phase. A little more than
@@ -78,21 +78,26 @@ impl Places {
         ([at(0), at(1)], at(2) as i32)
     }
 
-    /// [`Places::at`] for the voxels of a brick, counted from `origin` (subpixels and phases), which
+    /// What offsets are added to for [`Places::at`] counted from `origin` (subpixels and phases), which
     /// is near: positions fit i32.
     #[inline(always)]
-    pub(crate) fn all(
-        &self,
-        corner: FlatCorner,
-        origin: [i64; 3],
-        locals: &[u16],
-        at: &mut [[i32; 512]; 3],
-    ) {
+    pub(crate) fn from(corner: FlatCorner, origin: [i64; 3]) -> FlatCorner {
+        std::array::from_fn(|axis| corner[axis] - (origin[axis] << FINER_BITS) + HALF)
+    }
+
+    /// Offsets of the 512 voxels of a brick, along each axis.
+    #[inline(always)]
+    pub(crate) fn offsets(&self) -> &[[i64; 512]; 3] {
+        &self.offsets
+    }
+
+    /// [`Places::at`] for some voxels of a brick, counted from [what](Places::from) `from` is counted from.
+    #[inline(always)]
+    pub(crate) fn all(&self, from: FlatCorner, locals: &[u16], at: &mut [[i32; 512]; 3]) {
         // The lower half of a sum is the same for a shift with and without a sign.
         let rounded = |sum: i64| (sum as u64 >> FINER_BITS) as i32;
-        for axis in 0..3 {
+        for (axis, from) in from.into_iter().enumerate() {
             let offsets = &self.offsets[axis];
-            let from = corner[axis] - (origin[axis] << FINER_BITS) + HALF;
             if locals.len() == 512 {
                 // All voxels of a brick are in order: no look-up.
                 for (at, offset) in at[axis].iter_mut().zip(offsets) {

@@ -401,6 +401,15 @@ impl Part<'_> {
         }
     }
 
+    /// Brick `i` of the part, if it is known already.
+    #[inline(always)]
+    pub(crate) fn peek(&self, i: usize) -> Option<&Brick> {
+        match self.among {
+            Among::Here(bricks) => Some(&bricks[*self.inside.get(i)? as usize].brick),
+            Among::Coming(coming) => (i < coming.came()).then(|| coming.brick(i).0),
+        }
+    }
+
     /// Whether sheet `k`, the one behind the last that this was asked of, can be drawn: all bricks that
     /// begin there and may touch an open pixel are here. If not, what is lacked is noted.
     #[inline(always)]

@@ -10,11 +10,10 @@
 #![expect(unsafe_code, reason = "the one wall: run-time dispatch, unchecked conversion, lanes")]
 
 pub(crate) mod records;
-mod select;
+pub(crate) mod toss;
 
 use crate::footprint::{Footprint, Sections};
 use crate::sheet::Sum;
-pub(crate) use select::select;
 
 /// Pixels of one open sheet of a tile part.
 pub type Pixels<S> = [[S; 4]];
@@ -289,10 +288,16 @@ impl Simd {
         let mut all = vec![Simd(Level::Plain)];
         #[cfg(target_arch = "x86_64")]
         {
-            if is_x86_feature_detected!("avx2") {
+            // Whoever has AVX2 has those, too, and a machine that says otherwise is not trusted.
+            let counts_bits = is_x86_feature_detected!("popcnt")
+                && is_x86_feature_detected!("lzcnt")
+                && is_x86_feature_detected!("bmi1")
+                && is_x86_feature_detected!("bmi2");
+            if is_x86_feature_detected!("avx2") && counts_bits {
                 all.push(Simd(Level::Avx2));
             }
-            if is_x86_feature_detected!("avx512f")
+            if counts_bits
+                && is_x86_feature_detected!("avx512f")
                 && is_x86_feature_detected!("avx512vl")
                 && is_x86_feature_detected!("avx512dq")
                 && is_x86_feature_detected!("avx512bw")
@@ -342,13 +347,13 @@ impl Simd {
 }
 
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
+#[target_feature(enable = "avx2,popcnt,lzcnt,bmi1,bmi2")]
 fn run_avx2<W: Work>(work: W) -> W::Out {
     work.run()
 }
 
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+#[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,popcnt,lzcnt,bmi1,bmi2")]
 fn run_avx512<W: Work>(work: W) -> W::Out {
     work.run()
 }

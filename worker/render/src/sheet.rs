@@ -243,6 +243,13 @@ fn fixed_light(light: f32) -> u32 {
     truncate(light * ONE + 0.5)
 }
 
+/// `yes` if `which`, else `no`: both are worked out, and no branch is made of it.
+#[inline(always)]
+fn select(which: bool, yes: f32, no: f32) -> f32 {
+    let mask = u32::from(which).wrapping_neg();
+    f32::from_bits(yes.to_bits() & mask | no.to_bits() & !mask)
+}
+
 /// Sums and state of up to [`LANES`] pixels beside each other, channel by channel: what
 /// [`Rule::close_row`] works on. Lanes are pixels.
 #[derive(Clone)]
@@ -310,42 +317,42 @@ impl Rule {
         row: &mut Row,
         live: u32,
     ) -> u32 {
-        // Several short loops over plain arrays: of one long one compilers make scalar code for AVX2.
-        let [mut taus, mut per_raws, mut sheet] = [[0.0f32; LANES]; 3];
+        // Several short loops over plain arrays, with what they read of `self` beside them, and selects
+        // by bits: of one long loop, of loads behind a condition or of branches compilers make scalar code.
+        let (unit, per_unit) = (self.unit, self.per_unit);
+        let [mut taus, mut per_raws, mut raws, mut sheet] = [[0.0f32; LANES]; 4];
         for i in 0..LANES {
             let filled = row.here[0][i] >= FAINTEST;
-            let raw = if filled { row.here[0][i] } else { 1.0 };
-            let tau = raw * self.unit * row.secant[i];
-            taus[i] = if filled { tau } else { 0.0 };
-            per_raws[i] = 1.0 / raw;
+            raws[i] = select(filled, row.here[0][i], 1.0);
+            taus[i] = select(filled, raws[i] * unit * row.secant[i], 0.0);
+            per_raws[i] = 1.0 / raws[i];
         }
         for i in 0..LANES {
             sheet[i] = if PAPER { taus[i].min(1.0) } else { opacity(taus[i]) };
         }
         let [mut weights, mut light] = [[0.0f32; LANES]; 2];
         for i in 0..LANES {
-            let (small, large) =
-                phis(taus[i], per_raws[i] * self.per_unit * row.cosine[i], sheet[i]);
-            let weight = if taus[i] < SWITCH { small } else { large };
-            weights[i] = if taus[i] > 0.0 { weight } else { 0.0 };
+            let (small, large) = phis(taus[i], per_raws[i] * per_unit * row.cosine[i], sheet[i]);
+            let weight = select(taus[i] < SWITCH, small, large);
+            weights[i] = select(taus[i] > 0.0, weight, 0.0);
         }
         // Where there is nothing, colours are nothing too, and neighbours may be anything.
         let mut slopes = [[0.0f32; LANES]; 4];
         if LINEAR {
             for i in 0..LANES {
-                let (tl, tn) = (row.before[0][i], row.behind[0][i]);
-                let raw = row.here[0][i];
-                let raw = if raw >= FAINTEST { raw } else { 1.0 };
+                let (tl, raw, tn) = (row.before[0][i], raws[i], row.behind[0][i]);
                 let s =
                     if WHOLE { self.slopes_whole(tl, raw, tn) } else { self.slopes(tl, raw, tn) };
                 (slopes[0][i], slopes[1][i]) = (s.before, s.per_tl);
                 (slopes[2][i], slopes[3][i]) = (s.behind, s.unit);
             }
         }
+        let mut a = row.a;
         for i in 0..LANES {
-            light[i] = (1.0 - row.a[i]) * (live >> i & 1) as f32;
-            row.a[i] += light[i] * sheet[i];
+            light[i] = select(live >> i & 1 == 1, 1.0 - a[i], 0.0);
+            a[i] += light[i] * sheet[i];
         }
+        row.a = a;
         for ch in 0..COLOURS {
             let [here, before, behind] =
                 [&row.here, &row.before, &row.behind].map(|sums| &sums[ch + 1]);
@@ -371,7 +378,7 @@ impl Rule {
         }
         let mut shut = 0;
         for i in 0..LANES {
-            shut |= u32::from(self.is_shut(row.a[i])) << i;
+            shut |= u32::from(self.is_shut(a[i])) << i;
         }
         shut & live
     }

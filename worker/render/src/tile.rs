@@ -255,9 +255,12 @@ impl Pixels {
         for (plane, light) in self.colour.iter_mut().zip(&row.light) {
             let plane = plane[at..].first_chunk_mut::<STRIP>().expect("a strip");
             let light = light[lane..].first_chunk::<STRIP>().expect("a strip");
+            // Out of memory that compilers think is `row`, too.
+            let mut sums = *plane;
             for i in 0..STRIP {
-                plane[i] = plane[i].wrapping_add(light[i]);
+                sums[i] = sums[i].wrapping_add(light[i]);
             }
+            *plane = sums;
         }
     }
 }

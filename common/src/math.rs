@@ -6,27 +6,38 @@
 //! on lanes. Formulas: Cody-Waite reduction and the Taylor series of degree 7 on
 //! `|r| <= ln 2 / 2`, whose remainder (5e-9) is below half an ulp of f32.
 
+/// 1.5 * 2^23: floats from there on are integers.
+pub const MAGIC: f32 = 12_582_912.0;
+/// ln 2 in two parts; the first has 15 trailing zero bits, so that its products with small integers are
+/// exact.
+pub const LN2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
+/// (exp(x) - 1) / x, highest power first.
+pub const TAYLOR: [f32; 7] =
+    [1.0 / 5040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0];
+/// The series of [`phi`] over the square of the depth, highest power first.
+pub const PHI: [f32; 5] = [-1.0 / 2016.0, 1.0 / 360.0, -1.0 / 80.0, 1.0 / 24.0, -1.0 / 12.0];
+
+/// A polynomial by Horner's rule, highest power first.
+#[inline(always)]
+fn polynomial<const N: usize>(coefficients: &[f32; N], x: f32) -> f32 {
+    let mut p = coefficients[0];
+    for c in &coefficients[1..] {
+        p = p * x + c;
+    }
+    p
+}
+
 /// `exp(x)` as `s * (1 + q)` with a power of two s and `q` small, for `x <= 0`, clamped below at -87
 /// (where f32 results would be denormal). For `x` near 0, s is 1 and q keeps all its digits.
 #[inline(always)]
 fn exp_parts(x: f32) -> (f32, f32) {
     let x = if x > -87.0 { x } else { -87.0 };
-    // Adding 1.5 * 2^23 rounds to the nearest integer, ties to even, and leaves that integer in
-    // the low bits: no conversion instruction, the same on every machine.
-    const MAGIC: f32 = 12_582_912.0;
+    // Adding it rounds to the nearest integer, ties to even, and leaves that integer in the low bits: no
+    // conversion instruction, the same on every machine.
     let shifted = x * std::f32::consts::LOG2_E + MAGIC;
     let n = shifted - MAGIC;
-    // ln 2 in two parts; the first has 15 trailing zero bits, so that n * LN2_HI is exact.
-    const LN2_HI: f32 = 0.693_359_4;
-    const LN2_LO: f32 = -2.121_944_4e-4;
-    let r = (x - n * LN2_HI) - n * LN2_LO;
-    let p = 1.0 / 5040.0;
-    let p = p * r + 1.0 / 720.0;
-    let p = p * r + 1.0 / 120.0;
-    let p = p * r + 1.0 / 24.0;
-    let p = p * r + 1.0 / 6.0;
-    let p = p * r + 0.5;
-    let p = p * r + 1.0;
+    let r = (x - n * LN2[0]) - n * LN2[1];
+    let p = polynomial(&TAYLOR, r);
     let exponent = (shifted.to_bits() as i32).wrapping_sub(MAGIC.to_bits() as i32);
     (f32::from_bits(((exponent + 127) as u32) << 23), p * r)
 }
@@ -64,14 +75,7 @@ pub fn phi(tau: f32, per_tau: f32, a: f32) -> f32 {
 pub fn phis(tau: f32, per_tau: f32, a: f32) -> (f32, f32) {
     // The closed form loses all digits below tau = 1e-3; the series takes over where both are
     // good to 1e-7 absolute.
-    let small = {
-        let p = -1.0 / 2016.0;
-        let p = p * tau + 1.0 / 360.0;
-        let p = p * tau + -1.0 / 80.0;
-        let p = p * tau + 1.0 / 24.0;
-        let p = p * tau + -1.0 / 12.0;
-        p * tau * tau
-    };
+    let small = polynomial(&PHI, tau) * tau * tau;
     (small, a * per_tau + a * 0.5 - 1.0)
 }
 

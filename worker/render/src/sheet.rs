@@ -76,19 +76,19 @@ impl Sum for f32 {
 
 /// Below this a float sum is taken for nothing: colours over denormal sums lose their digits
 /// (E / tau of a denormal is off by half).
-const FAINTEST: f32 = 1e-30;
+pub(crate) const FAINTEST: f32 = 1e-30;
 
 /// The arithmetic of a closing sheet, with the constants of one view.
 #[derive(Clone, Copy, Debug)]
 pub struct Rule {
-    compositing: Compositing,
+    pub(crate) compositing: Compositing,
     /// Optical depth of one raw unit, and raw units of one of optical depth.
-    unit: f32,
-    per_unit: f32,
+    pub(crate) unit: f32,
+    pub(crate) per_unit: f32,
     /// Weight of the sheet before and of the one behind.
-    gain_before: f32,
-    gain_behind: f32,
-    eps: f32,
+    pub(crate) gain_before: f32,
+    pub(crate) gain_behind: f32,
+    pub(crate) eps: f32,
 }
 
 impl Rule {
@@ -234,11 +234,13 @@ impl Slopes {
     }
 }
 
+/// One in the fixed point of light.
+pub(crate) const ONE: f32 = (1u32 << 28) as f32;
+
 /// Light in fixed point. One rounding a sheet: colour of any cut into slabs adds up to the same
 /// integers.
 #[inline(always)]
 fn fixed_light(light: f32) -> u32 {
-    const ONE: f32 = (1u32 << 28) as f32;
     // Not negative but for the last bits of f32.
     truncate(light * ONE + 0.5)
 }

@@ -5,8 +5,9 @@
 //! a bit each; a sheet that closes looks at those alone, two strips at a time.
 
 use crate::mask::OpenMask;
-use crate::sheet::{LANES, Row};
+use crate::sheet::Row;
 use crate::splat::Simd;
+use crate::splat::close::close_rows;
 use crate::splat::records::{Line, Record, Recorded, STRIDE, STRIP, Strip};
 use crate::tile::{Io, PART, Part, Pixels, keep_last};
 use slabcast_common::message::Counters;
@@ -225,8 +226,17 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
             }
         }
         self.was = touched;
-        let mut closing = Closing { k, part, open, pixels, row: Row::default(), any_shut: false };
-        let mut pending = None;
+        let mut closing = Closing {
+            simd: self.simd,
+            k,
+            part,
+            open,
+            pixels,
+            rows: Default::default(),
+            any_shut: false,
+        };
+        let mut pending = [(0, 0); 4];
+        let mut some = 0;
         for strip in 0..STRIPS {
             let mut rows = touched[strip];
             while rows != 0 {
@@ -237,31 +247,34 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
                     self.dead[strip] |= 1 << y;
                     continue;
                 }
-                let here = (strip, y);
-                match pending.take() {
-                    None => pending = Some(here),
-                    Some(other) => {
-                        self.take([other, here], &mut closing);
-                        closing.close::<S>(&[other, here]);
-                    }
+                pending[some] = (strip, y);
+                some += 1;
+                if some == 4 {
+                    let [a, b, c, d] = pending;
+                    self.take([a, b], &mut closing, 0);
+                    self.take([c, d], &mut closing, 1);
+                    closing.close::<S, 2>([[a, b], [c, d]]);
+                    some = 0;
                 }
             }
         }
-        if let Some(one) = pending {
-            self.take([one, one], &mut closing);
-            closing.close::<S>(&[one]);
+        for two in pending[..some].chunks(2) {
+            // One alone is its own neighbour.
+            let two = [two[0], two[two.len() - 1]];
+            self.take(two, &mut closing, 0);
+            closing.close::<S, 1>([two]);
         }
         closing.any_shut
     }
 
     #[inline(always)]
-    fn take(&mut self, strips: [(usize, usize); 2], to: &mut Closing<'_>) {
+    fn take(&mut self, strips: [(usize, usize); 2], to: &mut Closing<'_>, row: usize) {
         let strips = strips.map(|(strip, y)| Strip {
             record: y * STRIDE + strip * STRIP,
             pixel: y * EDGE + strip * STRIP,
         });
         let sums = (&mut *self.records, &mut *self.before);
-        S::take(self.simd, sums, &to.pixels.a, strips, slot::<N>(to.k), &mut to.row);
+        S::take(self.simd, sums, &to.pixels.a, strips, slot::<N>(to.k), &mut to.rows[row]);
     }
 
     /// Leaves nothing behind, where sheets before `k` are closed.
@@ -283,44 +296,49 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
 
 /// A sheet that is being closed.
 struct Closing<'a> {
+    simd: Simd,
     k: i32,
     part: &'a Part<'a>,
     open: &'a mut OpenMask,
     pixels: &'a mut Pixels,
-    row: Row,
+    rows: [Row; 2],
     any_shut: bool,
 }
 
 impl Closing<'_> {
-    /// Composites one strip or two, whose sums are in the row.
+    /// Composites strips, two a row, whose sums are in the first rows.
     #[inline(always)]
-    fn close<S: Recorded>(&mut self, strips: &[(usize, usize)]) {
-        let Closing { part, open, pixels, row, .. } = self;
-        // A voxel touches a sheet or two with nothing, where its kernel ends or is cut.
-        if row.here[0] == [0.0; LANES] {
-            return;
-        }
-        let mut live = 0;
-        for (half, &(strip, y)) in strips.iter().enumerate() {
-            live |= (open.row(y) >> (strip * STRIP) & 0xff) << (half * STRIP);
+    fn close<S: Recorded, const ROWS: usize>(&mut self, strips: [[(usize, usize); 2]; ROWS]) {
+        let Closing { simd, part, open, pixels, rows, .. } = self;
+        let rows = rows.first_chunk_mut::<ROWS>().expect("two rows at most");
+        let mut live = [0; ROWS];
+        for (live, two) in live.iter_mut().zip(&strips) {
+            for (half, &(strip, y)) in two.iter().enumerate() {
+                *live |= ((open.row(y) >> (strip * STRIP) & 0xff) << (half * STRIP)) as u32;
+            }
         }
         // Where rays are parallel, the row's secants stay 1.
         if let Projection::Persp { .. } = part.frame.view.projection {
-            for (half, &(strip, y)) in strips.iter().enumerate() {
-                let secants = &pixels.secants[y * EDGE + strip * STRIP..][..STRIP];
-                for (i, secant) in secants.iter().enumerate() {
-                    let lane = half * STRIP + i;
-                    (row.secant[lane], row.cosine[lane]) = (*secant, 1.0 / secant);
+            for (row, two) in rows.iter_mut().zip(&strips) {
+                for (half, &(strip, y)) in two.iter().enumerate() {
+                    let secants = &pixels.secants[y * EDGE + strip * STRIP..][..STRIP];
+                    for (i, secant) in secants.iter().enumerate() {
+                        let lane = half * STRIP + i;
+                        (row.secant[lane], row.cosine[lane]) = (*secant, 1.0 / secant);
+                    }
                 }
             }
         }
-        let shut = part.frame.rule.close_row::<S>(row, live as u32);
-        for (half, &(strip, y)) in strips.iter().enumerate() {
-            let at = y * EDGE + strip * STRIP;
-            pixels.put(at, row, half * STRIP);
-            let shut = u64::from(shut >> (half * STRIP) & 0xff);
-            open.close(y, shut << (strip * STRIP));
-            self.any_shut |= shut != 0;
+        let shut = close_rows::<S, ROWS>(*simd, &part.frame.rule, rows, live);
+        for ((row, two), shut) in rows.iter().zip(&strips).zip(shut) {
+            // One alone is there twice.
+            let halves = if two[0] == two[1] { 1 } else { 2 };
+            for (half, &(strip, y)) in two[..halves].iter().enumerate() {
+                pixels.put(y * EDGE + strip * STRIP, row, half * STRIP);
+                let shut = u64::from(shut >> (half * STRIP) & 0xff);
+                open.close(y, shut << (strip * STRIP));
+                self.any_shut |= shut != 0;
+            }
         }
     }
 }

@@ -9,6 +9,7 @@
 //! float to an integer without the range check that would double the loop's cost.
 #![expect(unsafe_code, reason = "the one wall: run-time dispatch, unchecked conversion, lanes")]
 
+pub(crate) mod close;
 pub(crate) mod records;
 pub(crate) mod toss;
 

@@ -356,11 +356,15 @@ pub(super) mod avx2 {
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx512 {
     use super::avx2::At;
-    use crate::splat::records::{MOST, STRIDE, Splat, Tables};
+    use crate::splat::Tap;
+    use crate::splat::records::{Across, BySlot, MOST, Record, STRIDE, Splat, Tables};
     use std::arch::x86_64::*;
 
     /// Registers of a record at most: sixteen sums each.
     const PARTS: usize = MOST / 4;
+
+    /// Columns whose weights stay in registers.
+    const GROUP: usize = 8;
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     pub(in super::super) fn splat_all<const C: usize, const N: usize>(
@@ -438,6 +442,65 @@ pub(super) mod avx512 {
                             let sums = _mm512_loadu_si512(at);
                             let sums = _mm512_add_epi32(sums, _mm512_cvttps_epi32(add));
                             _mm512_storeu_si512(at, sums);
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    /// Each slot's weight for its four channels: four slots a register.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn spread<const N: usize>(weights: &[f32; N]) -> [__m512; PARTS] {
+        let slot = _mm512_setr_epi32(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3);
+        let mut spread = [_mm512_setzero_ps(); PARTS];
+        for (four, spread) in weights.as_chunks::<4>().0.iter().zip(&mut spread) {
+            // SAFETY: four floats are 16 bytes.
+            let four = unsafe { _mm_loadu_ps(four.as_ptr()) };
+            *spread = _mm512_permutexvar_ps(slot, _mm512_castps128_ps512(four));
+        }
+        spread
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    pub(in super::super) fn splat_deep<const N: usize>(
+        records: &mut [Record<i32, N>],
+        at: usize,
+        (x, y): Across<'_, Tap, N>,
+        payload: [f32; 4],
+        z: &BySlot<f32, N>,
+    ) {
+        let (half, zero) = (_mm512_set1_ps(0.5), _mm512_setzero_ps());
+        // SAFETY: four floats are 16 bytes.
+        let payload = _mm512_broadcast_f32x4(unsafe { _mm_loadu_ps(payload.as_ptr()) });
+        let mut sections = spread::<N>(z);
+        for section in &mut sections[..N / 4] {
+            // Negative sections there are none.
+            *section = _mm512_max_ps(_mm512_mul_ps(payload, *section), zero);
+        }
+        // Columns in groups whose weights stay in registers.
+        for (group, x) in x.chunks(GROUP).enumerate() {
+            let mut columns = [[zero; PARTS]; GROUP];
+            for (column, x) in columns.iter_mut().zip(x) {
+                *column = spread::<N>(&x.map(Tap::get));
+            }
+            let columns = &columns[..x.len()];
+            for (row, wy) in records[at + GROUP * group..].chunks_mut(STRIDE).zip(y) {
+                let mut rows = spread::<N>(&wy.map(Tap::get));
+                for (row, section) in rows[..N / 4].iter_mut().zip(sections) {
+                    *row = _mm512_mul_ps(section, *row);
+                }
+                for (record, wx) in row[..x.len()].iter_mut().zip(columns) {
+                    let at: *mut __m512i = record.as_mut_ptr().cast();
+                    for i in 0..N / 4 {
+                        let add = _mm512_add_ps(_mm512_mul_ps(rows[i], wx[i]), half);
+                        // SAFETY: sixteen sums are 64 bytes, and borrowed for us alone.
+                        unsafe {
+                            let sums = _mm512_loadu_si512(at.add(i));
+                            let sums = _mm512_add_epi32(sums, _mm512_cvttps_epi32(add));
+                            _mm512_storeu_si512(at.add(i), sums);
                         }
                     }
                 }

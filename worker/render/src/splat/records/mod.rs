@@ -461,7 +461,7 @@ impl Recorded for i32 {
             (records, at, across, payload, z),
             splat_deep::<i32, N>,
             long::avx2::splat_deep::<N>,
-            long::avx2::splat_deep::<N>
+            long::avx512::splat_deep::<N>
         );
     }
 }

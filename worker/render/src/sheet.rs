@@ -389,6 +389,8 @@ impl Rule {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::splat::Simd;
+    use crate::splat::close::close_rows;
     use proptest::prelude::*;
 
     proptest! {
@@ -432,7 +434,8 @@ mod tests {
         }
     }
 
-    /// A row closed at once against its pixels one by one, bit by bit.
+    /// A row closed at once against its pixels one by one, bit by bit, and again with another on every
+    /// instruction set.
     fn check<S: Sum>(
         rule: &Rule,
         row: &Row,
@@ -451,6 +454,15 @@ mod tests {
             }
             prop_assert_eq!(closed.a[i].to_bits(), a.to_bits());
             prop_assert_eq!(closed.light.map(|l| l[i]), colour);
+        }
+        for simd in Simd::all() {
+            let mut two = [row.clone(), row.clone()];
+            two[0].here = row.before;
+            let lives = [!live & 0xffff, live];
+            let [_, got] = close_rows::<S, 2>(simd, rule, &mut two, lives);
+            prop_assert_eq!(got, shut, "{}", simd.name());
+            prop_assert_eq!(two[1].a.map(f32::to_bits), closed.a.map(f32::to_bits));
+            prop_assert_eq!(two[1].light, closed.light);
         }
         Ok(())
     }

@@ -284,6 +284,7 @@ impl AxisTable {
         let firsts: Vec<i32> = spans.iter().map(|s| near(s.0)).collect();
         let more_from = firsts.partition_point(|first| *first == firsts[0]) as i32;
         let first = First { near: firsts[0], more_from };
+        debug_assert!((0..SUBPIXELS).zip(&firsts).all(|(p, want)| first.of(p) == *want));
         let count: Vec<u32> = spans.iter().map(|s| (s.1 - s.0 + 1).max(0) as u32).collect();
         let stride = count.iter().copied().max().unwrap_or(0) as usize;
         let margin = if padded { stride } else { 0 };

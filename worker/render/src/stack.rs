@@ -2,7 +2,7 @@
 //!
 //! What differs between views is how voxels get there: [`crate::flat`] and [`crate::deep`] toss and
 //! splat; this room closes. Rows of strips of eight pixels that something was added to are known by
-//! a bit each; a sheet that closes looks at those alone, two strips at a time.
+//! a bit each; a sheet that closes looks at those alone, four strips at a time.
 
 use crate::mask::OpenMask;
 use crate::sheet::Row;

@@ -9,6 +9,7 @@
 use crate::footprint::Phases;
 use crate::mask::{OpenMask, REACH_MOST};
 use crate::splat::records::{BySlot, MOST, Recorded, RowAt, STRIDE};
+use crate::splat::toss::prefetch;
 use crate::splat::{Accumulate, Simd, Work};
 use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels};
@@ -212,6 +213,9 @@ impl<S: Recorded, const N: usize> Stage<S, N> for DeepStage<'_, S, N> {
     ) {
         let Part { frame, rect, slab, .. } = self.part;
         let Some((brick, corner)) = self.part.open_brick(which, open, counters) else { return };
+        if let Some(next) = self.part.peek(which + 1) {
+            prefetch(next);
+        }
         let cull = frame.scene.quality.cull;
         let (sections, view, n) = (&frame.sections, &frame.view, brick.len());
         let Tossing { eye, at, cells, fate, samples } = &mut *self.tossing;

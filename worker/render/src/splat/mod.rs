@@ -359,6 +359,27 @@ fn run_avx512<W: Work>(work: W) -> W::Out {
     work.run()
 }
 
+/// Four rows of sixteen columns, column by column: four columns a register.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+#[inline]
+fn by_column([a, b, c, d]: [std::arch::x86_64::__m512i; 4]) -> [std::arch::x86_64::__m512i; 4] {
+    use std::arch::x86_64::*;
+    let (low, high) = (_mm512_unpacklo_epi32(a, b), _mm512_unpackhi_epi32(a, b));
+    let (low_2, high_2) = (_mm512_unpacklo_epi32(c, d), _mm512_unpackhi_epi32(c, d));
+    // Columns 0 4 8 12, 1 5 9 13 and so on, one a quarter; then in order.
+    let (a, b) = (_mm512_unpacklo_epi64(low, low_2), _mm512_unpackhi_epi64(low, low_2));
+    let (c, d) = (_mm512_unpacklo_epi64(high, high_2), _mm512_unpackhi_epi64(high, high_2));
+    let ab = [_mm512_shuffle_i32x4::<0x44>(a, b), _mm512_shuffle_i32x4::<0xee>(a, b)];
+    let cd = [_mm512_shuffle_i32x4::<0x44>(c, d), _mm512_shuffle_i32x4::<0xee>(c, d)];
+    [
+        _mm512_shuffle_i32x4::<0x88>(ab[0], cd[0]),
+        _mm512_shuffle_i32x4::<0xdd>(ab[0], cd[0]),
+        _mm512_shuffle_i32x4::<0x88>(ab[1], cd[1]),
+        _mm512_shuffle_i32x4::<0xdd>(ab[1], cd[1]),
+    ]
+}
+
 /// Adds one section to the pixels of rows `y0..` and columns `x0..` of a sheet with `stride` pixels
 /// a row: `((payload * w_z) * w_y) * w_x`, in this order everywhere.
 ///

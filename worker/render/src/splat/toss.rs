@@ -198,6 +198,7 @@ mod avx512 {
     use super::{Sieve, Sifted, Tossing};
     use crate::footprint::Phases;
     use crate::place::FINER_BITS;
+    use crate::splat::by_column;
     use crate::tile::PART;
     use slabcast_common::brick::Brick;
     use slabcast_common::shade::NO_NORMAL;
@@ -257,23 +258,7 @@ mod avx512 {
             let normal = _mm512_slli_epi32::<16>(at(normals.as_ptr()));
             let deep = _mm512_or_si512(_mm512_and_si512(at(z.as_ptr().cast()), phase), normal);
             let sample = at(samples.as_ptr());
-            // Four voxels a register, one a quarter: 0 4 8 12, 1 5 9 13 and so on, then in order.
-            let (low, high) =
-                (_mm512_unpacklo_epi32(place, rows), _mm512_unpackhi_epi32(place, rows));
-            let (low_2, high_2) =
-                (_mm512_unpacklo_epi32(deep, sample), _mm512_unpackhi_epi32(deep, sample));
-            let a = _mm512_unpacklo_epi64(low, low_2);
-            let b = _mm512_unpackhi_epi64(low, low_2);
-            let c = _mm512_unpacklo_epi64(high, high_2);
-            let d = _mm512_unpackhi_epi64(high, high_2);
-            let ab = (_mm512_shuffle_i32x4::<0x44>(a, b), _mm512_shuffle_i32x4::<0xee>(a, b));
-            let cd = (_mm512_shuffle_i32x4::<0x44>(c, d), _mm512_shuffle_i32x4::<0xee>(c, d));
-            let fours = [
-                _mm512_shuffle_i32x4::<0x88>(ab.0, cd.0),
-                _mm512_shuffle_i32x4::<0xdd>(ab.0, cd.0),
-                _mm512_shuffle_i32x4::<0x88>(ab.1, cd.1),
-                _mm512_shuffle_i32x4::<0xdd>(ab.1, cd.1),
-            ];
+            let fours = by_column([place, rows, deep, sample]);
             for (to, four) in ready.as_chunks_mut::<4>().0.iter_mut().zip(fours) {
                 // SAFETY: four voxels are 64 bytes, each four numbers.
                 unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), four) };

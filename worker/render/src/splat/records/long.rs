@@ -356,8 +356,8 @@ pub(super) mod avx2 {
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx512 {
     use super::avx2::At;
-    use crate::splat::Tap;
-    use crate::splat::records::{Across, BySlot, MOST, Record, STRIDE, Splat, Tables};
+    use crate::splat::records::{Across, BySlot, MOST, Record, RowAt, STRIDE, Splat, Tables};
+    use crate::splat::{Tap, by_column};
     use std::arch::x86_64::*;
 
     /// Registers of a record at most: sixteen sums each.
@@ -446,6 +446,30 @@ pub(super) mod avx512 {
                     }
                 }
             }
+        }
+    }
+
+    /// Four rows and sixteen columns at a time.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    pub(in super::super) fn weave<const N: usize>(
+        rows: [RowAt<'_, Tap>; N],
+        wide: usize,
+        to: &mut [BySlot<Tap, N>],
+    ) {
+        if N != 4 || wide > 16 || to.len() < 16 {
+            return super::avx2::weave(rows, wide, to);
+        }
+        let mut lines = [_mm512_setzero_si512(); 4];
+        for (line, at) in lines.iter_mut().zip(rows) {
+            let (present, from) = at.columns();
+            // SAFETY: a tap is a float; lanes that are not present are not read, and those that are lie
+            // in the row.
+            *line = unsafe { _mm512_maskz_loadu_epi32(present, from.cast()) };
+        }
+        for (to, four) in to.chunks_exact_mut(4).zip(by_column(lines)) {
+            // SAFETY: four columns of four taps are 64 bytes; no weight is negative.
+            unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), four) };
         }
     }
 

@@ -154,6 +154,21 @@ impl<'a, W> RowAt<'a, W> {
     /// No weights.
     pub(crate) const NONE: Self = RowAt { table: &[], from: 0, len: 0, column: 0 };
 
+    /// Which of the first 16 columns it has a weight for, a bit each, and where that of the first column
+    /// would be.
+    #[inline(always)]
+    fn columns(&self) -> (u16, *const W) {
+        let row = self.row();
+        // A row of more than 31 weights has more than are looked at.
+        let present = (1u64 << row.len().min(31)) - 1;
+        let present = if self.column >= 0 {
+            present.checked_shl(self.column as u32).unwrap_or(0)
+        } else {
+            present.checked_shr(self.column.unsigned_abs()).unwrap_or(0)
+        };
+        (present as u16, row.as_ptr().wrapping_offset(-(self.column as isize)))
+    }
+
     /// The weights.
     #[inline(always)]
     fn row(&self) -> &'a [W] {
@@ -444,7 +459,7 @@ impl Recorded for i32 {
         wide: usize,
         to: &mut [BySlot<Tap, N>],
     ) {
-        at_level!(simd, (rows, wide, to), weave, long::avx2::weave, long::avx2::weave);
+        at_level!(simd, (rows, wide, to), weave, long::avx2::weave, long::avx512::weave);
     }
 
     #[inline(always)]

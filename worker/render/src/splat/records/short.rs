@@ -480,17 +480,9 @@ pub(super) mod avx512 {
         };
         let mut lines = [_mm256_setzero_si256(); 4];
         for (line, at) in lines.iter_mut().zip(rows) {
-            let (row, column) = (at.row(), at.column);
-            // Lane j is column j. A row of more than 31 weights has more than are looked at.
-            let present = (1u64 << row.len().min(31)) - 1;
-            let present = if column >= 0 {
-                present.checked_shl(column as u32).unwrap_or(0)
-            } else {
-                present.checked_shr(column.unsigned_abs()).unwrap_or(0)
-            };
-            let from = row.as_ptr().wrapping_offset(-(column as isize));
+            let (present, from) = at.columns();
             // SAFETY: lanes that are not present are not read; those that are lie in the row.
-            *line = unsafe { _mm256_maskz_loadu_epi16(present as u16, from) };
+            *line = unsafe { _mm256_maskz_loadu_epi16(present, from) };
         }
         by_column(lines, sixteen);
     }

@@ -25,6 +25,7 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
     let rows: Vec<&str> = said.lines().filter(|l| l.trim_end().ends_with(" %")).collect();
     assert_eq!(rows.len(), 8, "both schedules: {said}");
     assert!(said.contains("region schedule") && said.contains("slab schedule, 3 slabs"), "{said}");
+    assert!(!said.contains("render threads' time"), "three frames are too few to tell: {said}");
     assert_eq!(names(&dir.join("out")), ["plan.csv", "plan.json", "plan.png", "plan.svg"]);
     let svg = std::fs::read_to_string(dir.join("out/plan.svg")).unwrap();
     assert!(svg.contains("predicted efficiency") && svg.contains("<circle"));
@@ -46,6 +47,7 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
         assert!(n("latency_efficiency") <= 1.5, "{row}");
         let named = ["cores", "straggler", "link", "master"];
         assert!(named.contains(&row["bound_by"].as_str().unwrap()), "{row}");
+        assert!(row["render_threads"].is_null() && row["master_busy"].is_null(), "{row}");
     }
     // What was measured is read again; a slow link then binds.
     let slow =
@@ -62,6 +64,22 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
     let out = run(dir, &[&SMALL[..], &["--trace", "bad.trace"]].concat());
     assert_eq!(out.status.code(), Some(1));
     assert!(text(&out.stderr).contains("bad.trace: is no trace"), "{}", text(&out.stderr));
+}
+
+#[test]
+fn a_longer_plan_says_where_the_threads_time_goes() {
+    let dir = tempfile::tempdir().unwrap();
+    let frames = ["plan", "formula:spheres:32", "--size", "128x128", "--frames", "9", "--quiet"];
+    let cluster = ["--workers", "2", "--schedule", "region", "--trace", "s.trace"];
+    let said = good(dir.path(), &[&frames[..], &cluster].concat());
+    assert!(said.contains("four in flight: % of the render threads' time"), "{said}");
+    let plan = json(&good(dir.path(), &[&frames[..], &cluster, &["--json"]].concat()));
+    let row = &plan["predicted"][0];
+    let parts = row["render_threads"].as_object().unwrap();
+    let lost: f64 = parts.values().map(|part| part.as_f64().unwrap()).sum();
+    let alone = row["throughput_efficiency"].as_f64().unwrap();
+    assert!((lost + alone - 1.0).abs() < 1e-6, "all of it, and once: {row}");
+    assert!(row["master_busy"]["driver"].as_f64().unwrap() > 0.0, "{row}");
 }
 
 #[test]

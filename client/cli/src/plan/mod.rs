@@ -252,20 +252,25 @@ impl Predicted {
     }
 }
 
-/// Where the render threads' time goes.
+/// Where the render threads' time goes; nothing where paths are too short to tell.
 fn losses(name: &str, rows: &[Row]) -> String {
-    let mut text = format!("\n{name} schedule, four in flight: render threads' time in %\n");
+    let told: Vec<_> = rows.iter().filter_map(|r| Some((r, r.steady.as_ref()?))).collect();
+    if told.is_empty() {
+        return String::new();
+    }
+    let mut text = format!("\n{name} schedule, four in flight: % of the render threads' time\n");
     let _ = write!(text, "{:>7} {:>8}", "workers", "alone");
     for (name, _) in LOSSES {
         let _ = write!(text, " {name:>8}");
     }
     let _ = writeln!(text, " | {:>6} {:>7}", "driver", "streams");
-    for r in rows {
+    for (r, steady) in told {
         let _ = write!(text, "{:>7} {:>8.1}", r.workers, 100.0 * r.throughput_efficiency);
-        for part in r.lost {
+        for part in steady.lost {
             let _ = write!(text, " {:>8.1}", 100.0 * part);
         }
-        let _ = writeln!(text, " | {:>6.1} {:>7.1}", 100.0 * r.busy[0], 100.0 * r.busy[1]);
+        let [driver, streams] = steady.busy.map(|part| 100.0 * part);
+        let _ = writeln!(text, " | {driver:>6.1} {streams:>7.1}");
     }
     text
 }
@@ -351,8 +356,13 @@ impl Said<'_> {
                 );
             }
         }
-        for p in self.predicted {
-            text += &losses(p.name(), &p.rows);
+        let told: String = self.predicted.iter().map(|p| losses(p.name(), &p.rows)).collect();
+        if !told.is_empty() {
+            text += &told;
+            text += "\nalone: eff. of frames/s. drawing: what tiles take beyond one core's share. tables: \
+                     made by each worker for\na frame. messages: read and written. bricks: tiles lack \
+                     some. on way: results and leases travel. dry: the\nmaster has nothing to lend. \
+                     end: of the path. driver, streams: how busy the master's threads are, in %.\n";
         }
         for [plain, learned] in self.predicted.iter().filter_map(|p| p.orders) {
             let _ = writeln!(
@@ -385,9 +395,14 @@ impl Said<'_> {
                     "throughput_efficiency": r.throughput_efficiency,
                     "bytes_down": r.bytes[0], "bytes_up": r.bytes[1], "brick_bytes": r.bytes[2],
                     "leases": r.leases,
-                    "render_threads": r.lost.iter().zip(LOSSES).map(|(part, (_, name))| (name.to_string(), (*part).into()))
-                        .collect::<serde_json::Map<_, _>>(),
-                    "master_busy": { "driver": r.busy[0], "streams": r.busy[1] },
+                    "render_threads": r.steady.as_ref().map(|s| {
+                        let parts = LOSSES.iter().zip(s.lost);
+                        let named = parts.map(|((_, name), part)| (name.to_string(), part.into()));
+                        named.collect::<serde_json::Map<_, _>>()
+                    }),
+                    "master_busy": r.steady.as_ref().map(|s| {
+                        serde_json::json!({ "driver": s.busy[0], "streams": s.busy[1] })
+                    }),
                     "messages": { "down": r.messages[0], "writes": r.messages[1], "up": r.messages[2] },
                     "bound_by": r.bound.0.name(), "bound_part": r.bound.1,
                     "parts_ms": { "cores": ms(0), "straggler": ms(1), "link": ms(2),

@@ -62,9 +62,16 @@ pub(crate) struct Row {
     pub(crate) master_ms: [f64; 3],
     /// Messages of a later frame: from the master, how often some of those left together, to the master.
     pub(crate) messages: [f64; 3],
-    /// Of the render threads' time with several frames in flight, the parts that [`LOSSES`] names.
+    /// What threads did while frames were delivered steadily; nothing of a path of four frames and fewer.
+    pub(crate) steady: Option<Steady>,
+}
+
+/// Of the time with several frames in flight
+#[derive(Clone, Debug)]
+pub(crate) struct Steady {
+    /// what render threads lose, by the parts that [`LOSSES`] names,
     pub(crate) lost: [f64; LOSSES.len()],
-    /// Of the time with several frames in flight, how much the driver is busy, and each of the streams.
+    /// and how much the driver is busy, and each of the streams.
     pub(crate) busy: [f64; 2],
 }
 
@@ -172,17 +179,33 @@ fn row(
     let frames = jobs.len() as f64;
     let each_ms = throughput.steady_ms(IN_FLIGHT);
     let spent = throughput.spent;
-    let all_spent = spent.all().max(1) as f64;
-    let part = |ns: u64| ns as f64 / all_spent;
-    let drawing = part(spent.tiles + spent.tables + spent.blocks);
-    let window = all_spent / threads;
+    let throughput_efficiency = steadily / threads / each_ms;
+    let steady = (spent.all() > 0).then(|| {
+        let all_spent = spent.all() as f64;
+        let part = |ns: u64| ns as f64 / all_spent;
+        let drawing = part(spent.tiles + spent.tables + spent.blocks);
+        let window = all_spent / threads;
+        let [driver, streams] = [0, 1].map(|i| throughput.steady[i] as f64 / window);
+        Steady {
+            lost: [
+                drawing - part(spent.tables) - throughput_efficiency,
+                part(spent.tables),
+                part(spent.messages),
+                part(spent.bricks),
+                part(spent.way),
+                part(spent.dry),
+                part(spent.tail),
+            ],
+            busy: [driver, streams / 2.0],
+        }
+    });
     Ok(Row {
         workers,
         first_ms: latency.first_ms(),
         frame_ms,
         latency_efficiency: alone / threads / frame_ms,
         frames_per_s: 1e3 / each_ms,
-        throughput_efficiency: steadily / threads / each_ms,
+        throughput_efficiency,
         bytes: [latency.mean(|f| f.down), latency.mean(|f| f.up), latency.mean(|f| f.bricks)],
         leases: latency.mean(|f| f.leases),
         bound: (kinds[most], parts[most] / all),
@@ -196,16 +219,7 @@ fn row(
             latency.mean(|f| f.writes_down),
             latency.mean(|f| f.messages_up),
         ],
-        lost: [
-            drawing - part(spent.tables) - steadily / threads / each_ms,
-            part(spent.tables),
-            part(spent.messages),
-            part(spent.bricks),
-            part(spent.way),
-            part(spent.dry),
-            part(spent.tail),
-        ],
-        busy: [throughput.steady[0] as f64 / window, throughput.steady[1] as f64 / window / 2.0],
+        steady,
     })
 }
 

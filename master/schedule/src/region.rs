@@ -496,6 +496,16 @@ mod tests {
         |t| known(t).map(|k| k.0)
     }
 
+    /// Shared among everybody, of whom this much is known; nobody has bricks.
+    fn among_all(
+        tiles: &[Macrotile],
+        roster: &Roster,
+        known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>,
+    ) -> Vec<WorkerId> {
+        let pace = Pace::of(tiles, known);
+        share(tiles, roster, Crew::ALL, &pace, known, (&at_home(known), &|_| 0))
+    }
+
     fn shares(owners: &[WorkerId]) -> Vec<usize> {
         let count = |w: u64| owners.iter().filter(|o| o.0 == w).count();
         (1..=3).map(count).collect()
@@ -504,27 +514,13 @@ mod tests {
     #[test]
     fn first_shares_are_as_threads_and_later_ones_stay() {
         let (tiles, roster) = (tiles(24), roster(&[1, 2, 3]));
-        let owners = share(
-            &tiles,
-            &roster,
-            Crew::ALL,
-            &Pace::of(&[], &|_| None),
-            &|_| None,
-            (&|_| None, &|_| 0),
-        );
+        let owners = among_all(&tiles, &roster, &|_| None);
         assert_eq!(shares(&owners), [4, 8, 12]);
         assert!(owners.is_sorted(), "in bands");
         let at = |t: &Macrotile| (t.rect.x0 / 64) as usize;
         // Each took what it was guessed to, or nearly.
         let known = |t: &Macrotile| Some((owners[at(t)], 1000.0 + at(t) as f64));
-        let again = share(
-            &tiles,
-            &roster,
-            Crew::ALL,
-            &Pace::of(&tiles, &known),
-            &known,
-            (&at_home(&known), &|_| 0),
-        );
+        let again = among_all(&tiles, &roster, &known);
         assert_eq!(again, owners);
     }
 
@@ -545,28 +541,14 @@ mod tests {
     #[test]
     fn a_tenth_of_the_speed_gets_a_tenth_of_the_work() {
         let (tiles, roster) = (tiles(42), roster(&[1, 1, 1]));
-        let owners = share(
-            &tiles,
-            &roster,
-            Crew::ALL,
-            &Pace::of(&[], &|_| None),
-            &|_| None,
-            (&|_| None, &|_| 0),
-        );
+        let owners = among_all(&tiles, &roster, &|_| None);
         assert_eq!(shares(&owners), [14, 14, 14]);
         let at = |t: &Macrotile| (t.rect.x0 / 64) as usize;
         let known = |t: &Macrotile| {
             let owner = owners[at(t)];
             Some((owner, if owner.0 == 2 { 10_000.0 } else { 1000.0 }))
         };
-        let again = share(
-            &tiles,
-            &roster,
-            Crew::ALL,
-            &Pace::of(&tiles, &known),
-            &known,
-            (&at_home(&known), &|_| 0),
-        );
+        let again = among_all(&tiles, &roster, &known);
         assert_eq!(shares(&again), [20, 2, 20]);
     }
 
@@ -590,14 +572,7 @@ mod tests {
         let tiles = tiles(30);
         let at = |t: &Macrotile| t.rect.x0 / 64;
         let known = |t: &Macrotile| Some((WorkerId(if at(t) < 20 { 1 } else { 9 }), 500.0));
-        let owners = share(
-            &tiles,
-            &roster(&[1, 1, 1]),
-            Crew::ALL,
-            &Pace::of(&tiles, &known),
-            &known,
-            (&at_home(&known), &|_| 0),
-        );
+        let owners = among_all(&tiles, &roster(&[1, 1, 1]), &known);
         let counts = shares(&owners);
         assert!(counts.iter().all(|n| (9..=12).contains(n)), "{counts:?}");
         let kept = owners[..20].iter().filter(|o| o.0 == 1).count();

@@ -389,17 +389,7 @@ impl Shelf {
         let profile = |p: &Profile| [p.std, p.radius, p.spread].map(f64::to_bits);
         let ([a, b, c], [d, e, f]) = (profile(x), profile(y));
         let key = ([a, b, c, d, e, f, scale.to_bits()], padded);
-        let tables = || self.tables.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(found) = tables().get(&key) {
-            return found.clone();
-        }
-        // Not under the lock: it takes a tenth of a millisecond, and threads want others.
-        let made = Arc::new(Tables::new(x, y, scale, padded));
-        let mut tables = tables();
-        if tables.len() >= SHELF {
-            tables.clear();
-        }
-        tables.entry(key).or_insert(made).clone()
+        shelved(&self.tables, SHELF, key, || Tables::new(x, y, scale, padded))
     }
 
     /// [`Sections::new`], made once: it takes 80 us, which is a twentieth of what a worker of fifteen draws of a
@@ -413,17 +403,28 @@ impl Shelf {
     ) -> Arc<Sections> {
         let bits = [profile.std, profile.radius, profile.spread, thickness].map(f64::to_bits);
         let key = (bits, phases, merged);
-        let shelf = || self.sections.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(found) = shelf().get(&key) {
-            return found.clone();
-        }
-        let made = Arc::new(Sections::new(profile, thickness, phases, merged));
-        let mut shelf = shelf();
-        if shelf.len() >= SECTIONS {
-            shelf.clear();
-        }
-        shelf.entry(key).or_insert(made).clone()
+        shelved(&self.sections, SECTIONS, key, || Sections::new(profile, thickness, phases, merged))
     }
+}
+
+/// What a shelf has under `key`, or else what is made now. A shelf of `most` is cleared.
+fn shelved<K: Ord, V>(
+    shelf: &Mutex<BTreeMap<K, Arc<V>>>,
+    most: usize,
+    key: K,
+    make: impl FnOnce() -> V,
+) -> Arc<V> {
+    let shelf = || shelf.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(found) = shelf().get(&key) {
+        return found.clone();
+    }
+    // Not under the lock: it takes a tenth of a millisecond, and threads want others.
+    let made = Arc::new(make());
+    let mut shelf = shelf();
+    if shelf.len() >= most {
+        shelf.clear();
+    }
+    shelf.entry(key).or_insert(made).clone()
 }
 
 /// Sections that a shelf keeps, of some 8 KB each. A view of a lattice that is not cubic has its own, and none

@@ -21,6 +21,17 @@ use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Samples, Volume};
 use std::sync::Arc;
 
+/// `volume` as a scene of its own, in three colours.
+pub(crate) fn spec(volume: &Volume, quality: Quality) -> SceneSpec {
+    SceneSpec {
+        id: SceneId(0),
+        volume: volume.info(Digest32::default()),
+        transfer: presets::by_name("peer-vessels", &volume.summary).expect("a preset"),
+        quality,
+        bricks: Default::default(),
+    }
+}
+
 /// Draws the self-test with `simd` and returns its hash: a shaded ball with a hole, 24 voxels
 /// wide, in perspective, with integer sums and again with floats, in two slabs.
 pub fn run(simd: Simd) -> Digest32 {
@@ -39,13 +50,7 @@ pub fn run(simd: Simd) -> Digest32 {
     let ways = [(Sums::I32, persp), (Sums::F32, persp), (Sums::I16, persp), (Sums::I16, ortho)];
     for (sums, projection) in ways {
         let quality = Quality { sums, ..Quality::default() };
-        let spec = SceneSpec {
-            id: SceneId(0),
-            volume: volume.info(Digest32::default()),
-            transfer: presets::by_name("peer-vessels", &volume.summary).expect("a preset"),
-            quality,
-            bricks: Default::default(),
-        };
+        let spec = spec(&volume, quality);
         let camera = Camera {
             to_eye: DVec3::new(0.6, 1.0, 0.4),
             up: DVec3::Z,

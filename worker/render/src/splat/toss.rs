@@ -424,28 +424,21 @@ mod avx512 {
 mod tests {
     use super::*;
     use crate::scene::{Frame, Scene};
+    use crate::selftest;
     use glam::DVec3;
     use proptest::prelude::*;
-    use slabcast_common::ids::{BrickId, SceneId};
-    use slabcast_common::message::SceneSpec;
+    use slabcast_common::ids::BrickId;
     use slabcast_common::occlusion::Rect;
-    use slabcast_common::presets;
     use slabcast_common::quality::Quality;
     use slabcast_common::view::{Camera, CameraProjection, View};
-    use slabcast_common::volume::{Digest32, Volume};
+    use slabcast_common::volume::Volume;
     use std::sync::Arc;
 
     /// A picture of 64x64 of 16x16x16 voxels, seen from anywhere in parallel.
     fn frame(to_eye: DVec3, height: f64, thickness: f64) -> Frame {
         let volume = Volume::from_fn_u8("any", [16; 3], |i, j, k| (i + 3 * j + 7 * k) as u8);
         let quality = Quality { thickness, ..Quality::default() };
-        let spec = SceneSpec {
-            id: SceneId(0),
-            volume: volume.info(Digest32::default()),
-            transfer: presets::by_name("peer-vessels", &volume.summary).expect("a preset"),
-            quality,
-            bricks: Default::default(),
-        };
+        let spec = selftest::spec(&volume, quality);
         let projection = CameraProjection::Ortho { height };
         let camera = Camera { to_eye, up: DVec3::Z, target: DVec3::ZERO, projection };
         let view = View::new(&volume.lattice, &camera, [64; 2], &quality).expect("a view");

@@ -424,7 +424,7 @@ impl View {
 
 /// 1.5 * 2^52: added to a number below 2^51 it leaves the nearest integer, ties to even, in the
 /// low bits of the sum.
-const MAGIC: f64 = 6_755_399_441_055_744.0;
+pub const MAGIC: f64 = 6_755_399_441_055_744.0;
 
 /// Nearest integer, ties to even, without a library call. `|x| < 2^31`.
 #[inline(always)]

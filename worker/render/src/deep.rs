@@ -8,17 +8,14 @@
 
 use crate::footprint::Phases;
 use crate::mask::{OpenMask, REACH_MOST};
-use crate::splat::records::{BySlot, MOST, Recorded, RowAt, STRIDE};
-use crate::splat::toss::prefetch;
+use crate::splat::records::apart::{self, Apart, BATCH, Each, WINDOW};
+use crate::splat::records::{BySlot, Recorded, Table};
+use crate::splat::toss::{self, Kept, Sieve, Sifted, Tossing, any_in_rows, prefetch};
 use crate::splat::{Accumulate, Simd, Work};
 use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
-use slabcast_common::shade::NO_NORMAL;
-use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, round_i32};
-
-/// Pixels of a window at most, along an axis: a footprint of eight pixels a vox.
-const WINDOW: usize = 40;
+use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS};
 
 /// A voxel waiting in the bucket of its first sheet, with all that drawing it takes: nobody goes back
 /// to the brick.
@@ -41,52 +38,12 @@ pub(crate) struct Waiting {
     batch: Box<Batch>,
 }
 
-/// Voxels of a brick on their way to buckets.
-struct Tossing {
-    /// Eye coordinates.
-    eye: [[f64; 512]; 3],
-    /// Screen position at their own depth, in subpixels from the part's corner; depth in phases.
-    at: [[i32; 512]; 3],
-    cells: [u32; 512],
-    fate: [u32; 512],
-    samples: [u32; 512],
-}
-
-impl Default for Tossing {
-    fn default() -> Self {
-        Tossing {
-            eye: [[0.0; 512]; 3],
-            at: [[0; 512]; 3],
-            cells: [0; 512],
-            fate: [0; 512],
-            samples: [0; 512],
-        }
-    }
-}
-
-/// Voxels that are placed, shaded and splatted together.
-const BATCH: usize = 64;
-
-/// A number a voxel.
-type Each<T> = [T; BATCH];
-
 /// Voxels on their way from a bucket to the records.
 struct Batch {
     eye: [Each<f64>; 3],
     samples: Each<u32>,
     normals: Each<u16>,
-    /// Sheets that a voxel has left, from the one at hand.
-    left: Each<i32>,
-    /// Depths in phases.
-    z: Each<i32>,
-    /// First pixels of footprints, from the part's corner, and where weights begin: by axis and slot.
-    first: [[Each<i32>; MOST]; 2],
-    from: [[Each<u32>; MOST]; 2],
-    /// By axis, the window that holds all footprints of a voxel.
-    lo: [Each<i32>; 2],
-    hi: [Each<i32>; 2],
-    /// Voxels that touch an open pixel.
-    kept: Each<u32>,
+    apart: Apart,
     light: [Each<f32>; 4],
 }
 
@@ -96,13 +53,7 @@ impl Default for Batch {
             eye: [[0.0; BATCH]; 3],
             samples: [0; BATCH],
             normals: [0; BATCH],
-            left: [0; BATCH],
-            z: [0; BATCH],
-            first: [[[0; BATCH]; MOST]; 2],
-            from: [[[0; BATCH]; MOST]; 2],
-            lo: [[0; BATCH]; 2],
-            hi: [[0; BATCH]; 2],
-            kept: [0; BATCH],
+            apart: Apart::default(),
             light: [[0.0; BATCH]; 4],
         }
     }
@@ -115,7 +66,7 @@ impl Batch {
         for axis in 0..3 {
             self.eye[axis][i] = v.eye[axis];
         }
-        (self.samples[i], self.normals[i], self.left[i]) = (v.sample, v.normal, left);
+        (self.samples[i], self.normals[i], self.apart.left[i]) = (v.sample, v.normal, left);
     }
 }
 
@@ -171,7 +122,7 @@ impl<S: Recorded, const N: usize> Work for RenderDeep<'_, S, N> {
         let RenderDeep { part, deep, simd, store, waiting, pixels, io } = self;
         let Waiting { queues, tossing, batch } = waiting;
         let [x, y] = [[[S::Weight::default(); N]; WINDOW]; 2];
-        let stage = DeepStage { part: &part, deep, tossing, batch, across: [x, y] };
+        let stage = DeepStage { part: &part, deep, simd, tossing, batch, across: [x, y] };
         walk::<S, N, _>(&part, stage, (simd, store), queues, pixels, io);
     }
 }
@@ -179,6 +130,7 @@ impl<S: Recorded, const N: usize> Work for RenderDeep<'_, S, N> {
 struct DeepStage<'a, S: Recorded, const N: usize> {
     part: &'a Part<'a>,
     deep: Deep,
+    simd: Simd,
     tossing: &'a mut Tossing,
     batch: &'a mut Batch,
     /// Weights of the voxel at hand by column and by row.
@@ -216,56 +168,35 @@ impl<S: Recorded, const N: usize> Stage<S, N> for DeepStage<'_, S, N> {
         if let Some(next) = self.part.peek(which + 1) {
             prefetch(next);
         }
-        let cull = frame.scene.quality.cull;
-        let (sections, view, n) = (&frame.sections, &frame.view, brick.len());
-        let Tossing { eye, at, cells, fate, samples } = &mut *self.tossing;
-        for (i, &local) in brick.index.iter().enumerate() {
-            let v = corner.eye + frame.offsets()[usize::from(local)];
-            (eye[0][i], eye[1][i], eye[2][i]) = (v.x, v.y, v.z);
-        }
-        let middle = [
-            f64::from(view.size[0]) * 0.5 - f64::from(rect.x0),
-            f64::from(view.size[1]) * 0.5 - f64::from(rect.y0),
-        ];
-        let per_depth = f64::from(SUBPIXELS) * self.deep.focal;
-        let (far, middle) = (1e6, middle.map(|m| m * f64::from(SUBPIXELS)));
-        for i in 0..n {
-            let scale = per_depth / (eye[2][i] + self.deep.distance);
-            // Places are tests, not pixels: far ones may be anything that is far.
-            at[0][i] = round_i32((eye[0][i] * scale + middle[0]).clamp(-far, far));
-            at[1][i] = round_i32((eye[1][i] * scale + middle[1]).clamp(-far, far));
-            at[2][i] = view.depth_in_phases(eye[2][i]);
-        }
-        let [x, y, z] = at;
-        open.near_all(&x[..n], &y[..n], cells, fate);
-        brick.values.bits(samples);
-        let normals = brick.normals.as_deref();
-        let wanted = if cull { 3 } else { 1 };
-        let (mut reached, mut kept) = (0, 0);
-        for i in 0..n {
-            let (first, count) = sections.span(z[i]);
-            if fate[i] == 0 || first >= slab.end || first + count as i32 <= slab.first {
-                continue;
-            }
-            reached += 1;
-            if fate[i] < wanted {
-                continue;
-            }
-            kept += 1;
-            let voxel = DeepVoxel {
-                eye: eye.each_ref().map(|e| e[i]),
-                sample: samples[i],
-                normal: normals.map_or(NO_NORMAL, |n| n[i]),
-                cell: cells[i] as u16,
-            };
+        let view = &frame.view;
+        let places = toss::DeepBrick {
+            view,
+            offsets: frame.offsets(),
+            corner: corner.eye.to_array(),
+            per_depth: f64::from(SUBPIXELS) * self.deep.focal,
+            distance: self.deep.distance,
+            middle: [(0, rect.x0), (1, rect.y0)].map(|(axis, origin)| {
+                (f64::from(view.size[axis]) * 0.5 - f64::from(origin)) * f64::from(SUBPIXELS)
+            }),
+        };
+        let sieve = Sieve {
+            places,
+            open,
+            cull: frame.scene.quality.cull,
+            sections: &frame.sections,
+            sheets: [slab.first, slab.end],
+        };
+        let Sifted { reached, kept } = sieve.sift(self.simd, brick, self.tossing);
+        for Kept { first, local, cell, normal, sample } in self.tossing.kept(kept) {
+            let voxel = DeepVoxel { eye: sieve.places.eye(local), sample, normal, cell };
             if first < slab.first {
                 queues.carried.push((voxel, first));
             } else {
                 queues.buckets[(first - slab.first) as usize].push(voxel);
             }
         }
-        counters.tossed += kept;
-        counters.culled += reached - kept;
+        counters.tossed += kept as u64;
+        counters.culled += (reached - kept) as u64;
     }
 
     #[inline(always)]
@@ -351,14 +282,15 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
         open: &OpenMask,
     ) -> u64 {
         let Part { frame, rect, .. } = self.part;
-        let Batch { eye, samples, normals, left, z, first, from, lo, hi, kept, light } =
-            &mut *self.batch;
+        let Batch { eye, samples, normals, apart, light } = &mut *self.batch;
+        let Apart { first, from, lo, hi, left, deep, kept } = apart;
         let view = &frame.view;
-        for (z, &depth) in z[..n].iter_mut().zip(&eye[2]) {
-            *z = view.depth_in_phases(depth);
+        let (most, phases) = (frame.sections.most() as i32, frame.sections.phases());
+        for i in 0..n {
+            let phase = view.depth_in_phases(eye[2][i]) & (phases - 1);
+            deep[i] = (phase * most + most - left[i]) as u32;
         }
         // Where each section lies, and the windows that hold all of a voxel's.
-        let most = frame.sections.most() as i32;
         for (axis, origin) in [rect.x0, rect.y0].into_iter().enumerate() {
             let (eye, lo, hi) = (&eye[axis][..n], &mut lo[axis][..n], &mut hi[axis][..n]);
             lo.fill(i32::MAX);
@@ -396,7 +328,8 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
                 continue;
             }
             let columns = (u64::MAX >> (64 - (x1 - x0))) << x0;
-            if cull && (y0..y1).fold(0, |rows, y| rows | open.row(y as usize)) & columns == 0 {
+            let rows = [y0, y1].map(|y| y as usize);
+            if cull && !any_in_rows(self.simd, open.rows(), rows, columns) {
                 continue;
             }
             kept[some] = i as u32;
@@ -408,36 +341,26 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
         }
         let eyes = eye.each_ref().map(|e| &e[..some]);
         frame.payloads(&samples[..some], &normals[..some], Some(eyes), light);
-        let sections = S::deep(&frame.sections);
-        for (j, &i) in kept[..some].iter().enumerate() {
-            let i = i as usize % BATCH;
-            // From an even column, and as many: two of them may lie in one register.
-            let lo = [lo[0][i] & !1, lo[1][i]];
-            let wide = [(hi[0][i] - lo[0] + 1) & !1, hi[1][i] - lo[1]].map(|n| n as usize);
-            let mut deep = [S::Depth::default(); N];
-            let gone = (most - left[i]) as usize;
-            let row = (z[i] & (frame.sections.phases() - 1)) as usize * most as usize;
-            for (sheet, &w) in sections[row..][..most as usize][gone..].iter().enumerate() {
-                deep[(slot::<N>(k) + sheet) % N] = w;
-            }
-            for axis in 0..2 {
-                // Loops, since closures of arrays are compiled for the baseline.
-                let mut rows = [RowAt::NONE; N];
-                for (at, row) in rows.iter_mut().enumerate() {
-                    if after::<N>(k, at) < left[i] {
-                        let (phases, table) = layers[at].axes[axis];
-                        let (from, len) = (from[axis][at][i] as usize, phases.len);
-                        *row = RowAt { table, from, len, column: first[axis][at][i] - lo[axis] };
-                    }
-                }
-                S::weave(sheets.simd, rows, wide[axis], &mut self.across[axis]);
-            }
-            let [columns, lines] = [0, 1].map(|axis| &self.across[axis][..wide[axis]]);
-            let at = lo[1] as usize * STRIDE + lo[0] as usize;
-            let payload = S::payload(light.each_ref().map(|c| c[j]));
-            S::splat_deep(sheets.simd, sheets.records, at, (columns, lines), payload, &deep);
-            sheets.touch(k, lo.map(|p| p as usize), wide);
+        let mut payloads = [S::Payload::default(); BATCH];
+        let [sigma, r, g, b] = light;
+        for (j, payload) in payloads[..some].iter_mut().enumerate() {
+            *payload = S::payload([sigma[j], r[j], g[j], b[j]]);
         }
+        let apart = &self.batch.apart;
+        for &i in &apart.kept[..some] {
+            let (at, wide) = apart.window(i as usize % BATCH, S::STEP);
+            sheets.touch(k, at, wide);
+        }
+        let across = [0, 1].map(|axis| {
+            layers.each_ref().map(|layer| {
+                let (phases, weights) = layer.axes[axis];
+                Table { weights, len: phases.len }
+            })
+        });
+        let deep = Table { weights: S::deep(&frame.sections), len: most as usize };
+        let layers = apart::Layers::<S, N> { across, deep, slot: slot::<N>(k) };
+        let voxels = (apart, &payloads[..some]);
+        S::splat_apart(sheets.simd, sheets.records, voxels, &layers, &mut self.across);
         some as u64
     }
 }

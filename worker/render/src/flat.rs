@@ -19,7 +19,7 @@ use crate::mask::OpenMask;
 use crate::place::Places;
 use crate::scene::{Flat, Frame};
 use crate::splat::records::{Recorded, Splat, Table, Tables, splat};
-use crate::splat::toss::{Sieve, Sifted, Tossing, prefetch};
+use crate::splat::toss::{self, Sieve, Sifted, Tossing, prefetch};
 use crate::splat::{Simd, Work};
 use crate::stack::{Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels};
@@ -134,19 +134,21 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
             i64::from(base) * i64::from(frame.sections.phases()),
         ];
         let sieve = Sieve {
-            places: &self.flat.places,
-            from: Places::from(corner.flat, origin),
+            places: toss::FlatBrick {
+                places: &self.flat.places,
+                from: Places::from(corner.flat, origin),
+            },
             open,
             cull: frame.scene.quality.cull,
             sections: &frame.sections,
             // From the sheet that depths are counted from.
             sheets: [slab.first, slab.end].map(|k| k - base),
-            phases: self.phases,
         };
-        let Sifted { reached, kept } = sieve.sift(self.simd, brick, self.tossing);
+        let Sifted { reached, kept } =
+            sieve.sift_ready(self.simd, brick, &self.phases, self.tossing);
         counters.tossed += kept as u64;
         counters.culled += (reached - kept) as u64;
-        for (first, voxel) in self.tossing.kept(kept) {
+        for (first, voxel) in self.tossing.ready(kept) {
             let first = base + *first;
             if first < slab.first {
                 queues.carried.push((*voxel, first));

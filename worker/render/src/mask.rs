@@ -44,6 +44,12 @@ impl OpenMask {
         self.rows[y & 63] &= !bits;
     }
 
+    /// All rows of open pixels.
+    #[inline(always)]
+    pub(crate) fn rows(&self) -> &[u64; 64] {
+        &self.rows
+    }
+
     /// Open pixels of row `y`.
     #[inline(always)]
     pub(crate) fn row(&self, y: usize) -> u64 {

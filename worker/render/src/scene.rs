@@ -80,8 +80,8 @@ pub struct Frame {
     /// What payloads are multiplied by: raw units of a sum for one unit of payload; for 16-bit
     /// sums that times the factors of their weights.
     pub raw_scale: f32,
-    /// Eye offsets of the 512 voxels of a brick.
-    offsets: Vec<DVec3>,
+    /// Eye offsets of the 512 voxels of a brick, by axis.
+    offsets: Box<[[f64; 512]; 3]>,
     /// Unit direction to the eye in world axes, where it is the same for all voxels.
     pub(crate) to_eye: Option<Vec3>,
     /// Positions, where all sections of all voxels share one footprint.
@@ -168,13 +168,18 @@ impl Frame {
         let footprints = Footprints::new(&view, q.kernel, range, spread, scene.shelf.clone());
         let reach = footprints.at(0).and_then(|f| f.reach()).filter(|&r| r <= REACH_MOST);
         let flat = reach.and_then(|reach| Some(Flat { places: Places::new(&view)?, reach }));
+        let mut offsets = Box::new([[0.0; 512]; 3]);
+        for i in 0..512u16 {
+            let v = view.offset_in_eye(local(i)).to_array();
+            offsets.iter_mut().zip(v).for_each(|(offsets, v)| offsets[usize::from(i)] = v);
+        }
         Frame {
             flat,
             sections: scene.shelf.sections(&profile, d, phases, merged),
             footprints,
             rule,
             raw_scale,
-            offsets: (0..512).map(|i| view.offset_in_eye(local(i))).collect(),
+            offsets,
             to_eye,
             view,
             scene,
@@ -186,8 +191,8 @@ impl Frame {
         self.scene.quality.compositing == Compositing::Linear
     }
 
-    /// Offsets of a brick's voxels from its corner, in vox along the eye's axes.
-    pub(crate) fn offsets(&self) -> &[DVec3] {
+    /// Offsets of a brick's voxels from its corner, in vox along each of the eye's axes.
+    pub(crate) fn offsets(&self) -> &[[f64; 512]; 3] {
         &self.offsets
     }
 
@@ -201,7 +206,8 @@ impl Frame {
     /// position, for every renderer.
     #[inline]
     pub fn place(&self, corner: &Corner, local: u16) -> Placed {
-        let eye = corner.eye + self.offsets[local as usize];
+        let [x, y, z] = self.offsets.each_ref().map(|o| o[usize::from(local)]);
+        let eye = corner.eye + DVec3::new(x, y, z);
         match &self.flat {
             Some(flat) => {
                 let (screen, z) = flat.places.at(corner.flat, local);

@@ -356,8 +356,12 @@ pub(super) mod avx2 {
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx512 {
     use super::avx2::At;
-    use crate::splat::records::{Across, BySlot, MOST, Record, RowAt, STRIDE, Splat, Tables};
-    use crate::splat::{Tap, by_column};
+    use crate::splat::records::apart::lines::{self, Lines};
+    use crate::splat::records::apart::{self, Apart, BATCH, LINE, Layers, Woven};
+    use crate::splat::records::{
+        Across, BySlot, MOST, Record, Recorded, RowAt, STRIDE, Splat, Tables,
+    };
+    use crate::splat::{Simd, Tap, by_column};
     use std::arch::x86_64::*;
 
     /// Registers of a record at most: sixteen sums each.
@@ -526,6 +530,109 @@ pub(super) mod avx512 {
                             let sums = _mm512_add_epi32(sums, _mm512_cvttps_epi32(add));
                             _mm512_storeu_si512(at.add(i), sums);
                         }
+                    }
+                }
+            }
+        }
+    }
+
+    /// [`apart::splat_apart`].
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    pub(in super::super) fn splat_apart<const N: usize>(
+        simd: Simd,
+        records: &mut [Record<i32, N>],
+        (apart, payloads): (&Apart, &[[f32; 4]]),
+        layers: &Layers<'_, i32, N>,
+        woven: &mut Woven<Tap, N>,
+    ) {
+        let [wide, high] = lines::most(apart, &apart.kept[..payloads.len()], i32::STEP);
+        if N != 4 || wide > LINE || high > LINE {
+            return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
+        }
+        let at = (records, (apart, payloads), layers);
+        match wide {
+            0..=6 => side_by_side::<6, N>(at),
+            7 => side_by_side::<7, N>(at),
+            8 => side_by_side::<8, N>(at),
+            9 => side_by_side::<9, N>(at),
+            10 => side_by_side::<10, N>(at),
+            11 | 12 => side_by_side::<12, N>(at),
+            13 | 14 => side_by_side::<14, N>(at),
+            _ => side_by_side::<16, N>(at),
+        }
+    }
+
+    /// What [`splat_apart`] is called with, in one.
+    type ApartAt<'a, const N: usize> =
+        (&'a mut [Record<i32, N>], (&'a Apart, &'a [[f32; 4]]), &'a Layers<'a, i32, N>);
+
+    /// Weights of voxel `i` in four slots, pixel by pixel: four pixels a register.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn line(lines: &Lines<'_, Tap>, i: usize) -> [__m512; 4] {
+        let mut slots = [_mm512_setzero_si512(); 4];
+        for (slot, line) in slots.iter_mut().enumerate() {
+            let (present, from) = lines.of(slot, i);
+            // SAFETY: a tap is a float; lanes that are not present are not read, and those that are lie
+            // in the table.
+            *line = unsafe { _mm512_maskz_loadu_epi32(present as u16, from.cast()) };
+        }
+        let [a, b, c, d] = by_column(slots);
+        let float = _mm512_castsi512_ps;
+        [float(a), float(b), float(c), float(d)]
+    }
+
+    /// Windows of `WIDE` columns.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn side_by_side<const WIDE: usize, const N: usize>(
+        (records, (apart, payloads), layers): ApartAt<'_, N>,
+    ) {
+        let (half, zero) = (_mm512_set1_ps(0.5), _mm512_setzero_ps());
+        let lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+        let slot = _mm512_srli_epi32::<2>(lane);
+        // Which weight in depth a lane takes: that of its slot.
+        let turn = _mm512_sub_epi32(slot, _mm512_set1_epi32(layers.slot as i32));
+        let turn = _mm512_and_si512(turn, _mm512_set1_epi32(3));
+        let kept = &apart.kept[..payloads.len()];
+        let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
+        let across = Lines::new(apart, layers, n, (0, WIDE));
+        let down = Lines::new(apart, layers, n, (1, 0));
+        for (&i, payload) in kept.iter().zip(payloads) {
+            let i = i as usize % BATCH;
+            let ([x, y], [_, high]) = apart.window(i, i32::STEP);
+            let x = lines::inside(x, WIDE);
+            let z = &layers.deep.weights[apart.deep[i] as usize..][..apart.left[i] as usize];
+            let present = (1u16 << z.len().min(4)) - 1;
+            // SAFETY: lanes that are not present are not read; four floats are 16 bytes.
+            let (z, payload) = unsafe {
+                (_mm512_maskz_loadu_ps(present, z.as_ptr()), _mm_loadu_ps(payload.as_ptr()))
+            };
+            let section =
+                _mm512_mul_ps(_mm512_broadcast_f32x4(payload), _mm512_permutexvar_ps(turn, z));
+            // Negative sections there are none.
+            let section = _mm512_max_ps(section, zero);
+            let columns = line(&across, i);
+            let mut wx = [zero; WIDE];
+            for c in 0..WIDE {
+                let from = _mm512_add_epi32(slot, _mm512_set1_epi32(4 * (c as i32 % 4)));
+                wx[c] = _mm512_permutexvar_ps(from, columns[c / 4]);
+            }
+            let rows = line(&down, i);
+            let mut from = slot;
+            for (j, row) in records[y * STRIDE + x..].chunks_mut(STRIDE).take(high).enumerate() {
+                let wy = _mm512_permutexvar_ps(from, rows[j / 4 % 4]);
+                from = _mm512_add_epi32(from, _mm512_set1_epi32(4));
+                let of_row = _mm512_mul_ps(section, wy);
+                let row = row.first_chunk_mut::<WIDE>().expect("a window inside the part");
+                for c in 0..WIDE {
+                    let at: *mut __m512i = row[c].as_mut_ptr().cast();
+                    let add = _mm512_add_ps(_mm512_mul_ps(of_row, wx[c]), half);
+                    // SAFETY: sixteen sums are 64 bytes, and borrowed for us alone.
+                    unsafe {
+                        let sums = _mm512_loadu_si512(at);
+                        let sums = _mm512_add_epi32(sums, _mm512_cvttps_epi32(add));
+                        _mm512_storeu_si512(at, sums);
                     }
                 }
             }

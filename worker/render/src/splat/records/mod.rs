@@ -5,6 +5,7 @@
 //! two pixels ([`short`]); 32-bit sums take twice that ([`long`]). Every loop is written plainly
 //! here; what is written in lanes there must equal it.
 
+pub(crate) mod apart;
 mod long;
 mod short;
 
@@ -12,6 +13,8 @@ use super::{Accumulate, Grey, Level, Section, Simd, Tap, section_fixed, whole};
 use crate::footprint::{Footprint, Sections};
 use crate::sheet::{LANES, Row, Sum};
 use slabcast_common::image::RawSums;
+
+use apart::{Apart, Layers, Woven};
 
 /// Sheets of a record at most.
 pub(crate) const MOST: usize = 8;
@@ -199,6 +202,9 @@ pub(crate) trait Recorded: Accumulate {
     type Depth: Copy + Default;
     /// Extinction and colours of a voxel.
     type Payload: Copy + Default;
+    /// Windows begin at a column that is a multiple of it, and have as many: records that may share a
+    /// register.
+    const STEP: i32 = 1;
 
     /// The weights of a footprint with tables across an axis.
     fn across<'a>(footprint: &Footprint<'a>, axis: usize) -> Option<&'a [Self::Weight]>;
@@ -263,6 +269,21 @@ pub(crate) trait Recorded: Accumulate {
         splat_deep::<Self, N>(records, at, across, payload, z);
     }
 
+    /// Adds voxels with `payloads` whose sections have footprints of their own, in `woven` if need be.
+    ///
+    /// # Panics
+    /// If there are not as many payloads as voxels are kept, or if a window leaves the part.
+    #[inline(always)]
+    fn splat_apart<const N: usize>(
+        simd: Simd,
+        records: &mut [Record<Self, N>],
+        voxels: (&Apart, &[Self::Payload]),
+        layers: &Layers<'_, Self, N>,
+        woven: &mut Woven<Self::Weight, N>,
+    ) {
+        apart::splat_apart(simd, records, voxels, layers, woven);
+    }
+
     /// Takes the sums of sheet k, which `slot` holds, of two strips for a row that is to be closed:
     /// those of the sheet before (out of `before`), of the sheet itself, and of the one behind, and
     /// the opacity so far, `a`. Leaves those of sheet k in `before` and nothing in the slot.
@@ -308,6 +329,7 @@ impl Recorded for i16 {
     four_sums!();
     type Depth = i16;
     type Payload = u64;
+    const STEP: i32 = 2;
 
     fn across<'a>(footprint: &Footprint<'a>, axis: usize) -> Option<&'a [i16]> {
         footprint.all_fixed(axis)
@@ -375,6 +397,24 @@ impl Recorded for i16 {
     }
 
     #[inline(always)]
+    fn splat_apart<const N: usize>(
+        simd: Simd,
+        records: &mut [Record<i16, N>],
+        voxels: (&Apart, &[u64]),
+        layers: &Layers<'_, i16, N>,
+        woven: &mut Woven<i16, N>,
+    ) {
+        match simd.0 {
+            // SAFETY: the value proves that the instructions are there.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => unsafe {
+                short::avx512::splat_apart(simd, records, voxels, layers, woven);
+            },
+            _ => apart::splat_apart(simd, records, voxels, layers, woven),
+        }
+    }
+
+    #[inline(always)]
     fn take<const N: usize>(
         simd: Simd,
         sums: (&mut [Record<i16, N>], &mut [[i16; 4]]),
@@ -432,6 +472,24 @@ impl Recorded for i32 {
             long::avx2::splat_all::<4, N>,
             long::avx512::splat_all::<4, N>
         );
+    }
+
+    #[inline(always)]
+    fn splat_apart<const N: usize>(
+        simd: Simd,
+        records: &mut [Record<i32, N>],
+        voxels: (&Apart, &[[f32; 4]]),
+        layers: &Layers<'_, i32, N>,
+        woven: &mut Woven<Tap, N>,
+    ) {
+        match simd.0 {
+            // SAFETY: the value proves that the instructions are there.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => unsafe {
+                long::avx512::splat_apart(simd, records, voxels, layers, woven);
+            },
+            _ => apart::splat_apart(simd, records, voxels, layers, woven),
+        }
     }
 
     #[inline(always)]

@@ -349,7 +349,12 @@ pub(super) mod avx2 {
 pub(super) mod avx512 {
     use super::avx2::{by_column, sixteen, turned};
     use crate::sheet::Row;
-    use crate::splat::records::{Across, BySlot, Record, RowAt, STRIDE, Splat, Strip, Tables};
+    use crate::splat::Simd;
+    use crate::splat::records::apart::lines::{self, Lines};
+    use crate::splat::records::apart::{self, Apart, BATCH, LINE, Layers, Woven};
+    use crate::splat::records::{
+        Across, BySlot, Record, Recorded, RowAt, STRIDE, Splat, Strip, Tables,
+    };
     use std::arch::x86_64::*;
 
     /// 16-bit numbers of a register.
@@ -542,6 +547,96 @@ pub(super) mod avx512 {
                 for (i, wx) in columns[..units].iter().enumerate() {
                     // SAFETY: so many registers are the records of `row`, borrowed for us alone.
                     unsafe { add(at.add(i), section, *wx) };
+                }
+            }
+        }
+    }
+
+    /// [`apart::splat_apart`].
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    pub(in super::super) fn splat_apart<const N: usize>(
+        simd: Simd,
+        records: &mut [Record<i16, N>],
+        (apart, payloads): (&Apart, &[u64]),
+        layers: &Layers<'_, i16, N>,
+        woven: &mut Woven<i16, N>,
+    ) {
+        let [wide, high] = lines::most(apart, &apart.kept[..payloads.len()], i16::STEP);
+        if N != 4 || wide > LINE || high > LINE {
+            return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
+        }
+        let at = (records, (apart, payloads), layers);
+        match wide / 2 {
+            0..=2 => side_by_side::<2, N>(at),
+            3 => side_by_side::<3, N>(at),
+            4 => side_by_side::<4, N>(at),
+            5 => side_by_side::<5, N>(at),
+            6 => side_by_side::<6, N>(at),
+            7 => side_by_side::<7, N>(at),
+            _ => side_by_side::<8, N>(at),
+        }
+    }
+
+    /// Weights of voxel `i` in four slots, two of sixteen pixels a register.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn line(lines: &Lines<'_, i16>, i: usize) -> [__m512i; 2] {
+        const { assert!(LINE == WORDS / 2) };
+        let mut both = [_mm512_setzero_si512(); 2];
+        for (two, both) in both.iter_mut().enumerate() {
+            let (low, low_at) = lines.of(2 * two, i);
+            let (high, high_at) = lines.of(2 * two + 1, i);
+            // SAFETY: lanes that are not present are not read, and those that are lie in the table.
+            unsafe {
+                *both = _mm512_maskz_loadu_epi16(low, low_at);
+                *both = _mm512_mask_loadu_epi16(*both, high << LINE, high_at.wrapping_sub(LINE));
+            }
+        }
+        both
+    }
+
+    /// What [`splat_apart`] is called with, in one.
+    type ApartAt<'a, const N: usize> =
+        (&'a mut [Record<i16, N>], (&'a Apart, &'a [u64]), &'a Layers<'a, i16, N>);
+
+    /// Windows of `U` registers, of two columns each.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn side_by_side<const U: usize, const N: usize>(
+        (records, (apart, payloads), layers): ApartAt<'_, N>,
+    ) {
+        let turn = words(|lane| (lane / 4 + 2 * N - layers.slot) % N);
+        // Which weight of a line's 64 a lane takes: that of its slot for its column, or for the row.
+        let column = words(|lane| lane / 4 % N * LINE + lane / (4 * N));
+        let row = words(|lane| lane / 4 % N * LINE);
+        let kept = &apart.kept[..payloads.len()];
+        let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
+        let across = Lines::new(apart, layers, n, (0, 2 * U));
+        let down = Lines::new(apart, layers, n, (1, 0));
+        for (&i, &payload) in kept.iter().zip(payloads) {
+            let i = i as usize % BATCH;
+            let ([x, y], [_, high]) = apart.window(i, i16::STEP);
+            let x = lines::inside(x, 2 * U);
+            let z = &layers.deep.weights[apart.deep[i] as usize..][..apart.left[i] as usize];
+            let section = _mm512_set1_epi64(payload as i64);
+            let section = _mm512_mulhrs_epi16(section, _mm512_permutexvar_epi16(turn, load(z)));
+            let [low, behind] = line(&across, i);
+            let (mut wx, mut from) = ([_mm512_setzero_si512(); U], column);
+            for wx in &mut wx {
+                *wx = _mm512_permutex2var_epi16(low, from, behind);
+                from = _mm512_add_epi16(from, _mm512_set1_epi16(2));
+            }
+            let [low, behind] = line(&down, i);
+            let mut from = row;
+            for row in records[y * STRIDE + x..].chunks_mut(STRIDE).take(high) {
+                let wy = _mm512_permutex2var_epi16(low, from, behind);
+                from = _mm512_add_epi16(from, _mm512_set1_epi16(1));
+                let section = _mm512_mulhrs_epi16(section, wy);
+                let row = &mut row[..2 * U];
+                let at: *mut __m512i = row.as_mut_ptr().cast();
+                for (i, wx) in wx.into_iter().enumerate() {
+                    // SAFETY: so many registers are the records of `row`, borrowed for us alone.
+                    unsafe { add(at.add(i), section, wx) };
                 }
             }
         }

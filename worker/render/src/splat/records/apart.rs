@@ -1,0 +1,302 @@
+//! Voxels whose sections have footprints of their own, as in perspective: each lies elsewhere on the
+//! screen and is of another width.
+//!
+//! A voxel's weights are put side by side by column and slot, and by row and slot
+//! ([`Recorded::weave`]), so that all its sections are added to a pixel's record at once
+//! ([`Recorded::splat_deep`]). With AVX-512 both happen in registers, where windows are at most [`LINE`]
+//! pixels wide.
+
+use super::{BySlot, MOST, Record, Recorded, RowAt, STRIDE, Table};
+use crate::splat::Simd;
+
+/// Voxels that are placed, shaded and splatted together.
+pub(crate) const BATCH: usize = 64;
+
+/// A number a voxel.
+pub(crate) type Each<T> = [T; BATCH];
+
+/// Pixels of a window at most, along an axis: a footprint of eight pixels a vox.
+pub(crate) const WINDOW: usize = 40;
+
+/// Pixels of a window at most whose weights are looked at as one register.
+pub(crate) const LINE: usize = 16;
+
+/// Where the sections of some voxels lie.
+pub(crate) struct Apart {
+    /// First pixels of footprints, from the part's corner, and where weights begin: by axis and slot.
+    pub(crate) first: [[Each<i32>; MOST]; 2],
+    pub(crate) from: [[Each<u32>; MOST]; 2],
+    /// By axis, the window inside the part that holds all footprints of a voxel: its first pixel, and the
+    /// one behind its last.
+    pub(crate) lo: [Each<i32>; 2],
+    pub(crate) hi: [Each<i32>; 2],
+    /// Sheets that a voxel has left, from the one at hand, and where its weights in depth for these begin.
+    pub(crate) left: Each<i32>,
+    pub(crate) deep: Each<u32>,
+    /// Voxels that are added.
+    pub(crate) kept: Each<u32>,
+}
+
+impl Default for Apart {
+    fn default() -> Self {
+        Apart {
+            first: [[[0; BATCH]; MOST]; 2],
+            from: [[[0; BATCH]; MOST]; 2],
+            lo: [[0; BATCH]; 2],
+            hi: [[0; BATCH]; 2],
+            left: [0; BATCH],
+            deep: [0; BATCH],
+            kept: [0; BATCH],
+        }
+    }
+}
+
+impl Apart {
+    /// First column and row of the window of voxel `i`, and how many there are. Columns begin at a
+    /// multiple of `step`, and so many they are.
+    #[inline(always)]
+    pub(crate) fn window(&self, i: usize, step: i32) -> ([usize; 2], [usize; 2]) {
+        let [x, y] = [self.lo[0][i] / step * step, self.lo[1][i]];
+        let wide = (self.hi[0][i] - x + step - 1) / step * step;
+        ([x, y].map(|lo| lo as usize), [wide, self.hi[1][i] - y].map(|n| n as usize))
+    }
+}
+
+/// What the sheets are that voxels reach from one on.
+#[derive(Clone, Copy)]
+pub(crate) struct Layers<'a, S: Recorded, const N: usize> {
+    /// Weights across and down, by slot.
+    pub(crate) across: [[Table<'a, S::Weight>; N]; 2],
+    /// In depth.
+    pub(crate) deep: Table<'a, S::Depth>,
+    /// Of the first of them.
+    pub(crate) slot: usize,
+}
+
+impl<S: Recorded, const N: usize> Layers<'_, S, N> {
+    /// How many sheets behind the first `slot` belongs to.
+    #[inline(always)]
+    pub(crate) fn after(&self, slot: usize) -> i32 {
+        ((slot + N - self.slot) % N) as i32
+    }
+}
+
+/// Weights by slot of a window's columns and of its rows.
+pub(crate) type Woven<W, const N: usize> = [[BySlot<W, N>; WINDOW]; 2];
+
+/// [`Recorded::splat_apart`], voxel by voxel.
+#[inline(always)]
+pub(super) fn splat_apart<S: Recorded, const N: usize>(
+    simd: Simd,
+    records: &mut [Record<S, N>],
+    (apart, payloads): (&Apart, &[S::Payload]),
+    layers: &Layers<'_, S, N>,
+    woven: &mut Woven<S::Weight, N>,
+) {
+    for (&i, &payload) in apart.kept.iter().zip(payloads) {
+        let i = i as usize % BATCH;
+        let ([x, y], wide) = apart.window(i, S::STEP);
+        let begin = apart.deep[i] as usize;
+        let mut deep = [S::Depth::default(); N];
+        for (sheet, &w) in layers.deep.weights[begin..][..apart.left[i] as usize].iter().enumerate()
+        {
+            deep[(layers.slot + sheet) % N] = w;
+        }
+        for (axis, lo) in [x, y].into_iter().enumerate() {
+            // Loops, since closures of arrays are compiled for the baseline.
+            let mut rows = [RowAt::NONE; N];
+            for (at, row) in rows.iter_mut().enumerate() {
+                if layers.after(at) < apart.left[i] {
+                    let Table { weights: table, len } = layers.across[axis][at];
+                    let from = apart.from[axis][at][i] as usize;
+                    *row = RowAt { table, from, len, column: apart.first[axis][at][i] - lo as i32 };
+                }
+            }
+            S::weave(simd, rows, wide[axis], &mut woven[axis]);
+        }
+        let [columns, lines] = [0, 1].map(|axis| &woven[axis][..wide[axis]]);
+        S::splat_deep(simd, records, y * STRIDE + x, (columns, lines), payload, &deep);
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+pub(super) mod lines {
+    use super::{Apart, BATCH, Each, LINE, Layers};
+    use crate::splat::records::Recorded;
+    use crate::tile::PART;
+    use std::arch::x86_64::*;
+
+    /// Columns and rows that the windows of all voxels fit which are added; columns a multiple of the step.
+    #[inline(always)]
+    pub(crate) fn most(apart: &Apart, kept: &[u32], step: i32) -> [usize; 2] {
+        let mut most = [0; 2];
+        for &i in kept {
+            let (_, wide) = apart.window(i as usize % BATCH, step);
+            most = [most[0].max(wide[0]), most[1].max(wide[1])];
+        }
+        most
+    }
+
+    /// First column of a window of `wide` columns from `first`, moved to lie inside the part.
+    #[inline(always)]
+    pub(crate) fn inside(first: usize, wide: usize) -> usize {
+        first.min(PART as usize - wide)
+    }
+
+    /// Weights in four slots along an axis for windows of at most [`LINE`] pixels. Those that are present lie
+    /// in the slot's weights.
+    pub(crate) struct Lines<'a, W> {
+        /// Which pixels of a window there are any for, a bit each.
+        present: [Each<u32>; 4],
+        /// Where that of a window's first pixel would be.
+        at: [Each<i32>; 4],
+        weights: [&'a [W]; 4],
+    }
+
+    impl<'a, W> Lines<'a, W> {
+        /// Those of the first `n` voxels, for windows that are moved inside to be `wide` columns, and of any
+        /// number of rows.
+        ///
+        /// # Panics
+        /// If there are not four slots.
+        #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+        #[inline]
+        pub(crate) fn new<S: Recorded<Weight = W>, const N: usize>(
+            apart: &Apart,
+            layers: &Layers<'a, S, N>,
+            n: usize,
+            (axis, wide): (usize, usize),
+        ) -> Lines<'a, W> {
+            let load = |from: &[i32]| -> __m512i {
+                let from = from.first_chunk::<16>().expect("sixteen voxels");
+                // SAFETY: sixteen numbers are 64 bytes.
+                unsafe { _mm512_loadu_si512(from.as_ptr().cast()) }
+            };
+            let zero = _mm512_setzero_si512();
+            let (present, at) = ([[0; BATCH]; 4], [[0; BATCH]; 4]);
+            let mut lines = Lines { present, at, weights: [&[]; 4] };
+            for slot in 0..4 {
+                let table = &layers.across[axis][slot];
+                lines.weights[slot] = table.weights;
+                let last = table.weights.len().checked_sub(table.len).expect("a row of the table");
+                let last = _mm512_set1_epi32(last.min(i32::MAX as usize) as i32);
+                // A row of more than a line's pixels has more than are looked at.
+                let all = _mm512_set1_epi32(((1u64 << table.len.min(31)) - 1) as i32);
+                for i in (0..n.min(BATCH)).step_by(16) {
+                    let mut lo = load(&apart.lo[axis][i..]);
+                    if axis == 0 {
+                        let most = _mm512_set1_epi32(PART - wide as i32);
+                        lo = _mm512_and_si512(lo, _mm512_set1_epi32(-S::STEP));
+                        lo = _mm512_min_epi32(lo, most);
+                    }
+                    let column = _mm512_sub_epi32(load(&apart.first[axis][slot][i..]), lo);
+                    // Shifts by more than there are bits, and by less than none, leave nothing.
+                    let bits = _mm512_or_si512(
+                        _mm512_sllv_epi32(all, column),
+                        _mm512_srlv_epi32(all, _mm512_sub_epi32(zero, column)),
+                    );
+                    // In sheets that a voxel does not reach there may be some: its section is nothing there.
+                    let bits = _mm512_and_si512(bits, _mm512_set1_epi32((1 << LINE) - 1));
+                    // SAFETY: sixteen numbers are 64 bytes.
+                    let from = unsafe {
+                        _mm512_loadu_si512(apart.from[axis][slot][i..][..16].as_ptr().cast())
+                    };
+                    let from = _mm512_sub_epi32(_mm512_min_epu32(from, last), column);
+                    let bits_to = &mut lines.present[slot][i..][..16];
+                    let from_to = &mut lines.at[slot][i..][..16];
+                    // SAFETY: sixteen numbers are 64 bytes.
+                    unsafe {
+                        _mm512_storeu_si512(bits_to.as_mut_ptr().cast(), bits);
+                        _mm512_storeu_si512(from_to.as_mut_ptr().cast(), from);
+                    }
+                }
+            }
+            lines
+        }
+
+        /// Which weights of voxel `i` there are in `slot`, a bit each, and where that of the first pixel would
+        /// lie.
+        #[inline(always)]
+        pub(crate) fn of(&self, slot: usize, i: usize) -> (u32, *const W) {
+            let from = self.weights[slot].as_ptr();
+            (self.present[slot][i], from.wrapping_offset(self.at[slot][i] as isize))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::splat::Tap;
+    use proptest::prelude::*;
+
+    /// Where the sections of a voxel lie: around a pixel, each so far aside of it and with weights from here
+    /// on, by axis; and how many sheets it has left.
+    type Somewhere = ([i32; 2], [[(i32, u32); 4]; 2], i32);
+
+    fn somewhere() -> impl Strategy<Value = Somewhere> {
+        let aside = prop::array::uniform4((0..4i32, 0..150u32));
+        (prop::array::uniform2(-12..70i32), prop::array::uniform2(aside), 1..=4i32)
+    }
+
+    /// Voxels by every instruction set; `lens`: widths of footprints by axis and slot.
+    fn add_everywhere<S: Recorded>(
+        voxels: &[Somewhere],
+        lens: [[usize; 4]; 2],
+        slot: usize,
+        weights: &[S::Weight],
+        deep: &[S::Depth],
+    ) -> Result<(), TestCaseError> {
+        let across = lens.map(|lens| lens.map(|len| Table { weights, len }));
+        let layers = Layers::<S, 4> { across, deep: Table { weights: deep, len: 4 }, slot };
+        let mut apart = Apart::default();
+        let mut payloads = Vec::new();
+        for (i, (around, aside, left)) in voxels.iter().enumerate() {
+            (apart.left[i], apart.deep[i]) = (*left, i as u32 % 5);
+            for axis in 0..2 {
+                let (mut lo, mut hi) = (i32::MAX, i32::MIN);
+                for at in 0..4 {
+                    let (by, from) = aside[axis][at];
+                    let first = around[axis] + by;
+                    (apart.first[axis][at][i], apart.from[axis][at][i]) = (first, from);
+                    if layers.after(at) < *left {
+                        (lo, hi) = (lo.min(first), hi.max(first + lens[axis][at] as i32));
+                    }
+                }
+                (apart.lo[axis][i], apart.hi[axis][i]) = (lo.max(0), hi.min(64));
+            }
+            if (0..2).all(|axis| apart.lo[axis][i] < apart.hi[axis][i]) {
+                apart.kept[payloads.len()] = i as u32;
+                payloads.push(S::payload([31_000.0 - i as f32, 17_003.4, 77.7, i as f32]));
+            }
+        }
+        let before = [S::from_raw([11; 4]); 4];
+        let run = |simd| {
+            let mut records: Vec<Record<S, 4>> = vec![before; STRIDE * 64];
+            let mut woven = [[[S::Weight::default(); 4]; WINDOW]; 2];
+            S::splat_apart(simd, &mut records, (&apart, &payloads), &layers, &mut woven);
+            records
+        };
+        let want = run(Simd::plain());
+        prop_assert_eq!(want.iter().any(|r| *r != before), !payloads.is_empty());
+        for simd in Simd::all() {
+            prop_assert!(run(simd) == want, "{}", simd.name());
+        }
+        Ok(())
+    }
+
+    proptest! {
+        #[test]
+        fn every_instruction_set_adds_voxels_as_one_by_one(
+            voxels in prop::collection::vec(somewhere(), 0..BATCH), slot in 0..4usize,
+            len in 1..18usize, more in prop::array::uniform2(prop::array::uniform4(0..2usize)),
+        ) {
+            let lens = more.map(|more| more.map(|more| len + more));
+            let short: Vec<i16> = (0..170).map(|i| 4000 + (i * 7919 % 19_000) as i16).collect();
+            let real: Vec<f32> = short.iter().map(|&w| f32::from(w) * 7.1e-5).collect();
+            let taps: Vec<Tap> = real.iter().map(|&w| Tap::new(w)).collect();
+            add_everywhere::<i16>(&voxels, lens, slot, &short, &short)?;
+            add_everywhere::<i32>(&voxels, lens, slot, &taps, &real)?;
+        }
+    }
+}

@@ -371,6 +371,13 @@ pub struct Totals {
 /// (`master::memory`).
 const FRAMES_AT_ONCE: usize = 4;
 
+/// The same while bricks fill the link ([`Traffic::is_full`]). Whoever has a thread free then waits for bricks, and more
+/// frames only have more workers ask for the same ones, at the cost of those that the frame in front
+/// waits for. mri256 at 512x512 and 1 Gbit/s, throughput with four and with this (`slabcast plan --frames
+/// 24`): on 16 workers 17 to 21 % of n times one worker's frames and 24, on 32 10 to 11 and 13 (docs/scaling.md has
+/// more, and where it costs a little).
+const FRAMES_ON_A_FULL_LINK: usize = 2;
+
 /// All but the frames.
 #[derive(Debug)]
 struct Cluster {
@@ -724,7 +731,9 @@ impl Scheduler {
         if self.active.is_empty() {
             return true;
         }
-        if self.active.len() >= FRAMES_AT_ONCE || !self.follows() {
+        let full = self.cluster.traffic.is_full();
+        let most = if full { FRAMES_ON_A_FULL_LINK } else { FRAMES_AT_ONCE };
+        if self.active.len() >= most || !self.follows() {
             return false;
         }
         let ahead = u64::from(self.cluster.config.queue_ahead.max(1));

@@ -1,5 +1,5 @@
 //! Whether the link bears crews (`region`), each of which is sent what a view needs: most of it when they are
-//! formed, and more a frame than all together.
+//! formed, and more a frame than all together. And whether bricks fill it, where fewer frames are best.
 //!
 //! Nobody tells the scheduler how fast the link is; it sees when bricks leave and when workers say that they have
 //! them. From the moment at which some are on their way to anybody until none are, what has landed by now in the
@@ -28,7 +28,8 @@ const FORM_LATER: f64 = 0.3;
 /// How many frames are the first.
 const FIRST: u32 = 8;
 
-/// They are dissolved where it is above this. Between the two lies what forming them is sent.
+/// They are dissolved where it is above this, and fewer frames are in the making ([`Traffic::is_full`]). Between the
+/// two lies what forming them is sent.
 const DISSOLVE: f64 = 0.8;
 
 /// What frames before count against one. Of four that are in the making two may be done at once.
@@ -109,6 +110,11 @@ impl Traffic {
     pub(crate) fn bears_crews(&self) -> bool {
         self.crews
     }
+
+    /// Whether bricks of the last frames took nearly all the time that there was.
+    pub(crate) fn is_full(&self) -> bool {
+        self.carried > DISSOLVE * self.took
+    }
 }
 
 #[cfg(test)]
@@ -153,12 +159,15 @@ mod tests {
         let mut frame = |i: u64, bytes| {
             traffic.leave(bytes, false, i * 2_000);
             traffic.done(true, (i + 1) * 2_000);
-            traffic.bears_crews()
+            (traffic.bears_crews(), traffic.is_full())
         };
-        assert!(frame(0, 50_000));
-        let full: Vec<bool> = (1..10).map(|i| frame(i, 200_000)).collect();
-        assert_eq!(full.iter().filter(|c| **c).count(), SETTLE as usize - 1, "{full:?}");
-        assert!(!frame(10, 130_000), "and between the two nothing changes");
+        assert_eq!(frame(0, 50_000), (true, false));
+        let filled: Vec<_> = (1..10).map(|i| frame(i, 200_000)).collect();
+        let with = filled.iter().filter(|(crews, _)| *crews).count();
+        assert_eq!(with, SETTLE as usize - 1, "{filled:?}");
+        assert_eq!(filled.last(), Some(&(false, true)), "{filled:?}");
+        assert_eq!(frame(10, 130_000), (false, true), "and between the two nothing changes");
+        assert_eq!(frame(11, 20_000), (false, false));
     }
 
     #[test]
@@ -166,6 +175,7 @@ mod tests {
         let mut traffic = Traffic::default();
         traffic.done(false, 1_000);
         assert!(!traffic.bears_crews());
+        assert!(!traffic.is_full(), "of no frame is known what it was sent");
         traffic.done(true, 2_000);
         assert!(traffic.bears_crews(), "nothing had to be sent");
     }

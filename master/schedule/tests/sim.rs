@@ -332,6 +332,24 @@ fn crews_draw_in_turn_where_tiles_are_few_and_frames_many() {
 }
 
 #[test]
+fn fewer_frames_are_in_the_making_while_bricks_fill_the_link() {
+    let (slab, trace) = world(12);
+    let region = under(Schedule::Region, &slab);
+    let most = |bytes_per_s| {
+        let mut heard = Listener::default();
+        let link = Link { bytes_per_s, latency_ns: 50_000 };
+        let c = Cluster { in_flight: 4, link, ..cluster(8) };
+        sim::run(&region, &trace, &c, &mut heard).expect("it can be predicted");
+        let spans = heard.0.iter().flat_map(|(_, spans)| spans);
+        let made: Vec<_> = spans.filter(|s| s.category == "frame").collect();
+        let beside = |at| made.iter().filter(|s| s.start <= at && at < s.end).count();
+        made[..6].iter().map(|s| beside(s.start)).max()
+    };
+    assert_eq!(most(None), Some(4));
+    assert_eq!(most(Some(1e5)), Some(2));
+}
+
+#[test]
 fn what_threads_time_goes_into_is_all_of_it() {
     let (slab, trace) = world(9);
     let region = under(Schedule::Region, &slab);

@@ -29,6 +29,7 @@ pub struct BrickStore {
     held: Vec<Mutex<Held>>,
     relevant_voxels: u64,
     bytes: u64,
+    extent: Option<TightBox>,
 }
 
 /// A brick in the form in which it was last wanted.
@@ -63,6 +64,7 @@ impl BrickStore {
             wanted: wanted.clone(),
             relevant_voxels: infos.iter().map(|b| u64::from(b.voxels)).sum(),
             bytes: infos.iter().map(|b| u64::from(b.bytes)).sum(),
+            extent: infos.iter().map(|info| info.tight).reduce(TightBox::union),
             infos: infos.into(),
             held,
         }
@@ -111,7 +113,7 @@ impl BrickStore {
 
     /// Where they are; `None` without bricks.
     pub fn extent(&self) -> Option<TightBox> {
-        self.infos.iter().map(|info| info.tight).reduce(TightBox::union)
+        self.extent
     }
 
     /// Bytes of all encodings.

@@ -450,8 +450,9 @@ impl Encoder {
 struct Srgb8 {
     /// Linear value from which level `i + 1` is the nearest; none for level 256.
     thresholds: [f64; 256],
-    /// The level at the beginning of each part of linear light; at most one threshold is in it.
-    start: [u8; Srgb8::PARTS + 1],
+    /// The level at the beginning of each part of linear light; at most one threshold is in it. Part i is what
+    /// rounds to `i / PARTS`; those beyond one are there so that no place needs to be checked.
+    start: [u8; 2 * Srgb8::PARTS],
 }
 
 impl Srgb8 {
@@ -467,7 +468,8 @@ impl Srgb8 {
             };
             let thresholds: [f64; 256] = std::array::from_fn(light);
             let start = std::array::from_fn(|i| {
-                thresholds.partition_point(|&t| t <= i as f64 / Srgb8::PARTS as f64) as u8
+                let from = (i as f64 - 0.5) / Srgb8::PARTS as f64;
+                thresholds.partition_point(|&t| t <= from) as u8
             });
             Srgb8 { thresholds, start }
         })
@@ -476,7 +478,11 @@ impl Srgb8 {
     /// `linear` in `[0, 1]`.
     #[inline(always)]
     fn encode(&self, linear: f64) -> u8 {
-        let level = self.start[(linear * Srgb8::PARTS as f64) as usize];
+        // From here on the last bit of a number is a one: what is added to it is rounded to a whole number,
+        // which are its last bits. That is quicker than a conversion, which looks at what no number can hold.
+        const WHOLE: f64 = (1u64 << 52) as f64;
+        let part = (linear * Srgb8::PARTS as f64 + WHOLE).to_bits() as usize;
+        let level = self.start[part % (2 * Srgb8::PARTS)];
         level + u8::from(self.thresholds[usize::from(level)] <= linear)
     }
 }
@@ -490,7 +496,9 @@ mod tests {
         let s = Srgb8::get();
         let even = (0..=100_000).map(|i| f64::from(i) / 100_000.0);
         let next = s.thresholds[..255].iter().flat_map(|t| [t.next_down(), *t, t.next_up()]);
-        let parts = (0..=Srgb8::PARTS).map(|i| i as f64 / Srgb8::PARTS as f64);
+        // Where parts have their middle and where one ends.
+        let halves = 2 * Srgb8::PARTS;
+        let parts = (0..=halves).map(|i| i as f64 / halves as f64);
         for l in parts.clone().chain(even) {
             let want = (srgb_from_linear(l) * 255.0 + 0.5).floor() as u8;
             assert_eq!(s.encode(l), want, "{l}");

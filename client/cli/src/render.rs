@@ -644,7 +644,9 @@ impl Look {
             self.incomplete.push(frame.number);
         }
         let pixel = frame.format.bytes();
-        let all_same = frame.bytes.chunks_exact(pixel).all(|p| p == &frame.bytes[..pixel]);
+        // Each pixel is the one before it.
+        let all_same = frame.bytes.len() < pixel
+            || frame.bytes[pixel..] == frame.bytes[..frame.bytes.len() - pixel];
         let (lo, hi) = info.summary.range();
         let tf = asked.transfer.name();
         let why = if facts.voxels.relevant == 0 && lo == hi {

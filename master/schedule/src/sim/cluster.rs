@@ -26,8 +26,8 @@ const FRAME: u64 = 600;
 const BATCH: u64 = 64 << 10;
 /// Batches under way to one worker.
 const BATCHES: usize = 2;
-/// Threads that carry the master's streams (`client/cli/src/runtime.rs`), and that finish frames
-/// (`master/src/driver.rs`).
+/// Threads that carry the master's streams (`client/cli/src/runtime.rs`; where all is on two cores or fewer one),
+/// and that finish frames (`master/src/driver.rs`).
 const STREAMS: u32 = 2;
 const FINISHERS: u32 = 2;
 
@@ -232,7 +232,7 @@ pub fn run(
         inbox: Vec::new(),
         driver_busy: false,
         driver: Cores::new(1),
-        streams: Cores::new(STREAMS),
+        streams: Cores::new(cluster.cores.map_or(STREAMS, |n| if n > 2 { STREAMS } else { 1 })),
         finisher: Cores::new(FINISHERS),
         machine: cluster.cores.map(Cores::new),
         shut: BTreeMap::new(),

@@ -241,10 +241,15 @@ fn one_sentence(text: &str, typed: &[String]) -> String {
     };
     for line in text.lines().map(str::trim).filter(|l| !l.is_empty()) {
         if let Some(usage) = line.strip_prefix("Usage: ") {
-            // `slabcast render [OPTIONS] ...`: the words before the first that is no name.
+            // `slabcast render [OPTIONS] ...`: the program, whatever it is called here, and the words before
+            // the first that is no name.
             let name = |w: &&str| w.chars().all(|c| c.is_ascii_lowercase());
-            let words: Vec<&str> = usage.split_whitespace().take_while(name).collect();
-            help = format!("{} --help", words.join(" "));
+            let mut words = usage.split_whitespace();
+            help = words.next().unwrap_or("slabcast").to_string();
+            for word in words.take_while(name) {
+                help = format!("{help} {word}");
+            }
+            help += " --help";
         } else if line.starts_with("For more information") {
             // Said in fewer words below.
         } else if let Some(tip) = line.strip_prefix("tip: ") {
@@ -321,6 +326,11 @@ mod tests {
                 "slabcast render x --eps tiny",
                 "invalid value `tiny` for `--eps <E>`: give a number or a fraction, like 0.002 or \
                  1/512; see `slabcast render --help`",
+            ),
+            (
+                "slabcast-0.1 worker",
+                "the following required arguments were not provided: --master <HOST:PORT>; see \
+                 `slabcast-0.1 worker --help`",
             ),
         ] {
             assert_eq!(says(line), want);

@@ -8,7 +8,7 @@
 
 use crate::footprint::Phases;
 use crate::mask::{OpenMask, REACH_MOST};
-use crate::splat::records::apart::{self, Apart, BATCH, Each, WINDOW};
+use crate::splat::records::apart::{Apart, BATCH, Each, Layers, WINDOW, after};
 use crate::splat::records::{BySlot, Recorded, Table};
 use crate::splat::toss::{self, Kept, Sieve, Sifted, Tossing, any_in_rows, prefetch};
 use crate::splat::{Accumulate, Simd, Work};
@@ -254,19 +254,13 @@ fn layers<'a, S: Recorded, const N: usize>(part: &'a Part<'_>, k: i32) -> [Layer
     let last = (k + part.frame.sections.most() as i32 - 1).min(part.frame.footprints.last());
     std::array::from_fn(|at| {
         // Sheets farther back than a voxel reaches are not asked for; any will do.
-        let sheet = (k + after::<N>(k, at)).min(last);
+        let sheet = (k + after::<N>(slot::<N>(k), at)).min(last);
         let footprint = part.frame.footprints.at(sheet).expect("no sheet of the part is clipped");
         let axes = [0, 1].map(|axis| {
             footprint.phases(axis).zip(S::across(&footprint, axis)).expect("footprints have tables")
         });
         Layer { scale: footprint.scale, axes }
     })
-}
-
-/// How many sheets behind sheet `k` is the next one that `at` is the slot of.
-#[inline(always)]
-fn after<const N: usize>(k: i32, at: usize) -> i32 {
-    ((at + N - slot::<N>(k)) % N) as i32
 }
 
 impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
@@ -296,7 +290,7 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
             lo.fill(i32::MAX);
             hi.fill(i32::MIN);
             for (at, layer) in layers.iter().enumerate() {
-                let sheet = after::<N>(k, at);
+                let sheet = after::<N>(slot::<N>(k), at);
                 if sheet >= most {
                     continue;
                 }
@@ -358,7 +352,7 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
             })
         });
         let deep = Table { weights: S::deep(&frame.sections), len: most as usize };
-        let layers = apart::Layers::<S, N> { across, deep, slot: slot::<N>(k) };
+        let layers = Layers::<S, N> { across, deep, slot: slot::<N>(k) };
         let voxels = (apart, &payloads[..some]);
         S::splat_apart(sheets.simd, sheets.records, voxels, &layers, &mut self.across);
         some as u64

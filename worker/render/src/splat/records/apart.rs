@@ -77,8 +77,14 @@ impl<S: Recorded, const N: usize> Layers<'_, S, N> {
     /// How many sheets behind the first `slot` belongs to.
     #[inline(always)]
     pub(crate) fn after(&self, slot: usize) -> i32 {
-        ((slot + N - self.slot) % N) as i32
+        after::<N>(self.slot, slot)
     }
+}
+
+/// How many sheets behind the one that slot `first` holds is the next one that `slot` does.
+#[inline(always)]
+pub(crate) fn after<const N: usize>(first: usize, slot: usize) -> i32 {
+    ((slot + N - first) % N) as i32
 }
 
 /// Weights by slot of a window's columns and of its rows.

@@ -9,12 +9,11 @@ pub(crate) mod apart;
 mod long;
 mod short;
 
+use self::apart::{Apart, Layers, Woven};
 use super::{Accumulate, Grey, Level, Section, Simd, Tap, section_fixed, whole};
 use crate::footprint::{Footprint, Sections};
 use crate::sheet::{LANES, Row, Sum};
 use slabcast_common::image::RawSums;
-
-use apart::{Apart, Layers, Woven};
 
 /// Sheets of a record at most.
 pub(crate) const MOST: usize = 8;

@@ -178,7 +178,7 @@ pub(super) mod lines {
                 // SAFETY: sixteen numbers are 64 bytes.
                 unsafe { _mm512_loadu_si512(from.as_ptr().cast()) }
             };
-            let zero = _mm512_setzero_si512();
+            let [zero, one, line] = [0, 1, LINE as i32].map(|n| _mm512_set1_epi32(n));
             let (present, at) = ([[0; BATCH]; 4], [[0; BATCH]; 4]);
             let mut lines = Lines { present, at, weights: [&[]; 4] };
             for slot in 0..4 {
@@ -186,8 +186,7 @@ pub(super) mod lines {
                 lines.weights[slot] = table.weights;
                 let last = table.weights.len().checked_sub(table.len).expect("a row of the table");
                 let last = _mm512_set1_epi32(last.min(i32::MAX as usize) as i32);
-                // A row of more than a line's pixels has more than are looked at.
-                let all = _mm512_set1_epi32(((1u64 << table.len.min(31)) - 1) as i32);
+                let len = _mm512_set1_epi32(table.len.min(i32::MAX as usize) as i32);
                 for i in (0..n.min(BATCH)).step_by(16) {
                     let mut lo = load(&apart.lo[axis][i..]);
                     if axis == 0 {
@@ -196,13 +195,15 @@ pub(super) mod lines {
                         lo = _mm512_min_epi32(lo, most);
                     }
                     let column = _mm512_sub_epi32(load(&apart.first[axis][slot][i..]), lo);
-                    // Shifts by more than there are bits, and by less than none, leave nothing.
-                    let bits = _mm512_or_si512(
-                        _mm512_sllv_epi32(all, column),
-                        _mm512_srlv_epi32(all, _mm512_sub_epi32(zero, column)),
-                    );
+                    // From a footprint's first pixel to behind its last, of those that are looked at.
                     // In sheets that a voxel does not reach there may be some: its section is nothing there.
-                    let bits = _mm512_and_si512(bits, _mm512_set1_epi32((1 << LINE) - 1));
+                    let begin = _mm512_min_epi32(_mm512_max_epi32(column, zero), line);
+                    let end = _mm512_add_epi32(column, len);
+                    let end = _mm512_min_epi32(_mm512_max_epi32(end, zero), line);
+                    let bits = _mm512_sub_epi32(
+                        _mm512_sllv_epi32(one, end),
+                        _mm512_sllv_epi32(one, begin),
+                    );
                     // SAFETY: sixteen numbers are 64 bytes.
                     let from = unsafe {
                         _mm512_loadu_si512(apart.from[axis][slot][i..][..16].as_ptr().cast())
@@ -295,10 +296,18 @@ mod tests {
         #[test]
         fn every_instruction_set_adds_voxels_as_one_by_one(
             voxels in prop::collection::vec(somewhere(), 0..BATCH), slot in 0..4usize,
-            len in 1..18usize, more in prop::array::uniform2(prop::array::uniform4(0..2usize)),
+            len in 1..WINDOW - 4, more in prop::array::uniform2(prop::array::uniform4(0..2usize)),
+            edge in any::<bool>(),
         ) {
+            let mut voxels = voxels;
+            if edge {
+                // All reach in over the part's first columns and rows, or end before them.
+                for (around, ..) in &mut voxels {
+                    *around = around.map(|at| at.rem_euclid(12) - len as i32);
+                }
+            }
             let lens = more.map(|more| more.map(|more| len + more));
-            let short: Vec<i16> = (0..170).map(|i| 4000 + (i * 7919 % 19_000) as i16).collect();
+            let short: Vec<i16> = (0..190).map(|i| 4000 + (i * 7919 % 19_000) as i16).collect();
             let real: Vec<f32> = short.iter().map(|&w| f32::from(w) * 7.1e-5).collect();
             let taps: Vec<Tap> = real.iter().map(|&w| Tap::new(w)).collect();
             add_everywhere::<i16>(&voxels, lens, slot, &short, &short)?;

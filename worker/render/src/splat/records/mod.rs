@@ -161,13 +161,9 @@ impl<'a, W> RowAt<'a, W> {
     #[inline(always)]
     fn columns(&self) -> (u16, *const W) {
         let row = self.row();
-        // A row of more than 31 weights has more than are looked at.
-        let present = (1u64 << row.len().min(31)) - 1;
-        let present = if self.column >= 0 {
-            present.checked_shl(self.column as u32).unwrap_or(0)
-        } else {
-            present.checked_shr(self.column.unsigned_abs()).unwrap_or(0)
-        };
+        let column = i64::from(self.column);
+        let bits_below = |column: i64| (1u32 << column.clamp(0, 16)) - 1;
+        let present = bits_below(column + row.len() as i64) & !bits_below(column);
         (present as u16, row.as_ptr().wrapping_offset(-(self.column as isize)))
     }
 
@@ -839,7 +835,7 @@ mod tests {
                 for (slot, row) in rows.iter_mut().enumerate() {
                     // Rows before, across and behind the window, at the table's ends and in its middle;
                     // one is none at all.
-                    let len = (i as usize * 5 + slot * 3) % 14;
+                    let len = (i as usize * 5 + slot * 3) % 38;
                     let from = (weights.len() - len) * slot / (N - 1);
                     let column = (i * 7 + slot as i32 * 2) % 40 - 16;
                     *row = RowAt { table: weights, from, len, column };

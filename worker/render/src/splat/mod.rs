@@ -10,6 +10,8 @@
 #![expect(unsafe_code, reason = "the one wall: run-time dispatch, unchecked conversion, lanes")]
 
 pub(crate) mod close;
+#[cfg(target_arch = "x86_64")]
+mod lanes;
 pub(crate) mod records;
 pub(crate) mod toss;
 

@@ -1,10 +1,12 @@
 //! Sifting: which voxels of a brick are wanted in a part, and all that drawing those takes.
 //!
 //! Voxels are placed, in a flat view by an addition, tested against the part's sheets and one bit of
-//! its mask, and those that are left put beside each other. With AVX-512 that is done for sixteen local
-//! indices at a time, present or not, and what is not wanted never gets out of the registers;
-//! elsewhere in loops over plain arrays, one for each step.
+//! its mask, and those that are left put beside each other. With AVX2 that is done for eight local
+//! indices at a time, present or not, with AVX-512 for sixteen, and what is not wanted never gets out
+//! of the registers; elsewhere in loops over plain arrays, one for each step.
 
+#[cfg(target_arch = "x86_64")]
+use super::lanes::Lanes;
 use super::records::Splat;
 use super::{Level, Simd};
 use crate::footprint::{Phases, Sections};
@@ -22,12 +24,12 @@ pub(crate) trait Placing {
     const KEPT: bool;
     /// The places of voxels with these local indices.
     fn all(&self, index: &[u16], at: &mut [[i32; 512]; 3]);
-    /// The same of sixteen from `local` on.
+    /// The same of as many as there are lanes, from `local` on.
     ///
     /// # Safety
-    /// For machines with AVX-512.
+    /// For machines with the instructions of `L`.
     #[cfg(target_arch = "x86_64")]
-    unsafe fn sixteen(&self, local: usize) -> [std::arch::x86_64::__m512i; 3];
+    unsafe fn some<L: Lanes>(&self, local: usize) -> [L::Ints; 3];
 }
 
 /// In a flat view, from the part's corner and the front of some sheet.
@@ -62,10 +64,10 @@ impl Placing for FlatBrick<'_> {
     }
 
     #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    unsafe fn sixteen(&self, local: usize) -> [std::arch::x86_64::__m512i; 3] {
-        avx512::flat(self, local)
+    #[inline(always)]
+    unsafe fn some<L: Lanes>(&self, local: usize) -> [L::Ints; 3] {
+        // SAFETY: the caller's.
+        unsafe { wide::flat::<L>(self, local) }
     }
 }
 
@@ -85,10 +87,10 @@ impl Placing for DeepBrick<'_> {
     }
 
     #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    unsafe fn sixteen(&self, local: usize) -> [std::arch::x86_64::__m512i; 3] {
-        avx512::deep(self, local)
+    #[inline(always)]
+    unsafe fn some<L: Lanes>(&self, local: usize) -> [L::Ints; 3] {
+        // SAFETY: the caller's.
+        unsafe { wide::deep::<L>(self, local) }
     }
 }
 
@@ -229,7 +231,7 @@ pub(crate) fn any_in_rows(
     match simd.0 {
         // SAFETY: the value proves that the instructions are there.
         #[cfg(target_arch = "x86_64")]
-        Level::Avx512 => unsafe { avx512::any_in_rows(rows, [begin, end], columns) },
+        Level::Avx512 => unsafe { wide::any_in_rows(rows, [begin, end], columns) },
         _ => rows[begin..end].iter().fold(0, |all, row| all | row) & columns != 0,
     }
 }
@@ -241,8 +243,11 @@ impl<P: Placing> Sieve<'_, P> {
         match simd.0 {
             // SAFETY: the value proves that the instructions are there.
             #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe { avx512::sift(self, brick, tossing) },
-            _ => self.sift_plain(brick, tossing),
+            Level::Avx512 => unsafe { wide::avx512::sift(self, brick, tossing) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe { wide::avx2::sift(self, brick, tossing) },
+            Level::Plain => self.sift_plain(brick, tossing),
         }
     }
 
@@ -301,9 +306,14 @@ impl Sieve<'_, FlatBrick<'_>> {
             // SAFETY: the value proves that the instructions are there.
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe {
-                avx512::make_ready(self.sections, phases, sifted.kept, tossing);
+                wide::avx512::make_ready(self.sections, phases, sifted.kept, tossing);
             },
-            _ => make_ready(self.sections, phases, sifted.kept, tossing),
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe {
+                wide::avx2::make_ready(self.sections, phases, sifted.kept, tossing);
+            },
+            Level::Plain => make_ready(self.sections, phases, sifted.kept, tossing),
         }
         sifted
     }
@@ -343,156 +353,166 @@ fn move_inside(phases: &Phases, at: &[i32], inside: &mut [u32; 512], from: &mut 
 }
 
 #[cfg(target_arch = "x86_64")]
-mod avx512 {
+mod wide {
     use super::{DeepBrick, FAR, FlatBrick, Placing, Sieve, Sifted, Tossing};
     use crate::footprint::{Phases, Sections};
     use crate::place::FINER_BITS;
-    use crate::splat::by_column;
+    use crate::splat::lanes::{Eight, Lanes, Sixteen};
     use crate::tile::PART;
     use slabcast_common::brick::Brick;
     use slabcast_common::shade::NO_NORMAL;
     use slabcast_common::view::{MAGIC, SUBPIXEL_BITS, SUBPIXELS};
     use slabcast_common::volume::Samples;
-    use std::arch::x86_64::*;
 
-    /// [`Sieve::sift_plain`].
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,popcnt")]
-    pub(super) fn sift<P: Placing>(
-        sieve: &Sieve<'_, P>,
-        brick: &Brick,
-        tossing: &mut Tossing,
-    ) -> Sifted {
-        match &brick.values {
-            Samples::U8(v) => voxels(sieve, brick, v, tossing),
-            Samples::U16(v) => voxels(sieve, brick, v, tossing),
-            Samples::F32(v) => voxels(sieve, brick, v, tossing),
-        }
+    /// What is compiled for an instruction set: every function that these call is inlined into them.
+    macro_rules! compiled {
+        ($name:ident, $features:literal, $lanes:ty) => {
+            pub(super) mod $name {
+                use super::*;
+
+                /// [`Sieve::sift_plain`].
+                #[target_feature(enable = $features)]
+                pub(in super::super) fn sift<P: Placing>(
+                    sieve: &Sieve<'_, P>,
+                    brick: &Brick,
+                    tossing: &mut Tossing,
+                ) -> Sifted {
+                    // SAFETY: these are the instructions.
+                    unsafe {
+                        match &brick.values {
+                            Samples::U8(v) => voxels::<$lanes, _, _>(sieve, brick, v, tossing),
+                            Samples::U16(v) => voxels::<$lanes, _, _>(sieve, brick, v, tossing),
+                            Samples::F32(v) => voxels::<$lanes, _, _>(sieve, brick, v, tossing),
+                        }
+                    }
+                }
+
+                /// [`super::super::make_ready`].
+                #[target_feature(enable = $features)]
+                pub(in super::super) fn make_ready(
+                    sections: &Sections,
+                    across: &[Phases; 2],
+                    kept: usize,
+                    tossing: &mut Tossing,
+                ) {
+                    // SAFETY: these are the instructions.
+                    unsafe { super::make_ready::<$lanes>(sections, across, kept, tossing) }
+                }
+            }
+        };
     }
 
-    /// Sixteen numbers of a brick from the `local`th on.
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    fn sixteen(of: &[i64; 512], local: usize) -> [__m512i; 2] {
-        let at = of[local..].first_chunk::<16>().expect("sixteen of a brick").as_ptr();
-        // SAFETY: sixteen numbers are 128 bytes.
-        unsafe { [_mm512_loadu_si512(at.cast()), _mm512_loadu_si512(at.add(8).cast())] }
-    }
+    compiled!(avx2, "avx2,popcnt,lzcnt,bmi1,bmi2", Eight);
+    compiled!(avx512, "avx512f,avx512vl,avx512dq,avx512bw,popcnt,lzcnt,bmi1,bmi2", Sixteen);
 
     /// Places in a flat view.
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    pub(super) fn flat(places: &FlatBrick<'_>, local: usize) -> [__m512i; 3] {
-        // Bits 24 to 55 of sixteen sums, the lower halves of what is left of them.
-        let lower = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
-        let mut at = [_mm512_setzero_si512(); 3];
-        for (axis, at) in at.iter_mut().enumerate() {
-            let from = _mm512_set1_epi64(places.from[axis]);
-            let [low, high] = sixteen(&places.places.offsets()[axis], local);
-            let low = _mm512_srli_epi64::<FINER_BITS>(_mm512_add_epi64(from, low));
-            let high = _mm512_srli_epi64::<FINER_BITS>(_mm512_add_epi64(from, high));
-            *at = _mm512_permutex2var_epi32(low, lower, high);
+    ///
+    /// # Safety
+    /// For machines with the instructions of `L`, as are all of these.
+    #[inline(always)]
+    pub(super) unsafe fn flat<L: Lanes>(places: &FlatBrick<'_>, local: usize) -> [L::Ints; 3] {
+        let [x, y, z] = places.places.offsets().each_ref();
+        let at = [x, y, z].map(|of| of[local..local + L::LANES].as_ptr());
+        let [x, y, z] = places.from;
+        // SAFETY: so many there are.
+        unsafe {
+            [
+                L::bits_of_sums(x, at[0], FINER_BITS),
+                L::bits_of_sums(y, at[1], FINER_BITS),
+                L::bits_of_sums(z, at[2], FINER_BITS),
+            ]
         }
-        at
     }
 
-    /// [`slabcast_common::view::round_i32`] of sixteen numbers.
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    fn round(both: [__m512d; 2]) -> __m512i {
-        let lower = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
-        let magic = _mm512_set1_pd(MAGIC);
-        let [low, high] = both;
-        let low = _mm512_castpd_si512(_mm512_add_pd(low, magic));
-        let high = _mm512_castpd_si512(_mm512_add_pd(high, magic));
-        _mm512_permutex2var_epi32(low, lower, high)
+    /// Eye coordinates along `axis`, in halves.
+    #[inline(always)]
+    unsafe fn eye<L: Lanes>(places: &DeepBrick<'_>, axis: usize, local: usize) -> [L::Reals; 2] {
+        let at = places.offsets[axis][local..local + L::LANES].as_ptr();
+        // SAFETY: so many there are.
+        unsafe {
+            let corner = L::real(places.corner[axis]);
+            let behind = at.add(L::LANES / 2);
+            [L::add(corner, L::reals(at)), L::add(corner, L::reals(behind))]
+        }
+    }
+
+    /// [`slabcast_common::view::round_i32`].
+    #[inline(always)]
+    unsafe fn round<L: Lanes>(both: [L::Reals; 2]) -> L::Ints {
+        // SAFETY: the caller's.
+        unsafe {
+            let magic = L::real(MAGIC);
+            L::lower([L::add(both[0], magic), L::add(both[1], magic)])
+        }
     }
 
     /// Places in perspective.
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    pub(super) fn deep(places: &DeepBrick<'_>, local: usize) -> [__m512i; 3] {
-        let mut eye = [[_mm512_setzero_pd(); 2]; 3];
-        for (axis, eye) in eye.iter_mut().enumerate() {
-            let at = places.offsets[axis][local..].first_chunk::<16>();
-            let at = at.expect("sixteen of a brick").as_ptr();
-            let corner = _mm512_set1_pd(places.corner[axis]);
-            // SAFETY: sixteen numbers are 128 bytes.
-            let both = unsafe { [_mm512_loadu_pd(at), _mm512_loadu_pd(at.add(8))] };
-            *eye = [_mm512_add_pd(corner, both[0]), _mm512_add_pd(corner, both[1])];
-        }
-        let [x, y, z] = eye;
-        let [mut across, mut down, mut deep] = [[_mm512_setzero_pd(); 2]; 3];
-        for half in 0..2 {
-            let depth = _mm512_add_pd(z[half], _mm512_set1_pd(places.distance));
-            let scale = _mm512_div_pd(_mm512_set1_pd(places.per_depth), depth);
-            for (to, (from, middle)) in
-                [(&mut across, (x, places.middle[0])), (&mut down, (y, places.middle[1]))]
-            {
-                let at = _mm512_add_pd(_mm512_mul_pd(from[half], scale), _mm512_set1_pd(middle));
-                let at = _mm512_max_pd(at, _mm512_set1_pd(-FAR));
-                to[half] = _mm512_min_pd(at, _mm512_set1_pd(FAR));
-            }
-            // A division by one changes nothing and is slow.
+    #[inline(always)]
+    pub(super) unsafe fn deep<L: Lanes>(places: &DeepBrick<'_>, local: usize) -> [L::Ints; 3] {
+        // SAFETY: the caller's.
+        unsafe {
+            let x = eye::<L>(places, 0, local);
+            let y = eye::<L>(places, 1, local);
+            let mut z = eye::<L>(places, 2, local);
+            let (mut across, mut down) = (x, y);
             let thickness = places.view.thickness;
-            deep[half] = z[half];
-            if thickness != 1.0 {
-                deep[half] = _mm512_div_pd(z[half], _mm512_set1_pd(thickness));
+            for half in 0..2 {
+                let depth = L::add(z[half], L::real(places.distance));
+                let scale = L::div(L::real(places.per_depth), depth);
+                let at = L::add(L::mul(x[half], scale), L::real(places.middle[0]));
+                across[half] = L::clamp(at, FAR);
+                let at = L::add(L::mul(y[half], scale), L::real(places.middle[1]));
+                down[half] = L::clamp(at, FAR);
+                // A division by one changes nothing and is slow.
+                if thickness != 1.0 {
+                    z[half] = L::div(z[half], L::real(thickness));
+                }
+                z[half] = L::mul(z[half], L::real(f64::from(places.view.depth_phases())));
             }
-            let phases = _mm512_set1_pd(f64::from(places.view.depth_phases()));
-            deep[half] = _mm512_mul_pd(deep[half], phases);
+            [round::<L>(across), round::<L>(down), round::<L>(z)]
         }
-        [round(across), round(down), round(deep)]
     }
 
-    /// [`super::move_inside`] for sixteen voxels: first pixels, and where weights begin.
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    fn move_inside(phases: &Phases, at: __m512i) -> (__m512i, __m512i) {
+    /// [`super::move_inside`]: first pixels, and where weights begin.
+    #[inline(always)]
+    unsafe fn move_inside<L: Lanes>(phases: &Phases, at: L::Ints) -> (L::Ints, L::Ints) {
         let (near, more_from, len) = (phases.first(0), phases.more_from(), phases.len as i32);
-        let phase = _mm512_and_si512(at, _mm512_set1_epi32(SUBPIXELS - 1));
-        let first = _mm512_srai_epi32::<SUBPIXEL_BITS>(at);
-        let first = _mm512_add_epi32(first, _mm512_set1_epi32(near));
-        let more = _mm512_cmpge_epi32_mask(phase, _mm512_set1_epi32(more_from));
-        let first = _mm512_mask_add_epi32(first, more, first, _mm512_set1_epi32(1));
-        let moved = _mm512_max_epi32(first, _mm512_setzero_si512());
-        let moved = _mm512_min_epi32(moved, _mm512_set1_epi32(PART - len));
-        let by = _mm512_max_epi32(_mm512_sub_epi32(moved, first), _mm512_set1_epi32(-len));
-        let by = _mm512_min_epi32(by, _mm512_set1_epi32(len));
         let (begin, stride) = (phases.begin(0) as i32, (phases.begin(1) - phases.begin(0)) as i32);
-        let from = _mm512_mullo_epi32(phase, _mm512_set1_epi32(stride));
-        let from = _mm512_add_epi32(from, _mm512_set1_epi32(begin));
-        (moved, _mm512_add_epi32(from, by))
+        // SAFETY: the caller's.
+        unsafe {
+            let phase = L::and(at, L::set(SUBPIXELS - 1));
+            let first = L::plus(L::down(at, SUBPIXEL_BITS), L::set(near));
+            let first = L::one_more(L::less(L::set(more_from - 1), phase), first);
+            let moved = L::min(L::max(first, L::set(0)), L::set(PART - len));
+            let by = L::min(L::max(L::minus(moved, first), L::set(-len)), L::set(len));
+            let from = L::plus(L::times(phase, L::set(stride)), L::set(begin));
+            (moved, L::plus(from, by))
+        }
     }
 
-    /// [`super::make_ready`].
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    pub(super) fn make_ready(
+    #[inline(always)]
+    unsafe fn make_ready<L: Lanes>(
         sections: &Sections,
         across: &[Phases; 2],
         kept: usize,
         tossing: &mut Tossing,
     ) {
         let Tossing { at: [x, y, z], cells, samples, normals, ready, .. } = tossing;
-        let phase = _mm512_set1_epi32(sections.phases() - 1);
-        for i in (0..kept).step_by(16) {
-            let ready = ready[i..].first_chunk_mut::<16>().expect("sixteen of 512");
-            let at = |items: *const u32| {
-                // SAFETY: the chunk above shows that sixteen of 512 begin here.
-                unsafe { _mm512_loadu_si512(items.add(i).cast()) }
-            };
-            let (x0, from_x) = move_inside(&across[0], at(x.as_ptr().cast()));
-            let (y0, from_y) = move_inside(&across[1], at(y.as_ptr().cast()));
-            let place = _mm512_or_si512(x0, _mm512_slli_epi32::<8>(y0));
-            let place = _mm512_or_si512(place, _mm512_slli_epi32::<16>(at(cells.as_ptr())));
-            let rows = _mm512_or_si512(from_x, _mm512_slli_epi32::<16>(from_y));
-            let normal = _mm512_slli_epi32::<16>(at(normals.as_ptr()));
-            let deep = _mm512_or_si512(_mm512_and_si512(at(z.as_ptr().cast()), phase), normal);
-            let sample = at(samples.as_ptr());
-            let fours = by_column([place, rows, deep, sample]);
-            for (to, four) in ready.as_chunks_mut::<4>().0.iter_mut().zip(fours) {
-                // SAFETY: four voxels are 64 bytes, each four numbers.
-                unsafe { _mm512_storeu_si512(to.as_mut_ptr().cast(), four) };
+        for i in (0..kept).step_by(L::LANES) {
+            // Of 512 each, as many begin here.
+            let ready = &mut ready[i..i + L::LANES];
+            // SAFETY: as the line above shows; a voxel that is ready is four numbers.
+            unsafe {
+                let (x0, from_x) = move_inside::<L>(&across[0], L::load(x.as_ptr().add(i).cast()));
+                let (y0, from_y) = move_inside::<L>(&across[1], L::load(y.as_ptr().add(i).cast()));
+                let place = L::or(x0, L::up(y0, 8));
+                let place = L::or(place, L::up(L::load(cells.as_ptr().add(i)), 16));
+                let rows = L::or(from_x, L::up(from_y, 16));
+                let z = L::load(z.as_ptr().add(i).cast());
+                let normal = L::up(L::load(normals.as_ptr().add(i)), 16);
+                let deep = L::or(L::and(z, L::set(sections.phases() - 1)), normal);
+                let sample = L::load(samples.as_ptr().add(i));
+                L::store_fours(ready.as_mut_ptr().cast(), [place, rows, deep, sample]);
             }
         }
     }
@@ -501,6 +521,7 @@ mod avx512 {
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
     pub(super) fn any_in_rows(rows: &[u64; 64], [begin, end]: [usize; 2], columns: u64) -> bool {
+        use std::arch::x86_64::*;
         let (rows, columns) = (&rows[begin..end], _mm512_set1_epi64(columns as i64));
         let mut any = 0;
         for rows in rows.chunks(8) {
@@ -513,53 +534,37 @@ mod avx512 {
     }
 
     /// What samples and normals are, widened to 32 bits.
-    trait Wide: Copy {
-        /// # Safety
-        /// Those of sixteen from `at` that `mask` marks may be read.
-        unsafe fn load(mask: u16, at: *const Self) -> __m512i;
+    trait Wide: Sized {
+        /// The first ones.
+        unsafe fn load<L: Lanes>(items: &[Self]) -> L::Ints;
     }
 
     impl Wide for u8 {
-        #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-        #[inline]
-        unsafe fn load(mask: u16, at: *const u8) -> __m512i {
-            // SAFETY: see above; others are not read.
-            _mm512_cvtepu8_epi32(unsafe { _mm_maskz_loadu_epi8(mask, at.cast()) })
+        #[inline(always)]
+        unsafe fn load<L: Lanes>(items: &[u8]) -> L::Ints {
+            // SAFETY: the caller's.
+            unsafe { L::bytes(items) }
         }
     }
 
     impl Wide for u16 {
-        #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-        #[inline]
-        unsafe fn load(mask: u16, at: *const u16) -> __m512i {
-            // SAFETY: see above; others are not read.
-            _mm512_cvtepu16_epi32(unsafe { _mm256_maskz_loadu_epi16(mask, at.cast()) })
+        #[inline(always)]
+        unsafe fn load<L: Lanes>(items: &[u16]) -> L::Ints {
+            // SAFETY: the caller's.
+            unsafe { L::shorts(items) }
         }
     }
 
     impl Wide for f32 {
-        #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-        #[inline]
-        unsafe fn load(mask: u16, at: *const f32) -> __m512i {
-            // SAFETY: see above; others are not read.
-            unsafe { _mm512_maskz_loadu_epi32(mask, at.cast()) }
+        #[inline(always)]
+        unsafe fn load<L: Lanes>(items: &[f32]) -> L::Ints {
+            // SAFETY: the caller's.
+            unsafe { L::floats(items) }
         }
     }
 
-    /// Sixteen of `items` at the lanes of `present`, from the `rank`th on.
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,popcnt")]
-    #[inline]
-    fn spread<T: Wide>(items: &[T], rank: usize, present: u16) -> __m512i {
-        let items = &items[rank..];
-        let count = (present.count_ones() as usize).min(items.len());
-        // SAFETY: so many there are.
-        let items = unsafe { T::load(((1u32 << count) - 1) as u16, items.as_ptr()) };
-        _mm512_maskz_expand_epi32(present, items)
-    }
-
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,popcnt")]
-    #[inline]
-    fn voxels<T: Wide, P: Placing>(
+    #[inline(always)]
+    unsafe fn voxels<L: Lanes, T: Wide, P: Placing>(
         sieve: &Sieve<'_, P>,
         brick: &Brick,
         values: &[T],
@@ -568,85 +573,69 @@ mod avx512 {
         let Sieve { places, open, cull, sections, sheets } = sieve;
         let Tossing { at: [x_to, y_to, z_to], first: first_to, cells: cells_to, .. } = tossing;
         let Tossing { samples: samples_to, normals: normals_to, locals: locals_to, .. } = tossing;
-        let lanes = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
         let (grown, reach) = open.grown();
-        let span = _mm512_set1_epi32(64 + 2 * reach);
-        let reach = _mm512_set1_epi32(reach);
-        let (zero, last) = (_mm512_setzero_si512(), _mm512_set1_epi32(63));
         let (front, back, shift) = sections.reach();
-        let (front, back) = (_mm512_set1_epi32(front), _mm512_set1_epi32(back));
-        let shift = _mm_cvtsi32_si128(shift as i32);
-        let (begin, end) = (_mm512_set1_epi32(sheets[0]), _mm512_set1_epi32(sheets[1]));
         let (mut rank, mut reached, mut kept) = (0, 0, 0);
         for (group, present) in brick.present().iter().enumerate() {
-            for part in 0..4 {
-                let present = (present >> (16 * part)) as u16;
+            for part in 0..64 / L::LANES {
+                let present = (present >> (L::LANES * part)) as u32 & ((1 << L::LANES) - 1);
                 if present == 0 {
                     continue;
                 }
                 let here = rank;
                 rank += present.count_ones() as usize;
-                let local = 64 * group + 16 * part;
-                // SAFETY: these are the instructions.
-                let [x, y, z] = unsafe { places.sixteen(local) };
-                // In the slab's sheets, and near enough to the part.
-                let first = _mm512_sra_epi32(_mm512_sub_epi32(z, front), shift);
-                let behind = _mm512_sra_epi32(_mm512_add_epi32(z, back), shift);
-                let near = _mm512_mask_cmplt_epi32_mask(present, first, end);
-                let near = _mm512_mask_cmpge_epi32_mask(near, behind, begin);
-                let px = _mm512_srai_epi32::<SUBPIXEL_BITS>(x);
-                let py = _mm512_srai_epi32::<SUBPIXEL_BITS>(y);
-                let near = _mm512_mask_cmplt_epu32_mask(near, _mm512_add_epi32(px, reach), span);
-                let near = _mm512_mask_cmplt_epu32_mask(near, _mm512_add_epi32(py, reach), span);
-                if near == 0 {
-                    continue;
-                }
-                reached += near.count_ones() as usize;
-                let px = _mm512_min_epi32(_mm512_max_epi32(px, zero), last);
-                let py = _mm512_min_epi32(_mm512_max_epi32(py, zero), last);
-                let cell = _mm512_or_si512(_mm512_slli_epi32::<6>(py), px);
-                let mut mark = near;
-                if *cull {
-                    // The mask in words of 32 bits.
-                    let word = _mm512_srli_epi32::<5>(cell);
-                    // SAFETY: a cell is below 64 times 64, so its word is one of the 128 of the mask.
-                    let words = unsafe {
-                        _mm512_mask_i32gather_epi32::<4>(zero, near, word, grown.as_ptr().cast())
-                    };
-                    let bit = _mm512_and_si512(px, _mm512_set1_epi32(31));
-                    let bits = _mm512_sllv_epi32(_mm512_set1_epi32(1), bit);
-                    mark = _mm512_mask_test_epi32_mask(near, words, bits);
+                let local = 64 * group + L::LANES * part;
+                // SAFETY: the caller's, and what is said below.
+                let mark = unsafe {
+                    let [x, y, z] = places.some::<L>(local);
+                    // In the slab's sheets, and near enough to the part.
+                    let first = L::down(L::minus(z, L::set(front)), shift);
+                    let behind = L::down(L::plus(z, L::set(back)), shift);
+                    let near = L::both(L::marks(present), L::less(first, L::set(sheets[1])));
+                    let near = L::both(near, L::less(L::set(sheets[0] - 1), behind));
+                    let [px, py] = [L::down(x, SUBPIXEL_BITS), L::down(y, SUBPIXEL_BITS)];
+                    let (from, span) = (L::set(reach), L::set(63 + 2 * reach));
+                    let near = L::both(near, L::at_most(L::plus(px, from), span));
+                    let near = L::both(near, L::at_most(L::plus(py, from), span));
+                    let mut mark = L::bits(near);
                     if mark == 0 {
                         continue;
                     }
-                }
-                let sample = spread(values, here, present);
-                let normal = match &brick.normals {
-                    Some(normals) => spread(normals, here, present),
-                    None => _mm512_set1_epi32(NO_NORMAL.into()),
-                };
-                let put = |to: *mut u32, from: __m512i| {
-                    // SAFETY: no more are kept than were gone through, so sixteen from there on are among
-                    // the array's 512.
-                    unsafe {
-                        _mm512_storeu_si512(
-                            to.add(kept).cast(),
-                            _mm512_maskz_compress_epi32(mark, from),
-                        );
+                    reached += mark.count_ones() as usize;
+                    let (zero, last) = (L::set(0), L::set(63));
+                    let [px, py] = [L::min(L::max(px, zero), last), L::min(L::max(py, zero), last)];
+                    let cell = L::or(L::up(py, 6), px);
+                    if *cull {
+                        // The mask in words of 32 bits; a cell is below 64 times 64, so its word is one of
+                        // the mask's 128. The bit that is asked for goes where a sign is.
+                        let words = L::look_up(near, grown.as_ptr().cast(), L::down(cell, 5));
+                        let words = L::up_each(words, L::without(px, L::set(31)));
+                        mark &= L::bits(L::less(words, zero));
+                        if mark == 0 {
+                            continue;
+                        }
                     }
+                    let sample = L::spread(present, T::load::<L>(&values[here..]));
+                    let normal = match &brick.normals {
+                        Some(normals) => L::spread(present, Wide::load::<L>(&normals[here..])),
+                        None => L::set(NO_NORMAL.into()),
+                    };
+                    // No more are kept than were gone through, so as many lanes from there on are among an
+                    // array's 512.
+                    if P::KEPT {
+                        L::store(x_to.as_mut_ptr().add(kept).cast(), L::beside(mark, x));
+                        L::store(y_to.as_mut_ptr().add(kept).cast(), L::beside(mark, y));
+                        L::store(z_to.as_mut_ptr().add(kept).cast(), L::beside(mark, z));
+                    } else {
+                        let local = L::beside(mark, L::from(local as i32));
+                        L::store(locals_to.as_mut_ptr().add(kept), local);
+                    }
+                    L::store(first_to.as_mut_ptr().add(kept).cast(), L::beside(mark, first));
+                    L::store(cells_to.as_mut_ptr().add(kept), L::beside(mark, cell));
+                    L::store(samples_to.as_mut_ptr().add(kept), L::beside(mark, sample));
+                    L::store(normals_to.as_mut_ptr().add(kept), L::beside(mark, normal));
+                    mark
                 };
-                if P::KEPT {
-                    put(x_to.as_mut_ptr().cast(), x);
-                    put(y_to.as_mut_ptr().cast(), y);
-                    put(z_to.as_mut_ptr().cast(), z);
-                } else {
-                    let local = _mm512_add_epi32(lanes, _mm512_set1_epi32(local as i32));
-                    put(locals_to.as_mut_ptr(), local);
-                }
-                put(first_to.as_mut_ptr().cast(), first);
-                put(cells_to.as_mut_ptr(), cell);
-                put(samples_to.as_mut_ptr(), sample);
-                put(normals_to.as_mut_ptr(), normal);
                 kept += mark.count_ones() as usize;
             }
         }

@@ -1,0 +1,372 @@
+//! Numbers of 32 bits side by side in a register, as many as an instruction set has.
+//!
+//! What compilers do not make of plain loops, such as putting those lanes beside each other that are
+//! wanted, is written once for any number of lanes: in functions that are inlined into one that is
+//! compiled for the instruction set. Functions here need that set, and say nothing else of it.
+
+use super::by_column;
+use std::arch::x86_64::*;
+
+/// An instruction set's lanes. No function may be called on a machine that lacks its instructions.
+pub(crate) trait Lanes {
+    /// How many there are.
+    const LANES: usize;
+    /// A whole number each.
+    type Ints: Copy;
+    /// A yes or no each.
+    type Marks: Copy;
+    /// An f64 for every other lane.
+    type Reals: Copy;
+
+    unsafe fn set(n: i32) -> Self::Ints;
+    /// `n`, `n + 1` and so on.
+    unsafe fn from(n: i32) -> Self::Ints;
+    unsafe fn load(at: *const u32) -> Self::Ints;
+    unsafe fn store(to: *mut u32, a: Self::Ints);
+    unsafe fn plus(a: Self::Ints, b: Self::Ints) -> Self::Ints;
+    unsafe fn minus(a: Self::Ints, b: Self::Ints) -> Self::Ints;
+    unsafe fn times(a: Self::Ints, b: Self::Ints) -> Self::Ints;
+    unsafe fn and(a: Self::Ints, b: Self::Ints) -> Self::Ints;
+    /// The bits of `b` that `a` does not have.
+    unsafe fn without(a: Self::Ints, b: Self::Ints) -> Self::Ints;
+    unsafe fn or(a: Self::Ints, b: Self::Ints) -> Self::Ints;
+    unsafe fn min(a: Self::Ints, b: Self::Ints) -> Self::Ints;
+    unsafe fn max(a: Self::Ints, b: Self::Ints) -> Self::Ints;
+    /// `a << bits`.
+    unsafe fn up(a: Self::Ints, bits: u32) -> Self::Ints;
+    /// `a >> bits`, of numbers with a sign.
+    unsafe fn down(a: Self::Ints, bits: u32) -> Self::Ints;
+    /// `a << b`.
+    unsafe fn up_each(a: Self::Ints, b: Self::Ints) -> Self::Ints;
+    /// `a < b`.
+    unsafe fn less(a: Self::Ints, b: Self::Ints) -> Self::Marks;
+    /// `a <= b`, of numbers without a sign.
+    unsafe fn at_most(a: Self::Ints, b: Self::Ints) -> Self::Marks;
+    unsafe fn both(a: Self::Marks, b: Self::Marks) -> Self::Marks;
+    /// A bit a lane.
+    unsafe fn bits(marks: Self::Marks) -> u32;
+    unsafe fn marks(bits: u32) -> Self::Marks;
+    /// `a`, and 1 more where it is marked.
+    unsafe fn one_more(marks: Self::Marks, a: Self::Ints) -> Self::Ints;
+    /// The `at`th numbers of `table`, in lanes that are marked; no others are read.
+    unsafe fn look_up(marks: Self::Marks, table: *const u32, at: Self::Ints) -> Self::Ints;
+    /// Those of `bits` beside each other, from the first lane on.
+    unsafe fn beside(bits: u32, a: Self::Ints) -> Self::Ints;
+    /// The first ones in the lanes of `bits`.
+    unsafe fn spread(bits: u32, a: Self::Ints) -> Self::Ints;
+    /// The first ones of `items`, as many as there are lanes or items; what other lanes hold is not said.
+    unsafe fn bytes(items: &[u8]) -> Self::Ints;
+    /// See [`Lanes::bytes`].
+    unsafe fn shorts(items: &[u16]) -> Self::Ints;
+    /// See [`Lanes::bytes`].
+    unsafe fn floats(items: &[f32]) -> Self::Ints;
+    /// Lane by lane, four numbers of each.
+    unsafe fn store_fours(to: *mut u32, fours: [Self::Ints; 4]);
+    /// Bits `from` to `from + 31` of the sums of `n` and what lies from `at` on.
+    unsafe fn bits_of_sums(n: i64, at: *const i64, from: u32) -> Self::Ints;
+    unsafe fn real(x: f64) -> Self::Reals;
+    unsafe fn reals(at: *const f64) -> Self::Reals;
+    unsafe fn add(a: Self::Reals, b: Self::Reals) -> Self::Reals;
+    unsafe fn mul(a: Self::Reals, b: Self::Reals) -> Self::Reals;
+    unsafe fn div(a: Self::Reals, b: Self::Reals) -> Self::Reals;
+    unsafe fn clamp(a: Self::Reals, most: f64) -> Self::Reals;
+    /// The lower halves of f64s' bits.
+    unsafe fn lower(both: [Self::Reals; 2]) -> Self::Ints;
+}
+
+/// Functions that are compiled for some features.
+macro_rules! with {
+    ($features:literal $(
+        fn $name:ident ($($arg:ident: $ty:ty),*) $(-> $out:ty)? $body:block
+    )*) => {$(
+        #[target_feature(enable = $features)]
+        #[inline]
+        unsafe fn $name ($($arg: $ty),*) $(-> $out)? $body
+    )*};
+}
+
+/// For each byte, in the `i`th of eight bytes, which bit is the `i`th that is set.
+const BESIDE: [u64; 256] = {
+    let mut all = [0; 256];
+    let mut bits = 0;
+    while bits < 256 {
+        let (mut bit, mut count) = (0, 0);
+        while bit < 8 {
+            if bits >> bit & 1 == 1 {
+                all[bits] |= bit << (8 * count);
+                count += 1;
+            }
+            bit += 1;
+        }
+        bits += 1;
+    }
+    all
+};
+
+/// For each byte, in the `i`th of eight bytes, how many bits are set below the `i`th.
+const SPREAD: [u64; 256] = {
+    let mut all = [0; 256];
+    let mut bits = 0;
+    while bits < 256 {
+        let (mut bit, mut count) = (0, 0);
+        while bit < 8 {
+            all[bits] |= count << (8 * bit);
+            count += (bits >> bit & 1) as u64;
+            bit += 1;
+        }
+        bits += 1;
+    }
+    all
+};
+
+/// The first eight of `items`, zeros where there are fewer.
+#[inline(always)]
+fn eight<T: Copy + Default>(items: &[T]) -> [T; 8] {
+    match items.first_chunk() {
+        Some(eight) => *eight,
+        None => {
+            let mut eight = [T::default(); 8];
+            eight[..items.len()].copy_from_slice(items);
+            eight
+        }
+    }
+}
+
+/// Eight lanes, with AVX2.
+pub(super) struct Eight;
+
+impl Eight {
+    /// Lanes of `a` in the order that a table says.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn ordered(order: u64, a: __m256i) -> __m256i {
+        let order = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(order as i64));
+        _mm256_permutevar8x32_epi32(a, order)
+    }
+
+    /// The lower halves of four and four numbers of 64 bits.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn lower_halves(low: __m256i, high: __m256i) -> __m256i {
+        let (low, high) = (_mm256_castsi256_ps(low), _mm256_castsi256_ps(high));
+        let both = _mm256_castps_si256(_mm256_shuffle_ps::<0b10_00_10_00>(low, high));
+        _mm256_permute4x64_epi64::<0b11_01_10_00>(both)
+    }
+}
+
+impl Lanes for Eight {
+    const LANES: usize = 8;
+    type Ints = __m256i;
+    /// All bits of a lane, or none.
+    type Marks = __m256i;
+    type Reals = __m256d;
+
+    with! { "avx2"
+        fn set(n: i32) -> __m256i { _mm256_set1_epi32(n) }
+        fn from(n: i32) -> __m256i {
+            _mm256_add_epi32(_mm256_set1_epi32(n), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7))
+        }
+        fn load(at: *const u32) -> __m256i {
+            // SAFETY: the caller has eight numbers there.
+            unsafe { _mm256_loadu_si256(at.cast()) }
+        }
+        fn store(to: *mut u32, a: __m256i) {
+            // SAFETY: the caller has room for eight there.
+            unsafe { _mm256_storeu_si256(to.cast(), a) }
+        }
+        fn plus(a: __m256i, b: __m256i) -> __m256i { _mm256_add_epi32(a, b) }
+        fn minus(a: __m256i, b: __m256i) -> __m256i { _mm256_sub_epi32(a, b) }
+        fn times(a: __m256i, b: __m256i) -> __m256i { _mm256_mullo_epi32(a, b) }
+        fn and(a: __m256i, b: __m256i) -> __m256i { _mm256_and_si256(a, b) }
+        fn without(a: __m256i, b: __m256i) -> __m256i { _mm256_andnot_si256(a, b) }
+        fn or(a: __m256i, b: __m256i) -> __m256i { _mm256_or_si256(a, b) }
+        fn min(a: __m256i, b: __m256i) -> __m256i { _mm256_min_epi32(a, b) }
+        fn max(a: __m256i, b: __m256i) -> __m256i { _mm256_max_epi32(a, b) }
+        fn up(a: __m256i, bits: u32) -> __m256i { _mm256_sll_epi32(a, _mm_cvtsi32_si128(bits as i32)) }
+        fn down(a: __m256i, bits: u32) -> __m256i { _mm256_sra_epi32(a, _mm_cvtsi32_si128(bits as i32)) }
+        fn up_each(a: __m256i, b: __m256i) -> __m256i { _mm256_sllv_epi32(a, b) }
+        fn less(a: __m256i, b: __m256i) -> __m256i { _mm256_cmpgt_epi32(b, a) }
+        fn at_most(a: __m256i, b: __m256i) -> __m256i {
+            _mm256_cmpeq_epi32(_mm256_min_epu32(a, b), a)
+        }
+        fn both(a: __m256i, b: __m256i) -> __m256i { _mm256_and_si256(a, b) }
+        fn bits(marks: __m256i) -> u32 { _mm256_movemask_ps(_mm256_castsi256_ps(marks)) as u32 }
+        fn marks(bits: u32) -> __m256i {
+            let each = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
+            _mm256_cmpeq_epi32(_mm256_and_si256(_mm256_set1_epi32(bits as i32), each), each)
+        }
+        fn one_more(marks: __m256i, a: __m256i) -> __m256i { _mm256_sub_epi32(a, marks) }
+        fn look_up(marks: __m256i, table: *const u32, at: __m256i) -> __m256i {
+            let zero = _mm256_setzero_si256();
+            // SAFETY: the caller says that the table has what is looked up.
+            unsafe { _mm256_mask_i32gather_epi32::<4>(zero, table.cast(), at, marks) }
+        }
+        fn beside(bits: u32, a: __m256i) -> __m256i { Eight::ordered(BESIDE[bits as usize % 256], a) }
+        fn spread(bits: u32, a: __m256i) -> __m256i { Eight::ordered(SPREAD[bits as usize % 256], a) }
+        fn bytes(items: &[u8]) -> __m256i {
+            _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(i64::from_le_bytes(eight(items))))
+        }
+        fn shorts(items: &[u16]) -> __m256i {
+            // SAFETY: eight numbers are 16 bytes.
+            _mm256_cvtepu16_epi32(unsafe { _mm_loadu_si128(eight(items).as_ptr().cast()) })
+        }
+        fn floats(items: &[f32]) -> __m256i {
+            // SAFETY: eight numbers are 32 bytes.
+            unsafe { _mm256_loadu_si256(eight(items).as_ptr().cast()) }
+        }
+        fn store_fours(to: *mut u32, fours: [__m256i; 4]) {
+            let [a, b, c, d] = fours;
+            let ab = [_mm256_unpacklo_epi32(a, b), _mm256_unpackhi_epi32(a, b)];
+            let cd = [_mm256_unpacklo_epi32(c, d), _mm256_unpackhi_epi32(c, d)];
+            // Lanes 0 and 4, 1 and 5, and so on, one a half.
+            let one = [_mm256_unpacklo_epi64(ab[0], cd[0]), _mm256_unpackhi_epi64(ab[0], cd[0])];
+            let two = [_mm256_unpacklo_epi64(ab[1], cd[1]), _mm256_unpackhi_epi64(ab[1], cd[1])];
+            let ordered = [
+                _mm256_permute2x128_si256::<0x20>(one[0], one[1]),
+                _mm256_permute2x128_si256::<0x20>(two[0], two[1]),
+                _mm256_permute2x128_si256::<0x31>(one[0], one[1]),
+                _mm256_permute2x128_si256::<0x31>(two[0], two[1]),
+            ];
+            for (i, two) in ordered.into_iter().enumerate() {
+                // SAFETY: the caller has room for four times eight numbers.
+                unsafe { _mm256_storeu_si256(to.add(8 * i).cast(), two) };
+            }
+        }
+        fn bits_of_sums(n: i64, at: *const i64, from: u32) -> __m256i {
+            let (n, from) = (_mm256_set1_epi64x(n), _mm_cvtsi32_si128(from as i32));
+            // SAFETY: the caller has eight numbers there.
+            let (low, high) = unsafe {
+                (_mm256_loadu_si256(at.cast()), _mm256_loadu_si256(at.add(4).cast()))
+            };
+            let low = _mm256_srl_epi64(_mm256_add_epi64(n, low), from);
+            let high = _mm256_srl_epi64(_mm256_add_epi64(n, high), from);
+            Eight::lower_halves(low, high)
+        }
+        fn real(x: f64) -> __m256d { _mm256_set1_pd(x) }
+        fn reals(at: *const f64) -> __m256d {
+            // SAFETY: the caller has four numbers there.
+            unsafe { _mm256_loadu_pd(at) }
+        }
+        fn add(a: __m256d, b: __m256d) -> __m256d { _mm256_add_pd(a, b) }
+        fn mul(a: __m256d, b: __m256d) -> __m256d { _mm256_mul_pd(a, b) }
+        fn div(a: __m256d, b: __m256d) -> __m256d { _mm256_div_pd(a, b) }
+        fn clamp(a: __m256d, most: f64) -> __m256d {
+            _mm256_min_pd(_mm256_max_pd(a, _mm256_set1_pd(-most)), _mm256_set1_pd(most))
+        }
+        fn lower(both: [__m256d; 2]) -> __m256i {
+            Eight::lower_halves(_mm256_castpd_si256(both[0]), _mm256_castpd_si256(both[1]))
+        }
+    }
+}
+
+/// Sixteen lanes, with AVX-512.
+pub(super) struct Sixteen;
+
+impl Sixteen {
+    /// A bit for each of the first of sixteen that there are.
+    #[inline(always)]
+    fn there<T>(items: &[T]) -> u16 {
+        ((1u32 << items.len().min(16)) - 1) as u16
+    }
+
+    /// The lower halves of eight and eight numbers of 64 bits.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn lower_halves(low: __m512i, high: __m512i) -> __m512i {
+        let lower = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+        _mm512_permutex2var_epi32(low, lower, high)
+    }
+}
+
+impl Lanes for Sixteen {
+    const LANES: usize = 16;
+    type Ints = __m512i;
+    type Marks = __mmask16;
+    type Reals = __m512d;
+
+    with! { "avx512f,avx512vl,avx512dq,avx512bw"
+        fn set(n: i32) -> __m512i { _mm512_set1_epi32(n) }
+        fn from(n: i32) -> __m512i {
+            let lanes = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+            _mm512_add_epi32(_mm512_set1_epi32(n), lanes)
+        }
+        fn load(at: *const u32) -> __m512i {
+            // SAFETY: the caller has sixteen numbers there.
+            unsafe { _mm512_loadu_si512(at.cast()) }
+        }
+        fn store(to: *mut u32, a: __m512i) {
+            // SAFETY: the caller has room for sixteen there.
+            unsafe { _mm512_storeu_si512(to.cast(), a) }
+        }
+        fn plus(a: __m512i, b: __m512i) -> __m512i { _mm512_add_epi32(a, b) }
+        fn minus(a: __m512i, b: __m512i) -> __m512i { _mm512_sub_epi32(a, b) }
+        fn times(a: __m512i, b: __m512i) -> __m512i { _mm512_mullo_epi32(a, b) }
+        fn and(a: __m512i, b: __m512i) -> __m512i { _mm512_and_si512(a, b) }
+        fn without(a: __m512i, b: __m512i) -> __m512i { _mm512_andnot_si512(a, b) }
+        fn or(a: __m512i, b: __m512i) -> __m512i { _mm512_or_si512(a, b) }
+        fn min(a: __m512i, b: __m512i) -> __m512i { _mm512_min_epi32(a, b) }
+        fn max(a: __m512i, b: __m512i) -> __m512i { _mm512_max_epi32(a, b) }
+        fn up(a: __m512i, bits: u32) -> __m512i { _mm512_sll_epi32(a, _mm_cvtsi32_si128(bits as i32)) }
+        fn down(a: __m512i, bits: u32) -> __m512i { _mm512_sra_epi32(a, _mm_cvtsi32_si128(bits as i32)) }
+        fn up_each(a: __m512i, b: __m512i) -> __m512i { _mm512_sllv_epi32(a, b) }
+        fn less(a: __m512i, b: __m512i) -> __mmask16 { _mm512_cmplt_epi32_mask(a, b) }
+        fn at_most(a: __m512i, b: __m512i) -> __mmask16 { _mm512_cmple_epu32_mask(a, b) }
+        fn both(a: __mmask16, b: __mmask16) -> __mmask16 { a & b }
+        fn bits(marks: __mmask16) -> u32 { marks.into() }
+        fn marks(bits: u32) -> __mmask16 { bits as u16 }
+        fn one_more(marks: __mmask16, a: __m512i) -> __m512i {
+            _mm512_mask_add_epi32(a, marks, a, _mm512_set1_epi32(1))
+        }
+        fn look_up(marks: __mmask16, table: *const u32, at: __m512i) -> __m512i {
+            let zero = _mm512_setzero_si512();
+            // SAFETY: the caller says that the table has what is looked up.
+            unsafe { _mm512_mask_i32gather_epi32::<4>(zero, marks, at, table.cast()) }
+        }
+        fn beside(bits: u32, a: __m512i) -> __m512i { _mm512_maskz_compress_epi32(bits as u16, a) }
+        fn spread(bits: u32, a: __m512i) -> __m512i { _mm512_maskz_expand_epi32(bits as u16, a) }
+        fn bytes(items: &[u8]) -> __m512i {
+            // SAFETY: those that are not there are not read.
+            let items = unsafe { _mm_maskz_loadu_epi8(Sixteen::there(items), items.as_ptr().cast()) };
+            _mm512_cvtepu8_epi32(items)
+        }
+        fn shorts(items: &[u16]) -> __m512i {
+            // SAFETY: as above.
+            let items = unsafe { _mm256_maskz_loadu_epi16(Sixteen::there(items), items.as_ptr().cast()) };
+            _mm512_cvtepu16_epi32(items)
+        }
+        fn floats(items: &[f32]) -> __m512i {
+            // SAFETY: as above.
+            unsafe { _mm512_maskz_loadu_epi32(Sixteen::there(items), items.as_ptr().cast()) }
+        }
+        fn store_fours(to: *mut u32, fours: [__m512i; 4]) {
+            for (i, four) in by_column(fours).into_iter().enumerate() {
+                // SAFETY: the caller has room for four times sixteen numbers.
+                unsafe { _mm512_storeu_si512(to.add(16 * i).cast(), four) };
+            }
+        }
+        fn bits_of_sums(n: i64, at: *const i64, from: u32) -> __m512i {
+            let (n, from) = (_mm512_set1_epi64(n), _mm_cvtsi32_si128(from as i32));
+            // SAFETY: the caller has sixteen numbers there.
+            let (low, high) = unsafe {
+                (_mm512_loadu_si512(at.cast()), _mm512_loadu_si512(at.add(8).cast()))
+            };
+            let low = _mm512_srl_epi64(_mm512_add_epi64(n, low), from);
+            let high = _mm512_srl_epi64(_mm512_add_epi64(n, high), from);
+            Sixteen::lower_halves(low, high)
+        }
+        fn real(x: f64) -> __m512d { _mm512_set1_pd(x) }
+        fn reals(at: *const f64) -> __m512d {
+            // SAFETY: the caller has eight numbers there.
+            unsafe { _mm512_loadu_pd(at) }
+        }
+        fn add(a: __m512d, b: __m512d) -> __m512d { _mm512_add_pd(a, b) }
+        fn mul(a: __m512d, b: __m512d) -> __m512d { _mm512_mul_pd(a, b) }
+        fn div(a: __m512d, b: __m512d) -> __m512d { _mm512_div_pd(a, b) }
+        fn clamp(a: __m512d, most: f64) -> __m512d {
+            _mm512_min_pd(_mm512_max_pd(a, _mm512_set1_pd(-most)), _mm512_set1_pd(most))
+        }
+        fn lower(both: [__m512d; 2]) -> __m512i {
+            Sixteen::lower_halves(_mm512_castpd_si512(both[0]), _mm512_castpd_si512(both[1]))
+        }
+    }
+}

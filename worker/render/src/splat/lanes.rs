@@ -15,8 +15,6 @@ pub(crate) trait Lanes {
     type Ints: Copy;
     /// A yes or no each.
     type Marks: Copy;
-    /// An f64 for every other lane.
-    type Reals: Copy;
 
     unsafe fn set(n: i32) -> Self::Ints;
     /// `n`, `n + 1` and so on.
@@ -64,14 +62,6 @@ pub(crate) trait Lanes {
     unsafe fn store_fours(to: *mut u32, fours: [Self::Ints; 4]);
     /// Bits `from` to `from + 31` of the sums of `n` and what lies from `at` on.
     unsafe fn bits_of_sums(n: i64, at: *const i64, from: u32) -> Self::Ints;
-    unsafe fn real(x: f64) -> Self::Reals;
-    unsafe fn reals(at: *const f64) -> Self::Reals;
-    unsafe fn add(a: Self::Reals, b: Self::Reals) -> Self::Reals;
-    unsafe fn mul(a: Self::Reals, b: Self::Reals) -> Self::Reals;
-    unsafe fn div(a: Self::Reals, b: Self::Reals) -> Self::Reals;
-    unsafe fn clamp(a: Self::Reals, most: f64) -> Self::Reals;
-    /// The lower halves of f64s' bits.
-    unsafe fn lower(both: [Self::Reals; 2]) -> Self::Ints;
 }
 
 /// Functions that are compiled for some features.
@@ -143,15 +133,6 @@ impl Eight {
         let order = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(order as i64));
         _mm256_permutevar8x32_epi32(a, order)
     }
-
-    /// The lower halves of four and four numbers of 64 bits.
-    #[target_feature(enable = "avx2")]
-    #[inline]
-    fn lower_halves(low: __m256i, high: __m256i) -> __m256i {
-        let (low, high) = (_mm256_castsi256_ps(low), _mm256_castsi256_ps(high));
-        let both = _mm256_castps_si256(_mm256_shuffle_ps::<0b10_00_10_00>(low, high));
-        _mm256_permute4x64_epi64::<0b11_01_10_00>(both)
-    }
 }
 
 impl Lanes for Eight {
@@ -159,7 +140,6 @@ impl Lanes for Eight {
     type Ints = __m256i;
     /// All bits of a lane, or none.
     type Marks = __m256i;
-    type Reals = __m256d;
 
     with! { "avx2"
         fn set(n: i32) -> __m256i { _mm256_set1_epi32(n) }
@@ -240,21 +220,10 @@ impl Lanes for Eight {
             };
             let low = _mm256_srl_epi64(_mm256_add_epi64(n, low), from);
             let high = _mm256_srl_epi64(_mm256_add_epi64(n, high), from);
-            Eight::lower_halves(low, high)
-        }
-        fn real(x: f64) -> __m256d { _mm256_set1_pd(x) }
-        fn reals(at: *const f64) -> __m256d {
-            // SAFETY: the caller has four numbers there.
-            unsafe { _mm256_loadu_pd(at) }
-        }
-        fn add(a: __m256d, b: __m256d) -> __m256d { _mm256_add_pd(a, b) }
-        fn mul(a: __m256d, b: __m256d) -> __m256d { _mm256_mul_pd(a, b) }
-        fn div(a: __m256d, b: __m256d) -> __m256d { _mm256_div_pd(a, b) }
-        fn clamp(a: __m256d, most: f64) -> __m256d {
-            _mm256_min_pd(_mm256_max_pd(a, _mm256_set1_pd(-most)), _mm256_set1_pd(most))
-        }
-        fn lower(both: [__m256d; 2]) -> __m256i {
-            Eight::lower_halves(_mm256_castpd_si256(both[0]), _mm256_castpd_si256(both[1]))
+            // The lower halves.
+            let (low, high) = (_mm256_castsi256_ps(low), _mm256_castsi256_ps(high));
+            let both = _mm256_castps_si256(_mm256_shuffle_ps::<0b10_00_10_00>(low, high));
+            _mm256_permute4x64_epi64::<0b11_01_10_00>(both)
         }
     }
 }
@@ -268,21 +237,12 @@ impl Sixteen {
     fn there<T>(items: &[T]) -> u16 {
         ((1u32 << items.len().min(16)) - 1) as u16
     }
-
-    /// The lower halves of eight and eight numbers of 64 bits.
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    fn lower_halves(low: __m512i, high: __m512i) -> __m512i {
-        let lower = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
-        _mm512_permutex2var_epi32(low, lower, high)
-    }
 }
 
 impl Lanes for Sixteen {
     const LANES: usize = 16;
     type Ints = __m512i;
     type Marks = __mmask16;
-    type Reals = __m512d;
 
     with! { "avx512f,avx512vl,avx512dq,avx512bw"
         fn set(n: i32) -> __m512i { _mm512_set1_epi32(n) }
@@ -352,21 +312,9 @@ impl Lanes for Sixteen {
             };
             let low = _mm512_srl_epi64(_mm512_add_epi64(n, low), from);
             let high = _mm512_srl_epi64(_mm512_add_epi64(n, high), from);
-            Sixteen::lower_halves(low, high)
-        }
-        fn real(x: f64) -> __m512d { _mm512_set1_pd(x) }
-        fn reals(at: *const f64) -> __m512d {
-            // SAFETY: the caller has eight numbers there.
-            unsafe { _mm512_loadu_pd(at) }
-        }
-        fn add(a: __m512d, b: __m512d) -> __m512d { _mm512_add_pd(a, b) }
-        fn mul(a: __m512d, b: __m512d) -> __m512d { _mm512_mul_pd(a, b) }
-        fn div(a: __m512d, b: __m512d) -> __m512d { _mm512_div_pd(a, b) }
-        fn clamp(a: __m512d, most: f64) -> __m512d {
-            _mm512_min_pd(_mm512_max_pd(a, _mm512_set1_pd(-most)), _mm512_set1_pd(most))
-        }
-        fn lower(both: [__m512d; 2]) -> __m512i {
-            Sixteen::lower_halves(_mm512_castpd_si512(both[0]), _mm512_castpd_si512(both[1]))
+            // The lower halves.
+            let lower = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+            _mm512_permutex2var_epi32(low, lower, high)
         }
     }
 }

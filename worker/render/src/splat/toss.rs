@@ -1,12 +1,10 @@
 //! Sifting: which voxels of a brick are wanted in a part, and all that drawing those takes.
 //!
 //! Voxels are placed, in a flat view by an addition, tested against the part's sheets and one bit of
-//! its mask, and those that are left put beside each other. With AVX2 that is done for eight local
-//! indices at a time, present or not, with AVX-512 for sixteen, and what is not wanted never gets out
-//! of the registers; elsewhere in loops over plain arrays, one for each step.
+//! its mask, and those that are left put beside each other. With AVX-512 that is done for sixteen local
+//! indices at a time, present or not, with AVX2 in flat views for eight, and what is not wanted never
+//! gets out of the registers; elsewhere in loops over plain arrays, one for each step.
 
-#[cfg(target_arch = "x86_64")]
-use super::lanes::Lanes;
 use super::records::Splat;
 use super::{Level, Simd};
 use crate::footprint::{Phases, Sections};
@@ -24,12 +22,6 @@ pub(crate) trait Placing {
     const KEPT: bool;
     /// The places of voxels with these local indices.
     fn all(&self, index: &[u16], at: &mut [[i32; 512]; 3]);
-    /// The same of as many as there are lanes, from `local` on.
-    ///
-    /// # Safety
-    /// For machines with the instructions of `L`.
-    #[cfg(target_arch = "x86_64")]
-    unsafe fn some<L: Lanes>(&self, local: usize) -> [L::Ints; 3];
 }
 
 /// In a flat view, from the part's corner and the front of some sheet.
@@ -62,13 +54,6 @@ impl Placing for FlatBrick<'_> {
     fn all(&self, index: &[u16], at: &mut [[i32; 512]; 3]) {
         self.places.all(self.from, index, at);
     }
-
-    #[cfg(target_arch = "x86_64")]
-    #[inline(always)]
-    unsafe fn some<L: Lanes>(&self, local: usize) -> [L::Ints; 3] {
-        // SAFETY: the caller's.
-        unsafe { wide::flat::<L>(self, local) }
-    }
 }
 
 impl Placing for DeepBrick<'_> {
@@ -84,13 +69,6 @@ impl Placing for DeepBrick<'_> {
             to_y[i] = round_i32((y * scale + self.middle[1]).clamp(-FAR, FAR));
             to_z[i] = self.view.depth_in_phases(z);
         }
-    }
-
-    #[cfg(target_arch = "x86_64")]
-    #[inline(always)]
-    unsafe fn some<L: Lanes>(&self, local: usize) -> [L::Ints; 3] {
-        // SAFETY: the caller's.
-        unsafe { wide::deep::<L>(self, local) }
     }
 }
 
@@ -237,20 +215,6 @@ pub(crate) fn any_in_rows(
 }
 
 impl<P: Placing> Sieve<'_, P> {
-    /// Sifts the voxels of `brick` into `tossing`.
-    #[inline(always)]
-    pub(crate) fn sift(&self, simd: Simd, brick: &Brick, tossing: &mut Tossing) -> Sifted {
-        match simd.0 {
-            // SAFETY: the value proves that the instructions are there.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe { wide::avx512::sift(self, brick, tossing) },
-            // SAFETY: as above.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => unsafe { wide::avx2::sift(self, brick, tossing) },
-            Level::Plain => self.sift_plain(brick, tossing),
-        }
-    }
-
     /// Puts place or local index, first sheet, cell, sample and normal of those that are kept beside each
     /// other.
     #[inline(always)]
@@ -290,7 +254,35 @@ impl<P: Placing> Sieve<'_, P> {
     }
 }
 
+impl Sieve<'_, DeepBrick<'_>> {
+    /// Sifts the voxels of `brick` into `tossing`.
+    #[inline(always)]
+    pub(crate) fn sift(&self, simd: Simd, brick: &Brick, tossing: &mut Tossing) -> Sifted {
+        match simd.0 {
+            // SAFETY: the value proves that the instructions are there.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => unsafe { wide::avx512::sift(self, brick, tossing) },
+            // Four divisions at a time are too few to place voxels that are not there, too.
+            _ => self.sift_plain(brick, tossing),
+        }
+    }
+}
+
 impl Sieve<'_, FlatBrick<'_>> {
+    /// Sifts the voxels of `brick` into `tossing`.
+    #[inline(always)]
+    fn sift(&self, simd: Simd, brick: &Brick, tossing: &mut Tossing) -> Sifted {
+        match simd.0 {
+            // SAFETY: the value proves that the instructions are there.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => unsafe { wide::avx512::sift(self, brick, tossing) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe { wide::avx2::sift(self, brick, tossing) },
+            Level::Plain => self.sift_plain(brick, tossing),
+        }
+    }
+
     /// Sifts the voxels of `brick`, and packs those that are kept. `phases`: where weights across and down
     /// lie.
     #[inline(always)]
@@ -363,6 +355,7 @@ mod wide {
     use slabcast_common::shade::NO_NORMAL;
     use slabcast_common::view::{MAGIC, SUBPIXEL_BITS, SUBPIXELS};
     use slabcast_common::volume::Samples;
+    use std::arch::x86_64::*;
 
     /// What is compiled for an instruction set: every function that these call is inlined into them.
     macro_rules! compiled {
@@ -372,7 +365,7 @@ mod wide {
 
                 /// [`Sieve::sift_plain`].
                 #[target_feature(enable = $features)]
-                pub(in super::super) fn sift<P: Placing>(
+                pub(in super::super) fn sift<P: Placed<$lanes>>(
                     sieve: &Sieve<'_, P>,
                     brick: &Brick,
                     tossing: &mut Tossing,
@@ -405,72 +398,87 @@ mod wide {
     compiled!(avx2, "avx2,popcnt,lzcnt,bmi1,bmi2", Eight);
     compiled!(avx512, "avx512f,avx512vl,avx512dq,avx512bw,popcnt,lzcnt,bmi1,bmi2", Sixteen);
 
-    /// Places in a flat view.
-    ///
-    /// # Safety
-    /// For machines with the instructions of `L`, as are all of these.
-    #[inline(always)]
-    pub(super) unsafe fn flat<L: Lanes>(places: &FlatBrick<'_>, local: usize) -> [L::Ints; 3] {
-        let [x, y, z] = places.places.offsets().each_ref();
-        let at = [x, y, z].map(|of| of[local..local + L::LANES].as_ptr());
-        let [x, y, z] = places.from;
-        // SAFETY: so many there are.
-        unsafe {
-            [
-                L::bits_of_sums(x, at[0], FINER_BITS),
-                L::bits_of_sums(y, at[1], FINER_BITS),
-                L::bits_of_sums(z, at[2], FINER_BITS),
-            ]
+    /// Places in lanes.
+    pub(super) trait Placed<L: Lanes>: Placing {
+        /// Those of voxels from `local` on.
+        ///
+        /// # Safety
+        /// For machines with the instructions of `L`, as are all functions here.
+        unsafe fn some(&self, local: usize) -> [L::Ints; 3];
+    }
+
+    impl<L: Lanes> Placed<L> for FlatBrick<'_> {
+        #[inline(always)]
+        unsafe fn some(&self, local: usize) -> [L::Ints; 3] {
+            let [x, y, z] = self.places.offsets().each_ref();
+            let at = [x, y, z].map(|of| of[local..local + L::LANES].as_ptr());
+            let [x, y, z] = self.from;
+            // SAFETY: so many there are.
+            unsafe {
+                [
+                    L::bits_of_sums(x, at[0], FINER_BITS),
+                    L::bits_of_sums(y, at[1], FINER_BITS),
+                    L::bits_of_sums(z, at[2], FINER_BITS),
+                ]
+            }
         }
     }
 
-    /// Eye coordinates along `axis`, in halves.
-    #[inline(always)]
-    unsafe fn eye<L: Lanes>(places: &DeepBrick<'_>, axis: usize, local: usize) -> [L::Reals; 2] {
-        let at = places.offsets[axis][local..local + L::LANES].as_ptr();
-        // SAFETY: so many there are.
-        unsafe {
-            let corner = L::real(places.corner[axis]);
-            let behind = at.add(L::LANES / 2);
-            [L::add(corner, L::reals(at)), L::add(corner, L::reals(behind))]
+    impl Placed<Sixteen> for DeepBrick<'_> {
+        #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+        #[inline]
+        unsafe fn some(&self, local: usize) -> [__m512i; 3] {
+            deep(self, local)
         }
     }
 
-    /// [`slabcast_common::view::round_i32`].
-    #[inline(always)]
-    unsafe fn round<L: Lanes>(both: [L::Reals; 2]) -> L::Ints {
-        // SAFETY: the caller's.
-        unsafe {
-            let magic = L::real(MAGIC);
-            L::lower([L::add(both[0], magic), L::add(both[1], magic)])
-        }
+    /// [`slabcast_common::view::round_i32`] of sixteen numbers.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn round(both: [__m512d; 2]) -> __m512i {
+        let lower = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+        let magic = _mm512_set1_pd(MAGIC);
+        let [low, high] = both;
+        let low = _mm512_castpd_si512(_mm512_add_pd(low, magic));
+        let high = _mm512_castpd_si512(_mm512_add_pd(high, magic));
+        _mm512_permutex2var_epi32(low, lower, high)
     }
 
     /// Places in perspective.
-    #[inline(always)]
-    pub(super) unsafe fn deep<L: Lanes>(places: &DeepBrick<'_>, local: usize) -> [L::Ints; 3] {
-        // SAFETY: the caller's.
-        unsafe {
-            let x = eye::<L>(places, 0, local);
-            let y = eye::<L>(places, 1, local);
-            let mut z = eye::<L>(places, 2, local);
-            let (mut across, mut down) = (x, y);
-            let thickness = places.view.thickness;
-            for half in 0..2 {
-                let depth = L::add(z[half], L::real(places.distance));
-                let scale = L::div(L::real(places.per_depth), depth);
-                let at = L::add(L::mul(x[half], scale), L::real(places.middle[0]));
-                across[half] = L::clamp(at, FAR);
-                let at = L::add(L::mul(y[half], scale), L::real(places.middle[1]));
-                down[half] = L::clamp(at, FAR);
-                // A division by one changes nothing and is slow.
-                if thickness != 1.0 {
-                    z[half] = L::div(z[half], L::real(thickness));
-                }
-                z[half] = L::mul(z[half], L::real(f64::from(places.view.depth_phases())));
-            }
-            [round::<L>(across), round::<L>(down), round::<L>(z)]
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn deep(places: &DeepBrick<'_>, local: usize) -> [__m512i; 3] {
+        let mut eye = [[_mm512_setzero_pd(); 2]; 3];
+        for (axis, eye) in eye.iter_mut().enumerate() {
+            let at = places.offsets[axis][local..].first_chunk::<16>();
+            let at = at.expect("sixteen of a brick").as_ptr();
+            let corner = _mm512_set1_pd(places.corner[axis]);
+            // SAFETY: sixteen numbers are 128 bytes.
+            let both = unsafe { [_mm512_loadu_pd(at), _mm512_loadu_pd(at.add(8))] };
+            *eye = [_mm512_add_pd(corner, both[0]), _mm512_add_pd(corner, both[1])];
         }
+        let [x, y, z] = eye;
+        let [mut across, mut down, mut deep] = [[_mm512_setzero_pd(); 2]; 3];
+        for half in 0..2 {
+            let depth = _mm512_add_pd(z[half], _mm512_set1_pd(places.distance));
+            let scale = _mm512_div_pd(_mm512_set1_pd(places.per_depth), depth);
+            for (to, (from, middle)) in
+                [(&mut across, (x, places.middle[0])), (&mut down, (y, places.middle[1]))]
+            {
+                let at = _mm512_add_pd(_mm512_mul_pd(from[half], scale), _mm512_set1_pd(middle));
+                let at = _mm512_max_pd(at, _mm512_set1_pd(-FAR));
+                to[half] = _mm512_min_pd(at, _mm512_set1_pd(FAR));
+            }
+            // A division by one changes nothing and is slow.
+            let thickness = places.view.thickness;
+            deep[half] = z[half];
+            if thickness != 1.0 {
+                deep[half] = _mm512_div_pd(z[half], _mm512_set1_pd(thickness));
+            }
+            let phases = _mm512_set1_pd(f64::from(places.view.depth_phases()));
+            deep[half] = _mm512_mul_pd(deep[half], phases);
+        }
+        [round(across), round(down), round(deep)]
     }
 
     /// [`super::move_inside`]: first pixels, and where weights begin.
@@ -521,7 +529,6 @@ mod wide {
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
     pub(super) fn any_in_rows(rows: &[u64; 64], [begin, end]: [usize; 2], columns: u64) -> bool {
-        use std::arch::x86_64::*;
         let (rows, columns) = (&rows[begin..end], _mm512_set1_epi64(columns as i64));
         let mut any = 0;
         for rows in rows.chunks(8) {
@@ -564,7 +571,7 @@ mod wide {
     }
 
     #[inline(always)]
-    unsafe fn voxels<L: Lanes, T: Wide, P: Placing>(
+    unsafe fn voxels<L: Lanes, T: Wide, P: Placed<L>>(
         sieve: &Sieve<'_, P>,
         brick: &Brick,
         values: &[T],
@@ -587,7 +594,7 @@ mod wide {
                 let local = 64 * group + L::LANES * part;
                 // SAFETY: the caller's, and what is said below.
                 let mark = unsafe {
-                    let [x, y, z] = places.some::<L>(local);
+                    let [x, y, z] = places.some(local);
                     // In the slab's sheets, and near enough to the part.
                     let first = L::down(L::minus(z, L::set(front)), shift);
                     let behind = L::down(L::plus(z, L::set(back)), shift);

@@ -3,8 +3,9 @@
 //!
 //! A voxel's weights are put side by side by column and slot, and by row and slot
 //! ([`Recorded::weave`]), so that all its sections are added to a pixel's record at once
-//! ([`Recorded::splat_deep`]). With AVX-512 both happen in registers, where windows are at most [`LINE`]
-//! pixels wide.
+//! ([`Recorded::splat_deep`]). With AVX2 and AVX-512, where windows are at most [`LINE`] pixels wide, what
+//! lies in a window is worked out for many voxels at once (`lines`), and weights are put side by side
+//! in registers.
 
 use super::{BySlot, MOST, Record, Recorded, RowAt, STRIDE, Table};
 use crate::splat::Simd;
@@ -128,9 +129,9 @@ pub(super) fn splat_apart<S: Recorded, const N: usize>(
 #[cfg(target_arch = "x86_64")]
 pub(super) mod lines {
     use super::{Apart, BATCH, Each, LINE, Layers};
+    use crate::splat::lanes::Lanes;
     use crate::splat::records::Recorded;
     use crate::tile::PART;
-    use std::arch::x86_64::*;
 
     /// Columns and rows that the windows of all voxels fit which are added; columns a multiple of the step.
     #[inline(always)]
@@ -160,61 +161,52 @@ pub(super) mod lines {
     }
 
     impl<'a, W> Lines<'a, W> {
-        /// Those of the first `n` voxels, for windows that are moved inside to be `wide` columns, and of any
-        /// number of rows.
+        /// Those of the first `n` voxels, for windows that begin at multiples of `step` and are moved inside to
+        /// be `wide` columns, and of any number of rows.
         ///
         /// # Panics
         /// If there are not four slots.
-        #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-        #[inline]
-        pub(crate) fn new<S: Recorded<Weight = W>, const N: usize>(
+        ///
+        /// # Safety
+        /// For machines with the instructions of `L`.
+        #[inline(always)]
+        pub(crate) unsafe fn new<L: Lanes, S: Recorded<Weight = W>, const N: usize>(
             apart: &Apart,
             layers: &Layers<'a, S, N>,
             n: usize,
-            (axis, wide): (usize, usize),
+            (axis, wide, step): (usize, usize, i32),
         ) -> Lines<'a, W> {
-            let load = |from: &[i32]| -> __m512i {
-                let from = from.first_chunk::<16>().expect("sixteen voxels");
-                // SAFETY: sixteen numbers are 64 bytes.
-                unsafe { _mm512_loadu_si512(from.as_ptr().cast()) }
-            };
-            let [zero, one, line] = [0, 1, LINE as i32].map(|n| _mm512_set1_epi32(n));
             let (present, at) = ([[0; BATCH]; 4], [[0; BATCH]; 4]);
             let mut lines = Lines { present, at, weights: [&[]; 4] };
             for slot in 0..4 {
                 let table = &layers.across[axis][slot];
                 lines.weights[slot] = table.weights;
                 let last = table.weights.len().checked_sub(table.len).expect("a row of the table");
-                let last = _mm512_set1_epi32(last.min(i32::MAX as usize) as i32);
-                let len = _mm512_set1_epi32(table.len.min(i32::MAX as usize) as i32);
-                for i in (0..n.min(BATCH)).step_by(16) {
-                    let mut lo = load(&apart.lo[axis][i..]);
-                    if axis == 0 {
-                        let most = _mm512_set1_epi32(PART - wide as i32);
-                        lo = _mm512_and_si512(lo, _mm512_set1_epi32(-S::STEP));
-                        lo = _mm512_min_epi32(lo, most);
-                    }
-                    let column = _mm512_sub_epi32(load(&apart.first[axis][slot][i..]), lo);
-                    // From a footprint's first pixel to behind its last, of those that are looked at.
-                    // In sheets that a voxel does not reach there may be some: its section is nothing there.
-                    let begin = _mm512_min_epi32(_mm512_max_epi32(column, zero), line);
-                    let end = _mm512_add_epi32(column, len);
-                    let end = _mm512_min_epi32(_mm512_max_epi32(end, zero), line);
-                    let bits = _mm512_sub_epi32(
-                        _mm512_sllv_epi32(one, end),
-                        _mm512_sllv_epi32(one, begin),
-                    );
-                    // SAFETY: sixteen numbers are 64 bytes.
-                    let from = unsafe {
-                        _mm512_loadu_si512(apart.from[axis][slot][i..][..16].as_ptr().cast())
-                    };
-                    let from = _mm512_sub_epi32(_mm512_min_epu32(from, last), column);
-                    let bits_to = &mut lines.present[slot][i..][..16];
-                    let from_to = &mut lines.at[slot][i..][..16];
-                    // SAFETY: sixteen numbers are 64 bytes.
+                let [last, len] = [last, table.len].map(|n| n.min(i32::MAX as usize) as i32);
+                for i in (0..n.min(BATCH)).step_by(L::LANES) {
+                    let some = i..i + L::LANES;
+                    let lo = apart.lo[axis][some.clone()].as_ptr().cast();
+                    let first = apart.first[axis][slot][some.clone()].as_ptr().cast();
+                    let from = apart.from[axis][slot][some.clone()].as_ptr();
+                    let bits_to = lines.present[slot][some.clone()].as_mut_ptr();
+                    let from_to = lines.at[slot][some].as_mut_ptr().cast();
+                    // SAFETY: as many lanes as there are begin at each.
                     unsafe {
-                        _mm512_storeu_si512(bits_to.as_mut_ptr().cast(), bits);
-                        _mm512_storeu_si512(from_to.as_mut_ptr().cast(), from);
+                        let mut lo = L::load(lo);
+                        if axis == 0 {
+                            lo = L::min(L::and(lo, L::set(-step)), L::set(PART - wide as i32));
+                        }
+                        let column = L::minus(L::load(first), lo);
+                        // From a footprint's first pixel to behind its last, of those that are looked at. In
+                        // sheets that a voxel does not reach there may be some: its section is nothing there.
+                        let (zero, one, line) = (L::set(0), L::set(1), L::set(LINE as i32));
+                        let begin = L::min(L::max(column, zero), line);
+                        let end = L::min(L::max(L::plus(column, L::set(len)), zero), line);
+                        let bits = L::minus(L::up_each(one, end), L::up_each(one, begin));
+                        L::store(bits_to, bits);
+                        // Begins are below 2^31.
+                        let from = L::min(L::load(from), L::set(last));
+                        L::store(from_to, L::minus(from, column));
                     }
                 }
             }
@@ -227,6 +219,26 @@ pub(super) mod lines {
         pub(crate) fn of(&self, slot: usize, i: usize) -> (u32, *const W) {
             let from = self.weights[slot].as_ptr();
             (self.present[slot][i], from.wrapping_offset(self.at[slot][i] as isize))
+        }
+
+        /// The same, and [`LINE`] weights from that of the first pixel on, where the table has them all.
+        #[inline(always)]
+        pub(crate) fn around(&self, slot: usize, i: usize) -> (u32, Option<&'a [W; LINE]>) {
+            let around = usize::try_from(self.at[slot][i]).ok();
+            let around = around.and_then(|at| self.weights[slot].get(at..)?.first_chunk());
+            (self.present[slot][i], around)
+        }
+
+        /// One by one, what is not present zero.
+        pub(crate) fn one_by_one(&self, slot: usize, i: usize) -> [W; LINE]
+        where
+            W: Copy + Default,
+        {
+            std::array::from_fn(|j| {
+                let is_present = self.present[slot][i] >> j & 1 == 1;
+                let at = self.at[slot][i] + j as i32;
+                if is_present { self.weights[slot][at as usize] } else { W::default() }
+            })
         }
     }
 }

@@ -26,10 +26,13 @@ macro_rules! by_width {
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx2 {
     use crate::sheet::{LANES, Row};
-    use crate::splat::Tap;
+    use crate::splat::lanes::{Eight, Lanes as _};
+    use crate::splat::records::apart::lines::{self, Lines};
+    use crate::splat::records::apart::{self, Apart, BATCH, LINE, Layers, Woven};
     use crate::splat::records::{
-        Across, BySlot, MOST, Record, RowAt, STRIDE, STRIP, Splat, Strip, Tables,
+        Across, BySlot, MOST, Record, Recorded as _, RowAt, STRIDE, STRIP, Splat, Strip, Tables,
     };
+    use crate::splat::{Simd, Tap};
     use std::arch::x86_64::*;
 
     /// Registers of a record at most: eight sums each.
@@ -150,24 +153,32 @@ pub(super) mod avx2 {
                 *line =
                     unsafe { _mm256_maskload_ps(from.cast(), _mm256_and_si256(behind, before)) };
             }
-            let low =
-                [_mm256_unpacklo_ps(lines[0], lines[1]), _mm256_unpacklo_ps(lines[2], lines[3])];
-            let high =
-                [_mm256_unpackhi_ps(lines[0], lines[1]), _mm256_unpackhi_ps(lines[2], lines[3])];
-            // Columns 0 and 4, 1 and 5, and so on.
-            let pairs = [
-                _mm256_shuffle_ps::<0b01_00_01_00>(low[0], low[1]),
-                _mm256_shuffle_ps::<0b11_10_11_10>(low[0], low[1]),
-                _mm256_shuffle_ps::<0b01_00_01_00>(high[0], high[1]),
-                _mm256_shuffle_ps::<0b11_10_11_10>(high[0], high[1]),
-            ];
-            let (low, high) = to.split_at_mut(4);
-            for (i, pair) in pairs.into_iter().enumerate() {
-                // SAFETY: four taps are four floats, 16 bytes; no weight is negative.
-                unsafe {
-                    _mm_storeu_ps(low[i].as_mut_ptr().cast(), _mm256_castps256_ps128(pair));
-                    _mm_storeu_ps(high[i].as_mut_ptr().cast(), _mm256_extractf128_ps::<1>(pair));
-                }
+            by_column(lines, to.as_flattened_mut());
+        }
+    }
+
+    /// Four rows of eight columns, written column by column.
+    ///
+    /// # Panics
+    /// If there is not room for as many.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn by_column(lines: [__m256; 4], to: &mut [Tap]) {
+        let low = [_mm256_unpacklo_ps(lines[0], lines[1]), _mm256_unpacklo_ps(lines[2], lines[3])];
+        let high = [_mm256_unpackhi_ps(lines[0], lines[1]), _mm256_unpackhi_ps(lines[2], lines[3])];
+        // Columns 0 and 4, 1 and 5, and so on.
+        let pairs = [
+            _mm256_shuffle_ps::<0b01_00_01_00>(low[0], low[1]),
+            _mm256_shuffle_ps::<0b11_10_11_10>(low[0], low[1]),
+            _mm256_shuffle_ps::<0b01_00_01_00>(high[0], high[1]),
+            _mm256_shuffle_ps::<0b11_10_11_10>(high[0], high[1]),
+        ];
+        let (low, high) = to[..32].as_chunks_mut::<4>().0.split_at_mut(4);
+        for (i, pair) in pairs.into_iter().enumerate() {
+            // SAFETY: four taps are four floats, 16 bytes; no weight is negative.
+            unsafe {
+                _mm_storeu_ps(low[i].as_mut_ptr().cast(), _mm256_castps256_ps128(pair));
+                _mm_storeu_ps(high[i].as_mut_ptr().cast(), _mm256_extractf128_ps::<1>(pair));
             }
         }
     }
@@ -224,6 +235,118 @@ pub(super) mod avx2 {
                         let sums = _mm256_loadu_si256(at.add(i));
                         let sums = _mm256_add_epi32(sums, _mm256_cvttps_epi32(add));
                         _mm256_storeu_si256(at.add(i), sums);
+                    }
+                }
+            }
+        }
+    }
+
+    /// [`apart::splat_apart`].
+    #[target_feature(enable = "avx2")]
+    pub(in super::super) fn splat_apart<const N: usize>(
+        simd: Simd,
+        records: &mut [Record<i32, N>],
+        (apart, payloads): (&Apart, &[[f32; 4]]),
+        layers: &Layers<'_, i32, N>,
+        woven: &mut Woven<Tap, N>,
+    ) {
+        let [wide, high] = lines::most(apart, &apart.kept[..payloads.len()], i32::STEP);
+        if N != 4 || wide > LINE || high > LINE {
+            return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
+        }
+        let at = (records, (apart, payloads), layers);
+        match wide {
+            0..=6 => side_by_side::<6, N>(at),
+            7 => side_by_side::<7, N>(at),
+            8 => side_by_side::<8, N>(at),
+            9 => side_by_side::<9, N>(at),
+            10 => side_by_side::<10, N>(at),
+            11 | 12 => side_by_side::<12, N>(at),
+            13 | 14 => side_by_side::<14, N>(at),
+            _ => side_by_side::<16, N>(at),
+        }
+    }
+
+    /// Weights of voxel `i` in four slots, pixel by pixel, of at least the first `n` pixels.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn line(lines: &Lines<'_, Tap>, i: usize, n: usize, to: &mut [Tap; 64]) {
+        for (eight, to) in to.as_chunks_mut::<32>().0.iter_mut().take(n.div_ceil(8)).enumerate() {
+            let mut slots = [_mm256_setzero_ps(); 4];
+            for (slot, line) in slots.iter_mut().enumerate() {
+                let (present, from) = lines.of(slot, i);
+                // SAFETY: these are the instructions. A tap is a float; lanes that are not present are not
+                // read, and those that are lie in the table.
+                unsafe {
+                    let present = Eight::marks(present >> (8 * eight));
+                    *line = _mm256_maskload_ps(from.wrapping_add(8 * eight).cast(), present);
+                }
+            }
+            by_column(slots, to);
+        }
+    }
+
+    /// What [`splat_apart`] is called with, in one.
+    type ApartAt<'a, const N: usize> =
+        (&'a mut [Record<i32, N>], (&'a Apart, &'a [[f32; 4]]), &'a Layers<'a, i32, N>);
+
+    /// Windows of `WIDE` columns.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn side_by_side<const WIDE: usize, const N: usize>(
+        (records, (apart, payloads), layers): ApartAt<'_, N>,
+    ) {
+        let (half, zero) = (_mm256_set1_ps(0.5), _mm256_setzero_ps());
+        let kept = &apart.kept[..payloads.len()];
+        let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
+        // SAFETY: these are the instructions.
+        let (across, down) = unsafe {
+            (
+                Lines::new::<Eight, _, N>(apart, layers, n, (0, WIDE, i32::STEP)),
+                Lines::new::<Eight, _, N>(apart, layers, n, (1, 0, 1)),
+            )
+        };
+        let [mut columns, mut rows] = [[Tap::default(); 64]; 2];
+        for (&i, payload) in kept.iter().zip(payloads) {
+            let i = i as usize % BATCH;
+            let ([x, y], [_, high]) = apart.window(i, i32::STEP);
+            let x = lines::inside(x, WIDE);
+            let z = &layers.deep.weights[apart.deep[i] as usize..][..apart.left[i] as usize];
+            let mut deep = [0.0; 4];
+            for (sheet, &w) in z.iter().enumerate() {
+                deep[(layers.slot + sheet) % 4] = w;
+            }
+            // SAFETY: four floats are 16 bytes.
+            let payload = unsafe { _mm_loadu_ps(payload.as_ptr()) };
+            let payload = _mm256_set_m128(payload, payload);
+            let wz = spread::<4>(&deep);
+            let mut sections = [zero; 2];
+            for two in 0..2 {
+                // Negative sections there are none.
+                sections[two] = _mm256_max_ps(_mm256_mul_ps(payload, wz[two]), zero);
+            }
+            line(&across, i, WIDE, &mut columns);
+            line(&down, i, high, &mut rows);
+            let mut wx = [[zero; 2]; WIDE];
+            for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<4>().0) {
+                let [low, high, ..] = spread::<4>(&w.map(Tap::get));
+                *wx = [low, high];
+            }
+            let of_rows = records[y * STRIDE + x..].chunks_mut(STRIDE).zip(rows.as_chunks::<4>().0);
+            for (row, wy) in of_rows.take(high) {
+                let [low, high, ..] = spread::<4>(&wy.map(Tap::get));
+                let of_row = [_mm256_mul_ps(sections[0], low), _mm256_mul_ps(sections[1], high)];
+                let row = row.first_chunk_mut::<WIDE>().expect("a window inside the part");
+                for c in 0..WIDE {
+                    let at: *mut __m256i = row[c].as_mut_ptr().cast();
+                    for two in 0..2 {
+                        let add = _mm256_add_ps(_mm256_mul_ps(of_row[two], wx[c][two]), half);
+                        // SAFETY: eight sums are 32 bytes, and borrowed for us alone.
+                        unsafe {
+                            let sums = _mm256_loadu_si256(at.add(two));
+                            let sums = _mm256_add_epi32(sums, _mm256_cvttps_epi32(add));
+                            _mm256_storeu_si256(at.add(two), sums);
+                        }
                     }
                 }
             }
@@ -356,6 +479,7 @@ pub(super) mod avx2 {
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx512 {
     use super::avx2::At;
+    use crate::splat::lanes::Sixteen;
     use crate::splat::records::apart::lines::{self, Lines};
     use crate::splat::records::apart::{self, Apart, BATCH, LINE, Layers, Woven};
     use crate::splat::records::{
@@ -596,8 +720,13 @@ pub(super) mod avx512 {
         let turn = _mm512_and_si512(turn, _mm512_set1_epi32(3));
         let kept = &apart.kept[..payloads.len()];
         let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
-        let across = Lines::new(apart, layers, n, (0, WIDE));
-        let down = Lines::new(apart, layers, n, (1, 0));
+        // SAFETY: these are the instructions.
+        let (across, down) = unsafe {
+            (
+                Lines::new::<Sixteen, _, N>(apart, layers, n, (0, WIDE, i32::STEP)),
+                Lines::new::<Sixteen, _, N>(apart, layers, n, (1, 0, 1)),
+            )
+        };
         for (&i, payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
             let ([x, y], [_, high]) = apart.window(i, i32::STEP);

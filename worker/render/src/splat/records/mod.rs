@@ -405,7 +405,12 @@ impl Recorded for i16 {
             Level::Avx512 => unsafe {
                 short::avx512::splat_apart(simd, records, voxels, layers, woven);
             },
-            _ => apart::splat_apart(simd, records, voxels, layers, woven),
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe {
+                short::avx2::splat_apart(simd, records, voxels, layers, woven);
+            },
+            Level::Plain => apart::splat_apart(simd, records, voxels, layers, woven),
         }
     }
 
@@ -483,7 +488,12 @@ impl Recorded for i32 {
             Level::Avx512 => unsafe {
                 long::avx512::splat_apart(simd, records, voxels, layers, woven);
             },
-            _ => apart::splat_apart(simd, records, voxels, layers, woven),
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe {
+                long::avx2::splat_apart(simd, records, voxels, layers, woven);
+            },
+            Level::Plain => apart::splat_apart(simd, records, voxels, layers, woven),
         }
     }
 

@@ -3,6 +3,10 @@
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx2 {
     use crate::sheet::{LANES, Row};
+    use crate::splat::Simd;
+    use crate::splat::lanes::Eight;
+    use crate::splat::records::apart::lines::{self, Lines};
+    use crate::splat::records::apart::{self, Apart, BATCH, LINE, Layers, Woven};
     use crate::splat::records::{
         Across, BySlot, MOST, Record, RowAt, STRIDE, STRIP, Splat, Strip, Tables,
     };
@@ -211,6 +215,110 @@ pub(super) mod avx2 {
         }
     }
 
+    /// [`apart::splat_apart`].
+    #[target_feature(enable = "avx2")]
+    pub(in super::super) fn splat_apart<const N: usize>(
+        simd: Simd,
+        records: &mut [Record<i16, N>],
+        (apart, payloads): (&Apart, &[u64]),
+        layers: &Layers<'_, i16, N>,
+        woven: &mut Woven<i16, N>,
+    ) {
+        let [wide, high] = lines::most(apart, &apart.kept[..payloads.len()], 1);
+        if N != 4 || wide > LINE || high > LINE {
+            return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
+        }
+        let at = (records, (apart, payloads), layers);
+        match wide {
+            0..=6 => side_by_side::<6, N>(at),
+            7 => side_by_side::<7, N>(at),
+            8 => side_by_side::<8, N>(at),
+            9 => side_by_side::<9, N>(at),
+            10 => side_by_side::<10, N>(at),
+            11 | 12 => side_by_side::<12, N>(at),
+            13 | 14 => side_by_side::<14, N>(at),
+            _ => side_by_side::<16, N>(at),
+        }
+    }
+
+    /// Weights of voxel `i` in four slots, pixel by pixel.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn line(lines: &Lines<'_, i16>, i: usize, to: &mut [i16; 64]) {
+        const { assert!(LINE == 16) };
+        let each = _mm256_setr_epi16(
+            1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, -32768,
+        );
+        let mut slots = [_mm256_setzero_si256(); 4];
+        for (slot, line) in slots.iter_mut().enumerate() {
+            let (present, around) = lines.around(slot, i);
+            *line = match around {
+                Some(around) => {
+                    // SAFETY: sixteen weights are 32 bytes.
+                    let around = unsafe { _mm256_loadu_si256(around.as_ptr().cast()) };
+                    let present = _mm256_and_si256(_mm256_set1_epi16(present as i16), each);
+                    _mm256_and_si256(around, _mm256_cmpeq_epi16(present, each))
+                }
+                // SAFETY: as above.
+                None => unsafe { _mm256_loadu_si256(lines.one_by_one(slot, i).as_ptr().cast()) },
+            };
+        }
+        by_column(slots, to);
+    }
+
+    /// What [`splat_apart`] is called with, in one.
+    type ApartAt<'a, const N: usize> =
+        (&'a mut [Record<i16, N>], (&'a Apart, &'a [u64]), &'a Layers<'a, i16, N>);
+
+    /// Windows of `WIDE` columns.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn side_by_side<const WIDE: usize, const N: usize>(
+        (records, (apart, payloads), layers): ApartAt<'_, N>,
+    ) {
+        let zero = _mm256_setzero_si256();
+        let [turn, _] = turns::<N>(layers.slot);
+        let kept = &apart.kept[..payloads.len()];
+        let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
+        // SAFETY: these are the instructions.
+        let (across, down) = unsafe {
+            (
+                Lines::new::<Eight, _, N>(apart, layers, n, (0, WIDE, 1)),
+                Lines::new::<Eight, _, N>(apart, layers, n, (1, 0, 1)),
+            )
+        };
+        let [mut columns, mut rows] = [[0; 64]; 2];
+        for (&i, &payload) in kept.iter().zip(payloads) {
+            let i = i as usize % BATCH;
+            let ([x, y], [_, high]) = apart.window(i, 1);
+            let x = lines::inside(x, WIDE);
+            let z = &layers.deep.weights[apart.deep[i] as usize..][..apart.left[i] as usize];
+            let deep: [i16; 4] = match z.first_chunk() {
+                Some(four) => *four,
+                None => std::array::from_fn(|sheet| z.get(sheet).copied().unwrap_or(0)),
+            };
+            // SAFETY: four weights are 8 bytes.
+            let z = _mm256_broadcastsi128_si256(unsafe { _mm_loadl_epi64(deep.as_ptr().cast()) });
+            let section = _mm256_set1_epi64x(payload as i64);
+            let section = _mm256_mulhrs_epi16(section, _mm256_shuffle_epi8(z, turn));
+            line(&across, i, &mut columns);
+            line(&down, i, &mut rows);
+            let mut wx = [zero; WIDE];
+            for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<4>().0) {
+                [*wx, _] = spread::<4>(w);
+            }
+            let of_rows = records[y * STRIDE + x..].chunks_mut(STRIDE).zip(rows.as_chunks::<4>().0);
+            for (row, wy) in of_rows.take(high) {
+                let [wy, _] = spread::<4>(wy);
+                let section = _mm256_mulhrs_epi16(section, wy);
+                let row = row.first_chunk_mut::<WIDE>().expect("a window inside the part");
+                for c in 0..WIDE {
+                    add::<N>(&mut row[c], &[section, zero], &[wx[c], zero]);
+                }
+            }
+        }
+    }
+
     #[target_feature(enable = "avx2")]
     #[inline]
     fn columns<const C: usize, const N: usize>(
@@ -350,6 +458,7 @@ pub(super) mod avx512 {
     use super::avx2::{by_column, sixteen, turned};
     use crate::sheet::Row;
     use crate::splat::Simd;
+    use crate::splat::lanes::Sixteen;
     use crate::splat::records::apart::lines::{self, Lines};
     use crate::splat::records::apart::{self, Apart, BATCH, LINE, Layers, Woven};
     use crate::splat::records::{
@@ -611,8 +720,13 @@ pub(super) mod avx512 {
         let row = words(|lane| lane / 4 % N * LINE);
         let kept = &apart.kept[..payloads.len()];
         let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
-        let across = Lines::new(apart, layers, n, (0, 2 * U));
-        let down = Lines::new(apart, layers, n, (1, 0));
+        // SAFETY: these are the instructions.
+        let (across, down) = unsafe {
+            (
+                Lines::new::<Sixteen, _, N>(apart, layers, n, (0, 2 * U, i16::STEP)),
+                Lines::new::<Sixteen, _, N>(apart, layers, n, (1, 0, 1)),
+            )
+        };
         for (&i, &payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
             let ([x, y], [_, high]) = apart.window(i, i16::STEP);

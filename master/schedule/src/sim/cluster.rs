@@ -15,6 +15,7 @@ use slabcast_common::message::{
 use slabcast_common::occlusion::Rect;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::trace::{RegionTile, Trace};
+use std::borrow::Cow;
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -98,14 +99,12 @@ impl Task {
 }
 
 /// What a trace says of a task.
-struct Known {
+struct Known<'a> {
     ns: u64,
     lease_bytes: u64,
     result_bytes: u64,
-    /// Of a region: places of the bricks that it is drawn from.
-    touched: Vec<u32>,
-    /// Of a region: blocks whose bricks it looks at.
-    opened: Vec<u32>,
+    /// Of a region: with the places of the bricks that it is drawn from, and blocks whose bricks it looks at.
+    region: Cow<'a, RegionTile>,
 }
 
 /// A thread that has nothing to draw.
@@ -116,13 +115,12 @@ struct Idle {
     heard: Option<Nanos>,
 }
 
-struct Running {
+struct Running<'a> {
     lease: Task,
     /// What of its time is not the tile itself: tables, and blocks.
     tables: Nanos,
     blocks: Nanos,
-    /// Of a region.
-    touched: Vec<u32>,
+    region: Cow<'a, RegionTile>,
     stood: Option<Nanos>,
     received: Nanos,
     ready: Nanos,
@@ -134,7 +132,7 @@ struct Running {
     pixels: Nanos,
 }
 
-struct Worker {
+struct Worker<'a> {
     down: Pipe,
     up: Pipe,
     /// What receives and sends.
@@ -145,12 +143,13 @@ struct Worker {
     heard: Nanos,
     /// What that took of a core that a render thread had.
     stolen: Nanos,
-    present: BTreeSet<(BrickSetKey, BrickId)>,
+    /// Whether it has a brick, by its place in the jobs' list of its set.
+    present: BTreeMap<BrickSetKey, Vec<bool>>,
     leases: VecDeque<(Task, Nanos)>,
     /// Bricks that regions asked for, and since when regions stand still.
     asked: BTreeSet<(BrickSetKey, BrickId)>,
     stands: BTreeMap<(TaskId, Epoch), Nanos>,
-    running: Vec<Option<Running>>,
+    running: Vec<Option<Running<'a>>>,
     idle: Vec<Idle>,
     /// When its tables of a frame are made.
     tables: BTreeMap<FrameId, Nanos>,
@@ -168,7 +167,7 @@ struct World<'a> {
     scheduler: Scheduler,
     coming: BTreeMap<(Nanos, u64), Coming>,
     order: u64,
-    workers: BTreeMap<WorkerId, Worker>,
+    workers: BTreeMap<WorkerId, Worker<'a>>,
     down: Pipe,
     up: Pipe,
     inbox: Vec<Event>,
@@ -252,6 +251,8 @@ pub fn run(
         worker_work: 0,
     };
     let mut took = Took::default();
+    let present: BTreeMap<BrickSetKey, Vec<bool>> =
+        jobs.iter().map(|j| (j.scene.bricks, vec![false; j.bricks.len()])).collect();
     for id in 1..=u64::from(cluster.workers) {
         let worker = Worker {
             down: Pipe::new(bandwidth),
@@ -261,7 +262,7 @@ pub fn run(
             wrote: 0,
             heard: 0,
             stolen: 0,
-            present: BTreeSet::new(),
+            present: present.clone(),
             leases: VecDeque::new(),
             asked: BTreeSet::new(),
             stands: BTreeMap::new(),
@@ -313,7 +314,7 @@ pub fn run(
     Ok((w.outcome, took))
 }
 
-impl World<'_> {
+impl<'a> World<'a> {
     fn now(&self) -> Nanos {
         self.clock.0.get()
     }
@@ -499,10 +500,10 @@ impl World<'_> {
                 let w = self.workers.get_mut(&id).expect("a worker stays");
                 w.under_way -= 1;
                 let count = bricks.len() as u32;
-                for b in bricks {
+                for &b in &bricks {
                     w.asked.remove(&(set, b));
-                    w.present.insert((set, b));
                 }
+                self.have(id, set, &bricks, true);
                 self.batches(id, now);
                 self.up(id, Event::BricksIn { worker: id, set, bricks: count }, SMALL, at);
                 self.begin(id, None)?;
@@ -569,10 +570,7 @@ impl World<'_> {
                 self.up(id, pong, SMALL, at);
             }
             ToWorker::DropBricks { set, bricks } => {
-                let w = self.workers.get_mut(&id).expect("a worker stays");
-                for b in bricks {
-                    w.present.remove(&(set, b));
-                }
+                self.have(id, set, &bricks, false);
             }
             _ => {
                 self.read(id, FRAME);
@@ -582,9 +580,10 @@ impl World<'_> {
     }
 
     /// What is known of a task.
-    fn known(&self, task: &Task) -> Result<Known, Unknown> {
+    fn known(&self, task: &Task) -> Result<Known<'a>, Unknown> {
         let frame = task.frame().0 as usize - 1;
-        let (size, traced) = (self.trace.about.size, &self.trace.frames[frame]);
+        let trace: &'a Trace = self.trace;
+        let (size, traced) = (trace.about.size, &trace.frames[frame]);
         let known = match task {
             Task::Slab(l) => {
                 let slab = traced.slab(l.slab);
@@ -592,15 +591,14 @@ impl World<'_> {
                     ns: t.ns,
                     lease_bytes: t.lease_bytes.into(),
                     result_bytes: t.result_bytes.into(),
-                    touched: Vec::new(),
-                    opened: Vec::new(),
+                    region: Cow::Owned(RegionTile::default()),
                 })
             }
-            Task::Region(l) => traced.region(&l.tile, size).map(|t| {
+            Task::Region(l) => traced.region(&l.tile, size).map(|region| {
                 // A bit or so for each touched brick, and the cost's other figures.
-                let result_bytes = u64::from(t.result_bytes) + 20 + t.touched.len() as u64;
-                let RegionTile { ns, touched, opened, .. } = t.into_owned();
-                Known { ns, lease_bytes: SMALL, result_bytes, touched, opened }
+                let result_bytes =
+                    u64::from(region.result_bytes) + 20 + region.touched.len() as u64;
+                Known { ns: region.ns, lease_bytes: SMALL, result_bytes, region }
             }),
         };
         known.ok_or_else(|| {
@@ -609,18 +607,29 @@ impl World<'_> {
         })
     }
 
+    /// A worker has these bricks from now on, or has them no longer.
+    fn have(&mut self, id: WorkerId, set: BrickSetKey, bricks: &[BrickId], there: bool) {
+        let Some(job) = self.jobs.iter().find(|j| j.scene.bricks == set) else { return };
+        let w = self.workers.get_mut(&id).expect("a worker stays");
+        let present = w.present.get_mut(&set).expect("a set of a job");
+        for brick in bricks {
+            if let Ok(place) = job.bricks.binary_search_by_key(brick, |b| b.id) {
+                present[place] = there;
+            }
+        }
+    }
+
     /// The bricks at these places of a frame's set that a worker lacks.
     fn lacks(&self, id: WorkerId, frame: FrameId, places: &[u32]) -> Vec<BrickId> {
         let job = &self.jobs[frame.0 as usize - 1];
-        let set = job.scene.bricks;
-        let names = places.iter().filter_map(|&p| job.bricks.get(p as usize)).map(|b| b.id);
-        let present = &self.workers[&id].present;
-        names.filter(|b| !present.contains(&(set, *b))).collect()
+        let present = &self.workers[&id].present[&job.scene.bricks];
+        let lacks = places.iter().filter(|&&p| present.get(p as usize) == Some(&false));
+        lacks.map(|&p| job.bricks[p as usize].id).collect()
     }
 
     /// The first task in the queue whose bricks are there. Regions before it that lack some ask for
     /// them: a thread has come to them, and takes another meanwhile.
-    fn take(&mut self, id: WorkerId) -> Result<Option<(Task, Nanos, Known)>, Unknown> {
+    fn take(&mut self, id: WorkerId) -> Result<Option<(Task, Nanos, Known<'a>)>, Unknown> {
         let now = self.now();
         for i in 0..self.workers[&id].leases.len() {
             let w = &self.workers[&id];
@@ -630,13 +639,15 @@ impl World<'_> {
             let known = self.known(task)?;
             let lacks = match task {
                 Task::Slab(l) => {
-                    let here = |b: &BrickId| w.present.contains(&(set, *b));
+                    let all = &self.jobs[frame.0 as usize - 1].bricks;
+                    let place = |b: &BrickId| all.binary_search_by_key(b, |b| b.id).ok();
+                    let here = |b| place(b).is_some_and(|i| w.present[&set][i]);
                     if !l.bricks.iter().all(here) {
                         continue;
                     }
                     Vec::new()
                 }
-                Task::Region(_) => self.lacks(id, frame, &known.touched),
+                Task::Region(_) => self.lacks(id, frame, &known.region.touched),
             };
             let w = self.workers.get_mut(&id).expect("a worker stays");
             if lacks.is_empty() {
@@ -686,7 +697,7 @@ impl World<'_> {
             let w = self.workers.get_mut(&id).expect("a worker stays");
             // Its threads share what they looked at.
             let known_of = w.opened.entry(frame).or_default();
-            let fresh = known.opened.iter().filter(|b| known_of.insert(**b)).count();
+            let fresh = known.region.opened.iter().filter(|b| known_of.insert(**b)).count();
             let blocks = traced.block_ns.saturating_mul(fresh as u64);
             let ns = known.ns.saturating_add(blocks);
             // The first tile of a frame makes its tables; others wait for them.
@@ -704,14 +715,14 @@ impl World<'_> {
             };
             let w = self.workers.get_mut(&id).expect("a worker stays");
             let stood = w.stands.remove(&lease.name()).map(|since| now - since);
-            let Known { result_bytes, touched, .. } = known;
+            let Known { result_bytes, region, .. } = known;
             let (ready, start) = (now, now);
             let (tables, blocks) = (made.saturating_sub(now), (blocks as f64 * stretch) as Nanos);
             let running = Running {
                 lease,
                 tables,
                 blocks,
-                touched,
+                region,
                 stood,
                 received,
                 ready,
@@ -754,7 +765,7 @@ impl World<'_> {
                     a.resize(tile.area(), 0.0);
                 }
                 region = Some(RegionCost {
-                    touched: r.touched,
+                    touched: r.region.into_owned().touched,
                     stalls: u32::from(r.stood.is_some()),
                     parked_us: micros(r.stood.unwrap_or(0)),
                     ..RegionCost::default()

@@ -935,7 +935,7 @@ impl Driver {
         frame: FrameId,
         state: Box<slabcast_common::image::FrameState>,
         stats: Box<FrameStats>,
-        spans: Vec<slabcast_schedule::Span>,
+        spans: slabcast_schedule::Spans,
     ) {
         let Some(flight) = self.flights.get(&frame) else { return };
         let Some(r) = self.running.get(&flight.job) else {

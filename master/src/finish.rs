@@ -15,7 +15,7 @@ use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::stats::{BrickStats, ErrorStats, FrameStats, LeftOut};
 use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::Digest32;
-use slabcast_schedule::Span;
+use slabcast_schedule::{Span, Spans};
 use slabcast_volumes::BrickStore;
 use std::sync::Arc;
 
@@ -29,7 +29,7 @@ pub(crate) struct FrameSums {
     pub(crate) view: View,
     pub(crate) state: Box<FrameState>,
     pub(crate) stats: Box<FrameStats>,
-    pub(crate) spans: Vec<Span>,
+    pub(crate) spans: Spans,
     /// Where its bricks come from.
     pub(crate) store: Option<Arc<BrickStore>>,
     /// Nobody drew it.
@@ -186,7 +186,7 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
         format: finish.format,
         bytes: bytes.into(),
         stats_json: serde_json::to_string(&stats).unwrap_or_default(),
-        trace_json: s.request.want_trace.then(|| chrome_trace(&s.spans, s.job, s.frame)),
+        trace_json: s.request.want_trace.then(|| chrome_trace(&s.spans.told(), s.job, s.frame)),
         stats,
     }
 }

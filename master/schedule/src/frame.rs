@@ -23,7 +23,7 @@ use crate::macrotile::{self, Cut, LEAF, LEVELS};
 use crate::queue::{End, Queue, Verdict};
 use crate::region::{Crew, Regions};
 use crate::residency::{Errand, Flight};
-use crate::{Action, Clock, Cluster, FrameJob, Micros, Span};
+use crate::{Action, Clock, Cluster, FrameJob, Micros, Span, spans};
 use slabcast_common::brick::BrickGrid;
 use slabcast_common::ids::{BrickId, Epoch, TaskId, WorkerId};
 use slabcast_common::image::{FrameState, TilePixels};
@@ -132,6 +132,10 @@ pub(crate) struct Frame {
     /// When the next region may be taken from an owner that is silent, while a thread is idle.
     forborne: Option<Micros>,
     needed_ever: Vec<bool>,
+    /// Bricks among them, and their voxels.
+    needed: (u64, u64),
+    /// Voxels of all bricks.
+    relevant: u64,
     any_result: bool,
     last_reason: String,
     pub(crate) ledger: Ledger,
@@ -172,8 +176,6 @@ impl Frame {
         clock: &dyn Clock,
     ) -> Self {
         let began = clock.now();
-        let ascending = job.bricks.windows(2).all(|w| w[0].id < w[1].id);
-        assert!(ascending, "a job's bricks ascend by id");
         let (view, by_region) = (&job.view, goes_by_region(&job));
         let mut projected = Vec::new();
         let slabs = if by_region {
@@ -204,6 +206,8 @@ impl Frame {
             outlived: None,
             forborne: None,
             needed_ever: vec![false; job.bricks.len()],
+            needed: (0, 0),
+            relevant: cluster.residency.voxels(job.scene.bricks),
             any_result: false,
             last_reason: String::new(),
             ledger,
@@ -275,7 +279,7 @@ impl Frame {
                 self.ledger.counters.culled += u64::from(self.job.bricks[i].voxels);
                 continue;
             }
-            self.needed_ever[i] = true;
+            note_needed(&mut self.needed_ever, &mut self.needed, &self.job, i);
             needed.push(i as u32);
             rects.push(p.rect);
         }
@@ -335,7 +339,7 @@ impl Frame {
         }
         let tile = |task: &crate::queue::Task| {
             let (worker, us) = match &task.end {
-                End::Done { worker, render_us } => (worker.clone(), *render_us),
+                End::Done { worker, render_us } => (worker.to_string(), *render_us),
                 End::Open | End::Poisoned => (String::new(), 0),
             };
             TileStats {
@@ -526,11 +530,15 @@ impl Frame {
         let slab = self.slab.as_ref()?;
         let lent = self.lent.get(&id).into_iter().flatten();
         let mine: Vec<u32> = lent.filter_map(|l| slab.queue.place(l.task)).collect();
-        let others = |task: &crate::queue::Task| {
-            let refused_it = |id| task.failed.iter().any(|(w, ..)| *w == id);
-            cluster.roster.staying().any(|(other, _)| other != id && !refused_it(other))
-        };
-        slab.queue.next_for(id, &mine, among, others, suits)
+        slab.queue.next_for(id, &mine, among, |task| could_have(cluster, task, id), suits)
+    }
+
+    /// The same among those that are its own.
+    fn next_own(&self, cluster: &Cluster, id: WorkerId, own: &[u32]) -> Option<u32> {
+        let slab = self.slab.as_ref()?;
+        let lent = self.lent.get(&id).into_iter().flatten();
+        let mine: Vec<u32> = lent.filter_map(|l| slab.queue.place(l.task)).collect();
+        slab.queue.next_among(id, &mine, own, |task| could_have(cluster, task, id))
     }
 
     /// Lends tasks of a slab.
@@ -623,6 +631,10 @@ impl Frame {
         };
         let all_threads = cluster.roster.threads();
         let (takers, orphans): (Vec<(WorkerId, u64)>, bool) = match turn.only {
+            // Most of the frames in the making have nothing for it.
+            Some(id) if orphaning.is_empty() && !queue.any_waits(regions.owned(id)) => {
+                (Vec::new(), false)
+            }
             Some(id) if orphaning.is_empty() => {
                 let worker = cluster.roster.get(id).filter(|w| !w.leaving && room(id, w));
                 (worker.map(|w| (id, u64::from(w.threads))).into_iter().collect(), false)
@@ -659,11 +671,17 @@ impl Frame {
                         break;
                     }
                     let Some(Slab { regions: Some(regions), .. }) = &self.slab else { break };
-                    let own = |place| {
-                        let owner = regions.owner(place);
-                        owner == id || orphans && orphaning.contains(&owner)
+                    let next = if orphans {
+                        let own = |place| {
+                            let owner = regions.owner(place);
+                            owner == id || orphaning.contains(&owner)
+                        };
+                        self.next(cluster, id, own, |_| true)
+                    } else {
+                        self.next_own(cluster, id, regions.owned(id))
                     };
-                    let Some(place) = self.next(cluster, id, own, |_| true) else { break };
+                    let Some(place) = next else { break };
+                    let Some(Slab { regions: Some(regions), .. }) = &self.slab else { break };
                     us += regions.took(place).unwrap_or(f64::INFINITY);
                     self.give(cluster, place, id, now);
                     leases.push((id, place));
@@ -814,7 +832,9 @@ impl Frame {
         let lent = self.lent.get_mut(&worker)?;
         let at = lent.iter().position(|l| l.task == task && l.epoch == epoch)?;
         let lent = lent.remove(at);
-        cluster.residency.unpin(worker, &lent.bricks);
+        if !lent.bricks.is_empty() {
+            cluster.residency.unpin(worker, &lent.bricks);
+        }
         cluster.roster.ends(worker, 1);
         Some(lent)
     }
@@ -907,27 +927,24 @@ impl Frame {
         if let (Some(regions), Some(cost)) = (&slab.regions, cost) {
             drawn_from = cost.touched.len();
             for &i in &cost.touched {
-                self.needed_ever[i as usize] = true;
+                note_needed(&mut self.needed_ever, &mut self.needed, &self.job, i as usize);
             }
             self.ledger.stalled(worker, cost);
             cluster.residency.touched(self.job.scene.bricks, &cost.touched);
             let whose = (worker, regions.home(place, worker, &cluster.roster));
             cluster.memory.learn(regions, &tile, whose, end - start, &cost.touched);
         }
-        self.ledger.spans.push(Span {
-            name: format!("{},{}", tile.x0, tile.y0),
-            category: "tile",
-            worker: Some(who.name.clone()),
+        self.ledger.spans.tile(spans::Tile {
+            corner: [tile.x0, tile.y0],
+            worker: who.name.clone(),
             thread,
             start,
             end,
-            args: vec![
-                ("slab", self.at.to_string()),
-                ("edge", slab.cut.edge.to_string()),
-                ("est", slab.cut.tiles[place as usize].est.to_string()),
-                ("bricks", drawn_from.to_string()),
-                ("attempt", result.epoch.0.to_string()),
-            ],
+            slab: self.at,
+            edge: slab.cut.edge,
+            est: slab.cut.tiles[place as usize].est,
+            bricks: drawn_from,
+            attempt: result.epoch.0,
         });
         slab.queue.finish(place, End::Done { worker: who.name.clone(), render_us: end - start });
         self.progress(cluster);
@@ -1093,7 +1110,7 @@ impl Frame {
                 cluster.roster.ends(id, lent.len() as u64);
                 busy.insert(id);
             }
-            for lent in lent {
+            for lent in lent.iter().filter(|l| !l.bricks.is_empty()) {
                 cluster.residency.unpin(id, &lent.bricks);
             }
         }
@@ -1122,11 +1139,8 @@ impl Frame {
         }
         let mut bricks =
             BrickStats { relevant: self.job.bricks.len() as u64, ..BrickStats::default() };
-        for (info, _) in self.job.bricks.iter().zip(&self.needed_ever).filter(|(_, n)| **n) {
-            bricks.needed += 1;
-            bricks.needed_voxels += u64::from(info.voxels);
-        }
-        let relevant = self.job.bricks.iter().map(|b| u64::from(b.voxels)).sum();
+        (bricks.needed, bricks.needed_voxels) = self.needed;
+        let relevant = self.relevant;
         let quality = self.job.scene.quality;
         let schedule = if self.by_region() { Schedule::Region } else { Schedule::Slab };
         let (stats, spans) =
@@ -1164,6 +1178,12 @@ pub(crate) fn carry(
     }
 }
 
+/// Whether somebody else than this worker could draw a task.
+fn could_have(cluster: &Cluster, task: &crate::queue::Task, id: WorkerId) -> bool {
+    let refused_it = |id| task.failed.iter().any(|(w, ..)| *w == id);
+    cluster.roster.staying().any(|(other, _)| other != id && !refused_it(other))
+}
+
 /// Puts a lease on the books of workers and bricks.
 fn lend(
     cluster: &mut Cluster,
@@ -1175,8 +1195,10 @@ fn lend(
 ) -> Lent {
     cluster.roster.lends(id);
     let bricks = slab.bricks_of(place);
-    cluster.residency.pin(id, &bricks);
-    cluster.residency.want(id, bricks.iter().copied());
+    if !bricks.is_empty() {
+        cluster.residency.pin(id, &bricks);
+        cluster.residency.want(id, bricks.iter().copied());
+    }
     Lent { task: slab.queue.id(place), epoch, sent: now, bricks }
 }
 
@@ -1246,6 +1268,13 @@ fn check_cost(cost: Option<&RegionCost>, tile: Rect, bricks: usize) -> Result<()
     match beyond {
         Some(i) => Err(format!("a result touched brick {i} of {bricks}")),
         None => Ok(()),
+    }
+}
+
+/// A brick of a frame is needed: once each is counted.
+fn note_needed(ever: &mut [bool], needed: &mut (u64, u64), job: &FrameJob, place: usize) {
+    if !std::mem::replace(&mut ever[place], true) {
+        *needed = (needed.0 + 1, needed.1 + u64::from(job.bricks[place].voxels));
     }
 }
 

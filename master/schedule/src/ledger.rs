@@ -8,7 +8,8 @@
 use crate::critical::{Path, Piece};
 use crate::residency::Flight;
 use crate::roster::Worker;
-use crate::{Micros, Span};
+use crate::spans::Flown;
+use crate::{Micros, Span, Spans};
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::ids::WorkerId;
 use slabcast_common::message::{Counters, RegionCost, Sampling, TaskTimes};
@@ -18,6 +19,10 @@ use slabcast_common::stats::{
     PoisonedTile, SlabStats, VoxelStats, WorkerStats,
 };
 use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// Stretches of time that there is room for at once: tiles and flights of 64 workers.
+const SPANS: usize = 512;
 
 /// Times `[start, end)` on the master's clock.
 type Interval = (Micros, Micros);
@@ -25,7 +30,7 @@ type Interval = (Micros, Micros);
 /// One worker's part.
 #[derive(Debug)]
 struct Account {
-    name: String,
+    name: Arc<str>,
     threads: u32,
     from: Micros,
     until: Option<Micros>,
@@ -55,7 +60,7 @@ pub(crate) struct Ledger {
     sampled: Sampling,
     result_bytes: Option<u64>,
     pub(crate) slabs: Vec<SlabStats>,
-    pub(crate) spans: Vec<Span>,
+    pub(crate) spans: Spans,
     pub(crate) retries: u64,
     pub(crate) dropped_results: u64,
     pub(crate) poisoned: Vec<PoisonedTile>,
@@ -95,7 +100,7 @@ impl Ledger {
             sampled: Sampling::default(),
             result_bytes: None,
             slabs: Vec::new(),
-            spans: Vec::new(),
+            spans: Spans::with_room(SPANS),
             retries: 0,
             dropped_results: 0,
             poisoned: Vec::new(),
@@ -106,7 +111,7 @@ impl Ledger {
     /// A phase of the frame ended: what these tiles say of its critical path.
     pub(crate) fn phase(&mut self, pieces: &[Piece], began: Micros) {
         let accounts = &self.accounts;
-        let name = |id| accounts.get(&id).map_or_else(String::new, |a| a.name.clone());
+        let name = |id| accounts.get(&id).map_or_else(String::new, |a| a.name.to_string());
         self.path.phase(pieces, began, name);
     }
 
@@ -183,15 +188,8 @@ impl Ledger {
         let Some(a) = self.accounts.get_mut(&id) else { return };
         let start = flight.since.max(self.began).min(now);
         a.flights.push((start, now));
-        self.spans.push(Span {
-            name: format!("{} bricks", flight.bricks),
-            category: "bricks",
-            worker: Some(a.name.clone()),
-            thread: 0,
-            start,
-            end: now,
-            args: vec![("bytes", flight.bytes.to_string())],
-        });
+        let Flight { bricks, bytes, .. } = flight;
+        self.spans.bricks(Flown { worker: a.name.clone(), start, end: now, bricks, bytes });
     }
 
     pub(crate) fn holds(&mut self, id: WorkerId, held: (u64, u64)) {
@@ -209,7 +207,7 @@ impl Ledger {
         relevant_voxels: u64,
         bricks: BrickStats,
         now: Micros,
-    ) -> (FrameStats, Vec<Span>) {
+    ) -> (FrameStats, Spans) {
         let flights = union(self.accounts.values().flat_map(|a| &a.flights).copied().collect());
         let renders = union(self.accounts.values().flat_map(|a| &a.renders).copied().collect());
         let mut workers: Vec<_> = self
@@ -219,7 +217,7 @@ impl Ledger {
                 let present = a.until.unwrap_or(now).saturating_sub(a.from);
                 let threads_us = present.saturating_mul(u64::from(a.threads));
                 WorkerStats {
-                    id: a.name,
+                    id: a.name.to_string(),
                     render_ms: ms(a.render_us),
                     distribute_ms: ms(length(&union(a.flights))),
                     p2p_ms: ms(a.p2p_us),

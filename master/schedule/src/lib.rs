@@ -55,10 +55,12 @@ mod region;
 mod residency;
 mod roster;
 pub mod sim;
+mod spans;
 mod traffic;
 
 pub use borders::slabs;
 pub use frame::is_shut;
+pub use spans::Spans;
 
 use frame::{Frame, Step, Turn, carry, goes_by_region};
 use region::Memory;
@@ -299,7 +301,7 @@ pub enum Action {
         /// What it cost. Both hashes, `left_out` and `error` are for the master to fill in.
         stats: Box<FrameStats>,
         /// What happened when, by the end of each.
-        spans: Vec<Span>,
+        spans: Spans,
     },
     /// A frame can't be rendered: every tile that was tried was given up.
     FrameFailed {
@@ -791,7 +793,7 @@ impl Scheduler {
             let (bricks_held, bytes_held) = self.cluster.residency.held(id);
             WorkerView {
                 id,
-                name: w.name.clone(),
+                name: w.name.to_string(),
                 threads: w.threads,
                 bricks_held,
                 bytes_held,

@@ -179,14 +179,37 @@ pub fn cut_through(
     (wanted, many): (u64, u64),
     forced: Option<u32>,
 ) -> Cut {
-    const PART: usize = 2;
-    let to_render = |n: &Node| n.covered > 0;
-    let tree = tree(covered_leaves(size, rects));
-    let level = forced_level(forced)
-        .or_else(|| coarsest(&tree, &to_render, many).filter(|&level| level >= PART))
-        .or_else(|| coarsest(&tree, &to_render, wanted).map(|level| level.min(PART)))
-        .unwrap_or(0);
-    list(size, &tree[level], level, &to_render, |_| false)
+    Through::new(size, rects).cut((wanted, many), forced)
+}
+
+/// What [`cut_through`] cuts, for who wants to know more of it.
+pub(crate) struct Through {
+    size: [u32; 2],
+    tree: Vec<Grid<Node>>,
+}
+
+impl Through {
+    pub(crate) fn new(size: [u32; 2], rects: &[Rect]) -> Self {
+        Through { size, tree: tree(covered_leaves(size, rects)) }
+    }
+
+    /// How many tiles of this edge are to be rendered.
+    pub(crate) fn count(&self, edge: u32) -> usize {
+        let level = forced_level(Some(edge)).unwrap_or(0);
+        self.tree[level].cells.iter().filter(|n| n.covered > 0).count()
+    }
+
+    /// See [`cut_through`].
+    pub(crate) fn cut(&self, (wanted, many): (u64, u64), forced: Option<u32>) -> Cut {
+        const PART: usize = 2;
+        let to_render = |n: &Node| n.covered > 0;
+        let tree = &self.tree;
+        let level = forced_level(forced)
+            .or_else(|| coarsest(tree, &to_render, many).filter(|&level| level >= PART))
+            .or_else(|| coarsest(tree, &to_render, wanted).map(|level| level.min(PART)))
+            .unwrap_or(0);
+        list(self.size, &tree[level], level, &to_render, |_| false)
+    }
 }
 
 /// Levels of the quadtree above these leaves.
@@ -225,7 +248,8 @@ fn covered_leaves(size: [u32; 2], rects: &[Rect]) -> Grid<Node> {
             over.cells[y * over.columns + x] += add;
         }
     }
-    let picture = Rect::of_size(size);
+    // Leaves are whole but for those at the right and at the bottom.
+    let part = |i: usize, n: u32| u64::from((n - i as u32 * LEAF).min(LEAF));
     let mut grid = Grid::new(columns, rows, Node::default());
     let mut above = vec![0; columns];
     for y in 0..rows {
@@ -234,9 +258,7 @@ fn covered_leaves(size: [u32; 2], rects: &[Rect]) -> Grid<Node> {
             run += over.cells[y * over.columns + x];
             *above += run;
             if *above > 0 {
-                let (x0, y0) = (x as i32 * LEAF as i32, y as i32 * LEAF as i32);
-                let leaf = Rect::new(x0, y0, x0 + LEAF as i32, y0 + LEAF as i32);
-                let pixels = leaf.intersect(&picture).area() as u64;
+                let pixels = part(x, size[0]) * part(y, size[1]);
                 grid.cells[y * columns + x] = Node { covered: pixels, open: pixels };
             }
         }
@@ -348,6 +370,21 @@ impl Cut {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn pixels_of_leaves_at_the_border_are_counted_as_the_picture_cuts_them() {
+        for size in [[64, 64], [70, 33], [16, 100], [17, 1]] {
+            let picture = Rect::of_size(size);
+            let through = Through::new(size, &[picture]);
+            let [columns, rows] = size.map(|n| n.div_ceil(LEAF) as usize);
+            assert_eq!(through.count(LEAF), columns * rows);
+            for edge in [16, 32, 64] {
+                let cut = through.cut((0, 0), Some(edge));
+                assert_eq!(cut.tiles.len(), through.count(edge));
+                assert!(cut.tiles.iter().all(|t| t.est == t.rect.area() as u64), "{size:?}");
+            }
+        }
+    }
     use proptest::prelude::*;
 
     fn open(size: [u32; 2]) -> ShutMap {

@@ -18,7 +18,8 @@
 use crate::macrotile::Macrotile;
 use crate::{Config, Micros};
 use slabcast_common::ids::{Epoch, TaskId, WorkerId};
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 /// A lease whose result would count.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -36,7 +37,7 @@ pub(crate) enum End {
     /// Not yet.
     Open,
     /// Rendered, by whom, in what time.
-    Done { worker: String, render_us: Micros },
+    Done { worker: Arc<str>, render_us: Micros },
     /// Given up.
     Poisoned,
 }
@@ -48,7 +49,8 @@ pub(crate) struct Task {
     pub(crate) end: End,
     live: Vec<Live>,
     attempts: u32,
-    queued: bool,
+    /// Its place among those that wait, while it does.
+    queued: Option<i64>,
     /// Lost workers that were probably running it.
     pub(crate) blamed: Vec<(WorkerId, String)>,
     /// Workers that said they could not, and why.
@@ -58,7 +60,10 @@ pub(crate) struct Task {
 impl Task {
     /// Whether it may be run twice: one worker has it, and nobody was lost with it.
     pub(crate) fn may_double(&self) -> bool {
-        self.live.len() == 1 && !self.queued && !self.is_suspect() && self.failed.is_empty()
+        self.live.len() == 1
+            && self.queued.is_none()
+            && !self.is_suspect()
+            && self.failed.is_empty()
     }
 
     /// Whether somebody had it before.
@@ -85,7 +90,10 @@ pub(crate) enum Verdict {
 pub(crate) struct Queue {
     first: TaskId,
     pub(crate) tasks: Vec<Task>,
-    waiting: VecDeque<u32>,
+    /// Places of those that wait, the first one first.
+    waiting: BTreeMap<i64, u32>,
+    /// The place of who is put in front of all next.
+    front: i64,
     deadlines: BTreeSet<(Micros, u32, Epoch)>,
     open: u32,
     /// Workers lost while it was rendered, that a task may have killed.
@@ -97,19 +105,20 @@ pub(crate) struct Queue {
 impl Queue {
     /// A queue of these tiles in this order; the first is called `first`, and so on.
     pub(crate) fn new(first: TaskId, tiles: &[Macrotile]) -> Self {
-        let task = |&tile: &Macrotile| Task {
+        let task = |(&tile, order): (&Macrotile, i64)| Task {
             tile,
             end: End::Open,
             live: Vec::new(),
             attempts: 0,
-            queued: true,
+            queued: Some(order),
             blamed: Vec::new(),
             failed: Vec::new(),
         };
         Queue {
             first,
-            tasks: tiles.iter().map(task).collect(),
-            waiting: (0..tiles.len() as u32).collect(),
+            tasks: tiles.iter().zip(0..).map(task).collect(),
+            waiting: (0..).zip(0..tiles.len() as u32).collect(),
+            front: -1,
             deadlines: BTreeSet::new(),
             open: tiles.len() as u32,
             losses: 0,
@@ -129,7 +138,12 @@ impl Queue {
 
     /// Those that wait.
     pub(crate) fn all_waiting(&self) -> impl Iterator<Item = u32> {
-        self.waiting.iter().copied()
+        self.waiting.values().copied()
+    }
+
+    /// Whether any of these waits.
+    pub(crate) fn any_waits(&self, places: &[u32]) -> bool {
+        places.iter().any(|&place| self.tasks[place as usize].queued.is_some())
     }
 
     /// A task's name.
@@ -154,14 +168,40 @@ impl Queue {
         others: impl Fn(&Task) -> bool,
         suits: impl Fn(u32) -> bool,
     ) -> Option<u32> {
+        let waiting = self.waiting.values().copied().filter(|&place| among(place));
+        self.first_fit(worker, mine, waiting, others, suits)
+    }
+
+    fn first_fit(
+        &self,
+        worker: WorkerId,
+        mine: &[u32],
+        mut waiting: impl Iterator<Item = u32>,
+        others: impl Fn(&Task) -> bool,
+        suits: impl Fn(u32) -> bool,
+    ) -> Option<u32> {
         let has_suspect = mine.iter().any(|&p| self.tasks[p as usize].is_suspect());
-        self.waiting.iter().copied().filter(|&place| among(place)).find(|&place| {
+        waiting.find(|&place| {
             let task = &self.tasks[place as usize];
             let has_it = mine.contains(&place);
             let failed = task.failed.iter().any(|(w, ..)| *w == worker) && others(task);
             let two_suspects = has_suspect && task.is_suspect();
             !(has_it || failed || two_suspects) && suits(place)
         })
+    }
+
+    /// The same among a few places, whether they wait or not: who has a list of its own need not go through
+    /// all that wait.
+    pub(crate) fn next_among(
+        &self,
+        worker: WorkerId,
+        mine: &[u32],
+        places: &[u32],
+        others: impl Fn(&Task) -> bool,
+    ) -> Option<u32> {
+        let waits = |&place: &u32| Some((self.tasks[place as usize].queued?, place));
+        let few: BTreeMap<i64, u32> = places.iter().filter_map(waits).collect();
+        self.first_fit(worker, mine, few.into_values(), others, |_| true)
     }
 
     /// Lends a waiting task to a worker.
@@ -173,10 +213,8 @@ impl Queue {
         config: &Config,
     ) -> Epoch {
         let task = &mut self.tasks[place as usize];
-        assert!(task.queued, "only a waiting task is lent");
-        let at = self.waiting.iter().position(|&p| p == place);
-        self.waiting.remove(at.expect("a queued task waits"));
-        task.queued = false;
+        let order = task.queued.take().expect("only a waiting task is lent");
+        self.waiting.remove(&order);
         self.lend(place, worker, now, config)
     }
 
@@ -224,8 +262,8 @@ impl Queue {
                 self.deadlines.remove(&(deadline, place, live.epoch));
             }
         }
-        if std::mem::take(&mut task.queued) {
-            self.waiting.retain(|&p| p != place);
+        if let Some(order) = task.queued.take() {
+            self.waiting.remove(&order);
         }
     }
 
@@ -243,9 +281,10 @@ impl Queue {
     /// Puts a task in front, unless it waits already.
     fn requeue(&mut self, place: u32) {
         let task = &mut self.tasks[place as usize];
-        if task.end == End::Open && !task.queued {
-            task.queued = true;
-            self.waiting.push_front(place);
+        if task.end == End::Open && task.queued.is_none() {
+            task.queued = Some(self.front);
+            self.waiting.insert(self.front, place);
+            self.front -= 1;
         }
     }
 
@@ -361,7 +400,7 @@ mod tests {
     }
 
     fn done() -> End {
-        End::Done { worker: String::new(), render_us: 1 }
+        End::Done { worker: "".into(), render_us: 1 }
     }
 
     #[test]
@@ -383,6 +422,30 @@ mod tests {
         assert!(matches!(q.judge(TaskId(10), Epoch(1), WorkerId(3)), Verdict::Counts(0, _)));
         assert_eq!(q.judge(TaskId(9), Epoch(0), WorkerId(3)), Verdict::Dead);
         assert_eq!(q.judge(TaskId(14), Epoch(0), WorkerId(3)), Verdict::Dead);
+    }
+
+    #[test]
+    fn a_list_of_ones_own_gives_what_going_through_all_that_wait_gives() {
+        let c = Config::default();
+        let mut q = queue(6);
+        let same = |q: &Queue, own: &[u32], mine: &[u32]| {
+            let all = q.next_for(WorkerId(1), mine, |p| own.contains(&p), |_| true, |_| true);
+            assert_eq!(q.next_among(WorkerId(1), mine, own, |_| true), all);
+            assert_eq!(q.any_waits(own), own.iter().any(|p| q.all_waiting().any(|w| w == *p)));
+            all
+        };
+        assert_eq!(same(&q, &[5, 2, 4], &[]), Some(2), "the first in the queue, not in the list");
+        q.lease(2, WorkerId(1), 0, &c);
+        q.lease(5, WorkerId(2), 0, &c);
+        assert_eq!(same(&q, &[5, 2, 4], &[2]), Some(4));
+        assert_eq!(same(&q, &[5, 2], &[2]), None);
+        // What comes back is before all others, the last one first.
+        q.lose(WorkerId(2), "two", &[(5, Epoch(0))], 0, &c);
+        q.pass_on(&[2]);
+        assert_eq!(q.all_waiting().collect::<Vec<_>>(), [2, 5, 0, 1, 3, 4]);
+        assert_eq!(same(&q, &[4, 2, 5], &[2]), Some(5), "it has the first");
+        q.finish(2, done());
+        assert_eq!((q.waiting(), same(&q, &[2], &[])), (5, None));
     }
 
     #[test]

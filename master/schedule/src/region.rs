@@ -22,14 +22,14 @@
 //!
 //! It refuses to know what time it is and which copy of a result counts.
 
-use crate::macrotile::{Cut, Macrotile, cut_through};
+use crate::macrotile::{Cut, Macrotile, Through};
 use crate::roster::Roster;
 use crate::{FrameJob, Micros};
 use slabcast_common::blocks::{Block, Blocks};
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::WorkerId;
 use slabcast_common::occlusion::Rect;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 /// How much later than the mean a worker may be done before a tile of it moves, as a fraction. Tiles of
 /// 64 pixels are 2 % of a frame of 512 each. At half, noise of the measurement moves tiles and their
@@ -213,10 +213,10 @@ pub(crate) struct Regions {
     kind: Kind,
     /// Whose each tile is, by its place in the queue.
     owners: Vec<WorkerId>,
+    /// Places of each worker's, ascending where nothing moved.
+    owned: BTreeMap<WorkerId, Vec<u32>>,
     /// Whose it was before anybody took it from them.
     homes: Vec<WorkerId>,
-    /// All who own or owned one.
-    who: BTreeSet<WorkerId>,
     /// What each took its last owner, if that is known.
     took: Vec<Option<(WorkerId, f64)>>,
     pace: Pace,
@@ -235,12 +235,13 @@ impl Regions {
         let blocks = memory.blocks(key, &job.bricks);
         let rects: Vec<Rect> =
             blocks.iter().filter_map(|b| Some(job.view.project(&b.tight)?.rect)).collect();
-        let plain = cut_through(size, &rects, (0, 0), Some(PLAIN)).tiles.len();
+        let through = Through::new(size, &rects);
+        let plain = through.count(PLAIN);
         let crew = Crew::of_frame(beside, plain, roster);
         let threads = crew.members(roster).map(|m| m.1).sum::<u64>();
         let wanted = (job.work.tiles_per_worker * threads as f64).ceil() as u64;
         let many = wanted.max(MANY * threads);
-        let mut cut = cut_through(size, &rects, (wanted, many), job.work.tile);
+        let mut cut = through.cut((wanted, many), job.work.tile);
         let kind = (key, size, cut.edge, crew);
         let known = |t: &Macrotile| memory.known(kind, &t.rect).map(|k| (k.owner, k.us));
         let pace = Pace::of(&cut.tiles, &known);
@@ -250,8 +251,11 @@ impl Regions {
         let home = |t: &Macrotile| memory.known(kind, &t.rect).map(|k| k.home);
         let owners = share(&cut.tiles, roster, crew, &pace, &known, (&home, &bricks));
         let took = cut.tiles.iter().map(known).collect();
-        let who = owners.iter().copied().collect();
-        (cut, Regions { kind, homes: owners.clone(), owners, who, took, pace })
+        let mut owned = BTreeMap::<WorkerId, Vec<u32>>::new();
+        for (&owner, place) in owners.iter().zip(0..) {
+            owned.entry(owner).or_default().push(place);
+        }
+        (cut, Regions { kind, homes: owners.clone(), owners, owned, took, pace })
     }
 
     /// Who draws it.
@@ -262,7 +266,7 @@ impl Regions {
     /// Those whose tiles these are and who are gone, or leave.
     pub(crate) fn orphaning(&self, roster: &Roster) -> Vec<WorkerId> {
         let gone = |id: &WorkerId| roster.get(*id).is_none_or(|w| w.leaving);
-        self.who.iter().copied().filter(gone).collect()
+        self.owned.keys().copied().filter(gone).collect()
     }
 
     /// Whose a task is next time, if this worker drew it now.
@@ -274,6 +278,11 @@ impl Regions {
     /// Whose a task is.
     pub(crate) fn owner(&self, place: u32) -> WorkerId {
         self.owners[place as usize]
+    }
+
+    /// All that are a worker's.
+    pub(crate) fn owned(&self, id: WorkerId) -> &[u32] {
+        self.owned.get(&id).map_or(&[], Vec::as_slice)
     }
 
     /// What a task took its last owner, in microseconds.
@@ -320,8 +329,12 @@ impl Regions {
 
     /// Another worker takes a task.
     pub(crate) fn moves(&mut self, place: u32, worker: WorkerId) {
-        self.owners[place as usize] = worker;
-        self.who.insert(worker);
+        let before = std::mem::replace(&mut self.owners[place as usize], worker);
+        if before != worker {
+            // Who owned one stays among those whose loss is looked for.
+            self.owned.entry(before).or_default().retain(|p| *p != place);
+            self.owned.entry(worker).or_default().push(place);
+        }
     }
 }
 
@@ -395,20 +408,20 @@ fn share(
     let place = |id: WorkerId| staying.binary_search_by_key(&id, |s| s.0).ok();
     let mean = pace.mean;
     let slowness: Vec<f64> = staying.iter().map(|s| pace.slowness(s.0)).collect();
-    let cost = |t: &Macrotile, w: usize| {
-        let us = match known(t) {
-            Some((owner, us)) => us * slowness[w] / pace.slowness(owner),
-            None => t.est as f64 * mean * slowness[w],
-        };
-        us / staying[w].1
+    // What is known of each tile is looked up once: the loops below ask for it again and again.
+    let takes = |t: &Macrotile| match known(t) {
+        Some((owner, us)) => (us, pace.slowness(owner)),
+        None => (t.est as f64 * mean, 1.0),
     };
+    let takes: Vec<(f64, f64)> = tiles.iter().map(takes).collect();
+    let homes: Vec<Option<usize>> = tiles.iter().map(|t| home(t).and_then(place)).collect();
+    let cost = |i: usize, w: usize| takes[i].0 * slowness[w] / takes[i].1 / staying[w].1;
     let mut load = vec![0.0; staying.len()];
     // In the order of rows.
     let mut order: Vec<usize> = (0..tiles.len()).collect();
     order.sort_by_key(|&i| (tiles[i].rect.y0, tiles[i].rect.x0));
-    let owner = |i: usize| home(&tiles[i]).and_then(place);
     let mut owners = vec![0; tiles.len()];
-    if (0..tiles.len()).all(|i| owner(i).is_none()) {
+    if homes.iter().all(Option::is_none) {
         // Bands of rows, as high as each is fast.
         let fast = |w: usize| staying[w].1 / slowness[w];
         let all = (0..staying.len()).map(fast).sum::<f64>();
@@ -422,20 +435,20 @@ fn share(
             }
             done += 2.0 * half;
             owners[i] = w;
-            load[w] += cost(&tiles[i], w);
+            load[w] += cost(i, w);
         }
     } else {
         for &i in &order {
-            if let Some(w) = owner(i) {
+            if let Some(w) = homes[i] {
                 owners[i] = w;
-                load[w] += cost(&tiles[i], w);
+                load[w] += cost(i, w);
             }
         }
-        for &i in order.iter().filter(|&&i| owner(i).is_none()) {
-            let after = |w: &usize| load[*w] + cost(&tiles[i], *w);
+        for &i in order.iter().filter(|&&i| homes[i].is_none()) {
+            let after = |w: &usize| load[*w] + cost(i, *w);
             let least = (0..staying.len()).min_by(|a, b| after(a).total_cmp(&after(b)));
             owners[i] = least.unwrap_or(0);
-            load[owners[i]] += cost(&tiles[i], owners[i]);
+            load[owners[i]] += cost(i, owners[i]);
         }
     }
     for moved in 0..tiles.len() {
@@ -451,10 +464,12 @@ fn share(
         // Of those that leave both earlier than the later one was, by enough to be worth it and to pay for
         // the bricks that move, the one nearest to what the other has; else the largest.
         let better = |i: &usize| {
-            let (from, to) = (cost(&tiles[*i], most), cost(&tiles[*i], least));
+            if owners[*i] != most {
+                return false;
+            }
+            let (from, to) = (cost(*i, most), cost(*i, least));
             let after = (load[most] - from).max(load[least] + to);
-            owners[*i] == most
-                && load[least] + to < load[most] - 0.5 * from
+            load[least] + to < load[most] - 0.5 * from
                 && load[most] - after > BRICK * bricks(&tiles[*i]) as f64
         };
         let apart = |i: usize| {
@@ -465,8 +480,8 @@ fn share(
             (0..tiles.len()).filter(|&j| owners[j] == least).map(near).min().unwrap_or(0)
         };
         let Some(i) = (0..tiles.len()).filter(better).min_by_key(|&i| apart(i)) else { break };
-        load[most] -= cost(&tiles[i], most);
-        load[least] += cost(&tiles[i], least);
+        load[most] -= cost(i, most);
+        load[least] += cost(i, least);
         owners[i] = least;
     }
     owners.into_iter().map(|w| staying[w].0).collect()

@@ -123,6 +123,10 @@ pub(crate) enum Errand {
 #[derive(Debug)]
 struct Set {
     bricks: Arc<[BrickInfo]>,
+    /// Their names alone: one is looked for in a tenth of the memory.
+    ids: Vec<BrickId>,
+    /// Voxels of all.
+    voxels: u64,
     needed: Vec<u64>,
 }
 
@@ -141,8 +145,17 @@ pub(crate) struct Residency {
     asks: bool,
 }
 
-fn place_of(bricks: &[BrickInfo], id: BrickId) -> Option<u32> {
-    bricks.binary_search_by_key(&id, |b| b.id).ok().map(|i| i as u32)
+impl Set {
+    fn new(bricks: &Arc<[BrickInfo]>) -> Self {
+        let ids: Vec<BrickId> = bricks.iter().map(|b| b.id).collect();
+        assert!(ids.windows(2).all(|w| w[0] < w[1]), "a job's bricks ascend by id");
+        let voxels = bricks.iter().map(|b| u64::from(b.voxels)).sum();
+        Set { bricks: bricks.clone(), ids, voxels, needed: vec![0; bricks.len()] }
+    }
+
+    fn place_of(&self, id: BrickId) -> Option<u32> {
+        self.ids.binary_search(&id).ok().map(|i| i as u32)
+    }
 }
 
 impl Residency {
@@ -191,7 +204,7 @@ impl Residency {
         let ids = shelf.told.remove(&key).unwrap_or_default();
         let books = shelf.sets.entry(key).or_insert_with(|| Books::new(set.bricks.len()));
         for id in ids {
-            let Some(i) = place_of(&set.bricks, id) else { continue };
+            let Some(i) = set.place_of(id) else { continue };
             if books.place[i as usize] == Place::Absent {
                 books.place[i as usize] = Place::Held;
                 books.held_count += 1;
@@ -224,10 +237,7 @@ impl Residency {
         self.sets.retain(|k, _| *k == key || shelves.values().any(|s| s.sets.contains_key(k)));
         self.current = key;
         self.round_bytes = 0;
-        let set = self
-            .sets
-            .entry(key)
-            .or_insert_with(|| Set { bricks: bricks.clone(), needed: vec![0; bricks.len()] });
+        let set = self.sets.entry(key).or_insert_with(|| Set::new(bricks));
         assert_eq!(set.bricks.len(), bricks.len(), "a set key names one list of bricks");
         for worker in self.shelves.keys().copied().collect::<Vec<_>>() {
             if self.shelves[&worker].told.contains_key(&key) {
@@ -424,7 +434,7 @@ impl Residency {
         // Of a set that is gone nothing is lacked.
         let (Some(set), Some(books)) = (self.sets.get(&key), books) else { return true };
         let known = |i: u32| books.place[i as usize] != Place::Absent;
-        ids.iter().all(|id| place_of(&set.bricks, *id).is_some_and(known))
+        ids.iter().all(|id| set.place_of(*id).is_some_and(known))
     }
 
     /// These arrived broken and are not counted among those that arrived. They go again.
@@ -439,7 +449,7 @@ impl Residency {
         let books = shelf.sets.get_mut(&key)?;
         let mut again = Vec::new();
         for &id in ids {
-            let Some(i) = place_of(&set.bricks, id) else { continue };
+            let Some(i) = set.place_of(id) else { continue };
             let bytes = u64::from(set.bricks[i as usize].bytes);
             let place = books.place[i as usize];
             if place == Place::Flying {
@@ -498,7 +508,12 @@ impl Residency {
     /// Places of these bricks in their set, as far as it has them.
     pub(crate) fn places(&self, key: BrickSetKey, ids: &[BrickId]) -> Vec<u32> {
         let Some(set) = self.sets.get(&key) else { return Vec::new() };
-        ids.iter().filter_map(|&id| place_of(&set.bricks, id)).collect()
+        ids.iter().filter_map(|&id| set.place_of(id)).collect()
+    }
+
+    /// Voxels of a set that is open.
+    pub(crate) fn voxels(&self, key: BrickSetKey) -> u64 {
+        self.sets.get(&key).map_or(0, |set| set.voxels)
     }
 
     /// These were drawn from, somewhere.
@@ -516,7 +531,7 @@ impl Residency {
         };
         let Some(books) = shelf.sets.get_mut(&key) else { return };
         for &id in ids {
-            let Some(i) = place_of(&set.bricks, id) else { continue };
+            let Some(i) = set.place_of(id) else { continue };
             if books.place[i as usize] != Place::Held {
                 continue;
             }

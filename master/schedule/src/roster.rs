@@ -20,6 +20,7 @@ use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, SceneId, WorkerId};
 use slabcast_common::message::DIRECTORIES;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
 
 /// How fast two machines' clocks may drift apart: 100 ppm, twice what quartz is sold with. A
 /// fresh sample of an offset replaces the best one when it is no less certain than the best
@@ -36,7 +37,7 @@ const MAX_PINGS: usize = 1024;
 /// One worker.
 #[derive(Debug)]
 pub(crate) struct Worker {
-    pub(crate) name: String,
+    pub(crate) name: Arc<str>,
     pub(crate) threads: u32,
     pub(crate) since: Micros,
     /// It takes no more leases.
@@ -99,6 +100,8 @@ pub(crate) struct Roster {
     /// No ping is due before, and nobody silent for too long. What is heard moves that, which is found out
     /// when the time has come: to look at all workers at each message is what would take longest of all.
     quiet_until: Micros,
+    /// Render threads of those that take leases.
+    threads: u64,
     /// Workers that have fewer leases than threads, leaving ones among them.
     dry: usize,
     /// Grows when somebody comes, leaves or is lost.
@@ -108,7 +111,7 @@ pub(crate) struct Roster {
 impl Roster {
     pub(crate) fn join(&mut self, id: WorkerId, name: String, threads: u32, now: Micros) {
         let worker = Worker {
-            name,
+            name: name.into(),
             threads: threads.clamp(1, MAX_THREADS),
             since: now,
             leaving: false,
@@ -121,6 +124,7 @@ impl Roster {
             pings: VecDeque::new(),
             offset: None,
         };
+        self.threads += u64::from(worker.threads);
         self.workers.insert(id, worker);
         self.dry += 1;
         self.changes += 1;
@@ -130,14 +134,19 @@ impl Roster {
     pub(crate) fn remove(&mut self, id: WorkerId) -> Option<Worker> {
         let worker = self.workers.remove(&id)?;
         self.dry -= usize::from(worker.is_dry());
+        self.threads -= if worker.leaving { 0 } else { u64::from(worker.threads) };
         self.changes += 1;
         Some(worker)
     }
 
     /// A worker takes no more leases. Whether that is news.
     pub(crate) fn leaves(&mut self, id: WorkerId) -> bool {
-        let news = self.get_mut(id).is_some_and(|w| !std::mem::replace(&mut w.leaving, true));
-        self.changes += u64::from(news);
+        let Some(w) = self.workers.get_mut(&id) else { return false };
+        let news = !std::mem::replace(&mut w.leaving, true);
+        if news {
+            self.threads -= u64::from(w.threads);
+            self.changes += 1;
+        }
         news
     }
 
@@ -186,7 +195,7 @@ impl Roster {
 
     /// Render threads of those that take leases.
     pub(crate) fn threads(&self) -> u64 {
-        self.staying().map(|(_, w)| u64::from(w.threads)).sum()
+        self.threads
     }
 
     pub(crate) fn is_empty(&self) -> bool {
@@ -302,6 +311,22 @@ mod tests {
         assert!(r.pong(w, n, 1_000_000 + 7000, 9000));
         assert_eq!(r.get(w).unwrap().to_master(1_010_000), Some(10_000));
         assert!(!r.pong(w, n, 0, 9001), "answered twice");
+    }
+
+    #[test]
+    fn threads_are_those_of_who_stays() {
+        let mut r = Roster::default();
+        let counted = |r: &Roster| r.staying().map(|(_, w)| u64::from(w.threads)).sum::<u64>();
+        for (id, threads) in [(1, 3), (2, 0), (3, u32::MAX)] {
+            r.join(WorkerId(id), "a".into(), threads, 0);
+        }
+        assert_eq!((r.threads(), counted(&r)), (4 + u64::from(MAX_THREADS), r.threads()));
+        assert!(r.leaves(WorkerId(3)) && !r.leaves(WorkerId(3)) && !r.leaves(WorkerId(9)));
+        assert_eq!((r.threads(), counted(&r)), (4, 4));
+        r.remove(WorkerId(3));
+        r.remove(WorkerId(1));
+        assert!(r.remove(WorkerId(1)).is_none());
+        assert_eq!((r.threads(), counted(&r)), (1, 1));
     }
 
     #[test]

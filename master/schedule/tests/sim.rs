@@ -14,7 +14,7 @@ use slabcast_common::trace::{
 use slabcast_common::view::{Camera, CameraProjection, Projected, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Toll, Unknown, Unmeasured};
-use slabcast_schedule::{FrameJob, Span, macrotile, slabs as slabs_of};
+use slabcast_schedule::{FrameJob, Span, Spans, macrotile, slabs as slabs_of};
 use std::sync::Arc;
 
 const SIZE: [u32; 2] = [256, 200];
@@ -404,8 +404,8 @@ impl sim::Stopwatch for Listener {
         None
     }
 
-    fn done(&mut self, stats: FrameStats, spans: Vec<Span>) {
-        self.0.push((stats, spans));
+    fn done(&mut self, stats: FrameStats, spans: Spans) {
+        self.0.push((stats, spans.told()));
     }
 }
 

@@ -11,7 +11,7 @@ use slabcast_common::quality::Schedule;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::trace::Trace;
 use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Stopwatch, Took, Unmeasured};
-use slabcast_schedule::{FrameJob, Span};
+use slabcast_schedule::{FrameJob, Spans};
 
 /// What a frame's time goes into.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -275,7 +275,7 @@ impl Stopwatch for Heard {
         None
     }
 
-    fn done(&mut self, stats: FrameStats, _: Vec<Span>) {
+    fn done(&mut self, stats: FrameStats, _: Spans) {
         self.0.push(stats);
     }
 }

@@ -18,7 +18,7 @@ use slabcast_common::message::PathRequest;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::trace::Trace;
 use slabcast_schedule::sim::{Costs, Link, Nanos, Outcome, Stopwatch};
-use slabcast_schedule::{FrameJob, Span};
+use slabcast_schedule::{FrameJob, Spans};
 use std::collections::VecDeque;
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader};
@@ -250,7 +250,7 @@ impl Stopwatch for Totals {
         None
     }
 
-    fn done(&mut self, stats: FrameStats, _: Vec<Span>) {
+    fn done(&mut self, stats: FrameStats, _: Spans) {
         self.0.push(stats.ms.total);
     }
 }

@@ -15,7 +15,7 @@ use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::stats::FrameStats;
 use slabcast_common::trace::Trace;
 use slabcast_schedule::sim::{Costs, Link, Nanos, Stopwatch, alone_ms};
-use slabcast_schedule::{FrameJob, Span};
+use slabcast_schedule::{FrameJob, Span, Spans};
 
 /// How fast tiles are drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -58,8 +58,8 @@ impl Stopwatch for Listener {
         None
     }
 
-    fn done(&mut self, stats: FrameStats, spans: Vec<Span>) {
-        self.0.push((stats, spans));
+    fn done(&mut self, stats: FrameStats, spans: Spans) {
+        self.0.push((stats, spans.told()));
     }
 }
 

@@ -26,7 +26,7 @@ mod pipe;
 
 pub use cluster::run;
 
-use crate::{Micros, Span};
+use crate::{Micros, Spans};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::trace::Trace;
@@ -246,7 +246,7 @@ pub trait Stopwatch {
     fn read(&mut self) -> Option<Nanos>;
 
     /// A frame is done: its statistics and what happened when, as a master would have them.
-    fn done(&mut self, stats: FrameStats, spans: Vec<Span>) {
+    fn done(&mut self, stats: FrameStats, spans: Spans) {
         drop((stats, spans));
     }
 }

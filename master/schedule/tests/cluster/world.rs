@@ -499,7 +499,9 @@ impl World {
                 let bytes = finish.map(|finish| state.encode(&finish, false).bytes);
                 let picture = finish.is_none().then(|| state.finish());
                 let (at, stats) = (self.now(), *stats);
-                let before = self.done.insert(frame, Done { picture, bytes, stats, spans, at });
+                let before = self
+                    .done
+                    .insert(frame, Done { picture, bytes, stats, spans: spans.told(), at });
                 assert!(before.is_none(), "seed {seed}: {frame} done twice");
                 let first = *self.jobs.keys().find(|f| !self.is_over(**f)).unwrap_or(&frame);
                 assert!(first >= frame, "seed {seed}: {frame} before {first}");

@@ -5,6 +5,23 @@
 //! two pixels ([`short`]); 32-bit sums take twice that ([`long`]). Every loop is written plainly
 //! here; what is written in lanes there must equal it.
 
+/// Calls a function for windows of `wide` columns, at most sixteen, or of a few more.
+#[cfg(target_arch = "x86_64")]
+macro_rules! by_window {
+    ($wide:expr, $side_by_side:ident, $n:ident, $at:expr) => {
+        match $wide {
+            0..=6 => $side_by_side::<6, $n>($at),
+            7 => $side_by_side::<7, $n>($at),
+            8 => $side_by_side::<8, $n>($at),
+            9 => $side_by_side::<9, $n>($at),
+            10 => $side_by_side::<10, $n>($at),
+            11 | 12 => $side_by_side::<12, $n>($at),
+            13 | 14 => $side_by_side::<14, $n>($at),
+            _ => $side_by_side::<16, $n>($at),
+        }
+    };
+}
+
 pub(crate) mod apart;
 mod long;
 mod short;

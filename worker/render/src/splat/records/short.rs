@@ -229,16 +229,7 @@ pub(super) mod avx2 {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         }
         let at = (records, (apart, payloads), layers);
-        match wide {
-            0..=6 => side_by_side::<6, N>(at),
-            7 => side_by_side::<7, N>(at),
-            8 => side_by_side::<8, N>(at),
-            9 => side_by_side::<9, N>(at),
-            10 => side_by_side::<10, N>(at),
-            11 | 12 => side_by_side::<12, N>(at),
-            13 | 14 => side_by_side::<14, N>(at),
-            _ => side_by_side::<16, N>(at),
-        }
+        by_window!(wide, side_by_side, N, at)
     }
 
     /// Weights of voxel `i` in four slots, pixel by pixel.

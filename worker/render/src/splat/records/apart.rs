@@ -91,6 +91,11 @@ pub(crate) fn after<const N: usize>(first: usize, slot: usize) -> i32 {
 /// Weights by slot of a window's columns and of its rows.
 pub(crate) type Woven<W, const N: usize> = [[BySlot<W, N>; WINDOW]; 2];
 
+/// What [`Recorded::splat_apart`] adds, where and by which weights, for windows of a known width.
+#[cfg(target_arch = "x86_64")]
+pub(super) type ApartAt<'a, S, const N: usize> =
+    (&'a mut [Record<S, N>], (&'a Apart, &'a [<S as Recorded>::Payload]), &'a Layers<'a, S, N>);
+
 /// [`Recorded::splat_apart`], voxel by voxel.
 #[inline(always)]
 pub(super) fn splat_apart<S: Recorded, const N: usize>(
@@ -133,15 +138,16 @@ pub(super) mod lines {
     use crate::splat::records::Recorded;
     use crate::tile::PART;
 
-    /// Columns and rows that the windows of all voxels fit which are added; columns a multiple of the step.
+    /// Columns that the windows of all voxels fit which are added, a multiple of the step; `None` if there
+    /// are not four slots, or windows of more than [`LINE`] pixels.
     #[inline(always)]
-    pub(crate) fn most(apart: &Apart, kept: &[u32], step: i32) -> [usize; 2] {
+    pub(crate) fn widest<const N: usize>(apart: &Apart, kept: &[u32], step: i32) -> Option<usize> {
         let mut most = [0; 2];
         for &i in kept {
             let (_, wide) = apart.window(i as usize % BATCH, step);
             most = [most[0].max(wide[0]), most[1].max(wide[1])];
         }
-        most
+        (N == 4 && most.iter().all(|&most| most <= LINE)).then_some(most[0])
     }
 
     /// First column of a window of `wide` columns from `first`, moved to lie inside the part.
@@ -161,8 +167,8 @@ pub(super) mod lines {
     }
 
     impl<'a, W> Lines<'a, W> {
-        /// Those of the first `n` voxels, for windows that begin at multiples of `step` and are moved inside to
-        /// be `wide` columns, and of any number of rows.
+        /// Those across and down of the voxels in `kept`, which ascend. Windows begin at columns that are
+        /// multiples of `step` and are moved inside to be `wide` columns; they may have any number of rows.
         ///
         /// # Panics
         /// If there are not four slots.
@@ -170,7 +176,24 @@ pub(super) mod lines {
         /// # Safety
         /// For machines with the instructions of `L`.
         #[inline(always)]
-        pub(crate) unsafe fn new<L: Lanes, S: Recorded<Weight = W>, const N: usize>(
+        pub(crate) unsafe fn both<L: Lanes, S: Recorded<Weight = W>, const N: usize>(
+            apart: &Apart,
+            kept: &[u32],
+            layers: &Layers<'a, S, N>,
+            (wide, step): (usize, i32),
+        ) -> [Lines<'a, W>; 2] {
+            let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
+            // SAFETY: the caller has the instructions.
+            unsafe {
+                let across = Lines::new::<L, S, N>(apart, layers, n, (0, wide, step));
+                let down = Lines::new::<L, S, N>(apart, layers, n, (1, 0, 1));
+                [across, down]
+            }
+        }
+
+        /// Those of the first `n` voxels along `axis`. See [`Lines::both`].
+        #[inline(always)]
+        unsafe fn new<L: Lanes, S: Recorded<Weight = W>, const N: usize>(
             apart: &Apart,
             layers: &Layers<'a, S, N>,
             n: usize,
@@ -204,8 +227,8 @@ pub(super) mod lines {
                         let end = L::min(L::max(L::plus(column, L::set(len)), zero), line);
                         let bits = L::minus(L::up_each(one, end), L::up_each(one, begin));
                         L::store(bits_to, bits);
-                        // Begins are below 2^31.
-                        let from = L::min(L::load(from), L::set(last));
+                        // What is read lies in the table, whatever a begin says.
+                        let from = L::max(L::min(L::load(from), L::set(last)), zero);
                         L::store(from_to, L::minus(from, column));
                     }
                 }

@@ -28,7 +28,7 @@ pub(super) mod avx2 {
     use crate::sheet::{LANES, Row};
     use crate::splat::lanes::{Eight, Lanes as _};
     use crate::splat::records::apart::lines::{self, Lines};
-    use crate::splat::records::apart::{self, Apart, BATCH, LINE, Layers, Woven};
+    use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, Layers, Woven};
     use crate::splat::records::{
         Across, BySlot, MOST, Record, Recorded as _, RowAt, STRIDE, STRIP, Splat, Strip, Tables,
     };
@@ -250,10 +250,10 @@ pub(super) mod avx2 {
         layers: &Layers<'_, i32, N>,
         woven: &mut Woven<Tap, N>,
     ) {
-        let [wide, high] = lines::most(apart, &apart.kept[..payloads.len()], i32::STEP);
-        if N != 4 || wide > LINE || high > LINE {
+        let kept = &apart.kept[..payloads.len()];
+        let Some(wide) = lines::widest::<N>(apart, kept, i32::STEP) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
-        }
+        };
         let at = (records, (apart, payloads), layers);
         by_window!(wide, side_by_side, N, at)
     }
@@ -277,26 +277,17 @@ pub(super) mod avx2 {
         }
     }
 
-    /// What [`splat_apart`] is called with, in one.
-    type ApartAt<'a, const N: usize> =
-        (&'a mut [Record<i32, N>], (&'a Apart, &'a [[f32; 4]]), &'a Layers<'a, i32, N>);
-
     /// Windows of `WIDE` columns.
     #[target_feature(enable = "avx2")]
     #[inline]
     fn side_by_side<const WIDE: usize, const N: usize>(
-        (records, (apart, payloads), layers): ApartAt<'_, N>,
+        (records, (apart, payloads), layers): ApartAt<'_, i32, N>,
     ) {
         let (half, zero) = (_mm256_set1_ps(0.5), _mm256_setzero_ps());
         let kept = &apart.kept[..payloads.len()];
-        let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
         // SAFETY: these are the instructions.
-        let (across, down) = unsafe {
-            (
-                Lines::new::<Eight, _, N>(apart, layers, n, (0, WIDE, i32::STEP)),
-                Lines::new::<Eight, _, N>(apart, layers, n, (1, 0, 1)),
-            )
-        };
+        let [across, down] =
+            unsafe { Lines::both::<Eight, _, N>(apart, kept, layers, (WIDE, i32::STEP)) };
         let [mut columns, mut rows] = [[Tap::default(); 64]; 2];
         for (&i, payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
@@ -472,7 +463,7 @@ pub(super) mod avx512 {
     use super::avx2::At;
     use crate::splat::lanes::Sixteen;
     use crate::splat::records::apart::lines::{self, Lines};
-    use crate::splat::records::apart::{self, Apart, BATCH, LINE, Layers, Woven};
+    use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, Layers, Woven};
     use crate::splat::records::{
         Across, BySlot, MOST, Record, Recorded, RowAt, STRIDE, Splat, Tables,
     };
@@ -660,17 +651,13 @@ pub(super) mod avx512 {
         layers: &Layers<'_, i32, N>,
         woven: &mut Woven<Tap, N>,
     ) {
-        let [wide, high] = lines::most(apart, &apart.kept[..payloads.len()], i32::STEP);
-        if N != 4 || wide > LINE || high > LINE {
+        let kept = &apart.kept[..payloads.len()];
+        let Some(wide) = lines::widest::<N>(apart, kept, i32::STEP) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
-        }
+        };
         let at = (records, (apart, payloads), layers);
         by_window!(wide, side_by_side, N, at)
     }
-
-    /// What [`splat_apart`] is called with, in one.
-    type ApartAt<'a, const N: usize> =
-        (&'a mut [Record<i32, N>], (&'a Apart, &'a [[f32; 4]]), &'a Layers<'a, i32, N>);
 
     /// Weights of voxel `i` in four slots, pixel by pixel: four pixels a register.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
@@ -692,7 +679,7 @@ pub(super) mod avx512 {
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
     fn side_by_side<const WIDE: usize, const N: usize>(
-        (records, (apart, payloads), layers): ApartAt<'_, N>,
+        (records, (apart, payloads), layers): ApartAt<'_, i32, N>,
     ) {
         let (half, zero) = (_mm512_set1_ps(0.5), _mm512_setzero_ps());
         let lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
@@ -701,14 +688,9 @@ pub(super) mod avx512 {
         let turn = _mm512_sub_epi32(slot, _mm512_set1_epi32(layers.slot as i32));
         let turn = _mm512_and_si512(turn, _mm512_set1_epi32(3));
         let kept = &apart.kept[..payloads.len()];
-        let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
         // SAFETY: these are the instructions.
-        let (across, down) = unsafe {
-            (
-                Lines::new::<Sixteen, _, N>(apart, layers, n, (0, WIDE, i32::STEP)),
-                Lines::new::<Sixteen, _, N>(apart, layers, n, (1, 0, 1)),
-            )
-        };
+        let [across, down] =
+            unsafe { Lines::both::<Sixteen, _, N>(apart, kept, layers, (WIDE, i32::STEP)) };
         for (&i, payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
             let ([x, y], [_, high]) = apart.window(i, i32::STEP);

@@ -6,7 +6,7 @@ pub(super) mod avx2 {
     use crate::splat::Simd;
     use crate::splat::lanes::Eight;
     use crate::splat::records::apart::lines::{self, Lines};
-    use crate::splat::records::apart::{self, Apart, BATCH, LINE, Layers, Woven};
+    use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, LINE, Layers, Woven};
     use crate::splat::records::{
         Across, BySlot, MOST, Record, RowAt, STRIDE, STRIP, Splat, Strip, Tables,
     };
@@ -224,10 +224,10 @@ pub(super) mod avx2 {
         layers: &Layers<'_, i16, N>,
         woven: &mut Woven<i16, N>,
     ) {
-        let [wide, high] = lines::most(apart, &apart.kept[..payloads.len()], 1);
-        if N != 4 || wide > LINE || high > LINE {
+        let kept = &apart.kept[..payloads.len()];
+        let Some(wide) = lines::widest::<N>(apart, kept, 1) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
-        }
+        };
         let at = (records, (apart, payloads), layers);
         by_window!(wide, side_by_side, N, at)
     }
@@ -257,27 +257,17 @@ pub(super) mod avx2 {
         by_column(slots, to);
     }
 
-    /// What [`splat_apart`] is called with, in one.
-    type ApartAt<'a, const N: usize> =
-        (&'a mut [Record<i16, N>], (&'a Apart, &'a [u64]), &'a Layers<'a, i16, N>);
-
     /// Windows of `WIDE` columns.
     #[target_feature(enable = "avx2")]
     #[inline]
     fn side_by_side<const WIDE: usize, const N: usize>(
-        (records, (apart, payloads), layers): ApartAt<'_, N>,
+        (records, (apart, payloads), layers): ApartAt<'_, i16, N>,
     ) {
         let zero = _mm256_setzero_si256();
         let [turn, _] = turns::<N>(layers.slot);
         let kept = &apart.kept[..payloads.len()];
-        let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
         // SAFETY: these are the instructions.
-        let (across, down) = unsafe {
-            (
-                Lines::new::<Eight, _, N>(apart, layers, n, (0, WIDE, 1)),
-                Lines::new::<Eight, _, N>(apart, layers, n, (1, 0, 1)),
-            )
-        };
+        let [across, down] = unsafe { Lines::both::<Eight, _, N>(apart, kept, layers, (WIDE, 1)) };
         let [mut columns, mut rows] = [[0; 64]; 2];
         for (&i, &payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
@@ -451,7 +441,7 @@ pub(super) mod avx512 {
     use crate::splat::Simd;
     use crate::splat::lanes::Sixteen;
     use crate::splat::records::apart::lines::{self, Lines};
-    use crate::splat::records::apart::{self, Apart, BATCH, LINE, Layers, Woven};
+    use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, LINE, Layers, Woven};
     use crate::splat::records::{
         Across, BySlot, Record, Recorded, RowAt, STRIDE, Splat, Strip, Tables,
     };
@@ -661,10 +651,10 @@ pub(super) mod avx512 {
         layers: &Layers<'_, i16, N>,
         woven: &mut Woven<i16, N>,
     ) {
-        let [wide, high] = lines::most(apart, &apart.kept[..payloads.len()], i16::STEP);
-        if N != 4 || wide > LINE || high > LINE {
+        let kept = &apart.kept[..payloads.len()];
+        let Some(wide) = lines::widest::<N>(apart, kept, i16::STEP) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
-        }
+        };
         let at = (records, (apart, payloads), layers);
         match wide / 2 {
             0..=2 => side_by_side::<2, N>(at),
@@ -695,29 +685,20 @@ pub(super) mod avx512 {
         both
     }
 
-    /// What [`splat_apart`] is called with, in one.
-    type ApartAt<'a, const N: usize> =
-        (&'a mut [Record<i16, N>], (&'a Apart, &'a [u64]), &'a Layers<'a, i16, N>);
-
     /// Windows of `U` registers, of two columns each.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
     fn side_by_side<const U: usize, const N: usize>(
-        (records, (apart, payloads), layers): ApartAt<'_, N>,
+        (records, (apart, payloads), layers): ApartAt<'_, i16, N>,
     ) {
         let turn = words(|lane| (lane / 4 + 2 * N - layers.slot) % N);
         // Which weight of a line's 64 a lane takes: that of its slot for its column, or for the row.
         let column = words(|lane| lane / 4 % N * LINE + lane / (4 * N));
         let row = words(|lane| lane / 4 % N * LINE);
         let kept = &apart.kept[..payloads.len()];
-        let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
         // SAFETY: these are the instructions.
-        let (across, down) = unsafe {
-            (
-                Lines::new::<Sixteen, _, N>(apart, layers, n, (0, 2 * U, i16::STEP)),
-                Lines::new::<Sixteen, _, N>(apart, layers, n, (1, 0, 1)),
-            )
-        };
+        let [across, down] =
+            unsafe { Lines::both::<Sixteen, _, N>(apart, kept, layers, (2 * U, i16::STEP)) };
         for (&i, &payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
             let ([x, y], [_, high]) = apart.window(i, i16::STEP);

@@ -10,7 +10,7 @@
 //! 2. **Splat.** The bit is looked at once more, since pixels have shut meanwhile; light falls on
 //!    sixteen voxels at once; each is added to the records of its footprint with all its sections
 //!    ([`crate::splat::records`]). A footprint that leaves the part is moved inside and reads zeros.
-//! 3. **Close.** Strips of eight pixels that something was added to are composited two at a time.
+//! 3. **Close.** Open pixels that something was added to are composited sixteen at a time.
 //!
 //! The bytes are those of [`crate::serial`], which knows none of this.
 
@@ -21,7 +21,7 @@ use crate::scene::{Flat, Frame};
 use crate::splat::records::{Recorded, Splat, Table, Tables, splat};
 use crate::splat::toss::{self, Sieve, Sifted, Tossing, prefetch};
 use crate::splat::{Simd, Work};
-use crate::stack::{Queues, Sheets, Stage, Store, slot, walk};
+use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
 use slabcast_common::view::SUBPIXELS;
@@ -173,7 +173,7 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
         let cull = self.part.frame.scene.quality.cull;
         let Batch { voxels, samples, normals, light } = &mut *self.batch;
         let mut payloads = [S::Payload::default(); BATCH];
-        let [wide, high] = self.tables.across.map(|t| t.len);
+        let mut corners = [0; EDGE];
         for some in bucket.chunks(BATCH) {
             let mut n = 0;
             for v in some {
@@ -183,7 +183,8 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
             let voxels = &voxels[..n];
             for (i, v) in voxels.iter().enumerate() {
                 (samples[i], normals[i]) = (v.sample, v.normal());
-                sheets.touch(k, v.first(), [wide, high]);
+                let [x, y] = v.first();
+                corners[y % EDGE] |= 1 << x;
             }
             self.part.frame.payloads(&samples[..n], &normals[..n], None, light);
             let [sigma, r, g, b] = light;
@@ -201,6 +202,7 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
                 &self.tables,
             );
         }
+        sheets.touch_all(k, &corners, self.tables.across.map(|t| t.len));
     }
 
     #[inline(always)]

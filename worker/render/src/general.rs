@@ -8,7 +8,9 @@ use crate::mask::OpenMask;
 use crate::planes::{BLOCK, Planes, Window};
 use crate::scene::Placed;
 use crate::sheet::{LANES, Row};
-use crate::splat::{Accumulate, Weight, Work};
+use crate::splat::records::STRIDE;
+use crate::splat::touched::put;
+use crate::splat::{Accumulate, Simd, Weight, Work};
 use crate::tile::{Io, PART, Part, Pixels, keep_last};
 use slabcast_common::message::Counters;
 use slabcast_common::occlusion::Rect;
@@ -296,20 +298,21 @@ impl General<'_> {
                 if live == [0, 0] {
                     continue;
                 }
+                let mut places = [0; LANES];
+                for (lane, place) in places.iter_mut().enumerate() {
+                    let at = (y + lane / BLOCK) * STRIDE + x0 + lane % BLOCK;
+                    let secant = pixels.secants[at];
+                    (row.secant[lane], row.cosine[lane]) = (secant, 1.0 / secant);
+                    row.a[lane] = f32::from_bits(pixels.all[at][0]);
+                    *place = at as u32;
+                }
                 for half in 0..2 {
-                    let (at, lane) = ((y + half) * PART as usize + x0, half * BLOCK);
-                    planes.load(k, at, &mut row, lane);
-                    let secants = &pixels.secants[at..at + BLOCK];
-                    for (i, secant) in secants.iter().enumerate() {
-                        (row.secant[lane + i], row.cosine[lane + i]) = (*secant, 1.0 / secant);
-                    }
-                    row.a[lane..lane + BLOCK].copy_from_slice(&pixels.a[at..at + BLOCK]);
+                    planes.load(k, (y + half) * PART as usize + x0, &mut row, half * BLOCK);
                 }
                 let shut = rule.close_row::<S>(&mut row, (live[0] | live[1] << BLOCK) as u32);
+                put(Simd::plain(), &row, &places, &mut pixels.all);
                 for half in 0..2 {
-                    let (at, lane) = ((y + half) * PART as usize + x0, half * BLOCK);
-                    pixels.put(at, &row, lane);
-                    let shut = u64::from(shut >> lane & 0xff);
+                    let shut = u64::from(shut >> (half * BLOCK) & 0xff);
                     open.close(y + half, shut << x0);
                     any_shut |= shut != 0;
                 }

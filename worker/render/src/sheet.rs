@@ -252,7 +252,7 @@ fn select(which: bool, yes: f32, no: f32) -> f32 {
     f32::from_bits(yes.to_bits() & mask | no.to_bits() & !mask)
 }
 
-/// Sums and state of up to [`LANES`] pixels beside each other, channel by channel: what
+/// Sums and state of up to [`LANES`] pixels, channel by channel: what
 /// [`Rule::close_row`] works on. Lanes are pixels.
 #[derive(Clone)]
 pub struct Row {
@@ -272,8 +272,7 @@ pub struct Row {
     pub light: [[u32; LANES]; 3],
 }
 
-/// Pixels of a [`Row`]: two strips of eight, which need not be neighbours; a register of AVX-512 or
-/// two of AVX2. Strips of sixteen would be filled with pixels that nothing touched.
+/// Pixels of a [`Row`], which need not be neighbours: a register of AVX-512 or two of AVX2.
 pub const LANES: usize = 16;
 
 impl Default for Row {

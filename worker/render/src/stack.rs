@@ -1,33 +1,33 @@
 //! The open sheets of a part in records, and the walk through them, front to back.
 //!
 //! What differs between views is how voxels get there: [`crate::flat`] and [`crate::deep`] toss and
-//! splat; this room closes. Rows of strips of eight pixels that something was added to are known by
-//! a bit each; a sheet that closes looks at those alone, four strips at a time.
+//! splat; this room closes. Pixels that something was added to are known by a bit each; a sheet that
+//! closes looks at the open ones among those alone, sixteen at a time from wherever they lie.
 
 use crate::mask::OpenMask;
-use crate::sheet::Row;
+use crate::sheet::{LANES, Row};
 use crate::splat::Simd;
 use crate::splat::close::close_rows;
-use crate::splat::records::{Line, Record, Recorded, STRIDE, STRIP, Strip};
+use crate::splat::records::{Line, Record, Recorded, STRIDE};
+use crate::splat::touched::{Places, Some16, column_and_row, put, take};
 use crate::tile::{Io, PART, Part, Pixels, keep_last};
 use slabcast_common::message::Counters;
 use slabcast_common::view::Projection;
 
 pub(crate) const EDGE: usize = PART as usize;
-/// Strips of a row.
-const STRIPS: usize = EDGE / STRIP;
 
 /// Memory for sums of one kind.
 pub(crate) struct Store<S: Recorded> {
     /// Records of any number of sheets; nothing in them between parts.
     records: Vec<Line>,
-    /// Sums of the sheet before, where it was touched.
+    /// Sums of the sheet before, where it was touched; elsewhere anything.
     before: Vec<S::Pixel>,
+    places: Places,
 }
 
 impl<S: Recorded> Default for Store<S> {
     fn default() -> Self {
-        Store { records: Vec::new(), before: Vec::new() }
+        Store { records: Vec::new(), before: Vec::new(), places: Places::default() }
     }
 }
 
@@ -94,9 +94,9 @@ pub(crate) fn walk<S: Recorded, const N: usize, T: Stage<S, N>>(
     let mut open = part.begin(pixels, out);
     if let Some(last) = &out.last {
         part.each_pixel(|x, y, tile| {
-            sheets.before[y * EDGE + x] = S::from_raw(last[tile]);
+            sheets.before[y * STRIDE + x] = S::from_raw(last[tile]);
         });
-        sheets.was = [u64::MAX; STRIPS];
+        sheets.was = [u64::MAX; EDGE];
     }
     if queues.buckets.len() < slab.len() as usize {
         queues.buckets.resize_with(slab.len() as usize, Vec::new);
@@ -114,7 +114,7 @@ pub(crate) fn walk<S: Recorded, const N: usize, T: Stage<S, N>>(
             stage.toss(next, &open, queues, counters);
             next += 1;
         }
-        sheets.added[slot::<N>(k)] = [0; STRIPS];
+        sheets.added[slot::<N>(k)] = [0; EDGE];
         if !queues.carried.is_empty() {
             stage.splat_carried(&queues.carried, &mut sheets, &open, counters);
             queues.carried.clear();
@@ -140,26 +140,27 @@ pub(crate) fn walk<S: Recorded, const N: usize, T: Stage<S, N>>(
     if let Some(last) = keep_last(part, stopped, out) {
         // Nobody reads a shut pixel's sums; they may be anything, so they are none.
         part.each_pixel(|x, y, tile| {
-            let touched = sheets.was[x / STRIP] >> y & open.row(y) >> x & 1 == 1;
-            last[tile] = if touched { S::raw(&sheets.before[y * EDGE + x]) } else { [0; 4] };
+            let touched = (sheets.was[y] & open.row(y)) >> x & 1 == 1;
+            last[tile] = if touched { S::raw(&sheets.before[y * STRIDE + x]) } else { [0; 4] };
         });
     }
     sheets.empty(k);
 }
 
-/// Rows of each strip that something was added to, one bit each.
-type Rows = [u64; STRIPS];
+/// Pixels of a part, a bit each, row by row.
+pub(crate) type Rows = [u64; EDGE];
 
 /// The open sheets of a part.
 pub(crate) struct Sheets<'a, S: Recorded, const N: usize> {
     pub(crate) simd: Simd,
     pub(crate) records: &'a mut [Record<S, N>],
     before: &'a mut [S::Pixel],
-    /// By slot of their first sheet: rows that voxels touch.
+    places: &'a mut Places,
+    /// By slot of their first sheet: pixels that voxels touch.
     added: [Rows; N],
-    /// Rows of `before` that may not be zero.
+    /// Pixels of `before` that are the sheet's before.
     was: Rows,
-    /// Rows with records of shut pixels that are not zero.
+    /// Shut pixels with records that may not be zero.
     dead: Rows,
     /// Sheets that a voxel touches at most.
     most: usize,
@@ -170,42 +171,74 @@ pub(crate) fn slot<const N: usize>(k: i32) -> usize {
     k as usize % N
 }
 
+/// By how much one pixel has to be moved, step by step together with all that it has become, to be `n`.
+#[inline(always)]
+fn doubling(n: usize) -> impl Iterator<Item = usize> {
+    let mut done = 1;
+    std::iter::from_fn(move || {
+        let step = done.min(n - done);
+        done += step;
+        (step > 0).then_some(step)
+    })
+}
+
 impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
     fn new(simd: Simd, store: &'a mut Store<S>, most: usize) -> Self {
         let lines = STRIDE * EDGE * size_of::<Record<S, N>>() / size_of::<Line>();
         if store.records.len() < lines {
             store.records.resize(lines, Line::ZERO);
         }
-        store.before.resize(EDGE * EDGE, S::Pixel::default());
+        store.before.resize(STRIDE * EDGE, S::Pixel::default());
         Sheets {
             simd,
             records: bytemuck::cast_slice_mut(&mut store.records[..lines]),
             before: &mut store.before,
-            added: [[0; STRIPS]; N],
-            was: [0; STRIPS],
-            dead: [0; STRIPS],
+            places: &mut store.places,
+            added: [[0; EDGE]; N],
+            was: [0; EDGE],
+            dead: [0; EDGE],
             most,
+        }
+    }
+
+    /// Notes that voxels that begin at sheet `k` touch so many columns and rows from where `corners` has
+    /// bits.
+    #[inline(always)]
+    pub(crate) fn touch_all(&mut self, k: i32, corners: &Rows, [wide, high]: [usize; 2]) {
+        let added = &mut self.added[slot::<N>(k)];
+        let mut grown = *corners;
+        // Columns and rows double until so many are there; no footprint leaves the part.
+        for done in doubling(wide) {
+            for row in &mut grown {
+                *row |= *row << done;
+            }
+        }
+        for done in doubling(high) {
+            let was = grown;
+            for (row, was) in grown[done..].iter_mut().zip(&was) {
+                *row |= was;
+            }
+        }
+        for (added, grown) in added.iter_mut().zip(&grown) {
+            *added |= grown;
         }
     }
 
     /// Notes that a voxel that begins at sheet `k` touches so many columns and rows from (x, y).
     #[inline(always)]
     pub(crate) fn touch(&mut self, k: i32, [x, y]: [usize; 2], [wide, high]: [usize; 2]) {
-        let rows = (u64::MAX >> (64 - high)) << (y & 63);
-        let added = &mut self.added[slot::<N>(k)];
-        let (first, last) = (x / STRIP % STRIPS, (x + wide - 1) / STRIP % STRIPS);
-        added[first] |= rows;
-        added[last] |= rows;
-        for strip in first + 1..last {
-            added[strip] |= rows;
+        let columns = (u64::MAX >> (EDGE - wide)) << x;
+        for row in &mut self.added[slot::<N>(k)][y..y + high] {
+            *row |= columns;
         }
     }
 
-    /// Rows that voxels which begin at sheets `from` to `k` touch.
+    /// Pixels that voxels which begin at sheets `from` to `k` touch.
+    #[inline(always)]
     fn touched(&self, from: i32, k: i32) -> Rows {
-        let mut rows = [0; STRIPS];
+        let mut rows = [0; EDGE];
         for first in from..=k {
-            for (row, added) in rows.iter_mut().zip(self.added[slot::<N>(first)]) {
+            for (row, added) in rows.iter_mut().zip(&self.added[slot::<N>(first)]) {
                 *row |= added;
             }
         }
@@ -216,79 +249,59 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
     #[inline(always)]
     fn close(&mut self, k: i32, part: &Part<'_>, open: &mut OpenMask, pixels: &mut Pixels) -> bool {
         let touched = self.touched(k + 1 - self.most as i32, k);
-        for strip in 0..STRIPS {
-            // What the sheet before has where this one has nothing.
-            let mut stale = self.was[strip] & !touched[strip];
-            while stale != 0 {
-                let y = stale.trailing_zeros() as usize;
-                stale &= stale - 1;
-                self.before[y * EDGE + strip * STRIP..][..STRIP].fill(S::Pixel::default());
+        let mut closing = touched;
+        for (y, (closing, dead)) in closing.iter_mut().zip(&mut self.dead).enumerate() {
+            // Nobody looks at shut pixels again in this part.
+            *dead |= *closing & !open.row(y);
+            *closing &= open.row(y);
+        }
+        for (y, (closing, was)) in closing.iter().zip(&self.was).enumerate() {
+            // Where this sheet has something and the one before had nothing.
+            let mut fresh = closing & !was;
+            while fresh != 0 {
+                let x = fresh.trailing_zeros();
+                let run = (fresh >> x).trailing_ones();
+                self.before[y * STRIDE + x as usize..][..run as usize].fill(S::Pixel::default());
+                // Adding carries through the run.
+                fresh &= fresh.wrapping_add(1 << x);
             }
         }
         self.was = touched;
-        let mut closing = Closing {
-            simd: self.simd,
-            k,
-            part,
-            open,
-            pixels,
-            rows: Default::default(),
-            any_shut: false,
-        };
-        let mut pending = [(0, 0); 4];
-        let mut some = 0;
-        for strip in 0..STRIPS {
-            let mut rows = touched[strip];
-            while rows != 0 {
-                let y = rows.trailing_zeros() as usize;
-                rows &= rows - 1;
-                if closing.open.row(y) >> (strip * STRIP) & 0xff == 0 {
-                    // Nobody looks at these pixels again in this part.
-                    self.dead[strip] |= 1 << y;
-                    continue;
-                }
-                pending[some] = (strip, y);
-                some += 1;
-                if some == 4 {
-                    let [a, b, c, d] = pending;
-                    self.take([a, b], &mut closing, 0);
-                    self.take([c, d], &mut closing, 1);
-                    closing.close::<S, 2>([[a, b], [c, d]]);
-                    some = 0;
-                }
+        self.places.list(self.simd, &closing);
+        let Sheets { simd, records, before, places, .. } = self;
+        let mut some = Closing { simd: *simd, part, open, pixels, any_shut: false };
+        let mut rows: [Row; 2] = Default::default();
+        for i in (0..places.len()).step_by(2 * LANES) {
+            let first = places.from(i);
+            take::<S, N>(
+                *simd,
+                (records, before),
+                &some.pixels.all,
+                first,
+                slot::<N>(k),
+                &mut rows[0],
+            );
+            if i + LANES < places.len() {
+                let second = places.from(i + LANES);
+                let sums = (&mut **records, &mut **before);
+                take::<S, N>(*simd, sums, &some.pixels.all, second, slot::<N>(k), &mut rows[1]);
+                some.close::<S, 2>(&mut rows, [first, second]);
+            } else {
+                some.close::<S, 1>(rows.first_chunk_mut().expect("one of two"), [first]);
             }
         }
-        for two in pending[..some].chunks(2) {
-            // One alone is its own neighbour.
-            let two = [two[0], two[two.len() - 1]];
-            self.take(two, &mut closing, 0);
-            closing.close::<S, 1>([two]);
-        }
-        closing.any_shut
-    }
-
-    #[inline(always)]
-    fn take(&mut self, strips: [(usize, usize); 2], to: &mut Closing<'_>, row: usize) {
-        let strips = strips.map(|(strip, y)| Strip {
-            record: y * STRIDE + strip * STRIP,
-            pixel: y * EDGE + strip * STRIP,
-        });
-        let sums = (&mut *self.records, &mut *self.before);
-        S::take(self.simd, sums, &to.pixels.a, strips, slot::<N>(to.k), &mut to.rows[row]);
+        some.any_shut
     }
 
     /// Leaves nothing behind, where sheets before `k` are closed.
     fn empty(&mut self, k: i32) {
         let left = self.touched(k + 1 - self.most as i32, k - 1);
-        for strip in 0..STRIPS {
-            for y in 0..EDGE {
-                let at = strip * STRIP;
-                if (left[strip] | self.dead[strip]) >> y & 1 == 1 {
-                    self.records[y * STRIDE + at..][..STRIP].fill([S::Pixel::default(); N]);
-                }
-                if self.was[strip] >> y & 1 == 1 {
-                    self.before[y * EDGE + at..][..STRIP].fill(S::Pixel::default());
-                }
+        for (y, (left, dead)) in left.iter().zip(&self.dead).enumerate() {
+            let some = left | dead;
+            if some != 0 {
+                let [from, to] = [some.trailing_zeros(), 64 - some.leading_zeros()];
+                let [from, to] = [from, to].map(|x| y * STRIDE + x as usize);
+                self.records[from..to].fill([S::Pixel::default(); N]);
             }
         }
     }
@@ -297,48 +310,71 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
 /// A sheet that is being closed.
 struct Closing<'a> {
     simd: Simd,
-    k: i32,
     part: &'a Part<'a>,
     open: &'a mut OpenMask,
     pixels: &'a mut Pixels,
-    rows: [Row; 2],
     any_shut: bool,
 }
 
 impl Closing<'_> {
-    /// Composites strips, two a row, whose sums are in the first rows.
+    /// Composites pixels whose sums are in rows.
     #[inline(always)]
-    fn close<S: Recorded, const ROWS: usize>(&mut self, strips: [[(usize, usize); 2]; ROWS]) {
-        let Closing { simd, part, open, pixels, rows, .. } = self;
-        let rows = rows.first_chunk_mut::<ROWS>().expect("two rows at most");
-        let mut live = [0; ROWS];
-        for (live, two) in live.iter_mut().zip(&strips) {
-            for (half, &(strip, y)) in two.iter().enumerate() {
-                *live |= ((open.row(y) >> (strip * STRIP) & 0xff) << (half * STRIP)) as u32;
-            }
-        }
-        // Where rays are parallel, the row's secants stay 1.
+    fn close<S: Recorded, const ROWS: usize>(
+        &mut self,
+        rows: &mut [Row; ROWS],
+        places: [Some16<'_>; ROWS],
+    ) {
+        let Closing { simd, part, open, pixels, any_shut } = self;
+        // Where rays are parallel, the rows' secants stay 1.
         if let Projection::Persp { .. } = part.frame.view.projection {
-            for (row, two) in rows.iter_mut().zip(&strips) {
-                for (half, &(strip, y)) in two.iter().enumerate() {
-                    let secants = &pixels.secants[y * EDGE + strip * STRIP..][..STRIP];
-                    for (i, secant) in secants.iter().enumerate() {
-                        let lane = half * STRIP + i;
-                        (row.secant[lane], row.cosine[lane]) = (*secant, 1.0 / secant);
-                    }
+            for (row, places) in rows.iter_mut().zip(places) {
+                for (secant, &at) in row.secant.iter_mut().zip(places.at()) {
+                    *secant = pixels.secants[at as usize];
+                }
+                for (cosine, secant) in row.cosine.iter_mut().zip(&row.secant) {
+                    *cosine = 1.0 / secant;
                 }
             }
         }
+        let mut live = [0; ROWS];
+        for (live, places) in live.iter_mut().zip(places) {
+            *live = (1 << places.len()) - 1;
+        }
         let shut = close_rows::<S, ROWS>(*simd, &part.frame.rule, rows, live);
-        for ((row, two), shut) in rows.iter().zip(&strips).zip(shut) {
-            // One alone is there twice.
-            let halves = if two[0] == two[1] { 1 } else { 2 };
-            for (half, &(strip, y)) in two[..halves].iter().enumerate() {
-                pixels.put(y * EDGE + strip * STRIP, row, half * STRIP);
-                let shut = u64::from(shut >> (half * STRIP) & 0xff);
-                open.close(y, shut << (strip * STRIP));
-                self.any_shut |= shut != 0;
+        for ((row, places), mut shut) in rows.iter().zip(places).zip(shut) {
+            put(*simd, row, &places.at()[..places.len()], &mut pixels.all);
+            *any_shut |= shut != 0;
+            while shut != 0 {
+                let [x, y] = column_and_row(places.at()[shut.trailing_zeros() as usize % LANES]);
+                open.close(y, 1 << x);
+                shut &= shut - 1;
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn voxels_touch_together_what_they_touch_one_by_one(
+            [wide, high] in prop::array::uniform2(1..=64usize),
+            corners in prop::collection::vec(any::<[usize; 2]>(), 0..20),
+        ) {
+            let [mut one_by_one, mut together] = [Store::<i32>::default(), Store::default()];
+            let mut one_by_one = Sheets::<i32, 4>::new(Simd::plain(), &mut one_by_one, 4);
+            let mut together = Sheets::<i32, 4>::new(Simd::plain(), &mut together, 4);
+            let mut rows = [0u64; EDGE];
+            for [x, y] in corners {
+                let at = [x % (EDGE + 1 - wide), y % (EDGE + 1 - high)];
+                one_by_one.touch(2, at, [wide, high]);
+                rows[at[1]] |= 1 << at[0];
+            }
+            together.touch_all(2, &rows, [wide, high]);
+            prop_assert_eq!(together.touched(0, 3), one_by_one.touched(0, 3));
         }
     }
 }

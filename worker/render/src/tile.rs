@@ -28,8 +28,7 @@ use crate::mask::OpenMask;
 use crate::planes;
 use crate::region::{Coming, Memory};
 use crate::scene::{Corner, Frame};
-use crate::sheet::Row;
-use crate::splat::records::{MOST, Recorded};
+use crate::splat::records::{MOST, Recorded, STRIDE};
 use crate::splat::{Grey, Simd};
 use crate::stack::Store;
 use slabcast_common::brick::Brick;
@@ -225,43 +224,18 @@ pub(crate) struct Part<'a> {
     pub(crate) inside: &'a [u32],
 }
 
-/// A part's pixels, in rows of [`PART`] whatever the part's width.
+/// A part's pixels, in rows of [`STRIDE`] whatever the part's width.
 pub(crate) struct Pixels {
+    /// Lengths of rays in a sheet over its thickness.
     pub(crate) secants: Vec<f32>,
-    pub(crate) a: Vec<f32>,
-    pub(crate) colour: [Vec<u32>; 3],
+    /// The bits of each one's opacity, and three colours.
+    pub(crate) all: Vec<[u32; 4]>,
 }
 
 impl Default for Pixels {
     fn default() -> Self {
-        let n = planes::PART * planes::PART;
-        Pixels {
-            secants: vec![1.0; n],
-            a: vec![0.0; n],
-            colour: std::array::from_fn(|_| vec![0; n]),
-        }
-    }
-}
-
-/// Pixels that are written together.
-const STRIP: usize = planes::BLOCK;
-
-impl Pixels {
-    /// Takes over what a closed row says of [`STRIP`] pixels from `at`, which are its lanes from
-    /// `lane`.
-    #[inline(always)]
-    pub(crate) fn put(&mut self, at: usize, row: &Row, lane: usize) {
-        self.a[at..at + STRIP].copy_from_slice(&row.a[lane..lane + STRIP]);
-        for (plane, light) in self.colour.iter_mut().zip(&row.light) {
-            let plane = plane[at..].first_chunk_mut::<STRIP>().expect("a strip");
-            let light = light[lane..].first_chunk::<STRIP>().expect("a strip");
-            // Out of memory that compilers think is `row`, too.
-            let mut sums = *plane;
-            for i in 0..STRIP {
-                sums[i] = sums[i].wrapping_add(light[i]);
-            }
-            *plane = sums;
-        }
+        let n = STRIDE * planes::PART;
+        Pixels { secants: vec![1.0; n], all: vec![[0; 4]; n] }
     }
 }
 
@@ -473,17 +447,14 @@ impl Part<'_> {
     /// Takes the part's pixels out of the tile's; returns which are open.
     pub(crate) fn begin(&self, pixels: &mut Pixels, tile: &TilePixels) -> OpenMask {
         let (w, h) = (self.rect.width(), self.rect.height());
-        let stride = planes::PART;
         let mut open = OpenMask::shut(self.rect);
-        for plane in &mut pixels.colour {
-            plane.fill(0);
-        }
         for y in 0..h {
-            let (row, to) = (self.tile_row(y), y * stride);
-            pixels.a[to..to + w].copy_from_slice(&tile.a[row..row + w]);
+            let (row, to) = (self.tile_row(y), y * STRIDE);
             let mut bits = 0u64;
-            for x in 0..w {
-                bits |= u64::from(!self.frame.rule.is_shut(pixels.a[to + x])) << x;
+            let all = &mut pixels.all[to..to + w];
+            for (x, (pixel, a)) in all.iter_mut().zip(&tile.a[row..row + w]).enumerate() {
+                *pixel = [a.to_bits(), 0, 0, 0];
+                bits |= u64::from(!self.frame.rule.is_shut(*a)) << x;
             }
             open.open_row(y, bits);
             let view = &self.frame.view;
@@ -505,11 +476,14 @@ impl Part<'_> {
     pub(crate) fn end(&self, pixels: &Pixels, out: &mut TilePixels) {
         let (w, h) = (self.rect.width(), self.rect.height());
         for y in 0..h {
-            let (row, from) = (self.tile_row(y), y * planes::PART);
-            out.a[row..row + w].copy_from_slice(&pixels.a[from..from + w]);
-            let [r, g, b] = pixels.colour.each_ref().map(|plane| &plane[from..from + w]);
-            for (x, colour) in out.colour[row..row + w].iter_mut().enumerate() {
-                for (sum, more) in colour.iter_mut().zip([r[x], g[x], b[x]]) {
+            let (row, from) = (self.tile_row(y), y * STRIDE);
+            let (a, colour) = (&mut out.a[row..row + w], &mut out.colour[row..row + w]);
+            for (pixel, (a, colour)) in
+                pixels.all[from..from + w].iter().zip(a.iter_mut().zip(colour))
+            {
+                let [opacity, r, g, b] = *pixel;
+                *a = f32::from_bits(opacity);
+                for (sum, more) in colour.iter_mut().zip([r, g, b]) {
                     *sum = sum.wrapping_add(more);
                 }
             }

@@ -60,6 +60,13 @@ pub(crate) trait Lanes {
     unsafe fn floats(items: &[f32]) -> Self::Ints;
     /// Lane by lane, four numbers of each.
     unsafe fn store_fours(to: *mut u32, fours: [Self::Ints; 4]);
+    /// Four numbers from each of as many places as there are lanes: the first of all places, the second, and
+    /// so on. The `i`th begins at the `at[i] * stride`th number behind `from`.
+    unsafe fn fours(from: *const u32, stride: usize, at: *const u32) -> [Self::Ints; 4];
+    /// The same of two numbers behind each of two `from`s: four.
+    unsafe fn twos(from: [*const u32; 2], stride: usize, at: *const u32) -> [Self::Ints; 4];
+    /// Whole numbers as floats.
+    unsafe fn store_floats(to: *mut f32, a: Self::Ints);
     /// Bits `from` to `from + 31` of the sums of `n` and what lies from `at` on.
     unsafe fn bits_of_sums(n: i64, at: *const i64, from: u32) -> Self::Ints;
 }
@@ -122,6 +129,29 @@ fn eight<T: Copy + Default>(items: &[T]) -> [T; 8] {
     }
 }
 
+/// Where the numbers of place `*at` begin.
+///
+/// # Safety
+/// They are there.
+#[inline(always)]
+unsafe fn place(from: *const u32, stride: usize, at: *const u32) -> *const __m128i {
+    // SAFETY: the caller's.
+    unsafe { from.add(*at as usize * stride).cast() }
+}
+
+/// Two numbers from each of two.
+///
+/// # Safety
+/// They are there.
+#[inline(always)]
+unsafe fn two_twos([a, b]: [*const u32; 2], stride: usize, at: *const u32) -> __m128i {
+    // SAFETY: the caller's, and every machine has these instructions.
+    unsafe {
+        let (a, b) = (place(a, stride, at), place(b, stride, at));
+        _mm_unpacklo_epi64(_mm_loadl_epi64(a), _mm_loadl_epi64(b))
+    }
+}
+
 /// Eight lanes, with AVX2.
 pub(super) struct Eight;
 
@@ -132,6 +162,20 @@ impl Eight {
     fn ordered(order: u64, a: __m256i) -> __m256i {
         let order = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(order as i64));
         _mm256_permutevar8x32_epi32(a, order)
+    }
+
+    /// Four by four in each half, turned over.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn turned(p: [__m256i; 4]) -> [__m256i; 4] {
+        let low = [_mm256_unpacklo_epi32(p[0], p[1]), _mm256_unpacklo_epi32(p[2], p[3])];
+        let high = [_mm256_unpackhi_epi32(p[0], p[1]), _mm256_unpackhi_epi32(p[2], p[3])];
+        [
+            _mm256_unpacklo_epi64(low[0], low[1]),
+            _mm256_unpackhi_epi64(low[0], low[1]),
+            _mm256_unpacklo_epi64(high[0], high[1]),
+            _mm256_unpackhi_epi64(high[0], high[1]),
+        ]
     }
 }
 
@@ -212,6 +256,35 @@ impl Lanes for Eight {
                 unsafe { _mm256_storeu_si256(to.add(8 * i).cast(), two) };
             }
         }
+        fn fours(from: *const u32, stride: usize, at: *const u32) -> [__m256i; 4] {
+            let mut places = [_mm256_setzero_si256(); 4];
+            for (i, places) in places.iter_mut().enumerate() {
+                // SAFETY: the caller has four numbers at each place.
+                *places = unsafe {
+                    let low = _mm_loadu_si128(place(from, stride, at.add(i)));
+                    let high = _mm_loadu_si128(place(from, stride, at.add(i + 4)));
+                    _mm256_set_m128i(high, low)
+                };
+            }
+            Eight::turned(places)
+        }
+        fn twos(from: [*const u32; 2], stride: usize, at: *const u32) -> [__m256i; 4] {
+            let [a, b] = from;
+            let mut places = [_mm256_setzero_si256(); 4];
+            for (i, places) in places.iter_mut().enumerate() {
+                // SAFETY: the caller has two numbers at each place.
+                *places = unsafe {
+                    let low = two_twos([a, b], stride, at.add(i));
+                    let high = two_twos([a, b], stride, at.add(i + 4));
+                    _mm256_set_m128i(high, low)
+                };
+            }
+            Eight::turned(places)
+        }
+        fn store_floats(to: *mut f32, a: __m256i) {
+            // SAFETY: the caller has room for eight there.
+            unsafe { _mm256_storeu_ps(to, _mm256_cvtepi32_ps(a)) }
+        }
         fn bits_of_sums(n: i64, at: *const i64, from: u32) -> __m256i {
             let (n, from) = (_mm256_set1_epi64x(n), _mm_cvtsi32_si128(from as i32));
             // SAFETY: the caller has eight numbers there.
@@ -236,6 +309,28 @@ impl Sixteen {
     #[inline(always)]
     fn there<T>(items: &[T]) -> u16 {
         ((1u32 << items.len().min(16)) - 1) as u16
+    }
+
+    /// A register of four quarters.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn quarters(a: __m128i, b: __m128i, c: __m128i, d: __m128i) -> __m512i {
+        let low = _mm512_inserti32x4::<1>(_mm512_castsi128_si512(a), b);
+        _mm512_inserti32x4::<3>(_mm512_inserti32x4::<2>(low, c), d)
+    }
+
+    /// Four by four in each quarter, turned over.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn turned(p: [__m512i; 4]) -> [__m512i; 4] {
+        let low = [_mm512_unpacklo_epi32(p[0], p[1]), _mm512_unpacklo_epi32(p[2], p[3])];
+        let high = [_mm512_unpackhi_epi32(p[0], p[1]), _mm512_unpackhi_epi32(p[2], p[3])];
+        [
+            _mm512_unpacklo_epi64(low[0], low[1]),
+            _mm512_unpackhi_epi64(low[0], low[1]),
+            _mm512_unpacklo_epi64(high[0], high[1]),
+            _mm512_unpackhi_epi64(high[0], high[1]),
+        ]
     }
 }
 
@@ -303,6 +398,39 @@ impl Lanes for Sixteen {
                 // SAFETY: the caller has room for four times sixteen numbers.
                 unsafe { _mm512_storeu_si512(to.add(16 * i).cast(), four) };
             }
+        }
+        fn fours(from: *const u32, stride: usize, at: *const u32) -> [__m512i; 4] {
+            let mut places = [_mm512_setzero_si512(); 4];
+            for (i, places) in places.iter_mut().enumerate() {
+                // SAFETY: the caller has four numbers at each place.
+                *places = unsafe {
+                    let a = _mm_loadu_si128(place(from, stride, at.add(i)));
+                    let b = _mm_loadu_si128(place(from, stride, at.add(i + 4)));
+                    let c = _mm_loadu_si128(place(from, stride, at.add(i + 8)));
+                    let d = _mm_loadu_si128(place(from, stride, at.add(i + 12)));
+                    Sixteen::quarters(a, b, c, d)
+                };
+            }
+            Sixteen::turned(places)
+        }
+        fn twos(from: [*const u32; 2], stride: usize, at: *const u32) -> [__m512i; 4] {
+            let [a, b] = from;
+            let mut places = [_mm512_setzero_si512(); 4];
+            for (i, places) in places.iter_mut().enumerate() {
+                // SAFETY: the caller has two numbers at each place.
+                *places = unsafe {
+                    let first = two_twos([a, b], stride, at.add(i));
+                    let second = two_twos([a, b], stride, at.add(i + 4));
+                    let third = two_twos([a, b], stride, at.add(i + 8));
+                    let fourth = two_twos([a, b], stride, at.add(i + 12));
+                    Sixteen::quarters(first, second, third, fourth)
+                };
+            }
+            Sixteen::turned(places)
+        }
+        fn store_floats(to: *mut f32, a: __m512i) {
+            // SAFETY: the caller has room for sixteen there.
+            unsafe { _mm512_storeu_ps(to, _mm512_cvtepi32_ps(a)) }
         }
         fn bits_of_sums(n: i64, at: *const i64, from: u32) -> __m512i {
             let (n, from) = (_mm512_set1_epi64(n), _mm_cvtsi32_si128(from as i32));

@@ -14,6 +14,7 @@ pub(crate) mod close;
 mod lanes;
 pub(crate) mod records;
 pub(crate) mod toss;
+pub(crate) mod touched;
 
 use crate::footprint::{Footprint, Sections};
 use crate::sheet::Sum;

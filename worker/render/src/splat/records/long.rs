@@ -25,12 +25,11 @@ macro_rules! by_width {
 
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx2 {
-    use crate::sheet::{LANES, Row};
     use crate::splat::lanes::{Eight, Lanes as _};
     use crate::splat::records::apart::lines::{self, Lines};
     use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, Layers, Woven};
     use crate::splat::records::{
-        Across, BySlot, MOST, Record, Recorded as _, RowAt, STRIDE, STRIP, Splat, Strip, Tables,
+        Across, BySlot, MOST, Record, Recorded as _, RowAt, STRIDE, Splat, Tables,
     };
     use crate::splat::{Simd, Tap};
     use std::arch::x86_64::*;
@@ -330,128 +329,6 @@ pub(super) mod avx2 {
                             _mm256_storeu_si256(at.add(two), sums);
                         }
                     }
-                }
-            }
-        }
-    }
-
-    /// Four by four in each half, turned over.
-    #[target_feature(enable = "avx2")]
-    #[inline]
-    fn turned(p: [__m256i; 4]) -> [__m256i; 4] {
-        let low = [_mm256_unpacklo_epi32(p[0], p[1]), _mm256_unpacklo_epi32(p[2], p[3])];
-        let high = [_mm256_unpackhi_epi32(p[0], p[1]), _mm256_unpackhi_epi32(p[2], p[3])];
-        [
-            _mm256_unpacklo_epi64(low[0], low[1]),
-            _mm256_unpackhi_epi64(low[0], low[1]),
-            _mm256_unpacklo_epi64(high[0], high[1]),
-            _mm256_unpackhi_epi64(high[0], high[1]),
-        ]
-    }
-
-    #[target_feature(enable = "avx2")]
-    #[inline]
-    pub(in super::super) fn take<const N: usize>(
-        (records, before): (&mut [Record<i32, N>], &mut [[i32; 4]]),
-        a: &[f32],
-        strips: [Strip; 2],
-        slot: usize,
-        row: &mut Row,
-    ) {
-        const { assert!(LANES == 2 * STRIP) };
-        let behind = (slot + 1) % N;
-        let twice = strips[0].pixel == strips[1].pixel;
-        for (half, strip) in strips.iter().enumerate() {
-            let lane = half * STRIP;
-            row.a[lane..lane + STRIP].copy_from_slice(&a[strip.pixel..strip.pixel + STRIP]);
-            let records = &mut records[strip.record..strip.record + STRIP];
-            let before = &mut before[strip.pixel..strip.pixel + STRIP];
-            // SAFETY: four sums are 16 bytes.
-            let load = |sums: &[i32; 4]| unsafe { _mm_loadu_si128(sums.as_ptr().cast()) };
-            // Pixel i, and above it pixel i + 4.
-            let mut sheets = [[_mm256_setzero_si256(); 4]; 3];
-            for i in 0..4 {
-                sheets[0][i] = _mm256_set_m128i(load(&before[i + 4]), load(&before[i]));
-                let pair = [&records[i + 4], &records[i]];
-                sheets[1][i] = _mm256_set_m128i(load(&pair[0][slot]), load(&pair[1][slot]));
-                sheets[2][i] = _mm256_set_m128i(load(&pair[0][behind]), load(&pair[1][behind]));
-            }
-            if !(twice && half == 0) {
-                for (before, record) in before.iter_mut().zip(records) {
-                    *before = record[slot];
-                    record[slot] = [0; 4];
-                }
-            }
-            let to = [&mut row.before, &mut row.here, &mut row.behind];
-            for (to, sheet) in to.into_iter().zip(sheets) {
-                let sums = turned(sheet);
-                for (to, sums) in to.iter_mut().zip(sums) {
-                    let to = to[lane..].first_chunk_mut::<STRIP>().expect("a strip");
-                    // SAFETY: eight floats are 32 bytes.
-                    unsafe { _mm256_storeu_ps(to.as_mut_ptr(), _mm256_cvtepi32_ps(sums)) };
-                }
-            }
-        }
-    }
-
-    /// Four pixels of extinction and grey.
-    #[target_feature(enable = "avx2")]
-    #[inline]
-    fn four(pixel: impl Fn(usize) -> [i32; 2]) -> __m256i {
-        let wide = |i: usize| bytemuck::cast::<[i32; 2], i64>(pixel(i));
-        _mm256_setr_epi64x(wide(0), wide(1), wide(2), wide(3))
-    }
-
-    /// Extinction and grey of eight pixels.
-    #[target_feature(enable = "avx2")]
-    #[inline]
-    fn parted(low: __m256i, high: __m256i) -> [__m256; 2] {
-        let (low, high) = (_mm256_castsi256_ps(low), _mm256_castsi256_ps(high));
-        // Pixels 0, 1, 4, 5 and 2, 3, 6, 7: put in order by pairs.
-        let of = |sums: __m256| {
-            let pairs = _mm256_permute4x64_epi64::<0b11_01_10_00>(_mm256_castps_si256(sums));
-            _mm256_cvtepi32_ps(pairs)
-        };
-        [
-            of(_mm256_shuffle_ps::<0b10_00_10_00>(low, high)),
-            of(_mm256_shuffle_ps::<0b11_01_11_01>(low, high)),
-        ]
-    }
-
-    #[target_feature(enable = "avx2")]
-    #[inline]
-    pub(in super::super) fn take_grey<const N: usize>(
-        (records, before): (&mut [[[i32; 2]; N]], &mut [[i32; 2]]),
-        a: &[f32],
-        strips: [Strip; 2],
-        slot: usize,
-        row: &mut Row,
-    ) {
-        const { assert!(LANES == 2 * STRIP) };
-        let behind = (slot + 1) % N;
-        let twice = strips[0].pixel == strips[1].pixel;
-        for (half, strip) in strips.iter().enumerate() {
-            let lane = half * STRIP;
-            row.a[lane..lane + STRIP].copy_from_slice(&a[strip.pixel..strip.pixel + STRIP]);
-            let records = records[strip.record..].first_chunk_mut::<STRIP>().expect("a strip");
-            let before = before[strip.pixel..].first_chunk_mut::<STRIP>().expect("a strip");
-            let sheets = [
-                parted(four(|i| before[i]), four(|i| before[i + 4])),
-                parted(four(|i| records[i][slot]), four(|i| records[i + 4][slot])),
-                parted(four(|i| records[i][behind]), four(|i| records[i + 4][behind])),
-            ];
-            if !(twice && half == 0) {
-                for (before, record) in before.iter_mut().zip(records) {
-                    *before = record[slot];
-                    record[slot] = [0; 2];
-                }
-            }
-            let to = [&mut row.before, &mut row.here, &mut row.behind];
-            for (to, sheet) in to.into_iter().zip(sheets) {
-                for (to, sums) in to.iter_mut().zip(sheet) {
-                    let to = to[lane..].first_chunk_mut::<STRIP>().expect("a strip");
-                    // SAFETY: eight floats are 32 bytes.
-                    unsafe { _mm256_storeu_ps(to.as_mut_ptr(), sums) };
                 }
             }
         }

@@ -29,7 +29,7 @@ mod short;
 use self::apart::{Apart, Layers, Woven};
 use super::{Accumulate, Grey, Level, Section, Simd, Tap, section_fixed, whole};
 use crate::footprint::{Footprint, Sections};
-use crate::sheet::{LANES, Row, Sum};
+use crate::sheet::Sum;
 use slabcast_common::image::RawSums;
 
 /// Sheets of a record at most.
@@ -141,18 +141,6 @@ impl Splat {
         (x.row(rows[0]), y.row(rows[1]), tables.deep.row(z))
     }
 }
-
-/// Eight pixels of a row in the part.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Strip {
-    /// First record.
-    pub(crate) record: usize,
-    /// First pixel, where rows have no pixel more than columns.
-    pub(crate) pixel: usize,
-}
-
-/// Pixels of a strip.
-pub(crate) const STRIP: usize = 8;
 
 /// A weight for each slot.
 pub(crate) type BySlot<W, const N: usize> = [W; N];
@@ -295,21 +283,6 @@ pub(crate) trait Recorded: Accumulate {
     ) {
         apart::splat_apart(simd, records, voxels, layers, woven);
     }
-
-    /// Takes the sums of sheet k, which `slot` holds, of two strips for a row that is to be closed:
-    /// those of the sheet before (out of `before`), of the sheet itself, and of the one behind, and
-    /// the opacity so far, `a`. Leaves those of sheet k in `before` and nothing in the slot.
-    ///
-    /// # Panics
-    /// If a strip leaves the part.
-    fn take<const N: usize>(
-        simd: Simd,
-        sums: (&mut [Record<Self, N>], &mut [Self::Pixel]),
-        a: &[f32],
-        strips: [Strip; 2],
-        slot: usize,
-        row: &mut Row,
-    );
 }
 
 /// What pixels of four sums have in common.
@@ -430,24 +403,6 @@ impl Recorded for i16 {
             Level::Plain => apart::splat_apart(simd, records, voxels, layers, woven),
         }
     }
-
-    #[inline(always)]
-    fn take<const N: usize>(
-        simd: Simd,
-        sums: (&mut [Record<i16, N>], &mut [[i16; 4]]),
-        a: &[f32],
-        strips: [Strip; 2],
-        slot: usize,
-        row: &mut Row,
-    ) {
-        at_level!(
-            simd,
-            (sums, a, strips, slot, row),
-            take_plain::<i16, N>,
-            short::avx2::take::<N>,
-            short::avx512::take::<N>
-        );
-    }
 }
 
 impl Recorded for i32 {
@@ -512,24 +467,6 @@ impl Recorded for i32 {
             },
             Level::Plain => apart::splat_apart(simd, records, voxels, layers, woven),
         }
-    }
-
-    #[inline(always)]
-    fn take<const N: usize>(
-        simd: Simd,
-        sums: (&mut [Record<i32, N>], &mut [[i32; 4]]),
-        a: &[f32],
-        strips: [Strip; 2],
-        slot: usize,
-        row: &mut Row,
-    ) {
-        at_level!(
-            simd,
-            (sums, a, strips, slot, row),
-            take_plain::<i32, N>,
-            long::avx2::take::<N>,
-            long::avx2::take::<N>
-        );
     }
 
     #[inline(always)]
@@ -621,24 +558,6 @@ impl Recorded for Grey {
             long::avx512::splat_all::<2, N>
         );
     }
-
-    #[inline(always)]
-    fn take<const N: usize>(
-        simd: Simd,
-        sums: (&mut [Record<Grey, N>], &mut [[i32; 2]]),
-        a: &[f32],
-        strips: [Strip; 2],
-        slot: usize,
-        row: &mut Row,
-    ) {
-        at_level!(
-            simd,
-            (sums, a, strips, slot, row),
-            take_plain::<Grey, N>,
-            long::avx2::take_grey::<N>,
-            long::avx2::take_grey::<N>
-        );
-    }
 }
 
 /// [`splat_plain`] with the tables of the sums that grey ones are bit for bit.
@@ -726,38 +645,9 @@ fn splat_deep<S: Recorded, const N: usize>(
     }
 }
 
-/// [`Recorded::take`] plainly.
-fn take_plain<S: Recorded, const N: usize>(
-    (records, before): (&mut [Record<S, N>], &mut [S::Pixel]),
-    a: &[f32],
-    strips: [Strip; 2],
-    slot: usize,
-    row: &mut Row,
-) {
-    const { assert!(LANES == 2 * STRIP) };
-    // A strip may stand there twice, where there is none to pair it with.
-    let was = strips.map(|s| std::array::from_fn::<_, STRIP, _>(|i| before[s.pixel + i]));
-    let here = strips.map(|s| std::array::from_fn::<_, STRIP, _>(|i| records[s.record + i]));
-    for (half, strip) in strips.iter().enumerate() {
-        for i in 0..STRIP {
-            let sheets = [was[half][i], here[half][i][slot], here[half][i][(slot + 1) % N]];
-            let to = [&mut row.before, &mut row.here, &mut row.behind];
-            for (to, sums) in to.into_iter().zip(sheets) {
-                for (to, bits) in to.iter_mut().zip(S::raw(&sums)) {
-                    to[half * STRIP + i] = S::from_bits(bits).value();
-                }
-            }
-            row.a[half * STRIP + i] = a[strip.pixel + i];
-            before[strip.pixel + i] = here[half][i][slot];
-            records[strip.record + i][slot] = S::Pixel::default();
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use proptest::prelude::*;
 
     /// Nine voxels with odd weights, by every instruction set.
     fn splat_everywhere<S: Recorded + std::fmt::Debug, const N: usize>(
@@ -896,64 +786,5 @@ mod tests {
         weave_everywhere::<i16, MOST>(&short);
         weave_everywhere::<i32, 4>(&long);
         weave_everywhere::<i32, MOST>(&long);
-    }
-
-    /// Two strips, taken by every instruction set.
-    fn take_everywhere<S: Recorded, const N: usize>(
-        strips: [usize; 2],
-        slot: usize,
-        mut next: impl FnMut() -> S,
-    ) -> Result<(), TestCaseError> {
-        let mut sums = || S::from_raw([(); 4].map(|()| S::bits(next())));
-        let records: Vec<Record<S, N>> = (0..48).map(|_| [(); N].map(|()| sums())).collect();
-        let before: Vec<S::Pixel> = (0..48).map(|_| sums()).collect();
-        let opacity: Vec<f32> = (0..48).map(|i| i as f32).collect();
-        let [a, b] = strips;
-        let strips = strips.map(|at| Strip { record: at, pixel: at });
-        let run = |simd| {
-            let (mut records, mut before) = (records.clone(), before.clone());
-            let mut row = Row::default();
-            S::take(simd, (&mut records, &mut before), &opacity, strips, slot, &mut row);
-            (records, before, row.before, row.here, row.behind, row.a)
-        };
-        let want = run(Simd::plain());
-        let value = |pixel: &S::Pixel, c: usize| S::from_bits(S::raw(pixel)[c]).value();
-        for c in 0..if S::GREY { 2 } else { 4 } {
-            prop_assert_eq!(want.3[c][0], value(&records[a][slot], c));
-            prop_assert_eq!(want.4[c][9], value(&records[b + 1][(slot + 1) % N], c));
-            prop_assert_eq!(want.2[c][7], value(&before[a + 7], c));
-        }
-        prop_assert_eq!(want.5[10], (b + 2) as f32);
-        for simd in Simd::all() {
-            let got = run(simd);
-            prop_assert!(got.0 == want.0 && got.1 == want.1 && got.5 == want.5, "{}", simd.name());
-            // Of grey sums nobody looks at the second and third colour.
-            let there = if S::GREY { 2 } else { 4 };
-            for (got, want) in [(&got.2, &want.2), (&got.3, &want.3), (&got.4, &want.4)] {
-                prop_assert!(got[..there] == want[..there], "{}", simd.name());
-            }
-        }
-        Ok(())
-    }
-
-    proptest! {
-        #[test]
-        fn strips_are_taken_as_the_plain_loop_takes_them(
-            seed in any::<u32>(), slot in 0..MOST, a in 0..40usize, b in 0..40usize,
-        ) {
-            let mut state = u64::from(seed) | 1 << 40;
-            let mut next = || {
-                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(99);
-                (state >> 32) as i32
-            };
-            // Apart, or the same strip twice.
-            prop_assume!(a == b || a.abs_diff(b) >= STRIP);
-            take_everywhere::<i16, 4>([a, b], slot % 4, || next() as i16)?;
-            take_everywhere::<i16, MOST>([a, b], slot, || next() as i16)?;
-            take_everywhere::<i32, 4>([a, b], slot % 4, &mut next)?;
-            take_everywhere::<i32, MOST>([a, b], slot, &mut next)?;
-            take_everywhere::<Grey, 4>([a, b], slot % 4, || Grey::from_bits(next() as u32))?;
-            take_everywhere::<Grey, MOST>([a, b], slot, || Grey::from_bits(next() as u32))?;
-        }
     }
 }

@@ -2,14 +2,11 @@
 
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx2 {
-    use crate::sheet::{LANES, Row};
     use crate::splat::Simd;
     use crate::splat::lanes::Eight;
     use crate::splat::records::apart::lines::{self, Lines};
     use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, LINE, Layers, Woven};
-    use crate::splat::records::{
-        Across, BySlot, MOST, Record, RowAt, STRIDE, STRIP, Splat, Strip, Tables,
-    };
+    use crate::splat::records::{Across, BySlot, MOST, Record, RowAt, STRIDE, Splat, Tables};
     use std::arch::x86_64::*;
 
     /// Registers of a record at most: four sheets each.
@@ -321,130 +318,16 @@ pub(super) mod avx2 {
             }
         }
     }
-
-    #[target_feature(enable = "avx2")]
-    #[inline]
-    pub(in super::super) fn take<const N: usize>(
-        sums: (&mut [Record<i16, N>], &mut [[i16; 4]]),
-        a: &[f32],
-        strips: [Strip; 2],
-        slot: usize,
-        row: &mut Row,
-    ) {
-        let sheets = turned(sums, strips, slot);
-        for (to, sheet) in [&mut row.before, &mut row.here, &mut row.behind].into_iter().zip(sheets)
-        {
-            for (to, sums) in to.iter_mut().zip(sheet) {
-                let halves = [_mm256_castsi256_si128(sums), _mm256_extracti128_si256::<1>(sums)];
-                for (to, half) in to.as_chunks_mut::<8>().0.iter_mut().zip(halves) {
-                    let floats = _mm256_cvtepi32_ps(_mm256_cvtepi16_epi32(half));
-                    // SAFETY: eight floats are 32 bytes.
-                    unsafe { _mm256_storeu_ps(to.as_mut_ptr(), floats) };
-                }
-            }
-        }
-        for (to, strip) in row.a.as_chunks_mut::<8>().0.iter_mut().zip(strips) {
-            *to = *a[strip.pixel..].first_chunk().expect("a strip");
-        }
-    }
-
-    /// Sums of two strips in the sheet before, in that of `slot` and in the one behind, channel by
-    /// channel: sixteen pixels a register. Leaves what [`super::take`] says.
-    #[target_feature(enable = "avx2")]
-    #[inline]
-    pub(super) fn turned<const N: usize>(
-        (records, before): (&mut [Record<i16, N>], &mut [[i16; 4]]),
-        [a, b]: [Strip; 2],
-        slot: usize,
-    ) -> [[__m256i; 4]; 3] {
-        const { assert!(LANES == 2 * STRIP) };
-        let records_a = &records[a.record..a.record + STRIP];
-        let records_b = &records[b.record..b.record + STRIP];
-        // Slots k and k+1 of pixel i, side by side, strip b above strip a.
-        let behind = (slot + 1) % N;
-        let one = |record: &Record<i16, N>| -> __m128i {
-            // SAFETY: four sums are 8 bytes.
-            let sums = |slot: usize| unsafe { _mm_loadl_epi64(record[slot].as_ptr().cast()) };
-            _mm_unpacklo_epi64(sums(slot), sums(behind))
-        };
-        let mut here = [_mm256_setzero_si256(); STRIP];
-        for i in 0..STRIP {
-            here[i] = _mm256_set_m128i(one(&records_b[i]), one(&records_a[i]));
-        }
-        // The sheet before is eight pixels of four sums: two pixels a register half.
-        let two = |s: &Strip| -> [__m128i; 4] {
-            let pixels = before[s.pixel..].first_chunk::<STRIP>().expect("a strip");
-            // SAFETY: eight pixels are four times 16 bytes.
-            [0, 1, 2, 3]
-                .map(|i| unsafe { _mm_loadu_si128(pixels.as_ptr().cast::<__m128i>().add(i)) })
-        };
-        let (was_a, was_b) = (two(&a), two(&b));
-        let mut was = [_mm256_setzero_si256(); 4];
-        let mut now = [_mm256_setzero_si256(); 4];
-        for i in 0..4 {
-            was[i] = _mm256_set_m128i(was_b[i], was_a[i]);
-            now[i] = _mm256_unpacklo_epi64(here[2 * i], here[2 * i + 1]);
-        }
-        for (strip, high) in [(a, false), (b, true)] {
-            let to = before[strip.pixel..].first_chunk_mut::<STRIP>().expect("a strip");
-            for i in 0..4 {
-                let half = _mm256_castsi256_si128(now[i]);
-                let half = if high { _mm256_extracti128_si256::<1>(now[i]) } else { half };
-                // SAFETY: eight pixels are four times 16 bytes.
-                unsafe { _mm_storeu_si128(to.as_mut_ptr().cast::<__m128i>().add(i), half) };
-            }
-            for record in &mut records[strip.record..strip.record + STRIP] {
-                record[slot] = [0; 4];
-            }
-        }
-        // Eight by eight, turned over: pairs, quadruples, all eight.
-        let pairs = |o: usize| {
-            [
-                _mm256_unpacklo_epi16(here[o], here[o + 1]),
-                _mm256_unpacklo_epi16(here[o + 2], here[o + 3]),
-                _mm256_unpackhi_epi16(here[o], here[o + 1]),
-                _mm256_unpackhi_epi16(here[o + 2], here[o + 3]),
-            ]
-        };
-        let (p, q) = (pairs(0), pairs(4));
-        let eight = |o: usize| {
-            let low =
-                [_mm256_unpacklo_epi32(p[o], p[o + 1]), _mm256_unpackhi_epi32(p[o], p[o + 1])];
-            let high =
-                [_mm256_unpacklo_epi32(q[o], q[o + 1]), _mm256_unpackhi_epi32(q[o], q[o + 1])];
-            [
-                _mm256_unpacklo_epi64(low[0], high[0]),
-                _mm256_unpackhi_epi64(low[0], high[0]),
-                _mm256_unpacklo_epi64(low[1], high[1]),
-                _mm256_unpackhi_epi64(low[1], high[1]),
-            ]
-        };
-        // Two pixels a register: 0 1, 2 3, 4 5, 6 7; first 0 2 and 1 3, 4 6 and 5 7.
-        let even = [_mm256_unpacklo_epi16(was[0], was[1]), _mm256_unpacklo_epi16(was[2], was[3])];
-        let odd = [_mm256_unpackhi_epi16(was[0], was[1]), _mm256_unpackhi_epi16(was[2], was[3])];
-        let p = [_mm256_unpacklo_epi16(even[0], odd[0]), _mm256_unpackhi_epi16(even[0], odd[0])];
-        let q = [_mm256_unpacklo_epi16(even[1], odd[1]), _mm256_unpackhi_epi16(even[1], odd[1])];
-        let was = [
-            _mm256_unpacklo_epi64(p[0], q[0]),
-            _mm256_unpackhi_epi64(p[0], q[0]),
-            _mm256_unpacklo_epi64(p[1], q[1]),
-            _mm256_unpackhi_epi64(p[1], q[1]),
-        ];
-        [was, eight(0), eight(2)]
-    }
 }
 
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx512 {
-    use super::avx2::{by_column, sixteen, turned};
-    use crate::sheet::Row;
+    use super::avx2::{by_column, sixteen};
     use crate::splat::Simd;
     use crate::splat::lanes::Sixteen;
     use crate::splat::records::apart::lines::{self, Lines};
     use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, LINE, Layers, Woven};
-    use crate::splat::records::{
-        Across, BySlot, Record, Recorded, RowAt, STRIDE, Splat, Strip, Tables,
-    };
+    use crate::splat::records::{Across, BySlot, Record, Recorded, RowAt, STRIDE, Splat, Tables};
     use std::arch::x86_64::*;
 
     /// 16-bit numbers of a register.
@@ -726,35 +609,5 @@ pub(super) mod avx512 {
                 }
             }
         }
-    }
-
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    pub(in super::super) fn take<const N: usize>(
-        sums: (&mut [Record<i16, N>], &mut [[i16; 4]]),
-        a: &[f32],
-        strips: [Strip; 2],
-        slot: usize,
-        row: &mut Row,
-    ) {
-        let sheets = turned(sums, strips, slot);
-        for (to, sheet) in [&mut row.before, &mut row.here, &mut row.behind].into_iter().zip(sheets)
-        {
-            for (to, sums) in to.iter_mut().zip(sheet) {
-                let floats = _mm512_cvtepi32_ps(_mm512_cvtepi16_epi32(sums));
-                // SAFETY: sixteen floats are 64 bytes. Two stores of 32 would have whoever loads
-                // them wait.
-                unsafe { _mm512_storeu_ps(to.as_mut_ptr(), floats) };
-            }
-        }
-        let half = |s: Strip| -> __m256 {
-            let a = a[s.pixel..].first_chunk::<8>().expect("a strip");
-            // SAFETY: eight floats are 32 bytes.
-            unsafe { _mm256_loadu_ps(a.as_ptr()) }
-        };
-        let both = _mm512_castps256_ps512(half(strips[0]));
-        let both = _mm512_insertf32x8::<1>(both, half(strips[1]));
-        // SAFETY: sixteen floats are 64 bytes.
-        unsafe { _mm512_storeu_ps(row.a.as_mut_ptr(), both) };
     }
 }

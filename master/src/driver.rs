@@ -450,9 +450,11 @@ impl Driver {
                 break;
             }
             self.handle(event);
-            // Everything readable first, then the wishes: leases that belong together leave
-            // together.
-            while let Ok(event) = events.try_recv() {
+            // Everything readable first, then the wishes: leases that belong together leave together.
+            // What comes meanwhile waits for the next time: who has many workers is never without
+            // an event for long, and leases must not wait until then.
+            for _ in 0..events.len() {
+                let Ok(event) = events.try_recv() else { break };
                 if matches!(event, Event::Shutdown) {
                     self.leave();
                     return;

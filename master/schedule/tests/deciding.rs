@@ -139,6 +139,8 @@ fn costs() -> Costs {
         frame_brick: 20.0,
         result: 3_000.0,
         event: 1_500.0,
+        driver_woken: 10_000.0,
+        driver_message: 800.0,
         master: toll(16_000.0),
         worker: toll(28_000.0),
         finish_pixel: 0.3,

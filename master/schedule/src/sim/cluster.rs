@@ -172,6 +172,7 @@ struct World<'a> {
     up: Pipe,
     inbox: Vec<Event>,
     driver_busy: bool,
+    driver_awake: bool,
     driver: Cores,
     streams: Cores,
     finisher: Cores,
@@ -230,6 +231,7 @@ pub fn run(
         up: Pipe::new(bandwidth),
         inbox: Vec::new(),
         driver_busy: false,
+        driver_awake: false,
         driver: Cores::new(1),
         streams: Cores::new(cluster.cores.map_or(STREAMS, |n| if n > 2 { STREAMS } else { 1 })),
         finisher: Cores::new(FINISHERS),
@@ -384,22 +386,25 @@ impl<'a> World<'a> {
 
     /// Work of a thread of the master.
     fn master(&mut self, which: fn(&mut Self) -> &mut Cores, at: Nanos, ns: f64) -> Nanos {
-        let woken = if which(self).sleeps(at) { self.cluster.costs.master.woken } else { 0.0 };
-        let ns = ns + woken;
-        let alone = which(self).run(at, ns);
-        match &mut self.machine {
-            Some(machine) => machine.run(at, ns).max(alone),
-            None => alone,
-        }
+        let woken = self.cluster.costs.master.woken;
+        let (alone, took) = which(self).take(at, ns, woken);
+        self.machine.as_mut().map_or(alone, |m| m.run(at, took).max(alone))
+    }
+
+    /// Work of the driver, which looks at what lies before it when that is done: when it is.
+    fn driver_works(&mut self, at: Nanos, ns: f64) -> Nanos {
+        let alone = self.driver.run(at, ns);
+        let end = self.machine.as_mut().map_or(alone, |m| m.run(at, ns).max(alone));
+        self.driver_busy = true;
+        self.later(end, Coming::Free);
+        end
     }
 
     /// Work of a worker beside rendering.
     fn worker(&mut self, id: WorkerId, at: Nanos, ns: f64) -> Nanos {
-        let sleeps = self.workers[&id].io.sleeps(at);
-        let ns = ns + if sleeps { self.cluster.costs.worker.woken } else { 0.0 };
-        self.worker_work += ns as Nanos;
         let w = self.workers.get_mut(&id).expect("a worker that works is there");
-        let alone = w.io.run(at, ns);
+        let (alone, ns) = w.io.take(at, ns, self.cluster.costs.worker.woken);
+        self.worker_work += ns as Nanos;
         match &mut self.machine {
             Some(machine) => machine.run(at, ns).max(alone),
             None => {
@@ -490,6 +495,7 @@ impl<'a> World<'a> {
             }
             Coming::Free => {
                 self.driver_busy = false;
+                self.driver_awake = !self.inbox.is_empty();
                 self.drive(took, watch)?;
             }
             Coming::AtWorker(id, message) => self.told(id, message)?,
@@ -806,10 +812,16 @@ impl<'a> World<'a> {
         }
         let now = self.now();
         let costs = self.cluster.costs;
+        if !std::mem::replace(&mut self.driver_awake, true) {
+            // What comes while it wakes is handled along with what woke it.
+            self.driver_works(now, costs.driver_woken);
+            return Ok(());
+        }
         let mut cost = 0.0;
         let mut actions = Vec::new();
         let mut heard = BTreeSet::new();
         for event in std::mem::take(&mut self.inbox) {
+            cost += costs.driver_message;
             let result = match &event {
                 Event::Result { result, .. } => Some(result.pixels.len()),
                 _ => None,
@@ -889,9 +901,9 @@ impl<'a> World<'a> {
                 }
             }
         }
-        let end = self.master(|w| &mut w.driver, now, cost);
-        self.driver_busy = true;
-        self.later(end, Coming::Free);
+        let sent = |a: &&Action| matches!(a, Action::Send { .. } | Action::SendBricks { .. });
+        cost += costs.driver_message * actions.iter().filter(sent).count() as f64;
+        let end = self.driver_works(now, cost);
         let mut written = BTreeSet::new();
         for action in &actions {
             let lent = match action {

@@ -89,7 +89,11 @@ pub struct Costs {
     /// To send a pixel of a picture to who asked for it: the master's streams, and the client on the
     /// machine of a rehearsal.
     pub deliver: [f64; 2],
-    /// The master's streams. Its driver is woken as they are.
+    /// Driver: to begin to work after it slept.
+    pub driver_woken: f64,
+    /// Driver: to take a message from its queue, or to put one into a link's.
+    pub driver_message: f64,
+    /// The master's streams.
     pub master: Toll,
     /// The master's finishers: a pixel of a picture (hash, encoding).
     pub finish_pixel: f64,

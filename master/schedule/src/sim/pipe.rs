@@ -42,18 +42,22 @@ impl Cores {
         Cores { free: vec![0; n.max(1) as usize], work: 0 }
     }
 
-    /// Whether whoever takes work that is there at `at` has slept.
-    pub(super) fn sleeps(&self, at: Nanos) -> bool {
-        self.free.iter().any(|free| *free < at)
+    /// Work that is there at `at`, for whoever is the first to begin with it: who is awake does when the work at
+    /// hand is done, who sleeps is woken, which takes `woken`. When it is done, and what it took.
+    pub(super) fn take(&mut self, at: Nanos, ns: f64, woken: f64) -> (Nanos, f64) {
+        let begins = |free: &Nanos| if *free < at { at + woken as Nanos } else { *free };
+        let core = self.free.iter_mut().min_by_key(|free| begins(free));
+        let core = core.expect("there is at least one");
+        let begun = begins(core);
+        let took = if *core < at { woken + ns } else { ns };
+        self.work += took as Nanos;
+        *core = begun + ns as Nanos;
+        (*core, took)
     }
 
-    /// Work that is there at `at`: when it is done.
+    /// The same where nobody has to be woken: when it is done.
     pub(super) fn run(&mut self, at: Nanos, ns: f64) -> Nanos {
-        let ns = ns as Nanos;
-        self.work += ns;
-        let core = self.free.iter_mut().min().expect("there is at least one");
-        *core = (*core).max(at) + ns;
-        *core
+        self.take(at, ns, 0.0).0
     }
 }
 
@@ -77,6 +81,18 @@ mod tests {
         let mut cores = Cores::new(2);
         assert_eq!([5.0, 5.0, 5.0].map(|ns| cores.run(10, ns)), [15, 15, 20]);
         assert_eq!(cores.work, 15);
-        assert_eq!([19, 15, 14].map(|at| cores.sleeps(at + 1)), [true, true, false]);
+    }
+
+    #[test]
+    fn nobody_is_woken_for_what_somebody_awake_begins_sooner() {
+        let mut cores = Cores::new(2);
+        assert_eq!(cores.take(100, 30.0, 20.0), (150, 50.0), "everybody slept");
+        assert_eq!(
+            cores.take(135, 30.0, 20.0),
+            (180, 30.0),
+            "the first is done before another is awake"
+        );
+        assert_eq!(cores.take(140, 30.0, 20.0), (190, 50.0), "and now it is not");
+        assert_eq!(cores.work, 130);
     }
 }

@@ -81,8 +81,9 @@ def run(binary, volume, tf, axes, workers, options, folder):
         client = subprocess.run(
             [binary, "render", "--master", address, "--tf", tf, "--size", options.size,
              "--frames", str(options.frames), "--stats", stats, "-o", out, *options.extra],
-            stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True)
         wall = time.monotonic() - begin
+        log.write(client.stdout)
         if client.returncode != 0:
             log.flush()
             sys.exit(f"render failed with exit code {client.returncode}:\n"
@@ -94,6 +95,7 @@ def run(binary, volume, tf, axes, workers, options, folder):
             "workers": workers,
             "frames": frames,
             "wall_s": wall,
+            "said": client.stdout,
             "png_bytes": png,
             "master_mib": peak_mib(master),
             "worker_mib": [peak_mib(w) for w in crew],

@@ -1,8 +1,6 @@
 //! Workers that hold tiles instead of drawing them, and masters that know it.
 
-mod program;
-
-use program::{Process, good, run, slabcast, text};
+use crate::program::{Process, good, run, slabcast, text};
 use serde_json::Value;
 use std::path::Path;
 use std::process::Stdio;
@@ -10,7 +8,7 @@ use std::process::Stdio;
 const SCENE: [&str; 6] = ["formula:spheres:32", "--size", "128x128", "--frames", "4", "--quiet"];
 
 fn master(dir: &Path, more: &[&str]) -> (Process, String) {
-    program::master(dir, "formula:spheres:32", more)
+    crate::program::master(dir, "formula:spheres:32", more)
 }
 
 #[test]

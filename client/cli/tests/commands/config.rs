@@ -1,8 +1,6 @@
 //! Flags, environment and file: who wins, and who is told about a mistake.
 
-mod program;
-
-use program::{good, run, slabcast, text};
+use crate::program::{good, run, slabcast, text};
 use std::path::Path;
 
 fn shown(dir: &Path, env: &[(&str, &str)], line: &[&str]) -> serde_json::Value {
@@ -154,6 +152,6 @@ fn a_demo_needs_nothing_and_may_be_repeated() {
     let said = good(dir.path(), &["demo", "-q"]);
     assert!(said.starts_with("12 frames in slabcast-demo/ (frame_0000.png"), "{said}");
     assert!(said.contains("slabcast render FILE"), "{said}");
-    assert_eq!(program::names(&folder).len(), 12);
+    assert_eq!(crate::program::names(&folder).len(), 12);
     assert!(std::fs::read(folder.join("frame_0003.png")).unwrap().starts_with(b"\x89PNG"));
 }

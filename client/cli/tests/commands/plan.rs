@@ -1,8 +1,6 @@
 //! `slabcast plan`: what is measured, what is predicted, and what is refused.
 
-mod program;
-
-use program::{good, names, run, text};
+use crate::program::{good, names, run, text};
 use serde_json::Value;
 
 const SMALL: [&str; 7] =

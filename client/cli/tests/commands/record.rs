@@ -1,8 +1,6 @@
 //! `--record` and `slabcast replay` on real runs.
 
-mod program;
-
-use program::{end, good, names, run, signal, slabcast, text};
+use crate::program::{end, good, names, run, signal, slabcast, text};
 use std::process::Stdio;
 use std::time::Duration;
 
@@ -52,7 +50,7 @@ fn a_master_records_until_it_is_told_to_stop() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     let (mut master, address) =
-        program::master(dir, "formula:spheres:24", &["--record", "events.log"]);
+        crate::program::master(dir, "formula:spheres:24", &["--record", "events.log"]);
     let worker = |name: &str| {
         let args = ["worker", "--master", &address, "--threads", "1", "--name", name];
         slabcast(dir, &args).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap()

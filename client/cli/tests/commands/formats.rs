@@ -2,9 +2,7 @@
 //! and get the same voxels as from its twin. They are not part of the repository; where their
 //! folder is missing the test says so and passes.
 
-mod program;
-
-use program::{good, run, text};
+use crate::program::{good, run, text};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -108,7 +106,11 @@ fn convert_keeps_voxels_values_and_place() {
         from = name.to_string();
     }
     good(dir.path(), &["convert", "a.nrrd", "b.nii", "--force", "-q"]);
-    assert_eq!(program::names(dir.path()), ["a.nrrd", "b.nii", "c.nii.gz"], "nothing else is left");
+    assert_eq!(
+        crate::program::names(dir.path()),
+        ["a.nrrd", "b.nii", "c.nii.gz"],
+        "nothing else is left"
+    );
     // Raw numbers, told by flags.
     std::fs::write(dir.path().join("r.bin"), [0, 1, 0, 2, 0, 3, 1, 0, 2, 0, 3, 0]).unwrap();
     let flags = ["--dims", "3x2x1", "--type", "int16", "--byte-order", "big", "--spacing", "1x2x3"];

@@ -1,9 +1,7 @@
 //! What docs/colours-and-cameras.md promises, by the program itself: its example files are drawn, names
 //! and ranges mean what they say, files for ParaView come back.
 
-mod program;
-
-use program::{run, slabcast};
+use crate::program::{run, slabcast};
 use slabcast_common::stats::FrameStats;
 use std::path::{Path, PathBuf};
 

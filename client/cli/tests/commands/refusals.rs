@@ -3,9 +3,7 @@
 //!
 //! The real program runs, each time in a folder of its own.
 
-mod program;
-
-use program::{run, slabcast};
+use crate::program::{run, slabcast};
 use std::collections::BTreeSet;
 use std::io::Write;
 use std::net::TcpListener;

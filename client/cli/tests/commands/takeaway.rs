@@ -1,9 +1,7 @@
 //! What people take away: pictures of every format that can be made again, moving ones, video in a
 //! pipe, and what becomes of them when the disk is full or Ctrl-C is pressed.
 
-mod program;
-
-use program::{end, good, names, run, signal, slabcast, text};
+use crate::program::{end, good, names, run, signal, slabcast, text};
 use std::io::{Read, Write};
 use std::path::Path;
 use std::process::{Command, Stdio};

@@ -1,8 +1,6 @@
 //! `slabcast study`: what it writes, that its figures agree with each other, and what it refuses.
 
-mod program;
-
-use program::{good, names, run, text};
+use crate::program::{good, names, run, text};
 use serde_json::Value;
 use std::path::Path;
 

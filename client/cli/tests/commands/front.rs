@@ -1,9 +1,7 @@
 //! `slabcast report`, `--error` and `--budget` as a user runs them: figures that are what they say,
 //! words that are kept.
 
-mod program;
-
-use program::{Process, master, slabcast};
+use crate::program::{Process, master, slabcast};
 use serde_json::Value;
 use std::path::Path;
 use std::process::Output;

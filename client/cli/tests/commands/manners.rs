@@ -1,8 +1,6 @@
 //! How the program behaves when all is well: what goes where, what is left, how it stops.
 
-mod program;
-
-use program::{end, names, run, signal, slabcast, text};
+use crate::program::{end, names, run, signal, slabcast, text};
 use slabcast_common::stats::FrameStats;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -257,9 +255,9 @@ fn daemons_say_where_they_are_and_leave_when_told() {
     assert!(jobs.contains("done") && jobs.contains("2/2"), "{jobs}");
     // A cluster's pictures say what made them, too; and its master has the time.
     let again = ["rerender", "slabcast-out/frame_0001.png", "formula:spheres:24", "-o", "a.png"];
-    assert!(program::good(dir.path(), &again).contains("a.png: the same "));
+    assert!(crate::program::good(dir.path(), &again).contains("a.png: the same "));
     std::fs::remove_file(dir.path().join("a.png")).unwrap();
-    let said = program::good(dir.path(), &["doctor", "--master", &address, "--json"]);
+    let said = crate::program::good(dir.path(), &["doctor", "--master", &address, "--json"]);
     let said: serde_json::Value = serde_json::from_str(&said).unwrap();
     for name in ["master", "versions", "clock"] {
         let checks = said["checks"].as_array().unwrap();

@@ -1,5 +1,4 @@
 //! The real program, run by tests in folders of their own.
-#![allow(dead_code, reason = "each test program uses a part of it")]
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;

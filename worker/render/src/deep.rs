@@ -8,6 +8,7 @@
 
 use crate::footprint::Phases;
 use crate::mask::{OpenMask, REACH_MOST};
+use crate::scene::Frame;
 use crate::splat::records::apart::{Apart, BATCH, Each, Layers, WINDOW, after};
 use crate::splat::records::{BySlot, Recorded, Table};
 use crate::splat::toss::{self, Kept, Sieve, Sifted, Tossing, any_in_rows, prefetch};
@@ -15,6 +16,7 @@ use crate::splat::{Accumulate, Simd, Work};
 use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
+use slabcast_common::occlusion::Rect;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS};
 
 /// A voxel waiting in the bucket of its first sheet, with all that drawing it takes: nobody goes back
@@ -81,25 +83,29 @@ pub(crate) struct Deep {
 
 /// Whether `part` may be rendered here.
 pub(crate) fn takes(part: &Part<'_>) -> Option<Deep> {
-    let (frame, view) = (part.frame, &part.frame.view);
+    deep(part.frame, &part.rect, part.nearest()?)
+}
+
+/// What it takes for a part whose bricks begin at sheet `nearest` or behind it.
+fn deep(frame: &Frame, r: &Rect, nearest: i32) -> Option<Deep> {
+    let view = &frame.view;
     let Projection::Persp { focal, distance } = view.projection else { return None };
     let most = frame.sections.most();
     // Scales fall with depth: those of the nearest sheet and of a voxel's length in front of it
     // bound all others, and show that no sheet is clipped.
-    let nearest = part.nearest()?;
     let footprint = frame.footprints.at(nearest)?;
     let own = footprint.reach()?;
     let front = view.scale_at(nearest - most as i32 - 1)?;
     // A section's plane and the voxel's own depth are less than that apart.
     let depth_apart = (0.5 * most as f64 + 1.0) * view.thickness;
     let middle = view.size.map(|n| f64::from(n) * 0.5);
-    let r = &part.rect;
     let aside = [r.x0, r.x1].map(|x| (f64::from(x) - middle[0]).abs());
     let above = [r.y0, r.y1].map(|y| (f64::from(y) - middle[1]).abs());
-    let farthest = aside.into_iter().chain(above).fold(0.0, f64::max) + 64.0;
-    // x / (z + dz) lies within |x / z| dz / z of x / z.
-    let apart = farthest * depth_apart * front / focal;
-    let reach = f64::from(own) + libm::ceil(apart) + 2.0;
+    // None that is farther aside than a mask is grown at most touches the part.
+    let farthest = aside.into_iter().chain(above).fold(0.0, f64::max) + f64::from(REACH_MOST);
+    // x / (z + dz) lies within |x / z| dz / z of x / z, and each is rounded to a subpixel.
+    let apart = farthest * depth_apart * front / focal + 4.0 / f64::from(SUBPIXELS);
+    let reach = f64::from(own) + libm::ceil(apart);
     let fits = reach <= f64::from(REACH_MOST) && 2.0 * reach + 2.0 < WINDOW as f64;
     fits.then_some(Deep { focal, distance, reach: reach as i32 })
 }
@@ -360,3 +366,65 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
 }
 
 const _: () = assert!(EDGE == PART as usize && WINDOW <= EDGE);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Scene;
+    use crate::selftest;
+    use glam::DVec3;
+    use proptest::prelude::*;
+    use slabcast_common::ids::BrickId;
+    use slabcast_common::quality::Quality;
+    use slabcast_common::view::{Camera, CameraProjection, View};
+    use slabcast_common::volume::Volume;
+    use std::sync::Arc;
+
+    proptest! {
+        /// Where voxels are looked for is the pixel of their centre and so many around it.
+        #[test]
+        fn no_section_lies_farther_aside_than_a_voxel_is_looked_for(
+            eye in prop::array::uniform3(-1.0..1.0f64), fov in 10.0..110.0f64,
+            distance in 10.0..60.0f64, thickness in prop::sample::select(vec![0.5, 1.0, 1.7]),
+            edge in prop::sample::select(vec![64, 150, 300]), which in 0..8u32,
+        ) {
+            let volume = Volume::from_fn_u8("any", [16; 3], |i, j, k| (i + 3 * j + 7 * k) as u8);
+            let quality = Quality { thickness, ..Quality::default() };
+            let projection = CameraProjection::Persp { fov, distance };
+            let to_eye = DVec3::from_array(eye) + DVec3::splat(1e-3);
+            let camera = Camera { to_eye, up: DVec3::Z, target: DVec3::ZERO, projection };
+            let view = View::new(&volume.lattice, &camera, [edge; 2], &quality).expect("a view");
+            let spec = selftest::spec(&volume, quality);
+            let frame = Frame::new(Arc::new(Scene::new(&spec)), view);
+            let corner = frame.corner(BrickId(which));
+            let placed: Vec<_> = (0..512).map(|local| frame.place(&corner, local)).collect();
+            let first = |z| frame.sections.first(z);
+            let nearest = placed.iter().map(|p| first(p.z)).min().expect("512 of them");
+            for (y0, x0) in [0, 64, 128, 192, 256].into_iter().flat_map(|y| [(y, 0), (y, 64), (y, y)]) {
+                let part = Rect::new(x0, y0, x0 + PART, y0 + PART)
+                    .intersect(&Rect::of_size([edge; 2]));
+                let Some(deep) = deep(&frame, &part, nearest).filter(|_| !part.is_empty()) else {
+                    continue;
+                };
+                for p in &placed {
+                    let scale = deep.focal / (p.eye.z + deep.distance);
+                    let cell = frame.view.screen(p.eye.x, p.eye.y, scale).map(|at| at >> SUBPIXEL_BITS);
+                    let (k, count) = frame.sections.span(p.z);
+                    for sheet in k..k + count as i32 {
+                        let footprint = frame.footprints.at(sheet).expect("none is clipped");
+                        let at = frame.screen(p, &footprint);
+                        let [x, y] = [0, 1].map(|axis| footprint.extent(axis, at[axis]));
+                        if Rect::new(x.0, y.0, x.1, y.1).intersect(&part).is_empty() {
+                            continue;
+                        }
+                        for (axis, (from, to)) in [x, y].into_iter().enumerate() {
+                            let (from, to) = (i64::from(from) - cell[axis], i64::from(to) - 1 - cell[axis]);
+                            let reach = i64::from(deep.reach);
+                            prop_assert!(-reach <= from && to <= reach, "{from} to {to} of {reach}");
+                        }
+                    }
+                }
+            }
+        }
+    }
+}

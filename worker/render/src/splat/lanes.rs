@@ -239,17 +239,13 @@ impl Lanes for Eight {
             unsafe { _mm256_loadu_si256(eight(items).as_ptr().cast()) }
         }
         fn store_fours(to: *mut u32, fours: [__m256i; 4]) {
-            let [a, b, c, d] = fours;
-            let ab = [_mm256_unpacklo_epi32(a, b), _mm256_unpackhi_epi32(a, b)];
-            let cd = [_mm256_unpacklo_epi32(c, d), _mm256_unpackhi_epi32(c, d)];
             // Lanes 0 and 4, 1 and 5, and so on, one a half.
-            let one = [_mm256_unpacklo_epi64(ab[0], cd[0]), _mm256_unpackhi_epi64(ab[0], cd[0])];
-            let two = [_mm256_unpacklo_epi64(ab[1], cd[1]), _mm256_unpackhi_epi64(ab[1], cd[1])];
+            let [a, b, c, d] = Eight::turned(fours);
             let ordered = [
-                _mm256_permute2x128_si256::<0x20>(one[0], one[1]),
-                _mm256_permute2x128_si256::<0x20>(two[0], two[1]),
-                _mm256_permute2x128_si256::<0x31>(one[0], one[1]),
-                _mm256_permute2x128_si256::<0x31>(two[0], two[1]),
+                _mm256_permute2x128_si256::<0x20>(a, b),
+                _mm256_permute2x128_si256::<0x20>(c, d),
+                _mm256_permute2x128_si256::<0x31>(a, b),
+                _mm256_permute2x128_si256::<0x31>(c, d),
             ];
             for (i, two) in ordered.into_iter().enumerate() {
                 // SAFETY: the caller has room for four times eight numbers.
@@ -322,7 +318,7 @@ impl Sixteen {
     /// Four by four in each quarter, turned over.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn turned(p: [__m512i; 4]) -> [__m512i; 4] {
+    pub(super) fn turned(p: [__m512i; 4]) -> [__m512i; 4] {
         let low = [_mm512_unpacklo_epi32(p[0], p[1]), _mm512_unpacklo_epi32(p[2], p[3])];
         let high = [_mm512_unpackhi_epi32(p[0], p[1]), _mm512_unpackhi_epi32(p[2], p[3])];
         [

@@ -366,13 +366,10 @@ fn run_avx512<W: Work>(work: W) -> W::Out {
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
 #[inline]
-fn by_column([a, b, c, d]: [std::arch::x86_64::__m512i; 4]) -> [std::arch::x86_64::__m512i; 4] {
+fn by_column(rows: [std::arch::x86_64::__m512i; 4]) -> [std::arch::x86_64::__m512i; 4] {
     use std::arch::x86_64::*;
-    let (low, high) = (_mm512_unpacklo_epi32(a, b), _mm512_unpackhi_epi32(a, b));
-    let (low_2, high_2) = (_mm512_unpacklo_epi32(c, d), _mm512_unpackhi_epi32(c, d));
     // Columns 0 4 8 12, 1 5 9 13 and so on, one a quarter; then in order.
-    let (a, b) = (_mm512_unpacklo_epi64(low, low_2), _mm512_unpackhi_epi64(low, low_2));
-    let (c, d) = (_mm512_unpacklo_epi64(high, high_2), _mm512_unpackhi_epi64(high, high_2));
+    let [a, b, c, d] = lanes::Sixteen::turned(rows);
     let ab = [_mm512_shuffle_i32x4::<0x44>(a, b), _mm512_shuffle_i32x4::<0xee>(a, b)];
     let cd = [_mm512_shuffle_i32x4::<0x44>(c, d), _mm512_shuffle_i32x4::<0xee>(c, d)];
     [

@@ -96,17 +96,26 @@ fn deep(frame: &Frame, r: &Rect, nearest: i32) -> Option<Deep> {
     let footprint = frame.footprints.at(nearest)?;
     let own = footprint.reach()?;
     let front = view.scale_at(nearest - most as i32 - 1)?;
-    // A section's plane and the voxel's own depth are less than that apart.
-    let depth_apart = (0.5 * most as f64 + 1.0) * view.thickness;
+    // From a voxel's own depth to the middle of a sheet that it reaches: to the sheet's far side at most,
+    // and half a sheet back.
+    let (ahead, behind, shift) = frame.sections.reach();
+    let reaches = f64::from(ahead.max(behind) + 1) / f64::from(1 << shift);
+    let depth_apart = (reaches + 0.5) * view.thickness;
     let middle = view.size.map(|n| f64::from(n) * 0.5);
     let aside = [r.x0, r.x1].map(|x| (f64::from(x) - middle[0]).abs());
     let above = [r.y0, r.y1].map(|y| (f64::from(y) - middle[1]).abs());
-    // None that is farther aside than a mask is grown at most touches the part.
-    let farthest = aside.into_iter().chain(above).fold(0.0, f64::max) + f64::from(REACH_MOST);
-    // x / (z + dz) lies within |x / z| dz / z of x / z, and each is rounded to a subpixel.
-    let apart = farthest * depth_apart * front / focal + 4.0 / f64::from(SUBPIXELS);
-    let reach = f64::from(own) + libm::ceil(apart);
-    let fits = reach <= f64::from(REACH_MOST) && 2.0 * reach + 2.0 < WINDOW as f64;
+    let farthest = aside.into_iter().chain(above).fold(0.0, f64::max);
+    // x / (z + dz) lies within |x / z| dz / z of x / z, and each is rounded to a subpixel; of voxels so many
+    // pixels outside of the part.
+    let reach_of = |outside: f64| {
+        let apart = (farthest + outside) * depth_apart * front / focal + 4.0 / f64::from(SUBPIXELS);
+        f64::from(own) + libm::ceil(apart)
+    };
+    // None that is farther outside than a mask is grown at most touches the part; so none that is farther
+    // than what those reach does.
+    let of_any = reach_of(f64::from(REACH_MOST));
+    let reach = reach_of(of_any);
+    let fits = of_any <= f64::from(REACH_MOST) && 2.0 * reach + 2.0 < WINDOW as f64;
     fits.then_some(Deep { focal, distance, reach: reach as i32 })
 }
 

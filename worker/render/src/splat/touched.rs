@@ -2,7 +2,7 @@
 //! of a closing sheet in, out and back.
 //!
 //! A row of lanes takes sixteen pixels from anywhere, so that no lane is spent on one that nothing was
-//! added to. Loops are written plainly, and once for all registers; both give the same bytes.
+//! added to, and where many footprints leave nothing at their rims on none of those, either. Loops are written plainly, and once for all registers; both give the same bytes.
 
 use super::Simd;
 use super::records::{Record, Recorded, STRIDE};
@@ -18,11 +18,13 @@ const PART: usize = 64 * STRIDE;
 pub(crate) struct Places {
     at: Box<[u32; MOST]>,
     n: usize,
+    /// Memory for places that are dropped.
+    dropped: Box<[u32; MOST]>,
 }
 
 impl Default for Places {
     fn default() -> Self {
-        Places { at: Box::new([0; MOST]), n: 0 }
+        Places { at: Box::new([0; MOST]), n: 0, dropped: Box::new([0; MOST]) }
     }
 }
 
@@ -74,6 +76,47 @@ impl Places {
         }
     }
 
+    /// Leaves only those where the sheet that `slot` holds has any extinction. At the others it is over and
+    /// done with: what there is of its sums are the ones before, and the slot is empty.
+    ///
+    /// # Panics
+    /// If there are fewer records or sums than a part has.
+    #[inline(always)]
+    pub(crate) fn sift<S: Recorded, const N: usize>(
+        &mut self,
+        simd: Simd,
+        sums: SumsOf<'_, S, N>,
+        slot: usize,
+    ) {
+        match simd.0 {
+            super::Level::Plain => self.sift_plain::<S, N>(sums, slot),
+            // SAFETY: the value proves that the instructions are there.
+            #[cfg(target_arch = "x86_64")]
+            super::Level::Avx2 => unsafe { wide::avx2::sift::<S, N>(self, sums, slot) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            super::Level::Avx512 => unsafe { wide::avx512::sift::<S, N>(self, sums, slot) },
+        }
+    }
+
+    fn sift_plain<S: Recorded, const N: usize>(
+        &mut self,
+        (records, before): SumsOf<'_, S, N>,
+        slot: usize,
+    ) {
+        let n = std::mem::take(&mut self.n);
+        for i in 0..n {
+            let at = self.at[i];
+            let sums = &mut records[at as usize][slot];
+            if first_word(sums) == 0 {
+                before[at as usize] = std::mem::take(sums);
+            } else {
+                self.at[self.n] = at;
+                self.n += 1;
+            }
+        }
+    }
+
     /// How many there are.
     pub(crate) fn len(&self) -> usize {
         self.n
@@ -92,6 +135,12 @@ impl Places {
 pub(crate) fn column_and_row(place: u32) -> [usize; 2] {
     let place = place as usize;
     [place % STRIDE, place / STRIDE]
+}
+
+/// A pixel's first 32 bits: its extinction, and no more than one colour beside it. Zero: it has none.
+#[inline(always)]
+fn first_word<P: bytemuck::Pod>(pixel: &P) -> u32 {
+    bytemuck::pod_read_unaligned(&bytemuck::bytes_of(pixel)[..4])
 }
 
 /// Records of open sheets, and sums of the sheet before.
@@ -197,6 +246,16 @@ mod wide {
                 }
 
                 #[target_feature(enable = $features)]
+                pub(in super::super) fn sift<S: Recorded, const N: usize>(
+                    places: &mut Places,
+                    sums: SumsOf<'_, S, N>,
+                    slot: usize,
+                ) {
+                    // SAFETY: these are the instructions.
+                    unsafe { super::sift::<$lanes, S, N>(places, sums, slot) }
+                }
+
+                #[target_feature(enable = $features)]
                 pub(in super::super) fn take<S: Recorded, const N: usize>(
                     sums: SumsOf<'_, S, N>,
                     pixels: &[[u32; 4]],
@@ -241,6 +300,42 @@ mod wide {
             }
         }
         places.n = n;
+    }
+
+    #[inline(always)]
+    unsafe fn sift<L: Lanes, S: Recorded, const N: usize>(
+        places: &mut Places,
+        (records, before): SumsOf<'_, S, N>,
+        slot: usize,
+    ) {
+        const { assert!(size_of::<Record<S, N>>() == N * size_of::<S::Pixel>()) };
+        let words = (size_of::<Record<S, N>>() / 4) as i32;
+        let (records, before) = (&mut records[..PART], &mut before[..PART]);
+        let first: *mut S::Pixel = records.as_mut_ptr().cast();
+        let (all, mut kept) = (places.at.as_mut_ptr(), 0);
+        let (empty, mut dropped) = (places.dropped.as_mut_ptr(), 0);
+        // SAFETY: the caller's. A record has N pixels, and all places are below PART. So many lanes as there are
+        // fit behind the last place, and what is kept of some is stored where they or those before them lay.
+        unsafe {
+            let now = first.add(slot % N);
+            for from in (0..places.n).step_by(L::LANES) {
+                let there = (1u32 << (places.n - from).min(L::LANES)) - 1;
+                let at = L::load(all.add(from));
+                let sums = L::times(at, L::set(words));
+                let sums = L::look_up(L::marks(there), now.cast_const().cast(), sums);
+                let none = L::bits(L::at_most(sums, L::set(0))) & there;
+                L::store(empty.add(dropped), L::beside(none, at));
+                dropped += none.count_ones() as usize;
+                L::store(all.add(kept), L::beside(there & !none, at));
+                kept += (there & !none).count_ones() as usize;
+            }
+            for &at in &places.dropped[..dropped] {
+                let sums = now.add(N * at as usize);
+                before[at as usize] = *sums;
+                *sums = S::Pixel::default();
+            }
+        }
+        places.n = kept;
     }
 
     #[inline(always)]
@@ -349,12 +444,16 @@ mod tests {
 
     /// Everything that closing does at some places but for the arithmetic, by every instruction set.
     fn go_everywhere<S: Recorded, const N: usize>(
-        rows: &[u64; 64],
+        (rows, sifted): (&[u64; 64], bool),
         slot: usize,
         seed: u32,
     ) -> Result<(), TestCaseError> {
         let mut next = numbers(seed);
-        let mut sums = || S::from_raw([(); 4].map(|()| S::from_bits(next()).bits()));
+        // One of four has nothing.
+        let mut sums = || match next() % 4 {
+            0 => S::Pixel::default(),
+            _ => S::from_raw([(); 4].map(|()| S::from_bits(next()).bits())),
+        };
         let records: Vec<Record<S, N>> = (0..PART).map(|_| [(); N].map(|()| sums())).collect();
         let before: Vec<S::Pixel> = (0..PART).map(|_| sums()).collect();
         let pixels: Vec<[u32; 4]> =
@@ -364,6 +463,9 @@ mod tests {
             let (mut pixels, mut taken) = (pixels.clone(), Vec::new());
             let mut places = Places::default();
             places.list(simd, rows);
+            if sifted {
+                places.sift::<S, N>(simd, (&mut records, &mut before), slot);
+            }
             for i in (0..places.len()).step_by(LANES) {
                 let mut row = Row::default();
                 let some = places.from(i);
@@ -389,15 +491,19 @@ mod tests {
         let value = |pixel: &S::Pixel| S::from_bits(S::raw(pixel)[0]).value();
         for y in 0..64 {
             for x in (0..64).filter(|x| rows[y] >> x & 1 == 1) {
+                let i = y * STRIDE + x;
+                prop_assert!(want.1[i] == records[i][slot]);
+                prop_assert!(want.0[i][slot] == S::Pixel::default());
+                if sifted && first_word(&records[i][slot]) == 0 {
+                    prop_assert_eq!(want.2[i], pixels[i]);
+                    continue;
+                }
                 let (at, a, sums) = of_row.next().expect("every pixel is taken");
                 prop_assert_eq!(column_and_row(*at), [x, y]);
-                let i = y * STRIDE + x;
                 prop_assert_eq!(*a, i as f32);
                 let behind = (slot + 1) % N;
                 let sheets = [&before[i], &records[i][slot], &records[i][behind]];
                 prop_assert_eq!(sums.each_ref().map(|c| c[0]), sheets.map(value));
-                prop_assert!(want.1[i] == records[i][slot]);
-                prop_assert!(want.0[i][slot] == S::Pixel::default());
                 let light = 3 * i as u32;
                 let [_, r, g, b] = pixels[i];
                 let added = [r, g, b].map(|c| c.wrapping_add(light));
@@ -414,14 +520,15 @@ mod tests {
     proptest! {
         #[test]
         fn pixels_from_anywhere_are_taken_and_put_as_the_plain_loops_do(
-            rows in rows(), slot in 0..8usize, seed in any::<u32>(),
+            rows in rows(), sifted in any::<bool>(), slot in 0..8usize, seed in any::<u32>(),
         ) {
-            go_everywhere::<i16, 4>(&rows, slot % 4, seed)?;
-            go_everywhere::<i16, 8>(&rows, slot, seed)?;
-            go_everywhere::<i32, 4>(&rows, slot % 4, seed)?;
-            go_everywhere::<i32, 8>(&rows, slot, seed)?;
-            go_everywhere::<Grey, 4>(&rows, slot % 4, seed)?;
-            go_everywhere::<Grey, 8>(&rows, slot, seed)?;
+            let rows = (&rows, sifted);
+            go_everywhere::<i16, 4>(rows, slot % 4, seed)?;
+            go_everywhere::<i16, 8>(rows, slot, seed)?;
+            go_everywhere::<i32, 4>(rows, slot % 4, seed)?;
+            go_everywhere::<i32, 8>(rows, slot, seed)?;
+            go_everywhere::<Grey, 4>(rows, slot % 4, seed)?;
+            go_everywhere::<Grey, 8>(rows, slot, seed)?;
         }
     }
 }

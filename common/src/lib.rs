@@ -36,7 +36,7 @@ pub mod wanted;
 
 /// Version of the arithmetic behind the pixels. Two programs that agree on it give the same
 /// bytes for the same view; a change of any golden hash raises it (CONTRACTS.md, Exactness).
-pub const PIXELS_VERSION: u32 = 6;
+pub const PIXELS_VERSION: u32 = 7;
 
 /// Version of the messages between master, worker and client.
 pub const PROTOCOL_VERSION: u32 = 4;
@@ -44,4 +44,4 @@ pub const PROTOCOL_VERSION: u32 = 4;
 /// SHA-256 of the self-test tile that every worker draws before it says hello
 /// (`slabcast_render::selftest`, which also has the test that keeps this constant true).
 pub const SELF_TEST_SHA256: &str =
-    "e5d935737ae0df26246527cfa4a19d629b18e4bcb60376a60074276824d0533f";
+    "223117abe5801f89fa92e9a33617765f2924a9584dbedf7fb9a0f7dbd0f23ef4";

@@ -29,9 +29,11 @@ pub(crate) fn watched(frame: &Frame, bricks: &[Arc<Brick>], notes: Option<&mut S
             floats(p, |pixel, c, v| to[pixel][c] += v);
         }),
         Sums::I16 => render_sums::<i16>(frame, bricks, notes, fixed),
-        // Round to nearest, as the splat loop says; saturating, as it is.
+        // Round to nearest, of two the even one, as the splat loop says; saturating, as it is.
         Sums::I32 | Sums::Auto => render_sums::<i32>(frame, bricks, notes, |to, p| {
-            floats(p, |pixel, c, v| to[pixel][c] = to[pixel][c].wrapping_add((v + 0.5) as i32));
+            floats(p, |pixel, c, v| {
+                to[pixel][c] = to[pixel][c].wrapping_add(v.round_ties_even() as i32);
+            });
         }),
     }
 }

@@ -113,7 +113,20 @@ impl Section {
 /// The largest f32 below 2^31.
 const LARGEST: f32 = 2_147_483_520.0;
 
-/// 32-bit fixed point: one rounding, to nearest, when a contribution is added. What would leave
+/// The whole number nearest to `x`, which is not negative, of two the even one; the largest that an f32 can
+/// be below 2^31 for what is larger or not a number. One instruction on lanes, where nothing is larger.
+#[inline(always)]
+fn nearest(x: f32) -> i32 {
+    let x = if x < LARGEST { x } else { LARGEST };
+    // From here up f32s are whole, and a sum with it has no bits left for halves.
+    const WHOLE: f32 = 8_388_608.0;
+    let rounded = (x + WHOLE) - WHOLE;
+    let rounded = if x < WHOLE { rounded } else { x };
+    // SAFETY: it is 0 to LARGEST.
+    unsafe { rounded.to_int_unchecked::<i32>() }
+}
+
+/// 32-bit fixed point: one rounding, [`nearest`], when a contribution is added. What would leave
 /// the integers is held at their end (`Frame::raw_scale` leaves room, so nothing does).
 impl Accumulate for i32 {
     type Weight = Tap;
@@ -132,12 +145,9 @@ impl Accumulate for i32 {
 
     #[inline(always)]
     fn plus(self, row: Section, wx: Tap) -> Self {
-        let c = row.0 * wx.0 + 0.5;
-        let c = if c < LARGEST { c } else { LARGEST };
-        // SAFETY: a section is not negative (`section`), nor is a weight (`Tap`), so their product
-        // is 0 to infinity, or NaN for infinity times 0. The select takes what is too large, and
-        // NaN, to the largest f32 below 2^31.
-        self.wrapping_add(unsafe { c.to_int_unchecked::<i32>() })
+        // A section is not negative (`section`), nor is a weight (`Tap`), so their product is 0 to
+        // infinity, or NaN for infinity times 0.
+        self.wrapping_add(nearest(row.0 * wx.0))
     }
 }
 
@@ -459,6 +469,21 @@ mod tests {
         assert_eq!(sheet[0], [2, 3, 0, 0]);
         assert_eq!([times(3, 16384), times(5, 13107), times(32767, 32767)], [2, 2, 32766]);
         assert_eq!([whole(0.49), whole(0.5), whole(-3.0), whole(f32::NAN)], [0, 1, 0, 0]);
+    }
+
+    #[test]
+    fn the_nearest_whole_number_is_the_one_of_the_standard() {
+        let ties = (0..100).map(|i| i as f32 * 0.5);
+        let whole = (20..31).flat_map(|bits| {
+            let x = (1u32 << bits) as f32;
+            [x.next_down(), x, x.next_up(), x - 0.5, x + 0.5, x + 1.0]
+        });
+        let odd = [0.0, 0.499_999_97, 0.500_000_06, 4_194_303.8, 8_388_607.5, 8_388_609.0];
+        for x in ties.chain(whole).chain(odd).chain((0..10_000).map(|i| i as f32 * 0.37)) {
+            assert_eq!(nearest(x), x.round_ties_even() as i32, "{x}");
+        }
+        let most = LARGEST as i32;
+        assert_eq!([LARGEST, 3e9, f32::INFINITY, f32::NAN].map(nearest), [most; 4]);
     }
 
     #[test]

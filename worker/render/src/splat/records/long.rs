@@ -73,7 +73,7 @@ pub(super) mod avx2 {
     fn all<const WIDE: usize, const C: usize, const N: usize>(
         (records, (voxels, payloads), slot, tables): At<'_, C, N>,
     ) {
-        let (half, zero) = (_mm256_set1_ps(0.5), _mm256_setzero_ps());
+        let zero = _mm256_setzero_ps();
         let turns = turns::<C, N>(slot);
         let present: [i32; 8] =
             std::array::from_fn(|i| if i < tables.deep.len.min(N) { -1 } else { 0 });
@@ -102,11 +102,11 @@ pub(super) mod avx2 {
                     let wx = _mm256_set1_ps(wx.get());
                     let at: *mut __m256i = record.as_mut_ptr().cast();
                     for (i, row) in rows[..N * C / 8].iter().enumerate() {
-                        let add = _mm256_add_ps(_mm256_mul_ps(*row, wx), half);
+                        let add = _mm256_mul_ps(*row, wx);
                         // SAFETY: eight sums are 32 bytes, and borrowed for us alone.
                         unsafe {
                             let sums = _mm256_loadu_si256(at.add(i));
-                            let sums = _mm256_add_epi32(sums, _mm256_cvttps_epi32(add));
+                            let sums = _mm256_add_epi32(sums, _mm256_cvtps_epi32(add));
                             _mm256_storeu_si256(at.add(i), sums);
                         }
                     }
@@ -210,7 +210,7 @@ pub(super) mod avx2 {
         payload: [f32; 4],
         z: &BySlot<f32, N>,
     ) {
-        let (half, zero) = (_mm256_set1_ps(0.5), _mm256_setzero_ps());
+        let zero = _mm256_setzero_ps();
         // SAFETY: four floats are 16 bytes.
         let payload = unsafe { _mm_loadu_ps(payload.as_ptr()) };
         let payload = _mm256_set_m128(payload, payload);
@@ -228,11 +228,11 @@ pub(super) mod avx2 {
                 let wx = spread::<N>(&wx.map(Tap::get));
                 let at: *mut __m256i = record.as_mut_ptr().cast();
                 for i in 0..N / 2 {
-                    let add = _mm256_add_ps(_mm256_mul_ps(rows[i], wx[i]), half);
+                    let add = _mm256_mul_ps(rows[i], wx[i]);
                     // SAFETY: eight sums are 32 bytes, and borrowed for us alone.
                     unsafe {
                         let sums = _mm256_loadu_si256(at.add(i));
-                        let sums = _mm256_add_epi32(sums, _mm256_cvttps_epi32(add));
+                        let sums = _mm256_add_epi32(sums, _mm256_cvtps_epi32(add));
                         _mm256_storeu_si256(at.add(i), sums);
                     }
                 }
@@ -282,7 +282,7 @@ pub(super) mod avx2 {
     fn side_by_side<const WIDE: usize, const N: usize>(
         (records, (apart, payloads), layers): ApartAt<'_, i32, N>,
     ) {
-        let (half, zero) = (_mm256_set1_ps(0.5), _mm256_setzero_ps());
+        let zero = _mm256_setzero_ps();
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
         let [across, down] =
@@ -321,11 +321,11 @@ pub(super) mod avx2 {
                 for c in 0..WIDE {
                     let at: *mut __m256i = row[c].as_mut_ptr().cast();
                     for two in 0..2 {
-                        let add = _mm256_add_ps(_mm256_mul_ps(of_row[two], wx[c][two]), half);
+                        let add = _mm256_mul_ps(of_row[two], wx[c][two]);
                         // SAFETY: eight sums are 32 bytes, and borrowed for us alone.
                         unsafe {
                             let sums = _mm256_loadu_si256(at.add(two));
-                            let sums = _mm256_add_epi32(sums, _mm256_cvttps_epi32(add));
+                            let sums = _mm256_add_epi32(sums, _mm256_cvtps_epi32(add));
                             _mm256_storeu_si256(at.add(two), sums);
                         }
                     }
@@ -393,7 +393,7 @@ pub(super) mod avx512 {
             *to = turn(part);
         }
         let present = (1u16 << tables.deep.len.min(N)).wrapping_sub(1);
-        let (half, zero) = (_mm512_set1_ps(0.5), _mm512_setzero_ps());
+        let zero = _mm512_setzero_ps();
         for (v, payload) in voxels.iter().zip(payloads) {
             let (x, y, z) = v.weights(tables);
             let x = x.first_chunk::<WIDE>().expect("a row of the table");
@@ -422,12 +422,12 @@ pub(super) mod avx512 {
                 for i in 0..WIDE {
                     let at: *mut __m512i = row[i].as_mut_ptr().cast();
                     for (part, row) in rows[..N * C / 16].iter().enumerate() {
-                        let add = _mm512_add_ps(_mm512_mul_ps(*row, wx[i]), half);
+                        let add = _mm512_mul_ps(*row, wx[i]);
                         // SAFETY: sixteen sums are 64 bytes, and borrowed for us alone.
                         unsafe {
                             let at = at.add(part);
                             let sums = _mm512_loadu_si512(at);
-                            let sums = _mm512_add_epi32(sums, _mm512_cvttps_epi32(add));
+                            let sums = _mm512_add_epi32(sums, _mm512_cvtps_epi32(add));
                             _mm512_storeu_si512(at, sums);
                         }
                     }
@@ -483,7 +483,7 @@ pub(super) mod avx512 {
         payload: [f32; 4],
         z: &BySlot<f32, N>,
     ) {
-        let (half, zero) = (_mm512_set1_ps(0.5), _mm512_setzero_ps());
+        let zero = _mm512_setzero_ps();
         // SAFETY: four floats are 16 bytes.
         let payload = _mm512_broadcast_f32x4(unsafe { _mm_loadu_ps(payload.as_ptr()) });
         let mut sections = spread::<N>(z);
@@ -506,11 +506,11 @@ pub(super) mod avx512 {
                 for (record, wx) in row[..x.len()].iter_mut().zip(columns) {
                     let at: *mut __m512i = record.as_mut_ptr().cast();
                     for i in 0..N / 4 {
-                        let add = _mm512_add_ps(_mm512_mul_ps(rows[i], wx[i]), half);
+                        let add = _mm512_mul_ps(rows[i], wx[i]);
                         // SAFETY: sixteen sums are 64 bytes, and borrowed for us alone.
                         unsafe {
                             let sums = _mm512_loadu_si512(at.add(i));
-                            let sums = _mm512_add_epi32(sums, _mm512_cvttps_epi32(add));
+                            let sums = _mm512_add_epi32(sums, _mm512_cvtps_epi32(add));
                             _mm512_storeu_si512(at.add(i), sums);
                         }
                     }
@@ -558,7 +558,7 @@ pub(super) mod avx512 {
     fn side_by_side<const WIDE: usize, const N: usize>(
         (records, (apart, payloads), layers): ApartAt<'_, i32, N>,
     ) {
-        let (half, zero) = (_mm512_set1_ps(0.5), _mm512_setzero_ps());
+        let zero = _mm512_setzero_ps();
         let lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
         let slot = _mm512_srli_epi32::<2>(lane);
         // Which weight in depth a lane takes: that of its slot.
@@ -597,11 +597,11 @@ pub(super) mod avx512 {
                 let row = row.first_chunk_mut::<WIDE>().expect("a window inside the part");
                 for c in 0..WIDE {
                     let at: *mut __m512i = row[c].as_mut_ptr().cast();
-                    let add = _mm512_add_ps(_mm512_mul_ps(of_row, wx[c]), half);
+                    let add = _mm512_mul_ps(of_row, wx[c]);
                     // SAFETY: sixteen sums are 64 bytes, and borrowed for us alone.
                     unsafe {
                         let sums = _mm512_loadu_si512(at);
-                        let sums = _mm512_add_epi32(sums, _mm512_cvttps_epi32(add));
+                        let sums = _mm512_add_epi32(sums, _mm512_cvtps_epi32(add));
                         _mm512_storeu_si512(at, sums);
                     }
                 }

@@ -19,12 +19,14 @@ use crate::request::{Asked, Opened, PictureOf, WorkArgs};
 use crate::stage::Stage;
 use crate::{embedded, parse};
 use predict::{LOSSES, Question, Row};
+use rehearse::Over;
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::trace::{MAX_BYTES, Trace};
 use slabcast_schedule::FrameJob;
 use slabcast_schedule::sim::{Link, alone_ms};
 use std::fmt::Write as _;
 use std::io::{Read, Write};
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 
 /// What a stream gets through of a link's nominal rate: heads of Ethernet, IP, TCP, HTTP/2. 118 MB/s
@@ -77,6 +79,15 @@ pub(crate) struct PlanArgs {
     #[arg(long, value_name = "LIST", value_parser = parse::workers, requires = "trace",
           help_heading = "Measuring")]
     rehearse: Option<parse::Workers>,
+    /// Where the rehearsal's master listens, for whoever reaches it: an address of this machine that
+    /// workers reach over a link of --link's rate, as docs/shaped.sh makes one [default: 127.0.0.1,
+    /// without a limit]
+    #[arg(long, value_name = "ADDRESS", requires = "rehearse", help_heading = "Measuring")]
+    rehearse_at: Option<IpAddr>,
+    /// What the rehearsal's workers are started by, such as `ip netns exec far`: words that this
+    /// program and its arguments are put behind
+    #[arg(long, value_name = "COMMAND", requires = "rehearse_at", help_heading = "Measuring")]
+    rehearse_by: Option<String>,
     /// Folder for plan.svg, plan.png, plan.json and plan.csv
     #[arg(short = 'o', long = "output", value_name = "DIR", help_heading = "Output")]
     output: Option<PathBuf>,
@@ -192,6 +203,10 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
                     axes: &args.of.look.view.axes,
                     threads: args.threads,
                     costs,
+                    over: match args.rehearse_at {
+                        Some(at) => Over { at, by: args.rehearse_by.as_deref(), link },
+                        None => Over::LOOPBACK,
+                    },
                 };
                 let mut progress = Progress::new(args.quiet);
                 let rehearsed = stage.run(&list.0, &mut progress);
@@ -377,7 +392,7 @@ impl Said<'_> {
                  frame's time goes: cores (rendering, spread evenly), straggler\n(waiting for the \
                  last tile), link, or master (decisions and messages).\n";
         for p in self.predicted.iter().filter(|p| !p.rehearsed.is_empty()) {
-            text += &rehearse::table(p.name(), &p.rehearsed);
+            text += &rehearse::table(p.name(), self.args.rehearse_at, &p.rehearsed);
         }
         text
     }

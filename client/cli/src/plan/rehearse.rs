@@ -22,6 +22,7 @@ use slabcast_schedule::{FrameJob, Spans};
 use std::collections::VecDeque;
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -54,6 +55,23 @@ pub(super) struct Rehearsed {
     pub(super) busy: Option<f64>,
 }
 
+/// What a rehearsal's messages go over.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Over<'a> {
+    /// Where its master listens.
+    pub(super) at: IpAddr,
+    /// What its workers are started by, in words.
+    pub(super) by: Option<&'a str>,
+    /// What lies between: what is predicted is of this.
+    pub(super) link: Link,
+}
+
+impl Over<'_> {
+    /// This machine's own, which has no limit.
+    pub(super) const LOOPBACK: Over<'static> =
+        Over { at: IpAddr::V4(Ipv4Addr::LOCALHOST), by: None, link: Link::NONE };
+}
+
 /// A process that ends with this value.
 struct Process(Child);
 
@@ -65,17 +83,26 @@ impl Drop for Process {
 }
 
 impl Process {
-    fn start(args: &[String]) -> Result<Process, Fail> {
+    /// Starts this program, by way of other words if there are some.
+    fn start(by: Option<&str>, args: &[String]) -> Result<Process, Fail> {
         let program = std::env::current_exe()
             .map_err(|e| Fail::failed(format!("finding this program failed: {e}")))?;
-        let mut command = Command::new(program);
+        let mut words = by.unwrap_or_default().split_whitespace();
+        let mut command = match words.next() {
+            Some(first) => Command::new(first),
+            None => Command::new(&program),
+        };
+        if by.is_some() {
+            command.args(words).arg(&program);
+        }
         command.args(args).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
         for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("SLABCAST_")) {
             command.env_remove(name);
         }
         let child = command.spawn();
         child.map(Process).map_err(|e| {
-            Fail::failed(format!("starting `slabcast {}` failed: {e}", args.join(" ")))
+            let by = by.map(|by| format!("{by} ")).unwrap_or_default();
+            Fail::failed(format!("starting `{by}slabcast {}` failed: {e}", args.join(" ")))
         })
     }
 
@@ -102,6 +129,7 @@ pub(super) struct Stage<'a> {
     pub(super) axes: &'a AxisArgs,
     pub(super) threads: u32,
     pub(super) costs: Costs,
+    pub(super) over: Over<'a>,
 }
 
 impl Stage<'_> {
@@ -122,27 +150,33 @@ impl Stage<'_> {
     }
 
     async fn one(&self, n: u32) -> Result<Played, Fail> {
+        let Over { at, by, .. } = self.over;
+        let listen = SocketAddr::new(at, 0).to_string();
         let mut args: Vec<String> =
-            ["master", "--listen", "127.0.0.1:0", "--rehearse", "--log-level", "error", "--volume"]
+            ["master", "--listen", &listen, "--rehearse", "--log-level", "error", "--volume"]
                 .map(String::from)
                 .into();
         args.push(self.volume.display().to_string());
+        if !at.is_loopback() {
+            // Who names an address knows who reaches it.
+            args.push("--insecure".into());
+        }
         for (flag, axis) in [("--up", self.axes.up), ("--front", self.axes.front)] {
             args.extend(axis.map(|axis| format!("{flag}={axis}")));
         }
-        let mut master = Process::start(&args)?;
+        let mut master = Process::start(None, &args)?;
         let out = master.0.stdout.take().ok_or_else(|| Fail::failed("the master has no stdout"))?;
         let mut line = String::new();
         let read = BufReader::new(out).read_line(&mut line);
         let address = line.trim().strip_prefix("listening on ").map(String::from);
         let (Ok(_), Some(address)) = (read, address) else {
-            return Err(Fail::failed(
-                "the master of the rehearsal did not start; try `slabcast master --rehearse \
-                 --volume` with the same file",
-            ));
+            return Err(Fail::failed(format!(
+                "the master of the rehearsal did not start at {at}; try `slabcast {}`",
+                args.join(" ")
+            )));
         };
         let file = self.file.display().to_string();
-        let workers = (1..=n)
+        let mut workers = (1..=n)
             .map(|i| {
                 let (threads, name) = (self.threads.to_string(), format!("rehearsal-{i}"));
                 let args = [
@@ -158,12 +192,21 @@ impl Stage<'_> {
                     "--log-level",
                     "error",
                 ];
-                Process::start(&args.map(String::from))
+                Process::start(by, &args.map(String::from))
             })
             .collect::<Result<Vec<_>, _>>()?;
         let client = remote::connect(&address).await?;
         let come = Instant::now();
         while client.workers().await.map_err(|e| remote::fail(&e))?.len() < n as usize {
+            for worker in &mut workers {
+                if let Ok(Some(status)) = worker.0.try_wait() {
+                    let by = by.map(|by| format!(", started by `{by}`")).unwrap_or_default();
+                    return Err(Fail::failed(format!(
+                        "a worker of the rehearsal{by} has ended ({status}); try `slabcast worker \
+                         --master {address} --rehearse {file}` there"
+                    )));
+                }
+            }
             if come.elapsed() > COME {
                 return Err(Fail::failed(format!("not all of {n} workers came within a minute")));
             }
@@ -189,8 +232,13 @@ impl Stage<'_> {
         let cores = Some(embedded::cores());
         let of = (workers, self.threads);
         let costs = predict::decided(self.jobs, self.trace, of, self.costs, predict::IN_FLIGHT)?;
-        let question =
-            Question { threads: self.threads, link: Link::NONE, cores, stretch: 1.0, mixed: false };
+        let question = Question {
+            threads: self.threads,
+            link: self.over.link,
+            cores,
+            stretch: 1.0,
+            mixed: false,
+        };
         let cluster = question.cluster(workers, costs, predict::IN_FLIGHT);
         // The path again and again, as it is played.
         let frames = self.jobs.len();
@@ -319,9 +367,10 @@ async fn play(
 }
 
 /// The comparison, for people.
-pub(super) fn table(schedule: &str, rows: &[Rehearsed]) -> String {
+pub(super) fn table(schedule: &str, at: Option<IpAddr>, rows: &[Rehearsed]) -> String {
+    let over = at.map_or_else(|| "loopback".into(), |at| format!("over the link of {at}"));
     let mut text = format!(
-        "\n{schedule} schedule, rehearsed on this machine (loopback, {} cores for all), measured \
+        "\n{schedule} schedule, rehearsed on this machine ({over}, {} cores for all), measured \
          beside predicted:\n\n\
          {:>7} {:>9} {:>9} {:>6} {:>9} {:>9} {:>6} {:>13} {:>13} {:>6}\n",
         embedded::cores(),

@@ -37,6 +37,38 @@ fn a_cluster_of_two_is_rehearsed_beside_its_prediction() {
 }
 
 #[test]
+fn a_rehearsal_goes_over_the_address_that_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    // All of 127.0.0.0/8 is this machine, on Linux.
+    let at = if cfg!(target_os = "linux") { "127.0.0.2" } else { "127.0.0.1" };
+    let more = ["--schedule", "region", "--trace", "s.trace", "--workers", "2", "--rehearse", "2"];
+    let plan = |over: &[&str]| run(dir.path(), &[&["plan"][..], &SCENE, &more, over].concat());
+    let out = plan(&["--rehearse-at", at, "--rehearse-by", "env PASSED=1"]);
+    let said = text(&out.stdout);
+    assert_eq!(out.status.code(), Some(0), "{}", text(&out.stderr));
+    assert!(said.contains(&format!("over the link of {at}")), "{said}");
+
+    // What workers can't be started by is named, and nobody waits for them.
+    let out = plan(&["--rehearse-at", at, "--rehearse-by", "no-such-program far"]);
+    assert_eq!(out.status.code(), Some(1));
+    let said = text(&out.stderr);
+    assert!(said.contains("starting `no-such-program far slabcast worker"), "{said}");
+
+    let out = plan(&["--rehearse-at", at, "--rehearse-by", "false"]);
+    assert_eq!(out.status.code(), Some(1));
+    let said = text(&out.stderr);
+    assert!(said.contains("started by `false` has ended (exit status: 1)"), "{said}");
+
+    // An address that is not this machine's.
+    let out = plan(&["--rehearse-at", "192.0.2.1"]);
+    assert_eq!(out.status.code(), Some(1));
+    assert!(text(&out.stderr).contains("192.0.2.1"), "{}", text(&out.stderr));
+    let out = plan(&["--rehearse-by", "env"]);
+    assert_eq!(out.status.code(), Some(2));
+    assert!(text(&out.stderr).contains("--rehearse-at"), "{}", text(&out.stderr));
+}
+
+#[test]
 fn what_is_rehearsed_is_never_taken_for_a_picture() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();

@@ -20,7 +20,7 @@ use crate::borders;
 use crate::critical::Piece;
 use crate::ledger::{Ledger, Rendered, ms, place_in_time};
 use crate::macrotile::{self, Cut, LEAF, LEVELS};
-use crate::queue::{End, Queue, Verdict};
+use crate::queue::{End, PARTS, Queue, Verdict};
 use crate::region::{Crew, Regions};
 use crate::residency::{Errand, Flight};
 use crate::{Action, Clock, Cluster, FrameJob, Micros, Span, spans};
@@ -36,6 +36,8 @@ use slabcast_common::stats::{BrickStats, PoisonedTile, SlabStats, TileStats};
 use slabcast_common::view::Projected;
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+mod late;
 
 /// Whether a pixel with accumulated opacity `a` is shut for good.
 ///
@@ -112,6 +114,8 @@ pub(crate) struct Frame {
     pub(crate) job: Box<FrameJob>,
     /// Which crew draws it, if not everybody has to.
     beside: Option<u32>,
+    /// Whether no other was in the making or waited when it began.
+    alone: bool,
     projected: Vec<Option<Projected>>,
     slabs: Vec<SheetRange>,
     at: usize,
@@ -131,6 +135,8 @@ pub(crate) struct Frame {
     outlived: Option<Micros>,
     /// When the next region may be taken from an owner that is silent, while a thread is idle.
     forborne: Option<Micros>,
+    /// Parts of tiles that were cut late, and who is to have them: what they were drawn from goes along.
+    gained: Vec<(WorkerId, u32)>,
     needed_ever: Vec<bool>,
     /// Bricks among them, and their voxels.
     needed: (u64, u64),
@@ -171,7 +177,7 @@ pub(crate) fn goes_by_region(job: &FrameJob) -> bool {
 impl Frame {
     pub(crate) fn start(
         job: Box<FrameJob>,
-        beside: Option<u32>,
+        (beside, alone): (Option<u32>, bool),
         cluster: &mut Cluster,
         clock: &dyn Clock,
     ) -> Self {
@@ -205,6 +211,7 @@ impl Frame {
             pace: Pace::default(),
             outlived: None,
             forborne: None,
+            gained: Vec::new(),
             needed_ever: vec![false; job.bricks.len()],
             needed: (0, 0),
             relevant: cluster.residency.voxels(job.scene.bricks),
@@ -214,6 +221,7 @@ impl Frame {
             projected,
             job,
             beside,
+            alone,
         };
         frame.ledger.cull_us += clock.now().saturating_sub(began);
         frame
@@ -261,8 +269,13 @@ impl Frame {
     /// Cuts the whole depth into regions.
     fn begin_regions(&mut self, cluster: &mut Cluster, clock: &dyn Clock) {
         let began = clock.now();
-        let (cut, regions) =
-            Regions::cut(&self.job, self.beside, &cluster.roster, &mut cluster.memory);
+        let (cut, regions) = Regions::cut(
+            &self.job,
+            (self.beside, self.alone),
+            cluster.traffic.rate(),
+            &cluster.roster,
+            &mut cluster.memory,
+        );
         self.put_on(cluster, began, cut, (Vec::new(), Vec::new()), Some(regions));
         self.ledger.cull_us += clock.now().saturating_sub(began);
     }
@@ -312,7 +325,8 @@ impl Frame {
             needed.iter().zip(&rects).filter_map(|(&i, r)| Some((cut.first_in(r)?, i))).collect();
         order.sort_unstable();
         let queue = Queue::new(TaskId(cluster.next_task), &cut.tiles);
-        cluster.next_task += cut.tiles.len() as u64;
+        let names = if self.alone { PARTS as u64 } else { 1 };
+        cluster.next_task += names * cut.tiles.len() as u64;
         self.slab = Some(Slab {
             sheets: self.slabs[self.at],
             began,
@@ -340,7 +354,7 @@ impl Frame {
         let tile = |task: &crate::queue::Task| {
             let (worker, us) = match &task.end {
                 End::Done { worker, render_us } => (worker.to_string(), *render_us),
-                End::Open | End::Poisoned => (String::new(), 0),
+                End::Open | End::Poisoned | End::Cut => (String::new(), 0),
             };
             TileStats {
                 x: task.tile.rect.x0 as u32,
@@ -366,8 +380,12 @@ impl Frame {
         }
         self.ledger.phase(&slab.pieces, slab.began);
         self.ledger.retries += slab.queue.retries;
+        let mut tiles: Vec<TileStats> =
+            slab.queue.tasks.iter().filter(|t| t.end != End::Cut).map(tile).collect();
+        // Parts that were cut late stand behind all others.
+        tiles.sort_by_key(|t| std::cmp::Reverse(t.est));
         self.ledger.slabs.push(SlabStats {
-            tiles: slab.queue.tasks.iter().map(tile).collect(),
+            tiles,
             empty: slab.cut.empty,
             shut: slab.cut.shut,
             barrier_wait_ms: ms(waited),
@@ -380,7 +398,7 @@ impl Frame {
             start: slab.began,
             end: now,
             args: vec![
-                ("tiles", slab.queue.tasks.len().to_string()),
+                ("tiles", slab.queue.all().to_string()),
                 ("edge", slab.cut.edge.to_string()),
                 ("bricks", slab.needed.len().to_string()),
             ],
@@ -440,17 +458,30 @@ impl Frame {
         let set = self.job.scene.bricks;
         if let Some(regions) = &slab.regions {
             // What a tile was drawn from goes with it.
-            for &(id, place) in &leases {
+            for &(id, place) in leases.iter().chain(&self.gained) {
                 let tile = slab.cut.tiles[place as usize].rect;
-                if let Some(bricks) = cluster.memory.moving(regions, &tile, id) {
-                    cluster.residency.owe(id, set, bricks.iter().copied());
-                }
+                let Some(bricks) = cluster.memory.moving(regions, (place, &tile), id) else {
+                    continue;
+                };
+                // Of a part whose whole tile was drawn then, what lies over the part.
+                let (part, job) = (regions.is_told(place), &self.job);
+                let over = |&i: &u32| {
+                    let seen = job.view.project(&job.bricks[i as usize].tight);
+                    seen.is_some_and(|p| !p.rect.intersect(&tile).is_empty())
+                };
+                let bricks = bricks.iter().copied().filter(|i| !part || over(i));
+                cluster.residency.owe(id, set, bricks);
             }
         }
-        let to_flush: BTreeSet<_> =
-            newcomers.into_iter().chain(leases.iter().map(|l| l.0)).collect();
-        for id in to_flush {
-            carry(cluster, Some(&mut self.ledger), id, now);
+        let gained = std::mem::take(&mut self.gained);
+        let moved = leases.iter().chain(&gained).map(|l| l.0);
+        let to_flush: BTreeSet<_> = newcomers.into_iter().chain(moved).collect();
+        // Of regions leases go first, lest they wait behind others' bricks: a region asks for what it lacks, and 64
+        // workers that begin a frame are sent up to 19 MB.
+        if !by_region {
+            for &id in &to_flush {
+                carry(cluster, Some(&mut self.ledger), id, now);
+            }
         }
         // Each worker's leases of this round, in the order in which it got them.
         let mut count = BTreeMap::new();
@@ -505,6 +536,11 @@ impl Frame {
                 state: self.state.tile(tile),
             };
             cluster.send(id, ToWorker::Lease(Box::new(lease)));
+        }
+        if by_region {
+            for id in to_flush {
+                carry(cluster, Some(&mut self.ledger), id, now);
+            }
         }
     }
 
@@ -630,7 +666,7 @@ impl Frame {
             _ => regions.orphaning(&cluster.roster),
         };
         let all_threads = cluster.roster.threads();
-        let (takers, orphans): (Vec<(WorkerId, u64)>, bool) = match turn.only {
+        let (mut takers, orphans): (Vec<(WorkerId, u64)>, bool) = match turn.only {
             // Most of the frames in the making have nothing for it.
             Some(id) if orphaning.is_empty() && !queue.any_waits(regions.owned(id)) => {
                 (Vec::new(), false)
@@ -654,7 +690,9 @@ impl Frame {
         };
         // All threads have something before any has more.
         for first in [true, false] {
-            for &(id, threads) in &takers {
+            let mut at = 0;
+            while let Some(&(id, threads)) = takers.get(at) {
+                at += 1;
                 let mut us = self.lent_us(id);
                 while let Some(waiting) = self.waiting() {
                     let load = cluster.roster.get(id).map_or(u64::MAX, |w| w.leases);
@@ -681,6 +719,16 @@ impl Frame {
                         self.next_own(cluster, id, regions.owned(id))
                     };
                     let Some(place) = next else { break };
+                    if self.alone && turn.last {
+                        let have = self.split_late(cluster, (place, id), now);
+                        let staying = cluster.roster.staying().filter(|(id, _)| have.contains(id));
+                        let new = staying.filter(|(id, _)| takers.iter().all(|t| t.0 != *id));
+                        let new: Vec<_> = new.map(|(id, w)| (id, u64::from(w.threads))).collect();
+                        takers.extend(new);
+                        if !have.is_empty() {
+                            continue;
+                        }
+                    }
                     let Some(Slab { regions: Some(regions), .. }) = &self.slab else { break };
                     us += regions.took(place).unwrap_or(f64::INFINITY);
                     self.give(cluster, place, id, now);
@@ -916,7 +964,7 @@ impl Frame {
         let Rendered { start, end, .. } = r;
         slab.pieces.push(Piece {
             corner: [tile.x0, tile.y0],
-            edge: slab.cut.edge,
+            edge: slab.cut.edge_of(&tile),
             thread: (worker, thread),
             lacked: result.times.ready_us.saturating_sub(result.times.received_us),
             start,
@@ -932,7 +980,7 @@ impl Frame {
             self.ledger.stalled(worker, cost);
             cluster.residency.touched(self.job.scene.bricks, &cost.touched);
             let whose = (worker, regions.home(place, worker, &cluster.roster));
-            cluster.memory.learn(regions, &tile, whose, end - start, &cost.touched);
+            cluster.memory.learn(regions, (place, &tile), whose, end - start, &cost.touched);
         }
         self.ledger.spans.tile(spans::Tile {
             corner: [tile.x0, tile.y0],
@@ -941,7 +989,7 @@ impl Frame {
             start,
             end,
             slab: self.at,
-            edge: slab.cut.edge,
+            edge: slab.cut.edge_of(&tile),
             est: slab.cut.tiles[place as usize].est,
             bricks: drawn_from,
             attempt: result.epoch.0,
@@ -953,7 +1001,7 @@ impl Frame {
 
     fn progress(&self, cluster: &mut Cluster) {
         let Some(slab) = &self.slab else { return };
-        let total = slab.queue.tasks.len() as u32;
+        let total = slab.queue.all();
         cluster.out.push_back(Action::Progress {
             frame: self.job.frame,
             done: total - slab.queue.open(),
@@ -1002,7 +1050,7 @@ impl Frame {
                 slab: self.at as u32,
                 x: rect.x0 as u32,
                 y: rect.y0 as u32,
-                size: slab.cut.edge,
+                size: slab.cut.edge_of(&rect),
                 workers: workers.clone(),
             });
             self.ledger.spans.push(Span {

@@ -30,7 +30,7 @@
 //! # Rooms
 //!
 //! [`frame`](is_shut) the states of one frame, under either schedule; `region` what is the `region`
-//! schedule's own; [`macrotile`] the quadtree and its workload, `queue` leases with epochs,
+//! schedule's own, with `alone` for a frame that nobody waits behind; [`macrotile`] the quadtree and its workload, `queue` leases with epochs,
 //! `residency` who holds which brick, `roster` workers and every deadline, `traffic` whether the link bears more,
 //! `ledger` what a frame cost, `critical` what it waited for.
 
@@ -45,6 +45,7 @@ use slabcast_common::view::View;
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 
+mod alone;
 mod borders;
 mod critical;
 mod frame;
@@ -614,6 +615,7 @@ impl Scheduler {
             self.cluster.traffic.land(0, true, now);
         }
         self.cluster.residency.leave(id);
+        self.cluster.memory.forget(id);
     }
 
     fn drop_worker(&mut self, worker: WorkerId, reason: String, blame: bool, now: Micros) {
@@ -663,7 +665,8 @@ impl Scheduler {
                 if self.active.is_empty() {
                     self.cluster.traffic.begin(clock.now());
                 }
-                let beside = self.beside();
+                let alone = self.active.is_empty() && self.waiting.is_empty();
+                let beside = (self.beside(), alone);
                 self.active.push_back(Frame::start(job, beside, &mut self.cluster, clock));
                 // To it, all are new, and to the one before it is no longer the last.
                 if only.take().is_some() {

@@ -12,6 +12,7 @@
 //! rectangles + pixels, in integers, with one line of memory beside the leaves' counts.
 
 use slabcast_common::occlusion::{Rect, ShutMap};
+use std::collections::BTreeSet;
 
 /// Edge of a quadtree leaf in pixels (the paper's choice).
 pub const LEAF: u32 = 16;
@@ -199,6 +200,19 @@ impl Through {
         self.tree[level].cells.iter().filter(|n| n.covered > 0).count()
     }
 
+    /// The tiles of a coarse cut, and in the place of those that are `cut` those of a fine one.
+    pub(crate) fn mixed(&self, coarse: &Cut, fine: &Cut, cut: &[bool]) -> Cut {
+        let corner = |r: &Rect| [r.x0, r.y0].map(|at| at / coarse.edge as i32);
+        let kept = coarse.tiles.iter().zip(cut).filter(|(_, cut)| !**cut).map(|(t, _)| *t);
+        let mut tiles: Vec<Macrotile> = kept.collect();
+        let whole: BTreeSet<[i32; 2]> = tiles.iter().map(|t| corner(&t.rect)).collect();
+        let edge = if tiles.len() < coarse.tiles.len() { fine.edge } else { coarse.edge };
+        tiles.extend(fine.tiles.iter().filter(|t| !whole.contains(&corner(&t.rect))));
+        let mut mixed = Cut { edge, tiles, ..coarse.clone() };
+        mixed.sort(self.size);
+        mixed
+    }
+
     /// See [`cut_through`].
     pub(crate) fn cut(&self, (wanted, many): (u64, u64), forced: Option<u32>) -> Cut {
         const PART: usize = 2;
@@ -303,6 +317,15 @@ impl Cut {
     pub fn sort(&mut self, size: [u32; 2]) {
         self.tiles.sort_by_key(|t| std::cmp::Reverse(t.est));
         self.index(size);
+    }
+
+    /// Parts of a tile come behind all others. Nobody may look for the place
+    /// of a tile in the picture after that.
+    pub(crate) fn add(&mut self, parts: Vec<Macrotile>) {
+        let long = |t: &Macrotile| t.rect.width().max(t.rect.height()) as u32;
+        let edge = parts.iter().map(|t| long(t).next_power_of_two()).max();
+        self.edge = edge.unwrap_or(self.edge).clamp(LEAF, self.edge);
+        self.tiles.extend(parts);
     }
 
     /// Edge of one of the tiles: the least level's that it fits.
@@ -426,6 +449,35 @@ mod tests {
         assert_eq!(cut.first_in(&Rect::new(60, 0, 70, 9)), Some(0));
         // Nothing is left to cut.
         assert_eq!(cut_mixed(size, &rects, &open, true, (0, Some(64)), 3).edge, 64);
+    }
+
+    #[test]
+    fn cut_tiles_and_whole_ones_cover_each_pixel_once() {
+        // Three tiles of 64 in a picture that cuts the last one, and nothing under the second.
+        let size = [190, 50];
+        let through = Through::new(size, &[Rect::new(0, 0, 60, 50), Rect::new(130, 0, 190, 50)]);
+        let [coarse, fine] = [64, 32].map(|edge| through.cut((0, 0), Some(edge)));
+        assert_eq!((coarse.tiles.len(), fine.tiles.len()), (2, 8));
+        for (cut, n, edge) in [
+            ([false; 2], 2, 64),
+            ([true, false], 5, 32),
+            ([false, true], 5, 32),
+            ([true; 2], 8, 32),
+        ] {
+            let mixed = through.mixed(&coarse, &fine, &cut);
+            assert_eq!((mixed.tiles.len(), mixed.edge), (n, edge));
+            let mut over = vec![0; 190 * 50];
+            for t in &mixed.tiles {
+                for y in t.rect.y0..t.rect.y1 {
+                    for x in t.rect.x0..t.rect.x1 {
+                        over[(y * 190 + x) as usize] += 1;
+                    }
+                }
+            }
+            let want = |x: i32| i32::from(!(64..128).contains(&x));
+            assert!((0..190 * 50).all(|i| over[i as usize] == want(i % 190)), "{cut:?}");
+            assert!(mixed.tiles.is_sorted_by_key(|t| std::cmp::Reverse(t.est)));
+        }
     }
 
     #[test]

@@ -40,6 +40,8 @@ pub(crate) enum End {
     Done { worker: Arc<str>, render_us: Micros },
     /// Given up.
     Poisoned,
+    /// Its parts took its place before anybody had it.
+    Cut,
 }
 
 /// One macrotile of the slab.
@@ -57,7 +59,22 @@ pub(crate) struct Task {
     pub(crate) failed: Vec<(WorkerId, String, String)>,
 }
 
+/// Names, and places in the order, that a tile has for itself and for its parts.
+pub(crate) const PARTS: i64 = 5;
+
 impl Task {
+    fn new(tile: Macrotile, order: i64) -> Task {
+        Task {
+            tile,
+            end: End::Open,
+            live: Vec::new(),
+            attempts: 0,
+            queued: Some(order),
+            blamed: Vec::new(),
+            failed: Vec::new(),
+        }
+    }
+
     /// Whether it may be run twice: one worker has it, and nobody was lost with it.
     pub(crate) fn may_double(&self) -> bool {
         self.live.len() == 1
@@ -96,6 +113,8 @@ pub(crate) struct Queue {
     front: i64,
     deadlines: BTreeSet<(Micros, u32, Epoch)>,
     open: u32,
+    /// Tasks whose parts took their place.
+    cut: u32,
     /// Workers lost while it was rendered, that a task may have killed.
     losses: usize,
     /// Leases beyond the first of a task.
@@ -105,22 +124,15 @@ pub(crate) struct Queue {
 impl Queue {
     /// A queue of these tiles in this order; the first is called `first`, and so on.
     pub(crate) fn new(first: TaskId, tiles: &[Macrotile]) -> Self {
-        let task = |(&tile, order): (&Macrotile, i64)| Task {
-            tile,
-            end: End::Open,
-            live: Vec::new(),
-            attempts: 0,
-            queued: Some(order),
-            blamed: Vec::new(),
-            failed: Vec::new(),
-        };
+        let task = |(&tile, order): (&Macrotile, i64)| Task::new(tile, order * PARTS);
         Queue {
             first,
             tasks: tiles.iter().zip(0..).map(task).collect(),
-            waiting: (0..).zip(0..tiles.len() as u32).collect(),
+            waiting: (0..).step_by(PARTS as usize).zip(0..tiles.len() as u32).collect(),
             front: -1,
             deadlines: BTreeSet::new(),
             open: tiles.len() as u32,
+            cut: 0,
             losses: 0,
             retries: 0,
         }
@@ -129,6 +141,28 @@ impl Queue {
     /// Tasks without an end.
     pub(crate) fn open(&self) -> u32 {
         self.open
+    }
+
+    /// Tasks that have, had or will have a result.
+    pub(crate) fn all(&self) -> u32 {
+        self.tasks.len() as u32 - self.cut
+    }
+
+    /// Puts the parts of a waiting task that nobody had yet in its place, in their order. Places and names are those
+    /// behind all others; who makes the queue leaves room for [`PARTS`] names of each tile.
+    pub(crate) fn cut(&mut self, place: u32, parts: &[Macrotile]) {
+        let task = &mut self.tasks[place as usize];
+        assert!(!task.was_lent() && parts.len() < PARTS as usize, "only whole tiles are cut");
+        let order = task.queued.take().expect("a task is cut while it waits");
+        task.end = End::Cut;
+        self.waiting.remove(&order);
+        self.cut += 1;
+        self.open += parts.len() as u32;
+        self.open -= 1;
+        for (&tile, order) in parts.iter().zip(order..) {
+            self.waiting.insert(order, self.tasks.len() as u32);
+            self.tasks.push(Task::new(tile, order));
+        }
     }
 
     /// Tasks waiting for a worker.
@@ -476,6 +510,27 @@ mod tests {
         // It had begun it after all.
         q.finish(2, done());
         assert_eq!(take(&mut q, 2, &[1], 0), (3, Epoch(0)));
+    }
+
+    #[test]
+    fn parts_take_the_place_of_a_tile_that_nobody_had() {
+        let c = Config::default();
+        let mut q = queue(3);
+        assert_eq!(take(&mut q, 1, &[], 0), (0, Epoch(0)));
+        let tile = |est| Macrotile { rect: Rect::new(0, 0, 8, 8), est };
+        q.cut(1, &[tile(30), tile(20), tile(10)]);
+        assert_eq!((q.open(), q.all(), q.waiting()), (5, 5, 4));
+        assert_eq!(q.all_waiting().collect::<Vec<_>>(), [3, 4, 5, 2], "before what came after it");
+        assert_eq!((q.place(TaskId(15)), q.place(TaskId(16))), (Some(5), None));
+        assert_eq!(q.judge(TaskId(11), Epoch(0), WorkerId(1)), Verdict::Dead);
+        // They are tasks like any other.
+        assert_eq!(take(&mut q, 2, &[], 0), (3, Epoch(0)));
+        assert!(q.lose(WorkerId(2), "two", &[(3, Epoch(0))], 1, &c).is_empty());
+        assert_eq!(take(&mut q, 3, &[], 0), (3, Epoch(1)));
+        for place in [0, 3, 4, 5, 2] {
+            q.finish(place, done());
+        }
+        assert_eq!((q.open(), q.waiting(), q.next_deadline()), (0, 0, None));
     }
 
     #[test]

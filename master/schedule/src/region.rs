@@ -22,6 +22,7 @@
 //!
 //! It refuses to know what time it is and which copy of a result counts.
 
+use crate::alone::{self, Whole};
 use crate::macrotile::{Cut, Macrotile, Through};
 use crate::roster::Roster;
 use crate::{FrameJob, Micros};
@@ -29,6 +30,7 @@ use slabcast_common::blocks::{Block, Blocks};
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::WorkerId;
 use slabcast_common::occlusion::Rect;
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 /// How much later than the mean a worker may be done before a tile of it moves, as a fraction. Tiles of
@@ -58,6 +60,19 @@ const MANY: u64 = 64;
 /// The edge at which tiles are counted for that.
 const PLAIN: u32 = 64;
 
+/// A frame that is alone is cut into so many tiles of what is asked for, one a thread where 2.5 are: more are cut where
+/// that pays ([`alone`]). mri256 `peer-opaque` at 512x512 on 64 workers, which began with 480 tiles of 16 pixels, takes
+/// 2.4 ms a frame where it took 4.6.
+const BEGIN: f64 = 0.4;
+
+/// How much longer the parts of a tile of 64 pixels take together than the tile: 17 to 30 %, 24 of mri256 `peer-semi`
+/// at 1024x1024.
+const MORE: f64 = 1.24;
+
+/// Tiles that take less say nothing of who drew them, in microseconds: tables, a block that is opened, a message on the
+/// same core.
+const LEAST_TOLD: f64 = 500.0;
+
 /// Crews that share out the frames of a path ([`Crew`]).
 pub(crate) const CREWS: u32 = 2;
 
@@ -76,6 +91,8 @@ const SMALLEST: u32 = 5;
 /// What is known of a tile from the frame before.
 #[derive(Clone, Debug)]
 struct Known {
+    /// Which frame taught it, in their order.
+    frame: u64,
     /// Who drew it last.
     owner: WorkerId,
     /// Whose it was to be. Who has nothing to do takes a tile for once: next time it is drawn where its
@@ -87,11 +104,18 @@ struct Known {
     touched: Vec<u32>,
 }
 
-/// What frames of one kind (a brick set, a size of pictures, a size of tiles) teach the next one.
+/// What frames of one kind (a brick set, a size of pictures) teach the next one.
 #[derive(Debug)]
 struct Lessons {
     kind: Kind,
-    tiles: BTreeMap<(i32, i32), Known>,
+    tiles: BTreeMap<Sides, Known>,
+}
+
+/// A rectangle as something that has an order.
+type Sides = [i32; 4];
+
+fn sides(tile: &Rect) -> Sides {
+    [tile.x0, tile.y0, tile.x1, tile.y1]
 }
 
 /// What the schedule remembers.
@@ -99,6 +123,10 @@ struct Lessons {
 pub(crate) struct Memory {
     blocks: Option<(BrickSetKey, Blocks)>,
     lessons: Vec<Lessons>,
+    /// Frames that were cut.
+    frames: u64,
+    /// How many times longer than others workers take, as far as tiles tell that were drawn by one and then by another.
+    slow: BTreeMap<WorkerId, f64>,
 }
 
 impl Memory {
@@ -112,17 +140,49 @@ impl Memory {
 
     fn known(&self, kind: Kind, tile: &Rect) -> Option<&Known> {
         let lessons = self.lessons.iter().find(|l| l.kind == kind)?;
-        lessons.tiles.get(&(tile.x0, tile.y0))
+        lessons.tiles.get(&sides(tile))
+    }
+
+    /// What is known of a tile of [`PLAIN`] pixels, or of a quarter of one, however the last frame cut it: of a tile that
+    /// it cut the sum of its parts, of parts of one that it drew whole their share of it.
+    fn recall(&self, kind: Kind, tile: &Rect) -> Option<Cow<'_, Known>> {
+        let whole = whole_of(tile, kind.1);
+        let known = self.known(kind, tile);
+        let taught = |k: Option<&Known>| k.map_or(0, |k| k.frame);
+        let parts = quarters(&whole).into_iter().filter_map(|part| self.known(kind, &part));
+        if *tile != whole {
+            let one = self.known(kind, &whole).filter(|one| one.frame > taught(known));
+            let Some(one) = one else { return known.map(Cow::Borrowed) };
+            // As it was among the others, if they were known then.
+            let all = parts.map(|k| k.us).sum::<f64>();
+            let share = match known {
+                Some(known) if all > 0.0 => known.us / all,
+                _ => tile.area() as f64 / whole.area() as f64,
+            };
+            return Some(Cow::Owned(Known { us: MORE * share * one.us, ..one.clone() }));
+        }
+        let last = parts.clone().map(|k| k.frame).max().unwrap_or(0);
+        if last <= taught(known) {
+            return known.map(Cow::Borrowed);
+        }
+        let parts = parts.filter(|k| k.frame == last);
+        let most = parts.clone().max_by(|a, b| a.us.total_cmp(&b.us))?;
+        let mut touched: Vec<u32> = parts.clone().flat_map(|k| k.touched.iter().copied()).collect();
+        touched.sort_unstable();
+        touched.dedup();
+        let us = parts.map(|k| k.us).sum::<f64>() / MORE;
+        Some(Cow::Owned(Known { us, touched, ..most.clone() }))
     }
 
     /// The bricks that a tile was drawn from in the frame before, if by another worker.
-    pub(crate) fn moving(
-        &self,
-        regions: &Regions,
-        tile: &Rect,
+    pub(crate) fn moving<'a>(
+        &'a self,
+        regions: &'a Regions,
+        (place, tile): (u32, &Rect),
         worker: WorkerId,
-    ) -> Option<&[u32]> {
-        let known = self.known(regions.kind, tile)?;
+    ) -> Option<&'a [u32]> {
+        let told = regions.told.get(&place);
+        let known = told.or_else(|| self.known(regions.kind, tile))?;
         (known.owner != worker).then_some(&known.touched[..])
     }
 
@@ -130,14 +190,22 @@ impl Memory {
     pub(crate) fn learn(
         &mut self,
         regions: &Regions,
-        tile: &Rect,
+        (place, tile): (u32, &Rect),
         (owner, home): (WorkerId, WorkerId),
         us: Micros,
         touched: &[u32],
     ) {
-        let before = self.known(regions.kind, tile).filter(|k| k.owner == owner).map(|k| k.us);
         let us = us as f64;
-        let us = before.map_or(us, |before| 0.5 * (before + us));
+        let before = regions.told.get(&place).or_else(|| self.known(regions.kind, tile));
+        let before = before.map(|k| (k.owner, k.us));
+        let us = match before {
+            Some((last, before)) if last == owner => 0.5 * (before + us),
+            Some((last, before)) => {
+                self.compare((owner, us), (last, before));
+                us
+            }
+            None => us,
+        };
         let at = self.lessons.iter().position(|l| l.kind == regions.kind).unwrap_or_else(|| {
             if self.lessons.len() == KINDS {
                 self.lessons.remove(0);
@@ -146,8 +214,27 @@ impl Memory {
             self.lessons.len() - 1
         });
         let lessons = &mut self.lessons[at];
-        let known = Known { owner, home, us, touched: touched.to_vec() };
-        lessons.tiles.insert((tile.x0, tile.y0), known);
+        let known = Known { frame: regions.frame, owner, home, us, touched: touched.to_vec() };
+        lessons.tiles.insert(sides(tile), known);
+    }
+
+    /// A tile took one worker so long, and another before it: a quarter of what that says beyond what is known already
+    /// is believed of either.
+    fn compare(&mut self, (one, here): (WorkerId, f64), (other, there): (WorkerId, f64)) {
+        // Of what takes no longer than a message nothing can be said.
+        if here.min(there) < LEAST_TOLD {
+            return;
+        }
+        let slow = |id: &WorkerId| self.slow.get(id).copied().unwrap_or(1.0);
+        let (a, b) = (slow(&one), slow(&other));
+        let beyond = ((here / there) / (a / b)).clamp(0.1, 10.0).sqrt().sqrt();
+        self.slow.insert(one, (a * beyond).clamp(0.01, 100.0));
+        self.slow.insert(other, (b / beyond).clamp(0.01, 100.0));
+    }
+
+    /// A worker is gone.
+    pub(crate) fn forget(&mut self, id: WorkerId) {
+        self.slow.remove(&id);
     }
 }
 
@@ -201,16 +288,50 @@ impl Crew {
     }
 }
 
-/// What frames learn from each other by: a brick set, a size of pictures and one of tiles, and who draws.
-type Kind = (BrickSetKey, [u32; 2], u32, Crew);
+/// What frames learn from each other by: a brick set, a size of pictures, and who draws.
+type Kind = (BrickSetKey, [u32; 2], Crew);
+
+/// The tile of [`PLAIN`] pixels that a tile is a part of, or is, in a picture of this size.
+fn whole_of(tile: &Rect, size: [u32; 2]) -> Rect {
+    let edge = PLAIN as i32;
+    let corner = |at: i32| at / edge * edge;
+    let (x0, y0) = (corner(tile.x0), corner(tile.y0));
+    Rect::new(x0, y0, x0 + edge, y0 + edge).intersect(&Rect::of_size(size))
+}
+
+/// The parts that a tile is cut into, of half of [`PLAIN`].
+fn quarters(tile: &Rect) -> Vec<Rect> {
+    let half = PLAIN as i32 / 2;
+    let part = |(x, y)| {
+        let (x0, y0) = (tile.x0 + x * half, tile.y0 + y * half);
+        Rect::new(x0, y0, x0 + half, y0 + half).intersect(tile)
+    };
+    let all = [(0, 0), (1, 0), (0, 1), (1, 1)].map(part);
+    all.into_iter().filter(|r| !r.is_empty()).collect()
+}
 
 /// Kinds that are remembered: crews each, and everybody, at the beginning or the end of a path.
 const KINDS: usize = 1 + CREWS as usize;
+
+/// A part that a waiting tile may be cut into.
+#[derive(Debug)]
+pub(crate) struct Part {
+    pub(crate) tile: Macrotile,
+    /// What it takes, and what its bricks take who has not drawn it, in microseconds.
+    pub(crate) us: f64,
+    pub(crate) price: f64,
+    /// What is known of it, if the frame before did not draw it as it is.
+    told: Option<Known>,
+}
 
 /// A frame's regions.
 #[derive(Debug)]
 pub(crate) struct Regions {
     kind: Kind,
+    /// Its number among frames that were cut.
+    frame: u64,
+    /// What is known of tiles that the frame before cut in another way, by their place in the queue.
+    told: BTreeMap<u32, Known>,
     /// Whose each tile is, by its place in the queue.
     owners: Vec<WorkerId>,
     /// Places of each worker's, ascending where nothing moved.
@@ -220,18 +341,25 @@ pub(crate) struct Regions {
     /// What each took its last owner, if that is known.
     took: Vec<Option<(WorkerId, f64)>>,
     pace: Pace,
+    /// What a brick takes who is sent it, in microseconds.
+    brick: f64,
+    /// Parts that tiles can be cut into while the frame is drawn; of a frame that is alone.
+    fine: Parts,
 }
 
 impl Regions {
     /// Cuts a frame's picture, estimates its tiles and shares them out among those who stay, or among the
-    /// `beside`th crew of them.
+    /// `beside`th crew of them. `alone`: no other frame is in the making or waits.
     pub(crate) fn cut(
         job: &FrameJob,
-        beside: Option<u32>,
+        (beside, alone): (Option<u32>, bool),
+        rate: Option<f64>,
         roster: &Roster,
         memory: &mut Memory,
     ) -> (Cut, Regions) {
         let (key, size) = (job.scene.bricks, job.view.size);
+        memory.frames += 1;
+        let frame = memory.frames;
         let blocks = memory.blocks(key, &job.bricks);
         let rects: Vec<Rect> =
             blocks.iter().filter_map(|b| Some(job.view.project(&b.tight)?.rect)).collect();
@@ -239,28 +367,60 @@ impl Regions {
         let plain = through.count(PLAIN);
         let crew = Crew::of_frame(beside, plain, roster);
         let threads = crew.members(roster).map(|m| m.1).sum::<u64>();
-        let wanted = (job.work.tiles_per_worker * threads as f64).ceil() as u64;
+        let ratio = if alone { BEGIN } else { 1.0 } * job.work.tiles_per_worker;
+        let wanted = (ratio * threads as f64).ceil() as u64;
         let many = wanted.max(MANY * threads);
+        let kind = (key, size, crew);
         let mut cut = through.cut((wanted, many), job.work.tile);
-        let kind = (key, size, cut.edge, crew);
-        let known = |t: &Macrotile| memory.known(kind, &t.rect).map(|k| (k.owner, k.us));
+        let bytes = job.bricks.iter().map(|b| u64::from(b.bytes)).sum::<u64>();
+        let wire = rate.map_or(0.0, |rate| bytes as f64 / job.bricks.len().max(1) as f64 / rate);
+        let brick = BRICK + wire;
+        // Whoever chose a size has it.
+        let leveled = alone && job.work.tile.is_none() && (PLAIN / 2..=PLAIN).contains(&cut.edge);
+        let mut fine = BTreeMap::new();
+        if leveled
+            && let Some(mixed) = mixed(&through, threads as usize, |t| memory.recall(kind, t))
+        {
+            (cut, fine) = mixed;
+        }
+        let recall = |t: &Macrotile| match leveled {
+            true => memory.recall(kind, &t.rect),
+            false => memory.known(kind, &t.rect).map(Cow::Borrowed),
+        };
+        let taught: BTreeMap<Sides, Cow<'_, Known>> =
+            cut.tiles.iter().filter_map(|t| Some((sides(&t.rect), recall(t)?))).collect();
+        let known = |t: &Macrotile| taught.get(&sides(&t.rect)).map(|k| (k.owner, k.us));
         let pace = Pace::of(&cut.tiles, &known);
         pace.correct(&mut cut.tiles, &known);
         cut.sort(size);
-        let bricks = |t: &Macrotile| memory.known(kind, &t.rect).map_or(0, |k| k.touched.len());
-        let home = |t: &Macrotile| memory.known(kind, &t.rect).map(|k| k.home);
-        let owners = share(&cut.tiles, roster, crew, &pace, &known, (&home, &bricks));
+        let bricks = |t: &Macrotile| taught.get(&sides(&t.rect)).map_or(0, |k| k.touched.len());
+        let owners = if leveled && !taught.is_empty() {
+            let slow = |id: WorkerId| memory.slow.get(&id).copied().unwrap_or(1.0);
+            let price = |t: &Macrotile| {
+                taught.get(&sides(&t.rect)).map_or(0.0, |k| brick * bricks_along(k))
+            };
+            level(&cut.tiles, roster, crew, (pace.mean, &slow), &known, &price)
+        } else {
+            let home = |t: &Macrotile| taught.get(&sides(&t.rect)).map(|k| k.home);
+            share(&cut.tiles, roster, crew, &pace, &known, (&home, &bricks))
+        };
         let took = cut.tiles.iter().map(known).collect();
         let mut owned = BTreeMap::<WorkerId, Vec<u32>>::new();
         for (&owner, place) in owners.iter().zip(0..) {
             owned.entry(owner).or_default().push(place);
         }
-        (cut, Regions { kind, homes: owners.clone(), owners, owned, took, pace })
+        let told = |(t, place): (&Macrotile, u32)| match taught.get(&sides(&t.rect)) {
+            Some(Cow::Owned(known)) => Some((place, known.clone())),
+            _ => None,
+        };
+        let told = cut.tiles.iter().zip(0..).filter_map(told).collect();
+        let homes = owners.clone();
+        (cut, Regions { kind, frame, told, homes, owners, owned, took, pace, brick, fine })
     }
 
     /// Who draws it.
     pub(crate) fn crew(&self) -> Crew {
-        self.kind.3
+        self.kind.2
     }
 
     /// Those whose tiles these are and who are gone, or leave.
@@ -283,6 +443,55 @@ impl Regions {
     /// All that are a worker's.
     pub(crate) fn owned(&self, id: WorkerId) -> &[u32] {
         self.owned.get(&id).map_or(&[], Vec::as_slice)
+    }
+
+    /// The parts of a waiting tile, what is guessed of each, and what they take, as far as that is known; none of what
+    /// can't be cut.
+    pub(crate) fn parts(&self, place: u32, tile: &Rect, memory: &Memory) -> Vec<Part> {
+        if *tile != whole_of(tile, self.kind.1)
+            || tile.width().max(tile.height()) <= PLAIN as usize / 2
+        {
+            return Vec::new();
+        }
+        let there = |r: Rect| Some((r, *self.fine.get(&sides(&r))?));
+        let parts: Vec<(Rect, u64)> = quarters(tile).into_iter().filter_map(there).collect();
+        let all: u64 = parts.iter().map(|p| p.1).sum();
+        let Some((_, whole)) = self.took[place as usize] else { return Vec::new() };
+        let part = |(rect, est): (Rect, u64)| {
+            let known = memory.recall(self.kind, &rect);
+            let guess = || MORE * whole * est as f64 / all.max(1) as f64;
+            let us = known.as_ref().map_or_else(guess, |k| k.us);
+            let price = known.as_ref().map_or(0.0, |k| self.brick * bricks_along(k));
+            let told = match known {
+                Some(Cow::Owned(known)) => Some(known),
+                _ => None,
+            };
+            let est = ((us / self.pace.mean) as u64).max(1);
+            Part { tile: Macrotile { rect, est }, us, price, told }
+        };
+        parts.into_iter().map(part).collect()
+    }
+
+    /// A waiting tile's parts are these workers' from now on, at the places behind all others.
+    pub(crate) fn cut_late(&mut self, place: u32, parts: Vec<(Part, WorkerId)>) {
+        let (owner, home) = (self.owners[place as usize], self.homes[place as usize]);
+        let last = self.took[place as usize].map_or(owner, |t| t.0);
+        self.owned.entry(owner).or_default().retain(|p| *p != place);
+        for (part, to) in parts {
+            let at = self.owners.len() as u32;
+            self.owners.push(to);
+            self.homes.push(home);
+            self.took.push(Some((last, part.us)));
+            self.owned.entry(to).or_default().push(at);
+            if let Some(known) = part.told {
+                self.told.insert(at, known);
+            }
+        }
+    }
+
+    /// Whether what is known of a task is known of other tiles.
+    pub(crate) fn is_told(&self, place: u32) -> bool {
+        self.told.contains_key(&place)
     }
 
     /// What a task took its last owner, in microseconds.
@@ -336,6 +545,94 @@ impl Regions {
             self.owned.entry(worker).or_default().push(place);
         }
     }
+}
+
+/// How many bricks go along with a tile. Of a part of what was whole it is those that it lies under: some half.
+#[expect(clippy::ptr_arg, reason = "whether it is borrowed says of what it is known")]
+fn bricks_along(known: &Cow<'_, Known>) -> f64 {
+    let part = if matches!(known, Cow::Owned(_)) { 0.5 } else { 1.0 };
+    part * known.touched.len() as f64
+}
+
+/// Parts that tiles can be cut into, with what is guessed of each.
+type Parts = BTreeMap<Sides, u64>;
+
+/// The tiles of a frame that is alone, some of them cut ([`alone::which`]), and all parts that there may be. `None`:
+/// too little is known.
+fn mixed<'a>(
+    through: &Through,
+    threads: usize,
+    recall: impl Fn(&Rect) -> Option<Cow<'a, Known>>,
+) -> Option<(Cut, Parts)> {
+    let plain = through.cut((0, 0), Some(PLAIN));
+    let known: Vec<Option<f64>> =
+        plain.tiles.iter().map(|t| recall(&t.rect).map(|k| k.us)).collect();
+    let told = || plain.tiles.iter().zip(&known).filter_map(|(t, us)| Some((t.est, (*us)?)));
+    let (units, us) = told().fold((0, 0.0), |(a, b), (est, us)| (a + est, b + us));
+    if 2 * told().count() < plain.tiles.len() || units == 0 {
+        return None;
+    }
+    let unit = us / units as f64;
+    let fine = through.cut((0, 0), Some(PLAIN / 2));
+    let parts: Parts = fine.tiles.iter().map(|t| (sides(&t.rect), t.est)).collect();
+    let whole = |(t, us): (&Macrotile, &Option<f64>)| {
+        let us = us.unwrap_or(t.est as f64 * unit);
+        let part = |r: &Rect| Some((*r, *parts.get(&sides(r))?));
+        let guess = |est: u64| MORE * us * est as f64 / t.est.max(1) as f64;
+        let takes = |(r, est): (Rect, u64)| recall(&r).map_or_else(|| guess(est), |k| k.us);
+        Whole { us, parts: quarters(&t.rect).iter().filter_map(part).map(takes).collect() }
+    };
+    let wholes: Vec<Whole> = plain.tiles.iter().zip(&known).map(whole).collect();
+    let cut = alone::which(&wholes, threads);
+    Some((through.mixed(&plain, &fine, &cut), parts))
+}
+
+/// Whose each tile of a frame that is alone is: whoever drew it last, unless the frame ends earlier if another does
+/// ([`alone::balance`]). What `Pace` says of workers is not asked: it compares guesses, and of the two or three tiles
+/// that each of 64 workers has one may well take three times what is guessed.
+fn level(
+    tiles: &[Macrotile],
+    roster: &Roster,
+    crew: Crew,
+    (unit, slow): (f64, &impl Fn(WorkerId) -> f64),
+    known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>,
+    price: &impl Fn(&Macrotile) -> f64,
+) -> Vec<WorkerId> {
+    let staying: Vec<(WorkerId, f64)> =
+        crew.members(roster).map(|(id, threads)| (id, threads as f64)).collect();
+    if staying.is_empty() {
+        return vec![WorkerId(0); tiles.len()];
+    }
+    let place = |id: WorkerId| staying.binary_search_by_key(&id, |s| s.0).ok();
+    let slows: Vec<f64> = staying.iter().map(|s| slow(s.0)).collect();
+    let takes = |t: &Macrotile| match known(t) {
+        Some((owner, us)) => (us, slow(owner)),
+        None => (t.est as f64 * unit, 1.0),
+    };
+    let takes: Vec<(f64, f64)> = tiles.iter().map(takes).collect();
+    let held: Vec<Option<usize>> = tiles.iter().map(|t| place(known(t)?.0)).collect();
+    let prices: Vec<f64> = tiles.iter().map(price).collect();
+    let cost = |i: usize, w: usize| {
+        let slower = slows[w] / takes[i].1;
+        let slower = if (1.0 / BELIEVED..=BELIEVED).contains(&slower) { 1.0 } else { slower };
+        takes[i].0 * slower / staying[w].1
+    };
+    let mut load = vec![0.0; staying.len()];
+    let mut owners: Vec<usize> = held.iter().map(|w| w.unwrap_or(0)).collect();
+    for (i, w) in held.iter().enumerate() {
+        if let Some(w) = *w {
+            load[w] += cost(i, w);
+        }
+    }
+    for i in (0..tiles.len()).filter(|&i| held[i].is_none()) {
+        let after = |w: &usize| load[*w] + cost(i, *w);
+        let least = (0..staying.len()).min_by(|a, b| after(a).total_cmp(&after(b)));
+        owners[i] = least.unwrap_or(0);
+        load[owners[i]] += cost(i, owners[i]);
+    }
+    let price = |i: usize, w: usize| if held[i].is_none_or(|h| h == w) { 0.0 } else { prices[i] };
+    alone::balance(&mut owners, staying.len(), cost, price);
+    owners.into_iter().map(|w| staying[w].0).collect()
 }
 
 /// How long guessed units take.
@@ -490,6 +787,7 @@ fn share(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use slabcast_common::volume::Digest32;
 
     fn roster(threads: &[u32]) -> Roster {
         let mut roster = Roster::default();
@@ -592,6 +890,71 @@ mod tests {
         assert!(counts.iter().all(|n| (9..=12).contains(n)), "{counts:?}");
         let kept = owners[..20].iter().filter(|o| o.0 == 1).count();
         assert_eq!(kept, counts[0], "it keeps of its own");
+    }
+
+    /// What is known of a tile after frames of which each drew some tiles in so many microseconds.
+    fn after(frames: &[&[(Rect, f64, &[u32])]]) -> (Memory, Kind) {
+        let kind = (BrickSetKey(Digest32([0; 32])), [512, 512], Crew::ALL);
+        let mut tiles = BTreeMap::new();
+        for (frame, drawn) in (1..).zip(frames) {
+            for (rect, us, touched) in *drawn {
+                let (owner, touched) = (WorkerId(frame), touched.to_vec());
+                let known = Known { frame, owner, home: owner, us: *us, touched };
+                tiles.insert(sides(rect), known);
+            }
+        }
+        let lessons = vec![Lessons { kind, tiles }];
+        (Memory { lessons, ..Memory::default() }, kind)
+    }
+
+    #[test]
+    fn a_tile_is_known_by_its_parts_and_parts_by_their_tile_whichever_came_last() {
+        let whole = Rect::new(64, 0, 128, 64);
+        let part = |x, y| Rect::new(64 + 32 * x, 32 * y, 96 + 32 * x, 32 + 32 * y);
+        let near = |k: Option<Cow<'_, Known>>, us: f64| {
+            let k = k.expect("it is known");
+            assert!((k.us - us).abs() < 1e-6, "{} for {us}", k.us);
+            (k.owner.0, k.touched.clone())
+        };
+        let (m, kind) = after(&[&[(whole, 1000.0, &[1, 2])]]);
+        assert_eq!(near(m.recall(kind, &whole), 1000.0), (1, vec![1, 2]));
+        assert_eq!(near(m.recall(kind, &part(1, 1)), MORE * 250.0), (1, vec![1, 2]), "a quarter");
+        assert!(m.recall(kind, &Rect::new(0, 0, 64, 64)).is_none());
+        // In the frame after it was cut, and nothing lay under two of its parts.
+        let parts: &[_] = &[(part(0, 0), 310.0, &[1, 3][..]), (part(1, 0), 930.0, &[2, 3])];
+        let (m, kind) = after(&[&[(whole, 1000.0, &[7])], parts]);
+        assert_eq!(near(m.recall(kind, &whole), 1240.0 / MORE), (2, vec![1, 2, 3]));
+        assert_eq!(near(m.recall(kind, &part(0, 0)), 310.0), (2, vec![1, 3]));
+        // Whole again: its parts share what it took now as they did then.
+        let (m, kind) = after(&[parts, &[(whole, 2000.0, &[8])]]);
+        assert_eq!(near(m.recall(kind, &whole), 2000.0), (2, vec![8]));
+        assert_eq!(near(m.recall(kind, &part(1, 0)), MORE * 1500.0), (2, vec![8]));
+    }
+
+    #[test]
+    fn a_tile_that_two_workers_drew_says_which_of_them_is_slow() {
+        let mut m = Memory::default();
+        for _ in 0..12 {
+            m.compare((WorkerId(1), 9000.0), (WorkerId(2), 900.0));
+        }
+        let ratio = m.slow[&WorkerId(1)] / m.slow[&WorkerId(2)];
+        assert!((8.0..=10.1).contains(&ratio), "{ratio}");
+        m.compare((WorkerId(3), 5.0), (WorkerId(2), 900.0));
+        assert!(!m.slow.contains_key(&WorkerId(3)), "5 us say nothing");
+        m.forget(WorkerId(1));
+        assert!(!m.slow.contains_key(&WorkerId(1)));
+    }
+
+    #[test]
+    fn a_slow_workers_tiles_go_to_others_and_come_back_to_it_no_more() {
+        let (tiles, roster) = (tiles(12), roster(&[1, 1]));
+        let at = |t: &Macrotile| t.rect.x0 / 64;
+        // Six each; the second worker takes ten times as long.
+        let known =
+            |t: &Macrotile| Some(if at(t) < 6 { (WorkerId(1), 1e3) } else { (WorkerId(2), 1e4) });
+        let slow = |id: WorkerId| if id.0 == 2 { 10.0 } else { 1.0 };
+        let owners = level(&tiles, &roster, Crew::ALL, (1.0, &slow), &known, &|_| 0.0);
+        assert_eq!(owners.iter().filter(|o| o.0 == 2).count(), 1);
     }
 
     #[test]

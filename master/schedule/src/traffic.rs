@@ -106,6 +106,11 @@ impl Traffic {
         (self.sent, self.done) = (0, now);
     }
 
+    /// Bytes a microsecond that the link carries, as far as that was seen.
+    pub(crate) fn rate(&self) -> Option<f64> {
+        (self.rate > 0.0).then_some(self.rate)
+    }
+
     /// Whether crews are to draw.
     pub(crate) fn bears_crews(&self) -> bool {
         self.crews

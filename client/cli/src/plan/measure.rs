@@ -281,9 +281,10 @@ impl Bench {
         let rects: Vec<Rect> = projected.iter().flatten().map(|p| p.rect).collect();
         // The schedule goes by blocks of bricks, whose outline is a little larger: it may take the level
         // beside the one that bricks alone say. And a frame beside others may be one of two crews'.
+        // Of a frame that is alone it cuts some tiles of 64 pixels in parts of 32.
         let mut edges: BTreeSet<u32> = match job.work.tile {
             Some(edge) => [edge].into(),
-            None => [64, 128, 256].into(),
+            None => [32, 64, 128, 256].into(),
         };
         for &wanted in path.wanted.iter().filter(|_| job.work.tile.is_none()) {
             for wanted in [wanted + wanted / 4, wanted / 2 + wanted / 8, wanted / 2 - wanted / 8] {

@@ -137,6 +137,87 @@ fn a_job_under_one_schedule_may_follow_one_under_the_other() {
     campaign(MIXED, seeds(150));
 }
 
+/// A world in which frames come one by one, of one set and one size, so that each is alone in the making and the one
+/// before it teaches it: tiles are cut, before it and as it is drawn.
+fn chaos_alone(seed: u64) -> World {
+    let mut rng = Rng::new(seed ^ 0xa10e_5000);
+    let config = Config {
+        lease: rng.pick(&[60_000_000, 100_000]),
+        poison_after: 1000,
+        queue_ahead: rng.pick(&[1, 2, 4]),
+        ..Config::default()
+    };
+    let mut w = World::new(seed, config);
+    let small_budgets = rng.once_in(4);
+    let dims = [rng.between(16, 40) as u32, rng.between(16, 40) as u32, rng.between(8, 24) as u32];
+    let (set, bricks) = (fake::key(0), fake::bricks(&mut rng, dims, 6));
+    let size = [rng.between(60, 260) as u32, rng.between(60, 200) as u32];
+    let quality = Quality {
+        thickness: rng.pick(&[2.0, 4.0]),
+        eps: rng.pick(&[0.0, 1.0 / 512.0, 0.3]),
+        ..Quality::default()
+    };
+    let scene = fake::scene(0, set, dims, quality);
+    let work = Work { schedule: Schedule::Region, ..Work::default() };
+    let turn = rng.below(1000);
+    for _ in 0..rng.between(1, 10) {
+        let n = nature(&mut rng, small_budgets);
+        w.join(Nature { us_per_pixel_sheet: rng.pick(&[0.05, 0.05, 0.2]), ..n });
+    }
+    for frame in 0..rng.between(3, 6) {
+        // Some views are alike, as on a path.
+        let mut view = Rng::new(turn + rng.pick(&[0, 0, 0, 1]));
+        w.queue(fake::job(&mut view, frame, &scene, &bricks, size, work));
+        for _ in 0..rng.pick(&[0, 0, 1, 3]) {
+            let when = w.now() + rng.below(rng.clone().pick(&[3_000, 30_000]));
+            let whom = WorkerId(rng.between(1, 8));
+            let what = match rng.below(8) {
+                0..=2 => Script::Kill(whom),
+                3 => Script::Stall(whom, rng.pick(&[10_000, 500_000, 20_000_000])),
+                4 => Script::Leave(whom),
+                5 => Script::Slow(whom, 4.0),
+                6 => Script::Cancel(FrameId(frame)),
+                _ => Script::Join(nature(&mut rng, small_budgets)),
+            };
+            w.script(when, what);
+        }
+        if !w.scheduler.has_workers() || rng.once_in(3) {
+            let when = w.now() + rng.below(20_000);
+            w.script(when, Script::Join(Nature { immune: true, ..Nature::default() }));
+        }
+        let when = w.now() + 1_000_000;
+        w.script(when, Script::Join(Nature { immune: true, ..Nature::default() }));
+        w.run_until(|w| w.scheduler.is_idle());
+    }
+    w.finish();
+    w
+}
+
+#[test]
+fn pictures_of_frames_alone_are_the_serial_ones_however_their_tiles_are_cut() {
+    let range = seeds(300);
+    let one = range.end - range.start == 1;
+    let (mut frames, mut cut, mut mixed, mut lost, mut dropped, mut retries) = (0, 0, 0, 0, 0, 0);
+    for seed in range {
+        let w = chaos_alone(seed);
+        frames += w.done.len();
+        lost += w.scheduler.totals().lost_workers;
+        dropped += w.scheduler.totals().dropped_results;
+        for done in w.done.values() {
+            let has = |size| done.stats.slabs.iter().flat_map(|s| &s.tiles).any(|t| t.size == size);
+            cut += usize::from(has(32));
+            mixed += usize::from(has(32) && has(64));
+            retries += done.stats.retries;
+        }
+        assert_eq!(w.log, chaos_alone(seed).log, "seed {seed} replays");
+    }
+    println!(
+        "alone: {frames} frames, {cut} cut, {mixed} of them in part, {retries} retries, {dropped} results \
+         dropped, {lost} workers lost"
+    );
+    assert!(one || mixed > 0 && retries > 0 && dropped > 0 && lost > 0);
+}
+
 /// Of 3,000 worlds one in which a worker was lost while a frame, done, waited for the one before it: its
 /// statistics had bricks on their way after its end.
 #[test]

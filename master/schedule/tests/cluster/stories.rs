@@ -394,6 +394,74 @@ fn frames_of_a_path_go_on_beside_each_other_and_end_in_order() {
     assert!(all < alone.now(), "{all} us, one after the other {} us", alone.now());
 }
 
+/// Frames of one view, each alone in the making, in which nothing hides anything; how long each took.
+fn one_by_one(w: &mut World, frames: std::ops::Range<u64>, work: Work) -> Vec<Micros> {
+    let quality = Quality { thickness: 1.0, eps: 0.0, ..Quality::default() };
+    let scene = fake::scene(0, fake::key(0), DIMS, quality);
+    let took = frames.map(|frame| {
+        let mut job = fake::job(&mut Rng::new(5), 0, &scene, &bricks(), [256, 256], work);
+        (job.frame, job.number) = (FrameId(frame), frame);
+        w.queue(job);
+        time(w)
+    });
+    took.collect()
+}
+
+/// How many tiles of each size a frame had.
+fn sizes(w: &World, frame: u64) -> BTreeMap<u32, usize> {
+    let mut sizes = BTreeMap::new();
+    for t in &w.done[&FrameId(frame)].stats.slabs[0].tiles {
+        *sizes.entry(t.size).or_insert(0) += 1;
+    }
+    sizes
+}
+
+#[test]
+fn where_tiles_are_few_and_long_a_frame_alone_is_cut_so_that_all_end_at_once() {
+    // 16 tiles of 64 pixels at most for 12 threads: four of them would have all others wait.
+    let run = |tile| {
+        let mut w = world();
+        for _ in 0..12 {
+            w.join(Nature { us_per_pixel_sheet: 0.1, ..Nature::default() });
+        }
+        let work = Work { tile, schedule: Schedule::Region, ..slab() };
+        let took = one_by_one(&mut w, 0..4, work);
+        w.finish();
+        (took, w)
+    };
+    let (whole, _) = run(Some(64));
+    let (cut, w) = run(None);
+    assert_eq!(sizes(&w, 0).keys().copied().collect::<Vec<_>>(), [64], "nothing is known yet");
+    let both = sizes(&w, 3);
+    assert!(both.contains_key(&64) && both.contains_key(&32), "{both:?}");
+    assert!(10 * cut[3] < 9 * whole[3], "{cut:?} us, in tiles of 64 {whole:?}");
+}
+
+#[test]
+fn what_a_worker_has_last_is_cut_and_shared_where_it_would_be_late() {
+    // Two tiles each; then a worker takes half as long again.
+    let run = |slow: f64| {
+        let mut w = world();
+        for _ in 0..8 {
+            w.join(Nature { us_per_pixel_sheet: 0.1, ..Nature::default() });
+        }
+        let work = Work { schedule: Schedule::Region, ..slab() };
+        let before = one_by_one(&mut w, 0..3, work);
+        let now = w.now();
+        w.script(now, Script::Slow(WorkerId(2), slow));
+        w.run_for(1);
+        let took = one_by_one(&mut w, 3..4, work)[0];
+        w.finish();
+        (before[2], took, sizes(&w, 3).get(&32).copied().unwrap_or(0))
+    };
+    let (before, steady, few) = run(1.0);
+    assert!(steady < before + before / 10, "{steady} us after {before}");
+    // Parts of its second tile are drawn by others.
+    let (before, late, more) = run(1.5);
+    assert!(more > few, "{more} parts and not {few}");
+    assert!(10 * late < 13 * before, "{late} us after {before}");
+}
+
 #[test]
 fn a_tile_that_moves_takes_its_bricks_along() {
     let mut w = world();

@@ -41,7 +41,8 @@ def plan(args, scene, trace, more):
 def cell(row, alone, rate, large):
     """Latency beside what is asked for, throughput, and what binds."""
     n = row["workers"]
-    through = f"{100 * row['throughput_efficiency']:.0f} %"
+    part = row["throughput_efficiency"]
+    through = "-" if part is None else f"{100 * part:.0f} %"
     if large:
         return f"{100 * row['latency_efficiency']:.0f} % / {through} {row['bound_by']}"
     asked = alone / n + 1.2 + 1e3 * (row["bytes_down"] + row["bytes_up"] + row["brick_bytes"]) / rate

@@ -188,6 +188,45 @@ async fn killed_with_a_tile(schedule: &str) {
     }
 }
 
+/// Frames one by one on more threads than there are tiles to share out evenly: what the first ones teach has
+/// tiles cut into parts.
+#[tokio::test]
+async fn tiles_that_are_cut_for_a_frame_alone_cost_no_pixel() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let views = ["--size", "300x280", "--frames", "1", "--thickness", "0.125", "--tf", "auto"];
+    let render = |name: &str, how: &[&str]| {
+        let file = dir.path().join(format!("{name}.jsonl"));
+        run(Command::new(SLABCAST)
+            .arg("render")
+            .args(how)
+            .args(views)
+            .arg("-o")
+            .arg(dir.path().join(name))
+            .arg("--stats")
+            .arg(&file));
+        stats(&file).remove(0)
+    };
+    let one = ["--workers", "1", "--threads", "1", "--schedule", "slab"];
+    let want = render("embedded", &[&[VOLUME], &one[..]].concat()).pixels_sha256;
+    let (_master, address) = master();
+    let _workers = ["a", "b", "c"].map(|name| {
+        let args = ["worker", "--master", &address, "--name", name, "--threads", "5"];
+        let child = Command::new(SLABCAST).args(args).stdout(Stdio::null()).stderr(Stdio::null());
+        Process(child.spawn().expect("the worker starts"))
+    });
+    let client = Client::connect(&address).await.unwrap();
+    until("three workers", async || (client.workers().await.unwrap().len() == 3).then_some(()))
+        .await;
+    let mut cut = false;
+    for i in 0..5 {
+        let frame = render(&i.to_string(), &["--master", &address, "--schedule", "region"]);
+        assert_eq!(frame.pixels_sha256, want, "frame {i}");
+        let has = |size| frame.slabs[0].tiles.iter().any(|t| t.size == size);
+        cut |= has(64) && has(32);
+    }
+    assert!(cut, "no frame had tiles of two sizes");
+}
+
 #[tokio::test]
 async fn a_job_waits_for_workers_and_goes_on_with_those_that_come() {
     let dir = tempfile::tempdir().unwrap();

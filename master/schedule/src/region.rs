@@ -118,6 +118,16 @@ fn sides(tile: &Rect) -> Sides {
     [tile.x0, tile.y0, tile.x1, tile.y1]
 }
 
+/// What is known of a tile, and what it takes by that.
+enum Taught<'a> {
+    /// It was drawn.
+    Itself(&'a Known),
+    /// The whole tile was, that it is a part of.
+    Whole(&'a Known, f64),
+    /// Its parts were.
+    Parts([Option<&'a Known>; 4], f64),
+}
+
 /// What the schedule remembers.
 #[derive(Debug, Default)]
 pub(crate) struct Memory {
@@ -143,35 +153,58 @@ impl Memory {
         lessons.tiles.get(&sides(tile))
     }
 
-    /// What is known of a tile of [`PLAIN`] pixels, or of a quarter of one, however the last frame cut it: of a tile that
-    /// it cut the sum of its parts, of parts of one that it drew whole their share of it.
+    /// What is known of a tile of [`PLAIN`] pixels, or of a quarter of one, however the last frame cut it.
     fn recall(&self, kind: Kind, tile: &Rect) -> Option<Cow<'_, Known>> {
+        Some(match self.taught(kind, tile)? {
+            Taught::Itself(known) => Cow::Borrowed(known),
+            Taught::Whole(whole, us) => Cow::Owned(Known { us, ..whole.clone() }),
+            Taught::Parts(parts, us) => {
+                let most = parts.iter().flatten().max_by(|a, b| a.us.total_cmp(&b.us))?;
+                let touched = parts.iter().flatten().flat_map(|k| k.touched.iter().copied());
+                let mut touched: Vec<u32> = touched.collect();
+                touched.sort_unstable();
+                touched.dedup();
+                Cow::Owned(Known { us, touched, ..(*most).clone() })
+            }
+        })
+    }
+
+    /// How long it takes, as far as that is known.
+    fn recall_us(&self, kind: Kind, tile: &Rect) -> Option<f64> {
+        Some(match self.taught(kind, tile)? {
+            Taught::Itself(known) => known.us,
+            Taught::Whole(_, us) | Taught::Parts(_, us) => us,
+        })
+    }
+
+    /// What the last frame that drew it taught of a tile: of one that it cut the sum of its parts, of parts of one that
+    /// it drew whole their share of it.
+    fn taught(&self, kind: Kind, tile: &Rect) -> Option<Taught<'_>> {
+        let lessons = &self.lessons.iter().find(|l| l.kind == kind)?.tiles;
         let whole = whole_of(tile, kind.1);
-        let known = self.known(kind, tile);
-        let taught = |k: Option<&Known>| k.map_or(0, |k| k.frame);
-        let parts = quarters(&whole).into_iter().filter_map(|part| self.known(kind, &part));
+        let known = lessons.get(&sides(tile));
+        let frame = known.map_or(0, |k| k.frame);
+        let parts = || quarters(&whole).map(|part| lessons.get(&sides(&part?)));
         if *tile != whole {
-            let one = self.known(kind, &whole).filter(|one| one.frame > taught(known));
-            let Some(one) = one else { return known.map(Cow::Borrowed) };
+            let Some(one) = lessons.get(&sides(&whole)).filter(|one| one.frame > frame) else {
+                return known.map(Taught::Itself);
+            };
             // As it was among the others, if they were known then.
-            let all = parts.map(|k| k.us).sum::<f64>();
+            let all = parts().iter().flatten().map(|k| k.us).sum::<f64>();
             let share = match known {
                 Some(known) if all > 0.0 => known.us / all,
                 _ => tile.area() as f64 / whole.area() as f64,
             };
-            return Some(Cow::Owned(Known { us: MORE * share * one.us, ..one.clone() }));
+            return Some(Taught::Whole(one, MORE * share * one.us));
         }
-        let last = parts.clone().map(|k| k.frame).max().unwrap_or(0);
-        if last <= taught(known) {
-            return known.map(Cow::Borrowed);
+        let parts = parts();
+        let last = parts.iter().flatten().map(|k| k.frame).max().unwrap_or(0);
+        if last <= frame {
+            return known.map(Taught::Itself);
         }
-        let parts = parts.filter(|k| k.frame == last);
-        let most = parts.clone().max_by(|a, b| a.us.total_cmp(&b.us))?;
-        let mut touched: Vec<u32> = parts.clone().flat_map(|k| k.touched.iter().copied()).collect();
-        touched.sort_unstable();
-        touched.dedup();
-        let us = parts.map(|k| k.us).sum::<f64>() / MORE;
-        Some(Cow::Owned(Known { us, touched, ..most.clone() }))
+        let parts = parts.map(|k| k.filter(|k| k.frame == last));
+        let us = parts.iter().flatten().map(|k| k.us).sum::<f64>() / MORE;
+        Some(Taught::Parts(parts, us))
     }
 
     /// The bricks that a tile was drawn from in the frame before, if by another worker.
@@ -299,15 +332,14 @@ fn whole_of(tile: &Rect, size: [u32; 2]) -> Rect {
     Rect::new(x0, y0, x0 + edge, y0 + edge).intersect(&Rect::of_size(size))
 }
 
-/// The parts that a tile is cut into, of half of [`PLAIN`].
-fn quarters(tile: &Rect) -> Vec<Rect> {
+/// The parts that a tile is cut into, of half of [`PLAIN`]; at the picture's border there may be fewer.
+fn quarters(tile: &Rect) -> [Option<Rect>; 4] {
     let half = PLAIN as i32 / 2;
-    let part = |(x, y)| {
+    [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(x, y)| {
         let (x0, y0) = (tile.x0 + x * half, tile.y0 + y * half);
-        Rect::new(x0, y0, x0 + half, y0 + half).intersect(tile)
-    };
-    let all = [(0, 0), (1, 0), (0, 1), (1, 1)].map(part);
-    all.into_iter().filter(|r| !r.is_empty()).collect()
+        let part = Rect::new(x0, y0, x0 + half, y0 + half).intersect(tile);
+        Some(part).filter(|r| !r.is_empty())
+    })
 }
 
 /// Kinds that are remembered: crews each, and everybody, at the beginning or the end of a path.
@@ -379,7 +411,7 @@ impl Regions {
         let leveled = alone && job.work.tile.is_none() && (PLAIN / 2..=PLAIN).contains(&cut.edge);
         let mut fine = BTreeMap::new();
         if leveled
-            && let Some(mixed) = mixed(&through, threads as usize, |t| memory.recall(kind, t))
+            && let Some(mixed) = mixed(&through, threads as usize, |t| memory.recall_us(kind, t))
         {
             (cut, fine) = mixed;
         }
@@ -454,7 +486,8 @@ impl Regions {
             return Vec::new();
         }
         let there = |r: Rect| Some((r, *self.fine.get(&sides(&r))?));
-        let parts: Vec<(Rect, u64)> = quarters(tile).into_iter().filter_map(there).collect();
+        let parts: Vec<(Rect, u64)> =
+            quarters(tile).into_iter().flatten().filter_map(there).collect();
         let all: u64 = parts.iter().map(|p| p.1).sum();
         let Some((_, whole)) = self.took[place as usize] else { return Vec::new() };
         let part = |(rect, est): (Rect, u64)| {
@@ -558,15 +591,14 @@ fn bricks_along(known: &Cow<'_, Known>) -> f64 {
 type Parts = BTreeMap<Sides, u64>;
 
 /// The tiles of a frame that is alone, some of them cut ([`alone::which`]), and all parts that there may be. `None`:
-/// too little is known.
-fn mixed<'a>(
+/// of too few it is known what they take.
+fn mixed(
     through: &Through,
     threads: usize,
-    recall: impl Fn(&Rect) -> Option<Cow<'a, Known>>,
+    taught: impl Fn(&Rect) -> Option<f64>,
 ) -> Option<(Cut, Parts)> {
     let plain = through.cut((0, 0), Some(PLAIN));
-    let known: Vec<Option<f64>> =
-        plain.tiles.iter().map(|t| recall(&t.rect).map(|k| k.us)).collect();
+    let known: Vec<Option<f64>> = plain.tiles.iter().map(|t| taught(&t.rect)).collect();
     let told = || plain.tiles.iter().zip(&known).filter_map(|(t, us)| Some((t.est, (*us)?)));
     let (units, us) = told().fold((0, 0.0), |(a, b), (est, us)| (a + est, b + us));
     if 2 * told().count() < plain.tiles.len() || units == 0 {
@@ -577,10 +609,12 @@ fn mixed<'a>(
     let parts: Parts = fine.tiles.iter().map(|t| (sides(&t.rect), t.est)).collect();
     let whole = |(t, us): (&Macrotile, &Option<f64>)| {
         let us = us.unwrap_or(t.est as f64 * unit);
-        let part = |r: &Rect| Some((*r, *parts.get(&sides(r))?));
         let guess = |est: u64| MORE * us * est as f64 / t.est.max(1) as f64;
-        let takes = |(r, est): (Rect, u64)| recall(&r).map_or_else(|| guess(est), |k| k.us);
-        Whole { us, parts: quarters(&t.rect).iter().filter_map(part).map(takes).collect() }
+        let takes = |r: Rect| {
+            let est = *parts.get(&sides(&r))?;
+            Some(taught(&r).unwrap_or_else(|| guess(est)))
+        };
+        Whole { us, parts: quarters(&t.rect).into_iter().flatten().filter_map(takes).collect() }
     };
     let wholes: Vec<Whole> = plain.tiles.iter().zip(&known).map(whole).collect();
     let cut = alone::which(&wholes, threads);

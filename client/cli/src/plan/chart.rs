@@ -16,7 +16,7 @@ const COLOURS: [[u8; 3]; 4] = [[213, 94, 0], [0, 114, 178], [0, 140, 100], [110,
 const LETTER: usize = 6;
 
 /// What is drawn of a row.
-type Figure = fn(&Row) -> f64;
+type Figure = fn(&Row) -> Option<f64>;
 
 /// A line, a dot or a word.
 enum Stroke {
@@ -42,7 +42,8 @@ impl Chart {
         // Even steps for each doubling.
         let x =
             |n: u32| left + (right - left) * libm::log2(f64::from(n)) / libm::log2(f64::from(most));
-        let top_value = all().flat_map(|r| [r.latency_efficiency, r.throughput_efficiency]);
+        let through: Figure = |r| r.throughput.map(|t| t.1);
+        let top_value = all().flat_map(|r| [Some(r.latency_efficiency), through(r)]).flatten();
         let ceiling = top_value.fold(1.0, f64::max);
         let y = |e: f64| bottom - (bottom - top) * e / ceiling;
         for tenth in (0..=10).step_by(2) {
@@ -59,7 +60,7 @@ impl Chart {
         }
         c.text([right - 44.0, bottom + 48.0], "workers", INK, 1);
         let of: [(&str, Figure); 2] =
-            [("latency", |r| r.latency_efficiency), ("throughput", |r| r.throughput_efficiency)];
+            [("latency", |r| Some(r.latency_efficiency)), ("throughput", through)];
         for (i, (schedule, rows)) in schedules.iter().enumerate() {
             let mut before = None;
             for r in rows.iter() {
@@ -74,7 +75,7 @@ impl Chart {
             for (j, (name, value)) in of.iter().enumerate() {
                 let colour = COLOURS[(2 * i + j) % 4];
                 let points: Vec<[f64; 2]> =
-                    rows.iter().map(|r| [x(r.workers), y(value(r))]).collect();
+                    rows.iter().filter_map(|r| Some([x(r.workers), y(value(r)?)])).collect();
                 for w in points.windows(2) {
                     c.line(w[0], w[1], colour, 2.0);
                 }

@@ -18,7 +18,7 @@ use crate::progress::Progress;
 use crate::request::{Asked, Opened, PictureOf, WorkArgs};
 use crate::stage::Stage;
 use crate::{embedded, parse};
-use predict::{LOSSES, Question, Row};
+use predict::{IN_FLIGHT, LOSSES, Question, Row, STEADILY};
 use rehearse::Over;
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::trace::{MAX_BYTES, Trace};
@@ -280,7 +280,8 @@ fn losses(name: &str, rows: &[Row]) -> String {
     }
     let _ = writeln!(text, " | {:>6} {:>7}", "driver", "streams");
     for (r, steady) in told {
-        let _ = write!(text, "{:>7} {:>8.1}", r.workers, 100.0 * r.throughput_efficiency);
+        let alone = r.throughput.map_or(0.0, |t| t.1);
+        let _ = write!(text, "{:>7} {:>8.1}", r.workers, 100.0 * alone);
         for part in steady.lost {
             let _ = write!(text, " {:>8.1}", 100.0 * part);
         }
@@ -355,21 +356,31 @@ impl Said<'_> {
                 "brick KB"
             );
             for r in &p.rows {
+                let throughput = r.throughput.map_or_else(
+                    || format!("{:>9} {:>6}", "-", "-"),
+                    |(frames, part)| format!("{frames:>9.1} {:>4.0} %", part * 100.0),
+                );
                 let _ = writeln!(
                     text,
-                    "{:>7} {:>9.1} {:>9.2} {:>4.0} % {:>9.1} {:>4.0} % {:>9.0} {:>9.1}  {} {:.0} %",
+                    "{:>7} {:>9.1} {:>9.2} {:>4.0} % {throughput} {:>9.0} {:>9.1}  {} {:.0} %",
                     r.workers,
                     r.first_ms,
                     r.frame_ms,
                     r.latency_efficiency * 100.0,
-                    r.frames_per_s,
-                    r.throughput_efficiency * 100.0,
                     (r.bytes[0] + r.bytes[1]) / 1e3,
                     r.bytes[2] / 1e3,
                     r.bound.0.name(),
                     r.bound.1 * 100.0,
                 );
             }
+        }
+        if self.predicted.iter().flat_map(|p| &p.rows).any(|r| r.throughput.is_none()) {
+            let least = STEADILY + IN_FLIGHT as usize;
+            let _ = writeln!(
+                text,
+                "\nframes/s: can't be told of {} frames; give --frames {least} or more",
+                self.frames
+            );
         }
         let told: String = self.predicted.iter().map(|p| losses(p.name(), &p.rows)).collect();
         if !told.is_empty() {
@@ -406,8 +417,8 @@ impl Said<'_> {
                 serde_json::json!({
                     "schedule": schedule, "workers": r.workers, "first_ms": r.first_ms, "frame_ms": r.frame_ms,
                     "latency_efficiency": r.latency_efficiency,
-                    "frames_per_s": r.frames_per_s,
-                    "throughput_efficiency": r.throughput_efficiency,
+                    "frames_per_s": r.throughput.map(|t| t.0),
+                    "throughput_efficiency": r.throughput.map(|t| t.1),
                     "bytes_down": r.bytes[0], "bytes_up": r.bytes[1], "brick_bytes": r.bytes[2],
                     "leases": r.leases,
                     "render_threads": r.steady.as_ref().map(|s| {
@@ -454,6 +465,7 @@ impl Said<'_> {
                         straggler_ms,link_ms,master_ms\n"
             .to_string();
         let rows = self.predicted.iter().flat_map(|p| p.rows.iter().map(move |r| (p.name(), r)));
+        let told = |n: Option<f64>| n.map_or_else(String::new, |n| n.to_string());
         for (schedule, r) in rows {
             let _ = writeln!(
                 text,
@@ -462,8 +474,8 @@ impl Said<'_> {
                 r.first_ms,
                 r.frame_ms,
                 r.latency_efficiency,
-                r.frames_per_s,
-                r.throughput_efficiency,
+                told(r.throughput.map(|t| t.0)),
+                told(r.throughput.map(|t| t.1)),
                 r.bytes[0],
                 r.bytes[1],
                 r.bytes[2],

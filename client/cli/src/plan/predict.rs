@@ -47,9 +47,9 @@ pub(crate) struct Row {
     pub(crate) frame_ms: f64,
     /// Against one worker's best time over the number of render threads.
     pub(crate) latency_efficiency: f64,
-    /// Frames a second, as many in flight as a master has.
-    pub(crate) frames_per_s: f64,
-    pub(crate) throughput_efficiency: f64,
+    /// Frames a second, as many in flight as a master has, and the same efficiency; nothing where fewer than
+    /// [`STEADILY`] come steadily.
+    pub(crate) throughput: Option<(f64, f64)>,
     /// Bytes of a later frame: down, up, bricks.
     pub(crate) bytes: [f64; 3],
     /// Leases of a later frame.
@@ -62,7 +62,7 @@ pub(crate) struct Row {
     pub(crate) master_ms: [f64; 3],
     /// Messages of a later frame: from the master, how often some of those left together, to the master.
     pub(crate) messages: [f64; 3],
-    /// What threads did while frames were delivered steadily; nothing of a path of four frames and fewer.
+    /// What threads did while frames were delivered steadily; nothing where that can't be told, either.
     pub(crate) steady: Option<Steady>,
 }
 
@@ -89,6 +89,10 @@ pub(crate) const LOSSES: [(&str, &str); 7] = [
 
 /// Frames that a master has in hand (`master::driver`).
 pub(crate) const IN_FLIGHT: u32 = 4;
+
+/// Frames that have to come steadily for throughput to be told by them, as many as are in flight. Of fewer chance says
+/// which came early: two of six came with 211 % of what all cores can do on a machine that something disturbed.
+pub(crate) const STEADILY: usize = IN_FLIGHT as usize;
 
 /// What is asked.
 #[derive(Clone, Copy, Debug)]
@@ -179,8 +183,9 @@ fn row(
     let frames = jobs.len() as f64;
     let each_ms = throughput.steady_ms(IN_FLIGHT);
     let spent = throughput.spent;
+    let told = Outcome::steady(jobs.len(), IN_FLIGHT) >= STEADILY;
     let throughput_efficiency = steadily / threads / each_ms;
-    let steady = (spent.all() > 0).then(|| {
+    let steady = (told && spent.all() > 0).then(|| {
         let all_spent = spent.all() as f64;
         let part = |ns: u64| ns as f64 / all_spent;
         let drawing = part(spent.tiles + spent.tables + spent.blocks);
@@ -204,8 +209,7 @@ fn row(
         first_ms: latency.first_ms(),
         frame_ms,
         latency_efficiency: alone / threads / frame_ms,
-        frames_per_s: 1e3 / each_ms,
-        throughput_efficiency,
+        throughput: told.then_some((1e3 / each_ms, throughput_efficiency)),
         bytes: [latency.mean(|f| f.down), latency.mean(|f| f.up), latency.mean(|f| f.bricks)],
         leases: latency.mean(|f| f.leases),
         bound: (kinds[most], parts[most] / all),

@@ -24,6 +24,10 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
     assert_eq!(rows.len(), 8, "both schedules: {said}");
     assert!(said.contains("region schedule") && said.contains("slab schedule, 3 slabs"), "{said}");
     assert!(!said.contains("render threads' time"), "three frames are too few to tell: {said}");
+    assert!(
+        said.contains("frames/s: can't be told of 3 frames; give --frames 8 or more"),
+        "{said}"
+    );
     assert_eq!(names(&dir.join("out")), ["plan.csv", "plan.json", "plan.png", "plan.svg"]);
     let svg = std::fs::read_to_string(dir.join("out/plan.svg")).unwrap();
     assert!(svg.contains("predicted efficiency") && svg.contains("<circle"));
@@ -46,6 +50,7 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
         let named = ["cores", "straggler", "link", "master"];
         assert!(named.contains(&row["bound_by"].as_str().unwrap()), "{row}");
         assert!(row["render_threads"].is_null() && row["master_busy"].is_null(), "{row}");
+        assert!(row["frames_per_s"].is_null() && row["throughput_efficiency"].is_null(), "{row}");
     }
     // What was measured is read again; a slow link then binds.
     let slow =
@@ -71,6 +76,7 @@ fn a_longer_plan_says_where_the_threads_time_goes() {
     let cluster = ["--workers", "2", "--schedule", "region", "--trace", "s.trace"];
     let said = good(dir.path(), &[&frames[..], &cluster].concat());
     assert!(said.contains("four in flight: % of the render threads' time"), "{said}");
+    assert!(!said.contains("can't be told"), "{said}");
     let plan = json(&good(dir.path(), &[&frames[..], &cluster, &["--json"]].concat()));
     let row = &plan["predicted"][0];
     let parts = row["render_threads"].as_object().unwrap();

@@ -210,9 +210,10 @@ async fn tiles_that_are_cut_for_a_frame_alone_cost_no_pixel() {
     let want = render("embedded", &[&[VOLUME], &one[..]].concat()).pixels_sha256;
     let (_master, address) = master();
     let _workers = ["a", "b", "c"].map(|name| {
-        let args = ["worker", "--master", &address, "--name", name, "--threads", "5"];
-        let child = Command::new(SLABCAST).args(args).stdout(Stdio::null()).stderr(Stdio::null());
-        Process(child.spawn().expect("the worker starts"))
+        let mut child = Command::new(SLABCAST);
+        child.args(["worker", "--master", &address, "--name", name, "--threads", "5"]);
+        let child = child.stdout(Stdio::null()).stderr(Stdio::null()).spawn();
+        Process(child.expect("the worker starts"))
     });
     let client = Client::connect(&address).await.unwrap();
     until("three workers", async || (client.workers().await.unwrap().len() == 3).then_some(()))

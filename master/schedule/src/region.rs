@@ -20,6 +20,11 @@
 //! is none and its owner has work for longer than two such tiles. Where a path's frames have few tiles for so
 //! many threads, and the link bears it (`traffic`), each is one [`Crew`]'s.
 //!
+//! **Alone.** A frame that no other is in the making beside and none waits behind is there when its last tile is. Its tiles are
+//! dealt out so that all are done at once, and some are cut for that ([`alone`]), before it and as they are lent
+//! (`frame::late`). So what is known is of tiles of 64 pixels in one frame and of parts of 32 in the next, and each tells
+//! of the other ([`Memory::recall`]).
+//!
 //! It refuses to know what time it is and which copy of a result counts.
 
 use crate::alone::{self, Whole};

@@ -424,7 +424,7 @@ fn where_tiles_are_few_and_long_a_frame_alone_is_cut_so_that_all_end_at_once() {
         for _ in 0..12 {
             w.join(Nature { us_per_pixel_sheet: 0.1, ..Nature::default() });
         }
-        let work = Work { tile, schedule: Schedule::Region, ..slab() };
+        let work = Work { tile, tiles_per_worker: 1.0, schedule: Schedule::Region, ..slab() };
         let took = one_by_one(&mut w, 0..4, work);
         w.finish();
         (took, w)
@@ -445,7 +445,7 @@ fn what_a_worker_has_last_is_cut_and_shared_where_it_would_be_late() {
         for _ in 0..8 {
             w.join(Nature { us_per_pixel_sheet: 0.1, ..Nature::default() });
         }
-        let work = Work { schedule: Schedule::Region, ..slab() };
+        let work = Work { tiles_per_worker: 1.0, schedule: Schedule::Region, ..slab() };
         let before = one_by_one(&mut w, 0..3, work);
         let now = w.now();
         w.script(now, Script::Slow(WorkerId(2), slow));

@@ -126,8 +126,9 @@ fn nearest(x: f32) -> i32 {
     unsafe { rounded.to_int_unchecked::<i32>() }
 }
 
-/// 32-bit fixed point: one rounding, [`nearest`], when a contribution is added. What would leave
-/// the integers is held at their end (`Frame::raw_scale` leaves room, so nothing does).
+/// 32-bit fixed point: one rounding, to nearest and of two to the even one, when a contribution is
+/// added. What would leave the integers is held at their end (`Frame::raw_scale` leaves room, so
+/// nothing does).
 impl Accumulate for i32 {
     type Weight = Tap;
     type Section = Section;

@@ -20,6 +20,7 @@ use slabcast_common::trace::Trace;
 use slabcast_schedule::sim::{Costs, Link, Nanos, Outcome, Stopwatch};
 use slabcast_schedule::{FrameJob, Spans};
 use std::collections::VecDeque;
+use std::ffi::OsStr;
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -87,14 +88,10 @@ impl Process {
     fn start(by: Option<&str>, args: &[String]) -> Result<Process, Fail> {
         let program = std::env::current_exe()
             .map_err(|e| Fail::failed(format!("finding this program failed: {e}")))?;
-        let mut words = by.unwrap_or_default().split_whitespace();
-        let mut command = match words.next() {
-            Some(first) => Command::new(first),
-            None => Command::new(&program),
-        };
-        if by.is_some() {
-            command.args(words).arg(&program);
-        }
+        let words = by.unwrap_or_default().split_whitespace().map(OsStr::new);
+        let mut words = words.chain([program.as_os_str()]);
+        let mut command = Command::new(words.next().unwrap_or_default());
+        command.args(words);
         command.args(args).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
         for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("SLABCAST_")) {
             command.env_remove(name);
@@ -200,7 +197,7 @@ impl Stage<'_> {
         while client.workers().await.map_err(|e| remote::fail(&e))?.len() < n as usize {
             for worker in &mut workers {
                 if let Ok(Some(status)) = worker.0.try_wait() {
-                    let by = by.map(|by| format!(", started by `{by}`")).unwrap_or_default();
+                    let by = by.map(|by| format!(" that `{by}` started")).unwrap_or_default();
                     return Err(Fail::failed(format!(
                         "a worker of the rehearsal{by} has ended ({status}); try `slabcast worker \
                          --master {address} --rehearse {file}` there"

@@ -57,7 +57,7 @@ fn a_rehearsal_goes_over_the_address_that_is_named() {
     let out = plan(&["--rehearse-at", at, "--rehearse-by", "false"]);
     assert_eq!(out.status.code(), Some(1));
     let said = text(&out.stderr);
-    assert!(said.contains("started by `false` has ended (exit status: 1)"), "{said}");
+    assert!(said.contains("that `false` started has ended (exit status: 1)"), "{said}");
 
     // An address that is not this machine's.
     let out = plan(&["--rehearse-at", "192.0.2.1"]);

@@ -35,7 +35,6 @@ use slabcast_common::blocks::{Block, Blocks};
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::WorkerId;
 use slabcast_common::occlusion::Rect;
-use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 /// How much later than the mean a worker may be done before a tile of it moves, as a fraction. Tiles of
@@ -138,6 +137,37 @@ enum Taught<'a> {
     Parts([Option<&'a Known>; 4], f64),
 }
 
+/// What is recalled of a tile.
+enum Recalled<'a> {
+    /// As it was learnt: it was drawn as it is.
+    Itself(&'a Known),
+    /// As it follows from other tiles: those that it was cut into, or the one that it is a part of.
+    Others(Known),
+}
+
+impl Recalled<'_> {
+    fn known(&self) -> &Known {
+        match self {
+            Recalled::Itself(known) => known,
+            Recalled::Others(known) => known,
+        }
+    }
+
+    /// What follows from other tiles, and can't be looked up.
+    fn told(&self) -> Option<&Known> {
+        match self {
+            Recalled::Itself(_) => None,
+            Recalled::Others(known) => Some(known),
+        }
+    }
+
+    /// How many bricks go along with the tile. Of a part of what was whole it is those that it lies under: some half.
+    fn bricks_along(&self) -> f64 {
+        let part = if self.told().is_some() { 0.5 } else { 1.0 };
+        part * self.known().touched.len() as f64
+    }
+}
+
 /// What the schedule remembers.
 #[derive(Debug, Default)]
 pub(crate) struct Memory {
@@ -164,17 +194,17 @@ impl Memory {
     }
 
     /// What is known of a tile of [`PLAIN`] pixels, or of a quarter of one, however the last frame cut it.
-    fn recall(&self, kind: Kind, tile: &Rect) -> Option<Cow<'_, Known>> {
+    fn recall(&self, kind: Kind, tile: &Rect) -> Option<Recalled<'_>> {
         Some(match self.taught(kind, tile)? {
-            Taught::Itself(known) => Cow::Borrowed(known),
-            Taught::Whole(whole, us) => Cow::Owned(Known { us, ..whole.clone() }),
+            Taught::Itself(known) => Recalled::Itself(known),
+            Taught::Whole(whole, us) => Recalled::Others(Known { us, ..whole.clone() }),
             Taught::Parts(parts, us) => {
                 let most = parts.iter().flatten().max_by(|a, b| a.us.total_cmp(&b.us))?;
                 let touched = parts.iter().flatten().flat_map(|k| k.touched.iter().copied());
                 let mut touched: Vec<u32> = touched.collect();
                 touched.sort_unstable();
                 touched.dedup();
-                Cow::Owned(Known { us, touched, ..(*most).clone() })
+                Recalled::Others(Known { us, touched, ..(*most).clone() })
             }
         })
     }
@@ -316,6 +346,11 @@ impl Crew {
         threads.filter(move |(id, _)| self.has(*id))
     }
 
+    /// They, by their names, with the threads of each.
+    fn staying(self, roster: &Roster) -> Vec<(WorkerId, f64)> {
+        self.members(roster).map(|(id, threads)| (id, threads as f64)).collect()
+    }
+
     /// Whose a frame is that comes to so many tiles of 64 pixels: the `beside`th crew's, where there is more than
     /// one frame.
     fn of_frame(beside: Option<u32>, tiles: usize, roster: &Roster) -> Crew {
@@ -329,6 +364,11 @@ impl Crew {
         let (least, most) = (strong().min().unwrap_or(0), strong().max().unwrap_or(0));
         if few && all && 5 * least >= 3 * most { crew(index) } else { Crew::ALL }
     }
+}
+
+/// Where a worker is among those who stay.
+fn place_of(staying: &[(WorkerId, f64)], id: WorkerId) -> Option<usize> {
+    staying.binary_search_by_key(&id, |s| s.0).ok()
 }
 
 /// What frames learn from each other by: a brick set, a size of pictures, and who draws.
@@ -434,23 +474,23 @@ impl Regions {
         }
         let recall = |t: &Macrotile| match either {
             true => memory.recall(kind, &t.rect),
-            false => memory.known(kind, &t.rect).map(Cow::Borrowed),
+            false => memory.known(kind, &t.rect).map(Recalled::Itself),
         };
-        let taught: BTreeMap<Sides, Cow<'_, Known>> =
+        let taught: BTreeMap<Sides, Recalled<'_>> =
             cut.tiles.iter().filter_map(|t| Some((sides(&t.rect), recall(t)?))).collect();
-        let known = |t: &Macrotile| taught.get(&sides(&t.rect)).map(|k| (k.owner, k.us));
+        let recalled = |t: &Macrotile| taught.get(&sides(&t.rect));
+        let of = |t: &Macrotile| recalled(t).map(Recalled::known);
+        let known = |t: &Macrotile| of(t).map(|k| (k.owner, k.us));
         let pace = Pace::of(&cut.tiles, &known);
         pace.correct(&mut cut.tiles, &known);
         cut.sort(size);
-        let bricks = |t: &Macrotile| taught.get(&sides(&t.rect)).map_or(0, |k| k.touched.len());
+        let bricks = |t: &Macrotile| of(t).map_or(0, |k| k.touched.len());
         let owners = if leveled && !taught.is_empty() {
             let slow = |id: WorkerId| memory.slow.get(&id).copied().unwrap_or(1.0);
-            let price = |t: &Macrotile| {
-                taught.get(&sides(&t.rect)).map_or(0.0, |k| brick * bricks_along(k))
-            };
+            let price = |t: &Macrotile| recalled(t).map_or(0.0, |k| brick * k.bricks_along());
             level(&cut.tiles, roster, crew, (pace.mean, &slow), &known, &price)
         } else {
-            let home = |t: &Macrotile| taught.get(&sides(&t.rect)).map(|k| k.home);
+            let home = |t: &Macrotile| of(t).map(|k| k.home);
             share(&cut.tiles, roster, crew, &pace, &known, (&home, &bricks))
         };
         let took = cut.tiles.iter().map(known).collect();
@@ -458,9 +498,9 @@ impl Regions {
         for (&owner, place) in owners.iter().zip(0..) {
             owned.entry(owner).or_default().push(place);
         }
-        let told = |(t, place): (&Macrotile, u32)| match taught.get(&sides(&t.rect)) {
-            Some(Cow::Owned(known)) => Some((place, known.clone())),
-            _ => None,
+        let told = |(t, place): (&Macrotile, u32)| {
+            let known = recalled(t)?.told()?;
+            Some((place, known.clone()))
         };
         let told = cut.tiles.iter().zip(0..).filter_map(told).collect();
         let homes = owners.clone();
@@ -508,14 +548,11 @@ impl Regions {
         let all: u64 = parts.iter().map(|p| p.1).sum();
         let Some((_, whole)) = self.took[place as usize] else { return Vec::new() };
         let part = |(rect, est): (Rect, u64)| {
-            let known = memory.recall(self.kind, &rect);
+            let recalled = memory.recall(self.kind, &rect);
             let guess = || MORE * whole * est as f64 / all.max(1) as f64;
-            let us = known.as_ref().map_or_else(guess, |k| k.us);
-            let price = known.as_ref().map_or(0.0, |k| self.brick * bricks_along(k));
-            let told = match known {
-                Some(Cow::Owned(known)) => Some(known),
-                _ => None,
-            };
+            let us = recalled.as_ref().map_or_else(guess, |k| k.known().us);
+            let price = recalled.as_ref().map_or(0.0, |k| self.brick * k.bricks_along());
+            let told = recalled.as_ref().and_then(Recalled::told).cloned();
             let est = ((us / self.pace.mean) as u64).max(1);
             Part { tile: Macrotile { rect, est }, us, price, told }
         };
@@ -597,13 +634,6 @@ impl Regions {
     }
 }
 
-/// How many bricks go along with a tile. Of a part of what was whole it is those that it lies under: some half.
-#[expect(clippy::ptr_arg, reason = "whether it is borrowed says of what it is known")]
-fn bricks_along(known: &Cow<'_, Known>) -> f64 {
-    let part = if matches!(known, Cow::Owned(_)) { 0.5 } else { 1.0 };
-    part * known.touched.len() as f64
-}
-
 /// Parts that tiles can be cut into, with what is guessed of each.
 type Parts = BTreeMap<Sides, u64>;
 
@@ -649,19 +679,17 @@ fn level(
     known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>,
     price: &impl Fn(&Macrotile) -> f64,
 ) -> Vec<WorkerId> {
-    let staying: Vec<(WorkerId, f64)> =
-        crew.members(roster).map(|(id, threads)| (id, threads as f64)).collect();
+    let staying = crew.staying(roster);
     if staying.is_empty() {
         return vec![WorkerId(0); tiles.len()];
     }
-    let place = |id: WorkerId| staying.binary_search_by_key(&id, |s| s.0).ok();
     let slows: Vec<f64> = staying.iter().map(|s| slow(s.0)).collect();
     let takes = |t: &Macrotile| match known(t) {
         Some((owner, us)) => (us, slow(owner)),
         None => (t.est as f64 * unit, 1.0),
     };
     let takes: Vec<(f64, f64)> = tiles.iter().map(takes).collect();
-    let held: Vec<Option<usize>> = tiles.iter().map(|t| place(known(t)?.0)).collect();
+    let held: Vec<Option<usize>> = tiles.iter().map(|t| place_of(&staying, known(t)?.0)).collect();
     let prices: Vec<f64> = tiles.iter().map(price).collect();
     let cost = |i: usize, w: usize| {
         let slower = slows[w] / takes[i].1;
@@ -748,12 +776,10 @@ fn share(
     known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>,
     (home, bricks): (&impl Fn(&Macrotile) -> Option<WorkerId>, &impl Fn(&Macrotile) -> usize),
 ) -> Vec<WorkerId> {
-    let staying: Vec<(WorkerId, f64)> =
-        crew.members(roster).map(|(id, threads)| (id, threads as f64)).collect();
+    let staying = crew.staying(roster);
     if staying.is_empty() {
         return vec![WorkerId(0); tiles.len()];
     }
-    let place = |id: WorkerId| staying.binary_search_by_key(&id, |s| s.0).ok();
     let mean = pace.mean;
     let slowness: Vec<f64> = staying.iter().map(|s| pace.slowness(s.0)).collect();
     // What is known of each tile is looked up once: the loops below ask for it again and again.
@@ -762,7 +788,7 @@ fn share(
         None => (t.est as f64 * mean, 1.0),
     };
     let takes: Vec<(f64, f64)> = tiles.iter().map(takes).collect();
-    let homes: Vec<Option<usize>> = tiles.iter().map(|t| home(t).and_then(place)).collect();
+    let homes: Vec<Option<usize>> = tiles.iter().map(|t| place_of(&staying, home(t)?)).collect();
     let cost = |i: usize, w: usize| takes[i].0 * slowness[w] / takes[i].1 / staying[w].1;
     let mut load = vec![0.0; staying.len()];
     // In the order of rows.
@@ -962,8 +988,9 @@ mod tests {
     fn a_tile_is_known_by_its_parts_and_parts_by_their_tile_whichever_came_last() {
         let whole = Rect::new(64, 0, 128, 64);
         let part = |x, y| Rect::new(64 + 32 * x, 32 * y, 96 + 32 * x, 32 + 32 * y);
-        let near = |k: Option<Cow<'_, Known>>, us: f64| {
+        let near = |k: Option<Recalled<'_>>, us: f64| {
             let k = k.expect("it is known");
+            let k = k.known();
             assert!((k.us - us).abs() < 1e-6, "{} for {us}", k.us);
             (k.owner.0, k.touched.clone())
         };

@@ -51,35 +51,30 @@ const LEAST: f64 = 0.002;
 /// a third more bricks move, and at 1 no more than a tenth fewer, for a later end.
 const PAYS: f64 = 0.2;
 
-/// A tile that may be cut: what it takes whole, and its parts, in microseconds.
-#[derive(Clone, Debug)]
-pub(crate) struct Whole {
-    pub(crate) us: f64,
-    pub(crate) parts: Vec<f64>,
-}
-
-/// Which tiles are cut for the frame to end first, on so many threads.
-pub(crate) fn which(tiles: &[Whole], threads: usize) -> Vec<bool> {
-    let n = tiles.len();
+/// Which tiles are cut for the frame to end first, on so many threads. They take so many microseconds whole; what the
+/// parts of one take is asked for only where whole tiles are not fine enough.
+pub(crate) fn which(us: &[f64], parts: impl Fn(usize) -> Vec<f64>, threads: usize) -> Vec<bool> {
+    let n = us.len();
+    let (mut least, mut long, mut short) = (end(&mut us.to_vec(), threads), 0, 0);
+    let share = us.iter().sum::<f64>() / threads.max(1) as f64;
+    if WORTH * WORTH * least <= share {
+        return vec![false; n];
+    }
+    let parts: Vec<Vec<f64>> = (0..n).map(parts).collect();
     let mut order: Vec<usize> = (0..n).collect();
-    order.sort_by(|&a, &b| tiles[b].us.total_cmp(&tiles[a].us));
+    order.sort_by(|&a, &b| us[b].total_cmp(&us[a]));
     let mut items = Vec::new();
     let mut end_with = |long: usize, short: usize| {
         items.clear();
         for (rank, &i) in order.iter().enumerate() {
             if rank < long || rank + short >= n {
-                items.extend_from_slice(&tiles[i].parts);
+                items.extend_from_slice(&parts[i]);
             } else {
-                items.push(tiles[i].us);
+                items.push(us[i]);
             }
         }
         end(&mut items, threads)
     };
-    let (mut least, mut long, mut short) = (end_with(0, 0), 0, 0);
-    let share = tiles.iter().map(|t| t.us).sum::<f64>() / threads.max(1) as f64;
-    if WORTH * WORTH * least <= share {
-        return vec![false; n];
-    }
     for count in counts(n) {
         let end = end_with(count, 0);
         if end < WORTH * least {
@@ -146,9 +141,15 @@ pub(crate) fn balance(
         if load[most] <= EVEN * mean {
             break;
         }
-        // What is won, what goes there, what comes back, and to whom.
+        // What is won, what goes there, what comes back, and to whom. Between two that are as fast no more is won than half
+        // of what one is later by than the other; so who has most time comes first, and most others are not looked at.
         let mut best: Option<(f64, usize, Option<usize>, usize)> = None;
-        for to in (0..workers).filter(|&to| to != most) {
+        let mut others: Vec<usize> = (0..workers).filter(|&to| to != most).collect();
+        others.sort_by(by);
+        for to in others {
+            if best.is_some_and(|b| b.0 >= 0.5 * (load[most] - load[to])) {
+                break;
+            }
             for &i in &owned[most] {
                 let mut consider = |from: f64, here: f64, back: Option<usize>, paid: f64| {
                     let gain = load[most] - from.max(here) - PAYS * paid.max(0.0);
@@ -184,15 +185,16 @@ pub(crate) fn balance(
 mod tests {
     use super::*;
 
-    fn wholes(us: &[f64]) -> Vec<Whole> {
-        us.iter().map(|&us| Whole { us, parts: vec![0.31 * us; 4] }).collect()
+    /// Which are cut of tiles whose parts take a quarter longer.
+    fn cut(us: &[f64], threads: usize) -> Vec<bool> {
+        which(us, |i| vec![0.31 * us[i]; 4], threads)
     }
 
     #[test]
     fn a_tile_longer_than_a_share_is_cut_and_the_others_are_not() {
         // 41 ms for four threads, one tile of 20.
-        let tiles = wholes(&[3000.0, 20_000.0, 3000.0, 3000.0, 3000.0, 3000.0, 3000.0, 3000.0]);
-        let cut = which(&tiles, 4);
+        let us = [3000.0, 20_000.0, 3000.0, 3000.0, 3000.0, 3000.0, 3000.0, 3000.0];
+        let cut = cut(&us, 4);
         assert!(cut[1], "20 ms of a share of 10");
         assert!(cut.iter().filter(|c| **c).count() <= 3, "{cut:?}");
     }
@@ -200,17 +202,17 @@ mod tests {
     #[test]
     fn nothing_is_cut_where_tiles_are_fine_enough_or_short() {
         let many: Vec<f64> = (0..100).map(|i| 2000.0 + 10.0 * f64::from(i)).collect();
-        assert!(!which(&wholes(&many), 4).contains(&true));
+        assert!(!cut(&many, 4).contains(&true));
         // Of 50 us each, cutting would only have the master hear more of them.
-        assert!(!which(&wholes(&[50.0; 8]), 6).contains(&true));
-        assert!(which(&[], 4).is_empty());
-        assert_eq!(which(&wholes(&[1000.0]), 0), [false]);
+        assert!(!cut(&[50.0; 8], 6).contains(&true));
+        assert!(cut(&[], 4).is_empty());
+        assert_eq!(cut(&[1000.0], 0), [false]);
     }
 
     #[test]
     fn equal_tiles_a_few_more_than_threads_are_cut_where_that_ends_sooner() {
         // Five tiles for four threads: whole, the fifth has everybody wait for as long again.
-        let cut = which(&wholes(&[10_000.0; 5]), 4);
+        let cut = cut(&[10_000.0; 5], 4);
         let n = cut.iter().filter(|c| **c).count();
         assert!((1..5).contains(&n), "{cut:?}");
     }

@@ -272,7 +272,7 @@ impl Frame {
         let (cut, regions) = Regions::cut(
             &self.job,
             (self.beside, self.alone),
-            cluster.traffic.rate(),
+            (cluster.traffic.rate(), cluster.traffic.binds_alone()),
             &cluster.roster,
             &mut cluster.memory,
         );

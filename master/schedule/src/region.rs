@@ -27,7 +27,7 @@
 //!
 //! It refuses to know what time it is and which copy of a result counts.
 
-use crate::alone::{self, Whole};
+use crate::alone;
 use crate::macrotile::{Cut, Macrotile, Through};
 use crate::roster::Roster;
 use crate::{FrameJob, Micros};
@@ -217,6 +217,21 @@ impl Memory {
         })
     }
 
+    /// The same of each of the parts of a whole tile.
+    fn recall_parts_us(&self, kind: Kind, whole: &Rect) -> [Option<f64>; 4] {
+        let Some(lessons) = self.lessons.iter().find(|l| l.kind == kind) else { return [None; 4] };
+        let get = |r: &Rect| lessons.tiles.get(&sides(r));
+        let (rects, one) = (quarters(whole), get(whole));
+        let parts = rects.map(|r| get(&r?));
+        std::array::from_fn(|i| {
+            let (tile, known) = (rects[i]?, parts[i]);
+            match one.filter(|one| one.frame > known.map_or(0, |k| k.frame)) {
+                Some(one) => Some(part_of((one, whole), (known, &tile), &parts)),
+                None => known.map(|k| k.us),
+            }
+        })
+    }
+
     /// What the last frame that drew it taught of a tile: of one that it cut the sum of its parts, of parts of one that
     /// it drew whole their share of it.
     fn taught(&self, kind: Kind, tile: &Rect) -> Option<Taught<'_>> {
@@ -229,13 +244,7 @@ impl Memory {
             let Some(one) = lessons.get(&sides(&whole)).filter(|one| one.frame > frame) else {
                 return known.map(Taught::Itself);
             };
-            // As it was among the others, if they were known then.
-            let all = parts().iter().flatten().map(|k| k.us).sum::<f64>();
-            let share = match known {
-                Some(known) if all > 0.0 => known.us / all,
-                _ => tile.area() as f64 / whole.area() as f64,
-            };
-            return Some(Taught::Whole(one, MORE * share * one.us));
+            return Some(Taught::Whole(one, part_of((one, &whole), (known, tile), &parts())));
         }
         let parts = parts();
         let last = parts.iter().flatten().map(|k| k.frame).max().unwrap_or(0);
@@ -366,6 +375,20 @@ impl Crew {
     }
 }
 
+/// What a part takes of a tile that was drawn whole after it: as it was among the others, if they were known then.
+fn part_of(
+    (one, whole): (&Known, &Rect),
+    (known, part): (Option<&Known>, &Rect),
+    parts: &[Option<&Known>; 4],
+) -> f64 {
+    let all = parts.iter().flatten().map(|k| k.us).sum::<f64>();
+    let share = match known {
+        Some(known) if all > 0.0 => known.us / all,
+        _ => part.area() as f64 / whole.area() as f64,
+    };
+    MORE * share * one.us
+}
+
 /// Where a worker is among those who stay.
 fn place_of(staying: &[(WorkerId, f64)], id: WorkerId) -> Option<usize> {
     staying.binary_search_by_key(&id, |s| s.0).ok()
@@ -431,11 +454,12 @@ pub(crate) struct Regions {
 
 impl Regions {
     /// Cuts a frame's picture, estimates its tiles and shares them out among those who stay, or among the
-    /// `beside`th crew of them. `alone`: no other frame is in the making or waits.
+    /// `beside`th crew of them. `alone`: no other frame is in the making or waits; `bind`: bricks are what such
+    /// frames wait for.
     pub(crate) fn cut(
         job: &FrameJob,
         (beside, alone): (Option<u32>, bool),
-        rate: Option<f64>,
+        (rate, bind): (Option<f64>, bool),
         roster: &Roster,
         memory: &mut Memory,
     ) -> (Cut, Regions) {
@@ -467,8 +491,11 @@ impl Regions {
         let either = job.work.tile.is_none() && (PLAIN / 2..=PLAIN).contains(&cut.edge);
         let leveled = alone && either;
         let mut fine = BTreeMap::new();
+        // Who is to draw a tile that another part of was cut from lacks bricks, and which tiles are cut changes from frame to frame. So
+        // where bricks bind all are of one size, and none is cut late.
         if leveled
-            && let Some(mixed) = mixed(&through, threads as usize, |t| memory.recall_us(kind, t))
+            && !bind
+            && let Some(mixed) = mixed(&through, threads as usize, (memory, kind))
         {
             (cut, fine) = mixed;
         }
@@ -642,10 +669,11 @@ type Parts = BTreeMap<Sides, u64>;
 fn mixed(
     through: &Through,
     threads: usize,
-    taught: impl Fn(&Rect) -> Option<f64>,
+    (memory, kind): (&Memory, Kind),
 ) -> Option<(Cut, Parts)> {
     let plain = through.cut((0, 0), Some(PLAIN));
-    let known: Vec<Option<f64>> = plain.tiles.iter().map(|t| taught(&t.rect)).collect();
+    let known: Vec<Option<f64>> =
+        plain.tiles.iter().map(|t| memory.recall_us(kind, &t.rect)).collect();
     let told = || plain.tiles.iter().zip(&known).filter_map(|(t, us)| Some((t.est, (*us)?)));
     let (units, us) = told().fold((0, 0.0), |(a, b), (est, us)| (a + est, b + us));
     if 2 * told().count() < plain.tiles.len() || units == 0 {
@@ -654,17 +682,19 @@ fn mixed(
     let unit = us / units as f64;
     let fine = through.cut((0, 0), Some(PLAIN / 2));
     let parts: Parts = fine.tiles.iter().map(|t| (sides(&t.rect), t.est)).collect();
-    let whole = |(t, us): (&Macrotile, &Option<f64>)| {
-        let us = us.unwrap_or(t.est as f64 * unit);
-        let guess = |est: u64| MORE * us * est as f64 / t.est.max(1) as f64;
-        let takes = |r: Rect| {
-            let est = *parts.get(&sides(&r))?;
-            Some(taught(&r).unwrap_or_else(|| guess(est)))
+    let whole = |(t, us): (&Macrotile, &Option<f64>)| us.unwrap_or(t.est as f64 * unit);
+    let us: Vec<f64> = plain.tiles.iter().zip(&known).map(whole).collect();
+    let takes = |i: usize| {
+        let t = &plain.tiles[i];
+        let guess = |est: u64| MORE * us[i] * est as f64 / t.est.max(1) as f64;
+        let part = |(r, us): (Option<Rect>, Option<f64>)| {
+            let est = *parts.get(&sides(&r?))?;
+            Some(us.unwrap_or_else(|| guess(est)))
         };
-        Whole { us, parts: quarters(&t.rect).into_iter().flatten().filter_map(takes).collect() }
+        let known = memory.recall_parts_us(kind, &t.rect);
+        quarters(&t.rect).into_iter().zip(known).filter_map(part).collect()
     };
-    let wholes: Vec<Whole> = plain.tiles.iter().zip(&known).map(whole).collect();
-    let cut = alone::which(&wholes, threads);
+    let cut = alone::which(&us, takes, threads);
     Some((through.mixed(&plain, &fine, &cut), parts))
 }
 
@@ -1007,6 +1037,9 @@ mod tests {
         let (m, kind) = after(&[parts, &[(whole, 2000.0, &[8])]]);
         assert_eq!(near(m.recall(kind, &whole), 2000.0), (2, vec![8]));
         assert_eq!(near(m.recall(kind, &part(1, 0)), MORE * 1500.0), (2, vec![8]));
+        // All at once they are known as they are one by one.
+        let all = quarters(&whole).map(|p| m.recall_us(kind, &p?));
+        assert_eq!(m.recall_parts_us(kind, &whole), all);
     }
 
     #[test]

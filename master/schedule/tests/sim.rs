@@ -193,6 +193,19 @@ fn one_worker_without_any_cost_takes_the_sum_of_its_tiles() {
 }
 
 #[test]
+fn what_only_the_first_frame_takes_delays_no_other() {
+    let (jobs, trace) = world(3);
+    let times = |first_brick| {
+        let costs = Costs { first_brick, frame_brick: 10.0, ..Costs::default() };
+        let outcome = run(&jobs, &trace, &Cluster { costs, ..cluster(2) });
+        outcome.frames.iter().map(|f| f.done - f.began).collect::<Vec<_>>()
+    };
+    let (as_others, dear) = (times(10.0), times(1010.0));
+    assert_eq!(dear[0], as_others[0] + 1000 * 512, "the first has 512 bricks");
+    assert_eq!(dear[1..], as_others[1..]);
+}
+
+#[test]
 fn more_workers_share_the_work_and_nothing_is_won_beyond_it() {
     let (jobs, trace) = world(3);
     let mut before = u64::MAX;

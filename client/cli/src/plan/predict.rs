@@ -326,7 +326,7 @@ pub(crate) fn decided(
     let (_, took) =
         sim::run(jobs, trace, &cluster, &mut watch).map_err(|e| Fail::failed(e.to_string()))?;
     let per = |(n, ns): (u64, u64)| if n == 0 { 0.0 } else { ns as f64 / n as f64 };
-    let Took { frames, slabs, results, others, result_count, .. } = took;
+    let Took { first, frames, slabs, results, others, result_count, .. } = took;
     // Of what is of the order of a microsecond that is a part.
     let reading = reading();
     let each = |counted: (u64, u64)| (per(counted) - reading).max(0.0);
@@ -338,6 +338,7 @@ pub(crate) fn decided(
         false => (0.0, per(results)),
     };
     Ok(Costs {
+        first_brick: per(first),
         frame_brick: per(frames),
         slab_brick: per(slabs),
         // A result and the lease that follows it are handled in one go.

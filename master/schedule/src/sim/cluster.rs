@@ -187,6 +187,8 @@ struct World<'a> {
     last_slab: Option<(FrameId, i32)>,
     /// Frames of which a region was lent.
     begun: BTreeSet<FrameId>,
+    /// Frames that were begun under either schedule.
+    frames_begun: u64,
     outcome: Outcome,
     /// When the first frame was delivered: from then on time is accounted for.
     watched: Option<Nanos>,
@@ -242,6 +244,7 @@ pub fn run(
         at: 0,
         last_slab: None,
         begun: BTreeSet::new(),
+        frames_begun: 0,
         outcome: Outcome {
             frames: vec![FrameOutcome::default(); jobs.len()],
             ..Outcome::default()
@@ -873,7 +876,11 @@ impl<'a> World<'a> {
             let bricks = job.bricks.len() as f64;
             let pixels = job.view.size[0] as f64 * job.view.size[1] as f64;
             // What begins a frame or a slab gives its first leases, too.
-            cost += if frames > 0 {
+            let first = frames > 0 && self.frames_begun == 0;
+            self.frames_begun += frames;
+            cost += if first {
+                costs.first_brick * bricks
+            } else if frames > 0 {
                 costs.frame_brick * bricks
             } else if slabs > 0 {
                 costs.slab_brick * bricks + costs.slab_pixel * pixels
@@ -883,8 +890,9 @@ impl<'a> World<'a> {
             if let (Some(before), Some(after)) = (before, after) {
                 let ns = after - before;
                 if frames > 0 {
-                    took.frames.0 += job.bricks.len() as u64;
-                    took.frames.1 += ns;
+                    let took = if first { &mut took.first } else { &mut took.frames };
+                    took.0 += job.bricks.len() as u64;
+                    took.1 += ns;
                 } else if slabs > 0 {
                     took.slabs.0 += job.bricks.len() as u64;
                     took.slabs.1 += ns;

@@ -70,7 +70,9 @@ pub struct Toll {
 /// What messages and decisions cost a processor, in nanoseconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Costs {
-    /// Driver: to begin a frame, a brick of it.
+    /// Driver: to begin the first frame, which also finds where bricks lie, a brick of it.
+    pub first_brick: f64,
+    /// Driver: to begin another, a brick of it.
     pub frame_brick: f64,
     /// Driver: to begin a slab, a brick of the frame.
     pub slab_brick: f64,
@@ -267,7 +269,9 @@ impl Stopwatch for Unmeasured {
 /// What the scheduler took by kind of work: counts and nanoseconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Took {
-    /// Frames that were begun, and what that took, in bricks.
+    /// The first frame, and what beginning it took, in bricks.
+    pub first: (u64, Nanos),
+    /// Those that were begun after it, likewise.
     pub frames: (u64, Nanos),
     /// Slabs that were begun, in bricks of their frames.
     pub slabs: (u64, Nanos),

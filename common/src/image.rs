@@ -4,7 +4,7 @@
 //! its tile's A and the last sheet's raw sums and goes on; its colour is fixed point and is
 //! added to what stood there. So any cut into slabs and tiles gives the same integers.
 
-use crate::leaves::{Finish, Leaves, compose};
+use crate::leaves::{Finish, LEAF, Leaves, compose};
 use crate::math::{linear_from_srgb, srgb_from_linear};
 use crate::occlusion::Rect;
 use crate::volume::Digest32;
@@ -412,6 +412,26 @@ impl Encoder {
         }
     }
 
+    /// The same of rows of sums.
+    pub(crate) fn put_sums<'a>(
+        &self,
+        rows: impl Iterator<Item = (&'a [f32], &'a [[u32; 3]])>,
+        out: &mut Vec<u8>,
+    ) {
+        let black = self.background == Some([0.0; 3]);
+        match self.format {
+            PixelFormat::Rgb8 if black => over_black(rows, out, |rgb| rgb),
+            PixelFormat::Rgba8 if black => over_black(rows, out, |[r, g, b]| [r, g, b, u8::MAX]),
+            _ => {
+                let mut pixels = Vec::with_capacity(LEAF * LEAF);
+                for (a, colour) in rows {
+                    pixels.extend(a.iter().zip(colour).map(|(&a, &colour)| finished(a, colour)));
+                }
+                self.put(&pixels, out);
+            }
+        }
+    }
+
     #[inline(always)]
     fn each<const N: usize>(
         &self,
@@ -442,6 +462,28 @@ impl Encoder {
                 [straight(r), straight(g), straight(b), a]
             }
             None => [0.0; 4],
+        }
+    }
+}
+
+/// Rows of sums over black, of which nothing shines through: what is in front of it is all that there is.
+fn over_black<'a, const N: usize>(
+    rows: impl Iterator<Item = (&'a [f32], &'a [[u32; 3]])>,
+    out: &mut Vec<u8>,
+    bytes: impl Fn([u8; 3]) -> [u8; N],
+) {
+    let srgb = SumsSrgb8::get();
+    for (_, colour) in rows {
+        let first = out.len();
+        out.resize(first + colour.len() * N, 0);
+        let to = out[first..].as_chunks_mut::<N>().0;
+        // All of many rows are empty, and that is seen four numbers at once.
+        if colour.as_flattened().iter().fold(0, |any, sum| any | sum) == 0 {
+            to.fill(bytes([0; 3]));
+            continue;
+        }
+        for (to, &[r, g, b]) in to.iter_mut().zip(colour) {
+            *to = bytes([srgb.encode(r), srgb.encode(g), srgb.encode(b)]);
         }
     }
 }
@@ -487,9 +529,73 @@ impl Srgb8 {
     }
 }
 
+/// [`Srgb8`] of sums in units of [`COLOUR_UNIT`], without a float: what [`finished`] rounds them to is in the thresholds.
+/// Through floats three channels go in and out of a register together, which takes twice as long as looking them up.
+struct SumsSrgb8 {
+    /// The least sum of level `i + 1`; none for level 256.
+    thresholds: [u32; 256],
+    /// The level at the beginning of each part; at most one threshold is in it.
+    start: [u8; SumsSrgb8::PARTS + 1],
+}
+
+impl SumsSrgb8 {
+    const PARTS: usize = Srgb8::PARTS;
+    /// Full intensity.
+    const ONE: u32 = 1 << 28;
+
+    fn get() -> &'static SumsSrgb8 {
+        static TABLE: OnceLock<SumsSrgb8> = OnceLock::new();
+        TABLE.get_or_init(|| {
+            let start = std::array::from_fn(|i| {
+                SumsSrgb8::level((i * (SumsSrgb8::ONE as usize / SumsSrgb8::PARTS)) as u32)
+            });
+            let threshold = |i: usize| {
+                // No sum up to the first has that level, the second has.
+                let (mut below, mut above) = (0, SumsSrgb8::ONE);
+                while above - below > 1 {
+                    let middle = below + (above - below) / 2;
+                    let side = if usize::from(SumsSrgb8::level(middle)) > i {
+                        &mut above
+                    } else {
+                        &mut below
+                    };
+                    *side = middle;
+                }
+                if i < 255 { above } else { u32::MAX }
+            };
+            SumsSrgb8 { thresholds: std::array::from_fn(threshold), start }
+        })
+    }
+
+    /// By way of floats.
+    fn level(sum: u32) -> u8 {
+        let [light, ..] = finished(1.0, [sum; 3]);
+        Srgb8::get().encode(f64::from(light).clamp(0.0, 1.0))
+    }
+
+    #[inline(always)]
+    fn encode(&self, sum: u32) -> u8 {
+        let sum = sum.min(SumsSrgb8::ONE);
+        let level = self.start[sum as usize / (SumsSrgb8::ONE as usize / SumsSrgb8::PARTS)];
+        level + u8::from(self.thresholds[usize::from(level)] <= sum)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn sums_give_what_their_floats_do() {
+        let s = SumsSrgb8::get();
+        let near = |at: u32| [at.saturating_sub(1), at, at.saturating_add(1)];
+        let parts = (0..=SumsSrgb8::PARTS as u32).map(|i| i << 16);
+        let marks = s.thresholds.iter().copied().chain(parts).chain([SumsSrgb8::ONE, u32::MAX]);
+        let even = (0..=1_000_000).map(|i| i * 270);
+        for sum in marks.flat_map(near).chain(even) {
+            assert_eq!(s.encode(sum), SumsSrgb8::level(sum), "{sum}");
+        }
+    }
 
     #[test]
     fn thresholds_give_what_the_formula_rounds_to() {

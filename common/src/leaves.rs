@@ -6,7 +6,7 @@
 //! whoever does it does it to the same bytes. A leaf of 16x16 pixels whose every byte is that of a pixel
 //! without a volume is left out, whatever its sums are: what is put back in its place is the same.
 
-use crate::image::{Background, Encoder, PixelFormat, TilePixels, finished};
+use crate::image::{Background, Encoder, PixelFormat, TilePixels};
 use crate::occlusion::Rect;
 use serde::{Deserialize, Serialize};
 
@@ -48,6 +48,18 @@ fn leaves(size: [u32; 2]) -> impl Iterator<Item = [std::ops::Range<usize>; 2]> {
         .flat_map(move |y| (0..w).step_by(LEAF).map(move |x| [cut(x, w), cut(y, h)]))
 }
 
+/// The largest of opacities: of eighths first, since each of one after the other waits for the one before it.
+fn most(a: &[f32]) -> f32 {
+    let (eights, rest) = a.as_chunks::<8>();
+    let mut most = [0.0f32; 8];
+    for eight in eights {
+        for (most, a) in most.iter_mut().zip(eight) {
+            *most = if *a > *most { *a } else { *most };
+        }
+    }
+    most.iter().chain(rest).fold(0.0, |most, &a| a.max(most))
+}
+
 fn there(mask: &[u8], leaf: usize) -> bool {
     mask.get(leaf / 8).is_some_and(|byte| byte >> (leaf % 8) & 1 == 1)
 }
@@ -74,24 +86,20 @@ impl Leaves {
         let blank = finish.blank().repeat(LEAF * LEAF);
         let mut mask = vec![0; Leaves::mask_len(size)];
         let mut data = Vec::new();
-        let mut leaf = Vec::with_capacity(LEAF * LEAF);
         for (i, [xs, ys]) in leaves(size).enumerate() {
-            leaf.clear();
-            for y in ys {
+            let row = |y: usize| {
                 let row = y * width + xs.start..y * width + xs.end;
-                let (a, colour) = (&pixels.a[row.clone()], &pixels.colour[row]);
-                leaf.extend(a.iter().zip(colour).map(|(&a, &colour)| finished(a, colour)));
-            }
+                (&pixels.a[row.clone()], &pixels.colour[row])
+            };
             let from = data.len();
-            encoder.put(&leaf, &mut data);
+            encoder.put_sums(ys.map(row), &mut data);
             if data[from..] == blank[..data.len() - from] {
                 data.truncate(from);
             } else {
                 mask[i / 8] |= 1 << (i % 8);
             }
         }
-        let alpha_most = pixels.a.iter().fold(0.0, |most, &a| a.max(most));
-        Leaves { size, format: finish.format, mask, data, alpha_most }
+        Leaves { size, format: finish.format, mask, data, alpha_most: most(&pixels.a) }
     }
 
     /// A tile without a leaf.

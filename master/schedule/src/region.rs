@@ -22,7 +22,8 @@
 //!
 //! **Alone.** A frame that no other is in the making beside and none waits behind is there when its last tile is. Its tiles are
 //! dealt out so that all are done at once, and some are cut for that ([`alone`]), before it and as they are lent
-//! (`frame::late`). So what is known is of tiles of 64 pixels in one frame and of parts of 32 in the next, and each tells
+//! (`frame::late`); where bricks take most of such frames' time (`traffic`) none are, since who draws what was cut otherwise
+//! before lacks bricks. So what is known is of tiles of 64 pixels in one frame and of parts of 32 in the next, and each tells
 //! of the other ([`Memory::recall`]).
 //!
 //! It refuses to know what time it is and which copy of a result counts.
@@ -491,8 +492,8 @@ impl Regions {
         let either = job.work.tile.is_none() && (PLAIN / 2..=PLAIN).contains(&cut.edge);
         let leveled = alone && either;
         let mut fine = BTreeMap::new();
-        // Who is to draw a tile that another part of was cut from lacks bricks, and which tiles are cut changes from frame to frame. So
-        // where bricks bind all are of one size, and none is cut late.
+        // Which tiles are cut changes from frame to frame, and who is given a whole one lacks the bricks of parts that
+        // others drew. So where bricks bind all are of one size, and none is cut late.
         if leveled
             && !bind
             && let Some(mixed) = mixed(&through, threads as usize, (memory, kind))

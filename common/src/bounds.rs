@@ -5,11 +5,12 @@
 //! `slabcast check` holds pictures against them. In 1/255. `within`: where visible voxels are.
 
 use crate::brick::TightBox;
-use crate::kernel::Profile;
+use crate::kernel::{Lean, Profile};
 use crate::message::SceneSpec;
 use crate::quality::{Compositing, Kernel, Quality, Sums};
 use crate::transfer::Classifier;
 use crate::view::{Projected, Projection, SUBPIXELS, View};
+use glam::DVec3;
 use std::f64::consts::PI;
 
 /// What integer sums leave free above a solid of the largest extinction: ripple takes at most
@@ -68,10 +69,12 @@ pub fn quantisation(scene: &SceneSpec, view: &View, within: &TightBox) -> f64 {
     }
     let payload_max = Classifier::largest_payload(&scene.transfer, &scene.volume, q.compositing);
     let d = view.thickness;
-    let m = &view.eye_from_index;
+    // Upright, where a kernel is a box, and a ray slanted if it leans.
+    let m = view.kernel_lean.upright_steps(&view.eye_from_index);
     let cell = m.x_axis.abs() + m.y_axis.abs() + m.z_axis.abs();
-    let r = view.kernel_radius * 2.0 + cell;
-    let met = r.x * r.y * (r.z + d) / m.determinant().abs();
+    let [x, y] = view.kernel_lean.of_rays().map(|slope| slope.abs() * d);
+    let r = view.kernel_radius * 2.0 + cell + DVec3::new(x, y, d);
+    let met = r.x * r.y * r.z / m.determinant().abs();
     let unit = match q.sums {
         // Payload, section, row and contribution are each rounded by half a unit, and then times
         // weights below one; three weights by 2^-16, times a payload below 2^15: 3.5 units.
@@ -115,8 +118,8 @@ pub fn accumulation(view: &View, within: &TightBox) -> f64 {
 /// in all. Of these T is taken for one, and their sum over a ray is `w` times
 ///
 /// - at most the largest extinction times the way through the volume times [`ripple`];
-/// - where shifts across the ray are whole pixels of a parallel view and no pixel is shut: at most
-///   the largest optical depth that any pixel has, which is -ln(1 - alpha). Shifts along the ray move
+/// - where shifts across the ray are whole pixels of a parallel view, no pixel is shut and the kernel does not
+///   lean: at most the largest optical depth that any pixel has, which is -ln(1 - alpha). Shifts along the ray move
 ///   nothing then, and their cover is as heavy as what it covers.
 struct Change<'a> {
     view: &'a View,
@@ -156,7 +159,8 @@ impl Change<'_> {
             .project(within)
             .is_some_and(|Projected { rect: r, .. }| r.x0 > 0 && r.y0 > 0 && r.x1 < w && r.y1 < h);
         let parallel = matches!(view.projection, Projection::Ortho { .. });
-        let open = alpha_most.filter(|&a| parallel && inside && 1.0 - a > q.eps.max(1e-6));
+        let straight = parallel && view.kernel_lean.is_none();
+        let open = alpha_most.filter(|&a| straight && inside && 1.0 - a > q.eps.max(1e-6));
         Change {
             view,
             drawn: std::array::from_fn(|a| Profile::new(q.kernel, std[a], radius[a])),
@@ -297,8 +301,13 @@ pub fn rounding(
         Projection::Ortho { .. } => 0.0,
         Projection::Persp { .. } => 1.0 / 32768.0,
     };
-    let aside = |a: usize| across + width * view.kernel_radius[a];
-    let off = [aside(0), aside(1), 0.5 * view.thickness / f64::from(view.depth_phases())];
+    let deep = 0.5 * view.thickness / f64::from(view.depth_phases());
+    // A section lies where its voxel's depth has it, and a row where its footprint does, rounded once more.
+    let Lean { depth: [lean_x, lean_y], row } = view.kernel_lean;
+    let down = across + lean_y.abs() * deep;
+    let along = across + lean_x.abs() * deep;
+    let along = if row == 0.0 { along } else { along + across + row.abs() * down };
+    let off = [along + width * view.kernel_radius[0], down + width * view.kernel_radius[1], deep];
     let change = Change::new(scene, view, within, alpha_most, off);
     let moved = |a: usize, x: f64| {
         let p = &change.drawn[a];

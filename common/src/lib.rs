@@ -36,10 +36,10 @@ pub mod wanted;
 
 /// Version of the arithmetic behind the pixels. Two programs that agree on it give the same
 /// bytes for the same view; a change of any golden hash raises it (CONTRACTS.md, Exactness).
-pub const PIXELS_VERSION: u32 = 7;
+pub const PIXELS_VERSION: u32 = 8;
 
 /// Version of the messages between master, worker and client.
-pub const PROTOCOL_VERSION: u32 = 4;
+pub const PROTOCOL_VERSION: u32 = 5;
 
 /// SHA-256 of the self-test tile that every worker draws before it says hello
 /// (`slabcast_render::selftest`, which also has the test that keeps this constant true).

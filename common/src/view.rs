@@ -7,6 +7,7 @@
 //! computed everywhere by the functions here, in f64, in one order.
 
 use crate::brick::TightBox;
+use crate::kernel::{Lean, drawn_ellipsoid};
 use crate::occlusion::Rect;
 use crate::quality::{Quality, Refused};
 use crate::slab::SheetRange;
@@ -95,10 +96,12 @@ pub struct View {
     pub projection: Projection,
     /// Sheet thickness in vox.
     pub thickness: f64,
-    /// Standard deviation of the kernel along the eye's axes, in vox.
+    /// Standard deviation of the kernel's profiles, in vox: along the eye's axes, but for its lean.
     pub kernel_std: DVec3,
-    /// Support radius of the kernel along the eye's axes, in vox.
+    /// Support radius of the kernel's profiles, in vox.
     pub kernel_radius: DVec3,
+    /// How the kernel leans where the lattice is not cubic.
+    pub kernel_lean: Lean,
     /// Volume of a lattice cell in vox^3.
     pub cell: f64,
 }
@@ -202,17 +205,14 @@ impl View {
         let eye_from_index = DMat3::from_cols(steps[0], steps[1], steps[2]);
         let target = eye_from_world * (camera.target / vox);
         let eye_origin = -(eye_from_index * lattice.centre_index()) - target;
-        let (spread, cell) = if lattice.is_isotropic() {
-            (DVec3::ONE, 1.0)
-        } else {
-            // The true kernel is an ellipsoid; what is drawn is the product of its marginals
-            // along the eye's axes.
-            let row =
-                |f: &dyn Fn(DVec3) -> f64| steps.iter().map(|s| f(*s) * f(*s)).sum::<f64>().sqrt();
-            let spread = DVec3::new(row(&|s| s.x), row(&|s| s.y), row(&|s| s.z));
-            (spread, eye_from_index.determinant().abs())
-        };
         let [std, radius] = quality.shape();
+        let (spread, kernel_lean, cell) = if lattice.is_isotropic() {
+            (DVec3::ONE, Lean::NONE, 1.0)
+        } else {
+            let shape = (quality.kernel, std, radius);
+            let (spread, lean) = drawn_ellipsoid(&eye_from_index, shape, quality.thickness);
+            (spread, lean, eye_from_index.determinant().abs())
+        };
         let view = View {
             size,
             eye_from_index,
@@ -222,6 +222,7 @@ impl View {
             thickness: quality.thickness,
             kernel_std: spread * std,
             kernel_radius: spread * radius,
+            kernel_lean,
             cell,
         };
         // Depths in phases must fit i32, screen positions 26 bits.
@@ -385,7 +386,7 @@ impl View {
     /// box of the projected box.
     pub fn project(&self, b: &TightBox) -> Option<Projected> {
         let (lo, hi) = self.eye_box(b);
-        let r = self.kernel_radius;
+        let r = self.kernel_lean.reach(self.kernel_radius);
         let phase = self.thickness / f64::from(self.depth_phases());
         let sheet = |z: f64| floor(z / self.thickness) as i32;
         let mut sheets =

@@ -84,8 +84,8 @@ impl Lattice {
     }
 
     /// Whether the lattice is cubic: equal spacings and right angles, to 1 part in 1000 (files
-    /// carry spacings rounded to some digits). Other lattices are drawn with a kernel that is
-    /// only the projection of the true one on the eye's axes, until footprint tables come.
+    /// carry spacings rounded to some digits). The kernel of other lattices is an ellipsoid
+    /// ([`crate::kernel`]).
     pub fn is_isotropic(&self) -> bool {
         let s = self.spacing();
         let vox = self.vox();

@@ -61,6 +61,7 @@ pub fn view_sha256(scene: &SceneSpec, crop: Option<&CropBox>, view: &View) -> Di
         .chain(view.eye_from_world.to_cols_array())
         .chain(view.kernel_std.to_array())
         .chain(view.kernel_radius.to_array())
+        .chain(view.kernel_lean.to_array())
         .chain(projection)
         .chain([view.thickness, view.cell]);
     for x in numbers {

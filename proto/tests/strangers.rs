@@ -194,6 +194,7 @@ fn matrices_that_are_not_finite_are_refused_by_field() {
         kernel_std: vec![1.0; 3],
         kernel_radius: vec![1.0; 3],
         cell: 1.0,
+        kernel_lean: vec![0.0; 3],
     };
     assert!(convert::view_from_wire(good.clone()).is_ok());
     let field = |v: v1::View| convert::view_from_wire(v).unwrap_err().field().to_owned();
@@ -206,6 +207,8 @@ fn matrices_that_are_not_finite_are_refused_by_field() {
     assert_eq!(field(v1::View { eye_from_world: vec![1.0; 8], ..good.clone() }), "eye_from_world");
     assert_eq!(field(v1::View { eye_origin: nan(3), ..good.clone() }), "eye_origin");
     assert_eq!(field(v1::View { kernel_std: vec![0.0; 3], ..good.clone() }), "kernel_std");
+    assert_eq!(field(v1::View { kernel_lean: vec![0.0; 2], ..good.clone() }), "kernel_lean");
+    assert_eq!(field(v1::View { kernel_lean: nan(3), ..good.clone() }), "kernel_lean");
     assert_eq!(field(v1::View { thickness: -1.0, ..good.clone() }), "thickness");
     assert_eq!(field(v1::View { width: 8193, ..good.clone() }), "width");
     assert_eq!(field(v1::View { projection: None, ..good.clone() }), "projection");

@@ -6,7 +6,7 @@
 
 use crate::embedded::{cores, start_master};
 use crate::fail::{Fail, reason, say};
-use crate::request::{AxisArgs, lattice_notice};
+use crate::request::AxisArgs;
 use crate::{parse, plan, record, runtime, signals, volume};
 use slabcast_common::path::Axis;
 use slabcast_master::{Handle, MasterConfig};
@@ -130,9 +130,6 @@ pub(crate) fn master(args: &MasterArgs) -> Result<(), Fail> {
         let (stop, stopped) = watch::channel(false);
         let mut served =
             tokio::spawn(slabcast_master::serve::serve(handle.clone(), listener, stopped));
-        if let Some(notice) = lattice_notice(&handle.volume().info) {
-            warn!(volume = name, "{notice}");
-        }
         if args.insecure && !address.ip().is_loopback() {
             warn!("--insecure: whoever reaches {address} may read the volume and submit jobs");
         }

@@ -2,7 +2,7 @@
 
 use crate::fail::{Fail, say};
 use crate::progress::bytes;
-use crate::request::{AxisArgs, lattice_notice};
+use crate::request::AxisArgs;
 use crate::volume;
 use glam::DVec3;
 use slabcast_common::brick::{BRICK_VOXELS, BrickGrid};
@@ -240,9 +240,6 @@ fn text(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
         bytes(sample_bytes(info) + auto + MASTER_BASE),
         bytes(auto + WORKER_BASE),
     );
-    if let Some(notice) = lattice_notice(info) {
-        let _ = writeln!(out, "{:<12} {notice}", "note");
-    }
     out
 }
 

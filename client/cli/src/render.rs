@@ -12,7 +12,7 @@ use crate::output::provenance::Recipe;
 use crate::output::{Format, Frame, Lines, Output, OutputArgs, Patience, Writer};
 use crate::progress::{self, Progress, Step};
 use crate::record::{self, Recording};
-use crate::request::{self, Asked, LookArgs, WorkArgs};
+use crate::request::{Asked, LookArgs, WorkArgs};
 use crate::show::{self, Show};
 use crate::source::{Cancel, Source, Update};
 use crate::stage::Stage;
@@ -459,7 +459,6 @@ impl Run {
         let as_what = (self.output.format, self.output.fps());
         let recipe = Recipe::new(&self.asked, info, orientation, as_what)?;
         self.output.make()?;
-        self.notes.extend(request::lattice_notice(info));
         self.notes.iter().for_each(|n| progress::note(n));
         Ok(recipe)
     }

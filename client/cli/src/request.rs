@@ -8,7 +8,6 @@ use crate::fail::Fail;
 use crate::front::choose::Aim;
 use crate::output::provenance::Provenance;
 use crate::parse::{self, Frames, Tile};
-use crate::progress;
 use crate::transfer::{LookFlags, Transfer, read_json};
 use crate::volume::InputArgs;
 use clap::builder::{PossibleValuesParser, TypedValueParser, ValueParser};
@@ -246,16 +245,12 @@ impl PictureOf {
         self.input.is_empty()
     }
 
-    /// Opens the volume, sees whether what was asked for can be drawn of it, and says so if its lattice
-    /// is drawn by an approximation.
+    /// Opens the volume and sees whether what was asked for can be drawn of it.
     pub(crate) fn open(&self, asked: &Asked) -> Result<Opened, Fail> {
         let volume = self.input.open(&self.volume)?;
         let orientation = self.look.view.axes.of(&volume)?;
         let info = volume.info(volume.digest());
         asked.fit(&info, orientation, volume.anatomical)?;
-        if let Some(notice) = lattice_notice(&info) {
-            progress::note(&notice);
-        }
         Ok(Opened { volume, info, orientation })
     }
 }
@@ -692,26 +687,6 @@ pub(crate) fn client_key() -> String {
     // The address of a local differs from process to process where ids repeat (containers).
     let here = std::ptr::from_ref(&count) as usize;
     format!("cli-{now:x}-{}-{here:x}-{count}", std::process::id())
-}
-
-/// What to say of a lattice that is drawn by an approximation so far.
-pub(crate) fn lattice_notice(info: &VolumeInfo) -> Option<String> {
-    let lattice = &info.lattice;
-    if lattice.is_isotropic() {
-        return None;
-    }
-    let [a, b, c] = lattice.spacing();
-    let vox = lattice.vox();
-    let cubic = [a, b, c].iter().all(|&s| s <= vox * 1.001);
-    let why = if cubic {
-        "the axes are not at right angles".to_string()
-    } else {
-        format!("the spacing is {a:.4} x {b:.4} x {c:.4}")
-    };
-    Some(format!(
-        "{why}: this version draws such lattices with an approximate kernel (exact footprints come \
-         later); shapes and places are right, edges are a little softer along the wide axes"
-    ))
 }
 
 #[cfg(test)]

@@ -6,6 +6,7 @@ use bytes::Bytes;
 use glam::{DMat3, DVec3};
 use slabcast_common::brick::{BRICK, BrickSetKey, MAX_BRICKS};
 use slabcast_common::ids::SceneId;
+use slabcast_common::kernel::Lean;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Compositing, Kernel, Quality, Splat, Sums};
 use slabcast_common::view::{MAX_EDGE, Projection, View};
@@ -245,6 +246,7 @@ pub fn view_to_wire(view: &View) -> v1::View {
         kernel_std: view.kernel_std.to_array().to_vec(),
         kernel_radius: view.kernel_radius.to_array().to_vec(),
         cell: view.cell,
+        kernel_lean: view.kernel_lean.to_array().to_vec(),
     }
 }
 
@@ -292,6 +294,7 @@ pub fn view_from_wire(view: v1::View) -> Result<View, WireError> {
         thickness: positive("thickness", view.thickness)?,
         kernel_std: positive_vector("kernel_std", &view.kernel_std)?,
         kernel_radius: positive_vector("kernel_radius", &view.kernel_radius)?,
+        kernel_lean: Lean::from_array(triple_from_wire("kernel_lean", &view.kernel_lean)?),
         cell: positive("cell", view.cell)?,
     })
 }

@@ -7,6 +7,7 @@ use proptest::prelude::*;
 use slabcast_common::brick::{Brick, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::*;
 use slabcast_common::image::{Background, PixelFormat, TilePixels, TileState};
+use slabcast_common::kernel::Lean;
 use slabcast_common::leaves::{Finish, Leaves};
 use slabcast_common::message::*;
 use slabcast_common::occlusion::Rect;
@@ -63,10 +64,10 @@ pub fn view() -> impl Strategy<Value = View> {
     ];
     (
         (size(), matrix(), vector(), matrix(), projection),
-        (above_zero(), spread(), spread(), above_zero()),
+        (above_zero(), spread(), spread(), vector(), above_zero()),
     )
         .prop_map(|((size, eye_from_index, eye_origin, eye_from_world, projection), rest)| {
-            let (thickness, kernel_std, kernel_radius, cell) = rest;
+            let (thickness, kernel_std, kernel_radius, lean, cell) = rest;
             View {
                 size,
                 eye_from_index,
@@ -76,6 +77,7 @@ pub fn view() -> impl Strategy<Value = View> {
                 thickness,
                 kernel_std,
                 kernel_radius,
+                kernel_lean: Lean::from_array(lean.to_array()),
                 cell,
             }
         })

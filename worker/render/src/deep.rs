@@ -1,15 +1,19 @@
-//! A tile part of a perspective view in whole sums: sections with footprints of their own.
+//! A tile part of a perspective view, or of a kernel that leans, in whole sums: sections with footprints of
+//! their own.
 //!
-//! A voxel's sections lie on sheets of different scale, so each has its own place and width on the
-//! screen, rarely more than a pixel apart. Their weights are put side by side, by column, row and
+//! In perspective a voxel's sections lie on sheets of different scale, so each has its own place and width on
+//! the screen, rarely more than a pixel apart; those of a kernel that leans lie aside of each other in any view
+//! ([`crate::footprint::Leaning`]), and so may their rows. Their weights are put side by side, by column, row and
 //! slot, and added to the records of the window that holds them all, as in [`crate::flat`]. Voxels
 //! are tested at the place where their own depth puts them, in a mask grown by what sections may lie
 //! aside of it. Where that is far, as very near the eye, [`crate::general`] takes over.
 
-use crate::footprint::Phases;
+use crate::footprint::{Leaning, Phases};
 use crate::mask::{OpenMask, REACH_MOST};
 use crate::scene::Frame;
-use crate::splat::records::apart::{Apart, BATCH, Each, Layers, WINDOW, after};
+use crate::splat::records::apart::{
+    Apart, BATCH, Each, Layers, WINDOW, after, along_row, splat_skewed,
+};
 use crate::splat::records::{BySlot, Recorded, Table};
 use crate::splat::toss::{self, Kept, Sieve, Sifted, Tossing, any_in_rows, prefetch};
 use crate::splat::{Accumulate, Simd, Work};
@@ -47,6 +51,8 @@ struct Batch {
     normals: Each<u16>,
     apart: Apart,
     light: [Each<f32>; 4],
+    /// Where a section of each is along an axis.
+    aside: Each<f64>,
 }
 
 impl Default for Batch {
@@ -57,6 +63,7 @@ impl Default for Batch {
             normals: [0; BATCH],
             apart: Apart::default(),
             light: [[0.0; BATCH]; 4],
+            aside: [0.0; BATCH],
         }
     }
 }
@@ -72,14 +79,18 @@ impl Batch {
     }
 }
 
-/// What a perspective part needs to be rendered here.
+/// What a part needs to be rendered here.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Deep {
+    /// Of parallel rays as of an eye that is [far](AWAY).
     focal: f64,
     distance: f64,
     /// Pixels from the one that holds a centre within which all sections stay.
     reach: i32,
 }
+
+/// How far an eye is, in vox, whose rays are parallel to the last bit of their scale.
+const AWAY: f64 = (1u64 << 60) as f64;
 
 /// Whether `part` may be rendered here.
 pub(crate) fn takes(part: &Part<'_>) -> Option<Deep> {
@@ -89,7 +100,12 @@ pub(crate) fn takes(part: &Part<'_>) -> Option<Deep> {
 /// What it takes for a part whose bricks begin at sheet `nearest` or behind it.
 fn deep(frame: &Frame, r: &Rect, nearest: i32) -> Option<Deep> {
     let view = &frame.view;
-    let Projection::Persp { focal, distance } = view.projection else { return None };
+    let leaning = frame.leaning.as_ref();
+    let (focal, distance) = match view.projection {
+        Projection::Persp { focal, distance } => (focal, distance),
+        Projection::Ortho { scale } if leaning.is_some() => (scale * AWAY, AWAY),
+        Projection::Ortho { .. } => return None,
+    };
     let most = frame.sections.most();
     // Scales fall with depth: those of the nearest sheet and of a voxel's length in front of it
     // bound all others, and show that no sheet is clipped.
@@ -105,11 +121,17 @@ fn deep(frame: &Frame, r: &Rect, nearest: i32) -> Option<Deep> {
     let aside = [r.x0, r.x1].map(|x| (f64::from(x) - middle[0]).abs());
     let above = [r.y0, r.y1].map(|y| (f64::from(y) - middle[1]).abs());
     let farthest = aside.into_iter().chain(above).fold(0.0, f64::max);
+    // Where the kernel leans a section is farther aside, and its outermost rows are.
+    let leans = leaning.map_or(0.0, |leaning| {
+        let sections = leaning.most(0).max(leaning.most(1)) * front;
+        let row = leaning.row() as f64 / 65536.0;
+        sections + row.abs() * f64::from(own + 1)
+    });
     // x / (z + dz) lies within |x / z| dz / z of x / z, and each is rounded to a subpixel; of voxels so many
     // pixels outside of the part.
     let reach_of = |outside: f64| {
         let apart = (farthest + outside) * depth_apart * front / focal + 4.0 / f64::from(SUBPIXELS);
-        f64::from(own) + libm::ceil(apart)
+        f64::from(own) + libm::ceil(apart + leans)
     };
     // None that is farther outside than a mask is grown at most touches the part; so none that is farther
     // than what those reach does.
@@ -279,6 +301,102 @@ fn layers<'a, S: Recorded, const N: usize>(part: &'a Part<'_>, k: i32) -> [Layer
 }
 
 impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
+    /// Where each section of the first `n` voxels of the batch lies, and the windows that hold all of a voxel's.
+    #[inline(always)]
+    fn place(&mut self, n: usize, k: i32, layers: &[Layer<'_, S>; N]) {
+        let Part { frame, rect, .. } = self.part;
+        let Batch { eye, apart, aside, .. } = &mut *self.batch;
+        let Apart { first, from, places, lo, hi, left, deep, .. } = apart;
+        let view = &frame.view;
+        let (most, phases) = (frame.sections.most() as i32, frame.sections.phases());
+        for i in 0..n {
+            let phase = view.depth_in_phases(eye[2][i]) & (phases - 1);
+            deep[i] = (phase * most + most - left[i]) as u32;
+        }
+        let parallel = matches!(view.projection, Projection::Ortho { .. });
+        let leaning = frame.leaning.as_ref();
+        let row = leaning.map_or(0, Leaning::row);
+        // Rows first, since columns may hang on them.
+        for (axis, origin) in [(1, rect.y0), (0, rect.x0)] {
+            let (lo, hi) = (&mut lo[axis], &mut hi[axis]);
+            lo[..n].fill(i32::MAX);
+            hi[..n].fill(i32::MIN);
+            let lean = leaning.filter(|leaning| leaning.most(axis) > 0.0);
+            let mut before = None;
+            for (at, layer) in layers.iter().enumerate() {
+                let sheet = after::<N>(slot::<N>(k), at);
+                if sheet >= most {
+                    continue;
+                }
+                let skewed = axis == 0 && row != 0;
+                // Where all sections lie in one place, it is that of sections, too, which a voxel has no more.
+                let alike = parallel && lean.is_none() && !skewed;
+                if let Some(before) = before.filter(|_| alike) {
+                    first[axis][at] = first[axis][before];
+                    from[axis][at] = from[axis][before];
+                    places[axis][at] = places[axis][before];
+                    continue;
+                }
+                before = Some(at);
+                let phases = &layer.axes[axis].0;
+                let mut eye = &eye[axis];
+                if let Some(lean) = lean {
+                    let table = lean.aside(axis);
+                    for i in 0..n {
+                        // What lies behind a voxel's last section is not drawn.
+                        let which = deep[i] as usize + sheet as usize;
+                        aside[i] = eye[i] + table[which.min(table.len() - 1)];
+                    }
+                    eye = aside;
+                }
+                let (to_first, to_from) = (&mut first[axis][at], &mut from[axis][at]);
+                for i in 0..n {
+                    let at = view.screen_along(axis, eye[i], layer.scale);
+                    let (pixel, phase) =
+                        ((at >> SUBPIXEL_BITS) as i32, at as i32 & (SUBPIXELS - 1));
+                    to_first[i] = pixel - origin + phases.first(phase);
+                    to_from[i] = phases.begin(phase as usize) as u32;
+                }
+                if row != 0 {
+                    let place = &mut places[axis][at];
+                    for i in 0..n {
+                        let at = view.screen_along(axis, eye[i], layer.scale);
+                        place[i] = (at - (i64::from(origin) << SUBPIXEL_BITS)) as i32;
+                    }
+                }
+                let len = phases.len as i32;
+                if skewed {
+                    // The first and the last row lie farthest aside.
+                    let high = layer.axes[1].0.len as i32;
+                    for i in 0..n {
+                        let (place, top) = (places.each_ref().map(|p| p[at][i]), first[1][at][i]);
+                        let [a, b] = [top, top + high - 1].map(|y| along_row(row, place, y));
+                        let first =
+                            |x: i32| (x >> SUBPIXEL_BITS) + phases.first(x & (SUBPIXELS - 1));
+                        if sheet < left[i] {
+                            lo[i] = lo[i].min(first(a.min(b)));
+                            hi[i] = hi[i].max(first(a.max(b)) + len);
+                        }
+                    }
+                    continue;
+                }
+                let first = &first[axis][at];
+                for i in 0..n {
+                    let here = alike | (sheet < left[i]);
+                    lo[i] = if here { lo[i].min(first[i]) } else { lo[i] };
+                    hi[i] = if here { hi[i].max(first[i] + len) } else { hi[i] };
+                }
+            }
+            // Inside the part.
+            for lo in &mut lo[..n] {
+                *lo = (*lo).max(0);
+            }
+            for hi in &mut hi[..n] {
+                *hi = (*hi).min(PART);
+            }
+        }
+    }
+
     /// Adds the first `n` voxels of the batch to their sheets from `k` on, which `layers` are of; not
     /// those around which all is shut. How many it added.
     #[inline(always)]
@@ -290,46 +408,11 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
         sheets: &mut Sheets<'_, S, N>,
         open: &OpenMask,
     ) -> u64 {
-        let Part { frame, rect, .. } = self.part;
-        let Batch { eye, samples, normals, apart, light } = &mut *self.batch;
-        let Apart { first, from, lo, hi, left, deep, kept } = apart;
-        let view = &frame.view;
-        let (most, phases) = (frame.sections.most() as i32, frame.sections.phases());
-        for i in 0..n {
-            let phase = view.depth_in_phases(eye[2][i]) & (phases - 1);
-            deep[i] = (phase * most + most - left[i]) as u32;
-        }
-        // Where each section lies, and the windows that hold all of a voxel's.
-        for (axis, origin) in [rect.x0, rect.y0].into_iter().enumerate() {
-            let (eye, lo, hi) = (&eye[axis][..n], &mut lo[axis][..n], &mut hi[axis][..n]);
-            lo.fill(i32::MAX);
-            hi.fill(i32::MIN);
-            for (at, layer) in layers.iter().enumerate() {
-                let sheet = after::<N>(slot::<N>(k), at);
-                if sheet >= most {
-                    continue;
-                }
-                let phases = &layer.axes[axis].0;
-                let (len, scale) = (phases.len as i32, layer.scale);
-                let (first, from) = (&mut first[axis][at][..n], &mut from[axis][at][..n]);
-                for i in 0..n {
-                    let at = view.screen_along(axis, eye[i], scale);
-                    let (pixel, phase) =
-                        ((at >> SUBPIXEL_BITS) as i32, at as i32 & (SUBPIXELS - 1));
-                    first[i] = pixel - origin + phases.first(phase);
-                    from[i] = phases.begin(phase as usize) as u32;
-                }
-                for i in 0..n {
-                    let here = sheet < left[i];
-                    lo[i] = if here { lo[i].min(first[i]) } else { lo[i] };
-                    hi[i] = if here { hi[i].max(first[i] + len) } else { hi[i] };
-                }
-            }
-            // Inside the part.
-            for i in 0..n {
-                (lo[i], hi[i]) = (lo[i].max(0), hi[i].min(PART));
-            }
-        }
+        let frame = self.part.frame;
+        self.place(n, k, layers);
+        let Batch { eye, samples, normals, apart, light, .. } = &mut *self.batch;
+        let Apart { lo, hi, kept, .. } = apart;
+        let most = frame.sections.most();
         let (mut some, cull) = (0, frame.scene.quality.cull);
         for i in 0..n {
             let ([x0, y0], [x1, y1]) = ([lo[0][i], lo[1][i]], [hi[0][i], hi[1][i]]);
@@ -366,10 +449,17 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
                 Table { weights, len: phases.len }
             })
         });
-        let deep = Table { weights: S::deep(&frame.sections), len: most as usize };
+        let deep = Table { weights: S::deep(&frame.sections), len: most };
+        let phases = layers.each_ref().map(|layer| layer.axes[0].0);
         let layers = Layers::<S, N> { across, deep, slot: slot::<N>(k) };
         let voxels = (apart, &payloads[..some]);
-        S::splat_apart(sheets.simd, sheets.records, voxels, &layers, &mut self.across);
+        let row = frame.leaning.as_ref().map_or(0, Leaning::row);
+        if row == 0 {
+            S::splat_apart(sheets.simd, sheets.records, voxels, &layers, &mut self.across);
+        } else {
+            let layers = (&layers, (row, &phases));
+            splat_skewed::<S, N>(sheets.simd, sheets.records, voxels, layers, &mut self.across);
+        }
         some as u64
     }
 }
@@ -386,7 +476,7 @@ mod tests {
     use slabcast_common::ids::BrickId;
     use slabcast_common::quality::Quality;
     use slabcast_common::view::{Camera, CameraProjection, View};
-    use slabcast_common::volume::Volume;
+    use slabcast_common::volume::{Lattice, Volume};
     use std::sync::Arc;
 
     proptest! {
@@ -396,10 +486,18 @@ mod tests {
             eye in prop::array::uniform3(-1.0..1.0f64), fov in 10.0..110.0f64,
             distance in 10.0..60.0f64, thickness in prop::sample::select(vec![0.5, 1.0, 1.7]),
             edge in prop::sample::select(vec![64, 150, 300]), which in 0..8u32,
+            wide in prop::sample::select(vec![1.0, 1.0, 1.4, 2.5]),
+            skew in prop::sample::select(vec![0.0, 0.0, 0.5]), parallel in any::<bool>(),
         ) {
-            let volume = Volume::from_fn_u8("any", [16; 3], |i, j, k| (i + 3 * j + 7 * k) as u8);
+            let mut volume =
+                Volume::from_fn_u8("any", [16; 3], |i, j, k| (i + 3 * j + 7 * k) as u8);
+            volume.lattice = Lattice::from_spacing([16; 3], [1.0, wide, 1.0]);
+            volume.lattice.steps[0].y = skew;
             let quality = Quality { thickness, ..Quality::default() };
-            let projection = CameraProjection::Persp { fov, distance };
+            let projection = match parallel {
+                false => CameraProjection::Persp { fov, distance },
+                true => CameraProjection::Ortho { height: distance },
+            };
             let to_eye = DVec3::from_array(eye) + DVec3::splat(1e-3);
             let camera = Camera { to_eye, up: DVec3::Z, target: DVec3::ZERO, projection };
             let view = View::new(&volume.lattice, &camera, [edge; 2], &quality).expect("a view");
@@ -421,8 +519,11 @@ mod tests {
                     let (k, count) = frame.sections.span(p.z);
                     for sheet in k..k + count as i32 {
                         let footprint = frame.footprints.at(sheet).expect("none is clipped");
-                        let at = frame.screen(p, &footprint);
-                        let [x, y] = [0, 1].map(|axis| footprint.extent(axis, at[axis]));
+                        let at = frame.screen(p, sheet, &footprint);
+                        let y = footprint.extent(1, at[1]);
+                        let ends = [y.0, y.1 - 1].map(|y| frame.along_row(at, y));
+                        let [a, b] = ends.map(|x| footprint.extent(0, x));
+                        let x = (a.0.min(b.0), a.1.max(b.1));
                         if Rect::new(x.0, y.0, x.1, y.1).intersect(&part).is_empty() {
                             continue;
                         }

@@ -169,7 +169,8 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
             for (n, &wz) in sections.iter().enumerate() {
                 let k = first + n as i32;
                 let Some(f) = frame.footprints.at(k) else { continue };
-                let [x, y] = frame.screen(&placed, &f);
+                let [x, y] = frame.screen(&placed, k, &f);
+                let x = frame.along_row([x, y], at[1]);
                 let (_, wx) = S::Weight::of(&f, 0, x, columns, &mut bx);
                 let (_, wy) = S::Weight::of(&f, 1, y, rows, &mut by);
                 let (&[wx], &[wy]) = (wx, wy) else { continue };

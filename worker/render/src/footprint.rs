@@ -1,8 +1,8 @@
 //! The kernel's profile, its sections in depth and its footprints on the screen.
 //!
-//! The kernel is a product of three 1-D profiles along the eye's axes (DESIGN.md section 1):
-//! a Gaussian of standard deviation s, cut at radius R, with its edge value subtracted and its
-//! integral normalised to one:
+//! The kernel is a product of three 1-D profiles along the eye's axes (DESIGN.md section 1), in lattices that
+//! are not cubic along axes that [lean](slabcast_common::kernel): a Gaussian of standard deviation s, cut at
+//! radius R, with its edge value subtracted and its integral normalised to one:
 //!
 //! ```text
 //! g(u) = (exp(-u^2 / 2 s^2) - exp(-R^2 / 2 s^2)) / Z,   |u| < R
@@ -18,7 +18,7 @@
 
 use crate::splat::Tap;
 use glam::DVec3;
-pub use slabcast_common::kernel::Profile;
+pub use slabcast_common::kernel::{Lean, Profile};
 use slabcast_common::quality::Kernel;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, View};
@@ -139,7 +139,7 @@ impl Sections {
 
     /// Where the weights of depth `z` begin, and how many there are.
     #[inline(always)]
-    fn row(&self, z: i32) -> (usize, usize) {
+    pub(crate) fn row(&self, z: i32) -> (usize, usize) {
         ((z & (self.phases - 1)) as usize * self.stride, self.span(z).1 as usize)
     }
 
@@ -184,6 +184,69 @@ impl Sections {
     /// Most sheets that one voxel touches.
     pub fn most(&self) -> usize {
         self.stride
+    }
+}
+
+/// Where sections and rows of a kernel that leans lie ([`slabcast_common::kernel`]).
+#[derive(Debug)]
+pub(crate) struct Leaning {
+    /// How far each section lies beside its voxel along x and y, in vox: as [`Sections::all`] has weights.
+    aside: [Vec<f64>; 2],
+    /// [`Lean::row_fixed`].
+    row: i64,
+    /// The farthest that any section lies aside.
+    most: [f64; 2],
+}
+
+impl Leaning {
+    /// For sheets of the thickness of `view`, cut by `sections`, of a kernel with profile `deep` along the depth;
+    /// `scale`: pixels a vox at most.
+    pub(crate) fn new(view: &View, deep: &Profile, sections: &Sections, scale: f64) -> Leaning {
+        let (lean, thickness) = (&view.kernel_lean, view.thickness);
+        // Where two spacings are alike but for their last digits rows and sections lie aside by less than
+        // positions are rounded: that is nothing.
+        let shows = |vox: f64| vox * scale * f64::from(SUBPIXELS) >= 1.0;
+        let row = if shows(lean.row.abs() * view.kernel_radius.y) { lean.row_fixed() } else { 0 };
+        let slopes =
+            lean.depth.map(|slope| if shows(slope.abs() * deep.radius) { slope } else { 0.0 });
+        let mut leaning = Leaning { aside: [vec![], vec![]], row, most: [0.0; 2] };
+        let mut behind = vec![0.0; sections.stride];
+        for p in 0..sections.phases {
+            let at = f64::from(p) / f64::from(sections.phases);
+            let first = (f64::from(sections.first(p)) - at) * thickness;
+            deep.places(first, thickness, &mut behind);
+            for (axis, slope) in slopes.into_iter().enumerate() {
+                for behind in &behind {
+                    let aside = slope * behind;
+                    leaning.aside[axis].push(aside);
+                    leaning.most[axis] = leaning.most[axis].max(aside.abs());
+                }
+            }
+        }
+        leaning
+    }
+
+    /// Whether anything lies aside at all.
+    pub(crate) fn shows(&self) -> bool {
+        self.row != 0 || self.most != [0.0; 2]
+    }
+
+    /// How far sections lie beside their voxels along an axis, in vox: [`Sections::most`] a phase.
+    #[inline(always)]
+    pub(crate) fn aside(&self, axis: usize) -> &[f64] {
+        &self.aside[axis]
+    }
+
+    /// The farthest of [those](Leaning::aside).
+    #[inline(always)]
+    pub(crate) fn most(&self, axis: usize) -> f64 {
+        self.most[axis]
+    }
+
+    /// How far the middle of a row moves along x for each row, in units of 2^-16.
+    #[inline(always)]
+    pub(crate) fn row(&self) -> i64 {
+        self.row
     }
 }
 

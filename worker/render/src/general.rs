@@ -176,10 +176,21 @@ impl General<'_> {
         let last = first + count as i32 - 1;
         let at = |k: i32| {
             let f = frame.footprints.at(k)?;
-            let [x, y] = frame.screen(placed, &f);
-            let ((x0, x1), (y0, y1)) = (f.extent(0, x), f.extent(1, y));
-            Some(Rect::new(x0, y0, x1, y1))
+            let at = frame.screen(placed, k, &f);
+            let (y0, y1) = f.extent(1, at[1]);
+            // Rows lie one way.
+            let [a, b] = [y0, y1 - 1].map(|y| f.extent(0, frame.along_row(at, y)));
+            Some(Rect::new(a.0.min(b.0), y0, a.1.max(b.1), y1))
         };
+        if frame.leaning.is_some() {
+            let mut all = (first..=last).filter_map(at);
+            let one = all.next()?;
+            // As below, one that holds no pixel's centre counts, too.
+            return Some(all.fold(one, |a, b| {
+                let (x0, y0) = (a.x0.min(b.x0), a.y0.min(b.y0));
+                Rect::new(x0, y0, a.x1.max(b.x1), a.y1.max(b.y1))
+            }));
+        }
         match frame.view.projection {
             Projection::Ortho { .. } => at(first),
             Projection::Persp { .. } => {
@@ -233,7 +244,9 @@ impl General<'_> {
         open: &OpenMask,
         counters: &mut Counters,
     ) {
-        let Part { frame, slab, .. } = self.part;
+        let Part { frame, rect, slab, .. } = self.part;
+        let leaning_rows = frame.leaning.as_ref().is_some_and(|l| l.row() != 0);
+        let rows = (rect.y0, rect.y1);
         // The sheet behind the slab is filled as far as the colour rule peeks.
         let end = slab.end + i32::from(frame.looks_at_neighbours());
         for Waiting { brick, voxel, placed } in bucket {
@@ -250,26 +263,37 @@ impl General<'_> {
             let (first, count) = frame.sections.span(placed.z);
             for sheet in first.max(k).max(slab.first)..(first + count as i32).min(end) {
                 let Some(f) = frame.footprints.at(sheet) else { continue };
-                let at = frame.screen(placed, &f);
-                if let Some(window) = self.window::<S>(&f, at, weights) {
-                    let i = (sheet - first) as usize;
-                    planes.add(sheet, window, S::section(&frame.sections, placed.z, i, &payload));
+                let at = frame.screen(placed, sheet, &f);
+                let i = (sheet - first) as usize;
+                let section = || S::section(&frame.sections, placed.z, i, &payload);
+                if leaning_rows {
+                    // Each lies elsewhere.
+                    let (y0, y1) = f.extent(1, at[1]);
+                    for y in y0.max(rows.0)..y1.min(rows.1) {
+                        let x = frame.along_row(at, y);
+                        if let Some(row) = self.window::<S>(&f, [x, at[1]], (y, y + 1), weights) {
+                            planes.add(sheet, row, section());
+                        }
+                    }
+                } else if let Some(window) = self.window::<S>(&f, at, rows, weights) {
+                    planes.add(sheet, window, section());
                 }
             }
         }
     }
 
-    /// A footprint inside the part, or nothing.
+    /// A footprint inside the part and `rows`, or nothing.
     #[inline(always)]
     fn window<'b, S: Accumulate>(
         &self,
         f: &'b Footprint<'_>,
         [x, y]: [i64; 2],
+        rows: (i32, i32),
         [bx, by]: &'b mut [Vec<S::Weight>; 2],
     ) -> Option<Window<'b, S::Weight>> {
         let rect = self.part.rect;
         let (x0, wx) = S::Weight::of(f, 0, x, (rect.x0, rect.x1), bx);
-        let (y0, wy) = S::Weight::of(f, 1, y, (rect.y0, rect.y1), by);
+        let (y0, wy) = S::Weight::of(f, 1, y, rows, by);
         let inside = !wx.is_empty() && !wy.is_empty();
         let at = |p: i32, origin: i32| (p - origin) as usize;
         inside.then(|| ((at(x0, rect.x0), wx), (at(y0, rect.y0), wy)))

@@ -82,16 +82,18 @@ pub(crate) struct Model {
     step: f64,
 }
 
-/// A voxel near a block's rays.
+/// A voxel near a block's rays, upright as these ([`slabcast_common::kernel::Lean::upright`]).
 struct Near {
     eye: DVec3,
+    /// The same as the eye sees it.
+    seen: DVec3,
     /// Where sheets have it (in perspective each sheet has it somewhere else: across as it is).
     rounded: DVec3,
     /// Extinction per vox and that times the colours, for kernels that integrate to one.
     payload: [f32; 4],
 }
 
-/// A ray: `(at + slope z, z)`.
+/// A ray: `(at + slope z, z)`, upright.
 struct Ray {
     at: [f64; 2],
     slope: [f64; 2],
@@ -181,7 +183,9 @@ impl Model {
     fn near(&self, frame: &Frame, block: Rect, bricks: &[Arc<Brick>]) -> Vec<Near> {
         let view = &frame.view;
         let middle = ray(view, (block.x0 + block.x1) / 2, (block.y0 + block.y1) / 2);
+        let lean = &view.kernel_lean;
         let half = f64::from((block.x1 - block.x0).max(block.y1 - block.y0)) * 0.5 + 1.0;
+        let half = half * (1.0 + lean.row.abs());
         let per_vox = |z: f64| match view.projection {
             Projection::Ortho { scale } => scale,
             Projection::Persp { focal, distance } => focal / (z + distance).max(NEAR * distance),
@@ -191,9 +195,11 @@ impl Model {
         for brick in bricks {
             let corner = frame.corner(brick.id);
             // A sphere about the brick's middle, before its voxels.
-            let centre = view.offset_in_eye([7; 3]) * 0.5;
-            let (at, wide) =
-                (corner.eye + centre, centre.length().max(longest(view)) + self.reach.length());
+            let centre = lean.upright(view.offset_in_eye([7; 3]) * 0.5);
+            let (at, wide) = (
+                lean.upright(corner.eye) + centre,
+                centre.length().max(longest(view)) + self.reach.length(),
+            );
             let nearest = (at.z - wide).max(middle.near);
             let slack = wide + half / per_vox(nearest);
             let off =
@@ -204,20 +210,20 @@ impl Model {
             }
             for (i, &local) in brick.index.iter().enumerate() {
                 let placed = frame.place(&corner, local);
-                let eye = placed.eye;
+                let (seen, eye) = (placed.eye, lean.upright(placed.eye));
                 let wide = half / per_vox((eye.z - self.reach.z).max(middle.near));
                 let slope = |a: usize| middle.slope[a].abs() * self.reach.z;
                 if (0..2).any(|a| off(eye, a) > self.reach[a] + wide + slope(a)) {
                     continue;
                 }
-                let payload = frame.payload(brick, i, eye);
+                let payload = frame.payload(brick, i, seen);
                 if payload[0] <= 0.0 {
                     continue;
                 }
-                let mut rounded = eye;
+                let mut rounded = seen;
                 rounded.z = f64::from(placed.z) / phases * view.thickness;
                 if let Projection::Ortho { scale } = view.projection {
-                    let screen = view.screen(eye.x, eye.y, scale);
+                    let screen = view.screen(seen.x, seen.y, scale);
                     for a in 0..2 {
                         let pixels =
                             screen[a] as f64 / f64::from(SUBPIXELS) - f64::from(view.size[a]) * 0.5;
@@ -225,7 +231,8 @@ impl Model {
                     }
                 }
                 let unit = 1.0 / frame.raw_scale;
-                near.push(Near { eye, rounded, payload: payload.map(|p| p * unit) });
+                let rounded = lean.upright(rounded);
+                near.push(Near { eye, seen, rounded, payload: payload.map(|p| p * unit) });
             }
         }
         near.sort_unstable_by(|a, b| a.eye.z.total_cmp(&b.eye.z));
@@ -301,12 +308,14 @@ impl Model {
                     let mut rounded = x;
                     let sheet = libm::floor(z / frame.view.thickness) as i32;
                     if let Some(scale) = frame.view.scale_at(sheet) {
-                        for a in 0..2 {
-                            let there = frame.view.screen_along(a, v.eye[a], scale) as f64
+                        let off = [0, 1].map(|a| {
+                            let there = frame.view.screen_along(a, v.seen[a], scale) as f64
                                 / f64::from(SUBPIXELS);
-                            let exact = v.eye[a] * scale + f64::from(frame.view.size[a]) * 0.5;
-                            rounded[a] -= (there - exact) / scale;
-                        }
+                            let exact = v.seen[a] * scale + f64::from(frame.view.size[a]) * 0.5;
+                            (there - exact) / scale
+                        });
+                        rounded[0] -= off[0] - frame.view.kernel_lean.row * off[1];
+                        rounded[1] -= off[1];
                     }
                     weights = [of(&self.cut, x), of(&self.cut, rounded), of(&self.whole, x)];
                 }
@@ -331,35 +340,35 @@ impl Model {
 
 /// The longest way from a brick's middle to one of its corners' voxels.
 fn longest(view: &View) -> f64 {
-    let m = view.eye_from_index;
+    let m = view.kernel_lean.upright_steps(&view.eye_from_index);
     3.5 * (m.x_axis.length() + m.y_axis.length() + m.z_axis.length())
 }
 
 fn ray(view: &View, x: i32, y: i32) -> Ray {
     let px = f64::from(x) + 0.5 - f64::from(view.size[0]) * 0.5;
     let py = f64::from(y) + 0.5 - f64::from(view.size[1]) * 0.5;
-    match view.projection {
-        Projection::Ortho { scale } => Ray {
-            at: [px / scale, py / scale],
-            slope: [0.0; 2],
-            near: f64::NEG_INFINITY,
-            secant: 1.0,
-        },
+    let (at, [u, v], near) = match view.projection {
+        Projection::Ortho { scale } => ([px / scale, py / scale], [0.0; 2], f64::NEG_INFINITY),
         Projection::Persp { focal, distance } => {
             let (u, v) = (px / focal, py / focal);
-            Ray {
-                at: [u * distance, v * distance],
-                slope: [u, v],
-                near: (NEAR - 1.0) * distance,
-                secant: (1.0 + u * u + v * v).sqrt(),
-            }
+            ([u * distance, v * distance], [u, v], (NEAR - 1.0) * distance)
         }
+    };
+    let upright = |x: f64, y: f64, z: f64| {
+        let p = view.kernel_lean.upright(DVec3::new(x, y, z));
+        [p.x, p.y]
+    };
+    Ray {
+        at: upright(at[0], at[1], 0.0),
+        slope: upright(u, v, 1.0),
+        near,
+        secant: (1.0 + u * u + v * v).sqrt(),
     }
 }
 
 /// The waves of the lattice that are high enough to matter, of each pair one.
 fn waves(view: &View, profile: &[Profile; 3], radius: [f64; 3]) -> Vec<Wave> {
-    let dual = view.eye_from_index.inverse().transpose();
+    let dual = view.kernel_lean.upright_steps(&view.eye_from_index).inverse().transpose();
     // The transform of an even profile, by the midpoint rule: it ends in nothing, or nearly.
     let transform = |a: usize, f: f64| {
         const N: usize = 256;
@@ -395,11 +404,11 @@ struct Along(Vec<[[f64; 2]; 2]>);
 
 impl Along {
     fn new(waves: &[Wave], view: &View, ray: &Ray, start: f64, step: f64) -> Along {
-        let index_from_eye = view.eye_from_index.inverse();
+        let index_from_eye = view.kernel_lean.upright_steps(&view.eye_from_index).inverse();
         let way = index_from_eye * DVec3::new(ray.slope[0], ray.slope[1], 1.0);
         let z = start + 0.5 * step;
         let at = DVec3::new(ray.at[0] + ray.slope[0] * z, ray.at[1] + ray.slope[1] * z, z);
-        let index = index_from_eye * (at - view.eye_origin);
+        let index = index_from_eye * (at - view.kernel_lean.upright(view.eye_origin));
         let turn = |wave: &Wave| {
             let [from, by] = [wave.turns.dot(index), wave.turns.dot(way) * step]
                 .map(|turns| libm::sincos(2.0 * std::f64::consts::PI * turns.fract()));

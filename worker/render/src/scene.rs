@@ -1,6 +1,6 @@
 //! A scene and a frame of it, made ready for drawing: tables that tiles share.
 
-use crate::footprint::{Footprint, Footprints, Profile, Sections, Shelf};
+use crate::footprint::{Footprint, Footprints, Lean, Leaning, Profile, Sections, Shelf};
 use crate::mask::REACH_MOST;
 use crate::place::{FlatCorner, Places};
 use crate::sheet::Rule;
@@ -13,7 +13,7 @@ use slabcast_common::quality::{Compositing, Quality, Sums};
 use slabcast_common::shade::{Lit, NO_NORMAL, Shader};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::Classifier;
-use slabcast_common::view::{Projection, View};
+use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, View};
 use std::sync::Arc;
 
 /// A volume's looks under one transfer function and quality.
@@ -86,6 +86,8 @@ pub struct Frame {
     pub(crate) to_eye: Option<Vec3>,
     /// Positions, where all sections of all voxels share one footprint.
     pub(crate) flat: Option<Flat>,
+    /// Where sections and rows lie, where the kernel leans.
+    pub(crate) leaning: Option<Leaning>,
 }
 
 /// What an orthographic view has whose footprints are in a table and small enough for masks.
@@ -167,23 +169,19 @@ impl Frame {
         let rule = Rule::new(q.compositing, unit, d / view.kernel_std.z, q.eps as f32);
         let footprints = Footprints::new(&view, q.kernel, range, spread, scene.shelf.clone());
         let reach = footprints.at(0).and_then(|f| f.reach()).filter(|&r| r <= REACH_MOST);
+        let sections = scene.shelf.sections(&profile, d, phases, merged);
+        let largest = (range.first..range.end).find_map(|k| view.scale_at(k)).unwrap_or(1.0);
+        let leans = !view.kernel_lean.is_none();
+        let leaning = leans.then(|| Leaning::new(&view, &profile, &sections, largest));
+        let leaning = leaning.filter(Leaning::shows);
+        let reach = reach.filter(|_| leaning.is_none());
         let flat = reach.and_then(|reach| Some(Flat { places: Places::new(&view)?, reach }));
         let mut offsets = Box::new([[0.0; 512]; 3]);
         for i in 0..512u16 {
             let v = view.offset_in_eye(local(i)).to_array();
             offsets.iter_mut().zip(v).for_each(|(offsets, v)| offsets[usize::from(i)] = v);
         }
-        Frame {
-            flat,
-            sections: scene.shelf.sections(&profile, d, phases, merged),
-            footprints,
-            rule,
-            raw_scale,
-            offsets,
-            to_eye,
-            view,
-            scene,
-        }
+        Frame { flat, leaning, sections, footprints, rule, raw_scale, offsets, to_eye, view, scene }
     }
 
     /// Whether the colour rule looks at neighbouring sheets.
@@ -217,13 +215,32 @@ impl Frame {
         }
     }
 
-    /// Screen position, in 1/256 pixel of absolute image coordinates, of a voxel's footprint.
+    /// Screen position, in 1/256 pixel of absolute image coordinates, of a voxel's footprint in sheet `k`, one
+    /// of [its](Sections::span).
     #[inline]
-    pub fn screen(&self, placed: &Placed, footprint: &Footprint<'_>) -> [i64; 2] {
-        match placed.screen {
-            Some(at) => at,
-            None => self.view.screen(placed.eye.x, placed.eye.y, footprint.scale),
+    pub fn screen(&self, placed: &Placed, k: i32, footprint: &Footprint<'_>) -> [i64; 2] {
+        if let Some(at) = placed.screen {
+            return at;
         }
+        let mut at = [placed.eye.x, placed.eye.y];
+        if let Some(leaning) = &self.leaning {
+            let section = (k - self.sections.first(placed.z)) as usize;
+            let which = self.sections.row(placed.z).0 + section;
+            for (axis, at) in at.iter_mut().enumerate() {
+                *at += leaning.aside(axis)[which];
+            }
+        }
+        self.view.screen(at[0], at[1], footprint.scale)
+    }
+
+    /// Where the middle of row `y` is along x of a footprint [at](Frame::screen) a position.
+    #[inline]
+    pub fn along_row(&self, at: [i64; 2], y: i32) -> i64 {
+        let Some(leaning) = self.leaning.as_ref().filter(|leaning| leaning.row() != 0) else {
+            return at[0];
+        };
+        let middle = (i64::from(y) << SUBPIXEL_BITS) + i64::from(SUBPIXELS / 2);
+        at[0] + Lean::along_row(leaning.row(), middle - at[1])
     }
 
     /// [`Frame::payload`] of many voxels by their samples' bits, normals and, where each sees the eye

@@ -50,13 +50,17 @@ struct Part<'a> {
 }
 
 impl Part<'_> {
-    /// The pixels that it adds to.
-    fn covers(&self) -> Rect {
+    /// The rows of pixels that it adds to: each one's first pixel, and how many there are.
+    fn rows(&self) -> Vec<([i32; 2], usize)> {
         let [w, h] = self.frame.view.size.map(|n| n as i32);
         let (mut bx, mut by) = (Vec::new(), Vec::new());
-        let (x, wx) = self.footprint.weights(0, self.at[0], (0, w), &mut bx);
-        let (y, wy) = self.footprint.weights(1, self.at[1], (0, h), &mut by);
-        Rect::new(x, y, x + wx.len() as i32, y + wy.len() as i32)
+        let (y0, wy) = self.footprint.weights(1, self.at[1], (0, h), &mut by);
+        let rows = (y0..).take(wy.len()).map(|y| {
+            let at = self.frame.along_row(self.at, y);
+            let (x, wx) = self.footprint.weights(0, at, (0, w), &mut bx);
+            ([x, y], wx.len())
+        });
+        rows.collect()
     }
 }
 
@@ -64,13 +68,13 @@ impl Part<'_> {
 fn floats(p: &Part<'_>, mut add: impl FnMut(usize, usize, f32)) {
     let [w, h] = p.frame.view.size.map(|n| n as i32);
     let (mut bx, mut by) = (Vec::new(), Vec::new());
-    let (x0, wx) = p.footprint.weights(0, p.at[0], (0, w), &mut bx);
     let (y0, wy) = p.footprint.weights(1, p.at[1], (0, h), &mut by);
     let wz = p.frame.sections.of(p.z).1[p.section];
     let section = p.payload.map(|c| c * wz);
-    for (j, wy) in wy.iter().enumerate() {
+    for (y, wy) in (y0..).zip(wy) {
+        let (x0, wx) = p.footprint.weights(0, p.frame.along_row(p.at, y), (0, w), &mut bx);
         for (i, wx) in wx.iter().enumerate() {
-            let pixel = (y0 as usize + j) * w as usize + x0 as usize + i;
+            let pixel = (y * w + x0) as usize + i;
             for c in 0..4 {
                 add(pixel, c, section[c] * wy.get() * wx.get());
             }
@@ -83,13 +87,13 @@ fn fixed(to: &mut [[i16; 4]], p: &Part<'_>) {
     let times = |a: i32, b: i16| (a * i32::from(b) + 16384) >> 15;
     let [w, h] = p.frame.view.size.map(|n| n as i32);
     let (mut bx, mut by) = (Vec::new(), Vec::new());
-    let (x0, wx) = p.footprint.weights_fixed(0, p.at[0], (0, w), &mut bx);
     let (y0, wy) = p.footprint.weights_fixed(1, p.at[1], (0, h), &mut by);
     let wz = p.frame.sections.of_fixed(p.z).1[p.section];
     let section = p.payload.map(|c| times((c + 0.5) as i32, wz));
-    for (j, &wy) in wy.iter().enumerate() {
+    for (y, &wy) in (y0..).zip(wy) {
+        let (x0, wx) = p.footprint.weights_fixed(0, p.frame.along_row(p.at, y), (0, w), &mut bx);
         for (i, &wx) in wx.iter().enumerate() {
-            let pixel = (y0 as usize + j) * w as usize + x0 as usize + i;
+            let pixel = (y * w + x0) as usize + i;
             for c in 0..4 {
                 let sum = i32::from(to[pixel][c]) + times(times(section[c], wy), wx);
                 to[pixel][c] = sum.min(32767) as i16;
@@ -153,12 +157,14 @@ fn render_sums<S: Sum>(
                     continue;
                 }
                 let Some(footprint) = frame.footprints.at(sheet) else { continue };
-                let at = frame.screen(&placed, &footprint);
+                let at = frame.screen(&placed, sheet, &footprint);
                 let section = (sheet - first) as usize;
                 let part = Part { frame, z, section, payload, footprint, at };
                 add(to, &part);
                 if let Some(notes) = notes.as_mut().filter(|_| sheet == k) {
-                    notes.section(part.covers());
+                    for ([x, y], n) in part.rows() {
+                        notes.section(Rect::new(x, y, x + n as i32, y + 1));
+                    }
                 }
             }
         }

@@ -156,6 +156,9 @@ proptest! {
         edge in prop::sample::select(vec![16i32, 32, 64, 256]),
         cuts in prop::collection::vec(0.0..1.0f64, 0..5),
         spacing in prop::sample::select(vec![1.0, 1.0, 2.5]),
+        skew in prop::sample::select(vec![0.0, 0.0, 0.5]),
+        // Along z, or along the axis that is unlike the others: then sections lie above each other.
+        up in prop::sample::select(vec![DVec3::Z, DVec3::Z, DVec3::Y]),
         zoom in prop::sample::select(vec![0.3, 1.25, 1.25, 6.0]),
         kernel in prop::sample::select(
             vec![Kernel::Gaussian, Kernel::Gaussian, Kernel::Bspline, Kernel::Tent]),
@@ -172,10 +175,11 @@ proptest! {
             if h < 110 { 0 } else { h.wrapping_add((i * 7 + j * 3 + k) as u8 & 31) }
         });
         v.lattice = Lattice::from_spacing(v.lattice.dims, [1.0, spacing, 1.0]);
+        v.lattice.steps[0].y = skew;
         let quality = Quality { thickness, eps, compositing, sums, kernel, ..Quality::default() };
         let camera = Camera {
             to_eye: DVec3::new(azimuth.sin(), azimuth.cos(), tilt),
-            up: DVec3::Z,
+            up,
             target: DVec3::ZERO,
             projection: if persp {
                 CameraProjection::Persp { fov: 40.0, distance }

@@ -376,6 +376,81 @@ fn oblique_and_perspective_rays_are_what_brute_force_finds() {
     }
 }
 
+/// Lattices that are not cubic: wide along an axis, and of three lengths with no right angle.
+fn lattices(n: u32) -> [Lattice; 3] {
+    let wide = |spacing| Lattice::from_spacing([n; 3], spacing);
+    let mut skewed = wide([1.0; 3]);
+    skewed.steps =
+        [DVec3::new(1.1, 0.0, 0.1), DVec3::new(0.5, 1.3, 0.0), DVec3::new(-0.4, 0.6, 1.9)];
+    [wide([1.0, 1.0, 2.2]), wide([1.6, 1.0, 1.3]), skewed]
+}
+
+/// The kernel of a lattice that is not cubic is a ball in index space, looked at from anywhere.
+#[test]
+fn leaning_kernels_are_what_brute_force_finds_in_index_space() {
+    let samples = |[i, j, k]: [u32; 3]| (i * 7 + j * 13 + k * 29 + i * j * k) % 11;
+    let n = 5;
+    let mut volume = Volume::from_fn_u8("dice", [n; 3], |i, j, k| samples([i, j, k]) as u8);
+    let (sigma, std) = (0.07, 0.6);
+    let tf = transfer(
+        vec![[0.0, 0.0, 1.0, 0.5], [10.0, 1.0, 0.0, 0.5]],
+        vec![[0.0, 0.0], [10.0, 10.0 * sigma]],
+        OpacityUnit::Extinction,
+    );
+    // What is beyond so far is nothing.
+    let q = Quality { std, radius: 3.6, ..i32_sums() };
+    for lattice in lattices(n) {
+        volume.lattice = lattice;
+        let vox = lattice.vox();
+        for projection in [
+            CameraProjection::Ortho { height: 18.0 * vox },
+            CameraProjection::Persp { fov: 40.0, distance: 22.0 * vox },
+        ] {
+            let asked = Asked::new(volume.clone(), tf.clone(), q, oblique(projection), 32);
+            let view = &asked.view;
+            assert!(!view.kernel_lean.is_none());
+            let reference = asked.reference();
+            let index_from_eye = view.eye_from_index.inverse();
+            for [x, y] in [[16, 16], [9, 20], [20, 12], [17, 11]] {
+                use slabcast_common::view::Projection::{Ortho, Persp};
+                let [px, py] = [x, y].map(|p: u32| f64::from(p) + 0.5 - 16.0);
+                let (at, step) = match view.projection {
+                    Ortho { scale } => (DVec3::new(px / scale, py / scale, 0.0), DVec3::Z),
+                    Persp { focal, distance } => {
+                        let slope = DVec3::new(px / focal, py / focal, 1.0);
+                        (DVec3::new(slope.x, slope.y, 0.0) * distance, slope)
+                    }
+                };
+                let (steps, half) = (4000, 20.0);
+                let h = 2.0 * half / f64::from(steps);
+                let (mut depth, mut light) = (0.0f64, [0.0; 3]);
+                for s in 0..steps {
+                    let eye = at + step * (-half + (f64::from(s) + 0.5) * h);
+                    let index = index_from_eye * (eye - view.eye_origin);
+                    let mut sums = [0.0; 4];
+                    for v in (0..n * n * n).map(|v| [v % n, v / n % n, v / n / n]) {
+                        let off = index - DVec3::from_array(v.map(f64::from));
+                        let bell = (-0.5 * off.length_squared() / (std * std)).exp();
+                        let value = f64::from(samples(v));
+                        let w = sigma * value * bell / (std * (2.0 * PI).sqrt()).powi(3);
+                        let colour = [0.1 * value, 1.0 - 0.1 * value, 0.5];
+                        sums[0] += w;
+                        (0..3).for_each(|c| sums[c + 1] += w * colour[c]);
+                    }
+                    let along = h * step.length() * vox;
+                    let seen = (-(depth + sums[0] * along * 0.5)).exp() * along;
+                    (0..3).for_each(|c| light[c] += sums[c + 1] * seen);
+                    depth += sums[0] * along;
+                }
+                let want = [light[0], light[1], light[2], 1.0 - (-depth).exp()];
+                let got = reference.pixel(x, y);
+                assert!(want[3] > 0.01, "{want:?}");
+                assert_near(got, want, 2e-6, &format!("{lattice:?} {projection:?} {x},{y}"));
+            }
+        }
+    }
+}
+
 /// Rays that cross a wall at a slant cross more of it: by the secant.
 #[test]
 fn a_slanted_ray_is_longer_by_the_secant() {
@@ -475,6 +550,52 @@ fn thin_sheets_come_to_the_limit_in_both_projections() {
         println!("{projection:?}: {figures:?}");
         assert!(figures.n_pixels > 200);
         assert!(figures.rmse < 0.05, "{projection:?}: {figures:?}");
+    }
+}
+
+#[test]
+fn thin_sheets_of_leaning_kernels_come_to_the_limit() {
+    let n = 16;
+    for (lattice, projection) in lattices(n).into_iter().zip(projections(n).into_iter().cycle()) {
+        let mut volume = balls(n);
+        volume.lattice = lattice;
+        let q = Quality { thickness: 1.0 / 16.0, ..i32_sums() };
+        let asked = Asked::new(volume, lit(), q, oblique(projection), 72);
+        let picture = asked.splatted();
+        let sample = stratified([72, 72], 600, 5);
+        let got: Vec<_> =
+            sample.iter().map(|p| picture.pixels[(p[1] * 72 + p[0]) as usize]).collect();
+        let figures = ErrorFigures::compare(&got, &asked.reference().pixels(&sample), BLACK);
+        println!("{projection:?}: {figures:?}");
+        assert!(figures.n_pixels > 200);
+        assert!(figures.rmse < 0.05, "{projection:?}: {figures:?}");
+    }
+}
+
+/// Each section is drawn in one place, where it truly is smeared: that shows little.
+#[test]
+fn sheets_of_leaning_kernels_are_near_the_same_sheets_in_f64() {
+    let n = 16;
+    for (lattice, thickness) in
+        lattices(n).into_iter().flat_map(|l| [0.5, 1.0, 3.0, 40.0].map(|d| (l, d)))
+    {
+        for projection in projections(n) {
+            let mut volume = balls(n);
+            volume.lattice = lattice;
+            let q = Quality { thickness, ..i32_sums() };
+            let asked = Asked::new(volume, lit(), q, oblique(projection), 64);
+            let picture = asked.splatted();
+            let sample = stratified([64, 64], 512, 5);
+            let got: Vec<_> =
+                sample.iter().map(|p| picture.pixels[(p[1] * 64 + p[0]) as usize]).collect();
+            let reference = asked.reference();
+            let same = |p: &[u32; 2]| reference.at_same_thickness(p[0], p[1]);
+            let want: Vec<_> = sample.iter().map(same).collect();
+            let figures = ErrorFigures::compare(&got, &want, BLACK);
+            println!("{:?} {projection:?} {thickness}: {figures:?}", lattice.steps);
+            let most = if thickness <= 1.0 { 0.05 } else { 0.8 };
+            assert!(figures.rmse < most, "{projection:?} {thickness}: {figures:?}");
+        }
     }
 }
 

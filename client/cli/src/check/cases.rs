@@ -73,6 +73,18 @@ const FORMULAS: [Formula; 14] = [
 /// others differ in arithmetic alone, which golden frames watch.
 const IN_MATRIX: usize = 8;
 
+/// A lattice that is not cubic: its case's name, its steps, and what is special about the quality.
+type Leaning = (&'static str, [[f64; 3]; 3], Tweak);
+
+/// Spheres of which kernels lean: in three steps of which no two are at right angles rows of theirs do, too, and
+/// in thick slices.
+const LEANING: [Leaning; 2] = [
+    ("spheres/auto/oblique", [[1.1, 0.0, 0.1], [0.5, 1.3, 0.0], [-0.4, 0.6, 1.9]], |_| {}),
+    ("spheres/auto/slices", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.8]], |q| {
+        q.sums = Sums::I16;
+    }),
+];
+
 /// The cases of the matrix: the volume (if any), and formula volumes.
 pub(crate) fn of_matrix(file: Option<&Path>, size: [u32; 2]) -> Result<Vec<Case>, Fail> {
     let mut cases = Vec::new();
@@ -84,6 +96,7 @@ pub(crate) fn of_matrix(file: Option<&Path>, size: [u32; 2]) -> Result<Vec<Case>
     for formula in &FORMULAS[..IN_MATRIX] {
         cases.push(of_formula(formula, size)?);
     }
+    cases.push(leaning(&LEANING[0], size)?);
     Ok(cases)
 }
 
@@ -105,11 +118,20 @@ pub(crate) fn of_golden(sample: &Path) -> Result<Vec<Case>, Fail> {
     for formula in &FORMULAS {
         cases.push(of_formula(formula, SIZE)?);
     }
+    for lattice in &LEANING {
+        cases.push(leaning(lattice, SIZE)?);
+    }
     Ok(cases)
 }
 
 fn of_formula((file, name, tf, tweak): &Formula, size: [u32; 2]) -> Result<Case, Fail> {
     Case::new((*name).into(), Arc::new(volume::open(file.as_ref())?), tf, tweak, size)
+}
+
+fn leaning((name, steps, tweak): &Leaning, size: [u32; 2]) -> Result<Case, Fail> {
+    let mut volume = volume::open("formula:spheres".as_ref())?;
+    volume.lattice.steps = steps.map(DVec3::from_array);
+    Case::new((*name).into(), Arc::new(volume), "auto", tweak, size)
 }
 
 /// A file's name without its endings.

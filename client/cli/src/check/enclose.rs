@@ -21,7 +21,7 @@ use slabcast_common::quality::{Compositing, Sums};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Projection, SUBPIXELS};
 use slabcast_render::Frame;
-use slabcast_render::footprint::Profile;
+use slabcast_render::footprint::{Lean, Profile};
 
 /// Half an ulp of f32 near one.
 const ULP: f64 = 6e-8;
@@ -159,11 +159,11 @@ impl<'a> Enclosure<'a> {
         let d = view.thickness;
         let dz = 0.5 * d / f64::from(view.depth_phases()) + 1e-12;
         let radius = view.kernel_radius.z;
-        let across = |profile: &Profile, p: f64, at: f64, scale: f64| {
-            // f64 itself may be off by as much as the second term.
-            let off = ((0.5 + 1.0 / 256.0) / f64::from(SUBPIXELS)
-                + 1e-9 * (1.0 + at.abs() * scale))
-                / scale;
+        // f64 itself may be off by as much as the second term.
+        let rounding = |at: f64, scale: f64| {
+            ((0.5 + 1.0 / 256.0) / f64::from(SUBPIXELS) + 1e-9 * (1.0 + at.abs() * scale)) / scale
+        };
+        let across = |profile: &Profile, p: f64, at: f64, scale: f64, off: f64| {
             let u = (p / scale - at).abs();
             Span::new(profile.at(u + off), profile.at((u - off).max(0.0)))
         };
@@ -181,12 +181,25 @@ impl<'a> Enclosure<'a> {
                 let end = libm::ceil((eye.z + dz + radius) / d) as i32;
                 let place = |k: i32| {
                     let scale = view.scale_at(k)?;
-                    let gx = across(&self.kernel[0], px, eye.x, scale);
-                    let gy = across(&self.kernel[1], py, eye.y, scale);
+                    // Where the kernel leans, its section is beside its voxel, and its row beside that.
+                    let Lean { depth: [lean_x, lean_y], row } = view.kernel_lean;
+                    let from = f64::from(k) * d - eye.z;
+                    let behind = self.kernel[2].placed(from, from + d);
+                    let at_y = eye.y + lean_y * behind;
+                    let off_y = rounding(at_y, scale) + lean_y.abs() * dz;
+                    let at_x = eye.x + lean_x * behind;
+                    let mut off_x = rounding(at_x, scale) + lean_x.abs() * dz;
+                    let down = py / scale - at_y;
+                    if row != 0.0 {
+                        off_x += rounding(at_x, scale) + row.abs() * off_y + down.abs() / 65536.0;
+                    }
+                    let gx = across(&self.kernel[0], px, at_x + row * down, scale, off_x);
+                    let gy = across(&self.kernel[1], py, at_y, scale, off_y);
                     (gx.hi > 0.0 && gy.hi > 0.0).then(|| gx.times(gy))
                 };
-                // Where rays are parallel the place is the same in all sheets.
-                let parallel = matches!(view.projection, Projection::Ortho { .. });
+                // Where rays are parallel and the kernel does not lean the place is the same in all sheets.
+                let parallel = matches!(view.projection, Projection::Ortho { .. })
+                    && view.kernel_lean.is_none();
                 let same = if parallel { place(f_lo) } else { None };
                 let mut payload = None;
                 for k in f_lo..end {

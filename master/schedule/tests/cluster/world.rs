@@ -77,7 +77,7 @@ impl Default for Nature {
 /// What reaches somebody at a time.
 #[derive(Debug)]
 enum Coming {
-    ToWorker(WorkerId, ToWorker),
+    ToWorker(WorkerId, Box<ToWorker>),
     Bricks(WorkerId, BrickSetKey, Vec<BrickId>),
     ToMaster(Event),
     TaskEnd(WorkerId, usize),
@@ -354,7 +354,7 @@ impl World {
         let delay = self.rng.between(w.nature.latency.0, w.nature.latency.1);
         w.down = w.down.max(self.clock.now() + delay).max(w.stalled_until);
         let when = w.down;
-        self.at(when, Coming::ToWorker(id, message));
+        self.at(when, Coming::ToWorker(id, Box::new(message)));
     }
 
     /// Sends something to the master.
@@ -613,7 +613,7 @@ impl World {
             }
             Coming::ToWorker(id, message) => {
                 let Some(w) = self.workers.get_mut(&id) else { return };
-                match message {
+                match *message {
                     ToWorker::Lease(lease) if !w.leaving => {
                         let now = self.clock.now();
                         w.leases.push((Loan::Slab(lease), now));

@@ -41,7 +41,7 @@ impl Reference {
         let m = self.index_from_eye;
         let at = |z: f64| {
             let eye = DVec3::new(ray.at[0] + ray.slope[0] * z, ray.at[1] + ray.slope[1] * z, z);
-            m * (eye - self.view.eye_origin)
+            m * (eye - self.origin)
         };
         let radius = self.kernel.each_ref().map(|k| k.radius);
         let reach =
@@ -49,7 +49,7 @@ impl Reference {
         let (p, q) = (at(from), at(to));
         let first = (p.min(q) - reach).to_array().map(|x| libm::floor(x) as i64);
         let last = (p.max(q) + reach).to_array().map(|x| libm::ceil(x) as i64);
-        let (steps, origin) = (self.view.eye_from_index, self.view.eye_origin);
+        let (steps, origin) = (self.steps, self.origin);
         for k in first[2]..=last[2] {
             for j in first[1]..=last[1] {
                 for i in first[0]..=last[0] {

@@ -25,9 +25,9 @@
 //! and lets [`ErrorFigures`] say how far off it is. Nothing is shared between pixels; callers
 //! split them among their threads.
 //!
-//! On lattices that are not cubic the true kernel is an ellipsoid and the view carries the
-//! product of its marginals along the eye's axes. That product is what is integrated here too:
-//! this judge does not see that departure.
+//! On lattices that are not cubic the kernel is an ellipsoid that leans against the eye's axes. All here
+//! is then in coordinates that lean along, where it is a product of three profiles again and rays are
+//! straight still (`upright`).
 
 mod figures;
 mod ideal;
@@ -35,6 +35,7 @@ mod profile;
 mod quadrature;
 mod sample;
 mod sheets;
+mod upright;
 mod walk;
 
 pub use figures::ErrorFigures;
@@ -71,10 +72,17 @@ pub struct Reference {
     compositing: Compositing,
     shader: Option<Shader>,
     kernel: [Profile; 3],
+    /// Its deviations.
+    std: DVec3,
+    /// How the kernel leans: slopes of x and y over depth, and of x over y.
+    lean: [f64; 3],
+    /// Steps of the lattice, sample (0, 0, 0), and back to the index, upright.
+    steps: DMat3,
+    origin: DVec3,
     index_from_eye: DMat3,
-    /// In ascending id, each with its tight box in eye space.
+    /// In ascending id, each with its tight box, upright.
     bricks: Vec<(Arc<Brick>, EyeBox)>,
-    /// Eye offsets of the 512 voxels of a brick.
+    /// Upright offsets of the 512 voxels of a brick.
     offsets: Vec<DVec3>,
     rule: Gauss,
     tolerance: f64,
@@ -92,14 +100,17 @@ impl Reference {
     /// Makes `view` of the scene ready; `bricks` are all bricks of the scene, in any order.
     pub fn new(spec: &SceneSpec, view: View, bricks: &[Arc<Brick>]) -> Reference {
         let grid = BrickGrid::of(spec.volume.lattice.dims);
-        let m = view.eye_from_index;
+        let [std, radius] = spec.quality.shape();
+        let (spread, lean) = upright::of(&view, std);
+        let m = upright::steps(&view.eye_from_index, lean);
+        let origin = upright::point(view.eye_origin, lean);
         let mut bricks: Vec<_> = bricks
             .iter()
             .map(|brick| {
                 let tight = brick.tight(&grid);
                 let lo = DVec3::from_array(tight.lo.map(f64::from));
                 let hi = DVec3::from_array(tight.hi.map(f64::from));
-                let (centre, half) = (view.eye_origin + m * ((lo + hi) * 0.5), (hi - lo) * 0.5);
+                let (centre, half) = (origin + m * ((lo + hi) * 0.5), (hi - lo) * 0.5);
                 let reach =
                     m.x_axis.abs() * half.x + m.y_axis.abs() * half.y + m.z_axis.abs() * half.z;
                 // What two ways to compute a position may differ by.
@@ -108,7 +119,7 @@ impl Reference {
             })
             .collect();
         bricks.sort_by_key(|(brick, _)| brick.id);
-        let (kernel, std, radius) = (spec.quality.kernel, view.kernel_std, view.kernel_radius);
+        let kernel = spec.quality.kernel;
         let classifier = |c| Classifier::new(&spec.transfer, &spec.volume, c);
         Reference {
             view,
@@ -117,11 +128,11 @@ impl Reference {
             sheet_looks: classifier(spec.quality.compositing),
             compositing: spec.quality.compositing,
             shader: spec.transfer.shading.on.then(|| Shader::new(&spec.transfer.shading)),
-            kernel: [
-                Profile::new(kernel, std.x, radius.x),
-                Profile::new(kernel, std.y, radius.y),
-                Profile::new(kernel, std.z, radius.z),
-            ],
+            kernel: spread.map(|spread| Profile::new(kernel, std * spread, radius * spread)),
+            std: DVec3::from_array(spread) * std,
+            lean,
+            steps: m,
+            origin,
             index_from_eye: m.inverse(),
             bricks,
             offsets: (0..512).map(|i| m * DVec3::from_array(local(i).map(f64::from))).collect(),

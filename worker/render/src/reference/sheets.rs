@@ -115,11 +115,12 @@ impl Reference {
         let n = (stop - base) as usize + 2;
         let mut sheets = vec![[0.0; 4]; n];
         let mut peeks = sheets.clone();
-        // A ray along z meets all sections of a voxel at the same place.
+        // A ray along z meets all sections of a voxel at the same place, unless the kernel leans.
         let straight = ray.slope == [0.0; 2];
+        let leans = ray.lean != [0.0; 2];
         for v in &walk.voxels {
             let f = first(v);
-            let across = if straight { self.across(&ray, [x, y], v, 0.0, how) } else { 1.0 };
+            let across = if straight { self.across(&ray, [x, y], v, [0.0; 2], how) } else { 1.0 };
             let mut up_to = gz.integral_to(f as f64 * d - v.z);
             for k in f..end(v) {
                 let (from, to) = (k as f64 * d, (k + 1) as f64 * d);
@@ -128,7 +129,9 @@ impl Reference {
                 let weight = if straight {
                     if (from + to) * 0.5 < ray.start { 0.0 } else { along * across }
                 } else if how.section == Section::Exact {
-                    self.along_the_ray(&ray, v, from, to)
+                    self.along_the_ray(&ray, v, [from.max(v.enter), to.min(v.leave)], |z| z)
+                } else if leans {
+                    self.leaning(&ray, [x, y], v, [from, to], along, how)
                 } else {
                     self.placed(&ray, [x, y], v, from, along, how)
                 };
@@ -165,33 +168,87 @@ impl Reference {
             Section::Centroid => centroid(),
             Section::Between => 0.5 * (middle + centroid()),
         };
-        along * self.across(ray, pixel, v, at, how)
+        along * self.across(ray, pixel, v, [at; 2], how)
     }
 
-    /// The profiles across the ray where it passes depth `at`.
-    fn across(&self, ray: &Ray, pixel: [u32; 2], v: &Near, at: f64, how: Sheets) -> f64 {
-        let off = |axis: usize, offset: f64| {
-            let exact = offset + ray.slope[axis] * at;
-            if !how.rounded {
-                return exact;
-            }
-            let scale = match self.view.projection {
-                Projection::Ortho { scale } => scale,
-                Projection::Persp { focal, distance } => focal / (distance + at),
-            };
-            // From the footprint's centre, in pixels of the picture, to the pixel's.
-            let here = f64::from(pixel[axis]) + 0.5;
-            let centre = (here - exact * scale) * f64::from(SUBPIXELS);
-            (here - libm::rint(centre) / f64::from(SUBPIXELS)) / scale
+    /// The section between two depths of a kernel that leans: where it lies follows from the eye's rays as
+    /// [`Reference::placed`] says, and for the lean exactly.
+    fn leaning(
+        &self,
+        ray: &Ray,
+        pixel: [u32; 2],
+        v: &Near,
+        [from, to]: [f64; 2],
+        along: f64,
+        how: Sheets,
+    ) -> f64 {
+        let middle = 0.5 * (from + to);
+        if middle < ray.start || along <= 0.0 {
+            return 0.0;
+        }
+        let centroid = v.z + self.kernel[2].moment(from - v.z, to - from) / along;
+        let at = match how.section {
+            Section::MidPlane | Section::Exact => middle,
+            Section::Centroid => centroid,
+            Section::Between => 0.5 * (middle + centroid),
         };
-        self.kernel[0].at(off(0, v.x)) * self.kernel[1].at(off(1, v.y))
+        let mut moved = *v;
+        if how.rounded {
+            let off = |axis: usize, how: Sheets| self.off(ray, pixel, v, axis, [at, centroid], how);
+            let exact = Sheets { rounded: false, ..how };
+            moved.x += off(0, how) - off(0, exact);
+            moved.y += off(1, how) - off(1, exact);
+        }
+        self.along_the_ray(ray, &moved, [from, to], |_| at)
     }
 
-    /// The kernel's integral along the ray between two depths, per unit of depth.
-    fn along_the_ray(&self, ray: &Ray, v: &Near, from: f64, to: f64) -> f64 {
+    /// The profiles across the ray where it passes a depth: first for the eye's slope, then for the lean's.
+    fn across(&self, ray: &Ray, pixel: [u32; 2], v: &Near, at: [f64; 2], how: Sheets) -> f64 {
+        let [x, y] = [0, 1].map(|axis| self.off(ray, pixel, v, axis, at, how));
+        self.kernel[0].at(x) * self.kernel[1].at(y)
+    }
+
+    /// From a voxel to the ray along an axis, there.
+    fn off(
+        &self,
+        ray: &Ray,
+        pixel: [u32; 2],
+        v: &Near,
+        axis: usize,
+        [at, leaning]: [f64; 2],
+        how: Sheets,
+    ) -> f64 {
+        let offset = [v.x, v.y][axis];
+        let exact = if ray.lean[axis] == 0.0 {
+            offset + ray.slope[axis] * at
+        } else {
+            offset + (ray.slope[axis] - ray.lean[axis]) * at + ray.lean[axis] * leaning
+        };
+        if !how.rounded {
+            return exact;
+        }
+        let scale = match self.view.projection {
+            Projection::Ortho { scale } => scale,
+            Projection::Persp { focal, distance } => focal / (distance + at),
+        };
+        // From the footprint's centre, in pixels of the picture, to the pixel's.
+        let here = f64::from(pixel[axis]) + 0.5;
+        let centre = (here - exact * scale) * f64::from(SUBPIXELS);
+        (here - libm::rint(centre) / f64::from(SUBPIXELS)) / scale
+    }
+
+    /// The kernel's integral along the ray between two depths, per unit of depth; at depth z the eye's ray is
+    /// where it passes `seen_at(z)`.
+    fn along_the_ray(
+        &self,
+        ray: &Ray,
+        v: &Near,
+        [from, to]: [f64; 2],
+        seen_at: impl Fn(f64) -> f64,
+    ) -> f64 {
         let [gx, gy, gz] = &self.kernel;
-        let from = from.max(v.z - gz.radius).max(v.enter);
-        let to = to.min(v.z + gz.radius).min(v.leave);
+        let from = from.max(v.z - gz.radius);
+        let to = to.min(v.z + gz.radius);
         if from >= to {
             return 0.0;
         }
@@ -201,8 +258,9 @@ impl Reference {
         for piece in 0..pieces as u32 {
             for (node, weight) in self.rule.nodes.iter().zip(self.rule.weights) {
                 let z = from + (f64::from(piece) + node) * h;
-                let across = gx.at(v.x + ray.slope[0] * z) * gy.at(v.y + ray.slope[1] * z);
-                sum += weight * h * gz.at(z - v.z) * across;
+                let seen = seen_at(z) - z;
+                let [x, y] = [0, 1].map(|a| ray.slope[a] * z + (ray.slope[a] - ray.lean[a]) * seen);
+                sum += weight * h * gz.at(z - v.z) * gx.at(v.x + x) * gy.at(v.y + y);
             }
         }
         sum

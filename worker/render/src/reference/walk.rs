@@ -1,6 +1,6 @@
 //! Along a true ray: where it runs and which voxels it meets.
 
-use super::{EyeBox, Reference};
+use super::{EyeBox, Reference, upright};
 use glam::DVec3;
 use slabcast_common::brick::{BRICK, Brick};
 use slabcast_common::shade::NO_NORMAL;
@@ -13,11 +13,13 @@ use slabcast_common::view::{NEAR, Projection};
 /// it is a quarter for 1.7 times the values (peer-semi, at a tolerance of 1e-6).
 const PANEL: f64 = 0.8;
 
-/// A pixel's ray by depth z: `(at + slope z, z)` in eye space.
+/// A pixel's ray by depth z: `(at + slope z, z)`, upright.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Ray {
     pub(super) at: [f64; 2],
     pub(super) slope: [f64; 2],
+    /// What part of the slope is the kernel's lean and not the eye's.
+    pub(super) lean: [f64; 2],
     /// The near plane.
     pub(super) start: f64,
     /// Length of the ray between two planes one apart.
@@ -54,28 +56,28 @@ impl Reference {
     pub(super) fn ray(&self, x: u32, y: u32) -> Ray {
         let [w, h] = self.view.size.map(f64::from);
         let (px, py) = (f64::from(x) + 0.5 - w * 0.5, f64::from(y) + 0.5 - h * 0.5);
-        let std = self.view.kernel_std;
-        match self.view.projection {
-            Projection::Ortho { scale } => Ray {
-                at: [px / scale, py / scale],
-                slope: [0.0; 2],
-                start: f64::NEG_INFINITY,
-                secant: 1.0,
-                parallel: true,
-                step: PANEL * std.z,
-            },
+        let (at, [u, v], start) = match self.view.projection {
+            Projection::Ortho { scale } => ([px / scale, py / scale], [0.0; 2], f64::NEG_INFINITY),
             Projection::Persp { focal, distance } => {
                 let (u, v) = (px / focal, py / focal);
-                let step = std.z.min(std.x / u.abs()).min(std.y / v.abs());
-                Ray {
-                    at: [u * distance, v * distance],
-                    slope: [u, v],
-                    start: (NEAR - 1.0) * distance,
-                    secant: (1.0 + u * u + v * v).sqrt(),
-                    parallel: false,
-                    step: PANEL * step,
-                }
+                ([u * distance, v * distance], [u, v], (NEAR - 1.0) * distance)
             }
+        };
+        let across = |x: f64, y: f64, z: f64| {
+            let p = upright::point(DVec3::new(x, y, z), self.lean);
+            [p.x, p.y]
+        };
+        let (slope, lean) = (across(u, v, 1.0), across(0.0, 0.0, 1.0));
+        let std = self.std;
+        let step = std.z.min(std.x / slope[0].abs()).min(std.y / slope[1].abs());
+        Ray {
+            at: across(at[0], at[1], 0.0),
+            slope,
+            lean,
+            start,
+            secant: (1.0 + u * u + v * v).sqrt(),
+            parallel: slope == [0.0; 2],
+            step: PANEL * step,
         }
     }
 }
@@ -126,8 +128,11 @@ impl<'a> Walk<'a> {
     ) -> Walk<'a> {
         let m = of.index_from_eye;
         let step = m * DVec3::new(ray.slope[0], ray.slope[1], 1.0);
-        let index = m * (DVec3::new(ray.at[0], ray.at[1], 0.0) - of.view.eye_origin);
-        let [rx, ry, _] = of.kernel.each_ref().map(|k| k.radius);
+        let index = m * (DVec3::new(ray.at[0], ray.at[1], 0.0) - of.origin);
+        let [rx, ry, rz] = of.kernel.each_ref().map(|k| k.radius);
+        // Sheets put sections elsewhere along the eye's ray, and not along the kernel's lean.
+        let beside = |axis: usize| ray.lean[axis].abs() * (reach_z - rz);
+        let (rx, ry) = (rx + beside(0), ry + beside(1));
         let reach = m.x_axis.abs() * rx
             + m.y_axis.abs() * ry
             + m.z_axis.abs() * reach_z
@@ -241,10 +246,14 @@ impl<'a> Walk<'a> {
         }
         let view = &self.of.view;
         let corner = self.of.grid.corner(brick.id);
-        let corner =
-            view.eye_origin + view.eye_from_index * DVec3::from_array(corner.map(f64::from));
+        let corner = DVec3::from_array(corner.map(f64::from));
+        let (seen, corner) = (
+            view.eye_origin + view.eye_from_index * corner,
+            self.of.origin + self.of.steps * corner,
+        );
         for (i, &local) in brick.index.iter().enumerate() {
-            let eye = corner + self.of.offsets[local as usize];
+            let offset = self.of.offsets[local as usize];
+            let eye = corner + offset;
             let Some((enter, leave)) = self.ray.inside(eye, eye, self.of_use) else { continue };
             let look = self.looks.look_of(brick, i);
             if look.sigma <= 0.0 {
@@ -254,7 +263,11 @@ impl<'a> Walk<'a> {
                 None => look.rgb,
                 Some(shader) => {
                     let normal = brick.normals.as_ref().map_or(NO_NORMAL, |n| n[i]);
-                    shader.shade(look.rgb, normal, view.to_eye(eye))
+                    shader.shade(
+                        look.rgb,
+                        normal,
+                        view.to_eye(seen + upright::seen(offset, self.of.lean)),
+                    )
                 }
             };
             let (x, y) = (self.ray.at[0] - eye.x, self.ray.at[1] - eye.y);

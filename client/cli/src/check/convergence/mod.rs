@@ -13,7 +13,7 @@ use super::scenes::SCENES;
 use super::table::number;
 use crate::fail::{Fail, say};
 use crate::progress::{self, Progress};
-use crate::request::{Asked, LookArgs, ThreadArg, lattice_notice};
+use crate::request::{Asked, LookArgs, ThreadArg};
 use crate::{plot, volume};
 use slabcast_common::path::{Orientation, ProjectionKind, Turntable, ViewPath};
 use slabcast_common::quality::{Quality, Work};
@@ -149,9 +149,6 @@ fn subjects<'a>(
                 .map_err(|e| Fail::failed(format!("{name}: {e}")))?,
             None => {
                 asked.fit(&info, orientation, volume.anatomical)?;
-                if let Some(notice) = lattice_notice(&info) {
-                    progress::note(&notice);
-                }
                 asked.transfer.function(&info).map_err(|e| asked.blame(&e))?
             }
         };

@@ -8,7 +8,9 @@
 //! in registers.
 
 use super::{BySlot, MOST, Record, Recorded, RowAt, STRIDE, Table};
+use crate::footprint::{Lean, Phases};
 use crate::splat::Simd;
+use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
 
 /// Voxels that are placed, shaded and splatted together.
 pub(crate) const BATCH: usize = 64;
@@ -27,6 +29,8 @@ pub(crate) struct Apart {
     /// First pixels of footprints, from the part's corner, and where weights begin: by axis and slot.
     pub(crate) first: [[Each<i32>; MOST]; 2],
     pub(crate) from: [[Each<u32>; MOST]; 2],
+    /// Where footprints lie themselves, in subpixels from the part's corner: known where rows lie aside.
+    pub(crate) places: [[Each<i32>; MOST]; 2],
     /// By axis, the window inside the part that holds all footprints of a voxel: its first pixel, and the
     /// one behind its last.
     pub(crate) lo: [Each<i32>; 2],
@@ -43,6 +47,7 @@ impl Default for Apart {
         Apart {
             first: [[[0; BATCH]; MOST]; 2],
             from: [[[0; BATCH]; MOST]; 2],
+            places: [[[0; BATCH]; MOST]; 2],
             lo: [[0; BATCH]; 2],
             hi: [[0; BATCH]; 2],
             left: [0; BATCH],
@@ -74,7 +79,34 @@ pub(crate) struct Layers<'a, S: Recorded, const N: usize> {
     pub(crate) slot: usize,
 }
 
-impl<S: Recorded, const N: usize> Layers<'_, S, N> {
+impl<'a, S: Recorded, const N: usize> Layers<'a, S, N> {
+    /// Weights in depth of voxel `i`, by slot.
+    #[inline(always)]
+    pub(super) fn depths(&self, apart: &Apart, i: usize) -> BySlot<S::Depth, N> {
+        let weights = &self.deep.weights[apart.deep[i] as usize..][..apart.left[i] as usize];
+        let mut deep = [S::Depth::default(); N];
+        for (sheet, &w) in weights.iter().enumerate() {
+            deep[(self.slot + sheet) % N] = w;
+        }
+        deep
+    }
+
+    /// Weights of voxel `i` along `axis`, in a window that begins at `lo`.
+    #[inline(always)]
+    fn rows(&self, apart: &Apart, i: usize, axis: usize, lo: usize) -> [RowAt<'a, S::Weight>; N] {
+        // Loops, since closures of arrays are compiled for the baseline.
+        let mut rows = [RowAt::NONE; N];
+        for (at, row) in rows.iter_mut().enumerate() {
+            let Table { weights: table, len } = self.across[axis][at];
+            *row = RowAt::none_of(table);
+            if self.after(at) < apart.left[i] {
+                let from = apart.from[axis][at][i] as usize;
+                *row = RowAt { table, from, len, column: apart.first[axis][at][i] - lo as i32 };
+            }
+        }
+        rows
+    }
+
     /// How many sheets behind the first `slot` belongs to.
     #[inline(always)]
     pub(crate) fn after(&self, slot: usize) -> i32 {
@@ -108,26 +140,55 @@ pub(super) fn splat_apart<S: Recorded, const N: usize>(
     for (&i, &payload) in apart.kept.iter().zip(payloads) {
         let i = i as usize % BATCH;
         let ([x, y], wide) = apart.window(i, S::STEP);
-        let begin = apart.deep[i] as usize;
-        let mut deep = [S::Depth::default(); N];
-        for (sheet, &w) in layers.deep.weights[begin..][..apart.left[i] as usize].iter().enumerate()
-        {
-            deep[(layers.slot + sheet) % N] = w;
-        }
+        let deep = layers.depths(apart, i);
         for (axis, lo) in [x, y].into_iter().enumerate() {
-            // Loops, since closures of arrays are compiled for the baseline.
-            let mut rows = [RowAt::NONE; N];
-            for (at, row) in rows.iter_mut().enumerate() {
-                if layers.after(at) < apart.left[i] {
-                    let Table { weights: table, len } = layers.across[axis][at];
-                    let from = apart.from[axis][at][i] as usize;
-                    *row = RowAt { table, from, len, column: apart.first[axis][at][i] - lo as i32 };
-                }
-            }
-            S::weave(simd, rows, wide[axis], &mut woven[axis]);
+            S::weave(simd, layers.rows(apart, i, axis, lo), wide[axis], &mut woven[axis]);
         }
         let [columns, lines] = [0, 1].map(|axis| &woven[axis][..wide[axis]]);
         S::splat_deep(simd, records, y * STRIDE + x, (columns, lines), payload, &deep);
+    }
+}
+
+/// Where the middle of row `y` is along x of a footprint at `place`, in subpixels; `row`: [`Lean::row_fixed`].
+#[inline(always)]
+pub(crate) fn along_row(row: i64, [x, y_of]: [i32; 2], y: i32) -> i32 {
+    let middle = (y << SUBPIXEL_BITS) + SUBPIXELS / 2;
+    x + Lean::along_row(row, i64::from(middle - y_of)) as i32
+}
+
+/// [`splat_apart`] of voxels whose rows lie aside of each other, too: each row has weights of its own. `phases`:
+/// where those across lie in each slot.
+#[inline(always)]
+pub(crate) fn splat_skewed<S: Recorded, const N: usize>(
+    simd: Simd,
+    records: &mut [Record<S, N>],
+    (apart, payloads): (&Apart, &[S::Payload]),
+    (layers, (row, phases)): (&Layers<'_, S, N>, (i64, &[Phases; N])),
+    woven: &mut Woven<S::Weight, N>,
+) {
+    for (&i, &payload) in apart.kept.iter().zip(payloads) {
+        let i = i as usize % BATCH;
+        let ([x, y], [wide, high]) = apart.window(i, S::STEP);
+        let deep = layers.depths(apart, i);
+        let [columns, lines] = &mut *woven;
+        S::weave(simd, layers.rows(apart, i, 1, y), high, lines);
+        for (line, y) in (y..y + high).enumerate() {
+            let mut rows = [RowAt::NONE; N];
+            for (at, to) in rows.iter_mut().enumerate() {
+                let Table { weights: table, len } = layers.across[0][at];
+                *to = RowAt::none_of(table);
+                if layers.after(at) < apart.left[i] {
+                    let place = [apart.places[0][at][i], apart.places[1][at][i]];
+                    let place = along_row(row, place, y as i32);
+                    let phase = place & (SUBPIXELS - 1);
+                    let column = (place >> SUBPIXEL_BITS) + phases[at].first(phase) - x as i32;
+                    *to = RowAt { table, from: phases[at].begin(phase as usize), len, column };
+                }
+            }
+            S::weave(simd, rows, wide, columns);
+            let across = (&columns[..wide], &lines[line..=line]);
+            S::splat_deep(simd, records, y * STRIDE + x, across, payload, &deep);
+        }
     }
 }
 
@@ -139,15 +200,15 @@ pub(super) mod lines {
     use crate::tile::PART;
 
     /// Columns that the windows of all voxels fit which are added, a multiple of the step; `None` if there
-    /// are not four slots, or windows of more than [`LINE`] pixels.
+    /// are windows of more than [`LINE`] pixels.
     #[inline(always)]
-    pub(crate) fn widest<const N: usize>(apart: &Apart, kept: &[u32], step: i32) -> Option<usize> {
+    pub(crate) fn widest(apart: &Apart, kept: &[u32], step: i32) -> Option<usize> {
         let mut most = [0; 2];
         for &i in kept {
             let (_, wide) = apart.window(i as usize % BATCH, step);
             most = [most[0].max(wide[0]), most[1].max(wide[1])];
         }
-        (N == 4 && most.iter().all(|&most| most <= LINE)).then_some(most[0])
+        most.iter().all(|&most| most <= LINE).then_some(most[0])
     }
 
     /// First column of a window of `wide` columns from `first`, moved to lie inside the part.
@@ -156,52 +217,49 @@ pub(super) mod lines {
         first.min(PART as usize - wide)
     }
 
-    /// Weights in four slots along an axis for windows of at most [`LINE`] pixels. Those that are present lie
+    /// Weights in each slot along an axis for windows of at most [`LINE`] pixels. Those that are present lie
     /// in the slot's weights.
-    pub(crate) struct Lines<'a, W> {
+    pub(crate) struct Lines<'a, W, const N: usize> {
         /// Which pixels of a window there are any for, a bit each.
-        present: [Each<u32>; 4],
+        present: [Each<u32>; N],
         /// Where that of a window's first pixel would be.
-        at: [Each<i32>; 4],
-        weights: [&'a [W]; 4],
+        at: [Each<i32>; N],
+        weights: [&'a [W]; N],
     }
 
-    impl<'a, W> Lines<'a, W> {
+    impl<'a, W, const N: usize> Lines<'a, W, N> {
         /// Those across and down of the voxels in `kept`, which ascend. Windows begin at columns that are
         /// multiples of `step` and are moved inside to be `wide` columns; they may have any number of rows.
-        ///
-        /// # Panics
-        /// If there are not four slots.
         ///
         /// # Safety
         /// For machines with the instructions of `L`.
         #[inline(always)]
-        pub(crate) unsafe fn both<L: Lanes, S: Recorded<Weight = W>, const N: usize>(
+        pub(crate) unsafe fn both<L: Lanes, S: Recorded<Weight = W>>(
             apart: &Apart,
             kept: &[u32],
             layers: &Layers<'a, S, N>,
             (wide, step): (usize, i32),
-        ) -> [Lines<'a, W>; 2] {
+        ) -> [Lines<'a, W, N>; 2] {
             let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
             // SAFETY: the caller has the instructions.
             unsafe {
-                let across = Lines::new::<L, S, N>(apart, layers, n, (0, wide, step));
-                let down = Lines::new::<L, S, N>(apart, layers, n, (1, 0, 1));
+                let across = Lines::new::<L, S>(apart, layers, n, (0, wide, step));
+                let down = Lines::new::<L, S>(apart, layers, n, (1, 0, 1));
                 [across, down]
             }
         }
 
         /// Those of the first `n` voxels along `axis`. See [`Lines::both`].
         #[inline(always)]
-        unsafe fn new<L: Lanes, S: Recorded<Weight = W>, const N: usize>(
+        unsafe fn new<L: Lanes, S: Recorded<Weight = W>>(
             apart: &Apart,
             layers: &Layers<'a, S, N>,
             n: usize,
             (axis, wide, step): (usize, usize, i32),
-        ) -> Lines<'a, W> {
-            let (present, at) = ([[0; BATCH]; 4], [[0; BATCH]; 4]);
-            let mut lines = Lines { present, at, weights: [&[]; 4] };
-            for slot in 0..4 {
+        ) -> Lines<'a, W, N> {
+            let (present, at) = ([[0; BATCH]; N], [[0; BATCH]; N]);
+            let mut lines = Lines { present, at, weights: [&[]; N] };
+            for slot in 0..N {
                 let table = &layers.across[axis][slot];
                 lines.weights[slot] = table.weights;
                 let last = table.weights.len().checked_sub(table.len).expect("a row of the table");

@@ -124,7 +124,7 @@ pub(super) mod avx2 {
         }
     }
 
-    /// Four rows and eight columns at a time.
+    /// Four or eight rows and eight columns at a time.
     #[target_feature(enable = "avx2")]
     #[inline]
     pub(in super::super) fn weave<const N: usize>(
@@ -133,14 +133,14 @@ pub(super) mod avx2 {
         to: &mut [BySlot<Tap, N>],
     ) {
         let eights = wide.div_ceil(8);
-        if N != 4 || to.len() < 8 * eights {
+        if !(N == 4 || N == 8) || to.len() < 8 * eights {
             return super::super::weave(rows, wide, to);
         }
         for (eight, to) in to.chunks_exact_mut(8).take(eights).enumerate() {
             let first = 8 * eight as i32;
             let columns = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
             let columns = _mm256_add_epi32(columns, _mm256_set1_epi32(first));
-            let mut lines = [_mm256_setzero_ps(); 4];
+            let mut lines = [_mm256_setzero_ps(); 8];
             for (line, at) in lines.iter_mut().zip(rows) {
                 let row = at.row();
                 let (begin, end) = (at.column, at.column + row.len() as i32);
@@ -152,7 +152,34 @@ pub(super) mod avx2 {
                 *line =
                     unsafe { _mm256_maskload_ps(from.cast(), _mm256_and_si256(behind, before)) };
             }
-            by_column(lines, to.as_flattened_mut());
+            let to = to.as_flattened_mut();
+            if N == 4 {
+                by_column([0, 1, 2, 3].map(|i| lines[i]), to);
+            } else {
+                eight_by_column(lines, to);
+            }
+        }
+    }
+
+    /// Eight rows of eight columns, written column by column.
+    ///
+    /// # Panics
+    /// If there is not room for as many.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn eight_by_column(lines: [__m256; 8], to: &mut [Tap]) {
+        let [front, back] = [0, 4].map(|from| turned([0, 1, 2, 3].map(|i| lines[from + i])));
+        let (low, high) = to[..64].as_chunks_mut::<8>().0.split_at_mut(4);
+        for i in 0..4 {
+            let columns = [
+                _mm256_permute2f128_ps::<0x20>(front[i], back[i]),
+                _mm256_permute2f128_ps::<0x31>(front[i], back[i]),
+            ];
+            // SAFETY: eight taps are eight floats, 32 bytes; no weight is negative.
+            unsafe {
+                _mm256_storeu_ps(low[i].as_mut_ptr().cast(), columns[0]);
+                _mm256_storeu_ps(high[i].as_mut_ptr().cast(), columns[1]);
+            }
         }
     }
 
@@ -163,15 +190,7 @@ pub(super) mod avx2 {
     #[target_feature(enable = "avx2")]
     #[inline]
     fn by_column(lines: [__m256; 4], to: &mut [Tap]) {
-        let low = [_mm256_unpacklo_ps(lines[0], lines[1]), _mm256_unpacklo_ps(lines[2], lines[3])];
-        let high = [_mm256_unpackhi_ps(lines[0], lines[1]), _mm256_unpackhi_ps(lines[2], lines[3])];
-        // Columns 0 and 4, 1 and 5, and so on.
-        let pairs = [
-            _mm256_shuffle_ps::<0b01_00_01_00>(low[0], low[1]),
-            _mm256_shuffle_ps::<0b11_10_11_10>(low[0], low[1]),
-            _mm256_shuffle_ps::<0b01_00_01_00>(high[0], high[1]),
-            _mm256_shuffle_ps::<0b11_10_11_10>(high[0], high[1]),
-        ];
+        let pairs = turned(lines);
         let (low, high) = to[..32].as_chunks_mut::<4>().0.split_at_mut(4);
         for (i, pair) in pairs.into_iter().enumerate() {
             // SAFETY: four taps are four floats, 16 bytes; no weight is negative.
@@ -180,6 +199,20 @@ pub(super) mod avx2 {
                 _mm_storeu_ps(high[i].as_mut_ptr().cast(), _mm256_extractf128_ps::<1>(pair));
             }
         }
+    }
+
+    /// Columns 0 and 4 of four rows, 1 and 5, and so on.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn turned(lines: [__m256; 4]) -> [__m256; 4] {
+        let low = [_mm256_unpacklo_ps(lines[0], lines[1]), _mm256_unpacklo_ps(lines[2], lines[3])];
+        let high = [_mm256_unpackhi_ps(lines[0], lines[1]), _mm256_unpackhi_ps(lines[2], lines[3])];
+        [
+            _mm256_shuffle_ps::<0b01_00_01_00>(low[0], low[1]),
+            _mm256_shuffle_ps::<0b11_10_11_10>(low[0], low[1]),
+            _mm256_shuffle_ps::<0b01_00_01_00>(high[0], high[1]),
+            _mm256_shuffle_ps::<0b11_10_11_10>(high[0], high[1]),
+        ]
     }
 
     /// Each slot's weight for its four channels: two slots a register.
@@ -250,7 +283,7 @@ pub(super) mod avx2 {
         woven: &mut Woven<Tap, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        let Some(wide) = lines::widest::<N>(apart, kept, i32::STEP) else {
+        let Some(wide) = lines::widest(apart, kept, i32::STEP).filter(|_| N == 4) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
         let at = (records, (apart, payloads), layers);
@@ -260,7 +293,7 @@ pub(super) mod avx2 {
     /// Weights of voxel `i` in four slots, pixel by pixel, of at least the first `n` pixels.
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn line(lines: &Lines<'_, Tap>, i: usize, n: usize, to: &mut [Tap; 64]) {
+    fn line<const N: usize>(lines: &Lines<'_, Tap, N>, i: usize, n: usize, to: &mut [Tap; 64]) {
         for (eight, to) in to.as_chunks_mut::<32>().0.iter_mut().take(n.div_ceil(8)).enumerate() {
             let mut slots = [_mm256_setzero_ps(); 4];
             for (slot, line) in slots.iter_mut().enumerate() {
@@ -286,7 +319,7 @@ pub(super) mod avx2 {
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
         let [across, down] =
-            unsafe { Lines::both::<Eight, _, N>(apart, kept, layers, (WIDE, i32::STEP)) };
+            unsafe { Lines::both::<Eight, _>(apart, kept, layers, (WIDE, i32::STEP)) };
         let [mut columns, mut rows] = [[Tap::default(); 64]; 2];
         for (&i, payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
@@ -529,17 +562,20 @@ pub(super) mod avx512 {
         woven: &mut Woven<Tap, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        let Some(wide) = lines::widest::<N>(apart, kept, i32::STEP) else {
+        let Some(wide) = lines::widest(apart, kept, i32::STEP) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
         let at = (records, (apart, payloads), layers);
+        if N == 8 {
+            return by_window!(wide, eight_slots, N, at);
+        }
         by_window!(wide, side_by_side, N, at)
     }
 
     /// Weights of voxel `i` in four slots, pixel by pixel: four pixels a register.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn line(lines: &Lines<'_, Tap>, i: usize) -> [__m512; 4] {
+    fn line<const N: usize>(lines: &Lines<'_, Tap, N>, i: usize) -> [__m512; 4] {
         let mut slots = [_mm512_setzero_si512(); 4];
         for (slot, line) in slots.iter_mut().enumerate() {
             let (present, from) = lines.of(slot, i);
@@ -550,6 +586,78 @@ pub(super) mod avx512 {
         let [a, b, c, d] = by_column(slots);
         let float = _mm512_castsi512_ps;
         [float(a), float(b), float(c), float(d)]
+    }
+
+    /// Weights of voxel `i` in slots from `from`, four of them.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn four_slots<const N: usize>(
+        lines: &Lines<'_, Tap, N>,
+        i: usize,
+        from: usize,
+    ) -> [__m512i; 4] {
+        let mut slots = [_mm512_setzero_si512(); 4];
+        for (slot, line) in slots.iter_mut().enumerate() {
+            let (present, at) = lines.of((from + slot) % N, i);
+            // SAFETY: a tap is a float; lanes that are not present are not read, and those that are lie
+            // in the table.
+            *line = unsafe { _mm512_maskz_loadu_epi32(present as u16, at.cast()) };
+        }
+        by_column(slots)
+    }
+
+    /// Windows of `WIDE` columns, of eight slots: two registers a record.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn eight_slots<const WIDE: usize, const N: usize>(
+        (records, (apart, payloads), layers): ApartAt<'_, i32, N>,
+    ) {
+        let zero = _mm512_setzero_ps();
+        let float = _mm512_castsi512_ps;
+        let lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+        let slot = _mm512_srli_epi32::<2>(lane);
+        let kept = &apart.kept[..payloads.len()];
+        // SAFETY: these are the instructions.
+        let [across, down] =
+            unsafe { Lines::both::<Sixteen, _>(apart, kept, layers, (WIDE, i32::STEP)) };
+        for (&i, payload) in kept.iter().zip(payloads) {
+            let i = i as usize % BATCH;
+            let ([x, y], [_, high]) = apart.window(i, i32::STEP);
+            let x = lines::inside(x, WIDE);
+            let wz = spread::<N>(&layers.depths(apart, i));
+            // SAFETY: four floats are 16 bytes.
+            let payload = _mm512_broadcast_f32x4(unsafe { _mm_loadu_ps(payload.as_ptr()) });
+            // Half of the slots after the other; negative sections there are none.
+            for half in 0..2 {
+                let section = _mm512_max_ps(_mm512_mul_ps(payload, wz[half]), zero);
+                let columns = four_slots(&across, i, 4 * half);
+                let mut wx = [zero; WIDE];
+                for c in 0..WIDE {
+                    let from = _mm512_add_epi32(slot, _mm512_set1_epi32(4 * (c as i32 % 4)));
+                    wx[c] = _mm512_permutexvar_ps(from, float(columns[c / 4]));
+                }
+                let rows = four_slots(&down, i, 4 * half);
+                let mut from = slot;
+                let of_rows = records[y * STRIDE + x..].chunks_mut(STRIDE).take(high);
+                for (j, row) in of_rows.enumerate() {
+                    let wy = _mm512_permutexvar_ps(from, float(rows[j / 4 % 4]));
+                    from = _mm512_add_epi32(from, _mm512_set1_epi32(4));
+                    let of_row = _mm512_mul_ps(section, wy);
+                    let row = row.first_chunk_mut::<WIDE>().expect("a window inside the part");
+                    for c in 0..WIDE {
+                        let at: *mut __m512i = row[c].as_mut_ptr().cast();
+                        let add = _mm512_mul_ps(of_row, wx[c]);
+                        // SAFETY: sixteen sums are 64 bytes, half of a record, and borrowed for us alone.
+                        unsafe {
+                            let at = at.add(half);
+                            let sums = _mm512_loadu_si512(at);
+                            let sums = _mm512_add_epi32(sums, _mm512_cvtps_epi32(add));
+                            _mm512_storeu_si512(at, sums);
+                        }
+                    }
+                }
+            }
+        }
     }
 
     /// Windows of `WIDE` columns.
@@ -567,7 +675,7 @@ pub(super) mod avx512 {
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
         let [across, down] =
-            unsafe { Lines::both::<Sixteen, _, N>(apart, kept, layers, (WIDE, i32::STEP)) };
+            unsafe { Lines::both::<Sixteen, _>(apart, kept, layers, (WIDE, i32::STEP)) };
         for (&i, payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
             let ([x, y], [_, high]) = apart.window(i, i32::STEP);

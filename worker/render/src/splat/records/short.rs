@@ -122,17 +122,59 @@ pub(super) mod avx2 {
         }
     }
 
-    /// Sixteen columns of four rows, where so many are enough.
+    /// Eight rows of sixteen columns, written column by column.
+    #[target_feature(enable = "avx2")]
     #[inline]
-    pub(super) fn sixteen<const N: usize>(
-        wide: usize,
-        to: &mut [BySlot<i16, N>],
-    ) -> Option<&mut [i16; 64]> {
-        let fits = N == 4 && wide <= 16;
-        to.as_flattened_mut().first_chunk_mut().filter(|_| fits)
+    pub(super) fn eight_by_column(lines: [__m256i; 8], to: &mut [i16; 128]) {
+        let zero = _mm256_setzero_si256();
+        let [mut twos, mut fours] = [[zero; 8]; 2];
+        for i in 0..4 {
+            let (a, b) = (lines[2 * i], lines[2 * i + 1]);
+            // Columns 0 to 3 and 8 to 11, then the others.
+            (twos[i], twos[4 + i]) = (_mm256_unpacklo_epi16(a, b), _mm256_unpackhi_epi16(a, b));
+        }
+        for i in 0..2 {
+            for half in 0..2 {
+                let (a, b) = (twos[4 * half + 2 * i], twos[4 * half + 2 * i + 1]);
+                fours[4 * half + i] = _mm256_unpacklo_epi32(a, b);
+                fours[4 * half + 2 + i] = _mm256_unpackhi_epi32(a, b);
+            }
+        }
+        let (low, high) = to.as_chunks_mut::<8>().0.split_at_mut(8);
+        for i in 0..4 {
+            let (a, b) = (fours[2 * i], fours[2 * i + 1]);
+            let pair = [_mm256_unpacklo_epi64(a, b), _mm256_unpackhi_epi64(a, b)];
+            for (j, column) in pair.into_iter().enumerate() {
+                let (low, high) = (&mut low[2 * i + j], &mut high[2 * i + j]);
+                // SAFETY: eight weights are 16 bytes.
+                unsafe {
+                    _mm_storeu_si128(low.as_mut_ptr().cast(), _mm256_castsi256_si128(column));
+                    let column = _mm256_extracti128_si256::<1>(column);
+                    _mm_storeu_si128(high.as_mut_ptr().cast(), column);
+                }
+            }
+        }
     }
 
-    /// Four rows and sixteen columns at a time.
+    /// Whether [`by_sixteen`] takes windows of `wide` columns.
+    #[inline]
+    pub(super) fn fits<const N: usize>(wide: usize, to: &[BySlot<i16, N>]) -> bool {
+        (N == 4 || N == 8) && wide <= 16 && to.len() >= 16
+    }
+
+    /// Sixteen columns of four rows or of eight, written column by column.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    pub(super) fn by_sixteen<const N: usize>(lines: [__m256i; 8], to: &mut [BySlot<i16, N>]) {
+        let to = to.as_flattened_mut();
+        if N == 4 {
+            by_column([0, 1, 2, 3].map(|i| lines[i]), to.first_chunk_mut().expect("it fits"));
+        } else {
+            eight_by_column(lines, to.first_chunk_mut().expect("it fits"));
+        }
+    }
+
+    /// Four or eight rows and sixteen columns at a time.
     #[target_feature(enable = "avx2")]
     #[inline]
     pub(in super::super) fn weave<const N: usize>(
@@ -140,11 +182,11 @@ pub(super) mod avx2 {
         wide: usize,
         to: &mut [BySlot<i16, N>],
     ) {
-        let Some(sixteen) = sixteen(wide, to) else {
+        if !fits(wide, to) {
             return super::super::weave(rows, wide, to);
-        };
+        }
         let columns = _mm256_setr_epi16(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-        let mut lines = [_mm256_setzero_si256(); 4];
+        let mut lines = [_mm256_setzero_si256(); 8];
         for (line, at) in lines.iter_mut().zip(rows) {
             let (begin, end) = (at.column, at.column + at.len as i32);
             if begin >= 16 || end <= 0 || at.len == 0 {
@@ -160,7 +202,7 @@ pub(super) mod avx2 {
             let around = unsafe { _mm256_loadu_si256(around.as_ptr().cast()) };
             *line = _mm256_and_si256(around, _mm256_and_si256(behind, before));
         }
-        by_column(lines, sixteen);
+        by_sixteen(lines, to);
     }
 
     /// Adds `row * w`, register by register, to a record.
@@ -222,7 +264,7 @@ pub(super) mod avx2 {
         woven: &mut Woven<i16, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        let Some(wide) = lines::widest::<N>(apart, kept, 1) else {
+        let Some(wide) = lines::widest(apart, kept, 1).filter(|_| N == 4) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
         let at = (records, (apart, payloads), layers);
@@ -232,7 +274,7 @@ pub(super) mod avx2 {
     /// Weights of voxel `i` in four slots, pixel by pixel.
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn line(lines: &Lines<'_, i16>, i: usize, to: &mut [i16; 64]) {
+    fn line<const N: usize>(lines: &Lines<'_, i16, N>, i: usize, to: &mut [i16; 64]) {
         const { assert!(LINE == 16) };
         let each = _mm256_setr_epi16(
             1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, -32768,
@@ -264,7 +306,7 @@ pub(super) mod avx2 {
         let [turn, _] = turns::<N>(layers.slot);
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
-        let [across, down] = unsafe { Lines::both::<Eight, _, N>(apart, kept, layers, (WIDE, 1)) };
+        let [across, down] = unsafe { Lines::both::<Eight, _>(apart, kept, layers, (WIDE, 1)) };
         let [mut columns, mut rows] = [[0; 64]; 2];
         for (&i, &payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
@@ -322,7 +364,7 @@ pub(super) mod avx2 {
 
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx512 {
-    use super::avx2::{by_column, sixteen};
+    use super::avx2::{by_sixteen, eight_by_column, fits};
     use crate::splat::Simd;
     use crate::splat::lanes::Sixteen;
     use crate::splat::records::apart::lines::{self, Lines};
@@ -445,7 +487,7 @@ pub(super) mod avx512 {
         }
     }
 
-    /// Four rows and sixteen columns at a time.
+    /// Four or eight rows and sixteen columns at a time.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
     pub(in super::super) fn weave<const N: usize>(
@@ -453,16 +495,16 @@ pub(super) mod avx512 {
         wide: usize,
         to: &mut [BySlot<i16, N>],
     ) {
-        let Some(sixteen) = sixteen(wide, to) else {
+        if !fits(wide, to) {
             return super::super::weave(rows, wide, to);
-        };
-        let mut lines = [_mm256_setzero_si256(); 4];
+        }
+        let mut lines = [_mm256_setzero_si256(); 8];
         for (line, at) in lines.iter_mut().zip(rows) {
             let (present, from) = at.columns();
             // SAFETY: lanes that are not present are not read; those that are lie in the row.
             *line = unsafe { _mm256_maskz_loadu_epi16(present, from) };
         }
-        by_column(lines, sixteen);
+        by_sixteen(lines, to);
     }
 
     /// Each slot's weight for its four channels, of one pixel of eight sheets or two of four.
@@ -535,10 +577,13 @@ pub(super) mod avx512 {
         woven: &mut Woven<i16, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        let Some(wide) = lines::widest::<N>(apart, kept, i16::STEP) else {
+        let Some(wide) = lines::widest(apart, kept, i16::STEP) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
         let at = (records, (apart, payloads), layers);
+        if N == 8 {
+            return by_window!(wide, eight_slots, N, at);
+        }
         match wide / 2 {
             0..=2 => side_by_side::<2, N>(at),
             3 => side_by_side::<3, N>(at),
@@ -553,7 +598,7 @@ pub(super) mod avx512 {
     /// Weights of voxel `i` in four slots, two of sixteen pixels a register.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn line(lines: &Lines<'_, i16>, i: usize) -> [__m512i; 2] {
+    fn line<const N: usize>(lines: &Lines<'_, i16, N>, i: usize) -> [__m512i; 2] {
         const { assert!(LINE == WORDS / 2) };
         let mut both = [_mm512_setzero_si512(); 2];
         for (two, both) in both.iter_mut().enumerate() {
@@ -566,6 +611,57 @@ pub(super) mod avx512 {
             }
         }
         both
+    }
+
+    /// Weights of voxel `i` in eight slots, pixel by pixel.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn line_of_eight<const N: usize>(lines: &Lines<'_, i16, N>, i: usize, to: &mut [i16; 128]) {
+        let mut slots = [_mm256_setzero_si256(); 8];
+        for (slot, line) in slots[..N].iter_mut().enumerate() {
+            let (present, at) = lines.of(slot, i);
+            // SAFETY: lanes that are not present are not read, and those that are lie in the table.
+            *line = unsafe { _mm256_maskz_loadu_epi16(present as u16, at) };
+        }
+        eight_by_column(slots, to);
+    }
+
+    /// Windows of `WIDE` columns, of eight slots: a register a record.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn eight_slots<const WIDE: usize, const N: usize>(
+        (records, (apart, payloads), layers): ApartAt<'_, i16, N>,
+    ) {
+        let turn = words(|lane| (lane / 4 + 2 * N - layers.slot) % N);
+        let kept = &apart.kept[..payloads.len()];
+        // SAFETY: these are the instructions.
+        let [across, down] =
+            unsafe { Lines::both::<Sixteen, _>(apart, kept, layers, (WIDE, i16::STEP)) };
+        let [mut columns, mut rows] = [[0; 128]; 2];
+        for (&i, &payload) in kept.iter().zip(payloads) {
+            let i = i as usize % BATCH;
+            let ([x, y], [_, high]) = apart.window(i, i16::STEP);
+            let x = lines::inside(x, WIDE);
+            let z = &layers.deep.weights[apart.deep[i] as usize..][..apart.left[i] as usize];
+            let section = _mm512_set1_epi64(payload as i64);
+            let section = _mm512_mulhrs_epi16(section, _mm512_permutexvar_epi16(turn, load(z)));
+            line_of_eight(&across, i, &mut columns);
+            line_of_eight(&down, i, &mut rows);
+            let mut wx = [_mm512_setzero_si512(); WIDE];
+            for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<8>().0) {
+                *wx = spread(w);
+            }
+            let of_rows = records[y * STRIDE + x..].chunks_mut(STRIDE).zip(rows.as_chunks::<8>().0);
+            for (row, wy) in of_rows.take(high) {
+                let section = _mm512_mulhrs_epi16(section, spread(wy));
+                let row = row.first_chunk_mut::<WIDE>().expect("a window inside the part");
+                let at: *mut __m512i = row.as_mut_ptr().cast();
+                for (i, wx) in wx.into_iter().enumerate() {
+                    // SAFETY: so many registers are the records of `row`, borrowed for us alone.
+                    unsafe { add(at.add(i), section, wx) };
+                }
+            }
+        }
     }
 
     /// Windows of `U` registers, of two columns each.
@@ -581,7 +677,7 @@ pub(super) mod avx512 {
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
         let [across, down] =
-            unsafe { Lines::both::<Sixteen, _, N>(apart, kept, layers, (2 * U, i16::STEP)) };
+            unsafe { Lines::both::<Sixteen, _>(apart, kept, layers, (2 * U, i16::STEP)) };
         for (&i, &payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
             let ([x, y], [_, high]) = apart.window(i, i16::STEP);

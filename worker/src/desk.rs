@@ -751,8 +751,8 @@ mod tests {
             assert!(sums(result).a.iter().any(|&a| a > 0.9) && sums(result).last.is_none());
             let cost = result.region.as_ref().expect("of a region");
             assert_eq!(cost.touched, [0, 1]);
-            // The second may have been begun when all was here.
-            assert_eq!(cost.stalls > 0, cost.parked_us > 0);
+            // The second may have been begun when all was here, or have stood still for less than a microsecond.
+            assert!(cost.stalls > 0 && (cost.parked_us > 0 || task == 2) || cost.parked_us == 0);
             assert!(cost.stalls == 1 || task == 2 && cost.stalls == 0);
         }
         // What is here is not asked for, and nothing stands still.

@@ -167,24 +167,26 @@ impl Profile {
         Front { at, weight: self.integral_to(at), moment: self.moment_to(at) }
     }
 
-    /// What places of sections ([`Profile::placed`]) leave of [the variance](Self::variance) in sheets of
-    /// `thickness`, in vox^2: nothing in thin ones, all in those that hold a voxel whole.
+    /// The share of [the variance](Self::variance) that places of sections ([`Profile::placed`]) leave in sheets
+    /// of `thickness`: nothing in thin ones, all in those that hold a voxel whole.
     fn left_within(&self, thickness: f64) -> f64 {
         const PHASES: u32 = 16;
+        // Sheets as far as the kernel reaches; of thick ones two.
+        let reach = libm::ceil(self.radius / thickness).clamp(1.0, 1e4) as i32;
         let mut among = 0.0;
         for phase in 0..PHASES {
             let at = (f64::from(phase) + 0.5) / f64::from(PHASES);
-            // Sheets as far as the kernel reaches; of thick ones two.
-            let reach = libm::ceil(self.radius / thickness).clamp(1.0, 1e4) as i32;
-            for k in -reach - 1..=reach {
-                let from = (f64::from(k) + at) * thickness;
-                let to = from + thickness;
-                let weight = self.integral_to(to) - self.integral_to(from);
-                let placed = self.placed(from, to);
-                among += weight * placed * placed / f64::from(PHASES);
+            let plane = |k: i32| self.front((f64::from(k) + at) * thickness);
+            let mut front = plane(-reach - 1);
+            for k in -reach..=reach + 1 {
+                let back = plane(k);
+                let placed = front.to(&back);
+                among += (back.weight - front.weight) * placed * placed / f64::from(PHASES);
+                front = back;
             }
         }
-        (self.variance() - among).max(0.0)
+        let variance = self.variance();
+        (variance - among).max(0.0) / variance
     }
 }
 
@@ -314,7 +316,7 @@ pub fn drawn_ellipsoid(
     }
     let deep = Profile::new(kernel, std * spread.z, radius * spread.z);
     // In steps of the lattice.
-    let left = deep.left_within(thickness) / deep.variance() * spread.z * spread.z;
+    let left = deep.left_within(thickness) * spread.z * spread.z;
     let across = lean.row * spread.y;
     let yy = spread.y * spread.y + left * by * by;
     let xy = across * spread.y + left * bx * by;
@@ -367,11 +369,11 @@ mod tests {
             let variance = p.variance();
             for thin in [0.1, 0.25, 0.5] {
                 let d = thin * p.std;
-                let left = p.left_within(d) / (d * d / 12.0);
+                let left = p.left_within(d) * variance / (d * d / 12.0);
                 assert!((left - 1.0).abs() < 0.05, "{p:?}, {thin}: {left}");
             }
             let thick = p.left_within(1e3 * p.std);
-            assert!((thick / variance - 1.0).abs() < 0.02, "{p:?}: {thick}");
+            assert!((thick - 1.0).abs() < 0.02, "{p:?}: {thick}");
             for (from, to) in [(-9.0, -8.0), (0.3, 0.7), (-0.2, 0.1), (p.radius - 1e-6, 50.0)] {
                 let placed = p.placed(from, to);
                 assert!(

@@ -206,25 +206,22 @@ impl View {
         let target = eye_from_world * (camera.target / vox);
         let eye_origin = -(eye_from_index * lattice.centre_index()) - target;
         let [std, radius] = quality.shape();
-        let (spread, kernel_lean, cell) = if lattice.is_isotropic() {
-            (DVec3::ONE, Lean::NONE, 1.0)
-        } else {
-            let shape = (quality.kernel, std, radius);
-            let (spread, lean) = drawn_ellipsoid(&eye_from_index, shape, quality.thickness);
-            (spread, lean, eye_from_index.determinant().abs())
-        };
-        let view = View {
+        let mut view = View {
             size,
             eye_from_index,
             eye_origin,
             eye_from_world,
             projection,
             thickness: quality.thickness,
-            kernel_std: spread * std,
-            kernel_radius: spread * radius,
-            kernel_lean,
-            cell,
+            kernel_std: DVec3::splat(std),
+            kernel_radius: DVec3::splat(radius),
+            kernel_lean: Lean::NONE,
+            cell: 1.0,
         };
+        if !lattice.is_isotropic() {
+            view.lean(quality);
+            view.cell = eye_from_index.determinant().abs();
+        }
         // Depths in phases must fit i32, screen positions 26 bits.
         let corners = TightBox { lo: [0; 3], hi: lattice.dims.map(|n| n - 1) };
         let (lo, hi) = view.eye_box(&corners);
@@ -237,6 +234,27 @@ impl View {
             ));
         }
         Ok(view)
+    }
+
+    /// The same camera in the sheets of another quality, whose kernel is the same: where it leans, how wide it
+    /// is drawn depends on how thick sheets are.
+    #[must_use]
+    pub fn in_sheets_of(&self, quality: &Quality) -> View {
+        let mut view = View { thickness: quality.thickness, ..*self };
+        if self.kernel_lean.depth != [0.0; 2] {
+            view.lean(quality);
+        }
+        view
+    }
+
+    /// Gives a lattice that is not cubic its kernel.
+    fn lean(&mut self, quality: &Quality) {
+        let [std, radius] = quality.shape();
+        let shape = (quality.kernel, std, radius);
+        let (spread, lean) = drawn_ellipsoid(&self.eye_from_index, shape, quality.thickness);
+        self.kernel_std = spread * std;
+        self.kernel_radius = spread * radius;
+        self.kernel_lean = lean;
     }
 
     /// Depth positions are rounded to this part of a sheet: 1/256 of a sheet or of a vox,
@@ -536,6 +554,27 @@ mod tests {
         let big = Lattice::from_spacing([9, 7, 5], [2.0 * 1048576.0; 3]);
         let cb = Camera { projection: CameraProjection::Ortho { height: 36.0 * 1048576.0 }, ..c };
         assert_eq!(v, View::new(&big, &cb, [64, 48], &q).unwrap());
+    }
+
+    #[test]
+    fn a_view_in_other_sheets_is_the_one_made_for_them() {
+        let p = CameraProjection::Ortho { height: 36.0 };
+        for spacing in [[1.0; 3], [1.0, 1.0, 2.5], [0.3, 1.7, 1.0]] {
+            let l = Lattice::from_spacing([9, 7, 5], spacing);
+            for tilt in [0.0, 0.7] {
+                let of = |q| View::new(&l, &camera(0.3, tilt, p), [64, 48], &q).unwrap();
+                let q = Quality::default();
+                let other = Quality { thickness: 0.5 * q.thickness, ..q };
+                assert_eq!(of(q).in_sheets_of(&other), of(other), "{spacing:?}, tilt {tilt}");
+                assert_ne!(of(q), of(other));
+            }
+        }
+        // It is more than the thickness: widths of what leans.
+        let l = Lattice::from_spacing([9, 7, 5], [1.0, 1.0, 2.5]);
+        let q = Quality::default();
+        let leaning = View::new(&l, &camera(0.3, 0.7, p), [64, 48], &q).unwrap();
+        let thin = leaning.in_sheets_of(&Quality { thickness: 0.25, ..q });
+        assert!(thin.kernel_std.y < leaning.kernel_std.y, "{thin:?}");
     }
 
     #[test]

@@ -16,7 +16,8 @@ use divan::counter::ItemsCount;
 use glam::DVec3;
 use slabcast_common::brick::{Brick, TightBox};
 use slabcast_common::ids::SceneId;
-use slabcast_common::image::{FrameState, TilePixels, TileState};
+use slabcast_common::image::{Background, FrameState, PixelFormat, TilePixels, TileState};
+use slabcast_common::leaves::{Finish, LEAF, Leaves};
 use slabcast_common::message::{Counters, SceneSpec};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Compositing, Quality, Sums};
@@ -240,6 +241,30 @@ fn project_and_sort_bricks(bencher: Bencher<'_, '_>) {
         let seen = look();
         Seen::front_to_back(&seen).len()
     });
+}
+
+/// A tile becomes bytes of a picture; every fourth leaf of it is empty. Items are pixels.
+#[divan::bench(args = [(PixelFormat::Rgb8, [0.0; 3]), (PixelFormat::Rgb8, [1.0; 3]), (PixelFormat::Rgba8, [0.0; 3])])]
+fn finish_a_tile(bencher: Bencher<'_, '_>, (format, background): (PixelFormat, [f64; 3])) {
+    const EDGE: usize = 64;
+    let mut x = 7u32;
+    let mut next = || {
+        x = x.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        x >> 4
+    };
+    let there = |i: usize| !(i % EDGE / LEAF + i / EDGE / LEAF).is_multiple_of(4);
+    let a = (0..EDGE * EDGE).map(|i| if there(i) { 0.5 } else { 0.0 }).collect();
+    let colour = |i| if there(i) { [next(), next(), next()] } else { [0; 3] };
+    let pixels = TilePixels { a, colour: (0..EDGE * EDGE).map(colour).collect(), last: None };
+    let (tile, size) = (Rect::new(0, 0, EDGE as i32, EDGE as i32), [EDGE as u32; 2]);
+    let finish = Finish { format, background: Background::Colour(background) };
+    let leaves = || Leaves::of(&pixels, size, &finish);
+    let (mut sums, mut done) = (FrameState::new(size), FrameState::new(size));
+    sums.put(tile, &pixels);
+    done.lay_finished(tile, leaves());
+    let plain = sums.finish().encode(format, finish.background);
+    assert!(done.encode(&finish, false).bytes == plain, "the bytes of the finished picture");
+    bencher.counter(ItemsCount::new(EDGE * EDGE)).bench_local(leaves);
 }
 
 /// Bricks as they travel.

@@ -50,7 +50,7 @@ impl Pair {
     /// A view of it.
     pub fn frames(&self, view: &View) -> [Frame; 2] {
         let Pair([whole, half]) = self;
-        let thin = View { thickness: view.thickness * 0.5, ..*view };
+        let thin = view.in_sheets_of(&half.quality);
         [Frame::new(whole.clone(), *view), Frame::new(half.clone(), thin)]
     }
 }

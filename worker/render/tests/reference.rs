@@ -535,18 +535,37 @@ fn projections(n: u32) -> [CameraProjection; 2] {
     ]
 }
 
+/// How far what is splatted is from what the reference makes of the same pixels, `n` of them.
+fn figures(
+    asked: &Asked,
+    n: usize,
+    judge: impl Fn(&Reference, &[[u32; 2]]) -> Vec<[f64; 4]>,
+) -> ErrorFigures {
+    let picture = asked.splatted();
+    let [w, h] = picture.size;
+    let sample = stratified([w, h], n, 5);
+    let at = |p: &[u32; 2]| picture.pixels[(p[1] * w + p[0]) as usize];
+    let got: Vec<_> = sample.iter().map(at).collect();
+    ErrorFigures::compare(&got, &judge(&asked.reference(), &sample), BLACK)
+}
+
+/// The limit.
+fn limit(reference: &Reference, sample: &[[u32; 2]]) -> Vec<[f64; 4]> {
+    reference.pixels(sample)
+}
+
+/// The same sheets in f64.
+fn same_sheets(reference: &Reference, sample: &[[u32; 2]]) -> Vec<[f64; 4]> {
+    sample.iter().map(|&[x, y]| reference.at_same_thickness(x, y)).collect()
+}
+
 #[test]
 fn thin_sheets_come_to_the_limit_in_both_projections() {
     let n = 24;
     for projection in projections(n) {
         let q = Quality { thickness: 1.0 / 16.0, ..i32_sums() };
         let asked = Asked::new(balls(n), lit(), q, oblique(projection), 96);
-        let picture = asked.splatted();
-        let sample = stratified([96, 96], 1024, 5);
-        let got: Vec<_> =
-            sample.iter().map(|p| picture.pixels[(p[1] * 96 + p[0]) as usize]).collect();
-        let want = asked.reference().pixels(&sample);
-        let figures = ErrorFigures::compare(&got, &want, BLACK);
+        let figures = figures(&asked, 1024, limit);
         println!("{projection:?}: {figures:?}");
         assert!(figures.n_pixels > 200);
         assert!(figures.rmse < 0.05, "{projection:?}: {figures:?}");
@@ -561,11 +580,7 @@ fn thin_sheets_of_leaning_kernels_come_to_the_limit() {
         volume.lattice = lattice;
         let q = Quality { thickness: 1.0 / 16.0, ..i32_sums() };
         let asked = Asked::new(volume, lit(), q, oblique(projection), 72);
-        let picture = asked.splatted();
-        let sample = stratified([72, 72], 600, 5);
-        let got: Vec<_> =
-            sample.iter().map(|p| picture.pixels[(p[1] * 72 + p[0]) as usize]).collect();
-        let figures = ErrorFigures::compare(&got, &asked.reference().pixels(&sample), BLACK);
+        let figures = figures(&asked, 600, limit);
         println!("{projection:?}: {figures:?}");
         assert!(figures.n_pixels > 200);
         assert!(figures.rmse < 0.05, "{projection:?}: {figures:?}");
@@ -584,14 +599,7 @@ fn sheets_of_leaning_kernels_are_near_the_same_sheets_in_f64() {
             volume.lattice = lattice;
             let q = Quality { thickness, ..i32_sums() };
             let asked = Asked::new(volume, lit(), q, oblique(projection), 64);
-            let picture = asked.splatted();
-            let sample = stratified([64, 64], 512, 5);
-            let got: Vec<_> =
-                sample.iter().map(|p| picture.pixels[(p[1] * 64 + p[0]) as usize]).collect();
-            let reference = asked.reference();
-            let same = |p: &[u32; 2]| reference.at_same_thickness(p[0], p[1]);
-            let want: Vec<_> = sample.iter().map(same).collect();
-            let figures = ErrorFigures::compare(&got, &want, BLACK);
+            let figures = figures(&asked, 512, same_sheets);
             println!("{:?} {projection:?} {thickness}: {figures:?}", lattice.steps);
             let most = if thickness <= 1.0 { 0.05 } else { 0.8 };
             assert!(figures.rmse < most, "{projection:?} {thickness}: {figures:?}");
@@ -609,14 +617,7 @@ fn the_same_sheets_in_f64_are_what_the_splatter_draws() {
             for thickness in [0.3, 1.0, 2.5] {
                 let q = Quality { thickness, compositing, ..i32_sums() };
                 let asked = Asked::new(balls(n), lit(), q, oblique(projection), 64);
-                let picture = asked.splatted();
-                let sample = stratified([64, 64], 512, 5);
-                let got: Vec<_> =
-                    sample.iter().map(|p| picture.pixels[(p[1] * 64 + p[0]) as usize]).collect();
-                let reference = asked.reference();
-                let want: Vec<_> =
-                    sample.iter().map(|p| reference.at_same_thickness(p[0], p[1])).collect();
-                let figures = ErrorFigures::compare(&got, &want, BLACK);
+                let figures = figures(&asked, 512, same_sheets);
                 println!("{projection:?} {compositing:?} {thickness}: {figures:?}");
                 assert!(
                     figures.rmse < 0.15,

@@ -28,6 +28,17 @@ pub enum Section {
     Exact,
 }
 
+impl Section {
+    /// At which depth that is.
+    fn at(self, middle: f64, centroid: f64) -> f64 {
+        match self {
+            Section::MidPlane | Section::Exact => middle,
+            Section::Centroid => centroid,
+            Section::Between => 0.5 * (middle + centroid),
+        }
+    }
+}
+
 /// How [`Reference::by_sheets`] takes the sheets of a view.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Sheets {
@@ -162,13 +173,8 @@ impl Reference {
         if middle < ray.start || along <= 0.0 {
             return 0.0;
         }
-        let centroid = || v.z + self.kernel[2].moment(from - v.z, d) / along;
-        let at = match how.section {
-            Section::MidPlane | Section::Exact => middle,
-            Section::Centroid => centroid(),
-            Section::Between => 0.5 * (middle + centroid()),
-        };
-        along * self.across(ray, pixel, v, [at; 2], how)
+        let centroid = v.z + self.kernel[2].moment(from - v.z, d) / along;
+        along * self.across(ray, pixel, v, [how.section.at(middle, centroid); 2], how)
     }
 
     /// The section between two depths of a kernel that leans: where it lies follows from the eye's rays as
@@ -187,11 +193,7 @@ impl Reference {
             return 0.0;
         }
         let centroid = v.z + self.kernel[2].moment(from - v.z, to - from) / along;
-        let at = match how.section {
-            Section::MidPlane | Section::Exact => middle,
-            Section::Centroid => centroid,
-            Section::Between => 0.5 * (middle + centroid),
-        };
+        let at = how.section.at(middle, centroid);
         let mut moved = *v;
         if how.rounded {
             let off = |axis: usize, how: Sheets| self.off(ray, pixel, v, axis, [at, centroid], how);

@@ -36,7 +36,7 @@ pub mod wanted;
 
 /// Version of the arithmetic behind the pixels. Two programs that agree on it give the same
 /// bytes for the same view; a change of any golden hash raises it (CONTRACTS.md, Exactness).
-pub const PIXELS_VERSION: u32 = 8;
+pub const PIXELS_VERSION: u32 = 9;
 
 /// Version of the messages between master, worker and client.
 pub const PROTOCOL_VERSION: u32 = 5;

@@ -8,15 +8,14 @@
 //! are tested at the place where their own depth puts them, in a mask grown by what sections may lie
 //! aside of it. Where that is far, as very near the eye, [`crate::general`] takes over.
 
-use crate::footprint::{Leaning, Phases};
+use crate::batch::{Axes, Batch};
+use crate::footprint::{Footprint, Leaning};
 use crate::mask::{OpenMask, REACH_MOST};
 use crate::scene::Frame;
-use crate::splat::records::apart::{
-    Apart, BATCH, Each, Layers, WINDOW, after, along_row, splat_skewed,
-};
-use crate::splat::records::{BySlot, Recorded, Table};
-use crate::splat::toss::{self, Kept, Sieve, Sifted, Tossing, any_in_rows, prefetch};
-use crate::splat::{Accumulate, Simd, Work};
+use crate::splat::records::Recorded;
+use crate::splat::records::apart::{Apart, BATCH, Each, WINDOW, Woven, after};
+use crate::splat::toss::{self, Kept, Sieve, Sifted, Tossing, prefetch};
+use crate::splat::{Simd, Work, whole_registers};
 use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
@@ -42,55 +41,31 @@ pub(crate) struct Waiting {
     queues: Queues<DeepVoxel>,
     tossing: Box<Tossing>,
     batch: Box<Batch>,
+    places: Box<Places>,
 }
 
-/// Voxels on their way from a bucket to the records.
-struct Batch {
+/// Where voxels of a batch are.
+struct Places {
+    /// Eye coordinates.
     eye: [Each<f64>; 3],
-    samples: Each<u32>,
-    normals: Each<u16>,
-    apart: Apart,
-    light: [Each<f32>; 4],
     /// Where a section of each is along an axis.
     aside: Each<f64>,
 }
 
-impl Default for Batch {
+impl Default for Places {
     fn default() -> Self {
-        Batch {
-            eye: [[0.0; BATCH]; 3],
-            samples: [0; BATCH],
-            normals: [0; BATCH],
-            apart: Apart::default(),
-            light: [[0.0; BATCH]; 4],
-            aside: [0.0; BATCH],
-        }
-    }
-}
-
-impl Batch {
-    /// Takes over `v`, which has `left` sheets left, as voxel `i`.
-    #[inline(always)]
-    fn put(&mut self, i: usize, v: &DeepVoxel, left: i32) {
-        for axis in 0..3 {
-            self.eye[axis][i] = v.eye[axis];
-        }
-        (self.samples[i], self.normals[i], self.apart.left[i]) = (v.sample, v.normal, left);
+        Places { eye: [[0.0; BATCH]; 3], aside: [0.0; BATCH] }
     }
 }
 
 /// What a part needs to be rendered here.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Deep {
-    /// Of parallel rays as of an eye that is [far](AWAY).
     focal: f64,
     distance: f64,
     /// Pixels from the one that holds a centre within which all sections stay.
     reach: i32,
 }
-
-/// How far an eye is, in vox, whose rays are parallel to the last bit of their scale.
-const AWAY: f64 = (1u64 << 60) as f64;
 
 /// Whether `part` may be rendered here.
 pub(crate) fn takes(part: &Part<'_>) -> Option<Deep> {
@@ -101,11 +76,7 @@ pub(crate) fn takes(part: &Part<'_>) -> Option<Deep> {
 fn deep(frame: &Frame, r: &Rect, nearest: i32) -> Option<Deep> {
     let view = &frame.view;
     let leaning = frame.leaning.as_ref();
-    let (focal, distance) = match view.projection {
-        Projection::Persp { focal, distance } => (focal, distance),
-        Projection::Ortho { scale } if leaning.is_some() => (scale * AWAY, AWAY),
-        Projection::Ortho { .. } => return None,
-    };
+    let Projection::Persp { focal, distance } = view.projection else { return None };
     let most = frame.sections.most();
     // Scales fall with depth: those of the nearest sheet and of a voxel's length in front of it
     // bound all others, and show that no sheet is clipped.
@@ -122,11 +93,7 @@ fn deep(frame: &Frame, r: &Rect, nearest: i32) -> Option<Deep> {
     let above = [r.y0, r.y1].map(|y| (f64::from(y) - middle[1]).abs());
     let farthest = aside.into_iter().chain(above).fold(0.0, f64::max);
     // Where the kernel leans a section is farther aside, and its outermost rows are.
-    let leans = leaning.map_or(0.0, |leaning| {
-        let sections = leaning.most(0).max(leaning.most(1)) * front;
-        let row = leaning.row() as f64 / 65536.0;
-        sections + row.abs() * f64::from(own + 1)
-    });
+    let leans = leaning.map_or(0.0, |leaning| leaning.pixels(front, own));
     // x / (z + dz) lies within |x / z| dz / z of x / z, and each is rounded to a subpixel; of voxels so many
     // pixels outside of the part.
     let reach_of = |outside: f64| {
@@ -157,9 +124,10 @@ impl<S: Recorded, const N: usize> Work for RenderDeep<'_, S, N> {
     #[inline(always)]
     fn run(self) {
         let RenderDeep { part, deep, simd, store, waiting, pixels, io } = self;
-        let Waiting { queues, tossing, batch } = waiting;
+        let Waiting { queues, tossing, batch, places } = waiting;
         let [x, y] = [[[S::Weight::default(); N]; WINDOW]; 2];
-        let stage = DeepStage { part: &part, deep, simd, tossing, batch, across: [x, y] };
+        let across = [x, y];
+        let stage = DeepStage { part: &part, deep, simd, tossing, batch, places, across };
         walk::<S, N, _>(&part, stage, (simd, store), queues, pixels, io);
     }
 }
@@ -170,19 +138,13 @@ struct DeepStage<'a, S: Recorded, const N: usize> {
     simd: Simd,
     tossing: &'a mut Tossing,
     batch: &'a mut Batch,
+    places: &'a mut Places,
     /// Weights of the voxel at hand by column and by row.
-    across: [[BySlot<S::Weight, N>; WINDOW]; 2],
+    across: Woven<S::Weight, N>,
 }
 
-/// Footprints of one sheet.
-#[derive(Clone, Copy)]
-struct Layer<'a, S: Recorded> {
-    scale: f64,
-    axes: [Axis<'a, S>; 2],
-}
-
-/// Weights along one axis, and where they lie.
-type Axis<'a, S> = (Phases, &'a [<S as Accumulate>::Weight]);
+/// Footprints of sheets by slot, and their scales.
+type Footprints<'a, S, const N: usize> = (Axes<'a, S, N>, [f64; N]);
 
 impl<S: Recorded, const N: usize> Stage<S, N> for DeepStage<'_, S, N> {
     type Voxel = DeepVoxel;
@@ -248,18 +210,16 @@ impl<S: Recorded, const N: usize> Stage<S, N> for DeepStage<'_, S, N> {
         if bucket.is_empty() {
             return;
         }
-        let layers = layers(self.part, k);
+        let footprints = footprints::<S, N>(self.part, k);
         let most = self.part.frame.sections.most() as i32;
         let cull = self.part.frame.scene.quality.cull;
         for some in bucket.chunks(BATCH) {
             let mut n = 0;
             for v in some {
-                self.batch.put(n, v, most);
+                self.put(n, v, most);
                 n += usize::from(!cull || open.is_near(v.cell.into()));
             }
-            let added = self.add(n, k, &layers, sheets, open);
-            counters.splatted += added;
-            counters.culled += some.len() as u64 - added;
+            self.add(n, k, &footprints, sheets, open, (some.len(), counters));
         }
     }
 
@@ -272,73 +232,66 @@ impl<S: Recorded, const N: usize> Stage<S, N> for DeepStage<'_, S, N> {
         counters: &mut Counters,
     ) {
         let k = self.part.slab.first;
-        let layers = layers(self.part, k);
+        let footprints = footprints::<S, N>(self.part, k);
         let most = self.part.frame.sections.most() as i32;
         for some in carried.chunks(BATCH) {
             for (i, (v, first)) in some.iter().enumerate() {
-                self.batch.put(i, v, most - (k - first));
+                self.put(i, v, most - (k - first));
             }
-            let added = self.add(some.len(), k, &layers, sheets, open);
-            counters.splatted += added;
-            counters.culled += some.len() as u64 - added;
+            self.add(some.len(), k, &footprints, sheets, open, (some.len(), counters));
         }
     }
 }
 
-/// Footprints of the sheets from `k` that a voxel may reach, by slot.
+/// Footprints of the sheets from `k` that a voxel may reach.
 #[inline(always)]
-fn layers<'a, S: Recorded, const N: usize>(part: &'a Part<'_>, k: i32) -> [Layer<'a, S>; N] {
+fn footprints<'a, S: Recorded, const N: usize>(part: &'a Part<'_>, k: i32) -> Footprints<'a, S, N> {
     let last = (k + part.frame.sections.most() as i32 - 1).min(part.frame.footprints.last());
-    std::array::from_fn(|at| {
+    let all: [Footprint<'a>; N] = std::array::from_fn(|at| {
         // Sheets farther back than a voxel reaches are not asked for; any will do.
         let sheet = (k + after::<N>(slot::<N>(k), at)).min(last);
-        let footprint = part.frame.footprints.at(sheet).expect("no sheet of the part is clipped");
-        let axes = [0, 1].map(|axis| {
-            footprint.phases(axis).zip(S::across(&footprint, axis)).expect("footprints have tables")
-        });
-        Layer { scale: footprint.scale, axes }
-    })
+        part.frame.footprints.at(sheet).expect("no sheet of the part is clipped")
+    });
+    (Axes::new(part.frame, k, all), all.map(|footprint| footprint.scale))
 }
 
 impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
+    /// Takes over `v`, which has `left` sheets left, as voxel `i` of the batch.
+    #[inline(always)]
+    fn put(&mut self, i: usize, v: &DeepVoxel, left: i32) {
+        for axis in 0..3 {
+            self.places.eye[axis][i] = v.eye[axis];
+        }
+        let Batch { samples, normals, apart, .. } = &mut *self.batch;
+        (samples[i], normals[i], apart.left[i]) = (v.sample, v.normal, left);
+    }
+
     /// Where each section of the first `n` voxels of the batch lies, and the windows that hold all of a voxel's.
     #[inline(always)]
-    fn place(&mut self, n: usize, k: i32, layers: &[Layer<'_, S>; N]) {
+    fn place(&mut self, n: usize, k: i32, (axes, scales): &Footprints<'_, S, N>) {
         let Part { frame, rect, .. } = self.part;
-        let Batch { eye, apart, aside, .. } = &mut *self.batch;
-        let Apart { first, from, places, lo, hi, left, deep, .. } = apart;
+        let Places { eye, aside } = &mut *self.places;
+        let n = whole_registers(n);
+        let apart = &mut self.batch.apart;
         let view = &frame.view;
         let (most, phases) = (frame.sections.most() as i32, frame.sections.phases());
         for i in 0..n {
             let phase = view.depth_in_phases(eye[2][i]) & (phases - 1);
-            deep[i] = (phase * most + most - left[i]) as u32;
+            apart.deep[i] = (phase * most + most - apart.left[i]) as u32;
         }
-        let parallel = matches!(view.projection, Projection::Ortho { .. });
         let leaning = frame.leaning.as_ref();
         let row = leaning.map_or(0, Leaning::row);
         // Rows first, since columns may hang on them.
         for (axis, origin) in [(1, rect.y0), (0, rect.x0)] {
-            let (lo, hi) = (&mut lo[axis], &mut hi[axis]);
-            lo[..n].fill(i32::MAX);
-            hi[..n].fill(i32::MIN);
+            apart.begin(axis, n);
             let lean = leaning.filter(|leaning| leaning.most(axis) > 0.0);
-            let mut before = None;
-            for (at, layer) in layers.iter().enumerate() {
+            for at in 0..N {
                 let sheet = after::<N>(slot::<N>(k), at);
                 if sheet >= most {
                     continue;
                 }
-                let skewed = axis == 0 && row != 0;
-                // Where all sections lie in one place, it is that of sections, too, which a voxel has no more.
-                let alike = parallel && lean.is_none() && !skewed;
-                if let Some(before) = before.filter(|_| alike) {
-                    first[axis][at] = first[axis][before];
-                    from[axis][at] = from[axis][before];
-                    places[axis][at] = places[axis][before];
-                    continue;
-                }
-                before = Some(at);
-                let phases = &layer.axes[axis].0;
+                let Apart { first, from, places, deep, .. } = &mut *apart;
+                let (phases, scale) = (&axes.phases[axis][at], scales[at]);
                 let mut eye = &eye[axis];
                 if let Some(lean) = lean {
                     let table = lean.aside(axis);
@@ -349,118 +302,49 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
                     }
                     eye = aside;
                 }
+                if row != 0 {
+                    let place = &mut places[axis][at];
+                    for i in 0..n {
+                        let at = view.screen_along(axis, eye[i], scale);
+                        place[i] = (at - (i64::from(origin) << SUBPIXEL_BITS)) as i32;
+                    }
+                    if axis == 0 {
+                        let phases = [phases, &axes.phases[1][at]];
+                        apart.hold_skewed(at, n, (phases, row), sheet);
+                        continue;
+                    }
+                }
                 let (to_first, to_from) = (&mut first[axis][at], &mut from[axis][at]);
                 for i in 0..n {
-                    let at = view.screen_along(axis, eye[i], layer.scale);
+                    let at = view.screen_along(axis, eye[i], scale);
                     let (pixel, phase) =
                         ((at >> SUBPIXEL_BITS) as i32, at as i32 & (SUBPIXELS - 1));
                     to_first[i] = pixel - origin + phases.first(phase);
                     to_from[i] = phases.begin(phase as usize) as u32;
                 }
-                if row != 0 {
-                    let place = &mut places[axis][at];
-                    for i in 0..n {
-                        let at = view.screen_along(axis, eye[i], layer.scale);
-                        place[i] = (at - (i64::from(origin) << SUBPIXEL_BITS)) as i32;
-                    }
-                }
-                let len = phases.len as i32;
-                if skewed {
-                    // The first and the last row lie farthest aside.
-                    let high = layer.axes[1].0.len as i32;
-                    for i in 0..n {
-                        let (place, top) = (places.each_ref().map(|p| p[at][i]), first[1][at][i]);
-                        let [a, b] = [top, top + high - 1].map(|y| along_row(row, place, y));
-                        let first =
-                            |x: i32| (x >> SUBPIXEL_BITS) + phases.first(x & (SUBPIXELS - 1));
-                        if sheet < left[i] {
-                            lo[i] = lo[i].min(first(a.min(b)));
-                            hi[i] = hi[i].max(first(a.max(b)) + len);
-                        }
-                    }
-                    continue;
-                }
-                let first = &first[axis][at];
-                for i in 0..n {
-                    let here = alike | (sheet < left[i]);
-                    lo[i] = if here { lo[i].min(first[i]) } else { lo[i] };
-                    hi[i] = if here { hi[i].max(first[i] + len) } else { hi[i] };
-                }
+                apart.hold(axis, at, n, (phases.len as i32, sheet));
             }
-            // Inside the part.
-            for lo in &mut lo[..n] {
-                *lo = (*lo).max(0);
-            }
-            for hi in &mut hi[..n] {
-                *hi = (*hi).min(PART);
-            }
+            apart.cut(axis, n);
         }
     }
 
-    /// Adds the first `n` voxels of the batch to their sheets from `k` on, which `layers` are of; not
-    /// those around which all is shut. How many it added.
+    /// Adds the first `n` voxels of the batch, of `of` there were, to their sheets from `k` on.
     #[inline(always)]
     fn add(
         &mut self,
         n: usize,
         k: i32,
-        layers: &[Layer<'_, S>; N],
+        footprints: &Footprints<'_, S, N>,
         sheets: &mut Sheets<'_, S, N>,
         open: &OpenMask,
-    ) -> u64 {
-        let frame = self.part.frame;
-        self.place(n, k, layers);
-        let Batch { eye, samples, normals, apart, light, .. } = &mut *self.batch;
-        let Apart { lo, hi, kept, .. } = apart;
-        let most = frame.sections.most();
-        let (mut some, cull) = (0, frame.scene.quality.cull);
-        for i in 0..n {
-            let ([x0, y0], [x1, y1]) = ([lo[0][i], lo[1][i]], [hi[0][i], hi[1][i]]);
-            if x0 >= x1 || y0 >= y1 {
-                continue;
-            }
-            let columns = (u64::MAX >> (64 - (x1 - x0))) << x0;
-            let rows = [y0, y1].map(|y| y as usize);
-            if cull && !any_in_rows(self.simd, open.rows(), rows, columns) {
-                continue;
-            }
-            kept[some] = i as u32;
-            for eye in &mut *eye {
-                eye[some] = eye[i];
-            }
-            (samples[some], normals[some]) = (samples[i], normals[i]);
-            some += 1;
-        }
-        let eyes = eye.each_ref().map(|e| &e[..some]);
-        frame.payloads(&samples[..some], &normals[..some], Some(eyes), light);
-        let mut payloads = [S::Payload::default(); BATCH];
-        let [sigma, r, g, b] = light;
-        for (j, payload) in payloads[..some].iter_mut().enumerate() {
-            *payload = S::payload([sigma[j], r[j], g[j], b[j]]);
-        }
-        let apart = &self.batch.apart;
-        for &i in &apart.kept[..some] {
-            let (at, wide) = apart.window(i as usize % BATCH, S::STEP);
-            sheets.touch(k, at, wide);
-        }
-        let across = [0, 1].map(|axis| {
-            layers.each_ref().map(|layer| {
-                let (phases, weights) = layer.axes[axis];
-                Table { weights, len: phases.len }
-            })
-        });
-        let deep = Table { weights: S::deep(&frame.sections), len: most };
-        let phases = layers.each_ref().map(|layer| layer.axes[0].0);
-        let layers = Layers::<S, N> { across, deep, slot: slot::<N>(k) };
-        let voxels = (apart, &payloads[..some]);
-        let row = frame.leaning.as_ref().map_or(0, Leaning::row);
-        if row == 0 {
-            S::splat_apart(sheets.simd, sheets.records, voxels, &layers, &mut self.across);
-        } else {
-            let layers = (&layers, (row, &phases));
-            splat_skewed::<S, N>(sheets.simd, sheets.records, voxels, layers, &mut self.across);
-        }
-        some as u64
+        (of, counters): (usize, &mut Counters),
+    ) {
+        self.place(n, k, footprints);
+        let (part, eyes, across) =
+            ((self.part, open), Some(&mut self.places.eye), &mut self.across);
+        let added = self.batch.add(part, (n, k), &footprints.0, eyes, across, sheets);
+        counters.splatted += added;
+        counters.culled += of as u64 - added;
     }
 }
 
@@ -469,6 +353,7 @@ const _: () = assert!(EDGE == PART as usize && WINDOW <= EDGE);
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::leaning;
     use crate::scene::Scene;
     use crate::selftest;
     use glam::DVec3;
@@ -510,12 +395,21 @@ mod tests {
             for (y0, x0) in [0, 64, 128, 192, 256].into_iter().flat_map(|y| [(y, 0), (y, 64), (y, y)]) {
                 let part = Rect::new(x0, y0, x0 + PART, y0 + PART)
                     .intersect(&Rect::of_size([edge; 2]));
-                let Some(deep) = deep(&frame, &part, nearest).filter(|_| !part.is_empty()) else {
-                    continue;
+                let lean = leaning::takes(&frame);
+                let near = match parallel {
+                    false => deep(&frame, &part, nearest).map(|deep| deep.reach),
+                    true => lean.map(|lean| lean.flat.reach),
                 };
-                for p in &placed {
-                    let scale = deep.focal / (p.eye.z + deep.distance);
-                    let cell = frame.view.screen(p.eye.x, p.eye.y, scale).map(|at| at >> SUBPIXEL_BITS);
+                let Some(reach) = near.filter(|_| !part.is_empty()) else { continue };
+                for (local, p) in (0..).zip(&placed) {
+                    let at = match (lean, frame.view.projection) {
+                        (Some(lean), _) if parallel => lean.flat.places.at(corner.flat, local).0,
+                        (_, Projection::Persp { focal, distance }) => {
+                            frame.view.screen(p.eye.x, p.eye.y, focal / (p.eye.z + distance))
+                        }
+                        _ => unreachable!("a view that is neither"),
+                    };
+                    let cell = at.map(|at| at >> SUBPIXEL_BITS);
                     let (k, count) = frame.sections.span(p.z);
                     for sheet in k..k + count as i32 {
                         let footprint = frame.footprints.at(sheet).expect("none is clipped");
@@ -529,7 +423,7 @@ mod tests {
                         }
                         for (axis, (from, to)) in [x, y].into_iter().enumerate() {
                             let (from, to) = (i64::from(from) - cell[axis], i64::from(to) - 1 - cell[axis]);
-                            let reach = i64::from(deep.reach);
+                            let reach = i64::from(reach);
                             prop_assert!(-reach <= from && to <= reach, "{from} to {to} of {reach}");
                         }
                     }

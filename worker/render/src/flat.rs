@@ -20,7 +20,7 @@ use crate::place::Places;
 use crate::scene::{Flat, Frame};
 use crate::splat::records::{Recorded, Splat, Table, Tables, splat};
 use crate::splat::toss::{self, Sieve, Sifted, Tossing, prefetch};
-use crate::splat::{Simd, Work};
+use crate::splat::{Simd, Work, whole_registers};
 use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
@@ -70,7 +70,7 @@ pub(crate) struct RenderFlat<'a, S: Recorded, const N: usize> {
 
 /// Whether parts of `frame` may be rendered here.
 pub(crate) fn takes(frame: &Frame) -> Option<&Flat> {
-    frame.flat.as_ref().filter(|flat| 2 * flat.reach < PART)
+    frame.flat.as_ref().filter(|flat| 2 * flat.reach < PART && frame.leaning.is_none())
 }
 
 impl<S: Recorded, const N: usize> Work for RenderFlat<'_, S, N> {
@@ -92,6 +92,51 @@ impl<S: Recorded, const N: usize> Work for RenderFlat<'_, S, N> {
         let phases = [phases_x, phases_y];
         let stage = FlatStage { part: &part, simd, flat, phases, tables, tossing, batch };
         walk::<S, N, _>(&part, stage, (simd, store), queues, pixels, io);
+    }
+}
+
+/// What a voxel's brick is among a part's, which pixels are open, where voxels wait, and what is counted.
+pub(crate) type Asked<'a> = (usize, &'a OpenMask, &'a mut Queues<Splat>, &'a mut Counters);
+
+/// [`Stage::toss`] in a view that is flat; `phases` as [`Sieve::sift_ready`] takes them.
+#[inline(always)]
+pub(crate) fn toss(
+    part: &Part<'_>,
+    simd: Simd,
+    flat: &Flat,
+    phases: Option<&[Phases; 2]>,
+    tossing: &mut Tossing,
+    (which, open, queues, counters): Asked<'_>,
+) {
+    let Part { frame, rect, slab, .. } = part;
+    let Some((brick, corner)) = part.open_brick(which, open, counters) else { return };
+    if let Some(next) = part.peek(which + 1) {
+        prefetch(next);
+    }
+    let base = part.first_sheet(which);
+    let origin = [
+        i64::from(rect.x0 * SUBPIXELS),
+        i64::from(rect.y0 * SUBPIXELS),
+        i64::from(base) * i64::from(frame.sections.phases()),
+    ];
+    let sieve = Sieve {
+        places: toss::FlatBrick { places: &flat.places, from: Places::from(corner.flat, origin) },
+        open,
+        cull: frame.scene.quality.cull,
+        sections: &frame.sections,
+        // From the sheet that depths are counted from.
+        sheets: [slab.first, slab.end].map(|k| k - base),
+    };
+    let Sifted { reached, kept } = sieve.sift_ready(simd, brick, phases, tossing);
+    counters.tossed += kept as u64;
+    counters.culled += (reached - kept) as u64;
+    for (first, voxel) in tossing.ready(kept) {
+        let first = base + *first;
+        if first < slab.first {
+            queues.carried.push((*voxel, first));
+        } else {
+            queues.buckets[(first - slab.first) as usize].push(*voxel);
+        }
     }
 }
 
@@ -122,40 +167,15 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
         queues: &mut Queues<Splat>,
         counters: &mut Counters,
     ) {
-        let Part { frame, rect, slab, .. } = self.part;
-        let Some((brick, corner)) = self.part.open_brick(which, open, counters) else { return };
-        if let Some(next) = self.part.peek(which + 1) {
-            prefetch(next);
-        }
-        let base = self.part.first_sheet(which);
-        let origin = [
-            i64::from(rect.x0 * SUBPIXELS),
-            i64::from(rect.y0 * SUBPIXELS),
-            i64::from(base) * i64::from(frame.sections.phases()),
-        ];
-        let sieve = Sieve {
-            places: toss::FlatBrick {
-                places: &self.flat.places,
-                from: Places::from(corner.flat, origin),
-            },
-            open,
-            cull: frame.scene.quality.cull,
-            sections: &frame.sections,
-            // From the sheet that depths are counted from.
-            sheets: [slab.first, slab.end].map(|k| k - base),
-        };
-        let Sifted { reached, kept } =
-            sieve.sift_ready(self.simd, brick, &self.phases, self.tossing);
-        counters.tossed += kept as u64;
-        counters.culled += (reached - kept) as u64;
-        for (first, voxel) in self.tossing.ready(kept) {
-            let first = base + *first;
-            if first < slab.first {
-                queues.carried.push((*voxel, first));
-            } else {
-                queues.buckets[(first - slab.first) as usize].push(*voxel);
-            }
-        }
+        let phases = Some(&self.phases);
+        toss(
+            self.part,
+            self.simd,
+            self.flat,
+            phases,
+            self.tossing,
+            (which, open, queues, counters),
+        );
     }
 
     #[inline(always)]
@@ -186,7 +206,8 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
                 let [x, y] = v.first();
                 corners[y % EDGE] |= 1 << x;
             }
-            self.part.frame.payloads(&samples[..n], &normals[..n], None, light);
+            let all = &normals[..whole_registers(n)];
+            self.part.frame.payloads(&samples[..n], all, None, light);
             let [sigma, r, g, b] = light;
             let payloads = &mut payloads[..n];
             for (i, payload) in payloads.iter_mut().enumerate() {

@@ -192,6 +192,8 @@ impl Sections {
 pub(crate) struct Leaning {
     /// How far each section lies beside its voxel along x and y, in vox: as [`Sections::all`] has weights.
     aside: [Vec<f64>; 2],
+    /// The same in subpixels, where a view is parallel.
+    subpixels: [Vec<i32>; 2],
     /// [`Lean::row_fixed`].
     row: i64,
     /// The farthest that any section lies aside.
@@ -209,7 +211,8 @@ impl Leaning {
         let row = if shows(lean.row.abs() * view.kernel_radius.y) { lean.row_fixed() } else { 0 };
         let slopes =
             lean.depth.map(|slope| if shows(slope.abs() * deep.radius) { slope } else { 0.0 });
-        let mut leaning = Leaning { aside: [vec![], vec![]], row, most: [0.0; 2] };
+        let (aside, subpixels) = ([vec![], vec![]], [vec![], vec![]]);
+        let mut leaning = Leaning { aside, subpixels, row, most: [0.0; 2] };
         let mut behind = vec![0.0; sections.stride];
         for p in 0..sections.phases {
             let at = f64::from(p) / f64::from(sections.phases);
@@ -219,6 +222,8 @@ impl Leaning {
                 for behind in &behind {
                     let aside = slope * behind;
                     leaning.aside[axis].push(aside);
+                    let subpixels = libm::floor(aside * scale * f64::from(SUBPIXELS) + 0.5);
+                    leaning.subpixels[axis].push(subpixels as i32);
                     leaning.most[axis] = leaning.most[axis].max(aside.abs());
                 }
             }
@@ -235,6 +240,19 @@ impl Leaning {
     #[inline(always)]
     pub(crate) fn aside(&self, axis: usize) -> &[f64] {
         &self.aside[axis]
+    }
+
+    /// The same in subpixels, where a view is parallel.
+    #[inline(always)]
+    pub(crate) fn subpixels(&self, axis: usize) -> &[i32] {
+        &self.subpixels[axis]
+    }
+
+    /// Pixels at most that a section or an outermost row lies beside its voxel, for footprints of a `reach`; `scale`:
+    /// pixels a vox at most.
+    pub(crate) fn pixels(&self, scale: f64, reach: i32) -> f64 {
+        let row = self.row as f64 / 65536.0;
+        self.most[0].max(self.most[1]) * scale + row.abs() * f64::from(reach + 1)
     }
 
     /// The farthest of [those](Leaning::aside).
@@ -323,6 +341,12 @@ impl Phases {
     #[inline(always)]
     pub(crate) fn first(&self, p: i32) -> i32 {
         self.first.of(p)
+    }
+
+    /// First pixel of a footprint at a place in subpixels.
+    #[inline(always)]
+    pub(crate) fn first_at(&self, place: i32) -> i32 {
+        (place >> SUBPIXEL_BITS) + self.first(place & (SUBPIXELS - 1))
     }
 
     /// The phase from which on the first pixel is one farther.

@@ -18,6 +18,7 @@
 //! arithmetic of a closing sheet ([`sheet`]). This crate refuses to know threads, networks and
 //! clocks; whoever calls it has those.
 
+mod batch;
 pub mod closed;
 mod deep;
 pub mod estimate;
@@ -25,6 +26,7 @@ pub mod explain;
 mod flat;
 pub mod footprint;
 mod general;
+mod leaning;
 mod mask;
 mod model;
 pub mod outlook;

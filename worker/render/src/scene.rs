@@ -84,7 +84,7 @@ pub struct Frame {
     offsets: Box<[[f64; 512]; 3]>,
     /// Unit direction to the eye in world axes, where it is the same for all voxels.
     pub(crate) to_eye: Option<Vec3>,
-    /// Positions, where all sections of all voxels share one footprint.
+    /// Positions, where all sections of all voxels share one footprint, be they in one place or aside of it.
     pub(crate) flat: Option<Flat>,
     /// Where sections and rows lie, where the kernel leans.
     pub(crate) leaning: Option<Leaning>,
@@ -95,7 +95,7 @@ pub struct Frame {
 pub(crate) struct Flat {
     /// Where voxels land.
     pub(crate) places: Places,
-    /// Pixels that a footprint reaches at most from the one that holds its centre.
+    /// Pixels that a footprint reaches at most from the one that holds its voxel's centre.
     pub(crate) reach: i32,
 }
 
@@ -115,7 +115,7 @@ pub struct Placed {
     pub eye: DVec3,
     /// Depth in phases of a sheet ([`View::depth_phases`]).
     pub z: i32,
-    /// Screen position in subpixels, where it is the same in all sheets.
+    /// Screen position in subpixels, where the view is flat.
     screen: Option<[i64; 2]>,
 }
 
@@ -168,13 +168,20 @@ impl Frame {
         };
         let rule = Rule::new(q.compositing, unit, d / view.kernel_std.z, q.eps as f32);
         let footprints = Footprints::new(&view, q.kernel, range, spread, scene.shelf.clone());
-        let reach = footprints.at(0).and_then(|f| f.reach()).filter(|&r| r <= REACH_MOST);
+        let reach = footprints.at(0).and_then(|f| f.reach());
         let sections = scene.shelf.sections(&profile, d, phases, merged);
         let largest = (range.first..range.end).find_map(|k| view.scale_at(k)).unwrap_or(1.0);
         let leans = !view.kernel_lean.is_none();
         let leaning = leans.then(|| Leaning::new(&view, &profile, &sections, largest));
         let leaning = leaning.filter(Leaning::shows);
-        let reach = reach.filter(|_| leaning.is_none());
+        let reach = reach.map(|reach| match &leaning {
+            // A subpixel more, since what lies aside is rounded, too.
+            Some(leaning) => {
+                reach + libm::ceil(leaning.pixels(largest, reach) + 1.0 / 256.0) as i32
+            }
+            None => reach,
+        });
+        let reach = reach.filter(|&reach| reach <= REACH_MOST);
         let flat = reach.and_then(|reach| Some(Flat { places: Places::new(&view)?, reach }));
         let mut offsets = Box::new([[0.0; 512]; 3]);
         for i in 0..512u16 {
@@ -219,18 +226,28 @@ impl Frame {
     /// of [its](Sections::span).
     #[inline]
     pub fn screen(&self, placed: &Placed, k: i32, footprint: &Footprint<'_>) -> [i64; 2] {
-        if let Some(at) = placed.screen {
-            return at;
-        }
-        let mut at = [placed.eye.x, placed.eye.y];
-        if let Some(leaning) = &self.leaning {
+        let leaning = self.leaning.as_ref().map(|leaning| {
             let section = (k - self.sections.first(placed.z)) as usize;
-            let which = self.sections.row(placed.z).0 + section;
-            for (axis, at) in at.iter_mut().enumerate() {
-                *at += leaning.aside(axis)[which];
+            (leaning, self.sections.row(placed.z).0 + section)
+        });
+        match (placed.screen, leaning) {
+            (Some(at), None) => at,
+            (Some([x, y]), Some((leaning, which))) => {
+                let aside = [0, 1].map(|axis| i64::from(leaning.subpixels(axis)[which]));
+                [x + aside[0], y + aside[1]]
+            }
+            (None, leaning) => {
+                let aside = |axis| leaning.map_or(0.0, |(l, which)| l.aside(axis)[which]);
+                let [x, y] = [placed.eye.x + aside(0), placed.eye.y + aside(1)];
+                self.view.screen(x, y, footprint.scale)
             }
         }
-        self.view.screen(at[0], at[1], footprint.scale)
+    }
+
+    /// Whether all sections of a voxel have the same columns with the same weights.
+    pub(crate) fn has_columns_alike(&self) -> bool {
+        let leans = |leaning: &Leaning| leaning.most(0) > 0.0 || leaning.row() != 0;
+        self.flat.is_some() && !self.leaning.as_ref().is_some_and(leans)
     }
 
     /// Where the middle of row `y` is along x of a footprint [at](Frame::screen) a position.
@@ -246,10 +263,11 @@ impl Frame {
     /// [`Frame::payload`] of many voxels by their samples' bits, normals and, where each sees the eye
     /// in a direction of its own, eye coordinates by axis (opacities do not hang on gradients):
     /// extinctions, then each colour. Loops of a length that compilers do not know, so that they run
-    /// them on lanes.
+    /// them on lanes. There may be more normals than samples, for [whole registers](crate::splat::whole_registers); what comes of
+    /// those is not said.
     ///
     /// # Panics
-    /// If there are not as many normals or eyes as samples; in a perspective view without eyes.
+    /// If there are fewer normals or eyes than samples; in a perspective view without eyes.
     #[inline(always)]
     pub(crate) fn payloads<const MOST: usize>(
         &self,
@@ -258,11 +276,11 @@ impl Frame {
         eyes: Option<[&[f64]; 3]>,
         out: &mut [[f32; MOST]; 4],
     ) {
-        let n = samples.len().min(MOST);
-        assert_eq!(samples.len(), normals.len(), "a normal a sample");
+        let n = normals.len().min(MOST);
+        assert!(samples.len() <= n, "a normal a sample");
         let [sigma, colours @ ..] = out;
-        for i in 0..n {
-            let look = self.scene.classifier.look_of_bits(samples[i]);
+        for (i, &sample) in samples[..samples.len().min(n)].iter().enumerate() {
+            let look = self.scene.classifier.look_of_bits(sample);
             sigma[i] = look.sigma;
             for c in 0..3 {
                 colours[c][i] = look.rgb[c];

@@ -24,6 +24,7 @@
 use crate::deep::{self, RenderDeep};
 use crate::flat::{self, RenderFlat};
 use crate::general::{GeneralScratch, Kind, Queues, RenderGeneral};
+use crate::leaning::{self, RenderLeaning};
 use crate::mask::OpenMask;
 use crate::planes;
 use crate::region::{Coming, Memory};
@@ -100,6 +101,7 @@ struct Whole {
 #[derive(Default)]
 struct Waiting {
     flat: flat::Waiting,
+    leaning: leaning::Waiting,
     deep: deep::Waiting,
 }
 
@@ -331,6 +333,9 @@ impl Part<'_> {
         if let Some(view) = flat::takes(part.frame) {
             let waiting = &mut waiting.flat;
             simd.run(RenderFlat::<S, N> { part, view, simd, store, waiting, pixels, io });
+        } else if let Some(lean) = leaning::takes(part.frame) {
+            let waiting = &mut waiting.leaning;
+            simd.run(RenderLeaning::<S, N> { part, lean, simd, store, waiting, pixels, io });
         } else if let Some(deep) = deep::takes(&part) {
             let waiting = &mut waiting.deep;
             simd.run(RenderDeep::<S, N> { part, deep, simd, store, waiting, pixels, io });

@@ -335,6 +335,13 @@ impl Simd {
     }
 }
 
+/// `n`, or a few more for the last register of a loop to be full: what does not fill one is worked out one by
+/// one, and there may be as much of that as of the rest.
+#[inline(always)]
+pub(crate) fn whole_registers(n: usize) -> usize {
+    n.next_multiple_of(16)
+}
+
 /// Work that is compiled for every instruction set. Whatever it calls must be `inline(always)` to be
 /// compiled with it.
 pub trait Work {

@@ -284,13 +284,13 @@ impl Sieve<'_, FlatBrick<'_>> {
     }
 
     /// Sifts the voxels of `brick`, and packs those that are kept. `phases`: where weights across and down
-    /// lie.
+    /// lie; `None`: voxels are packed with their [places](Splat::aside_of).
     #[inline(always)]
     pub(crate) fn sift_ready(
         &self,
         simd: Simd,
         brick: &Brick,
-        phases: &[Phases; 2],
+        phases: Option<&[Phases; 2]>,
         tossing: &mut Tossing,
     ) -> Sifted {
         let sifted = self.sift(simd, brick, tossing);
@@ -313,11 +313,26 @@ impl Sieve<'_, FlatBrick<'_>> {
 
 /// Packs the first `kept`.
 #[inline(always)]
-fn make_ready(sections: &Sections, across: &[Phases; 2], kept: usize, tossing: &mut Tossing) {
+fn make_ready(
+    sections: &Sections,
+    across: Option<&[Phases; 2]>,
+    kept: usize,
+    tossing: &mut Tossing,
+) {
     let Tossing { at: [x, y, z], cells, samples, normals, windows, ready, .. } = tossing;
     let [x0, from_x, y0, from_y] = windows;
-    move_inside(&across[0], &x[..kept], x0, from_x);
-    move_inside(&across[1], &y[..kept], y0, from_y);
+    match across {
+        Some(across) => {
+            move_inside(&across[0], &x[..kept], x0, from_x);
+            move_inside(&across[1], &y[..kept], y0, from_y);
+        }
+        None => {
+            for i in 0..kept {
+                (x0[i], y0[i]) = (0, 0);
+                (from_x[i], from_y[i]) = (x[i] as u32 & 0xffff, y[i] as u32);
+            }
+        }
+    }
     let phases = sections.phases();
     for (j, ready) in ready[..kept].iter_mut().enumerate() {
         ready.place = x0[j] | y0[j] << 8 | cells[j] << 16;
@@ -384,7 +399,7 @@ mod wide {
                 #[target_feature(enable = $features)]
                 pub(in super::super) fn make_ready(
                     sections: &Sections,
-                    across: &[Phases; 2],
+                    across: Option<&[Phases; 2]>,
                     kept: usize,
                     tossing: &mut Tossing,
                 ) {
@@ -501,7 +516,7 @@ mod wide {
     #[inline(always)]
     unsafe fn make_ready<L: Lanes>(
         sections: &Sections,
-        across: &[Phases; 2],
+        across: Option<&[Phases; 2]>,
         kept: usize,
         tossing: &mut Tossing,
     ) {
@@ -511,8 +526,13 @@ mod wide {
             let ready = &mut ready[i..i + L::LANES];
             // SAFETY: as the line above shows; a voxel that is ready is four numbers.
             unsafe {
-                let (x0, from_x) = move_inside::<L>(&across[0], L::load(x.as_ptr().add(i).cast()));
-                let (y0, from_y) = move_inside::<L>(&across[1], L::load(y.as_ptr().add(i).cast()));
+                let (x, y) = (L::load(x.as_ptr().add(i).cast()), L::load(y.as_ptr().add(i).cast()));
+                let [(x0, from_x), (y0, from_y)] = match across {
+                    Some([x_phases, y_phases]) => {
+                        [move_inside::<L>(x_phases, x), move_inside::<L>(y_phases, y)]
+                    }
+                    None => [(L::set(0), L::and(x, L::set(0xffff))), (L::set(0), y)],
+                };
                 let place = L::or(x0, L::up(y0, 8));
                 let place = L::or(place, L::up(L::load(cells.as_ptr().add(i)), 16));
                 let rows = L::or(from_x, L::up(from_y, 16));
@@ -696,7 +716,7 @@ mod tests {
             which in 0..8u32, share in 0.0..1.0f64, seed in any::<u64>(),
             kind in 0..3u8, shaded in any::<bool>(), cull in any::<bool>(),
             open in prop::collection::vec((0..64usize, 0..64u32), 0..40),
-            begin in -16..16i32, count in 0..24i32, reach in 0..9i32,
+            begin in -16..16i32, count in 0..24i32, reach in 0..9i32, moved in any::<bool>(),
         ) {
             let flat = CameraProjection::Ortho { height };
             let frame = frame(DVec3::from_array(eye), flat, thickness);
@@ -715,9 +735,10 @@ mod tests {
                 sheets: [begin, begin + count],
             };
             let phases = [0, 1].map(|axis| footprint.phases(axis).expect("a table"));
+            let phases = moved.then_some(phases);
             let sift = |simd| {
                 let mut tossing = Tossing::default();
-                let sifted = sieve.sift_ready(simd, &brick, &phases, &mut tossing);
+                let sifted = sieve.sift_ready(simd, &brick, phases.as_ref(), &mut tossing);
                 let voxel = |(first, v): (&i32, &Splat)| (*first, v.place, v.rows, v.deep, v.sample);
                 (sifted, tossing.ready(sifted.kept).map(voxel).collect::<Vec<_>>())
             };

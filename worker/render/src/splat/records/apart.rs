@@ -10,6 +10,7 @@
 use super::{BySlot, MOST, Record, Recorded, RowAt, STRIDE, Table};
 use crate::footprint::{Lean, Phases};
 use crate::splat::Simd;
+use crate::tile::PART;
 use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
 
 /// Voxels that are placed, shaded and splatted together.
@@ -58,6 +59,59 @@ impl Default for Apart {
 }
 
 impl Apart {
+    /// Begins windows of the first `n` voxels along `axis`.
+    #[inline(always)]
+    pub(crate) fn begin(&mut self, axis: usize, n: usize) {
+        self.lo[axis][..n].fill(i32::MAX);
+        self.hi[axis][..n].fill(i32::MIN);
+    }
+
+    /// Has the windows hold footprints of `len` pixels along `axis` in a slot, of which voxels have some if they have
+    /// more than `sheets` left.
+    #[inline(always)]
+    pub(crate) fn hold(&mut self, axis: usize, slot: usize, n: usize, (len, sheets): (i32, i32)) {
+        let first = &self.first[axis][slot];
+        let (lo, hi) = (&mut self.lo[axis], &mut self.hi[axis]);
+        for i in 0..n {
+            let here = sheets < self.left[i];
+            lo[i] = lo[i].min(if here { first[i] } else { i32::MAX });
+            hi[i] = hi[i].max(if here { first[i] + len } else { i32::MIN });
+        }
+    }
+
+    /// The same across where rows lie aside of each other: `row` is [`Lean::row_fixed`], and rows are placed.
+    #[inline(always)]
+    pub(crate) fn hold_skewed(
+        &mut self,
+        slot: usize,
+        n: usize,
+        ([x, y], row): ([&Phases; 2], i64),
+        sheets: i32,
+    ) {
+        for i in 0..n {
+            let place = self.places.each_ref().map(|places| places[slot][i]);
+            // The first and the last row lie farthest aside.
+            let top = self.first[1][slot][i];
+            let ends = [top, top + y.len as i32 - 1];
+            let [a, b] = ends.map(|y| x.first_at(along_row(row, place, y)));
+            if sheets < self.left[i] {
+                self.lo[0][i] = self.lo[0][i].min(a.min(b));
+                self.hi[0][i] = self.hi[0][i].max(a.max(b) + x.len as i32);
+            }
+        }
+    }
+
+    /// Cuts windows along `axis` where the part ends.
+    #[inline(always)]
+    pub(crate) fn cut(&mut self, axis: usize, n: usize) {
+        for lo in &mut self.lo[axis][..n] {
+            *lo = (*lo).max(0);
+        }
+        for hi in &mut self.hi[axis][..n] {
+            *hi = (*hi).min(PART);
+        }
+    }
+
     /// First column and row of the window of voxel `i`, and how many there are. Columns begin at a
     /// multiple of `step`, and so many they are.
     #[inline(always)]
@@ -77,6 +131,8 @@ pub(crate) struct Layers<'a, S: Recorded, const N: usize> {
     pub(crate) deep: Table<'a, S::Depth>,
     /// Of the first of them.
     pub(crate) slot: usize,
+    /// Whether a voxel has the same columns in all of them, with the same weights.
+    pub(crate) alike: bool,
 }
 
 impl<'a, S: Recorded, const N: usize> Layers<'a, S, N> {
@@ -139,7 +195,7 @@ pub(super) fn splat_apart<S: Recorded, const N: usize>(
 ) {
     for (&i, &payload) in apart.kept.iter().zip(payloads) {
         let i = i as usize % BATCH;
-        let ([x, y], wide) = apart.window(i, S::STEP);
+        let ([x, y], wide) = apart.window(i, S::step::<N>());
         let deep = layers.depths(apart, i);
         for (axis, lo) in [x, y].into_iter().enumerate() {
             S::weave(simd, layers.rows(apart, i, axis, lo), wide[axis], &mut woven[axis]);
@@ -168,7 +224,7 @@ pub(crate) fn splat_skewed<S: Recorded, const N: usize>(
 ) {
     for (&i, &payload) in apart.kept.iter().zip(payloads) {
         let i = i as usize % BATCH;
-        let ([x, y], [wide, high]) = apart.window(i, S::STEP);
+        let ([x, y], [wide, high]) = apart.window(i, S::step::<N>());
         let deep = layers.depths(apart, i);
         let [columns, lines] = &mut *woven;
         S::weave(simd, layers.rows(apart, i, 1, y), high, lines);
@@ -198,16 +254,20 @@ pub(super) mod lines {
     use crate::splat::lanes::Lanes;
     use crate::splat::records::Recorded;
     use crate::tile::PART;
+    use std::ops::Range;
 
-    /// Columns that the windows of all voxels fit which are added, a multiple of the step; `None` if there
-    /// are windows of more than [`LINE`] pixels.
+    /// Columns that the windows of all voxels fit which are added, a multiple of the step, which is 1 or 2; `None` if
+    /// there are windows of more than [`LINE`] pixels.
     #[inline(always)]
     pub(crate) fn widest(apart: &Apart, kept: &[u32], step: i32) -> Option<usize> {
-        let mut most = [0; 2];
-        for &i in kept {
-            let (_, wide) = apart.window(i as usize % BATCH, step);
-            most = [most[0].max(wide[0]), most[1].max(wide[1])];
-        }
+        let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
+        // Of all, since loops over numbers beside each other are fast; few are left out.
+        let most = [0, 1].map(|axis| {
+            let step = if axis == 0 { step } else { 1 };
+            let ends = apart.lo[axis][..n].iter().zip(&apart.hi[axis][..n]);
+            let wide = ends.map(|(&lo, &hi)| (hi - (lo & -step) + step - 1) & -step);
+            wide.fold(0, i32::max) as usize
+        });
         most.iter().all(|&most| most <= LINE).then_some(most[0])
     }
 
@@ -230,6 +290,7 @@ pub(super) mod lines {
     impl<'a, W, const N: usize> Lines<'a, W, N> {
         /// Those across and down of the voxels in `kept`, which ascend. Windows begin at columns that are
         /// multiples of `step` and are moved inside to be `wide` columns; they may have any number of rows.
+        /// Columns that are alike are those of the first slot alone.
         ///
         /// # Safety
         /// For machines with the instructions of `L`.
@@ -243,23 +304,24 @@ pub(super) mod lines {
             let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
             // SAFETY: the caller has the instructions.
             unsafe {
-                let across = Lines::new::<L, S>(apart, layers, n, (0, wide, step));
-                let down = Lines::new::<L, S>(apart, layers, n, (1, 0, 1));
+                let slots = if layers.alike { layers.slot..layers.slot + 1 } else { 0..N };
+                let across = Lines::new::<L, S>(apart, layers, n, (0, slots, wide, step));
+                let down = Lines::new::<L, S>(apart, layers, n, (1, 0..N, 0, 1));
                 [across, down]
             }
         }
 
-        /// Those of the first `n` voxels along `axis`. See [`Lines::both`].
+        /// Those of the first `n` voxels along `axis` in some slots. See [`Lines::both`].
         #[inline(always)]
         unsafe fn new<L: Lanes, S: Recorded<Weight = W>>(
             apart: &Apart,
             layers: &Layers<'a, S, N>,
             n: usize,
-            (axis, wide, step): (usize, usize, i32),
+            (axis, slots, wide, step): (usize, Range<usize>, usize, i32),
         ) -> Lines<'a, W, N> {
             let (present, at) = ([[0; BATCH]; N], [[0; BATCH]; N]);
             let mut lines = Lines { present, at, weights: [&[]; N] };
-            for slot in 0..N {
+            for slot in slots {
                 let table = &layers.across[axis][slot];
                 lines.weights[slot] = table.weights;
                 let last = table.weights.len().checked_sub(table.len).expect("a row of the table");
@@ -332,35 +394,42 @@ mod tests {
 
     /// Where the sections of a voxel lie: around a pixel, each so far aside of it and with weights from here
     /// on, by axis; and how many sheets it has left.
-    type Somewhere = ([i32; 2], [[(i32, u32); 4]; 2], i32);
+    type Somewhere = ([i32; 2], [[(i32, u32); MOST]; 2], i32);
 
     fn somewhere() -> impl Strategy<Value = Somewhere> {
-        let aside = prop::array::uniform4((0..4i32, 0..150u32));
-        (prop::array::uniform2(-12..70i32), prop::array::uniform2(aside), 1..=4i32)
+        let aside = prop::array::uniform8((0..4i32, 0..150u32));
+        (prop::array::uniform2(-12..70i32), prop::array::uniform2(aside), 1..=MOST as i32)
     }
 
     /// Voxels by every instruction set; `lens`: widths of footprints by axis and slot.
-    fn add_everywhere<S: Recorded>(
+    fn add_everywhere<S: Recorded, const N: usize>(
         voxels: &[Somewhere],
-        lens: [[usize; 4]; 2],
-        slot: usize,
+        lens: [[usize; MOST]; 2],
+        (slot, alike): (usize, bool),
         weights: &[S::Weight],
         deep: &[S::Depth],
     ) -> Result<(), TestCaseError> {
-        let across = lens.map(|lens| lens.map(|len| Table { weights, len }));
-        let layers = Layers::<S, 4> { across, deep: Table { weights: deep, len: 4 }, slot };
+        let slot = slot % N;
+        // Columns that are alike are those of the first slot.
+        let of = |axis: usize, at: usize| if alike && axis == 0 { slot } else { at };
+        let across = [0, 1]
+            .map(|axis| std::array::from_fn(|at| Table { weights, len: lens[axis][of(axis, at)] }));
+        let deep = Table { weights: deep, len: N };
+        let layers = Layers::<S, N> { across, deep, slot, alike };
         let mut apart = Apart::default();
         let mut payloads = Vec::new();
         for (i, (around, aside, left)) in voxels.iter().enumerate() {
-            (apart.left[i], apart.deep[i]) = (*left, i as u32 % 5);
+            let left = *left.min(&(N as i32));
+            (apart.left[i], apart.deep[i]) = (left, i as u32 % 5);
             for axis in 0..2 {
                 let (mut lo, mut hi) = (i32::MAX, i32::MIN);
-                for at in 0..4 {
-                    let (by, from) = aside[axis][at];
+                for at in 0..N {
+                    let (by, from) = aside[axis][of(axis, at)];
                     let first = around[axis] + by;
                     (apart.first[axis][at][i], apart.from[axis][at][i]) = (first, from);
-                    if layers.after(at) < *left {
-                        (lo, hi) = (lo.min(first), hi.max(first + lens[axis][at] as i32));
+                    if layers.after(at) < left {
+                        let len = layers.across[axis][at].len as i32;
+                        (lo, hi) = (lo.min(first), hi.max(first + len));
                     }
                 }
                 (apart.lo[axis][i], apart.hi[axis][i]) = (lo.max(0), hi.min(64));
@@ -370,17 +439,17 @@ mod tests {
                 payloads.push(S::payload([31_000.0 - i as f32, 17_003.4, 77.7, i as f32]));
             }
         }
-        let before = [S::from_raw([11; 4]); 4];
+        let before = [S::from_raw([11; 4]); N];
         let run = |simd| {
-            let mut records: Vec<Record<S, 4>> = vec![before; STRIDE * 64];
-            let mut woven = [[[S::Weight::default(); 4]; WINDOW]; 2];
+            let mut records: Vec<Record<S, N>> = vec![before; STRIDE * 64];
+            let mut woven = [[[S::Weight::default(); N]; WINDOW]; 2];
             S::splat_apart(simd, &mut records, (&apart, &payloads), &layers, &mut woven);
             records
         };
         let want = run(Simd::plain());
         prop_assert_eq!(want.iter().any(|r| *r != before), !payloads.is_empty());
         for simd in Simd::all() {
-            prop_assert!(run(simd) == want, "{}", simd.name());
+            prop_assert!(run(simd) == want, "{} of {N}", simd.name());
         }
         Ok(())
     }
@@ -388,9 +457,9 @@ mod tests {
     proptest! {
         #[test]
         fn every_instruction_set_adds_voxels_as_one_by_one(
-            voxels in prop::collection::vec(somewhere(), 0..BATCH), slot in 0..4usize,
-            len in 1..WINDOW - 4, more in prop::array::uniform2(prop::array::uniform4(0..2usize)),
-            edge in any::<bool>(),
+            voxels in prop::collection::vec(somewhere(), 0..BATCH), slot in 0..MOST,
+            len in prop_oneof![1..8usize, 1..WINDOW - 4], alike in any::<bool>(),
+            more in prop::array::uniform2(prop::array::uniform8(0..2usize)), edge in any::<bool>(),
         ) {
             let mut voxels = voxels;
             if edge {
@@ -399,12 +468,14 @@ mod tests {
                     *around = around.map(|at| at.rem_euclid(12) - len as i32);
                 }
             }
-            let lens = more.map(|more| more.map(|more| len + more));
+            let (lens, at) = (more.map(|more| more.map(|more| len + more)), (slot, alike));
             let short: Vec<i16> = (0..190).map(|i| 4000 + (i * 7919 % 19_000) as i16).collect();
             let real: Vec<f32> = short.iter().map(|&w| f32::from(w) * 7.1e-5).collect();
             let taps: Vec<Tap> = real.iter().map(|&w| Tap::new(w)).collect();
-            add_everywhere::<i16>(&voxels, lens, slot, &short, &short)?;
-            add_everywhere::<i32>(&voxels, lens, slot, &taps, &real)?;
+            add_everywhere::<i16, 4>(&voxels, lens, at, &short, &short)?;
+            add_everywhere::<i32, 4>(&voxels, lens, at, &taps, &real)?;
+            add_everywhere::<i16, MOST>(&voxels, lens, at, &short, &short)?;
+            add_everywhere::<i32, MOST>(&voxels, lens, at, &taps, &real)?;
         }
     }
 }

@@ -283,7 +283,7 @@ pub(super) mod avx2 {
         woven: &mut Woven<Tap, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        let Some(wide) = lines::widest(apart, kept, i32::STEP).filter(|_| N == 4) else {
+        let Some(wide) = lines::widest(apart, kept, i32::step::<N>()).filter(|_| N == 4) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
         let at = (records, (apart, payloads), layers);
@@ -312,18 +312,18 @@ pub(super) mod avx2 {
     /// Windows of `WIDE` columns.
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn side_by_side<const WIDE: usize, const N: usize>(
+    fn side_by_side<const WIDE: usize, const N: usize, const ALIKE: bool>(
         (records, (apart, payloads), layers): ApartAt<'_, i32, N>,
     ) {
         let zero = _mm256_setzero_ps();
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
         let [across, down] =
-            unsafe { Lines::both::<Eight, _>(apart, kept, layers, (WIDE, i32::STEP)) };
+            unsafe { Lines::both::<Eight, _>(apart, kept, layers, (WIDE, i32::step::<N>())) };
         let [mut columns, mut rows] = [[Tap::default(); 64]; 2];
         for (&i, payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
-            let ([x, y], [_, high]) = apart.window(i, i32::STEP);
+            let ([x, y], [_, high]) = apart.window(i, i32::step::<N>());
             let x = lines::inside(x, WIDE);
             let z = &layers.deep.weights[apart.deep[i] as usize..][..apart.left[i] as usize];
             let mut deep = [0.0; 4];
@@ -339,13 +339,19 @@ pub(super) mod avx2 {
                 // Negative sections there are none.
                 sections[two] = _mm256_max_ps(_mm256_mul_ps(payload, wz[two]), zero);
             }
-            line(&across, i, WIDE, &mut columns);
-            line(&down, i, high, &mut rows);
             let mut wx = [[zero; 2]; WIDE];
-            for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<4>().0) {
-                let [low, high, ..] = spread::<4>(&w.map(Tap::get));
-                *wx = [low, high];
+            if ALIKE {
+                for (wx, w) in wx.iter_mut().zip(&across.one_by_one(layers.slot, i)) {
+                    *wx = [_mm256_set1_ps(w.get()); 2];
+                }
+            } else {
+                line(&across, i, WIDE, &mut columns);
+                for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<4>().0) {
+                    let [low, high, ..] = spread::<4>(&w.map(Tap::get));
+                    *wx = [low, high];
+                }
             }
+            line(&down, i, high, &mut rows);
             let of_rows = records[y * STRIDE + x..].chunks_mut(STRIDE).zip(rows.as_chunks::<4>().0);
             for (row, wy) in of_rows.take(high) {
                 let [low, high, ..] = spread::<4>(&wy.map(Tap::get));
@@ -562,155 +568,107 @@ pub(super) mod avx512 {
         woven: &mut Woven<Tap, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        let Some(wide) = lines::widest(apart, kept, i32::STEP) else {
+        let Some(wide) = lines::widest(apart, kept, i32::step::<N>()) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
         let at = (records, (apart, payloads), layers);
-        if N == 8 {
-            return by_window!(wide, eight_slots, N, at);
-        }
         by_window!(wide, side_by_side, N, at)
     }
 
-    /// Weights of voxel `i` in four slots, pixel by pixel: four pixels a register.
+    /// Weights of voxel `i` in four slots, the first or the second ones, pixel by pixel: four pixels a
+    /// register.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn line<const N: usize>(lines: &Lines<'_, Tap, N>, i: usize) -> [__m512; 4] {
+    fn four_slots<const N: usize>(lines: &Lines<'_, Tap, N>, i: usize, half: usize) -> [__m512; 4] {
         let mut slots = [_mm512_setzero_si512(); 4];
         for (slot, line) in slots.iter_mut().enumerate() {
-            let (present, from) = lines.of(slot, i);
+            let (present, from) = lines.of(4 * half + slot, i);
             // SAFETY: a tap is a float; lanes that are not present are not read, and those that are lie
             // in the table.
             *line = unsafe { _mm512_maskz_loadu_epi32(present as u16, from.cast()) };
         }
-        let [a, b, c, d] = by_column(slots);
-        let float = _mm512_castsi512_ps;
-        [float(a), float(b), float(c), float(d)]
+        by_column(slots).map(|four| _mm512_castsi512_ps(four))
     }
 
-    /// Weights of voxel `i` in slots from `from`, four of them.
+    /// Weights of voxel `i` in depth, each slot's for its four channels: four slots a register.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn four_slots<const N: usize>(
-        lines: &Lines<'_, Tap, N>,
+    fn deep<const N: usize>(
+        layers: &Layers<'_, i32, N>,
+        apart: &Apart,
         i: usize,
-        from: usize,
-    ) -> [__m512i; 4] {
-        let mut slots = [_mm512_setzero_si512(); 4];
-        for (slot, line) in slots.iter_mut().enumerate() {
-            let (present, at) = lines.of((from + slot) % N, i);
-            // SAFETY: a tap is a float; lanes that are not present are not read, and those that are lie
-            // in the table.
-            *line = unsafe { _mm512_maskz_loadu_epi32(present as u16, at.cast()) };
+        turn: __m512i,
+    ) -> [__m512; PARTS] {
+        if N != 4 {
+            return spread::<N>(&layers.depths(apart, i));
         }
-        by_column(slots)
+        let z = &layers.deep.weights[apart.deep[i] as usize..][..apart.left[i] as usize];
+        let present = (1u16 << z.len().min(4)) - 1;
+        // SAFETY: lanes that are not present are not read.
+        let z = unsafe { _mm512_maskz_loadu_ps(present, z.as_ptr()) };
+        [_mm512_permutexvar_ps(turn, z); PARTS]
     }
 
-    /// Windows of `WIDE` columns, of eight slots: two registers a record.
+    /// Windows of `WIDE` columns, four slots after the other.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn eight_slots<const WIDE: usize, const N: usize>(
+    fn side_by_side<const WIDE: usize, const N: usize, const ALIKE: bool>(
         (records, (apart, payloads), layers): ApartAt<'_, i32, N>,
     ) {
         let zero = _mm512_setzero_ps();
-        let float = _mm512_castsi512_ps;
         let lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
         let slot = _mm512_srli_epi32::<2>(lane);
+        // Which of four weights in depth a lane takes: that of its slot.
+        let turn = _mm512_sub_epi32(slot, _mm512_set1_epi32(layers.slot as i32));
+        let turn = _mm512_and_si512(turn, _mm512_set1_epi32(3));
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
         let [across, down] =
-            unsafe { Lines::both::<Sixteen, _>(apart, kept, layers, (WIDE, i32::STEP)) };
+            unsafe { Lines::both::<Sixteen, _>(apart, kept, layers, (WIDE, i32::step::<N>())) };
         for (&i, payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
-            let ([x, y], [_, high]) = apart.window(i, i32::STEP);
+            let ([x, y], [_, high]) = apart.window(i, i32::step::<N>());
             let x = lines::inside(x, WIDE);
-            let wz = spread::<N>(&layers.depths(apart, i));
             // SAFETY: four floats are 16 bytes.
             let payload = _mm512_broadcast_f32x4(unsafe { _mm_loadu_ps(payload.as_ptr()) });
-            // Half of the slots after the other; negative sections there are none.
-            for half in 0..2 {
-                let section = _mm512_max_ps(_mm512_mul_ps(payload, wz[half]), zero);
-                let columns = four_slots(&across, i, 4 * half);
+            let deep = deep(layers, apart, i, turn);
+            for half in 0..N / 4 {
+                // Negative sections there are none.
+                let section = _mm512_max_ps(_mm512_mul_ps(payload, deep[half]), zero);
                 let mut wx = [zero; WIDE];
-                for c in 0..WIDE {
-                    let from = _mm512_add_epi32(slot, _mm512_set1_epi32(4 * (c as i32 % 4)));
-                    wx[c] = _mm512_permutexvar_ps(from, float(columns[c / 4]));
+                if ALIKE {
+                    let (present, from) = across.of(layers.slot, i);
+                    // SAFETY: a tap is a float; lanes that are not present are not read, and those that are
+                    // lie in the table.
+                    let line = unsafe { _mm512_maskz_loadu_ps(present as u16, from.cast()) };
+                    for c in 0..WIDE {
+                        wx[c] = _mm512_permutexvar_ps(_mm512_set1_epi32(c as i32), line);
+                    }
+                } else {
+                    let columns = four_slots(&across, i, half);
+                    for c in 0..WIDE {
+                        let from = _mm512_add_epi32(slot, _mm512_set1_epi32(4 * (c as i32 % 4)));
+                        wx[c] = _mm512_permutexvar_ps(from, columns[c / 4]);
+                    }
                 }
-                let rows = four_slots(&down, i, 4 * half);
+                let rows = four_slots(&down, i, half);
                 let mut from = slot;
                 let of_rows = records[y * STRIDE + x..].chunks_mut(STRIDE).take(high);
                 for (j, row) in of_rows.enumerate() {
-                    let wy = _mm512_permutexvar_ps(from, float(rows[j / 4 % 4]));
+                    let wy = _mm512_permutexvar_ps(from, rows[j / 4 % 4]);
                     from = _mm512_add_epi32(from, _mm512_set1_epi32(4));
                     let of_row = _mm512_mul_ps(section, wy);
                     let row = row.first_chunk_mut::<WIDE>().expect("a window inside the part");
                     for c in 0..WIDE {
                         let at: *mut __m512i = row[c].as_mut_ptr().cast();
                         let add = _mm512_mul_ps(of_row, wx[c]);
-                        // SAFETY: sixteen sums are 64 bytes, half of a record, and borrowed for us alone.
+                        // SAFETY: sixteen sums of four slots are 64 bytes, and borrowed for us alone.
                         unsafe {
                             let at = at.add(half);
                             let sums = _mm512_loadu_si512(at);
                             let sums = _mm512_add_epi32(sums, _mm512_cvtps_epi32(add));
                             _mm512_storeu_si512(at, sums);
                         }
-                    }
-                }
-            }
-        }
-    }
-
-    /// Windows of `WIDE` columns.
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    fn side_by_side<const WIDE: usize, const N: usize>(
-        (records, (apart, payloads), layers): ApartAt<'_, i32, N>,
-    ) {
-        let zero = _mm512_setzero_ps();
-        let lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-        let slot = _mm512_srli_epi32::<2>(lane);
-        // Which weight in depth a lane takes: that of its slot.
-        let turn = _mm512_sub_epi32(slot, _mm512_set1_epi32(layers.slot as i32));
-        let turn = _mm512_and_si512(turn, _mm512_set1_epi32(3));
-        let kept = &apart.kept[..payloads.len()];
-        // SAFETY: these are the instructions.
-        let [across, down] =
-            unsafe { Lines::both::<Sixteen, _>(apart, kept, layers, (WIDE, i32::STEP)) };
-        for (&i, payload) in kept.iter().zip(payloads) {
-            let i = i as usize % BATCH;
-            let ([x, y], [_, high]) = apart.window(i, i32::STEP);
-            let x = lines::inside(x, WIDE);
-            let z = &layers.deep.weights[apart.deep[i] as usize..][..apart.left[i] as usize];
-            let present = (1u16 << z.len().min(4)) - 1;
-            // SAFETY: lanes that are not present are not read; four floats are 16 bytes.
-            let (z, payload) = unsafe {
-                (_mm512_maskz_loadu_ps(present, z.as_ptr()), _mm_loadu_ps(payload.as_ptr()))
-            };
-            let section =
-                _mm512_mul_ps(_mm512_broadcast_f32x4(payload), _mm512_permutexvar_ps(turn, z));
-            // Negative sections there are none.
-            let section = _mm512_max_ps(section, zero);
-            let columns = line(&across, i);
-            let mut wx = [zero; WIDE];
-            for c in 0..WIDE {
-                let from = _mm512_add_epi32(slot, _mm512_set1_epi32(4 * (c as i32 % 4)));
-                wx[c] = _mm512_permutexvar_ps(from, columns[c / 4]);
-            }
-            let rows = line(&down, i);
-            let mut from = slot;
-            for (j, row) in records[y * STRIDE + x..].chunks_mut(STRIDE).take(high).enumerate() {
-                let wy = _mm512_permutexvar_ps(from, rows[j / 4 % 4]);
-                from = _mm512_add_epi32(from, _mm512_set1_epi32(4));
-                let of_row = _mm512_mul_ps(section, wy);
-                let row = row.first_chunk_mut::<WIDE>().expect("a window inside the part");
-                for c in 0..WIDE {
-                    let at: *mut __m512i = row[c].as_mut_ptr().cast();
-                    let add = _mm512_mul_ps(of_row, wx[c]);
-                    // SAFETY: sixteen sums are 64 bytes, and borrowed for us alone.
-                    unsafe {
-                        let sums = _mm512_loadu_si512(at);
-                        let sums = _mm512_add_epi32(sums, _mm512_cvtps_epi32(add));
-                        _mm512_storeu_si512(at, sums);
                     }
                 }
             }

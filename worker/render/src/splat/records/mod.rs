@@ -9,15 +9,24 @@
 #[cfg(target_arch = "x86_64")]
 macro_rules! by_window {
     ($wide:expr, $side_by_side:ident, $n:ident, $at:expr) => {
-        match $wide {
-            0..=6 => $side_by_side::<6, $n>($at),
-            7 => $side_by_side::<7, $n>($at),
-            8 => $side_by_side::<8, $n>($at),
-            9 => $side_by_side::<9, $n>($at),
-            10 => $side_by_side::<10, $n>($at),
-            11 | 12 => $side_by_side::<12, $n>($at),
-            13 | 14 => $side_by_side::<14, $n>($at),
-            _ => $side_by_side::<16, $n>($at),
+        match ($wide, $at.2.alike) {
+            // Footprints of one width.
+            (0..=4, true) => $side_by_side::<4, $n, true>($at),
+            (5, true) => $side_by_side::<5, $n, true>($at),
+            (6, true) => $side_by_side::<6, $n, true>($at),
+            (7 | 8, true) => $side_by_side::<8, $n, true>($at),
+            (9 | 10, true) => $side_by_side::<10, $n, true>($at),
+            (11 | 12, true) => $side_by_side::<12, $n, true>($at),
+            (_, true) => $side_by_side::<16, $n, true>($at),
+            // Windows that hold several, of any.
+            (0..=6, false) => $side_by_side::<6, $n, false>($at),
+            (7, false) => $side_by_side::<7, $n, false>($at),
+            (8, false) => $side_by_side::<8, $n, false>($at),
+            (9, false) => $side_by_side::<9, $n, false>($at),
+            (10, false) => $side_by_side::<10, $n, false>($at),
+            (11 | 12, false) => $side_by_side::<12, $n, false>($at),
+            (13 | 14, false) => $side_by_side::<14, $n, false>($at),
+            (_, false) => $side_by_side::<16, $n, false>($at),
         }
     };
 }
@@ -91,7 +100,8 @@ pub(crate) struct Splat {
     /// First column and row of its footprint, a byte each, and above them the pixel of the part that
     /// is nearest to its centre: 64 times the row, and the column.
     pub(crate) place: u32,
-    /// Where its weights across begin and, above that, those down.
+    /// Where its weights across begin and, above that, those down; of a voxel whose sections lie aside of each
+    /// other, where it is itself.
     pub(crate) rows: u32,
     /// Depth in phases from its sheet's front and, above that, its normal.
     pub(crate) deep: u32,
@@ -125,6 +135,18 @@ impl Splat {
         (self.deep >> 16) as u16
     }
 
+    /// Where it is itself, in subpixels from the part's corner: less than 2^15 of them.
+    #[inline(always)]
+    pub(crate) fn aside_of(&self) -> [i32; 2] {
+        [i32::from(self.rows as i16), self.rows as i32 >> 16]
+    }
+
+    /// Its depth in phases from its sheet's front.
+    #[inline(always)]
+    pub(crate) fn phase(&self) -> u32 {
+        self.deep & 0xffff
+    }
+
     /// Record of its first row and column.
     #[inline(always)]
     pub(crate) fn at(&self) -> usize {
@@ -136,7 +158,7 @@ impl Splat {
     #[inline(always)]
     pub(crate) fn weights<'a, S: Recorded>(&self, tables: &Tables<'a, S>) -> Weights<'a, S> {
         let [x, y] = &tables.across;
-        let z = (self.deep & 0xffff) as usize * tables.deep.len;
+        let z = self.phase() as usize * tables.deep.len;
         let rows = [self.rows & 0xffff, self.rows >> 16].map(|row| row as usize);
         (x.row(rows[0]), y.row(rows[1]), tables.deep.row(z))
     }
@@ -209,10 +231,11 @@ pub(crate) trait Recorded: Accumulate {
     type Depth: Copy + Default;
     /// Extinction and colours of a voxel.
     type Payload: Copy + Default;
-    /// Windows begin at a column that is a multiple of it, and have as many: records that may share a
-    /// register.
-    const STEP: i32 = 1;
-
+    /// Windows begin at a column that is a multiple of it, and have as many: records of `N` sheets that may
+    /// share a register.
+    fn step<const N: usize>() -> i32 {
+        1
+    }
     /// The weights of a footprint with tables across an axis.
     fn across<'a>(footprint: &Footprint<'a>, axis: usize) -> Option<&'a [Self::Weight]>;
     /// The weights in depth, [`Sections::most`] a phase.
@@ -321,7 +344,10 @@ impl Recorded for i16 {
     four_sums!();
     type Depth = i16;
     type Payload = u64;
-    const STEP: i32 = 2;
+
+    fn step<const N: usize>() -> i32 {
+        if N == 4 { 2 } else { 1 }
+    }
 
     fn across<'a>(footprint: &Footprint<'a>, axis: usize) -> Option<&'a [i16]> {
         footprint.all_fixed(axis)

@@ -299,7 +299,7 @@ pub(super) mod avx2 {
     /// Windows of `WIDE` columns.
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn side_by_side<const WIDE: usize, const N: usize>(
+    fn side_by_side<const WIDE: usize, const N: usize, const ALIKE: bool>(
         (records, (apart, payloads), layers): ApartAt<'_, i16, N>,
     ) {
         let zero = _mm256_setzero_si256();
@@ -321,12 +321,18 @@ pub(super) mod avx2 {
             let z = _mm256_broadcastsi128_si256(unsafe { _mm_loadl_epi64(deep.as_ptr().cast()) });
             let section = _mm256_set1_epi64x(payload as i64);
             let section = _mm256_mulhrs_epi16(section, _mm256_shuffle_epi8(z, turn));
-            line(&across, i, &mut columns);
-            line(&down, i, &mut rows);
             let mut wx = [zero; WIDE];
-            for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<4>().0) {
-                [*wx, _] = spread::<4>(w);
+            if ALIKE {
+                for (wx, &w) in wx.iter_mut().zip(&across.one_by_one(layers.slot, i)) {
+                    *wx = _mm256_set1_epi16(w);
+                }
+            } else {
+                line(&across, i, &mut columns);
+                for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<4>().0) {
+                    [*wx, _] = spread::<4>(w);
+                }
             }
+            line(&down, i, &mut rows);
             let of_rows = records[y * STRIDE + x..].chunks_mut(STRIDE).zip(rows.as_chunks::<4>().0);
             for (row, wy) in of_rows.take(high) {
                 let [wy, _] = spread::<4>(wy);
@@ -441,6 +447,22 @@ pub(super) mod avx512 {
             let sums = _mm512_loadu_si512(at);
             let sums = _mm512_adds_epi16(sums, _mm512_mulhrs_epi16(row, w));
             _mm512_storeu_si512(at, sums);
+        }
+    }
+
+    /// [`add`] to the first `WIDE` records of eight sheets of a row.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn add_row<const WIDE: usize, const N: usize>(
+        row: &mut [Record<i16, N>],
+        section: __m512i,
+        wx: &[__m512i; WIDE],
+    ) {
+        let row = row.first_chunk_mut::<WIDE>().expect("a window inside the part");
+        let at: *mut __m512i = row.as_mut_ptr().cast();
+        for (i, &wx) in wx.iter().enumerate() {
+            // SAFETY: so many registers are the records of `row`, borrowed for us alone.
+            unsafe { add(at.add(i), section, wx) };
         }
     }
 
@@ -577,21 +599,14 @@ pub(super) mod avx512 {
         woven: &mut Woven<i16, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        let Some(wide) = lines::widest(apart, kept, i16::STEP) else {
+        let Some(wide) = lines::widest(apart, kept, i16::step::<N>()) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
         let at = (records, (apart, payloads), layers);
         if N == 8 {
-            return by_window!(wide, eight_slots, N, at);
-        }
-        match wide / 2 {
-            0..=2 => side_by_side::<2, N>(at),
-            3 => side_by_side::<3, N>(at),
-            4 => side_by_side::<4, N>(at),
-            5 => side_by_side::<5, N>(at),
-            6 => side_by_side::<6, N>(at),
-            7 => side_by_side::<7, N>(at),
-            _ => side_by_side::<8, N>(at),
+            by_window!(wide, eight_slots, N, at)
+        } else {
+            by_window!(wide, four_slots, N, at)
         }
     }
 
@@ -626,70 +641,117 @@ pub(super) mod avx512 {
         eight_by_column(slots, to);
     }
 
+    /// Weights of voxel `i` across where they are alike.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn one_line<const N: usize>(lines: &Lines<'_, i16, N>, slot: usize, i: usize) -> __m512i {
+        let (present, at) = lines.of(slot, i);
+        // SAFETY: lanes that are not present are not read, and those that are lie in the table.
+        unsafe { _mm512_maskz_loadu_epi16(present, at) }
+    }
+
+    /// Weights of voxel `i` in eight slots, of eight pixels: slot by slot, four slots a register.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn eights<const N: usize>(lines: &Lines<'_, i16, N>, i: usize) -> [__m512i; 2] {
+        let mut slots = [_mm_setzero_si128(); 8];
+        for (slot, line) in slots[..N].iter_mut().enumerate() {
+            let (present, at) = lines.of(slot, i);
+            // SAFETY: lanes that are not present are not read, and those that are lie in the table.
+            *line = unsafe { _mm_maskz_loadu_epi16(present as u8, at) };
+        }
+        let [a, b, c, d, e, f, g, h] = slots;
+        [[a, b, c, d], [e, f, g, h]].map(|[a, b, c, d]| {
+            let low = _mm256_inserti128_si256::<1>(_mm256_castsi128_si256(a), b);
+            let high = _mm256_inserti128_si256::<1>(_mm256_castsi128_si256(c), d);
+            _mm512_inserti64x4::<1>(_mm512_castsi256_si512(low), high)
+        })
+    }
+
     /// Windows of `WIDE` columns, of eight slots: a register a record.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn eight_slots<const WIDE: usize, const N: usize>(
+    fn eight_slots<const WIDE: usize, const N: usize, const ALIKE: bool>(
         (records, (apart, payloads), layers): ApartAt<'_, i16, N>,
     ) {
         let turn = words(|lane| (lane / 4 + 2 * N - layers.slot) % N);
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
         let [across, down] =
-            unsafe { Lines::both::<Sixteen, _>(apart, kept, layers, (WIDE, i16::STEP)) };
+            unsafe { Lines::both::<Sixteen, _>(apart, kept, layers, (WIDE, i16::step::<N>())) };
         let [mut columns, mut rows] = [[0; 128]; 2];
+        // Which of [`eights`] lanes take in the first row: those of their slots.
+        let first = words(|lane| lane / 4 * 8);
         for (&i, &payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
-            let ([x, y], [_, high]) = apart.window(i, i16::STEP);
+            let ([x, y], [_, high]) = apart.window(i, i16::step::<N>());
             let x = lines::inside(x, WIDE);
             let z = &layers.deep.weights[apart.deep[i] as usize..][..apart.left[i] as usize];
             let section = _mm512_set1_epi64(payload as i64);
             let section = _mm512_mulhrs_epi16(section, _mm512_permutexvar_epi16(turn, load(z)));
-            line_of_eight(&across, i, &mut columns);
-            line_of_eight(&down, i, &mut rows);
             let mut wx = [_mm512_setzero_si512(); WIDE];
-            for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<8>().0) {
-                *wx = spread(w);
+            if ALIKE {
+                let line = one_line(&across, layers.slot, i);
+                for (c, wx) in wx.iter_mut().enumerate() {
+                    *wx = _mm512_permutexvar_epi16(_mm512_set1_epi16(c as i16), line);
+                }
+            } else {
+                line_of_eight(&across, i, &mut columns);
+                for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<8>().0) {
+                    *wx = spread(w);
+                }
             }
-            let of_rows = records[y * STRIDE + x..].chunks_mut(STRIDE).zip(rows.as_chunks::<8>().0);
-            for (row, wy) in of_rows.take(high) {
-                let section = _mm512_mulhrs_epi16(section, spread(wy));
-                let row = row.first_chunk_mut::<WIDE>().expect("a window inside the part");
-                let at: *mut __m512i = row.as_mut_ptr().cast();
-                for (i, wx) in wx.into_iter().enumerate() {
-                    // SAFETY: so many registers are the records of `row`, borrowed for us alone.
-                    unsafe { add(at.add(i), section, wx) };
+            let of_rows = records[y * STRIDE + x..].chunks_mut(STRIDE).take(high);
+            if high <= 8 {
+                let ([low, behind], mut from) = (eights(&down, i), first);
+                for row in of_rows {
+                    let wy = _mm512_permutex2var_epi16(low, from, behind);
+                    from = _mm512_add_epi16(from, _mm512_set1_epi16(1));
+                    add_row(row, _mm512_mulhrs_epi16(section, wy), &wx);
+                }
+            } else {
+                line_of_eight(&down, i, &mut rows);
+                for (row, wy) in of_rows.zip(rows.as_chunks::<8>().0) {
+                    add_row(row, _mm512_mulhrs_epi16(section, spread(wy)), &wx);
                 }
             }
         }
     }
 
-    /// Windows of `U` registers, of two columns each.
+    /// Windows of `WIDE` columns, of four slots: two a register.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn side_by_side<const U: usize, const N: usize>(
+    fn four_slots<const WIDE: usize, const N: usize, const ALIKE: bool>(
         (records, (apart, payloads), layers): ApartAt<'_, i16, N>,
     ) {
         let turn = words(|lane| (lane / 4 + 2 * N - layers.slot) % N);
         // Which weight of a line's 64 a lane takes: that of its slot for its column, or for the row.
-        let column = words(|lane| lane / 4 % N * LINE + lane / (4 * N));
+        let column = words(|lane| if ALIKE { 0 } else { lane / 4 % N * LINE } + lane / (4 * N));
         let row = words(|lane| lane / 4 % N * LINE);
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
         let [across, down] =
-            unsafe { Lines::both::<Sixteen, _>(apart, kept, layers, (2 * U, i16::STEP)) };
+            unsafe { Lines::both::<Sixteen, _>(apart, kept, layers, (WIDE, i16::step::<N>())) };
         for (&i, &payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
-            let ([x, y], [_, high]) = apart.window(i, i16::STEP);
-            let x = lines::inside(x, 2 * U);
+            let ([x, y], [_, high]) = apart.window(i, i16::step::<N>());
+            let x = lines::inside(x, WIDE);
             let z = &layers.deep.weights[apart.deep[i] as usize..][..apart.left[i] as usize];
             let section = _mm512_set1_epi64(payload as i64);
             let section = _mm512_mulhrs_epi16(section, _mm512_permutexvar_epi16(turn, load(z)));
-            let [low, behind] = line(&across, i);
-            let (mut wx, mut from) = ([_mm512_setzero_si512(); U], column);
-            for wx in &mut wx {
-                *wx = _mm512_permutex2var_epi16(low, from, behind);
-                from = _mm512_add_epi16(from, _mm512_set1_epi16(2));
+            let (mut wx, mut from) = ([_mm512_setzero_si512(); WIDE], column);
+            if ALIKE {
+                let line = one_line(&across, layers.slot, i);
+                for wx in &mut wx[..WIDE / 2] {
+                    *wx = _mm512_permutexvar_epi16(from, line);
+                    from = _mm512_add_epi16(from, _mm512_set1_epi16(2));
+                }
+            } else {
+                let [low, behind] = line(&across, i);
+                for wx in &mut wx[..WIDE / 2] {
+                    *wx = _mm512_permutex2var_epi16(low, from, behind);
+                    from = _mm512_add_epi16(from, _mm512_set1_epi16(2));
+                }
             }
             let [low, behind] = line(&down, i);
             let mut from = row;
@@ -697,9 +759,9 @@ pub(super) mod avx512 {
                 let wy = _mm512_permutex2var_epi16(low, from, behind);
                 from = _mm512_add_epi16(from, _mm512_set1_epi16(1));
                 let section = _mm512_mulhrs_epi16(section, wy);
-                let row = &mut row[..2 * U];
+                let row = &mut row[..WIDE];
                 let at: *mut __m512i = row.as_mut_ptr().cast();
-                for (i, wx) in wx.into_iter().enumerate() {
+                for (i, &wx) in wx[..WIDE / 2].iter().enumerate() {
                     // SAFETY: so many registers are the records of `row`, borrowed for us alone.
                     unsafe { add(at.add(i), section, wx) };
                 }

@@ -1,0 +1,116 @@
+//! Voxels on their way from a bucket to the records, where each section has weights of its own.
+
+use crate::footprint::{Footprint, Leaning, Phases};
+use crate::mask::OpenMask;
+use crate::scene::Frame;
+use crate::splat::records::apart::{Apart, BATCH, Each, Layers, Woven, splat_skewed};
+use crate::splat::records::{Recorded, Table};
+use crate::splat::toss::any_in_rows;
+use crate::splat::whole_registers;
+use crate::stack::{Sheets, slot};
+use crate::tile::Part;
+
+/// Voxels of one bucket, and where their sections lie.
+pub(crate) struct Batch {
+    pub(crate) samples: Each<u32>,
+    pub(crate) normals: Each<u16>,
+    pub(crate) apart: Apart,
+    light: [Each<f32>; 4],
+}
+
+impl Default for Batch {
+    fn default() -> Self {
+        Batch {
+            samples: [0; BATCH],
+            normals: [0; BATCH],
+            apart: Apart::default(),
+            light: [[0.0; BATCH]; 4],
+        }
+    }
+}
+
+/// Footprints by slot: their weights, and where those across and down lie.
+pub(crate) struct Axes<'a, S: Recorded, const N: usize> {
+    pub(crate) layers: Layers<'a, S, N>,
+    pub(crate) phases: [[Phases; N]; 2],
+}
+
+impl<'a, S: Recorded, const N: usize> Axes<'a, S, N> {
+    /// Of the footprints that `at` knows by slot, for voxels that begin in sheet `k`.
+    #[inline(always)]
+    pub(crate) fn new(frame: &'a Frame, k: i32, at: [Footprint<'a>; N]) -> Self {
+        let along = |axis| {
+            at.map(|footprint| {
+                let table = footprint.phases(axis).zip(S::across(&footprint, axis));
+                table.expect("footprints have tables")
+            })
+        };
+        let axes = [along(0), along(1)];
+        let across =
+            axes.map(|slots| slots.map(|(phases, weights)| Table { weights, len: phases.len }));
+        let deep = Table { weights: S::deep(&frame.sections), len: frame.sections.most() };
+        let alike = frame.has_columns_alike();
+        let layers = Layers { across, deep, slot: slot::<N>(k), alike };
+        Axes { layers, phases: axes.map(|slots| slots.map(|(phases, _)| phases)) }
+    }
+}
+
+impl Batch {
+    /// Adds the first `n` voxels, which are placed, to their sheets from `k` on, which have these footprints; not
+    /// those around which all is shut. `eyes`: eye coordinates by axis, where each voxel sees the eye in a
+    /// direction of its own. How many it added.
+    #[inline(always)]
+    pub(crate) fn add<S: Recorded, const N: usize>(
+        &mut self,
+        (part, open): (&Part<'_>, &OpenMask),
+        (n, k): (usize, i32),
+        Axes { layers, phases: [phases, _] }: &Axes<'_, S, N>,
+        mut eyes: Option<&mut [Each<f64>; 3]>,
+        woven: &mut Woven<S::Weight, N>,
+        sheets: &mut Sheets<'_, S, N>,
+    ) -> u64 {
+        let frame = part.frame;
+        let Batch { samples, normals, apart, light } = self;
+        let Apart { lo, hi, kept, .. } = apart;
+        let (mut some, cull) = (0, frame.scene.quality.cull);
+        for i in 0..n {
+            let ([x0, y0], [x1, y1]) = ([lo[0][i], lo[1][i]], [hi[0][i], hi[1][i]]);
+            if x0 >= x1 || y0 >= y1 {
+                continue;
+            }
+            let columns = (u64::MAX >> (64 - (x1 - x0))) << x0;
+            let rows = [y0, y1].map(|y| y as usize);
+            if cull && !any_in_rows(sheets.simd, open.rows(), rows, columns) {
+                continue;
+            }
+            kept[some] = i as u32;
+            for eye in eyes.iter_mut().flat_map(|eyes| eyes.iter_mut()) {
+                eye[some] = eye[i];
+            }
+            (samples[some], normals[some]) = (samples[i], normals[i]);
+            some += 1;
+        }
+        let all = whole_registers(some);
+        let eyes = eyes.map(|eyes| eyes.each_ref().map(|eye| &eye[..all]));
+        frame.payloads(&samples[..some], &normals[..all], eyes, light);
+        let mut payloads = [S::Payload::default(); BATCH];
+        let [sigma, r, g, b] = light;
+        for (j, payload) in payloads[..some].iter_mut().enumerate() {
+            *payload = S::payload([sigma[j], r[j], g[j], b[j]]);
+        }
+        let apart = &self.apart;
+        for &i in &apart.kept[..some] {
+            let (at, wide) = apart.window(i as usize % BATCH, S::step::<N>());
+            sheets.touch(k, at, wide);
+        }
+        let row = frame.leaning.as_ref().map_or(0, Leaning::row);
+        let voxels = (apart, &payloads[..some]);
+        if row == 0 {
+            S::splat_apart(sheets.simd, sheets.records, voxels, layers, woven);
+        } else {
+            let layers = (layers, (row, phases));
+            splat_skewed::<S, N>(sheets.simd, sheets.records, voxels, layers, woven);
+        }
+        some as u64
+    }
+}

@@ -1,0 +1,227 @@
+//! A tile part of a parallel view whose kernel leans, in whole sums.
+//!
+//! Voxels land where integers say, as in [`crate::flat`]. A voxel's sections lie aside of it by as many
+//! subpixels as the phase of its depth says ([`Leaning`]), and so may their rows; they are added as those of
+//! perspective views are ([`crate::deep`]).
+
+use crate::batch::{Axes, Batch};
+use crate::flat::toss;
+use crate::footprint::Leaning;
+use crate::mask::OpenMask;
+use crate::scene::{Flat, Frame};
+use crate::splat::records::apart::{Apart, BATCH, Each, WINDOW, Woven, after};
+use crate::splat::records::{Recorded, Splat};
+use crate::splat::toss::Tossing;
+use crate::splat::{Simd, Work, whole_registers};
+use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
+use crate::tile::{Io, PART, Part, Pixels};
+use slabcast_common::message::Counters;
+use slabcast_common::view::SUBPIXELS;
+
+/// Memory for voxels that a render thread keeps from part to part.
+#[derive(Default)]
+pub(crate) struct Waiting {
+    queues: Queues<Splat>,
+    tossing: Tossing,
+    batch: Box<Batch>,
+}
+
+/// What a frame needs for its parts to be rendered here.
+#[derive(Clone, Copy)]
+pub(crate) struct Lean<'a> {
+    pub(crate) flat: &'a Flat,
+    leaning: &'a Leaning,
+}
+
+/// Whether parts of `frame` may be rendered here.
+pub(crate) fn takes(frame: &Frame) -> Option<Lean<'_>> {
+    let (flat, leaning) = (frame.flat.as_ref()?, frame.leaning.as_ref()?);
+    (2 * flat.reach + 2 < WINDOW as i32).then_some(Lean { flat, leaning })
+}
+
+/// Renders a part: compiled for each instruction set as a whole.
+pub(crate) struct RenderLeaning<'a, S: Recorded, const N: usize> {
+    pub(crate) part: Part<'a>,
+    pub(crate) lean: Lean<'a>,
+    pub(crate) simd: Simd,
+    pub(crate) store: &'a mut Store<S>,
+    pub(crate) waiting: &'a mut Waiting,
+    pub(crate) pixels: &'a mut Pixels,
+    pub(crate) io: Io<'a>,
+}
+
+impl<S: Recorded, const N: usize> Work for RenderLeaning<'_, S, N> {
+    type Out = ();
+    #[inline(always)]
+    fn run(self) {
+        let RenderLeaning { part, lean, simd, store, waiting, pixels, io } = self;
+        let footprint = part.frame.footprints.at(0).expect("a flat view's sheets are all drawn");
+        let axes = Axes::new(part.frame, 0, [footprint; N]);
+        let Waiting { queues, tossing, batch } = waiting;
+        let [x, y] = [[[S::Weight::default(); N]; WINDOW]; 2];
+        let (at, across) = ([[0; BATCH]; 2], [x, y]);
+        let stage = LeaningStage { part: &part, simd, lean, axes, tossing, batch, at, across };
+        walk::<S, N, _>(&part, stage, (simd, store), queues, pixels, io);
+    }
+}
+
+struct LeaningStage<'a, S: Recorded, const N: usize> {
+    part: &'a Part<'a>,
+    simd: Simd,
+    lean: Lean<'a>,
+    /// Weights across and down, the same in all sheets.
+    axes: Axes<'a, S, N>,
+    tossing: &'a mut Tossing,
+    batch: &'a mut Batch,
+    /// Where the voxels of the batch are themselves, in subpixels from the part's corner.
+    at: [Each<i32>; 2],
+    /// Weights of the voxel at hand by column and by row.
+    across: Woven<S::Weight, N>,
+}
+
+impl<S: Recorded, const N: usize> Stage<S, N> for LeaningStage<'_, S, N> {
+    type Voxel = Splat;
+
+    #[inline(always)]
+    fn reach(&self) -> i32 {
+        self.lean.flat.reach
+    }
+
+    #[inline(always)]
+    fn toss(
+        &mut self,
+        which: usize,
+        open: &OpenMask,
+        queues: &mut Queues<Splat>,
+        counters: &mut Counters,
+    ) {
+        let asked = (which, open, queues, counters);
+        toss(self.part, self.simd, self.lean.flat, None, self.tossing, asked);
+    }
+
+    #[inline(always)]
+    fn splat(
+        &mut self,
+        bucket: &[Splat],
+        k: i32,
+        sheets: &mut Sheets<'_, S, N>,
+        open: &OpenMask,
+        counters: &mut Counters,
+    ) {
+        let most = self.part.frame.sections.most() as i32;
+        let cull = self.part.frame.scene.quality.cull;
+        for some in bucket.chunks(BATCH) {
+            let mut n = 0;
+            for v in some {
+                self.put(n, v, most);
+                n += usize::from(!cull | open.is_near(v.cell()));
+            }
+            self.add(n, k, sheets, open, (some.len(), counters));
+        }
+    }
+
+    #[inline(always)]
+    fn splat_carried(
+        &mut self,
+        carried: &[(Splat, i32)],
+        sheets: &mut Sheets<'_, S, N>,
+        open: &OpenMask,
+        counters: &mut Counters,
+    ) {
+        let k = self.part.slab.first;
+        let most = self.part.frame.sections.most() as i32;
+        for some in carried.chunks(BATCH) {
+            for (i, (v, first)) in some.iter().enumerate() {
+                self.put(i, v, most - (k - first));
+            }
+            self.add(some.len(), k, sheets, open, (some.len(), counters));
+        }
+    }
+}
+
+impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
+    /// Takes over `v`, which has `left` sheets left, as voxel `i` of the batch.
+    #[inline(always)]
+    fn put(&mut self, i: usize, v: &Splat, left: i32) {
+        let most = self.part.frame.sections.most() as i32;
+        let Batch { samples, normals, apart, .. } = &mut *self.batch;
+        [self.at[0][i], self.at[1][i]] = v.aside_of();
+        (samples[i], normals[i], apart.left[i]) = (v.sample, v.normal(), left);
+        apart.deep[i] = v.phase() * most as u32 + (most - left) as u32;
+    }
+
+    /// Where each section of the first `n` voxels of the batch lies, and the windows that hold all of a voxel's.
+    #[inline(always)]
+    fn place(&mut self, n: usize, k: i32) {
+        let n = whole_registers(n);
+        let apart = &mut self.batch.apart;
+        let Lean { leaning, .. } = self.lean;
+        let most = self.part.frame.sections.most() as i32;
+        let row = leaning.row();
+        // Rows first, since columns may hang on them.
+        for axis in [1, 0] {
+            apart.begin(axis, n);
+            let phases = &self.axes.phases[axis][0];
+            let aside = (leaning.most(axis) > 0.0).then(|| leaning.subpixels(axis));
+            let skewed = axis == 0 && row != 0;
+            let mut before = None;
+            for at in 0..N {
+                let sheet = after::<N>(slot::<N>(k), at);
+                if sheet >= most {
+                    continue;
+                }
+                let Apart { first, from, places, deep, .. } = &mut *apart;
+                if let Some(before) = before.filter(|_| aside.is_none() && !skewed) {
+                    // All in one place, also those of sheets that a voxel has no more.
+                    first[axis][at] = first[axis][before];
+                    from[axis][at] = from[axis][before];
+                    places[axis][at] = places[axis][before];
+                    continue;
+                }
+                before = Some(at);
+                let place = &mut places[axis][at];
+                place[..n].copy_from_slice(&self.at[axis][..n]);
+                if let Some(aside) = aside {
+                    for i in 0..n {
+                        // What lies behind a voxel's last section is not drawn.
+                        let which = deep[i] as usize + sheet as usize;
+                        place[i] += aside[which.min(aside.len() - 1)];
+                    }
+                }
+                if skewed {
+                    let phases = [phases, &self.axes.phases[1][0]];
+                    apart.hold_skewed(at, n, (phases, row), sheet);
+                    continue;
+                }
+                for i in 0..n {
+                    first[axis][at][i] = phases.first_at(place[i]);
+                    from[axis][at][i] = phases.begin((place[i] & (SUBPIXELS - 1)) as usize) as u32;
+                }
+                // Where all lie in one place every voxel has some in the first.
+                let sheets = if aside.is_some() { sheet } else { 0 };
+                apart.hold(axis, at, n, (phases.len as i32, sheets));
+            }
+            apart.cut(axis, n);
+        }
+    }
+
+    /// Adds the first `n` voxels of the batch, of `of` there were, to their sheets from `k` on.
+    #[inline(always)]
+    fn add(
+        &mut self,
+        n: usize,
+        k: i32,
+        sheets: &mut Sheets<'_, S, N>,
+        open: &OpenMask,
+        (of, counters): (usize, &mut Counters),
+    ) {
+        self.place(n, k);
+        self.axes.layers.slot = slot::<N>(k);
+        let (part, across) = ((self.part, open), &mut self.across);
+        let added = self.batch.add(part, (n, k), &self.axes, None, across, sheets);
+        counters.splatted += added;
+        counters.culled += of as u64 - added;
+    }
+}
+
+const _: () = assert!(EDGE == PART as usize && WINDOW <= EDGE);

@@ -9,6 +9,18 @@
 //! float to an integer without the range check that would double the loop's cost.
 #![expect(unsafe_code, reason = "the one wall: run-time dispatch, unchecked conversion, lanes")]
 
+#[cfg(target_arch = "x86_64")]
+/// Functions that are compiled for some features.
+macro_rules! with {
+    ($features:literal $(
+        fn $name:ident ($($arg:ident: $ty:ty),*) $(-> $out:ty)? $body:block
+    )*) => {$(
+        #[target_feature(enable = $features)]
+        #[inline]
+        unsafe fn $name ($($arg: $ty),*) $(-> $out)? $body
+    )*};
+}
+
 pub(crate) mod close;
 #[cfg(target_arch = "x86_64")]
 mod lanes;

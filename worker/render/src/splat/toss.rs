@@ -209,7 +209,7 @@ pub(crate) fn any_in_rows(
     match simd.0 {
         // SAFETY: the value proves that the instructions are there.
         #[cfg(target_arch = "x86_64")]
-        Level::Avx512 => unsafe { wide::any_in_rows(rows, [begin, end], columns) },
+        Level::Avx512 => unsafe { sixteen::any_in_rows(rows, [begin, end], columns) },
         _ => rows[begin..end].iter().fold(0, |all, row| all | row) & columns != 0,
     }
 }
@@ -361,16 +361,15 @@ fn move_inside(phases: &Phases, at: &[i32], inside: &mut [u32; 512], from: &mut 
 
 #[cfg(target_arch = "x86_64")]
 mod wide {
-    use super::{DeepBrick, FAR, FlatBrick, Placing, Sieve, Sifted, Tossing};
+    use super::{FlatBrick, Placing, Sieve, Sifted, Tossing};
     use crate::footprint::{Phases, Sections};
     use crate::place::FINER_BITS;
     use crate::splat::lanes::{Eight, Lanes, Sixteen};
     use crate::tile::PART;
     use slabcast_common::brick::Brick;
     use slabcast_common::shade::NO_NORMAL;
-    use slabcast_common::view::{MAGIC, SUBPIXEL_BITS, SUBPIXELS};
+    use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
     use slabcast_common::volume::Samples;
-    use std::arch::x86_64::*;
 
     /// What is compiled for an instruction set: every function that these call is inlined into them.
     macro_rules! compiled {
@@ -439,63 +438,6 @@ mod wide {
         }
     }
 
-    impl Placed<Sixteen> for DeepBrick<'_> {
-        #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-        #[inline]
-        unsafe fn some(&self, local: usize) -> [__m512i; 3] {
-            deep(self, local)
-        }
-    }
-
-    /// [`slabcast_common::view::round_i32`] of sixteen numbers.
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    fn round(both: [__m512d; 2]) -> __m512i {
-        let lower = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
-        let magic = _mm512_set1_pd(MAGIC);
-        let [low, high] = both;
-        let low = _mm512_castpd_si512(_mm512_add_pd(low, magic));
-        let high = _mm512_castpd_si512(_mm512_add_pd(high, magic));
-        _mm512_permutex2var_epi32(low, lower, high)
-    }
-
-    /// Places in perspective.
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    fn deep(places: &DeepBrick<'_>, local: usize) -> [__m512i; 3] {
-        let mut eye = [[_mm512_setzero_pd(); 2]; 3];
-        for (axis, eye) in eye.iter_mut().enumerate() {
-            let at = places.offsets[axis][local..].first_chunk::<16>();
-            let at = at.expect("sixteen of a brick").as_ptr();
-            let corner = _mm512_set1_pd(places.corner[axis]);
-            // SAFETY: sixteen numbers are 128 bytes.
-            let both = unsafe { [_mm512_loadu_pd(at), _mm512_loadu_pd(at.add(8))] };
-            *eye = [_mm512_add_pd(corner, both[0]), _mm512_add_pd(corner, both[1])];
-        }
-        let [x, y, z] = eye;
-        let [mut across, mut down, mut deep] = [[_mm512_setzero_pd(); 2]; 3];
-        for half in 0..2 {
-            let depth = _mm512_add_pd(z[half], _mm512_set1_pd(places.distance));
-            let scale = _mm512_div_pd(_mm512_set1_pd(places.per_depth), depth);
-            for (to, (from, middle)) in
-                [(&mut across, (x, places.middle[0])), (&mut down, (y, places.middle[1]))]
-            {
-                let at = _mm512_add_pd(_mm512_mul_pd(from[half], scale), _mm512_set1_pd(middle));
-                let at = _mm512_max_pd(at, _mm512_set1_pd(-FAR));
-                to[half] = _mm512_min_pd(at, _mm512_set1_pd(FAR));
-            }
-            // A division by one changes nothing and is slow.
-            let thickness = places.view.thickness;
-            deep[half] = z[half];
-            if thickness != 1.0 {
-                deep[half] = _mm512_div_pd(z[half], _mm512_set1_pd(thickness));
-            }
-            let phases = _mm512_set1_pd(f64::from(places.view.depth_phases()));
-            deep[half] = _mm512_mul_pd(deep[half], phases);
-        }
-        [round(across), round(down), round(deep)]
-    }
-
     /// [`super::move_inside`]: first pixels, and where weights begin.
     #[inline(always)]
     unsafe fn move_inside<L: Lanes>(phases: &Phases, at: L::Ints) -> (L::Ints, L::Ints) {
@@ -543,21 +485,6 @@ mod wide {
                 L::store_fours(ready.as_mut_ptr().cast(), [place, rows, deep, sample]);
             }
         }
-    }
-
-    /// [`super::any_in_rows`].
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    pub(super) fn any_in_rows(rows: &[u64; 64], [begin, end]: [usize; 2], columns: u64) -> bool {
-        let (rows, columns) = (&rows[begin..end], _mm512_set1_epi64(columns as i64));
-        let mut any = 0;
-        for rows in rows.chunks(8) {
-            // SAFETY: lanes beyond the rows are not read.
-            let rows =
-                unsafe { _mm512_maskz_loadu_epi64(0xff >> (8 - rows.len()), rows.as_ptr().cast()) };
-            any |= _mm512_test_epi64_mask(rows, columns);
-        }
-        any != 0
     }
 
     /// What samples and normals are, widened to 32 bits.
@@ -667,6 +594,88 @@ mod wide {
             }
         }
         Sifted { reached, kept }
+    }
+}
+
+/// What only sixteen lanes gain from.
+#[cfg(target_arch = "x86_64")]
+mod sixteen {
+    use super::wide::Placed;
+    use super::{DeepBrick, FAR};
+    use crate::splat::lanes::Sixteen;
+    use slabcast_common::view::MAGIC;
+    use std::arch::x86_64::*;
+
+    impl Placed<Sixteen> for DeepBrick<'_> {
+        #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+        #[inline]
+        unsafe fn some(&self, local: usize) -> [__m512i; 3] {
+            deep(self, local)
+        }
+    }
+
+    /// [`slabcast_common::view::round_i32`] of sixteen numbers.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn round(both: [__m512d; 2]) -> __m512i {
+        let lower = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+        let magic = _mm512_set1_pd(MAGIC);
+        let [low, high] = both;
+        let low = _mm512_castpd_si512(_mm512_add_pd(low, magic));
+        let high = _mm512_castpd_si512(_mm512_add_pd(high, magic));
+        _mm512_permutex2var_epi32(low, lower, high)
+    }
+
+    /// Places in perspective.
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    fn deep(places: &DeepBrick<'_>, local: usize) -> [__m512i; 3] {
+        let mut eye = [[_mm512_setzero_pd(); 2]; 3];
+        for (axis, eye) in eye.iter_mut().enumerate() {
+            let at = places.offsets[axis][local..].first_chunk::<16>();
+            let at = at.expect("sixteen of a brick").as_ptr();
+            let corner = _mm512_set1_pd(places.corner[axis]);
+            // SAFETY: sixteen numbers are 128 bytes.
+            let both = unsafe { [_mm512_loadu_pd(at), _mm512_loadu_pd(at.add(8))] };
+            *eye = [_mm512_add_pd(corner, both[0]), _mm512_add_pd(corner, both[1])];
+        }
+        let [x, y, z] = eye;
+        let [mut across, mut down, mut deep] = [[_mm512_setzero_pd(); 2]; 3];
+        for half in 0..2 {
+            let depth = _mm512_add_pd(z[half], _mm512_set1_pd(places.distance));
+            let scale = _mm512_div_pd(_mm512_set1_pd(places.per_depth), depth);
+            for (to, (from, middle)) in
+                [(&mut across, (x, places.middle[0])), (&mut down, (y, places.middle[1]))]
+            {
+                let at = _mm512_add_pd(_mm512_mul_pd(from[half], scale), _mm512_set1_pd(middle));
+                let at = _mm512_max_pd(at, _mm512_set1_pd(-FAR));
+                to[half] = _mm512_min_pd(at, _mm512_set1_pd(FAR));
+            }
+            // A division by one changes nothing and is slow.
+            let thickness = places.view.thickness;
+            deep[half] = z[half];
+            if thickness != 1.0 {
+                deep[half] = _mm512_div_pd(z[half], _mm512_set1_pd(thickness));
+            }
+            let phases = _mm512_set1_pd(f64::from(places.view.depth_phases()));
+            deep[half] = _mm512_mul_pd(deep[half], phases);
+        }
+        [round(across), round(down), round(deep)]
+    }
+
+    /// [`super::any_in_rows`].
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    pub(super) fn any_in_rows(rows: &[u64; 64], [begin, end]: [usize; 2], columns: u64) -> bool {
+        let (rows, columns) = (&rows[begin..end], _mm512_set1_epi64(columns as i64));
+        let mut any = 0;
+        for rows in rows.chunks(8) {
+            // SAFETY: lanes beyond the rows are not read.
+            let rows =
+                unsafe { _mm512_maskz_loadu_epi64(0xff >> (8 - rows.len()), rows.as_ptr().cast()) };
+            any |= _mm512_test_epi64_mask(rows, columns);
+        }
+        any != 0
     }
 }
 

@@ -4,8 +4,11 @@
 //! linear rule; everything else is closed there. A row is one chain of some sixty operations that wait
 //! for each other, so two rows are closed at once.
 
-use super::{Level, Simd};
+#[cfg(target_arch = "x86_64")]
+use super::Level;
+use super::Simd;
 use crate::sheet::{Row, Rule, Sum};
+#[cfg(target_arch = "x86_64")]
 use slabcast_common::quality::Compositing;
 
 /// [`Rule::close_row`] for some rows.

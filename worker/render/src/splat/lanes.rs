@@ -4,8 +4,14 @@
 //! wanted, is written once for any number of lanes: in functions that are inlined into one that is
 //! compiled for the instruction set. Functions here need that set, and say nothing else of it.
 
+#[cfg(target_arch = "aarch64")]
+mod neon;
+#[cfg(target_arch = "x86_64")]
 mod x86;
 
+#[cfg(target_arch = "aarch64")]
+pub(super) use neon::Four;
+#[cfg(target_arch = "x86_64")]
 pub(super) use x86::{Eight, Sixteen};
 
 /// An instruction set's lanes. No function may be called on a machine that lacks its instructions.
@@ -47,7 +53,8 @@ pub(crate) trait Lanes {
     unsafe fn marks(bits: u32) -> Self::Marks;
     /// `a`, and 1 more where it is marked.
     unsafe fn one_more(marks: Self::Marks, a: Self::Ints) -> Self::Ints;
-    /// The `at`th numbers of `table`, in lanes that are marked; no others are read.
+    /// The `at`th numbers of `table`, in lanes that are marked; of others no more than the table's first is
+    /// read.
     unsafe fn look_up(marks: Self::Marks, table: *const u32, at: Self::Ints) -> Self::Ints;
     /// Those of `bits` beside each other, from the first lane on.
     unsafe fn beside(bits: u32, a: Self::Ints) -> Self::Ints;

@@ -1,16 +1,18 @@
 //! The innermost loop: a section of a voxel is added to a sheet.
 //!
 //! The loop is written once, plainly, over pixels of four sums; it is compiled for the
-//! machine's baseline and again for AVX2 and AVX-512, and chosen at run time. There is no
-//! fused multiply-add in it and compilers may not invent one, so all give the same bytes.
+//! machine's baseline and on x86-64 again for AVX2 and AVX-512, and chosen at run time. On 64-bit ARM
+//! NEON is in the baseline: there compilers use it in plain loops, and what they don't make of these
+//! is written for it. There is no fused multiply-add in any and compilers may not invent one, so all
+//! give the same bytes.
 //!
 //! This module is the wall: the only place with `unsafe`. It holds two things: the call of a
 //! function compiled for instructions that were seen on this machine, and the conversion of a
 //! float to an integer without the range check that would double the loop's cost.
 #![expect(unsafe_code, reason = "the one wall: run-time dispatch, unchecked conversion, lanes")]
 
-#[cfg(target_arch = "x86_64")]
 /// Functions that are compiled for some features.
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! with {
     ($features:literal $(
         fn $name:ident ($($arg:ident: $ty:ty),*) $(-> $out:ty)? $body:block
@@ -22,7 +24,7 @@ macro_rules! with {
 }
 
 pub(crate) mod close;
-#[cfg(target_arch = "x86_64")]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 mod lanes;
 pub(crate) mod records;
 pub(crate) mod toss;
@@ -296,6 +298,8 @@ enum Level {
     Avx2,
     #[cfg(target_arch = "x86_64")]
     Avx512,
+    #[cfg(target_arch = "aarch64")]
+    Neon,
 }
 
 impl Simd {
@@ -311,8 +315,13 @@ impl Simd {
 
     /// All that this machine has, plain first.
     pub fn all() -> Vec<Self> {
-        #[allow(unused_mut, reason = "grows on x86-64 only")]
+        #[allow(unused_mut, reason = "grows on x86-64 and 64-bit ARM only")]
         let mut all = vec![Simd(Level::Plain)];
+        // Part of the baseline, but for machines without an operating system.
+        #[cfg(target_arch = "aarch64")]
+        if std::arch::is_aarch64_feature_detected!("neon") {
+            all.push(Simd(Level::Neon));
+        }
         #[cfg(target_arch = "x86_64")]
         {
             // Whoever has AVX2 has those, too, and a machine that says otherwise is not trusted.
@@ -343,6 +352,8 @@ impl Simd {
             Level::Avx2 => "avx2",
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => "avx512",
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => "neon",
         }
     }
 }
@@ -369,13 +380,14 @@ impl Simd {
     #[inline]
     pub fn run<W: Work>(self, work: W) -> W::Out {
         match self.0 {
-            Level::Plain => work.run(),
             // SAFETY: the value proves that the instructions are there (`Simd::all`).
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => unsafe { run_avx2(work) },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe { run_avx512(work) },
+            // NEON is in the baseline of 64-bit ARM.
+            _ => work.run(),
         }
     }
 }

@@ -2,8 +2,8 @@
 //!
 //! Voxels are placed, in a flat view by an addition, tested against the part's sheets and one bit of
 //! its mask, and those that are left put beside each other. With AVX-512 that is done for sixteen local
-//! indices at a time, present or not, with AVX2 in flat views for eight, and what is not wanted never
-//! gets out of the registers; elsewhere in loops over plain arrays, one for each step.
+//! indices at a time, present or not, in flat views with AVX2 for eight and with NEON for four, and what is
+//! not wanted never gets out of the registers; elsewhere in loops over plain arrays, one for each step.
 
 use super::records::Splat;
 use super::{Level, Simd};
@@ -262,7 +262,7 @@ impl Sieve<'_, DeepBrick<'_>> {
             // SAFETY: the value proves that the instructions are there.
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe { wide::avx512::sift(self, brick, tossing) },
-            // Four divisions at a time are too few to place voxels that are not there, too.
+            // Four divisions at a time are too few to place voxels that are not there, too; NEON has two.
             _ => self.sift_plain(brick, tossing),
         }
     }
@@ -279,6 +279,9 @@ impl Sieve<'_, FlatBrick<'_>> {
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => unsafe { wide::avx2::sift(self, brick, tossing) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => unsafe { wide::neon::sift(self, brick, tossing) },
             Level::Plain => self.sift_plain(brick, tossing),
         }
     }
@@ -304,6 +307,11 @@ impl Sieve<'_, FlatBrick<'_>> {
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => unsafe {
                 wide::avx2::make_ready(self.sections, phases, sifted.kept, tossing);
+            },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => unsafe {
+                wide::neon::make_ready(self.sections, phases, sifted.kept, tossing);
             },
             Level::Plain => make_ready(self.sections, phases, sifted.kept, tossing),
         }
@@ -359,12 +367,16 @@ fn move_inside(phases: &Phases, at: &[i32], inside: &mut [u32; 512], from: &mut 
     }
 }
 
-#[cfg(target_arch = "x86_64")]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 mod wide {
     use super::{FlatBrick, Placing, Sieve, Sifted, Tossing};
     use crate::footprint::{Phases, Sections};
     use crate::place::FINER_BITS;
-    use crate::splat::lanes::{Eight, Lanes, Sixteen};
+    #[cfg(target_arch = "aarch64")]
+    use crate::splat::lanes::Four;
+    use crate::splat::lanes::Lanes;
+    #[cfg(target_arch = "x86_64")]
+    use crate::splat::lanes::{Eight, Sixteen};
     use crate::tile::PART;
     use slabcast_common::brick::Brick;
     use slabcast_common::shade::NO_NORMAL;
@@ -409,7 +421,11 @@ mod wide {
         };
     }
 
+    #[cfg(target_arch = "aarch64")]
+    compiled!(neon, "neon", Four);
+    #[cfg(target_arch = "x86_64")]
     compiled!(avx2, "avx2,popcnt,lzcnt,bmi1,bmi2", Eight);
+    #[cfg(target_arch = "x86_64")]
     compiled!(avx512, "avx512f,avx512vl,avx512dq,avx512bw,popcnt,lzcnt,bmi1,bmi2", Sixteen);
 
     /// Places in lanes.

@@ -62,6 +62,9 @@ impl Places {
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             super::Level::Avx512 => unsafe { wide::avx512::list(self, rows) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            super::Level::Neon => unsafe { wide::neon::list(self, rows) },
         }
     }
 
@@ -96,6 +99,9 @@ impl Places {
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             super::Level::Avx512 => unsafe { wide::avx512::sift::<S, N>(self, sums, slot) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            super::Level::Neon => unsafe { wide::neon::sift::<S, N>(self, sums, slot) },
         }
     }
 
@@ -174,6 +180,11 @@ pub(crate) fn take<S: Recorded, const N: usize>(
         super::Level::Avx512 => unsafe {
             wide::avx512::take::<S, N>(sums, pixels, places, slot, row);
         },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        super::Level::Neon => unsafe {
+            wide::neon::take::<S, N>(sums, pixels, places, slot, row);
+        },
     }
 }
 
@@ -218,6 +229,9 @@ pub(crate) fn put(simd: Simd, row: &Row, at: &[u32], pixels: &mut [[u32; 4]]) {
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
         super::Level::Avx512 => unsafe { wide::avx512::fours(row, &mut fours) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        super::Level::Neon => unsafe { wide::neon::fours(row, &mut fours) },
     }
     for (&at, four) in at.iter().zip(&fours) {
         let pixel = &mut pixels[at as usize];
@@ -228,10 +242,14 @@ pub(crate) fn put(simd: Simd, row: &Row, at: &[u32], pixels: &mut [[u32; 4]]) {
     }
 }
 
-#[cfg(target_arch = "x86_64")]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 mod wide {
     use super::{LANES, PART, Places, Record, Recorded, Row, STRIDE, Some16, SumsOf};
-    use crate::splat::lanes::{Eight, Lanes, Sixteen};
+    #[cfg(target_arch = "aarch64")]
+    use crate::splat::lanes::Four;
+    use crate::splat::lanes::Lanes;
+    #[cfg(target_arch = "x86_64")]
+    use crate::splat::lanes::{Eight, Sixteen};
 
     /// The functions here for one instruction set.
     macro_rules! compiled {
@@ -277,7 +295,11 @@ mod wide {
         };
     }
 
+    #[cfg(target_arch = "aarch64")]
+    compiled!(neon, "neon", Four);
+    #[cfg(target_arch = "x86_64")]
     compiled!(avx2, "avx2,popcnt,lzcnt,bmi1,bmi2", Eight);
+    #[cfg(target_arch = "x86_64")]
     compiled!(avx512, "avx512f,avx512vl,avx512dq,avx512bw,popcnt,lzcnt,bmi1,bmi2", Sixteen);
 
     #[inline(always)]

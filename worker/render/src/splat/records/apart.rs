@@ -3,8 +3,8 @@
 //!
 //! A voxel's weights are put side by side by column and slot, and by row and slot
 //! ([`Recorded::weave`]), so that all its sections are added to a pixel's record at once
-//! ([`Recorded::splat_deep`]). With AVX2 and AVX-512, where windows are at most [`LINE`] pixels wide, what
-//! lies in a window is worked out for many voxels at once (`lines`), and weights are put side by side
+//! ([`Recorded::splat_deep`]). With AVX2, AVX-512 and NEON, where windows are at most [`LINE`] pixels wide,
+//! what lies in a window is worked out for many voxels at once (`lines`), and weights are put side by side
 //! in registers.
 
 use super::{BySlot, MOST, Record, Recorded, RowAt, STRIDE, Table};
@@ -180,7 +180,7 @@ pub(crate) fn after<const N: usize>(first: usize, slot: usize) -> i32 {
 pub(crate) type Woven<W, const N: usize> = [[BySlot<W, N>; WINDOW]; 2];
 
 /// What [`Recorded::splat_apart`] adds, where and by which weights, for windows of a known width.
-#[cfg(target_arch = "x86_64")]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 pub(super) type ApartAt<'a, S, const N: usize> =
     (&'a mut [Record<S, N>], (&'a Apart, &'a [<S as Recorded>::Payload]), &'a Layers<'a, S, N>);
 
@@ -248,7 +248,7 @@ pub(crate) fn splat_skewed<S: Recorded, const N: usize>(
     }
 }
 
-#[cfg(target_arch = "x86_64")]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 pub(super) mod lines {
     use super::{Apart, BATCH, Each, LINE, Layers};
     use crate::splat::lanes::Lanes;

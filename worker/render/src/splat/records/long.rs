@@ -4,25 +4,6 @@
 //! clamps: a payload times weights stays below 2^31 (`bounds::raw_per_payload`), and what would not
 //! turns into i32's smallest number here and its largest there.
 
-/// `all` for footprints as wide as common ones are, so that a row's loop is of known length, or
-/// `others`.
-#[cfg(target_arch = "x86_64")]
-macro_rules! by_width {
-    ($wide:expr, $at:expr, $others:expr) => {
-        match $wide {
-            4 => all::<4, C, N>($at),
-            5 => all::<5, C, N>($at),
-            6 => all::<6, C, N>($at),
-            7 => all::<7, C, N>($at),
-            8 => all::<8, C, N>($at),
-            9 => all::<9, C, N>($at),
-            13 => all::<13, C, N>($at),
-            14 => all::<14, C, N>($at),
-            _ => $others,
-        }
-    };
-}
-
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx2 {
     use crate::splat::lanes::{Eight, Lanes as _};
@@ -64,7 +45,7 @@ pub(super) mod avx2 {
         tables: &Tables<'_, i32>,
     ) {
         let at = (records, voxels, slot, tables);
-        by_width!(tables.across[0].len, at, all::<0, C, N>(at))
+        by_width!(tables.across[0].len, all[C, N], at, all::<0, C, N>(at))
     }
 
     /// Footprints of `WIDE` columns, or of any number where that is 0.
@@ -404,7 +385,7 @@ pub(super) mod avx512 {
             return super::avx2::splat_all(records, voxels, slot, tables);
         }
         let at = (records, voxels, slot, tables);
-        by_width!(tables.across[0].len, at, any_width(at))
+        by_width!(tables.across[0].len, all[C, N], at, any_width(at))
     }
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]

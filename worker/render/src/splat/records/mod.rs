@@ -2,37 +2,62 @@
 //!
 //! A record has N sheets, four or eight: as many as a voxel has sections, which for sheets of a vox
 //! are four. Four sheets of 16-bit sums are 32 bytes: one operation of AVX2, and one of AVX-512 for
-//! two pixels ([`short`]); 32-bit sums take twice that ([`long`]). Every loop is written plainly
-//! here; what is written in lanes there must equal it.
+//! two pixels ([`short`]); 32-bit sums take twice that ([`long`]). NEON's registers are of sixteen bytes, and
+//! there all kinds of sums share their loops (`neon`). Every loop is written plainly here; what is written
+//! in lanes there must equal it.
 
 /// Calls a function for windows of `wide` columns, at most sixteen, or of a few more.
-#[cfg(target_arch = "x86_64")]
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! by_window {
     ($wide:expr, $side_by_side:ident, $n:ident, $at:expr) => {
+        by_window!($wide, $side_by_side[$n], $at)
+    };
+    ($wide:expr, $side_by_side:ident[$($of:ident),*], $at:expr) => {
         match ($wide, $at.2.alike) {
             // Footprints of one width.
-            (0..=4, true) => $side_by_side::<4, $n, true>($at),
-            (5, true) => $side_by_side::<5, $n, true>($at),
-            (6, true) => $side_by_side::<6, $n, true>($at),
-            (7 | 8, true) => $side_by_side::<8, $n, true>($at),
-            (9 | 10, true) => $side_by_side::<10, $n, true>($at),
-            (11 | 12, true) => $side_by_side::<12, $n, true>($at),
-            (_, true) => $side_by_side::<16, $n, true>($at),
+            (0..=4, true) => $side_by_side::<4, $($of),*, true>($at),
+            (5, true) => $side_by_side::<5, $($of),*, true>($at),
+            (6, true) => $side_by_side::<6, $($of),*, true>($at),
+            (7 | 8, true) => $side_by_side::<8, $($of),*, true>($at),
+            (9 | 10, true) => $side_by_side::<10, $($of),*, true>($at),
+            (11 | 12, true) => $side_by_side::<12, $($of),*, true>($at),
+            (_, true) => $side_by_side::<16, $($of),*, true>($at),
             // Windows that hold several, of any.
-            (0..=6, false) => $side_by_side::<6, $n, false>($at),
-            (7, false) => $side_by_side::<7, $n, false>($at),
-            (8, false) => $side_by_side::<8, $n, false>($at),
-            (9, false) => $side_by_side::<9, $n, false>($at),
-            (10, false) => $side_by_side::<10, $n, false>($at),
-            (11 | 12, false) => $side_by_side::<12, $n, false>($at),
-            (13 | 14, false) => $side_by_side::<14, $n, false>($at),
-            (_, false) => $side_by_side::<16, $n, false>($at),
+            (0..=6, false) => $side_by_side::<6, $($of),*, false>($at),
+            (7, false) => $side_by_side::<7, $($of),*, false>($at),
+            (8, false) => $side_by_side::<8, $($of),*, false>($at),
+            (9, false) => $side_by_side::<9, $($of),*, false>($at),
+            (10, false) => $side_by_side::<10, $($of),*, false>($at),
+            (11 | 12, false) => $side_by_side::<12, $($of),*, false>($at),
+            (13 | 14, false) => $side_by_side::<14, $($of),*, false>($at),
+            (_, false) => $side_by_side::<16, $($of),*, false>($at),
+        }
+    };
+}
+
+/// Calls a function for footprints as wide as common ones are, so that a row's loop is of known length, or
+/// does what is for others.
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+macro_rules! by_width {
+    ($wide:expr, $all:ident[$($of:ident),*], $at:expr, $others:expr) => {
+        match $wide {
+            4 => $all::<4, $($of),*>($at),
+            5 => $all::<5, $($of),*>($at),
+            6 => $all::<6, $($of),*>($at),
+            7 => $all::<7, $($of),*>($at),
+            8 => $all::<8, $($of),*>($at),
+            9 => $all::<9, $($of),*>($at),
+            13 => $all::<13, $($of),*>($at),
+            14 => $all::<14, $($of),*>($at),
+            _ => $others,
         }
     };
 }
 
 pub(crate) mod apart;
 mod long;
+#[cfg(target_arch = "aarch64")]
+mod neon;
 mod short;
 
 use self::apart::{Apart, Layers, Woven};
@@ -208,9 +233,9 @@ impl<'a, W> RowAt<'a, W> {
     }
 }
 
-/// Calls the one of three functions that belongs to the level of `simd`.
+/// Calls the one of four functions that belongs to the level of `simd`.
 macro_rules! at_level {
-    ($simd:expr, $args:tt, $plain:path, $avx2:path, $avx512:path) => {
+    ($simd:expr, $args:tt, $plain:path, $avx2:path, $avx512:path, $neon:path) => {
         match $simd.0 {
             Level::Plain => $plain $args,
             // SAFETY: the value proves that the instructions are there; AVX-512 has AVX2 in it.
@@ -219,6 +244,9 @@ macro_rules! at_level {
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe { $avx512 $args },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => unsafe { $neon $args },
         }
     };
 }
@@ -382,7 +410,8 @@ impl Recorded for i16 {
             (records, voxels, slot, tables),
             splat_plain::<i16, N>,
             short::avx2::splat_all::<N>,
-            short::avx512::splat_all::<N>
+            short::avx512::splat_all::<N>,
+            neon::splat_all::<i16, N>
         );
     }
 
@@ -393,7 +422,14 @@ impl Recorded for i16 {
         wide: usize,
         to: &mut [BySlot<i16, N>],
     ) {
-        at_level!(simd, (rows, wide, to), weave, short::avx2::weave, short::avx512::weave);
+        at_level!(
+            simd,
+            (rows, wide, to),
+            weave,
+            short::avx2::weave,
+            short::avx512::weave,
+            neon::weave::<i16, N>
+        );
     }
 
     #[inline(always)]
@@ -410,7 +446,8 @@ impl Recorded for i16 {
             (records, at, across, payload, z),
             splat_deep::<i16, N>,
             short::avx2::splat_deep::<N>,
-            short::avx512::splat_deep::<N>
+            short::avx512::splat_deep::<N>,
+            neon::splat_deep::<i16, N>
         );
     }
 
@@ -432,6 +469,11 @@ impl Recorded for i16 {
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => unsafe {
                 short::avx2::splat_apart(simd, records, voxels, layers, woven);
+            },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => unsafe {
+                neon::splat_apart(simd, records, voxels, layers, woven);
             },
             Level::Plain => apart::splat_apart(simd, records, voxels, layers, woven),
         }
@@ -475,7 +517,8 @@ impl Recorded for i32 {
             (records, voxels, slot, tables),
             splat_plain::<i32, N>,
             long::avx2::splat_all::<4, N>,
-            long::avx512::splat_all::<4, N>
+            long::avx512::splat_all::<4, N>,
+            neon::splat_all::<i32, N>
         );
     }
 
@@ -498,6 +541,11 @@ impl Recorded for i32 {
             Level::Avx2 => unsafe {
                 long::avx2::splat_apart(simd, records, voxels, layers, woven);
             },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => unsafe {
+                neon::splat_apart(simd, records, voxels, layers, woven);
+            },
             Level::Plain => apart::splat_apart(simd, records, voxels, layers, woven),
         }
     }
@@ -509,7 +557,14 @@ impl Recorded for i32 {
         wide: usize,
         to: &mut [BySlot<Tap, N>],
     ) {
-        at_level!(simd, (rows, wide, to), weave, long::avx2::weave, long::avx512::weave);
+        at_level!(
+            simd,
+            (rows, wide, to),
+            weave,
+            long::avx2::weave,
+            long::avx512::weave,
+            neon::weave::<i32, N>
+        );
     }
 
     #[inline(always)]
@@ -526,7 +581,8 @@ impl Recorded for i32 {
             (records, at, across, payload, z),
             splat_deep::<i32, N>,
             long::avx2::splat_deep::<N>,
-            long::avx512::splat_deep::<N>
+            long::avx512::splat_deep::<N>,
+            neon::splat_deep::<i32, N>
         );
     }
 }
@@ -588,7 +644,8 @@ impl Recorded for Grey {
             (records, voxels, slot, tables),
             splat_grey,
             long::avx2::splat_all::<2, N>,
-            long::avx512::splat_all::<2, N>
+            long::avx512::splat_all::<2, N>,
+            neon::splat_grey::<N>
         );
     }
 }

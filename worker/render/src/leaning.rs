@@ -10,7 +10,7 @@ use crate::footprint::Leaning;
 use crate::mask::OpenMask;
 use crate::scene::{Flat, Frame};
 use crate::splat::records::apart::{Apart, BATCH, Each, WINDOW, Woven, after};
-use crate::splat::records::{Recorded, Splat};
+use crate::splat::records::{MOST, Recorded, Splat};
 use crate::splat::toss::Tossing;
 use crate::splat::{Simd, Work, whole_registers};
 use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
@@ -39,8 +39,9 @@ pub(crate) fn takes(frame: &Frame) -> Option<Lean<'_>> {
     (2 * flat.reach + 2 < WINDOW as i32).then_some(Lean { flat, leaning })
 }
 
-/// Renders a part: compiled for each instruction set as a whole.
-pub(crate) struct RenderLeaning<'a, S: Recorded, const N: usize> {
+/// Renders a part, in records of eight sheets, since few kernels that lean reach through four: compiled for each
+/// instruction set as a whole.
+pub(crate) struct RenderLeaning<'a, S: Recorded> {
     pub(crate) part: Part<'a>,
     pub(crate) lean: Lean<'a>,
     pub(crate) simd: Simd,
@@ -50,18 +51,18 @@ pub(crate) struct RenderLeaning<'a, S: Recorded, const N: usize> {
     pub(crate) io: Io<'a>,
 }
 
-impl<S: Recorded, const N: usize> Work for RenderLeaning<'_, S, N> {
+impl<S: Recorded> Work for RenderLeaning<'_, S> {
     type Out = ();
     #[inline(always)]
     fn run(self) {
         let RenderLeaning { part, lean, simd, store, waiting, pixels, io } = self;
         let footprint = part.frame.footprints.at(0).expect("a flat view's sheets are all drawn");
-        let axes = Axes::new(part.frame, 0, [footprint; N]);
+        let axes = Axes::new(part.frame, 0, [footprint; MOST]);
         let Waiting { queues, tossing, batch } = waiting;
-        let [x, y] = [[[S::Weight::default(); N]; WINDOW]; 2];
+        let [x, y] = [[[S::Weight::default(); MOST]; WINDOW]; 2];
         let (at, across) = ([[0; BATCH]; 2], [x, y]);
         let stage = LeaningStage { part: &part, simd, lean, axes, tossing, batch, at, across };
-        walk::<S, N, _>(&part, stage, (simd, store), queues, pixels, io);
+        walk::<S, MOST, _>(&part, stage, (simd, store), queues, pixels, io);
     }
 }
 

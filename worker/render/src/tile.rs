@@ -335,7 +335,7 @@ impl Part<'_> {
             simd.run(RenderFlat::<S, N> { part, view, simd, store, waiting, pixels, io });
         } else if let Some(lean) = leaning::takes(part.frame) {
             let waiting = &mut waiting.leaning;
-            simd.run(RenderLeaning::<S, N> { part, lean, simd, store, waiting, pixels, io });
+            simd.run(RenderLeaning { part, lean, simd, store, waiting, pixels, io });
         } else if let Some(deep) = deep::takes(&part) {
             let waiting = &mut waiting.deep;
             simd.run(RenderDeep::<S, N> { part, deep, simd, store, waiting, pixels, io });

@@ -9,6 +9,7 @@ use crate::splat::toss::any_in_rows;
 use crate::splat::whole_registers;
 use crate::stack::{Sheets, slot};
 use crate::tile::Part;
+use slabcast_common::message::Counters;
 
 /// Voxels of one bucket, and where their sections lie.
 pub(crate) struct Batch {
@@ -58,7 +59,7 @@ impl<'a, S: Recorded, const N: usize> Axes<'a, S, N> {
 impl Batch {
     /// Adds the first `n` voxels, which are placed, to their sheets from `k` on, which have these footprints; not
     /// those around which all is shut. `eyes`: eye coordinates by axis, where each voxel sees the eye in a
-    /// direction of its own. How many it added.
+    /// direction of its own. Of so many voxels there were, what it adds and what not is counted.
     #[inline(always)]
     pub(crate) fn add<S: Recorded, const N: usize>(
         &mut self,
@@ -68,7 +69,8 @@ impl Batch {
         mut eyes: Option<&mut [Each<f64>; 3]>,
         woven: &mut Woven<S::Weight, N>,
         sheets: &mut Sheets<'_, S, N>,
-    ) -> u64 {
+        (of, counters): (usize, &mut Counters),
+    ) {
         let frame = part.frame;
         let Batch { samples, normals, apart, light } = self;
         let Apart { lo, hi, kept, .. } = apart;
@@ -111,6 +113,7 @@ impl Batch {
             let layers = (layers, (row, phases));
             splat_skewed::<S, N>(sheets.simd, sheets.records, voxels, layers, woven);
         }
-        some as u64
+        counters.splatted += some as u64;
+        counters.culled += (of - some) as u64;
     }
 }

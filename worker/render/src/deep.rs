@@ -328,7 +328,7 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
         }
     }
 
-    /// Adds the first `n` voxels of the batch, of `of` there were, to their sheets from `k` on.
+    /// Adds the first `n` voxels of the batch, of `counted` there were, to their sheets from `k` on.
     #[inline(always)]
     fn add(
         &mut self,
@@ -337,14 +337,12 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
         footprints: &Footprints<'_, S, N>,
         sheets: &mut Sheets<'_, S, N>,
         open: &OpenMask,
-        (of, counters): (usize, &mut Counters),
+        counted: (usize, &mut Counters),
     ) {
         self.place(n, k, footprints);
         let (part, eyes, across) =
             ((self.part, open), Some(&mut self.places.eye), &mut self.across);
-        let added = self.batch.add(part, (n, k), &footprints.0, eyes, across, sheets);
-        counters.splatted += added;
-        counters.culled += of as u64 - added;
+        self.batch.add(part, (n, k), &footprints.0, eyes, across, sheets, counted);
     }
 }
 

@@ -206,7 +206,7 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
         }
     }
 
-    /// Adds the first `n` voxels of the batch, of `of` there were, to their sheets from `k` on.
+    /// Adds the first `n` voxels of the batch, of `counted` there were, to their sheets from `k` on.
     #[inline(always)]
     fn add(
         &mut self,
@@ -214,14 +214,12 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
         k: i32,
         sheets: &mut Sheets<'_, S, N>,
         open: &OpenMask,
-        (of, counters): (usize, &mut Counters),
+        counted: (usize, &mut Counters),
     ) {
         self.place(n, k);
         self.axes.layers.slot = slot::<N>(k);
         let (part, across) = ((self.part, open), &mut self.across);
-        let added = self.batch.add(part, (n, k), &self.axes, None, across, sheets);
-        counters.splatted += added;
-        counters.culled += of as u64 - added;
+        self.batch.add(part, (n, k), &self.axes, None, across, sheets, counted);
     }
 }
 

@@ -264,11 +264,13 @@ pub(super) mod avx2 {
         woven: &mut Woven<Tap, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        let Some(wide) = lines::widest(apart, kept, i32::step::<N>()).filter(|_| N == 4) else {
+        // Columns are alike in records of eight sheets.
+        let four = N == 4 && !layers.alike;
+        let Some(wide) = lines::widest(apart, kept, i32::step::<N>()).filter(|_| four) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
         let at = (records, (apart, payloads), layers);
-        by_window!(wide, side_by_side, N, at)
+        by_window!(wide, side_by_side[N], at)
     }
 
     /// Weights of voxel `i` in four slots, pixel by pixel, of at least the first `n` pixels.
@@ -293,7 +295,7 @@ pub(super) mod avx2 {
     /// Windows of `WIDE` columns.
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn side_by_side<const WIDE: usize, const N: usize, const ALIKE: bool>(
+    fn side_by_side<const WIDE: usize, const N: usize>(
         (records, (apart, payloads), layers): ApartAt<'_, i32, N>,
     ) {
         let zero = _mm256_setzero_ps();
@@ -321,16 +323,10 @@ pub(super) mod avx2 {
                 sections[two] = _mm256_max_ps(_mm256_mul_ps(payload, wz[two]), zero);
             }
             let mut wx = [[zero; 2]; WIDE];
-            if ALIKE {
-                for (wx, w) in wx.iter_mut().zip(&across.one_by_one(layers.slot, i)) {
-                    *wx = [_mm256_set1_ps(w.get()); 2];
-                }
-            } else {
-                line(&across, i, WIDE, &mut columns);
-                for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<4>().0) {
-                    let [low, high, ..] = spread::<4>(&w.map(Tap::get));
-                    *wx = [low, high];
-                }
+            line(&across, i, WIDE, &mut columns);
+            for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<4>().0) {
+                let [low, high, ..] = spread::<4>(&w.map(Tap::get));
+                *wx = [low, high];
             }
             line(&down, i, high, &mut rows);
             let of_rows = records[y * STRIDE + x..].chunks_mut(STRIDE).zip(rows.as_chunks::<4>().0);
@@ -549,11 +545,17 @@ pub(super) mod avx512 {
         woven: &mut Woven<Tap, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        let Some(wide) = lines::widest(apart, kept, i32::step::<N>()) else {
+        // Columns are alike in records of eight sheets.
+        let known = N == 8 || !layers.alike;
+        let Some(wide) = lines::widest(apart, kept, i32::step::<N>()).filter(|_| known) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
         let at = (records, (apart, payloads), layers);
-        by_window!(wide, side_by_side, N, at)
+        if const { N == 8 } {
+            by_window_alike!(wide, side_by_side[N], at)
+        } else {
+            by_window!(wide, side_by_side[N][false], at)
+        }
     }
 
     /// Weights of voxel `i` in four slots, the first or the second ones, pixel by pixel: four pixels a

@@ -9,12 +9,29 @@
 /// Calls a function for windows of `wide` columns, at most sixteen, or of a few more.
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! by_window {
-    ($wide:expr, $side_by_side:ident, $n:ident, $at:expr) => {
-        by_window!($wide, $side_by_side[$n], $at)
+    ($wide:expr, $side_by_side:ident[$($of:ident),*], $at:expr) => {
+        by_window!($wide, $side_by_side[$($of),*][], $at)
     };
+    ($wide:expr, $side_by_side:ident[$($of:ident),*][$($alike:literal)?], $at:expr) => {
+        match $wide {
+            0..=6 => $side_by_side::<6, $($of),*, $($alike)?>($at),
+            7 => $side_by_side::<7, $($of),*, $($alike)?>($at),
+            8 => $side_by_side::<8, $($of),*, $($alike)?>($at),
+            9 => $side_by_side::<9, $($of),*, $($alike)?>($at),
+            10 => $side_by_side::<10, $($of),*, $($alike)?>($at),
+            11 | 12 => $side_by_side::<12, $($of),*, $($alike)?>($at),
+            13 | 14 => $side_by_side::<14, $($of),*, $($alike)?>($at),
+            _ => $side_by_side::<16, $($of),*, $($alike)?>($at),
+        }
+    };
+}
+
+/// The same where columns may be alike: then windows are as wide as footprints are.
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+macro_rules! by_window_alike {
     ($wide:expr, $side_by_side:ident[$($of:ident),*], $at:expr) => {
         match ($wide, $at.2.alike) {
-            // Footprints of one width.
+            (_, false) => by_window!($wide, $side_by_side[$($of),*][false], $at),
             (0..=4, true) => $side_by_side::<4, $($of),*, true>($at),
             (5, true) => $side_by_side::<5, $($of),*, true>($at),
             (6, true) => $side_by_side::<6, $($of),*, true>($at),
@@ -22,15 +39,6 @@ macro_rules! by_window {
             (9 | 10, true) => $side_by_side::<10, $($of),*, true>($at),
             (11 | 12, true) => $side_by_side::<12, $($of),*, true>($at),
             (_, true) => $side_by_side::<16, $($of),*, true>($at),
-            // Windows that hold several, of any.
-            (0..=6, false) => $side_by_side::<6, $($of),*, false>($at),
-            (7, false) => $side_by_side::<7, $($of),*, false>($at),
-            (8, false) => $side_by_side::<8, $($of),*, false>($at),
-            (9, false) => $side_by_side::<9, $($of),*, false>($at),
-            (10, false) => $side_by_side::<10, $($of),*, false>($at),
-            (11 | 12, false) => $side_by_side::<12, $($of),*, false>($at),
-            (13 | 14, false) => $side_by_side::<14, $($of),*, false>($at),
-            (_, false) => $side_by_side::<16, $($of),*, false>($at),
         }
     };
 }

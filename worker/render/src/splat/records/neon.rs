@@ -461,7 +461,7 @@ pub(super) fn splat_apart<S: InLanes, const N: usize>(
         return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
     };
     let at = (records, (apart, payloads), layers);
-    by_window!(wide, side_by_side[S, N], at)
+    by_window_alike!(wide, side_by_side[S, N], at)
 }
 
 /// Weights of voxel `i`, pixel by pixel, of at least the first `n` pixels.

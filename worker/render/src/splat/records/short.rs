@@ -264,11 +264,13 @@ pub(super) mod avx2 {
         woven: &mut Woven<i16, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        let Some(wide) = lines::widest(apart, kept, 1).filter(|_| N == 4) else {
+        // Columns are alike in records of eight sheets.
+        let four = N == 4 && !layers.alike;
+        let Some(wide) = lines::widest(apart, kept, 1).filter(|_| four) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
         let at = (records, (apart, payloads), layers);
-        by_window!(wide, side_by_side, N, at)
+        by_window!(wide, side_by_side[N], at)
     }
 
     /// Weights of voxel `i` in four slots, pixel by pixel.
@@ -299,7 +301,7 @@ pub(super) mod avx2 {
     /// Windows of `WIDE` columns.
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn side_by_side<const WIDE: usize, const N: usize, const ALIKE: bool>(
+    fn side_by_side<const WIDE: usize, const N: usize>(
         (records, (apart, payloads), layers): ApartAt<'_, i16, N>,
     ) {
         let zero = _mm256_setzero_si256();
@@ -322,15 +324,9 @@ pub(super) mod avx2 {
             let section = _mm256_set1_epi64x(payload as i64);
             let section = _mm256_mulhrs_epi16(section, _mm256_shuffle_epi8(z, turn));
             let mut wx = [zero; WIDE];
-            if ALIKE {
-                for (wx, &w) in wx.iter_mut().zip(&across.one_by_one(layers.slot, i)) {
-                    *wx = _mm256_set1_epi16(w);
-                }
-            } else {
-                line(&across, i, &mut columns);
-                for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<4>().0) {
-                    [*wx, _] = spread::<4>(w);
-                }
+            line(&across, i, &mut columns);
+            for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<4>().0) {
+                [*wx, _] = spread::<4>(w);
             }
             line(&down, i, &mut rows);
             let of_rows = records[y * STRIDE + x..].chunks_mut(STRIDE).zip(rows.as_chunks::<4>().0);
@@ -599,14 +595,16 @@ pub(super) mod avx512 {
         woven: &mut Woven<i16, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        let Some(wide) = lines::widest(apart, kept, i16::step::<N>()) else {
+        // Columns are alike in records of eight sheets.
+        let known = N == 8 || !layers.alike;
+        let Some(wide) = lines::widest(apart, kept, i16::step::<N>()).filter(|_| known) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
         let at = (records, (apart, payloads), layers);
-        if N == 8 {
-            by_window!(wide, eight_slots, N, at)
+        if const { N == 8 } {
+            by_window_alike!(wide, eight_slots[N], at)
         } else {
-            by_window!(wide, four_slots, N, at)
+            by_window!(wide, four_slots[N], at)
         }
     }
 
@@ -721,12 +719,12 @@ pub(super) mod avx512 {
     /// Windows of `WIDE` columns, of four slots: two a register.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn four_slots<const WIDE: usize, const N: usize, const ALIKE: bool>(
+    fn four_slots<const WIDE: usize, const N: usize>(
         (records, (apart, payloads), layers): ApartAt<'_, i16, N>,
     ) {
         let turn = words(|lane| (lane / 4 + 2 * N - layers.slot) % N);
         // Which weight of a line's 64 a lane takes: that of its slot for its column, or for the row.
-        let column = words(|lane| if ALIKE { 0 } else { lane / 4 % N * LINE } + lane / (4 * N));
+        let column = words(|lane| lane / 4 % N * LINE + lane / (4 * N));
         let row = words(|lane| lane / 4 % N * LINE);
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
@@ -740,18 +738,10 @@ pub(super) mod avx512 {
             let section = _mm512_set1_epi64(payload as i64);
             let section = _mm512_mulhrs_epi16(section, _mm512_permutexvar_epi16(turn, load(z)));
             let (mut wx, mut from) = ([_mm512_setzero_si512(); WIDE], column);
-            if ALIKE {
-                let line = one_line(&across, layers.slot, i);
-                for wx in &mut wx[..WIDE / 2] {
-                    *wx = _mm512_permutexvar_epi16(from, line);
-                    from = _mm512_add_epi16(from, _mm512_set1_epi16(2));
-                }
-            } else {
-                let [low, behind] = line(&across, i);
-                for wx in &mut wx[..WIDE / 2] {
-                    *wx = _mm512_permutex2var_epi16(low, from, behind);
-                    from = _mm512_add_epi16(from, _mm512_set1_epi16(2));
-                }
+            let [low, behind] = line(&across, i);
+            for wx in &mut wx[..WIDE / 2] {
+                *wx = _mm512_permutex2var_epi16(low, from, behind);
+                from = _mm512_add_epi16(from, _mm512_set1_epi16(2));
             }
             let [low, behind] = line(&down, i);
             let mut from = row;

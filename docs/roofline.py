@@ -1,11 +1,14 @@
 #!/usr/bin/env python3
-"""Where a frame's time goes, in nanoseconds and cycles a unit of work.
+"""Where a frame's time goes, in nanoseconds and cycles a unit of work, and how near adding is to the roof.
 
     python3 docs/roofline.py --slabcast target/release/slabcast -- VOLUME --tf NAME [flags of bench]
 
 Runs `slabcast bench` on one thread under `perf record` (by the clock: virtual machines count no cycles), asks
 llvm-addr2line which functions each sample was in, those inlined included, and adds them up by stage. Units
 are bench's own counts. Cycles are those of the frequency that --ghz says or /proc/cpuinfo names.
+
+Then docs/roof.rs is compiled by rustc and says how many bytes a second this machine reads, adds to and writes
+back: in as much memory as a part's sums take, and in 16 KiB. That is the roof over adding, whatever the clock.
 """
 
 import argparse
@@ -23,6 +26,7 @@ STAGES = [
     ("toss", r"\btoss\b|open_brick|near_all|move_inside|FlatStage.*::toss"),
     ("close", r"\bclose|\btake\b|take_grey|\bput\b"),
     ("light", r"payloads|light_all"),
+    ("add", r"splat_all|splat_apart|splat_deep"),
     ("splat", r"\bsplat\b|splat_all|splat::records|\btouch\b|render_records"),
     ("project", r"Seen|\btight\b|overlaps|View::project|front_to_back|slabcast::local|\bcorner\b|render_into|each_pixel|Part::end"),
 ]
@@ -70,6 +74,29 @@ def chains(exe, found):
     return out
 
 
+def roofed(bench, seconds):
+    """Says how many bytes adding moves in so many seconds a frame, beside what the machine can."""
+    adds = bench["adds"]
+    if not adds or not seconds:
+        print("\nadding: each voxel has footprints of its own, so bytes are not counted")
+        return
+    across, down = adds["pixels"]
+    each = 2 * across * down * adds["bytes"]
+    # Rows of a part are 66 pixels apart.
+    part = 64 * 66 * adds["bytes"]
+    source = pathlib.Path(__file__).with_name("roof.rs")
+    with tempfile.TemporaryDirectory() as folder:
+        roof = f"{folder}/roof"
+        subprocess.run(["rustc", "--edition", "2024", "-O", "-o", roof, str(source)], check=True)
+        roof = json.loads(subprocess.run([roof, "16384", str(part)], check=True, capture_output=True, text=True).stdout)
+    top, near = roof["gb_a_second"][str(part)], roof["gb_a_second"]["16384"]
+    moved = each * bench["splatted"] / 1e9
+    print(f"\nadding: {across}x{down} pixels of {adds['bytes']} bytes, read and written: {each:,} bytes a voxel, "
+          f"{moved:.2f} GB a frame, {moved / seconds:.0f} GB/s\n"
+          f"the roof, {roof['registers']}: {top:.0f} GB/s in a part's {part // 1024} KiB, {near:.0f} in 16 KiB; "
+          f"adding reaches {100 * moved / seconds / top:.0f} %, and the frame {100 * moved / (bench['median_ms'] / 1e3) / top:.0f} %")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--slabcast", required=True, type=pathlib.Path)
@@ -98,13 +125,14 @@ def main():
     print(f"{bench['simd']}, {bench['quality']['sums']} sums; {frames} frames, median {bench['median_ms']:.1f} ms; "
           f"{ghz:.2f} GHz; {total} samples, of which {of_frame} in the stages of frames\n")
     print("| stage | ms a frame | share | units a frame | ns a unit | cycles a unit |\n|---|--:|--:|---|--:|--:|")
-    units = {"toss": ("voxels tossed", bench["tossed"]), "splat": ("voxels splatted", bench["splatted"]),
-             "light": ("voxels splatted", bench["splatted"])}
+    splatted = ("voxels splatted", bench["splatted"])
+    units = {"toss": ("voxels tossed", bench["tossed"]), "add": splatted, "splat": splatted, "light": splatted}
     for stage, _ in STAGES:
         ms = stages[stage] * 1e3 / HERTZ / frames
         unit, n = units.get(stage, ("", 0))
         each = f"{ms * 1e6 / n:.0f} | {ms * 1e6 / n * ghz:.0f}" if n else " | "
         print(f"| {stage} | {ms:.1f} | {100 * stages[stage] / of_frame:.0f} % | {f'{n:,} {unit}' if n else ''} | {each} |")
+    roofed(bench, stages["add"] / HERTZ / frames)
     if args.functions:
         for name, n in rest.most_common(25):
             print(f"{n:6} {name}")

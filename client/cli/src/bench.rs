@@ -69,7 +69,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
     let mut progress = Progress::new(false).of("frame");
     progress.frames(views as u64, &format!("{views} views"));
     let (mut each, mut counters, mut middle) = (Vec::new(), Counters::default(), None);
-    let mut sha256 = String::new();
+    let (mut sha256, mut adds) = (String::new(), None);
     for i in 0..views {
         let (view, scene) = (stage.view(i, &asked.quality)?, stage.scene(i));
         let began = Instant::now();
@@ -83,6 +83,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
         }
         if i == views / 2 {
             sha256 = picture.sha256().to_string();
+            adds = frame.adds();
             middle = Some((stage.view_of(i, &asked.quality, asked.size())?, picture));
         }
         progress.step(progress::Step { frames: i as u64 + 1, ..Default::default() });
@@ -123,6 +124,8 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
             "quality": quality, "relevant": relevant, "pixels_sha256": sha256,
             "tossed": counters.tossed / n, "splatted": counters.splatted / n,
             "culled": counters.culled / n,
+            // What a voxel adds to, where that is the same for all: sums of so many pixels, so many bytes each.
+            "adds": adds.map(|adds| serde_json::json!({ "pixels": adds.pixels, "bytes": adds.bytes })),
             "limit": errors.as_ref().map(|e| figures(&e[0])),
             "same_thickness": errors.as_ref().map(|e| figures(&e[1])),
         });

@@ -28,7 +28,7 @@ use crate::leaning::{self, RenderLeaning};
 use crate::mask::OpenMask;
 use crate::planes;
 use crate::region::{Coming, Memory};
-use crate::scene::{Corner, Frame};
+use crate::scene::{Corner, Frame, Scene};
 use crate::splat::records::{MOST, Recorded, STRIDE};
 use crate::splat::{Grey, Simd};
 use crate::stack::Store;
@@ -241,11 +241,40 @@ impl Default for Pixels {
     }
 }
 
+/// What a voxel adds to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Adds {
+    /// Pixels across and down.
+    pub pixels: [usize; 2],
+    /// Bytes of sums that a pixel has for the sheets of all sections together: each is read and written.
+    pub bytes: usize,
+}
+
 impl Frame {
+    /// What each voxel adds to, where that is the same for all: in parallel views that are drawn in whole sums,
+    /// but for kernels that lean.
+    pub fn adds(&self) -> Option<Adds> {
+        let Scene { quality, ref classifier, .. } = *self.scene;
+        let channel = match quality.sums {
+            Sums::F32 => return None,
+            Sums::I16 => size_of::<i16>(),
+            Sums::I32 | Sums::Auto => size_of::<i32>(),
+        };
+        let most = self.sections.most();
+        if flat::takes(self).is_none() || classifier.is_modulated() || most > MOST {
+            return None;
+        }
+        let footprint = self.footprints.at(0)?;
+        let [across, down] = [0, 1].map(|axis| footprint.phases(axis).map(|phases| phases.len));
+        let channels = if self.has_two_channels() { 2 } else { 4 };
+        let sheets = if most <= 4 { 4 } else { MOST };
+        Some(Adds { pixels: [across?, down?], bytes: channel * channels * sheets })
+    }
+
     /// Whether its three colours are one and it is drawn where that is made use of: opacity and one
     /// colour, half of what others add up and close.
     pub fn has_two_channels(&self) -> bool {
-        let crate::Scene { grey, quality, ref classifier, .. } = *self.scene;
+        let Scene { grey, quality, ref classifier, .. } = *self.scene;
         let fits = !classifier.is_modulated() && self.sections.most() <= MOST;
         let whole = matches!(quality.sums, Sums::I32 | Sums::Auto);
         grey && whole && fits && flat::takes(self).is_some()
@@ -513,4 +542,36 @@ pub(crate) fn keep_last<'a>(
 /// Planes as they are before the first slab.
 pub fn blank(tile: Rect) -> TileState {
     TileState { a: vec![0.0; tile.area()], last: None::<Vec<RawSums>> }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::selftest;
+    use glam::DVec3;
+    use slabcast_common::quality::Quality;
+    use slabcast_common::view::{Camera, CameraProjection, View};
+    use slabcast_common::volume::Volume;
+
+    #[test]
+    fn a_voxel_adds_to_its_footprint_where_all_have_one() {
+        let volume = Volume::from_fn_u8("any", [16; 3], |i, j, k| (i + 3 * j + 7 * k) as u8);
+        // 1.6 pixels a vox: a kernel is 6.4 wide, and so touches seven.
+        let flat = CameraProjection::Ortho { height: 40.0 };
+        let deep = CameraProjection::Persp { fov: 30.0, distance: 60.0 };
+        let adds = |sums, thickness, projection| {
+            let quality = Quality { sums, thickness, ..Quality::default() };
+            let to_eye = DVec3::new(1.0, 2.0, 0.5);
+            let camera = Camera { to_eye, up: DVec3::Z, target: DVec3::ZERO, projection };
+            let view = View::new(&volume.lattice, &camera, [64; 2], &quality).expect("a view");
+            let scene = Scene::new(&selftest::spec(&volume, quality));
+            Frame::new(Arc::new(scene), view).adds()
+        };
+        let seven = |bytes| Some(Adds { pixels: [7; 2], bytes });
+        assert_eq!(adds(Sums::I16, 1.0, flat), seven(32));
+        assert_eq!(adds(Sums::I32, 1.0, flat), seven(64));
+        assert_eq!(adds(Sums::I16, 0.5, flat), seven(64));
+        assert_eq!(adds(Sums::F32, 1.0, flat), None);
+        assert_eq!(adds(Sums::I16, 1.0, deep), None);
+    }
 }

@@ -63,8 +63,8 @@ impl Default for Places {
 pub(crate) struct Deep {
     focal: f64,
     distance: f64,
-    /// Pixels from the one that holds a centre within which all sections stay.
-    reach: i32,
+    /// Pixels along x and y from the one that holds a centre within which all sections stay.
+    reach: [i32; 2],
 }
 
 /// Whether `part` may be rendered here.
@@ -93,19 +93,21 @@ fn deep(frame: &Frame, r: &Rect, nearest: i32) -> Option<Deep> {
     let above = [r.y0, r.y1].map(|y| (f64::from(y) - middle[1]).abs());
     let farthest = aside.into_iter().chain(above).fold(0.0, f64::max);
     // Where the kernel leans a section is farther aside, and its outermost rows are.
-    let leans = leaning.map_or(0.0, |leaning| leaning.pixels(front, own));
+    let leans = leaning.map_or([0.0; 2], |leaning| leaning.pixels(front, own));
     // x / (z + dz) lies within |x / z| dz / z of x / z, and each is rounded to a subpixel; of voxels so many
     // pixels outside of the part.
     let reach_of = |outside: f64| {
         let apart = (farthest + outside) * depth_apart * front / focal + 4.0 / f64::from(SUBPIXELS);
-        f64::from(own) + libm::ceil(apart + leans)
+        [0, 1].map(|axis| f64::from(own[axis]) + libm::ceil(apart + leans[axis]))
     };
     // None that is farther outside than a mask is grown at most touches the part; so none that is farther
     // than what those reach does.
-    let of_any = reach_of(f64::from(REACH_MOST));
+    let [x, y] = reach_of(f64::from(REACH_MOST));
+    let of_any = x.max(y);
     let reach = reach_of(of_any);
-    let fits = of_any <= f64::from(REACH_MOST) && 2.0 * reach + 2.0 < WINDOW as f64;
-    fits.then_some(Deep { focal, distance, reach: reach as i32 })
+    let fits = of_any <= f64::from(REACH_MOST)
+        && reach.iter().all(|reach| 2.0 * reach + 2.0 < WINDOW as f64);
+    fits.then_some(Deep { focal, distance, reach: reach.map(|reach| reach as i32) })
 }
 
 /// Renders a part: compiled for each instruction set as a whole.
@@ -150,7 +152,7 @@ impl<S: Recorded, const N: usize> Stage<S, N> for DeepStage<'_, S, N> {
     type Voxel = DeepVoxel;
 
     #[inline(always)]
-    fn reach(&self) -> i32 {
+    fn reach(&self) -> [i32; 2] {
         self.deep.reach
     }
 
@@ -421,7 +423,7 @@ mod tests {
                         }
                         for (axis, (from, to)) in [x, y].into_iter().enumerate() {
                             let (from, to) = (i64::from(from) - cell[axis], i64::from(to) - 1 - cell[axis]);
-                            let reach = i64::from(reach);
+                            let reach = i64::from(reach[axis]);
                             prop_assert!(-reach <= from && to <= reach, "{from} to {to} of {reach}");
                         }
                     }

@@ -70,7 +70,8 @@ pub(crate) struct RenderFlat<'a, S: Recorded, const N: usize> {
 
 /// Whether parts of `frame` may be rendered here.
 pub(crate) fn takes(frame: &Frame) -> Option<&Flat> {
-    frame.flat.as_ref().filter(|flat| 2 * flat.reach < PART && frame.leaning.is_none())
+    let fits = |flat: &&Flat| flat.reach.iter().all(|reach| 2 * reach < PART);
+    frame.flat.as_ref().filter(fits).filter(|_| frame.leaning.is_none())
 }
 
 impl<S: Recorded, const N: usize> Work for RenderFlat<'_, S, N> {
@@ -155,7 +156,7 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
     type Voxel = Splat;
 
     #[inline(always)]
-    fn reach(&self) -> i32 {
+    fn reach(&self) -> [i32; 2] {
         self.flat.reach
     }
 

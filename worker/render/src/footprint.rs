@@ -248,11 +248,12 @@ impl Leaning {
         &self.subpixels[axis]
     }
 
-    /// Pixels at most that a section or an outermost row lies beside its voxel, for footprints of a `reach`; `scale`:
-    /// pixels a vox at most.
-    pub(crate) fn pixels(&self, scale: f64, reach: i32) -> f64 {
+    /// Pixels at most along x and y that a section or an outermost row lies beside its voxel, for footprints of a
+    /// `reach` along each; `scale`: pixels a vox at most.
+    pub(crate) fn pixels(&self, scale: f64, [_, reach]: [i32; 2]) -> [f64; 2] {
         let row = self.row as f64 / 65536.0;
-        self.most[0].max(self.most[1]) * scale + row.abs() * f64::from(reach + 1)
+        let [x, y] = self.most.map(|vox| vox * scale);
+        [x + row.abs() * f64::from(reach + 1), y]
     }
 
     /// The farthest of [those](Leaning::aside).
@@ -584,11 +585,11 @@ pub struct Footprint<'a> {
 }
 
 impl<'a> Footprint<'a> {
-    /// Pixels that it reaches at most from the one that holds its centre, where its weights are in
+    /// Pixels along x and y that it reaches at most from the one that holds its centre, where its weights are in
     /// a table; otherwise they are worked out where they are drawn.
     #[inline]
-    pub fn reach(&self) -> Option<i32> {
-        self.table.map(|t| t.along(0).reach.max(t.along(1).reach))
+    pub fn reach(&self) -> Option<[i32; 2]> {
+        self.table.map(|t| [t.along(0).reach, t.along(1).reach])
     }
 
     /// Pixels `[first, end)` along `axis` (0: x, 1: y) that a footprint at screen position

@@ -36,7 +36,8 @@ pub(crate) struct Lean<'a> {
 /// Whether parts of `frame` may be rendered here.
 pub(crate) fn takes(frame: &Frame) -> Option<Lean<'_>> {
     let (flat, leaning) = (frame.flat.as_ref()?, frame.leaning.as_ref()?);
-    (2 * flat.reach + 2 < WINDOW as i32).then_some(Lean { flat, leaning })
+    let fits = flat.reach.iter().all(|reach| 2 * reach + 2 < WINDOW as i32);
+    fits.then_some(Lean { flat, leaning })
 }
 
 /// Renders a part, in records of eight sheets, since few kernels that lean reach through four: compiled for each
@@ -84,7 +85,7 @@ impl<S: Recorded, const N: usize> Stage<S, N> for LeaningStage<'_, S, N> {
     type Voxel = Splat;
 
     #[inline(always)]
-    fn reach(&self) -> i32 {
+    fn reach(&self) -> [i32; 2] {
         self.lean.flat.reach
     }
 

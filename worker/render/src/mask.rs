@@ -14,9 +14,21 @@ use slabcast_common::view::SUBPIXEL_BITS;
 pub(crate) struct OpenMask {
     rect: Rect,
     rows: [u64; 64],
-    /// Pixels with an open one at most `reach` columns and rows away.
+    /// Pixels with an open one at most so many columns and rows away.
     grown: [u64; 64],
-    reach: i32,
+    reach: [i32; 2],
+}
+
+/// By how much to grow, step by step, to have grown by `reach`: what is grown by n can be grown by n + 1 more at
+/// once.
+#[inline(always)]
+fn steps(reach: i32) -> impl Iterator<Item = usize> {
+    let mut done = 0;
+    std::iter::from_fn(move || {
+        let step = (reach - done).min(done + 1);
+        done += step;
+        (step > 0).then_some(step as usize)
+    })
 }
 
 /// Farthest that a mask is grown: beyond it every footprint covers most of a part anyway.
@@ -29,7 +41,7 @@ impl OpenMask {
     /// If `rect` has more than 64 columns or rows.
     pub(crate) fn shut(rect: Rect) -> Self {
         assert!(rect.width() <= 64 && rect.height() <= 64, "a part is at most 64x64");
-        OpenMask { rect, rows: [0; 64], grown: [0; 64], reach: 0 }
+        OpenMask { rect, rows: [0; 64], grown: [0; 64], reach: [0; 2] }
     }
 
     /// Opens the pixels of row `y` whose bits are set.
@@ -56,25 +68,24 @@ impl OpenMask {
         self.rows[y & 63]
     }
 
-    /// Grows the mask by `reach` pixels, at most [`REACH_MOST`]: to be done again after pixels shut.
+    /// Grows the mask by so many columns and rows, each at most [`REACH_MOST`]: to be done again after pixels
+    /// shut.
     #[inline(always)]
-    pub(crate) fn grow(&mut self, reach: i32) {
-        self.reach = reach.min(REACH_MOST);
+    pub(crate) fn grow(&mut self, reach: [i32; 2]) {
+        self.reach = reach.map(|reach| reach.min(REACH_MOST));
         self.grown = self.rows;
-        // What is grown by n can be grown by n + 1 more at once.
-        let mut done = 0;
-        while done < self.reach {
-            let step = (self.reach - done).min(done + 1);
+        let [columns, rows] = self.reach;
+        for step in steps(columns) {
             for row in &mut self.grown {
                 *row |= *row << step | *row >> step;
             }
+        }
+        for step in steps(rows) {
             let was = self.grown;
-            let step_rows = step as usize;
-            for y in step_rows..64 {
-                self.grown[y] |= was[y - step_rows];
-                self.grown[y - step_rows] |= was[y];
+            for y in step..64 {
+                self.grown[y] |= was[y - step];
+                self.grown[y - step] |= was[y];
             }
-            done += step;
         }
     }
 
@@ -82,20 +93,21 @@ impl OpenMask {
     /// mask's reach around them may touch the part (1) or an open pixel of it, too (3).
     #[inline(always)]
     pub(crate) fn near_all(&self, x: &[i32], y: &[i32], cells: &mut [u32], fate: &mut [u32]) {
-        let span = (64 + 2 * self.reach) as u32;
+        let [wide, high] = self.reach.map(|reach| (64 + 2 * reach) as u32);
+        let [across, down] = self.reach;
         for (((x, y), cell), fate) in x.iter().zip(y).zip(cells).zip(fate) {
             let (x, y) = (x >> SUBPIXEL_BITS, y >> SUBPIXEL_BITS);
-            let inside = |p: i32| u32::from(((p + self.reach) as u32) < span);
+            let inside = [(x + across, wide), (y + down, high)];
+            let [inside_x, inside_y] = inside.map(|(p, span)| u32::from((p as u32) < span));
             let (cx, cy) = (x.clamp(0, 63), y.clamp(0, 63));
             *cell = (cy << 6 | cx) as u32;
-            *fate =
-                (inside(x) & inside(y)) * (1 + 2 * ((self.grown[cy as usize] >> cx) as u32 & 1));
+            *fate = (inside_x & inside_y) * (1 + 2 * ((self.grown[cy as usize] >> cx) as u32 & 1));
         }
     }
 
     /// What [`OpenMask::near_all`] looks at: the grown mask and its reach.
     #[inline(always)]
-    pub(crate) fn grown(&self) -> (&[u64; 64], i32) {
+    pub(crate) fn grown(&self) -> (&[u64; 64], [i32; 2]) {
         (&self.grown, self.reach)
     }
 
@@ -149,18 +161,17 @@ mod tests {
             }
             for (x0, y0, dx, dy) in rects {
                 let r = Rect::new(x0, y0, x0 + dx, y0 + dy);
-                // A square around a centre is open only where the grown mask says it may be.
-                let (reach, cx, cy) = (dx.clamp(0, REACH_MOST), x0, y0);
-                mask.grow(reach);
-                let square = Rect::new(
-                    x + cx - reach, y + cy - reach, x + cx + reach + 1, y + cy + reach + 1,
-                );
+                // A rectangle around a centre is open only where the grown mask says it may be.
+                let ([rx, ry], cx, cy) = ([dx, dy].map(|d| d.clamp(0, REACH_MOST)), x0, y0);
+                mask.grow([rx, ry]);
+                let around =
+                    Rect::new(x + cx - rx, y + cy - ry, x + cx + rx + 1, y + cy + ry + 1);
                 let (mut cell, mut fate) = ([0], [9]);
                 mask.near_all(&[cx * 256 + 255], &[cy * 256], &mut cell, &mut fate);
                 let near = fate[0] == 3;
-                prop_assert!(near || !mask.any(&square), "{square:?} in {part:?}");
+                prop_assert!(near || !mask.any(&around), "{around:?} in {part:?}");
                 let inside = (0..64).contains(&cx) && (0..64).contains(&cy);
-                prop_assert!(!inside || near == mask.any(&square));
+                prop_assert!(!inside || near == mask.any(&around));
                 prop_assert!(fate[0] == 0 || near == mask.is_near(cell[0]));
                 let inside = |&(i, j): &(i32, i32)| {
                     let (i, j) = (i + x, j + y);

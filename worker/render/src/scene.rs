@@ -95,8 +95,8 @@ pub struct Frame {
 pub(crate) struct Flat {
     /// Where voxels land.
     pub(crate) places: Places,
-    /// Pixels that a footprint reaches at most from the one that holds its voxel's centre.
-    pub(crate) reach: i32,
+    /// Pixels along x and y that a footprint reaches at most from the one that holds its voxel's centre.
+    pub(crate) reach: [i32; 2],
 }
 
 /// A brick's corner, seen by the eye.
@@ -177,11 +177,12 @@ impl Frame {
         let reach = reach.map(|reach| match &leaning {
             // A subpixel more, since what lies aside is rounded, too.
             Some(leaning) => {
-                reach + libm::ceil(leaning.pixels(largest, reach) + 1.0 / 256.0) as i32
+                let aside = leaning.pixels(largest, reach);
+                [0, 1].map(|axis| reach[axis] + libm::ceil(aside[axis] + 1.0 / 256.0) as i32)
             }
             None => reach,
         });
-        let reach = reach.filter(|&reach| reach <= REACH_MOST);
+        let reach = reach.filter(|reach| reach.iter().all(|&reach| reach <= REACH_MOST));
         let flat = reach.and_then(|reach| Some(Flat { places: Places::new(&view)?, reach }));
         let mut offsets = Box::new([[0.0; 512]; 3]);
         for i in 0..512u16 {

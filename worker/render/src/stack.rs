@@ -49,8 +49,8 @@ pub(crate) trait Stage<S: Recorded, const N: usize> {
     /// A voxel waiting in the bucket of its first sheet.
     type Voxel: Copy;
 
-    /// Pixels that a footprint reaches at most from the one that holds its centre.
-    fn reach(&self) -> i32;
+    /// Pixels along x and y that a footprint reaches at most from the one that holds its centre.
+    fn reach(&self) -> [i32; 2];
     /// Tests brick `which` of the part, then its voxels, and tosses what is left into buckets.
     fn toss(
         &mut self,

@@ -175,10 +175,12 @@ impl Frame {
         let leaning = leans.then(|| Leaning::new(&view, &profile, &sections, largest));
         let leaning = leaning.filter(Leaning::shows);
         let reach = reach.map(|reach| match &leaning {
-            // A subpixel more, since what lies aside is rounded, too.
             Some(leaning) => {
                 let aside = leaning.pixels(largest, reach);
-                [0, 1].map(|axis| reach[axis] + libm::ceil(aside[axis] + 1.0 / 256.0) as i32)
+                // A subpixel more, since what lies aside is rounded, too; what does not is nothing.
+                let subpixel = 1.0 / f64::from(SUBPIXELS);
+                let more = |aside| if aside > 0.0 { aside + subpixel } else { 0.0 };
+                [0, 1].map(|axis| reach[axis] + libm::ceil(more(aside[axis])) as i32)
             }
             None => reach,
         });

@@ -27,7 +27,7 @@ STAGES = [
     ("close", r"\bclose|\btake\b|take_grey|\bput\b"),
     ("light", r"payloads|light_all"),
     ("add", r"splat_all|splat_apart|splat_deep"),
-    ("splat", r"\bsplat\b|splat_all|splat::records|\btouch\b|render_records"),
+    ("splat", r"\bsplat\b|splat::records|\btouch\b|render_records"),
     ("project", r"Seen|\btight\b|overlaps|View::project|front_to_back|slabcast::local|\bcorner\b|render_into|each_pixel|Part::end"),
 ]
 

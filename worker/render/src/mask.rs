@@ -19,15 +19,14 @@ pub(crate) struct OpenMask {
     reach: [i32; 2],
 }
 
-/// By how much to grow, step by step, to have grown by `reach`: what is grown by n can be grown by n + 1 more at
-/// once.
+/// By how much one pixel has to be moved, step by step together with all that it has become, to be `n`.
 #[inline(always)]
-fn steps(reach: i32) -> impl Iterator<Item = usize> {
-    let mut done = 0;
+pub(crate) fn doubling(n: usize) -> impl Iterator<Item = usize> {
+    let mut done = 1;
     std::iter::from_fn(move || {
-        let step = (reach - done).min(done + 1);
+        let step = done.min(n - done);
         done += step;
-        (step > 0).then_some(step as usize)
+        (step > 0).then_some(step)
     })
 }
 
@@ -74,13 +73,14 @@ impl OpenMask {
     pub(crate) fn grow(&mut self, reach: [i32; 2]) {
         self.reach = reach.map(|reach| reach.min(REACH_MOST));
         self.grown = self.rows;
-        let [columns, rows] = self.reach;
-        for step in steps(columns) {
+        // To both sides at once: a pixel and so many on either side.
+        let [columns, rows] = self.reach.map(|reach| doubling(reach as usize + 1));
+        for step in columns {
             for row in &mut self.grown {
                 *row |= *row << step | *row >> step;
             }
         }
-        for step in steps(rows) {
+        for step in rows {
             let was = self.grown;
             for y in step..64 {
                 self.grown[y] |= was[y - step];

@@ -4,7 +4,7 @@
 //! splat; this room closes. Pixels that something was added to are known by a bit each; a sheet that
 //! closes looks at the open ones among those alone, sixteen at a time from wherever they lie.
 
-use crate::mask::OpenMask;
+use crate::mask::{OpenMask, doubling};
 use crate::sheet::{LANES, Row};
 use crate::splat::Simd;
 use crate::splat::close::close_rows;
@@ -202,17 +202,6 @@ pub(crate) struct Sheets<'a, S: Recorded, const N: usize> {
 #[inline(always)]
 pub(crate) fn slot<const N: usize>(k: i32) -> usize {
     k as usize % N
-}
-
-/// By how much one pixel has to be moved, step by step together with all that it has become, to be `n`.
-#[inline(always)]
-fn doubling(n: usize) -> impl Iterator<Item = usize> {
-    let mut done = 1;
-    std::iter::from_fn(move || {
-        let step = done.min(n - done);
-        done += step;
-        (step > 0).then_some(step)
-    })
 }
 
 impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {

@@ -741,7 +741,8 @@ mod tests {
             which in 0..8u32, share in 0.0..1.0f64, seed in any::<u64>(),
             kind in 0..3u8, shaded in any::<bool>(), cull in any::<bool>(),
             open in prop::collection::vec((0..64usize, 0..64u32), 0..40),
-            begin in -16..16i32, count in 0..24i32, reach in prop::array::uniform2(0..9i32), moved in any::<bool>(),
+            begin in -16..16i32, count in 0..24i32,
+            reach in prop::array::uniform2(0..9i32), moved in any::<bool>(),
         ) {
             let flat = CameraProjection::Ortho { height };
             let frame = frame(DVec3::from_array(eye), flat, thickness);

@@ -36,7 +36,7 @@ pub mod wanted;
 
 /// Version of the arithmetic behind the pixels. Two programs that agree on it give the same
 /// bytes for the same view; a change of any golden hash raises it (CONTRACTS.md, Exactness).
-pub const PIXELS_VERSION: u32 = 9;
+pub const PIXELS_VERSION: u32 = 10;
 
 /// Version of the messages between master, worker and client.
 pub const PROTOCOL_VERSION: u32 = 5;
@@ -44,4 +44,4 @@ pub const PROTOCOL_VERSION: u32 = 5;
 /// SHA-256 of the self-test tile that every worker draws before it says hello
 /// (`slabcast_render::selftest`, which also has the test that keeps this constant true).
 pub const SELF_TEST_SHA256: &str =
-    "223117abe5801f89fa92e9a33617765f2924a9584dbedf7fb9a0f7dbd0f23ef4";
+    "7e6c3ac2882e16e162b721300888f56132d5f1e7d7586ca6e40a95780f4b385f";

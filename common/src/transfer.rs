@@ -232,6 +232,7 @@ impl<'de> Deserialize<'de> for TransferChoice {
 
 /// What a value looks like: extinction per vox (or the paper's alpha) and linear colour.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[repr(C)]
 pub struct Look {
     /// Extinction per vox of travel, capped; for [`Compositing::Paper`] alpha per vox.
     pub sigma: f32,

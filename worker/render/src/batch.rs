@@ -6,7 +6,7 @@ use crate::scene::Frame;
 use crate::splat::records::apart::{Apart, BATCH, Each, Layers, Woven, splat_skewed};
 use crate::splat::records::{Recorded, Table};
 use crate::splat::toss::any_in_rows;
-use crate::splat::whole_registers;
+use crate::splat::{Simd, whole_registers};
 use crate::stack::{Sheets, slot};
 use crate::tile::Part;
 use slabcast_common::message::Counters;
@@ -57,20 +57,18 @@ impl<'a, S: Recorded, const N: usize> Axes<'a, S, N> {
 }
 
 impl Batch {
-    /// Adds the first `n` voxels, which are placed, to their sheets from `k` on, which have these footprints; not
-    /// those around which all is shut. `eyes`: eye coordinates by axis, where each voxel sees the eye in a
-    /// direction of its own. Of so many voxels there were, what it adds and what not is counted.
+    /// Keeps of the first `n` voxels, which are placed, those around which anything is open, and has light fall
+    /// on them; says how many there are. `eyes`: eye coordinates by axis, where each voxel sees the eye in a
+    /// direction of its own. Of `of` voxels that there were, what is added and what not is counted.
     #[inline(always)]
-    pub(crate) fn add<S: Recorded, const N: usize>(
+    pub(crate) fn light<S: Recorded>(
         &mut self,
-        (part, open): (&Part<'_>, &OpenMask),
-        (n, k): (usize, i32),
-        Axes { layers, phases: [phases, _] }: &Axes<'_, S, N>,
+        (simd, part, open): (Simd, &Part<'_>, &OpenMask),
+        n: usize,
         mut eyes: Option<&mut [Each<f64>; 3]>,
-        woven: &mut Woven<S::Weight, N>,
-        sheets: &mut Sheets<'_, S, N>,
+        payloads: &mut [S::Payload; BATCH],
         (of, counters): (usize, &mut Counters),
-    ) {
+    ) -> usize {
         let frame = part.frame;
         let Batch { samples, normals, apart, light } = self;
         let Apart { lo, hi, kept, .. } = apart;
@@ -82,7 +80,7 @@ impl Batch {
             }
             let columns = (u64::MAX >> (64 - (x1 - x0))) << x0;
             let rows = [y0, y1].map(|y| y as usize);
-            if cull && !any_in_rows(sheets.simd, open.rows(), rows, columns) {
+            if cull && !any_in_rows(simd, open.rows(), rows, columns) {
                 continue;
             }
             kept[some] = i as u32;
@@ -94,18 +92,37 @@ impl Batch {
         }
         let all = whole_registers(some);
         let eyes = eyes.map(|eyes| eyes.each_ref().map(|eye| &eye[..all]));
-        frame.payloads(&samples[..some], &normals[..all], eyes, light);
-        let mut payloads = [S::Payload::default(); BATCH];
+        frame.payloads(simd, &samples[..some], &normals[..all], eyes, light);
         let [sigma, r, g, b] = light;
         for (j, payload) in payloads[..some].iter_mut().enumerate() {
             *payload = S::payload([sigma[j], r[j], g[j], b[j]]);
         }
+        counters.splatted += some as u64;
+        counters.culled += (of - some) as u64;
+        some
+    }
+
+    /// Adds those of the first `n` voxels that [are kept](Batch::light) to their sheets from `k` on, which have
+    /// these footprints.
+    #[inline(always)]
+    pub(crate) fn add<S: Recorded, const N: usize>(
+        &mut self,
+        (part, open): (&Part<'_>, &OpenMask),
+        (n, k): (usize, i32),
+        Axes { layers, phases: [phases, _] }: &Axes<'_, S, N>,
+        eyes: Option<&mut [Each<f64>; 3]>,
+        woven: &mut Woven<S::Weight, N>,
+        sheets: &mut Sheets<'_, S, N>,
+        counted: (usize, &mut Counters),
+    ) {
+        let mut payloads = [S::Payload::default(); BATCH];
+        let some = self.light::<S>((sheets.simd, part, open), n, eyes, &mut payloads, counted);
         let apart = &self.apart;
         for &i in &apart.kept[..some] {
             let (at, wide) = apart.window(i as usize % BATCH, S::step::<N>());
             sheets.touch(k, at, wide);
         }
-        let row = frame.leaning.as_ref().map_or(0, Leaning::row);
+        let row = part.frame.leaning.as_ref().map_or(0, Leaning::row);
         let voxels = (apart, &payloads[..some]);
         if row == 0 {
             S::splat_apart(sheets.simd, sheets.records, voxels, layers, woven);
@@ -113,7 +130,5 @@ impl Batch {
             let layers = (layers, (row, phases));
             splat_skewed::<S, N>(sheets.simd, sheets.records, voxels, layers, woven);
         }
-        counters.splatted += some as u64;
-        counters.culled += (of - some) as u64;
     }
 }

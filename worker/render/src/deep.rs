@@ -10,17 +10,19 @@
 
 use crate::batch::{Axes, Batch};
 use crate::footprint::{Footprint, Leaning};
+use crate::level::LevelSheets;
 use crate::mask::{OpenMask, REACH_MOST};
 use crate::scene::Frame;
-use crate::splat::records::Recorded;
 use crate::splat::records::apart::{Apart, BATCH, Each, WINDOW, Woven, after};
+use crate::splat::records::{MOST, Recorded};
+use crate::splat::tiers::{Shape, Tiered};
 use crate::splat::toss::{self, Kept, Sieve, Sifted, Tossing, prefetch};
 use crate::splat::{Simd, Work, whole_registers};
 use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS};
+use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, round_i32};
 
 /// A voxel waiting in the bucket of its first sheet, with all that drawing it takes: nobody goes back
 /// to the brick.
@@ -50,11 +52,21 @@ struct Places {
     eye: [Each<f64>; 3],
     /// Where a section of each is along an axis.
     aside: Each<f64>,
+    /// In a level view, which storey each belongs to, and by slot which tier and where among all of a sheet.
+    storey: Each<i32>,
+    tiers: [Each<u32>; MOST],
+    places: [Each<u32>; MOST],
 }
 
 impl Default for Places {
     fn default() -> Self {
-        Places { eye: [[0.0; BATCH]; 3], aside: [0.0; BATCH] }
+        Places {
+            eye: [[0.0; BATCH]; 3],
+            aside: [0.0; BATCH],
+            storey: [0; BATCH],
+            tiers: [[0; BATCH]; MOST],
+            places: [[0; BATCH]; MOST],
+        }
     }
 }
 
@@ -121,7 +133,7 @@ pub(crate) struct RenderDeep<'a, S: Recorded, const N: usize> {
     pub(crate) io: Io<'a>,
 }
 
-impl<S: Recorded, const N: usize> Work for RenderDeep<'_, S, N> {
+impl<S: Tiered, const N: usize> Work for RenderDeep<'_, S, N> {
     type Out = ();
     #[inline(always)]
     fn run(self) {
@@ -130,7 +142,22 @@ impl<S: Recorded, const N: usize> Work for RenderDeep<'_, S, N> {
         let [x, y] = [[[S::Weight::default(); N]; WINDOW]; 2];
         let across = [x, y];
         let stage = DeepStage { part: &part, deep, simd, tossing, batch, places, across };
-        walk::<S, N, _>(&part, stage, (simd, store), queues, pixels, io);
+        let frame = part.frame;
+        match (&frame.storeys, part.nearest()) {
+            (Some(storeys), Some(nearest)) => {
+                // The nearest sheet has the widest footprints, the last one most storeys.
+                let widest = frame.footprints.at(nearest).and_then(|footprint| footprint.phases(0));
+                let len = widest.expect("a table of a sheet that is not clipped").len;
+                let last = frame.footprints.at(frame.footprints.last()).expect("one behind it");
+                let shape = Shape::new::<S>(storeys.rows(PART, last.scale), len);
+                let sheets = LevelSheets::<S, N>::new(simd, store, &part, storeys, shape);
+                walk(&part, stage, sheets, queues, pixels, io);
+            }
+            _ => {
+                let sheets = Sheets::<S, N>::new(simd, store, frame.sections.most());
+                walk(&part, stage, sheets, queues, pixels, io);
+            }
+        }
     }
 }
 
@@ -148,16 +175,10 @@ struct DeepStage<'a, S: Recorded, const N: usize> {
 /// Footprints of sheets by slot, and their scales.
 type Footprints<'a, S, const N: usize> = (Axes<'a, S, N>, [f64; N]);
 
-impl<S: Recorded, const N: usize> Stage<S, N> for DeepStage<'_, S, N> {
-    type Voxel = DeepVoxel;
-
+impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
+    /// [`Stage::toss`].
     #[inline(always)]
-    fn reach(&self) -> [i32; 2] {
-        self.deep.reach
-    }
-
-    #[inline(always)]
-    fn toss(
+    fn toss_all(
         &mut self,
         which: usize,
         open: &OpenMask,
@@ -199,51 +220,92 @@ impl<S: Recorded, const N: usize> Stage<S, N> for DeepStage<'_, S, N> {
         counters.tossed += kept as u64;
         counters.culled += (reached - kept) as u64;
     }
-
+    /// Takes over those of `some` voxels near which anything is open; says how many.
     #[inline(always)]
-    fn splat(
-        &mut self,
-        bucket: &[DeepVoxel],
-        k: i32,
-        sheets: &mut Sheets<'_, S, N>,
-        open: &OpenMask,
-        counters: &mut Counters,
-    ) {
-        if bucket.is_empty() {
-            return;
-        }
-        let footprints = footprints::<S, N>(self.part, k);
+    fn take(&mut self, some: &[DeepVoxel], open: &OpenMask) -> usize {
         let most = self.part.frame.sections.most() as i32;
         let cull = self.part.frame.scene.quality.cull;
-        for some in bucket.chunks(BATCH) {
-            let mut n = 0;
-            for v in some {
-                self.put(n, v, most);
-                n += usize::from(!cull || open.is_near(v.cell.into()));
-            }
-            self.add(n, k, &footprints, sheets, open, (some.len(), counters));
+        let mut n = 0;
+        for v in some {
+            self.put(n, v, most);
+            n += usize::from(!cull || open.is_near(v.cell.into()));
         }
+        n
     }
 
+    /// Takes over voxels that begin before the slab, for those of their sheets that are left.
     #[inline(always)]
-    fn splat_carried(
-        &mut self,
-        carried: &[(DeepVoxel, i32)],
-        sheets: &mut Sheets<'_, S, N>,
-        open: &OpenMask,
-        counters: &mut Counters,
-    ) {
-        let k = self.part.slab.first;
-        let footprints = footprints::<S, N>(self.part, k);
+    fn take_carried(&mut self, some: &[(DeepVoxel, i32)]) -> usize {
         let most = self.part.frame.sections.most() as i32;
-        for some in carried.chunks(BATCH) {
-            for (i, (v, first)) in some.iter().enumerate() {
-                self.put(i, v, most - (k - first));
-            }
-            self.add(some.len(), k, &footprints, sheets, open, (some.len(), counters));
+        for (i, (v, first)) in some.iter().enumerate() {
+            self.put(i, v, most - (self.part.slab.first - first));
         }
+        some.len()
     }
 }
+
+/// [`Stage`] for open sheets that voxels are added to by `$add`.
+macro_rules! stage {
+    ($bound:ident, $sheets:ident, $add:ident) => {
+        impl<S: $bound, const N: usize> Stage<$sheets<'_, S, N>> for DeepStage<'_, S, N> {
+            type Voxel = DeepVoxel;
+
+            #[inline(always)]
+            fn reach(&self) -> [i32; 2] {
+                self.deep.reach
+            }
+
+            #[inline(always)]
+            fn toss(
+                &mut self,
+                which: usize,
+                open: &OpenMask,
+                queues: &mut Queues<DeepVoxel>,
+                counters: &mut Counters,
+            ) {
+                self.toss_all(which, open, queues, counters);
+            }
+
+            #[inline(always)]
+            fn splat(
+                &mut self,
+                bucket: &[DeepVoxel],
+                k: i32,
+                sheets: &mut $sheets<'_, S, N>,
+                open: &OpenMask,
+                counters: &mut Counters,
+            ) {
+                if bucket.is_empty() {
+                    return;
+                }
+                let footprints = footprints::<S, N>(self.part, k);
+                for some in bucket.chunks(BATCH) {
+                    let n = self.take(some, open);
+                    self.$add(n, k, &footprints, sheets, open, (some.len(), counters));
+                }
+            }
+
+            #[inline(always)]
+            fn splat_carried(
+                &mut self,
+                carried: &[(DeepVoxel, i32)],
+                sheets: &mut $sheets<'_, S, N>,
+                open: &OpenMask,
+                counters: &mut Counters,
+            ) {
+                let k = self.part.slab.first;
+                let footprints = footprints::<S, N>(self.part, k);
+                for some in carried.chunks(BATCH) {
+                    let n = self.take_carried(some);
+                    self.$add(n, k, &footprints, sheets, open, (some.len(), counters));
+                }
+            }
+        }
+    };
+}
+
+stage!(Recorded, Sheets, add);
+stage!(Tiered, LevelSheets, add_level);
 
 /// Footprints of the sheets from `k` that a voxel may reach.
 #[inline(always)]
@@ -272,7 +334,7 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
     #[inline(always)]
     fn place(&mut self, n: usize, k: i32, (axes, scales): &Footprints<'_, S, N>) {
         let Part { frame, rect, .. } = self.part;
-        let Places { eye, aside } = &mut *self.places;
+        let Places { eye, aside, .. } = &mut *self.places;
         let n = whole_registers(n);
         let apart = &mut self.batch.apart;
         let view = &frame.view;
@@ -345,6 +407,60 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
         let (part, eyes, across) =
             ((self.part, open), Some(&mut self.places.eye), &mut self.across);
         self.batch.add(part, (n, k), &footprints.0, eyes, across, sheets, counted);
+    }
+}
+
+impl<S: Tiered, const N: usize> DeepStage<'_, S, N> {
+    /// [`DeepStage::add`] to tiers.
+    #[inline(always)]
+    fn add_level(
+        &mut self,
+        n: usize,
+        k: i32,
+        footprints: &Footprints<'_, S, N>,
+        sheets: &mut LevelSheets<'_, S, N>,
+        open: &OpenMask,
+        counted: (usize, &mut Counters),
+    ) {
+        self.place(n, k, footprints);
+        let (Axes { layers, .. }, scales) = footprints;
+        let Part { frame, rect, .. } = self.part;
+        let storeys = frame.storeys.as_ref().expect("a level view");
+        let shape = sheets.tiers.shape();
+        let Places { eye, storey, tiers, places, .. } = &mut *self.places;
+        let (per, first) = storeys.from_eye();
+        let all = whole_registers(n);
+        for (storey, y) in storey[..all].iter_mut().zip(&eye[1]) {
+            *storey = round_i32(y * per + first);
+        }
+        let most = frame.sections.most() as i32;
+        for (at, tiers) in tiers[..N].iter_mut().enumerate() {
+            if layers.after(at) < most {
+                let base = storeys.base(&frame.view, rect, scales[at]);
+                let firsts = &self.batch.apart.first[0][at];
+                for (i, (storey, first)) in storey[..all].iter().zip(firsts).enumerate() {
+                    tiers[i] = (storey - base).clamp(0, shape.rows as i32 - 1) as u32;
+                    places[at][i] = shape.place_in(tiers[i], *first);
+                }
+            }
+        }
+        let mut payloads = [S::Payload::default(); BATCH];
+        let asked = (sheets.simd, self.part, open);
+        let some = self.batch.light::<S>(asked, n, Some(eye), &mut payloads, counted);
+        let apart = &self.batch.apart;
+        for &i in &apart.kept[..some] {
+            let i = i as usize % BATCH;
+            // The window that holds all sections.
+            let ([x, _], [wide, _]) = apart.window(i, 1);
+            let columns = (u64::MAX >> (EDGE - wide)) << x;
+            for at in 0..N {
+                if layers.after(at) < apart.left[i] {
+                    sheets.touch(at, tiers[at][i] as usize, columns);
+                }
+            }
+        }
+        let voxels = (apart, &payloads[..some]);
+        S::add_apart(sheets.simd, &mut sheets.tiers, voxels, places, layers);
     }
 }
 

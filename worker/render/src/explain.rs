@@ -118,6 +118,8 @@ struct Part<S: Accumulate> {
     section: [S::Section; 4],
     wx: S::Weight,
     wy: S::Weight,
+    /// In a level view: whose row it adds to.
+    storey: Option<u32>,
 }
 
 impl<S: Accumulate> Part<S> {
@@ -154,7 +156,8 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
             for (i, &local) in brick.index.iter().enumerate() {
                 let placed = frame.place(&corner, local);
                 let (first, _) = frame.sections.of(placed.z);
-                found.push((first, brick.id, i as u16, b as u32, placed));
+                let storey = frame.storey(&corner, local);
+                found.push((first, brick.id, i as u16, b as u32, (placed, storey)));
             }
         }
         found.sort_unstable_by_key(|&(first, id, i, ..)| (first, id, i));
@@ -162,7 +165,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
         let (mut bx, mut by) = (Vec::new(), Vec::new());
         let (mut tx, mut ty) = (Vec::new(), Vec::new());
         let (columns, rows) = ((at[0], at[0] + 1), (at[1], at[1] + 1));
-        for (first, _, i, b, placed) in found {
+        for (first, _, i, b, (placed, storey)) in found {
             let z = placed.z;
             let (_, sections) = frame.sections.of(z);
             let mut payload = None;
@@ -190,7 +193,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
                 let parts = pixel.sheets.entry(k).or_default();
                 let weights = [real_x.get(), real_y.get(), wz];
                 let section = S::section(&frame.sections, z, n, &payload);
-                parts.push(Part { voxel, weights, section, wx, wy });
+                parts.push(Part { voxel, weights, section, wx, wy, storey });
             }
         }
         pixel
@@ -199,13 +202,27 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
     /// The sums of sheet `k` of the voxels that begin at `last` or before.
     fn sums(&self, k: i32, last: i32) -> [S; 4] {
         let mut sums = [S::default(); 4];
+        // Rows of storeys at the pixel's column, ascending, and what they weigh there.
+        let mut rows: BTreeMap<u32, ([S; 4], S::Weight)> = BTreeMap::new();
         for part in self.sheets.get(&k).into_iter().flatten() {
             let v = &self.voxels[part.voxel as usize];
             if v.first > last {
                 // They ascend.
                 break;
             }
-            part.add_to(&mut sums);
+            match part.storey {
+                None => part.add_to(&mut sums),
+                Some(storey) => {
+                    let (row, _) = rows.entry(storey).or_insert(([S::default(); 4], part.wy));
+                    for c in 0..4 {
+                        row[c] = row[c].plus(part.section[c], part.wx);
+                    }
+                }
+            }
+        }
+        if let Some(storeys) = &self.frame.storeys {
+            let row = |c: usize| rows.values().map(move |(row, wy)| (row[c], *wy));
+            sums = std::array::from_fn(|c| S::down(row(c), storeys.spread));
         }
         sums
     }
@@ -271,9 +288,18 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
     fn sections(&self, k: i32, secant: f32, n: usize) -> (usize, usize, Vec<Section>) {
         let mut all = Vec::new();
         for part in self.sheets.get(&k).into_iter().flatten() {
-            let mut sums = [S::default(); 4];
-            part.add_to(&mut sums);
-            let raw = sums[0].value();
+            let raw = match &self.frame.storeys {
+                None => {
+                    let mut sums = [S::default(); 4];
+                    part.add_to(&mut sums);
+                    sums[0].value()
+                }
+                // Its share of a sum that is rounded with others.
+                Some(storeys) => {
+                    let row = S::default().plus(part.section[0], part.wx).value();
+                    row * (part.weights[1] * storeys.spread)
+                }
+            };
             if raw > 0.0 {
                 all.push((raw, part));
             }

@@ -19,7 +19,7 @@ use crate::mask::OpenMask;
 use crate::place::Places;
 use crate::scene::{Flat, Frame};
 use crate::splat::records::{Recorded, Splat, Table, Tables, splat};
-use crate::splat::toss::{self, Sieve, Sifted, Tossing, prefetch};
+use crate::splat::toss::{self, Packing, Sieve, Sifted, Tossing, prefetch};
 use crate::splat::{Simd, Work, whole_registers};
 use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels};
@@ -29,18 +29,18 @@ use slabcast_common::view::SUBPIXELS;
 /// Memory for voxels that a render thread keeps from part to part.
 #[derive(Default)]
 pub(crate) struct Waiting {
-    queues: Queues<Splat>,
-    tossing: Tossing,
-    batch: Batch,
+    pub(crate) queues: Queues<Splat>,
+    pub(crate) tossing: Tossing,
+    pub(crate) batch: Batch,
 }
 
 /// Voxels that are shaded and splatted together. A bucket of a part has some 50; at 16 loops are
 /// too short for lanes, at 1024 this is more than a first cache.
-const BATCH: usize = 128;
+pub(crate) const BATCH: usize = 128;
 
 /// Voxels on their way from a bucket to the records.
-struct Batch {
-    voxels: [Splat; BATCH],
+pub(crate) struct Batch {
+    pub(crate) voxels: [Splat; BATCH],
     samples: [u32; BATCH],
     normals: [u16; BATCH],
     light: [[f32; BATCH]; 4],
@@ -54,6 +54,40 @@ impl Default for Batch {
             normals: [0; BATCH],
             light: [[0.0; BATCH]; 4],
         }
+    }
+}
+
+impl Batch {
+    /// Takes those of some voxels over that are still wanted, notes each, and has light fall on them; says how
+    /// many there are.
+    #[inline(always)]
+    pub(crate) fn light<S: Recorded>(
+        &mut self,
+        (simd, part, open): (Simd, &Part<'_>, &OpenMask),
+        some: &[Splat],
+        counters: &mut Counters,
+        mut note: impl FnMut(&Splat),
+        payloads: &mut [S::Payload; BATCH],
+    ) -> usize {
+        let cull = part.frame.scene.quality.cull;
+        let Batch { voxels, samples, normals, light } = self;
+        let mut n = 0;
+        for v in some {
+            voxels[n] = *v;
+            n += usize::from(!cull | open.is_near(v.cell()));
+        }
+        for (i, v) in voxels[..n].iter().enumerate() {
+            (samples[i], normals[i]) = (v.sample, v.normal());
+            note(v);
+        }
+        part.frame.payloads(simd, &samples[..n], &normals[..whole_registers(n)], None, light);
+        let [sigma, r, g, b] = light;
+        for (i, payload) in payloads[..n].iter_mut().enumerate() {
+            *payload = S::payload([sigma[i], r[i], g[i], b[i]]);
+        }
+        counters.culled += (some.len() - n) as u64;
+        counters.splatted += n as u64;
+        n
     }
 }
 
@@ -92,20 +126,21 @@ impl<S: Recorded, const N: usize> Work for RenderFlat<'_, S, N> {
         let Waiting { queues, tossing, batch } = waiting;
         let phases = [phases_x, phases_y];
         let stage = FlatStage { part: &part, simd, flat, phases, tables, tossing, batch };
-        walk::<S, N, _>(&part, stage, (simd, store), queues, pixels, io);
+        let sheets = Sheets::<S, N>::new(simd, store, part.frame.sections.most());
+        walk(&part, stage, sheets, queues, pixels, io);
     }
 }
 
 /// What a voxel's brick is among a part's, which pixels are open, where voxels wait, and what is counted.
 pub(crate) type Asked<'a> = (usize, &'a OpenMask, &'a mut Queues<Splat>, &'a mut Counters);
 
-/// [`Stage::toss`] in a view that is flat; `phases` as [`Sieve::sift_ready`] takes them.
+/// [`Stage::toss`] in a view that is flat.
 #[inline(always)]
 pub(crate) fn toss(
     part: &Part<'_>,
     simd: Simd,
     flat: &Flat,
-    phases: Option<&[Phases; 2]>,
+    packing: Packing<'_>,
     tossing: &mut Tossing,
     (which, open, queues, counters): Asked<'_>,
 ) {
@@ -128,7 +163,7 @@ pub(crate) fn toss(
         // From the sheet that depths are counted from.
         sheets: [slab.first, slab.end].map(|k| k - base),
     };
-    let Sifted { reached, kept } = sieve.sift_ready(simd, brick, phases, tossing);
+    let Sifted { reached, kept } = sieve.sift_ready(simd, brick, packing, tossing);
     counters.tossed += kept as u64;
     counters.culled += (reached - kept) as u64;
     for (first, voxel) in tossing.ready(kept) {
@@ -152,7 +187,7 @@ struct FlatStage<'a, S: Recorded> {
     batch: &'a mut Batch,
 }
 
-impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
+impl<S: Recorded, const N: usize> Stage<Sheets<'_, S, N>> for FlatStage<'_, S> {
     type Voxel = Splat;
 
     #[inline(always)]
@@ -168,15 +203,9 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
         queues: &mut Queues<Splat>,
         counters: &mut Counters,
     ) {
-        let phases = Some(&self.phases);
-        toss(
-            self.part,
-            self.simd,
-            self.flat,
-            phases,
-            self.tossing,
-            (which, open, queues, counters),
-        );
+        let asked = (which, open, queues, counters);
+        let packing = Packing::Window(&self.phases);
+        toss(self.part, self.simd, self.flat, packing, self.tossing, asked);
     }
 
     #[inline(always)]
@@ -191,35 +220,19 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
         if bucket.is_empty() {
             return;
         }
-        let cull = self.part.frame.scene.quality.cull;
-        let Batch { voxels, samples, normals, light } = &mut *self.batch;
         let mut payloads = [S::Payload::default(); BATCH];
         let mut corners = [0; EDGE];
         for some in bucket.chunks(BATCH) {
-            let mut n = 0;
-            for v in some {
-                voxels[n] = *v;
-                n += usize::from(!cull | open.is_near(v.cell()));
-            }
-            let voxels = &voxels[..n];
-            for (i, v) in voxels.iter().enumerate() {
-                (samples[i], normals[i]) = (v.sample, v.normal());
+            let note = |v: &Splat| {
                 let [x, y] = v.first();
                 corners[y % EDGE] |= 1 << x;
-            }
-            let all = &normals[..whole_registers(n)];
-            self.part.frame.payloads(&samples[..n], all, None, light);
-            let [sigma, r, g, b] = light;
-            let payloads = &mut payloads[..n];
-            for (i, payload) in payloads.iter_mut().enumerate() {
-                *payload = S::payload([sigma[i], r[i], g[i], b[i]]);
-            }
-            counters.culled += (some.len() - n) as u64;
-            counters.splatted += n as u64;
+            };
+            let asked = (sheets.simd, self.part, open);
+            let n = self.batch.light::<S>(asked, some, counters, note, &mut payloads);
             S::splat_all(
                 sheets.simd,
                 sheets.records,
-                (voxels, payloads),
+                (&self.batch.voxels[..n], &payloads[..n]),
                 slot::<N>(k),
                 &self.tables,
             );
@@ -243,7 +256,7 @@ impl<S: Recorded, const N: usize> Stage<S, N> for FlatStage<'_, S> {
             }
             counters.splatted += 1;
             let mut light = [[0.0]; 4];
-            frame.payloads(&[v.sample], &[v.normal()], None, &mut light);
+            frame.payloads(sheets.simd, &[v.sample], &[v.normal()], None, &mut light);
             let payload = S::payload(light.map(|[c]| c));
             let (x, y, z) = v.weights(&self.tables);
             let left = &z[(slab.first - first) as usize..];

@@ -592,6 +592,11 @@ impl<'a> Footprint<'a> {
         self.table.map(|t| [t.along(0).reach, t.along(1).reach])
     }
 
+    /// Length of a step of the lattice along `axis`, in vox.
+    pub(crate) fn spread(&self, axis: usize) -> f64 {
+        self.profiles[axis].spread
+    }
+
     /// Pixels `[first, end)` along `axis` (0: x, 1: y) that a footprint at screen position
     /// `pos` (1/256 pixel) covers.
     #[inline]

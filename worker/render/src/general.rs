@@ -5,12 +5,13 @@
 
 use crate::footprint::Footprint;
 use crate::mask::OpenMask;
-use crate::planes::{BLOCK, Planes, Window};
+use crate::planes::{BLOCK, Lofts, Planes, Window};
 use crate::scene::Placed;
 use crate::sheet::{LANES, Row};
 use crate::splat::records::STRIDE;
 use crate::splat::touched::put;
 use crate::splat::{Accumulate, Simd, Weight, Work};
+use crate::storeys::Storeys;
 use crate::tile::{Io, PART, Part, Pixels, keep_last};
 use slabcast_common::message::Counters;
 use slabcast_common::occlusion::Rect;
@@ -45,13 +46,19 @@ pub(crate) struct Kinds {
 /// Memory for sums of one kind.
 pub(crate) struct Kind<S: Accumulate> {
     planes: Planes<S>,
+    /// In level views, from which `planes` are filled when a sheet closes.
+    lofts: Lofts<S>,
     /// For weights that are in no table.
     weights: [Vec<S::Weight>; 2],
 }
 
 impl<S: Accumulate> Default for Kind<S> {
     fn default() -> Self {
-        Kind { planes: Planes::default(), weights: [Vec::new(), Vec::new()] }
+        Kind {
+            planes: Planes::default(),
+            lofts: Lofts::default(),
+            weights: [Vec::new(), Vec::new()],
+        }
     }
 }
 
@@ -76,7 +83,11 @@ impl<S: Accumulate> Work for RenderGeneral<'_, S> {
     #[inline(always)]
     fn run(self) {
         let RenderGeneral { part, kind, queues, pixels, io } = self;
-        kind.planes.reset(part.frame.sections.most() + 1);
+        let slots = part.frame.sections.most() + 1;
+        kind.planes.reset(slots);
+        if part.frame.storeys.is_some() {
+            kind.lofts.reset(slots);
+        }
         General { part: &part }.render(kind, queues, pixels, io);
     }
 }
@@ -146,6 +157,12 @@ impl General<'_> {
             self.splat_all(&bucket, k, kind, &open, counters);
             bucket.clear();
             queues.buckets[(k - slab.first) as usize] = bucket;
+            if let Some(storeys) = &frame.storeys {
+                for k in [k, k + 1] {
+                    self.fold(k, storeys, kind, &open);
+                }
+                kind.lofts.clear(k);
+            }
             if self.close(k, &kind.planes, &mut open, pixels) {
                 any_open = open.count() > 0;
             }
@@ -240,7 +257,7 @@ impl General<'_> {
         &self,
         bucket: &[Waiting],
         k: i32,
-        Kind { planes, weights }: &mut Kind<S>,
+        Kind { planes, lofts, weights }: &mut Kind<S>,
         open: &OpenMask,
         counters: &mut Counters,
     ) {
@@ -250,7 +267,7 @@ impl General<'_> {
         // The sheet behind the slab is filled as far as the colour rule peeks.
         let end = slab.end + i32::from(frame.looks_at_neighbours());
         for Waiting { brick, voxel, placed } in bucket {
-            let (brick, _) = self.part.brick(*brick as usize);
+            let (brick, corner) = self.part.brick(*brick as usize);
             if frame.scene.quality.cull && self.extent(placed).is_none_or(|e| !open.any(&e)) {
                 counters.culled += 1;
                 continue;
@@ -266,7 +283,16 @@ impl General<'_> {
                 let at = frame.screen(placed, sheet, &f);
                 let i = (sheet - first) as usize;
                 let section = || S::section(&frame.sections, placed.z, i, &payload);
-                if leaning_rows {
+                if let Some(storeys) = &frame.storeys {
+                    let (x0, wx) = S::Weight::of(&f, 0, at[0], (rect.x0, rect.x1), &mut weights[0]);
+                    if !wx.is_empty() {
+                        let base = storeys.base(&frame.view, rect, f.scale);
+                        let storey = frame.storey(corner, brick.index[usize::from(*voxel)]);
+                        let storey = storey.expect("a level view") as i32;
+                        let columns = ((x0 - rect.x0) as usize, wx);
+                        lofts.add((sheet, base), storey, columns, section());
+                    }
+                } else if leaning_rows {
                     // Each lies elsewhere.
                     let (y0, y1) = f.extent(1, at[1]);
                     for y in y0.max(rows.0)..y1.min(rows.1) {
@@ -297,6 +323,35 @@ impl General<'_> {
         let inside = !wx.is_empty() && !wy.is_empty();
         let at = |p: i32, origin: i32| (p - origin) as usize;
         inside.then(|| ((at(x0, rect.x0), wx), (at(y0, rect.y0), wy)))
+    }
+
+    /// Fills the plane of sheet `k` from its rows of storeys, where pixels are open.
+    #[inline(always)]
+    fn fold<S: Accumulate>(
+        &self,
+        k: i32,
+        storeys: &Storeys,
+        Kind { planes, lofts, weights }: &mut Kind<S>,
+        open: &OpenMask,
+    ) {
+        let Part { frame, rect, .. } = self.part;
+        planes.clear(k);
+        let Some(f) = frame.footprints.at(k) else { return };
+        for y in 0..rect.height() {
+            if open.row(y) == 0 {
+                continue;
+            }
+            let row = rect.y0 + y as i32;
+            let weight = |at| S::Weight::of(&f, 1, at, (row, row + 1), &mut weights[1]).1[0];
+            let reaching = frame.storeys_at(storeys, &f, row, weight);
+            let some = &reaching.some[..reaching.n];
+            let mut columns = lofts.touched(k, some) & open.row(y);
+            while columns != 0 {
+                let x = columns.trailing_zeros() as usize;
+                columns &= columns - 1;
+                planes.set(k, [x, y], lofts.down(k, x, some, storeys.spread));
+            }
+        }
     }
 
     /// Closes sheet `k` where it was touched; whether pixels were shut.

@@ -11,7 +11,7 @@ use crate::mask::OpenMask;
 use crate::scene::{Flat, Frame};
 use crate::splat::records::apart::{Apart, BATCH, Each, WINDOW, Woven, after};
 use crate::splat::records::{MOST, Recorded, Splat};
-use crate::splat::toss::Tossing;
+use crate::splat::toss::{Packing, Tossing};
 use crate::splat::{Simd, Work, whole_registers};
 use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels};
@@ -63,7 +63,8 @@ impl<S: Recorded> Work for RenderLeaning<'_, S> {
         let [x, y] = [[[S::Weight::default(); MOST]; WINDOW]; 2];
         let (at, across) = ([[0; BATCH]; 2], [x, y]);
         let stage = LeaningStage { part: &part, simd, lean, axes, tossing, batch, at, across };
-        walk::<S, MOST, _>(&part, stage, (simd, store), queues, pixels, io);
+        let sheets = Sheets::<S, MOST>::new(simd, store, part.frame.sections.most());
+        walk(&part, stage, sheets, queues, pixels, io);
     }
 }
 
@@ -81,7 +82,7 @@ struct LeaningStage<'a, S: Recorded, const N: usize> {
     across: Woven<S::Weight, N>,
 }
 
-impl<S: Recorded, const N: usize> Stage<S, N> for LeaningStage<'_, S, N> {
+impl<S: Recorded, const N: usize> Stage<Sheets<'_, S, N>> for LeaningStage<'_, S, N> {
     type Voxel = Splat;
 
     #[inline(always)]
@@ -98,7 +99,7 @@ impl<S: Recorded, const N: usize> Stage<S, N> for LeaningStage<'_, S, N> {
         counters: &mut Counters,
     ) {
         let asked = (which, open, queues, counters);
-        toss(self.part, self.simd, self.lean.flat, None, self.tossing, asked);
+        toss(self.part, self.simd, self.lean.flat, Packing::Aside, self.tossing, asked);
     }
 
     #[inline(always)]

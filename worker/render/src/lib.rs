@@ -27,6 +27,7 @@ mod flat;
 pub mod footprint;
 mod general;
 mod leaning;
+mod level;
 mod mask;
 mod model;
 pub mod outlook;
@@ -40,6 +41,7 @@ pub mod serial;
 pub mod sheet;
 pub mod splat;
 mod stack;
+mod storeys;
 pub mod survey;
 pub mod tile;
 

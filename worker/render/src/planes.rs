@@ -6,6 +6,7 @@
 
 use crate::sheet::Row;
 use crate::splat::{Accumulate, Pixels, splat};
+use crate::storeys::ROWS;
 use slabcast_common::image::RawSums;
 
 /// Pixels of a part's row, and rows of a part.
@@ -42,6 +43,117 @@ impl Touched {
     #[inline(always)]
     fn slot(&self, k: i32) -> usize {
         k.rem_euclid(self.slots) as usize
+    }
+}
+
+/// Rows of storeys in the open sheets of a level view's part ([`crate::storeys`]).
+#[derive(Default)]
+pub(crate) struct Lofts<S> {
+    sheets: Vec<Loft<S>>,
+}
+
+/// Those of one sheet.
+struct Loft<S> {
+    /// The sheet, and the storey that row 0 stands for.
+    k: i32,
+    base: i32,
+    rows: Vec<[S; 4]>,
+    /// By row, columns that something was added to.
+    touched: [u64; ROWS],
+}
+
+impl<S: Accumulate> Lofts<S> {
+    /// Empties all and makes room for `slots`.
+    pub(crate) fn reset(&mut self, slots: usize) {
+        let empty = || Loft {
+            k: i32::MIN,
+            base: 0,
+            rows: vec![[S::default(); 4]; ROWS * PART],
+            touched: [0; ROWS],
+        };
+        self.sheets.resize_with(slots, empty);
+        self.sheets.iter_mut().for_each(Loft::clear);
+    }
+
+    #[inline(always)]
+    fn slot(&self, k: i32) -> usize {
+        k.rem_euclid(self.sheets.len() as i32) as usize
+    }
+
+    /// Adds one section of a voxel of `storey` to sheet `k`, whose row 0 is that of `base`.
+    #[inline(always)]
+    pub(crate) fn add(
+        &mut self,
+        (k, base): (i32, i32),
+        storey: i32,
+        (x0, wx): (usize, &[S::Weight]),
+        section: [S::Section; 4],
+    ) {
+        let slot = self.slot(k);
+        let loft = &mut self.sheets[slot];
+        (loft.k, loft.base) = (k, base);
+        let row = storey - base;
+        if !(0..ROWS as i32).contains(&row) {
+            // It reaches none of the part's pixels.
+            return;
+        }
+        let row = row as usize;
+        for (sums, &w) in loft.rows[row * PART + x0..][..wx.len()].iter_mut().zip(wx) {
+            for c in 0..4 {
+                sums[c] = sums[c].plus(section[c], w);
+            }
+        }
+        loft.touched[row] |= (u64::MAX >> (PART - wx.len())) << x0;
+    }
+
+    /// The columns of sheet `k` that any of these storeys were added to.
+    #[inline(always)]
+    pub(crate) fn touched<W>(&self, k: i32, storeys: &[(i32, W)]) -> u64 {
+        let loft = &self.sheets[self.slot(k)];
+        if loft.k != k {
+            return 0;
+        }
+        let row = |&(storey, _): &(i32, W)| loft.touched.get((storey - loft.base) as usize);
+        storeys.iter().filter_map(row).fold(0, |all, touched| all | touched)
+    }
+
+    /// What these storeys, each with its weight, add up to in column `x` of sheet `k`.
+    #[inline(always)]
+    pub(crate) fn down(
+        &self,
+        k: i32,
+        x: usize,
+        storeys: &[(i32, S::Weight)],
+        spread: f32,
+    ) -> [S; 4] {
+        let loft = &self.sheets[self.slot(k)];
+        let row = |c: usize| {
+            storeys.iter().filter_map(move |&(storey, wy)| {
+                let row = (storey - loft.base) as usize;
+                loft.rows.get(row * PART + x).map(|sums| (sums[c], wy))
+            })
+        };
+        [0, 1, 2, 3].map(|c| S::down(row(c), spread))
+    }
+
+    /// Empties sheet `k`.
+    #[inline(always)]
+    pub(crate) fn clear(&mut self, k: i32) {
+        let slot = self.slot(k);
+        if self.sheets[slot].k == k {
+            self.sheets[slot].clear();
+        }
+    }
+}
+
+impl<S: Accumulate> Loft<S> {
+    fn clear(&mut self) {
+        for (row, touched) in self.rows.chunks_mut(PART).zip(&mut self.touched) {
+            if std::mem::take(touched) != 0 {
+                row.fill([S::default(); 4]);
+            }
+        }
+        self.k = i32::MIN;
     }
 }
 
@@ -95,6 +207,14 @@ impl<S: Accumulate> Planes<S> {
             }
             mask &= mask - 1;
         }
+    }
+
+    /// Puts sums of sheet `k` that came from rows of storeys.
+    #[inline(always)]
+    pub(crate) fn set(&mut self, k: i32, [x, y]: [usize; 2], sums: [S; 4]) {
+        let slot = self.touched.slot(k);
+        self.sheets[slot][y * PART + x] = sums;
+        self.touched.masks[slot] |= 1 << (y / BLOCK * 8 + x / BLOCK);
     }
 
     /// Adds one section of a voxel to sheet `k`.

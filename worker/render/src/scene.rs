@@ -4,6 +4,8 @@ use crate::footprint::{Footprint, Footprints, Lean, Leaning, Profile, Sections, 
 use crate::mask::REACH_MOST;
 use crate::place::{FlatCorner, Places};
 use crate::sheet::Rule;
+use crate::splat::{Simd, looks};
+use crate::storeys::Storeys;
 use glam::{DVec3, Vec3};
 use slabcast_common::bounds::{raw_per_payload, short_per_payload};
 use slabcast_common::brick::{Brick, BrickGrid, TightBox, local};
@@ -88,6 +90,8 @@ pub struct Frame {
     pub(crate) flat: Option<Flat>,
     /// Where sections and rows lie, where the kernel leans.
     pub(crate) leaning: Option<Leaning>,
+    /// What lies level, where voxels are added to rows of it.
+    pub(crate) storeys: Option<Storeys>,
 }
 
 /// What an orthographic view has whose footprints are in a table and small enough for masks.
@@ -99,9 +103,16 @@ pub(crate) struct Flat {
     pub(crate) reach: [i32; 2],
 }
 
+/// Local index of the voxel at a place in its brick.
+fn local_of([i, j, k]: [u32; 3]) -> u16 {
+    (i + 8 * j + 64 * k) as u16
+}
+
 /// A brick's corner, seen by the eye.
 #[derive(Clone, Copy, Debug)]
 pub struct Corner {
+    /// Index position of its first voxel.
+    pub(crate) index: [u32; 3],
     /// Eye coordinates in vox.
     pub eye: DVec3,
     /// Where the view is flat.
@@ -138,20 +149,6 @@ impl Frame {
         let profile = Profile::new(q.kernel, view.kernel_std.z, view.kernel_radius.z);
         let profile = profile.with_spread(spread.z);
         let d = view.thickness;
-        let (raw_scale, unit) = match q.sums {
-            Sums::F32 => (1.0, 1.0),
-            // Weights are those per step of the lattice and over the thickness, so the payload has
-            // these factors. It is at most 31,207, since a cell is no larger than the product of
-            // the spreads.
-            Sums::I16 => {
-                let units = short_per_payload(scene.payload_max, d);
-                ((units * d / (spread.x * spread.y * spread.z)) as f32, (1.0 / units) as f32)
-            }
-            Sums::I32 | Sums::Auto => {
-                let scale = raw_per_payload(scene.payload_max, d);
-                (scale, (1.0 / f64::from(scale)) as f32)
-            }
-        };
         let phases = view.depth_phases();
         // Floats are there to be near the limit, 16 bits to be fast.
         let merged = match q.sums {
@@ -166,7 +163,6 @@ impl Frame {
             Projection::Ortho { .. } => Some(view.to_eye(DVec3::ZERO)),
             Projection::Persp { .. } => None,
         };
-        let rule = Rule::new(q.compositing, unit, d / view.kernel_std.z, q.eps as f32);
         let footprints = Footprints::new(&view, q.kernel, range, spread, scene.shelf.clone());
         let reach = footprints.at(0).and_then(|f| f.reach());
         let sections = scene.shelf.sections(&profile, d, phases, merged);
@@ -174,6 +170,27 @@ impl Frame {
         let leans = !view.kernel_lean.is_none();
         let leaning = leans.then(|| Leaning::new(&view, &profile, &sections, largest));
         let leaning = leaning.filter(Leaning::shows);
+        let level = leaning.is_none() && q.sums != Sums::F32;
+        let storeys = level.then(|| Storeys::new(&view, scene.dims, spread.y, range.end));
+        let mut storeys = storeys.flatten();
+        let (raw_scale, unit) = match q.sums {
+            Sums::F32 => (1.0, 1.0),
+            // Weights are those per step of the lattice and over the thickness, so the payload has
+            // these factors. It is at most 31,207, since a cell is no larger than the product of
+            // the spreads.
+            Sums::I16 => {
+                let units = short_per_payload(scene.payload_max, d);
+                ((units * d / (spread.x * spread.y * spread.z)) as f32, (1.0 / units) as f32)
+            }
+            Sums::I32 | Sums::Auto => {
+                let scale = raw_per_payload(scene.payload_max, d);
+                // A solid's rows of storeys are as its sums.
+                let of_rows =
+                    if storeys.is_some() { f64::from(scale) / spread.y } else { f64::from(scale) };
+                (of_rows as f32, (1.0 / f64::from(scale)) as f32)
+            }
+        };
+        let rule = Rule::new(q.compositing, unit, d / view.kernel_std.z, q.eps as f32);
         let reach = reach.map(|reach| match &leaning {
             Some(leaning) => {
                 let aside = leaning.pixels(largest, reach);
@@ -186,12 +203,30 @@ impl Frame {
         });
         let reach = reach.filter(|reach| reach.iter().all(|&reach| reach <= REACH_MOST));
         let flat = reach.and_then(|reach| Some(Flat { places: Places::new(&view)?, reach }));
+        if let (Some(storeys), Some(Flat { places, .. })) = (&mut storeys, &flat) {
+            storeys.in_integers(|at| {
+                let corner = places.corner(view.corner_in_eye(at.map(|n| n & !7)));
+                places.at(corner, local_of(at.map(|n| n & 7))).0[1]
+            });
+        }
         let mut offsets = Box::new([[0.0; 512]; 3]);
         for i in 0..512u16 {
             let v = view.offset_in_eye(local(i)).to_array();
             offsets.iter_mut().zip(v).for_each(|(offsets, v)| offsets[usize::from(i)] = v);
         }
-        Frame { flat, leaning, sections, footprints, rule, raw_scale, offsets, to_eye, view, scene }
+        Frame {
+            flat,
+            leaning,
+            storeys,
+            sections,
+            footprints,
+            rule,
+            raw_scale,
+            offsets,
+            to_eye,
+            view,
+            scene,
+        }
     }
 
     /// Whether the colour rule looks at neighbouring sheets.
@@ -206,8 +241,9 @@ impl Frame {
 
     /// The corner of brick `id`.
     pub fn corner(&self, id: BrickId) -> Corner {
-        let eye = self.view.corner_in_eye(self.scene.grid.corner(id));
-        Corner { eye, flat: self.flat.as_ref().map_or([0; 3], |f| f.places.corner(eye)) }
+        let index = self.scene.grid.corner(id);
+        let eye = self.view.corner_in_eye(index);
+        Corner { index, eye, flat: self.flat.as_ref().map_or([0; 3], |f| f.places.corner(eye)) }
     }
 
     /// Where a voxel lies: its brick's corner and its local index. The one definition of a
@@ -247,6 +283,13 @@ impl Frame {
         }
     }
 
+    /// The storey of a voxel, in a level view: its brick's corner and its local index.
+    #[inline]
+    pub(crate) fn storey(&self, corner: &Corner, of: u16) -> Option<u32> {
+        let (at, storeys) = (local(of), self.storeys.as_ref()?);
+        Some(storeys.of_voxel(std::array::from_fn(|axis| corner.index[axis] + at[axis])))
+    }
+
     /// Whether all sections of a voxel have the same columns with the same weights.
     pub(crate) fn has_columns_alike(&self) -> bool {
         let leans = |leaning: &Leaning| leaning.most(0) > 0.0 || leaning.row() != 0;
@@ -274,6 +317,7 @@ impl Frame {
     #[inline(always)]
     pub(crate) fn payloads<const MOST: usize>(
         &self,
+        simd: Simd,
         samples: &[u32],
         normals: &[u16],
         eyes: Option<[&[f64]; 3]>,
@@ -281,8 +325,12 @@ impl Frame {
     ) {
         let n = normals.len().min(MOST);
         assert!(samples.len() <= n, "a normal a sample");
+        let table = self.scene.classifier.table();
+        if !table.is_empty() {
+            looks::take(simd, table, samples, out);
+        }
         let [sigma, colours @ ..] = out;
-        for (i, &sample) in samples[..samples.len().min(n)].iter().enumerate() {
+        for (i, &sample) in samples.iter().enumerate().take(if table.is_empty() { n } else { 0 }) {
             let look = self.scene.classifier.look_of_bits(sample);
             sigma[i] = look.sigma;
             for c in 0..3 {

@@ -33,7 +33,7 @@ pub(crate) fn spec(volume: &Volume, quality: Quality) -> SceneSpec {
 }
 
 /// Draws the self-test with `simd` and returns its hash: a shaded ball with a hole, 24 voxels
-/// wide, in perspective, with integer sums and again with floats, in two slabs.
+/// wide, from above and level, in perspective and in parallel, with integer sums and with floats, in two slabs.
 pub fn run(simd: Simd) -> Digest32 {
     let n = 24u32;
     let volume = Volume::from_fn_u8("selftest", [n; 3], |i, j, k| {
@@ -47,12 +47,20 @@ pub fn run(simd: Simd) -> Digest32 {
     let persp = CameraProjection::Persp { fov: 35.0, distance: 50.0 };
     // 16-bit sums have a loop of their own where footprints are all the same.
     let ortho = CameraProjection::Ortho { height: 30.0 };
-    let ways = [(Sums::I32, persp), (Sums::F32, persp), (Sums::I16, persp), (Sums::I16, ortho)];
-    for (sums, projection) in ways {
+    let ways = [
+        (Sums::I32, persp, 0.4),
+        (Sums::F32, persp, 0.4),
+        (Sums::I16, persp, 0.4),
+        (Sums::I16, ortho, 0.4),
+        // Level views add to rows of storeys.
+        (Sums::I32, persp, 0.0),
+        (Sums::I16, ortho, 0.0),
+    ];
+    for (sums, projection, up) in ways {
         let quality = Quality { sums, ..Quality::default() };
         let spec = spec(&volume, quality);
         let camera = Camera {
-            to_eye: DVec3::new(0.6, 1.0, 0.4),
+            to_eye: DVec3::new(0.6, 1.0, up),
             up: DVec3::Z,
             target: DVec3::ZERO,
             projection,

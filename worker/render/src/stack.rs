@@ -9,7 +9,8 @@ use crate::sheet::{LANES, Row};
 use crate::splat::Simd;
 use crate::splat::close::close_rows;
 use crate::splat::records::{Line, Record, Recorded, STRIDE};
-use crate::splat::touched::{Places, Some16, column_and_row, put, take};
+use crate::splat::tiers::{Folded, Shape};
+use crate::splat::touched::{Places, Some16, column_and_row, put, take, take_folded};
 use crate::tile::{Io, PART, Part, Pixels, keep_last};
 use slabcast_common::message::Counters;
 use slabcast_common::view::Projection;
@@ -19,15 +20,60 @@ pub(crate) const EDGE: usize = PART as usize;
 /// Memory for sums of one kind.
 pub(crate) struct Store<S: Recorded> {
     /// Records of any number of sheets; nothing in them between parts.
-    records: Vec<Line>,
+    lines: Vec<Line>,
+    pub(crate) closes: Closes<S>,
+    pub(crate) level: LevelStore<S>,
+}
+
+/// Memory for level views.
+pub(crate) struct LevelStore<S: Recorded> {
+    /// Tiers, in which there is nothing between parts but in margins; and of which shape they are.
+    tiers: Vec<Line>,
+    shape: (Shape, usize),
+    /// Sums of pixels that close.
+    folded: Folded<S>,
+}
+
+impl<S: Recorded> LevelStore<S> {
+    /// Tiers of this shape for so many sheets, and room for the sums of a part's pixels.
+    pub(crate) fn of(&mut self, shape: Shape, sheets: usize) -> (&mut [Line], &mut Folded<S>) {
+        let n = shape.lines(sheets);
+        if self.shape != (shape, sheets) {
+            // Margins lie elsewhere now.
+            self.shape = (shape, sheets);
+            self.tiers.fill(Line::ZERO);
+            self.tiers.resize(n.max(self.tiers.len()), Line::ZERO);
+        }
+        (&mut self.tiers[..n], &mut self.folded)
+    }
+}
+
+/// Memory for sheets that are closed, and what is known of the one before.
+pub(crate) struct Closes<S: Recorded> {
     /// Sums of the sheet before, where it was touched; elsewhere anything.
     before: Vec<S::Pixel>,
+    /// Pixels of `before` that are the sheet's before.
+    was: Rows,
     places: Places,
+    sifting: Sifting,
 }
 
 impl<S: Recorded> Default for Store<S> {
     fn default() -> Self {
-        Store { records: Vec::new(), before: Vec::new(), places: Places::default() }
+        let shape = (Shape::default(), 0);
+        let level = LevelStore { tiers: Vec::new(), shape, folded: Folded::default() };
+        Store { lines: Vec::new(), closes: Closes::default(), level }
+    }
+}
+
+impl<S: Recorded> Default for Closes<S> {
+    fn default() -> Self {
+        Closes {
+            before: Vec::new(),
+            was: [0; EDGE],
+            places: Places::default(),
+            sifting: Sifting::default(),
+        }
     }
 }
 
@@ -44,8 +90,20 @@ impl<V> Default for Queues<V> {
     }
 }
 
-/// How voxels of one kind of view get into sheets.
-pub(crate) trait Stage<S: Recorded, const N: usize> {
+/// Open sheets of a part, whatever they keep their sums in.
+pub(crate) trait Open<S: Recorded> {
+    /// Sums of the sheet before by pixel, and where these are.
+    fn before(&mut self) -> (&mut [S::Pixel], &mut Rows);
+    /// From now on voxels begin at sheet `k`.
+    fn begin(&mut self, k: i32);
+    /// Closes sheet `k` where it was touched; whether pixels were shut.
+    fn close(&mut self, k: i32, part: &Part<'_>, open: &mut OpenMask, pixels: &mut Pixels) -> bool;
+    /// Leaves nothing behind, where sheets before `k` are closed.
+    fn empty(&mut self, k: i32);
+}
+
+/// How voxels of one kind of view get into sheets, which are kept in `H`.
+pub(crate) trait Stage<H> {
     /// A voxel waiting in the bucket of its first sheet.
     type Voxel: Copy;
 
@@ -64,7 +122,7 @@ pub(crate) trait Stage<S: Recorded, const N: usize> {
         &mut self,
         bucket: &[Self::Voxel],
         k: i32,
-        sheets: &mut Sheets<'_, S, N>,
+        sheets: &mut H,
         open: &OpenMask,
         counters: &mut Counters,
     );
@@ -73,7 +131,7 @@ pub(crate) trait Stage<S: Recorded, const N: usize> {
     fn splat_carried(
         &mut self,
         carried: &[(Self::Voxel, i32)],
-        sheets: &mut Sheets<'_, S, N>,
+        sheets: &mut H,
         open: &OpenMask,
         counters: &mut Counters,
     );
@@ -81,22 +139,22 @@ pub(crate) trait Stage<S: Recorded, const N: usize> {
 
 /// Walks through the sheets of `part`'s slab.
 #[inline(always)]
-pub(crate) fn walk<S: Recorded, const N: usize, T: Stage<S, N>>(
+pub(crate) fn walk<S: Recorded, H: Open<S>, T: Stage<H>>(
     part: &Part<'_>,
     mut stage: T,
-    (simd, store): (Simd, &mut Store<S>),
+    mut sheets: H,
     queues: &mut Queues<T::Voxel>,
     pixels: &mut Pixels,
     (out, counters): Io<'_>,
 ) {
-    let mut sheets = Sheets::<S, N>::new(simd, store, part.frame.sections.most());
     let slab = part.slab;
     let mut open = part.begin(pixels, out);
     if let Some(last) = &out.last {
+        let (before, was) = sheets.before();
         part.each_pixel(|x, y, tile| {
-            sheets.before[y * STRIDE + x] = S::from_raw(last[tile]);
+            before[y * STRIDE + x] = S::from_raw(last[tile]);
         });
-        sheets.was = [u64::MAX; EDGE];
+        *was = [u64::MAX; EDGE];
     }
     if queues.buckets.len() < slab.len() as usize {
         queues.buckets.resize_with(slab.len() as usize, Vec::new);
@@ -114,7 +172,7 @@ pub(crate) fn walk<S: Recorded, const N: usize, T: Stage<S, N>>(
             stage.toss(next, &open, queues, counters);
             next += 1;
         }
-        sheets.added[slot::<N>(k)] = [0; EDGE];
+        sheets.begin(k);
         if !queues.carried.is_empty() {
             stage.splat_carried(&queues.carried, &mut sheets, &open, counters);
             queues.carried.clear();
@@ -138,10 +196,11 @@ pub(crate) fn walk<S: Recorded, const N: usize, T: Stage<S, N>>(
     }
     part.end(pixels, out);
     if let Some(last) = keep_last(part, stopped, out) {
+        let (before, was) = sheets.before();
         // Nobody reads a shut pixel's sums; they may be anything, so they are none.
         part.each_pixel(|x, y, tile| {
-            let touched = (sheets.was[y] & open.row(y)) >> x & 1 == 1;
-            last[tile] = if touched { S::raw(&sheets.before[y * STRIDE + x]) } else { [0; 4] };
+            let touched = (was[y] & open.row(y)) >> x & 1 == 1;
+            last[tile] = if touched { S::raw(&before[y * STRIDE + x]) } else { [0; 4] };
         });
     }
     sheets.empty(k);
@@ -182,17 +241,95 @@ impl Sifting {
     }
 }
 
-/// The open sheets of a part.
+impl<S: Recorded> Closes<S> {
+    /// Begins a part.
+    #[inline(always)]
+    pub(crate) fn begin(&mut self) {
+        self.before.resize(STRIDE * EDGE, S::Pixel::default());
+        self.was = [0; EDGE];
+        self.sifting = Sifting::default();
+    }
+
+    /// [`Open::before`].
+    #[inline(always)]
+    pub(crate) fn before(&mut self) -> (&mut [S::Pixel], &mut Rows) {
+        (&mut self.before, &mut self.was)
+    }
+
+    /// Closes the sheet that `slot` of `records` holds at the pixels of `closing`, of those that it was
+    /// `touched` at; whether pixels were shut.
+    #[inline(always)]
+    fn close<const N: usize>(
+        &mut self,
+        simd: Simd,
+        (records, slot): (&mut [Record<S, N>], usize),
+        (closing, touched): (&Rows, &Rows),
+        part: &Part<'_>,
+        open: &mut OpenMask,
+        pixels: &mut Pixels,
+    ) -> bool {
+        self.begin_sheet(closing, touched);
+        let Closes { before, places, sifting, .. } = self;
+        places.list(simd, closing);
+        if sifting.is_due() {
+            let n = places.len();
+            places.sift::<S, N>(simd, (records, before), slot);
+            sifting.found(n - places.len(), n);
+        }
+        let mut some = Closing { simd, part, open, pixels, any_shut: false };
+        some.all::<S>(places, |_, places, pixels, row| {
+            take::<S, N>(simd, (&mut *records, &mut *before), pixels, places, slot, row);
+        });
+        some.any_shut
+    }
+
+    /// Closes a sheet whose sums are beside each other, at the pixels that they are those of.
+    #[inline(always)]
+    pub(crate) fn close_folded(
+        &mut self,
+        simd: Simd,
+        folded: &Folded<S>,
+        closing: &Rows,
+        part: &Part<'_>,
+        open: &mut OpenMask,
+        pixels: &mut Pixels,
+    ) -> bool {
+        self.begin_sheet(closing, closing);
+        let Closes { before, places, .. } = self;
+        places.list(simd, closing);
+        let mut some = Closing { simd, part, open, pixels, any_shut: false };
+        some.all::<S>(places, |i, places, pixels, row| {
+            take_folded::<S>(simd, (folded.from(i), &mut *before), pixels, places, row);
+        });
+        some.any_shut
+    }
+
+    /// What comes before a sheet that is touched at some pixels and closes at some is there from here on.
+    #[inline(always)]
+    fn begin_sheet(&mut self, closing: &Rows, touched: &Rows) {
+        let Closes { before, was, .. } = self;
+        for (y, (closing, was)) in closing.iter().zip(&*was).enumerate() {
+            // Where this sheet has something and the one before had nothing.
+            let mut fresh = closing & !was;
+            while fresh != 0 {
+                let x = fresh.trailing_zeros();
+                let run = (fresh >> x).trailing_ones();
+                before[y * STRIDE + x as usize..][..run as usize].fill(S::Pixel::default());
+                // Adding carries through the run.
+                fresh &= fresh.wrapping_add(1 << x);
+            }
+        }
+        *was = *touched;
+    }
+}
+
+/// The open sheets of a part, in records.
 pub(crate) struct Sheets<'a, S: Recorded, const N: usize> {
     pub(crate) simd: Simd,
     pub(crate) records: &'a mut [Record<S, N>],
-    before: &'a mut [S::Pixel],
-    places: &'a mut Places,
-    sifting: Sifting,
+    closes: &'a mut Closes<S>,
     /// By slot of their first sheet: pixels that voxels touch.
     added: [Rows; N],
-    /// Pixels of `before` that are the sheet's before.
-    was: Rows,
     /// Shut pixels with records that may not be zero.
     dead: Rows,
     /// Sheets that a voxel touches at most.
@@ -204,21 +341,58 @@ pub(crate) fn slot<const N: usize>(k: i32) -> usize {
     k as usize % N
 }
 
-impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
-    fn new(simd: Simd, store: &'a mut Store<S>, most: usize) -> Self {
-        let lines = STRIDE * EDGE * size_of::<Record<S, N>>() / size_of::<Line>();
-        if store.records.len() < lines {
-            store.records.resize(lines, Line::ZERO);
+impl<S: Recorded, const N: usize> Open<S> for Sheets<'_, S, N> {
+    #[inline(always)]
+    fn before(&mut self) -> (&mut [S::Pixel], &mut Rows) {
+        self.closes.before()
+    }
+
+    #[inline(always)]
+    fn begin(&mut self, k: i32) {
+        self.added[slot::<N>(k)] = [0; EDGE];
+    }
+
+    #[inline(always)]
+    fn close(&mut self, k: i32, part: &Part<'_>, open: &mut OpenMask, pixels: &mut Pixels) -> bool {
+        let touched = self.touched(k + 1 - self.most as i32, k);
+        let mut closing = touched;
+        for (y, (closing, dead)) in closing.iter_mut().zip(&mut self.dead).enumerate() {
+            // Nobody looks at shut pixels again in this part.
+            *dead |= *closing & !open.row(y);
+            *closing &= open.row(y);
         }
-        store.before.resize(STRIDE * EDGE, S::Pixel::default());
+        let records = (&mut *self.records, slot::<N>(k));
+        self.closes.close(self.simd, records, (&closing, &touched), part, open, pixels)
+    }
+
+    #[inline(always)]
+    fn empty(&mut self, k: i32) {
+        let left = self.touched(k + 1 - self.most as i32, k - 1);
+        for (y, (left, dead)) in left.iter().zip(&self.dead).enumerate() {
+            let some = left | dead;
+            if some != 0 {
+                let [from, to] = [some.trailing_zeros(), 64 - some.leading_zeros()];
+                let [from, to] = [from, to].map(|x| y * STRIDE + x as usize);
+                self.records[from..to].fill([S::Pixel::default(); N]);
+            }
+        }
+    }
+}
+
+impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
+    /// In memory of `store`, for voxels that touch `most` sheets at most.
+    pub(crate) fn new(simd: Simd, store: &'a mut Store<S>, most: usize) -> Self {
+        let Store { lines: all, closes, .. } = store;
+        let lines = STRIDE * EDGE * size_of::<Record<S, N>>() / size_of::<Line>();
+        if all.len() < lines {
+            all.resize(lines, Line::ZERO);
+        }
+        closes.begin();
         Sheets {
             simd,
-            records: bytemuck::cast_slice_mut(&mut store.records[..lines]),
-            before: &mut store.before,
-            places: &mut store.places,
-            sifting: Sifting::default(),
+            records: bytemuck::cast_slice_mut(&mut all[..lines]),
+            closes,
             added: [[0; EDGE]; N],
-            was: [0; EDGE],
             dead: [0; EDGE],
             most,
         }
@@ -267,72 +441,6 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
         }
         rows
     }
-
-    /// Closes sheet `k` where it was touched; whether pixels were shut.
-    #[inline(always)]
-    fn close(&mut self, k: i32, part: &Part<'_>, open: &mut OpenMask, pixels: &mut Pixels) -> bool {
-        let touched = self.touched(k + 1 - self.most as i32, k);
-        let mut closing = touched;
-        for (y, (closing, dead)) in closing.iter_mut().zip(&mut self.dead).enumerate() {
-            // Nobody looks at shut pixels again in this part.
-            *dead |= *closing & !open.row(y);
-            *closing &= open.row(y);
-        }
-        for (y, (closing, was)) in closing.iter().zip(&self.was).enumerate() {
-            // Where this sheet has something and the one before had nothing.
-            let mut fresh = closing & !was;
-            while fresh != 0 {
-                let x = fresh.trailing_zeros();
-                let run = (fresh >> x).trailing_ones();
-                self.before[y * STRIDE + x as usize..][..run as usize].fill(S::Pixel::default());
-                // Adding carries through the run.
-                fresh &= fresh.wrapping_add(1 << x);
-            }
-        }
-        self.was = touched;
-        self.places.list(self.simd, &closing);
-        let Sheets { simd, records, before, places, sifting, .. } = self;
-        if sifting.is_due() {
-            let n = places.len();
-            places.sift::<S, N>(*simd, (records, before), slot::<N>(k));
-            sifting.found(n - places.len(), n);
-        }
-        let mut some = Closing { simd: *simd, part, open, pixels, any_shut: false };
-        let mut rows: [Row; 2] = Default::default();
-        for i in (0..places.len()).step_by(2 * LANES) {
-            let first = places.from(i);
-            take::<S, N>(
-                *simd,
-                (records, before),
-                &some.pixels.all,
-                first,
-                slot::<N>(k),
-                &mut rows[0],
-            );
-            if i + LANES < places.len() {
-                let second = places.from(i + LANES);
-                let sums = (&mut **records, &mut **before);
-                take::<S, N>(*simd, sums, &some.pixels.all, second, slot::<N>(k), &mut rows[1]);
-                some.close::<S, 2>(&mut rows, [first, second]);
-            } else {
-                some.close::<S, 1>(rows.first_chunk_mut().expect("one of two"), [first]);
-            }
-        }
-        some.any_shut
-    }
-
-    /// Leaves nothing behind, where sheets before `k` are closed.
-    fn empty(&mut self, k: i32) {
-        let left = self.touched(k + 1 - self.most as i32, k - 1);
-        for (y, (left, dead)) in left.iter().zip(&self.dead).enumerate() {
-            let some = left | dead;
-            if some != 0 {
-                let [from, to] = [some.trailing_zeros(), 64 - some.leading_zeros()];
-                let [from, to] = [from, to].map(|x| y * STRIDE + x as usize);
-                self.records[from..to].fill([S::Pixel::default(); N]);
-            }
-        }
-    }
 }
 
 /// A sheet that is being closed.
@@ -345,6 +453,27 @@ struct Closing<'a> {
 }
 
 impl Closing<'_> {
+    /// Composites all of `places`, of which `take` puts those from the `i`th on into a row.
+    #[inline(always)]
+    fn all<S: Recorded>(
+        &mut self,
+        places: &Places,
+        mut take: impl FnMut(usize, Some16<'_>, &[[u32; 4]], &mut Row),
+    ) {
+        let mut rows: [Row; 2] = Default::default();
+        for i in (0..places.len()).step_by(2 * LANES) {
+            let first = places.from(i);
+            take(i, first, &self.pixels.all, &mut rows[0]);
+            if i + LANES < places.len() {
+                let second = places.from(i + LANES);
+                take(i + LANES, second, &self.pixels.all, &mut rows[1]);
+                self.close::<S, 2>(&mut rows, [first, second]);
+            } else {
+                self.close::<S, 1>(rows.first_chunk_mut().expect("one of two"), [first]);
+            }
+        }
+    }
+
     /// Composites pixels whose sums are in rows.
     #[inline(always)]
     fn close<S: Recorded, const ROWS: usize>(

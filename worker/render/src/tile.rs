@@ -25,11 +25,13 @@ use crate::deep::{self, RenderDeep};
 use crate::flat::{self, RenderFlat};
 use crate::general::{GeneralScratch, Kind, Queues, RenderGeneral};
 use crate::leaning::{self, RenderLeaning};
+use crate::level::{self, RenderLevel};
 use crate::mask::OpenMask;
 use crate::planes;
 use crate::region::{Coming, Memory};
 use crate::scene::{Corner, Frame, Scene};
-use crate::splat::records::{MOST, Recorded, STRIDE};
+use crate::splat::records::{MOST, STRIDE};
+use crate::splat::tiers::Tiered;
 use crate::splat::{Grey, Simd};
 use crate::stack::Store;
 use slabcast_common::brick::Brick;
@@ -317,6 +319,22 @@ impl Part<'_> {
         io: Io<'_>,
     ) {
         let part = self;
+        if let Some(view) = level::takes(part.frame) {
+            if part.frame.sections.most() <= 4 {
+                simd.run(RenderLevel::<Grey, 4> { part, view, simd, store, waiting, pixels, io });
+            } else {
+                simd.run(RenderLevel::<Grey, MOST> {
+                    part,
+                    view,
+                    simd,
+                    store,
+                    waiting,
+                    pixels,
+                    io,
+                });
+            }
+            return;
+        }
         let view = flat::takes(part.frame).expect("a flat view");
         if part.frame.sections.most() <= 4 {
             simd.run(RenderFlat::<Grey, 4> { part, view, simd, store, waiting, pixels, io });
@@ -326,7 +344,7 @@ impl Part<'_> {
     }
 
     /// Renders it in whole sums, in the fastest room that takes it.
-    fn render<S: Recorded>(
+    fn render<S: Tiered>(
         self,
         simd: Simd,
         store: &mut Store<S>,
@@ -349,7 +367,7 @@ impl Part<'_> {
     }
 
     /// The same with records of N sheets.
-    fn render_records<S: Recorded, const N: usize>(
+    fn render_records<S: Tiered, const N: usize>(
         self,
         simd: Simd,
         store: &mut Store<S>,
@@ -359,7 +377,10 @@ impl Part<'_> {
         io: Io<'_>,
     ) {
         let part = self;
-        if let Some(view) = flat::takes(part.frame) {
+        if let Some(view) = level::takes(part.frame) {
+            let waiting = &mut waiting.flat;
+            simd.run(RenderLevel::<S, N> { part, view, simd, store, waiting, pixels, io });
+        } else if let Some(view) = flat::takes(part.frame) {
             let waiting = &mut waiting.flat;
             simd.run(RenderFlat::<S, N> { part, view, simd, store, waiting, pixels, io });
         } else if let Some(lean) = leaning::takes(part.frame) {

@@ -138,13 +138,14 @@ fn in_regions(
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 60, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: 80, ..ProptestConfig::default() })]
 
     #[test]
     fn tiles_and_slabs_give_the_bytes_of_the_serial_renderer(
         dims in (1u32..22, 1u32..22, 1u32..22),
         seed in any::<u64>(),
-        azimuth in 0.0..6.3f64, tilt in -1.5..1.5f64,
+        // Half of the views are level, where voxels are added to rows of storeys.
+        azimuth in 0.0..6.3f64, tilt in prop_oneof![Just(0.0), -1.5..1.5f64],
         persp in any::<bool>(), distance in 2.0..60.0f64,
         thickness in prop::sample::select(vec![0.25, 0.5, 1.0, 1.0, 1.0, 2.3, 40.0]),
         compositing in prop::sample::select(

@@ -26,7 +26,9 @@ macro_rules! with {
 pub(crate) mod close;
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 mod lanes;
+pub(crate) mod looks;
 pub(crate) mod records;
+pub(crate) mod tiers;
 pub(crate) mod toss;
 pub(crate) mod touched;
 
@@ -109,6 +111,8 @@ pub trait Accumulate: Sum {
     /// `self + row * wx`.
     #[must_use]
     fn plus(self, row: Self::Section, wx: Self::Weight) -> Self;
+    /// What a pixel has of rows of storeys, each times its weight, in their order ([`crate::storeys`]).
+    fn down(rows: impl Iterator<Item = (Self, Self::Weight)>, spread: f32) -> Self;
 }
 
 /// One channel of a section of 32-bit sums, not negative and not NaN, or that times weights.
@@ -164,6 +168,12 @@ impl Accumulate for i32 {
         // infinity, or NaN for infinity times 0.
         self.wrapping_add(nearest(row.0 * wx.0))
     }
+
+    #[inline(always)]
+    fn down(rows: impl Iterator<Item = (i32, Tap)>, spread: f32) -> i32 {
+        // Floats, since they have one order: four or five of them are off by less than any row is rounded.
+        nearest(rows.fold(0.0, |sum, (row, wy)| sum + row as f32 * (wy.0 * spread)))
+    }
 }
 
 /// 32-bit fixed point of scenes whose three colours are one: as [`i32`], bit for bit.
@@ -205,6 +215,11 @@ impl Accumulate for Grey {
     fn plus(self, row: Section, wx: Tap) -> Self {
         Grey(self.0.plus(row, wx))
     }
+
+    #[inline(always)]
+    fn down(rows: impl Iterator<Item = (Grey, Tap)>, spread: f32) -> Grey {
+        Grey(i32::down(rows.map(|(row, wy)| (row.0, wy)), spread))
+    }
 }
 
 /// Floats, in one order.
@@ -226,6 +241,11 @@ impl Accumulate for f32 {
     #[inline(always)]
     fn plus(self, row: f32, wx: Tap) -> Self {
         self + row * wx.0
+    }
+
+    #[inline(always)]
+    fn down(rows: impl Iterator<Item = (f32, Tap)>, spread: f32) -> f32 {
+        rows.fold(0.0, |sum, (row, wy)| sum + row * (wy.0 * spread))
     }
 }
 
@@ -255,6 +275,11 @@ impl Accumulate for i16 {
     #[inline(always)]
     fn plus(self, row: i16, wx: i16) -> Self {
         self.saturating_add(times(row, wx))
+    }
+
+    #[inline(always)]
+    fn down(rows: impl Iterator<Item = (i16, i16)>, _: f32) -> i16 {
+        rows.fold(0, |sum: i16, (row, wy)| sum.saturating_add(times(row, wy)))
     }
 }
 

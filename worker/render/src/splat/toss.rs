@@ -6,6 +6,7 @@
 //! not wanted never gets out of the registers; elsewhere in loops over plain arrays, one for each step.
 
 use super::records::Splat;
+use super::tiers::Shape;
 use super::{Level, Simd};
 use crate::footprint::{Phases, Sections};
 use crate::mask::OpenMask;
@@ -148,6 +149,37 @@ pub(crate) struct Kept {
     pub(crate) sample: u32,
 }
 
+/// How the voxels of a flat view that are kept are packed.
+#[derive(Clone, Copy)]
+pub(crate) enum Packing<'a> {
+    /// With a window of the part and where weights across and down lie.
+    Window(&'a [Phases; 2]),
+    /// With their [places](Splat::aside_of).
+    Aside,
+    /// With their tier and a [place](Shape::place) in it, and where weights across lie.
+    Tier(&'a Phases, Shape, &'a TierOf),
+}
+
+/// Which tier a voxel belongs to by where it lies down the part: `(y - base) * per`, in units of
+/// [`TIER_BITS`], rounded to nearest.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct TierOf {
+    pub(crate) base: i32,
+    pub(crate) per: i32,
+}
+
+/// Tiers lie 192 subpixels apart and more ([`crate::storeys`]), and voxels less than 2^15 from the part's first
+/// row: so products stay below 2^28, and a thousandth of a tier is told apart.
+pub(crate) const TIER_BITS: u32 = 20;
+
+impl TierOf {
+    #[inline(always)]
+    fn at(self, y: i32, rows: usize) -> u32 {
+        let tier = ((y - self.base) * self.per + (1 << (TIER_BITS - 1))) >> TIER_BITS;
+        tier.clamp(0, rows as i32 - 1) as u32
+    }
+}
+
 impl Tossing {
     /// The first `kept` voxels of a flat view, with their first sheets.
     #[inline(always)]
@@ -286,14 +318,13 @@ impl Sieve<'_, FlatBrick<'_>> {
         }
     }
 
-    /// Sifts the voxels of `brick`, and packs those that are kept. `phases`: where weights across and down
-    /// lie; `None`: voxels are packed with their [places](Splat::aside_of).
+    /// Sifts the voxels of `brick`, and packs those that are kept.
     #[inline(always)]
     pub(crate) fn sift_ready(
         &self,
         simd: Simd,
         brick: &Brick,
-        phases: Option<&[Phases; 2]>,
+        packing: Packing<'_>,
         tossing: &mut Tossing,
     ) -> Sifted {
         let sifted = self.sift(simd, brick, tossing);
@@ -301,19 +332,19 @@ impl Sieve<'_, FlatBrick<'_>> {
             // SAFETY: the value proves that the instructions are there.
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe {
-                wide::avx512::make_ready(self.sections, phases, sifted.kept, tossing);
+                wide::avx512::make_ready(self.sections, packing, sifted.kept, tossing);
             },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => unsafe {
-                wide::avx2::make_ready(self.sections, phases, sifted.kept, tossing);
+                wide::avx2::make_ready(self.sections, packing, sifted.kept, tossing);
             },
             // SAFETY: as above.
             #[cfg(target_arch = "aarch64")]
             Level::Neon => unsafe {
-                wide::neon::make_ready(self.sections, phases, sifted.kept, tossing);
+                wide::neon::make_ready(self.sections, packing, sifted.kept, tossing);
             },
-            Level::Plain => make_ready(self.sections, phases, sifted.kept, tossing),
+            Level::Plain => make_ready(self.sections, packing, sifted.kept, tossing),
         }
         sifted
     }
@@ -321,23 +352,25 @@ impl Sieve<'_, FlatBrick<'_>> {
 
 /// Packs the first `kept`.
 #[inline(always)]
-fn make_ready(
-    sections: &Sections,
-    across: Option<&[Phases; 2]>,
-    kept: usize,
-    tossing: &mut Tossing,
-) {
+fn make_ready(sections: &Sections, packing: Packing<'_>, kept: usize, tossing: &mut Tossing) {
     let Tossing { at: [x, y, z], cells, samples, normals, windows, ready, .. } = tossing;
     let [x0, from_x, y0, from_y] = windows;
-    match across {
-        Some(across) => {
+    match packing {
+        Packing::Window(across) => {
             move_inside(&across[0], &x[..kept], x0, from_x);
             move_inside(&across[1], &y[..kept], y0, from_y);
         }
-        None => {
+        Packing::Aside => {
             for i in 0..kept {
                 (x0[i], y0[i]) = (0, 0);
                 (from_x[i], from_y[i]) = (x[i] as u32 & 0xffff, y[i] as u32);
+            }
+        }
+        Packing::Tier(phases, shape, tier) => {
+            for i in 0..kept {
+                x0[i] = shape.place(phases.first_at(x[i]));
+                from_x[i] = phases.begin((x[i] & (SUBPIXELS - 1)) as usize) as u32;
+                (y0[i], from_y[i]) = (tier.at(y[i], shape.rows), 0);
             }
         }
     }
@@ -369,7 +402,7 @@ fn move_inside(phases: &Phases, at: &[i32], inside: &mut [u32; 512], from: &mut 
 
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 mod wide {
-    use super::{FlatBrick, Placing, Sieve, Sifted, Tossing};
+    use super::{FlatBrick, Packing, Placing, Shape, Sieve, Sifted, TIER_BITS, TierOf, Tossing};
     use crate::footprint::{Phases, Sections};
     use crate::place::FINER_BITS;
     #[cfg(target_arch = "aarch64")]
@@ -410,12 +443,12 @@ mod wide {
                 #[target_feature(enable = $features)]
                 pub(in super::super) fn make_ready(
                     sections: &Sections,
-                    across: Option<&[Phases; 2]>,
+                    packing: Packing<'_>,
                     kept: usize,
                     tossing: &mut Tossing,
                 ) {
                     // SAFETY: these are the instructions.
-                    unsafe { super::make_ready::<$lanes>(sections, across, kept, tossing) }
+                    unsafe { super::make_ready::<$lanes>(sections, packing, kept, tossing) }
                 }
             }
         };
@@ -454,27 +487,60 @@ mod wide {
         }
     }
 
-    /// [`super::move_inside`]: first pixels, and where weights begin.
+    /// First pixels of footprints, and where weights begin.
     #[inline(always)]
-    unsafe fn move_inside<L: Lanes>(phases: &Phases, at: L::Ints) -> (L::Ints, L::Ints) {
-        let (near, more_from, len) = (phases.first(0), phases.more_from(), phases.len as i32);
+    unsafe fn first<L: Lanes>(phases: &Phases, at: L::Ints) -> (L::Ints, L::Ints) {
+        let (near, more_from) = (phases.first(0), phases.more_from());
         let (begin, stride) = (phases.begin(0) as i32, (phases.begin(1) - phases.begin(0)) as i32);
         // SAFETY: the caller's.
         unsafe {
             let phase = L::and(at, L::set(SUBPIXELS - 1));
             let first = L::plus(L::down(at, SUBPIXEL_BITS), L::set(near));
             let first = L::one_more(L::less(L::set(more_from - 1), phase), first);
+            (first, L::plus(L::times(phase, L::set(stride)), L::set(begin)))
+        }
+    }
+
+    /// [`super::move_inside`].
+    #[inline(always)]
+    unsafe fn move_inside<L: Lanes>(phases: &Phases, at: L::Ints) -> (L::Ints, L::Ints) {
+        let len = phases.len as i32;
+        // SAFETY: the caller's.
+        unsafe {
+            let (first, from) = first::<L>(phases, at);
             let moved = L::min(L::max(first, L::set(0)), L::set(PART - len));
             let by = L::min(L::max(L::minus(moved, first), L::set(-len)), L::set(len));
-            let from = L::plus(L::times(phase, L::set(stride)), L::set(begin));
             (moved, L::plus(from, by))
+        }
+    }
+
+    /// Places in tiers, and where weights begin.
+    #[inline(always)]
+    unsafe fn in_tier<L: Lanes>(phases: &Phases, shape: &Shape, at: L::Ints) -> (L::Ints, L::Ints) {
+        let (none, last) = (shape.place(i32::MIN / 2), shape.place(i32::MAX / 2));
+        // SAFETY: the caller's.
+        unsafe {
+            let (first, from) = first::<L>(phases, at);
+            let place = L::plus(first, L::set(shape.margin as i32));
+            (L::min(L::max(place, L::set(none as i32)), L::set(last as i32)), from)
+        }
+    }
+
+    /// [`TierOf::at`].
+    #[inline(always)]
+    unsafe fn tier_at<L: Lanes>(tier: &TierOf, rows: usize, y: L::Ints) -> L::Ints {
+        // SAFETY: the caller's.
+        unsafe {
+            let units = L::times(L::minus(y, L::set(tier.base)), L::set(tier.per));
+            let at = L::down(L::plus(units, L::set(1 << (TIER_BITS - 1))), TIER_BITS);
+            L::min(L::max(at, L::set(0)), L::set(rows as i32 - 1))
         }
     }
 
     #[inline(always)]
     unsafe fn make_ready<L: Lanes>(
         sections: &Sections,
-        across: Option<&[Phases; 2]>,
+        packing: Packing<'_>,
         kept: usize,
         tossing: &mut Tossing,
     ) {
@@ -485,11 +551,15 @@ mod wide {
             // SAFETY: as the line above shows; a voxel that is ready is four numbers.
             unsafe {
                 let (x, y) = (L::load(x.as_ptr().add(i).cast()), L::load(y.as_ptr().add(i).cast()));
-                let [(x0, from_x), (y0, from_y)] = match across {
-                    Some([x_phases, y_phases]) => {
+                let [(x0, from_x), (y0, from_y)] = match packing {
+                    Packing::Window([x_phases, y_phases]) => {
                         [move_inside::<L>(x_phases, x), move_inside::<L>(y_phases, y)]
                     }
-                    None => [(L::set(0), L::and(x, L::set(0xffff))), (L::set(0), y)],
+                    Packing::Aside => [(L::set(0), L::and(x, L::set(0xffff))), (L::set(0), y)],
+                    Packing::Tier(phases, shape, tier) => [
+                        in_tier::<L>(phases, &shape, x),
+                        (tier_at::<L>(tier, shape.rows, y), L::set(0)),
+                    ],
                 };
                 let place = L::or(x0, L::up(y0, 8));
                 let place = L::or(place, L::up(L::load(cells.as_ptr().add(i)), 16));
@@ -761,10 +831,10 @@ mod tests {
                 sheets: [begin, begin + count],
             };
             let phases = [0, 1].map(|axis| footprint.phases(axis).expect("a table"));
-            let phases = moved.then_some(phases);
+            let packing = if moved { Packing::Window(&phases) } else { Packing::Aside };
             let sift = |simd| {
                 let mut tossing = Tossing::default();
-                let sifted = sieve.sift_ready(simd, &brick, phases.as_ref(), &mut tossing);
+                let sifted = sieve.sift_ready(simd, &brick, packing, &mut tossing);
                 let voxel = |(first, v): (&i32, &Splat)| (*first, v.place, v.rows, v.deep, v.sample);
                 (sifted, tossing.ready(sifted.kept).map(voxel).collect::<Vec<_>>())
             };

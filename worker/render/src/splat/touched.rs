@@ -209,6 +209,50 @@ fn take_plain<S: Recorded, const N: usize>(
     }
 }
 
+/// The same of sums that are beside each other, one of sheet k and one of the one behind a pixel, and stay there.
+///
+/// # Panics
+/// If there are fewer sums or pixels than a part has.
+#[inline(always)]
+pub(crate) fn take_folded<S: Recorded>(
+    simd: Simd,
+    (folded, before): (&[Record<S, 2>; LANES], &mut [S::Pixel]),
+    pixels: &[[u32; 4]],
+    places: Some16<'_>,
+    row: &mut Row,
+) {
+    match simd.0 {
+        super::Level::Plain => {
+            for (i, (&at, [here, behind])) in places.at[..places.n].iter().zip(folded).enumerate() {
+                let at = at as usize;
+                let to = [&mut row.before, &mut row.here, &mut row.behind];
+                for (to, sums) in to.into_iter().zip([&before[at], here, behind]) {
+                    for (to, bits) in to.iter_mut().zip(S::raw(sums)) {
+                        to[i] = S::from_bits(bits).value();
+                    }
+                }
+                row.a[i] = f32::from_bits(pixels[at][0]);
+                before[at] = *here;
+            }
+        }
+        // SAFETY: the value proves that the instructions are there.
+        #[cfg(target_arch = "x86_64")]
+        super::Level::Avx2 => unsafe {
+            wide::avx2::take_folded::<S>((folded, before), pixels, places, row);
+        },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        super::Level::Avx512 => unsafe {
+            wide::avx512::take_folded::<S>((folded, before), pixels, places, row);
+        },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        super::Level::Neon => unsafe {
+            wide::neon::take_folded::<S>((folded, before), pixels, places, row);
+        },
+    }
+}
+
 /// Puts what a closed row says of its first pixels into those of a part, at these places.
 ///
 /// # Panics
@@ -283,6 +327,17 @@ mod wide {
                 ) {
                     // SAFETY: these are the instructions.
                     unsafe { super::take::<$lanes, S, N>(sums, pixels, places, slot, row) }
+                }
+
+                #[target_feature(enable = $features)]
+                pub(in super::super) fn take_folded<S: Recorded>(
+                    sums: (&[Record<S, 2>; LANES], &mut [S::Pixel]),
+                    pixels: &[[u32; 4]],
+                    places: Some16<'_>,
+                    row: &mut Row,
+                ) {
+                    // SAFETY: these are the instructions.
+                    unsafe { super::take_folded::<$lanes, S>(sums, pixels, places, row) }
                 }
 
                 #[target_feature(enable = $features)]
@@ -408,6 +463,62 @@ mod wide {
                 let now = now.add(N * at as usize);
                 *old.add(at as usize) = *now;
                 *now = S::Pixel::default();
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn take_folded<L: Lanes, S: Recorded>(
+        (folded, before): (&[Record<S, 2>; LANES], &mut [S::Pixel]),
+        pixels: &[[u32; 4]],
+        Some16 { at, n }: Some16<'_>,
+        row: &mut Row,
+    ) {
+        /// The first sixteen numbers.
+        const IN_ORDER: [u32; LANES] = {
+            let mut order = [0; LANES];
+            let mut i = 0;
+            while i < LANES {
+                order[i] = i as u32;
+                i += 1;
+            }
+            order
+        };
+        const { assert!(matches!(size_of::<S::Pixel>(), 8 | 16)) };
+        const { assert!(size_of::<Record<S, 2>>() == 2 * size_of::<S::Pixel>()) };
+        let words = size_of::<S::Pixel>() / 4;
+        let (before, pixels) = (&mut before[..PART], &pixels[..PART]);
+        let old: *mut S::Pixel = before.as_mut_ptr();
+        // SAFETY: the caller's. All places are below PART, and there are as many records, and lanes in a row's
+        // arrays from `lanes` on.
+        unsafe {
+            for lanes in (0..n).step_by(L::LANES) {
+                let some = lanes..lanes + L::LANES;
+                let at = at[some.clone()].as_ptr();
+                let [a, ..] = L::fours(pixels.as_ptr().cast(), 4, at);
+                L::store(row.a[some.clone()].as_mut_ptr().cast(), a);
+                let (old, order) = (old.cast_const().cast(), IN_ORDER[some.clone()].as_ptr());
+                let from: *const u32 = folded.as_ptr().cast();
+                let sheets = if words == 4 {
+                    [
+                        L::fours(old, 4, at),
+                        L::fours(from, 8, order),
+                        L::fours(from.add(4), 8, order),
+                    ]
+                } else {
+                    let [a, b, ..] = L::twos([old, old], words, at);
+                    let [c, d, e, f] = L::fours(from, 4, order);
+                    [shorts::<L, S>(a, b), shorts::<L, S>(c, d), shorts::<L, S>(e, f)]
+                };
+                let to = [&mut row.before, &mut row.here, &mut row.behind];
+                for (to, sums) in to.into_iter().zip(sheets) {
+                    for (to, sums) in to.iter_mut().zip(sums) {
+                        L::store_floats(to[some.clone()].as_mut_ptr(), sums);
+                    }
+                }
+            }
+            for (&at, [here, _]) in at[..n].iter().zip(folded) {
+                *old.add(at as usize) = *here;
             }
         }
     }

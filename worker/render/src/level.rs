@@ -1,0 +1,465 @@
+//! The open sheets of a level view's part, and flat views that are level ([`crate::storeys`]).
+//!
+//! Voxels get here as they do in [`crate::flat`] and [`crate::deep`]; they are added to tiers
+//! ([`crate::splat::tiers`]) and not to pixels. A sheet that closes makes the sums of those of its pixels that
+//! are open and that something was added to, its own and what the sheet behind has by then, eight beside each
+//! other; from there on it is closed as any other.
+
+use crate::flat::{self, BATCH, Batch, Waiting, toss};
+use crate::footprint::{Footprint, Phases};
+use crate::mask::OpenMask;
+use crate::scene::Flat;
+use crate::splat::records::{Recorded, Splat, Table};
+use crate::splat::tiers::{Folded, Shape, Tiered, Tiers, Weights};
+use crate::splat::toss::{Packing, TIER_BITS, TierOf, Tossing};
+use crate::splat::{Simd, Work};
+use crate::stack::{Closes, EDGE, Open, Queues, Rows, Stage, Store, slot, walk};
+use crate::storeys::{REACHING, ROWS, Storeys};
+use crate::tile::{Io, PART, Part, Pixels};
+use slabcast_common::message::Counters;
+use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS};
+
+/// The tiers that reach each row of a part's pixels in one sheet, and what they weigh there.
+struct Down<'a, W> {
+    /// Which sheet this is.
+    k: i32,
+    weights: &'a [W],
+    /// Of each row: the first tier, and how many there are: four, or a few more.
+    reach: [[u8; 2]; EDGE],
+    /// Rows that more than four reach.
+    more: u64,
+    len: i32,
+    /// By tier, the first row of pixels that it reaches, and where the weight of the part's first would lie.
+    first: [i32; ROWS],
+    from: [i32; ROWS],
+    /// Rows whose weights are here, and these.
+    known: u64,
+    rows: [[W; REACHING]; EDGE],
+}
+
+/// Farther from a part than any of its tiers.
+const FAR: i32 = 1 << 20;
+
+impl<W: Copy + Default> Default for Down<'_, W> {
+    fn default() -> Self {
+        Down {
+            k: i32::MIN,
+            weights: &[],
+            reach: [[0; 2]; EDGE],
+            more: 0,
+            len: 0,
+            first: [0; ROWS],
+            from: [0; ROWS],
+            known: 0,
+            rows: [[W::default(); REACHING]; EDGE],
+        }
+    }
+}
+
+/// Tiers that reach a row of pixels at least, some with no weight: as many as do if a kernel reaches two steps of the
+/// lattice to either side.
+const FOUR: usize = 4;
+
+impl<'a, W: Copy + Default> Down<'a, W> {
+    /// Of sheet `k` with this footprint, whose weights down are `weights`.
+    #[inline(always)]
+    fn fill(
+        &mut self,
+        k: i32,
+        part: &'a Part<'_>,
+        storeys: &Storeys,
+        (footprint, weights): (&Footprint<'a>, &'a [W]),
+        tiers: usize,
+    ) {
+        let phases = footprint.phases(1).expect("a table");
+        let (view, rect) = (&part.frame.view, &part.rect);
+        let base = storeys.base(view, rect, footprint.scale);
+        (self.k, self.weights, self.known, self.more) = (k, weights, 0, 0);
+        // Far away for storeys that there are none of.
+        for tier in 0..tiers {
+            let storey = base + tier as i32;
+            (self.first[tier], self.from[tier]) = if storey < 0 {
+                (-FAR, 0)
+            } else if storey as usize >= storeys.len() {
+                (FAR, 0)
+            } else {
+                let at = storeys.at(view, storey as usize, footprint);
+                let at = (at - (i64::from(rect.y0) << SUBPIXEL_BITS)) as i32;
+                let first = phases.first_at(at);
+                (first, phases.begin((at & (SUBPIXELS - 1)) as usize) as i32 - first)
+            };
+        }
+        // Each begins farther down than the one before, and ends so.
+        let (first, len) = (&self.first, phases.len as i32);
+        self.len = len;
+        let (mut from, mut to) = (0, 0);
+        for y in 0..EDGE {
+            let row = y as i32;
+            while from < tiers && first[from] + len <= row {
+                from += 1;
+            }
+            to = to.max(from);
+            while to < tiers && first[to] <= row {
+                to += 1;
+            }
+            let begin = from.min(tiers - FOUR);
+            let n = (to - begin).max(FOUR);
+            self.reach[y] = [begin, n].map(|tier| tier as u8);
+            self.more |= u64::from(n > FOUR) << y;
+        }
+    }
+
+    /// What the tiers weigh that reach row `y`.
+    #[inline(always)]
+    fn row(&mut self, y: usize) -> &[W] {
+        let [begin, n] = self.reach[y % EDGE].map(usize::from);
+        let row = &mut self.rows[y % EDGE][..n.min(REACHING)];
+        if self.known >> y & 1 == 0 {
+            self.known |= 1 << y;
+            let y = y as i32;
+            for (i, w) in row.iter_mut().enumerate() {
+                let tier = (begin + i) % ROWS;
+                let reaches = self.first[tier] <= y && y < self.first[tier] + self.len;
+                *w = if reaches {
+                    self.weights[(self.from[tier] + y) as usize]
+                } else {
+                    W::default()
+                };
+            }
+        }
+        row
+    }
+
+    /// Columns that the tiers were touched at that reach each row.
+    #[inline(always)]
+    fn touched(&self, tiers: usize, touched: &[u64; ROWS]) -> Rows {
+        let mut four = [0; ROWS];
+        for tier in 0..tiers - (FOUR - 1) {
+            four[tier] = touched[tier..tier + FOUR].iter().fold(0, |all, columns| all | columns);
+        }
+        let mut rows = [0; EDGE];
+        for (row, [begin, _]) in rows.iter_mut().zip(&self.reach) {
+            *row = four[usize::from(*begin) % ROWS];
+        }
+        let mut more = self.more;
+        while more != 0 {
+            let y = more.trailing_zeros() as usize;
+            more &= more - 1;
+            let [begin, n] = self.reach[y].map(usize::from);
+            rows[y] = touched[begin..begin + n].iter().fold(0, |all, columns| all | columns);
+        }
+        rows
+    }
+}
+
+/// The open sheets of a part, in tiers.
+pub(crate) struct LevelSheets<'a, S: Recorded, const N: usize> {
+    pub(crate) simd: Simd,
+    pub(crate) tiers: Tiers<'a, S, N>,
+    closes: &'a mut Closes<S>,
+    /// Sums of pixels that close.
+    folded: &'a mut Folded<S>,
+    part: &'a Part<'a>,
+    storeys: &'a Storeys,
+    /// By slot and tier: columns of the part that something was added to; and whether there are any.
+    touched: [[u64; ROWS]; N],
+    any: [bool; N],
+    /// Of sheets by turns, or of all.
+    downs: [Down<'a, S::Weight>; 2],
+}
+
+impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
+    /// In memory of `store`, with tiers of this shape.
+    pub(crate) fn new(
+        simd: Simd,
+        store: &'a mut Store<S>,
+        part: &'a Part<'a>,
+        storeys: &'a Storeys,
+        shape: Shape,
+    ) -> Self {
+        let Store { closes, level, .. } = store;
+        closes.begin();
+        let (tiers, folded) = level.of(shape, N);
+        LevelSheets {
+            simd,
+            tiers: Tiers::new(tiers, shape),
+            closes,
+            folded,
+            part,
+            storeys,
+            touched: [[0; ROWS]; N],
+            any: [false; N],
+            downs: Default::default(),
+        }
+    }
+
+    /// Notes that voxels that begin at sheet `k` add to these columns, tier by tier, in `most` sheets.
+    #[inline(always)]
+    fn touch_all(&mut self, k: i32, most: usize, columns: &[u64; ROWS]) {
+        let rows = self.tiers.shape().rows;
+        for sheet in 0..most {
+            let slot = slot::<N>(k + sheet as i32);
+            self.any[slot] = true;
+            let touched = &mut self.touched[slot];
+            for (touched, columns) in touched.iter_mut().zip(columns).take(rows) {
+                *touched |= columns;
+            }
+        }
+    }
+
+    /// Notes that something is added to columns of a tier.
+    #[inline(always)]
+    pub(crate) fn touch(&mut self, slot: usize, row: usize, columns: u64) {
+        self.touched[slot][row % ROWS] |= columns;
+        self.any[slot] = true;
+    }
+
+    /// Where the tiers of sheet `k` lie is known from here on; says where that stands.
+    #[inline(always)]
+    fn down(&mut self, k: i32) -> usize {
+        let part: &'a Part<'a> = self.part;
+        let footprints = &part.frame.footprints;
+        let parallel = matches!(part.frame.view.projection, Projection::Ortho { .. });
+        // Behind the last sheet that anything reaches there is nothing, wherever it were.
+        let k = if parallel { 0 } else { k.min(footprints.last()) };
+        let which = k as usize % 2;
+        if self.downs[which].k != k {
+            let footprint: Footprint<'a> = footprints.at(k).expect("no sheet is clipped");
+            let weights = S::across(&footprint, 1).expect("a table");
+            let rows = self.tiers.shape().rows;
+            self.downs[which].fill(k, part, self.storeys, (&footprint, weights), rows);
+        }
+        which
+    }
+}
+
+impl<S: Tiered, const N: usize> Open<S> for LevelSheets<'_, S, N> {
+    #[inline(always)]
+    fn before(&mut self) -> (&mut [S::Pixel], &mut Rows) {
+        self.closes.before()
+    }
+
+    #[inline(always)]
+    fn begin(&mut self, _: i32) {}
+
+    #[inline(always)]
+    fn close(&mut self, k: i32, part: &Part<'_>, open: &mut OpenMask, pixels: &mut Pixels) -> bool {
+        let slots = [slot::<N>(k), slot::<N>(k + 1)];
+        if !self.any[slots[0]] {
+            *self.closes.before().1 = [0; EDGE];
+            return false;
+        }
+        let mut closing = [0; EDGE];
+        self.folded.clear();
+        {
+            let [here, behind] = [self.down(k), self.down(k + 1)];
+            let LevelSheets { simd, tiers, folded, storeys, downs, touched, .. } = self;
+            let tiers = &*tiers;
+            let touched = downs[here].touched(tiers.shape().rows, &touched[slots[0]]);
+            for (y, touched) in touched.into_iter().enumerate() {
+                let open = touched & open.row(y);
+                if open == 0 {
+                    continue;
+                }
+                let first = [here, behind].map(|down| usize::from(downs[down].reach[y][0]));
+                let begin = [0, 1].map(|sheet| tiers.begin(slots[sheet], first[sheet]));
+                let weights = if here == behind {
+                    let row = downs[here].row(y);
+                    [row, row]
+                } else {
+                    let [even, odd] = &mut *downs;
+                    let (even, odd) = (even.row(y), odd.row(y));
+                    if here == 0 { [even, odd] } else { [odd, even] }
+                };
+                let above = [(begin[0], weights[0]), (begin[1], weights[1])];
+                closing[y] = S::fold(*simd, tiers, above, storeys.spread, open, folded);
+            }
+        }
+        let shut = self.closes.close_folded(self.simd, self.folded, &closing, part, open, pixels);
+        self.clear(slots[0]);
+        shut
+    }
+
+    #[inline(always)]
+    fn empty(&mut self, _: i32) {
+        for slot in 0..N {
+            self.clear(slot);
+        }
+    }
+}
+
+impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
+    /// Empties a sheet.
+    #[inline(always)]
+    fn clear(&mut self, slot: usize) {
+        if !std::mem::take(&mut self.any[slot]) {
+            return;
+        }
+        let rows = self.tiers.shape().rows;
+        for (row, columns) in self.touched[slot][..rows].iter_mut().enumerate() {
+            if *columns != 0 {
+                self.tiers.empty(slot, row, std::mem::take(columns));
+            }
+        }
+    }
+}
+
+/// Renders a part of a flat view: compiled for each instruction set as a whole.
+pub(crate) struct RenderLevel<'a, S: Recorded, const N: usize> {
+    pub(crate) part: Part<'a>,
+    pub(crate) view: Level<'a>,
+    pub(crate) simd: Simd,
+    pub(crate) store: &'a mut Store<S>,
+    pub(crate) waiting: &'a mut Waiting,
+    pub(crate) pixels: &'a mut Pixels,
+    pub(crate) io: Io<'a>,
+}
+
+/// What a flat view has that is level.
+#[derive(Clone, Copy)]
+pub(crate) struct Level<'a> {
+    flat: &'a Flat,
+    storeys: &'a Storeys,
+}
+
+/// Whether parts of `frame` may be rendered here.
+pub(crate) fn takes(frame: &crate::scene::Frame) -> Option<Level<'_>> {
+    Some(Level { flat: flat::takes(frame)?, storeys: frame.storeys.as_ref()? })
+}
+
+impl<S: Tiered, const N: usize> Work for RenderLevel<'_, S, N> {
+    type Out = ();
+    #[inline(always)]
+    fn run(self) {
+        let RenderLevel { part, view: Level { flat, storeys }, simd, store, waiting, pixels, io } =
+            self;
+        let frame = part.frame;
+        let footprint = frame.footprints.at(0).expect("a flat view's sheets are all drawn");
+        let phases = footprint.phases(0).expect("a flat view's footprints have tables");
+        let across = S::across(&footprint, 0).expect("as phases are there");
+        let across = Table { weights: across, len: phases.len };
+        let deep = Table { weights: S::deep(&frame.sections), len: frame.sections.most() };
+        let shape = Shape::new::<S>(storeys.rows(PART, footprint.scale), phases.len);
+        // Where the storey of the first tier lies, or would.
+        let apart = storeys.subpixels(footprint.scale);
+        let first = storeys.base(&frame.view, &part.rect, footprint.scale);
+        let first = f64::from(first) - storeys.of_row(&frame.view, part.rect.y0, footprint.scale);
+        let tier_of = TierOf {
+            base: libm::floor(first * apart + 0.5) as i32,
+            per: libm::floor(f64::from(1 << TIER_BITS) / apart + 0.5) as i32,
+        };
+        let Waiting { queues, tossing, batch } = waiting;
+        let weights = Weights { across, deep };
+        let columns = [0; ROWS];
+        let stage = LevelStage {
+            part: &part,
+            simd,
+            flat,
+            phases,
+            shape,
+            tier_of,
+            weights,
+            columns,
+            tossing,
+            batch,
+        };
+        let sheets = LevelSheets::<S, N>::new(simd, store, &part, storeys, shape);
+        walk(&part, stage, sheets, queues, pixels, io);
+    }
+}
+
+struct LevelStage<'a, S: Recorded> {
+    part: &'a Part<'a>,
+    simd: Simd,
+    flat: &'a Flat,
+    /// Where weights across lie.
+    phases: Phases,
+    shape: Shape,
+    tier_of: TierOf,
+    weights: Weights<'a, S>,
+    /// By tier, columns that voxels of a bucket add to.
+    columns: [u64; ROWS],
+    tossing: &'a mut Tossing,
+    batch: &'a mut Batch,
+}
+
+impl<S: Tiered, const N: usize> Stage<LevelSheets<'_, S, N>> for LevelStage<'_, S> {
+    type Voxel = Splat;
+
+    #[inline(always)]
+    fn reach(&self) -> [i32; 2] {
+        self.flat.reach
+    }
+
+    #[inline(always)]
+    fn toss(
+        &mut self,
+        which: usize,
+        open: &OpenMask,
+        queues: &mut Queues<Splat>,
+        counters: &mut Counters,
+    ) {
+        let asked = (which, open, queues, counters);
+        let packing = Packing::Tier(&self.phases, self.shape, &self.tier_of);
+        toss(self.part, self.simd, self.flat, packing, self.tossing, asked);
+    }
+
+    #[inline(always)]
+    fn splat(
+        &mut self,
+        bucket: &[Splat],
+        k: i32,
+        sheets: &mut LevelSheets<'_, S, N>,
+        open: &OpenMask,
+        counters: &mut Counters,
+    ) {
+        if bucket.is_empty() {
+            return;
+        }
+        let LevelStage { part, shape, weights, columns, batch, .. } = self;
+        let len = weights.across.len;
+        let mut payloads = [S::Payload::default(); BATCH];
+        columns[..shape.rows].fill(0);
+        for some in bucket.chunks(BATCH) {
+            let note = |v: &Splat| {
+                let [place, row] = v.first();
+                columns[row % ROWS] |= shape.columns(place as u32, len);
+            };
+            let asked = (sheets.simd, *part, open);
+            let n = batch.light::<S>(asked, some, counters, note, &mut payloads);
+            let voxels = (&batch.voxels[..n], &payloads[..n]);
+            S::add_flat(sheets.simd, &mut sheets.tiers, voxels, slot::<N>(k), weights);
+        }
+        sheets.touch_all(k, weights.deep.len, columns);
+    }
+
+    #[inline(always)]
+    fn splat_carried(
+        &mut self,
+        carried: &[(Splat, i32)],
+        sheets: &mut LevelSheets<'_, S, N>,
+        open: &OpenMask,
+        counters: &mut Counters,
+    ) {
+        let LevelStage { part, shape, weights: Weights { across, deep }, .. } = self;
+        let Part { frame, slab, .. } = part;
+        for (v, first) in carried {
+            if frame.scene.quality.cull && !open.is_near(v.cell()) {
+                counters.culled += 1;
+                continue;
+            }
+            counters.splatted += 1;
+            let mut light = [[0.0]; 4];
+            frame.payloads(sheets.simd, &[v.sample], &[v.normal()], None, &mut light);
+            let payload = S::payload(light.map(|[c]| c));
+            let [place, row] = v.first();
+            let wx = across.row((v.rows & 0xffff) as usize);
+            let z = deep.row(v.phase() as usize * deep.len);
+            for (sheet, &wz) in z.iter().enumerate().skip((slab.first - first) as usize) {
+                let slot = slot::<N>(first + sheet as i32);
+                sheets.tiers.add((slot, row), (place, wx), &S::cut(payload, wz));
+                sheets.touch(slot, row, shape.columns(place as u32, wx.len()));
+            }
+        }
+    }
+}

@@ -1,0 +1,186 @@
+//! Level views: those in which layers of the lattice lie level.
+//!
+//! A *storey* is all voxels of one index along the lattice's upright axis. Where the camera is level and that
+//! axis points up in the picture, as on a turntable, all voxels of a storey lie in one row of it, wherever they
+//! are in depth, in parallel views; in perspective they do in each sheet. A footprint is a product, so what is
+//! the same for a whole storey need not be done for each voxel: a voxel is added along x alone, to its storey's
+//! row of sums, and when a sheet closes a pixel's sum is that of the few storeys that reach it, each times its
+//! weight down the picture. Of seven rows of pixels that a voxel was added to there is one left (the separable
+//! footprint of the paper's section 3, with its second half done once for all voxels that share it).
+//!
+//! ```text
+//! row(k, s, x) = sum over voxels of storey s of  (payload * wz) * wx       each rounded to whole units
+//! sum(k, x, y) = sum over storeys, top down, of  row(k, s, x) * wy         rounded as the kind of sums says
+//! ```
+//!
+//! **Why pixels stay exact.** A row is a sum of integers, which has no order. A voxel that is culled reaches
+//! shut pixels alone, with all of its columns in all of its storey's rows. And the storeys of a pixel are added
+//! in one order, from the top of the picture down, which does not hang on how the volume is stored.
+//!
+//! Floats are not added so, since their sums have an order of their own, and neither are views in which
+//! storeys lie closer than [`CLOSEST`]: there a voxel has no more rows of pixels than a pixel has storeys.
+
+use crate::footprint::Footprint;
+use crate::scene::Frame;
+use slabcast_common::occlusion::Rect;
+use slabcast_common::view::{SUBPIXELS, View};
+
+/// Pixels from a storey to the next, at least. At one a voxel has four or five rows of pixels, as a pixel has
+/// storeys; below, rows of storeys outgrow the cache that those of pixels fit.
+const CLOSEST: f64 = 0.75;
+
+/// Storeys that reach a pixel at most: kernels of a radius of seven steps.
+pub(crate) const REACHING: usize = 16;
+
+/// Rows of storeys that a part of 64 pixels has at most, those that reach in from outside among them: it needs
+/// 104, and a power of two is sooner divided by.
+pub(crate) const ROWS: usize = 128;
+
+/// The storeys of a level view, from the top of the picture down.
+#[derive(Clone, Debug)]
+pub(crate) struct Storeys {
+    /// The lattice's upright axis, and whether higher indices lie higher in the picture.
+    axis: usize,
+    upwards: bool,
+    /// Down the picture, in vox, of each storey.
+    eye: Vec<f64>,
+    /// From one to the next, more than zero.
+    step: f64,
+    /// Positions in subpixels, where places are in integers.
+    flat: Option<Vec<i64>>,
+    /// How many a footprint reaches to either side.
+    reach: f64,
+    /// Length of a step of the lattice in vox: rows are kept over it, and weights down have it as a factor, so
+    /// that a solid's rows are as its sums.
+    pub(crate) spread: f32,
+}
+
+impl Storeys {
+    /// The storeys of `view`, if it is level and they are far enough apart in sheets up to `last`.
+    pub(crate) fn new(view: &View, dims: [u32; 3], spread: f64, last: i32) -> Option<Storeys> {
+        let m = &view.eye_from_index;
+        let down = [m.x_axis.y, m.y_axis.y, m.z_axis.y];
+        let axis = (0..3).find(|&a| down[a] != 0.0)?;
+        if (0..3).any(|a| a != axis && down[a] != 0.0) {
+            return None;
+        }
+        let (step, upwards) = (down[axis].abs(), down[axis] < 0.0);
+        let apart = view.scale_at(last)? * step;
+        let reach = view.kernel_radius.y / step;
+        if apart < CLOSEST || 2.0 * reach + 2.0 > REACHING as f64 {
+            return None;
+        }
+        let eye = vec![0.0; dims[axis] as usize];
+        let mut storeys =
+            Storeys { axis, upwards, eye, step, flat: None, reach, spread: spread as f32 };
+        // As a brick's corner and an offset in it, since positions are made so.
+        storeys.eye = storeys.all(|at| {
+            let [corner, offset] = [at.map(|n| n & !7), at.map(|n| n & 7)];
+            view.corner_in_eye(corner).y + view.offset_in_eye(offset).y
+        });
+        Some(storeys)
+    }
+
+    /// What there is of each, by the index of a voxel in it.
+    fn all<T>(&self, of: impl Fn([u32; 3]) -> T) -> Vec<T> {
+        let along = |n| std::array::from_fn(|a| if a == self.axis { n } else { 0 });
+        let n = self.eye.len() as u32;
+        (0..n).map(|s| of(along(if self.upwards { n - 1 - s } else { s }))).collect()
+    }
+
+    /// Which one a voxel belongs to, by its index.
+    #[inline(always)]
+    pub(crate) fn of_voxel(&self, index: [u32; 3]) -> u32 {
+        let n = index[self.axis];
+        if self.upwards { self.eye.len() as u32 - 1 - n } else { n }
+    }
+
+    /// With positions from integers, by the index of a voxel.
+    pub(crate) fn in_integers(&mut self, at: impl Fn([u32; 3]) -> i64) {
+        self.flat = Some(self.all(at));
+    }
+
+    /// How many there are.
+    pub(crate) fn len(&self) -> usize {
+        self.eye.len()
+    }
+
+    /// Where storey `s` lies down the picture in a sheet with this footprint, in subpixels.
+    #[inline(always)]
+    pub(crate) fn at(&self, view: &View, s: usize, footprint: &Footprint<'_>) -> i64 {
+        match &self.flat {
+            Some(flat) => flat[s],
+            None => view.screen_along(1, self.eye[s], footprint.scale),
+        }
+    }
+
+    /// Which storey, counted from the top, lies at `y` vox down the eye's axis: a fraction.
+    #[inline(always)]
+    fn of_eye(&self, y: f64) -> f64 {
+        (y - self.eye[0]) / self.step
+    }
+
+    /// Factor and summand that make of eye coordinates which storey it is.
+    pub(crate) fn from_eye(&self) -> (f64, f64) {
+        (1.0 / self.step, -self.eye[0] / self.step)
+    }
+
+    /// Subpixels from one to the next at `scale`.
+    pub(crate) fn subpixels(&self, scale: f64) -> f64 {
+        self.step * scale * f64::from(SUBPIXELS)
+    }
+
+    /// The storey that lies at position 0 of row `y` of pixels at `scale`, as a fraction; it need not be there.
+    pub(crate) fn of_row(&self, view: &View, y: i32, scale: f64) -> f64 {
+        self.of_eye((f64::from(y) - f64::from(view.size[1]) * 0.5) / scale)
+    }
+
+    /// The first storey that row 0 of a part stands for, in a sheet of this scale: it does not reach the part,
+    /// nor does the one of row [`Storeys::rows`] less one.
+    #[inline(always)]
+    pub(crate) fn base(&self, view: &View, part: &Rect, scale: f64) -> i32 {
+        // A footprint reaches half a pixel less than its radius, and is placed to a subpixel.
+        libm::floor(self.of_row(view, part.y0, scale) - self.reach) as i32 - 1
+    }
+
+    /// Rows of storeys that a part of `high` pixels has at a scale, which are at most [`ROWS`].
+    pub(crate) fn rows(&self, high: i32, scale: f64) -> usize {
+        let across = f64::from(high) / (self.step * scale);
+        libm::ceil(across + 2.0 * self.reach) as usize + 4
+    }
+}
+
+/// The storeys that reach a row of pixels in one sheet.
+pub(crate) struct Reaching<W> {
+    /// Which, and each one's weight.
+    pub(crate) some: [(i32, W); REACHING],
+    pub(crate) n: usize,
+}
+
+impl Frame {
+    /// The storeys that reach row `y` of pixels in a sheet with this footprint, top down, and each one's weight there by
+    /// `weight`; plainly, one by one.
+    pub(crate) fn storeys_at<W: Copy + Default>(
+        &self,
+        storeys: &Storeys,
+        footprint: &Footprint<'_>,
+        y: i32,
+        mut weight: impl FnMut(i64) -> W,
+    ) -> Reaching<W> {
+        let mut reaching = Reaching { some: [(0, W::default()); REACHING], n: 0 };
+        let middle = storeys.of_row(&self.view, y, footprint.scale);
+        let around = storeys.reach + 2.0 + 1.0 / (storeys.step * footprint.scale);
+        let last = storeys.len() as i32 - 1;
+        let from = (libm::floor(middle - around) as i32).clamp(0, last + 1);
+        let to = (libm::ceil(middle + around) as i32).clamp(-1, last);
+        for s in from..=to {
+            let at = storeys.at(&self.view, s as usize, footprint);
+            let (first, end) = footprint.extent(1, at);
+            if first <= y && y < end {
+                reaching.some[reaching.n] = (s, weight(at));
+                reaching.n += 1;
+            }
+        }
+        reaching
+    }
+}

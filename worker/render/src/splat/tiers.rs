@@ -40,8 +40,9 @@ impl Shape {
         let margin = len.next_multiple_of(8);
         // As a footprint may begin in the last column of a line.
         let groups = (len + a_line::<S>() - 1).div_ceil(a_line::<S>());
-        // Four groups are added at a time, where there are more.
-        let spare = if groups > 4 { groups.next_multiple_of(4) } else { groups };
+        // Whole chunks of weights are added: of sixteen columns, or of four lines where there are more.
+        let sixteen = 16 / a_line::<S>();
+        let spare = groups.next_multiple_of(if groups > 4 { 4 } else { sixteen });
         let wide = (margin + PART as usize) / a_line::<S>() + spare;
         Shape { rows, wide, margin, groups, line: a_line::<S>() }
     }
@@ -305,6 +306,9 @@ impl Tiered for i16 {
             // SAFETY: the value proves that the instructions are there.
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe { avx512::add_flat_shorts(tiers, voxels, slot, weights) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe { avx2::add_flat_shorts(tiers, voxels, slot, weights) },
             _ => add_flat(tiers, voxels, slot, weights),
         }
     }
@@ -321,6 +325,9 @@ impl Tiered for i16 {
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe { avx512::add_apart_shorts(tiers, voxels, places, layers) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe { avx2::add_apart_shorts(tiers, voxels, places, layers) },
             _ => add_apart(tiers, voxels, places, layers),
         }
     }
@@ -362,6 +369,11 @@ impl Tiered for i32 {
             Level::Avx512 => unsafe {
                 avx512::add_flat_longs::<i32, 4, N>(tiers, voxels, slot, weights);
             },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe {
+                avx2::add_flat_longs::<i32, 4, N>(tiers, voxels, slot, weights);
+            },
             _ => add_flat(tiers, voxels, slot, weights),
         }
     }
@@ -378,6 +390,9 @@ impl Tiered for i32 {
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe { avx512::add_apart_longs(tiers, voxels, places, layers) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe { avx2::add_apart_longs(tiers, voxels, places, layers) },
             _ => add_apart(tiers, voxels, places, layers),
         }
     }
@@ -397,6 +412,9 @@ impl Tiered for i32 {
             Level::Avx512 => unsafe {
                 avx512::fold_longs::<i32, 4, N>(tiers, above, spread, open, to)
             },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe { avx2::fold_longs::<i32, 4, N>(tiers, above, spread, open, to) },
             _ => fold(tiers, above, open, to, |rows| i32::down(rows.iter().copied(), spread)),
         }
     }
@@ -417,6 +435,11 @@ impl Tiered for Grey {
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe {
                 avx512::add_flat_longs::<Grey, 2, N>(tiers, voxels, slot, weights);
+            },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe {
+                avx2::add_flat_longs::<Grey, 2, N>(tiers, voxels, slot, weights);
             },
             _ => add_flat(tiers, voxels, slot, weights),
         }
@@ -448,6 +471,11 @@ impl Tiered for Grey {
             Level::Avx512 => unsafe {
                 avx512::fold_longs::<Grey, 2, N>(tiers, above, spread, open, to)
             },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe {
+                avx2::fold_longs::<Grey, 2, N>(tiers, above, spread, open, to)
+            },
             _ => fold(tiers, above, open, to, |rows| i32::down(rows.iter().copied(), spread)),
         }
     }
@@ -457,6 +485,350 @@ impl Tiered for Grey {
 mod avx2 {
     use super::*;
     use std::arch::x86_64::*;
+
+    /// Bytes of a register.
+    const BYTES: usize = 32;
+
+    /// Columns of a chunk of weights of 16 bits, and of 32.
+    const SHORTS: usize = 16;
+    const LONGS: usize = 8;
+
+    /// All bits for the weights of a footprint of `len` columns, and none on either side.
+    struct Window<T> {
+        bits: [T; 112],
+    }
+
+    impl<T: Copy + Default> Window<T> {
+        fn new(len: usize, all: T) -> Self {
+            let mut bits = [T::default(); 112];
+            bits[16..16 + len].fill(all);
+            Window { bits }
+        }
+
+        /// Those from the `i`th weight less `shift` on, which is not more than sixteen.
+        #[inline(always)]
+        fn from(&self, i: usize, shift: usize) -> &[T; 16] {
+            self.bits[16 + i - shift..].first_chunk().expect("a footprint is shorter than 64")
+        }
+    }
+
+    /// A register's worth of the weights from `from` less `shift` on, and what lies around them in the table.
+    #[inline(always)]
+    fn around<T: Copy + Default, const LEN: usize>(
+        table: &[T],
+        from: usize,
+        shift: usize,
+        chunk: usize,
+    ) -> [T; LEN] {
+        let begin = (from + chunk * LEN) as isize - shift as isize;
+        let all = usize::try_from(begin).ok().and_then(|begin| table.get(begin..begin + LEN));
+        match all {
+            Some(all) => *all.first_chunk().expect("as long"),
+            // At the table's ends.
+            None => std::array::from_fn(|i| {
+                let at = usize::try_from(begin + i as isize).ok();
+                at.and_then(|at| table.get(at)).copied().unwrap_or_default()
+            }),
+        }
+    }
+
+    /// Sixteen-bit weights of four registers of four columns, each for four channels.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn spread_shorts(
+        table: &[i16],
+        from: usize,
+        shift: usize,
+        chunk: usize,
+        window: &Window<i16>,
+    ) -> [__m256i; 4] {
+        let around: [i16; SHORTS] = around(table, from, shift, chunk);
+        let there = window.from(chunk * SHORTS, shift);
+        let turns = [
+            _mm256_setr_epi8(
+                0, 1, 0, 1, 0, 1, 0, 1, 2, 3, 2, 3, 2, 3, 2, 3, 4, 5, 4, 5, 4, 5, 4, 5, 6, 7, 6, 7,
+                6, 7, 6, 7,
+            ),
+            _mm256_setr_epi8(
+                8, 9, 8, 9, 8, 9, 8, 9, 10, 11, 10, 11, 10, 11, 10, 11, 12, 13, 12, 13, 12, 13, 12,
+                13, 14, 15, 14, 15, 14, 15, 14, 15,
+            ),
+        ];
+        let mut spread = [_mm256_setzero_si256(); 4];
+        for half in 0..2 {
+            // SAFETY: eight weights of sixteen are 16 bytes.
+            let w = unsafe {
+                let w = _mm_loadu_si128(around[8 * half..].as_ptr().cast());
+                _mm_and_si128(w, _mm_loadu_si128(there[8 * half..].as_ptr().cast()))
+            };
+            let w = _mm256_broadcastsi128_si256(w);
+            for (i, turn) in turns.iter().enumerate() {
+                spread[2 * half + i] = _mm256_shuffle_epi8(w, *turn);
+            }
+        }
+        spread
+    }
+
+    /// Adds `section * w` to as many registers from `at` on as there are weights.
+    ///
+    /// # Safety
+    /// There are as many.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn add_shorts(at: *mut __m256i, section: __m256i, w: &[__m256i]) {
+        for (g, w) in w.iter().enumerate() {
+            // SAFETY: the caller's; lines are aligned.
+            unsafe {
+                let sums = _mm256_load_si256(at.add(g));
+                let sums = _mm256_adds_epi16(sums, _mm256_mulhrs_epi16(section, *w));
+                _mm256_store_si256(at.add(g), sums);
+            }
+        }
+    }
+
+    /// What is added to tiers of some shape: registers of a tier, of a sheet, and those that a footprint reaches.
+    #[inline(always)]
+    fn registers<S: Recorded, const N: usize>(
+        tiers: &Tiers<'_, S, N>,
+        len: usize,
+    ) -> (usize, usize, usize) {
+        let Shape { rows, wide, .. } = tiers.shape;
+        let columns = BYTES / size_of::<S::Pixel>();
+        let a_tier = wide * size_of::<Line>() / BYTES;
+        assert!(tiers.lines.len() >= N * rows * wide, "tiers of all sheets");
+        (a_tier, rows * a_tier, (len + columns - 1).div_ceil(columns))
+    }
+
+    #[target_feature(enable = "avx2")]
+    pub(super) fn add_flat_shorts<const N: usize>(
+        tiers: &mut Tiers<'_, i16, N>,
+        (voxels, payloads): (&[Splat], &[u64]),
+        slot: usize,
+        Weights { across, deep }: &Weights<'_, i16>,
+    ) {
+        let (a_tier, sheet, all) = registers(tiers, across.len);
+        let window = Window::new(across.len, -1);
+        let first: *mut __m256i = tiers.lines.as_mut_ptr().cast();
+        for (v, &payload) in voxels.iter().zip(payloads) {
+            let [place, row] = v.first();
+            let (at, shift) = (row * a_tier + place / 4, place % 4);
+            assert!(at + all <= sheet, "a footprint inside its tier");
+            let payload = _mm256_set1_epi64x(payload as i64);
+            for chunk in 0..all.div_ceil(4) {
+                let w = spread_shorts(
+                    across.weights,
+                    (v.rows & 0xffff) as usize,
+                    shift,
+                    chunk,
+                    &window,
+                );
+                let w = &w[..(all - 4 * chunk).min(4)];
+                for (i, &wz) in deep.row(v.phase() as usize * deep.len).iter().enumerate() {
+                    let section = _mm256_mulhrs_epi16(payload, _mm256_set1_epi16(wz));
+                    // SAFETY: of the slot's, as shown above.
+                    unsafe {
+                        add_shorts(first.add((slot + i) % N * sheet + at + 4 * chunk), section, w);
+                    }
+                }
+            }
+        }
+    }
+
+    #[target_feature(enable = "avx2")]
+    pub(super) fn add_apart_shorts<const N: usize>(
+        tiers: &mut Tiers<'_, i16, N>,
+        (apart, payloads): (&Apart, &[u64]),
+        places: &[Each<u32>; MOST],
+        layers: &Layers<'_, i16, N>,
+    ) {
+        for slot in 0..N {
+            let across = &layers.across[0][slot];
+            let (_, sheet, all) = registers(tiers, across.len);
+            let window = Window::new(across.len, -1);
+            let after = layers.after(slot);
+            let first: *mut __m256i = tiers.lines.as_mut_ptr().cast();
+            for (&i, &payload) in apart.kept.iter().zip(payloads) {
+                let i = i as usize % BATCH;
+                if after >= apart.left[i] {
+                    continue;
+                }
+                let place = places[slot][i] as usize;
+                let (at, shift) = (place / 4, place % 4);
+                assert!(at + all <= sheet, "a footprint inside its tier");
+                let wz = layers.deep.weights[apart.deep[i] as usize + after as usize];
+                let section = _mm256_set1_epi64x(payload as i64);
+                let section = _mm256_mulhrs_epi16(section, _mm256_set1_epi16(wz));
+                let from = apart.from[0][slot][i] as usize;
+                for chunk in 0..all.div_ceil(4) {
+                    let w = spread_shorts(across.weights, from, shift, chunk, &window);
+                    let w = &w[..(all - 4 * chunk).min(4)];
+                    // SAFETY: of the slot's, as shown above.
+                    unsafe { add_shorts(first.add(slot * sheet + at + 4 * chunk), section, w) };
+                }
+            }
+        }
+    }
+
+    /// Weights of a chunk's registers of 8 / C columns, each for C channels.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn spread_longs<const C: usize>(
+        table: &[Tap],
+        from: usize,
+        shift: usize,
+        chunk: usize,
+        window: &Window<i32>,
+    ) -> [__m256; 4] {
+        let around: [Tap; LONGS] = around(table, from, shift, chunk);
+        let there = window.from(chunk * LONGS, shift);
+        // SAFETY: eight weights are 32 bytes, and so are eight numbers.
+        let w = unsafe {
+            let there = _mm256_loadu_si256(there.as_ptr().cast());
+            _mm256_and_ps(_mm256_loadu_ps(around.as_ptr().cast()), _mm256_castsi256_ps(there))
+        };
+        let lanes = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
+        let each =
+            if C == 4 { _mm256_srli_epi32::<2>(lanes) } else { _mm256_srli_epi32::<1>(lanes) };
+        let mut spread = [w; 4];
+        for (g, spread) in spread.iter_mut().enumerate() {
+            let which = _mm256_add_epi32(each, _mm256_set1_epi32((8 / C * g) as i32));
+            *spread = _mm256_permutevar8x32_ps(w, which);
+        }
+        spread
+    }
+
+    /// Adds `section * w` to as many registers from `at` on as there are weights.
+    ///
+    /// # Safety
+    /// There are as many.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn add_longs(at: *mut __m256i, section: __m256, w: &[__m256]) {
+        for (g, w) in w.iter().enumerate() {
+            // SAFETY: the caller's; lines are aligned.
+            unsafe {
+                let add = _mm256_cvtps_epi32(_mm256_mul_ps(section, *w));
+                _mm256_store_si256(at.add(g), _mm256_add_epi32(_mm256_load_si256(at.add(g)), add));
+            }
+        }
+    }
+
+    /// A payload of C channels times a weight in depth, over and over; not negative.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn section<const C: usize>(payload: &[f32; C], wz: f32) -> __m256 {
+        let four: [f32; 4] = std::array::from_fn(|i| payload[i % C]);
+        // SAFETY: four floats are 16 bytes.
+        let four = unsafe { _mm_loadu_ps(four.as_ptr()) };
+        let section = _mm256_mul_ps(_mm256_set_m128(four, four), _mm256_set1_ps(wz));
+        _mm256_max_ps(section, _mm256_setzero_ps())
+    }
+
+    #[target_feature(enable = "avx2")]
+    pub(super) fn add_flat_longs<S, const C: usize, const N: usize>(
+        tiers: &mut Tiers<'_, S, N>,
+        (voxels, payloads): (&[Splat], &[[f32; C]]),
+        slot: usize,
+        Weights { across, deep }: &Weights<'_, S>,
+    ) where
+        S: Recorded<Depth = f32> + Accumulate<Weight = Tap>,
+    {
+        const { assert!(C == 2 || C == 4) };
+        let (a_tier, sheet, all) = registers(tiers, across.len);
+        let (columns, of_chunk) = (8 / C, C);
+        let window = Window::new(across.len, -1);
+        let first: *mut __m256i = tiers.lines.as_mut_ptr().cast();
+        for (v, payload) in voxels.iter().zip(payloads) {
+            let [place, row] = v.first();
+            let (at, shift) = (row * a_tier + place / columns, place % columns);
+            assert!(at + all <= sheet, "a footprint inside its tier");
+            for chunk in 0..all.div_ceil(of_chunk) {
+                let from = (v.rows & 0xffff) as usize;
+                let w = spread_longs::<C>(across.weights, from, shift, chunk, &window);
+                let w = &w[..(all - of_chunk * chunk).min(of_chunk)];
+                for (i, &wz) in deep.row(v.phase() as usize * deep.len).iter().enumerate() {
+                    let at = (slot + i) % N * sheet + at + of_chunk * chunk;
+                    // SAFETY: of the slot's, as shown above.
+                    unsafe { add_longs(first.add(at), section(payload, wz), w) };
+                }
+            }
+        }
+    }
+
+    #[target_feature(enable = "avx2")]
+    pub(super) fn add_apart_longs<const N: usize>(
+        tiers: &mut Tiers<'_, i32, N>,
+        (apart, payloads): (&Apart, &[[f32; 4]]),
+        places: &[Each<u32>; MOST],
+        layers: &Layers<'_, i32, N>,
+    ) {
+        for slot in 0..N {
+            let across = &layers.across[0][slot];
+            let (_, sheet, all) = registers(tiers, across.len);
+            let window = Window::new(across.len, -1);
+            let after = layers.after(slot);
+            let first: *mut __m256i = tiers.lines.as_mut_ptr().cast();
+            for (&i, payload) in apart.kept.iter().zip(payloads) {
+                let i = i as usize % BATCH;
+                if after >= apart.left[i] {
+                    continue;
+                }
+                let place = places[slot][i] as usize;
+                let (at, shift) = (place / 2, place % 2);
+                assert!(at + all <= sheet, "a footprint inside its tier");
+                let wz = layers.deep.weights[apart.deep[i] as usize + after as usize];
+                let from = apart.from[0][slot][i] as usize;
+                for chunk in 0..all.div_ceil(4) {
+                    let w = spread_longs::<4>(across.weights, from, shift, chunk, &window);
+                    let w = &w[..(all - 4 * chunk).min(4)];
+                    let at = slot * sheet + at + 4 * chunk;
+                    // SAFETY: of the slot's, as shown above.
+                    unsafe { add_longs(first.add(at), section(payload, wz), w) };
+                }
+            }
+        }
+    }
+
+    #[target_feature(enable = "avx2")]
+    pub(super) fn fold_longs<S, const C: usize, const N: usize>(
+        tiers: &Tiers<'_, S, N>,
+        above: [Above<'_, Tap>; 2],
+        spread: f32,
+        open: u64,
+        to: &mut Folded<S>,
+    ) -> u64
+    where
+        S: Recorded<Pixel = [i32; C]> + Accumulate<Weight = Tap>,
+    {
+        const { assert!(C == 2 || C == 4) };
+        let (mut filled, columns) = (0, 8 / C);
+        let some = |x: &usize| open >> x & ((1 << columns) - 1) != 0;
+        for x in (0..PART as usize).step_by(columns).filter(some) {
+            let mut whole = [[0i32; 8]; 2];
+            for (whole, (begin, weights)) in whole.iter_mut().zip(above) {
+                let mut sums = _mm256_setzero_ps();
+                for (row, wy) in weights.iter().enumerate() {
+                    let from = &tiers.pixels(begin + (row * tiers.shape.wide) as u32)[x..];
+                    let from: &[i32; 8] = from.as_flattened().first_chunk().expect("a register");
+                    // SAFETY: eight numbers are 32 bytes.
+                    let row = unsafe { _mm256_loadu_si256(from.as_ptr().cast()) };
+                    let wy = _mm256_set1_ps(wy.0 * spread);
+                    sums = _mm256_add_ps(sums, _mm256_mul_ps(_mm256_cvtepi32_ps(row), wy));
+                }
+                let sums = _mm256_min_ps(sums, _mm256_set1_ps(crate::splat::LARGEST));
+                // SAFETY: as above.
+                unsafe { _mm256_storeu_si256(whole.as_mut_ptr().cast(), _mm256_cvtps_epi32(sums)) };
+            }
+            let [here, behind] = whole.each_ref().map(|whole| whole.as_chunks::<C>().0);
+            for (i, record) in here.iter().zip(behind).enumerate() {
+                let fills = open >> (x + i) & u64::from(record.0[0] != 0);
+                to.records[to.n] = [*record.0, *record.1];
+                to.n += fills as usize;
+                filled |= fills << (x + i);
+            }
+        }
+        filled
+    }
 
     #[target_feature(enable = "avx2")]
     pub(super) fn fold_shorts<const N: usize>(
@@ -997,6 +1369,113 @@ mod avx512 {
                     };
                 }
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// Numbers that look random.
+    fn numbers(seed: u32) -> impl FnMut(u32) -> u32 {
+        let mut state = u64::from(seed) | 1 << 40;
+        move |below| {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(99);
+            ((state >> 32) as u32) % below
+        }
+    }
+
+    /// Voxels added flat and apart, and some rows folded, by every instruction set as by the plain loops.
+    fn everywhere<S: Tiered, const N: usize>(
+        (len, rows, reaching): (usize, usize, usize),
+        seed: u32,
+        weight: impl Fn(u32) -> S::Weight,
+        deep: impl Fn(u32) -> S::Depth,
+    ) -> Result<(), TestCaseError> {
+        let mut next = numbers(seed);
+        let shape = Shape::new::<S>(rows, len);
+        let phases = 5;
+        let table: Vec<S::Weight> = (0..phases * len).map(|_| weight(next(1000))).collect();
+        let across = Table { weights: &table[..], len };
+        let depths: Vec<S::Depth> = (0..3 * N).map(|_| deep(next(1000))).collect();
+        let weights = Weights { across, deep: Table { weights: &depths[..], len: N } };
+        let payloads: Vec<S::Payload> = (0..40)
+            .map(|_| S::payload([next(9000), next(9000), next(9000), next(9000)].map(|x| x as f32)))
+            .collect();
+        let mut place = || {
+            let first = next(64 + 2 * len as u32) as i32 - 2 * len as i32;
+            (first, shape.place(first), next(rows as u32), next(phases as u32) * len as u32)
+        };
+        let voxels: Vec<Splat> = (0..40)
+            .map(|_| {
+                let (_, place, row, from) = place();
+                Splat { place: place | row << 8, rows: from, deep: from % 3, sample: 0 }
+            })
+            .collect();
+        let (mut apart, mut places) = (Apart::default(), [[0; BATCH]; MOST]);
+        for i in 0..40 {
+            apart.kept[i] = i as u32;
+            apart.left[i] = 1 + (i % N) as i32;
+            for slot in 0..N {
+                let (first, _, row, from) = place();
+                (apart.first[0][slot][i], apart.from[0][slot][i]) = (first, from);
+                places[slot][i] = shape.place_in(row, first);
+            }
+        }
+        let layers =
+            Layers { across: [[across; N]; 2], deep: weights.deep, slot: 1 % N, alike: false };
+        let (begin, open) =
+            (next((rows - reaching) as u32) as usize, u64::from(next(1 << 31)) << 9 | 1);
+        let wy: Vec<S::Weight> = (0..reaching).map(|_| weight(next(1000))).collect();
+        let run = |simd| {
+            let mut lines = vec![Line::ZERO; shape.lines(N)];
+            let mut tiers = Tiers::<S, N>::new(&mut lines, shape);
+            S::add_flat(simd, &mut tiers, (&voxels, &payloads), 2 % N, &weights);
+            S::add_apart(simd, &mut tiers, (&apart, &payloads), &places, &layers);
+            let mut folded = Folded::default();
+            let mut all = Vec::new();
+            for open in [open, !open, u64::MAX, 0] {
+                let above = [0, 1].map(|slot| (tiers.begin(slot, begin), &wy[..]));
+                all.push(S::fold(simd, &tiers, above, 1.25, open, &mut folded));
+                assert_eq!(
+                    all.iter().map(|filled| filled.count_ones()).sum::<u32>(),
+                    folded.n as u32
+                );
+            }
+            let margin = shape.margin;
+            let seen: Vec<Vec<S::Pixel>> = (0..N * rows)
+                .map(|i| {
+                    tiers.tier_mut(i / rows, i % rows)[margin..margin + PART as usize].to_vec()
+                })
+                .collect();
+            (seen, all, folded.records[..folded.n].to_vec())
+        };
+        let want = run(Simd::plain());
+        let nothing = S::Pixel::default();
+        prop_assert!(want.0.iter().flatten().any(|sums| *sums != nothing) && want.1[3] == 0);
+        for simd in Simd::all() {
+            prop_assert!(run(simd) == want, "{}", simd.name());
+        }
+        Ok(())
+    }
+
+    proptest! {
+        #[test]
+        fn every_instruction_set_adds_to_tiers_and_folds_them_as_the_plain_loops_do(
+            len in prop::sample::select(vec![1, 3, 4, 5, 7, 8, 9, 13, 14, 17, 25, 26, 41, 63]),
+            rows in 24..60usize, reaching in 1..9usize, seed in any::<u32>(),
+        ) {
+            let shape = (len, rows, reaching);
+            let short = |x| x as i16 * 20;
+            everywhere::<i16, 4>(shape, seed, short, short)?;
+            everywhere::<i16, 8>(shape, seed, short, short)?;
+            let (tap, deep) = (|x| Tap::new(x as f32 * 1e-3), |x| x as f32 * 1e-3);
+            everywhere::<i32, 4>(shape, seed, tap, deep)?;
+            everywhere::<i32, 8>(shape, seed, tap, deep)?;
+            everywhere::<Grey, 4>(shape, seed, tap, deep)?;
+            everywhere::<Grey, 8>(shape, seed, tap, deep)?;
         }
     }
 }

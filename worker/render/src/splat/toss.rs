@@ -812,7 +812,7 @@ mod tests {
             kind in 0..3u8, shaded in any::<bool>(), cull in any::<bool>(),
             open in prop::collection::vec((0..64usize, 0..64u32), 0..40),
             begin in -16..16i32, count in 0..24i32,
-            reach in prop::array::uniform2(0..9i32), moved in any::<bool>(),
+            reach in prop::array::uniform2(0..9i32), packed in 0..3u8,
         ) {
             let flat = CameraProjection::Ortho { height };
             let frame = frame(DVec3::from_array(eye), flat, thickness);
@@ -831,7 +831,13 @@ mod tests {
                 sheets: [begin, begin + count],
             };
             let phases = [0, 1].map(|axis| footprint.phases(axis).expect("a table"));
-            let packing = if moved { Packing::Window(&phases) } else { Packing::Aside };
+            let shape = Shape::new::<i16>(40, phases[0].len.min(63));
+            let tier = TierOf { base: -700, per: (1 << TIER_BITS) / (200 + (seed % 3000) as i32) };
+            let packing = match packed {
+                0 => Packing::Window(&phases),
+                1 => Packing::Aside,
+                _ => Packing::Tier(&phases[0], shape, &tier),
+            };
             let sift = |simd| {
                 let mut tossing = Tossing::default();
                 let sifted = sieve.sift_ready(simd, &brick, packing, &mut tossing);

@@ -647,6 +647,36 @@ mod tests {
         for simd in Simd::all() {
             prop_assert!(run(simd) == want, "{}", simd.name());
         }
+        // The same sums beside each other are taken as they are from where they lie.
+        let mut places = Places::default();
+        places.list_plain(rows);
+        for simd in Simd::all() {
+            let (mut records, mut old, mut anew) =
+                (records.clone(), before.clone(), before.clone());
+            for i in (0..places.len()).step_by(LANES) {
+                let some = places.from(i);
+                let mut beside = [[S::Pixel::default(); 2]; LANES];
+                for (beside, &at) in beside.iter_mut().zip(&some.at()[..some.len()]) {
+                    let record = records[at as usize];
+                    *beside = [record[slot], record[(slot + 1) % N]];
+                }
+                let [mut want, mut got] = [Row::default(), Row::default()];
+                let plain = Simd::plain();
+                take::<S, N>(plain, (&mut records, &mut old), &pixels, some, slot, &mut want);
+                take_folded::<S>(simd, (&beside, &mut anew), &pixels, some, &mut got);
+                let there = if S::GREY { 2 } else { 4 };
+                let of = |row: &Row| {
+                    let lanes = |of: &[f32; LANES]| of[..some.len()].to_vec();
+                    let sheets = [&row.before, &row.here, &row.behind];
+                    (
+                        lanes(&row.a),
+                        sheets.map(|c| c[..there].iter().map(lanes).collect::<Vec<_>>()),
+                    )
+                };
+                prop_assert!(of(&got) == of(&want), "{}", simd.name());
+            }
+            prop_assert!(old == anew, "{}", simd.name());
+        }
         Ok(())
     }
 

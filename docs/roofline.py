@@ -24,9 +24,10 @@ HERTZ = 2000
 # The first that a function's chain of callers has in it; what is left is not of a frame's stages.
 STAGES = [
     ("toss", r"\btoss\b|open_brick|near_all|move_inside|FlatStage.*::toss"),
+    ("fold", r"\bfold_shorts|\bfold_longs|Tiered.*::fold|\bDown\b|level::.*touched"),
     ("close", r"\bclose|\btake\b|take_grey|\bput\b"),
     ("light", r"payloads|light_all"),
-    ("add", r"splat_all|splat_apart|splat_deep"),
+    ("add", r"splat_all|splat_apart|splat_deep|add_flat|add_apart"),
     ("splat", r"\bsplat\b|splat::records|\btouch\b|render_records"),
     ("project", r"Seen|\btight\b|overlaps|View::project|front_to_back|slabcast::local|\bcorner\b|render_into|each_pixel|Part::end"),
 ]

@@ -268,6 +268,8 @@ impl Frame {
         }
         let footprint = self.footprints.at(0)?;
         let [across, down] = [0, 1].map(|axis| footprint.phases(axis).map(|phases| phases.len));
+        // In a level view to the row of its storey alone.
+        let down = if self.storeys.is_some() { Some(1) } else { down };
         let channels = if self.has_two_channels() { 2 } else { 4 };
         let sheets = if most <= 4 { 4 } else { MOST };
         Some(Adds { pixels: [across?, down?], bytes: channel * channels * sheets })
@@ -580,19 +582,24 @@ mod tests {
         // 1.6 pixels a vox: a kernel is 6.4 wide, and so touches seven.
         let flat = CameraProjection::Ortho { height: 40.0 };
         let deep = CameraProjection::Persp { fov: 30.0, distance: 60.0 };
-        let adds = |sums, thickness, projection| {
+        let adds_from = |up, sums, thickness, projection| {
             let quality = Quality { sums, thickness, ..Quality::default() };
-            let to_eye = DVec3::new(1.0, 2.0, 0.5);
+            let to_eye = DVec3::new(1.0, 2.0, up);
             let camera = Camera { to_eye, up: DVec3::Z, target: DVec3::ZERO, projection };
             let view = View::new(&volume.lattice, &camera, [64; 2], &quality).expect("a view");
             let scene = Scene::new(&selftest::spec(&volume, quality));
             Frame::new(Arc::new(scene), view).adds()
         };
+        let adds = |sums, thickness, projection| adds_from(0.5, sums, thickness, projection);
         let seven = |bytes| Some(Adds { pixels: [7; 2], bytes });
         assert_eq!(adds(Sums::I16, 1.0, flat), seven(32));
         assert_eq!(adds(Sums::I32, 1.0, flat), seven(64));
         assert_eq!(adds(Sums::I16, 0.5, flat), seven(64));
         assert_eq!(adds(Sums::F32, 1.0, flat), None);
         assert_eq!(adds(Sums::I16, 1.0, deep), None);
+        let level = |sums, thickness| adds_from(0.0, sums, thickness, flat);
+        let row = |bytes| Some(Adds { pixels: [7, 1], bytes });
+        assert_eq!([level(Sums::I16, 1.0), level(Sums::I32, 0.5)], [row(32), row(128)]);
+        assert_eq!(level(Sums::F32, 1.0), None);
     }
 }

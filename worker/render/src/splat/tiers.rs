@@ -169,15 +169,29 @@ impl<'a, S: Recorded, const N: usize> Tiers<'a, S, N> {
         }
     }
 
-    /// Empties the columns of a tier.
+    /// Empties the lines of a tier that have any of the columns.
     #[inline(always)]
     pub(crate) fn empty(&mut self, slot: usize, row: usize, columns: u64) {
-        let margin = self.shape.margin;
-        let [from, to] = [columns.trailing_zeros(), 64 - columns.leading_zeros()];
-        if from < to {
-            let all = margin + from as usize..margin + to as usize;
-            self.tier_mut(slot, row)[all].fill(S::Pixel::default());
+        let begin = self.begin(slot, row) as usize;
+        let lines = &mut self.lines[begin..begin + PART as usize / a_line::<S>()];
+        let mut left = firsts::<S>(columns);
+        while left != 0 {
+            lines[left.trailing_zeros() as usize / a_line::<S>()] = Line::ZERO;
+            left &= left - 1;
         }
+    }
+}
+
+/// The first column of each line of a tier that has any of `columns`.
+#[inline(always)]
+fn firsts<S: Recorded>(columns: u64) -> u64 {
+    let pairs = columns | columns >> 1;
+    let fours = pairs | pairs >> 2;
+    if a_line::<S>() == 4 {
+        fours & 0x1111_1111_1111_1111
+    } else {
+        const { assert!(matches!(a_line::<S>(), 4 | 8)) };
+        (fours | fours >> 4) & 0x0101_0101_0101_0101
     }
 }
 
@@ -1050,14 +1064,6 @@ mod avx512 {
         }
     }
 
-    /// The lowest bit of each byte that has any.
-    #[inline(always)]
-    fn bytes_of(bits: u64) -> u64 {
-        let bits = bits | bits >> 4;
-        let bits = bits | bits >> 2;
-        (bits | bits >> 1) & 0x0101_0101_0101_0101
-    }
-
     /// The lines of tiers, all of which are there from the part's first column to its last.
     #[inline(always)]
     fn lines_of<S: Recorded, const N: usize>(
@@ -1095,7 +1101,7 @@ mod avx512 {
             let all = |weights: &[i16; 4]| weights.map(|w| _mm512_set1_epi16(w));
             [all(here), all(behind)]
         });
-        let mut left = bytes_of(open);
+        let mut left = firsts::<i16>(open);
         while left != 0 {
             let eight = left.trailing_zeros() as usize / 8;
             left &= left - 1;
@@ -1164,30 +1170,36 @@ mod avx512 {
         // The pixels of a line, and its words that are extinctions.
         let (pixels, words) = (16 / C, if C == 2 { 0x5555 } else { 0x1111 });
         let mut filled = 0;
-        for group in 0..PART as usize / pixels {
+        let [(_, here), (_, behind)] = above;
+        let four = here.first_chunk::<4>().zip(behind.first_chunk::<4>());
+        let four = four.filter(|_| here.len().max(behind.len()) == 4).map(|(here, behind)| {
+            let all = |weights: &[Tap; 4]| weights.map(|w| _mm512_set1_ps(w.0 * spread));
+            [all(here), all(behind)]
+        });
+        let most = _mm512_set1_ps(crate::splat::LARGEST);
+        let mut left = firsts::<S>(open);
+        while left != 0 {
+            let group = left.trailing_zeros() as usize / pixels;
+            left &= left - 1;
             let here = open >> (pixels * group) & ((1 << pixels) - 1);
-            if here == 0 {
-                continue;
-            }
             let mut whole = [_mm512_setzero_si512(); 2];
-            for (whole, (begin, weights)) in whole.iter_mut().zip(above) {
+            for sheet in 0..2 {
+                let (begin, weights) = above[sheet];
                 let mut sums = _mm512_setzero_ps();
                 let mut line = begin as usize + group;
-                let add = |wy: &Tap| {
+                let mut add = |wy: __m512| {
                     // SAFETY: a tier that is there has so many lines.
                     let row = unsafe { _mm512_load_si512(lines.add(line).cast()) };
                     line += wide;
-                    let row = _mm512_cvtepi32_ps(row);
-                    let row = _mm512_mul_ps(row, _mm512_set1_ps(wy.0 * spread));
+                    let row = _mm512_mul_ps(_mm512_cvtepi32_ps(row), wy);
                     sums = _mm512_add_ps(sums, row);
                 };
-                match weights.first_chunk::<4>().filter(|_| weights.len() == 4) {
+                match &four {
                     // A loop of known length.
-                    Some(four) => four.iter().for_each(add),
-                    None => weights.iter().for_each(add),
+                    Some(four) => four[sheet].iter().for_each(|&wy| add(wy)),
+                    None => weights.iter().for_each(|wy| add(_mm512_set1_ps(wy.0 * spread))),
                 }
-                let most = _mm512_set1_ps(crate::splat::LARGEST);
-                *whole = _mm512_cvtps_epi32(_mm512_min_ps(sums, most));
+                whole[sheet] = _mm512_cvtps_epi32(_mm512_min_ps(sums, most));
             }
             // A bit for each pixel's extinction, then one for each pixel, and one for each half of it.
             let some = _mm512_mask_test_epi32_mask(words, whole[0], whole[0]);

@@ -8,7 +8,7 @@
 use crate::flat::{self, BATCH, Batch, Waiting, toss};
 use crate::footprint::{Footprint, Phases};
 use crate::mask::OpenMask;
-use crate::scene::Flat;
+use crate::scene::{Flat, Frame};
 use crate::splat::records::{Recorded, Splat, Table};
 use crate::splat::tiers::{Folded, Shape, Tiered, Tiers, Weights};
 use crate::splat::toss::{Packing, TIER_BITS, TierOf, Tossing};
@@ -251,29 +251,27 @@ impl<S: Tiered, const N: usize> Open<S> for LevelSheets<'_, S, N> {
         }
         let mut closing = [0; EDGE];
         self.folded.clear();
-        {
-            let [here, behind] = [self.down(k), self.down(k + 1)];
-            let LevelSheets { simd, tiers, folded, storeys, downs, touched, .. } = self;
-            let tiers = &*tiers;
-            let touched = downs[here].touched(tiers.shape().rows, &touched[slots[0]]);
-            for (y, touched) in touched.into_iter().enumerate() {
-                let open = touched & open.row(y);
-                if open == 0 {
-                    continue;
-                }
-                let first = [here, behind].map(|down| usize::from(downs[down].reach[y][0]));
-                let begin = [0, 1].map(|sheet| tiers.begin(slots[sheet], first[sheet]));
-                let weights = if here == behind {
-                    let row = downs[here].row(y);
-                    [row, row]
-                } else {
-                    let [even, odd] = &mut *downs;
-                    let (even, odd) = (even.row(y), odd.row(y));
-                    if here == 0 { [even, odd] } else { [odd, even] }
-                };
-                let above = [(begin[0], weights[0]), (begin[1], weights[1])];
-                closing[y] = S::fold(*simd, tiers, above, storeys.spread, open, folded);
+        let [here, behind] = [self.down(k), self.down(k + 1)];
+        let LevelSheets { simd, tiers, folded, storeys, downs, touched, .. } = self;
+        let tiers = &*tiers;
+        let touched = downs[here].touched(tiers.shape().rows, &touched[slots[0]]);
+        for (y, touched) in touched.into_iter().enumerate() {
+            let open = touched & open.row(y);
+            if open == 0 {
+                continue;
             }
+            let first = [here, behind].map(|down| usize::from(downs[down].reach[y][0]));
+            let begin = [0, 1].map(|sheet| tiers.begin(slots[sheet], first[sheet]));
+            let weights = if here == behind {
+                let row = downs[here].row(y);
+                [row, row]
+            } else {
+                let [even, odd] = &mut *downs;
+                let (even, odd) = (even.row(y), odd.row(y));
+                if here == 0 { [even, odd] } else { [odd, even] }
+            };
+            let above = [(begin[0], weights[0]), (begin[1], weights[1])];
+            closing[y] = S::fold(*simd, tiers, above, storeys.spread, open, folded);
         }
         let shut = self.closes.close_folded(self.simd, self.folded, &closing, part, open, pixels);
         self.clear(slots[0]);
@@ -307,7 +305,7 @@ impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
 /// Renders a part of a flat view: compiled for each instruction set as a whole.
 pub(crate) struct RenderLevel<'a, S: Recorded, const N: usize> {
     pub(crate) part: Part<'a>,
-    pub(crate) view: Level<'a>,
+    pub(crate) view: LevelView<'a>,
     pub(crate) simd: Simd,
     pub(crate) store: &'a mut Store<S>,
     pub(crate) waiting: &'a mut Waiting,
@@ -317,22 +315,29 @@ pub(crate) struct RenderLevel<'a, S: Recorded, const N: usize> {
 
 /// What a flat view has that is level.
 #[derive(Clone, Copy)]
-pub(crate) struct Level<'a> {
+pub(crate) struct LevelView<'a> {
     flat: &'a Flat,
     storeys: &'a Storeys,
 }
 
 /// Whether parts of `frame` may be rendered here.
-pub(crate) fn takes(frame: &crate::scene::Frame) -> Option<Level<'_>> {
-    Some(Level { flat: flat::takes(frame)?, storeys: frame.storeys.as_ref()? })
+pub(crate) fn takes(frame: &Frame) -> Option<LevelView<'_>> {
+    Some(LevelView { flat: flat::takes(frame)?, storeys: frame.storeys.as_ref()? })
 }
 
 impl<S: Tiered, const N: usize> Work for RenderLevel<'_, S, N> {
     type Out = ();
     #[inline(always)]
     fn run(self) {
-        let RenderLevel { part, view: Level { flat, storeys }, simd, store, waiting, pixels, io } =
-            self;
+        let RenderLevel {
+            part,
+            view: LevelView { flat, storeys },
+            simd,
+            store,
+            waiting,
+            pixels,
+            io,
+        } = self;
         let frame = part.frame;
         let footprint = frame.footprints.at(0).expect("a flat view's sheets are all drawn");
         let phases = footprint.phases(0).expect("a flat view's footprints have tables");

@@ -140,7 +140,9 @@ impl Storeys {
     #[inline(always)]
     pub(crate) fn base(&self, view: &View, part: &Rect, scale: f64) -> i32 {
         // A footprint reaches half a pixel less than its radius, and is placed to a subpixel.
-        libm::floor(self.of_row(view, part.y0, scale) - self.reach) as i32 - 1
+        let first = libm::floor(self.of_row(view, part.y0, scale) - self.reach) - 1.0;
+        // Far off the picture it is any that is far.
+        first.clamp(-1e9, 1e9) as i32
     }
 
     /// Rows of storeys that a part of `high` pixels has at a scale, which are at most [`ROWS`].

@@ -428,7 +428,7 @@ impl<S: Tiered, const N: usize> DeepStage<'_, S, N> {
         let storeys = frame.storeys.as_ref().expect("a level view");
         let shape = sheets.tiers.shape();
         let Places { eye, storey, tiers, places, .. } = &mut *self.places;
-        let (per, first) = storeys.from_eye();
+        let (per, first) = storeys.by_eye();
         let all = whole_registers(n);
         for (storey, y) in storey[..all].iter_mut().zip(&eye[1]) {
             *storey = round_i32(y * per + first);

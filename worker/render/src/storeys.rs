@@ -121,7 +121,7 @@ impl Storeys {
     }
 
     /// Factor and summand that make of eye coordinates which storey it is.
-    pub(crate) fn from_eye(&self) -> (f64, f64) {
+    pub(crate) fn by_eye(&self) -> (f64, f64) {
         (1.0 / self.step, -self.eye[0] / self.step)
     }
 
@@ -252,7 +252,7 @@ mod tests {
             let Some(storeys) = &frame.storeys else { return Ok(()) };
             let part = Rect::new(0, y0, 64, 90);
             let corner = frame.corner(BrickId(which));
-            let (per, first) = storeys.from_eye();
+            let (per, first) = storeys.by_eye();
             for l in (0..512).filter(|&l| (0..3).all(|a| corner.index[a] + local(l)[a] < [20, 16, 24][a])) {
                 let storey = frame.storey(&corner, l).expect("a level view");
                 let placed = frame.place(&corner, l);

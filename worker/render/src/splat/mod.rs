@@ -111,7 +111,7 @@ pub trait Accumulate: Sum {
     /// `self + row * wx`.
     #[must_use]
     fn plus(self, row: Self::Section, wx: Self::Weight) -> Self;
-    /// What a pixel has of rows of storeys, each times its weight, in their order ([`crate::storeys`]).
+    /// What a pixel has of rows of storeys, each times its weight, in their order: see `storeys`.
     fn down(rows: impl Iterator<Item = (Self, Self::Weight)>, spread: f32) -> Self;
 }
 

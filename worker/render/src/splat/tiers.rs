@@ -8,7 +8,9 @@
 
 use super::records::apart::{Apart, BATCH, Each, Layers};
 use super::records::{Line, MOST, Record, Recorded, Splat, Table};
-use super::{Accumulate, Grey, Level, Simd, Tap};
+#[cfg(target_arch = "x86_64")]
+use super::Level;
+use super::{Accumulate, Grey, Simd, Tap};
 use crate::sheet::LANES;
 use crate::storeys::{REACHING, ROWS};
 use crate::tile::PART;

@@ -6,10 +6,10 @@
 //! reads. A register adds at a multiple of its own length alone, since what a neighbour has just written there
 //! is then read back as it was written; weights are moved to where a footprint begins in its first register.
 
-use super::records::apart::{Apart, BATCH, Each, Layers};
-use super::records::{Line, MOST, Record, Recorded, Splat, Table};
 #[cfg(target_arch = "x86_64")]
 use super::Level;
+use super::records::apart::{Apart, BATCH, Each, Layers};
+use super::records::{Line, MOST, Record, Recorded, Splat, Table};
 use super::{Accumulate, Grey, Simd, Tap};
 use crate::sheet::LANES;
 use crate::storeys::{REACHING, ROWS};

@@ -18,8 +18,9 @@
 //! [`crate::region`] takes a tile through all sheets of a frame while bricks are still coming: a part
 //! then stops before the first sheet at which it lacks one, and goes on from there later.
 //!
-//! Three rooms do that: `general` for every view and every kind of sums; far faster, in whole numbers,
-//! `flat` for most orthographic views and `deep` for most perspective ones.
+//! Some rooms do that: `general` for every view and every kind of sums; far faster, in whole numbers,
+//! `flat` for most orthographic views, `leaning` for those whose kernel leans, `deep` for most perspective ones,
+//! and `level` for flat ones that are level; it keeps the sheets of `deep` ones that are level, too.
 
 use crate::deep::{self, RenderDeep};
 use crate::flat::{self, RenderFlat};

@@ -28,6 +28,8 @@ pub(crate) struct Shape {
     groups: usize,
     /// Pixels of a line.
     line: usize,
+    /// Columns of a footprint at most.
+    len: usize,
 }
 
 /// Pixels of a line of the cache.
@@ -46,7 +48,7 @@ impl Shape {
         let sixteen = 16 / a_line::<S>();
         let spare = groups.next_multiple_of(if groups > 4 { 4 } else { sixteen });
         let wide = (margin + PART as usize) / a_line::<S>() + spare;
-        Shape { rows, wide, margin, groups, line: a_line::<S>() }
+        Shape { rows, wide, margin, groups, line: a_line::<S>(), len }
     }
 
     /// Lines of tiers for `sheets`.
@@ -187,13 +189,18 @@ impl<'a, S: Recorded, const N: usize> Tiers<'a, S, N> {
 /// The first column of each line of a tier that has any of `columns`.
 #[inline(always)]
 fn firsts<S: Recorded>(columns: u64) -> u64 {
+    firsts_of(columns, a_line::<S>())
+}
+
+/// The first of each `n` columns, two, four or eight, that have any of `columns`.
+#[inline(always)]
+fn firsts_of(columns: u64, n: usize) -> u64 {
     let pairs = columns | columns >> 1;
     let fours = pairs | pairs >> 2;
-    if a_line::<S>() == 4 {
-        fours & 0x1111_1111_1111_1111
-    } else {
-        const { assert!(matches!(a_line::<S>(), 4 | 8)) };
-        (fours | fours >> 4) & 0x0101_0101_0101_0101
+    match n {
+        2 => pairs & 0x5555_5555_5555_5555,
+        4 => fours & 0x1111_1111_1111_1111,
+        _ => (fours | fours >> 4) & 0x0101_0101_0101_0101,
     }
 }
 
@@ -497,13 +504,39 @@ impl Tiered for Grey {
     }
 }
 
+/// Calls a function for as many groups a chunk, and says how many chunks there are.
+#[cfg(target_arch = "x86_64")]
+macro_rules! by_groups {
+    ($groups:expr, $most:literal, $add:ident[$($of:ident),*]($($arg:expr),*)) => {
+        match $groups {
+            1 => $add::<1, $($of),*>($($arg),*, 1),
+            2 => $add::<2, $($of),*>($($arg),*, 1),
+            3 if $most >= 3 => $add::<3, $($of),*>($($arg),*, 1),
+            4 if $most >= 4 => $add::<4, $($of),*>($($arg),*, 1),
+            n => $add::<$most, $($of),*>($($arg),*, n.div_ceil($most)),
+        }
+    };
+}
+
+/// The lines of tiers, all of which are there from the part's first column to its last.
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+fn lines_of<S: Recorded, const N: usize>(
+    tiers: &Tiers<'_, S, N>,
+    above: &[Above<'_, S::Weight>; 2],
+) -> *const Line {
+    let there = tiers.lines.len() - PART as usize / a_line::<S>();
+    let last = |(begin, weights): &Above<'_, S::Weight>| {
+        *begin as usize + weights.len().saturating_sub(1) * tiers.shape.wide
+    };
+    assert!(last(&above[0]).max(last(&above[1])) <= there, "a tier is longer than a part is wide");
+    tiers.lines.as_ptr()
+}
+
 #[cfg(target_arch = "x86_64")]
 mod avx2 {
     use super::*;
     use std::arch::x86_64::*;
-
-    /// Bytes of a register.
-    const BYTES: usize = 32;
 
     /// Columns of a chunk of weights of 16 bits, and of 32.
     const SHORTS: usize = 16;
@@ -515,6 +548,7 @@ mod avx2 {
     }
 
     impl<T: Copy + Default> Window<T> {
+        #[inline(always)]
         fn new(len: usize, all: T) -> Self {
             let mut bits = [T::default(); 112];
             bits[16..16 + len].fill(all);
@@ -536,30 +570,38 @@ mod avx2 {
         shift: usize,
         chunk: usize,
     ) -> [T; LEN] {
-        let begin = (from + chunk * LEN) as isize - shift as isize;
-        let all = usize::try_from(begin).ok().and_then(|begin| table.get(begin..begin + LEN));
-        match all {
+        let begin = (from + chunk * LEN).wrapping_sub(shift);
+        match table.get(begin..begin.wrapping_add(LEN)) {
             Some(all) => *all.first_chunk().expect("as long"),
             // At the table's ends.
             None => std::array::from_fn(|i| {
-                let at = usize::try_from(begin + i as isize).ok();
-                at.and_then(|at| table.get(at)).copied().unwrap_or_default()
+                table.get(begin.wrapping_add(i)).copied().unwrap_or_default()
             }),
         }
     }
 
-    /// Sixteen-bit weights of four registers of four columns, each for four channels.
+    /// Sixteen-bit weights of groups of four columns, each for four channels.
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn spread_shorts(
+    fn spread_shorts<const GROUPS: usize>(
         table: &[i16],
         from: usize,
         shift: usize,
         chunk: usize,
         window: &Window<i16>,
-    ) -> [__m256i; 4] {
+    ) -> [__m256i; GROUPS] {
+        const { assert!(GROUPS <= 4) };
         let around: [i16; SHORTS] = around(table, from, shift, chunk);
         let there = window.from(chunk * SHORTS, shift);
+        let eight = |half: usize| {
+            // SAFETY: eight weights of sixteen are 16 bytes.
+            let w = unsafe {
+                let w = _mm_loadu_si128(around[8 * half..].as_ptr().cast());
+                _mm_and_si128(w, _mm_loadu_si128(there[8 * half..].as_ptr().cast()))
+            };
+            _mm256_broadcastsi128_si256(w)
+        };
+        let halves = [eight(0), if GROUPS > 2 { eight(1) } else { _mm256_setzero_si256() }];
         let turns = [
             _mm256_setr_epi8(
                 0, 1, 0, 1, 0, 1, 0, 1, 2, 3, 2, 3, 2, 3, 2, 3, 4, 5, 4, 5, 4, 5, 4, 5, 6, 7, 6, 7,
@@ -570,28 +612,24 @@ mod avx2 {
                 13, 14, 15, 14, 15, 14, 15, 14, 15,
             ),
         ];
-        let mut spread = [_mm256_setzero_si256(); 4];
-        for half in 0..2 {
-            // SAFETY: eight weights of sixteen are 16 bytes.
-            let w = unsafe {
-                let w = _mm_loadu_si128(around[8 * half..].as_ptr().cast());
-                _mm_and_si128(w, _mm_loadu_si128(there[8 * half..].as_ptr().cast()))
-            };
-            let w = _mm256_broadcastsi128_si256(w);
-            for (i, turn) in turns.iter().enumerate() {
-                spread[2 * half + i] = _mm256_shuffle_epi8(w, *turn);
-            }
+        let mut spread = [_mm256_setzero_si256(); GROUPS];
+        for (g, spread) in spread.iter_mut().enumerate() {
+            *spread = _mm256_shuffle_epi8(halves[g / 2], turns[g % 2]);
         }
         spread
     }
 
-    /// Adds `section * w` to as many registers from `at` on as there are weights.
+    /// Adds `section * w` to the registers from `at` on.
     ///
     /// # Safety
     /// There are as many.
     #[target_feature(enable = "avx2")]
     #[inline]
-    unsafe fn add_shorts(at: *mut __m256i, section: __m256i, w: &[__m256i]) {
+    unsafe fn add_shorts<const GROUPS: usize>(
+        at: *mut __m256i,
+        section: __m256i,
+        w: &[__m256i; GROUPS],
+    ) {
         for (g, w) in w.iter().enumerate() {
             // SAFETY: the caller's; lines are aligned.
             unsafe {
@@ -602,49 +640,70 @@ mod avx2 {
         }
     }
 
-    /// What is added to tiers of some shape: registers of a tier, of a sheet, and those that a footprint reaches.
+    /// Columns of a register.
+    const fn columns<S: Recorded>() -> usize {
+        a_line::<S>() / 2
+    }
+
+    /// Registers of a tier and of a sheet.
+    ///
+    /// # Panics
+    /// If not all sheets have memory.
     #[inline(always)]
-    fn registers<S: Recorded, const N: usize>(
-        tiers: &Tiers<'_, S, N>,
-        len: usize,
-    ) -> (usize, usize, usize) {
+    fn registers<S: Recorded, const N: usize>(tiers: &Tiers<'_, S, N>) -> [usize; 2] {
         let Shape { rows, wide, .. } = tiers.shape;
-        let columns = BYTES / size_of::<S::Pixel>();
-        let a_tier = wide * size_of::<Line>() / BYTES;
         assert!(tiers.lines.len() >= N * rows * wide, "tiers of all sheets");
-        (a_tier, rows * a_tier, (len + columns - 1).div_ceil(columns))
+        [2 * wide, 2 * rows * wide]
+    }
+
+    /// Registers that a footprint reaches at most.
+    fn groups<S: Recorded>(shape: &Shape) -> usize {
+        (shape.len + columns::<S>() - 1).div_ceil(columns::<S>())
     }
 
     #[target_feature(enable = "avx2")]
     pub(super) fn add_flat_shorts<const N: usize>(
         tiers: &mut Tiers<'_, i16, N>,
+        voxels: (&[Splat], &[u64]),
+        slot: usize,
+        weights: &Weights<'_, i16>,
+    ) {
+        let groups = groups::<i16>(&tiers.shape);
+        by_groups!(groups, 4, flat_shorts[N](tiers, voxels, slot, weights));
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn flat_shorts<const GROUPS: usize, const N: usize>(
+        tiers: &mut Tiers<'_, i16, N>,
         (voxels, payloads): (&[Splat], &[u64]),
         slot: usize,
         Weights { across, deep }: &Weights<'_, i16>,
+        chunks: usize,
     ) {
-        let (a_tier, sheet, all) = registers(tiers, across.len);
+        let [a_tier, sheet] = registers(tiers);
         let window = Window::new(across.len, -1);
+        let offsets: [usize; N] = std::array::from_fn(|i| (slot + i) % N * sheet);
         let first: *mut __m256i = tiers.lines.as_mut_ptr().cast();
         for (v, &payload) in voxels.iter().zip(payloads) {
             let [place, row] = v.first();
             let (at, shift) = (row * a_tier + place / 4, place % 4);
-            assert!(at + all <= sheet, "a footprint inside its tier");
+            assert!(at + chunks * GROUPS <= sheet, "a footprint inside its tier");
+            let from = (v.rows & 0xffff) as usize;
+            let wz = deep.row(v.phase() as usize * deep.len);
             let payload = _mm256_set1_epi64x(payload as i64);
-            for chunk in 0..all.div_ceil(4) {
-                let w = spread_shorts(
-                    across.weights,
-                    (v.rows & 0xffff) as usize,
-                    shift,
-                    chunk,
-                    &window,
-                );
-                let w = &w[..(all - 4 * chunk).min(4)];
-                for (i, &wz) in deep.row(v.phase() as usize * deep.len).iter().enumerate() {
-                    let section = _mm256_mulhrs_epi16(payload, _mm256_set1_epi16(wz));
+            for chunk in 0..chunks {
+                let w = spread_shorts::<GROUPS>(across.weights, from, shift, chunk, &window);
+                let at = at + chunk * GROUPS;
+                let add = |(offset, wz): (&usize, &i16)| {
+                    let section = _mm256_mulhrs_epi16(payload, _mm256_set1_epi16(*wz));
                     // SAFETY: of the slot's, as shown above.
-                    unsafe {
-                        add_shorts(first.add((slot + i) % N * sheet + at + 4 * chunk), section, w);
-                    }
+                    unsafe { add_shorts(first.add(offset + at), section, &w) };
+                };
+                match wz.first_chunk::<N>() {
+                    // A loop of known length.
+                    Some(wz) => offsets.iter().zip(wz).for_each(add),
+                    None => offsets.iter().zip(wz).for_each(add),
                 }
             }
         }
@@ -653,13 +712,26 @@ mod avx2 {
     #[target_feature(enable = "avx2")]
     pub(super) fn add_apart_shorts<const N: usize>(
         tiers: &mut Tiers<'_, i16, N>,
-        (apart, payloads): (&Apart, &[u64]),
+        voxels: (&Apart, &[u64]),
         places: &[Each<u32>; MOST],
         layers: &Layers<'_, i16, N>,
     ) {
+        let groups = groups::<i16>(&tiers.shape);
+        by_groups!(groups, 4, apart_shorts[N](tiers, voxels, places, layers));
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn apart_shorts<const GROUPS: usize, const N: usize>(
+        tiers: &mut Tiers<'_, i16, N>,
+        (apart, payloads): (&Apart, &[u64]),
+        places: &[Each<u32>; MOST],
+        layers: &Layers<'_, i16, N>,
+        chunks: usize,
+    ) {
+        let [_, sheet] = registers(tiers);
         for slot in 0..N {
             let across = &layers.across[0][slot];
-            let (_, sheet, all) = registers(tiers, across.len);
             let window = Window::new(across.len, -1);
             let after = layers.after(slot);
             let first: *mut __m256i = tiers.lines.as_mut_ptr().cast();
@@ -670,31 +742,32 @@ mod avx2 {
                 }
                 let place = places[slot][i] as usize;
                 let (at, shift) = (place / 4, place % 4);
-                assert!(at + all <= sheet, "a footprint inside its tier");
+                assert!(at + chunks * GROUPS <= sheet, "a footprint inside its tier");
                 let wz = layers.deep.weights[apart.deep[i] as usize + after as usize];
                 let section = _mm256_set1_epi64x(payload as i64);
                 let section = _mm256_mulhrs_epi16(section, _mm256_set1_epi16(wz));
                 let from = apart.from[0][slot][i] as usize;
-                for chunk in 0..all.div_ceil(4) {
-                    let w = spread_shorts(across.weights, from, shift, chunk, &window);
-                    let w = &w[..(all - 4 * chunk).min(4)];
+                for chunk in 0..chunks {
+                    let w = spread_shorts::<GROUPS>(across.weights, from, shift, chunk, &window);
                     // SAFETY: of the slot's, as shown above.
-                    unsafe { add_shorts(first.add(slot * sheet + at + 4 * chunk), section, w) };
+                    unsafe {
+                        add_shorts(first.add(slot * sheet + at + chunk * GROUPS), section, &w);
+                    }
                 }
             }
         }
     }
 
-    /// Weights of a chunk's registers of 8 / C columns, each for C channels.
+    /// Weights of groups of 8 / C columns, each for C channels.
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn spread_longs<const C: usize>(
+    fn spread_longs<const GROUPS: usize, const C: usize>(
         table: &[Tap],
         from: usize,
         shift: usize,
         chunk: usize,
         window: &Window<i32>,
-    ) -> [__m256; 4] {
+    ) -> [__m256; GROUPS] {
         let around: [Tap; LONGS] = around(table, from, shift, chunk);
         let there = window.from(chunk * LONGS, shift);
         // SAFETY: eight weights are 32 bytes, and so are eight numbers.
@@ -705,7 +778,7 @@ mod avx2 {
         let lanes = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
         let each =
             if C == 4 { _mm256_srli_epi32::<2>(lanes) } else { _mm256_srli_epi32::<1>(lanes) };
-        let mut spread = [w; 4];
+        let mut spread = [w; GROUPS];
         for (g, spread) in spread.iter_mut().enumerate() {
             let which = _mm256_add_epi32(each, _mm256_set1_epi32((8 / C * g) as i32));
             *spread = _mm256_permutevar8x32_ps(w, which);
@@ -713,13 +786,17 @@ mod avx2 {
         spread
     }
 
-    /// Adds `section * w` to as many registers from `at` on as there are weights.
+    /// Adds `section * w` to the registers from `at` on.
     ///
     /// # Safety
     /// There are as many.
     #[target_feature(enable = "avx2")]
     #[inline]
-    unsafe fn add_longs(at: *mut __m256i, section: __m256, w: &[__m256]) {
+    unsafe fn add_longs<const GROUPS: usize>(
+        at: *mut __m256i,
+        section: __m256,
+        w: &[__m256; GROUPS],
+    ) {
         for (g, w) in w.iter().enumerate() {
             // SAFETY: the caller's; lines are aligned.
             unsafe {
@@ -729,43 +806,74 @@ mod avx2 {
         }
     }
 
-    /// A payload of C channels times a weight in depth, over and over; not negative.
+    /// A payload of C channels, over and over.
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn section<const C: usize>(payload: &[f32; C], wz: f32) -> __m256 {
+    fn payload<const C: usize>(payload: &[f32; C]) -> __m256 {
         let four: [f32; 4] = std::array::from_fn(|i| payload[i % C]);
         // SAFETY: four floats are 16 bytes.
         let four = unsafe { _mm_loadu_ps(four.as_ptr()) };
-        let section = _mm256_mul_ps(_mm256_set_m128(four, four), _mm256_set1_ps(wz));
-        _mm256_max_ps(section, _mm256_setzero_ps())
+        _mm256_set_m128(four, four)
+    }
+
+    /// A payload times a weight in depth; not negative.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn section(payload: __m256, wz: f32) -> __m256 {
+        _mm256_max_ps(_mm256_mul_ps(payload, _mm256_set1_ps(wz)), _mm256_setzero_ps())
     }
 
     #[target_feature(enable = "avx2")]
     pub(super) fn add_flat_longs<S, const C: usize, const N: usize>(
         tiers: &mut Tiers<'_, S, N>,
-        (voxels, payloads): (&[Splat], &[[f32; C]]),
+        voxels: (&[Splat], &[[f32; C]]),
         slot: usize,
-        Weights { across, deep }: &Weights<'_, S>,
+        weights: &Weights<'_, S>,
     ) where
         S: Recorded<Depth = f32> + Accumulate<Weight = Tap>,
     {
-        const { assert!(C == 2 || C == 4) };
-        let (a_tier, sheet, all) = registers(tiers, across.len);
-        let (columns, of_chunk) = (8 / C, C);
+        let groups = groups::<S>(&tiers.shape);
+        if C == 4 {
+            by_groups!(groups, 4, flat_longs[S, C, N](tiers, voxels, slot, weights));
+        } else {
+            by_groups!(groups, 2, flat_longs[S, C, N](tiers, voxels, slot, weights));
+        }
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn flat_longs<const GROUPS: usize, S, const C: usize, const N: usize>(
+        tiers: &mut Tiers<'_, S, N>,
+        (voxels, payloads): (&[Splat], &[[f32; C]]),
+        slot: usize,
+        Weights { across, deep }: &Weights<'_, S>,
+        chunks: usize,
+    ) where
+        S: Recorded<Depth = f32> + Accumulate<Weight = Tap>,
+    {
+        let [a_tier, sheet] = registers(tiers);
+        let columns = columns::<S>();
         let window = Window::new(across.len, -1);
+        let offsets: [usize; N] = std::array::from_fn(|i| (slot + i) % N * sheet);
         let first: *mut __m256i = tiers.lines.as_mut_ptr().cast();
-        for (v, payload) in voxels.iter().zip(payloads) {
+        for (v, of) in voxels.iter().zip(payloads) {
             let [place, row] = v.first();
             let (at, shift) = (row * a_tier + place / columns, place % columns);
-            assert!(at + all <= sheet, "a footprint inside its tier");
-            for chunk in 0..all.div_ceil(of_chunk) {
-                let from = (v.rows & 0xffff) as usize;
-                let w = spread_longs::<C>(across.weights, from, shift, chunk, &window);
-                let w = &w[..(all - of_chunk * chunk).min(of_chunk)];
-                for (i, &wz) in deep.row(v.phase() as usize * deep.len).iter().enumerate() {
-                    let at = (slot + i) % N * sheet + at + of_chunk * chunk;
+            assert!(at + chunks * GROUPS <= sheet, "a footprint inside its tier");
+            let from = (v.rows & 0xffff) as usize;
+            let wz = deep.row(v.phase() as usize * deep.len);
+            let payload = payload(of);
+            for chunk in 0..chunks {
+                let w = spread_longs::<GROUPS, C>(across.weights, from, shift, chunk, &window);
+                let at = at + chunk * GROUPS;
+                let add = |(offset, wz): (&usize, &f32)| {
                     // SAFETY: of the slot's, as shown above.
-                    unsafe { add_longs(first.add(at), section(payload, wz), w) };
+                    unsafe { add_longs(first.add(offset + at), section(payload, *wz), &w) };
+                };
+                match wz.first_chunk::<N>() {
+                    // A loop of known length.
+                    Some(wz) => offsets.iter().zip(wz).for_each(add),
+                    None => offsets.iter().zip(wz).for_each(add),
                 }
             }
         }
@@ -774,32 +882,46 @@ mod avx2 {
     #[target_feature(enable = "avx2")]
     pub(super) fn add_apart_longs<const N: usize>(
         tiers: &mut Tiers<'_, i32, N>,
-        (apart, payloads): (&Apart, &[[f32; 4]]),
+        voxels: (&Apart, &[[f32; 4]]),
         places: &[Each<u32>; MOST],
         layers: &Layers<'_, i32, N>,
     ) {
+        let groups = groups::<i32>(&tiers.shape);
+        by_groups!(groups, 4, apart_longs[N](tiers, voxels, places, layers));
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    fn apart_longs<const GROUPS: usize, const N: usize>(
+        tiers: &mut Tiers<'_, i32, N>,
+        (apart, payloads): (&Apart, &[[f32; 4]]),
+        places: &[Each<u32>; MOST],
+        layers: &Layers<'_, i32, N>,
+        chunks: usize,
+    ) {
+        let [_, sheet] = registers(tiers);
         for slot in 0..N {
             let across = &layers.across[0][slot];
-            let (_, sheet, all) = registers(tiers, across.len);
             let window = Window::new(across.len, -1);
             let after = layers.after(slot);
             let first: *mut __m256i = tiers.lines.as_mut_ptr().cast();
-            for (&i, payload) in apart.kept.iter().zip(payloads) {
+            for (&i, of) in apart.kept.iter().zip(payloads) {
                 let i = i as usize % BATCH;
                 if after >= apart.left[i] {
                     continue;
                 }
                 let place = places[slot][i] as usize;
                 let (at, shift) = (place / 2, place % 2);
-                assert!(at + all <= sheet, "a footprint inside its tier");
+                assert!(at + chunks * GROUPS <= sheet, "a footprint inside its tier");
                 let wz = layers.deep.weights[apart.deep[i] as usize + after as usize];
+                let section = section(payload(of), wz);
                 let from = apart.from[0][slot][i] as usize;
-                for chunk in 0..all.div_ceil(4) {
-                    let w = spread_longs::<4>(across.weights, from, shift, chunk, &window);
-                    let w = &w[..(all - 4 * chunk).min(4)];
-                    let at = slot * sheet + at + 4 * chunk;
+                for chunk in 0..chunks {
+                    let w = spread_longs::<GROUPS, 4>(across.weights, from, shift, chunk, &window);
                     // SAFETY: of the slot's, as shown above.
-                    unsafe { add_longs(first.add(at), section(payload, wz), w) };
+                    unsafe {
+                        add_longs(first.add(slot * sheet + at + chunk * GROUPS), section, &w);
+                    }
                 }
             }
         }
@@ -817,33 +939,96 @@ mod avx2 {
         S: Recorded<Pixel = [i32; C]> + Accumulate<Weight = Tap>,
     {
         const { assert!(C == 2 || C == 4) };
-        let (mut filled, columns) = (0, 8 / C);
-        let some = |x: &usize| open >> x & ((1 << columns) - 1) != 0;
-        for x in (0..PART as usize).step_by(columns).filter(some) {
-            let mut whole = [[0i32; 8]; 2];
-            for (whole, (begin, weights)) in whole.iter_mut().zip(above) {
+        let (first, a_tier) = (lines_of(tiers, &above).cast::<__m256i>(), 2 * tiers.shape.wide);
+        let [(_, here), (_, behind)] = above;
+        let four = here.first_chunk::<4>().zip(behind.first_chunk::<4>());
+        let four = four.filter(|_| here.len().max(behind.len()) == 4).map(|(here, behind)| {
+            let all = |weights: &[Tap; 4]| weights.map(|w| _mm256_set1_ps(w.0 * spread));
+            [all(here), all(behind)]
+        });
+        let (most, zero) = (_mm256_set1_ps(crate::splat::LARGEST), _mm256_setzero_si256());
+        let (mut filled, mut n) = (0, to.n);
+        let room = &mut to.records[..n + open.count_ones() as usize + SPARE];
+        let room: *mut [S::Pixel; 2] = room.as_mut_ptr();
+        let mut left = firsts_of(open, columns::<S>());
+        while left != 0 {
+            let x = left.trailing_zeros() as usize;
+            left &= left - 1;
+            let mut whole = [zero; 2];
+            for sheet in 0..2 {
+                let (begin, weights) = above[sheet];
+                let mut at = 2 * begin as usize + x / columns::<S>();
                 let mut sums = _mm256_setzero_ps();
-                for (row, wy) in weights.iter().enumerate() {
-                    let from = &tiers.pixels(begin + (row * tiers.shape.wide) as u32)[x..];
-                    let from: &[i32; 8] = from.as_flattened().first_chunk().expect("a register");
-                    // SAFETY: eight numbers are 32 bytes.
-                    let row = unsafe { _mm256_loadu_si256(from.as_ptr().cast()) };
-                    let wy = _mm256_set1_ps(wy.0 * spread);
+                let mut add = |wy: __m256| {
+                    // SAFETY: a tier that is there has so many registers.
+                    let row = unsafe { _mm256_load_si256(first.add(at)) };
+                    at += a_tier;
                     sums = _mm256_add_ps(sums, _mm256_mul_ps(_mm256_cvtepi32_ps(row), wy));
+                };
+                match &four {
+                    // A loop of known length.
+                    Some(four) => four[sheet].iter().for_each(|&wy| add(wy)),
+                    None => weights.iter().for_each(|wy| add(_mm256_set1_ps(wy.0 * spread))),
                 }
-                let sums = _mm256_min_ps(sums, _mm256_set1_ps(crate::splat::LARGEST));
-                // SAFETY: as above.
-                unsafe { _mm256_storeu_si256(whole.as_mut_ptr().cast(), _mm256_cvtps_epi32(sums)) };
+                whole[sheet] = _mm256_cvtps_epi32(_mm256_min_ps(sums, most));
             }
-            let [here, behind] = whole.each_ref().map(|whole| whole.as_chunks::<C>().0);
-            for (i, record) in here.iter().zip(behind).enumerate() {
-                let fills = open >> (x + i) & u64::from(record.0[0] != 0);
-                to.records[to.n] = [*record.0, *record.1];
-                to.n += fills as usize;
-                filled |= fills << (x + i);
+            let nothing = _mm256_cmpeq_epi32(whole[0], zero);
+            let nothing = _mm256_movemask_ps(_mm256_castsi256_ps(nothing)) as u32;
+            let [here, behind] = whole;
+            // SAFETY: no more are kept than there are open pixels, and two or four are stored where the next one goes.
+            unsafe {
+                if C == 4 {
+                    let some = (open >> x) as u32 & (!nothing & 1 | (!nothing >> 4 & 1) << 1);
+                    _mm256_storeu_si256(
+                        room.add(n).cast(),
+                        _mm256_permute2x128_si256::<0x20>(here, behind),
+                    );
+                    n += (some & 1) as usize;
+                    _mm256_storeu_si256(
+                        room.add(n).cast(),
+                        _mm256_permute2x128_si256::<0x31>(here, behind),
+                    );
+                    n += (some >> 1) as usize;
+                    filled |= u64::from(some) << x;
+                } else {
+                    // Extinctions are every other number.
+                    let there = !nothing & 0x55;
+                    let there = (there | there >> 1) & 0x33;
+                    let some = (open >> x) as u32 & (there | there >> 2) & 0xf;
+                    n = store_fours(room.cast(), n, [here, behind], some);
+                    filled |= u64::from(some) << x;
+                }
             }
         }
+        to.n = n;
         filled
+    }
+
+    /// Stores those of four records of 16 bytes that `some` has bits for from the `n`th on, the first half of each from
+    /// a register, the second half from another. Says how many there are then.
+    ///
+    /// # Safety
+    /// There is room for four.
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn store_fours(
+        room: *mut __m128i,
+        n: usize,
+        [here, behind]: [__m256i; 2],
+        some: u32,
+    ) -> usize {
+        let even = _mm256_unpacklo_epi64(here, behind);
+        let odd = _mm256_unpackhi_epi64(here, behind);
+        let [b0, b1, b2, b3] = [0, 1, 2, 3].map(|i| (some >> i & 1) as usize);
+        let n = [n, n + b0, n + b0 + b1, n + b0 + b1 + b2, n + b0 + b1 + b2 + b3];
+        // SAFETY: the caller's.
+        unsafe {
+            _mm_storeu_si128(room.add(n[0]), _mm256_castsi256_si128(even));
+            _mm_storeu_si128(room.add(n[1]), _mm256_castsi256_si128(odd));
+            _mm_storeu_si128(room.add(n[2]), _mm256_extracti128_si256::<1>(even));
+            _mm_storeu_si128(room.add(n[3]), _mm256_extracti128_si256::<1>(odd));
+        }
+        n[4]
     }
 
     #[target_feature(enable = "avx2")]
@@ -853,36 +1038,46 @@ mod avx2 {
         open: u64,
         to: &mut Folded<i16>,
     ) -> u64 {
-        let mut filled = 0;
-        for x in (0..PART as usize).step_by(4).filter(|x| open >> x & 0xf != 0) {
-            let mut sums = [_mm256_setzero_si256(); 2];
-            for (sums, (begin, weights)) in sums.iter_mut().zip(above) {
-                for (row, &wy) in weights.iter().enumerate() {
-                    let from = &tiers.pixels(begin + (row * tiers.shape.wide) as u32)[x..];
-                    let from: &[[i16; 4]; 4] = from.first_chunk().expect("four pixels");
-                    // SAFETY: four pixels are 32 bytes.
-                    let row = unsafe { _mm256_loadu_si256(from.as_ptr().cast()) };
-                    let row = _mm256_mulhrs_epi16(row, _mm256_set1_epi16(wy));
-                    *sums = _mm256_adds_epi16(*sums, row);
+        let (first, a_tier) = (lines_of(tiers, &above).cast::<__m256i>(), 2 * tiers.shape.wide);
+        let [(_, here), (_, behind)] = above;
+        let four = here.first_chunk::<4>().zip(behind.first_chunk::<4>());
+        let four = four.filter(|_| here.len().max(behind.len()) == 4).map(|(here, behind)| {
+            let all = |weights: &[i16; 4]| weights.map(|w| _mm256_set1_epi16(w));
+            [all(here), all(behind)]
+        });
+        let zero = _mm256_setzero_si256();
+        let (mut filled, mut n) = (0, to.n);
+        let room = &mut to.records[..n + open.count_ones() as usize + SPARE];
+        let room: *mut __m128i = room.as_mut_ptr().cast();
+        let mut left = firsts_of(open, 4);
+        while left != 0 {
+            let x = left.trailing_zeros() as usize;
+            left &= left - 1;
+            let mut sums = [zero; 2];
+            for sheet in 0..2 {
+                let (begin, weights) = above[sheet];
+                let mut at = 2 * begin as usize + x / 4;
+                let mut add = |wy: __m256i| {
+                    // SAFETY: four pixels of 64 in a tier that is there are a register.
+                    let row = unsafe { _mm256_load_si256(first.add(at)) };
+                    at += a_tier;
+                    sums[sheet] = _mm256_adds_epi16(sums[sheet], _mm256_mulhrs_epi16(row, wy));
+                };
+                match &four {
+                    // A loop of known length.
+                    Some(four) => four[sheet].iter().for_each(|&wy| add(wy)),
+                    None => weights.iter().for_each(|&wy| add(_mm256_set1_epi16(wy))),
                 }
             }
-            let [here, behind] = sums;
-            let even = _mm256_unpacklo_epi64(here, behind);
-            let odd = _mm256_unpackhi_epi64(here, behind);
-            let mut records = [[[0i16; 4]; 2]; 4];
-            let fours: *mut __m256i = records.as_mut_ptr().cast();
-            // SAFETY: four records of 16 bytes are two registers.
-            unsafe {
-                _mm256_storeu_si256(fours, _mm256_permute2x128_si256::<0x20>(even, odd));
-                _mm256_storeu_si256(fours.add(1), _mm256_permute2x128_si256::<0x31>(even, odd));
-            }
-            for (i, record) in records.iter().enumerate() {
-                let fills = open >> (x + i) & u64::from(record[0][0] != 0);
-                to.records[to.n] = *record;
-                to.n += fills as usize;
-                filled |= fills << (x + i);
-            }
+            // A sign for each pixel without extinction, which comes first.
+            let nothing = _mm256_slli_epi64::<48>(_mm256_cmpeq_epi16(sums[0], zero));
+            let nothing = _mm256_movemask_pd(_mm256_castsi256_pd(nothing)) as u32;
+            let some = (open >> x) as u32 & !nothing & 0xf;
+            // SAFETY: no more are kept than there are open pixels, and four are stored where the next one goes.
+            n = unsafe { store_fours(room, n, sums, some) };
+            filled |= u64::from(some) << x;
         }
+        to.n = n;
         filled
     }
 }
@@ -895,19 +1090,6 @@ mod avx512 {
     /// Columns of a chunk of weights of 16 bits, and of 32.
     const SHORTS: usize = 32;
     const LONGS: usize = 16;
-
-    /// Calls a function for as many groups a chunk, and says how many chunks there are.
-    macro_rules! by_groups {
-        ($groups:expr, $most:literal, $add:ident[$($of:ident),*]($($arg:expr),*)) => {
-            match $groups {
-                1 => $add::<1, $($of),*>($($arg),*, 1),
-                2 => $add::<2, $($of),*>($($arg),*, 1),
-                3 if $most >= 3 => $add::<3, $($of),*>($($arg),*, 1),
-                4 if $most >= 4 => $add::<4, $($of),*>($($arg),*, 1),
-                n => $add::<$most, $($of),*>($($arg),*, n.div_ceil($most)),
-            }
-        };
-    }
 
     /// Which of the weights from `chunk` times `of` on are those of a footprint of `len` columns that begins at
     /// `shift`.
@@ -1064,23 +1246,6 @@ mod avx512 {
                 }
             }
         }
-    }
-
-    /// The lines of tiers, all of which are there from the part's first column to its last.
-    #[inline(always)]
-    fn lines_of<S: Recorded, const N: usize>(
-        tiers: &Tiers<'_, S, N>,
-        above: &[Above<'_, S::Weight>; 2],
-    ) -> *const Line {
-        let there = tiers.lines.len() - PART as usize / a_line::<S>();
-        let last = |(begin, weights): &Above<'_, S::Weight>| {
-            *begin as usize + weights.len().saturating_sub(1) * tiers.shape.wide
-        };
-        assert!(
-            last(&above[0]).max(last(&above[1])) <= there,
-            "a tier is longer than a part is wide"
-        );
-        tiers.lines.as_ptr()
     }
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,popcnt")]

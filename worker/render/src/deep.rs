@@ -10,7 +10,7 @@
 
 use crate::batch::{Axes, Batch};
 use crate::footprint::{Footprint, Leaning};
-use crate::level::LevelSheets;
+use crate::level::{Hull, LevelSheets};
 use crate::mask::{OpenMask, REACH_MOST};
 use crate::scene::Frame;
 use crate::splat::records::apart::{Apart, BATCH, Each, WINDOW, Woven, after};
@@ -52,8 +52,10 @@ struct Places {
     eye: [Each<f64>; 3],
     /// Where a section of each is along an axis.
     aside: Each<f64>,
-    /// In a level view, which storey each belongs to, and by slot which tier and where among all of a sheet.
+    /// In a level view, which storey each belongs to, the rows that it reaches, and by slot which tier and where
+    /// among all of a sheet.
     storey: Each<i32>,
+    hull: Hull,
     tiers: [Each<u32>; MOST],
     places: [Each<u32>; MOST],
 }
@@ -64,6 +66,7 @@ impl Default for Places {
             eye: [[0.0; BATCH]; 3],
             aside: [0.0; BATCH],
             storey: [0; BATCH],
+            hull: Hull::default(),
             tiers: [[0; BATCH]; MOST],
             places: [[0; BATCH]; MOST],
         }
@@ -214,7 +217,7 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
             if first < slab.first {
                 queues.carried.push((voxel, first));
             } else {
-                queues.buckets[(first - slab.first) as usize].push(voxel);
+                queues.buckets[(first - slab.first) as usize].push(&voxel);
             }
         }
         counters.tossed += kept as u64;
@@ -330,9 +333,10 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
         (samples[i], normals[i], apart.left[i]) = (v.sample, v.normal, left);
     }
 
-    /// Where each section of the first `n` voxels of the batch lies, and the windows that hold all of a voxel's.
+    /// Where each section of the first `n` voxels of the batch lies, and the windows that hold all of a voxel's,
+    /// along x and, if `down`, along y.
     #[inline(always)]
-    fn place(&mut self, n: usize, k: i32, (axes, scales): &Footprints<'_, S, N>) {
+    fn place(&mut self, n: usize, k: i32, (axes, scales): &Footprints<'_, S, N>, down: bool) {
         let Part { frame, rect, .. } = self.part;
         let Places { eye, aside, .. } = &mut *self.places;
         let n = whole_registers(n);
@@ -347,6 +351,9 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
         let row = leaning.map_or(0, Leaning::row);
         // Rows first, since columns may hang on them.
         for (axis, origin) in [(1, rect.y0), (0, rect.x0)] {
+            if axis == 1 && !down {
+                continue;
+            }
             apart.begin(axis, n);
             let lean = leaning.filter(|leaning| leaning.most(axis) > 0.0);
             for at in 0..N {
@@ -403,7 +410,7 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
         open: &OpenMask,
         counted: (usize, &mut Counters),
     ) {
-        self.place(n, k, footprints);
+        self.place(n, k, footprints, true);
         let (part, eyes, across) =
             ((self.part, open), Some(&mut self.places.eye), &mut self.across);
         self.batch.add(part, (n, k), &footprints.0, eyes, across, sheets, counted);
@@ -422,18 +429,25 @@ impl<S: Tiered, const N: usize> DeepStage<'_, S, N> {
         open: &OpenMask,
         counted: (usize, &mut Counters),
     ) {
-        self.place(n, k, footprints);
         let (Axes { layers, .. }, scales) = footprints;
         let Part { frame, rect, .. } = self.part;
         let storeys = frame.storeys.as_ref().expect("a level view");
         let shape = sheets.tiers.shape();
-        let Places { eye, storey, tiers, places, .. } = &mut *self.places;
+        let most = frame.sections.most() as i32;
+        let known = sheets.hull(k, most as usize, &mut self.places.hull);
+        self.place(n, k, footprints, !known);
+        let Places { eye, storey, hull, tiers, places, .. } = &mut *self.places;
         let (per, first) = storeys.by_eye();
         let all = whole_registers(n);
         for (storey, y) in storey[..all].iter_mut().zip(&eye[1]) {
             *storey = round_i32(y * per + first);
         }
-        let most = frame.sections.most() as i32;
+        if known {
+            let Apart { lo, hi, .. } = &mut self.batch.apart;
+            for (i, storey) in storey[..all].iter().enumerate() {
+                [lo[1][i], hi[1][i]] = hull.of(*storey);
+            }
+        }
         for (at, tiers) in tiers[..N].iter_mut().enumerate() {
             if layers.after(at) < most {
                 let base = storeys.base(&frame.view, rect, scales[at]);

@@ -171,7 +171,7 @@ pub(crate) fn toss(
         if first < slab.first {
             queues.carried.push((*voxel, first));
         } else {
-            queues.buckets[(first - slab.first) as usize].push(*voxel);
+            queues.buckets[(first - slab.first) as usize].push(voxel);
         }
     }
 }

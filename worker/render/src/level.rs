@@ -21,8 +21,9 @@ use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS};
 
 /// The tiers that reach each row of a part's pixels in one sheet, and what they weigh there.
 struct Down<'a, W> {
-    /// Which sheet this is.
+    /// Which sheet this is, and the storey of its first tier.
     k: i32,
+    base: i32,
     weights: &'a [W],
     /// Of each row: the first tier, and how many there are: four, or a few more.
     reach: [[u8; 2]; EDGE],
@@ -32,18 +33,20 @@ struct Down<'a, W> {
     /// By tier, the first row of pixels that it reaches, and where the weight of the part's first would lie.
     first: [i32; ROWS],
     from: [i32; ROWS],
-    /// Rows whose weights are here, and these.
+    /// Rows whose weights are here, and these: of tiers between the first and the last with any, but of four at least.
     known: u64,
+    heavy: [[u8; 2]; EDGE],
     rows: [[W; REACHING]; EDGE],
 }
 
 /// Farther from a part than any of its tiers.
 const FAR: i32 = 1 << 20;
 
-impl<W: Copy + Default> Default for Down<'_, W> {
+impl<W: Copy + Default + PartialEq> Default for Down<'_, W> {
     fn default() -> Self {
         Down {
             k: i32::MIN,
+            base: 0,
             weights: &[],
             reach: [[0; 2]; EDGE],
             more: 0,
@@ -51,6 +54,7 @@ impl<W: Copy + Default> Default for Down<'_, W> {
             first: [0; ROWS],
             from: [0; ROWS],
             known: 0,
+            heavy: [[0; 2]; EDGE],
             rows: [[W::default(); REACHING]; EDGE],
         }
     }
@@ -60,7 +64,7 @@ impl<W: Copy + Default> Default for Down<'_, W> {
 /// lattice to either side.
 const FOUR: usize = 4;
 
-impl<'a, W: Copy + Default> Down<'a, W> {
+impl<'a, W: Copy + Default + PartialEq> Down<'a, W> {
     /// Of sheet `k` with this footprint, whose weights down are `weights`.
     #[inline(always)]
     fn fill(
@@ -74,7 +78,8 @@ impl<'a, W: Copy + Default> Down<'a, W> {
         let phases = footprint.phases(1).expect("a table");
         let (view, rect) = (&part.frame.view, &part.rect);
         let base = storeys.base(view, rect, footprint.scale);
-        (self.k, self.weights, self.known, self.more) = (k, weights, 0, 0);
+        (self.k, self.base, self.weights) = (k, base, weights);
+        (self.known, self.more) = (0, 0);
         // Far away for storeys that there are none of.
         for tier in 0..tiers {
             let storey = base + tier as i32;
@@ -109,25 +114,38 @@ impl<'a, W: Copy + Default> Down<'a, W> {
         }
     }
 
-    /// What the tiers weigh that reach row `y`.
+    /// The first of the tiers that reach row `y` with any weight, and what they weigh.
     #[inline(always)]
-    fn row(&mut self, y: usize) -> &[W] {
-        let [begin, n] = self.reach[y % EDGE].map(usize::from);
-        let row = &mut self.rows[y % EDGE][..n.min(REACHING)];
+    fn row(&mut self, y: usize) -> (usize, &[W]) {
         if self.known >> y & 1 == 0 {
-            self.known |= 1 << y;
-            let y = y as i32;
-            for (i, w) in row.iter_mut().enumerate() {
-                let tier = (begin + i) % ROWS;
-                let reaches = self.first[tier] <= y && y < self.first[tier] + self.len;
-                *w = if reaches {
-                    self.weights[(self.from[tier] + y) as usize]
-                } else {
-                    W::default()
-                };
-            }
+            self.weigh(y);
         }
-        row
+        let [begin, n] = self.heavy[y % EDGE].map(usize::from);
+        (begin, &self.rows[y % EDGE][..n.min(REACHING)])
+    }
+
+    /// Finds out what the tiers weigh that reach row `y`.
+    #[inline(always)]
+    fn weigh(&mut self, y: usize) {
+        self.known |= 1 << y;
+        let [begin, n] = self.reach[y % EDGE].map(usize::from);
+        let (mut from, mut to) = (0, n.min(REACHING));
+        let row = &mut self.rows[y % EDGE];
+        let at = y as i32;
+        for (i, w) in row[..to].iter_mut().enumerate() {
+            let tier = (begin + i) % ROWS;
+            let reaches = self.first[tier] <= at && at < self.first[tier] + self.len;
+            *w = if reaches { self.weights[(self.from[tier] + at) as usize] } else { W::default() };
+        }
+        // Tables are as long as the longest footprint is.
+        while to - from > FOUR && row[to - 1] == W::default() {
+            to -= 1;
+        }
+        while to - from > FOUR && row[from] == W::default() {
+            from += 1;
+        }
+        row.copy_within(from..to, 0);
+        self.heavy[y % EDGE] = [begin + from, to - from].map(|tier| tier as u8);
     }
 
     /// Columns that the tiers were touched at that reach each row.
@@ -164,8 +182,8 @@ pub(crate) struct LevelSheets<'a, S: Recorded, const N: usize> {
     /// By slot and tier: columns of the part that something was added to; and whether there are any.
     touched: [[u64; ROWS]; N],
     any: [bool; N],
-    /// Of sheets by turns, or of all.
-    downs: [Down<'a, S::Weight>; 2],
+    /// By slot, or one for all sheets.
+    downs: [Down<'a, S::Weight>; N],
 }
 
 impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
@@ -189,7 +207,7 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
             storeys,
             touched: [[0; ROWS]; N],
             any: [false; N],
-            downs: Default::default(),
+            downs: std::array::from_fn(|_| Down::default()),
         }
     }
 
@@ -222,7 +240,7 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
         let parallel = matches!(part.frame.view.projection, Projection::Ortho { .. });
         // Behind the last sheet that anything reaches there is nothing, wherever it were.
         let k = if parallel { 0 } else { k.min(footprints.last()) };
-        let which = k as usize % 2;
+        let which = slot::<N>(k);
         if self.downs[which].k != k {
             let footprint: Footprint<'a> = footprints.at(k).expect("no sheet is clipped");
             let weights = S::across(&footprint, 1).expect("a table");
@@ -230,6 +248,70 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
             self.downs[which].fill(k, part, self.storeys, (&footprint, weights), rows);
         }
         which
+    }
+}
+
+/// Rows of a part's pixels that storeys reach in some sheets: of each storey from `base` on the first one, and the one
+/// behind the last.
+pub(crate) struct Hull {
+    base: i32,
+    n: usize,
+    rows: [[i32; 2 * ROWS]; 2],
+}
+
+impl Default for Hull {
+    fn default() -> Self {
+        Hull { base: 0, n: 1, rows: [[0; 2 * ROWS]; 2] }
+    }
+}
+
+impl Hull {
+    /// Those of a storey, cut where the part ends.
+    #[inline(always)]
+    pub(crate) fn of(&self, storey: i32) -> [i32; 2] {
+        let at = (storey - self.base).clamp(0, self.n as i32 - 1) as usize % (2 * ROWS);
+        [self.rows[0][at].max(0), self.rows[1][at].min(PART)]
+    }
+}
+
+impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
+    /// Fills `hull` for `most` sheets from `k` on, of which there are no more than slots; whether it has room for that.
+    #[inline(always)]
+    pub(crate) fn hull(&mut self, k: i32, most: usize, hull: &mut Hull) -> bool {
+        let rows = self.tiers.shape().rows;
+        let mut which = [0; N];
+        for (j, which) in which.iter_mut().enumerate() {
+            *which = self.down(k + j.min(most - 1) as i32);
+        }
+        let bases = which.map(|which| self.downs[which].base);
+        let [first, last] = bases
+            .iter()
+            .fold([i32::MAX, i32::MIN], |[first, last], &base| [first.min(base), last.max(base)]);
+        let apart = last.abs_diff(first) as usize;
+        if apart + rows > 2 * ROWS {
+            return false;
+        }
+        (hull.base, hull.n) = (first, apart + rows);
+        for (rows, none) in hull.rows.iter_mut().zip([i32::MAX, i32::MIN]) {
+            rows[..hull.n].fill(none);
+        }
+        let [lo, hi] = &mut hull.rows;
+        for &which in &which[..most.min(N)] {
+            let Down { base, first: of, len, .. } = &self.downs[which];
+            // A tier that is not there lies beyond the outermost, which does not reach the part either.
+            let begin = base.abs_diff(first) as usize;
+            let inside = begin..begin + rows;
+            let ends = [(0..begin, of[0]), (inside.end..hull.n, of[rows - 1])];
+            for (some, of) in ends {
+                for (lo, hi) in lo[some.clone()].iter_mut().zip(&mut hi[some]) {
+                    (*lo, *hi) = ((*lo).min(of), (*hi).max(of + len));
+                }
+            }
+            for ((lo, hi), of) in lo[inside.clone()].iter_mut().zip(&mut hi[inside]).zip(of) {
+                (*lo, *hi) = ((*lo).min(*of), (*hi).max(of + len));
+            }
+        }
+        true
     }
 }
 
@@ -260,17 +342,21 @@ impl<S: Tiered, const N: usize> Open<S> for LevelSheets<'_, S, N> {
             if open == 0 {
                 continue;
             }
-            let first = [here, behind].map(|down| usize::from(downs[down].reach[y][0]));
-            let begin = [0, 1].map(|sheet| tiers.begin(slots[sheet], first[sheet]));
-            let weights = if here == behind {
-                let row = downs[here].row(y);
-                [row, row]
+            let rows = if here == behind {
+                let (first, row) = downs[here].row(y);
+                [(first, row); 2]
             } else {
-                let [even, odd] = &mut *downs;
-                let (even, odd) = (even.row(y), odd.row(y));
-                if here == 0 { [even, odd] } else { [odd, even] }
+                let both = downs.get_disjoint_mut([here, behind]).expect("two sheets");
+                both.map(|down| {
+                    let (first, row) = down.row(y);
+                    (first, &*row)
+                })
             };
-            let above = [(begin[0], weights[0]), (begin[1], weights[1])];
+            let [(first, weights), (next, weights_next)] = rows;
+            let above = [
+                (tiers.begin(slots[0], first), weights),
+                (tiers.begin(slots[1], next), weights_next),
+            ];
             closing[y] = S::fold(*simd, tiers, above, storeys.spread, open, folded);
         }
         let shut = self.closes.close_folded(self.simd, self.folded, &closing, part, open, pixels);

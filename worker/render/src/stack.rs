@@ -77,9 +77,44 @@ impl<S: Recorded> Default for Closes<S> {
     }
 }
 
+/// Voxels of one bucket: the first `n` items; what is behind them is there from before, so that a voxel is added by one
+/// store.
+pub(crate) struct Bucket<V> {
+    items: Vec<V>,
+    n: usize,
+}
+
+impl<V> Default for Bucket<V> {
+    fn default() -> Self {
+        Bucket { items: Vec::new(), n: 0 }
+    }
+}
+
+impl<V: Copy> Bucket<V> {
+    #[inline(always)]
+    pub(crate) fn push(&mut self, voxel: &V) {
+        let Bucket { items, n } = self;
+        match items.get_mut(*n) {
+            Some(to) => *to = *voxel,
+            None => items.push(*voxel),
+        }
+        *n += 1;
+    }
+
+    #[inline(always)]
+    fn voxels(&self) -> &[V] {
+        &self.items[..self.n]
+    }
+
+    #[inline(always)]
+    fn clear(&mut self) {
+        self.n = 0;
+    }
+}
+
 /// Voxels that wait.
 pub(crate) struct Queues<V> {
-    pub(crate) buckets: Vec<Vec<V>>,
+    pub(crate) buckets: Vec<Bucket<V>>,
     /// Voxels that begin before the slab, and where.
     pub(crate) carried: Vec<(V, i32)>,
 }
@@ -157,7 +192,7 @@ pub(crate) fn walk<S: Recorded, H: Open<S>, T: Stage<H>>(
         *was = [u64::MAX; EDGE];
     }
     if queues.buckets.len() < slab.len() as usize {
-        queues.buckets.resize_with(slab.len() as usize, Vec::new);
+        queues.buckets.resize_with(slab.len() as usize, Bucket::default);
     }
     open.grow(stage.reach());
     let mut any_open = open.count() > 0;
@@ -178,7 +213,7 @@ pub(crate) fn walk<S: Recorded, H: Open<S>, T: Stage<H>>(
             queues.carried.clear();
         }
         let bucket = &mut queues.buckets[(k - slab.first) as usize];
-        stage.splat(bucket, k, &mut sheets, &open, counters);
+        stage.splat(bucket.voxels(), k, &mut sheets, &open, counters);
         bucket.clear();
         if sheets.close(k, part, &mut open, pixels) {
             any_open = open.count() > 0;
@@ -191,7 +226,7 @@ pub(crate) fn walk<S: Recorded, H: Open<S>, T: Stage<H>>(
     counters.culled += hidden * part.voxels_from(next);
     queues.carried.clear();
     for bucket in &mut queues.buckets {
-        counters.culled += hidden * bucket.len() as u64;
+        counters.culled += hidden * bucket.n as u64;
         bucket.clear();
     }
     part.end(pixels, out);

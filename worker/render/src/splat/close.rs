@@ -23,7 +23,12 @@ pub(crate) fn close_rows<S: Sum, const ROWS: usize>(
         // SAFETY: the value proves that the instructions are there.
         #[cfg(target_arch = "x86_64")]
         Level::Avx512 if S::WHOLE && rule.compositing == Compositing::Linear => unsafe {
-            avx512::close::<S, ROWS>(rule, rows, live)
+            wide::avx512::<S, ROWS>(rule, rows, live)
+        },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx2 if S::WHOLE && rule.compositing == Compositing::Linear => unsafe {
+            wide::avx2::<S, ROWS>(rule, rows, live)
         },
         _ => {
             let mut shut = [0; ROWS];
@@ -36,166 +41,196 @@ pub(crate) fn close_rows<S: Sum, const ROWS: usize>(
 }
 
 #[cfg(target_arch = "x86_64")]
-mod avx512 {
+mod wide {
     use crate::sheet::{FAINTEST, LANES, ONE, Row, Rule, Sum};
     use crate::splat::LARGEST;
+    use crate::splat::lanes::{Eight, Floats, Sixteen};
     use slabcast_common::math::{LN2, MAGIC, PHI, SWITCH, TAYLOR};
-    use std::arch::x86_64::*;
+    use std::slice::from_mut;
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    fn load(lanes: &[f32; LANES]) -> __m512 {
-        // SAFETY: sixteen floats are 64 bytes.
-        unsafe { _mm512_loadu_ps(lanes.as_ptr()) }
-    }
-
-    /// A polynomial in `x`, highest power first.
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    fn polynomial<const N: usize>(coefficients: &[f32; N], x: __m512) -> __m512 {
-        let mut p = _mm512_set1_ps(coefficients[0]);
-        for c in &coefficients[1..] {
-            p = _mm512_add_ps(_mm512_mul_ps(p, x), _mm512_set1_ps(*c));
-        }
-        p
-    }
-
-    /// `slabcast_common::math::opacity`.
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    fn opacity(tau: __m512) -> __m512 {
-        let magic = _mm512_set1_ps(MAGIC);
-        let x = _mm512_sub_ps(_mm512_set1_ps(-0.0), tau);
-        let x = _mm512_max_ps(x, _mm512_set1_ps(-87.0));
-        let log2_e = _mm512_set1_ps(std::f32::consts::LOG2_E);
-        let shifted = _mm512_add_ps(_mm512_mul_ps(x, log2_e), magic);
-        let n = _mm512_sub_ps(shifted, magic);
-        let r = _mm512_sub_ps(x, _mm512_mul_ps(n, _mm512_set1_ps(LN2[0])));
-        let r = _mm512_sub_ps(r, _mm512_mul_ps(n, _mm512_set1_ps(LN2[1])));
-        let q = _mm512_mul_ps(polynomial(&TAYLOR, r), r);
-        let exponent = _mm512_sub_epi32(_mm512_castps_si512(shifted), _mm512_castps_si512(magic));
-        let exponent = _mm512_add_epi32(exponent, _mm512_set1_epi32(127));
-        let s = _mm512_castsi512_ps(_mm512_slli_epi32::<23>(exponent));
-        _mm512_sub_ps(_mm512_sub_ps(_mm512_set1_ps(1.0), s), _mm512_mul_ps(s, q))
-    }
-
-    /// What sixteen pixels have before their colours are looked at.
-    #[derive(Clone, Copy)]
-    struct Pixels {
-        per_raw: __m512,
-        /// Opacity of the sheet.
-        opacity: __m512,
-        /// Of the change of colour through it.
-        weight: __m512,
-        before: __m512,
-        per_before: __m512,
-        behind: __m512,
-        /// What of the light comes through from the sheet on.
-        light: __m512,
-    }
-
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    pub(super) fn close<S: Sum, const ROWS: usize>(
+    pub(super) fn avx512<S: Sum, const ROWS: usize>(
         rule: &Rule,
         rows: &mut [Row; ROWS],
         live: [u32; ROWS],
     ) -> [u32; ROWS] {
-        let zero = _mm512_setzero_ps();
-        let one = _mm512_set1_ps(1.0);
-        let mut pixels = [Pixels {
-            per_raw: zero,
-            opacity: zero,
-            weight: zero,
-            before: zero,
-            per_before: zero,
-            behind: zero,
-            light: zero,
-        }; ROWS];
-        let mut taus = [zero; ROWS];
-        let mut raws = [zero; ROWS];
-        for r in 0..ROWS {
-            let here = load(&rows[r].here[0]);
-            let filled = _mm512_cmp_ps_mask::<_CMP_GE_OQ>(here, _mm512_set1_ps(FAINTEST));
-            raws[r] = _mm512_mask_blend_ps(filled, one, here);
-            let tau = _mm512_mul_ps(raws[r], _mm512_set1_ps(rule.unit));
-            taus[r] = _mm512_maskz_mul_ps(filled, tau, load(&rows[r].secant));
-            pixels[r].per_raw = _mm512_div_ps(one, raws[r]);
-        }
-        for r in 0..ROWS {
-            pixels[r].opacity = opacity(taus[r]);
-        }
-        for r in 0..ROWS {
-            let Pixels { per_raw, opacity, .. } = pixels[r];
-            let tau = taus[r];
-            let small = _mm512_mul_ps(_mm512_mul_ps(polynomial(&PHI, tau), tau), tau);
-            let per_tau = _mm512_mul_ps(per_raw, _mm512_set1_ps(rule.per_unit));
-            let per_tau = _mm512_mul_ps(per_tau, load(&rows[r].cosine));
-            let half = _mm512_mul_ps(opacity, _mm512_set1_ps(0.5));
-            let large = _mm512_add_ps(_mm512_mul_ps(opacity, per_tau), half);
-            let large = _mm512_sub_ps(large, one);
-            let is_small = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(tau, _mm512_set1_ps(SWITCH));
-            let is_there = _mm512_cmp_ps_mask::<_CMP_GT_OQ>(tau, zero);
-            let weight = _mm512_mask_blend_ps(is_small, large, small);
-            pixels[r].weight = _mm512_maskz_mov_ps(is_there, weight);
-        }
-        for r in 0..ROWS {
-            let (tl, tn, h) = (load(&rows[r].before[0]), load(&rows[r].behind[0]), raws[r]);
-            let tl_2 = _mm512_mul_ps(tl, tl);
-            let h_2 = _mm512_mul_ps(_mm512_set1_ps(4e-4), _mm512_mul_ps(h, h));
-            let squares = _mm512_add_ps(tl_2, h_2);
-            let sum = _mm512_add_ps(tn, _mm512_mul_ps(_mm512_set1_ps(0.05), h));
-            let some = _mm512_max_ps(tl, one);
-            let both = _mm512_mul_ps(squares, sum);
-            let per_all = _mm512_div_ps(one, _mm512_mul_ps(some, both));
-            let gain = _mm512_mul_ps(_mm512_set1_ps(rule.gain_before), tl_2);
-            let share = _mm512_mul_ps(_mm512_mul_ps(some, sum), per_all);
-            pixels[r].before = _mm512_mul_ps(gain, share);
-            pixels[r].per_before = _mm512_mul_ps(both, per_all);
-            let share = _mm512_mul_ps(_mm512_mul_ps(some, squares), per_all);
-            pixels[r].behind = _mm512_mul_ps(_mm512_set1_ps(rule.gain_behind), share);
-        }
+        // SAFETY: these are the instructions.
+        unsafe { close::<Sixteen, S, ROWS>(rule, rows, live) }
+    }
+
+    #[target_feature(enable = "avx2")]
+    pub(super) fn avx2<S: Sum, const ROWS: usize>(
+        rule: &Rule,
+        rows: &mut [Row; ROWS],
+        live: [u32; ROWS],
+    ) -> [u32; ROWS] {
         let mut shut = [0; ROWS];
-        for r in 0..ROWS {
-            let a = load(&rows[r].a);
-            let light = _mm512_maskz_sub_ps(live[r] as u16, one, a);
-            let a = _mm512_add_ps(a, _mm512_mul_ps(light, pixels[r].opacity));
-            pixels[r].light = light;
-            let left = _mm512_sub_ps(one, a);
-            let is_shut = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(left, _mm512_set1_ps(rule.eps));
-            shut[r] = u32::from(is_shut) & live[r];
-            // SAFETY: sixteen floats are 64 bytes.
-            unsafe { _mm512_storeu_ps(rows[r].a.as_mut_ptr(), a) };
-        }
-        for ch in 0..if S::GREY { 1 } else { 3 } {
-            for r in 0..ROWS {
-                let p = &pixels[r];
-                let (el, en) = (load(&rows[r].before[ch + 1]), load(&rows[r].behind[ch + 1]));
-                let tn = load(&rows[r].behind[0]);
-                let c = _mm512_mul_ps(load(&rows[r].here[ch + 1]), p.per_raw);
-                let ahead = _mm512_sub_ps(en, _mm512_mul_ps(c, tn));
-                let back = _mm512_sub_ps(c, _mm512_mul_ps(el, p.per_before));
-                let change = _mm512_mul_ps(p.before, back);
-                let change = _mm512_add_ps(change, _mm512_mul_ps(p.behind, ahead));
-                let most = _mm512_max_ps(_mm512_min_ps(c, _mm512_sub_ps(one, c)), zero);
-                let most = _mm512_mul_ps(_mm512_set1_ps(2.0), most);
-                let change = _mm512_min_ps(change, most);
-                let change = _mm512_max_ps(change, _mm512_sub_ps(zero, most));
-                let of_sheet = _mm512_mul_ps(c, p.opacity);
-                let of_sheet = _mm512_add_ps(of_sheet, _mm512_mul_ps(change, p.weight));
-                let light = _mm512_mul_ps(p.light, of_sheet);
-                let light = _mm512_mul_ps(light, _mm512_set1_ps(ONE));
-                let light = _mm512_add_ps(light, _mm512_set1_ps(0.5));
-                let light = _mm512_min_ps(_mm512_max_ps(light, zero), _mm512_set1_ps(LARGEST));
-                let light = _mm512_cvttps_epi32(light);
-                // SAFETY: sixteen numbers are 64 bytes.
-                unsafe { _mm512_storeu_si512(rows[r].light[ch].as_mut_ptr().cast(), light) };
-            }
-        }
-        if S::GREY {
-            for row in rows {
-                row.light = [row.light[0]; 3];
-            }
+        for ((row, live), shut) in rows.iter_mut().zip(live).zip(&mut shut) {
+            // SAFETY: these are the instructions.
+            let halves = unsafe { close::<Eight, S, 2>(rule, from_mut(row), [live, live >> 8]) };
+            *shut = halves[0] | halves[1] << 8;
         }
         shut
+    }
+
+    /// A polynomial in `x`, highest power first.
+    #[inline(always)]
+    unsafe fn polynomial<L: Floats, const N: usize>(
+        coefficients: &[f32; N],
+        x: L::Floats,
+    ) -> L::Floats {
+        // SAFETY: the caller has these instructions.
+        unsafe {
+            let mut p = L::all(coefficients[0]);
+            for c in &coefficients[1..] {
+                p = L::add(L::mul(p, x), L::all(*c));
+            }
+            p
+        }
+    }
+
+    /// `slabcast_common::math::opacity`.
+    #[inline(always)]
+    unsafe fn opacity<L: Floats>(tau: L::Floats) -> L::Floats {
+        // SAFETY: the caller has these instructions.
+        unsafe {
+            let magic = L::all(MAGIC);
+            let x = L::most(L::sub(L::all(-0.0), tau), L::all(-87.0));
+            let shifted = L::add(L::mul(x, L::all(std::f32::consts::LOG2_E)), magic);
+            let n = L::sub(shifted, magic);
+            let r = L::sub(x, L::mul(n, L::all(LN2[0])));
+            let r = L::sub(r, L::mul(n, L::all(LN2[1])));
+            let q = L::mul(polynomial::<L, 7>(&TAYLOR, r), r);
+            let exponent = L::minus(L::to_bits(shifted), L::to_bits(magic));
+            let s = L::from_bits(L::up(L::plus(exponent, L::set(127)), 23));
+            L::sub(L::sub(L::all(1.0), s), L::mul(s, q))
+        }
+    }
+
+    /// What some pixels have before their colours are looked at.
+    #[derive(Clone, Copy)]
+    struct Pixels<F> {
+        raw: F,
+        per_raw: F,
+        tau: F,
+        /// Opacity of the sheet.
+        opacity: F,
+        /// Of the change of colour through it.
+        weight: F,
+        before: F,
+        per_before: F,
+        behind: F,
+        /// What of the light comes through from the sheet on.
+        light: F,
+    }
+
+    /// Closes the lanes of some rows, a register after the other; says which of each one's are shut now.
+    ///
+    /// # Safety
+    /// The instructions are there.
+    #[inline(always)]
+    unsafe fn close<L: Floats, S: Sum, const REGISTERS: usize>(
+        rule: &Rule,
+        rows: &mut [Row],
+        live: [u32; REGISTERS],
+    ) -> [u32; REGISTERS] {
+        const { assert!(LANES.is_multiple_of(L::LANES)) };
+        assert_eq!(rows.len() * LANES, REGISTERS * L::LANES, "lanes of all rows");
+        // Which row has a register's lanes, and from where on.
+        let at = |r: usize| (r * L::LANES / LANES, r * L::LANES % LANES);
+        // SAFETY: the caller's; each row has so many lanes.
+        unsafe {
+            let load = |lanes: &[f32; LANES], from: usize| L::load_floats(lanes.as_ptr().add(from));
+            let (zero, one) = (L::all(0.0), L::all(1.0));
+            let mut pixels = [Pixels {
+                raw: zero,
+                per_raw: zero,
+                tau: zero,
+                opacity: zero,
+                weight: zero,
+                before: zero,
+                per_before: zero,
+                behind: zero,
+                light: zero,
+            }; REGISTERS];
+            for (r, p) in pixels.iter_mut().enumerate() {
+                let (row, from) = at(r);
+                let row = &rows[row];
+                let here = load(&row.here[0], from);
+                let filled = L::from_on(here, L::all(FAINTEST));
+                p.raw = L::select(filled, here, one);
+                let tau = L::mul(p.raw, L::all(rule.unit));
+                p.tau = L::only(filled, L::mul(tau, load(&row.secant, from)));
+                p.per_raw = L::div(one, p.raw);
+            }
+            for p in &mut pixels {
+                p.opacity = opacity::<L>(p.tau);
+            }
+            for (r, p) in pixels.iter_mut().enumerate() {
+                let (row, from) = at(r);
+                let tau = p.tau;
+                let small = L::mul(L::mul(polynomial::<L, 5>(&PHI, tau), tau), tau);
+                let per_tau = L::mul(p.per_raw, L::all(rule.per_unit));
+                let per_tau = L::mul(per_tau, load(&rows[row].cosine, from));
+                let half = L::mul(p.opacity, L::all(0.5));
+                let large = L::sub(L::add(L::mul(p.opacity, per_tau), half), one);
+                let weight = L::select(L::below(tau, L::all(SWITCH)), small, large);
+                p.weight = L::only(L::below(zero, tau), weight);
+            }
+            for (r, p) in pixels.iter_mut().enumerate() {
+                let (row, from) = at(r);
+                let row = &rows[row];
+                let (tl, tn) = (load(&row.before[0], from), load(&row.behind[0], from));
+                let tl_2 = L::mul(tl, tl);
+                let h_2 = L::mul(L::all(4e-4), L::mul(p.raw, p.raw));
+                let squares = L::add(tl_2, h_2);
+                let sum = L::add(tn, L::mul(L::all(0.05), p.raw));
+                let some = L::most(tl, one);
+                let both = L::mul(squares, sum);
+                let per_all = L::div(one, L::mul(some, both));
+                let gain = L::mul(L::all(rule.gain_before), tl_2);
+                p.before = L::mul(gain, L::mul(L::mul(some, sum), per_all));
+                p.per_before = L::mul(both, per_all);
+                let share = L::mul(L::mul(some, squares), per_all);
+                p.behind = L::mul(L::all(rule.gain_behind), share);
+            }
+            let mut shut = [0; REGISTERS];
+            for (r, p) in pixels.iter_mut().enumerate() {
+                let (row, from) = at(r);
+                let here = live[r] & ((1 << L::LANES) - 1);
+                let a = load(&rows[row].a, from);
+                p.light = L::only(L::marks(here), L::sub(one, a));
+                let a = L::add(a, L::mul(p.light, p.opacity));
+                shut[r] = L::bits(L::below(L::sub(one, a), L::all(rule.eps))) & here;
+                L::put_floats(rows[row].a.as_mut_ptr().add(from), a);
+            }
+            for ch in 0..if S::GREY { 1 } else { 3 } {
+                for (r, p) in pixels.iter().enumerate() {
+                    let (row, from) = at(r);
+                    let row = &mut rows[row];
+                    let el = load(&row.before[ch + 1], from);
+                    let en = load(&row.behind[ch + 1], from);
+                    let tn = load(&row.behind[0], from);
+                    let c = L::mul(load(&row.here[ch + 1], from), p.per_raw);
+                    let ahead = L::sub(en, L::mul(c, tn));
+                    let back = L::sub(c, L::mul(el, p.per_before));
+                    let change = L::add(L::mul(p.before, back), L::mul(p.behind, ahead));
+                    let most = L::most(L::least(c, L::sub(one, c)), zero);
+                    let most = L::mul(L::all(2.0), most);
+                    let change = L::most(L::least(change, most), L::sub(zero, most));
+                    let of_sheet = L::add(L::mul(c, p.opacity), L::mul(change, p.weight));
+                    let light = L::mul(L::mul(p.light, of_sheet), L::all(ONE));
+                    let light = L::add(light, L::all(0.5));
+                    let light = L::least(L::most(light, zero), L::all(LARGEST));
+                    L::store(row.light[ch].as_mut_ptr().add(from), L::truncated(light));
+                }
+            }
+            if S::GREY {
+                for row in rows {
+                    row.light = [row.light[0]; 3];
+                }
+            }
+            shut
+        }
     }
 }

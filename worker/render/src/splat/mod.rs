@@ -59,7 +59,7 @@ impl Tap {
 }
 
 /// A weight across the view axis, as sums of one kind want it.
-pub trait Weight: Copy + Default + std::fmt::Debug {
+pub trait Weight: Copy + Default + PartialEq + std::fmt::Debug {
     /// Weights along `axis`: see [`Footprint::weights`].
     fn of<'b>(
         footprint: &'b Footprint<'_>,

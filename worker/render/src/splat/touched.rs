@@ -448,7 +448,7 @@ mod wide {
                         L::fours(next, N * words, at),
                     ]
                 } else {
-                    let [a, b, ..] = L::twos([old, old], words, at);
+                    let [a, b] = L::pairs(old, at);
                     let [c, d, e, f] = L::twos([now, next], N * words, at);
                     [shorts::<L, S>(a, b), shorts::<L, S>(c, d), shorts::<L, S>(e, f)]
                 };
@@ -506,7 +506,7 @@ mod wide {
                         L::fours(from.add(4), 8, order),
                     ]
                 } else {
-                    let [a, b, ..] = L::twos([old, old], words, at);
+                    let [a, b] = L::pairs(old, at);
                     let [c, d, e, f] = L::fours(from, 4, order);
                     [shorts::<L, S>(a, b), shorts::<L, S>(c, d), shorts::<L, S>(e, f)]
                 };

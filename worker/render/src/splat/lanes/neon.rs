@@ -142,6 +142,18 @@ impl Lanes for Four {
             }
             Four::turned(places)
         }
+        fn pairs(from: *const u32, at: *const u32) -> [int32x4_t; 2] {
+            let mut places = [vdupq_n_s32(0); 2];
+            for (i, places) in places.iter_mut().enumerate() {
+                // SAFETY: the caller has two numbers at each place.
+                *places = unsafe {
+                    let [a, b] = [2 * i, 2 * i + 1].map(|i| from.add(*at.add(i) as usize * 2).cast());
+                    vcombine_s32(vld1_s32(a), vld1_s32(b))
+                };
+            }
+            let [low, high] = places;
+            [vuzp1q_s32(low, high), vuzp2q_s32(low, high)]
+        }
         fn twos(from: [*const u32; 2], stride: usize, at: *const u32) -> [int32x4_t; 4] {
             let mut places = [vdupq_n_s32(0); 4];
             for (i, places) in places.iter_mut().enumerate() {

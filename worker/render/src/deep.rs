@@ -429,8 +429,8 @@ impl<S: Tiered, const N: usize> DeepStage<'_, S, N> {
         open: &OpenMask,
         counted: (usize, &mut Counters),
     ) {
-        let (Axes { layers, .. }, scales) = footprints;
-        let Part { frame, rect, .. } = self.part;
+        let (Axes { layers, .. }, _) = footprints;
+        let frame = self.part.frame;
         let storeys = frame.storeys.as_ref().expect("a level view");
         let shape = sheets.tiers.shape();
         let most = frame.sections.most() as i32;
@@ -449,8 +449,9 @@ impl<S: Tiered, const N: usize> DeepStage<'_, S, N> {
             }
         }
         for (at, tiers) in tiers[..N].iter_mut().enumerate() {
-            if layers.after(at) < most {
-                let base = storeys.base(&frame.view, rect, scales[at]);
+            let sheet = layers.after(at);
+            if sheet < most {
+                let base = hull.bases[sheet as usize % MOST];
                 let firsts = &self.batch.apart.first[0][at];
                 for (i, (storey, first)) in storey[..all].iter().zip(firsts).enumerate() {
                     tiers[i] = (storey - base).clamp(0, shape.rows as i32 - 1) as u32;

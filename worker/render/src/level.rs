@@ -9,7 +9,7 @@ use crate::flat::{self, BATCH, Batch, Waiting, toss};
 use crate::footprint::{Footprint, Phases};
 use crate::mask::OpenMask;
 use crate::scene::{Flat, Frame};
-use crate::splat::records::{Recorded, Splat, Table};
+use crate::splat::records::{MOST, Recorded, Splat, Table};
 use crate::splat::tiers::{Folded, Shape, Tiered, Tiers, Weights};
 use crate::splat::toss::{Packing, TIER_BITS, TierOf, Tossing};
 use crate::splat::{Simd, Work};
@@ -254,6 +254,8 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
 /// Rows of a part's pixels that storeys reach in some sheets: of each storey from `base` on the first one, and the one
 /// behind the last.
 pub(crate) struct Hull {
+    /// The storey of the first tier of each sheet.
+    pub(crate) bases: [i32; MOST],
     base: i32,
     n: usize,
     rows: [[i32; 2 * ROWS]; 2],
@@ -261,7 +263,7 @@ pub(crate) struct Hull {
 
 impl Default for Hull {
     fn default() -> Self {
-        Hull { base: 0, n: 1, rows: [[0; 2 * ROWS]; 2] }
+        Hull { bases: [0; MOST], base: 0, n: 1, rows: [[0; 2 * ROWS]; 2] }
     }
 }
 
@@ -283,10 +285,11 @@ impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
         for (j, which) in which.iter_mut().enumerate() {
             *which = self.down(k + j.min(most - 1) as i32);
         }
-        let bases = which.map(|which| self.downs[which].base);
-        let [first, last] = bases
-            .iter()
-            .fold([i32::MAX, i32::MIN], |[first, last], &base| [first.min(base), last.max(base)]);
+        let (mut first, mut last) = (i32::MAX, i32::MIN);
+        for (to, &which) in hull.bases.iter_mut().zip(&which) {
+            *to = self.downs[which].base;
+            (first, last) = (first.min(*to), last.max(*to));
+        }
         let apart = last.abs_diff(first) as usize;
         if apart + rows > 2 * ROWS {
             return false;

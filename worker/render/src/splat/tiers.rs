@@ -542,24 +542,31 @@ mod avx2 {
     const SHORTS: usize = 16;
     const LONGS: usize = 8;
 
-    /// All bits for the weights of a footprint of `len` columns, and none on either side.
-    struct Window<T> {
-        bits: [T; 112],
+    macro_rules! bits_of {
+        ($number:ty) => {{
+            let mut bits = [0; 3 * REACH];
+            let mut i = REACH;
+            while i < 2 * REACH {
+                bits[i] = !(0 as $number);
+                i += 1;
+            }
+            bits
+        }};
     }
 
-    impl<T: Copy + Default> Window<T> {
-        #[inline(always)]
-        fn new(len: usize, all: T) -> Self {
-            let mut bits = [T::default(); 112];
-            bits[16..16 + len].fill(all);
-            Window { bits }
-        }
+    /// Longer than a footprint, where it begins in a register, and a register beyond that.
+    const REACH: usize = 96;
 
-        /// Those from the `i`th weight less `shift` on, which is not more than sixteen.
-        #[inline(always)]
-        fn from(&self, i: usize, shift: usize) -> &[T; 16] {
-            self.bits[16 + i - shift..].first_chunk().expect("a footprint is shorter than 64")
-        }
+    /// No bits, then all, then none.
+    static SHORT_BITS: [i16; 3 * REACH] = bits_of!(i16);
+    static LONG_BITS: [i32; 3 * REACH] = bits_of!(i32);
+
+    /// Of lanes from the `i`th on: bits of those from `shift` to where a footprint of `len` columns ends, as the bits that
+    /// both of these have.
+    #[inline(always)]
+    fn window<T>(bits: &[T; 3 * REACH], shift: usize, len: usize, i: usize) -> [&[T; 16]; 2] {
+        [REACH - shift + i, 2 * REACH - shift - len + i]
+            .map(|from| bits[from..].first_chunk().expect("a footprint is shorter than 64"))
     }
 
     /// A register's worth of the weights from `from` less `shift` on, and what lies around them in the table.
@@ -584,22 +591,19 @@ mod avx2 {
     #[target_feature(enable = "avx2")]
     #[inline]
     fn spread_shorts<const GROUPS: usize>(
-        table: &[i16],
+        Table { weights: table, len }: &Table<'_, i16>,
         from: usize,
         shift: usize,
         chunk: usize,
-        window: &Window<i16>,
     ) -> [__m256i; GROUPS] {
         const { assert!(GROUPS <= 4) };
         let around: [i16; SHORTS] = around(table, from, shift, chunk);
-        let there = window.from(chunk * SHORTS, shift);
+        let [begun, left] = window(&SHORT_BITS, shift, *len, chunk * SHORTS);
         let eight = |half: usize| {
             // SAFETY: eight weights of sixteen are 16 bytes.
-            let w = unsafe {
-                let w = _mm_loadu_si128(around[8 * half..].as_ptr().cast());
-                _mm_and_si128(w, _mm_loadu_si128(there[8 * half..].as_ptr().cast()))
-            };
-            _mm256_broadcastsi128_si256(w)
+            let load = |of: &[i16; 16]| unsafe { _mm_loadu_si128(of[8 * half..].as_ptr().cast()) };
+            let there = _mm_and_si128(load(begun), load(left));
+            _mm256_broadcastsi128_si256(_mm_and_si128(load(&around), there))
         };
         let halves = [eight(0), if GROUPS > 2 { eight(1) } else { _mm256_setzero_si256() }];
         let turns = [
@@ -682,7 +686,6 @@ mod avx2 {
         chunks: usize,
     ) {
         let [a_tier, sheet] = registers(tiers);
-        let window = Window::new(across.len, -1);
         let offsets: [usize; N] = std::array::from_fn(|i| (slot + i) % N * sheet);
         let first: *mut __m256i = tiers.lines.as_mut_ptr().cast();
         for (v, &payload) in voxels.iter().zip(payloads) {
@@ -693,7 +696,7 @@ mod avx2 {
             let wz = deep.row(v.phase() as usize * deep.len);
             let payload = _mm256_set1_epi64x(payload as i64);
             for chunk in 0..chunks {
-                let w = spread_shorts::<GROUPS>(across.weights, from, shift, chunk, &window);
+                let w = spread_shorts::<GROUPS>(across, from, shift, chunk);
                 let at = at + chunk * GROUPS;
                 let add = |(offset, wz): (&usize, &i16)| {
                     let section = _mm256_mulhrs_epi16(payload, _mm256_set1_epi16(*wz));
@@ -732,7 +735,6 @@ mod avx2 {
         let [_, sheet] = registers(tiers);
         for slot in 0..N {
             let across = &layers.across[0][slot];
-            let window = Window::new(across.len, -1);
             let after = layers.after(slot);
             let first: *mut __m256i = tiers.lines.as_mut_ptr().cast();
             for (&i, &payload) in apart.kept.iter().zip(payloads) {
@@ -748,7 +750,7 @@ mod avx2 {
                 let section = _mm256_mulhrs_epi16(section, _mm256_set1_epi16(wz));
                 let from = apart.from[0][slot][i] as usize;
                 for chunk in 0..chunks {
-                    let w = spread_shorts::<GROUPS>(across.weights, from, shift, chunk, &window);
+                    let w = spread_shorts::<GROUPS>(across, from, shift, chunk);
                     // SAFETY: of the slot's, as shown above.
                     unsafe {
                         add_shorts(first.add(slot * sheet + at + chunk * GROUPS), section, &w);
@@ -762,18 +764,17 @@ mod avx2 {
     #[target_feature(enable = "avx2")]
     #[inline]
     fn spread_longs<const GROUPS: usize, const C: usize>(
-        table: &[Tap],
+        Table { weights: table, len }: &Table<'_, Tap>,
         from: usize,
         shift: usize,
         chunk: usize,
-        window: &Window<i32>,
     ) -> [__m256; GROUPS] {
         let around: [Tap; LONGS] = around(table, from, shift, chunk);
-        let there = window.from(chunk * LONGS, shift);
+        let bits = window(&LONG_BITS, shift, *len, chunk * LONGS);
         // SAFETY: eight weights are 32 bytes, and so are eight numbers.
         let w = unsafe {
-            let there = _mm256_loadu_si256(there.as_ptr().cast());
-            _mm256_and_ps(_mm256_loadu_ps(around.as_ptr().cast()), _mm256_castsi256_ps(there))
+            let [begun, left] = bits.map(|bits| _mm256_loadu_ps(bits.as_ptr().cast()));
+            _mm256_and_ps(_mm256_loadu_ps(around.as_ptr().cast()), _mm256_and_ps(begun, left))
         };
         let lanes = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
         let each =
@@ -853,7 +854,6 @@ mod avx2 {
     {
         let [a_tier, sheet] = registers(tiers);
         let columns = columns::<S>();
-        let window = Window::new(across.len, -1);
         let offsets: [usize; N] = std::array::from_fn(|i| (slot + i) % N * sheet);
         let first: *mut __m256i = tiers.lines.as_mut_ptr().cast();
         for (v, of) in voxels.iter().zip(payloads) {
@@ -864,7 +864,7 @@ mod avx2 {
             let wz = deep.row(v.phase() as usize * deep.len);
             let payload = payload(of);
             for chunk in 0..chunks {
-                let w = spread_longs::<GROUPS, C>(across.weights, from, shift, chunk, &window);
+                let w = spread_longs::<GROUPS, C>(across, from, shift, chunk);
                 let at = at + chunk * GROUPS;
                 let add = |(offset, wz): (&usize, &f32)| {
                     // SAFETY: of the slot's, as shown above.
@@ -902,7 +902,6 @@ mod avx2 {
         let [_, sheet] = registers(tiers);
         for slot in 0..N {
             let across = &layers.across[0][slot];
-            let window = Window::new(across.len, -1);
             let after = layers.after(slot);
             let first: *mut __m256i = tiers.lines.as_mut_ptr().cast();
             for (&i, of) in apart.kept.iter().zip(payloads) {
@@ -917,7 +916,7 @@ mod avx2 {
                 let section = section(payload(of), wz);
                 let from = apart.from[0][slot][i] as usize;
                 for chunk in 0..chunks {
-                    let w = spread_longs::<GROUPS, 4>(across.weights, from, shift, chunk, &window);
+                    let w = spread_longs::<GROUPS, 4>(across, from, shift, chunk);
                     // SAFETY: of the slot's, as shown above.
                     unsafe {
                         add_longs(first.add(slot * sheet + at + chunk * GROUPS), section, &w);

@@ -253,7 +253,7 @@ impl<P: Placing> Sieve<'_, P> {
     /// Puts place or local index, first sheet, cell, sample and normal of those that are kept beside each
     /// other.
     #[inline(always)]
-    fn sift_plain(&self, brick: &Brick, tossing: &mut Tossing) -> Sifted {
+    fn sift_plain(&self, simd: Simd, brick: &Brick, tossing: &mut Tossing) -> Sifted {
         let Tossing { at, first, fate, cells, samples, normals, locals, .. } = tossing;
         let n = brick.len().min(BRICK_VOXELS);
         self.places.all(&brick.index[..n], at);
@@ -273,19 +273,46 @@ impl<P: Placing> Sieve<'_, P> {
             Some(of) => normals.iter_mut().zip(of).for_each(|(to, &of)| *to = of.into()),
             None => normals[..n].fill(NO_NORMAL.into()),
         }
-        // From the front on, nothing is overwritten that is still to be moved.
-        let mut kept = 0;
-        for i in 0..n {
-            if P::KEPT {
-                (x[kept], y[kept], z[kept]) = (x[i], y[i], z[i]);
-            } else {
-                locals[kept] = brick.index[i].into();
-            }
-            first[kept] = first[i];
-            (cells[kept], samples[kept], normals[kept]) = (cells[i], samples[i], normals[i]);
-            kept += usize::from(fate[i] >= wanted);
+        if !P::KEPT {
+            locals.iter_mut().zip(&brick.index).for_each(|(to, &of)| *to = of.into());
         }
+        let kept = keep(simd, tossing, n, wanted, P::KEPT);
         Sifted { reached, kept }
+    }
+}
+
+/// Puts those of the first `n` whose fate is `wanted` or more beside each other, with places or with local indices;
+/// says how many there are.
+#[inline(always)]
+fn keep(simd: Simd, tossing: &mut Tossing, n: usize, wanted: u32, places: bool) -> usize {
+    let n = n.min(BRICK_VOXELS);
+    match simd.0 {
+        // SAFETY: the value proves that the instructions are there.
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512 if !places => unsafe { wide::avx512::keep(tossing, n, wanted) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx2 if !places => unsafe { wide::avx2::keep(tossing, n, wanted) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon if !places => unsafe { wide::neon::keep(tossing, n, wanted) },
+        _ => {
+            let Tossing { at, first, fate, cells, samples, normals, locals, .. } = tossing;
+            let [x, y, z] = at;
+            // From the front on, nothing is overwritten that is still to be moved.
+            let mut kept = 0;
+            for i in 0..n {
+                if places {
+                    (x[kept], y[kept], z[kept]) = (x[i], y[i], z[i]);
+                } else {
+                    locals[kept] = locals[i];
+                }
+                first[kept] = first[i];
+                (cells[kept], samples[kept], normals[kept]) = (cells[i], samples[i], normals[i]);
+                kept += usize::from(fate[i] >= wanted);
+            }
+            kept
+        }
     }
 }
 
@@ -298,7 +325,7 @@ impl Sieve<'_, DeepBrick<'_>> {
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe { wide::avx512::sift(self, brick, tossing) },
             // Four divisions at a time are too few to place voxels that are not there, too; NEON has two.
-            _ => self.sift_plain(brick, tossing),
+            _ => self.sift_plain(simd, brick, tossing),
         }
     }
 }
@@ -317,7 +344,7 @@ impl Sieve<'_, FlatBrick<'_>> {
             // SAFETY: as above.
             #[cfg(target_arch = "aarch64")]
             Level::Neon => unsafe { wide::neon::sift(self, brick, tossing) },
-            Level::Plain => self.sift_plain(brick, tossing),
+            Level::Plain => self.sift_plain(simd, brick, tossing),
         }
     }
 
@@ -442,6 +469,17 @@ mod wide {
                     }
                 }
 
+                /// [`super::super::keep`], with local indices.
+                #[target_feature(enable = $features)]
+                pub(in super::super) fn keep(
+                    tossing: &mut Tossing,
+                    n: usize,
+                    wanted: u32,
+                ) -> usize {
+                    // SAFETY: these are the instructions.
+                    unsafe { super::keep::<$lanes>(tossing, n, wanted) }
+                }
+
                 /// [`super::super::make_ready`].
                 #[target_feature(enable = $features)]
                 pub(in super::super) fn make_ready(
@@ -463,6 +501,31 @@ mod wide {
     compiled!(avx2, "avx2,popcnt,lzcnt,bmi1,bmi2", Eight);
     #[cfg(target_arch = "x86_64")]
     compiled!(avx512, "avx512f,avx512vl,avx512dq,avx512bw,popcnt,lzcnt,bmi1,bmi2", Sixteen);
+
+    #[inline(always)]
+    unsafe fn keep<L: Lanes>(tossing: &mut Tossing, n: usize, wanted: u32) -> usize {
+        let Tossing { first, fate, cells, samples, normals, locals, .. } = tossing;
+        let mut kept = 0;
+        for from in (0..n.min(512)).step_by(L::LANES) {
+            let there = (1u64 << (n - from).min(L::LANES)) as u32 - 1;
+            // SAFETY: the caller's. Arrays have 512 numbers, a multiple of lanes; and as no more are kept than were gone
+            // through, what is stored lies where these lanes lay or in front.
+            unsafe {
+                let fate = L::load(fate.as_ptr().add(from));
+                let mark = L::bits(L::less(L::set(wanted as i32 - 1), fate)) & there;
+                let put = |of: *mut u32| {
+                    let some = L::beside(mark, L::load(of.add(from)));
+                    L::store(of.add(kept), some);
+                };
+                put(first.as_mut_ptr().cast());
+                for of in [&mut *cells, samples, normals, locals] {
+                    put(of.as_mut_ptr());
+                }
+                kept += mark.count_ones() as usize;
+            }
+        }
+        kept
+    }
 
     /// Places in lanes.
     pub(super) trait Placed<L: Lanes>: Placing {

@@ -350,10 +350,7 @@ impl<S: Tiered, const N: usize> Open<S> for LevelSheets<'_, S, N> {
                 [(first, row); 2]
             } else {
                 let both = downs.get_disjoint_mut([here, behind]).expect("two sheets");
-                both.map(|down| {
-                    let (first, row) = down.row(y);
-                    (first, &*row)
-                })
+                both.map(|down| down.row(y))
             };
             let [(first, weights), (next, weights_next)] = rows;
             let above = [

@@ -3,7 +3,8 @@
 //! Voxels are placed, in a flat view by an addition, tested against the part's sheets and one bit of
 //! its mask, and those that are left put beside each other. With AVX-512 that is done for sixteen local
 //! indices at a time, present or not, in flat views with AVX2 for eight and with NEON for four, and what is
-//! not wanted never gets out of the registers; elsewhere in loops over plain arrays, one for each step.
+//! not wanted never gets out of the registers; elsewhere in loops over plain arrays, one for each step, and what is
+//! kept is put beside each other in lanes.
 
 use super::records::Splat;
 use super::tiers::Shape;

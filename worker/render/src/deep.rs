@@ -10,7 +10,7 @@
 
 use crate::batch::{Axes, Batch};
 use crate::footprint::{Footprint, Leaning};
-use crate::level::{Hull, LevelSheets};
+use crate::level::LevelSheets;
 use crate::mask::{OpenMask, REACH_MOST};
 use crate::scene::Frame;
 use crate::splat::records::apart::{Apart, BATCH, Each, WINDOW, Woven, after};
@@ -52,10 +52,8 @@ struct Places {
     eye: [Each<f64>; 3],
     /// Where a section of each is along an axis.
     aside: Each<f64>,
-    /// In a level view, which storey each belongs to, the rows that it reaches, and by slot which tier and where
-    /// among all of a sheet.
+    /// In a level view, which storey each belongs to, and by slot which tier and where among all of a sheet.
     storey: Each<i32>,
-    hull: Hull,
     tiers: [Each<u32>; MOST],
     places: [Each<u32>; MOST],
 }
@@ -66,7 +64,6 @@ impl Default for Places {
             eye: [[0.0; BATCH]; 3],
             aside: [0.0; BATCH],
             storey: [0; BATCH],
-            hull: Hull::default(),
             tiers: [[0; BATCH]; MOST],
             places: [[0; BATCH]; MOST],
         }
@@ -334,9 +331,14 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
     }
 
     /// Where each section of the first `n` voxels of the batch lies, and the windows that hold all of a voxel's,
-    /// along x and, if `down`, along y.
+    /// along some axes: rows before columns, which may hang on them.
     #[inline(always)]
-    fn place(&mut self, n: usize, k: i32, (axes, scales): &Footprints<'_, S, N>, down: bool) {
+    fn place(
+        &mut self,
+        (n, k): (usize, i32),
+        (axes, scales): &Footprints<'_, S, N>,
+        along: &[usize],
+    ) {
         let Part { frame, rect, .. } = self.part;
         let Places { eye, aside, .. } = &mut *self.places;
         let n = whole_registers(n);
@@ -349,11 +351,8 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
         }
         let leaning = frame.leaning.as_ref();
         let row = leaning.map_or(0, Leaning::row);
-        // Rows first, since columns may hang on them.
-        for (axis, origin) in [(1, rect.y0), (0, rect.x0)] {
-            if axis == 1 && !down {
-                continue;
-            }
+        for &axis in along {
+            let origin = [rect.x0, rect.y0][axis];
             apart.begin(axis, n);
             let lean = leaning.filter(|leaning| leaning.most(axis) > 0.0);
             for at in 0..N {
@@ -410,7 +409,7 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
         open: &OpenMask,
         counted: (usize, &mut Counters),
     ) {
-        self.place(n, k, footprints, true);
+        self.place((n, k), footprints, &[1, 0]);
         let (part, eyes, across) =
             ((self.part, open), Some(&mut self.places.eye), &mut self.across);
         self.batch.add(part, (n, k), &footprints.0, eyes, across, sheets, counted);
@@ -434,19 +433,15 @@ impl<S: Tiered, const N: usize> DeepStage<'_, S, N> {
         let storeys = frame.storeys.as_ref().expect("a level view");
         let shape = sheets.tiers.shape();
         let most = frame.sections.most() as i32;
-        let known = sheets.hull(k, most as usize, &mut self.places.hull);
-        self.place(n, k, footprints, !known);
-        let Places { eye, storey, hull, tiers, places, .. } = &mut *self.places;
+        self.place((n, k), footprints, &[0]);
+        let hull = sheets.hull(k, most as usize);
+        let Places { eye, storey, tiers, places, .. } = &mut *self.places;
+        let Apart { lo, hi, .. } = &mut self.batch.apart;
         let (per, first) = storeys.by_eye();
         let all = whole_registers(n);
-        for (storey, y) in storey[..all].iter_mut().zip(&eye[1]) {
-            *storey = round_i32(y * per + first);
-        }
-        if known {
-            let Apart { lo, hi, .. } = &mut self.batch.apart;
-            for (i, storey) in storey[..all].iter().enumerate() {
-                [lo[1][i], hi[1][i]] = hull.of(*storey);
-            }
+        for (i, storey) in storey[..all].iter_mut().enumerate() {
+            *storey = round_i32(eye[1][i] * per + first);
+            [lo[1][i], hi[1][i]] = hull.of(*storey);
         }
         for (at, tiers) in tiers[..N].iter_mut().enumerate() {
             let sheet = layers.after(at);

@@ -184,6 +184,7 @@ pub(crate) struct LevelSheets<'a, S: Recorded, const N: usize> {
     any: [bool; N],
     /// By slot, or one for all sheets.
     downs: [Down<'a, S::Weight>; N],
+    hull: Hull,
 }
 
 impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
@@ -208,6 +209,7 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
             touched: [[0; ROWS]; N],
             any: [false; N],
             downs: std::array::from_fn(|_| Down::default()),
+            hull: Hull::default(),
         }
     }
 
@@ -251,11 +253,12 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
     }
 }
 
-/// Rows of a part's pixels that storeys reach in some sheets: of each storey from `base` on the first one, and the one
-/// behind the last.
+/// Rows of a part's pixels that storeys reach in the sheets from one on.
 pub(crate) struct Hull {
-    /// The storey of the first tier of each sheet.
+    /// The first of the sheets, and the storey of each one's first tier.
+    k: i32,
     pub(crate) bases: [i32; MOST],
+    /// Of `n` storeys from `base` on the first row, and the one behind the last.
     base: i32,
     n: usize,
     rows: [[i32; 2 * ROWS]; 2],
@@ -263,7 +266,7 @@ pub(crate) struct Hull {
 
 impl Default for Hull {
     fn default() -> Self {
-        Hull { bases: [0; MOST], base: 0, n: 1, rows: [[0; 2 * ROWS]; 2] }
+        Hull { k: i32::MIN, bases: [0; MOST], base: 0, n: 1, rows: [[0; 2 * ROWS]; 2] }
     }
 }
 
@@ -277,30 +280,34 @@ impl Hull {
 }
 
 impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
-    /// Fills `hull` for `most` sheets from `k` on, of which there are no more than slots; whether it has room for that.
+    /// Rows that storeys reach in `most` sheets from `k` on, of which there are no more than slots.
+    ///
+    /// Perspective's windows are below 40 pixels, so a voxel's sections lie less than 20 aside of its centre. Thus
+    /// its sheets' first tiers lie less than 2 * 20 / [`crate::storeys`]' least distance apart, 54 storeys, and a table of
+    /// twice the rows of a sheet holds all.
     #[inline(always)]
-    pub(crate) fn hull(&mut self, k: i32, most: usize, hull: &mut Hull) -> bool {
-        let rows = self.tiers.shape().rows;
+    pub(crate) fn hull(&mut self, k: i32, most: usize) -> &Hull {
+        if self.hull.k == k {
+            return &self.hull;
+        }
         let mut which = [0; N];
         for (j, which) in which.iter_mut().enumerate() {
             *which = self.down(k + j.min(most - 1) as i32);
         }
+        let LevelSheets { hull, downs, tiers, .. } = self;
+        let rows = tiers.shape().rows;
         let (mut first, mut last) = (i32::MAX, i32::MIN);
         for (to, &which) in hull.bases.iter_mut().zip(&which) {
-            *to = self.downs[which].base;
+            *to = downs[which].base;
             (first, last) = (first.min(*to), last.max(*to));
         }
-        let apart = last.abs_diff(first) as usize;
-        if apart + rows > 2 * ROWS {
-            return false;
-        }
-        (hull.base, hull.n) = (first, apart + rows);
+        (hull.k, hull.base, hull.n) = (k, first, last.abs_diff(first) as usize + rows);
         for (rows, none) in hull.rows.iter_mut().zip([i32::MAX, i32::MIN]) {
             rows[..hull.n].fill(none);
         }
         let [lo, hi] = &mut hull.rows;
         for &which in &which[..most.min(N)] {
-            let Down { base, first: of, len, .. } = &self.downs[which];
+            let Down { base, first: of, len, .. } = &downs[which];
             // A tier that is not there lies beyond the outermost, which does not reach the part either.
             let begin = base.abs_diff(first) as usize;
             let inside = begin..begin + rows;
@@ -314,7 +321,7 @@ impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
                 (*lo, *hi) = ((*lo).min(*of), (*hi).max(of + len));
             }
         }
-        true
+        hull
     }
 }
 

@@ -290,13 +290,10 @@ fn keep(simd: Simd, tossing: &mut Tossing, n: usize, wanted: u32, places: bool) 
     match simd.0 {
         // SAFETY: the value proves that the instructions are there.
         #[cfg(target_arch = "x86_64")]
-        Level::Avx512 if !places => unsafe { wide::avx512::keep(tossing, n, wanted) },
-        // SAFETY: as above.
-        #[cfg(target_arch = "x86_64")]
-        Level::Avx2 if !places => unsafe { wide::avx2::keep(tossing, n, wanted) },
+        Level::Avx2 if !places => unsafe { wide::keep_eight(tossing, n, wanted) },
         // SAFETY: as above.
         #[cfg(target_arch = "aarch64")]
-        Level::Neon if !places => unsafe { wide::neon::keep(tossing, n, wanted) },
+        Level::Neon if !places => unsafe { wide::keep_four(tossing, n, wanted) },
         _ => {
             let Tossing { at, first, fate, cells, samples, normals, locals, .. } = tossing;
             let [x, y, z] = at;
@@ -470,17 +467,6 @@ mod wide {
                     }
                 }
 
-                /// [`super::super::keep`], with local indices.
-                #[target_feature(enable = $features)]
-                pub(in super::super) fn keep(
-                    tossing: &mut Tossing,
-                    n: usize,
-                    wanted: u32,
-                ) -> usize {
-                    // SAFETY: these are the instructions.
-                    unsafe { super::keep::<$lanes>(tossing, n, wanted) }
-                }
-
                 /// [`super::super::make_ready`].
                 #[target_feature(enable = $features)]
                 pub(in super::super) fn make_ready(
@@ -502,6 +488,22 @@ mod wide {
     compiled!(avx2, "avx2,popcnt,lzcnt,bmi1,bmi2", Eight);
     #[cfg(target_arch = "x86_64")]
     compiled!(avx512, "avx512f,avx512vl,avx512dq,avx512bw,popcnt,lzcnt,bmi1,bmi2", Sixteen);
+
+    /// [`super::keep`] with local indices; AVX-512 does that while it sifts.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2,popcnt,lzcnt,bmi1,bmi2")]
+    pub(super) fn keep_eight(tossing: &mut Tossing, n: usize, wanted: u32) -> usize {
+        // SAFETY: these are the instructions.
+        unsafe { keep::<Eight>(tossing, n, wanted) }
+    }
+
+    /// [`super::keep`] with local indices.
+    #[cfg(target_arch = "aarch64")]
+    #[target_feature(enable = "neon")]
+    pub(super) fn keep_four(tossing: &mut Tossing, n: usize, wanted: u32) -> usize {
+        // SAFETY: these are the instructions.
+        unsafe { keep::<Four>(tossing, n, wanted) }
+    }
 
     #[inline(always)]
     unsafe fn keep<L: Lanes>(tossing: &mut Tossing, n: usize, wanted: u32) -> usize {

@@ -1,4 +1,7 @@
-//! Pixels are exact: golden frames, and one hash whatever the cluster looks like.
+//! Pixels are exact: golden frames, and one hash whatever the cluster looks like. With [`extremes`] in one program,
+//! since each has a long test that leaves a processor free now and then.
+
+mod extremes;
 
 use std::process::Command;
 

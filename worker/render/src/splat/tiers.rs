@@ -24,8 +24,6 @@ pub(crate) struct Shape {
     wide: usize,
     /// Columns before a part's first.
     pub(crate) margin: usize,
-    /// Lines from where a footprint begins that any may reach.
-    groups: usize,
     /// Pixels of a line.
     line: usize,
     /// Columns of a footprint at most.
@@ -37,18 +35,23 @@ const fn a_line<S: Recorded>() -> usize {
     size_of::<Line>() / size_of::<S::Pixel>()
 }
 
+/// How many groups of so many columns a footprint of `len` may reach: it may begin in the last column of the first.
+#[inline(always)]
+fn groups(len: usize, columns: usize) -> usize {
+    (len + columns - 1).div_ceil(columns)
+}
+
 impl Shape {
     /// For footprints of at most `len` columns and so many tiers.
     pub(crate) fn new<S: Recorded>(rows: usize, len: usize) -> Shape {
         assert!(rows <= ROWS && len < 64, "{rows} tiers for footprints of {len}");
         let margin = len.next_multiple_of(8);
-        // As a footprint may begin in the last column of a line.
-        let groups = (len + a_line::<S>() - 1).div_ceil(a_line::<S>());
+        let groups = groups(len, a_line::<S>());
         // Whole chunks of weights are added: of sixteen columns, or of four lines where there are more.
         let sixteen = 16 / a_line::<S>();
         let spare = groups.next_multiple_of(if groups > 4 { 4 } else { sixteen });
         let wide = (margin + PART as usize) / a_line::<S>() + spare;
-        Shape { rows, wide, margin, groups, line: a_line::<S>(), len }
+        Shape { rows, wide, margin, line: a_line::<S>(), len }
     }
 
     /// Lines of tiers for `sheets`.
@@ -660,11 +663,6 @@ mod avx2 {
         [2 * wide, 2 * rows * wide]
     }
 
-    /// Registers that a footprint reaches at most.
-    fn groups<S: Recorded>(shape: &Shape) -> usize {
-        (shape.len + columns::<S>() - 1).div_ceil(columns::<S>())
-    }
-
     #[target_feature(enable = "avx2")]
     pub(super) fn add_flat_shorts<const N: usize>(
         tiers: &mut Tiers<'_, i16, N>,
@@ -672,7 +670,7 @@ mod avx2 {
         slot: usize,
         weights: &Weights<'_, i16>,
     ) {
-        let groups = groups::<i16>(&tiers.shape);
+        let groups = groups(tiers.shape.len, columns::<i16>());
         by_groups!(groups, 4, flat_shorts[N](tiers, voxels, slot, weights));
     }
 
@@ -719,7 +717,7 @@ mod avx2 {
         places: &[Each<u32>; MOST],
         layers: &Layers<'_, i16, N>,
     ) {
-        let groups = groups::<i16>(&tiers.shape);
+        let groups = groups(tiers.shape.len, columns::<i16>());
         by_groups!(groups, 4, apart_shorts[N](tiers, voxels, places, layers));
     }
 
@@ -833,7 +831,7 @@ mod avx2 {
     ) where
         S: Recorded<Depth = f32> + Accumulate<Weight = Tap>,
     {
-        let groups = groups::<S>(&tiers.shape);
+        let groups = groups(tiers.shape.len, columns::<S>());
         if C == 4 {
             by_groups!(groups, 4, flat_longs[S, C, N](tiers, voxels, slot, weights));
         } else {
@@ -886,7 +884,7 @@ mod avx2 {
         places: &[Each<u32>; MOST],
         layers: &Layers<'_, i32, N>,
     ) {
-        let groups = groups::<i32>(&tiers.shape);
+        let groups = groups(tiers.shape.len, columns::<i32>());
         by_groups!(groups, 4, apart_longs[N](tiers, voxels, places, layers));
     }
 
@@ -1155,7 +1153,11 @@ mod avx512 {
         slot: usize,
         weights: &Weights<'_, i16>,
     ) {
-        by_groups!(tiers.shape.groups, 4, flat_shorts[N](tiers, voxels, slot, weights));
+        by_groups!(
+            groups(tiers.shape.len, a_line::<i16>()),
+            4,
+            flat_shorts[N](tiers, voxels, slot, weights)
+        );
     }
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
@@ -1204,7 +1206,11 @@ mod avx512 {
         places: &[Each<u32>; MOST],
         layers: &Layers<'_, i16, N>,
     ) {
-        by_groups!(tiers.shape.groups, 4, apart_shorts[N](tiers, voxels, places, layers));
+        by_groups!(
+            groups(tiers.shape.len, a_line::<i16>()),
+            4,
+            apart_shorts[N](tiers, voxels, places, layers)
+        );
     }
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
@@ -1450,9 +1456,9 @@ mod avx512 {
         S: Recorded<Depth = f32> + Accumulate<Weight = Tap>,
     {
         if C == 4 {
-            by_groups!(tiers.shape.groups, 4, flat_longs[S, C, N](tiers, voxels, slot, weights));
+            by_groups!(groups(tiers.shape.len, a_line::<S>()), 4, flat_longs[S, C, N](tiers, voxels, slot, weights));
         } else {
-            by_groups!(tiers.shape.groups, 2, flat_longs[S, C, N](tiers, voxels, slot, weights));
+            by_groups!(groups(tiers.shape.len, a_line::<S>()), 2, flat_longs[S, C, N](tiers, voxels, slot, weights));
         }
     }
 
@@ -1506,7 +1512,11 @@ mod avx512 {
         places: &[Each<u32>; MOST],
         layers: &Layers<'_, i32, N>,
     ) {
-        by_groups!(tiers.shape.groups, 4, apart_longs[N](tiers, voxels, places, layers));
+        by_groups!(
+            groups(tiers.shape.len, a_line::<i32>()),
+            4,
+            apart_longs[N](tiers, voxels, places, layers)
+        );
     }
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]

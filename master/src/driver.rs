@@ -218,6 +218,7 @@ impl Master {
             clock: RealClock(Instant::now()),
             silence: config.schedule.silence,
             rehearse: config.rehearse,
+            in_reserve: 0,
             scheduler: Watched::new(config.schedule, config.record),
             links: BTreeMap::new(),
             next_worker: 1,
@@ -412,6 +413,8 @@ struct Driver {
     clock: RealClock,
     silence: Micros,
     rehearse: bool,
+    /// Workers in reserve when that was said last.
+    in_reserve: usize,
     scheduler: Watched,
     links: BTreeMap<WorkerId, Attached>,
     next_worker: u64,
@@ -647,6 +650,15 @@ impl Driver {
         }
     }
 
+    /// Says how many workers draw where that has changed.
+    fn tell_of_reserve(&mut self) {
+        let in_reserve = self.scheduler.in_reserve();
+        if std::mem::replace(&mut self.in_reserve, in_reserve) != in_reserve {
+            let drawing = self.links.len().saturating_sub(in_reserve);
+            info!(drawing, in_reserve, "as many workers draw as frames are soonest done with");
+        }
+    }
+
     fn workers(&self) -> Vec<Worker> {
         let ms = |since: Instant| since.elapsed().as_millis() as u64;
         let view = |w: slabcast_schedule::WorkerView| {
@@ -664,6 +676,7 @@ impl Driver {
                 tasks_done: a.tasks_done,
                 silent_ms: ms(a.heard),
                 here_ms: ms(a.since),
+                in_reserve: w.in_reserve,
             })
         };
         self.scheduler.workers().into_iter().filter_map(view).collect()
@@ -968,6 +981,7 @@ impl Driver {
             let FrameStats { ms, pixels_sha256, .. } = &frame.stats;
             info!(ms = ms.total, pixels_sha256, "frame done");
         });
+        self.tell_of_reserve();
         let number = frame.number;
         let mut table = self.jobs.lock();
         let mut over = false;

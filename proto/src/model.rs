@@ -134,6 +134,8 @@ pub struct Worker {
     pub silent_ms: u64,
     /// Milliseconds since it came.
     pub here_ms: u64,
+    /// It is lent nothing for now: the others draw as many frames without it.
+    pub in_reserve: bool,
 }
 
 /// A piece of a frame.

@@ -131,7 +131,7 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), Fail> {
                 bytes(w.held_bytes),
                 bytes(w.memory_budget_bytes),
                 w.tasks_done.to_string(),
-                w.tasks_lent.to_string(),
+                if w.in_reserve { "in reserve".into() } else { w.tasks_lent.to_string() },
                 time(Duration::from_millis(w.here_ms)),
             ]
         }));
@@ -230,6 +230,7 @@ fn worker_json(w: &Worker) -> serde_json::Value {
         "simd": w.simd, "memory_budget_bytes": w.memory_budget_bytes,
         "held_bytes": w.held_bytes, "held_bricks": w.held_bricks, "tasks_lent": w.tasks_lent,
         "tasks_done": w.tasks_done, "silent_ms": w.silent_ms, "here_ms": w.here_ms,
+        "in_reserve": w.in_reserve,
     })
 }
 

@@ -256,6 +256,11 @@ impl Frame {
         self.slab.is_none() && self.at == self.slabs.len()
     }
 
+    /// Whether no other was in the making or waited when it began.
+    pub(crate) fn is_alone(&self) -> bool {
+        self.alone
+    }
+
     /// Whether it can go beside other frames of its set.
     pub(crate) fn by_region(&self) -> bool {
         goes_by_region(&self.job)
@@ -672,7 +677,7 @@ impl Frame {
                 (Vec::new(), false)
             }
             Some(id) if orphaning.is_empty() => {
-                let worker = cluster.roster.get(id).filter(|w| !w.leaving && room(id, w));
+                let worker = cluster.roster.get(id).filter(|w| w.draws() && room(id, w));
                 (worker.map(|w| (id, u64::from(w.threads))).into_iter().collect(), false)
             }
             _ => {

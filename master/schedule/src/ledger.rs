@@ -152,6 +152,11 @@ impl Ledger {
         }
     }
 
+    /// How long render threads drew.
+    pub(crate) fn drew_us(&self) -> Micros {
+        self.accounts.values().map(|a| a.render_us).sum()
+    }
+
     /// A result came that counts, in a message of so many bytes if it crossed a network.
     pub(crate) fn came(&mut self, bytes: Option<u32>) {
         if let Some(bytes) = bytes {

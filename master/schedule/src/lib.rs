@@ -31,7 +31,8 @@
 //!
 //! [`frame`](is_shut) the states of one frame, under either schedule; `region` what is the `region`
 //! schedule's own, with `alone` for a frame that nobody waits behind; [`macrotile`] the quadtree and its workload, `queue` leases with epochs,
-//! `residency` who holds which brick, `roster` workers and every deadline, `traffic` whether the link bears more,
+//! `residency` who holds which brick, `roster` workers and every deadline, `traffic` whether the link bears more, `reserve` how many
+//! workers are enough,
 //! `ledger` what a frame cost, `critical` what it waited for.
 
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
@@ -53,6 +54,7 @@ mod ledger;
 pub mod macrotile;
 mod queue;
 mod region;
+mod reserve;
 mod residency;
 mod roster;
 pub mod sim;
@@ -65,6 +67,7 @@ pub use spans::Spans;
 
 use frame::{Frame, Step, Turn, carry, goes_by_region};
 use region::Memory;
+use reserve::Reserve;
 use residency::Residency;
 use roster::Roster;
 use traffic::Traffic;
@@ -353,6 +356,8 @@ pub struct WorkerView {
     pub since: Micros,
     /// Whether it takes no more leases.
     pub leaving: bool,
+    /// Whether it takes none for now, since the others draw as many frames without it.
+    pub in_reserve: bool,
 }
 
 /// Counts over the scheduler's life.
@@ -389,6 +394,7 @@ struct Cluster {
     residency: Residency,
     memory: Memory,
     traffic: Traffic,
+    reserve: Reserve,
     out: VecDeque<Action>,
     next_task: u64,
     totals: Totals,
@@ -439,6 +445,7 @@ impl Scheduler {
                 residency: Residency::default(),
                 memory: Memory::default(),
                 traffic: Traffic::default(),
+                reserve: Reserve::default(),
                 out: VecDeque::new(),
                 next_task: 0,
                 totals: Totals::default(),
@@ -527,6 +534,8 @@ impl Scheduler {
                 cluster.roster.heard(worker, now);
                 let lent = |f: &&mut Frame| f.has_lent(worker, task, epoch);
                 if let Some(frame) = self.active.iter_mut().find(lent) {
+                    cluster.reserve.call_all();
+                    cluster.roster.halve(0);
                     frame.failed(cluster, worker, task, epoch, reason);
                 }
             }
@@ -664,8 +673,14 @@ impl Scheduler {
                 let Some(job) = self.waiting.pop_front() else { break };
                 if self.active.is_empty() {
                     self.cluster.traffic.begin(clock.now());
+                    self.cluster.reserve.begin(clock.now());
                 }
                 let alone = self.active.is_empty() && self.waiting.is_empty();
+                let halved = match goes_by_region(&job) {
+                    true => self.cluster.reserve.halved(job.scene.id, alone),
+                    false => 0,
+                };
+                self.cluster.roster.halve(halved);
                 let beside = (self.beside(), alone);
                 self.active.push_back(Frame::start(job, beside, &mut self.cluster, clock));
                 // To it, all are new, and to the one before it is no longer the last.
@@ -694,7 +709,14 @@ impl Scheduler {
         while self.active.front().is_some_and(Frame::is_done) {
             let Some(mut done) = self.active.pop_front() else { break };
             done.end(&mut self.cluster);
-            self.cluster.traffic.done(!self.active.is_empty(), clock.now());
+            let (beside, now) = (!self.active.is_empty(), clock.now());
+            self.cluster.traffic.done(beside, now);
+            if done.by_region() && beside != done.is_alone() {
+                let roster = &self.cluster.roster;
+                let drawing = (roster.staying().count(), roster.threads());
+                let full = self.cluster.traffic.is_full();
+                self.cluster.reserve.done((!beside, full), done.ledger.drew_us(), drawing, now);
+            }
             let done = done.finish(&mut self.cluster, clock.now());
             self.cluster.out.push_back(done);
             ended = true;
@@ -804,9 +826,15 @@ impl Scheduler {
                 leases,
                 since: w.since,
                 leaving: w.leaving,
+                in_reserve: self.cluster.roster.has_in_reserve(id),
             }
         };
         self.cluster.roster.iter().map(view).collect()
+    }
+
+    /// How many workers are held in reserve ([`WorkerView::in_reserve`]).
+    pub fn in_reserve(&self) -> usize {
+        self.cluster.roster.in_reserve()
     }
 
     /// Counts over the scheduler's life.

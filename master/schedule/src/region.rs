@@ -30,7 +30,7 @@
 
 use crate::alone;
 use crate::macrotile::{Cut, Macrotile, Through};
-use crate::roster::Roster;
+use crate::roster::{Roster, Worker};
 use crate::{FrameJob, Micros};
 use slabcast_common::blocks::{Block, Blocks};
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
@@ -390,9 +390,10 @@ fn part_of(
     MORE * share * one.us
 }
 
-/// Where a worker is among those who stay.
-fn place_of(staying: &[(WorkerId, f64)], id: WorkerId) -> Option<usize> {
-    staying.binary_search_by_key(&id, |s| s.0).ok()
+/// Where a worker is among those who stay; of one in reserve, where its neighbour is, who takes its place.
+fn place_of(staying: &[(WorkerId, f64)], id: WorkerId, roster: &Roster) -> Option<usize> {
+    let beside = |at: usize| roster.has_in_reserve(id).then(|| at.saturating_sub(1));
+    staying.binary_search_by_key(&id, |s| s.0).or_else(|at| beside(at).ok_or(())).ok()
 }
 
 /// What frames learn from each other by: a brick set, a size of pictures, and who draws.
@@ -542,14 +543,14 @@ impl Regions {
 
     /// Those whose tiles these are and who are gone, or leave.
     pub(crate) fn orphaning(&self, roster: &Roster) -> Vec<WorkerId> {
-        let gone = |id: &WorkerId| roster.get(*id).is_none_or(|w| w.leaving);
+        let gone = |id: &WorkerId| roster.get(*id).is_none_or(|w| !w.draws());
         self.owned.keys().copied().filter(gone).collect()
     }
 
     /// Whose a task is next time, if this worker drew it now.
     pub(crate) fn home(&self, place: u32, drew: WorkerId, roster: &Roster) -> WorkerId {
         let home = self.homes[place as usize];
-        if roster.get(home).is_some_and(|w| !w.leaving) { home } else { drew }
+        if roster.get(home).is_some_and(Worker::draws) { home } else { drew }
     }
 
     /// Whose a task is.
@@ -720,7 +721,8 @@ fn level(
         None => (t.est as f64 * unit, 1.0),
     };
     let takes: Vec<(f64, f64)> = tiles.iter().map(takes).collect();
-    let held: Vec<Option<usize>> = tiles.iter().map(|t| place_of(&staying, known(t)?.0)).collect();
+    let held: Vec<Option<usize>> =
+        tiles.iter().map(|t| place_of(&staying, known(t)?.0, roster)).collect();
     let prices: Vec<f64> = tiles.iter().map(price).collect();
     let cost = |i: usize, w: usize| {
         let slower = slows[w] / takes[i].1;
@@ -819,7 +821,8 @@ fn share(
         None => (t.est as f64 * mean, 1.0),
     };
     let takes: Vec<(f64, f64)> = tiles.iter().map(takes).collect();
-    let homes: Vec<Option<usize>> = tiles.iter().map(|t| place_of(&staying, home(t)?)).collect();
+    let homes: Vec<Option<usize>> =
+        tiles.iter().map(|t| place_of(&staying, home(t)?, roster)).collect();
     let cost = |i: usize, w: usize| takes[i].0 * slowness[w] / takes[i].1 / staying[w].1;
     let mut load = vec![0.0; staying.len()];
     // In the order of rows.

@@ -15,10 +15,12 @@
 //! heartbeats, which can't happen to a driver that keeps `next_deadline`, the excess is added
 //! to everybody's account.
 
+use crate::reserve;
 use crate::{Config, Micros};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, SceneId, WorkerId};
 use slabcast_common::message::DIRECTORIES;
+use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
@@ -42,6 +44,8 @@ pub(crate) struct Worker {
     pub(crate) since: Micros,
     /// It takes no more leases.
     pub(crate) leaving: bool,
+    /// It takes none as long as the others are enough (`reserve`).
+    reserve: bool,
     /// Scenes it was sent.
     pub(crate) scenes: BTreeSet<SceneId>,
     /// Leases of frames in the making that it has not answered.
@@ -79,6 +83,11 @@ impl Worker {
         true
     }
 
+    /// Whether it takes leases.
+    pub(crate) fn draws(&self) -> bool {
+        !self.leaving && !self.reserve
+    }
+
     /// Whether one of its threads has no lease.
     pub(crate) fn is_dry(&self) -> bool {
         self.leases < u64::from(self.threads)
@@ -102,10 +111,12 @@ pub(crate) struct Roster {
     quiet_until: Micros,
     /// Render threads of those that take leases.
     threads: u64,
-    /// Workers that have fewer leases than threads, leaving ones among them.
+    /// Workers that have fewer leases than threads, those among them that take none.
     dry: usize,
-    /// Grows when somebody comes, leaves or is lost.
+    /// Grows when somebody comes, leaves, is lost, or goes into reserve or out of it.
     changes: u64,
+    /// How often workers are halved, so that the others are held in reserve.
+    halved: u32,
 }
 
 impl Roster {
@@ -115,6 +126,7 @@ impl Roster {
             threads: threads.clamp(1, MAX_THREADS),
             since: now,
             leaving: false,
+            reserve: false,
             scenes: BTreeSet::new(),
             leases: 0,
             over: Vec::new(),
@@ -129,14 +141,57 @@ impl Roster {
         self.dry += 1;
         self.changes += 1;
         self.quiet_until = self.quiet_until.min(now);
+        self.choose();
     }
 
     pub(crate) fn remove(&mut self, id: WorkerId) -> Option<Worker> {
         let worker = self.workers.remove(&id)?;
         self.dry -= usize::from(worker.is_dry());
-        self.threads -= if worker.leaving { 0 } else { u64::from(worker.threads) };
+        self.threads -= if worker.draws() { u64::from(worker.threads) } else { 0 };
         self.changes += 1;
+        self.choose();
         Some(worker)
+    }
+
+    /// Holds all in reserve but those that are left when workers were halved so often.
+    pub(crate) fn halve(&mut self, often: u32) {
+        if self.halved != often {
+            self.halved = often;
+            self.choose();
+        }
+    }
+
+    /// Whether a worker stays and is held in reserve.
+    pub(crate) fn has_in_reserve(&self, id: WorkerId) -> bool {
+        self.get(id).is_some_and(|w| !w.leaving && w.reserve)
+    }
+
+    /// How many of those that stay are held in reserve.
+    pub(crate) fn in_reserve(&self) -> usize {
+        self.workers.values().filter(|w| !w.leaving && w.reserve).count()
+    }
+
+    /// Whoever has most threads draws, since bricks are sent to each worker once; of equal ones every second, fourth, eighth
+    /// pair, so that what was two neighbours' becomes one's, and both crews (`region`) keep as many.
+    fn choose(&mut self) {
+        if self.halved == 0 && self.in_reserve() == 0 {
+            return;
+        }
+        let key = |id: WorkerId, w: &Worker| (Reverse(w.threads), (id.0 / 2).reverse_bits(), id);
+        let staying = self.workers.iter().filter(|(_, w)| !w.leaving);
+        let mut order: Vec<_> = staying.map(|(&id, w)| key(id, w)).collect();
+        order.sort_unstable();
+        let drawing = reserve::drawing(order.len(), self.halved);
+        for (i, (Reverse(threads), _, id)) in order.into_iter().enumerate() {
+            let w = self.workers.get_mut(&id).expect("just listed");
+            let reserve = i >= drawing;
+            if std::mem::replace(&mut w.reserve, reserve) != reserve {
+                let threads = u64::from(threads);
+                self.threads =
+                    if reserve { self.threads - threads } else { self.threads + threads };
+                self.changes += 1;
+            }
+        }
     }
 
     /// A worker takes no more leases. Whether that is news.
@@ -144,8 +199,9 @@ impl Roster {
         let Some(w) = self.workers.get_mut(&id) else { return false };
         let news = !std::mem::replace(&mut w.leaving, true);
         if news {
-            self.threads -= u64::from(w.threads);
+            self.threads -= if w.reserve { 0 } else { u64::from(w.threads) };
             self.changes += 1;
+            self.choose();
         }
         news
     }
@@ -166,12 +222,12 @@ impl Roster {
         self.dry += usize::from(!before && w.is_dry());
     }
 
-    /// Whether some thread has nothing to do, as far as is known; of workers that leave, too.
+    /// Whether some thread has nothing to do, as far as is known; of workers that take no leases, too.
     pub(crate) fn any_dry(&self) -> bool {
         self.dry > 0
     }
 
-    /// Another number than before: somebody came, leaves or was lost.
+    /// Another number than before: who takes leases has changed.
     pub(crate) fn changes(&self) -> u64 {
         self.changes
     }
@@ -190,7 +246,7 @@ impl Roster {
 
     /// Those that take leases.
     pub(crate) fn staying(&self) -> impl Iterator<Item = (WorkerId, &Worker)> {
-        self.iter().filter(|(_, w)| !w.leaving)
+        self.iter().filter(|(_, w)| w.draws())
     }
 
     /// Render threads of those that take leases.
@@ -327,6 +383,33 @@ mod tests {
         r.remove(WorkerId(1));
         assert!(r.remove(WorkerId(1)).is_none());
         assert_eq!((r.threads(), counted(&r)), (1, 1));
+    }
+
+    #[test]
+    fn who_draws_is_the_largest_and_of_equals_every_second_pair() {
+        let mut r = Roster::default();
+        for id in 0..16 {
+            r.join(WorkerId(id), "a".into(), 1, 0);
+        }
+        let drawing = |r: &Roster| r.staying().map(|(id, _)| id.0).collect::<Vec<_>>();
+        let before = r.changes();
+        r.halve(1);
+        assert_eq!(drawing(&r), [0, 1, 4, 5, 8, 9, 12, 13]);
+        assert_eq!((r.threads(), r.in_reserve()), (8, 8));
+        assert_ne!(r.changes(), before);
+        assert!(r.has_in_reserve(WorkerId(2)) && !r.has_in_reserve(WorkerId(1)));
+        // Somebody is lost, and somebody leaves: others take their places at once.
+        r.remove(WorkerId(0));
+        r.leaves(WorkerId(4));
+        assert_eq!(drawing(&r).len(), 7);
+        assert!(!r.has_in_reserve(WorkerId(4)), "who leaves is nobody's reserve");
+        r.join(WorkerId(20), "large".into(), 8, 0);
+        assert!(drawing(&r).contains(&20), "it has the most threads: {:?}", drawing(&r));
+        let counted = r.staying().map(|(_, w)| u64::from(w.threads)).sum::<u64>();
+        assert_eq!(r.threads(), counted);
+        r.halve(0);
+        assert_eq!((drawing(&r).len(), r.in_reserve()), (15, 0));
+        assert_eq!(r.threads(), 14 + 8);
     }
 
     #[test]

@@ -15,6 +15,7 @@ use slabcast_common::view::{Camera, CameraProjection, Projected, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Toll, Unknown, Unmeasured};
 use slabcast_schedule::{FrameJob, Span, Spans, macrotile, slabs as slabs_of};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 const SIZE: [u32; 2] = [256, 200];
@@ -342,6 +343,31 @@ fn crews_draw_in_turn_where_tiles_are_few_and_frames_many() {
     assert_eq!(crews(&alone), 0, "alone, a frame is everybody's: {alone:?}");
     assert_eq!(crews(&four), four.len(), "beside others, a crew's: {four:?}");
     assert_eq!(crews(&slow[..6]), 0, "but not while bricks fill the link: {slow:?}");
+}
+
+#[test]
+fn more_workers_than_are_good_are_held_in_reserve() {
+    let (slab, trace) = world(120);
+    let mut region = under(Schedule::Region, &slab);
+    region.iter_mut().for_each(|job| job.work.tile = Some(32));
+    // A message costs the master 30 us, and a view that turns by six degrees brings bricks to everybody.
+    let master = Toll { send: (15_000.0, 0.0), receive: (15_000.0, 0.0), ..Toll::default() };
+    let costs = Costs { master, ..Costs::default() };
+    let drew = |workers, bytes_per_s| {
+        let mut heard = Listener::default();
+        let link = Link { bytes_per_s: Some(bytes_per_s), latency_ns: 50_000 };
+        let c = Cluster { costs, link, in_flight: 4, ..cluster(workers) };
+        sim::run(&region, &trace, &c, &mut heard).expect("it can be predicted");
+        let last = &heard.0[100..];
+        let drew = last.iter().flat_map(|(s, _)| s.workers.iter().filter(|w| w.render_ms > 0.0));
+        let drew: BTreeSet<_> = drew.map(|w| &w.id).collect();
+        let times: Vec<_> =
+            last.iter().map(|(_, spans)| spans.iter().map(|s| s.end).max()).collect();
+        (drew.len(), times.last().copied().flatten().unwrap_or(0) - times[0].unwrap_or(0))
+    };
+    let (all, few) = (drew(32, 2e7), drew(8, 2e7));
+    assert!(all.0 <= 8, "{all:?} of 32 draw, {few:?} of 8");
+    assert!(all.1 < few.1 * 6 / 5, "{all:?} of 32, {few:?} of 8");
 }
 
 #[test]

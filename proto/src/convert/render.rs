@@ -339,6 +339,7 @@ pub fn worker_to_wire(worker: &Worker) -> v1::Worker {
         tasks_done: worker.tasks_done,
         silent_ms: worker.silent_ms,
         here_ms: worker.here_ms,
+        in_reserve: worker.in_reserve,
     }
 }
 
@@ -357,6 +358,7 @@ pub fn worker_from_wire(worker: v1::Worker) -> Result<Worker, WireError> {
         tasks_done: worker.tasks_done,
         silent_ms: worker.silent_ms,
         here_ms: worker.here_ms,
+        in_reserve: worker.in_reserve,
     })
 }
 

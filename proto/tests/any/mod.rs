@@ -662,5 +662,6 @@ pub fn worker() -> impl Strategy<Value = model::Worker> {
         tasks_done: n[4],
         silent_ms: n[5],
         here_ms: n[6],
+        in_reserve: m[0] % 2 == 1,
     })
 }

@@ -1,0 +1,250 @@
+//! How many workers draw, where all of them would be done later than some.
+//!
+//! Whoever draws is sent bricks, and bricks at the border of two workers' tiles are sent to both. So with more workers
+//! there is less to draw for each and more to send to all, and from some number on the link binds, or the master's thread,
+//! and each one more makes frames come later: mri256 `peer-opaque` at 512x512 and 1 Gbit/s, four in flight, has 430 frames a
+//! second on 8 workers, 397 on 15, 263 on 32 and 127 on 64 (`slabcast plan --frames 72`, a core that takes 10 ms a frame).
+//! So the others are **held in reserve**: they are lent nothing and sent nothing, until more are wanted or somebody is
+//! lost. With that 32 have 310 and 64 have 222, of which the first dozen come as slowly as before; then it is 400.
+//!
+//! What binds is not asked, since of the master's thread and of what results take nothing is known here. What is known is
+//! how long frames take and how much of that render threads draw. Where they stand still for the most part half of the
+//! workers would do, and half of them is tried ([`Level`]); if frames come later then, it is taken back.
+//!
+//! Frames that are alone and frames beside others are told apart, as in `traffic`: of those that are alone all ways
+//! and waking are part of the time, in which nobody draws.
+//!
+//! It refuses to know who is held in reserve (`roster`), and to go on with a number of workers that was not tried.
+
+use crate::Micros;
+use slabcast_common::ids::SceneId;
+
+/// Where threads draw for less than this of frames' time half of the workers would do: of frames beside others, and of
+/// such as are alone. Without a limit of bandwidth mri256 has 860 frames a second on 64 workers, whose threads draw for 0.14
+/// of the time, and 1340 on 32 (0.44). Of frames alone it takes 1.4 ms on 64 (0.12) and would take as long on 32; at 1 Gbit/s
+/// 4.2 and 3.6 (0.04 and 0.09). What is less is sent to fewer, so that each change costs bricks: at 0.4 and 0.1 a path of
+/// 72 frames was over before that was won back.
+const IDLE: [f64; 2] = [0.2, 0.05];
+
+/// The first of them while bricks fill the link, where bricks that a change brings are dearest.
+const IDLE_ON_A_FULL_LINK: f64 = 0.15;
+
+/// Where they draw for more than this twice as many are tried. That is far more than twice [`IDLE`], lest the two take
+/// turns.
+const BUSY: [f64; 2] = [0.85, 0.5];
+
+/// Frames after a change that say nothing: those that had begun, and bricks that the change brings.
+const SETTLE: [u32; 2] = [4, 2];
+
+/// Frames that are looked at together. Two crews' frames come in pairs.
+const WINDOW: u32 = 6;
+
+/// Where threads draw for less than this part of [`IDLE`], a quarter of the workers is tried at once.
+const HARDLY: f64 = 0.5;
+
+/// Fewer workers than this always draw all.
+const LEAST: usize = 4;
+
+/// Taken back is a change after which the same work takes longer by this. Two windows of one path differ by some percent.
+const WORSE: f64 = 1.1;
+
+/// Most frames after which what was taken back is tried again.
+const PATIENCE: u32 = 4096;
+
+/// Most times that workers are halved: a thousandth of them draws.
+const MOST: u32 = 10;
+
+/// Render threads' time and work over some frames.
+#[derive(Clone, Copy, Debug, Default)]
+struct Span {
+    frames: u32,
+    took: f64,
+    drew: f64,
+    /// Threads that might have drawn, times how long.
+    had: f64,
+}
+
+impl Span {
+    /// Which part of their time threads drew.
+    fn busy(&self) -> f64 {
+        self.drew / self.had.max(1.0)
+    }
+
+    /// How long a frame takes for what is drawn of it.
+    fn pace(&self) -> f64 {
+        self.took / self.drew.max(1.0)
+    }
+}
+
+/// How often the workers are halved, for one kind of frames.
+#[derive(Clone, Copy, Debug, Default)]
+struct Level {
+    halved: u32,
+    /// Frames since that changed.
+    since: u32,
+    span: Span,
+    /// Before they were halved last, as long as it is not known whether that was good.
+    before: Option<f64>,
+    /// Frames to wait for before they are halved again.
+    wait: u32,
+    /// How many that were the last time.
+    patience: u32,
+}
+
+impl Level {
+    /// A frame is done, which so many workers might draw.
+    fn done(&mut self, frame: Span, workers: usize, (kind, full): (usize, bool)) {
+        self.wait = self.wait.saturating_sub(1);
+        self.since += 1;
+        if self.since <= SETTLE[kind] {
+            return;
+        }
+        let idle = if full { IDLE[kind].min(IDLE_ON_A_FULL_LINK) } else { IDLE[kind] };
+        let busy = BUSY[kind];
+        let s = &mut self.span;
+        s.frames += frame.frames;
+        (s.took, s.drew, s.had) = (s.took + frame.took, s.drew + frame.drew, s.had + frame.had);
+        if s.frames < WINDOW {
+            return;
+        }
+        let span = std::mem::take(s);
+        let before = self.before.take();
+        let worse = before.is_some_and(|before| span.pace() > WORSE * before);
+        if worse || self.halved > 0 && span.busy() > busy {
+            // Twice as long as before, lest they come and go.
+            self.patience = (2 * self.patience).clamp(2 * WINDOW, PATIENCE);
+            self.wait = self.patience;
+            self.change(self.halved.saturating_sub(1));
+        } else if span.busy() < idle && self.wait == 0 && workers > LEAST {
+            // Lest each step lose a little.
+            self.before = Some(before.unwrap_or(f64::INFINITY).min(span.pace()));
+            let often = if span.busy() < HARDLY * idle { 2 } else { 1 };
+            self.change(self.halved + often);
+        }
+    }
+
+    fn change(&mut self, halved: u32) {
+        (self.halved, self.since) = (halved, 0);
+    }
+}
+
+/// What frames tell of how many workers are best.
+#[derive(Debug, Default)]
+pub(crate) struct Reserve {
+    scene: Option<SceneId>,
+    /// Of frames beside others, and of those that are alone.
+    levels: [Level; 2],
+    /// When a frame was done, or began alone.
+    since: Micros,
+}
+
+impl Reserve {
+    /// A frame begins, and none is in the making.
+    pub(crate) fn begin(&mut self, now: Micros) {
+        self.since = now;
+    }
+
+    /// How often workers are to be halved for a frame. Of another scene nothing is known.
+    pub(crate) fn halved(&mut self, scene: SceneId, alone: bool) -> u32 {
+        if self.scene.replace(scene) != Some(scene) {
+            self.levels = Default::default();
+        }
+        self.levels[usize::from(alone)].halved
+    }
+
+    /// A frame is done, for which threads drew so long, of so many workers and threads that might have; whether it was
+    /// alone.
+    pub(crate) fn done(
+        &mut self,
+        (alone, full): (bool, bool),
+        drew: Micros,
+        (workers, threads): (usize, u64),
+        now: Micros,
+    ) {
+        let took = now.saturating_sub(std::mem::replace(&mut self.since, now)) as f64;
+        let span = Span { frames: 1, took, drew: drew as f64, had: took * threads as f64 };
+        let kind = usize::from(alone);
+        self.levels[kind].done(span, workers, (kind, full));
+    }
+
+    /// A task could not be drawn: whoever is left may try.
+    pub(crate) fn call_all(&mut self) {
+        self.levels = Default::default();
+    }
+}
+
+/// How many of so many workers draw when they were halved so often.
+pub(crate) fn drawing(workers: usize, halved: u32) -> usize {
+    workers.div_ceil(1 << halved.min(MOST)).max(LEAST.min(workers))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SCENE: SceneId = SceneId(1);
+
+    /// Frames beside others, each of which takes so long on so many workers of one thread. How many drew each.
+    fn path(
+        reserve: &mut Reserve,
+        frames: usize,
+        all: usize,
+        takes: impl Fn(usize) -> f64,
+    ) -> Vec<usize> {
+        let (mut now, mut drew) = (reserve.since, Vec::new());
+        for _ in 0..frames {
+            let n = drawing(all, reserve.halved(SCENE, false));
+            now += (1000.0 * takes(n)) as Micros;
+            reserve.done((false, false), 10_000, (n, n as u64), now);
+            drew.push(n);
+        }
+        drew
+    }
+
+    /// What 10 ms of drawing take, and bricks that become more with the square root of workers; milliseconds.
+    fn linked(n: usize) -> f64 {
+        (10.0 / n as f64).max(0.7 * (n as f64).sqrt())
+    }
+
+    #[test]
+    fn where_bricks_bind_as_many_draw_as_are_good() {
+        let mut reserve = Reserve::default();
+        let drew = path(&mut reserve, 120, 64, linked);
+        assert_eq!(drew[..10], [64; 10], "the first frames say little");
+        assert_eq!(drew[119], 16, "{drew:?}");
+        assert!(drew.is_sorted_by(|a, b| a >= b), "{drew:?}");
+        // Nothing is to be sent any more, and who draws has no pause.
+        let drew = path(&mut reserve, 200, 64, |n| 10.0 / n as f64);
+        assert_eq!(drew[199], 64, "{drew:?}");
+    }
+
+    #[test]
+    fn where_workers_bind_all_draw() {
+        let drew = path(&mut Reserve::default(), 200, 64, |n| 10.0 / n as f64 / 0.8);
+        assert_eq!(drew, [64; 200]);
+    }
+
+    #[test]
+    fn what_makes_frames_late_is_taken_back_and_tried_less_and_less_often() {
+        // Threads stand still for some other reason, and half of them take twice as long.
+        let drew = path(&mut Reserve::default(), 1000, 64, |n| 64.0 / n as f64);
+        let few = drew.iter().filter(|n| **n < 64).count();
+        assert!((10..=100).contains(&few), "{few}");
+    }
+
+    #[test]
+    fn another_scene_begins_with_all_and_so_do_frames_that_are_alone() {
+        let mut reserve = Reserve::default();
+        path(&mut reserve, 120, 64, linked);
+        assert!(reserve.halved(SCENE, false) > 0);
+        assert_eq!(reserve.halved(SCENE, true), 0);
+        assert_eq!(reserve.halved(SceneId(2), false), 0);
+    }
+
+    #[test]
+    fn few_workers_all_draw() {
+        assert_eq!([1, 3, 4, 5, 8].map(|n| drawing(n, 3)), [1, 3, 4, 4, 4]);
+        assert_eq!([64, 65].map(|n| drawing(n, 2)), [16, 17]);
+        assert_eq!(drawing(100_000, u32::MAX), 98);
+    }
+}

@@ -16,7 +16,7 @@ use slabcast_common::message::{Sampled, Sampling, SceneSpec};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Quality;
 use slabcast_common::slab::SheetRange;
-use slabcast_common::view::View;
+use slabcast_common::view::{Projected, View};
 use std::sync::Arc;
 
 /// Edge of a block in pixels. A footprint of 3 pixels to each side is drawn for a block of 8 some three
@@ -99,9 +99,19 @@ impl Probe {
         scratch: &mut Scratch,
     ) -> Sampling {
         let mut samples = Sampling::default();
+        let seen = |b: &Arc<Brick>| frame.view.project(&b.tight(&frame.scene.grid));
+        let mut rects: Vec<Option<Projected>> = Vec::new();
         for block in blocks(tile, frame.view.size) {
             if let Some(pair) = &self.pair {
-                thinner(pair, simd, block, bricks, scratch, &mut samples.thickness);
+                if rects.is_empty() {
+                    rects.extend(bricks.iter().map(seen));
+                }
+                // In sheets of half the thickness footprints of perspective views may reach a pixel farther.
+                let near = Rect::new(block.x0 - 1, block.y0 - 1, block.x1 + 1, block.y1 + 1);
+                let over = |p: &Projected| !p.rect.intersect(&near).is_empty();
+                let some = bricks.iter().zip(&rects).filter(|(_, p)| p.as_ref().is_some_and(over));
+                let some: Vec<Arc<Brick>> = some.map(|(brick, _)| brick.clone()).collect();
+                thinner(pair, simd, block, &some, scratch, &mut samples.thickness);
             }
             if let Some(model) = &self.model {
                 model.sample(frame, block, bricks, &mut samples);

@@ -16,6 +16,7 @@
 //! Positions come in phases (1/256 pixel, 1/256 sheet or finer), so both are tables, filled in
 //! f64 and kept in f32.
 
+use crate::model::Table;
 use crate::splat::Tap;
 use glam::DVec3;
 pub use slabcast_common::kernel::{Lean, Profile};
@@ -450,7 +451,11 @@ pub struct Footprints {
 pub struct Shelf {
     tables: Mutex<BTreeMap<Key, Arc<Tables>>>,
     sections: Mutex<BTreeMap<Deep, Arc<Sections>>>,
+    profiles: Mutex<BTreeMap<Cut, Arc<Table>>>,
 }
+
+/// A deviation and a radius, as bits, and whether the kernel is whole.
+type Cut = ([u64; 2], bool);
 
 /// A profile and a thickness, as bits, phases of a sheet, and whether slivers are given away.
 type Deep = ([u64; 4], i32, bool);
@@ -493,6 +498,15 @@ impl Shelf {
         let key = (bits, phases, merged);
         shelved(&self.sections, SECTIONS, key, || Sections::new(profile, thickness, phases, merged))
     }
+
+    /// A profile of this deviation and radius, or the whole of what it is cut from, as [`crate::model`] has it.
+    pub(crate) fn profile(
+        &self,
+        (std, radius, whole): (f64, f64, bool),
+        make: impl FnOnce() -> Table,
+    ) -> Arc<Table> {
+        shelved(&self.profiles, SECTIONS, ([std, radius].map(f64::to_bits), whole), make)
+    }
 }
 
 /// What a shelf has under `key`, or else what is made now. A shelf of `most` is cleared.
@@ -515,7 +529,7 @@ fn shelved<K: Ord, V>(
     shelf.entry(key).or_insert(made).clone()
 }
 
-/// Sections that a shelf keeps, of some 8 KB each. A view of a lattice that is not cubic has its own, and none
+/// Sections that a shelf keeps, and profiles, of some 8 KB each. A view of a lattice that is not cubic has its own, and none
 /// of them is asked for again.
 const SECTIONS: usize = 64;
 

@@ -11,7 +11,7 @@ use crate::sheet::{LANES, Row};
 use crate::splat::records::STRIDE;
 use crate::splat::touched::put;
 use crate::splat::{Accumulate, Simd, Weight, Work};
-use crate::storeys::Storeys;
+use crate::storeys::{Reaching, Storeys};
 use crate::tile::{Io, PART, Part, Pixels, keep_last};
 use slabcast_common::message::Counters;
 use slabcast_common::occlusion::Rect;
@@ -43,6 +43,9 @@ pub(crate) struct Kinds {
     pub(crate) floats: Kind<f32>,
 }
 
+/// Storeys that reach a row of pixels, and in which sheet.
+type OfSheet<W> = (Option<i32>, Reaching<W>);
+
 /// Memory for sums of one kind.
 pub(crate) struct Kind<S: Accumulate> {
     planes: Planes<S>,
@@ -50,6 +53,8 @@ pub(crate) struct Kind<S: Accumulate> {
     lofts: Lofts<S>,
     /// For weights that are in no table.
     weights: [Vec<S::Weight>; 2],
+    /// Storeys that reach each row of the part in a sheet, and in which: of even sheets and odd ones.
+    reaching: [Vec<OfSheet<S::Weight>>; 2],
 }
 
 impl<S: Accumulate> Default for Kind<S> {
@@ -58,6 +63,7 @@ impl<S: Accumulate> Default for Kind<S> {
             planes: Planes::default(),
             lofts: Lofts::default(),
             weights: [Vec::new(), Vec::new()],
+            reaching: [Vec::new(), Vec::new()],
         }
     }
 }
@@ -87,6 +93,7 @@ impl<S: Accumulate> Work for RenderGeneral<'_, S> {
         kind.planes.reset(slots);
         if part.frame.storeys.is_some() {
             kind.lofts.reset(slots);
+            kind.reaching.iter_mut().for_each(Vec::clear);
         }
         General { part: &part }.render(kind, queues, pixels, io);
     }
@@ -257,7 +264,7 @@ impl General<'_> {
         &self,
         bucket: &[Waiting],
         k: i32,
-        Kind { planes, lofts, weights }: &mut Kind<S>,
+        Kind { planes, lofts, weights, .. }: &mut Kind<S>,
         open: &OpenMask,
         counters: &mut Counters,
     ) {
@@ -266,6 +273,8 @@ impl General<'_> {
         let rows = (rect.y0, rect.y1);
         // The sheet behind the slab is filled as far as the colour rule peeks.
         let end = slab.end + i32::from(frame.looks_at_neighbours());
+        // The first storey at the scale that was asked for last.
+        let mut based = (f64::NAN, 0);
         for Waiting { brick, voxel, placed } in bucket {
             let (brick, corner) = self.part.brick(*brick as usize);
             if frame.scene.quality.cull && self.extent(placed).is_none_or(|e| !open.any(&e)) {
@@ -286,7 +295,10 @@ impl General<'_> {
                 if let Some(storeys) = &frame.storeys {
                     let (x0, wx) = S::Weight::of(&f, 0, at[0], (rect.x0, rect.x1), &mut weights[0]);
                     if !wx.is_empty() {
-                        let base = storeys.base(&frame.view, rect, f.scale);
+                        if based.0 != f.scale {
+                            based = (f.scale, storeys.base(&frame.view, rect, f.scale));
+                        }
+                        let base = based.1;
                         let storey = frame.storey(corner, brick.index[usize::from(*voxel)]);
                         let storey = storey.expect("a level view") as i32;
                         let columns = ((x0 - rect.x0) as usize, wx);
@@ -331,19 +343,26 @@ impl General<'_> {
         &self,
         k: i32,
         storeys: &Storeys,
-        Kind { planes, lofts, weights }: &mut Kind<S>,
+        Kind { planes, lofts, weights, reaching }: &mut Kind<S>,
         open: &OpenMask,
     ) {
         let Part { frame, rect, .. } = self.part;
         planes.clear(k);
         let Some(f) = frame.footprints.at(k) else { return };
+        // In a parallel view all sheets are alike.
+        let like = if let Projection::Ortho { .. } = frame.view.projection { 0 } else { k };
+        let reaching = &mut reaching[like as usize % 2];
+        reaching.resize_with(rect.height(), Default::default);
         for y in 0..rect.height() {
             if open.row(y) == 0 {
                 continue;
             }
             let row = rect.y0 + y as i32;
             let weight = |at| S::Weight::of(&f, 1, at, (row, row + 1), &mut weights[1]).1[0];
-            let reaching = frame.storeys_at(storeys, &f, row, weight);
+            let (of, reaching) = &mut reaching[y];
+            if of.replace(like) != Some(like) {
+                *reaching = frame.storeys_at(storeys, &f, row, weight);
+            }
             let some = &reaching.some[..reaching.n];
             let mut columns = lofts.touched(k, some) & open.row(y);
             while columns != 0 {

@@ -22,6 +22,7 @@ use slabcast_common::message::Sampling;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Compositing, Kernel};
 use slabcast_common::view::{NEAR, Projection, SUBPIXELS, View};
+use std::cell::Cell;
 use std::sync::Arc;
 
 /// Steps along a ray, in deviations of the kernel.
@@ -41,13 +42,14 @@ const LOWEST: f64 = 1e-6;
 const FIELDS: usize = 3;
 
 /// A profile by its distance: nodes to its radius, lines between.
-struct Table {
+#[derive(Debug)]
+pub(crate) struct Table {
     nodes: Vec<f32>,
     per_step: f64,
 }
 
 impl Table {
-    fn new(radius: f64, at: impl Fn(f64) -> f64) -> Table {
+    pub(crate) fn new(radius: f64, at: impl Fn(f64) -> f64) -> Table {
         let nodes = (0..=NODES).map(|i| at(radius * i as f64 / NODES as f64) as f32).collect();
         Table { nodes, per_step: NODES as f64 / radius }
     }
@@ -74,8 +76,8 @@ struct Wave {
 
 /// A frame's tables.
 pub(crate) struct Model {
-    cut: [Table; 3],
-    whole: [Table; 3],
+    cut: [Arc<Table>; 3],
+    whole: [Arc<Table>; 3],
     waves: Vec<Wave>,
     /// Reach of the whole Gaussian along the eye's axes, in vox.
     reach: DVec3,
@@ -83,14 +85,55 @@ pub(crate) struct Model {
 }
 
 /// A voxel near a block's rays, upright as these ([`slabcast_common::kernel::Lean::upright`]).
+#[derive(Clone)]
 struct Near {
     eye: DVec3,
     /// The same as the eye sees it.
     seen: DVec3,
     /// Where sheets have it (in perspective each sheet has it somewhere else: across as it is).
     rounded: DVec3,
-    /// Extinction per vox and that times the colours, for kernels that integrate to one.
-    payload: [f32; 4],
+    /// Which it is of which brick.
+    voxel: (u32, u32),
+    /// Extinction per vox and that times the colours, for kernels that integrate to one: known of those that a ray
+    /// came to.
+    payload: Cell<Option<[f32; 4]>>,
+    /// Steps that it reaches, from one on to the one behind the last.
+    steps: [usize; 2],
+    /// Where its weights in depth are, once they are known.
+    deep: Cell<Option<usize>>,
+}
+
+impl Near {
+    fn payload(&self, frame: &Frame, bricks: &[Arc<Brick>]) -> [f32; 4] {
+        self.payload.get().unwrap_or_else(|| {
+            let (brick, i) = self.voxel;
+            let unit = 1.0 / frame.raw_scale;
+            let payload = frame.payload(&bricks[brick as usize], i as usize, self.seen);
+            let payload = payload.map(|p| p * unit);
+            self.payload.set(Some(payload));
+            payload
+        })
+    }
+}
+
+/// Voxels near a block, front to back, and the steps along its rays, which are the same for all of them.
+struct Column {
+    near: Vec<Near>,
+    start: f64,
+    step: f64,
+    /// Farther than rounding moves any of them across.
+    rounding: f64,
+    /// Weights in depth of those voxels that a ray came to, of the steps of each.
+    deep: Vec<[f32; FIELDS]>,
+    /// Sums along the ray at hand.
+    field: Vec<[[f32; 4]; FIELDS]>,
+}
+
+impl Column {
+    /// The middle of a step.
+    fn at(&self, j: usize) -> f64 {
+        self.start + (j as f64 + 0.5) * self.step
+    }
 }
 
 /// A ray: `(at + slope z, z)`, upright.
@@ -141,13 +184,17 @@ impl Model {
         let (std, radius) = (view.kernel_std.to_array(), view.kernel_radius.to_array());
         let profile: [Profile; 3] =
             std::array::from_fn(|a| Profile::new(q.kernel, std[a], radius[a]));
-        let cut = std::array::from_fn(|a| Table::new(radius[a], |u| profile[a].at(u)));
+        let shelf = frame.scene.shelf();
+        let of = |a: usize, whole, reach, at: &dyn Fn(f64) -> f64| {
+            shelf.profile((std[a], radius[a], whole), || Table::new(reach, at))
+        };
+        let cut = std::array::from_fn(|a| of(a, false, radius[a], &|u| profile[a].at(u)));
         let gaussian = q.kernel == Kernel::Gaussian;
         let reach = if gaussian { std.map(|s| s * WHOLE) } else { radius };
         let whole = std::array::from_fn(|a| {
             let norm = 1.0 / (std[a] * (2.0 * std::f64::consts::PI).sqrt());
             let bell = |u: f64| norm * libm::exp(-0.5 * u * u / (std[a] * std[a]));
-            Table::new(reach[a], |u| if gaussian { bell(u) } else { profile[a].at(u) })
+            of(a, true, reach[a], &|u| if gaussian { bell(u) } else { profile[a].at(u) })
         });
         let waves = waves(view, &profile, radius);
         Some(Model { cut, whole, waves, reach: reach.into(), step: STEP * view.kernel_std.z })
@@ -161,17 +208,11 @@ impl Model {
         bricks: &[Arc<Brick>],
         samples: &mut Sampling,
     ) {
-        let near = self.near(frame, block, bricks);
-        if near.is_empty() {
-            return;
-        }
-        let mut field = Vec::new();
+        let Some(mut column) = self.near(frame, block, bricks) else { return };
         for (x, y) in [(0, 3), (1, 6), (2, 1), (3, 4), (4, 7), (5, 2), (6, 5), (7, 0)] {
             let ray = ray(&frame.view, block.x0 + x, block.y0 + y);
-            let Some([as_is, rounded, whole, level]) = self.follow(frame, &ray, &near, &mut field)
-            else {
-                continue;
-            };
+            let seen = self.follow((frame, bricks), &ray, &mut column);
+            let Some([as_is, rounded, whole, level]) = seen else { continue };
             let there = |other: &Light| as_is.through < 1.0 || other.through < 1.0;
             samples.positions.put(there(&rounded), rounded.off(&as_is));
             samples.truncation.put(there(&whole), whole.off(&as_is));
@@ -179,8 +220,8 @@ impl Model {
         }
     }
 
-    /// The voxels whose whole kernel may reach a ray of the block, front to back.
-    fn near(&self, frame: &Frame, block: Rect, bricks: &[Arc<Brick>]) -> Vec<Near> {
+    /// The voxels whose whole kernel may reach a ray of the block; `None`: there are none.
+    fn near(&self, frame: &Frame, block: Rect, bricks: &[Arc<Brick>]) -> Option<Column> {
         let view = &frame.view;
         let middle = ray(view, (block.x0 + block.x1) / 2, (block.y0 + block.y1) / 2);
         let lean = &view.kernel_lean;
@@ -192,7 +233,7 @@ impl Model {
         };
         let phases = f64::from(view.depth_phases());
         let mut near = Vec::new();
-        for brick in bricks {
+        for (which, brick) in bricks.iter().enumerate() {
             let corner = frame.corner(brick.id);
             // A sphere about the brick's middle, before its voxels.
             let centre = lean.upright(view.offset_in_eye([7; 3]) * 0.5);
@@ -216,10 +257,6 @@ impl Model {
                 if (0..2).any(|a| off(eye, a) > self.reach[a] + wide + slope(a)) {
                     continue;
                 }
-                let payload = frame.payload(brick, i, seen);
-                if payload[0] <= 0.0 {
-                    continue;
-                }
                 let mut rounded = seen;
                 rounded.z = f64::from(placed.z) / phases * view.thickness;
                 if let Projection::Ortho { scale } = view.projection {
@@ -230,32 +267,47 @@ impl Model {
                         rounded[a] = pixels / scale;
                     }
                 }
-                let unit = 1.0 / frame.raw_scale;
                 let rounded = lean.upright(rounded);
-                near.push(Near { eye, seen, rounded, payload: payload.map(|p| p * unit) });
+                let voxel = (which as u32, i as u32);
+                let (payload, steps, deep) = (Cell::new(None), [0; 2], Cell::new(None));
+                near.push(Near { eye, seen, rounded, voxel, payload, steps, deep });
             }
         }
-        near.sort_unstable_by(|a, b| a.eye.z.total_cmp(&b.eye.z));
-        near
+        // Numbers and places are sorted, not voxels, of which each is as long as two lines of a cache.
+        let mut order: Vec<(f64, u32)> = near.iter().map(|v| v.eye.z).zip(0..).collect();
+        order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        let mut near: Vec<Near> =
+            order.into_iter().map(|(_, i)| near[i as usize].clone()).collect();
+        let start = (near.first()?.eye.z - self.reach.z).max(middle.near);
+        let farthest = near.last()?.eye.z + self.reach.z;
+        let depth = farthest - start;
+        // A step of an endless volume is never met: positions are at most 2^30 phases apart.
+        let steps = (depth / self.step).ceil().clamp(1.0, 1e7) as usize;
+        for v in &mut near {
+            let at = |z: f64| (z - start) / self.step - 0.5;
+            let first = at(v.eye.z - self.reach.z).ceil().max(0.0) as usize;
+            // Below zero it is none.
+            let end = (at(v.eye.z + self.reach.z).floor() + 1.0) as usize;
+            v.steps = [first.min(steps), end.clamp(first.min(steps), steps)];
+        }
+        let rounding = 2.0 / (f64::from(SUBPIXELS) * per_vox(farthest));
+        let (step, deep, field) = (self.step, Vec::new(), Vec::new());
+        Some(Column { near, start, step, rounding, deep, field })
     }
 
     /// The four pictures of a ray; `None` if no voxel reaches it.
     fn follow(
         &self,
-        frame: &Frame,
+        (frame, bricks): (&Frame, &[Arc<Brick>]),
         ray: &Ray,
-        near: &[Near],
-        field: &mut Vec<[[f32; 4]; FIELDS]>,
+        column: &mut Column,
     ) -> Option<[Light; 4]> {
         let parallel = ray.slope == [0.0; 2];
-        let start = (near[0].eye.z - self.reach.z).max(ray.near);
-        let depth = near[near.len() - 1].eye.z + self.reach.z - start;
-        // A step of an endless volume is never met: positions are at most 2^30 phases apart.
-        let steps = (depth / self.step).ceil().clamp(1.0, 1e7) as usize;
+        let mut field = std::mem::take(&mut column.field);
+        let mut deep = std::mem::take(&mut column.deep);
         field.clear();
         let (mut lights, mut waves) =
-            ([Light::NEW; 4], Along::new(&self.waves, &frame.view, ray, start, self.step));
-        let at = |j: usize| start + (j as f64 + 0.5) * self.step;
+            ([Light::NEW; 4], Along::new(&self.waves, &frame.view, ray, column.start, self.step));
         let mut passed = 0;
         let mut met = false;
         let mut pass =
@@ -271,19 +323,21 @@ impl Model {
                     passed += 1;
                 }
             };
-        for v in near {
-            let first =
-                (((v.eye.z - self.reach.z - start) / self.step - 0.5).ceil()).max(0.0) as usize;
-            if first >= steps {
-                break;
-            }
-            pass(first, field, &mut lights);
+        for v in &column.near {
+            let [first, end] = v.steps;
+            pass(first, &mut field, &mut lights);
             if lights.iter().all(|l| l.through < frame.scene.quality.eps / 16.0) {
                 break;
             }
             let across =
                 |z: f64, place: &DVec3| [0, 1].map(|a| ray.at[a] + ray.slope[a] * z - place[a]);
-            let of = |tables: &[Table; 3], [x, y]: [f64; 2]| tables[0].at(x) * tables[1].at(y);
+            let slack =
+                |a: usize| self.reach[a] + ray.slope[a].abs() * self.reach.z + column.rounding;
+            let middle = across(v.eye.z, &v.eye);
+            if first == end || (0..2).any(|a| middle[a].abs() > slack(a)) {
+                continue;
+            }
+            let of = |tables: &[Arc<Table>; 3], [x, y]: [f64; 2]| tables[0].at(x) * tables[1].at(y);
             let mut weights = [0.0; FIELDS];
             if parallel {
                 let (x, rounded) = (across(0.0, &v.eye), across(0.0, &v.rounded));
@@ -292,18 +346,23 @@ impl Model {
                     continue;
                 }
             }
-            let last = (((v.eye.z + self.reach.z - start) / self.step - 0.5).floor())
-                .min((steps - 1) as f64);
-            if last < first as f64 {
-                continue;
+            let payload = v.payload(frame, bricks);
+            if field.len() < end {
+                field.resize(end, Default::default());
             }
-            let last = last as usize;
-            if field.len() <= last {
-                field.resize(last + 1, Default::default());
-            }
-            for (j, here) in field[first..=last].iter_mut().enumerate() {
-                let z = at(first + j);
+            let from = v.deep.get().unwrap_or_else(|| {
+                let from = deep.len();
+                v.deep.set(Some(from));
+                deep.extend((first..end).map(|j| {
+                    let (off, rounded) = (column.at(j) - v.eye.z, column.at(j) - v.rounded.z);
+                    let [cut, whole] = [&self.cut[2], &self.whole[2]];
+                    [cut.at(off), cut.at(rounded), whole.at(off)]
+                }));
+                from
+            });
+            for (j, (here, deep)) in field[first..end].iter_mut().zip(&deep[from..]).enumerate() {
                 if !parallel {
+                    let z = column.at(first + j);
                     let x = across(z, &v.eye);
                     let mut rounded = x;
                     let sheet = libm::floor(z / frame.view.thickness) as i32;
@@ -319,21 +378,17 @@ impl Model {
                     }
                     weights = [of(&self.cut, x), of(&self.cut, rounded), of(&self.whole, x)];
                 }
-                let deep = [
-                    self.cut[2].at(z - v.eye.z),
-                    self.cut[2].at(z - v.rounded.z),
-                    self.whole[2].at(z - v.eye.z),
-                ];
-                for f in 0..FIELDS {
-                    let w = weights[f] * deep[f];
+                for ((here, weight), deep) in here.iter_mut().zip(weights).zip(deep) {
+                    let w = weight * deep;
                     met |= w > 0.0;
-                    for c in 0..4 {
-                        here[f][c] += v.payload[c] * w;
+                    for (here, payload) in here.iter_mut().zip(payload) {
+                        *here += payload * w;
                     }
                 }
             }
         }
-        pass(field.len(), field, &mut lights);
+        pass(field.len(), &mut field, &mut lights);
+        (column.field, column.deep) = (field, deep);
         met.then_some(lights)
     }
 }
@@ -370,14 +425,17 @@ fn ray(view: &View, x: i32, y: i32) -> Ray {
 fn waves(view: &View, profile: &[Profile; 3], radius: [f64; 3]) -> Vec<Wave> {
     let dual = view.kernel_lean.upright_steps(&view.eye_from_index).inverse().transpose();
     // The transform of an even profile, by the midpoint rule: it ends in nothing, or nearly.
-    let transform = |a: usize, f: f64| {
-        const N: usize = 256;
+    const N: usize = 256;
+    let nodes: [[(f64, f64); N]; 3] = std::array::from_fn(|a| {
         let h = radius[a] / N as f64;
-        let at = |i: usize| {
+        std::array::from_fn(|i| {
             let u = (i as f64 + 0.5) * h;
-            profile[a].at(u) * libm::cos(2.0 * std::f64::consts::PI * f * u)
-        };
-        2.0 * h * (0..N).map(at).sum::<f64>()
+            (u, profile[a].at(u))
+        })
+    });
+    let transform = |a: usize, f: f64| {
+        let at = |(u, g): &(f64, f64)| g * libm::cos(2.0 * std::f64::consts::PI * f * u);
+        2.0 * radius[a] / N as f64 * nodes[a].iter().map(at).sum::<f64>()
     };
     let mut waves = Vec::new();
     for k in -2..=2 {

@@ -56,6 +56,11 @@ impl Scene {
         }
     }
 
+    /// Tables that its frames share.
+    pub(crate) fn shelf(&self) -> &Shelf {
+        &self.shelf
+    }
+
     /// Whether sheets add floats.
     pub fn float_sums(&self) -> bool {
         self.quality.sums == Sums::F32

@@ -153,6 +153,7 @@ impl Storeys {
 }
 
 /// The storeys that reach a row of pixels in one sheet.
+#[derive(Clone, Copy, Default)]
 pub(crate) struct Reaching<W> {
     /// Which, and each one's weight.
     pub(crate) some: [(i32, W); REACHING],

@@ -655,7 +655,7 @@ impl Driver {
         let in_reserve = self.scheduler.in_reserve();
         if std::mem::replace(&mut self.in_reserve, in_reserve) != in_reserve {
             let drawing = self.links.len().saturating_sub(in_reserve);
-            info!(drawing, in_reserve, "as many workers draw as frames are soonest done with");
+            info!(drawing, in_reserve, "who would make frames late is held in reserve");
         }
     }
 

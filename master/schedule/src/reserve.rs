@@ -54,6 +54,10 @@ const PATIENCE: u32 = 4096;
 /// Most times that workers are halved: a thousandth of them draws.
 const MOST: u32 = 10;
 
+/// Frames of the other kind in a row after which it goes by these. Of a path one is alone now and then, where whoever
+/// takes the pictures was late, and to call all for that one would send them bricks.
+const OTHERS: u32 = 4;
+
 /// Render threads' time and work over some frames.
 #[derive(Clone, Copy, Debug, Default)]
 struct Span {
@@ -134,6 +138,9 @@ pub(crate) struct Reserve {
     scene: Option<SceneId>,
     /// Of frames beside others, and of those that are alone.
     levels: [Level; 2],
+    /// Whether it goes by those that are alone, and how many frames in a row were of the other kind.
+    alone: bool,
+    others: u32,
     /// When a frame was done, or began alone.
     since: Micros,
 }
@@ -149,7 +156,11 @@ impl Reserve {
         if self.scene.replace(scene) != Some(scene) {
             self.levels = Default::default();
         }
-        self.levels[usize::from(alone)].halved
+        self.others = if alone == self.alone { 0 } else { self.others + 1 };
+        if self.others >= OTHERS {
+            (self.alone, self.others) = (alone, 0);
+        }
+        self.levels[usize::from(self.alone)].halved
     }
 
     /// A frame is done, for which threads drew so long, of so many workers and threads that might have; whether it was
@@ -163,8 +174,11 @@ impl Reserve {
     ) {
         let took = now.saturating_sub(std::mem::replace(&mut self.since, now)) as f64;
         let span = Span { frames: 1, took, drew: drew as f64, had: took * threads as f64 };
-        let kind = usize::from(alone);
-        self.levels[kind].done(span, workers, (kind, full));
+        // As many drew as that kind goes by.
+        if alone == self.alone {
+            let kind = usize::from(alone);
+            self.levels[kind].done(span, workers, (kind, full));
+        }
     }
 
     /// A task could not be drawn: whoever is left may try.
@@ -237,7 +251,9 @@ mod tests {
         let mut reserve = Reserve::default();
         path(&mut reserve, 120, 64, linked);
         assert!(reserve.halved(SCENE, false) > 0);
-        assert_eq!(reserve.halved(SCENE, true), 0);
+        let halved = reserve.halved(SCENE, false);
+        let alone: Vec<u32> = (0..5).map(|_| reserve.halved(SCENE, true)).collect();
+        assert_eq!(alone, [halved, halved, halved, 0, 0], "one alone is no kind");
         assert_eq!(reserve.halved(SceneId(2), false), 0);
     }
 

@@ -218,6 +218,73 @@ fn pictures_of_frames_alone_are_the_serial_ones_however_their_tiles_are_cut() {
     assert!(one || mixed > 0 && retries > 0 && dropped > 0 && lost > 0);
 }
 
+/// A world of many workers and a path of small frames, several in the making or one, so that most workers are held
+/// in reserve and called up when others are lost; and how many were at most.
+fn chaos_crowd(seed: u64) -> (World, usize) {
+    let mut rng = Rng::new(seed ^ 0xc70d_5000);
+    let config = Config { lease: rng.pick(&[60_000_000, 100_000]), ..Config::default() };
+    let mut w = World::new(seed, Config { poison_after: 1000, ..config });
+    let dims = [rng.between(8, 24) as u32, rng.between(8, 24) as u32, rng.between(8, 16) as u32];
+    let (set, bricks) = (fake::key(0), fake::bricks(&mut rng, dims, 6));
+    let size = [rng.between(40, 140) as u32, rng.between(40, 140) as u32];
+    let quality = Quality { thickness: 4.0, ..Quality::default() };
+    let scene = fake::scene(0, set, dims, quality);
+    let work = Work { schedule: Schedule::Region, ..Work::default() };
+    let small_budgets = rng.once_in(4);
+    for _ in 0..rng.between(5, 24) {
+        let n = nature(&mut rng, small_budgets);
+        w.join(Nature { us_per_pixel_sheet: 0.002, latency: (200, 2_000), ..n });
+    }
+    let (frames, one_by_one) = (rng.between(24, 40), rng.once_in(3));
+    let mut most = 0;
+    for frame in 0..frames {
+        let turn = seed + frame / 4;
+        w.queue(fake::job(&mut Rng::new(turn), frame, &scene, &bricks, size, work));
+        if rng.once_in(5) {
+            let when = w.now() + rng.below(20_000);
+            let whom = WorkerId(rng.between(1, 24));
+            let what = match rng.below(8) {
+                0..=3 => Script::Kill(whom),
+                4 => Script::Stall(whom, rng.pick(&[10_000, 500_000, 20_000_000])),
+                5 => Script::Leave(whom),
+                6 => Script::Cancel(FrameId(frame)),
+                _ => Script::Join(nature(&mut rng, small_budgets)),
+            };
+            w.script(when, what);
+        }
+        if one_by_one || frame % 8 == 7 {
+            let when = w.now() + 1_000_000;
+            w.script(when, Script::Join(Nature { immune: true, ..Nature::default() }));
+            w.run_until(|w| {
+                most = most.max(w.scheduler.in_reserve());
+                w.scheduler.is_idle()
+            });
+        }
+    }
+    w.finish();
+    (w, most)
+}
+
+#[test]
+fn pictures_are_the_serial_ones_whoever_is_held_in_reserve() {
+    let range = seeds(100);
+    let one = range.end - range.start == 1;
+    let (mut frames, mut held, mut worlds, mut lost, mut retries) = (0, 0, 0, 0, 0);
+    for seed in range {
+        let (w, most) = chaos_crowd(seed);
+        worlds += 1;
+        held += usize::from(most > 0);
+        frames += w.done.len();
+        lost += w.scheduler.totals().lost_workers;
+        retries += w.done.values().map(|d| d.stats.retries).sum::<u64>();
+        assert_eq!(w.log, chaos_crowd(seed).0.log, "seed {seed} replays");
+    }
+    println!(
+        "crowds: {frames} frames, workers in reserve in {held} of {worlds} worlds, {retries} retries, {lost} workers lost"
+    );
+    assert!(one || 2 * held > worlds && lost > 0 && retries > 0);
+}
+
 /// Of 3,000 worlds one in which a worker was lost while a frame, done, waited for the one before it: its
 /// statistics had bricks on their way after its end.
 #[test]

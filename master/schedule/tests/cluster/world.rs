@@ -879,7 +879,7 @@ impl World {
     }
 
     /// Lets time run until `until` says so. Panics when nothing happens any more.
-    pub(crate) fn run_until(&mut self, until: impl Fn(&World) -> bool) {
+    pub(crate) fn run_until(&mut self, mut until: impl FnMut(&World) -> bool) {
         for _ in 0..2_000_000 {
             if until(self) {
                 return;

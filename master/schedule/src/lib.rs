@@ -524,6 +524,9 @@ impl Scheduler {
                                     carry(cluster, Some(&mut frame.ledger), worker, now);
                                 }
                                 self.rendered_elsewhere(whose, worker, rendered);
+                                if self.calls_all_now(now) {
+                                    only = None;
+                                }
                             }
                         }
                     }
@@ -592,6 +595,19 @@ impl Scheduler {
         }
         let ledger = self.active.front_mut().map(|f| &mut f.ledger);
         carry(&mut self.cluster, ledger, worker, now);
+    }
+
+    /// Whether those in reserve are called up for a first frame that takes long to draw.
+    fn calls_all_now(&mut self, now: Micros) -> bool {
+        let Cluster { roster, reserve, .. } = &mut self.cluster;
+        let Some(frame) = self.active.front().filter(|_| roster.in_reserve() > 0) else {
+            return false;
+        };
+        let calls = reserve.calls_all_now(frame.ledger.drew_us(), roster.threads(), now);
+        if calls {
+            roster.halve(0);
+        }
+        calls
     }
 
     /// A worker drew for one frame while the others were in the making.
@@ -677,7 +693,11 @@ impl Scheduler {
                 }
                 let alone = self.active.is_empty() && self.waiting.is_empty();
                 let halved = match goes_by_region(&job) {
-                    true => self.cluster.reserve.halved(job.scene.id, alone),
+                    true => {
+                        let workers =
+                            self.cluster.roster.iter().filter(|(_, w)| !w.leaving).count();
+                        self.cluster.reserve.halved(job.scene.bricks, alone, workers)
+                    }
                     false => 0,
                 };
                 self.cluster.roster.halve(halved);

@@ -5,11 +5,16 @@
 //! and each one more makes frames come later: mri256 `peer-opaque` at 512x512 and 1 Gbit/s, four in flight, has 430 frames a
 //! second on 8 workers, 397 on 15, 263 on 32 and 127 on 64 (`slabcast plan --frames 72`, a core that takes 10 ms a frame).
 //! So the others are **held in reserve**: they are lent nothing and sent nothing, until more are wanted or somebody is
-//! lost. With that 32 have 310 and 64 have 222, of which the first dozen come as slowly as before; then it is 400.
+//! lost. With that 32 have 371 and 64 have 356.
 //!
 //! What binds is not asked, since of the master's thread and of what results take nothing is known here. What is known is
 //! how long frames take and how much of that render threads draw. Where they stand still for the most part half of the
 //! workers would do, and half of them is tried ([`Level`]); if frames come later then, it is taken back.
+//!
+//! The **first frame** of a brick set is drawn by [`FIRST`] workers at most. Nobody holds a brick then, and to send a voxel takes
+//! longer than to draw it: 5 bytes are 40 ns at 1 Gbit/s, and each goes to several workers. So a first picture is there sooner
+//! if few draw it: at 1 Gbit/s mri256's after 44 ms from 16 workers and after 104 from 64, and without a limit after 5 and 10.
+//! If their threads have nearly nothing to do all the same, the others are not called.
 //!
 //! Frames that are alone and frames beside others are told apart, as in `traffic`: of those that are alone all ways
 //! and waking are part of the time, in which nobody draws.
@@ -17,7 +22,7 @@
 //! It refuses to know who is held in reserve (`roster`), and to go on with a number of workers that was not tried.
 
 use crate::Micros;
-use slabcast_common::ids::SceneId;
+use slabcast_common::brick::BrickSetKey;
 
 /// Where threads draw for less than this of frames' time half of the workers would do: of frames beside others, and of
 /// such as are alone. Without a limit of bandwidth mri256 has 860 frames a second on 64 workers, whose threads draw for 0.14
@@ -44,6 +49,17 @@ const HARDLY: f64 = 0.5;
 
 /// Fewer workers than this always draw all.
 const LEAST: usize = 4;
+
+/// Workers that draw the first frame of a set at most. Half as many would be as soon done with it at 1 Gbit/s (33 ms), but a
+/// scene that takes long to draw has all others' bricks to wait for in its second frame.
+const FIRST: usize = 16;
+
+/// Where they draw for more than this of the first frame all are called. Of mri256 on 16 workers it is 0.02 at 1 Gbit/s, and
+/// without a limit 0.15; of `peer-semi` at 1024x1024 0.07 and 0.5.
+const CALL: f64 = 0.1;
+
+/// Where that much of it is drawn already they are called before it is done: of `peer-semi` at 1024x1024 it is half at the end.
+const CALL_NOW: f64 = 0.25;
 
 /// Taken back is a change after which the same work takes longer by this. Two windows of one path differ by some percent.
 const WORSE: f64 = 1.1;
@@ -135,7 +151,9 @@ impl Level {
 /// What frames tell of how many workers are best.
 #[derive(Debug, Default)]
 pub(crate) struct Reserve {
-    scene: Option<SceneId>,
+    set: Option<BrickSetKey>,
+    /// No frame of the set is done.
+    first: bool,
     /// Of frames beside others, and of those that are alone.
     levels: [Level; 2],
     /// Whether it goes by those that are alone, and how many frames in a row were of the other kind.
@@ -151,16 +169,29 @@ impl Reserve {
         self.since = now;
     }
 
-    /// How often workers are to be halved for a frame. Of another scene nothing is known.
-    pub(crate) fn halved(&mut self, scene: SceneId, alone: bool) -> u32 {
-        if self.scene.replace(scene) != Some(scene) {
-            self.levels = Default::default();
+    /// How often so many workers are to be halved for a frame. Of another set nothing is known.
+    pub(crate) fn halved(&mut self, set: BrickSetKey, alone: bool, workers: usize) -> u32 {
+        if self.set.replace(set) != Some(set) {
+            let halved = (0..MOST).find(|&often| drawing(workers, often) <= FIRST).unwrap_or(MOST);
+            self.levels = [Level { halved, ..Level::default() }; 2];
+            self.first = true;
         }
         self.others = if alone == self.alone { 0 } else { self.others + 1 };
         if self.others >= OTHERS {
             (self.alone, self.others) = (alone, 0);
         }
         self.levels[usize::from(self.alone)].halved
+    }
+
+    /// Whether all are to be called while the first frame of a set is in the making, for which so many threads drew so
+    /// long by now.
+    pub(crate) fn calls_all_now(&mut self, drew: Micros, threads: u64, now: Micros) -> bool {
+        let had = now.saturating_sub(self.since).saturating_mul(threads);
+        let calls = self.first && drew as f64 > CALL_NOW * had as f64;
+        if calls {
+            self.call_all();
+        }
+        calls
     }
 
     /// A frame is done, for which threads drew so long, of so many workers and threads that might have; whether it was
@@ -174,6 +205,9 @@ impl Reserve {
     ) {
         let took = now.saturating_sub(std::mem::replace(&mut self.since, now)) as f64;
         let span = Span { frames: 1, took, drew: drew as f64, had: took * threads as f64 };
+        if std::mem::take(&mut self.first) && span.busy() > CALL {
+            self.levels = Default::default();
+        }
         // As many drew as that kind goes by.
         if alone == self.alone {
             let kind = usize::from(alone);
@@ -183,7 +217,7 @@ impl Reserve {
 
     /// A task could not be drawn: whoever is left may try.
     pub(crate) fn call_all(&mut self) {
-        self.levels = Default::default();
+        (self.levels, self.first) = Default::default();
     }
 }
 
@@ -195,8 +229,9 @@ pub(crate) fn drawing(workers: usize, halved: u32) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use slabcast_common::volume::Digest32;
 
-    const SCENE: SceneId = SceneId(1);
+    const SET: BrickSetKey = BrickSetKey(Digest32([1; 32]));
 
     /// Frames beside others, each of which takes so long on so many workers of one thread. How many drew each.
     fn path(
@@ -207,12 +242,24 @@ mod tests {
     ) -> Vec<usize> {
         let (mut now, mut drew) = (reserve.since, Vec::new());
         for _ in 0..frames {
-            let n = drawing(all, reserve.halved(SCENE, false));
+            let n = drawing(all, reserve.halved(SET, false, all));
             now += (1000.0 * takes(n)) as Micros;
             reserve.done((false, false), 10_000, (n, n as u64), now);
             drew.push(n);
         }
         drew
+    }
+
+    /// The same where the set is not a new one: all begin.
+    fn later(
+        reserve: &mut Reserve,
+        frames: usize,
+        all: usize,
+        takes: impl Fn(usize) -> f64,
+    ) -> Vec<usize> {
+        reserve.halved(SET, false, 1);
+        reserve.first = false;
+        path(reserve, frames, all, takes)
     }
 
     /// What 10 ms of drawing take, and bricks that become more with the square root of workers; milliseconds.
@@ -223,7 +270,7 @@ mod tests {
     #[test]
     fn where_bricks_bind_as_many_draw_as_are_good() {
         let mut reserve = Reserve::default();
-        let drew = path(&mut reserve, 120, 64, linked);
+        let drew = later(&mut reserve, 120, 64, linked);
         assert_eq!(drew[..10], [64; 10], "the first frames say little");
         assert_eq!(drew[119], 16, "{drew:?}");
         assert!(drew.is_sorted_by(|a, b| a >= b), "{drew:?}");
@@ -233,28 +280,46 @@ mod tests {
     }
 
     #[test]
+    fn few_draw_a_first_frame_and_the_others_come_if_it_is_drawing_that_takes_long() {
+        let bricks = path(&mut Reserve::default(), 30, 64, |n| 3.0 * n as f64);
+        assert!(bricks[0] == FIRST && bricks.iter().all(|n| *n <= FIRST), "{bricks:?}");
+        let long = path(&mut Reserve::default(), 30, 64, |n| 12.0 / n as f64);
+        assert_eq!((long[0], &long[1..]), (FIRST, &[64; 29][..]));
+        assert_eq!(path(&mut Reserve::default(), 3, 16, |n| 3.0 * n as f64), [16; 3]);
+        // A quarter of what 16 threads could draw by then is drawn.
+        let mut reserve = Reserve::default();
+        reserve.begin(1_000);
+        assert_eq!(drawing(64, reserve.halved(SET, true, 64)), FIRST);
+        assert!(
+            !reserve.calls_all_now(20_000, 16, 9_000) && !reserve.calls_all_now(31_000, 16, 9_000)
+        );
+        assert!(reserve.calls_all_now(33_000, 16, 9_000) && reserve.halved(SET, true, 64) == 0);
+        assert!(!reserve.calls_all_now(33_000, 16, 9_000), "they are called");
+    }
+
+    #[test]
     fn where_workers_bind_all_draw() {
-        let drew = path(&mut Reserve::default(), 200, 64, |n| 10.0 / n as f64 / 0.8);
+        let drew = later(&mut Reserve::default(), 200, 64, |n| 10.0 / n as f64 / 0.8);
         assert_eq!(drew, [64; 200]);
     }
 
     #[test]
     fn what_makes_frames_late_is_taken_back_and_tried_less_and_less_often() {
         // Threads stand still for some other reason, and half of them take twice as long.
-        let drew = path(&mut Reserve::default(), 1000, 64, |n| 64.0 / n as f64);
+        let drew = later(&mut Reserve::default(), 1000, 64, |n| 64.0 / n as f64);
         let few = drew.iter().filter(|n| **n < 64).count();
         assert!((10..=100).contains(&few), "{few}");
     }
 
     #[test]
-    fn another_scene_begins_with_all_and_so_do_frames_that_are_alone() {
+    fn another_set_begins_anew_and_so_do_frames_that_are_alone() {
         let mut reserve = Reserve::default();
-        path(&mut reserve, 120, 64, linked);
-        assert!(reserve.halved(SCENE, false) > 0);
-        let halved = reserve.halved(SCENE, false);
-        let alone: Vec<u32> = (0..5).map(|_| reserve.halved(SCENE, true)).collect();
+        later(&mut reserve, 120, 64, linked);
+        let halved = reserve.halved(SET, false, 64);
+        assert!(halved > 0);
+        let alone: Vec<u32> = (0..5).map(|_| reserve.halved(SET, true, 64)).collect();
         assert_eq!(alone, [halved, halved, halved, 0, 0], "one alone is no kind");
-        assert_eq!(reserve.halved(SceneId(2), false), 0);
+        assert_eq!(reserve.halved(BrickSetKey(Digest32([2; 32])), false, 12), 0);
     }
 
     #[test]

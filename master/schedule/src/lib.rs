@@ -692,17 +692,13 @@ impl Scheduler {
                     self.cluster.reserve.begin(clock.now());
                 }
                 let alone = self.active.is_empty() && self.waiting.is_empty();
-                let halved = match goes_by_region(&job) {
-                    true => {
-                        let workers =
-                            self.cluster.roster.iter().filter(|(_, w)| !w.leaving).count();
-                        self.cluster.reserve.halved(job.scene.bricks, alone, workers)
-                    }
-                    false => 0,
-                };
-                self.cluster.roster.halve(halved);
+                let (set, by_region) = (job.scene.bricks, goes_by_region(&job));
                 let beside = (self.beside(), alone);
                 self.active.push_back(Frame::start(job, beside, &mut self.cluster, clock));
+                let Cluster { roster, residency, reserve, .. } = &mut self.cluster;
+                let workers = roster.iter().filter(|(_, w)| !w.leaving).count();
+                let workers = (workers, residency.workers_for(set));
+                roster.halve(if by_region { reserve.halved(set, alone, workers) } else { 0 });
                 // To it, all are new, and to the one before it is no longer the last.
                 if only.take().is_some() {
                     self.find_sated(None);

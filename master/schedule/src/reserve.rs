@@ -50,7 +50,7 @@ const HARDLY: f64 = 0.5;
 /// Fewer workers than this always draw all.
 const LEAST: usize = 4;
 
-/// Workers that draw the first frame of a set at most. Half as many would be as soon done with it at 1 Gbit/s (33 ms), but a
+/// Workers that draw the first frame of a set at most. Half as many would be done with it sooner at 1 Gbit/s (33 ms), but a
 /// scene that takes long to draw has all others' bricks to wait for in its second frame.
 const FIRST: usize = 16;
 
@@ -169,8 +169,14 @@ impl Reserve {
         self.since = now;
     }
 
-    /// How often so many workers are to be halved for a frame. Of another set nothing is known.
-    pub(crate) fn halved(&mut self, set: BrickSetKey, alone: bool, workers: usize) -> u32 {
+    /// How often so many workers are to be halved for a frame, of which so many must be left. Of another set nothing is
+    /// known.
+    pub(crate) fn halved(
+        &mut self,
+        set: BrickSetKey,
+        alone: bool,
+        (workers, needed): (usize, usize),
+    ) -> u32 {
         if self.set.replace(set) != Some(set) {
             let halved = (0..MOST).find(|&often| drawing(workers, often) <= FIRST).unwrap_or(MOST);
             self.levels = [Level { halved, ..Level::default() }; 2];
@@ -180,7 +186,9 @@ impl Reserve {
         if self.others >= OTHERS {
             (self.alone, self.others) = (alone, 0);
         }
-        self.levels[usize::from(self.alone)].halved
+        // Who is short of memory is sent the same bricks again and again.
+        let halved = self.levels[usize::from(self.alone)].halved;
+        (0..=halved).rev().find(|&often| drawing(workers, often) >= needed).unwrap_or(0)
     }
 
     /// Whether all are to be called while the first frame of a set is in the making, for which so many threads drew so
@@ -242,7 +250,7 @@ mod tests {
     ) -> Vec<usize> {
         let (mut now, mut drew) = (reserve.since, Vec::new());
         for _ in 0..frames {
-            let n = drawing(all, reserve.halved(SET, false, all));
+            let n = drawing(all, reserve.halved(SET, false, (all, 0)));
             now += (1000.0 * takes(n)) as Micros;
             reserve.done((false, false), 10_000, (n, n as u64), now);
             drew.push(n);
@@ -257,7 +265,7 @@ mod tests {
         all: usize,
         takes: impl Fn(usize) -> f64,
     ) -> Vec<usize> {
-        reserve.halved(SET, false, 1);
+        reserve.halved(SET, false, (1, 0));
         reserve.first = false;
         path(reserve, frames, all, takes)
     }
@@ -289,11 +297,12 @@ mod tests {
         // A quarter of what 16 threads could draw by then is drawn.
         let mut reserve = Reserve::default();
         reserve.begin(1_000);
-        assert_eq!(drawing(64, reserve.halved(SET, true, 64)), FIRST);
+        assert_eq!(drawing(64, reserve.halved(SET, true, (64, 0))), FIRST);
         assert!(
             !reserve.calls_all_now(20_000, 16, 9_000) && !reserve.calls_all_now(31_000, 16, 9_000)
         );
-        assert!(reserve.calls_all_now(33_000, 16, 9_000) && reserve.halved(SET, true, 64) == 0);
+        assert!(reserve.calls_all_now(33_000, 16, 9_000));
+        assert_eq!(reserve.halved(SET, true, (64, 0)), 0);
         assert!(!reserve.calls_all_now(33_000, 16, 9_000), "they are called");
     }
 
@@ -315,11 +324,19 @@ mod tests {
     fn another_set_begins_anew_and_so_do_frames_that_are_alone() {
         let mut reserve = Reserve::default();
         later(&mut reserve, 120, 64, linked);
-        let halved = reserve.halved(SET, false, 64);
+        let halved = reserve.halved(SET, false, (64, 0));
         assert!(halved > 0);
-        let alone: Vec<u32> = (0..5).map(|_| reserve.halved(SET, true, 64)).collect();
+        let alone: Vec<u32> = (0..5).map(|_| reserve.halved(SET, true, (64, 0))).collect();
         assert_eq!(alone, [halved, halved, halved, 0, 0], "one alone is no kind");
-        assert_eq!(reserve.halved(BrickSetKey(Digest32([2; 32])), false, 12), 0);
+        assert_eq!(reserve.halved(BrickSetKey(Digest32([2; 32])), false, (12, 0)), 0);
+    }
+
+    #[test]
+    fn as_many_draw_as_have_room_for_the_bricks() {
+        let mut reserve = Reserve::default();
+        let drawn = [0, 16, 17, 33, 65, usize::MAX]
+            .map(|needed| drawing(64, reserve.halved(SET, false, (64, needed))));
+        assert_eq!(drawn, [16, 16, 32, 64, 64, 64]);
     }
 
     #[test]

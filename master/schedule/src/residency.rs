@@ -125,8 +125,9 @@ struct Set {
     bricks: Arc<[BrickInfo]>,
     /// Their names alone: one is looked for in a tenth of the memory.
     ids: Vec<BrickId>,
-    /// Voxels of all.
+    /// Voxels and bytes of all.
     voxels: u64,
+    all_bytes: u64,
     needed: Vec<u64>,
 }
 
@@ -150,7 +151,8 @@ impl Set {
         let ids: Vec<BrickId> = bricks.iter().map(|b| b.id).collect();
         assert!(ids.windows(2).all(|w| w[0] < w[1]), "a job's bricks ascend by id");
         let voxels = bricks.iter().map(|b| u64::from(b.voxels)).sum();
-        Set { bricks: bricks.clone(), ids, voxels, needed: vec![0; bricks.len()] }
+        let all_bytes = bricks.iter().map(|b| u64::from(b.bytes)).sum();
+        Set { bricks: bricks.clone(), ids, voxels, all_bytes, needed: vec![0; bricks.len()] }
     }
 
     fn place_of(&self, id: BrickId) -> Option<u32> {
@@ -516,6 +518,17 @@ impl Residency {
         self.sets.get(&key).map_or(0, |set| set.voxels)
     }
 
+    /// How many workers hold a set that is open, each of whose bricks goes to some of them, by their budgets' mean.
+    pub(crate) fn workers_for(&self, key: BrickSetKey) -> usize {
+        /// A brick at the corner of four workers' tiles goes to all of them.
+        const COPIES: u128 = 4;
+        let budgets: u128 = self.shelves.values().map(|s| u128::from(s.budget)).sum();
+        let bytes = self.sets.get(&key).map_or(0, |set| u128::from(set.all_bytes));
+        let shelves = self.shelves.len();
+        let workers = (COPIES * bytes * shelves as u128).div_ceil(budgets.max(1));
+        usize::try_from(workers).unwrap_or(usize::MAX)
+    }
+
     /// These were drawn from, somewhere.
     pub(crate) fn touched(&mut self, key: BrickSetKey, places: &[u32]) {
         let Some(set) = self.sets.get_mut(&key) else { return };
@@ -785,6 +798,19 @@ mod tests {
         assert!(flush(&mut r).is_empty());
         r.ponged(W, 77);
         assert_eq!(flush(&mut r), [send(&[6, 8])]);
+    }
+
+    #[test]
+    fn so_many_workers_are_needed_as_hold_each_brick_four_times() {
+        let mut r = residency(1000);
+        let bytes: u64 = r.sets[&KEY].bricks.iter().map(|b| u64::from(b.bytes)).sum();
+        let needed = |budget: u64| (4 * bytes).div_ceil(budget) as usize;
+        assert_eq!(r.workers_for(KEY), needed(1000));
+        r.join(WorkerId(99), 3000, Vec::new());
+        assert_eq!(r.workers_for(KEY), needed(2000), "by the mean");
+        r.join(WorkerId(98), u64::MAX, Vec::new());
+        assert_eq!(r.workers_for(KEY), 1);
+        assert!(residency(0).workers_for(KEY) > 1_000);
     }
 
     #[test]

@@ -55,8 +55,9 @@ def peak_mib(process):
     return float("nan")
 
 
-def run(binary, volume, tf, axes, workers, options, folder):
-    """One job on a cluster of its own; gives statistics of its frames and of its processes."""
+def run(binary, volume, tf, axes, workers, options, folder, told=True):
+    """One job on a cluster of its own; gives statistics of its frames and of its processes. Not `told`: none of
+    frames, whose hashes and estimates of errors take time."""
     address = f"127.0.0.1:{free_port()}"
     log = open(folder / "log.txt", "a")
     processes = []
@@ -80,7 +81,8 @@ def run(binary, volume, tf, axes, workers, options, folder):
         begin = time.monotonic()
         client = subprocess.run(
             [binary, "render", "--master", address, "--tf", tf, "--size", options.size,
-             "--frames", str(options.frames), "--stats", stats, "-o", out, *options.extra],
+             "--frames", str(options.frames), *(["--stats", stats] if told else []), "-o", out,
+             *options.extra],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True)
         wall = time.monotonic() - begin
         log.write(client.stdout)
@@ -88,7 +90,8 @@ def run(binary, volume, tf, axes, workers, options, folder):
             log.flush()
             sys.exit(f"render failed with exit code {client.returncode}:\n"
                      + "\n".join((folder / "log.txt").read_text().splitlines()[-20:]))
-        frames = [json.loads(line) for line in stats.read_text().splitlines() if line.strip()]
+        lines = stats.read_text().splitlines() if told else []
+        frames = [json.loads(line) for line in lines if line.strip()]
         frames.sort(key=lambda f: f["frame"])
         png = sum(p.stat().st_size for p in out.glob("*.png"))
         return {

@@ -91,7 +91,7 @@ struct Slab {
     served: BTreeSet<WorkerId>,
     /// [`Roster::changes`](crate::roster::Roster::changes) up to which it was looked at.
     changes: Option<u64>,
-    /// Whether some of its owners were gone then, or leaving.
+    /// Whether some of its owners took no leases then.
     orphaned: bool,
     /// End of each render thread's last task.
     dry: BTreeMap<(WorkerId, u32), Micros>,

@@ -541,7 +541,7 @@ impl Regions {
         self.kind.2
     }
 
-    /// Those whose tiles these are and who are gone, or leave.
+    /// Those whose tiles these are and who are gone, leave, or are held in reserve.
     pub(crate) fn orphaning(&self, roster: &Roster) -> Vec<WorkerId> {
         let gone = |id: &WorkerId| roster.get(*id).is_none_or(|w| !w.draws());
         self.owned.keys().copied().filter(gone).collect()

@@ -159,16 +159,9 @@ pub(crate) struct Reserve {
     /// Whether it goes by those that are alone, and how many frames in a row were of the other kind.
     alone: bool,
     others: u32,
-    /// When a frame was done, or began alone.
-    since: Micros,
 }
 
 impl Reserve {
-    /// A frame begins, and none is in the making.
-    pub(crate) fn begin(&mut self, now: Micros) {
-        self.since = now;
-    }
-
     /// How often so many workers are to be halved for a frame, of which so many must be left. Of another set nothing is
     /// known.
     pub(crate) fn halved(
@@ -187,14 +180,20 @@ impl Reserve {
             (self.alone, self.others) = (alone, 0);
         }
         // Who is short of memory is sent the same bricks again and again.
-        let halved = self.levels[usize::from(self.alone)].halved;
-        (0..=halved).rev().find(|&often| drawing(workers, often) >= needed).unwrap_or(0)
+        let halved = &mut self.levels[usize::from(self.alone)].halved;
+        *halved = (0..=*halved).rev().find(|&often| drawing(workers, often) >= needed).unwrap_or(0);
+        *halved
+    }
+
+    /// Whether no frame of the set is done.
+    pub(crate) fn is_first(&self) -> bool {
+        self.first
     }
 
     /// Whether all are to be called while the first frame of a set is in the making, for which so many threads drew so
-    /// long by now.
-    pub(crate) fn calls_all_now(&mut self, drew: Micros, threads: u64, now: Micros) -> bool {
-        let had = now.saturating_sub(self.since).saturating_mul(threads);
+    /// long of the time that it takes by now.
+    pub(crate) fn calls_all_now(&mut self, drew: Micros, threads: u64, took: Micros) -> bool {
+        let had = took.saturating_mul(threads);
         let calls = self.first && drew as f64 > CALL_NOW * had as f64;
         if calls {
             self.call_all();
@@ -209,9 +208,9 @@ impl Reserve {
         (alone, full): (bool, bool),
         drew: Micros,
         (workers, threads): (usize, u64),
-        now: Micros,
+        took: Micros,
     ) {
-        let took = now.saturating_sub(std::mem::replace(&mut self.since, now)) as f64;
+        let took = took as f64;
         let span = Span { frames: 1, took, drew: drew as f64, had: took * threads as f64 };
         if std::mem::take(&mut self.first) && span.busy() > CALL {
             self.levels = Default::default();
@@ -248,26 +247,19 @@ mod tests {
         all: usize,
         takes: impl Fn(usize) -> f64,
     ) -> Vec<usize> {
-        let (mut now, mut drew) = (reserve.since, Vec::new());
+        let mut drew = Vec::new();
         for _ in 0..frames {
             let n = drawing(all, reserve.halved(SET, false, (all, 0)));
-            now += (1000.0 * takes(n)) as Micros;
-            reserve.done((false, false), 10_000, (n, n as u64), now);
+            let took = (1000.0 * takes(n)) as Micros;
+            reserve.done((false, false), 10_000, (n, n as u64), took);
             drew.push(n);
         }
         drew
     }
 
-    /// The same where the set is not a new one: all begin.
-    fn later(
-        reserve: &mut Reserve,
-        frames: usize,
-        all: usize,
-        takes: impl Fn(usize) -> f64,
-    ) -> Vec<usize> {
-        reserve.halved(SET, false, (1, 0));
-        reserve.first = false;
-        path(reserve, frames, all, takes)
+    /// Where the set is not a new one, so that all begin.
+    fn later() -> Reserve {
+        Reserve { set: Some(SET), ..Reserve::default() }
     }
 
     /// What 10 ms of drawing take, and bricks that become more with the square root of workers; milliseconds.
@@ -277,8 +269,8 @@ mod tests {
 
     #[test]
     fn where_bricks_bind_as_many_draw_as_are_good() {
-        let mut reserve = Reserve::default();
-        let drew = later(&mut reserve, 120, 64, linked);
+        let mut reserve = later();
+        let drew = path(&mut reserve, 120, 64, linked);
         assert_eq!(drew[..10], [64; 10], "the first frames say little");
         assert_eq!(drew[119], 16, "{drew:?}");
         assert!(drew.is_sorted_by(|a, b| a >= b), "{drew:?}");
@@ -296,34 +288,33 @@ mod tests {
         assert_eq!(path(&mut Reserve::default(), 3, 16, |n| 3.0 * n as f64), [16; 3]);
         // A quarter of what 16 threads could draw by then is drawn.
         let mut reserve = Reserve::default();
-        reserve.begin(1_000);
         assert_eq!(drawing(64, reserve.halved(SET, true, (64, 0))), FIRST);
         assert!(
-            !reserve.calls_all_now(20_000, 16, 9_000) && !reserve.calls_all_now(31_000, 16, 9_000)
+            !reserve.calls_all_now(20_000, 16, 8_000) && !reserve.calls_all_now(31_000, 16, 8_000)
         );
-        assert!(reserve.calls_all_now(33_000, 16, 9_000));
+        assert!(reserve.calls_all_now(33_000, 16, 8_000));
         assert_eq!(reserve.halved(SET, true, (64, 0)), 0);
-        assert!(!reserve.calls_all_now(33_000, 16, 9_000), "they are called");
+        assert!(!reserve.calls_all_now(33_000, 16, 8_000), "they are called");
     }
 
     #[test]
     fn where_workers_bind_all_draw() {
-        let drew = later(&mut Reserve::default(), 200, 64, |n| 10.0 / n as f64 / 0.8);
+        let drew = path(&mut later(), 200, 64, |n| 10.0 / n as f64 / 0.8);
         assert_eq!(drew, [64; 200]);
     }
 
     #[test]
     fn what_makes_frames_late_is_taken_back_and_tried_less_and_less_often() {
         // Threads stand still for some other reason, and half of them take twice as long.
-        let drew = later(&mut Reserve::default(), 1000, 64, |n| 64.0 / n as f64);
+        let drew = path(&mut later(), 1000, 64, |n| 64.0 / n as f64);
         let few = drew.iter().filter(|n| **n < 64).count();
         assert!((10..=100).contains(&few), "{few}");
     }
 
     #[test]
     fn another_set_begins_anew_and_so_do_frames_that_are_alone() {
-        let mut reserve = Reserve::default();
-        later(&mut reserve, 120, 64, linked);
+        let mut reserve = later();
+        path(&mut reserve, 120, 64, linked);
         let halved = reserve.halved(SET, false, (64, 0));
         assert!(halved > 0);
         let alone: Vec<u32> = (0..5).map(|_| reserve.halved(SET, true, (64, 0))).collect();
@@ -337,6 +328,13 @@ mod tests {
         let drawn = [0, 16, 17, 33, 65, usize::MAX]
             .map(|needed| drawing(64, reserve.halved(SET, false, (64, needed))));
         assert_eq!(drawn, [16, 16, 32, 64, 64, 64]);
+        // However long they stand still it does not go farther meanwhile.
+        let mut reserve = later();
+        for _ in 0..1000 {
+            reserve.halved(SET, false, (64, 33));
+            reserve.done((false, false), 10, (64, 64), 1000);
+        }
+        assert!(reserve.levels[0].halved <= 2, "{reserve:?}");
     }
 
     #[test]

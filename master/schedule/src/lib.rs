@@ -605,7 +605,7 @@ impl Scheduler {
         let calls = reserve.calls_all_now(
             frame.ledger.drew_us(),
             roster.threads(),
-            now.saturating_sub(traffic.since()),
+            now.saturating_sub(traffic.last_done()),
         );
         if calls {
             roster.halve(0);

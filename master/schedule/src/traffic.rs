@@ -102,7 +102,7 @@ impl Traffic {
     }
 
     /// When the last frame was done, or one began and none was in the making.
-    pub(crate) fn since(&self) -> Micros {
+    pub(crate) fn last_done(&self) -> Micros {
         self.done
     }
 

@@ -598,15 +598,11 @@ impl Scheduler {
 
     /// Whether those in reserve are called up for a first frame that takes long to draw.
     fn calls_all_now(&mut self, now: Micros) -> bool {
-        let Cluster { roster, reserve, traffic, .. } = &mut self.cluster;
+        let Cluster { roster, reserve, .. } = &mut self.cluster;
         // Asked after each result, and hardly ever in need of an answer.
         let asked = reserve.is_first() && roster.in_reserve() > 0;
         let Some(frame) = self.active.front().filter(|_| asked) else { return false };
-        let calls = reserve.calls_all_now(
-            frame.ledger.drew_us(),
-            roster.threads(),
-            now.saturating_sub(traffic.last_done()),
-        );
+        let calls = reserve.calls_all_now(frame.ledger.drew_us(), roster.threads(), now);
         if calls {
             roster.halve(0);
         }
@@ -692,6 +688,7 @@ impl Scheduler {
                 let Some(job) = self.waiting.pop_front() else { break };
                 if self.active.is_empty() {
                     self.cluster.traffic.begin(clock.now());
+                    self.cluster.reserve.begin(clock.now());
                 }
                 let alone = self.active.is_empty() && self.waiting.is_empty();
                 let (set, by_region) = (job.scene.bricks, goes_by_region(&job));
@@ -728,12 +725,12 @@ impl Scheduler {
             let Some(mut done) = self.active.pop_front() else { break };
             done.end(&mut self.cluster);
             let (beside, now) = (!self.active.is_empty(), clock.now());
-            let took = self.cluster.traffic.done(beside, now);
+            self.cluster.traffic.done(beside, now);
             if done.by_region() && beside != done.is_alone() {
                 let roster = &self.cluster.roster;
                 let drawing = (roster.staying().count(), roster.threads());
                 let full = self.cluster.traffic.is_full();
-                self.cluster.reserve.done((!beside, full), done.ledger.drew_us(), drawing, took);
+                self.cluster.reserve.done((!beside, full), done.ledger.drew_us(), drawing, now);
             }
             let done = done.finish(&mut self.cluster, clock.now());
             self.cluster.out.push_back(done);

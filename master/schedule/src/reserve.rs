@@ -159,9 +159,17 @@ pub(crate) struct Reserve {
     /// Whether it goes by those that are alone, and how many frames in a row were of the other kind.
     alone: bool,
     others: u32,
+    /// When a frame was done that is of either kind, or began alone. A path's first frame begins alone and ends beside
+    /// others, so it is judged with the one after it, by the time of both: `traffic` counts each.
+    since: Micros,
 }
 
 impl Reserve {
+    /// A frame begins, and none is in the making.
+    pub(crate) fn begin(&mut self, now: Micros) {
+        self.since = now;
+    }
+
     /// How often so many workers are to be halved for a frame, of which so many must be left. Of another set nothing is
     /// known.
     pub(crate) fn halved(
@@ -191,9 +199,9 @@ impl Reserve {
     }
 
     /// Whether all are to be called while the first frame of a set is in the making, for which so many threads drew so
-    /// long of the time that it takes by now.
-    pub(crate) fn calls_all_now(&mut self, drew: Micros, threads: u64, took: Micros) -> bool {
-        let had = took.saturating_mul(threads);
+    /// long by now.
+    pub(crate) fn calls_all_now(&mut self, drew: Micros, threads: u64, now: Micros) -> bool {
+        let had = now.saturating_sub(self.since).saturating_mul(threads);
         let calls = self.first && drew as f64 > CALL_NOW * had as f64;
         if calls {
             self.call_all();
@@ -208,9 +216,9 @@ impl Reserve {
         (alone, full): (bool, bool),
         drew: Micros,
         (workers, threads): (usize, u64),
-        took: Micros,
+        now: Micros,
     ) {
-        let took = took as f64;
+        let took = now.saturating_sub(std::mem::replace(&mut self.since, now)) as f64;
         let span = Span { frames: 1, took, drew: drew as f64, had: took * threads as f64 };
         if std::mem::take(&mut self.first) && span.busy() > CALL {
             self.levels = Default::default();
@@ -247,11 +255,11 @@ mod tests {
         all: usize,
         takes: impl Fn(usize) -> f64,
     ) -> Vec<usize> {
-        let mut drew = Vec::new();
+        let (mut now, mut drew) = (reserve.since, Vec::new());
         for _ in 0..frames {
             let n = drawing(all, reserve.halved(SET, false, (all, 0)));
-            let took = (1000.0 * takes(n)) as Micros;
-            reserve.done((false, false), 10_000, (n, n as u64), took);
+            now += (1000.0 * takes(n)) as Micros;
+            reserve.done((false, false), 10_000, (n, n as u64), now);
             drew.push(n);
         }
         drew
@@ -288,13 +296,14 @@ mod tests {
         assert_eq!(path(&mut Reserve::default(), 3, 16, |n| 3.0 * n as f64), [16; 3]);
         // A quarter of what 16 threads could draw by then is drawn.
         let mut reserve = Reserve::default();
+        reserve.begin(1_000);
         assert_eq!(drawing(64, reserve.halved(SET, true, (64, 0))), FIRST);
         assert!(
-            !reserve.calls_all_now(20_000, 16, 8_000) && !reserve.calls_all_now(31_000, 16, 8_000)
+            !reserve.calls_all_now(20_000, 16, 9_000) && !reserve.calls_all_now(31_000, 16, 9_000)
         );
-        assert!(reserve.calls_all_now(33_000, 16, 8_000));
+        assert!(reserve.calls_all_now(33_000, 16, 9_000));
         assert_eq!(reserve.halved(SET, true, (64, 0)), 0);
-        assert!(!reserve.calls_all_now(33_000, 16, 8_000), "they are called");
+        assert!(!reserve.calls_all_now(33_000, 16, 9_000), "they are called");
     }
 
     #[test]
@@ -330,9 +339,9 @@ mod tests {
         assert_eq!(drawn, [16, 16, 32, 64, 64, 64]);
         // However long they stand still it does not go farther meanwhile.
         let mut reserve = later();
-        for _ in 0..1000 {
+        for i in 1..1000 {
             reserve.halved(SET, false, (64, 33));
-            reserve.done((false, false), 10, (64, 64), 1000);
+            reserve.done((false, false), 10, (64, 64), 1000 * i);
         }
         assert!(reserve.levels[0].halved <= 2, "{reserve:?}");
     }

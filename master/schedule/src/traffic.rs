@@ -101,16 +101,10 @@ impl Traffic {
         (self.sent, self.done) = (0, now);
     }
 
-    /// When the last frame was done, or one began and none was in the making.
-    pub(crate) fn last_done(&self) -> Micros {
-        self.done
-    }
-
-    /// A frame is done; whether others are in the making. Says how long it took. Crews are for those that have others beside them, and learn
+    /// A frame is done; whether others are in the making. Crews are for those that have others beside them, and learn
     /// from these alone; those that are alone learn from such.
-    pub(crate) fn done(&mut self, beside: bool, now: Micros) -> Micros {
-        let took_us = now.saturating_sub(self.done);
-        let took = took_us as f64;
+    pub(crate) fn done(&mut self, beside: bool, now: Micros) {
+        let took = now.saturating_sub(self.done) as f64;
         let carried = if self.sent == 0 { 0.0 } else { self.sent as f64 / self.rate };
         let carried = carried.min(took);
         if !beside {
@@ -131,7 +125,6 @@ impl Traffic {
             }
         }
         (self.sent, self.done) = (0, now);
-        took_us
     }
 
     /// Bytes a microsecond that the link carries, as far as that was seen.

@@ -228,6 +228,26 @@ async fn tiles_that_are_cut_for_a_frame_alone_cost_no_pixel() {
     assert!(cut, "no frame had tiles of two sizes");
 }
 
+/// Workers that call from the master's machine share its processors, so that a path's frames have few, large tiles.
+#[tokio::test]
+async fn workers_of_the_masters_machine_draw_large_tiles_of_the_same_pixels() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let want = embedded(dir.path());
+    let (_master, address) = master();
+    let client = Client::connect(&address).await.expect("the master answers");
+    let _workers = ["a", "b"].map(|name| worker(&address, name));
+    until("two workers", async || (client.workers().await.unwrap().len() == 2).then_some(())).await;
+    let (mut rendering, file) = render(dir.path(), &address, "out", "region");
+    assert_eq!(rendering.exit_within(Duration::from_secs(120)), Some(0));
+    let frames = stats(&file);
+    assert_eq!(hashes(&frames), want);
+    // The first frame may be begun before the master knows of the others.
+    for frame in &frames[1..] {
+        let edges = frame.slabs[0].tiles.iter().map(|t| t.size);
+        assert_eq!(edges.min(), Some(256), "frame {}", frame.frame);
+    }
+}
+
 #[tokio::test]
 async fn a_job_waits_for_workers_and_goes_on_with_those_that_come() {
     let dir = tempfile::tempdir().unwrap();

@@ -9,7 +9,7 @@
 
 use crate::finish;
 use crate::jobs::{FinishedFrame, Job, JobState, JobView, Jobs, Watch};
-use crate::link::{BrickOrder, WorkerLink};
+use crate::link::{BrickOrder, Caller, WorkerLink};
 use crate::memory;
 use crate::record::{Recorder, Watched};
 use slabcast_common::ids::{FrameId, JobId, SceneId, WorkerId};
@@ -134,7 +134,7 @@ impl From<Rejected> for SubmitError {
 pub(crate) enum Event {
     Attach {
         hello: Hello,
-        address: String,
+        caller: Caller,
         link: WorkerLink,
         reply: oneshot::Sender<Result<WorkerId, String>>,
     },
@@ -323,12 +323,12 @@ impl Handle {
     pub async fn attach(
         &self,
         hello: Hello,
-        address: String,
+        caller: Caller,
         link: WorkerLink,
     ) -> Result<WorkerId, String> {
         let gone = || "the master is shutting down; come back later".to_string();
         let (reply, answer) = oneshot::channel();
-        self.inbox.send(Event::Attach { hello, address, link, reply }).await.map_err(|_| gone())?;
+        self.inbox.send(Event::Attach { hello, caller, link, reply }).await.map_err(|_| gone())?;
         answer.await.map_err(|_| gone())?
     }
 
@@ -482,8 +482,8 @@ impl Driver {
 
     fn handle(&mut self, event: Event) {
         match event {
-            Event::Attach { hello, address, link, reply } => {
-                let _ = reply.send(self.attach(hello, address, link));
+            Event::Attach { hello, caller, link, reply } => {
+                let _ = reply.send(self.attach(hello, caller, link));
             }
             Event::Said { worker, message } => self.said(worker, message),
             Event::Detached { worker, reason } => {
@@ -529,7 +529,7 @@ impl Driver {
     fn attach(
         &mut self,
         hello: Hello,
-        address: String,
+        caller: Caller,
         link: WorkerLink,
     ) -> Result<WorkerId, String> {
         let mut refuse = None;
@@ -582,7 +582,7 @@ impl Driver {
         let now = Instant::now();
         let attached = Attached {
             link,
-            address,
+            address: caller.address,
             simd: hello.simd,
             memory_budget_bytes: hello.memory_budget_bytes,
             tasks_done: 0,
@@ -597,6 +597,8 @@ impl Driver {
                 worker,
                 name,
                 threads: hello.threads,
+                // A rehearsing one stands for another machine's.
+                is_here: caller.is_here && !hello.rehearses,
                 memory_budget_bytes: hello.memory_budget_bytes,
                 held: hello.held,
             },

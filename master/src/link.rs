@@ -43,6 +43,15 @@ pub struct WorkerLink {
     pub bricks: mpsc::UnboundedSender<BrickOrder>,
 }
 
+/// Where a worker calls from.
+#[derive(Clone, Debug, Default)]
+pub struct Caller {
+    /// Its address; empty for one of this process.
+    pub address: String,
+    /// Whether that is this machine, whose processors it shares with the master then.
+    pub is_here: bool,
+}
+
 /// Bricks of one embedded batch: some 64 KiB, as over TCP, so that tiles start while the rest
 /// is on its way.
 const BATCH_BRICKS: usize = 64;
@@ -93,22 +102,22 @@ pub fn embedded(handle: crate::Handle) -> EmbeddedEnd {
     tokio::spawn(async move {
         let Some(ToMaster::Hello(hello)) = reply_rx.recv().await else { return };
         let link = WorkerLink { control: control_tx, bricks: order_tx };
-        serve_link(handle, hello, String::new(), link, &mut reply_rx).await;
+        let caller = Caller { address: String::new(), is_here: true };
+        serve_link(handle, hello, caller, link, &mut reply_rx).await;
     });
     EmbeddedEnd { control: control_rx, replies: reply_tx, bricks: batch_rx }
 }
 
-/// Carries a worker's messages to the driver until either side ends. `address` is where the
-/// worker called from; empty for one of this process.
+/// Carries a worker's messages to the driver until either side ends.
 pub async fn serve_link(
     handle: crate::Handle,
     hello: Hello,
-    address: String,
+    caller: Caller,
     link: WorkerLink,
     replies: &mut mpsc::Receiver<ToMaster>,
 ) {
     let control = link.control.clone();
-    let worker = match handle.attach(hello, address, link).await {
+    let worker = match handle.attach(hello, caller, link).await {
         Ok(worker) => worker,
         Err(reason) => {
             let _ = control.send(ToWorker::Refused { reason });

@@ -7,7 +7,7 @@
 use crate::Handle;
 use crate::driver::SubmitError;
 use crate::jobs::{JobState, JobView, WatchItem};
-use crate::link::{BATCHES_IN_FLIGHT, BrickOrder, WorkerLink, serve_link};
+use crate::link::{BATCHES_IN_FLIGHT, BrickOrder, Caller, WorkerLink, serve_link};
 use slabcast_common::ids::JobId;
 use slabcast_common::message::{ToMaster, ToWorker};
 use slabcast_proto::convert::{self, Down};
@@ -237,14 +237,19 @@ impl v1::cluster_server::Cluster for ClusterService {
         &self,
         request: Request<Streaming<v1::FromWorker>>,
     ) -> Result<Response<Self::ControlStream>, Status> {
-        let address = request.remote_addr().map(|a| a.to_string()).unwrap_or_default();
+        let [from, to] = [request.remote_addr(), request.local_addr()];
+        let caller = Caller {
+            address: from.map(|a| a.to_string()).unwrap_or_default(),
+            // Whoever has the address that it calls is the machine that is called.
+            is_here: from.zip(to).is_some_and(|(from, to)| from.ip() == to.ip()),
+        };
         let inbound = request.into_inner();
         // Unbounded for the same reason as `WorkerLink::control`, which it carries on.
         let (out, outbound) = mpsc::unbounded_channel();
         let (handle, sessions) = (self.handle.clone(), self.sessions.clone());
         tokio::spawn(async move {
-            if let Err(status) = control(handle, sessions, &address, inbound, &out).await {
-                debug!(address, status = status.message(), "control ended");
+            if let Err(status) = control(handle, sessions, &caller, inbound, &out).await {
+                debug!(address = caller.address, status = status.message(), "control ended");
                 let _ = out.send(Err(status));
             }
         });
@@ -314,7 +319,7 @@ fn brick_messages(order: BrickOrder) -> Vec<v1::BricksDown> {
 async fn control(
     handle: Handle,
     sessions: Sessions,
-    address: &str,
+    caller: &Caller,
     mut inbound: Streaming<v1::FromWorker>,
     out: &mpsc::UnboundedSender<Result<v1::ToWorker, Status>>,
 ) -> Result<(), Status> {
@@ -336,9 +341,9 @@ async fn control(
     locked(&sessions).insert(session, Waiting { orders, alive });
     let link = WorkerLink { control: control_tx, bricks: orders_tx };
     let (replies, mut reply_rx) = mpsc::channel(64);
-    let from = address.to_string();
+    let caller = caller.clone();
     // A task of its own: it outlives whatever ends below, and then tells the driver.
-    tokio::spawn(async move { serve_link(handle, hello, from, link, &mut reply_rx).await });
+    tokio::spawn(async move { serve_link(handle, hello, caller, link, &mut reply_rx).await });
     let down = async {
         while let Some(message) = control_rx.recv().await {
             match convert::to_worker_to_wire(&message, session) {

@@ -1396,7 +1396,7 @@ mod tests {
     #[test]
     fn results_of_a_mad_clock_stay_between_lease_and_arrival() {
         let mut roster = crate::roster::Roster::default();
-        roster.join(WorkerId(1), "mad".into(), 1, 0);
+        roster.join(WorkerId(1), "mad".into(), (1, false), 0);
         let worker = roster.get(WorkerId(1)).expect("it joined");
         for (start_us, end_us) in [(0, u64::MAX), (u64::MAX, 0), (5, 6), (7, 7)] {
             let times = slabcast_common::message::TaskTimes {

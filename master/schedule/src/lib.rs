@@ -150,6 +150,8 @@ pub enum Event {
         name: String,
         /// Its render threads.
         threads: u32,
+        /// Whether it runs on the master's machine: what a message takes there, threads that draw lack.
+        is_here: bool,
         /// Bytes of bricks it may hold, by their encoded size.
         memory_budget_bytes: u64,
         /// Bricks it still holds from before.
@@ -476,9 +478,9 @@ impl Scheduler {
         let cluster = &mut self.cluster;
         cluster.roster.watch(now, &cluster.config);
         match event {
-            Event::WorkerJoined { worker, name, threads, memory_budget_bytes, held } => {
+            Event::WorkerJoined { worker, name, threads, is_here, memory_budget_bytes, held } => {
                 cluster.residency.join(worker, memory_budget_bytes, held);
-                cluster.roster.join(worker, name, threads, now);
+                cluster.roster.join(worker, name, (threads, is_here), now);
                 for frame in &mut self.active {
                     frame.joined(cluster, worker, now);
                 }

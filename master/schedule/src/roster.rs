@@ -41,6 +41,8 @@ const MAX_PINGS: usize = 1024;
 pub(crate) struct Worker {
     pub(crate) name: Arc<str>,
     pub(crate) threads: u32,
+    /// It runs on the master's machine.
+    pub(crate) is_here: bool,
     pub(crate) since: Micros,
     /// It takes no more leases.
     pub(crate) leaving: bool,
@@ -120,10 +122,17 @@ pub(crate) struct Roster {
 }
 
 impl Roster {
-    pub(crate) fn join(&mut self, id: WorkerId, name: String, threads: u32, now: Micros) {
+    pub(crate) fn join(
+        &mut self,
+        id: WorkerId,
+        name: String,
+        (threads, is_here): (u32, bool),
+        now: Micros,
+    ) {
         let worker = Worker {
             name: name.into(),
             threads: threads.clamp(1, MAX_THREADS),
+            is_here,
             since: now,
             leaving: false,
             reserve: false,
@@ -354,7 +363,7 @@ mod tests {
     fn the_offset_comes_from_the_shortest_round_trip() {
         let mut r = Roster::default();
         let w = WorkerId(1);
-        r.join(w, "a".into(), 1, 0);
+        r.join(w, "a".into(), (1, false), 0);
         assert_eq!(r.get(w).unwrap().to_master(5), None);
         // The worker's clock is 1,000,000 ahead. A slow, lopsided pong first.
         let n = r.ping(w, 100);
@@ -374,7 +383,7 @@ mod tests {
         let mut r = Roster::default();
         let counted = |r: &Roster| r.staying().map(|(_, w)| u64::from(w.threads)).sum::<u64>();
         for (id, threads) in [(1, 3), (2, 0), (3, u32::MAX)] {
-            r.join(WorkerId(id), "a".into(), threads, 0);
+            r.join(WorkerId(id), "a".into(), (threads, false), 0);
         }
         assert_eq!((r.threads(), counted(&r)), (4 + u64::from(MAX_THREADS), r.threads()));
         assert!(r.leaves(WorkerId(3)) && !r.leaves(WorkerId(3)) && !r.leaves(WorkerId(9)));
@@ -389,7 +398,7 @@ mod tests {
     fn who_draws_is_the_largest_and_of_equals_every_second_pair() {
         let mut r = Roster::default();
         for id in 0..16 {
-            r.join(WorkerId(id), "a".into(), 1, 0);
+            r.join(WorkerId(id), "a".into(), (1, false), 0);
         }
         let drawing = |r: &Roster| r.staying().map(|(id, _)| id.0).collect::<Vec<_>>();
         let before = r.changes();
@@ -403,7 +412,7 @@ mod tests {
         r.leaves(WorkerId(4));
         assert_eq!(drawing(&r).len(), 7);
         assert!(!r.has_in_reserve(WorkerId(4)), "who leaves is nobody's reserve");
-        r.join(WorkerId(20), "large".into(), 8, 0);
+        r.join(WorkerId(20), "large".into(), (8, false), 0);
         assert!(drawing(&r).contains(&20), "it has the most threads: {:?}", drawing(&r));
         let counted = r.staying().map(|(_, w)| u64::from(w.threads)).sum::<u64>();
         assert_eq!(r.threads(), counted);
@@ -417,7 +426,7 @@ mod tests {
         let mut r = Roster::default();
         let w = WorkerId(1);
         r.watch(0, &config());
-        r.join(w, "a".into(), 1, 0);
+        r.join(w, "a".into(), (1, false), 0);
         r.watch(900_000, &config());
         r.watch(60_000_000, &config());
         assert!(r.silent(60_000_000, &config()).is_empty());

@@ -329,7 +329,7 @@ fn taken(t: Vec<u64>, seen: &mut Seen) -> Result<Taken, String> {
 fn event(e: Noted, seen: &mut Seen) -> Result<Event, String> {
     let ids = |ids: Vec<u32>| ids.into_iter().map(BrickId).collect::<Vec<_>>();
     Ok(match e {
-        Noted::Joined { w, name, threads, memory, held } => {
+        Noted::Joined { w, name, threads, here, memory, held } => {
             if !seen.workers.insert(w) {
                 return Err(format!("w{w} joined before; a worker's name is never used again"));
             }
@@ -338,7 +338,8 @@ fn event(e: Noted, seen: &mut Seen) -> Result<Event, String> {
                 .map(|(set, bricks)| Ok((key(&set)?, ids(bricks))))
                 .collect::<Result<_, String>>()?;
             let worker = WorkerId(w);
-            Event::WorkerJoined { worker, name, threads, memory_budget_bytes: memory, held }
+            let (is_here, memory_budget_bytes) = (here, memory);
+            Event::WorkerJoined { worker, name, threads, is_here, memory_budget_bytes, held }
         }
         Noted::Heard { w } => Event::WorkerHeard { worker: WorkerId(w) },
         Noted::Lost { w, reason } => Event::WorkerLost { worker: WorkerId(w), reason },

@@ -128,8 +128,15 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
                 let (name, threads) = (format!("n{next}"), 1 + rng.below(3) as u32);
                 let held = vec![(BrickSetKey(Digest32([9; 32])), vec![BrickId(1), BrickId(7)])];
                 let budget = if rng.below(3) == 0 { 20_000 } else { u64::MAX };
-                let memory_budget_bytes = budget;
-                Some(Event::WorkerJoined { worker, name, threads, memory_budget_bytes, held })
+                let (is_here, memory_budget_bytes) = (rng.below(2) == 0, budget);
+                Some(Event::WorkerJoined {
+                    worker,
+                    name,
+                    threads,
+                    is_here,
+                    memory_budget_bytes,
+                    held,
+                })
             }
             3 if rng.below(40) == 0 && !workers.is_empty() => {
                 let worker = workers.remove(rng.below(workers.len() as u64) as usize);

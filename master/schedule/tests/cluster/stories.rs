@@ -572,8 +572,14 @@ fn statistics_of_a_frame_worked_out_by_hand() {
     let mut s = Scheduler::new(Config::default());
     let worker = WorkerId(1);
     let (name, held) = ("one".to_string(), Vec::new());
-    let joined =
-        Event::WorkerJoined { worker, name, threads: 1, memory_budget_bytes: u64::MAX, held };
+    let joined = Event::WorkerJoined {
+        worker,
+        name,
+        threads: 1,
+        is_here: false,
+        memory_budget_bytes: u64::MAX,
+        held,
+    };
     s.handle(&clock, joined);
     let work = Work { tile: Some(256), slabs: 2, ..slab() };
     let job = job_with(3, work, Quality { thickness: 2.0, eps: 0.0, ..Quality::default() });

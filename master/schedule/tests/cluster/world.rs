@@ -34,6 +34,7 @@ impl Clock for VirtualClock {
 #[derive(Clone, Debug)]
 pub(crate) struct Nature {
     pub(crate) threads: u32,
+    pub(crate) is_here: bool,
     /// Microseconds a pixel-sheet.
     pub(crate) us_per_pixel_sheet: f64,
     pub(crate) budget: u64,
@@ -58,6 +59,7 @@ impl Default for Nature {
     fn default() -> Self {
         Nature {
             threads: 1,
+            is_here: false,
             us_per_pixel_sheet: 0.5,
             budget: u64::MAX,
             latency: (100, 100),
@@ -284,6 +286,7 @@ impl World {
             worker: id,
             name: format!("host-{}", id.0),
             threads: nature.threads,
+            is_here: nature.is_here,
             memory_budget_bytes: nature.budget,
             held,
         });

@@ -371,6 +371,25 @@ fn more_workers_than_are_good_are_held_in_reserve() {
     assert!(all.2 < few.2 * 6 / 5, "{all:?} of 32, {few:?} of 8");
 }
 
+/// A path's second frame ends soon after the first, which had all bricks to wait for: taken by itself it says that threads draw
+/// all the time, and calls everybody.
+#[test]
+fn a_paths_first_frame_is_judged_with_the_second_one() {
+    let (slab, trace) = world(24);
+    let mut region = under(Schedule::Region, &slab);
+    region.iter_mut().for_each(|job| job.work.tile = Some(32));
+    for workers in [32, 64] {
+        let mut heard = Listener::default();
+        let link = Link { bytes_per_s: Some(1e9), latency_ns: 50_000 };
+        let c = Cluster { link, in_flight: 4, ..cluster(workers) };
+        sim::run(&region, &trace, &c, &mut heard).expect("it can be predicted");
+        let frames = heard.0.iter().map(|(stats, _)| &stats.workers);
+        let drew: Vec<usize> =
+            frames.map(|some| some.iter().filter(|w| w.render_ms > 0.0).count()).collect();
+        assert!(drew[..8].iter().all(|n| *n <= 16), "of {workers}: {drew:?}");
+    }
+}
+
 #[test]
 fn fewer_frames_are_in_the_making_while_bricks_fill_the_link() {
     let (slab, trace) = world(12);

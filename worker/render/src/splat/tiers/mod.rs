@@ -1,0 +1,517 @@
+//! Rows of storeys: a voxel is added along x alone, and pixels are made of rows when a sheet closes
+//! ([`crate::storeys`]).
+//!
+//! A *tier* is the row of one storey in one open sheet. Tiers lie slot by slot; each begins with a margin of as
+//! many columns as a footprint has, and ends with one, so that no footprint need be cut: what lies there nobody
+//! reads. A register adds at a multiple of its own length alone, since what a neighbour has just written there
+//! is then read back as it was written; weights are moved to where a footprint begins in its first register.
+
+#[cfg(target_arch = "x86_64")]
+mod avx2;
+#[cfg(target_arch = "x86_64")]
+mod avx512;
+#[cfg(target_arch = "x86_64")]
+mod wide;
+
+#[cfg(target_arch = "x86_64")]
+use super::Level;
+use super::records::apart::{Apart, BATCH, Each, Layers};
+use super::records::{Line, MOST, Record, Recorded, Splat, Table};
+use super::{Accumulate, Grey, Simd};
+use crate::sheet::LANES;
+use crate::storeys::{REACHING, ROWS};
+use crate::tile::PART;
+
+/// Which memory the tiers of a part take.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Shape {
+    /// Tiers of a sheet.
+    pub(crate) rows: usize,
+    /// Lines of the cache of a tier.
+    wide: usize,
+    /// Columns before a part's first.
+    pub(crate) margin: usize,
+    /// Pixels of a line.
+    line: usize,
+    /// Columns of a footprint at most.
+    len: usize,
+}
+
+/// Pixels of a line of the cache.
+const fn a_line<S: Recorded>() -> usize {
+    size_of::<Line>() / size_of::<S::Pixel>()
+}
+
+/// How many groups of so many columns a footprint of `len` may reach: it may begin in the last column of the first.
+#[inline(always)]
+fn groups(len: usize, columns: usize) -> usize {
+    (len + columns - 1).div_ceil(columns)
+}
+
+impl Shape {
+    /// For footprints of at most `len` columns and so many tiers.
+    pub(crate) fn new<S: Recorded>(rows: usize, len: usize) -> Shape {
+        assert!(rows <= ROWS && len < 64, "{rows} tiers for footprints of {len}");
+        let margin = len.next_multiple_of(8);
+        let groups = groups(len, a_line::<S>());
+        // Whole chunks of weights are added: of sixteen columns, or of four lines where there are more.
+        let sixteen = 16 / a_line::<S>();
+        let spare = groups.next_multiple_of(if groups > 4 { 4 } else { sixteen });
+        let wide = (margin + PART as usize) / a_line::<S>() + spare;
+        Shape { rows, wide, margin, line: a_line::<S>(), len }
+    }
+
+    /// Lines of tiers for `sheets`.
+    pub(crate) fn lines(&self, sheets: usize) -> usize {
+        sheets * self.rows * self.wide
+    }
+
+    /// The place of a footprint's first pixel, which is at `first` in the part: it may lie outside.
+    #[inline(always)]
+    pub(crate) fn place(&self, first: i32) -> u32 {
+        (first + self.margin as i32).clamp(0, self.margin as i32 + PART) as u32
+    }
+
+    /// The same among the pixels of all tiers of a sheet.
+    #[inline(always)]
+    pub(crate) fn place_in(&self, tier: u32, first: i32) -> u32 {
+        tier * (self.wide * self.line) as u32 + self.place(first)
+    }
+
+    /// Columns of the part that a footprint of `len` columns has from a [place](Shape::place) on.
+    #[inline(always)]
+    pub(crate) fn columns(&self, place: u32, len: usize) -> u64 {
+        let (all, first) = ((1u64 << len) - 1, place as i32 - self.margin as i32);
+        if first < 0 { all >> -first } else { all.checked_shl(first as u32).unwrap_or(0) }
+    }
+}
+
+/// The open sheets of a part, tier by tier.
+pub(crate) struct Tiers<'a, S: Recorded, const N: usize> {
+    lines: &'a mut [Line],
+    shape: Shape,
+    kind: std::marker::PhantomData<S>,
+}
+
+/// Weights across and in depth.
+#[derive(Clone, Copy)]
+pub(crate) struct Weights<'a, S: Recorded> {
+    pub(crate) across: Table<'a, S::Weight>,
+    pub(crate) deep: Table<'a, S::Depth>,
+}
+
+/// Tiers that reach some row of pixels in a sheet, beside each other: the line that the first one's first column in
+/// the part [is in](Tiers::begin), and what each weighs.
+pub(crate) type Above<'a, W> = (u32, &'a [W]);
+
+/// Sums of pixels that close, of their sheet and of the one behind, beside each other.
+pub(crate) struct Folded<S: Recorded> {
+    records: Box<[Record<S, 2>]>,
+    n: usize,
+}
+
+/// What is stored at once, more than is there at most.
+const SPARE: usize = 8;
+
+impl<S: Recorded> Default for Folded<S> {
+    fn default() -> Self {
+        let n = (PART * PART) as usize + LANES + SPARE;
+        Folded { records: vec![Record::<S, 2>::default(); n].into(), n: 0 }
+    }
+}
+
+impl<S: Recorded> Folded<S> {
+    /// Forgets all.
+    #[inline(always)]
+    pub(crate) fn clear(&mut self) {
+        self.n = 0;
+    }
+
+    /// Those from the `i`th on, as many as are closed at once.
+    #[inline(always)]
+    pub(crate) fn from(&self, i: usize) -> &[Record<S, 2>; LANES] {
+        self.records[i..].first_chunk().expect("room behind the last")
+    }
+}
+
+impl<'a, S: Recorded, const N: usize> Tiers<'a, S, N> {
+    /// In memory that is all zero, but for margins of tiers of this shape.
+    ///
+    /// # Panics
+    /// If there are not as many lines.
+    pub(crate) fn new(lines: &'a mut [Line], shape: Shape) -> Self {
+        let lines = &mut lines[..shape.lines(N)];
+        Tiers { lines, shape, kind: std::marker::PhantomData }
+    }
+
+    #[inline(always)]
+    pub(crate) fn shape(&self) -> Shape {
+        self.shape
+    }
+
+    /// The line that a tier's first column in the part is in.
+    #[inline(always)]
+    pub(crate) fn begin(&self, slot: usize, row: usize) -> u32 {
+        let Shape { rows, wide, margin, .. } = self.shape;
+        ((slot * rows + row) * wide + margin / a_line::<S>()) as u32
+    }
+
+    /// The part's pixels of a tier that begins there.
+    #[inline(always)]
+    fn pixels(&self, begin: u32) -> &[S::Pixel; PART as usize] {
+        let lines = &self.lines[begin as usize..];
+        bytemuck::cast_slice(lines).first_chunk().expect("a tier is longer than a part is wide")
+    }
+
+    #[inline(always)]
+    fn tier_mut(&mut self, slot: usize, row: usize) -> &mut [S::Pixel] {
+        let Shape { rows, wide, .. } = self.shape;
+        bytemuck::cast_slice_mut(&mut self.lines[(slot * rows + row) * wide..][..wide])
+    }
+
+    /// Adds a section to a tier, plainly.
+    #[inline(always)]
+    pub(crate) fn add(
+        &mut self,
+        (slot, row): (usize, usize),
+        (place, wx): (usize, &[S::Weight]),
+        section: &[S::Section; 4],
+    ) {
+        let tier = self.tier_mut(slot, row);
+        for (pixel, &w) in tier[place..place + wx.len()].iter_mut().zip(wx) {
+            S::add(pixel, section, w);
+        }
+    }
+
+    /// Empties the lines of a tier that have any of the columns.
+    #[inline(always)]
+    pub(crate) fn empty(&mut self, slot: usize, row: usize, columns: u64) {
+        let begin = self.begin(slot, row) as usize;
+        let lines = &mut self.lines[begin..begin + PART as usize / a_line::<S>()];
+        let mut left = firsts::<S>(columns);
+        while left != 0 {
+            lines[left.trailing_zeros() as usize / a_line::<S>()] = Line::ZERO;
+            left &= left - 1;
+        }
+    }
+}
+
+/// The first column of each line of a tier that has any of `columns`.
+#[inline(always)]
+fn firsts<S: Recorded>(columns: u64) -> u64 {
+    firsts_of(columns, a_line::<S>())
+}
+
+/// The first of each `n` columns, two, four or eight, that have any of `columns`.
+#[inline(always)]
+fn firsts_of(columns: u64, n: usize) -> u64 {
+    let pairs = columns | columns >> 1;
+    let fours = pairs | pairs >> 2;
+    match n {
+        2 => pairs & 0x5555_5555_5555_5555,
+        4 => fours & 0x1111_1111_1111_1111,
+        _ => (fours | fours >> 4) & 0x0101_0101_0101_0101,
+    }
+}
+
+/// Sums whose tiers are added to and folded in lanes.
+pub(crate) trait Tiered: Recorded {
+    /// Adds `voxels` with `payloads`, which begin at the sheet that `slot` holds, to the tiers that their
+    /// [rows](Splat::first) name.
+    fn add_flat<const N: usize>(
+        simd: Simd,
+        tiers: &mut Tiers<'_, Self, N>,
+        voxels: (&[Splat], &[Self::Payload]),
+        slot: usize,
+        weights: &Weights<'_, Self>,
+    );
+
+    /// Adds voxels whose sections have [places](Shape::place_in) of their own, by slot.
+    fn add_apart<const N: usize>(
+        simd: Simd,
+        tiers: &mut Tiers<'_, Self, N>,
+        voxels: (&Apart, &[Self::Payload]),
+        places: &[Each<u32>; MOST],
+        layers: &Layers<'_, Self, N>,
+    );
+
+    /// Puts the sums that two sheets have in a row of pixels, by the tiers above them, behind those of `to`: of
+    /// pixels that `open` has bits for and the first sheet has any extinction in. Says which these are.
+    fn fold<const N: usize>(
+        simd: Simd,
+        tiers: &Tiers<'_, Self, N>,
+        above: [Above<'_, Self::Weight>; 2],
+        spread: f32,
+        open: u64,
+        to: &mut Folded<Self>,
+    ) -> u64;
+}
+
+/// [`Tiered::fold`] plainly; `down`: [`Accumulate::down`] of each channel.
+#[inline(always)]
+fn fold<S: Recorded<Pixel = [T; C]>, T: Copy + Default, const C: usize, const N: usize>(
+    tiers: &Tiers<'_, S, N>,
+    above: [Above<'_, S::Weight>; 2],
+    open: u64,
+    to: &mut Folded<S>,
+    down: impl Fn(&[(T, S::Weight)]) -> T,
+) -> u64 {
+    let (mut left, mut filled) = (open, 0);
+    while left != 0 {
+        let x = left.trailing_zeros() as usize;
+        left &= left - 1;
+        let mut record = [[T::default(); C]; 2];
+        for (sums, (begin, weights)) in record.iter_mut().zip(above) {
+            let mut rows = [[(T::default(), S::Weight::default()); REACHING]; C];
+            for (row, &wy) in weights.iter().enumerate().take(REACHING) {
+                let pixel = tiers.pixels(begin + (row * tiers.shape.wide) as u32)[x];
+                for (rows, sum) in rows.iter_mut().zip(pixel) {
+                    rows[row] = (sum, wy);
+                }
+            }
+            for (sum, rows) in sums.iter_mut().zip(&rows) {
+                *sum = down(&rows[..weights.len().min(REACHING)]);
+            }
+        }
+        // Extinction comes first.
+        if S::raw(&record[0])[0] != 0 {
+            to.records[to.n] = record;
+            to.n += 1;
+            filled |= 1 << x;
+        }
+    }
+    filled
+}
+
+/// [`Tiered::add_flat`] plainly.
+#[inline(always)]
+fn add_flat<S: Recorded, const N: usize>(
+    tiers: &mut Tiers<'_, S, N>,
+    (voxels, payloads): (&[Splat], &[S::Payload]),
+    slot: usize,
+    Weights { across, deep }: &Weights<'_, S>,
+) {
+    for (v, &payload) in voxels.iter().zip(payloads) {
+        let [place, row] = v.first();
+        let wx = across.row((v.rows & 0xffff) as usize);
+        for (i, &wz) in deep.row(v.phase() as usize * deep.len).iter().enumerate() {
+            tiers.add(((slot + i) % N, row), (place, wx), &S::cut(payload, wz));
+        }
+    }
+}
+
+/// [`Tiered::add_apart`] plainly.
+#[inline(always)]
+fn add_apart<S: Recorded, const N: usize>(
+    tiers: &mut Tiers<'_, S, N>,
+    (apart, payloads): (&Apart, &[S::Payload]),
+    places: &[Each<u32>; MOST],
+    layers: &Layers<'_, S, N>,
+) {
+    for (&i, &payload) in apart.kept.iter().zip(payloads) {
+        let i = i as usize % BATCH;
+        for slot in 0..N {
+            let sheet = layers.after(slot);
+            if sheet >= apart.left[i] {
+                continue;
+            }
+            let wz = layers.deep.weights[apart.deep[i] as usize + sheet as usize];
+            let wx = layers.across[0][slot].row(apart.from[0][slot][i] as usize);
+            let a_tier = tiers.shape.wide * tiers.shape.line;
+            let [row, place] =
+                [places[slot][i] as usize / a_tier, places[slot][i] as usize % a_tier];
+            tiers.add((slot, row), (place, wx), &S::cut(payload, wz));
+        }
+    }
+}
+
+/// Adds to tiers and folds them by what is compiled for the instructions that were seen, or plainly. `$wide` is what registers
+/// of these sums are, `$channel` a channel of theirs.
+macro_rules! tiered {
+    ($sums:ty, $channel:ty, $wide:ident $(<$c:literal>)?) => {
+        impl Tiered for $sums {
+            #[inline(always)]
+            fn add_flat<const N: usize>(
+                simd: Simd,
+                tiers: &mut Tiers<'_, Self, N>,
+                voxels: (&[Splat], &[Self::Payload]),
+                slot: usize,
+                weights: &Weights<'_, Self>,
+            ) {
+                assert_eq!(voxels.0.len(), voxels.1.len(), "a payload a voxel");
+                match simd.0 {
+                    // SAFETY: the value proves that the instructions are there.
+                    #[cfg(target_arch = "x86_64")]
+                    Level::Avx512 => unsafe {
+                        avx512::add_flat::<avx512::$wide $(<$c>)?, Self, N>(tiers, voxels, slot, weights);
+                    },
+                    // SAFETY: as above.
+                    #[cfg(target_arch = "x86_64")]
+                    Level::Avx2 => unsafe {
+                        avx2::add_flat::<avx2::$wide $(<$c>)?, Self, N>(tiers, voxels, slot, weights);
+                    },
+                    _ => add_flat(tiers, voxels, slot, weights),
+                }
+            }
+
+            #[inline(always)]
+            fn add_apart<const N: usize>(
+                simd: Simd,
+                tiers: &mut Tiers<'_, Self, N>,
+                voxels: (&Apart, &[Self::Payload]),
+                places: &[Each<u32>; MOST],
+                layers: &Layers<'_, Self, N>,
+            ) {
+                match simd.0 {
+                    // SAFETY: as above.
+                    #[cfg(target_arch = "x86_64")]
+                    Level::Avx512 => unsafe {
+                        avx512::add_apart::<avx512::$wide $(<$c>)?, Self, N>(tiers, voxels, places, layers);
+                    },
+                    // SAFETY: as above.
+                    #[cfg(target_arch = "x86_64")]
+                    Level::Avx2 => unsafe {
+                        avx2::add_apart::<avx2::$wide $(<$c>)?, Self, N>(tiers, voxels, places, layers);
+                    },
+                    _ => add_apart(tiers, voxels, places, layers),
+                }
+            }
+
+            #[inline(always)]
+            fn fold<const N: usize>(
+                simd: Simd,
+                tiers: &Tiers<'_, Self, N>,
+                above: [Above<'_, Self::Weight>; 2],
+                spread: f32,
+                open: u64,
+                to: &mut Folded<Self>,
+            ) -> u64 {
+                match simd.0 {
+                    // SAFETY: as above.
+                    #[cfg(target_arch = "x86_64")]
+                    Level::Avx512 => unsafe {
+                        <avx512::$wide $(<$c>)? as wide::Wide<Self>>::fold(tiers, above, spread, open, to)
+                    },
+                    // SAFETY: as above.
+                    #[cfg(target_arch = "x86_64")]
+                    Level::Avx2 => unsafe {
+                        <avx2::$wide $(<$c>)? as wide::Wide<Self>>::fold(tiers, above, spread, open, to)
+                    },
+                    _ => fold(tiers, above, open, to, |rows| <$channel>::down(rows.iter().copied(), spread)),
+                }
+            }
+        }
+    };
+}
+
+tiered!(i16, i16, Shorts);
+tiered!(i32, i32, Longs<4>);
+tiered!(Grey, i32, Longs<2>);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::splat::Tap;
+    use proptest::prelude::*;
+
+    /// Numbers that look random.
+    fn numbers(seed: u32) -> impl FnMut(u32) -> u32 {
+        let mut state = u64::from(seed) | 1 << 40;
+        move |below| {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(99);
+            ((state >> 32) as u32) % below
+        }
+    }
+
+    /// Voxels added flat and apart, and some rows folded, by every instruction set as by the plain loops.
+    fn everywhere<S: Tiered, const N: usize>(
+        (len, rows, reaching): (usize, usize, usize),
+        seed: u32,
+        weight: impl Fn(u32) -> S::Weight,
+        deep: impl Fn(u32) -> S::Depth,
+    ) -> Result<(), TestCaseError> {
+        let mut next = numbers(seed);
+        let shape = Shape::new::<S>(rows, len);
+        let phases = 5;
+        let table: Vec<S::Weight> = (0..phases * len).map(|_| weight(next(1000))).collect();
+        let across = Table { weights: &table[..], len };
+        let depths: Vec<S::Depth> = (0..3 * N).map(|_| deep(next(1000))).collect();
+        let weights = Weights { across, deep: Table { weights: &depths[..], len: N } };
+        let payloads: Vec<S::Payload> = (0..40)
+            .map(|_| S::payload([next(9000), next(9000), next(9000), next(9000)].map(|x| x as f32)))
+            .collect();
+        let mut place = || {
+            let first = next(64 + 2 * len as u32) as i32 - 2 * len as i32;
+            (first, shape.place(first), next(rows as u32), next(phases as u32) * len as u32)
+        };
+        let voxels: Vec<Splat> = (0..40)
+            .map(|_| {
+                let (_, place, row, from) = place();
+                Splat { place: place | row << 8, rows: from, deep: from % 3, sample: 0 }
+            })
+            .collect();
+        let (mut apart, mut places) = (Apart::default(), [[0; BATCH]; MOST]);
+        for i in 0..40 {
+            apart.kept[i] = i as u32;
+            apart.left[i] = 1 + (i % N) as i32;
+            for slot in 0..N {
+                let (first, _, row, from) = place();
+                (apart.first[0][slot][i], apart.from[0][slot][i]) = (first, from);
+                places[slot][i] = shape.place_in(row, first);
+            }
+        }
+        let layers =
+            Layers { across: [[across; N]; 2], deep: weights.deep, slot: 1 % N, alike: false };
+        let (begin, open) =
+            (next((rows - reaching) as u32) as usize, u64::from(next(1 << 31)) << 9 | 1);
+        let wy: Vec<S::Weight> = (0..reaching).map(|_| weight(next(1000))).collect();
+        let run = |simd| {
+            let mut lines = vec![Line::ZERO; shape.lines(N)];
+            let mut tiers = Tiers::<S, N>::new(&mut lines, shape);
+            S::add_flat(simd, &mut tiers, (&voxels, &payloads), 2 % N, &weights);
+            S::add_apart(simd, &mut tiers, (&apart, &payloads), &places, &layers);
+            let mut folded = Folded::default();
+            let mut all = Vec::new();
+            for open in [open, !open, u64::MAX, 0] {
+                let above = [0, 1].map(|slot| (tiers.begin(slot, begin), &wy[..]));
+                all.push(S::fold(simd, &tiers, above, 1.25, open, &mut folded));
+                assert_eq!(
+                    all.iter().map(|filled| filled.count_ones()).sum::<u32>(),
+                    folded.n as u32
+                );
+            }
+            let margin = shape.margin;
+            let seen: Vec<Vec<S::Pixel>> = (0..N * rows)
+                .map(|i| {
+                    tiers.tier_mut(i / rows, i % rows)[margin..margin + PART as usize].to_vec()
+                })
+                .collect();
+            (seen, all, folded.records[..folded.n].to_vec())
+        };
+        let want = run(Simd::plain());
+        let nothing = S::Pixel::default();
+        prop_assert!(want.0.iter().flatten().any(|sums| *sums != nothing) && want.1[3] == 0);
+        for simd in Simd::all() {
+            prop_assert!(run(simd) == want, "{}", simd.name());
+        }
+        Ok(())
+    }
+
+    proptest! {
+        #[test]
+        fn every_instruction_set_adds_to_tiers_and_folds_them_as_the_plain_loops_do(
+            len in prop::sample::select(vec![1, 3, 4, 5, 7, 8, 9, 13, 14, 17, 25, 26, 41, 63]),
+            rows in 24..60usize, reaching in 1..9usize, seed in any::<u32>(),
+        ) {
+            let shape = (len, rows, reaching);
+            let short = |x| x as i16 * 20;
+            everywhere::<i16, 4>(shape, seed, short, short)?;
+            everywhere::<i16, 8>(shape, seed, short, short)?;
+            let (tap, deep) = (|x| Tap::new(x as f32 * 1e-3), |x| x as f32 * 1e-3);
+            everywhere::<i32, 4>(shape, seed, tap, deep)?;
+            everywhere::<i32, 8>(shape, seed, tap, deep)?;
+            everywhere::<Grey, 4>(shape, seed, tap, deep)?;
+            everywhere::<Grey, 8>(shape, seed, tap, deep)?;
+        }
+    }
+}

@@ -22,7 +22,7 @@
 //! `flat` for most orthographic views, `leaning` for those whose kernel leans, `deep` for most perspective ones,
 //! and `level` for flat ones that are level; it keeps the sheets of `deep` ones that are level, too.
 
-use crate::deep::{self, RenderDeep};
+use crate::deep::{self, Deep, RenderDeep};
 use crate::flat::{self, RenderFlat};
 use crate::general::{GeneralScratch, Kind, Queues, RenderGeneral};
 use crate::leaning::{self, RenderLeaning};
@@ -279,10 +279,14 @@ impl Frame {
     /// Whether its three colours are one and it is drawn where that is made use of: opacity and one
     /// colour, half of what others add up and close.
     pub fn has_two_channels(&self) -> bool {
+        self.may_have_two_channels() && flat::takes(self).is_some()
+    }
+
+    /// Whether two channels are all that 32-bit sums of it need.
+    fn may_have_two_channels(&self) -> bool {
         let Scene { grey, quality, ref classifier, .. } = *self.scene;
         let fits = !classifier.is_modulated() && self.sections.most() <= MOST;
-        let whole = matches!(quality.sums, Sums::I32 | Sums::Auto);
-        grey && whole && fits && flat::takes(self).is_some()
+        grey && fits && matches!(quality.sums, Sums::I32 | Sums::Auto)
     }
 }
 
@@ -306,9 +310,36 @@ impl Part<'_> {
                 part.render_grey(simd, store, &mut waiting.flat, pixels, io);
             }
             Sums::I32 | Sums::Auto => {
+                if let Some(deep) = part.deep_grey() {
+                    let (store, waiting) = (&mut whole.greys, &mut whole.waiting.deep);
+                    return part.render_deep_grey(deep, simd, store, waiting, pixels, io);
+                }
                 let (store, waiting) = (&mut whole.longs, &mut whole.waiting);
                 part.render(simd, store, waiting, (&mut kinds.longs, queues), pixels, io);
             }
+        }
+    }
+
+    /// How it is drawn in two channels in perspective: level views are. Records of others would be added to one by one.
+    fn deep_grey(&self) -> Option<Deep> {
+        let may = self.frame.may_have_two_channels() && self.frame.storeys.is_some();
+        if may { deep::takes(self) } else { None }
+    }
+
+    fn render_deep_grey(
+        self,
+        deep: Deep,
+        simd: Simd,
+        store: &mut Store<Grey>,
+        waiting: &mut deep::Waiting,
+        pixels: &mut Pixels,
+        io: Io<'_>,
+    ) {
+        let part = self;
+        if part.frame.sections.most() <= 4 {
+            simd.run(RenderDeep::<Grey, 4> { part, deep, simd, store, waiting, pixels, io });
+        } else {
+            simd.run(RenderDeep::<Grey, MOST> { part, deep, simd, store, waiting, pixels, io });
         }
     }
 

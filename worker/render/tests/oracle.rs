@@ -193,7 +193,7 @@ proptest! {
         let view = View::new(&v.lattice, &camera, size, &quality).unwrap();
         let bricks = bricks_of(&v);
         let mut look = transfer(top, unit);
-        // Grey is drawn in two channels where views are flat.
+        // Grey is drawn in two channels where views are flat, and in perspective where they are level.
         if seed & 1 == 0 {
             look.colors = look.colors.iter().map(|c| [c[0], c[1], c[1], c[1]]).collect();
         }

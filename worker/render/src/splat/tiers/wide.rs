@@ -154,13 +154,19 @@ unsafe fn flat<const GROUPS: usize, W: Wide<S>, S: Recorded, const N: usize>(
             for chunk in 0..chunks {
                 let w = W::spread::<GROUPS>(across, from, shift, chunk);
                 let at = at + chunk * GROUPS;
-                let add = |(offset, wz): (&usize, &S::Depth)| {
-                    W::add(lines, offset + at, W::section(payload, *wz), &w);
-                };
+                // Loops without closures: what is compiled for `W` is inlined into nothing else.
                 match wz.first_chunk::<N>() {
-                    // A loop of known length.
-                    Some(wz) => offsets.iter().zip(wz).for_each(add),
-                    None => offsets.iter().zip(wz).for_each(add),
+                    // One of known length.
+                    Some(wz) => {
+                        for (offset, wz) in offsets.iter().zip(wz) {
+                            W::add(lines, offset + at, W::section(payload, *wz), &w);
+                        }
+                    }
+                    None => {
+                        for (offset, wz) in offsets.iter().zip(wz) {
+                            W::add(lines, offset + at, W::section(payload, *wz), &w);
+                        }
+                    }
                 }
             }
         }
@@ -192,38 +198,59 @@ unsafe fn apart<const GROUPS: usize, W: Wide<S>, S: Recorded, const N: usize>(
     chunks: usize,
 ) {
     let [_, sheet] = registers::<W, S, N>(tiers);
-    let lines = tiers.lines.as_mut_ptr();
-    let add = |slot: usize, i: usize, payload: W::Register| {
-        let after = layers.after(slot);
-        if after >= apart.left[i] {
-            return;
-        }
-        let (place, columns) = (places[slot][i] as usize, columns::<W, S>());
-        let (at, shift) = (place / columns, place % columns);
-        assert!(at + chunks * GROUPS <= sheet, "a footprint inside its tier");
-        let wz = layers.deep.weights[apart.deep[i] as usize + after as usize];
-        let (across, from) = (&layers.across[0][slot], apart.from[0][slot][i] as usize);
-        // SAFETY: the caller's, and registers are the slot's, as shown above.
-        unsafe {
-            let section = W::section(payload, wz);
-            for chunk in 0..chunks {
-                let w = W::spread::<GROUPS>(across, from, shift, chunk);
-                W::add(lines, slot * sheet + at + chunk * GROUPS, section, &w);
-            }
-        }
-    };
-    let voxels = || apart.kept.iter().map(|&i| i as usize % BATCH).zip(payloads);
-    // SAFETY: the caller's.
+    let to = To { lines: tiers.lines.as_mut_ptr(), sheet, chunks };
+    // SAFETY: the caller's, and registers are as many.
     unsafe {
         if W::BY_SHEET {
             for slot in 0..N {
-                voxels().for_each(|(i, of)| add(slot, i, W::payload(of)));
+                for (&i, of) in apart.kept.iter().zip(payloads) {
+                    let voxel = (i as usize % BATCH, W::payload(of));
+                    section::<GROUPS, W, S, N>(&to, slot, voxel, apart, places, layers);
+                }
             }
         } else {
-            for (i, of) in voxels() {
-                let payload = W::payload(of);
-                (0..N).for_each(|slot| add(slot, i, payload));
+            for (&i, of) in apart.kept.iter().zip(payloads) {
+                let voxel = (i as usize % BATCH, W::payload(of));
+                for slot in 0..N {
+                    section::<GROUPS, W, S, N>(&to, slot, voxel, apart, places, layers);
+                }
             }
+        }
+    }
+}
+
+/// What sections are added to: registers of all sheets, so many each, and in how many chunks.
+struct To {
+    lines: *mut Line,
+    sheet: usize,
+    chunks: usize,
+}
+
+/// Adds the section that a voxel has in a slot, if it reaches that.
+#[inline(always)]
+unsafe fn section<const GROUPS: usize, W: Wide<S>, S: Recorded, const N: usize>(
+    &To { lines, sheet, chunks }: &To,
+    slot: usize,
+    (i, payload): (usize, W::Register),
+    apart: &Apart,
+    places: &[Each<u32>; MOST],
+    layers: &Layers<'_, S, N>,
+) {
+    let after = layers.after(slot);
+    if after >= apart.left[i] {
+        return;
+    }
+    let (place, columns) = (places[slot][i] as usize, columns::<W, S>());
+    let (at, shift) = (place / columns, place % columns);
+    assert!(at + chunks * GROUPS <= sheet, "a footprint inside its tier");
+    let wz = layers.deep.weights[apart.deep[i] as usize + after as usize];
+    let (across, from) = (&layers.across[0][slot], apart.from[0][slot][i] as usize);
+    // SAFETY: the caller's, and registers are the slot's, as shown above.
+    unsafe {
+        let section = W::section(payload, wz);
+        for chunk in 0..chunks {
+            let w = W::spread::<GROUPS>(across, from, shift, chunk);
+            W::add(lines, slot * sheet + at + chunk * GROUPS, section, &w);
         }
     }
 }

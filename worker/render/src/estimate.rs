@@ -7,6 +7,7 @@
 //! One pixel in 128 is drawn twice, in blocks, since neighbours share footprints.
 
 use crate::model::Model;
+use crate::region::parts;
 use crate::scene::{Frame, Scene};
 use crate::splat::Simd;
 use crate::tile::{self, Scratch};
@@ -55,9 +56,13 @@ impl Pair {
     }
 }
 
-/// The blocks of a tile that are drawn again: of a large picture one of 8x8 pixels in every other tile of 64x64,
-/// more in a larger one, and in a smaller one sometimes.
+/// The blocks of a tile that are drawn again: of a large picture one of 8x8 pixels in every other part of 64x64, and in
+/// a smaller tile sometimes. Of a larger one they are those of its parts, so that they lie as far apart.
 fn blocks(tile: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
+    parts(tile).flat_map(move |part| blocks_of_part(part, size))
+}
+
+fn blocks_of_part(tile: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
     let [w, h] = [tile.x1 - tile.x0, tile.y1 - tile.y0].map(|n| n / BLOCK);
     let all = (w * h) as u32;
     // A number that only the tile decides: all workers and frames agree.
@@ -165,6 +170,17 @@ mod tests {
             let share = pixels as f64 / (2048.0 * 2048.0) * f64::from(ONE_IN);
             assert!((0.9..1.1).contains(&share), "{share} of what was meant at {edge}");
         }
+        let of = |edge: i32| {
+            let tiles = (0..256).step_by(edge as usize);
+            let tiles = tiles.flat_map(|y| (0..256).step_by(edge as usize).map(move |x| (x, y)));
+            let mut all: Vec<_> = tiles
+                .flat_map(|(x, y)| blocks(Rect::new(x, y, x + edge, y + edge), [256; 2]))
+                .map(|block| (block.y0, block.x0))
+                .collect();
+            all.sort_unstable();
+            all
+        };
+        assert!(of(64) == of(128) && of(64) == of(256), "the same of large tiles");
         assert_eq!(blocks(Rect::new(0, 0, 7, 7), [7; 2]).count(), 0, "no block fits");
         let small = (0..4).flat_map(|i| blocks(Rect::new(64 * i, 0, 64 * i + 64, 64), [256, 64]));
         assert_eq!(small.count(), AT_LEAST as usize, "an eighth of a small picture");

@@ -390,7 +390,7 @@ fn go_through(
 }
 
 /// A tile's parts: no part of it lies in two of the picture's.
-fn parts(tile: Rect) -> impl Iterator<Item = Rect> {
+pub(crate) fn parts(tile: Rect) -> impl Iterator<Item = Rect> {
     let cut = |from: i32, to: i32| {
         let parts = from.div_euclid(PART)..=(to - 1).div_euclid(PART);
         parts.map(move |i| ((i * PART).max(from), ((i + 1) * PART).min(to)))

@@ -64,8 +64,8 @@ const MANY: u64 = 64;
 
 /// A frame beside others may have so many tiles of those that are asked for, where threads that draw share the master's
 /// processors: each result then takes some 100 us of what they could draw in, and while there are tiles of four frames
-/// nobody lacks any. Two processes of a thread each on two processors have 1.4 times the frames of one in tiles of 64
-/// pixels, and 1.6 times in such of 256 (mri256 `peer-opaque`, 512x512).
+/// nobody lacks any. Two processes of a thread each on two processors take 12.9 ms a frame in tiles of 256 pixels, where they took
+/// 15.1 in such of 64 (mri256 `peer-opaque`, 512x512; docs/scaling.md).
 const SHARED: f64 = 0.6;
 
 /// The edge at which tiles are counted for that.

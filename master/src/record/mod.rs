@@ -84,65 +84,32 @@ struct Head {
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Noted {
-    Joined {
-        w: u64,
-        name: String,
-        threads: u32,
-        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-        here: bool,
-        memory: u64,
-        held: Vec<(String, Vec<u32>)>,
-    },
-    Heard {
-        w: u64,
-    },
-    Lost {
-        w: u64,
-        reason: String,
-    },
-    Leaving {
-        w: u64,
-    },
+    Joined(NotedWorker),
+    Heard { w: u64 },
+    Lost { w: u64, reason: String },
+    Leaving { w: u64 },
     Queued(NotedJob),
-    Cancelled {
-        frame: u64,
-    },
-    SceneEnded {
-        scene: u64,
-    },
+    Cancelled { frame: u64 },
+    SceneEnded { scene: u64 },
     Result(NotedResult),
-    Failed {
-        w: u64,
-        task: u64,
-        epoch: u32,
-        reason: String,
-    },
-    BricksIn {
-        w: u64,
-        set: String,
-        bricks: u32,
-    },
-    BricksBroken {
-        w: u64,
-        set: String,
-        bricks: Vec<u32>,
-    },
-    BricksWanted {
-        w: u64,
-        set: String,
-        bricks: Vec<u32>,
-    },
-    BricksForgotten {
-        w: u64,
-        set: String,
-        bricks: Vec<u32>,
-    },
-    Pong {
-        w: u64,
-        nonce: u64,
-        clock_us: u64,
-    },
+    Failed { w: u64, task: u64, epoch: u32, reason: String },
+    BricksIn { w: u64, set: String, bricks: u32 },
+    BricksBroken { w: u64, set: String, bricks: Vec<u32> },
+    BricksWanted { w: u64, set: String, bricks: Vec<u32> },
+    BricksForgotten { w: u64, set: String, bricks: Vec<u32> },
+    Pong { w: u64, nonce: u64, clock_us: u64 },
     Tick,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+struct NotedWorker {
+    w: u64,
+    name: String,
+    threads: u32,
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    here: bool,
+    memory: u64,
+    held: Vec<(String, Vec<u32>)>,
 }
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -442,7 +409,7 @@ fn noted(event: &Event, shut: impl Fn(&TileResult, f32) -> bool) -> Option<Noted
     let set = |key: &slabcast_common::brick::BrickSetKey| key.0.to_string();
     Some(match event {
         Event::WorkerJoined { worker, name, threads, is_here, memory_budget_bytes, held } => {
-            Noted::Joined {
+            Noted::Joined(NotedWorker {
                 w: worker.0,
                 name: name.clone(),
                 threads: *threads,
@@ -452,7 +419,7 @@ fn noted(event: &Event, shut: impl Fn(&TileResult, f32) -> bool) -> Option<Noted
                     .iter()
                     .map(|(key, ids)| (set(key), ids.iter().map(|b| b.0).collect()))
                     .collect(),
-            }
+            })
         }
         Event::WorkerHeard { worker } => Noted::Heard { w: worker.0 },
         Event::WorkerLost { worker, reason } => Noted::Lost { w: worker.0, reason: reason.clone() },

@@ -3,7 +3,9 @@
 //! A record is a stranger's file: every line is checked before the scheduler sees it, and what is
 //! wrong is named by its line.
 
-use super::{Decision, Head, Line, Noted, NotedJob, NotedResult, VERSION, bits, from_hex};
+use super::{
+    Decision, Head, Line, Noted, NotedJob, NotedResult, NotedWorker, VERSION, bits, from_hex,
+};
 use prost::Message;
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::brick::{BRICK_VOXELS, BrickInfo, BrickSetKey, TightBox};
@@ -329,7 +331,7 @@ fn taken(t: Vec<u64>, seen: &mut Seen) -> Result<Taken, String> {
 fn event(e: Noted, seen: &mut Seen) -> Result<Event, String> {
     let ids = |ids: Vec<u32>| ids.into_iter().map(BrickId).collect::<Vec<_>>();
     Ok(match e {
-        Noted::Joined { w, name, threads, here, memory, held } => {
+        Noted::Joined(NotedWorker { w, name, threads, here, memory, held }) => {
             if !seen.workers.insert(w) {
                 return Err(format!("w{w} joined before; a worker's name is never used again"));
             }

@@ -19,6 +19,7 @@ use crate::splat::tiers::{Shape, Tiered};
 use crate::splat::toss::{self, Kept, Sieve, Sifted, Tossing, prefetch};
 use crate::splat::{Simd, Work, whole_registers};
 use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
+use crate::storeys::Storeys;
 use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
 use slabcast_common::occlusion::Rect;
@@ -133,31 +134,39 @@ pub(crate) struct RenderDeep<'a, S: Recorded, const N: usize> {
     pub(crate) io: Io<'a>,
 }
 
-impl<S: Tiered, const N: usize> Work for RenderDeep<'_, S, N> {
+impl<S: Recorded, const N: usize> Work for RenderDeep<'_, S, N> {
     type Out = ();
     #[inline(always)]
     fn run(self) {
         let RenderDeep { part, deep, simd, store, waiting, pixels, io } = self;
-        let Waiting { queues, tossing, batch, places } = waiting;
-        let [x, y] = [[[S::Weight::default(); N]; WINDOW]; 2];
-        let across = [x, y];
-        let stage = DeepStage { part: &part, deep, simd, tossing, batch, places, across };
+        let (stage, queues) = DeepStage::new(&part, deep, simd, waiting);
+        let sheets = Sheets::<S, N>::new(simd, store, part.frame.sections.most());
+        walk(&part, stage, sheets, queues, pixels, io);
+    }
+}
+
+/// Renders a part of a level view, which has storeys: likewise.
+pub(crate) struct RenderDeepLevel<'a, S: Recorded, const N: usize> {
+    pub(crate) deep: RenderDeep<'a, S, N>,
+    pub(crate) storeys: &'a Storeys,
+}
+
+impl<S: Tiered, const N: usize> Work for RenderDeepLevel<'_, S, N> {
+    type Out = ();
+    #[inline(always)]
+    fn run(self) {
+        let RenderDeepLevel { deep, storeys } = self;
+        let RenderDeep { part, deep, simd, store, waiting, pixels, io } = deep;
+        let (stage, queues) = DeepStage::new(&part, deep, simd, waiting);
         let frame = part.frame;
-        match (&frame.storeys, part.nearest()) {
-            (Some(storeys), Some(nearest)) => {
-                // The nearest sheet has the widest footprints, the last one most storeys.
-                let widest = frame.footprints.at(nearest).and_then(|footprint| footprint.phases(0));
-                let len = widest.expect("a table of a sheet that is not clipped").len;
-                let last = frame.footprints.at(frame.footprints.last()).expect("one behind it");
-                let shape = Shape::new::<S>(storeys.rows(PART, last.scale), len);
-                let sheets = LevelSheets::<S, N>::new(simd, store, &part, storeys, shape);
-                walk(&part, stage, sheets, queues, pixels, io);
-            }
-            _ => {
-                let sheets = Sheets::<S, N>::new(simd, store, frame.sections.most());
-                walk(&part, stage, sheets, queues, pixels, io);
-            }
-        }
+        // The nearest sheet has the widest footprints, the last one most storeys.
+        let nearest = part.nearest().and_then(|nearest| frame.footprints.at(nearest));
+        let widest = nearest.and_then(|footprint| footprint.phases(0));
+        let len = widest.expect("a table of a sheet that is not clipped").len;
+        let last = frame.footprints.at(frame.footprints.last()).expect("one behind it");
+        let shape = Shape::new::<S>(storeys.rows(PART, last.scale), len);
+        let sheets = LevelSheets::<S, N>::new(simd, store, &part, storeys, shape);
+        walk(&part, stage, sheets, queues, pixels, io);
     }
 }
 
@@ -170,6 +179,21 @@ struct DeepStage<'a, S: Recorded, const N: usize> {
     places: &'a mut Places,
     /// Weights of the voxel at hand by column and by row.
     across: Woven<S::Weight, N>,
+}
+
+impl<'a, S: Recorded, const N: usize> DeepStage<'a, S, N> {
+    /// With what waits beside it.
+    #[inline(always)]
+    fn new(
+        part: &'a Part<'a>,
+        deep: Deep,
+        simd: Simd,
+        waiting: &'a mut Waiting,
+    ) -> (Self, &'a mut Queues<DeepVoxel>) {
+        let Waiting { queues, tossing, batch, places } = waiting;
+        let across = [[[S::Weight::default(); N]; WINDOW]; 2];
+        (DeepStage { part, deep, simd, tossing, batch, places, across }, queues)
+    }
 }
 
 /// Footprints of sheets by slot, and their scales.

@@ -62,12 +62,12 @@ fn blocks(tile: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
     parts(tile).flat_map(move |part| blocks_of_part(part, size))
 }
 
-fn blocks_of_part(tile: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
-    let [w, h] = [tile.x1 - tile.x0, tile.y1 - tile.y0].map(|n| n / BLOCK);
+fn blocks_of_part(part: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
+    let [w, h] = [part.x1 - part.x0, part.y1 - part.y0].map(|n| n / BLOCK);
     let all = (w * h) as u32;
-    // A number that only the tile decides: all workers and frames agree.
+    // A number that only the part decides: all workers and frames agree.
     let mut x =
-        (tile.x0 as u32).wrapping_mul(0x9e37_79b1) ^ (tile.y0 as u32).wrapping_mul(0x85eb_ca6b);
+        (part.x0 as u32).wrapping_mul(0x9e37_79b1) ^ (part.y0 as u32).wrapping_mul(0x85eb_ca6b);
     let mut next = move || {
         x = x.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
         x >> 8
@@ -77,7 +77,7 @@ fn blocks_of_part(tile: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
     let n = all / each + u32::from(next() % each < all % each);
     (0..n).map(move |_| {
         let i = (next() % all) as i32;
-        let (x0, y0) = (tile.x0 + i % w * BLOCK, tile.y0 + i / w * BLOCK);
+        let (x0, y0) = (part.x0 + i % w * BLOCK, part.y0 + i / w * BLOCK);
         Rect::new(x0, y0, x0 + BLOCK, y0 + BLOCK)
     })
 }

@@ -22,7 +22,7 @@
 //! `flat` for most orthographic views, `leaning` for those whose kernel leans, `deep` for most perspective ones,
 //! and `level` for flat ones that are level; it keeps the sheets of `deep` ones that are level, too.
 
-use crate::deep::{self, Deep, RenderDeep};
+use crate::deep::{self, Deep, RenderDeep, RenderDeepLevel};
 use crate::flat::{self, RenderFlat};
 use crate::general::{GeneralScratch, Kind, Queues, RenderGeneral};
 use crate::leaning::{self, RenderLeaning};
@@ -35,6 +35,7 @@ use crate::splat::records::{MOST, STRIDE};
 use crate::splat::tiers::Tiered;
 use crate::splat::{Grey, Simd};
 use crate::stack::Store;
+use crate::storeys::Storeys;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{RawSums, TilePixels, TileState};
 use slabcast_common::message::Counters;
@@ -290,7 +291,7 @@ impl Frame {
     }
 }
 
-impl Part<'_> {
+impl<'a> Part<'a> {
     /// Renders it.
     pub(crate) fn draw(self, simd: Simd, scratch: &mut Scratch, io: Io<'_>) {
         let part = self;
@@ -310,9 +311,11 @@ impl Part<'_> {
                 part.render_grey(simd, store, &mut waiting.flat, pixels, io);
             }
             Sums::I32 | Sums::Auto => {
-                if let Some(deep) = part.deep_grey() {
+                if let Some((deep, storeys)) = part.deep_grey() {
                     let (store, waiting) = (&mut whole.greys, &mut whole.waiting.deep);
-                    return part.render_deep_grey(deep, simd, store, waiting, pixels, io);
+                    let deep =
+                        RenderDeep::<Grey, 4> { part, deep, simd, store, waiting, pixels, io };
+                    return simd.run(RenderDeepLevel { deep, storeys });
                 }
                 let (store, waiting) = (&mut whole.longs, &mut whole.waiting);
                 part.render(simd, store, waiting, (&mut kinds.longs, queues), pixels, io);
@@ -320,27 +323,12 @@ impl Part<'_> {
         }
     }
 
-    /// How it is drawn in two channels in perspective: level views are. Records of others would be added to one by one.
-    fn deep_grey(&self) -> Option<Deep> {
-        let may = self.frame.may_have_two_channels() && self.frame.storeys.is_some();
-        if may { deep::takes(self) } else { None }
-    }
-
-    fn render_deep_grey(
-        self,
-        deep: Deep,
-        simd: Simd,
-        store: &mut Store<Grey>,
-        waiting: &mut deep::Waiting,
-        pixels: &mut Pixels,
-        io: Io<'_>,
-    ) {
-        let part = self;
-        if part.frame.sections.most() <= 4 {
-            simd.run(RenderDeep::<Grey, 4> { part, deep, simd, store, waiting, pixels, io });
-        } else {
-            simd.run(RenderDeep::<Grey, MOST> { part, deep, simd, store, waiting, pixels, io });
-        }
+    /// How it is drawn in two channels in perspective: where the view is level and voxels have four sheets. Each kind more
+    /// takes the compiler seconds, and records of views that are not level would be added to one by one.
+    fn deep_grey(&self) -> Option<(Deep, &'a Storeys)> {
+        let storeys = self.frame.storeys.as_ref()?;
+        let may = self.frame.may_have_two_channels() && self.frame.sections.most() <= 4;
+        Some((deep::takes(self).filter(|_| may)?, storeys))
     }
 
     /// Renders it where the frame [has two channels](Frame::has_two_channels).
@@ -422,7 +410,12 @@ impl Part<'_> {
             simd.run(RenderLeaning { part, lean, simd, store, waiting, pixels, io });
         } else if let Some(deep) = deep::takes(&part) {
             let waiting = &mut waiting.deep;
-            simd.run(RenderDeep::<S, N> { part, deep, simd, store, waiting, pixels, io });
+            let storeys = part.frame.storeys.as_ref();
+            let deep = RenderDeep::<S, N> { part, deep, simd, store, waiting, pixels, io };
+            match storeys {
+                Some(storeys) => simd.run(RenderDeepLevel { deep, storeys }),
+                None => simd.run(deep),
+            }
         } else {
             simd.run(RenderGeneral { part, kind, queues, pixels, io });
         }

@@ -23,6 +23,24 @@ macro_rules! with {
     )*};
 }
 
+/// Calls the one of four functions that belongs to the level of `simd`.
+macro_rules! at_level {
+    ($simd:expr, $args:tt, $plain:path, $avx2:path, $avx512:path, $neon:path) => {
+        match $simd.0 {
+            Level::Plain => $plain $args,
+            // SAFETY: the value proves that the instructions are there; AVX-512 has AVX2 in it.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe { $avx2 $args },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => unsafe { $avx512 $args },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => unsafe { $neon $args },
+        }
+    };
+}
+
 pub(crate) mod close;
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 mod lanes;

@@ -241,24 +241,6 @@ impl<'a, W> RowAt<'a, W> {
     }
 }
 
-/// Calls the one of four functions that belongs to the level of `simd`.
-macro_rules! at_level {
-    ($simd:expr, $args:tt, $plain:path, $avx2:path, $avx512:path, $neon:path) => {
-        match $simd.0 {
-            Level::Plain => $plain $args,
-            // SAFETY: the value proves that the instructions are there; AVX-512 has AVX2 in it.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => unsafe { $avx2 $args },
-            // SAFETY: as above.
-            #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe { $avx512 $args },
-            // SAFETY: as above.
-            #[cfg(target_arch = "aarch64")]
-            Level::Neon => unsafe { $neon $args },
-        }
-    };
-}
-
 /// Sums that records are made of.
 pub(crate) trait Recorded: Accumulate {
     /// Sums of one sheet at a pixel.

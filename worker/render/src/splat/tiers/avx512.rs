@@ -13,7 +13,7 @@ pub(super) struct Shorts;
 /// Sums of 32 bits, of `C` channels.
 pub(super) struct Longs<const C: usize>;
 
-compiled!("avx512f,avx512vl,avx512dq,avx512bw,popcnt");
+compiled!("avx512f,avx512vl,avx512dq,avx512bw,popcnt,bmi2");
 
 /// Which of the weights from `chunk` times `of` on are those of a footprint of `len` columns that begins at
 /// `shift`.

@@ -13,7 +13,6 @@ mod avx512;
 #[cfg(target_arch = "x86_64")]
 mod wide;
 
-#[cfg(target_arch = "x86_64")]
 use super::Level;
 use super::records::apart::{Apart, BATCH, Each, Layers};
 use super::records::{Line, MOST, Record, Recorded, Splat, Table};
@@ -247,15 +246,19 @@ pub(crate) trait Tiered: Recorded {
     ) -> u64;
 }
 
-/// [`Tiered::fold`] plainly; `down`: [`Accumulate::down`] of each channel.
+/// [`Tiered::fold`] plainly, of sums whose channels are `T`s.
 #[inline(always)]
-fn fold<S: Recorded<Pixel = [T; C]>, T: Copy + Default, const C: usize, const N: usize>(
+fn fold<S, T, const C: usize, const N: usize>(
     tiers: &Tiers<'_, S, N>,
     above: [Above<'_, S::Weight>; 2],
+    spread: f32,
     open: u64,
     to: &mut Folded<S>,
-    down: impl Fn(&[(T, S::Weight)]) -> T,
-) -> u64 {
+) -> u64
+where
+    S: Recorded<Pixel = [T; C]>,
+    T: Accumulate<Weight = S::Weight> + Copy + Default,
+{
     let (mut left, mut filled) = (open, 0);
     while left != 0 {
         let x = left.trailing_zeros() as usize;
@@ -270,7 +273,7 @@ fn fold<S: Recorded<Pixel = [T; C]>, T: Copy + Default, const C: usize, const N:
                 }
             }
             for (sum, rows) in sums.iter_mut().zip(&rows) {
-                *sum = down(&rows[..weights.len().min(REACHING)]);
+                *sum = T::down(rows[..weights.len().min(REACHING)].iter().copied(), spread);
             }
         }
         // Extinction comes first.
@@ -325,10 +328,9 @@ fn add_apart<S: Recorded, const N: usize>(
     }
 }
 
-/// Adds to tiers and folds them by what is compiled for the instructions that were seen, or plainly. `$wide` is what registers
-/// of these sums are, `$channel` a channel of theirs.
+/// Sums of `$c` channels that are `$channel`s; `$wide` is what their registers are.
 macro_rules! tiered {
-    ($sums:ty, $channel:ty, $wide:ident $(<$c:literal>)?) => {
+    ($sums:ty, [$channel:ty; $c:literal], $wide:ident $(<$n:literal>)?) => {
         impl Tiered for $sums {
             #[inline(always)]
             fn add_flat<const N: usize>(
@@ -339,19 +341,14 @@ macro_rules! tiered {
                 weights: &Weights<'_, Self>,
             ) {
                 assert_eq!(voxels.0.len(), voxels.1.len(), "a payload a voxel");
-                match simd.0 {
-                    // SAFETY: the value proves that the instructions are there.
-                    #[cfg(target_arch = "x86_64")]
-                    Level::Avx512 => unsafe {
-                        avx512::add_flat::<avx512::$wide $(<$c>)?, Self, N>(tiers, voxels, slot, weights);
-                    },
-                    // SAFETY: as above.
-                    #[cfg(target_arch = "x86_64")]
-                    Level::Avx2 => unsafe {
-                        avx2::add_flat::<avx2::$wide $(<$c>)?, Self, N>(tiers, voxels, slot, weights);
-                    },
-                    _ => add_flat(tiers, voxels, slot, weights),
-                }
+                at_level!(
+                    simd,
+                    (tiers, voxels, slot, weights),
+                    add_flat::<Self, N>,
+                    avx2::add_flat::<avx2::$wide $(<$n>)?, Self, N>,
+                    avx512::add_flat::<avx512::$wide $(<$n>)?, Self, N>,
+                    add_flat::<Self, N>
+                );
             }
 
             #[inline(always)]
@@ -362,19 +359,14 @@ macro_rules! tiered {
                 places: &[Each<u32>; MOST],
                 layers: &Layers<'_, Self, N>,
             ) {
-                match simd.0 {
-                    // SAFETY: as above.
-                    #[cfg(target_arch = "x86_64")]
-                    Level::Avx512 => unsafe {
-                        avx512::add_apart::<avx512::$wide $(<$c>)?, Self, N>(tiers, voxels, places, layers);
-                    },
-                    // SAFETY: as above.
-                    #[cfg(target_arch = "x86_64")]
-                    Level::Avx2 => unsafe {
-                        avx2::add_apart::<avx2::$wide $(<$c>)?, Self, N>(tiers, voxels, places, layers);
-                    },
-                    _ => add_apart(tiers, voxels, places, layers),
-                }
+                at_level!(
+                    simd,
+                    (tiers, voxels, places, layers),
+                    add_apart::<Self, N>,
+                    avx2::add_apart::<avx2::$wide $(<$n>)?, Self, N>,
+                    avx512::add_apart::<avx512::$wide $(<$n>)?, Self, N>,
+                    add_apart::<Self, N>
+                );
             }
 
             #[inline(always)]
@@ -386,27 +378,22 @@ macro_rules! tiered {
                 open: u64,
                 to: &mut Folded<Self>,
             ) -> u64 {
-                match simd.0 {
-                    // SAFETY: as above.
-                    #[cfg(target_arch = "x86_64")]
-                    Level::Avx512 => unsafe {
-                        <avx512::$wide $(<$c>)? as wide::Wide<Self>>::fold(tiers, above, spread, open, to)
-                    },
-                    // SAFETY: as above.
-                    #[cfg(target_arch = "x86_64")]
-                    Level::Avx2 => unsafe {
-                        <avx2::$wide $(<$c>)? as wide::Wide<Self>>::fold(tiers, above, spread, open, to)
-                    },
-                    _ => fold(tiers, above, open, to, |rows| <$channel>::down(rows.iter().copied(), spread)),
-                }
+                at_level!(
+                    simd,
+                    (tiers, above, spread, open, to),
+                    fold::<Self, $channel, $c, N>,
+                    avx2::fold::<avx2::$wide $(<$n>)?, Self, N>,
+                    avx512::fold::<avx512::$wide $(<$n>)?, Self, N>,
+                    fold::<Self, $channel, $c, N>
+                )
             }
         }
     };
 }
 
-tiered!(i16, i16, Shorts);
-tiered!(i32, i32, Longs<4>);
-tiered!(Grey, i32, Longs<2>);
+tiered!(i16, [i16; 4], Shorts);
+tiered!(i32, [i32; 4], Longs<4>);
+tiered!(Grey, [i32; 2], Longs<2>);
 
 #[cfg(test)]
 mod tests {

@@ -80,6 +80,19 @@ macro_rules! compiled {
             // SAFETY: these are the instructions.
             unsafe { super::wide::add_apart::<W, S, N>(tiers, voxels, places, layers) }
         }
+
+        /// [`Wide::fold`].
+        #[target_feature(enable = $features)]
+        pub(super) fn fold<W: Wide<S>, S: Recorded, const N: usize>(
+            tiers: &Tiers<'_, S, N>,
+            above: [Above<'_, S::Weight>; 2],
+            spread: f32,
+            open: u64,
+            to: &mut Folded<S>,
+        ) -> u64 {
+            // SAFETY: these are the instructions.
+            unsafe { W::fold(tiers, above, spread, open, to) }
+        }
     };
 }
 pub(super) use compiled;

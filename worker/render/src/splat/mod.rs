@@ -36,6 +36,7 @@ macro_rules! at_level {
             Level::Avx512 => unsafe { $avx512 $args },
             // SAFETY: as above.
             #[cfg(target_arch = "aarch64")]
+            #[allow(unused_unsafe, reason = "what has no lanes there is called plainly")]
             Level::Neon => unsafe { $neon $args },
         }
     };

@@ -16,6 +16,8 @@ pub(crate) struct Batch {
     pub(crate) samples: Each<u32>,
     pub(crate) normals: Each<u16>,
     pub(crate) apart: Apart,
+    /// What is open where its sections lie: 0 if nothing is.
+    pub(crate) near: Each<u64>,
     light: [Each<f32>; 4],
 }
 
@@ -25,6 +27,7 @@ impl Default for Batch {
             samples: [0; BATCH],
             normals: [0; BATCH],
             apart: Apart::default(),
+            near: [0; BATCH],
             light: [[0.0; BATCH]; 4],
         }
     }
@@ -57,38 +60,44 @@ impl<'a, S: Recorded, const N: usize> Axes<'a, S, N> {
 }
 
 impl Batch {
-    /// Keeps of the first `n` voxels, which are placed, those around which anything is open, and has light fall
+    /// Looks whether anything is open in the windows of the first `n` voxels.
+    #[inline(always)]
+    fn look(&mut self, (simd, part, open): (Simd, &Part<'_>, &OpenMask), n: usize) {
+        let cull = part.frame.scene.quality.cull;
+        let Apart { lo, hi, .. } = &self.apart;
+        for (i, near) in self.near[..n].iter_mut().enumerate() {
+            let ([x0, y0], [x1, y1]) = ([lo[0][i], lo[1][i]], [hi[0][i], hi[1][i]]);
+            *near = 0;
+            if x0 < x1 && y0 < y1 {
+                let columns = (u64::MAX >> (64 - (x1 - x0))) << x0;
+                let rows = [y0, y1].map(|y| y as usize);
+                *near = u64::from(!cull || any_in_rows(simd, open.rows(), rows, columns));
+            }
+        }
+    }
+
+    /// Keeps of the first `n` voxels those that [anything is open](Batch::near) near, and has light fall
     /// on them; says how many there are. `eyes`: eye coordinates by axis, where each voxel sees the eye in a
     /// direction of its own. Of `of` voxels that there were, what is added and what not is counted.
     #[inline(always)]
     pub(crate) fn light<S: Recorded>(
         &mut self,
-        (simd, part, open): (Simd, &Part<'_>, &OpenMask),
+        (simd, frame): (Simd, &Frame),
         n: usize,
         mut eyes: Option<&mut [Each<f64>; 3]>,
         payloads: &mut [S::Payload; BATCH],
         (of, counters): (usize, &mut Counters),
     ) -> usize {
-        let frame = part.frame;
-        let Batch { samples, normals, apart, light } = self;
-        let Apart { lo, hi, kept, .. } = apart;
-        let (mut some, cull) = (0, frame.scene.quality.cull);
+        let Batch { samples, normals, apart, near, light } = self;
+        let kept = &mut apart.kept;
+        let mut some = 0;
         for i in 0..n {
-            let ([x0, y0], [x1, y1]) = ([lo[0][i], lo[1][i]], [hi[0][i], hi[1][i]]);
-            if x0 >= x1 || y0 >= y1 {
-                continue;
-            }
-            let columns = (u64::MAX >> (64 - (x1 - x0))) << x0;
-            let rows = [y0, y1].map(|y| y as usize);
-            if cull && !any_in_rows(simd, open.rows(), rows, columns) {
-                continue;
-            }
             kept[some] = i as u32;
             for eye in eyes.iter_mut().flat_map(|eyes| eyes.iter_mut()) {
                 eye[some] = eye[i];
             }
             (samples[some], normals[some]) = (samples[i], normals[i]);
-            some += 1;
+            some += usize::from(near[i] != 0);
         }
         let all = whole_registers(some);
         let eyes = eyes.map(|eyes| eyes.each_ref().map(|eye| &eye[..all]));
@@ -116,7 +125,9 @@ impl Batch {
         counted: (usize, &mut Counters),
     ) {
         let mut payloads = [S::Payload::default(); BATCH];
-        let some = self.light::<S>((sheets.simd, part, open), n, eyes, &mut payloads, counted);
+        self.look((sheets.simd, part, open), n);
+        let asked = (sheets.simd, part.frame);
+        let some = self.light::<S>(asked, n, eyes, &mut payloads, counted);
         let apart = &self.apart;
         for &i in &apart.kept[..some] {
             let (at, wide) = apart.window(i as usize % BATCH, S::step::<N>());

@@ -18,7 +18,7 @@ use crate::splat::records::{MOST, Recorded};
 use crate::splat::tiers::{Shape, Tiered};
 use crate::splat::toss::{self, Kept, Sieve, Sifted, Tossing, prefetch};
 use crate::splat::{Simd, Work, whole_registers};
-use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
+use crate::stack::{Chunk, Due, EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::storeys::Storeys;
 use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
@@ -53,9 +53,10 @@ struct Places {
     eye: [Each<f64>; 3],
     /// Where a section of each is along an axis.
     aside: Each<f64>,
-    /// In a level view, which storey each belongs to, and by slot which tier and where among all of a sheet.
+    /// In a level view, which storey each belongs to, the columns that hold its sections, and by slot where among
+    /// all tiers of a sheet it begins.
     storey: Each<i32>,
-    tiers: [Each<u32>; MOST],
+    columns: Each<u64>,
     places: [Each<u32>; MOST],
 }
 
@@ -65,7 +66,7 @@ impl Default for Places {
             eye: [[0.0; BATCH]; 3],
             aside: [0.0; BATCH],
             storey: [0; BATCH],
-            tiers: [[0; BATCH]; MOST],
+            columns: [0; BATCH],
             places: [[0; BATCH]; MOST],
         }
     }
@@ -127,7 +128,6 @@ fn deep(frame: &Frame, r: &Rect, nearest: i32) -> Option<Deep> {
 pub(crate) struct RenderDeep<'a, S: Recorded, const N: usize> {
     pub(crate) part: Part<'a>,
     pub(crate) deep: Deep,
-    pub(crate) simd: Simd,
     pub(crate) store: &'a mut Store<S>,
     pub(crate) waiting: &'a mut Waiting,
     pub(crate) pixels: &'a mut Pixels,
@@ -137,8 +137,8 @@ pub(crate) struct RenderDeep<'a, S: Recorded, const N: usize> {
 impl<S: Recorded, const N: usize> Work for RenderDeep<'_, S, N> {
     type Out = ();
     #[inline(always)]
-    fn run(self) {
-        let RenderDeep { part, deep, simd, store, waiting, pixels, io } = self;
+    fn run(self, simd: Simd) {
+        let RenderDeep { part, deep, store, waiting, pixels, io } = self;
         let (stage, queues) = DeepStage::new(&part, deep, simd, waiting);
         let sheets = Sheets::<S, N>::new(simd, store, part.frame.sections.most());
         walk(&part, stage, sheets, queues, pixels, io);
@@ -154,9 +154,9 @@ pub(crate) struct RenderDeepLevel<'a, S: Recorded, const N: usize> {
 impl<S: Tiered, const N: usize> Work for RenderDeepLevel<'_, S, N> {
     type Out = ();
     #[inline(always)]
-    fn run(self) {
+    fn run(self, simd: Simd) {
         let RenderDeepLevel { deep, storeys } = self;
-        let RenderDeep { part, deep, simd, store, waiting, pixels, io } = deep;
+        let RenderDeep { part, deep, store, waiting, pixels, io } = deep;
         let (stage, queues) = DeepStage::new(&part, deep, simd, waiting);
         let frame = part.frame;
         // The nearest sheet has the widest footprints, the last one most storeys.
@@ -244,27 +244,28 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
         counters.tossed += kept as u64;
         counters.culled += (reached - kept) as u64;
     }
-    /// Takes over those of `some` voxels near which anything is open; says how many.
+
+    /// Takes over those of `some` voxels, which are due at sheet `k`, near which anything is open; says how many.
     #[inline(always)]
-    fn take(&mut self, some: &[DeepVoxel], open: &OpenMask) -> usize {
+    fn take(&mut self, some: &Chunk<'_, DeepVoxel>, k: i32, open: &OpenMask) -> usize {
         let most = self.part.frame.sections.most() as i32;
         let cull = self.part.frame.scene.quality.cull;
         let mut n = 0;
-        for v in some {
-            self.put(n, v, most);
-            n += usize::from(!cull || open.is_near(v.cell.into()));
+        match some {
+            Chunk::Here(some) => {
+                for v in *some {
+                    self.put(n, v, most);
+                    n += usize::from(!cull || open.is_near(v.cell.into()));
+                }
+            }
+            Chunk::Before(some) => {
+                for (v, first) in *some {
+                    self.put(n, v, most - (k - first));
+                    n += usize::from(!cull || open.is_near(v.cell.into()));
+                }
+            }
         }
         n
-    }
-
-    /// Takes over voxels that begin before the slab, for those of their sheets that are left.
-    #[inline(always)]
-    fn take_carried(&mut self, some: &[(DeepVoxel, i32)]) -> usize {
-        let most = self.part.frame.sections.most() as i32;
-        for (i, (v, first)) in some.iter().enumerate() {
-            self.put(i, v, most - (self.part.slab.first - first));
-        }
-        some.len()
     }
 }
 
@@ -293,34 +294,15 @@ macro_rules! stage {
             #[inline(always)]
             fn splat(
                 &mut self,
-                bucket: &[DeepVoxel],
+                due: &Due<'_, DeepVoxel>,
                 k: i32,
                 sheets: &mut $sheets<'_, S, N>,
                 open: &OpenMask,
                 counters: &mut Counters,
             ) {
-                if bucket.is_empty() {
-                    return;
-                }
                 let footprints = footprints::<S, N>(self.part, k);
-                for some in bucket.chunks(BATCH) {
-                    let n = self.take(some, open);
-                    self.$add(n, k, &footprints, sheets, open, (some.len(), counters));
-                }
-            }
-
-            #[inline(always)]
-            fn splat_carried(
-                &mut self,
-                carried: &[(DeepVoxel, i32)],
-                sheets: &mut $sheets<'_, S, N>,
-                open: &OpenMask,
-                counters: &mut Counters,
-            ) {
-                let k = self.part.slab.first;
-                let footprints = footprints::<S, N>(self.part, k);
-                for some in carried.chunks(BATCH) {
-                    let n = self.take_carried(some);
+                for some in due.chunks(BATCH) {
+                    let n = self.take(&some, k, open);
                     self.$add(n, k, &footprints, sheets, open, (some.len(), counters));
                 }
             }
@@ -458,41 +440,42 @@ impl<S: Tiered, const N: usize> DeepStage<'_, S, N> {
         let shape = sheets.tiers.shape();
         let most = frame.sections.most() as i32;
         self.place((n, k), footprints, &[0]);
-        let hull = sheets.hull(k, most as usize);
-        let Places { eye, storey, tiers, places, .. } = &mut *self.places;
-        let Apart { lo, hi, .. } = &mut self.batch.apart;
-        let (per, first) = storeys.by_eye();
+        let cull = frame.scene.quality.cull;
+        let hull = sheets.hull(k, most as usize, cull.then_some(open));
+        let Places { eye, storey, columns, places, .. } = &mut *self.places;
+        let Batch { apart: Apart { lo, hi, first, .. }, near, .. } = &mut *self.batch;
+        let (per, base) = storeys.by_eye();
         let all = whole_registers(n);
         for (i, storey) in storey[..all].iter_mut().enumerate() {
-            *storey = round_i32(eye[1][i] * per + first);
-            [lo[1][i], hi[1][i]] = hull.of(*storey);
+            *storey = round_i32(eye[1][i] * per + base);
         }
-        for (at, tiers) in tiers[..N].iter_mut().enumerate() {
+        for i in 0..all {
+            let [lo, hi] = [lo[0][i], hi[0][i]];
+            // Of voxels that have none, and of what fills a register, these are any numbers.
+            let beyond = (EDGE as u32).wrapping_sub(hi.wrapping_sub(lo) as u32);
+            let inside = u64::MAX.wrapping_shr(beyond).wrapping_shl(lo as u32);
+            columns[i] = if lo < hi { inside } else { 0 };
+            near[i] = columns[i] & hull.open(storey[i]);
+        }
+        for (at, places) in places[..N].iter_mut().enumerate() {
             let sheet = layers.after(at);
             if sheet < most {
                 let base = hull.bases[sheet as usize % MOST];
-                let firsts = &self.batch.apart.first[0][at];
-                for (i, (storey, first)) in storey[..all].iter().zip(firsts).enumerate() {
-                    tiers[i] = (storey - base).clamp(0, shape.rows as i32 - 1) as u32;
-                    places[at][i] = shape.place_in(tiers[i], *first);
+                for (i, (storey, first)) in storey[..all].iter().zip(&first[0][at]).enumerate() {
+                    let tier = (storey - base).clamp(0, shape.rows as i32 - 1) as u32;
+                    places[i] = shape.place_in(tier, *first);
                 }
             }
         }
         let mut payloads = [S::Payload::default(); BATCH];
-        let asked = (sheets.simd, self.part, open);
+        let asked = (sheets.simd, frame);
         let some = self.batch.light::<S>(asked, n, Some(eye), &mut payloads, counted);
         let apart = &self.batch.apart;
         for &i in &apart.kept[..some] {
             let i = i as usize % BATCH;
-            // The window that holds all sections.
-            let ([x, _], [wide, _]) = apart.window(i, 1);
-            let columns = (u64::MAX >> (EDGE - wide)) << x;
-            for at in 0..N {
-                if layers.after(at) < apart.left[i] {
-                    sheets.touch(at, tiers[at][i] as usize, columns);
-                }
-            }
+            sheets.hull.touch(storey[i], columns[i]);
         }
+        sheets.touch_hull();
         let voxels = (apart, &payloads[..some]);
         S::add_apart(sheets.simd, &mut sheets.tiers, voxels, places, layers);
     }

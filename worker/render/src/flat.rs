@@ -21,7 +21,7 @@ use crate::scene::{Flat, Frame};
 use crate::splat::records::{Recorded, Splat, Table, Tables, splat};
 use crate::splat::toss::{self, Packing, Sieve, Sifted, Tossing, prefetch};
 use crate::splat::{Simd, Work, whole_registers};
-use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
+use crate::stack::{Chunk, Due, EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
 use slabcast_common::view::SUBPIXELS;
@@ -41,6 +41,8 @@ pub(crate) const BATCH: usize = 128;
 /// Voxels on their way from a bucket to the records.
 pub(crate) struct Batch {
     pub(crate) voxels: [Splat; BATCH],
+    /// Of those that began before the slab, how many of their sheets lie there.
+    pub(crate) gone: [u32; BATCH],
     samples: [u32; BATCH],
     normals: [u16; BATCH],
     light: [[f32; BATCH]; 4],
@@ -50,6 +52,7 @@ impl Default for Batch {
     fn default() -> Self {
         Batch {
             voxels: [Splat::default(); BATCH],
+            gone: [0; BATCH],
             samples: [0; BATCH],
             normals: [0; BATCH],
             light: [[0.0; BATCH]; 4],
@@ -58,23 +61,33 @@ impl Default for Batch {
 }
 
 impl Batch {
-    /// Takes those of some voxels over that are still wanted, notes each, and has light fall on them; says how
-    /// many there are.
+    /// Takes over those of `some` voxels, which are due at sheet `k`, that are still wanted, notes each, and has light
+    /// fall on them; says how many there are.
     #[inline(always)]
     pub(crate) fn light<S: Recorded>(
         &mut self,
         (simd, part, open): (Simd, &Part<'_>, &OpenMask),
-        some: &[Splat],
+        (some, k): (&Chunk<'_, Splat>, i32),
         counters: &mut Counters,
         mut note: impl FnMut(&Splat),
         payloads: &mut [S::Payload; BATCH],
     ) -> usize {
         let cull = part.frame.scene.quality.cull;
-        let Batch { voxels, samples, normals, light } = self;
+        let Batch { voxels, gone, samples, normals, light } = self;
         let mut n = 0;
-        for v in some {
-            voxels[n] = *v;
-            n += usize::from(!cull | open.is_near(v.cell()));
+        match some {
+            Chunk::Here(some) => {
+                for v in *some {
+                    voxels[n] = *v;
+                    n += usize::from(!cull | open.is_near(v.cell()));
+                }
+            }
+            Chunk::Before(some) => {
+                for (v, first) in *some {
+                    (voxels[n], gone[n]) = (*v, k.abs_diff(*first));
+                    n += usize::from(!cull | open.is_near(v.cell()));
+                }
+            }
         }
         for (i, v) in voxels[..n].iter().enumerate() {
             (samples[i], normals[i]) = (v.sample, v.normal());
@@ -95,7 +108,6 @@ impl Batch {
 pub(crate) struct RenderFlat<'a, S: Recorded, const N: usize> {
     pub(crate) part: Part<'a>,
     pub(crate) view: &'a Flat,
-    pub(crate) simd: Simd,
     pub(crate) store: &'a mut Store<S>,
     pub(crate) waiting: &'a mut Waiting,
     pub(crate) pixels: &'a mut Pixels,
@@ -111,8 +123,8 @@ pub(crate) fn takes(frame: &Frame) -> Option<&Flat> {
 impl<S: Recorded, const N: usize> Work for RenderFlat<'_, S, N> {
     type Out = ();
     #[inline(always)]
-    fn run(self) {
-        let RenderFlat { part, view: flat, simd, store, waiting, pixels, io } = self;
+    fn run(self, simd: Simd) {
+        let RenderFlat { part, view: flat, store, waiting, pixels, io } = self;
         let footprint = part.frame.footprints.at(0).expect("a flat view's sheets are all drawn");
         let axis = |axis| {
             let phases = footprint.phases(axis)?;
@@ -211,57 +223,37 @@ impl<S: Recorded, const N: usize> Stage<Sheets<'_, S, N>> for FlatStage<'_, S> {
     #[inline(always)]
     fn splat(
         &mut self,
-        bucket: &[Splat],
+        due: &Due<'_, Splat>,
         k: i32,
         sheets: &mut Sheets<'_, S, N>,
         open: &OpenMask,
         counters: &mut Counters,
     ) {
-        if bucket.is_empty() {
-            return;
-        }
         let mut payloads = [S::Payload::default(); BATCH];
         let mut corners = [0; EDGE];
-        for some in bucket.chunks(BATCH) {
+        let slot = slot::<N>(k);
+        for some in due.chunks(BATCH) {
             let note = |v: &Splat| {
                 let [x, y] = v.first();
                 corners[y % EDGE] |= 1 << x;
             };
             let asked = (sheets.simd, self.part, open);
-            let n = self.batch.light::<S>(asked, some, counters, note, &mut payloads);
-            S::splat_all(
-                sheets.simd,
-                sheets.records,
-                (&self.batch.voxels[..n], &payloads[..n]),
-                slot::<N>(k),
-                &self.tables,
-            );
+            let n = self.batch.light::<S>(asked, (&some, k), counters, note, &mut payloads);
+            let (voxels, payloads) = (&self.batch.voxels[..n], &payloads[..n]);
+            match some {
+                Chunk::Here(_) => {
+                    let (voxels, records) = ((voxels, payloads), &mut *sheets.records);
+                    S::splat_all(sheets.simd, records, voxels, slot, &self.tables);
+                }
+                Chunk::Before(_) => {
+                    for ((v, gone), &payload) in voxels.iter().zip(&self.batch.gone).zip(payloads) {
+                        let (x, y, z) = v.weights(&self.tables);
+                        let left = &z[*gone as usize..];
+                        splat::<S, N>(sheets.records, v.at(), (x, y, left), payload, slot);
+                    }
+                }
+            }
         }
         sheets.touch_all(k, &corners, self.tables.across.map(|t| t.len));
-    }
-
-    #[inline(always)]
-    fn splat_carried(
-        &mut self,
-        carried: &[(Splat, i32)],
-        sheets: &mut Sheets<'_, S, N>,
-        open: &OpenMask,
-        counters: &mut Counters,
-    ) {
-        let Part { frame, slab, .. } = self.part;
-        for (v, first) in carried {
-            if frame.scene.quality.cull && !open.is_near(v.cell()) {
-                counters.culled += 1;
-                continue;
-            }
-            counters.splatted += 1;
-            let mut light = [[0.0]; 4];
-            frame.payloads(sheets.simd, &[v.sample], &[v.normal()], None, &mut light);
-            let payload = S::payload(light.map(|[c]| c));
-            let (x, y, z) = v.weights(&self.tables);
-            let left = &z[(slab.first - first) as usize..];
-            splat::<S, N>(sheets.records, v.at(), (x, y, left), payload, slot::<N>(slab.first));
-            sheets.touch(slab.first, v.first(), [x.len(), y.len()]);
-        }
     }
 }

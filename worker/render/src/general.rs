@@ -87,7 +87,7 @@ pub(crate) struct RenderGeneral<'a, S: Accumulate> {
 impl<S: Accumulate> Work for RenderGeneral<'_, S> {
     type Out = ();
     #[inline(always)]
-    fn run(self) {
+    fn run(self, _: Simd) {
         let RenderGeneral { part, kind, queues, pixels, io } = self;
         let slots = part.frame.sections.most() + 1;
         kind.planes.reset(slots);

@@ -13,7 +13,7 @@ use crate::splat::records::apart::{Apart, BATCH, Each, WINDOW, Woven, after};
 use crate::splat::records::{MOST, Recorded, Splat};
 use crate::splat::toss::{Packing, Tossing};
 use crate::splat::{Simd, Work, whole_registers};
-use crate::stack::{EDGE, Queues, Sheets, Stage, Store, slot, walk};
+use crate::stack::{Chunk, Due, EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
 use slabcast_common::view::SUBPIXELS;
@@ -45,7 +45,6 @@ pub(crate) fn takes(frame: &Frame) -> Option<Lean<'_>> {
 pub(crate) struct RenderLeaning<'a, S: Recorded> {
     pub(crate) part: Part<'a>,
     pub(crate) lean: Lean<'a>,
-    pub(crate) simd: Simd,
     pub(crate) store: &'a mut Store<S>,
     pub(crate) waiting: &'a mut Waiting,
     pub(crate) pixels: &'a mut Pixels,
@@ -55,8 +54,8 @@ pub(crate) struct RenderLeaning<'a, S: Recorded> {
 impl<S: Recorded> Work for RenderLeaning<'_, S> {
     type Out = ();
     #[inline(always)]
-    fn run(self) {
-        let RenderLeaning { part, lean, simd, store, waiting, pixels, io } = self;
+    fn run(self, simd: Simd) {
+        let RenderLeaning { part, lean, store, waiting, pixels, io } = self;
         let footprint = part.frame.footprints.at(0).expect("a flat view's sheets are all drawn");
         let axes = Axes::new(part.frame, 0, [footprint; MOST]);
         let Waiting { queues, tossing, batch } = waiting;
@@ -105,44 +104,43 @@ impl<S: Recorded, const N: usize> Stage<Sheets<'_, S, N>> for LeaningStage<'_, S
     #[inline(always)]
     fn splat(
         &mut self,
-        bucket: &[Splat],
+        due: &Due<'_, Splat>,
         k: i32,
         sheets: &mut Sheets<'_, S, N>,
         open: &OpenMask,
         counters: &mut Counters,
     ) {
-        let most = self.part.frame.sections.most() as i32;
-        let cull = self.part.frame.scene.quality.cull;
-        for some in bucket.chunks(BATCH) {
-            let mut n = 0;
-            for v in some {
-                self.put(n, v, most);
-                n += usize::from(!cull | open.is_near(v.cell()));
-            }
+        for some in due.chunks(BATCH) {
+            let n = self.take(&some, k, open);
             self.add(n, k, sheets, open, (some.len(), counters));
-        }
-    }
-
-    #[inline(always)]
-    fn splat_carried(
-        &mut self,
-        carried: &[(Splat, i32)],
-        sheets: &mut Sheets<'_, S, N>,
-        open: &OpenMask,
-        counters: &mut Counters,
-    ) {
-        let k = self.part.slab.first;
-        let most = self.part.frame.sections.most() as i32;
-        for some in carried.chunks(BATCH) {
-            for (i, (v, first)) in some.iter().enumerate() {
-                self.put(i, v, most - (k - first));
-            }
-            self.add(some.len(), k, sheets, open, (some.len(), counters));
         }
     }
 }
 
 impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
+    /// Takes over those of `some` voxels, which are due at sheet `k`, near which anything is open; says how many.
+    #[inline(always)]
+    fn take(&mut self, some: &Chunk<'_, Splat>, k: i32, open: &OpenMask) -> usize {
+        let most = self.part.frame.sections.most() as i32;
+        let cull = self.part.frame.scene.quality.cull;
+        let mut n = 0;
+        match some {
+            Chunk::Here(some) => {
+                for v in *some {
+                    self.put(n, v, most);
+                    n += usize::from(!cull | open.is_near(v.cell()));
+                }
+            }
+            Chunk::Before(some) => {
+                for (v, first) in *some {
+                    self.put(n, v, most - (k - first));
+                    n += usize::from(!cull | open.is_near(v.cell()));
+                }
+            }
+        }
+        n
+    }
+
     /// Takes over `v`, which has `left` sheets left, as voxel `i` of the batch.
     #[inline(always)]
     fn put(&mut self, i: usize, v: &Splat, left: i32) {

@@ -13,7 +13,7 @@ use crate::splat::records::{MOST, Recorded, Splat, Table};
 use crate::splat::tiers::{Folded, Shape, Tiered, Tiers, Weights};
 use crate::splat::toss::{Packing, TIER_BITS, TierOf, Tossing};
 use crate::splat::{Simd, Work};
-use crate::stack::{Closes, EDGE, Open, Queues, Rows, Stage, Store, slot, walk};
+use crate::stack::{Chunk, Closes, Due, EDGE, Open, Queues, Rows, Stage, Store, slot, walk};
 use crate::storeys::{REACHING, ROWS, Storeys};
 use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
@@ -184,7 +184,7 @@ pub(crate) struct LevelSheets<'a, S: Recorded, const N: usize> {
     any: [bool; N],
     /// By slot, or one for all sheets.
     downs: [Down<'a, S::Weight>; N],
-    hull: Hull,
+    pub(crate) hull: Hull,
 }
 
 impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
@@ -227,11 +227,25 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
         }
     }
 
-    /// Notes that something is added to columns of a tier.
+    /// Notes what the [hull](LevelSheets::hull) was [touched](Hull::touch) at, in all of its sheets.
     #[inline(always)]
-    pub(crate) fn touch(&mut self, slot: usize, row: usize, columns: u64) {
-        self.touched[slot][row % ROWS] |= columns;
-        self.any[slot] = true;
+    pub(crate) fn touch_hull(&mut self) {
+        let LevelSheets { hull, tiers, touched, any, .. } = self;
+        let rows = tiers.shape().rows;
+        for (sheet, base) in hull.bases.iter().enumerate().take(hull.sheets) {
+            let slot = slot::<N>(hull.k + sheet as i32);
+            any[slot] = true;
+            let touched = &mut touched[slot][..rows];
+            let from = base.abs_diff(hull.base) as usize;
+            for (touched, columns) in touched.iter_mut().zip(&hull.touched[from..]) {
+                *touched |= columns;
+            }
+            // What lies beyond a sheet's tiers was added to the outermost.
+            touched[0] |= hull.touched[..from].iter().fold(0, |all, columns| all | columns);
+            let beyond = &hull.touched[from + rows..hull.n];
+            touched[rows - 1] |= beyond.iter().fold(0, |all, columns| all | columns);
+        }
+        hull.touched[..hull.n].fill(0);
     }
 
     /// Where the tiers of sheet `k` lie is known from here on; says where that stands.
@@ -253,40 +267,99 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
     }
 }
 
-/// Rows of a part's pixels that storeys reach in the sheets from one on.
+/// What is open where storeys reach in the sheets from one on, and where something was added to them.
 pub(crate) struct Hull {
-    /// The first of the sheets, and the storey of each one's first tier.
+    /// The first of the sheets, how many there are, and the storey of each one's first tier.
     k: i32,
+    sheets: usize,
     pub(crate) bases: [i32; MOST],
-    /// Of `n` storeys from `base` on the first row, and the one behind the last.
+    /// Of `n` storeys from `base` on: columns that are open in any row that it reaches, and columns that were added to.
     base: i32,
     n: usize,
-    rows: [[i32; 2 * ROWS]; 2],
+    open: [u64; 2 * ROWS],
+    touched: [u64; 2 * ROWS],
 }
 
 impl Default for Hull {
     fn default() -> Self {
-        Hull { k: i32::MIN, bases: [0; MOST], base: 0, n: 1, rows: [[0; 2 * ROWS]; 2] }
+        Hull {
+            k: i32::MIN,
+            sheets: 0,
+            bases: [0; MOST],
+            base: 0,
+            n: 1,
+            open: [0; 2 * ROWS],
+            touched: [0; 2 * ROWS],
+        }
     }
 }
 
 impl Hull {
-    /// Those of a storey, cut where the part ends.
+    /// A storey's place; that of the outermost, which do not reach the part, for those beyond.
     #[inline(always)]
-    pub(crate) fn of(&self, storey: i32) -> [i32; 2] {
-        let at = (storey - self.base).clamp(0, self.n as i32 - 1) as usize % (2 * ROWS);
-        [self.rows[0][at].max(0), self.rows[1][at].min(PART)]
+    fn place(&self, storey: i32) -> usize {
+        (storey - self.base).clamp(0, self.n as i32 - 1) as usize % (2 * ROWS)
+    }
+
+    /// Columns that are open in any row that a storey reaches.
+    #[inline(always)]
+    pub(crate) fn open(&self, storey: i32) -> u64 {
+        self.open[self.place(storey)]
+    }
+
+    /// Notes that something is added to columns of a storey.
+    #[inline(always)]
+    pub(crate) fn touch(&mut self, storey: i32, columns: u64) {
+        self.touched[self.place(storey)] |= columns;
+    }
+}
+
+/// Which columns are open in any of some rows that follow each other.
+struct AnyOpen {
+    /// Of the `i`th power of two of rows, from each on.
+    rows: [Rows; AnyOpen::POWERS],
+}
+
+impl AnyOpen {
+    const POWERS: usize = EDGE.ilog2() as usize + 1;
+
+    /// For at most so many rows.
+    #[inline(always)]
+    fn new(open: &Rows, most: usize) -> AnyOpen {
+        let mut rows = [[0; EDGE]; AnyOpen::POWERS];
+        rows[0] = *open;
+        for power in 1..=most.clamp(1, EDGE).ilog2() as usize {
+            let step = 1 << (power - 1);
+            let [from, to] = rows.get_disjoint_mut([power - 1, power]).expect("two of them");
+            for (to, (a, b)) in to.iter_mut().zip(from.iter().zip(&from[step..])) {
+                *to = a | b;
+            }
+        }
+        AnyOpen { rows }
+    }
+
+    /// Of the rows from `begin` to the one before `end`, where the part has any.
+    #[inline(always)]
+    fn of(&self, begin: i32, end: i32) -> u64 {
+        let [begin, end] = [begin.max(0), end.min(PART)];
+        if begin >= end {
+            return 0;
+        }
+        let power = (end - begin).ilog2() as usize % AnyOpen::POWERS;
+        let rows = &self.rows[power];
+        rows[begin as usize % EDGE] | rows[(end as usize - (1 << power)) % EDGE]
     }
 }
 
 impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
-    /// Rows that storeys reach in `most` sheets from `k` on, of which there are no more than slots.
+    /// What is open, or all if nothing is said of that, where storeys reach in `most` sheets from `k` on, of which there are
+    /// no more than slots.
     ///
     /// Perspective's windows are below 40 pixels, so a voxel's sections lie less than 20 aside of its centre. Thus
     /// its sheets' first tiers lie less than 2 * 20 / [`crate::storeys`]' least distance apart, 54 storeys, and a table of
     /// twice the rows of a sheet holds all.
     #[inline(always)]
-    pub(crate) fn hull(&mut self, k: i32, most: usize) -> &Hull {
+    pub(crate) fn hull(&mut self, k: i32, most: usize, open: Option<&OpenMask>) -> &Hull {
         if self.hull.k == k {
             return &self.hull;
         }
@@ -301,25 +374,27 @@ impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
             *to = downs[which].base;
             (first, last) = (first.min(*to), last.max(*to));
         }
+        hull.sheets = most.min(N);
         (hull.k, hull.base, hull.n) = (k, first, last.abs_diff(first) as usize + rows);
-        for (rows, none) in hull.rows.iter_mut().zip([i32::MAX, i32::MIN]) {
-            rows[..hull.n].fill(none);
-        }
-        let [lo, hi] = &mut hull.rows;
-        for &which in &which[..most.min(N)] {
+        let mut reach = [[i32::MAX; 2 * ROWS], [i32::MIN; 2 * ROWS]];
+        let [lo, hi] = &mut reach;
+        for &which in &which[..hull.sheets] {
             let Down { base, first: of, len, .. } = &downs[which];
-            // A tier that is not there lies beyond the outermost, which does not reach the part either.
+            // A storey beyond a sheet's tiers does not reach the part in it.
             let begin = base.abs_diff(first) as usize;
             let inside = begin..begin + rows;
-            let ends = [(0..begin, of[0]), (inside.end..hull.n, of[rows - 1])];
-            for (some, of) in ends {
-                for (lo, hi) in lo[some.clone()].iter_mut().zip(&mut hi[some]) {
-                    (*lo, *hi) = ((*lo).min(of), (*hi).max(of + len));
-                }
-            }
             for ((lo, hi), of) in lo[inside.clone()].iter_mut().zip(&mut hi[inside]).zip(of) {
                 (*lo, *hi) = ((*lo).min(*of), (*hi).max(of + len));
             }
+        }
+        let mut high = 1;
+        for (lo, hi) in lo[..hull.n].iter().zip(&hi[..hull.n]) {
+            high = high.max((*hi).min(PART).saturating_sub((*lo).max(0)));
+        }
+        let rows = open.map_or([u64::MAX; EDGE], |open| *open.rows());
+        let any = AnyOpen::new(&rows, high as usize);
+        for (i, open) in hull.open[..hull.n].iter_mut().enumerate() {
+            *open = any.of(lo[i], hi[i]);
         }
         hull
     }
@@ -399,7 +474,6 @@ impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
 pub(crate) struct RenderLevel<'a, S: Recorded, const N: usize> {
     pub(crate) part: Part<'a>,
     pub(crate) view: LevelView<'a>,
-    pub(crate) simd: Simd,
     pub(crate) store: &'a mut Store<S>,
     pub(crate) waiting: &'a mut Waiting,
     pub(crate) pixels: &'a mut Pixels,
@@ -421,16 +495,9 @@ pub(crate) fn takes(frame: &Frame) -> Option<LevelView<'_>> {
 impl<S: Tiered, const N: usize> Work for RenderLevel<'_, S, N> {
     type Out = ();
     #[inline(always)]
-    fn run(self) {
-        let RenderLevel {
-            part,
-            view: LevelView { flat, storeys },
-            simd,
-            store,
-            waiting,
-            pixels,
-            io,
-        } = self;
+    fn run(self, simd: Simd) {
+        let RenderLevel { part, view: LevelView { flat, storeys }, store, waiting, pixels, io } =
+            self;
         let frame = part.frame;
         let footprint = frame.footprints.at(0).expect("a flat view's sheets are all drawn");
         let phases = footprint.phases(0).expect("a flat view's footprints have tables");
@@ -505,59 +572,63 @@ impl<S: Tiered, const N: usize> Stage<LevelSheets<'_, S, N>> for LevelStage<'_, 
     #[inline(always)]
     fn splat(
         &mut self,
-        bucket: &[Splat],
+        due: &Due<'_, Splat>,
         k: i32,
         sheets: &mut LevelSheets<'_, S, N>,
         open: &OpenMask,
         counters: &mut Counters,
     ) {
-        if bucket.is_empty() {
-            return;
-        }
         let LevelStage { part, shape, weights, columns, batch, .. } = self;
-        let len = weights.across.len;
+        let Weights { across, deep } = &*weights;
         let mut payloads = [S::Payload::default(); BATCH];
         columns[..shape.rows].fill(0);
-        for some in bucket.chunks(BATCH) {
+        for some in due.chunks(BATCH) {
             let note = |v: &Splat| {
                 let [place, row] = v.first();
-                columns[row % ROWS] |= shape.columns(place as u32, len);
+                columns[row % ROWS] |= shape.columns(place as u32, across.len);
             };
             let asked = (sheets.simd, *part, open);
-            let n = batch.light::<S>(asked, some, counters, note, &mut payloads);
-            let voxels = (&batch.voxels[..n], &payloads[..n]);
-            S::add_flat(sheets.simd, &mut sheets.tiers, voxels, slot::<N>(k), weights);
+            let n = batch.light::<S>(asked, (&some, k), counters, note, &mut payloads);
+            let (voxels, payloads) = (&batch.voxels[..n], &payloads[..n]);
+            match some {
+                Chunk::Here(_) => {
+                    let (voxels, tiers) = ((voxels, payloads), &mut sheets.tiers);
+                    S::add_flat(sheets.simd, tiers, voxels, slot::<N>(k), weights);
+                }
+                Chunk::Before(_) => {
+                    for ((v, gone), &payload) in voxels.iter().zip(&batch.gone).zip(payloads) {
+                        let [place, row] = v.first();
+                        let wx = across.row((v.rows & 0xffff) as usize);
+                        let z = &deep.row(v.phase() as usize * deep.len)[*gone as usize..];
+                        for (i, &wz) in z.iter().enumerate() {
+                            let tier = (slot::<N>(k + i as i32), row);
+                            sheets.tiers.add(tier, (place, wx), &S::cut(payload, wz));
+                        }
+                    }
+                }
+            }
         }
-        sheets.touch_all(k, weights.deep.len, columns);
+        sheets.touch_all(k, deep.len, columns);
     }
+}
 
-    #[inline(always)]
-    fn splat_carried(
-        &mut self,
-        carried: &[(Splat, i32)],
-        sheets: &mut LevelSheets<'_, S, N>,
-        open: &OpenMask,
-        counters: &mut Counters,
-    ) {
-        let LevelStage { part, shape, weights: Weights { across, deep }, .. } = self;
-        let Part { frame, slab, .. } = part;
-        for (v, first) in carried {
-            if frame.scene.quality.cull && !open.is_near(v.cell()) {
-                counters.culled += 1;
-                continue;
-            }
-            counters.splatted += 1;
-            let mut light = [[0.0]; 4];
-            frame.payloads(sheets.simd, &[v.sample], &[v.normal()], None, &mut light);
-            let payload = S::payload(light.map(|[c]| c));
-            let [place, row] = v.first();
-            let wx = across.row((v.rows & 0xffff) as usize);
-            let z = deep.row(v.phase() as usize * deep.len);
-            for (sheet, &wz) in z.iter().enumerate().skip((slab.first - first) as usize) {
-                let slot = slot::<N>(first + sheet as i32);
-                sheets.tiers.add((slot, row), (place, wx), &S::cut(payload, wz));
-                sheets.touch(slot, row, shape.columns(place as u32, wx.len()));
-            }
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn any_open_is_what_rows_have_together(
+            set in prop::collection::vec((0..EDGE, 0..64u32), 0..40),
+            begin in -70..70i32, high in 0..=64i32,
+        ) {
+            let mut rows = [0; EDGE];
+            set.iter().for_each(|&(y, x)| rows[y] |= 1 << x);
+            let any = AnyOpen::new(&rows, high as usize);
+            let want = (0..PART).filter(|y| (begin..begin + high).contains(y));
+            let want = want.fold(0, |all, y| all | rows[y as usize]);
+            prop_assert_eq!(any.of(begin, begin + high), want);
         }
     }
 }

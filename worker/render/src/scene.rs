@@ -4,7 +4,7 @@ use crate::footprint::{Footprint, Footprints, Lean, Leaning, Profile, Sections, 
 use crate::mask::REACH_MOST;
 use crate::place::{FlatCorner, Places};
 use crate::sheet::Rule;
-use crate::splat::{Simd, looks};
+use crate::splat::{Simd, Work, looks};
 use crate::storeys::Storeys;
 use glam::{DVec3, Vec3};
 use slabcast_common::bounds::{raw_per_payload, short_per_payload};
@@ -313,13 +313,12 @@ impl Frame {
 
     /// [`Frame::payload`] of many voxels by their samples' bits, normals and, where each sees the eye
     /// in a direction of its own, eye coordinates by axis (opacities do not hang on gradients):
-    /// extinctions, then each colour. Loops of a length that compilers do not know, so that they run
-    /// them on lanes. There may be more normals than samples, for [whole registers](crate::splat::whole_registers); what comes of
-    /// those is not said.
+    /// extinctions, then each colour. There may be more normals than samples, for
+    /// [whole registers](crate::splat::whole_registers); what comes of those is not said.
     ///
     /// # Panics
     /// If there are fewer normals or eyes than samples; in a perspective view without eyes.
-    #[inline(always)]
+    #[inline]
     pub(crate) fn payloads<const MOST: usize>(
         &self,
         simd: Simd,
@@ -328,45 +327,7 @@ impl Frame {
         eyes: Option<[&[f64]; 3]>,
         out: &mut [[f32; MOST]; 4],
     ) {
-        let n = normals.len().min(MOST);
-        assert!(samples.len() <= n, "a normal a sample");
-        let table = self.scene.classifier.table();
-        if !table.is_empty() {
-            looks::take(simd, table, samples, out);
-        }
-        let [sigma, colours @ ..] = out;
-        for (i, &sample) in samples.iter().enumerate().take(if table.is_empty() { n } else { 0 }) {
-            let look = self.scene.classifier.look_of_bits(sample);
-            sigma[i] = look.sigma;
-            for c in 0..3 {
-                colours[c][i] = look.rgb[c];
-            }
-        }
-        if let Some(shader) = &self.scene.shader {
-            let mut lit = [[0.0; MOST]; 2];
-            match (self.to_eye, eyes) {
-                (Some(to_eye), _) => shader.light_all(normals, |_| to_eye, &mut lit),
-                (None, eyes) => {
-                    let mut to_eye = [[0.0; MOST]; 3];
-                    self.view.to_eye_all(eyes.expect("eyes in perspective"), &mut to_eye);
-                    let [x, y, z] = &to_eye;
-                    shader.light_all(normals, |i| Vec3::new(x[i], y[i], z[i]), &mut lit);
-                }
-            }
-            for colour in &mut *colours {
-                for i in 0..n {
-                    colour[i] = Lit { lambert: lit[0][i], gloss: lit[1][i] }.on(colour[i]);
-                }
-            }
-        }
-        for sigma in &mut sigma[..n] {
-            *sigma = (f64::from(*sigma) * self.view.cell) as f32 * self.raw_scale;
-        }
-        for colour in colours {
-            for i in 0..n {
-                colour[i] *= sigma[i];
-            }
-        }
+        simd.run(Payloads { frame: self, samples, normals, eyes, out });
     }
 
     /// What voxel `i` of `brick` at eye position `eye` adds to a sheet per unit of weight, in
@@ -387,5 +348,62 @@ impl Frame {
         };
         let sigma = (f64::from(look.sigma) * self.view.cell) as f32 * self.raw_scale;
         [sigma, sigma * rgb[0], sigma * rgb[1], sigma * rgb[2]]
+    }
+}
+
+/// [`Frame::payloads`]: compiled for each instruction set by itself, and not with all that calls it. Its loops are of a
+/// length that compilers do not know, so that they run them on lanes.
+struct Payloads<'a, const MOST: usize> {
+    frame: &'a Frame,
+    samples: &'a [u32],
+    normals: &'a [u16],
+    eyes: Option<[&'a [f64]; 3]>,
+    out: &'a mut [[f32; MOST]; 4],
+}
+
+impl<const MOST: usize> Work for Payloads<'_, MOST> {
+    type Out = ();
+    #[inline(always)]
+    fn run(self, simd: Simd) {
+        let Payloads { frame, samples, normals, eyes, out } = self;
+        let n = normals.len().min(MOST);
+        assert!(samples.len() <= n, "a normal a sample");
+        let table = frame.scene.classifier.table();
+        if !table.is_empty() {
+            looks::take(simd, table, samples, out);
+        }
+        let [sigma, colours @ ..] = out;
+        for (i, &sample) in samples.iter().enumerate().take(if table.is_empty() { n } else { 0 }) {
+            let look = frame.scene.classifier.look_of_bits(sample);
+            sigma[i] = look.sigma;
+            for c in 0..3 {
+                colours[c][i] = look.rgb[c];
+            }
+        }
+        if let Some(shader) = &frame.scene.shader {
+            let mut lit = [[0.0; MOST]; 2];
+            match (frame.to_eye, eyes) {
+                (Some(to_eye), _) => shader.light_all(normals, |_| to_eye, &mut lit),
+                (None, eyes) => {
+                    let mut to_eye = [[0.0; MOST]; 3];
+                    frame.view.to_eye_all(eyes.expect("eyes in perspective"), &mut to_eye);
+                    let [x, y, z] = &to_eye;
+                    shader.light_all(normals, |i| Vec3::new(x[i], y[i], z[i]), &mut lit);
+                }
+            }
+            for colour in &mut *colours {
+                for i in 0..n {
+                    colour[i] = Lit { lambert: lit[0][i], gloss: lit[1][i] }.on(colour[i]);
+                }
+            }
+        }
+        for sigma in &mut sigma[..n] {
+            *sigma = (f64::from(*sigma) * frame.view.cell) as f32 * frame.raw_scale;
+        }
+        for colour in colours {
+            for i in 0..n {
+                colour[i] *= sigma[i];
+            }
+        }
     }
 }

@@ -152,24 +152,53 @@ pub(crate) trait Stage<H> {
         queues: &mut Queues<Self::Voxel>,
         counters: &mut Counters,
     );
-    /// Shades the voxels that begin at sheet `k` and adds them to their sheets.
+    /// Shades voxels that are due at sheet `k`, and adds them to those of their sheets that are left.
     fn splat(
         &mut self,
-        bucket: &[Self::Voxel],
+        due: &Due<'_, Self::Voxel>,
         k: i32,
         sheets: &mut H,
         open: &OpenMask,
         counters: &mut Counters,
     );
-    /// Adds voxels that begin before the slab, with their first sheets, to those of their sheets that
-    /// are left.
-    fn splat_carried(
-        &mut self,
-        carried: &[(Self::Voxel, i32)],
-        sheets: &mut H,
-        open: &OpenMask,
-        counters: &mut Counters,
-    );
+}
+
+/// Voxels that are drawn from some sheet on: those that begin there, and those that began before the slab, with their
+/// first sheets.
+pub(crate) struct Due<'a, V> {
+    here: &'a [V],
+    before: &'a [(V, i32)],
+}
+
+/// Some that are due, of one kind.
+pub(crate) enum Chunk<'a, V> {
+    Here(&'a [V]),
+    Before(&'a [(V, i32)]),
+}
+
+impl<'a, V> Due<'a, V> {
+    #[inline(always)]
+    pub(crate) fn is_empty(&self) -> bool {
+        self.here.is_empty() && self.before.is_empty()
+    }
+
+    /// At most `n` at a time: one loop over both, since what draws them is a lot of code.
+    #[inline(always)]
+    pub(crate) fn chunks(&self, n: usize) -> impl Iterator<Item = Chunk<'a, V>> + use<'a, V> {
+        let before = self.before.chunks(n).map(Chunk::Before);
+        before.chain(self.here.chunks(n).map(Chunk::Here))
+    }
+}
+
+impl<V> Chunk<'_, V> {
+    /// How many.
+    #[inline(always)]
+    pub(crate) fn len(&self) -> usize {
+        match self {
+            Chunk::Here(some) => some.len(),
+            Chunk::Before(some) => some.len(),
+        }
+    }
 }
 
 /// Walks through the sheets of `part`'s slab.
@@ -208,13 +237,13 @@ pub(crate) fn walk<S: Recorded, H: Open<S>, T: Stage<H>>(
             next += 1;
         }
         sheets.begin(k);
-        if !queues.carried.is_empty() {
-            stage.splat_carried(&queues.carried, &mut sheets, &open, counters);
-            queues.carried.clear();
-        }
         let bucket = &mut queues.buckets[(k - slab.first) as usize];
-        stage.splat(bucket.voxels(), k, &mut sheets, &open, counters);
+        let due = Due { here: bucket.voxels(), before: &queues.carried };
+        if !due.is_empty() {
+            stage.splat(&due, k, &mut sheets, &open, counters);
+        }
         bucket.clear();
+        queues.carried.clear();
         if sheets.close(k, part, &mut open, pixels) {
             any_open = open.count() > 0;
             open.grow(stage.reach());

@@ -313,8 +313,7 @@ impl<'a> Part<'a> {
             Sums::I32 | Sums::Auto => {
                 if let Some((deep, storeys)) = part.deep_grey() {
                     let (store, waiting) = (&mut whole.greys, &mut whole.waiting.deep);
-                    let deep =
-                        RenderDeep::<Grey, 4> { part, deep, simd, store, waiting, pixels, io };
+                    let deep = RenderDeep::<Grey, 4> { part, deep, store, waiting, pixels, io };
                     return simd.run(RenderDeepLevel { deep, storeys });
                 }
                 let (store, waiting) = (&mut whole.longs, &mut whole.waiting);
@@ -343,25 +342,17 @@ impl<'a> Part<'a> {
         let part = self;
         if let Some(view) = level::takes(part.frame) {
             if part.frame.sections.most() <= 4 {
-                simd.run(RenderLevel::<Grey, 4> { part, view, simd, store, waiting, pixels, io });
+                simd.run(RenderLevel::<Grey, 4> { part, view, store, waiting, pixels, io });
             } else {
-                simd.run(RenderLevel::<Grey, MOST> {
-                    part,
-                    view,
-                    simd,
-                    store,
-                    waiting,
-                    pixels,
-                    io,
-                });
+                simd.run(RenderLevel::<Grey, MOST> { part, view, store, waiting, pixels, io });
             }
             return;
         }
         let view = flat::takes(part.frame).expect("a flat view");
         if part.frame.sections.most() <= 4 {
-            simd.run(RenderFlat::<Grey, 4> { part, view, simd, store, waiting, pixels, io });
+            simd.run(RenderFlat::<Grey, 4> { part, view, store, waiting, pixels, io });
         } else {
-            simd.run(RenderFlat::<Grey, MOST> { part, view, simd, store, waiting, pixels, io });
+            simd.run(RenderFlat::<Grey, MOST> { part, view, store, waiting, pixels, io });
         }
     }
 
@@ -401,17 +392,17 @@ impl<'a> Part<'a> {
         let part = self;
         if let Some(view) = level::takes(part.frame) {
             let waiting = &mut waiting.flat;
-            simd.run(RenderLevel::<S, N> { part, view, simd, store, waiting, pixels, io });
+            simd.run(RenderLevel::<S, N> { part, view, store, waiting, pixels, io });
         } else if let Some(view) = flat::takes(part.frame) {
             let waiting = &mut waiting.flat;
-            simd.run(RenderFlat::<S, N> { part, view, simd, store, waiting, pixels, io });
+            simd.run(RenderFlat::<S, N> { part, view, store, waiting, pixels, io });
         } else if let Some(lean) = leaning::takes(part.frame) {
             let waiting = &mut waiting.leaning;
-            simd.run(RenderLeaning { part, lean, simd, store, waiting, pixels, io });
+            simd.run(RenderLeaning { part, lean, store, waiting, pixels, io });
         } else if let Some(deep) = deep::takes(&part) {
             let waiting = &mut waiting.deep;
             let storeys = part.frame.storeys.as_ref();
-            let deep = RenderDeep::<S, N> { part, deep, simd, store, waiting, pixels, io };
+            let deep = RenderDeep::<S, N> { part, deep, store, waiting, pixels, io };
             match storeys {
                 Some(storeys) => simd.run(RenderDeepLevel { deep, storeys }),
                 None => simd.run(deep),

@@ -6,10 +6,11 @@
 
 #[cfg(target_arch = "x86_64")]
 use super::Level;
-use super::Simd;
+use super::{Simd, Work};
 use crate::sheet::{Row, Rule, Sum};
 #[cfg(target_arch = "x86_64")]
 use slabcast_common::quality::Compositing;
+use std::marker::PhantomData;
 
 /// [`Rule::close_row`] for some rows.
 #[inline(always)]
@@ -30,13 +31,27 @@ pub(crate) fn close_rows<S: Sum, const ROWS: usize>(
         Level::Avx2 if S::WHOLE && rule.compositing == Compositing::Linear => unsafe {
             wide::avx2::<S, ROWS>(rule, rows, live)
         },
-        _ => {
-            let mut shut = [0; ROWS];
-            for ((shut, row), live) in shut.iter_mut().zip(rows).zip(live) {
-                *shut = rule.close_row::<S>(row, live);
-            }
-            shut
+        _ => simd.run(CloseRows { rule, rows, live, sums: PhantomData::<S> }),
+    }
+}
+
+/// [`Rule::close_row`] for some rows, compiled by itself and not with all that calls it.
+struct CloseRows<'a, S, const ROWS: usize> {
+    rule: &'a Rule,
+    rows: &'a mut [Row; ROWS],
+    live: [u32; ROWS],
+    sums: PhantomData<S>,
+}
+
+impl<S: Sum, const ROWS: usize> Work for CloseRows<'_, S, ROWS> {
+    type Out = [u32; ROWS];
+    #[inline(always)]
+    fn run(self, _: Simd) -> [u32; ROWS] {
+        let mut shut = [0; ROWS];
+        for ((shut, row), live) in shut.iter_mut().zip(self.rows).zip(self.live) {
+            *shut = self.rule.close_row::<S>(row, live);
         }
+        shut
     }
 }
 

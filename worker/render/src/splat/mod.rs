@@ -414,8 +414,8 @@ pub(crate) fn whole_registers(n: usize) -> usize {
 pub trait Work {
     /// What comes out.
     type Out;
-    /// Does it.
-    fn run(self) -> Self::Out;
+    /// Does it. Which instruction set it is compiled for is known where it is: what is for others is left out.
+    fn run(self, simd: Simd) -> Self::Out;
 }
 
 impl Simd {
@@ -431,21 +431,38 @@ impl Simd {
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe { run_avx512(work) },
             // NEON is in the baseline of 64-bit ARM.
-            _ => work.run(),
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => run_neon(work),
+            Level::Plain => run_plain(work),
         }
     }
 }
 
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,popcnt,lzcnt,bmi1,bmi2")]
-fn run_avx2<W: Work>(work: W) -> W::Out {
-    work.run()
+// None is compiled with its callers, of which some have much code.
+
+#[inline(never)]
+fn run_plain<W: Work>(work: W) -> W::Out {
+    work.run(Simd(Level::Plain))
+}
+
+#[cfg(target_arch = "aarch64")]
+#[inline(never)]
+fn run_neon<W: Work>(work: W) -> W::Out {
+    work.run(Simd(Level::Neon))
 }
 
 #[cfg(target_arch = "x86_64")]
+#[inline(never)]
+#[target_feature(enable = "avx2,popcnt,lzcnt,bmi1,bmi2")]
+fn run_avx2<W: Work>(work: W) -> W::Out {
+    work.run(Simd(Level::Avx2))
+}
+
+#[cfg(target_arch = "x86_64")]
+#[inline(never)]
 #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,popcnt,lzcnt,bmi1,bmi2")]
 fn run_avx512<W: Work>(work: W) -> W::Out {
-    work.run()
+    work.run(Simd(Level::Avx512))
 }
 
 /// Four rows of sixteen columns, column by column: four columns a register.
@@ -505,7 +522,7 @@ mod tests {
     impl<S: Accumulate> Work for One<'_, S> {
         type Out = ();
         #[inline(always)]
-        fn run(self) {
+        fn run(self, _: Simd) {
             splat(self.sheet, 64, (3, self.wx), (1, self.wy), self.section);
         }
     }

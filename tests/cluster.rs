@@ -313,6 +313,7 @@ async fn a_worker_of_another_protocol_is_refused_by_name() {
         self_test_sha256: hash.into(),
         held: vec![],
         rehearses: false,
+        machine: String::new(),
     };
     use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
     let good = SELF_TEST_SHA256;

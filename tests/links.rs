@@ -78,6 +78,7 @@ fn config(name: &str, threads: u32) -> Config {
         memory_budget_bytes: 64 << 20,
         simd: Simd::detect(),
         rehearsal: None,
+        machine: String::new(),
     }
 }
 

@@ -59,6 +59,7 @@ fn measure(workers: usize) -> [f64; 3] {
             memory_budget_bytes: 1 << 20,
             simd: Simd::detect(),
             rehearsal: None,
+            machine: String::new(),
         };
         there.spawn(slabcast_worker::dial::run(config, address.clone(), stopped.clone()));
     }

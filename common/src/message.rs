@@ -172,6 +172,8 @@ pub struct Hello {
     pub held: Vec<(BrickSetKey, Vec<BrickId>)>,
     /// It holds tiles for a recorded time instead of drawing them.
     pub rehearses: bool,
+    /// Which machine it runs on; empty if unknown.
+    pub machine: String,
 }
 
 /// What became of a task's voxels (see `stats::VoxelStats`).

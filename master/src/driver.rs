@@ -63,6 +63,8 @@ pub struct MasterConfig {
     pub record: Option<Recorder>,
     /// Only workers that rehearse are let in, and pictures are marked.
     pub rehearse: bool,
+    /// Which machine this is, for workers that are on it to be told from others; empty if unknown.
+    pub machine: String,
 }
 
 impl MasterConfig {
@@ -75,6 +77,7 @@ impl MasterConfig {
             schedule: slabcast_schedule::Config::default(),
             record: None,
             rehearse: false,
+            machine: String::new(),
         }
     }
 }
@@ -218,6 +221,7 @@ impl Master {
             clock: RealClock(Instant::now()),
             silence: config.schedule.silence,
             rehearse: config.rehearse,
+            machine: config.machine,
             in_reserve: 0,
             scheduler: Watched::new(config.schedule, config.record),
             links: BTreeMap::new(),
@@ -413,6 +417,7 @@ struct Driver {
     clock: RealClock,
     silence: Micros,
     rehearse: bool,
+    machine: String,
     /// Workers in reserve when that was said last.
     in_reserve: usize,
     scheduler: Watched,
@@ -579,6 +584,8 @@ impl Driver {
         // Workers give a master up after three of these, as it does them after its own silence.
         let heartbeat_ms = (self.silence / 3000).min(u32::MAX.into()) as u32;
         let _ = link.control.send(ToWorker::Welcome { worker, heartbeat_ms });
+        // A rehearsing one stands for another machine's.
+        let is_here = caller.is_on(&hello.machine, &self.machine) && !hello.rehearses;
         let now = Instant::now();
         let attached = Attached {
             link,
@@ -597,8 +604,7 @@ impl Driver {
                 worker,
                 name,
                 threads: hello.threads,
-                // A rehearsing one stands for another machine's.
-                is_here: caller.is_here && !hello.rehearses,
+                is_here,
                 memory_budget_bytes: hello.memory_budget_bytes,
                 held: hello.held,
             },

@@ -48,8 +48,17 @@ pub struct WorkerLink {
 pub struct Caller {
     /// Its address; empty for one of this process.
     pub address: String,
-    /// Whether that is this machine, whose processors it shares with the master then.
+    /// Whether that is an address of this machine, or it is of this process.
     pub is_here: bool,
+}
+
+impl Caller {
+    /// Whether a caller that says to be on `machine` shares the processors of a master on `own`: if either does not
+    /// know, whoever has the address that it calls is on the machine that is called. An address alone is
+    /// another for each container, and the same at the end of a tunnel.
+    pub(crate) fn is_on(&self, machine: &str, own: &str) -> bool {
+        if machine.is_empty() || own.is_empty() { self.is_here } else { machine == own }
+    }
 }
 
 /// Bricks of one embedded batch: some 64 KiB, as over TCP, so that tiles start while the rest
@@ -132,4 +141,28 @@ pub async fn serve_link(
         }
     }
     handle.detach(worker, "its link closed".into()).await;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_is_on_the_masters_machine_is_told_by_its_name_or_else_by_its_address() {
+        let caller = |is_here| Caller { address: "10.0.0.1:5".into(), is_here };
+        for (is_here, machine, own, want) in [
+            (true, "a", "a", true),
+            // A container, which has an address of its own.
+            (false, "a", "a", true),
+            // The other end of a tunnel.
+            (true, "b", "a", false),
+            (false, "b", "a", false),
+            (true, "", "a", true),
+            (false, "", "a", false),
+            (true, "a", "", true),
+            (false, "a", "", false),
+        ] {
+            assert_eq!(caller(is_here).is_on(machine, own), want, "{machine:?} on {own:?}");
+        }
+    }
 }

@@ -303,11 +303,12 @@ fn the_bytes_of_a_hello_never_change() {
                 bricks: Some(v1::BrickIds { differences: vec![5, 1, -1] }),
             }],
             rehearses: false,
+            machine: "m".into(),
         })),
     }
     .encode_to_vec();
     let golden = [
-        0x0a, 29, // FromWorker.hello = 1, 29 bytes
+        0x0a, 32, // FromWorker.hello = 1, 32 bytes
         0x08, 1, // protocol_version = 1, varint
         0x10, 2, // pixels_version = 2, varint
         0x1a, 1, b'n', // name = 3
@@ -319,6 +320,7 @@ fn the_bytes_of_a_hello_never_change() {
         0x0a, 1, 9, // HeldBricks.set = 1
         0x12, 5, // HeldBricks.bricks = 2
         0x0a, 3, 10, 2, 1, // BrickIds.differences = 1, packed, zigzag
+        0x52, 1, b'm', // machine = 10
     ];
     assert_eq!(bytes, golden);
 }

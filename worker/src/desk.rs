@@ -45,6 +45,8 @@ pub struct Config {
     pub simd: Simd,
     /// Tiles are held for the times of this trace, and nothing is drawn.
     pub rehearsal: Option<Arc<Rehearsal>>,
+    /// Which machine this is, for the master to tell whether it is its own; empty if unknown.
+    pub machine: String,
 }
 
 /// A link to a master, over a network or not.
@@ -82,6 +84,7 @@ pub fn hello(config: &Config, cache: &BrickCache) -> Hello {
         self_test_sha256: slabcast_render::selftest::run(config.simd).to_string(),
         held: cache.held(),
         rehearses: config.rehearsal.is_some(),
+        machine: config.machine.clone(),
     }
 }
 
@@ -586,6 +589,7 @@ mod tests {
                     memory_budget_bytes: 1 << 20,
                     simd: Simd::plain(),
                     rehearsal: None,
+                    machine: String::new(),
                 };
                 let link = Link { control: control_rx, replies: replies_tx, bricks: bricks_rx };
                 run(&config, link, &mut BrickCache::default(), stopped).await

@@ -109,6 +109,7 @@ pub(crate) fn master(args: &MasterArgs) -> Result<(), Fail> {
     let orientation = axes.of(&volume)?;
     let mut config = MasterConfig::new(volume, orientation);
     config.rehearse = args.rehearse;
+    config.machine = machine();
     if args.rehearse {
         warn!("--rehearse: this master's pictures are stripes, whatever is asked for");
     }
@@ -230,6 +231,13 @@ fn local(listener: &TcpListener) -> Result<SocketAddr, Fail> {
     listener.local_addr().map_err(|e| Fail::failed(format!("listening failed: {}", reason(&e))))
 }
 
+/// Which machine this is, the same for all processes and containers of it until it is started again; empty
+/// where the system does not say.
+fn machine() -> String {
+    let id = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
+    id.trim().to_owned()
+}
+
 /// Runs `slabcast worker`.
 pub(crate) fn worker(args: &WorkerArgs) -> Result<(), Fail> {
     let rehearsal = match &args.rehearse {
@@ -242,6 +250,7 @@ pub(crate) fn worker(args: &WorkerArgs) -> Result<(), Fail> {
         threads: args.threads.unwrap_or_else(cores),
         memory_budget_bytes: args.memory,
         simd: Simd::detect(),
+        machine: machine(),
     };
     let runtime = runtime::start()?;
     let result = runtime.block_on(async {

@@ -100,6 +100,7 @@ impl Cluster {
                 memory_budget_bytes: SHARED,
                 simd: Simd::detect(),
                 rehearsal: None,
+                machine: String::new(),
             };
             let stop = stopped.clone();
             workers.spawn(async move {

@@ -162,6 +162,7 @@ fn hello_to_wire(hello: &Hello) -> v1::Hello {
         self_test_sha256: hello.self_test_sha256.clone(),
         held,
         rehearses: hello.rehearses,
+        machine: hello.machine.clone(),
     }
 }
 
@@ -197,6 +198,7 @@ fn hello_from_wire(hello: v1::Hello) -> Result<Hello, WireError> {
         self_test_sha256: hash,
         held,
         rehearses: hello.rehearses,
+        machine: optional_name_from_wire("machine", hello.machine)?,
     })
 }
 

@@ -361,6 +361,7 @@ pub fn hello() -> impl Strategy<Value = Hello> {
                 self_test_sha256: hash.clone(),
                 held,
                 rehearses: threads % 5 == 0,
+                machine: simd.clone(),
             })
         })
 }

@@ -193,6 +193,7 @@ impl Tcp {
                 memory_budget_bytes: memory,
                 simd: Simd::detect(),
                 rehearsal: None,
+                machine: String::new(),
             };
             let run = slabcast_worker::dial::run(config, address.clone(), stopped.clone());
             tasks.spawn(async move { run.await.map(|_| ()) });

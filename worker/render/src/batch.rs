@@ -99,7 +99,7 @@ impl Batch {
             (samples[some], normals[some]) = (samples[i], normals[i]);
             some += usize::from(near[i] != 0);
         }
-        let all = whole_registers(some);
+        let all = whole_registers::<BATCH>(some);
         let eyes = eyes.map(|eyes| eyes.each_ref().map(|eye| &eye[..all]));
         frame.payloads(simd, &samples[..some], &normals[..all], eyes, light);
         let [sigma, r, g, b] = light;

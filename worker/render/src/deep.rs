@@ -347,7 +347,7 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
     ) {
         let Part { frame, rect, .. } = self.part;
         let Places { eye, aside, .. } = &mut *self.places;
-        let n = whole_registers(n);
+        let n = whole_registers::<BATCH>(n);
         let apart = &mut self.batch.apart;
         let view = &frame.view;
         let (most, phases) = (frame.sections.most() as i32, frame.sections.phases());
@@ -445,9 +445,9 @@ impl<S: Tiered, const N: usize> DeepStage<'_, S, N> {
         let Places { eye, storey, columns, places, .. } = &mut *self.places;
         let Batch { apart: Apart { lo, hi, first, .. }, near, .. } = &mut *self.batch;
         let (per, base) = storeys.by_eye();
-        let all = whole_registers(n);
-        for (i, storey) in storey[..all].iter_mut().enumerate() {
-            *storey = round_i32(eye[1][i] * per + base);
+        let all = whole_registers::<BATCH>(n);
+        for i in 0..all {
+            storey[i] = round_i32(eye[1][i] * per + base);
         }
         for i in 0..all {
             let [lo, hi] = [lo[0][i], hi[0][i]];
@@ -461,9 +461,9 @@ impl<S: Tiered, const N: usize> DeepStage<'_, S, N> {
             let sheet = layers.after(at);
             if sheet < most {
                 let base = hull.bases[sheet as usize % MOST];
-                for (i, (storey, first)) in storey[..all].iter().zip(&first[0][at]).enumerate() {
-                    let tier = (storey - base).clamp(0, shape.rows as i32 - 1) as u32;
-                    places[i] = shape.place_in(tier, *first);
+                for i in 0..all {
+                    let tier = (storey[i] - base).clamp(0, shape.rows as i32 - 1) as u32;
+                    places[i] = shape.place_in(tier, first[0][at][i]);
                 }
             }
         }

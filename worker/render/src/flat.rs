@@ -93,7 +93,13 @@ impl Batch {
             (samples[i], normals[i]) = (v.sample, v.normal());
             note(v);
         }
-        part.frame.payloads(simd, &samples[..n], &normals[..whole_registers(n)], None, light);
+        part.frame.payloads(
+            simd,
+            &samples[..n],
+            &normals[..whole_registers::<BATCH>(n)],
+            None,
+            light,
+        );
         let [sigma, r, g, b] = light;
         for (i, payload) in payloads[..n].iter_mut().enumerate() {
             *payload = S::payload([sigma[i], r[i], g[i], b[i]]);

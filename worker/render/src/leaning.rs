@@ -154,7 +154,7 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
     /// Where each section of the first `n` voxels of the batch lies, and the windows that hold all of a voxel's.
     #[inline(always)]
     fn place(&mut self, n: usize, k: i32) {
-        let n = whole_registers(n);
+        let n = whole_registers::<BATCH>(n);
         let apart = &mut self.batch.apart;
         let Lean { leaning, .. } = self.lean;
         let most = self.part.frame.sections.most() as i32;

@@ -403,10 +403,11 @@ impl Simd {
 }
 
 /// `n`, or a few more for the last register of a loop to be full: what does not fill one is worked out one by
-/// one, and there may be as much of that as of the rest.
+/// one, and there may be as much of that as of the rest. No more than `MOST`, which compilers then know.
 #[inline(always)]
-pub(crate) fn whole_registers(n: usize) -> usize {
-    n.next_multiple_of(16)
+pub(crate) fn whole_registers<const MOST: usize>(n: usize) -> usize {
+    const { assert!(MOST.is_multiple_of(16)) };
+    n.next_multiple_of(16).min(MOST)
 }
 
 /// Work that is compiled for every instruction set. Whatever it calls must be `inline(always)` to be

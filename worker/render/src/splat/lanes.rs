@@ -71,8 +71,12 @@ pub(crate) trait Lanes {
     /// Four numbers from each of as many places as there are lanes: the first of all places, the second, and
     /// so on. The `i`th begins at the `at[i] * stride`th number behind `from`.
     unsafe fn fours(from: *const u32, stride: usize, at: *const u32) -> [Self::Ints; 4];
-    /// The same of two numbers.
+    /// The same of places that follow each other, from `from` on.
+    unsafe fn fours_on(from: *const u32) -> [Self::Ints; 4];
+    /// [`Lanes::fours`] of two numbers, which are all that each place has.
     unsafe fn pairs(from: *const u32, at: *const u32) -> [Self::Ints; 2];
+    /// The same of places that follow each other, from `from` on.
+    unsafe fn pairs_on(from: *const u32) -> [Self::Ints; 2];
     /// The same of two numbers behind each of two `from`s: four.
     unsafe fn twos(from: [*const u32; 2], stride: usize, at: *const u32) -> [Self::Ints; 4];
     /// Whole numbers as floats.

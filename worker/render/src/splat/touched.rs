@@ -277,18 +277,40 @@ pub(crate) fn put(simd: Simd, row: &Row, at: &[u32], pixels: &mut [[u32; 4]]) {
         #[cfg(target_arch = "aarch64")]
         super::Level::Neon => unsafe { wide::neon::fours(row, &mut fours) },
     }
-    for (&at, four) in at.iter().zip(&fours) {
-        let pixel = &mut pixels[at as usize];
-        // The opacity anew, and colours added.
-        for (c, keep) in [0, u32::MAX, u32::MAX, u32::MAX].into_iter().enumerate() {
-            pixel[c] = (pixel[c] & keep).wrapping_add(four[c]);
+    match at.first_chunk::<LANES>().filter(|at| follow(*at)) {
+        // Beside each other, as most are where few pixels are shut: in whole registers.
+        Some(at) => {
+            let pixels = pixels[at[0] as usize..].first_chunk_mut::<LANES>();
+            let pixels = pixels.expect("places are of the part");
+            for (pixel, four) in pixels.iter_mut().zip(&fours) {
+                put_one(pixel, four);
+            }
+        }
+        None => {
+            for (&at, four) in at.iter().zip(&fours) {
+                put_one(&mut pixels[at as usize], four);
+            }
         }
     }
 }
 
+/// The opacity anew, and colours added.
+#[inline(always)]
+fn put_one(pixel: &mut [u32; 4], four: &[u32; 4]) {
+    for (c, keep) in [0, u32::MAX, u32::MAX, u32::MAX].into_iter().enumerate() {
+        pixel[c] = (pixel[c] & keep).wrapping_add(four[c]);
+    }
+}
+
+/// Whether places, which ascend, follow each other.
+#[inline(always)]
+fn follow(at: &[u32]) -> bool {
+    at.len().checked_sub(1).is_some_and(|last| at[last].wrapping_sub(at[0]) == last as u32)
+}
+
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 mod wide {
-    use super::{LANES, PART, Places, Record, Recorded, Row, STRIDE, Some16, SumsOf};
+    use super::{LANES, PART, Places, Record, Recorded, Row, STRIDE, Some16, SumsOf, follow};
     #[cfg(target_arch = "aarch64")]
     use crate::splat::lanes::Four;
     use crate::splat::lanes::Lanes;
@@ -494,20 +516,29 @@ mod wide {
         unsafe {
             for lanes in (0..n).step_by(L::LANES) {
                 let some = lanes..lanes + L::LANES;
-                let at = at[some.clone()].as_ptr();
-                let [a, ..] = L::fours(pixels.as_ptr().cast(), 4, at);
+                let places = &at[some.clone()];
+                // Those that count are beside each other, as most are where few pixels are shut.
+                let follow = some.end <= n && follow(places);
+                let (at, first) = (places.as_ptr(), places[0] as usize);
+                let [a, ..] = if follow {
+                    L::fours_on(pixels.as_ptr().add(first).cast())
+                } else {
+                    L::fours(pixels.as_ptr().cast(), 4, at)
+                };
                 L::store(row.a[some.clone()].as_mut_ptr().cast(), a);
-                let (old, order) = (old.cast_const().cast(), IN_ORDER[some.clone()].as_ptr());
+                let order = IN_ORDER[some.clone()].as_ptr();
                 let from: *const u32 = folded.as_ptr().cast();
+                let there: *const u32 = old.add(first).cast_const().cast();
+                let old = old.cast_const().cast();
                 let sheets = if words == 4 {
                     [
-                        L::fours(old, 4, at),
+                        if follow { L::fours_on(there) } else { L::fours(old, 4, at) },
                         L::fours(from, 8, order),
                         L::fours(from.add(4), 8, order),
                     ]
                 } else {
-                    let [a, b] = L::pairs(old, at);
-                    let [c, d, e, f] = L::fours(from, 4, order);
+                    let [a, b] = if follow { L::pairs_on(there) } else { L::pairs(old, at) };
+                    let [c, d, e, f] = L::fours_on(from.add(4 * lanes));
                     [shorts::<L, S>(a, b), shorts::<L, S>(c, d), shorts::<L, S>(e, f)]
                 };
                 let to = [&mut row.before, &mut row.here, &mut row.behind];

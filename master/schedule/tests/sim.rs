@@ -258,6 +258,28 @@ fn what_the_master_costs_shows_in_frames_and_overlaps_where_it_may() {
     assert!(rehearsal.each_ms() > three.each_ms());
 }
 
+/// Long work on the cores that all share, a picture's, holds short work up by its turns and not by all of it.
+#[test]
+fn what_is_done_with_pictures_hardly_delays_messages() {
+    let (jobs, trace) = world(40);
+    let jobs = under(Schedule::Region, &jobs);
+    let each_ms = |pixel: f64| {
+        let toll = Toll { woken: 2_000.0, receive: (500.0, 0.0), ..Toll::default() };
+        let costs = Costs {
+            master: toll,
+            worker: toll,
+            mark_pixel: pixel,
+            deliver: [pixel; 2],
+            ..Costs::default()
+        };
+        let cluster = Cluster { cores: Some(2), in_flight: 4, costs, ..cluster(2) };
+        run(&jobs, &trace, &cluster).each_ms()
+    };
+    // A frame takes two workers half a millisecond, and its picture three times 0.2 of two cores.
+    let [free, dear] = [0.0, 4.0].map(each_ms);
+    assert!(dear < 1.1 * free, "{free} ms a frame without, {dear} with");
+}
+
 #[test]
 fn the_same_cluster_behaves_the_same() {
     let (jobs, trace) = world(3);

@@ -57,9 +57,24 @@ enum Coming {
     Lease(WorkerId, Task),
     /// A tile has had its time.
     TaskEnd(WorkerId, usize),
-    /// A frame is hashed and encoded.
-    Finished(FrameId),
+    /// Some of what is done with a picture is done, and so many nanoseconds of it are left.
+    Chore(Chore, f64),
 }
+
+/// What is done with a picture whose tiles are there. It takes milliseconds, and what takes microseconds does not wait
+/// for all of it: systems take turns, and a stream sends pieces.
+#[derive(Clone, Copy)]
+enum Chore {
+    /// To hash and encode it.
+    Finish(FrameId),
+    /// To send it to the client.
+    Send(FrameId),
+    /// To receive it there, where all is on one machine.
+    Receive,
+}
+
+/// How long of a chore is done in one go: a piece of 64 KiB takes as long to send.
+const TURN: f64 = 50_000.0;
 
 /// What a worker was lent.
 enum Task {
@@ -390,9 +405,89 @@ impl<'a> World<'a> {
 
     /// Work of a thread of the master.
     fn master(&mut self, which: fn(&mut Self) -> &mut Cores, at: Nanos, ns: f64) -> Nanos {
-        let woken = self.cluster.costs.master.woken;
+        self.awake(which, at, (ns, self.cluster.costs.master.woken))
+    }
+
+    /// Work of a thread of the master, which takes so long to wake if it slept.
+    fn awake(
+        &mut self,
+        which: fn(&mut Self) -> &mut Cores,
+        at: Nanos,
+        (ns, woken): (f64, f64),
+    ) -> Nanos {
         let (alone, took) = which(self).take(at, ns, woken);
         self.machine.as_mut().map_or(alone, |m| m.run(at, took).max(alone))
+    }
+
+    /// Does some of a chore of which so many nanoseconds are left. Nobody has time that is still to come set aside for
+    /// him: whatever comes first is done first.
+    fn do_some(&mut self, at: Nanos, chore: Chore, left: f64, woken: f64) {
+        // A thread finishes one picture after the other; where it has no core for itself, it is told apart by turns.
+        let whole = matches!(chore, Chore::Finish(_)) && self.machine.is_none();
+        let ns = if whole { left } else { left.min(TURN) };
+        let done = match chore {
+            Chore::Finish(_) => self.awake(|w| &mut w.finisher, at, (ns, woken)),
+            Chore::Send(_) => self.awake(|w| &mut w.streams, at, (ns, woken)),
+            Chore::Receive => self.machine.as_mut().map_or(at, |machine| machine.run(at, ns)),
+        };
+        self.later(done, Coming::Chore(chore, left - ns));
+    }
+
+    /// Goes on with a chore, or with what comes after it.
+    fn go_on(
+        &mut self,
+        chore: Chore,
+        left: f64,
+        took: &mut Took,
+        watch: &mut dyn Stopwatch,
+    ) -> Result<(), Unknown> {
+        let now = self.now();
+        if left > 0.0 {
+            self.do_some(now, chore, left, 0.0);
+            return Ok(());
+        }
+        let pixels = |w: &Self, frame: FrameId| {
+            let [wide, high] = w.jobs[frame.0 as usize - 1].view.size;
+            f64::from(wide) * f64::from(high)
+        };
+        let [out, client] = self.cluster.costs.deliver;
+        match chore {
+            Chore::Finish(frame) => {
+                let ns = out * pixels(self, frame);
+                self.do_some(now, Chore::Send(frame), ns, self.cluster.costs.master.woken);
+                self.finished(frame, took, watch)?;
+            }
+            Chore::Send(frame) if self.machine.is_some() => {
+                self.do_some(now, Chore::Receive, client * pixels(self, frame), 0.0);
+            }
+            Chore::Send(_) | Chore::Receive => {}
+        }
+        Ok(())
+    }
+
+    /// A frame is hashed and encoded.
+    fn finished(
+        &mut self,
+        frame: FrameId,
+        took: &mut Took,
+        watch: &mut dyn Stopwatch,
+    ) -> Result<(), Unknown> {
+        let now = self.now();
+        self.outcome.frames[frame.0 as usize - 1].delivered = now;
+        self.finished += 1;
+        if self.finished == 1 {
+            self.watched = Some(now);
+            let (driver, streams) = (self.driver.work, self.streams.work);
+            self.outcome.first = [driver, streams, self.finisher.work, self.worker_work];
+        }
+        // Frames may end in another order; those before are delivered all the same.
+        let steady = Outcome::steady(self.jobs.len(), self.cluster.in_flight);
+        if self.finished == steady + 1 {
+            self.close();
+        }
+        self.in_hand -= 1;
+        self.feed();
+        self.drive(took, watch)
     }
 
     /// Work of the driver, which looks at what lies before it when that is done: when it is.
@@ -534,23 +629,7 @@ impl<'a> World<'a> {
                 self.end_task(id, thread);
                 self.begin(id, Some(thread))?;
             }
-            Coming::Finished(frame) => {
-                self.outcome.frames[frame.0 as usize - 1].delivered = now;
-                self.finished += 1;
-                if self.finished == 1 {
-                    self.watched = Some(now);
-                    let (driver, streams) = (self.driver.work, self.streams.work);
-                    self.outcome.first = [driver, streams, self.finisher.work, self.worker_work];
-                }
-                // Frames may end in another order; those before are delivered all the same.
-                let steady = Outcome::steady(self.jobs.len(), self.cluster.in_flight);
-                if self.finished == steady + 1 {
-                    self.close();
-                }
-                self.in_hand -= 1;
-                self.feed();
-                self.drive(took, watch)?;
-            }
+            Coming::Chore(chore, left) => self.go_on(chore, left, took, watch)?,
         }
         Ok(())
     }
@@ -993,15 +1072,9 @@ impl<'a> World<'a> {
                     self.outcome.frames[i + 1].began = self.outcome.frames[i].done;
                 }
                 let [w, h] = self.jobs[i].view.size.map(f64::from);
-                let Costs { finish_pixel, mark_pixel, deliver: [out, client], .. } =
-                    self.cluster.costs;
+                let Costs { finish_pixel, mark_pixel, .. } = self.cluster.costs;
                 let ns = if self.machine.is_some() { mark_pixel } else { finish_pixel };
-                let finished = self.master(|w| &mut w.finisher, at, ns * w * h);
-                let sent = self.master(|w| &mut w.streams, finished, out * w * h);
-                if let Some(machine) = &mut self.machine {
-                    machine.run(sent, client * w * h);
-                }
-                self.later(finished, Coming::Finished(frame));
+                self.do_some(at, Chore::Finish(frame), ns * w * h, self.cluster.costs.master.woken);
             }
             Action::FrameFailed { frame, reason } => {
                 return Err(Unknown::Failed { frame: frame.0 as usize - 1, reason });

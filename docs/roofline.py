@@ -24,11 +24,11 @@ HERTZ = 2000
 # The first that a function's chain of callers has in it; what is left is not of a frame's stages.
 STAGES = [
     ("toss", r"\btoss\b|open_brick|near_all|move_inside|FlatStage.*::toss"),
-    ("fold", r"\bfold_shorts|\bfold_longs|Tiered.*::fold|\bDown\b|level::.*touched"),
-    ("close", r"\bclose|\btake\b|take_grey|\bput\b"),
+    ("fold", r"tiers\.\..*fold|tiers::.*fold|\bweigh\b|\bdown\b|\btouched$|\btouched <"),
+    ("close", r"\bclose|take_folded|touched::wide"),
     ("light", r"payloads|light_all"),
     ("add", r"splat_all|splat_apart|splat_deep|add_flat|add_apart"),
-    ("splat", r"\bsplat\b|splat::records|\btouch\b|render_records"),
+    ("look again, place sections", r"\bsplat\b|splat::records|\btouch\b|render_records"),
     ("project", r"Seen|\btight\b|overlaps|View::project|front_to_back|slabcast::local|\bcorner\b|render_into|each_pixel|Part::end"),
 ]
 
@@ -127,7 +127,7 @@ def main():
           f"{ghz:.2f} GHz; {total} samples, of which {of_frame} in the stages of frames\n")
     print("| stage | ms a frame | share | units a frame | ns a unit | cycles a unit |\n|---|--:|--:|---|--:|--:|")
     splatted = ("voxels splatted", bench["splatted"])
-    units = {"toss": ("voxels tossed", bench["tossed"]), "add": splatted, "splat": splatted, "light": splatted}
+    units = {"toss": ("voxels tossed", bench["tossed"]), "add": splatted, "look again, place sections": splatted, "light": splatted}
     for stage, _ in STAGES:
         ms = stages[stage] * 1e3 / HERTZ / frames
         unit, n = units.get(stage, ("", 0))

@@ -250,22 +250,10 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
     fn take(&mut self, some: &Chunk<'_, DeepVoxel>, k: i32, open: &OpenMask) -> usize {
         let most = self.part.frame.sections.most() as i32;
         let cull = self.part.frame.scene.quality.cull;
-        let mut n = 0;
-        match some {
-            Chunk::Here(some) => {
-                for v in *some {
-                    self.put(n, v, most);
-                    n += usize::from(!cull || open.is_near(v.cell.into()));
-                }
-            }
-            Chunk::Before(some) => {
-                for (v, first) in *some {
-                    self.put(n, v, most - (k - first));
-                    n += usize::from(!cull || open.is_near(v.cell.into()));
-                }
-            }
-        }
-        n
+        some.keep(k, |n, v, gone| {
+            self.put(n, v, most - gone);
+            !cull || open.is_near(v.cell.into())
+        })
     }
 }
 

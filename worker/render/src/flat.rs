@@ -74,21 +74,10 @@ impl Batch {
     ) -> usize {
         let cull = part.frame.scene.quality.cull;
         let Batch { voxels, gone, samples, normals, light } = self;
-        let mut n = 0;
-        match some {
-            Chunk::Here(some) => {
-                for v in *some {
-                    voxels[n] = *v;
-                    n += usize::from(!cull | open.is_near(v.cell()));
-                }
-            }
-            Chunk::Before(some) => {
-                for (v, first) in *some {
-                    (voxels[n], gone[n]) = (*v, k.abs_diff(*first));
-                    n += usize::from(!cull | open.is_near(v.cell()));
-                }
-            }
-        }
+        let n = some.keep(k, |n, v, of| {
+            (voxels[n], gone[n]) = (*v, of as u32);
+            !cull | open.is_near(v.cell())
+        });
         for (i, v) in voxels[..n].iter().enumerate() {
             (samples[i], normals[i]) = (v.sample, v.normal());
             note(v);

@@ -123,22 +123,10 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
     fn take(&mut self, some: &Chunk<'_, Splat>, k: i32, open: &OpenMask) -> usize {
         let most = self.part.frame.sections.most() as i32;
         let cull = self.part.frame.scene.quality.cull;
-        let mut n = 0;
-        match some {
-            Chunk::Here(some) => {
-                for v in *some {
-                    self.put(n, v, most);
-                    n += usize::from(!cull | open.is_near(v.cell()));
-                }
-            }
-            Chunk::Before(some) => {
-                for (v, first) in *some {
-                    self.put(n, v, most - (k - first));
-                    n += usize::from(!cull | open.is_near(v.cell()));
-                }
-            }
-        }
-        n
+        some.keep(k, |n, v, gone| {
+            self.put(n, v, most - gone);
+            !cull | open.is_near(v.cell())
+        })
     }
 
     /// Takes over `v`, which has `left` sheets left, as voxel `i` of the batch.

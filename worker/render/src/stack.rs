@@ -199,6 +199,26 @@ impl<V> Chunk<'_, V> {
             Chunk::Before(some) => some.len(),
         }
     }
+
+    /// Has each taken over as the `n`th of those that are kept so far, with as many of its sheets gone at sheet `k`,
+    /// unless it is told not to keep it; says how many are kept.
+    #[inline(always)]
+    pub(crate) fn keep(&self, k: i32, mut take: impl FnMut(usize, &V, i32) -> bool) -> usize {
+        let mut n = 0;
+        match self {
+            Chunk::Here(some) => {
+                for v in *some {
+                    n += usize::from(take(n, v, 0));
+                }
+            }
+            Chunk::Before(some) => {
+                for (v, first) in *some {
+                    n += usize::from(take(n, v, k - first));
+                }
+            }
+        }
+        n
+    }
 }
 
 /// Walks through the sheets of `part`'s slab.

@@ -73,7 +73,8 @@ enum Chore {
     Receive,
 }
 
-/// How long of a chore is done in one go: a piece of 64 KiB takes as long to send.
+/// How long of a chore is done in one go, in ns: three pieces of 64 KiB to send or to receive (TRANSPORT.md, answer 1). It is
+/// short beside a tile, and a picture of 1024x1024 takes some hundred such turns of the simulation.
 const TURN: f64 = 50_000.0;
 
 /// What a worker was lent.
@@ -419,10 +420,16 @@ impl<'a> World<'a> {
         self.machine.as_mut().map_or(alone, |m| m.run(at, took).max(alone))
     }
 
+    /// Pixels of a frame's picture.
+    fn pixels(&self, frame: FrameId) -> f64 {
+        let [wide, high] = self.jobs[frame.0 as usize - 1].view.size;
+        f64::from(wide) * f64::from(high)
+    }
+
     /// Does some of a chore of which so many nanoseconds are left. Nobody has time that is still to come set aside for
     /// him: whatever comes first is done first.
     fn do_some(&mut self, at: Nanos, chore: Chore, left: f64, woken: f64) {
-        // A thread finishes one picture after the other; where it has no core for itself, it is told apart by turns.
+        // A thread finishes one picture after the other; only where it has no core for itself others come between.
         let whole = matches!(chore, Chore::Finish(_)) && self.machine.is_none();
         let ns = if whole { left } else { left.min(TURN) };
         let done = match chore {
@@ -446,19 +453,15 @@ impl<'a> World<'a> {
             self.do_some(now, chore, left, 0.0);
             return Ok(());
         }
-        let pixels = |w: &Self, frame: FrameId| {
-            let [wide, high] = w.jobs[frame.0 as usize - 1].view.size;
-            f64::from(wide) * f64::from(high)
-        };
         let [out, client] = self.cluster.costs.deliver;
         match chore {
             Chore::Finish(frame) => {
-                let ns = out * pixels(self, frame);
+                let ns = out * self.pixels(frame);
                 self.do_some(now, Chore::Send(frame), ns, self.cluster.costs.master.woken);
                 self.finished(frame, took, watch)?;
             }
             Chore::Send(frame) if self.machine.is_some() => {
-                self.do_some(now, Chore::Receive, client * pixels(self, frame), 0.0);
+                self.do_some(now, Chore::Receive, client * self.pixels(frame), 0.0);
             }
             Chore::Send(_) | Chore::Receive => {}
         }
@@ -1071,10 +1074,10 @@ impl<'a> World<'a> {
                 if i + 1 < self.queued {
                     self.outcome.frames[i + 1].began = self.outcome.frames[i].done;
                 }
-                let [w, h] = self.jobs[i].view.size.map(f64::from);
                 let Costs { finish_pixel, mark_pixel, .. } = self.cluster.costs;
                 let ns = if self.machine.is_some() { mark_pixel } else { finish_pixel };
-                self.do_some(at, Chore::Finish(frame), ns * w * h, self.cluster.costs.master.woken);
+                let (ns, woken) = (ns * self.pixels(frame), self.cluster.costs.master.woken);
+                self.do_some(at, Chore::Finish(frame), ns, woken);
             }
             Action::FrameFailed { frame, reason } => {
                 return Err(Unknown::Failed { frame: frame.0 as usize - 1, reason });

@@ -302,10 +302,11 @@ fn put_one(pixel: &mut [u32; 4], four: &[u32; 4]) {
     }
 }
 
-/// Whether places, which ascend, follow each other.
+/// Whether places, which ascend and are not none, follow each other.
 #[inline(always)]
 fn follow(at: &[u32]) -> bool {
-    at.len().checked_sub(1).is_some_and(|last| at[last].wrapping_sub(at[0]) == last as u32)
+    let last = at.len() - 1;
+    at[last] - at[0] == last as u32
 }
 
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]

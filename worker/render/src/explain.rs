@@ -221,8 +221,9 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
             }
         }
         if let Some(storeys) = &self.frame.storeys {
-            let row = |c: usize| rows.values().map(move |(row, wy)| (row[c], *wy));
-            sums = std::array::from_fn(|c| S::down(row(c), storeys.spread));
+            let weight = |wy: &S::Weight| wy.of_rows(storeys.spread);
+            let row = |c: usize| rows.values().map(move |(row, wy)| (row[c], weight(wy)));
+            sums = std::array::from_fn(|c| S::down(row(c)));
         }
         sums
     }

@@ -358,7 +358,10 @@ impl General<'_> {
                 continue;
             }
             let row = rect.y0 + y as i32;
-            let weight = |at| S::Weight::of(&f, 1, at, (row, row + 1), &mut weights[1]).1[0];
+            let weight = |at| {
+                let weight = S::Weight::of(&f, 1, at, (row, row + 1), &mut weights[1]).1[0];
+                weight.of_rows(storeys.spread)
+            };
             let (of, reaching) = &mut reaching[y];
             if of.replace(like) != Some(like) {
                 *reaching = frame.storeys_at(storeys, &f, row, weight);
@@ -368,7 +371,7 @@ impl General<'_> {
             while columns != 0 {
                 let x = columns.trailing_zeros() as usize;
                 columns &= columns - 1;
-                planes.set(k, [x, y], lofts.down(k, x, some, storeys.spread));
+                planes.set(k, [x, y], lofts.down(k, x, some));
             }
         }
     }

@@ -2,19 +2,21 @@
 //!
 //! Voxels get here as they do in [`crate::flat`] and [`crate::deep`]; they are added to tiers
 //! ([`crate::splat::tiers`]) and not to pixels. A sheet that closes makes the sums of those of its pixels that
-//! are open and that something was added to, its own and what the sheet behind has by then, eight beside each
-//! other; from there on it is closed as any other.
+//! are open and that something was added to, its own and what the sheet behind has by then, and puts those beside
+//! each other that have any extinction, with what they have of the sheet before; so they are closed.
 
 use crate::flat::{self, BATCH, Batch, Waiting, toss};
 use crate::footprint::{Footprint, Phases};
 use crate::mask::OpenMask;
 use crate::scene::{Flat, Frame};
 use crate::splat::records::{MOST, Recorded, Splat, Table};
-use crate::splat::tiers::{Folded, Shape, Tiered, Tiers, Weights};
+use crate::splat::tiers::{ByRow, Ends, FOUR, Folded, Shape, Tiered, Tiers, Weights};
 use crate::splat::toss::{Packing, TIER_BITS, TierOf, Tossing};
-use crate::splat::{Simd, Work};
-use crate::stack::{Chunk, Closes, Due, EDGE, Open, Queues, Rows, Stage, Store, slot, walk};
-use crate::storeys::{REACHING, ROWS, Storeys};
+use crate::splat::{Simd, Weight, Work};
+use crate::stack::{
+    Chunk, Closes, Due, EDGE, Open, Queues, Rows, Stage, Store, close_folded, slot, walk,
+};
+use crate::storeys::{ROWS, Storeys};
 use crate::tile::{Io, PART, Part, Pixels};
 use slabcast_common::message::Counters;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS};
@@ -25,6 +27,7 @@ struct Down<'a, W> {
     k: i32,
     base: i32,
     weights: &'a [W],
+    spread: f32,
     /// Of each row: the first tier, and how many there are: four, or a few more.
     reach: [[u8; 2]; EDGE],
     /// Rows that more than four reach.
@@ -33,38 +36,33 @@ struct Down<'a, W> {
     /// By tier, the first row of pixels that it reaches, and where the weight of the part's first would lie.
     first: [i32; ROWS],
     from: [i32; ROWS],
-    /// Rows whose weights are here, and these: of tiers between the first and the last with any, but of four at least.
+    /// What tiers weigh in rows that are known.
     known: u64,
-    heavy: [[u8; 2]; EDGE],
-    rows: [[W; REACHING]; EDGE],
+    by_row: ByRow<W>,
 }
 
 /// Farther from a part than any of its tiers.
 const FAR: i32 = 1 << 20;
 
-impl<W: Copy + Default + PartialEq> Default for Down<'_, W> {
+impl<W: Weight> Default for Down<'_, W> {
     fn default() -> Self {
         Down {
             k: i32::MIN,
             base: 0,
             weights: &[],
+            spread: 1.0,
             reach: [[0; 2]; EDGE],
             more: 0,
             len: 0,
             first: [0; ROWS],
             from: [0; ROWS],
             known: 0,
-            heavy: [[0; 2]; EDGE],
-            rows: [[W::default(); REACHING]; EDGE],
+            by_row: ByRow::default(),
         }
     }
 }
 
-/// Tiers that reach a row of pixels at least, some with no weight: as many as do if a kernel reaches two steps of the
-/// lattice to either side.
-const FOUR: usize = 4;
-
-impl<'a, W: Copy + Default + PartialEq> Down<'a, W> {
+impl<'a, W: Weight> Down<'a, W> {
     /// Of sheet `k` with this footprint, whose weights down are `weights`.
     #[inline(always)]
     fn fill(
@@ -78,7 +76,7 @@ impl<'a, W: Copy + Default + PartialEq> Down<'a, W> {
         let phases = footprint.phases(1).expect("a table");
         let (view, rect) = (&part.frame.view, &part.rect);
         let base = storeys.base(view, rect, footprint.scale);
-        (self.k, self.base, self.weights) = (k, base, weights);
+        (self.k, self.base, self.weights, self.spread) = (k, base, weights, storeys.spread);
         (self.known, self.more) = (0, 0);
         // Far away for storeys that there are none of.
         for tier in 0..tiers {
@@ -114,38 +112,23 @@ impl<'a, W: Copy + Default + PartialEq> Down<'a, W> {
         }
     }
 
-    /// The first of the tiers that reach row `y` with any weight, and what they weigh.
+    /// What tiers weigh in some rows at least.
     #[inline(always)]
-    fn row(&mut self, y: usize) -> (usize, &[W]) {
-        if self.known >> y & 1 == 0 {
-            self.weigh(y);
+    fn know(&mut self, rows: u64) {
+        let mut left = rows & !self.known;
+        self.known |= rows;
+        while left != 0 {
+            let y = left.trailing_zeros() as usize;
+            left &= left - 1;
+            let Down { weights, spread, reach, len, first, from, by_row, .. } = self;
+            let at = y as i32;
+            by_row.set(y, reach[y % EDGE].map(usize::from), |tier| {
+                let tier = tier % ROWS;
+                let reaches = first[tier] <= at && at < first[tier] + *len;
+                let weight = || weights[(from[tier] + at) as usize].of_rows(*spread);
+                if reaches { weight() } else { W::default() }
+            });
         }
-        let [begin, n] = self.heavy[y % EDGE].map(usize::from);
-        (begin, &self.rows[y % EDGE][..n.min(REACHING)])
-    }
-
-    /// Finds out what the tiers weigh that reach row `y`.
-    #[inline(always)]
-    fn weigh(&mut self, y: usize) {
-        self.known |= 1 << y;
-        let [begin, n] = self.reach[y % EDGE].map(usize::from);
-        let (mut from, mut to) = (0, n.min(REACHING));
-        let row = &mut self.rows[y % EDGE];
-        let at = y as i32;
-        for (i, w) in row[..to].iter_mut().enumerate() {
-            let tier = (begin + i) % ROWS;
-            let reaches = self.first[tier] <= at && at < self.first[tier] + self.len;
-            *w = if reaches { self.weights[(self.from[tier] + at) as usize] } else { W::default() };
-        }
-        // Tables are as long as the longest footprint is.
-        while to - from > FOUR && row[to - 1] == W::default() {
-            to -= 1;
-        }
-        while to - from > FOUR && row[from] == W::default() {
-            from += 1;
-        }
-        row.copy_within(from..to, 0);
-        self.heavy[y % EDGE] = [begin + from, to - from].map(|tier| tier as u8);
     }
 
     /// Columns that the tiers were touched at that reach each row.
@@ -416,32 +399,25 @@ impl<S: Tiered, const N: usize> Open<S> for LevelSheets<'_, S, N> {
             *self.closes.before().1 = [0; EDGE];
             return false;
         }
-        let mut closing = [0; EDGE];
-        self.folded.clear();
         let [here, behind] = [self.down(k), self.down(k + 1)];
-        let LevelSheets { simd, tiers, folded, storeys, downs, touched, .. } = self;
-        let tiers = &*tiers;
-        let touched = downs[here].touched(tiers.shape().rows, &touched[slots[0]]);
-        for (y, touched) in touched.into_iter().enumerate() {
-            let open = touched & open.row(y);
-            if open == 0 {
-                continue;
-            }
-            let rows = if here == behind {
-                let (first, row) = downs[here].row(y);
-                [(first, row); 2]
-            } else {
-                let both = downs.get_disjoint_mut([here, behind]).expect("two sheets");
-                both.map(|down| down.row(y))
-            };
-            let [(first, weights), (next, weights_next)] = rows;
-            let above = [
-                (tiers.begin(slots[0], first), weights),
-                (tiers.begin(slots[1], next), weights_next),
-            ];
-            closing[y] = S::fold(*simd, tiers, above, storeys.spread, open, folded);
+        let LevelSheets { simd, tiers, folded, closes, downs, touched, .. } = self;
+        let (simd, rows) = (*simd, tiers.shape().rows);
+        let (mut some, mut any) = (downs[here].touched(rows, &touched[slots[0]]), 0);
+        for (y, some) in some.iter_mut().enumerate() {
+            *some &= open.row(y);
+            any |= u64::from(*some != 0) << y;
         }
-        let shut = self.closes.close_folded(self.simd, self.folded, &closing, part, open, pixels);
+        downs[here].know(any);
+        downs[behind].know(any);
+        let (before, was) = closes.before();
+        let by_row = [here, behind].map(|which| &downs[which].by_row);
+        let (mut rows, mut shut) = (0, false);
+        while rows < EDGE {
+            let (before, was) = (&mut *before, &mut *was);
+            let ends = Ends { open: &some, slots, by_row, before, was, pixels: &pixels.all };
+            rows = S::fold(simd, tiers, ends, rows, folded);
+            shut |= close_folded::<S>(simd, folded, part, open, pixels);
+        }
         self.clear(slots[0]);
         shut
     }

@@ -119,13 +119,7 @@ impl<S: Accumulate> Lofts<S> {
 
     /// What these storeys, each with its weight, add up to in column `x` of sheet `k`.
     #[inline(always)]
-    pub(crate) fn down(
-        &self,
-        k: i32,
-        x: usize,
-        storeys: &[(i32, S::Weight)],
-        spread: f32,
-    ) -> [S; 4] {
+    pub(crate) fn down(&self, k: i32, x: usize, storeys: &[(i32, S::Weight)]) -> [S; 4] {
         let loft = &self.sheets[self.slot(k)];
         let row = |c: usize| {
             storeys.iter().filter_map(move |&(storey, wy)| {
@@ -133,7 +127,7 @@ impl<S: Accumulate> Lofts<S> {
                 loft.rows.get(row * PART + x).map(|sums| (sums[c], wy))
             })
         };
-        [0, 1, 2, 3].map(|c| S::down(row(c), spread))
+        [0, 1, 2, 3].map(|c| S::down(row(c)))
     }
 
     /// Empties sheet `k`.

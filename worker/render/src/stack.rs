@@ -10,7 +10,7 @@ use crate::splat::Simd;
 use crate::splat::close::close_rows;
 use crate::splat::records::{Line, Record, Recorded, STRIDE};
 use crate::splat::tiers::{Folded, Shape};
-use crate::splat::touched::{Places, Some16, column_and_row, put, take, take_folded};
+use crate::splat::touched::{Places, Some16, column_and_row, put, take, unpack};
 use crate::tile::{Io, PART, Part, Pixels, keep_last};
 use slabcast_common::message::Counters;
 use slabcast_common::view::Projection;
@@ -325,6 +325,23 @@ impl Sifting {
     }
 }
 
+/// Closes the pixels of a sheet that are beside each other.
+#[inline(always)]
+pub(crate) fn close_folded<S: Recorded>(
+    simd: Simd,
+    folded: &Folded<S>,
+    part: &Part<'_>,
+    open: &mut OpenMask,
+    pixels: &mut Pixels,
+) -> bool {
+    let mut some = Closing { simd, part, open, pixels, any_shut: false };
+    some.all::<S>(folded.places(), |i, _, _, row| {
+        let (sheets, opacities) = folded.sums(i);
+        unpack::<S>(simd, sheets, opacities, row);
+    });
+    some.any_shut
+}
+
 impl<S: Recorded> Closes<S> {
     /// Begins a part.
     #[inline(always)]
@@ -363,27 +380,6 @@ impl<S: Recorded> Closes<S> {
         let mut some = Closing { simd, part, open, pixels, any_shut: false };
         some.all::<S>(places, |_, places, pixels, row| {
             take::<S, N>(simd, (&mut *records, &mut *before), pixels, places, slot, row);
-        });
-        some.any_shut
-    }
-
-    /// Closes a sheet whose sums are beside each other, at the pixels that they are those of.
-    #[inline(always)]
-    pub(crate) fn close_folded(
-        &mut self,
-        simd: Simd,
-        folded: &Folded<S>,
-        closing: &Rows,
-        part: &Part<'_>,
-        open: &mut OpenMask,
-        pixels: &mut Pixels,
-    ) -> bool {
-        self.begin_sheet(closing, closing);
-        let Closes { before, places, .. } = self;
-        places.list(simd, closing);
-        let mut some = Closing { simd, part, open, pixels, any_shut: false };
-        some.all::<S>(places, |i, places, pixels, row| {
-            take_folded::<S>(simd, (folded.from(i), &mut *before), pixels, places, row);
         });
         some.any_shut
     }

@@ -117,7 +117,7 @@ pub(crate) trait Floats: Lanes {
 }
 
 /// For each byte, in the `i`th of eight bytes, which bit is the `i`th that is set.
-const BESIDE: [u64; 256] = {
+pub(super) const BESIDE: [u64; 256] = {
     let mut all = [0; 256];
     let mut bits = 0;
     while bits < 256 {

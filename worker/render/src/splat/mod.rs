@@ -87,6 +87,9 @@ pub trait Weight: Copy + Default + PartialEq + std::fmt::Debug {
         clip: (i32, i32),
         buffer: &'b mut Vec<Self>,
     ) -> (i32, &'b [Self]);
+    /// What makes sums of rows that are kept over a length of `spread`: see `storeys`.
+    #[must_use]
+    fn of_rows(self, spread: f32) -> Self;
 }
 
 impl Weight for Tap {
@@ -100,6 +103,11 @@ impl Weight for Tap {
     ) -> (i32, &'b [Tap]) {
         footprint.weights(axis, pos, clip, buffer)
     }
+
+    #[inline(always)]
+    fn of_rows(self, spread: f32) -> Tap {
+        Tap::new(self.0 * spread)
+    }
 }
 
 impl Weight for i16 {
@@ -112,6 +120,12 @@ impl Weight for i16 {
         buffer: &'b mut Vec<i16>,
     ) -> (i32, &'b [i16]) {
         footprint.weights_fixed(axis, pos, clip, buffer)
+    }
+
+    /// Their rows are kept as sums are.
+    #[inline(always)]
+    fn of_rows(self, _: f32) -> i16 {
+        self
     }
 }
 
@@ -130,8 +144,8 @@ pub trait Accumulate: Sum {
     /// `self + row * wx`.
     #[must_use]
     fn plus(self, row: Self::Section, wx: Self::Weight) -> Self;
-    /// What a pixel has of rows of storeys, each times its weight, in their order: see `storeys`.
-    fn down(rows: impl Iterator<Item = (Self, Self::Weight)>, spread: f32) -> Self;
+    /// What a pixel has of rows of storeys, each times its weight [for rows](Weight::of_rows), in their order.
+    fn down(rows: impl Iterator<Item = (Self, Self::Weight)>) -> Self;
 }
 
 /// One channel of a section of 32-bit sums, not negative and not NaN, or that times weights.
@@ -189,9 +203,9 @@ impl Accumulate for i32 {
     }
 
     #[inline(always)]
-    fn down(rows: impl Iterator<Item = (i32, Tap)>, spread: f32) -> i32 {
+    fn down(rows: impl Iterator<Item = (i32, Tap)>) -> i32 {
         // Floats, since they have one order: four or five of them are off by less than any row is rounded.
-        nearest(rows.fold(0.0, |sum, (row, wy)| sum + row as f32 * (wy.0 * spread)))
+        nearest(rows.fold(0.0, |sum, (row, wy)| sum + row as f32 * wy.0))
     }
 }
 
@@ -236,8 +250,8 @@ impl Accumulate for Grey {
     }
 
     #[inline(always)]
-    fn down(rows: impl Iterator<Item = (Grey, Tap)>, spread: f32) -> Grey {
-        Grey(i32::down(rows.map(|(row, wy)| (row.0, wy)), spread))
+    fn down(rows: impl Iterator<Item = (Grey, Tap)>) -> Grey {
+        Grey(i32::down(rows.map(|(row, wy)| (row.0, wy))))
     }
 }
 
@@ -263,8 +277,8 @@ impl Accumulate for f32 {
     }
 
     #[inline(always)]
-    fn down(rows: impl Iterator<Item = (f32, Tap)>, spread: f32) -> f32 {
-        rows.fold(0.0, |sum, (row, wy)| sum + row * (wy.0 * spread))
+    fn down(rows: impl Iterator<Item = (f32, Tap)>) -> f32 {
+        rows.fold(0.0, |sum, (row, wy)| sum + row * wy.0)
     }
 }
 
@@ -297,7 +311,7 @@ impl Accumulate for i16 {
     }
 
     #[inline(always)]
-    fn down(rows: impl Iterator<Item = (i16, i16)>, _: f32) -> i16 {
+    fn down(rows: impl Iterator<Item = (i16, i16)>) -> i16 {
         rows.fold(0, |sum: i16, (row, wy)| sum.saturating_add(times(row, wy)))
     }
 }

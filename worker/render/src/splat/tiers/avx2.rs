@@ -1,7 +1,8 @@
 //! Tiers with AVX2: a line of the cache is two registers.
 
-use super::wide::{Wide, compiled, lines_of};
-use super::{Above, Folded, SPARE, Tiers, Weights, a_line, firsts_of};
+use super::wide::{Wide, compiled};
+use super::{Ends, FOUR, Folded, Tiers, Weights};
+use crate::splat::lanes::BESIDE;
 use crate::splat::records::apart::{Apart, Each, Layers};
 use crate::splat::records::{Line, MOST, Recorded, Splat, Table};
 use crate::splat::{Accumulate, Tap};
@@ -64,31 +65,68 @@ fn around<T: Copy + Default, const LEN: usize>(
     }
 }
 
-/// Stores those of four records of 16 bytes that `some` has bits for from the `n`th on, the first half of each from
-/// a register, the second half from another. Says how many there are then.
-///
-/// # Safety
-/// There is room for four.
+/// A bit for each word of pixels that have so many.
+#[inline(always)]
+fn words<const WORDS: usize>(pixels: u32) -> u32 {
+    // Two of four, or four of two.
+    if WORDS == 2 {
+        let [pairs, odd] = [pixels & 3, pixels >> 2];
+        ((pairs & 1) | (pairs >> 1) << 2 | (odd & 1) << 4 | (odd >> 1) << 6) * 3
+    } else {
+        ((pixels & 1) | (pixels >> 1) << 4) * 15
+    }
+}
+
+/// All bits of those words.
 #[target_feature(enable = "avx2")]
 #[inline]
-unsafe fn store_fours(
-    room: *mut __m128i,
-    n: usize,
-    [here, behind]: [__m256i; 2],
-    some: u32,
-) -> usize {
-    let even = _mm256_unpacklo_epi64(here, behind);
-    let odd = _mm256_unpackhi_epi64(here, behind);
-    let [b0, b1, b2, b3] = [0, 1, 2, 3].map(|i| (some >> i & 1) as usize);
-    let n = [n, n + b0, n + b0 + b1, n + b0 + b1 + b2, n + b0 + b1 + b2 + b3];
+fn marks(words: u32) -> __m256i {
+    let each = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
+    _mm256_cmpeq_epi32(_mm256_and_si256(_mm256_set1_epi32(words as i32), each), each)
+}
+
+/// [`Wide::exchange`], by words.
+#[target_feature(enable = "avx2")]
+#[inline]
+unsafe fn exchange(to: *mut __m256i, which: u32, now: __m256i) -> __m256i {
     // SAFETY: the caller's.
     unsafe {
-        _mm_storeu_si128(room.add(n[0]), _mm256_castsi256_si128(even));
-        _mm_storeu_si128(room.add(n[1]), _mm256_castsi256_si128(odd));
-        _mm_storeu_si128(room.add(n[2]), _mm256_extracti128_si256::<1>(even));
-        _mm_storeu_si128(room.add(n[3]), _mm256_extracti128_si256::<1>(odd));
+        let old = _mm256_loadu_si256(to);
+        _mm256_storeu_si256(to, now);
+        _mm256_and_si256(old, marks(which))
     }
-    n[4]
+}
+
+/// [`Wide::store_beside`], by words.
+#[target_feature(enable = "avx2")]
+#[inline]
+unsafe fn store_beside(to: *mut __m256i, which: u32, sums: __m256i) {
+    let order = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(BESIDE[which as usize % 256] as i64));
+    // SAFETY: the caller's.
+    unsafe { _mm256_storeu_si256(to, _mm256_permutevar8x32_epi32(sums, order)) };
+}
+
+/// [`Wide::store_places`] of so many pixels.
+///
+/// # Safety
+/// There are as many fours, and as much room.
+#[inline(always)]
+unsafe fn store_places<const PIXELS: usize>(
+    which: u32,
+    fours: *const [u32; 4],
+    opacities: *mut f32,
+    at: u32,
+    places: *mut u32,
+) {
+    let mut n = 0;
+    for i in 0..PIXELS {
+        // SAFETY: the caller's.
+        unsafe {
+            *opacities.add(n) = f32::from_bits((*fours.add(i))[0]);
+            *places.add(n) = at + i as u32;
+        }
+        n += (which >> i & 1) as usize;
+    }
 }
 
 impl Wide<i16> for Shorts {
@@ -163,55 +201,81 @@ impl Wide<i16> for Shorts {
         }
     }
 
+    type Sums = __m256i;
+
+    type Down = __m256i;
+
     #[target_feature(enable = "avx2")]
-    unsafe fn fold<const N: usize>(
-        tiers: &Tiers<'_, i16, N>,
-        above: [Above<'_, i16>; 2],
-        _: f32,
-        open: u64,
-        to: &mut Folded<i16>,
-    ) -> u64 {
-        let (first, a_tier) = (lines_of(tiers, &above).cast::<__m256i>(), 2 * tiers.shape.wide);
-        let [(_, here), (_, behind)] = above;
-        let four = here.first_chunk::<4>().zip(behind.first_chunk::<4>());
-        let four = four.filter(|_| here.len().max(behind.len()) == 4).map(|(here, behind)| {
-            let all = |weights: &[i16; 4]| weights.map(|w| _mm256_set1_epi16(w));
-            [all(here), all(behind)]
-        });
-        let zero = _mm256_setzero_si256();
-        let (mut filled, mut n) = (0, to.n);
-        let room = &mut to.records[..n + open.count_ones() as usize + SPARE];
-        let room: *mut __m128i = room.as_mut_ptr().cast();
-        let mut left = firsts_of(open, 4);
-        while left != 0 {
-            let x = left.trailing_zeros() as usize;
-            left &= left - 1;
-            let mut sums = [zero; 2];
-            for sheet in 0..2 {
-                let (begin, weights) = above[sheet];
-                let mut at = 2 * begin as usize + x / 4;
-                let mut add = |wy: __m256i| {
-                    // SAFETY: four pixels of 64 in a tier that is there are a register.
-                    let row = unsafe { _mm256_load_si256(first.add(at)) };
-                    at += a_tier;
-                    sums[sheet] = _mm256_adds_epi16(sums[sheet], _mm256_mulhrs_epi16(row, wy));
-                };
-                match &four {
-                    // A loop of known length.
-                    Some(four) => four[sheet].iter().for_each(|&wy| add(wy)),
-                    None => weights.iter().for_each(|&wy| add(_mm256_set1_epi16(wy))),
-                }
-            }
-            // A sign for each pixel without extinction, which comes first.
-            let nothing = _mm256_slli_epi64::<48>(_mm256_cmpeq_epi16(sums[0], zero));
-            let nothing = _mm256_movemask_pd(_mm256_castsi256_pd(nothing)) as u32;
-            let some = (open >> x) as u32 & !nothing & 0xf;
-            // SAFETY: no more are kept than there are open pixels, and four are stored where the next one goes.
-            n = unsafe { store_fours(room, n, sums, some) };
-            filled |= u64::from(some) << x;
+    #[inline]
+    unsafe fn weight(w: i16) -> __m256i {
+        _mm256_set1_epi16(w)
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn down(
+        lines: *const Line,
+        at: usize,
+        a_tier: usize,
+        weights: &[__m256i; FOUR],
+    ) -> __m256i {
+        let mut sums = _mm256_setzero_si256();
+        for (i, w) in weights.iter().enumerate() {
+            // SAFETY: the caller's; lines are aligned.
+            let row = unsafe { _mm256_load_si256(lines.cast::<__m256i>().add(at + i * a_tier)) };
+            sums = _mm256_adds_epi16(sums, _mm256_mulhrs_epi16(row, *w));
         }
-        to.n = n;
-        filled
+        sums
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn down_all(lines: *const Line, at: usize, a_tier: usize, weights: &[i16]) -> __m256i {
+        let mut sums = _mm256_setzero_si256();
+        for (i, w) in weights.iter().enumerate() {
+            // SAFETY: the caller's; lines are aligned.
+            let row = unsafe { _mm256_load_si256(lines.cast::<__m256i>().add(at + i * a_tier)) };
+            sums = _mm256_adds_epi16(sums, _mm256_mulhrs_epi16(row, _mm256_set1_epi16(*w)));
+        }
+        sums
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn filled(sums: __m256i) -> u32 {
+        // A sign for each pixel without extinction, which comes first.
+        let nothing = _mm256_cmpeq_epi16(sums, _mm256_setzero_si256());
+        let nothing = _mm256_castsi256_pd(_mm256_slli_epi64::<48>(nothing));
+        !_mm256_movemask_pd(nothing) as u32
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn exchange(to: *mut [i16; 4], which: u32, now: __m256i) -> __m256i {
+        // SAFETY: the caller's.
+        unsafe { exchange(to.cast(), words::<2>(which), now) }
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn store_beside(to: *mut [i16; 4], which: u32, sums: __m256i) {
+        // SAFETY: the caller's.
+        unsafe { store_beside(to.cast(), words::<2>(which), sums) };
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn store_places(
+        which: u32,
+        fours: *const [u32; 4],
+        opacities: *mut f32,
+        at: u32,
+        places: *mut u32,
+    ) {
+        // SAFETY: the caller's.
+        unsafe {
+            store_places::<4>(which, fours, opacities, at, places);
+        }
     }
 }
 
@@ -284,77 +348,91 @@ where
         }
     }
 
+    type Sums = __m256i;
+
+    type Down = __m256;
+
     #[target_feature(enable = "avx2")]
-    unsafe fn fold<const N: usize>(
-        tiers: &Tiers<'_, S, N>,
-        above: [Above<'_, Tap>; 2],
-        spread: f32,
-        open: u64,
-        to: &mut Folded<S>,
-    ) -> u64 {
-        const { assert!(C == 2 || C == 4) };
-        let (first, a_tier) = (lines_of(tiers, &above).cast::<__m256i>(), 2 * tiers.shape.wide);
-        let [(_, here), (_, behind)] = above;
-        let four = here.first_chunk::<4>().zip(behind.first_chunk::<4>());
-        let four = four.filter(|_| here.len().max(behind.len()) == 4).map(|(here, behind)| {
-            let all = |weights: &[Tap; 4]| weights.map(|w| _mm256_set1_ps(w.0 * spread));
-            [all(here), all(behind)]
-        });
-        let (most, zero) = (_mm256_set1_ps(crate::splat::LARGEST), _mm256_setzero_si256());
-        let (mut filled, mut n) = (0, to.n);
-        let room = &mut to.records[..n + open.count_ones() as usize + SPARE];
-        let room: *mut [S::Pixel; 2] = room.as_mut_ptr();
-        let mut left = firsts_of(open, a_line::<S>() / 2);
-        while left != 0 {
-            let x = left.trailing_zeros() as usize;
-            left &= left - 1;
-            let mut whole = [zero; 2];
-            for sheet in 0..2 {
-                let (begin, weights) = above[sheet];
-                let mut at = 2 * begin as usize + x / (a_line::<S>() / 2);
-                let mut sums = _mm256_setzero_ps();
-                let mut add = |wy: __m256| {
-                    // SAFETY: a tier that is there has so many registers.
-                    let row = unsafe { _mm256_load_si256(first.add(at)) };
-                    at += a_tier;
-                    sums = _mm256_add_ps(sums, _mm256_mul_ps(_mm256_cvtepi32_ps(row), wy));
-                };
-                match &four {
-                    // A loop of known length.
-                    Some(four) => four[sheet].iter().for_each(|&wy| add(wy)),
-                    None => weights.iter().for_each(|wy| add(_mm256_set1_ps(wy.0 * spread))),
-                }
-                whole[sheet] = _mm256_cvtps_epi32(_mm256_min_ps(sums, most));
-            }
-            let nothing = _mm256_cmpeq_epi32(whole[0], zero);
-            let nothing = _mm256_movemask_ps(_mm256_castsi256_ps(nothing)) as u32;
-            let [here, behind] = whole;
-            // SAFETY: no more are kept than there are open pixels, and two or four are stored where the next one goes.
-            unsafe {
-                if C == 4 {
-                    let some = (open >> x) as u32 & (!nothing & 1 | (!nothing >> 4 & 1) << 1);
-                    _mm256_storeu_si256(
-                        room.add(n).cast(),
-                        _mm256_permute2x128_si256::<0x20>(here, behind),
-                    );
-                    n += (some & 1) as usize;
-                    _mm256_storeu_si256(
-                        room.add(n).cast(),
-                        _mm256_permute2x128_si256::<0x31>(here, behind),
-                    );
-                    n += (some >> 1) as usize;
-                    filled |= u64::from(some) << x;
-                } else {
-                    // Extinctions are every other number.
-                    let there = !nothing & 0x55;
-                    let there = (there | there >> 1) & 0x33;
-                    let some = (open >> x) as u32 & (there | there >> 2) & 0xf;
-                    n = store_fours(room.cast(), n, [here, behind], some);
-                    filled |= u64::from(some) << x;
-                }
-            }
+    #[inline]
+    unsafe fn weight(w: Tap) -> __m256 {
+        _mm256_set1_ps(w.0)
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn down(
+        lines: *const Line,
+        at: usize,
+        a_tier: usize,
+        weights: &[__m256; FOUR],
+    ) -> __m256i {
+        let mut sums = _mm256_setzero_ps();
+        for (i, w) in weights.iter().enumerate() {
+            // SAFETY: the caller's; lines are aligned.
+            let row = unsafe { _mm256_load_si256(lines.cast::<__m256i>().add(at + i * a_tier)) };
+            sums = _mm256_add_ps(sums, _mm256_mul_ps(_mm256_cvtepi32_ps(row), *w));
         }
-        to.n = n;
-        filled
+        _mm256_cvtps_epi32(_mm256_min_ps(sums, _mm256_set1_ps(crate::splat::LARGEST)))
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn down_all(lines: *const Line, at: usize, a_tier: usize, weights: &[Tap]) -> __m256i {
+        let mut sums = _mm256_setzero_ps();
+        for (i, w) in weights.iter().enumerate() {
+            // SAFETY: the caller's; lines are aligned.
+            let row = unsafe { _mm256_load_si256(lines.cast::<__m256i>().add(at + i * a_tier)) };
+            let row = _mm256_mul_ps(_mm256_cvtepi32_ps(row), _mm256_set1_ps(w.0));
+            sums = _mm256_add_ps(sums, row);
+        }
+        _mm256_cvtps_epi32(_mm256_min_ps(sums, _mm256_set1_ps(crate::splat::LARGEST)))
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn filled(sums: __m256i) -> u32 {
+        const { assert!(C == 2 || C == 4) };
+        let nothing = _mm256_cmpeq_epi32(sums, _mm256_setzero_si256());
+        let some = !_mm256_movemask_ps(_mm256_castsi256_ps(nothing)) as u32;
+        // Extinctions are every other number, or every fourth.
+        if C == 2 {
+            let pairs = some & 1 | (some >> 2 & 1) << 1;
+            pairs | (some >> 4 & 1) << 2 | (some >> 6 & 1) << 3
+        } else {
+            some & 1 | (some >> 4 & 1) << 1
+        }
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn exchange(to: *mut [i32; C], which: u32, now: __m256i) -> __m256i {
+        // SAFETY: the caller's.
+        unsafe { exchange(to.cast(), words::<C>(which), now) }
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn store_beside(to: *mut [i32; C], which: u32, sums: __m256i) {
+        // SAFETY: the caller's.
+        unsafe { store_beside(to.cast(), words::<C>(which), sums) };
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    unsafe fn store_places(
+        which: u32,
+        fours: *const [u32; 4],
+        opacities: *mut f32,
+        at: u32,
+        places: *mut u32,
+    ) {
+        // SAFETY: the caller's.
+        unsafe {
+            if C == 2 {
+                store_places::<4>(which, fours, opacities, at, places);
+            } else {
+                store_places::<2>(which, fours, opacities, at, places);
+            };
+        }
     }
 }

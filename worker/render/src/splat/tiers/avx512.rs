@@ -1,7 +1,7 @@
 //! Tiers with AVX-512: a line of the cache is a register.
 
-use super::wide::{Wide, compiled, lines_of};
-use super::{Above, Folded, Tiers, Weights, firsts};
+use super::wide::{Wide, compiled};
+use super::{Ends, FOUR, Folded, Tiers, Weights};
 use crate::splat::records::apart::{Apart, Each, Layers};
 use crate::splat::records::{Line, MOST, Recorded, Splat, Table};
 use crate::splat::{Accumulate, Tap};
@@ -90,67 +90,79 @@ impl Wide<i16> for Shorts {
         }
     }
 
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,popcnt")]
-    unsafe fn fold<const N: usize>(
-        tiers: &Tiers<'_, i16, N>,
-        above: [Above<'_, i16>; 2],
-        _: f32,
-        open: u64,
-        to: &mut Folded<i16>,
-    ) -> u64 {
-        let (lines, wide) = (lines_of(tiers, &above), tiers.shape.wide);
-        let order = [
-            _mm512_setr_epi64(0, 8, 1, 9, 2, 10, 3, 11),
-            _mm512_setr_epi64(4, 12, 5, 13, 6, 14, 7, 15),
-        ];
-        let extinction = _mm512_set1_epi64(0xffff);
-        let mut filled = 0;
-        let [(_, here), (_, behind)] = above;
-        let four = here.first_chunk::<4>().zip(behind.first_chunk::<4>());
-        let four = four.filter(|_| here.len().max(behind.len()) == 4).map(|(here, behind)| {
-            let all = |weights: &[i16; 4]| weights.map(|w| _mm512_set1_epi16(w));
-            [all(here), all(behind)]
-        });
-        let mut left = firsts::<i16>(open);
-        while left != 0 {
-            let eight = left.trailing_zeros() as usize / 8;
-            left &= left - 1;
-            let here = (open >> (8 * eight)) as u8;
-            let mut sums = [_mm512_setzero_si512(); 2];
-            for sheet in 0..2 {
-                let (begin, weights) = above[sheet];
-                let mut line = begin as usize + eight;
-                let mut add = |wy: __m512i| {
-                    // SAFETY: eight pixels of 64 in a tier that is there are a line.
-                    let row = unsafe { _mm512_load_si512(lines.add(line).cast()) };
-                    line += wide;
-                    let row = _mm512_mulhrs_epi16(row, wy);
-                    sums[sheet] = _mm512_adds_epi16(sums[sheet], row);
-                };
-                match &four {
-                    // A loop of known length.
-                    Some(four) => four[sheet].iter().for_each(|&wy| add(wy)),
-                    None => weights.iter().for_each(|&wy| add(_mm512_set1_epi16(wy))),
-                }
-            }
-            let some = _mm512_mask_test_epi64_mask(here, sums[0], extinction);
-            let sums = [
-                _mm512_maskz_compress_epi64(some, sums[0]),
-                _mm512_maskz_compress_epi64(some, sums[1]),
-            ];
-            let room = to.records[to.n..].first_chunk_mut::<8>().expect("room for eight");
-            let at: *mut __m512i = room.as_mut_ptr().cast();
-            for (i, order) in order.iter().enumerate() {
-                // SAFETY: eight records of 16 bytes are two registers.
-                unsafe {
-                    let both = _mm512_permutex2var_epi64(sums[0], *order, sums[1]);
-                    _mm512_storeu_si512(at.add(i), both);
-                }
-            }
-            to.n += some.count_ones() as usize;
-            filled |= u64::from(some) << (8 * eight);
+    type Sums = __m512i;
+
+    type Down = __m512i;
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    unsafe fn weight(w: i16) -> __m512i {
+        _mm512_set1_epi16(w)
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    unsafe fn down(
+        lines: *const Line,
+        at: usize,
+        a_tier: usize,
+        weights: &[__m512i; FOUR],
+    ) -> __m512i {
+        let mut sums = _mm512_setzero_si512();
+        for (i, w) in weights.iter().enumerate() {
+            // SAFETY: the caller's; lines are aligned.
+            let row = unsafe { _mm512_load_si512(lines.add(at + i * a_tier).cast()) };
+            sums = _mm512_adds_epi16(sums, _mm512_mulhrs_epi16(row, *w));
         }
-        filled
+        sums
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    unsafe fn down_all(lines: *const Line, at: usize, a_tier: usize, weights: &[i16]) -> __m512i {
+        let mut sums = _mm512_setzero_si512();
+        for (i, w) in weights.iter().enumerate() {
+            // SAFETY: the caller's; lines are aligned.
+            let row = unsafe { _mm512_load_si512(lines.add(at + i * a_tier).cast()) };
+            sums = _mm512_adds_epi16(sums, _mm512_mulhrs_epi16(row, _mm512_set1_epi16(*w)));
+        }
+        sums
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    unsafe fn filled(sums: __m512i) -> u32 {
+        // Extinction comes first.
+        _mm512_test_epi64_mask(sums, _mm512_set1_epi64(0xffff)).into()
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
+    #[inline]
+    unsafe fn exchange(to: *mut [i16; 4], which: u32, now: __m512i) -> __m512i {
+        // SAFETY: the caller's.
+        unsafe { exchange(to.cast(), halves::<2>(which), now) }
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
+    #[inline]
+    unsafe fn store_beside(to: *mut [i16; 4], which: u32, sums: __m512i) {
+        // SAFETY: the caller's.
+        unsafe {
+            _mm512_storeu_si512(to.cast(), _mm512_maskz_compress_epi64(halves::<2>(which), sums));
+        }
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
+    #[inline]
+    unsafe fn store_places(
+        which: u32,
+        fours: *const [u32; 4],
+        opacities: *mut f32,
+        at: u32,
+        places: *mut u32,
+    ) {
+        // SAFETY: the caller's.
+        unsafe { store_places::<2>(which, fours, opacities, at, places) }
     }
 }
 
@@ -221,81 +233,131 @@ where
         }
     }
 
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,popcnt,bmi2")]
-    unsafe fn fold<const N: usize>(
-        tiers: &Tiers<'_, S, N>,
-        above: [Above<'_, Tap>; 2],
-        spread: f32,
-        open: u64,
-        to: &mut Folded<S>,
-    ) -> u64 {
-        const { assert!(C == 2 || C == 4) };
-        let (lines, wide) = (lines_of(tiers, &above), tiers.shape.wide);
-        let order = if C == 2 {
-            [
-                _mm512_setr_epi64(0, 8, 1, 9, 2, 10, 3, 11),
-                _mm512_setr_epi64(4, 12, 5, 13, 6, 14, 7, 15),
-            ]
-        } else {
-            [
-                _mm512_setr_epi64(0, 1, 8, 9, 2, 3, 10, 11),
-                _mm512_setr_epi64(4, 5, 12, 13, 6, 7, 14, 15),
-            ]
-        };
-        // The pixels of a line, and its words that are extinctions.
-        let (pixels, words) = (16 / C, if C == 2 { 0x5555 } else { 0x1111 });
-        let mut filled = 0;
-        let [(_, here), (_, behind)] = above;
-        let four = here.first_chunk::<4>().zip(behind.first_chunk::<4>());
-        let four = four.filter(|_| here.len().max(behind.len()) == 4).map(|(here, behind)| {
-            let all = |weights: &[Tap; 4]| weights.map(|w| _mm512_set1_ps(w.0 * spread));
-            [all(here), all(behind)]
-        });
-        let most = _mm512_set1_ps(crate::splat::LARGEST);
-        let mut left = firsts::<S>(open);
-        while left != 0 {
-            let group = left.trailing_zeros() as usize / pixels;
-            left &= left - 1;
-            let here = open >> (pixels * group) & ((1 << pixels) - 1);
-            let mut whole = [_mm512_setzero_si512(); 2];
-            for sheet in 0..2 {
-                let (begin, weights) = above[sheet];
-                let mut sums = _mm512_setzero_ps();
-                let mut line = begin as usize + group;
-                let mut add = |wy: __m512| {
-                    // SAFETY: a tier that is there has so many lines.
-                    let row = unsafe { _mm512_load_si512(lines.add(line).cast()) };
-                    line += wide;
-                    let row = _mm512_mul_ps(_mm512_cvtepi32_ps(row), wy);
-                    sums = _mm512_add_ps(sums, row);
-                };
-                match &four {
-                    // A loop of known length.
-                    Some(four) => four[sheet].iter().for_each(|&wy| add(wy)),
-                    None => weights.iter().for_each(|wy| add(_mm512_set1_ps(wy.0 * spread))),
-                }
-                whole[sheet] = _mm512_cvtps_epi32(_mm512_min_ps(sums, most));
-            }
-            // A bit for each pixel's extinction, then one for each pixel, and one for each half of it.
-            let some = _mm512_mask_test_epi32_mask(words, whole[0], whole[0]);
-            let some = _pext_u32(some.into(), words.into()) & here as u32;
-            let halves = if C == 2 { some } else { _pdep_u32(some, 0x55) * 3 };
-            let whole = [
-                _mm512_maskz_compress_epi64(halves as u8, whole[0]),
-                _mm512_maskz_compress_epi64(halves as u8, whole[1]),
-            ];
-            let room = to.records[to.n..].first_chunk_mut::<8>().expect("room for eight");
-            let at: *mut __m512i = room.as_mut_ptr().cast();
-            for (i, order) in order.iter().enumerate() {
-                // SAFETY: eight records are two registers and more.
-                unsafe {
-                    let both = _mm512_permutex2var_epi64(whole[0], *order, whole[1]);
-                    _mm512_storeu_si512(at.add(i), both);
-                }
-            }
-            to.n += some.count_ones() as usize;
-            filled |= u64::from(some) << (pixels * group);
+    type Sums = __m512i;
+
+    type Down = __m512;
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    unsafe fn weight(w: Tap) -> __m512 {
+        _mm512_set1_ps(w.0)
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    unsafe fn down(
+        lines: *const Line,
+        at: usize,
+        a_tier: usize,
+        weights: &[__m512; FOUR],
+    ) -> __m512i {
+        let mut sums = _mm512_setzero_ps();
+        for (i, w) in weights.iter().enumerate() {
+            // SAFETY: the caller's; lines are aligned.
+            let row = unsafe { _mm512_load_si512(lines.add(at + i * a_tier).cast()) };
+            sums = _mm512_add_ps(sums, _mm512_mul_ps(_mm512_cvtepi32_ps(row), *w));
         }
-        filled
+        _mm512_cvtps_epi32(_mm512_min_ps(sums, _mm512_set1_ps(crate::splat::LARGEST)))
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    unsafe fn down_all(lines: *const Line, at: usize, a_tier: usize, weights: &[Tap]) -> __m512i {
+        let mut sums = _mm512_setzero_ps();
+        for (i, w) in weights.iter().enumerate() {
+            // SAFETY: the caller's; lines are aligned.
+            let row = unsafe { _mm512_load_si512(lines.add(at + i * a_tier).cast()) };
+            let row = _mm512_mul_ps(_mm512_cvtepi32_ps(row), _mm512_set1_ps(w.0));
+            sums = _mm512_add_ps(sums, row);
+        }
+        _mm512_cvtps_epi32(_mm512_min_ps(sums, _mm512_set1_ps(crate::splat::LARGEST)))
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
+    #[inline]
+    unsafe fn filled(sums: __m512i) -> u32 {
+        const { assert!(C == 2 || C == 4) };
+        // Extinction comes first.
+        let words = if C == 2 { 0x5555 } else { 0x1111 };
+        _pext_u32(_mm512_mask_test_epi32_mask(words, sums, sums).into(), words.into())
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
+    #[inline]
+    unsafe fn exchange(to: *mut [i32; C], which: u32, now: __m512i) -> __m512i {
+        // SAFETY: the caller's.
+        unsafe { exchange(to.cast(), halves::<C>(which), now) }
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
+    #[inline]
+    unsafe fn store_beside(to: *mut [i32; C], which: u32, sums: __m512i) {
+        // SAFETY: the caller's.
+        unsafe {
+            _mm512_storeu_si512(to.cast(), _mm512_maskz_compress_epi64(halves::<C>(which), sums));
+        }
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
+    #[inline]
+    unsafe fn store_places(
+        which: u32,
+        fours: *const [u32; 4],
+        opacities: *mut f32,
+        at: u32,
+        places: *mut u32,
+    ) {
+        // SAFETY: the caller's.
+        unsafe { store_places::<C>(which, fours, opacities, at, places) }
+    }
+}
+
+/// A bit for each eight bytes of pixels that have so many words.
+#[target_feature(enable = "bmi2")]
+#[inline]
+fn halves<const WORDS: usize>(pixels: u32) -> u8 {
+    if WORDS == 2 { pixels as u8 } else { (_pdep_u32(pixels, 0x55) * 3) as u8 }
+}
+
+/// [`Wide::exchange`], by eight bytes.
+#[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+#[inline]
+unsafe fn exchange(to: *mut i64, which: u8, now: __m512i) -> __m512i {
+    // SAFETY: the caller's.
+    unsafe {
+        let old = _mm512_maskz_loadu_epi64(which, to);
+        _mm512_storeu_si512(to.cast(), now);
+        old
+    }
+}
+
+/// [`Wide::store_places`] of as many pixels of so many words as a register has.
+#[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
+#[inline]
+unsafe fn store_places<const WORDS: usize>(
+    which: u32,
+    fours: *const [u32; 4],
+    opacities: *mut f32,
+    at: u32,
+    places: *mut u32,
+) {
+    let from =
+        _mm256_add_epi32(_mm256_set1_epi32(at as i32), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
+    // SAFETY: the caller's: eight or four of each.
+    unsafe {
+        let first = _mm512_loadu_si512(fours.cast());
+        if WORDS == 2 {
+            let of = _mm512_setr_epi32(0, 4, 8, 12, 16, 20, 24, 28, 0, 0, 0, 0, 0, 0, 0, 0);
+            let second = _mm512_loadu_si512(fours.add(4).cast());
+            let all = _mm512_castsi512_si256(_mm512_permutex2var_epi32(first, of, second));
+            let some = _mm256_maskz_compress_epi32(which as u8, all);
+            _mm256_storeu_si256(opacities.cast(), some);
+            _mm256_storeu_si256(places.cast(), _mm256_maskz_compress_epi32(which as u8, from));
+        } else {
+            let some = _mm512_maskz_compress_epi32(_pdep_u32(which, 0x1111) as u16, first);
+            _mm_storeu_si128(opacities.cast(), _mm512_castsi512_si128(some));
+            let from = _mm256_castsi256_si128(from);
+            _mm_storeu_si128(places.cast(), _mm_maskz_compress_epi32(which as u8, from));
+        }
     }
 }

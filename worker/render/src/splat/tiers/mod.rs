@@ -15,8 +15,9 @@ mod wide;
 
 use super::Level;
 use super::records::apart::{Apart, BATCH, Each, Layers};
-use super::records::{Line, MOST, Record, Recorded, Splat, Table};
-use super::{Accumulate, Grey, Simd};
+use super::records::{Line, MOST, Recorded, STRIDE, Splat, Table};
+use super::touched::Places;
+use super::{Accumulate, Grey, Simd, Weight};
 use crate::sheet::LANES;
 use crate::storeys::{REACHING, ROWS};
 use crate::tile::PART;
@@ -99,37 +100,112 @@ pub(crate) struct Weights<'a, S: Recorded> {
     pub(crate) deep: Table<'a, S::Depth>,
 }
 
-/// Tiers that reach some row of pixels in a sheet, beside each other: the line that the first one's first column in
-/// the part [is in](Tiers::begin), and what each weighs.
-pub(crate) type Above<'a, W> = (u32, &'a [W]);
+/// Rows of a part.
+const EDGE: usize = PART as usize;
 
-/// Sums of pixels that close, of their sheet and of the one behind, beside each other.
-pub(crate) struct Folded<S: Recorded> {
-    records: Box<[Record<S, 2>]>,
-    n: usize,
+/// The tiers that reach each row of pixels in a sheet, and what they weigh there.
+pub(crate) struct ByRow<W> {
+    /// The first of them, and how many there are: four at least.
+    reach: [[u8; 2]; EDGE],
+    weights: [[W; REACHING]; EDGE],
+    /// One more than the last of any row.
+    end: usize,
 }
 
-/// What is stored at once, more than is there at most.
-const SPARE: usize = 8;
+impl<W: Weight> Default for ByRow<W> {
+    fn default() -> Self {
+        ByRow { reach: [[0; 2]; EDGE], weights: [[W::default(); REACHING]; EDGE], end: 0 }
+    }
+}
+
+/// Tiers that reach a row of pixels at least, some with no weight: as many as do if a kernel reaches two steps of the
+/// lattice to either side.
+pub(crate) const FOUR: usize = 4;
+
+impl<W: Weight> ByRow<W> {
+    /// Has `n` tiers from `begin` on reach row `y`, by the weight of each: those before the first and behind the last
+    /// with any are left out, but for four.
+    #[inline(always)]
+    pub(crate) fn set(&mut self, y: usize, [begin, n]: [usize; 2], weight: impl Fn(usize) -> W) {
+        let (mut from, mut to) = (0, n.min(REACHING));
+        let row = &mut self.weights[y % EDGE];
+        for (i, w) in row[..to].iter_mut().enumerate() {
+            *w = weight(begin + i);
+        }
+        while to - from > FOUR && row[to - 1] == W::default() {
+            to -= 1;
+        }
+        while to - from > FOUR && row[from] == W::default() {
+            from += 1;
+        }
+        row.copy_within(from..to, 0);
+        self.end = self.end.max(begin + to);
+        self.reach[y % EDGE] = [begin + from, to - from].map(|tier| tier as u8);
+    }
+
+    /// The first of the tiers that reach row `y`, and what they weigh.
+    #[inline(always)]
+    fn row(&self, y: usize) -> (usize, &[W]) {
+        let [begin, n] = self.reach[y % EDGE].map(usize::from);
+        (begin, &self.weights[y % EDGE][..n.min(REACHING)])
+    }
+}
+
+/// A sheet that closes, and what is known of the one before.
+pub(crate) struct Ends<'a, S: Recorded> {
+    /// Pixels that are open and that something was added to.
+    pub(crate) open: &'a [u64; EDGE],
+    /// Of the sheet and of the one behind.
+    pub(crate) slots: [usize; 2],
+    pub(crate) by_row: [&'a ByRow<S::Weight>; 2],
+    /// Sums of the sheet before, in rows of [`STRIDE`]; then of this one.
+    pub(crate) before: &'a mut [S::Pixel],
+    /// Pixels that `before` is of: elsewhere there is nothing, whatever it says.
+    pub(crate) was: &'a mut [u64; EDGE],
+    /// As [`crate::tile::Pixels`] has them.
+    pub(crate) pixels: &'a [[u32; 4]],
+}
+
+/// Pixels that close, beside each other: where they are, what they have of the sheet before, of theirs and of the one
+/// behind, and how opaque they are.
+pub(crate) struct Folded<S: Recorded> {
+    places: Places,
+    sheets: Box<[[S::Pixel; MOST_CLOSING]; 3]>,
+    opacities: Box<[f32; MOST_CLOSING]>,
+}
+
+/// Pixels that are closed together, or up to a row more: these are what a first cache holds, and of the lanes behind the last
+/// one few are spent.
+const ENOUGH: usize = 512;
+
+/// As many, and as many as are stored at once behind the last.
+const MOST_CLOSING: usize = ENOUGH + EDGE + LANES;
 
 impl<S: Recorded> Default for Folded<S> {
     fn default() -> Self {
-        let n = (PART * PART) as usize + LANES + SPARE;
-        Folded { records: vec![Record::<S, 2>::default(); n].into(), n: 0 }
+        let sheets = boxed([S::Pixel::default(); MOST_CLOSING]);
+        Folded { places: Places::default(), sheets, opacities: boxed(0.0) }
     }
 }
 
+/// So many of the same.
+fn boxed<T: Copy, const N: usize>(one: T) -> Box<[T; N]> {
+    vec![one; N].into_boxed_slice().try_into().unwrap_or_else(|_| unreachable!("as many"))
+}
+
 impl<S: Recorded> Folded<S> {
-    /// Forgets all.
+    /// Where they are, row by row.
     #[inline(always)]
-    pub(crate) fn clear(&mut self) {
-        self.n = 0;
+    pub(crate) fn places(&self) -> &Places {
+        &self.places
     }
 
-    /// Those from the `i`th on, as many as are closed at once.
+    /// Sums and opacities of those from the `i`th on, as many as are closed at once.
     #[inline(always)]
-    pub(crate) fn from(&self, i: usize) -> &[Record<S, 2>; LANES] {
-        self.records[i..].first_chunk().expect("room behind the last")
+    pub(crate) fn sums(&self, i: usize) -> ([&[S::Pixel; LANES]; 3], &[f32; LANES]) {
+        let room = "room behind the last";
+        let sheets = self.sheets.each_ref().map(|sums| sums[i..].first_chunk().expect(room));
+        (sheets, self.opacities[i..].first_chunk().expect(room))
     }
 }
 
@@ -234,56 +310,74 @@ pub(crate) trait Tiered: Recorded {
         layers: &Layers<'_, Self, N>,
     );
 
-    /// Puts the sums that two sheets have in a row of pixels, by the tiers above them, behind those of `to`: of
-    /// pixels that `open` has bits for and the first sheet has any extinction in. Says which these are.
+    /// Makes the sums that a sheet and the one behind have in pixels of the tiers above them: in those that are open and
+    /// have any extinction in the sheet, in rows from `rows` on, until there are [`ENOUGH`]. Says where to go on.
+    ///
+    /// # Panics
+    /// If there are fewer sums or pixels than a part has.
     fn fold<const N: usize>(
         simd: Simd,
         tiers: &Tiers<'_, Self, N>,
-        above: [Above<'_, Self::Weight>; 2],
-        spread: f32,
-        open: u64,
+        ends: Ends<'_, Self>,
+        rows: usize,
         to: &mut Folded<Self>,
-    ) -> u64;
+    ) -> usize;
 }
 
 /// [`Tiered::fold`] plainly, of sums whose channels are `T`s.
 #[inline(always)]
 fn fold<S, T, const C: usize, const N: usize>(
     tiers: &Tiers<'_, S, N>,
-    above: [Above<'_, S::Weight>; 2],
-    spread: f32,
-    open: u64,
+    Ends { open, slots, by_row, before, was, pixels }: Ends<'_, S>,
+    rows: usize,
     to: &mut Folded<S>,
-) -> u64
+) -> usize
 where
     S: Recorded<Pixel = [T; C]>,
     T: Accumulate<Weight = S::Weight> + Copy + Default,
 {
-    let (mut left, mut filled) = (open, 0);
-    while left != 0 {
-        let x = left.trailing_zeros() as usize;
-        left &= left - 1;
-        let mut record = [[T::default(); C]; 2];
-        for (sums, (begin, weights)) in record.iter_mut().zip(above) {
-            let mut rows = [[(T::default(), S::Weight::default()); REACHING]; C];
-            for (row, &wy) in weights.iter().enumerate().take(REACHING) {
-                let pixel = tiers.pixels(begin + (row * tiers.shape.wide) as u32)[x];
-                for (rows, sum) in rows.iter_mut().zip(pixel) {
-                    rows[row] = (sum, wy);
+    let (mut y, mut n) = (rows, 0);
+    while y < EDGE && n < ENOUGH {
+        let (open, was) = (&open[y], &mut was[y]);
+        let (mut left, had) = (*open, std::mem::take(was));
+        while left != 0 {
+            let x = left.trailing_zeros() as usize;
+            left &= left - 1;
+            let mut sheets = [[T::default(); C]; 2];
+            for (sums, (slot, by_row)) in sheets.iter_mut().zip(slots.into_iter().zip(by_row)) {
+                let (first, weights) = by_row.row(y);
+                let begin = tiers.begin(slot, first);
+                let mut rows = [[(T::default(), S::Weight::default()); REACHING]; C];
+                for (row, &wy) in weights.iter().enumerate() {
+                    let pixel = tiers.pixels(begin + (row * tiers.shape.wide) as u32)[x];
+                    for (rows, sum) in rows.iter_mut().zip(pixel) {
+                        rows[row] = (sum, wy);
+                    }
+                }
+                for (sum, rows) in sums.iter_mut().zip(&rows) {
+                    *sum = T::down(rows[..weights.len()].iter().copied());
                 }
             }
-            for (sum, rows) in sums.iter_mut().zip(&rows) {
-                *sum = T::down(rows[..weights.len().min(REACHING)].iter().copied(), spread);
+            // Extinction comes first.
+            if S::raw(&sheets[0])[0] == 0 {
+                continue;
             }
+            let (at, [here, behind]) = (y * STRIDE + x, sheets);
+            let old = std::mem::replace(&mut before[at], here);
+            let old = if had >> x & 1 == 1 { old } else { [T::default(); C] };
+            for (to, sums) in to.sheets.iter_mut().zip([old, here, behind]) {
+                to[n] = sums;
+            }
+            to.opacities[n] = f32::from_bits(pixels[at][0]);
+            // SAFETY: it is a place of the part.
+            unsafe { to.places.room()[n] = at as u32 };
+            n += 1;
+            *was |= 1 << x;
         }
-        // Extinction comes first.
-        if S::raw(&record[0])[0] != 0 {
-            to.records[to.n] = record;
-            to.n += 1;
-            filled |= 1 << x;
-        }
+        y += 1;
     }
-    filled
+    to.places.set_len(n);
+    y
 }
 
 /// [`Tiered::add_flat`] plainly.
@@ -373,14 +467,13 @@ macro_rules! tiered {
             fn fold<const N: usize>(
                 simd: Simd,
                 tiers: &Tiers<'_, Self, N>,
-                above: [Above<'_, Self::Weight>; 2],
-                spread: f32,
-                open: u64,
+                ends: Ends<'_, Self>,
+                rows: usize,
                 to: &mut Folded<Self>,
-            ) -> u64 {
+            ) -> usize {
                 at_level!(
                     simd,
-                    (tiers, above, spread, open, to),
+                    (tiers, ends, rows, to),
                     fold::<Self, $channel, $c, N>,
                     avx2::fold::<avx2::$wide $(<$n>)?, Self, N>,
                     avx512::fold::<avx512::$wide $(<$n>)?, Self, N>,
@@ -449,23 +542,51 @@ mod tests {
         }
         let layers =
             Layers { across: [[across; N]; 2], deep: weights.deep, slot: 1 % N, alike: false };
-        let (begin, open) =
-            (next((rows - reaching) as u32) as usize, u64::from(next(1 << 31)) << 9 | 1);
-        let wy: Vec<S::Weight> = (0..reaching).map(|_| weight(next(1000))).collect();
+        // Some rows of pixels, one after the other reached by tiers farther down, sheet by sheet.
+        let mut by_row = [ByRow::default(), ByRow::default()];
+        for y in 0..EDGE {
+            let begin = y * (rows - reaching - FOUR) / EDGE;
+            for (sheet, by_row) in by_row.iter_mut().enumerate() {
+                let reaching = reaching + next(2) as usize * sheet;
+                let weights: Vec<S::Weight> = (0..reaching).map(|_| weight(next(1000))).collect();
+                by_row.set(y, [begin, reaching.max(FOUR)], |tier| {
+                    weights.get(tier - begin).copied().unwrap_or_default()
+                });
+            }
+        }
+        let mut bits = || {
+            let mut row = || u64::from(next(u32::MAX)) << 32 | u64::from(next(u32::MAX));
+            match row() % 4 {
+                0 => 0,
+                1 => row() & row() & row(),
+                2 => row() | row(),
+                _ => u64::MAX,
+            }
+        };
+        let sheets: Vec<[u64; EDGE]> = (0..4).map(|_| [(); EDGE].map(|()| bits())).collect();
+        let fours: Vec<[u32; 4]> =
+            (0..EDGE * STRIDE).map(|i| [(i as f32).to_bits(), 1, 2, 3]).collect();
         let run = |simd| {
             let mut lines = vec![Line::ZERO; shape.lines(N)];
             let mut tiers = Tiers::<S, N>::new(&mut lines, shape);
             S::add_flat(simd, &mut tiers, (&voxels, &payloads), 2 % N, &weights);
             S::add_apart(simd, &mut tiers, (&apart, &payloads), &places, &layers);
-            let mut folded = Folded::default();
+            let (mut before, mut was) = (vec![S::Pixel::default(); EDGE * STRIDE], [0; EDGE]);
             let mut all = Vec::new();
-            for open in [open, !open, u64::MAX, 0] {
-                let above = [0, 1].map(|slot| (tiers.begin(slot, begin), &wy[..]));
-                all.push(S::fold(simd, &tiers, above, 1.25, open, &mut folded));
-                assert_eq!(
-                    all.iter().map(|filled| filled.count_ones()).sum::<u32>(),
-                    folded.n as u32
-                );
+            for (k, open) in sheets.iter().enumerate() {
+                let (slots, mut to, mut y) = ([k, k + 1].map(|k| k % N), Folded::default(), 0);
+                let mut n = 0;
+                while y < EDGE {
+                    let (by_row, before) = (by_row.each_ref(), &mut before[..]);
+                    let ends = Ends { open, slots, by_row, before, was: &mut was, pixels: &fours };
+                    y = S::fold(simd, &tiers, ends, y, &mut to);
+                    n += to.places.len();
+                    all.extend(to.places.all().iter().enumerate().map(|(i, &at)| {
+                        let sums = to.sheets.each_ref().map(|sums| sums[i]);
+                        (at, sums, before[at as usize], to.opacities[i])
+                    }));
+                }
+                assert_eq!(was.iter().map(|row| row.count_ones() as usize).sum::<usize>(), n);
             }
             let margin = shape.margin;
             let seen: Vec<Vec<S::Pixel>> = (0..N * rows)
@@ -473,11 +594,15 @@ mod tests {
                     tiers.tier_mut(i / rows, i % rows)[margin..margin + PART as usize].to_vec()
                 })
                 .collect();
-            (seen, all, folded.records[..folded.n].to_vec())
+            (seen, all, was)
         };
         let want = run(Simd::plain());
         let nothing = S::Pixel::default();
-        prop_assert!(want.0.iter().flatten().any(|sums| *sums != nothing) && want.1[3] == 0);
+        prop_assert!(want.0.iter().flatten().any(|sums| *sums != nothing));
+        for (at, [_, here, _], before, a) in &want.1 {
+            prop_assert!(S::raw(here)[0] != 0 && *a == *at as f32);
+            prop_assert!(*at as usize % STRIDE < EDGE && here == before);
+        }
         for simd in Simd::all() {
             prop_assert!(run(simd) == want, "{}", simd.name());
         }

@@ -3,9 +3,10 @@
 //! A footprint reaches a few registers of its tier. Its weights are spread out over the channels of columns, as many
 //! registers at a time as a chunk of weights fills, and each section is added to those by them.
 
-use super::{Above, Folded, PART, Shape, Tiers, Weights, a_line, groups};
+use super::{EDGE, ENOUGH, Ends, FOUR, Folded, Shape, Tiers, Weights, a_line, firsts_of, groups};
+use crate::sheet::LANES;
 use crate::splat::records::apart::{Apart, BATCH, Each, Layers};
-use crate::splat::records::{Line, MOST, Recorded, Splat, Table};
+use crate::splat::records::{Line, MOST, Recorded, STRIDE, Splat, Table};
 
 /// Registers in which sums of one kind are added to tiers.
 ///
@@ -44,14 +45,48 @@ pub(super) trait Wide<S: Recorded> {
         w: &[Self::Register; GROUPS],
     );
 
-    /// [`super::Tiered::fold`].
-    unsafe fn fold<const N: usize>(
-        tiers: &Tiers<'_, S, N>,
-        above: [Above<'_, S::Weight>; 2],
-        spread: f32,
-        open: u64,
-        to: &mut Folded<S>,
-    ) -> u64;
+    /// Sums of the pixels of a register.
+    type Sums: Copy;
+
+    /// A weight down the picture, for all channels.
+    type Down: Copy;
+
+    /// `w` for all channels.
+    unsafe fn weight(w: S::Weight) -> Self::Down;
+
+    /// What the `at`th register of `lines` and those of the tiers below add up to with these weights.
+    unsafe fn down(
+        lines: *const Line,
+        at: usize,
+        a_tier: usize,
+        weights: &[Self::Down; FOUR],
+    ) -> Self::Sums;
+
+    /// The same of any number.
+    unsafe fn down_all(
+        lines: *const Line,
+        at: usize,
+        a_tier: usize,
+        weights: &[S::Weight],
+    ) -> Self::Sums;
+
+    /// A bit for each pixel that has any extinction.
+    unsafe fn filled(sums: Self::Sums) -> u32;
+
+    /// Puts sums instead of those of the pixels of `to`; these, of pixels that `which` has bits for.
+    unsafe fn exchange(to: *mut S::Pixel, which: u32, now: Self::Sums) -> Self::Sums;
+
+    /// Stores pixels beside each other.
+    unsafe fn store_beside(to: *mut S::Pixel, which: u32, sums: Self::Sums);
+
+    /// The first numbers of fours, and whole numbers from `at` on, beside each other.
+    unsafe fn store_places(
+        which: u32,
+        fours: *const [u32; 4],
+        opacities: *mut f32,
+        at: u32,
+        places: *mut u32,
+    );
 }
 
 /// Compiles the loops for some instructions.
@@ -81,17 +116,16 @@ macro_rules! compiled {
             unsafe { super::wide::add_apart::<W, S, N>(tiers, voxels, places, layers) }
         }
 
-        /// [`Wide::fold`].
+        /// [`super::wide::fold`].
         #[target_feature(enable = $features)]
         pub(super) fn fold<W: Wide<S>, S: Recorded, const N: usize>(
             tiers: &Tiers<'_, S, N>,
-            above: [Above<'_, S::Weight>; 2],
-            spread: f32,
-            open: u64,
+            ends: Ends<'_, S>,
+            rows: usize,
             to: &mut Folded<S>,
-        ) -> u64 {
+        ) -> usize {
             // SAFETY: these are the instructions.
-            unsafe { W::fold(tiers, above, spread, open, to) }
+            unsafe { super::wide::fold::<W, S, N>(tiers, ends, rows, to) }
         }
     };
 }
@@ -268,16 +302,96 @@ unsafe fn section<const GROUPS: usize, W: Wide<S>, S: Recorded, const N: usize>(
     }
 }
 
-/// The lines of tiers, all of which are there from the part's first column to its last.
+/// [`super::Tiered::fold`].
+///
+/// # Safety
+/// For machines with the instructions of `W`.
 #[inline(always)]
-pub(super) fn lines_of<S: Recorded, const N: usize>(
+pub(super) unsafe fn fold<W: Wide<S>, S: Recorded, const N: usize>(
     tiers: &Tiers<'_, S, N>,
-    above: &[Above<'_, S::Weight>; 2],
-) -> *const Line {
-    let there = tiers.lines.len() - PART as usize / a_line::<S>();
-    let last = |(begin, weights): &Above<'_, S::Weight>| {
-        *begin as usize + weights.len().saturating_sub(1) * tiers.shape.wide
+    Ends { open, slots, by_row, before, was, pixels }: Ends<'_, S>,
+    rows: usize,
+    to: &mut Folded<S>,
+) -> usize {
+    const { assert!(columns::<W, S>() <= LANES) };
+    let columns = columns::<W, S>();
+    let all = (1u32 << columns) - 1;
+    let [a_tier, _] = registers::<W, S, N>(tiers);
+    assert!(by_row[0].end.max(by_row[1].end) <= tiers.shape.rows, "tiers that are there");
+    // Which register is the first of the part in the first tier of each sheet.
+    let first = slots.map(|slot| W::OF_LINE * tiers.begin(slot % N, 0) as usize);
+    let (before, pixels) = (&mut before[..EDGE * STRIDE], &pixels[..EDGE * STRIDE]);
+    let Folded { places: all_places, sheets, opacities } = to;
+    // SAFETY: places of the part are stored there.
+    let places = unsafe { all_places.room().as_mut_ptr() };
+    let opacities = opacities.as_mut_ptr();
+    let [sums_before, sums_here, sums_behind] = sheets.each_mut();
+    let (sums_before, sums_here, sums_behind) =
+        (sums_before.as_mut_ptr(), sums_here.as_mut_ptr(), sums_behind.as_mut_ptr());
+    let lines = tiers.lines.as_ptr();
+    let (mut next, mut n) = (rows, 0);
+    while next < EDGE && n < ENOUGH {
+        let y = next;
+        next += 1;
+        let (open, had) = (open[y], std::mem::take(&mut was[y]));
+        if open == 0 {
+            continue;
+        }
+        let ((above_here, w_here), (above_behind, w_behind)) = (by_row[0].row(y), by_row[1].row(y));
+        let (here, behind) = (first[0] + above_here * a_tier, first[1] + above_behind * a_tier);
+        // SAFETY: the caller's.
+        let four = unsafe { four::<W, S>(w_here, w_behind) };
+        let mut left = firsts_of(open, columns);
+        while left != 0 {
+            let x = left.trailing_zeros() as usize;
+            left &= left - 1;
+            let at = y * STRIDE + x;
+            let (here, behind) = (here + x / columns, behind + x / columns);
+            // SAFETY: the caller's; so many tiers are there, and registers from their first in the part on. Each pixel of
+            // the part is come to once at most, and of ENOUGH and a row there is room.
+            unsafe {
+                let (here, behind) = match &four {
+                    // Loops of known length.
+                    Some([a, b]) => {
+                        (W::down(lines, here, a_tier, a), W::down(lines, behind, a_tier, b))
+                    }
+                    None => (
+                        W::down_all(lines, here, a_tier, w_here),
+                        W::down_all(lines, behind, a_tier, w_behind),
+                    ),
+                };
+                let some = W::filled(here) & (open >> x) as u32 & all;
+                let old = W::exchange(before.as_mut_ptr().add(at), (had >> x) as u32 & all, here);
+                W::store_beside(sums_before.add(n), some, old);
+                W::store_beside(sums_here.add(n), some, here);
+                W::store_beside(sums_behind.add(n), some, behind);
+                let (opacities, places) = (opacities.add(n), places.add(n));
+                W::store_places(some, pixels.as_ptr().add(at), opacities, at as u32, places);
+                n += some.count_ones() as usize;
+                was[y] |= u64::from(some) << x;
+            }
+        }
+    }
+    all_places.set_len(n);
+    next
+}
+
+/// Weights of two sheets, each for all channels, if both have four.
+#[inline(always)]
+unsafe fn four<W: Wide<S>, S: Recorded>(
+    here: &[S::Weight],
+    behind: &[S::Weight],
+) -> Option<[[W::Down; FOUR]; 2]> {
+    let (Ok([a, b, c, d]), Ok([e, f, g, h])) =
+        (<[S::Weight; FOUR]>::try_from(here), <[S::Weight; FOUR]>::try_from(behind))
+    else {
+        return None;
     };
-    assert!(last(&above[0]).max(last(&above[1])) <= there, "a tier is longer than a part is wide");
-    tiers.lines.as_ptr()
+    // SAFETY: the caller's. Without closures: what is compiled for `W` is inlined into nothing else.
+    unsafe {
+        Some([
+            [W::weight(a), W::weight(b), W::weight(c), W::weight(d)],
+            [W::weight(e), W::weight(f), W::weight(g), W::weight(h)],
+        ])
+    }
 }

@@ -7,7 +7,7 @@ use crate::splat::records::apart::{Apart, BATCH, Each, Layers, Woven, splat_skew
 use crate::splat::records::{Recorded, Table};
 use crate::splat::toss::any_in_rows;
 use crate::splat::{Simd, whole_registers};
-use crate::stack::{Sheets, slot};
+use crate::stack::{EDGE, Sheets, slot};
 use crate::tile::Part;
 use slabcast_common::message::Counters;
 
@@ -129,10 +129,15 @@ impl Batch {
         let asked = (sheets.simd, part.frame);
         let some = self.light::<S>(asked, n, eyes, &mut payloads, counted);
         let apart = &self.apart;
+        // All windows as wide and high as the largest: they are alike but for a pixel or two, and pixels that nothing was
+        // added to are found out when they close.
+        let (mut corners, mut largest) = ([0; EDGE], [1; 2]);
         for &i in &apart.kept[..some] {
-            let (at, wide) = apart.window(i as usize % BATCH, S::step::<N>());
-            sheets.touch(k, at, wide);
+            let ([x, y], wide) = apart.window(i as usize % BATCH, S::step::<N>());
+            corners[y % EDGE] |= 1 << x;
+            largest = [0, 1].map(|axis| largest[axis].max(wide[axis]));
         }
+        sheets.touch_all(k, &corners, largest);
         let row = part.frame.leaning.as_ref().map_or(0, Leaning::row);
         let voxels = (apart, &payloads[..some]);
         if row == 0 {

@@ -484,7 +484,7 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
     pub(crate) fn touch_all(&mut self, k: i32, corners: &Rows, [wide, high]: [usize; 2]) {
         let added = &mut self.added[slot::<N>(k)];
         let mut grown = *corners;
-        // Columns and rows double until so many are there; no footprint leaves the part.
+        // Columns and rows double until so many are there, or the part ends.
         for done in doubling(wide) {
             for row in &mut grown {
                 *row |= *row << done;
@@ -498,15 +498,6 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
         }
         for (added, grown) in added.iter_mut().zip(&grown) {
             *added |= grown;
-        }
-    }
-
-    /// Notes that a voxel that begins at sheet `k` touches so many columns and rows from (x, y).
-    #[inline(always)]
-    pub(crate) fn touch(&mut self, k: i32, [x, y]: [usize; 2], [wide, high]: [usize; 2]) {
-        let columns = (u64::MAX >> (EDGE - wide)) << x;
-        for row in &mut self.added[slot::<N>(k)][y..y + high] {
-            *row |= columns;
         }
     }
 
@@ -601,17 +592,18 @@ mod tests {
             [wide, high] in prop::array::uniform2(1..=64usize),
             corners in prop::collection::vec(any::<[usize; 2]>(), 0..20),
         ) {
-            let [mut one_by_one, mut together] = [Store::<i32>::default(), Store::default()];
-            let mut one_by_one = Sheets::<i32, 4>::new(Simd::plain(), &mut one_by_one, 4);
-            let mut together = Sheets::<i32, 4>::new(Simd::plain(), &mut together, 4);
-            let mut rows = [0u64; EDGE];
+            let mut store = Store::<i32>::default();
+            let mut together = Sheets::<i32, 4>::new(Simd::plain(), &mut store, 4);
+            let [mut rows, mut one_by_one] = [[0u64; EDGE]; 2];
             for [x, y] in corners {
-                let at = [x % (EDGE + 1 - wide), y % (EDGE + 1 - high)];
-                one_by_one.touch(2, at, [wide, high]);
-                rows[at[1]] |= 1 << at[0];
+                let [x, y] = [x % EDGE, y % EDGE];
+                rows[y] |= 1 << x;
+                for row in &mut one_by_one[y..EDGE.min(y + high)] {
+                    *row |= (u64::MAX >> (EDGE - wide)) << x;
+                }
             }
             together.touch_all(2, &rows, [wide, high]);
-            prop_assert_eq!(together.touched(0, 3), one_by_one.touched(0, 3));
+            prop_assert_eq!(together.touched(0, 3), one_by_one);
         }
     }
 }

@@ -84,7 +84,7 @@ pub fn run(simd: Simd) -> Digest32 {
 }
 
 /// All voxels of an 8-bit volume that are not zero, as bricks, with normals.
-fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
+pub(crate) fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
     let grid = BrickGrid::of(volume.lattice.dims);
     let Samples::U8(samples) = &volume.samples else { unreachable!("made above") };
     let [nx, ny, _] = volume.lattice.dims.map(|n| n as usize);

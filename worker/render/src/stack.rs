@@ -9,6 +9,8 @@ use crate::sheet::{LANES, Row};
 use crate::splat::Simd;
 use crate::splat::close::close_rows;
 use crate::splat::records::{Line, Record, Recorded, STRIDE};
+#[cfg(test)]
+use crate::splat::tiers::Tiers;
 use crate::splat::tiers::{Folded, Shape};
 use crate::splat::touched::{Places, Some16, column_and_row, put, take, unpack};
 use crate::tile::{Io, PART, Part, Pixels, keep_last};
@@ -63,6 +65,21 @@ impl<S: Recorded> Default for Store<S> {
         let shape = (Shape::default(), 0);
         let level = LevelStore { tiers: Vec::new(), shape, folded: Folded::default() };
         Store { lines: Vec::new(), closes: Closes::default(), level }
+    }
+}
+
+#[cfg(test)]
+impl<S: Recorded> Store<S> {
+    /// Whether there are no sums of any part, and whether there are tiers at all.
+    pub(crate) fn is_empty(&mut self) -> (bool, bool) {
+        let LevelStore { tiers, shape: (shape, sheets), .. } = &mut self.level;
+        let empty = match *sheets {
+            4 => Tiers::<S, 4>::new(tiers, *shape).are_empty(),
+            8 => Tiers::<S, 8>::new(tiers, *shape).are_empty(),
+            _ => true,
+        };
+        let records: &[u64] = bytemuck::cast_slice(&self.lines);
+        (empty && records.iter().all(|sums| *sums == 0), *sheets > 0)
     }
 }
 

@@ -238,6 +238,14 @@ impl<'a, S: Recorded, const N: usize> Tiers<'a, S, N> {
         bytemuck::cast_slice(lines).first_chunk().expect("a tier is longer than a part is wide")
     }
 
+    /// Whether nothing was added in the part, in any tier.
+    #[cfg(test)]
+    pub(crate) fn are_empty(&self) -> bool {
+        let all = (0..N).flat_map(|slot| (0..self.shape.rows).map(move |row| (slot, row)));
+        let mut pixels = all.flat_map(|(slot, row)| self.pixels(self.begin(slot, row)));
+        pixels.all(|pixel| *pixel == S::Pixel::default())
+    }
+
     #[inline(always)]
     fn tier_mut(&mut self, slot: usize, row: usize) -> &mut [S::Pixel] {
         let Shape { rows, wide, .. } = self.shape;

@@ -25,7 +25,7 @@ HERTZ = 2000
 STAGES = [
     ("toss", r"\btoss\b|open_brick|near_all|move_inside|FlatStage.*::toss"),
     ("fold", r"tiers\.\..*fold|tiers::.*fold|\bweigh\b|\bdown\b|\btouched$|\btouched <"),
-    ("close", r"\bclose|take_folded|touched::wide"),
+    ("close", r"\bclose|unpack|touched::wide"),
     ("light", r"payloads|light_all"),
     ("add", r"splat_all|splat_apart|splat_deep|add_flat|add_apart"),
     ("look again, place sections", r"\bsplat\b|splat::records|\btouch\b|render_records"),

@@ -1,6 +1,6 @@
 //! Tiers with AVX2: a line of the cache is two registers.
 
-use super::wide::{Wide, compiled};
+use super::wide::{Pixels, Wide, compiled};
 use super::{Ends, FOUR, Folded, Tiers, Weights};
 use crate::splat::lanes::BESIDE;
 use crate::splat::records::apart::{Apart, Each, Layers};
@@ -65,72 +65,10 @@ fn around<T: Copy + Default, const LEN: usize>(
     }
 }
 
-/// A bit for each word of pixels that have so many.
-#[inline(always)]
-fn words<const WORDS: usize>(pixels: u32) -> u32 {
-    // Two of four, or four of two.
-    if WORDS == 2 {
-        let [pairs, odd] = [pixels & 3, pixels >> 2];
-        ((pairs & 1) | (pairs >> 1) << 2 | (odd & 1) << 4 | (odd >> 1) << 6) * 3
-    } else {
-        ((pixels & 1) | (pixels >> 1) << 4) * 15
-    }
-}
-
-/// All bits of those words.
-#[target_feature(enable = "avx2")]
-#[inline]
-fn marks(words: u32) -> __m256i {
-    let each = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
-    _mm256_cmpeq_epi32(_mm256_and_si256(_mm256_set1_epi32(words as i32), each), each)
-}
-
-/// [`Wide::exchange`], by words.
-#[target_feature(enable = "avx2")]
-#[inline]
-unsafe fn exchange(to: *mut __m256i, which: u32, now: __m256i) -> __m256i {
-    // SAFETY: the caller's.
-    unsafe {
-        let old = _mm256_loadu_si256(to);
-        _mm256_storeu_si256(to, now);
-        _mm256_and_si256(old, marks(which))
-    }
-}
-
-/// [`Wide::store_beside`], by words.
-#[target_feature(enable = "avx2")]
-#[inline]
-unsafe fn store_beside(to: *mut __m256i, which: u32, sums: __m256i) {
-    let order = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(BESIDE[which as usize % 256] as i64));
-    // SAFETY: the caller's.
-    unsafe { _mm256_storeu_si256(to, _mm256_permutevar8x32_epi32(sums, order)) };
-}
-
-/// [`Wide::store_places`] of so many pixels.
-///
-/// # Safety
-/// There are as many fours, and as much room.
-#[inline(always)]
-unsafe fn store_places<const PIXELS: usize>(
-    which: u32,
-    fours: *const [u32; 4],
-    opacities: *mut f32,
-    at: u32,
-    places: *mut u32,
-) {
-    let mut n = 0;
-    for i in 0..PIXELS {
-        // SAFETY: the caller's.
-        unsafe {
-            *opacities.add(n) = f32::from_bits((*fours.add(i))[0]);
-            *places.add(n) = at + i as u32;
-        }
-        n += (which >> i & 1) as usize;
-    }
-}
-
 impl Wide<i16> for Shorts {
     type Register = __m256i;
+    type Sums = __m256i;
+    type Down = __m256i;
     const OF_LINE: usize = 2;
     const CHUNK: usize = 4;
     const BY_SHEET: bool = true;
@@ -201,10 +139,6 @@ impl Wide<i16> for Shorts {
         }
     }
 
-    type Sums = __m256i;
-
-    type Down = __m256i;
-
     #[target_feature(enable = "avx2")]
     #[inline]
     unsafe fn weight(w: i16) -> __m256i {
@@ -248,35 +182,6 @@ impl Wide<i16> for Shorts {
         let nothing = _mm256_castsi256_pd(_mm256_slli_epi64::<48>(nothing));
         !_mm256_movemask_pd(nothing) as u32
     }
-
-    #[target_feature(enable = "avx2")]
-    #[inline]
-    unsafe fn exchange(to: *mut [i16; 4], which: u32, now: __m256i) -> __m256i {
-        // SAFETY: the caller's.
-        unsafe { exchange(to.cast(), words::<2>(which), now) }
-    }
-
-    #[target_feature(enable = "avx2")]
-    #[inline]
-    unsafe fn store_beside(to: *mut [i16; 4], which: u32, sums: __m256i) {
-        // SAFETY: the caller's.
-        unsafe { store_beside(to.cast(), words::<2>(which), sums) };
-    }
-
-    #[target_feature(enable = "avx2")]
-    #[inline]
-    unsafe fn store_places(
-        which: u32,
-        fours: *const [u32; 4],
-        opacities: *mut f32,
-        at: u32,
-        places: *mut u32,
-    ) {
-        // SAFETY: the caller's.
-        unsafe {
-            store_places::<4>(which, fours, opacities, at, places);
-        }
-    }
 }
 
 impl<S, const C: usize> Wide<S> for Longs<C>
@@ -284,6 +189,8 @@ where
     S: Recorded<Payload = [f32; C], Depth = f32, Pixel = [i32; C]> + Accumulate<Weight = Tap>,
 {
     type Register = __m256;
+    type Sums = __m256i;
+    type Down = __m256;
     const OF_LINE: usize = 2;
     const CHUNK: usize = C;
     const BY_SHEET: bool = true;
@@ -348,10 +255,6 @@ where
         }
     }
 
-    type Sums = __m256i;
-
-    type Down = __m256;
-
     #[target_feature(enable = "avx2")]
     #[inline]
     unsafe fn weight(w: Tap) -> __m256 {
@@ -402,37 +305,62 @@ where
             some & 1 | (some >> 4 & 1) << 1
         }
     }
+}
 
+/// A bit for each word of pixels that have so many.
+#[inline(always)]
+fn words_of(words: usize, pixels: u32) -> u32 {
+    // Four of two, or two of four.
+    if words == 2 {
+        let [first, last] = [pixels & 3, pixels >> 2 & 3];
+        (first & 1 | (first >> 1) << 2 | (last & 1) << 4 | (last >> 1) << 6) * 3
+    } else {
+        (pixels & 1 | (pixels >> 1 & 1) << 4) * 15
+    }
+}
+
+impl Pixels for __m256i {
     #[target_feature(enable = "avx2")]
     #[inline]
-    unsafe fn exchange(to: *mut [i32; C], which: u32, now: __m256i) -> __m256i {
+    unsafe fn exchange(self, words: usize, to: *mut u32, which: u32) -> __m256i {
+        let each = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
+        let bits = _mm256_set1_epi32(words_of(words, which) as i32);
+        let marks = _mm256_cmpeq_epi32(_mm256_and_si256(bits, each), each);
         // SAFETY: the caller's.
-        unsafe { exchange(to.cast(), words::<C>(which), now) }
+        unsafe {
+            let old = _mm256_loadu_si256(to.cast());
+            _mm256_storeu_si256(to.cast(), self);
+            _mm256_and_si256(old, marks)
+        }
     }
 
     #[target_feature(enable = "avx2")]
     #[inline]
-    unsafe fn store_beside(to: *mut [i32; C], which: u32, sums: __m256i) {
+    unsafe fn store_beside(self, words: usize, to: *mut u32, which: u32) {
+        let order = BESIDE[words_of(words, which) as usize % 256] as i64;
+        let order = _mm256_cvtepu8_epi32(_mm_cvtsi64_si128(order));
         // SAFETY: the caller's.
-        unsafe { store_beside(to.cast(), words::<C>(which), sums) };
+        unsafe { _mm256_storeu_si256(to.cast(), _mm256_permutevar8x32_epi32(self, order)) };
     }
 
     #[target_feature(enable = "avx2")]
     #[inline]
     unsafe fn store_places(
+        words: usize,
         which: u32,
         fours: *const [u32; 4],
         opacities: *mut f32,
         at: u32,
         places: *mut u32,
     ) {
-        // SAFETY: the caller's.
-        unsafe {
-            if C == 2 {
-                store_places::<4>(which, fours, opacities, at, places);
-            } else {
-                store_places::<2>(which, fours, opacities, at, places);
-            };
+        let mut n = 0;
+        for i in 0..8 / words {
+            // SAFETY: the caller's.
+            unsafe {
+                *opacities.add(n) = f32::from_bits((*fours.add(i))[0]);
+                *places.add(n) = at + i as u32;
+            }
+            n += (which >> i & 1) as usize;
         }
     }
 }

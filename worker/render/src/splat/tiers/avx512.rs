@@ -1,6 +1,6 @@
 //! Tiers with AVX-512: a line of the cache is a register.
 
-use super::wide::{Wide, compiled};
+use super::wide::{Pixels, Wide, compiled};
 use super::{Ends, FOUR, Folded, Tiers, Weights};
 use crate::splat::records::apart::{Apart, Each, Layers};
 use crate::splat::records::{Line, MOST, Recorded, Splat, Table};
@@ -29,6 +29,8 @@ fn present(len: usize, shift: usize, chunk: usize, of: usize) -> u64 {
 
 impl Wide<i16> for Shorts {
     type Register = __m512i;
+    type Sums = __m512i;
+    type Down = __m512i;
     const OF_LINE: usize = 1;
     const CHUNK: usize = 4;
     const BY_SHEET: bool = false;
@@ -90,10 +92,6 @@ impl Wide<i16> for Shorts {
         }
     }
 
-    type Sums = __m512i;
-
-    type Down = __m512i;
-
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
     unsafe fn weight(w: i16) -> __m512i {
@@ -135,35 +133,6 @@ impl Wide<i16> for Shorts {
         // Extinction comes first.
         _mm512_test_epi64_mask(sums, _mm512_set1_epi64(0xffff)).into()
     }
-
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
-    #[inline]
-    unsafe fn exchange(to: *mut [i16; 4], which: u32, now: __m512i) -> __m512i {
-        // SAFETY: the caller's.
-        unsafe { exchange(to.cast(), halves::<2>(which), now) }
-    }
-
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
-    #[inline]
-    unsafe fn store_beside(to: *mut [i16; 4], which: u32, sums: __m512i) {
-        // SAFETY: the caller's.
-        unsafe {
-            _mm512_storeu_si512(to.cast(), _mm512_maskz_compress_epi64(halves::<2>(which), sums));
-        }
-    }
-
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
-    #[inline]
-    unsafe fn store_places(
-        which: u32,
-        fours: *const [u32; 4],
-        opacities: *mut f32,
-        at: u32,
-        places: *mut u32,
-    ) {
-        // SAFETY: the caller's.
-        unsafe { store_places::<2>(which, fours, opacities, at, places) }
-    }
 }
 
 impl<S, const C: usize> Wide<S> for Longs<C>
@@ -171,6 +140,8 @@ where
     S: Recorded<Payload = [f32; C], Depth = f32, Pixel = [i32; C]> + Accumulate<Weight = Tap>,
 {
     type Register = __m512;
+    type Sums = __m512i;
+    type Down = __m512;
     const OF_LINE: usize = 1;
     const CHUNK: usize = C;
     const BY_SHEET: bool = false;
@@ -233,10 +204,6 @@ where
         }
     }
 
-    type Sums = __m512i;
-
-    type Down = __m512;
-
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
     unsafe fn weight(w: Tap) -> __m512 {
@@ -281,83 +248,63 @@ where
         let words = if C == 2 { 0x5555 } else { 0x1111 };
         _pext_u32(_mm512_mask_test_epi32_mask(words, sums, sums).into(), words.into())
     }
+}
 
+/// A bit for each eight bytes of pixels that have so many words.
+#[target_feature(enable = "bmi2")]
+#[inline]
+fn halves(words: usize, pixels: u32) -> u8 {
+    if words == 2 { pixels as u8 } else { (_pdep_u32(pixels, 0x55) * 3) as u8 }
+}
+
+impl Pixels for __m512i {
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
     #[inline]
-    unsafe fn exchange(to: *mut [i32; C], which: u32, now: __m512i) -> __m512i {
-        // SAFETY: the caller's.
-        unsafe { exchange(to.cast(), halves::<C>(which), now) }
-    }
-
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
-    #[inline]
-    unsafe fn store_beside(to: *mut [i32; C], which: u32, sums: __m512i) {
+    unsafe fn exchange(self, words: usize, to: *mut u32, which: u32) -> __m512i {
         // SAFETY: the caller's.
         unsafe {
-            _mm512_storeu_si512(to.cast(), _mm512_maskz_compress_epi64(halves::<C>(which), sums));
+            let old = _mm512_maskz_loadu_epi64(halves(words, which), to.cast());
+            _mm512_storeu_si512(to.cast(), self);
+            old
         }
     }
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
     #[inline]
+    unsafe fn store_beside(self, words: usize, to: *mut u32, which: u32) {
+        let some = _mm512_maskz_compress_epi64(halves(words, which), self);
+        // SAFETY: the caller's.
+        unsafe { _mm512_storeu_si512(to.cast(), some) };
+    }
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
+    #[inline]
     unsafe fn store_places(
+        words: usize,
         which: u32,
         fours: *const [u32; 4],
         opacities: *mut f32,
         at: u32,
         places: *mut u32,
     ) {
-        // SAFETY: the caller's.
-        unsafe { store_places::<C>(which, fours, opacities, at, places) }
-    }
-}
-
-/// A bit for each eight bytes of pixels that have so many words.
-#[target_feature(enable = "bmi2")]
-#[inline]
-fn halves<const WORDS: usize>(pixels: u32) -> u8 {
-    if WORDS == 2 { pixels as u8 } else { (_pdep_u32(pixels, 0x55) * 3) as u8 }
-}
-
-/// [`Wide::exchange`], by eight bytes.
-#[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-#[inline]
-unsafe fn exchange(to: *mut i64, which: u8, now: __m512i) -> __m512i {
-    // SAFETY: the caller's.
-    unsafe {
-        let old = _mm512_maskz_loadu_epi64(which, to);
-        _mm512_storeu_si512(to.cast(), now);
-        old
-    }
-}
-
-/// [`Wide::store_places`] of as many pixels of so many words as a register has.
-#[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,bmi2")]
-#[inline]
-unsafe fn store_places<const WORDS: usize>(
-    which: u32,
-    fours: *const [u32; 4],
-    opacities: *mut f32,
-    at: u32,
-    places: *mut u32,
-) {
-    let from =
-        _mm256_add_epi32(_mm256_set1_epi32(at as i32), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
-    // SAFETY: the caller's: eight or four of each.
-    unsafe {
-        let first = _mm512_loadu_si512(fours.cast());
-        if WORDS == 2 {
-            let of = _mm512_setr_epi32(0, 4, 8, 12, 16, 20, 24, 28, 0, 0, 0, 0, 0, 0, 0, 0);
-            let second = _mm512_loadu_si512(fours.add(4).cast());
-            let all = _mm512_castsi512_si256(_mm512_permutex2var_epi32(first, of, second));
-            let some = _mm256_maskz_compress_epi32(which as u8, all);
-            _mm256_storeu_si256(opacities.cast(), some);
-            _mm256_storeu_si256(places.cast(), _mm256_maskz_compress_epi32(which as u8, from));
-        } else {
-            let some = _mm512_maskz_compress_epi32(_pdep_u32(which, 0x1111) as u16, first);
-            _mm_storeu_si128(opacities.cast(), _mm512_castsi512_si128(some));
-            let from = _mm256_castsi256_si128(from);
-            _mm_storeu_si128(places.cast(), _mm_maskz_compress_epi32(which as u8, from));
+        let eight = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
+        let from = _mm256_add_epi32(_mm256_set1_epi32(at as i32), eight);
+        let from = _mm256_maskz_compress_epi32(which as u8, from);
+        // SAFETY: the caller's: eight or four of each.
+        unsafe {
+            let first = _mm512_loadu_si512(fours.cast());
+            if words == 2 {
+                let of = _mm512_setr_epi32(0, 4, 8, 12, 16, 20, 24, 28, 0, 0, 0, 0, 0, 0, 0, 0);
+                let second = _mm512_loadu_si512(fours.add(4).cast());
+                let all = _mm512_castsi512_si256(_mm512_permutex2var_epi32(first, of, second));
+                let some = _mm256_maskz_compress_epi32(which as u8, all);
+                _mm256_storeu_si256(opacities.cast(), some);
+                _mm256_storeu_si256(places.cast(), from);
+            } else {
+                let some = _mm512_maskz_compress_epi32(_pdep_u32(which, 0x1111) as u16, first);
+                _mm_storeu_si128(opacities.cast(), _mm512_castsi512_si128(some));
+                _mm_storeu_si128(places.cast(), _mm256_castsi256_si128(from));
+            }
         }
     }
 }

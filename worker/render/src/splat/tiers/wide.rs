@@ -15,6 +15,10 @@ use crate::splat::records::{Line, MOST, Recorded, STRIDE, Splat, Table};
 pub(super) trait Wide<S: Recorded> {
     /// Weights of some columns or a section, each for all channels.
     type Register: Copy;
+    /// Sums of the pixels of a register.
+    type Sums: Pixels;
+    /// A weight down the picture, for all channels.
+    type Down: Copy;
     /// Registers of a line of the cache.
     const OF_LINE: usize;
     /// Registers whose weights are read at once, at most: two or four.
@@ -45,12 +49,6 @@ pub(super) trait Wide<S: Recorded> {
         w: &[Self::Register; GROUPS],
     );
 
-    /// Sums of the pixels of a register.
-    type Sums: Copy;
-
-    /// A weight down the picture, for all channels.
-    type Down: Copy;
-
     /// `w` for all channels.
     unsafe fn weight(w: S::Weight) -> Self::Down;
 
@@ -72,15 +70,22 @@ pub(super) trait Wide<S: Recorded> {
 
     /// A bit for each pixel that has any extinction.
     unsafe fn filled(sums: Self::Sums) -> u32;
+}
 
-    /// Puts sums instead of those of the pixels of `to`; these, of pixels that `which` has bits for.
-    unsafe fn exchange(to: *mut S::Pixel, which: u32, now: Self::Sums) -> Self::Sums;
+/// Registers of pixels of two or four words each, whatever kind of sums these are.
+///
+/// # Safety
+/// As that of [`Wide`].
+pub(super) trait Pixels: Copy {
+    /// Puts these pixels, of so many words, instead of those of `to`; which were there, of those that `which` has bits for.
+    unsafe fn exchange(self, words: usize, to: *mut u32, which: u32) -> Self;
 
-    /// Stores pixels beside each other.
-    unsafe fn store_beside(to: *mut S::Pixel, which: u32, sums: Self::Sums);
+    /// Stores those of `which` beside each other.
+    unsafe fn store_beside(self, words: usize, to: *mut u32, which: u32);
 
-    /// The first numbers of fours, and whole numbers from `at` on, beside each other.
+    /// The first numbers of as many fours as a register has such pixels, and whole numbers from `at` on, beside each other.
     unsafe fn store_places(
+        words: usize,
         which: u32,
         fours: *const [u32; 4],
         opacities: *mut f32,
@@ -314,7 +319,7 @@ pub(super) unsafe fn fold<W: Wide<S>, S: Recorded, const N: usize>(
     to: &mut Folded<S>,
 ) -> usize {
     const { assert!(columns::<W, S>() <= LANES) };
-    let columns = columns::<W, S>();
+    let (columns, words) = (columns::<W, S>(), size_of::<S::Pixel>() / 4);
     let all = (1u32 << columns) - 1;
     let [a_tier, _] = registers::<W, S, N>(tiers);
     assert!(by_row[0].end.max(by_row[1].end) <= tiers.shape.rows, "tiers that are there");
@@ -361,12 +366,14 @@ pub(super) unsafe fn fold<W: Wide<S>, S: Recorded, const N: usize>(
                     ),
                 };
                 let some = W::filled(here) & (open >> x) as u32 & all;
-                let old = W::exchange(before.as_mut_ptr().add(at), (had >> x) as u32 & all, here);
-                W::store_beside(sums_before.add(n), some, old);
-                W::store_beside(sums_here.add(n), some, here);
-                W::store_beside(sums_behind.add(n), some, behind);
+                let had = (had >> x) as u32 & all;
+                let old = here.exchange(words, before.as_mut_ptr().add(at).cast(), had);
+                old.store_beside(words, sums_before.add(n).cast(), some);
+                here.store_beside(words, sums_here.add(n).cast(), some);
+                behind.store_beside(words, sums_behind.add(n).cast(), some);
                 let (opacities, places) = (opacities.add(n), places.add(n));
-                W::store_places(some, pixels.as_ptr().add(at), opacities, at as u32, places);
+                let fours = pixels.as_ptr().add(at);
+                W::Sums::store_places(words, some, fours, opacities, at as u32, places);
                 n += some.count_ones() as usize;
                 was[y] |= u64::from(some) << x;
             }

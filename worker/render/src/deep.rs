@@ -191,7 +191,7 @@ impl<'a, S: Recorded, const N: usize> DeepStage<'a, S, N> {
         waiting: &'a mut Waiting,
     ) -> (Self, &'a mut Queues<DeepVoxel>) {
         let Waiting { queues, tossing, batch, places } = waiting;
-        let across = [[[S::Weight::default(); N]; WINDOW]; 2];
+        let across = Woven::default();
         (DeepStage { part, deep, simd, tossing, batch, places, across }, queues)
     }
 }

@@ -59,8 +59,7 @@ impl<S: Recorded> Work for RenderLeaning<'_, S> {
         let footprint = part.frame.footprints.at(0).expect("a flat view's sheets are all drawn");
         let axes = Axes::new(part.frame, 0, [footprint; MOST]);
         let Waiting { queues, tossing, batch } = waiting;
-        let [x, y] = [[[S::Weight::default(); MOST]; WINDOW]; 2];
-        let (at, across) = ([[0; BATCH]; 2], [x, y]);
+        let (at, across) = ([[0; BATCH]; 2], Woven::default());
         let stage = LeaningStage { part: &part, simd, lean, axes, tossing, batch, at, across };
         let sheets = Sheets::<S, MOST>::new(simd, store, part.frame.sections.most());
         walk(&part, stage, sheets, queues, pixels, io);

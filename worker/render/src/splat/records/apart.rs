@@ -176,13 +176,32 @@ pub(crate) fn after<const N: usize>(first: usize, slot: usize) -> i32 {
     ((slot + N - first) % N) as i32
 }
 
-/// Weights by slot of a window's columns and of its rows.
-pub(crate) type Woven<W, const N: usize> = [[BySlot<W, N>; WINDOW]; 2];
+/// Memory for weights that are put side by side.
+pub(crate) struct Woven<W, const N: usize> {
+    /// By slot, of a window's columns and of its rows.
+    by_slot: [[BySlot<W, N>; WINDOW]; 2],
+    #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+    pub(super) spans: [lines::Spans<N>; 2],
+}
+
+impl<W: Copy + Default, const N: usize> Default for Woven<W, N> {
+    fn default() -> Self {
+        Woven {
+            by_slot: [[[W::default(); N]; WINDOW]; 2],
+            #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+            spans: Default::default(),
+        }
+    }
+}
 
 /// What [`Recorded::splat_apart`] adds, where and by which weights, for windows of a known width.
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
-pub(super) type ApartAt<'a, S, const N: usize> =
-    (&'a mut [Record<S, N>], (&'a Apart, &'a [<S as Recorded>::Payload]), &'a Layers<'a, S, N>);
+pub(super) type ApartAt<'a, S, const N: usize> = (
+    &'a mut [Record<S, N>],
+    (&'a Apart, &'a [<S as Recorded>::Payload]),
+    &'a Layers<'a, S, N>,
+    &'a mut [lines::Spans<N>; 2],
+);
 
 /// [`Recorded::splat_apart`], voxel by voxel.
 #[inline(always)]
@@ -198,9 +217,10 @@ pub(super) fn splat_apart<S: Recorded, const N: usize>(
         let ([x, y], wide) = apart.window(i, S::step::<N>());
         let deep = layers.depths(apart, i);
         for (axis, lo) in [x, y].into_iter().enumerate() {
-            S::weave(simd, layers.rows(apart, i, axis, lo), wide[axis], &mut woven[axis]);
+            let rows = layers.rows(apart, i, axis, lo);
+            S::weave(simd, rows, wide[axis], &mut woven.by_slot[axis]);
         }
-        let [columns, lines] = [0, 1].map(|axis| &woven[axis][..wide[axis]]);
+        let [columns, lines] = [0, 1].map(|axis| &woven.by_slot[axis][..wide[axis]]);
         S::splat_deep(simd, records, y * STRIDE + x, (columns, lines), payload, &deep);
     }
 }
@@ -226,7 +246,7 @@ pub(crate) fn splat_skewed<S: Recorded, const N: usize>(
         let i = i as usize % BATCH;
         let ([x, y], [wide, high]) = apart.window(i, S::step::<N>());
         let deep = layers.depths(apart, i);
-        let [columns, lines] = &mut *woven;
+        let [columns, lines] = &mut woven.by_slot;
         S::weave(simd, layers.rows(apart, i, 1, y), high, lines);
         for (line, y) in (y..y + high).enumerate() {
             let mut rows = [RowAt::NONE; N];
@@ -277,13 +297,25 @@ pub(super) mod lines {
         first.min(PART as usize - wide)
     }
 
-    /// Weights in each slot along an axis for windows of at most [`LINE`] pixels. Those that are present lie
-    /// in the slot's weights.
-    pub(crate) struct Lines<'a, W, const N: usize> {
+    /// Which weights in each slot windows have along an axis. These are kilobytes, and a bucket may have few voxels:
+    /// they stay where they are from one to the next, and what is of no voxel at hand is anything.
+    pub(crate) struct Spans<const N: usize> {
         /// Which pixels of a window there are any for, a bit each.
         present: [Each<u32>; N],
         /// Where that of a window's first pixel would be.
         at: [Each<i32>; N],
+    }
+
+    impl<const N: usize> Default for Spans<N> {
+        fn default() -> Self {
+            Spans { present: [[0; BATCH]; N], at: [[0; BATCH]; N] }
+        }
+    }
+
+    /// Weights in each slot along an axis for windows of at most [`LINE`] pixels. Those that are present lie
+    /// in the slot's weights.
+    pub(crate) struct Lines<'a, W, const N: usize> {
+        spans: &'a Spans<N>,
         weights: [&'a [W]; N],
     }
 
@@ -299,14 +331,15 @@ pub(super) mod lines {
             apart: &Apart,
             kept: &[u32],
             layers: &Layers<'a, S, N>,
+            [across, down]: &'a mut [Spans<N>; 2],
             (wide, step): (usize, i32),
         ) -> [Lines<'a, W, N>; 2] {
             let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
             // SAFETY: the caller has the instructions.
             unsafe {
                 let slots = if layers.alike { layers.slot..layers.slot + 1 } else { 0..N };
-                let across = Lines::new::<L, S>(apart, layers, n, (0, slots, wide, step));
-                let down = Lines::new::<L, S>(apart, layers, n, (1, 0..N, 0, 1));
+                let across = Lines::new::<L, S>(apart, layers, across, n, (0, slots, wide, step));
+                let down = Lines::new::<L, S>(apart, layers, down, n, (1, 0..N, 0, 1));
                 [across, down]
             }
         }
@@ -316,14 +349,18 @@ pub(super) mod lines {
         unsafe fn new<L: Lanes, S: Recorded<Weight = W>>(
             apart: &Apart,
             layers: &Layers<'a, S, N>,
+            spans: &'a mut Spans<N>,
             n: usize,
             (axis, slots, wide, step): (usize, Range<usize>, usize, i32),
         ) -> Lines<'a, W, N> {
-            let (present, at) = ([[0; BATCH]; N], [[0; BATCH]; N]);
-            let mut lines = Lines { present, at, weights: [&[]; N] };
-            for slot in slots {
+            let mut weights: [&[W]; N] = [&[]; N];
+            for slot in 0..N {
+                if !slots.contains(&slot) {
+                    spans.present[slot] = [0; BATCH];
+                    continue;
+                }
                 let table = &layers.across[axis][slot];
-                lines.weights[slot] = table.weights;
+                weights[slot] = table.weights;
                 let last = table.weights.len().checked_sub(table.len).expect("a row of the table");
                 let [last, len] = [last, table.len].map(|n| n.min(i32::MAX as usize) as i32);
                 for i in (0..n.min(BATCH)).step_by(L::LANES) {
@@ -331,8 +368,8 @@ pub(super) mod lines {
                     let lo = apart.lo[axis][some.clone()].as_ptr().cast();
                     let first = apart.first[axis][slot][some.clone()].as_ptr().cast();
                     let from = apart.from[axis][slot][some.clone()].as_ptr();
-                    let bits_to = lines.present[slot][some.clone()].as_mut_ptr();
-                    let from_to = lines.at[slot][some].as_mut_ptr().cast();
+                    let bits_to = spans.present[slot][some.clone()].as_mut_ptr();
+                    let from_to = spans.at[slot][some].as_mut_ptr().cast();
                     // SAFETY: as many lanes as there are begin at each.
                     unsafe {
                         let mut lo = L::load(lo);
@@ -353,7 +390,7 @@ pub(super) mod lines {
                     }
                 }
             }
-            lines
+            Lines { spans, weights }
         }
 
         /// Which weights of voxel `i` there are in `slot`, a bit each, and where that of the first pixel would
@@ -361,15 +398,15 @@ pub(super) mod lines {
         #[inline(always)]
         pub(crate) fn of(&self, slot: usize, i: usize) -> (u32, *const W) {
             let from = self.weights[slot].as_ptr();
-            (self.present[slot][i], from.wrapping_offset(self.at[slot][i] as isize))
+            (self.spans.present[slot][i], from.wrapping_offset(self.spans.at[slot][i] as isize))
         }
 
         /// The same, and [`LINE`] weights from that of the first pixel on, where the table has them all.
         #[inline(always)]
         pub(crate) fn around(&self, slot: usize, i: usize) -> (u32, Option<&'a [W; LINE]>) {
-            let around = usize::try_from(self.at[slot][i]).ok();
+            let around = usize::try_from(self.spans.at[slot][i]).ok();
             let around = around.and_then(|at| self.weights[slot].get(at..)?.first_chunk());
-            (self.present[slot][i], around)
+            (self.spans.present[slot][i], around)
         }
 
         /// One by one, what is not present zero.
@@ -378,8 +415,8 @@ pub(super) mod lines {
             W: Copy + Default,
         {
             std::array::from_fn(|j| {
-                let is_present = self.present[slot][i] >> j & 1 == 1;
-                let at = self.at[slot][i] + j as i32;
+                let is_present = self.spans.present[slot][i] >> j & 1 == 1;
+                let at = self.spans.at[slot][i] + j as i32;
                 if is_present { self.weights[slot][at as usize] } else { W::default() }
             })
         }
@@ -442,7 +479,7 @@ mod tests {
         let before = [S::from_raw([11; 4]); N];
         let run = |simd| {
             let mut records: Vec<Record<S, N>> = vec![before; STRIDE * 64];
-            let mut woven = [[[S::Weight::default(); N]; WINDOW]; 2];
+            let mut woven = Woven::default();
             S::splat_apart(simd, &mut records, (&apart, &payloads), &layers, &mut woven);
             records
         };

@@ -269,7 +269,7 @@ pub(super) mod avx2 {
         let Some(wide) = lines::widest(apart, kept, i32::step::<N>()).filter(|_| four) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
-        let at = (records, (apart, payloads), layers);
+        let at = (records, (apart, payloads), layers, &mut woven.spans);
         by_window!(wide, side_by_side[N], at)
     }
 
@@ -296,13 +296,14 @@ pub(super) mod avx2 {
     #[target_feature(enable = "avx2")]
     #[inline]
     fn side_by_side<const WIDE: usize, const N: usize>(
-        (records, (apart, payloads), layers): ApartAt<'_, i32, N>,
+        (records, (apart, payloads), layers, spans): ApartAt<'_, i32, N>,
     ) {
         let zero = _mm256_setzero_ps();
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
-        let [across, down] =
-            unsafe { Lines::both::<Eight, _>(apart, kept, layers, (WIDE, i32::step::<N>())) };
+        let [across, down] = unsafe {
+            Lines::both::<Eight, _>(apart, kept, layers, spans, (WIDE, i32::step::<N>()))
+        };
         let [mut columns, mut rows] = [[Tap::default(); 64]; 2];
         for (&i, payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
@@ -550,7 +551,7 @@ pub(super) mod avx512 {
         let Some(wide) = lines::widest(apart, kept, i32::step::<N>()).filter(|_| known) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
-        let at = (records, (apart, payloads), layers);
+        let at = (records, (apart, payloads), layers, &mut woven.spans);
         if const { N == 8 } {
             by_window_alike!(wide, side_by_side[N], at)
         } else {
@@ -596,7 +597,7 @@ pub(super) mod avx512 {
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
     fn side_by_side<const WIDE: usize, const N: usize, const ALIKE: bool>(
-        (records, (apart, payloads), layers): ApartAt<'_, i32, N>,
+        (records, (apart, payloads), layers, spans): ApartAt<'_, i32, N>,
     ) {
         let zero = _mm512_setzero_ps();
         let lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
@@ -606,8 +607,9 @@ pub(super) mod avx512 {
         let turn = _mm512_and_si512(turn, _mm512_set1_epi32(3));
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
-        let [across, down] =
-            unsafe { Lines::both::<Sixteen, _>(apart, kept, layers, (WIDE, i32::step::<N>())) };
+        let [across, down] = unsafe {
+            Lines::both::<Sixteen, _>(apart, kept, layers, spans, (WIDE, i32::step::<N>()))
+        };
         for (&i, payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
             let ([x, y], [_, high]) = apart.window(i, i32::step::<N>());

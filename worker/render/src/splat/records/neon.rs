@@ -460,7 +460,7 @@ pub(super) fn splat_apart<S: InLanes, const N: usize>(
     let Some(wide) = lines::widest(apart, kept, 1) else {
         return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
     };
-    let at = (records, (apart, payloads), layers);
+    let at = (records, (apart, payloads), layers, &mut woven.spans);
     by_window_alike!(wide, side_by_side[S, N], at)
 }
 
@@ -495,12 +495,12 @@ fn line<S: InLanes, const N: usize>(
 #[target_feature(enable = "neon")]
 #[inline]
 fn side_by_side<const WIDE: usize, S: InLanes, const N: usize, const ALIKE: bool>(
-    (records, (apart, payloads), layers): ApartAt<'_, S, N>,
+    (records, (apart, payloads), layers, spans): ApartAt<'_, S, N>,
 ) {
     let turn = turn::<S, N>(layers.slot);
     let kept = &apart.kept[..payloads.len()];
     // SAFETY: these are the instructions.
-    let [across, down] = unsafe { Lines::both::<Four, _>(apart, kept, layers, (WIDE, 1)) };
+    let [across, down] = unsafe { Lines::both::<Four, _>(apart, kept, layers, spans, (WIDE, 1)) };
     let [mut columns, mut rows] = [[[S::Weight::default(); N]; LINE]; 2];
     for (&i, &payload) in kept.iter().zip(payloads) {
         let i = i as usize % BATCH;

@@ -269,7 +269,7 @@ pub(super) mod avx2 {
         let Some(wide) = lines::widest(apart, kept, 1).filter(|_| four) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
-        let at = (records, (apart, payloads), layers);
+        let at = (records, (apart, payloads), layers, &mut woven.spans);
         by_window!(wide, side_by_side[N], at)
     }
 
@@ -302,13 +302,14 @@ pub(super) mod avx2 {
     #[target_feature(enable = "avx2")]
     #[inline]
     fn side_by_side<const WIDE: usize, const N: usize>(
-        (records, (apart, payloads), layers): ApartAt<'_, i16, N>,
+        (records, (apart, payloads), layers, spans): ApartAt<'_, i16, N>,
     ) {
         let zero = _mm256_setzero_si256();
         let [turn, _] = turns::<N>(layers.slot);
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
-        let [across, down] = unsafe { Lines::both::<Eight, _>(apart, kept, layers, (WIDE, 1)) };
+        let [across, down] =
+            unsafe { Lines::both::<Eight, _>(apart, kept, layers, spans, (WIDE, 1)) };
         let [mut columns, mut rows] = [[0; 64]; 2];
         for (&i, &payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
@@ -600,7 +601,7 @@ pub(super) mod avx512 {
         let Some(wide) = lines::widest(apart, kept, i16::step::<N>()).filter(|_| known) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
-        let at = (records, (apart, payloads), layers);
+        let at = (records, (apart, payloads), layers, &mut woven.spans);
         if const { N == 8 } {
             by_window_alike!(wide, eight_slots[N], at)
         } else {
@@ -670,13 +671,14 @@ pub(super) mod avx512 {
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
     fn eight_slots<const WIDE: usize, const N: usize, const ALIKE: bool>(
-        (records, (apart, payloads), layers): ApartAt<'_, i16, N>,
+        (records, (apart, payloads), layers, spans): ApartAt<'_, i16, N>,
     ) {
         let turn = words(|lane| (lane / 4 + 2 * N - layers.slot) % N);
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
-        let [across, down] =
-            unsafe { Lines::both::<Sixteen, _>(apart, kept, layers, (WIDE, i16::step::<N>())) };
+        let [across, down] = unsafe {
+            Lines::both::<Sixteen, _>(apart, kept, layers, spans, (WIDE, i16::step::<N>()))
+        };
         let [mut columns, mut rows] = [[0; 128]; 2];
         // Which of [`eights`] lanes take in the first row: those of their slots.
         let first = words(|lane| lane / 4 * 8);
@@ -720,7 +722,7 @@ pub(super) mod avx512 {
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
     fn four_slots<const WIDE: usize, const N: usize>(
-        (records, (apart, payloads), layers): ApartAt<'_, i16, N>,
+        (records, (apart, payloads), layers, spans): ApartAt<'_, i16, N>,
     ) {
         let turn = words(|lane| (lane / 4 + 2 * N - layers.slot) % N);
         // Which weight of a line's 64 a lane takes: that of its slot for its column, or for the row.
@@ -728,8 +730,9 @@ pub(super) mod avx512 {
         let row = words(|lane| lane / 4 % N * LINE);
         let kept = &apart.kept[..payloads.len()];
         // SAFETY: these are the instructions.
-        let [across, down] =
-            unsafe { Lines::both::<Sixteen, _>(apart, kept, layers, (WIDE, i16::step::<N>())) };
+        let [across, down] = unsafe {
+            Lines::both::<Sixteen, _>(apart, kept, layers, spans, (WIDE, i16::step::<N>()))
+        };
         for (&i, &payload) in kept.iter().zip(payloads) {
             let i = i as usize % BATCH;
             let ([x, y], [_, high]) = apart.window(i, i16::step::<N>());

@@ -18,6 +18,7 @@
 
 use crate::model::Table;
 use crate::splat::Tap;
+use crate::splat::records::MOST;
 use glam::DVec3;
 pub use slabcast_common::kernel::{Lean, Profile};
 use slabcast_common::quality::Kernel;
@@ -229,6 +230,8 @@ impl Leaning {
                 }
             }
         }
+        // Sheets of a voxel at the end of the table are looked up together, there or not.
+        leaning.subpixels.iter_mut().for_each(|aside| aside.extend([0; MOST]));
         leaning
     }
 
@@ -243,7 +246,7 @@ impl Leaning {
         &self.aside[axis]
     }
 
-    /// The same in subpixels, where a view is parallel.
+    /// The same in subpixels, where a view is parallel; and [`MOST`] zeros more.
     #[inline(always)]
     pub(crate) fn subpixels(&self, axis: usize) -> &[i32] {
         &self.subpixels[axis]

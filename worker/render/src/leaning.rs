@@ -151,6 +151,10 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
             apart.begin(axis, n);
             let phases = &self.axes.phases[axis][0];
             let aside = (leaning.most(axis) > 0.0).then(|| leaning.subpixels(axis));
+            if let Some(aside) = aside {
+                let from = (slot::<N>(k), most as usize);
+                apart.lean::<N>(self.simd, axis, n, &self.at[axis], aside, from);
+            }
             let skewed = axis == 0 && row != 0;
             let mut before = None;
             for at in 0..N {
@@ -158,7 +162,7 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
                 if sheet >= most {
                     continue;
                 }
-                let Apart { first, from, places, deep, .. } = &mut *apart;
+                let Apart { first, from, places, .. } = &mut *apart;
                 if let Some(before) = before.filter(|_| aside.is_none() && !skewed) {
                     // All in one place, also those of sheets that a voxel has no more.
                     first[axis][at] = first[axis][before];
@@ -168,13 +172,8 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
                 }
                 before = Some(at);
                 let place = &mut places[axis][at];
-                place[..n].copy_from_slice(&self.at[axis][..n]);
-                if let Some(aside) = aside {
-                    for i in 0..n {
-                        // What lies behind a voxel's last section is not drawn.
-                        let which = deep[i] as usize + sheet as usize;
-                        place[i] += aside[which.min(aside.len() - 1)];
-                    }
+                if aside.is_none() {
+                    place[..n].copy_from_slice(&self.at[axis][..n]);
                 }
                 if skewed {
                     let phases = [phases, &self.axes.phases[1][0]];

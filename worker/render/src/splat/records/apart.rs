@@ -9,7 +9,7 @@
 
 use super::{BySlot, MOST, Record, Recorded, RowAt, STRIDE, Table};
 use crate::footprint::{Lean, Phases};
-use crate::splat::Simd;
+use crate::splat::{Level, Simd};
 use crate::tile::PART;
 use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
 
@@ -59,6 +59,41 @@ impl Default for Apart {
 }
 
 impl Apart {
+    /// Has sections of the first `n` voxels, which are `at` some place along `axis`, lie as far aside as `aside` says of
+    /// each phase's sheets ([`Leaning::subpixels`](crate::footprint::Leaning::subpixels)): in so many sheets from that
+    /// on which slot `first` holds. What lies behind a voxel's last section may lie anywhere.
+    #[inline(always)]
+    pub(crate) fn lean<const N: usize>(
+        &mut self,
+        simd: Simd,
+        axis: usize,
+        n: usize,
+        at: &Each<i32>,
+        aside: &[i32],
+        sheets: (usize, usize),
+    ) {
+        let places = &mut self.places[axis];
+        let which = (&self.deep, at);
+        match simd.0 {
+            // SAFETY: the value proves that the instructions are there.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => unsafe { lean::sixteen::<N>(places, n, which, aside, sheets) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe { lean::eight::<N>(places, n, which, aside, sheets) },
+            _ => {
+                let (first, sheets) = sheets;
+                for sheet in 0..sheets.min(N) {
+                    let place = &mut places[(first + sheet) % N];
+                    for i in 0..n {
+                        let which = self.deep[i] as usize + sheet;
+                        place[i] = at[i] + aside[which.min(aside.len() - 1)];
+                    }
+                }
+            }
+        }
+    }
+
     /// Begins windows of the first `n` voxels along `axis`.
     #[inline(always)]
     pub(crate) fn begin(&mut self, axis: usize, n: usize) {
@@ -119,6 +154,71 @@ impl Apart {
         let [x, y] = [self.lo[0][i] / step * step, self.lo[1][i]];
         let wide = (self.hi[0][i] - x + step - 1) / step * step;
         ([x, y].map(|lo| lo as usize), [wide, self.hi[1][i] - y].map(|n| n as usize))
+    }
+}
+
+/// [`Apart::lean`]: a voxel's sheets lie beside each other in the table, and voxels in what comes out.
+#[cfg(target_arch = "x86_64")]
+mod lean {
+    use super::{BATCH, Each, LINE};
+    use crate::splat::lanes::{Eight, Lanes, Sixteen};
+    use crate::splat::records::MOST;
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    pub(super) fn sixteen<const N: usize>(
+        places: &mut [Each<i32>; MOST],
+        n: usize,
+        which: (&Each<u32>, &Each<i32>),
+        aside: &[i32],
+        sheets: (usize, usize),
+    ) {
+        // SAFETY: these are the instructions.
+        unsafe { some::<Sixteen, N>(places, n, which, aside, sheets) }
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    pub(super) fn eight<const N: usize>(
+        places: &mut [Each<i32>; MOST],
+        n: usize,
+        which: (&Each<u32>, &Each<i32>),
+        aside: &[i32],
+        sheets: (usize, usize),
+    ) {
+        // SAFETY: these are the instructions.
+        unsafe { some::<Eight, N>(places, n, which, aside, sheets) }
+    }
+
+    #[inline(always)]
+    unsafe fn some<L: Lanes, const N: usize>(
+        places: &mut [Each<i32>; MOST],
+        n: usize,
+        (deep, at): (&Each<u32>, &Each<i32>),
+        aside: &[i32],
+        (first, sheets): (usize, usize),
+    ) {
+        let last = aside.len().checked_sub(MOST).expect("a voxel's sheets and more");
+        for i in (0..n.min(BATCH)).step_by(L::LANES) {
+            let some = i..i + L::LANES;
+            // Those of no voxel at hand are anything.
+            let mut which = [0; LINE];
+            for (to, &deep) in which[..L::LANES].iter_mut().zip(&deep[some.clone()]) {
+                *to = deep.min(last as u32);
+            }
+            // SAFETY: the caller's. Fours begin at most at the `last`, and four later; as many lanes are left in
+            // what comes out.
+            unsafe {
+                let at = L::load(at[some.clone()].as_ptr().cast());
+                for four in 0..sheets.min(N).div_ceil(4) {
+                    let from = aside[4 * four..].as_ptr().cast();
+                    for (j, aside) in L::fours(from, 1, which.as_ptr()).into_iter().enumerate() {
+                        let place = &mut places[(first + 4 * four + j) % N];
+                        L::store(place[some.clone()].as_mut_ptr().cast(), L::plus(at, aside));
+                    }
+                }
+            }
+        }
     }
 }
 
@@ -492,6 +592,34 @@ mod tests {
     }
 
     proptest! {
+        #[test]
+        fn every_instruction_set_has_sections_lie_as_far_aside(
+            at in prop::collection::vec(-9000..9000i32, BATCH),
+            deep in prop::collection::vec(0..48u32, BATCH),
+            n in 0..=BATCH, first in 0..MOST, sheets in 1..=MOST, axis in 0..2usize,
+        ) {
+            let aside: Vec<i32> = (0..40 + MOST as i32).map(|i| i * 37 % 301 - 150).collect();
+            let at: Each<i32> = at.try_into().expect("a batch");
+            let of = |simd| {
+                let mut apart = Apart::default();
+                apart.deep.copy_from_slice(&deep);
+                apart.lean::<MOST>(simd, axis, n, &at, &aside, (first, sheets));
+                // What lies behind the last section may lie anywhere.
+                let some = |i: &usize| deep[*i] as usize + sheets <= 40;
+                let voxel = |i: usize| (0..sheets).map(move |sheet| (sheet, i));
+                let places = (0..n).filter(some).flat_map(voxel);
+                places.map(|(s, i)| apart.places[axis][(first + s) % MOST][i]).collect::<Vec<_>>()
+            };
+            let want = of(Simd::plain());
+            let on_paper = (0..n).find(|&i| deep[i] as usize + sheets <= 40);
+            if let Some(i) = on_paper {
+                prop_assert_eq!(want[0], at[i] + aside[deep[i] as usize]);
+            }
+            for simd in Simd::all() {
+                prop_assert_eq!(&of(simd), &want, "{}", simd.name());
+            }
+        }
+
         #[test]
         fn every_instruction_set_adds_voxels_as_one_by_one(
             voxels in prop::collection::vec(somewhere(), 0..BATCH), slot in 0..MOST,

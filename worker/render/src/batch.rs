@@ -40,6 +40,17 @@ pub(crate) struct Axes<'a, S: Recorded, const N: usize> {
 }
 
 impl<'a, S: Recorded, const N: usize> Axes<'a, S, N> {
+    /// Has another footprint in a slot.
+    #[inline(always)]
+    pub(crate) fn put(&mut self, slot: usize, footprint: &Footprint<'a>) {
+        for axis in 0..2 {
+            let table = footprint.phases(axis).zip(S::across(footprint, axis));
+            let (phases, weights) = table.expect("footprints have tables");
+            self.phases[axis][slot] = phases;
+            self.layers.across[axis][slot] = Table { weights, len: phases.len };
+        }
+    }
+
     /// Of the footprints that `at` knows by slot, for voxels that begin in sheet `k`.
     #[inline(always)]
     pub(crate) fn new(frame: &'a Frame, k: i32, at: [Footprint<'a>; N]) -> Self {
@@ -131,13 +142,13 @@ impl Batch {
         let apart = &self.apart;
         // All windows as wide and high as the largest: they are alike but for a pixel or two, and pixels that nothing was
         // added to are found out when they close.
-        let (mut corners, mut largest) = ([0; EDGE], [1; 2]);
+        let (mut corners, mut columns, mut rows) = ([0; EDGE], 1, 1);
         for &i in &apart.kept[..some] {
-            let ([x, y], wide) = apart.window(i as usize % BATCH, S::step::<N>());
+            let ([x, y], [wide, high]) = apart.window(i as usize % BATCH, S::step::<N>());
             corners[y % EDGE] |= 1 << x;
-            largest = [0, 1].map(|axis| largest[axis].max(wide[axis]));
+            (columns, rows) = (columns.max(wide), rows.max(high));
         }
-        sheets.touch_all(k, &corners, largest);
+        sheets.touch_all(k, &corners, [columns, rows]);
         let row = part.frame.leaning.as_ref().map_or(0, Leaning::row);
         let voxels = (apart, &payloads[..some]);
         if row == 0 {

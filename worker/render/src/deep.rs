@@ -9,7 +9,7 @@
 //! aside of it. Where that is far, as very near the eye, [`crate::general`] takes over.
 
 use crate::batch::{Axes, Batch};
-use crate::footprint::{Footprint, Leaning};
+use crate::footprint::Leaning;
 use crate::level::LevelSheets;
 use crate::mask::{OpenMask, REACH_MOST};
 use crate::scene::Frame;
@@ -171,6 +171,13 @@ impl<S: Tiered, const N: usize> Work for RenderDeepLevel<'_, S, N> {
 }
 
 struct DeepStage<'a, S: Recorded, const N: usize> {
+    /// Of the sheets that voxels reached last; none before the first.
+    footprints: Option<Footprints<'a, S, N>>,
+    drawing: Drawing<'a, S, N>,
+}
+
+/// All but footprints.
+struct Drawing<'a, S: Recorded, const N: usize> {
     part: &'a Part<'a>,
     deep: Deep,
     simd: Simd,
@@ -192,14 +199,51 @@ impl<'a, S: Recorded, const N: usize> DeepStage<'a, S, N> {
     ) -> (Self, &'a mut Queues<DeepVoxel>) {
         let Waiting { queues, tossing, batch, places } = waiting;
         let across = Woven::default();
-        (DeepStage { part, deep, simd, tossing, batch, places, across }, queues)
+        let drawing = Drawing { part, deep, simd, tossing, batch, places, across };
+        (DeepStage { footprints: None, drawing }, queues)
     }
 }
 
-/// Footprints of sheets by slot, and their scales.
-type Footprints<'a, S, const N: usize> = (Axes<'a, S, N>, [f64; N]);
+/// Footprints of sheets by slot.
+struct Footprints<'a, S: Recorded, const N: usize> {
+    axes: Axes<'a, S, N>,
+    scales: [f64; N],
+    /// Which sheet's each slot has.
+    sheets: [i32; N],
+}
 
-impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
+impl<'a, S: Recorded, const N: usize> Footprints<'a, S, N> {
+    /// Of sheet `k`, in all slots.
+    #[inline(always)]
+    fn new(part: &'a Part<'_>, k: i32) -> Self {
+        let footprint = part.frame.footprints.at(k).expect(DRAWN);
+        let axes = Axes::new(part.frame, k, [footprint; N]);
+        Footprints { axes, scales: [footprint.scale; N], sheets: [k; N] }
+    }
+
+    /// Those of the sheets from `k` that a voxel may reach: from one to the next it is one that changes.
+    #[inline(always)]
+    fn come_to(&mut self, part: &'a Part<'_>, k: i32) {
+        let footprints = &part.frame.footprints;
+        let last = (k + part.frame.sections.most() as i32 - 1).min(footprints.last());
+        let slot = slot::<N>(k);
+        self.axes.layers.slot = slot;
+        for at in 0..N {
+            // Sheets farther back than a voxel reaches are not asked for; any will do.
+            let sheet = (k + after::<N>(slot, at)).min(last);
+            if self.sheets[at] != sheet {
+                let footprint = footprints.at(sheet).expect(DRAWN);
+                self.axes.put(at, &footprint);
+                (self.scales[at], self.sheets[at]) = (footprint.scale, sheet);
+            }
+        }
+    }
+}
+
+/// What [`takes`] has found out.
+const DRAWN: &str = "no sheet of the part is clipped";
+
+impl<S: Recorded, const N: usize> Drawing<'_, S, N> {
     /// [`Stage::toss`].
     #[inline(always)]
     fn toss_all(
@@ -265,7 +309,7 @@ macro_rules! stage {
 
             #[inline(always)]
             fn reach(&self) -> [i32; 2] {
-                self.deep.reach
+                self.drawing.deep.reach
             }
 
             #[inline(always)]
@@ -276,7 +320,7 @@ macro_rules! stage {
                 queues: &mut Queues<DeepVoxel>,
                 counters: &mut Counters,
             ) {
-                self.toss_all(which, open, queues, counters);
+                self.drawing.toss_all(which, open, queues, counters);
             }
 
             #[inline(always)]
@@ -288,10 +332,13 @@ macro_rules! stage {
                 open: &OpenMask,
                 counters: &mut Counters,
             ) {
-                let footprints = footprints::<S, N>(self.part, k);
+                let DeepStage { footprints, drawing } = self;
+                let part = drawing.part;
+                let footprints = footprints.get_or_insert_with(|| Footprints::new(part, k));
+                footprints.come_to(part, k);
                 for some in due.chunks(BATCH) {
-                    let n = self.take(&some, k, open);
-                    self.$add(n, k, &footprints, sheets, open, (some.len(), counters));
+                    let n = drawing.take(&some, k, open);
+                    drawing.$add(n, k, footprints, sheets, open, (some.len(), counters));
                 }
             }
         }
@@ -301,19 +348,7 @@ macro_rules! stage {
 stage!(Recorded, Sheets, add);
 stage!(Tiered, LevelSheets, add_level);
 
-/// Footprints of the sheets from `k` that a voxel may reach.
-#[inline(always)]
-fn footprints<'a, S: Recorded, const N: usize>(part: &'a Part<'_>, k: i32) -> Footprints<'a, S, N> {
-    let last = (k + part.frame.sections.most() as i32 - 1).min(part.frame.footprints.last());
-    let all: [Footprint<'a>; N] = std::array::from_fn(|at| {
-        // Sheets farther back than a voxel reaches are not asked for; any will do.
-        let sheet = (k + after::<N>(slot::<N>(k), at)).min(last);
-        part.frame.footprints.at(sheet).expect("no sheet of the part is clipped")
-    });
-    (Axes::new(part.frame, k, all), all.map(|footprint| footprint.scale))
-}
-
-impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
+impl<S: Recorded, const N: usize> Drawing<'_, S, N> {
     /// Takes over `v`, which has `left` sheets left, as voxel `i` of the batch.
     #[inline(always)]
     fn put(&mut self, i: usize, v: &DeepVoxel, left: i32) {
@@ -330,7 +365,7 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
     fn place(
         &mut self,
         (n, k): (usize, i32),
-        (axes, scales): &Footprints<'_, S, N>,
+        Footprints { axes, scales, .. }: &Footprints<'_, S, N>,
         along: &[usize],
     ) {
         let Part { frame, rect, .. } = self.part;
@@ -406,12 +441,12 @@ impl<S: Recorded, const N: usize> DeepStage<'_, S, N> {
         self.place((n, k), footprints, &[1, 0]);
         let (part, eyes, across) =
             ((self.part, open), Some(&mut self.places.eye), &mut self.across);
-        self.batch.add(part, (n, k), &footprints.0, eyes, across, sheets, counted);
+        self.batch.add(part, (n, k), &footprints.axes, eyes, across, sheets, counted);
     }
 }
 
-impl<S: Tiered, const N: usize> DeepStage<'_, S, N> {
-    /// [`DeepStage::add`] to tiers.
+impl<S: Tiered, const N: usize> Drawing<'_, S, N> {
+    /// [`Drawing::add`] to tiers.
     #[inline(always)]
     fn add_level(
         &mut self,
@@ -422,7 +457,7 @@ impl<S: Tiered, const N: usize> DeepStage<'_, S, N> {
         open: &OpenMask,
         counted: (usize, &mut Counters),
     ) {
-        let (Axes { layers, .. }, _) = footprints;
+        let Axes { layers, .. } = &footprints.axes;
         let frame = self.part.frame;
         let storeys = frame.storeys.as_ref().expect("a level view");
         let shape = sheets.tiers.shape();

@@ -9,7 +9,9 @@
 
 use super::{BySlot, MOST, Record, Recorded, RowAt, STRIDE, Table};
 use crate::footprint::{Lean, Phases};
-use crate::splat::{Level, Simd};
+#[cfg(target_arch = "x86_64")]
+use crate::splat::Level;
+use crate::splat::Simd;
 use crate::tile::PART;
 use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
 
@@ -73,14 +75,15 @@ impl Apart {
         sheets: (usize, usize),
     ) {
         let places = &mut self.places[axis];
-        let which = (&self.deep, at);
         match simd.0 {
             // SAFETY: the value proves that the instructions are there.
             #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => unsafe { lean::sixteen::<N>(places, n, which, aside, sheets) },
+            Level::Avx512 => unsafe {
+                lean::sixteen::<N>(places, n, (&self.deep, at), aside, sheets)
+            },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => unsafe { lean::eight::<N>(places, n, which, aside, sheets) },
+            Level::Avx2 => unsafe { lean::eight::<N>(places, n, (&self.deep, at), aside, sheets) },
             _ => {
                 let (first, sheets) = sheets;
                 for sheet in 0..sheets.min(N) {

@@ -40,34 +40,35 @@ pub(crate) struct Axes<'a, S: Recorded, const N: usize> {
 }
 
 impl<'a, S: Recorded, const N: usize> Axes<'a, S, N> {
+    /// With one footprint in all slots, for voxels that begin in sheet `k`.
+    #[inline(always)]
+    pub(crate) fn new(frame: &'a Frame, k: i32, footprint: &Footprint<'a>) -> Self {
+        let [(x, phases_x), (y, phases_y)] = [along::<S>(footprint, 0), along::<S>(footprint, 1)];
+        let deep = Table { weights: S::deep(&frame.sections), len: frame.sections.most() };
+        let alike = frame.has_columns_alike();
+        let layers = Layers { across: [[x; N], [y; N]], deep, slot: slot::<N>(k), alike };
+        Axes { layers, phases: [[phases_x; N], [phases_y; N]] }
+    }
+
     /// Has another footprint in a slot.
     #[inline(always)]
     pub(crate) fn put(&mut self, slot: usize, footprint: &Footprint<'a>) {
         for axis in 0..2 {
-            let table = footprint.phases(axis).zip(S::across(footprint, axis));
-            let (phases, weights) = table.expect("footprints have tables");
-            self.phases[axis][slot] = phases;
-            self.layers.across[axis][slot] = Table { weights, len: phases.len };
+            let (table, phases) = along::<S>(footprint, axis);
+            (self.layers.across[axis][slot], self.phases[axis][slot]) = (table, phases);
         }
     }
+}
 
-    /// Of the footprints that `at` knows by slot, for voxels that begin in sheet `k`.
-    #[inline(always)]
-    pub(crate) fn new(frame: &'a Frame, k: i32, at: [Footprint<'a>; N]) -> Self {
-        let along = |axis| {
-            at.map(|footprint| {
-                let table = footprint.phases(axis).zip(S::across(&footprint, axis));
-                table.expect("footprints have tables")
-            })
-        };
-        let axes = [along(0), along(1)];
-        let across =
-            axes.map(|slots| slots.map(|(phases, weights)| Table { weights, len: phases.len }));
-        let deep = Table { weights: S::deep(&frame.sections), len: frame.sections.most() };
-        let alike = frame.has_columns_alike();
-        let layers = Layers { across, deep, slot: slot::<N>(k), alike };
-        Axes { layers, phases: axes.map(|slots| slots.map(|(phases, _)| phases)) }
-    }
+/// Weights of a footprint along an axis, and where they lie.
+#[inline(always)]
+fn along<'a, S: Recorded>(
+    footprint: &Footprint<'a>,
+    axis: usize,
+) -> (Table<'a, S::Weight>, Phases) {
+    let table = footprint.phases(axis).zip(S::across(footprint, axis));
+    let (phases, weights) = table.expect("footprints have tables");
+    (Table { weights, len: phases.len }, phases)
 }
 
 impl Batch {

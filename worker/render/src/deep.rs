@@ -170,13 +170,14 @@ impl<S: Tiered, const N: usize> Work for RenderDeepLevel<'_, S, N> {
     }
 }
 
+/// How a part's voxels get into its sheets.
 struct DeepStage<'a, S: Recorded, const N: usize> {
     /// Of the sheets that voxels reached last; none before the first.
     footprints: Option<Footprints<'a, S, N>>,
     drawing: Drawing<'a, S, N>,
 }
 
-/// All but footprints.
+/// All of that but footprints, which are read while this changes.
 struct Drawing<'a, S: Recorded, const N: usize> {
     part: &'a Part<'a>,
     deep: Deep,
@@ -217,11 +218,11 @@ impl<'a, S: Recorded, const N: usize> Footprints<'a, S, N> {
     #[inline(always)]
     fn new(part: &'a Part<'_>, k: i32) -> Self {
         let footprint = part.frame.footprints.at(k).expect(DRAWN);
-        let axes = Axes::new(part.frame, k, [footprint; N]);
+        let axes = Axes::new(part.frame, k, &footprint);
         Footprints { axes, scales: [footprint.scale; N], sheets: [k; N] }
     }
 
-    /// Those of the sheets from `k` that a voxel may reach: from one to the next it is one that changes.
+    /// Those of the sheets from `k` that a voxel may reach: from one sheet to the next only one of them is new.
     #[inline(always)]
     fn come_to(&mut self, part: &'a Part<'_>, k: i32) {
         let footprints = &part.frame.footprints;

@@ -57,7 +57,7 @@ impl<S: Recorded> Work for RenderLeaning<'_, S> {
     fn run(self, simd: Simd) {
         let RenderLeaning { part, lean, store, waiting, pixels, io } = self;
         let footprint = part.frame.footprints.at(0).expect("a flat view's sheets are all drawn");
-        let axes = Axes::new(part.frame, 0, [footprint; MOST]);
+        let axes = Axes::new(part.frame, 0, &footprint);
         let Waiting { queues, tossing, batch } = waiting;
         let (at, across) = ([[0; BATCH]; 2], Woven::default());
         let stage = LeaningStage { part: &part, simd, lean, axes, tossing, batch, at, across };

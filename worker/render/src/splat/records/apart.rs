@@ -79,11 +79,11 @@ impl Apart {
             // SAFETY: the value proves that the instructions are there.
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe {
-                lean::sixteen::<N>(places, n, (&self.deep, at), aside, sheets)
+                lean::sixteen::<N>((places, &self.deep, at, aside), n, sheets)
             },
             // SAFETY: as above.
             #[cfg(target_arch = "x86_64")]
-            Level::Avx2 => unsafe { lean::eight::<N>(places, n, (&self.deep, at), aside, sheets) },
+            Level::Avx2 => unsafe { lean::eight::<N>((places, &self.deep, at, aside), n, sheets) },
             _ => {
                 let (first, sheets) = sheets;
                 for sheet in 0..sheets.min(N) {
@@ -167,38 +167,28 @@ mod lean {
     use crate::splat::lanes::{Eight, Lanes, Sixteen};
     use crate::splat::records::MOST;
 
+    /// Where sections lie by slot, and of the voxels where weights in depth begin and where they are; how far
+    /// sections lie aside.
+    type At<'a> = (&'a mut [Each<i32>; MOST], &'a Each<u32>, &'a Each<i32>, &'a [i32]);
+
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    pub(super) fn sixteen<const N: usize>(
-        places: &mut [Each<i32>; MOST],
-        n: usize,
-        which: (&Each<u32>, &Each<i32>),
-        aside: &[i32],
-        sheets: (usize, usize),
-    ) {
+    pub(super) fn sixteen<const N: usize>(at: At<'_>, n: usize, sheets: (usize, usize)) {
         // SAFETY: these are the instructions.
-        unsafe { some::<Sixteen, N>(places, n, which, aside, sheets) }
+        unsafe { some::<Sixteen, N>(at, n, sheets) }
     }
 
     #[target_feature(enable = "avx2")]
     #[inline]
-    pub(super) fn eight<const N: usize>(
-        places: &mut [Each<i32>; MOST],
-        n: usize,
-        which: (&Each<u32>, &Each<i32>),
-        aside: &[i32],
-        sheets: (usize, usize),
-    ) {
+    pub(super) fn eight<const N: usize>(at: At<'_>, n: usize, sheets: (usize, usize)) {
         // SAFETY: these are the instructions.
-        unsafe { some::<Eight, N>(places, n, which, aside, sheets) }
+        unsafe { some::<Eight, N>(at, n, sheets) }
     }
 
     #[inline(always)]
     unsafe fn some<L: Lanes, const N: usize>(
-        places: &mut [Each<i32>; MOST],
+        (places, deep, at, aside): At<'_>,
         n: usize,
-        (deep, at): (&Each<u32>, &Each<i32>),
-        aside: &[i32],
         (first, sheets): (usize, usize),
     ) {
         let last = aside.len().checked_sub(MOST).expect("a voxel's sheets and more");
@@ -283,6 +273,7 @@ pub(crate) fn after<const N: usize>(first: usize, slot: usize) -> i32 {
 pub(crate) struct Woven<W, const N: usize> {
     /// By slot, of a window's columns and of its rows.
     by_slot: [[BySlot<W, N>; WINDOW]; 2],
+    /// Across and down.
     #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
     pub(super) spans: [lines::Spans<N>; 2],
 }

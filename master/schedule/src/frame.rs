@@ -777,7 +777,7 @@ impl Frame {
             });
             let suits = |place| {
                 slab.queue.tasks[place as usize].was_lent()
-                    || regions.is_worth_taking(place, id, left)
+                    || regions.is_worth_taking(place, id, left, &cluster.memory)
                     || self.until(slab, regions, place) <= now
             };
             match self.next(cluster, id, |_| true, suits) {
@@ -984,8 +984,7 @@ impl Frame {
             }
             self.ledger.stalled(worker, cost);
             cluster.residency.touched(self.job.scene.bricks, &cost.touched);
-            let whose = (worker, regions.home(place, worker, &cluster.roster));
-            cluster.memory.learn(regions, (place, &tile), whose, end - start, &cost.touched);
+            cluster.memory.learn(regions, (place, &tile), worker, end - start, &cost.touched);
         }
         self.ledger.spans.tile(spans::Tile {
             corner: [tile.x0, tile.y0],

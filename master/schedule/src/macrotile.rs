@@ -214,15 +214,23 @@ impl Through {
     }
 
     /// See [`cut_through`].
-    pub(crate) fn cut(&self, (wanted, many): (u64, u64), forced: Option<u32>) -> Cut {
+    pub(crate) fn cut(&self, wanted: (u64, u64), forced: Option<u32>) -> Cut {
+        let level = forced_level(forced).unwrap_or_else(|| self.level(wanted));
+        list(self.size, &self.tree[level], level, &|n| n.covered > 0, |_| false)
+    }
+
+    /// The edge of the tiles that are cut where none is forced.
+    pub(crate) fn edge(&self, wanted: (u64, u64)) -> u32 {
+        LEAF << self.level(wanted)
+    }
+
+    fn level(&self, (wanted, many): (u64, u64)) -> usize {
         const PART: usize = 2;
-        let to_render = |n: &Node| n.covered > 0;
-        let tree = &self.tree;
-        let level = forced_level(forced)
-            .or_else(|| coarsest(tree, &to_render, many).filter(|&level| level >= PART))
-            .or_else(|| coarsest(tree, &to_render, wanted).map(|level| level.min(PART)))
-            .unwrap_or(0);
-        list(self.size, &tree[level], level, &to_render, |_| false)
+        let coarsest = |wanted| coarsest(&self.tree, &|n| n.covered > 0, wanted);
+        coarsest(many)
+            .filter(|&level| level >= PART)
+            .or_else(|| coarsest(wanted).map(|level| level.min(PART)))
+            .unwrap_or(0)
     }
 }
 

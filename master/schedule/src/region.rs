@@ -30,7 +30,7 @@
 
 use crate::alone;
 use crate::macrotile::{Cut, Macrotile, Through};
-use crate::roster::{Roster, Worker};
+use crate::roster::Roster;
 use crate::{FrameJob, Micros};
 use slabcast_common::blocks::{Block, Blocks};
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
@@ -81,6 +81,15 @@ const BEGIN: f64 = 0.4;
 /// mri256 `peer-semi` at 1024x1024 (122 tiles) on 64 workers has 68 % with one in flight where it has 66 after tiles of 32.
 const LARGE: usize = 64;
 
+/// Of a path's frames for the same threads, tiles stay as large as those of the frame before while they are as many as are asked
+/// for up to this part. Where a picture of a path has 40 tiles of 64 pixels and the next one 41, and 40 are asked for,
+/// everybody would be sent most bricks anew (mri256 on 16 workers at 1 Gbit/s: 1.2 MB, 13 ms).
+const STAY: f64 = 0.1;
+
+/// Of tiles that are asked for, a crew's frame has so many: 2 a thread where 2.5 are. Who is done with his draws those of the
+/// crew's next frame meanwhile. On 32 workers a crew draws mri256 in 40 tiles of 64 pixels or in 130 of 32.
+const CREW_ASKS: f64 = 0.8;
+
 /// How much longer the parts of a tile of 64 pixels take together than the tile: 17 to 30 %, 24 of mri256 `peer-semi`
 /// at 1024x1024.
 const MORE: f64 = 1.24;
@@ -111,9 +120,6 @@ struct Known {
     frame: u64,
     /// Who drew it last.
     owner: WorkerId,
-    /// Whose it was to be. Who has nothing to do takes a tile for once: next time it is drawn where its
-    /// neighbours are, lest borders, and with them bricks that two workers hold, become more and more.
-    home: WorkerId,
     /// What it takes its owner.
     us: f64,
     /// Places of the bricks that it was drawn from.
@@ -125,6 +131,18 @@ struct Known {
 struct Lessons {
     kind: Kind,
     tiles: BTreeMap<Sides, Known>,
+    /// Whose each was to be in the frame that was cut last, drawn or not. Who has nothing to do takes a tile for once:
+    /// next time it is drawn where its neighbours are, lest borders, and with them bricks that two workers hold, become
+    /// more and more.
+    homes: BTreeMap<Sides, WorkerId>,
+    /// And its tiles' edge, for so many threads.
+    edge: Option<(u64, u32)>,
+}
+
+impl Lessons {
+    fn of(kind: Kind) -> Lessons {
+        Lessons { kind, tiles: BTreeMap::new(), homes: BTreeMap::new(), edge: None }
+    }
 }
 
 /// A rectangle as something that has an order.
@@ -280,7 +298,7 @@ impl Memory {
         &mut self,
         regions: &Regions,
         (place, tile): (u32, &Rect),
-        (owner, home): (WorkerId, WorkerId),
+        owner: WorkerId,
         us: Micros,
         touched: &[u32],
     ) {
@@ -295,16 +313,25 @@ impl Memory {
             }
             None => us,
         };
-        let at = self.lessons.iter().position(|l| l.kind == regions.kind).unwrap_or_else(|| {
+        let known = Known { frame: regions.frame, owner, us, touched: touched.to_vec() };
+        self.of_kind(regions.kind).tiles.insert(sides(tile), known);
+    }
+
+    fn of_kind(&mut self, kind: Kind) -> &mut Lessons {
+        let at = self.lessons.iter().position(|l| l.kind == kind).unwrap_or_else(|| {
             if self.lessons.len() == KINDS {
                 self.lessons.remove(0);
             }
-            self.lessons.push(Lessons { kind: regions.kind, tiles: BTreeMap::new() });
+            self.lessons.push(Lessons::of(kind));
             self.lessons.len() - 1
         });
-        let lessons = &mut self.lessons[at];
-        let known = Known { frame: regions.frame, owner, home, us, touched: touched.to_vec() };
-        lessons.tiles.insert(sides(tile), known);
+        &mut self.lessons[at]
+    }
+
+    /// Whose a tile was to be in the frame that was cut last.
+    fn home(&self, kind: Kind, tile: &Rect) -> Option<WorkerId> {
+        let lessons = self.lessons.iter().find(|l| l.kind == kind)?;
+        lessons.homes.get(&sides(tile)).copied()
     }
 
     /// A tile took one worker so long, and another before it: a quarter of what that says beyond what is known already
@@ -314,11 +341,20 @@ impl Memory {
         if here.min(there) < LEAST_TOLD {
             return;
         }
-        let slow = |id: &WorkerId| self.slow.get(id).copied().unwrap_or(1.0);
-        let (a, b) = (slow(&one), slow(&other));
+        let (a, b) = (self.slow(one), self.slow(other));
         let beyond = ((here / there) / (a / b)).clamp(0.1, 10.0).sqrt().sqrt();
         self.slow.insert(one, (a * beyond).clamp(0.01, 100.0));
         self.slow.insert(other, (b / beyond).clamp(0.01, 100.0));
+    }
+
+    /// How slow a worker is, beside others.
+    fn slow(&self, id: WorkerId) -> f64 {
+        self.slow.get(&id).copied().unwrap_or(1.0)
+    }
+
+    /// How many times longer a worker takes than another, as far as that is believed.
+    pub(crate) fn slower(&self, one: WorkerId, other: WorkerId) -> f64 {
+        believed(self.slow(one) / self.slow(other))
     }
 
     /// A worker is gone.
@@ -398,6 +434,31 @@ fn many(wanted: f64, threads: u64, shared: bool) -> u64 {
     many.ceil() as u64
 }
 
+/// The tiles' edge of a frame beside others, where the one before it had the `last`, if it was for as many threads.
+fn edge_beside(
+    through: &Through,
+    (wanted, threads): (f64, u64),
+    here: bool,
+    last: Option<u32>,
+) -> u32 {
+    let edge = |wanted: f64| through.edge((wanted.ceil() as u64, many(wanted, threads, here)));
+    match last {
+        Some(last) => last.clamp(edge((1.0 + STAY) * wanted), edge((1.0 - STAY) * wanted)),
+        None => edge(wanted),
+    }
+}
+
+/// The tiles' edge of a frame that is alone, before any is cut in parts.
+fn edge_alone(through: &Through, (wanted, threads): (f64, u64)) -> u32 {
+    let edge = |wanted: f64| through.edge((wanted.ceil() as u64, many(wanted, threads, false)));
+    let finest = edge(wanted);
+    if finest >= PLAIN {
+        return finest;
+    }
+    let coarsest = if through.count(PLAIN) < LARGE { PLAIN / 2 } else { PLAIN };
+    edge(BEGIN * wanted).min(coarsest).max(finest)
+}
+
 /// What a part takes of a tile that was drawn whole after it: as it was among the others, if they were known then.
 fn part_of(
     (one, whole): (&Known, &Rect),
@@ -465,11 +526,10 @@ pub(crate) struct Regions {
     owners: Vec<WorkerId>,
     /// Places of each worker's, ascending where nothing moved.
     owned: BTreeMap<WorkerId, Vec<u32>>,
-    /// Whose it was before anybody took it from them.
-    homes: Vec<WorkerId>,
     /// What each took its last owner, if that is known.
     took: Vec<Option<(WorkerId, f64)>>,
-    pace: Pace,
+    /// Microseconds that a guessed unit takes, in the mean.
+    unit: f64,
     /// What a brick takes who is sent it, in microseconds.
     brick: f64,
     /// Parts that tiles can be cut into while the frame is drawn; of a frame that is alone.
@@ -498,16 +558,21 @@ impl Regions {
         let crew = Crew::of_frame(beside, plain, roster);
         let threads = crew.members(roster).map(|m| m.1).sum::<u64>();
         let wanted = job.work.tiles_per_worker * threads as f64;
-        let many = many(wanted, threads, !alone && crew.is_here(roster));
-        let begin = (BEGIN * wanted).ceil() as u64;
-        let wanted = wanted.ceil() as u64;
         let kind = (key, size, crew);
-        let mut cut = through.cut((wanted, many), job.work.tile);
-        if alone && job.work.tile.is_none() && cut.edge < PLAIN {
-            let coarsest = if plain < LARGE { PLAIN / 2 } else { PLAIN };
-            let edge = through.cut((begin, many), None).edge.min(coarsest);
-            cut = through.cut((0, 0), Some(edge.max(cut.edge)));
-        }
+        let lessons = memory.of_kind(kind);
+        let edge = job.work.tile.unwrap_or_else(|| {
+            let last = lessons.edge.filter(|(of, _)| *of == threads).map(|(_, edge)| edge);
+            match alone {
+                true => edge_alone(&through, (wanted, threads)),
+                false => {
+                    let here = crew.is_here(roster);
+                    let wanted = if crew.of > 1 { CREW_ASKS * wanted } else { wanted };
+                    edge_beside(&through, (wanted, threads), here, last)
+                }
+            }
+        });
+        lessons.edge = Some((threads, edge));
+        let mut cut = through.cut((0, 0), Some(edge));
         let bytes = job.bricks.iter().map(|b| u64::from(b.bytes)).sum::<u64>();
         let wire = rate.map_or(0.0, |rate| bytes as f64 / job.bricks.len().max(1) as f64 / rate);
         let brick = BRICK + wire;
@@ -532,17 +597,25 @@ impl Regions {
         let recalled = |t: &Macrotile| taught.get(&sides(&t.rect));
         let of = |t: &Macrotile| recalled(t).map(Recalled::known);
         let known = |t: &Macrotile| of(t).map(|k| (k.owner, k.us));
-        let pace = Pace::of(&cut.tiles, &known);
-        pace.correct(&mut cut.tiles, &known);
+        let unit = unit(&cut.tiles, &known);
+        for t in &mut cut.tiles {
+            if let Some((_, us)) = known(t) {
+                t.est = in_units(us, unit);
+            }
+        }
         cut.sort(size);
         let bricks = |t: &Macrotile| of(t).map_or(0, |k| k.touched.len());
+        let slow = |id: WorkerId| memory.slow(id);
         let owners = if leveled && !taught.is_empty() {
-            let slow = |id: WorkerId| memory.slow.get(&id).copied().unwrap_or(1.0);
             let price = |t: &Macrotile| recalled(t).map_or(0.0, |k| brick * k.bricks_along());
-            level(&cut.tiles, roster, crew, (pace.mean, &slow), &known, &price)
+            level(&cut.tiles, roster, crew, (unit, &slow), &known, &price)
         } else {
-            let home = |t: &Macrotile| of(t).map(|k| k.home);
-            share(&cut.tiles, roster, crew, &pace, &known, (&home, &bricks))
+            let there = |id: &WorkerId| roster.get(*id).is_some_and(|w| !w.leaving);
+            let home = |t: &Macrotile| {
+                let home = memory.home(kind, &t.rect).filter(there);
+                home.or_else(|| Some(known(t)?.0))
+            };
+            share(&cut.tiles, roster, crew, (unit, &slow), &known, (&home, &bricks))
         };
         let took = cut.tiles.iter().map(known).collect();
         let mut owned = BTreeMap::<WorkerId, Vec<u32>>::new();
@@ -554,8 +627,10 @@ impl Regions {
             Some((place, known.clone()))
         };
         let told = cut.tiles.iter().zip(0..).filter_map(told).collect();
-        let homes = owners.clone();
-        (cut, Regions { kind, frame, told, homes, owners, owned, took, pace, brick, fine })
+        drop(taught);
+        let homes = cut.tiles.iter().zip(&owners).map(|(t, owner)| (sides(&t.rect), *owner));
+        memory.of_kind(kind).homes = homes.collect();
+        (cut, Regions { kind, frame, told, owners, owned, took, unit, brick, fine })
     }
 
     /// Who draws it.
@@ -567,12 +642,6 @@ impl Regions {
     pub(crate) fn orphaning(&self, roster: &Roster) -> Vec<WorkerId> {
         let gone = |id: &WorkerId| roster.get(*id).is_none_or(|w| !w.draws());
         self.owned.keys().copied().filter(gone).collect()
-    }
-
-    /// Whose a task is next time, if this worker drew it now.
-    pub(crate) fn home(&self, place: u32, drew: WorkerId, roster: &Roster) -> WorkerId {
-        let home = self.homes[place as usize];
-        if roster.get(home).is_some_and(Worker::draws) { home } else { drew }
     }
 
     /// Whose a task is.
@@ -604,7 +673,7 @@ impl Regions {
             let us = recalled.as_ref().map_or_else(guess, |k| k.known().us);
             let price = recalled.as_ref().map_or(0.0, |k| self.brick * k.bricks_along());
             let told = recalled.as_ref().and_then(Recalled::told).cloned();
-            let est = ((us / self.pace.mean) as u64).max(1);
+            let est = in_units(us, self.unit);
             Part { tile: Macrotile { rect, est }, us, price, told }
         };
         parts.into_iter().map(part).collect()
@@ -612,13 +681,12 @@ impl Regions {
 
     /// A waiting tile's parts are these workers' from now on, at the places behind all others.
     pub(crate) fn cut_late(&mut self, place: u32, parts: Vec<(Part, WorkerId)>) {
-        let (owner, home) = (self.owners[place as usize], self.homes[place as usize]);
+        let owner = self.owners[place as usize];
         let last = self.took[place as usize].map_or(owner, |t| t.0);
         self.owned.entry(owner).or_default().retain(|p| *p != place);
         for (part, to) in parts {
             let at = self.owners.len() as u32;
             self.owners.push(to);
-            self.homes.push(home);
             self.took.push(Some((last, part.us)));
             self.owned.entry(to).or_default().push(at);
             if let Some(known) = part.told {
@@ -661,10 +729,11 @@ impl Regions {
         place: u32,
         worker: WorkerId,
         left: &BTreeMap<WorkerId, f64>,
+        memory: &Memory,
     ) -> bool {
         let Some((last, us)) = self.took[place as usize] else { return true };
         let owner = self.owners[place as usize];
-        let here = us * self.pace.slowness(worker) / self.pace.slowness(last);
+        let here = us * memory.slower(worker, last);
         left.get(&owner).is_none_or(|left| *left > 2.0 * here)
     }
 
@@ -723,8 +792,7 @@ fn mixed(
 }
 
 /// Whose each tile of a frame that is alone is: whoever drew it last, unless the frame ends earlier if another does
-/// ([`alone::balance`]). What `Pace` says of workers is not asked: it compares guesses, and of the two or three tiles
-/// that each of 64 workers has one may well take three times what is guessed.
+/// ([`alone::balance`]).
 fn level(
     tiles: &[Macrotile],
     roster: &Roster,
@@ -746,11 +814,7 @@ fn level(
     let held: Vec<Option<usize>> =
         tiles.iter().map(|t| place_of(&staying, known(t)?.0, roster)).collect();
     let prices: Vec<f64> = tiles.iter().map(price).collect();
-    let cost = |i: usize, w: usize| {
-        let slower = slows[w] / takes[i].1;
-        let slower = if (1.0 / BELIEVED..=BELIEVED).contains(&slower) { 1.0 } else { slower };
-        takes[i].0 * slower / staying[w].1
-    };
+    let cost = |i: usize, w: usize| takes[i].0 * believed(slows[w] / takes[i].1) / staying[w].1;
     let mut load = vec![0.0; staying.len()];
     let mut owners: Vec<usize> = held.iter().map(|w| w.unwrap_or(0)).collect();
     for (i, w) in held.iter().enumerate() {
@@ -769,56 +833,24 @@ fn level(
     owners.into_iter().map(|w| staying[w].0).collect()
 }
 
-/// How long guessed units take.
-#[derive(Debug)]
-struct Pace {
-    /// Of each worker whose tiles are known: guessed units and microseconds.
-    workers: BTreeMap<WorkerId, (f64, f64)>,
-    /// Microseconds that a unit takes, in the mean; 1 before anything is known.
-    mean: f64,
-}
-
-/// How much slower or faster than the mean a worker must look before that is believed. The guess alone
-/// makes equal workers look different by a third; a core shared with somebody is slower by half.
+/// How much slower or faster than another a worker must look before that is believed: what a tile takes differs from
+/// frame to frame, and a core shared with somebody is slower by half.
 const BELIEVED: f64 = 2.0;
 
-impl Pace {
-    fn of(tiles: &[Macrotile], known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>) -> Pace {
-        let mut workers = BTreeMap::<WorkerId, (f64, f64)>::new();
-        for t in tiles {
-            if let Some((owner, us)) = known(t) {
-                let (units, took) = workers.entry(owner).or_default();
-                *units += t.est as f64;
-                *took += us;
-            }
-        }
-        let (units, us) =
-            workers.values().fold((0.0, 0.0), |(a, b), (units, us)| (a + units, b + us));
-        let mean = if units > 0.0 && us > 0.0 { us / units } else { 1.0 };
-        Pace { workers, mean }
-    }
+fn believed(slower: f64) -> f64 {
+    if (1.0 / BELIEVED..=BELIEVED).contains(&slower) { 1.0 } else { slower }
+}
 
-    /// How many times longer than in the mean it takes a worker, as far as that is believed.
-    fn slowness(&self, worker: WorkerId) -> f64 {
-        let Some(&(units, us)) = self.workers.get(&worker) else { return 1.0 };
-        let slow = if units > 0.0 { us / units / self.mean } else { 1.0 };
-        if (1.0 / BELIEVED..=BELIEVED).contains(&slow) { 1.0 } else { slow.clamp(0.01, 100.0) }
-    }
+/// Microseconds that a guessed unit takes, in the mean of tiles that are known; 1 before any is.
+fn unit(tiles: &[Macrotile], known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>) -> f64 {
+    let known = tiles.iter().filter_map(|t| Some((t.est as f64, known(t)?.1)));
+    let (units, us) = known.fold((0.0, 0.0), |(a, b), (units, us)| (a + units, b + us));
+    if units > 0.0 && us > 0.0 { us / units } else { 1.0 }
+}
 
-    /// Puts what tiles took in the place of what they are guessed to take: in guessed units, so that
-    /// the two can stand beside each other.
-    fn correct(
-        &self,
-        tiles: &mut [Macrotile],
-        known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>,
-    ) {
-        let mean = self.mean;
-        for t in tiles {
-            if let Some((_, us)) = known(t) {
-                t.est = ((us / mean) as u64).max(1);
-            }
-        }
-    }
+/// What a tile took, in the units that others are guessed in: so the two can stand beside each other.
+fn in_units(us: f64, unit: f64) -> u64 {
+    ((us / unit) as u64).max(1)
 }
 
 /// Whose each tile is: at first in bands, then its last owner's, unless that one would be done late; a
@@ -827,7 +859,7 @@ fn share(
     tiles: &[Macrotile],
     roster: &Roster,
     crew: Crew,
-    pace: &Pace,
+    (unit, slow): (f64, &impl Fn(WorkerId) -> f64),
     known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>,
     (home, bricks): (&impl Fn(&Macrotile) -> Option<WorkerId>, &impl Fn(&Macrotile) -> usize),
 ) -> Vec<WorkerId> {
@@ -835,25 +867,25 @@ fn share(
     if staying.is_empty() {
         return vec![WorkerId(0); tiles.len()];
     }
-    let mean = pace.mean;
-    let slowness: Vec<f64> = staying.iter().map(|s| pace.slowness(s.0)).collect();
+    let slows: Vec<f64> = staying.iter().map(|s| slow(s.0)).collect();
     // What is known of each tile is looked up once: the loops below ask for it again and again.
     let takes = |t: &Macrotile| match known(t) {
-        Some((owner, us)) => (us, pace.slowness(owner)),
-        None => (t.est as f64 * mean, 1.0),
+        Some((owner, us)) => (us, slow(owner)),
+        None => (t.est as f64 * unit, 1.0),
     };
     let takes: Vec<(f64, f64)> = tiles.iter().map(takes).collect();
     let homes: Vec<Option<usize>> =
         tiles.iter().map(|t| place_of(&staying, home(t)?, roster)).collect();
-    let cost = |i: usize, w: usize| takes[i].0 * slowness[w] / takes[i].1 / staying[w].1;
+    let cost = |i: usize, w: usize| takes[i].0 * believed(slows[w] / takes[i].1) / staying[w].1;
     let mut load = vec![0.0; staying.len()];
     // In the order of rows.
     let mut order: Vec<usize> = (0..tiles.len()).collect();
     order.sort_by_key(|&i| (tiles[i].rect.y0, tiles[i].rect.x0));
     let mut owners = vec![0; tiles.len()];
+    let drawn = tiles.iter().filter(|t| known(t).is_some()).count();
     if homes.iter().all(Option::is_none) {
         // Bands of rows, as high as each is fast.
-        let fast = |w: usize| staying[w].1 / slowness[w];
+        let fast = |w: usize| staying[w].1 / believed(slows[w]);
         let all = (0..staying.len()).map(fast).sum::<f64>();
         let work = tiles.iter().map(|t| t.est as f64).sum::<f64>();
         let (mut w, mut until, mut done) = (0, fast(0) / all * work, 0.0);
@@ -881,7 +913,9 @@ fn share(
             load[owners[i]] += cost(i, owners[i]);
         }
     }
-    for moved in 0..tiles.len() {
+    // While the first frame is drawn, others begin beside it: most of what loads are made of is guessed then.
+    let moves = if (1..tiles.len()).contains(&(2 * drawn)) { 0 } else { tiles.len() };
+    for moved in 0..moves {
         let by = |a: &usize, b: &usize| load[*a].total_cmp(&load[*b]);
         let ends = ((0..load.len()).max_by(by), (0..load.len()).min_by(by));
         let (Some(most), Some(least)) = ends else { break };
@@ -948,8 +982,8 @@ mod tests {
         roster: &Roster,
         known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>,
     ) -> Vec<WorkerId> {
-        let pace = Pace::of(tiles, known);
-        share(tiles, roster, Crew::ALL, &pace, known, (&at_home(known), &|_| 0))
+        let told = (unit(tiles, known), &|_| 1.0);
+        share(tiles, roster, Crew::ALL, told, known, (&at_home(known), &|_| 0))
     }
 
     fn shares(owners: &[WorkerId]) -> Vec<usize> {
@@ -1007,6 +1041,28 @@ mod tests {
     }
 
     #[test]
+    fn tiles_stay_as_large_as_they_are_where_either_size_would_do() {
+        // So many tiles of 64 pixels of 64, and four times as many of 32.
+        let picture = |n: i32| {
+            let tile = |i: i32| {
+                let (x, y) = (64 * (i % 8), 64 * (i / 8));
+                Rect::new(x, y, x + 64, y + 64)
+            };
+            Through::new([512, 512], &(0..n).map(tile).collect::<Vec<_>>())
+        };
+        let mut last = None;
+        let mut edge = |n| {
+            let edge = edge_beside(&picture(n), (40.0, 16), false, last);
+            last = Some(edge);
+            edge
+        };
+        assert_eq!(
+            [40, 41, 44, 45, 41, 40, 37, 36, 40].map(&mut edge),
+            [32, 32, 32, 64, 64, 64, 64, 32, 32]
+        );
+    }
+
+    #[test]
     fn a_tenth_of_the_speed_gets_a_tenth_of_the_work() {
         let (tiles, roster) = (tiles(42), roster(&[1, 1, 1]));
         let owners = among_all(&tiles, &roster, &|_| None);
@@ -1016,8 +1072,29 @@ mod tests {
             let owner = owners[at(t)];
             Some((owner, if owner.0 == 2 { 10_000.0 } else { 1000.0 }))
         };
-        let again = among_all(&tiles, &roster, &known);
+        let slow = |id: WorkerId| if id.0 == 2 { 10.0 } else { 1.0 };
+        let told = (unit(&tiles, &known), &slow);
+        let again = share(&tiles, &roster, Crew::ALL, told, &known, (&at_home(&known), &|_| 0));
         assert_eq!(shares(&again), [20, 2, 20]);
+    }
+
+    #[test]
+    fn what_few_tiles_took_moves_none() {
+        let (tiles, roster) = (tiles(24), roster(&[1, 1, 1]));
+        let bands = among_all(&tiles, &roster, &|_| None);
+        let at = |t: &Macrotile| (t.rect.x0 / 64) as usize;
+        // The first tiles that are drawn lie at the edge of what is to be seen, and take a hundredth of what is guessed.
+        let shared = |drawn: usize| {
+            let known = |t: &Macrotile| {
+                let us = if at(t) < 4 { 10.0 } else { 1000.0 };
+                (at(t) < drawn).then(|| (bands[at(t)], us))
+            };
+            let told = (unit(&tiles, &known), &|_| 1.0);
+            let home = |t: &Macrotile| Some(bands[at(t)]);
+            share(&tiles, &roster, Crew::ALL, told, &known, (&home, &|_| 0))
+        };
+        assert_eq!([1, 4, 11].map(shared), [(); 3].map(|()| bands.clone()));
+        assert_ne!(shared(24), bands, "all are known, and the first worker has half as much to do");
     }
 
     #[test]
@@ -1026,10 +1103,10 @@ mod tests {
         let at = |t: &Macrotile| t.rect.x0 / 64;
         // Seven tiles of 1 ms against five: half of a millisecond is won by moving one.
         let known = |t: &Macrotile| Some((WorkerId(if at(t) < 7 { 1 } else { 2 }), 1000.0));
-        let pace = Pace::of(&tiles, &known);
+        let told = (unit(&tiles, &known), &|_| 1.0);
         let moved = |bricks: usize| {
-            let owners =
-                share(&tiles, &roster, Crew::ALL, &pace, &known, (&at_home(&known), &|_| bricks));
+            let whose = (&at_home(&known), &|_: &Macrotile| bricks);
+            let owners = share(&tiles, &roster, Crew::ALL, told, &known, whose);
             owners.iter().filter(|o| o.0 == 1).count()
         };
         assert_eq!([moved(0), moved(300), moved(360)], [6, 6, 7]);
@@ -1054,11 +1131,11 @@ mod tests {
         for (frame, drawn) in (1..).zip(frames) {
             for (rect, us, touched) in *drawn {
                 let (owner, touched) = (WorkerId(frame), touched.to_vec());
-                let known = Known { frame, owner, home: owner, us: *us, touched };
+                let known = Known { frame, owner, us: *us, touched };
                 tiles.insert(sides(rect), known);
             }
         }
-        let lessons = vec![Lessons { kind, tiles }];
+        let lessons = vec![Lessons { tiles, ..Lessons::of(kind) }];
         (Memory { lessons, ..Memory::default() }, kind)
     }
 
@@ -1118,13 +1195,14 @@ mod tests {
 
     #[test]
     fn estimates_are_corrected_in_units_of_the_guess() {
-        let mut tiles = tiles(3);
+        let tiles = tiles(3);
         let known = |t: &Macrotile| match t.rect.x0 {
             0 => Some((WorkerId(1), 300.0)),
             64 => Some((WorkerId(1), 100.0)),
             _ => None,
         };
-        Pace::of(&tiles, &known).correct(&mut tiles, &known);
-        assert_eq!(tiles.iter().map(|t| t.est).collect::<Vec<_>>(), [6144, 2048, 4096]);
+        let unit = unit(&tiles, &known);
+        assert_eq!([300.0, 100.0, 200.0].map(|us| in_units(us, unit)), [6144, 2048, 4096]);
+        assert_eq!(in_units(0.0, unit), 1);
     }
 }

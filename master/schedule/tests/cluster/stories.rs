@@ -463,6 +463,58 @@ fn what_a_worker_has_last_is_cut_and_shared_where_it_would_be_late() {
 }
 
 #[test]
+fn frames_that_begin_while_the_first_is_drawn_are_shared_out_as_it_is() {
+    let mut w = world();
+    workers(&mut w, 8);
+    for frame in 0..4 {
+        // The same view again and again.
+        let work = Work { tile: Some(16), schedule: Schedule::Region, ..slab() };
+        let quality = Quality { thickness: 1.0, ..Quality::default() };
+        let mut job = job_with(0, work, quality);
+        (job.frame, job.number) = (FrameId(frame), frame);
+        w.queue(job);
+    }
+    w.finish();
+    let sent =
+        |frame| w.done[&FrameId(frame)].stats.workers.iter().map(|v| v.bricks_sent).sum::<u64>();
+    let sent: Vec<u64> = (0..4).map(sent).collect();
+    // What the first three tiles took is known when the second begins. Later ones know enough to move some.
+    assert!(10 * sent[1] < sent[0], "{sent:?}");
+}
+
+#[test]
+fn workers_of_other_speeds_get_fitting_shares_of_a_path() {
+    // What the others do in a frame's time; in tiles of 16 pixels, of which a frame has up to 64.
+    let run = |speeds: &[f64]| {
+        let mut w = world();
+        for speed in speeds {
+            w.join(Nature { us_per_pixel_sheet: 0.5 / speed, ..Nature::default() });
+        }
+        let work = Work { tile: Some(16), schedule: Schedule::Region, ..slab() };
+        for frame in 0..32 {
+            let quality = Quality { thickness: 1.0, ..Quality::default() };
+            w.queue(job_with(frame, work, quality));
+        }
+        w.run_until(|w| w.done.len() >= 8);
+        let (from, done) = (w.now(), w.done.len());
+        w.run_until(|w| w.done.len() >= 24);
+        let each = (w.now() - from) as f64 / (w.done.len() - done) as f64;
+        w.finish();
+        each * speeds.iter().sum::<f64>()
+    };
+    let healthy = run(&[1.0; 8]);
+    for speeds in [
+        [1.0, 1.0, 1.0, 0.1, 1.0, 1.0, 1.0, 1.0],
+        [1.0, 0.3, 1.0, 0.3, 1.0, 0.3, 1.0, 1.0],
+        [1.0, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2],
+    ] {
+        let ratio = run(&speeds) / healthy;
+        println!("speeds {speeds:?}: {ratio:.2} x of what they can do");
+        assert!(ratio <= 1.3, "{speeds:?}: {ratio:.2} x");
+    }
+}
+
+#[test]
 fn a_tile_that_moves_takes_its_bricks_along() {
     let mut w = world();
     let gone = w.join(Nature::default());

@@ -135,7 +135,7 @@ struct Lessons {
     /// next time it is drawn where its neighbours are, lest borders, and with them bricks that two workers hold, become
     /// more and more.
     homes: BTreeMap<Sides, WorkerId>,
-    /// And its tiles' edge, for so many threads.
+    /// And its tiles' edge, for so many threads; none if it was alone.
     edge: Option<(u64, u32)>,
 }
 
@@ -571,7 +571,7 @@ impl Regions {
                 }
             }
         });
-        lessons.edge = Some((threads, edge));
+        lessons.edge = (!alone).then_some((threads, edge));
         let mut cut = through.cut((0, 0), Some(edge));
         let bytes = job.bricks.iter().map(|b| u64::from(b.bytes)).sum::<u64>();
         let wire = rate.map_or(0.0, |rate| bytes as f64 / job.bricks.len().max(1) as f64 / rate);

@@ -138,7 +138,7 @@ pub fn cut(
 ) -> Cut {
     let to_render = |n: &Node| if cull { n.open > 0 } else { n.covered > 0 };
     let tree = tree(leaves(size, rects, shut));
-    let level = forced_level(forced).or_else(|| coarsest(&tree, &to_render, wanted)).unwrap_or(0);
+    let level = forced.map(level_of).or_else(|| coarsest(&tree, &to_render, wanted)).unwrap_or(0);
     list(size, &tree[level], level, &to_render, |rect| shut.all_shut(rect))
 }
 
@@ -180,7 +180,8 @@ pub fn cut_through(
     (wanted, many): (u64, u64),
     forced: Option<u32>,
 ) -> Cut {
-    Through::new(size, rects).cut((wanted, many), forced)
+    let through = Through::new(size, rects);
+    through.cut(forced.unwrap_or_else(|| through.edge((wanted, many))))
 }
 
 /// What [`cut_through`] cuts, for who wants to know more of it.
@@ -196,8 +197,7 @@ impl Through {
 
     /// How many tiles of this edge are to be rendered.
     pub(crate) fn count(&self, edge: u32) -> usize {
-        let level = forced_level(Some(edge)).unwrap_or(0);
-        self.tree[level].cells.iter().filter(|n| n.covered > 0).count()
+        self.tree[level_of(edge)].cells.iter().filter(|n| n.covered > 0).count()
     }
 
     /// The tiles of a coarse cut, and in the place of those that are `cut` those of a fine one.
@@ -213,24 +213,20 @@ impl Through {
         mixed
     }
 
-    /// See [`cut_through`].
-    pub(crate) fn cut(&self, wanted: (u64, u64), forced: Option<u32>) -> Cut {
-        let level = forced_level(forced).unwrap_or_else(|| self.level(wanted));
+    /// The tiles of this edge.
+    pub(crate) fn cut(&self, edge: u32) -> Cut {
+        let level = level_of(edge);
         list(self.size, &self.tree[level], level, &|n| n.covered > 0, |_| false)
     }
 
-    /// The edge of the tiles that are cut where none is forced.
-    pub(crate) fn edge(&self, wanted: (u64, u64)) -> u32 {
-        LEAF << self.level(wanted)
-    }
-
-    fn level(&self, (wanted, many): (u64, u64)) -> usize {
+    /// The edge of the tiles that [`cut_through`] chooses.
+    pub(crate) fn edge(&self, (wanted, many): (u64, u64)) -> u32 {
         const PART: usize = 2;
         let coarsest = |wanted| coarsest(&self.tree, &|n| n.covered > 0, wanted);
-        coarsest(many)
+        let level = coarsest(many)
             .filter(|&level| level >= PART)
-            .or_else(|| coarsest(wanted).map(|level| level.min(PART)))
-            .unwrap_or(0)
+            .or_else(|| coarsest(wanted).map(|level| level.min(PART)));
+        LEAF << level.unwrap_or(0)
     }
 }
 
@@ -246,9 +242,9 @@ fn tree(leaves: Grid<Node>) -> Vec<Grid<Node>> {
     tree
 }
 
-fn forced_level(forced: Option<u32>) -> Option<usize> {
-    let level = |edge| (0..LEVELS).find(|&l| LEAF << l == edge);
-    forced.map(|edge| level(edge).expect("Work::check lets only quadtree levels through"))
+fn level_of(edge: u32) -> usize {
+    let level = (0..LEVELS).find(|&l| LEAF << l == edge);
+    level.expect("Work::check lets only quadtree levels through")
 }
 
 /// The coarsest level at which more than `wanted` tiles are to be rendered.
@@ -410,7 +406,7 @@ mod tests {
             let [columns, rows] = size.map(|n| n.div_ceil(LEAF) as usize);
             assert_eq!(through.count(LEAF), columns * rows);
             for edge in [16, 32, 64] {
-                let cut = through.cut((0, 0), Some(edge));
+                let cut = through.cut(edge);
                 assert_eq!(cut.tiles.len(), through.count(edge));
                 assert!(cut.tiles.iter().all(|t| t.est == t.rect.area() as u64), "{size:?}");
             }
@@ -464,7 +460,7 @@ mod tests {
         // Three tiles of 64 in a picture that cuts the last one, and nothing under the second.
         let size = [190, 50];
         let through = Through::new(size, &[Rect::new(0, 0, 60, 50), Rect::new(130, 0, 190, 50)]);
-        let [coarse, fine] = [64, 32].map(|edge| through.cut((0, 0), Some(edge)));
+        let [coarse, fine] = [64, 32].map(|edge| through.cut(edge));
         assert_eq!((coarse.tiles.len(), fine.tiles.len()), (2, 8));
         for (cut, n, edge) in [
             ([false; 2], 2, 64),

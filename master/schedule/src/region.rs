@@ -12,10 +12,9 @@
 //! worker was slow.
 //!
 //! **Who.** At first each worker gets a band of rows: bricks at a border are sent to both sides, and when
-//! a path turns about the upright axis, bricks stay in their rows. Whoever drew a tile last holds its
-//! bricks, so it gets it again, unless it took it from another for once. A tile moves only when one worker would else be done more than
-//! [`SLACK`] later than the mean and the frame is shorter by more than its bricks take; those go along at
-//! once. When all of a
+//! a path turns about the upright axis, bricks stay in their rows. Who was given a tile in the frame that was cut before
+//! holds its bricks, or is sent them, so it gets it again, whoever drew it then. A tile moves only when one worker would else be
+//! done more than [`SLACK`] later than the mean and the frame is shorter by more than its bricks take; those go along at once. When all of a
 //! worker's tiles are lent it takes tiles of the next frames of the path; another's tile only where there
 //! is none and its owner has work for longer than two such tiles. Where a path's frames have few tiles for so
 //! many threads, and the link bears it (`traffic`), each is one [`Crew`]'s.
@@ -81,8 +80,8 @@ const BEGIN: f64 = 0.4;
 /// mri256 `peer-semi` at 1024x1024 (122 tiles) on 64 workers has 68 % with one in flight where it has 66 after tiles of 32.
 const LARGE: usize = 64;
 
-/// Of a path's frames for the same threads, tiles stay as large as those of the frame before while they are as many as are asked
-/// for up to this part. Where a picture of a path has 40 tiles of 64 pixels and the next one 41, and 40 are asked for,
+/// Of a path's frames for the same threads, tiles stay as large as those of the frame before where a tenth more or less of
+/// those that are asked for would be cut into such. Where a picture of a path has 40 tiles of 64 pixels and the next one 41, and 40 are asked for,
 /// everybody would be sent most bricks anew (mri256 on 16 workers at 1 Gbit/s: 1.2 MB, 13 ms).
 const STAY: f64 = 0.1;
 
@@ -573,7 +572,7 @@ impl Regions {
             }
         });
         lessons.edge = (!alone).then_some((threads, edge));
-        let mut cut = through.cut((0, 0), Some(edge));
+        let mut cut = through.cut(edge);
         let bytes = job.bricks.iter().map(|b| u64::from(b.bytes)).sum::<u64>();
         let wire = rate.map_or(0.0, |rate| bytes as f64 / job.bricks.len().max(1) as f64 / rate);
         let brick = BRICK + wire;
@@ -765,7 +764,7 @@ fn mixed(
     threads: usize,
     (memory, kind): (&Memory, Kind),
 ) -> Option<(Cut, Parts)> {
-    let plain = through.cut((0, 0), Some(PLAIN));
+    let plain = through.cut(PLAIN);
     let known: Vec<Option<f64>> =
         plain.tiles.iter().map(|t| memory.recall_us(kind, &t.rect)).collect();
     let told = || plain.tiles.iter().zip(&known).filter_map(|(t, us)| Some((t.est, (*us)?)));
@@ -774,7 +773,7 @@ fn mixed(
         return None;
     }
     let unit = us / units as f64;
-    let fine = through.cut((0, 0), Some(PLAIN / 2));
+    let fine = through.cut(PLAIN / 2);
     let parts: Parts = fine.tiles.iter().map(|t| (sides(&t.rect), t.est)).collect();
     let whole = |(t, us): (&Macrotile, &Option<f64>)| us.unwrap_or(t.est as f64 * unit);
     let us: Vec<f64> = plain.tiles.iter().zip(&known).map(whole).collect();
@@ -806,29 +805,13 @@ fn level(
     if staying.is_empty() {
         return vec![WorkerId(0); tiles.len()];
     }
-    let slows: Vec<f64> = staying.iter().map(|s| slow(s.0)).collect();
-    let takes = |t: &Macrotile| match known(t) {
-        Some((owner, us)) => (us, slow(owner)),
-        None => (t.est as f64 * unit, 1.0),
-    };
-    let takes: Vec<(f64, f64)> = tiles.iter().map(takes).collect();
+    let times = Times::of(tiles, &staying, (unit, slow), known);
+    let cost = |i: usize, w: usize| times.of_tile(i, w);
     let held: Vec<Option<usize>> =
         tiles.iter().map(|t| place_of(&staying, known(t)?.0, roster)).collect();
     let prices: Vec<f64> = tiles.iter().map(price).collect();
-    let cost = |i: usize, w: usize| takes[i].0 * believed(slows[w] / takes[i].1) / staying[w].1;
-    let mut load = vec![0.0; staying.len()];
-    let mut owners: Vec<usize> = held.iter().map(|w| w.unwrap_or(0)).collect();
-    for (i, w) in held.iter().enumerate() {
-        if let Some(w) = *w {
-            load[w] += cost(i, w);
-        }
-    }
-    for i in (0..tiles.len()).filter(|&i| held[i].is_none()) {
-        let after = |w: &usize| load[*w] + cost(i, *w);
-        let least = (0..staying.len()).min_by(|a, b| after(a).total_cmp(&after(b)));
-        owners[i] = least.unwrap_or(0);
-        load[owners[i]] += cost(i, owners[i]);
-    }
+    let order: Vec<usize> = (0..tiles.len()).collect();
+    let (mut owners, _) = times.deal(&held, &order);
     let price = |i: usize, w: usize| if held[i].is_none_or(|h| h == w) { 0.0 } else { prices[i] };
     alone::balance(&mut owners, staying.len(), cost, price);
     owners.into_iter().map(|w| staying[w].0).collect()
@@ -854,8 +837,62 @@ fn in_units(us: f64, unit: f64) -> u64 {
     ((us / unit) as u64).max(1)
 }
 
-/// Whose each tile is: at first in bands, then its last owner's, unless that one would be done late; a
-/// new one's the least loaded worker's. Loads are times.
+/// What tiles take those who stay.
+struct Times {
+    /// What each takes who drew it, or is guessed to, in microseconds, and how slow that one is. It is looked up once:
+    /// what follows asks for it again and again.
+    takes: Vec<(f64, f64)>,
+    /// Of each who stays, how slow it is and how many threads it has.
+    slows: Vec<f64>,
+    threads: Vec<f64>,
+}
+
+impl Times {
+    fn of(
+        tiles: &[Macrotile],
+        staying: &[(WorkerId, f64)],
+        (unit, slow): (f64, &impl Fn(WorkerId) -> f64),
+        known: &impl Fn(&Macrotile) -> Option<(WorkerId, f64)>,
+    ) -> Times {
+        let takes = |t: &Macrotile| match known(t) {
+            Some((owner, us)) => (us, slow(owner)),
+            None => (t.est as f64 * unit, 1.0),
+        };
+        Times {
+            takes: tiles.iter().map(takes).collect(),
+            slows: staying.iter().map(|s| slow(s.0)).collect(),
+            threads: staying.iter().map(|s| s.1).collect(),
+        }
+    }
+
+    /// How much longer a worker is busy with a tile, by their places.
+    fn of_tile(&self, tile: usize, worker: usize) -> f64 {
+        let (us, slow) = self.takes[tile];
+        us * believed(self.slows[worker] / slow) / self.threads[worker]
+    }
+
+    /// Whose each tile is, and how long each worker has to do: whose it was, or else, in this order, whoever is done with
+    /// it soonest.
+    fn deal(&self, held: &[Option<usize>], order: &[usize]) -> (Vec<usize>, Vec<f64>) {
+        let mut load = vec![0.0; self.threads.len()];
+        let mut owners: Vec<usize> = held.iter().map(|w| w.unwrap_or(0)).collect();
+        for &i in order {
+            if let Some(w) = held[i] {
+                load[w] += self.of_tile(i, w);
+            }
+        }
+        for &i in order.iter().filter(|&&i| held[i].is_none()) {
+            let after = |w: &usize| load[*w] + self.of_tile(i, *w);
+            let least = (0..load.len()).min_by(|a, b| after(a).total_cmp(&after(b)));
+            owners[i] = least.unwrap_or(0);
+            load[owners[i]] += self.of_tile(i, owners[i]);
+        }
+        (owners, load)
+    }
+}
+
+/// Whose each tile is: at first in bands, then whose it was in the frame that was cut before, unless that one would be
+/// done late; a new one's whoever is done with it soonest. Loads are times.
 fn share(
     tiles: &[Macrotile],
     roster: &Roster,
@@ -868,25 +905,16 @@ fn share(
     if staying.is_empty() {
         return vec![WorkerId(0); tiles.len()];
     }
-    let slows: Vec<f64> = staying.iter().map(|s| slow(s.0)).collect();
-    // What is known of each tile is looked up once: the loops below ask for it again and again.
-    let takes = |t: &Macrotile| match known(t) {
-        Some((owner, us)) => (us, slow(owner)),
-        None => (t.est as f64 * unit, 1.0),
-    };
-    let takes: Vec<(f64, f64)> = tiles.iter().map(takes).collect();
-    let homes: Vec<Option<usize>> =
+    let times = Times::of(tiles, &staying, (unit, slow), known);
+    let cost = |i: usize, w: usize| times.of_tile(i, w);
+    let mut homes: Vec<Option<usize>> =
         tiles.iter().map(|t| place_of(&staying, home(t)?, roster)).collect();
-    let cost = |i: usize, w: usize| takes[i].0 * believed(slows[w] / takes[i].1) / staying[w].1;
-    let mut load = vec![0.0; staying.len()];
     // In the order of rows.
     let mut order: Vec<usize> = (0..tiles.len()).collect();
     order.sort_by_key(|&i| (tiles[i].rect.y0, tiles[i].rect.x0));
-    let mut owners = vec![0; tiles.len()];
-    let drawn = tiles.iter().filter(|t| known(t).is_some()).count();
     if homes.iter().all(Option::is_none) {
         // Bands of rows, as high as each is fast.
-        let fast = |w: usize| staying[w].1 / believed(slows[w]);
+        let fast = |w: usize| staying[w].1 / believed(times.slows[w]);
         let all = (0..staying.len()).map(fast).sum::<f64>();
         let work = tiles.iter().map(|t| t.est as f64).sum::<f64>();
         let (mut w, mut until, mut done) = (0, fast(0) / all * work, 0.0);
@@ -897,25 +925,13 @@ fn share(
                 until += fast(w) / all * work;
             }
             done += 2.0 * half;
-            owners[i] = w;
-            load[w] += cost(i, w);
-        }
-    } else {
-        for &i in &order {
-            if let Some(w) = homes[i] {
-                owners[i] = w;
-                load[w] += cost(i, w);
-            }
-        }
-        for &i in order.iter().filter(|&&i| homes[i].is_none()) {
-            let after = |w: &usize| load[*w] + cost(i, *w);
-            let least = (0..staying.len()).min_by(|a, b| after(a).total_cmp(&after(b)));
-            owners[i] = least.unwrap_or(0);
-            load[owners[i]] += cost(i, owners[i]);
+            homes[i] = Some(w);
         }
     }
+    let (mut owners, mut load) = times.deal(&homes, &order);
     // While the first frame is drawn, others begin beside it: most of what loads are made of is guessed then.
-    let moves = if (1..tiles.len()).contains(&(2 * drawn)) { 0 } else { tiles.len() };
+    let drawn = tiles.iter().filter(|t| known(t).is_some()).count();
+    let moves = if drawn > 0 && 2 * drawn < tiles.len() { 0 } else { tiles.len() };
     for moved in 0..moves {
         let by = |a: &usize, b: &usize| load[*a].total_cmp(&load[*b]);
         let ends = ((0..load.len()).max_by(by), (0..load.len()).min_by(by));
@@ -1025,7 +1041,7 @@ mod tests {
         let through = Through::new([512, 512], &[Rect::new(90, 40, 430, 480)]);
         let edge = |threads: u64, shared| {
             let wanted = 2.5 * threads as f64;
-            through.cut((wanted.ceil() as u64, many(wanted, threads, shared)), None).edge
+            through.edge((wanted.ceil() as u64, many(wanted, threads, shared)))
         };
         assert_eq!([1, 2, 4, 8, 16, 32].map(|n| edge(n, true)), [256, 256, 128, 128, 64, 32]);
         assert_eq!([1, 2, 4, 8, 16, 32].map(|n| edge(n, false)), [64, 64, 64, 64, 64, 32]);

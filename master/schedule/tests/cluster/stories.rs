@@ -484,7 +484,8 @@ fn frames_that_begin_while_the_first_is_drawn_are_shared_out_as_it_is() {
 
 #[test]
 fn workers_of_other_speeds_get_fitting_shares_of_a_path() {
-    // What the others do in a frame's time; in tiles of 16 pixels, of which a frame has up to 64.
+    // How long a frame takes, times what all can do in a unit of time: in tiles of 16 pixels, of which a frame has up to 64.
+    // Where nobody is known to be slow it is 7 % more than among equals, since others take tiles of those who are late.
     let run = |speeds: &[f64]| {
         let mut w = world();
         for speed in speeds {
@@ -509,8 +510,10 @@ fn workers_of_other_speeds_get_fitting_shares_of_a_path() {
         [1.0, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2],
     ] {
         let ratio = run(&speeds) / healthy;
-        println!("speeds {speeds:?}: {ratio:.2} x of what they can do");
-        assert!(ratio <= 1.3, "{speeds:?}: {ratio:.2} x");
+        assert!(
+            ratio <= 1.04,
+            "{speeds:?}: {ratio:.3} times as long as equals of the same strength"
+        );
     }
 }
 

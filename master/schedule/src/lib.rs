@@ -731,7 +731,8 @@ impl Scheduler {
             if done.by_region() && beside != done.is_alone() {
                 let roster = &self.cluster.roster;
                 let drawing = (roster.staying().count(), roster.threads());
-                let full = self.cluster.traffic.is_full();
+                let traffic = &self.cluster.traffic;
+                let full = if beside { traffic.is_full() } else { traffic.is_full_alone() };
                 self.cluster.reserve.done((!beside, full), done.ledger.drew_us(), drawing, now);
             }
             let done = done.finish(&mut self.cluster, clock.now());

@@ -146,6 +146,11 @@ impl Traffic {
     pub(crate) fn is_full(&self) -> bool {
         self.carried > DISSOLVE * self.took
     }
+
+    /// The same of frames that were alone.
+    pub(crate) fn is_full_alone(&self) -> bool {
+        self.alone.is_some_and(|share| share > DISSOLVE)
+    }
 }
 
 #[cfg(test)]
@@ -227,9 +232,11 @@ mod tests {
         let mut traffic = Traffic { rate: 100.0, ..Traffic::default() };
         assert!(!traffic.binds_alone(), "of no frame is known what it was sent");
         assert_eq!(alone(&mut traffic, 1, 190_000), [true], "the first is sent all that it needs");
+        assert!(traffic.is_full_alone());
         assert!(!alone(&mut traffic, 9, 90_000).contains(&false), "0.45");
         assert_eq!(alone(&mut traffic, 3, 40_000), [true, false, false]);
         assert!(!alone(&mut traffic, 9, 90_000).contains(&true), "and now that is not enough");
+        assert!(!traffic.is_full_alone());
         assert!(
             !traffic.is_full() && !traffic.bears_crews(),
             "which says nothing of frames beside others"

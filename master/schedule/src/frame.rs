@@ -18,6 +18,7 @@
 
 use crate::borders;
 use crate::critical::Piece;
+use crate::crowd::Crowd;
 use crate::ledger::{Ledger, Rendered, ms, place_in_time};
 use crate::macrotile::{self, Cut, LEAF, LEVELS};
 use crate::queue::{End, PARTS, Queue, Verdict};
@@ -93,7 +94,7 @@ struct Slab {
     changes: Option<u64>,
     /// Whether some of its owners took no leases then.
     orphaned: bool,
-    /// End of each render thread's last task.
+    /// End of each render thread's last task; not of regions, which have no barrier.
     dry: BTreeMap<(WorkerId, u32), Micros>,
     /// Tiles that counted.
     pieces: Vec<Piece>,
@@ -127,9 +128,9 @@ pub(crate) struct Frame {
     first_task: TaskId,
     /// Workers that were sent the frame's view.
     told: BTreeSet<WorkerId>,
-    lent: BTreeMap<WorkerId, Vec<Lent>>,
+    lent: Crowd<Vec<Lent>>,
     /// When each worker answered last.
-    answered: BTreeMap<WorkerId, Micros>,
+    answered: Crowd<Micros>,
     pace: Pace,
     /// When the next task outlives its estimate, while a thread is idle.
     outlived: Option<Micros>,
@@ -206,8 +207,8 @@ impl Frame {
             ended: None,
             first_task: TaskId(cluster.next_task),
             told: BTreeSet::new(),
-            lent: BTreeMap::new(),
-            answered: BTreeMap::new(),
+            lent: Crowd::default(),
+            answered: Crowd::default(),
             pace: Pace::default(),
             outlived: None,
             forborne: None,
@@ -441,7 +442,7 @@ impl Frame {
             let slab = self.slab.as_mut().expect("as before");
             let epoch = slab.queue.lend_again(place, id, now, &cluster.config);
             let lent = lend(cluster, slab, place, id, epoch, now);
-            self.lent.entry(id).or_default().push(lent);
+            self.lent.or_default(id).push(lent);
             leases.push((id, place));
         }
         let slab = self.slab.as_mut().expect("as before");
@@ -495,7 +496,7 @@ impl Frame {
         }
         for (id, place) in leases {
             let left = count.get_mut(&id).expect("counted above");
-            let lent = &self.lent[&id];
+            let lent = &self.lent[id];
             let lent = &lent[lent.len() - *left];
             *left -= 1;
             if self.told.insert(id) {
@@ -554,7 +555,7 @@ impl Frame {
         let slab = self.slab.as_mut().expect("a slab that is dispatched has begun");
         let epoch = slab.queue.lease(place, id, now, &cluster.config);
         let lent = lend(cluster, slab, place, id, epoch, now);
-        self.lent.entry(id).or_default().push(lent);
+        self.lent.or_default(id).push(lent);
         if let Some(regions) = &mut slab.regions {
             regions.moves(place, id);
         }
@@ -569,7 +570,7 @@ impl Frame {
         suits: impl Fn(u32) -> bool,
     ) -> Option<u32> {
         let slab = self.slab.as_ref()?;
-        let lent = self.lent.get(&id).into_iter().flatten();
+        let lent = self.lent.get(id).into_iter().flatten();
         let mine: Vec<u32> = lent.filter_map(|l| slab.queue.place(l.task)).collect();
         slab.queue.next_for(id, &mine, among, |task| could_have(cluster, task, id), suits)
     }
@@ -577,7 +578,7 @@ impl Frame {
     /// The same among those that are its own.
     fn next_own(&self, cluster: &Cluster, id: WorkerId, own: &[u32]) -> Option<u32> {
         let slab = self.slab.as_ref()?;
-        let lent = self.lent.get(&id).into_iter().flatten();
+        let lent = self.lent.get(id).into_iter().flatten();
         let mine: Vec<u32> = lent.filter_map(|l| slab.queue.place(l.task)).collect();
         slab.queue.next_among(id, &mine, own, |task| could_have(cluster, task, id))
     }
@@ -638,7 +639,7 @@ impl Frame {
     /// it is not.
     pub(crate) fn lent_us(&self, id: WorkerId) -> f64 {
         let Some(Slab { queue, regions: Some(regions), .. }) = &self.slab else { return 0.0 };
-        let lent = self.lent.get(&id).into_iter().flatten();
+        let lent = self.lent.get(id).into_iter().flatten();
         let places = lent.filter_map(|l| queue.place(l.task));
         places.map(|place| regions.took(place).unwrap_or(f64::INFINITY)).sum()
     }
@@ -660,7 +661,7 @@ impl Frame {
         let sated = &cluster.sated;
         let room = |id: WorkerId, w: &crate::roster::Worker| {
             w.leases < u64::from(w.threads).saturating_mul(ahead.max(MOST_AHEAD))
-                && !sated.contains(&id)
+                && sated.binary_search(&id).is_err()
         };
         if queue.waiting() == 0 {
             return leases;
@@ -681,13 +682,12 @@ impl Frame {
                 (worker.map(|w| (id, u64::from(w.threads))).into_iter().collect(), false)
             }
             _ => {
-                let owners: BTreeSet<WorkerId> =
-                    queue.all_waiting().map(|p| regions.owner(p)).collect();
-                let orphans = orphaning.iter().any(|id| owners.contains(id));
+                let has_some = |id: WorkerId| queue.any_waits(regions.owned(id));
+                let orphans = orphaning.iter().any(|id| has_some(*id));
                 let takers = cluster
                     .roster
                     .staying()
-                    .filter(|(id, w)| room(*id, w) && (orphans || owners.contains(id)))
+                    .filter(|(id, w)| room(*id, w) && (orphans || has_some(*id)))
                     .map(|(id, w)| (id, u64::from(w.threads)))
                     .collect();
                 (takers, orphans)
@@ -805,7 +805,7 @@ impl Frame {
     /// Until when an owner keeps a task from those who have nothing to do.
     fn until(&self, slab: &Slab, regions: &Regions, place: u32) -> Micros {
         let (owner, us) = regions.forbearance(place);
-        let heard = self.answered.get(&owner).copied().unwrap_or(0).max(slab.began);
+        let heard = self.answered.get(owner).copied().unwrap_or(0).max(slab.began);
         heard.saturating_add(us)
     }
 
@@ -829,10 +829,10 @@ impl Frame {
         }
         let pace = self.pace.measure()?;
         let mut late: Vec<(Micros, u32)> = Vec::new();
-        for (&id, lent) in &self.lent {
+        for (id, lent) in self.lent.iter() {
             let Some(worker) = cluster.roster.get(id) else { continue };
             let threads = worker.threads as usize;
-            let answered = self.answered.get(&id).copied().unwrap_or(0);
+            let answered = self.answered.get(id).copied().unwrap_or(0);
             let mut heads_late = 0;
             for (i, lent) in lent.iter().enumerate() {
                 let open = |&p: &u32| slab.queue.tasks[p as usize].end == End::Open;
@@ -855,7 +855,7 @@ impl Frame {
         late.sort_unstable();
         for (at, place) in late {
             let has_it = |id: WorkerId| {
-                let lent = self.lent.get(&id).into_iter().flatten();
+                let lent = self.lent.get(id).into_iter().flatten();
                 lent.into_iter().any(|l| l.task == slab.queue.id(place))
             };
             let fits = |id: WorkerId, load: u64| {
@@ -882,7 +882,7 @@ impl Frame {
         task: TaskId,
         epoch: Epoch,
     ) -> Option<Lent> {
-        let lent = self.lent.get_mut(&worker)?;
+        let lent = self.lent.get_mut(worker)?;
         let at = lent.iter().position(|l| l.task == task && l.epoch == epoch)?;
         let lent = lent.remove(at);
         if !lent.bricks.is_empty() {
@@ -894,7 +894,7 @@ impl Frame {
 
     /// Whether a worker has this lease of it, or had.
     pub(crate) fn has_lent(&self, worker: WorkerId, task: TaskId, epoch: Epoch) -> bool {
-        let lent = self.lent.get(&worker).into_iter().flatten();
+        let lent = self.lent.get(worker).into_iter().flatten();
         lent.into_iter().any(|l| l.task == task && l.epoch == epoch)
     }
 
@@ -964,8 +964,10 @@ impl Frame {
         self.pace.note(slab.cut.tiles[place as usize].est, r.end - r.start, lasted);
         self.ledger.rendered(worker, &r, &result.counters);
         let thread = result.times.thread.min(who.threads - 1);
-        let dry = slab.dry.entry((worker, thread)).or_insert(r.end);
-        *dry = r.end.max(*dry);
+        if slab.regions.is_none() {
+            let dry = slab.dry.entry((worker, thread)).or_insert(r.end);
+            *dry = r.end.max(*dry);
+        }
         let Rendered { start, end, .. } = r;
         slab.pieces.push(Piece {
             corner: [tile.x0, tile.y0],
@@ -1086,7 +1088,7 @@ impl Frame {
         let Some(slab) = &self.slab else { return (Vec::new(), 0) };
         let mut running = 0;
         let mut leases = Vec::new();
-        for (i, lent) in self.lent.get(&id).into_iter().flatten().enumerate() {
+        for (i, lent) in self.lent.get(id).into_iter().flatten().enumerate() {
             if let Some(place) = slab.queue.place(lent.task) {
                 leases.push((place, lent.epoch));
                 running += usize::from(i < threads as usize);
@@ -1117,7 +1119,7 @@ impl Frame {
         // A frame that is done and waits for one before it is over.
         let now = self.ended.unwrap_or(now);
         let (leases, running) = self.probably(id, threads);
-        self.lent.remove(&id);
+        self.lent.remove(id);
         self.told.remove(&id);
         if let Some(flight) = cluster.residency.flight(id) {
             self.ledger.landed(id, flight, now);
@@ -1151,7 +1153,7 @@ impl Frame {
 
     /// Leases that a worker has.
     pub(crate) fn leases(&self, id: WorkerId) -> u32 {
-        self.lent.get(&id).map_or(0, |l| l.len() as u32)
+        self.lent.get(id).map_or(0, |l| l.len() as u32)
     }
 
     /// The frame is over, in whatever way: workers forget it.

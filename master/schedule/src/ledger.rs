@@ -6,6 +6,7 @@
 //! whatever a worker's clock does.
 
 use crate::critical::{Path, Piece};
+use crate::crowd::Crowd;
 use crate::residency::Flight;
 use crate::roster::Worker;
 use crate::spans::Flown;
@@ -18,7 +19,6 @@ use slabcast_common::stats::{
     BoundAndEstimate, BrickStats, EXTRAPOLATION, ErrorStats, Estimate, FrameMs, FrameStats,
     PoisonedTile, SlabStats, VoxelStats, WorkerStats,
 };
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// Stretches of time that there is room for at once: tiles and flights of 64 workers.
@@ -54,7 +54,7 @@ pub(crate) struct Ledger {
     began: Micros,
     pub(crate) cull_us: Micros,
     pub(crate) composite_us: Micros,
-    accounts: BTreeMap<WorkerId, Account>,
+    accounts: Crowd<Account>,
     pub(crate) counters: Counters,
     /// How far pixels are off that were looked at.
     sampled: Sampling,
@@ -95,7 +95,7 @@ impl Ledger {
             began,
             cull_us: 0,
             composite_us: 0,
-            accounts: BTreeMap::new(),
+            accounts: Crowd::default(),
             counters: Counters::default(),
             sampled: Sampling::default(),
             result_bytes: None,
@@ -111,13 +111,13 @@ impl Ledger {
     /// A phase of the frame ended: what these tiles say of its critical path.
     pub(crate) fn phase(&mut self, pieces: &[Piece], began: Micros) {
         let accounts = &self.accounts;
-        let name = |id| accounts.get(&id).map_or_else(String::new, |a| a.name.to_string());
+        let name = |id| accounts.get(id).map_or_else(String::new, |a| a.name.to_string());
         self.path.phase(pieces, began, name);
     }
 
     /// A worker takes part from now on.
     pub(crate) fn enrol(&mut self, id: WorkerId, worker: &Worker, now: Micros) {
-        self.accounts.entry(id).or_insert_with(|| Account {
+        self.accounts.or_insert_with(id, || Account {
             name: worker.name.clone(),
             threads: worker.threads,
             from: now,
@@ -138,14 +138,14 @@ impl Ledger {
 
     /// A worker takes part no longer.
     pub(crate) fn leave(&mut self, id: WorkerId, now: Micros) {
-        if let Some(a) = self.accounts.get_mut(&id) {
+        if let Some(a) = self.accounts.get_mut(id) {
             a.until = Some(now);
         }
     }
 
     pub(crate) fn rendered(&mut self, id: WorkerId, r: &Rendered, counters: &Counters) {
         self.counters += *counters;
-        if let Some(a) = self.accounts.get_mut(&id) {
+        if let Some(a) = self.accounts.get_mut(id) {
             a.render_us += r.end - r.start;
             a.p2p_us += r.p2p_us;
             a.renders.push((r.start, r.end));
@@ -166,14 +166,14 @@ impl Ledger {
 
     /// A worker drew for another frame while this one was in the making.
     pub(crate) fn elsewhere(&mut self, id: WorkerId, (start, end): Interval) {
-        if let Some(a) = self.accounts.get_mut(&id) {
+        if let Some(a) = self.accounts.get_mut(id) {
             a.elsewhere_us += end.saturating_sub(start.max(a.from));
         }
     }
 
     /// What a region waited for. A stranger's figures: they are added up and no more.
     pub(crate) fn stalled(&mut self, id: WorkerId, cost: &RegionCost) {
-        if let Some(a) = self.accounts.get_mut(&id) {
+        if let Some(a) = self.accounts.get_mut(id) {
             a.stalls += u64::from(cost.stalls);
             a.parked_us = a.parked_us.saturating_add(cost.parked_us);
             a.stall_us = a.stall_us.saturating_add(cost.idle_us);
@@ -182,7 +182,7 @@ impl Ledger {
     }
 
     pub(crate) fn sent(&mut self, id: WorkerId, bricks: u64, bytes: u64) {
-        if let Some(a) = self.accounts.get_mut(&id) {
+        if let Some(a) = self.accounts.get_mut(id) {
             a.bricks_sent += bricks;
             a.bytes_sent += bytes;
         }
@@ -190,7 +190,7 @@ impl Ledger {
 
     /// Bricks were on their way to a worker without a pause until now.
     pub(crate) fn landed(&mut self, id: WorkerId, flight: Flight, now: Micros) {
-        let Some(a) = self.accounts.get_mut(&id) else { return };
+        let Some(a) = self.accounts.get_mut(id) else { return };
         let start = flight.since.max(self.began).min(now);
         a.flights.push((start, now));
         let Flight { bricks, bytes, .. } = flight;
@@ -198,7 +198,7 @@ impl Ledger {
     }
 
     pub(crate) fn holds(&mut self, id: WorkerId, held: (u64, u64)) {
-        if let Some(a) = self.accounts.get_mut(&id) {
+        if let Some(a) = self.accounts.get_mut(id) {
             a.held = held;
         }
     }

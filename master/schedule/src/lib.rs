@@ -32,7 +32,8 @@
 //! [`frame`](is_shut) the states of one frame, under either schedule; `region` what is the `region`
 //! schedule's own, with `alone` for a frame that nobody waits behind; [`macrotile`] the quadtree and its workload, `queue` leases with epochs,
 //! `residency` who holds which brick, `roster` workers and every deadline, `traffic` whether the link bears more,
-//! `reserve` how many workers are enough, `ledger` what a frame cost, `critical` what it waited for.
+//! `reserve` how many workers are enough, `ledger` what a frame cost, `critical` what it waited for. What there is of each worker
+//! and of each tile lies in `crowd` and `tiled`.
 
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
@@ -48,6 +49,7 @@ use std::sync::Arc;
 mod alone;
 mod borders;
 mod critical;
+mod crowd;
 mod frame;
 mod ledger;
 pub mod macrotile;
@@ -58,6 +60,7 @@ mod residency;
 mod roster;
 pub mod sim;
 mod spans;
+mod tiled;
 mod traffic;
 
 pub use borders::slabs;
@@ -399,8 +402,8 @@ struct Cluster {
     out: VecDeque<Action>,
     next_task: u64,
     totals: Totals,
-    /// Workers that have enough for now: they are lent no more of their own.
-    sated: BTreeSet<WorkerId>,
+    /// Workers that have enough for now, in their order: they are lent no more of their own.
+    sated: Vec<WorkerId>,
 }
 
 impl Cluster {
@@ -450,7 +453,7 @@ impl Scheduler {
                 out: VecDeque::new(),
                 next_task: 0,
                 totals: Totals::default(),
-                sated: BTreeSet::new(),
+                sated: Vec::new(),
             },
             waiting: VecDeque::new(),
             active: VecDeque::new(),

@@ -202,26 +202,25 @@ impl Queue {
         others: impl Fn(&Task) -> bool,
         suits: impl Fn(u32) -> bool,
     ) -> Option<u32> {
-        let waiting = self.waiting.values().copied().filter(|&place| among(place));
-        self.first_fit(worker, mine, waiting, others, suits)
+        let fits = self.fits(worker, mine, others);
+        self.waiting.values().copied().find(|&place| among(place) && fits(place) && suits(place))
     }
 
-    fn first_fit(
+    /// Whether a worker may have a task.
+    fn fits(
         &self,
         worker: WorkerId,
         mine: &[u32],
-        mut waiting: impl Iterator<Item = u32>,
         others: impl Fn(&Task) -> bool,
-        suits: impl Fn(u32) -> bool,
-    ) -> Option<u32> {
+    ) -> impl Fn(u32) -> bool {
         let has_suspect = mine.iter().any(|&p| self.tasks[p as usize].is_suspect());
-        waiting.find(|&place| {
+        move |place| {
             let task = &self.tasks[place as usize];
             let has_it = mine.contains(&place);
             let failed = task.failed.iter().any(|(w, ..)| *w == worker) && others(task);
             let two_suspects = has_suspect && task.is_suspect();
-            !(has_it || failed || two_suspects) && suits(place)
-        })
+            !(has_it || failed || two_suspects)
+        }
     }
 
     /// The same among a few places, whether they wait or not: who has a list of its own need not go through
@@ -233,9 +232,10 @@ impl Queue {
         places: &[u32],
         others: impl Fn(&Task) -> bool,
     ) -> Option<u32> {
+        let fits = self.fits(worker, mine, others);
         let waits = |&place: &u32| Some((self.tasks[place as usize].queued?, place));
-        let few: BTreeMap<i64, u32> = places.iter().filter_map(waits).collect();
-        self.first_fit(worker, mine, few.into_values(), others, |_| true)
+        let may = places.iter().filter_map(waits).filter(|&(_, place)| fits(place));
+        may.min().map(|(_, place)| place)
     }
 
     /// Lends a waiting task to a worker.

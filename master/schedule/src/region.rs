@@ -28,8 +28,10 @@
 //! It refuses to know what time it is and which copy of a result counts.
 
 use crate::alone;
+use crate::crowd::Crowd;
 use crate::macrotile::{Cut, Macrotile, Through};
 use crate::roster::Roster;
+use crate::tiled::Tiled;
 use crate::{FrameJob, Micros};
 use slabcast_common::blocks::{Block, Blocks};
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
@@ -130,26 +132,20 @@ struct Known {
 #[derive(Debug)]
 struct Lessons {
     kind: Kind,
-    tiles: BTreeMap<Sides, Known>,
+    tiles: Tiled<Known>,
     /// Whose each was to be in the frame that was cut last, drawn or not. Who has nothing to do takes a tile for once:
     /// next time it is drawn where its neighbours are, lest borders, and with them bricks that two workers hold, become
     /// more and more.
-    homes: BTreeMap<Sides, WorkerId>,
+    homes: Tiled<WorkerId>,
     /// And its tiles' edge, for so many threads; none if it was alone.
     edge: Option<(u64, u32)>,
 }
 
 impl Lessons {
     fn of(kind: Kind) -> Lessons {
-        Lessons { kind, tiles: BTreeMap::new(), homes: BTreeMap::new(), edge: None }
+        let size = kind.1;
+        Lessons { kind, tiles: Tiled::new(size), homes: Tiled::new(size), edge: None }
     }
-}
-
-/// A rectangle as something that has an order.
-type Sides = [i32; 4];
-
-fn sides(tile: &Rect) -> Sides {
-    [tile.x0, tile.y0, tile.x1, tile.y1]
 }
 
 /// What is known of a tile, and what it takes by that.
@@ -201,7 +197,7 @@ pub(crate) struct Memory {
     /// Frames that were cut.
     frames: u64,
     /// How many times longer than others workers take, as far as tiles tell that were drawn by one and then by another.
-    slow: BTreeMap<WorkerId, f64>,
+    slow: Crowd<f64>,
 }
 
 impl Memory {
@@ -215,7 +211,7 @@ impl Memory {
 
     fn known(&self, kind: Kind, tile: &Rect) -> Option<&Known> {
         let lessons = self.lessons.iter().find(|l| l.kind == kind)?;
-        lessons.tiles.get(&sides(tile))
+        lessons.tiles.get(tile)
     }
 
     /// What is known of a tile of [`PLAIN`] pixels, or of a quarter of one, however the last frame cut it.
@@ -245,7 +241,7 @@ impl Memory {
     /// The same of each of the parts of a whole tile.
     fn recall_parts_us(&self, kind: Kind, whole: &Rect) -> [Option<f64>; 4] {
         let Some(lessons) = self.lessons.iter().find(|l| l.kind == kind) else { return [None; 4] };
-        let get = |r: &Rect| lessons.tiles.get(&sides(r));
+        let get = |r: &Rect| lessons.tiles.get(r);
         let (rects, one) = (quarters(whole), get(whole));
         let parts = rects.map(|r| get(&r?));
         std::array::from_fn(|i| {
@@ -262,11 +258,11 @@ impl Memory {
     fn taught(&self, kind: Kind, tile: &Rect) -> Option<Taught<'_>> {
         let lessons = &self.lessons.iter().find(|l| l.kind == kind)?.tiles;
         let whole = whole_of(tile, kind.1);
-        let known = lessons.get(&sides(tile));
+        let known = lessons.get(tile);
         let frame = known.map_or(0, |k| k.frame);
-        let parts = || quarters(&whole).map(|part| lessons.get(&sides(&part?)));
+        let parts = || quarters(&whole).map(|part| lessons.get(&part?));
         if *tile != whole {
-            let Some(one) = lessons.get(&sides(&whole)).filter(|one| one.frame > frame) else {
+            let Some(one) = lessons.get(&whole).filter(|one| one.frame > frame) else {
                 return known.map(Taught::Itself);
             };
             return Some(Taught::Whole(one, part_of((one, &whole), (known, tile), &parts())));
@@ -314,7 +310,7 @@ impl Memory {
             None => us,
         };
         let known = Known { frame: regions.frame, owner, us, touched: touched.to_vec() };
-        self.of_kind(regions.kind).tiles.insert(sides(tile), known);
+        self.of_kind(regions.kind).tiles.insert(tile, known);
     }
 
     fn of_kind(&mut self, kind: Kind) -> &mut Lessons {
@@ -331,7 +327,7 @@ impl Memory {
     /// Whose a tile was to be in the frame that was cut last.
     fn home(&self, kind: Kind, tile: &Rect) -> Option<WorkerId> {
         let lessons = self.lessons.iter().find(|l| l.kind == kind)?;
-        lessons.homes.get(&sides(tile)).copied()
+        lessons.homes.get(tile).copied()
     }
 
     /// A tile took one worker so long, and another before it: a quarter of what that says beyond what is known already
@@ -349,7 +345,7 @@ impl Memory {
 
     /// How slow a worker is, beside others.
     fn slow(&self, id: WorkerId) -> f64 {
-        self.slow.get(&id).copied().unwrap_or(1.0)
+        self.slow.get(id).copied().unwrap_or(1.0)
     }
 
     /// How many times longer a worker takes than another, as far as that is believed.
@@ -359,7 +355,7 @@ impl Memory {
 
     /// A worker is gone.
     pub(crate) fn forget(&mut self, id: WorkerId) {
-        self.slow.remove(&id);
+        self.slow.remove(id);
     }
 }
 
@@ -525,7 +521,7 @@ pub(crate) struct Regions {
     /// Whose each tile is, by its place in the queue.
     owners: Vec<WorkerId>,
     /// Places of each worker's, ascending where nothing moved.
-    owned: BTreeMap<WorkerId, Vec<u32>>,
+    owned: Crowd<Vec<u32>>,
     /// What each took its last owner, if that is known.
     took: Vec<Option<(WorkerId, f64)>>,
     /// Microseconds that a guessed unit takes, in the mean.
@@ -579,7 +575,7 @@ impl Regions {
         // Whoever chose a size has it.
         let either = job.work.tile.is_none() && (PLAIN / 2..=PLAIN).contains(&cut.edge);
         let leveled = alone && either;
-        let mut fine = BTreeMap::new();
+        let mut fine = Parts::new(size);
         // Which tiles are cut changes from frame to frame, and who is given a whole one lacks the bricks of parts that
         // others drew. So where bricks bind all are of one size, and none is cut late.
         if leveled
@@ -592,9 +588,13 @@ impl Regions {
             true => memory.recall(kind, &t.rect),
             false => memory.known(kind, &t.rect).map(Recalled::Itself),
         };
-        let taught: BTreeMap<Sides, Recalled<'_>> =
-            cut.tiles.iter().filter_map(|t| Some((sides(&t.rect), recall(t)?))).collect();
-        let recalled = |t: &Macrotile| taught.get(&sides(&t.rect));
+        let mut taught = Tiled::new(size);
+        for t in &cut.tiles {
+            if let Some(recalled) = recall(t) {
+                taught.insert(&t.rect, recalled);
+            }
+        }
+        let recalled = |t: &Macrotile| taught.get(&t.rect);
         let of = |t: &Macrotile| recalled(t).map(Recalled::known);
         let known = |t: &Macrotile| of(t).map(|k| (k.owner, k.us));
         let unit = unit(&cut.tiles, &known);
@@ -618,9 +618,9 @@ impl Regions {
             share(&cut.tiles, roster, crew, (unit, &slow), &known, (&home, &bricks))
         };
         let took = cut.tiles.iter().map(known).collect();
-        let mut owned = BTreeMap::<WorkerId, Vec<u32>>::new();
+        let mut owned = Crowd::<Vec<u32>>::default();
         for (&owner, place) in owners.iter().zip(0..) {
-            owned.entry(owner).or_default().push(place);
+            owned.or_default(owner).push(place);
         }
         let told = |(t, place): (&Macrotile, u32)| {
             let known = recalled(t)?.told()?;
@@ -628,8 +628,11 @@ impl Regions {
         };
         let told = cut.tiles.iter().zip(0..).filter_map(told).collect();
         drop(taught);
-        let homes = cut.tiles.iter().zip(&owners).map(|(t, owner)| (sides(&t.rect), *owner));
-        memory.of_kind(kind).homes = homes.collect();
+        let homes = &mut memory.of_kind(kind).homes;
+        homes.clear();
+        for (t, owner) in cut.tiles.iter().zip(&owners) {
+            homes.insert(&t.rect, *owner);
+        }
         (cut, Regions { kind, frame, told, owners, owned, took, unit, brick, fine })
     }
 
@@ -641,7 +644,7 @@ impl Regions {
     /// Those whose tiles these are and who are gone, leave, or are held in reserve.
     pub(crate) fn orphaning(&self, roster: &Roster) -> Vec<WorkerId> {
         let gone = |id: &WorkerId| roster.get(*id).is_none_or(|w| !w.draws());
-        self.owned.keys().copied().filter(gone).collect()
+        self.owned.ids().filter(gone).collect()
     }
 
     /// Whose a task is.
@@ -651,7 +654,7 @@ impl Regions {
 
     /// All that are a worker's.
     pub(crate) fn owned(&self, id: WorkerId) -> &[u32] {
-        self.owned.get(&id).map_or(&[], Vec::as_slice)
+        self.owned.get(id).map_or(&[], Vec::as_slice)
     }
 
     /// The parts of a waiting tile, what is guessed of each, and what they take, as far as that is known; none of what
@@ -662,7 +665,7 @@ impl Regions {
         {
             return Vec::new();
         }
-        let there = |r: Rect| Some((r, *self.fine.get(&sides(&r))?));
+        let there = |r: Rect| Some((r, *self.fine.get(&r)?));
         let parts: Vec<(Rect, u64)> =
             quarters(tile).into_iter().flatten().filter_map(there).collect();
         let all: u64 = parts.iter().map(|p| p.1).sum();
@@ -683,12 +686,12 @@ impl Regions {
     pub(crate) fn cut_late(&mut self, place: u32, parts: Vec<(Part, WorkerId)>) {
         let owner = self.owners[place as usize];
         let last = self.took[place as usize].map_or(owner, |t| t.0);
-        self.owned.entry(owner).or_default().retain(|p| *p != place);
+        self.owned.or_default(owner).retain(|p| *p != place);
         for (part, to) in parts {
             let at = self.owners.len() as u32;
             self.owners.push(to);
             self.took.push(Some((last, part.us)));
-            self.owned.entry(to).or_default().push(at);
+            self.owned.or_default(to).push(at);
             if let Some(known) = part.told {
                 self.told.insert(at, known);
             }
@@ -706,17 +709,13 @@ impl Regions {
     }
 
     /// How long each worker has to do with what of these tasks is its own, in microseconds.
-    pub(crate) fn left(
-        &self,
-        open: impl Iterator<Item = u32>,
-        roster: &Roster,
-    ) -> BTreeMap<WorkerId, f64> {
-        let mut left = BTreeMap::new();
+    pub(crate) fn left(&self, open: impl Iterator<Item = u32>, roster: &Roster) -> Crowd<f64> {
+        let mut left = Crowd::default();
         for place in open {
             if let Some((_, us)) = self.took[place as usize] {
                 let owner = self.owners[place as usize];
                 let threads = roster.get(owner).map_or(1, |w| w.threads);
-                *left.entry(owner).or_default() += us / f64::from(threads);
+                *left.or_default(owner) += us / f64::from(threads);
             }
         }
         left
@@ -728,13 +727,13 @@ impl Regions {
         &self,
         place: u32,
         worker: WorkerId,
-        left: &BTreeMap<WorkerId, f64>,
+        left: &Crowd<f64>,
         memory: &Memory,
     ) -> bool {
         let Some((last, us)) = self.took[place as usize] else { return true };
         let owner = self.owners[place as usize];
         let here = us * memory.slower(worker, last);
-        left.get(&owner).is_none_or(|left| *left > 2.0 * here)
+        left.get(owner).is_none_or(|left| *left > 2.0 * here)
     }
 
     /// Whose a task is, and how long its owner may be silent before it is anybody's.
@@ -748,14 +747,14 @@ impl Regions {
         let before = std::mem::replace(&mut self.owners[place as usize], worker);
         if before != worker {
             // Who owned one stays among those whose loss is looked for.
-            self.owned.entry(before).or_default().retain(|p| *p != place);
-            self.owned.entry(worker).or_default().push(place);
+            self.owned.or_default(before).retain(|p| *p != place);
+            self.owned.or_default(worker).push(place);
         }
     }
 }
 
 /// Parts that tiles can be cut into, with what is guessed of each.
-type Parts = BTreeMap<Sides, u64>;
+type Parts = Tiled<u64>;
 
 /// The tiles of a frame that is alone, some of them cut ([`alone::which`]), and all parts that there may be. `None`:
 /// of too few it is known what they take.
@@ -774,14 +773,17 @@ fn mixed(
     }
     let unit = us / units as f64;
     let fine = through.cut(PLAIN / 2);
-    let parts: Parts = fine.tiles.iter().map(|t| (sides(&t.rect), t.est)).collect();
+    let mut parts = Parts::new(kind.1);
+    for t in &fine.tiles {
+        parts.insert(&t.rect, t.est);
+    }
     let whole = |(t, us): (&Macrotile, &Option<f64>)| us.unwrap_or(t.est as f64 * unit);
     let us: Vec<f64> = plain.tiles.iter().zip(&known).map(whole).collect();
     let takes = |i: usize| {
         let t = &plain.tiles[i];
         let guess = |est: u64| MORE * us[i] * est as f64 / t.est.max(1) as f64;
         let part = |(r, us): (Option<Rect>, Option<f64>)| {
-            let est = *parts.get(&sides(&r?))?;
+            let est = *parts.get(&r?)?;
             Some(us.unwrap_or_else(|| guess(est)))
         };
         let known = memory.recall_parts_us(kind, &t.rect);
@@ -1144,12 +1146,12 @@ mod tests {
     /// What is known of a tile after frames of which each drew some tiles in so many microseconds.
     fn after(frames: &[&[(Rect, f64, &[u32])]]) -> (Memory, Kind) {
         let kind = (BrickSetKey(Digest32([0; 32])), [512, 512], Crew::ALL);
-        let mut tiles = BTreeMap::new();
+        let mut tiles = Tiled::new(kind.1);
         for (frame, drawn) in (1..).zip(frames) {
             for (rect, us, touched) in *drawn {
                 let (owner, touched) = (WorkerId(frame), touched.to_vec());
                 let known = Known { frame, owner, us: *us, touched };
-                tiles.insert(sides(rect), known);
+                tiles.insert(rect, known);
             }
         }
         let lessons = vec![Lessons { tiles, ..Lessons::of(kind) }];
@@ -1190,12 +1192,12 @@ mod tests {
         for _ in 0..12 {
             m.compare((WorkerId(1), 9000.0), (WorkerId(2), 900.0));
         }
-        let ratio = m.slow[&WorkerId(1)] / m.slow[&WorkerId(2)];
+        let ratio = m.slow[WorkerId(1)] / m.slow[WorkerId(2)];
         assert!((8.0..=10.1).contains(&ratio), "{ratio}");
         m.compare((WorkerId(3), 5.0), (WorkerId(2), 900.0));
-        assert!(!m.slow.contains_key(&WorkerId(3)), "5 us say nothing");
+        assert!(m.slow.get(WorkerId(3)).is_none(), "5 us say nothing");
         m.forget(WorkerId(1));
-        assert!(!m.slow.contains_key(&WorkerId(1)));
+        assert!(m.slow.get(WorkerId(1)).is_none());
     }
 
     #[test]

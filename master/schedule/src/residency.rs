@@ -28,6 +28,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 use crate::Micros;
+use crate::crowd::Crowd;
 
 /// Where a brick is, seen from one worker.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -105,7 +106,7 @@ struct Shelf {
     /// What is to be sent, in order; of the current set.
     wanted: VecDeque<u32>,
     /// What it asked for and can't be sent before its drop is confirmed, or has to go again.
-    owed: VecDeque<(BrickSetKey, u32)>,
+    owed: Vec<(BrickSetKey, Vec<u32>)>,
     mode: Mode,
     flight: Option<Flight>,
 }
@@ -135,7 +136,7 @@ struct Set {
 #[derive(Debug, Default)]
 pub(crate) struct Residency {
     sets: BTreeMap<BrickSetKey, Set>,
-    shelves: BTreeMap<WorkerId, Shelf>,
+    shelves: Crowd<Shelf>,
     /// Number of slabs so far: the clock of "least recently needed".
     round: u64,
     /// The set that tasks are drawn from.
@@ -176,13 +177,13 @@ impl Residency {
             told: BTreeMap::new(),
             leaving: VecDeque::new(),
             wanted: VecDeque::new(),
-            owed: VecDeque::new(),
+            owed: Vec::new(),
             mode: Mode::Broadcast,
             flight: None,
         };
         let before = self.shelves.insert(worker, shelf);
         assert!(before.is_none(), "worker {worker} joins twice; a WorkerId is never used again");
-        let shelf = self.shelves.get_mut(&worker).expect("just put in");
+        let shelf = self.shelves.get_mut(worker).expect("just put in");
         for (key, ids) in held {
             shelf.told.entry(key).or_default().extend(ids);
         }
@@ -195,14 +196,14 @@ impl Residency {
     }
 
     pub(crate) fn leave(&mut self, worker: WorkerId) {
-        self.shelves.remove(&worker);
+        self.shelves.remove(worker);
     }
 
     /// Enters the bricks that a worker brought along into the books of an opened set. Ids the
     /// set does not have are a stranger's mistake and are ignored.
     fn believe(&mut self, worker: WorkerId, key: BrickSetKey) {
         let set = &self.sets[&key];
-        let shelf = self.shelves.get_mut(&worker).expect("a worker with a shelf");
+        let shelf = self.shelves.get_mut(worker).expect("a worker with a shelf");
         let ids = shelf.told.remove(&key).unwrap_or_default();
         let books = shelf.sets.entry(key).or_insert_with(|| Books::new(set.bricks.len()));
         for id in ids {
@@ -241,8 +242,8 @@ impl Residency {
         self.round_bytes = 0;
         let set = self.sets.entry(key).or_insert_with(|| Set::new(bricks));
         assert_eq!(set.bricks.len(), bricks.len(), "a set key names one list of bricks");
-        for worker in self.shelves.keys().copied().collect::<Vec<_>>() {
-            if self.shelves[&worker].told.contains_key(&key) {
+        for worker in self.shelves.ids().collect::<Vec<_>>() {
+            if self.shelves[worker].told.contains_key(&key) {
                 self.believe(worker, key);
             }
             self.settle_mode(worker);
@@ -265,7 +266,7 @@ impl Residency {
             set.needed[i as usize] = self.round;
             self.round_bytes += u64::from(set.bricks[i as usize].bytes);
         }
-        for worker in self.shelves.keys().copied().collect::<Vec<_>>() {
+        for worker in self.shelves.ids().collect::<Vec<_>>() {
             self.settle_mode(worker);
         }
     }
@@ -273,7 +274,7 @@ impl Residency {
     /// Decides for the slab whether a worker gets all its bricks, and forgets what it was still
     /// to be sent for the slab before, but for leases it has not given back.
     fn settle_mode(&mut self, worker: WorkerId) {
-        let shelf = self.shelves.get_mut(&worker).expect("a worker with a shelf");
+        let shelf = self.shelves.get_mut(worker).expect("a worker with a shelf");
         shelf.mode = if self.asks {
             Mode::Asks
         } else if self.round_bytes.saturating_add(shelf.pinned_bytes) > shelf.budget {
@@ -286,13 +287,13 @@ impl Residency {
 
     /// Whether a worker gets only the bricks of its leases.
     pub(crate) fn is_lazy(&self, worker: WorkerId) -> bool {
-        self.shelves[&worker].mode == Mode::Lazy
+        self.shelves[worker].mode == Mode::Lazy
     }
 
     /// Whether a lease's bricks fit beside those of the worker's other leases. Always so for a
     /// worker that gets the whole slab.
     pub(crate) fn fits(&self, worker: WorkerId, lease: &[u32]) -> bool {
-        let shelf = &self.shelves[&worker];
+        let shelf = &self.shelves[worker];
         if shelf.mode != Mode::Lazy {
             return true;
         }
@@ -309,7 +310,7 @@ impl Residency {
     /// A lease on these bricks begins.
     pub(crate) fn pin(&mut self, worker: WorkerId, lease: &[u32]) {
         let set = &self.sets[&self.current];
-        let shelf = self.shelves.get_mut(&worker).expect("a worker with a shelf");
+        let shelf = self.shelves.get_mut(worker).expect("a worker with a shelf");
         let books = shelf.sets.entry(self.current).or_insert_with(|| Books::new(set.bricks.len()));
         for &i in lease {
             let pins = &mut books.pins[i as usize];
@@ -323,7 +324,7 @@ impl Residency {
     /// A lease on these bricks ended.
     pub(crate) fn unpin(&mut self, worker: WorkerId, lease: &[u32]) {
         let set = &self.sets[&self.current];
-        let Some(shelf) = self.shelves.get_mut(&worker) else { return };
+        let Some(shelf) = self.shelves.get_mut(worker) else { return };
         let books = shelf.sets.get_mut(&self.current).expect("what is pinned has books");
         for &i in lease {
             let pins = &mut books.pins[i as usize];
@@ -338,7 +339,7 @@ impl Residency {
     /// sent.
     pub(crate) fn want(&mut self, worker: WorkerId, bricks: impl IntoIterator<Item = u32>) {
         let set = &self.sets[&self.current];
-        let shelf = self.shelves.get_mut(&worker).expect("a worker with a shelf");
+        let shelf = self.shelves.get_mut(worker).expect("a worker with a shelf");
         let books = shelf.sets.entry(self.current).or_insert_with(|| Books::new(set.bricks.len()));
         for i in bricks {
             let at = i as usize;
@@ -359,7 +360,7 @@ impl Residency {
     ) -> Vec<Errand> {
         let mut errands = Vec::new();
         let key = self.current;
-        let Some(shelf) = self.shelves.get_mut(&worker) else { return errands };
+        let Some(shelf) = self.shelves.get_mut(worker) else { return errands };
         pay(&self.sets, shelf, now, &mut errands);
         if shelf.mode == Mode::Lazy {
             // Of a lease that ended without its bricks.
@@ -419,7 +420,7 @@ impl Residency {
         count: u32,
     ) -> Option<Flight> {
         let set = self.sets.get(&key)?;
-        let shelf = self.shelves.get_mut(&worker)?;
+        let shelf = self.shelves.get_mut(worker)?;
         let books = shelf.sets.get_mut(&key)?;
         for _ in 0..count {
             let Some(i) = books.flying.pop_front() else { break };
@@ -432,7 +433,7 @@ impl Residency {
 
     /// Whether a worker holds these, as far as is known here, or they are on their way to it or back.
     pub(crate) fn was_sent(&self, worker: WorkerId, key: BrickSetKey, ids: &[BrickId]) -> bool {
-        let books = self.shelves.get(&worker).and_then(|s| s.sets.get(&key));
+        let books = self.shelves.get(worker).and_then(|s| s.sets.get(&key));
         // Of a set that is gone nothing is lacked.
         let (Some(set), Some(books)) = (self.sets.get(&key), books) else { return true };
         let known = |i: u32| books.place[i as usize] != Place::Absent;
@@ -447,7 +448,7 @@ impl Residency {
         ids: &[BrickId],
     ) -> Option<Flight> {
         let set = self.sets.get(&key)?;
-        let shelf = self.shelves.get_mut(&worker)?;
+        let shelf = self.shelves.get_mut(worker)?;
         let books = shelf.sets.get_mut(&key)?;
         let mut again = Vec::new();
         for &id in ids {
@@ -476,7 +477,7 @@ impl Residency {
             again.push(i);
         }
         if shelf.mode == Mode::Asks {
-            shelf.owed.extend(again.into_iter().map(|i| (key, i)));
+            owe(&mut shelf.owed, key, again);
         } else if key == self.current {
             // Those that somebody waits for are in front of all others.
             let round = self.round;
@@ -500,11 +501,11 @@ impl Residency {
         key: BrickSetKey,
         bricks: impl IntoIterator<Item = u32>,
     ) {
-        let (Some(set), Some(shelf)) = (self.sets.get(&key), self.shelves.get_mut(&worker)) else {
+        let (Some(set), Some(shelf)) = (self.sets.get(&key), self.shelves.get_mut(worker)) else {
             return;
         };
         shelf.sets.entry(key).or_insert_with(|| Books::new(set.bricks.len()));
-        shelf.owed.extend(bricks.into_iter().map(|i| (key, i)));
+        owe(&mut shelf.owed, key, bricks);
     }
 
     /// Places of these bricks in their set, as far as it has them.
@@ -539,7 +540,7 @@ impl Residency {
 
     /// A worker forgot these. What a lease of its needs goes again.
     pub(crate) fn forgotten(&mut self, worker: WorkerId, key: BrickSetKey, ids: &[BrickId]) {
-        let (Some(set), Some(shelf)) = (self.sets.get(&key), self.shelves.get_mut(&worker)) else {
+        let (Some(set), Some(shelf)) = (self.sets.get(&key), self.shelves.get_mut(worker)) else {
             return;
         };
         let Some(books) = shelf.sets.get_mut(&key) else { return };
@@ -562,7 +563,7 @@ impl Residency {
 
     /// All control messages up to the ping `nonce` were read: what left before it is gone.
     pub(crate) fn ponged(&mut self, worker: WorkerId, nonce: u64) {
-        let Some(shelf) = self.shelves.get_mut(&worker) else { return };
+        let Some(shelf) = self.shelves.get_mut(worker) else { return };
         while shelf.leaving.front().is_some_and(|(n, ..)| *n <= nonce) {
             let (_, key, gone) = shelf.leaving.pop_front().expect("there is a front");
             let books = shelf.sets.get_mut(&key).expect("what leaves has books");
@@ -577,25 +578,25 @@ impl Residency {
 
     /// Bricks and bytes that a worker has of a set.
     pub(crate) fn held_of(&self, worker: WorkerId, key: BrickSetKey) -> (u64, u64) {
-        let books = self.shelves.get(&worker).and_then(|s| s.sets.get(&key));
+        let books = self.shelves.get(worker).and_then(|s| s.sets.get(&key));
         books.map_or((0, 0), |b| (b.held_count, b.held_bytes))
     }
 
     /// Bricks and bytes that a worker has of all sets.
     pub(crate) fn held(&self, worker: WorkerId) -> (u64, u64) {
-        let books = self.shelves.get(&worker).into_iter().flat_map(|s| s.sets.values());
+        let books = self.shelves.get(worker).into_iter().flat_map(|s| s.sets.values());
         books.fold((0, 0), |(n, b), books| (n + books.held_count, b + books.held_bytes))
     }
 
     /// The flight to a worker that has not landed.
     pub(crate) fn flight(&self, worker: WorkerId) -> Option<Flight> {
-        self.shelves.get(&worker).and_then(|s| s.flight)
+        self.shelves.get(worker).and_then(|s| s.flight)
     }
 
     /// The flight ends for the statistics of one frame and goes on for the next.
     pub(crate) fn cut_flights(&mut self, now: Micros) -> Vec<(WorkerId, Flight)> {
         let mut cut = Vec::new();
-        for (&worker, shelf) in &mut self.shelves {
+        for (worker, shelf) in self.shelves.iter_mut() {
             if let Some(flight) = &mut shelf.flight {
                 cut.push((worker, *flight));
                 *flight = Flight { since: now, bricks: 0, bytes: 0 };
@@ -637,34 +638,42 @@ fn pay(
     now: Micros,
     errands: &mut Vec<Errand>,
 ) {
-    for (key, i) in std::mem::take(&mut shelf.owed) {
+    for (key, mut places) in std::mem::take(&mut shelf.owed) {
         // A set may be closed before its last bricks are asked for.
         let (Some(set), Some(books)) = (sets.get(&key), shelf.sets.get_mut(&key)) else { continue };
-        let info = &set.bricks[i as usize];
-        match books.place[i as usize] {
-            Place::Flying | Place::Held => continue,
-            Place::Leaving => {
-                shelf.owed.push_back((key, i));
-                continue;
+        let (mut sent, mut bytes) = (Vec::with_capacity(places.len()), 0);
+        places.retain(|&i| {
+            let place = &mut books.place[i as usize];
+            if *place == Place::Absent {
+                let info = &set.bricks[i as usize];
+                *place = Place::Flying;
+                books.flying.push_back(i);
+                sent.push(info.id);
+                bytes += u64::from(info.bytes);
             }
-            Place::Absent => {}
+            *place == Place::Leaving
+        });
+        if !places.is_empty() {
+            owe(&mut shelf.owed, key, places);
         }
-        books.place[i as usize] = Place::Flying;
-        books.flying.push_back(i);
-        shelf.bytes += u64::from(info.bytes);
-        shelf.departs(now, 1, info.bytes.into());
-        match errands.last_mut() {
-            Some(Errand::Send { set, bricks, bytes, .. }) if *set == key => {
-                bricks.push(info.id);
-                *bytes += u64::from(info.bytes);
-            }
-            _ => errands.push(Errand::Send {
-                set: key,
-                bricks: vec![info.id],
-                bytes: info.bytes.into(),
-                over_budget: false,
-            }),
+        if sent.is_empty() {
+            continue;
         }
+        shelf.bytes += bytes;
+        shelf.departs(now, sent.len() as u64, bytes);
+        errands.push(Errand::Send { set: key, bricks: sent, bytes, over_budget: false });
+    }
+}
+
+/// Notes that a worker is to be sent these, behind all that it is to be sent already.
+fn owe(
+    owed: &mut Vec<(BrickSetKey, Vec<u32>)>,
+    key: BrickSetKey,
+    places: impl IntoIterator<Item = u32>,
+) {
+    match owed.last_mut().filter(|last| last.0 == key) {
+        Some(last) => last.1.extend(places),
+        None => owed.push((key, places.into_iter().collect())),
     }
 }
 

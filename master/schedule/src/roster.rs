@@ -15,13 +15,14 @@
 //! heartbeats, which can't happen to a driver that keeps `next_deadline`, the excess is added
 //! to everybody's account.
 
+use crate::crowd::Crowd;
 use crate::reserve;
 use crate::{Config, Micros};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, SceneId, WorkerId};
 use slabcast_common::message::DIRECTORIES;
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 
 /// How fast two machines' clocks may drift apart: 100 ppm, twice what quartz is sold with. A
@@ -105,7 +106,7 @@ impl Worker {
 /// All workers.
 #[derive(Debug, Default)]
 pub(crate) struct Roster {
-    workers: BTreeMap<WorkerId, Worker>,
+    workers: Crowd<Worker>,
     next_nonce: u64,
     watched: Option<Micros>,
     /// No ping is due before, and nobody silent for too long. What is heard moves that, which is found out
@@ -154,7 +155,7 @@ impl Roster {
     }
 
     pub(crate) fn remove(&mut self, id: WorkerId) -> Option<Worker> {
-        let worker = self.workers.remove(&id)?;
+        let worker = self.workers.remove(id)?;
         self.dry -= usize::from(worker.is_dry());
         self.threads -= if worker.draws() { u64::from(worker.threads) } else { 0 };
         self.changes += 1;
@@ -188,11 +189,11 @@ impl Roster {
         }
         let key = |id: WorkerId, w: &Worker| (Reverse(w.threads), (id.0 / 2).reverse_bits(), id);
         let staying = self.workers.iter().filter(|(_, w)| !w.leaving);
-        let mut order: Vec<_> = staying.map(|(&id, w)| key(id, w)).collect();
+        let mut order: Vec<_> = staying.map(|(id, w)| key(id, w)).collect();
         order.sort_unstable();
         let drawing = reserve::drawing(order.len(), self.halved);
         for (i, (Reverse(threads), _, id)) in order.into_iter().enumerate() {
-            let w = self.workers.get_mut(&id).expect("just listed");
+            let w = self.workers.get_mut(id).expect("just listed");
             let reserve = i >= drawing;
             if std::mem::replace(&mut w.reserve, reserve) != reserve {
                 let threads = u64::from(threads);
@@ -205,7 +206,7 @@ impl Roster {
 
     /// A worker takes no more leases. Whether that is news.
     pub(crate) fn leaves(&mut self, id: WorkerId) -> bool {
-        let Some(w) = self.workers.get_mut(&id) else { return false };
+        let Some(w) = self.workers.get_mut(id) else { return false };
         let news = !std::mem::replace(&mut w.leaving, true);
         if news {
             self.threads -= if w.reserve { 0 } else { u64::from(w.threads) };
@@ -217,7 +218,7 @@ impl Roster {
 
     /// A worker has another lease.
     pub(crate) fn lends(&mut self, id: WorkerId) {
-        let Some(w) = self.workers.get_mut(&id) else { return };
+        let Some(w) = self.workers.get_mut(id) else { return };
         let before = w.is_dry();
         w.leases += 1;
         self.dry -= usize::from(before && !w.is_dry());
@@ -225,7 +226,7 @@ impl Roster {
 
     /// A worker has so many leases less.
     pub(crate) fn ends(&mut self, id: WorkerId, leases: u64) {
-        let Some(w) = self.workers.get_mut(&id) else { return };
+        let Some(w) = self.workers.get_mut(id) else { return };
         let before = w.is_dry();
         w.leases -= leases;
         self.dry += usize::from(!before && w.is_dry());
@@ -242,15 +243,15 @@ impl Roster {
     }
 
     pub(crate) fn get(&self, id: WorkerId) -> Option<&Worker> {
-        self.workers.get(&id)
+        self.workers.get(id)
     }
 
     pub(crate) fn get_mut(&mut self, id: WorkerId) -> Option<&mut Worker> {
-        self.workers.get_mut(&id)
+        self.workers.get_mut(id)
     }
 
     pub(crate) fn iter(&self) -> impl Iterator<Item = (WorkerId, &Worker)> {
-        self.workers.iter().map(|(&id, w)| (id, w))
+        self.workers.iter()
     }
 
     /// Those that take leases.
@@ -269,7 +270,7 @@ impl Roster {
 
     /// Something came from the worker.
     pub(crate) fn heard(&mut self, id: WorkerId, now: Micros) {
-        if let Some(w) = self.workers.get_mut(&id) {
+        if let Some(w) = self.workers.get_mut(id) {
             w.heard = w.heard.max(now);
         }
     }
@@ -299,7 +300,7 @@ impl Roster {
     /// A nonce for a ping that goes to the worker now.
     pub(crate) fn ping(&mut self, id: WorkerId, now: Micros) -> u64 {
         self.next_nonce += 1;
-        if let Some(w) = self.workers.get_mut(&id) {
+        if let Some(w) = self.workers.get_mut(id) {
             w.pings.push_back((self.next_nonce, now));
             if w.pings.len() > MAX_PINGS {
                 w.pings.pop_front();
@@ -318,7 +319,7 @@ impl Roster {
         let beaten = ids
             .into_iter()
             .map(|id| {
-                self.workers.get_mut(&id).expect("just seen").next_ping = now + config.heartbeat;
+                self.workers.get_mut(id).expect("just seen").next_ping = now + config.heartbeat;
                 (id, self.ping(id, now))
             })
             .collect();
@@ -329,7 +330,7 @@ impl Roster {
 
     /// A pong came. Whether its ping was ours and not answered before.
     pub(crate) fn pong(&mut self, id: WorkerId, nonce: u64, clock_us: u64, now: Micros) -> bool {
-        let Some(w) = self.workers.get_mut(&id) else { return false };
+        let Some(w) = self.workers.get_mut(id) else { return false };
         let Some(i) = w.pings.iter().position(|p| p.0 == nonce) else { return false };
         let sent = w.pings[i].1;
         w.pings.drain(..=i);

@@ -12,11 +12,11 @@
 //! of n times one core's speed without, 89.5 and 69.5 with it (docs/scaling.md, Large scenes).
 
 use super::{End, Frame, Slab};
+use crate::crowd::Crowd;
 use crate::region::Part;
 use crate::roster::Roster;
 use crate::{Cluster, Micros};
 use slabcast_common::ids::WorkerId;
-use std::collections::BTreeMap;
 
 /// How much later than the mean a worker has to be for its last tile to be cut: this part of what the tile takes, and so
 /// many microseconds. In parts a tile takes a quarter longer; at half as much 64 workers have 67.6 % where they have
@@ -70,7 +70,7 @@ impl Frame {
         }
         let mut left = self.left(slab, &cluster.roster, now)?;
         let mean = left.values().sum::<f64>() / left.len() as f64;
-        let mine = left.get_mut(&id)?;
+        let mine = left.get_mut(id)?;
         if *mine - mean <= LATE.0 * us + LATE.1 {
             return None;
         }
@@ -81,26 +81,26 @@ impl Frame {
         let mut whose = Vec::with_capacity(parts.len());
         for part in parts {
             let away = |to: WorkerId| if to == id { 0.0 } else { AWAY + part.price };
-            let after = |(to, left): (&WorkerId, &f64)| left + part.us + away(*to);
+            let after = |(to, left): (WorkerId, &f64)| left + part.us + away(to);
             let first = left.iter().min_by(|a, b| after(*a).total_cmp(&after(*b)));
-            let to = *first?.0;
-            *left.get_mut(&to)? += part.us / threads(to) + away(to);
+            let to = first?.0;
+            *left.get_mut(to)? += part.us / threads(to) + away(to);
             whose.push((part, to));
         }
         whose.iter().any(|(_, to)| *to != id).then_some(whose)
     }
 
     /// How long each worker that stays has to do, in microseconds, by what its tiles took before.
-    fn left(&self, slab: &Slab, roster: &Roster, now: Micros) -> Option<BTreeMap<WorkerId, f64>> {
+    fn left(&self, slab: &Slab, roster: &Roster, now: Micros) -> Option<Crowd<f64>> {
         let regions = slab.regions.as_ref()?;
         let tasks = slab.queue.tasks.iter().zip(0..);
         let open = tasks.filter(|(t, _)| t.end == End::Open).map(|(_, place)| place);
         let all = regions.left(open, roster);
-        let mut left: BTreeMap<WorkerId, f64> =
-            roster.staying().map(|(id, _)| (id, all.get(&id).copied().unwrap_or(0.0))).collect();
+        let mut left: Crowd<f64> =
+            roster.staying().map(|(id, _)| (id, all.get(id).copied().unwrap_or(0.0))).collect();
         // But for what is drawn by now of what threads draw.
-        for (id, lent) in &self.lent {
-            let (Some(left), Some(worker)) = (left.get_mut(id), roster.get(*id)) else { continue };
+        for (id, lent) in self.lent.iter() {
+            let (Some(left), Some(worker)) = (left.get_mut(id), roster.get(id)) else { continue };
             let answered = self.answered.get(id).copied().unwrap_or(0);
             for lent in lent.iter().take(worker.threads as usize) {
                 let took = slab.queue.place(lent.task).and_then(|place| regions.took(place));

@@ -1,0 +1,167 @@
+//! Something about each of some workers, in the order of their ids.
+//!
+//! The scheduler asks ten times for each message who a worker is and what it has. Ids are given out one after the other, so a
+//! worker mostly stands where its id says, and is found by one look there; if some before it are gone, by halving. A tree of 64
+//! workers took a quarter of all that the scheduler does, in looking ids up (docs/scaling.md).
+
+use slabcast_common::ids::WorkerId;
+
+/// A map from workers that is gone through in the order of their ids.
+#[derive(Clone, Debug)]
+pub(crate) struct Crowd<T> {
+    ids: Vec<WorkerId>,
+    /// Each one's, at its place.
+    values: Vec<T>,
+}
+
+impl<T> Default for Crowd<T> {
+    fn default() -> Self {
+        Crowd { ids: Vec::new(), values: Vec::new() }
+    }
+}
+
+impl<T> Crowd<T> {
+    /// Where a worker is, or would be.
+    fn place(&self, id: WorkerId) -> Result<usize, usize> {
+        let Some(first) = self.ids.first() else { return Err(0) };
+        let guess = usize::try_from(id.0.wrapping_sub(first.0)).unwrap_or(usize::MAX);
+        if self.ids.get(guess) == Some(&id) {
+            return Ok(guess);
+        }
+        self.ids.binary_search(&id)
+    }
+
+    pub(crate) fn get(&self, id: WorkerId) -> Option<&T> {
+        Some(&self.values[self.place(id).ok()?])
+    }
+
+    pub(crate) fn get_mut(&mut self, id: WorkerId) -> Option<&mut T> {
+        let place = self.place(id).ok()?;
+        Some(&mut self.values[place])
+    }
+
+    /// Puts a worker's value down. The one before, if there is any.
+    pub(crate) fn insert(&mut self, id: WorkerId, value: T) -> Option<T> {
+        match self.place(id) {
+            Ok(place) => Some(std::mem::replace(&mut self.values[place], value)),
+            Err(place) => {
+                self.ids.insert(place, id);
+                self.values.insert(place, value);
+                None
+            }
+        }
+    }
+
+    pub(crate) fn remove(&mut self, id: WorkerId) -> Option<T> {
+        let place = self.place(id).ok()?;
+        self.ids.remove(place);
+        Some(self.values.remove(place))
+    }
+
+    /// A worker's value, made now if it had none.
+    pub(crate) fn or_insert_with(&mut self, id: WorkerId, make: impl FnOnce() -> T) -> &mut T {
+        let place = self.place(id).unwrap_or_else(|place| {
+            self.ids.insert(place, id);
+            self.values.insert(place, make());
+            place
+        });
+        &mut self.values[place]
+    }
+
+    pub(crate) fn or_default(&mut self, id: WorkerId) -> &mut T
+    where
+        T: Default,
+    {
+        self.or_insert_with(id, T::default)
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.ids.len()
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.ids.is_empty()
+    }
+
+    pub(crate) fn ids(&self) -> impl Iterator<Item = WorkerId> {
+        self.ids.iter().copied()
+    }
+
+    pub(crate) fn values(&self) -> impl Iterator<Item = &T> {
+        self.values.iter()
+    }
+
+    pub(crate) fn values_mut(&mut self) -> impl Iterator<Item = &mut T> {
+        self.values.iter_mut()
+    }
+
+    pub(crate) fn into_values(self) -> impl Iterator<Item = T> {
+        self.values.into_iter()
+    }
+
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (WorkerId, &T)> {
+        self.ids().zip(&self.values)
+    }
+
+    pub(crate) fn iter_mut(&mut self) -> impl Iterator<Item = (WorkerId, &mut T)> {
+        self.ids.iter().copied().zip(&mut self.values)
+    }
+}
+
+impl<T> std::ops::Index<WorkerId> for Crowd<T> {
+    type Output = T;
+
+    fn index(&self, id: WorkerId) -> &T {
+        self.get(id).expect("a worker that is known")
+    }
+}
+
+impl<T> IntoIterator for Crowd<T> {
+    type Item = (WorkerId, T);
+    type IntoIter = std::iter::Zip<std::vec::IntoIter<WorkerId>, std::vec::IntoIter<T>>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.ids.into_iter().zip(self.values)
+    }
+}
+
+impl<T> FromIterator<(WorkerId, T)> for Crowd<T> {
+    fn from_iter<I: IntoIterator<Item = (WorkerId, T)>>(all: I) -> Self {
+        let mut crowd = Crowd::default();
+        for (id, value) in all {
+            crowd.insert(id, value);
+        }
+        crowd
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use std::collections::BTreeMap;
+
+    proptest! {
+        /// Whoever comes and goes in whatever order, it is what a tree of the standard library is.
+        #[test]
+        fn it_is_an_ordered_map(
+            base in prop::sample::select(vec![0u64, 1, 1000, u64::MAX - 40]),
+            deeds in prop::collection::vec((0u64..40, 0u8..4, any::<u16>()), 0..200),
+        ) {
+            let (mut crowd, mut tree) = (Crowd::default(), BTreeMap::new());
+            for (id, deed, value) in deeds {
+                let id = WorkerId(base + id);
+                match deed {
+                    0 => prop_assert_eq!(crowd.insert(id, value), tree.insert(id, value)),
+                    1 => prop_assert_eq!(crowd.remove(id), tree.remove(&id)),
+                    2 => *crowd.or_default(id) = *tree.entry(id).or_default(),
+                    _ => prop_assert_eq!(crowd.get_mut(id), tree.get_mut(&id)),
+                }
+                prop_assert_eq!(crowd.get(id), tree.get(&id));
+                prop_assert_eq!((crowd.len(), crowd.is_empty()), (tree.len(), tree.is_empty()));
+            }
+            prop_assert!(crowd.iter().eq(tree.iter().map(|(&id, v)| (id, v))));
+            prop_assert!(crowd.into_iter().eq(tree));
+        }
+    }
+}

@@ -1,8 +1,8 @@
 //! Something about each of some workers, in the order of their ids.
 //!
 //! The scheduler asks ten times for each message who a worker is and what it has. Ids are given out one after the other, so a
-//! worker mostly stands where its id says, and is found by one look there; if some before it are gone, by halving. A tree of 64
-//! workers took a quarter of all that the scheduler does, in looking ids up (docs/scaling.md).
+//! worker mostly stands where its id says, and is found by one look there; if some before it are gone, by halving. With 64 workers
+//! a quarter of all that the scheduler does was looking up workers and tiles ([`tiled`](crate::tiled)) in trees (docs/scaling.md).
 
 use slabcast_common::ids::WorkerId;
 

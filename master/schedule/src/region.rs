@@ -58,10 +58,16 @@ const BRICK: f64 = 3.0;
 /// what the tile takes: the scheduling of two busy machines, as for tasks that are late.
 const FORBEARANCE: Micros = 5_000;
 
-/// Tiles for a thread beyond which a coarser cut is taken. Messages of a tile of 64 pixels cost a thread some
-/// 40 us of its 600; one of 128 takes a tenth longer to draw than four of 64 (mri256 `peer-opaque`, EPYC). At 12 one
-/// worker drew that in tiles of 128, at 84 % of what it could; now at 89.
-const MANY: u64 = 64;
+/// Tiles for a thread beyond which a coarser cut is taken: to draw, one of 128 pixels takes what four of 64 do, but each
+/// result costs the core that draws some 40 us of its own. Frames a second of 2 and 4 workers of mri256 at 1024x1024: 70 and 141
+/// in tiles of 64 pixels, 77 and 158 in such of 128 (`plan`); a real worker that has a processor to itself takes 15.3 and 14.4 ms
+/// a frame at 512x512, 37 and 34 at 1024x1024 (docs/scaling.md).
+const MANY: f64 = 6.0;
+
+/// The coarsest tiles of workers that are not on the master's machine: where each of few lacks bricks, nothing is drawn
+/// until some come. One worker at 1 Gbit/s has 88 % of what it could in tiles of 128 pixels (mri256 at 1024x1024), and 77 in such
+/// of 256.
+const COARSEST: u32 = 128;
 
 /// A frame beside others may have so many tiles of those that are asked for, where threads that draw share the master's
 /// processors: each result then takes some 100 us of what they could draw in, and while there are tiles of four frames
@@ -423,11 +429,13 @@ impl Crew {
     }
 }
 
-/// With how many tiles a cut is fine enough, of which so many are `wanted`; `shared`: other frames are in the making, and
-/// threads share the master's processors.
-fn many(wanted: f64, threads: u64, shared: bool) -> u64 {
-    let many = if shared { SHARED * wanted } else { wanted.max((MANY * threads) as f64) };
-    many.ceil() as u64
+/// The edge of as few tiles as are enough: so many are `wanted`, for so many `threads`. `beside`: other frames are in the
+/// making; `here`: the threads share the master's processors.
+fn edge(through: &Through, (wanted, threads): (f64, f64), beside: bool, here: bool) -> u32 {
+    let shared = beside && here;
+    let many = if shared { SHARED * wanted } else { wanted.max(MANY * threads) };
+    let edge = through.edge((wanted.ceil() as u64, many.ceil() as u64));
+    if shared { edge } else { edge.min(COARSEST) }
 }
 
 /// The tiles' edge of a frame beside others, where the one before it had the `last`, if it was for as many threads.
@@ -437,16 +445,17 @@ fn edge_beside(
     here: bool,
     last: Option<u32>,
 ) -> u32 {
-    let edge = |wanted: f64| through.edge((wanted.ceil() as u64, many(wanted, threads, here)));
+    // Of so many times what is asked for.
+    let edge = |part: f64| edge(through, (part * wanted, part * threads as f64), true, here);
     match last {
-        Some(last) => last.clamp(edge((1.0 + STAY) * wanted), edge((1.0 - STAY) * wanted)),
-        None => edge(wanted),
+        Some(last) => last.clamp(edge(1.0 + STAY), edge(1.0 - STAY)),
+        None => edge(1.0),
     }
 }
 
 /// The tiles' edge of a frame that is alone, before any is cut in parts.
 fn edge_alone(through: &Through, (wanted, threads): (f64, u64)) -> u32 {
-    let edge = |wanted: f64| through.edge((wanted.ceil() as u64, many(wanted, threads, false)));
+    let edge = |wanted: f64| edge(through, (wanted, threads as f64), false, false);
     let finest = edge(wanted);
     if finest >= PLAIN {
         return finest;
@@ -1041,12 +1050,13 @@ mod tests {
     fn tiles_are_as_large_as_there_are_enough_of_where_threads_share_the_masters_processors() {
         // As a head lies in a picture.
         let through = Through::new([512, 512], &[Rect::new(90, 40, 430, 480)]);
-        let edge = |threads: u64, shared| {
-            let wanted = 2.5 * threads as f64;
-            through.edge((wanted.ceil() as u64, many(wanted, threads, shared)))
+        let edge = |threads: u64, here| {
+            let asked = (2.5 * threads as f64, threads as f64);
+            edge(&through, asked, true, here)
         };
         assert_eq!([1, 2, 4, 8, 16, 32].map(|n| edge(n, true)), [256, 256, 128, 128, 64, 32]);
-        assert_eq!([1, 2, 4, 8, 16, 32].map(|n| edge(n, false)), [64, 64, 64, 64, 64, 32]);
+        // There are 24 of 128 pixels, 56 of 64.
+        assert_eq!([1, 2, 4, 8, 16, 32].map(|n| edge(n, false)), [128, 128, 64, 64, 64, 32]);
         // A tile of theirs is everybody's who has most of the threads.
         let here = |crew: &[(u32, bool)]| {
             let mut roster = Roster::default();

@@ -340,6 +340,38 @@ async fn a_worker_of_another_protocol_is_refused_by_name() {
     }
 }
 
+/// It then sends finished pixels as they are; who rehearses stands for another machine's, and packs them.
+#[tokio::test]
+async fn a_worker_of_the_masters_machine_is_told_that_it_is() {
+    use slabcast_common::message::{Hello, ToMaster, ToWorker};
+    use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
+    use slabcast_proto::{convert, v1::cluster_client::ClusterClient};
+    let (_master, address) = master();
+    for rehearses in [false, true] {
+        let hello = Hello {
+            protocol_version: PROTOCOL_VERSION,
+            pixels_version: PIXELS_VERSION,
+            name: "stub".into(),
+            threads: 1,
+            memory_budget_bytes: 1 << 20,
+            simd: "plain".into(),
+            self_test_sha256: SELF_TEST_SHA256.into(),
+            held: vec![],
+            rehearses,
+            machine: String::new(),
+        };
+        let mut client = ClusterClient::connect(format!("http://{address}")).await.unwrap();
+        let first = convert::from_worker_to_wire(&ToMaster::Hello(hello));
+        let stream =
+            tokio_stream::StreamExt::chain(tokio_stream::once(first), tokio_stream::pending());
+        let mut answers = client.control(stream).await.unwrap().into_inner();
+        let answer = answers.message().await.unwrap().expect("an answer");
+        let (welcome, _) = convert::to_worker_from_wire(answer).unwrap();
+        let ToWorker::Welcome { is_here, .. } = welcome else { panic!("not let in: {welcome:?}") };
+        assert_eq!(is_here, !rehearses);
+    }
+}
+
 /// What any gRPC client relies on: health, reflection, quick round trips.
 #[tokio::test]
 async fn health_and_reflection_answer_and_round_trips_are_quick() {

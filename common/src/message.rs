@@ -83,6 +83,8 @@ pub enum ToWorker {
         worker: WorkerId,
         /// How often the master pings; silence for three times as long means it is gone.
         heartbeat_ms: u32,
+        /// Whether the worker shares the master's machine: then it does not pack what it sends.
+        is_here: bool,
     },
     /// The hello was not good; the link ends. Says why and what to do.
     Refused {

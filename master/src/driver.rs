@@ -583,9 +583,9 @@ impl Driver {
         );
         // Workers give a master up after three of these, as it does them after its own silence.
         let heartbeat_ms = (self.silence / 3000).min(u32::MAX.into()) as u32;
-        let _ = link.control.send(ToWorker::Welcome { worker, heartbeat_ms });
         // A rehearsing one stands for another machine's.
         let is_here = caller.is_on(&hello.machine, &self.machine) && !hello.rehearses;
+        let _ = link.control.send(ToWorker::Welcome { worker, heartbeat_ms, is_here });
         let now = Instant::now();
         let attached = Attached {
             link,

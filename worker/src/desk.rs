@@ -226,7 +226,7 @@ impl Drop for Desk<'_> {
 impl Desk<'_> {
     fn told(&mut self, message: ToWorker) {
         match message {
-            ToWorker::Welcome { worker, heartbeat_ms } => {
+            ToWorker::Welcome { worker, heartbeat_ms, .. } => {
                 info!(%worker, "let in");
                 self.patience = Duration::from_millis(u64::from(heartbeat_ms) * 3);
             }
@@ -609,7 +609,8 @@ mod tests {
             let id = SceneId(3);
             let volume = volume.info(Digest32::default());
             let spec = SceneSpec { id, volume, transfer, quality, bricks: SET };
-            world.say(ToWorker::Welcome { worker: WorkerId(1), heartbeat_ms: 60_000 });
+            let (worker, heartbeat_ms) = (WorkerId(1), 60_000);
+            world.say(ToWorker::Welcome { worker, heartbeat_ms, is_here: false });
             world.say(ToWorker::Scene(Arc::new(spec)));
             for (frame, finish) in [(FRAME, None), (FINISHED, Some(FINISH))] {
                 world.say(ToWorker::Frame { frame, scene: id, view, finish });

@@ -66,10 +66,18 @@ fn key_from_wire(field: &str, set: &[u8]) -> Result<BrickSetKey, WireError> {
 /// # Panics
 /// If a result's planes differ in size: such a result is our own mistake.
 pub fn from_worker_to_wire(message: &ToMaster) -> v1::FromWorker {
+    from_worker_to_wire_as(message, true)
+}
+
+/// The same, where finished pixels are packed if that makes them fewer bytes (`packs`), or go as they are.
+///
+/// # Panics
+/// As that.
+pub fn from_worker_to_wire_as(message: &ToMaster, packs: bool) -> v1::FromWorker {
     use v1::from_worker::Message;
     let message = match message {
         ToMaster::Hello(hello) => Message::Hello(hello_to_wire(hello)),
-        ToMaster::Result(result) => Message::Result(result_to_wire(result)),
+        ToMaster::Result(result) => Message::Result(result_to_wire(result, packs)),
         ToMaster::Failed { task, epoch, reason } => Message::Failed(v1::TaskFailed {
             task: task.0,
             epoch: epoch.0,
@@ -224,7 +232,7 @@ fn last_from_wire(last: Option<v1::Plane>, n: usize) -> Result<Option<Vec<RawSum
         .transpose()
 }
 
-fn result_to_wire(result: &TileResult) -> v1::TileResult {
+fn result_to_wire(result: &TileResult, packs: bool) -> v1::TileResult {
     let (c, t) = (&result.counters, &result.times);
     let n = result.pixels.len();
     let (a, colour, last, finished) = match &result.pixels {
@@ -233,7 +241,7 @@ fn result_to_wire(result: &TileResult) -> v1::TileResult {
             let colour = plane::to_wire(n, |i| p.colour[i]);
             (Some(a_to_wire(&p.a)), Some(colour), last_to_wire(&p.last, n), None)
         }
-        Pixels::Finished(tile) => (None, None, None, Some(leaves::to_wire(tile))),
+        Pixels::Finished(tile) => (None, None, None, Some(leaves::to_wire(tile, packs))),
     };
     v1::TileResult {
         task: result.task.0,
@@ -356,8 +364,9 @@ pub fn check_result(tile: Rect, result: &TileResult) -> Result<(), WireError> {
 pub fn to_worker_to_wire(message: &ToWorker, session: u64) -> Down {
     use v1::to_worker::Message;
     let message = match message {
-        ToWorker::Welcome { worker, heartbeat_ms } => {
-            Message::Welcome(v1::Welcome { worker: worker.0, heartbeat_ms: *heartbeat_ms, session })
+        ToWorker::Welcome { worker, heartbeat_ms, is_here } => {
+            let (worker, heartbeat_ms, is_here) = (worker.0, *heartbeat_ms, *is_here);
+            Message::Welcome(v1::Welcome { worker, heartbeat_ms, session, is_here })
         }
         ToWorker::Refused { reason } => {
             Message::Refused(v1::Refused { reason: reason_to_wire(reason) })
@@ -392,15 +401,15 @@ pub fn to_worker_from_wire(message: v1::ToWorker) -> Result<(ToWorker, Option<u6
     use v1::to_worker::Message;
     let message = match required("message", message.message)? {
         Message::Welcome(welcome) => {
-            let heartbeat_ms = welcome.heartbeat_ms;
+            let v1::Welcome { worker, heartbeat_ms, session, is_here } = welcome;
             if !(1..=600_000).contains(&heartbeat_ms) {
                 return Err(WireError::value(
                     "welcome.heartbeat_ms",
                     format!("{heartbeat_ms}; give 1 to 600000"),
                 ));
             }
-            let message = ToWorker::Welcome { worker: WorkerId(welcome.worker), heartbeat_ms };
-            return Ok((message, Some(session_from_wire("welcome.session", welcome.session)?)));
+            let message = ToWorker::Welcome { worker: WorkerId(worker), heartbeat_ms, is_here };
+            return Ok((message, Some(session_from_wire("welcome.session", session)?)));
         }
         Message::Refused(refused) => {
             ToWorker::Refused { reason: reason_from_wire("refused.reason", refused.reason)? }

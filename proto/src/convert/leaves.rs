@@ -2,8 +2,8 @@
 //!
 //! A leaf with nothing but background is not here at all (`common::leaves`). The others are colours of a
 //! picture, of which lz4 finds a third to two thirds to be the same as something before: background
-//! within leaves, flat parts, alpha. It is tried on every tile, and what does not get smaller goes as it
-//! is. docs/scaling.md has what it takes and saves.
+//! within leaves, flat parts, alpha. It is tried on every tile that leaves the master's machine, and what
+//! does not get smaller goes as it is. docs/scaling.md has what it takes and saves.
 
 use super::render::{format_from_wire, format_to_wire};
 use super::{MAX_TILE_PIXELS, WireError};
@@ -11,15 +11,16 @@ use crate::v1;
 use lz4_flex::block;
 use slabcast_common::leaves::Leaves;
 
-pub(super) fn to_wire(leaves: &Leaves) -> v1::FinishedPixels {
-    let packed = block::compress(&leaves.data);
-    let lz4 = packed.len() < leaves.data.len();
+pub(super) fn to_wire(leaves: &Leaves, packs: bool) -> v1::FinishedPixels {
+    let packed = packs.then(|| block::compress(&leaves.data));
+    let packed = packed.filter(|packed| packed.len() < leaves.data.len());
+    let lz4 = packed.is_some();
     v1::FinishedPixels {
         width: leaves.size[0],
         height: leaves.size[1],
         format: format_to_wire(leaves.format),
         leaves: leaves.mask.clone().into(),
-        data: if lz4 { packed.into() } else { leaves.data.clone().into() },
+        data: packed.unwrap_or_else(|| leaves.data.clone()).into(),
         lz4,
         alpha_most: leaves.alpha_most,
     }
@@ -90,13 +91,16 @@ mod tests {
         {
             for (period, packs) in [(1, true), (100, true), (1 << 20, false)] {
                 let tile = tile(format, period);
-                let message = to_wire(&tile);
+                let message = to_wire(&tile, true);
                 assert_eq!(message.lz4, packs);
                 assert!(message.data.len() <= tile.data.len());
-                assert_eq!(from_wire(message), Ok(tile));
+                assert_eq!(from_wire(message), Ok(tile.clone()));
+                let plain = to_wire(&tile, false);
+                assert!(!plain.lz4 && plain.data == tile.data);
+                assert_eq!(from_wire(plain), Ok(tile));
             }
             let blank = Leaves::blank([256, 256], format);
-            let message = to_wire(&blank);
+            let message = to_wire(&blank, true);
             assert!(message.data.is_empty() && !message.lz4);
             assert_eq!(from_wire(message), Ok(blank));
         }
@@ -105,7 +109,7 @@ mod tests {
     #[test]
     fn sizes_are_refused_before_memory_is_taken() {
         let broken = |change: fn(&mut v1::FinishedPixels)| {
-            let mut message = to_wire(&tile(PixelFormat::Rgb8, 100));
+            let mut message = to_wire(&tile(PixelFormat::Rgb8, 100), true);
             assert!(message.lz4);
             change(&mut message);
             from_wire(message).unwrap_err().field().to_owned()

@@ -26,7 +26,7 @@ mod scene;
 pub use cluster::{
     Bricks, Down, brick_batches_to_wire, bricks_from_wire, bricks_open_from_wire,
     bricks_open_to_wire, check_result, from_worker_from_wire, from_worker_to_wire,
-    to_worker_from_wire, to_worker_to_wire,
+    from_worker_to_wire_as, to_worker_from_wire, to_worker_to_wire,
 };
 pub use error::WireError;
 pub use render::{

@@ -757,15 +757,15 @@ impl Scheduler {
         (0..region::CREWS).min_by_key(frames).filter(|_| !alone && bears)
     }
 
-    /// Who has enough to draw for a while ([`frame::REFILL`]), among all or of one worker.
+    /// Who has enough to draw for a while ([`frame::Ahead::refill`]), among all or of one worker.
     fn find_sated(&mut self, only: Option<WorkerId>) {
         let roster = &self.cluster.roster;
         let ahead = u64::from(self.cluster.config.queue_ahead.max(1));
+        let most = frame::Ahead::of(roster);
         let enough = |id: WorkerId, w: &roster::Worker| {
             let threads = u64::from(w.threads);
             let lent = || self.active.iter().map(|f| f.lent_us(id)).sum::<f64>();
-            w.leases >= threads.saturating_mul(ahead.max(2))
-                && lent() >= frame::REFILL * threads as f64
+            w.leases >= threads.saturating_mul(ahead.max(2)) && lent() >= most.refill(threads)
         };
         self.cluster.sated = match only {
             Some(id) => roster.get(id).filter(|w| enough(id, w)).map(|_| id).into_iter().collect(),

@@ -407,6 +407,34 @@ fn one_by_one(w: &mut World, frames: std::ops::Range<u64>, work: Work) -> Vec<Mi
     took.collect()
 }
 
+#[test]
+fn who_draws_by_itself_is_lent_all_that_is_short_at_once() {
+    // 16 tiles, of which others might have some to take.
+    let lent = |n| {
+        let mut w = world();
+        for _ in 0..n {
+            w.join(Nature { us_per_pixel_sheet: 0.002, ..Nature::default() });
+        }
+        let work = Work { tile: Some(64), schedule: Schedule::Region, ..slab() };
+        one_by_one(&mut w, 0..2, work);
+        let before = w.leases_given;
+        let quality = Quality { thickness: 1.0, eps: 0.0, ..Quality::default() };
+        let scene = fake::scene(0, fake::key(0), DIMS, quality);
+        let mut job = fake::job(&mut Rng::new(5), 0, &scene, &bricks(), [256, 256], work);
+        (job.frame, job.number) = (FrameId(2), 2);
+        w.queue(job);
+        w.run_until(|w| w.leases_given > before);
+        let most = leases(&w).into_iter().max();
+        let tiles = w.done[&FrameId(1)].stats.slabs[0].tiles.len();
+        w.finish();
+        (most.map(|n| n as usize), tiles)
+    };
+    let (most, tiles) = lent(1);
+    assert!(tiles > 8 && most == Some(tiles), "{most:?} of {tiles}");
+    let (most, tiles) = lent(2);
+    assert!(most < Some(tiles), "{most:?} of {tiles}");
+}
+
 /// How many tiles of each size a frame had.
 fn sizes(w: &World, frame: u64) -> BTreeMap<u32, usize> {
     let mut sizes = BTreeMap::new();

@@ -278,7 +278,7 @@ fn losses(name: &str, rows: &[Row]) -> String {
     for (name, _) in LOSSES {
         let _ = write!(text, " {name:>8}");
     }
-    let _ = writeln!(text, " | {:>6} {:>7}", "driver", "streams");
+    let _ = writeln!(text, " | {:>6} {:>7} {:>8}", "driver", "streams", "decides");
     for (r, steady) in told {
         let alone = r.throughput.map_or(0.0, |t| t.1);
         let _ = write!(text, "{:>7} {:>8.1}", r.workers, 100.0 * alone);
@@ -286,7 +286,8 @@ fn losses(name: &str, rows: &[Row]) -> String {
             let _ = write!(text, " {:>8.1}", 100.0 * part);
         }
         let [driver, streams] = steady.busy.map(|part| 100.0 * part);
-        let _ = writeln!(text, " | {driver:>6.1} {streams:>7.1}");
+        let decides = steady.deciding_ms;
+        let _ = writeln!(text, " | {driver:>6.1} {streams:>7.1} {decides:>5.2} ms");
     }
     text
 }
@@ -388,7 +389,8 @@ impl Said<'_> {
             text += "\nalone: eff. of frames/s. drawing: what tiles take beyond one core's share. tables: \
                      made by each worker for\na frame. messages: read and written. bricks: tiles lack \
                      some. on way: results and leases travel. dry: the\nmaster has nothing to lend. \
-                     end: of the path. driver, streams: how busy the master's threads are, in %.\n";
+                     end: of the path. driver, streams: how busy the master's threads are, in %.\n\
+                     decides: how long the driver decides for a frame but the first, measured here.\n";
         }
         for [plain, learned] in self.predicted.iter().filter_map(|p| p.orders) {
             let _ = writeln!(
@@ -429,6 +431,7 @@ impl Said<'_> {
                     "master_busy": r.steady.as_ref().map(|s| {
                         serde_json::json!({ "driver": s.busy[0], "streams": s.busy[1] })
                     }),
+                    "deciding_ms": r.steady.as_ref().map(|s| s.deciding_ms),
                     "messages": { "down": r.messages[0], "writes": r.messages[1], "up": r.messages[2] },
                     "bound_by": r.bound.0.name(), "bound_part": r.bound.1,
                     "parts_ms": { "cores": ms(0), "straggler": ms(1), "link": ms(2),

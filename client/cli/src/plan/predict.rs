@@ -71,8 +71,10 @@ pub(crate) struct Row {
 pub(crate) struct Steady {
     /// what render threads lose, by the parts that [`LOSSES`] names,
     pub(crate) lost: [f64; LOSSES.len()],
-    /// and how much the driver is busy, and each of the streams.
+    /// and how much the driver is busy, and each of the streams;
     pub(crate) busy: [f64; 2],
+    /// and how long the scheduler decides for a frame, by the processor's clock.
+    pub(crate) deciding_ms: f64,
 }
 
 /// What render threads' time goes into beside what drawing takes one core alone, by a word for tables and
@@ -142,9 +144,9 @@ pub(crate) fn rows(
 ) -> Result<Vec<Row>, Fail> {
     let rows = shared(workers.len(), threads, |i, _: &mut ()| {
         let cluster = (workers[i], question.threads);
-        let one = decided(jobs, trace, cluster, messages, 1)?;
+        let (one, _) = decided(jobs, trace, cluster, messages, 1)?;
         let several = decided(jobs, trace, cluster, messages, IN_FLIGHT)?;
-        row(jobs, trace, workers[i], question, [one, several])
+        row(jobs, trace, workers[i], question, one, several)
     });
     rows.into_iter().collect()
 }
@@ -154,7 +156,8 @@ fn row(
     trace: &Trace,
     workers: u32,
     question: &Question,
-    [costs, several]: [Costs; 2],
+    costs: Costs,
+    (several, deciding_ms): (Costs, f64),
 ) -> Result<Row, Fail> {
     let run = |link: Link, costs: Costs, in_flight: u32| {
         let question = Question { link, ..*question };
@@ -202,6 +205,7 @@ fn row(
                 part(spent.tail),
             ],
             busy: [driver, streams / 2.0],
+            deciding_ms,
         }
     });
     Ok(Row {
@@ -308,18 +312,19 @@ pub(crate) fn measured_costs(
     cluster: (u32, u32),
 ) -> Result<Costs, Fail> {
     let schedule = jobs.first().map_or(Schedule::Auto, |job| job.work.schedule);
-    decided(jobs, trace, cluster, costs::messages(trace, schedule), 1)
+    Ok(decided(jobs, trace, cluster, costs::messages(trace, schedule), 1)?.0)
 }
 
 /// What deciding costs on this machine: the scheduler runs the path once on so many workers of so many
-/// threads (whose tiles are in the trace), with so many frames in flight, and is timed.
+/// threads (whose tiles are in the trace), with so many frames in flight, and is timed. And how long it takes for a frame
+/// but the first, in ms.
 pub(crate) fn decided(
     jobs: &[FrameJob],
     trace: &Trace,
     (workers, threads): (u32, u32),
     messages: Costs,
     in_flight: u32,
-) -> Result<Costs, Fail> {
+) -> Result<(Costs, f64), Fail> {
     let question = Question { threads, link: Link::NONE, cores: None, stretch: 1.0, mixed: false };
     let mut watch = Cpu;
     let cluster = question.cluster(workers, messages, in_flight);
@@ -337,7 +342,12 @@ pub(crate) fn decided(
         true => (each((result_count, results.1)), 0.0),
         false => (0.0, per(results)),
     };
-    Ok(Costs {
+    // The first frame sorts the bricks into blocks.
+    let begun = jobs.len().saturating_sub(1) as f64;
+    let many = (result_count + others.0) as f64 + jobs.len() as f64;
+    let beside = (slabs.1 + results.1 + others.1) as f64 - reading * many;
+    let a_frame = frames.1 as f64 / begun.max(1.0) + beside.max(0.0) / jobs.len() as f64;
+    let costs = Costs {
         first_brick: per(first),
         frame_brick: per(frames),
         slab_brick: per(slabs),
@@ -346,5 +356,6 @@ pub(crate) fn decided(
         result_pixel,
         event: each(others),
         ..messages
-    })
+    };
+    Ok((costs, a_frame / 1e6))
 }

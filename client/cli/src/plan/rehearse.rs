@@ -228,7 +228,8 @@ impl Stage<'_> {
     fn predict(&self, workers: u32) -> Result<(Outcome, f64), Fail> {
         let cores = Some(embedded::cores());
         let of = (workers, self.threads);
-        let costs = predict::decided(self.jobs, self.trace, of, self.costs, predict::IN_FLIGHT)?;
+        let (costs, _) =
+            predict::decided(self.jobs, self.trace, of, self.costs, predict::IN_FLIGHT)?;
         let question = Question {
             threads: self.threads,
             link: self.over.link,

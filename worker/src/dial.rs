@@ -136,9 +136,9 @@ async fn link(
     let (bricks_tx, bricks) = mpsc::channel(BATCHES);
     // Whether this is the master's machine: packing results takes a tenth of what drawing does there, and saves nothing.
     let is_here = Arc::new(AtomicBool::new(false));
-    let packs = is_here.clone();
+    let here = is_here.clone();
     let outbound = ReceiverStream::new(reply_rx).map(move |message| {
-        convert::from_worker_to_wire_as(&message, !packs.load(Ordering::Relaxed))
+        convert::from_worker_to_wire_as(&message, !here.load(Ordering::Relaxed))
     });
     let bricks_endpoint = bricks_endpoint(endpoint);
     let mut carrying = tokio::spawn(async move {

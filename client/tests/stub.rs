@@ -144,6 +144,7 @@ fn stats(frame: u64) -> FrameStats {
         left_out: vec![],
         error: Default::default(),
         retries: 0,
+        handed_over: 0,
         dropped_results: 0,
         poisoned: vec![],
         critical_path: None,

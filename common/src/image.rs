@@ -47,6 +47,25 @@ pub(crate) fn finished(a: f32, colour: [u32; 3]) -> [f32; 4] {
 }
 
 impl TilePixels {
+    /// Those of a piece of `tile`, which they are the pixels of.
+    ///
+    /// # Panics
+    /// If the piece is not inside the tile.
+    pub fn piece(&self, tile: Rect, piece: Rect) -> TilePixels {
+        fn rows<T: Copy>(plane: &[T], tile: Rect, piece: Rect) -> Vec<T> {
+            let from = (piece.x0 - tile.x0) as usize;
+            let rows = plane.chunks(tile.width()).skip((piece.y0 - tile.y0) as usize);
+            let rows = rows.take(piece.height()).map(|row| &row[from..from + piece.width()]);
+            rows.flatten().copied().collect()
+        }
+        assert_eq!(tile.union(&piece), tile, "a piece lies in its tile");
+        TilePixels {
+            a: rows(&self.a, tile, piece),
+            colour: rows(&self.colour, tile, piece),
+            last: self.last.as_ref().map(|last| rows(last, tile, piece)),
+        }
+    }
+
     /// Writes the pixels of `tile`, which one slab made, into the rows of a picture of `size`.
     ///
     /// # Panics

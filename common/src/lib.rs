@@ -24,6 +24,7 @@ pub mod paraview;
 pub mod path;
 pub mod presets;
 pub mod quality;
+pub mod region;
 pub mod shade;
 pub mod slab;
 pub mod stats;
@@ -39,7 +40,7 @@ pub mod wanted;
 pub const PIXELS_VERSION: u32 = 10;
 
 /// Version of the messages between master, worker and client.
-pub const PROTOCOL_VERSION: u32 = 5;
+pub const PROTOCOL_VERSION: u32 = 6;
 
 /// SHA-256 of the self-test tile that every worker draws before it says hello
 /// (`slabcast_render::selftest`, which also has the test that keeps this constant true).

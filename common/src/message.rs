@@ -11,6 +11,7 @@ use crate::leaves::{Finish, Leaves};
 use crate::occlusion::Rect;
 use crate::path::ViewPath;
 use crate::quality::{Quality, Work};
+use crate::region::parts;
 use crate::slab::SheetRange;
 pub use crate::transfer::TransferChoice;
 use crate::transfer::TransferFunction;
@@ -53,9 +54,9 @@ pub struct Lease {
     pub state: TileState,
 }
 
-/// One tile through all sheets of its frame, lent to one worker. It starts from nothing, and the
-/// worker asks for the bricks that it turns out to need.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// One tile through all sheets of its frame, lent to one worker. The worker asks for the bricks that it turns out
+/// to need.
+#[derive(Clone, Debug, PartialEq)]
 pub struct RegionLease {
     /// Which task.
     pub task: TaskId,
@@ -67,6 +68,46 @@ pub struct RegionLease {
     pub tile: Rect,
     /// Some of its pixels are drawn in thinner sheets, too.
     pub estimate: bool,
+    /// What another worker has drawn of it; `None`: it starts from nothing.
+    pub begun: Option<Arc<Begun>>,
+}
+
+/// A region as somebody left it who gave it away.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Begun {
+    /// The next sheet to draw of each of its parts ([`crate::region::parts`]), in their order; `None`: it is at its end.
+    pub sheets: Vec<Option<i32>>,
+    /// Its pixels after the sheets before these.
+    pub pixels: TilePixels,
+}
+
+impl Begun {
+    /// The same of a piece of its `tile`.
+    ///
+    /// # Panics
+    /// If the piece is not inside the tile.
+    pub fn piece(&self, tile: Rect, piece: Rect) -> Begun {
+        let of = |part: Rect| {
+            let mut all = parts(tile).zip(&self.sheets);
+            all.find(|(whole, _)| !whole.intersect(&part).is_empty()).and_then(|(_, at)| *at)
+        };
+        Begun { sheets: parts(piece).map(of).collect(), pixels: self.pixels.piece(tile, piece) }
+    }
+}
+
+/// What a worker gives away of a region that it draws.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HandedOver {
+    /// Its lease: which task.
+    pub task: TaskId,
+    /// And which attempt at it.
+    pub epoch: Epoch,
+    /// What it keeps of its tile: its result will have these pixels and no others.
+    pub kept: Rect,
+    /// What it gives away: the rest.
+    pub given: Rect,
+    /// How that stands.
+    pub begun: Begun,
 }
 
 /// Sets whose directories a worker keeps: as many as a master keeps brick sets, and one for a job that
@@ -124,6 +165,18 @@ pub enum ToWorker {
     Lease(Box<Lease>),
     /// Work through all depths.
     Region(RegionLease),
+    /// Others have time: some of what is left of a region is to be given away ([`ToMaster::HandedOver`]). Who has
+    /// drawn it already, or can't cut it, does nothing.
+    HandOver {
+        /// Of which frame.
+        frame: FrameId,
+        /// The lease: which task.
+        task: TaskId,
+        /// And which attempt at it.
+        epoch: Epoch,
+        /// How much of what is left, in thousandths.
+        share: u32,
+    },
     /// A frame is over (finished or cancelled): leases of it that have not begun are dropped.
     EndFrame {
         /// The frame.
@@ -353,6 +406,8 @@ pub enum ToMaster {
         /// For people.
         reason: String,
     },
+    /// A part of a region is given away, as the master asked for.
+    HandedOver(Box<HandedOver>),
     /// Bricks came in.
     BricksIn {
         /// Of which set.

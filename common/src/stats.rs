@@ -224,6 +224,9 @@ pub struct FrameStats {
     /// Leases that were handed out again because their worker was lost or late.
     #[serde(default)]
     pub retries: u64,
+    /// Tiles of which a worker that had nothing to do was given a piece while they were drawn.
+    #[serde(default)]
+    pub handed_over: u64,
     /// Results that came too late or twice and were dropped.
     #[serde(default)]
     pub dropped_results: u64,

@@ -628,6 +628,7 @@ impl Driver {
                 warn!(%worker, %task, reason, "task failed");
                 Happened::Failed { worker, task, epoch, reason }
             }
+            ToMaster::HandedOver(piece) => Happened::HandedOver { worker, piece },
             ToMaster::BricksIn { set, bricks } => Happened::BricksIn { worker, set, bricks },
             ToMaster::BricksBroken { set, bricks } => {
                 warn!(%worker, bricks = bricks.len(), "bricks broken on the way, sent again");

@@ -339,6 +339,7 @@ mod tests {
             left_out: vec![],
             error: Default::default(),
             retries: 0,
+            handed_over: 0,
             dropped_results: 0,
             poisoned: vec![],
             critical_path: None,

@@ -7,10 +7,12 @@
 
 use crate::cache::BrickCache;
 use crate::parking::{Parking, Say, Who};
-use crate::pool::{Came, FrameSlot, Going, Gone, Outcome, Pool, Ready, Rendered, SceneSlot, Task};
+use crate::pool::{
+    Came, FrameSlot, Going, Gone, Outcome, Pool, Ready, Rendered, SceneSlot, Task, Wish,
+};
 use crate::rehearse::Rehearsal;
 use slabcast_common::brick::{BrickGrid, BrickSetKey};
-use slabcast_common::ids::{BrickId, FrameId, SceneId, TaskId};
+use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId};
 use slabcast_common::message::{
     BrickBatch, Hello, Lease, Pixels, RegionCost, RegionLease, TaskTimes, TileResult, ToMaster,
     ToWorker,
@@ -114,6 +116,7 @@ pub async fn run(
         cache,
         parking: Parking::new(config.memory_budget_bytes),
         parked: BTreeMap::new(),
+        wishes: BTreeMap::new(),
         scenes: BTreeMap::new(),
         frames: BTreeMap::new(),
         waiting: BTreeMap::new(),
@@ -197,6 +200,8 @@ struct Desk<'a> {
     parking: Parking,
     /// Regions that stand still.
     parked: BTreeMap<Who, Box<Going>>,
+    /// Where each region that is not at its end is told to give some of its tile away.
+    wishes: BTreeMap<Who, (Epoch, Arc<Wish>)>,
     scenes: BTreeMap<SceneId, Arc<SceneSlot>>,
     frames: BTreeMap<FrameId, Arc<FrameSlot>>,
     waiting: BTreeMap<TaskId, Waiting>,
@@ -253,6 +258,18 @@ impl Desk<'_> {
             }
             ToWorker::Lease(lease) => self.lease(lease),
             ToWorker::Region(lease) => self.region(lease),
+            ToWorker::HandOver { frame, task, epoch, share } => {
+                let who = (frame, task);
+                match self.wishes.get(&who) {
+                    Some((of, wish)) if *of == epoch => wish.give(share),
+                    _ => return,
+                }
+                // One that stands still does not wait for its bricks to do so.
+                if let Some(going) = self.parked.remove(&who) {
+                    self.go_on(going);
+                    self.pool.parked(!self.parked.is_empty());
+                }
+            }
             ToWorker::EndFrame { frame } => {
                 if let Some(slot) = self.frames.remove(&frame) {
                     slot.over.store(true, Ordering::Relaxed);
@@ -260,6 +277,7 @@ impl Desk<'_> {
                 self.waiting.retain(|_, w| w.lease.frame != frame);
                 for who in self.parking.end_frame(frame) {
                     self.parked.remove(&who);
+                    self.wishes.remove(&who);
                 }
                 self.pool.parked(!self.parked.is_empty());
             }
@@ -345,8 +363,11 @@ impl Desk<'_> {
             self.replies.push(refuse("the directory of its bricks never came"));
             return;
         };
-        self.parking.enter((lease.frame, lease.task), spec.bricks, shelf.clone());
-        self.go_on(Box::new(Going::new(lease, frame, shelf, received)));
+        let (who, epoch) = ((lease.frame, lease.task), lease.epoch);
+        self.parking.enter(who, spec.bricks, shelf.clone());
+        let going = Going::new(lease, frame, shelf, received);
+        self.wishes.insert(who, (epoch, going.wish.clone()));
+        self.go_on(Box::new(going));
     }
 
     fn go_on(&mut self, mut going: Box<Going>) {
@@ -361,6 +382,7 @@ impl Desk<'_> {
         match outcome {
             Outcome::Slab(done) => self.rendered(done),
             Outcome::Region(gone) => self.went(gone),
+            Outcome::Handed(piece) => self.replies.push(ToMaster::HandedOver(piece)),
         }
     }
 
@@ -386,10 +408,14 @@ impl Desk<'_> {
         let Gone { mut going, end, thread, came } = gone;
         let RegionLease { task, epoch, frame, .. } = going.lease;
         let who = (frame, task);
+        let stands = matches!(came, Came::Lacks(..)) && self.frames.contains_key(&frame);
+        if !stands {
+            self.wishes.remove(&who);
+        }
         match came {
-            Came::Lacks(lacks, farther) if self.frames.contains_key(&frame) => {
+            Came::Lacks(lacks, farther) if stands => {
                 going.stalls += 1;
-                if self.parking.park(who, &lacks, farther) {
+                if self.parking.park(who, &lacks, farther) || going.wish.is_there() {
                     self.go_on(going);
                 } else {
                     going.parked_at = Some(Instant::now());
@@ -668,7 +694,8 @@ mod tests {
 
         fn region_of(&self, frame: FrameId, task: u64, tile: Rect) {
             let (task, epoch) = (TaskId(task), Epoch(0));
-            self.say(ToWorker::Region(RegionLease { task, epoch, frame, tile, estimate: false }));
+            let (estimate, begun) = (false, None);
+            self.say(ToWorker::Region(RegionLease { task, epoch, frame, tile, estimate, begun }));
         }
 
         async fn result(&mut self) -> Box<TileResult> {
@@ -786,6 +813,51 @@ mod tests {
         world.lease_of(FINISHED, 3, &[0, 1]);
         let slab = world.result().await;
         assert_eq!(sums(&slab).a, sums(&raw).a);
+    }
+
+    #[tokio::test]
+    async fn a_region_gives_a_piece_away_and_another_goes_on_from_there() {
+        let mut world = World::new().await;
+        world.directory();
+        let tile = Rect::new(0, 0, 32, 32);
+        world.region(1, tile);
+        wishes(&mut world, 2).await;
+        let hand_over = |task, epoch| {
+            let (frame, task, epoch) = (FRAME, TaskId(task), Epoch(epoch));
+            ToWorker::HandOver { frame, task, epoch, share: 500 }
+        };
+        // Of what it does not have, or not so, it gives nothing.
+        world.say(hand_over(1, 1));
+        world.say(hand_over(2, 0));
+        world.settle().await;
+        // Though it stands still.
+        world.say(hand_over(1, 0));
+        let ToMaster::HandedOver(piece) = world.hear().await else { panic!("a piece") };
+        assert_eq!((piece.task, piece.epoch), (TaskId(1), Epoch(0)));
+        assert_eq!(piece.kept.union(&piece.given), tile);
+        assert_eq!((piece.kept.area(), piece.given.area()), (512, 512));
+        assert_eq!(piece.begun.pixels.a.len(), 512);
+        world.send(0).await;
+        world.send(1).await;
+        let kept = world.result().await;
+        assert_eq!((kept.task, kept.pixels.len()), (TaskId(1), 512));
+        world.say(hand_over(1, 0));
+        world.settle().await;
+        let lease = |task, tile, begun| {
+            let (task, epoch, frame, estimate) = (TaskId(task), Epoch(0), FRAME, false);
+            ToWorker::Region(RegionLease { task, epoch, frame, tile, estimate, begun })
+        };
+        world.say(lease(2, piece.given, Some(Arc::new(piece.begun.clone()))));
+        let given = world.result().await;
+        world.say(lease(3, tile, None));
+        let whole = world.result().await;
+        for (part, rect) in [(kept, piece.kept), (given, piece.given)] {
+            assert_eq!(*sums(&part), sums(&whole).piece(tile, rect), "as if it had never moved");
+        }
+        // What can't have been begun so is refused.
+        world.say(lease(4, tile, Some(Arc::new(piece.begun.clone()))));
+        let ToMaster::Failed { reason, .. } = world.hear().await else { panic!("refused") };
+        assert!(reason.contains("tile's size"), "{reason}");
     }
 
     #[tokio::test]

@@ -10,7 +10,9 @@ use slabcast_common::brick::Brick;
 use slabcast_common::ids::FrameId;
 use slabcast_common::image::TilePixels;
 use slabcast_common::leaves::{Finish, Leaves};
-use slabcast_common::message::{Counters, Lease, Pixels, RegionLease, Sampling, SceneSpec};
+use slabcast_common::message::{
+    Counters, HandedOver, Lease, Pixels, RegionLease, Sampling, SceneSpec,
+};
 use slabcast_common::view::View;
 use slabcast_render::estimate::{Pair, Probe};
 use slabcast_render::outlook::{Directory, Outlook};
@@ -20,7 +22,7 @@ use slabcast_render::tile::{self, Scratch};
 use slabcast_render::{Frame, Scene};
 use std::collections::{BTreeMap, BTreeSet};
 use std::panic::AssertUnwindSafe;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
@@ -115,11 +117,44 @@ pub(crate) struct Rendered {
     pub(crate) outcome: Option<Result<(TilePixels, Counters), String>>,
 }
 
+/// How much of what is left of a region is to be given away, in thousandths; 0: none.
+#[derive(Default)]
+pub(crate) struct Wish(AtomicU32);
+
+impl Wish {
+    pub(crate) fn give(&self, share: u32) {
+        self.0.store(share.clamp(1, 1000), Ordering::Relaxed);
+    }
+
+    pub(crate) fn is_there(&self) -> bool {
+        self.0.load(Ordering::Relaxed) > 0
+    }
+
+    fn take(&self) -> Option<f64> {
+        let share = self.0.swap(0, Ordering::Relaxed);
+        (share > 0).then(|| f64::from(share) / 1000.0)
+    }
+}
+
+/// A shelf, of which a region takes bricks as long as it need not give any of its tile away.
+struct Watched<'a>(&'a Shelf, &'a Wish);
+
+impl Supply for Watched<'_> {
+    fn get(&self, place: u32) -> Option<Arc<Brick>> {
+        self.0.get(place)
+    }
+
+    fn stops(&self) -> bool {
+        self.1.is_there()
+    }
+}
+
 /// A region on its way.
 pub(crate) struct Going {
     pub(crate) lease: RegionLease,
     pub(crate) frame: Arc<FrameSlot>,
     pub(crate) shelf: Arc<Shelf>,
+    pub(crate) wish: Arc<Wish>,
     pub(crate) received: Instant,
     /// When it stood still last.
     pub(crate) parked_at: Option<Instant>,
@@ -138,8 +173,8 @@ impl Going {
         shelf: Arc<Shelf>,
         received: Instant,
     ) -> Going {
-        let (parked_at, parked, stalls, drawn, region) = Default::default();
-        Going { lease, frame, shelf, received, parked_at, parked, stalls, drawn, region }
+        let (wish, parked_at, parked, stalls, drawn, region) = Default::default();
+        Going { lease, frame, shelf, wish, received, parked_at, parked, stalls, drawn, region }
     }
 }
 
@@ -183,6 +218,8 @@ pub(crate) enum Task {
 pub(crate) enum Outcome {
     Slab(Rendered),
     Region(Gone),
+    /// A piece of a region that goes on.
+    Handed(Box<HandedOver>),
 }
 
 /// Frame, whether it begins, and the order of coming.
@@ -311,7 +348,10 @@ fn work(thread: u32, simd: Simd, queue: &Queue, out: &mpsc::UnboundedSender<Outc
     while let Some(task) = next(queue) {
         let outcome = match task {
             Task::Slab(ready) => Outcome::Slab(render(thread, simd, ready, &mut scratch)),
-            Task::Region(going) => Outcome::Region(advance(thread, simd, going, &mut scratch)),
+            Task::Region(going) => {
+                let give = |piece| drop(out.send(Outcome::Handed(Box::new(piece))));
+                Outcome::Region(advance(thread, simd, going, &mut scratch, &give))
+            }
         };
         if out.send(outcome).is_err() {
             return;
@@ -398,7 +438,13 @@ fn render(thread: u32, simd: Simd, task: Ready, scratch: &mut Scratch) -> Render
     Rendered { lease, received, ready, start, end, thread, outcome }
 }
 
-fn advance(thread: u32, simd: Simd, mut going: Box<Going>, scratch: &mut Scratch) -> Gone {
+fn advance(
+    thread: u32,
+    simd: Simd,
+    mut going: Box<Going>,
+    scratch: &mut Scratch,
+    give: &dyn Fn(HandedOver),
+) -> Gone {
     let span = tracing::debug_span!(
         "region", frame = %going.lease.frame, task = %going.lease.task, x = going.lease.tile.x0,
         y = going.lease.tile.y0
@@ -407,19 +453,38 @@ fn advance(thread: u32, simd: Simd, mut going: Box<Going>, scratch: &mut Scratch
     let came = if going.frame.over.load(Ordering::Relaxed) {
         Came::Over
     } else {
-        caught(scratch, |scratch| go(simd, &mut going, scratch)).unwrap_or_else(Came::Failed)
+        caught(scratch, |scratch| go(simd, &mut going, scratch, give)).unwrap_or_else(Came::Failed)
     };
     Gone { going, end: Instant::now(), thread, came }
 }
 
-fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch) -> Came {
-    let Going { lease, frame: slot, shelf, drawn, region, .. } = going;
+fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch, give: &dyn Fn(HandedOver)) -> Came {
+    let Going { lease, frame: slot, shelf, wish, drawn, region, .. } = going;
     let frame = slot.get();
     let outlook = slot.outlook(shelf.directory());
     let start = Instant::now();
     let before = region.as_ref().and_then(Region::depth);
-    let on = region.get_or_insert_with(|| Region::new(outlook, lease.tile));
-    let lacks = on.advance(frame, simd, outlook, &**shelf, AHEAD, scratch);
+    let on = match region {
+        Some(on) => on,
+        None => region.insert(match &lease.begun {
+            None => Region::new(outlook, lease.tile),
+            Some(begun) => match Region::go_on(outlook, lease.tile, begun) {
+                Ok(on) => on,
+                Err(why) => return Came::Failed(format!("what was begun of its tile: {why}")),
+            },
+        }),
+    };
+    let supply = Watched(shelf, wish);
+    let lacks = loop {
+        let lacks = on.advance(frame, simd, outlook, &supply, AHEAD, scratch);
+        let Some(share) = wish.take().filter(|_| on.depth().is_some()) else { break lacks };
+        let eps = frame.scene.quality.eps;
+        if let Some((kept, given, begun)) = on.hand_over(outlook, eps, share) {
+            let (task, epoch) = (lease.task, lease.epoch);
+            lease.tile = kept;
+            give(HandedOver { task, epoch, kept, given, begun });
+        }
+    };
     *drawn += start.elapsed();
     tracing::debug!(ms = start.elapsed().as_secs_f64() * 1e3, lacks = lacks.len(), "drawn");
     if !lacks.is_empty() {
@@ -437,7 +502,8 @@ fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch) -> Came {
             };
             *drawn += begun.elapsed();
             let mut sampled = Sampling::default();
-            if lease.estimate {
+            // Of what another began, its bricks are not here.
+            if lease.estimate && lease.begun.is_none() {
                 let bricks = touched.iter().map(|&place| shelf.get(place));
                 // One that was forgotten since is not sent again for this.
                 let bricks: Option<Vec<_>> = bricks.collect();

@@ -25,6 +25,7 @@ use crate::queue::{End, PARTS, Queue, Verdict};
 use crate::region::{Crew, Regions};
 use crate::residency::{Errand, Flight};
 use crate::{Action, Clock, Cluster, FrameJob, Micros, Span, spans};
+use handover::Family;
 use slabcast_common::brick::BrickGrid;
 use slabcast_common::ids::{BrickId, Epoch, TaskId, WorkerId};
 use slabcast_common::image::{FrameState, TilePixels};
@@ -38,6 +39,7 @@ use slabcast_common::view::Projected;
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
+mod handover;
 mod late;
 
 /// Whether a pixel with accumulated opacity `a` is shut for good.
@@ -65,6 +67,11 @@ struct Lent {
 /// and 5.3 ms at 1.5 ms, and 23.2, 13.0 and 5.1 at this; threads wait less often, and fewer tiles move.
 const HORIZON: f64 = 4_000.0;
 
+/// The same at the end of a frame that is alone, which is there when the last worker is done: what waits here others can
+/// draw. mri256 `peer-semi` at 1536x1536 takes 43.6, 21.7 and 12.3 ms a frame on 15, 32 and 64 workers at four times as much, and
+/// 43.1, 21.5 and 12.1 at this (`plan`, one in flight).
+const HORIZON_ALONE: f64 = 1_000.0;
+
 /// Who draws by itself is lent so many times as much, and as many more leases: nobody else could take them, and where it
 /// has few tiles that lack bricks it has others meanwhile. One worker takes 13.25 ms for a frame of mri256 at 512x512 without, and
 /// 12.75 with this (`plan`, one in flight, no limit; 14.1 and 12.8 at 1 Gbit/s).
@@ -83,13 +90,18 @@ const MOST_AHEAD: u64 = 8;
 #[derive(Clone, Copy)]
 pub(crate) struct Ahead {
     us: f64,
+    /// Of a frame that is alone.
+    alone_us: f64,
     leases: u64,
 }
 
 impl Ahead {
     pub(crate) fn of(roster: &crate::Roster) -> Ahead {
-        let times = if roster.staying().nth(1).is_none() { SOLE } else { 1 };
-        Ahead { us: times as f64 * HORIZON, leases: times * MOST_AHEAD }
+        let sole = roster.staying().nth(1).is_none();
+        let times = if sole { SOLE } else { 1 };
+        let us = times as f64 * HORIZON;
+        let alone_us = if sole { us } else { HORIZON_ALONE };
+        Ahead { us, alone_us, leases: times * MOST_AHEAD }
     }
 
     /// Of how much that is left a worker of so many threads is lent no more ([`REFILL`]).
@@ -122,6 +134,13 @@ struct Slab {
     dry: BTreeMap<(WorkerId, u32), Micros>,
     /// Tiles that counted.
     pieces: Vec<Piece>,
+    /// Names that its tasks may have.
+    names: u64,
+    /// Regions of which their worker was asked for a piece, by their places.
+    handing: BTreeMap<u32, (WorkerId, Micros)>,
+    /// The tile that each piece is of which was given away, and such tiles whose tasks are not all drawn.
+    roots: BTreeMap<u32, u32>,
+    families: BTreeMap<u32, Family>,
 }
 
 impl Slab {
@@ -160,6 +179,8 @@ pub(crate) struct Frame {
     outlived: Option<Micros>,
     /// When the next region may be taken from an owner that is silent, while a thread is idle.
     forborne: Option<Micros>,
+    /// When a region that takes longer than it was to is late enough to be cut, while a thread is idle.
+    pieces_at: Option<Micros>,
     /// Parts of tiles that were cut late, and who is to have them: what they were drawn from goes along.
     gained: Vec<(WorkerId, u32)>,
     needed_ever: Vec<bool>,
@@ -236,6 +257,7 @@ impl Frame {
             pace: Pace::default(),
             outlived: None,
             forborne: None,
+            pieces_at: None,
             gained: Vec::new(),
             needed_ever: vec![false; job.bricks.len()],
             needed: (0, 0),
@@ -355,8 +377,10 @@ impl Frame {
             needed.iter().zip(&rects).filter_map(|(&i, r)| Some((cut.first_in(r)?, i))).collect();
         order.sort_unstable();
         let queue = Queue::new(TaskId(cluster.next_task), &cut.tiles);
-        let names = if self.alone { PARTS as u64 } else { 1 };
-        cluster.next_task += names * cut.tiles.len() as u64;
+        // Of such that may be cut, in parts and then in pieces.
+        let names = if self.alone { 2 * PARTS as u64 } else { 1 };
+        let names = names * cut.tiles.len() as u64;
+        cluster.next_task += names;
         self.slab = Some(Slab {
             sheets: self.slabs[self.at],
             began,
@@ -371,6 +395,10 @@ impl Frame {
             orphaned: false,
             dry: BTreeMap::new(),
             pieces: Vec::new(),
+            names,
+            handing: BTreeMap::new(),
+            roots: BTreeMap::new(),
+            families: BTreeMap::new(),
         });
     }
 
@@ -381,17 +409,21 @@ impl Frame {
             self.state.end_slab();
             self.shut.refresh();
         }
-        let tile = |task: &crate::queue::Task| {
+        // What was given away of a tile is told as the tile's.
+        let whole = slab.whole_tiles();
+        let tile = |(task, place): (&crate::queue::Task, u32)| {
             let (worker, us) = match &task.end {
                 End::Done { worker, render_us } => (worker.to_string(), *render_us),
                 End::Open | End::Poisoned | End::Cut => (String::new(), 0),
             };
+            let (rect, est, more) =
+                whole.get(&place).copied().unwrap_or((task.tile.rect, task.tile.est, 0));
             TileStats {
-                x: task.tile.rect.x0 as u32,
-                y: task.tile.rect.y0 as u32,
-                size: slab.cut.edge_of(&task.tile.rect),
-                est: task.tile.est,
-                ms: ms(us),
+                x: rect.x0 as u32,
+                y: rect.y0 as u32,
+                size: slab.cut.edge_of(&rect),
+                est,
+                ms: ms(us + more),
                 worker,
             }
         };
@@ -410,8 +442,9 @@ impl Frame {
         }
         self.ledger.phase(&slab.pieces, slab.began);
         self.ledger.retries += slab.queue.retries;
-        let mut tiles: Vec<TileStats> =
-            slab.queue.tasks.iter().filter(|t| t.end != End::Cut).map(tile).collect();
+        let tasks = slab.queue.tasks.iter().zip(0..);
+        let told = tasks.filter(|(t, at)| t.end != End::Cut && !slab.is_told_elsewhere(*at));
+        let mut tiles: Vec<TileStats> = told.map(tile).collect();
         // Parts that were cut late stand behind all others.
         tiles.sort_by_key(|t| std::cmp::Reverse(t.est));
         self.ledger.slabs.push(SlabStats {
@@ -456,6 +489,13 @@ impl Frame {
             (true, false) => self.choose_own(cluster, turn, now),
             (true, true) => self.choose_others(cluster, turn, now),
         };
+        let pieces = match by_region && turn.others && turn.last {
+            true => self.find_pieces(cluster, now),
+            false => {
+                self.pieces_at = None;
+                Vec::new()
+            }
+        };
         // Nobody's estimate is outlived before the time that was found last.
         let known = by_region && turn.only.is_some() && self.outlived.is_some_and(|at| now < at);
         let may_double = (!by_region || turn.others) && !known && cluster.roster.any_dry();
@@ -493,11 +533,15 @@ impl Frame {
                 let Some(bricks) = cluster.memory.moving(regions, (place, &tile), id) else {
                     continue;
                 };
-                // Of a part whose whole tile was drawn then, what lies over the part.
+                // Of a part whose whole tile was drawn then, what lies over the part; of a piece, what lies behind
+                // what is drawn of it.
                 let (part, job) = (regions.is_told(place), &self.job);
+                let begun = slab.queue.tasks[place as usize].begun.as_ref();
+                let from = begun.and_then(|begun| begun.sheets.iter().flatten().min());
                 let over = |&i: &u32| {
                     let seen = job.view.project(&job.bricks[i as usize].tight);
-                    seen.is_some_and(|p| !p.rect.intersect(&tile).is_empty())
+                    let behind = |p: &Projected| from.is_none_or(|from| p.sheets.end > *from);
+                    seen.is_some_and(|p| !p.rect.intersect(&tile).is_empty() && behind(&p))
                 };
                 let bricks = bricks.iter().copied().filter(|i| !part || over(i));
                 cluster.residency.owe(id, set, bricks);
@@ -551,7 +595,8 @@ impl Frame {
                 }
                 let (task, epoch, frame) = (lent.task, lent.epoch, self.job.frame);
                 let estimate = self.job.work.estimate;
-                let lease = RegionLease { task, epoch, frame, tile, estimate };
+                let begun = slab.queue.tasks[place as usize].begun.clone();
+                let lease = RegionLease { task, epoch, frame, tile, estimate, begun };
                 cluster.send(id, ToWorker::Region(lease));
                 continue;
             }
@@ -572,6 +617,7 @@ impl Frame {
                 carry(cluster, Some(&mut self.ledger), id, now);
             }
         }
+        self.ask_for_pieces(cluster, pieces);
     }
 
     /// A waiting task for one worker goes to it.
@@ -727,7 +773,8 @@ impl Frame {
                 while let Some(waiting) = self.waiting() {
                     let load = cluster.roster.get(id).map_or(u64::MAX, |w| w.leases);
                     let many = threads.saturating_mul(ahead);
-                    let short = us < most.us * threads as f64;
+                    let us_ahead = if self.alone && turn.last { most.alone_us } else { most.us };
+                    let short = us < us_ahead * threads as f64;
                     let may = if first {
                         load < threads
                     } else if !turn.last || waiting > all_threads {
@@ -801,7 +848,9 @@ impl Frame {
                 regions.left(open, &cluster.roster)
             });
             let suits = |place| {
-                slab.queue.tasks[place as usize].was_lent()
+                let task = &slab.queue.tasks[place as usize];
+                task.was_lent()
+                    || task.begun.is_some()
                     || regions.is_worth_taking(place, id, left, &cluster.memory)
                     || self.until(slab, regions, place) <= now
             };
@@ -849,7 +898,10 @@ impl Frame {
             .filter(|(_, w)| w.leases < u64::from(w.threads))
             .map(|(id, w)| (id, w.leases))
             .collect();
-        if idle.is_empty() {
+        // Some of them wait for pieces.
+        let pieces = slab.waits_for_pieces(now);
+        if idle.len() <= pieces.len() {
+            self.outlived = pieces.into_iter().min();
             return None;
         }
         let pace = self.pace.measure()?;
@@ -868,7 +920,8 @@ impl Frame {
                     None => now,
                     Some(place) => {
                         let est = slab.cut.tiles[place as usize].est;
-                        lent.sent.max(answered).saturating_add(pace.patience(est))
+                        let at = lent.sent.max(answered).saturating_add(pace.patience(est));
+                        at.max(slab.waits_for_piece(place))
                     }
                 };
                 heads_late = at.max(heads_late);
@@ -1004,14 +1057,32 @@ impl Frame {
             came: now,
         });
         let mut drawn_from = lent.map_or(0, |l| l.bricks.len());
-        if let (Some(regions), Some(cost)) = (&slab.regions, cost) {
+        if let Some(cost) = cost {
             drawn_from = cost.touched.len();
             for &i in &cost.touched {
                 note_needed(&mut self.needed_ever, &mut self.needed, &self.job, i as usize);
             }
             self.ledger.stalled(worker, cost);
             cluster.residency.touched(self.job.scene.bricks, &cost.touched);
-            cluster.memory.learn(regions, (place, &tile), worker, end - start, &cost.touched);
+        }
+        slab.handing.remove(&place);
+        let touched = cost.map_or(&[][..], |cost| &cost.touched[..]);
+        let family = slab.drawn(place, end - start, touched);
+        if let Some(regions) = &slab.regions {
+            let mut learn = |place, tile: &Rect, owner, us, touched: &[u32]| {
+                cluster.memory.learn(regions, (place, tile), owner, us, touched);
+            };
+            match &family {
+                Ok(None) => {}
+                Ok(Some((root, family))) => {
+                    let (us, touched) = family.cost();
+                    learn(*root, &family.tile, family.owner, us, touched);
+                }
+                Err(()) if cost.is_some() => {
+                    learn(place, &tile, worker, end - start, touched);
+                }
+                Err(()) => {}
+            }
         }
         self.ledger.spans.tile(spans::Tile {
             corner: [tile.x0, tile.y0],
@@ -1057,6 +1128,7 @@ impl Frame {
         let Some(slab) = &mut self.slab else { return };
         let Verdict::Counts(place, _) = slab.queue.judge(task, epoch, worker) else { return };
         let name = cluster.roster.get(worker).map_or("", |w| &w.name);
+        slab.handing.remove(&place);
         let given_up = slab.queue.fail(place, epoch, worker, name, reason, &cluster.config);
         self.give_up(given_up);
         self.progress(cluster);
@@ -1151,6 +1223,7 @@ impl Frame {
         }
         self.ledger.leave(id, now);
         if let Some(slab) = &mut self.slab {
+            slab.handing.retain(|_, (asked, _)| *asked != id);
             let running = if blame { running } else { 0 };
             let given_up = slab.queue.lose(id, &worker.name, &leases, running, &cluster.config);
             self.give_up(given_up);
@@ -1173,7 +1246,8 @@ impl Frame {
     pub(crate) fn next_deadline(&self) -> Option<Micros> {
         // A frame that is done and waits for one before it has none.
         let slab = self.slab.as_ref()?;
-        slab.queue.next_deadline().into_iter().chain(self.outlived).chain(self.forborne).min()
+        let waits = [self.outlived, self.forborne, self.pieces_at].into_iter().flatten();
+        slab.queue.next_deadline().into_iter().chain(waits).min()
     }
 
     /// Leases that a worker has.
@@ -1328,9 +1402,14 @@ struct Measured {
 }
 
 impl Measured {
+    /// How long one of this workload is drawn.
+    fn expects(&self, est: u64) -> Micros {
+        ((self.render * u128::from(est.max(1))) >> 20).min(u128::from(Micros::MAX)) as Micros
+    }
+
     /// After what time a task of this workload has outlived its estimate.
     fn patience(&self, est: u64) -> Micros {
-        let expected = ((self.render * u128::from(est.max(1))) >> 20) + self.beside;
+        let expected = u128::from(self.expects(est)) + self.beside;
         Pace::FLOOR.saturating_add((2 * expected).min(u128::from(Micros::MAX)) as Micros)
     }
 }

@@ -62,6 +62,7 @@ pub(crate) struct Ledger {
     pub(crate) slabs: Vec<SlabStats>,
     pub(crate) spans: Spans,
     pub(crate) retries: u64,
+    pub(crate) handed_over: u64,
     pub(crate) dropped_results: u64,
     pub(crate) poisoned: Vec<PoisonedTile>,
     path: Path,
@@ -102,6 +103,7 @@ impl Ledger {
             slabs: Vec::new(),
             spans: Spans::with_room(SPANS),
             retries: 0,
+            handed_over: 0,
             dropped_results: 0,
             poisoned: Vec::new(),
             path: Path::default(),
@@ -292,6 +294,7 @@ impl Ledger {
                 ..ErrorStats::default()
             },
             retries: self.retries,
+            handed_over: self.handed_over,
             dropped_results: self.dropped_results,
             poisoned: self.poisoned,
             critical_path: Some(self.path.sentence(now.saturating_sub(self.began), self.cull_us)),

@@ -39,7 +39,7 @@ use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::FrameState;
 use slabcast_common::leaves::Finish;
-use slabcast_common::message::{SceneSpec, TileResult, ToWorker};
+use slabcast_common::message::{HandedOver, SceneSpec, TileResult, ToWorker};
 use slabcast_common::quality::Work;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::view::View;
@@ -208,6 +208,13 @@ pub enum Event {
         epoch: Epoch,
         /// For people.
         reason: String,
+    },
+    /// A piece of a region is given away, as it was asked to.
+    HandedOver {
+        /// By whom.
+        worker: WorkerId,
+        /// Which.
+        piece: Box<HandedOver>,
     },
     /// The next bricks of a set, in the order in which they were sent, arrived whole. Broken
     /// ones are not counted.
@@ -544,6 +551,15 @@ impl Scheduler {
                     cluster.reserve.call_all();
                     cluster.roster.halve(0);
                     frame.failed(cluster, worker, task, epoch, reason);
+                }
+            }
+            Event::HandedOver { worker, piece } => {
+                cluster.roster.heard(worker, now);
+                let lent = |f: &&mut Frame| f.has_lent(worker, piece.task, piece.epoch);
+                if let Some(frame) = self.active.iter_mut().find(lent)
+                    && let Err(reason) = frame.handed_over(cluster, worker, *piece, now)
+                {
+                    self.drop_worker(worker, reason, false, now);
                 }
             }
             Event::BricksIn { worker, set, bricks } => {

@@ -18,6 +18,7 @@
 use crate::macrotile::Macrotile;
 use crate::{Config, Micros};
 use slabcast_common::ids::{Epoch, TaskId, WorkerId};
+use slabcast_common::message::Begun;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -57,6 +58,8 @@ pub(crate) struct Task {
     pub(crate) blamed: Vec<(WorkerId, String)>,
     /// Workers that said they could not, and why.
     pub(crate) failed: Vec<(WorkerId, String, String)>,
+    /// What is drawn of it already: a piece that somebody gave away.
+    pub(crate) begun: Option<Arc<Begun>>,
 }
 
 /// Names, and places in the order, that a tile has for itself and for its parts.
@@ -72,6 +75,7 @@ impl Task {
             queued: Some(order),
             blamed: Vec::new(),
             failed: Vec::new(),
+            begun: None,
         }
     }
 
@@ -162,6 +166,34 @@ impl Queue {
         for (&tile, order) in parts.iter().zip(order..) {
             self.waiting.insert(order, self.tasks.len() as u32);
             self.tasks.push(Task::new(tile, order));
+        }
+    }
+
+    /// Puts a piece of a tile in front of all that wait: its place, which is behind all others'. Who makes the queue leaves
+    /// room for its name.
+    pub(crate) fn add(&mut self, piece: Macrotile, begun: Arc<Begun>) -> u32 {
+        let place = self.tasks.len() as u32;
+        let mut task = Task::new(piece, self.front);
+        task.begun = Some(begun);
+        self.waiting.insert(self.front, place);
+        self.front -= 1;
+        self.open += 1;
+        self.tasks.push(task);
+        place
+    }
+
+    /// Whether this lease of a task is the only one, and nobody else is to have it. Of one that took a worker with it, or
+    /// was refused, that is never said.
+    pub(crate) fn is_alone(&self, place: u32, worker: WorkerId, epoch: Epoch) -> bool {
+        let task = &self.tasks[place as usize];
+        task.may_double() && task.live.iter().all(|l| l.worker == worker && l.epoch == epoch)
+    }
+
+    /// A lease ends without a result that counts, through nobody's fault.
+    pub(crate) fn forsake(&mut self, place: u32, worker: WorkerId, epoch: Epoch) {
+        self.end_lease(place, worker, epoch);
+        if self.tasks[place as usize].live.is_empty() {
+            self.requeue(place);
         }
     }
 

@@ -713,6 +713,27 @@ impl Regions {
         }
     }
 
+    /// Of a tile that is being drawn a piece is given away, and is this worker's, at the place behind all others. What
+    /// the tile takes in all from now on, and what the piece does.
+    pub(crate) fn hand_over(
+        &mut self,
+        (place, tile): (u32, &Rect),
+        (kept, given): (f64, f64),
+        taker: WorkerId,
+        memory: &Memory,
+    ) {
+        let (last, _) = self.took[place as usize].unwrap_or((self.owner(place), 0.0));
+        self.took[place as usize] = Some((last, kept));
+        let known = self.told.get(&place).or_else(|| memory.known(self.kind, tile)).cloned();
+        let at = self.owners.len() as u32;
+        self.owners.push(taker);
+        self.took.push(Some((last, given)));
+        self.owned.or_default(taker).push(at);
+        if let Some(known) = known {
+            self.told.insert(at, known);
+        }
+    }
+
     /// Whether what is known of a task is known of other tiles.
     pub(crate) fn is_told(&self, place: u32) -> bool {
         self.told.contains_key(&place)

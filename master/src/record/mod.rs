@@ -42,13 +42,15 @@ use serde::{Deserialize, Serialize};
 use slabcast_common::brick::BrickInfo;
 use slabcast_common::image::PixelFormat;
 use slabcast_common::leaves::Finish;
-use slabcast_common::message::{Pixels, Sampling, TileResult, ToWorker};
+use slabcast_common::message::{HandedOver, Pixels, Sampling, TileResult, ToWorker};
+use slabcast_common::occlusion::Rect;
 use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{Action, Event};
 use std::fmt;
 
-/// Version of the file's format. Since 2 results may be finished, and statistics count their bytes.
-const VERSION: u32 = 2;
+/// Version of the file's format. Since 2 results may be finished, and statistics count their bytes; since 3 regions may be
+/// handed over in part.
+const VERSION: u32 = 3;
 
 /// Entries between driver and disk: some twenty frames' of 512x512, 4 MiB where tiles are shut in
 /// patterns. At a tenth, one slow `fsync` of somebody else's cuts the record.
@@ -93,6 +95,7 @@ enum Noted {
     SceneEnded { scene: u64 },
     Result(NotedResult),
     Failed { w: u64, task: u64, epoch: u32, reason: String },
+    HandedOver(NotedPiece),
     BricksIn { w: u64, set: String, bricks: u32 },
     BricksBroken { w: u64, set: String, bricks: Vec<u32> },
     BricksWanted { w: u64, set: String, bricks: Vec<u32> },
@@ -153,6 +156,36 @@ struct NotedResult {
     /// Of finished pixels: columns and rows, format, and whether its parts fit each other.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     finished: Option<([u32; 2], PixelFormat, bool)>,
+}
+
+/// A piece of a region that was given away.
+#[derive(Debug, Serialize, Deserialize)]
+struct NotedPiece {
+    w: u64,
+    task: u64,
+    epoch: u32,
+    kept: Rect,
+    given: Rect,
+    sheets: Vec<Option<i32>>,
+    /// As of a result.
+    planes: (usize, usize, Option<usize>),
+    finite: bool,
+}
+
+impl NotedPiece {
+    fn of(worker: u64, piece: &HandedOver) -> Self {
+        let p = &piece.begun.pixels;
+        NotedPiece {
+            w: worker,
+            task: piece.task.0,
+            epoch: piece.epoch.0,
+            kept: piece.kept,
+            given: piece.given,
+            sheets: piece.begun.sheets.clone(),
+            planes: (p.a.len(), p.colour.len(), p.last.as_ref().map(Vec::len)),
+            finite: p.a.iter().all(|a| a.is_finite()),
+        }
+    }
 }
 
 impl NotedResult {
@@ -277,7 +310,8 @@ fn say(message: &ToWorker) -> String {
         ToWorker::Region(l) => {
             let ([x0, y0], [x1, y1]) = ([l.tile.x0, l.tile.y0], [l.tile.x1, l.tile.y1]);
             let (task, epoch, frame) = (l.task, l.epoch, l.frame);
-            format!("region {task} {epoch} of {frame}, ({x0},{y0}) to ({x1},{y1})")
+            let begun = if l.begun.is_some() { ", as it was left" } else { "" };
+            format!("region {task} {epoch} of {frame}, ({x0},{y0}) to ({x1},{y1}){begun}")
         }
         ToWorker::Directory { set, bricks, .. } => {
             let ids: Vec<_> = bricks.iter().map(|b| b.id).collect();
@@ -286,6 +320,9 @@ fn say(message: &ToWorker) -> String {
         }
         ToWorker::DropBricks { bricks, .. } => {
             format!("forget {} bricks {:016x}", bricks.len(), hash_of(bricks))
+        }
+        ToWorker::HandOver { frame, task, epoch, share } => {
+            format!("hand over {share} of 1000 of {task} {epoch} of {frame}")
         }
         ToWorker::Ping { nonce } => format!("ping {nonce}"),
         ToWorker::Lease(_) | ToWorker::Welcome { .. } | ToWorker::Refused { .. } => {
@@ -434,6 +471,7 @@ fn noted(event: &Event, shut: impl Fn(&TileResult, f32) -> bool) -> Option<Noted
         Event::Failed { worker, task, epoch, reason } => {
             Noted::Failed { w: worker.0, task: task.0, epoch: epoch.0, reason: reason.clone() }
         }
+        Event::HandedOver { worker, piece } => Noted::HandedOver(NotedPiece::of(worker.0, piece)),
         Event::BricksIn { worker, set: key, bricks } => {
             Noted::BricksIn { w: worker.0, set: set(key), bricks: *bricks }
         }

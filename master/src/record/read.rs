@@ -4,7 +4,8 @@
 //! wrong is named by its line.
 
 use super::{
-    Decision, Head, Line, Noted, NotedJob, NotedResult, NotedWorker, VERSION, bits, from_hex,
+    Decision, Head, Line, Noted, NotedJob, NotedPiece, NotedResult, NotedWorker, VERSION, bits,
+    from_hex,
 };
 use prost::Message;
 use slabcast_common::PIXELS_VERSION;
@@ -13,8 +14,10 @@ use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::TilePixels;
 use slabcast_common::leaves::Leaves;
 use slabcast_common::message::{
-    Counters, Pixels, RegionCost, Sampled, Sampling, SceneSpec, TaskTimes, TileResult,
+    Begun, Counters, HandedOver, Pixels, RegionCost, Sampled, Sampling, SceneSpec, TaskTimes,
+    TileResult,
 };
+use slabcast_common::occlusion::Rect;
 use slabcast_common::volume::Digest32;
 use slabcast_proto::{convert, v1};
 use slabcast_schedule::{Clock, Config, Event, FrameJob, Micros, Scheduler};
@@ -353,6 +356,9 @@ fn event(e: Noted, seen: &mut Seen) -> Result<Event, String> {
         Noted::Failed { w, task, epoch, reason } => {
             Event::Failed { worker: WorkerId(w), task: TaskId(task), epoch: Epoch(epoch), reason }
         }
+        Noted::HandedOver(p) => {
+            Event::HandedOver { worker: WorkerId(p.w), piece: Box::new(piece(p)?) }
+        }
         Noted::BricksIn { w, set, bricks } => {
             Event::BricksIn { worker: WorkerId(w), set: key(&set)?, bricks }
         }
@@ -406,6 +412,30 @@ fn finished(r: &NotedResult) -> Result<Option<Leaves>, String> {
 
 /// A result that the scheduler takes for the one that was recorded: shut pixels have opacity 1,
 /// open ones 0, and there is no light.
+/// A piece with pixels that the scheduler takes for those that were recorded.
+fn piece(p: NotedPiece) -> Result<HandedOver, String> {
+    let (a, colour, last) = p.planes;
+    let n = [a, colour, last.unwrap_or(0), p.sheets.len()];
+    if n.iter().any(|n| *n > 2 * convert::MAX_TILE_PIXELS) {
+        return Err("its planes are larger than the wire lets through".into());
+    }
+    let mut pixels = TilePixels {
+        a: vec![0.0; a],
+        colour: vec![[0; 3]; colour],
+        last: last.map(|n| vec![[0; 4]; n]),
+    };
+    if !p.finite {
+        *pixels.a.first_mut().ok_or("`finite` of a plane without pixels")? = f32::NAN;
+    }
+    let inside = |r: &Rect| 0 <= r.x0 && 0 <= r.y0 && r.x1 <= 1 << 16 && r.y1 <= 1 << 16;
+    if ![&p.kept, &p.given].into_iter().all(|r| inside(r) && !r.is_empty()) {
+        return Err("`kept` and `given` are no rectangles of a picture".into());
+    }
+    let begun = Begun { sheets: p.sheets, pixels };
+    let (task, epoch) = (TaskId(p.task), Epoch(p.epoch));
+    Ok(HandedOver { task, epoch, kept: p.kept, given: p.given, begun })
+}
+
 fn result(r: &NotedResult) -> Result<TileResult, String> {
     let (a, colour, last) = r.planes;
     // A liar's planes may have any length; it is compared, no more.

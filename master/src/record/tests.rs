@@ -6,13 +6,15 @@ use slabcast_common::ids::{BrickId, FrameId, SceneId, WorkerId};
 use slabcast_common::image::{Background, PixelFormat, TilePixels};
 use slabcast_common::leaves::{Finish, Leaves};
 use slabcast_common::message::{
-    Counters, Pixels, RegionCost, Sampled, Sampling, SceneSpec, TaskTimes, TileResult, ToWorker,
+    Begun, Counters, HandedOver, Pixels, RegionCost, Sampled, Sampling, SceneSpec, TaskTimes,
+    TileResult, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::path::Orientation;
 use slabcast_common::path::{Turntable, ViewPath};
 use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Schedule, Sums, Work};
+use slabcast_common::region::{cut, parts};
 use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros};
@@ -96,6 +98,10 @@ fn jobs(rng: &mut Rng, schedule: Schedule) -> Vec<FrameJob> {
             FrameJob { frame, number, scene, bricks, view, work, finish }
         })
         .collect()
+}
+
+fn area(r: &Rect) -> f64 {
+    r.area() as f64
 }
 
 /// A run of one seed, recorded.
@@ -224,6 +230,28 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
                 Action::Send { worker, message: ToWorker::Region(l) } => {
                     leases.push((worker, (l.task, l.epoch), l.tile, finish(l.frame)));
                 }
+                Action::Send { worker, message: ToWorker::HandOver { task, epoch, share, .. } } => {
+                    let name = (task, epoch);
+                    let lease = leases.iter_mut().find(|l| l.0 == worker && l.1 == name);
+                    let share = f64::from(share) / 1000.0;
+                    let pieces = lease.and_then(|l| Some((cut(l.2, share, area)?, l)));
+                    if let Some(((kept, given), lease)) = pieces {
+                        let n = given.area();
+                        let mut pixels = TilePixels {
+                            a: vec![0.5; n],
+                            colour: vec![[5; 3]; n],
+                            last: (rng.below(2) == 0).then(|| vec![[1; 4]; n]),
+                        };
+                        if rng.below(20) == 0 {
+                            pixels.a[0] = f32::NAN;
+                        }
+                        let sheets = parts(given).map(|_| (rng.below(9) > 0).then_some(-3));
+                        let begun = Begun { sheets: sheets.collect(), pixels };
+                        lease.2 = kept;
+                        let piece = Box::new(HandedOver { task, epoch, kept, given, begun });
+                        arrived.push(Event::HandedOver { worker, piece });
+                    }
+                }
                 Action::SendBricks { worker, set, bricks } => {
                     let bricks = bricks.len() as u32;
                     arrived.push(Event::BricksIn { worker, set, bricks });
@@ -252,6 +280,7 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
 #[test]
 fn a_recorded_run_replays_identically() {
     let (mut frames, mut dropped, mut dropped_finished) = (0, 0, [0; 3]);
+    let mut pieces = 0;
     for seed in 0..48 {
         let schedule = if seed % 2 == 0 { Schedule::Slab } else { Schedule::Region };
         let (bytes, written) = recorded(seed, schedule);
@@ -262,13 +291,17 @@ fn a_recorded_run_replays_identically() {
         frames += done.frames;
         let text = String::from_utf8_lossy(&bytes);
         dropped += text.matches("plane has").count();
+        pieces += text.matches(", as it was left").count();
         let lies = ["do not fit", "its tile has", "a result in Rgba8"];
         for (n, lie) in dropped_finished.iter_mut().zip(lies) {
             *n += text.matches(lie).count();
         }
     }
-    let all = dropped > 0 && dropped_finished.iter().all(|n| *n > 0);
-    assert!(frames > 120 && all, "{frames} frames, {dropped} and {dropped_finished:?} liars");
+    let all = dropped > 0 && pieces > 0 && dropped_finished.iter().all(|n| *n > 0);
+    assert!(
+        frames > 120 && all,
+        "{frames} frames, {dropped} and {dropped_finished:?} liars, {pieces} pieces"
+    );
 }
 
 /// A record with one line changed.
@@ -335,7 +368,7 @@ fn broken_files_are_refused_with_their_line() {
     let (line, bad) = tampered(&bytes, any, |_| "{\"event\":5}".into());
     assert!(says(&bad).starts_with(&format!("line {line}: is no line of a record")));
     let head = |l: &str| l.starts_with("{\"record\"");
-    let (_, bad) = tampered(&bytes, head, |l| l.replace("\"version\":2", "\"version\":7"));
+    let (_, bad) = tampered(&bytes, head, |l| l.replace("\"version\":3", "\"version\":7"));
     assert!(says(&bad).contains("version 7"), "{}", says(&bad));
     let scene = |l: &str| l.starts_with("{\"scene\"");
     let (line, bad) = tampered(&bytes, scene, |l| l.replace("\"wire\":\"", "\"wire\":\"ff"));

@@ -16,10 +16,11 @@ use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::{RawSums, TilePixels, TileState};
 use slabcast_common::leaves::Finish;
 use slabcast_common::message::{
-    BrickBatch, Counters, Hello, Lease, Pixels, RegionCost, RegionLease, Sampled, Sampling,
-    TaskTimes, TileResult, ToMaster, ToWorker,
+    Begun, BrickBatch, Counters, HandedOver, Hello, Lease, Pixels, RegionCost, RegionLease,
+    Sampled, Sampling, TaskTimes, TileResult, ToMaster, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
+use slabcast_common::region::parts;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::MAX_EDGE;
 use std::sync::Arc;
@@ -100,6 +101,7 @@ pub fn from_worker_to_wire_as(message: &ToMaster, packs: bool) -> v1::FromWorker
                 bricks: Some(bricks_to_wire(bricks)),
             })
         }
+        ToMaster::HandedOver(piece) => Message::HandedOver(handed_over_to_wire(piece)),
         ToMaster::Pong { nonce, clock_us } => {
             Message::Pong(v1::Pong { nonce: *nonce, clock_us: *clock_us })
         }
@@ -142,6 +144,9 @@ pub fn from_worker_from_wire(message: v1::FromWorker) -> Result<ToMaster, WireEr
             set: key_from_wire("bricks_forgotten.set", &gone.set)?,
             bricks: bricks_list_from_wire("bricks_forgotten.bricks", gone.bricks)?,
         },
+        Message::HandedOver(piece) => ToMaster::HandedOver(Box::new(
+            handed_over_from_wire(piece).map_err(|e| e.within("handed_over"))?,
+        )),
         Message::Pong(pong) => ToMaster::Pong { nonce: pong.nonce, clock_us: pong.clock_us },
         Message::Leaving(leaving) => {
             ToMaster::Leaving { reason: reason_from_wire("leaving.reason", leaving.reason)? }
@@ -386,6 +391,12 @@ pub fn to_worker_to_wire(message: &ToWorker, session: u64) -> Down {
         }
         ToWorker::Lease(lease) => Message::Lease(lease_to_wire(lease)),
         ToWorker::Region(lease) => Message::Region(region_to_wire(lease)),
+        ToWorker::HandOver { frame, task, epoch, share } => Message::HandOver(v1::HandOver {
+            frame: frame.0,
+            task: task.0,
+            epoch: epoch.0,
+            share: *share,
+        }),
         ToWorker::EndFrame { frame } => Message::EndFrame(v1::EndFrame { frame: frame.0 }),
         ToWorker::EndScene { scene } => Message::EndScene(v1::EndScene { scene: scene.0 }),
         ToWorker::DropBricks { set, bricks } => return Down::Bricks(drop_to_wire(set, bricks)),
@@ -434,7 +445,15 @@ pub fn to_worker_from_wire(message: v1::ToWorker) -> Result<(ToWorker, Option<u6
             directory_from_wire(directory).map_err(|e| e.within("directory"))?
         }
         Message::Region(lease) => {
-            ToWorker::Region(region_from_wire(&lease).map_err(|e| e.within("region"))?)
+            ToWorker::Region(region_from_wire(lease).map_err(|e| e.within("region"))?)
+        }
+        Message::HandOver(hand) => {
+            let v1::HandOver { frame, task, epoch, share } = hand;
+            if !(1..=999).contains(&share) {
+                return Err(WireError::value("hand_over.share", format!("{share}; give 1 to 999")));
+            }
+            let (frame, task, epoch) = (FrameId(frame), TaskId(task), Epoch(epoch));
+            ToWorker::HandOver { frame, task, epoch, share }
         }
         Message::EndFrame(end) => ToWorker::EndFrame { frame: FrameId(end.frame) },
         Message::EndScene(end) => ToWorker::EndScene { scene: SceneId(end.scene) },
@@ -523,16 +542,75 @@ fn region_to_wire(lease: &RegionLease) -> v1::Region {
         width: lease.tile.width() as u32,
         height: lease.tile.height() as u32,
         estimate: lease.estimate,
+        begun: lease.begun.as_ref().map(|begun| begun_to_wire(begun)),
     }
 }
 
-fn region_from_wire(lease: &v1::Region) -> Result<RegionLease, WireError> {
+fn region_from_wire(lease: v1::Region) -> Result<RegionLease, WireError> {
+    let tile = tile_from_wire(lease.x, lease.y, lease.width, lease.height)?;
+    let begun = lease.begun.map(|begun| begun_from_wire(begun, tile));
     Ok(RegionLease {
         task: TaskId(lease.task),
         epoch: Epoch(lease.epoch),
         frame: FrameId(lease.frame),
-        tile: tile_from_wire(lease.x, lease.y, lease.width, lease.height)?,
+        tile,
         estimate: lease.estimate,
+        begun: begun.transpose().map_err(|e| e.within("begun"))?.map(Arc::new),
+    })
+}
+
+fn begun_to_wire(begun: &Begun) -> v1::Begun {
+    let (p, n) = (&begun.pixels, begun.pixels.a.len());
+    assert_eq!(p.colour.len(), n, "colour has its tile's size");
+    v1::Begun {
+        parts: begun.sheets.iter().map(|&sheet| v1::PartBegun { sheet }).collect(),
+        a: Some(a_to_wire(&p.a)),
+        colour: Some(plane::to_wire(n, |i| p.colour[i])),
+        last: last_to_wire(&p.last, n),
+    }
+}
+
+fn begun_from_wire(begun: v1::Begun, tile: Rect) -> Result<Begun, WireError> {
+    let (n, of_tile) = (tile.area(), parts(tile).count());
+    if begun.parts.len() != of_tile {
+        return Err(WireError::length("parts", begun.parts.len(), of_tile));
+    }
+    let colour = plane::from_wire(Some(begun.colour.unwrap_or_default()), n, |p: [u32; 3]| p)
+        .map_err(|e| e.within("colour"))?;
+    let (a, last) = (a_from_wire(begun.a, n)?, last_from_wire(begun.last, n)?);
+    let sheets = begun.parts.iter().map(|part| part.sheet).collect();
+    Ok(Begun { sheets, pixels: TilePixels { a, colour, last } })
+}
+
+fn handed_over_to_wire(piece: &HandedOver) -> v1::HandedOver {
+    let rect = |r: Rect| v1::Piece {
+        x: r.x0 as u32,
+        y: r.y0 as u32,
+        width: r.width() as u32,
+        height: r.height() as u32,
+    };
+    v1::HandedOver {
+        task: piece.task.0,
+        epoch: piece.epoch.0,
+        kept: Some(rect(piece.kept)),
+        given: Some(rect(piece.given)),
+        begun: Some(begun_to_wire(&piece.begun)),
+    }
+}
+
+fn handed_over_from_wire(piece: v1::HandedOver) -> Result<HandedOver, WireError> {
+    let rect = |name, rect: Option<v1::Piece>| {
+        let v1::Piece { x, y, width, height } = required(name, rect)?;
+        tile_from_wire(x, y, width, height).map_err(|e| e.within(name))
+    };
+    let (kept, given) = (rect("kept", piece.kept)?, rect("given", piece.given)?);
+    let begun = begun_from_wire(required("begun", piece.begun)?, given);
+    Ok(HandedOver {
+        task: TaskId(piece.task),
+        epoch: Epoch(piece.epoch),
+        kept,
+        given,
+        begun: begun.map_err(|e| e.within("begun"))?,
     })
 }
 

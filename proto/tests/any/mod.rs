@@ -16,6 +16,7 @@ use slabcast_common::path::{
     ProjectionKind, Side, Turntable, ViewPath,
 };
 use slabcast_common::quality::{Borders, Compositing, Keep, Kernel, Quality, Schedule, Sums, Work};
+use slabcast_common::region::parts;
 use slabcast_common::shade::{Light, Shading};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
@@ -243,9 +244,30 @@ pub fn lease() -> impl Strategy<Value = Lease> {
 }
 
 pub fn region() -> impl Strategy<Value = RegionLease> {
-    (lease(), any::<bool>()).prop_map(|(l, estimate)| {
+    (lease(), any::<bool>(), any::<u8>()).prop_map(|(l, estimate, sheets)| {
         let (task, epoch, frame, tile) = (l.task, l.epoch, l.frame, l.tile);
-        RegionLease { task, epoch, frame, tile, estimate }
+        let begun = (sheets % 2 == 0).then(|| Arc::new(begun(&l, sheets)));
+        RegionLease { task, epoch, frame, tile, estimate, begun }
+    })
+}
+
+/// A lease's tile as somebody left it.
+fn begun(lease: &Lease, sheets: u8) -> Begun {
+    let Lease { state, tile, slab, .. } = lease;
+    let (a, last) = (state.a.clone(), state.last.clone());
+    let colour = a.iter().map(|a| [a.to_bits(), 0, a.to_bits() >> 3]).collect();
+    let part = |i: u32| (u32::from(sheets) >> (i % 8) & 1 == 0).then_some(slab.first);
+    let sheets = parts(*tile).zip(0..).map(|(_, i)| part(i)).collect();
+    Begun { sheets, pixels: TilePixels { a, colour, last } }
+}
+
+pub fn handed_over() -> impl Strategy<Value = HandedOver> {
+    (lease(), lease(), any::<u8>()).prop_map(|(l, other, sheets)| HandedOver {
+        task: l.task,
+        epoch: l.epoch,
+        kept: other.tile,
+        given: l.tile,
+        begun: begun(&l, sheets),
     })
 }
 
@@ -379,6 +401,7 @@ pub fn to_master() -> impl Strategy<Value = ToMaster> {
         (key(), ids(50)).prop_map(|(set, bricks)| ToMaster::BricksBroken { set, bricks }),
         (key(), ids(50)).prop_map(|(set, bricks)| ToMaster::BricksWanted { set, bricks }),
         (key(), ids(50)).prop_map(|(set, bricks)| ToMaster::BricksForgotten { set, bricks }),
+        handed_over().prop_map(|piece| ToMaster::HandedOver(Box::new(piece))),
         any::<[u64; 2]>().prop_map(|[nonce, clock_us]| ToMaster::Pong { nonce, clock_us }),
         ".{0,50}".prop_map(|reason| ToMaster::Leaving { reason }),
     ]
@@ -399,6 +422,10 @@ pub fn to_worker() -> impl Strategy<Value = ToWorker> {
         lease().prop_map(|l| ToWorker::Lease(Box::new(l))),
         directory(),
         region().prop_map(ToWorker::Region),
+        (any::<[u64; 2]>(), any::<u32>(), 1u32..=999).prop_map(|([f, t], e, share)| {
+            let (frame, task, epoch) = (FrameId(f), TaskId(t), Epoch(e));
+            ToWorker::HandOver { frame, task, epoch, share }
+        }),
         any::<u64>().prop_map(|f| ToWorker::EndFrame { frame: FrameId(f) }),
         any::<u64>().prop_map(|s| ToWorker::EndScene { scene: SceneId(s) }),
         (key(), vec((0u32..1 << 27).prop_map(BrickId), 1..60))

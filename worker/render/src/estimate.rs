@@ -7,7 +7,6 @@
 //! One pixel in 128 is drawn twice, in blocks, since neighbours share footprints.
 
 use crate::model::Model;
-use crate::region::parts;
 use crate::scene::{Frame, Scene};
 use crate::splat::Simd;
 use crate::tile::{self, Scratch};
@@ -16,6 +15,7 @@ use slabcast_common::image::{COLOUR_UNIT, TilePixels, TileState};
 use slabcast_common::message::{Sampled, Sampling, SceneSpec};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Quality;
+use slabcast_common::region::parts;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Projected, View};
 use std::sync::Arc;

@@ -11,6 +11,8 @@
 //! Region::advance    to the end, or to the first sheet that lacks a brick
 //!   .. names the bricks that it lacks there and a little farther; others render meanwhile
 //! Region::advance    from that sheet on
+//! Region::hand_over  where it stands: somebody else draws a piece of it from there
+//! Region::go_on      that one's, before he draws
 //! Region::finish     pixels, counts, and which bricks it touched
 //! ```
 //!
@@ -26,8 +28,10 @@ use crate::splat::Simd;
 use crate::tile::{Among, Io, PART, Part, Scratch};
 use slabcast_common::brick::Brick;
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::Counters;
+use slabcast_common::leaves::LEAF;
+use slabcast_common::message::{Begun, Counters};
 use slabcast_common::occlusion::Rect;
+use slabcast_common::region::{cut, parts};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::Projected;
 use std::cell::{Cell, OnceCell, RefCell};
@@ -37,6 +41,11 @@ use std::sync::Arc;
 pub trait Supply {
     /// A brick, if it is here.
     fn get(&self, place: u32) -> Option<Arc<Brick>>;
+
+    /// Whether regions are to stop before the next sheet, whatever is here.
+    fn stops(&self) -> bool {
+        false
+    }
 }
 
 /// A brick that a part took.
@@ -265,6 +274,10 @@ impl<'a> Coming<'a> {
     /// Takes the bricks that begin at sheet `k` and may touch what is open; voxels of the others are
     /// culled. If one is not here, notes what is lacked.
     pub(crate) fn is_supplied(&self, k: i32, open: &OpenMask, counters: &mut Counters) -> bool {
+        if self.supply.stops() {
+            self.stop.set(Some(k));
+            return false;
+        }
         let waiting = &mut *self.waiting.borrow_mut();
         let mut culled = self.look(k, k, open, waiting);
         let head = k.abs_diff(self.slab.first) as usize;
@@ -389,17 +402,6 @@ fn go_through(
     went
 }
 
-/// A tile's parts: no part of it lies in two of the picture's.
-pub(crate) fn parts(tile: Rect) -> impl Iterator<Item = Rect> {
-    let cut = |from: i32, to: i32| {
-        let parts = from.div_euclid(PART)..=(to - 1).div_euclid(PART);
-        parts.map(move |i| ((i * PART).max(from), ((i + 1) * PART).min(to)))
-    };
-    cut(tile.y0, tile.y1).flat_map(move |(y0, y1)| {
-        cut(tile.x0, tile.x1).map(move |(x0, x1)| Rect::new(x0, y0, x1, y1))
-    })
-}
-
 /// Draws a tile whose bricks are all here through all sheets, into the pixels of another, whose memory
 /// it takes over: once that and scratch have grown, nothing is allocated (`tests/allocations.rs`).
 ///
@@ -480,9 +482,66 @@ impl Region {
         (left > 0).then(|| (left, self.open.iter().map(|s| i64::from(s.at)).sum()))
     }
 
+    /// `tile`, as somebody else left it.
+    ///
+    /// # Errors
+    /// In words, where it can't have been left so.
+    pub fn go_on(outlook: &Outlook, tile: Rect, begun: &Begun) -> Result<Region, &'static str> {
+        let (n, pixels) = (tile.area(), &begun.pixels);
+        let last = pixels.last.as_ref().is_none_or(|last| last.len() == n);
+        if pixels.a.len() != n || pixels.colour.len() != n || !last {
+            return Err("its planes do not have the tile's size");
+        }
+        if begun.sheets.len() != parts(tile).count() {
+            return Err("it does not have as many sheets as its tile has parts");
+        }
+        let all = outlook.sheets();
+        if begun.sheets.iter().flatten().any(|at| !(all.first..=all.end).contains(at)) {
+            return Err("its sheets are not the frame's");
+        }
+        let open = parts(tile).zip(&begun.sheets);
+        let open = open.filter_map(|(rect, at)| Some(Strand { rect, at: (*at)? })).collect();
+        let pixels = pixels.clone();
+        Ok(Region { tile, open, pixels, counters: Counters::default(), touched: Vec::new() })
+    }
+
+    /// Gives away about `share` of what is left: what it keeps of its tile, what it gives, and how that stands.
+    /// `None`: it can't be cut. What is left is told by open pixels and by sheets.
+    pub fn hand_over(
+        &mut self,
+        outlook: &Outlook,
+        eps: f64,
+        share: f64,
+    ) -> Option<(Rect, Rect, Begun)> {
+        let (tile, all) = (self.tile, outlook.sheets());
+        let mut leaves = Leaves::new(tile);
+        for strand in &self.open {
+            let todo = f64::from((all.end - strand.at).max(1)) / f64::from(all.len().max(1));
+            leaves.add(&strand.rect, |i| {
+                let shut = eps > 0.0 && (1.0f32 - self.pixels.a[i]) < eps as f32;
+                if shut { 0.0 } else { todo }
+            });
+        }
+        let (kept, given) = cut(tile, share, |r| leaves.sum(r))?;
+        let at = |rect: Rect| {
+            let on = self.open.iter().find(|s| !s.rect.intersect(&rect).is_empty());
+            on.map(|s| s.at)
+        };
+        let sheets = parts(given).map(at).collect();
+        let begun = Begun { sheets, pixels: self.pixels.piece(tile, given) };
+        for strand in &mut self.open {
+            strand.rect = strand.rect.intersect(&kept);
+        }
+        self.open.retain(|s| !s.rect.is_empty());
+        self.pixels = self.pixels.piece(tile, kept);
+        self.tile = kept;
+        Some((kept, given, begun))
+    }
+
     /// Goes as far as bricks are here. What it lacks to go farther, by places in the directory and
     /// without repetition: those that begin at the sheets at which its parts stand still, and those
-    /// of `ahead` sheets more that are not hidden by what is drawn already. Nothing: it is at its end.
+    /// of `ahead` sheets more that are not hidden by what is drawn already. Nothing: it is at its end, or its supply
+    /// [stops](Supply::stops) it.
     pub fn advance(
         &mut self,
         frame: &Frame,
@@ -495,7 +554,7 @@ impl Region {
         loop {
             let lacks = self.go(frame, simd, outlook, supply, ahead, scratch);
             // What was lacked may have come while the list was made.
-            if self.open.is_empty() || !lacks.is_empty() {
+            if self.open.is_empty() || !lacks.is_empty() || supply.stops() {
                 return lacks;
             }
         }
@@ -541,6 +600,51 @@ impl Region {
     }
 }
 
+/// What is left to do in each leaf of a tile.
+struct Leaves {
+    tile: Rect,
+    left: Vec<f64>,
+}
+
+impl Leaves {
+    fn new(tile: Rect) -> Leaves {
+        let mut leaves = Leaves { tile, left: Vec::new() };
+        let [columns, rows] = leaves.of(tile.x1 - 1, tile.y1 - 1).map(|n| n + 1);
+        leaves.left.resize(columns * rows, 0.0);
+        leaves
+    }
+
+    /// Column and row of the leaf that a pixel lies in.
+    fn of(&self, x: i32, y: i32) -> [usize; 2] {
+        let leaf = |at: i32, first: i32| (at / LEAF as i32 - first / LEAF as i32) as usize;
+        [leaf(x, self.tile.x0), leaf(y, self.tile.y0)]
+    }
+
+    fn columns(&self) -> usize {
+        self.of(self.tile.x1 - 1, self.tile.y0)[0] + 1
+    }
+
+    /// Adds what is left of each pixel of a rectangle, by its place in the tile.
+    fn add(&mut self, rect: &Rect, todo: impl Fn(usize) -> f64) {
+        let (columns, width) = (self.columns(), self.tile.width());
+        for y in rect.y0..rect.y1 {
+            for x in rect.x0..rect.x1 {
+                let i = (y - self.tile.y0) as usize * width + (x - self.tile.x0) as usize;
+                let [column, row] = self.of(x, y);
+                self.left[row * columns + column] += todo(i);
+            }
+        }
+    }
+
+    /// What is left in a rectangle of whole leaves.
+    fn sum(&self, rect: &Rect) -> f64 {
+        let columns = self.columns();
+        let ([x0, y0], [x1, y1]) = (self.of(rect.x0, rect.y0), self.of(rect.x1 - 1, rect.y1 - 1));
+        let rows = self.left.chunks(columns).take(y1 + 1).skip(y0);
+        rows.map(|row| row[x0..=x1].iter().sum::<f64>()).sum()
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -561,12 +665,5 @@ mod tests {
             assert_eq!(list.iter().count(), 0);
         }
         assert_eq!(list.chunks.iter().filter(|c| c.get().is_some()).count(), 5);
-    }
-
-    #[test]
-    fn parts_of_a_tile_are_those_of_the_picture() {
-        let got: Vec<Rect> = parts(Rect::new(48, 64, 130, 100)).collect();
-        let of = |x0, x1| Rect::new(x0, 64, x1, 100);
-        assert_eq!(got, [of(48, 64), of(64, 128), of(128, 130)]);
     }
 }

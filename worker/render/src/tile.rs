@@ -50,6 +50,7 @@ use std::sync::Arc;
 /// overlap and no less time (docs/measurements.md); at 128 a row would need two words, and the
 /// sheets 1.5 MiB.
 pub(crate) const PART: i32 = planes::PART as i32;
+const _: () = assert!(PART == slabcast_common::region::PART);
 
 /// A brick as a frame sees it: what all tiles ask of it, worked out once.
 #[derive(Clone, Debug)]

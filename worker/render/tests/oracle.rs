@@ -23,7 +23,7 @@ use slabcast_render::region::{Region, Supply};
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch};
 use slabcast_render::{Frame, Scene, serial};
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::sync::Arc;
 use world::{bricks_of, infos_of};
 
@@ -72,6 +72,8 @@ fn tiled(
 struct Store<'a> {
     bricks: &'a [Arc<Brick>],
     here: RefCell<Vec<bool>>,
+    /// Sheets until a region is to stop; none: it is not.
+    stop_in: Cell<Option<u64>>,
 }
 
 impl Supply for Store<'_> {
@@ -79,17 +81,23 @@ impl Supply for Store<'_> {
         let place = place as usize;
         self.here.borrow()[place].then(|| self.bricks[place].clone())
     }
+
+    fn stops(&self) -> bool {
+        self.stop_in.set(self.stop_in.get().map(|n| n.saturating_sub(1)));
+        self.stop_in.get() == Some(0)
+    }
 }
 
 /// The frame in regions, of whose bricks a worker holds one in `held_in` at first; one in
-/// `lost_in` rounds it forgets half of them. With what was asked for and what was touched.
+/// `lost_in` rounds it forgets half of them. One in `given_in` regions stops and is cut, and one of the pieces is
+/// drawn as another worker's. With what was asked for and what was touched.
 fn in_regions(
     frame: &Frame,
     simd: Simd,
     bricks: &[Arc<Brick>],
     edge: i32,
     ahead: u32,
-    (held_in, lost_in): (u64, u64),
+    (held_in, lost_in, given_in): (u64, u64, u64),
     seed: u64,
 ) -> (Picture, Counters, Vec<u32>, Vec<u32>) {
     let mut state = seed | 1;
@@ -105,34 +113,51 @@ fn in_regions(
     let directory = Directory::in_blocks(directory, 3 + (seed % 3) as u32, 1 << 20);
     let outlook = Outlook::new(frame, &Arc::new(directory));
     let here = RefCell::new(bricks.iter().map(|_| once_in(held_in)).collect());
-    let store = Store { bricks, here };
+    let store = Store { bricks, here, stop_in: Cell::new(None) };
     let mut picture = Picture { size, pixels: vec![[0.0; 4]; (size[0] * size[1]) as usize] };
     let mut scratch = Scratch::default();
     let (mut asked, mut touched, mut counted) = (Vec::new(), Vec::new(), Counters::default());
+    let mut tiles = Vec::new();
     for y in (0..size[1] as i32).step_by(edge as usize) {
         for x in (0..size[0] as i32).step_by(edge as usize) {
             let rect = Rect::new(x, y, x + edge, y + edge).intersect(&Rect::of_size(size));
-            let mut region = Region::new(&outlook, rect);
-            loop {
-                let lacks = region.advance(frame, simd, &outlook, &store, ahead, &mut scratch);
-                if lacks.is_empty() {
-                    break;
-                }
-                let mut here = store.here.borrow_mut();
-                if once_in(lost_in) {
-                    here.iter_mut().for_each(|h| *h &= once_in(2));
-                }
-                for &place in &lacks {
-                    assert!(!std::mem::replace(&mut here[place as usize], true), "it was here");
-                }
-                asked.extend(lacks);
-            }
-            let done = region.finish();
-            assert!(done.touched.windows(2).all(|p| p[0] < p[1]) && done.pixels.last.is_none());
-            touched.extend(done.touched);
-            counted += done.counters;
-            done.pixels.write(rect, size, &mut picture.pixels);
+            tiles.push((Region::new(&outlook, rect), rect));
         }
+    }
+    while let Some((mut region, mut rect)) = tiles.pop() {
+        store.stop_in.set(once_in(given_in).then(|| 1 + seed % 40));
+        loop {
+            let lacks = region.advance(frame, simd, &outlook, &store, ahead, &mut scratch);
+            if lacks.is_empty() && region.depth().is_none() {
+                break;
+            }
+            if store.stop_in.take() == Some(0) {
+                let share = [0.2, 0.5, 0.9][(seed % 3) as usize];
+                let eps = frame.scene.quality.eps;
+                if let Some((kept, given, begun)) = region.hand_over(&outlook, eps, share) {
+                    assert_eq!((region.tile(), kept.union(&given)), (kept, rect));
+                    assert_eq!(kept.area() + given.area(), rect.area());
+                    let other = Region::go_on(&outlook, given, &begun).expect("it stands so");
+                    assert!(other.depth().is_some() && region.depth().is_some());
+                    assert!(Region::go_on(&outlook, rect, &begun).is_err());
+                    tiles.push((other, given));
+                    rect = kept;
+                }
+            }
+            let mut here = store.here.borrow_mut();
+            if once_in(lost_in) {
+                here.iter_mut().for_each(|h| *h &= once_in(2));
+            }
+            for &place in &lacks {
+                assert!(!std::mem::replace(&mut here[place as usize], true), "it was here");
+            }
+            asked.extend(lacks);
+        }
+        let done = region.finish();
+        assert!(done.touched.windows(2).all(|p| p[0] < p[1]) && done.pixels.last.is_none());
+        touched.extend(done.touched);
+        counted += done.counters;
+        done.pixels.write(rect, size, &mut picture.pixels);
     }
     (picture, counted, asked, touched)
 }
@@ -227,18 +252,21 @@ proptest! {
         let (got, counted) = tiled(&frame, Simd::detect(), &bricks, edge, &[run]);
         prop_assert!(got == want, "in one slab");
 
-        // All bricks here, none here at first, and coming and going.
+        // All bricks here, none here at first, and coming and going; tiles handed over with what is drawn of them.
         let simd = Simd::detect();
-        for (held_in, lost_in, ahead) in [(1, 1 << 40, 8), (3, 1 << 40, 0), (2, 4, 3)] {
-            let holds = (held_in, lost_in);
+        let never = 1 << 40;
+        let worlds = [(1, never, never, 8), (3, never, never, 0), (2, 4, never, 3), (1, never, 1, 0), (2, 4, 2, 3)];
+        for (held_in, lost_in, given_in, ahead) in worlds {
+            let holds = (held_in, lost_in, given_in);
+            let whole = held_in == 1 && given_in == never;
             let (got, counters, asked, touched) =
                 in_regions(&frame, simd, &bricks, edge, ahead, holds, seed);
             prop_assert!(got == want, "in regions of {edge} pixels, {holds:?}");
             // Who looks at fewer bricks draws from the same ones.
             let figures = |c: &Counters| [c.tossed, c.splatted];
-            prop_assert!(held_in > 1 || figures(&counters) == figures(&counted));
+            prop_assert!(!whole || figures(&counters) == figures(&counted));
             prop_assert!(held_in > 1 || asked.is_empty());
-            if ahead == 0 && lost_in > 1000 {
+            if ahead == 0 && lost_in == never && given_in == never {
                 prop_assert!(asked.iter().all(|a| touched.contains(a)), "asked for in vain");
             }
             let frame = make(false);

@@ -65,7 +65,7 @@ impl Frame {
         let us = regions.took(place).filter(|us| *us >= LEAST)?;
         let task = &slab.queue.tasks[place as usize];
         let waits = |p: &u32| *p != place && slab.queue.any_waits(&[*p]);
-        if task.was_lent() || regions.owned(id).iter().any(waits) {
+        if task.was_lent() || task.begun.is_some() || regions.owned(id).iter().any(waits) {
             return None;
         }
         let mut left = self.left(slab, &cluster.roster, now)?;

@@ -150,6 +150,8 @@ pub struct FrameOutcome {
     pub bricks: u64,
     /// Leases.
     pub leases: u64,
+    /// Pieces that were given away.
+    pub handed_over: u64,
     /// Messages from the master, and how often some of them left together; bricks left out.
     pub messages_down: u64,
     /// See above.

@@ -199,8 +199,10 @@ fn pictures_of_frames_alone_are_the_serial_ones_however_their_tiles_are_cut() {
     let range = seeds(300);
     let one = range.end - range.start == 1;
     let (mut frames, mut cut, mut mixed, mut lost, mut dropped, mut retries) = (0, 0, 0, 0, 0, 0);
+    let mut pieces = 0;
     for seed in range {
         let w = chaos_alone(seed);
+        pieces += w.handed_over;
         frames += w.done.len();
         lost += w.scheduler.totals().lost_workers;
         dropped += w.scheduler.totals().dropped_results;
@@ -213,10 +215,10 @@ fn pictures_of_frames_alone_are_the_serial_ones_however_their_tiles_are_cut() {
         assert_eq!(w.log, chaos_alone(seed).log, "seed {seed} replays");
     }
     println!(
-        "alone: {frames} frames, {cut} cut, {mixed} of them in part, {retries} retries, {dropped} results \
-         dropped, {lost} workers lost"
+        "alone: {frames} frames, {cut} cut, {mixed} of them in part, {pieces} pieces given away, {retries} \
+         retries, {dropped} results dropped, {lost} workers lost"
     );
-    assert!(one || mixed > 0 && retries > 0 && dropped > 0 && lost > 0);
+    assert!(one || pieces > 0 && mixed > 0 && retries > 0 && dropped > 0 && lost > 0);
 }
 
 /// A world of many workers and a path of small frames, several in the making or one, so that most workers are held

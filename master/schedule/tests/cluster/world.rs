@@ -10,10 +10,12 @@ use slabcast_common::image::Picture;
 use slabcast_common::image::{TilePixels, TileState};
 use slabcast_common::leaves::Leaves;
 use slabcast_common::message::{
-    Counters, DIRECTORIES, Lease, Pixels, RegionCost, RegionLease, TaskTimes, TileResult, ToWorker,
+    Begun, Counters, DIRECTORIES, HandedOver, Lease, Pixels, RegionCost, RegionLease, TaskTimes,
+    TileResult, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Schedule;
+use slabcast_common::region::{cut, parts};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::view::Projected;
@@ -145,6 +147,8 @@ impl Loan {
 struct Going {
     /// Pixels after the sheets before `at`; nothing before it began.
     drawn: Option<(i32, TilePixels)>,
+    /// The same when it was begun last.
+    before: Option<(i32, TilePixels)>,
     touched: BTreeSet<BrickId>,
     lacks: BTreeSet<BrickId>,
     keeps: BTreeSet<BrickId>,
@@ -216,6 +220,7 @@ pub(crate) struct World {
     pub(crate) failed: BTreeMap<FrameId, String>,
     pub(crate) drops: Vec<(WorkerId, String)>,
     pub(crate) leases_given: u64,
+    pub(crate) handed_over: u64,
     /// Hash of all actions: two runs of a seed are one.
     pub(crate) log: u64,
 }
@@ -238,6 +243,7 @@ impl World {
             failed: BTreeMap::new(),
             drops: Vec::new(),
             leases_given: 0,
+            handed_over: 0,
             log: 0,
         }
     }
@@ -442,6 +448,12 @@ impl World {
                         assert_eq!(same, 1, "seed {seed}: {} twice to {id}", lease.task);
                         self.leases_given += 1;
                     }
+                    ToWorker::HandOver { frame, task, epoch, share } => {
+                        assert!(w.frames.contains(frame), "seed {seed}: a piece before its frame");
+                        let there = w.outstanding.contains_key(&(*task, *epoch));
+                        assert!(there, "seed {seed}: {id} is asked for a piece of nothing");
+                        assert!((1..1000).contains(share), "seed {seed}: {share} of 1000");
+                    }
                     ToWorker::EndFrame { frame } => {
                         assert!(w.frames.remove(frame), "seed {seed}: end of a frame not begun");
                         w.outstanding.retain(|_, (f, _)| f != frame);
@@ -624,8 +636,18 @@ impl World {
                     }
                     ToWorker::Region(lease) if !w.leaving => {
                         let now = self.clock.now();
-                        w.leases.push((Loan::Region(lease, Box::default()), now));
+                        let drawn = lease.begun.as_ref().map(|begun| {
+                            let at = begun.sheets[0].expect("no part of a piece is done");
+                            assert_eq!(begun.sheets, vec![Some(at); parts(lease.tile).count()]);
+                            assert_eq!(begun.pixels.a.len(), lease.tile.area(), "seed {seed}");
+                            (at, begun.pixels.clone())
+                        });
+                        let going = Box::new(Going { drawn, ..Going::default() });
+                        w.leases.push((Loan::Region(lease, going), now));
                         self.begin(id);
+                    }
+                    ToWorker::HandOver { task, epoch, share, .. } => {
+                        self.hand_over(id, (task, epoch), f64::from(share) / 1000.0);
                     }
                     ToWorker::EndFrame { frame } => w.leases.retain(|(l, _)| l.frame() != frame),
                     ToWorker::DropBricks { set, bricks } => {
@@ -717,7 +739,8 @@ impl World {
                     if going.parked_at > 0 {
                         going.parked_us += now - going.parked_at;
                     }
-                    going.advance(&self.jobs[&l.frame], l.tile, &w.present)
+                    going.before = going.drawn.clone();
+                    going.advance_to(&self.jobs[&l.frame], l.tile, &w.present, i32::MAX)
                 }
             };
             let time = (area * f64::from(sheets) * w.nature.us_per_pixel_sheet) as Micros + 50;
@@ -729,6 +752,60 @@ impl World {
                 self.at(now + time + jitter, Coming::TaskEnd(id, thread));
             }
         }
+    }
+
+    /// A worker gives away a piece of a region that it draws, that lies there or that stands still.
+    fn hand_over(&mut self, id: WorkerId, name: (TaskId, Epoch), share: f64) {
+        let now = self.clock.now();
+        let Some(w) = self.workers.get_mut(&id) else { return };
+        let lies = w.nature.lie_in > 0 && self.rng.once_in(w.nature.lie_in);
+        let running = w.running.iter_mut().flatten().map(|r| (&mut r.loan, Some(r.start)));
+        let waiting = w.leases.iter_mut().map(|(loan, _)| (loan, None));
+        let of = |(loan, _): &(&mut Loan, Option<Micros>)| loan.task() == name;
+        let Some((Loan::Region(lease, going), since)) = running.chain(waiting).find(of) else {
+            return;
+        };
+        let known = &self.jobs[&lease.frame];
+        let tile = lease.tile;
+        let Some((kept, given)) = cut(tile, share, |r| r.area() as f64) else { return };
+        if let Some(since) = since {
+            // As far as it has come by now, of what it was to draw from where it was begun last.
+            let until = going.drawn.as_ref().map_or(0, |d| d.0);
+            going.drawn = going.before.take();
+            let from = going.drawn.as_ref().map_or_else(|| known.first(tile), |d| d.0);
+            let whole = f64::from(until - from) * tile.area() as f64 * w.nature.us_per_pixel_sheet;
+            let part = ((now - since) as f64 / (whole + 50.0)).min(1.0);
+            let at = from + (part * f64::from(until - from)) as i32;
+            going.advance_to(known, tile, &w.present, at);
+        }
+        let at = going.drawn.as_ref().map_or_else(|| known.first(tile), |d| d.0);
+        let blank = || TilePixels {
+            a: vec![0.0; tile.area()],
+            colour: vec![[0; 3]; tile.area()],
+            last: None,
+        };
+        let whole = going.drawn.as_ref().map_or_else(blank, |d| d.1.clone());
+        let sheets = parts(given).map(|_| Some(at)).collect();
+        let begun = Begun { sheets, pixels: whole.piece(tile, given) };
+        going.drawn = going.drawn.is_some().then(|| (at, whole.piece(tile, kept)));
+        lease.tile = kept;
+        if since.is_some() {
+            going.before = going.drawn.clone();
+            going.advance_to(known, kept, &w.present, i32::MAX);
+        }
+        let (task, epoch) = name;
+        let mut piece = Box::new(HandedOver { task, epoch, kept, given, begun });
+        if lies {
+            match self.rng.below(5) {
+                0 => piece.begun.pixels.a.truncate(3),
+                1 => piece.begun.pixels.a[0] = f32::INFINITY,
+                2 => piece.begun.sheets.push(None),
+                3 => piece.kept = piece.given,
+                _ => piece.given.x0 += 1,
+            }
+        }
+        self.handed_over += 1;
+        self.up(id, Event::HandedOver { worker: id, piece });
     }
 
     fn end_task(&mut self, id: WorkerId, thread: usize) {
@@ -983,14 +1060,23 @@ impl World {
     }
 }
 
+impl Known {
+    /// The first sheet of a tile.
+    fn first(&self, tile: Rect) -> i32 {
+        let over = self.projections.values().filter(|p| !p.rect.intersect(&tile).is_empty());
+        over.fold(SheetRange::default(), |all, p| all.union(p.sheets)).first
+    }
+}
+
 impl Going {
     /// Draws sheet after sheet with what is there, as far as nothing is lacked that may touch an open
-    /// pixel. How many sheets that are.
-    fn advance(
+    /// pixel, and to sheet `until` at most. How many sheets that are.
+    fn advance_to(
         &mut self,
         job: &Known,
         tile: Rect,
         present: &BTreeSet<(BrickSetKey, BrickId)>,
+        until: i32,
     ) -> u32 {
         let (set, quality) = (job.job.scene.bricks, &job.job.scene.quality);
         let over: Vec<(BrickId, Projected)> = job
@@ -1007,7 +1093,7 @@ impl Going {
         });
         let from = k;
         self.lacks.clear();
-        while k < sheets.end && self.lacks.is_empty() {
+        while k < sheets.end.min(until) && self.lacks.is_empty() {
             let visible = |p: &Projected| {
                 let r = p.rect.intersect(&tile);
                 let mut any = !quality.cull;
@@ -1065,6 +1151,7 @@ impl Script {
 fn sender(event: &Event) -> WorkerId {
     match event {
         Event::Result { worker, .. }
+        | Event::HandedOver { worker, .. }
         | Event::Failed { worker, .. }
         | Event::BricksIn { worker, .. }
         | Event::BricksBroken { worker, .. }

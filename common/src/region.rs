@@ -1,0 +1,115 @@
+//! A region's parts, and where a region is cut of which others are to draw a piece.
+//!
+//! A tile is drawn in parts, squares of the picture of [`PART`] pixels, one after the other through all sheets. What
+//! is left of it when somebody else has time are parts that nobody came to yet, and a part that is some
+//! sheets deep. A cut is one straight line, so that both pieces are rectangles; it lies between leaves of 16x16
+//! pixels, where finished pixels may be cut.
+
+use crate::leaves::LEAF;
+use crate::occlusion::Rect;
+
+/// Edge of the parts that tiles are drawn in.
+pub const PART: i32 = 64;
+
+/// A tile's parts: no part of it lies in two of the picture's.
+pub fn parts(tile: Rect) -> impl Iterator<Item = Rect> {
+    let cut = |from: i32, to: i32| {
+        let parts = from.div_euclid(PART)..=(to - 1).div_euclid(PART);
+        parts.map(move |i| ((i * PART).max(from), ((i + 1) * PART).min(to)))
+    };
+    cut(tile.y0, tile.y1).flat_map(move |(y0, y1)| {
+        cut(tile.x0, tile.x1).map(move |(x0, x1)| Rect::new(x0, y0, x1, y1))
+    })
+}
+
+/// Cuts a tile in two, so that about `share` of what is left to do lies in the second piece. `left` says how much that is
+/// in a rectangle, in whatever unit. `None`: it can't be cut so that there is something to do in both.
+///
+/// Of lines that do as well the first one across the picture is taken: rows stay as long as they are.
+pub fn cut(tile: Rect, share: f64, left: impl Fn(&Rect) -> f64) -> Option<(Rect, Rect)> {
+    let all = left(&tile);
+    let lines = |from: i32, to: i32| {
+        let leaf = LEAF as i32;
+        let first = (from.div_euclid(leaf) + 1) * leaf;
+        (first..to).step_by(LEAF)
+    };
+    let rows = lines(tile.y0, tile.y1).map(|y| {
+        (Rect::new(tile.x0, tile.y0, tile.x1, y), Rect::new(tile.x0, y, tile.x1, tile.y1))
+    });
+    let columns = lines(tile.x0, tile.x1).map(|x| {
+        (Rect::new(tile.x0, tile.y0, x, tile.y1), Rect::new(x, tile.y0, tile.x1, tile.y1))
+    });
+    let mut best: Option<(f64, (Rect, Rect))> = None;
+    for (one, other) in rows.chain(columns) {
+        for (kept, given) in [(one, other), (other, one)] {
+            let (here, there) = (left(&kept), left(&given));
+            let off = (there - share * all).abs();
+            if here > 0.0 && there > 0.0 && best.is_none_or(|(least, _)| off < least) {
+                best = Some((off, (kept, given)));
+            }
+        }
+    }
+    best.map(|(_, pieces)| pieces)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_of_a_tile_are_those_of_the_picture() {
+        let got: Vec<Rect> = parts(Rect::new(48, 64, 130, 100)).collect();
+        let of = |x0, x1| Rect::new(x0, 64, x1, 100);
+        assert_eq!(got, [of(48, 64), of(64, 128), of(128, 130)]);
+    }
+
+    #[test]
+    fn the_pieces_make_up_the_tile_and_the_share_is_as_near_as_leaves_allow() {
+        let area = |r: &Rect| r.area() as f64;
+        for tile in
+            [Rect::new(64, 128, 128, 192), Rect::new(0, 0, 40, 64), Rect::new(0, 64, 17, 80)]
+        {
+            for share in [0.1, 0.25, 0.5, 0.7] {
+                let (kept, given) = cut(tile, share, area).expect("it has a line");
+                assert_eq!(kept.union(&given), tile);
+                assert_eq!(kept.area() + given.area(), tile.area());
+                let lines = [given.x0, given.y0, given.x1, given.y1];
+                let inner = [
+                    given.x0 > tile.x0,
+                    given.y0 > tile.y0,
+                    given.x1 < tile.x1,
+                    given.y1 < tile.y1,
+                ];
+                assert!(
+                    lines.iter().zip(inner).all(|(at, inner)| !inner || at % 16 == 0),
+                    "{given:?}"
+                );
+            }
+        }
+        let (kept, given) = cut(Rect::new(64, 0, 128, 64), 0.5, area).expect("it has a line");
+        assert_eq!(
+            (kept, given),
+            (Rect::new(64, 0, 128, 32), Rect::new(64, 32, 128, 64)),
+            "by rows"
+        );
+        assert_eq!(cut(Rect::new(64, 0, 80, 16), 0.5, area), None, "a leaf");
+    }
+
+    #[test]
+    fn what_is_done_stays_with_whoever_did_it() {
+        // Of four parts the first two are done and the third is half way.
+        let tile = Rect::new(0, 0, 128, 128);
+        let todo = [0.0, 0.0, 0.5, 1.0];
+        let left = |r: &Rect| {
+            let of = |(part, todo): (Rect, f64)| {
+                let both = part.intersect(r);
+                if both.is_empty() { 0.0 } else { todo * both.area() as f64 }
+            };
+            parts(tile).zip(todo).map(of).sum::<f64>()
+        };
+        let (kept, given) = cut(tile, 0.5, left).expect("it has a line");
+        assert!((left(&given) / left(&tile) - 0.5).abs() <= 0.2, "{given:?}");
+        assert!(left(&kept) > 0.0);
+        assert_eq!(cut(tile, 0.5, |_| 0.0), None, "nothing is left");
+    }
+}

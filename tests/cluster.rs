@@ -228,6 +228,34 @@ async fn tiles_that_are_cut_for_a_frame_alone_cost_no_pixel() {
     assert!(cut, "no frame had tiles of two sizes");
 }
 
+/// One tile that holds nearly all of the picture: who has none of it is given a piece as it is drawn.
+#[tokio::test]
+async fn a_tile_that_is_handed_over_while_it_is_drawn_costs_no_pixel() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let views = ["--size", "300x280", "--frames", "1", "--thickness", "0.125", "--tile", "256"];
+    let render = |name: &str, how: &[&str]| {
+        let out = dir.path().join(name);
+        run(Command::new(SLABCAST).arg("render").args(how).args(views).arg("-o").arg(&out));
+        std::fs::read(out.join("frame_0000.png")).expect("a picture")
+    };
+    let one = ["--workers", "1", "--threads", "1", "--schedule", "slab"];
+    let want = render("embedded", &[&[VOLUME], &one[..]].concat());
+    let (_master, address) = master();
+    let client = Client::connect(&address).await.unwrap();
+    let _workers = ["a", "b"].map(|name| worker(&address, name));
+    until("two workers", async || (client.workers().await.unwrap().len() == 2).then_some(())).await;
+    let mut pieces = 0;
+    for i in 0..4 {
+        let file = dir.path().join(format!("{i}.jsonl"));
+        let file = file.to_str().expect("a name");
+        // With sums on the wire, and with finished pixels.
+        let how = [&["--master", &address, "--stats", file][..], &["--no-hash"][..i % 2]].concat();
+        assert!(render(&i.to_string(), &how) == want, "frame {i}");
+        pieces += stats(file.as_ref())[0].handed_over;
+    }
+    assert!(pieces > 0);
+}
+
 /// Workers that call from the master's machine share its processors, so that a path's frames have few, large tiles.
 #[tokio::test]
 async fn workers_of_the_masters_machine_draw_large_tiles_of_the_same_pixels() {

@@ -67,6 +67,16 @@ pub(super) struct Family {
     touched: Vec<u32>,
 }
 
+/// What a result says of a tile.
+pub(super) enum Drawn {
+    /// Nothing of it was given away.
+    Itself,
+    /// Others have pieces of it.
+    InPart,
+    /// It was the last of the tile's at this place.
+    Whole(u32, Family),
+}
+
 /// How long a region takes yet that was to take so long, in microseconds, and has taken some of it. What takes longer
 /// than it was to is slower than was known, by how much it is over so far.
 fn left(us: f64, elapsed: f64) -> f64 {
@@ -305,26 +315,24 @@ impl Slab {
         self.roots.get(&place).is_some_and(|root| done(*root) && done(place))
     }
 
-    /// One of a family's tasks was drawn, in so long and from these bricks. What the whole tile was, when it was the last;
-    /// `Err`: it is no family's.
-    pub(super) fn drawn(
-        &mut self,
-        place: u32,
-        us: Micros,
-        touched: &[u32],
-    ) -> Result<Option<(u32, Family)>, ()> {
+    /// A task was drawn, in so long and from these bricks: what that says of the tile that it is, or is a piece of.
+    pub(super) fn drawn(&mut self, place: u32, us: Micros, touched: &[u32]) -> Drawn {
         let root = self.roots.get(&place).copied().unwrap_or(place);
-        let family = self.families.get_mut(&root).ok_or(())?;
+        let Some(family) = self.families.get_mut(&root) else { return Drawn::Itself };
         family.open -= 1;
         family.us += us;
         family.touched.extend_from_slice(touched);
         if family.open > 0 {
-            return Ok(None);
+            return Drawn::InPart;
         }
-        let mut family = self.families.remove(&root).ok_or(())?;
-        family.touched.sort_unstable();
-        family.touched.dedup();
-        Ok(Some((root, family)))
+        match self.families.remove(&root) {
+            Some(mut family) => {
+                family.touched.sort_unstable();
+                family.touched.dedup();
+                Drawn::Whole(root, family)
+            }
+            None => Drawn::Itself,
+        }
     }
 }
 

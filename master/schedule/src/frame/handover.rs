@@ -33,13 +33,18 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// What goes by until a piece is drawn that is asked for now, in microseconds: the question, the piece to the master
-/// and on to who is dry, of 30 KB or so, and those of its bricks that nobody thought of.
+/// and on to who is dry, and those of its bricks that nobody thought of. At 300 and at 800 the figures of [`GAIN`] change
+/// by their noise.
 const AWAY: f64 = 500.0;
+
+/// Bytes of a piece, which pass the link twice: of 64x32 pixels in a scene that fills them.
+const BYTES: f64 = 48_000.0;
 
 /// How much longer the pieces of a region take together than it would have taken, at least.
 const MORE: f64 = 1.1;
 
-/// What a hand-over has to win, in microseconds, to be worth its messages.
+/// What a hand-over has to win, in microseconds, to be worth its messages. At 150 as many again are asked for, and 64 workers
+/// win nothing by them (mri256 `peer-semi` at 1536x1536, `plan`).
 const GAIN: f64 = 300.0;
 
 /// The least and the most that is asked for, of what is left.
@@ -84,11 +89,16 @@ fn left(us: f64, elapsed: f64) -> f64 {
 }
 
 /// How much of what is left of a region is to be given away for both pieces to be done at once, if others are so many times
-/// quicker; `None`: it does not pay.
-fn share(left: f64, quicker: f64) -> Option<f64> {
-    let share = (1.0 - AWAY / (MORE * left)) / (1.0 + 1.0 / quicker);
+/// quicker and what is given is `away` for so long; `None`: it does not pay.
+fn share(left: f64, quicker: f64, away: f64) -> Option<f64> {
+    let share = (1.0 - away / (MORE * left)) / (1.0 + 1.0 / quicker);
     let ends = MORE * left * (1.0 - share);
     (share >= SHARE.0 && ends + GAIN <= left).then(|| share.min(SHARE.1))
+}
+
+/// [`AWAY`], by a link as quick as was seen.
+fn away(cluster: &Cluster) -> f64 {
+    AWAY + cluster.traffic.rate().map_or(0.0, |rate| 2.0 * BYTES / rate)
 }
 
 impl Frame {
@@ -99,20 +109,24 @@ impl Frame {
         if slab.queue.waiting() > 0 || cluster.traffic.binds_alone() {
             return Vec::new();
         }
-        let pays = |(left, quicker, lease)| Some((lease, (1000.0 * share(left, quicker)?) as u32));
+        let away = away(cluster);
+        let pays = |(left, quicker, lease)| {
+            let share = share(left, quicker, away)?;
+            Some((lease, (1000.0 * share) as u32))
+        };
         let pace = self.pace.measure();
         let drawn = self.being_drawn((cluster, slab, pace), now).into_iter();
         let drawn: Vec<_> = drawn.map_while(pays).collect();
         let free = self.free((cluster, slab, pace), now);
-        let soon = free.iter().filter(|f| f.0 <= AWAY).map(|f| f.2).sum::<u64>();
+        let soon = free.iter().filter(|f| f.0 <= away).map(|f| f.2).sum::<u64>();
         let names = slab.names.saturating_sub(slab.queue.tasks.len() as u64);
         let room = soon.min(names).saturating_sub(slab.handing.len() as u64) as usize;
         // When the next one is free soon; or, if one is now, when a region is late enough.
         self.pieces_at = if drawn.len() < room {
-            self.overtime((cluster, slab, pace), now)
+            self.overtime((cluster, slab, pace), away, now)
         } else {
-            let next = free.iter().find(|f| f.0 > AWAY).filter(|_| drawn.len() > room);
-            next.map(|f| now.saturating_add((f.0 - AWAY).ceil() as Micros).max(now + 1))
+            let next = free.iter().find(|f| f.0 > away).filter(|_| drawn.len() > room);
+            next.map(|f| now.saturating_add((f.0 - away).ceil() as Micros).max(now + 1))
         };
         let asked: Questions = drawn.into_iter().take(room).collect();
         if let Some(slab) = &mut self.slab {
@@ -178,8 +192,13 @@ impl Frame {
     }
 
     /// When the first region that is drawn now will have taken so much longer than it was to that a piece of it pays.
-    fn overtime(&self, of: (&Cluster, &Slab, Option<Measured>), now: Micros) -> Option<Micros> {
-        let enough = 2.5 * (AWAY + GAIN);
+    fn overtime(
+        &self,
+        of: (&Cluster, &Slab, Option<Measured>),
+        away: f64,
+        now: Micros,
+    ) -> Option<Micros> {
+        let enough = 2.5 * (away + GAIN);
         let at = |(_, us, since): (Leased, f64, Micros)| {
             since.saturating_add((us + enough).min(1e15) as Micros)
         };
@@ -242,7 +261,8 @@ impl Frame {
             owned.map(|r| far(&r, &given)).min().unwrap_or(i32::MAX)
         };
         // Of those who can have begun it as soon as it is there, who has drawn nearest to it and lacks least bricks.
-        let soon = free.iter().filter(|f| f.0 <= AWAY && f.1 != worker);
+        let away = away(cluster);
+        let soon = free.iter().filter(|f| f.0 <= away && f.1 != worker);
         let first = || free.iter().find(|f| f.1 != worker);
         let taker = soon.min_by_key(|f| (near(f.1), f.1)).or_else(first).map_or(worker, |f| f.1);
         let part = given.area() as f64 / tile.area() as f64;
@@ -374,13 +394,13 @@ mod tests {
     #[test]
     fn a_piece_is_asked_for_where_both_are_done_sooner() {
         assert_eq!(
-            [0.0, 400.0, 1000.0].map(|us| share(us, 1.0)),
+            [0.0, 400.0, 1000.0].map(|us| share(us, 1.0, AWAY)),
             [None; 3],
             "it would come too late"
         );
         for us in [2500.0, 5000.0, 50_000.0] {
             for quicker in [1.0, 1.5, 8.0] {
-                let share = share(us, quicker).expect("it pays");
+                let share = share(us, quicker, AWAY).expect("it pays");
                 let (kept, given) = (MORE * us * (1.0 - share), MORE * us * share / quicker);
                 assert!((kept - (AWAY + given)).abs() < 1.0 && kept < us, "{us}: {kept}, {given}");
             }

@@ -4,7 +4,7 @@
 //! its tile's A and the last sheet's raw sums and goes on; its colour is fixed point and is
 //! added to what stood there. So any cut into slabs and tiles gives the same integers.
 
-use crate::leaves::{Finish, LEAF, Leaves, compose};
+use crate::leaves::{Finish, LEAF, Leaves, Mosaic};
 use crate::math::{linear_from_srgb, srgb_from_linear};
 use crate::occlusion::Rect;
 use crate::volume::Digest32;
@@ -89,6 +89,9 @@ pub struct FrameState {
     laid: Vec<(Rect, TilePixels)>,
     /// Tiles that came finished, likewise. A frame that has some has no others.
     done: Vec<(Rect, Leaves)>,
+    /// Whether some of them were taken out ([`FrameState::take_finished`]), and the largest opacity of all that came.
+    taken: bool,
+    done_most: f32,
     /// Of all pixels; none before something was put.
     a: Vec<f32>,
     colour: Vec<[u32; 3]>,
@@ -105,8 +108,8 @@ impl FrameState {
 
     /// Nothing drawn yet.
     pub fn new(size: [u32; 2]) -> Self {
-        let (laid, done, a, colour, last, next) = Default::default();
-        FrameState { size, laid, done, a, colour, last, next }
+        let (laid, done, taken, done_most, a, colour, last, next) = Default::default();
+        FrameState { size, laid, done, taken, done_most, a, colour, last, next }
     }
 
     fn pixels(&self) -> usize {
@@ -126,8 +129,7 @@ impl FrameState {
     /// The largest opacity of any pixel.
     pub fn alpha_most(&self) -> f32 {
         let laid = self.laid.iter().flat_map(|(_, tile)| &tile.a);
-        let done = self.done.iter().map(|(_, tile)| &tile.alpha_most);
-        self.a.iter().chain(laid).chain(done).fold(0.0, |most, &a| a.max(most))
+        self.a.iter().chain(laid).fold(self.done_most, |most, &a| a.max(most))
     }
 
     fn rows(&self, r: Rect) -> impl Iterator<Item = std::ops::Range<usize>> + use<> {
@@ -210,7 +212,20 @@ impl FrameState {
         assert!([w, h] == [tile.width(), tile.height()], "leaves of the tile's size");
         assert_eq!(leaves.check(), Ok(()));
         assert!(tile.intersect(&Rect::of_size(self.size)) == tile, "inside the picture");
+        self.done_most = self.done_most.max(leaves.alpha_most);
         self.done.push((tile, leaves));
+    }
+
+    /// Tiles that came finished and were not taken.
+    pub fn finished(&self) -> &[(Rect, Leaves)] {
+        &self.done
+    }
+
+    /// Takes them, for whoever lays them into the picture while others are drawn. The last ones stay for
+    /// [`FrameState::encode_on`].
+    pub fn take_finished(&mut self) -> Vec<(Rect, Leaves)> {
+        self.taken = true;
+        std::mem::take(&mut self.done)
     }
 
     /// Ends a slab: what came in as last sums is what the next slab starts from. A pixel that
@@ -225,7 +240,7 @@ impl FrameState {
     /// # Panics
     /// If tiles came finished: sums can't be had from them.
     pub fn finish(&self) -> Picture {
-        assert!(self.done.is_empty(), "tiles as sums");
+        assert!(self.done.is_empty() && !self.taken, "tiles as sums");
         let mut pixels = Vec::with_capacity(self.pixels());
         self.each_row(|row| pixels.extend_from_slice(row));
         Picture { size: self.size, pixels }
@@ -234,16 +249,26 @@ impl FrameState {
     /// The finished picture's bytes, and its hash if it is to be `hashed`, without a picture in between.
     ///
     /// # Panics
-    /// If tiles came finished and it is to be hashed, or some came in another format or as sums.
+    /// If tiles came finished and it is to be hashed or some were taken, or some came in another format or as sums.
     pub fn encode(&self, finish: &Finish, hashed: bool) -> Encoded {
+        assert!(!self.taken, "all tiles are here");
         if !self.done.is_empty() {
             assert!(!hashed, "the hash is of the linear picture");
-            assert!(self.laid.is_empty() && self.a.is_empty(), "all tiles came finished");
-            return Encoded { sha256: None, bytes: compose(self.size, &self.done, finish) };
+            return self.encode_on(Mosaic::new(self.size, finish));
         }
         let mut encoding = Encoding::new(self.pixels(), finish, hashed);
         self.each_row(|row| encoding.put(row));
         encoding.end()
+    }
+
+    /// The finished picture's bytes, where all tiles came finished and those that were taken are laid.
+    ///
+    /// # Panics
+    /// If some came as sums, and as [`Mosaic::lay`].
+    pub fn encode_on(&self, mut begun: Mosaic) -> Encoded {
+        assert!(self.laid.is_empty() && self.a.is_empty(), "all tiles came finished");
+        begun.lay(&self.done);
+        Encoded { sha256: None, bytes: begun.end() }
     }
 
     /// Makes the picture row by row, from the top.

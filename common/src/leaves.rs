@@ -161,23 +161,42 @@ impl Leaves {
     }
 }
 
-/// A picture of finished tiles; the background is where none is.
-///
-/// # Panics
-/// As [`Leaves::write`], and if a tile has another format.
-pub(crate) fn compose(size: [u32; 2], tiles: &[(Rect, Leaves)], finish: &Finish) -> Vec<u8> {
-    let [w, h] = size.map(|n| n as usize);
-    let blank = finish.blank();
-    let mut picture = if blank.iter().all(|b| *b == blank[0]) {
-        vec![blank[0]; w * h * blank.len()]
-    } else {
-        blank.repeat(w * h)
-    };
-    for (tile, leaves) in tiles {
-        assert!(leaves.format == finish.format, "a frame has one format");
-        leaves.write(*tile, w, &mut picture);
+/// A picture that finished tiles are laid into; the background is where none is.
+#[derive(Clone, Debug)]
+pub struct Mosaic {
+    format: PixelFormat,
+    width: usize,
+    picture: Vec<u8>,
+}
+
+impl Mosaic {
+    /// Nothing but the background.
+    pub fn new(size: [u32; 2], finish: &Finish) -> Mosaic {
+        let [width, height] = size.map(|n| n as usize);
+        let blank = finish.blank();
+        let picture = if blank.iter().all(|b| *b == blank[0]) {
+            vec![blank[0]; width * height * blank.len()]
+        } else {
+            blank.repeat(width * height)
+        };
+        Mosaic { format: finish.format, width, picture }
     }
-    picture
+
+    /// Lays tiles into it.
+    ///
+    /// # Panics
+    /// If a tile has another format, its parts do not fit each other, or it leaves the picture.
+    pub fn lay(&mut self, tiles: &[(Rect, Leaves)]) {
+        for (tile, leaves) in tiles {
+            assert!(leaves.format == self.format, "a frame has one format");
+            leaves.write(*tile, self.width, &mut self.picture);
+        }
+    }
+
+    /// Its bytes.
+    pub fn end(self) -> Vec<u8> {
+        self.picture
+    }
 }
 
 #[cfg(test)]

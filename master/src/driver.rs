@@ -7,13 +7,15 @@
 //! their own. It has a runtime of its own (one thread) for its queue and its timer alone, so
 //! that culling a large volume delays no stream.
 
-use crate::finish;
+use crate::finish::{self, Chore, Laying};
 use crate::jobs::{FinishedFrame, Job, JobState, JobView, Jobs, Watch};
 use crate::link::{BrickOrder, Caller, WorkerLink};
 use crate::memory;
 use crate::record::{Recorder, Watched};
 use slabcast_common::ids::{FrameId, JobId, SceneId, WorkerId};
+use slabcast_common::leaves::Leaves;
 use slabcast_common::message::{Hello, PathRequest, SceneSpec, ToMaster, ToWorker, TransferChoice};
+use slabcast_common::occlusion::Rect;
 use slabcast_common::path::Orientation;
 use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Refused};
@@ -199,15 +201,22 @@ impl Master {
         let jobs = Arc::new(Jobs::starting_at(unix_ms() as u64));
         let handle = Handle { inbox: inbox.clone(), jobs: jobs.clone(), served: served.clone() };
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build()?;
-        let (to_finisher, sums) = std::sync::mpsc::channel::<(FrameId, finish::FrameSums)>();
-        let sums = Arc::new(Mutex::new(sums));
+        let (to_finisher, chores) = std::sync::mpsc::channel::<Chore>();
+        let chores = Arc::new(Mutex::new(chores));
         for _ in 0..FINISHERS {
-            let (sums, done) = (sums.clone(), inbox.clone());
-            let next = move || sums.lock().unwrap_or_else(PoisonError::into_inner).recv();
+            let (chores, done) = (chores.clone(), inbox.clone());
+            let next = move || chores.lock().unwrap_or_else(PoisonError::into_inner).recv();
             std::thread::Builder::new().name("slabcast-finish".into()).spawn(move || {
-                while let Ok((flight, sums)) = next() {
+                while let Ok(chore) = next() {
+                    let (flight, sums) = match chore {
+                        Chore::Lay(laying) => {
+                            laying.lay();
+                            continue;
+                        }
+                        Chore::Finish(flight, sums) => (flight, sums),
+                    };
                     let job = sums.job;
-                    let frame = finish::finish(sums);
+                    let frame = finish::finish(*sums);
                     if done.blocking_send(Event::Finished { job, flight, frame }).is_err() {
                         return;
                     }
@@ -408,6 +417,8 @@ struct Flight {
     /// What is logged about it is logged inside these.
     frame_span: tracing::Span,
     slab_span: Option<(u32, tracing::Span)>,
+    /// Where tiles are laid that come finished while others are drawn.
+    laying: Option<Arc<Laying>>,
 }
 
 struct Driver {
@@ -433,7 +444,7 @@ struct Driver {
     flights: BTreeMap<FrameId, Flight>,
     inbox: mpsc::Sender<Event>,
     /// Bounded by [`FRAMES_IN_FLIGHT`].
-    finisher: std::sync::mpsc::Sender<(FrameId, finish::FrameSums)>,
+    finisher: std::sync::mpsc::Sender<Chore>,
 }
 
 impl Driver {
@@ -852,7 +863,9 @@ impl Driver {
             self.next_frame += 1;
             let frame_span = tracing::info_span!("frame", %job, number, id = %frame);
             let scene = r.scene_of(number, frame);
-            let flight = Flight { job, number, scene: scene.clone(), frame_span, slab_span: None };
+            let (slab_span, laying) = (None, None);
+            let flight =
+                Flight { job, number, scene: scene.clone(), frame_span, slab_span, laying };
             self.flights.insert(frame, flight);
             let only_this = r.tween.is_some().then_some(scene.id);
             let queued = FrameJob {
@@ -939,6 +952,7 @@ impl Driver {
                         self.jobs.ring_tile();
                     }
                 }
+                Action::Finished { frame, tiles } => self.lay(frame, tiles),
                 Action::FrameDone { frame, state, stats, spans } => {
                     self.hand_to_finisher(frame, state, stats, spans);
                 }
@@ -954,6 +968,19 @@ impl Driver {
         }
     }
 
+    /// Has finished tiles laid into their frame's picture while others are drawn.
+    fn lay(&mut self, frame: FrameId, tiles: Vec<(Rect, Leaves)>) {
+        // Nobody drew what is rehearsed.
+        let Some(flight) = self.flights.get_mut(&frame).filter(|_| !self.rehearse) else { return };
+        let Some(r) = self.running.get(&flight.job) else { return };
+        let laying = flight.laying.get_or_insert_with(|| {
+            let size = r.views[flight.number as usize].size;
+            Arc::new(Laying::new(size, r.request.finish()))
+        });
+        laying.add(tiles);
+        let _ = self.finisher.send(Chore::Lay(laying.clone()));
+    }
+
     fn hand_to_finisher(
         &mut self,
         frame: FrameId,
@@ -967,7 +994,8 @@ impl Driver {
             return;
         };
         let view = r.views[flight.number as usize];
-        let sums = finish::FrameSums {
+        let laying = flight.laying.clone();
+        let sums = Box::new(finish::FrameSums {
             job: flight.job,
             frame,
             request: r.request.clone(),
@@ -975,13 +1003,14 @@ impl Driver {
             crop: r.wanted.crop,
             view,
             state,
+            laying,
             stats,
             spans,
             store: r.store.clone(),
             rehearsed: self.rehearse,
-        };
+        });
         // The finisher ends only with the driver.
-        let _ = self.finisher.send((frame, sums));
+        let _ = self.finisher.send(Chore::Finish(frame, sums));
     }
 
     fn finished(&mut self, job: JobId, flight: FrameId, frame: FinishedFrame) {

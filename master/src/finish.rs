@@ -9,7 +9,9 @@ use slabcast_common::bounds;
 use slabcast_common::brick::TightBox;
 use slabcast_common::ids::{FrameId, JobId};
 use slabcast_common::image::{Encoded, FrameState, Picture, PixelFormat};
+use slabcast_common::leaves::{Finish, Leaves, Mosaic};
 use slabcast_common::message::{PathRequest, SceneSpec};
+use slabcast_common::occlusion::Rect;
 use slabcast_common::path::CropBox;
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::stats::{BrickStats, ErrorStats, FrameStats, LeftOut};
@@ -17,7 +19,57 @@ use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::Digest32;
 use slabcast_schedule::{Span, Spans};
 use slabcast_volumes::BrickStore;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// What finishers do.
+pub(crate) enum Chore {
+    /// Lays tiles into the picture of a frame of which others are drawn yet.
+    Lay(Arc<Laying>),
+    /// Makes the frame.
+    Finish(FrameId, Box<FrameSums>),
+}
+
+/// A picture that finished tiles are laid into as they come.
+pub(crate) struct Laying {
+    size: [u32; 2],
+    finish: Finish,
+    coming: Mutex<Vec<(Rect, Leaves)>>,
+    /// `None` before it was begun; not by the driver, since that takes as long as it is large.
+    picture: Mutex<Option<Mosaic>>,
+}
+
+impl Laying {
+    pub(crate) fn new(size: [u32; 2], finish: Finish) -> Laying {
+        Laying { size, finish, coming: Mutex::default(), picture: Mutex::default() }
+    }
+
+    /// Tiles that are to be laid.
+    pub(crate) fn add(&self, tiles: Vec<(Rect, Leaves)>) {
+        locked(&self.coming).extend(tiles);
+    }
+
+    /// Lays those that came so far.
+    pub(crate) fn lay(&self) {
+        self.lay_into(&mut locked(&self.picture));
+    }
+
+    fn lay_into(&self, picture: &mut Option<Mosaic>) {
+        // Behind the picture's lock: who ends it finds none that another has taken and not laid.
+        let tiles = std::mem::take(&mut *locked(&self.coming));
+        picture.get_or_insert_with(|| Mosaic::new(self.size, &self.finish)).lay(&tiles);
+    }
+
+    /// The picture, with all that came.
+    fn end(&self) -> Mosaic {
+        let mut picture = locked(&self.picture);
+        self.lay_into(&mut picture);
+        picture.take().unwrap_or_else(|| Mosaic::new(self.size, &self.finish))
+    }
+}
+
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
 
 /// Everything that makes a frame.
 pub(crate) struct FrameSums {
@@ -28,6 +80,8 @@ pub(crate) struct FrameSums {
     pub(crate) crop: Option<CropBox>,
     pub(crate) view: View,
     pub(crate) state: Box<FrameState>,
+    /// Where tiles that came before are laid.
+    pub(crate) laying: Option<Arc<Laying>>,
     pub(crate) stats: Box<FrameStats>,
     pub(crate) spans: Spans,
     /// Where its bricks come from.
@@ -157,6 +211,8 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
     let alpha_most = f64::from(s.state.alpha_most());
     let Encoded { sha256, bytes } = if s.rehearsed {
         Encoded { sha256: None, bytes: marked(size).encode(finish.format, finish.background) }
+    } else if let Some(laying) = &s.laying {
+        s.state.encode_on(laying.end())
     } else {
         s.state.encode(&finish, s.request.want_hash)
     };

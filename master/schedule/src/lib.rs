@@ -38,8 +38,9 @@
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::FrameState;
-use slabcast_common::leaves::Finish;
+use slabcast_common::leaves::{Finish, Leaves};
 use slabcast_common::message::{HandedOver, SceneSpec, TileResult, ToWorker};
+use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Work;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::view::View;
@@ -307,11 +308,18 @@ pub enum Action {
         /// Slabs of the frame.
         slabs: u32,
     },
+    /// Tiles of a frame came finished, and can be laid into its picture while others are drawn.
+    Finished {
+        /// Which frame.
+        frame: FrameId,
+        /// Where they lie, and their pixels.
+        tiles: Vec<(Rect, Leaves)>,
+    },
     /// A frame is done.
     FrameDone {
         /// Which.
         frame: FrameId,
-        /// Its picture.
+        /// Its picture, but for tiles that left before ([`Action::Finished`]).
         state: Box<FrameState>,
         /// What it cost. Both hashes, `left_out` and `error` are for the master to fill in.
         stats: Box<FrameStats>,

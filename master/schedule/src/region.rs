@@ -713,6 +713,13 @@ impl Regions {
         }
     }
 
+    /// How long bricks of a piece are on the link that is given away of a tile, in microseconds: of those that the tile was drawn
+    /// from before some half lies over it.
+    pub(crate) fn price_of_piece(&self, place: u32, tile: &Rect, memory: &Memory) -> f64 {
+        let known = self.told.get(&place).or_else(|| memory.known(self.kind, tile));
+        0.5 * (self.brick - BRICK) * known.map_or(0, |k| k.touched.len()) as f64
+    }
+
     /// Of a tile that is being drawn a piece is given away, and is this worker's, at the place behind all others. What
     /// the tile takes in all from now on, and what the piece does.
     pub(crate) fn hand_over(

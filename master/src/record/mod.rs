@@ -236,6 +236,7 @@ enum Decision {
     Bricks { worker: u64, count: usize, hash: u64 },
     Drop { worker: u64, reason: String },
     Progress { frame: u64, tiles: (u32, u32), slab: (u32, u32) },
+    Finished { frame: u64, tiles: usize },
     Done { frame: u64, stats: Box<FrameStats> },
     Failed { frame: u64, reason: String },
 }
@@ -289,6 +290,9 @@ impl Decision {
             }
             Action::Progress { frame, done, total, slab, slabs } => {
                 Decision::Progress { frame: frame.0, tiles: (*done, *total), slab: (*slab, *slabs) }
+            }
+            Action::Finished { frame, tiles } => {
+                Decision::Finished { frame: frame.0, tiles: tiles.len() }
             }
             Action::FrameDone { frame, stats, .. } => {
                 Decision::Done { frame: frame.0, stats: stats.clone() }
@@ -358,6 +362,9 @@ impl fmt::Display for Decision {
             Decision::Drop { worker, reason } => write!(f, "w{worker}: dropped, {reason}"),
             Decision::Progress { frame, tiles, slab } => {
                 write!(f, "f{frame}: {}/{} of slab {}/{}", tiles.0, tiles.1, slab.0, slab.1)
+            }
+            Decision::Finished { frame, tiles } => {
+                write!(f, "f{frame}: {tiles} finished tiles for its picture")
             }
             Decision::Done { frame, stats } => {
                 let text = serde_json::to_string(stats).unwrap_or_default();

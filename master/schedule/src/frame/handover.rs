@@ -110,13 +110,19 @@ impl Frame {
             return Vec::new();
         }
         let away = away(cluster);
-        let pays = |(left, quicker, lease)| {
-            let share = share(left, quicker, away)?;
+        let price = |place: u32| {
+            let tile = &slab.cut.tiles[place as usize].rect;
+            let regions = slab.regions.as_ref();
+            regions.map_or(0.0, |regions| regions.price_of_piece(place, tile, &cluster.memory))
+        };
+        let pays = |(left, quicker, lease): (f64, f64, Leased)| {
+            let share = share(left, quicker, away)
+                .and_then(|_| share(left, quicker, away + price(lease.0)))?;
             Some((lease, (1000.0 * share) as u32))
         };
         let pace = self.pace.measure();
         let drawn = self.being_drawn((cluster, slab, pace), now).into_iter();
-        let drawn: Vec<_> = drawn.map_while(pays).collect();
+        let drawn: Vec<_> = drawn.filter_map(pays).collect();
         let free = self.free((cluster, slab, pace), now);
         let soon = free.iter().filter(|f| f.0 <= away).map(|f| f.2).sum::<u64>();
         let names = slab.names.saturating_sub(slab.queue.tasks.len() as u64);

@@ -1303,7 +1303,14 @@ impl<'a> World<'a> {
                 }
                 self.batches(worker, at);
             }
-            Action::FrameDone { frame, stats, spans, .. } => {
+            Action::Finished { tiles, .. } => {
+                if self.machine.is_none() {
+                    let pixels = tiles.iter().map(|(tile, _)| tile.area()).sum::<usize>();
+                    let ns = self.cluster.costs.finish_pixel * pixels as f64;
+                    self.master(|w| &mut w.finisher, at, ns);
+                }
+            }
+            Action::FrameDone { frame, state, stats, spans } => {
                 watch.done(*stats, spans);
                 let i = frame.0 as usize - 1;
                 self.shut.retain(|(f, _), _| *f != i);
@@ -1313,7 +1320,13 @@ impl<'a> World<'a> {
                 }
                 let Costs { finish_pixel, mark_pixel, .. } = self.cluster.costs;
                 let ns = if self.machine.is_some() { mark_pixel } else { finish_pixel };
-                let (ns, woken) = (ns * self.pixels(frame), self.cluster.costs.master.woken);
+                // Of tiles that came finished only the last ones are left.
+                let left = state.finished().iter().map(|(tile, _)| tile.area()).sum::<usize>();
+                let pixels = match self.jobs[i].finish {
+                    Some(_) if self.machine.is_none() => left as f64,
+                    _ => self.pixels(frame),
+                };
+                let (ns, woken) = (ns * pixels, self.cluster.costs.master.woken);
                 self.do_some(at, Chore::Finish(frame), ns, woken);
             }
             Action::FrameFailed { frame, reason } => {

@@ -8,7 +8,7 @@ use slabcast_common::brick::{BrickGrid, BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
 use slabcast_common::image::Picture;
 use slabcast_common::image::{TilePixels, TileState};
-use slabcast_common::leaves::Leaves;
+use slabcast_common::leaves::{Leaves, Mosaic};
 use slabcast_common::message::{
     Begun, Counters, DIRECTORIES, HandedOver, Lease, Pixels, RegionCost, RegionLease, TaskTimes,
     TileResult, ToWorker,
@@ -216,6 +216,8 @@ pub(crate) struct World {
     next_worker: u64,
     jobs: BTreeMap<FrameId, Known>,
     cancelled: BTreeSet<FrameId>,
+    /// Of frames whose tiles come finished, as far as they have come.
+    pictures: BTreeMap<FrameId, Mosaic>,
     pub(crate) done: BTreeMap<FrameId, Done>,
     pub(crate) failed: BTreeMap<FrameId, String>,
     pub(crate) drops: Vec<(WorkerId, String)>,
@@ -239,6 +241,7 @@ impl World {
             next_worker: 1,
             jobs: BTreeMap::new(),
             cancelled: BTreeSet::new(),
+            pictures: BTreeMap::new(),
             done: BTreeMap::new(),
             failed: BTreeMap::new(),
             drops: Vec::new(),
@@ -507,11 +510,21 @@ impl World {
             Action::Progress { frame, done, total, slab, slabs } => {
                 assert!(done <= total && slab < slabs, "seed {seed}: progress of {frame}");
             }
+            Action::Finished { frame, tiles } => {
+                let job = &self.jobs[&frame].job;
+                let finish = job.finish.expect("its tiles come finished");
+                let begun = || Mosaic::new(job.view.size, &finish);
+                self.pictures.entry(frame).or_insert_with(begun).lay(&tiles);
+            }
             Action::FrameDone { frame, state, stats, spans } => {
                 self.note("done", frame.0, 0);
                 assert!(!self.cancelled.contains(&frame), "seed {seed}: {frame} was cancelled");
                 let finish = self.jobs[&frame].job.finish;
-                let bytes = finish.map(|finish| state.encode(&finish, false).bytes);
+                let begun = self.pictures.remove(&frame);
+                let bytes = finish.map(|finish| match begun {
+                    Some(begun) => state.encode_on(begun).bytes,
+                    None => state.encode(&finish, false).bytes,
+                });
                 let picture = finish.is_none().then(|| state.finish());
                 let (at, stats) = (self.now(), *stats);
                 let before = self

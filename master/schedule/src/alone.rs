@@ -55,28 +55,50 @@ const PAYS: f64 = 0.2;
 /// parts of one take is asked for only where whole tiles are not fine enough.
 pub(crate) fn which(us: &[f64], parts: impl Fn(usize) -> Vec<f64>, threads: usize) -> Vec<bool> {
     let n = us.len();
-    let (mut least, mut long, mut short) = (end(&mut us.to_vec(), threads), 0, 0);
+    let whole: Vec<u64> = us.iter().map(|us| item(*us)).collect();
+    let (mut least, mut long, mut short) = (end(&mut whole.clone(), threads), 0, 0);
     let share = us.iter().sum::<f64>() / threads.max(1) as f64;
     if WORTH * WORTH * least <= share {
         return vec![false; n];
     }
-    let parts: Vec<Vec<f64>> = (0..n).map(parts).collect();
+    let parts = |i: usize| parts(i).into_iter().map(item).collect();
+    let parts: Vec<Vec<u64>> = (0..n).map(parts).collect();
     let mut order: Vec<usize> = (0..n).collect();
     order.sort_by(|&a, &b| us[b].total_cmp(&us[a]));
+    // What it adds to cut so many of the longest: to the time of all tiles, and to their number.
+    let mut added = vec![(0.0, 0)];
+    for (&i, rank) in order.iter().zip(0..) {
+        let (time, tiles): (f64, usize) = added[rank];
+        let parts = &parts[i];
+        let more = parts.iter().sum::<u64>() as f64 - whole[i] as f64;
+        added.push((time + more, tiles + parts.len()));
+    }
+    let all = whole.iter().sum::<u64>() as f64;
+    // When all would be done if no thread waited.
+    let soonest = |long: usize, short: usize| {
+        let [a, b, c] = [long, n, n - short].map(|rank| added[rank]);
+        let (time, tiles) = (all + a.0 + b.0 - c.0, n - long - short + a.1 + b.1 - c.1);
+        time / (16.0 * threads as f64) + LEASE * tiles as f64
+    };
     let mut items = Vec::new();
-    let mut end_with = |long: usize, short: usize| {
+    let mut end_with = |(long, short): (usize, usize), least: f64| {
+        // What can't be sooner by enough is not tried.
+        let soonest = soonest(long, short);
+        if soonest >= WORTH * least {
+            return soonest;
+        }
         items.clear();
         for (rank, &i) in order.iter().enumerate() {
             if rank < long || rank + short >= n {
                 items.extend_from_slice(&parts[i]);
             } else {
-                items.push(us[i]);
+                items.push(whole[i]);
             }
         }
         end(&mut items, threads)
     };
     for count in counts(n) {
-        let end = end_with(count, 0);
+        let end = end_with((count, 0), least);
         if end < WORTH * least {
             (least, long) = (end, count);
         } else if end > FAR * least {
@@ -84,7 +106,7 @@ pub(crate) fn which(us: &[f64], parts: impl Fn(usize) -> Vec<f64>, threads: usiz
         }
     }
     for count in counts(n - long) {
-        let end = end_with(long, count);
+        let end = end_with((long, count), least);
         if end < WORTH * least {
             (least, short) = (end, count);
         } else if end > FAR * least {
@@ -104,15 +126,19 @@ fn counts(n: usize) -> impl Iterator<Item = usize> {
     std::iter::successors((n > 0).then_some(1), next)
 }
 
+/// What a tile takes its thread, in sixteenths of a microsecond, which have an order and are sorted in a third of the time.
+fn item(us: f64) -> u64 {
+    (16.0 * (us + EACH)) as u64
+}
+
 /// When the last thread is done, if each that is free takes the longest that is left; with what the master needs.
-fn end(items: &mut [f64], threads: usize) -> f64 {
-    items.sort_by(|a, b| b.total_cmp(a));
-    // In sixteenths of a microsecond, which have an order.
+fn end(items: &mut [u64], threads: usize) -> f64 {
+    items.sort_unstable();
     let mut free: BinaryHeap<Reverse<u64>> = (0..threads).map(|_| Reverse(0)).collect();
     let mut last = 0;
-    for us in items.iter() {
+    for item in items.iter().rev() {
         let Some(mut first) = free.peek_mut() else { break };
-        first.0 += (16.0 * (us + EACH)) as u64;
+        first.0 += item;
         last = last.max(first.0);
     }
     last as f64 / 16.0 + LEASE * items.len() as f64

@@ -539,6 +539,9 @@ pub(crate) struct Regions {
     owned: Crowd<Vec<u32>>,
     /// What each took its last owner, if that is known.
     took: Vec<Option<(WorkerId, f64)>>,
+    /// All that of all tiles together, and of the longest, when it was cut.
+    all_us: f64,
+    longest_us: f64,
     /// Microseconds that a guessed unit takes, in the mean.
     unit: f64,
     /// What a brick takes who is sent it, in microseconds.
@@ -632,7 +635,9 @@ impl Regions {
             };
             share(&cut.tiles, roster, crew, (unit, &slow), &known, (&home, &bricks))
         };
-        let took = cut.tiles.iter().map(known).collect();
+        let took: Vec<Option<(WorkerId, f64)>> = cut.tiles.iter().map(known).collect();
+        let us = || took.iter().flatten().map(|t| t.1);
+        let (all_us, longest_us) = (us().sum(), us().fold(0.0, f64::max));
         let mut owned = Crowd::<Vec<u32>>::default();
         for (&owner, place) in owners.iter().zip(0..) {
             owned.or_default(owner).push(place);
@@ -648,7 +653,20 @@ impl Regions {
         for (t, owner) in cut.tiles.iter().zip(&owners) {
             homes.insert(&t.rect, *owner);
         }
-        (cut, Regions { kind, frame, told, owners, owned, took, unit, brick, fine })
+        let regions = Regions {
+            kind,
+            frame,
+            told,
+            owners,
+            owned,
+            took,
+            all_us,
+            longest_us,
+            unit,
+            brick,
+            fine,
+        };
+        (cut, regions)
     }
 
     /// Who draws it.
@@ -749,6 +767,16 @@ impl Regions {
     /// What a task took its last owner, in microseconds.
     pub(crate) fn took(&self, place: u32) -> Option<f64> {
         self.took[place as usize].map(|(_, us)| us)
+    }
+
+    /// How long each of so many threads has to draw, in microseconds, as far as that was known when it was cut.
+    pub(crate) fn us_a_thread(&self, threads: u64) -> f64 {
+        self.all_us / threads.max(1) as f64
+    }
+
+    /// How long the longest of its tiles was to take, likewise; infinitely long, where nothing was known.
+    pub(crate) fn longest_us(&self) -> f64 {
+        if self.all_us > 0.0 { self.longest_us } else { f64::INFINITY }
     }
 
     /// How long each worker has to do with what of these tasks is its own, in microseconds.

@@ -21,7 +21,7 @@
 //!
 //! Statistics and what is learnt for the next frame are of the whole tile ([`Family`]).
 
-use super::{End, Frame, Measured, Micros, Slab, Verdict, check};
+use super::{End, Frame, Measured, Micros, Regions, Slab, Verdict, check};
 use crate::Cluster;
 use crate::macrotile::Macrotile;
 use slabcast_common::ids::{Epoch, WorkerId};
@@ -107,6 +107,11 @@ impl Frame {
         self.pieces_at = None;
         let Some(slab) = self.slab.as_ref().filter(|_| self.alone) else { return Vec::new() };
         if slab.queue.waiting() > 0 || cluster.traffic.binds_alone() {
+            return Vec::new();
+        }
+        // Where all tiles are short nobody need be looked at.
+        let longest = slab.regions.as_ref().map_or(0.0, Regions::longest_us);
+        if longest < 1.5 * (AWAY + GAIN) {
             return Vec::new();
         }
         let away = away(cluster);

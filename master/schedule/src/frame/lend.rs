@@ -24,10 +24,18 @@ use std::collections::{BTreeMap, BTreeSet};
 /// and 5.3 ms at 1.5 ms, and 23.2, 13.0 and 5.1 at this; threads wait less often, and fewer tiles move.
 const HORIZON: f64 = 4_000.0;
 
-/// The same at the end of a frame that is alone, which is there when the last worker is done: what waits here others can
-/// draw. mri256 `peer-semi` at 1536x1536 takes 43.6, 21.7 and 12.3 ms a frame on 15, 32 and 64 workers at four times as much, and
-/// 43.1, 21.5 and 12.1 at this (`plan`, one in flight).
+/// The same at the end of a frame that is alone and [long](LONG), which is there when the last worker is done: what waits here
+/// others can draw. mri256 `peer-semi` at 1536x1536 takes 23.3 and 13.8 ms a frame on 32 and 64 workers at four times as much, and 22.9
+/// and 13.4 at this (`plan`, one in flight).
 const HORIZON_ALONE: f64 = 1_000.0;
+
+/// A frame that is alone is long if each thread has so much to draw of it, in microseconds. In shorter ones most workers have all their
+/// leases at once, and each message more is a tenth of a small tile: mri256 `peer-opaque` at 512x512 took 3.5 ms for 3.3 on 8 workers, and
+/// 10.7 for 9.9 on 2 where that held from the beginning.
+const LONG: f64 = 8_000.0;
+
+/// Its end is where so many tiles for each thread wait.
+const ENDS: u64 = 2;
 
 /// Who draws by itself is lent so many times as much, and as many more leases: nobody else could take them, and where it
 /// has few tiles that lack bricks it has others meanwhile. One worker takes 13.25 ms for a frame of mri256 at 512x512 without, and
@@ -360,6 +368,7 @@ impl Frame {
                 (takers, orphans)
             }
         };
+        let is_long = regions.us_a_thread(all_threads) > LONG;
         // All threads have something before any has more.
         for first in [true, false] {
             let mut at = 0;
@@ -369,7 +378,8 @@ impl Frame {
                 while let Some(waiting) = self.waiting() {
                     let load = cluster.roster.get(id).map_or(u64::MAX, |w| w.leases);
                     let many = threads.saturating_mul(ahead);
-                    let us_ahead = if self.alone && turn.last { most.alone_us } else { most.us };
+                    let ends = self.alone && turn.last && waiting <= ENDS * all_threads;
+                    let us_ahead = if ends && is_long { most.alone_us } else { most.us };
                     let short = us < us_ahead * threads as f64;
                     let may = if first {
                         load < threads

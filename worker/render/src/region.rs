@@ -25,7 +25,7 @@ use crate::mask::OpenMask;
 use crate::outlook::{Outlook, Sight};
 use crate::scene::{Corner, Frame};
 use crate::splat::Simd;
-use crate::tile::{Among, Io, PART, Part, Scratch};
+use crate::tile::{Among, Io, Part, Scratch};
 use slabcast_common::brick::Brick;
 use slabcast_common::image::TilePixels;
 use slabcast_common::leaves::LEAF;
@@ -571,6 +571,7 @@ impl Region {
     ) -> Vec<u32> {
         let mut lacks = Vec::new();
         let mut open = std::mem::take(&mut self.open);
+        let several = open.len() > 1;
         let from = From { frame, simd, outlook, supply, ahead };
         open.retain_mut(|strand| {
             let at = (self.tile, strand.rect, strand.at);
@@ -582,7 +583,7 @@ impl Region {
             went.stop.is_some()
         });
         self.open = open;
-        if self.tile.width() > PART as usize || self.tile.height() > PART as usize {
+        if several {
             // Parts lack the same brick; the first to name it says how urgent it is.
             let mut named = std::collections::BTreeSet::new();
             lacks.retain(|&place| named.insert(place));

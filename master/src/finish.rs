@@ -1,7 +1,8 @@
 //! From finished sums to a picture, its hash, its bytes and its statistics.
 //!
-//! This runs on a thread of its own beside the driver, so that a frame is hashed and encoded
-//! while the next one is rendered.
+//! This runs on threads of their own beside the driver, so that a frame is hashed and encoded
+//! while the next one is rendered. Tiles that come finished are laid into its picture while others
+//! of it are drawn.
 
 use crate::jobs::FinishedFrame;
 use sha2::{Digest, Sha256};

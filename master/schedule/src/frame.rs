@@ -57,8 +57,8 @@ pub fn is_shut(a: f32, eps: f64) -> bool {
     eps > 0.0 && (1.0f32 - a) < eps as f32
 }
 
-/// Finished tiles that leave for the picture together: what is left when the last one has come is laid in some 30 us, and each time
-/// somebody is woken. mri256 `peer-semi` at 1536x1536 was there a millisecond after its last tile when all were laid then.
+/// Finished tiles that leave for the picture together: what is left when the last one has come is laid in 20 us at most, where all of a
+/// picture of 1536x1536 take 0.6 ms (docs/scaling.md). Each time a finisher is woken, so that it is not each tile.
 const LAID_TOGETHER: usize = 16;
 
 /// A lease that a worker has and has not answered; perhaps dead.

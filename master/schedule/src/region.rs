@@ -295,8 +295,7 @@ impl Memory {
         (place, tile): (u32, &Rect),
         worker: WorkerId,
     ) -> Option<&'a [u32]> {
-        let told = regions.told.get(&place);
-        let known = told.or_else(|| self.known(regions.kind, tile))?;
+        let known = regions.known((place, tile), self)?;
         (known.owner != worker).then_some(&known.touched[..])
     }
 
@@ -310,7 +309,7 @@ impl Memory {
         touched: &[u32],
     ) {
         let us = us as f64;
-        let before = regions.told.get(&place).or_else(|| self.known(regions.kind, tile));
+        let before = regions.known((place, tile), self);
         let before = before.map(|k| (k.owner, k.us));
         let us = match before {
             Some((last, before)) if last == owner => 0.5 * (before + us),
@@ -669,6 +668,11 @@ impl Regions {
         (cut, regions)
     }
 
+    /// What is known of one of its tasks, by itself or by other tiles.
+    fn known<'a>(&'a self, (place, tile): (u32, &Rect), memory: &'a Memory) -> Option<&'a Known> {
+        self.told.get(&place).or_else(|| memory.known(self.kind, tile))
+    }
+
     /// Who draws it.
     pub(crate) fn crew(&self) -> Crew {
         self.kind.2
@@ -734,7 +738,7 @@ impl Regions {
     /// How long bricks of a piece are on the link that is given away of a tile, in microseconds: of those that the tile was drawn
     /// from before some half lies over it.
     pub(crate) fn price_of_piece(&self, place: u32, tile: &Rect, memory: &Memory) -> f64 {
-        let known = self.told.get(&place).or_else(|| memory.known(self.kind, tile));
+        let known = self.known((place, tile), memory);
         0.5 * (self.brick - BRICK) * known.map_or(0, |k| k.touched.len()) as f64
     }
 
@@ -749,7 +753,7 @@ impl Regions {
     ) {
         let (last, _) = self.took[place as usize].unwrap_or((self.owner(place), 0.0));
         self.took[place as usize] = Some((last, kept));
-        let known = self.told.get(&place).or_else(|| memory.known(self.kind, tile)).cloned();
+        let known = self.known((place, tile), memory).cloned();
         let at = self.owners.len() as u32;
         self.owners.push(taker);
         self.took.push(Some((last, given)));

@@ -422,6 +422,7 @@ mod tests {
     use super::*;
     use crate::local::Cut;
     use crate::request::Asked;
+    use slabcast_common::leaves::Mosaic;
     use slabcast_common::path::{Axis, Orientation, Turntable, ViewPath};
     use slabcast_render::outlook::Directory;
     use slabcast_render::tile::Seen;
@@ -492,6 +493,39 @@ mod tests {
                 ns.map(|n| n as f64 / 1e3 / f64::from(tiles)),
                 composed as f64 / 4e6
             );
+        }
+    }
+
+    /// What is left to do of a picture of finished tiles when its last one has come, if all are laid then and if those before
+    /// were. All tiles are full, and the picture's memory is new. For docs/scaling.md.
+    #[test]
+    #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_is_left -- --ignored --nocapture"]
+    fn what_is_left_at_the_last_tile() {
+        let full = TilePixels {
+            a: vec![0.5; 64 * 64],
+            colour: (0..64 * 64).map(|i| [i * 7919 % (1 << 27); 3]).collect(),
+            last: None,
+        };
+        let leaves = Leaves::of(&full, [64, 64], &FINISH);
+        for n in [512, 1024, 1536, 2048] {
+            let at = (0..n).step_by(64);
+            let corners = at.clone().flat_map(|y| at.clone().map(move |x| (x, y)));
+            let tiles: Vec<_> =
+                corners.map(|(x, y)| (Rect::new(x, y, x + 64, y + 64), leaves.clone())).collect();
+            let took = |before: usize| {
+                let mut mosaic = Mosaic::new([n as u32; 2], &FINISH);
+                mosaic.lay(&tiles[..before]);
+                let mut state = FrameState::new([n as u32; 2]);
+                for (rect, leaves) in &tiles[before..] {
+                    state.lay_finished(*rect, leaves.clone());
+                }
+                let began = cpu_ns();
+                let bytes = state.encode_on(mosaic).bytes;
+                (cpu_ns() - began, bytes)
+            };
+            let least = |before| (0..15).map(|_| took(before).0).min().unwrap_or(0) as f64 / 1e6;
+            assert!(took(0).1 == took(tiles.len() - 16).1, "the same picture");
+            println!("{n}: {:.2} ms, {:.2} ms", least(0), least(tiles.len() - 16));
         }
     }
 

@@ -96,6 +96,12 @@ fn share(left: f64, quicker: f64, away: f64) -> Option<f64> {
     (share >= SHARE.0 && ends + GAIN <= left).then(|| share.min(SHARE.1))
 }
 
+/// The least that has to be left for [`share`] to pay, where others are as quick: half of it, drawn as a piece, and half of
+/// the way are to be shorter by [`GAIN`].
+fn least(away: f64) -> f64 {
+    (0.5 * away + GAIN) / (1.0 - 0.5 * MORE)
+}
+
 /// [`AWAY`], by a link as quick as was seen.
 fn away(cluster: &Cluster) -> f64 {
     AWAY + cluster.traffic.rate().map_or(0.0, |rate| 2.0 * BYTES / rate)
@@ -111,7 +117,7 @@ impl Frame {
         }
         // Where all tiles are short nobody need be looked at.
         let longest = slab.regions.as_ref().map_or(0.0, Regions::longest_us);
-        if longest < 1.5 * (AWAY + GAIN) {
+        if longest < least(AWAY) {
             return Vec::new();
         }
         let away = away(cluster);
@@ -121,8 +127,9 @@ impl Frame {
             regions.map_or(0.0, |regions| regions.price_of_piece(place, tile, &cluster.memory))
         };
         let pays = |(left, quicker, lease): (f64, f64, Leased)| {
-            let share = share(left, quicker, away)
-                .and_then(|_| share(left, quicker, away + price(lease.0)))?;
+            // What its bricks take is looked up only where it pays without.
+            share(left, quicker, away)?;
+            let share = share(left, quicker, away + price(lease.0))?;
             Some((lease, (1000.0 * share) as u32))
         };
         let pace = self.pace.measure();
@@ -209,7 +216,8 @@ impl Frame {
         away: f64,
         now: Micros,
     ) -> Option<Micros> {
-        let enough = 2.5 * (away + GAIN);
+        // What is over its time by so much will take as much again.
+        let enough = 1.0 + least(away);
         let at = |(_, us, since): (Leased, f64, Micros)| {
             since.saturating_add((us + enough).min(1e15) as Micros)
         };
@@ -416,6 +424,8 @@ mod tests {
                 assert!((kept - (AWAY + given)).abs() < 1.0 && kept < us, "{us}: {kept}, {given}");
             }
         }
+        let least = least(AWAY);
+        assert!(share(least - 1.0, 1.0, AWAY).is_none() && share(least + 1.0, 1.0, AWAY).is_some());
         assert_eq!(left(1000.0, 400.0), 600.0);
         assert_eq!(left(1000.0, 4000.0), 3000.0, "as late again");
     }

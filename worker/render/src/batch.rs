@@ -46,7 +46,8 @@ impl<'a, S: Recorded, const N: usize> Axes<'a, S, N> {
         let [(x, phases_x), (y, phases_y)] = [along::<S>(footprint, 0), along::<S>(footprint, 1)];
         let deep = Table { weights: S::deep(&frame.sections), len: frame.sections.most() };
         let alike = frame.has_columns_alike();
-        let layers = Layers { across: [[x; N], [y; N]], deep, slot: slot::<N>(k), alike };
+        let (across, slot) = ([[x; N], [y; N]], slot::<N>(k));
+        let layers = Layers { across, deep, slot, alike, stacked: None };
         Axes { layers, phases: [[phases_x; N], [phases_y; N]] }
     }
 

@@ -19,6 +19,7 @@
 use crate::model::Table;
 use crate::splat::Tap;
 use crate::splat::records::MOST;
+use crate::splat::records::stacked::{STACKED, Stacked};
 use glam::DVec3;
 pub use slabcast_common::kernel::{Lean, Profile};
 use slabcast_common::quality::Kernel;
@@ -200,6 +201,8 @@ pub(crate) struct Leaning {
     row: i64,
     /// The farthest that any section lies aside.
     most: [f64; 2],
+    /// Pixels that a voxel's footprints lie apart down the picture at most, if each sheet's lies farther than the one before.
+    stacked: Option<i32>,
 }
 
 impl Leaning {
@@ -214,7 +217,7 @@ impl Leaning {
         let slopes =
             lean.depth.map(|slope| if shows(slope.abs() * deep.radius) { slope } else { 0.0 });
         let (aside, subpixels) = ([vec![], vec![]], [vec![], vec![]]);
-        let mut leaning = Leaning { aside, subpixels, row, most: [0.0; 2] };
+        let mut leaning = Leaning { aside, subpixels, row, most: [0.0; 2], stacked: None };
         let mut behind = vec![0.0; sections.stride];
         for p in 0..sections.phases {
             let at = f64::from(p) / f64::from(sections.phases);
@@ -229,6 +232,15 @@ impl Leaning {
                     leaning.most[axis] = leaning.most[axis].max(aside.abs());
                 }
             }
+        }
+        if row == 0 && leaning.most[0] == 0.0 {
+            let phases = leaning.subpixels[1].chunks(sections.stride);
+            let steady = |phase: &[i32]| phase.is_sorted() || phase.iter().rev().is_sorted();
+            let apart = |phase: &[i32]| phase[0].abs_diff(phase[phase.len() - 1]) as i32;
+            leaning.stacked = phases.clone().all(steady).then(|| {
+                // From one pixel to the next where a footprint begins there may be hardly more than nothing.
+                (phases.map(apart).fold(0, i32::max) >> SUBPIXEL_BITS) + 1
+            });
         }
         // Sheets of a voxel at the end of the table are looked up together, there or not.
         leaning.subpixels.iter_mut().for_each(|aside| aside.extend([0; MOST]));
@@ -250,6 +262,13 @@ impl Leaning {
     #[inline(always)]
     pub(crate) fn subpixels(&self, axis: usize) -> &[i32] {
         &self.subpixels[axis]
+    }
+
+    /// Where rows lie whose voxels have the same columns in all sheets, if these are no more than are added so.
+    pub(crate) fn stacked(&self, [x, down]: [Phases; 2]) -> Option<Stacked<'_>> {
+        let rows = down.len as i32 + self.stacked?;
+        let fits = x.len <= STACKED && rows <= STACKED as i32 && down.margin >= STACKED;
+        fits.then(|| Stacked { subpixels: &self.subpixels[1], down })
     }
 
     /// Pixels at most along x and y that a section or an outermost row lies beside its voxel, for footprints of a
@@ -288,6 +307,9 @@ struct AxisTable {
     /// Pixels that a footprint reaches at most from the one that holds its centre.
     reach: i32,
 }
+
+/// Zeros before and behind a phase's weights, if there are any: as many as these, and so many at least.
+type Zeros = Option<usize>;
 
 /// Pixels that a footprint covers along one axis: `[first, last]` for a centre at phase `p`.
 fn reach(p: i32, radius_px: f64) -> (i64, i64) {
@@ -368,9 +390,8 @@ impl Phases {
 }
 
 impl AxisTable {
-    /// Weights of `profile` at `scale`; `padded`: with as many zeros around each phase's as it has
-    /// weights.
-    fn new(profile: &Profile, scale: f64, padded: bool) -> Self {
+    /// Weights of `profile` at `scale`, with [`Zeros`] around each phase's.
+    fn new(profile: &Profile, scale: f64, zeros: Zeros) -> Self {
         let radius = profile.radius * scale;
         let spans: Vec<(i64, i64)> = (0..SUBPIXELS).map(|p| reach(p, radius)).collect();
         let firsts: Vec<i32> = spans.iter().map(|s| near(s.0)).collect();
@@ -379,7 +400,7 @@ impl AxisTable {
         debug_assert!((0..SUBPIXELS).zip(&firsts).all(|(p, want)| first.of(p) == *want));
         let count: Vec<u32> = spans.iter().map(|s| (s.1 - s.0 + 1).max(0) as u32).collect();
         let stride = count.iter().copied().max().unwrap_or(0) as usize;
-        let margin = if padded { stride } else { 0 };
+        let margin = zeros.map_or(0, |least| stride.max(least));
         let far = |s: &(i64, i64)| near((-s.0).max(s.1));
         let reach = spans.iter().map(far).max().unwrap_or(0);
         let n = (stride + 2 * margin) * SUBPIXELS as usize;
@@ -420,8 +441,8 @@ struct Tables {
 }
 
 impl Tables {
-    fn new(x: &Profile, y: &Profile, scale: f64, padded: bool) -> Self {
-        let along = |profile| AxisTable::new(profile, scale, padded);
+    fn new(x: &Profile, y: &Profile, scale: f64, zeros: Zeros) -> Self {
+        let along = |profile| AxisTable::new(profile, scale, zeros);
         Tables { x: along(x), y: (x != y).then(|| along(y)) }
     }
 
@@ -463,8 +484,8 @@ type Cut = ([u64; 2], bool);
 /// A profile and a thickness, as bits, phases of a sheet, and whether slivers are given away.
 type Deep = ([u64; 4], i32, bool);
 
-/// Two profiles and a scale, as bits, and whether weights are padded.
-type Key = ([u64; 7], bool);
+/// Two profiles and a scale, as bits, and zeros around weights.
+type Key = ([u64; 7], Zeros);
 
 /// Tables that a shelf keeps: some 1000 are 14 MB at two pixels a vox. A turn of a volume of 256
 /// voxels a side has 450. A shelf that is full is cleared: what frames use they hold themselves.
@@ -481,11 +502,11 @@ fn rounded(scale: f64) -> f64 {
 }
 
 impl Shelf {
-    fn get(&self, x: &Profile, y: &Profile, scale: f64, padded: bool) -> Arc<Tables> {
+    fn get(&self, x: &Profile, y: &Profile, scale: f64, zeros: Zeros) -> Arc<Tables> {
         let profile = |p: &Profile| [p.std, p.radius, p.spread].map(f64::to_bits);
         let ([a, b, c], [d, e, f]) = (profile(x), profile(y));
-        let key = ([a, b, c, d, e, f, scale.to_bits()], padded);
-        shelved(&self.tables, SHELF, key, || Tables::new(x, y, scale, padded))
+        let key = ([a, b, c, d, e, f, scale.to_bits()], zeros);
+        shelved(&self.tables, SHELF, key, || Tables::new(x, y, scale, zeros))
     }
 
     /// [`Sections::new`], made once: it takes 80 us, which is a twentieth of what a worker of fifteen draws of a
@@ -578,13 +599,14 @@ impl Footprints {
     #[inline]
     pub fn at(&self, k: i32) -> Option<Footprint<'_>> {
         let scale = self.view.scale_at(k)?;
-        // Where one table serves all sheets, windows are moved to lie inside a part.
-        let (slot, padded) = match self.view.projection {
-            Projection::Ortho { .. } => (self.tables.first(), true),
-            Projection::Persp { .. } => (self.tables.get((k - self.first) as usize), false),
+        // Where one table serves all sheets, windows are moved to lie inside a part, or sections may be stacked.
+        let least = if self.view.kernel_lean.is_none() { 0 } else { STACKED };
+        let (slot, zeros) = match self.view.projection {
+            Projection::Ortho { .. } => (self.tables.first(), Some(least)),
+            Projection::Persp { .. } => (self.tables.get((k - self.first) as usize), None),
         };
         let wide = rounded(scale);
-        let make = || self.shelf.get(&self.x, &self.y, wide, padded);
+        let make = || self.shelf.get(&self.x, &self.y, wide, zeros);
         let table = slot.map(|t| &**t.get_or_init(make));
         Some(Footprint { scale, wide, table, profiles: [&self.x, &self.y] })
     }

@@ -9,7 +9,8 @@ use crate::flat::toss;
 use crate::footprint::Leaning;
 use crate::mask::OpenMask;
 use crate::scene::{Flat, Frame};
-use crate::splat::records::apart::{Apart, BATCH, Each, WINDOW, Woven, after};
+use crate::splat::records::apart::{Apart, BATCH, WINDOW, Woven, after};
+use crate::splat::records::stacked::Stacked;
 use crate::splat::records::{MOST, Recorded, Splat};
 use crate::splat::toss::{Packing, Tossing};
 use crate::splat::{Simd, Work, whole_registers};
@@ -57,10 +58,14 @@ impl<S: Recorded> Work for RenderLeaning<'_, S> {
     fn run(self, simd: Simd) {
         let RenderLeaning { part, lean, store, waiting, pixels, io } = self;
         let footprint = part.frame.footprints.at(0).expect("a flat view's sheets are all drawn");
-        let axes = Axes::new(part.frame, 0, &footprint);
+        let mut axes = Axes::new(part.frame, 0, &footprint);
         let Waiting { queues, tossing, batch } = waiting;
-        let (at, across) = ([[0; BATCH]; 2], Woven::default());
-        let stage = LeaningStage { part: &part, simd, lean, axes, tossing, batch, at, across };
+        if S::stacks::<MOST>(simd) {
+            axes.layers.stacked =
+                lean.leaning.stacked(axes.phases.each_ref().map(|phases| phases[0]));
+        }
+        let across = Woven::default();
+        let stage = LeaningStage { part: &part, simd, lean, axes, tossing, batch, across };
         let sheets = Sheets::<S, MOST>::new(simd, store, part.frame.sections.most());
         walk(&part, stage, sheets, queues, pixels, io);
     }
@@ -74,8 +79,6 @@ struct LeaningStage<'a, S: Recorded, const N: usize> {
     axes: Axes<'a, S, N>,
     tossing: &'a mut Tossing,
     batch: &'a mut Batch,
-    /// Where the voxels of the batch are themselves, in subpixels from the part's corner.
-    at: [Each<i32>; 2],
     /// Weights of the voxel at hand by column and by row.
     across: Woven<S::Weight, N>,
 }
@@ -133,7 +136,7 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
     fn put(&mut self, i: usize, v: &Splat, left: i32) {
         let most = self.part.frame.sections.most() as i32;
         let Batch { samples, normals, apart, .. } = &mut *self.batch;
-        [self.at[0][i], self.at[1][i]] = v.aside_of();
+        [apart.at[0][i], apart.at[1][i]] = v.aside_of();
         (samples[i], normals[i], apart.left[i]) = (v.sample, v.normal(), left);
         apart.deep[i] = v.phase() * most as u32 + (most - left) as u32;
     }
@@ -153,7 +156,7 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
             let aside = (leaning.most(axis) > 0.0).then(|| leaning.subpixels(axis));
             if let Some(aside) = aside {
                 let from = (slot::<N>(k), most as usize);
-                apart.lean::<N>(self.simd, axis, n, &self.at[axis], aside, from);
+                apart.lean::<N>(self.simd, axis, n, aside, from);
             }
             let skewed = axis == 0 && row != 0;
             let mut before = None;
@@ -162,7 +165,7 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
                 if sheet >= most {
                     continue;
                 }
-                let Apart { first, from, places, .. } = &mut *apart;
+                let Apart { first, from, places, at: own, .. } = &mut *apart;
                 if let Some(before) = before.filter(|_| aside.is_none() && !skewed) {
                     // All in one place, also those of sheets that a voxel has no more.
                     first[axis][at] = first[axis][before];
@@ -173,7 +176,7 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
                 before = Some(at);
                 let place = &mut places[axis][at];
                 if aside.is_none() {
-                    place[..n].copy_from_slice(&self.at[axis][..n]);
+                    place[..n].copy_from_slice(&own[axis][..n]);
                 }
                 if skewed {
                     let phases = [phases, &self.axes.phases[1][0]];
@@ -192,6 +195,35 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
         }
     }
 
+    /// Where the columns of each of the first `n` voxels of the batch lie, which all its sections have, and the windows that hold
+    /// these: from the first of them to the last.
+    #[inline(always)]
+    fn place_stacked(&mut self, n: usize, stacked: &Stacked<'_>) {
+        let n = whole_registers::<BATCH>(n);
+        let (slot, across) = (self.axes.layers.slot, &self.axes.phases[0][0]);
+        let apart = &mut self.batch.apart;
+        let Apart { first, from, at, lo, hi, left, deep, .. } = &mut *apart;
+        let Stacked { subpixels, down } = stacked;
+        let mut ends = [[0; BATCH]; 2];
+        for i in 0..n {
+            let begin = deep[i] as usize;
+            let of = [begin, (begin + left[i] as usize).wrapping_sub(1)];
+            for (end, of) in ends.iter_mut().zip(of) {
+                end[i] = at[1][i] + subpixels[of.min(subpixels.len() - 1)];
+            }
+        }
+        for i in 0..n {
+            let column = across.first_at(at[0][i]);
+            first[0][slot][i] = column;
+            from[0][slot][i] = across.begin((at[0][i] & (SUBPIXELS - 1)) as usize) as u32;
+            (lo[0][i], hi[0][i]) = (column, column + across.len as i32);
+            let [a, b] = [down.first_at(ends[0][i]), down.first_at(ends[1][i])];
+            (lo[1][i], hi[1][i]) = (a.min(b), a.max(b) + down.len as i32);
+        }
+        apart.cut(0, n);
+        apart.cut(1, n);
+    }
+
     /// Adds the first `n` voxels of the batch, of `counted` there were, to their sheets from `k` on.
     #[inline(always)]
     fn add(
@@ -202,8 +234,11 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
         open: &OpenMask,
         counted: (usize, &mut Counters),
     ) {
-        self.place(n, k);
         self.axes.layers.slot = slot::<N>(k);
+        match self.axes.layers.stacked {
+            Some(stacked) => self.place_stacked(n, &stacked),
+            None => self.place(n, k),
+        }
         let (part, across) = ((self.part, open), &mut self.across);
         self.batch.add(part, (n, k), &self.axes, None, across, sheets, counted);
     }

@@ -7,6 +7,7 @@
 //! what lies in a window is worked out for many voxels at once (`lines`), and weights are put side by side
 //! in registers.
 
+use super::stacked::Stacked;
 use super::{BySlot, MOST, Record, Recorded, RowAt, STRIDE, Table};
 use crate::footprint::{Lean, Phases};
 #[cfg(target_arch = "x86_64")]
@@ -34,6 +35,8 @@ pub(crate) struct Apart {
     pub(crate) from: [[Each<u32>; MOST]; 2],
     /// Where footprints lie themselves, in subpixels from the part's corner: known where rows lie aside.
     pub(crate) places: [[Each<i32>; MOST]; 2],
+    /// Where voxels do, where their sections lie aside of them.
+    pub(crate) at: [Each<i32>; 2],
     /// By axis, the window inside the part that holds all footprints of a voxel: its first pixel, and the
     /// one behind its last.
     pub(crate) lo: [Each<i32>; 2],
@@ -51,6 +54,7 @@ impl Default for Apart {
             first: [[[0; BATCH]; MOST]; 2],
             from: [[[0; BATCH]; MOST]; 2],
             places: [[[0; BATCH]; MOST]; 2],
+            at: [[0; BATCH]; 2],
             lo: [[0; BATCH]; 2],
             hi: [[0; BATCH]; 2],
             left: [0; BATCH],
@@ -61,8 +65,7 @@ impl Default for Apart {
 }
 
 impl Apart {
-    /// Has sections of the first `n` voxels, which are `at` some place along `axis`, lie as far aside as `aside` says of
-    /// each phase's sheets ([`Leaning::subpixels`](crate::footprint::Leaning::subpixels)): in so many sheets from that
+    /// Has sections of the first `n` voxels lie as far aside along `axis` as `aside` says of each phase's sheets ([`Leaning::subpixels`](crate::footprint::Leaning::subpixels)): in so many sheets from that
     /// on which slot `first` holds. What lies behind a voxel's last section may lie anywhere.
     #[inline(always)]
     pub(crate) fn lean<const N: usize>(
@@ -70,11 +73,10 @@ impl Apart {
         simd: Simd,
         axis: usize,
         n: usize,
-        at: &Each<i32>,
         aside: &[i32],
         sheets: (usize, usize),
     ) {
-        let places = &mut self.places[axis];
+        let (places, at) = (&mut self.places[axis], &self.at[axis]);
         match simd.0 {
             // SAFETY: the value proves that the instructions are there.
             #[cfg(target_arch = "x86_64")]
@@ -226,6 +228,8 @@ pub(crate) struct Layers<'a, S: Recorded, const N: usize> {
     pub(crate) slot: usize,
     /// Whether a voxel has the same columns in all of them, with the same weights.
     pub(crate) alike: bool,
+    /// Where rows lie, if that is looked up as voxels are added ([`Recorded::stacks`]).
+    pub(crate) stacked: Option<Stacked<'a>>,
 }
 
 impl<'a, S: Recorded, const N: usize> Layers<'a, S, N> {
@@ -546,7 +550,7 @@ mod tests {
         let across = [0, 1]
             .map(|axis| std::array::from_fn(|at| Table { weights, len: lens[axis][of(axis, at)] }));
         let deep = Table { weights: deep, len: N };
-        let layers = Layers::<S, N> { across, deep, slot, alike };
+        let layers = Layers::<S, N> { across, deep, slot, alike, stacked: None };
         let mut apart = Apart::default();
         let mut payloads = Vec::new();
         for (i, (around, aside, left)) in voxels.iter().enumerate() {
@@ -594,10 +598,11 @@ mod tests {
         ) {
             let aside: Vec<i32> = (0..40 + MOST as i32).map(|i| i * 37 % 301 - 150).collect();
             let at: Each<i32> = at.try_into().expect("a batch");
+            let deep: Each<u32> = deep.try_into().expect("a batch");
             let of = |simd| {
                 let mut apart = Apart::default();
-                apart.deep.copy_from_slice(&deep);
-                apart.lean::<MOST>(simd, axis, n, &at, &aside, (first, sheets));
+                (apart.deep, apart.at[axis]) = (deep, at);
+                apart.lean::<MOST>(simd, axis, n, &aside, (first, sheets));
                 // What lies behind the last section may lie anywhere.
                 let some = |i: &usize| deep[*i] as usize + sheets <= 40;
                 let voxel = |i: usize| (0..sheets).map(move |sheet| (sheet, i));

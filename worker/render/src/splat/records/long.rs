@@ -359,7 +359,7 @@ pub(super) mod avx512 {
     use crate::splat::records::apart::lines::{self, Lines};
     use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, Layers, Woven};
     use crate::splat::records::{
-        Across, BySlot, MOST, Record, Recorded, RowAt, STRIDE, Splat, Tables,
+        Across, BySlot, MOST, Record, Recorded, RowAt, STRIDE, Splat, Tables, stacked,
     };
     use crate::splat::{Simd, Tap, by_column};
     use std::arch::x86_64::*;
@@ -546,17 +546,16 @@ pub(super) mod avx512 {
         woven: &mut Woven<Tap, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        // Columns are alike in records of eight sheets.
-        let known = N == 8 || !layers.alike;
-        let Some(wide) = lines::widest(apart, kept, i32::step::<N>()).filter(|_| known) else {
+        if let Some(stacked) = layers.stacked {
+            return stacked::avx512::longs((records, (apart, payloads), layers, stacked));
+        }
+        // Those that are alike are stacked, but for windows that are too large for lanes.
+        let any = !layers.alike;
+        let Some(wide) = lines::widest(apart, kept, i32::step::<N>()).filter(|_| any) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
         let at = (records, (apart, payloads), layers, &mut woven.spans);
-        if const { N == 8 } {
-            by_window_alike!(wide, side_by_side[N], at)
-        } else {
-            by_window!(wide, side_by_side[N][false], at)
-        }
+        by_window!(wide, side_by_side[N], at)
     }
 
     /// Weights of voxel `i` in four slots, the first or the second ones, pixel by pixel: four pixels a
@@ -596,7 +595,7 @@ pub(super) mod avx512 {
     /// Windows of `WIDE` columns, four slots after the other.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn side_by_side<const WIDE: usize, const N: usize, const ALIKE: bool>(
+    fn side_by_side<const WIDE: usize, const N: usize>(
         (records, (apart, payloads), layers, spans): ApartAt<'_, i32, N>,
     ) {
         let zero = _mm512_setzero_ps();
@@ -621,20 +620,10 @@ pub(super) mod avx512 {
                 // Negative sections there are none.
                 let section = _mm512_max_ps(_mm512_mul_ps(payload, deep[half]), zero);
                 let mut wx = [zero; WIDE];
-                if ALIKE {
-                    let (present, from) = across.of(layers.slot, i);
-                    // SAFETY: a tap is a float; lanes that are not present are not read, and those that are
-                    // lie in the table.
-                    let line = unsafe { _mm512_maskz_loadu_ps(present as u16, from.cast()) };
-                    for c in 0..WIDE {
-                        wx[c] = _mm512_permutexvar_ps(_mm512_set1_epi32(c as i32), line);
-                    }
-                } else {
-                    let columns = four_slots(&across, i, half);
-                    for c in 0..WIDE {
-                        let from = _mm512_add_epi32(slot, _mm512_set1_epi32(4 * (c as i32 % 4)));
-                        wx[c] = _mm512_permutexvar_ps(from, columns[c / 4]);
-                    }
+                let columns = four_slots(&across, i, half);
+                for c in 0..WIDE {
+                    let from = _mm512_add_epi32(slot, _mm512_set1_epi32(4 * (c as i32 % 4)));
+                    wx[c] = _mm512_permutexvar_ps(from, columns[c / 4]);
                 }
                 let rows = four_slots(&down, i, half);
                 let mut from = slot;

@@ -27,7 +27,7 @@ macro_rules! by_window {
 }
 
 /// The same where columns may be alike: then windows are as wide as footprints are.
-#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+#[cfg(target_arch = "aarch64")]
 macro_rules! by_window_alike {
     ($wide:expr, $side_by_side:ident[$($of:ident),*], $at:expr) => {
         match ($wide, $at.2.alike) {
@@ -67,6 +67,7 @@ mod long;
 #[cfg(target_arch = "aarch64")]
 mod neon;
 mod short;
+pub(crate) mod stacked;
 
 use self::apart::{Apart, Layers, Woven};
 use super::{Accumulate, Grey, Level, Section, Simd, Tap, section_fixed, whole};
@@ -317,6 +318,13 @@ pub(crate) trait Recorded: Accumulate {
         splat_deep::<Self, N>(records, at, across, payload, z);
     }
 
+    /// Whether [stacked](stacked) sections' rows are looked up as voxels are added. Then where they lie in sheets need not be known.
+    #[inline(always)]
+    fn stacks<const N: usize>(simd: Simd) -> bool {
+        let _ = simd;
+        false
+    }
+
     /// Adds voxels with `payloads` whose sections have footprints of their own, in `woven` if need be.
     ///
     /// # Panics
@@ -330,6 +338,16 @@ pub(crate) trait Recorded: Accumulate {
         woven: &mut Woven<Self::Weight, N>,
     ) {
         apart::splat_apart(simd, records, voxels, layers, woven);
+    }
+}
+
+/// Whether [`Recorded::stacks`] for records of eight sheets of four sums.
+#[inline(always)]
+fn stacks(simd: Simd) -> bool {
+    match simd.0 {
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512 => true,
+        _ => false,
     }
 }
 
@@ -442,6 +460,11 @@ impl Recorded for i16 {
     }
 
     #[inline(always)]
+    fn stacks<const N: usize>(simd: Simd) -> bool {
+        N == MOST && stacks(simd)
+    }
+
+    #[inline(always)]
     fn splat_apart<const N: usize>(
         simd: Simd,
         records: &mut [Record<i16, N>],
@@ -510,6 +533,11 @@ impl Recorded for i32 {
             long::avx512::splat_all::<4, N>,
             neon::splat_all::<i32, N>
         );
+    }
+
+    #[inline(always)]
+    fn stacks<const N: usize>(simd: Simd) -> bool {
+        N == MOST && stacks(simd)
     }
 
     #[inline(always)]

@@ -372,7 +372,9 @@ pub(super) mod avx512 {
     use crate::splat::lanes::Sixteen;
     use crate::splat::records::apart::lines::{self, Lines};
     use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, LINE, Layers, Woven};
-    use crate::splat::records::{Across, BySlot, Record, Recorded, RowAt, STRIDE, Splat, Tables};
+    use crate::splat::records::{
+        Across, BySlot, Record, Recorded, RowAt, STRIDE, Splat, Tables, stacked,
+    };
     use std::arch::x86_64::*;
 
     /// 16-bit numbers of a register.
@@ -414,7 +416,7 @@ pub(super) mod avx512 {
     /// A register of 16-bit numbers.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn words(of: impl Fn(usize) -> usize) -> __m512i {
+    pub(in super::super) fn words(of: impl Fn(usize) -> usize) -> __m512i {
         let mut words = [0i16; WORDS];
         for (lane, word) in words.iter_mut().enumerate() {
             *word = of(lane) as i16;
@@ -426,7 +428,7 @@ pub(super) mod avx512 {
     /// The first of `weights`, at most 32, and zeros.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn load(weights: &[i16]) -> __m512i {
+    pub(in super::super) fn load(weights: &[i16]) -> __m512i {
         let present = (1u64 << weights.len().min(WORDS)) - 1;
         // SAFETY: lanes that are not present are not read.
         unsafe { _mm512_maskz_loadu_epi16(present as u32, weights.as_ptr()) }
@@ -450,7 +452,7 @@ pub(super) mod avx512 {
     /// [`add`] to the first `WIDE` records of eight sheets of a row.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn add_row<const WIDE: usize, const N: usize>(
+    pub(in super::super) fn add_row<const WIDE: usize, const N: usize>(
         row: &mut [Record<i16, N>],
         section: __m512i,
         wx: &[__m512i; WIDE],
@@ -596,14 +598,17 @@ pub(super) mod avx512 {
         woven: &mut Woven<i16, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        // Columns are alike in records of eight sheets.
-        let known = N == 8 || !layers.alike;
-        let Some(wide) = lines::widest(apart, kept, i16::step::<N>()).filter(|_| known) else {
+        if let Some(stacked) = layers.stacked {
+            return stacked::avx512::shorts((records, (apart, payloads), layers, stacked));
+        }
+        // Those that are alike are stacked, but for windows that are too large for lanes.
+        let any = !layers.alike;
+        let Some(wide) = lines::widest(apart, kept, i16::step::<N>()).filter(|_| any) else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
         let at = (records, (apart, payloads), layers, &mut woven.spans);
         if const { N == 8 } {
-            by_window_alike!(wide, eight_slots[N], at)
+            by_window!(wide, eight_slots[N], at)
         } else {
             by_window!(wide, four_slots[N], at)
         }
@@ -640,15 +645,6 @@ pub(super) mod avx512 {
         eight_by_column(slots, to);
     }
 
-    /// Weights of voxel `i` across where they are alike.
-    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-    #[inline]
-    fn one_line<const N: usize>(lines: &Lines<'_, i16, N>, slot: usize, i: usize) -> __m512i {
-        let (present, at) = lines.of(slot, i);
-        // SAFETY: lanes that are not present are not read, and those that are lie in the table.
-        unsafe { _mm512_maskz_loadu_epi16(present, at) }
-    }
-
     /// Weights of voxel `i` in eight slots, of eight pixels: slot by slot, four slots a register.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
@@ -670,7 +666,7 @@ pub(super) mod avx512 {
     /// Windows of `WIDE` columns, of eight slots: a register a record.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    fn eight_slots<const WIDE: usize, const N: usize, const ALIKE: bool>(
+    fn eight_slots<const WIDE: usize, const N: usize>(
         (records, (apart, payloads), layers, spans): ApartAt<'_, i16, N>,
     ) {
         let turn = words(|lane| (lane / 4 + 2 * N - layers.slot) % N);
@@ -690,16 +686,9 @@ pub(super) mod avx512 {
             let section = _mm512_set1_epi64(payload as i64);
             let section = _mm512_mulhrs_epi16(section, _mm512_permutexvar_epi16(turn, load(z)));
             let mut wx = [_mm512_setzero_si512(); WIDE];
-            if ALIKE {
-                let line = one_line(&across, layers.slot, i);
-                for (c, wx) in wx.iter_mut().enumerate() {
-                    *wx = _mm512_permutexvar_epi16(_mm512_set1_epi16(c as i16), line);
-                }
-            } else {
-                line_of_eight(&across, i, &mut columns);
-                for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<8>().0) {
-                    *wx = spread(w);
-                }
+            line_of_eight(&across, i, &mut columns);
+            for (wx, w) in wx.iter_mut().zip(columns.as_chunks::<8>().0) {
+                *wx = spread(w);
             }
             let of_rows = records[y * STRIDE + x..].chunks_mut(STRIDE).take(high);
             if high <= 8 {

@@ -548,8 +548,13 @@ mod tests {
                 places[slot][i] = shape.place_in(row, first);
             }
         }
-        let layers =
-            Layers { across: [[across; N]; 2], deep: weights.deep, slot: 1 % N, alike: false };
+        let layers = Layers {
+            across: [[across; N]; 2],
+            deep: weights.deep,
+            slot: 1 % N,
+            alike: false,
+            stacked: None,
+        };
         // Some rows of pixels, one after the other reached by tiers farther down, sheet by sheet.
         let mut by_row = [ByRow::default(), ByRow::default()];
         for y in 0..EDGE {

@@ -19,7 +19,7 @@
 use crate::model::Table;
 use crate::splat::Tap;
 use crate::splat::records::MOST;
-use crate::splat::records::stacked::{STACKED, Stacked};
+use crate::splat::records::stacked::{self, Stacked};
 use glam::DVec3;
 pub use slabcast_common::kernel::{Lean, Profile};
 use slabcast_common::quality::Kernel;
@@ -201,7 +201,8 @@ pub(crate) struct Leaning {
     row: i64,
     /// The farthest that any section lies aside.
     most: [f64; 2],
-    /// Pixels that a voxel's footprints lie apart down the picture at most, if each sheet's lies farther than the one before.
+    /// Pixels that a voxel's footprints lie apart down the picture at most, if they have the same columns and each
+    /// sheet's lies farther than that of the one before.
     stacked: Option<i32>,
 }
 
@@ -238,7 +239,7 @@ impl Leaning {
             let steady = |phase: &[i32]| phase.is_sorted() || phase.iter().rev().is_sorted();
             let apart = |phase: &[i32]| phase[0].abs_diff(phase[phase.len() - 1]) as i32;
             leaning.stacked = phases.clone().all(steady).then(|| {
-                // From one pixel to the next where a footprint begins there may be hardly more than nothing.
+                // Two places that are hardly apart may lie on either side of where a footprint begins a pixel farther.
                 (phases.map(apart).fold(0, i32::max) >> SUBPIXEL_BITS) + 1
             });
         }
@@ -264,10 +265,10 @@ impl Leaning {
         &self.subpixels[axis]
     }
 
-    /// Where rows lie whose voxels have the same columns in all sheets, if these are no more than are added so.
+    /// Where rows lie of voxels with the same columns in all sheets, if there are no more of either than are added so.
     pub(crate) fn stacked(&self, [x, down]: [Phases; 2]) -> Option<Stacked<'_>> {
         let rows = down.len as i32 + self.stacked?;
-        let fits = x.len <= STACKED && rows <= STACKED as i32 && down.margin >= STACKED;
+        let fits = x.len <= stacked::COLUMNS && rows <= stacked::ROWS as i32;
         fits.then(|| Stacked { subpixels: &self.subpixels[1], down })
     }
 
@@ -600,7 +601,7 @@ impl Footprints {
     pub fn at(&self, k: i32) -> Option<Footprint<'_>> {
         let scale = self.view.scale_at(k)?;
         // Where one table serves all sheets, windows are moved to lie inside a part, or sections may be stacked.
-        let least = if self.view.kernel_lean.is_none() { 0 } else { STACKED };
+        let least = if self.view.kernel_lean.is_none() { 0 } else { stacked::ROWS };
         let (slot, zeros) = match self.view.projection {
             Projection::Ortho { .. } => (self.tables.first(), Some(least)),
             Projection::Persp { .. } => (self.tables.get((k - self.first) as usize), None),

@@ -2,7 +2,7 @@
 //!
 //! Voxels land where integers say, as in [`crate::flat`]. A voxel's sections lie aside of it by as many
 //! subpixels as the phase of its depth says ([`Leaning`]), and so may their rows; they are added as those of
-//! perspective views are ([`crate::deep`]).
+//! perspective views are ([`crate::deep`]), or, where they lie one above the other, as [`stacked`] says.
 
 use crate::batch::{Axes, Batch};
 use crate::flat::toss;
@@ -10,7 +10,7 @@ use crate::footprint::Leaning;
 use crate::mask::OpenMask;
 use crate::scene::{Flat, Frame};
 use crate::splat::records::apart::{Apart, BATCH, WINDOW, Woven, after};
-use crate::splat::records::stacked::Stacked;
+use crate::splat::records::stacked::{self, Stacked};
 use crate::splat::records::{MOST, Recorded, Splat};
 use crate::splat::toss::{Packing, Tossing};
 use crate::splat::{Simd, Work, whole_registers};
@@ -60,9 +60,9 @@ impl<S: Recorded> Work for RenderLeaning<'_, S> {
         let footprint = part.frame.footprints.at(0).expect("a flat view's sheets are all drawn");
         let mut axes = Axes::new(part.frame, 0, &footprint);
         let Waiting { queues, tossing, batch } = waiting;
-        if S::stacks::<MOST>(simd) {
-            axes.layers.stacked =
-                lean.leaning.stacked(axes.phases.each_ref().map(|phases| phases[0]));
+        if stacked::in_lanes::<S>(simd) {
+            let phases = axes.phases.each_ref().map(|phases| phases[0]);
+            axes.layers.stacked = lean.leaning.stacked(phases);
         }
         let across = Woven::default();
         let stage = LeaningStage { part: &part, simd, lean, axes, tossing, batch, across };

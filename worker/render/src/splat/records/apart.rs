@@ -65,8 +65,9 @@ impl Default for Apart {
 }
 
 impl Apart {
-    /// Has sections of the first `n` voxels lie as far aside along `axis` as `aside` says of each phase's sheets ([`Leaning::subpixels`](crate::footprint::Leaning::subpixels)): in so many sheets from that
-    /// on which slot `first` holds. What lies behind a voxel's last section may lie anywhere.
+    /// Has sections of the first `n` voxels lie as far aside along `axis` as `aside` says of each phase's sheets
+    /// ([`Leaning::subpixels`](crate::footprint::Leaning::subpixels)): in so many sheets from that on which slot `first`
+    /// holds. What lies behind a voxel's last section may lie anywhere.
     #[inline(always)]
     pub(crate) fn lean<const N: usize>(
         &mut self,
@@ -228,7 +229,7 @@ pub(crate) struct Layers<'a, S: Recorded, const N: usize> {
     pub(crate) slot: usize,
     /// Whether a voxel has the same columns in all of them, with the same weights.
     pub(crate) alike: bool,
-    /// Where rows lie, if that is looked up as voxels are added ([`Recorded::stacks`]).
+    /// Where rows lie, if they are looked up as voxels are added ([`stacked`](super::stacked)).
     pub(crate) stacked: Option<Stacked<'a>>,
 }
 

@@ -549,9 +549,9 @@ pub(super) mod avx512 {
         if let Some(stacked) = layers.stacked {
             return stacked::avx512::longs((records, (apart, payloads), layers, stacked));
         }
-        // Those that are alike are stacked, but for windows that are too large for lanes.
-        let any = !layers.alike;
-        let Some(wide) = lines::widest(apart, kept, i32::step::<N>()).filter(|_| any) else {
+        // Columns that are alike are stacked, but for windows that are too large for lanes.
+        let wide = lines::widest(apart, kept, i32::step::<N>()).filter(|_| !layers.alike);
+        let Some(wide) = wide else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);
         };
         let at = (records, (apart, payloads), layers, &mut woven.spans);

@@ -250,6 +250,8 @@ pub(crate) trait Recorded: Accumulate {
     type Depth: Copy + Default;
     /// Extinction and colours of a voxel.
     type Payload: Copy + Default;
+    /// Whether [stacked](stacked) sections are added in lanes.
+    const STACKED: bool = false;
     /// Windows begin at a column that is a multiple of it, and have as many: records of `N` sheets that may
     /// share a register.
     fn step<const N: usize>() -> i32 {
@@ -318,13 +320,6 @@ pub(crate) trait Recorded: Accumulate {
         splat_deep::<Self, N>(records, at, across, payload, z);
     }
 
-    /// Whether [stacked](stacked) sections' rows are looked up as voxels are added. Then where they lie in sheets need not be known.
-    #[inline(always)]
-    fn stacks<const N: usize>(simd: Simd) -> bool {
-        let _ = simd;
-        false
-    }
-
     /// Adds voxels with `payloads` whose sections have footprints of their own, in `woven` if need be.
     ///
     /// # Panics
@@ -338,16 +333,6 @@ pub(crate) trait Recorded: Accumulate {
         woven: &mut Woven<Self::Weight, N>,
     ) {
         apart::splat_apart(simd, records, voxels, layers, woven);
-    }
-}
-
-/// Whether [`Recorded::stacks`] for records of eight sheets of four sums.
-#[inline(always)]
-fn stacks(simd: Simd) -> bool {
-    match simd.0 {
-        #[cfg(target_arch = "x86_64")]
-        Level::Avx512 => true,
-        _ => false,
     }
 }
 
@@ -378,6 +363,7 @@ macro_rules! four_sums {
 /// 64 bits: extinction in the lowest 16.
 impl Recorded for i16 {
     four_sums!();
+    const STACKED: bool = true;
     type Depth = i16;
     type Payload = u64;
 
@@ -460,11 +446,6 @@ impl Recorded for i16 {
     }
 
     #[inline(always)]
-    fn stacks<const N: usize>(simd: Simd) -> bool {
-        N == MOST && stacks(simd)
-    }
-
-    #[inline(always)]
     fn splat_apart<const N: usize>(
         simd: Simd,
         records: &mut [Record<i16, N>],
@@ -495,6 +476,7 @@ impl Recorded for i16 {
 
 impl Recorded for i32 {
     four_sums!();
+    const STACKED: bool = true;
     type Depth = f32;
     type Payload = [f32; 4];
 
@@ -533,11 +515,6 @@ impl Recorded for i32 {
             long::avx512::splat_all::<4, N>,
             neon::splat_all::<i32, N>
         );
-    }
-
-    #[inline(always)]
-    fn stacks<const N: usize>(simd: Simd) -> bool {
-        N == MOST && stacks(simd)
     }
 
     #[inline(always)]

@@ -94,10 +94,9 @@ pub(crate) struct ViewArgs {
     #[arg(long, value_name = "KIND", default_value = "ortho", value_parser = words(
         &[("ortho", ProjectionKind::Ortho), ("persp", ProjectionKind::Persp)]))]
     projection: ProjectionKind,
-    /// Vertical, full field of view in degrees (--projection persp)
-    #[arg(long, value_name = "DEG", default_value = "30", value_parser = parse::positive,
-          allow_negative_numbers = true)]
-    fov: f64,
+    /// Vertical, full field of view in degrees, of --projection persp [default: 30]
+    #[arg(long, value_name = "DEG", value_parser = parse::positive, allow_negative_numbers = true)]
+    fov: Option<f64>,
     #[command(flatten)]
     pub(crate) axes: AxisArgs,
     /// Views, a turntable, key frames or a flight from a file instead; its size holds unless --size
@@ -634,13 +633,19 @@ impl ViewArgs {
 
     /// The path of the flags.
     fn of_flags(&self, size: [u32; 2]) -> Result<ViewPath, Fail> {
+        let persp = self.projection == ProjectionKind::Persp;
+        if self.fov.is_some() && !persp {
+            return Err(Fail::usage(
+                "--fov: a parallel view has no field of view; add --projection persp",
+            ));
+        }
+        let fov = self.fov.unwrap_or(30.0);
         if let Some(side) = self.view {
-            let persp = self.projection == ProjectionKind::Persp;
             let key = Key {
                 view: Some(side),
                 projection: self.projection,
                 height: self.height,
-                fov: persp.then_some(self.fov),
+                fov: persp.then_some(fov),
                 ..Key::default()
             };
             let one = KeyFrames {
@@ -668,7 +673,7 @@ impl ViewArgs {
             elevation: self.elevation,
             height: self.height,
             projection: self.projection,
-            fov: self.fov,
+            fov,
             up: self.axes.up,
             front: self.axes.front,
         };
@@ -773,6 +778,8 @@ mod tests {
             ("--nan red", "--nan"),
             ("--colors virids", "did you mean `viridis`"),
             ("--path no.json", "no.json:"),
+            ("--fov 40", "--fov:"),
+            ("--view left --fov 40", "--fov:"),
         ] {
             let said = asked(line).err().unwrap_or_else(|| panic!("`{line}` was taken"));
             assert!(said.contains(says), "`{line}` says: {said}");

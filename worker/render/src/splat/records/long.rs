@@ -10,13 +10,13 @@ pub(super) mod avx2 {
     use crate::splat::records::apart::lines::{self, Lines};
     use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, Layers, Woven};
     use crate::splat::records::{
-        Across, BySlot, MOST, Record, Recorded as _, RowAt, STRIDE, Splat, Tables,
+        Across, BySlot, MOST, Record, Recorded as _, RowAt, STRIDE, Splat, Tables, stacked,
     };
     use crate::splat::{Simd, Tap};
     use std::arch::x86_64::*;
 
     /// Registers of a record at most: eight sums each.
-    const PARTS: usize = MOST / 2;
+    pub(in super::super) const PARTS: usize = MOST / 2;
 
     /// Which of a row's weights in depth each of the eight lanes of a register takes: that of its slot.
     #[target_feature(enable = "avx2")]
@@ -264,6 +264,9 @@ pub(super) mod avx2 {
         woven: &mut Woven<Tap, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
+        if let Some(stacked) = layers.stacked {
+            return stacked::avx2::longs((records, (apart, payloads), layers, stacked));
+        }
         // Columns are alike in records of eight sheets.
         let four = N == 4 && !layers.alike;
         let Some(wide) = lines::widest(apart, kept, i32::step::<N>()).filter(|_| four) else {

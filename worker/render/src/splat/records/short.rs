@@ -6,11 +6,13 @@ pub(super) mod avx2 {
     use crate::splat::lanes::Eight;
     use crate::splat::records::apart::lines::{self, Lines};
     use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, LINE, Layers, Woven};
-    use crate::splat::records::{Across, BySlot, MOST, Record, RowAt, STRIDE, Splat, Tables};
+    use crate::splat::records::{
+        Across, BySlot, MOST, Record, RowAt, STRIDE, Splat, Tables, stacked,
+    };
     use std::arch::x86_64::*;
 
     /// Registers of a record at most: four sheets each.
-    const PARTS: usize = MOST / 4;
+    pub(in super::super) const PARTS: usize = MOST / 4;
 
     #[target_feature(enable = "avx2")]
     pub(in super::super) fn splat_all<const N: usize>(
@@ -65,7 +67,7 @@ pub(super) mod avx2 {
     /// Which of a voxel's weights in depth each lane takes, that of its slot, by bytes.
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn turns<const N: usize>(slot: usize) -> [__m256i; PARTS] {
+    pub(in super::super) fn turns<const N: usize>(slot: usize) -> [__m256i; PARTS] {
         let mut turns = [_mm256_setzero_si256(); PARTS];
         for (part, turn) in turns[..N / 4].iter_mut().enumerate() {
             let bytes: [u8; 32] = std::array::from_fn(|byte| {
@@ -208,7 +210,7 @@ pub(super) mod avx2 {
     /// Adds `row * w`, register by register, to a record.
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn add<const N: usize>(
+    pub(in super::super) fn add<const N: usize>(
         record: &mut Record<i16, N>,
         row: &[__m256i; PARTS],
         w: &[__m256i; PARTS],
@@ -227,7 +229,10 @@ pub(super) mod avx2 {
 
     #[target_feature(enable = "avx2")]
     #[inline]
-    fn times<const N: usize>(a: &[__m256i; PARTS], b: &[__m256i; PARTS]) -> [__m256i; PARTS] {
+    pub(in super::super) fn times<const N: usize>(
+        a: &[__m256i; PARTS],
+        b: &[__m256i; PARTS],
+    ) -> [__m256i; PARTS] {
         let mut all = [_mm256_setzero_si256(); PARTS];
         for i in 0..N / 4 {
             all[i] = _mm256_mulhrs_epi16(a[i], b[i]);
@@ -264,6 +269,9 @@ pub(super) mod avx2 {
         woven: &mut Woven<i16, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
+        if let Some(stacked) = layers.stacked {
+            return stacked::avx2::shorts((records, (apart, payloads), layers, stacked));
+        }
         // Columns are alike in records of eight sheets.
         let four = N == 4 && !layers.alike;
         let Some(wide) = lines::widest(apart, kept, 1).filter(|_| four) else {

@@ -47,7 +47,7 @@ impl<'a, S: Recorded, const N: usize> Axes<'a, S, N> {
         let deep = Table { weights: S::deep(&frame.sections), len: frame.sections.most() };
         let alike = frame.has_columns_alike();
         let (across, slot) = ([[x; N], [y; N]], slot::<N>(k));
-        let layers = Layers { across, deep, slot, alike, stacked: None };
+        let layers = Layers { across, deep, slot, alike, slant: None };
         Axes { layers, phases: [[phases_x; N], [phases_y; N]] }
     }
 
@@ -153,7 +153,7 @@ impl Batch {
         sheets.touch_all(k, &corners, [columns, rows]);
         let row = part.frame.leaning.as_ref().map_or(0, Leaning::row);
         let voxels = (apart, &payloads[..some]);
-        if row == 0 {
+        if row == 0 || layers.slant.is_some() {
             S::splat_apart(sheets.simd, sheets.records, voxels, layers, woven);
         } else {
             let layers = (layers, (row, phases));

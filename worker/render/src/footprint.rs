@@ -19,7 +19,8 @@
 use crate::model::Table;
 use crate::splat::Tap;
 use crate::splat::records::MOST;
-use crate::splat::records::stacked::{self, Stacked};
+use crate::splat::records::apart::LINE;
+use crate::splat::records::slant::{self, Slant};
 use glam::DVec3;
 pub use slabcast_common::kernel::{Lean, Profile};
 use slabcast_common::quality::Kernel;
@@ -201,9 +202,10 @@ pub(crate) struct Leaning {
     row: i64,
     /// The farthest that any section lies aside.
     most: [f64; 2],
-    /// Pixels that a voxel's footprints lie apart down the picture at most, if they have the same columns and each
-    /// sheet's lies farther than that of the one before.
-    stacked: Option<i32>,
+    /// Pixels that a voxel's footprints lie apart at most: in a row, and down the picture.
+    apart: [i64; 2],
+    /// Whether each sheet's lies farther down, or farther up, than that of the one before.
+    steady: bool,
 }
 
 impl Leaning {
@@ -218,7 +220,8 @@ impl Leaning {
         let slopes =
             lean.depth.map(|slope| if shows(slope.abs() * deep.radius) { slope } else { 0.0 });
         let (aside, subpixels) = ([vec![], vec![]], [vec![], vec![]]);
-        let mut leaning = Leaning { aside, subpixels, row, most: [0.0; 2], stacked: None };
+        let mut leaning =
+            Leaning { aside, subpixels, row, most: [0.0; 2], apart: [0; 2], steady: true };
         let mut behind = vec![0.0; sections.stride];
         for p in 0..sections.phases {
             let at = f64::from(p) / f64::from(sections.phases);
@@ -234,14 +237,21 @@ impl Leaning {
                 }
             }
         }
-        if row == 0 && leaning.most[0] == 0.0 {
-            let phases = leaning.subpixels[1].chunks(sections.stride);
-            let steady = |phase: &[i32]| phase.is_sorted() || phase.iter().rev().is_sorted();
-            let apart = |phase: &[i32]| phase[0].abs_diff(phase[phase.len() - 1]) as i32;
-            leaning.stacked = phases.clone().all(steady).then(|| {
+        let [x, y] = leaning.subpixels.each_ref().map(|aside| aside.chunks(sections.stride));
+        for (x, y) in x.zip(y) {
+            leaning.steady &= y.is_sorted() || y.iter().rev().is_sorted();
+            // In one row of the picture. What is rounded once for a section may be otherwise in another.
+            let of_row =
+                x.iter().zip(y).map(|(&x, &y)| i64::from(x) + Lean::along_row(row, -i64::from(y)));
+            let rounded = i64::from(row != 0);
+            for (to, apart) in leaning
+                .apart
+                .iter_mut()
+                .zip([between(of_row) + rounded, between(y.iter().map(|&y| i64::from(y)))])
+            {
                 // Two places that are hardly apart may lie on either side of where a footprint begins a pixel farther.
-                (phases.map(apart).fold(0, i32::max) >> SUBPIXEL_BITS) + 1
-            });
+                *to = (*to).max((apart >> SUBPIXEL_BITS) + 1);
+            }
         }
         // Sheets of a voxel at the end of the table are looked up together, there or not.
         leaning.subpixels.iter_mut().for_each(|aside| aside.extend([0; MOST]));
@@ -265,11 +275,22 @@ impl Leaning {
         &self.subpixels[axis]
     }
 
-    /// Where rows lie of voxels with the same columns in all sheets, if there are no more of either than are added so.
-    pub(crate) fn stacked(&self, [x, down]: [Phases; 2]) -> Option<Stacked<'_>> {
-        let rows = down.len as i32 + self.stacked?;
-        let fits = x.len <= stacked::COLUMNS && rows <= stacked::ROWS as i32;
-        fits.then(|| Stacked { subpixels: &self.subpixels[1], down })
+    /// How sections of voxels lie aside of each other, if they have no more rows and columns than are added so.
+    pub(crate) fn slant(&self, phases: [Phases; 2]) -> Option<Slant<'_>> {
+        let [x, down] = &phases;
+        let skewed = self.row != 0;
+        if !skewed && self.most[0] > 0.0 {
+            // Columns of their own that are the same in all rows.
+            return None;
+        }
+        let wide = x.len as i64 + if skewed { self.apart[0] } else { 0 };
+        let fits = wide <= if skewed { slant::COLUMNS } else { LINE } as i64
+            && down.len as i64 + self.apart[1] <= slant::ROWS as i64
+            && (skewed || self.steady)
+            && self.row.abs() < 1 << 20;
+        let subpixels = self.subpixels.each_ref().map(Vec::as_slice);
+        let (row, wide) = (self.row as i32, wide as usize);
+        fits.then_some(Slant { subpixels, phases, row, skewed, wide })
     }
 
     /// Pixels at most along x and y that a section or an outermost row lies beside its voxel, for footprints of a
@@ -291,6 +312,12 @@ impl Leaning {
     pub(crate) fn row(&self) -> i64 {
         self.row
     }
+}
+
+/// How far the least and the greatest of some numbers are from each other.
+fn between(all: impl Iterator<Item = i64>) -> i64 {
+    let (least, most) = all.fold((i64::MAX, i64::MIN), |(a, b), n| (a.min(n), b.max(n)));
+    most.saturating_sub(least).max(0)
 }
 
 /// Footprint weights along one screen axis for one scale, by subpixel phase.
@@ -600,8 +627,8 @@ impl Footprints {
     #[inline]
     pub fn at(&self, k: i32) -> Option<Footprint<'_>> {
         let scale = self.view.scale_at(k)?;
-        // Where one table serves all sheets, windows are moved to lie inside a part, or sections may be stacked.
-        let least = if self.view.kernel_lean.is_none() { 0 } else { stacked::ROWS };
+        // Where one table serves all sheets, windows are moved to lie inside a part, or sections lie aside of each other.
+        let least = if self.view.kernel_lean.is_none() { 0 } else { slant::ROWS };
         let (slot, zeros) = match self.view.projection {
             Projection::Ortho { .. } => (self.tables.first(), Some(least)),
             Projection::Persp { .. } => (self.tables.get((k - self.first) as usize), None),

@@ -2,7 +2,7 @@
 //!
 //! Voxels land where integers say, as in [`crate::flat`]. A voxel's sections lie aside of it by as many
 //! subpixels as the phase of its depth says ([`Leaning`]), and so may their rows; they are added as those of
-//! perspective views are ([`crate::deep`]), or, where they lie one above the other, as [`stacked`] says.
+//! perspective views are ([`crate::deep`]), or, where there are few pixels to each, as [`slant`] says.
 
 use crate::batch::{Axes, Batch};
 use crate::flat::toss;
@@ -10,7 +10,7 @@ use crate::footprint::Leaning;
 use crate::mask::OpenMask;
 use crate::scene::{Flat, Frame};
 use crate::splat::records::apart::{Apart, BATCH, WINDOW, Woven, after};
-use crate::splat::records::stacked::{self, Stacked};
+use crate::splat::records::slant::{self, Slant};
 use crate::splat::records::{MOST, Recorded, Splat};
 use crate::splat::toss::{Packing, Tossing};
 use crate::splat::{Simd, Work, whole_registers};
@@ -60,9 +60,9 @@ impl<S: Recorded> Work for RenderLeaning<'_, S> {
         let footprint = part.frame.footprints.at(0).expect("a flat view's sheets are all drawn");
         let mut axes = Axes::new(part.frame, 0, &footprint);
         let Waiting { queues, tossing, batch } = waiting;
-        if stacked::in_lanes::<S>(simd) {
+        if slant::in_lanes::<S>(simd) {
             let phases = axes.phases.each_ref().map(|phases| phases[0]);
-            axes.layers.stacked = lean.leaning.stacked(phases);
+            axes.layers.slant = lean.leaning.slant(phases);
         }
         let across = Woven::default();
         let stage = LeaningStage { part: &part, simd, lean, axes, tossing, batch, across };
@@ -198,12 +198,12 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
     /// Where the columns of each of the first `n` voxels of the batch lie, which all its sections have, and the windows that hold
     /// these: from the first of them to the last.
     #[inline(always)]
-    fn place_stacked(&mut self, n: usize, stacked: &Stacked<'_>) {
+    fn place_stacked(&mut self, n: usize, slant: &Slant<'_>) {
         let n = whole_registers::<BATCH>(n);
         let (slot, across) = (self.axes.layers.slot, &self.axes.phases[0][0]);
         let apart = &mut self.batch.apart;
         let Apart { first, from, at, lo, hi, left, deep, .. } = &mut *apart;
-        let Stacked { subpixels, down } = stacked;
+        let (subpixels, down) = (slant.subpixels[1], &slant.phases[1]);
         let mut ends = [[0; BATCH]; 2];
         for i in 0..n {
             let begin = deep[i] as usize;
@@ -235,8 +235,11 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
         counted: (usize, &mut Counters),
     ) {
         self.axes.layers.slot = slot::<N>(k);
-        match self.axes.layers.stacked {
-            Some(stacked) => self.place_stacked(n, &stacked),
+        match self.axes.layers.slant {
+            Some(slant) if slant.skewed => {
+                slant::windows(self.simd, &slant, &mut self.batch.apart, n);
+            }
+            Some(slant) => self.place_stacked(n, &slant),
             None => self.place(n, k),
         }
         let (part, across) = ((self.part, open), &mut self.across);

@@ -7,7 +7,7 @@
 //! what lies in a window is worked out for many voxels at once (`lines`), and weights are put side by side
 //! in registers.
 
-use super::stacked::Stacked;
+use super::slant::Slant;
 use super::{BySlot, MOST, Record, Recorded, RowAt, STRIDE, Table};
 use crate::footprint::{Lean, Phases};
 #[cfg(target_arch = "x86_64")]
@@ -229,8 +229,8 @@ pub(crate) struct Layers<'a, S: Recorded, const N: usize> {
     pub(crate) slot: usize,
     /// Whether a voxel has the same columns in all of them, with the same weights.
     pub(crate) alike: bool,
-    /// Where rows lie, if they are looked up as voxels are added ([`stacked`](super::stacked)).
-    pub(crate) stacked: Option<Stacked<'a>>,
+    /// How sections lie aside of each other, if where they are is looked up as voxels are added ([`slant`](super::slant)).
+    pub(crate) slant: Option<Slant<'a>>,
 }
 
 impl<'a, S: Recorded, const N: usize> Layers<'a, S, N> {
@@ -551,7 +551,7 @@ mod tests {
         let across = [0, 1]
             .map(|axis| std::array::from_fn(|at| Table { weights, len: lens[axis][of(axis, at)] }));
         let deep = Table { weights: deep, len: N };
-        let layers = Layers::<S, N> { across, deep, slot, alike, stacked: None };
+        let layers = Layers::<S, N> { across, deep, slot, alike, slant: None };
         let mut apart = Apart::default();
         let mut payloads = Vec::new();
         for (i, (around, aside, left)) in voxels.iter().enumerate() {

@@ -10,7 +10,7 @@ pub(super) mod avx2 {
     use crate::splat::records::apart::lines::{self, Lines};
     use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, Layers, Woven};
     use crate::splat::records::{
-        Across, BySlot, MOST, Record, Recorded as _, RowAt, STRIDE, Splat, Tables, stacked,
+        Across, BySlot, MOST, Record, Recorded as _, RowAt, STRIDE, Splat, Tables, slant,
     };
     use crate::splat::{Simd, Tap};
     use std::arch::x86_64::*;
@@ -264,8 +264,8 @@ pub(super) mod avx2 {
         woven: &mut Woven<Tap, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        if let Some(stacked) = layers.stacked {
-            return stacked::avx2::longs((records, (apart, payloads), layers, stacked));
+        if let Some(slant) = layers.slant {
+            return slant::avx2::longs((records, (apart, payloads), layers, slant));
         }
         // Columns are alike in records of eight sheets.
         let four = N == 4 && !layers.alike;
@@ -362,7 +362,7 @@ pub(super) mod avx512 {
     use crate::splat::records::apart::lines::{self, Lines};
     use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, Layers, Woven};
     use crate::splat::records::{
-        Across, BySlot, MOST, Record, Recorded, RowAt, STRIDE, Splat, Tables, stacked,
+        Across, BySlot, MOST, Record, Recorded, RowAt, STRIDE, Splat, Tables, slant,
     };
     use crate::splat::{Simd, Tap, by_column};
     use std::arch::x86_64::*;
@@ -549,10 +549,10 @@ pub(super) mod avx512 {
         woven: &mut Woven<Tap, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        if let Some(stacked) = layers.stacked {
-            return stacked::avx512::longs((records, (apart, payloads), layers, stacked));
+        if let Some(slant) = layers.slant {
+            return slant::avx512::longs((records, (apart, payloads), layers, slant));
         }
-        // Columns that are alike are stacked, but for windows that are too large for lanes.
+        // Columns that are alike are added above, but for windows that are too large for lanes.
         let wide = lines::widest(apart, kept, i32::step::<N>()).filter(|_| !layers.alike);
         let Some(wide) = wide else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);

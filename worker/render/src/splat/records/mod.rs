@@ -67,7 +67,7 @@ mod long;
 #[cfg(target_arch = "aarch64")]
 mod neon;
 mod short;
-pub(crate) mod stacked;
+pub(crate) mod slant;
 
 use self::apart::{Apart, Layers, Woven};
 use super::{Accumulate, Grey, Level, Section, Simd, Tap, section_fixed, whole};
@@ -250,8 +250,8 @@ pub(crate) trait Recorded: Accumulate {
     type Depth: Copy + Default;
     /// Extinction and colours of a voxel.
     type Payload: Copy + Default;
-    /// Whether [stacked](stacked) sections are added in lanes.
-    const STACKED: bool = false;
+    /// Whether sections that [lie aside of each other](slant) are added in lanes.
+    const SLANTED: bool = false;
     /// Windows begin at a column that is a multiple of it, and have as many: records of `N` sheets that may
     /// share a register.
     fn step<const N: usize>() -> i32 {
@@ -363,7 +363,7 @@ macro_rules! four_sums {
 /// 64 bits: extinction in the lowest 16.
 impl Recorded for i16 {
     four_sums!();
-    const STACKED: bool = true;
+    const SLANTED: bool = true;
     type Depth = i16;
     type Payload = u64;
 
@@ -476,7 +476,7 @@ impl Recorded for i16 {
 
 impl Recorded for i32 {
     four_sums!();
-    const STACKED: bool = true;
+    const SLANTED: bool = true;
     type Depth = f32;
     type Payload = [f32; 4];
 

@@ -7,7 +7,7 @@ pub(super) mod avx2 {
     use crate::splat::records::apart::lines::{self, Lines};
     use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, LINE, Layers, Woven};
     use crate::splat::records::{
-        Across, BySlot, MOST, Record, RowAt, STRIDE, Splat, Tables, stacked,
+        Across, BySlot, MOST, Record, RowAt, STRIDE, Splat, Tables, slant,
     };
     use std::arch::x86_64::*;
 
@@ -269,8 +269,8 @@ pub(super) mod avx2 {
         woven: &mut Woven<i16, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        if let Some(stacked) = layers.stacked {
-            return stacked::avx2::shorts((records, (apart, payloads), layers, stacked));
+        if let Some(slant) = layers.slant {
+            return slant::avx2::shorts((records, (apart, payloads), layers, slant));
         }
         // Columns are alike in records of eight sheets.
         let four = N == 4 && !layers.alike;
@@ -381,7 +381,7 @@ pub(super) mod avx512 {
     use crate::splat::records::apart::lines::{self, Lines};
     use crate::splat::records::apart::{self, Apart, ApartAt, BATCH, LINE, Layers, Woven};
     use crate::splat::records::{
-        Across, BySlot, Record, Recorded, RowAt, STRIDE, Splat, Tables, stacked,
+        Across, BySlot, Record, Recorded, RowAt, STRIDE, Splat, Tables, slant,
     };
     use std::arch::x86_64::*;
 
@@ -448,7 +448,7 @@ pub(super) mod avx512 {
     /// The 64 bytes from `at` may be written.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
-    unsafe fn add(at: *mut __m512i, row: __m512i, w: __m512i) {
+    pub(in super::super) unsafe fn add(at: *mut __m512i, row: __m512i, w: __m512i) {
         // SAFETY: see above.
         unsafe {
             let sums = _mm512_loadu_si512(at);
@@ -606,10 +606,10 @@ pub(super) mod avx512 {
         woven: &mut Woven<i16, N>,
     ) {
         let kept = &apart.kept[..payloads.len()];
-        if let Some(stacked) = layers.stacked {
-            return stacked::avx512::shorts((records, (apart, payloads), layers, stacked));
+        if let Some(slant) = layers.slant {
+            return slant::avx512::shorts((records, (apart, payloads), layers, slant));
         }
-        // Columns that are alike are stacked, but for windows that are too large for lanes.
+        // Columns that are alike are added above, but for windows that are too large for lanes.
         let wide = lines::widest(apart, kept, i16::step::<N>()).filter(|_| !layers.alike);
         let Some(wide) = wide else {
             return apart::splat_apart(simd, records, (apart, payloads), layers, woven);

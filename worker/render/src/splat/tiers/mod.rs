@@ -553,7 +553,7 @@ mod tests {
             deep: weights.deep,
             slot: 1 % N,
             alike: false,
-            stacked: None,
+            slant: None,
         };
         // Some rows of pixels, one after the other reached by tiers farther down, sheet by sheet.
         let mut by_row = [ByRow::default(), ByRow::default()];

@@ -243,12 +243,9 @@ impl Leaning {
             // In one row of the picture. What is rounded once for a section may be otherwise in another.
             let of_row =
                 x.iter().zip(y).map(|(&x, &y)| i64::from(x) + Lean::along_row(row, -i64::from(y)));
-            let rounded = i64::from(row != 0);
-            for (to, apart) in leaning
-                .apart
-                .iter_mut()
-                .zip([between(of_row) + rounded, between(y.iter().map(|&y| i64::from(y)))])
-            {
+            let across = between(of_row) + i64::from(row != 0);
+            let down = between(y.iter().map(|&y| i64::from(y)));
+            for (to, apart) in leaning.apart.iter_mut().zip([across, down]) {
                 // Two places that are hardly apart may lie on either side of where a footprint begins a pixel farther.
                 *to = (*to).max((apart >> SUBPIXEL_BITS) + 1);
             }

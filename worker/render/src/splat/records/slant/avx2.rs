@@ -12,40 +12,43 @@ use std::arch::x86_64::*;
 /// Rows or columns that are looked up at once.
 const BLOCK: usize = 4;
 
-macro_rules! present {
-    ($number:ty) => {{
-        let mut present = [0; 2 * MOST];
-        let mut i = 0;
-        while i < MOST {
-            present[i] = !(0 as $number);
-            i += 1;
-        }
-        present
-    }};
-}
+/// All bits of 32 bytes, and none of 32 more.
+static PRESENT: [u8; 64] = {
+    let mut present = [0; 64];
+    let mut i = 0;
+    while i < 32 {
+        present[i] = 0xff;
+        i += 1;
+    }
+    present
+};
 
-/// All bits of eight numbers, and none of eight more.
-static PRESENT: [i32; 2 * MOST] = present!(i32);
-static PRESENT_SHORTS: [i16; 2 * MOST] = present!(i16);
+/// All bits of the first of eight weights, as many as `deep` has: from where on a register holds them.
+#[inline(always)]
+fn present<W>(deep: &[W]) -> *const u8 {
+    const { assert!(size_of::<W>() * MOST <= 32) };
+    PRESENT[32 - size_of::<W>() * deep.len().min(MOST)..].as_ptr()
+}
 
 /// The weights of `deep`, eight at most, and zeros; `behind`: what lies in the table from the first of them on.
 #[target_feature(enable = "avx2")]
 #[inline]
 fn eight_deep(deep: &[i16], behind: &[i16]) -> __m128i {
-    let present = &PRESENT_SHORTS[MOST - deep.len().min(MOST)..];
-    // SAFETY: eight weights are 16 bytes.
-    let load = |eight: &[i16; MOST]| unsafe { _mm_loadu_si128(eight.as_ptr().cast()) };
-    match (behind.first_chunk(), present.first_chunk()) {
-        (Some(eight), Some(present)) => _mm_and_si128(load(eight), load(present)),
-        // At the end of the table.
-        _ => {
-            let mut eight = [0; MOST];
-            for (to, &w) in eight.iter_mut().zip(deep) {
-                *to = w;
-            }
-            load(&eight)
-        }
+    if let Some(eight) = behind.first_chunk::<MOST>() {
+        // SAFETY: eight weights are 16 bytes, and so many lie from what is present on.
+        let (eight, present) = unsafe {
+            let eight = _mm_loadu_si128(eight.as_ptr().cast());
+            (eight, _mm_loadu_si128(present(deep).cast()))
+        };
+        return _mm_and_si128(eight, present);
     }
+    // At the end of the table.
+    let mut eight = [0; MOST];
+    for (to, &w) in eight.iter_mut().zip(deep) {
+        *to = w;
+    }
+    // SAFETY: eight weights are 16 bytes.
+    unsafe { _mm_loadu_si128(eight.as_ptr().cast()) }
 }
 
 /// [`BLOCK`] weights of each slot from the `behind`th after its begin on: of four slots a register, two and two by turns.
@@ -101,7 +104,7 @@ fn taken(of: &[__m256i; PARTS], order: &[__m256i; PARTS]) -> [__m256i; PARTS] {
 /// Finds the windows of the first `n` voxels, which are skewed.
 #[target_feature(enable = "avx2")]
 pub(super) fn windows(slant: &Slant<'_>, apart: &mut Apart, n: usize) {
-    // SAFETY: these are the instructions, or more.
+    // SAFETY: these are the instructions.
     unsafe { voxel::windows(slant, apart, n) }
 }
 
@@ -132,9 +135,11 @@ fn short<const SKEWED: bool, const WIDE: usize, const N: usize>(
         let sections =
             times::<N>(&[_mm256_set1_epi64x(payload as i64); PARTS], &taken(&[z; PARTS], &turns));
         let (mut x, mut wx) = (0, [[_mm256_setzero_si256(); PARTS]; WIDE]);
-        // SAFETY: as above.
-        let mut rows = unsafe { lookup.rows(apart, i, y) };
-        if !SKEWED {
+        let mut rows = None;
+        if SKEWED {
+            // SAFETY: as above.
+            rows = Some(unsafe { lookup.rows(apart, i, y) });
+        } else {
             let (column, across) = lookup.columns::<WIDE>(apart, i);
             for (wx, &w) in wx.iter_mut().zip(across) {
                 *wx = [_mm256_set1_epi16(w); PARTS];
@@ -149,7 +154,7 @@ fn short<const SKEWED: bool, const WIDE: usize, const N: usize>(
             {
                 let of_row = times::<N>(&sections, &taken(&of_rows, &[from; PARTS]));
                 from = next(from);
-                if SKEWED {
+                if let Some(rows) = &mut rows {
                     // SAFETY: as above, and of all columns.
                     unsafe {
                         let (column, begins) = rows.next::<WIDE>();
@@ -190,10 +195,10 @@ fn long<const SKEWED: bool, const WIDE: usize, const N: usize>(
         let i = i as usize % BATCH;
         // SAFETY: as above.
         let Voxel { y, high, deep, begins } = unsafe { lookup.voxel(apart, i) };
-        let present = PRESENT[MOST - deep.len().min(MOST)..].as_ptr();
         // SAFETY: lanes that are not there are not read; four floats are 16 bytes, and eight numbers 32.
         let (z, payload) = unsafe {
-            let z = _mm256_maskload_ps(deep.as_ptr(), _mm256_loadu_si256(present.cast()));
+            let present = _mm256_loadu_si256(present(deep).cast());
+            let z = _mm256_maskload_ps(deep.as_ptr(), present);
             (z, _mm256_broadcast_ps(&_mm_loadu_ps(payload.as_ptr())))
         };
         let z = _mm256_permutevar8x32_ps(z, lookup.turn);
@@ -206,9 +211,11 @@ fn long<const SKEWED: bool, const WIDE: usize, const N: usize>(
             *section = _mm256_max_ps(_mm256_mul_ps(payload, wz), zero);
         }
         let (mut x, mut wx) = (0, [[zero; LONG_PARTS]; WIDE]);
-        // SAFETY: as above.
-        let mut rows = unsafe { lookup.rows(apart, i, y) };
-        if !SKEWED {
+        let mut rows = None;
+        if SKEWED {
+            // SAFETY: as above.
+            rows = Some(unsafe { lookup.rows(apart, i, y) });
+        } else {
             let (column, across) = lookup.columns::<WIDE>(apart, i);
             for (wx, w) in wx.iter_mut().zip(across) {
                 *wx = [_mm256_set1_ps(w.get()); LONG_PARTS];
@@ -227,7 +234,7 @@ fn long<const SKEWED: bool, const WIDE: usize, const N: usize>(
                     *of_row = _mm256_mul_ps(*of_row, _mm256_permutevar_ps(two, from));
                 }
                 from = next(from);
-                if SKEWED {
+                if let Some(rows) = &mut rows {
                     // SAFETY: as above, and of all columns.
                     unsafe {
                         let (column, begins) = rows.next::<WIDE>();

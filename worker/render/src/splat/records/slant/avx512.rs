@@ -1,9 +1,8 @@
 //! Sections that lie aside of each other in AVX-512's registers.
 
-use super::Slant;
-use super::voxel::{self, At, Begins, Lookup, Voxel};
+use super::voxel::{At, Begins, Lookup, Voxel};
 use crate::splat::Tap;
-use crate::splat::records::apart::{Apart, BATCH};
+use crate::splat::records::apart::BATCH;
 use crate::splat::records::short::avx512::{add, load, words};
 use crate::splat::records::{MOST, STRIDE};
 use std::arch::x86_64::*;
@@ -48,13 +47,6 @@ unsafe fn twos(weights: &[Tap], begins: &Begins, behind: usize) -> [__m512; 4] {
     }
 }
 
-/// Finds the windows of the first `n` voxels, which are skewed.
-#[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
-pub(super) fn windows(slant: &Slant<'_>, apart: &mut Apart, n: usize) {
-    // SAFETY: these are the instructions, or more.
-    unsafe { voxel::windows(slant, apart, n) }
-}
-
 #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
 pub(in super::super) fn shorts<const N: usize>(at: At<'_, i16, N>) {
     by_columns!(short[N], at);
@@ -80,9 +72,11 @@ fn short<const SKEWED: bool, const WIDE: usize, const N: usize>(
         let wz = _mm512_permutexvar_epi16(turn_deep, load(deep));
         let section = _mm512_mulhrs_epi16(section, wz);
         let (mut x, mut wx) = (0, [_mm512_setzero_si512(); WIDE]);
-        // SAFETY: as above.
-        let mut rows = unsafe { lookup.rows(apart, i, y) };
-        if !SKEWED {
+        let mut rows = None;
+        if SKEWED {
+            // SAFETY: as above.
+            rows = Some(unsafe { lookup.rows(apart, i, y) });
+        } else {
             let (column, across) = lookup.columns::<WIDE>(apart, i);
             // SAFETY: sixteen weights are 32 bytes.
             let line = unsafe { _mm256_loadu_si256(across.as_ptr().cast()) };
@@ -102,7 +96,7 @@ fn short<const SKEWED: bool, const WIDE: usize, const N: usize>(
                 let wy = _mm512_permutex2var_epi16(low, from, behind);
                 from = next(from);
                 let of_row = _mm512_mulhrs_epi16(section, wy);
-                if SKEWED {
+                if let Some(rows) = &mut rows {
                     // SAFETY: as above, and of all columns.
                     unsafe {
                         let (column, begins) = rows.next::<WIDE>();
@@ -165,9 +159,11 @@ fn long<const SKEWED: bool, const WIDE: usize, const N: usize>(
             *section = _mm512_max_ps(_mm512_mul_ps(payload, wz), zero);
         }
         let (mut x, mut wx) = (0, [[zero; 2]; WIDE]);
-        // SAFETY: as above.
-        let mut rows = unsafe { lookup.rows(apart, i, y) };
-        if !SKEWED {
+        let mut rows = None;
+        if SKEWED {
+            // SAFETY: as above.
+            rows = Some(unsafe { lookup.rows(apart, i, y) });
+        } else {
             let (column, across) = lookup.columns::<WIDE>(apart, i);
             // SAFETY: a tap is a float, and sixteen are 64 bytes.
             let line = unsafe { _mm512_loadu_ps(across.as_ptr().cast()) };
@@ -188,7 +184,7 @@ fn long<const SKEWED: bool, const WIDE: usize, const N: usize>(
                     *of_row = _mm512_mul_ps(*of_row, wy);
                 }
                 from = next(from);
-                if SKEWED {
+                if let Some(rows) = &mut rows {
                     // SAFETY: as above, and of all columns.
                     unsafe {
                         let (column, begins) = rows.next::<WIDE>();

@@ -80,8 +80,8 @@ def main_table(rows, results):
             each = [x for r in entry["rounds"] for x in later(r)]
             faster = {p: ratio(got[p], entry) for p in peers}
             goal, held = "", ""
-            for splat, peer, least in row.reach:
-                if name.startswith(f"slabcast {splat}") and peer in faster:
+            for peer, least in row.reach:
+                if name.startswith("slabcast") and peer in faster:
                     goal = f"{times(least)} of {peer}"
                     held = "yes" if faster[peer][0] >= least else "no"
             show = ["-" if p not in faster or p == name else

@@ -30,16 +30,27 @@ const LEAST: f64 = 500.0;
 /// fewer move that would have won something.
 const AWAY: f64 = 300.0;
 
+/// How long each worker that stays has to do, in microseconds.
+pub(super) struct Left {
+    each: Crowd<f64>,
+    mean: f64,
+}
+
 impl Frame {
     /// Before a worker is lent a tile of its own: cuts it, if the worker would be done too late with it. Who has
-    /// tiles to draw for that, the worker itself among them; nobody where the tile stays whole.
+    /// tiles to draw for that, the worker itself among them; nobody where the tile stays whole. `known` keeps what
+    /// each has left to do while no tile is cut and no time goes by: what is lent meanwhile changes nothing of it.
     pub(super) fn split_late(
         &mut self,
         cluster: &Cluster,
         (place, id): (u32, WorkerId),
         now: Micros,
+        known: &mut Option<Left>,
     ) -> Vec<WorkerId> {
-        let Some(parts) = self.late_parts(cluster, (place, id), now) else { return Vec::new() };
+        let Some(parts) = self.late_parts(cluster, (place, id), now, known) else {
+            return Vec::new();
+        };
+        *known = None;
         let Some(Slab { cut, queue, regions: Some(regions), .. }) = &mut self.slab else {
             return Vec::new();
         };
@@ -59,6 +70,7 @@ impl Frame {
         cluster: &Cluster,
         (place, id): (u32, WorkerId),
         now: Micros,
+        known: &mut Option<Left>,
     ) -> Option<Vec<(Part, WorkerId)>> {
         let slab = self.slab.as_ref()?;
         let regions = slab.regions.as_ref()?;
@@ -68,12 +80,15 @@ impl Frame {
         if task.was_lent() || task.begun.is_some() || regions.owned(id).iter().any(waits) {
             return None;
         }
-        let mut left = self.left(slab, &cluster.roster, now)?;
-        let mean = left.values().sum::<f64>() / left.len() as f64;
-        let mine = left.get_mut(id)?;
-        if *mine - mean <= LATE.0 * us + LATE.1 {
+        if known.is_none() {
+            *known = Some(self.left(slab, &cluster.roster, now)?);
+        }
+        let Left { each, mean } = known.as_ref()?;
+        if each.get(id)? - mean <= LATE.0 * us + LATE.1 {
             return None;
         }
+        let mut left = each.clone();
+        let mine = left.get_mut(id)?;
         let threads = |id| f64::from(cluster.roster.get(id).map_or(1, |w| w.threads));
         *mine -= us / threads(id);
         let mut parts = regions.parts(place, &task.tile.rect, &cluster.memory);
@@ -91,7 +106,7 @@ impl Frame {
     }
 
     /// How long each worker that stays has to do, in microseconds, by what its tiles took before.
-    fn left(&self, slab: &Slab, roster: &Roster, now: Micros) -> Option<Crowd<f64>> {
+    fn left(&self, slab: &Slab, roster: &Roster, now: Micros) -> Option<Left> {
         let regions = slab.regions.as_ref()?;
         let tasks = slab.queue.tasks.iter().zip(0..);
         let open = tasks.filter(|(t, _)| t.end == End::Open).map(|(_, place)| place);
@@ -109,6 +124,7 @@ impl Frame {
             }
             *left = left.max(0.0);
         }
-        Some(left)
+        let mean = left.values().sum::<f64>() / left.len() as f64;
+        Some(Left { each: left, mean })
     }
 }

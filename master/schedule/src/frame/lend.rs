@@ -131,7 +131,8 @@ impl Frame {
         }
         let set = self.job.scene.bricks;
         if let Some(regions) = &slab.regions {
-            // What a tile was drawn from goes with it.
+            // What a tile was drawn from goes with it. Parts of one were drawn from the same bricks, and stand one after the other.
+            let mut seen: (Vec<u32>, Vec<Option<Projected>>) = Default::default();
             for &(id, place) in leases.iter().chain(&self.gained) {
                 let tile = slab.cut.tiles[place as usize].rect;
                 let Some(bricks) = cluster.memory.moving(regions, (place, &tile), id) else {
@@ -142,13 +143,21 @@ impl Frame {
                 let (part, job) = (regions.is_told(place), &self.job);
                 let begun = slab.queue.tasks[place as usize].begun.as_ref();
                 let from = begun.and_then(|begun| begun.sheets.iter().flatten().min());
-                let over = |&i: &u32| {
-                    let seen = job.view.project(&job.bricks[i as usize].tight);
-                    let behind = |p: &Projected| from.is_none_or(|from| p.sheets.end > *from);
-                    seen.is_some_and(|p| !p.rect.intersect(&tile).is_empty() && behind(&p))
+                if !part {
+                    cluster.residency.owe(id, set, bricks.iter().copied());
+                    continue;
+                }
+                if seen.0 != bricks {
+                    let of = |&i: &u32| job.view.project(&job.bricks[i as usize].tight);
+                    seen = (bricks.to_vec(), bricks.iter().map(of).collect());
+                }
+                let over = |p: &Projected| {
+                    let behind = from.is_none_or(|from| p.sheets.end > *from);
+                    behind && !p.rect.intersect(&tile).is_empty()
                 };
-                let bricks = bricks.iter().copied().filter(|i| !part || over(i));
-                cluster.residency.owe(id, set, bricks);
+                let bricks =
+                    bricks.iter().zip(&seen.1).filter(|(_, p)| p.as_ref().is_some_and(over));
+                cluster.residency.owe(id, set, bricks.map(|(i, _)| *i));
             }
         }
         let gained = std::mem::take(&mut self.gained);
@@ -369,6 +378,7 @@ impl Frame {
             }
         };
         let is_long = regions.us_a_thread(all_threads) > LONG;
+        let mut left = None;
         // All threads have something before any has more.
         for first in [true, false] {
             let mut at = 0;
@@ -403,7 +413,7 @@ impl Frame {
                     };
                     let Some(place) = next else { break };
                     if self.alone && turn.last {
-                        let have = self.split_late(cluster, (place, id), now);
+                        let have = self.split_late(cluster, (place, id), now, &mut left);
                         let staying = cluster.roster.staying().filter(|(id, _)| have.contains(id));
                         let new = staying.filter(|(id, _)| takers.iter().all(|t| t.0 != *id));
                         let new: Vec<_> = new.map(|(id, w)| (id, u64::from(w.threads))).collect();
@@ -416,6 +426,10 @@ impl Frame {
                     us += regions.took(place).unwrap_or(f64::INFINITY);
                     self.give(cluster, place, id, now);
                     leases.push((id, place));
+                    if orphans {
+                        // It may have been another's.
+                        left = None;
+                    }
                 }
             }
         }

@@ -1,13 +1,16 @@
 //! How long tasks take, by those that came last: what outlives its estimate is run twice.
 
 use crate::Micros;
+use std::cell::Cell;
 use std::collections::VecDeque;
 
 /// How long tasks take, by the last ones of the frame.
 #[derive(Debug, Default)]
 pub(super) struct Pace {
-    /// Workload, render time, and time beside it, of each.
-    last: VecDeque<(u64, Micros, Micros)>,
+    /// Render time for a workload of 2^20, and time beside it, of each.
+    last: VecDeque<Measured>,
+    /// Their medians, once somebody has asked.
+    medians: Cell<Option<Measured>>,
 }
 
 impl Pace {
@@ -20,7 +23,10 @@ impl Pace {
     const FLOOR: Micros = 5_000;
 
     pub(super) fn note(&mut self, est: u64, render_us: Micros, lasted: Micros) {
-        self.last.push_back((est.max(1), render_us, lasted.saturating_sub(render_us)));
+        let render = (u128::from(render_us) << 20) / u128::from(est.max(1));
+        let beside = u128::from(lasted.saturating_sub(render_us));
+        self.last.push_back(Measured { render, beside });
+        self.medians.set(None);
         if self.last.len() > Self::LAST {
             self.last.pop_front();
         }
@@ -32,13 +38,16 @@ impl Pace {
         if self.last.len() < Self::LEAST {
             return None;
         }
-        let median = |of: &dyn Fn(&(u64, Micros, Micros)) -> u128| {
-            let mut all: Vec<u128> = self.last.iter().map(of).collect();
-            let mid = all.len() / 2;
-            *all.select_nth_unstable(mid).1
-        };
-        let render = median(&|t| (u128::from(t.1) << 20) / u128::from(t.0));
-        Some(Measured { render, beside: median(&|t| u128::from(t.2)) })
+        if self.medians.get().is_none() {
+            let median = |of: &dyn Fn(&Measured) -> u128| {
+                let mut all: Vec<u128> = self.last.iter().map(of).collect();
+                let mid = all.len() / 2;
+                *all.select_nth_unstable(mid).1
+            };
+            let (render, beside) = (median(&|m| m.render), median(&|m| m.beside));
+            self.medians.set(Some(Measured { render, beside }));
+        }
+        self.medians.get()
     }
 }
 

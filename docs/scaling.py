@@ -1,8 +1,9 @@
-"""Tables of docs/scaling.md: `python3 docs/scaling.py SLABCAST DATA [--frames N] [--large] [--rehearse LIST]`.
+"""Tables of docs/scaling.md: `python3 docs/scaling.py SLABCAST DATA [--frames N] [--large] [--rehearse LIST] [--hidden]`.
 
 For the three scenes of the paper's kind, or the two large ones, `slabcast plan` measures tiles once and
 predicts both schedules at 1 and 10 Gbit/s and without limit; with --rehearse, processes on this machine
-are compared with what is predicted for them. Prints Markdown. DATA is the folder with mri256.nrrd and the
+are compared with what is predicted for them. With --hidden, how much of what bricks take on a link of
+1 Gbit/s is hidden behind drawing once the first frame is there, instead. Prints Markdown. DATA is the folder with mri256.nrrd and the
 others.
 """
 
@@ -27,10 +28,10 @@ LINKS = [("1gbit", 0.94e9 / 8), ("10gbit", 9.4e9 / 8), ("unlimited", float("inf"
 WORKERS = [1, 2, 4, 8, 15, 16, 32, 64]
 
 
-def plan(args, scene, trace, more):
+def plan(args, scene, trace, more, workers=WORKERS):
     _, file, flags = scene
     command = [args.slabcast, "plan", os.path.join(args.data, file), *flags,
-               "--frames", str(args.frames), "--workers", ",".join(map(str, WORKERS)),
+               "--frames", str(args.frames), "--workers", ",".join(map(str, workers)),
                "--trace", trace, "-q", "--json", *more]
     out = subprocess.run(command, capture_output=True, text=True)
     if out.returncode != 0:
@@ -50,6 +51,24 @@ def cell(row, alone, rate, large):
     return f"{row['frame_ms']:.1f}{limit} / {through} {row['bound_by']}"
 
 
+def hidden(args, scene, trace):
+    """How long a thread waits for bricks, against what a frame's take on the link."""
+    got = plan(args, scene, trace, ["--link", "1gbit", "--schedule", "region"], [*range(1, 11), 15])
+    rate = LINKS[0][1]
+    print("| workers | " + " | ".join(str(r["workers"]) for r in got["predicted"]) + " |")
+    print("|---|" + "--:|" * len(got["predicted"]))
+    rows = {"waits, % of a thread's time": [], "bricks of a frame, ms of the link": [], "hidden, %": []}
+    for r in got["predicted"]:
+        waits = r["render_threads"]["bricks"]
+        link = 1e3 * r["brick_bytes"] / rate
+        part = 1 - 1e3 * waits / r["frames_per_s"] / link
+        for to, value in zip(rows.values(), [f"{100 * waits:.1f}", f"{link:.2f}", f"{100 * part:.0f}"]):
+            to.append(value)
+    for name, cells in rows.items():
+        print(f"| {name} | " + " | ".join(cells) + " |")
+    print(flush=True)
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("slabcast")
@@ -57,6 +76,7 @@ def main():
     parser.add_argument("--frames", type=int, default=18)
     parser.add_argument("--large", action="store_true")
     parser.add_argument("--rehearse")
+    parser.add_argument("--hidden", action="store_true")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         for scene in LARGE if args.large else SCENES:
@@ -64,6 +84,9 @@ def main():
             if os.path.exists(trace):
                 os.remove(trace)
             print(f"**{scene[0]}** `{' '.join(scene[2])}`", flush=True)
+            if args.hidden:
+                hidden(args, scene, trace)
+                continue
             for i, (link, rate) in enumerate(LINKS):
                 got = plan(args, scene, trace, ["--link", link])
                 alone = got["measured"]["alone_ms"]

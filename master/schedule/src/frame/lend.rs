@@ -46,8 +46,11 @@ const SOLE: u64 = 4;
 /// a view turns all that it is lent of a frame may lack some bricks. Of two, three and four workers of mri256 at 512x512 and 1 Gbit/s
 /// with four frames in flight threads wait for bricks for 10.4, 1.6 and 3.0 % of their time without, for 4.6, 0.9 and 2.8 with this, and have
 /// 95, 158 and 227 frames a second and 98, 176 and 243 (`plan`; two of mouse_skull 154 and 162, of aneurism 151 and 159). Four times as
-/// much wins two workers two frames more, and eight workers nothing.
-const FEW: (u64, usize) = (2, 4);
+/// much has two workers draw two frames more; twice as much for 8 or 15 changes nothing beyond noise.
+const FEW: u64 = 2;
+
+/// So many are few.
+const MOST_FEW: usize = 4;
 
 /// While a worker has so much of that left, and a lease beyond those that its threads draw, it is lent no more: each
 /// lending wakes it, which takes as long as a tenth of a small tile, and three tiles in one message are as
@@ -69,15 +72,14 @@ pub(crate) struct Ahead {
 
 impl Ahead {
     pub(crate) fn of(roster: &crate::Roster) -> Ahead {
-        let workers = roster.staying().take(FEW.1 + 1).count();
-        let sole = workers <= 1;
+        let workers = roster.staying().take(MOST_FEW + 1).count();
         let times = match workers {
-            _ if sole => SOLE,
-            n if n <= FEW.1 => FEW.0,
+            0 | 1 => SOLE,
+            2..=MOST_FEW => FEW,
             _ => 1,
         };
         let us = times as f64 * HORIZON;
-        let alone_us = if sole { us } else { HORIZON_ALONE };
+        let alone_us = if workers <= 1 { us } else { HORIZON_ALONE };
         Ahead { us, alone_us, leases: times * MOST_AHEAD }
     }
 

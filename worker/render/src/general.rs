@@ -19,7 +19,7 @@ use slabcast_common::view::Projection;
 
 /// A voxel waiting in the bucket of its first sheet.
 #[derive(Clone, Copy)]
-struct Waiting {
+pub(crate) struct Waiting {
     /// Which of the part's bricks.
     brick: u32,
     /// Which voxel of it.
@@ -69,10 +69,42 @@ impl<S: Accumulate> Default for Kind<S> {
 }
 
 /// Voxels that wait.
-#[derive(Default)]
-pub(crate) struct Queues {
-    buckets: Vec<Vec<Waiting>>,
-    carried: Vec<Waiting>,
+pub(crate) struct Queues<V = Waiting> {
+    buckets: Vec<Vec<V>>,
+    /// Buckets behind this hold nothing: a part that stops often doesn't look at those of all sheets each time.
+    filled: usize,
+    carried: Vec<V>,
+}
+
+impl<V> Default for Queues<V> {
+    fn default() -> Self {
+        Queues { buckets: Vec::new(), filled: 0, carried: Vec::new() }
+    }
+}
+
+impl<V> Queues<V> {
+    /// Empties what an earlier part left, and makes room for one of `sheets`.
+    #[inline(always)]
+    fn begin(&mut self, sheets: usize) {
+        if self.buckets.len() < sheets {
+            self.buckets.resize_with(sheets, Vec::new);
+        }
+        let filled = std::mem::take(&mut self.filled);
+        self.buckets[..filled].iter_mut().for_each(Vec::clear);
+        self.carried.clear();
+    }
+
+    /// Puts a voxel before the sheet where it begins, counted from the slab's first.
+    #[inline(always)]
+    fn put(&mut self, sheet: usize, voxel: V) {
+        self.buckets[sheet].push(voxel);
+        self.filled = self.filled.max(sheet + 1);
+    }
+
+    /// Voxels whose sheets were not come to.
+    fn waiting(&self) -> u64 {
+        self.buckets[..self.filled].iter().map(|b| b.len() as u64).sum()
+    }
 }
 
 /// A part with what it works on: compiled for each instruction set as a whole.
@@ -120,14 +152,7 @@ impl General<'_> {
                 kind.planes.put(slab.first - 1, y * PART as usize + x, last[tile]);
             });
         }
-        let sheets = slab.len() as usize;
-        if queues.buckets.len() < sheets {
-            queues.buckets.resize_with(sheets, Vec::new);
-        }
-        for bucket in &mut queues.buckets {
-            bucket.clear();
-        }
-        queues.carried.clear();
+        queues.begin(slab.len() as usize);
 
         let float_sums = frame.scene.float_sums();
         let mut next = 0;
@@ -179,7 +204,7 @@ impl General<'_> {
         let stopped = end < slab.end;
         if !stopped {
             counters.culled += part.voxels_from(next);
-            counters.culled += queues.buckets.iter().map(|b| b.len() as u64).sum::<u64>();
+            counters.culled += queues.waiting();
         }
         self.part.end(pixels, out);
         if let Some(last) = keep_last(part, stopped, out) {
@@ -254,7 +279,7 @@ impl General<'_> {
             if first < slab.first {
                 queues.carried.push(waiting);
             } else {
-                queues.buckets[(first - slab.first) as usize].push(waiting);
+                queues.put((first - slab.first) as usize, waiting);
             }
         }
     }
@@ -420,5 +445,27 @@ impl General<'_> {
             }
         }
         any_shut
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Queues;
+
+    #[test]
+    fn what_a_part_left_is_gone_and_only_sheets_that_it_filled_are_looked_at() {
+        let mut queues = Queues::default();
+        queues.begin(1 << 20);
+        queues.put(700, 'a');
+        queues.put(3, 'b');
+        assert_eq!((queues.waiting(), queues.filled), (2, 701));
+        // It stopped there; the same worker draws a part of fewer sheets, then of more.
+        for sheets in [10, 1000] {
+            queues.begin(sheets);
+            assert_eq!((queues.waiting(), queues.filled), (0, 0));
+            queues.put(sheets - 1, 'c');
+        }
+        queues.begin(1 << 20);
+        assert!(queues.buckets.iter().all(Vec::is_empty), "nothing is left over");
     }
 }

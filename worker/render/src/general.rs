@@ -190,7 +190,8 @@ impl General<'_> {
             bucket.clear();
             queues.buckets[(k - slab.first) as usize] = bucket;
             if let Some(storeys) = &frame.storeys {
-                for k in [k, k + 1] {
+                // What the sheet behind has so far, if the colour rule peeks there.
+                for k in k..=k + i32::from(frame.looks_at_neighbours()) {
                     self.fold(k, storeys, kind, &open);
                 }
                 kind.lofts.clear(k);
@@ -393,10 +394,11 @@ impl General<'_> {
             }
             let some = &reaching.some[..reaching.n];
             let mut columns = lofts.touched(k, some) & open.row(y);
+            // Blocks of columns beside each other: in those to which nothing was added there is nothing.
             while columns != 0 {
-                let x = columns.trailing_zeros() as usize;
-                columns &= columns - 1;
-                planes.set(k, [x, y], lofts.down(k, x, some));
+                let x = columns.trailing_zeros() as usize / BLOCK * BLOCK;
+                columns &= !(0xff << x);
+                planes.set(k, [x, y], &lofts.down(k, x, some));
             }
         }
     }

@@ -117,17 +117,30 @@ impl<S: Accumulate> Lofts<S> {
         storeys.iter().filter_map(row).fold(0, |all, touched| all | touched)
     }
 
-    /// What these storeys, each with its weight, add up to in column `x` of sheet `k`.
+    /// What these storeys, each with its weight, add up to in the [`BLOCK`] columns of sheet `k` from `x` on.
     #[inline(always)]
-    pub(crate) fn down(&self, k: i32, x: usize, storeys: &[(i32, S::Weight)]) -> [S; 4] {
+    pub(crate) fn down(&self, k: i32, x: usize, storeys: &[(i32, S::Weight)]) -> [[S; 4]; BLOCK] {
         let loft = &self.sheets[self.slot(k)];
-        let row = |c: usize| {
-            storeys.iter().filter_map(move |&(storey, wy)| {
-                let row = (storey - loft.base) as usize;
-                loft.rows.get(row * PART + x).map(|sums| (sums[c], wy))
-            })
-        };
-        [0, 1, 2, 3].map(|c| S::down(row(c)))
+        let mut ways = [[S::Way::default(); 4]; BLOCK];
+        for &(storey, wy) in storeys {
+            let row = (storey - loft.base) as usize;
+            let Some(row) = loft.rows.get(row * PART + x..).and_then(<[_]>::first_chunk) else {
+                continue;
+            };
+            let row: &[[S; 4]; BLOCK] = row;
+            for i in 0..BLOCK {
+                for c in 0..4 {
+                    ways[i][c] = S::on(ways[i][c], row[i][c], wy);
+                }
+            }
+        }
+        let mut sums = [[S::default(); 4]; BLOCK];
+        for i in 0..BLOCK {
+            for c in 0..4 {
+                sums[i][c] = S::end(ways[i][c]);
+            }
+        }
+        sums
     }
 
     /// Empties sheet `k`.
@@ -203,11 +216,11 @@ impl<S: Accumulate> Planes<S> {
         }
     }
 
-    /// Puts sums of sheet `k` that came from rows of storeys.
+    /// Puts sums of sheet `k` that came from rows of storeys, from a block's first column on.
     #[inline(always)]
-    pub(crate) fn set(&mut self, k: i32, [x, y]: [usize; 2], sums: [S; 4]) {
+    pub(crate) fn set(&mut self, k: i32, [x, y]: [usize; 2], sums: &[[S; 4]; BLOCK]) {
         let slot = self.touched.slot(k);
-        self.sheets[slot][y * PART + x] = sums;
+        self.sheets[slot][y * PART + x..][..BLOCK].copy_from_slice(sums);
         self.touched.masks[slot] |= 1 << (y / BLOCK * 8 + x / BLOCK);
     }
 

@@ -136,6 +136,8 @@ pub trait Accumulate: Sum {
     type Weight: Weight;
     /// One channel of a section or a row.
     type Section: Copy;
+    /// What [rows of storeys](Accumulate::down) add up to on the way; the default is nothing.
+    type Way: Copy + Default;
 
     /// First sheet of a voxel at depth `z` (in phases), and its section in the `i`th from there.
     fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Self::Section; 4];
@@ -144,8 +146,15 @@ pub trait Accumulate: Sum {
     /// `self + row * wx`.
     #[must_use]
     fn plus(self, row: Self::Section, wx: Self::Weight) -> Self;
+    /// `way + row * wy`.
+    fn on(way: Self::Way, row: Self, wy: Self::Weight) -> Self::Way;
+    /// What it is in the end.
+    fn end(way: Self::Way) -> Self;
     /// What a pixel has of rows of storeys, each times its weight [for rows](Weight::of_rows), in their order.
-    fn down(rows: impl Iterator<Item = (Self, Self::Weight)>) -> Self;
+    #[inline(always)]
+    fn down(rows: impl Iterator<Item = (Self, Self::Weight)>) -> Self {
+        Self::end(rows.fold(Self::Way::default(), |way, (row, wy)| Self::on(way, row, wy)))
+    }
 }
 
 /// One channel of a section of 32-bit sums, not negative and not NaN, or that times weights.
@@ -183,6 +192,7 @@ fn nearest(x: f32) -> i32 {
 impl Accumulate for i32 {
     type Weight = Tap;
     type Section = Section;
+    type Way = f32;
 
     #[inline(always)]
     fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Section; 4] {
@@ -202,10 +212,15 @@ impl Accumulate for i32 {
         self.wrapping_add(nearest(row.0 * wx.0))
     }
 
+    /// Floats, since they have one order: four or five of them are off by less than any row is rounded.
     #[inline(always)]
-    fn down(rows: impl Iterator<Item = (i32, Tap)>) -> i32 {
-        // Floats, since they have one order: four or five of them are off by less than any row is rounded.
-        nearest(rows.fold(0.0, |sum, (row, wy)| sum + row as f32 * wy.0))
+    fn on(way: f32, row: i32, wy: Tap) -> f32 {
+        way + row as f32 * wy.0
+    }
+
+    #[inline(always)]
+    fn end(way: f32) -> i32 {
+        nearest(way)
     }
 }
 
@@ -233,6 +248,7 @@ impl Sum for Grey {
 impl Accumulate for Grey {
     type Weight = Tap;
     type Section = Section;
+    type Way = f32;
 
     #[inline(always)]
     fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Section; 4] {
@@ -250,8 +266,13 @@ impl Accumulate for Grey {
     }
 
     #[inline(always)]
-    fn down(rows: impl Iterator<Item = (Grey, Tap)>) -> Grey {
-        Grey(i32::down(rows.map(|(row, wy)| (row.0, wy))))
+    fn on(way: f32, row: Grey, wy: Tap) -> f32 {
+        i32::on(way, row.0, wy)
+    }
+
+    #[inline(always)]
+    fn end(way: f32) -> Grey {
+        Grey(i32::end(way))
     }
 }
 
@@ -259,6 +280,7 @@ impl Accumulate for Grey {
 impl Accumulate for f32 {
     type Weight = Tap;
     type Section = f32;
+    type Way = f32;
 
     #[inline(always)]
     fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [f32; 4] {
@@ -277,8 +299,13 @@ impl Accumulate for f32 {
     }
 
     #[inline(always)]
-    fn down(rows: impl Iterator<Item = (f32, Tap)>) -> f32 {
-        rows.fold(0.0, |sum, (row, wy)| sum + row * wy.0)
+    fn on(way: f32, row: f32, wy: Tap) -> f32 {
+        way + row * wy.0
+    }
+
+    #[inline(always)]
+    fn end(way: f32) -> f32 {
+        way
     }
 }
 
@@ -293,6 +320,7 @@ fn times(a: i16, b: i16) -> i16 {
 impl Accumulate for i16 {
     type Weight = i16;
     type Section = i16;
+    type Way = i16;
 
     #[inline(always)]
     fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [i16; 4] {
@@ -311,8 +339,13 @@ impl Accumulate for i16 {
     }
 
     #[inline(always)]
-    fn down(rows: impl Iterator<Item = (i16, i16)>) -> i16 {
-        rows.fold(0, |sum: i16, (row, wy)| sum.saturating_add(times(row, wy)))
+    fn on(way: i16, row: i16, wy: i16) -> i16 {
+        way.saturating_add(times(row, wy))
+    }
+
+    #[inline(always)]
+    fn end(way: i16) -> i16 {
+        way
     }
 }
 

@@ -8,6 +8,7 @@ use crate::fail::{Fail, say};
 use crate::progress::{self, Progress};
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::volume::Digest32;
+use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -121,6 +122,18 @@ struct Verdict {
     wrong: Vec<(Setting, String)>,
 }
 
+impl Verdict {
+    fn new(want: Digest32) -> Verdict {
+        Verdict { want, pictures: 0, wrong: Vec::new() }
+    }
+
+    /// Takes what others found of the same view.
+    fn take(&mut self, more: Verdict) {
+        self.pictures += more.pictures;
+        self.wrong.extend(more.wrong);
+    }
+}
+
 /// Runs the command.
 pub(crate) fn run(args: &MatrixArgs) -> Result<(), Fail> {
     let sample = Path::new(SAMPLE);
@@ -132,37 +145,45 @@ pub(crate) fn run(args: &MatrixArgs) -> Result<(), Fail> {
     let settings = Setting::all(args.pairwise);
     let began = Instant::now();
     let runtime = crate::runtime::start()?;
-    let mut progress = Progress::new(false).of("setting");
+    let progress = RefCell::new(Progress::new(false).of("setting"));
+    let done = Cell::new(0);
+    let step = || {
+        done.set(done.get() + 1);
+        progress.borrow_mut().step(progress::Step { frames: done.get(), ..Default::default() });
+    };
     let total = (cases.len() * settings.len()) as u64;
-    progress.frames(
+    progress.borrow_mut().frames(
         total,
         &format!("{} volumes under {} settings, two views each", cases.len(), settings.len()),
     );
-    let mut done = 0;
     let mut wrong = 0;
     let mut pictures = 0;
     for case in &cases {
         let case_began = Instant::now();
         let truth = case.truth()?;
-        let mut verdicts: Vec<Verdict> =
-            truth.iter().map(|&want| Verdict { want, pictures: 0, wrong: Vec::new() }).collect();
         let mut groups: BTreeMap<(Link, u32, u32), Vec<Setting>> = BTreeMap::new();
         for s in &settings {
             groups.entry((s.link, s.workers, s.threads)).or_default().push(*s);
         }
-        for group in groups.values() {
-            runtime.block_on(check(case, group, &mut verdicts, || {
-                done += 1;
-                progress.step(progress::Step { frames: done, ..Default::default() });
-            }))?;
-        }
+        // Two clusters at a time: one alone leaves a processor free while its messages are on their way.
+        let queue = RefCell::new(groups.values());
+        let lane = || async {
+            let mut verdicts: Vec<Verdict> = truth.iter().map(|&want| Verdict::new(want)).collect();
+            loop {
+                let next = queue.borrow_mut().next();
+                let Some(group) = next else { return Ok::<_, Fail>(verdicts) };
+                check(case, group, &mut verdicts, step).await?;
+            }
+        };
+        let (mut verdicts, other) = runtime.block_on(async { tokio::try_join!(lane(), lane()) })?;
+        verdicts.iter_mut().zip(other).for_each(|(all, more)| all.take(more));
         for (i, v) in verdicts.iter().enumerate() {
             let outcome = match v.wrong.len() {
                 0 => "exact".to_string(),
                 n => format!("{n} DIFFER"),
             };
             let time = if i == 0 { progress::time(case_began.elapsed()) } else { String::new() };
-            progress.aside(|| {
+            progress.borrow().aside(|| {
                 say(&format!(
                     "{:<32} {}  {:>4} pictures  {outcome:<10} {time}\n",
                     case.view_name(i),
@@ -177,7 +198,7 @@ pub(crate) fn run(args: &MatrixArgs) -> Result<(), Fail> {
             pictures += v.pictures;
         }
     }
-    progress.end();
+    progress.borrow().end();
     runtime.shutdown_timeout(Duration::from_secs(1));
     let views = cases.len() * cases::VIEWS.len();
     let time = progress::time(began.elapsed());
@@ -199,7 +220,7 @@ async fn check(
     case: &Case,
     settings: &[Setting],
     verdicts: &mut [Verdict],
-    mut done: impl FnMut(),
+    done: impl Fn(),
 ) -> Result<(), Fail> {
     let Some(first) = settings.first() else { return Ok(()) };
     let mut cluster = Either::start(&case.volume, first.link, first.crew()).await?;

@@ -196,7 +196,7 @@ fn chaos_alone(seed: u64) -> World {
 
 #[test]
 fn pictures_of_frames_alone_are_the_serial_ones_however_their_tiles_are_cut() {
-    let range = seeds(300);
+    let range = seeds(150);
     let one = range.end - range.start == 1;
     let (mut frames, mut cut, mut mixed, mut lost, mut dropped, mut retries) = (0, 0, 0, 0, 0, 0);
     let mut pieces = 0;

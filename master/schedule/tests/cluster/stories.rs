@@ -505,7 +505,7 @@ fn a_piece_outlives_who_gave_it_away_and_who_was_lent_it() {
     // Whoever is lost at whatever time: the picture is whole, and nobody is sent a piece that is not as he was told.
     let (mut lost_pieces, mut n) = (0, 0);
     for victim in 1..=3 {
-        for after in (500..60_000).step_by(7_300) {
+        for after in (500..60_000).step_by(12_100) {
             let mut w = world();
             for _ in 0..3 {
                 w.join(Nature { us_per_pixel_sheet: 0.1, ..Nature::default() });

@@ -18,8 +18,8 @@ use slabcast_common::occlusion::Rect;
 use slabcast_common::view::Projection;
 
 /// A voxel waiting in the bucket of its first sheet.
-#[derive(Clone, Copy)]
-pub(crate) struct Waiting {
+#[derive(Clone, Copy, Default)]
+struct Waiting {
     /// Which of the part's bricks.
     brick: u32,
     /// Which voxel of it.
@@ -69,20 +69,15 @@ impl<S: Accumulate> Default for Kind<S> {
 }
 
 /// Voxels that wait.
-pub(crate) struct Queues<V = Waiting> {
-    buckets: Vec<Vec<V>>,
+#[derive(Default)]
+pub(crate) struct Queues {
+    buckets: Vec<Vec<Waiting>>,
     /// Buckets behind this hold nothing: a part that stops often doesn't look at those of all sheets each time.
     filled: usize,
-    carried: Vec<V>,
+    carried: Vec<Waiting>,
 }
 
-impl<V> Default for Queues<V> {
-    fn default() -> Self {
-        Queues { buckets: Vec::new(), filled: 0, carried: Vec::new() }
-    }
-}
-
-impl<V> Queues<V> {
+impl Queues {
     /// Empties what an earlier part left, and makes room for one of `sheets`.
     #[inline(always)]
     fn begin(&mut self, sheets: usize) {
@@ -96,7 +91,7 @@ impl<V> Queues<V> {
 
     /// Puts a voxel before the sheet where it begins, counted from the slab's first.
     #[inline(always)]
-    fn put(&mut self, sheet: usize, voxel: V) {
+    fn put(&mut self, sheet: usize, voxel: Waiting) {
         self.buckets[sheet].push(voxel);
         self.filled = self.filled.max(sheet + 1);
     }
@@ -452,20 +447,20 @@ impl General<'_> {
 
 #[cfg(test)]
 mod tests {
-    use super::Queues;
+    use super::{Queues, Waiting};
 
     #[test]
     fn what_a_part_left_is_gone_and_only_sheets_that_it_filled_are_looked_at() {
         let mut queues = Queues::default();
         queues.begin(1 << 20);
-        queues.put(700, 'a');
-        queues.put(3, 'b');
+        queues.put(700, Waiting::default());
+        queues.put(3, Waiting::default());
         assert_eq!((queues.waiting(), queues.filled), (2, 701));
         // It stopped there; the same worker draws a part of fewer sheets, then of more.
         for sheets in [10, 1000] {
             queues.begin(sheets);
             assert_eq!((queues.waiting(), queues.filled), (0, 0));
-            queues.put(sheets - 1, 'c');
+            queues.put(sheets - 1, Waiting::default());
         }
         queues.begin(1 << 20);
         assert!(queues.buckets.iter().all(Vec::is_empty), "nothing is left over");

@@ -125,7 +125,7 @@ pub struct Corner {
 }
 
 /// A voxel, seen by the eye.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub struct Placed {
     /// Eye coordinates in vox.
     pub eye: DVec3,

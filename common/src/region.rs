@@ -11,6 +11,12 @@ use crate::occlusion::Rect;
 /// Edge of the parts that tiles are drawn in.
 pub const PART: i32 = 64;
 
+/// Sheets beyond the one at which a region lacks a brick that it looks for more. With as many as a brick is thick, 8, a head's
+/// regions are sent bricks that what lies in front of them then hides: of mri256 26.8 % were held after 18 views, with 5 25.4,
+/// with 4 25.1. In exchange they ask 322 times for the first view instead of 228, with 4 372 times, while others of their
+/// worker's are drawn. In later views they expect most of what they need beforehand (docs/scaling.md).
+pub const AHEAD: u32 = 4;
+
 /// A tile's parts: no part of it lies in two of the picture's.
 pub fn parts(tile: Rect) -> impl Iterator<Item = Rect> {
     let cut = |from: i32, to: i32| {
@@ -20,6 +26,13 @@ pub fn parts(tile: Rect) -> impl Iterator<Item = Rect> {
     cut(tile.y0, tile.y1).flat_map(move |(y0, y1)| {
         cut(tile.x0, tile.x1).map(move |(x0, x1)| Rect::new(x0, y0, x1, y1))
     })
+}
+
+/// The square of a picture of that size that a part of a tile lies in.
+pub fn square_of(part: &Rect, size: [u32; 2]) -> Rect {
+    let at = |x: i32| x.div_euclid(PART) * PART;
+    let (x0, y0) = (at(part.x0), at(part.y0));
+    Rect::new(x0, y0, x0 + PART, y0 + PART).intersect(&Rect::of_size(size))
 }
 
 /// Cuts a tile in two, so that about `share` of what is left to do lies in the second piece. `left` says how much that is

@@ -21,9 +21,13 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
 
+mod course;
+
+pub use course::{Course, Has, Sees};
+
 /// Version of the format. Since 2 regions' results weigh what finished pixels do, since 3 their times have
-/// no look at bricks in them.
-pub const VERSION: u32 = 3;
+/// no look at bricks in them, since 4 they say when they come to each brick.
+pub const VERSION: u32 = 4;
 
 /// Largest trace that is read, in bytes: 1000 frames with tiles of 16 pixels.
 pub const MAX_BYTES: u64 = 1 << 30;
@@ -126,9 +130,9 @@ pub struct RegionLevel {
 }
 
 /// A tile as it is written: places as differences to the one before.
-type Written = (u32, u32, u64, u32, Vec<u32>, Vec<u32>);
+type Written = (u32, u32, u64, u32, Vec<u32>, Vec<u32>, Vec<u16>, Vec<u32>);
 
-/// One tile through all depths: `[x, y, ns, result bytes, touched, opened]`.
+/// One tile through all depths: `[x, y, ns, result bytes, touched, opened, needed, expected]`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "Written", into = "Written")]
 pub struct RegionTile {
@@ -144,28 +148,36 @@ pub struct RegionTile {
     pub touched: Vec<u32>,
     /// Numbers of the blocks whose bricks it looks at, front to back in its frame; ascending.
     pub opened: Vec<u32>,
+    /// Of a tile of one part: when drawing comes to each of its bricks, in thousandths of its time. Of others their
+    /// parts say it, which are tiles themselves; where nobody does, all are needed at once.
+    pub needed: Vec<u16>,
+    /// Places of the bricks that who drew the frame before would ask for beforehand (`render::depths`), if he had none;
+    /// ascending.
+    pub expected: Vec<u32>,
 }
 
 impl From<Written> for RegionTile {
-    fn from((x, y, ns, result_bytes, mut touched, mut opened): Written) -> Self {
-        for places in [&mut touched, &mut opened] {
+    fn from(written: Written) -> Self {
+        let (x, y, ns, result_bytes, mut touched, mut opened, needed, mut expected) = written;
+        for places in [&mut touched, &mut opened, &mut expected] {
             for i in 1..places.len() {
                 places[i] = places[i].saturating_add(places[i - 1]);
             }
         }
-        RegionTile { x, y, ns, result_bytes, touched, opened }
+        RegionTile { x, y, ns, result_bytes, touched, opened, needed, expected }
     }
 }
 
 impl From<RegionTile> for Written {
     fn from(t: RegionTile) -> Self {
-        let RegionTile { x, y, ns, result_bytes, mut touched, mut opened } = t;
-        for places in [&mut touched, &mut opened] {
+        let RegionTile { x, y, ns, result_bytes, .. } = t;
+        let RegionTile { mut touched, mut opened, needed, mut expected, .. } = t;
+        for places in [&mut touched, &mut opened, &mut expected] {
             for i in (1..places.len()).rev() {
                 places[i] -= places[i - 1];
             }
         }
-        (x, y, ns, result_bytes, touched, opened)
+        (x, y, ns, result_bytes, touched, opened, needed, expected)
     }
 }
 
@@ -245,6 +257,10 @@ impl Trace {
             }
             if frame.regions.iter().any(|l| !l.tiles.is_sorted_by_key(|t| (t.y, t.x))) {
                 return no(format!("frames[{i}].regions: tiles are not by row and column"));
+            }
+            let tiles = || frame.regions.iter().flat_map(|l| &l.tiles);
+            if tiles().any(|t| !t.needed.is_empty() && t.needed.len() != t.touched.len()) {
+                return no(format!("frames[{i}].regions: not every brick says when it is needed"));
             }
             for (s, slab) in frame.slabs.iter().enumerate() {
                 if slab.shut.iter().map(|r| u64::from(*r)).sum::<u64>() > pixels {
@@ -498,6 +514,8 @@ mod tests {
                             result_bytes: 900,
                             touched: vec![3, 4, 70],
                             opened: vec![0, 9],
+                            needed: vec![0, 250, 40],
+                            expected: vec![2, 3, 71],
                         },
                         RegionTile { x: 64, ns: 7, result_bytes: 40, ..RegionTile::default() },
                     ],
@@ -543,11 +561,12 @@ mod tests {
         let says = |text: &str| Trace::from_json(text.as_bytes()).unwrap_err().to_string();
         let good = trace().to_json();
         assert!(says("{}").contains("slabcast plan --trace"));
-        assert!(says(&good.replacen("\"version\":3", "\"version\":4", 1)).contains("version 4"));
+        assert!(says(&good.replacen("\"version\":4", "\"version\":5", 1)).contains("version 5"));
         assert!(says(&good.replace("[100,70]", "[100,0]")).starts_with("about.size"));
         assert!(says(&good.replace("[100,70]", "[10,7]")).contains("more pixels"));
         assert!(says(&good.replace("\"edge\":64", "\"edge\":65")).contains("65 is no edge"));
         assert!(says(&good.replace("[64,0,700", "[64,99,700")).contains("by row and column"));
+        assert!(says(&good.replace("[0,250,40]", "[0,250]")).contains("when it is needed"));
         let pixels = format!("\"pixels_version\":{}", crate::PIXELS_VERSION);
         assert!(says(&good.replace(&pixels, "\"pixels_version\":0")).contains("measure it again"));
     }

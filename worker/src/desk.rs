@@ -383,6 +383,12 @@ impl Desk<'_> {
             Outcome::Slab(done) => self.rendered(done),
             Outcome::Region(gone) => self.went(gone),
             Outcome::Handed(piece) => self.replies.push(ToMaster::HandedOver(piece)),
+            Outcome::Expected(set, shelf, places) => {
+                let bricks = self.parking.expect(set, &shelf, &places, self.cache);
+                if !bricks.is_empty() {
+                    self.replies.push(ToMaster::BricksWanted { set, bricks });
+                }
+            }
         }
     }
 
@@ -593,6 +599,8 @@ mod tests {
         replies: mpsc::Receiver<ToMaster>,
         stop: watch::Sender<bool>,
         ended: tokio::task::JoinHandle<std::io::Result<Ended>>,
+        /// What it was told of.
+        known: Option<(SceneSpec, View)>,
     }
 
     /// Two full bricks beside each other.
@@ -620,7 +628,7 @@ mod tests {
                 let link = Link { control: control_rx, replies: replies_tx, bricks: bricks_rx };
                 run(&config, link, &mut BrickCache::default(), stopped).await
             });
-            let mut world = World { control, bricks, replies, stop, ended };
+            let mut world = World { control, bricks, replies, stop, ended, known: None };
             assert!(matches!(world.hear().await, ToMaster::Hello(_)), "the hello comes first");
 
             let volume = Volume::from_fn_u8("pair", [16, 8, 8], |_, _, _| 200);
@@ -637,6 +645,7 @@ mod tests {
             let spec = SceneSpec { id, volume, transfer, quality, bricks: SET };
             let (worker, heartbeat_ms) = (WorkerId(1), 60_000);
             world.say(ToWorker::Welcome { worker, heartbeat_ms, is_here: false });
+            world.known = Some((spec.clone(), view));
             world.say(ToWorker::Scene(Arc::new(spec)));
             for (frame, finish) in [(FRAME, None), (FINISHED, Some(FINISH))] {
                 world.say(ToWorker::Frame { frame, scene: id, view, finish });
@@ -793,6 +802,38 @@ mod tests {
         assert_eq!(result.region.as_ref().map(|c| (c.stalls, c.parked_us)), Some((0, 0)));
         let halves = results.iter().flat_map(|r| sums(r).a.clone());
         assert!(halves.eq(sums(&result).a.iter().copied()), "stopping changes no byte");
+    }
+
+    /// Where nothing is culled all that lies over a region is expected, and asked for in one message.
+    #[tokio::test]
+    async fn what_a_region_will_need_is_asked_for_before_it_is_begun() {
+        let mut world = World::new().await;
+        world.directory();
+        let frame = FrameId(9);
+        let (known, view) = world.known.clone().expect("a scene");
+        let quality = Quality { cull: false, ..known.quality };
+        let spec = SceneSpec { id: SceneId(4), quality, ..known };
+        let (scene, finish) = (spec.id, None);
+        world.say(ToWorker::Scene(Arc::new(spec)));
+        world.say(ToWorker::Frame { frame, scene, view, finish });
+        world.send(1).await;
+        let tile = Rect::new(0, 0, 32, 32);
+        world.region_of(frame, 1, tile);
+        assert_eq!(wishes(&mut world, 1).await, [0]);
+        world.settle().await;
+        world.send(0).await;
+        let result = world.result().await;
+        assert_eq!(result.region.map(|cost| cost.touched), Some(vec![0, 1]));
+        let drop = ToWorker::DropBricks { set: SET, bricks: vec![BrickId(0), BrickId(1)] };
+        world.bricks.send(Bricks::Message(drop)).await.unwrap();
+        world.settle().await;
+        world.region_of(frame, 2, tile);
+        let ToMaster::BricksWanted { bricks, .. } = world.hear().await else { panic!("a wish") };
+        assert_eq!(bricks, [BrickId(0), BrickId(1)]);
+        world.send(1).await;
+        world.send(0).await;
+        let result = world.result().await;
+        assert_eq!(result.region.map(|cost| cost.touched), Some(vec![0, 1]));
     }
 
     #[tokio::test]
@@ -958,8 +999,9 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn a_master_that_falls_silent_is_left() {
         let world = World::new().await;
-        let World { control: _control, bricks: _bricks, replies: _replies, stop: _stop, ended } =
-            world;
+        let World {
+            control: _control, bricks: _bricks, replies: _replies, stop: _stop, ended, ..
+        } = world;
         let Ended::Lost(reason) = ended.await.unwrap().unwrap() else { panic!("lost") };
         assert!(reason.contains("silent"), "{reason}");
     }

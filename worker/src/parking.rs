@@ -105,6 +105,30 @@ impl Parking {
         on
     }
 
+    /// Regions that are not begun will need these: which of them are to be asked for. Nothing is forgotten for that.
+    pub(crate) fn expect(
+        &mut self,
+        set: BrickSetKey,
+        shelf: &Shelf,
+        places: &[u32],
+        cache: &BrickCache,
+    ) -> Vec<BrickId> {
+        let mut ids = Vec::new();
+        for &place in places {
+            let brick = &shelf.bricks()[place as usize];
+            let after = cache.encoded_bytes() + self.coming_bytes + u64::from(brick.bytes);
+            if after > self.budget {
+                break;
+            }
+            if !shelf.holds(place) && !self.coming.contains_key(&(set, place)) {
+                self.coming.insert((set, place), BTreeSet::new());
+                self.coming_bytes += u64::from(brick.bytes);
+                ids.push(brick.id);
+            }
+        }
+        ids
+    }
+
     fn let_go(&mut self, set: BrickSetKey, places: impl IntoIterator<Item = u32>) {
         for place in places {
             if let Some(n) = self.kept.get_mut(&(set, place)) {
@@ -359,6 +383,27 @@ mod tests {
         w.parking.leave(who(1), &[]);
         w.parking.park(who(2), &[4], true);
         assert_eq!(w.ask(), [wanted(&[4])]);
+    }
+
+    #[test]
+    fn what_is_expected_is_asked_for_once_and_never_makes_room() {
+        let mut w = World::new(5);
+        w.enter(1);
+        w.come(&[7]);
+        let expect = |w: &mut World, places: &[u32]| {
+            let shelf = w.cache.shelf(SET).expect("its directory came").clone();
+            let ids = w.parking.expect(SET, &shelf, places, &w.cache);
+            ids.iter().map(|b| b.0).collect::<Vec<_>>()
+        };
+        assert_eq!(expect(&mut w, &[1, 2, 7]), [1, 2]);
+        assert!(!w.parking.park(who(1), &[1, 3], true));
+        assert_eq!(w.ask(), [wanted(&[3])], "1 is on its way");
+        assert_eq!(w.come(&[1, 3]), [who(1)]);
+        // One here, three, and one on its way: no more than that.
+        assert_eq!(expect(&mut w, &[2, 4, 5, 6]), [4]);
+        assert_eq!(w.come(&[2, 4]), []);
+        assert_eq!(expect(&mut w, &[8]), [0u32; 0]);
+        assert_eq!(w.held(), [1, 2, 3, 4, 7], "nothing is forgotten for it");
     }
 
     #[test]

@@ -2,21 +2,26 @@
 //! nothing of links.
 //!
 //! The queue is in order of frames, since a frame that is late holds up those behind it; in a frame a
-//! region that goes on comes before one that begins.
+//! region that goes on comes before one that begins. Before a thread takes one it looks at those that have come
+//! since: what the frames before say that they will need is asked for at once, and is on its way while others are drawn.
 
-use crate::rehearse::{Rehearsal, Through};
+use crate::rehearse::Rehearsal;
 use crate::shelf::Shelf;
-use slabcast_common::brick::Brick;
+use slabcast_common::brick::{Brick, BrickSetKey};
 use slabcast_common::ids::FrameId;
 use slabcast_common::image::TilePixels;
 use slabcast_common::leaves::{Finish, Leaves};
 use slabcast_common::message::{
     Counters, HandedOver, Lease, Pixels, RegionLease, Sampling, SceneSpec,
 };
+use slabcast_common::occlusion::Rect;
+use slabcast_common::region::AHEAD;
+use slabcast_common::trace::Course;
 use slabcast_common::view::View;
+use slabcast_render::depths::Depths;
 use slabcast_render::estimate::{Pair, Probe};
 use slabcast_render::outlook::{Directory, Outlook};
-use slabcast_render::region::{Finished, Region, Supply};
+use slabcast_render::region::{self, Finished, Region, Supply};
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch};
 use slabcast_render::{Frame, Scene};
@@ -27,23 +32,22 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
 
-/// Sheets beyond the one at which a region lacks a brick that it looks for more. With as many as a brick is thick, 8, a head's
-/// regions are sent bricks that what lies in front of them then hides: of mri256 26.8 % are held after 18 views, with 5 25.4,
-/// with 4 25.1. In exchange they ask 322 times for the first view instead of 228, with 4 372 times, while others of their
-/// worker's are drawn (docs/scaling.md).
-const AHEAD: u32 = 5;
-
 /// A scene that tiles share; its tables are made by the first thread that needs them.
 pub(crate) struct SceneSlot {
     pub(crate) spec: Arc<SceneSpec>,
     scene: OnceLock<Arc<Scene>>,
+    /// How deep its last pictures were open, by their size.
+    depths: Mutex<BTreeMap<[u32; 2], Arc<Depths>>>,
+    /// Of a rehearsal: parts of pictures that were held.
+    pub(crate) parts: Mutex<BTreeSet<[i32; 2]>>,
     /// What the thickness costs is found by; `None` where sheets can't be thinner.
     pair: OnceLock<Option<Pair>>,
 }
 
 impl SceneSlot {
     pub(crate) fn new(spec: Arc<SceneSpec>) -> Self {
-        SceneSlot { spec, scene: OnceLock::new(), pair: OnceLock::new() }
+        let (scene, depths, parts, pair) = Default::default();
+        SceneSlot { spec, scene, depths, parts, pair }
     }
 }
 
@@ -56,6 +60,7 @@ pub(crate) struct FrameSlot {
     frame: OnceLock<Frame>,
     probe: OnceLock<Probe>,
     outlook: OnceLock<Outlook>,
+    depths: OnceLock<Arc<Depths>>,
     /// Of a rehearsal: its place in the trace, and when its tables are made.
     pub(crate) rehearsed: OnceLock<Option<usize>>,
     pub(crate) made: OnceLock<Instant>,
@@ -67,8 +72,20 @@ pub(crate) struct FrameSlot {
 
 impl FrameSlot {
     pub(crate) fn new(scene: Arc<SceneSlot>, view: View, finish: Option<Finish>) -> Self {
-        let (frame, probe, outlook, rehearsed, made, held, over) = Default::default();
-        FrameSlot { scene, view, finish, frame, probe, outlook, rehearsed, made, held, over }
+        let (frame, probe, outlook, depths, rehearsed, made, held, over) = Default::default();
+        FrameSlot {
+            scene,
+            view,
+            finish,
+            frame,
+            probe,
+            outlook,
+            depths,
+            rehearsed,
+            made,
+            held,
+            over,
+        }
     }
 
     fn get(&self) -> &Frame {
@@ -81,6 +98,15 @@ impl FrameSlot {
     /// What it sees of a directory.
     fn outlook(&self, directory: &Arc<Directory>) -> &Outlook {
         self.outlook.get_or_init(|| Outlook::new(self.get(), directory))
+    }
+
+    /// How deep pictures of its scene and size were open.
+    fn depths(&self) -> &Depths {
+        self.depths.get_or_init(|| {
+            let size = self.view.size;
+            let mut all = locked(&self.scene.depths);
+            all.entry(size).or_insert_with(|| Arc::new(Depths::new(size))).clone()
+        })
     }
 
     /// What tells how far its pixels are off.
@@ -164,6 +190,10 @@ pub(crate) struct Going {
     pub(crate) drawn: Duration,
     /// What is drawn so far; `None` before it began.
     region: Option<Region>,
+    /// The same of a rehearsal.
+    pub(crate) course: Option<Course>,
+    /// Whether what it will need was looked for.
+    looked: bool,
 }
 
 impl Going {
@@ -173,8 +203,28 @@ impl Going {
         shelf: Arc<Shelf>,
         received: Instant,
     ) -> Going {
-        let (wish, parked_at, parked, stalls, drawn, region) = Default::default();
-        Going { lease, frame, shelf, wish, received, parked_at, parked, stalls, drawn, region }
+        let (wish, parked_at, parked, stalls, drawn, region, course, looked) = Default::default();
+        Going {
+            lease,
+            frame,
+            shelf,
+            wish,
+            received,
+            parked_at,
+            parked,
+            stalls,
+            drawn,
+            region,
+            course,
+            looked,
+        }
+    }
+}
+
+impl Going {
+    /// Whether no thread has come to it.
+    fn begins(&self) -> bool {
+        self.region.is_none() && self.course.is_none()
     }
 }
 
@@ -220,6 +270,8 @@ pub(crate) enum Outcome {
     Region(Gone),
     /// A piece of a region that goes on.
     Handed(Box<HandedOver>),
+    /// What regions that nobody has begun will need, by frames before: places on a shelf.
+    Expected(BrickSetKey, Arc<Shelf>, Vec<u32>),
 }
 
 /// Frame, whether it begins, and the order of coming.
@@ -229,6 +281,8 @@ type Place = (FrameId, bool, u64);
 struct State {
     tasks: BTreeMap<Place, Task>,
     order: u64,
+    /// Regions that were not looked at.
+    fresh: usize,
     closed: bool,
     /// Threads with nothing to do.
     idle: u32,
@@ -298,9 +352,10 @@ impl Pool {
     pub(crate) fn submit(&self, task: Task) {
         let (frame, begins) = match &task {
             Task::Slab(ready) => (ready.lease.frame, true),
-            Task::Region(going) => (going.lease.frame, going.region.is_none()),
+            Task::Region(going) => (going.lease.frame, going.begins()),
         };
         let mut state = locked(&self.queue.state);
+        state.fresh += usize::from(matches!(&task, Task::Region(going) if !going.looked));
         state.order += 1;
         let place = (frame, begins, state.order);
         state.tasks.insert(place, task);
@@ -325,15 +380,33 @@ impl Pool {
     }
 }
 
-/// The next task; `None`: there will be none.
-fn next(queue: &Queue) -> Option<Task> {
+/// A region to look at.
+struct Look {
+    frame: Arc<FrameSlot>,
+    shelf: Arc<Shelf>,
+    tile: Rect,
+}
+
+/// The next task, and which regions have come since; `None`: there will be none.
+fn next(queue: &Queue) -> Option<(Task, Vec<Look>)> {
     let mut state = locked(&queue.state);
     loop {
         if state.closed {
             return None;
         }
+        let mut looks = Vec::new();
+        if state.fresh > 0 {
+            state.fresh = 0;
+            for task in state.tasks.values_mut() {
+                let Task::Region(going) = task else { continue };
+                if !std::mem::replace(&mut going.looked, true) && going.lease.begun.is_none() {
+                    let (frame, shelf) = (going.frame.clone(), going.shelf.clone());
+                    looks.push(Look { frame, shelf, tile: going.lease.tile });
+                }
+            }
+        }
         if let Some((_, task)) = state.tasks.pop_first() {
-            return Some(task);
+            return Some((task, looks));
         }
         state.count();
         state.idle += 1;
@@ -345,7 +418,15 @@ fn next(queue: &Queue) -> Option<Task> {
 
 fn work(thread: u32, simd: Simd, queue: &Queue, out: &mpsc::UnboundedSender<Outcome>) {
     let mut scratch = Scratch::default();
-    while let Some(task) = next(queue) {
+    while let Some((task, looks)) = next(queue) {
+        for Look { frame, shelf, tile } in looks {
+            let looked = caught(&mut scratch, |_| {
+                let outlook = frame.outlook(shelf.directory());
+                region::expected((frame.get(), outlook, &*shelf), tile, frame.depths())
+            });
+            // Who can't even look at it fails when it is drawn.
+            expect(&frame, shelf, looked.unwrap_or_default(), out);
+        }
         let outcome = match task {
             Task::Slab(ready) => Outcome::Slab(render(thread, simd, ready, &mut scratch)),
             Task::Region(going) => {
@@ -359,6 +440,19 @@ fn work(thread: u32, simd: Simd, queue: &Queue, out: &mpsc::UnboundedSender<Outc
     }
 }
 
+/// Has the desk ask for what a region will need.
+fn expect(
+    frame: &FrameSlot,
+    shelf: Arc<Shelf>,
+    places: Vec<u32>,
+    out: &mpsc::UnboundedSender<Outcome>,
+) {
+    if !places.is_empty() {
+        // Who is not there any more needs nothing.
+        let _ = out.send(Outcome::Expected(frame.scene.spec.bricks, shelf, places));
+    }
+}
+
 /// A task that is taken so soon was there before the thread was free.
 const AT_ONCE: Duration = Duration::from_micros(20);
 
@@ -367,10 +461,14 @@ fn hold(thread: u32, rehearsal: &Rehearsal, queue: &Queue, out: &mpsc::Unbounded
     let mut free = Instant::now();
     loop {
         let asked = Instant::now();
-        let Some(task) = next(queue) else { return };
+        let Some((task, looks)) = next(queue) else { return };
         // Whether it waited for the task, or the task for it.
         let came = Instant::now();
         let from = if came - asked < AT_ONCE { free } else { free.max(came) };
+        for Look { frame, shelf, tile } in looks {
+            let places = rehearsal.expected(&frame, &shelf, tile);
+            expect(&frame, shelf, places, out);
+        }
         let outcome = match task {
             Task::Slab(task) => {
                 let (mut start, mut end) = (free.max(task.ready), free.max(task.ready));
@@ -384,17 +482,13 @@ fn hold(thread: u32, rehearsal: &Rehearsal, queue: &Queue, out: &mpsc::Unbounded
                 Outcome::Slab(Rendered { lease, received, ready, start, end, thread, outcome })
             }
             Task::Region(mut going) => {
-                let (mut end, over) = (from, going.frame.over.load(Ordering::Relaxed));
-                let came = match (!over).then(|| rehearsal.region(&going, from)) {
-                    None => Came::Over,
-                    Some(Err(why)) => Came::Failed(why),
-                    Some(Ok(Through::Lacks(lacks))) => Came::Lacks(lacks, true),
-                    Some(Ok(Through::Held { held, took, drawn })) => {
-                        held.wait();
-                        going.drawn += took;
-                        end = held.end;
-                        Came::Done(drawn)
-                    }
+                let over = going.frame.over.load(Ordering::Relaxed);
+                // It gives nothing of its tile away.
+                going.wish.take();
+                let (came, end) = match (!over).then(|| rehearsal.region(&mut going, from)) {
+                    None => (Came::Over, from),
+                    Some(Err(why)) => (Came::Failed(why), from),
+                    Some(Ok(went)) => went,
                 };
                 free = end;
                 Outcome::Region(Gone { going, end, thread, came })
@@ -494,7 +588,9 @@ fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch, give: &dyn Fn(Handed
     match region.take() {
         Some(region) => {
             let begun = Instant::now();
-            let Finished { pixels, counters, touched } = region.finish();
+            let done = region.finish();
+            done.teach(slot.depths());
+            let Finished { pixels, counters, touched, .. } = done;
             let size = [lease.tile.width() as u32, lease.tile.height() as u32];
             let pixels = match &slot.finish {
                 Some(finish) => Pixels::Finished(Leaves::of(&pixels, size, finish)),

@@ -10,11 +10,16 @@
 //! late; over a thousand tiles that is a frame. So a thread's next tile begins when the one before
 //! should have ended, or when it came, and only a result is late, never the work behind it.
 
-use crate::pool::{Drawn, FrameSlot, Going, Ready, locked};
+use crate::pool::{Came, Drawn, FrameSlot, Going, Ready, locked};
+use crate::shelf::Shelf;
 use slabcast_common::image::TilePixels;
 use slabcast_common::message::{Counters, Pixels, Sampling};
+use slabcast_common::occlusion::Rect;
+use slabcast_common::region::{AHEAD, parts};
 use slabcast_common::slab::SheetRange;
-use slabcast_common::trace::{Trace, filled, filled_through, finished_through, view_sha256};
+use slabcast_common::trace::{
+    Course, Trace, filled, filled_through, finished_through, view_sha256,
+};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -80,12 +85,27 @@ impl Rehearsal {
         Ok((Held { start, end }, pixels))
     }
 
-    /// The same of a region that a thread has come to at `start`: which bricks it lacks, or when it
-    /// ends and what comes of it. All of them are lacked at once, where drawing finds one after the
-    /// other.
-    pub(crate) fn region(&self, going: &Going, start: Instant) -> Result<Through, String> {
-        let Going { lease, frame, shelf, .. } = going;
-        let tile = lease.tile;
+    /// What a region will need by the frame before it, if that was held here: places of bricks that are not here.
+    pub(crate) fn expected(&self, frame: &FrameSlot, shelf: &Shelf, tile: Rect) -> Vec<u32> {
+        let at = *frame.rehearsed.get_or_init(|| self.find(frame));
+        let known = at.and_then(|at| self.trace.frames[at].region(&tile, self.trace.about.size));
+        let held = locked(&frame.scene.parts);
+        let (Some(known), true) = (known, parts(tile).all(|p| held.contains(&[p.x0, p.y0]))) else {
+            return Vec::new();
+        };
+        let there = |place: &u32| (*place as usize) < shelf.bricks().len() && !shelf.holds(*place);
+        known.expected.iter().copied().filter(there).collect()
+    }
+
+    /// Holds a region from where it stands, from `start` on: where it comes to, and when. As one that is drawn, it goes as
+    /// far as bricks are here, those among them that come meanwhile.
+    pub(crate) fn region(
+        &self,
+        going: &mut Going,
+        start: Instant,
+    ) -> Result<(Came, Instant), String> {
+        let tile = going.lease.tile;
+        let (frame, shelf, size) = (&going.frame, &going.shelf, self.trace.about.size);
         let unknown = || {
             format!(
                 "the trace that is rehearsed has no tile ({},{}) to ({},{}) through all depths of \
@@ -95,38 +115,55 @@ impl Rehearsal {
         };
         let at = *frame.rehearsed.get_or_init(|| self.find(frame));
         let traced = &self.trace.frames[at.ok_or_else(unknown)?];
-        let known = traced.region(&tile, self.trace.about.size).ok_or_else(unknown)?;
-        let bricks = shelf.bricks().len() as u32;
-        if known.touched.last().is_some_and(|&last| last >= bricks) {
+        let known = traced.region(&tile, size).ok_or_else(unknown)?;
+        let bricks = shelf.bricks();
+        if known.touched.last().is_some_and(|&last| last as usize >= bricks.len()) {
             return Err(unknown());
         }
-        let lacks: Vec<u32> =
-            known.touched.iter().copied().filter(|&place| !shelf.holds(place)).collect();
-        if !lacks.is_empty() {
-            return Ok(Through::Lacks(lacks));
+        let course = match &mut going.course {
+            Some(course) => course,
+            course => {
+                let sees = |place: u32| frame.view.project(&bricks.get(place as usize)?.tight);
+                let of = Course::of(traced, &tile, size, &sees);
+                course.insert(of.ok_or_else(unknown)?)
+            }
+        };
+        let has = |place| shelf.holds(place);
+        course.take();
+        if course.goes(&has) <= 0.0 && !course.is_over() {
+            return Ok((Came::Lacks(course.lacks(&has, AHEAD), true), start));
         }
         let setup = Duration::from_nanos(traced.setup_ns + traced.outlook_ns);
-        let made = *frame.made.get_or_init(|| start + setup);
-        let mut opened = locked(&frame.held);
-        let fresh = known.opened.iter().filter(|b| opened.insert(**b)).count();
-        drop(opened);
-        let opening = traced.block_ns.saturating_mul(fresh as u64);
-        let took = Duration::from_nanos(known.ns.saturating_add(opening));
-        let held = Held { start, end: made.max(start) + took };
+        let mut end = (*frame.made.get_or_init(|| start + setup)).max(start);
+        let begun = end;
+        if going.drawn.is_zero() {
+            let mut opened = locked(&frame.held);
+            let fresh = known.opened.iter().filter(|b| opened.insert(**b)).count();
+            end += Duration::from_nanos(traced.block_ns.saturating_mul(fresh as u64));
+        }
+        // Made while the tile is held, and not when that is over.
         let pixels = match &frame.finish {
             Some(finish) => Pixels::Finished(finished_through(&tile, known.result_bytes, finish)),
             None => Pixels::Sums(filled_through(&tile, known.result_bytes)),
         };
+        loop {
+            let ns = course.goes(&has);
+            if ns <= 0.0 {
+                break;
+            }
+            end += Duration::from_nanos(ns.round() as u64);
+            Held { start, end }.wait();
+            course.go(ns, &has);
+        }
+        going.drawn += end - begun;
+        if !course.is_over() {
+            return Ok((Came::Lacks(course.lacks(&has, AHEAD), true), end));
+        }
+        locked(&frame.scene.parts).extend(parts(tile).map(|p| [p.x0, p.y0]));
         let (counters, sampled) = (Counters::default(), Sampling::default());
         let drawn = Drawn { pixels, counters, touched: known.into_owned().touched, sampled };
-        Ok(Through::Held { held, took, drawn: Box::new(drawn) })
+        Ok((Came::Done(Box::new(drawn)), end))
     }
-}
-
-/// Where a region came to that is held.
-pub(crate) enum Through {
-    Lacks(Vec<u32>),
-    Held { held: Held, took: Duration, drawn: Box<Drawn> },
 }
 
 /// When a task is held.

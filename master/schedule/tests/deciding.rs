@@ -86,7 +86,7 @@ fn ball(frames: usize) -> (Vec<FrameJob>, Trace) {
                 let ns = 20_000 + 100 * t.rect.area() as u64 + 500 * touched.len() as u64;
                 let (x, y) = (t.rect.x0 as u32, t.rect.y0 as u32);
                 let result_bytes = t.rect.area() as u32;
-                RegionTile { x, y, ns, result_bytes, touched, opened: Vec::new() }
+                RegionTile { x, y, ns, result_bytes, touched, ..RegionTile::default() }
             };
             let mut tiles: Vec<RegionTile> = cut.tiles.iter().map(tile).collect();
             tiles.sort_by_key(|t| (t.y, t.x));

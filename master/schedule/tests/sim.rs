@@ -145,6 +145,7 @@ fn through(edge: u32, rects: &[Rect], projected: &[Option<Projected>]) -> Region
                 touched: touched.map(|(i, _)| i).collect(),
                 // A block to the left, and one for all.
                 opened: vec![t.rect.x0 as u32 / 128, 7],
+                ..RegionTile::default()
             }
         })
         .collect();
@@ -346,6 +347,43 @@ fn regions_have_no_barrier_and_bricks_come_where_they_are_asked_for() {
     };
     let each = [1, 2, 4].map(ms);
     assert!(each[1] < each[0] && each[2] < each[1], "{each:?}");
+}
+
+#[test]
+fn a_region_is_drawn_up_to_each_brick_that_it_lacks_and_those_that_are_expected_come_before() {
+    let (slab, mut trace) = world(12);
+    let region = under(Schedule::Region, &slab);
+    let link = Link { bytes_per_s: Some(1e8), latency_ns: 100_000 };
+    let ran = |trace: &Trace| {
+        let c = Cluster { link, ..cluster(4) };
+        let outcome = run(&region, trace, &c);
+        let drawn: u64 = outcome.frames[1..].iter().map(|f| f.render).sum();
+        let took: u64 = outcome.frames[1..].iter().map(|f| f.done - f.began).sum();
+        (drawn, took, outcome)
+    };
+    let (drawn, _, _) = ran(&trace);
+    let each = |trace: &mut Trace, what: &dyn Fn(&mut RegionTile)| {
+        let levels = trace.frames.iter_mut().flat_map(|f| &mut f.regions);
+        levels.filter(|l| l.edge <= 64).flat_map(|l| &mut l.tiles).for_each(what);
+    };
+    // In the order of the list, a brick after the other.
+    each(&mut trace, &|t| {
+        let n = t.touched.len().max(1) as u16;
+        t.needed = (0..t.touched.len() as u16).map(|i| 1000 / n * i).collect();
+    });
+    let (stopping, long, stopped) = ran(&trace);
+    assert_eq!(stopping, drawn, "stopping is no work");
+    assert_eq!(stopped, ran(&trace).2);
+    for level in trace.frames.iter_mut().flat_map(|f| &mut f.regions) {
+        level.tiles.iter_mut().for_each(|t| t.expected = t.touched.clone());
+    }
+    let (expecting, short, expected) = ran(&trace);
+    assert_eq!(expecting, drawn);
+    assert!(short < long, "{short} ns for {long}");
+    let waited = [&expected, &stopped].map(|o| o.spent.bricks);
+    assert!(20 * waited[0] < 19 * waited[1], "{waited:?}");
+    let sent = |o: &Outcome| o.frames.iter().map(|f| f.bricks).sum::<u64>();
+    assert!(sent(&expected) <= sent(&stopped) * 5 / 4, "only where it draws");
 }
 
 #[test]

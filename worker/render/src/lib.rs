@@ -21,6 +21,7 @@
 mod batch;
 pub mod closed;
 mod deep;
+pub mod depths;
 pub mod estimate;
 pub mod explain;
 mod flat;

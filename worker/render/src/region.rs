@@ -8,6 +8,7 @@
 //! ```text
 //! Outlook::new       the directory as a frame sees it: once a frame
 //! Region::new        a tile before its first sheet
+//! expected           what it will ask for, if the frame before tells: it can be asked for before the tile is begun
 //! Region::advance    to the end, or to the first sheet that lacks a brick
 //!   .. names the bricks that it lacks there and a little farther; others render meanwhile
 //! Region::advance    from that sheet on
@@ -21,6 +22,7 @@
 //! cut are tossed again ([`crate::tile`]). Where nothing is lacked there is no cut, and a region
 //! costs what a tile of one slab costs.
 
+use crate::depths::{Cells, Depths, LOOKS};
 use crate::mask::OpenMask;
 use crate::outlook::{Outlook, Sight};
 use crate::scene::{Corner, Frame};
@@ -159,6 +161,9 @@ pub(crate) struct Coming<'a> {
     lacks: RefCell<Vec<u32>>,
     /// The first sheet that any brick begins at.
     nearest: Option<i32>,
+    /// How deep its cells are open, and the last sheet that was come to.
+    cells: RefCell<Cells>,
+    last: Cell<i32>,
 }
 
 impl<'a> Coming<'a> {
@@ -176,8 +181,9 @@ impl<'a> Coming<'a> {
         waiting.heads.resize(slab.len() as usize, NONE);
         waiting.bricks.clear();
         (waiting.voxels, waiting.blocks) = (0, 0);
-        let (stop, lacks, nearest) = Default::default();
+        let (stop, lacks, nearest, cells) = Default::default();
         let waiting = RefCell::new(waiting);
+        let last = Cell::new(at);
         let mut coming = Coming {
             frame,
             outlook,
@@ -191,6 +197,8 @@ impl<'a> Coming<'a> {
             stop,
             lacks,
             nearest,
+            cells,
+            last,
         };
         coming.nearest = coming.find_nearest();
         coming
@@ -277,6 +285,10 @@ impl<'a> Coming<'a> {
         if self.supply.stops() {
             self.stop.set(Some(k));
             return false;
+        }
+        self.last.set(k);
+        if k % LOOKS == 0 {
+            self.cells.borrow_mut().look(k, open);
         }
         let waiting = &mut *self.waiting.borrow_mut();
         let mut culled = self.look(k, k, open, waiting);
@@ -369,13 +381,14 @@ struct Went {
     /// The sheet before which it stopped for what it lacks.
     stop: Option<i32>,
     lacks: Vec<u32>,
+    cells: Cells,
 }
 
 /// Draws the sheets of a part of `tile` from `at` on, as far as bricks are here; `came` is told the places
 /// of those that it took.
 fn go_through(
     from: From<'_>,
-    (tile, rect, at): (Rect, Rect, i32),
+    (tile, rect, at, cells): (Rect, Rect, i32, Cells),
     scratch: &mut Scratch,
     io: Io<'_>,
     mut came: impl FnMut(u32),
@@ -385,6 +398,7 @@ fn go_through(
     let Memory { waiting, taken } = &mut memory;
     let (seen, place) = ((frame, outlook, supply), (rect, at, ahead));
     let coming = Coming::new(seen, place, std::mem::take(waiting), taken);
+    coming.cells.replace(cells);
     if let Some(nearest) = coming.nearest {
         let mut slab = coming.slab;
         if at == outlook.sheets().first {
@@ -394,7 +408,13 @@ fn go_through(
         let among = Among::Coming(&coming);
         Part { frame, rect, tile, slab, among, inside: &[] }.draw(simd, scratch, io);
     }
-    let went = Went { stop: coming.stop.get(), lacks: coming.lacks.take() };
+    let mut cells = coming.cells.take();
+    let (stop, last) = (coming.stop.get(), coming.last.get());
+    if stop.is_none() && last + 1 < coming.slab.end {
+        // It ended before its last sheet: nothing was open any more.
+        cells.shut(last + 1);
+    }
+    let went = Went { stop, lacks: coming.lacks.take(), cells };
     *waiting = coming.waiting.into_inner();
     taken.iter().for_each(|t| came(t.place));
     taken.clear();
@@ -422,7 +442,7 @@ pub fn draw(
     let mut counted = Counters::default();
     let from = From { frame, simd, outlook, supply, ahead: 0 };
     for rect in parts(tile) {
-        let at = (tile, rect, outlook.sheets().first);
+        let at = (tile, rect, outlook.sheets().first, Cells::default());
         let went = go_through(from, at, scratch, (&mut *out, &mut counted), |_| ());
         assert!(went.stop.is_none(), "a brick is not here");
     }
@@ -435,6 +455,8 @@ struct Strand {
     rect: Rect,
     /// The next sheet to draw.
     at: i32,
+    /// How deep it is open.
+    cells: Cells,
 }
 
 /// A tile on its way through the sheets of a frame.
@@ -447,6 +469,8 @@ pub struct Region {
     counters: Counters,
     /// Places of bricks that were drawn, some of them twice.
     touched: Vec<u32>,
+    /// How deep parts were open that are at their end.
+    depths: Vec<(Rect, Cells)>,
 }
 
 /// A region that came to its end.
@@ -458,16 +482,60 @@ pub struct Finished {
     pub counters: Counters,
     /// Places in the directory of the bricks that it touched, ascending.
     pub touched: Vec<u32>,
+    depths: Vec<(Rect, Cells)>,
+}
+
+impl Finished {
+    /// Tells the next frame how deep it was open.
+    pub fn teach(&self, depths: &Depths) {
+        self.depths.iter().for_each(|(part, cells)| depths.note(part, cells));
+    }
+}
+
+/// What a region that is not begun will ask for, if its frame is as deep as those of `depths`: places in the directory of
+/// bricks that are not here, ascending. Nothing of what nobody knows about. Where nothing is culled, it is all that lies over it.
+pub fn expected(
+    (frame, outlook, supply): (&Frame, &Outlook, &dyn Supply),
+    tile: Rect,
+    depths: &Depths,
+) -> Vec<u32> {
+    let all = !frame.scene.quality.cull;
+    let expects = |r: &Rect, first| !r.is_empty() && (all || depths.expects(r, first));
+    let mut places = Vec::new();
+    for part in parts(tile) {
+        let deepest = if all { i32::MAX } else { depths.deepest(&part) };
+        for &i in outlook.over(part.x0, part.y0) {
+            let projected = &outlook.block(i).projected;
+            if projected.sheets.first > deepest {
+                break;
+            }
+            let rect = projected.rect.intersect(&part);
+            if !expects(&rect, projected.sheets.first) {
+                continue;
+            }
+            for &Sight { projected, place, .. } in outlook.bricks(i) {
+                let rect = projected.rect.intersect(&part);
+                if expects(&rect, projected.sheets.first) && supply.get(place).is_none() {
+                    places.push(place);
+                }
+            }
+        }
+    }
+    places.sort_unstable();
+    places.dedup();
+    places
 }
 
 impl Region {
     /// `tile`, which lies inside the picture, before the first sheet.
     pub fn new(outlook: &Outlook, tile: Rect) -> Region {
         let at = outlook.sheets().first;
-        let open = parts(tile).map(|rect| Strand { rect, at }).collect();
+        let cells = Cells::default();
+        let open = parts(tile).map(|rect| Strand { rect, at, cells }).collect();
         let n = tile.area();
         let pixels = TilePixels { a: vec![0.0; n], colour: vec![[0; 3]; n], last: None };
-        Region { tile, open, pixels, counters: Counters::default(), touched: Vec::new() }
+        let (counters, touched, depths) = Default::default();
+        Region { tile, open, pixels, counters, touched, depths }
     }
 
     /// Its tile.
@@ -500,9 +568,12 @@ impl Region {
             return Err("its sheets are not the frame's");
         }
         let open = parts(tile).zip(&begun.sheets);
-        let open = open.filter_map(|(rect, at)| Some(Strand { rect, at: (*at)? })).collect();
+        let cells = Cells::default();
+        let strand = |(rect, at): (Rect, &Option<i32>)| Some(Strand { rect, at: (*at)?, cells });
+        let open = open.filter_map(strand).collect();
         let pixels = pixels.clone();
-        Ok(Region { tile, open, pixels, counters: Counters::default(), touched: Vec::new() })
+        let (counters, touched, depths) = Default::default();
+        Ok(Region { tile, open, pixels, counters, touched, depths })
     }
 
     /// Gives away about `share` of what is left: what it keeps of its tile, what it gives, and how that stands.
@@ -530,7 +601,11 @@ impl Region {
         let sheets = parts(given).map(at).collect();
         let begun = Begun { sheets, pixels: self.pixels.piece(tile, given) };
         for strand in &mut self.open {
-            strand.rect = strand.rect.intersect(&kept);
+            let rect = strand.rect.intersect(&kept);
+            if rect != strand.rect {
+                // They are counted from its corner, and seen again.
+                (strand.rect, strand.cells) = (rect, Cells::default());
+            }
         }
         self.open.retain(|s| !s.rect.is_empty());
         self.pixels = self.pixels.piece(tile, kept);
@@ -574,12 +649,16 @@ impl Region {
         let several = open.len() > 1;
         let from = From { frame, simd, outlook, supply, ahead };
         open.retain_mut(|strand| {
-            let at = (self.tile, strand.rect, strand.at);
+            let at = (self.tile, strand.rect, strand.at, strand.cells);
             let io = (&mut self.pixels, &mut self.counters);
             let touched = |place| self.touched.push(place);
             let went = go_through(from, at, scratch, io, touched);
             lacks.extend(went.lacks);
             strand.at = went.stop.unwrap_or(strand.at);
+            strand.cells = went.cells;
+            if went.stop.is_none() {
+                self.depths.push((strand.rect, went.cells));
+            }
             went.stop.is_some()
         });
         self.open = open;
@@ -593,11 +672,11 @@ impl Region {
 
     /// Ends it, at its end or before.
     pub fn finish(self) -> Finished {
-        let Region { mut pixels, counters, mut touched, .. } = self;
+        let Region { mut pixels, counters, mut touched, depths, .. } = self;
         touched.sort_unstable();
         touched.dedup();
         pixels.last = None;
-        Finished { pixels, counters, touched }
+        Finished { pixels, counters, touched, depths }
     }
 }
 

@@ -18,8 +18,9 @@ use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
+use slabcast_render::depths::Depths;
 use slabcast_render::outlook::{Directory, Outlook};
-use slabcast_render::region::{Region, Supply};
+use slabcast_render::region::{Region, Supply, expected};
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch};
 use slabcast_render::{Frame, Scene, serial};
@@ -124,6 +125,7 @@ fn in_regions(
             tiles.push((Region::new(&outlook, rect), rect));
         }
     }
+    let depths = Depths::new(size);
     while let Some((mut region, mut rect)) = tiles.pop() {
         store.stop_in.set(once_in(given_in).then(|| 1 + seed % 40));
         loop {
@@ -155,10 +157,24 @@ fn in_regions(
         }
         let done = region.finish();
         assert!(done.touched.windows(2).all(|p| p[0] < p[1]) && done.pixels.last.is_none());
+        done.teach(&depths);
         touched.extend(done.touched);
         counted += done.counters;
         done.pixels.write(rect, size, &mut picture.pixels);
     }
+    // Who has nothing asks for what he will need before he draws it again, if nothing is hidden for all of it.
+    store.here.borrow_mut().fill(false);
+    let rest = Rect::new(7, 0, size[0] as i32, size[1] as i32);
+    let [again, of_rest] = [Rect::of_size(size), rest].map(|tile| match tile.is_empty() {
+        false => expected((frame, &outlook, &store), tile, &depths),
+        true => Vec::new(),
+    });
+    let cull = frame.scene.quality.cull;
+    assert!(cull || touched.iter().all(|place| again.binary_search(place).is_ok()));
+    assert!(of_rest.iter().all(|place| again.binary_search(place).is_ok()));
+    let unknown = Depths::new(size);
+    let nothing = expected((frame, &outlook, &store), Rect::of_size(size), &unknown);
+    assert!(!cull || nothing.is_empty());
     (picture, counted, asked, touched)
 }
 

@@ -8,6 +8,8 @@
 //! begins, a block's bricks when one of its tiles first needs them ([`slabcast_render::outlook`]). So a
 //! tile's time is that with its blocks looked at; it names them, and a block's price is measured apart.
 //! Whoever runs the tiles charges a worker each block of a frame once, to the tile that comes first.
+//!
+//! A tile of one part is drawn once more, to see when it comes to each of its bricks: who lacks one draws as far as that.
 
 use super::clock::cpu_ns;
 use crate::fail::Fail;
@@ -26,6 +28,7 @@ use slabcast_common::message::{
 };
 use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::quality::Work;
+use slabcast_common::region::PART;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::trace::{
     About, FrameTrace, Level, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace, VERSION,
@@ -34,13 +37,16 @@ use slabcast_common::trace::{
 use slabcast_common::view::Projected;
 use slabcast_proto::convert::{self, Down};
 use slabcast_render::Frame;
+use slabcast_render::depths::Depths;
 use slabcast_render::outlook::Outlook;
 use slabcast_render::region::{self, Finished, Region, Supply};
 use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch};
 use slabcast_schedule::{FrameJob, is_shut, macrotile};
-use std::collections::BTreeSet;
+use std::cell::RefCell;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 /// What is measured.
 pub(crate) struct Path<'a> {
@@ -88,10 +94,12 @@ pub(crate) fn measure(
     (progress, before): (&mut Progress, usize),
 ) -> Result<Trace, Fail> {
     let jobs = jobs(path.stage, path.frames, path.work)?;
-    let mut bench = Bench { scratch: Scratch::default(), repeats: path.repeats };
+    let depths = Depths::new(jobs[0].view.size);
+    let mut bench = Bench { scratch: Scratch::default(), repeats: path.repeats, depths };
     let mut frames = Vec::with_capacity(jobs.len());
     // What a worker has after its first frame: footprints in the scene, memory that has grown.
     bench.frame(path, 0, &jobs[0])?;
+    bench.depths = Depths::new(jobs[0].view.size);
     for (i, job) in jobs.iter().enumerate() {
         if signals::told() {
             break;
@@ -115,6 +123,8 @@ pub(crate) fn measure(
 struct Bench {
     scratch: Scratch,
     repeats: u32,
+    /// How deep the frame before was open.
+    depths: Depths,
 }
 
 /// The shortest of some runs, in nanoseconds, and what the last one gave.
@@ -298,7 +308,8 @@ impl Bench {
         // beside the one that bricks alone say. And a frame beside others may be one of two crews'.
         // Of a frame that is alone it cuts some tiles of 64 pixels in parts of 32.
         let mut edges: BTreeSet<u32> = match job.work.tile {
-            Some(edge) => [edge].into(),
+            // What says when a large tile comes to its bricks are its parts.
+            Some(edge) => [edge, edge.min(PART as u32)].into(),
             None => [32, 64, 128, 256].into(),
         };
         for &wanted in path.wanted.iter().filter(|_| job.work.tile.is_none()) {
@@ -308,35 +319,50 @@ impl Bench {
             }
         }
         let mut levels = Vec::new();
+        let depths = Depths::new(size);
         for edge in edges {
             let cut = macrotile::cut_through(size, &rects, (0, 0), Some(edge));
             let simd = Simd::detect();
-            let mut draw = |t: Rect, outlook: &Outlook| {
+            let mut draw = |t: Rect, outlook: &Outlook, supply: &dyn Supply| {
                 let mut region = Region::new(outlook, t);
-                region.advance(frame, simd, outlook, bricks, 0, &mut self.scratch);
-                let Finished { pixels, counters, touched } = region.finish();
+                region.advance(frame, simd, outlook, supply, 0, &mut self.scratch);
+                let done = region.finish();
+                done.teach(&depths);
+                let Finished { pixels, counters, touched, .. } = done;
                 let size = [t.width() as u32, t.height() as u32];
                 (Leaves::of(&pixels, size, &FINISH), counters, touched)
             };
             let mut tiles: Vec<RegionTile> = Vec::with_capacity(cut.tiles.len());
             for t in &cut.tiles {
                 let outlook = Outlook::new(frame, bricks.directory());
-                let (leaves, counters, touched) = draw(t.rect, &outlook);
+                let (leaves, counters, touched) = draw(t.rect, &outlook, bricks);
                 let (result_bytes, _) = weigh(Pixels::Finished(leaves), counters);
                 let (x, y) = (t.rect.x0 as u32, t.rect.y0 as u32);
                 let opened = outlook.opened().collect();
-                tiles.push(RegionTile { x, y, ns: 0, result_bytes, touched, opened });
+                // Blocks that only this opens are opened by the way.
+                let expected = region::expected((frame, &outlook, &Nothing), t.rect, &self.depths);
+                let tile =
+                    RegionTile { x, y, result_bytes, touched, opened, ..RegionTile::default() };
+                tiles.push(RegionTile { expected, ..tile });
             }
             // All blocks that any needs are open then, as the price of one is told apart.
             let outlook = Outlook::new(frame, bricks.directory());
             let opened = tiles.iter().flat_map(|t| &t.opened);
             opened.for_each(|block| outlook.open(*block));
             let rects: Vec<Rect> = cut.tiles.iter().map(|t| t.rect).collect();
-            let times = in_turn(self.repeats, &rects, |t| drop(draw(t, &outlook)));
+            let times = in_turn(self.repeats, &rects, |t| drop(draw(t, &outlook, bricks)));
+            if edge <= PART as u32 {
+                for (tile, rect) in tiles.iter_mut().zip(&rects) {
+                    let clocked = Clocked::new(bricks);
+                    drop(draw(*rect, &outlook, &clocked));
+                    tile.needed = clocked.needed(&tile.touched);
+                }
+            }
             tiles.iter_mut().zip(times).for_each(|(tile, ns)| tile.ns = ns);
             tiles.sort_by_key(|t| (t.y, t.x));
             levels.push(RegionLevel { edge, tiles });
         }
+        self.depths = depths;
         levels
     }
 
@@ -363,6 +389,42 @@ impl Bench {
         let edges = [64, 128, 256].into_iter().filter(|e| *e as i32 <= whole.x1.max(whole.y1) * 2);
         let timed = edges.map(|edge| (edge, of(edge)));
         timed.min_by_key(|t| t.1).unwrap_or((64, 0))
+    }
+}
+
+/// No bricks.
+struct Nothing;
+
+impl Supply for Nothing {
+    fn get(&self, _: u32) -> Option<Arc<Brick>> {
+        None
+    }
+}
+
+/// Bricks, and when each was first asked for.
+struct Clocked<'a> {
+    bricks: &'a dyn Supply,
+    began: Instant,
+    came: RefCell<BTreeMap<u32, Duration>>,
+}
+
+impl<'a> Clocked<'a> {
+    fn new(bricks: &'a dyn Supply) -> Clocked<'a> {
+        Clocked { bricks, began: Instant::now(), came: RefCell::default() }
+    }
+
+    /// When that was for each of these, in thousandths of the time until now.
+    fn needed(&self, touched: &[u32]) -> Vec<u16> {
+        let (all, came) = (self.began.elapsed().as_secs_f64().max(1e-9), self.came.borrow());
+        let of = |place| came.get(place).map_or(0.0, Duration::as_secs_f64) / all;
+        touched.iter().map(|place| (1000.0 * of(place)) as u16).collect()
+    }
+}
+
+impl Supply for Clocked<'_> {
+    fn get(&self, place: u32) -> Option<Arc<Brick>> {
+        self.came.borrow_mut().entry(place).or_insert_with(|| self.began.elapsed());
+        self.bricks.get(place)
     }
 }
 

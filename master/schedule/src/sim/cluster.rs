@@ -13,15 +13,17 @@ use slabcast_common::message::{
     Counters, Lease, Pixels, RegionCost, RegionLease, TaskTimes, TileResult, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
+use slabcast_common::region::{AHEAD, PART, parts};
 use slabcast_common::slab::SheetRange;
-use slabcast_common::trace::{RegionTile, Trace};
+use slabcast_common::trace::{Course, RegionTile, Trace};
+use slabcast_common::view::Projected;
 use std::borrow::Cow;
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 mod pieces;
 
-use pieces::{Piece, state_bytes};
+use pieces::state_bytes;
 
 /// Bytes of a message that carries nothing large: head, ids, framing.
 const SMALL: u64 = 64;
@@ -127,6 +129,11 @@ struct Known<'a> {
     region: Cow<'a, RegionTile>,
 }
 
+/// Whether the brick at a place is here; those that a set does not have are.
+fn has(present: &[bool]) -> impl Fn(u32) -> bool {
+    |place| present.get(place as usize) != Some(&false)
+}
+
 /// A thread that has nothing to draw.
 #[derive(Clone, Copy, Default)]
 struct Idle {
@@ -135,23 +142,56 @@ struct Idle {
     heard: Option<Nanos>,
 }
 
+/// What a worker was lent, and how far that is.
+struct Lent<'a> {
+    task: Task,
+    known: Known<'a>,
+    /// Of a region.
+    course: Option<Course>,
+    received: Nanos,
+    /// The order in which threads take what is there.
+    order: u64,
+    /// Whether what it will need was asked for, as far as frames before tell.
+    expected: bool,
+    /// Whether any has taken it.
+    begun: bool,
+    /// Since when it stands still, how often it did, and how long in all.
+    stands: Option<Nanos>,
+    stalls: u32,
+    stood: Nanos,
+    /// Places of the bricks that it waits for.
+    waits: BTreeSet<u32>,
+    /// How long it was drawn.
+    drawn: Nanos,
+    /// When its pixels are there at the earliest.
+    pixels: Nanos,
+}
+
 struct Running<'a> {
-    lease: Task,
+    lent: Lent<'a>,
+    start: Nanos,
     /// What of its time is not the tile itself: tables, and blocks.
     tables: Nanos,
     blocks: Nanos,
-    region: Cow<'a, RegionTile>,
-    stood: Option<Nanos>,
-    received: Nanos,
-    ready: Nanos,
-    start: Nanos,
+    /// Up to when its course was followed.
+    followed: Nanos,
+    /// What messages took of its core.
+    stolen: Nanos,
     /// But for messages meanwhile.
     end: Nanos,
-    result_bytes: u64,
-    /// When its pixels are there.
-    pixels: Nanos,
     /// Which end of it is the right one.
     ends: u64,
+}
+
+impl Running<'_> {
+    /// It came as far as that.
+    fn follow(&mut self, present: &[bool], now: Nanos, stretch: f64) {
+        if let Some(course) = &mut self.lent.course {
+            let went = now.saturating_sub(self.followed);
+            course.go(went as f64 / stretch, &has(present));
+            self.followed += went;
+        }
+    }
 }
 
 struct Worker<'a> {
@@ -167,10 +207,11 @@ struct Worker<'a> {
     stolen: Nanos,
     /// Whether it has a brick, by its place in the jobs' list of its set.
     present: BTreeMap<BrickSetKey, Vec<bool>>,
-    leases: VecDeque<(Task, Nanos)>,
-    /// Bricks that regions asked for, and since when regions stand still.
+    leases: Vec<Lent<'a>>,
+    /// Bricks that regions asked for.
     asked: BTreeSet<(BrickSetKey, BrickId)>,
-    stands: BTreeMap<(TaskId, Epoch), Nanos>,
+    /// Parts of pictures that it drew: it knows how deep they are.
+    drawn: BTreeSet<(BrickSetKey, i32, i32)>,
     running: Vec<Option<Running<'a>>>,
     idle: Vec<Idle>,
     /// When its tables of a frame are made.
@@ -216,7 +257,7 @@ struct World<'a> {
     watched: Option<Nanos>,
     closed: bool,
     /// Pieces by the corners of their tiles.
-    pieces: BTreeMap<(FrameId, [i32; 4]), Piece>,
+    pieces: BTreeMap<(FrameId, [i32; 4]), Course>,
     /// When the driver lent what has not begun yet.
     decided: BTreeMap<(WorkerId, TaskId, Epoch), Nanos>,
     finished: usize,
@@ -293,9 +334,9 @@ pub fn run(
             heard: 0,
             stolen: 0,
             present: present.clone(),
-            leases: VecDeque::new(),
+            leases: Vec::new(),
             asked: BTreeSet::new(),
-            stands: BTreeMap::new(),
+            drawn: BTreeSet::new(),
             running: (0..cluster.threads).map(|_| None).collect(),
             idle: vec![Idle::default(); cluster.threads as usize],
             tables: BTreeMap::new(),
@@ -629,8 +670,7 @@ impl<'a> World<'a> {
                 self.begin(id, None)?;
             }
             Coming::Lease(id, lease) => {
-                let w = self.workers.get_mut(&id).expect("a worker stays");
-                w.leases.push_back((lease, now));
+                self.lent(id, lease)?;
                 self.begin(id, None)?;
             }
             Coming::TaskEnd(id, thread, ends) => {
@@ -640,11 +680,15 @@ impl<'a> World<'a> {
                 }
                 let stolen = std::mem::take(&mut w.stolen);
                 if stolen > 0 {
+                    if let Some(r) = &mut w.running[thread] {
+                        (r.followed, r.end) = (r.followed + stolen, now + stolen);
+                        r.stolen += stolen;
+                    }
                     self.spend(now, now + stolen, |s| &mut s.messages);
                     self.later(now + stolen, Coming::TaskEnd(id, thread, ends));
                     return Ok(());
                 }
-                self.end_task(id, thread);
+                self.stop(id, thread);
                 self.begin(id, Some(thread))?;
             }
             Coming::Chore(chore, left) => self.go_on(chore, left, took, watch)?,
@@ -668,11 +712,12 @@ impl<'a> World<'a> {
             ToWorker::HandOver { task, epoch, share, .. } => {
                 let at = self.read(id, SMALL);
                 self.hand_over(id, (task, epoch), f64::from(share) / 1000.0, at);
+                self.begin(id, None)?;
             }
             ToWorker::EndFrame { frame } => {
                 self.read(id, SMALL);
                 let w = self.workers.get_mut(&id).expect("a worker stays");
-                w.leases.retain(|(l, _)| l.frame() != frame);
+                w.leases.retain(|l| l.task.frame() != frame);
                 w.tables.remove(&frame);
                 w.opened.remove(&frame);
             }
@@ -707,12 +752,12 @@ impl<'a> World<'a> {
                 })
             }
             Task::Region(l) if l.begun.is_some() => {
-                self.piece_of(l.frame, &l.tile).map(|(ns, piece)| Known {
-                    ns,
+                self.piece_of(l.frame, &l.tile).map(|piece| Known {
+                    ns: 0,
                     lease_bytes: SMALL,
                     result_bytes: SMALL + 3 * l.tile.area() as u64,
                     region: Cow::Owned(RegionTile {
-                        touched: piece.touched.clone(),
+                        touched: piece.needs(),
                         ..RegionTile::default()
                     }),
                 })
@@ -733,59 +778,174 @@ impl<'a> World<'a> {
     /// A worker has these bricks from now on, or has them no longer.
     fn have(&mut self, id: WorkerId, set: BrickSetKey, bricks: &[BrickId], there: bool) {
         let Some(job) = self.jobs.iter().find(|j| j.scene.bricks == set) else { return };
+        let (stretch, now) = (self.cluster.stretch, self.now());
         let w = self.workers.get_mut(&id).expect("a worker stays");
+        // As far as they came without these.
+        let regions = w.running.iter_mut().flatten();
+        let of_set =
+            |task: &Task, jobs: &[FrameJob]| jobs[task.frame().0 as usize - 1].scene.bricks == set;
+        let mut running: Vec<&mut Running<'_>> =
+            regions.filter(|r| of_set(&r.lent.task, self.jobs)).collect();
         let present = w.present.get_mut(&set).expect("a set of a job");
+        running.iter_mut().for_each(|r| r.follow(present, now, stretch));
         for brick in bricks {
             if let Ok(place) = job.bricks.binary_search_by_key(brick, |b| b.id) {
                 present[place] = there;
-            }
-        }
-    }
-
-    /// The bricks at these places of a frame's set that a worker lacks.
-    fn lacks(&self, id: WorkerId, frame: FrameId, places: &[u32]) -> Vec<BrickId> {
-        let job = &self.jobs[frame.0 as usize - 1];
-        let present = &self.workers[&id].present[&job.scene.bricks];
-        let lacks = places.iter().filter(|&&p| present.get(p as usize) == Some(&false));
-        lacks.map(|&p| job.bricks[p as usize].id).collect()
-    }
-
-    /// The first task in the queue whose bricks are there. Regions before it that lack some ask for
-    /// them: a thread has come to them, and takes another meanwhile.
-    fn take(&mut self, id: WorkerId) -> Result<Option<(Task, Nanos, Known<'a>)>, Unknown> {
-        let now = self.now();
-        for i in 0..self.workers[&id].leases.len() {
-            let w = &self.workers[&id];
-            let task = &w.leases[i].0;
-            let (frame, name) = (task.frame(), task.name());
-            let set = self.jobs[frame.0 as usize - 1].scene.bricks;
-            let known = self.known(task)?;
-            let lacks = match task {
-                Task::Slab(l) => {
-                    let all = &self.jobs[frame.0 as usize - 1].bricks;
-                    let place = |b: &BrickId| all.binary_search_by_key(b, |b| b.id).ok();
-                    let here = |b| place(b).is_some_and(|i| w.present[&set][i]);
-                    if !l.bricks.iter().all(here) {
-                        continue;
+                if there {
+                    let waiting = w.leases.iter_mut().filter(|l| of_set(&l.task, self.jobs));
+                    for lent in waiting {
+                        lent.waits.remove(&(place as u32));
                     }
-                    Vec::new()
                 }
-                Task::Region(_) => self.lacks(id, frame, &known.region.touched),
-            };
-            let w = self.workers.get_mut(&id).expect("a worker stays");
-            if lacks.is_empty() {
-                let (task, received) = w.leases.remove(i).expect("just seen");
-                return Ok(Some((task, received, known)));
-            }
-            w.stands.entry(name).or_insert(now);
-            let bricks: Vec<BrickId> =
-                lacks.into_iter().filter(|b| w.asked.insert((set, *b))).collect();
-            if !bricks.is_empty() {
-                let bytes = SMALL + 2 * bricks.len() as u64;
-                self.up(id, Event::BricksWanted { worker: id, set, bricks }, bytes, now);
             }
         }
-        Ok(None)
+        let threads = 0..self.cluster.threads as usize;
+        threads.for_each(|thread| self.goes_until(id, thread));
+    }
+
+    /// A region that is drawn goes so far with the bricks that are here now.
+    fn goes_until(&mut self, id: WorkerId, thread: usize) {
+        self.order += 1;
+        let (ends, stretch) = (self.order, self.cluster.stretch);
+        let w = self.workers.get_mut(&id).expect("a worker stays");
+        let Some(r) = &mut w.running[thread] else { return };
+        let Some(course) = &r.lent.course else { return };
+        let set = self.jobs[r.lent.task.frame().0 as usize - 1].scene.bricks;
+        let goes = course.goes(&has(&w.present[&set]));
+        let end = r.followed + (goes * stretch).round() as Nanos;
+        if end != r.end {
+            (r.end, r.ends) = (end, ends);
+            self.later(end, Coming::TaskEnd(id, thread, ends));
+        }
+    }
+
+    /// What a frame sees of a brick.
+    fn sees(&self, frame: FrameId) -> impl Fn(u32) -> Option<Projected> + use<'a> {
+        let jobs: &'a [FrameJob] = self.jobs;
+        let job = &jobs[frame.0 as usize - 1];
+        |place| job.view.project(&job.bricks.get(place as usize)?.tight)
+    }
+
+    /// A worker is lent a task.
+    fn lent(&mut self, id: WorkerId, task: Task) -> Result<(), Unknown> {
+        let known = self.known(&task)?;
+        let frame = task.frame();
+        let course = match &task {
+            Task::Slab(_) => None,
+            Task::Region(l) if l.begun.is_some() => self.piece_of(frame, &l.tile),
+            Task::Region(l) => {
+                let traced = &self.trace.frames[frame.0 as usize - 1];
+                Course::of(traced, &l.tile, self.trace.about.size, &self.sees(frame))
+            }
+        };
+        self.order += 1;
+        let lent = Lent {
+            task,
+            known,
+            course,
+            received: self.now(),
+            order: self.order,
+            expected: false,
+            begun: false,
+            stands: None,
+            stalls: 0,
+            stood: 0,
+            waits: BTreeSet::new(),
+            drawn: 0,
+            pixels: 0,
+        };
+        self.workers.get_mut(&id).expect("a worker stays").leases.push(lent);
+        Ok(())
+    }
+
+    /// What a thread takes next: of the oldest frame, what goes on before what begins, as `worker::pool`. A region that
+    /// stands before its first sheet asks for what it lacks there, and the next one is looked at.
+    fn take(&mut self, id: WorkerId) -> Option<Lent<'a>> {
+        let now = self.now();
+        self.expect(id);
+        loop {
+            let w = &self.workers[&id];
+            let set_of = |task: &Task| self.jobs[task.frame().0 as usize - 1].scene.bricks;
+            let is_there = |l: &Lent<'_>| match &l.task {
+                Task::Slab(lease) => {
+                    let all = &self.jobs[lease.frame.0 as usize - 1].bricks;
+                    let place = |b: &BrickId| all.binary_search_by_key(b, |b| b.id).ok();
+                    let present = &w.present[&set_of(&l.task)];
+                    lease.bricks.iter().all(|b| place(b).is_some_and(|i| present[i]))
+                }
+                Task::Region(_) => l.waits.is_empty(),
+            };
+            let there = (0..w.leases.len()).filter(|&i| is_there(&w.leases[i]));
+            let at = there.min_by_key(|&i| {
+                let l = &w.leases[i];
+                (l.task.frame(), !l.begun && l.stalls == 0, l.order)
+            })?;
+            let set = set_of(&w.leases[at].task);
+            let w = self.workers.get_mut(&id).expect("a worker stays");
+            let mut lent = w.leases.remove(at);
+            if let Some(course) = &mut lent.course {
+                course.take();
+                let present = &w.present[&set];
+                if !course.is_over() && course.goes(&has(present)) <= 0.0 {
+                    self.park(id, lent);
+                    continue;
+                }
+            }
+            if let Some(since) = lent.stands.take() {
+                lent.stood += now - since;
+            }
+            return Some(lent);
+        }
+    }
+
+    /// A thread asks for what regions will need that nobody has begun, as far as those of frames before tell, which were
+    /// drawn here (`worker::pool`).
+    fn expect(&mut self, id: WorkerId) {
+        let now = self.now();
+        let w = self.workers.get_mut(&id).expect("a worker stays");
+        let mut wishes: BTreeMap<BrickSetKey, Vec<BrickId>> = BTreeMap::new();
+        for lent in w.leases.iter_mut().filter(|l| !l.expected) {
+            lent.expected = true;
+            let Task::Region(lease) = &lent.task else { continue };
+            let job = &self.jobs[lease.frame.0 as usize - 1];
+            let set = job.scene.bricks;
+            if !parts(lease.tile).all(|p| w.drawn.contains(&(set, p.x0 / PART, p.y0 / PART))) {
+                continue;
+            }
+            let here = has(&w.present[&set]);
+            let lacks = lent.known.region.expected.iter().filter(|place| !here(**place));
+            let ids = lacks.filter_map(|place| Some(job.bricks.get(*place as usize)?.id));
+            let asked = &mut w.asked;
+            wishes.entry(set).or_default().extend(ids.filter(|id| asked.insert((set, *id))));
+        }
+        for (set, bricks) in wishes.into_iter().filter(|(_, bricks)| !bricks.is_empty()) {
+            let bytes = SMALL + 2 * bricks.len() as u64;
+            self.up(id, Event::BricksWanted { worker: id, set, bricks }, bytes, now);
+        }
+    }
+
+    /// A region asks for what it lacks, and stands still.
+    fn park(&mut self, id: WorkerId, mut lent: Lent<'a>) {
+        let now = self.now();
+        let job = &self.jobs[lent.task.frame().0 as usize - 1];
+        let set = job.scene.bricks;
+        let w = self.workers.get_mut(&id).expect("a worker stays");
+        let lacks = match &lent.course {
+            Some(course) => course.lacks(&has(&w.present[&set]), AHEAD),
+            None => Vec::new(),
+        };
+        let ids = lacks.iter().map(|&place| job.bricks[place as usize].id);
+        let bricks: Vec<BrickId> = ids.filter(|b| w.asked.insert((set, *b))).collect();
+        lent.stalls += 1;
+        lent.stands = lent.stands.or(Some(now));
+        lent.waits.extend(lacks);
+        self.order += 1;
+        lent.order = self.order;
+        w.leases.push(lent);
+        if !bricks.is_empty() {
+            let bytes = SMALL + 2 * bricks.len() as u64;
+            self.up(id, Event::BricksWanted { worker: id, set, bricks }, bytes, now);
+        }
     }
 
     /// Free threads begin leases whose bricks are there. One of them is `awake`: it has just ended another.
@@ -795,13 +955,11 @@ impl<'a> World<'a> {
             let w = self.workers.get_mut(&id).expect("a worker stays");
             let free = awake.or_else(|| w.running.iter().position(Option::is_none));
             let Some(thread) = free else { return Ok(()) };
-            let Some((lease, received, known)) = self.take(id)? else { return Ok(()) };
+            let lacking = w.leases.iter().filter_map(|l| l.stands).min();
+            let Some(mut lent) = self.take(id) else { return Ok(()) };
             let mut now = self.now();
-            let w = &self.workers[&id];
-            let (task, epoch) = lease.name();
-            let here = w.leases.iter().map(|(l, _)| l.name()).chain([(task, epoch)]);
-            let lacking = here.filter_map(|name| w.stands.get(&name).copied()).min();
-            let idle = w.idle[thread];
+            let (task, epoch) = lent.task.name();
+            let idle = self.workers[&id].idle[thread];
             let decided = self.decided.remove(&(id, task, epoch));
             if awake.take().is_none() {
                 let at = now + woken as Nanos;
@@ -810,60 +968,50 @@ impl<'a> World<'a> {
                 self.was_idle(idle, decided, lacking, self.now());
                 self.spend(self.now(), now, |s| &mut s.way);
             }
-            let frame = lease.frame();
+            let frame = lent.task.frame();
             let traced = &self.trace.frames[frame.0 as usize - 1];
             let mut setup = traced.setup_ns;
-            if matches!(lease, Task::Region(_)) {
+            if matches!(lent.task, Task::Region(_)) {
                 setup += traced.outlook_ns;
             }
             let stretch = self.cluster.stretch;
             let w = self.workers.get_mut(&id).expect("a worker stays");
-            // Its threads share what they looked at.
-            let known_of = w.opened.entry(frame).or_default();
-            let fresh = known.region.opened.iter().filter(|b| known_of.insert(**b)).count();
-            let blocks = traced.block_ns.saturating_mul(fresh as u64);
-            let ns = known.ns.saturating_add(blocks);
+            let mut blocks = 0;
+            if !lent.begun {
+                // Its threads share what they looked at.
+                let known_of = w.opened.entry(frame).or_default();
+                let opened = &lent.known.region.opened;
+                let fresh = opened.iter().filter(|b| known_of.insert(**b)).count();
+                blocks = (traced.block_ns.saturating_mul(fresh as u64) as f64 * stretch) as Nanos;
+            }
             // The first tile of a frame makes its tables; others wait for them.
             let made = *w.tables.entry(frame).or_insert(now + (setup as f64 * stretch) as Nanos);
-            let end = made.max(now) + (ns as f64 * stretch) as Nanos;
-            self.outcome.frames[frame.0 as usize - 1].render += end - now;
-            let pixels = match &mut self.machine {
-                Some(machine) => {
-                    let (fixed, pixel) = self.cluster.costs.hold;
-                    let ns = fixed + pixel * lease.tile().area() as f64;
-                    self.worker_work += ns as Nanos;
-                    machine.run(now, ns).max(end + self.cluster.costs.late as Nanos)
-                }
-                None => end,
+            let tables = made.saturating_sub(now);
+            let begins = !std::mem::replace(&mut lent.begun, true);
+            let from = now + tables + blocks;
+            let set = self.jobs[frame.0 as usize - 1].scene.bricks;
+            let ns = match &lent.course {
+                Some(course) => course.goes(&has(&w.present[&set])),
+                None => lent.known.ns as f64,
             };
-            let w = self.workers.get_mut(&id).expect("a worker stays");
-            let stood = w.stands.remove(&lease.name()).map(|since| now - since);
-            let Known { result_bytes, region, .. } = known;
-            let (ready, start) = (now, now);
-            let (tables, blocks) = (made.saturating_sub(now), (blocks as f64 * stretch) as Nanos);
+            let end = from + (ns * stretch).round() as Nanos;
+            if begins && let Some(machine) = &mut self.machine {
+                let (fixed, pixel) = self.cluster.costs.hold;
+                let ns = fixed + pixel * lent.task.tile().area() as f64;
+                self.worker_work += ns as Nanos;
+                lent.pixels = machine.run(now, ns);
+            }
             self.order += 1;
             let ends = self.order;
-            let w = self.workers.get_mut(&id).expect("a worker stays");
-            let running = Running {
-                lease,
-                tables,
-                blocks,
-                region,
-                stood,
-                received,
-                ready,
-                start,
-                end,
-                result_bytes,
-                pixels,
-                ends,
-            };
+            let running =
+                Running { lent, start: now, tables, blocks, followed: from, stolen: 0, end, ends };
             w.running[thread] = Some(running);
             self.later(end, Coming::TaskEnd(id, thread, ends));
         }
     }
 
-    fn end_task(&mut self, id: WorkerId, thread: usize) {
+    /// A thread is at a task's end, or where it lacks bricks.
+    fn stop(&mut self, id: WorkerId, thread: usize) {
         let now = self.now();
         let w = self.workers.get_mut(&id).expect("a worker stays");
         let r = w.running[thread].take().expect("a task that ends has begun");
@@ -871,12 +1019,32 @@ impl<'a> World<'a> {
         let (tables, blocks) = (r.start + r.tables, r.start + r.tables + r.blocks);
         self.spend(r.start, tables, |s| &mut s.tables);
         self.spend(tables, blocks, |s| &mut s.blocks);
-        self.spend(blocks, r.end, |s| &mut s.tiles);
-        let (tile, frame) = (r.lease.tile(), r.lease.frame().0 as usize - 1);
+        let drawn = now - r.stolen;
+        self.spend(blocks, drawn, |s| &mut s.tiles);
+        let mut lent = r.lent;
+        lent.drawn += now - r.start;
+        let frame = lent.task.frame();
+        self.outcome.frames[frame.0 as usize - 1].render += drawn - r.start;
+        if let Some(course) = &mut lent.course {
+            let set = self.jobs[frame.0 as usize - 1].scene.bricks;
+            let present = &self.workers[&id].present[&set];
+            course.go(f64::INFINITY, &has(present));
+            if !course.is_over() {
+                self.park(id, lent);
+                return;
+            }
+        }
+        self.end_task(id, thread, lent);
+    }
+
+    fn end_task(&mut self, id: WorkerId, thread: usize, lent: Lent<'a>) {
+        let now = self.now();
+        let (tile, frame) = (lent.task.tile(), lent.task.frame().0 as usize - 1);
         let size = self.trace.about.size;
         let mut a = Vec::with_capacity(tile.area());
         let mut region = None;
-        match &r.lease {
+        let Known { result_bytes, region: traced, .. } = lent.known;
+        match &lent.task {
             Task::Slab(l) => {
                 let shut = self.shut.entry((frame, l.slab.first)).or_insert_with(|| {
                     self.trace.frames[frame].slab(l.slab).map_or_else(Vec::new, |s| s.shut(size))
@@ -891,39 +1059,43 @@ impl<'a> World<'a> {
                 if self.jobs[frame].finish.is_none() {
                     a.resize(tile.area(), 0.0);
                 }
+                let set = self.jobs[frame].scene.bricks;
+                let w = self.workers.get_mut(&id).expect("a worker stays");
+                w.drawn.extend(parts(tile).map(|p| (set, p.x0 / PART, p.y0 / PART)));
                 region = Some(RegionCost {
-                    touched: r.region.into_owned().touched,
-                    stalls: u32::from(r.stood.is_some()),
-                    parked_us: micros(r.stood.unwrap_or(0)),
+                    touched: traced.into_owned().touched,
+                    stalls: lent.stalls,
+                    parked_us: micros(lent.stood),
                     ..RegionCost::default()
                 });
             }
         }
-        let (task, epoch) = r.lease.name();
-        let pixels = match (&r.lease, self.jobs[frame].finish) {
+        let (task, epoch) = lent.task.name();
+        let pixels = match (&lent.task, self.jobs[frame].finish) {
             (Task::Region(_), Some(finish)) => {
                 let size = [tile.width() as u32, tile.height() as u32];
                 Pixels::Finished(Leaves::blank(size, finish.format))
             }
             _ => Pixels::Sums(TilePixels { a, colour: vec![[0; 3]; tile.area()], last: None }),
         };
+        let late = self.machine.as_ref().map_or(0, |_| self.cluster.costs.late as Nanos);
         let result = Box::new(TileResult {
             task,
             epoch,
             pixels,
             counters: Counters::default(),
             times: TaskTimes {
-                received_us: micros(r.received),
-                ready_us: micros(r.ready),
-                start_us: micros(r.start),
+                received_us: micros(lent.received),
+                ready_us: micros(lent.received + lent.stood),
+                start_us: micros(now - lent.drawn),
                 end_us: micros(now),
                 thread: thread as u32,
             },
             region,
-            bytes: Some(r.result_bytes.min(u64::from(u32::MAX)) as u32),
+            bytes: Some(result_bytes.min(u64::from(u32::MAX)) as u32),
         });
         let event = Event::Result { worker: id, result };
-        self.up(id, event, r.result_bytes, r.pixels.max(now));
+        self.up(id, event, result_bytes, lent.pixels.max(now + late));
     }
 
     /// The driver: everything that lies before it, then the wishes.

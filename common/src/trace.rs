@@ -44,6 +44,12 @@ pub struct Trace {
     pub frames: Vec<FrameTrace>,
 }
 
+/// What traces of all versions have.
+#[derive(Deserialize)]
+struct Versioned {
+    version: u32,
+}
+
 /// What a trace is of.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -222,17 +228,23 @@ impl Trace {
     /// What is wrong with it, and the remedy.
     pub fn from_json(bytes: &[u8]) -> Result<Trace, NoTrace> {
         let no = |why: String| Err(NoTrace(why));
+        let other = |version: u32| {
+            no(format!(
+                "is a trace of version {version}, this program reads {VERSION}; measure it again"
+            ))
+        };
         let trace: Trace = match serde_json::from_slice(bytes) {
             Ok(trace) => trace,
-            Err(e) => {
-                return no(format!("is no trace: {e}; give a file of `slabcast plan --trace`"));
-            }
+            // One of another version may have tiles of other lengths.
+            Err(e) => match serde_json::from_slice::<Versioned>(bytes) {
+                Ok(Versioned { version }) if version != VERSION => return other(version),
+                _ => {
+                    return no(format!("is no trace: {e}; give a file of `slabcast plan --trace`"));
+                }
+            },
         };
         if trace.version != VERSION {
-            return no(format!(
-                "is a trace of version {}, this program reads {VERSION}; measure it again",
-                trace.version
-            ));
+            return other(trace.version);
         }
         if trace.about.pixels_version != crate::PIXELS_VERSION {
             return no(format!(
@@ -562,6 +574,9 @@ mod tests {
         let good = trace().to_json();
         assert!(says("{}").contains("slabcast plan --trace"));
         assert!(says(&good.replacen("\"version\":4", "\"version\":5", 1)).contains("version 5"));
+        let old = good.replace("\"version\":4", "\"version\":3").replace(",[2,1,68]]", "]");
+        assert!(old.len() < good.len() && says(&old).contains("version 3"), "{old}");
+        assert!(says(&good.replace(",[2,1,68]]", "]")).contains("invalid length"));
         assert!(says(&good.replace("[100,70]", "[100,0]")).starts_with("about.size"));
         assert!(says(&good.replace("[100,70]", "[10,7]")).contains("more pixels"));
         assert!(says(&good.replace("\"edge\":64", "\"edge\":65")).contains("65 is no edge"));

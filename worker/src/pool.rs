@@ -219,9 +219,7 @@ impl Going {
             looked,
         }
     }
-}
 
-impl Going {
     /// Whether no thread has come to it.
     fn begins(&self) -> bool {
         self.region.is_none() && self.course.is_none()

@@ -30,11 +30,11 @@ pub(crate) const LOOKS: i32 = 8;
 /// A cell with fewer open pixels is shut.
 const LEAST: u8 = 8;
 
-/// Sheets that a brick has to begin before the sheet at which what lies over it was shut: two bricks. With 4, 8 and 12
-/// that worker held 31, 29 and 28 %.
+/// Sheets that a brick has to begin before the sheet at which what lies over it was shut: two bricks where sheets are a voxel
+/// thick. With 4, 8 and 12 that worker held 31, 29 and 28 %.
 const SLACK: i32 = 16;
 
-/// Pixels at a brick's border that do not count: footprints hardly reach there. 0.7 % are held for none.
+/// Pixels at a brick's border that do not count: footprints hardly reach there. Without that 0.7 % more are held.
 const BORDER: i32 = 3;
 
 /// How many bits each byte has.

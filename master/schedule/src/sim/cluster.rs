@@ -122,6 +122,7 @@ impl Task {
 
 /// What a trace says of a task.
 struct Known<'a> {
+    /// Of a task of a slab; a region's time is its course's.
     ns: u64,
     lease_bytes: u64,
     result_bytes: u64,
@@ -901,7 +902,6 @@ impl<'a> World<'a> {
     /// A thread asks for what regions will need that nobody has begun, as far as those of frames before tell, which were
     /// drawn here (`worker::pool`).
     fn expect(&mut self, id: WorkerId) {
-        let now = self.now();
         let w = self.workers.get_mut(&id).expect("a worker stays");
         let mut wishes: BTreeMap<BrickSetKey, Vec<BrickId>> = BTreeMap::new();
         for lent in w.leases.iter_mut().filter(|l| !l.expected) {
@@ -918,9 +918,14 @@ impl<'a> World<'a> {
             let asked = &mut w.asked;
             wishes.entry(set).or_default().extend(ids.filter(|id| asked.insert((set, *id))));
         }
-        for (set, bricks) in wishes.into_iter().filter(|(_, bricks)| !bricks.is_empty()) {
+        wishes.into_iter().for_each(|(set, bricks)| self.wish(id, set, bricks));
+    }
+
+    /// A worker asks for bricks, if there are any to ask for.
+    fn wish(&mut self, id: WorkerId, set: BrickSetKey, bricks: Vec<BrickId>) {
+        if !bricks.is_empty() {
             let bytes = SMALL + 2 * bricks.len() as u64;
-            self.up(id, Event::BricksWanted { worker: id, set, bricks }, bytes, now);
+            self.up(id, Event::BricksWanted { worker: id, set, bricks }, bytes, self.now());
         }
     }
 
@@ -942,10 +947,7 @@ impl<'a> World<'a> {
         self.order += 1;
         lent.order = self.order;
         w.leases.push(lent);
-        if !bricks.is_empty() {
-            let bytes = SMALL + 2 * bricks.len() as u64;
-            self.up(id, Event::BricksWanted { worker: id, set, bricks }, bytes, now);
-        }
+        self.wish(id, set, bricks);
     }
 
     /// Free threads begin leases whose bricks are there. One of them is `awake`: it has just ended another.

@@ -120,10 +120,10 @@ impl Rehearsal {
         if known.touched.last().is_some_and(|&last| last as usize >= bricks.len()) {
             return Err(unknown());
         }
+        let sees = |place: u32| frame.view.project(&bricks.get(place as usize)?.tight);
         let course = match &mut going.course {
             Some(course) => course,
             course => {
-                let sees = |place: u32| frame.view.project(&bricks.get(place as usize)?.tight);
                 let of = Course::of(traced, &tile, size, &sees);
                 course.insert(of.ok_or_else(unknown)?)
             }
@@ -132,7 +132,7 @@ impl Rehearsal {
         let has = |place: u32| place as usize >= bricks.len() || shelf.holds(place);
         course.take();
         if course.goes(&has) <= 0.0 && !course.is_over() {
-            return Ok((Came::Lacks(course.lacks(&has, AHEAD), true), start));
+            return Ok((Came::Lacks(course.lacks(&has, AHEAD, &sees), true), start));
         }
         let setup = Duration::from_nanos(traced.setup_ns + traced.outlook_ns);
         let mut end = (*frame.made.get_or_init(|| start + setup)).max(start);
@@ -158,7 +158,7 @@ impl Rehearsal {
         }
         going.drawn += end - begun;
         if !course.is_over() {
-            return Ok((Came::Lacks(course.lacks(&has, AHEAD), true), end));
+            return Ok((Came::Lacks(course.lacks(&has, AHEAD, &sees), true), end));
         }
         locked(&frame.scene.parts).extend(parts(tile).map(|p| [p.x0, p.y0]));
         let (counters, sampled) = (Counters::default(), Sampling::default());

@@ -29,8 +29,6 @@ struct Need {
     /// Nanoseconds after its part was begun.
     at: f64,
     place: u32,
-    /// Its first sheet.
-    sheet: i32,
 }
 
 /// A part of a tile.
@@ -94,18 +92,22 @@ fn more(piece: &Rect, tile: &Rect) -> f64 {
 }
 
 /// A traced tile of one part.
-fn strand(rect: Rect, tile: &RegionTile, sees: Sees<'_>) -> Strand {
+fn strand(rect: Rect, tile: &RegionTile) -> Strand {
     let ns = tile.ns as f64;
     let mut needs: Vec<Need> = (tile.touched.iter().enumerate())
         .map(|(i, &place)| {
             let part = f64::from(tile.needed.get(i).copied().unwrap_or(0)) / 1000.0;
-            let sheet = sees(place).map_or(i32::MIN, |p| p.sheets.first);
             // Before its end: who is there has all that it was drawn from.
-            Need { at: (part * ns).clamp(0.0, (ns - 1.0).max(0.0)), place, sheet }
+            Need { at: (part * ns).clamp(0.0, (ns - 1.0).max(0.0)), place }
         })
         .collect();
     needs.sort_by(|a, b| a.at.total_cmp(&b.at).then(a.place.cmp(&b.place)));
     Strand { rect, ns, done: 0.0, needs }
+}
+
+/// The sheet at which a brick begins; one that is not seen begins before all.
+fn first_sheet(sees: Sees<'_>, place: u32) -> i32 {
+    sees(place).map_or(i32::MIN, |p| p.sheets.first)
 }
 
 impl Course {
@@ -115,17 +117,17 @@ impl Course {
         let whole = traced.region(tile, size);
         let part = |rect: Rect| {
             if let Some(known) = traced.region(&rect, size) {
-                return Some(strand(rect, &known, sees));
+                return Some(strand(rect, &known));
             }
             let square = square_of(&rect, size);
             let known = traced.region(&square, size)?;
-            strand(square, &known, sees).within(&rect, more(&rect, &square), sees)
+            strand(square, &known).within(&rect, more(&rect, &square), sees)
         };
         let known: Option<Vec<Strand>> = parts(*tile).map(part).collect();
         let mut strands = match (known, &whole) {
             (Some(strands), _) => strands,
             // Only tiles of this edge were traced: when each brick is needed nobody knows.
-            (None, Some(whole)) => vec![strand(*tile, whole, sees)],
+            (None, Some(whole)) => vec![strand(*tile, whole)],
             (None, None) => return None,
         };
         if let (Some(whole), [_, _, ..]) = (&whole, &strands[..]) {
@@ -174,13 +176,14 @@ impl Course {
     }
 
     /// What it lacks where its parts stand, and up to so many sheets beyond, each brick once.
-    pub fn lacks(&self, has: Has<'_>, ahead: u32) -> Vec<u32> {
+    pub fn lacks(&self, has: Has<'_>, ahead: u32, sees: Sees<'_>) -> Vec<u32> {
         let mut lacks = Vec::new();
+        let sheet = |n: &Need| first_sheet(sees, n.place);
         for s in self.strands.iter().filter(|s| s.done < s.ns) {
             let Some(first) = s.lacked(has).filter(|n| n.at <= s.done) else { continue };
-            let until = first.sheet.saturating_add_unsigned(ahead);
-            for n in s.needs.iter().filter(|n| n.at >= s.done && n.sheet <= until) {
-                if !has(n.place) && !lacks.contains(&n.place) {
+            let until = sheet(first).saturating_add_unsigned(ahead);
+            for n in s.needs.iter().filter(|n| n.at >= s.done && !has(n.place)) {
+                if sheet(n) <= until && !lacks.contains(&n.place) {
                     lacks.push(n.place);
                 }
             }
@@ -218,11 +221,11 @@ impl Course {
     }
 
     /// The sheets before which a piece's parts stand; `None` of one at its end. `tile` is the piece.
-    pub fn sheets(&self, tile: Rect) -> Vec<Option<i32>> {
+    pub fn sheets(&self, tile: Rect, sees: Sees<'_>) -> Vec<Option<i32>> {
         let of = |part: Rect| {
             let s = self.strands.iter().find(|s| !s.rect.intersect(&part).is_empty())?;
             let next = s.needs.iter().find(|n| n.at >= s.done).or(s.needs.last());
-            (s.done < s.ns).then(|| next.map_or(0, |n| n.sheet))
+            (s.done < s.ns).then(|| next.map_or(0, |n| first_sheet(sees, n.place)))
         };
         parts(tile).map(of).collect()
     }
@@ -293,24 +296,24 @@ mod tests {
     #[test]
     fn a_tile_goes_as_far_as_its_bricks_and_asks_a_few_sheets_ahead() {
         let mut c = course(LEFT);
-        assert_eq!(c.lacks(&|_| false, 5), [0, 4], "20 is deeper");
+        assert_eq!(c.lacks(&|_| false, 5, &sees), [0, 4], "20 is deeper");
         assert_eq!(
             (c.goes(&|_| false), c.goes(&|p| p == 0), c.goes(&|_| true)),
             (0.0, 100.0, 1000.0)
         );
         c.go(60.0, &|p| p == 0);
         assert_eq!(c.takes(), (1000.0, 940.0));
-        assert_eq!(c.lacks(&|p| p == 0, 5), [0u32; 0], "it does not stand still");
+        assert_eq!(c.lacks(&|p| p == 0, 5, &sees), [0u32; 0], "it does not stand still");
         // The next one comes meanwhile.
         assert_eq!(c.goes(&|p| p < 9), 640.0);
         c.go(640.0, &|p| p < 9);
         assert!(!c.is_over());
-        assert_eq!((c.lacks(&|p| p < 9, 5), c.needs()), (vec![20], vec![20]));
-        assert_eq!(c.sheets(LEFT), [Some(20)]);
+        assert_eq!((c.lacks(&|p| p < 9, 5, &sees), c.needs()), (vec![20], vec![20]));
+        assert_eq!(c.sheets(LEFT, &sees), [Some(20)]);
         c.take();
         c.go(f64::INFINITY, &|_| true);
         assert!(c.is_over());
-        assert_eq!(c.sheets(LEFT), [None]);
+        assert_eq!(c.sheets(LEFT, &sees), [None]);
     }
 
     #[test]
@@ -320,7 +323,7 @@ mod tests {
         let has = |p: u32| p != 4;
         assert_eq!(c.goes(&has), 2.0 * (100.0 + 500.0 + 100.0 + 500.0));
         c.go(f64::INFINITY, &has);
-        assert_eq!(c.lacks(&has, 5), [4], "once for both");
+        assert_eq!(c.lacks(&has, 5, &sees), [4], "once for both");
         assert_eq!(c.goes(&|_| true), 0.0, "that they could go on it finds when it is taken");
         c.take();
         assert_eq!(c.goes(&|_| true), 3600.0);
@@ -332,7 +335,7 @@ mod tests {
         only.regions.remove(0);
         let c = Course::of(&only, &ALL, SIZE, &sees).expect("the tile itself is traced");
         assert_eq!(c.takes().0, 6000.0);
-        assert_eq!(c.lacks(&|_| false, 5), [0, 1, 4], "all are needed at once");
+        assert_eq!(c.lacks(&|_| false, 5, &sees), [0, 1, 4], "all are needed at once");
         assert_eq!(Course::of(&only, &LEFT, SIZE, &sees), None);
         let half = course(Rect::new(0, 0, 64, 32));
         assert!((500.0..600.0).contains(&half.takes().0), "with a border of its own: {half:?}");
@@ -357,7 +360,7 @@ mod tests {
                 prop_assert!((all - left - gone).abs() < 20.0, "{gone} of {all}, {left} left");
                 if c.goes(&has) <= 0.0 {
                     c.take();
-                    prop_assert!(c.goes(&has) > 0.0 || c.is_over() || !c.lacks(&has, 5).is_empty());
+                    prop_assert!(c.goes(&has) > 0.0 || c.is_over() || !c.lacks(&has, 5, &sees).is_empty());
                 }
                 here.insert(brick);
             }
@@ -372,7 +375,7 @@ mod tests {
             let both: f64 = pieces.iter().map(|p| p.takes().1).sum();
             prop_assert!(both >= left * 0.99 && both <= left * 1.7 + 1.0, "{both} for {left}");
             for (mut piece, tile) in pieces.into_iter().zip([kept, given]) {
-                prop_assert_eq!(piece.sheets(tile).len(), parts(tile).count());
+                prop_assert_eq!(piece.sheets(tile, &sees).len(), parts(tile).count());
                 piece.take();
                 piece.go(f64::INFINITY, &|_| true);
                 prop_assert!(piece.is_over());

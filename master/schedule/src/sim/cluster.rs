@@ -934,9 +934,10 @@ impl<'a> World<'a> {
         let now = self.now();
         let job = &self.jobs[lent.task.frame().0 as usize - 1];
         let set = job.scene.bricks;
+        let sees = self.sees(lent.task.frame());
         let w = self.workers.get_mut(&id).expect("a worker stays");
         let lacks = match &lent.course {
-            Some(course) => course.lacks(&has(&w.present[&set]), AHEAD),
+            Some(course) => course.lacks(&has(&w.present[&set]), AHEAD, &sees),
             None => Vec::new(),
         };
         let ids = lacks.iter().map(|&place| job.bricks[place as usize].id);

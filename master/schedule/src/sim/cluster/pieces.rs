@@ -103,7 +103,7 @@ impl<'a> World<'a> {
         // Of one that nothing was drawn into there are no sums.
         let last = (left < all).then(|| vec![[0; 4]; n]);
         let pixels = TilePixels { a: vec![0.0; n], colour: vec![[0; 3]; n], last };
-        let begun = Begun { sheets: piece.sheets(given), pixels };
+        let begun = Begun { sheets: piece.sheets(given, &sees), pixels };
         if let Some(thread) = thread {
             self.goes_until(id, thread);
         }

@@ -12,7 +12,7 @@ use crate::occlusion::Rect;
 use crate::quality::{Quality, Refused};
 use crate::slab::SheetRange;
 use crate::volume::Lattice;
-use glam::{DMat3, DVec3, Vec3};
+use glam::{DMat3, DVec2, DVec3, Vec3};
 
 /// Screen positions are rounded to 1/2^8 = 1/256 pixel.
 ///
@@ -425,6 +425,24 @@ impl View {
                 (focal / depth(sheets.first).max(near), focal / depth(sheets.end - 1))
             }
         };
+        let rect = self.window((lo.truncate(), hi.truncate()), r.truncate(), scales);
+        (!rect.is_empty()).then_some(Projected { rect, sheets })
+    }
+
+    /// The pixels of [`Self::project`] alone. In parallel projection they hang on no sheet, and take a third of the time.
+    pub fn outline(&self, b: &TightBox) -> Option<Rect> {
+        let Projection::Ortho { scale } = self.projection else {
+            return self.project(b).map(|p| p.rect);
+        };
+        let (lo, hi) = self.eye_box(b);
+        let r = self.kernel_lean.reach(self.kernel_radius);
+        let rect = self.window((lo.truncate(), hi.truncate()), r.truncate(), (scale, scale));
+        (!rect.is_empty()).then_some(rect)
+    }
+
+    /// Pixels in which a box from `lo` to `hi` in eye space, grown by a reach, lies at either scale and between.
+    #[inline(always)]
+    fn window(&self, (lo, hi): (DVec2, DVec2), reach: DVec2, scales: (f64, f64)) -> Rect {
         let span = |lo: f64, hi: f64, n: u32| {
             let at_lo = (lo * scales.0).min(lo * scales.1) + f64::from(n) * 0.5;
             let at_hi = (hi * scales.0).max(hi * scales.1) + f64::from(n) * 0.5;
@@ -434,10 +452,9 @@ impl View {
             let last = floor(at_hi - 0.5 + 1.0 / 32.0).min(f64::from(n) - 1.0);
             (first as i32, last as i32 + 1)
         };
-        let (x0, x1) = span(lo.x - r.x, hi.x + r.x, self.size[0]);
-        let (y0, y1) = span(lo.y - r.y, hi.y + r.y, self.size[1]);
-        let rect = Rect::new(x0, y0, x1, y1);
-        (!rect.is_empty()).then_some(Projected { rect, sheets })
+        let (x0, x1) = span(lo.x - reach.x, hi.x + reach.x, self.size[0]);
+        let (y0, y1) = span(lo.y - reach.y, hi.y + reach.y, self.size[1]);
+        Rect::new(x0, y0, x1, y1)
     }
 }
 
@@ -615,6 +632,7 @@ mod tests {
             let base = [corner.0 * 8, corner.1 * 8, corner.2 * 8];
             let boxed = TightBox { lo: base, hi: base.map(|x| x + 7) };
             let projected = v.project(&boxed);
+            prop_assert_eq!(v.outline(&boxed), projected.map(|p| p.rect));
             let eye = v.corner_in_eye(base) + v.offset_in_eye([pick.0, pick.1, pick.2]);
             let phases = v.depth_phases();
             let zq = f64::from(v.depth_in_phases(eye.z)) / f64::from(phases);

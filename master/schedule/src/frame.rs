@@ -22,6 +22,7 @@
 use crate::borders;
 use crate::critical::Piece;
 use crate::crowd::Crowd;
+use crate::foresight::Outlook;
 use crate::ledger::{Ledger, Rendered, ms, place_in_time};
 use crate::macrotile::{self, Cut, LEAF, LEVELS};
 use crate::queue::{End, PARTS, Queue, Verdict};
@@ -144,6 +145,10 @@ pub(crate) struct Frame {
     pieces_at: Option<Micros>,
     /// Parts of tiles that were cut late, and who is to have them: what they were drawn from goes along.
     gained: Vec<(WorkerId, u32)>,
+    /// Whose tiles lie where; of regions that several draw.
+    outlook: Option<Outlook>,
+    /// Where each block of bricks lies, until bricks are sent ahead.
+    outlines: Option<Vec<Rect>>,
     needed_ever: Vec<bool>,
     /// Bricks among them, and their voxels.
     needed: (u64, u64),
@@ -220,6 +225,8 @@ impl Frame {
             forborne: None,
             pieces_at: None,
             gained: Vec::new(),
+            outlook: None,
+            outlines: None,
             needed_ever: vec![false; job.bricks.len()],
             needed: (0, 0),
             relevant: cluster.residency.voxels(job.scene.bricks),
@@ -282,15 +289,52 @@ impl Frame {
     /// Cuts the whole depth into regions.
     fn begin_regions(&mut self, cluster: &mut Cluster, clock: &dyn Clock) {
         let began = clock.now();
-        let (cut, regions) = Regions::cut(
+        let (cut, regions, outlines) = Regions::cut(
             &self.job,
             (self.beside, self.alone),
             (cluster.traffic.rate(), cluster.traffic.binds_alone()),
             &cluster.roster,
             &mut cluster.memory,
         );
+        // Who draws alone has drawn all that was drawn.
+        let several = cluster.roster.staying().nth(1).is_some();
+        let ahead = several && cluster.traffic.has_room(self.alone);
+        let owner = |place| regions.owner(place);
+        self.outlook = ahead.then(|| Outlook::new(self.job.view.size, &cut, owner));
+        self.outlines = ahead.then_some(outlines);
         self.put_on(cluster, began, cut, (Vec::new(), Vec::new()), Some(regions));
         self.ledger.cull_us += clock.now().saturating_sub(began);
+    }
+
+    /// Whether bricks may still be sent ahead ([`Self::foresee`]).
+    pub(crate) fn foresees(&self) -> bool {
+        self.outlines.is_some()
+    }
+
+    /// Sends what was drawn from lately to those over whose tiles it lies now. Nobody waits for it: it comes after the
+    /// frame's first leases.
+    pub(crate) fn foresee(&mut self, cluster: &mut Cluster, now: Micros) {
+        let set = self.job.scene.bricks;
+        let outlines = self.outlines.take().filter(|_| self.slab.is_some());
+        let (Some(outlines), Some(outlook)) = (outlines, &self.outlook) else { return };
+        let shelves = cluster.residency.shelves(set, self.alone);
+        let (Some(shelves), Some(blocks)) = (shelves, cluster.memory.blocks_of(set)) else {
+            return;
+        };
+        let lacked = outlook.lacked(&shelves, (blocks, &outlines), outline(&self.job));
+        for id in cluster.residency.owe_all(set, lacked) {
+            carry(cluster, Some(&mut self.ledger), id, now);
+        }
+    }
+
+    /// What was drawn from for the first time for long goes to those over whose tiles of this frame it lies, when they
+    /// are told something anyway.
+    pub(crate) fn foresee_fresh(&self, cluster: &mut Cluster, fresh: &[u32]) {
+        let set = self.job.scene.bricks;
+        let Some(outlook) = self.outlook.as_ref().filter(|_| self.slab.is_some()) else { return };
+        let Some(shelves) = cluster.residency.shelves(set, self.alone) else { return };
+        let lacked = outlook.lacked_of(&shelves, fresh, outline(&self.job));
+        cluster.residency.owe_all(set, lacked);
     }
 
     /// Culls bricks, cuts the slab into macrotiles and sorts them.
@@ -550,7 +594,8 @@ impl Frame {
                 note_needed(&mut self.needed_ever, &mut self.needed, &self.job, i as usize);
             }
             self.ledger.stalled(worker, cost);
-            cluster.residency.touched(self.job.scene.bricks, &cost.touched);
+            let set = self.job.scene.bricks;
+            cluster.residency.touched(set, &cost.touched, &mut cluster.fresh);
         }
         slab.handing.remove(&place);
         let touched = cost.map_or(&[][..], |cost| &cost.touched[..]);
@@ -815,6 +860,11 @@ pub(crate) fn carry(
             }
         }
     }
+}
+
+/// Where each brick lies in a frame's picture.
+fn outline(job: &FrameJob) -> impl Fn(u32) -> Option<Rect> {
+    |place| job.view.outline(&job.bricks[place as usize].tight)
 }
 
 /// Whether what a stranger says of a region can be counted.

@@ -30,7 +30,7 @@
 //! # Rooms
 //!
 //! [`frame`](is_shut) the states of one frame, under either schedule; `region` what is the `region`
-//! schedule's own, with `alone` for a frame that nobody waits behind; [`macrotile`] the quadtree and its workload, `queue` leases with epochs,
+//! schedule's own, with `alone` for a frame that nobody waits behind and `foresight` for bricks that are sent ahead; [`macrotile`] the quadtree and its workload, `queue` leases with epochs,
 //! `residency` who holds which brick, `roster` workers and every deadline, `traffic` whether the link bears more,
 //! `reserve` how many workers are enough, `ledger` what a frame cost, `critical` what it waited for. What there is of each worker
 //! and of each tile lies in `crowd` and `tiled`.
@@ -51,6 +51,7 @@ mod alone;
 mod borders;
 mod critical;
 mod crowd;
+mod foresight;
 mod frame;
 mod ledger;
 pub mod macrotile;
@@ -417,6 +418,8 @@ struct Cluster {
     out: VecDeque<Action>,
     next_task: u64,
     totals: Totals,
+    /// Places of bricks of a result that were not drawn from lately.
+    fresh: Vec<u32>,
     /// Workers that have enough for now, in their order: they are lent no more of their own.
     sated: Vec<WorkerId>,
 }
@@ -468,6 +471,7 @@ impl Scheduler {
                 out: VecDeque::new(),
                 next_task: 0,
                 totals: Totals::default(),
+                fresh: Vec::new(),
                 sated: Vec::new(),
             },
             waiting: VecDeque::new(),
@@ -488,9 +492,10 @@ impl Scheduler {
             | Event::Pong { .. } => {
                 !self.active.is_empty() && self.active.iter().all(Frame::by_region)
             }
+            Event::Tick => self.foresees(),
             _ => false,
         };
-        let due = self.next_deadline().is_some_and(|due| due <= now);
+        let due = self.deadline().is_some_and(|due| due <= now);
         // Whom alone a result makes room at.
         let mut only = None;
         let cluster = &mut self.cluster;
@@ -543,6 +548,7 @@ impl Scheduler {
                                     carry(cluster, Some(&mut frame.ledger), worker, now);
                                 }
                                 self.rendered_elsewhere(whose, worker, rendered);
+                                self.foresee_fresh(whose);
                                 if self.calls_all_now(now) {
                                     only = None;
                                 }
@@ -609,7 +615,11 @@ impl Scheduler {
                     self.after_bricks(worker, None, now);
                 }
             }
-            Event::Tick => {}
+            Event::Tick => {
+                if let Some(frame) = self.active.iter_mut().find(|f| f.foresees()) {
+                    frame.foresee(cluster, now);
+                }
+            }
         }
         if !quiet || due {
             self.advance(only, clock);
@@ -636,6 +646,22 @@ impl Scheduler {
             roster.halve(0);
         }
         calls
+    }
+
+    /// Bricks came out that nobody drew from lately: who draws beside will need them.
+    fn foresee_fresh(&mut self, whose: usize) {
+        let fresh = std::mem::take(&mut self.cluster.fresh);
+        if fresh.is_empty() {
+            return;
+        }
+        let set = self.active[whose].job.scene.bricks;
+        for frame in &self.active {
+            if frame.job.scene.bricks == set {
+                frame.foresee_fresh(&mut self.cluster, &fresh);
+            }
+        }
+        self.cluster.fresh = fresh;
+        self.cluster.fresh.clear();
     }
 
     /// A worker drew for one frame while the others were in the making.
@@ -849,8 +875,18 @@ impl Scheduler {
         self.cluster.out.pop_front()
     }
 
-    /// When [`Event::Tick`] is due at the latest.
+    /// When [`Event::Tick`] is due at the latest. 0: as soon as nothing else has happened.
     pub fn next_deadline(&self) -> Option<Micros> {
+        if self.foresees() { Some(0) } else { self.deadline() }
+    }
+
+    /// Whether a frame has bricks to send ahead.
+    fn foresees(&self) -> bool {
+        self.active.iter().any(Frame::foresees)
+    }
+
+    /// When something is due.
+    fn deadline(&self) -> Option<Micros> {
         let frame = self.active.iter().filter_map(Frame::next_deadline).min();
         let roster = self.cluster.roster.next_deadline();
         roster.into_iter().chain(frame).min()

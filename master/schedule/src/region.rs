@@ -1,9 +1,9 @@
 //! The `region` schedule's own part of a frame: where the picture is cut, who takes which tile, and
 //! what the frames before teach about both (DESIGN.md section 3).
 //!
-//! A task is one tile through all depths. There is no barrier, the master culls nothing and sends no
-//! brick that was not asked for: workers do both, sheet by sheet. What is left to decide is how much
-//! work a tile is and who gets it.
+//! A task is one tile through all depths. There is no barrier, and the master culls nothing: workers do, sheet by
+//! sheet, and ask for the bricks that they lack; only what others' tiles tell of, it sends ahead (`foresight`). What is
+//! left to decide is how much work a tile is and who gets it.
 //!
 //! **How much.** The paper's workload, pixels under bricks, is the first guess; here those of blocks
 //! of 4x4x4 bricks and of whole leaves, since nothing hangs on it but the order of the first frame. From
@@ -126,6 +126,9 @@ const BLOCKS: usize = 2048;
 /// Edge of the smallest, four bricks, as a power of two.
 const SMALLEST: u32 = 5;
 
+/// Where a block lies that is not in the picture.
+const NOWHERE: Rect = Rect { x0: 0, y0: 0, x1: 0, y1: 0 };
+
 /// What is known of a tile from the frame before.
 #[derive(Clone, Debug)]
 struct Known {
@@ -218,6 +221,11 @@ impl Memory {
             self.blocks = Some((key, Blocks::of(bricks, SMALLEST, BLOCKS)));
         }
         self.blocks.as_ref().map_or(&[], |(_, blocks)| blocks.all())
+    }
+
+    /// The blocks of a set whose frames were the last to be cut.
+    pub(crate) fn blocks_of(&self, key: BrickSetKey) -> Option<&Blocks> {
+        self.blocks.as_ref().filter(|(k, _)| *k == key).map(|(_, blocks)| blocks)
     }
 
     fn known(&self, kind: Kind, tile: &Rect) -> Option<&Known> {
@@ -551,21 +559,22 @@ pub(crate) struct Regions {
 
 impl Regions {
     /// Cuts a frame's picture, estimates its tiles and shares them out among those who stay, or among the
-    /// `beside`th crew of them. `alone`: no other frame is in the making or waits; `bind`: bricks are what such
-    /// frames wait for.
+    /// `beside`th crew of them. With where each block of bricks lies ([`Memory::blocks_of`]). `alone`: no other frame is in
+    /// the making or waits; `bind`: bricks are what such frames wait for.
     pub(crate) fn cut(
         job: &FrameJob,
         (beside, alone): (Option<u32>, bool),
         (rate, bind): (Option<f64>, bool),
         roster: &Roster,
         memory: &mut Memory,
-    ) -> (Cut, Regions) {
+    ) -> (Cut, Regions, Vec<Rect>) {
         let (key, size) = (job.scene.bricks, job.view.size);
         memory.frames += 1;
         let frame = memory.frames;
         let blocks = memory.blocks(key, &job.bricks);
-        let rects: Vec<Rect> =
-            blocks.iter().filter_map(|b| Some(job.view.project(&b.tight)?.rect)).collect();
+        let outline = |b: &Block| job.view.outline(&b.tight).unwrap_or(NOWHERE);
+        let outlines: Vec<Rect> = blocks.iter().map(outline).collect();
+        let rects: Vec<Rect> = outlines.iter().filter(|r| !r.is_empty()).copied().collect();
         let through = Through::new(size, &rects);
         let plain = through.count(PLAIN);
         let crew = Crew::of_frame(beside, plain, roster);
@@ -665,7 +674,7 @@ impl Regions {
             brick,
             fine,
         };
-        (cut, regions)
+        (cut, regions, outlines)
     }
 
     /// What is known of one of its tasks, by itself or by other tiles.

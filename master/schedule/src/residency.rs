@@ -17,7 +17,8 @@
 //!
 //! - **On request.** Under the `region` schedule workers ask for what they need, when they need it,
 //!   and make room themselves: only they know what their regions stand on. Then this room sends what
-//!   was asked for and not sent, notes what they say they forgot, and evicts nothing.
+//!   was asked for and not sent, notes what they say they forgot, and evicts nothing. What they will
+//!   ask for (`foresight`) it sends as well, as far as that fits beside what they have.
 //!
 //! The measure of memory is a brick's encoded size. A worker's own representation is larger or
 //! smaller by its own factor, which it knows when it states its budget.
@@ -29,6 +30,10 @@ use std::sync::Arc;
 
 use crate::Micros;
 use crate::crowd::Crowd;
+
+/// What was drawn from in so many rounds before the present one was drawn from lately, while frames overlap: one round
+/// is of parts of several. Where none do one is enough.
+const LATELY: u64 = 2;
 
 /// Where a brick is, seen from one worker.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -158,6 +163,37 @@ impl Set {
 
     fn place_of(&self, id: BrickId) -> Option<u32> {
         self.ids.binary_search(&id).ok().map(|i| i as u32)
+    }
+}
+
+/// Who has which bricks of a set, and which of them were drawn from lately.
+pub(crate) struct Shelves<'a> {
+    key: BrickSetKey,
+    needed: &'a [u64],
+    least: u64,
+    shelves: &'a Crowd<Shelf>,
+}
+
+impl<'a> Shelves<'a> {
+    /// A worker's; `None`: it has none of the set.
+    pub(crate) fn of(&self, worker: WorkerId) -> Option<Shelved<'a>> {
+        Some(Shelved(&self.shelves.get(worker)?.sets.get(&self.key)?.place))
+    }
+
+    /// Whether a brick was drawn from lately.
+    pub(crate) fn is_late(&self, place: u32) -> bool {
+        self.needed[place as usize] >= self.least
+    }
+}
+
+/// What one worker has of it.
+#[derive(Clone, Copy)]
+pub(crate) struct Shelved<'a>(&'a [Place]);
+
+impl Shelved<'_> {
+    /// Whether it neither has a brick nor is sent it.
+    pub(crate) fn lacks(self, place: u32) -> bool {
+        self.0[place as usize] == Place::Absent
     }
 }
 
@@ -530,12 +566,51 @@ impl Residency {
         usize::try_from(workers).unwrap_or(usize::MAX)
     }
 
-    /// These were drawn from, somewhere.
-    pub(crate) fn touched(&mut self, key: BrickSetKey, places: &[u32]) {
+    /// These were drawn from, somewhere. Those that were not lately are added to `fresh`.
+    pub(crate) fn touched(&mut self, key: BrickSetKey, places: &[u32], fresh: &mut Vec<u32>) {
+        let least = self.least(LATELY);
         let Some(set) = self.sets.get_mut(&key) else { return };
         for &i in places {
-            set.needed[i as usize] = self.round;
+            let last = std::mem::replace(&mut set.needed[i as usize], self.round);
+            if last < least {
+                fresh.push(i);
+            }
         }
+    }
+
+    /// The first of so many rounds before the present one.
+    fn least(&self, rounds: u64) -> u64 {
+        self.round.saturating_sub(rounds).max(1)
+    }
+
+    /// Who has which bricks of a set, and which were drawn from lately; `None`: the set is not open. `alone`: no frames
+    /// overlap.
+    pub(crate) fn shelves(&self, key: BrickSetKey, alone: bool) -> Option<Shelves<'_>> {
+        let needed = &self.sets.get(&key)?.needed;
+        let least = self.least(if alone { 1 } else { LATELY });
+        Some(Shelves { key, needed, least, shelves: &self.shelves })
+    }
+
+    /// Workers are owed these because they will ask for them. Who has no room for all of its list beside what it has is
+    /// owed none: it would have to forget what it needs. Returns who is owed some.
+    pub(crate) fn owe_all(
+        &mut self,
+        key: BrickSetKey,
+        lists: Vec<(WorkerId, Vec<u32>)>,
+    ) -> Vec<WorkerId> {
+        let Some(set) = self.sets.get(&key) else { return Vec::new() };
+        let mut owed = Vec::new();
+        for (worker, places) in lists {
+            let Some(shelf) = self.shelves.get_mut(worker) else { continue };
+            let bytes: u64 = places.iter().map(|&i| u64::from(set.bricks[i as usize].bytes)).sum();
+            if shelf.bytes.saturating_add(bytes) > shelf.budget {
+                continue;
+            }
+            shelf.sets.entry(key).or_insert_with(|| Books::new(set.bricks.len()));
+            owe(&mut shelf.owed, key, places);
+            owed.push(worker);
+        }
+        owed
     }
 
     /// A worker forgot these. What a lease of its needs goes again.
@@ -763,6 +838,42 @@ mod tests {
         r.want(W, [0, 1, 1]);
         assert_eq!(flush(&mut r), [send(&[2])]);
         assert!(flush(&mut r).is_empty());
+    }
+
+    #[test]
+    fn what_is_drawn_from_for_the_first_time_for_long_is_fresh() {
+        let mut r = residency(1000);
+        let bricks = r.sets[&KEY].bricks.clone();
+        let fresh = |r: &mut Residency, places: &[u32]| {
+            let mut fresh = Vec::new();
+            r.open(KEY, &bricks, true);
+            r.touched(KEY, places, &mut fresh);
+            fresh
+        };
+        assert_eq!(fresh(&mut r, &[1, 2, 1]), [1, 2]);
+        assert_eq!(fresh(&mut r, &[2, 3]), [3]);
+        assert_eq!(fresh(&mut r, &[4]), [4]);
+        assert_eq!(
+            fresh(&mut r, &[3, 1, 2]),
+            [1],
+            "of the first round, of which others are too far"
+        );
+    }
+
+    #[test]
+    fn what_a_worker_will_ask_for_is_sent_where_there_is_room_for_it() {
+        let mut r = residency(300);
+        let bricks = r.sets[&KEY].bricks.clone();
+        r.open(KEY, &bricks, true);
+        let other = WorkerId(2);
+        r.join(other, 1000, Vec::new());
+        let list = |places: &[u32]| vec![(W, places.to_vec()), (other, places.to_vec())];
+        assert_eq!(r.owe_all(KEY, list(&[1, 2, 3])), [other], "one is held, and three do not fit");
+        assert!(flush(&mut r).is_empty());
+        assert_eq!(r.flush(other, 5, &mut || 78), [send(&[2, 4, 6])]);
+        assert_eq!(r.owe_all(KEY, list(&[2, 4])), [W, other]);
+        assert_eq!(flush(&mut r), [send(&[4, 8])]);
+        assert_eq!(r.flush(other, 5, &mut || 79), [send(&[8])], "the first is on its way");
     }
 
     #[test]

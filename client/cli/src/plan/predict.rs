@@ -331,7 +331,7 @@ pub(crate) fn decided(
     let (_, took) =
         sim::run(jobs, trace, &cluster, &mut watch).map_err(|e| Fail::failed(e.to_string()))?;
     let per = |(n, ns): (u64, u64)| if n == 0 { 0.0 } else { ns as f64 / n as f64 };
-    let Took { first, frames, slabs, results, others, result_count, .. } = took;
+    let Took { first, frames, slabs, results, ahead, others, result_count, .. } = took;
     // Of what is of the order of a microsecond that is a part.
     let reading = reading();
     let each = |counted: (u64, u64)| (per(counted) - reading).max(0.0);
@@ -344,8 +344,8 @@ pub(crate) fn decided(
     };
     // The first frame sorts the bricks into blocks.
     let begun = jobs.len().saturating_sub(1) as f64;
-    let many = (result_count + others.0) as f64 + jobs.len() as f64;
-    let beside = (slabs.1 + results.1 + others.1) as f64 - reading * many;
+    let many = (result_count + ahead.0 + others.0) as f64 + jobs.len() as f64;
+    let beside = (slabs.1 + results.1 + ahead.1 + others.1) as f64 - reading * many;
     let a_frame = frames.1 as f64 / begun.max(1.0) + beside.max(0.0) / jobs.len() as f64;
     let costs = Costs {
         first_brick: per(first),
@@ -354,6 +354,7 @@ pub(crate) fn decided(
         // A result and the lease that follows it are handled in one go.
         result,
         result_pixel,
+        ahead: each(ahead),
         event: each(others),
         ..messages
     };

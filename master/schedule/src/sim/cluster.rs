@@ -1122,8 +1122,10 @@ impl<'a> World<'a> {
                 Event::Result { result, .. } => Some(result.pixels.len()),
                 _ => None,
             };
+            let ahead = matches!(event, Event::Tick) && self.scheduler.foresees();
             cost += match result {
                 Some(pixels) => costs.result + costs.result_pixel * pixels as f64,
+                None if ahead => costs.ahead,
                 None => costs.event,
             };
             if let Event::Result { worker, .. } = &event {
@@ -1197,8 +1199,9 @@ impl<'a> World<'a> {
                     took.lease_count += leases;
                     took.lease_pixels += lease_pixels;
                 } else {
-                    took.others.0 += 1;
-                    took.others.1 += ns;
+                    let took = if ahead { &mut took.ahead } else { &mut took.others };
+                    took.0 += 1;
+                    took.1 += ns;
                 }
             }
         }

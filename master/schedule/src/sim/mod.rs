@@ -86,6 +86,8 @@ pub struct Costs {
     pub result: f64,
     /// Driver: a pixel of a result.
     pub result_pixel: f64,
+    /// Driver: to see which bricks of a frame that was begun are sent ahead.
+    pub ahead: f64,
     /// Driver: anything else that happens.
     pub event: f64,
     /// To send a pixel of a picture to who asked for it: the master's streams, and the client on the
@@ -287,6 +289,8 @@ pub struct Took {
     pub lease_count: u64,
     /// Pixels of those.
     pub lease_pixels: u64,
+    /// Frames whose bricks were sent ahead ([`crate`]'s foresight).
+    pub ahead: (u64, Nanos),
     /// All else.
     pub others: (u64, Nanos),
 }

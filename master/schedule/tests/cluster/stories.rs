@@ -7,6 +7,7 @@ use slabcast_common::brick::BrickInfo;
 use slabcast_common::ids::{FrameId, SceneId, WorkerId};
 use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_common::stats::FrameStats;
+use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
 use std::cell::Cell;
 use std::collections::BTreeMap;
@@ -376,6 +377,45 @@ fn regions_are_sent_what_they_ask_for_and_no_more() {
 }
 
 #[test]
+fn what_turns_into_the_tiles_of_another_is_sent_before_it_asks() {
+    let frame = |frame: u64, upside_down: bool| {
+        let mut job = job_by(0, Schedule::Region);
+        let side = if upside_down { -1.0 } else { 1.0 };
+        let camera = Camera {
+            to_eye: [0.3, 1.0, 0.1].into(),
+            up: [0.0, 0.0, side].into(),
+            target: [0.0; 3].into(),
+            projection: CameraProjection::Ortho { height: 60.0 },
+        };
+        let scene = &job.scene;
+        let view = View::new(&scene.volume.lattice, &camera, [128, 128], &scene.quality);
+        (job.frame, job.number, job.view) = (FrameId(frame), frame, view.expect("a view"));
+        job
+    };
+    // Two workers draw the upper and the lower half, of which the second frame swaps the bricks.
+    let mut w = world();
+    for _ in 0..2 {
+        w.join(Nature { us_per_pixel_sheet: 0.02, ..Nature::default() });
+    }
+    let mut sent = Vec::new();
+    for (number, upside_down) in [(0, false), (1, true), (2, false)] {
+        w.queue(frame(number, upside_down));
+        w.run_until(|w| w.scheduler.is_idle());
+        let stats = &w.done[&FrameId(number)].stats;
+        let of = stats.workers.iter().map(|w| w.bricks_sent).sum::<u64>();
+        sent.push((of, std::mem::take(&mut w.bricks_asked), stats.bricks.needed));
+    }
+    w.finish();
+    let [(first, all, needed), (second, asked, _), (third, last, _)] = sent[..] else {
+        unreachable!("three frames")
+    };
+    assert_eq!(all, first, "of the first frame nothing is sent ahead");
+    assert!(10 * second > 7 * needed, "{second} of {needed}: others' bricks are to be drawn from");
+    assert!(4 * asked < second, "{asked} of {second} were asked for");
+    assert_eq!((third, last), (0, 0), "everybody has what it draws from");
+}
+
+#[test]
 fn frames_of_a_path_go_on_beside_each_other_and_end_in_order() {
     let mut w = world();
     workers(&mut w, 3);
@@ -456,16 +496,17 @@ fn where_tiles_are_few_and_long_a_frame_alone_is_cut_so_that_all_end_at_once() {
             w.join(Nature { us_per_pixel_sheet: 0.1, ..Nature::default() });
         }
         let work = Work { tile, tiles_per_worker: 1.0, schedule: Schedule::Region, ..slab() };
-        let took = one_by_one(&mut w, 0..4, work);
+        let took = one_by_one(&mut w, 0..12, work);
         w.finish();
-        (took, w)
+        // Which tile is late in one frame or another is chance.
+        (took[2..].iter().sum::<Micros>(), w)
     };
     let (whole, _) = run(Some(64));
     let (cut, w) = run(None);
     assert_eq!(sizes(&w, 0).keys().copied().collect::<Vec<_>>(), [64], "nothing is known yet");
     let both = sizes(&w, 3);
     assert!(both.contains_key(&64) && both.contains_key(&32), "{both:?}");
-    assert!(10 * cut[3] < 9 * whole[3], "{cut:?} us, in tiles of 64 {whole:?}");
+    assert!(10 * cut < 9 * whole, "{cut} us, in tiles of 64 {whole}");
 }
 
 /// Three workers of a tile each and more, and a frame that each of them knows; what happens to the first one then, 3 ms
@@ -581,13 +622,14 @@ fn workers_of_other_speeds_get_fitting_shares_of_a_path() {
             w.join(Nature { us_per_pixel_sheet: 0.5 / speed, ..Nature::default() });
         }
         let work = Work { tile: Some(16), schedule: Schedule::Region, ..slab() };
-        for frame in 0..32 {
+        for frame in 0..80 {
             let quality = Quality { thickness: 1.0, ..Quality::default() };
             w.queue(job_with(frame, work, quality));
         }
         w.run_until(|w| w.done.len() >= 8);
         let (from, done) = (w.now(), w.done.len());
-        w.run_until(|w| w.done.len() >= 24);
+        // Of 16 frames it is 6 % more or less, as the dice of their tiles fall.
+        w.run_until(|w| w.done.len() >= 72);
         let each = (w.now() - from) as f64 / (w.done.len() - done) as f64;
         w.finish();
         each * speeds.iter().sum::<f64>()

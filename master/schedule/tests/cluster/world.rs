@@ -222,6 +222,8 @@ pub(crate) struct World {
     pub(crate) failed: BTreeMap<FrameId, String>,
     pub(crate) drops: Vec<(WorkerId, String)>,
     pub(crate) leases_given: u64,
+    /// Bricks that workers of regions asked for.
+    pub(crate) bricks_asked: u64,
     pub(crate) handed_over: u64,
     /// Hash of all actions: two runs of a seed are one.
     pub(crate) log: u64,
@@ -246,6 +248,7 @@ impl World {
             failed: BTreeMap::new(),
             drops: Vec::new(),
             leases_given: 0,
+            bricks_asked: 0,
             handed_over: 0,
             log: 0,
         }
@@ -967,6 +970,7 @@ impl World {
             self.up(id, Event::BricksForgotten { worker: id, set: k, bricks: vec![b] });
         }
         if !asked.is_empty() {
+            self.bricks_asked += asked.len() as u64;
             self.up(id, Event::BricksWanted { worker: id, set, bricks: asked });
         }
     }

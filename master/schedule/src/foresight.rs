@@ -12,8 +12,7 @@
 //!
 //! Where a block of bricks lies over one worker's tiles alone and that has what was drawn from, no brick is looked at
 //! closer. The others are projected, which takes as long as all else here. For 11,056 bricks and 15 or 64 workers a frame
-//! takes the master less with this than without: half or two thirds of the questions that workers ask are not
-//! (docs/scaling.md).
+//! takes the master less with this than without, since workers ask half as much (docs/scaling.md).
 //!
 //! It refuses to know what a worker has: that is `residency`'s.
 

@@ -171,7 +171,13 @@ fn in_regions(
     });
     let cull = frame.scene.quality.cull;
     assert!(cull || touched.iter().all(|place| again.binary_search(place).is_ok()));
-    assert!(of_rest.iter().all(|place| again.binary_search(place).is_ok()));
+    // A brick's border does not count, but of one of which a tile has 6 pixels or fewer all do.
+    let narrow = |place: u32| {
+        let seen = frame.view.project(&bricks[place as usize].tight(&frame.scene.grid));
+        let seen = seen.map_or(Rect::default(), |p| p.rect.intersect(&rest));
+        seen.width().min(seen.height()) <= 6
+    };
+    assert!(of_rest.iter().all(|place| again.binary_search(place).is_ok() || narrow(*place)));
     let unknown = Depths::new(size);
     let nothing = expected((frame, &outlook, &store), Rect::of_size(size), &unknown);
     assert!(!cull || nothing.is_empty());

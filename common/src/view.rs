@@ -429,7 +429,8 @@ impl View {
         (!rect.is_empty()).then_some(Projected { rect, sheets })
     }
 
-    /// The pixels of [`Self::project`] alone. In parallel projection they hang on no sheet, and take a third of the time.
+    /// The pixels of [`Self::project`] alone. In parallel projection they hang on no sheet, and none
+    /// is worked out.
     pub fn outline(&self, b: &TightBox) -> Option<Rect> {
         let Projection::Ortho { scale } = self.projection else {
             return self.project(b).map(|p| p.rect);

@@ -126,9 +126,6 @@ const BLOCKS: usize = 2048;
 /// Edge of the smallest, four bricks, as a power of two.
 const SMALLEST: u32 = 5;
 
-/// Where a block lies that is not in the picture.
-const NOWHERE: Rect = Rect { x0: 0, y0: 0, x1: 0, y1: 0 };
-
 /// What is known of a tile from the frame before.
 #[derive(Clone, Debug)]
 struct Known {
@@ -572,7 +569,7 @@ impl Regions {
         memory.frames += 1;
         let frame = memory.frames;
         let blocks = memory.blocks(key, &job.bricks);
-        let outline = |b: &Block| job.view.outline(&b.tight).unwrap_or(NOWHERE);
+        let outline = |b: &Block| job.view.outline(&b.tight).unwrap_or_default();
         let outlines: Vec<Rect> = blocks.iter().map(outline).collect();
         let rects: Vec<Rect> = outlines.iter().filter(|r| !r.is_empty()).copied().collect();
         let through = Through::new(size, &rects);

@@ -29,8 +29,8 @@ const FORM: f64 = 0.6;
 const FORM_LATER: f64 = 0.3;
 
 /// Bricks that may not be needed are sent until the share is above [`DISSOLVE`], and again when it is below this. On a
-/// link of 1 Gbit/s the share goes up and down; if they were sent whenever it is below 0.5, or among the first frames, paths
-/// of overlapping frames would take up to a tenth longer on 15 workers.
+/// link of 1 Gbit/s the share goes up and down; if they were sent whenever it is below 0.65, or in the first frame, paths of
+/// overlapping frames would take up to a seventh longer on 15 workers (docs/scaling.md).
 const SPARE: f64 = 0.1;
 
 /// How many frames are the first.

@@ -157,9 +157,12 @@ impl Traffic {
     }
 
     /// Whether frames that are alone, or such as overlap, leave room for bricks that may not be needed. Until one is done
-    /// nobody knows; and of one frame at a time nothing else travels meanwhile.
+    /// nobody knows.
     pub(crate) fn has_room(&self, alone: bool) -> bool {
-        if alone { self.alone.is_some() } else { self.took > 0.0 && !self.crowded }
+        if alone {
+            return self.alone.is_some() && !self.is_full_alone();
+        }
+        self.took > 0.0 && !self.crowded
     }
 
     /// The same of frames that were alone.
@@ -269,7 +272,7 @@ mod tests {
         let nothing = !traffic.binds_alone() && !traffic.has_room(true);
         assert!(nothing, "of no frame is known what it was sent");
         assert_eq!(alone(&mut traffic, 1, 190_000), [true], "the first is sent all that it needs");
-        assert!(traffic.is_full_alone());
+        assert!(traffic.is_full_alone() && !traffic.has_room(true));
         assert!(!alone(&mut traffic, 9, 90_000).contains(&false), "0.45");
         assert_eq!(alone(&mut traffic, 3, 40_000), [true, false, false]);
         assert!(!alone(&mut traffic, 9, 90_000).contains(&true), "and now that is not enough");

@@ -1,167 +1,216 @@
-//! Efficiency over workers, as SVG and PNG from one list of strokes.
+//! The chart of a plan: efficiency up, workers across, and below what binds.
 
-use super::predict::Row;
-use crate::canvas::Canvas;
-use std::fmt::Write;
+use super::predict::{Bound, Row};
+use crate::chart::{Anchor, Box2, Draw, Mark, Sheet, Theme, width};
+use plotters::prelude::DrawingBackend;
 
-const SIZE: [usize; 2] = [860, 460];
-/// Left, top, right and bottom of the diagram.
-const BOX: [f64; 4] = [70.0, 56.0, 840.0, 400.0];
-const GROUND: [u8; 3] = [252, 252, 248];
-const INK: [u8; 3] = [40, 40, 40];
-const FAINT: [u8; 3] = [222, 222, 216];
-/// Okabe and Ito's colours, which most colour-blind readers tell apart.
-const COLOURS: [[u8; 3]; 4] = [[213, 94, 0], [0, 114, 178], [0, 140, 100], [110, 60, 130]];
-/// What binds is told by the shape of a point's middle: its letter, below the axis.
-const LETTER: usize = 6;
+type Failed = Box<dyn std::error::Error + Send + Sync>;
+
+const WIDE: u32 = 1000;
+/// What lies between the axes.
+const ROOM: Box2 = Box2 { x0: 84.0, y0: 84.0, x1: 806.0, y1: 440.0 };
+/// Where the strips that say what binds begin, and how far they are apart.
+const STRIPS: (f64, f64) = (500.0, 26.0);
+/// Half a strip's height.
+const HALF: f64 = 8.0;
+/// Resources and their places among a theme's colours.
+const BOUNDS: [(Bound, usize); 4] =
+    [(Bound::Cores, 2), (Bound::Straggler, 4), (Bound::Link, 3), (Bound::Master, 6)];
 
 /// What is drawn of a row.
 type Figure = fn(&Row) -> Option<f64>;
 
-/// A line, a dot or a word.
-enum Stroke {
-    Line([f64; 2], [f64; 2], [u8; 3], f64),
-    Dot([f64; 2], [u8; 3]),
-    Text([f64; 2], String, [u8; 3], usize),
+/// What is drawn of a schedule: its name, its mark, and its places among a theme's colours under either schedule.
+const FIGURES: [(&str, Figure, Mark, [usize; 2]); 2] = [
+    ("latency", |r| Some(r.latency_efficiency), Mark::Dot, [0, 1]),
+    ("throughput", |r| r.throughput.map(|t| t.1), Mark::Square, [5, 4]),
+];
+
+/// The efficiencies of some clusters under some schedules (two at most), by number of workers.
+pub(super) struct Chart<'a> {
+    pub(super) title: &'a str,
+    pub(super) note: &'a str,
+    pub(super) schedules: &'a [(&'a str, &'a [Row])],
 }
 
-/// What is drawn.
-pub(super) struct Chart {
-    strokes: Vec<Stroke>,
+impl Chart<'_> {
+    fn rows(&self) -> impl Iterator<Item = &Row> {
+        self.schedules.iter().flat_map(|s| s.1)
+    }
+
+    /// The most workers, of two and more: with fewer there is no axis.
+    fn most(&self) -> u32 {
+        self.rows().map(|r| r.workers).max().unwrap_or(1).max(2)
+    }
+
+    /// Where so many workers stand: in even steps for each doubling.
+    fn x(&self, workers: u32) -> f64 {
+        let doublings = |n: u32| libm::log2(f64::from(n.max(1)));
+        ROOM.x0 + (ROOM.x1 - ROOM.x0) * doublings(workers) / doublings(self.most())
+    }
+
+    /// Powers of two, and the most workers where there is room for them.
+    fn ticks(&self) -> Vec<u32> {
+        let most = self.most();
+        let mut ticks: Vec<u32> = (0..32).map(|i| 1 << i).take_while(|n| *n <= most).collect();
+        let last = ticks.last().copied().unwrap_or(1);
+        if self.x(most) - self.x(last) > width(&format!("{last}{most}"), 12.0) {
+            ticks.push(most);
+        }
+        ticks
+    }
+
+    /// What binds a schedule's clusters, from where to where along the axis; each cluster reaches halfway to its neighbours.
+    fn strip(&self, rows: &[Row]) -> Vec<(Bound, f64, f64)> {
+        let mut strip: Vec<(Bound, f64, f64)> = Vec::new();
+        for (i, row) in rows.iter().enumerate() {
+            let own = self.x(row.workers);
+            let edge = |other: Option<&Row>, end: f64| {
+                other.map_or(end, |o| (own + self.x(o.workers)) / 2.0)
+            };
+            let from = edge(i.checked_sub(1).and_then(|i| rows.get(i)), own - HALF);
+            let to = edge(rows.get(i + 1), own + HALF);
+            match strip.last_mut() {
+                Some((bound, _, end)) if *bound == row.bound.0 => *end = to,
+                _ => strip.push((row.bound.0, from, to)),
+            }
+        }
+        strip
+    }
 }
 
-impl Chart {
-    /// The efficiencies of some clusters under some schedules (two at most), by number of workers.
-    pub(super) fn new(title: &str, note: &str, schedules: &[(&str, &[Row])]) -> Chart {
-        let mut c = Chart { strokes: Vec::new() };
-        let [left, top, right, bottom] = BOX;
-        c.text([16.0, 14.0], title, INK, 2);
-        c.text([16.0, 36.0], note, INK, 1);
-        let all = || schedules.iter().flat_map(|s| s.1);
-        let most = all().map(|r| r.workers).max().unwrap_or(1).max(2);
-        // Even steps for each doubling.
-        let x =
-            |n: u32| left + (right - left) * libm::log2(f64::from(n)) / libm::log2(f64::from(most));
-        let through: Figure = |r| r.throughput.map(|t| t.1);
-        let top_value = all().flat_map(|r| [Some(r.latency_efficiency), through(r)]).flatten();
-        let ceiling = top_value.fold(1.0, f64::max);
-        let y = |e: f64| bottom - (bottom - top) * e / ceiling;
+impl Draw for Chart<'_> {
+    fn size(&self) -> (u32, u32) {
+        (WIDE, (STRIPS.0 + STRIPS.1 * self.schedules.len() as f64) as u32 + 12)
+    }
+
+    fn draw<DB: DrawingBackend>(&self, on: &Sheet<'_, DB>, theme: &Theme) -> Result<(), Failed>
+    where
+        DB::ErrorType: 'static,
+    {
+        on.text(self.title, (22.0, 32.0), 18.0, Anchor::Left, theme.ink)?;
+        on.text(self.note, (22.0, 54.0), 12.0, Anchor::Left, theme.faint)?;
+        let values = self.rows().flat_map(|r| FIGURES.iter().filter_map(|f| f.1(r)));
+        // Frames that come a little early have more than all cores.
+        let ceiling = values.fold(1.0, f64::max);
+        let y = |e: f64| ROOM.y1 - (ROOM.y1 - ROOM.y0) * e / ceiling;
         for tenth in (0..=10).step_by(2) {
             let at = y(f64::from(tenth) / 10.0);
-            c.line([left, at], [right, at], FAINT, 1.0);
-            c.text([left - 44.0, at - 4.0], &format!("{:>3} %", tenth * 10), INK, 1);
+            on.line(&[(ROOM.x0, at), (ROOM.x1, at)], 1.0, theme.grid)?;
+            let word = format!("{} %", tenth * 10);
+            on.text(&word, (ROOM.x0 - 12.0, at + 4.0), 12.0, Anchor::Right, theme.ink)?;
         }
-        let mut n = 1;
-        while n <= most {
-            c.line([x(n), top], [x(n), bottom], FAINT, 1.0);
-            let word = n.to_string();
-            c.text([x(n) - 3.0 * word.len() as f64, bottom + 8.0], &word, INK, 1);
-            n *= 2;
+        for n in self.ticks() {
+            let at = self.x(n);
+            on.line(&[(at, ROOM.y0), (at, ROOM.y1)], 1.0, theme.grid)?;
+            on.text(&n.to_string(), (at, ROOM.y1 + 20.0), 12.0, Anchor::Middle, theme.ink)?;
         }
-        c.text([right - 44.0, bottom + 48.0], "workers", INK, 1);
-        let of: [(&str, Figure); 2] =
-            [("latency", |r| Some(r.latency_efficiency)), ("throughput", through)];
-        for (i, (schedule, rows)) in schedules.iter().enumerate() {
-            let mut before = None;
-            for r in rows.iter() {
-                // Where another resource begins to bind, its name stands below.
-                let kind = r.bound.0;
-                if before.replace(kind) != Some(kind) {
-                    let at = x(r.workers).min(right - (LETTER * kind.name().len()) as f64);
-                    let below = bottom + 22.0 + 11.0 * i as f64;
-                    c.text([at, below], kind.name(), COLOURS[2 * i % 4], 1);
+        on.line(&[(ROOM.x0, ROOM.y0), (ROOM.x0, ROOM.y1), (ROOM.x1, ROOM.y1)], 1.2, theme.ink)?;
+        let middle = ((ROOM.x0 + ROOM.x1) / 2.0, (ROOM.y0 + ROOM.y1) / 2.0);
+        on.text("workers", (middle.0, ROOM.y1 + 38.0), 13.0, Anchor::Middle, theme.ink)?;
+        on.upwards("of what so many cores could do", (22.0, middle.1), 13.0, theme.ink)?;
+
+        let legend = ROOM.x1 + 30.0;
+        let mut down = ROOM.y0 + 8.0;
+        for (i, (schedule, rows)) in self.schedules.iter().enumerate() {
+            for (name, value, mark, colours) in FIGURES {
+                let colour = theme.colours[colours[i % 2]];
+                let points: Vec<(f64, f64)> =
+                    rows.iter().filter_map(|r| Some((self.x(r.workers), y(value(r)?)))).collect();
+                if points.is_empty() {
+                    continue;
                 }
-            }
-            for (j, (name, value)) in of.iter().enumerate() {
-                let colour = COLOURS[(2 * i + j) % 4];
-                let points: Vec<[f64; 2]> =
-                    rows.iter().filter_map(|r| Some([x(r.workers), y(value(r)?)])).collect();
-                for w in points.windows(2) {
-                    c.line(w[0], w[1], colour, 2.0);
+                on.line(&points, 2.0, colour)?;
+                for at in &points {
+                    on.mark(mark, *at, 3.6, colour)?;
                 }
-                points.iter().for_each(|p| c.strokes.push(Stroke::Dot(*p, colour)));
-                let at = [left + 10.0 + 160.0 * (2 * i + j) as f64, bottom + 48.0];
-                c.strokes.push(Stroke::Dot([at[0] - 6.0, at[1] + 3.0], colour));
-                c.text(at, &format!("{schedule}, {name}"), colour, 1);
+                on.mark(mark, (legend, down), 5.0, colour)?;
+                let word = format!("{schedule}, {name}");
+                on.text(&word, (legend + 14.0, down + 4.0), 12.0, Anchor::Left, theme.ink)?;
+                down += 22.0;
             }
         }
-        c
-    }
-
-    fn line(&mut self, a: [f64; 2], b: [f64; 2], colour: [u8; 3], width: f64) {
-        self.strokes.push(Stroke::Line(a, b, colour, width));
-    }
-
-    fn text(&mut self, at: [f64; 2], text: &str, colour: [u8; 3], dot: usize) {
-        self.strokes.push(Stroke::Text(at, text.into(), colour, dot));
-    }
-
-    pub(super) fn svg(&self) -> String {
-        let [w, h] = SIZE;
-        let hex = |c: &[u8; 3]| format!("#{:02x}{:02x}{:02x}", c[0], c[1], c[2]);
-        let mut svg = format!(
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{w}\" height=\"{h}\" viewBox=\"0 0 \
-             {w} {h}\" font-family=\"sans-serif\">\n<rect width=\"{w}\" height=\"{h}\" \
-             fill=\"{}\"/>\n",
-            hex(&GROUND)
-        );
-        for stroke in &self.strokes {
-            let _ = match stroke {
-                Stroke::Line(a, b, colour, width) => writeln!(
-                    svg,
-                    "<line x1=\"{:.1}\" y1=\"{:.1}\" x2=\"{:.1}\" y2=\"{:.1}\" stroke=\"{}\" \
-                     stroke-width=\"{width}\"/>",
-                    a[0],
-                    a[1],
-                    b[0],
-                    b[1],
-                    hex(colour)
-                ),
-                Stroke::Dot(at, colour) => writeln!(
-                    svg,
-                    "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"3.5\" fill=\"{}\"/>",
-                    at[0],
-                    at[1],
-                    hex(colour)
-                ),
-                Stroke::Text(at, text, colour, dot) => writeln!(
-                    svg,
-                    "<text x=\"{:.1}\" y=\"{:.1}\" font-size=\"{}\" fill=\"{}\">{}</text>",
-                    at[0],
-                    at[1] + 8.0 * *dot as f64,
-                    if *dot > 1 { 17 } else { 12 },
-                    hex(colour),
-                    text.replace('&', "&amp;").replace('<', "&lt;")
-                ),
-            };
+        down += 14.0;
+        on.text("bound by", (legend - 6.0, down + 4.0), 12.0, Anchor::Left, theme.faint)?;
+        for (bound, colour) in BOUNDS {
+            if self.rows().any(|r| r.bound.0 == bound) {
+                down += 22.0;
+                on.bar(&Box2::about((legend, down), 6.0), theme.colours[colour])?;
+                let at = (legend + 14.0, down + 4.0);
+                on.text(bound.name(), at, 12.0, Anchor::Left, theme.ink)?;
+            }
         }
-        svg + "</svg>\n"
+        for (i, (schedule, rows)) in self.schedules.iter().enumerate() {
+            let at = STRIPS.0 + STRIPS.1 * i as f64;
+            on.text(schedule, (ROOM.x0 - 14.0, at + 4.0), 12.0, Anchor::Right, theme.ink)?;
+            for (bound, x0, x1) in self.strip(rows) {
+                let colour = BOUNDS.iter().find(|b| b.0 == bound).map_or(0, |b| b.1);
+                let own = Box2 { x0, y0: at - HALF, x1, y1: at + HALF };
+                on.bar(&own, theme.colours[colour])?;
+                if width(bound.name(), 11.0) + 6.0 < x1 - x0 {
+                    let middle = ((x0 + x1) / 2.0, at + 4.0);
+                    on.text(bound.name(), middle, 11.0, Anchor::Middle, theme.ground)?;
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::chart::{DARK, LIGHT, pixels, svg};
+
+    fn row(workers: u32, bound: Bound) -> Row {
+        Row {
+            workers,
+            first_ms: 9.0,
+            frame_ms: 5.0,
+            latency_efficiency: 1.0 / f64::from(workers),
+            throughput: None,
+            bytes: [0.0; 3],
+            leases: 0.0,
+            bound: (bound, 0.5),
+            parts: [0.0; 4],
+            master_ms: [0.0; 3],
+            messages: [0.0; 3],
+            steady: None,
+        }
     }
 
-    pub(super) fn canvas(&self) -> Canvas {
-        let mut canvas = Canvas::new(SIZE);
-        canvas.fill([0, 0], SIZE, GROUND);
-        let put = |canvas: &mut Canvas, at: [f64; 2], size: usize, colour| {
-            let half = size as f64 / 2.0;
-            let corner = at.map(|x| (x - half).round().max(0.0) as usize);
-            canvas.fill(corner, [size; 2], colour);
+    #[test]
+    fn what_binds_is_a_strip_without_gaps_in_which_words_have_room() {
+        // As the link and the master bind by turns where clusters are large and close to each other.
+        let bound = |n: u32| {
+            if n < 20 { Bound::Cores } else { [Bound::Link, Bound::Master][(n % 2) as usize] }
         };
-        for stroke in &self.strokes {
-            match stroke {
-                Stroke::Line(a, b, colour, width) => {
-                    let steps = (b[0] - a[0]).abs().max((b[1] - a[1]).abs()).ceil().max(1.0);
-                    for i in 0..=steps as usize {
-                        let t = i as f64 / steps;
-                        let at = [a[0] + (b[0] - a[0]) * t, a[1] + (b[1] - a[1]) * t];
-                        put(&mut canvas, at, *width as usize, *colour);
-                    }
-                }
-                Stroke::Dot(at, colour) => put(&mut canvas, *at, 7, *colour),
-                Stroke::Text(at, text, colour, dot) => {
-                    canvas.text(at.map(|x| x.max(0.0) as usize), *dot, text, *colour);
-                }
-            }
-        }
-        canvas
+        let rows: Vec<Row> = (1..=64).map(|n| row(n, bound(n))).collect();
+        let schedules = [("region", &rows[..])];
+        let chart = Chart { title: "t", note: "", schedules: &schedules };
+        let strip = chart.strip(&rows);
+        assert_eq!(strip.len(), 46, "cores, and then each by itself");
+        assert!(strip.windows(2).all(|w| w[0].2 == w[1].1 && w[0].1 < w[0].2), "{strip:?}");
+        assert!(strip[0].1 < ROOM.x0 && strip[45].2 > ROOM.x1, "ends stand about their points");
+        let drawn = svg(&chart, &LIGHT).unwrap();
+        // In the strip and in the legend, or in the legend alone.
+        let said = |name: &str| drawn.lines().filter(|l| l.trim() == name).count();
+        assert_eq!(["cores", "link", "master", "straggler"].map(said), [2, 1, 1, 0], "{drawn}");
+    }
+
+    #[test]
+    fn only_what_is_drawn_is_in_the_legend_and_one_cluster_is_a_chart() {
+        let rows = [row(3, Bound::Cores)];
+        let schedules = [("region", &rows[..]), ("slab, 3 slabs", &rows[..])];
+        let chart = Chart { title: "t", note: "", schedules: &schedules };
+        let drawn = svg(&chart, &DARK).unwrap();
+        assert!(
+            drawn.contains("slab, 3 slabs, latency") && !drawn.contains("throughput"),
+            "{drawn}"
+        );
+        assert_eq!(chart.ticks(), [1, 2, 3]);
+        assert!(!pixels(&chart, &LIGHT).unwrap().rgb.is_empty());
+        let none = Chart { schedules: &[], ..chart };
+        assert!(svg(&none, &LIGHT).is_ok());
     }
 }

@@ -12,8 +12,9 @@ pub(crate) mod measure;
 pub(crate) mod predict;
 mod rehearse;
 
+use crate::chart::{LIGHT, pixels, svg, write_png};
 use crate::fail::{Fail, say};
-use crate::output::{Made, write_atomic};
+use crate::output::{Made, probe, write_atomic};
 use crate::progress::Progress;
 use crate::request::{Asked, Opened, PictureOf, WorkArgs};
 use crate::stage::Stage;
@@ -131,9 +132,12 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
         }
     }
     let mut progress = Progress::new(args.quiet);
+    // Refused before minutes of measuring, and gone again until there is something to write.
     if let Some(dir) = &args.output {
-        // Refused before minutes of measuring, and gone again until there is something to write.
         drop(Made::new(dir)?);
+    }
+    if let Some(file) = args.trace.as_deref().filter(|file| !file.exists()) {
+        probe(file)?;
     }
     let Opened { volume, info, orientation } = args.of.open(&asked)?;
     progress.stage("cutting the volume into bricks");
@@ -494,18 +498,17 @@ impl Said<'_> {
 
     fn write(&self, dir: &Path) -> Result<(), Fail> {
         let _made = Made::new(dir)?;
-        let chart = chart::Chart::new(
-            &format!("{}: predicted efficiency", self.title()),
-            &self.cluster(),
-            &self.predicted.iter().map(|p| (p.name(), &p.rows[..])).collect::<Vec<_>>(),
-        );
+        let title = format!("{}: predicted efficiency", self.title());
+        let schedules: Vec<_> = self.predicted.iter().map(|p| (p.name(), &p.rows[..])).collect();
+        let chart = chart::Chart { title: &title, note: &self.cluster(), schedules: &schedules };
+        let drawn = |e: String| Fail::failed(format!("the chart can't be drawn: {e}"));
         let text = |name: &str, text: String| {
             write_atomic(&dir.join(name), |out| out.write_all(text.as_bytes()))
         };
-        text("plan.svg", chart.svg())?;
+        text("plan.svg", svg(&chart, &LIGHT).map_err(drawn)?)?;
         text("plan.json", format!("{:#}\n", self.json()))?;
         text("plan.csv", self.csv())?;
-        let about = [("Description", format!("{}; {}; predicted", self.title(), self.cluster()))];
-        write_atomic(&dir.join("plan.png"), |out| chart.canvas().png(out, &about))
+        let pixels = pixels(&chart, &LIGHT).map_err(drawn)?;
+        write_atomic(&dir.join("plan.png"), |out| write_png(&pixels, out))
     }
 }

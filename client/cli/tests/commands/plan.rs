@@ -107,5 +107,11 @@ fn flags_of_a_plan_are_refused_by_name_and_with_a_remedy() {
     let out = run(dir.path(), &many);
     assert_eq!(out.status.code(), Some(2));
     assert!(text(&out.stderr).contains("--workers, --threads"), "{}", text(&out.stderr));
+    // Before anything is opened, let alone drawn for minutes.
+    let nowhere = ["plan", "missing.nrrd", "--trace", "nowhere/s.trace"];
+    let out = run(dir.path(), &nowhere);
+    assert_eq!(out.status.code(), Some(1));
+    let said = text(&out.stderr);
+    assert!(said.contains("nowhere/s.trace: making the file failed"), "{said}");
     assert!(names(dir.path()).is_empty());
 }

@@ -25,7 +25,7 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
     assert!(said.contains("region schedule") && said.contains("slab schedule, 3 slabs"), "{said}");
     assert!(!said.contains("render threads' time"), "three frames are too few to tell: {said}");
     assert!(
-        said.contains("frames/s: can't be told of 3 frames; give --frames 8 or more"),
+        said.contains("frames/s: can't be told of 3 frames; give --frames 16 or more"),
         "{said}"
     );
     assert_eq!(names(&dir.join("out")), ["plan.csv", "plan.json", "plan.png", "plan.svg"]);
@@ -72,7 +72,7 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
 #[test]
 fn a_longer_plan_says_where_the_threads_time_goes() {
     let dir = tempfile::tempdir().unwrap();
-    let frames = ["plan", "formula:spheres:32", "--size", "128x128", "--frames", "9", "--quiet"];
+    let frames = ["plan", "formula:spheres:32", "--size", "128x128", "--frames", "16", "--quiet"];
     let cluster = ["--workers", "2", "--schedule", "region", "--trace", "s.trace"];
     let said = good(dir.path(), &[&frames[..], &cluster].concat());
     assert!(said.contains("four in flight: % of the render threads' time"), "{said}");

@@ -5,10 +5,14 @@
 //! [`Sheet`] hides which, and how large a pixel is. Text is measured by the same font, so labels
 //! keep apart in both.
 
+use crate::fail::Fail;
+use crate::output::write_atomic;
 use ab_glyph::{Font, FontRef, ScaleFont};
 use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
+use std::io::Write;
+use std::path::Path;
 use std::sync::Once;
 
 static FONT: &[u8] = include_bytes!("../fonts/DejaVuSans.ttf");
@@ -384,6 +388,19 @@ pub(crate) fn write_png(image: &Pixels, out: &mut impl std::io::Write) -> std::i
     let mut png = png.write_header().map_err(plain)?;
     png.write_image_data(&image.rgb).map_err(plain)?;
     png.finish().map_err(plain)
+}
+
+/// Writes it as `stem`.svg and `stem`.png into a folder.
+pub(crate) fn save(
+    chart: &impl Draw,
+    theme: &Theme,
+    (dir, stem): (&Path, &str),
+) -> Result<(), Fail> {
+    let drawn = |e: String| Fail::failed(format!("the chart can't be drawn: {e}"));
+    let svg = svg(chart, theme).map_err(drawn)?;
+    write_atomic(&dir.join(format!("{stem}.svg")), |f| f.write_all(svg.as_bytes()))?;
+    let pixels = pixels(chart, theme).map_err(drawn)?;
+    write_atomic(&dir.join(format!("{stem}.png")), |f| write_png(&pixels, f))
 }
 
 /// An axis in logarithms: its ends, and where its ticks stand.

@@ -159,10 +159,10 @@ impl Traffic {
     /// Whether frames that are alone, or such as overlap, leave room for bricks that may not be needed. Until one is done
     /// nobody knows.
     pub(crate) fn has_room(&self, alone: bool) -> bool {
-        if alone {
-            return self.alone.is_some() && !self.is_full_alone();
+        match alone {
+            true => self.alone.is_some() && !self.is_full_alone(),
+            false => self.took > 0.0 && !self.crowded,
         }
-        self.took > 0.0 && !self.crowded
     }
 
     /// The same of frames that were alone.

@@ -11,7 +11,7 @@ const WIDE: u32 = 1000;
 const ROOM: Box2 = Box2 { x0: 84.0, y0: 84.0, x1: 806.0, y1: 440.0 };
 /// Where the strips that say what binds begin, and how far they are apart.
 const STRIPS: (f64, f64) = (500.0, 26.0);
-/// Half a strip's height.
+/// Half a strip's height, and how far it goes beyond its first and last cluster.
 const HALF: f64 = 8.0;
 /// Resources and their places among a theme's colours.
 const BOUNDS: [(Bound, usize); 4] =
@@ -38,20 +38,27 @@ impl Chart<'_> {
         self.schedules.iter().flat_map(|s| s.1)
     }
 
-    /// The most workers, of two and more: with fewer there is no axis.
-    fn most(&self) -> u32 {
-        self.rows().map(|r| r.workers).max().unwrap_or(1).max(2)
+    /// Where workers stand. With fewer than two there is no axis.
+    fn axis(&self) -> Axis {
+        Axis { most: self.rows().map(|r| r.workers).max().unwrap_or(1).max(2) }
     }
+}
 
-    /// Where so many workers stand: in even steps for each doubling.
+/// The axis of workers, up to the most, in even steps for each doubling.
+struct Axis {
+    most: u32,
+}
+
+impl Axis {
+    /// Where so many stand.
     fn x(&self, workers: u32) -> f64 {
         let doublings = |n: u32| libm::log2(f64::from(n.max(1)));
-        ROOM.x0 + (ROOM.x1 - ROOM.x0) * doublings(workers) / doublings(self.most())
+        ROOM.x0 + (ROOM.x1 - ROOM.x0) * doublings(workers) / doublings(self.most)
     }
 
     /// Powers of two, and the most workers where there is room for them.
     fn ticks(&self) -> Vec<u32> {
-        let most = self.most();
+        let most = self.most;
         let mut ticks: Vec<u32> = (0..32).map(|i| 1 << i).take_while(|n| *n <= most).collect();
         let last = ticks.last().copied().unwrap_or(1);
         if self.x(most) - self.x(last) > width(&format!("{last}{most}"), 12.0) {
@@ -90,6 +97,7 @@ impl Draw for Chart<'_> {
     {
         on.text(self.title, (22.0, 32.0), 18.0, Anchor::Left, theme.ink)?;
         on.text(self.note, (22.0, 54.0), 12.0, Anchor::Left, theme.faint)?;
+        let axis = self.axis();
         let values = self.rows().flat_map(|r| FIGURES.iter().filter_map(|f| f.1(r)));
         // Frames that come a little early have more than all cores.
         let ceiling = values.fold(1.0, f64::max);
@@ -100,8 +108,8 @@ impl Draw for Chart<'_> {
             let word = format!("{} %", tenth * 10);
             on.text(&word, (ROOM.x0 - 12.0, at + 4.0), 12.0, Anchor::Right, theme.ink)?;
         }
-        for n in self.ticks() {
-            let at = self.x(n);
+        for n in axis.ticks() {
+            let at = axis.x(n);
             on.line(&[(at, ROOM.y0), (at, ROOM.y1)], 1.0, theme.grid)?;
             on.text(&n.to_string(), (at, ROOM.y1 + 20.0), 12.0, Anchor::Middle, theme.ink)?;
         }
@@ -116,7 +124,7 @@ impl Draw for Chart<'_> {
             for (name, value, mark, colours) in FIGURES {
                 let colour = theme.colours[colours[i % 2]];
                 let points: Vec<(f64, f64)> =
-                    rows.iter().filter_map(|r| Some((self.x(r.workers), y(value(r)?)))).collect();
+                    rows.iter().filter_map(|r| Some((axis.x(r.workers), y(value(r)?)))).collect();
                 if points.is_empty() {
                     continue;
                 }
@@ -143,7 +151,7 @@ impl Draw for Chart<'_> {
         for (i, (schedule, rows)) in self.schedules.iter().enumerate() {
             let at = STRIPS.0 + STRIPS.1 * i as f64;
             on.text(schedule, (ROOM.x0 - 14.0, at + 4.0), 12.0, Anchor::Right, theme.ink)?;
-            for (bound, x0, x1) in self.strip(rows) {
+            for (bound, x0, x1) in axis.strip(rows) {
                 let colour = BOUNDS.iter().find(|b| b.0 == bound).map_or(0, |b| b.1);
                 let own = Box2 { x0, y0: at - HALF, x1, y1: at + HALF };
                 on.bar(&own, theme.colours[colour])?;
@@ -188,7 +196,7 @@ mod tests {
         let rows: Vec<Row> = (1..=64).map(|n| row(n, bound(n))).collect();
         let schedules = [("region", &rows[..])];
         let chart = Chart { title: "t", note: "", schedules: &schedules };
-        let strip = chart.strip(&rows);
+        let strip = chart.axis().strip(&rows);
         assert_eq!(strip.len(), 46, "cores, and then each by itself");
         assert!(strip.windows(2).all(|w| w[0].2 == w[1].1 && w[0].1 < w[0].2), "{strip:?}");
         assert!(strip[0].1 < ROOM.x0 && strip[45].2 > ROOM.x1, "ends stand about their points");
@@ -208,7 +216,7 @@ mod tests {
             drawn.contains("slab, 3 slabs, latency") && !drawn.contains("throughput"),
             "{drawn}"
         );
-        assert_eq!(chart.ticks(), [1, 2, 3]);
+        assert_eq!(chart.axis().ticks(), [1, 2, 3]);
         assert!(!pixels(&chart, &LIGHT).unwrap().rgb.is_empty());
         let none = Chart { schedules: &[], ..chart };
         assert!(svg(&none, &LIGHT).is_ok());

@@ -644,6 +644,49 @@ mod tests {
         }
     }
 
+    /// What bricks weigh, and what lz4 makes of them and takes, of each by itself and of messages of some 64 KiB.
+    /// Packed they would be once, in the store; unpacked by each worker. For docs/scaling.md.
+    #[test]
+    #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_bricks -- --ignored --nocapture"]
+    fn what_bricks_weigh_and_take_to_pack() {
+        const MESSAGE: usize = 64 << 10;
+        println!("bytes a voxel and a brick; of them packed, %, and us a brick to pack and unpack");
+        for scene in OPAQUE {
+            let Some(stage) = staged(scene) else { continue };
+            let encoded = |brick: &Arc<Brick>| {
+                let mut bytes = Vec::new();
+                brick.encode(&mut bytes);
+                bytes
+            };
+            let bricks: Vec<Vec<u8>> = stage.bricks.iter().map(encoded).collect();
+            let voxels: u32 =
+                stage.bricks.directory().bricks().iter().map(|b| u32::from(b.voxels)).sum();
+            let all: usize = bricks.iter().map(Vec::len).sum();
+            let each = all / bricks.len();
+            println!("{}: {:.2}, {each}", scene.2, all as f64 / f64::from(voxels));
+            let messages: Vec<Vec<u8>> =
+                bricks.chunks((MESSAGE / each).max(1)).map(<[Vec<u8>]>::concat).collect();
+            for (name, pieces) in [("each", &bricks), ("messages", &messages)] {
+                let pack = || pieces.iter().map(|p| lz4_flex::block::compress(p)).collect();
+                let (packing, packed): (u64, Vec<Vec<u8>>) = shortest(3, pack);
+                let (unpacking, ()) = shortest(3, || {
+                    for (bytes, piece) in packed.iter().zip(pieces) {
+                        let plain = lz4_flex::block::decompress(bytes, piece.len());
+                        assert!(plain.is_ok_and(|plain| plain == *piece), "it comes back");
+                    }
+                });
+                let of_all = packed.iter().map(Vec::len).sum::<usize>() as f64 / all as f64;
+                let us = |ns: u64| ns as f64 / 1e3 / bricks.len() as f64;
+                println!(
+                    "  {name}: {:.1}; {:.2}, {:.2}",
+                    100.0 * of_all,
+                    us(packing),
+                    us(unpacking)
+                );
+            }
+        }
+    }
+
     /// The tiles of a picture of 512x512 in which something is, as sums.
     fn tiles_of(picture: &[[f32; 4]]) -> Vec<(Rect, TilePixels)> {
         let corners = (0..512).step_by(64).flat_map(|y| (0..512).step_by(64).map(move |x| (x, y)));

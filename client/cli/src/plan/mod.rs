@@ -12,7 +12,7 @@ pub(crate) mod measure;
 pub(crate) mod predict;
 mod rehearse;
 
-use crate::chart::{LIGHT, pixels, svg, write_png};
+use crate::chart::{LIGHT, save};
 use crate::fail::{Fail, say};
 use crate::output::{Made, probe, write_atomic};
 use crate::progress::Progress;
@@ -132,10 +132,8 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
         }
     }
     let mut progress = Progress::new(args.quiet);
-    // Refused before minutes of measuring, and gone again until there is something to write.
-    if let Some(dir) = &args.output {
-        drop(Made::new(dir)?);
-    }
+    // Refused before minutes of measuring; what is made goes again if nothing comes into it.
+    let _made = args.output.as_deref().map(Made::new).transpose()?;
     if let Some(file) = args.trace.as_deref().filter(|file| !file.exists()) {
         probe(file)?;
     }
@@ -497,18 +495,14 @@ impl Said<'_> {
     }
 
     fn write(&self, dir: &Path) -> Result<(), Fail> {
-        let _made = Made::new(dir)?;
         let title = format!("{}: predicted efficiency", self.title());
         let schedules: Vec<_> = self.predicted.iter().map(|p| (p.name(), &p.rows[..])).collect();
         let chart = chart::Chart { title: &title, note: &self.cluster(), schedules: &schedules };
-        let drawn = |e: String| Fail::failed(format!("the chart can't be drawn: {e}"));
+        save(&chart, &LIGHT, (dir, "plan"))?;
         let text = |name: &str, text: String| {
             write_atomic(&dir.join(name), |out| out.write_all(text.as_bytes()))
         };
-        text("plan.svg", svg(&chart, &LIGHT).map_err(drawn)?)?;
         text("plan.json", format!("{:#}\n", self.json()))?;
-        text("plan.csv", self.csv())?;
-        let pixels = pixels(&chart, &LIGHT).map_err(drawn)?;
-        write_atomic(&dir.join("plan.png"), |out| write_png(&pixels, out))
+        text("plan.csv", self.csv())
     }
 }

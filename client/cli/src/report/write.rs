@@ -33,13 +33,10 @@ pub(super) fn check(args: &ReportArgs) -> Result<Made, Fail> {
 pub(super) fn files(out: &Path, report: &Report) -> Result<(), Fail> {
     let text =
         |name: &str, text: &str| write_atomic(&out.join(name), |f| f.write_all(text.as_bytes()));
-    let drawn = |e: String| Fail::failed(format!("the chart can't be drawn: {e}"));
     text("report.json", &json(report))?;
     text("report.csv", &csv(report))?;
     for (name, theme) in [("report", &LIGHT), ("report-dark", &DARK)] {
-        text(&format!("{name}.svg"), &chart::svg(&Chart(report), theme).map_err(drawn)?)?;
-        let pixels = chart::pixels(&Chart(report), theme).map_err(drawn)?;
-        write_atomic(&out.join(format!("{name}.png")), |f| chart::write_png(&pixels, f))?;
+        chart::save(&Chart(report), theme, (out, name))?;
     }
     Ok(())
 }

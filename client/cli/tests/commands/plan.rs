@@ -15,7 +15,8 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     let cluster = ["--workers", "1..3,8", "--link", "1gbit", "--latency", "100us"];
-    let files = ["--trace", "s.trace", "-o", "out"];
+    // The trace may lie in the folder that is yet to be made.
+    let files = ["--trace", "out/s.trace", "-o", "out"];
     let said = good(dir, &[&SMALL[..], &cluster, &files].concat());
     assert!(said.contains("measured here: ") && said.contains("alone, one core takes"), "{said}");
     assert!(said.contains("predicted from that"), "{said}");
@@ -28,7 +29,10 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
         said.contains("frames/s: can't be told of 3 frames; give --frames 16 or more"),
         "{said}"
     );
-    assert_eq!(names(&dir.join("out")), ["plan.csv", "plan.json", "plan.png", "plan.svg"]);
+    assert_eq!(
+        names(&dir.join("out")),
+        ["plan.csv", "plan.json", "plan.png", "plan.svg", "s.trace"]
+    );
     let svg = std::fs::read_to_string(dir.join("out/plan.svg")).unwrap();
     assert!(svg.contains("predicted efficiency") && svg.contains("<circle"));
     let csv = std::fs::read_to_string(dir.join("out/plan.csv")).unwrap();
@@ -53,12 +57,21 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
         assert!(row["frames_per_s"].is_null() && row["throughput_efficiency"].is_null(), "{row}");
     }
     // What was measured is read again; a slow link then binds.
-    let slow =
-        ["--workers", "8", "--link", "1mbit", "--trace", "s.trace", "--json", "--schedule", "slab"];
+    let slow = [
+        "--workers",
+        "8",
+        "--link",
+        "1mbit",
+        "--trace",
+        "out/s.trace",
+        "--json",
+        "--schedule",
+        "slab",
+    ];
     let plan = json(&good(dir, &[&SMALL[..], &slow].concat()));
     assert_eq!(plan["predicted"][0]["bound_by"], "link", "{plan}");
     // And is not taken for another picture's.
-    let other = ["--tf", "bone", "--trace", "s.trace"];
+    let other = ["--tf", "bone", "--trace", "out/s.trace"];
     let out = run(dir, &[&SMALL[..], &other].concat());
     assert_eq!(out.status.code(), Some(1));
     let said = text(&out.stderr);

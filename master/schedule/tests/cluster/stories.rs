@@ -266,7 +266,8 @@ fn without_idle_threads_a_late_lease_goes_to_another_worker_at_its_deadline() {
 
 #[test]
 fn a_straggler_holds_up_a_frame_by_less_than_a_third() {
-    // PROMISES.md R4: one of 8 workers at a tenth of the speed, against 7 healthy ones.
+    // PROMISES.md R4: one of 8 workers at a tenth of the speed, against 7 healthy ones; and of the tiles that are lent
+    // few are drawn twice for it.
     let run = |slow: bool, tile: Option<u32>, schedule: Schedule| {
         let mut w = world();
         workers(&mut w, 7);
@@ -277,18 +278,24 @@ fn a_straggler_holds_up_a_frame_by_less_than_a_third() {
         w.queue(job_with(0, work, Quality { thickness: 1.0, ..Quality::default() }));
         let time = time(&mut w);
         w.finish();
-        time
+        let stats = &w.done[&FrameId(0)].stats;
+        let tiles: usize = stats.slabs.iter().map(|s| s.tiles.len()).sum();
+        (time, stats.retries as f64 / tiles as f64)
     };
     let mut worst = 0.0f64;
     for (tile, schedule) in
         [Some(16), Some(32)].into_iter().zip([BOTH; 2]).flat_map(|(t, b)| b.map(|b| (t, b)))
     {
-        let (healthy, slow) = (run(false, tile, schedule), run(true, tile, schedule));
+        let ((healthy, _), (slow, twice)) = (run(false, tile, schedule), run(true, tile, schedule));
         let ratio = slow as f64 / healthy as f64;
         println!(
-            "straggler: {schedule:?}, {tile:?}, {slow} us, healthy {healthy} us, {ratio:.2} x"
+            "straggler: {schedule:?}, {tile:?}, {slow} us, healthy {healthy} us, {ratio:.2} x, {:.1} % twice",
+            100.0 * twice
         );
         worst = worst.max(ratio);
+        // What the slow one has at the end of each of three slabs others draw as well.
+        let most = if schedule == Schedule::Region { 0.1 } else { 0.15 };
+        assert!(twice <= most, "{:.1} % of the tiles", 100.0 * twice);
     }
     assert!(worst <= 1.3, "{worst:.2} x");
 }

@@ -175,9 +175,9 @@ async fn link(
                         let (endpoint, to) = (bricks_endpoint.clone(), bricks_tx.clone());
                         bricks_stream = Some(tokio::spawn(carry_bricks(endpoint, session, to)));
                     }
-                    if control_tx.send(message).is_err() {
-                        break Ok(());
-                    }
+                    // A desk that is gone has said good-bye, which is lost if the stream ends before it
+                    // has left: then the master ends the stream.
+                    let _ = control_tx.send(message);
                 }
                 Err(e) => break Err(format!("the master sent what can't be read: {e}")),
             }

@@ -26,8 +26,8 @@ mod course;
 pub use course::{Course, Has, Sees};
 
 /// Version of the format. Since 2 regions' results weigh what finished pixels do, since 3 their times have
-/// no look at bricks in them, since 4 they say when they come to each brick.
-pub const VERSION: u32 = 4;
+/// no look at bricks in them, since 4 they say when they come to each brick, since 5 what messages take is in it.
+pub const VERSION: u32 = 5;
 
 /// Largest trace that is read, in bytes: 1000 frames with tiles of 16 pixels.
 pub const MAX_BYTES: u64 = 1 << 30;
@@ -70,6 +70,19 @@ pub struct About {
     pub slabs: u32,
     /// How often each tile was drawn; the shortest time counts.
     pub repeats: u32,
+    /// What messages take there; of a machine that does not say it nothing.
+    pub pings: Option<Pings>,
+}
+
+/// What a ping and its pong take of the processors, between a real master and real workers that TCP joins on one machine, in
+/// nanoseconds: the master's driver, the master's streams, the worker.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Pings {
+    /// Of a worker by itself: everybody on the way is woken.
+    pub alone_ns: [u64; 3],
+    /// In company, where many are pinged at once: next to nobody is.
+    pub company_ns: [u64; 3],
 }
 
 /// One frame.
@@ -256,6 +269,10 @@ impl Trace {
         let [w, h] = trace.about.size;
         if !(1..=8192).contains(&w) || !(1..=8192).contains(&h) {
             return no(format!("about.size: {w}x{h} is no size of a picture"));
+        }
+        let pings = trace.about.pings.iter().flat_map(|p| [p.alone_ns, p.company_ns]).flatten();
+        if pings.max() > Some(1_000_000_000) {
+            return no("about.pings: one takes longer than a second".into());
         }
         let pixels = u64::from(w) * u64::from(h);
         for (i, frame) in trace.frames.iter().enumerate() {
@@ -507,6 +524,7 @@ mod tests {
                 size: [100, 70],
                 slabs: 1,
                 repeats: 2,
+                pings: Some(Pings { alone_ns: [9, 21, 20], company_ns: [1, 5, 4] }),
             },
             frames: vec![FrameTrace {
                 view: Digest32([7; 32]).to_string(),
@@ -573,11 +591,12 @@ mod tests {
         let says = |text: &str| Trace::from_json(text.as_bytes()).unwrap_err().to_string();
         let good = trace().to_json();
         assert!(says("{}").contains("slabcast plan --trace"));
-        assert!(says(&good.replacen("\"version\":4", "\"version\":5", 1)).contains("version 5"));
-        let old = good.replace("\"version\":4", "\"version\":3").replace(",[2,1,68]]", "]");
+        assert!(says(&good.replacen("\"version\":5", "\"version\":6", 1)).contains("version 6"));
+        let old = good.replace("\"version\":5", "\"version\":3").replace(",[2,1,68]]", "]");
         assert!(old.len() < good.len() && says(&old).contains("version 3"), "{old}");
         assert!(says(&good.replace(",[2,1,68]]", "]")).contains("invalid length"));
         assert!(says(&good.replace("[100,70]", "[100,0]")).starts_with("about.size"));
+        assert!(says(&good.replace("[9,21,20]", "[9,2000000000,20]")).starts_with("about.pings"));
         assert!(says(&good.replace("[100,70]", "[10,7]")).contains("more pixels"));
         assert!(says(&good.replace("\"edge\":64", "\"edge\":65")).contains("65 is no edge"));
         assert!(says(&good.replace("[64,0,700", "[64,99,700")).contains("by row and column"));

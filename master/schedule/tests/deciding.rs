@@ -114,6 +114,7 @@ fn ball(frames: usize) -> (Vec<FrameJob>, Trace) {
         size: SIZE,
         slabs: 3,
         repeats: 1,
+        pings: None,
     };
     (jobs, Trace { version: VERSION, about, frames: traced })
 }

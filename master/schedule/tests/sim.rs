@@ -67,6 +67,7 @@ fn world(frames: usize) -> (Vec<FrameJob>, Trace) {
         size: SIZE,
         slabs: 3,
         repeats: 1,
+        pings: None,
     };
     (jobs, Trace { version: VERSION, about, frames })
 }

@@ -1,7 +1,7 @@
 //! What messages cost a processor.
 //!
 //! Two parts: what is done to bytes here (planes to messages and back) is timed by the command; what
-//! gRPC, TCP and the kernel take is a constant that `tests/messages.rs` measured.
+//! gRPC, TCP and the kernel take follows from what pings took where the tiles were drawn ([`pings`](super::pings)).
 
 use super::clock::cpu_ns;
 use super::measure::FINISH;
@@ -15,32 +15,58 @@ use slabcast_common::message::{
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Schedule;
 use slabcast_common::slab::SheetRange;
-use slabcast_common::trace::{self, Trace};
+use slabcast_common::trace::{self, Pings, Trace};
 use slabcast_proto::convert::{self, Down};
 use slabcast_proto::v1;
 use slabcast_schedule::sim::{Costs, Toll};
 use std::time::Instant;
 
-/// A thread of a master, or of a worker, that slept begins to work, in ns. `tests/messages.rs` has a ping
-/// and its pong cost the master's streams 40 us and a worker 36 us alone, and 7.6 and 7.0 us in the company
-/// of 31 others (2 vCPU, on which waking a core costs 20 us): each end is woken once for either.
-const WOKEN: (f64, f64) = (16_000.0, 28_000.0);
-/// The driver, which has no socket, begins to work. There a ping and its pong cost it 22.4 us alone and 2.0 in the
-/// company of 31 others, and it wakes for either. Of a rehearsal on one core (mri256 at 1024x1024, four workers) `perf` has
-/// it wait and wake for 7.3 us each of 79 times a frame.
-const DRIVER_WOKEN: f64 = 10_000.0;
-/// The driver takes a message from its queue or puts one into a link's, and counts it: in that rehearsal 15 % of its
-/// 1.85 ms a frame are neither decisions nor waking, for 333 messages.
-const DRIVER_EACH: f64 = 800.0;
-/// A socket is read from or written to: what is left of that in company, less [`EACH`].
-const CALL: f64 = 3_000.0;
-/// A message through gRPC in company: TRANSPORT.md, answer 1.
-const EACH: f64 = 800.0;
-/// A byte of it: TRANSPORT.md has 4.4 us for 16 KiB in company.
+/// Of a machine that does not say what threads take: an EPYC of 2.45 GHz (Zen 3, 2 vCPU), on which waking a
+/// processor costs 20 us.
+const KNOWN: Pings =
+    Pings { alone_ns: [22_400, 40_100, 35_500], company_ns: [2_000, 7_600, 7_000] };
+/// What of a message in company is gRPC's, and not the socket's: there 3.65 us a message at either end, of which
+/// TRANSPORT.md, answer 1, has 0.8 for gRPC.
+const GRPC: f64 = 0.22;
+/// What of the driver's work for a ping or a pong is the message, and not what it decides: of a rehearsal (mri256 at 1024x1024,
+/// four workers, that machine) 15 % of 1.85 ms a frame are neither decisions nor waking, 0.8 us of each of 333 messages.
+const QUEUED: f64 = 0.8;
+/// A byte of a message: TRANSPORT.md has 4.4 us for 16 KiB in company.
 const BYTE: f64 = 0.3;
 /// To send a pixel of three bytes to the client, and to receive it: TRANSPORT.md, answer 1, has 14 and 17
 /// us for 64 KiB.
 const DELIVER: [f64; 2] = [0.65, 0.8];
+
+/// What each message costs, in ns, whatever is in it.
+struct Prices {
+    /// A thread of the master's streams, and of a worker's, that slept begins to work.
+    woken: [f64; 2],
+    /// The driver, which has no socket, does.
+    driver_woken: f64,
+    /// It takes a message from its queue or puts one into a link's, and counts it.
+    driver_each: f64,
+    /// A socket is read from or written to.
+    call: f64,
+    /// A message goes through gRPC.
+    each: f64,
+}
+
+impl Prices {
+    fn of(pings: &Pings) -> Prices {
+        let [driver, streams, worker] = pings.company_ns.map(|ns| ns as f64);
+        let waking = |i: usize| pings.alone_ns[i].saturating_sub(pings.company_ns[i]) as f64;
+        // Of a ping and its pong the driver and the streams are woken for either, a worker for the ping. Either is a
+        // message that is written at one end and read at the other.
+        let message = (streams + worker) / 4.0;
+        Prices {
+            woken: [waking(1) / 2.0, waking(2)],
+            driver_woken: waking(0) / 2.0,
+            driver_each: QUEUED * driver / 2.0,
+            call: (1.0 - GRPC) * message,
+            each: GRPC * message,
+        }
+    }
+}
 
 /// Nanoseconds of the best of some runs.
 fn best(mut run: impl FnMut()) -> f64 {
@@ -99,6 +125,7 @@ pub(super) fn messages(trace: &Trace, schedule: Schedule) -> Costs {
     };
     let up = |m: &ToMaster| convert::from_worker_to_wire(m).encode_to_vec();
     let (lease_bytes, result_bytes) = (down(&lease), up(&result));
+    let price = Prices::of(trace.about.pings.as_ref().unwrap_or(&KNOWN));
     let byte = |ns: f64, bytes: &[u8]| BYTE + ns / bytes.len().max(1) as f64;
     let send = best(|| drop(down(&lease)));
     let worker_send = best(|| drop(up(&result)));
@@ -112,27 +139,27 @@ pub(super) fn messages(trace: &Trace, schedule: Schedule) -> Costs {
     });
     Costs {
         master: Toll {
-            woken: WOKEN.0,
-            call: CALL,
-            send: (EACH, byte(send, &lease_bytes)),
-            receive: (EACH, byte(receive, &result_bytes)),
-            bricks: (EACH, BYTE),
+            woken: price.woken[0],
+            call: price.call,
+            send: (price.each, byte(send, &lease_bytes)),
+            receive: (price.each, byte(receive, &result_bytes)),
+            bricks: (price.each, BYTE),
         },
         worker: Toll {
-            woken: WOKEN.1,
-            call: CALL,
-            send: (EACH, byte(worker_send, &result_bytes)),
-            receive: (EACH, byte(worker_receive, &lease_bytes)),
+            woken: price.woken[1],
+            call: price.call,
+            send: (price.each, byte(worker_send, &result_bytes)),
+            receive: (price.each, byte(worker_receive, &lease_bytes)),
             // Bricks are decoded and put into the cache: some 3 ns a byte (docs/performance.md).
-            bricks: (EACH, BYTE + 3.0),
+            bricks: (price.each, BYTE + 3.0),
         },
         finish_pixel: finish(trace, by_region),
         mark_pixel: mark(trace.about.size),
         deliver: DELIVER,
         hold: (0.0, fill(by_region)),
         late: late(),
-        driver_woken: DRIVER_WOKEN,
-        driver_message: DRIVER_EACH,
+        driver_woken: price.driver_woken,
+        driver_message: price.driver_each,
         ..Costs::default()
     }
 }
@@ -221,4 +248,19 @@ fn late() -> f64 {
         })
         .sum();
     sum / 50.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn waking_is_what_company_saves() {
+        let price = Prices::of(&KNOWN);
+        assert_eq!((price.woken, price.driver_woken), ([16_250.0, 28_500.0], 10_200.0));
+        assert!((price.call + price.each - 3_650.0).abs() < 1.0, "a message in company");
+        // Noise may have company look dearer: then nobody is woken.
+        let odd = Pings { alone_ns: KNOWN.company_ns, company_ns: KNOWN.alone_ns };
+        assert_eq!(Prices::of(&odd).woken, [0.0; 2]);
+    }
 }

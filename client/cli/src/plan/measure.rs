@@ -31,7 +31,7 @@ use slabcast_common::quality::Work;
 use slabcast_common::region::PART;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::trace::{
-    About, FrameTrace, Level, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace, VERSION,
+    About, FrameTrace, Level, Pings, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace, VERSION,
     view_sha256,
 };
 use slabcast_common::view::Projected;
@@ -61,6 +61,8 @@ pub(crate) struct Path<'a> {
     pub(crate) slab: bool,
     pub(crate) region: bool,
     pub(crate) repeats: u32,
+    /// What messages take here, where it is known.
+    pub(crate) pings: Option<Pings>,
     pub(crate) names: (String, String),
 }
 
@@ -116,6 +118,7 @@ pub(crate) fn measure(
         size: jobs[0].view.size,
         slabs: path.work.slabs,
         repeats: path.repeats,
+        pings: path.pings,
     };
     Ok(Trace { version: VERSION, about, frames })
 }

@@ -3,26 +3,27 @@
 //! Two halves, and it says which is which: [`measure`] draws every tile of the path here, on one
 //! core, and weighs its messages; [`predict`] runs the scheduler itself with these tiles against
 //! virtual workers and links (`slabcast_schedule::sim`). [`costs`] has what messages cost a
-//! processor, [`chart`] draws. [`rehearse`] puts it to the test with processes on this machine.
+//! processor, as [`pings`] were measured here, [`chart`] draws. [`rehearse`] puts it to the test with processes on this machine.
 
 mod chart;
 pub(crate) mod clock;
 mod costs;
 pub(crate) mod measure;
+mod pings;
 pub(crate) mod predict;
 mod rehearse;
 
 use crate::chart::{LIGHT, save};
 use crate::fail::{Fail, say};
 use crate::output::{Made, probe, write_atomic};
-use crate::progress::Progress;
+use crate::progress::{Progress, warn};
 use crate::request::{Asked, Opened, PictureOf, WorkArgs};
 use crate::stage::Stage;
 use crate::{embedded, parse};
 use predict::{IN_FLIGHT, LOSSES, Question, Row, STEADILY};
 use rehearse::Over;
 use slabcast_common::quality::{Schedule, Work};
-use slabcast_common::trace::{MAX_BYTES, Trace};
+use slabcast_common::trace::{MAX_BYTES, Pings, Trace};
 use slabcast_schedule::FrameJob;
 use slabcast_schedule::sim::{Link, alone_ms};
 use std::fmt::Write as _;
@@ -157,6 +158,8 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
             Measured { trace, now: false }
         }
         file => {
+            progress.stage("measuring what messages take");
+            let pings = pinged();
             progress.frames(frames as u64, &format!("drawing the tiles of {frames} frames"));
             let path = measure::Path {
                 stage: &stage,
@@ -167,6 +170,7 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
                 slab: schedules.contains(&Schedule::Slab),
                 region: schedules.contains(&Schedule::Region),
                 repeats: args.repeats,
+                pings,
                 names,
             };
             let trace = measure::measure(&path, (&mut progress, 0))?;
@@ -232,6 +236,17 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
     say(&if args.json { format!("{}\n", said.json()) } else { said.table() })
 }
 
+/// What messages take here; who can't tell is warned.
+pub(crate) fn pinged() -> Option<Pings> {
+    let told = pings::measure();
+    told.inspect_err(|why| {
+        warn(&format!(
+            "what messages take can't be measured here ({why}): theirs on another machine count"
+        ))
+    })
+    .ok()
+}
+
 /// Reads a trace.
 pub(crate) fn read(file: &Path) -> Result<Trace, Fail> {
     let mut bytes = Vec::new();
@@ -267,6 +282,21 @@ impl Predicted {
             Schedule::Region | Schedule::Auto => "region",
         }
     }
+}
+
+/// What messages take, in a line.
+fn said_of(pings: Option<&Pings>) -> String {
+    let Some(Pings { alone_ns, company_ns }) = pings else {
+        return "messages: not measured here; those of an EPYC of 2.45 GHz".into();
+    };
+    let us = |ns: &[u64; 3]| ns.map(|ns| format!("{:.1}", ns as f64 / 1e3)).join(", ");
+    format!(
+        "a ping and its pong take the master's driver, its streams, a worker {} us alone, {} in \
+         the company of {}",
+        us(alone_ns),
+        us(company_ns),
+        pings::COMPANY - 1
+    )
 }
 
 /// Where the render threads' time goes; nothing where paths are too short to tell.
@@ -332,13 +362,14 @@ impl Said<'_> {
         let when = if self.measured.now { "measured here" } else { "measured before (--trace)" };
         let mut text = format!(
             "{}; {}\n{when}: {} tiles, each {} times; alone, one core takes {:.2} ms a frame (tiles \
-             of {edge} pixels)\npredicted from that, by the scheduler itself against virtual \
+             of {edge} pixels)\n{}\npredicted from that, by the scheduler itself against virtual \
              workers and links:\n",
             self.title(),
             self.cluster(),
             self.tiles(),
             trace.about.repeats,
             alone_ms(trace),
+            said_of(trace.about.pings.as_ref()),
         );
         for p in self.predicted {
             let slabs = match p.schedule {
@@ -451,6 +482,7 @@ impl Said<'_> {
                 "size": trace.about.size, "frames": trace.frames.len(), "tiles": self.tiles(),
                 "repeats": trace.about.repeats, "simd": trace.about.simd,
                 "slabs": trace.about.slabs, "alone_ms": alone_ms(trace),
+                "pings": trace.about.pings,
             },
             "cluster": {
                 "threads": self.args.threads, "link": self.args.link.to_string(),

@@ -8,13 +8,14 @@ use super::{
 };
 use crate::embedded;
 use crate::fail::Fail;
-use crate::plan::GOODPUT;
 use crate::plan::measure::{self, Path as Measured};
+use crate::plan::{GOODPUT, pinged};
 use crate::progress::{self, Progress, Step};
 use crate::request::{Asked, Opened};
 use crate::signals;
 use crate::stage::Stage;
 use slabcast_common::quality::{Borders, Kernel, Quality, Schedule, Work};
+use slabcast_common::trace::Pings;
 use slabcast_common::view::MAX_EDGE;
 use slabcast_schedule::sim::Link;
 
@@ -44,6 +45,8 @@ pub(super) struct Lab<'a> {
     link: Link,
     repeats: u32,
     views: usize,
+    /// What messages take here.
+    pings: Option<Pings>,
     /// Rendering nodes that are run for real.
     live: Vec<u32>,
     progress: Progress,
@@ -61,6 +64,8 @@ impl Lab<'_> {
         let mut progress = Progress::new(false).of("view");
         progress.stage(&format!("reading {}", args.of.volume.display()));
         let opened = args.of.open(&asked)?;
+        progress.stage("measuring what messages take");
+        let pings = pinged();
         let cores = embedded::cores();
         let views = asked.path.frames();
         // 2, 4, 8, 12 and 15 rendering nodes, and one.
@@ -75,6 +80,7 @@ impl Lab<'_> {
             },
             repeats: if args.quick { 1 } else { args.repeats },
             views,
+            pings,
             live,
             progress,
             done: 0,
@@ -105,6 +111,7 @@ impl Lab<'_> {
             slab: true,
             region: schedules.contains(&Schedule::Region),
             repeats,
+            pings: self.pings,
             names: (self.opened.volume.name.clone(), asked.transfer.name()),
         };
         let jobs = measure::jobs(stage, views, asked.work)?;

@@ -1,4 +1,5 @@
-//! A region's parts, and where a region is cut of which others are to draw a piece.
+//! A region's parts, where a region is cut of which others are to draw a piece, and how far ahead one looks that lacks
+//! bricks.
 //!
 //! A tile is drawn in parts, squares of the picture of [`PART`] pixels, one after the other through all sheets. What
 //! is left of it when somebody else has time are parts that nobody came to yet, and a part that is some
@@ -16,6 +17,61 @@ pub const PART: i32 = 64;
 /// with 4 25.1. In exchange they ask 322 times for the first view instead of 228, with 4 372 times, while others of their
 /// worker's are drawn. In later views they expect most of what they need beforehand (docs/scaling.md).
 pub const AHEAD: u32 = 4;
+
+/// As [`AHEAD`], of a worker that waits for bricks; twice as far each time that the same region stands still again, up to
+/// [`FARTHEST`]. mri256 on 15 workers of one machine, real ones: with 4 always they were sent 7.7 % of the set a later frame, and
+/// regions stood still 48 times; so 8.3 % and 27 times; with 8 to begin with 7.4 % and 31; with 16 and four times as far 9.7 % and 26
+/// (docs/scaling.md).
+const FAR: u32 = 16;
+const FARTHEST: u32 = 1024;
+
+/// A worker waits for bricks whose threads did so for one part of this many of the last [`LATELY`]. At half and twice this
+/// figures change by their noise.
+const PARTS: u64 = 100;
+
+/// After this time, in ns, what was before counts half.
+const LATELY: u64 = 60_000_000;
+
+/// How far a worker's regions look beyond the sheet at which they lack a brick: for more bricks that nothing hides yet, which
+/// are asked for along with it.
+///
+/// Who looks far asks for bricks that what lies in front of them then hides, and who does not stands still
+/// again some sheets on. One whose other regions keep his threads busy meanwhile loses nothing by that, and looks
+/// [`AHEAD`]. One whose threads wait looks far, and farther each time that the same region stands still: mouse_skull on 15
+/// workers had tiles that stood still 15 times in a frame, for 0.16 ms each (docs/scaling.md). A scene's first frame
+/// does not count and looks as near as can be, since all is lacked there.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Lookahead {
+    /// From when on counts what was waited, in ns.
+    from: u64,
+    /// What threads waited, in sum.
+    waited: u64,
+}
+
+impl Lookahead {
+    /// A region of a scene's first frame is drawn at this time, in ns.
+    pub fn forget(&mut self, now: u64) {
+        *self = Lookahead { from: now, waited: 0 };
+    }
+
+    /// Threads had nothing to do for so many nanoseconds, in sum, while regions lacked bricks.
+    pub fn waited(&mut self, ns: u64) {
+        self.waited = self.waited.saturating_add(ns);
+    }
+
+    /// How many sheets a region looks ahead that is drawn at this time, in ns, on a worker of so many threads, and that stood
+    /// still so many times before.
+    pub fn sheets(&mut self, now: u64, threads: u32, stalls: u32) -> u32 {
+        let lately = now.saturating_sub(self.from);
+        let waits = self.waited > 0
+            && PARTS.saturating_mul(self.waited) >= lately.saturating_mul(u64::from(threads));
+        if lately > LATELY {
+            self.from = now - lately / 2;
+            self.waited /= 2;
+        }
+        if waits { FAR.saturating_mul(2u32.saturating_pow(stalls)).min(FARTHEST) } else { AHEAD }
+    }
+}
 
 /// A tile's parts: no part of it lies in two of the picture's.
 pub fn parts(tile: Rect) -> impl Iterator<Item = Rect> {
@@ -74,6 +130,26 @@ mod tests {
         let got: Vec<Rect> = parts(Rect::new(48, 64, 130, 100)).collect();
         let of = |x0, x1| Rect::new(x0, 64, x1, 100);
         assert_eq!(got, [of(48, 64), of(64, 128), of(128, 130)]);
+    }
+
+    #[test]
+    fn who_waits_for_bricks_looks_far() {
+        const MS: u64 = 1_000_000;
+        let mut look = Lookahead::default();
+        assert_eq!(look.sheets(10 * MS, 1, 3), AHEAD, "who never waited");
+        look.waited(MS);
+        assert_eq!(
+            [0, 1, 2, 5, 6, 99].map(|n| look.sheets(20 * MS, 1, n)),
+            [16, 32, 64, 512, 1024, 1024]
+        );
+        assert_eq!(look.sheets(20 * MS, 8, 0), AHEAD, "a millisecond of 160");
+        // What was waited long ago is forgotten by and by.
+        assert_eq!(look.sheets(100 * MS, 1, 0), FAR);
+        assert_eq!(look.sheets(130 * MS, 1, 0), AHEAD);
+        look.waited(50 * MS);
+        assert_eq!(look.sheets(140 * MS, 8, 0), FAR);
+        look.forget(140 * MS);
+        assert_eq!(look.sheets(141 * MS, 1, 0), AHEAD, "a first frame");
     }
 
     #[test]

@@ -15,7 +15,7 @@ use slabcast_common::message::{
     Counters, HandedOver, Lease, Pixels, RegionLease, Sampling, SceneSpec,
 };
 use slabcast_common::occlusion::Rect;
-use slabcast_common::region::AHEAD;
+use slabcast_common::region::{AHEAD, Lookahead};
 use slabcast_common::trace::Course;
 use slabcast_common::view::View;
 use slabcast_render::depths::Depths;
@@ -42,12 +42,14 @@ pub(crate) struct SceneSlot {
     pub(crate) parts: Mutex<BTreeSet<[i32; 2]>>,
     /// What the thickness costs is found by; `None` where sheets can't be thinner.
     pair: OnceLock<Option<Pair>>,
+    /// The frame that was drawn first.
+    first: OnceLock<FrameId>,
 }
 
 impl SceneSlot {
     pub(crate) fn new(spec: Arc<SceneSpec>) -> Self {
-        let (scene, depths, parts, pair) = Default::default();
-        SceneSlot { spec, scene, depths, parts, pair }
+        let (scene, depths, parts, pair, first) = Default::default();
+        SceneSlot { spec, scene, depths, parts, pair, first }
     }
 }
 
@@ -289,6 +291,10 @@ struct State {
     /// Up to when `waited` is counted.
     since: Option<Instant>,
     waited: Duration,
+    /// How many threads there are, when the first of them had nothing to do, and how far regions look since.
+    threads: u32,
+    began: Option<Instant>,
+    look: Lookahead,
 }
 
 impl State {
@@ -298,8 +304,21 @@ impl State {
         if let Some(since) = self.since.replace(now)
             && self.parked
         {
-            self.waited += (now - since) * self.idle;
+            let waited = (now - since) * self.idle;
+            self.waited += waited;
+            self.look.waited(waited.as_nanos() as u64);
         }
+    }
+
+    /// How many sheets a region that a thread takes looks ahead.
+    fn ahead(&mut self, going: &Going) -> u32 {
+        let now = self.began.get_or_insert_with(Instant::now).elapsed().as_nanos() as u64;
+        let frame = going.lease.frame;
+        if *going.frame.scene.first.get_or_init(|| frame) == frame {
+            self.look.forget(now);
+            return AHEAD;
+        }
+        self.look.sheets(now, self.threads, going.stalls)
     }
 }
 
@@ -333,6 +352,7 @@ impl Pool {
         rehearsal: Option<&Arc<Rehearsal>>,
     ) -> std::io::Result<(Pool, mpsc::UnboundedReceiver<Outcome>)> {
         let queue = Arc::<Queue>::default();
+        locked(&queue.state).threads = threads;
         let pool = Pool { queue: queue.clone() };
         let (out, results) = mpsc::unbounded_channel();
         for thread in 0..threads {
@@ -385,8 +405,17 @@ struct Look {
     tile: Rect,
 }
 
-/// The next task, and which regions have come since; `None`: there will be none.
-fn next(queue: &Queue) -> Option<(Task, Vec<Look>)> {
+/// What a thread takes.
+struct Next {
+    task: Task,
+    /// Regions that have come since the last was taken.
+    looks: Vec<Look>,
+    /// How many sheets it looks ahead, if it is a region.
+    ahead: u32,
+}
+
+/// The next task; `None`: there will be none.
+fn next(queue: &Queue) -> Option<Next> {
     let mut state = locked(&queue.state);
     loop {
         if state.closed {
@@ -404,7 +433,11 @@ fn next(queue: &Queue) -> Option<(Task, Vec<Look>)> {
             }
         }
         if let Some((_, task)) = state.tasks.pop_first() {
-            return Some((task, looks));
+            let ahead = match &task {
+                Task::Region(going) => state.ahead(going),
+                Task::Slab(_) => AHEAD,
+            };
+            return Some(Next { task, looks, ahead });
         }
         state.count();
         state.idle += 1;
@@ -416,7 +449,7 @@ fn next(queue: &Queue) -> Option<(Task, Vec<Look>)> {
 
 fn work(thread: u32, simd: Simd, queue: &Queue, out: &mpsc::UnboundedSender<Outcome>) {
     let mut scratch = Scratch::default();
-    while let Some((task, looks)) = next(queue) {
+    while let Some(Next { task, looks, ahead }) = next(queue) {
         for Look { frame, shelf, tile } in looks {
             let looked = caught(&mut scratch, |_| {
                 let outlook = frame.outlook(shelf.directory());
@@ -429,7 +462,7 @@ fn work(thread: u32, simd: Simd, queue: &Queue, out: &mpsc::UnboundedSender<Outc
             Task::Slab(ready) => Outcome::Slab(render(thread, simd, ready, &mut scratch)),
             Task::Region(going) => {
                 let give = |piece| drop(out.send(Outcome::Handed(Box::new(piece))));
-                Outcome::Region(advance(thread, simd, going, &mut scratch, &give))
+                Outcome::Region(advance(thread, simd, (going, ahead), &mut scratch, &give))
             }
         };
         if out.send(outcome).is_err() {
@@ -459,7 +492,7 @@ fn hold(thread: u32, rehearsal: &Rehearsal, queue: &Queue, out: &mpsc::Unbounded
     let mut free = Instant::now();
     loop {
         let asked = Instant::now();
-        let Some((task, looks)) = next(queue) else { return };
+        let Some(Next { task, looks, ahead }) = next(queue) else { return };
         // Whether it waited for the task, or the task for it.
         let came = Instant::now();
         let from = if came - asked < AT_ONCE { free } else { free.max(came) };
@@ -483,7 +516,7 @@ fn hold(thread: u32, rehearsal: &Rehearsal, queue: &Queue, out: &mpsc::Unbounded
                 let over = going.frame.over.load(Ordering::Relaxed);
                 // It gives nothing of its tile away.
                 going.wish.take();
-                let (came, end) = match (!over).then(|| rehearsal.region(&mut going, from)) {
+                let (came, end) = match (!over).then(|| rehearsal.region(&mut going, from, ahead)) {
                     None => (Came::Over, from),
                     Some(Err(why)) => (Came::Failed(why), from),
                     Some(Ok(went)) => went,
@@ -533,7 +566,7 @@ fn render(thread: u32, simd: Simd, task: Ready, scratch: &mut Scratch) -> Render
 fn advance(
     thread: u32,
     simd: Simd,
-    mut going: Box<Going>,
+    (mut going, ahead): (Box<Going>, u32),
     scratch: &mut Scratch,
     give: &dyn Fn(HandedOver),
 ) -> Gone {
@@ -545,12 +578,18 @@ fn advance(
     let came = if going.frame.over.load(Ordering::Relaxed) {
         Came::Over
     } else {
-        caught(scratch, |scratch| go(simd, &mut going, scratch, give)).unwrap_or_else(Came::Failed)
+        caught(scratch, |scratch| go(simd, (&mut going, ahead), scratch, give))
+            .unwrap_or_else(Came::Failed)
     };
     Gone { going, end: Instant::now(), thread, came }
 }
 
-fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch, give: &dyn Fn(HandedOver)) -> Came {
+fn go(
+    simd: Simd,
+    (going, ahead): (&mut Going, u32),
+    scratch: &mut Scratch,
+    give: &dyn Fn(HandedOver),
+) -> Came {
     let Going { lease, frame: slot, shelf, wish, drawn, region, .. } = going;
     let frame = slot.get();
     let outlook = slot.outlook(shelf.directory());
@@ -568,7 +607,7 @@ fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch, give: &dyn Fn(Handed
     };
     let supply = Watched(shelf, wish);
     let lacks = loop {
-        let lacks = on.advance(frame, simd, outlook, &supply, AHEAD, scratch);
+        let lacks = on.advance(frame, simd, outlook, &supply, ahead, scratch);
         let Some(share) = wish.take().filter(|_| on.depth().is_some()) else { break lacks };
         let eps = frame.scene.quality.eps;
         if let Some((kept, given, begun)) = on.hand_over(outlook, eps, share) {

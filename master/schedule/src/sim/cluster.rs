@@ -13,7 +13,7 @@ use slabcast_common::message::{
     Counters, Lease, Pixels, RegionCost, RegionLease, TaskTimes, TileResult, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
-use slabcast_common::region::{AHEAD, PART, parts};
+use slabcast_common::region::{AHEAD, Lookahead, PART, parts};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::trace::{Course, RegionTile, Trace};
 use slabcast_common::view::Projected;
@@ -154,6 +154,8 @@ struct Lent<'a> {
     order: u64,
     /// Whether what it will need was asked for, as far as frames before tell.
     expected: bool,
+    /// How many sheets it looks ahead since it was taken.
+    ahead: u32,
     /// Whether any has taken it.
     begun: bool,
     /// Since when it stands still, how often it did, and how long in all.
@@ -213,6 +215,9 @@ struct Worker<'a> {
     asked: BTreeSet<(BrickSetKey, BrickId)>,
     /// Parts of pictures that it drew: it knows how deep they are.
     drawn: BTreeSet<(BrickSetKey, i32, i32)>,
+    /// How far its regions look ahead, and the first frame that it drew of each set.
+    look: Lookahead,
+    first: BTreeMap<BrickSetKey, FrameId>,
     running: Vec<Option<Running<'a>>>,
     idle: Vec<Idle>,
     /// When its tables of a frame are made.
@@ -338,6 +343,8 @@ pub fn run(
             leases: Vec::new(),
             asked: BTreeSet::new(),
             drawn: BTreeSet::new(),
+            look: Lookahead::default(),
+            first: BTreeMap::new(),
             running: (0..cluster.threads).map(|_| None).collect(),
             idle: vec![Idle::default(); cluster.threads as usize],
             tables: BTreeMap::new(),
@@ -847,6 +854,7 @@ impl<'a> World<'a> {
             received: self.now(),
             order: self.order,
             expected: false,
+            ahead: AHEAD,
             begun: false,
             stands: None,
             stalls: 0,
@@ -884,6 +892,13 @@ impl<'a> World<'a> {
             let set = set_of(&w.leases[at].task);
             let w = self.workers.get_mut(&id).expect("a worker stays");
             let mut lent = w.leases.remove(at);
+            let frame = lent.task.frame();
+            lent.ahead = if *w.first.entry(set).or_insert(frame) == frame {
+                w.look.forget(now);
+                AHEAD
+            } else {
+                w.look.sheets(now, self.cluster.threads, lent.stalls)
+            };
             if let Some(course) = &mut lent.course {
                 course.take();
                 let present = &w.present[&set];
@@ -937,7 +952,7 @@ impl<'a> World<'a> {
         let sees = self.sees(lent.task.frame());
         let w = self.workers.get_mut(&id).expect("a worker stays");
         let lacks = match &lent.course {
-            Some(course) => course.lacks(&has(&w.present[&set]), AHEAD, &sees),
+            Some(course) => course.lacks(&has(&w.present[&set]), lent.ahead, &sees),
             None => Vec::new(),
         };
         let ids = lacks.iter().map(|&place| job.bricks[place as usize].id);
@@ -969,6 +984,9 @@ impl<'a> World<'a> {
                 now = self.machine.as_mut().map_or(at, |m| m.run(now, woken));
                 self.worker_work += woken as Nanos;
                 self.was_idle(idle, decided, lacking, self.now());
+                let came = self.now();
+                let waited = came - lacking.unwrap_or(came).clamp(idle.since, came);
+                self.workers.get_mut(&id).expect("a worker stays").look.waited(waited);
                 self.spend(self.now(), now, |s| &mut s.way);
             }
             let frame = lent.task.frame();

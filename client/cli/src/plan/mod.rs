@@ -173,7 +173,13 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
                 pings,
                 names,
             };
-            let trace = measure::measure(&path, (&mut progress, 0))?;
+            let mut trace = measure::measure(&path, (&mut progress, 0))?;
+            // Once more, seconds or minutes later; who could not tell before is not asked again.
+            if let Some(before) = pings {
+                progress.stage("measuring what messages take");
+                trace.about.pings =
+                    pings::measure().map_or(pings, |now| Some(pings::least(before, now)));
+            }
             if let Some(file) = file {
                 write_atomic(file, |out| out.write_all(trace.to_json().as_bytes()))?;
             }

@@ -836,6 +836,59 @@ mod tests {
         assert_eq!(result.region.map(|cost| cost.touched), Some(vec![0, 1]));
     }
 
+    /// Seen from the side, one brick begins eight sheets behind the other. In a scene's first frame each is asked for when
+    /// drawing comes to it; later, as the thread has waited for them, both together.
+    #[tokio::test]
+    async fn a_worker_that_waits_for_bricks_looks_past_the_first_that_it_lacks() {
+        let mut world = World::new().await;
+        world.directory();
+        let (known, _) = world.known.clone().expect("a scene");
+        let volume = Volume::from_fn_u8("pair", [16, 8, 8], |_, _, _| 200);
+        let mut transfer = presets::by_name("peer-semi", &volume.summary).unwrap();
+        transfer.shading.on = false;
+        let spec = SceneSpec { id: SceneId(4), transfer, ..known };
+        let turntable = Turntable { start: 90.0, ..Turntable::default() };
+        let orientation = Orientation::new(None, None).unwrap();
+        let path = ViewPath::turn([32, 32], turntable);
+        let camera = path.camera(0, &volume.lattice, orientation).unwrap();
+        let view = View::new(&volume.lattice, &camera, [32, 32], &spec.quality).unwrap();
+        let (scene, finish) = (spec.id, None);
+        world.say(ToWorker::Scene(Arc::new(spec)));
+        for frame in [FrameId(9), FrameId(10)] {
+            world.say(ToWorker::Frame { frame, scene, view, finish });
+        }
+        let wish = |heard| match heard {
+            ToMaster::BricksWanted { bricks, .. } => bricks.iter().map(|b| b.0).collect::<Vec<_>>(),
+            other => panic!("a wish, not {other:?}"),
+        };
+        world.region_of(FrameId(9), 1, Rect::new(0, 0, 32, 16));
+        for _ in 0..2 {
+            let asked = wish(world.hear().await);
+            assert_eq!(asked.len(), 1, "one after the other");
+            world.send(asked[0]).await;
+        }
+        assert_eq!(world.result().await.region.map(|cost| cost.stalls), Some(2));
+        // Of another tile nothing is expected, and it waits longer than a fiftieth of the time.
+        for tile in [Rect::new(0, 16, 16, 32), Rect::new(16, 16, 32, 32)] {
+            let drop = ToWorker::DropBricks { set: SET, bricks: vec![BrickId(0), BrickId(1)] };
+            world.bricks.send(Bricks::Message(drop)).await.unwrap();
+            world.settle().await;
+            world.region_of(FrameId(10), 2, tile);
+            let asked = wish(world.hear().await);
+            tokio::time::sleep(Duration::from_millis(50)).await;
+            for brick in &asked {
+                world.send(*brick).await;
+            }
+            if asked.len() == 1 {
+                let more = wish(world.hear().await);
+                world.send(more[0]).await;
+            }
+            let stalls = world.result().await.region.map(|cost| cost.stalls);
+            let first = tile.x0 == 0;
+            assert_eq!((asked.len(), stalls), if first { (1, Some(2)) } else { (2, Some(1)) });
+        }
+    }
+
     #[tokio::test]
     async fn a_region_is_finished_where_its_frame_asks_for_it_and_a_slab_never() {
         let mut world = World::new().await;

@@ -19,7 +19,7 @@ use crate::output::{Made, probe, write_atomic};
 use crate::progress::{Progress, warn};
 use crate::request::{Asked, Opened, PictureOf, WorkArgs};
 use crate::stage::Stage;
-use crate::{embedded, parse};
+use crate::{embedded, parse, signals};
 use predict::{IN_FLIGHT, LOSSES, Question, Row, STEADILY};
 use rehearse::Over;
 use slabcast_common::quality::{Schedule, Work};
@@ -175,7 +175,7 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
             };
             let mut trace = measure::measure(&path, (&mut progress, 0))?;
             // Once more, seconds or minutes later; who could not tell before is not asked again.
-            if let Some(before) = pings {
+            if let Some(before) = pings.filter(|_| !signals::told()) {
                 progress.stage("measuring what messages take");
                 trace.about.pings =
                     pings::measure().map_or(pings, |now| Some(pings::least(before, now)));

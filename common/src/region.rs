@@ -50,19 +50,18 @@ pub struct Lookahead {
 }
 
 impl Lookahead {
-    /// A region of a scene's first frame is drawn at this time, in ns.
-    pub fn forget(&mut self, now: u64) {
-        *self = Lookahead { from: now, waited: 0 };
-    }
-
     /// Threads had nothing to do for so many nanoseconds, in sum, while regions lacked bricks.
     pub fn waited(&mut self, ns: u64) {
         self.waited = self.waited.saturating_add(ns);
     }
 
-    /// How many sheets a region looks ahead that is drawn at this time, in ns, on a worker of so many threads, and that stood
-    /// still so many times before.
-    pub fn sheets(&mut self, now: u64, threads: u32, stalls: u32) -> u32 {
+    /// How many sheets a region looks ahead that is drawn at this time, in ns, on a worker of so many threads: one that stood
+    /// still so many times before, and is of its scene's first frame or not.
+    pub fn sheets(&mut self, now: u64, threads: u32, (stalls, first): (u32, bool)) -> u32 {
+        if first {
+            *self = Lookahead { from: now, waited: 0 };
+            return AHEAD;
+        }
         let lately = now.saturating_sub(self.from);
         let waits = self.waited > 0
             && PARTS.saturating_mul(self.waited)
@@ -138,22 +137,22 @@ mod tests {
     fn who_waits_for_bricks_looks_far() {
         const MS: u64 = 1_000_000;
         let mut look = Lookahead::default();
-        assert_eq!(look.sheets(10 * MS, 1, 3), AHEAD, "who never waited");
+        assert_eq!(look.sheets(10 * MS, 1, (3, false)), AHEAD, "who never waited");
         look.waited(MS / 2);
-        assert_eq!(look.sheets(20 * MS, 1, 0), AHEAD, "half a millisecond of 30 at least");
+        assert_eq!(look.sheets(20 * MS, 1, (0, false)), AHEAD, "half a millisecond of 30 at least");
         look.waited(MS / 2);
         assert_eq!(
-            [0, 1, 2, 5, 6, 99].map(|n| look.sheets(20 * MS, 1, n)),
+            [0, 1, 2, 5, 6, 99].map(|n| look.sheets(20 * MS, 1, (n, false))),
             [16, 32, 64, 512, 1024, 1024]
         );
-        assert_eq!(look.sheets(20 * MS, 8, 0), AHEAD, "a millisecond of 160");
+        assert_eq!(look.sheets(20 * MS, 8, (0, false)), AHEAD, "a millisecond of 160");
         // What was waited long ago is forgotten by and by.
-        assert_eq!(look.sheets(40 * MS, 1, 0), FAR);
-        assert_eq!(look.sheets(100 * MS, 1, 0), AHEAD);
+        assert_eq!(look.sheets(40 * MS, 1, (0, false)), FAR);
+        assert_eq!(look.sheets(100 * MS, 1, (0, false)), AHEAD);
         look.waited(50 * MS);
-        assert_eq!(look.sheets(110 * MS, 8, 0), FAR);
-        look.forget(110 * MS);
-        assert_eq!(look.sheets(111 * MS, 1, 0), AHEAD, "a first frame");
+        assert_eq!(look.sheets(110 * MS, 8, (0, false)), FAR);
+        assert_eq!(look.sheets(110 * MS, 8, (0, true)), AHEAD);
+        assert_eq!(look.sheets(111 * MS, 1, (0, false)), AHEAD, "a first frame");
     }
 
     #[test]

@@ -226,11 +226,8 @@ async fn carry_bricks(
     loop {
         match inbound.message().await {
             Ok(Some(message)) => match convert::bricks_from_wire(message) {
-                Ok(bricks) => {
-                    if to.send(bricks).await.is_err() {
-                        return "the desk closed".into();
-                    }
-                }
+                // A desk that is gone needs none. This stream ends with the other, which still carries its good-bye.
+                Ok(bricks) => drop(to.send(bricks).await),
                 Err(e) => return format!("the master sent bricks that can't be read: {e}"),
             },
             Ok(None) => return "the master closed the bricks stream".into(),

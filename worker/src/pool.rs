@@ -15,7 +15,7 @@ use slabcast_common::message::{
     Counters, HandedOver, Lease, Pixels, RegionLease, Sampling, SceneSpec,
 };
 use slabcast_common::occlusion::Rect;
-use slabcast_common::region::{AHEAD, Lookahead};
+use slabcast_common::region::Lookahead;
 use slabcast_common::trace::Course;
 use slabcast_common::view::View;
 use slabcast_render::depths::Depths;
@@ -188,6 +188,8 @@ pub(crate) struct Going {
     pub(crate) parked_at: Option<Instant>,
     pub(crate) parked: Duration,
     pub(crate) stalls: u32,
+    /// How many sheets it looks ahead since a thread took it.
+    pub(crate) ahead: u32,
     /// Time of its drawing so far.
     pub(crate) drawn: Duration,
     /// What is drawn so far; `None` before it began.
@@ -205,7 +207,8 @@ impl Going {
         shelf: Arc<Shelf>,
         received: Instant,
     ) -> Going {
-        let (wish, parked_at, parked, stalls, drawn, region, course, looked) = Default::default();
+        let (wish, parked_at, parked, stalls, ahead) = Default::default();
+        let (drawn, region, course, looked) = Default::default();
         Going {
             lease,
             frame,
@@ -215,6 +218,7 @@ impl Going {
             parked_at,
             parked,
             stalls,
+            ahead,
             drawn,
             region,
             course,
@@ -291,7 +295,7 @@ struct State {
     /// Up to when `waited` is counted.
     since: Option<Instant>,
     waited: Duration,
-    /// How many threads there are, when the first of them had nothing to do, and how far regions look since.
+    /// How many threads there are, when the first region was taken, and how far regions look since.
     threads: u32,
     began: Option<Instant>,
     look: Lookahead,
@@ -314,11 +318,8 @@ impl State {
     fn ahead(&mut self, going: &Going) -> u32 {
         let now = self.began.get_or_insert_with(Instant::now).elapsed().as_nanos() as u64;
         let frame = going.lease.frame;
-        if *going.frame.scene.first.get_or_init(|| frame) == frame {
-            self.look.forget(now);
-            return AHEAD;
-        }
-        self.look.sheets(now, self.threads, going.stalls)
+        let first = *going.frame.scene.first.get_or_init(|| frame) == frame;
+        self.look.sheets(now, self.threads, (going.stalls, first))
     }
 }
 
@@ -405,17 +406,8 @@ struct Look {
     tile: Rect,
 }
 
-/// What a thread takes.
-struct Next {
-    task: Task,
-    /// Regions that have come since the last was taken.
-    looks: Vec<Look>,
-    /// How many sheets it looks ahead, if it is a region.
-    ahead: u32,
-}
-
-/// The next task; `None`: there will be none.
-fn next(queue: &Queue) -> Option<Next> {
+/// The next task, and which regions have come since; `None`: there will be none.
+fn next(queue: &Queue) -> Option<(Task, Vec<Look>)> {
     let mut state = locked(&queue.state);
     loop {
         if state.closed {
@@ -432,12 +424,11 @@ fn next(queue: &Queue) -> Option<Next> {
                 }
             }
         }
-        if let Some((_, task)) = state.tasks.pop_first() {
-            let ahead = match &task {
-                Task::Region(going) => state.ahead(going),
-                Task::Slab(_) => AHEAD,
-            };
-            return Some(Next { task, looks, ahead });
+        if let Some((_, mut task)) = state.tasks.pop_first() {
+            if let Task::Region(going) = &mut task {
+                going.ahead = state.ahead(going);
+            }
+            return Some((task, looks));
         }
         state.count();
         state.idle += 1;
@@ -449,7 +440,7 @@ fn next(queue: &Queue) -> Option<Next> {
 
 fn work(thread: u32, simd: Simd, queue: &Queue, out: &mpsc::UnboundedSender<Outcome>) {
     let mut scratch = Scratch::default();
-    while let Some(Next { task, looks, ahead }) = next(queue) {
+    while let Some((task, looks)) = next(queue) {
         for Look { frame, shelf, tile } in looks {
             let looked = caught(&mut scratch, |_| {
                 let outlook = frame.outlook(shelf.directory());
@@ -462,7 +453,7 @@ fn work(thread: u32, simd: Simd, queue: &Queue, out: &mpsc::UnboundedSender<Outc
             Task::Slab(ready) => Outcome::Slab(render(thread, simd, ready, &mut scratch)),
             Task::Region(going) => {
                 let give = |piece| drop(out.send(Outcome::Handed(Box::new(piece))));
-                Outcome::Region(advance(thread, simd, (going, ahead), &mut scratch, &give))
+                Outcome::Region(advance(thread, simd, going, &mut scratch, &give))
             }
         };
         if out.send(outcome).is_err() {
@@ -492,7 +483,7 @@ fn hold(thread: u32, rehearsal: &Rehearsal, queue: &Queue, out: &mpsc::Unbounded
     let mut free = Instant::now();
     loop {
         let asked = Instant::now();
-        let Some(Next { task, looks, ahead }) = next(queue) else { return };
+        let Some((task, looks)) = next(queue) else { return };
         // Whether it waited for the task, or the task for it.
         let came = Instant::now();
         let from = if came - asked < AT_ONCE { free } else { free.max(came) };
@@ -516,7 +507,7 @@ fn hold(thread: u32, rehearsal: &Rehearsal, queue: &Queue, out: &mpsc::Unbounded
                 let over = going.frame.over.load(Ordering::Relaxed);
                 // It gives nothing of its tile away.
                 going.wish.take();
-                let (came, end) = match (!over).then(|| rehearsal.region(&mut going, from, ahead)) {
+                let (came, end) = match (!over).then(|| rehearsal.region(&mut going, from)) {
                     None => (Came::Over, from),
                     Some(Err(why)) => (Came::Failed(why), from),
                     Some(Ok(went)) => went,
@@ -566,7 +557,7 @@ fn render(thread: u32, simd: Simd, task: Ready, scratch: &mut Scratch) -> Render
 fn advance(
     thread: u32,
     simd: Simd,
-    (mut going, ahead): (Box<Going>, u32),
+    mut going: Box<Going>,
     scratch: &mut Scratch,
     give: &dyn Fn(HandedOver),
 ) -> Gone {
@@ -578,19 +569,13 @@ fn advance(
     let came = if going.frame.over.load(Ordering::Relaxed) {
         Came::Over
     } else {
-        caught(scratch, |scratch| go(simd, (&mut going, ahead), scratch, give))
-            .unwrap_or_else(Came::Failed)
+        caught(scratch, |scratch| go(simd, &mut going, scratch, give)).unwrap_or_else(Came::Failed)
     };
     Gone { going, end: Instant::now(), thread, came }
 }
 
-fn go(
-    simd: Simd,
-    (going, ahead): (&mut Going, u32),
-    scratch: &mut Scratch,
-    give: &dyn Fn(HandedOver),
-) -> Came {
-    let Going { lease, frame: slot, shelf, wish, drawn, region, .. } = going;
+fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch, give: &dyn Fn(HandedOver)) -> Came {
+    let Going { lease, frame: slot, shelf, wish, drawn, region, ahead, .. } = going;
     let frame = slot.get();
     let outlook = slot.outlook(shelf.directory());
     let start = Instant::now();
@@ -607,7 +592,7 @@ fn go(
     };
     let supply = Watched(shelf, wish);
     let lacks = loop {
-        let lacks = on.advance(frame, simd, outlook, &supply, ahead, scratch);
+        let lacks = on.advance(frame, simd, outlook, &supply, *ahead, scratch);
         let Some(share) = wish.take().filter(|_| on.depth().is_some()) else { break lacks };
         let eps = frame.scene.quality.eps;
         if let Some((kept, given, begun)) = on.hand_over(outlook, eps, share) {

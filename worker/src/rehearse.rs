@@ -97,13 +97,12 @@ impl Rehearsal {
         known.expected.iter().copied().filter(there).collect()
     }
 
-    /// Holds a region from where it stands, from `start` on, looking so many sheets ahead: where it comes to, and when. As one that is drawn, it goes as
+    /// Holds a region from where it stands, from `start` on: where it comes to, and when. As one that is drawn, it goes as
     /// far as bricks are here, those among them that come meanwhile.
     pub(crate) fn region(
         &self,
         going: &mut Going,
         start: Instant,
-        ahead: u32,
     ) -> Result<(Came, Instant), String> {
         let tile = going.lease.tile;
         let (frame, shelf, size) = (&going.frame, &going.shelf, self.trace.about.size);
@@ -133,7 +132,7 @@ impl Rehearsal {
         let has = |place: u32| place as usize >= bricks.len() || shelf.holds(place);
         course.take();
         if course.goes(&has) <= 0.0 && !course.is_over() {
-            return Ok((Came::Lacks(course.lacks(&has, ahead, &sees), true), start));
+            return Ok((Came::Lacks(course.lacks(&has, going.ahead, &sees), true), start));
         }
         let setup = Duration::from_nanos(traced.setup_ns + traced.outlook_ns);
         let mut end = (*frame.made.get_or_init(|| start + setup)).max(start);
@@ -159,7 +158,7 @@ impl Rehearsal {
         }
         going.drawn += end - begun;
         if !course.is_over() {
-            return Ok((Came::Lacks(course.lacks(&has, ahead, &sees), true), end));
+            return Ok((Came::Lacks(course.lacks(&has, going.ahead, &sees), true), end));
         }
         locked(&frame.scene.parts).extend(parts(tile).map(|p| [p.x0, p.y0]));
         let (counters, sampled) = (Counters::default(), Sampling::default());

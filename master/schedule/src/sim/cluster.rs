@@ -13,7 +13,7 @@ use slabcast_common::message::{
     Counters, Lease, Pixels, RegionCost, RegionLease, TaskTimes, TileResult, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
-use slabcast_common::region::{AHEAD, Lookahead, PART, parts};
+use slabcast_common::region::{Lookahead, PART, parts};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::trace::{Course, RegionTile, Trace};
 use slabcast_common::view::Projected;
@@ -854,7 +854,7 @@ impl<'a> World<'a> {
             received: self.now(),
             order: self.order,
             expected: false,
-            ahead: AHEAD,
+            ahead: 0,
             begun: false,
             stands: None,
             stalls: 0,
@@ -893,12 +893,8 @@ impl<'a> World<'a> {
             let w = self.workers.get_mut(&id).expect("a worker stays");
             let mut lent = w.leases.remove(at);
             let frame = lent.task.frame();
-            lent.ahead = if *w.first.entry(set).or_insert(frame) == frame {
-                w.look.forget(now);
-                AHEAD
-            } else {
-                w.look.sheets(now, self.cluster.threads, lent.stalls)
-            };
+            let first = *w.first.entry(set).or_insert(frame) == frame;
+            lent.ahead = w.look.sheets(now, self.cluster.threads, (lent.stalls, first));
             if let Some(course) = &mut lent.course {
                 course.take();
                 let present = &w.present[&set];

@@ -702,3 +702,6 @@ impl Look {
         }
     }
 }
+
+#[cfg(test)]
+mod plain;

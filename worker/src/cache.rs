@@ -152,6 +152,7 @@ mod tests {
     use super::*;
     use slabcast_common::brick::TightBox;
     use slabcast_common::volume::{Digest32, Samples};
+    use slabcast_render::region::Supply;
 
     const GRID: BrickGrid = BrickGrid { dims: [4, 4, 4] };
 
@@ -176,7 +177,7 @@ mod tests {
         assert!(cache.shelf(key(1)).is_none(), "half of it");
         assert!(cache.directory(key(1), GRID, (2, 4), infos(&[11, 30])).is_ok());
         let shelf = cache.shelf(key(1)).expect("all of it").clone();
-        let here = || (0..4).map(|i| shelf.holds(i)).collect::<Vec<_>>();
+        let here = || (0..4).map(|i| shelf.has(i)).collect::<Vec<_>>();
         assert_eq!(here(), [false, true, false, false]);
         cache.put(key(1), brick(30));
         cache.put(key(1), brick(31));

@@ -17,6 +17,7 @@ use crate::cache::BrickCache;
 use crate::shelf::Shelf;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, FrameId, TaskId};
+use slabcast_render::region::Supply;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -95,7 +96,7 @@ impl Parking {
             if stay.keeps.insert(place) {
                 *self.kept.entry((stay.set, place)).or_default() += 1;
             }
-            if !stay.shelf.holds(place) {
+            if !stay.shelf.has(place) {
                 stay.lacks.insert(place);
             }
         }
@@ -120,7 +121,7 @@ impl Parking {
             if after > self.budget {
                 break;
             }
-            if !shelf.holds(place) && !self.coming.contains_key(&(set, place)) {
+            if !shelf.has(place) && !self.coming.contains_key(&(set, place)) {
                 self.coming.insert((set, place), BTreeSet::new());
                 self.coming_bytes += u64::from(brick.bytes);
                 ids.push(brick.id);

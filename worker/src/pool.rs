@@ -172,6 +172,10 @@ impl Supply for Watched<'_> {
         self.0.get(place)
     }
 
+    fn has(&self, place: u32) -> bool {
+        self.0.has(place)
+    }
+
     fn stops(&self) -> bool {
         self.1.is_there()
     }

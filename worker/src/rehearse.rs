@@ -20,6 +20,7 @@ use slabcast_common::slab::SheetRange;
 use slabcast_common::trace::{
     Course, Trace, filled, filled_through, finished_through, view_sha256,
 };
+use slabcast_render::region::Supply;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -93,7 +94,7 @@ impl Rehearsal {
         let (Some(known), true) = (known, parts(tile).all(|p| held.contains(&[p.x0, p.y0]))) else {
             return Vec::new();
         };
-        let there = |place: &u32| (*place as usize) < shelf.bricks().len() && !shelf.holds(*place);
+        let there = |place: &u32| (*place as usize) < shelf.bricks().len() && !shelf.has(*place);
         known.expected.iter().copied().filter(there).collect()
     }
 
@@ -129,7 +130,7 @@ impl Rehearsal {
             }
         };
         // A tile's parts may name bricks that it does not.
-        let has = |place: u32| place as usize >= bricks.len() || shelf.holds(place);
+        let has = |place: u32| place as usize >= bricks.len() || shelf.has(place);
         course.take();
         if course.goes(&has) <= 0.0 && !course.is_over() {
             return Ok((Came::Lacks(course.lacks(&has, going.ahead, &sees), true), start));

@@ -1,8 +1,8 @@
 //! A brick set as render threads see it: its directory, and those of its bricks that are here.
 //!
-//! Threads look bricks up while the desk puts others in. A lock is held for one look or one put; what
-//! a thread took it keeps by its own pointer, so a brick that is forgotten meanwhile is drawn all the
-//! same.
+//! Threads look bricks up while the desk puts others in. Each place has a lock, held for one look or one put, so
+//! that threads meet at a lock only where they look at the same brick at once; what a thread took it keeps by its
+//! own pointer, so a brick that is forgotten meanwhile is drawn all the same.
 
 use slabcast_common::brick::{Brick, BrickGrid, BrickInfo};
 use slabcast_common::ids::BrickId;
@@ -15,12 +15,12 @@ pub(crate) struct Shelf {
     grid: BrickGrid,
     bricks: Arc<[BrickInfo]>,
     directory: OnceLock<Arc<Directory>>,
-    held: RwLock<Vec<Option<Arc<Brick>>>>,
+    held: Box<[RwLock<Option<Arc<Brick>>>]>,
 }
 
 impl Shelf {
     pub(crate) fn new(grid: BrickGrid, bricks: Arc<[BrickInfo]>) -> Shelf {
-        let held = RwLock::new(vec![None; bricks.len()]);
+        let held = bricks.iter().map(|_| RwLock::default()).collect();
         Shelf { grid, bricks, directory: OnceLock::new(), held }
     }
 
@@ -48,21 +48,18 @@ impl Shelf {
     pub(crate) fn put(&self, id: BrickId, brick: Option<Arc<Brick>>) -> Option<u32> {
         let place = self.place(id)?;
         // No thread panics while it holds the lock.
-        let mut held = self.held.write().unwrap_or_else(PoisonError::into_inner);
-        held[place as usize] = brick;
+        let held = &self.held[place as usize];
+        *held.write().unwrap_or_else(PoisonError::into_inner) = brick;
         Some(place)
-    }
-
-    /// Whether a brick is here.
-    pub(crate) fn holds(&self, place: u32) -> bool {
-        let held = self.held.read().unwrap_or_else(PoisonError::into_inner);
-        held[place as usize].is_some()
     }
 }
 
 impl Supply for Shelf {
     fn get(&self, place: u32) -> Option<Arc<Brick>> {
-        let held = self.held.read().unwrap_or_else(PoisonError::into_inner);
-        held[place as usize].clone()
+        self.held[place as usize].read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    fn has(&self, place: u32) -> bool {
+        self.held[place as usize].read().unwrap_or_else(PoisonError::into_inner).is_some()
     }
 }

@@ -44,6 +44,11 @@ pub trait Supply {
     /// A brick, if it is here.
     fn get(&self, place: u32) -> Option<Arc<Brick>>;
 
+    /// Whether it is here.
+    fn has(&self, place: u32) -> bool {
+        self.get(place).is_some()
+    }
+
     /// Whether regions are to stop before the next sheet, whatever is here.
     fn stops(&self) -> bool {
         false
@@ -325,7 +330,7 @@ impl<'a> Coming<'a> {
             let mut next = waiting.heads[k.abs_diff(self.slab.first) as usize];
             while let Some(waits) = waiting.bricks.get(next as usize) {
                 let &Sight { projected, place, .. } = self.sight(waits);
-                if self.passes(&projected.rect, open) && self.supply.get(place).is_none() {
+                if self.passes(&projected.rect, open) && !self.supply.has(place) {
                     lacked.push((projected.sheets.first, place));
                 }
                 next = waits.next;
@@ -515,7 +520,7 @@ pub fn expected(
             }
             for &Sight { projected, place, .. } in outlook.bricks(i) {
                 let rect = projected.rect.intersect(&part);
-                if expects(&rect, projected.sheets.first) && supply.get(place).is_none() {
+                if expects(&rect, projected.sheets.first) && !supply.has(place) {
                     places.push(place);
                 }
             }

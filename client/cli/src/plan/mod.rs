@@ -30,6 +30,7 @@ use std::fmt::Write as _;
 use std::io::{Read, Write};
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 /// What a stream gets through of a link's nominal rate: heads of Ethernet, IP, TCP, HTTP/2. 118 MB/s
 /// were measured on an emulated link of 1 Gbit/s (TRANSPORT.md, answer 7).
@@ -159,7 +160,9 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
         }
         file => {
             progress.stage("measuring what messages take");
+            let began = Instant::now();
             let pings = pinged();
+            let pinging = began.elapsed();
             progress.frames(frames as u64, &format!("drawing the tiles of {frames} frames"));
             let path = measure::Path {
                 stage: &stage,
@@ -173,9 +176,11 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
                 pings,
                 names,
             };
+            let began = Instant::now();
             let mut trace = measure::measure(&path, (&mut progress, 0))?;
-            // Once more, seconds or minutes later; who could not tell before is not asked again.
-            if let Some(before) = pings.filter(|_| !signals::told()) {
+            // Once more, unless that would be at once; who could not tell before is not asked again.
+            let later = began.elapsed() > pinging;
+            if let Some(before) = pings.filter(|_| later && !signals::told()) {
                 progress.stage("measuring what messages take");
                 trace.about.pings =
                     pings::measure().map_or(pings, |now| Some(pings::least(before, now)));

@@ -306,20 +306,7 @@ fn aim_there(
 
 /// Draws what a picture says of itself, by this process alone. Says nothing at the end.
 pub(crate) fn again(asked: Asked, output: Output, volume: Volume, quiet: bool) -> Result<(), Fail> {
-    let run = Run {
-        asked,
-        stands: true,
-        output,
-        show: None,
-        patience: Arc::default(),
-        notes: Vec::new(),
-        stats: Lines::None,
-        trace: Lines::None,
-        record: None,
-        progress: Progress::new(quiet),
-        began: Instant::now(),
-        tell: false,
-    };
+    let run = Run::bare(asked, output, quiet);
     let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
     let runtime = runtime::start_embedded()?;
     let result =
@@ -441,6 +428,24 @@ async fn cluster(
 }
 
 impl Run {
+    /// Pictures alone, of which nothing is said at the end.
+    fn bare(asked: Asked, output: Output, quiet: bool) -> Run {
+        Run {
+            asked,
+            stands: true,
+            output,
+            show: None,
+            patience: Arc::default(),
+            notes: Vec::new(),
+            stats: Lines::None,
+            trace: Lines::None,
+            record: None,
+            progress: Progress::new(quiet),
+            began: Instant::now(),
+            tell: false,
+        }
+    }
+
     fn request(&mut self, info: &VolumeInfo) -> PathRequest {
         let format = self.output.takes(self.asked.magnify, self.asked.background);
         self.asked.request(info, format, self.trace.wanted())

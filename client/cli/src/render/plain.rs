@@ -35,20 +35,7 @@ fn run(tf: &str, edge: u32, frames: u32, folder: &Path) -> Run {
         force: true,
     };
     let looked = Output::look(&args, "frame", asked.frames(), asked.background, &[]);
-    Run {
-        asked,
-        stands: true,
-        output: looked.expect("a folder").0,
-        show: None,
-        patience: Arc::default(),
-        notes: Vec::new(),
-        stats: Lines::None,
-        trace: Lines::None,
-        record: None,
-        progress: Progress::new(true),
-        began: Instant::now(),
-        tell: false,
-    }
+    Run::bare(asked, looked.expect("a folder").0, true)
 }
 
 /// What a master tells of a frame.

@@ -116,6 +116,22 @@ pub(crate) fn open(path: &Path) -> Result<Volume, Fail> {
     InputArgs::default().open(path)
 }
 
+/// A volume of ../shared/data and how it stands with this axis up; nothing, which is said, where it is not here.
+#[cfg(test)]
+pub(crate) fn of_the_data(
+    file: &str,
+    up: &str,
+) -> Option<(Volume, slabcast_common::path::Orientation)> {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data").join(file);
+    if !file.exists() {
+        println!("skipped: {} is not here", file.display());
+        return None;
+    }
+    let up = up.parse().expect("an axis");
+    let orientation = slabcast_common::path::Orientation::new(Some(up), None).expect("axes");
+    Some((open(&file).expect("a volume"), orientation))
+}
+
 fn open_with(path: &Path, hints: &Hints) -> Result<Opened, Fail> {
     slabcast_volumes::open_with(path, hints).map_err(|e| Fail::failed(e.to_string()))
 }

@@ -488,7 +488,7 @@ mod tests {
     use crate::local::Cut;
     use crate::request::Asked;
     use slabcast_common::leaves::Mosaic;
-    use slabcast_common::path::{Axis, Orientation, Turntable, ViewPath};
+    use slabcast_common::path::{Turntable, ViewPath};
     use slabcast_render::outlook::Directory;
     use slabcast_render::tile::Seen;
 
@@ -503,16 +503,8 @@ mod tests {
 
     /// Four views of 512x512 of it, or nothing, which is said, where the volume is not here.
     fn staged((file, axis, tf): Named) -> Option<Stage> {
-        let data = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
-        let file = data.join(file);
-        if !file.exists() {
-            println!("skipped: {} is not here", file.display());
-            return None;
-        }
-        let volume = crate::volume::open(&file).expect("a volume");
+        let (volume, orientation) = crate::volume::of_the_data(file, axis)?;
         let info = volume.info(volume.digest());
-        let up = axis.parse::<Axis>().expect("an axis");
-        let orientation = Orientation::new(Some(up), None).expect("axes");
         let turn = Turntable { frames: 4, step: 22.5, ..Turntable::default() };
         let asked = Asked::plain(ViewPath::turn([512, 512], turn), tf).expect("a request");
         Some(Stage::new(&volume, &info, &asked, orientation).expect("a stage"))

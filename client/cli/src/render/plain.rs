@@ -3,9 +3,10 @@
 
 use super::*;
 use slabcast_common::image::Picture;
-use slabcast_common::path::{Axis, Turntable, ViewPath};
+use slabcast_common::path::{Turntable, ViewPath};
 use slabcast_common::volume::Digest32;
 use slabcast_master::finish::view_sha256;
+use std::collections::BTreeMap;
 use std::sync::mpsc::sync_channel;
 
 /// File, axis that is up, transfer function, edge of the picture, and frames to time.
@@ -110,17 +111,10 @@ async fn plain(
 #[test]
 #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_a_master -- --ignored --nocapture"]
 fn what_a_master_in_the_process_takes() {
-    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
     let threads = embedded::cores();
     for (file, axis, tf, edge, frames) in SCENES {
-        let file = data.join(file);
-        if !file.exists() {
-            println!("skipped: {} is not here", file.display());
-            continue;
-        }
-        let volume = Arc::new(volume::open(&file).expect("a volume"));
-        let up = axis.parse::<Axis>().expect("an axis");
-        let orientation = Orientation::new(Some(up), None).expect("axes");
+        let Some((volume, orientation)) = volume::of_the_data(file, axis) else { continue };
+        let volume = Arc::new(volume);
         let runtime = runtime::start_embedded().expect("a runtime");
         let folder = tempfile::tempdir().expect("a folder");
         let mut one = run(tf, edge, 1, folder.path());
@@ -145,22 +139,22 @@ fn what_a_master_in_the_process_takes() {
             let took = began.elapsed().as_secs_f64() * 1e3;
             runtime::end(runtime);
             done.expect("pictures");
-            let pictures = std::fs::read_dir(folder.path()).expect("a folder").flatten();
-            let mut pictures: Vec<_> = pictures.map(|p| p.path()).collect();
-            pictures.sort();
-            assert_eq!(pictures.len(), frames as usize);
-            let last = std::fs::read(pictures.last().expect("a picture")).expect("a picture");
-            (took, last)
+            let files = std::fs::read_dir(folder.path()).expect("a folder").flatten();
+            let read =
+                |f: std::fs::DirEntry| (f.file_name(), std::fs::read(f.path()).expect("a file"));
+            let files: BTreeMap<_, _> = files.map(read).collect();
+            assert_eq!(files.len(), frames as usize);
+            (took, files)
         };
         let each = |with_master: bool| {
             let (start, _) = timed(WARM, with_master);
-            let (all, last) = timed(WARM + frames, with_master);
-            ((all - start) / f64::from(frames), last)
+            let (all, files) = timed(WARM + frames, with_master);
+            ((all - start) / f64::from(frames), files)
         };
         let mut ratios = Vec::new();
         for _ in 0..5 {
             let ((alone, theirs), (cluster, ours)) = (each(false), each(true));
-            assert!(theirs == ours, "the same file to the byte");
+            assert!(theirs == ours, "the same files to the byte");
             ratios.push(cluster / alone);
             println!(
                 "{tf} at {edge}, {threads} threads: {alone:.2} ms, with a master {cluster:.2}"

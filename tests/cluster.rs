@@ -368,16 +368,15 @@ async fn a_worker_of_another_protocol_is_refused_by_name() {
     }
 }
 
-/// It then sends finished pixels as they are; one whose address may be one end of a tunnel, but whose machine has another
-/// name, packs them.
+/// One whose address may be one end of a tunnel, but whose machine has another name, packs them.
 #[tokio::test]
-async fn a_worker_of_the_masters_machine_is_told_that_it_is() {
+async fn a_worker_of_the_masters_machine_is_told_to_send_results_as_they_are() {
     use slabcast_common::message::{Hello, ToMaster, ToWorker};
     use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
     use slabcast_proto::{convert, v1::cluster_client::ClusterClient};
-    let (_master, address) = master();
-    let named = std::path::Path::new("/proc/sys/kernel/random/boot_id").exists();
+    let named = Path::new("/proc/sys/kernel/random/boot_id").exists();
     for (machine, here) in [("", true), ("another", !named)] {
+        let ((_master, address), dir) = (master(), tempfile::tempdir().unwrap());
         let hello = Hello {
             protocol_version: PROTOCOL_VERSION,
             pixels_version: PIXELS_VERSION,
@@ -397,8 +396,17 @@ async fn a_worker_of_the_masters_machine_is_told_that_it_is() {
         let mut answers = client.control(stream).await.unwrap().into_inner();
         let answer = answers.message().await.unwrap().expect("an answer");
         let (welcome, _) = convert::to_worker_from_wire(answer).unwrap();
-        let ToWorker::Welcome { is_here, .. } = welcome else { panic!("not let in: {welcome:?}") };
-        assert_eq!(is_here, here, "{machine}");
+        assert!(matches!(welcome, ToWorker::Welcome { .. }), "not let in: {welcome:?}");
+        let _client = render(dir.path(), &address, "told", "region");
+        let told = loop {
+            let message = answers.message().await.unwrap().expect("a frame");
+            if let (ToWorker::Frame { plain, .. }, _) =
+                convert::to_worker_from_wire(message).unwrap()
+            {
+                break plain;
+            }
+        };
+        assert_eq!(told, here, "{machine}");
     }
 }
 

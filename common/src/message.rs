@@ -124,8 +124,6 @@ pub enum ToWorker {
         worker: WorkerId,
         /// How often the master pings; silence for three times as long means it is gone.
         heartbeat_ms: u32,
-        /// Whether the worker shares the master's machine: then it does not pack what it sends.
-        is_here: bool,
     },
     /// The hello was not good; the link ends. Says why and what to do.
     Refused {
@@ -145,6 +143,8 @@ pub enum ToWorker {
         /// What its regions are finished to; `None`: their results are sums. Those of leases are sums
         /// always.
         finish: Option<Finish>,
+        /// Whether finished pixels go as they are: packing them takes longer than it saves.
+        plain: bool,
     },
     /// Bricks that there are of a set, some of them or all: from the `first`, ascending by id. The
     /// parts of a directory come in order, and before the first region of the set. Those of the

@@ -26,8 +26,9 @@ mod course;
 pub use course::{Course, Has, Sees};
 
 /// Version of the format. Since 2 regions' results weigh what finished pixels do, since 3 their times have
-/// no look at bricks in them, since 4 they say when they come to each brick, since 5 what messages take is in it.
-pub const VERSION: u32 = 5;
+/// no look at bricks in them, since 4 they say when they come to each brick, since 5 what messages take is in it, since 6
+/// what packing results takes and saves.
+pub const VERSION: u32 = 6;
 
 /// Largest trace that is read, in bytes: 1000 frames with tiles of 16 pixels.
 pub const MAX_BYTES: u64 = 1 << 30;
@@ -72,6 +73,18 @@ pub struct About {
     pub repeats: u32,
     /// What messages take there; of a machine that does not say it nothing.
     pub pings: Option<Pings>,
+    /// What packing its regions' results takes there.
+    pub packing: Packing,
+}
+
+/// What lz4 takes of a processor for a byte of finished pixels, in nanoseconds.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Packing {
+    /// A worker, to pack it.
+    pub pack_ns: f64,
+    /// The master, to unpack it.
+    pub unpack_ns: f64,
 }
 
 /// What a ping and its pong take of the processors, between a real master and real workers that TCP joins on one machine, in
@@ -149,9 +162,9 @@ pub struct RegionLevel {
 }
 
 /// A tile as it is written: places as differences to the one before.
-type Written = (u32, u32, u64, u32, Vec<u32>, Vec<u32>, Vec<u16>, Vec<u32>);
+type Written = (u32, u32, u64, [u32; 2], Vec<u32>, Vec<u32>, Vec<u16>, Vec<u32>);
 
-/// One tile through all depths: `[x, y, ns, result bytes, touched, opened, needed, expected]`.
+/// One tile through all depths: `[x, y, ns, [result bytes, plain bytes], touched, opened, needed, expected]`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "Written", into = "Written")]
 pub struct RegionTile {
@@ -161,8 +174,10 @@ pub struct RegionTile {
     pub y: u32,
     /// Time to draw it where its blocks were looked at before, in nanoseconds.
     pub ns: u64,
-    /// Its result on the wire, as finished pixels.
+    /// Its result on the wire, as finished pixels that are packed.
     pub result_bytes: u32,
+    /// The same if they are not.
+    pub plain_bytes: u32,
     /// Places of the bricks that it is drawn from, in the list of the set's bricks; ascending.
     pub touched: Vec<u32>,
     /// Numbers of the blocks whose bricks it looks at, front to back in its frame; ascending.
@@ -175,28 +190,36 @@ pub struct RegionTile {
     pub expected: Vec<u32>,
 }
 
+impl RegionTile {
+    /// Its result on the wire.
+    pub fn bytes(&self, plain: bool) -> u32 {
+        if plain { self.plain_bytes } else { self.result_bytes }
+    }
+}
+
 impl From<Written> for RegionTile {
     fn from(written: Written) -> Self {
-        let (x, y, ns, result_bytes, mut touched, mut opened, needed, mut expected) = written;
+        let (x, y, ns, bytes, mut touched, mut opened, needed, mut expected) = written;
+        let [result_bytes, plain_bytes] = bytes;
         for places in [&mut touched, &mut opened, &mut expected] {
             for i in 1..places.len() {
                 places[i] = places[i].saturating_add(places[i - 1]);
             }
         }
-        RegionTile { x, y, ns, result_bytes, touched, opened, needed, expected }
+        RegionTile { x, y, ns, result_bytes, plain_bytes, touched, opened, needed, expected }
     }
 }
 
 impl From<RegionTile> for Written {
     fn from(t: RegionTile) -> Self {
-        let RegionTile { x, y, ns, result_bytes, .. } = t;
+        let RegionTile { x, y, ns, result_bytes, plain_bytes, .. } = t;
         let RegionTile { mut touched, mut opened, needed, mut expected, .. } = t;
         for places in [&mut touched, &mut opened, &mut expected] {
             for i in (1..places.len()).rev() {
                 places[i] -= places[i - 1];
             }
         }
-        (x, y, ns, result_bytes, touched, opened, needed, expected)
+        (x, y, ns, [result_bytes, plain_bytes], touched, opened, needed, expected)
     }
 }
 
@@ -274,6 +297,10 @@ impl Trace {
         if pings.max() > Some(1_000_000_000) {
             return no("about.pings: one takes longer than a second".into());
         }
+        let Packing { pack_ns, unpack_ns } = trace.about.packing;
+        if ![pack_ns, unpack_ns].iter().all(|ns| (0.0..=1e6).contains(ns)) {
+            return no("about.packing: no time of a byte".into());
+        }
         let pixels = u64::from(w) * u64::from(h);
         for (i, frame) in trace.frames.iter().enumerate() {
             // A minute for each is beyond any tile; sums of a million stay far inside 64 bits.
@@ -340,7 +367,10 @@ impl FrameTrace {
             Some(match level.tiles.binary_search_by_key(&(y, x), |t| (t.y, t.x)) {
                 Ok(at) => Cow::Borrowed(&level.tiles[at]),
                 Err(_) => {
-                    Cow::Owned(RegionTile { x, y, result_bytes: 40, ..RegionTile::default() })
+                    let (result_bytes, plain_bytes) = (40, 40);
+                    let tile =
+                        RegionTile { x, y, result_bytes, plain_bytes, ..RegionTile::default() };
+                    Cow::Owned(tile)
                 }
             })
         })
@@ -525,6 +555,7 @@ mod tests {
                 slabs: 1,
                 repeats: 2,
                 pings: Some(Pings { alone_ns: [9, 21, 20], company_ns: [1, 5, 4] }),
+                packing: Packing { pack_ns: 1.5, unpack_ns: 0.25 },
             },
             frames: vec![FrameTrace {
                 view: Digest32([7; 32]).to_string(),
@@ -542,6 +573,7 @@ mod tests {
                             y: 0,
                             ns: 1500,
                             result_bytes: 900,
+                            plain_bytes: 1200,
                             touched: vec![3, 4, 70],
                             opened: vec![0, 9],
                             needed: vec![0, 250, 40],
@@ -571,7 +603,9 @@ mod tests {
         assert_eq!(ns(64, 64, 100, 70), None, "it is empty");
         assert_eq!(ns(0, 0, 63, 64), None);
         let region = |x0, y0, x1, y1| frame.region(&Rect::new(x0, y0, x1, y1), [100, 70]);
-        assert_eq!(region(0, 0, 64, 64).expect("it is there").touched, [3, 4, 70]);
+        let tile = region(0, 0, 64, 64).expect("it is there");
+        assert_eq!((tile.bytes(false), tile.bytes(true)), (900, 1200));
+        assert_eq!(tile.touched, [3, 4, 70]);
         assert_eq!(region(64, 0, 100, 64).expect("it is there").ns, 7);
         assert_eq!(region(0, 64, 64, 70).expect("nothing lies in it").ns, 0);
         assert!(region(0, 0, 100, 70).is_none(), "a level that was not drawn");
@@ -591,12 +625,15 @@ mod tests {
         let says = |text: &str| Trace::from_json(text.as_bytes()).unwrap_err().to_string();
         let good = trace().to_json();
         assert!(says("{}").contains("slabcast plan --trace"));
-        assert!(says(&good.replacen("\"version\":5", "\"version\":6", 1)).contains("version 6"));
-        let old = good.replace("\"version\":5", "\"version\":3").replace(",[2,1,68]]", "]");
+        assert!(says(&good.replacen("\"version\":6", "\"version\":7", 1)).contains("version 7"));
+        let old = good.replace("\"version\":6", "\"version\":3").replace(",[2,1,68]]", "]");
         assert!(old.len() < good.len() && says(&old).contains("version 3"), "{old}");
         assert!(says(&good.replace(",[2,1,68]]", "]")).contains("invalid length"));
         assert!(says(&good.replace("[100,70]", "[100,0]")).starts_with("about.size"));
         assert!(says(&good.replace("[9,21,20]", "[9,2000000000,20]")).starts_with("about.pings"));
+        assert!(
+            says(&good.replace("\"pack_ns\":1.5", "\"pack_ns\":-1.5")).starts_with("about.packing")
+        );
         assert!(says(&good.replace("[100,70]", "[10,7]")).contains("more pixels"));
         assert!(says(&good.replace("\"edge\":64", "\"edge\":65")).contains("65 is no edge"));
         assert!(says(&good.replace("[64,0,700", "[64,99,700")).contains("by row and column"));

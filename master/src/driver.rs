@@ -596,7 +596,7 @@ impl Driver {
         let heartbeat_ms = (self.silence / 3000).min(u32::MAX.into()) as u32;
         // A rehearsing one stands for another machine's.
         let is_here = caller.is_on(&hello.machine, &self.machine) && !hello.rehearses;
-        let _ = link.control.send(ToWorker::Welcome { worker, heartbeat_ms, is_here });
+        let _ = link.control.send(ToWorker::Welcome { worker, heartbeat_ms });
         let now = Instant::now();
         let attached = Attached {
             link,

@@ -231,19 +231,19 @@ impl Drop for Desk<'_> {
 impl Desk<'_> {
     fn told(&mut self, message: ToWorker) {
         match message {
-            ToWorker::Welcome { worker, heartbeat_ms, .. } => {
+            ToWorker::Welcome { worker, heartbeat_ms } => {
                 info!(%worker, "let in");
                 self.patience = Duration::from_millis(u64::from(heartbeat_ms) * 3);
             }
             ToWorker::Scene(spec) => {
                 self.scenes.insert(spec.id, Arc::new(SceneSlot::new(spec)));
             }
-            ToWorker::Frame { frame, scene, view, finish } => {
+            ToWorker::Frame { frame, scene, view, finish, plain } => {
                 if let Some(scene) = self.scenes.get(&scene) {
                     // A view alone looks right; only with its volume can its depths be judged.
                     match convert::check_view(&scene.spec.volume.lattice, &view) {
                         Ok(()) => {
-                            let slot = FrameSlot::new(scene.clone(), view, finish);
+                            let slot = FrameSlot::new(scene.clone(), view, finish, plain);
                             self.frames.insert(frame, Arc::new(slot));
                         }
                         Err(e) => warn!(%frame, error = %e, "the master sent a view that is wrong"),
@@ -644,11 +644,11 @@ mod tests {
             let volume = volume.info(Digest32::default());
             let spec = SceneSpec { id, volume, transfer, quality, bricks: SET };
             let (worker, heartbeat_ms) = (WorkerId(1), 60_000);
-            world.say(ToWorker::Welcome { worker, heartbeat_ms, is_here: false });
+            world.say(ToWorker::Welcome { worker, heartbeat_ms });
             world.known = Some((spec.clone(), view));
             world.say(ToWorker::Scene(Arc::new(spec)));
             for (frame, finish) in [(FRAME, None), (FINISHED, Some(FINISH))] {
-                world.say(ToWorker::Frame { frame, scene: id, view, finish });
+                world.say(ToWorker::Frame { frame, scene: id, view, finish, plain: false });
             }
             world
         }
@@ -815,7 +815,7 @@ mod tests {
         let spec = SceneSpec { id: SceneId(4), quality, ..known };
         let (scene, finish) = (spec.id, None);
         world.say(ToWorker::Scene(Arc::new(spec)));
-        world.say(ToWorker::Frame { frame, scene, view, finish });
+        world.say(ToWorker::Frame { frame, scene, view, finish, plain: false });
         world.send(1).await;
         let tile = Rect::new(0, 0, 32, 32);
         world.region_of(frame, 1, tile);
@@ -855,7 +855,7 @@ mod tests {
         let (scene, finish) = (spec.id, None);
         world.say(ToWorker::Scene(Arc::new(spec)));
         for frame in [FrameId(9), FrameId(10)] {
-            world.say(ToWorker::Frame { frame, scene, view, finish });
+            world.say(ToWorker::Frame { frame, scene, view, finish, plain: false });
         }
         let wish = |heard| match heard {
             ToMaster::BricksWanted { bricks, .. } => bricks.iter().map(|b| b.0).collect::<Vec<_>>(),

@@ -134,11 +134,11 @@ async fn link(
     // Unbounded, bounded by the leases that the master gives and its pings.
     let (control_tx, control) = mpsc::unbounded_channel();
     let (bricks_tx, bricks) = mpsc::channel(BATCHES);
-    // Whether this is the master's machine: packing results takes a tenth of what drawing does there, and saves nothing.
-    let is_here = Arc::new(AtomicBool::new(false));
-    let here = is_here.clone();
+    // Whether results go as they are, by the frame that came last.
+    let plain = Arc::new(AtomicBool::new(false));
+    let as_is = plain.clone();
     let outbound = ReceiverStream::new(reply_rx).map(move |message| {
-        convert::from_worker_to_wire_as(&message, !here.load(Ordering::Relaxed))
+        convert::from_worker_to_wire_as(&message, !as_is.load(Ordering::Relaxed))
     });
     let bricks_endpoint = bricks_endpoint(endpoint);
     let mut carrying = tokio::spawn(async move {
@@ -168,8 +168,8 @@ async fn link(
             };
             match convert::to_worker_from_wire(message) {
                 Ok((message, session)) => {
-                    if let ToWorker::Welcome { is_here: told, .. } = message {
-                        is_here.store(told, Ordering::Relaxed);
+                    if let ToWorker::Frame { plain: told, .. } = message {
+                        plain.store(told, Ordering::Relaxed);
                     }
                     if let Some(session) = session {
                         let (endpoint, to) = (bricks_endpoint.clone(), bricks_tx.clone());

@@ -59,6 +59,8 @@ pub(crate) struct FrameSlot {
     pub(crate) view: View,
     /// What its regions are finished to.
     pub(crate) finish: Option<Finish>,
+    /// Of a rehearsal: whether they weigh what they do as they are.
+    pub(crate) plain: bool,
     frame: OnceLock<Frame>,
     probe: OnceLock<Probe>,
     outlook: OnceLock<Outlook>,
@@ -73,12 +75,18 @@ pub(crate) struct FrameSlot {
 }
 
 impl FrameSlot {
-    pub(crate) fn new(scene: Arc<SceneSlot>, view: View, finish: Option<Finish>) -> Self {
+    pub(crate) fn new(
+        scene: Arc<SceneSlot>,
+        view: View,
+        finish: Option<Finish>,
+        plain: bool,
+    ) -> Self {
         let (frame, probe, outlook, depths, rehearsed, made, held, over) = Default::default();
         FrameSlot {
             scene,
             view,
             finish,
+            plain,
             frame,
             probe,
             outlook,

@@ -145,7 +145,9 @@ impl Rehearsal {
         }
         // Made while the tile is held, and not when that is over.
         let pixels = match &frame.finish {
-            Some(finish) => Pixels::Finished(finished_through(&tile, known.result_bytes, finish)),
+            Some(finish) => {
+                Pixels::Finished(finished_through(&tile, known.bytes(frame.plain), finish))
+            }
             None => Pixels::Sums(filled_through(&tile, known.result_bytes)),
         };
         loop {

@@ -252,7 +252,7 @@ pub(crate) fn worker(args: &WorkerArgs) -> Result<(), Fail> {
         simd: Simd::detect(),
         machine: machine(),
     };
-    let runtime = runtime::start()?;
+    let runtime = runtime::start_worker(config.threads)?;
     let result = runtime.block_on(async {
         signals::listen();
         let (stop, stopped) = watch::channel(false);

@@ -14,6 +14,16 @@ pub(crate) fn start() -> Result<Runtime, Fail> {
     with_threads(if cores() > 2 { 2 } else { 1 })
 }
 
+/// Render threads up to which a worker has one thread for its streams.
+const FEW: u32 = 8;
+
+/// Starts it for a worker of so many render threads: as for any command with streams, or with one thread where render
+/// threads are few. Another one is woken for each lease that comes, and finds nothing to do: a ping and its pong take a worker
+/// 38 us of a Xeon's processors with two and 24 with one (docs/scaling.md).
+pub(crate) fn start_worker(render_threads: u32) -> Result<Runtime, Fail> {
+    if render_threads <= FEW { with_threads(1) } else { start() }
+}
+
 /// Starts it for a cluster in this process. Messages are passed on and nothing is encoded: a second
 /// thread would be woken for each of them to look for work, and take the render threads' cores.
 pub(crate) fn start_embedded() -> Result<Runtime, Fail> {

@@ -537,6 +537,7 @@ impl Scheduler {
                 let known = cluster.roster.get(worker).is_some();
                 let lent = |f: &Frame| f.has_lent(worker, result.task, result.epoch);
                 let whose = self.active.iter().position(lent).unwrap_or(0);
+                cluster.traffic.result(result.bytes.unwrap_or(0).into());
                 match self.active.get_mut(whose) {
                     Some(frame) if known => {
                         let outcome = frame.result(cluster, worker, *result, clock);

@@ -11,7 +11,7 @@ use slabcast_common::occlusion::Rect;
 use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_common::trace::{
-    About, FrameTrace, RegionLevel, RegionTile, Trace, VERSION, view_sha256,
+    About, FrameTrace, Packing, RegionLevel, RegionTile, Trace, VERSION, view_sha256,
 };
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
@@ -115,6 +115,7 @@ fn ball(frames: usize) -> (Vec<FrameJob>, Trace) {
         slabs: 3,
         repeats: 1,
         pings: None,
+        packing: Packing::default(),
     };
     (jobs, Trace { version: VERSION, about, frames: traced })
 }

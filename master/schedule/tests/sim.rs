@@ -2,14 +2,16 @@
 
 use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId};
+use slabcast_common::image::{Background, PixelFormat};
+use slabcast_common::leaves::Finish;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::presets;
 use slabcast_common::quality::{Borders, Quality, Schedule, Work};
 use slabcast_common::stats::FrameStats;
 use slabcast_common::trace::{
-    About, FrameTrace, Level, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace, VERSION,
-    view_sha256,
+    About, FrameTrace, Level, Packing, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace,
+    VERSION, view_sha256,
 };
 use slabcast_common::view::{Camera, CameraProjection, Projected, View};
 use slabcast_common::volume::{Digest32, Volume};
@@ -68,6 +70,7 @@ fn world(frames: usize) -> (Vec<FrameJob>, Trace) {
         slabs: 3,
         repeats: 1,
         pings: None,
+        packing: Packing::default(),
     };
     (jobs, Trace { version: VERSION, about, frames })
 }
@@ -143,6 +146,7 @@ fn through(edge: u32, rects: &[Rect], projected: &[Option<Projected>]) -> Region
                 y: t.rect.y0 as u32,
                 ns: 20 * t.rect.area() as u64,
                 result_bytes: 2 * t.rect.area() as u32,
+                plain_bytes: 3 * t.rect.area() as u32,
                 touched: touched.map(|(i, _)| i).collect(),
                 // A block to the left, and one for all.
                 opened: vec![t.rect.x0 as u32 / 128, 7],
@@ -258,6 +262,46 @@ fn what_the_master_costs_shows_in_frames_and_overlaps_where_it_may() {
     let rehearsal =
         run(&jobs, &trace, &Cluster { costs, in_flight: 3, cores: Some(1), ..cluster(4) });
     assert!(rehearsal.each_ms() > three.each_ms());
+}
+
+/// A worker of one thread has one core: while it sends it does not draw.
+#[test]
+fn what_a_result_takes_is_taken_from_what_is_drawn_next() {
+    let (jobs, trace) = world(3);
+    let jobs = under(Schedule::Region, &jobs);
+    let last = |ns: f64| {
+        let worker = Toll { send: (ns, 0.0), ..Toll::default() };
+        let costs = Costs { worker, ..Costs::default() };
+        run(&jobs, &trace, &Cluster { costs, ..cluster(1) }).frames[2]
+    };
+    let (free, dear) = (last(0.0), last(30_000.0));
+    let took = |f: &sim::FrameOutcome| f.done - f.began;
+    assert!(dear.leases > 3);
+    assert!(took(&dear) >= took(&free) + 30_000 * dear.leases, "{free:?} {dear:?}");
+}
+
+#[test]
+fn results_are_packed_where_they_would_fill_the_link() {
+    let (jobs, trace) = world(6);
+    let finish = Finish { format: PixelFormat::Rgb8, background: Background::Colour([0.0; 3]) };
+    let jobs = under(Schedule::Region, &jobs)
+        .into_iter()
+        .map(|job| FrameJob { finish: Some(finish), ..job })
+        .collect::<Vec<_>>();
+    let at = |bytes_per_s| {
+        let link = Link { bytes_per_s, latency_ns: 20_000 };
+        let costs = Costs { pack: 1.0, ..Costs::default() };
+        run(&jobs, &trace, &Cluster { link, costs, ..cluster(2) })
+    };
+    // Two bytes a pixel if they are packed, three if not.
+    let a_pixel = |f: &sim::FrameOutcome| {
+        let pixels = (f.render - 2 * 7_000) as f64 / 20.0;
+        f.up as f64 / pixels
+    };
+    let (fast, slow) = (at(Some(1e9)), at(Some(1e7)));
+    assert!(a_pixel(&fast.frames[0]) < 2.5, "nobody knows the link yet: {fast:?}");
+    assert!(a_pixel(&fast.frames[5]) > 2.9, "{fast:?}");
+    assert!(a_pixel(&slow.frames[5]) < 2.5, "{slow:?}");
 }
 
 /// Long work on the cores that all share, a picture's, holds short work up by its turns and not by all of it.

@@ -308,7 +308,10 @@ impl Decision {
 fn say(message: &ToWorker) -> String {
     match message {
         ToWorker::Scene(scene) => format!("{}", scene.id),
-        ToWorker::Frame { frame, scene, .. } => format!("{frame} of {scene}"),
+        ToWorker::Frame { frame, scene, plain, .. } => {
+            let plain = if *plain { ", results as they are" } else { "" };
+            format!("{frame} of {scene}{plain}")
+        }
         ToWorker::EndFrame { frame } => format!("end of {frame}"),
         ToWorker::EndScene { scene } => format!("end of {scene}"),
         ToWorker::Region(l) => {

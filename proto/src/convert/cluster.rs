@@ -369,15 +369,15 @@ pub fn check_result(tile: Rect, result: &TileResult) -> Result<(), WireError> {
 pub fn to_worker_to_wire(message: &ToWorker, session: u64) -> Down {
     use v1::to_worker::Message;
     let message = match message {
-        ToWorker::Welcome { worker, heartbeat_ms, is_here } => {
-            let (worker, heartbeat_ms, is_here) = (worker.0, *heartbeat_ms, *is_here);
-            Message::Welcome(v1::Welcome { worker, heartbeat_ms, session, is_here })
+        ToWorker::Welcome { worker, heartbeat_ms } => {
+            let (worker, heartbeat_ms) = (worker.0, *heartbeat_ms);
+            Message::Welcome(v1::Welcome { worker, heartbeat_ms, session })
         }
         ToWorker::Refused { reason } => {
             Message::Refused(v1::Refused { reason: reason_to_wire(reason) })
         }
         ToWorker::Scene(scene) => Message::Scene(scene_to_wire(scene)),
-        ToWorker::Frame { frame, scene, view, finish } => Message::Frame(v1::Frame {
+        ToWorker::Frame { frame, scene, view, finish, plain } => Message::Frame(v1::Frame {
             frame: frame.0,
             scene: scene.0,
             view: Some(view_to_wire(view)),
@@ -385,6 +385,7 @@ pub fn to_worker_to_wire(message: &ToWorker, session: u64) -> Down {
                 format: format_to_wire(finish.format),
                 background: Some(background_to_wire(finish.background)),
             }),
+            plain: *plain,
         }),
         ToWorker::Directory { set, grid, first, total, bricks } => {
             return Down::Parts(directory_to_wire(set, *grid, (*first, *total), bricks));
@@ -412,14 +413,14 @@ pub fn to_worker_from_wire(message: v1::ToWorker) -> Result<(ToWorker, Option<u6
     use v1::to_worker::Message;
     let message = match required("message", message.message)? {
         Message::Welcome(welcome) => {
-            let v1::Welcome { worker, heartbeat_ms, session, is_here } = welcome;
+            let v1::Welcome { worker, heartbeat_ms, session } = welcome;
             if !(1..=600_000).contains(&heartbeat_ms) {
                 return Err(WireError::value(
                     "welcome.heartbeat_ms",
                     format!("{heartbeat_ms}; give 1 to 600000"),
                 ));
             }
-            let message = ToWorker::Welcome { worker: WorkerId(worker), heartbeat_ms, is_here };
+            let message = ToWorker::Welcome { worker: WorkerId(worker), heartbeat_ms };
             return Ok((message, Some(session_from_wire("welcome.session", session)?)));
         }
         Message::Refused(refused) => {
@@ -437,6 +438,7 @@ pub fn to_worker_from_wire(message: v1::ToWorker) -> Result<(ToWorker, Option<u6
                 .finish
                 .map(|finish| finish_from_wire(finish).map_err(|e| e.within("frame.finish")))
                 .transpose()?,
+            plain: frame.plain,
         },
         Message::Lease(lease) => {
             ToWorker::Lease(Box::new(lease_from_wire(lease).map_err(|e| e.within("lease"))?))

@@ -409,14 +409,14 @@ pub fn to_master() -> impl Strategy<Value = ToMaster> {
 
 pub fn to_worker() -> impl Strategy<Value = ToWorker> {
     prop_oneof![
-        (any::<u64>(), 1u32..=600_000, any::<bool>()).prop_map(|(w, heartbeat_ms, is_here)| {
-            ToWorker::Welcome { worker: WorkerId(w), heartbeat_ms, is_here }
+        (any::<u64>(), 1u32..=600_000).prop_map(|(w, heartbeat_ms)| {
+            ToWorker::Welcome { worker: WorkerId(w), heartbeat_ms }
         }),
         ".{0,50}".prop_map(|reason| ToWorker::Refused { reason }),
         scene().prop_map(|s| ToWorker::Scene(Arc::new(s))),
-        (any::<[u64; 2]>(), view(), prop::option::of(finish())).prop_map(
-            |([f, s], view, finish)| {
-                ToWorker::Frame { frame: FrameId(f), scene: SceneId(s), view, finish }
+        (any::<[u64; 2]>(), view(), prop::option::of(finish()), any::<bool>()).prop_map(
+            |([f, s], view, finish, plain)| {
+                ToWorker::Frame { frame: FrameId(f), scene: SceneId(s), view, finish, plain }
             }
         ),
         lease().prop_map(|l| ToWorker::Lease(Box::new(l))),

@@ -123,7 +123,8 @@ pub(super) fn messages(trace: &Trace, schedule: Schedule) -> Costs {
         Down::Control(m) => m.encode_to_vec(),
         Down::Parts(_) | Down::Bricks(_) => Vec::new(),
     };
-    let up = |m: &ToMaster| convert::from_worker_to_wire(m).encode_to_vec();
+    // What packing takes the trace says.
+    let up = |m: &ToMaster| convert::from_worker_to_wire_as(m, false).encode_to_vec();
     let (lease_bytes, result_bytes) = (down(&lease), up(&result));
     let price = Prices::of(trace.about.pings.as_ref().unwrap_or(&KNOWN));
     let byte = |ns: f64, bytes: &[u8]| BYTE + ns / bytes.len().max(1) as f64;
@@ -153,6 +154,8 @@ pub(super) fn messages(trace: &Trace, schedule: Schedule) -> Costs {
             // Bricks are decoded and put into the cache: some 3 ns a byte (docs/performance.md).
             bricks: (price.each, BYTE + 3.0),
         },
+        pack: trace.about.packing.pack_ns,
+        unpack: trace.about.packing.unpack_ns,
         finish_pixel: finish(trace, by_region),
         mark_pixel: mark(trace.about.size),
         deliver: DELIVER,

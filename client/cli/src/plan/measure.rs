@@ -31,8 +31,8 @@ use slabcast_common::quality::Work;
 use slabcast_common::region::PART;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::trace::{
-    About, FrameTrace, Level, Pings, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace, VERSION,
-    view_sha256,
+    About, FrameTrace, Level, Packing, Pings, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace,
+    VERSION, view_sha256,
 };
 use slabcast_common::view::Projected;
 use slabcast_proto::convert::{self, Down};
@@ -97,7 +97,8 @@ pub(crate) fn measure(
 ) -> Result<Trace, Fail> {
     let jobs = jobs(path.stage, path.frames, path.work)?;
     let depths = Depths::new(jobs[0].view.size);
-    let mut bench = Bench { scratch: Scratch::default(), repeats: path.repeats, depths };
+    let packing = Packed::default();
+    let mut bench = Bench { scratch: Scratch::default(), repeats: path.repeats, depths, packing };
     let mut frames = Vec::with_capacity(jobs.len());
     // What a worker has after its first frame: footprints in the scene, memory that has grown.
     bench.frame(path, 0, &jobs[0])?;
@@ -119,6 +120,7 @@ pub(crate) fn measure(
         slabs: path.work.slabs,
         repeats: path.repeats,
         pings: path.pings,
+        packing: bench.packing.mean(),
     };
     Ok(Trace { version: VERSION, about, frames })
 }
@@ -128,6 +130,38 @@ struct Bench {
     repeats: u32,
     /// How deep the frame before was open.
     depths: Depths,
+    /// What packing took of the tiles so far.
+    packing: Packed,
+}
+
+/// Finished pixels that were packed and unpacked.
+#[derive(Default)]
+struct Packed {
+    bytes: u64,
+    pack_ns: u64,
+    unpack_ns: u64,
+}
+
+impl Packed {
+    fn mean(&self) -> Packing {
+        let mean = |ns: u64| ns as f64 / self.bytes.max(1) as f64;
+        Packing { pack_ns: mean(self.pack_ns), unpack_ns: mean(self.unpack_ns) }
+    }
+
+    /// Bytes of a result of finished pixels as it crosses, packed and as it is; what packing takes counts.
+    fn weigh(&mut self, repeats: u32, leaves: Leaves, counters: Counters) -> [u32; 2] {
+        self.bytes += leaves.data.len() as u64;
+        let result = result_of(Pixels::Finished(leaves), counters);
+        let [packed, plain] = [true, false].map(|packs| {
+            let to_wire = || convert::from_worker_to_wire_as(&result, packs);
+            let (to_ns, message) = shortest(repeats, to_wire);
+            let read = || drop(convert::from_worker_from_wire(message.clone()));
+            (to_ns, shortest(repeats, read).0, message.encoded_len() as u32)
+        });
+        self.pack_ns += packed.0.saturating_sub(plain.0);
+        self.unpack_ns += packed.1.saturating_sub(plain.1);
+        [packed.2, plain.2]
+    }
 }
 
 /// The shortest of some runs, in nanoseconds, and what the last one gave.
@@ -339,14 +373,14 @@ impl Bench {
             for t in &cut.tiles {
                 let outlook = Outlook::new(frame, bricks.directory());
                 let (leaves, counters, touched) = draw(t.rect, &outlook, bricks);
-                let (result_bytes, _) = weigh(Pixels::Finished(leaves), counters);
+                let [result_bytes, plain_bytes] =
+                    self.packing.weigh(self.repeats, leaves, counters);
                 let (x, y) = (t.rect.x0 as u32, t.rect.y0 as u32);
                 let opened = outlook.opened().collect();
                 // Blocks that only this opens are opened by the way.
                 let expected = region::expected((frame, &outlook, &Nothing), t.rect, &self.depths);
-                let tile =
-                    RegionTile { x, y, result_bytes, touched, opened, ..RegionTile::default() };
-                tiles.push(RegionTile { expected, ..tile });
+                let tile = RegionTile { x, y, touched, opened, expected, ..RegionTile::default() };
+                tiles.push(RegionTile { result_bytes, plain_bytes, ..tile });
             }
             // All blocks that any needs are open then, as the price of one is told apart.
             let outlook = Outlook::new(frame, bricks.directory());
@@ -447,15 +481,20 @@ fn lease_weighs(lease: Lease) -> u32 {
     }
 }
 
-/// Bytes of a result as it crosses.
-fn weigh(pixels: Pixels, counters: Counters) -> (u32, Pixels) {
+/// A result as it is sent, but for what a region tells of its bricks.
+fn result_of(pixels: Pixels, counters: Counters) -> ToMaster {
     let (task, epoch) = (TaskId(1 << 12), Epoch(0));
     // Times as they are after some hours: five bytes each.
     let us = 1 << 33;
     let times = TaskTimes { received_us: us, ready_us: us, start_us: us, end_us: us, thread: 0 };
     let (bytes, region) = (None, None);
     let result = TileResult { task, epoch, pixels, bytes, counters, times, region };
-    let result = ToMaster::Result(Box::new(result));
+    ToMaster::Result(Box::new(result))
+}
+
+/// Bytes of a result as it crosses.
+fn weigh(pixels: Pixels, counters: Counters) -> (u32, Pixels) {
+    let result = result_of(pixels, counters);
     let bytes = convert::from_worker_to_wire(&result).encoded_len();
     let ToMaster::Result(result) = result else { unreachable!("made above") };
     (bytes as u32, result.pixels)

@@ -66,7 +66,8 @@ pub(super) fn least(one: Pings, other: Pings) -> Pings {
 
 /// Nanoseconds for a ping and its pong, of each of [`NAMES`].
 fn look(workers: usize) -> Result<[u64; 3], String> {
-    let (here, there) = (runtime(NAMES[1])?, runtime(NAMES[2])?);
+    // As they have them (`runtime.rs`): a master where it has more than two processors, a worker of a few threads.
+    let (here, there) = (runtime(NAMES[1], 2)?, runtime(NAMES[2], 1)?);
     let took = pinged(workers, &here, &there);
     for runtime in [here, there] {
         runtime.shutdown_timeout(Duration::from_millis(200));
@@ -134,10 +135,9 @@ fn watched(workers: usize) -> Result<[u64; 3], String> {
     Ok(std::array::from_fn(|i| (after[i].saturating_sub(before[i]) as f64 / pings) as u64))
 }
 
-fn runtime(name: &str) -> Result<Runtime, String> {
-    // As the master has them (`runtime.rs`) where it has more than two processors.
+fn runtime(name: &str, threads: usize) -> Result<Runtime, String> {
     let mut builder = Builder::new_multi_thread();
-    builder.worker_threads(2).thread_name(name).enable_all().build().map_err(why)
+    builder.worker_threads(threads).thread_name(name).enable_all().build().map_err(why)
 }
 
 /// Processor time so far of this process's threads, in ns.

@@ -197,13 +197,14 @@ impl Frame {
             if self.told.insert(id) {
                 let scene = &self.job.scene;
                 let worker = cluster.roster.get_mut(id).expect("it was just lent a task");
+                let plain = worker.is_here || !cluster.traffic.packs();
                 if worker.scenes.insert(scene.id) {
                     cluster.send(id, ToWorker::Scene(scene.clone()));
                 }
                 let view = self.job.view;
                 let (frame, scene) = (self.job.frame, scene.id);
                 let finish = finish_of(&self.job);
-                let message = ToWorker::Frame { frame, scene, view, finish };
+                let message = ToWorker::Frame { frame, scene, view, finish, plain };
                 cluster.send(id, message);
             }
             let tile = slab.cut.tiles[place as usize].rect;

@@ -49,8 +49,8 @@ impl Clock for VirtualClock {
 /// What reaches somebody at a time.
 #[expect(clippy::large_enum_variant, reason = "a frame's view, once a frame and worker")]
 enum Coming {
-    /// A message is at the master's end of the link, so many bytes.
-    AtMaster(WorkerId, Event, u64),
+    /// A message is at the master's end of the link: so many bytes, of which unpacking takes so many nanoseconds.
+    AtMaster(WorkerId, Event, u64, f64),
     /// It is decoded and lies before the driver.
     Inbox(Event),
     /// The driver is free again.
@@ -125,7 +125,8 @@ struct Known<'a> {
     /// Of a task of a slab; a region's time is its course's.
     ns: u64,
     lease_bytes: u64,
-    result_bytes: u64,
+    /// Of finished pixels, packed and as they are. Sums weigh the first.
+    result_bytes: [u64; 2],
     /// Of a region: with the places of the bricks that it is drawn from, and blocks whose bricks it looks at.
     region: Cow<'a, RegionTile>,
 }
@@ -200,6 +201,8 @@ impl Running<'_> {
 struct Worker<'a> {
     down: Pipe,
     up: Pipe,
+    /// Whether its results go as they are.
+    plain: bool,
     /// What receives and sends.
     io: Cores,
     /// When what came last is read, what went last is written, and what the master heard last read.
@@ -334,6 +337,7 @@ pub fn run(
         let worker = Worker {
             down: Pipe::new(bandwidth),
             up: Pipe::new(bandwidth),
+            plain: false,
             io: Cores::new(1),
             read: 0,
             wrote: 0,
@@ -578,15 +582,22 @@ impl<'a> World<'a> {
 
     /// A worker's message goes up. What is there before the one before is written goes along with it.
     fn up(&mut self, id: WorkerId, event: Event, bytes: u64, at: Nanos) {
-        let toll = &self.cluster.costs.worker;
+        self.up_packed(id, event, (bytes, 0), at);
+    }
+
+    /// The same of so many bytes that so many were packed into; none, if they go as they are.
+    fn up_packed(&mut self, id: WorkerId, event: Event, (bytes, of): (u64, u64), at: Nanos) {
+        let Costs { worker: toll, pack, unpack, .. } = &self.cluster.costs;
         let call = if at <= self.workers[&id].wrote { 0.0 } else { toll.call };
-        let at = self.worker(id, at, call + toll.send.0 + toll.send.1 * bytes as f64);
+        let ns = call + toll.send.0 + toll.send.1 * bytes as f64 + pack * of as f64;
+        let at = self.worker(id, at, ns);
         let w = self.workers.get_mut(&id).expect("a worker that speaks is there");
         w.wrote = at;
         let there = through(&mut w.up, &mut self.up, at, bytes);
         self.outcome.frames[self.at].up += bytes;
         self.outcome.frames[self.at].messages_up += 1;
-        self.later(there + self.cluster.link.latency_ns, Coming::AtMaster(id, event, bytes));
+        let coming = Coming::AtMaster(id, event, bytes, unpack * of as f64);
+        self.later(there + self.cluster.link.latency_ns, coming);
     }
 
     /// The master's message goes down, when the driver is done with it. Of those that leave together to
@@ -641,10 +652,10 @@ impl<'a> World<'a> {
     ) -> Result<(), Unknown> {
         let now = self.now();
         match what {
-            Coming::AtMaster(id, event, bytes) => {
+            Coming::AtMaster(id, event, bytes, unpacking) => {
                 let toll = &self.cluster.costs.master;
                 let call = if now <= self.workers[&id].heard { 0.0 } else { toll.call };
-                let ns = call + toll.receive.0 + toll.receive.1 * bytes as f64;
+                let ns = call + toll.receive.0 + toll.receive.1 * bytes as f64 + unpacking;
                 let at = self.master(|w| &mut w.streams, now, ns);
                 // A stream keeps its order, whichever thread reads it.
                 let heard = &mut self.workers.get_mut(&id).expect("a worker stays").heard;
@@ -696,8 +707,12 @@ impl<'a> World<'a> {
                     self.later(now + stolen, Coming::TaskEnd(id, thread, ends));
                     return Ok(());
                 }
-                self.stop(id, thread);
+                let ended = self.stop(id, thread);
                 self.begin(id, Some(thread))?;
+                // What sending it takes is taken from what the thread draws next.
+                if let Some(lent) = ended {
+                    self.end_task(id, thread, lent);
+                }
             }
             Coming::Chore(chore, left) => self.go_on(chore, left, took, watch)?,
         }
@@ -737,6 +752,10 @@ impl<'a> World<'a> {
             ToWorker::DropBricks { set, bricks } => {
                 self.have(id, set, &bricks, false);
             }
+            ToWorker::Frame { plain, .. } => {
+                self.read(id, FRAME);
+                self.workers.get_mut(&id).expect("a worker stays").plain = plain;
+            }
             _ => {
                 self.read(id, FRAME);
             }
@@ -755,7 +774,7 @@ impl<'a> World<'a> {
                 slab.and_then(|s| s.tile(&l.tile, size)).map(|t| Known {
                     ns: t.ns,
                     lease_bytes: t.lease_bytes.into(),
-                    result_bytes: t.result_bytes.into(),
+                    result_bytes: [t.result_bytes.into(); 2],
                     region: Cow::Owned(RegionTile::default()),
                 })
             }
@@ -763,7 +782,7 @@ impl<'a> World<'a> {
                 self.piece_of(l.frame, &l.tile).map(|piece| Known {
                     ns: 0,
                     lease_bytes: SMALL,
-                    result_bytes: SMALL + 3 * l.tile.area() as u64,
+                    result_bytes: [SMALL + 3 * l.tile.area() as u64; 2],
                     region: Cow::Owned(RegionTile {
                         touched: piece.needs(),
                         ..RegionTile::default()
@@ -772,8 +791,9 @@ impl<'a> World<'a> {
             }
             Task::Region(l) => self.whole_region(l.tile, frame).map(|region| {
                 // A bit or so for each touched brick, and the cost's other figures.
+                let beside = 20 + region.touched.len() as u64;
                 let result_bytes =
-                    u64::from(region.result_bytes) + 20 + region.touched.len() as u64;
+                    [false, true].map(|plain| u64::from(region.bytes(plain)) + beside);
                 Known { ns: region.ns, lease_bytes: SMALL, result_bytes, region }
             }),
         };
@@ -1027,8 +1047,8 @@ impl<'a> World<'a> {
         }
     }
 
-    /// A thread is at a task's end, or where it lacks bricks.
-    fn stop(&mut self, id: WorkerId, thread: usize) {
+    /// A thread is at a task's end, or where it lacks bricks. What has ended.
+    fn stop(&mut self, id: WorkerId, thread: usize) -> Option<Lent<'a>> {
         let now = self.now();
         let w = self.workers.get_mut(&id).expect("a worker stays");
         let r = w.running[thread].take().expect("a task that ends has begun");
@@ -1048,10 +1068,15 @@ impl<'a> World<'a> {
             course.go(f64::INFINITY, &has(present));
             if !course.is_over() {
                 self.park(id, lent);
-                return;
+                return None;
             }
         }
-        self.end_task(id, thread, lent);
+        if let Task::Region(lease) = &lent.task {
+            let set = self.jobs[frame.0 as usize - 1].scene.bricks;
+            let w = self.workers.get_mut(&id).expect("a worker stays");
+            w.drawn.extend(parts(lease.tile).map(|p| (set, p.x0 / PART, p.y0 / PART)));
+        }
+        Some(lent)
     }
 
     fn end_task(&mut self, id: WorkerId, thread: usize, lent: Lent<'a>) {
@@ -1076,9 +1101,6 @@ impl<'a> World<'a> {
                 if self.jobs[frame].finish.is_none() {
                     a.resize(tile.area(), 0.0);
                 }
-                let set = self.jobs[frame].scene.bricks;
-                let w = self.workers.get_mut(&id).expect("a worker stays");
-                w.drawn.extend(parts(tile).map(|p| (set, p.x0 / PART, p.y0 / PART)));
                 region = Some(RegionCost {
                     touched: traced.into_owned().touched,
                     stalls: lent.stalls,
@@ -1088,8 +1110,12 @@ impl<'a> World<'a> {
             }
         }
         let (task, epoch) = lent.task.name();
+        // Bytes that it weighs, and how many are packed into them.
+        let [packed, plain] = result_bytes;
+        let mut weight = (packed, 0);
         let pixels = match (&lent.task, self.jobs[frame].finish) {
             (Task::Region(_), Some(finish)) => {
+                weight = if self.workers[&id].plain { (plain, 0) } else { (packed, plain) };
                 let size = [tile.width() as u32, tile.height() as u32];
                 Pixels::Finished(Leaves::blank(size, finish.format))
             }
@@ -1109,10 +1135,10 @@ impl<'a> World<'a> {
                 thread: thread as u32,
             },
             region,
-            bytes: Some(result_bytes.min(u64::from(u32::MAX)) as u32),
+            bytes: Some(weight.0.min(u64::from(u32::MAX)) as u32),
         });
         let event = Event::Result { worker: id, result };
-        self.up(id, event, result_bytes, lent.pixels.max(now + late));
+        self.up_packed(id, event, weight, lent.pixels.max(now + late));
     }
 
     /// The driver: everything that lies before it, then the wishes.

@@ -105,6 +105,10 @@ pub struct Costs {
     pub mark_pixel: f64,
     /// A worker's stream. Its render threads are woken as it is.
     pub worker: Toll,
+    /// To pack a byte of finished pixels, and to unpack it.
+    pub pack: f64,
+    /// See above.
+    pub unpack: f64,
     /// A rehearsing worker: to fill the planes of a result, and a pixel of them.
     pub hold: (f64, f64),
     /// A rehearsing worker: how late the system wakes a thread that holds a tile.

@@ -393,7 +393,8 @@ impl World {
                     ToWorker::Scene(scene) => {
                         assert!(w.scenes.insert(scene.id), "seed {seed}: scene twice to {id}");
                     }
-                    ToWorker::Frame { frame, scene, finish, .. } => {
+                    ToWorker::Frame { frame, scene, finish, plain, .. } => {
+                        assert!(*plain || !w.nature.is_here, "seed {seed}: nothing to pack for");
                         let job = &self.jobs[frame].job;
                         let regions = job.work.schedule != Schedule::Slab;
                         assert_eq!(*finish, job.finish.filter(|_| regions), "seed {seed}");

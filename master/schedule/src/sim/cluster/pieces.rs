@@ -50,6 +50,7 @@ impl<'a> World<'a> {
             all.expected.extend(whole.expected.iter().copied().filter(over));
         }
         all.result_bytes = 3 * tile.area() as u32;
+        all.plain_bytes = all.result_bytes;
         for list in [&mut all.touched, &mut all.opened, &mut all.expected] {
             list.sort_unstable();
             list.dedup();
@@ -94,7 +95,8 @@ impl<'a> World<'a> {
         *course = course.piece(&tile, &kept, &sees);
         lease.tile = kept;
         let known = &mut lent.known;
-        known.result_bytes = known.result_bytes * kept.area() as u64 / tile.area() as u64;
+        let part = |bytes| bytes * kept.area() as u64 / tile.area() as u64;
+        known.result_bytes = known.result_bytes.map(part);
         // What it still waits for, it may no longer need.
         let still = course.needs();
         lent.waits.retain(|place| still.binary_search(place).is_ok());

@@ -53,7 +53,7 @@ const KEEP: f64 = 0.75;
 const BIND: [f64; 2] = [0.6, 0.3];
 
 /// Results are packed once they take more than the first of the time at the rate that was seen, until, packed, they take less
-/// than the second. On one worker and two, whatever the link, they never are, which saves 3 % of a frame of mri256; on four
+/// than the second. On one worker and two they are not at 1 Gbit/s and more, which saves 3 % of a frame of mri256; on four
 /// and more at 1 Gbit/s they are, where as they are they would take 8 % more time on eight (aneurism: 23). With 0.8 and 0.5
 /// such frames take 5 to 8 % longer, with 0.4 and 0.2 one and two workers pack (docs/scaling.md).
 const PACK: [f64; 2] = [0.55, 0.35];

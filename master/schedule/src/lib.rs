@@ -534,10 +534,14 @@ impl Scheduler {
             }
             Event::Result { worker, result } => {
                 cluster.roster.heard(worker, now);
-                let known = cluster.roster.get(worker).is_some();
+                let from = cluster.roster.get(worker);
+                // What comes from this machine crosses no link.
+                if from.is_some_and(|w| !w.is_here) {
+                    cluster.traffic.result(result.bytes.unwrap_or(0).into());
+                }
+                let known = from.is_some();
                 let lent = |f: &Frame| f.has_lent(worker, result.task, result.epoch);
                 let whose = self.active.iter().position(lent).unwrap_or(0);
-                cluster.traffic.result(result.bytes.unwrap_or(0).into());
                 match self.active.get_mut(whose) {
                     Some(frame) if known => {
                         let outcome = frame.result(cluster, worker, *result, clock);

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Which bricks a path needs, holds and is sent, under either schedule (docs/scaling.md).
+"""Which bricks a path needs, holds and is sent, under either schedule (docs/measurements/scaling.md).
 
 bricks.py SLABCAST FOLDER: renders 18 views of the three volumes of FOLDER, and prints Markdown.
 Shares of voxels are counted; shares of bytes are of the encoded set, as `--log-level info` says.

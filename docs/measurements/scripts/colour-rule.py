@@ -1,11 +1,10 @@
-"""Measures what rules of compositing and thicknesses of sheets buy and cost (colour-rule.md).
+"""Measures what rules of compositing and thicknesses of sheets buy and cost (../colour-rule.md).
 
     cargo build --release --locked
-    python3 docs/colour-rule.py --data DIR --keep DIR --times
+    python3 docs/measurements/scripts/colour-rule.py --data DIR --keep DIR --times
 
 runs `slabcast check colour-rule` on five volumes and the sample, once with the default eps and once
-with eps 0, and writes the tables into docs/colour-rule.md, between its two markers. Results are
-kept as JSON lines in --keep; what is there already is not measured again, so an interrupted run
+with eps 0, and prints the tables. Results are kept as JSON lines in --keep; what is there already is not measured again, so an interrupted run
 goes on. Without --times frames are drawn on all cores and the column stays empty.
 """
 
@@ -14,7 +13,7 @@ import json
 import pathlib
 import subprocess
 
-HERE = pathlib.Path(__file__).resolve().parent
+ROOT = pathlib.Path(__file__).resolve().parents[3]
 SCENES = [
     ("mri256", "mri256.nrrd", ["--up=-y", "--tf", "peer-opaque"]),
     ("mouse_skull", "mouse_skull.nrrd", ["--up=z", "--tf", "peer-skull"]),
@@ -23,7 +22,6 @@ SCENES = [
     ("bonsai", "bonsai.nrrd", ["--up=y", "--tf", "peer-opaque"]),
     ("sample", None, ["--tf", "auto"]),
 ]
-BEGIN, END = "<!-- tables -->", "<!-- end of tables -->"
 
 
 def number(x):
@@ -53,7 +51,7 @@ def main():
     p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     p.add_argument("--data", required=True, help="folder with the volumes")
     p.add_argument("--keep", required=True, help="folder for results")
-    p.add_argument("--binary", default=str(HERE.parent / "target/release/slabcast"))
+    p.add_argument("--binary", default=str(ROOT / "target/release/slabcast"))
     p.add_argument("--kept", action="store_true", help="measure nothing: tables of what is kept")
     p.add_argument("--steps", default="8", help="in which the sheets move by one sheet")
     p.add_argument("--times", action="store_true", help="one thread, with times; quiet machines only")
@@ -64,7 +62,7 @@ def main():
     out = [f"Paths of {a.steps} steps a sheet, {timed} (`--steps {a.steps}`).", ""]
     for eps in ["1/512", "0"]:
         for name, file, flags in SCENES:
-            volume = pathlib.Path(a.data) / file if file else HERE.parent / "samples/mni152_t1.nii.gz"
+            volume = pathlib.Path(a.data) / file if file else ROOT / "samples/mni152_t1.nii.gz"
             timed = a.times and eps != "0"
             result = keep / f"{name}-{eps.replace('/', '_')}{'-times' if timed else ''}.jsonl"
             if a.kept and not result.exists():
@@ -76,10 +74,7 @@ def main():
                                       check=True, stdout=subprocess.PIPE, text=True)
                 result.write_text(done.stdout)
             out += table(name, eps, [json.loads(x) for x in result.read_text().splitlines()])
-    page = HERE / "colour-rule.md"
-    text = page.read_text()
-    head, rest = text.split(BEGIN)
-    page.write_text(head + BEGIN + "\n\n" + "\n".join(out) + "\n" + END + rest.split(END)[1])
+    print("\n".join(out))
 
 
 if __name__ == "__main__":

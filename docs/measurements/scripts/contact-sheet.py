@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-r"""Puts PNGs side by side into one: docs/contact-sheet.py OUT.png COLUMNS IN.png...
+r"""Puts PNGs side by side into one: docs/measurements/scripts/contact-sheet.py OUT.png COLUMNS IN.png...
 
 8 bits, RGB or RGBA over black, all of one size. Python's standard library is all it needs.
-docs/first-light.png was made by
+docs/pictures/first-light.png was made by
 
     slabcast render samples/mni152_t1.nii.gz --tf brain --size 290x240 --height 205 \
         --elevation 8 --frames 8 --start 20 --step 45 -o /tmp/f
-    python3 docs/contact-sheet.py docs/first-light.png 4 /tmp/f/frame_*.png
+    python3 docs/measurements/scripts/contact-sheet.py docs/pictures/first-light.png 4 /tmp/f/frame_*.png
 """
 
 import struct

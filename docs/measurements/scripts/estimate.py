@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Holds what a frame's statistics say of errors against the reference.
 
-    python3 docs/estimate.py --slabcast target/release/slabcast --data ../shared/data [--scene mri256]
+    python3 docs/measurements/scripts/estimate.py --slabcast target/release/slabcast --data ../shared/data [--scene mri256]
 
 Each volume is drawn in two views under two looks with --stats; the same views are judged by
 `slabcast error`. A row has, for each source, what the statistics estimate (RMSE in 1/255), what the

@@ -1,4 +1,4 @@
-"""What a master pays for workers that have nothing to do: `python3 docs/idle-workers.py SLABCAST [N]`.
+"""What a master pays for workers that have nothing to do: `python3 docs/measurements/scripts/idle-workers.py SLABCAST [N]`.
 
 Starts a master that rehearses and N (256) idle workers as processes of this machine, waits until all
 have come, and prints, over 20 seconds, the master's processor time, its memory, and how many workers

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """How many instructions a frame takes on 64-bit ARM, by what they are for, counted where no ARM is at hand.
 
-    python3 docs/instructions.py --slabcast target/aarch64-unknown-linux-gnu/release/slabcast -- VOLUME [flags of bench]
+    python3 docs/measurements/scripts/instructions.py --slabcast target/aarch64-unknown-linux-gnu/release/slabcast -- VOLUME [flags of bench]
 
 Runs `slabcast bench` on one thread in qemu's emulator of one program (7.2, whose plugins it was written for), which notes
 how often each piece of code ran, asks llvm-symbolizer which functions and files each instruction came from, those

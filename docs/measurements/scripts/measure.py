@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Runs the paper's protocol with real processes and prints the tables of docs/measurements.md.
+"""Runs the paper's protocol with real processes and prints the tables of docs/measurements/paper-protocol.md.
 
-    python3 docs/measure.py --data DIR [--binary PATH] [--only mri256] [--keep DIR]
+    python3 docs/measurements/scripts/measure.py --data DIR [--binary PATH] [--only mri256] [--keep DIR]
 
 For each volume: a master, then 1 and 2 workers of one thread each, then `slabcast render
 --master` with 18 frames of 512x512. Times come from --stats (the master's clock, picture

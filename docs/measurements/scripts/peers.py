@@ -2,7 +2,7 @@
 """Runs slabcast and other renderers in turn, on the same scenes, and prints their ratios.
 
     cargo build --release --locked
-    python3 docs/peers.py --peers DIR --data DIR --venv DIR [--only ROW] [--rounds N] [--write]
+    python3 docs/measurements/scripts/peers.py --peers DIR --data DIR --venv DIR [--only ROW] [--rounds N]
 
 --peers has the scripts that drive the others (vtk_peer.py, volpack_peer.py, pv_peer.py, common.py),
 --data the volumes, --venv a Python with vtk, numpy, pynrrd and pillow; VolPack needs libvolpack1-dev
@@ -14,7 +14,8 @@ In a round every contender runs once, slabcast and peers in turn, and rounds alt
 direction: a machine that drifts hits both. A time is camera set to picture in memory, the first
 view left out. Rows are kept in --keep as soon as they are measured. A row that is there, from the
 same binary and as many rounds and frames, is not measured again unless --only names it, so an
-interrupted run goes on. --write puts the tables into docs/performance.md, between two markers.
+interrupted run goes on. The tables go to stdout and to --keep/peers.md; docs/measurements/performance.md
+quotes the rows that its conclusions rest on.
 """
 
 import argparse
@@ -30,7 +31,6 @@ import time
 import peers_run
 import peers_tables
 
-BEGIN, END = "<!-- peers -->", "<!-- end of peers -->"
 
 Contender = collections.namedtuple("Contender", "name kind flags")
 
@@ -161,17 +161,9 @@ def save(path, text):
     part.replace(path)
 
 
-def write_into(page, text):
-    old = page.read_text()
-    if old.count(BEGIN) != 1 or old.count(END) != 1:
-        sys.exit(f"{page}: wants one line `{BEGIN}` and, below it, one `{END}`")
-    head, rest = old.split(BEGIN)
-    save(page, head + BEGIN + "\n\n" + text.rstrip() + "\n\n" + END + rest.split(END)[1])
-
-
 def main():
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    root = peers_run.HERE.parent
+    root = peers_run.HERE.parents[2]
     p.add_argument("--peers", default=root / "../shared/peers", help="scripts that drive the peers")
     p.add_argument("--data", default=root / "../shared/data", help="mri256.nrrd, aneurism.nrrd")
     p.add_argument("--slabcast", default=pathlib.Path(
@@ -186,7 +178,6 @@ def main():
                    help="folder for results, pictures and resampled volumes")
     p.add_argument("--no-pictures", action="store_true", help="times alone")
     p.add_argument("--tables", action="store_true", help="measure nothing; tables of what is kept")
-    p.add_argument("--write", action="store_true", help="put the tables into docs/performance.md")
     o = p.parse_args()
     if o.rounds < 1 or o.frames < 2:
         p.error("--rounds wants 1 or more, --frames 2 or more")
@@ -216,8 +207,6 @@ def main():
     print(text)
     print(f"{sum(r['took_s'] for r in results.values()) / 60:.0f} minutes in all; JSON, pictures and "
           f"this text in {bench.keep}", file=sys.stderr)
-    if o.write:
-        write_into(peers_run.HERE / "performance.md", text)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""What docs/peers.py needs numpy and Pillow for; it runs this with the python of --venv.
+"""What docs/measurements/scripts/peers.py needs numpy and Pillow for; it runs this with the python of --venv.
 
     presets PEERS               the peers' transfer functions and material, as JSON
     resample PEERS IN OUT N     a cube of N samples an edge as NRRD: means, or linear between samples

@@ -1,4 +1,4 @@
-"""How docs/peers.py runs each renderer, and what it takes for a time and for an error.
+"""How docs/measurements/scripts/peers.py runs each renderer, and what it takes for a time and for an error.
 
 A contender is run by its kind: `slabcast` (slabcast bench, in one process), `cluster` (slabcast
 master and workers as processes), `vtk`, `volpack`, `paraview`. Whatever can't run raises Missing

@@ -1,4 +1,4 @@
-"""The tables of docs/peers.py, from what its rows gave.
+"""The tables of docs/measurements/scripts/peers.py, from what its rows gave.
 
 A row's result has, for each renderer (`got`), milliseconds of every view of every round; what the
 renderer said of its first run (`said`); or why it is missing. Everything here is arithmetic on

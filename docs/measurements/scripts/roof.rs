@@ -5,7 +5,7 @@
 //! ```
 //!
 //! What is done to a register is what a voxel does to a pixel's 16-bit sums (a load, a product, a sum that saturates,
-//! a store), in registers as wide as the machine has, one after the other. `docs/roofline.py` compiles and runs it
+//! a store), in registers as wide as the machine has, one after the other. `docs/measurements/scripts/roofline.py` compiles and runs it
 //! and compares with what a frame reaches. Prints JSON: bytes read and written a second, in GB, by size.
 
 use std::hint::black_box;

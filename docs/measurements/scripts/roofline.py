@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
 """Where a frame's time goes, in nanoseconds and cycles a unit of work, and how near adding is to the roof.
 
-    python3 docs/roofline.py --slabcast target/release/slabcast -- VOLUME --tf NAME [flags of bench]
+    python3 docs/measurements/scripts/roofline.py --slabcast target/release/slabcast -- VOLUME --tf NAME [flags of bench]
 
 Runs `slabcast bench` on one thread under `perf record` (by the clock: virtual machines count no cycles), asks
 llvm-addr2line which functions each sample was in, those inlined included, and adds them up by stage. Units
 are bench's own counts. Cycles are those of the frequency that --ghz says or /proc/cpuinfo names.
 
-Then docs/roof.rs is compiled by rustc and says how many bytes a second this machine reads, adds to and writes
+Then docs/measurements/scripts/roof.rs is compiled by rustc and says how many bytes a second this machine reads, adds to and writes
 back: in as much memory as a part's sums take, and in 16 KiB. That is the roof over adding, whatever the clock.
 """
 

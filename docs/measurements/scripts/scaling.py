@@ -1,4 +1,4 @@
-"""Tables of docs/scaling.md: `python3 docs/scaling.py SLABCAST DATA [--frames N] [--large] [--rehearse LIST] [--hidden]`.
+"""Tables of docs/measurements/scaling.md: `python3 docs/measurements/scripts/scaling.py SLABCAST DATA [--frames N] [--large] [--rehearse LIST] [--hidden]`.
 
 For the three scenes of the paper's kind, or the two large ones, `slabcast plan` measures tiles once and
 predicts both schedules at 1 and 10 Gbit/s and without limit; with --rehearse, processes on this machine

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """What 16-bit sums round away, and where `--sums auto` takes them.
 
-    python3 docs/sums.py --slabcast target/release/slabcast VOLUME[=FLAGS] ...
+    python3 docs/measurements/scripts/sums.py --slabcast target/release/slabcast VOLUME[=FLAGS] ...
 
 Draws each volume with each transfer function in 16-bit sums, lets `slabcast error` say how far whole numbers
 put the picture off (RMSE and maximum in 1/255), and asks `slabcast bench` which sums `auto` takes. Prints a

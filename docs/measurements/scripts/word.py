@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Does slabcast keep its word? Asks for errors and times on real volumes and checks what comes.
 
-    python3 docs/word.py --slabcast target/release/slabcast --data ../shared/data [--only error|budget]
+    python3 docs/measurements/scripts/word.py --slabcast target/release/slabcast --data ../shared/data [--only error|budget]
 
 Each scene is asked for with --error, --error-max and --budget, measured once (into a folder of its
 own), and then judged in views and at pixels that the choice did not see: `slabcast bench` at two

@@ -595,7 +595,7 @@ impl Driver {
         // Workers give a master up after three of these, as it does them after its own silence.
         let heartbeat_ms = (self.silence / 3000).min(u32::MAX.into()) as u32;
         // A rehearsing one stands for another machine's.
-        let is_here = caller.is_on(&hello.machine, &self.machine) && !hello.rehearses;
+        let is_local = caller.is_on(&hello.machine, &self.machine) && !hello.rehearses;
         let _ = link.control.send(ToWorker::Welcome { worker, heartbeat_ms });
         let now = Instant::now();
         let attached = Attached {
@@ -615,7 +615,7 @@ impl Driver {
                 worker,
                 name,
                 threads: hello.threads,
-                is_here,
+                is_local,
                 memory_budget_bytes: hello.memory_budget_bytes,
                 held: hello.held,
             },

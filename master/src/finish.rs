@@ -244,7 +244,7 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
         format: finish.format,
         bytes: bytes.into(),
         stats_json: serde_json::to_string(&stats).unwrap_or_default(),
-        trace_json: s.request.want_trace.then(|| chrome_trace(&s.spans.told(), s.job, s.frame)),
+        trace_json: s.request.want_trace.then(|| chrome_trace(&s.spans.to_vec(), s.job, s.frame)),
         stats,
     }
 }

@@ -49,7 +49,7 @@ pub struct Caller {
     /// Its address; empty for one of this process.
     pub address: String,
     /// Whether that is an address of this machine, or it is of this process.
-    pub is_here: bool,
+    pub is_local: bool,
 }
 
 impl Caller {
@@ -57,7 +57,7 @@ impl Caller {
     /// know, whoever has the address that it calls is on the machine that is called. An address alone is
     /// another for each container, and the same at the end of a tunnel.
     pub(crate) fn is_on(&self, machine: &str, own: &str) -> bool {
-        if machine.is_empty() || own.is_empty() { self.is_here } else { machine == own }
+        if machine.is_empty() || own.is_empty() { self.is_local } else { machine == own }
     }
 }
 
@@ -111,7 +111,7 @@ pub fn embedded(handle: crate::Handle) -> EmbeddedEnd {
     tokio::spawn(async move {
         let Some(ToMaster::Hello(hello)) = reply_rx.recv().await else { return };
         let link = WorkerLink { control: control_tx, bricks: order_tx };
-        let caller = Caller { address: String::new(), is_here: true };
+        let caller = Caller { address: String::new(), is_local: true };
         serve_link(handle, hello, caller, link, &mut reply_rx).await;
     });
     EmbeddedEnd { control: control_rx, replies: reply_tx, bricks: batch_rx }
@@ -149,8 +149,8 @@ mod tests {
 
     #[test]
     fn who_is_on_the_masters_machine_is_told_by_its_name_or_else_by_its_address() {
-        let caller = |is_here| Caller { address: "10.0.0.1:5".into(), is_here };
-        for (is_here, machine, own, want) in [
+        let caller = |is_local| Caller { address: "10.0.0.1:5".into(), is_local };
+        for (is_local, machine, own, want) in [
             (true, "a", "a", true),
             // A container, which has an address of its own.
             (false, "a", "a", true),
@@ -162,7 +162,7 @@ mod tests {
             (true, "a", "", true),
             (false, "a", "", false),
         ] {
-            assert_eq!(caller(is_here).is_on(machine, own), want, "{machine:?} on {own:?}");
+            assert_eq!(caller(is_local).is_on(machine, own), want, "{machine:?} on {own:?}");
         }
     }
 }

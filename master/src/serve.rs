@@ -241,7 +241,7 @@ impl v1::cluster_server::Cluster for ClusterService {
         let caller = Caller {
             address: from.map(|a| a.to_string()).unwrap_or_default(),
             // Whoever has the address that it calls is the machine that is called.
-            is_here: from.zip(to).is_some_and(|(from, to)| from.ip() == to.ip()),
+            is_local: from.zip(to).is_some_and(|(from, to)| from.ip() == to.ip()),
         };
         let inbound = request.into_inner();
         // Unbounded for the same reason as `WorkerLink::control`, which it carries on.

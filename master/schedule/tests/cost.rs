@@ -63,7 +63,7 @@ fn cost(n: u32, edge: u32, height: f64, workers: u64, work: Work) -> f64 {
             worker: WorkerId(id),
             name: format!("w{id}"),
             threads: 4,
-            is_here: false,
+            is_local: false,
             memory_budget_bytes: u64::MAX,
             held: Vec::new(),
         };

@@ -16,7 +16,7 @@ use slabcast_common::trace::{
 use slabcast_common::view::{Camera, CameraProjection, Projected, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Toll, Unknown, Unmeasured};
-use slabcast_schedule::{FrameJob, Span, Spans, macrotile, slabs as slabs_of};
+use slabcast_schedule::{FrameJob, Span, Spans, macrotile, slab_ranges};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
@@ -79,7 +79,7 @@ fn frame(job: &FrameJob, quality: &Quality) -> FrameTrace {
     let projected: Vec<_> = job.bricks.iter().map(|b| job.view.project(&b.tight)).collect();
     let mut shut = ShutMap::open(Rect::of_size(SIZE));
     let mut slabs = Vec::new();
-    for (n, range) in slabs_of(&job.view, &projected, &|i| job.bricks[i].voxels, &job.work)
+    for (n, range) in slab_ranges(&job.view, &projected, &|i| job.bricks[i].voxels, &job.work)
         .into_iter()
         .enumerate()
     {
@@ -572,7 +572,7 @@ impl sim::Stopwatch for Listener {
     }
 
     fn done(&mut self, stats: FrameStats, spans: Spans) {
-        self.0.push((stats, spans.told()));
+        self.0.push((stats, spans.to_vec()));
     }
 }
 

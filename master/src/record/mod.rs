@@ -455,12 +455,12 @@ fn from_hex(text: &str) -> Option<Vec<u8>> {
 fn noted(event: &Event, shut: impl Fn(&TileResult, f32) -> bool) -> Option<Noted> {
     let set = |key: &slabcast_common::brick::BrickSetKey| key.0.to_string();
     Some(match event {
-        Event::WorkerJoined { worker, name, threads, is_here, memory_budget_bytes, held } => {
+        Event::WorkerJoined { worker, name, threads, is_local, memory_budget_bytes, held } => {
             Noted::Joined(NotedWorker {
                 w: worker.0,
                 name: name.clone(),
                 threads: *threads,
-                here: *is_here,
+                here: *is_local,
                 memory: *memory_budget_bytes,
                 held: held
                     .iter()

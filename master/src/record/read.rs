@@ -343,8 +343,8 @@ fn event(e: Noted, seen: &mut Seen) -> Result<Event, String> {
                 .map(|(set, bricks)| Ok((key(&set)?, ids(bricks))))
                 .collect::<Result<_, String>>()?;
             let worker = WorkerId(w);
-            let (is_here, memory_budget_bytes) = (here, memory);
-            Event::WorkerJoined { worker, name, threads, is_here, memory_budget_bytes, held }
+            let (is_local, memory_budget_bytes) = (here, memory);
+            Event::WorkerJoined { worker, name, threads, is_local, memory_budget_bytes, held }
         }
         Noted::Heard { w } => Event::WorkerHeard { worker: WorkerId(w) },
         Noted::Lost { w, reason } => Event::WorkerLost { worker: WorkerId(w), reason },

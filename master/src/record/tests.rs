@@ -134,12 +134,12 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
                 let (name, threads) = (format!("n{next}"), 1 + rng.below(3) as u32);
                 let held = vec![(BrickSetKey(Digest32([9; 32])), vec![BrickId(1), BrickId(7)])];
                 let budget = if rng.below(3) == 0 { 20_000 } else { u64::MAX };
-                let (is_here, memory_budget_bytes) = (rng.below(2) == 0, budget);
+                let (is_local, memory_budget_bytes) = (rng.below(2) == 0, budget);
                 Some(Event::WorkerJoined {
                     worker,
                     name,
                     threads,
-                    is_here,
+                    is_local,
                     memory_budget_bytes,
                     held,
                 })

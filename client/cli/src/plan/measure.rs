@@ -210,7 +210,7 @@ impl Bench {
         let mut slabs = Vec::new();
         let voxels = |i: usize| job.bricks[i].voxels;
         let cuts = if path.slab {
-            slabcast_schedule::slabs(&job.view, &projected, &voxels, &path.work)
+            slabcast_schedule::slab_ranges(&job.view, &projected, &voxels, &path.work)
         } else {
             Vec::new()
         };

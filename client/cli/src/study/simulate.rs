@@ -59,7 +59,7 @@ impl Stopwatch for Listener {
     }
 
     fn done(&mut self, stats: FrameStats, spans: Spans) {
-        self.0.push((stats, spans.told()));
+        self.0.push((stats, spans.to_vec()));
     }
 }
 

@@ -361,7 +361,7 @@ pub fn run(
             worker: WorkerId(id),
             name: format!("w{id}"),
             threads: cluster.threads,
-            is_here: false,
+            is_local: false,
             memory_budget_bytes: u64::MAX,
             held: Vec::new(),
         });

@@ -25,7 +25,7 @@ fn nature(rng: &mut Rng, small_budgets: bool) -> Nature {
     let slowest = rng.pick(&[200, 2_000, 30_000]);
     Nature {
         threads: rng.pick(&[1, 1, 2, 2, 3, 4, 8]),
-        is_here: rng.once_in(3),
+        is_local: rng.once_in(3),
         us_per_pixel_sheet: rng.pick(&[0.05, 0.3, 1.0, 3.0]),
         budget: if small_budgets { rng.pick(&[1, 3_000, 9_000, 30_000, 60_000]) } else { u64::MAX },
         latency: (50, slowest),

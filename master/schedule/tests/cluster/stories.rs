@@ -776,7 +776,7 @@ fn statistics_of_a_frame_worked_out_by_hand() {
         worker,
         name,
         threads: 1,
-        is_here: false,
+        is_local: false,
         memory_budget_bytes: u64::MAX,
         held,
     };

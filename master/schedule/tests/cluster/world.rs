@@ -36,7 +36,7 @@ impl Clock for VirtualClock {
 #[derive(Clone, Debug)]
 pub(crate) struct Nature {
     pub(crate) threads: u32,
-    pub(crate) is_here: bool,
+    pub(crate) is_local: bool,
     /// Microseconds a pixel-sheet.
     pub(crate) us_per_pixel_sheet: f64,
     pub(crate) budget: u64,
@@ -61,7 +61,7 @@ impl Default for Nature {
     fn default() -> Self {
         Nature {
             threads: 1,
-            is_here: false,
+            is_local: false,
             us_per_pixel_sheet: 0.5,
             budget: u64::MAX,
             latency: (100, 100),
@@ -298,7 +298,7 @@ impl World {
             worker: id,
             name: format!("host-{}", id.0),
             threads: nature.threads,
-            is_here: nature.is_here,
+            is_local: nature.is_local,
             memory_budget_bytes: nature.budget,
             held,
         });
@@ -394,7 +394,7 @@ impl World {
                         assert!(w.scenes.insert(scene.id), "seed {seed}: scene twice to {id}");
                     }
                     ToWorker::Frame { frame, scene, finish, plain, .. } => {
-                        assert!(*plain || !w.nature.is_here, "seed {seed}: nothing to pack for");
+                        assert!(*plain || !w.nature.is_local, "seed {seed}: nothing to pack for");
                         let job = &self.jobs[frame].job;
                         let regions = job.work.schedule != Schedule::Slab;
                         assert_eq!(*finish, job.finish.filter(|_| regions), "seed {seed}");
@@ -533,7 +533,7 @@ impl World {
                 let (at, stats) = (self.now(), *stats);
                 let before = self
                     .done
-                    .insert(frame, Done { picture, bytes, stats, spans: spans.told(), at });
+                    .insert(frame, Done { picture, bytes, stats, spans: spans.to_vec(), at });
                 assert!(before.is_none(), "seed {seed}: {frame} done twice");
                 let first = *self.jobs.keys().find(|f| !self.is_over(**f)).unwrap_or(&frame);
                 assert!(first >= frame, "seed {seed}: {frame} before {first}");

@@ -60,7 +60,7 @@ impl Spans {
     }
 
     /// All of it, with its texts.
-    pub fn told(&self) -> Vec<Span> {
+    pub fn to_vec(&self) -> Vec<Span> {
         self.0.iter().map(Noted::told).collect()
     }
 }
@@ -122,7 +122,7 @@ mod tests {
             args: Vec::new(),
         };
         spans.push(frame.clone());
-        let told = spans.told();
+        let told = spans.to_vec();
         let names: Vec<_> = told.iter().map(|s| (&*s.name, s.category, s.end)).collect();
         assert_eq!(
             names,

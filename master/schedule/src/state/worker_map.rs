@@ -2,25 +2,25 @@
 //!
 //! The scheduler asks ten times for each message who a worker is and what it has. Ids are given out one after the other, so a
 //! worker mostly stands where its id says, and is found by one look there; if some before it are gone, by halving. With 64 workers
-//! a quarter of all that the scheduler does was looking up workers and tiles ([`tiled`](crate::tiled)) in trees (docs/scaling.md).
+//! a quarter of all that the scheduler does was looking up workers and tiles ([`tiled`](crate::state::tile_map)) in trees (docs/scaling.md).
 
 use slabcast_common::ids::WorkerId;
 
 /// A map from workers that is gone through in the order of their ids.
 #[derive(Clone, Debug)]
-pub(crate) struct Crowd<T> {
+pub(crate) struct WorkerMap<T> {
     ids: Vec<WorkerId>,
     /// Each one's, at its place.
     values: Vec<T>,
 }
 
-impl<T> Default for Crowd<T> {
+impl<T> Default for WorkerMap<T> {
     fn default() -> Self {
-        Crowd { ids: Vec::new(), values: Vec::new() }
+        WorkerMap { ids: Vec::new(), values: Vec::new() }
     }
 }
 
-impl<T> Crowd<T> {
+impl<T> WorkerMap<T> {
     /// Where a worker is, or would be.
     fn place(&self, id: WorkerId) -> Result<usize, usize> {
         let Some(first) = self.ids.first() else { return Err(0) };
@@ -108,7 +108,7 @@ impl<T> Crowd<T> {
     }
 }
 
-impl<T> std::ops::Index<WorkerId> for Crowd<T> {
+impl<T> std::ops::Index<WorkerId> for WorkerMap<T> {
     type Output = T;
 
     fn index(&self, id: WorkerId) -> &T {
@@ -116,7 +116,7 @@ impl<T> std::ops::Index<WorkerId> for Crowd<T> {
     }
 }
 
-impl<T> IntoIterator for Crowd<T> {
+impl<T> IntoIterator for WorkerMap<T> {
     type Item = (WorkerId, T);
     type IntoIter = std::iter::Zip<std::vec::IntoIter<WorkerId>, std::vec::IntoIter<T>>;
 
@@ -125,9 +125,9 @@ impl<T> IntoIterator for Crowd<T> {
     }
 }
 
-impl<T> FromIterator<(WorkerId, T)> for Crowd<T> {
+impl<T> FromIterator<(WorkerId, T)> for WorkerMap<T> {
     fn from_iter<I: IntoIterator<Item = (WorkerId, T)>>(all: I) -> Self {
-        let mut crowd = Crowd::default();
+        let mut crowd = WorkerMap::default();
         for (id, value) in all {
             crowd.insert(id, value);
         }
@@ -148,7 +148,7 @@ mod tests {
             base in prop::sample::select(vec![0u64, 1, 1000, u64::MAX - 40]),
             deeds in prop::collection::vec((0u64..40, 0u8..4, any::<u16>()), 0..200),
         ) {
-            let (mut crowd, mut tree) = (Crowd::default(), BTreeMap::new());
+            let (mut crowd, mut tree) = (WorkerMap::default(), BTreeMap::new());
             for (id, deed, value) in deeds {
                 let id = WorkerId(base + id);
                 match deed {

@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 
 /// How long tasks take, by the last ones of the frame.
 #[derive(Debug, Default)]
-pub(super) struct Pace {
+pub(crate) struct Pace {
     /// Render time for a workload of 2^20, and time beside it, of each.
     last: VecDeque<Measured>,
     /// Their medians, once somebody has asked.
@@ -22,7 +22,7 @@ impl Pace {
     /// A task is never late before: the scheduling of two busy machines.
     const FLOOR: Micros = 5_000;
 
-    pub(super) fn note(&mut self, est: u64, render_us: Micros, lasted: Micros) {
+    pub(crate) fn note(&mut self, est: u64, render_us: Micros, lasted: Micros) {
         let render = (u128::from(render_us) << 20) / u128::from(est.max(1));
         let beside = u128::from(lasted.saturating_sub(render_us));
         self.last.push_back(Measured { render, beside });
@@ -34,7 +34,7 @@ impl Pace {
 
     /// What these tasks say about the next: medians of render time for a workload of 2^20, and
     /// of the time beside it.
-    pub(super) fn measure(&self) -> Option<Measured> {
+    pub(crate) fn measure(&self) -> Option<Measured> {
         if self.last.len() < Self::LEAST {
             return None;
         }
@@ -53,19 +53,19 @@ impl Pace {
 
 /// How long a task takes.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Measured {
+pub(crate) struct Measured {
     render: u128,
     beside: u128,
 }
 
 impl Measured {
     /// How long one of this workload is drawn.
-    pub(super) fn expects(&self, est: u64) -> Micros {
+    pub(crate) fn expects(&self, est: u64) -> Micros {
         ((self.render * u128::from(est.max(1))) >> 20).min(u128::from(Micros::MAX)) as Micros
     }
 
     /// After what time a task of this workload has outlived its estimate.
-    pub(super) fn patience(&self, est: u64) -> Micros {
+    pub(crate) fn patience(&self, est: u64) -> Micros {
         let expected = u128::from(self.expects(est)) + self.beside;
         Pace::FLOOR.saturating_add((2 * expected).min(u128::from(Micros::MAX)) as Micros)
     }

@@ -21,9 +21,13 @@
 //!
 //! Statistics and what is learnt for the next frame are of the whole tile ([`Family`]).
 
-use super::{End, Frame, Measured, Micros, Regions, Slab, Verdict, check};
-use crate::Cluster;
-use crate::macrotile::Macrotile;
+use crate::Micros;
+use crate::dispatch::pace::Measured;
+use crate::policy::macrotile::Macrotile;
+use crate::policy::region::Regions;
+use crate::state::cluster::Cluster;
+use crate::state::frame::{Frame, Slab, check};
+use crate::state::leases::{End, Verdict};
 use slabcast_common::ids::{Epoch, WorkerId};
 use slabcast_common::leaves::LEAF;
 use slabcast_common::message::{HandedOver, ToWorker};
@@ -57,14 +61,14 @@ const PATIENCE: Micros = 5_000;
 type Leased = (u32, WorkerId, Epoch);
 
 /// Leases that are to be asked for so many thousandths of what is left.
-pub(super) type Questions = Vec<(Leased, u32)>;
+pub(crate) type Questions = Vec<(Leased, u32)>;
 
 /// A tile of which pieces were given away, with all of them.
 #[derive(Debug)]
-pub(super) struct Family {
+pub(crate) struct Family {
     /// As it was cut first, and whose it was then.
-    pub(super) tile: Rect,
-    pub(super) owner: WorkerId,
+    pub(crate) tile: Rect,
+    pub(crate) owner: WorkerId,
     /// Of its tasks so many have no result.
     open: u32,
     /// What they took in all, and what they were drawn from.
@@ -73,7 +77,7 @@ pub(super) struct Family {
 }
 
 /// What a result says of a tile.
-pub(super) enum Drawn {
+pub(crate) enum Drawn {
     /// Nothing of it was given away.
     Itself,
     /// Others have pieces of it.
@@ -109,7 +113,7 @@ fn away(cluster: &Cluster) -> f64 {
 
 impl Frame {
     /// Of which regions, those that take longest yet, pieces are asked for: one for each thread that has nothing to do soon.
-    pub(super) fn find_pieces(&mut self, cluster: &Cluster, now: Micros) -> Questions {
+    pub(crate) fn find_pieces(&mut self, cluster: &Cluster, now: Micros) -> Questions {
         self.pieces_at = None;
         let Some(slab) = self.slab.as_ref().filter(|_| self.alone) else { return Vec::new() };
         if slab.queue.waiting() > 0 || cluster.traffic.binds_alone() {
@@ -154,7 +158,7 @@ impl Frame {
     }
 
     /// Asks for them; their leases are sent.
-    pub(super) fn ask_for_pieces(&self, cluster: &mut Cluster, questions: Questions) {
+    pub(crate) fn ask_for_pieces(&self, cluster: &mut Cluster, questions: Questions) {
         let Some(slab) = &self.slab else { return };
         for ((place, id, epoch), share) in questions {
             let (frame, task) = (self.job.frame, slab.queue.id(place));
@@ -315,12 +319,12 @@ impl Frame {
 
 impl Slab {
     /// Until when it is waited for a piece of a task to be given away.
-    pub(super) fn waits_for_piece(&self, place: u32) -> Micros {
+    pub(crate) fn waits_for_piece(&self, place: u32) -> Micros {
         self.handing.get(&place).map_or(0, |(_, asked)| asked.saturating_add(PATIENCE))
     }
 
     /// The same of each piece that is waited for now.
-    pub(super) fn waits_for_pieces(&self, now: Micros) -> Vec<Micros> {
+    pub(crate) fn waits_for_pieces(&self, now: Micros) -> Vec<Micros> {
         let until = self.handing.keys().map(|place| self.waits_for_piece(*place));
         until.filter(|until| *until > now).collect()
     }
@@ -333,7 +337,7 @@ impl Slab {
 
     /// Tiles of which pieces were given away and that were drawn: as they were cut first, with what was expected of them then,
     /// and what their pieces took.
-    pub(super) fn whole_tiles(&self) -> BTreeMap<u32, (Rect, u64, Micros)> {
+    pub(crate) fn whole_tiles(&self) -> BTreeMap<u32, (Rect, u64, Micros)> {
         let mut whole = BTreeMap::new();
         for (at, root) in self.roots.iter().filter(|(at, _)| self.is_told_elsewhere(**at)) {
             let (task, piece) =
@@ -349,13 +353,13 @@ impl Slab {
     }
 
     /// Whether a task is a piece that is told as its tile's: both were drawn.
-    pub(super) fn is_told_elsewhere(&self, place: u32) -> bool {
+    pub(crate) fn is_told_elsewhere(&self, place: u32) -> bool {
         let done = |at: u32| matches!(self.queue.tasks[at as usize].end, End::Done { .. });
         self.roots.get(&place).is_some_and(|root| done(*root) && done(place))
     }
 
     /// A task was drawn, in so long and from these bricks: what that says of the tile that it is, or is a piece of.
-    pub(super) fn drawn(&mut self, place: u32, us: Micros, touched: &[u32]) -> Drawn {
+    pub(crate) fn drawn(&mut self, place: u32, us: Micros, touched: &[u32]) -> Drawn {
         let root = self.roots.get(&place).copied().unwrap_or(place);
         let Some(family) = self.families.get_mut(&root) else { return Drawn::Itself };
         family.open -= 1;
@@ -377,7 +381,7 @@ impl Slab {
 
 impl Family {
     /// What its tasks took in all, and what they were drawn from.
-    pub(super) fn cost(&self) -> (Micros, &[u32]) {
+    pub(crate) fn cost(&self) -> (Micros, &[u32]) {
         (self.us, &self.touched)
     }
 }

@@ -20,18 +20,18 @@
 //! many threads, and the link bears it (`traffic`), each is one [`Crew`]'s.
 //!
 //! **Alone.** A frame that no other is in the making beside and none waits behind is there when its last tile is. Its tiles are
-//! dealt out so that all are done at once, and some are cut for that ([`alone`]), before it and as they are lent
+//! dealt out so that all are done at once, and some are cut for that ([`makespan`]), before it and as they are lent
 //! (`frame::late`); where bricks take most of such frames' time (`traffic`) none are, since who draws what was cut otherwise
 //! before lacks bricks. So what is known is of tiles of 64 pixels in one frame and of parts of 32 in the next, and each tells
 //! of the other ([`Memory::recall`]).
 //!
 //! It refuses to know what time it is and which copy of a result counts.
 
-use crate::alone;
-use crate::crowd::Crowd;
-use crate::macrotile::{Cut, Macrotile, Through};
-use crate::roster::Roster;
-use crate::tiled::Tiled;
+use crate::policy::macrotile::{Cut, Macrotile, Through};
+use crate::policy::makespan;
+use crate::state::tile_map::TileMap;
+use crate::state::worker_map::WorkerMap;
+use crate::state::workers::Roster;
 use crate::{FrameJob, Micros};
 use slabcast_common::blocks::{Block, Blocks};
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
@@ -84,7 +84,7 @@ const SHARED: f64 = 0.6;
 const PLAIN: u32 = 64;
 
 /// A frame that is alone is cut into so many tiles of those that are asked for, one a thread where 2.5 are, before more
-/// are cut where that pays ([`alone`]); never into such of 16 pixels while those of 32 are as many. mri256 `peer-opaque`
+/// are cut where that pays ([`makespan`]); never into such of 16 pixels while those of 32 are as many. mri256 `peer-opaque`
 /// at 512x512 on 64 workers, which began with 480 tiles of 16, takes 2.2 ms a frame where it took 3.6.
 const BEGIN: f64 = 0.4;
 
@@ -143,11 +143,11 @@ struct Known {
 #[derive(Debug)]
 struct Lessons {
     kind: Kind,
-    tiles: Tiled<Known>,
+    tiles: TileMap<Known>,
     /// Whose each was to be in the frame that was cut last, drawn or not. Who has nothing to do takes a tile for once:
     /// next time it is drawn where its neighbours are, lest borders, and with them bricks that two workers hold, become
     /// more and more.
-    homes: Tiled<WorkerId>,
+    homes: TileMap<WorkerId>,
     /// And its tiles' edge, for so many threads; none if it was alone.
     edge: Option<(u64, u32)>,
 }
@@ -155,7 +155,7 @@ struct Lessons {
 impl Lessons {
     fn of(kind: Kind) -> Lessons {
         let size = kind.1;
-        Lessons { kind, tiles: Tiled::new(size), homes: Tiled::new(size), edge: None }
+        Lessons { kind, tiles: TileMap::new(size), homes: TileMap::new(size), edge: None }
     }
 }
 
@@ -208,7 +208,7 @@ pub(crate) struct Memory {
     /// Frames that were cut.
     frames: u64,
     /// How many times longer than others workers take, as far as tiles tell that were drawn by one and then by another.
-    slow: Crowd<f64>,
+    slow: WorkerMap<f64>,
 }
 
 impl Memory {
@@ -410,8 +410,8 @@ impl Crew {
     }
 
     /// Whether most of its threads are on the master's machine.
-    fn is_here(self, roster: &Roster) -> bool {
-        let here = |(id, n): (WorkerId, u64)| match roster.get(id).is_some_and(|w| w.is_here) {
+    fn is_local(self, roster: &Roster) -> bool {
+        let here = |(id, n): (WorkerId, u64)| match roster.get(id).is_some_and(|w| w.is_local) {
             true => n as i64,
             false => -(n as i64),
         };
@@ -540,7 +540,7 @@ pub(crate) struct Regions {
     /// Whose each tile is, by its place in the queue.
     owners: Vec<WorkerId>,
     /// Places of each worker's, ascending where nothing moved.
-    owned: Crowd<Vec<u32>>,
+    owned: WorkerMap<Vec<u32>>,
     /// What each took its last owner, if that is known.
     took: Vec<Option<(WorkerId, f64)>>,
     /// All that of all tiles together, and of the longest, when it was cut.
@@ -584,7 +584,7 @@ impl Regions {
             match alone {
                 true => edge_alone(&through, (wanted, threads)),
                 false => {
-                    let here = crew.is_here(roster);
+                    let here = crew.is_local(roster);
                     let wanted = if crew.of > 1 { CREW_ASKS * wanted } else { wanted };
                     edge_beside(&through, (wanted, threads), here, last)
                 }
@@ -611,7 +611,7 @@ impl Regions {
             true => memory.recall(kind, &t.rect),
             false => memory.known(kind, &t.rect).map(Recalled::Itself),
         };
-        let mut taught = Tiled::new(size);
+        let mut taught = TileMap::new(size);
         for t in &cut.tiles {
             if let Some(recalled) = recall(t) {
                 taught.insert(&t.rect, recalled);
@@ -643,7 +643,7 @@ impl Regions {
         let took: Vec<Option<(WorkerId, f64)>> = cut.tiles.iter().map(known).collect();
         let us = || took.iter().flatten().map(|t| t.1);
         let (all_us, longest_us) = (us().sum(), us().fold(0.0, f64::max));
-        let mut owned = Crowd::<Vec<u32>>::default();
+        let mut owned = WorkerMap::<Vec<u32>>::default();
         for (&owner, place) in owners.iter().zip(0..) {
             owned.or_default(owner).push(place);
         }
@@ -790,8 +790,8 @@ impl Regions {
     }
 
     /// How long each worker has to do with what of these tasks is its own, in microseconds.
-    pub(crate) fn left(&self, open: impl Iterator<Item = u32>, roster: &Roster) -> Crowd<f64> {
-        let mut left = Crowd::default();
+    pub(crate) fn left(&self, open: impl Iterator<Item = u32>, roster: &Roster) -> WorkerMap<f64> {
+        let mut left = WorkerMap::default();
         for place in open {
             if let Some((_, us)) = self.took[place as usize] {
                 let owner = self.owners[place as usize];
@@ -808,7 +808,7 @@ impl Regions {
         &self,
         place: u32,
         worker: WorkerId,
-        left: &Crowd<f64>,
+        left: &WorkerMap<f64>,
         memory: &Memory,
     ) -> bool {
         let Some((last, us)) = self.took[place as usize] else { return true };
@@ -835,9 +835,9 @@ impl Regions {
 }
 
 /// Parts that tiles can be cut into, with what is guessed of each.
-type Parts = Tiled<u64>;
+type Parts = TileMap<u64>;
 
-/// The tiles of a frame that is alone, some of them cut ([`alone::which`]), and all parts that there may be. `None`:
+/// The tiles of a frame that is alone, some of them cut ([`makespan::which`]), and all parts that there may be. `None`:
 /// of too few it is known what they take.
 fn mixed(
     through: &Through,
@@ -870,12 +870,12 @@ fn mixed(
         let known = memory.recall_parts_us(kind, &t.rect);
         quarters(&t.rect).into_iter().zip(known).filter_map(part).collect()
     };
-    let cut = alone::which(&us, takes, threads);
+    let cut = makespan::which(&us, takes, threads);
     Some((through.mixed(&plain, &fine, &cut), parts))
 }
 
 /// Whose each tile of a frame that is alone is: whoever drew it last, unless the frame ends earlier if another does
-/// ([`alone::balance`]).
+/// ([`makespan::balance`]).
 fn level(
     tiles: &[Macrotile],
     roster: &Roster,
@@ -896,7 +896,7 @@ fn level(
     let order: Vec<usize> = (0..tiles.len()).collect();
     let (mut owners, _) = times.deal(&held, &order);
     let price = |i: usize, w: usize| if held[i].is_none_or(|h| h == w) { 0.0 } else { prices[i] };
-    alone::balance(&mut owners, staying.len(), cost, price);
+    makespan::balance(&mut owners, staying.len(), cost, price);
     owners.into_iter().map(|w| staying[w].0).collect()
 }
 
@@ -1135,7 +1135,7 @@ mod tests {
             for (&who, id) in crew.iter().zip(1..) {
                 roster.join(WorkerId(id), format!("w{id}"), who, 0);
             }
-            Crew::ALL.is_here(&roster)
+            Crew::ALL.is_local(&roster)
         };
         assert!(here(&[(2, true)]) && here(&[(1, false), (2, true)]));
         assert!(!here(&[(1, true), (1, false)]) && !here(&[(8, false)]) && !here(&[]));
@@ -1228,7 +1228,7 @@ mod tests {
     /// What is known of a tile after frames of which each drew some tiles in so many microseconds.
     fn after(frames: &[&[(Rect, f64, &[u32])]]) -> (Memory, Kind) {
         let kind = (BrickSetKey(Digest32([0; 32])), [512, 512], Crew::ALL);
-        let mut tiles = Tiled::new(kind.1);
+        let mut tiles = TileMap::new(kind.1);
         for (frame, drawn) in (1..).zip(frames) {
             for (rect, us, touched) in *drawn {
                 let (owner, touched) = (WorkerId(frame), touched.to_vec());

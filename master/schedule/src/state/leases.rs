@@ -15,7 +15,7 @@
 //! every worker that is lost. So each loss in the slab that a tile has an alibi for asks for
 //! one witness more against it, up to twice as many.
 
-use crate::macrotile::Macrotile;
+use crate::policy::macrotile::Macrotile;
 use crate::{Config, Micros};
 use slabcast_common::ids::{Epoch, TaskId, WorkerId};
 use slabcast_common::message::Begun;

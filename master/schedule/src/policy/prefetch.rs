@@ -16,8 +16,8 @@
 //!
 //! It refuses to know what a worker has: that is `residency`'s.
 
-use crate::macrotile::Cut;
-use crate::residency::{Shelved, Shelves};
+use crate::policy::macrotile::Cut;
+use crate::state::residency::{Shelved, Shelves};
 use slabcast_common::blocks::Blocks;
 use slabcast_common::ids::WorkerId;
 use slabcast_common::occlusion::Rect;
@@ -156,8 +156,8 @@ fn lacks(shelved: Option<Shelved<'_>>, place: u32) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::macrotile::cut_through;
-    use crate::residency::Residency;
+    use crate::policy::macrotile::cut_through;
+    use crate::state::residency::Residency;
     use proptest::prelude::*;
     use slabcast_common::brick::{BRICK, BrickInfo, BrickSetKey, TightBox};
     use slabcast_common::ids::BrickId;

@@ -15,8 +15,8 @@
 //! heartbeats, which can't happen to a driver that keeps `next_deadline`, the excess is added
 //! to everybody's account.
 
-use crate::crowd::Crowd;
-use crate::reserve;
+use crate::policy::active_set;
+use crate::state::worker_map::WorkerMap;
 use crate::{Config, Micros};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, SceneId, WorkerId};
@@ -43,7 +43,7 @@ pub(crate) struct Worker {
     pub(crate) name: Arc<str>,
     pub(crate) threads: u32,
     /// It runs on the master's machine.
-    pub(crate) is_here: bool,
+    pub(crate) is_local: bool,
     pub(crate) since: Micros,
     /// It takes no more leases.
     pub(crate) leaving: bool,
@@ -106,7 +106,7 @@ impl Worker {
 /// All workers.
 #[derive(Debug, Default)]
 pub(crate) struct Roster {
-    workers: Crowd<Worker>,
+    workers: WorkerMap<Worker>,
     next_nonce: u64,
     watched: Option<Micros>,
     /// No ping is due before, and nobody silent for too long. What is heard moves that, which is found out
@@ -127,13 +127,13 @@ impl Roster {
         &mut self,
         id: WorkerId,
         name: String,
-        (threads, is_here): (u32, bool),
+        (threads, is_local): (u32, bool),
         now: Micros,
     ) {
         let worker = Worker {
             name: name.into(),
             threads: threads.clamp(1, MAX_THREADS),
-            is_here,
+            is_local,
             since: now,
             leaving: false,
             reserve: false,
@@ -191,7 +191,7 @@ impl Roster {
         let staying = self.workers.iter().filter(|(_, w)| !w.leaving);
         let mut order: Vec<_> = staying.map(|(id, w)| key(id, w)).collect();
         order.sort_unstable();
-        let drawing = reserve::drawing(order.len(), self.halved);
+        let drawing = active_set::drawing(order.len(), self.halved);
         for (i, (Reverse(threads), _, id)) in order.into_iter().enumerate() {
             let w = self.workers.get_mut(id).expect("just listed");
             let reserve = i >= drawing;

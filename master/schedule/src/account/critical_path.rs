@@ -6,10 +6,10 @@
 //! that ended it: its message, its rendering, what its thread rendered before, until the phase
 //! began. What lies between two tiles is bricks on their way, as far as the worker says that the
 //! tile lacked some, and else messages and queues. All of it is on the master's clock
-//! ([`place_in_time`](crate::ledger::place_in_time)), so the parts add up to the frame's time.
+//! ([`place_in_time`](crate::account::ledger::place_in_time)), so the parts add up to the frame's time.
 
 use crate::Micros;
-use crate::ledger::ms;
+use crate::account::ledger::ms;
 use slabcast_common::ids::WorkerId;
 
 /// A tile that counted.

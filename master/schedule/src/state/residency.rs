@@ -29,7 +29,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 use crate::Micros;
-use crate::crowd::Crowd;
+use crate::state::worker_map::WorkerMap;
 
 /// What was drawn from in so many rounds before the present one was drawn from lately, while frames overlap: one round
 /// is of parts of several. Where none do one is enough.
@@ -141,7 +141,7 @@ struct Set {
 #[derive(Debug, Default)]
 pub(crate) struct Residency {
     sets: BTreeMap<BrickSetKey, Set>,
-    shelves: Crowd<Shelf>,
+    shelves: WorkerMap<Shelf>,
     /// Number of slabs so far: the clock of "least recently needed".
     round: u64,
     /// The set that tasks are drawn from.
@@ -171,7 +171,7 @@ pub(crate) struct Shelves<'a> {
     key: BrickSetKey,
     needed: &'a [u64],
     least: u64,
-    shelves: &'a Crowd<Shelf>,
+    shelves: &'a WorkerMap<Shelf>,
 }
 
 impl<'a> Shelves<'a> {

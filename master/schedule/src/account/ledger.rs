@@ -5,11 +5,11 @@
 //! lease's going and the result's coming. So no figure is negative or longer than it can be,
 //! whatever a worker's clock does.
 
-use crate::critical::{Path, Piece};
-use crate::crowd::Crowd;
-use crate::residency::Flight;
-use crate::roster::Worker;
-use crate::spans::Flown;
+use crate::account::critical_path::{Path, Piece};
+use crate::account::spans::Flown;
+use crate::state::residency::Flight;
+use crate::state::worker_map::WorkerMap;
+use crate::state::workers::Worker;
 use crate::{Micros, Span, Spans};
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::ids::WorkerId;
@@ -54,7 +54,7 @@ pub(crate) struct Ledger {
     began: Micros,
     pub(crate) cull_us: Micros,
     pub(crate) composite_us: Micros,
-    accounts: Crowd<Account>,
+    accounts: WorkerMap<Account>,
     pub(crate) counters: Counters,
     /// How far pixels are off that were looked at.
     sampled: Sampling,
@@ -96,7 +96,7 @@ impl Ledger {
             began,
             cull_us: 0,
             composite_us: 0,
-            accounts: Crowd::default(),
+            accounts: WorkerMap::default(),
             counters: Counters::default(),
             sampled: Sampling::default(),
             result_bytes: None,

@@ -1,24 +1,24 @@
 //! Something about each of some tiles of a picture, found by where the tile lies.
 //!
-//! A tile of the quadtree ([`macrotile`](crate::macrotile)) is known by its level and its column and row there, so that looking
+//! A tile of the quadtree ([`macrotile`](crate::policy::macrotile)) is known by its level and its column and row there, so that looking
 //! one up is arithmetic. At the right and at the bottom a picture cuts tiles off; what is left may be a tile of a finer level too,
 //! and is the same tile then: it has the same pixels.
 
-use crate::macrotile::{LEAF, LEVELS};
+use crate::policy::macrotile::{LEAF, LEVELS};
 use slabcast_common::occlusion::Rect;
 
 /// A map from tiles of a picture of one size.
 #[derive(Clone, Debug)]
-pub(crate) struct Tiled<T> {
+pub(crate) struct TileMap<T> {
     size: [u32; 2],
     /// For each level, row-major: one more than the tile's place among the values, or 0. Empty while no tile of it is known.
     cells: [Vec<u32>; LEVELS],
     values: Vec<T>,
 }
 
-impl<T> Tiled<T> {
+impl<T> TileMap<T> {
     pub(crate) fn new(size: [u32; 2]) -> Self {
-        Tiled { size, cells: Default::default(), values: Vec::new() }
+        TileMap { size, cells: Default::default(), values: Vec::new() }
     }
 
     /// The finest level that a tile is one of, and its cell there.
@@ -72,7 +72,7 @@ impl<T> Tiled<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::macrotile::cut_through;
+    use crate::policy::macrotile::cut_through;
     use proptest::prelude::*;
     use std::collections::BTreeMap;
 
@@ -84,7 +84,7 @@ mod tests {
             deeds in prop::collection::vec((0usize..LEVELS, any::<prop::sample::Index>(), any::<u16>()), 1..60),
         ) {
             let size = [size.0, size.1];
-            let (mut tiled, mut tree) = (Tiled::new(size), BTreeMap::new());
+            let (mut tiled, mut tree) = (TileMap::new(size), BTreeMap::new());
             let sides = |r: &Rect| [r.x0, r.y0, r.x1, r.y1];
             let cut = |level| cut_through(size, &[Rect::of_size(size)], (1, 1), Some(LEAF << level));
             for (level, which, value) in deeds {

@@ -8,7 +8,7 @@
 //! borders a brick apart. Borders are sheet borders, so no pixel changes, and a wrong guess costs bricks
 //! and nothing else.
 
-use crate::macrotile::LEAF;
+use crate::policy::macrotile::LEAF;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Borders, Work};
 use slabcast_common::slab::SheetRange;
@@ -26,7 +26,7 @@ const MOST: usize = 96;
 
 /// The slabs of a frame whose bricks project like this, front to back, none of them empty; `voxels` has
 /// those of each brick.
-pub fn slabs(
+pub fn slab_ranges(
     view: &View,
     projected: &[Option<Projected>],
     voxels: &dyn Fn(usize) -> u16,
@@ -222,7 +222,7 @@ mod tests {
             let sheets = bricks.iter().flatten().fold(SheetRange::default(), |a, p| a.union(p.sheets));
             for borders in [Borders::Data, Borders::Equal] {
                 let work = Work { slabs, borders, ..Work::default() };
-                let cut = crate::borders::slabs(&view, &bricks, &|_| 5, &work);
+                let cut = crate::policy::slab_borders::slab_ranges(&view, &bricks, &|_| 5, &work);
                 prop_assert!(cut.len() <= slabs as usize);
                 let mut at = sheets.first;
                 for s in &cut {

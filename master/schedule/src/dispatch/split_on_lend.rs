@@ -11,11 +11,13 @@
 //! their leases where a thread is dry. mri256 `peer-semi` at 1024x1024, 9 frames on 15 and 64 workers: 88.3 and 67.3 %
 //! of n times one core's speed without, 89.5 and 69.5 with it (docs/scaling.md, Large scenes).
 
-use super::{End, Frame, Slab};
-use crate::crowd::Crowd;
-use crate::region::Part;
-use crate::roster::Roster;
-use crate::{Cluster, Micros};
+use crate::Micros;
+use crate::policy::region::Part;
+use crate::state::cluster::Cluster;
+use crate::state::frame::{Frame, Slab};
+use crate::state::leases::End;
+use crate::state::worker_map::WorkerMap;
+use crate::state::workers::Roster;
 use slabcast_common::ids::WorkerId;
 
 /// How much later than the mean a worker has to be for its last tile to be cut: this part of what the tile takes, and so
@@ -31,8 +33,8 @@ const LEAST: f64 = 500.0;
 const AWAY: f64 = 300.0;
 
 /// How long each worker that stays has to do, in microseconds.
-pub(super) struct Left {
-    each: Crowd<f64>,
+pub(crate) struct Left {
+    each: WorkerMap<f64>,
     mean: f64,
 }
 
@@ -40,7 +42,7 @@ impl Frame {
     /// Before a worker is lent a tile of its own: cuts it, if the worker would be done too late with it. Who has
     /// tiles to draw for that, the worker itself among them; nobody where the tile stays whole. `known` keeps what
     /// each has left to do while no tile is cut and no time goes by: what is lent meanwhile changes nothing of it.
-    pub(super) fn split_late(
+    pub(crate) fn split_late(
         &mut self,
         cluster: &Cluster,
         (place, id): (u32, WorkerId),
@@ -111,7 +113,7 @@ impl Frame {
         let tasks = slab.queue.tasks.iter().zip(0..);
         let open = tasks.filter(|(t, _)| t.end == End::Open).map(|(_, place)| place);
         let all = regions.left(open, roster);
-        let mut left: Crowd<f64> =
+        let mut left: WorkerMap<f64> =
             roster.staying().map(|(id, _)| (id, all.get(id).copied().unwrap_or(0.0))).collect();
         // But for what is drawn by now of what threads draw.
         for (id, lent) in self.lent.iter() {

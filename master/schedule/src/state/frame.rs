@@ -19,16 +19,18 @@
 //! A frame waits, with nothing lost, while there is no worker. It refuses to know who is silent
 //! (`roster`), which copy of a result counts (`queue`) and where bricks are (`residency`).
 
-use crate::borders;
-use crate::critical::Piece;
-use crate::crowd::Crowd;
-use crate::foresight::Outlook;
-use crate::ledger::{Ledger, Rendered, ms, place_in_time};
-use crate::macrotile::{self, Cut, LEAF, LEVELS};
-use crate::queue::{End, PARTS, Queue, Verdict};
-use crate::region::{Crew, Regions};
-use crate::residency::{Errand, Flight};
-use crate::{Action, Clock, Cluster, FrameJob, Micros, Span, spans};
+use crate::account::critical_path::Piece;
+use crate::account::ledger::{Ledger, Rendered, ms, place_in_time};
+use crate::account::spans;
+use crate::policy::macrotile::{self, Cut, LEAF, LEVELS};
+use crate::policy::prefetch::Outlook;
+use crate::policy::region::{Crew, Regions};
+use crate::policy::slab_borders;
+use crate::state::cluster::Cluster;
+use crate::state::leases::{End, PARTS, Queue, Verdict};
+use crate::state::residency::{Errand, Flight};
+use crate::state::worker_map::WorkerMap;
+use crate::{Action, Clock, FrameJob, Micros, Span};
 use slabcast_common::ids::{Epoch, TaskId, WorkerId};
 use slabcast_common::image::{FrameState, TilePixels};
 use slabcast_common::leaves::{Finish, Leaves};
@@ -40,14 +42,8 @@ use slabcast_common::stats::{BrickStats, PoisonedTile, SlabStats, TileStats};
 use slabcast_common::view::Projected;
 use std::collections::{BTreeMap, BTreeSet};
 
-mod handover;
-mod late;
-mod lend;
-mod pace;
-
-use handover::{Drawn, Family};
-pub(crate) use lend::Ahead;
-use pace::{Measured, Pace};
+use crate::dispatch::pace::Pace;
+use crate::dispatch::steal::{Drawn, Family};
 
 /// Whether a pixel with accumulated opacity `a` is shut for good.
 ///
@@ -64,49 +60,49 @@ const LAID_TOGETHER: usize = 16;
 
 /// A lease that a worker has and has not answered; perhaps dead.
 #[derive(Debug)]
-struct Lent {
-    task: TaskId,
-    epoch: Epoch,
-    sent: Micros,
+pub(crate) struct Lent {
+    pub(crate) task: TaskId,
+    pub(crate) epoch: Epoch,
+    pub(crate) sent: Micros,
     /// Places of its bricks.
-    bricks: Vec<u32>,
+    pub(crate) bricks: Vec<u32>,
 }
 
 /// The slab that is being rendered.
 #[derive(Debug)]
-struct Slab {
-    sheets: SheetRange,
-    began: Micros,
-    cut: Cut,
-    queue: Queue,
+pub(crate) struct Slab {
+    pub(crate) sheets: SheetRange,
+    pub(crate) began: Micros,
+    pub(crate) cut: Cut,
+    pub(crate) queue: Queue,
     /// Places of the needed bricks, ascending, and their rectangles.
-    needed: Vec<u32>,
-    rects: Vec<Rect>,
+    pub(crate) needed: Vec<u32>,
+    pub(crate) rects: Vec<Rect>,
     /// Needed bricks in the order in which the queue's tiles come to them.
-    order: Vec<u32>,
+    pub(crate) order: Vec<u32>,
     /// Whose its tiles are, under the `region` schedule.
-    regions: Option<Regions>,
+    pub(crate) regions: Option<Regions>,
     /// Workers that the slab's bricks were queued for.
-    served: BTreeSet<WorkerId>,
-    /// [`Roster::changes`](crate::roster::Roster::changes) up to which it was looked at.
-    changes: Option<u64>,
+    pub(crate) served: BTreeSet<WorkerId>,
+    /// [`Roster::changes`](crate::state::workers::Roster::changes) up to which it was looked at.
+    pub(crate) changes: Option<u64>,
     /// Whether some of its owners took no leases then.
-    orphaned: bool,
+    pub(crate) orphaned: bool,
     /// End of each render thread's last task; not of regions, which have no barrier.
-    dry: BTreeMap<(WorkerId, u32), Micros>,
+    pub(crate) dry: BTreeMap<(WorkerId, u32), Micros>,
     /// Tiles that counted.
-    pieces: Vec<Piece>,
+    pub(crate) pieces: Vec<Piece>,
     /// Names that its tasks may have.
-    names: u64,
+    pub(crate) names: u64,
     /// Regions of which their worker was asked for a piece, by their places.
-    handing: BTreeMap<u32, (WorkerId, Micros)>,
+    pub(crate) handing: BTreeMap<u32, (WorkerId, Micros)>,
     /// The tile that each piece is of which was given away, and such tiles whose tasks are not all drawn.
-    roots: BTreeMap<u32, u32>,
-    families: BTreeMap<u32, Family>,
+    pub(crate) roots: BTreeMap<u32, u32>,
+    pub(crate) families: BTreeMap<u32, Family>,
 }
 
 impl Slab {
-    fn bricks_of(&self, place: u32) -> Vec<u32> {
+    pub(crate) fn bricks_of(&self, place: u32) -> Vec<u32> {
         let tile = self.cut.tiles[place as usize].rect;
         let over = |r: &Rect| !r.intersect(&tile).is_empty();
         let needed = self.needed.iter().zip(&self.rects);
@@ -119,43 +115,43 @@ impl Slab {
 pub(crate) struct Frame {
     pub(crate) job: Box<FrameJob>,
     /// Which crew draws it, if not everybody has to.
-    beside: Option<u32>,
+    pub(crate) beside: Option<u32>,
     /// Whether no other was in the making or waited when it began.
-    alone: bool,
-    projected: Vec<Option<Projected>>,
-    slabs: Vec<SheetRange>,
-    at: usize,
-    state: FrameState,
-    shut: ShutMap,
-    slab: Option<Slab>,
+    pub(crate) alone: bool,
+    pub(crate) projected: Vec<Option<Projected>>,
+    pub(crate) slabs: Vec<SheetRange>,
+    pub(crate) at: usize,
+    pub(crate) state: FrameState,
+    pub(crate) shut: ShutMap,
+    pub(crate) slab: Option<Slab>,
     /// When its last slab ended.
-    ended: Option<Micros>,
-    first_task: TaskId,
+    pub(crate) ended: Option<Micros>,
+    pub(crate) first_task: TaskId,
     /// Workers that were sent the frame's view.
-    told: BTreeSet<WorkerId>,
-    lent: Crowd<Vec<Lent>>,
+    pub(crate) told: BTreeSet<WorkerId>,
+    pub(crate) lent: WorkerMap<Vec<Lent>>,
     /// When each worker answered last.
-    answered: Crowd<Micros>,
-    pace: Pace,
+    pub(crate) answered: WorkerMap<Micros>,
+    pub(crate) pace: Pace,
     /// When the next task outlives its estimate, while a thread is idle.
-    outlived: Option<Micros>,
+    pub(crate) outlived: Option<Micros>,
     /// When the next region may be taken from an owner that is silent, while a thread is idle.
-    forborne: Option<Micros>,
+    pub(crate) forborne: Option<Micros>,
     /// When a region that takes longer than it was to is late enough to be cut, while a thread is idle.
-    pieces_at: Option<Micros>,
+    pub(crate) pieces_at: Option<Micros>,
     /// Parts of tiles that were cut late, and who is to have them: what they were drawn from goes along.
-    gained: Vec<(WorkerId, u32)>,
+    pub(crate) gained: Vec<(WorkerId, u32)>,
     /// Whose tiles lie where; of regions that several draw.
-    outlook: Option<Outlook>,
+    pub(crate) outlook: Option<Outlook>,
     /// Where each block of bricks lies, until bricks are sent ahead.
-    outlines: Option<Vec<Rect>>,
-    needed_ever: Vec<bool>,
+    pub(crate) outlines: Option<Vec<Rect>>,
+    pub(crate) needed_ever: Vec<bool>,
     /// Bricks among them, and their voxels.
-    needed: (u64, u64),
+    pub(crate) needed: (u64, u64),
     /// Voxels of all bricks.
-    relevant: u64,
-    any_result: bool,
-    last_reason: String,
+    pub(crate) relevant: u64,
+    pub(crate) any_result: bool,
+    pub(crate) last_reason: String,
     pub(crate) ledger: Ledger,
 }
 
@@ -201,7 +197,7 @@ impl Frame {
             vec![SheetRange::default()]
         } else {
             projected.extend(job.bricks.iter().map(|b| view.project(&b.tight)));
-            borders::slabs(view, &projected, &|i| job.bricks[i].voxels, &job.work)
+            slab_borders::slab_ranges(view, &projected, &|i| job.bricks[i].voxels, &job.work)
         };
         cluster.residency.open(job.scene.bricks, &job.bricks, by_region);
         let mut ledger = Ledger::new(began);
@@ -218,8 +214,8 @@ impl Frame {
             ended: None,
             first_task: TaskId(cluster.next_task),
             told: BTreeSet::new(),
-            lent: Crowd::default(),
-            answered: Crowd::default(),
+            lent: WorkerMap::default(),
+            answered: WorkerMap::default(),
             pace: Pace::default(),
             outlived: None,
             forborne: None,
@@ -416,7 +412,7 @@ impl Frame {
         }
         // What was given away of a tile is told as the tile's.
         let whole = slab.whole_tiles();
-        let tile = |(task, place): (&crate::queue::Task, u32)| {
+        let tile = |(task, place): (&crate::state::leases::Task, u32)| {
             let (worker, us) = match &task.end {
                 End::Done { worker, render_us } => (worker.to_string(), *render_us),
                 End::Open | End::Poisoned | End::Cut => (String::new(), 0),
@@ -632,7 +628,7 @@ impl Frame {
         Ok(Some((start, end)))
     }
 
-    fn progress(&self, cluster: &mut Cluster) {
+    pub(crate) fn progress(&self, cluster: &mut Cluster) {
         let Some(slab) = &self.slab else { return };
         let total = slab.queue.all();
         cluster.out.push_back(Action::Progress {
@@ -666,7 +662,7 @@ impl Frame {
     }
 
     /// These tasks are given up: their pixels stay as the slabs before left them.
-    fn give_up(&mut self, places: Vec<u32>) {
+    pub(crate) fn give_up(&mut self, places: Vec<u32>) {
         for place in places {
             let slab = self.slab.as_mut().expect("a task that is given up is of this slab");
             slab.queue.finish(place, End::Poisoned);
@@ -740,7 +736,7 @@ impl Frame {
         &mut self,
         cluster: &mut Cluster,
         id: WorkerId,
-        worker: &crate::roster::Worker,
+        worker: &crate::state::workers::Worker,
         (blame, threads): (bool, u32),
         now: Micros,
     ) {
@@ -890,7 +886,7 @@ fn note_needed(ever: &mut [bool], needed: &mut (u64, u64), job: &FrameJob, place
 }
 
 /// What the results of a frame's tasks are finished to.
-fn finish_of(job: &FrameJob) -> Option<Finish> {
+pub(crate) fn finish_of(job: &FrameJob) -> Option<Finish> {
     job.finish.filter(|_| goes_by_region(job))
 }
 
@@ -915,7 +911,7 @@ fn check_leaves(tile: Rect, leaves: &Leaves, finish: Option<Finish>) -> Result<(
 }
 
 /// Whether a stranger's pixels are those of a tile.
-fn check(tile: Rect, pixels: &TilePixels, finish: Option<Finish>) -> Result<(), String> {
+pub(crate) fn check(tile: Rect, pixels: &TilePixels, finish: Option<Finish>) -> Result<(), String> {
     if finish.is_some() {
         return Err("a result has sums where finished pixels were asked for".into());
     }
@@ -953,7 +949,7 @@ mod tests {
 
     #[test]
     fn results_of_a_mad_clock_stay_between_lease_and_arrival() {
-        let mut roster = crate::roster::Roster::default();
+        let mut roster = crate::state::workers::Roster::default();
         roster.join(WorkerId(1), "mad".into(), (1, false), 0);
         let worker = roster.get(WorkerId(1)).expect("it joined");
         for (start_us, end_us) in [(0, u64::MAX), (u64::MAX, 0), (5, 6), (7, 7)] {

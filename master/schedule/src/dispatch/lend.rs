@@ -9,8 +9,11 @@
 //!
 //! Then leases leave, each worker's together, with what their tiles were drawn from before.
 
-use super::{End, Frame, Lent, Regions, Slab, Turn, carry, finish_of};
-use crate::{Cluster, Micros};
+use crate::Micros;
+use crate::policy::region::Regions;
+use crate::state::cluster::Cluster;
+use crate::state::frame::{Frame, Lent, Slab, Turn, carry, finish_of};
+use crate::state::leases::End;
 use slabcast_common::brick::BrickGrid;
 use slabcast_common::ids::{BrickId, Epoch, WorkerId};
 use slabcast_common::message::{Lease, RegionLease, ToWorker};
@@ -71,7 +74,7 @@ pub(crate) struct Ahead {
 }
 
 impl Ahead {
-    pub(crate) fn of(roster: &crate::Roster) -> Ahead {
+    pub(crate) fn of(roster: &crate::state::workers::Roster) -> Ahead {
         let workers = roster.staying().take(MOST_FEW + 1).count();
         let times = match workers {
             0 | 1 => SOLE,
@@ -100,7 +103,7 @@ impl Frame {
     ///
     /// Of regions a worker gets its own, at the end of the last frame as much as [`HORIZON`] says; those
     /// of others only when it is their turn, and then only threads that are dry.
-    pub(super) fn dispatch(&mut self, cluster: &mut Cluster, turn: Turn, now: Micros) {
+    pub(crate) fn dispatch(&mut self, cluster: &mut Cluster, turn: Turn, now: Micros) {
         let by_region = self.by_region();
         let mut leases = match (by_region, turn.others) {
             (false, _) => self.choose(cluster, turn, now),
@@ -197,7 +200,7 @@ impl Frame {
             if self.told.insert(id) {
                 let scene = &self.job.scene;
                 let worker = cluster.roster.get_mut(id).expect("it was just lent a task");
-                let plain = worker.is_here || !cluster.traffic.packs();
+                let plain = worker.is_local || !cluster.traffic.packs();
                 if worker.scenes.insert(scene.id) {
                     cluster.send(id, ToWorker::Scene(scene.clone()));
                 }
@@ -358,7 +361,7 @@ impl Frame {
             return leases;
         };
         let sated = &cluster.sated;
-        let room = |id: WorkerId, w: &crate::roster::Worker| {
+        let room = |id: WorkerId, w: &crate::state::workers::Worker| {
             w.leases < u64::from(w.threads).saturating_mul(ahead.max(most.leases))
                 && sated.binary_search(&id).is_err()
         };
@@ -589,7 +592,7 @@ impl Frame {
 }
 
 /// Whether somebody else than this worker could draw a task.
-fn could_have(cluster: &Cluster, task: &crate::queue::Task, id: WorkerId) -> bool {
+fn could_have(cluster: &Cluster, task: &crate::state::leases::Task, id: WorkerId) -> bool {
     let refused_it = |id| task.failed.iter().any(|(w, ..)| *w == id);
     cluster.roster.staying().any(|(other, _)| other != id && !refused_it(other))
 }

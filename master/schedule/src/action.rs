@@ -1,0 +1,133 @@
+//! What the scheduler asks its driver to do, and what it tells about itself.
+
+use crate::{Micros, Spans};
+use slabcast_common::brick::BrickSetKey;
+use slabcast_common::ids::{BrickId, FrameId, WorkerId};
+use slabcast_common::image::FrameState;
+use slabcast_common::leaves::Leaves;
+use slabcast_common::message::ToWorker;
+use slabcast_common::occlusion::Rect;
+use slabcast_common::stats::FrameStats;
+
+/// An output of [`Scheduler::next_action`](crate::Scheduler::next_action).
+#[derive(Clone, Debug)]
+#[expect(clippy::large_enum_variant, reason = "a view in a message; there is one action at a time")]
+pub enum Action {
+    /// Send a control message. For each worker a scene precedes its first frame, and a frame
+    /// precedes its first lease.
+    Send {
+        /// The recipient.
+        worker: WorkerId,
+        /// The message.
+        message: ToWorker,
+    },
+    /// Send bricks, in this order. The worker holds none of them.
+    SendBricks {
+        /// The recipient.
+        worker: WorkerId,
+        /// Their set.
+        set: BrickSetKey,
+        /// Ids of the bricks.
+        bricks: Vec<BrickId>,
+    },
+    /// Close a worker's link. The scheduler has forgotten the worker.
+    Drop {
+        /// The worker.
+        worker: WorkerId,
+        /// Reason, for logs.
+        reason: String,
+    },
+    /// Report progress to watchers.
+    Progress {
+        /// The frame.
+        frame: FrameId,
+        /// Tiles of the slab that are rendered or given up.
+        done: u32,
+        /// Tiles of the slab.
+        total: u32,
+        /// Index of the slab.
+        slab: u32,
+        /// Slabs of the frame.
+        slabs: u32,
+    },
+    /// Finished tiles may be laid into the picture while others are rendered.
+    Finished {
+        /// The frame.
+        frame: FrameId,
+        /// Tile rectangles in pixels, with their finished pixels.
+        tiles: Vec<(Rect, Leaves)>,
+    },
+    /// A frame is complete.
+    FrameDone {
+        /// The frame.
+        frame: FrameId,
+        /// The picture, without the tiles that left in [`Action::Finished`].
+        state: Box<FrameState>,
+        /// The frame's statistics. The driver fills in both hashes, `left_out` and `error`.
+        stats: Box<FrameStats>,
+        /// Timeline of the frame, ordered by end times.
+        spans: Spans,
+    },
+    /// A frame can't be rendered: every tile that was attempted was given up.
+    FrameFailed {
+        /// The frame.
+        frame: FrameId,
+        /// Reason, for users.
+        reason: String,
+    },
+}
+
+/// An interval in a frame's timeline, on the master's clock.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Span {
+    /// Label.
+    pub name: String,
+    /// "frame", "slab", "tile" or "bricks".
+    pub category: &'static str,
+    /// Name of the worker; `None`: the master.
+    pub worker: Option<String>,
+    /// Index of the render thread.
+    pub thread: u32,
+    /// Start, in microseconds.
+    pub start: Micros,
+    /// End, in microseconds.
+    pub end: Micros,
+    /// Further attributes by name.
+    pub args: Vec<(&'static str, String)>,
+}
+
+/// A worker as `ListWorkers` shows it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct WorkerView {
+    /// The worker's id.
+    pub id: WorkerId,
+    /// Display name.
+    pub name: String,
+    /// Number of render threads.
+    pub threads: u32,
+    /// Number of bricks the worker holds, over all sets.
+    pub bricks_held: u64,
+    /// Encoded bytes of these bricks.
+    pub bytes_held: u64,
+    /// Render threads with a lease.
+    pub busy: u32,
+    /// Leases without an answer.
+    pub leases: u32,
+    /// When the worker joined, in microseconds on the master's clock.
+    pub since: Micros,
+    /// Whether the worker drains and takes no more leases.
+    pub leaving: bool,
+    /// Whether the worker is outside the active set: the others finish frames as fast without it.
+    pub in_reserve: bool,
+}
+
+/// Counters over the scheduler's lifetime.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Totals {
+    /// Results that were dropped as late or duplicate, those of ended frames included.
+    pub dropped_results: u64,
+    /// Brick transfers beyond a worker's memory budget, for a lease that exceeds it by itself.
+    pub over_budget: u64,
+    /// Workers lost, silent or dropped.
+    pub lost_workers: u64,
+}

@@ -1,0 +1,10 @@
+//! How the scheduler decides: where a picture is cut, who draws which tile, how many workers draw,
+//! and which bricks are sent before anybody asks.
+
+pub(crate) mod active_set;
+pub(crate) mod link_use;
+pub mod macrotile;
+pub(crate) mod makespan;
+pub(crate) mod prefetch;
+pub(crate) mod region;
+pub(crate) mod slab_borders;

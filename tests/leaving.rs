@@ -2,7 +2,7 @@
 
 use slabcast_common::path::Orientation;
 use slabcast_master::{Master, MasterConfig};
-use slabcast_render::splat::Simd;
+use slabcast_render::Simd;
 use slabcast_worker::{Config, Ended};
 use std::io::Write;
 use std::sync::{Arc, Mutex};

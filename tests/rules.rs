@@ -116,10 +116,10 @@ fn unsafe_stands_behind_one_wall() {
     holders.sort();
     holders.dedup();
     let outside: Vec<_> =
-        holders.iter().filter(|f| !f.starts_with("worker/render/src/splat")).collect();
+        holders.iter().filter(|f| !f.starts_with("worker/render/src/kernels")).collect();
     assert!(
         outside.is_empty() && !holders.is_empty(),
-        "only worker/render/src/splat/ may hold `unsafe`, not {outside:?}; use a safe way or argue \
+        "only worker/render/src/kernels/ may hold `unsafe`, not {outside:?}; use a safe way or argue \
          for the wall"
     );
 }

@@ -20,7 +20,7 @@ use slabcast_common::message::{
 use slabcast_common::occlusion::Rect;
 use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION};
 use slabcast_proto::convert::{self, Bricks};
-use slabcast_render::splat::Simd;
+use slabcast_render::Simd;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;

@@ -6,8 +6,8 @@
 
 use slabcast_common::brick::{Brick, BrickGrid, BrickInfo};
 use slabcast_common::ids::BrickId;
-use slabcast_render::outlook::Directory;
 use slabcast_render::region::Supply;
+use slabcast_render::visibility::Directory;
 use std::sync::{Arc, OnceLock, PoisonError, RwLock};
 
 /// See the head of the file.

@@ -10,7 +10,7 @@ use crate::request::AxisArgs;
 use crate::{parse, plan, record, runtime, signals, volume};
 use slabcast_common::path::Axis;
 use slabcast_master::{Handle, MasterConfig};
-use slabcast_render::splat::Simd;
+use slabcast_render::Simd;
 use slabcast_worker::{Config, Ended, Rehearsal};
 use std::net::SocketAddr;
 use std::path::PathBuf;

@@ -15,7 +15,7 @@ use slabcast_master::driver::SubmitError;
 use slabcast_master::jobs::{JobState, WatchItem};
 use slabcast_master::record::Recorder;
 use slabcast_master::{Handle, Master, MasterConfig, link};
-use slabcast_render::splat::Simd;
+use slabcast_render::Simd;
 use slabcast_worker::{BrickCache, Config, Ended, Link};
 use std::sync::Arc;
 use std::time::Duration;

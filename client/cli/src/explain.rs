@@ -1,6 +1,6 @@
 //! `slabcast explain`: why a pixel is as it is, and what a scene does not need ([`crate::needs`]).
 //!
-//! The numbers are the renderer's own ([`slabcast_render::explain`]): the pixel that they lead to
+//! The numbers are the renderer's own ([`slabcast_render::oracle::explain`]): the pixel that they lead to
 //! is the pixel of the picture, to the bit. Beside each sheet stands what the same sheets are in
 //! f64, and below all of them the limit.
 
@@ -10,8 +10,8 @@ use crate::request::{PictureOf, ThreadArg};
 use crate::still::Still;
 use crate::{needs, signals};
 use slabcast_common::volume::ValueMap;
-use slabcast_render::explain::{Explained, Section, SheetHere, explain};
-use slabcast_render::reference::{Sheet, Sheets};
+use slabcast_render::judge::reference::{Sheet, Sheets};
+use slabcast_render::oracle::explain::{Explained, Section, SheetHere, explain};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 

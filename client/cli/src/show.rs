@@ -1,7 +1,7 @@
 //! `slabcast render --show`: pictures of how a picture came about.
 //!
 //! Depth, work and sheets are the serial renderer's notes about each pixel
-//! ([`slabcast_render::survey`]), the error is an estimate from sheets of half the thickness, and
+//! ([`slabcast_render::oracle::work_counters`]), the error is an estimate from sheets of half the thickness, and
 //! tiles with their owners are in a frame's statistics. Each is drawn over the same view as the
 //! frame would be, with a legend below that says what the colours mean.
 
@@ -13,7 +13,7 @@ use crate::stage::Stage;
 use slabcast_common::image::{Picture, PixelFormat};
 use slabcast_common::quality::{Compositing, Quality};
 use slabcast_common::stats::FrameStats;
-use slabcast_render::survey::{Survey, survey};
+use slabcast_render::oracle::work_counters::{Survey, survey};
 
 /// What is shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -299,7 +299,7 @@ mod tests {
     use super::*;
     use crate::request::Asked;
     use slabcast_common::path::{Orientation, ViewPath};
-    use slabcast_render::reference::{Reference, stratified};
+    use slabcast_render::judge::reference::{Reference, stratified};
 
     fn stage(tf: &str) -> Stage {
         let volume = crate::volume::open("formula:spheres:48".as_ref()).unwrap();

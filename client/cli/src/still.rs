@@ -11,7 +11,7 @@ use slabcast_common::image::{Background, Picture};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::view::View;
-use slabcast_render::reference::Reference;
+use slabcast_render::judge::reference::Reference;
 use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
 

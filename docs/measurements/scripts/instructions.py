@@ -64,13 +64,13 @@ int qemu_plugin_install(uint64_t id, const void *info, int n, char **arguments) 
 BASE = 0x5500000000
 # Stages by file and function of the outermost caller that has any; what else draws is `other`.
 STAGES = [
-    ("toss", r"splat/toss\.rs$", r""),
-    ("list", r"splat/touched\.rs$", r"list"),
-    ("empty", r"splat/touched\.rs$", r"sift"),
-    ("take", r"splat/touched\.rs$", r"take"),
-    ("put", r"splat/touched\.rs$", r"^(put|fours)$"),
-    ("close", r"splat/close\.rs$", r""),
-    ("splat", r"splat/records/\w+\.rs$", r""),
+    ("toss", r"kernels/toss\.rs$", r""),
+    ("list", r"kernels/touched\.rs$", r"list"),
+    ("empty", r"kernels/touched\.rs$", r"sift"),
+    ("take", r"kernels/touched\.rs$", r"take"),
+    ("put", r"kernels/touched\.rs$", r"^(put|fours)$"),
+    ("close", r"kernels/composite/rows\.rs$", r""),
+    ("splat", r"kernels/pixel_records/\w+\.rs$", r""),
 ]
 
 

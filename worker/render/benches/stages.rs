@@ -26,9 +26,10 @@ use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
-use slabcast_render::splat::Simd;
+use slabcast_render::Simd;
+use slabcast_render::oracle::serial;
 use slabcast_render::tile::{self, Scratch, Seen};
-use slabcast_render::{Frame, Scene, serial};
+use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
 use std::time::Duration;
 

@@ -1,11 +1,13 @@
 //! A scene and a frame of it, made ready for drawing: tables that tiles share.
 
-use crate::footprint::{Footprint, Footprints, Lean, Leaning, Profile, Sections, Shelf};
-use crate::mask::REACH_MOST;
-use crate::place::{FlatCorner, Places};
-use crate::sheet::Rule;
-use crate::splat::{Simd, Work, looks};
-use crate::storeys::Storeys;
+use crate::kernels::composite::Rule;
+use crate::kernels::{Simd, Work, lut};
+use crate::primitives::footprint::{
+    Footprint, Footprints, Lean, Leaning, Profile, Sections, Shelf,
+};
+use crate::primitives::lattice_rows::Storeys;
+use crate::primitives::positions::{FlatCorner, Places};
+use crate::visibility::open_mask::REACH_MOST;
 use glam::{DVec3, Vec3};
 use slabcast_common::bounds::{raw_per_payload, short_per_payload};
 use slabcast_common::brick::{Brick, BrickGrid, TightBox, local};
@@ -314,7 +316,7 @@ impl Frame {
     /// [`Frame::payload`] of many voxels by their samples' bits, normals and, where each sees the eye
     /// in a direction of its own, eye coordinates by axis (opacities do not hang on gradients):
     /// extinctions, then each colour. There may be more normals than samples, for
-    /// [whole registers](crate::splat::whole_registers); what comes of those is not said.
+    /// [whole registers](crate::kernels::whole_registers); what comes of those is not said.
     ///
     /// # Panics
     /// If there are fewer normals or eyes than samples; in a perspective view without eyes.
@@ -370,7 +372,7 @@ impl<const MOST: usize> Work for Payloads<'_, MOST> {
         assert!(samples.len() <= n, "a normal a sample");
         let table = frame.scene.classifier.table();
         if !table.is_empty() {
-            looks::take(simd, table, samples, out);
+            lut::take(simd, table, samples, out);
         }
         let [sigma, colours @ ..] = out;
         for (i, &sample) in samples.iter().enumerate().take(if table.is_empty() { n } else { 0 }) {

@@ -4,8 +4,8 @@
 //! `slabcast_common::SELF_TEST_SHA256`, naming both. So a machine, a compiler or a build that
 //! rounds differently is found before it spoils a picture.
 
+use crate::kernels::Simd;
 use crate::scene::{Frame, Scene};
-use crate::splat::Simd;
 use crate::tile::{self, Scratch};
 use glam::DVec3;
 use slabcast_common::brick::{BRICK, Brick, BrickGrid};

@@ -8,7 +8,7 @@
 //!    rest are tossed into the bucket of their first sheet (paper section 3).
 //! 2. **Splat** bucket k: each voxel is tested once more, shaded, and all its sections are added
 //!    to the ring of open sheets. So the next sheet is half filled when this one closes, which
-//!    is just what the colour rule wants to see ([`crate::sheet`]).
+//!    is just what the colour rule wants to see ([`crate::kernels::composite`]).
 //! 3. **Close** sheet k where it was touched: composite, shut pixels, take them out of the mask.
 //!
 //! A part is left as soon as all its pixels are shut. Bytes do not depend on any of this: sums
@@ -22,62 +22,28 @@
 //! `flat` for most orthographic views, `leaning` for those whose kernel leans, `deep` for most perspective ones,
 //! and `level` for flat ones that are level; it keeps the sheets of `deep` ones that are level, too.
 
-use crate::deep::{self, Deep, RenderDeep, RenderDeepLevel};
-use crate::flat::{self, RenderFlat};
-use crate::general::{GeneralScratch, Kind, Queues, RenderGeneral};
-use crate::leaning::{self, RenderLeaning};
-use crate::level::{self, RenderLevel};
-use crate::mask::OpenMask;
-use crate::planes;
-use crate::region::{Coming, Memory};
-use crate::scene::{Corner, Frame, Scene};
-use crate::splat::records::{MOST, STRIDE};
-use crate::splat::tiers::Tiered;
-use crate::splat::{Grey, Simd};
-use crate::stack::Store;
-use crate::storeys::Storeys;
+use crate::geometry::general::{GeneralScratch, Kind, Queues, RenderGeneral};
+use crate::geometry::open_sheets::Store;
+use crate::geometry::ortho::{self, RenderFlat};
+use crate::geometry::perspective::{self, Deep, RenderDeep, RenderDeepLevel};
+use crate::geometry::shared_rows::{self, RenderLevel};
+use crate::geometry::sheared::{self, RenderLeaning};
+use crate::kernels::pixel_records::MOST;
+use crate::kernels::row_records::Tiered;
+use crate::kernels::{Grey, Simd};
+pub use crate::part::Seen;
+use crate::part::brick_feed::Memory;
+use crate::part::{Among, Io, Part, Pixels};
+use crate::primitives::lattice_rows::Storeys;
+use crate::primitives::sizes::PART;
+use crate::scene::{Frame, Scene};
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{RawSums, TilePixels, TileState};
 use slabcast_common::message::Counters;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Sums;
 use slabcast_common::slab::SheetRange;
-use slabcast_common::view::{Projected, Projection};
 use std::sync::Arc;
-
-/// Edge of a tile part. 64 gives a word for a row of the mask, and open sheets that fit a second
-/// cache of 512 KiB. At 32 a head takes 12 % more splats (286 k instead of 256 k a frame) for their
-/// overlap and no less time (docs/measurements.md); at 128 a row would need two words, and the
-/// sheets 1.5 MiB.
-pub(crate) const PART: i32 = planes::PART as i32;
-const _: () = assert!(PART == slabcast_common::region::PART);
-
-/// A brick as a frame sees it: what all tiles ask of it, worked out once.
-#[derive(Clone, Debug)]
-pub struct Seen {
-    /// The brick.
-    pub brick: Arc<Brick>,
-    /// Where its voxels may land.
-    pub projected: Projected,
-    pub(crate) corner: Corner,
-}
-
-impl Seen {
-    /// `brick` in `frame`; `None` if it is off the picture or behind the near plane.
-    pub fn new(frame: &Frame, brick: &Arc<Brick>) -> Option<Seen> {
-        let projected = frame.view.project(&brick.tight(&frame.scene.grid))?;
-        Some(Seen { brick: brick.clone(), projected, corner: frame.corner(brick.id) })
-    }
-
-    /// `seen` front to back; those that begin together in ascending id.
-    pub fn front_to_back(seen: &[Seen]) -> Vec<&Seen> {
-        // Numbers and places are sorted, not bricks: a third of the time.
-        let key = |s: &Seen| (s.projected.sheets.first, s.brick.id);
-        let mut order: Vec<_> = seen.iter().enumerate().map(|(i, s)| (key(s), i as u32)).collect();
-        order.sort_unstable();
-        order.into_iter().map(|(_, i)| &seen[i as usize]).collect()
-    }
-}
 
 /// Memory that a render thread keeps from tile to tile.
 #[derive(Default)]
@@ -105,13 +71,10 @@ struct Whole {
 /// Memory for voxels on their way to records.
 #[derive(Default)]
 struct Waiting {
-    flat: flat::Waiting,
-    leaning: leaning::Waiting,
-    deep: deep::Waiting,
+    flat: ortho::Waiting,
+    leaning: sheared::Waiting,
+    deep: perspective::Waiting,
 }
-
-/// The tile's pixels, from which a part starts and which it takes farther, and what it counts.
-pub(crate) type Io<'a> = (&'a mut TilePixels, &'a mut Counters);
 
 /// Renders the sheets of `slab` on `tile`, from `state`, with `bricks` (at least all that the tile
 /// and slab need).
@@ -211,41 +174,6 @@ pub fn render_into(
     counted
 }
 
-/// Where a part's bricks are.
-#[derive(Clone, Copy)]
-pub(crate) enum Among<'a> {
-    /// All of the tile's are here.
-    Here(&'a [&'a Seen]),
-    /// They come when they are looked at, if they can be had.
-    Coming(&'a Coming<'a>),
-}
-
-/// A part of a tile.
-pub(crate) struct Part<'a> {
-    pub(crate) frame: &'a Frame,
-    pub(crate) rect: Rect,
-    pub(crate) tile: Rect,
-    pub(crate) slab: SheetRange,
-    pub(crate) among: Among<'a>,
-    /// Those of the part that are here, front to back.
-    pub(crate) inside: &'a [u32],
-}
-
-/// A part's pixels, in rows of [`STRIDE`] whatever the part's width.
-pub(crate) struct Pixels {
-    /// Lengths of rays in a sheet over its thickness.
-    pub(crate) secants: Vec<f32>,
-    /// The bits of each one's opacity, and three colours.
-    pub(crate) all: Vec<[u32; 4]>,
-}
-
-impl Default for Pixels {
-    fn default() -> Self {
-        let n = STRIDE * planes::PART;
-        Pixels { secants: vec![1.0; n], all: vec![[0; 4]; n] }
-    }
-}
-
 /// What a voxel adds to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Adds {
@@ -266,7 +194,7 @@ impl Frame {
             Sums::I32 | Sums::Auto => size_of::<i32>(),
         };
         let most = self.sections.most();
-        if flat::takes(self).is_none() || classifier.is_modulated() || most > MOST {
+        if ortho::takes(self).is_none() || classifier.is_modulated() || most > MOST {
             return None;
         }
         let footprint = self.footprints.at(0)?;
@@ -281,7 +209,7 @@ impl Frame {
     /// Whether its three colours are one and it is drawn where that is made use of: opacity and one
     /// colour, half of what others add up and close.
     pub fn has_two_channels(&self) -> bool {
-        self.may_have_two_channels() && flat::takes(self).is_some()
+        self.may_have_two_channels() && ortho::takes(self).is_some()
     }
 
     /// Whether two channels are all that 32-bit sums of it need.
@@ -328,7 +256,7 @@ impl<'a> Part<'a> {
     fn deep_grey(&self) -> Option<(Deep, &'a Storeys)> {
         let storeys = self.frame.storeys.as_ref()?;
         let may = self.frame.may_have_two_channels() && self.frame.sections.most() <= 4;
-        Some((deep::takes(self).filter(|_| may)?, storeys))
+        Some((perspective::takes(self).filter(|_| may)?, storeys))
     }
 
     /// Renders it where the frame [has two channels](Frame::has_two_channels).
@@ -336,12 +264,12 @@ impl<'a> Part<'a> {
         self,
         simd: Simd,
         store: &mut Store<Grey>,
-        waiting: &mut flat::Waiting,
+        waiting: &mut ortho::Waiting,
         pixels: &mut Pixels,
         io: Io<'_>,
     ) {
         let part = self;
-        if let Some(view) = level::takes(part.frame) {
+        if let Some(view) = shared_rows::takes(part.frame) {
             if part.frame.sections.most() <= 4 {
                 simd.run(RenderLevel::<Grey, 4> { part, view, store, waiting, pixels, io });
             } else {
@@ -349,7 +277,7 @@ impl<'a> Part<'a> {
             }
             return;
         }
-        let view = flat::takes(part.frame).expect("a flat view");
+        let view = ortho::takes(part.frame).expect("a flat view");
         if part.frame.sections.most() <= 4 {
             simd.run(RenderFlat::<Grey, 4> { part, view, store, waiting, pixels, io });
         } else {
@@ -391,16 +319,16 @@ impl<'a> Part<'a> {
         io: Io<'_>,
     ) {
         let part = self;
-        if let Some(view) = level::takes(part.frame) {
+        if let Some(view) = shared_rows::takes(part.frame) {
             let waiting = &mut waiting.flat;
             simd.run(RenderLevel::<S, N> { part, view, store, waiting, pixels, io });
-        } else if let Some(view) = flat::takes(part.frame) {
+        } else if let Some(view) = ortho::takes(part.frame) {
             let waiting = &mut waiting.flat;
             simd.run(RenderFlat::<S, N> { part, view, store, waiting, pixels, io });
-        } else if let Some(lean) = leaning::takes(part.frame) {
+        } else if let Some(lean) = sheared::takes(part.frame) {
             let waiting = &mut waiting.leaning;
             simd.run(RenderLeaning { part, lean, store, waiting, pixels, io });
-        } else if let Some(deep) = deep::takes(&part) {
+        } else if let Some(deep) = perspective::takes(&part) {
             let waiting = &mut waiting.deep;
             let storeys = part.frame.storeys.as_ref();
             let deep = RenderDeep::<S, N> { part, deep, store, waiting, pixels, io };
@@ -412,171 +340,6 @@ impl<'a> Part<'a> {
             simd.run(RenderGeneral { part, kind, queues, pixels, io });
         }
     }
-
-    /// The first sheet that any of its bricks begins at; `None`: it has none.
-    pub(crate) fn nearest(&self) -> Option<i32> {
-        match self.among {
-            Among::Here(_) => (!self.inside.is_empty()).then(|| self.first_sheet(0)),
-            Among::Coming(coming) => coming.nearest(),
-        }
-    }
-
-    /// The first sheet of brick `i` of the part, front to back.
-    #[inline(always)]
-    pub(crate) fn first_sheet(&self, i: usize) -> i32 {
-        match self.among {
-            Among::Here(bricks) => bricks[self.inside[i] as usize].projected.sheets.first,
-            Among::Coming(coming) => coming.first_sheet(i),
-        }
-    }
-
-    /// Whether there is a brick `i` of the part that begins at sheet `k` or before. Of those that come,
-    /// there are the ones that [came](Part::is_supplied).
-    #[inline(always)]
-    pub(crate) fn begins(&self, i: usize, k: i32) -> bool {
-        match self.among {
-            Among::Here(_) => i < self.inside.len() && self.first_sheet(i) <= k,
-            Among::Coming(coming) => i < coming.came(),
-        }
-    }
-
-    /// Brick `i` of the part with its corner. It was [admitted](Part::open_brick).
-    #[inline(always)]
-    pub(crate) fn brick(&self, i: usize) -> (&Brick, &Corner) {
-        match self.among {
-            Among::Here(bricks) => {
-                let Seen { brick, corner, .. } = bricks[self.inside[i] as usize];
-                (brick, corner)
-            }
-            Among::Coming(coming) => coming.brick(i),
-        }
-    }
-
-    /// Brick `i` of the part, if it is known already.
-    #[inline(always)]
-    pub(crate) fn peek(&self, i: usize) -> Option<&Brick> {
-        match self.among {
-            Among::Here(bricks) => Some(&bricks[*self.inside.get(i)? as usize].brick),
-            Among::Coming(coming) => (i < coming.came()).then(|| coming.brick(i).0),
-        }
-    }
-
-    /// Whether sheet `k`, the one behind the last that this was asked of, can be drawn: all bricks that
-    /// begin there and may touch an open pixel are here. If not, what is lacked is noted.
-    #[inline(always)]
-    pub(crate) fn is_supplied(&self, k: i32, open: &OpenMask, counters: &mut Counters) -> bool {
-        match self.among {
-            Among::Here(_) => true,
-            Among::Coming(coming) => coming.is_supplied(k, open, counters),
-        }
-    }
-
-    /// The part's brick `i`, unless it is culled: all that it may touch is shut.
-    #[inline(always)]
-    pub(crate) fn open_brick(
-        &self,
-        i: usize,
-        open: &OpenMask,
-        counters: &mut Counters,
-    ) -> Option<(&Brick, &Corner)> {
-        // Of one that came the question was asked when it was looked for.
-        if let Among::Here(bricks) = self.among {
-            let seen = bricks[self.inside[i] as usize];
-            if self.frame.scene.quality.cull && !open.any(&seen.projected.rect) {
-                counters.culled += seen.brick.len() as u64;
-                return None;
-            }
-        }
-        Some(self.brick(i))
-    }
-
-    /// Voxels of the bricks from `i` on; where they come one by one, of those that did not.
-    pub(crate) fn voxels_from(&self, i: usize) -> u64 {
-        match self.among {
-            Among::Here(bricks) => {
-                let left = self.inside[i..].iter();
-                left.map(|&at| bricks[at as usize].brick.len() as u64).sum()
-            }
-            Among::Coming(coming) => coming.voxels_left(),
-        }
-    }
-
-    /// Index in the tile's planes of the first pixel of the part's row `y`.
-    fn tile_row(&self, y: usize) -> usize {
-        (self.rect.y0 - self.tile.y0) as usize * self.tile.width()
-            + y * self.tile.width()
-            + (self.rect.x0 - self.tile.x0) as usize
-    }
-
-    /// Calls `f` with each pixel's column and row in the part and index in the tile.
-    pub(crate) fn each_pixel(&self, mut f: impl FnMut(usize, usize, usize)) {
-        for y in 0..self.rect.height() {
-            let row = self.tile_row(y);
-            for x in 0..self.rect.width() {
-                f(x, y, row + x);
-            }
-        }
-    }
-
-    /// Takes the part's pixels out of the tile's; returns which are open.
-    pub(crate) fn begin(&self, pixels: &mut Pixels, tile: &TilePixels) -> OpenMask {
-        let (w, h) = (self.rect.width(), self.rect.height());
-        let mut open = OpenMask::shut(self.rect);
-        for y in 0..h {
-            let (row, to) = (self.tile_row(y), y * STRIDE);
-            let mut bits = 0u64;
-            let all = &mut pixels.all[to..to + w];
-            for (x, (pixel, a)) in all.iter_mut().zip(&tile.a[row..row + w]).enumerate() {
-                *pixel = [a.to_bits(), 0, 0, 0];
-                bits |= u64::from(!self.frame.rule.is_shut(*a)) << x;
-            }
-            open.open_row(y, bits);
-            let view = &self.frame.view;
-            let (px, py) = (self.rect.x0, self.rect.y0 + y as i32);
-            let secants = &mut pixels.secants[to..to + w];
-            match view.projection {
-                Projection::Ortho { .. } => secants.fill(1.0),
-                Projection::Persp { .. } => {
-                    for (x, secant) in secants.iter_mut().enumerate() {
-                        *secant = view.secant(px + x as i32, py);
-                    }
-                }
-            }
-        }
-        open
-    }
-
-    /// Puts the part's pixels into the tile's.
-    pub(crate) fn end(&self, pixels: &Pixels, out: &mut TilePixels) {
-        let (w, h) = (self.rect.width(), self.rect.height());
-        for y in 0..h {
-            let (row, from) = (self.tile_row(y), y * STRIDE);
-            let (a, colour) = (&mut out.a[row..row + w], &mut out.colour[row..row + w]);
-            for (pixel, (a, colour)) in
-                pixels.all[from..from + w].iter().zip(a.iter_mut().zip(colour))
-            {
-                let [opacity, r, g, b] = *pixel;
-                *a = f32::from_bits(opacity);
-                for (sum, more) in colour.iter_mut().zip([r, g, b]) {
-                    *sum = sum.wrapping_add(more);
-                }
-            }
-        }
-    }
-}
-
-/// Takes the sums of a part's last sheet to where the next sheet's drawing finds them.
-///
-/// Where a part stops before its slab does, they are wanted though nobody asked for them at first.
-pub(crate) fn keep_last<'a>(
-    part: &Part<'_>,
-    stopped: bool,
-    out: &'a mut TilePixels,
-) -> Option<&'a mut Vec<RawSums>> {
-    if stopped && out.last.is_none() && part.frame.looks_at_neighbours() {
-        out.last = Some(vec![[0; 4]; out.a.len()]);
-    }
-    out.last.as_mut()
 }
 
 /// Planes as they are before the first slab.

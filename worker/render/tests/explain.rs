@@ -10,9 +10,10 @@ use slabcast_common::shade::Shading;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
-use slabcast_render::explain::{Explained, explain};
-use slabcast_render::survey::survey;
-use slabcast_render::{Frame, Scene, serial};
+use slabcast_render::oracle::explain::{Explained, explain};
+use slabcast_render::oracle::serial;
+use slabcast_render::oracle::work_counters::survey;
+use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
 use world::bricks_of;
 

@@ -1,4 +1,4 @@
-//! Rendered pictures against `slabcast_render::closed`: what is known on paper, within bounds
+//! Rendered pictures against `slabcast_render::judge::analytic`: what is known on paper, within bounds
 //! that count roundings.
 
 mod world;
@@ -16,10 +16,11 @@ use slabcast_common::transfer::{
 };
 use slabcast_common::view::{Camera, CameraProjection, SUBPIXELS, View};
 use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
-use slabcast_render::closed::{Bell, Layer, Profile, Rounding, Stack};
-use slabcast_render::splat::Simd;
+use slabcast_render::Simd;
+use slabcast_render::judge::analytic::{Bell, Layer, Profile, Rounding, Stack};
+use slabcast_render::oracle::serial;
 use slabcast_render::tile::{self, Scratch};
-use slabcast_render::{Frame, Scene, serial};
+use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
 use world::bricks_of;
 

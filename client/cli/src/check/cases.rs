@@ -13,7 +13,8 @@ use slabcast_common::quality::{Compositing, Kernel, Quality, Sums, Work};
 use slabcast_common::transfer::{OpacityUnit, TransferFunction};
 use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
-use slabcast_render::{Frame, Scene, serial};
+use slabcast_render::oracle::serial;
+use slabcast_render::{Frame, Scene};
 use std::path::Path;
 use std::sync::Arc;
 

@@ -1,4 +1,4 @@
-//! Scenes whose pictures are known on paper (`slabcast_render::closed`), each within bounds that
+//! Scenes whose pictures are known on paper (`slabcast_render::judge::analytic`), each within bounds that
 //! count roundings.
 
 use super::shot::{Ready, Shot, sane};
@@ -14,7 +14,7 @@ use slabcast_common::transfer::{
     Classifier, ColorSpace, Domain, NanLook, OpacityUnit, SIGMA_MAX, TransferFunction,
 };
 use slabcast_common::view::SUBPIXELS;
-use slabcast_render::closed::{Bell, Layer, Profile, Rounding, Stack};
+use slabcast_render::judge::analytic::{Bell, Layer, Profile, Rounding, Stack};
 use std::path::Path;
 use std::sync::Arc;
 

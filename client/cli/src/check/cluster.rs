@@ -13,7 +13,7 @@ use slabcast_common::volume::{Digest32, Volume};
 use slabcast_master::driver::SubmitError;
 use slabcast_master::jobs::{FinishedFrame, JobState, WatchItem};
 use slabcast_master::{Handle, Master, MasterConfig};
-use slabcast_render::splat::Simd;
+use slabcast_render::Simd;
 use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio::sync::watch;

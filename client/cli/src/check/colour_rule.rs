@@ -15,7 +15,7 @@ use crate::request::{Opened, PictureOf, ThreadArg};
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::quality::{Compositing, Quality, Work};
 use slabcast_common::view::{Camera, CameraProjection, View};
-use slabcast_render::reference::{ErrorFigures, Reference, stratified};
+use slabcast_render::judge::reference::{ErrorFigures, Reference, stratified};
 use slabcast_render::{Frame, Scene};
 use std::fmt::Write;
 use std::sync::Arc;

@@ -16,12 +16,12 @@
 use super::shot::Ready;
 use slabcast_common::bounds::raw_per_payload;
 use slabcast_common::brick::TightBox;
+use slabcast_common::kernel::{Lean, Profile};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Compositing, Sums};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Projection, SUBPIXELS};
 use slabcast_render::Frame;
-use slabcast_render::footprint::{Lean, Profile};
 
 /// Half an ulp of f32 near one.
 const ULP: f64 = 6e-8;

@@ -21,7 +21,7 @@ use slabcast_common::image::{Background, Picture};
 use slabcast_common::quality::Quality;
 use slabcast_common::shade::{HeadWord, Light};
 use slabcast_common::transfer::{ColorSpace, TransferFunction};
-use slabcast_render::reference::ErrorFigures;
+use slabcast_render::judge::reference::ErrorFigures;
 
 /// A picture on its side against the upright one where the kernel leans, in 1/255. Such a kernel is a product of
 /// profiles along two axes across the depth, and these are others then; a Gaussian does not feel that, but each profile

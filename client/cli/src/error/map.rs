@@ -10,7 +10,7 @@ use crate::fail::Fail;
 use crate::output::write_atomic;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::occlusion::Rect;
-use slabcast_render::reference::cells;
+use slabcast_render::judge::reference::cells;
 use std::path::Path;
 
 /// Ends of the scale in 1/255. Three decades: at 0.01 a pixel is as good as exact in any 8-bit

@@ -23,7 +23,7 @@ use crate::still::Still;
 use crate::{parse, signals};
 use slabcast_common::image::Picture;
 use slabcast_common::quality::{Quality, Sums};
-use slabcast_render::reference::{ErrorFigures, Sheets, stratified};
+use slabcast_render::judge::reference::{ErrorFigures, Sheets, stratified};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 

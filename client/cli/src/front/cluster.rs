@@ -20,7 +20,7 @@ use slabcast_common::path::ViewPath;
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::volume::VolumeInfo;
 use slabcast_master::Handle;
-use slabcast_render::reference::ErrorFigures;
+use slabcast_render::judge::reference::ErrorFigures;
 use std::time::Instant;
 use tokio::runtime::Runtime;
 use tokio::task::JoinSet;

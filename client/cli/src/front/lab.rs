@@ -18,7 +18,7 @@ use slabcast_common::path::Orientation;
 use slabcast_common::quality::{Compositing, Quality, Sums};
 use slabcast_common::transfer::Classifier;
 use slabcast_common::volume::{Volume, VolumeInfo};
-use slabcast_render::reference::{ErrorFigures, Reference, stratified};
+use slabcast_render::judge::reference::{ErrorFigures, Reference, stratified};
 use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
 use std::time::Instant;

@@ -5,7 +5,7 @@
 //! another program has filled, a page that is touched for the first time) only ever makes it longer.
 //!
 //! Which bricks lie where a worker finds out once a frame, whatever its tiles: blocks of bricks when it
-//! begins, a block's bricks when one of its tiles first needs them ([`slabcast_render::outlook`]). So a
+//! begins, a block's bricks when one of its tiles first needs them ([`slabcast_render::visibility`]). So a
 //! tile's time is that with its blocks looked at; it names them, and a block's price is measured apart.
 //! Whoever runs the tiles charges a worker each block of a frame once, to the tile that comes first.
 //!
@@ -37,11 +37,11 @@ use slabcast_common::trace::{
 use slabcast_common::view::Projected;
 use slabcast_proto::convert::{self, Down};
 use slabcast_render::Frame;
-use slabcast_render::depths::Depths;
-use slabcast_render::outlook::Outlook;
+use slabcast_render::Simd;
 use slabcast_render::region::{self, Finished, Region, Supply};
-use slabcast_render::splat::Simd;
 use slabcast_render::tile::{self, Scratch};
+use slabcast_render::visibility::Depths;
+use slabcast_render::visibility::Outlook;
 use slabcast_schedule::{FrameJob, is_shut, macrotile};
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
@@ -528,8 +528,8 @@ mod tests {
     use crate::request::Asked;
     use slabcast_common::leaves::Mosaic;
     use slabcast_common::path::{Turntable, ViewPath};
-    use slabcast_render::outlook::Directory;
     use slabcast_render::tile::Seen;
+    use slabcast_render::visibility::Directory;
 
     /// Volume, axis that is up, and transfer function.
     type Named = (&'static str, &'static str, &'static str);

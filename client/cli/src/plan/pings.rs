@@ -9,7 +9,7 @@
 use slabcast_common::path::Orientation;
 use slabcast_common::trace::Pings;
 use slabcast_master::{Master, MasterConfig};
-use slabcast_render::splat::Simd;
+use slabcast_render::Simd;
 use slabcast_worker::Config;
 use std::fmt::Display;
 use std::time::{Duration, Instant};

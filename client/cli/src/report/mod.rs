@@ -251,7 +251,7 @@ fn measure(args: &ReportArgs) -> Result<Report, Fail> {
         machine: Machine {
             cpu: crate::machine::cpu(),
             cores: crate::embedded::cores() as usize,
-            simd: slabcast_render::splat::Simd::detect().name(),
+            simd: slabcast_render::Simd::detect().name(),
             threads,
         },
         complete: false,

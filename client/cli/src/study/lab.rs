@@ -274,7 +274,7 @@ impl Lab<'_> {
             machine: Machine {
                 cpu: crate::machine::cpu(),
                 cores: embedded::cores() as usize,
-                simd: slabcast_render::splat::Simd::detect().name(),
+                simd: slabcast_render::Simd::detect().name(),
             },
             link: self.args.link.to_string(),
             latency_us: self.args.latency as f64 / 1e3,

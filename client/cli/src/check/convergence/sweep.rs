@@ -9,7 +9,7 @@ use slabcast_common::quality::{Compositing, Quality, Sums};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::view::{Camera, View};
 use slabcast_common::volume::{Volume, VolumeInfo};
-use slabcast_render::reference::{Reference, Section, Sheets, stratified};
+use slabcast_render::judge::reference::{Reference, Section, Sheets, stratified};
 use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
 

@@ -1,0 +1,471 @@
+//! A tile part of any view in any sums: the general way ([`crate::tile`] tells what it does).
+//!
+//! Each section of a voxel has a footprint of its own, and sheets lie one after the other in
+//! [`Planes`]. Voxels wait as brick and index, so that float sums can be sorted into their one order.
+
+mod planes;
+
+use self::planes::{BLOCK, Lofts, Planes, Window};
+use crate::kernels::composite::{LANES, Row};
+use crate::kernels::pixel_records::STRIDE;
+use crate::kernels::touched::put;
+use crate::kernels::{Accumulate, Simd, Weight, Work};
+use crate::part::{Io, Part, Pixels, keep_last};
+use crate::primitives::footprint::Footprint;
+use crate::primitives::lattice_rows::{Reaching, Storeys};
+use crate::primitives::sizes::PART;
+use crate::scene::Placed;
+use crate::visibility::open_mask::OpenMask;
+use slabcast_common::message::Counters;
+use slabcast_common::occlusion::Rect;
+use slabcast_common::view::Projection;
+
+/// A voxel waiting in the bucket of its first sheet.
+#[derive(Clone, Copy, Default)]
+struct Waiting {
+    /// Which of the part's bricks.
+    brick: u32,
+    /// Which voxel of it.
+    voxel: u16,
+    /// Where it lies.
+    placed: Placed,
+}
+
+/// Memory that a render thread keeps from part to part.
+#[derive(Default)]
+pub(crate) struct GeneralScratch {
+    pub(crate) kinds: Kinds,
+    pub(crate) queues: Queues,
+}
+
+/// Memory for sums of every kind.
+#[derive(Default)]
+pub(crate) struct Kinds {
+    pub(crate) shorts: Kind<i16>,
+    pub(crate) longs: Kind<i32>,
+    pub(crate) floats: Kind<f32>,
+}
+
+/// Storeys that reach a row of pixels, and in which sheet.
+type OfSheet<W> = (Option<i32>, Reaching<W>);
+
+/// Memory for sums of one kind.
+pub(crate) struct Kind<S: Accumulate> {
+    planes: Planes<S>,
+    /// In level views, from which `planes` are filled when a sheet closes.
+    lofts: Lofts<S>,
+    /// For weights that are in no table.
+    weights: [Vec<S::Weight>; 2],
+    /// Storeys that reach each row of the part in a sheet, and in which: of even sheets and odd ones.
+    reaching: [Vec<OfSheet<S::Weight>>; 2],
+}
+
+impl<S: Accumulate> Default for Kind<S> {
+    fn default() -> Self {
+        Kind {
+            planes: Planes::default(),
+            lofts: Lofts::default(),
+            weights: [Vec::new(), Vec::new()],
+            reaching: [Vec::new(), Vec::new()],
+        }
+    }
+}
+
+/// Voxels that wait.
+#[derive(Default)]
+pub(crate) struct Queues {
+    buckets: Vec<Vec<Waiting>>,
+    /// Buckets behind this hold nothing: a part that stops often doesn't look at those of all sheets each time.
+    filled: usize,
+    carried: Vec<Waiting>,
+}
+
+impl Queues {
+    /// Empties what an earlier part left, and makes room for one of `sheets`.
+    #[inline(always)]
+    fn begin(&mut self, sheets: usize) {
+        if self.buckets.len() < sheets {
+            self.buckets.resize_with(sheets, Vec::new);
+        }
+        let filled = std::mem::take(&mut self.filled);
+        self.buckets[..filled].iter_mut().for_each(Vec::clear);
+        self.carried.clear();
+    }
+
+    /// Puts a voxel before the sheet where it begins, counted from the slab's first.
+    #[inline(always)]
+    fn put(&mut self, sheet: usize, voxel: Waiting) {
+        self.buckets[sheet].push(voxel);
+        self.filled = self.filled.max(sheet + 1);
+    }
+
+    /// Voxels whose sheets were not come to.
+    fn waiting(&self) -> u64 {
+        self.buckets[..self.filled].iter().map(|b| b.len() as u64).sum()
+    }
+}
+
+/// A part with what it works on: compiled for each instruction set as a whole.
+pub(crate) struct RenderGeneral<'a, S: Accumulate> {
+    pub(crate) part: Part<'a>,
+    pub(crate) kind: &'a mut Kind<S>,
+    pub(crate) queues: &'a mut Queues,
+    pub(crate) pixels: &'a mut Pixels,
+    pub(crate) io: Io<'a>,
+}
+
+impl<S: Accumulate> Work for RenderGeneral<'_, S> {
+    type Out = ();
+    #[inline(always)]
+    fn run(self, _: Simd) {
+        let RenderGeneral { part, kind, queues, pixels, io } = self;
+        let slots = part.frame.sections.most() + 1;
+        kind.planes.reset(slots);
+        if part.frame.storeys.is_some() {
+            kind.lofts.reset(slots);
+            kind.reaching.iter_mut().for_each(Vec::clear);
+        }
+        General { part: &part }.render(kind, queues, pixels, io);
+    }
+}
+
+struct General<'a> {
+    part: &'a Part<'a>,
+}
+
+impl General<'_> {
+    #[inline(always)]
+    fn render<S: Accumulate>(
+        &self,
+        kind: &mut Kind<S>,
+        queues: &mut Queues,
+        pixels: &mut Pixels,
+        (out, counters): Io<'_>,
+    ) {
+        let part = self.part;
+        let Part { frame, slab, .. } = part;
+        let mut open = self.part.begin(pixels, out);
+        if let Some(last) = &out.last {
+            self.part.each_pixel(|x, y, tile| {
+                kind.planes.put(slab.first - 1, y * PART as usize + x, last[tile]);
+            });
+        }
+        queues.begin(slab.len() as usize);
+
+        let float_sums = frame.scene.float_sums();
+        let mut next = 0;
+        let mut any_open = open.count() > 0;
+        let mut end = slab.end;
+        for k in slab.first..slab.end {
+            if !any_open {
+                break;
+            }
+            if !part.is_supplied(k, &open, counters) {
+                end = k;
+                break;
+            }
+            while part.begins(next, k) {
+                self.admit(next, &open, queues, counters);
+                next += 1;
+            }
+            if k == slab.first && !queues.carried.is_empty() {
+                // Voxels that begin before the slab come first, as they do without the cut.
+                let mut carried = std::mem::take(&mut queues.carried);
+                if float_sums {
+                    let sections = &frame.sections;
+                    let id = |v: &Waiting| part.brick(v.brick as usize).0.id;
+                    carried.sort_unstable_by_key(|v| (sections.first(v.placed.z), id(v), v.voxel));
+                }
+                self.splat_all(&carried, k, kind, &open, counters);
+                carried.clear();
+                queues.carried = carried;
+            }
+            let mut bucket = std::mem::take(&mut queues.buckets[(k - slab.first) as usize]);
+            if float_sums {
+                bucket.sort_unstable_by_key(|v| (part.brick(v.brick as usize).0.id, v.voxel));
+            }
+            self.splat_all(&bucket, k, kind, &open, counters);
+            bucket.clear();
+            queues.buckets[(k - slab.first) as usize] = bucket;
+            if let Some(storeys) = &frame.storeys {
+                // What the sheet behind has so far, if the colour rule peeks there.
+                for k in k..=k + i32::from(frame.looks_at_neighbours()) {
+                    self.fold(k, storeys, kind, &open);
+                }
+                kind.lofts.clear(k);
+            }
+            if self.close(k, &kind.planes, &mut open, pixels) {
+                any_open = open.count() > 0;
+            }
+            kind.planes.clear(k - 1);
+        }
+        // Whatever the part did not come to is hidden, unless it goes on later.
+        let stopped = end < slab.end;
+        if !stopped {
+            counters.culled += part.voxels_from(next);
+            counters.culled += queues.waiting();
+        }
+        self.part.end(pixels, out);
+        if let Some(last) = keep_last(part, stopped, out) {
+            // Nobody reads a shut pixel's sums; they may be anything, so they are none.
+            self.part.each_pixel(|x, y, tile| {
+                if open.row(y) >> x & 1 == 1 {
+                    last[tile] = kind.planes.raw(end - 1, y * PART as usize + x);
+                }
+            });
+        }
+    }
+
+    /// Where a voxel's footprints lie, all sections together, a pixel more at most.
+    #[inline(always)]
+    fn extent(&self, placed: &Placed) -> Option<Rect> {
+        let frame = self.part.frame;
+        let (first, count) = frame.sections.span(placed.z);
+        let last = first + count as i32 - 1;
+        let at = |k: i32| {
+            let f = frame.footprints.at(k)?;
+            let at = frame.screen(placed, k, &f);
+            let (y0, y1) = f.extent(1, at[1]);
+            // Rows lie one way.
+            let [a, b] = [y0, y1 - 1].map(|y| f.extent(0, frame.along_row(at, y)));
+            Some(Rect::new(a.0.min(b.0), y0, a.1.max(b.1), y1))
+        };
+        if frame.leaning.is_some() {
+            let mut all = (first..=last).filter_map(at);
+            let one = all.next()?;
+            // As below, one that holds no pixel's centre counts, too.
+            return Some(all.fold(one, |a, b| {
+                let (x0, y0) = (a.x0.min(b.x0), a.y0.min(b.y0));
+                Rect::new(x0, y0, a.x1.max(b.x1), a.y1.max(b.y1))
+            }));
+        }
+        match frame.view.projection {
+            Projection::Ortho { .. } => at(first),
+            Projection::Persp { .. } => {
+                // Edges move one way with depth, so the first and last visible sections hold
+                // the others. An end's rounding may put one a pixel farther out: grow by one.
+                // One that holds no pixel's centre still says where the edges are, which
+                // `Rect::union` would forget.
+                let front = (first..=last).find_map(at)?;
+                let back = at(last)?;
+                let (x0, y0) = (front.x0.min(back.x0), front.y0.min(back.y0));
+                let (x1, y1) = (front.x1.max(back.x1), front.y1.max(back.y1));
+                Some(Rect::new(x0 - 1, y0 - 1, x1 + 1, y1 + 1))
+            }
+        }
+    }
+
+    /// Tests a brick, then its voxels, and tosses what is left into buckets.
+    #[inline(always)]
+    fn admit(&self, which: usize, open: &OpenMask, queues: &mut Queues, counters: &mut Counters) {
+        let Part { frame, rect, slab, .. } = self.part;
+        let Some((brick, corner)) = self.part.open_brick(which, open, counters) else { return };
+        let cull = frame.scene.quality.cull;
+        for (voxel, &local) in brick.index.iter().enumerate() {
+            let placed = frame.place(corner, local);
+            let (first, count) = frame.sections.span(placed.z);
+            if first >= slab.end || first + count as i32 <= slab.first {
+                continue;
+            }
+            let Some(extent) = self.extent(&placed) else { continue };
+            let inside = !extent.intersect(rect).is_empty();
+            if !inside || cull && !open.any(&extent) {
+                counters.culled += u64::from(inside);
+                continue;
+            }
+            counters.tossed += 1;
+            let waiting = Waiting { brick: which as u32, voxel: voxel as u16, placed };
+            if first < slab.first {
+                queues.carried.push(waiting);
+            } else {
+                queues.put((first - slab.first) as usize, waiting);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn splat_all<S: Accumulate>(
+        &self,
+        bucket: &[Waiting],
+        k: i32,
+        Kind { planes, lofts, weights, .. }: &mut Kind<S>,
+        open: &OpenMask,
+        counters: &mut Counters,
+    ) {
+        let Part { frame, rect, slab, .. } = self.part;
+        let leaning_rows = frame.leaning.as_ref().is_some_and(|l| l.row() != 0);
+        let rows = (rect.y0, rect.y1);
+        // The sheet behind the slab is filled as far as the colour rule peeks.
+        let end = slab.end + i32::from(frame.looks_at_neighbours());
+        // The first storey at the scale that was asked for last.
+        let mut based = (f64::NAN, 0);
+        for Waiting { brick, voxel, placed } in bucket {
+            let (brick, corner) = self.part.brick(*brick as usize);
+            if frame.scene.quality.cull && self.extent(placed).is_none_or(|e| !open.any(&e)) {
+                counters.culled += 1;
+                continue;
+            }
+            let payload = frame.payload(brick, usize::from(*voxel), placed.eye);
+            if payload[0] <= 0.0 {
+                continue;
+            }
+            counters.splatted += 1;
+            let (first, count) = frame.sections.span(placed.z);
+            for sheet in first.max(k).max(slab.first)..(first + count as i32).min(end) {
+                let Some(f) = frame.footprints.at(sheet) else { continue };
+                let at = frame.screen(placed, sheet, &f);
+                let i = (sheet - first) as usize;
+                let section = || S::section(&frame.sections, placed.z, i, &payload);
+                if let Some(storeys) = &frame.storeys {
+                    let (x0, wx) = S::Weight::of(&f, 0, at[0], (rect.x0, rect.x1), &mut weights[0]);
+                    if !wx.is_empty() {
+                        if based.0 != f.scale {
+                            based = (f.scale, storeys.base(&frame.view, rect, f.scale));
+                        }
+                        let base = based.1;
+                        let storey = frame.storey(corner, brick.index[usize::from(*voxel)]);
+                        let storey = storey.expect("a level view") as i32;
+                        let columns = ((x0 - rect.x0) as usize, wx);
+                        lofts.add((sheet, base), storey, columns, section());
+                    }
+                } else if leaning_rows {
+                    // Each lies elsewhere.
+                    let (y0, y1) = f.extent(1, at[1]);
+                    for y in y0.max(rows.0)..y1.min(rows.1) {
+                        let x = frame.along_row(at, y);
+                        if let Some(row) = self.window::<S>(&f, [x, at[1]], (y, y + 1), weights) {
+                            planes.add(sheet, row, section());
+                        }
+                    }
+                } else if let Some(window) = self.window::<S>(&f, at, rows, weights) {
+                    planes.add(sheet, window, section());
+                }
+            }
+        }
+    }
+
+    /// A footprint inside the part and `rows`, or nothing.
+    #[inline(always)]
+    fn window<'b, S: Accumulate>(
+        &self,
+        f: &'b Footprint<'_>,
+        [x, y]: [i64; 2],
+        rows: (i32, i32),
+        [bx, by]: &'b mut [Vec<S::Weight>; 2],
+    ) -> Option<Window<'b, S::Weight>> {
+        let rect = self.part.rect;
+        let (x0, wx) = S::Weight::of(f, 0, x, (rect.x0, rect.x1), bx);
+        let (y0, wy) = S::Weight::of(f, 1, y, rows, by);
+        let inside = !wx.is_empty() && !wy.is_empty();
+        let at = |p: i32, origin: i32| (p - origin) as usize;
+        inside.then(|| ((at(x0, rect.x0), wx), (at(y0, rect.y0), wy)))
+    }
+
+    /// Fills the plane of sheet `k` from its rows of storeys, where pixels are open.
+    #[inline(always)]
+    fn fold<S: Accumulate>(
+        &self,
+        k: i32,
+        storeys: &Storeys,
+        Kind { planes, lofts, weights, reaching }: &mut Kind<S>,
+        open: &OpenMask,
+    ) {
+        let Part { frame, rect, .. } = self.part;
+        planes.clear(k);
+        let Some(f) = frame.footprints.at(k) else { return };
+        // In a parallel view all sheets are alike.
+        let like = if let Projection::Ortho { .. } = frame.view.projection { 0 } else { k };
+        let reaching = &mut reaching[like as usize % 2];
+        reaching.resize_with(rect.height(), Default::default);
+        for y in 0..rect.height() {
+            if open.row(y) == 0 {
+                continue;
+            }
+            let row = rect.y0 + y as i32;
+            let weight = |at| {
+                let weight = S::Weight::of(&f, 1, at, (row, row + 1), &mut weights[1]).1[0];
+                weight.of_rows(storeys.spread)
+            };
+            let (of, reaching) = &mut reaching[y];
+            if of.replace(like) != Some(like) {
+                *reaching = storeys.reaching(&frame.view, &f, row, weight);
+            }
+            let some = &reaching.some[..reaching.n];
+            let mut columns = lofts.touched(k, some) & open.row(y);
+            // Blocks of columns beside each other: in those to which nothing was added there is nothing.
+            while columns != 0 {
+                let x = columns.trailing_zeros() as usize / BLOCK * BLOCK;
+                columns &= !(0xff << x);
+                planes.set(k, [x, y], &lofts.down(k, x, some));
+            }
+        }
+    }
+
+    /// Closes sheet `k` where it was touched; whether pixels were shut.
+    #[inline(always)]
+    fn close<S: Accumulate>(
+        &self,
+        k: i32,
+        planes: &Planes<S>,
+        open: &mut OpenMask,
+        pixels: &mut Pixels,
+    ) -> bool {
+        const { assert!(LANES == 2 * BLOCK) };
+        let rule = self.part.frame.rule;
+        let mut mask = planes.touched(k);
+        let mut any_shut = false;
+        let mut row = Row::default();
+        while mask != 0 {
+            let b = mask.trailing_zeros() as usize;
+            mask &= mask - 1;
+            let (x0, y0) = (b % 8 * BLOCK, b / 8 * BLOCK);
+            for y in (y0..y0 + BLOCK).step_by(2) {
+                let live = [y, y + 1].map(|y| open.row(y) >> x0 & 0xff);
+                if live == [0, 0] {
+                    continue;
+                }
+                let mut places = [0; LANES];
+                for (lane, place) in places.iter_mut().enumerate() {
+                    let at = (y + lane / BLOCK) * STRIDE + x0 + lane % BLOCK;
+                    let secant = pixels.secants[at];
+                    (row.secant[lane], row.cosine[lane]) = (secant, 1.0 / secant);
+                    row.a[lane] = f32::from_bits(pixels.all[at][0]);
+                    *place = at as u32;
+                }
+                for half in 0..2 {
+                    planes.load(k, (y + half) * PART as usize + x0, &mut row, half * BLOCK);
+                }
+                let shut = rule.close_row::<S>(&mut row, (live[0] | live[1] << BLOCK) as u32);
+                put(Simd::plain(), &row, &places, &mut pixels.all);
+                for half in 0..2 {
+                    let shut = u64::from(shut >> (half * BLOCK) & 0xff);
+                    open.close(y + half, shut << x0);
+                    any_shut |= shut != 0;
+                }
+            }
+        }
+        any_shut
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Queues, Waiting};
+
+    #[test]
+    fn what_a_part_left_is_gone_and_only_sheets_that_it_filled_are_looked_at() {
+        let mut queues = Queues::default();
+        queues.begin(1 << 20);
+        queues.put(700, Waiting::default());
+        queues.put(3, Waiting::default());
+        assert_eq!((queues.waiting(), queues.filled), (2, 701));
+        // It stopped there; the same worker draws a part of fewer sheets, then of more.
+        for sheets in [10, 1000] {
+            queues.begin(sheets);
+            assert_eq!((queues.waiting(), queues.filled), (0, 0));
+            queues.put(sheets - 1, Waiting::default());
+        }
+        queues.begin(1 << 20);
+        assert!(queues.buckets.iter().all(Vec::is_empty), "nothing is left over");
+    }
+}

@@ -1,0 +1,627 @@
+//! The open sheets of a part in records, and the walk through them, front to back.
+//!
+//! What differs between views is how voxels get there: [`crate::geometry::ortho`] and [`crate::geometry::perspective`] toss and
+//! splat; this room closes. Pixels that something was added to are known by a bit each; a sheet that
+//! closes looks at the open ones among those alone, sixteen at a time from wherever they lie.
+
+use crate::kernels::Simd;
+use crate::kernels::composite::rows::close_rows;
+use crate::kernels::composite::{LANES, Row};
+use crate::kernels::pixel_records::{Line, Record, Recorded, STRIDE};
+#[cfg(test)]
+use crate::kernels::row_records::Tiers;
+use crate::kernels::row_records::{Folded, Shape};
+use crate::kernels::touched::{Places, Some16, column_and_row, put, take, unpack};
+use crate::part::{Io, Part, Pixels, keep_last};
+use crate::primitives::sizes::PART;
+use crate::visibility::open_mask::{OpenMask, doubling};
+use slabcast_common::message::Counters;
+use slabcast_common::view::Projection;
+
+pub(crate) const EDGE: usize = PART as usize;
+
+/// Memory for sums of one kind.
+pub(crate) struct Store<S: Recorded> {
+    /// Records of any number of sheets; nothing in them between parts.
+    lines: Vec<Line>,
+    pub(crate) closes: Closes<S>,
+    pub(crate) level: LevelStore<S>,
+}
+
+/// Memory for level views.
+pub(crate) struct LevelStore<S: Recorded> {
+    /// Tiers, in which there is nothing between parts but in margins; and of which shape they are.
+    tiers: Vec<Line>,
+    shape: (Shape, usize),
+    /// Sums of pixels that close.
+    folded: Folded<S>,
+}
+
+impl<S: Recorded> LevelStore<S> {
+    /// Tiers of this shape for so many sheets, and room for the sums of a part's pixels.
+    pub(crate) fn of(&mut self, shape: Shape, sheets: usize) -> (&mut [Line], &mut Folded<S>) {
+        let n = shape.lines(sheets);
+        if self.shape != (shape, sheets) {
+            // Margins lie elsewhere now.
+            self.shape = (shape, sheets);
+            self.tiers.fill(Line::ZERO);
+            self.tiers.resize(n.max(self.tiers.len()), Line::ZERO);
+        }
+        (&mut self.tiers[..n], &mut self.folded)
+    }
+}
+
+/// Memory for sheets that are closed, and what is known of the one before.
+pub(crate) struct Closes<S: Recorded> {
+    /// Sums of the sheet before, where it was touched; elsewhere anything.
+    before: Vec<S::Pixel>,
+    /// Pixels of `before` that are the sheet's before.
+    was: Rows,
+    places: Places,
+    sifting: Sifting,
+}
+
+impl<S: Recorded> Default for Store<S> {
+    fn default() -> Self {
+        let shape = (Shape::default(), 0);
+        let level = LevelStore { tiers: Vec::new(), shape, folded: Folded::default() };
+        Store { lines: Vec::new(), closes: Closes::default(), level }
+    }
+}
+
+#[cfg(test)]
+impl<S: Recorded> Store<S> {
+    /// Whether there are no sums of any part, and whether there are tiers at all.
+    pub(crate) fn is_empty(&mut self) -> (bool, bool) {
+        let LevelStore { tiers, shape: (shape, sheets), .. } = &mut self.level;
+        let empty = match *sheets {
+            4 => Tiers::<S, 4>::new(tiers, *shape).are_empty(),
+            8 => Tiers::<S, 8>::new(tiers, *shape).are_empty(),
+            _ => true,
+        };
+        let records: &[u64] = bytemuck::cast_slice(&self.lines);
+        (empty && records.iter().all(|sums| *sums == 0), *sheets > 0)
+    }
+}
+
+impl<S: Recorded> Default for Closes<S> {
+    fn default() -> Self {
+        Closes {
+            before: Vec::new(),
+            was: [0; EDGE],
+            places: Places::default(),
+            sifting: Sifting::default(),
+        }
+    }
+}
+
+/// Voxels of one bucket: the first `n` items; what is behind them is there from before, so that a voxel is added by one
+/// store.
+pub(crate) struct Bucket<V> {
+    items: Vec<V>,
+    n: usize,
+}
+
+impl<V> Default for Bucket<V> {
+    fn default() -> Self {
+        Bucket { items: Vec::new(), n: 0 }
+    }
+}
+
+impl<V: Copy> Bucket<V> {
+    #[inline(always)]
+    pub(crate) fn push(&mut self, voxel: &V) {
+        let Bucket { items, n } = self;
+        match items.get_mut(*n) {
+            Some(to) => *to = *voxel,
+            None => items.push(*voxel),
+        }
+        *n += 1;
+    }
+
+    #[inline(always)]
+    fn voxels(&self) -> &[V] {
+        &self.items[..self.n]
+    }
+
+    #[inline(always)]
+    fn clear(&mut self) {
+        self.n = 0;
+    }
+}
+
+/// Voxels that wait.
+pub(crate) struct Queues<V> {
+    pub(crate) buckets: Vec<Bucket<V>>,
+    /// Voxels that begin before the slab, and where.
+    pub(crate) carried: Vec<(V, i32)>,
+}
+
+impl<V> Default for Queues<V> {
+    fn default() -> Self {
+        Queues { buckets: Vec::new(), carried: Vec::new() }
+    }
+}
+
+/// Open sheets of a part, whatever they keep their sums in.
+pub(crate) trait Open<S: Recorded> {
+    /// Sums of the sheet before by pixel, and where these are.
+    fn before(&mut self) -> (&mut [S::Pixel], &mut Rows);
+    /// From now on voxels begin at sheet `k`.
+    fn begin(&mut self, k: i32);
+    /// Closes sheet `k` where it was touched; whether pixels were shut.
+    fn close(&mut self, k: i32, part: &Part<'_>, open: &mut OpenMask, pixels: &mut Pixels) -> bool;
+    /// Leaves nothing behind, where sheets before `k` are closed.
+    fn empty(&mut self, k: i32);
+}
+
+/// How voxels of one kind of view get into sheets, which are kept in `H`.
+pub(crate) trait Stage<H> {
+    /// A voxel waiting in the bucket of its first sheet.
+    type Voxel: Copy;
+
+    /// Pixels along x and y that a footprint reaches at most from the one that holds its centre.
+    fn reach(&self) -> [i32; 2];
+    /// Tests brick `which` of the part, then its voxels, and tosses what is left into buckets.
+    fn toss(
+        &mut self,
+        which: usize,
+        open: &OpenMask,
+        queues: &mut Queues<Self::Voxel>,
+        counters: &mut Counters,
+    );
+    /// Shades voxels that are due at sheet `k`, and adds them to those of their sheets that are left.
+    fn splat(
+        &mut self,
+        due: &Due<'_, Self::Voxel>,
+        k: i32,
+        sheets: &mut H,
+        open: &OpenMask,
+        counters: &mut Counters,
+    );
+}
+
+/// Voxels that are drawn from some sheet on: those that begin there, and those that began before the slab, with their
+/// first sheets.
+pub(crate) struct Due<'a, V> {
+    here: &'a [V],
+    before: &'a [(V, i32)],
+}
+
+/// Some that are due, of one kind.
+pub(crate) enum Chunk<'a, V> {
+    Here(&'a [V]),
+    Before(&'a [(V, i32)]),
+}
+
+impl<'a, V> Due<'a, V> {
+    #[inline(always)]
+    pub(crate) fn is_empty(&self) -> bool {
+        self.here.is_empty() && self.before.is_empty()
+    }
+
+    /// At most `n` at a time: one loop over both, since what draws them is a lot of code.
+    #[inline(always)]
+    pub(crate) fn chunks(&self, n: usize) -> impl Iterator<Item = Chunk<'a, V>> + use<'a, V> {
+        let before = self.before.chunks(n).map(Chunk::Before);
+        before.chain(self.here.chunks(n).map(Chunk::Here))
+    }
+}
+
+impl<V> Chunk<'_, V> {
+    /// How many.
+    #[inline(always)]
+    pub(crate) fn len(&self) -> usize {
+        match self {
+            Chunk::Here(some) => some.len(),
+            Chunk::Before(some) => some.len(),
+        }
+    }
+
+    /// Has each taken over as the `n`th of those that are kept so far, with as many of its sheets gone at sheet `k`,
+    /// unless it is told not to keep it; says how many are kept.
+    #[inline(always)]
+    pub(crate) fn keep(&self, k: i32, mut take: impl FnMut(usize, &V, i32) -> bool) -> usize {
+        let mut n = 0;
+        match self {
+            Chunk::Here(some) => {
+                for v in *some {
+                    n += usize::from(take(n, v, 0));
+                }
+            }
+            Chunk::Before(some) => {
+                for (v, first) in *some {
+                    n += usize::from(take(n, v, k - first));
+                }
+            }
+        }
+        n
+    }
+}
+
+/// Walks through the sheets of `part`'s slab.
+#[inline(always)]
+pub(crate) fn walk<S: Recorded, H: Open<S>, T: Stage<H>>(
+    part: &Part<'_>,
+    mut stage: T,
+    mut sheets: H,
+    queues: &mut Queues<T::Voxel>,
+    pixels: &mut Pixels,
+    (out, counters): Io<'_>,
+) {
+    let slab = part.slab;
+    let mut open = part.begin(pixels, out);
+    if let Some(last) = &out.last {
+        let (before, was) = sheets.before();
+        part.each_pixel(|x, y, tile| {
+            before[y * STRIDE + x] = S::from_raw(last[tile]);
+        });
+        *was = [u64::MAX; EDGE];
+    }
+    if queues.buckets.len() < slab.len() as usize {
+        queues.buckets.resize_with(slab.len() as usize, Bucket::default);
+    }
+    open.grow(stage.reach());
+    let mut any_open = open.count() > 0;
+    let (mut next, mut k) = (0, slab.first);
+    let mut stopped = false;
+    while k < slab.end && any_open {
+        if !part.is_supplied(k, &open, counters) {
+            stopped = true;
+            break;
+        }
+        while part.begins(next, k) {
+            stage.toss(next, &open, queues, counters);
+            next += 1;
+        }
+        sheets.begin(k);
+        let bucket = &mut queues.buckets[(k - slab.first) as usize];
+        let due = Due { here: bucket.voxels(), before: &queues.carried };
+        if !due.is_empty() {
+            stage.splat(&due, k, &mut sheets, &open, counters);
+        }
+        bucket.clear();
+        queues.carried.clear();
+        if sheets.close(k, part, &mut open, pixels) {
+            any_open = open.count() > 0;
+            open.grow(stage.reach());
+        }
+        k += 1;
+    }
+    // Whatever the part did not come to is hidden, unless it goes on later.
+    let hidden = u64::from(!stopped);
+    counters.culled += hidden * part.voxels_from(next);
+    queues.carried.clear();
+    for bucket in &mut queues.buckets {
+        counters.culled += hidden * bucket.n as u64;
+        bucket.clear();
+    }
+    part.end(pixels, out);
+    if let Some(last) = keep_last(part, stopped, out) {
+        let (before, was) = sheets.before();
+        // Nobody reads a shut pixel's sums; they may be anything, so they are none.
+        part.each_pixel(|x, y, tile| {
+            let touched = (was[y] & open.row(y)) >> x & 1 == 1;
+            last[tile] = if touched { S::raw(&before[y * STRIDE + x]) } else { [0; 4] };
+        });
+    }
+    sheets.empty(k);
+}
+
+/// Pixels of a part, a bit each, row by row.
+pub(crate) type Rows = [u64; EDGE];
+
+/// When to look for touched pixels that nothing reached. In 16-bit sums a footprint's corners and much of its
+/// outermost sections round to nothing: of mri256 a quarter of what is touched, of aneurism more than a third;
+/// of fog a thirtieth, and in 32-bit sums half as much.
+#[derive(Default)]
+struct Sifting {
+    /// Sheets until it is looked at again whether it pays.
+    rest: u32,
+}
+
+impl Sifting {
+    /// It takes a tenth of what closing does, and a pixel by itself; so it pays from here on.
+    const PAYS: usize = 5;
+
+    /// Sheets that go by where it does not.
+    const REST: u32 = 7;
+
+    #[inline(always)]
+    fn is_due(&mut self) -> bool {
+        let due = self.rest == 0;
+        self.rest = self.rest.saturating_sub(1);
+        due
+    }
+
+    /// Of `n` pixels `none` had nothing.
+    #[inline(always)]
+    fn found(&mut self, none: usize, n: usize) {
+        if none * Sifting::PAYS < n {
+            self.rest = Sifting::REST;
+        }
+    }
+}
+
+/// Closes the pixels of a sheet that are beside each other.
+#[inline(always)]
+pub(crate) fn close_folded<S: Recorded>(
+    simd: Simd,
+    folded: &Folded<S>,
+    part: &Part<'_>,
+    open: &mut OpenMask,
+    pixels: &mut Pixels,
+) -> bool {
+    let mut some = Closing { simd, part, open, pixels, any_shut: false };
+    some.all::<S>(folded.places(), |i, _, _, row| {
+        let (sheets, opacities) = folded.sums(i);
+        unpack::<S>(simd, sheets, opacities, row);
+    });
+    some.any_shut
+}
+
+impl<S: Recorded> Closes<S> {
+    /// Begins a part.
+    #[inline(always)]
+    pub(crate) fn begin(&mut self) {
+        self.before.resize(STRIDE * EDGE, S::Pixel::default());
+        self.was = [0; EDGE];
+        self.sifting = Sifting::default();
+    }
+
+    /// [`Open::before`].
+    #[inline(always)]
+    pub(crate) fn before(&mut self) -> (&mut [S::Pixel], &mut Rows) {
+        (&mut self.before, &mut self.was)
+    }
+
+    /// Closes the sheet that `slot` of `records` holds at the pixels of `closing`, of those that it was
+    /// `touched` at; whether pixels were shut.
+    #[inline(always)]
+    fn close<const N: usize>(
+        &mut self,
+        simd: Simd,
+        (records, slot): (&mut [Record<S, N>], usize),
+        (closing, touched): (&Rows, &Rows),
+        part: &Part<'_>,
+        open: &mut OpenMask,
+        pixels: &mut Pixels,
+    ) -> bool {
+        self.begin_sheet(closing, touched);
+        let Closes { before, places, sifting, .. } = self;
+        places.list(simd, closing);
+        if sifting.is_due() {
+            let n = places.len();
+            places.sift::<S, N>(simd, (records, before), slot);
+            sifting.found(n - places.len(), n);
+        }
+        let mut some = Closing { simd, part, open, pixels, any_shut: false };
+        some.all::<S>(places, |_, places, pixels, row| {
+            take::<S, N>(simd, (&mut *records, &mut *before), pixels, places, slot, row);
+        });
+        some.any_shut
+    }
+
+    /// What comes before a sheet that is touched at some pixels and closes at some is there from here on.
+    #[inline(always)]
+    fn begin_sheet(&mut self, closing: &Rows, touched: &Rows) {
+        let Closes { before, was, .. } = self;
+        for (y, (closing, was)) in closing.iter().zip(&*was).enumerate() {
+            // Where this sheet has something and the one before had nothing.
+            let mut fresh = closing & !was;
+            while fresh != 0 {
+                let x = fresh.trailing_zeros();
+                let run = (fresh >> x).trailing_ones();
+                before[y * STRIDE + x as usize..][..run as usize].fill(S::Pixel::default());
+                // Adding carries through the run.
+                fresh &= fresh.wrapping_add(1 << x);
+            }
+        }
+        *was = *touched;
+    }
+}
+
+/// The open sheets of a part, in records.
+pub(crate) struct Sheets<'a, S: Recorded, const N: usize> {
+    pub(crate) simd: Simd,
+    pub(crate) records: &'a mut [Record<S, N>],
+    closes: &'a mut Closes<S>,
+    /// By slot of their first sheet: pixels that voxels touch.
+    added: [Rows; N],
+    /// Shut pixels with records that may not be zero.
+    dead: Rows,
+    /// Sheets that a voxel touches at most.
+    most: usize,
+}
+
+#[inline(always)]
+pub(crate) fn slot<const N: usize>(k: i32) -> usize {
+    k as usize % N
+}
+
+impl<S: Recorded, const N: usize> Open<S> for Sheets<'_, S, N> {
+    #[inline(always)]
+    fn before(&mut self) -> (&mut [S::Pixel], &mut Rows) {
+        self.closes.before()
+    }
+
+    #[inline(always)]
+    fn begin(&mut self, k: i32) {
+        self.added[slot::<N>(k)] = [0; EDGE];
+    }
+
+    #[inline(always)]
+    fn close(&mut self, k: i32, part: &Part<'_>, open: &mut OpenMask, pixels: &mut Pixels) -> bool {
+        let touched = self.touched(k + 1 - self.most as i32, k);
+        let mut closing = touched;
+        for (y, (closing, dead)) in closing.iter_mut().zip(&mut self.dead).enumerate() {
+            // Nobody looks at shut pixels again in this part.
+            *dead |= *closing & !open.row(y);
+            *closing &= open.row(y);
+        }
+        let records = (&mut *self.records, slot::<N>(k));
+        self.closes.close(self.simd, records, (&closing, &touched), part, open, pixels)
+    }
+
+    #[inline(always)]
+    fn empty(&mut self, k: i32) {
+        let left = self.touched(k + 1 - self.most as i32, k - 1);
+        for (y, (left, dead)) in left.iter().zip(&self.dead).enumerate() {
+            let some = left | dead;
+            if some != 0 {
+                let [from, to] = [some.trailing_zeros(), 64 - some.leading_zeros()];
+                let [from, to] = [from, to].map(|x| y * STRIDE + x as usize);
+                self.records[from..to].fill([S::Pixel::default(); N]);
+            }
+        }
+    }
+}
+
+impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
+    /// In memory of `store`, for voxels that touch `most` sheets at most.
+    pub(crate) fn new(simd: Simd, store: &'a mut Store<S>, most: usize) -> Self {
+        let Store { lines: all, closes, .. } = store;
+        let lines = STRIDE * EDGE * size_of::<Record<S, N>>() / size_of::<Line>();
+        if all.len() < lines {
+            all.resize(lines, Line::ZERO);
+        }
+        closes.begin();
+        Sheets {
+            simd,
+            records: bytemuck::cast_slice_mut(&mut all[..lines]),
+            closes,
+            added: [[0; EDGE]; N],
+            dead: [0; EDGE],
+            most,
+        }
+    }
+
+    /// Notes that voxels that begin at sheet `k` touch so many columns and rows from where `corners` has
+    /// bits.
+    #[inline(always)]
+    pub(crate) fn touch_all(&mut self, k: i32, corners: &Rows, [wide, high]: [usize; 2]) {
+        let added = &mut self.added[slot::<N>(k)];
+        let mut grown = *corners;
+        // Columns and rows double until so many are there, or the part ends.
+        for done in doubling(wide) {
+            for row in &mut grown {
+                *row |= *row << done;
+            }
+        }
+        for done in doubling(high) {
+            let was = grown;
+            for (row, was) in grown[done..].iter_mut().zip(&was) {
+                *row |= was;
+            }
+        }
+        for (added, grown) in added.iter_mut().zip(&grown) {
+            *added |= grown;
+        }
+    }
+
+    /// Pixels that voxels which begin at sheets `from` to `k` touch.
+    #[inline(always)]
+    fn touched(&self, from: i32, k: i32) -> Rows {
+        let mut rows = [0; EDGE];
+        for first in from..=k {
+            for (row, added) in rows.iter_mut().zip(&self.added[slot::<N>(first)]) {
+                *row |= added;
+            }
+        }
+        rows
+    }
+}
+
+/// A sheet that is being closed.
+struct Closing<'a> {
+    simd: Simd,
+    part: &'a Part<'a>,
+    open: &'a mut OpenMask,
+    pixels: &'a mut Pixels,
+    any_shut: bool,
+}
+
+impl Closing<'_> {
+    /// Composites all of `places`, of which `take` puts those from the `i`th on into a row.
+    #[inline(always)]
+    fn all<S: Recorded>(
+        &mut self,
+        places: &Places,
+        mut take: impl FnMut(usize, Some16<'_>, &[[u32; 4]], &mut Row),
+    ) {
+        let mut rows: [Row; 2] = Default::default();
+        for i in (0..places.len()).step_by(2 * LANES) {
+            let first = places.from(i);
+            take(i, first, &self.pixels.all, &mut rows[0]);
+            if i + LANES < places.len() {
+                let second = places.from(i + LANES);
+                take(i + LANES, second, &self.pixels.all, &mut rows[1]);
+                self.close::<S, 2>(&mut rows, [first, second]);
+            } else {
+                self.close::<S, 1>(rows.first_chunk_mut().expect("one of two"), [first]);
+            }
+        }
+    }
+
+    /// Composites pixels whose sums are in rows.
+    #[inline(always)]
+    fn close<S: Recorded, const ROWS: usize>(
+        &mut self,
+        rows: &mut [Row; ROWS],
+        places: [Some16<'_>; ROWS],
+    ) {
+        let Closing { simd, part, open, pixels, any_shut } = self;
+        // Where rays are parallel, the rows' secants stay 1.
+        if let Projection::Persp { .. } = part.frame.view.projection {
+            for (row, places) in rows.iter_mut().zip(places) {
+                for (secant, &at) in row.secant.iter_mut().zip(places.at()) {
+                    *secant = pixels.secants[at as usize];
+                }
+                for (cosine, secant) in row.cosine.iter_mut().zip(&row.secant) {
+                    *cosine = 1.0 / secant;
+                }
+            }
+        }
+        let mut live = [0; ROWS];
+        for (live, places) in live.iter_mut().zip(places) {
+            *live = (1 << places.len()) - 1;
+        }
+        let shut = close_rows::<S, ROWS>(*simd, &part.frame.rule, rows, live);
+        for ((row, places), mut shut) in rows.iter().zip(places).zip(shut) {
+            put(*simd, row, &places.at()[..places.len()], &mut pixels.all);
+            *any_shut |= shut != 0;
+            while shut != 0 {
+                let [x, y] = column_and_row(places.at()[shut.trailing_zeros() as usize % LANES]);
+                open.close(y, 1 << x);
+                shut &= shut - 1;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn voxels_touch_together_what_they_touch_one_by_one(
+            [wide, high] in prop::array::uniform2(1..=64usize),
+            corners in prop::collection::vec(any::<[usize; 2]>(), 0..20),
+        ) {
+            let mut store = Store::<i32>::default();
+            let mut together = Sheets::<i32, 4>::new(Simd::plain(), &mut store, 4);
+            let [mut rows, mut one_by_one] = [[0u64; EDGE]; 2];
+            for [x, y] in corners {
+                let [x, y] = [x % EDGE, y % EDGE];
+                rows[y] |= 1 << x;
+                for row in &mut one_by_one[y..EDGE.min(y + high)] {
+                    *row |= (u64::MAX >> (EDGE - wide)) << x;
+                }
+            }
+            together.touch_all(2, &rows, [wide, high]);
+            prop_assert_eq!(together.touched(0, 3), one_by_one);
+        }
+    }
+}

@@ -1,0 +1,255 @@
+//! A tile part of a flat view in whole sums: the fast way.
+//!
+//! Flat is a view whose voxels have one footprint in all their sheets: orthographic, with
+//! footprints in a table ([`crate::primitives::positions`]). Then a voxel is a handful of integers, which are
+//! worked out sixteen at a time:
+//!
+//! 1. **Toss.** Positions are a corner and an offset; one bit of the mask says
+//!    whether a footprint may touch an open pixel. What is left waits in the bucket of its first
+//!    sheet with all that drawing it takes, so that nobody goes back to the brick.
+//! 2. **Splat.** The bit is looked at once more, since pixels have shut meanwhile; light falls on
+//!    sixteen voxels at once; each is added to the records of its footprint with all its sections
+//!    ([`crate::kernels::records`]). A footprint that leaves the part is moved inside and reads zeros.
+//! 3. **Close.** Open pixels that something was added to are composited sixteen at a time.
+//!
+//! The bytes are those of [`crate::oracle::serial`], which knows none of this.
+
+use crate::geometry::open_sheets::{Chunk, Due, EDGE, Queues, Sheets, Stage, Store, slot, walk};
+use crate::kernels::pixel_records::{Recorded, Splat, Table, Tables, splat};
+use crate::kernels::toss::{self, Packing, Sieve, Sifted, Tossing, prefetch};
+use crate::kernels::{Simd, Work, whole_registers};
+use crate::part::{Io, Part, Pixels};
+use crate::primitives::footprint::Phases;
+use crate::primitives::positions::Places;
+use crate::primitives::sizes::PART;
+use crate::scene::{Flat, Frame};
+use crate::visibility::open_mask::OpenMask;
+use slabcast_common::message::Counters;
+use slabcast_common::view::SUBPIXELS;
+
+/// Memory for voxels that a render thread keeps from part to part.
+#[derive(Default)]
+pub(crate) struct Waiting {
+    pub(crate) queues: Queues<Splat>,
+    pub(crate) tossing: Tossing,
+    pub(crate) batch: Batch,
+}
+
+/// Voxels that are shaded and splatted together. A bucket of a part has some 50; at 16 loops are
+/// too short for lanes, at 1024 this is more than a first cache.
+pub(crate) const BATCH: usize = 128;
+
+/// Voxels on their way from a bucket to the records.
+pub(crate) struct Batch {
+    pub(crate) voxels: [Splat; BATCH],
+    /// Of those that began before the slab, how many of their sheets lie there.
+    pub(crate) gone: [u32; BATCH],
+    samples: [u32; BATCH],
+    normals: [u16; BATCH],
+    light: [[f32; BATCH]; 4],
+}
+
+impl Default for Batch {
+    fn default() -> Self {
+        Batch {
+            voxels: [Splat::default(); BATCH],
+            gone: [0; BATCH],
+            samples: [0; BATCH],
+            normals: [0; BATCH],
+            light: [[0.0; BATCH]; 4],
+        }
+    }
+}
+
+impl Batch {
+    /// Takes over those of `some` voxels, which are due at sheet `k`, that are still wanted, notes each, and has light
+    /// fall on them; says how many there are.
+    #[inline(always)]
+    pub(crate) fn light<S: Recorded>(
+        &mut self,
+        (simd, part, open): (Simd, &Part<'_>, &OpenMask),
+        (some, k): (&Chunk<'_, Splat>, i32),
+        counters: &mut Counters,
+        mut note: impl FnMut(&Splat),
+        payloads: &mut [S::Payload; BATCH],
+    ) -> usize {
+        let cull = part.frame.scene.quality.cull;
+        let Batch { voxels, gone, samples, normals, light } = self;
+        let n = some.keep(k, |n, v, of| {
+            (voxels[n], gone[n]) = (*v, of as u32);
+            !cull | open.is_near(v.cell())
+        });
+        for (i, v) in voxels[..n].iter().enumerate() {
+            (samples[i], normals[i]) = (v.sample, v.normal());
+            note(v);
+        }
+        part.frame.payloads(
+            simd,
+            &samples[..n],
+            &normals[..whole_registers::<BATCH>(n)],
+            None,
+            light,
+        );
+        let [sigma, r, g, b] = light;
+        for (i, payload) in payloads[..n].iter_mut().enumerate() {
+            *payload = S::payload([sigma[i], r[i], g[i], b[i]]);
+        }
+        counters.culled += (some.len() - n) as u64;
+        counters.splatted += n as u64;
+        n
+    }
+}
+
+/// Renders a part: compiled for each instruction set as a whole.
+pub(crate) struct RenderFlat<'a, S: Recorded, const N: usize> {
+    pub(crate) part: Part<'a>,
+    pub(crate) view: &'a Flat,
+    pub(crate) store: &'a mut Store<S>,
+    pub(crate) waiting: &'a mut Waiting,
+    pub(crate) pixels: &'a mut Pixels,
+    pub(crate) io: Io<'a>,
+}
+
+/// Whether parts of `frame` may be rendered here.
+pub(crate) fn takes(frame: &Frame) -> Option<&Flat> {
+    let fits = |flat: &&Flat| flat.reach.iter().all(|reach| 2 * reach < PART);
+    frame.flat.as_ref().filter(fits).filter(|_| frame.leaning.is_none())
+}
+
+impl<S: Recorded, const N: usize> Work for RenderFlat<'_, S, N> {
+    type Out = ();
+    #[inline(always)]
+    fn run(self, simd: Simd) {
+        let RenderFlat { part, view: flat, store, waiting, pixels, io } = self;
+        let footprint = part.frame.footprints.at(0).expect("a flat view's sheets are all drawn");
+        let axis = |axis| {
+            let phases = footprint.phases(axis)?;
+            Some((phases, Table { weights: S::across(&footprint, axis)?, len: phases.len }))
+        };
+        let [(phases_x, x), (phases_y, y)] =
+            [0, 1].map(|a| axis(a).expect("a flat view's footprints have tables"));
+        let sections = &part.frame.sections;
+        let deep = Table { weights: S::deep(sections), len: sections.most() };
+        let tables = Tables { across: [x, y], deep };
+        let Waiting { queues, tossing, batch } = waiting;
+        let phases = [phases_x, phases_y];
+        let stage = FlatStage { part: &part, simd, flat, phases, tables, tossing, batch };
+        let sheets = Sheets::<S, N>::new(simd, store, part.frame.sections.most());
+        walk(&part, stage, sheets, queues, pixels, io);
+    }
+}
+
+/// What a voxel's brick is among a part's, which pixels are open, where voxels wait, and what is counted.
+pub(crate) type Asked<'a> = (usize, &'a OpenMask, &'a mut Queues<Splat>, &'a mut Counters);
+
+/// [`Stage::toss`] in a view that is flat.
+#[inline(always)]
+pub(crate) fn toss(
+    part: &Part<'_>,
+    simd: Simd,
+    flat: &Flat,
+    packing: Packing<'_>,
+    tossing: &mut Tossing,
+    (which, open, queues, counters): Asked<'_>,
+) {
+    let Part { frame, rect, slab, .. } = part;
+    let Some((brick, corner)) = part.open_brick(which, open, counters) else { return };
+    if let Some(next) = part.peek(which + 1) {
+        prefetch(next);
+    }
+    let base = part.first_sheet(which);
+    let origin = [
+        i64::from(rect.x0 * SUBPIXELS),
+        i64::from(rect.y0 * SUBPIXELS),
+        i64::from(base) * i64::from(frame.sections.phases()),
+    ];
+    let sieve = Sieve {
+        places: toss::FlatBrick { places: &flat.places, from: Places::from(corner.flat, origin) },
+        open,
+        cull: frame.scene.quality.cull,
+        sections: &frame.sections,
+        // From the sheet that depths are counted from.
+        sheets: [slab.first, slab.end].map(|k| k - base),
+    };
+    let Sifted { reached, kept } = sieve.sift_ready(simd, brick, packing, tossing);
+    counters.tossed += kept as u64;
+    counters.culled += (reached - kept) as u64;
+    for (first, voxel) in tossing.ready(kept) {
+        let first = base + *first;
+        if first < slab.first {
+            queues.carried.push((*voxel, first));
+        } else {
+            queues.buckets[(first - slab.first) as usize].push(voxel);
+        }
+    }
+}
+
+struct FlatStage<'a, S: Recorded> {
+    part: &'a Part<'a>,
+    simd: Simd,
+    flat: &'a Flat,
+    /// Where weights across and down lie.
+    phases: [Phases; 2],
+    tables: Tables<'a, S>,
+    tossing: &'a mut Tossing,
+    batch: &'a mut Batch,
+}
+
+impl<S: Recorded, const N: usize> Stage<Sheets<'_, S, N>> for FlatStage<'_, S> {
+    type Voxel = Splat;
+
+    #[inline(always)]
+    fn reach(&self) -> [i32; 2] {
+        self.flat.reach
+    }
+
+    #[inline(always)]
+    fn toss(
+        &mut self,
+        which: usize,
+        open: &OpenMask,
+        queues: &mut Queues<Splat>,
+        counters: &mut Counters,
+    ) {
+        let asked = (which, open, queues, counters);
+        let packing = Packing::Window(&self.phases);
+        toss(self.part, self.simd, self.flat, packing, self.tossing, asked);
+    }
+
+    #[inline(always)]
+    fn splat(
+        &mut self,
+        due: &Due<'_, Splat>,
+        k: i32,
+        sheets: &mut Sheets<'_, S, N>,
+        open: &OpenMask,
+        counters: &mut Counters,
+    ) {
+        let mut payloads = [S::Payload::default(); BATCH];
+        let mut corners = [0; EDGE];
+        let slot = slot::<N>(k);
+        for some in due.chunks(BATCH) {
+            let note = |v: &Splat| {
+                let [x, y] = v.first();
+                corners[y % EDGE] |= 1 << x;
+            };
+            let asked = (sheets.simd, self.part, open);
+            let n = self.batch.light::<S>(asked, (&some, k), counters, note, &mut payloads);
+            let (voxels, payloads) = (&self.batch.voxels[..n], &payloads[..n]);
+            match some {
+                Chunk::Here(_) => {
+                    let (voxels, records) = ((voxels, payloads), &mut *sheets.records);
+                    S::splat_all(sheets.simd, records, voxels, slot, &self.tables);
+                }
+                Chunk::Before(_) => {
+                    for ((v, gone), &payload) in voxels.iter().zip(&self.batch.gone).zip(payloads) {
+                        let (x, y, z) = v.weights(&self.tables);
+                        let left = &z[*gone as usize..];
+                        splat::<S, N>(sheets.records, v.at(), (x, y, left), payload, slot);
+                    }
+                }
+            }
+        }
+        sheets.touch_all(k, &corners, self.tables.across.map(|t| t.len));
+    }
+}

@@ -1,0 +1,190 @@
+//! How far a tile is off, at a few of its pixels: from sheets of half the thickness, and (by `model`) from
+//! what the model would be without rounded positions, the kernel's cut and its ripple.
+//!
+//! What thin sheets come to is not known where a frame is drawn; how much a picture changes when they
+//! become thinner is, and it tells: an error that falls with the power p of the thickness is
+//! 1 / (1 - 2^-p) of that change (Richardson's extrapolation; [`slabcast_common::stats::EXTRAPOLATION`]).
+//! One pixel in 128 is drawn twice, in blocks, since neighbours share footprints.
+
+mod model;
+
+use self::model::Model;
+use crate::kernels::Simd;
+use crate::scene::{Frame, Scene};
+use crate::tile::{self, Scratch};
+use slabcast_common::brick::{Brick, TightBox};
+use slabcast_common::image::{COLOUR_UNIT, TilePixels, TileState};
+use slabcast_common::message::{Sampled, Sampling, SceneSpec};
+use slabcast_common::occlusion::Rect;
+use slabcast_common::quality::Quality;
+use slabcast_common::region::parts;
+use slabcast_common::slab::SheetRange;
+use slabcast_common::view::{Projected, View};
+use std::sync::Arc;
+
+/// Edge of a block in pixels. A footprint of 3 pixels to each side is drawn for a block of 8 some three
+/// times as often as for a tile; for single pixels fifty times.
+const BLOCK: i32 = 8;
+
+/// Of so many pixels one is drawn again, in a picture of some size.
+const ONE_IN: u32 = 128;
+
+/// Blocks of a small picture at least. From half as many the estimate was off by more than two.
+const AT_LEAST: u32 = 32;
+
+/// Of eps, what is left where thickness alone is to show: a shut pixel is as far off as thickness makes it.
+const EPS: f64 = 1.0 / 16.0;
+
+/// A scene in sheets of its thickness and of half of it.
+pub struct Pair([Arc<Scene>; 2]);
+
+impl Pair {
+    /// `None` where half as thick is thinner than sheets may be.
+    pub fn of(spec: &SceneSpec) -> Option<Pair> {
+        let q = spec.quality;
+        let [whole, half] = [1.0, 0.5].map(|times| {
+            let quality = Quality { thickness: q.thickness * times, eps: q.eps * EPS, ..q };
+            quality.check().ok()?;
+            Some(Arc::new(Scene::new(&SceneSpec { quality, ..spec.clone() })))
+        });
+        Some(Pair([whole?, half?]))
+    }
+
+    /// A view of it.
+    pub fn frames(&self, view: &View) -> [Frame; 2] {
+        let Pair([whole, half]) = self;
+        let thin = view.in_sheets_of(&half.quality);
+        [Frame::new(whole.clone(), *view), Frame::new(half.clone(), thin)]
+    }
+}
+
+/// The blocks of a tile that are drawn again: of a large picture one of 8x8 pixels in every other part of 64x64, and in
+/// a smaller tile sometimes. Of a larger one they are those of its parts, so that they lie as far apart.
+fn blocks(tile: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
+    parts(tile).flat_map(move |part| blocks_of_part(part, size))
+}
+
+fn blocks_of_part(part: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
+    let [w, h] = [part.x1 - part.x0, part.y1 - part.y0].map(|n| n / BLOCK);
+    let all = (w * h) as u32;
+    // A number that only the part decides: all workers and frames agree.
+    let mut x =
+        (part.x0 as u32).wrapping_mul(0x9e37_79b1) ^ (part.y0 as u32).wrapping_mul(0x85eb_ca6b);
+    let mut next = move || {
+        x = x.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        x >> 8
+    };
+    let there = size[0] * size[1] / (BLOCK * BLOCK) as u32;
+    let each = (there / AT_LEAST).clamp(1, ONE_IN);
+    let n = all / each + u32::from(next() % each < all % each);
+    (0..n).map(move |_| {
+        let i = (next() % all) as i32;
+        let (x0, y0) = (part.x0 + i % w * BLOCK, part.y0 + i / w * BLOCK);
+        Rect::new(x0, y0, x0 + BLOCK, y0 + BLOCK)
+    })
+}
+
+/// What tells how far pixels of a frame are off.
+pub struct Probe {
+    pair: Option<[Frame; 2]>,
+    model: Option<Model>,
+}
+
+impl Probe {
+    /// For `frame`, whose scene has this pair.
+    pub fn new(frame: &Frame, pair: Option<&Pair>) -> Probe {
+        Probe { pair: pair.map(|p| p.frames(&frame.view)), model: Model::of(frame) }
+    }
+
+    /// Looks at some pixels of a tile; `bricks` are those that the tile was drawn from.
+    pub fn sample(
+        &self,
+        frame: &Frame,
+        simd: Simd,
+        tile: Rect,
+        bricks: &[Arc<Brick>],
+        scratch: &mut Scratch,
+    ) -> Sampling {
+        let mut samples = Sampling::default();
+        let seen = |b: &Arc<Brick>| frame.view.project(&b.tight(&frame.scene.grid));
+        let mut rects: Vec<Option<Projected>> = Vec::new();
+        for block in blocks(tile, frame.view.size) {
+            if let Some(pair) = &self.pair {
+                if rects.is_empty() {
+                    rects.extend(bricks.iter().map(seen));
+                }
+                // In sheets of half the thickness footprints of perspective views may reach a pixel farther.
+                let near = Rect::new(block.x0 - 1, block.y0 - 1, block.x1 + 1, block.y1 + 1);
+                let over = |p: &Projected| !p.rect.intersect(&near).is_empty();
+                let some = bricks.iter().zip(&rects).filter(|(_, p)| p.as_ref().is_some_and(over));
+                let some: Vec<Arc<Brick>> = some.map(|(brick, _)| brick.clone()).collect();
+                thinner(pair, simd, block, &some, scratch, &mut samples.thickness);
+            }
+            if let Some(model) = &self.model {
+                model.sample(frame, block, bricks, &mut samples);
+            }
+        }
+        samples
+    }
+}
+
+/// Draws a block twice and compares.
+fn thinner(
+    frames: &[Frame; 2],
+    simd: Simd,
+    block: Rect,
+    bricks: &[Arc<Brick>],
+    scratch: &mut Scratch,
+    sampled: &mut Sampled,
+) {
+    let [coarse, fine] = frames.each_ref().map(|frame| {
+        let whole = TightBox { lo: [0; 3], hi: frame.scene.dims.map(|n| n - 1) };
+        let sheets = frame.view.project(&whole).map_or_else(SheetRange::default, |p| p.sheets);
+        let state = TileState { a: vec![0.0; block.area()], last: None };
+        tile::render(frame, simd, block, sheets, bricks, &state, scratch).0
+    });
+    for i in 0..block.area() {
+        let light = |p: &TilePixels, k: usize| f64::from(p.colour[i][k]) * f64::from(COLOUR_UNIT);
+        let (a, b) = (f64::from(coarse.a[i]), f64::from(fine.a[i]));
+        let colours = (0..3).map(|k| light(&coarse, k) - light(&fine, k));
+        let squares = colours.fold((a - b) * (a - b), |sum, off| sum + off * off);
+        sampled.put(a > 0.0 || b > 0.0, squares);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn so_many_pixels_are_drawn_again_whatever_the_tiles() {
+        for edge in [16, 32, 64, 128, 256] {
+            let mut pixels = 0;
+            for y in (0..2048).step_by(edge as usize) {
+                for x in (0..2048).step_by(edge as usize) {
+                    let tile = Rect::new(x, y, x + edge, y + edge);
+                    for block in blocks(tile, [2048; 2]) {
+                        assert!(block.intersect(&tile) == block, "{block:?} in {tile:?}");
+                        pixels += block.area();
+                    }
+                }
+            }
+            let share = pixels as f64 / (2048.0 * 2048.0) * f64::from(ONE_IN);
+            assert!((0.9..1.1).contains(&share), "{share} of what was meant at {edge}");
+        }
+        let of = |edge: i32| {
+            let tiles = (0..256).step_by(edge as usize);
+            let tiles = tiles.flat_map(|y| (0..256).step_by(edge as usize).map(move |x| (x, y)));
+            let mut all: Vec<_> = tiles
+                .flat_map(|(x, y)| blocks(Rect::new(x, y, x + edge, y + edge), [256; 2]))
+                .map(|block| (block.y0, block.x0))
+                .collect();
+            all.sort_unstable();
+            all
+        };
+        assert!(of(64) == of(128) && of(64) == of(256), "the same of large tiles");
+        assert_eq!(blocks(Rect::new(0, 0, 7, 7), [7; 2]).count(), 0, "no block fits");
+        let small = (0..4).flat_map(|i| blocks(Rect::new(64 * i, 0, 64 * i + 64, 64), [256, 64]));
+        assert_eq!(small.count(), AT_LEAST as usize, "an eighth of a small picture");
+    }
+}

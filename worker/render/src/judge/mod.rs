@@ -1,0 +1,5 @@
+//! How far pictures are from the limit of thin sheets and exact arithmetic.
+
+pub mod analytic;
+pub mod error_probe;
+pub mod reference;

@@ -1,0 +1,560 @@
+//! What happens at a pixel when a sheet closes.
+//!
+//! In optical depth t a sheet's light is the integral of C(t) exp(-t): extinction itself drops
+//! out. c = E / tau is the exact mean of C and tau is exact, so A is exact for any thickness;
+//! only the slope of C inside the sheet is missing. The rule NL estimates it from the sheets
+//! before and behind, the latter *half filled*: what voxels that begin no later than this sheet
+//! have put into the next one (the peek). That is as accurate as the finished sheet, needs no
+//! latency, and is the same for every tile, order and culling, since "begins no later" is a
+//! matter of the absolute sheet grid (NUMERICS.md section 1.2).
+
+pub(crate) mod rows;
+
+use crate::kernels::truncate;
+use slabcast_common::math::{SWITCH, opacity, phi, phis};
+use slabcast_common::quality::Compositing;
+
+/// A sum of a sheet: integers, whose sum has no order, or floats, added in one order.
+pub trait Sum: Copy + Default + PartialEq {
+    /// Whether sums are whole numbers below 2^31.
+    const WHOLE: bool;
+    /// Whether the three colours are one: sums of the second and third are not looked at.
+    const GREY: bool = false;
+    /// The sum as a number.
+    fn value(self) -> f32;
+    /// Its bits.
+    fn bits(self) -> u32;
+    /// From bits.
+    fn from_bits(bits: u32) -> Self;
+}
+
+impl Sum for i32 {
+    const WHOLE: bool = true;
+    #[inline(always)]
+    fn value(self) -> f32 {
+        self as f32
+    }
+    #[inline(always)]
+    fn bits(self) -> u32 {
+        self as u32
+    }
+    #[inline(always)]
+    fn from_bits(bits: u32) -> Self {
+        bits as i32
+    }
+}
+
+impl Sum for i16 {
+    const WHOLE: bool = true;
+    #[inline(always)]
+    fn value(self) -> f32 {
+        f32::from(self)
+    }
+    #[inline(always)]
+    fn bits(self) -> u32 {
+        self as u32
+    }
+    #[inline(always)]
+    fn from_bits(bits: u32) -> Self {
+        bits as i16
+    }
+}
+
+impl Sum for f32 {
+    const WHOLE: bool = false;
+    #[inline(always)]
+    fn value(self) -> f32 {
+        self
+    }
+    #[inline(always)]
+    fn bits(self) -> u32 {
+        self.to_bits()
+    }
+    #[inline(always)]
+    fn from_bits(bits: u32) -> Self {
+        f32::from_bits(bits)
+    }
+}
+
+/// Below this a float sum is taken for nothing: colours over denormal sums lose their digits
+/// (E / tau of a denormal is off by half).
+pub(crate) const FAINTEST: f32 = 1e-30;
+
+/// The arithmetic of a closing sheet, with the constants of one view.
+#[derive(Clone, Copy, Debug)]
+pub struct Rule {
+    pub(crate) compositing: Compositing,
+    /// Optical depth of one raw unit, and raw units of one of optical depth.
+    pub(crate) unit: f32,
+    pub(crate) per_unit: f32,
+    /// Weight of the sheet before and of the one behind.
+    pub(crate) gain_before: f32,
+    pub(crate) gain_behind: f32,
+    pub(crate) eps: f32,
+}
+
+impl Rule {
+    /// `unit`: optical depth of a raw unit; `y`: sheet thickness over the kernel's standard
+    /// deviation along the view axis; `eps`: transmittance below which a pixel is shut.
+    pub fn new(compositing: Compositing, unit: f32, y: f64, eps: f32) -> Self {
+        // Fitted on five volumes; their sum tends to 1 with y, which restores fourth order.
+        let gain_before = 0.5 + 0.20 * y;
+        let gain_behind = (0.5 - 0.07 * y).max(0.25);
+        Rule {
+            compositing,
+            unit,
+            per_unit: 1.0 / unit,
+            // Sheets far thicker than the kernel have no slope to speak of; the clamp below
+            // holds the rest.
+            gain_before: gain_before.min(2.0) as f32,
+            gain_behind: gain_behind as f32,
+            eps,
+        }
+    }
+
+    /// The same, but no pixel is ever shut.
+    #[must_use]
+    pub(crate) fn never_shut(self) -> Self {
+        Rule { eps: 0.0, ..self }
+    }
+
+    /// Whether a pixel with opacity `a` is shut for good.
+    #[inline(always)]
+    pub fn is_shut(&self, a: f32) -> bool {
+        1.0 - a < self.eps
+    }
+
+    /// Optical depth of a raw sum along a ray (the sum of opacities, for the paper's compositing).
+    #[inline(always)]
+    pub fn optical_depth(&self, raw: f32, secant: f32) -> f32 {
+        raw * self.unit * secant
+    }
+
+    /// Closes a sheet at one pixel: `before`, `here` and `behind` are the raw sums of sheets
+    /// k-1, k and (half filled) k+1; `secant` the ray's length in the sheet over its thickness.
+    /// Adds to the opacity `a` and to the fixed-point colour.
+    #[inline(always)]
+    pub fn close<S: Sum>(
+        &self,
+        before: [S; 4],
+        here: [S; 4],
+        behind: [S; 4],
+        secant: f32,
+        a: &mut f32,
+        colour: &mut [u32; 3],
+    ) {
+        let raw = here[0].value();
+        if raw < FAINTEST {
+            return;
+        }
+        let tau = self.optical_depth(raw, secant);
+        let per_raw = 1.0 / raw;
+        let per_tau = per_raw * self.per_unit * (1.0 / secant);
+        let (sheet_a, weight) = match self.compositing {
+            Compositing::Paper => (tau.min(1.0), 0.0),
+            Compositing::Constant => (opacity(tau), 0.0),
+            Compositing::Linear => {
+                let o = opacity(tau);
+                (o, if tau > 0.0 { phi(tau, per_tau, o) } else { 0.0 })
+            }
+        };
+        let transmittance = 1.0 - *a;
+        if weight == 0.0 {
+            for ch in 0..3 {
+                let c = here[ch + 1].value() * per_raw;
+                colour[ch] = colour[ch].wrapping_add(fixed_light(transmittance * (c * sheet_a)));
+            }
+        } else {
+            let (tl, tn) = (before[0].value(), behind[0].value());
+            let slopes =
+                if S::WHOLE { self.slopes_whole(tl, raw, tn) } else { self.slopes(tl, raw, tn) };
+            for ch in 0..3 {
+                let c = here[ch + 1].value() * per_raw;
+                let (el, en) = (before[ch + 1].value(), behind[ch + 1].value());
+                let light = c * sheet_a + slopes.change(c, el, tn, en) * weight;
+                colour[ch] = colour[ch].wrapping_add(fixed_light(transmittance * light));
+            }
+        }
+        *a += transmittance * sheet_a;
+    }
+
+    /// How the colour changes through a sheet with sum `h` between one of `tl` before it and one of
+    /// `tn` behind, of any size. Ratios before squares: sums reach 1e15.
+    #[inline(always)]
+    fn slopes(&self, tl: f32, h: f32, tn: f32) -> Slopes {
+        let ml = 1.0 / tl.max(h);
+        let (ql, qh) = (tl * ml, h * ml);
+        // The sheet before counts unless it is below 2 % of this one.
+        let before = self.gain_before * (ql * ql) / (ql * ql + 4e-4 * (qh * qh));
+        let seen = tl > FAINTEST;
+        let per_tl = 1.0 / if seen { tl } else { 1.0 };
+        let per_tl = if seen { per_tl } else { 0.0 };
+        // A thin, noisy sheet behind fades out.
+        let unit = 1.0 / tn.max(h);
+        let behind = self.gain_behind / (tn * unit + 0.05 * (h * unit));
+        Slopes { before, per_tl, behind, unit }
+    }
+
+    /// [`Rule::slopes`] for whole numbers from 1 to 2^31 (the neighbours from 0): one division
+    /// instead of five, since their products stay below 2e37 and above 2e-5.
+    #[inline(always)]
+    fn slopes_whole(&self, tl: f32, h: f32, tn: f32) -> Slopes {
+        let squares = tl * tl + 4e-4 * (h * h);
+        let sum = tn + 0.05 * h;
+        let some = tl.max(1.0);
+        let per_all = 1.0 / (some * (squares * sum));
+        Slopes {
+            before: self.gain_before * (tl * tl) * ((some * sum) * per_all),
+            // Nothing over 1 is nothing, too.
+            per_tl: (squares * sum) * per_all,
+            behind: self.gain_behind * ((some * squares) * per_all),
+            unit: 1.0,
+        }
+    }
+}
+
+/// What [`Rule::slopes`] gives.
+struct Slopes {
+    /// Weight of the sheet before, and what makes a colour of its sums.
+    before: f32,
+    per_tl: f32,
+    /// Weight of the sheet behind, for its sums times `unit`.
+    behind: f32,
+    unit: f32,
+}
+
+impl Slopes {
+    /// Change of one component through a sheet of colour `c`, whose neighbours sum to `el` and,
+    /// for an optical depth of `tn`, to `en`.
+    #[inline(always)]
+    fn change(&self, c: f32, el: f32, tn: f32, en: f32) -> f32 {
+        let ahead = en * self.unit - c * (tn * self.unit);
+        let change = self.before * (c - el * self.per_tl) + self.behind * ahead;
+        // The colour stays between 0 and 1 through the sheet, so 0 <= C <= A.
+        let most = 2.0 * c.min(1.0 - c).max(0.0);
+        change.min(most).max(-most)
+    }
+}
+
+/// One in the fixed point of light.
+pub(crate) const ONE: f32 = (1u32 << 28) as f32;
+
+/// Light in fixed point. One rounding a sheet: colour of any cut into slabs adds up to the same
+/// integers.
+#[inline(always)]
+fn fixed_light(light: f32) -> u32 {
+    // Not negative but for the last bits of f32.
+    truncate(light * ONE + 0.5)
+}
+
+/// `yes` if `which`, else `no`: both are worked out, and no branch is made of it.
+#[inline(always)]
+fn select(which: bool, yes: f32, no: f32) -> f32 {
+    let mask = u32::from(which).wrapping_neg();
+    f32::from_bits(yes.to_bits() & mask | no.to_bits() & !mask)
+}
+
+/// Sums and state of up to [`LANES`] pixels, channel by channel: what
+/// [`Rule::close_row`] works on. Lanes are pixels.
+#[derive(Clone)]
+pub struct Row {
+    /// Raw sums of sheet k-1: extinction and three colours.
+    pub before: [[f32; LANES]; 4],
+    /// Of sheet k.
+    pub here: [[f32; LANES]; 4],
+    /// Of sheet k+1 as it stands.
+    pub behind: [[f32; LANES]; 4],
+    /// Length of the rays in the sheet over its thickness, and one over it.
+    pub secant: [f32; LANES],
+    /// See there.
+    pub cosine: [f32; LANES],
+    /// Opacity before, and after.
+    pub a: [f32; LANES],
+    /// What the sheet adds to the fixed-point colour.
+    pub light: [[u32; LANES]; 3],
+}
+
+/// Pixels of a [`Row`], which need not be neighbours: a register of AVX-512 or two of AVX2.
+pub const LANES: usize = 16;
+
+impl Default for Row {
+    fn default() -> Self {
+        Row {
+            before: [[0.0; LANES]; 4],
+            here: [[0.0; LANES]; 4],
+            behind: [[0.0; LANES]; 4],
+            secant: [1.0; LANES],
+            cosine: [1.0; LANES],
+            a: [0.0; LANES],
+            light: [[0; LANES]; 3],
+        }
+    }
+}
+
+impl Rule {
+    /// [`Rule::close`] of sums `S` for pixels beside each other, without a branch a pixel: the same
+    /// operations in the same order, so the same bytes. `live` has a bit for each pixel that is
+    /// open; others keep their opacity and get no light. Returns those that are shut now.
+    #[inline(always)]
+    pub fn close_row<S: Sum>(&self, row: &mut Row, live: u32) -> u32 {
+        use Compositing::{Constant, Linear, Paper};
+        match (self.compositing, S::WHOLE, S::GREY) {
+            (Linear, true, false) => self.close_lanes::<true, true, false, 3>(row, live),
+            (Linear, true, true) => self.close_lanes::<true, true, false, 1>(row, live),
+            (Linear, false, _) => self.close_lanes::<true, false, false, 3>(row, live),
+            (Constant, _, false) => self.close_lanes::<false, true, false, 3>(row, live),
+            (Constant, _, true) => self.close_lanes::<false, true, false, 1>(row, live),
+            (Paper, _, false) => self.close_lanes::<false, true, true, 3>(row, live),
+            (Paper, _, true) => self.close_lanes::<false, true, true, 1>(row, live),
+        }
+    }
+
+    #[inline(always)]
+    fn close_lanes<
+        const LINEAR: bool,
+        const WHOLE: bool,
+        const PAPER: bool,
+        const COLOURS: usize,
+    >(
+        &self,
+        row: &mut Row,
+        live: u32,
+    ) -> u32 {
+        // Several short loops over plain arrays, with what they read of `self` beside them, and selects
+        // by bits: of one long loop, of loads behind a condition or of branches compilers make scalar code.
+        let (unit, per_unit) = (self.unit, self.per_unit);
+        let [mut taus, mut per_raws, mut raws, mut sheet] = [[0.0f32; LANES]; 4];
+        for i in 0..LANES {
+            let filled = row.here[0][i] >= FAINTEST;
+            raws[i] = select(filled, row.here[0][i], 1.0);
+            taus[i] = select(filled, raws[i] * unit * row.secant[i], 0.0);
+            per_raws[i] = 1.0 / raws[i];
+        }
+        for i in 0..LANES {
+            sheet[i] = if PAPER { taus[i].min(1.0) } else { opacity(taus[i]) };
+        }
+        let [mut weights, mut light] = [[0.0f32; LANES]; 2];
+        for i in 0..LANES {
+            let (small, large) = phis(taus[i], per_raws[i] * per_unit * row.cosine[i], sheet[i]);
+            let weight = select(taus[i] < SWITCH, small, large);
+            weights[i] = select(taus[i] > 0.0, weight, 0.0);
+        }
+        // Where there is nothing, colours are nothing too, and neighbours may be anything.
+        let mut slopes = [[0.0f32; LANES]; 4];
+        if LINEAR {
+            for i in 0..LANES {
+                let (tl, raw, tn) = (row.before[0][i], raws[i], row.behind[0][i]);
+                let s =
+                    if WHOLE { self.slopes_whole(tl, raw, tn) } else { self.slopes(tl, raw, tn) };
+                (slopes[0][i], slopes[1][i]) = (s.before, s.per_tl);
+                (slopes[2][i], slopes[3][i]) = (s.behind, s.unit);
+            }
+        }
+        let mut a = row.a;
+        for i in 0..LANES {
+            light[i] = select(live >> i & 1 == 1, 1.0 - a[i], 0.0);
+            a[i] += light[i] * sheet[i];
+        }
+        row.a = a;
+        for ch in 0..COLOURS {
+            let [here, before, behind] =
+                [&row.here, &row.before, &row.behind].map(|sums| &sums[ch + 1]);
+            let out = &mut row.light[ch];
+            for i in 0..LANES {
+                let c = here[i] * per_raws[i];
+                let mut of_sheet = c * sheet[i];
+                if LINEAR {
+                    let s = Slopes {
+                        before: slopes[0][i],
+                        per_tl: slopes[1][i],
+                        behind: slopes[2][i],
+                        unit: slopes[3][i],
+                    };
+                    let change = s.change(c, before[i], row.behind[0][i], behind[i]);
+                    of_sheet += change * weights[i];
+                }
+                out[i] = fixed_light(light[i] * of_sheet);
+            }
+        }
+        if COLOURS == 1 {
+            row.light = [row.light[0]; 3];
+        }
+        let mut shut = 0;
+        for i in 0..LANES {
+            shut |= u32::from(self.is_shut(a[i])) << i;
+        }
+        shut & live
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernels::Simd;
+    use crate::kernels::composite::rows::close_rows;
+    use proptest::prelude::*;
+
+    proptest! {
+        /// Rows against the plain arithmetic, bit by bit: empty, faint, thick and huge sheets.
+        #[test]
+        fn a_row_closes_as_its_pixels_do(
+            sheets in prop::collection::vec(
+                prop::array::uniform3((-45.0..40.0f32, any::<bool>(), prop::array::uniform3(0.0..1.0f32))),
+                LANES,
+            ),
+            a in prop::collection::vec(0.0..1.0f32, LANES),
+            secant in prop::collection::vec(1.0..1.5f32, LANES),
+            d in 0.02..4.0f64,
+        ) {
+            for compositing in [Compositing::Linear, Compositing::Constant, Compositing::Paper] {
+                let rule = Rule::new(compositing, 0.75, d / 0.6, 1e-3);
+                let mut row = Row::default();
+                for i in 0..LANES {
+                    row.secant[i] = secant[i];
+                    row.cosine[i] = 1.0 / secant[i];
+                    row.a[i] = a[i];
+                    for (k, (e, full, c)) in sheets[i].iter().enumerate() {
+                        let t = if *full { libm::expf(*e) } else { 0.0 };
+                        let to = [&mut row.before, &mut row.here, &mut row.behind];
+                        let sums = [t, t * c[0], t * c[1], t * c[2]];
+                        for (ch, sum) in sums.into_iter().enumerate() {
+                            to[k][ch][i] = sum;
+                        }
+                    }
+                }
+                let live = 0xfffb;
+                check::<f32>(&rule, &row, live, |t| t)?;
+                // Whole numbers: the same sums in units, so that the faintest are nothing.
+                for sheet in [&mut row.before, &mut row.here, &mut row.behind] {
+                    for sum in sheet.as_flattened_mut() {
+                        *sum = (*sum * 1e3).min(2e9).round();
+                    }
+                }
+                check::<i32>(&rule, &row, live, |t| t as i32)?;
+            }
+        }
+    }
+
+    /// A row closed at once against its pixels one by one, bit by bit, and again with another on every
+    /// instruction set.
+    fn check<S: Sum>(
+        rule: &Rule,
+        row: &Row,
+        live: u32,
+        sum: impl Fn(f32) -> S,
+    ) -> Result<(), TestCaseError> {
+        let mut closed = row.clone();
+        let shut = rule.close_row::<S>(&mut closed, live);
+        for i in 0..LANES {
+            let of = |p: &[[f32; LANES]; 4]| p.map(|ch| sum(ch[i]));
+            let (mut a, mut colour) = (row.a[i], [0u32; 3]);
+            let (b, h, n) = (of(&row.before), of(&row.here), of(&row.behind));
+            if live >> i & 1 == 1 {
+                rule.close(b, h, n, row.secant[i], &mut a, &mut colour);
+                prop_assert_eq!(shut >> i & 1 == 1, rule.is_shut(a));
+            }
+            prop_assert_eq!(closed.a[i].to_bits(), a.to_bits());
+            prop_assert_eq!(closed.light.map(|l| l[i]), colour);
+        }
+        for simd in Simd::all() {
+            let mut two = [row.clone(), row.clone()];
+            two[0].here = row.before;
+            let lives = [!live & 0xffff, live];
+            let [_, got] = close_rows::<S, 2>(simd, rule, &mut two, lives);
+            prop_assert_eq!(got, shut, "{}", simd.name());
+            prop_assert_eq!(two[1].a.map(f32::to_bits), closed.a.map(f32::to_bits));
+            prop_assert_eq!(two[1].light, closed.light);
+        }
+        Ok(())
+    }
+
+    fn stack(compositing: Compositing, d: f64, sheets: &[[f32; 4]], eps: f32) -> (f32, [f64; 3]) {
+        let rule = Rule::new(compositing, 1.0, d / 0.6, eps);
+        let (mut a, mut colour) = (0.0, [0u32; 3]);
+        let at = |k: isize| {
+            if k < 0 { [0.0; 4] } else { sheets.get(k as usize).copied().unwrap_or([0.0; 4]) }
+        };
+        for k in 0..sheets.len() as isize {
+            if rule.is_shut(a) {
+                break;
+            }
+            rule.close(at(k - 1), at(k), at(k + 1), 1.0, &mut a, &mut colour);
+        }
+        (a, colour.map(|c| f64::from(c) / f64::from(1u32 << 28)))
+    }
+
+    proptest! {
+        #[test]
+        fn colour_stays_between_nothing_and_opacity(
+            taus in prop::collection::vec((-20.0..12.0f32, 0.0..1.0f32, 0.0..1.0f32), 1..40),
+            d in 0.1..4.0f64,
+        ) {
+            let sheets: Vec<[f32; 4]> = taus
+                .iter()
+                .map(|&(e, r, g)| {
+                    let t = libm::expf(e);
+                    [t, t * r, t * g, t]
+                })
+                .collect();
+            let (a, c) = stack(Compositing::Linear, d, &sheets, 0.0);
+            prop_assert!(a.is_finite() && (0.0..=1.0).contains(&a));
+            for ch in c {
+                prop_assert!(ch >= 0.0 && ch <= f64::from(a) + 1e-6, "{ch} over {a}");
+            }
+            // Opacity is the same for both rules, and is that of the summed depth.
+            let (ac, _) = stack(Compositing::Constant, d, &sheets, 0.0);
+            prop_assert_eq!(a, ac);
+            let total: f64 = sheets.iter().map(|s| f64::from(s[0])).sum();
+            prop_assert!((f64::from(a) + libm::expm1(-total)).abs() < 2e-6);
+        }
+    }
+
+    #[test]
+    fn a_constant_colour_comes_back_exactly() {
+        for tau in [1e-7f32, 1e-3, 0.3, 4.0, 500.0] {
+            let sheets = vec![[tau, tau * 0.5, tau * 0.25, tau]; 30];
+            let (a, c) = stack(Compositing::Linear, 1.0, &sheets, 0.0);
+            assert!((c[0] - 0.5 * f64::from(a)).abs() < 3e-7, "tau {tau}: {} of {a}", c[0]);
+            assert!((c[2] - f64::from(a)).abs() < 3e-7);
+        }
+    }
+
+    /// A colour ramp through a homogeneous medium has a closed form: with sigma = s and
+    /// C(z) = z / L, the picture is (1 - exp(-s L)) / (s L) - exp(-s L).
+    #[test]
+    fn linear_beats_constant_on_a_ramp_of_colour() {
+        let (l, s) = (10.0, 0.8);
+        let exact = (1.0 - libm::exp(-s * l)) / (s * l) - libm::exp(-s * l);
+        let error = |rule| {
+            let n = 10;
+            let sheets: Vec<[f32; 4]> = (0..n)
+                .map(|k| {
+                    let t = (s * l / n as f64) as f32;
+                    let c = (k as f32 + 0.5) / n as f32;
+                    [t, t * c, t * c, t * c]
+                })
+                .collect();
+            (stack(rule, 1.0, &sheets, 0.0).1[0] - exact).abs()
+        };
+        let (linear, constant) = (error(Compositing::Linear), error(Compositing::Constant));
+        assert!(linear * 2.5 < constant, "linear {linear:e}, constant {constant:e}");
+    }
+
+    #[test]
+    fn the_papers_sum_is_clamped() {
+        let (a, c) =
+            stack(Compositing::Paper, 1.0, &[[0.5, 0.25, 0.0, 0.5], [3.0, 3.0, 0.0, 0.0]], 0.0);
+        assert_eq!(a, 1.0);
+        assert!((c[0] - (0.25 + 0.5)).abs() < 1e-8 && (c[2] - 0.5).abs() < 1e-8);
+    }
+
+    #[test]
+    fn faint_layers_by_the_ten_thousand_keep_their_digits() {
+        let sheets = vec![[1e-6f32, 5e-7, 0.0, 1e-6]; 10_000];
+        let (a, c) = stack(Compositing::Linear, 1.0, &sheets, 0.0);
+        let want = -libm::expm1(-0.01);
+        assert!((f64::from(a) - want).abs() / want < 1e-5, "{a} against {want}");
+        // Colour has a unit of 2^-28: 10^4 roundings of half a unit at most.
+        assert!((c[0] - want / 2.0).abs() < 1e4 * 0.5 / f64::from(1u32 << 28) + 1e-7);
+    }
+}

@@ -1,0 +1,625 @@
+//! The innermost loop: a section of a voxel is added to a sheet.
+//!
+//! The loop is written once, plainly, over pixels of four sums; it is compiled for the
+//! machine's baseline and on x86-64 again for AVX2 and AVX-512, and chosen at run time. On 64-bit ARM
+//! NEON is in the baseline: there compilers use it in plain loops, and what they don't make of these
+//! is written for it. There is no fused multiply-add in any and compilers may not invent one, so all
+//! give the same bytes.
+//!
+//! This module is the wall: the only place with `unsafe`. It holds two things: the call of a
+//! function compiled for instructions that were seen on this machine, and the conversion of a
+//! float to an integer without the range check that would double the loop's cost.
+#![expect(unsafe_code, reason = "the one wall: run-time dispatch, unchecked conversion, lanes")]
+
+/// Functions that are compiled for some features.
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+macro_rules! with {
+    ($features:literal $(
+        fn $name:ident ($($arg:ident: $ty:ty),*) $(-> $out:ty)? $body:block
+    )*) => {$(
+        #[target_feature(enable = $features)]
+        #[inline]
+        unsafe fn $name ($($arg: $ty),*) $(-> $out)? $body
+    )*};
+}
+
+/// Calls the one of four functions that belongs to the level of `simd`.
+macro_rules! at_level {
+    ($simd:expr, $args:tt, $plain:path, $avx2:path, $avx512:path, $neon:path) => {
+        match $simd.0 {
+            Level::Plain => $plain $args,
+            // SAFETY: the value proves that the instructions are there; AVX-512 has AVX2 in it.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe { $avx2 $args },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => unsafe { $avx512 $args },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            #[allow(unused_unsafe, reason = "what has no lanes there is called plainly")]
+            Level::Neon => unsafe { $neon $args },
+        }
+    };
+}
+
+pub(crate) mod composite;
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+mod lanes;
+pub(crate) mod lut;
+pub(crate) mod pixel_records;
+pub(crate) mod row_records;
+pub(crate) mod toss;
+pub(crate) mod touched;
+
+use crate::kernels::composite::Sum;
+pub use crate::primitives::Tap;
+use crate::primitives::footprint::{Footprint, Sections};
+
+/// Pixels of one open sheet of a tile part.
+pub type Pixels<S> = [[S; 4]];
+
+/// A weight across the view axis, as sums of one kind want it.
+pub trait Weight: Copy + Default + PartialEq + std::fmt::Debug {
+    /// Weights along `axis`: see [`Footprint::weights`].
+    fn of<'b>(
+        footprint: &'b Footprint<'_>,
+        axis: usize,
+        pos: i64,
+        clip: (i32, i32),
+        buffer: &'b mut Vec<Self>,
+    ) -> (i32, &'b [Self]);
+    /// What makes sums of rows that are kept over a length of `spread`: see `storeys`.
+    #[must_use]
+    fn of_rows(self, spread: f32) -> Self;
+}
+
+impl Weight for Tap {
+    #[inline(always)]
+    fn of<'b>(
+        footprint: &'b Footprint<'_>,
+        axis: usize,
+        pos: i64,
+        clip: (i32, i32),
+        buffer: &'b mut Vec<Tap>,
+    ) -> (i32, &'b [Tap]) {
+        footprint.weights(axis, pos, clip, buffer)
+    }
+
+    #[inline(always)]
+    fn of_rows(self, spread: f32) -> Tap {
+        Tap::new(self.0 * spread)
+    }
+}
+
+impl Weight for i16 {
+    #[inline(always)]
+    fn of<'b>(
+        footprint: &'b Footprint<'_>,
+        axis: usize,
+        pos: i64,
+        clip: (i32, i32),
+        buffer: &'b mut Vec<i16>,
+    ) -> (i32, &'b [i16]) {
+        footprint.weights_fixed(axis, pos, clip, buffer)
+    }
+
+    /// Their rows are kept as sums are.
+    #[inline(always)]
+    fn of_rows(self, _: f32) -> i16 {
+        self
+    }
+}
+
+/// How contributions are added: a section is `payload * w_z`, a row `section * w_y`, and what is
+/// added to a pixel `row * w_x`, rounded as each kind says.
+pub trait Accumulate: Sum {
+    /// A weight across the view axis.
+    type Weight: Weight;
+    /// One channel of a section or a row.
+    type Section: Copy;
+    /// What [rows of storeys](Accumulate::down) add up to on the way; the default is nothing.
+    type Way: Copy + Default;
+
+    /// First sheet of a voxel at depth `z` (in phases), and its section in the `i`th from there.
+    fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Self::Section; 4];
+    /// `section * wy`.
+    fn row(section: Self::Section, wy: Self::Weight) -> Self::Section;
+    /// `self + row * wx`.
+    #[must_use]
+    fn plus(self, row: Self::Section, wx: Self::Weight) -> Self;
+    /// `way + row * wy`.
+    fn on(way: Self::Way, row: Self, wy: Self::Weight) -> Self::Way;
+    /// What it is in the end.
+    fn end(way: Self::Way) -> Self;
+    /// What a pixel has of rows of storeys, each times its weight [for rows](Weight::of_rows), in their order.
+    #[inline(always)]
+    fn down(rows: impl Iterator<Item = (Self, Self::Weight)>) -> Self {
+        Self::end(rows.fold(Self::Way::default(), |way, (row, wy)| Self::on(way, row, wy)))
+    }
+}
+
+/// One channel of a section of 32-bit sums, not negative and not NaN, or that times weights.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Section(f32);
+
+impl Section {
+    /// What is negative or not a number is nothing.
+    #[inline(always)]
+    fn new(section: f32) -> Self {
+        // A select, so that NaN too ends inside.
+        Section(if section > 0.0 { section } else { 0.0 })
+    }
+}
+
+/// The largest f32 below 2^31.
+const LARGEST: f32 = 2_147_483_520.0;
+
+/// The whole number nearest to `x`, which is not negative, of two the even one; the largest that an f32 can
+/// be below 2^31 for what is larger or not a number. One instruction on lanes, where nothing is larger.
+#[inline(always)]
+fn nearest(x: f32) -> i32 {
+    let x = if x < LARGEST { x } else { LARGEST };
+    // From here up f32s are whole, and a sum with it has no bits left for halves.
+    const WHOLE: f32 = 8_388_608.0;
+    let rounded = (x + WHOLE) - WHOLE;
+    let rounded = if x < WHOLE { rounded } else { x };
+    // SAFETY: it is 0 to LARGEST.
+    unsafe { rounded.to_int_unchecked::<i32>() }
+}
+
+/// 32-bit fixed point: one rounding, to nearest and of two to the even one, when a contribution is
+/// added. What would leave the integers is held at their end (`Frame::raw_scale` leaves room, so
+/// nothing does).
+impl Accumulate for i32 {
+    type Weight = Tap;
+    type Section = Section;
+    type Way = f32;
+
+    #[inline(always)]
+    fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Section; 4] {
+        let wz = sections.of(z).1[i];
+        payload.map(|p| Section::new(p * wz))
+    }
+
+    #[inline(always)]
+    fn row(section: Section, wy: Tap) -> Section {
+        Section(section.0 * wy.0)
+    }
+
+    #[inline(always)]
+    fn plus(self, row: Section, wx: Tap) -> Self {
+        // A section is not negative (`section`), nor is a weight (`Tap`), so their product is 0 to
+        // infinity, or NaN for infinity times 0.
+        self.wrapping_add(nearest(row.0 * wx.0))
+    }
+
+    /// Floats, since they have one order: four or five of them are off by less than any row is rounded.
+    #[inline(always)]
+    fn on(way: f32, row: i32, wy: Tap) -> f32 {
+        way + row as f32 * wy.0
+    }
+
+    #[inline(always)]
+    fn end(way: f32) -> i32 {
+        nearest(way)
+    }
+}
+
+/// 32-bit fixed point of scenes whose three colours are one: as [`i32`], bit for bit.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Grey(i32);
+
+impl Sum for Grey {
+    const WHOLE: bool = true;
+    const GREY: bool = true;
+    #[inline(always)]
+    fn value(self) -> f32 {
+        self.0.value()
+    }
+    #[inline(always)]
+    fn bits(self) -> u32 {
+        self.0.bits()
+    }
+    #[inline(always)]
+    fn from_bits(bits: u32) -> Self {
+        Grey(i32::from_bits(bits))
+    }
+}
+
+impl Accumulate for Grey {
+    type Weight = Tap;
+    type Section = Section;
+    type Way = f32;
+
+    #[inline(always)]
+    fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [Section; 4] {
+        i32::section(sections, z, i, payload)
+    }
+
+    #[inline(always)]
+    fn row(section: Section, wy: Tap) -> Section {
+        i32::row(section, wy)
+    }
+
+    #[inline(always)]
+    fn plus(self, row: Section, wx: Tap) -> Self {
+        Grey(self.0.plus(row, wx))
+    }
+
+    #[inline(always)]
+    fn on(way: f32, row: Grey, wy: Tap) -> f32 {
+        i32::on(way, row.0, wy)
+    }
+
+    #[inline(always)]
+    fn end(way: f32) -> Grey {
+        Grey(i32::end(way))
+    }
+}
+
+/// Floats, in one order.
+impl Accumulate for f32 {
+    type Weight = Tap;
+    type Section = f32;
+    type Way = f32;
+
+    #[inline(always)]
+    fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [f32; 4] {
+        let wz = sections.of(z).1[i];
+        payload.map(|p| p * wz)
+    }
+
+    #[inline(always)]
+    fn row(section: f32, wy: Tap) -> f32 {
+        section * wy.0
+    }
+
+    #[inline(always)]
+    fn plus(self, row: f32, wx: Tap) -> Self {
+        self + row * wx.0
+    }
+
+    #[inline(always)]
+    fn on(way: f32, row: f32, wy: Tap) -> f32 {
+        way + row * wy.0
+    }
+
+    #[inline(always)]
+    fn end(way: f32) -> f32 {
+        way
+    }
+}
+
+/// The product of two numbers in units of 2^-15, rounded to nearest: one instruction on lanes.
+#[inline(always)]
+fn times(a: i16, b: i16) -> i16 {
+    ((i32::from(a) * i32::from(b) + 0x4000) >> 15) as i16
+}
+
+/// 16-bit fixed point: payload, section and row are each rounded to nearest. Sums that would leave
+/// the integers stay at their end; terms are not negative, so that too has no order.
+impl Accumulate for i16 {
+    type Weight = i16;
+    type Section = i16;
+    type Way = i16;
+
+    #[inline(always)]
+    fn section(sections: &Sections, z: i32, i: usize, payload: &[f32; 4]) -> [i16; 4] {
+        let wz = sections.of_fixed(z).1[i];
+        section_fixed(payload.map(whole), wz)
+    }
+
+    #[inline(always)]
+    fn row(section: i16, wy: i16) -> i16 {
+        times(section, wy)
+    }
+
+    #[inline(always)]
+    fn plus(self, row: i16, wx: i16) -> Self {
+        self.saturating_add(times(row, wx))
+    }
+
+    #[inline(always)]
+    fn on(way: i16, row: i16, wy: i16) -> i16 {
+        way.saturating_add(times(row, wy))
+    }
+
+    #[inline(always)]
+    fn end(way: i16) -> i16 {
+        way
+    }
+}
+
+/// The section of a 16-bit payload: each channel times `wz`.
+#[inline(always)]
+pub(crate) fn section_fixed(payload: [i16; 4], wz: i16) -> [i16; 4] {
+    payload.map(|p| times(p, wz))
+}
+
+/// A payload of 16-bit sums: rounded to nearest, 0 to 32767.
+#[inline(always)]
+pub(crate) fn whole(payload: f32) -> i16 {
+    let bounded = bounded(payload + 0.5, 32767.0);
+    // SAFETY: it is 0 to 32767.
+    unsafe { bounded.to_int_unchecked::<i32>() as i16 }
+}
+
+/// `x` from 0 to `most`, 0 if it is not a number: two selects.
+#[inline(always)]
+fn bounded(x: f32, most: f32) -> f32 {
+    let x = if x > 0.0 { x } else { 0.0 };
+    if x < most { x } else { most }
+}
+
+/// The whole number below `x`, 0 to 2^31: of what is negative or not a number 0.
+#[inline(always)]
+pub(crate) fn truncate(x: f32) -> u32 {
+    let bounded = bounded(x, LARGEST);
+    // SAFETY: it is 0 to the largest f32 below 2^31.
+    unsafe { bounded.to_int_unchecked::<i32>() as u32 }
+}
+
+/// An instruction set that was seen on this machine. Holding the value is the proof.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Simd(Level);
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Level {
+    Plain,
+    #[cfg(target_arch = "x86_64")]
+    Avx2,
+    #[cfg(target_arch = "x86_64")]
+    Avx512,
+    #[cfg(target_arch = "aarch64")]
+    Neon,
+}
+
+impl Simd {
+    /// The widest that this machine has.
+    pub fn detect() -> Self {
+        *Self::all().last().expect("plain is always there")
+    }
+
+    /// The baseline.
+    pub fn plain() -> Self {
+        Simd(Level::Plain)
+    }
+
+    /// All that this machine has, plain first.
+    pub fn all() -> Vec<Self> {
+        #[allow(unused_mut, reason = "grows on x86-64 and 64-bit ARM only")]
+        let mut all = vec![Simd(Level::Plain)];
+        // Part of the baseline, but for machines without an operating system.
+        #[cfg(target_arch = "aarch64")]
+        if std::arch::is_aarch64_feature_detected!("neon") {
+            all.push(Simd(Level::Neon));
+        }
+        #[cfg(target_arch = "x86_64")]
+        {
+            // Whoever has AVX2 has those, too, and a machine that says otherwise is not trusted.
+            let counts_bits = is_x86_feature_detected!("popcnt")
+                && is_x86_feature_detected!("lzcnt")
+                && is_x86_feature_detected!("bmi1")
+                && is_x86_feature_detected!("bmi2");
+            if is_x86_feature_detected!("avx2") && counts_bits {
+                all.push(Simd(Level::Avx2));
+            }
+            if counts_bits
+                && is_x86_feature_detected!("avx512f")
+                && is_x86_feature_detected!("avx512vl")
+                && is_x86_feature_detected!("avx512dq")
+                && is_x86_feature_detected!("avx512bw")
+            {
+                all.push(Simd(Level::Avx512));
+            }
+        }
+        all
+    }
+
+    /// For people.
+    pub fn name(self) -> &'static str {
+        match self.0 {
+            Level::Plain => "plain",
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => "avx2",
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => "avx512",
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => "neon",
+        }
+    }
+}
+
+/// `n`, or a few more for the last register of a loop to be full: what does not fill one is worked out one by
+/// one, and there may be as much of that as of the rest. No more than `MOST`, which compilers then know.
+#[inline(always)]
+pub(crate) fn whole_registers<const MOST: usize>(n: usize) -> usize {
+    const { assert!(MOST.is_multiple_of(16)) };
+    n.next_multiple_of(16).min(MOST)
+}
+
+/// Work that is compiled for every instruction set. Whatever it calls must be `inline(always)` to be
+/// compiled with it.
+pub trait Work {
+    /// What comes out.
+    type Out;
+    /// Does it. Which instruction set it is compiled for is known where it is: what is for others is left out.
+    fn run(self, simd: Simd) -> Self::Out;
+}
+
+impl Simd {
+    /// Runs `work` with this instruction set. Choosing once a tile part is free; once a section
+    /// costs a call.
+    #[inline]
+    pub fn run<W: Work>(self, work: W) -> W::Out {
+        match self.0 {
+            // SAFETY: the value proves that the instructions are there (`Simd::all`).
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe { run_avx2(work) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => unsafe { run_avx512(work) },
+            // NEON is in the baseline of 64-bit ARM.
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => run_neon(work),
+            Level::Plain => run_plain(work),
+        }
+    }
+}
+
+// None is compiled with its callers, of which some have much code.
+
+#[inline(never)]
+fn run_plain<W: Work>(work: W) -> W::Out {
+    work.run(Simd(Level::Plain))
+}
+
+#[cfg(target_arch = "aarch64")]
+#[inline(never)]
+fn run_neon<W: Work>(work: W) -> W::Out {
+    work.run(Simd(Level::Neon))
+}
+
+#[cfg(target_arch = "x86_64")]
+#[inline(never)]
+#[target_feature(enable = "avx2,popcnt,lzcnt,bmi1,bmi2")]
+fn run_avx2<W: Work>(work: W) -> W::Out {
+    work.run(Simd(Level::Avx2))
+}
+
+#[cfg(target_arch = "x86_64")]
+#[inline(never)]
+#[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,popcnt,lzcnt,bmi1,bmi2")]
+fn run_avx512<W: Work>(work: W) -> W::Out {
+    work.run(Simd(Level::Avx512))
+}
+
+/// Four rows of sixteen columns, column by column: four columns a register.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+#[inline]
+fn by_column(rows: [std::arch::x86_64::__m512i; 4]) -> [std::arch::x86_64::__m512i; 4] {
+    use std::arch::x86_64::*;
+    // Columns 0 4 8 12, 1 5 9 13 and so on, one a quarter; then in order.
+    let [a, b, c, d] = lanes::Sixteen::turned(rows);
+    let ab = [_mm512_shuffle_i32x4::<0x44>(a, b), _mm512_shuffle_i32x4::<0xee>(a, b)];
+    let cd = [_mm512_shuffle_i32x4::<0x44>(c, d), _mm512_shuffle_i32x4::<0xee>(c, d)];
+    [
+        _mm512_shuffle_i32x4::<0x88>(ab[0], cd[0]),
+        _mm512_shuffle_i32x4::<0xdd>(ab[0], cd[0]),
+        _mm512_shuffle_i32x4::<0x88>(ab[1], cd[1]),
+        _mm512_shuffle_i32x4::<0xdd>(ab[1], cd[1]),
+    ]
+}
+
+/// Adds one section to the pixels of rows `y0..` and columns `x0..` of a sheet with `stride` pixels
+/// a row: `((payload * w_z) * w_y) * w_x`, in this order everywhere.
+///
+/// # Panics
+/// If the footprint leaves the sheet.
+#[inline(always)]
+pub fn splat<S: Accumulate>(
+    sheet: &mut Pixels<S>,
+    stride: usize,
+    (x0, wx): (usize, &[S::Weight]),
+    (y0, wy): (usize, &[S::Weight]),
+    section: [S::Section; 4],
+) {
+    for (j, &w) in wy.iter().enumerate() {
+        let row = (y0 + j) * stride + x0;
+        let p = section.map(|c| S::row(c, w));
+        for (pixel, &w) in sheet[row..row + wx.len()].iter_mut().zip(wx) {
+            for c in 0..4 {
+                pixel[c] = pixel[c].plus(p[c], w);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// One splat, as work.
+    struct One<'a, S: Accumulate> {
+        sheet: &'a mut Pixels<S>,
+        wx: &'a [S::Weight],
+        wy: &'a [S::Weight],
+        section: [S::Section; 4],
+    }
+
+    impl<S: Accumulate> Work for One<'_, S> {
+        type Out = ();
+        #[inline(always)]
+        fn run(self, _: Simd) {
+            splat(self.sheet, 64, (3, self.wx), (1, self.wy), self.section);
+        }
+    }
+
+    #[test]
+    fn every_instruction_set_gives_the_same_bytes() {
+        for n in 0..40usize {
+            let wx: Vec<f32> = (0..n).map(|i| 1.0 / (1.7 + i as f32)).collect();
+            let wy: Vec<f32> = (0..7).map(|i| 0.9 / (1.0 + i as f32)).collect();
+            let taps = |w: &[f32]| w.iter().map(|&w| Tap::new(w)).collect::<Vec<_>>();
+            let units = |w: &[f32]| w.iter().map(|&w| (w * 32768.0) as i16).collect::<Vec<_>>();
+            let (tx, ty, ix, iy) = (taps(&wx), taps(&wy), units(&wx), units(&wy));
+            let section = [1.9e8, 1.1e8, 7.7, 0.3];
+            let run = |simd: Simd| {
+                let mut ints = vec![[5i32; 4]; 64 * 9];
+                let mut floats = vec![[0.1f32; 4]; 64 * 9];
+                let mut shorts = vec![[5i16; 4]; 64 * 9];
+                let bounded = section.map(Section);
+                simd.run(One { sheet: &mut ints[..], wx: &tx, wy: &ty, section: bounded });
+                simd.run(One { sheet: &mut floats[..], wx: &tx, wy: &ty, section });
+                let section = [31_000, 17_003, 77, 3];
+                simd.run(One { sheet: &mut shorts[..], wx: &ix, wy: &iy, section });
+                (ints, floats, shorts)
+            };
+            let want = run(Simd::plain());
+            for simd in Simd::all() {
+                assert!(run(simd) == want, "{} differs at width {n}", simd.name());
+            }
+        }
+    }
+
+    #[test]
+    fn integers_round_to_nearest() {
+        let mut sheet = vec![[0i32; 4]; 1];
+        let one = [Tap::new(1.0)];
+        splat(&mut sheet, 1, (0, &one), (0, &one), [2.4, 2.6, 0.49, 0.0].map(Section));
+        assert_eq!(sheet[0], [2, 3, 0, 0]);
+        assert_eq!([times(3, 16384), times(5, 13107), times(32767, 32767)], [2, 2, 32766]);
+        assert_eq!([whole(0.49), whole(0.5), whole(-3.0), whole(f32::NAN)], [0, 1, 0, 0]);
+    }
+
+    #[test]
+    fn the_nearest_whole_number_is_the_one_of_the_standard() {
+        let ties = (0..100).map(|i| i as f32 * 0.5);
+        let whole = (20..31).flat_map(|bits| {
+            let x = (1u32 << bits) as f32;
+            [x.next_down(), x, x.next_up(), x - 0.5, x + 0.5, x + 1.0]
+        });
+        let odd = [0.0, 0.499_999_97, 0.500_000_06, 4_194_303.8, 8_388_607.5, 8_388_609.0];
+        for x in ties.chain(whole).chain(odd).chain((0..10_000).map(|i| i as f32 * 0.37)) {
+            assert_eq!(nearest(x), x.round_ties_even() as i32, "{x}");
+        }
+        let most = LARGEST as i32;
+        assert_eq!([LARGEST, 3e9, f32::INFINITY, f32::NAN].map(nearest), [most; 4]);
+    }
+
+    #[test]
+    fn nothing_leaves_the_integers() {
+        let mut sheet = vec![[0i32; 4]; 1];
+        let one = [Tap::new(1.0)];
+        assert_eq!([f32::NAN, -1.0].map(|w| Tap::new(w).get()), [0.0, 0.0]);
+        splat(&mut sheet, 1, (0, &one), (0, &one), [3e9, f32::INFINITY, 0.0, 1.0].map(Section));
+        assert_eq!(sheet[0], [2_147_483_520, 2_147_483_520, 0, 1]);
+        let nothing = [Tap::new(0.0)];
+        splat(&mut sheet, 1, (0, &nothing), (0, &one), [0.0, 0.0, f32::INFINITY, 0.0].map(Section));
+        assert_eq!(sheet[0][2], 2_147_483_520);
+        let mut sheet = vec![[30_000i16; 4]; 1];
+        splat(&mut sheet, 1, (0, &[32767]), (0, &[32767]), [9_000, 1, 0, 32767]);
+        assert_eq!(sheet[0], [32767, 30_001, 30_000, 32767]);
+    }
+}

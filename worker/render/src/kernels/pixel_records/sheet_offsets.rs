@@ -1,0 +1,644 @@
+//! Voxels whose sections have footprints of their own, as in perspective: each lies elsewhere on the
+//! screen and is of another width.
+//!
+//! A voxel's weights are put side by side by column and slot, and by row and slot
+//! ([`Recorded::weave`]), so that all its sections are added to a pixel's record at once
+//! ([`Recorded::splat_deep`]). With AVX2, AVX-512 and NEON, where windows are at most [`LINE`] pixels wide,
+//! what lies in a window is worked out for many voxels at once (`lines`), and weights are put side by side
+//! in registers.
+
+use super::shear::Slant;
+use super::{BySlot, MOST, Record, Recorded, RowAt, STRIDE, Table};
+#[cfg(target_arch = "x86_64")]
+use crate::kernels::Level;
+use crate::kernels::Simd;
+use crate::primitives::footprint::{Lean, Phases};
+pub(crate) use crate::primitives::sizes::LINE;
+use crate::primitives::sizes::PART;
+use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
+
+/// Voxels that are placed, shaded and splatted together.
+pub(crate) const BATCH: usize = 64;
+
+/// A number a voxel.
+pub(crate) type Each<T> = [T; BATCH];
+
+/// Pixels of a window at most, along an axis: a footprint of eight pixels a vox.
+pub(crate) const WINDOW: usize = 40;
+
+/// Where the sections of some voxels lie.
+pub(crate) struct Apart {
+    /// First pixels of footprints, from the part's corner, and where weights begin: by axis and slot.
+    pub(crate) first: [[Each<i32>; MOST]; 2],
+    pub(crate) from: [[Each<u32>; MOST]; 2],
+    /// Where footprints lie themselves, in subpixels from the part's corner: known where rows lie aside.
+    pub(crate) places: [[Each<i32>; MOST]; 2],
+    /// Where voxels do, where their sections lie aside of them.
+    pub(crate) at: [Each<i32>; 2],
+    /// By axis, the window inside the part that holds all footprints of a voxel: its first pixel, and the
+    /// one behind its last.
+    pub(crate) lo: [Each<i32>; 2],
+    pub(crate) hi: [Each<i32>; 2],
+    /// Sheets that a voxel has left, from the one at hand, and where its weights in depth for these begin.
+    pub(crate) left: Each<i32>,
+    pub(crate) deep: Each<u32>,
+    /// Voxels that are added.
+    pub(crate) kept: Each<u32>,
+}
+
+impl Default for Apart {
+    fn default() -> Self {
+        Apart {
+            first: [[[0; BATCH]; MOST]; 2],
+            from: [[[0; BATCH]; MOST]; 2],
+            places: [[[0; BATCH]; MOST]; 2],
+            at: [[0; BATCH]; 2],
+            lo: [[0; BATCH]; 2],
+            hi: [[0; BATCH]; 2],
+            left: [0; BATCH],
+            deep: [0; BATCH],
+            kept: [0; BATCH],
+        }
+    }
+}
+
+impl Apart {
+    /// Has sections of the first `n` voxels lie as far aside along `axis` as `aside` says of each phase's sheets
+    /// ([`Leaning::subpixels`](crate::primitives::footprint::Leaning::subpixels)): in so many sheets from that on which slot `first`
+    /// holds. What lies behind a voxel's last section may lie anywhere.
+    #[inline(always)]
+    pub(crate) fn lean<const N: usize>(
+        &mut self,
+        simd: Simd,
+        axis: usize,
+        n: usize,
+        aside: &[i32],
+        sheets: (usize, usize),
+    ) {
+        let (places, at) = (&mut self.places[axis], &self.at[axis]);
+        match simd.0 {
+            // SAFETY: the value proves that the instructions are there.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => unsafe {
+                lean::sixteen::<N>((places, &self.deep, at, aside), n, sheets)
+            },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => unsafe { lean::eight::<N>((places, &self.deep, at, aside), n, sheets) },
+            _ => {
+                let (first, sheets) = sheets;
+                for sheet in 0..sheets.min(N) {
+                    let place = &mut places[(first + sheet) % N];
+                    for i in 0..n {
+                        let which = self.deep[i] as usize + sheet;
+                        place[i] = at[i] + aside[which.min(aside.len() - 1)];
+                    }
+                }
+            }
+        }
+    }
+
+    /// Begins windows of the first `n` voxels along `axis`.
+    #[inline(always)]
+    pub(crate) fn begin(&mut self, axis: usize, n: usize) {
+        self.lo[axis][..n].fill(i32::MAX);
+        self.hi[axis][..n].fill(i32::MIN);
+    }
+
+    /// Has the windows hold footprints of `len` pixels along `axis` in a slot, of which voxels have some if they have
+    /// more than `sheets` left.
+    #[inline(always)]
+    pub(crate) fn hold(&mut self, axis: usize, slot: usize, n: usize, (len, sheets): (i32, i32)) {
+        let first = &self.first[axis][slot];
+        let (lo, hi) = (&mut self.lo[axis], &mut self.hi[axis]);
+        for i in 0..n {
+            let here = sheets < self.left[i];
+            lo[i] = lo[i].min(if here { first[i] } else { i32::MAX });
+            hi[i] = hi[i].max(if here { first[i] + len } else { i32::MIN });
+        }
+    }
+
+    /// The same across where rows lie aside of each other: `row` is [`Lean::row_fixed`], and rows are placed.
+    #[inline(always)]
+    pub(crate) fn hold_skewed(
+        &mut self,
+        slot: usize,
+        n: usize,
+        ([x, y], row): ([&Phases; 2], i64),
+        sheets: i32,
+    ) {
+        for i in 0..n {
+            let place = self.places.each_ref().map(|places| places[slot][i]);
+            // The first and the last row lie farthest aside.
+            let top = self.first[1][slot][i];
+            let ends = [top, top + y.len as i32 - 1];
+            let [a, b] = ends.map(|y| x.first_at(along_row(row, place, y)));
+            if sheets < self.left[i] {
+                self.lo[0][i] = self.lo[0][i].min(a.min(b));
+                self.hi[0][i] = self.hi[0][i].max(a.max(b) + x.len as i32);
+            }
+        }
+    }
+
+    /// Cuts windows along `axis` where the part ends.
+    #[inline(always)]
+    pub(crate) fn cut(&mut self, axis: usize, n: usize) {
+        for lo in &mut self.lo[axis][..n] {
+            *lo = (*lo).max(0);
+        }
+        for hi in &mut self.hi[axis][..n] {
+            *hi = (*hi).min(PART);
+        }
+    }
+
+    /// First column and row of the window of voxel `i`, and how many there are. Columns begin at a
+    /// multiple of `step`, and so many they are.
+    #[inline(always)]
+    pub(crate) fn window(&self, i: usize, step: i32) -> ([usize; 2], [usize; 2]) {
+        let [x, y] = [self.lo[0][i] / step * step, self.lo[1][i]];
+        let wide = (self.hi[0][i] - x + step - 1) / step * step;
+        ([x, y].map(|lo| lo as usize), [wide, self.hi[1][i] - y].map(|n| n as usize))
+    }
+}
+
+/// [`Apart::lean`]: a voxel's sheets lie beside each other in the table, and voxels in what comes out.
+#[cfg(target_arch = "x86_64")]
+mod lean {
+    use super::{BATCH, Each, LINE};
+    use crate::kernels::lanes::{Eight, Lanes, Sixteen};
+    use crate::kernels::pixel_records::MOST;
+
+    /// Where sections lie by slot, and of the voxels where weights in depth begin and where they are; how far
+    /// sections lie aside.
+    type At<'a> = (&'a mut [Each<i32>; MOST], &'a Each<u32>, &'a Each<i32>, &'a [i32]);
+
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    #[inline]
+    pub(super) fn sixteen<const N: usize>(at: At<'_>, n: usize, sheets: (usize, usize)) {
+        // SAFETY: these are the instructions.
+        unsafe { some::<Sixteen, N>(at, n, sheets) }
+    }
+
+    #[target_feature(enable = "avx2")]
+    #[inline]
+    pub(super) fn eight<const N: usize>(at: At<'_>, n: usize, sheets: (usize, usize)) {
+        // SAFETY: these are the instructions.
+        unsafe { some::<Eight, N>(at, n, sheets) }
+    }
+
+    #[inline(always)]
+    unsafe fn some<L: Lanes, const N: usize>(
+        (places, deep, at, aside): At<'_>,
+        n: usize,
+        (first, sheets): (usize, usize),
+    ) {
+        let last = aside.len().checked_sub(MOST).expect("a voxel's sheets and more");
+        for i in (0..n.min(BATCH)).step_by(L::LANES) {
+            let some = i..i + L::LANES;
+            // Those of no voxel at hand are anything.
+            let mut which = [0; LINE];
+            for (to, &deep) in which[..L::LANES].iter_mut().zip(&deep[some.clone()]) {
+                *to = deep.min(last as u32);
+            }
+            // SAFETY: the caller's. Fours begin at most at the `last`, and four later; as many lanes are left in
+            // what comes out.
+            unsafe {
+                let at = L::load(at[some.clone()].as_ptr().cast());
+                for four in 0..sheets.min(N).div_ceil(4) {
+                    let from = aside[4 * four..].as_ptr().cast();
+                    for (j, aside) in L::fours(from, 1, which.as_ptr()).into_iter().enumerate() {
+                        let place = &mut places[(first + 4 * four + j) % N];
+                        L::store(place[some.clone()].as_mut_ptr().cast(), L::plus(at, aside));
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// What the sheets are that voxels reach from one on.
+#[derive(Clone, Copy)]
+pub(crate) struct Layers<'a, S: Recorded, const N: usize> {
+    /// Weights across and down, by slot.
+    pub(crate) across: [[Table<'a, S::Weight>; N]; 2],
+    /// In depth.
+    pub(crate) deep: Table<'a, S::Depth>,
+    /// Of the first of them.
+    pub(crate) slot: usize,
+    /// Whether a voxel has the same columns in all of them, with the same weights.
+    pub(crate) alike: bool,
+    /// How sections lie aside of each other, if where they are is looked up as voxels are added ([`slant`](super::slant)).
+    pub(crate) slant: Option<Slant<'a>>,
+}
+
+impl<'a, S: Recorded, const N: usize> Layers<'a, S, N> {
+    /// Weights in depth of voxel `i`, by slot.
+    #[inline(always)]
+    pub(super) fn depths(&self, apart: &Apart, i: usize) -> BySlot<S::Depth, N> {
+        let weights = &self.deep.weights[apart.deep[i] as usize..][..apart.left[i] as usize];
+        let mut deep = [S::Depth::default(); N];
+        for (sheet, &w) in weights.iter().enumerate() {
+            deep[(self.slot + sheet) % N] = w;
+        }
+        deep
+    }
+
+    /// Weights of voxel `i` along `axis`, in a window that begins at `lo`.
+    #[inline(always)]
+    fn rows(&self, apart: &Apart, i: usize, axis: usize, lo: usize) -> [RowAt<'a, S::Weight>; N] {
+        // Loops, since closures of arrays are compiled for the baseline.
+        let mut rows = [RowAt::NONE; N];
+        for (at, row) in rows.iter_mut().enumerate() {
+            let Table { weights: table, len } = self.across[axis][at];
+            *row = RowAt::none_of(table);
+            if self.after(at) < apart.left[i] {
+                let from = apart.from[axis][at][i] as usize;
+                *row = RowAt { table, from, len, column: apart.first[axis][at][i] - lo as i32 };
+            }
+        }
+        rows
+    }
+
+    /// How many sheets behind the first `slot` belongs to.
+    #[inline(always)]
+    pub(crate) fn after(&self, slot: usize) -> i32 {
+        after::<N>(self.slot, slot)
+    }
+}
+
+/// How many sheets behind the one that slot `first` holds is the next one that `slot` does.
+#[inline(always)]
+pub(crate) fn after<const N: usize>(first: usize, slot: usize) -> i32 {
+    ((slot + N - first) % N) as i32
+}
+
+/// Memory for weights that are put side by side.
+pub(crate) struct Woven<W, const N: usize> {
+    /// By slot, of a window's columns and of its rows.
+    by_slot: [[BySlot<W, N>; WINDOW]; 2],
+    /// Across and down.
+    #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+    pub(super) spans: [lines::Spans<N>; 2],
+}
+
+impl<W: Copy + Default, const N: usize> Default for Woven<W, N> {
+    fn default() -> Self {
+        Woven {
+            by_slot: [[[W::default(); N]; WINDOW]; 2],
+            #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+            spans: Default::default(),
+        }
+    }
+}
+
+/// What [`Recorded::splat_apart`] adds, where and by which weights, for windows of a known width.
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+pub(super) type ApartAt<'a, S, const N: usize> = (
+    &'a mut [Record<S, N>],
+    (&'a Apart, &'a [<S as Recorded>::Payload]),
+    &'a Layers<'a, S, N>,
+    &'a mut [lines::Spans<N>; 2],
+);
+
+/// [`Recorded::splat_apart`], voxel by voxel.
+#[inline(always)]
+pub(super) fn splat_apart<S: Recorded, const N: usize>(
+    simd: Simd,
+    records: &mut [Record<S, N>],
+    (apart, payloads): (&Apart, &[S::Payload]),
+    layers: &Layers<'_, S, N>,
+    woven: &mut Woven<S::Weight, N>,
+) {
+    for (&i, &payload) in apart.kept.iter().zip(payloads) {
+        let i = i as usize % BATCH;
+        let ([x, y], wide) = apart.window(i, S::step::<N>());
+        let deep = layers.depths(apart, i);
+        for (axis, lo) in [x, y].into_iter().enumerate() {
+            let rows = layers.rows(apart, i, axis, lo);
+            S::weave(simd, rows, wide[axis], &mut woven.by_slot[axis]);
+        }
+        let [columns, lines] = [0, 1].map(|axis| &woven.by_slot[axis][..wide[axis]]);
+        S::splat_deep(simd, records, y * STRIDE + x, (columns, lines), payload, &deep);
+    }
+}
+
+/// Where the middle of row `y` is along x of a footprint at `place`, in subpixels; `row`: [`Lean::row_fixed`].
+#[inline(always)]
+pub(crate) fn along_row(row: i64, [x, y_of]: [i32; 2], y: i32) -> i32 {
+    let middle = (y << SUBPIXEL_BITS) + SUBPIXELS / 2;
+    x + Lean::along_row(row, i64::from(middle - y_of)) as i32
+}
+
+/// [`splat_apart`] of voxels whose rows lie aside of each other, too: each row has weights of its own. `phases`:
+/// where those across lie in each slot.
+#[inline(always)]
+pub(crate) fn splat_skewed<S: Recorded, const N: usize>(
+    simd: Simd,
+    records: &mut [Record<S, N>],
+    (apart, payloads): (&Apart, &[S::Payload]),
+    (layers, (row, phases)): (&Layers<'_, S, N>, (i64, &[Phases; N])),
+    woven: &mut Woven<S::Weight, N>,
+) {
+    for (&i, &payload) in apart.kept.iter().zip(payloads) {
+        let i = i as usize % BATCH;
+        let ([x, y], [wide, high]) = apart.window(i, S::step::<N>());
+        let deep = layers.depths(apart, i);
+        let [columns, lines] = &mut woven.by_slot;
+        S::weave(simd, layers.rows(apart, i, 1, y), high, lines);
+        for (line, y) in (y..y + high).enumerate() {
+            let mut rows = [RowAt::NONE; N];
+            for (at, to) in rows.iter_mut().enumerate() {
+                let Table { weights: table, len } = layers.across[0][at];
+                *to = RowAt::none_of(table);
+                if layers.after(at) < apart.left[i] {
+                    let place = [apart.places[0][at][i], apart.places[1][at][i]];
+                    let place = along_row(row, place, y as i32);
+                    let phase = place & (SUBPIXELS - 1);
+                    let column = (place >> SUBPIXEL_BITS) + phases[at].first(phase) - x as i32;
+                    *to = RowAt { table, from: phases[at].begin(phase as usize), len, column };
+                }
+            }
+            S::weave(simd, rows, wide, columns);
+            let across = (&columns[..wide], &lines[line..=line]);
+            S::splat_deep(simd, records, y * STRIDE + x, across, payload, &deep);
+        }
+    }
+}
+
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+pub(super) mod lines {
+    use super::{Apart, BATCH, Each, LINE, Layers};
+    use crate::kernels::lanes::Lanes;
+    use crate::kernels::pixel_records::Recorded;
+    use crate::primitives::sizes::PART;
+    use std::ops::Range;
+
+    /// Columns that the windows of all voxels fit which are added, a multiple of the step, which is 1 or 2; `None` if
+    /// there are windows of more than [`LINE`] pixels.
+    #[inline(always)]
+    pub(crate) fn widest(apart: &Apart, kept: &[u32], step: i32) -> Option<usize> {
+        let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
+        // Of all, since loops over numbers beside each other are fast; few are left out.
+        let most = [0, 1].map(|axis| {
+            let step = if axis == 0 { step } else { 1 };
+            let ends = apart.lo[axis][..n].iter().zip(&apart.hi[axis][..n]);
+            let wide = ends.map(|(&lo, &hi)| (hi - (lo & -step) + step - 1) & -step);
+            wide.fold(0, i32::max) as usize
+        });
+        most.iter().all(|&most| most <= LINE).then_some(most[0])
+    }
+
+    /// First column of a window of `wide` columns from `first`, moved to lie inside the part.
+    #[inline(always)]
+    pub(crate) fn inside(first: usize, wide: usize) -> usize {
+        first.min(PART as usize - wide)
+    }
+
+    /// Which weights in each slot windows have along an axis. These are kilobytes, and a bucket may have few voxels:
+    /// they stay where they are from one to the next, and what is of no voxel at hand is anything.
+    pub(crate) struct Spans<const N: usize> {
+        /// Which pixels of a window there are any for, a bit each.
+        present: [Each<u32>; N],
+        /// Where that of a window's first pixel would be.
+        at: [Each<i32>; N],
+    }
+
+    impl<const N: usize> Default for Spans<N> {
+        fn default() -> Self {
+            Spans { present: [[0; BATCH]; N], at: [[0; BATCH]; N] }
+        }
+    }
+
+    /// Weights in each slot along an axis for windows of at most [`LINE`] pixels. Those that are present lie
+    /// in the slot's weights.
+    pub(crate) struct Lines<'a, W, const N: usize> {
+        spans: &'a Spans<N>,
+        weights: [&'a [W]; N],
+    }
+
+    impl<'a, W, const N: usize> Lines<'a, W, N> {
+        /// Those across and down of the voxels in `kept`, which ascend. Windows begin at columns that are
+        /// multiples of `step` and are moved inside to be `wide` columns; they may have any number of rows.
+        /// Columns that are alike are those of the first slot alone.
+        ///
+        /// # Safety
+        /// For machines with the instructions of `L`.
+        #[inline(always)]
+        pub(crate) unsafe fn both<L: Lanes, S: Recorded<Weight = W>>(
+            apart: &Apart,
+            kept: &[u32],
+            layers: &Layers<'a, S, N>,
+            [across, down]: &'a mut [Spans<N>; 2],
+            (wide, step): (usize, i32),
+        ) -> [Lines<'a, W, N>; 2] {
+            let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
+            // SAFETY: the caller has the instructions.
+            unsafe {
+                let slots = if layers.alike { layers.slot..layers.slot + 1 } else { 0..N };
+                let across = Lines::new::<L, S>(apart, layers, across, n, (0, slots, wide, step));
+                let down = Lines::new::<L, S>(apart, layers, down, n, (1, 0..N, 0, 1));
+                [across, down]
+            }
+        }
+
+        /// Those of the first `n` voxels along `axis` in some slots. See [`Lines::both`].
+        #[inline(always)]
+        unsafe fn new<L: Lanes, S: Recorded<Weight = W>>(
+            apart: &Apart,
+            layers: &Layers<'a, S, N>,
+            spans: &'a mut Spans<N>,
+            n: usize,
+            (axis, slots, wide, step): (usize, Range<usize>, usize, i32),
+        ) -> Lines<'a, W, N> {
+            let mut weights: [&[W]; N] = [&[]; N];
+            for slot in 0..N {
+                if !slots.contains(&slot) {
+                    spans.present[slot] = [0; BATCH];
+                    continue;
+                }
+                let table = &layers.across[axis][slot];
+                weights[slot] = table.weights;
+                let last = table.weights.len().checked_sub(table.len).expect("a row of the table");
+                let [last, len] = [last, table.len].map(|n| n.min(i32::MAX as usize) as i32);
+                for i in (0..n.min(BATCH)).step_by(L::LANES) {
+                    let some = i..i + L::LANES;
+                    let lo = apart.lo[axis][some.clone()].as_ptr().cast();
+                    let first = apart.first[axis][slot][some.clone()].as_ptr().cast();
+                    let from = apart.from[axis][slot][some.clone()].as_ptr();
+                    let bits_to = spans.present[slot][some.clone()].as_mut_ptr();
+                    let from_to = spans.at[slot][some].as_mut_ptr().cast();
+                    // SAFETY: as many lanes as there are begin at each.
+                    unsafe {
+                        let mut lo = L::load(lo);
+                        if axis == 0 {
+                            lo = L::min(L::and(lo, L::set(-step)), L::set(PART - wide as i32));
+                        }
+                        let column = L::minus(L::load(first), lo);
+                        // From a footprint's first pixel to behind its last, of those that are looked at. In
+                        // sheets that a voxel does not reach there may be some: its section is nothing there.
+                        let (zero, one, line) = (L::set(0), L::set(1), L::set(LINE as i32));
+                        let begin = L::min(L::max(column, zero), line);
+                        let end = L::min(L::max(L::plus(column, L::set(len)), zero), line);
+                        let bits = L::minus(L::up_each(one, end), L::up_each(one, begin));
+                        L::store(bits_to, bits);
+                        // What is read lies in the table, whatever a begin says.
+                        let from = L::max(L::min(L::load(from), L::set(last)), zero);
+                        L::store(from_to, L::minus(from, column));
+                    }
+                }
+            }
+            Lines { spans, weights }
+        }
+
+        /// Which weights of voxel `i` there are in `slot`, a bit each, and where that of the first pixel would
+        /// lie.
+        #[inline(always)]
+        pub(crate) fn of(&self, slot: usize, i: usize) -> (u32, *const W) {
+            let from = self.weights[slot].as_ptr();
+            (self.spans.present[slot][i], from.wrapping_offset(self.spans.at[slot][i] as isize))
+        }
+
+        /// The same, and [`LINE`] weights from that of the first pixel on, where the table has them all.
+        #[inline(always)]
+        pub(crate) fn around(&self, slot: usize, i: usize) -> (u32, Option<&'a [W; LINE]>) {
+            let around = usize::try_from(self.spans.at[slot][i]).ok();
+            let around = around.and_then(|at| self.weights[slot].get(at..)?.first_chunk());
+            (self.spans.present[slot][i], around)
+        }
+
+        /// One by one, what is not present zero.
+        pub(crate) fn one_by_one(&self, slot: usize, i: usize) -> [W; LINE]
+        where
+            W: Copy + Default,
+        {
+            std::array::from_fn(|j| {
+                let is_present = self.spans.present[slot][i] >> j & 1 == 1;
+                let at = self.spans.at[slot][i] + j as i32;
+                if is_present { self.weights[slot][at as usize] } else { W::default() }
+            })
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernels::Tap;
+    use proptest::prelude::*;
+
+    /// Where the sections of a voxel lie: around a pixel, each so far aside of it and with weights from here
+    /// on, by axis; and how many sheets it has left.
+    type Somewhere = ([i32; 2], [[(i32, u32); MOST]; 2], i32);
+
+    fn somewhere() -> impl Strategy<Value = Somewhere> {
+        let aside = prop::array::uniform8((0..4i32, 0..150u32));
+        (prop::array::uniform2(-12..70i32), prop::array::uniform2(aside), 1..=MOST as i32)
+    }
+
+    /// Voxels by every instruction set; `lens`: widths of footprints by axis and slot.
+    fn add_everywhere<S: Recorded, const N: usize>(
+        voxels: &[Somewhere],
+        lens: [[usize; MOST]; 2],
+        (slot, alike): (usize, bool),
+        weights: &[S::Weight],
+        deep: &[S::Depth],
+    ) -> Result<(), TestCaseError> {
+        let slot = slot % N;
+        // Columns that are alike are those of the first slot.
+        let of = |axis: usize, at: usize| if alike && axis == 0 { slot } else { at };
+        let across = [0, 1]
+            .map(|axis| std::array::from_fn(|at| Table { weights, len: lens[axis][of(axis, at)] }));
+        let deep = Table { weights: deep, len: N };
+        let layers = Layers::<S, N> { across, deep, slot, alike, slant: None };
+        let mut apart = Apart::default();
+        let mut payloads = Vec::new();
+        for (i, (around, aside, left)) in voxels.iter().enumerate() {
+            let left = *left.min(&(N as i32));
+            (apart.left[i], apart.deep[i]) = (left, i as u32 % 5);
+            for axis in 0..2 {
+                let (mut lo, mut hi) = (i32::MAX, i32::MIN);
+                for at in 0..N {
+                    let (by, from) = aside[axis][of(axis, at)];
+                    let first = around[axis] + by;
+                    (apart.first[axis][at][i], apart.from[axis][at][i]) = (first, from);
+                    if layers.after(at) < left {
+                        let len = layers.across[axis][at].len as i32;
+                        (lo, hi) = (lo.min(first), hi.max(first + len));
+                    }
+                }
+                (apart.lo[axis][i], apart.hi[axis][i]) = (lo.max(0), hi.min(64));
+            }
+            if (0..2).all(|axis| apart.lo[axis][i] < apart.hi[axis][i]) {
+                apart.kept[payloads.len()] = i as u32;
+                payloads.push(S::payload([31_000.0 - i as f32, 17_003.4, 77.7, i as f32]));
+            }
+        }
+        let before = [S::from_raw([11; 4]); N];
+        let run = |simd| {
+            let mut records: Vec<Record<S, N>> = vec![before; STRIDE * 64];
+            let mut woven = Woven::default();
+            S::splat_apart(simd, &mut records, (&apart, &payloads), &layers, &mut woven);
+            records
+        };
+        let want = run(Simd::plain());
+        prop_assert_eq!(want.iter().any(|r| *r != before), !payloads.is_empty());
+        for simd in Simd::all() {
+            prop_assert!(run(simd) == want, "{} of {N}", simd.name());
+        }
+        Ok(())
+    }
+
+    proptest! {
+        #[test]
+        fn every_instruction_set_has_sections_lie_as_far_aside(
+            at in prop::collection::vec(-9000..9000i32, BATCH),
+            deep in prop::collection::vec(0..48u32, BATCH),
+            n in 0..=BATCH, first in 0..MOST, sheets in 1..=MOST, axis in 0..2usize,
+        ) {
+            let aside: Vec<i32> = (0..40 + MOST as i32).map(|i| i * 37 % 301 - 150).collect();
+            let at: Each<i32> = at.try_into().expect("a batch");
+            let deep: Each<u32> = deep.try_into().expect("a batch");
+            let of = |simd| {
+                let mut apart = Apart::default();
+                (apart.deep, apart.at[axis]) = (deep, at);
+                apart.lean::<MOST>(simd, axis, n, &aside, (first, sheets));
+                // What lies behind the last section may lie anywhere.
+                let some = |i: &usize| deep[*i] as usize + sheets <= 40;
+                let voxel = |i: usize| (0..sheets).map(move |sheet| (sheet, i));
+                let places = (0..n).filter(some).flat_map(voxel);
+                places.map(|(s, i)| apart.places[axis][(first + s) % MOST][i]).collect::<Vec<_>>()
+            };
+            let want = of(Simd::plain());
+            let on_paper = (0..n).find(|&i| deep[i] as usize + sheets <= 40);
+            if let Some(i) = on_paper {
+                prop_assert_eq!(want[0], at[i] + aside[deep[i] as usize]);
+            }
+            for simd in Simd::all() {
+                prop_assert_eq!(&of(simd), &want, "{}", simd.name());
+            }
+        }
+
+        #[test]
+        fn every_instruction_set_adds_voxels_as_one_by_one(
+            voxels in prop::collection::vec(somewhere(), 0..BATCH), slot in 0..MOST,
+            len in prop_oneof![1..8usize, 1..WINDOW - 4], alike in any::<bool>(),
+            more in prop::array::uniform2(prop::array::uniform8(0..2usize)), edge in any::<bool>(),
+        ) {
+            let mut voxels = voxels;
+            if edge {
+                // All reach in over the part's first columns and rows, or end before them.
+                for (around, ..) in &mut voxels {
+                    *around = around.map(|at| at.rem_euclid(12) - len as i32);
+                }
+            }
+            let (lens, at) = (more.map(|more| more.map(|more| len + more)), (slot, alike));
+            let short: Vec<i16> = (0..190).map(|i| 4000 + (i * 7919 % 19_000) as i16).collect();
+            let real: Vec<f32> = short.iter().map(|&w| f32::from(w) * 7.1e-5).collect();
+            let taps: Vec<Tap> = real.iter().map(|&w| Tap::new(w)).collect();
+            add_everywhere::<i16, 4>(&voxels, lens, at, &short, &short)?;
+            add_everywhere::<i32, 4>(&voxels, lens, at, &taps, &real)?;
+            add_everywhere::<i16, MOST>(&voxels, lens, at, &short, &short)?;
+            add_everywhere::<i32, MOST>(&voxels, lens, at, &taps, &real)?;
+        }
+    }
+}

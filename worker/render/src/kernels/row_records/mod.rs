@@ -1,0 +1,642 @@
+//! Rows of storeys: a voxel is added along x alone, and pixels are made of rows when a sheet closes
+//! ([`crate::primitives::lattice_rows`]).
+//!
+//! A *tier* is the row of one storey in one open sheet. Tiers lie slot by slot; each begins with a margin of as
+//! many columns as a footprint has, and ends with one, so that no footprint need be cut: what lies there nobody
+//! reads. A register adds at a multiple of its own length alone, since what a neighbour has just written there
+//! is then read back as it was written; weights are moved to where a footprint begins in its first register.
+
+#[cfg(target_arch = "x86_64")]
+mod avx2;
+#[cfg(target_arch = "x86_64")]
+mod avx512;
+#[cfg(target_arch = "x86_64")]
+mod wide;
+
+use super::Level;
+use super::pixel_records::sheet_offsets::{Apart, BATCH, Each, Layers};
+use super::pixel_records::{Line, MOST, Recorded, STRIDE, Splat, Table};
+use super::touched::Places;
+use super::{Accumulate, Grey, Simd, Weight};
+use crate::kernels::composite::LANES;
+use crate::primitives::sizes::PART;
+use crate::primitives::sizes::{LATTICE_ROWS as ROWS, REACHING};
+
+/// Which memory the tiers of a part take.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Shape {
+    /// Tiers of a sheet.
+    pub(crate) rows: usize,
+    /// Lines of the cache of a tier.
+    wide: usize,
+    /// Columns before a part's first.
+    pub(crate) margin: usize,
+    /// Pixels of a line.
+    line: usize,
+    /// Columns of a footprint at most.
+    len: usize,
+}
+
+/// Pixels of a line of the cache.
+const fn a_line<S: Recorded>() -> usize {
+    size_of::<Line>() / size_of::<S::Pixel>()
+}
+
+/// How many groups of so many columns a footprint of `len` may reach: it may begin in the last column of the first.
+#[inline(always)]
+fn groups(len: usize, columns: usize) -> usize {
+    (len + columns - 1).div_ceil(columns)
+}
+
+impl Shape {
+    /// For footprints of at most `len` columns and so many tiers.
+    pub(crate) fn new<S: Recorded>(rows: usize, len: usize) -> Shape {
+        assert!(rows <= ROWS && len < 64, "{rows} tiers for footprints of {len}");
+        let margin = len.next_multiple_of(8);
+        let groups = groups(len, a_line::<S>());
+        // Whole chunks of weights are added: of sixteen columns, or of four lines where there are more.
+        let sixteen = 16 / a_line::<S>();
+        let spare = groups.next_multiple_of(if groups > 4 { 4 } else { sixteen });
+        let wide = (margin + PART as usize) / a_line::<S>() + spare;
+        Shape { rows, wide, margin, line: a_line::<S>(), len }
+    }
+
+    /// Lines of tiers for `sheets`.
+    pub(crate) fn lines(&self, sheets: usize) -> usize {
+        sheets * self.rows * self.wide
+    }
+
+    /// The place of a footprint's first pixel, which is at `first` in the part: it may lie outside.
+    #[inline(always)]
+    pub(crate) fn place(&self, first: i32) -> u32 {
+        (first + self.margin as i32).clamp(0, self.margin as i32 + PART) as u32
+    }
+
+    /// The same among the pixels of all tiers of a sheet.
+    #[inline(always)]
+    pub(crate) fn place_in(&self, tier: u32, first: i32) -> u32 {
+        tier * (self.wide * self.line) as u32 + self.place(first)
+    }
+
+    /// Columns of the part that a footprint of `len` columns has from a [place](Shape::place) on.
+    #[inline(always)]
+    pub(crate) fn columns(&self, place: u32, len: usize) -> u64 {
+        let (all, first) = ((1u64 << len) - 1, place as i32 - self.margin as i32);
+        if first < 0 { all >> -first } else { all.checked_shl(first as u32).unwrap_or(0) }
+    }
+}
+
+/// The open sheets of a part, tier by tier.
+pub(crate) struct Tiers<'a, S: Recorded, const N: usize> {
+    lines: &'a mut [Line],
+    shape: Shape,
+    kind: std::marker::PhantomData<S>,
+}
+
+/// Weights across and in depth.
+#[derive(Clone, Copy)]
+pub(crate) struct Weights<'a, S: Recorded> {
+    pub(crate) across: Table<'a, S::Weight>,
+    pub(crate) deep: Table<'a, S::Depth>,
+}
+
+/// Rows of a part.
+const EDGE: usize = PART as usize;
+
+/// The tiers that reach each row of pixels in a sheet, and what they weigh there.
+pub(crate) struct ByRow<W> {
+    /// The first of them, and how many there are: four at least.
+    reach: [[u8; 2]; EDGE],
+    weights: [[W; REACHING]; EDGE],
+    /// One more than the last of any row.
+    end: usize,
+}
+
+impl<W: Weight> Default for ByRow<W> {
+    fn default() -> Self {
+        ByRow { reach: [[0; 2]; EDGE], weights: [[W::default(); REACHING]; EDGE], end: 0 }
+    }
+}
+
+/// Tiers that reach a row of pixels at least, some with no weight: as many as do if a kernel reaches two steps of the
+/// lattice to either side.
+pub(crate) const FOUR: usize = 4;
+
+impl<W: Weight> ByRow<W> {
+    /// Has `n` tiers from `begin` on reach row `y`, by the weight of each: those before the first and behind the last
+    /// with any are left out, but for four.
+    #[inline(always)]
+    pub(crate) fn set(&mut self, y: usize, [begin, n]: [usize; 2], weight: impl Fn(usize) -> W) {
+        let (mut from, mut to) = (0, n.min(REACHING));
+        let row = &mut self.weights[y % EDGE];
+        for (i, w) in row[..to].iter_mut().enumerate() {
+            *w = weight(begin + i);
+        }
+        while to - from > FOUR && row[to - 1] == W::default() {
+            to -= 1;
+        }
+        while to - from > FOUR && row[from] == W::default() {
+            from += 1;
+        }
+        row.copy_within(from..to, 0);
+        self.end = self.end.max(begin + to);
+        self.reach[y % EDGE] = [begin + from, to - from].map(|tier| tier as u8);
+    }
+
+    /// The first of the tiers that reach row `y`, and what they weigh.
+    #[inline(always)]
+    fn row(&self, y: usize) -> (usize, &[W]) {
+        let [begin, n] = self.reach[y % EDGE].map(usize::from);
+        (begin, &self.weights[y % EDGE][..n.min(REACHING)])
+    }
+}
+
+/// A sheet that closes, and what is known of the one before.
+pub(crate) struct Ends<'a, S: Recorded> {
+    /// Pixels that are open and that something was added to.
+    pub(crate) open: &'a [u64; EDGE],
+    /// Of the sheet and of the one behind.
+    pub(crate) slots: [usize; 2],
+    pub(crate) by_row: [&'a ByRow<S::Weight>; 2],
+    /// Sums of the sheet before, in rows of [`STRIDE`]; then of this one.
+    pub(crate) before: &'a mut [S::Pixel],
+    /// Pixels that `before` is of: elsewhere there is nothing, whatever it says.
+    pub(crate) was: &'a mut [u64; EDGE],
+    /// As [`crate::tile::Pixels`] has them.
+    pub(crate) pixels: &'a [[u32; 4]],
+}
+
+/// Pixels that close, beside each other: where they are, what they have of the sheet before, of theirs and of the one
+/// behind, and how opaque they are.
+pub(crate) struct Folded<S: Recorded> {
+    places: Places,
+    sheets: Box<[[S::Pixel; MOST_CLOSING]; 3]>,
+    opacities: Box<[f32; MOST_CLOSING]>,
+}
+
+/// Pixels that are closed together, or up to a row more: these are what a first cache holds, and of the lanes behind the last
+/// one few are spent.
+const ENOUGH: usize = 512;
+
+/// As many, and as many as are stored at once behind the last.
+const MOST_CLOSING: usize = ENOUGH + EDGE + LANES;
+
+impl<S: Recorded> Default for Folded<S> {
+    fn default() -> Self {
+        let sheets = boxed([S::Pixel::default(); MOST_CLOSING]);
+        Folded { places: Places::default(), sheets, opacities: boxed(0.0) }
+    }
+}
+
+/// So many of the same.
+fn boxed<T: Copy, const N: usize>(one: T) -> Box<[T; N]> {
+    vec![one; N].into_boxed_slice().try_into().unwrap_or_else(|_| unreachable!("as many"))
+}
+
+impl<S: Recorded> Folded<S> {
+    /// Where they are, row by row.
+    #[inline(always)]
+    pub(crate) fn places(&self) -> &Places {
+        &self.places
+    }
+
+    /// Sums and opacities of those from the `i`th on, as many as are closed at once.
+    #[inline(always)]
+    pub(crate) fn sums(&self, i: usize) -> ([&[S::Pixel; LANES]; 3], &[f32; LANES]) {
+        let room = "room behind the last";
+        let sheets = self.sheets.each_ref().map(|sums| sums[i..].first_chunk().expect(room));
+        (sheets, self.opacities[i..].first_chunk().expect(room))
+    }
+}
+
+impl<'a, S: Recorded, const N: usize> Tiers<'a, S, N> {
+    /// In memory that is all zero, but for margins of tiers of this shape.
+    ///
+    /// # Panics
+    /// If there are not as many lines.
+    pub(crate) fn new(lines: &'a mut [Line], shape: Shape) -> Self {
+        let lines = &mut lines[..shape.lines(N)];
+        Tiers { lines, shape, kind: std::marker::PhantomData }
+    }
+
+    #[inline(always)]
+    pub(crate) fn shape(&self) -> Shape {
+        self.shape
+    }
+
+    /// The line that a tier's first column in the part is in.
+    #[inline(always)]
+    pub(crate) fn begin(&self, slot: usize, row: usize) -> u32 {
+        let Shape { rows, wide, margin, .. } = self.shape;
+        ((slot * rows + row) * wide + margin / a_line::<S>()) as u32
+    }
+
+    /// The part's pixels of a tier that begins there.
+    #[inline(always)]
+    fn pixels(&self, begin: u32) -> &[S::Pixel; PART as usize] {
+        let lines = &self.lines[begin as usize..];
+        bytemuck::cast_slice(lines).first_chunk().expect("a tier is longer than a part is wide")
+    }
+
+    /// Whether nothing was added in the part, in any tier.
+    #[cfg(test)]
+    pub(crate) fn are_empty(&self) -> bool {
+        let all = (0..N).flat_map(|slot| (0..self.shape.rows).map(move |row| (slot, row)));
+        let mut pixels = all.flat_map(|(slot, row)| self.pixels(self.begin(slot, row)));
+        pixels.all(|pixel| *pixel == S::Pixel::default())
+    }
+
+    #[inline(always)]
+    fn tier_mut(&mut self, slot: usize, row: usize) -> &mut [S::Pixel] {
+        let Shape { rows, wide, .. } = self.shape;
+        bytemuck::cast_slice_mut(&mut self.lines[(slot * rows + row) * wide..][..wide])
+    }
+
+    /// Adds a section to a tier, plainly.
+    #[inline(always)]
+    pub(crate) fn add(
+        &mut self,
+        (slot, row): (usize, usize),
+        (place, wx): (usize, &[S::Weight]),
+        section: &[S::Section; 4],
+    ) {
+        let tier = self.tier_mut(slot, row);
+        for (pixel, &w) in tier[place..place + wx.len()].iter_mut().zip(wx) {
+            S::add(pixel, section, w);
+        }
+    }
+
+    /// Empties the lines of a tier that have any of the columns.
+    #[inline(always)]
+    pub(crate) fn empty(&mut self, slot: usize, row: usize, columns: u64) {
+        let begin = self.begin(slot, row) as usize;
+        let lines = &mut self.lines[begin..begin + PART as usize / a_line::<S>()];
+        let mut left = firsts::<S>(columns);
+        while left != 0 {
+            lines[left.trailing_zeros() as usize / a_line::<S>()] = Line::ZERO;
+            left &= left - 1;
+        }
+    }
+}
+
+/// The first column of each line of a tier that has any of `columns`.
+#[inline(always)]
+fn firsts<S: Recorded>(columns: u64) -> u64 {
+    firsts_of(columns, a_line::<S>())
+}
+
+/// The first of each `n` columns, two, four or eight, that have any of `columns`.
+#[inline(always)]
+fn firsts_of(columns: u64, n: usize) -> u64 {
+    let pairs = columns | columns >> 1;
+    let fours = pairs | pairs >> 2;
+    match n {
+        2 => pairs & 0x5555_5555_5555_5555,
+        4 => fours & 0x1111_1111_1111_1111,
+        _ => (fours | fours >> 4) & 0x0101_0101_0101_0101,
+    }
+}
+
+/// Sums whose tiers are added to and folded in lanes.
+pub(crate) trait Tiered: Recorded {
+    /// Adds `voxels` with `payloads`, which begin at the sheet that `slot` holds, to the tiers that their
+    /// [rows](Splat::first) name.
+    fn add_flat<const N: usize>(
+        simd: Simd,
+        tiers: &mut Tiers<'_, Self, N>,
+        voxels: (&[Splat], &[Self::Payload]),
+        slot: usize,
+        weights: &Weights<'_, Self>,
+    );
+
+    /// Adds voxels whose sections have [places](Shape::place_in) of their own, by slot.
+    fn add_apart<const N: usize>(
+        simd: Simd,
+        tiers: &mut Tiers<'_, Self, N>,
+        voxels: (&Apart, &[Self::Payload]),
+        places: &[Each<u32>; MOST],
+        layers: &Layers<'_, Self, N>,
+    );
+
+    /// Makes the sums that a sheet and the one behind have in pixels of the tiers above them: in those that are open and
+    /// have any extinction in the sheet, in rows from `rows` on, until there are [`ENOUGH`]. Says where to go on.
+    ///
+    /// # Panics
+    /// If there are fewer sums or pixels than a part has.
+    fn fold<const N: usize>(
+        simd: Simd,
+        tiers: &Tiers<'_, Self, N>,
+        ends: Ends<'_, Self>,
+        rows: usize,
+        to: &mut Folded<Self>,
+    ) -> usize;
+}
+
+/// [`Tiered::fold`] plainly, of sums whose channels are `T`s.
+#[inline(always)]
+fn fold<S, T, const C: usize, const N: usize>(
+    tiers: &Tiers<'_, S, N>,
+    Ends { open, slots, by_row, before, was, pixels }: Ends<'_, S>,
+    rows: usize,
+    to: &mut Folded<S>,
+) -> usize
+where
+    S: Recorded<Pixel = [T; C]>,
+    T: Accumulate<Weight = S::Weight> + Copy + Default,
+{
+    let (mut y, mut n) = (rows, 0);
+    while y < EDGE && n < ENOUGH {
+        let (open, was) = (&open[y], &mut was[y]);
+        let (mut left, had) = (*open, std::mem::take(was));
+        while left != 0 {
+            let x = left.trailing_zeros() as usize;
+            left &= left - 1;
+            let mut sheets = [[T::default(); C]; 2];
+            for (sums, (slot, by_row)) in sheets.iter_mut().zip(slots.into_iter().zip(by_row)) {
+                let (first, weights) = by_row.row(y);
+                let begin = tiers.begin(slot, first);
+                let mut rows = [[(T::default(), S::Weight::default()); REACHING]; C];
+                for (row, &wy) in weights.iter().enumerate() {
+                    let pixel = tiers.pixels(begin + (row * tiers.shape.wide) as u32)[x];
+                    for (rows, sum) in rows.iter_mut().zip(pixel) {
+                        rows[row] = (sum, wy);
+                    }
+                }
+                for (sum, rows) in sums.iter_mut().zip(&rows) {
+                    *sum = T::down(rows[..weights.len()].iter().copied());
+                }
+            }
+            // Extinction comes first.
+            if S::raw(&sheets[0])[0] == 0 {
+                continue;
+            }
+            let (at, [here, behind]) = (y * STRIDE + x, sheets);
+            let old = std::mem::replace(&mut before[at], here);
+            let old = if had >> x & 1 == 1 { old } else { [T::default(); C] };
+            for (to, sums) in to.sheets.iter_mut().zip([old, here, behind]) {
+                to[n] = sums;
+            }
+            to.opacities[n] = f32::from_bits(pixels[at][0]);
+            // SAFETY: it is a place of the part.
+            unsafe { to.places.room()[n] = at as u32 };
+            n += 1;
+            *was |= 1 << x;
+        }
+        y += 1;
+    }
+    to.places.set_len(n);
+    y
+}
+
+/// [`Tiered::add_flat`] plainly.
+#[inline(always)]
+fn add_flat<S: Recorded, const N: usize>(
+    tiers: &mut Tiers<'_, S, N>,
+    (voxels, payloads): (&[Splat], &[S::Payload]),
+    slot: usize,
+    Weights { across, deep }: &Weights<'_, S>,
+) {
+    for (v, &payload) in voxels.iter().zip(payloads) {
+        let [place, row] = v.first();
+        let wx = across.row((v.rows & 0xffff) as usize);
+        for (i, &wz) in deep.row(v.phase() as usize * deep.len).iter().enumerate() {
+            tiers.add(((slot + i) % N, row), (place, wx), &S::cut(payload, wz));
+        }
+    }
+}
+
+/// [`Tiered::add_apart`] plainly.
+#[inline(always)]
+fn add_apart<S: Recorded, const N: usize>(
+    tiers: &mut Tiers<'_, S, N>,
+    (apart, payloads): (&Apart, &[S::Payload]),
+    places: &[Each<u32>; MOST],
+    layers: &Layers<'_, S, N>,
+) {
+    for (&i, &payload) in apart.kept.iter().zip(payloads) {
+        let i = i as usize % BATCH;
+        for slot in 0..N {
+            let sheet = layers.after(slot);
+            if sheet >= apart.left[i] {
+                continue;
+            }
+            let wz = layers.deep.weights[apart.deep[i] as usize + sheet as usize];
+            let wx = layers.across[0][slot].row(apart.from[0][slot][i] as usize);
+            let a_tier = tiers.shape.wide * tiers.shape.line;
+            let [row, place] =
+                [places[slot][i] as usize / a_tier, places[slot][i] as usize % a_tier];
+            tiers.add((slot, row), (place, wx), &S::cut(payload, wz));
+        }
+    }
+}
+
+/// Sums of `$c` channels that are `$channel`s; `$wide` is what their registers are.
+macro_rules! tiered {
+    ($sums:ty, [$channel:ty; $c:literal], $wide:ident $(<$n:literal>)?) => {
+        impl Tiered for $sums {
+            #[inline(always)]
+            fn add_flat<const N: usize>(
+                simd: Simd,
+                tiers: &mut Tiers<'_, Self, N>,
+                voxels: (&[Splat], &[Self::Payload]),
+                slot: usize,
+                weights: &Weights<'_, Self>,
+            ) {
+                assert_eq!(voxels.0.len(), voxels.1.len(), "a payload a voxel");
+                at_level!(
+                    simd,
+                    (tiers, voxels, slot, weights),
+                    add_flat::<Self, N>,
+                    avx2::add_flat::<avx2::$wide $(<$n>)?, Self, N>,
+                    avx512::add_flat::<avx512::$wide $(<$n>)?, Self, N>,
+                    add_flat::<Self, N>
+                );
+            }
+
+            #[inline(always)]
+            fn add_apart<const N: usize>(
+                simd: Simd,
+                tiers: &mut Tiers<'_, Self, N>,
+                voxels: (&Apart, &[Self::Payload]),
+                places: &[Each<u32>; MOST],
+                layers: &Layers<'_, Self, N>,
+            ) {
+                at_level!(
+                    simd,
+                    (tiers, voxels, places, layers),
+                    add_apart::<Self, N>,
+                    avx2::add_apart::<avx2::$wide $(<$n>)?, Self, N>,
+                    avx512::add_apart::<avx512::$wide $(<$n>)?, Self, N>,
+                    add_apart::<Self, N>
+                );
+            }
+
+            #[inline(always)]
+            fn fold<const N: usize>(
+                simd: Simd,
+                tiers: &Tiers<'_, Self, N>,
+                ends: Ends<'_, Self>,
+                rows: usize,
+                to: &mut Folded<Self>,
+            ) -> usize {
+                at_level!(
+                    simd,
+                    (tiers, ends, rows, to),
+                    fold::<Self, $channel, $c, N>,
+                    avx2::fold::<avx2::$wide $(<$n>)?, Self, N>,
+                    avx512::fold::<avx512::$wide $(<$n>)?, Self, N>,
+                    fold::<Self, $channel, $c, N>
+                )
+            }
+        }
+    };
+}
+
+tiered!(i16, [i16; 4], Shorts);
+tiered!(i32, [i32; 4], Longs<4>);
+tiered!(Grey, [i32; 2], Longs<2>);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernels::Tap;
+    use proptest::prelude::*;
+
+    /// Numbers that look random.
+    fn numbers(seed: u32) -> impl FnMut(u32) -> u32 {
+        let mut state = u64::from(seed) | 1 << 40;
+        move |below| {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(99);
+            ((state >> 32) as u32) % below
+        }
+    }
+
+    /// Voxels added flat and apart, and some rows folded, by every instruction set as by the plain loops.
+    fn everywhere<S: Tiered, const N: usize>(
+        (len, rows, reaching): (usize, usize, usize),
+        seed: u32,
+        weight: impl Fn(u32) -> S::Weight,
+        deep: impl Fn(u32) -> S::Depth,
+    ) -> Result<(), TestCaseError> {
+        let mut next = numbers(seed);
+        let shape = Shape::new::<S>(rows, len);
+        let phases = 5;
+        let table: Vec<S::Weight> = (0..phases * len).map(|_| weight(next(1000))).collect();
+        let across = Table { weights: &table[..], len };
+        let depths: Vec<S::Depth> = (0..3 * N).map(|_| deep(next(1000))).collect();
+        let weights = Weights { across, deep: Table { weights: &depths[..], len: N } };
+        let payloads: Vec<S::Payload> = (0..40)
+            .map(|_| S::payload([next(9000), next(9000), next(9000), next(9000)].map(|x| x as f32)))
+            .collect();
+        let mut place = || {
+            let first = next(64 + 2 * len as u32) as i32 - 2 * len as i32;
+            (first, shape.place(first), next(rows as u32), next(phases as u32) * len as u32)
+        };
+        let voxels: Vec<Splat> = (0..40)
+            .map(|_| {
+                let (_, place, row, from) = place();
+                Splat { place: place | row << 8, rows: from, deep: from % 3, sample: 0 }
+            })
+            .collect();
+        let (mut apart, mut places) = (Apart::default(), [[0; BATCH]; MOST]);
+        for i in 0..40 {
+            apart.kept[i] = i as u32;
+            apart.left[i] = 1 + (i % N) as i32;
+            for slot in 0..N {
+                let (first, _, row, from) = place();
+                (apart.first[0][slot][i], apart.from[0][slot][i]) = (first, from);
+                places[slot][i] = shape.place_in(row, first);
+            }
+        }
+        let layers = Layers {
+            across: [[across; N]; 2],
+            deep: weights.deep,
+            slot: 1 % N,
+            alike: false,
+            slant: None,
+        };
+        // Some rows of pixels, one after the other reached by tiers farther down, sheet by sheet.
+        let mut by_row = [ByRow::default(), ByRow::default()];
+        for y in 0..EDGE {
+            let begin = y * (rows - reaching - FOUR) / EDGE;
+            for (sheet, by_row) in by_row.iter_mut().enumerate() {
+                let reaching = reaching + next(2) as usize * sheet;
+                let weights: Vec<S::Weight> = (0..reaching).map(|_| weight(next(1000))).collect();
+                by_row.set(y, [begin, reaching.max(FOUR)], |tier| {
+                    weights.get(tier - begin).copied().unwrap_or_default()
+                });
+            }
+        }
+        let mut bits = || {
+            let mut row = || u64::from(next(u32::MAX)) << 32 | u64::from(next(u32::MAX));
+            match row() % 4 {
+                0 => 0,
+                1 => row() & row() & row(),
+                2 => row() | row(),
+                _ => u64::MAX,
+            }
+        };
+        let sheets: Vec<[u64; EDGE]> = (0..4).map(|_| [(); EDGE].map(|()| bits())).collect();
+        let fours: Vec<[u32; 4]> =
+            (0..EDGE * STRIDE).map(|i| [(i as f32).to_bits(), 1, 2, 3]).collect();
+        let run = |simd| {
+            let mut lines = vec![Line::ZERO; shape.lines(N)];
+            let mut tiers = Tiers::<S, N>::new(&mut lines, shape);
+            S::add_flat(simd, &mut tiers, (&voxels, &payloads), 2 % N, &weights);
+            S::add_apart(simd, &mut tiers, (&apart, &payloads), &places, &layers);
+            let (mut before, mut was) = (vec![S::Pixel::default(); EDGE * STRIDE], [0; EDGE]);
+            let mut all = Vec::new();
+            for (k, open) in sheets.iter().enumerate() {
+                let (slots, mut to, mut y) = ([k, k + 1].map(|k| k % N), Folded::default(), 0);
+                let mut n = 0;
+                while y < EDGE {
+                    let (by_row, before) = (by_row.each_ref(), &mut before[..]);
+                    let ends = Ends { open, slots, by_row, before, was: &mut was, pixels: &fours };
+                    y = S::fold(simd, &tiers, ends, y, &mut to);
+                    n += to.places.len();
+                    all.extend(to.places.all().iter().enumerate().map(|(i, &at)| {
+                        let sums = to.sheets.each_ref().map(|sums| sums[i]);
+                        (at, sums, before[at as usize], to.opacities[i])
+                    }));
+                }
+                assert_eq!(was.iter().map(|row| row.count_ones() as usize).sum::<usize>(), n);
+            }
+            let margin = shape.margin;
+            let seen: Vec<Vec<S::Pixel>> = (0..N * rows)
+                .map(|i| {
+                    tiers.tier_mut(i / rows, i % rows)[margin..margin + PART as usize].to_vec()
+                })
+                .collect();
+            (seen, all, was)
+        };
+        let want = run(Simd::plain());
+        let nothing = S::Pixel::default();
+        prop_assert!(want.0.iter().flatten().any(|sums| *sums != nothing));
+        for (at, [_, here, _], before, a) in &want.1 {
+            prop_assert!(S::raw(here)[0] != 0 && *a == *at as f32);
+            prop_assert!(*at as usize % STRIDE < EDGE && here == before);
+        }
+        for simd in Simd::all() {
+            prop_assert!(run(simd) == want, "{}", simd.name());
+        }
+        Ok(())
+    }
+
+    proptest! {
+        #[test]
+        fn every_instruction_set_adds_to_tiers_and_folds_them_as_the_plain_loops_do(
+            len in prop::sample::select(vec![1, 3, 4, 5, 7, 8, 9, 13, 14, 17, 25, 26, 41, 63]),
+            rows in 24..60usize, reaching in 1..9usize, seed in any::<u32>(),
+        ) {
+            let shape = (len, rows, reaching);
+            let short = |x| x as i16 * 20;
+            everywhere::<i16, 4>(shape, seed, short, short)?;
+            everywhere::<i16, 8>(shape, seed, short, short)?;
+            let (tap, deep) = (|x| Tap::new(x as f32 * 1e-3), |x| x as f32 * 1e-3);
+            everywhere::<i32, 4>(shape, seed, tap, deep)?;
+            everywhere::<i32, 8>(shape, seed, tap, deep)?;
+            everywhere::<Grey, 4>(shape, seed, tap, deep)?;
+            everywhere::<Grey, 8>(shape, seed, tap, deep)?;
+        }
+    }
+}

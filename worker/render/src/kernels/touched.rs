@@ -1,0 +1,695 @@
+//! Pixels that a closing sheet was touched at, wherever they lie in their part: lists of them, and rows
+//! of a closing sheet in, out and back.
+//!
+//! A row of lanes takes sixteen pixels from anywhere, so that no lane is spent on one that nothing was
+//! added to, and where many footprints leave nothing at their rims on none of those, either. Loops are written plainly, and once for all registers; both give the same bytes.
+
+use super::Simd;
+use super::pixel_records::{Record, Recorded, STRIDE};
+use crate::kernels::composite::{LANES, Row};
+
+/// Pixels of a part at most, and as many lanes behind them as are stored at once.
+const MOST: usize = 64 * 64 + LANES;
+
+/// Places of a part.
+const PART: usize = 64 * STRIDE;
+
+/// Places of pixels in a part: `row * STRIDE + column`.
+pub(crate) struct Places {
+    at: Box<[u32; MOST]>,
+    n: usize,
+    /// Memory for places that are dropped.
+    dropped: Box<[u32; MOST]>,
+}
+
+impl Default for Places {
+    fn default() -> Self {
+        Places { at: Box::new([0; MOST]), n: 0, dropped: Box::new([0; MOST]) }
+    }
+}
+
+/// Sixteen places, each inside a part: that only [`Places`] makes them is the proof.
+#[derive(Clone, Copy)]
+pub(crate) struct Some16<'a> {
+    at: &'a [u32; LANES],
+    n: usize,
+}
+
+impl<'a> Some16<'a> {
+    /// All of them.
+    #[inline(always)]
+    pub(crate) fn at(self) -> &'a [u32; LANES] {
+        self.at
+    }
+
+    /// How many of them count.
+    #[inline(always)]
+    pub(crate) fn len(self) -> usize {
+        self.n
+    }
+}
+
+impl Places {
+    /// Those of the bits in `rows`.
+    #[inline(always)]
+    pub(crate) fn list(&mut self, simd: Simd, rows: &[u64; 64]) {
+        self.n = 0;
+        match simd.0 {
+            super::Level::Plain => self.list_plain(rows),
+            // SAFETY: the value proves that the instructions are there.
+            #[cfg(target_arch = "x86_64")]
+            super::Level::Avx2 => unsafe { wide::avx2::list(self, rows) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            super::Level::Avx512 => unsafe { wide::avx512::list(self, rows) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            super::Level::Neon => unsafe { wide::neon::list(self, rows) },
+        }
+    }
+
+    fn list_plain(&mut self, rows: &[u64; 64]) {
+        for (y, row) in rows.iter().enumerate() {
+            let mut row = *row;
+            while row != 0 {
+                self.at[self.n] = y as u32 * STRIDE as u32 + row.trailing_zeros();
+                self.n += 1;
+                row &= row - 1;
+            }
+        }
+    }
+
+    /// Leaves only those where the sheet that `slot` holds has any extinction. At the others it is over and
+    /// done with: what there is of its sums are the ones before, and the slot is empty.
+    ///
+    /// # Panics
+    /// If there are fewer records or sums than a part has.
+    #[inline(always)]
+    pub(crate) fn sift<S: Recorded, const N: usize>(
+        &mut self,
+        simd: Simd,
+        sums: SumsOf<'_, S, N>,
+        slot: usize,
+    ) {
+        match simd.0 {
+            super::Level::Plain => self.sift_plain::<S, N>(sums, slot),
+            // SAFETY: the value proves that the instructions are there.
+            #[cfg(target_arch = "x86_64")]
+            super::Level::Avx2 => unsafe { wide::avx2::sift::<S, N>(self, sums, slot) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "x86_64")]
+            super::Level::Avx512 => unsafe { wide::avx512::sift::<S, N>(self, sums, slot) },
+            // SAFETY: as above.
+            #[cfg(target_arch = "aarch64")]
+            super::Level::Neon => unsafe { wide::neon::sift::<S, N>(self, sums, slot) },
+        }
+    }
+
+    fn sift_plain<S: Recorded, const N: usize>(
+        &mut self,
+        (records, before): SumsOf<'_, S, N>,
+        slot: usize,
+    ) {
+        let n = std::mem::take(&mut self.n);
+        for i in 0..n {
+            let at = self.at[i];
+            let sums = &mut records[at as usize][slot];
+            if first_word(sums) == 0 {
+                before[at as usize] = std::mem::take(sums);
+            } else {
+                self.at[self.n] = at;
+                self.n += 1;
+            }
+        }
+    }
+
+    /// Memory for as many as a part has, and as many more as are stored at once.
+    ///
+    /// # Safety
+    /// What is stored there is inside a part.
+    #[inline(always)]
+    pub(super) unsafe fn room(&mut self) -> &mut [u32; MOST] {
+        &mut self.at
+    }
+
+    /// The first `n` of [that](Places::room) are there.
+    #[inline(always)]
+    pub(super) fn set_len(&mut self, n: usize) {
+        self.n = n;
+    }
+
+    /// All of them.
+    #[cfg(test)]
+    pub(crate) fn all(&self) -> &[u32] {
+        &self.at[..self.n]
+    }
+
+    /// How many there are.
+    pub(crate) fn len(&self) -> usize {
+        self.n
+    }
+
+    /// Those from the `i`th on, at most sixteen. Lanes behind the last hold places that there are, too.
+    #[inline(always)]
+    pub(crate) fn from(&self, i: usize) -> Some16<'_> {
+        let at = self.at[i..].first_chunk().expect("room behind the last");
+        Some16 { at, n: (self.n - i).min(LANES) }
+    }
+}
+
+/// Column and row of a place.
+#[inline(always)]
+pub(crate) fn column_and_row(place: u32) -> [usize; 2] {
+    let place = place as usize;
+    [place % STRIDE, place / STRIDE]
+}
+
+/// A pixel's first 32 bits: its extinction, and no more than one colour beside it. Zero: it has none.
+#[inline(always)]
+fn first_word<P: bytemuck::Pod>(pixel: &P) -> u32 {
+    bytemuck::pod_read_unaligned(&bytemuck::bytes_of(pixel)[..4])
+}
+
+/// Records of open sheets, and sums of the sheet before.
+pub(crate) type SumsOf<'a, S, const N: usize> =
+    (&'a mut [Record<S, N>], &'a mut [<S as Recorded>::Pixel]);
+
+/// Takes the sums of sheet k, which `slot` holds, at some places for a row that is to be closed: those of
+/// the sheet before, of the sheet itself, and of the one behind, and the opacity so far. Leaves those of
+/// sheet k as the ones before and nothing in the slot.
+///
+/// # Panics
+/// If there are fewer records, sums or pixels than a part has.
+#[inline(always)]
+pub(crate) fn take<S: Recorded, const N: usize>(
+    simd: Simd,
+    sums: SumsOf<'_, S, N>,
+    pixels: &[[u32; 4]],
+    places: Some16<'_>,
+    slot: usize,
+    row: &mut Row,
+) {
+    match simd.0 {
+        super::Level::Plain => take_plain::<S, N>(sums, pixels, places, slot, row),
+        // SAFETY: the value proves that the instructions are there.
+        #[cfg(target_arch = "x86_64")]
+        super::Level::Avx2 => unsafe {
+            wide::avx2::take::<S, N>(sums, pixels, places, slot, row);
+        },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        super::Level::Avx512 => unsafe {
+            wide::avx512::take::<S, N>(sums, pixels, places, slot, row);
+        },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        super::Level::Neon => unsafe {
+            wide::neon::take::<S, N>(sums, pixels, places, slot, row);
+        },
+    }
+}
+
+fn take_plain<S: Recorded, const N: usize>(
+    (records, before): SumsOf<'_, S, N>,
+    pixels: &[[u32; 4]],
+    Some16 { at, n }: Some16<'_>,
+    slot: usize,
+    row: &mut Row,
+) {
+    for (i, &at) in at[..n].iter().enumerate() {
+        let (at, behind) = (at as usize, (slot + 1) % N);
+        let sheets = [before[at], records[at][slot], records[at][behind]];
+        let to = [&mut row.before, &mut row.here, &mut row.behind];
+        for (to, sums) in to.into_iter().zip(sheets) {
+            for (to, bits) in to.iter_mut().zip(S::raw(&sums)) {
+                to[i] = S::from_bits(bits).value();
+            }
+        }
+        row.a[i] = f32::from_bits(pixels[at][0]);
+        before[at] = std::mem::take(&mut records[at][slot]);
+    }
+}
+
+/// The same of pixels whose sums are beside each other, sheet by sheet, as are their opacities.
+#[inline(always)]
+pub(crate) fn unpack<S: Recorded>(
+    simd: Simd,
+    sheets: [&[S::Pixel; LANES]; 3],
+    opacities: &[f32; LANES],
+    row: &mut Row,
+) {
+    row.a = *opacities;
+    match simd.0 {
+        super::Level::Plain => {
+            let to = [&mut row.before, &mut row.here, &mut row.behind];
+            for (to, sheet) in to.into_iter().zip(sheets) {
+                for (i, sums) in sheet.iter().enumerate() {
+                    for (to, bits) in to.iter_mut().zip(S::raw(sums)) {
+                        to[i] = S::from_bits(bits).value();
+                    }
+                }
+            }
+        }
+        // SAFETY: the value proves that the instructions are there.
+        #[cfg(target_arch = "x86_64")]
+        super::Level::Avx2 => unsafe { wide::avx2::unpack::<S>(sheets, row) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        super::Level::Avx512 => unsafe { wide::avx512::unpack::<S>(sheets, row) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        super::Level::Neon => unsafe { wide::neon::unpack::<S>(sheets, row) },
+    }
+}
+
+/// Puts what a closed row says of its first pixels into those of a part, at these places.
+///
+/// # Panics
+/// If a place is none of the part.
+#[inline(always)]
+pub(crate) fn put(simd: Simd, row: &Row, at: &[u32], pixels: &mut [[u32; 4]]) {
+    let mut fours = [[0; 4]; LANES];
+    match simd.0 {
+        super::Level::Plain => {
+            for (i, four) in fours.iter_mut().enumerate() {
+                let [r, g, b] = row.light.each_ref().map(|light| light[i]);
+                *four = [row.a[i].to_bits(), r, g, b];
+            }
+        }
+        // SAFETY: the value proves that the instructions are there.
+        #[cfg(target_arch = "x86_64")]
+        super::Level::Avx2 => unsafe { wide::avx2::fours(row, &mut fours) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "x86_64")]
+        super::Level::Avx512 => unsafe { wide::avx512::fours(row, &mut fours) },
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        super::Level::Neon => unsafe { wide::neon::fours(row, &mut fours) },
+    }
+    match at.first_chunk::<LANES>().filter(|at| follow(at)) {
+        // Beside each other, as most are where few pixels are shut: in whole registers.
+        Some(at) => {
+            let pixels = pixels[at[0] as usize..].first_chunk_mut::<LANES>();
+            let pixels = pixels.expect("places are of the part");
+            for (pixel, four) in pixels.iter_mut().zip(&fours) {
+                put_one(pixel, four);
+            }
+        }
+        None => {
+            for (&at, four) in at.iter().zip(&fours) {
+                put_one(&mut pixels[at as usize], four);
+            }
+        }
+    }
+}
+
+/// The opacity anew, and colours added.
+#[inline(always)]
+fn put_one(pixel: &mut [u32; 4], four: &[u32; 4]) {
+    for (c, keep) in [0, u32::MAX, u32::MAX, u32::MAX].into_iter().enumerate() {
+        pixel[c] = (pixel[c] & keep).wrapping_add(four[c]);
+    }
+}
+
+/// Whether places, which ascend, follow each other.
+#[inline(always)]
+fn follow(at: &[u32; LANES]) -> bool {
+    at[LANES - 1] - at[0] == LANES as u32 - 1
+}
+
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+mod wide {
+    use super::{LANES, PART, Places, Record, Recorded, Row, STRIDE, Some16, SumsOf};
+    #[cfg(target_arch = "aarch64")]
+    use crate::kernels::lanes::Four;
+    use crate::kernels::lanes::Lanes;
+    #[cfg(target_arch = "x86_64")]
+    use crate::kernels::lanes::{Eight, Sixteen};
+
+    /// The functions here for one instruction set.
+    macro_rules! compiled {
+        ($set:ident, $features:literal, $lanes:ty) => {
+            pub(super) mod $set {
+                use super::*;
+
+                #[target_feature(enable = $features)]
+                pub(in super::super) fn list(places: &mut Places, rows: &[u64; 64]) {
+                    // SAFETY: these are the instructions.
+                    unsafe { super::list::<$lanes>(places, rows) }
+                }
+
+                #[target_feature(enable = $features)]
+                pub(in super::super) fn sift<S: Recorded, const N: usize>(
+                    places: &mut Places,
+                    sums: SumsOf<'_, S, N>,
+                    slot: usize,
+                ) {
+                    // SAFETY: these are the instructions.
+                    unsafe { super::sift::<$lanes, S, N>(places, sums, slot) }
+                }
+
+                #[target_feature(enable = $features)]
+                pub(in super::super) fn take<S: Recorded, const N: usize>(
+                    sums: SumsOf<'_, S, N>,
+                    pixels: &[[u32; 4]],
+                    places: Some16<'_>,
+                    slot: usize,
+                    row: &mut Row,
+                ) {
+                    // SAFETY: these are the instructions.
+                    unsafe { super::take::<$lanes, S, N>(sums, pixels, places, slot, row) }
+                }
+
+                #[target_feature(enable = $features)]
+                pub(in super::super) fn unpack<S: Recorded>(
+                    sheets: [&[S::Pixel; LANES]; 3],
+                    row: &mut Row,
+                ) {
+                    // SAFETY: these are the instructions.
+                    unsafe { super::unpack::<$lanes, S>(sheets, row) }
+                }
+
+                #[target_feature(enable = $features)]
+                #[inline]
+                pub(in super::super) fn fours(row: &Row, to: &mut [[u32; 4]; LANES]) {
+                    // SAFETY: these are the instructions.
+                    unsafe { super::fours::<$lanes>(row, to) }
+                }
+            }
+        };
+    }
+
+    #[cfg(target_arch = "aarch64")]
+    compiled!(neon, "neon", Four);
+    #[cfg(target_arch = "x86_64")]
+    compiled!(avx2, "avx2,popcnt,lzcnt,bmi1,bmi2", Eight);
+    #[cfg(target_arch = "x86_64")]
+    compiled!(avx512, "avx512f,avx512vl,avx512dq,avx512bw,popcnt,lzcnt,bmi1,bmi2", Sixteen);
+
+    #[inline(always)]
+    unsafe fn list<L: Lanes>(places: &mut Places, rows: &[u64; 64]) {
+        let (to, mut n) = (places.at.as_mut_ptr(), 0);
+        for (y, &row) in rows.iter().enumerate() {
+            let mut row = row;
+            while row != 0 {
+                // Lanes that begin with the first bit's group.
+                let group = row.trailing_zeros() as usize / L::LANES * L::LANES;
+                let bits = (row >> group) as u32 & ((1 << L::LANES) - 1);
+                row &= u64::MAX.checked_shl((group + L::LANES) as u32).unwrap_or(0);
+                // SAFETY: the caller's. Rows have 64 times 64 bits, so as many lanes as there are fit behind
+                // those that were found.
+                unsafe {
+                    let at = L::from((y * STRIDE + group) as i32);
+                    L::store(to.add(n), L::beside(bits, at));
+                }
+                n += bits.count_ones() as usize;
+            }
+        }
+        places.n = n;
+    }
+
+    #[inline(always)]
+    unsafe fn sift<L: Lanes, S: Recorded, const N: usize>(
+        places: &mut Places,
+        (records, before): SumsOf<'_, S, N>,
+        slot: usize,
+    ) {
+        const { assert!(size_of::<Record<S, N>>() == N * size_of::<S::Pixel>()) };
+        let words = (size_of::<Record<S, N>>() / 4) as i32;
+        let (records, before) = (&mut records[..PART], &mut before[..PART]);
+        let first: *mut S::Pixel = records.as_mut_ptr().cast();
+        let (all, mut kept) = (places.at.as_mut_ptr(), 0);
+        let (empty, mut dropped) = (places.dropped.as_mut_ptr(), 0);
+        // SAFETY: the caller's. A record has N pixels, and all places are below PART. So many lanes as there are
+        // fit behind the last place, and what is kept of some is stored where they or those before them lay.
+        unsafe {
+            let now = first.add(slot % N);
+            for from in (0..places.n).step_by(L::LANES) {
+                let there = (1u32 << (places.n - from).min(L::LANES)) - 1;
+                let at = L::load(all.add(from));
+                let sums = L::times(at, L::set(words));
+                let sums = L::look_up(L::marks(there), now.cast_const().cast(), sums);
+                let none = L::bits(L::at_most(sums, L::set(0))) & there;
+                L::store(empty.add(dropped), L::beside(none, at));
+                dropped += none.count_ones() as usize;
+                L::store(all.add(kept), L::beside(there & !none, at));
+                kept += (there & !none).count_ones() as usize;
+            }
+            for &at in &places.dropped[..dropped] {
+                let sums = now.add(N * at as usize);
+                before[at as usize] = *sums;
+                *sums = S::Pixel::default();
+            }
+        }
+        places.n = kept;
+    }
+
+    #[inline(always)]
+    unsafe fn take<L: Lanes, S: Recorded, const N: usize>(
+        (records, before): SumsOf<'_, S, N>,
+        pixels: &[[u32; 4]],
+        Some16 { at, n }: Some16<'_>,
+        slot: usize,
+        row: &mut Row,
+    ) {
+        const { assert!(LANES.is_multiple_of(L::LANES)) };
+        const { assert!(matches!(size_of::<S::Pixel>(), 8 | 16)) };
+        const { assert!(size_of::<Record<S, N>>() == N * size_of::<S::Pixel>()) };
+        let words = size_of::<S::Pixel>() / 4;
+        let (records, before) = (&mut records[..PART], &mut before[..PART]);
+        let (pixels, slot, behind) = (&pixels[..PART], slot % N, (slot + 1) % N);
+        let old: *mut S::Pixel = before.as_mut_ptr();
+        let first: *mut S::Pixel = records.as_mut_ptr().cast();
+        // SAFETY: the caller's. A record has N pixels. All places are below PART, and there are as many lanes
+        // in a row's arrays from `lanes` on.
+        unsafe {
+            let [now, next] = [first.add(slot), first.add(behind)];
+            for lanes in (0..n).step_by(L::LANES) {
+                let some = lanes..lanes + L::LANES;
+                let at = at[some.clone()].as_ptr();
+                let [a, ..] = L::fours(pixels.as_ptr().cast(), 4, at);
+                L::store(row.a[some.clone()].as_mut_ptr().cast(), a);
+                let [old, now, next] = [old, now, next].map(|from| from.cast_const().cast());
+                let sheets = if words == 4 {
+                    [
+                        L::fours(old, words, at),
+                        L::fours(now, N * words, at),
+                        L::fours(next, N * words, at),
+                    ]
+                } else {
+                    let [a, b] = L::pairs(old, at);
+                    let [c, d, e, f] = L::twos([now, next], N * words, at);
+                    [shorts::<L, S>(a, b), shorts::<L, S>(c, d), shorts::<L, S>(e, f)]
+                };
+                let to = [&mut row.before, &mut row.here, &mut row.behind];
+                for (to, sums) in to.into_iter().zip(sheets) {
+                    for (to, sums) in to.iter_mut().zip(sums) {
+                        L::store_floats(to[some.clone()].as_mut_ptr(), sums);
+                    }
+                }
+            }
+            for &at in &at[..n] {
+                let now = now.add(N * at as usize);
+                *old.add(at as usize) = *now;
+                *now = S::Pixel::default();
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn unpack<L: Lanes, S: Recorded>(sheets: [&[S::Pixel; LANES]; 3], row: &mut Row) {
+        const { assert!(matches!(size_of::<S::Pixel>(), 8 | 16)) };
+        const { assert!(LANES.is_multiple_of(L::LANES)) };
+        let words = size_of::<S::Pixel>() / 4;
+        let to = [&mut row.before, &mut row.here, &mut row.behind];
+        for (to, sheet) in to.into_iter().zip(sheets) {
+            for lanes in (0..LANES).step_by(L::LANES) {
+                // SAFETY: the caller's. There are as many pixels, and lanes in a row's arrays, from `lanes` on.
+                unsafe {
+                    let from: *const u32 = sheet[lanes..].as_ptr().cast();
+                    let sums = if words == 4 {
+                        L::fours_on(from)
+                    } else {
+                        let [a, b] = L::pairs_on(from);
+                        shorts::<L, S>(a, b)
+                    };
+                    for (to, sums) in to.iter_mut().zip(sums) {
+                        L::store_floats(to[lanes..].as_mut_ptr(), sums);
+                    }
+                }
+            }
+        }
+    }
+
+    /// The channels of pixels of two words: four 16-bit sums, or two that are whole words.
+    #[inline(always)]
+    unsafe fn shorts<L: Lanes, S: Recorded>(a: L::Ints, b: L::Ints) -> [L::Ints; 4] {
+        if S::GREY {
+            // Nobody looks at the second and third colour.
+            return [a, b, b, b];
+        }
+        // SAFETY: the caller's.
+        unsafe {
+            let [low, high] = [a, b].map(|word| L::down(L::up(word, 16), 16));
+            [low, L::down(a, 16), high, L::down(b, 16)]
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn fours<L: Lanes>(row: &Row, to: &mut [[u32; 4]; LANES]) {
+        let [r, g, b] = &row.light;
+        for lanes in (0..LANES).step_by(L::LANES) {
+            let some = lanes..lanes + L::LANES;
+            // SAFETY: the caller's, and as many lanes begin at each.
+            unsafe {
+                let a = L::load(row.a[some.clone()].as_ptr().cast());
+                let [r, g, b] = [r, g, b].map(|light| L::load(light[some.clone()].as_ptr()));
+                L::store_fours(to[some].as_mut_ptr().cast(), [a, r, g, b]);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernels::Grey;
+    use proptest::prelude::*;
+
+    /// Numbers that look random.
+    fn numbers(seed: u32) -> impl FnMut() -> u32 {
+        let mut state = u64::from(seed) | 1 << 40;
+        move || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(99);
+            (state >> 32) as u32
+        }
+    }
+
+    /// Pixels by rows: few, some or all of a row's.
+    fn rows() -> impl Strategy<Value = [u64; 64]> {
+        let row =
+            prop_oneof![Just(0), any::<u64>(), (0..64u32).prop_map(|x| 1 << x), Just(u64::MAX)];
+        let rows = prop::collection::vec(row, 64);
+        rows.prop_map(|rows| rows.try_into().expect("64 of them"))
+    }
+
+    /// Everything that closing does at some places but for the arithmetic, by every instruction set.
+    fn go_everywhere<S: Recorded, const N: usize>(
+        (rows, sifted): (&[u64; 64], bool),
+        slot: usize,
+        seed: u32,
+    ) -> Result<(), TestCaseError> {
+        let mut next = numbers(seed);
+        // One of four has nothing.
+        let mut sums = || match next() % 4 {
+            0 => S::Pixel::default(),
+            _ => S::from_raw([(); 4].map(|()| S::from_bits(next()).bits())),
+        };
+        let records: Vec<Record<S, N>> = (0..PART).map(|_| [(); N].map(|()| sums())).collect();
+        let before: Vec<S::Pixel> = (0..PART).map(|_| sums()).collect();
+        let pixels: Vec<[u32; 4]> =
+            (0..PART as u32).map(|i| [(i as f32).to_bits(), i, 2 * i, u32::MAX - i]).collect();
+        let run = |simd| {
+            let (mut records, mut before) = (records.clone(), before.clone());
+            let (mut pixels, mut taken) = (pixels.clone(), Vec::new());
+            let mut places = Places::default();
+            places.list(simd, rows);
+            if sifted {
+                places.sift::<S, N>(simd, (&mut records, &mut before), slot);
+            }
+            for i in (0..places.len()).step_by(LANES) {
+                let mut row = Row::default();
+                let some = places.from(i);
+                take::<S, N>(simd, (&mut records, &mut before), &pixels, some, slot, &mut row);
+                let there = if S::GREY { 2 } else { 4 };
+                let channels = [row.before, row.here, row.behind].map(|c| c[..there].to_vec());
+                for lane in 0..some.len() {
+                    let sums =
+                        channels.each_ref().map(|c| c.iter().map(|c| c[lane]).collect::<Vec<_>>());
+                    taken.push((some.at()[lane], row.a[lane], sums));
+                    row.light = row.light.map(|mut light| {
+                        light[lane] = 3 * some.at()[lane];
+                        light
+                    });
+                    row.a[lane] += 0.5;
+                }
+                put(simd, &row, &some.at()[..some.len()], &mut pixels);
+            }
+            (records, before, pixels, taken)
+        };
+        let want = run(Simd::plain());
+        let mut of_row = want.3.iter();
+        let value = |pixel: &S::Pixel| S::from_bits(S::raw(pixel)[0]).value();
+        for y in 0..64 {
+            for x in (0..64).filter(|x| rows[y] >> x & 1 == 1) {
+                let i = y * STRIDE + x;
+                prop_assert!(want.1[i] == records[i][slot]);
+                prop_assert!(want.0[i][slot] == S::Pixel::default());
+                if sifted && first_word(&records[i][slot]) == 0 {
+                    prop_assert_eq!(want.2[i], pixels[i]);
+                    continue;
+                }
+                let (at, a, sums) = of_row.next().expect("every pixel is taken");
+                prop_assert_eq!(column_and_row(*at), [x, y]);
+                prop_assert_eq!(*a, i as f32);
+                let behind = (slot + 1) % N;
+                let sheets = [&before[i], &records[i][slot], &records[i][behind]];
+                prop_assert_eq!(sums.each_ref().map(|c| c[0]), sheets.map(value));
+                let light = 3 * i as u32;
+                let [_, r, g, b] = pixels[i];
+                let added = [r, g, b].map(|c| c.wrapping_add(light));
+                prop_assert_eq!(want.2[i], [(*a + 0.5).to_bits(), added[0], added[1], added[2]]);
+            }
+        }
+        prop_assert!(of_row.next().is_none());
+        for simd in Simd::all() {
+            prop_assert!(run(simd) == want, "{}", simd.name());
+        }
+        // The same sums beside each other are taken as they are from where they lie.
+        let mut places = Places::default();
+        places.list_plain(rows);
+        for simd in Simd::all() {
+            let (mut records, mut old) = (records.clone(), before.clone());
+            for i in (0..places.len()).step_by(LANES) {
+                let (some, behind) = (places.from(i), (slot + 1) % N);
+                let (mut sheets, mut opacities) = ([[S::Pixel::default(); LANES]; 3], [0.0; LANES]);
+                for (i, &at) in some.at()[..some.len()].iter().enumerate() {
+                    let (at, record) = (at as usize, records[at as usize]);
+                    let sums = [old[at], record[slot], record[behind]];
+                    sheets.iter_mut().zip(sums).for_each(|(to, sums)| to[i] = sums);
+                    opacities[i] = f32::from_bits(pixels[at][0]);
+                }
+                let [mut want, mut got] = [Row::default(), Row::default()];
+                let plain = Simd::plain();
+                take::<S, N>(plain, (&mut records, &mut old), &pixels, some, slot, &mut want);
+                unpack::<S>(simd, sheets.each_ref(), &opacities, &mut got);
+                let there = if S::GREY { 2 } else { 4 };
+                let of = |row: &Row| {
+                    let lanes = |of: &[f32; LANES]| of[..some.len()].to_vec();
+                    let sheets = [&row.before, &row.here, &row.behind];
+                    (
+                        lanes(&row.a),
+                        sheets.map(|c| c[..there].iter().map(lanes).collect::<Vec<_>>()),
+                    )
+                };
+                prop_assert!(of(&got) == of(&want), "{}", simd.name());
+            }
+        }
+        Ok(())
+    }
+
+    proptest! {
+        #[test]
+        fn pixels_from_anywhere_are_taken_and_put_as_the_plain_loops_do(
+            rows in rows(), sifted in any::<bool>(), slot in 0..8usize, seed in any::<u32>(),
+        ) {
+            let rows = (&rows, sifted);
+            go_everywhere::<i16, 4>(rows, slot % 4, seed)?;
+            go_everywhere::<i16, 8>(rows, slot, seed)?;
+            go_everywhere::<i32, 4>(rows, slot % 4, seed)?;
+            go_everywhere::<i32, 8>(rows, slot, seed)?;
+            go_everywhere::<Grey, 4>(rows, slot % 4, seed)?;
+            go_everywhere::<Grey, 8>(rows, slot, seed)?;
+        }
+    }
+}

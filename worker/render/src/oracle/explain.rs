@@ -1,0 +1,337 @@
+//! One pixel, sheet by sheet: what the renderer did there and which voxels made it.
+//!
+//! The paper's listing once more, for one pixel: its voxels in the order in which float sums are
+//! defined, their sections into sheets, sheets closed by the renderer's own rule. Every number is
+//! the renderer's, in its own arithmetic, and the pixel that comes out is its pixel to the bit (a
+//! test keeps it). Like [`crate::oracle::serial`] it culls nothing; what lies behind the sheet in which
+//! the pixel was shut is counted, not drawn.
+
+use crate::kernels::{Accumulate, Weight};
+use crate::scene::Frame;
+use slabcast_common::brick::Brick;
+use slabcast_common::ids::BrickId;
+use slabcast_common::image::{COLOUR_UNIT, FrameState, TilePixels};
+use slabcast_common::occlusion::Rect;
+use slabcast_common::quality::Sums;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+/// A pixel explained.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Explained {
+    /// Linear premultiplied RGBA, as rendered.
+    pub pixel: [f32; 4],
+    /// The sheets that hold something here and were read, front to back.
+    pub sheets: Vec<SheetHere>,
+    /// The sheet after which the pixel was shut.
+    pub shut_in: Option<i32>,
+    /// Voxels with a section in one of these sheets, and their bricks.
+    pub voxels: usize,
+    /// Bricks of these voxels.
+    pub bricks: usize,
+    /// Voxels and bricks of which nothing was read, since they begin behind the sheet in which
+    /// the pixel was shut.
+    pub hidden_voxels: usize,
+    /// Bricks that are hidden with all their voxels.
+    pub hidden_bricks: usize,
+}
+
+/// One sheet at one pixel.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SheetHere {
+    /// Which: between the depths `k` and `k + 1` thicknesses behind the target.
+    pub k: i32,
+    /// Its sums as the sheet holds them: extinction and the three sigma-weighted colours.
+    pub raw: [f32; 4],
+    /// What the sheet behind held when this one was closed: the colour rule's peek.
+    pub peek: [f32; 4],
+    /// Optical depth along the ray (the sum of opacities, for the paper's compositing).
+    pub tau: f32,
+    /// Mean colour, weighted by extinction.
+    pub colour: [f32; 3],
+    /// Opacity in front of the sheet and behind it. Transmittance T is `1 - a`.
+    pub a_before: f32,
+    /// Opacity of this sheet and all in front of it.
+    pub a: f32,
+    /// Light that the sheet adds to the pixel: linear, premultiplied, one rounding to 2^-28.
+    pub light: [f64; 3],
+    /// Sections that are not zero here.
+    pub sections: usize,
+    /// Their bricks.
+    pub bricks: usize,
+    /// The strongest sections, strongest first.
+    pub strongest: Vec<Section>,
+}
+
+/// What one voxel adds to one sheet at one pixel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Section {
+    /// Index position of the voxel.
+    pub voxel: [u32; 3],
+    /// Its brick.
+    pub brick: BrickId,
+    /// Its value's code.
+    pub code: f64,
+    /// Weights: the footprint's along x and y, and the section's.
+    pub weights: [f32; 3],
+    /// Optical depth that it adds along the ray.
+    pub tau: f32,
+    /// Its colour, shaded.
+    pub colour: [f32; 3],
+}
+
+/// Explains pixel (x, y) of `frame` from all bricks of its scene, with at most `strongest` voxels
+/// a sheet.
+///
+/// # Panics
+/// If the pixel is not in the picture.
+pub fn explain(
+    frame: &Frame,
+    bricks: &[Arc<Brick>],
+    [x, y]: [u32; 2],
+    strongest: usize,
+) -> Explained {
+    let [w, h] = frame.view.size;
+    assert!(x < w && y < h, "pixel {x},{y} of a picture of {w}x{h}");
+    let at = [x as i32, y as i32];
+    match frame.scene.quality.sums {
+        Sums::F32 => Pixel::<f32>::gather(frame, bricks, at).explain(strongest),
+        Sums::I16 => Pixel::<i16>::gather(frame, bricks, at).explain(strongest),
+        Sums::I32 | Sums::Auto => Pixel::<i32>::gather(frame, bricks, at).explain(strongest),
+    }
+}
+
+/// A voxel that covers the pixel in at least one sheet.
+struct Voxel {
+    first: i32,
+    brick: u32,
+    i: u16,
+    payload: [f32; 4],
+}
+
+/// A section at the pixel: which voxel, and its weights.
+struct Part<S: Accumulate> {
+    voxel: u32,
+    /// Along x and y, and of the section, as numbers.
+    weights: [f32; 3],
+    /// As sums add them.
+    section: [S::Section; 4],
+    wx: S::Weight,
+    wy: S::Weight,
+    /// In a level view: whose row it adds to.
+    storey: Option<u32>,
+}
+
+impl<S: Accumulate> Part<S> {
+    /// `sums` with what it adds, in the renderer's arithmetic.
+    fn add_to(&self, sums: &mut [S; 4]) {
+        for c in 0..4 {
+            sums[c] = sums[c].plus(S::row(self.section[c], self.wy), self.wx);
+        }
+    }
+}
+
+struct Pixel<'a, S: Accumulate> {
+    frame: &'a Frame,
+    bricks: &'a [Arc<Brick>],
+    at: [i32; 2],
+    /// In the order of float sums: first sheet, brick, voxel.
+    voxels: Vec<Voxel>,
+    /// The sections of each sheet, in the order of voxels.
+    sheets: BTreeMap<i32, Vec<Part<S>>>,
+}
+
+impl<'a, S: Accumulate> Pixel<'a, S> {
+    fn gather(frame: &'a Frame, bricks: &'a [Arc<Brick>], at: [i32; 2]) -> Pixel<'a, S> {
+        let view = &frame.view;
+        let here = Rect::new(at[0], at[1], at[0] + 1, at[1] + 1);
+        let mut found = Vec::new();
+        for (b, brick) in bricks.iter().enumerate() {
+            // Never too small, so nothing is missed.
+            let Some(p) = view.project(&brick.tight(&frame.scene.grid)) else { continue };
+            if p.rect.intersect(&here).is_empty() {
+                continue;
+            }
+            let corner = frame.corner(brick.id);
+            for (i, &local) in brick.index.iter().enumerate() {
+                let placed = frame.place(&corner, local);
+                let (first, _) = frame.sections.of(placed.z);
+                let storey = frame.storey(&corner, local);
+                found.push((first, brick.id, i as u16, b as u32, (placed, storey)));
+            }
+        }
+        found.sort_unstable_by_key(|&(first, id, i, ..)| (first, id, i));
+        let mut pixel = Pixel { frame, bricks, at, voxels: Vec::new(), sheets: BTreeMap::new() };
+        let (mut bx, mut by) = (Vec::new(), Vec::new());
+        let (mut tx, mut ty) = (Vec::new(), Vec::new());
+        let (columns, rows) = ((at[0], at[0] + 1), (at[1], at[1] + 1));
+        for (first, _, i, b, (placed, storey)) in found {
+            let z = placed.z;
+            let (_, sections) = frame.sections.of(z);
+            let mut payload = None;
+            for (n, &wz) in sections.iter().enumerate() {
+                let k = first + n as i32;
+                let Some(f) = frame.footprints.at(k) else { continue };
+                let [x, y] = frame.screen(&placed, k, &f);
+                let x = frame.along_row([x, y], at[1]);
+                let (_, wx) = S::Weight::of(&f, 0, x, columns, &mut bx);
+                let (_, wy) = S::Weight::of(&f, 1, y, rows, &mut by);
+                let (&[wx], &[wy]) = (wx, wy) else { continue };
+                let (_, real_x) = f.weights(0, x, columns, &mut tx);
+                let (_, real_y) = f.weights(1, y, rows, &mut ty);
+                let (&[real_x], &[real_y]) = (real_x, real_y) else { continue };
+                let payload = *payload.get_or_insert_with(|| {
+                    frame.payload(&bricks[b as usize], i.into(), placed.eye)
+                });
+                if payload[0] <= 0.0 {
+                    break;
+                }
+                if pixel.voxels.last().is_none_or(|v| (v.brick, v.i) != (b, i)) {
+                    pixel.voxels.push(Voxel { first, brick: b, i, payload });
+                }
+                let voxel = (pixel.voxels.len() - 1) as u32;
+                let parts = pixel.sheets.entry(k).or_default();
+                let weights = [real_x.get(), real_y.get(), wz];
+                let section = S::section(&frame.sections, z, n, &payload);
+                parts.push(Part { voxel, weights, section, wx, wy, storey });
+            }
+        }
+        pixel
+    }
+
+    /// The sums of sheet `k` of the voxels that begin at `last` or before.
+    fn sums(&self, k: i32, last: i32) -> [S; 4] {
+        let mut sums = [S::default(); 4];
+        // Rows of storeys at the pixel's column, ascending, and what they weigh there.
+        let mut rows: BTreeMap<u32, ([S; 4], S::Weight)> = BTreeMap::new();
+        for part in self.sheets.get(&k).into_iter().flatten() {
+            let v = &self.voxels[part.voxel as usize];
+            if v.first > last {
+                // They ascend.
+                break;
+            }
+            match part.storey {
+                None => part.add_to(&mut sums),
+                Some(storey) => {
+                    let (row, _) = rows.entry(storey).or_insert(([S::default(); 4], part.wy));
+                    for c in 0..4 {
+                        row[c] = row[c].plus(part.section[c], part.wx);
+                    }
+                }
+            }
+        }
+        if let Some(storeys) = &self.frame.storeys {
+            let weight = |wy: &S::Weight| wy.of_rows(storeys.spread);
+            let row = |c: usize| rows.values().map(move |(row, wy)| (row[c], weight(wy)));
+            sums = std::array::from_fn(|c| S::down(row(c)));
+        }
+        sums
+    }
+
+    fn explain(&self, strongest: usize) -> Explained {
+        let frame = self.frame;
+        let secant = frame.view.secant(self.at[0], self.at[1]);
+        let (mut a, mut colour) = (0.0f32, [0u32; 3]);
+        let mut sheets = Vec::new();
+        let mut shut_in = None;
+        for &k in self.sheets.keys() {
+            if frame.rule.is_shut(a) {
+                break;
+            }
+            // An empty sheet in between is one with no sums.
+            let before = self.sums(k - 1, k - 1);
+            let here = self.sums(k, k);
+            let behind = self.sums(k + 1, k);
+            let (a_before, c_before) = (a, colour);
+            frame.rule.close(before, here, behind, secant, &mut a, &mut colour);
+            let raw = here.map(S::value);
+            let light = std::array::from_fn(|c| {
+                f64::from(colour[c].wrapping_sub(c_before[c])) * f64::from(COLOUR_UNIT)
+            });
+            let mean = |c: usize| if raw[0] > 0.0 { raw[c] / raw[0] } else { 0.0 };
+            let (sections, bricks, strongest) = self.sections(k, secant, strongest);
+            if sections > 0 {
+                sheets.push(SheetHere {
+                    k,
+                    raw,
+                    peek: behind.map(S::value),
+                    tau: frame.rule.optical_depth(raw[0], secant),
+                    colour: [mean(1), mean(2), mean(3)],
+                    a_before,
+                    a,
+                    light,
+                    sections,
+                    bricks,
+                    strongest,
+                });
+            }
+            if frame.rule.is_shut(a) {
+                shut_in = Some(k);
+            }
+        }
+        let last = shut_in.unwrap_or(i32::MAX);
+        let (read, hidden): (Vec<&Voxel>, Vec<&Voxel>) =
+            self.voxels.iter().partition(|v| v.first <= last);
+        let bricks = |of: &[&Voxel]| -> BTreeSet<u32> { of.iter().map(|v| v.brick).collect() };
+        let read_bricks = bricks(&read);
+        Explained {
+            pixel: finish(a, colour),
+            sheets,
+            shut_in,
+            voxels: read.len(),
+            bricks: read_bricks.len(),
+            hidden_voxels: hidden.len(),
+            hidden_bricks: bricks(&hidden).difference(&read_bricks).count(),
+        }
+    }
+
+    /// How many sections of sheet `k` are not zero, of how many bricks, and the strongest.
+    fn sections(&self, k: i32, secant: f32, n: usize) -> (usize, usize, Vec<Section>) {
+        let mut all = Vec::new();
+        for part in self.sheets.get(&k).into_iter().flatten() {
+            let raw = match &self.frame.storeys {
+                None => {
+                    let mut sums = [S::default(); 4];
+                    part.add_to(&mut sums);
+                    sums[0].value()
+                }
+                // Its share of a sum that is rounded with others.
+                Some(storeys) => {
+                    let row = S::default().plus(part.section[0], part.wx).value();
+                    row * (part.weights[1] * storeys.spread)
+                }
+            };
+            if raw > 0.0 {
+                all.push((raw, part));
+            }
+        }
+        let bricks: BTreeSet<u32> =
+            all.iter().map(|(_, p)| self.voxels[p.voxel as usize].brick).collect();
+        // The sort is stable: of equals the first in order.
+        all.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let section = |&(raw, part): &(f32, &Part<S>)| {
+            let v = &self.voxels[part.voxel as usize];
+            let brick = &self.bricks[v.brick as usize];
+            let local = slabcast_common::brick::local(brick.index[v.i as usize]);
+            let corner = self.frame.scene.grid.corner(brick.id);
+            let [sigma, r, g, b] = v.payload;
+            Section {
+                voxel: std::array::from_fn(|a| corner[a] + local[a]),
+                brick: brick.id,
+                code: brick.values.code(v.i.into()),
+                weights: part.weights,
+                tau: self.frame.rule.optical_depth(raw, secant),
+                colour: [r / sigma, g / sigma, b / sigma],
+            }
+        };
+        (all.len(), bricks.len(), all.iter().take(n).map(section).collect())
+    }
+}
+
+/// From sums to a pixel, as a frame is finished.
+fn finish(a: f32, colour: [u32; 3]) -> [f32; 4] {
+    let mut state = FrameState::new([1, 1]);
+    let pixels = TilePixels { a: vec![a], colour: vec![colour], last: None };
+    state.put(Rect::new(0, 0, 1, 1), &pixels);
+    state.finish().pixels[0]
+}

@@ -1,0 +1,5 @@
+//! The renderer written plainly, as a reference for the fast one to equal byte for byte.
+
+pub mod explain;
+pub mod serial;
+pub mod work_counters;

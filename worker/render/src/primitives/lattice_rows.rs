@@ -1,0 +1,273 @@
+//! Level views: those in which layers of the lattice lie level.
+//!
+//! A *storey* is all voxels of one index along the lattice's upright axis. Where the camera is level and that
+//! axis points up in the picture, as on a turntable, all voxels of a storey lie in one row of it, wherever they
+//! are in depth, in parallel views; in perspective they do in each sheet. A footprint is a product, so what is
+//! the same for a whole storey need not be done for each voxel: a voxel is added along x alone, to its storey's
+//! row of sums, and when a sheet closes a pixel's sum is that of the few storeys that reach it, each times its
+//! weight down the picture. Of seven rows of pixels that a voxel was added to there is one left (the separable
+//! footprint of the paper's section 3, with its second half done once for all voxels that share it).
+//!
+//! ```text
+//! row(k, s, x) = sum over voxels of storey s of  (payload * wz) * wx       each rounded to whole units
+//! sum(k, x, y) = sum over storeys, top down, of  row(k, s, x) * wy         rounded as the kind of sums says
+//! ```
+//!
+//! **Why pixels stay exact.** A row is a sum of integers, which has no order. A voxel that is culled reaches
+//! shut pixels alone, with all of its columns in all of its storey's rows. And the storeys of a pixel are added
+//! in one order, from the top of the picture down, which does not hang on how the volume is stored.
+//!
+//! Floats are not added so, since their sums have an order of their own, and neither are views in which
+//! storeys lie closer than [`CLOSEST`]: there a voxel has no more rows of pixels than a pixel has storeys.
+
+use crate::primitives::footprint::Footprint;
+#[cfg(test)]
+use crate::primitives::sizes::LATTICE_ROWS as ROWS;
+use crate::primitives::sizes::REACHING;
+#[cfg(test)]
+use crate::scene::Frame;
+use slabcast_common::occlusion::Rect;
+use slabcast_common::view::{SUBPIXELS, View};
+
+/// Pixels from a storey to the next, at least. At one a voxel has four or five rows of pixels, as a pixel has
+/// storeys; below, rows of storeys outgrow the cache that those of pixels fit.
+const CLOSEST: f64 = 0.75;
+
+/// The storeys of a level view, from the top of the picture down.
+#[derive(Clone, Debug)]
+pub(crate) struct Storeys {
+    /// The lattice's upright axis, and whether higher indices lie higher in the picture.
+    axis: usize,
+    upwards: bool,
+    /// Down the picture, in vox, of each storey.
+    eye: Vec<f64>,
+    /// From one to the next, more than zero.
+    step: f64,
+    /// Positions in subpixels, where places are in integers.
+    flat: Option<Vec<i64>>,
+    /// How many a footprint reaches to either side.
+    reach: f64,
+    /// Length of a step of the lattice in vox: rows are kept over it, and weights down have it as a factor, so
+    /// that a solid's rows are as its sums.
+    pub(crate) spread: f32,
+}
+
+impl Storeys {
+    /// The storeys of `view`, if it is level and they are far enough apart in sheets up to `last`.
+    pub(crate) fn new(view: &View, dims: [u32; 3], spread: f64, last: i32) -> Option<Storeys> {
+        let m = &view.eye_from_index;
+        let down = [m.x_axis.y, m.y_axis.y, m.z_axis.y];
+        let axis = (0..3).find(|&a| down[a] != 0.0)?;
+        if (0..3).any(|a| a != axis && down[a] != 0.0) {
+            return None;
+        }
+        let (step, upwards) = (down[axis].abs(), down[axis] < 0.0);
+        let apart = view.scale_at(last)? * step;
+        let reach = view.kernel_radius.y / step;
+        if apart < CLOSEST || 2.0 * reach + 2.0 > REACHING as f64 {
+            return None;
+        }
+        let eye = vec![0.0; dims[axis] as usize];
+        let mut storeys =
+            Storeys { axis, upwards, eye, step, flat: None, reach, spread: spread as f32 };
+        // As a brick's corner and an offset in it, since positions are made so.
+        storeys.eye = storeys.all(|at| {
+            let [corner, offset] = [at.map(|n| n & !7), at.map(|n| n & 7)];
+            view.corner_in_eye(corner).y + view.offset_in_eye(offset).y
+        });
+        Some(storeys)
+    }
+
+    /// What there is of each, by the index of a voxel in it.
+    fn all<T>(&self, of: impl Fn([u32; 3]) -> T) -> Vec<T> {
+        let along = |n| std::array::from_fn(|a| if a == self.axis { n } else { 0 });
+        let n = self.eye.len() as u32;
+        (0..n).map(|s| of(along(if self.upwards { n - 1 - s } else { s }))).collect()
+    }
+
+    /// Which one a voxel belongs to, by its index.
+    #[inline(always)]
+    pub(crate) fn of_voxel(&self, index: [u32; 3]) -> u32 {
+        let n = index[self.axis];
+        if self.upwards { self.eye.len() as u32 - 1 - n } else { n }
+    }
+
+    /// With positions from integers, by the index of a voxel.
+    pub(crate) fn in_integers(&mut self, at: impl Fn([u32; 3]) -> i64) {
+        self.flat = Some(self.all(at));
+    }
+
+    /// How many there are.
+    pub(crate) fn len(&self) -> usize {
+        self.eye.len()
+    }
+
+    /// Where storey `s` lies down the picture in a sheet with this footprint, in subpixels.
+    #[inline(always)]
+    pub(crate) fn at(&self, view: &View, s: usize, footprint: &Footprint<'_>) -> i64 {
+        match &self.flat {
+            Some(flat) => flat[s],
+            None => view.screen_along(1, self.eye[s], footprint.scale),
+        }
+    }
+
+    /// Which storey, counted from the top, lies at `y` vox down the eye's axis: a fraction.
+    #[inline(always)]
+    fn of_eye(&self, y: f64) -> f64 {
+        (y - self.eye[0]) / self.step
+    }
+
+    /// Factor and summand that make of eye coordinates which storey it is.
+    pub(crate) fn by_eye(&self) -> (f64, f64) {
+        (1.0 / self.step, -self.eye[0] / self.step)
+    }
+
+    /// Subpixels from one to the next at `scale`.
+    pub(crate) fn subpixels(&self, scale: f64) -> f64 {
+        self.step * scale * f64::from(SUBPIXELS)
+    }
+
+    /// The storey that lies at position 0 of row `y` of pixels at `scale`, as a fraction; it need not be there.
+    pub(crate) fn of_row(&self, view: &View, y: i32, scale: f64) -> f64 {
+        self.of_eye((f64::from(y) - f64::from(view.size[1]) * 0.5) / scale)
+    }
+
+    /// The first storey that row 0 of a part stands for, in a sheet of this scale: it does not reach the part,
+    /// nor does the one of row [`Storeys::rows`] less one.
+    #[inline(always)]
+    pub(crate) fn base(&self, view: &View, part: &Rect, scale: f64) -> i32 {
+        // A footprint reaches half a pixel less than its radius, and is placed to a subpixel.
+        let first = libm::floor(self.of_row(view, part.y0, scale) - self.reach) - 1.0;
+        // Far off the picture it is any that is far.
+        first.clamp(-1e9, 1e9) as i32
+    }
+
+    /// Rows of storeys that a part of `high` pixels has at a scale, which are at most [`ROWS`].
+    pub(crate) fn rows(&self, high: i32, scale: f64) -> usize {
+        let across = f64::from(high) / (self.step * scale);
+        libm::ceil(across + 2.0 * self.reach) as usize + 4
+    }
+}
+
+impl Storeys {
+    /// The storeys that reach row `y` of pixels in a sheet with this footprint, top down, and each one's weight there by
+    /// `weight`; plainly, one by one.
+    pub(crate) fn reaching<W: Copy + Default>(
+        &self,
+        view: &View,
+        footprint: &Footprint<'_>,
+        y: i32,
+        mut weight: impl FnMut(i64) -> W,
+    ) -> Reaching<W> {
+        let mut reaching = Reaching { some: [(0, W::default()); REACHING], n: 0 };
+        let middle = self.of_row(view, y, footprint.scale);
+        let around = self.reach + 2.0 + 1.0 / (self.step * footprint.scale);
+        let last = self.len() as i32 - 1;
+        let from = (libm::floor(middle - around) as i32).clamp(0, last + 1);
+        let to = (libm::ceil(middle + around) as i32).clamp(-1, last);
+        for s in from..=to {
+            let at = self.at(view, s as usize, footprint);
+            let (first, end) = footprint.extent(1, at);
+            if first <= y && y < end {
+                reaching.some[reaching.n] = (s, weight(at));
+                reaching.n += 1;
+            }
+        }
+        reaching
+    }
+}
+
+/// The storeys that reach a row of pixels in one sheet.
+#[derive(Clone, Copy, Default)]
+pub(crate) struct Reaching<W> {
+    /// Which, and each one's weight.
+    pub(crate) some: [(i32, W); REACHING],
+    pub(crate) n: usize,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Scene;
+    use crate::selftest;
+    use glam::DVec3;
+    use proptest::prelude::*;
+    use slabcast_common::brick::local;
+    use slabcast_common::ids::BrickId;
+    use slabcast_common::quality::{Quality, Sums};
+    use slabcast_common::view::{Camera, CameraProjection};
+    use slabcast_common::volume::{Lattice, Volume};
+    use std::sync::Arc;
+
+    /// A view of 20x16x24 voxels.
+    fn frame(to_eye: DVec3, up: DVec3, projection: CameraProjection, sums: Sums, z: f64) -> Frame {
+        let mut volume =
+            Volume::from_fn_u8("any", [20, 16, 24], |i, j, k| (i + 3 * j + 7 * k) as u8);
+        volume.lattice = Lattice::from_spacing([20, 16, 24], [1.0, 1.0, z]);
+        let quality = Quality { sums, ..Quality::default() };
+        let camera = Camera { to_eye, up, target: DVec3::ZERO, projection };
+        let view = View::new(&volume.lattice, &camera, [100, 90], &quality).expect("a view");
+        Frame::new(Arc::new(Scene::new(&selftest::spec(&volume, quality))), view)
+    }
+
+    #[test]
+    fn views_are_level_where_layers_are_and_lie_far_enough_apart() {
+        let flat = |height| CameraProjection::Ortho { height };
+        let (aside, z) = (DVec3::new(1.0, 2.0, 0.0), DVec3::Z);
+        let storeys = |to_eye, up, height, sums, spacing| {
+            frame(to_eye, up, flat(height), sums, spacing).storeys.map(|s| (s.axis, s.upwards))
+        };
+        assert_eq!(storeys(aside, z, 40.0, Sums::I16, 1.0), Some((2, true)));
+        assert_eq!(storeys(aside, -z, 40.0, Sums::I32, 2.5), Some((2, false)));
+        let forward = DVec3::new(0.0, 0.3, 1.0);
+        assert_eq!(storeys(forward, DVec3::X, 40.0, Sums::I32, 1.0), Some((0, true)));
+        // From above; floats; a pixel for several storeys; and a kernel that leans.
+        assert_eq!(storeys(aside + z, z, 40.0, Sums::I16, 1.0), None);
+        assert_eq!(storeys(aside, z, 40.0, Sums::F32, 1.0), None);
+        assert_eq!(storeys(aside, z, 91.0 / CLOSEST, Sums::I16, 1.0), None);
+        assert_eq!(storeys(forward, DVec3::X, 40.0, Sums::I32, 2.5), None);
+        // In perspective the farthest sheet has them closest.
+        let deep = |distance| CameraProjection::Persp { fov: 40.0, distance };
+        let of = |distance| frame(aside, z, deep(distance), Sums::I16, 1.0).storeys.is_some();
+        assert_eq!([60.0, 140.0, 180.0].map(of), [true, true, false]);
+    }
+
+    proptest! {
+        /// What a voxel's place down the picture says of its storey is what its index does, and all that reach a
+        /// part have a tier there.
+        #[test]
+        fn a_storey_is_known_by_its_place(
+            azimuth in 0.0..6.3f64, height in 8.0..110.0f64, upside_down in any::<bool>(),
+            distance in 30.0..90.0f64, persp in any::<bool>(), which in 0..12u32, y0 in 0..90i32,
+        ) {
+            let up = if upside_down { -DVec3::Z } else { DVec3::Z };
+            let projection = match persp {
+                true => CameraProjection::Persp { fov: 40.0, distance },
+                false => CameraProjection::Ortho { height },
+            };
+            let to_eye = DVec3::new(azimuth.sin(), azimuth.cos(), 0.0);
+            let frame = frame(to_eye, up, projection, Sums::I32, 1.0);
+            let Some(storeys) = &frame.storeys else { return Ok(()) };
+            let part = Rect::new(0, y0, 64, 90);
+            let corner = frame.corner(BrickId(which));
+            let (per, first) = storeys.by_eye();
+            for l in (0..512).filter(|&l| (0..3).all(|a| corner.index[a] + local(l)[a] < [20, 16, 24][a])) {
+                let storey = frame.storey(&corner, l).expect("a level view");
+                let placed = frame.place(&corner, l);
+                prop_assert_eq!(libm::floor(placed.eye.y * per + first + 0.5) as u32, storey);
+                let (k, count) = frame.sections.span(placed.z);
+                for k in k..k + count as i32 {
+                    let f = frame.footprints.at(k).expect("no sheet is clipped");
+                    let at = frame.screen(&placed, k, &f)[1];
+                    prop_assert_eq!(at, storeys.at(&frame.view, storey as usize, &f));
+                    let (from, to) = f.extent(1, at);
+                    let base = storeys.base(&frame.view, &part, f.scale);
+                    let rows = storeys.rows(part.height() as i32, f.scale) as i32;
+                    let tier = storey as i32 - base;
+                    prop_assert!(from >= part.y1 || to <= part.y0 || (1..rows - 1).contains(&tier));
+                    prop_assert!(rows as usize <= ROWS);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,21 @@
+//! A footprint weight.
+
+/// A weight across the view axis, not negative. Holding the value is the proof, which the unchecked
+/// conversion below leans on.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[repr(transparent)]
+pub struct Tap(pub(crate) f32);
+
+impl Tap {
+    /// The weight `w`; what is negative or not a number is nothing.
+    #[inline]
+    pub fn new(w: f32) -> Self {
+        Tap(if w > 0.0 { w } else { 0.0 })
+    }
+
+    /// The weight.
+    #[inline(always)]
+    pub fn get(self) -> f32 {
+        self.0
+    }
+}

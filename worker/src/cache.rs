@@ -152,7 +152,7 @@ mod tests {
     use super::*;
     use slabcast_common::brick::TightBox;
     use slabcast_common::volume::{Digest32, Samples};
-    use slabcast_render::region::Supply;
+    use slabcast_render::region::BrickSupply;
 
     const GRID: BrickGrid = BrickGrid { dims: [4, 4, 4] };
 

@@ -17,7 +17,7 @@ use crate::cache::BrickCache;
 use crate::shelf::Shelf;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, FrameId, TaskId};
-use slabcast_render::region::Supply;
+use slabcast_render::region::BrickSupply;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 

@@ -19,11 +19,11 @@ use slabcast_common::region::Lookahead;
 use slabcast_common::trace::Course;
 use slabcast_common::view::View;
 use slabcast_render::Simd;
-use slabcast_render::judge::error_probe::{Pair, Probe};
-use slabcast_render::region::{self, Finished, Region, Supply};
+use slabcast_render::judge::error_probe::{ErrorProbe, ThicknessPair};
+use slabcast_render::region::{self, BrickSupply, FinishedRegion, Region};
 use slabcast_render::tile::{self, Scratch};
-use slabcast_render::visibility::Depths;
-use slabcast_render::visibility::{Directory, Outlook};
+use slabcast_render::visibility::ClosingDepths;
+use slabcast_render::visibility::{Directory, VisibleBricks};
 use slabcast_render::{Frame, Scene};
 use std::collections::{BTreeMap, BTreeSet};
 use std::panic::AssertUnwindSafe;
@@ -37,11 +37,11 @@ pub(crate) struct SceneSlot {
     pub(crate) spec: Arc<SceneSpec>,
     scene: OnceLock<Arc<Scene>>,
     /// How deep its last pictures were open, by their size.
-    depths: Mutex<BTreeMap<[u32; 2], Arc<Depths>>>,
+    depths: Mutex<BTreeMap<[u32; 2], Arc<ClosingDepths>>>,
     /// Of a rehearsal: parts of pictures that were held.
     pub(crate) parts: Mutex<BTreeSet<[i32; 2]>>,
     /// What the thickness costs is found by; `None` where sheets can't be thinner.
-    pair: OnceLock<Option<Pair>>,
+    pair: OnceLock<Option<ThicknessPair>>,
     /// The frame that was drawn first.
     first: OnceLock<FrameId>,
 }
@@ -62,9 +62,9 @@ pub(crate) struct FrameSlot {
     /// Of a rehearsal: whether they weigh what they do as they are.
     pub(crate) plain: bool,
     frame: OnceLock<Frame>,
-    probe: OnceLock<Probe>,
-    outlook: OnceLock<Outlook>,
-    depths: OnceLock<Arc<Depths>>,
+    probe: OnceLock<ErrorProbe>,
+    outlook: OnceLock<VisibleBricks>,
+    depths: OnceLock<Arc<ClosingDepths>>,
     /// Of a rehearsal: its place in the trace, and when its tables are made.
     pub(crate) rehearsed: OnceLock<Option<usize>>,
     pub(crate) made: OnceLock<Instant>,
@@ -106,24 +106,24 @@ impl FrameSlot {
     }
 
     /// What it sees of a directory.
-    fn outlook(&self, directory: &Arc<Directory>) -> &Outlook {
-        self.outlook.get_or_init(|| Outlook::new(self.get(), directory))
+    fn outlook(&self, directory: &Arc<Directory>) -> &VisibleBricks {
+        self.outlook.get_or_init(|| VisibleBricks::new(&self.get().view, directory))
     }
 
     /// How deep pictures of its scene and size were open.
-    fn depths(&self) -> &Depths {
+    fn depths(&self) -> &ClosingDepths {
         self.depths.get_or_init(|| {
             let size = self.view.size;
             let mut all = locked(&self.scene.depths);
-            all.entry(size).or_insert_with(|| Arc::new(Depths::new(size))).clone()
+            all.entry(size).or_insert_with(|| Arc::new(ClosingDepths::new(size))).clone()
         })
     }
 
     /// What tells how far its pixels are off.
-    fn probe(&self) -> &Probe {
+    fn probe(&self) -> &ErrorProbe {
         self.probe.get_or_init(|| {
-            let pair = self.scene.pair.get_or_init(|| Pair::of(&self.scene.spec));
-            Probe::new(self.get(), pair.as_ref())
+            let pair = self.scene.pair.get_or_init(|| ThicknessPair::new(&self.scene.spec));
+            ErrorProbe::new(self.get(), pair.as_ref())
         })
     }
 }
@@ -175,7 +175,7 @@ impl Wish {
 /// A shelf, of which a region takes bricks as long as it need not give any of its tile away.
 struct Watched<'a>(&'a Shelf, &'a Wish);
 
-impl Supply for Watched<'_> {
+impl BrickSupply for Watched<'_> {
     fn get(&self, place: u32) -> Option<Arc<Brick>> {
         self.0.get(place)
     }
@@ -456,7 +456,7 @@ fn work(thread: u32, simd: Simd, queue: &Queue, out: &mpsc::UnboundedSender<Outc
         for Look { frame, shelf, tile } in looks {
             let looked = caught(&mut scratch, |_| {
                 let outlook = frame.outlook(shelf.directory());
-                region::expected((frame.get(), outlook, &*shelf), tile, frame.depths())
+                region::expected_bricks(frame.get(), outlook, &*shelf, tile, frame.depths())
             });
             // Who can't even look at it fails when it is drawn.
             expect(&frame, shelf, looked.unwrap_or_default(), out);
@@ -596,7 +596,7 @@ fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch, give: &dyn Fn(Handed
         Some(on) => on,
         None => region.insert(match &lease.begun {
             None => Region::new(outlook, lease.tile),
-            Some(begun) => match Region::go_on(outlook, lease.tile, begun) {
+            Some(begun) => match Region::resume(outlook, lease.tile, begun) {
                 Ok(on) => on,
                 Err(why) => return Came::Failed(format!("what was begun of its tile: {why}")),
             },
@@ -607,7 +607,7 @@ fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch, give: &dyn Fn(Handed
         let lacks = on.advance(frame, simd, outlook, &supply, *ahead, scratch);
         let Some(share) = wish.take().filter(|_| on.depth().is_some()) else { break lacks };
         let eps = frame.scene.quality.eps;
-        if let Some((kept, given, begun)) = on.hand_over(outlook, eps, share) {
+        if let Some((kept, given, begun)) = on.split_off(outlook, eps, share) {
             let (task, epoch) = (lease.task, lease.epoch);
             lease.tile = kept;
             give(HandedOver { task, epoch, kept, given, begun });
@@ -623,8 +623,8 @@ fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch, give: &dyn Fn(Handed
         Some(region) => {
             let begun = Instant::now();
             let done = region.finish();
-            done.teach(slot.depths());
-            let Finished { pixels, counters, touched, .. } = done;
+            done.record_depths(slot.depths());
+            let FinishedRegion { pixels, counters, touched, .. } = done;
             let size = [lease.tile.width() as u32, lease.tile.height() as u32];
             let pixels = match &slot.finish {
                 Some(finish) => Pixels::Finished(Leaves::of(&pixels, size, finish)),

@@ -20,7 +20,7 @@ use slabcast_common::slab::SheetRange;
 use slabcast_common::trace::{
     Course, Trace, filled, filled_through, finished_through, view_sha256,
 };
-use slabcast_render::region::Supply;
+use slabcast_render::region::BrickSupply;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 

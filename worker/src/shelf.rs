@@ -6,7 +6,7 @@
 
 use slabcast_common::brick::{Brick, BrickGrid, BrickInfo};
 use slabcast_common::ids::BrickId;
-use slabcast_render::region::Supply;
+use slabcast_render::region::BrickSupply;
 use slabcast_render::visibility::Directory;
 use std::sync::{Arc, OnceLock, PoisonError, RwLock};
 
@@ -54,7 +54,7 @@ impl Shelf {
     }
 }
 
-impl Supply for Shelf {
+impl BrickSupply for Shelf {
     fn get(&self, place: u32) -> Option<Arc<Brick>> {
         self.held[place as usize].read().unwrap_or_else(PoisonError::into_inner).clone()
     }

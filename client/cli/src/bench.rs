@@ -83,7 +83,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
         }
         if i == views / 2 {
             sha256 = picture.sha256().to_string();
-            adds = frame.adds();
+            adds = frame.footprint_cost();
             middle = Some((stage.view_of(i, &asked.quality, asked.size())?, picture));
         }
         progress.step(progress::Step { frames: i as u64 + 1, ..Default::default() });

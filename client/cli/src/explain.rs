@@ -11,7 +11,7 @@ use crate::still::Still;
 use crate::{needs, signals};
 use slabcast_common::volume::ValueMap;
 use slabcast_render::judge::reference::{Sheet, Sheets};
-use slabcast_render::oracle::explain::{Explained, Section, SheetHere, explain};
+use slabcast_render::oracle::explain::{PixelExplanation, SectionAtPixel, SheetAtPixel, explain};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
@@ -69,7 +69,7 @@ struct Found {
     size: [u32; 2],
     thickness: f64,
     eps: f64,
-    explained: Explained,
+    explained: PixelExplanation,
     /// The same sheets in f64.
     sheets: BTreeMap<i64, Sheet>,
     same_thickness: [f64; 4],
@@ -179,7 +179,7 @@ fn text(found: &Found) -> String {
     out
 }
 
-fn put_sheet(out: &mut String, found: &Found, s: &SheetHere) {
+fn put_sheet(out: &mut String, found: &Found, s: &SheetAtPixel) {
     let d = found.thickness;
     let [r, g, b] = s.colour.map(|c| format!("{c:.3}"));
     let t64 = found.sheets.get(&i64::from(s.k)).map(|r| number(1.0 - r.so_far[3]));
@@ -231,13 +231,13 @@ fn number(x: f64) -> String {
 
 fn json(found: &Found) -> String {
     let e = &found.explained;
-    let section = |v: &Section| {
+    let section = |v: &SectionAtPixel| {
         serde_json::json!({
             "voxel": v.voxel, "brick": v.brick.0, "value": found.values.value(v.code),
             "weights": v.weights, "tau": v.tau, "colour": v.colour
         })
     };
-    let sheet = |s: &SheetHere| {
+    let sheet = |s: &SheetAtPixel| {
         let reference = found
             .sheets
             .get(&i64::from(s.k))

@@ -10,9 +10,9 @@ use slabcast_common::occlusion::Rect;
 use slabcast_common::slab::SheetRange;
 use slabcast_render::Frame;
 use slabcast_render::Simd;
-use slabcast_render::region::{self, Supply};
-use slabcast_render::tile::{self, Scratch, Seen};
-use slabcast_render::visibility::{Directory, Outlook};
+use slabcast_render::region::{self, BrickSupply};
+use slabcast_render::tile::{self, ProjectedBrick, Scratch};
+use slabcast_render::visibility::{Directory, VisibleBricks};
 use slabcast_volumes::BrickStore;
 use std::collections::BTreeMap;
 use std::ops::Deref;
@@ -66,7 +66,7 @@ impl Deref for Bricks {
     }
 }
 
-impl Supply for Bricks {
+impl BrickSupply for Bricks {
     fn get(&self, place: u32) -> Option<Arc<Brick>> {
         self.all.get(place as usize).cloned()
     }
@@ -95,7 +95,7 @@ pub(crate) fn tiles(whole: Rect, edge: u32) -> impl Iterator<Item = Rect> {
 fn through(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
     let whole = Rect::of_size(frame.view.size);
     let edge = cut.tile as i32;
-    let outlook = Outlook::new(frame, &bricks.directory);
+    let outlook = VisibleBricks::new(&frame.view, &bricks.directory);
     // What nothing lies in is not drawn; what may have most to draw comes first.
     let weighed = tiles(whole, cut.tile).map(|tile| (outlook.weight(&tile), tile));
     let mut tiles: Vec<(u64, Rect)> = weighed.filter(|(weight, _)| *weight > 0).collect();
@@ -108,7 +108,7 @@ fn through(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
     let drawn = shared(tiles.len(), cut.threads, |i, Kept(memory): &mut Kept| {
         let (_, tile) = tiles[i];
         let Memory { scratch, pixels } = memory;
-        let counted = region::draw((frame, &outlook, bricks), simd, tile, scratch, pixels);
+        let counted = region::draw(frame, &outlook, bricks, simd, tile, scratch, pixels);
         let band = tile.y0 / edge;
         let in_band = Rect { y0: tile.y0 - band * edge, y1: tile.y1 - band * edge, ..tile };
         let mut rows = bands[band as usize].lock().unwrap_or_else(PoisonError::into_inner);
@@ -130,13 +130,13 @@ fn in_slabs(frame: &Frame, bricks: &[Arc<Brick>], cut: Cut) -> (Picture, Counter
     let portions = bricks.len().div_ceil(PROJECTED);
     let seen = shared(portions, cut.threads, |i, _: &mut ()| {
         let portion = &bricks[i * PROJECTED..bricks.len().min((i + 1) * PROJECTED)];
-        portion.iter().filter_map(|b| Seen::new(frame, b)).collect::<Vec<_>>()
+        portion.iter().filter_map(|b| ProjectedBrick::new(frame, b)).collect::<Vec<_>>()
     });
-    let seen: Vec<Seen> = seen.into_iter().flatten().collect();
-    let mut tiles: Vec<(Rect, Vec<&Seen>)> =
+    let seen: Vec<ProjectedBrick> = seen.into_iter().flatten().collect();
+    let mut tiles: Vec<(Rect, Vec<&ProjectedBrick>)> =
         tiles(whole, cut.tile).map(|tile| (tile, Vec::new())).collect();
     let mut sheets = SheetRange::default();
-    for brick in Seen::front_to_back(&seen) {
+    for brick in ProjectedBrick::front_to_back(&seen) {
         let p = &brick.projected;
         sheets = sheets.union(p.sheets);
         for y in p.rect.y0 / edge..=(p.rect.y1 - 1) / edge {

@@ -13,7 +13,7 @@ use crate::stage::Stage;
 use slabcast_common::image::{Picture, PixelFormat};
 use slabcast_common::quality::{Compositing, Quality};
 use slabcast_common::stats::FrameStats;
-use slabcast_render::oracle::work_counters::{Survey, survey};
+use slabcast_render::oracle::work_counters::{WorkCounters, count_work};
 
 /// What is shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -79,7 +79,7 @@ pub(crate) fn draw(stage: &Stage, show: Show, i: usize, threads: usize) -> Resul
         let finer = local::picture(&stage.other(i, half)?, &stage.bricks, Cut::on(threads));
         error(&picture, &estimate(&picture, &finer, quality.compositing))
     } else {
-        let (picture, notes) = survey(&tables, &stage.bricks);
+        let (picture, notes) = count_work(&tables, &stage.bricks);
         match show {
             Show::Depth => depth(&picture, &notes, quality.thickness),
             Show::Sheets => {
@@ -145,7 +145,7 @@ fn nothing(p: &[f32; 4]) -> bool {
 }
 
 /// Where pixels were shut, counted from the first sheet that held anything.
-fn depth(picture: &Picture, notes: &Survey, thickness: f64) -> Canvas {
+fn depth(picture: &Picture, notes: &WorkCounters, thickness: f64) -> Canvas {
     let first = notes.first.unwrap_or(0);
     let far = notes.shut_in.iter().flatten().max().map_or(0, |k| k - first).max(1);
     let share = |k: i32| 1.0 - f64::from(k - first) / f64::from(far);

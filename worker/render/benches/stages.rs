@@ -28,7 +28,7 @@ use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_render::Simd;
 use slabcast_render::oracle::serial;
-use slabcast_render::tile::{self, Scratch, Seen};
+use slabcast_render::tile::{self, ProjectedBrick, Scratch};
 use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
 use std::time::Duration;
@@ -231,16 +231,16 @@ fn splat_more_sections_than_a_record_holds(bencher: Bencher<'_, '_>) {
 #[divan::bench]
 fn project_and_sort_bricks(bencher: Bencher<'_, '_>) {
     let stage = How::default().stage();
-    let look = || -> Vec<Seen> {
-        stage.bricks.iter().filter_map(|b| Seen::new(&stage.frame, b)).collect()
+    let look = || -> Vec<ProjectedBrick> {
+        stage.bricks.iter().filter_map(|b| ProjectedBrick::new(&stage.frame, b)).collect()
     };
     let seen = look();
-    let order = Seen::front_to_back(&seen);
+    let order = ProjectedBrick::front_to_back(&seen);
     let firsts = order.iter().map(|s| s.projected.sheets.first);
     assert!(firsts.is_sorted() && seen.len() == stage.bricks.len());
     bencher.counter(ItemsCount::new(seen.len())).bench_local(|| {
         let seen = look();
-        Seen::front_to_back(&seen).len()
+        ProjectedBrick::front_to_back(&seen).len()
     });
 }
 

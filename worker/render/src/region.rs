@@ -6,14 +6,14 @@
 //! if it may touch a pixel that is open there. What hides it is then drawn already.
 //!
 //! ```text
-//! Outlook::new       the directory as a frame sees it: once a frame
+//! VisibleBricks::new       the directory as a frame sees it: once a frame
 //! Region::new        a tile before its first sheet
 //! expected           what it will ask for, if the frame before tells: it can be asked for before the tile is begun
 //! Region::advance    to the end, or to the first sheet that lacks a brick
 //!   .. names the bricks that it lacks there and a little farther; others render meanwhile
 //! Region::advance    from that sheet on
-//! Region::hand_over  where it stands: somebody else draws a piece of it from there
-//! Region::go_on      that one's, before he draws
+//! Region::split_off  where it stands: somebody else draws a piece of it from there
+//! Region::resume      that one's, before he draws
 //! Region::finish     pixels, counts, and which bricks it touched
 //! ```
 //!
@@ -23,13 +23,13 @@
 //! costs what a tile of one slab costs.
 
 use crate::kernels::Simd;
-pub use crate::part::brick_feed::Supply;
+pub use crate::part::brick_feed::BrickSupply;
 use crate::part::brick_feed::{Coming, Memory};
 use crate::part::{Among, Io, Part};
 use crate::scene::Frame;
 use crate::tile::Scratch;
-use crate::visibility::closing_depth::{Cells, Depths};
-use crate::visibility::visible_bricks::{Outlook, Sight};
+use crate::visibility::closing_depth::{Cells, ClosingDepths};
+use crate::visibility::visible_bricks::{VisibleBrick, VisibleBricks};
 use slabcast_common::image::TilePixels;
 use slabcast_common::leaves::LEAF;
 use slabcast_common::message::{Begun, Counters};
@@ -41,8 +41,8 @@ use slabcast_common::region::{cut, parts};
 struct From<'a> {
     frame: &'a Frame,
     simd: Simd,
-    outlook: &'a Outlook,
-    supply: &'a dyn Supply,
+    outlook: &'a VisibleBricks,
+    supply: &'a dyn BrickSupply,
     /// Sheets beyond one that lacks a brick that are looked at.
     ahead: u32,
 }
@@ -99,7 +99,9 @@ fn go_through(
 /// # Panics
 /// If a brick is not here.
 pub fn draw(
-    (frame, outlook, supply): (&Frame, &Outlook, &dyn Supply),
+    frame: &Frame,
+    outlook: &VisibleBricks,
+    supply: &dyn BrickSupply,
     simd: Simd,
     tile: Rect,
     scratch: &mut Scratch,
@@ -146,7 +148,7 @@ pub struct Region {
 
 /// A region that came to its end.
 #[derive(Debug)]
-pub struct Finished {
+pub struct FinishedRegion {
     /// Its pixels. Sums of a last sheet are not among them: nobody goes on from there.
     pub pixels: TilePixels,
     /// Its voxels.
@@ -156,19 +158,21 @@ pub struct Finished {
     depths: Vec<(Rect, Cells)>,
 }
 
-impl Finished {
+impl FinishedRegion {
     /// Tells the next frame how deep it was open.
-    pub fn teach(&self, depths: &Depths) {
+    pub fn record_depths(&self, depths: &ClosingDepths) {
         self.depths.iter().for_each(|(part, cells)| depths.note(part, cells));
     }
 }
 
 /// What a region that is not begun will ask for, if its frame is as deep as those of `depths`: places in the directory of
 /// bricks that are not here, ascending. Nothing of what nobody knows about. Where nothing is culled, it is all that lies over it.
-pub fn expected(
-    (frame, outlook, supply): (&Frame, &Outlook, &dyn Supply),
+pub fn expected_bricks(
+    frame: &Frame,
+    outlook: &VisibleBricks,
+    supply: &dyn BrickSupply,
     tile: Rect,
-    depths: &Depths,
+    depths: &ClosingDepths,
 ) -> Vec<u32> {
     let all = !frame.scene.quality.cull;
     let expects = |r: &Rect, first| !r.is_empty() && (all || depths.expects(r, first));
@@ -184,7 +188,7 @@ pub fn expected(
             if !expects(&rect, projected.sheets.first) {
                 continue;
             }
-            for &Sight { projected, place, .. } in outlook.bricks(i) {
+            for &VisibleBrick { projected, place, .. } in outlook.bricks(i) {
                 let rect = projected.rect.intersect(&part);
                 if expects(&rect, projected.sheets.first) && !supply.has(place) {
                     places.push(place);
@@ -199,7 +203,7 @@ pub fn expected(
 
 impl Region {
     /// `tile`, which lies inside the picture, before the first sheet.
-    pub fn new(outlook: &Outlook, tile: Rect) -> Region {
+    pub fn new(outlook: &VisibleBricks, tile: Rect) -> Region {
         let at = outlook.sheets().first;
         let cells = Cells::default();
         let open = parts(tile).map(|rect| Strand { rect, at, cells }).collect();
@@ -225,7 +229,11 @@ impl Region {
     ///
     /// # Errors
     /// In words, where it can't have been left so.
-    pub fn go_on(outlook: &Outlook, tile: Rect, begun: &Begun) -> Result<Region, &'static str> {
+    pub fn resume(
+        outlook: &VisibleBricks,
+        tile: Rect,
+        begun: &Begun,
+    ) -> Result<Region, &'static str> {
         let (n, pixels) = (tile.area(), &begun.pixels);
         let last = pixels.last.as_ref().is_none_or(|last| last.len() == n);
         if pixels.a.len() != n || pixels.colour.len() != n || !last {
@@ -249,9 +257,9 @@ impl Region {
 
     /// Gives away about `share` of what is left: what it keeps of its tile, what it gives, and how that stands.
     /// `None`: it can't be cut. What is left is told by open pixels and by sheets.
-    pub fn hand_over(
+    pub fn split_off(
         &mut self,
-        outlook: &Outlook,
+        outlook: &VisibleBricks,
         eps: f64,
         share: f64,
     ) -> Option<(Rect, Rect, Begun)> {
@@ -287,13 +295,13 @@ impl Region {
     /// Goes as far as bricks are here. What it lacks to go farther, by places in the directory and
     /// without repetition: those that begin at the sheets at which its parts stand still, and those
     /// of `ahead` sheets more that are not hidden by what is drawn already. Nothing: it is at its end, or its supply
-    /// [stops](Supply::stops) it.
+    /// [stops](BrickSupply::stops) it.
     pub fn advance(
         &mut self,
         frame: &Frame,
         simd: Simd,
-        outlook: &Outlook,
-        supply: &dyn Supply,
+        outlook: &VisibleBricks,
+        supply: &dyn BrickSupply,
         ahead: u32,
         scratch: &mut Scratch,
     ) -> Vec<u32> {
@@ -310,8 +318,8 @@ impl Region {
         &mut self,
         frame: &Frame,
         simd: Simd,
-        outlook: &Outlook,
-        supply: &dyn Supply,
+        outlook: &VisibleBricks,
+        supply: &dyn BrickSupply,
         ahead: u32,
         scratch: &mut Scratch,
     ) -> Vec<u32> {
@@ -342,12 +350,12 @@ impl Region {
     }
 
     /// Ends it, at its end or before.
-    pub fn finish(self) -> Finished {
+    pub fn finish(self) -> FinishedRegion {
         let Region { mut pixels, counters, mut touched, depths, .. } = self;
         touched.sort_unstable();
         touched.dedup();
         pixels.last = None;
-        Finished { pixels, counters, touched, depths }
+        FinishedRegion { pixels, counters, touched, depths }
     }
 }
 

@@ -5,7 +5,7 @@ use crate::kernels::{Simd, Work, lut};
 use crate::primitives::footprint::{
     Footprint, Footprints, Lean, Leaning, Profile, Sections, Shelf,
 };
-use crate::primitives::lattice_rows::Storeys;
+use crate::primitives::lattice_rows::LatticeRows;
 use crate::primitives::positions::{FlatCorner, Places};
 use crate::visibility::open_mask::REACH_MOST;
 use glam::{DVec3, Vec3};
@@ -98,7 +98,7 @@ pub struct Frame {
     /// Where sections and rows lie, where the kernel leans.
     pub(crate) leaning: Option<Leaning>,
     /// What lies level, where voxels are added to rows of it.
-    pub(crate) storeys: Option<Storeys>,
+    pub(crate) lattice_rows: Option<LatticeRows>,
 }
 
 /// What an orthographic view has whose footprints are in a table and small enough for masks.
@@ -178,8 +178,8 @@ impl Frame {
         let leaning = leans.then(|| Leaning::new(&view, &profile, &sections, largest));
         let leaning = leaning.filter(Leaning::shows);
         let level = leaning.is_none() && q.sums != Sums::F32;
-        let storeys = level.then(|| Storeys::new(&view, scene.dims, spread.y, range.end));
-        let mut storeys = storeys.flatten();
+        let lattice_rows = level.then(|| LatticeRows::new(&view, scene.dims, spread.y, range.end));
+        let mut lattice_rows = lattice_rows.flatten();
         let (raw_scale, unit) = match q.sums {
             Sums::F32 => (1.0, 1.0),
             // Weights are those per step of the lattice and over the thickness, so the payload has
@@ -191,9 +191,12 @@ impl Frame {
             }
             Sums::I32 | Sums::Auto => {
                 let scale = raw_per_payload(scene.payload_max, d);
-                // A solid's rows of storeys are as its sums.
-                let of_rows =
-                    if storeys.is_some() { f64::from(scale) / spread.y } else { f64::from(scale) };
+                // A solid's lattice rows are as its sums.
+                let of_rows = if lattice_rows.is_some() {
+                    f64::from(scale) / spread.y
+                } else {
+                    f64::from(scale)
+                };
                 (of_rows as f32, (1.0 / f64::from(scale)) as f32)
             }
         };
@@ -210,8 +213,8 @@ impl Frame {
         });
         let reach = reach.filter(|reach| reach.iter().all(|&reach| reach <= REACH_MOST));
         let flat = reach.and_then(|reach| Some(Flat { places: Places::new(&view)?, reach }));
-        if let (Some(storeys), Some(Flat { places, .. })) = (&mut storeys, &flat) {
-            storeys.in_integers(|at| {
+        if let (Some(lattice_rows), Some(Flat { places, .. })) = (&mut lattice_rows, &flat) {
+            lattice_rows.in_integers(|at| {
                 let corner = places.corner(view.corner_in_eye(at.map(|n| n & !7)));
                 places.at(corner, local_of(at.map(|n| n & 7))).0[1]
             });
@@ -224,7 +227,7 @@ impl Frame {
         Frame {
             flat,
             leaning,
-            storeys,
+            lattice_rows,
             sections,
             footprints,
             rule,
@@ -290,11 +293,11 @@ impl Frame {
         }
     }
 
-    /// The storey of a voxel, in a level view: its brick's corner and its local index.
+    /// The lattice row of a voxel, in a level view: its brick's corner and its local index.
     #[inline]
-    pub(crate) fn storey(&self, corner: &Corner, of: u16) -> Option<u32> {
-        let (at, storeys) = (local(of), self.storeys.as_ref()?);
-        Some(storeys.of_voxel(std::array::from_fn(|axis| corner.index[axis] + at[axis])))
+    pub(crate) fn lattice_row(&self, corner: &Corner, of: u16) -> Option<u32> {
+        let (at, lattice_rows) = (local(of), self.lattice_rows.as_ref()?);
+        Some(lattice_rows.of_voxel(std::array::from_fn(|axis| corner.index[axis] + at[axis])))
     }
 
     /// Whether all sections of a voxel have the same columns with the same weights.

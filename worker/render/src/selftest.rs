@@ -52,7 +52,7 @@ pub fn run(simd: Simd) -> Digest32 {
         (Sums::F32, persp, 0.4),
         (Sums::I16, persp, 0.4),
         (Sums::I16, ortho, 0.4),
-        // Level views add to rows of storeys.
+        // Level views add to lattice rows.
         (Sums::I32, persp, 0.0),
         (Sums::I16, ortho, 0.0),
     ];

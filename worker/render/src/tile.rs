@@ -31,10 +31,10 @@ use crate::geometry::sheared::{self, RenderLeaning};
 use crate::kernels::pixel_records::MOST;
 use crate::kernels::row_records::Tiered;
 use crate::kernels::{Grey, Simd};
-pub use crate::part::Seen;
+pub use crate::part::ProjectedBrick;
 use crate::part::brick_feed::Memory;
 use crate::part::{Among, Io, Part, Pixels};
-use crate::primitives::lattice_rows::Storeys;
+use crate::primitives::lattice_rows::LatticeRows;
 use crate::primitives::sizes::PART;
 use crate::scene::{Frame, Scene};
 use slabcast_common::brick::Brick;
@@ -90,11 +90,12 @@ pub fn render(
     state: &TileState,
     scratch: &mut Scratch,
 ) -> (TilePixels, Counters) {
-    let seen: Vec<Seen> = bricks.iter().filter_map(|b| Seen::new(frame, b)).collect();
-    render_seen(frame, simd, tile, slab, &Seen::front_to_back(&seen), state, scratch)
+    let seen: Vec<ProjectedBrick> =
+        bricks.iter().filter_map(|b| ProjectedBrick::new(frame, b)).collect();
+    render_seen(frame, simd, tile, slab, &ProjectedBrick::front_to_back(&seen), state, scratch)
 }
 
-/// [`render`] with bricks that were looked at before and lie [front to back](Seen::front_to_back).
+/// [`render`] with bricks that were looked at before and lie [front to back](ProjectedBrick::front_to_back).
 ///
 /// # Panics
 /// If the planes of `state` do not have the tile's size.
@@ -103,7 +104,7 @@ pub fn render_seen(
     simd: Simd,
     tile: Rect,
     slab: SheetRange,
-    bricks: &[&Seen],
+    bricks: &[&ProjectedBrick],
     state: &TileState,
     scratch: &mut Scratch,
 ) -> (TilePixels, Counters) {
@@ -122,7 +123,7 @@ pub fn render_into(
     simd: Simd,
     tile: Rect,
     slab: SheetRange,
-    bricks: &[&Seen],
+    bricks: &[&ProjectedBrick],
     state: &TileState,
     scratch: &mut Scratch,
     out: &mut TilePixels,
@@ -176,7 +177,7 @@ pub fn render_into(
 
 /// What a voxel adds to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Adds {
+pub struct FootprintCost {
     /// Pixels across and down.
     pub pixels: [usize; 2],
     /// Bytes of sums that a pixel has for the sheets of all sections together: each is read and written.
@@ -186,7 +187,7 @@ pub struct Adds {
 impl Frame {
     /// What each voxel adds to, where that is the same for all: in parallel views that are drawn in whole sums,
     /// but for kernels that lean.
-    pub fn adds(&self) -> Option<Adds> {
+    pub fn footprint_cost(&self) -> Option<FootprintCost> {
         let Scene { quality, ref classifier, .. } = *self.scene;
         let channel = match quality.sums {
             Sums::F32 => return None,
@@ -199,11 +200,11 @@ impl Frame {
         }
         let footprint = self.footprints.at(0)?;
         let [across, down] = [0, 1].map(|axis| footprint.phases(axis).map(|phases| phases.len));
-        // In a level view to the row of its storey alone.
-        let down = if self.storeys.is_some() { Some(1) } else { down };
+        // In a level view to the row of its lattice row alone.
+        let down = if self.lattice_rows.is_some() { Some(1) } else { down };
         let channels = if self.has_two_channels() { 2 } else { 4 };
         let sheets = if most <= 4 { 4 } else { MOST };
-        Some(Adds { pixels: [across?, down?], bytes: channel * channels * sheets })
+        Some(FootprintCost { pixels: [across?, down?], bytes: channel * channels * sheets })
     }
 
     /// Whether its three colours are one and it is drawn where that is made use of: opacity and one
@@ -240,10 +241,10 @@ impl<'a> Part<'a> {
                 part.render_grey(simd, store, &mut waiting.flat, pixels, io);
             }
             Sums::I32 | Sums::Auto => {
-                if let Some((deep, storeys)) = part.deep_grey() {
+                if let Some((deep, lattice_rows)) = part.deep_grey() {
                     let (store, waiting) = (&mut whole.greys, &mut whole.waiting.deep);
                     let deep = RenderDeep::<Grey, 4> { part, deep, store, waiting, pixels, io };
-                    return simd.run(RenderDeepLevel { deep, storeys });
+                    return simd.run(RenderDeepLevel { deep, lattice_rows });
                 }
                 let (store, waiting) = (&mut whole.longs, &mut whole.waiting);
                 part.render(simd, store, waiting, (&mut kinds.longs, queues), pixels, io);
@@ -253,10 +254,10 @@ impl<'a> Part<'a> {
 
     /// How it is drawn in two channels in perspective: where the view is level and voxels have four sheets. Each kind more
     /// takes the compiler seconds, and records of views that are not level would be added to one by one.
-    fn deep_grey(&self) -> Option<(Deep, &'a Storeys)> {
-        let storeys = self.frame.storeys.as_ref()?;
+    fn deep_grey(&self) -> Option<(Deep, &'a LatticeRows)> {
+        let lattice_rows = self.frame.lattice_rows.as_ref()?;
         let may = self.frame.may_have_two_channels() && self.frame.sections.most() <= 4;
-        Some((perspective::takes(self).filter(|_| may)?, storeys))
+        Some((perspective::takes(self).filter(|_| may)?, lattice_rows))
     }
 
     /// Renders it where the frame [has two channels](Frame::has_two_channels).
@@ -330,10 +331,10 @@ impl<'a> Part<'a> {
             simd.run(RenderLeaning { part, lean, store, waiting, pixels, io });
         } else if let Some(deep) = perspective::takes(&part) {
             let waiting = &mut waiting.deep;
-            let storeys = part.frame.storeys.as_ref();
+            let lattice_rows = part.frame.lattice_rows.as_ref();
             let deep = RenderDeep::<S, N> { part, deep, store, waiting, pixels, io };
-            match storeys {
-                Some(storeys) => simd.run(RenderDeepLevel { deep, storeys }),
+            match lattice_rows {
+                Some(lattice_rows) => simd.run(RenderDeepLevel { deep, lattice_rows }),
                 None => simd.run(deep),
             }
         } else {
@@ -368,17 +369,17 @@ mod tests {
             let camera = Camera { to_eye, up: DVec3::Z, target: DVec3::ZERO, projection };
             let view = View::new(&volume.lattice, &camera, [64; 2], &quality).expect("a view");
             let scene = Scene::new(&selftest::spec(&volume, quality));
-            Frame::new(Arc::new(scene), view).adds()
+            Frame::new(Arc::new(scene), view).footprint_cost()
         };
         let adds = |sums, thickness, projection| adds_from(0.5, sums, thickness, projection);
-        let seven = |bytes| Some(Adds { pixels: [7; 2], bytes });
+        let seven = |bytes| Some(FootprintCost { pixels: [7; 2], bytes });
         assert_eq!(adds(Sums::I16, 1.0, flat), seven(32));
         assert_eq!(adds(Sums::I32, 1.0, flat), seven(64));
         assert_eq!(adds(Sums::I16, 0.5, flat), seven(64));
         assert_eq!(adds(Sums::F32, 1.0, flat), None);
         assert_eq!(adds(Sums::I16, 1.0, deep), None);
         let level = |sums, thickness| adds_from(0.0, sums, thickness, flat);
-        let row = |bytes| Some(Adds { pixels: [7, 1], bytes });
+        let row = |bytes| Some(FootprintCost { pixels: [7, 1], bytes });
         assert_eq!([level(Sums::I16, 1.0), level(Sums::I32, 0.5)], [row(32), row(128)]);
         assert_eq!(level(Sums::F32, 1.0), None);
     }

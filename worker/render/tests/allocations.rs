@@ -20,9 +20,9 @@ use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, Transf
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_render::Simd;
-use slabcast_render::region::{self, Supply};
-use slabcast_render::tile::{self, Scratch, Seen};
-use slabcast_render::visibility::{Directory, Outlook};
+use slabcast_render::region::{self, BrickSupply};
+use slabcast_render::tile::{self, ProjectedBrick, Scratch};
+use slabcast_render::visibility::{Directory, VisibleBricks};
 use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
 use world::{bricks_of, infos_of};
@@ -62,7 +62,7 @@ fn transfer(unit: OpacityUnit) -> TransferFunction {
 /// Every brick is here.
 struct All<'a>(&'a [Arc<Brick>]);
 
-impl Supply for All<'_> {
+impl BrickSupply for All<'_> {
     fn get(&self, place: u32) -> Option<Arc<Brick>> {
         self.0.get(place as usize).cloned()
     }
@@ -99,12 +99,12 @@ fn draw(scene: &Arc<Scene>, view: View, bricks: &[Arc<Brick>], kept: &mut Kept) 
     let making = measure(|| {
         let frame = Frame::new(scene.clone(), view);
         let mut seen = Vec::with_capacity(bricks.len());
-        seen.extend(bricks.iter().filter_map(|b| Seen::new(&frame, b)));
+        seen.extend(bricks.iter().filter_map(|b| ProjectedBrick::new(&frame, b)));
         made = Some((frame, seen));
     });
     let (frame, seen) = made.expect("it was made");
     let mut order = Vec::new();
-    let ordering = measure(|| order = Seen::front_to_back(&seen));
+    let ordering = measure(|| order = ProjectedBrick::front_to_back(&seen));
     let sheets =
         seen.iter().fold(SheetRange::default(), |range, s| range.union(s.projected.sheets));
     let drawing = measure(|| {
@@ -116,13 +116,14 @@ fn draw(scene: &Arc<Scene>, view: View, bricks: &[Arc<Brick>], kept: &mut Kept) 
         }
     });
     let mut outlook = None;
-    let looking = measure(|| outlook = Some(Outlook::new(&frame, &kept.directory)));
+    let looking = measure(|| outlook = Some(VisibleBricks::new(&frame.view, &kept.directory)));
     let outlook = outlook.expect("it was made");
     let through = measure(|| {
         for tile in &tiles {
             let (scratch, pixels) = (&mut kept.scratch, &mut kept.pixels);
-            let from: (_, _, &dyn Supply) = (&frame, &outlook, &All(bricks));
-            kept.through += region::draw(from, kept.simd, *tile, scratch, pixels).splatted;
+            let supply = All(bricks);
+            kept.through +=
+                region::draw(&frame, &outlook, &supply, kept.simd, *tile, scratch, pixels).splatted;
         }
     });
     let made = making.count_total + ordering.count_total + looking.count_total;

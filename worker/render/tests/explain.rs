@@ -10,9 +10,9 @@ use slabcast_common::shade::Shading;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
-use slabcast_render::oracle::explain::{Explained, explain};
+use slabcast_render::oracle::explain::{PixelExplanation, explain};
 use slabcast_render::oracle::serial;
-use slabcast_render::oracle::work_counters::survey;
+use slabcast_render::oracle::work_counters::count_work;
 use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
 use world::bricks_of;
@@ -117,7 +117,7 @@ fn a_survey_counts_what_explain_lists() {
     for (sums, projection) in [(Sums::I32, PROJECTIONS[0]), (Sums::F32, PROJECTIONS[1])] {
         let quality = Quality { sums, ..Quality::default() };
         let frame = frame(&volume, quality, projection);
-        let (picture, notes) = survey(&frame, &bricks);
+        let (picture, notes) = count_work(&frame, &bricks);
         assert_eq!(picture, serial::render(&frame, &bricks));
         let mut most = 0;
         for [x, y] in places() {
@@ -137,7 +137,7 @@ fn a_survey_counts_what_explain_lists() {
 
 /// Opacity goes on from sheet to sheet, light adds up to the pixel, voxels to their sheet.
 #[track_caller]
-fn agrees_with_itself(e: &Explained, quality: &Quality, what: &str) {
+fn agrees_with_itself(e: &PixelExplanation, quality: &Quality, what: &str) {
     let mut a = 0.0;
     let mut light = [0.0; 3];
     for s in &e.sheets {

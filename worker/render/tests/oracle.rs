@@ -20,10 +20,10 @@ use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
 use slabcast_render::Simd;
 use slabcast_render::oracle::serial;
-use slabcast_render::region::{Region, Supply, expected};
+use slabcast_render::region::{BrickSupply, Region, expected_bricks};
 use slabcast_render::tile::{self, Scratch};
-use slabcast_render::visibility::Depths;
-use slabcast_render::visibility::{Directory, Outlook};
+use slabcast_render::visibility::ClosingDepths;
+use slabcast_render::visibility::{Directory, VisibleBricks};
 use slabcast_render::{Frame, Scene};
 use std::cell::{Cell, RefCell};
 use std::sync::Arc;
@@ -78,7 +78,7 @@ struct Store<'a> {
     stop_in: Cell<Option<u64>>,
 }
 
-impl Supply for Store<'_> {
+impl BrickSupply for Store<'_> {
     fn get(&self, place: u32) -> Option<Arc<Brick>> {
         let place = place as usize;
         self.here.borrow()[place].then(|| self.bricks[place].clone())
@@ -112,8 +112,8 @@ fn in_regions(
     let size = frame.view.size;
     let directory = infos_of(bricks, &frame.scene.grid).into();
     // A brick a block, eight, or more than there are.
-    let directory = Directory::in_blocks(directory, 3 + (seed % 3) as u32, 1 << 20);
-    let outlook = Outlook::new(frame, &Arc::new(directory));
+    let directory = Directory::with_blocks(directory, 3 + (seed % 3) as u32, 1 << 20);
+    let outlook = VisibleBricks::new(&frame.view, &Arc::new(directory));
     let here = RefCell::new(bricks.iter().map(|_| once_in(held_in)).collect());
     let store = Store { bricks, here, stop_in: Cell::new(None) };
     let mut picture = Picture { size, pixels: vec![[0.0; 4]; (size[0] * size[1]) as usize] };
@@ -126,7 +126,7 @@ fn in_regions(
             tiles.push((Region::new(&outlook, rect), rect));
         }
     }
-    let depths = Depths::new(size);
+    let depths = ClosingDepths::new(size);
     while let Some((mut region, mut rect)) = tiles.pop() {
         store.stop_in.set(once_in(given_in).then(|| 1 + seed % 40));
         loop {
@@ -137,12 +137,12 @@ fn in_regions(
             if store.stop_in.take() == Some(0) {
                 let share = [0.2, 0.5, 0.9][(seed % 3) as usize];
                 let eps = frame.scene.quality.eps;
-                if let Some((kept, given, begun)) = region.hand_over(&outlook, eps, share) {
+                if let Some((kept, given, begun)) = region.split_off(&outlook, eps, share) {
                     assert_eq!((region.tile(), kept.union(&given)), (kept, rect));
                     assert_eq!(kept.area() + given.area(), rect.area());
-                    let other = Region::go_on(&outlook, given, &begun).expect("it stands so");
+                    let other = Region::resume(&outlook, given, &begun).expect("it stands so");
                     assert!(other.depth().is_some() && region.depth().is_some());
-                    assert!(Region::go_on(&outlook, rect, &begun).is_err());
+                    assert!(Region::resume(&outlook, rect, &begun).is_err());
                     tiles.push((other, given));
                     rect = kept;
                 }
@@ -158,7 +158,7 @@ fn in_regions(
         }
         let done = region.finish();
         assert!(done.touched.windows(2).all(|p| p[0] < p[1]) && done.pixels.last.is_none());
-        done.teach(&depths);
+        done.record_depths(&depths);
         touched.extend(done.touched);
         counted += done.counters;
         done.pixels.write(rect, size, &mut picture.pixels);
@@ -167,7 +167,7 @@ fn in_regions(
     store.here.borrow_mut().fill(false);
     let rest = Rect::new(7, 0, size[0] as i32, size[1] as i32);
     let [again, of_rest] = [Rect::of_size(size), rest].map(|tile| match tile.is_empty() {
-        false => expected((frame, &outlook, &store), tile, &depths),
+        false => expected_bricks(frame, &outlook, &store, tile, &depths),
         true => Vec::new(),
     });
     let cull = frame.scene.quality.cull;
@@ -179,8 +179,8 @@ fn in_regions(
         seen.width().min(seen.height()) <= 6
     };
     assert!(of_rest.iter().all(|place| again.binary_search(place).is_ok() || narrow(*place)));
-    let unknown = Depths::new(size);
-    let nothing = expected((frame, &outlook, &store), Rect::of_size(size), &unknown);
+    let unknown = ClosingDepths::new(size);
+    let nothing = expected_bricks(frame, &outlook, &store, Rect::of_size(size), &unknown);
     assert!(!cull || nothing.is_empty());
     (picture, counted, asked, touched)
 }
@@ -192,7 +192,7 @@ proptest! {
     fn tiles_and_slabs_give_the_bytes_of_the_serial_renderer(
         dims in (1u32..22, 1u32..22, 1u32..22),
         seed in any::<u64>(),
-        // Half of the views are level, where voxels are added to rows of storeys.
+        // Half of the views are level, where voxels are added to lattice rows.
         azimuth in 0.0..6.3f64, tilt in prop_oneof![Just(0.0), -1.5..1.5f64],
         persp in any::<bool>(), distance in 2.0..60.0f64,
         thickness in prop::sample::select(vec![0.25, 0.5, 1.0, 1.0, 1.0, 2.3, 40.0]),

@@ -38,10 +38,10 @@ use slabcast_common::view::Projected;
 use slabcast_proto::convert::{self, Down};
 use slabcast_render::Frame;
 use slabcast_render::Simd;
-use slabcast_render::region::{self, Finished, Region, Supply};
+use slabcast_render::region::{self, BrickSupply, FinishedRegion, Region};
 use slabcast_render::tile::{self, Scratch};
-use slabcast_render::visibility::Depths;
-use slabcast_render::visibility::Outlook;
+use slabcast_render::visibility::ClosingDepths;
+use slabcast_render::visibility::VisibleBricks;
 use slabcast_schedule::{FrameJob, is_shut, macrotile};
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
@@ -96,13 +96,13 @@ pub(crate) fn measure(
     (progress, before): (&mut Progress, usize),
 ) -> Result<Trace, Fail> {
     let jobs = jobs(path.stage, path.frames, path.work)?;
-    let depths = Depths::new(jobs[0].view.size);
+    let depths = ClosingDepths::new(jobs[0].view.size);
     let packing = Packed::default();
     let mut bench = Bench { scratch: Scratch::default(), repeats: path.repeats, depths, packing };
     let mut frames = Vec::with_capacity(jobs.len());
     // What a worker has after its first frame: footprints in the scene, memory that has grown.
     bench.frame(path, 0, &jobs[0])?;
-    bench.depths = Depths::new(jobs[0].view.size);
+    bench.depths = ClosingDepths::new(jobs[0].view.size);
     for (i, job) in jobs.iter().enumerate() {
         if signals::told() {
             break;
@@ -129,7 +129,7 @@ struct Bench {
     scratch: Scratch,
     repeats: u32,
     /// How deep the frame before was open.
-    depths: Depths,
+    depths: ClosingDepths,
     /// What packing took of the tiles so far.
     packing: Packed,
 }
@@ -315,13 +315,13 @@ impl Bench {
     /// What it takes to look at the directory, and at a block of it.
     fn look(&mut self, path: &Path<'_>, frame: &Frame) -> Looked {
         let directory = path.stage.bricks.directory();
-        let (outlook_ns, _) = shortest(self.repeats, || Outlook::new(frame, directory));
+        let (outlook_ns, _) = shortest(self.repeats, || VisibleBricks::new(&frame.view, directory));
         let mut block_ns = u64::MAX;
         for _ in 0..self.repeats {
-            let outlook = Outlook::new(frame, directory);
+            let outlook = VisibleBricks::new(&frame.view, directory);
             let began = cpu_ns();
-            let blocks = outlook.blocks();
-            (0..blocks).for_each(|block| outlook.open(block));
+            let blocks = outlook.block_count();
+            (0..blocks).for_each(|block| outlook.project_block(block));
             block_ns = block_ns.min((cpu_ns() - began) / u64::from(blocks.max(1)));
         }
         Looked { outlook_ns, block_ns }
@@ -356,36 +356,37 @@ impl Bench {
             }
         }
         let mut levels = Vec::new();
-        let depths = Depths::new(size);
+        let depths = ClosingDepths::new(size);
         for edge in edges {
             let cut = macrotile::cut_through(size, &rects, (0, 0), Some(edge));
             let simd = Simd::detect();
-            let mut draw = |t: Rect, outlook: &Outlook, supply: &dyn Supply| {
+            let mut draw = |t: Rect, outlook: &VisibleBricks, supply: &dyn BrickSupply| {
                 let mut region = Region::new(outlook, t);
                 region.advance(frame, simd, outlook, supply, 0, &mut self.scratch);
                 let done = region.finish();
-                done.teach(&depths);
-                let Finished { pixels, counters, touched, .. } = done;
+                done.record_depths(&depths);
+                let FinishedRegion { pixels, counters, touched, .. } = done;
                 let size = [t.width() as u32, t.height() as u32];
                 (Leaves::of(&pixels, size, &FINISH), counters, touched)
             };
             let mut tiles: Vec<RegionTile> = Vec::with_capacity(cut.tiles.len());
             for t in &cut.tiles {
-                let outlook = Outlook::new(frame, bricks.directory());
+                let outlook = VisibleBricks::new(&frame.view, bricks.directory());
                 let (leaves, counters, touched) = draw(t.rect, &outlook, bricks);
                 let [result_bytes, plain_bytes] =
                     self.packing.weigh(self.repeats, leaves, counters);
                 let (x, y) = (t.rect.x0 as u32, t.rect.y0 as u32);
-                let opened = outlook.opened().collect();
+                let opened = outlook.projected_blocks().collect();
                 // Blocks that only this opens are opened by the way.
-                let expected = region::expected((frame, &outlook, &Nothing), t.rect, &self.depths);
+                let expected =
+                    region::expected_bricks(frame, &outlook, &Nothing, t.rect, &self.depths);
                 let tile = RegionTile { x, y, touched, opened, expected, ..RegionTile::default() };
                 tiles.push(RegionTile { result_bytes, plain_bytes, ..tile });
             }
             // All blocks that any needs are open then, as the price of one is told apart.
-            let outlook = Outlook::new(frame, bricks.directory());
+            let outlook = VisibleBricks::new(&frame.view, bricks.directory());
             let opened = tiles.iter().flat_map(|t| &t.opened);
-            opened.for_each(|block| outlook.open(*block));
+            opened.for_each(|block| outlook.project_block(*block));
             let rects: Vec<Rect> = cut.tiles.iter().map(|t| t.rect).collect();
             let times = in_turn(self.repeats, &rects, |t| drop(draw(t, &outlook, bricks)));
             if edge <= PART as u32 {
@@ -411,17 +412,16 @@ impl Bench {
         let repeats = self.repeats;
         let mut pixels = TilePixels::default();
         let mut of = |edge: u32| {
-            let outlook = Outlook::new(frame, bricks.directory());
-            let from: (_, _, &dyn Supply) = (frame, &outlook, bricks);
+            let outlook = VisibleBricks::new(&frame.view, bricks.directory());
             let tiles: Vec<Rect> =
                 local::tiles(whole, edge).filter(|tile| outlook.weight(tile) > 0).collect();
             let mut draw = |tile| {
-                region::draw(from, simd, tile, &mut self.scratch, &mut pixels);
+                region::draw(frame, &outlook, bricks, simd, tile, &mut self.scratch, &mut pixels);
             };
             // The first time opens blocks; later ones count.
             tiles.iter().for_each(|tile| draw(*tile));
             let times = in_turn(repeats, &tiles, draw);
-            times.iter().sum::<u64>() + outlook.opened().count() as u64 * looked.block_ns
+            times.iter().sum::<u64>() + outlook.projected_blocks().count() as u64 * looked.block_ns
         };
         let edges = [64, 128, 256].into_iter().filter(|e| *e as i32 <= whole.x1.max(whole.y1) * 2);
         let timed = edges.map(|edge| (edge, of(edge)));
@@ -432,7 +432,7 @@ impl Bench {
 /// No bricks.
 struct Nothing;
 
-impl Supply for Nothing {
+impl BrickSupply for Nothing {
     fn get(&self, _: u32) -> Option<Arc<Brick>> {
         None
     }
@@ -440,13 +440,13 @@ impl Supply for Nothing {
 
 /// Bricks, and when each was first asked for.
 struct Clocked<'a> {
-    bricks: &'a dyn Supply,
+    bricks: &'a dyn BrickSupply,
     began: Instant,
     came: RefCell<BTreeMap<u32, Duration>>,
 }
 
 impl<'a> Clocked<'a> {
-    fn new(bricks: &'a dyn Supply) -> Clocked<'a> {
+    fn new(bricks: &'a dyn BrickSupply) -> Clocked<'a> {
         Clocked { bricks, began: Instant::now(), came: RefCell::default() }
     }
 
@@ -458,7 +458,7 @@ impl<'a> Clocked<'a> {
     }
 }
 
-impl Supply for Clocked<'_> {
+impl BrickSupply for Clocked<'_> {
     fn get(&self, place: u32) -> Option<Arc<Brick>> {
         self.came.borrow_mut().entry(place).or_insert_with(|| self.began.elapsed());
         self.bricks.get(place)
@@ -528,7 +528,7 @@ mod tests {
     use crate::request::Asked;
     use slabcast_common::leaves::Mosaic;
     use slabcast_common::path::{Turntable, ViewPath};
-    use slabcast_render::tile::Seen;
+    use slabcast_render::tile::ProjectedBrick;
     use slabcast_render::visibility::Directory;
 
     /// Volume, axis that is up, and transfer function.
@@ -639,29 +639,38 @@ mod tests {
             let frame = stage.frame(1).expect("a frame");
             let bricks = &stage.bricks;
             let (ns, n) = shortest(9, || {
-                let seen: Vec<Seen> = bricks.iter().filter_map(|b| Seen::new(&frame, b)).collect();
-                Seen::front_to_back(&seen).len()
+                let seen: Vec<ProjectedBrick> =
+                    bricks.iter().filter_map(|b| ProjectedBrick::new(&frame, b)).collect();
+                ProjectedBrick::front_to_back(&seen).len()
             });
             println!("{}, every brick: {:.0}, {n}", scene.2, ns as f64 / 1e3);
             for shift in 4..7 {
                 let infos = bricks.directory().bricks().clone();
-                let directory = Arc::new(Directory::in_blocks(infos, shift, usize::MAX));
-                let all = Outlook::new(&frame, &directory);
+                let directory = Arc::new(Directory::with_blocks(infos, shift, usize::MAX));
+                let all = VisibleBricks::new(&frame.view, &directory);
                 let tiles = local::tiles(Rect::of_size([512; 2]), 64);
                 let tiles: Vec<Rect> = tiles.filter(|tile| all.weight(tile) > 0).collect();
                 let (mut scratch, mut pixels) = Default::default();
                 let mut look = |tiles: &[Rect]| {
-                    let drawn = Outlook::new(&frame, &directory);
+                    let drawn = VisibleBricks::new(&frame.view, &directory);
                     for tile in tiles {
-                        let from: (_, _, &dyn Supply) = (&frame, &drawn, bricks);
-                        region::draw(from, Simd::detect(), *tile, &mut scratch, &mut pixels);
+                        let simd = Simd::detect();
+                        region::draw(
+                            &frame,
+                            &drawn,
+                            bricks,
+                            simd,
+                            *tile,
+                            &mut scratch,
+                            &mut pixels,
+                        );
                     }
-                    let blocks: Vec<u32> = drawn.opened().collect();
+                    let blocks: Vec<u32> = drawn.projected_blocks().collect();
                     let (ns, _) = shortest(9, || {
-                        let outlook = Outlook::new(&frame, &directory);
-                        blocks.iter().for_each(|block| outlook.open(*block));
+                        let outlook = VisibleBricks::new(&frame.view, &directory);
+                        blocks.iter().for_each(|block| outlook.project_block(*block));
                     });
-                    [ns as f64 / 1e3, drawn.looked_at() as f64]
+                    [ns as f64 / 1e3, drawn.projected_bricks() as f64]
                 };
                 let [whole_us, whole] = look(&tiles);
                 let each: Vec<[f64; 2]> =
@@ -670,7 +679,7 @@ mod tests {
                 println!(
                     "{}: {}; {:.0}, {:.0}; {whole_us:.0}, {whole:.0}",
                     1 << shift,
-                    all.blocks(),
+                    all.block_count(),
                     mean(0),
                     mean(1)
                 );

@@ -18,7 +18,7 @@ use crate::kernels::toss::{self, Kept, Sieve, Sifted, Tossing, prefetch};
 use crate::kernels::{Simd, Work, whole_registers};
 use crate::part::{Io, Part, Pixels};
 use crate::primitives::footprint::Leaning;
-use crate::primitives::lattice_rows::Storeys;
+use crate::primitives::lattice_rows::LatticeRows;
 use crate::primitives::sizes::PART;
 use crate::scene::Frame;
 use crate::visibility::open_mask::{OpenMask, REACH_MOST};
@@ -54,9 +54,9 @@ struct Places {
     eye: [Each<f64>; 3],
     /// Where a section of each is along an axis.
     aside: Each<f64>,
-    /// In a level view, which storey each belongs to, the columns that hold its sections, and by slot where among
+    /// In a level view, which lattice row each belongs to, the columns that hold its sections, and by slot where among
     /// all tiers of a sheet it begins.
-    storey: Each<i32>,
+    lattice_row: Each<i32>,
     columns: Each<u64>,
     places: [Each<u32>; MOST],
 }
@@ -66,7 +66,7 @@ impl Default for Places {
         Places {
             eye: [[0.0; BATCH]; 3],
             aside: [0.0; BATCH],
-            storey: [0; BATCH],
+            lattice_row: [0; BATCH],
             columns: [0; BATCH],
             places: [[0; BATCH]; MOST],
         }
@@ -146,27 +146,27 @@ impl<S: Recorded, const N: usize> Work for RenderDeep<'_, S, N> {
     }
 }
 
-/// Renders a part of a level view, which has storeys: likewise.
+/// Renders a part of a level view, which has lattice rows: likewise.
 pub(crate) struct RenderDeepLevel<'a, S: Recorded, const N: usize> {
     pub(crate) deep: RenderDeep<'a, S, N>,
-    pub(crate) storeys: &'a Storeys,
+    pub(crate) lattice_rows: &'a LatticeRows,
 }
 
 impl<S: Tiered, const N: usize> Work for RenderDeepLevel<'_, S, N> {
     type Out = ();
     #[inline(always)]
     fn run(self, simd: Simd) {
-        let RenderDeepLevel { deep, storeys } = self;
+        let RenderDeepLevel { deep, lattice_rows } = self;
         let RenderDeep { part, deep, store, waiting, pixels, io } = deep;
         let (stage, queues) = DeepStage::new(&part, deep, simd, waiting);
         let frame = part.frame;
-        // The nearest sheet has the widest footprints, the last one most storeys.
+        // The nearest sheet has the widest footprints, the last one most lattice rows.
         let nearest = part.nearest().and_then(|nearest| frame.footprints.at(nearest));
         let widest = nearest.and_then(|footprint| footprint.phases(0));
         let len = widest.expect("a table of a sheet that is not clipped").len;
         let last = frame.footprints.at(frame.footprints.last()).expect("one behind it");
-        let shape = Shape::new::<S>(storeys.rows(PART, last.scale), len);
-        let sheets = LevelSheets::<S, N>::new(simd, store, &part, storeys, shape);
+        let shape = Shape::new::<S>(lattice_rows.rows(PART, last.scale), len);
+        let sheets = LevelSheets::<S, N>::new(simd, store, &part, lattice_rows, shape);
         walk(&part, stage, sheets, queues, pixels, io);
     }
 }
@@ -461,18 +461,18 @@ impl<S: Tiered, const N: usize> Drawing<'_, S, N> {
     ) {
         let Axes { layers, .. } = &footprints.axes;
         let frame = self.part.frame;
-        let storeys = frame.storeys.as_ref().expect("a level view");
+        let lattice_rows = frame.lattice_rows.as_ref().expect("a level view");
         let shape = sheets.tiers.shape();
         let most = frame.sections.most() as i32;
         self.place((n, k), footprints, &[0]);
         let cull = frame.scene.quality.cull;
         let hull = sheets.hull(k, most as usize, cull.then_some(open));
-        let Places { eye, storey, columns, places, .. } = &mut *self.places;
+        let Places { eye, lattice_row, columns, places, .. } = &mut *self.places;
         let Batch { apart: Apart { lo, hi, first, .. }, near, .. } = &mut *self.batch;
-        let (per, base) = storeys.by_eye();
+        let (per, base) = lattice_rows.by_eye();
         let all = whole_registers::<BATCH>(n);
         for i in 0..all {
-            storey[i] = round_i32(eye[1][i] * per + base);
+            lattice_row[i] = round_i32(eye[1][i] * per + base);
         }
         for i in 0..all {
             let [lo, hi] = [lo[0][i], hi[0][i]];
@@ -480,14 +480,14 @@ impl<S: Tiered, const N: usize> Drawing<'_, S, N> {
             let beyond = (EDGE as u32).wrapping_sub(hi.wrapping_sub(lo) as u32);
             let inside = u64::MAX.wrapping_shr(beyond).wrapping_shl(lo as u32);
             columns[i] = if lo < hi { inside } else { 0 };
-            near[i] = columns[i] & hull.open(storey[i]);
+            near[i] = columns[i] & hull.open(lattice_row[i]);
         }
         for (at, places) in places[..N].iter_mut().enumerate() {
             let sheet = layers.after(at);
             if sheet < most {
                 let base = hull.bases[sheet as usize % MOST];
                 for i in 0..all {
-                    let tier = (storey[i] - base).clamp(0, shape.rows as i32 - 1) as u32;
+                    let tier = (lattice_row[i] - base).clamp(0, shape.rows as i32 - 1) as u32;
                     places[i] = shape.place_in(tier, first[0][at][i]);
                 }
             }
@@ -498,7 +498,7 @@ impl<S: Tiered, const N: usize> Drawing<'_, S, N> {
         let apart = &self.batch.apart;
         for &i in &apart.kept[..some] {
             let i = i as usize % BATCH;
-            sheets.hull.touch(storey[i], columns[i]);
+            sheets.hull.touch(lattice_row[i], columns[i]);
         }
         sheets.touch_hull();
         let voxels = (apart, &payloads[..some]);

@@ -15,7 +15,7 @@ use crate::kernels::toss::{Packing, TIER_BITS, TierOf, Tossing};
 use crate::kernels::{Simd, Weight, Work};
 use crate::part::{Io, Part, Pixels};
 use crate::primitives::footprint::{Footprint, Phases};
-use crate::primitives::lattice_rows::Storeys;
+use crate::primitives::lattice_rows::LatticeRows;
 use crate::primitives::sizes::LATTICE_ROWS as ROWS;
 use crate::primitives::sizes::PART;
 use crate::scene::{Flat, Frame};
@@ -25,7 +25,7 @@ use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS};
 
 /// The tiers that reach each row of a part's pixels in one sheet, and what they weigh there.
 struct Down<'a, W> {
-    /// Which sheet this is, and the storey of its first tier.
+    /// Which sheet this is, and the lattice row of its first tier.
     k: i32,
     base: i32,
     weights: &'a [W],
@@ -71,24 +71,24 @@ impl<'a, W: Weight> Down<'a, W> {
         &mut self,
         k: i32,
         part: &'a Part<'_>,
-        storeys: &Storeys,
+        lattice_rows: &LatticeRows,
         (footprint, weights): (&Footprint<'a>, &'a [W]),
         tiers: usize,
     ) {
         let phases = footprint.phases(1).expect("a table");
         let (view, rect) = (&part.frame.view, &part.rect);
-        let base = storeys.base(view, rect, footprint.scale);
-        (self.k, self.base, self.weights, self.spread) = (k, base, weights, storeys.spread);
+        let base = lattice_rows.base(view, rect, footprint.scale);
+        (self.k, self.base, self.weights, self.spread) = (k, base, weights, lattice_rows.spread);
         (self.known, self.more) = (0, 0);
-        // Far away for storeys that there are none of.
+        // Far away for lattice rows that there are none of.
         for tier in 0..tiers {
-            let storey = base + tier as i32;
-            (self.first[tier], self.from[tier]) = if storey < 0 {
+            let lattice_row = base + tier as i32;
+            (self.first[tier], self.from[tier]) = if lattice_row < 0 {
                 (-FAR, 0)
-            } else if storey as usize >= storeys.len() {
+            } else if lattice_row as usize >= lattice_rows.len() {
                 (FAR, 0)
             } else {
-                let at = storeys.at(view, storey as usize, footprint);
+                let at = lattice_rows.at(view, lattice_row as usize, footprint);
                 let at = (at - (i64::from(rect.y0) << SUBPIXEL_BITS)) as i32;
                 let first = phases.first_at(at);
                 (first, phases.begin((at & (SUBPIXELS - 1)) as usize) as i32 - first)
@@ -163,7 +163,7 @@ pub(crate) struct LevelSheets<'a, S: Recorded, const N: usize> {
     /// Sums of pixels that close.
     folded: &'a mut Folded<S>,
     part: &'a Part<'a>,
-    storeys: &'a Storeys,
+    lattice_rows: &'a LatticeRows,
     /// By slot and tier: columns of the part that something was added to; and whether there are any.
     touched: [[u64; ROWS]; N],
     any: [bool; N],
@@ -178,7 +178,7 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
         simd: Simd,
         store: &'a mut Store<S>,
         part: &'a Part<'a>,
-        storeys: &'a Storeys,
+        lattice_rows: &'a LatticeRows,
         shape: Shape,
     ) -> Self {
         let Store { closes, level, .. } = store;
@@ -190,7 +190,7 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
             closes,
             folded,
             part,
-            storeys,
+            lattice_rows,
             touched: [[0; ROWS]; N],
             any: [false; N],
             downs: std::array::from_fn(|_| Down::default()),
@@ -246,19 +246,19 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
             let footprint: Footprint<'a> = footprints.at(k).expect("no sheet is clipped");
             let weights = S::across(&footprint, 1).expect("a table");
             let rows = self.tiers.shape().rows;
-            self.downs[which].fill(k, part, self.storeys, (&footprint, weights), rows);
+            self.downs[which].fill(k, part, self.lattice_rows, (&footprint, weights), rows);
         }
         which
     }
 }
 
-/// What is open where storeys reach in the sheets from one on, and where something was added to them.
+/// What is open where lattice rows reach in the sheets from one on, and where something was added to them.
 pub(crate) struct Hull {
-    /// The first of the sheets, how many there are, and the storey of each one's first tier.
+    /// The first of the sheets, how many there are, and the lattice row of each one's first tier.
     k: i32,
     sheets: usize,
     pub(crate) bases: [i32; MOST],
-    /// Of `n` storeys from `base` on: columns that are open in any row that it reaches, and columns that were added to.
+    /// Of `n` lattice rows from `base` on: columns that are open in any row that it reaches, and columns that were added to.
     base: i32,
     n: usize,
     open: [u64; 2 * ROWS],
@@ -280,22 +280,22 @@ impl Default for Hull {
 }
 
 impl Hull {
-    /// A storey's place; that of the outermost, which do not reach the part, for those beyond.
+    /// A lattice row's place; that of the outermost, which do not reach the part, for those beyond.
     #[inline(always)]
-    fn place(&self, storey: i32) -> usize {
-        (storey - self.base).clamp(0, self.n as i32 - 1) as usize % (2 * ROWS)
+    fn place(&self, lattice_row: i32) -> usize {
+        (lattice_row - self.base).clamp(0, self.n as i32 - 1) as usize % (2 * ROWS)
     }
 
-    /// Columns that are open in any row that a storey reaches.
+    /// Columns that are open in any row that a lattice row reaches.
     #[inline(always)]
-    pub(crate) fn open(&self, storey: i32) -> u64 {
-        self.open[self.place(storey)]
+    pub(crate) fn open(&self, lattice_row: i32) -> u64 {
+        self.open[self.place(lattice_row)]
     }
 
-    /// Notes that something is added to columns of a storey.
+    /// Notes that something is added to columns of a lattice row.
     #[inline(always)]
-    pub(crate) fn touch(&mut self, storey: i32, columns: u64) {
-        self.touched[self.place(storey)] |= columns;
+    pub(crate) fn touch(&mut self, lattice_row: i32, columns: u64) {
+        self.touched[self.place(lattice_row)] |= columns;
     }
 }
 
@@ -337,11 +337,11 @@ impl AnyOpen {
 }
 
 impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
-    /// What is open, or all if nothing is said of that, where storeys reach in `most` sheets from `k` on, of which there are
+    /// What is open, or all if nothing is said of that, where lattice rows reach in `most` sheets from `k` on, of which there are
     /// no more than slots.
     ///
     /// Perspective's windows are below 40 pixels, so a voxel's sections lie less than 20 aside of its centre. Thus
-    /// its sheets' first tiers lie less than 2 * 20 / [`crate::primitives::lattice_rows`]' least distance apart, 54 storeys, and a table of
+    /// its sheets' first tiers lie less than 2 * 20 / [`crate::primitives::lattice_rows`]' least distance apart, 54 lattice rows, and a table of
     /// twice the rows of a sheet holds all.
     #[inline(always)]
     pub(crate) fn hull(&mut self, k: i32, most: usize, open: Option<&OpenMask>) -> &Hull {
@@ -365,7 +365,7 @@ impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
         let [lo, hi] = &mut reach;
         for &which in &which[..hull.sheets] {
             let Down { base, first: of, len, .. } = &downs[which];
-            // A storey beyond a sheet's tiers does not reach the part in it.
+            // A lattice row beyond a sheet's tiers does not reach the part in it.
             let begin = base.abs_diff(first) as usize;
             let inside = begin..begin + rows;
             for ((lo, hi), of) in lo[inside.clone()].iter_mut().zip(&mut hi[inside]).zip(of) {
@@ -462,31 +462,38 @@ pub(crate) struct RenderLevel<'a, S: Recorded, const N: usize> {
 #[derive(Clone, Copy)]
 pub(crate) struct LevelView<'a> {
     flat: &'a Flat,
-    storeys: &'a Storeys,
+    lattice_rows: &'a LatticeRows,
 }
 
 /// Whether parts of `frame` may be rendered here.
 pub(crate) fn takes(frame: &Frame) -> Option<LevelView<'_>> {
-    Some(LevelView { flat: ortho::takes(frame)?, storeys: frame.storeys.as_ref()? })
+    Some(LevelView { flat: ortho::takes(frame)?, lattice_rows: frame.lattice_rows.as_ref()? })
 }
 
 impl<S: Tiered, const N: usize> Work for RenderLevel<'_, S, N> {
     type Out = ();
     #[inline(always)]
     fn run(self, simd: Simd) {
-        let RenderLevel { part, view: LevelView { flat, storeys }, store, waiting, pixels, io } =
-            self;
+        let RenderLevel {
+            part,
+            view: LevelView { flat, lattice_rows },
+            store,
+            waiting,
+            pixels,
+            io,
+        } = self;
         let frame = part.frame;
         let footprint = frame.footprints.at(0).expect("a flat view's sheets are all drawn");
         let phases = footprint.phases(0).expect("a flat view's footprints have tables");
         let across = S::across(&footprint, 0).expect("as phases are there");
         let across = Table { weights: across, len: phases.len };
         let deep = Table { weights: S::deep(&frame.sections), len: frame.sections.most() };
-        let shape = Shape::new::<S>(storeys.rows(PART, footprint.scale), phases.len);
-        // Where the storey of the first tier lies, or would.
-        let apart = storeys.subpixels(footprint.scale);
-        let first = storeys.base(&frame.view, &part.rect, footprint.scale);
-        let first = f64::from(first) - storeys.of_row(&frame.view, part.rect.y0, footprint.scale);
+        let shape = Shape::new::<S>(lattice_rows.rows(PART, footprint.scale), phases.len);
+        // Where the lattice row of the first tier lies, or would.
+        let apart = lattice_rows.subpixels(footprint.scale);
+        let first = lattice_rows.base(&frame.view, &part.rect, footprint.scale);
+        let first =
+            f64::from(first) - lattice_rows.of_row(&frame.view, part.rect.y0, footprint.scale);
         let tier_of = TierOf {
             base: libm::floor(first * apart + 0.5) as i32,
             per: libm::floor(f64::from(1 << TIER_BITS) / apart + 0.5) as i32,
@@ -506,7 +513,7 @@ impl<S: Tiered, const N: usize> Work for RenderLevel<'_, S, N> {
             tossing,
             batch,
         };
-        let sheets = LevelSheets::<S, N>::new(simd, store, &part, storeys, shape);
+        let sheets = LevelSheets::<S, N>::new(simd, store, &part, lattice_rows, shape);
         walk(&part, stage, sheets, queues, pixels, io);
     }
 }

@@ -68,7 +68,7 @@ pub trait Weight: Copy + Default + PartialEq + std::fmt::Debug {
         clip: (i32, i32),
         buffer: &'b mut Vec<Self>,
     ) -> (i32, &'b [Self]);
-    /// What makes sums of rows that are kept over a length of `spread`: see `storeys`.
+    /// What makes sums of rows that are kept over a length of `spread`: see `lattice_rows`.
     #[must_use]
     fn of_rows(self, spread: f32) -> Self;
 }
@@ -117,7 +117,7 @@ pub trait Accumulate: Sum {
     type Weight: Weight;
     /// One channel of a section or a row.
     type Section: Copy;
-    /// What [rows of storeys](Accumulate::down) add up to on the way; the default is nothing.
+    /// What [lattice rows](Accumulate::down) add up to on the way; the default is nothing.
     type Way: Copy + Default;
 
     /// First sheet of a voxel at depth `z` (in phases), and its section in the `i`th from there.
@@ -131,7 +131,7 @@ pub trait Accumulate: Sum {
     fn on(way: Self::Way, row: Self, wy: Self::Weight) -> Self::Way;
     /// What it is in the end.
     fn end(way: Self::Way) -> Self;
-    /// What a pixel has of rows of storeys, each times its weight [for rows](Weight::of_rows), in their order.
+    /// What a pixel has of lattice rows, each times its weight [for rows](Weight::of_rows), in their order.
     #[inline(always)]
     fn down(rows: impl Iterator<Item = (Self, Self::Weight)>) -> Self {
         Self::end(rows.fold(Self::Way::default(), |way, (row, wy)| Self::on(way, row, wy)))

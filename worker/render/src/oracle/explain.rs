@@ -18,11 +18,11 @@ use std::sync::Arc;
 
 /// A pixel explained.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Explained {
+pub struct PixelExplanation {
     /// Linear premultiplied RGBA, as rendered.
     pub pixel: [f32; 4],
     /// The sheets that hold something here and were read, front to back.
-    pub sheets: Vec<SheetHere>,
+    pub sheets: Vec<SheetAtPixel>,
     /// The sheet after which the pixel was shut.
     pub shut_in: Option<i32>,
     /// Voxels with a section in one of these sheets, and their bricks.
@@ -38,7 +38,7 @@ pub struct Explained {
 
 /// One sheet at one pixel.
 #[derive(Clone, Debug, PartialEq)]
-pub struct SheetHere {
+pub struct SheetAtPixel {
     /// Which: between the depths `k` and `k + 1` thicknesses behind the target.
     pub k: i32,
     /// Its sums as the sheet holds them: extinction and the three sigma-weighted colours.
@@ -60,12 +60,12 @@ pub struct SheetHere {
     /// Their bricks.
     pub bricks: usize,
     /// The strongest sections, strongest first.
-    pub strongest: Vec<Section>,
+    pub strongest: Vec<SectionAtPixel>,
 }
 
 /// What one voxel adds to one sheet at one pixel.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Section {
+pub struct SectionAtPixel {
     /// Index position of the voxel.
     pub voxel: [u32; 3],
     /// Its brick.
@@ -90,7 +90,7 @@ pub fn explain(
     bricks: &[Arc<Brick>],
     [x, y]: [u32; 2],
     strongest: usize,
-) -> Explained {
+) -> PixelExplanation {
     let [w, h] = frame.view.size;
     assert!(x < w && y < h, "pixel {x},{y} of a picture of {w}x{h}");
     let at = [x as i32, y as i32];
@@ -119,7 +119,7 @@ struct Part<S: Accumulate> {
     wx: S::Weight,
     wy: S::Weight,
     /// In a level view: whose row it adds to.
-    storey: Option<u32>,
+    lattice_row: Option<u32>,
 }
 
 impl<S: Accumulate> Part<S> {
@@ -156,8 +156,8 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
             for (i, &local) in brick.index.iter().enumerate() {
                 let placed = frame.place(&corner, local);
                 let (first, _) = frame.sections.of(placed.z);
-                let storey = frame.storey(&corner, local);
-                found.push((first, brick.id, i as u16, b as u32, (placed, storey)));
+                let lattice_row = frame.lattice_row(&corner, local);
+                found.push((first, brick.id, i as u16, b as u32, (placed, lattice_row)));
             }
         }
         found.sort_unstable_by_key(|&(first, id, i, ..)| (first, id, i));
@@ -165,7 +165,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
         let (mut bx, mut by) = (Vec::new(), Vec::new());
         let (mut tx, mut ty) = (Vec::new(), Vec::new());
         let (columns, rows) = ((at[0], at[0] + 1), (at[1], at[1] + 1));
-        for (first, _, i, b, (placed, storey)) in found {
+        for (first, _, i, b, (placed, lattice_row)) in found {
             let z = placed.z;
             let (_, sections) = frame.sections.of(z);
             let mut payload = None;
@@ -193,7 +193,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
                 let parts = pixel.sheets.entry(k).or_default();
                 let weights = [real_x.get(), real_y.get(), wz];
                 let section = S::section(&frame.sections, z, n, &payload);
-                parts.push(Part { voxel, weights, section, wx, wy, storey });
+                parts.push(Part { voxel, weights, section, wx, wy, lattice_row });
             }
         }
         pixel
@@ -202,7 +202,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
     /// The sums of sheet `k` of the voxels that begin at `last` or before.
     fn sums(&self, k: i32, last: i32) -> [S; 4] {
         let mut sums = [S::default(); 4];
-        // Rows of storeys at the pixel's column, ascending, and what they weigh there.
+        // Rows of lattice rows at the pixel's column, ascending, and what they weigh there.
         let mut rows: BTreeMap<u32, ([S; 4], S::Weight)> = BTreeMap::new();
         for part in self.sheets.get(&k).into_iter().flatten() {
             let v = &self.voxels[part.voxel as usize];
@@ -210,25 +210,25 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
                 // They ascend.
                 break;
             }
-            match part.storey {
+            match part.lattice_row {
                 None => part.add_to(&mut sums),
-                Some(storey) => {
-                    let (row, _) = rows.entry(storey).or_insert(([S::default(); 4], part.wy));
+                Some(lattice_row) => {
+                    let (row, _) = rows.entry(lattice_row).or_insert(([S::default(); 4], part.wy));
                     for c in 0..4 {
                         row[c] = row[c].plus(part.section[c], part.wx);
                     }
                 }
             }
         }
-        if let Some(storeys) = &self.frame.storeys {
-            let weight = |wy: &S::Weight| wy.of_rows(storeys.spread);
+        if let Some(lattice_rows) = &self.frame.lattice_rows {
+            let weight = |wy: &S::Weight| wy.of_rows(lattice_rows.spread);
             let row = |c: usize| rows.values().map(move |(row, wy)| (row[c], weight(wy)));
             sums = std::array::from_fn(|c| S::down(row(c)));
         }
         sums
     }
 
-    fn explain(&self, strongest: usize) -> Explained {
+    fn explain(&self, strongest: usize) -> PixelExplanation {
         let frame = self.frame;
         let secant = frame.view.secant(self.at[0], self.at[1]);
         let (mut a, mut colour) = (0.0f32, [0u32; 3]);
@@ -251,7 +251,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
             let mean = |c: usize| if raw[0] > 0.0 { raw[c] / raw[0] } else { 0.0 };
             let (sections, bricks, strongest) = self.sections(k, secant, strongest);
             if sections > 0 {
-                sheets.push(SheetHere {
+                sheets.push(SheetAtPixel {
                     k,
                     raw,
                     peek: behind.map(S::value),
@@ -274,7 +274,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
             self.voxels.iter().partition(|v| v.first <= last);
         let bricks = |of: &[&Voxel]| -> BTreeSet<u32> { of.iter().map(|v| v.brick).collect() };
         let read_bricks = bricks(&read);
-        Explained {
+        PixelExplanation {
             pixel: finish(a, colour),
             sheets,
             shut_in,
@@ -286,19 +286,19 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
     }
 
     /// How many sections of sheet `k` are not zero, of how many bricks, and the strongest.
-    fn sections(&self, k: i32, secant: f32, n: usize) -> (usize, usize, Vec<Section>) {
+    fn sections(&self, k: i32, secant: f32, n: usize) -> (usize, usize, Vec<SectionAtPixel>) {
         let mut all = Vec::new();
         for part in self.sheets.get(&k).into_iter().flatten() {
-            let raw = match &self.frame.storeys {
+            let raw = match &self.frame.lattice_rows {
                 None => {
                     let mut sums = [S::default(); 4];
                     part.add_to(&mut sums);
                     sums[0].value()
                 }
                 // Its share of a sum that is rounded with others.
-                Some(storeys) => {
+                Some(lattice_rows) => {
                     let row = S::default().plus(part.section[0], part.wx).value();
-                    row * (part.weights[1] * storeys.spread)
+                    row * (part.weights[1] * lattice_rows.spread)
                 }
             };
             if raw > 0.0 {
@@ -315,7 +315,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
             let local = slabcast_common::brick::local(brick.index[v.i as usize]);
             let corner = self.frame.scene.grid.corner(brick.id);
             let [sigma, r, g, b] = v.payload;
-            Section {
+            SectionAtPixel {
                 voxel: std::array::from_fn(|a| corner[a] + local[a]),
                 brick: brick.id,
                 code: brick.values.code(v.i.into()),

@@ -7,9 +7,9 @@
 //! of how it gets there, and stands as the oracle for its bytes.
 
 use crate::kernels::composite::Sum;
-use crate::oracle::work_counters::Survey;
+use crate::oracle::work_counters::WorkCounters;
 use crate::primitives::footprint::Footprint;
-use crate::primitives::lattice_rows::Storeys;
+use crate::primitives::lattice_rows::LatticeRows;
 use crate::scene::Frame;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{FrameState, Picture, TilePixels};
@@ -24,7 +24,11 @@ pub fn render(frame: &Frame, bricks: &[Arc<Brick>]) -> Picture {
 }
 
 /// The same; `notes` are taken on the way.
-pub(crate) fn watched(frame: &Frame, bricks: &[Arc<Brick>], notes: Option<&mut Survey>) -> Picture {
+pub(crate) fn watched(
+    frame: &Frame,
+    bricks: &[Arc<Brick>],
+    notes: Option<&mut WorkCounters>,
+) -> Picture {
     match frame.scene.quality.sums {
         Sums::F32 => {
             let add = |to: &mut [[f32; 4]], p: &Part<'_>| {
@@ -54,8 +58,8 @@ struct Part<'a> {
     payload: [f32; 4],
     footprint: Footprint<'a>,
     at: [i64; 2],
-    /// In a level view: which storey's row it adds to, instead of rows of pixels.
-    storey: Option<u32>,
+    /// In a level view: which lattice row's row it adds to, instead of rows of pixels.
+    lattice_row: Option<u32>,
 }
 
 impl Part<'_> {
@@ -79,11 +83,11 @@ fn floats(p: &Part<'_>, mut add: impl FnMut(usize, usize, f32)) {
     let (mut bx, mut by) = (Vec::new(), Vec::new());
     let wz = p.frame.sections.of(p.z).1[p.section];
     let section = p.payload.map(|c| c * wz);
-    if let Some(storey) = p.storey {
+    if let Some(lattice_row) = p.lattice_row {
         let (x0, wx) = p.footprint.weights(0, p.at[0], (0, w), &mut bx);
         for (i, wx) in wx.iter().enumerate() {
             for c in 0..4 {
-                add(storey as usize * w as usize + x0 as usize + i, c, section[c] * wx.get());
+                add(lattice_row as usize * w as usize + x0 as usize + i, c, section[c] * wx.get());
             }
         }
         return;
@@ -107,10 +111,10 @@ fn fixed(to: &mut [[i16; 4]], p: &Part<'_>) {
     let (mut bx, mut by) = (Vec::new(), Vec::new());
     let wz = p.frame.sections.of_fixed(p.z).1[p.section];
     let section = p.payload.map(|c| times((c + 0.5) as i32, wz));
-    if let Some(storey) = p.storey {
+    if let Some(lattice_row) = p.lattice_row {
         let (x0, wx) = p.footprint.weights_fixed(0, p.at[0], (0, w), &mut bx);
         for (i, &wx) in wx.iter().enumerate() {
-            let pixel = &mut to[storey as usize * w as usize + x0 as usize + i];
+            let pixel = &mut to[lattice_row as usize * w as usize + x0 as usize + i];
             for c in 0..4 {
                 pixel[c] = (i32::from(pixel[c]) + times(section[c], wx)).min(32767) as i16;
             }
@@ -130,10 +134,10 @@ fn fixed(to: &mut [[i16; 4]], p: &Part<'_>) {
     }
 }
 
-/// Where a storey lies in subpixels, and the sums of its row at some column.
+/// Where a lattice row lies in subpixels, and the sums of its row at some column.
 type Above<'a, S> = (i64, &'a [S; 4]);
 
-/// What storeys add up to in row `y` of pixels: each row times its weight, rounded to nearest.
+/// What lattice rows add up to in row `y` of pixels: each row times its weight, rounded to nearest.
 fn down_fixed(footprint: &Footprint<'_>, rows: &[Above<'_, i16>], y: i32) -> [i16; 4] {
     let (mut sums, mut buffer) = ([0i32; 4], Vec::new());
     for (at, row) in rows {
@@ -160,7 +164,7 @@ fn down_floats(footprint: &Footprint<'_>, rows: &[Above<'_, i32>], y: i32) -> [i
 fn render_sums<S: Sum>(
     frame: &Frame,
     bricks: &[Arc<Brick>],
-    mut notes: Option<&mut Survey>,
+    mut notes: Option<&mut WorkCounters>,
     add: impl Fn(&mut [[S; 4]], &Part<'_>),
     down: impl Fn(&Footprint<'_>, &[Above<'_, S>], i32) -> [S; 4],
 ) -> Picture {
@@ -193,9 +197,9 @@ fn render_sums<S: Sum>(
     let mut before = vec![[S::default(); 4]; whole.area()];
     let mut here = before.clone();
     let mut peek = before.clone();
-    // In a level view, a row of sums for each storey.
-    let storeys = frame.storeys.as_ref();
-    let high = storeys.map_or(0, Storeys::len);
+    // In a level view, a row of sums for each lattice row.
+    let lattice_rows = frame.lattice_rows.as_ref();
+    let high = lattice_rows.map_or(0, LatticeRows::len);
     let mut rows = [vec![[S::default(); 4]; w * high], vec![[S::default(); 4]; w * high]];
     for k in range.first..range.end {
         here.fill([S::default(); 4]);
@@ -214,8 +218,8 @@ fn render_sums<S: Sum>(
             let count = frame.sections.of(z).1.len() as i32;
             // Its section here, and the one behind: a voxel in this bucket begins no later than
             // this sheet, so what it puts into the next one is what the rule may peek at.
-            let storey = frame.storey(&frame.corner(brick.id), brick.index[i as usize]);
-            let to = match storey {
+            let lattice_row = frame.lattice_row(&frame.corner(brick.id), brick.index[i as usize]);
+            let to = match lattice_row {
                 Some(_) => [(k, &mut *here_rows), (k + 1, &mut *peek_rows)],
                 None => [(k, &mut here), (k + 1, &mut peek)],
             };
@@ -226,7 +230,7 @@ fn render_sums<S: Sum>(
                 let Some(footprint) = frame.footprints.at(sheet) else { continue };
                 let at = frame.screen(&placed, sheet, &footprint);
                 let section = (sheet - first) as usize;
-                let part = Part { frame, z, section, payload, footprint, at, storey };
+                let part = Part { frame, z, section, payload, footprint, at, lattice_row };
                 add(to, &part);
                 if let Some(notes) = notes.as_mut().filter(|_| sheet == k) {
                     for ([x, y], n) in part.rows() {
@@ -236,15 +240,17 @@ fn render_sums<S: Sum>(
             }
         }
         for (sheet, rows, to) in [(k, here_rows, &mut here), (k + 1, peek_rows, &mut peek)] {
-            let Some((storeys, f)) = storeys.zip(frame.footprints.at(sheet)) else { continue };
+            let Some((lattice_rows, f)) = lattice_rows.zip(frame.footprints.at(sheet)) else {
+                continue;
+            };
             for y in 0..h {
                 let covers = |s: &usize| {
-                    let (first, end) = f.extent(1, storeys.at(&frame.view, *s, &f));
+                    let (first, end) = f.extent(1, lattice_rows.at(&frame.view, *s, &f));
                     first <= y as i32 && (y as i32) < end
                 };
                 let above: Vec<usize> = (0..high).filter(covers).collect();
                 for x in 0..w {
-                    let at = |&s: &usize| (storeys.at(&frame.view, s, &f), &rows[s * w + x]);
+                    let at = |&s: &usize| (lattice_rows.at(&frame.view, s, &f), &rows[s * w + x]);
                     let above: Vec<Above<'_, S>> = above.iter().map(at).collect();
                     to[y * w + x] = down(&f, &above, y as i32);
                 }

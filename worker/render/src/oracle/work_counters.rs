@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 /// Notes about every pixel, row-major.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Survey {
+pub struct WorkCounters {
     width: usize,
     /// The sheet after which the pixel was shut; `None` where it stayed open.
     pub shut_in: Vec<Option<i32>>,
@@ -26,9 +26,9 @@ pub struct Survey {
 }
 
 /// Draws a frame from all bricks of its scene, plainly, and takes notes.
-pub fn survey(frame: &Frame, bricks: &[Arc<Brick>]) -> (Picture, Survey) {
+pub fn count_work(frame: &Frame, bricks: &[Arc<Brick>]) -> (Picture, WorkCounters) {
     let [w, h] = frame.view.size.map(|n| n as usize);
-    let mut notes = Survey {
+    let mut notes = WorkCounters {
         width: w,
         shut_in: vec![None; w * h],
         sheets: vec![0; w * h],
@@ -39,7 +39,7 @@ pub fn survey(frame: &Frame, bricks: &[Arc<Brick>]) -> (Picture, Survey) {
     (picture, notes)
 }
 
-impl Survey {
+impl WorkCounters {
     /// A section was added to the pixels of `rect`.
     pub(crate) fn section(&mut self, rect: Rect) {
         for y in rect.y0 as usize..rect.y1 as usize {

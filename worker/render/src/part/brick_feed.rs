@@ -3,7 +3,7 @@
 use crate::scene::{Corner, Frame};
 use crate::visibility::closing_depth::{Cells, LOOKS};
 use crate::visibility::open_mask::OpenMask;
-use crate::visibility::visible_bricks::{Outlook, Sight};
+use crate::visibility::visible_bricks::{VisibleBrick, VisibleBricks};
 use slabcast_common::brick::Brick;
 use slabcast_common::message::Counters;
 use slabcast_common::occlusion::Rect;
@@ -13,7 +13,7 @@ use std::cell::{Cell, OnceCell, RefCell};
 use std::sync::Arc;
 
 /// Where bricks are had from, by their place in the directory.
-pub trait Supply {
+pub trait BrickSupply {
     /// A brick, if it is here.
     fn get(&self, place: u32) -> Option<Arc<Brick>>;
 
@@ -122,8 +122,8 @@ pub(crate) struct Memory {
 /// Bricks of a part that come when they are needed.
 pub(crate) struct Coming<'a> {
     frame: &'a Frame,
-    outlook: &'a Outlook,
-    supply: &'a dyn Supply,
+    outlook: &'a VisibleBricks,
+    supply: &'a dyn BrickSupply,
     rect: Rect,
     /// Sheets that are left.
     pub(crate) slab: SheetRange,
@@ -147,7 +147,7 @@ pub(crate) struct Coming<'a> {
 impl<'a> Coming<'a> {
     /// What lies over a part's sheets from `at` on.
     pub(crate) fn new(
-        (frame, outlook, supply): (&'a Frame, &'a Outlook, &'a dyn Supply),
+        (frame, outlook, supply): (&'a Frame, &'a VisibleBricks, &'a dyn BrickSupply),
         (rect, at, ahead): (Rect, i32, u32),
         mut waiting: Waiting,
         taken: &'a Growing<Taken>,
@@ -207,23 +207,23 @@ impl<'a> Coming<'a> {
         !self.frame.scene.quality.cull || open.any(rect)
     }
 
-    fn sight(&self, waits: &Waits) -> &'a Sight {
+    fn visible(&self, waits: &Waits) -> &'a VisibleBrick {
         &self.outlook.bricks(waits.block)[waits.brick as usize]
     }
 
     /// Has a block's bricks wait for their first sheets, at `k` soonest; the first of these.
     fn open(&self, block: u32, k: i32, waiting: &mut Waiting) -> i32 {
         let mut nearest = i32::MAX;
-        for (sight, brick) in self.outlook.bricks(block).iter().zip(0..) {
-            if !self.is_over(&sight.projected) {
+        for (visible, brick) in self.outlook.bricks(block).iter().zip(0..) {
+            if !self.is_over(&visible.projected) {
                 continue;
             }
-            let first = sight.projected.sheets.first;
+            let first = visible.projected.sheets.first;
             nearest = nearest.min(first);
             let head = &mut waiting.heads[first.max(k).abs_diff(self.slab.first) as usize];
             waiting.bricks.push(Waits { block, brick, next: *head });
             *head = waiting.bricks.len() as u32 - 1;
-            waiting.voxels += u64::from(sight.voxels);
+            waiting.voxels += u64::from(visible.voxels);
         }
         nearest
     }
@@ -273,13 +273,13 @@ impl<'a> Coming<'a> {
         let head = k.abs_diff(self.slab.first) as usize;
         let mut next = waiting.heads[head];
         while let Some(waits) = waiting.bricks.get(next as usize) {
-            let sight = self.sight(waits);
-            let voxels = u64::from(sight.voxels);
-            if !self.passes(&sight.projected.rect, open) {
+            let visible = self.visible(waits);
+            let voxels = u64::from(visible.voxels);
+            if !self.passes(&visible.projected.rect, open) {
                 culled += voxels;
-            } else if let Some(brick) = self.supply.get(sight.place) {
+            } else if let Some(brick) = self.supply.get(visible.place) {
                 let corner = self.frame.corner(brick.id);
-                let (place, first) = (sight.place, sight.projected.sheets.first);
+                let (place, first) = (visible.place, visible.projected.sheets.first);
                 self.taken.push(Taken { brick, corner, place, first });
             } else {
                 self.note(k, open, waiting);
@@ -302,7 +302,7 @@ impl<'a> Coming<'a> {
         for k in k..=until {
             let mut next = waiting.heads[k.abs_diff(self.slab.first) as usize];
             while let Some(waits) = waiting.bricks.get(next as usize) {
-                let &Sight { projected, place, .. } = self.sight(waits);
+                let &VisibleBrick { projected, place, .. } = self.visible(waits);
                 if self.passes(&projected.rect, open) && !self.supply.has(place) {
                     lacked.push((projected.sheets.first, place));
                 }

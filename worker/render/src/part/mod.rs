@@ -18,7 +18,7 @@ use std::sync::Arc;
 
 /// A brick as a frame sees it: what all tiles ask of it, worked out once.
 #[derive(Clone, Debug)]
-pub struct Seen {
+pub struct ProjectedBrick {
     /// The brick.
     pub brick: Arc<Brick>,
     /// Where its voxels may land.
@@ -26,17 +26,17 @@ pub struct Seen {
     pub(crate) corner: Corner,
 }
 
-impl Seen {
+impl ProjectedBrick {
     /// `brick` in `frame`; `None` if it is off the picture or behind the near plane.
-    pub fn new(frame: &Frame, brick: &Arc<Brick>) -> Option<Seen> {
+    pub fn new(frame: &Frame, brick: &Arc<Brick>) -> Option<ProjectedBrick> {
         let projected = frame.view.project(&brick.tight(&frame.scene.grid))?;
-        Some(Seen { brick: brick.clone(), projected, corner: frame.corner(brick.id) })
+        Some(ProjectedBrick { brick: brick.clone(), projected, corner: frame.corner(brick.id) })
     }
 
     /// `seen` front to back; those that begin together in ascending id.
-    pub fn front_to_back(seen: &[Seen]) -> Vec<&Seen> {
+    pub fn front_to_back(seen: &[ProjectedBrick]) -> Vec<&ProjectedBrick> {
         // Numbers and places are sorted, not bricks: a third of the time.
-        let key = |s: &Seen| (s.projected.sheets.first, s.brick.id);
+        let key = |s: &ProjectedBrick| (s.projected.sheets.first, s.brick.id);
         let mut order: Vec<_> = seen.iter().enumerate().map(|(i, s)| (key(s), i as u32)).collect();
         order.sort_unstable();
         order.into_iter().map(|(_, i)| &seen[i as usize]).collect()
@@ -50,7 +50,7 @@ pub(crate) type Io<'a> = (&'a mut TilePixels, &'a mut Counters);
 #[derive(Clone, Copy)]
 pub(crate) enum Among<'a> {
     /// All of the tile's are here.
-    Here(&'a [&'a Seen]),
+    Here(&'a [&'a ProjectedBrick]),
     /// They come when they are looked at, if they can be had.
     Coming(&'a Coming<'a>),
 }
@@ -114,7 +114,7 @@ impl Part<'_> {
     pub(crate) fn brick(&self, i: usize) -> (&Brick, &Corner) {
         match self.among {
             Among::Here(bricks) => {
-                let Seen { brick, corner, .. } = bricks[self.inside[i] as usize];
+                let ProjectedBrick { brick, corner, .. } = bricks[self.inside[i] as usize];
                 (brick, corner)
             }
             Among::Coming(coming) => coming.brick(i),

@@ -1,24 +1,24 @@
 //! Level views: those in which layers of the lattice lie level.
 //!
-//! A *storey* is all voxels of one index along the lattice's upright axis. Where the camera is level and that
-//! axis points up in the picture, as on a turntable, all voxels of a storey lie in one row of it, wherever they
+//! A *lattice row* is all voxels of one index along the lattice's upright axis. Where the camera is level and that
+//! axis points up in the picture, as on a turntable, all voxels of a lattice row lie in one row of it, wherever they
 //! are in depth, in parallel views; in perspective they do in each sheet. A footprint is a product, so what is
-//! the same for a whole storey need not be done for each voxel: a voxel is added along x alone, to its storey's
-//! row of sums, and when a sheet closes a pixel's sum is that of the few storeys that reach it, each times its
+//! the same for a whole lattice row need not be done for each voxel: a voxel is added along x alone, to its lattice row's
+//! row of sums, and when a sheet closes a pixel's sum is that of the few lattice rows that reach it, each times its
 //! weight down the picture. Of seven rows of pixels that a voxel was added to there is one left (the separable
 //! footprint of the paper's section 3, with its second half done once for all voxels that share it).
 //!
 //! ```text
-//! row(k, s, x) = sum over voxels of storey s of  (payload * wz) * wx       each rounded to whole units
-//! sum(k, x, y) = sum over storeys, top down, of  row(k, s, x) * wy         rounded as the kind of sums says
+//! row(k, s, x) = sum over voxels of lattice row s of  (payload * wz) * wx       each rounded to whole units
+//! sum(k, x, y) = sum over lattice rows, top down, of  row(k, s, x) * wy         rounded as the kind of sums says
 //! ```
 //!
 //! **Why pixels stay exact.** A row is a sum of integers, which has no order. A voxel that is culled reaches
-//! shut pixels alone, with all of its columns in all of its storey's rows. And the storeys of a pixel are added
+//! shut pixels alone, with all of its columns in all of its lattice row's rows. And the lattice rows of a pixel are added
 //! in one order, from the top of the picture down, which does not hang on how the volume is stored.
 //!
 //! Floats are not added so, since their sums have an order of their own, and neither are views in which
-//! storeys lie closer than [`CLOSEST`]: there a voxel has no more rows of pixels than a pixel has storeys.
+//! lattice rows lie closer than [`CLOSEST`]: there a voxel has no more rows of pixels than a pixel has lattice rows.
 
 use crate::primitives::footprint::Footprint;
 #[cfg(test)]
@@ -29,17 +29,17 @@ use crate::scene::Frame;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::view::{SUBPIXELS, View};
 
-/// Pixels from a storey to the next, at least. At one a voxel has four or five rows of pixels, as a pixel has
-/// storeys; below, rows of storeys outgrow the cache that those of pixels fit.
+/// Pixels from a lattice row to the next, at least. At one a voxel has four or five rows of pixels, as a pixel has
+/// lattice rows; below, lattice rows outgrow the cache that those of pixels fit.
 const CLOSEST: f64 = 0.75;
 
-/// The storeys of a level view, from the top of the picture down.
+/// The lattice rows of a level view, from the top of the picture down.
 #[derive(Clone, Debug)]
-pub(crate) struct Storeys {
+pub(crate) struct LatticeRows {
     /// The lattice's upright axis, and whether higher indices lie higher in the picture.
     axis: usize,
     upwards: bool,
-    /// Down the picture, in vox, of each storey.
+    /// Down the picture, in vox, of each lattice row.
     eye: Vec<f64>,
     /// From one to the next, more than zero.
     step: f64,
@@ -52,9 +52,9 @@ pub(crate) struct Storeys {
     pub(crate) spread: f32,
 }
 
-impl Storeys {
-    /// The storeys of `view`, if it is level and they are far enough apart in sheets up to `last`.
-    pub(crate) fn new(view: &View, dims: [u32; 3], spread: f64, last: i32) -> Option<Storeys> {
+impl LatticeRows {
+    /// The lattice rows of `view`, if it is level and they are far enough apart in sheets up to `last`.
+    pub(crate) fn new(view: &View, dims: [u32; 3], spread: f64, last: i32) -> Option<LatticeRows> {
         let m = &view.eye_from_index;
         let down = [m.x_axis.y, m.y_axis.y, m.z_axis.y];
         let axis = (0..3).find(|&a| down[a] != 0.0)?;
@@ -68,14 +68,14 @@ impl Storeys {
             return None;
         }
         let eye = vec![0.0; dims[axis] as usize];
-        let mut storeys =
-            Storeys { axis, upwards, eye, step, flat: None, reach, spread: spread as f32 };
+        let mut lattice_rows =
+            LatticeRows { axis, upwards, eye, step, flat: None, reach, spread: spread as f32 };
         // As a brick's corner and an offset in it, since positions are made so.
-        storeys.eye = storeys.all(|at| {
+        lattice_rows.eye = lattice_rows.all(|at| {
             let [corner, offset] = [at.map(|n| n & !7), at.map(|n| n & 7)];
             view.corner_in_eye(corner).y + view.offset_in_eye(offset).y
         });
-        Some(storeys)
+        Some(lattice_rows)
     }
 
     /// What there is of each, by the index of a voxel in it.
@@ -102,7 +102,7 @@ impl Storeys {
         self.eye.len()
     }
 
-    /// Where storey `s` lies down the picture in a sheet with this footprint, in subpixels.
+    /// Where lattice row `s` lies down the picture in a sheet with this footprint, in subpixels.
     #[inline(always)]
     pub(crate) fn at(&self, view: &View, s: usize, footprint: &Footprint<'_>) -> i64 {
         match &self.flat {
@@ -111,13 +111,13 @@ impl Storeys {
         }
     }
 
-    /// Which storey, counted from the top, lies at `y` vox down the eye's axis: a fraction.
+    /// Which lattice row, counted from the top, lies at `y` vox down the eye's axis: a fraction.
     #[inline(always)]
     fn of_eye(&self, y: f64) -> f64 {
         (y - self.eye[0]) / self.step
     }
 
-    /// Factor and summand that make of eye coordinates which storey it is.
+    /// Factor and summand that make of eye coordinates which lattice row it is.
     pub(crate) fn by_eye(&self) -> (f64, f64) {
         (1.0 / self.step, -self.eye[0] / self.step)
     }
@@ -127,13 +127,13 @@ impl Storeys {
         self.step * scale * f64::from(SUBPIXELS)
     }
 
-    /// The storey that lies at position 0 of row `y` of pixels at `scale`, as a fraction; it need not be there.
+    /// The lattice row that lies at position 0 of row `y` of pixels at `scale`, as a fraction; it need not be there.
     pub(crate) fn of_row(&self, view: &View, y: i32, scale: f64) -> f64 {
         self.of_eye((f64::from(y) - f64::from(view.size[1]) * 0.5) / scale)
     }
 
-    /// The first storey that row 0 of a part stands for, in a sheet of this scale: it does not reach the part,
-    /// nor does the one of row [`Storeys::rows`] less one.
+    /// The first lattice row that row 0 of a part stands for, in a sheet of this scale: it does not reach the part,
+    /// nor does the one of row [`LatticeRows::rows`] less one.
     #[inline(always)]
     pub(crate) fn base(&self, view: &View, part: &Rect, scale: f64) -> i32 {
         // A footprint reaches half a pixel less than its radius, and is placed to a subpixel.
@@ -142,15 +142,15 @@ impl Storeys {
         first.clamp(-1e9, 1e9) as i32
     }
 
-    /// Rows of storeys that a part of `high` pixels has at a scale, which are at most [`ROWS`].
+    /// Rows of lattice rows that a part of `high` pixels has at a scale, which are at most [`ROWS`].
     pub(crate) fn rows(&self, high: i32, scale: f64) -> usize {
         let across = f64::from(high) / (self.step * scale);
         libm::ceil(across + 2.0 * self.reach) as usize + 4
     }
 }
 
-impl Storeys {
-    /// The storeys that reach row `y` of pixels in a sheet with this footprint, top down, and each one's weight there by
+impl LatticeRows {
+    /// The lattice rows that reach row `y` of pixels in a sheet with this footprint, top down, and each one's weight there by
     /// `weight`; plainly, one by one.
     pub(crate) fn reaching<W: Copy + Default>(
         &self,
@@ -177,7 +177,7 @@ impl Storeys {
     }
 }
 
-/// The storeys that reach a row of pixels in one sheet.
+/// The lattice rows that reach a row of pixels in one sheet.
 #[derive(Clone, Copy, Default)]
 pub(crate) struct Reaching<W> {
     /// Which, and each one's weight.
@@ -214,26 +214,26 @@ mod tests {
     fn views_are_level_where_layers_are_and_lie_far_enough_apart() {
         let flat = |height| CameraProjection::Ortho { height };
         let (aside, z) = (DVec3::new(1.0, 2.0, 0.0), DVec3::Z);
-        let storeys = |to_eye, up, height, sums, spacing| {
-            frame(to_eye, up, flat(height), sums, spacing).storeys.map(|s| (s.axis, s.upwards))
+        let lattice_rows = |to_eye, up, height, sums, spacing| {
+            frame(to_eye, up, flat(height), sums, spacing).lattice_rows.map(|s| (s.axis, s.upwards))
         };
-        assert_eq!(storeys(aside, z, 40.0, Sums::I16, 1.0), Some((2, true)));
-        assert_eq!(storeys(aside, -z, 40.0, Sums::I32, 2.5), Some((2, false)));
+        assert_eq!(lattice_rows(aside, z, 40.0, Sums::I16, 1.0), Some((2, true)));
+        assert_eq!(lattice_rows(aside, -z, 40.0, Sums::I32, 2.5), Some((2, false)));
         let forward = DVec3::new(0.0, 0.3, 1.0);
-        assert_eq!(storeys(forward, DVec3::X, 40.0, Sums::I32, 1.0), Some((0, true)));
-        // From above; floats; a pixel for several storeys; and a kernel that leans.
-        assert_eq!(storeys(aside + z, z, 40.0, Sums::I16, 1.0), None);
-        assert_eq!(storeys(aside, z, 40.0, Sums::F32, 1.0), None);
-        assert_eq!(storeys(aside, z, 91.0 / CLOSEST, Sums::I16, 1.0), None);
-        assert_eq!(storeys(forward, DVec3::X, 40.0, Sums::I32, 2.5), None);
+        assert_eq!(lattice_rows(forward, DVec3::X, 40.0, Sums::I32, 1.0), Some((0, true)));
+        // From above; floats; a pixel for several lattice rows; and a kernel that leans.
+        assert_eq!(lattice_rows(aside + z, z, 40.0, Sums::I16, 1.0), None);
+        assert_eq!(lattice_rows(aside, z, 40.0, Sums::F32, 1.0), None);
+        assert_eq!(lattice_rows(aside, z, 91.0 / CLOSEST, Sums::I16, 1.0), None);
+        assert_eq!(lattice_rows(forward, DVec3::X, 40.0, Sums::I32, 2.5), None);
         // In perspective the farthest sheet has them closest.
         let deep = |distance| CameraProjection::Persp { fov: 40.0, distance };
-        let of = |distance| frame(aside, z, deep(distance), Sums::I16, 1.0).storeys.is_some();
+        let of = |distance| frame(aside, z, deep(distance), Sums::I16, 1.0).lattice_rows.is_some();
         assert_eq!([60.0, 140.0, 180.0].map(of), [true, true, false]);
     }
 
     proptest! {
-        /// What a voxel's place down the picture says of its storey is what its index does, and all that reach a
+        /// What a voxel's place down the picture says of its lattice row is what its index does, and all that reach a
         /// part have a tier there.
         #[test]
         fn a_storey_is_known_by_its_place(
@@ -247,23 +247,23 @@ mod tests {
             };
             let to_eye = DVec3::new(azimuth.sin(), azimuth.cos(), 0.0);
             let frame = frame(to_eye, up, projection, Sums::I32, 1.0);
-            let Some(storeys) = &frame.storeys else { return Ok(()) };
+            let Some(lattice_rows) = &frame.lattice_rows else { return Ok(()) };
             let part = Rect::new(0, y0, 64, 90);
             let corner = frame.corner(BrickId(which));
-            let (per, first) = storeys.by_eye();
+            let (per, first) = lattice_rows.by_eye();
             for l in (0..512).filter(|&l| (0..3).all(|a| corner.index[a] + local(l)[a] < [20, 16, 24][a])) {
-                let storey = frame.storey(&corner, l).expect("a level view");
+                let lattice_row = frame.lattice_row(&corner, l).expect("a level view");
                 let placed = frame.place(&corner, l);
-                prop_assert_eq!(libm::floor(placed.eye.y * per + first + 0.5) as u32, storey);
+                prop_assert_eq!(libm::floor(placed.eye.y * per + first + 0.5) as u32, lattice_row);
                 let (k, count) = frame.sections.span(placed.z);
                 for k in k..k + count as i32 {
                     let f = frame.footprints.at(k).expect("no sheet is clipped");
                     let at = frame.screen(&placed, k, &f)[1];
-                    prop_assert_eq!(at, storeys.at(&frame.view, storey as usize, &f));
+                    prop_assert_eq!(at, lattice_rows.at(&frame.view, lattice_row as usize, &f));
                     let (from, to) = f.extent(1, at);
-                    let base = storeys.base(&frame.view, &part, f.scale);
-                    let rows = storeys.rows(part.height() as i32, f.scale) as i32;
-                    let tier = storey as i32 - base;
+                    let base = lattice_rows.base(&frame.view, &part, f.scale);
+                    let rows = lattice_rows.rows(part.height() as i32, f.scale) as i32;
+                    let tier = lattice_row as i32 - base;
                     prop_assert!(from >= part.y1 || to <= part.y0 || (1..rows - 1).contains(&tier));
                     prop_assert!(rows as usize <= ROWS);
                 }

@@ -78,19 +78,19 @@ impl Cells {
 
 /// A picture's cells. Threads write and read them at once: each is by itself, and none needs to be right.
 #[derive(Debug)]
-pub struct Depths {
+pub struct ClosingDepths {
     columns: usize,
     rows: usize,
     /// `i32::MIN`: never drawn.
     cells: Vec<AtomicI32>,
 }
 
-impl Depths {
+impl ClosingDepths {
     /// Of a picture of this size, of which nothing is known.
-    pub fn new(size: [u32; 2]) -> Depths {
+    pub fn new(size: [u32; 2]) -> ClosingDepths {
         let [columns, rows] = size.map(|n| n.div_ceil(CELL as u32) as usize);
         let cells = (0..columns * rows).map(|_| AtomicI32::new(i32::MIN)).collect();
-        Depths { columns, rows, cells }
+        ClosingDepths { columns, rows, cells }
     }
 
     /// Those of cells that a rectangle touches.
@@ -143,7 +143,7 @@ mod tests {
         cells.look(16, &open);
         cells.look(24, &open);
         assert_eq!(cells.0[..3], [16, 8, i32::MAX]);
-        let depths = Depths::new([130, 190]);
+        let depths = ClosingDepths::new([130, 190]);
         depths.note(&part, &cells);
         let deepest = |x, y, w| depths.deepest(&Rect::new(x, y, x + w, y + 1));
         assert_eq!((deepest(64, 128, 8), deepest(72, 130, 8), deepest(71, 130, 2)), (16, 8, 16));

@@ -4,5 +4,5 @@ pub(crate) mod closing_depth;
 pub(crate) mod open_mask;
 pub(crate) mod visible_bricks;
 
-pub use closing_depth::Depths;
-pub use visible_bricks::{Directory, Outlook};
+pub use closing_depth::ClosingDepths;
+pub use visible_bricks::{Directory, VisibleBricks};

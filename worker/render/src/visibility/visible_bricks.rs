@@ -8,9 +8,9 @@
 //! and nobody looks at what lies inside a solid head.
 //!
 //! ```text
-//! Directory::new    when the directory comes, or bricks change
-//! Outlook::new      once a frame: blocks front to back, and which of them lie over each part
-//! Outlook::open     when a part needs a block
+//! Directory::new                 when the directory arrives, or bricks change
+//! VisibleBricks::new             once a frame: blocks front to back, and those over each part
+//! VisibleBricks::project_block   when a part needs a block
 //! ```
 //!
 //! What hides a block hides its bricks, since the projection of a box holds those of the boxes in it; a
@@ -18,7 +18,6 @@
 //! is and is opened when that is come to.
 
 use crate::primitives::sizes::PART;
-use crate::scene::Frame;
 use slabcast_common::blocks::Blocks;
 use slabcast_common::brick::BrickInfo;
 use slabcast_common::occlusion::Rect;
@@ -45,17 +44,17 @@ pub struct Directory {
     /// Bricks of the fullest block.
     fullest: usize,
     /// Memory of blocks that frames before had open: no more than frames at hand had at a time.
-    spare: Mutex<Vec<Vec<Sight>>>,
+    spare: Mutex<Vec<Vec<VisibleBrick>>>,
 }
 
 impl Directory {
     /// Puts bricks into blocks: a millisecond for ten thousand.
     pub fn new(bricks: Arc<[BrickInfo]>) -> Directory {
-        Directory::in_blocks(bricks, SHIFT, MOST)
+        Directory::with_blocks(bricks, SHIFT, MOST)
     }
 
     /// The same with blocks of `2^shift` voxels along each axis, or of more, so that there are `most`.
-    pub fn in_blocks(bricks: Arc<[BrickInfo]>, shift: u32, most: usize) -> Directory {
+    pub fn with_blocks(bricks: Arc<[BrickInfo]>, shift: u32, most: usize) -> Directory {
         let blocks = Blocks::of(&bricks, shift, most);
         let fullest = blocks.all().iter().map(|b| blocks.places(b).len()).max().unwrap_or(0);
         Directory { bricks, blocks, fullest, spare: Mutex::default() }
@@ -66,7 +65,7 @@ impl Directory {
         &self.bricks
     }
 
-    fn spare(&self) -> std::sync::MutexGuard<'_, Vec<Vec<Sight>>> {
+    fn spare(&self) -> std::sync::MutexGuard<'_, Vec<Vec<VisibleBrick>>> {
         // No thread panics while it holds the lock.
         self.spare.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -74,7 +73,7 @@ impl Directory {
 
 /// A brick as a frame sees it, whether it is here or not.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Sight {
+pub(crate) struct VisibleBrick {
     pub(crate) projected: Projected,
     /// Its place in the directory.
     pub(crate) place: u32,
@@ -83,21 +82,21 @@ pub(crate) struct Sight {
 
 /// A block as a frame sees it.
 #[derive(Debug)]
-pub(crate) struct Seen {
+pub(crate) struct ProjectedBlock {
     pub(crate) projected: Projected,
     pub(crate) voxels: u64,
     /// Which of the directory's it is.
     block: u32,
-    bricks: OnceLock<Vec<Sight>>,
+    bricks: OnceLock<Vec<VisibleBrick>>,
 }
 
 /// See the head of the file.
 #[derive(Debug)]
-pub struct Outlook {
+pub struct VisibleBricks {
     directory: Arc<Directory>,
     view: View,
     /// Blocks front to back.
-    seen: Vec<Seen>,
+    seen: Vec<ProjectedBlock>,
     sheets: SheetRange,
     /// Parts in a row of the picture.
     columns: usize,
@@ -107,14 +106,14 @@ pub struct Outlook {
     entries: Vec<u32>,
 }
 
-impl Outlook {
+impl VisibleBricks {
     /// Looks at the blocks of a directory.
-    pub fn new(frame: &Frame, directory: &Arc<Directory>) -> Outlook {
-        let view = frame.view;
+    pub fn new(view: &View, directory: &Arc<Directory>) -> VisibleBricks {
+        let view = *view;
         let mut seen = Vec::with_capacity(directory.blocks.all().len());
         seen.extend(directory.blocks.all().iter().zip(0..).filter_map(|(b, block)| {
             let projected = view.project(&b.tight)?;
-            Some(Seen { projected, voxels: b.voxels, block, bricks: OnceLock::new() })
+            Some(ProjectedBlock { projected, voxels: b.voxels, block, bricks: OnceLock::new() })
         }));
         seen.sort_unstable_by_key(|s| (s.projected.sheets.first, s.block));
         let sheets =
@@ -123,7 +122,7 @@ impl Outlook {
         let edge = PART as u32;
         let columns = view.size[0].div_ceil(edge) as usize;
         let parts = columns * view.size[1].div_ceil(edge) as usize;
-        let over = |s: &Seen| parts_under(s.projected.rect, columns);
+        let over = |s: &ProjectedBlock| parts_under(s.projected.rect, columns);
         let mut starts = vec![0usize; parts + 1];
         for part in seen.iter().flat_map(over) {
             starts[part + 1] += 1;
@@ -139,7 +138,7 @@ impl Outlook {
                 next[part] += 1;
             }
         }
-        Outlook { directory: directory.clone(), view, seen, sheets, columns, starts, entries }
+        VisibleBricks { directory: directory.clone(), view, seen, sheets, columns, starts, entries }
     }
 
     /// Sheets that anything may lie in.
@@ -154,26 +153,26 @@ impl Outlook {
     }
 
     /// How many blocks it has.
-    pub fn blocks(&self) -> u32 {
+    pub fn block_count(&self) -> u32 {
         self.seen.len() as u32
     }
 
     /// Looks at a block's bricks; at once if somebody did before. Its number is that of the frame, front
     /// to back.
-    pub fn open(&self, block: u32) {
+    pub fn project_block(&self, block: u32) {
         self.bricks(block);
     }
 
     /// Numbers of the blocks that are open, ascending.
-    pub fn opened(&self) -> impl Iterator<Item = u32> {
+    pub fn projected_blocks(&self) -> impl Iterator<Item = u32> {
         let open = self.seen.iter().zip(0..).filter(|(s, _)| s.bricks.get().is_some());
         open.map(|(_, i)| i)
     }
 
     /// Bricks of those.
-    pub fn looked_at(&self) -> usize {
+    pub fn projected_bricks(&self) -> usize {
         let blocks = self.directory.blocks.all();
-        let opened = self.opened().map(|i| &blocks[self.block(i).block as usize]);
+        let opened = self.projected_blocks().map(|i| &blocks[self.block(i).block as usize]);
         opened.map(|b| self.directory.blocks.places(b).len()).sum()
     }
 
@@ -186,34 +185,34 @@ impl Outlook {
         &self.entries[self.starts[part]..self.starts[part + 1]]
     }
 
-    pub(crate) fn block(&self, i: u32) -> &Seen {
+    pub(crate) fn block(&self, i: u32) -> &ProjectedBlock {
         &self.seen[i as usize]
     }
 
     /// A block's bricks that are not off the picture, by place.
-    pub(crate) fn bricks(&self, block: u32) -> &[Sight] {
+    pub(crate) fn bricks(&self, block: u32) -> &[VisibleBrick] {
         let seen = self.block(block);
         seen.bricks.get_or_init(|| {
             let directory = &*self.directory;
             let spare = directory.spare().pop();
-            let mut sights = spare.unwrap_or_else(|| Vec::with_capacity(directory.fullest));
+            let mut bricks = spare.unwrap_or_else(|| Vec::with_capacity(directory.fullest));
             let places = directory.blocks.places(&directory.blocks.all()[seen.block as usize]);
-            sights.extend(places.iter().filter_map(|&place| {
+            bricks.extend(places.iter().filter_map(|&place| {
                 let brick = &directory.bricks[place as usize];
                 let projected = self.view.project(&brick.tight)?;
-                Some(Sight { projected, place, voxels: brick.voxels })
+                Some(VisibleBrick { projected, place, voxels: brick.voxels })
             }));
-            sights
+            bricks
         })
     }
 }
 
-impl Drop for Outlook {
+impl Drop for VisibleBricks {
     fn drop(&mut self) {
         let mut spare = self.directory.spare();
-        spare.extend(self.seen.iter_mut().filter_map(|s| s.bricks.take()).map(|mut sights| {
-            sights.clear();
-            sights
+        spare.extend(self.seen.iter_mut().filter_map(|s| s.bricks.take()).map(|mut bricks| {
+            bricks.clear();
+            bricks
         }));
     }
 }

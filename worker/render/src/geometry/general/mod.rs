@@ -12,7 +12,7 @@ use crate::kernels::touched::put;
 use crate::kernels::{Accumulate, Simd, Weight, Work};
 use crate::part::{Io, Part, Pixels, keep_last};
 use crate::primitives::footprint::Footprint;
-use crate::primitives::lattice_rows::{Reaching, Storeys};
+use crate::primitives::lattice_rows::{LatticeRows, Reaching};
 use crate::primitives::sizes::PART;
 use crate::scene::Placed;
 use crate::visibility::open_mask::OpenMask;
@@ -46,7 +46,7 @@ pub(crate) struct Kinds {
     pub(crate) floats: Kind<f32>,
 }
 
-/// Storeys that reach a row of pixels, and in which sheet.
+/// Lattice rows that reach a row of pixels, and in which sheet.
 type OfSheet<W> = (Option<i32>, Reaching<W>);
 
 /// Memory for sums of one kind.
@@ -56,7 +56,7 @@ pub(crate) struct Kind<S: Accumulate> {
     lofts: Lofts<S>,
     /// For weights that are in no table.
     weights: [Vec<S::Weight>; 2],
-    /// Storeys that reach each row of the part in a sheet, and in which: of even sheets and odd ones.
+    /// Lattice rows that reach each row of the part in a sheet, and in which: of even sheets and odd ones.
     reaching: [Vec<OfSheet<S::Weight>>; 2],
 }
 
@@ -121,7 +121,7 @@ impl<S: Accumulate> Work for RenderGeneral<'_, S> {
         let RenderGeneral { part, kind, queues, pixels, io } = self;
         let slots = part.frame.sections.most() + 1;
         kind.planes.reset(slots);
-        if part.frame.storeys.is_some() {
+        if part.frame.lattice_rows.is_some() {
             kind.lofts.reset(slots);
             kind.reaching.iter_mut().for_each(Vec::clear);
         }
@@ -187,10 +187,10 @@ impl General<'_> {
             self.splat_all(&bucket, k, kind, &open, counters);
             bucket.clear();
             queues.buckets[(k - slab.first) as usize] = bucket;
-            if let Some(storeys) = &frame.storeys {
+            if let Some(lattice_rows) = &frame.lattice_rows {
                 // What the sheet behind has so far, if the colour rule peeks there.
                 for k in k..=k + i32::from(frame.looks_at_neighbours()) {
-                    self.fold(k, storeys, kind, &open);
+                    self.fold(k, lattice_rows, kind, &open);
                 }
                 kind.lofts.clear(k);
             }
@@ -297,7 +297,7 @@ impl General<'_> {
         let rows = (rect.y0, rect.y1);
         // The sheet behind the slab is filled as far as the colour rule peeks.
         let end = slab.end + i32::from(frame.looks_at_neighbours());
-        // The first storey at the scale that was asked for last.
+        // The first lattice row at the scale that was asked for last.
         let mut based = (f64::NAN, 0);
         for Waiting { brick, voxel, placed } in bucket {
             let (brick, corner) = self.part.brick(*brick as usize);
@@ -316,17 +316,18 @@ impl General<'_> {
                 let at = frame.screen(placed, sheet, &f);
                 let i = (sheet - first) as usize;
                 let section = || S::section(&frame.sections, placed.z, i, &payload);
-                if let Some(storeys) = &frame.storeys {
+                if let Some(lattice_rows) = &frame.lattice_rows {
                     let (x0, wx) = S::Weight::of(&f, 0, at[0], (rect.x0, rect.x1), &mut weights[0]);
                     if !wx.is_empty() {
                         if based.0 != f.scale {
-                            based = (f.scale, storeys.base(&frame.view, rect, f.scale));
+                            based = (f.scale, lattice_rows.base(&frame.view, rect, f.scale));
                         }
                         let base = based.1;
-                        let storey = frame.storey(corner, brick.index[usize::from(*voxel)]);
-                        let storey = storey.expect("a level view") as i32;
+                        let lattice_row =
+                            frame.lattice_row(corner, brick.index[usize::from(*voxel)]);
+                        let lattice_row = lattice_row.expect("a level view") as i32;
                         let columns = ((x0 - rect.x0) as usize, wx);
-                        lofts.add((sheet, base), storey, columns, section());
+                        lofts.add((sheet, base), lattice_row, columns, section());
                     }
                 } else if leaning_rows {
                     // Each lies elsewhere.
@@ -361,12 +362,12 @@ impl General<'_> {
         inside.then(|| ((at(x0, rect.x0), wx), (at(y0, rect.y0), wy)))
     }
 
-    /// Fills the plane of sheet `k` from its rows of storeys, where pixels are open.
+    /// Fills the plane of sheet `k` from its lattice rows, where pixels are open.
     #[inline(always)]
     fn fold<S: Accumulate>(
         &self,
         k: i32,
-        storeys: &Storeys,
+        lattice_rows: &LatticeRows,
         Kind { planes, lofts, weights, reaching }: &mut Kind<S>,
         open: &OpenMask,
     ) {
@@ -384,11 +385,11 @@ impl General<'_> {
             let row = rect.y0 + y as i32;
             let weight = |at| {
                 let weight = S::Weight::of(&f, 1, at, (row, row + 1), &mut weights[1]).1[0];
-                weight.of_rows(storeys.spread)
+                weight.of_rows(lattice_rows.spread)
             };
             let (of, reaching) = &mut reaching[y];
             if of.replace(like) != Some(like) {
-                *reaching = storeys.reaching(&frame.view, &f, row, weight);
+                *reaching = lattice_rows.reaching(&frame.view, &f, row, weight);
             }
             let some = &reaching.some[..reaching.n];
             let mut columns = lofts.touched(k, some) & open.row(y);

@@ -46,7 +46,7 @@ impl Touched {
     }
 }
 
-/// Rows of storeys in the open sheets of a level view's part ([`crate::primitives::lattice_rows`]).
+/// Rows of lattice rows in the open sheets of a level view's part ([`crate::primitives::lattice_rows`]).
 #[derive(Default)]
 pub(crate) struct Lofts<S> {
     sheets: Vec<Loft<S>>,
@@ -54,7 +54,7 @@ pub(crate) struct Lofts<S> {
 
 /// Those of one sheet.
 struct Loft<S> {
-    /// The sheet, and the storey that row 0 stands for.
+    /// The sheet, and the lattice row that row 0 stands for.
     k: i32,
     base: i32,
     rows: Vec<[S; 4]>,
@@ -80,19 +80,19 @@ impl<S: Accumulate> Lofts<S> {
         k.rem_euclid(self.sheets.len() as i32) as usize
     }
 
-    /// Adds one section of a voxel of `storey` to sheet `k`, whose row 0 is that of `base`.
+    /// Adds one section of a voxel of `lattice row` to sheet `k`, whose row 0 is that of `base`.
     #[inline(always)]
     pub(crate) fn add(
         &mut self,
         (k, base): (i32, i32),
-        storey: i32,
+        lattice_row: i32,
         (x0, wx): (usize, &[S::Weight]),
         section: [S::Section; 4],
     ) {
         let slot = self.slot(k);
         let loft = &mut self.sheets[slot];
         (loft.k, loft.base) = (k, base);
-        let row = storey - base;
+        let row = lattice_row - base;
         if !(0..ROWS as i32).contains(&row) {
             // It reaches none of the part's pixels.
             return;
@@ -106,24 +106,30 @@ impl<S: Accumulate> Lofts<S> {
         loft.touched[row] |= (u64::MAX >> (PART - wx.len())) << x0;
     }
 
-    /// The columns of sheet `k` that any of these storeys were added to.
+    /// The columns of sheet `k` that any of these lattice rows were added to.
     #[inline(always)]
-    pub(crate) fn touched<W>(&self, k: i32, storeys: &[(i32, W)]) -> u64 {
+    pub(crate) fn touched<W>(&self, k: i32, lattice_rows: &[(i32, W)]) -> u64 {
         let loft = &self.sheets[self.slot(k)];
         if loft.k != k {
             return 0;
         }
-        let row = |&(storey, _): &(i32, W)| loft.touched.get((storey - loft.base) as usize);
-        storeys.iter().filter_map(row).fold(0, |all, touched| all | touched)
+        let row =
+            |&(lattice_row, _): &(i32, W)| loft.touched.get((lattice_row - loft.base) as usize);
+        lattice_rows.iter().filter_map(row).fold(0, |all, touched| all | touched)
     }
 
-    /// What these storeys, each with its weight, add up to in the [`BLOCK`] columns of sheet `k` from `x` on.
+    /// What these lattice rows, each with its weight, add up to in the [`BLOCK`] columns of sheet `k` from `x` on.
     #[inline(always)]
-    pub(crate) fn down(&self, k: i32, x: usize, storeys: &[(i32, S::Weight)]) -> [[S; 4]; BLOCK] {
+    pub(crate) fn down(
+        &self,
+        k: i32,
+        x: usize,
+        lattice_rows: &[(i32, S::Weight)],
+    ) -> [[S; 4]; BLOCK] {
         let loft = &self.sheets[self.slot(k)];
         let mut ways = [[S::Way::default(); 4]; BLOCK];
-        for &(storey, wy) in storeys {
-            let row = (storey - loft.base) as usize;
+        for &(lattice_row, wy) in lattice_rows {
+            let row = (lattice_row - loft.base) as usize;
             let Some(row) = loft.rows.get(row * PART + x..).and_then(<[_]>::first_chunk) else {
                 continue;
             };
@@ -216,7 +222,7 @@ impl<S: Accumulate> Planes<S> {
         }
     }
 
-    /// Puts sums of sheet `k` that came from rows of storeys, from a block's first column on.
+    /// Puts sums of sheet `k` that came from lattice rows, from a block's first column on.
     #[inline(always)]
     pub(crate) fn set(&mut self, k: i32, [x, y]: [usize; 2], sums: &[[S; 4]; BLOCK]) {
         let slot = self.touched.slot(k);

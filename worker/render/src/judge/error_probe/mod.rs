@@ -36,23 +36,23 @@ const AT_LEAST: u32 = 32;
 const EPS: f64 = 1.0 / 16.0;
 
 /// A scene in sheets of its thickness and of half of it.
-pub struct Pair([Arc<Scene>; 2]);
+pub struct ThicknessPair([Arc<Scene>; 2]);
 
-impl Pair {
+impl ThicknessPair {
     /// `None` where half as thick is thinner than sheets may be.
-    pub fn of(spec: &SceneSpec) -> Option<Pair> {
+    pub fn new(spec: &SceneSpec) -> Option<ThicknessPair> {
         let q = spec.quality;
         let [whole, half] = [1.0, 0.5].map(|times| {
             let quality = Quality { thickness: q.thickness * times, eps: q.eps * EPS, ..q };
             quality.check().ok()?;
             Some(Arc::new(Scene::new(&SceneSpec { quality, ..spec.clone() })))
         });
-        Some(Pair([whole?, half?]))
+        Some(ThicknessPair([whole?, half?]))
     }
 
     /// A view of it.
     pub fn frames(&self, view: &View) -> [Frame; 2] {
-        let Pair([whole, half]) = self;
+        let ThicknessPair([whole, half]) = self;
         let thin = view.in_sheets_of(&half.quality);
         [Frame::new(whole.clone(), *view), Frame::new(half.clone(), thin)]
     }
@@ -85,15 +85,15 @@ fn blocks_of_part(part: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
 }
 
 /// What tells how far pixels of a frame are off.
-pub struct Probe {
+pub struct ErrorProbe {
     pair: Option<[Frame; 2]>,
     model: Option<Model>,
 }
 
-impl Probe {
+impl ErrorProbe {
     /// For `frame`, whose scene has this pair.
-    pub fn new(frame: &Frame, pair: Option<&Pair>) -> Probe {
-        Probe { pair: pair.map(|p| p.frames(&frame.view)), model: Model::of(frame) }
+    pub fn new(frame: &Frame, pair: Option<&ThicknessPair>) -> ErrorProbe {
+        ErrorProbe { pair: pair.map(|p| p.frames(&frame.view)), model: Model::of(frame) }
     }
 
     /// Looks at some pixels of a tile; `bricks` are those that the tile was drawn from.

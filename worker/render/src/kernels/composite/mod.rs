@@ -275,7 +275,7 @@ pub struct Row {
 }
 
 /// Pixels of a [`Row`], which need not be neighbours: a register of AVX-512 or two of AVX2.
-pub const LANES: usize = 16;
+pub(crate) const LANES: usize = 16;
 
 impl Default for Row {
     fn default() -> Self {

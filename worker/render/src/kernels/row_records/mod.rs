@@ -1,7 +1,7 @@
-//! Rows of storeys: a voxel is added along x alone, and pixels are made of rows when a sheet closes
+//! Rows of lattice rows: a voxel is added along x alone, and pixels are made of rows when a sheet closes
 //! ([`crate::primitives::lattice_rows`]).
 //!
-//! A *tier* is the row of one storey in one open sheet. Tiers lie slot by slot; each begins with a margin of as
+//! A *tier* is the row of one lattice row in one open sheet. Tiers lie slot by slot; each begins with a margin of as
 //! many columns as a footprint has, and ends with one, so that no footprint need be cut: what lies there nobody
 //! reads. A register adds at a multiple of its own length alone, since what a neighbour has just written there
 //! is then read back as it was written; weights are moved to where a footprint begins in its first register.

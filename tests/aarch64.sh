@@ -70,8 +70,8 @@ done
 
 # What else the renderer has (references in f64, bounds of errors, allocations) takes an emulator longer than
 # all of this, and says less of bytes.
-step "tests" cargo test --locked --target $target -p slabcast-common -p slabcast-schedule \
-    -p slabcast-render --lib --test oracle --test closed_forms
+step "tests" cargo test --locked --target $target -p slabcast-common -p slabcast-trace -p slabcast-schedule \
+    -p slabcast-sim -p slabcast-render --lib --test oracle --test closed_forms
 
 printf '\naarch64: all passed in %d s: golden frames, self-test (plain, neon), tests; ' $SECONDS
 if [ ${#runner[@]} = 0 ]; then echo "on this machine"; else echo "under $(qemu-aarch64 --version | head -1)"; fi

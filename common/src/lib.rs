@@ -28,7 +28,6 @@ pub mod region;
 pub mod shade;
 pub mod slab;
 pub mod stats;
-pub mod trace;
 pub mod transfer;
 pub mod tween;
 pub mod view;

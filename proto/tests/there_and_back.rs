@@ -301,39 +301,3 @@ fn whatever_bit_is_flipped_on_the_way_one_brick_is_sent_again() {
         assert_eq!(batch.broken, [bricks[which].id], "flip {flip}");
     }
 }
-
-#[test]
-fn a_finished_tile_that_nobody_drew_weighs_what_it_is_to_weigh() {
-    use slabcast_common::ids::*;
-    use slabcast_common::image::Background;
-    use slabcast_common::leaves::Finish;
-    use slabcast_common::message::{TaskTimes, TileResult};
-    use slabcast_common::occlusion::Rect;
-    use slabcast_common::trace::finished_through;
-    let us = 1 << 33;
-    let times = TaskTimes { received_us: us, ready_us: us, start_us: us, end_us: us, thread: 0 };
-    for (format, edge) in
-        [(PixelFormat::Rgb8, 64), (PixelFormat::Rgb8, 256), (PixelFormat::Rgba32F, 32)]
-    {
-        let finish = Finish { format, background: Background::Transparent };
-        let whole = (edge * edge) as usize * format.bytes();
-        for bytes in [100, 300, 1_000, 7_777, whole / 2, whole] {
-            if bytes > whole {
-                continue;
-            }
-            let rect = Rect::new(0, 0, edge, edge);
-            let result = ToMaster::Result(Box::new(TileResult {
-                task: TaskId(5000),
-                epoch: Epoch(0),
-                pixels: Pixels::Finished(finished_through(&rect, bytes as u32, &finish)),
-                bytes: None,
-                counters: Default::default(),
-                times,
-                region: None,
-            }));
-            let weighs = convert::from_worker_to_wire(&result).encoded_len();
-            let off = weighs.abs_diff(bytes);
-            assert!(off <= 40 + bytes / 50, "{format:?}, {edge}: {weighs} bytes for {bytes}");
-        }
-    }
-}

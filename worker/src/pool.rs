@@ -16,7 +16,7 @@ use slabcast_common::message::{
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::Lookahead;
-use slabcast_common::trace::Course;
+use slabcast_trace::Course;
 use slabcast_common::view::View;
 use slabcast_render::Simd;
 use slabcast_render::judge::error_probe::{ErrorProbe, ThicknessPair};

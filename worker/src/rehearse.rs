@@ -3,7 +3,7 @@
 //! Everything else is real: link, hello, bricks, leases, results of the right size. So processes on
 //! one machine rehearse a cluster of many: a core draws one tile at a time, but any number of
 //! threads can wait. What a tile takes is in a [`Trace`]; its pixels are those of
-//! [`slabcast_common::trace::filled`], which shut what the real ones would have shut. Only a master
+//! [`slabcast_trace::filled`], which shut what the real ones would have shut. Only a master
 //! that was started for it lets such a worker in, and it marks its pictures.
 //!
 //! **Time is held on the threads' own account.** The system wakes a sleeping thread some 60 us too
@@ -17,7 +17,7 @@ use slabcast_common::message::{Counters, Pixels, Sampling};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::parts;
 use slabcast_common::slab::SheetRange;
-use slabcast_common::trace::{
+use slabcast_trace::{
     Course, Trace, filled, filled_through, finished_through, view_sha256,
 };
 use slabcast_render::region::BrickSupply;
@@ -41,7 +41,7 @@ impl Rehearsal {
     /// Makes a trace ready: a byte for each pixel of each slab of each frame.
     pub fn new(trace: Trace) -> Self {
         let size = trace.about.size;
-        let slabs = |f: &slabcast_common::trace::FrameTrace| {
+        let slabs = |f: &slabcast_trace::FrameTrace| {
             f.slabs.iter().map(|s| Arc::new(s.shut(size))).collect()
         };
         Rehearsal { shut: trace.frames.iter().map(slabs).collect(), trace }

@@ -35,7 +35,8 @@
 //!   which bricks are prefetched. One cost model predicts when a frame ends.
 //! - `dispatch` hands out work: leases, work stealing, speculative copies.
 //! - `account` keeps a frame's statistics, critical path and timeline.
-//! - [`sim`] runs the scheduler against a virtual cluster.
+//!
+//! `slabcast-sim` runs the scheduler against a virtual cluster.
 
 mod account;
 mod action;
@@ -43,7 +44,6 @@ mod dispatch;
 mod event;
 mod policy;
 mod scheduler;
-pub mod sim;
 mod state;
 
 pub use account::spans::Spans;
@@ -79,7 +79,7 @@ pub struct Config {
     pub queue_ahead: u32,
     /// Cuts mixed tile sizes under the `slab` schedule: each render thread starts with a whole
     /// macrotile, later ones are quarters ([`macrotile::cut_mixed`]). The paper's experiment, which
-    /// `slabcast study` repeats by [`sim`]. No master sets it, and records do not have it.
+    /// `slabcast study` repeats by simulation (`slabcast-sim`). No master sets it, and records do not have it.
     pub mixed: bool,
 }
 

@@ -74,7 +74,7 @@ impl Scheduler {
             | Event::Pong { .. } => {
                 !self.active.is_empty() && self.active.iter().all(Frame::by_region)
             }
-            Event::Tick => self.foresees(),
+            Event::Tick => self.prefetch_is_due(),
             _ => false,
         };
         let due = self.deadline().is_some_and(|due| due <= now);
@@ -464,11 +464,11 @@ impl Scheduler {
 
     /// When [`Event::Tick`] is due at the latest. 0: as soon as nothing else has happened.
     pub fn next_deadline(&self) -> Option<Micros> {
-        if self.foresees() { Some(0) } else { self.deadline() }
+        if self.prefetch_is_due() { Some(0) } else { self.deadline() }
     }
 
     /// Whether a frame has bricks to send ahead.
-    pub(crate) fn foresees(&self) -> bool {
+    pub fn prefetch_is_due(&self) -> bool {
         self.active.iter().any(Frame::foresees)
     }
 

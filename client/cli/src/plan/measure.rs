@@ -30,7 +30,7 @@ use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::quality::Work;
 use slabcast_common::region::PART;
 use slabcast_common::slab::SheetRange;
-use slabcast_common::trace::{
+use slabcast_trace::{
     About, FrameTrace, Level, Packing, Pings, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace,
     VERSION, view_sha256,
 };

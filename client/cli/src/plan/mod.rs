@@ -2,7 +2,7 @@
 //!
 //! Two halves, and it says which is which: [`measure`] draws every tile of the path here, on one
 //! core, and weighs its messages; [`predict`] runs the scheduler itself with these tiles against
-//! virtual workers and links (`slabcast_schedule::sim`). [`costs`] has what messages cost a
+//! virtual workers and links (`slabcast_sim`). [`costs`] has what messages cost a
 //! processor, as [`pings`] were measured here, [`chart`] draws. [`rehearse`] puts it to the test with processes on this machine.
 
 mod chart;
@@ -23,9 +23,9 @@ use crate::{embedded, parse, signals};
 use predict::{IN_FLIGHT, LOSSES, Question, Row, STEADILY};
 use rehearse::Over;
 use slabcast_common::quality::{Schedule, Work};
-use slabcast_common::trace::{MAX_BYTES, Pings, Trace};
+use slabcast_trace::{MAX_BYTES, Pings, Trace};
 use slabcast_schedule::FrameJob;
-use slabcast_schedule::sim::{Link, alone_ms};
+use slabcast_sim::{Link, alone_ms};
 use std::fmt::Write as _;
 use std::io::{Read, Write};
 use std::net::IpAddr;

@@ -7,7 +7,7 @@
 //! the host that wakes a processor.
 
 use slabcast_common::path::Orientation;
-use slabcast_common::trace::Pings;
+use slabcast_trace::Pings;
 use slabcast_master::{Master, MasterConfig};
 use slabcast_render::Simd;
 use slabcast_worker::Config;

@@ -9,8 +9,8 @@ use slabcast_common::ids::FrameId;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Schedule;
 use slabcast_common::stats::FrameStats;
-use slabcast_common::trace::Trace;
-use slabcast_schedule::sim::{self, Cluster, Costs, Link, Outcome, Stopwatch, Took, Unmeasured};
+use slabcast_trace::Trace;
+use slabcast_sim::{self as sim, Cluster, Costs, Link, Outcome, Stopwatch, Took, Unmeasured};
 use slabcast_schedule::{FrameJob, Spans};
 
 /// What a frame's time goes into.

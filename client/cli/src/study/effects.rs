@@ -16,7 +16,7 @@ use serde::Serialize;
 use slabcast_common::brick::{Brick, BrickGrid, TightBox};
 use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::quality::{Quality, Schedule};
-use slabcast_common::trace::FrameTrace;
+use slabcast_trace::FrameTrace;
 use slabcast_common::view::{Projected, View};
 use slabcast_schedule::macrotile;
 use std::collections::BTreeMap;

@@ -1,5 +1,5 @@
 //! Clusters of the paper's size: the scheduler itself against virtual workers and links
-//! (`slabcast_schedule::sim`), with tiles that were drawn and timed here.
+//! (`slabcast_sim`), with tiles that were drawn and timed here.
 //!
 //! At two paces. *Here*: tiles take what they took on this machine. *Paper's*: all tiles take so
 //! many times longer that one node takes 17 s for a frame, as the paper's did (section 1), so that
@@ -13,8 +13,8 @@ use crate::plan::predict::{self, Question};
 use serde::Serialize;
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::stats::FrameStats;
-use slabcast_common::trace::Trace;
-use slabcast_schedule::sim::{Costs, Link, Nanos, Stopwatch, alone_ms};
+use slabcast_trace::Trace;
+use slabcast_sim::{Costs, Link, Nanos, Stopwatch, alone_ms};
 use slabcast_schedule::{FrameJob, Span, Spans};
 
 /// How fast tiles are drawn.

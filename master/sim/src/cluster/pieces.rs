@@ -1,13 +1,13 @@
 //! Pieces of regions that virtual workers give away (`frame::handover`): what a trace of whole tiles says of them.
 
 use super::{Lent, Nanos, SMALL, Task, World};
-use crate::{Event, FrameJob};
+use slabcast_schedule::{Event, FrameJob};
 use slabcast_common::ids::{Epoch, FrameId, TaskId, WorkerId};
 use slabcast_common::image::TilePixels;
 use slabcast_common::message::{Begun, HandedOver};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::{cut, parts, square_of};
-use slabcast_common::trace::{Course, RegionTile, Trace};
+use slabcast_trace::{Course, RegionTile, Trace};
 use std::borrow::Cow;
 
 /// Bytes of a piece's state: an opacity, three colours and four sums a pixel.

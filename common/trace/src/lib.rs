@@ -3,20 +3,20 @@
 //! A trace has, for each frame of a path, what each macrotile of each level took to draw on one
 //! core, what its lease and its result weigh on the wire, and which pixels are shut after each
 //! slab. With that the scheduler can run without anything being drawn: against virtual workers
-//! (`slabcast_schedule::sim`), or against real ones that hold each tile for its time
+//! (`slabcast_sim`), or against real ones that hold each tile for its time
 //! (`slabcast worker --rehearse`). It refuses to know how the times were taken and what is made of
 //! them.
 //!
 //! Times are those of one core that nothing else disturbs. Tiles that are drawn side by side on
 //! one machine share its memory and may take longer; a trace does not know that.
 
-use crate::image::TilePixels;
-use crate::leaves::{Finish, LEAF, Leaves};
-use crate::message::SceneSpec;
-use crate::occlusion::Rect;
-use crate::slab::SheetRange;
-use crate::view::{Projection, View};
-use crate::volume::Digest32;
+use slabcast_common::image::TilePixels;
+use slabcast_common::leaves::{Finish, LEAF, Leaves};
+use slabcast_common::message::SceneSpec;
+use slabcast_common::occlusion::Rect;
+use slabcast_common::slab::SheetRange;
+use slabcast_common::view::{Projection, View};
+use slabcast_common::volume::Digest32;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
@@ -282,11 +282,11 @@ impl Trace {
         if trace.version != VERSION {
             return other(trace.version);
         }
-        if trace.about.pixels_version != crate::PIXELS_VERSION {
+        if trace.about.pixels_version != slabcast_common::PIXELS_VERSION {
             return no(format!(
                 "was measured with pixels of version {}, this program draws {}; measure it again",
                 trace.about.pixels_version,
-                crate::PIXELS_VERSION
+                slabcast_common::PIXELS_VERSION
             ));
         }
         let [w, h] = trace.about.size;
@@ -549,7 +549,7 @@ mod tests {
                 volume: "head".into(),
                 transfer: "bone".into(),
                 simd: "avx2".into(),
-                pixels_version: crate::PIXELS_VERSION,
+                pixels_version: slabcast_common::PIXELS_VERSION,
                 program: "0.1.0".into(),
                 size: [100, 70],
                 slabs: 1,
@@ -638,7 +638,7 @@ mod tests {
         assert!(says(&good.replace("\"edge\":64", "\"edge\":65")).contains("65 is no edge"));
         assert!(says(&good.replace("[64,0,700", "[64,99,700")).contains("by row and column"));
         assert!(says(&good.replace("[0,250,40]", "[0,250]")).contains("when it is needed"));
-        let pixels = format!("\"pixels_version\":{}", crate::PIXELS_VERSION);
+        let pixels = format!("\"pixels_version\":{}", slabcast_common::PIXELS_VERSION);
         assert!(says(&good.replace(&pixels, "\"pixels_version\":0")).contains("measure it again"));
     }
 
@@ -658,7 +658,7 @@ mod tests {
 
     #[test]
     fn finished_pixels_that_nobody_drew_fit_their_tile() {
-        use crate::image::{Background, PixelFormat};
+        use slabcast_common::image::{Background, PixelFormat};
         for format in [PixelFormat::Rgb8, PixelFormat::Rgba32F] {
             let finish = Finish { format, background: Background::Transparent };
             for (w, h) in [(64, 64), (37, 5)] {

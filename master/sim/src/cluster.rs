@@ -4,7 +4,7 @@ use super::pipe::{Cores, Pipe, through};
 use super::{
     Cluster, Costs, FrameOutcome, Nanos, Outcome, Spent, Stopwatch, Took, Unknown, micros,
 };
-use crate::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
+use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, Epoch, FrameId, TaskId, WorkerId};
 use slabcast_common::image::TilePixels;
@@ -15,7 +15,7 @@ use slabcast_common::message::{
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::{Lookahead, PART, parts};
 use slabcast_common::slab::SheetRange;
-use slabcast_common::trace::{Course, RegionTile, Trace};
+use slabcast_trace::{Course, RegionTile, Trace};
 use slabcast_common::view::Projected;
 use std::borrow::Cow;
 use std::cell::Cell;
@@ -1162,7 +1162,7 @@ impl<'a> World<'a> {
                 Event::Result { result, .. } => Some(result.pixels.len()),
                 _ => None,
             };
-            let ahead = matches!(event, Event::Tick) && self.scheduler.foresees();
+            let ahead = matches!(event, Event::Tick) && self.scheduler.prefetch_is_due();
             cost += match result {
                 Some(pixels) => costs.result + costs.result_pixel * pixels as f64,
                 None if ahead => costs.ahead,

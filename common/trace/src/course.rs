@@ -6,9 +6,9 @@
 //! and what time it is.
 
 use super::{FrameTrace, RegionTile};
-use crate::occlusion::Rect;
-use crate::region::{parts, square_of};
-use crate::view::Projected;
+use slabcast_common::occlusion::Rect;
+use slabcast_common::region::{parts, square_of};
+use slabcast_common::view::Projected;
 
 /// How far a tile's footprints reach beyond it on both sides together, in pixels: tiles of 32 pixels take 1.24 times what
 /// those of 64 do (mri256 `peer-semi` at 1024x1024).
@@ -247,7 +247,7 @@ impl Course {
 mod tests {
     use super::super::RegionLevel;
     use super::*;
-    use crate::slab::SheetRange;
+    use slabcast_common::slab::SheetRange;
     use proptest::prelude::*;
     use std::collections::BTreeSet;
 

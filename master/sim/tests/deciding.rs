@@ -10,12 +10,12 @@ use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Schedule, Work};
-use slabcast_common::trace::{
+use slabcast_trace::{
     About, FrameTrace, Packing, RegionLevel, RegionTile, Trace, VERSION, view_sha256,
 };
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
-use slabcast_schedule::sim::{self, Cluster, Costs, Link, Nanos, Stopwatch, Toll};
+use slabcast_sim::{self as sim, Cluster, Costs, Link, Nanos, Stopwatch, Toll};
 use slabcast_schedule::{FrameJob, macrotile};
 use std::sync::Arc;
 use std::time::Instant;
@@ -153,7 +153,7 @@ fn costs() -> Costs {
 }
 
 #[test]
-#[ignore = "measures; cargo test --release -p slabcast-schedule --test deciding -- --ignored --nocapture"]
+#[ignore = "measures; cargo test --release -p slabcast-sim --test deciding -- --ignored --nocapture"]
 fn what_deciding_takes() {
     const FRAMES: usize = 48;
     let (jobs, trace) = ball(FRAMES);

@@ -3,7 +3,7 @@
 //!
 //! How long will a frame take on 40 machines? A formula knows tiles and bandwidth, and nothing of
 //! the order in which leases are given, who waits at a barrier, what is lent ahead, or which copy
-//! of a late tile counts. All of that is decided by [`Scheduler`](crate::Scheduler), which is pure: so it decides here
+//! of a late tile counts. All of that is decided by [`Scheduler`](slabcast_schedule::Scheduler), which is pure: so it decides here
 //! too, and only what it can't know is a model:
 //!
 //! ```text
@@ -26,10 +26,10 @@ mod pipe;
 
 pub use cluster::run;
 
-use crate::{Micros, Spans};
+use slabcast_schedule::{Micros, Spans};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::stats::FrameStats;
-use slabcast_common::trace::Trace;
+use slabcast_trace::Trace;
 
 /// Nanoseconds since the cluster began.
 pub type Nanos = u64;
@@ -133,7 +133,7 @@ pub struct Cluster {
     pub in_flight: u32,
     /// What rendering times are multiplied with.
     pub stretch: f64,
-    /// [`Config::mixed`](crate::Config::mixed).
+    /// [`Config::mixed`](slabcast_schedule::Config::mixed).
     pub mixed: bool,
 }
 

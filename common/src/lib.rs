@@ -17,6 +17,7 @@ pub mod ids;
 pub mod image;
 pub mod kernel;
 pub mod leaves;
+pub mod link;
 pub mod math;
 pub mod message;
 pub mod occlusion;

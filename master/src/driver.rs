@@ -14,6 +14,7 @@ use crate::memory;
 use crate::record::{Recorder, Watched};
 use slabcast_common::ids::{FrameId, JobId, SceneId, WorkerId};
 use slabcast_common::leaves::Leaves;
+use slabcast_common::link::{FINISHER_THREADS, FRAMES_IN_FLIGHT};
 use slabcast_common::message::{Hello, PathRequest, SceneSpec, ToMaster, ToWorker, TransferChoice};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::path::Orientation;
@@ -34,15 +35,6 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 use tokio::sync::{mpsc, oneshot};
 use tracing::{debug, info, warn};
-
-/// Frames that the scheduler has in the making or the finisher works at. All that are not being finished are
-/// drawn side by side: who is done with its tiles of one goes on with those of the next
-/// (`slabcast_schedule`).
-const FRAMES_IN_FLIGHT: usize = 4;
-
-/// Threads that finish frames, each a frame at a time: 3 ms for one of 512x512 (the hash alone 2). With one,
-/// 15 workers that draw a frame in 3 ms wait for it; a third would have no frame to finish.
-const FINISHERS: usize = 2;
 
 /// Brick sets that are kept beside each other (a change of transfer function and back costs
 /// nothing then); more would only fill the master's memory.
@@ -203,7 +195,7 @@ impl Master {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build()?;
         let (to_finisher, chores) = std::sync::mpsc::channel::<Chore>();
         let chores = Arc::new(Mutex::new(chores));
-        for _ in 0..FINISHERS {
+        for _ in 0..FINISHER_THREADS {
             let (chores, done) = (chores.clone(), inbox.clone());
             let next = move || chores.lock().unwrap_or_else(PoisonError::into_inner).recv();
             std::thread::Builder::new().name("slabcast-finish".into()).spawn(move || {

@@ -6,6 +6,7 @@
 
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::BrickId;
+use slabcast_common::link::BRICK_BATCHES_IN_FLIGHT;
 use slabcast_common::message::{BrickBatch, Hello, ToMaster, ToWorker};
 use slabcast_proto::convert::Bricks;
 use slabcast_volumes::BrickStore;
@@ -65,10 +66,6 @@ impl Caller {
 /// is on its way.
 const BATCH_BRICKS: usize = 64;
 
-/// Batches on their way to one worker: enough to keep a stream busy, little enough that a
-/// dropped worker's bricks don't pile up.
-pub const BATCHES_IN_FLIGHT: usize = 8;
-
 /// The worker's end of an embedded link: what `slabcast_worker::Link` is made of.
 pub struct EmbeddedEnd {
     /// From the master.
@@ -85,7 +82,7 @@ pub fn embedded(handle: crate::Handle) -> EmbeddedEnd {
     let (control_tx, control_rx) = mpsc::unbounded_channel();
     let (reply_tx, mut reply_rx) = mpsc::channel::<ToMaster>(64);
     let (order_tx, mut order_rx) = mpsc::unbounded_channel::<BrickOrder>();
-    let (batch_tx, batch_rx) = mpsc::channel(BATCHES_IN_FLIGHT);
+    let (batch_tx, batch_rx) = mpsc::channel(BRICK_BATCHES_IN_FLIGHT);
     tokio::spawn(async move {
         while let Some(order) = order_rx.recv().await {
             match order {

@@ -7,8 +7,9 @@
 use crate::Handle;
 use crate::driver::SubmitError;
 use crate::jobs::{JobState, JobView, WatchItem};
-use crate::link::{BATCHES_IN_FLIGHT, BrickOrder, Caller, WorkerLink, serve_link};
+use crate::link::{BrickOrder, Caller, WorkerLink, serve_link};
 use slabcast_common::ids::JobId;
+use slabcast_common::link::BRICK_BATCHES_IN_FLIGHT;
 use slabcast_common::message::{ToMaster, ToWorker};
 use slabcast_proto::convert::{self, Down};
 use slabcast_proto::model::{self, JobNotice};
@@ -261,7 +262,7 @@ impl v1::cluster_server::Cluster for ClusterService {
         request: Request<Streaming<v1::BricksUp>>,
     ) -> Result<Response<Self::BricksStream>, Status> {
         let mut inbound = request.into_inner();
-        let (out, outbound) = mpsc::channel(BATCHES_IN_FLIGHT);
+        let (out, outbound) = mpsc::channel(BRICK_BATCHES_IN_FLIGHT);
         let sessions = self.sessions.clone();
         tokio::spawn(async move {
             let opened = async {

@@ -49,7 +49,7 @@ pub const MAX_CONTROL_MESSAGE: usize = {
 
 /// Largest message of the Bricks stream: one HTTP/2 frame of 64 KiB with room for headers
 /// (TRANSPORT.md section 3: 65,536 bytes are one full frame and a tail of 20 bytes).
-pub const MAX_BRICKS_MESSAGE: usize = 65_000;
+pub const MAX_BRICKS_MESSAGE: usize = slabcast_common::link::MAX_BRICK_BATCH_BYTES;
 
 /// Largest message of the Render service, requests and replies: a path of 38,000 explicit views,
 /// or a transfer function of 25,000 points at full precision. A message costs up to 60 times

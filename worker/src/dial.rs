@@ -6,6 +6,7 @@
 
 use crate::cache::BrickCache;
 use crate::desk::{self, Config, Ended, Link};
+use slabcast_common::link::BRICK_BATCHES_IN_FLIGHT;
 use slabcast_common::message::ToWorker;
 use slabcast_proto::convert;
 use slabcast_proto::v1::cluster_client::ClusterClient;
@@ -24,9 +25,6 @@ use tracing::{info, warn};
 const CONNECT: Duration = Duration::from_secs(5);
 /// First and longest wait before dialling again (cluster.proto).
 const WAIT: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(5));
-/// Batches between the stream and the desk: 8 of 64 KiB keep a core busy decoding.
-const BATCHES: usize = 8;
-
 /// Serves the master at `master` (`host:port`) until `stop` turns true or the master refuses
 /// this worker. A master that is not there, or leaves, is dialled again for ever; bricks are
 /// kept meanwhile.
@@ -133,7 +131,7 @@ async fn link(
     let (replies, reply_rx) = mpsc::channel(64);
     // Unbounded, bounded by the leases that the master gives and its pings.
     let (control_tx, control) = mpsc::unbounded_channel();
-    let (bricks_tx, bricks) = mpsc::channel(BATCHES);
+    let (bricks_tx, bricks) = mpsc::channel(BRICK_BATCHES_IN_FLIGHT);
     // Whether results go as they are, by the frame that came last.
     let plain = Arc::new(AtomicBool::new(false));
     let as_is = plain.clone();

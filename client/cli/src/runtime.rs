@@ -3,15 +3,13 @@
 
 use crate::embedded::cores;
 use crate::fail::{Fail, reason};
+use slabcast_common::link::stream_threads;
 use std::time::Duration;
 use tokio::runtime::{Builder, Runtime};
 
-/// Starts it, for a command with streams: two threads, or one where there are two processors or fewer, since a
-/// second is woken for much of what the first could do at once. With two of each, workers' streams take 3.1 to 3.4 ms
-/// of two processors a frame of mri256 on two workers and the master's 2.3 to 2.4, with one 2.5 and 2.0
-/// (docs/scaling.md).
+/// Starts the runtime of a command with streams, with [`stream_threads`] for this machine's cores.
 pub(crate) fn start() -> Result<Runtime, Fail> {
-    with_threads(if cores() > 2 { 2 } else { 1 })
+    with_threads(stream_threads(cores()))
 }
 
 /// Render threads up to which a worker has one thread for its streams.

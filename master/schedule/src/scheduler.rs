@@ -10,18 +10,11 @@ use crate::state::residency::{self, Residency};
 use crate::state::workers::{self, Roster};
 use crate::{Action, Clock, Config, Event, FrameJob, Micros, Totals, WorkerView};
 use slabcast_common::ids::{SceneId, WorkerId};
+use slabcast_common::link::FRAMES_IN_FLIGHT;
 use slabcast_common::message::ToWorker;
 use std::collections::{BTreeSet, VecDeque};
 
-/// Frames of the `region` schedule in the making: as many as a master has in hand. With two, no thread runs dry at
-/// the end of a frame as long as the next one's tasks are as evenly shared; they are not, and who has the
-/// least to do of both waits for who has the most. mri256 at 512x512 on 15 workers has 58 % of n times one
-/// worker's frames with two, and 68 with four, at 1024x1024 79 and 89. Each takes 28 bytes a pixel, and its
-/// picture as long as a frame before it is late; where that is much, a master has one in hand
-/// (`master::memory`).
-const FRAMES_AT_ONCE: usize = 4;
-
-/// The same while bricks fill the link ([`Traffic::is_full`]). Whoever has a thread free then waits for bricks, and more
+/// [`FRAMES_IN_FLIGHT`] while bricks fill the link ([`Traffic::is_full`]). Whoever has a thread free then waits for bricks, and more
 /// frames only have more workers ask for the same ones, at the cost of those that the frame in front
 /// waits for. mri256 at 512x512 and 1 Gbit/s, throughput with four and with this (`slabcast plan --frames
 /// 24`): on 16 workers 17 to 21 % of n times one worker's frames and 24, on 32 10 to 11 and 13 (docs/scaling.md has
@@ -417,7 +410,7 @@ impl Scheduler {
             return true;
         }
         let full = self.cluster.traffic.is_full();
-        let most = if full { FRAMES_ON_A_FULL_LINK } else { FRAMES_AT_ONCE };
+        let most = if full { FRAMES_ON_A_FULL_LINK } else { FRAMES_IN_FLIGHT };
         if self.active.len() >= most || !self.follows() {
             return false;
         }

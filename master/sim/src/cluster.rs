@@ -9,6 +9,7 @@ use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, Epoch, FrameId, TaskId, WorkerId};
 use slabcast_common::image::TilePixels;
 use slabcast_common::leaves::Leaves;
+use slabcast_common::link::{FINISHER_THREADS, stream_threads};
 use slabcast_common::message::{
     Counters, Lease, Pixels, RegionCost, RegionLease, TaskTimes, TileResult, ToWorker,
 };
@@ -33,10 +34,6 @@ const FRAME: u64 = 600;
 const BATCH: u64 = 64 << 10;
 /// Batches under way to one worker.
 const BATCHES: usize = 2;
-/// Threads that carry the master's streams (`client/cli/src/runtime.rs`; where all is on two cores or fewer one),
-/// and that finish frames (`master/src/driver.rs`).
-const STREAMS: u32 = 2;
-const FINISHERS: u32 = 2;
 
 struct VirtualClock(Cell<Nanos>);
 
@@ -309,8 +306,8 @@ pub fn run(
         driver_busy: false,
         driver_awake: false,
         driver: Cores::new(1),
-        streams: Cores::new(cluster.cores.map_or(STREAMS, |n| if n > 2 { STREAMS } else { 1 })),
-        finisher: Cores::new(FINISHERS),
+        streams: Cores::new(stream_threads(cluster.cores.unwrap_or(u32::MAX)) as u32),
+        finisher: Cores::new(FINISHER_THREADS as u32),
         machine: cluster.cores.map(Cores::new),
         shut: BTreeMap::new(),
         queued: 0,

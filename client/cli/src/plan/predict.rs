@@ -6,6 +6,7 @@ use crate::fail::Fail;
 use crate::local::shared;
 use crate::study::order::spearman;
 use slabcast_common::ids::FrameId;
+use slabcast_common::link::{FRAMES_IN_FLIGHT, stream_threads};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Schedule;
 use slabcast_common::stats::FrameStats;
@@ -89,8 +90,8 @@ pub(crate) const LOSSES: [(&str, &str); 7] = [
     ("end", "end_of_path"),
 ];
 
-/// Frames that a master has in hand (`master::driver`).
-pub(crate) const IN_FLIGHT: u32 = 4;
+/// Frames that a master has in hand.
+pub(crate) const IN_FLIGHT: u32 = FRAMES_IN_FLIGHT as u32;
 
 /// Frames that have to come steadily for throughput to be told by them, three times as many as are in flight. Of fewer chance
 /// says which came early: two of six came with 211 % of what all cores can do on a machine that something disturbed,
@@ -205,7 +206,7 @@ fn row(
                 part(spent.dry),
                 part(spent.tail),
             ],
-            busy: [driver, streams / 2.0],
+            busy: [driver, streams / stream_threads(u32::MAX) as f64],
             deciding_ms,
         }
     });

@@ -16,7 +16,6 @@ use slabcast_common::message::{
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::Lookahead;
-use slabcast_trace::Course;
 use slabcast_common::view::View;
 use slabcast_render::Simd;
 use slabcast_render::judge::error_probe::{ErrorProbe, ThicknessPair};
@@ -25,6 +24,7 @@ use slabcast_render::tile::{self, Scratch};
 use slabcast_render::visibility::ClosingDepths;
 use slabcast_render::visibility::{Directory, VisibleBricks};
 use slabcast_render::{Frame, Scene};
+use slabcast_trace::Course;
 use std::collections::{BTreeMap, BTreeSet};
 use std::panic::AssertUnwindSafe;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};

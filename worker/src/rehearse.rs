@@ -17,10 +17,8 @@ use slabcast_common::message::{Counters, Pixels, Sampling};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::parts;
 use slabcast_common::slab::SheetRange;
-use slabcast_trace::{
-    Course, Trace, filled, filled_through, finished_through, view_sha256,
-};
 use slabcast_render::region::BrickSupply;
+use slabcast_trace::{Course, Trace, filled, filled_through, finished_through, view_sha256};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 

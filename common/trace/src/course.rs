@@ -247,8 +247,8 @@ impl Course {
 mod tests {
     use super::super::RegionLevel;
     use super::*;
-    use slabcast_common::slab::SheetRange;
     use proptest::prelude::*;
+    use slabcast_common::slab::SheetRange;
     use std::collections::BTreeSet;
 
     const SIZE: [u32; 2] = [128, 128];

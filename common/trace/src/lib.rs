@@ -10,6 +10,8 @@
 //! Times are those of one core that nothing else disturbs. Tiles that are drawn side by side on
 //! one machine share its memory and may take longer; a trace does not know that.
 
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 use slabcast_common::image::TilePixels;
 use slabcast_common::leaves::{Finish, LEAF, Leaves};
 use slabcast_common::message::SceneSpec;
@@ -17,8 +19,6 @@ use slabcast_common::occlusion::Rect;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::Digest32;
-use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 use std::borrow::Cow;
 
 mod course;

@@ -4,7 +4,6 @@ use super::pipe::{Cores, Pipe, through};
 use super::{
     Cluster, Costs, FrameOutcome, Nanos, Outcome, Spent, Stopwatch, Took, Unknown, micros,
 };
-use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, Epoch, FrameId, TaskId, WorkerId};
 use slabcast_common::image::TilePixels;
@@ -16,8 +15,9 @@ use slabcast_common::message::{
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::{Lookahead, PART, parts};
 use slabcast_common::slab::SheetRange;
-use slabcast_trace::{Course, RegionTile, Trace};
 use slabcast_common::view::Projected;
+use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
+use slabcast_trace::{Course, RegionTile, Trace};
 use std::borrow::Cow;
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};

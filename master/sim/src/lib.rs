@@ -26,9 +26,9 @@ mod pipe;
 
 pub use cluster::run;
 
-use slabcast_schedule::{Micros, Spans};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::stats::FrameStats;
+use slabcast_schedule::{Micros, Spans};
 use slabcast_trace::Trace;
 
 /// Nanoseconds since the cluster began.

@@ -10,13 +10,13 @@ use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Schedule, Work};
+use slabcast_common::view::{Camera, CameraProjection, View};
+use slabcast_common::volume::{Digest32, Volume};
+use slabcast_schedule::{FrameJob, macrotile};
+use slabcast_sim::{self as sim, Cluster, Costs, Link, Nanos, Stopwatch, Toll};
 use slabcast_trace::{
     About, FrameTrace, Packing, RegionLevel, RegionTile, Trace, VERSION, view_sha256,
 };
-use slabcast_common::view::{Camera, CameraProjection, View};
-use slabcast_common::volume::{Digest32, Volume};
-use slabcast_sim::{self as sim, Cluster, Costs, Link, Nanos, Stopwatch, Toll};
-use slabcast_schedule::{FrameJob, macrotile};
 use std::sync::Arc;
 use std::time::Instant;
 

@@ -9,14 +9,14 @@ use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::presets;
 use slabcast_common::quality::{Borders, Quality, Schedule, Work};
 use slabcast_common::stats::FrameStats;
-use slabcast_trace::{
-    About, FrameTrace, Level, Packing, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace,
-    VERSION, view_sha256,
-};
 use slabcast_common::view::{Camera, CameraProjection, Projected, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_schedule::{FrameJob, Span, Spans, macrotile, slab_ranges};
 use slabcast_sim::{self as sim, Cluster, Costs, Link, Outcome, Toll, Unknown, Unmeasured};
+use slabcast_trace::{
+    About, FrameTrace, Level, Packing, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace,
+    VERSION, view_sha256,
+};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 

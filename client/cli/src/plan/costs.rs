@@ -15,10 +15,10 @@ use slabcast_common::message::{
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Schedule;
 use slabcast_common::slab::SheetRange;
-use slabcast_trace::{self as trace, Pings, Trace};
 use slabcast_proto::convert::{self, Down};
 use slabcast_proto::v1;
 use slabcast_sim::{Costs, Toll};
+use slabcast_trace::{self as trace, Pings, Trace};
 use std::time::Instant;
 
 /// Of a machine that does not say what threads take: an EPYC of 2.45 GHz (Zen 3, 2 vCPU), on which waking a

@@ -30,10 +30,6 @@ use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::quality::Work;
 use slabcast_common::region::PART;
 use slabcast_common::slab::SheetRange;
-use slabcast_trace::{
-    About, FrameTrace, Level, Packing, Pings, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace,
-    VERSION, view_sha256,
-};
 use slabcast_common::view::Projected;
 use slabcast_proto::convert::{self, Down};
 use slabcast_render::Frame;
@@ -43,6 +39,10 @@ use slabcast_render::tile::{self, Scratch};
 use slabcast_render::visibility::ClosingDepths;
 use slabcast_render::visibility::VisibleBricks;
 use slabcast_schedule::{FrameJob, is_shut, macrotile};
+use slabcast_trace::{
+    About, FrameTrace, Level, Packing, Pings, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace,
+    VERSION, view_sha256,
+};
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;

@@ -7,9 +7,9 @@
 //! the host that wakes a processor.
 
 use slabcast_common::path::Orientation;
-use slabcast_trace::Pings;
 use slabcast_master::{Master, MasterConfig};
 use slabcast_render::Simd;
+use slabcast_trace::Pings;
 use slabcast_worker::Config;
 use std::fmt::Display;
 use std::time::{Duration, Instant};

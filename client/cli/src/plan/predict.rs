@@ -10,9 +10,9 @@ use slabcast_common::link::{FRAMES_IN_FLIGHT, stream_threads};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Schedule;
 use slabcast_common::stats::FrameStats;
-use slabcast_trace::Trace;
-use slabcast_sim::{self as sim, Cluster, Costs, Link, Outcome, Stopwatch, Took, Unmeasured};
 use slabcast_schedule::{FrameJob, Spans};
+use slabcast_sim::{self as sim, Cluster, Costs, Link, Outcome, Stopwatch, Took, Unmeasured};
+use slabcast_trace::Trace;
 
 /// What a frame's time goes into.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

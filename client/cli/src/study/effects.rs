@@ -16,9 +16,9 @@ use serde::Serialize;
 use slabcast_common::brick::{Brick, BrickGrid, TightBox};
 use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::quality::{Quality, Schedule};
-use slabcast_trace::FrameTrace;
 use slabcast_common::view::{Projected, View};
 use slabcast_schedule::macrotile;
+use slabcast_trace::FrameTrace;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 

@@ -15,9 +15,9 @@ use crate::request::{Asked, Opened};
 use crate::signals;
 use crate::stage::Stage;
 use slabcast_common::quality::{Borders, Kernel, Quality, Schedule, Work};
-use slabcast_trace::Pings;
 use slabcast_common::view::MAX_EDGE;
 use slabcast_sim::Link;
+use slabcast_trace::Pings;
 
 /// Frames of a setting of radius or size.
 const EFFECT_FRAMES: usize = 3;

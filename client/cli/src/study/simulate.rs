@@ -13,9 +13,9 @@ use crate::plan::predict::{self, Question};
 use serde::Serialize;
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::stats::FrameStats;
-use slabcast_trace::Trace;
-use slabcast_sim::{Costs, Link, Nanos, Stopwatch, alone_ms};
 use slabcast_schedule::{FrameJob, Span, Spans};
+use slabcast_sim::{Costs, Link, Nanos, Stopwatch, alone_ms};
+use slabcast_trace::Trace;
 
 /// How fast tiles are drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]

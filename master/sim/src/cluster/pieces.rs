@@ -1,12 +1,12 @@
 //! Pieces of regions that virtual workers give away (`frame::handover`): what a trace of whole tiles says of them.
 
 use super::{Lent, Nanos, SMALL, Task, World};
-use slabcast_schedule::{Event, FrameJob};
 use slabcast_common::ids::{Epoch, FrameId, TaskId, WorkerId};
 use slabcast_common::image::TilePixels;
 use slabcast_common::message::{Begun, HandedOver};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::{cut, parts, square_of};
+use slabcast_schedule::{Event, FrameJob};
 use slabcast_trace::{Course, RegionTile, Trace};
 use std::borrow::Cow;
 

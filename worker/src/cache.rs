@@ -1,6 +1,6 @@
 //! Bricks that a worker holds, by set, and the directories of sets.
 
-use crate::shelf::Shelf;
+use crate::brick_table::Shelf;
 use slabcast_common::brick::{Brick, BrickGrid, BrickInfo, BrickSetKey};
 use slabcast_common::ids::BrickId;
 use slabcast_common::message::DIRECTORIES;

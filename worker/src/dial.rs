@@ -2,10 +2,10 @@
 //!
 //! Control and bricks travel on connections of their own, so that a lease never queues behind
 //! a megabyte of bricks (at 1 Gb/s that is 22 ms instead of 1.4). The streams are carried to
-//! and from the same channels that an embedded link has; [`crate::desk`] can't tell.
+//! and from the same channels that an embedded link has; [`crate::session`] can't tell.
 
 use crate::cache::BrickCache;
-use crate::desk::{self, Config, Ended, Link};
+use crate::session::{self, Config, Ended, Link};
 use slabcast_common::link::BRICK_BATCHES_IN_FLIGHT;
 use slabcast_common::message::ToWorker;
 use slabcast_proto::convert;
@@ -187,7 +187,7 @@ async fn link(
         }
         carried
     });
-    let ended = desk::run(config, Link { control, replies, bricks }, cache, stop).await;
+    let ended = session::run(config, Link { control, replies, bricks }, cache, stop).await;
     let ended = ended.map_err(|e| format!("render threads: {e}"))?;
     // The desk dropped its ends. What it said last still leaves; then the streams are over.
     let carried = match tokio::time::timeout(Duration::from_secs(1), &mut carrying).await {

@@ -11,7 +11,7 @@
 //! should have ended, or when it came, and only a result is late, never the work behind it.
 
 use crate::pool::{Came, Drawn, FrameSlot, Going, Ready, locked};
-use crate::shelf::Shelf;
+use crate::brick_table::Shelf;
 use slabcast_common::image::TilePixels;
 use slabcast_common::message::{Counters, Pixels, Sampling};
 use slabcast_common::occlusion::Rect;

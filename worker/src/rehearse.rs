@@ -10,8 +10,8 @@
 //! late; over a thousand tiles that is a frame. So a thread's next tile begins when the one before
 //! should have ended, or when it came, and only a result is late, never the work behind it.
 
-use crate::pool::{Came, Drawn, FrameSlot, Going, Ready, locked};
 use crate::brick_table::Shelf;
+use crate::pool::{Came, Drawn, FrameSlot, Going, Ready, locked};
 use slabcast_common::image::TilePixels;
 use slabcast_common::message::{Counters, Pixels, Sampling};
 use slabcast_common::occlusion::Rect;

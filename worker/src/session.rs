@@ -6,11 +6,11 @@
 //! bricks: `parking` says what is asked for.
 
 use crate::cache::BrickCache;
-use crate::stalls::{Parking, Say, Who};
 use crate::pool::{
     Came, FrameSlot, Going, Gone, Outcome, Pool, Ready, Rendered, SceneSlot, Task, Wish,
 };
 use crate::rehearse::Rehearsal;
+use crate::stalls::{Parking, Say, Who};
 use slabcast_common::brick::{BrickGrid, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId};
 use slabcast_common::message::{

@@ -13,8 +13,8 @@
 //!
 //! It refuses to know threads, links and time.
 
-use crate::cache::BrickCache;
 use crate::brick_table::Shelf;
+use crate::cache::BrickCache;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, FrameId, TaskId};
 use slabcast_render::region::BrickSupply;

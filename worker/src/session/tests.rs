@@ -190,9 +190,7 @@ async fn a_brick_that_is_dropped_under_a_waiting_lease_is_waited_for_again() {
 async fn wishes(world: &mut World, bricks: usize) -> Vec<u32> {
     let mut asked = Vec::new();
     while asked.len() < bricks {
-        let ToMaster::BricksWanted { set, bricks } = world.hear().await else {
-            panic!("a wish")
-        };
+        let ToMaster::BricksWanted { set, bricks } = world.hear().await else { panic!("a wish") };
         assert_eq!(set, SET);
         asked.extend(bricks.iter().map(|b| b.0));
     }
@@ -479,9 +477,8 @@ async fn a_worker_that_is_told_to_stop_says_goodbye_and_ends() {
 #[tokio::test(start_paused = true)]
 async fn a_master_that_falls_silent_is_left() {
     let world = World::new().await;
-    let World {
-        control: _control, bricks: _bricks, replies: _replies, stop: _stop, ended, ..
-    } = world;
+    let World { control: _control, bricks: _bricks, replies: _replies, stop: _stop, ended, .. } =
+        world;
     let Ended::Lost(reason) = ended.await.unwrap().unwrap() else { panic!("lost") };
     assert!(reason.contains("silent"), "{reason}");
 }

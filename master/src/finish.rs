@@ -1,8 +1,8 @@
 //! From finished sums to a picture, its hash, its bytes and its statistics.
 //!
-//! This runs on threads of their own beside the driver, so that a frame is hashed and encoded
-//! while the next one is rendered. Tiles that come finished are laid into its picture while others
-//! of it are drawn.
+//! This runs on threads beside the driver (`finishers`), so that a frame is hashed and encoded
+//! while the next one is rendered. Tiles that come finished are composed into its picture while
+//! its other tiles are drawn.
 
 use crate::jobs::FinishedFrame;
 use sha2::{Digest, Sha256};
@@ -22,57 +22,60 @@ use slabcast_schedule::{Span, Spans};
 use slabcast_volumes::BrickStore;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// What finishers do.
-pub(crate) enum Chore {
-    /// Lays tiles into the picture of a frame of which others are drawn yet.
-    Lay(Arc<Laying>),
-    /// Makes the frame.
-    Finish(FrameId, Box<FrameSums>),
-}
-
-/// A picture that finished tiles are laid into as they come.
-pub(crate) struct Laying {
+/// A picture that finished tiles are composed into as they come.
+pub(crate) struct Assembly {
     size: [u32; 2],
     finish: Finish,
-    coming: Mutex<Vec<(Rect, Leaves)>>,
-    /// `None` before it was begun; not by the driver, since that takes as long as it is large.
+    /// Tiles that came and are not in the picture yet.
+    pending: Mutex<Vec<(Rect, Leaves)>>,
+    /// `None` before the first tile: allocating it takes the longer the larger it is, so the
+    /// driver leaves that to a finisher.
     picture: Mutex<Option<Mosaic>>,
 }
 
-impl Laying {
-    pub(crate) fn new(size: [u32; 2], finish: Finish) -> Laying {
-        Laying { size, finish, coming: Mutex::default(), picture: Mutex::default() }
+impl Assembly {
+    pub(crate) fn new(size: [u32; 2], finish: Finish) -> Assembly {
+        Assembly { size, finish, pending: Mutex::default(), picture: Mutex::default() }
     }
 
-    /// Tiles that are to be laid.
+    /// Adds tiles that are to be composed.
     pub(crate) fn add(&self, tiles: Vec<(Rect, Leaves)>) {
-        locked(&self.coming).extend(tiles);
+        self.pending.lock().unwrap_or_else(PoisonError::into_inner).extend(tiles);
     }
 
-    /// Lays those that came so far.
-    pub(crate) fn lay(&self) {
-        self.lay_into(&mut locked(&self.picture));
+    /// Composes the tiles that came so far.
+    ///
+    /// # Panics
+    /// If an earlier call panicked: its tiles are lost.
+    pub(crate) fn compose(&self) {
+        self.compose_into(&mut self.picture());
     }
 
-    fn lay_into(&self, picture: &mut Option<Mosaic>) {
-        // Behind the picture's lock: who ends it finds none that another has taken and not laid.
-        let tiles = std::mem::take(&mut *locked(&self.coming));
-        picture.get_or_insert_with(|| Mosaic::new(self.size, &self.finish)).lay(&tiles);
-    }
-
-    /// The picture, with all that came.
+    /// Returns the picture with all tiles that came.
+    ///
+    /// # Panics
+    /// If an earlier call panicked: its tiles are lost.
     fn end(&self) -> Mosaic {
-        let mut picture = locked(&self.picture);
-        self.lay_into(&mut picture);
+        let mut picture = self.picture();
+        self.compose_into(&mut picture);
         picture.take().unwrap_or_else(|| Mosaic::new(self.size, &self.finish))
     }
+
+    fn picture(&self) -> MutexGuard<'_, Option<Mosaic>> {
+        self.picture.lock().expect("no finisher panicked while it composed this picture")
+    }
+
+    fn compose_into(&self, picture: &mut Option<Mosaic>) {
+        // Taken while the picture is locked, so that whoever ends the picture finds no tile that
+        // another thread has taken and not composed.
+        let mut pending = self.pending.lock().unwrap_or_else(PoisonError::into_inner);
+        let tiles = std::mem::take(&mut *pending);
+        drop(pending);
+        picture.get_or_insert_with(|| Mosaic::new(self.size, &self.finish)).lay(&tiles);
+    }
 }
 
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// Everything that makes a frame.
+/// Everything that a finisher needs for one frame.
 pub(crate) struct FrameSums {
     pub(crate) job: JobId,
     pub(crate) frame: FrameId,
@@ -81,18 +84,21 @@ pub(crate) struct FrameSums {
     pub(crate) crop: Option<CropBox>,
     pub(crate) view: View,
     pub(crate) state: Box<FrameState>,
-    /// Where tiles that came before are laid.
-    pub(crate) laying: Option<Arc<Laying>>,
+    /// The picture of tiles that came finished, if any did.
+    pub(crate) assembly: Option<Arc<Assembly>>,
     pub(crate) stats: Box<FrameStats>,
     pub(crate) spans: Spans,
-    /// Where its bricks come from.
+    /// The brick set that it was drawn from.
     pub(crate) store: Option<Arc<BrickStore>>,
-    /// Nobody drew it.
+    /// Whether workers rehearsed, so that nobody drew it.
     pub(crate) rehearsed: bool,
 }
 
-/// Hash of everything that decides a frame's pixels: volume, cropping box, transfer function,
-/// quality, view.
+/// Returns the SHA-256 of everything that decides a frame's pixels: [`PIXELS_VERSION`], the
+/// volume's digest, the cropping box (in voxels), transfer function, quality and view.
+/// `Quality::cull` and `Quality::grey` change no pixel and are left out.
+///
+/// [`PIXELS_VERSION`]: slabcast_common::PIXELS_VERSION
 pub fn view_sha256(scene: &SceneSpec, crop: Option<&CropBox>, view: &View) -> Digest32 {
     let mut h = Sha256::new();
     h.update(b"slabcast view 1");
@@ -101,7 +107,7 @@ pub fn view_sha256(scene: &SceneSpec, crop: Option<&CropBox>, view: &View) -> Di
     h.update(scene.transfer.to_json());
     // Neither changes a byte.
     let quality = Quality { cull: true, grey: true, ..scene.quality };
-    h.update(serde_json::to_string(&quality).unwrap_or_default());
+    h.update(serde_json::to_string(&quality).expect("a quality has no map keys but strings"));
     h.update(view.size[0].to_le_bytes());
     h.update(view.size[1].to_le_bytes());
     let projection = match view.projection {
@@ -128,8 +134,8 @@ pub fn view_sha256(scene: &SceneSpec, crop: Option<&CropBox>, view: &View) -> Di
     Digest32(h.finalize().into())
 }
 
-/// The bounds that are known without a reference (DESIGN.md section 5), in 1/255; `within`: where voxels
-/// are, `alpha_most`: the largest opacity of a pixel.
+/// Writes the bounds that are known without a reference (DESIGN.md section 5) into `stats`, in
+/// 1/255. `within`: box of the voxels that are drawn; `alpha_most`: largest opacity of a pixel.
 fn error(
     stats: &mut ErrorStats,
     scene: &SceneSpec,
@@ -137,7 +143,7 @@ fn error(
     within: &TightBox,
     alpha_most: f64,
 ) {
-    // Above 255 one says nothing (16-bit sums, whose errors are a thousandth of it).
+    // A bound of 255 says nothing (16-bit sums, whose errors are a thousandth of it).
     let says = |bound: f64| Some(bound).filter(|&bound| bound < 255.0);
     let alpha_most = Some(alpha_most);
     stats.cutoff.bound = Some(bounds::cutoff(&scene.quality));
@@ -145,16 +151,17 @@ fn error(
     stats.accumulation.bound = Some(bounds::accumulation(view, within));
     stats.rounding.bound = bounds::rounding(scene, view, within, alpha_most).and_then(says);
     stats.truncation.bound = bounds::truncation(scene, view, within, alpha_most).and_then(says);
-    // Where solids hide what is behind, few pixels at their edges decide, and a sample misses them.
+    // Where solids hide everything behind them, a few pixels at their edges decide, and a sample
+    // misses those.
     if alpha_most.is_some_and(|a| 1.0 - a < scene.quality.eps) {
         stats.truncation.estimate = None;
     }
 }
 
-/// What the frame did not need, by name, with the bytes that it saved. Milliseconds are not measured
-/// in passing: `slabcast explain` draws with and without.
+/// Lists what the frame did not need, by name, with the bytes that it saved. Milliseconds are not
+/// measured in passing: `slabcast explain` draws with and without.
 ///
-/// Of bricks the bytes are those of one copy: the master's, and each worker's that holds them.
+/// Bytes of bricks are those of one copy; the master and each worker that needs them save one.
 fn left_out(
     store: &BrickStore,
     scene: &SceneSpec,
@@ -164,7 +171,7 @@ fn left_out(
 ) -> Vec<LeftOut> {
     let (wanted, voxels) = (store.wanted(), store.relevant_voxels());
     let all: u64 = scene.volume.lattice.dims.iter().map(|&n| u64::from(n)).product();
-    // Of voxels as they are stored, their place and their brick's head included.
+    // Stored voxels, with their index and their share of the brick's header.
     let bytes = |n: u64| (n as f64 * store.bytes() as f64 / voxels.max(1) as f64) as u64;
     let mut list = Vec::new();
     let mut put = |name: &str, saved_bytes: Option<u64>| {
@@ -196,7 +203,7 @@ fn left_out(
     list
 }
 
-/// Stripes over the whole picture: what was not drawn is not to be taken for a picture.
+/// Returns stripes over the whole picture, so that a rehearsal is not taken for a picture.
 fn marked(size: [u32; 2]) -> Picture {
     let [w, h] = size.map(|n| n as usize);
     let stripe = |i: usize| match (i % w + i / w) / 16 % 2 {
@@ -206,19 +213,19 @@ fn marked(size: [u32; 2]) -> Picture {
     Picture { size, pixels: (0..w * h).map(stripe).collect() }
 }
 
-/// Makes the frame.
+/// Encodes and hashes a frame, and completes its statistics.
 pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
     let (size, finish) = (s.state.size(), s.request.finish());
     let alpha_most = f64::from(s.state.alpha_most());
     let Encoded { sha256, bytes } = if s.rehearsed {
         Encoded { sha256: None, bytes: marked(size).encode(finish.format, finish.background) }
-    } else if let Some(laying) = &s.laying {
-        s.state.encode_on(laying.end())
+    } else if let Some(assembly) = &s.assembly {
+        s.state.encode_on(assembly.end())
     } else {
         s.state.encode(&finish, s.request.want_hash)
     };
     let mut stats = *s.stats;
-    // Frames of a job count from its first; people count those of the path.
+    // The scheduler counts the frames of a job from 0; statistics count those of the whole path.
     let number = stats.frame;
     stats.frame += s.request.path.first_frame() as u64;
     if let Some(path) = &mut stats.critical_path {
@@ -243,20 +250,20 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
         size,
         format: finish.format,
         bytes: bytes.into(),
-        stats_json: serde_json::to_string(&stats).unwrap_or_default(),
+        stats_json: serde_json::to_string(&stats).expect("statistics have no map keys but strings"),
         trace_json: s.request.want_trace.then(|| chrome_trace(&s.spans.to_vec(), s.job, s.frame)),
         stats,
     }
 }
 
-/// Spans as an array of Chrome trace events: one process for the master and one a worker, all
-/// on the master's clock (microseconds).
+/// Returns spans as a JSON array of Chrome trace events: one process for the master and one for
+/// each worker, all on the master's clock (microseconds).
 fn chrome_trace(spans: &[Span], job: JobId, frame: FrameId) -> String {
     let mut names: Vec<&str> = spans.iter().filter_map(|s| s.worker.as_deref()).collect();
     names.sort_unstable();
     names.dedup();
     let process = |worker: Option<&str>| {
-        // Process ids follow the names, so that every frame of a job gives a worker the same.
+        // Process ids are hashes of names, so that a worker has one id in all frames of a job.
         worker.map_or(1, |w| {
             let mut h = 0xcbf2_9ce4u32;
             for b in w.bytes() {

@@ -1,8 +1,8 @@
-//! A worker's end at the master.
+//! Links between the driver and its workers.
 //!
 //! The driver speaks to every worker through a [`WorkerLink`] and can't tell whether a network
-//! lies behind it. The embedded link passes the very messages over channels, and bricks as
-//! shared pointers; the TCP link ([`crate::serve`]) encodes both.
+//! lies behind it. The embedded link passes the same messages over channels, and bricks as shared
+//! pointers; the TCP link ([`crate::serve`]) encodes both.
 
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::BrickId;
@@ -13,71 +13,79 @@ use slabcast_volumes::BrickStore;
 use std::sync::Arc;
 use tokio::sync::mpsc;
 
-/// What is to happen to a worker's bricks, in this order.
+/// An order for one worker's bricks. Orders are carried out in the order in which they are sent.
 pub enum BrickOrder {
-    /// Send some.
+    /// Sends bricks.
     Send {
-        /// Of which set.
+        /// The brick set.
         set: BrickSetKey,
-        /// Where they are.
+        /// The set's bricks.
         store: Arc<BrickStore>,
-        /// Which.
+        /// Ids of the bricks to send.
         bricks: Vec<BrickId>,
     },
-    /// Have some forgotten. Here and not among the control messages, since "forget 5" and a new
-    /// 5 must not change places on the way.
+    /// Has the worker forget bricks. Travels here and not among the control messages, since
+    /// "forget 5" and a new brick 5 must not change places on the way.
     Drop {
-        /// Of which set.
+        /// The brick set.
         set: BrickSetKey,
-        /// Which.
+        /// Ids of the bricks to forget.
         bricks: Vec<BrickId>,
     },
 }
 
-/// What the driver holds of a worker.
+/// The driver's end of a link to a worker. The link closes when the driver drops it.
+///
+/// Both channels are unbounded, since the driver never waits for a worker. Their contents are
+/// bounded by what the driver sends:
 pub struct WorkerLink {
-    /// Control messages. Unbounded, since the driver never waits; what is in it is bounded by
-    /// the leases and one ping a second until silence ends the link.
+    /// Control messages: at most the leases that the scheduler has lent the worker and, until
+    /// silence ends the link, a ping each heartbeat (`Config::silence / Config::heartbeat` pings,
+    /// 20 by default).
     pub control: mpsc::UnboundedSender<ToWorker>,
-    /// Bricks to send. Unbounded in orders, bounded by the bricks that the worker lacks: none
-    /// is ordered twice.
+    /// Orders for bricks: at most one for each brick that the worker lacks, as no brick is ordered
+    /// twice.
     pub bricks: mpsc::UnboundedSender<BrickOrder>,
 }
 
-/// Where a worker calls from.
+/// The place that a worker calls from.
 #[derive(Clone, Debug, Default)]
 pub struct Caller {
-    /// Its address; empty for one of this process.
+    /// Address of the worker (`IP:PORT`); empty for a worker of this process.
     pub address: String,
-    /// Whether that is an address of this machine, or it is of this process.
+    /// Whether the address is one of this machine, or the worker is of this process.
     pub is_local: bool,
 }
 
 impl Caller {
-    /// Whether a caller that says to be on `machine` shares the processors of a master on `own`: if either does not
-    /// know, whoever has the address that it calls is on the machine that is called. An address alone is
-    /// another for each container, and the same at the end of a tunnel.
+    /// Whether a caller that says to be on `machine` shares the processors of a master on `own`.
+    /// If one of them does not know its machine's name, the address decides: a caller from the
+    /// address that it calls is on the machine that it calls. An address alone would not do, as
+    /// each container has one of its own and both ends of a tunnel may have the same.
     pub(crate) fn is_on(&self, machine: &str, own: &str) -> bool {
         if machine.is_empty() || own.is_empty() { self.is_local } else { machine == own }
     }
 }
 
-/// Bricks of one embedded batch: some 64 KiB, as over TCP, so that tiles start while the rest
-/// is on its way.
+/// Bricks of one embedded batch: some 64 KiB, as over TCP, so that tiles start while the other
+/// bricks are on their way.
 const BATCH_BRICKS: usize = 64;
 
-/// The worker's end of an embedded link: what `slabcast_worker::Link` is made of.
+/// The worker's end of an embedded link: the three channels of a `slabcast_worker::Link`.
 pub struct EmbeddedEnd {
-    /// From the master.
+    /// Control messages from the master; bounded as [`WorkerLink::control`] is.
     pub control: mpsc::UnboundedReceiver<ToWorker>,
-    /// To the master; the first message must be the hello.
+    /// Messages to the master. The first must be the hello.
     pub replies: mpsc::Sender<ToMaster>,
-    /// Bricks.
+    /// Bricks from the master, and orders to forget some.
     pub bricks: mpsc::Receiver<Bricks>,
 }
 
-/// Lets a worker in over channels of this process. Must be called inside a tokio runtime, which
-/// then carries the messages.
+/// Links a worker of this process to the master over channels. The worker is let in when it has
+/// sent its hello.
+///
+/// # Panics
+/// Outside a tokio runtime, which carries the messages.
 pub fn embedded(handle: crate::Handle) -> EmbeddedEnd {
     let (control_tx, control_rx) = mpsc::unbounded_channel();
     let (reply_tx, mut reply_rx) = mpsc::channel::<ToMaster>(64);
@@ -114,7 +122,8 @@ pub fn embedded(handle: crate::Handle) -> EmbeddedEnd {
     EmbeddedEnd { control: control_rx, replies: reply_tx, bricks: batch_rx }
 }
 
-/// Carries a worker's messages to the driver until either side ends.
+/// Lets a worker in and carries its messages to the driver until either side ends. A worker that
+/// is not let in gets the reason as [`ToWorker::Refused`].
 pub async fn serve_link(
     handle: crate::Handle,
     hello: Hello,
@@ -125,8 +134,8 @@ pub async fn serve_link(
     let control = link.control.clone();
     let worker = match handle.attach(hello, caller, link).await {
         Ok(worker) => worker,
-        Err(reason) => {
-            let _ = control.send(ToWorker::Refused { reason });
+        Err(refused) => {
+            let _ = control.send(ToWorker::Refused { reason: refused.to_string() });
             return;
         }
     };
@@ -145,7 +154,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn who_is_on_the_masters_machine_is_told_by_its_name_or_else_by_its_address() {
+    fn worker_is_on_the_masters_machine_by_machine_name_or_else_by_address() {
         let caller = |is_local| Caller { address: "10.0.0.1:5".into(), is_local };
         for (is_local, machine, own, want) in [
             (true, "a", "a", true),

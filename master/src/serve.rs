@@ -5,7 +5,7 @@
 //! are, and each has TCP_NODELAY (without it a task costs 40 ms).
 
 use crate::Handle;
-use crate::driver::SubmitError;
+use crate::SubmitError;
 use crate::jobs::{JobState, JobView, WatchItem};
 use crate::link::{BrickOrder, Caller, WorkerLink, serve_link};
 use slabcast_common::ids::JobId;
@@ -474,6 +474,7 @@ impl v1::render_server::Render for RenderService {
                 "the master has as many jobs as it takes; wait, or cancel one",
             )),
             Err(SubmitError::Gone) => Err(Status::unavailable("the master ends")),
+            Err(e @ SubmitError::Panicked(_)) => Err(Status::internal(e.to_string())),
         }
     }
 
@@ -589,7 +590,7 @@ impl v1::render_server::Render for RenderService {
             orientation: v.orientation,
             pixels_version: slabcast_common::PIXELS_VERSION,
             protocol_version: slabcast_common::PROTOCOL_VERSION,
-            now_unix_ms: crate::driver::unix_ms(),
+            now_unix_ms: crate::handle::unix_ms(),
         })))
     }
 

@@ -11,7 +11,7 @@ use crate::source::{Cancel, Source, Update};
 use slabcast_common::message::PathRequest;
 use slabcast_common::path::Orientation;
 use slabcast_common::volume::Volume;
-use slabcast_master::driver::SubmitError;
+use slabcast_master::SubmitError;
 use slabcast_master::jobs::{JobState, WatchItem};
 use slabcast_master::record::Recorder;
 use slabcast_master::{Handle, Master, MasterConfig, link};

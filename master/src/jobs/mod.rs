@@ -6,197 +6,197 @@
 //! budget. Frames that were taken are kept while there is room and rendered again when somebody
 //! asks for one that is gone: a frame is a pure function of its job.
 
+pub(crate) mod active;
+pub mod submit;
 #[cfg(test)]
 mod tests;
-mod watch;
+mod watcher;
 
-pub use watch::{Watch, WatchItem};
+pub use watcher::{Watch, WatchItem};
 
+use crate::handle::unix_ms;
 use bytes::Bytes;
 use slabcast_common::ids::JobId;
 use slabcast_common::image::PixelFormat;
 use slabcast_common::message::PathRequest;
 use slabcast_common::stats::FrameStats;
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use tokio::sync::watch;
 
-
-/// Most jobs that are remembered; the oldest ended ones are forgotten beyond it.
+/// Most jobs that a master remembers. Beyond it, the oldest jobs that are over are forgotten.
 pub const MAX_JOBS: usize = 1000;
 
-/// What a job is doing.
+/// State of a job.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum JobState {
     /// Other jobs come first.
     Queued,
-    /// Its bricks are being made.
+    /// The volume is being cut into the job's bricks.
     Preparing,
-    /// There is no worker.
+    /// No worker is linked to the master.
     WaitingForWorkers,
     /// Frames are being rendered.
     Running,
     /// All frames are done.
     Done,
-    /// It can't go on; says why.
+    /// The job can't go on, for this reason.
     Failed(String),
     /// A client cancelled it.
     Cancelled,
 }
 
 impl JobState {
-    /// Whether nothing more will happen by itself.
+    /// Whether the job is done, failed or cancelled, so that its state changes no more.
     pub fn is_over(&self) -> bool {
         matches!(self, JobState::Done | JobState::Failed(_) | JobState::Cancelled)
     }
 }
 
-/// A job as others see it.
+/// A job as clients see it.
 #[derive(Clone, Debug)]
 pub struct JobView {
-    /// Its name.
+    /// The job's id.
     pub id: JobId,
-    /// The client's name for it.
+    /// The key that the client chose for the request (`client_key`).
     pub client_key: String,
-    /// What it is doing.
+    /// State of the job.
     pub state: JobState,
-    /// Frames done.
+    /// Number of frames that were finished at least once.
     pub frames_done: u64,
-    /// Frames in all.
+    /// Number of frames of the path.
     pub frames_total: u64,
-    /// Macrotiles done and there in the slab at hand.
+    /// Macrotiles of the current slab: done, and in all.
     pub tiles: (u32, u32),
-    /// Slab at hand and slabs of the frame at hand.
+    /// Current slab, counted from 0, and number of slabs of the current frame.
     pub slab: (u32, u32),
-    /// Render threads of the workers that are there.
+    /// Number of workers that are linked to the master.
     pub workers: u32,
-    /// Picture size.
+    /// Width and height of the pictures, in pixels.
     pub size: [u32; 2],
-    /// Pixel format.
+    /// Pixel format of the pictures.
     pub format: PixelFormat,
-    /// When it was submitted, in milliseconds since 1970 UTC.
+    /// Time of submission, in milliseconds since 1970 UTC.
     pub submitted_unix_ms: i64,
-    /// When it ended, likewise; 0 before.
+    /// Time of its end, in milliseconds since 1970 UTC; 0 before.
     pub finished_unix_ms: i64,
 }
 
-/// A frame, ready to leave.
+/// A finished frame: its pixels and its statistics.
 #[derive(Debug)]
 pub struct FinishedFrame {
-    /// Its number in the path.
+    /// Number of the frame in its job, from 0.
     pub number: u64,
     /// Width and height in pixels.
     pub size: [u32; 2],
-    /// Of `bytes`.
+    /// Pixel format of `bytes`.
     pub format: PixelFormat,
-    /// The pixels.
+    /// Pixels, row by row from the top left.
     pub bytes: Bytes,
-    /// Statistics, hashes included.
+    /// Statistics of the frame, with its hashes.
     pub stats: FrameStats,
-    /// The same as one line of JSON.
+    /// `stats` as one line of JSON.
     pub stats_json: String,
-    /// Spans as Chrome trace events (a JSON array), where the client asked for them.
+    /// Spans as a JSON array of Chrome trace events, if the client asked for them.
     pub trace_json: Option<String>,
 }
 
+/// A job in the table.
 pub(crate) struct Job {
     pub(crate) view: JobView,
     pub(crate) request: Arc<PathRequest>,
-    pub(crate) frames: BTreeMap<u64, Arc<FinishedFrame>>,
-    /// Frames done at least once.
-    pub(crate) ever_done: BTreeSet<u64>,
-    /// Frames that a watcher has taken.
-    pub(crate) taken: BTreeSet<u64>,
-    /// Frames asked for that are done but gone.
+    /// Frames that are kept, by number.
+    frames: BTreeMap<u64, Arc<FinishedFrame>>,
+    /// Numbers of frames that were finished at least once.
+    ever_done: BTreeSet<u64>,
+    /// Numbers of frames that a watcher has taken since they were finished last.
+    taken: BTreeSet<u64>,
+    /// Number and bytes of the kept frames that are not in `taken`.
+    untaken: (usize, usize),
+    /// Numbers of frames that were dropped and are asked for again.
     pub(crate) wanted_again: BTreeSet<u64>,
-    /// Whether how to render it is forgotten: a frame that is gone stays gone.
-    pub(crate) retired: bool,
+    /// Whether frames that were dropped can't be rendered again.
+    retired: bool,
 }
 
+impl Job {
+    /// A job without frames.
+    pub(crate) fn new(view: JobView, request: Arc<PathRequest>) -> Job {
+        Job {
+            view,
+            request,
+            frames: BTreeMap::new(),
+            ever_done: BTreeSet::new(),
+            taken: BTreeSet::new(),
+            untaken: (0, 0),
+            wanted_again: BTreeSet::new(),
+            retired: false,
+        }
+    }
+
+    /// Whether it keeps a frame that nobody has taken.
+    pub(crate) fn has_untaken(&self) -> bool {
+        self.untaken.0 > 0
+    }
+
+    fn count_untaken(&mut self, bytes: usize) {
+        self.untaken.0 += 1;
+        self.untaken.1 += bytes;
+    }
+
+    fn discount_untaken(&mut self, bytes: usize) {
+        self.untaken.0 -= 1;
+        self.untaken.1 -= bytes;
+    }
+}
+
+/// All jobs that are remembered.
+///
+/// The driver asks at every event whether there is room for another frame, so the bytes of frames
+/// are counted as they come and go.
 #[derive(Default)]
 pub(crate) struct Table {
-    pub(crate) jobs: BTreeMap<JobId, Job>,
-    pub(crate) by_key: BTreeMap<String, JobId>,
-    pub(crate) next: u64,
-}
-
-/// The table, and two bells: one rings at each tile, the other when anything else changes.
-pub(crate) struct Jobs {
-    table: Mutex<Table>,
-    bell: tokio::sync::watch::Sender<u64>,
-    tiles: tokio::sync::watch::Sender<u64>,
-}
-
-impl Jobs {
-    /// A table whose first job has the number after `next`.
-    pub(crate) fn starting_at(next: u64) -> Self {
-        let table = Table { next, ..Table::default() };
-        Jobs { table: Mutex::new(table), bell: tokio::sync::watch::channel(0).0, tiles: tokio::sync::watch::channel(0).0 }
-    }
-
-    /// The table. Held for moments only, never across an await.
-    pub(crate) fn lock(&self) -> MutexGuard<'_, Table> {
-        self.table.lock().unwrap_or_else(|broken| broken.into_inner())
-    }
-
-    /// Wakes the watchers.
-    pub(crate) fn ring(&self) {
-        self.bell.send_modify(|n| *n += 1);
-    }
-
-    /// A tile was done: watchers look when they next have time for such news ([`NEWS`]).
-    pub(crate) fn ring_tile(&self) {
-        self.tiles.send_modify(|n| *n += 1);
-    }
-
-    /// Both bells.
-    pub(crate) fn listen(&self) -> (tokio::sync::watch::Receiver<u64>, tokio::sync::watch::Receiver<u64>) {
-        (self.bell.subscribe(), self.tiles.subscribe())
-    }
+    jobs: BTreeMap<JobId, Job>,
+    by_key: BTreeMap<String, JobId>,
+    last_id: u64,
+    /// Bytes of all frames that are kept.
+    bytes: usize,
+    /// Bytes of those that nobody has taken, of jobs that are not over.
+    untaken_bytes: usize,
 }
 
 impl Table {
-    /// Bytes of finished frames that wait for somebody to take them, and of all.
-    pub(crate) fn bytes(&self) -> (usize, usize) {
-        let (mut waiting, mut all) = (0, 0);
-        for job in self.jobs.values() {
-            for (n, f) in &job.frames {
-                all += f.bytes.len();
-                if !job.taken.contains(n) && !job.view.state.is_over() {
-                    waiting += f.bytes.len();
-                }
-            }
-        }
-        (waiting, all)
+    pub(crate) fn get(&self, id: JobId) -> Option<&Job> {
+        self.jobs.get(&id)
     }
 
-    /// Drops frames until `budget` holds, oldest jobs and lowest numbers first: those that were
-    /// taken, then those of jobs that are over. A frame of a job in progress that nobody has
-    /// taken stays; so does `newest`, which came just now, until the next one comes. Else one that
-    /// is larger than the budget would be dropped before its watcher sees it, asked for again,
-    /// rendered again and dropped again, for ever.
-    pub(crate) fn evict(&mut self, budget: usize, newest: (JobId, u64)) {
-        let (_, mut all) = self.bytes();
-        for over_too in [false, true] {
-            for (id, job) in &mut self.jobs {
-                let may_go = |n: &u64| {
-                    (*id, *n) != newest
-                        && (job.taken.contains(n) || (over_too && job.view.state.is_over()))
-                };
-                let gone: Vec<u64> = job.frames.keys().copied().filter(may_go).collect();
-                for n in gone {
-                    if all <= budget {
-                        return;
-                    }
-                    if let Some(f) = job.frames.remove(&n) {
-                        all -= f.bytes.len();
-                    }
-                }
-            }
+    /// All jobs, oldest first.
+    pub(crate) fn jobs(&self) -> impl Iterator<Item = &Job> {
+        self.jobs.values()
+    }
+
+    /// The job of a client's key.
+    pub(crate) fn by_key(&self, key: &str) -> Option<&Job> {
+        self.jobs.get(self.by_key.get(key)?)
+    }
+
+    /// Changes what a job's view says, but not its state.
+    pub(crate) fn update(&mut self, id: JobId, change: impl FnOnce(&mut JobView)) {
+        if let Some(job) = self.jobs.get_mut(&id) {
+            change(&mut job.view);
         }
     }
 
-    /// Forgets the oldest ended jobs beyond [`MAX_JOBS`].
-    pub(crate) fn forget(&mut self) {
+    /// Id for the next job.
+    pub(crate) fn next_id(&mut self) -> JobId {
+        self.last_id += 1;
+        JobId(self.last_id)
+    }
+
+    /// Adds a job. Forgets the oldest jobs that are over beyond [`MAX_JOBS`].
+    pub(crate) fn insert(&mut self, job: Job) {
+        self.by_key.insert(job.view.client_key.clone(), job.view.id);
+        self.jobs.insert(job.view.id, job);
         while self.jobs.len() > MAX_JOBS {
             let Some(id) =
                 self.jobs.iter().find(|(_, j)| j.view.state.is_over()).map(|(id, _)| *id)
@@ -205,7 +205,157 @@ impl Table {
             };
             if let Some(job) = self.jobs.remove(&id) {
                 self.by_key.remove(&job.view.client_key);
+                self.bytes -= job.frames.values().map(|f| f.bytes.len()).sum::<usize>();
             }
         }
+    }
+
+    /// Sets the state of a job that is not over.
+    pub(crate) fn set_state(&mut self, id: JobId, state: JobState) {
+        let Some(job) = self.jobs.get_mut(&id) else { return };
+        if job.view.state.is_over() {
+            return;
+        }
+        if state.is_over() {
+            job.view.finished_unix_ms = unix_ms();
+            self.untaken_bytes -= job.untaken.1;
+        }
+        job.view.state = state;
+    }
+
+    /// Notes that dropped frames of a job can't be rendered again.
+    pub(crate) fn retire(&mut self, id: JobId) {
+        if let Some(job) = self.jobs.get_mut(&id) {
+            job.retired = true;
+        }
+    }
+
+    /// Puts a finished frame in. True if it was the last that its job lacked: the job is done
+    /// then, in one step with its last frame, so that whoever sees that frame sees the state.
+    pub(crate) fn put(&mut self, id: JobId, frame: FinishedFrame) -> bool {
+        let Some(job) = self.jobs.get_mut(&id) else { return false };
+        let (number, bytes) = (frame.number, frame.bytes.len());
+        let is_open = !job.view.state.is_over();
+        let was_taken = job.taken.remove(&number);
+        if let Some(before) = job.frames.insert(number, Arc::new(frame)) {
+            let before = before.bytes.len();
+            self.bytes -= before;
+            if !was_taken {
+                job.discount_untaken(before);
+                self.untaken_bytes -= if is_open { before } else { 0 };
+            }
+        }
+        self.bytes += bytes;
+        job.count_untaken(bytes);
+        self.untaken_bytes += if is_open { bytes } else { 0 };
+        job.ever_done.insert(number);
+        job.view.frames_done = job.ever_done.len() as u64;
+        let is_done = job.view.frames_done == job.view.frames_total && is_open;
+        if is_done {
+            self.set_state(id, JobState::Done);
+        }
+        is_done
+    }
+
+    /// Takes a frame for a watcher; the table keeps it.
+    fn take(&mut self, id: JobId, number: u64) -> Option<Arc<FinishedFrame>> {
+        let job = self.jobs.get_mut(&id)?;
+        let frame = job.frames.get(&number)?.clone();
+        if job.taken.insert(number) {
+            job.discount_untaken(frame.bytes.len());
+            if !job.view.state.is_over() {
+                self.untaken_bytes -= frame.bytes.len();
+            }
+        }
+        job.wanted_again.remove(&number);
+        Some(frame)
+    }
+
+    /// Asks for a frame again if it was finished and dropped. True if that is new.
+    fn want_again(&mut self, id: JobId, number: u64) -> bool {
+        let Some(job) = self.jobs.get_mut(&id) else { return false };
+        job.ever_done.contains(&number)
+            && !job.frames.contains_key(&number)
+            && job.wanted_again.insert(number)
+    }
+
+    /// Notes that a frame is being rendered again.
+    pub(crate) fn rendering_again(&mut self, id: JobId, number: u64) {
+        if let Some(job) = self.jobs.get_mut(&id) {
+            job.wanted_again.remove(&number);
+        }
+    }
+
+    /// Bytes of frames that wait for a watcher, of jobs that are not over.
+    pub(crate) fn untaken_bytes(&self) -> usize {
+        self.untaken_bytes
+    }
+
+    /// Drops frames until `budget_bytes` holds, oldest jobs and lowest numbers first: those that
+    /// were taken, then those of jobs that are over. A frame of a job in progress that nobody has
+    /// taken stays; so does `newest`, which came just now, until the next one comes. Else a frame
+    /// larger than the budget would be dropped before its watcher sees it, asked for again,
+    /// rendered again and dropped again, for ever.
+    pub(crate) fn evict(&mut self, budget_bytes: usize, newest: (JobId, u64)) {
+        for over_too in [false, true] {
+            for (id, job) in &mut self.jobs {
+                if self.bytes <= budget_bytes {
+                    return;
+                }
+                let is_over = job.view.state.is_over();
+                let may_go = |n: &u64| {
+                    (*id, *n) != newest && (job.taken.contains(n) || (over_too && is_over))
+                };
+                let droppable: Vec<u64> = job.frames.keys().copied().filter(may_go).collect();
+                for number in droppable {
+                    if self.bytes <= budget_bytes {
+                        return;
+                    }
+                    let Some(frame) = job.frames.remove(&number) else { continue };
+                    self.bytes -= frame.bytes.len();
+                    if !job.taken.contains(&number) {
+                        // The job is over, so the table does not count it.
+                        job.discount_untaken(frame.bytes.len());
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// The table, and two bells: one rings at each tile, the other when anything else changes.
+pub(crate) struct Jobs {
+    table: Mutex<Table>,
+    bell: watch::Sender<u64>,
+    tile_bell: watch::Sender<u64>,
+}
+
+impl Jobs {
+    /// A table whose first job has the id `last_id + 1`.
+    pub(crate) fn starting_after(last_id: u64) -> Self {
+        let table = Table { last_id, ..Table::default() };
+        let [bell, tile_bell] = [(); 2].map(|()| watch::channel(0).0);
+        Jobs { table: Mutex::new(table), bell, tile_bell }
+    }
+
+    /// Locks the table: for moments only, never across an await.
+    pub(crate) fn lock(&self) -> MutexGuard<'_, Table> {
+        self.table.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Wakes the watchers.
+    pub(crate) fn ring(&self) {
+        self.bell.send_modify(|n| *n += 1);
+    }
+
+    /// Tells watchers of a tile. They look when they next have time for such news
+    /// ([`watcher::TILE_NEWS`]).
+    pub(crate) fn ring_tile(&self) {
+        self.tile_bell.send_modify(|n| *n += 1);
+    }
+
+    /// Receivers of both bells.
+    fn listen(&self) -> (watch::Receiver<u64>, watch::Receiver<u64>) {
+        (self.bell.subscribe(), self.tile_bell.subscribe())
     }
 }

@@ -1,11 +1,19 @@
-use super::watch::{Watch, WatchItem};
+//! The table's budget and counters, and what watchers see.
+
+use super::watcher::{TILE_NEWS, Watch, WatchItem};
 use super::*;
+use crate::driver::Event;
 use slabcast_common::image::Background;
 use slabcast_common::message::TransferChoice;
 use slabcast_common::path::{Turntable, ViewPath};
 use slabcast_common::quality::{Quality, Work};
+use std::time::Duration;
+use tokio::sync::mpsc;
+use tokio::time::Instant;
 
-fn frame(number: u64, bytes: usize) -> Arc<FinishedFrame> {
+const JOB: JobId = JobId(1);
+
+fn frame(number: u64, bytes: usize) -> FinishedFrame {
     let stats = FrameStats {
         v: 1,
         frame: number,
@@ -29,7 +37,7 @@ fn frame(number: u64, bytes: usize) -> Arc<FinishedFrame> {
         critical_path: None,
         rehearsed: false,
     };
-    Arc::new(FinishedFrame {
+    FinishedFrame {
         number,
         size: [1, 1],
         format: PixelFormat::Rgb8,
@@ -37,15 +45,14 @@ fn frame(number: u64, bytes: usize) -> Arc<FinishedFrame> {
         stats,
         stats_json: String::new(),
         trace_json: None,
-    })
+    }
 }
 
-/// A table with one job of four frames, of which `done` are there with ten bytes each.
-fn table(state: JobState, done: &[u64]) -> Jobs {
-    let jobs = Jobs::starting_at(0);
-    let id = JobId(1);
+/// A job of `frames` frames that is running.
+fn job(id: JobId, frames: u64) -> Job {
+    let client_key = format!("key {id}");
     let request = PathRequest {
-        client_key: "k".into(),
+        client_key: client_key.clone(),
         path: ViewPath::turn([1, 1], Turntable::default()),
         transfer: TransferChoice::Name("auto".into()),
         quality: Quality::default(),
@@ -57,10 +64,10 @@ fn table(state: JobState, done: &[u64]) -> Jobs {
     };
     let view = JobView {
         id,
-        client_key: "k".into(),
-        state,
-        frames_done: done.len() as u64,
-        frames_total: 4,
+        client_key,
+        state: JobState::Running,
+        frames_done: 0,
+        frames_total: frames,
         tiles: (0, 0),
         slab: (0, 0),
         workers: 1,
@@ -69,66 +76,126 @@ fn table(state: JobState, done: &[u64]) -> Jobs {
         submitted_unix_ms: 0,
         finished_unix_ms: 0,
     };
-    let job = Job {
-        view,
-        request: Arc::new(request),
-        frames: done.iter().map(|&n| (n, frame(n, 10))).collect(),
-        ever_done: done.iter().copied().collect(),
-        taken: BTreeSet::new(),
-        wanted_again: BTreeSet::new(),
-        retired: false,
-    };
-    jobs.lock().jobs.insert(id, job);
-    jobs
+    Job::new(view, Arc::new(request))
 }
 
-fn watch(
-    jobs: &Arc<Jobs>,
-    from: u64,
-) -> (Watch, tokio::sync::mpsc::Receiver<crate::driver::Event>) {
-    let (taken, events) = tokio::sync::mpsc::channel(8);
-    let watch = Watch {
-        jobs: jobs.clone(),
-        job: JobId(1),
-        next: from,
-        bells: jobs.listen(),
-        last_notice: None,
-        quiet: None,
-        taken,
-        over: false,
-    };
-    (watch, events)
+/// A table with one running job of four frames, of which `done` are kept with ten bytes each.
+fn table(done: &[u64]) -> Arc<Jobs> {
+    let jobs = Jobs::starting_after(0);
+    let mut table = jobs.lock();
+    table.insert(job(JOB, 4));
+    for &number in done {
+        table.put(JOB, frame(number, 10));
+    }
+    drop(table);
+    Arc::new(jobs)
+}
+
+fn watch(jobs: &Arc<Jobs>, first: u64) -> (Watch, mpsc::Receiver<Event>) {
+    let (driver, events) = mpsc::channel(8);
+    (Watch::new(jobs.clone(), JOB, first, driver), events)
+}
+
+fn kept(table: &Table) -> Vec<u64> {
+    table.jobs[&JOB].frames.keys().copied().collect()
 }
 
 #[test]
-fn frames_that_nobody_took_are_never_dropped_while_the_job_runs() {
-    let jobs = table(JobState::Running, &[0, 1, 2]);
+fn untaken_frames_are_never_dropped_while_their_job_runs() {
+    let jobs = table(&[0, 1, 2]);
     let mut table = jobs.lock();
-    table.jobs.get_mut(&JobId(1)).unwrap().taken.insert(0);
-    assert_eq!(table.bytes(), (20, 30));
-    table.evict(5, (JobId(1), 2));
-    let left: Vec<u64> = table.jobs[&JobId(1)].frames.keys().copied().collect();
-    assert_eq!(left, [1, 2], "only what was taken goes");
-    table.jobs.get_mut(&JobId(1)).unwrap().view.state = JobState::Done;
-    table.evict(10, (JobId(1), 2));
-    assert_eq!(table.jobs[&JobId(1)].frames.len(), 1, "of a job that is over others go too");
+    assert!(table.take(JOB, 0).is_some());
+    assert_eq!((table.untaken_bytes(), table.bytes), (20, 30));
+    table.evict(5, (JOB, 2));
+    assert_eq!(kept(&table), [1, 2], "only the taken frame goes");
+    table.set_state(JOB, JobState::Failed("for this test".into()));
+    assert_eq!(table.untaken_bytes(), 0);
+    table.evict(10, (JOB, 2));
+    assert_eq!(kept(&table), [2], "of a job that is over others go too");
 }
 
 #[test]
-fn a_frame_larger_than_the_budget_waits_for_its_watcher() {
-    let jobs = table(JobState::Done, &[2, 3]);
+fn frame_larger_than_the_budget_waits_for_its_watcher() {
+    let jobs = table(&[0, 1, 2, 3]);
     let mut table = jobs.lock();
-    let left = |t: &Table| t.jobs[&JobId(1)].frames.keys().copied().collect::<Vec<_>>();
-    table.evict(5, (JobId(1), 3));
-    assert_eq!(left(&table), [3], "the one that came just now stays");
-    table.jobs.get_mut(&JobId(1)).unwrap().frames.insert(0, frame(0, 10));
-    table.evict(5, (JobId(1), 0));
-    assert_eq!(left(&table), [0], "until the next one comes");
+    assert_eq!(table.jobs[&JOB].view.state, JobState::Done);
+    table.evict(5, (JOB, 3));
+    assert_eq!(kept(&table), [3], "the one that came just now stays");
+    table.put(JOB, frame(0, 10));
+    table.evict(5, (JOB, 0));
+    assert_eq!(kept(&table), [0], "until the next one comes");
+}
+
+#[test]
+fn last_frame_and_done_state_come_in_one_step() {
+    let jobs = table(&[0, 1, 2]);
+    let mut table = jobs.lock();
+    assert!(table.put(JOB, frame(3, 10)));
+    let view = &table.jobs[&JOB].view;
+    assert!(view.state == JobState::Done && view.frames_done == 4 && view.finished_unix_ms > 0);
+    assert!(!table.put(JOB, frame(3, 10)), "a frame that is rendered again ends nothing");
+}
+
+/// The counters against sums over all frames, after every step of seeded campaigns.
+#[test]
+fn counted_bytes_are_the_sums_over_all_frames() {
+    for seed in 1..=50u64 {
+        let mut x = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+        let mut below = |n: u64| {
+            x ^= x << 13;
+            x ^= x >> 7;
+            x ^= x << 17;
+            (x >> 11) % n
+        };
+        let mut table = Table::default();
+        for step in 0..400 {
+            let id = JobId(1 + below(4));
+            let number = below(6);
+            match below(8) {
+                0 if table.get(id).is_none() => table.insert(job(id, 6)),
+                1..4 => drop(table.put(id, frame(number, below(30) as usize))),
+                4 | 5 => drop(table.take(id, number)),
+                6 => table.evict(below(200) as usize, (id, number)),
+                _ if below(20) == 0 => table.set_state(id, JobState::Cancelled),
+                _ => {}
+            }
+            let (mut all, mut untaken) = (0, 0);
+            for job in table.jobs.values() {
+                let mut of_job = (0, 0);
+                for (number, frame) in &job.frames {
+                    all += frame.bytes.len();
+                    if !job.taken.contains(number) {
+                        of_job = (of_job.0 + 1, of_job.1 + frame.bytes.len());
+                    }
+                }
+                assert_eq!(job.untaken, of_job, "seed {seed}, step {step}");
+                untaken += if job.view.state.is_over() { 0 } else { of_job.1 };
+            }
+            let counted = (table.bytes, table.untaken_bytes);
+            assert_eq!(counted, (all, untaken), "seed {seed}, step {step}");
+        }
+    }
+}
+
+#[test]
+fn oldest_finished_jobs_are_forgotten_beyond_the_limit() {
+    let mut table = Table::default();
+    for id in 1..=MAX_JOBS as u64 + 2 {
+        table.insert(job(JobId(id), 1));
+        // The first one never ends.
+        if id > 1 {
+            table.put(JobId(id), frame(0, 3));
+        }
+    }
+    assert!(table.get(JobId(1)).is_some(), "a job in progress stays");
+    assert!(table.get(JobId(2)).is_none() && table.get(JobId(3)).is_none());
+    assert!(table.by_key("key job-2").is_none() && table.by_key("key job-4").is_some());
+    assert_eq!(table.bytes, 3 * (MAX_JOBS - 1));
 }
 
 #[tokio::test]
-async fn a_watcher_gets_frames_in_order_and_then_the_final_word() {
-    let jobs = Arc::new(table(JobState::Running, &[1, 0]));
+async fn watcher_gets_frames_in_order_and_then_the_final_state() {
+    let jobs = table(&[1, 0]);
     let (mut watch, _events) = watch(&jobs, 0);
     for want in [0, 1] {
         let Some(WatchItem::Frame(f)) = watch.next().await else { panic!("frame {want}") };
@@ -137,47 +204,51 @@ async fn a_watcher_gets_frames_in_order_and_then_the_final_word() {
     assert!(matches!(watch.next().await, Some(WatchItem::Notice(_))), "frame 2 is not done");
     {
         let mut table = jobs.lock();
-        let job = table.jobs.get_mut(&JobId(1)).unwrap();
-        job.frames.extend([(2, frame(2, 1)), (3, frame(3, 1))]);
-        job.view.state = JobState::Done;
+        table.put(JOB, frame(2, 1));
+        table.put(JOB, frame(3, 1));
     }
     jobs.ring();
     assert!(matches!(watch.next().await, Some(WatchItem::Frame(_))));
     assert!(matches!(watch.next().await, Some(WatchItem::Frame(_))));
-    let Some(WatchItem::Notice(last)) = watch.next().await else { panic!("a last word") };
+    let Some(WatchItem::Notice(last)) = watch.next().await else { panic!("a last notice") };
     assert_eq!(last.state, JobState::Done);
     assert!(watch.next().await.is_none());
 }
 
 #[tokio::test]
-async fn a_frame_that_is_gone_is_asked_for_again() {
-    let jobs = Arc::new(table(JobState::Done, &[1]));
-    jobs.lock().jobs.get_mut(&JobId(1)).unwrap().ever_done.insert(0);
+async fn dropped_frame_is_asked_for_again() {
+    let jobs = table(&[0, 1, 2, 3]);
+    {
+        let mut table = jobs.lock();
+        table.take(JOB, 0);
+        table.evict(35, (JOB, 3));
+        assert_eq!(kept(&table), [1, 2, 3]);
+    }
     let (mut watch, mut events) = watch(&jobs, 0);
     assert!(matches!(watch.next().await, Some(WatchItem::Notice(_))));
     let waiting = tokio::spawn(async move { watch.next().await });
     assert!(events.recv().await.is_some(), "the driver is woken");
-    assert!(jobs.lock().jobs[&JobId(1)].wanted_again.contains(&0));
-    jobs.lock().jobs.get_mut(&JobId(1)).unwrap().frames.insert(0, frame(0, 1));
+    assert!(jobs.lock().jobs[&JOB].wanted_again.contains(&0));
+    jobs.lock().put(JOB, frame(0, 1));
     jobs.ring();
     let Some(WatchItem::Frame(f)) = waiting.await.unwrap() else { panic!("frame 0") };
     assert_eq!(f.number, 0);
 }
 
 #[tokio::test(start_paused = true)]
-async fn of_tiles_a_watcher_hears_now_and_then_and_of_the_last_one() {
-    let jobs = Arc::new(table(JobState::Running, &[0]));
+async fn notices_of_tiles_are_rate_limited_and_the_last_one_comes() {
+    let jobs = table(&[0]);
     let (mut watch, _events) = watch(&jobs, 1);
     assert!(matches!(watch.next().await, Some(WatchItem::Notice(_))));
     let drawn = jobs.clone();
     let drawing = tokio::spawn(async move {
         for tile in 1..=1000 {
             tokio::time::sleep(Duration::from_millis(1)).await;
-            drawn.lock().jobs.get_mut(&JobId(1)).unwrap().view.tiles = (tile, 1000);
+            drawn.lock().update(JOB, |view| view.tiles = (tile, 1000));
             drawn.ring_tile();
         }
-        // A frame waits for nobody.
-        drawn.lock().jobs.get_mut(&JobId(1)).unwrap().frames.insert(1, frame(1, 1));
+        // A frame waits for no quiet time.
+        drawn.lock().put(JOB, frame(1, 1));
         drawn.ring();
     });
     let began = Instant::now();
@@ -185,20 +256,22 @@ async fn of_tiles_a_watcher_hears_now_and_then_and_of_the_last_one() {
     while let Some(WatchItem::Notice(view)) = watch.next().await {
         (notices, last) = (notices + 1, view.tiles.0);
     }
-    assert!((20..=26).contains(&notices), "{notices} notices of 1000 tiles in a second");
+    let most = 1000 / TILE_NEWS.as_millis() as usize + 1;
+    assert!((most - 6..=most).contains(&notices), "{notices} notices of 1000 tiles in a second");
     assert!(last >= 950, "the last was of tile {last}");
     assert_eq!(began.elapsed(), Duration::from_secs(1), "the frame came at once");
     drawing.await.unwrap();
     // A tile after which nothing happens is told of.
-    jobs.lock().jobs.get_mut(&JobId(1)).unwrap().view.tiles = (1, 64);
+    jobs.lock().update(JOB, |view| view.tiles = (1, 64));
     jobs.ring_tile();
     let Some(WatchItem::Notice(view)) = watch.next().await else { panic!("a notice") };
     assert_eq!(view.tiles, (1, 64));
 }
 
 #[tokio::test]
-async fn a_watcher_of_a_cancelled_job_is_told_and_let_go() {
-    let jobs = Arc::new(table(JobState::Cancelled, &[]));
+async fn watcher_of_a_cancelled_job_is_told_and_ends() {
+    let jobs = table(&[]);
+    jobs.lock().set_state(JOB, JobState::Cancelled);
     let (mut watch, _events) = watch(&jobs, 0);
     let Some(WatchItem::Notice(last)) = watch.next().await else { panic!("told") };
     assert_eq!(last.state, JobState::Cancelled);

@@ -1,114 +1,151 @@
 //! A watcher: a cursor over the frames of a job.
 
 use super::{FinishedFrame, JobState, JobView, Jobs};
+use crate::driver::Event;
 use slabcast_common::ids::JobId;
 use std::sync::Arc;
 use std::time::Duration;
+use tokio::sync::mpsc;
 use tokio::sync::watch::{self, error::RecvError};
 use tokio::time::Instant;
 
 /// What a watcher gets next.
 #[derive(Clone, Debug)]
 pub enum WatchItem {
-    /// Something about the job changed (also before the first frame).
+    /// The job changed; also sent before the first frame.
     Notice(JobView),
     /// The next frame, in order.
     Frame(Arc<FinishedFrame>),
 }
 
-/// How often a watcher hears of tiles. A frame of 64 tiles may take 20 ms: a notice each woke a thread
-/// some 3000 times a second, and was 3 % of a processor.
-pub(crate) const NEWS: Duration = Duration::from_millis(40);
+/// Shortest time between two notices that tell of tiles alone. A frame of 64 tiles may take 20 ms:
+/// a notice for each tile woke a thread some 3000 times a second, 3 % of a processor.
+pub(crate) const TILE_NEWS: Duration = Duration::from_millis(40);
 
-/// What a notice tells: state, frames done, tiles, slab, workers.
-pub(crate) type Told = (JobState, u64, (u32, u32), (u32, u32), u32);
+/// What a notice tells, to be compared with the next one.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct News {
+    state: JobState,
+    frames_done: u64,
+    workers: u32,
+    tiles: (u32, u32),
+    slab: (u32, u32),
+}
 
-/// A cursor over a job's frames.
+impl News {
+    fn new(view: &JobView) -> News {
+        News {
+            state: view.state.clone(),
+            frames_done: view.frames_done,
+            workers: view.workers,
+            tiles: view.tiles,
+            slab: view.slab,
+        }
+    }
+
+    /// Whether `next` tells something else, apart from tiles and slabs.
+    fn differs_beyond_tiles(&self, next: &News) -> bool {
+        (&self.state, self.frames_done, self.workers)
+            != (&next.state, next.frames_done, next.workers)
+    }
+}
+
+/// A cursor over a job's frames, from [`crate::Handle::watch`].
 pub struct Watch {
-    pub(crate) jobs: Arc<Jobs>,
-    pub(crate) job: JobId,
-    pub(crate) next: u64,
-    pub(crate) bells: (watch::Receiver<u64>, watch::Receiver<u64>),
-    pub(crate) last_notice: Option<Told>,
+    jobs: Arc<Jobs>,
+    job: JobId,
+    /// Number of the next frame.
+    next: u64,
+    bell: watch::Receiver<u64>,
+    tile_bell: watch::Receiver<u64>,
+    last_notice: Option<News>,
     /// Until when it does not listen to tiles.
-    pub(crate) quiet: Option<Instant>,
-    pub(crate) taken: tokio::sync::mpsc::Sender<crate::driver::Event>,
-    pub(crate) over: bool,
+    quiet_until: Option<Instant>,
+    driver: mpsc::Sender<Event>,
+    is_over: bool,
 }
 
 impl Watch {
-    /// The next notice or frame; `None` after the last frame, or after the notice that says
-    /// that there will be none.
+    /// A watcher of `job` from frame `next` on.
+    pub(crate) fn new(
+        jobs: Arc<Jobs>,
+        job: JobId,
+        next: u64,
+        driver: mpsc::Sender<Event>,
+    ) -> Watch {
+        let (bell, tile_bell) = jobs.listen();
+        let (last_notice, quiet_until, is_over) = (None, None, false);
+        Watch { jobs, job, next, bell, tile_bell, last_notice, quiet_until, driver, is_over }
+    }
+
+    /// Waits for the next notice or frame. Returns `None` after the last frame, or after the
+    /// notice which says that there will be no more. Frames come in order; each is marked as
+    /// taken, which lets the master drop it when it needs room.
     pub async fn next(&mut self) -> Option<WatchItem> {
         loop {
-            if self.over {
+            if self.is_over {
                 return None;
             }
-            let poke = {
-                // Seen before the table is read, so that no ring is missed.
-                self.bells.0.borrow_and_update();
-                let quiet = self.quiet.is_some_and(|until| Instant::now() < until);
-                if !quiet {
-                    self.bells.1.borrow_and_update();
+            let wake_driver = {
+                // Marked as seen before the table is read, so that no ring is missed.
+                self.bell.borrow_and_update();
+                let is_quiet = self.quiet_until.is_some_and(|until| Instant::now() < until);
+                if !is_quiet {
+                    self.tile_bell.borrow_and_update();
                 }
                 let mut table = self.jobs.lock();
-                let Some(job) = table.jobs.get_mut(&self.job) else {
-                    self.over = true;
-                    return None;
-                };
-                if let Some(frame) = job.frames.get(&self.next).cloned() {
-                    job.taken.insert(self.next);
-                    job.wanted_again.remove(&self.next);
+                if let Some(frame) = table.take(self.job, self.next) {
                     self.next += 1;
                     drop(table);
                     // The driver may render ahead again. If it is busy it will see for itself.
-                    let _ = self.taken.try_send(crate::driver::Event::FrameTaken);
+                    let _ = self.driver.try_send(Event::FrameTaken);
                     return Some(WatchItem::Frame(frame));
                 }
-                let v = &job.view;
-                let now = (v.state.clone(), v.frames_done, v.tiles, v.slab, v.workers);
-                if self.next >= v.frames_total
-                    || matches!(v.state, JobState::Failed(_) | JobState::Cancelled)
+                let Some(job) = table.get(self.job) else {
+                    self.is_over = true;
+                    return None;
+                };
+                let view = &job.view;
+                if self.next >= view.frames_total
+                    || matches!(view.state, JobState::Failed(_) | JobState::Cancelled)
                     || job.retired
                 {
-                    self.over = true;
-                    return Some(WatchItem::Notice(v.clone()));
+                    self.is_over = true;
+                    return Some(WatchItem::Notice(view.clone()));
                 }
-                let news = |last: &Told| {
-                    let (was, is) = ((&last.0, last.1, last.4), (&now.0, now.1, now.4));
-                    was != is || !quiet && (last.2, last.3) != (now.2, now.3)
-                };
-                if self.last_notice.as_ref().is_none_or(news) {
-                    self.last_notice = Some(now);
-                    self.quiet = Some(Instant::now() + NEWS);
-                    return Some(WatchItem::Notice(v.clone()));
+                let news = News::new(view);
+                let is_new = self.last_notice.as_ref().is_none_or(|last| {
+                    last.differs_beyond_tiles(&news) || !is_quiet && *last != news
+                });
+                if is_new {
+                    self.last_notice = Some(news);
+                    self.quiet_until = Some(Instant::now() + TILE_NEWS);
+                    return Some(WatchItem::Notice(view.clone()));
                 }
-                // Done once and gone since: ask for it again.
-                job.ever_done.contains(&self.next) && job.wanted_again.insert(self.next)
+                table.want_again(self.job, self.next)
             };
-            if poke && self.taken.send(crate::driver::Event::FrameTaken).await.is_err() {
-                self.over = true;
+            if wake_driver && self.driver.send(Event::FrameTaken).await.is_err() {
+                self.is_over = true;
                 return None;
             }
             if self.rung().await.is_err() {
-                self.over = true;
+                self.is_over = true;
                 return None;
             }
         }
     }
 
-    /// Waits until there may be something new.
+    /// Waits for a bell; for the one of tiles only after the quiet time.
     async fn rung(&mut self) -> Result<(), RecvError> {
-        let (bell, tiles) = &mut self.bells;
-        let quiet = self.quiet;
+        let quiet_until = self.quiet_until;
         let tile = async {
-            if let Some(until) = quiet {
+            if let Some(until) = quiet_until {
                 tokio::time::sleep_until(until).await;
             }
-            tiles.changed().await
+            self.tile_bell.changed().await
         };
         tokio::select! {
-            rung = bell.changed() => rung,
+            rung = self.bell.changed() => rung,
             rung = tile => rung,
         }
     }

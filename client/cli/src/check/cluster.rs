@@ -10,7 +10,7 @@ use slabcast_common::path::{Orientation, ViewPath};
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::volume::{Digest32, Volume};
-use slabcast_master::driver::SubmitError;
+use slabcast_master::SubmitError;
 use slabcast_master::jobs::{FinishedFrame, JobState, WatchItem};
 use slabcast_master::{Handle, Master, MasterConfig};
 use slabcast_render::Simd;

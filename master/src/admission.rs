@@ -1,0 +1,279 @@
+//! Workers of this master: who is let in, and the link to each.
+//!
+//! The scheduler knows workers by id, threads and memory; this table has what it need not know:
+//! links, addresses, names, when each was last heard.
+
+use crate::link::{Caller, WorkerLink};
+use slabcast_common::ids::WorkerId;
+use slabcast_common::message::{Hello, ToMaster, ToWorker};
+use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
+use slabcast_proto::model::Worker;
+use slabcast_schedule::WorkerView;
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+/// Most render threads of one worker.
+pub const MAX_THREADS: u32 = 4096;
+
+/// Why a worker is not let in. Its text names what the worker has, what the master has, and the
+/// remedy.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum AttachError {
+    /// The worker speaks another protocol version.
+    #[error(
+        "the worker speaks protocol {worker}, this master {PROTOCOL_VERSION}; run the same version \
+         of slabcast on both"
+    )]
+    Protocol {
+        /// The worker's protocol version.
+        worker: u32,
+    },
+    /// The worker draws other pixels.
+    #[error(
+        "the worker draws pixels of version {worker}, this master expects {PIXELS_VERSION}; run \
+         the same version of slabcast on both"
+    )]
+    Pixels {
+        /// The worker's pixels version.
+        worker: u32,
+    },
+    /// The worker's self-test tile has another hash.
+    #[error(
+        "the worker's self-test tile hashes to {worker}, it must be {SELF_TEST_SHA256}; its \
+         machine or build rounds differently, use an official build"
+    )]
+    SelfTest {
+        /// The worker's hash in hexadecimal, at most 64 characters of it.
+        worker: String,
+    },
+    /// The worker has no render threads, or more than [`MAX_THREADS`].
+    #[error("{worker} render threads; give 1 to {MAX_THREADS}")]
+    Threads {
+        /// The worker's render threads.
+        worker: u32,
+    },
+    /// The worker rehearses a trace, and the master does not.
+    #[error(
+        "the worker rehearses: it holds tiles for a recorded time and draws nothing; start it \
+         without --rehearse, or rehearse with a master of its own (slabcast master --rehearse)"
+    )]
+    Rehearses,
+    /// The master rehearses, and the worker does not.
+    #[error(
+        "this master rehearses and marks its pictures; start the worker with --rehearse TRACE, or \
+         the master without"
+    )]
+    Draws,
+    /// The master is shutting down.
+    #[error("the master is shutting down; come back later")]
+    ShuttingDown,
+}
+
+/// Checks a hello. `rehearses`: whether the master does.
+fn check(hello: &Hello, rehearses: bool) -> Result<(), AttachError> {
+    if hello.protocol_version != PROTOCOL_VERSION {
+        return Err(AttachError::Protocol { worker: hello.protocol_version });
+    }
+    if hello.pixels_version != PIXELS_VERSION {
+        return Err(AttachError::Pixels { worker: hello.pixels_version });
+    }
+    if hello.self_test_sha256 != SELF_TEST_SHA256 {
+        let worker = hello.self_test_sha256.chars().take(64).collect();
+        return Err(AttachError::SelfTest { worker });
+    }
+    if !(1..=MAX_THREADS).contains(&hello.threads) {
+        return Err(AttachError::Threads { worker: hello.threads });
+    }
+    match (hello.rehearses, rehearses) {
+        (true, false) => Err(AttachError::Rehearses),
+        (false, true) => Err(AttachError::Draws),
+        _ => Ok(()),
+    }
+}
+
+/// One worker's link and what is known of it.
+struct Attached {
+    link: WorkerLink,
+    address: String,
+    simd: String,
+    memory_budget_bytes: u64,
+    tasks_done: u64,
+    last_heard: Instant,
+    joined: Instant,
+    leaving: bool,
+}
+
+/// A worker that was let in.
+pub(crate) struct Admitted {
+    pub(crate) worker: WorkerId,
+    /// Whether it draws on the master's machine.
+    pub(crate) is_local: bool,
+}
+
+/// All workers that are linked.
+pub(crate) struct WorkerTable {
+    attached: BTreeMap<WorkerId, Attached>,
+    next_id: u64,
+    /// Whether this master rehearses.
+    rehearses: bool,
+    /// Name of this machine; empty if unknown.
+    machine: String,
+    /// Milliseconds between pings, as workers are told.
+    heartbeat_ms: u32,
+}
+
+impl WorkerTable {
+    /// A table without workers. Workers give a master up after three times `heartbeat_ms`.
+    pub(crate) fn new(rehearses: bool, machine: String, heartbeat_ms: u32) -> Self {
+        WorkerTable { attached: BTreeMap::new(), next_id: 1, rehearses, machine, heartbeat_ms }
+    }
+
+    /// Lets a worker in and welcomes it.
+    ///
+    /// # Errors
+    /// [`AttachError`] says what of its hello does not fit this master.
+    pub(crate) fn admit(
+        &mut self,
+        hello: &Hello,
+        caller: Caller,
+        link: WorkerLink,
+    ) -> Result<Admitted, AttachError> {
+        check(hello, self.rehearses)?;
+        let worker = WorkerId(self.next_id);
+        self.next_id += 1;
+        // A worker that rehearses stands for one on another machine.
+        let is_local = caller.is_on(&hello.machine, &self.machine) && !hello.rehearses;
+        let _ = link.control.send(ToWorker::Welcome { worker, heartbeat_ms: self.heartbeat_ms });
+        let now = Instant::now();
+        let attached = Attached {
+            link,
+            address: caller.address,
+            simd: hello.simd.clone(),
+            memory_budget_bytes: hello.memory_budget_bytes,
+            tasks_done: 0,
+            last_heard: now,
+            joined: now,
+            leaving: false,
+        };
+        self.attached.insert(worker, attached);
+        Ok(Admitted { worker, is_local })
+    }
+
+    /// Notes that a worker said `message`; false if there is no such worker.
+    pub(crate) fn heard(&mut self, worker: WorkerId, message: &ToMaster) -> bool {
+        let Some(attached) = self.attached.get_mut(&worker) else { return false };
+        attached.last_heard = Instant::now();
+        attached.tasks_done += u64::from(matches!(message, ToMaster::Result(_)));
+        attached.leaving |= matches!(message, ToMaster::Leaving { .. });
+        true
+    }
+
+    /// Closes a worker's link. Returns whether it had said that it leaves; `None` if there is no
+    /// such worker.
+    pub(crate) fn remove(&mut self, worker: WorkerId) -> Option<bool> {
+        self.attached.remove(&worker).map(|a| a.leaving)
+    }
+
+    /// A worker's link.
+    pub(crate) fn link(&self, worker: WorkerId) -> Option<&WorkerLink> {
+        self.attached.get(&worker).map(|a| &a.link)
+    }
+
+    /// All links.
+    pub(crate) fn links(&self) -> impl Iterator<Item = &WorkerLink> {
+        self.attached.values().map(|a| &a.link)
+    }
+
+    /// Number of workers.
+    pub(crate) fn len(&self) -> usize {
+        self.attached.len()
+    }
+
+    /// A worker as `slabcast status` lists it: what the scheduler says, with its link's figures.
+    pub(crate) fn view(&self, seen: WorkerView) -> Option<Worker> {
+        let ms = |since: Instant| since.elapsed().as_millis() as u64;
+        let attached = self.attached.get(&seen.id)?;
+        Some(Worker {
+            id: seen.id,
+            name: seen.name,
+            address: attached.address.clone(),
+            threads: seen.threads,
+            simd: attached.simd.clone(),
+            memory_budget_bytes: attached.memory_budget_bytes,
+            held_bytes: seen.bytes_held,
+            held_bricks: seen.bricks_held,
+            tasks_lent: seen.leases,
+            tasks_done: attached.tasks_done,
+            silent_ms: ms(attached.last_heard),
+            here_ms: ms(attached.joined),
+            in_reserve: seen.in_reserve,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn hello() -> Hello {
+        Hello {
+            protocol_version: PROTOCOL_VERSION,
+            pixels_version: PIXELS_VERSION,
+            name: "w".into(),
+            threads: 2,
+            memory_budget_bytes: 1 << 20,
+            simd: "plain".into(),
+            self_test_sha256: SELF_TEST_SHA256.into(),
+            held: vec![],
+            rehearses: false,
+            machine: String::new(),
+        }
+    }
+
+    #[test]
+    fn hello_that_does_not_fit_is_refused_and_the_text_names_both_sides() {
+        let next = PROTOCOL_VERSION + 1;
+        let wrong = "0".repeat(70);
+        for (hello, want, says) in [
+            (
+                Hello { protocol_version: next, ..hello() },
+                AttachError::Protocol { worker: next },
+                [format!("protocol {next}"), format!("master {PROTOCOL_VERSION}")],
+            ),
+            (
+                Hello { pixels_version: 99, ..hello() },
+                AttachError::Pixels { worker: 99 },
+                ["version 99".into(), format!("expects {PIXELS_VERSION}")],
+            ),
+            (
+                Hello { self_test_sha256: wrong.clone(), ..hello() },
+                AttachError::SelfTest { worker: wrong[..64].into() },
+                [wrong[..64].into(), SELF_TEST_SHA256.into()],
+            ),
+            (
+                Hello { threads: 0, ..hello() },
+                AttachError::Threads { worker: 0 },
+                ["0 render threads".into(), "1 to 4096".into()],
+            ),
+            (
+                Hello { threads: MAX_THREADS + 1, ..hello() },
+                AttachError::Threads { worker: MAX_THREADS + 1 },
+                ["4097 render threads".into(), "1 to 4096".into()],
+            ),
+        ] {
+            let refused = check(&hello, false).expect_err("it does not fit");
+            assert_eq!(refused, want);
+            let text = refused.to_string();
+            assert!(says.iter().all(|s| text.contains(s)), "{text}");
+        }
+    }
+
+    #[test]
+    fn workers_that_rehearse_and_masters_that_do_not_are_kept_apart() {
+        let rehearsing = Hello { rehearses: true, ..hello() };
+        assert_eq!(check(&rehearsing, false), Err(AttachError::Rehearses));
+        assert_eq!(check(&hello(), true), Err(AttachError::Draws));
+        assert_eq!(check(&rehearsing, true), Ok(()));
+        assert_eq!(check(&hello(), false), Ok(()));
+    }
+}

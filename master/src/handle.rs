@@ -1,0 +1,261 @@
+//! Starting a master, and speaking to it: for links, services and embedding programs.
+
+use crate::admission::{AttachError, WorkerTable};
+use crate::driver::{Driver, Event};
+use crate::finishers::Finishers;
+use crate::hooks::{Hooks, Stage};
+use crate::jobs::submit::{Plan, SubmitError, check_key};
+use crate::jobs::{JobView, Jobs, Watch};
+use crate::link::{Caller, WorkerLink};
+use crate::panics::caught;
+use crate::record::{Recorder, Watched};
+use slabcast_common::ids::{JobId, WorkerId};
+use slabcast_common::message::{Hello, PathRequest, ToMaster};
+use slabcast_common::path::Orientation;
+use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_proto::model::Worker;
+use std::sync::Arc;
+use std::time::SystemTime;
+use tokio::sync::{Semaphore, mpsc, oneshot};
+
+/// Requests that are checked at a time: with two, a path of 100,000 views does not hold up a short
+/// one. Each may take 50 MB of views.
+const PLANS_AT_ONCE: usize = 2;
+
+/// Events that wait for the driver before whoever sends one has to wait.
+const INBOX: usize = 1024;
+
+/// Settings of a master.
+pub struct MasterConfig {
+    /// The volume that the master serves.
+    pub volume: Arc<Volume>,
+    /// Axes of the volume that are up and front.
+    pub orientation: Orientation,
+    /// Bytes of finished frames that the master keeps.
+    pub frame_budget_bytes: usize,
+    /// Settings of the scheduler.
+    pub schedule: slabcast_schedule::Config,
+    /// Where the scheduler's events and decisions are recorded ([`crate::record::start`]).
+    pub record: Option<Recorder>,
+    /// Whether to let in only workers that rehearse, and mark the pictures.
+    pub rehearse: bool,
+    /// Name of this machine, by which its workers are told from others'; empty if unknown.
+    pub machine: String,
+    pub(crate) hooks: Hooks,
+}
+
+impl MasterConfig {
+    /// Returns the defaults for `volume`: 256 MiB of finished frames (64 frames of 1024x1024
+    /// RGBA8), no record, no rehearsal.
+    pub fn new(volume: impl Into<Arc<Volume>>, orientation: Orientation) -> Self {
+        MasterConfig {
+            volume: volume.into(),
+            orientation,
+            frame_budget_bytes: 256 << 20,
+            schedule: slabcast_schedule::Config::default(),
+            record: None,
+            rehearse: false,
+            machine: String::new(),
+            hooks: Hooks::default(),
+        }
+    }
+}
+
+/// Description of the volume that a master serves.
+#[derive(Clone, Debug)]
+pub struct ServedVolume {
+    /// Name of the volume's file, without folders.
+    pub name: String,
+    /// Sample type in the file.
+    pub file_type: String,
+    /// Whether world axes are anatomical (left, posterior, superior).
+    pub anatomical: bool,
+    /// Lattice, range of values, histogram and digest.
+    pub info: VolumeInfo,
+    /// Axes of the volume that are up and front.
+    pub orientation: Orientation,
+}
+
+/// A running master. Dropped without [`Master::shutdown`], its driver goes on until the last
+/// [`Handle`] is gone.
+pub struct Master {
+    handle: Handle,
+    thread: Option<std::thread::JoinHandle<()>>,
+}
+
+impl Master {
+    /// Starts a master's driver and finishers.
+    ///
+    /// # Errors
+    /// If the system gives no thread.
+    pub fn start(config: MasterConfig) -> std::io::Result<Master> {
+        let digest = config.volume.digest();
+        let served = Arc::new(ServedVolume {
+            name: config.volume.name.clone(),
+            file_type: config.volume.file_type.clone(),
+            anatomical: config.volume.anatomical,
+            info: config.volume.info(digest),
+            orientation: config.orientation,
+        });
+        let (inbox, events) = mpsc::channel(INBOX);
+        // Ids are never used again, not even by the next master at this address: a client that
+        // takes up its watch must not see another's job.
+        let jobs = Arc::new(Jobs::starting_after(unix_ms() as u64));
+        let finishers = Finishers::start(&inbox, &config.hooks)?;
+        let handle = Handle {
+            inbox: inbox.clone(),
+            jobs: jobs.clone(),
+            served: served.clone(),
+            planning: Arc::new(Semaphore::new(PLANS_AT_ONCE)),
+            hooks: config.hooks.clone(),
+        };
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build()?;
+        // A worker gives its master up after three heartbeats, as the master gives up a worker
+        // after `silence`.
+        let heartbeat_ms = (config.schedule.silence / 3000).min(u32::MAX.into()) as u32;
+        let workers = WorkerTable::new(config.rehearse, config.machine, heartbeat_ms);
+        let scheduler = Watched::new(config.schedule, config.record);
+        let driver = Driver::new(
+            (config.volume, served),
+            config.frame_budget_bytes,
+            config.rehearse,
+            scheduler,
+            workers,
+            jobs,
+            (inbox, finishers),
+            config.hooks,
+        );
+        let thread = std::thread::Builder::new()
+            .name("slabcast-master".into())
+            .spawn(move || runtime.block_on(driver.run(events)))?;
+        Ok(Master { handle, thread: Some(thread) })
+    }
+
+    /// Returns a handle to the master.
+    pub fn handle(&self) -> Handle {
+        self.handle.clone()
+    }
+
+    /// Tells workers to leave, ends the driver and waits for it. Jobs in progress fail.
+    pub async fn shutdown(mut self) {
+        let _ = self.handle.inbox.send(Event::Shutdown).await;
+        if let Some(thread) = self.thread.take() {
+            let _ = tokio::task::spawn_blocking(move || thread.join()).await;
+        }
+    }
+}
+
+/// A handle to a running master; cheap to clone.
+#[derive(Clone)]
+pub struct Handle {
+    inbox: mpsc::Sender<Event>,
+    jobs: Arc<Jobs>,
+    served: Arc<ServedVolume>,
+    planning: Arc<Semaphore>,
+    hooks: Hooks,
+}
+
+impl Handle {
+    /// Returns the description of the volume that is served.
+    pub fn volume(&self) -> &ServedVolume {
+        &self.served
+    }
+
+    /// Submits a view path and returns its job. A request that was submitted before under its
+    /// `client_key` gives the job of that time. Must be called inside a tokio runtime: the
+    /// request is checked on one of its blocking threads.
+    ///
+    /// # Errors
+    /// [`SubmitError::Refused`] names a field that can't be used; the others say why the master
+    /// takes no such job now.
+    pub async fn submit(&self, request: PathRequest) -> Result<JobId, SubmitError> {
+        check_key(&request.client_key)?;
+        if let Some(job) = self.jobs.lock().by_key(&request.client_key) {
+            return if *job.request == request {
+                Ok(job.view.id)
+            } else {
+                Err(SubmitError::KeyTaken)
+            };
+        }
+        let place = self.planning.clone().acquire_owned().await.map_err(|_| SubmitError::Gone)?;
+        let (served, hooks) = (self.served.clone(), self.hooks.clone());
+        let planned = tokio::task::spawn_blocking(move || {
+            let _place = place;
+            caught("checking the request", || {
+                hooks.reach(Stage::Plan);
+                Plan::new(request, &served)
+            })
+        });
+        let plan = planned.await.map_err(|_| SubmitError::Gone)?;
+        let plan = Box::new(plan.map_err(|e| SubmitError::Panicked(e.to_string()))??);
+        let (reply, answer) = oneshot::channel();
+        if self.inbox.send(Event::Submit { plan, reply }).await.is_err() {
+            return Err(SubmitError::Gone);
+        }
+        answer.await.map_err(|_| SubmitError::Gone)?
+    }
+
+    /// Returns a watcher of a job that starts with frame `first`; `None` if there is no such job.
+    pub fn watch(&self, job: JobId, first: u64) -> Option<Watch> {
+        self.jobs.lock().get(job)?;
+        Some(Watch::new(self.jobs.clone(), job, first, self.inbox.clone()))
+    }
+
+    /// Returns one job, if it is remembered.
+    pub fn job(&self, job: JobId) -> Option<JobView> {
+        self.jobs.lock().get(job).map(|job| job.view.clone())
+    }
+
+    /// Returns all jobs that are remembered, oldest first.
+    pub fn jobs(&self) -> Vec<JobView> {
+        self.jobs.lock().jobs().map(|job| job.view.clone()).collect()
+    }
+
+    /// Cancels a job. Returns false if there is none or its frames are no longer rendered.
+    pub async fn cancel(&self, job: JobId) -> bool {
+        let (reply, answer) = oneshot::channel();
+        self.inbox.send(Event::Cancel { job, reply }).await.is_ok() && answer.await.unwrap_or(false)
+    }
+
+    /// Returns the workers that are linked; none when the master is gone.
+    pub async fn workers(&self) -> Vec<Worker> {
+        let (reply, answer) = oneshot::channel();
+        if self.inbox.send(Event::Workers { reply }).await.is_err() {
+            return Vec::new();
+        }
+        answer.await.unwrap_or_default()
+    }
+
+    /// Lets a worker in and returns its id. The driver then sends to it over `link`, first a
+    /// welcome.
+    ///
+    /// # Errors
+    /// [`AttachError`] says what of the hello does not fit, in words for the worker's operator.
+    pub async fn attach(
+        &self,
+        hello: Hello,
+        caller: Caller,
+        link: WorkerLink,
+    ) -> Result<WorkerId, AttachError> {
+        let (reply, answer) = oneshot::channel();
+        let event = Event::Attach { hello, caller, link, reply };
+        self.inbox.send(event).await.map_err(|_| AttachError::ShuttingDown)?;
+        answer.await.map_err(|_| AttachError::ShuttingDown)?
+    }
+
+    /// Passes a worker's message to the driver. Returns false when the master is gone.
+    pub async fn worker_said(&self, worker: WorkerId, message: ToMaster) -> bool {
+        self.inbox.send(Event::Said { worker, message }).await.is_ok()
+    }
+
+    /// Tells the driver that a worker's link has ended, and why.
+    pub async fn detach(&self, worker: WorkerId, reason: String) {
+        let _ = self.inbox.send(Event::Detached { worker, reason }).await;
+    }
+}
+
+/// Returns wall time in milliseconds since 1970 UTC, for people: nothing is decided by it.
+pub(crate) fn unix_ms() -> i64 {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    since.map_or(0, |d| d.as_millis() as i64)
+}

@@ -636,3 +636,6 @@ impl Driver {
         self.refresh_states();
     }
 }
+
+#[cfg(test)]
+mod tests;

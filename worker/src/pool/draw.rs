@@ -3,15 +3,18 @@
 use super::task::{Came, Drawn, Going, Gone, Ready, Rendered, Watched};
 use slabcast_common::leaves::Leaves;
 use slabcast_common::message::{HandedOver, Pixels, Sampling};
-use slabcast_render::region::{BrickSupply, FinishedRegion, Region};
 use slabcast_render::Simd;
+use slabcast_render::region::{BrickSupply, FinishedRegion, Region};
 use slabcast_render::tile::{self, Scratch};
 use std::panic::AssertUnwindSafe;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 /// What `work` gives, or in words how the renderer failed; its memory is not used again then.
-pub(super) fn caught<T>(scratch: &mut Scratch, work: impl FnOnce(&mut Scratch) -> T) -> Result<T, String> {
+pub(super) fn caught<T>(
+    scratch: &mut Scratch,
+    work: impl FnOnce(&mut Scratch) -> T,
+) -> Result<T, String> {
     std::panic::catch_unwind(AssertUnwindSafe(|| work(scratch))).map_err(|panic| {
         *scratch = Scratch::default();
         let text = panic

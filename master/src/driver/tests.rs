@@ -1,0 +1,237 @@
+//! Panics and long requests beside the driver: what fails is one job, and the driver goes on.
+
+use super::*;
+use crate::handle::{Handle, Master, MasterConfig};
+use crate::jobs::WatchItem;
+use slabcast_common::image::{Background, PixelFormat, TilePixels};
+use slabcast_common::message::{
+    Counters, PathRequest, Pixels, RegionCost, TaskTimes, TileResult, TransferChoice,
+};
+use slabcast_common::path::{Orientation, Turntable, ViewPath};
+use slabcast_common::quality::{Quality, Work};
+use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Condvar, Mutex};
+
+const SIZE: [u32; 2] = [64, 48];
+
+fn master(hooks: Hooks, heartbeat: Micros) -> Master {
+    let volume = Volume::from_fn_u8("v", [24; 3], |i, j, k| (i * 7 + j * 3 + k) as u8);
+    let mut config = MasterConfig::new(volume, Orientation::new(None, None).expect("defaults"));
+    config.hooks = hooks;
+    config.schedule.heartbeat = heartbeat;
+    Master::start(config).expect("a master")
+}
+
+fn request(key: &str, frames: u32, preset: &str) -> PathRequest {
+    PathRequest {
+        client_key: key.into(),
+        path: ViewPath::turn(SIZE, Turntable { frames, ..Turntable::default() }),
+        transfer: TransferChoice::Name(preset.into()),
+        quality: Quality::default(),
+        work: Work::default(),
+        format: PixelFormat::Rgb8,
+        background: Background::Transparent,
+        want_trace: false,
+        want_hash: true,
+    }
+}
+
+/// A worker that draws nothing: it answers each lease with clear pixels, and pings with pongs.
+/// Counts the pings in `pings`.
+fn join(handle: &Handle, pings: Arc<AtomicUsize>) {
+    let mut end = crate::link::embedded(handle.clone());
+    tokio::spawn(async move {
+        let hello = Hello {
+            protocol_version: PROTOCOL_VERSION,
+            pixels_version: PIXELS_VERSION,
+            name: "clear".into(),
+            threads: 1,
+            memory_budget_bytes: 1 << 30,
+            simd: "none".into(),
+            self_test_sha256: SELF_TEST_SHA256.into(),
+            held: vec![],
+            rehearses: false,
+            machine: String::new(),
+        };
+        let _ = end.replies.send(ToMaster::Hello(hello)).await;
+        while let Some(message) = end.control.recv().await {
+            let reply = match message {
+                ToWorker::Region(lease) => {
+                    let n = lease.tile.area();
+                    let pixels =
+                        TilePixels { a: vec![0.0; n], colour: vec![[0; 3]; n], last: None };
+                    ToMaster::Result(Box::new(TileResult {
+                        task: lease.task,
+                        epoch: lease.epoch,
+                        pixels: Pixels::Sums(pixels),
+                        bytes: None,
+                        counters: Counters::default(),
+                        times: TaskTimes::default(),
+                        region: Some(RegionCost::default()),
+                    }))
+                }
+                ToWorker::Ping { nonce } => {
+                    pings.fetch_add(1, Ordering::Relaxed);
+                    ToMaster::Pong { nonce, clock_us: 0 }
+                }
+                _ => continue,
+            };
+            if end.replies.send(reply).await.is_err() {
+                return;
+            }
+        }
+    });
+}
+
+/// Watches a job to its end: its last state, and the number of its frames.
+async fn watched(handle: &Handle, job: JobId) -> (JobState, usize) {
+    let mut watch = handle.watch(job, 0).expect("a job that was just submitted");
+    let mut frames = 0;
+    while let Some(item) = watch.next().await {
+        frames += usize::from(matches!(item, WatchItem::Frame(_)));
+    }
+    (handle.job(job).expect("it is remembered").state, frames)
+}
+
+/// Runs a job of three frames; its last state, and the number of its frames.
+async fn run(handle: &Handle, key: &str, preset: &str) -> (JobState, usize) {
+    let job = handle.submit(request(key, 3, preset)).await.expect("a good request");
+    watched(handle, job).await
+}
+
+/// Hooks that panic as `stage` begins, the first `times` times.
+fn panics_at(stage: Stage, times: usize) -> Hooks {
+    let left = AtomicUsize::new(times);
+    Hooks::new(move |reached| {
+        let take = |n: usize| n.checked_sub(1);
+        if reached == stage && left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, take).is_ok()
+        {
+            panic!("injected into {stage:?}");
+        }
+    })
+}
+
+fn failed_with(state: &JobState, words: [&str; 2]) -> bool {
+    matches!(state, JobState::Failed(reason) if words.iter().all(|w| reason.contains(w)))
+}
+
+#[tokio::test]
+async fn panic_in_a_finisher_fails_the_job_and_the_master_goes_on() {
+    // More panics than there are finishers: each of them must have gone on.
+    const PANICS: usize = 5;
+    let master = master(panics_at(Stage::Finish, PANICS), 1_000_000);
+    let handle = master.handle();
+    join(&handle, Arc::default());
+    let (mut failed, mut done) = (0, 0);
+    // Frames of one job are finished side by side, so a job may use up more than one panic.
+    for i in 0..=PANICS {
+        let (state, frames) = run(&handle, &i.to_string(), "grey").await;
+        if state == JobState::Done {
+            assert_eq!(frames, 3);
+            done += 1;
+        } else {
+            let words = ["finishing the frame panicked", "injected into Finish"];
+            assert!(failed_with(&state, words), "{state:?}");
+            failed += 1;
+        }
+    }
+    assert!((2..=PANICS).contains(&failed) && done > 0, "{failed} failed, {done} done");
+    master.shutdown().await;
+}
+
+#[tokio::test]
+async fn panic_while_bricks_are_cut_fails_the_job_and_the_master_goes_on() {
+    let master = master(panics_at(Stage::CutBricks, 1), 1_000_000);
+    let handle = master.handle();
+    join(&handle, Arc::default());
+    let (state, frames) = run(&handle, "1", "grey").await;
+    assert!(failed_with(&state, ["cutting bricks panicked", "injected"]), "{state:?}");
+    assert_eq!(frames, 0);
+    assert_eq!(run(&handle, "2", "grey").await, (JobState::Done, 3));
+    master.shutdown().await;
+}
+
+#[tokio::test]
+async fn panic_while_a_request_is_checked_is_answered_and_the_master_goes_on() {
+    let master = master(panics_at(Stage::Plan, 1), 1_000_000);
+    let handle = master.handle();
+    join(&handle, Arc::default());
+    let error = handle.submit(request("1", 3, "grey")).await.expect_err("it panicked");
+    let SubmitError::Panicked(what) = error else { panic!("{error:?}") };
+    assert!(what.contains("checking the request panicked: injected"), "{what}");
+    assert_eq!(run(&handle, "1", "grey").await, (JobState::Done, 3));
+    master.shutdown().await;
+}
+
+/// Tiles that a finisher took and lost are not to be missing from a picture.
+#[test]
+fn picture_whose_composing_panicked_is_not_finished() {
+    let finish = slabcast_common::leaves::Finish {
+        format: PixelFormat::Rgb8,
+        background: Background::Transparent,
+    };
+    let assembly = Assembly::new([32, 32], finish);
+    // A tile that leaves the picture.
+    let tile = Rect::new(16, 16, 48, 48);
+    assembly.add(vec![(tile, Leaves::blank([32, 32], PixelFormat::Rgb8))]);
+    let panicked = caught("composing tiles", || assembly.compose()).expect_err("it panics");
+    assert_eq!(panicked.work, "composing tiles");
+    caught("composing tiles", || assembly.compose()).expect_err("and ever after");
+}
+
+/// A gate that holds a stage until it is opened, and tells when the stage has come to it.
+#[derive(Clone, Default)]
+struct Gate(Arc<(Mutex<bool>, Condvar)>);
+
+impl Gate {
+    fn open(&self) {
+        *self.0.0.lock().expect("nobody panics here") = true;
+        self.0.1.notify_all();
+    }
+
+    fn wait(&self) {
+        let mut is_open = self.0.0.lock().expect("nobody panics here");
+        while !*is_open {
+            is_open = self.0.1.wait(is_open).expect("nobody panics here");
+        }
+    }
+}
+
+/// The check of a long path is held, and meanwhile the driver pings, answers and finishes another
+/// job. Counted in events, not in time.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn submitting_a_long_path_delays_no_heartbeat() {
+    const PINGS: usize = 20;
+    let (gate, reached) = (Gate::default(), Arc::new(tokio::sync::Notify::new()));
+    let (held, tells) = (gate.clone(), reached.clone());
+    let first = AtomicUsize::new(0);
+    let hooks = Hooks::new(move |stage| {
+        if stage == Stage::Plan && first.fetch_add(1, Ordering::Relaxed) == 0 {
+            tells.notify_one();
+            held.wait();
+        }
+    });
+    let master = master(hooks, 1000);
+    let handle = master.handle();
+    let pings = Arc::<AtomicUsize>::default();
+    join(&handle, pings.clone());
+    let submitting = {
+        let handle = handle.clone();
+        tokio::spawn(async move { handle.submit(request("long", 100_000, "grey")).await })
+    };
+    reached.notified().await;
+    let before = pings.load(Ordering::Relaxed);
+    let mut answers = 0;
+    while pings.load(Ordering::Relaxed) < before + PINGS {
+        answers += handle.workers().await.len();
+    }
+    assert!(answers > 0, "the driver answers meanwhile");
+    assert_eq!(run(&handle, "short", "grey").await, (JobState::Done, 3));
+    assert!(handle.jobs().iter().all(|job| job.client_key != "long"), "it is still checked");
+    gate.open();
+    let job = submitting.await.expect("no panic").expect("a good request");
+    assert_eq!(handle.job(job).map(|job| job.frames_total), Some(100_000));
+    assert!(handle.cancel(job).await);
+    master.shutdown().await;
+}

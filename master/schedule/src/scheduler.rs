@@ -1,11 +1,11 @@
 //! The state machine itself: takes events in, advances frames, queues actions.
 
 use crate::dispatch::lend::Ahead;
-use crate::policy::active_set::Reserve;
-use crate::policy::link_use::Traffic;
-use crate::policy::region::{self, Memory};
+use crate::policy::active_set::ActiveSet;
+use crate::policy::link_use::LinkUse;
+use crate::policy::region::{self, CostHistory};
 use crate::state::cluster::Cluster;
-use crate::state::frame::{Frame, Step, Turn, carry, goes_by_region};
+use crate::state::frame::{Frame, Step, StepContext, carry, goes_by_region};
 use crate::state::residency::{self, Residency};
 use crate::state::workers::{self, Roster};
 use crate::{Action, Clock, Config, Event, FrameJob, Micros, Totals, WorkerView};
@@ -14,11 +14,10 @@ use slabcast_common::link::FRAMES_IN_FLIGHT;
 use slabcast_common::message::ToWorker;
 use std::collections::{BTreeSet, VecDeque};
 
-/// [`FRAMES_IN_FLIGHT`] while bricks fill the link ([`Traffic::is_full`]). Whoever has a thread free then waits for bricks, and more
-/// frames only have more workers ask for the same ones, at the cost of those that the frame in front
-/// waits for. mri256 at 512x512 and 1 Gbit/s, throughput with four and with this (`slabcast plan --frames
-/// 24`): on 16 workers 17 to 21 % of n times one worker's frames and 24, on 32 10 to 11 and 13 (docs/scaling.md has
-/// more, and where it costs a little).
+/// Tuning (frames): frames in flight while bricks saturate the link ([`LinkUse::is_full`]). An idle
+/// thread then waits for bricks, and more frames only make more workers request them. mri256 at
+/// 512x512 and 1 Gbit/s reaches 17 to 21 % of linear speedup on 16 workers with four in flight and
+/// 24 with two, on 32 workers 10 to 11 and 13.
 const FRAMES_ON_A_FULL_LINK: usize = 2;
 
 /// The state machine; see the head of the crate.
@@ -40,9 +39,9 @@ impl Scheduler {
                 config,
                 roster: Roster::default(),
                 residency: Residency::default(),
-                memory: Memory::default(),
-                traffic: Traffic::default(),
-                reserve: Reserve::default(),
+                history: CostHistory::default(),
+                link_use: LinkUse::default(),
+                active_set: ActiveSet::default(),
                 out: VecDeque::new(),
                 next_task: 0,
                 totals: Totals::default(),
@@ -112,7 +111,7 @@ impl Scheduler {
                 let from = cluster.roster.get(worker);
                 // What comes from this machine crosses no link.
                 if from.is_some_and(|w| !w.is_local) {
-                    cluster.traffic.result(result.bytes.unwrap_or(0).into());
+                    cluster.link_use.result(result.bytes.unwrap_or(0).into());
                 }
                 let known = from.is_some();
                 let lent = |f: &Frame| f.has_lent(worker, result.task, result.epoch);
@@ -142,7 +141,7 @@ impl Scheduler {
                 cluster.roster.heard(worker, now);
                 let lent = |f: &&mut Frame| f.has_lent(worker, task, epoch);
                 if let Some(frame) = self.active.iter_mut().find(lent) {
-                    cluster.reserve.call_all();
+                    cluster.active_set.call_all();
                     cluster.roster.halve(0);
                     frame.failed(cluster, worker, task, epoch, reason);
                 }
@@ -158,34 +157,34 @@ impl Scheduler {
             }
             Event::BricksIn { worker, set, bricks } => {
                 cluster.roster.heard(worker, now);
-                let before = cluster.residency.held_of(worker, set).1;
+                let before = cluster.residency.held_of_set(worker, set).1;
                 let landed = cluster.residency.arrived(worker, set, bricks);
-                let bytes = cluster.residency.held_of(worker, set).1 - before;
-                cluster.traffic.land(bytes, landed.is_some(), now);
+                let bytes = cluster.residency.held_of_set(worker, set).1 - before;
+                cluster.link_use.land(bytes, landed.is_some(), now);
                 self.after_bricks(worker, landed, now);
             }
             Event::BricksBroken { worker, set, bricks } => {
                 cluster.roster.heard(worker, now);
                 if cluster.residency.was_sent(worker, set, &bricks) {
                     let landed = cluster.residency.broken(worker, set, &bricks);
-                    cluster.traffic.land(0, landed.is_some(), now);
+                    cluster.link_use.land(0, landed.is_some(), now);
                     self.after_bricks(worker, landed, now);
                 } else {
-                    // Its name was spoilt, too: nobody knows which one it lacks. When it dials again it
-                    // says which it holds.
+                    // Its name was spoilt, too: nobody knows which one it lacks. When it dials
+                    // again it says which it holds.
                     let reason = "it named a broken brick that was not sent to it".to_string();
                     self.drop_worker(worker, reason, false, now);
                 }
             }
             Event::BricksWanted { worker, set, bricks } => {
                 cluster.roster.heard(worker, now);
-                let places = cluster.residency.places(set, &bricks);
-                cluster.residency.owe(worker, set, places);
+                let places = cluster.residency.indices(set, &bricks);
+                cluster.residency.request(worker, set, places);
                 self.after_bricks(worker, None, now);
             }
             Event::BricksForgotten { worker, set, bricks } => {
                 cluster.roster.heard(worker, now);
-                cluster.residency.forgotten(worker, set, &bricks);
+                cluster.residency.evicted(worker, set, &bricks);
                 self.after_bricks(worker, None, now);
             }
             Event::Pong { worker, nonce, clock_us } => {
@@ -207,9 +206,9 @@ impl Scheduler {
     }
 
     /// Bricks are on the account of the first frame in the making, whichever of several asked.
-    fn after_bricks(&mut self, worker: WorkerId, landed: Option<residency::Flight>, now: Micros) {
-        if let (Some(frame), Some(flight)) = (self.active.front_mut(), landed) {
-            frame.landed(worker, flight, now);
+    fn after_bricks(&mut self, worker: WorkerId, landed: Option<residency::Transfer>, now: Micros) {
+        if let (Some(frame), Some(transfer)) = (self.active.front_mut(), landed) {
+            frame.landed(worker, transfer, now);
         }
         let ledger = self.active.front_mut().map(|f| &mut f.ledger);
         carry(&mut self.cluster, ledger, worker, now);
@@ -217,11 +216,11 @@ impl Scheduler {
 
     /// Whether those in reserve are called up for a first frame that takes long to draw.
     fn calls_all_now(&mut self, now: Micros) -> bool {
-        let Cluster { roster, reserve, .. } = &mut self.cluster;
+        let Cluster { roster, active_set, .. } = &mut self.cluster;
         // Asked after each result, and hardly ever in need of an answer.
-        let asked = reserve.is_first() && roster.in_reserve() > 0;
+        let asked = active_set.is_first() && roster.in_reserve() > 0;
         let Some(frame) = self.active.front().filter(|_| asked) else { return false };
-        let calls = reserve.calls_all_now(frame.ledger.drew_us(), roster.threads(), now);
+        let calls = active_set.calls_all_now(frame.ledger.rendered_us(), roster.threads(), now);
         if calls {
             roster.halve(0);
         }
@@ -254,7 +253,7 @@ impl Scheduler {
         let Some(when) = rendered else { return };
         for (i, frame) in self.active.iter_mut().enumerate() {
             if i != whose && !frame.is_done() {
-                frame.ledger.elsewhere(worker, when);
+                frame.ledger.rendered_elsewhere(worker, when);
             }
         }
     }
@@ -270,11 +269,11 @@ impl Scheduler {
             frame.lost(&mut self.cluster, id, &worker, blame, now);
             threads = threads.saturating_sub(leases);
         }
-        if self.cluster.residency.flight(id).is_some() {
-            self.cluster.traffic.land(0, true, now);
+        if self.cluster.residency.transfer(id).is_some() {
+            self.cluster.link_use.land(0, true, now);
         }
         self.cluster.residency.leave(id);
-        self.cluster.memory.forget(id);
+        self.cluster.history.forget(id);
     }
 
     fn drop_worker(&mut self, worker: WorkerId, reason: String, blame: bool, now: Micros) {
@@ -305,11 +304,12 @@ impl Scheduler {
         self.forget_scenes();
     }
 
-    /// Lends what can be lent, each worker its own first, frame after frame; then, to threads that are
-    /// still dry, what is others'. Whether a frame came to its end, so that there is more to do.
+    /// Lends what can be lent, each worker its own first, frame after frame; then, to threads that
+    /// are still dry, what is others'. Whether a frame came to its end, so that there is more to
+    /// do.
     ///
-    /// After a result there is room at the worker that it came from, and `only` there: the others were asked
-    /// before, and nothing has changed for them. (64 workers send 500 results a frame.)
+    /// After a result there is room at the worker that it came from, and `only` there: the others
+    /// were asked before, and nothing has changed for them. (64 workers send 500 results a frame.)
     fn go_on(&mut self, only: Option<WorkerId>, clock: &dyn Clock) -> bool {
         let mut ended = false;
         let mut only = only;
@@ -322,24 +322,24 @@ impl Scheduler {
                 }
                 let Some(job) = self.waiting.pop_front() else { break };
                 if self.active.is_empty() {
-                    self.cluster.traffic.begin(clock.now());
-                    self.cluster.reserve.begin(clock.now());
+                    self.cluster.link_use.begin(clock.now());
+                    self.cluster.active_set.begin(clock.now());
                 }
                 let alone = self.active.is_empty() && self.waiting.is_empty();
                 let (set, by_region) = (job.scene.bricks, goes_by_region(&job));
                 let beside = (self.beside(), alone);
                 self.active.push_back(Frame::start(job, beside, &mut self.cluster, clock));
-                let Cluster { roster, residency, reserve, .. } = &mut self.cluster;
+                let Cluster { roster, residency, active_set, .. } = &mut self.cluster;
                 let workers = roster.iter().filter(|(_, w)| !w.leaving).count();
-                let workers = (workers, residency.workers_for(set));
-                roster.halve(if by_region { reserve.halved(set, alone, workers) } else { 0 });
+                let workers = (workers, residency.workers_to_hold(set));
+                roster.halve(if by_region { active_set.halved(set, alone, workers) } else { 0 });
                 // To it, all are new, and to the one before it is no longer the last.
                 if only.take().is_some() {
                     self.find_sated(None);
                 }
             }
-            let turn = Turn { only, ..self.turn(i, false) };
-            match self.active[i].step(&mut self.cluster, turn, clock) {
+            let context = StepContext { freed_worker: only, ..self.context(i, false) };
+            match self.active[i].step(&mut self.cluster, context, clock) {
                 Step::Waits | Step::Done => i += 1,
                 Step::Failed(reason) => {
                     let mut failed = self.active.remove(i).expect("it was just stepped");
@@ -352,21 +352,26 @@ impl Scheduler {
         }
         for i in 0..self.active.len() {
             if self.active[i].by_region() && !self.active[i].is_done() {
-                let turn = Turn { only, ..self.turn(i, true) };
-                self.active[i].step(&mut self.cluster, turn, clock);
+                let context = StepContext { freed_worker: only, ..self.context(i, true) };
+                self.active[i].step(&mut self.cluster, context, clock);
             }
         }
         while self.active.front().is_some_and(Frame::is_done) {
             let Some(mut done) = self.active.pop_front() else { break };
             done.end(&mut self.cluster);
             let (beside, now) = (!self.active.is_empty(), clock.now());
-            self.cluster.traffic.done(beside, now);
+            self.cluster.link_use.done(beside, now);
             if done.by_region() && beside != done.is_alone() {
                 let roster = &self.cluster.roster;
-                let drawing = (roster.staying().count(), roster.threads());
-                let traffic = &self.cluster.traffic;
-                let full = if beside { traffic.is_full() } else { traffic.is_full_alone() };
-                self.cluster.reserve.done((!beside, full), done.ledger.drew_us(), drawing, now);
+                let drawing = (roster.active().count(), roster.threads());
+                let link_use = &self.cluster.link_use;
+                let full = if beside { link_use.is_full() } else { link_use.is_full_alone() };
+                self.cluster.active_set.done(
+                    (!beside, full),
+                    done.ledger.rendered_us(),
+                    drawing,
+                    now,
+                );
             }
             let done = done.finish(&mut self.cluster, clock.now());
             self.cluster.out.push_back(done);
@@ -375,15 +380,15 @@ impl Scheduler {
         ended
     }
 
-    /// Which crew has the least frames in the making and may draw the next one; `None` where it is the only one, and
-    /// where the link does not bear crews.
+    /// Which crew has the least frames in the making and may draw the next one; `None` where it is
+    /// the only one, and where the link does not bear crews.
     fn beside(&self) -> Option<u32> {
         let frames = |i: &u32| {
             let crews = self.active.iter().filter_map(Frame::crew);
             crews.filter(|c| c.is_busy_as(*i)).count()
         };
         let alone = self.active.is_empty() && self.waiting.is_empty();
-        let bears = self.cluster.traffic.bears_crews();
+        let bears = self.cluster.link_use.bears_crews();
         (0..region::CREWS).min_by_key(frames).filter(|_| !alone && bears)
     }
 
@@ -399,23 +404,23 @@ impl Scheduler {
         };
         self.cluster.sated = match only {
             Some(id) => roster.get(id).filter(|w| enough(id, w)).map(|_| id).into_iter().collect(),
-            None => roster.staying().filter(|(id, w)| enough(*id, w)).map(|(id, _)| id).collect(),
+            None => roster.active().filter(|(id, w)| enough(*id, w)).map(|(id, _)| id).collect(),
         };
     }
 
-    /// Whether the next frame may begin beside those in the making: both go by region and share their
-    /// bricks, and some thread has nothing more to do.
+    /// Whether the next frame may begin beside those in the making: both go by region and share
+    /// their bricks, and some thread has nothing more to do.
     fn may_begin(&self) -> bool {
         if self.active.is_empty() {
             return true;
         }
-        let full = self.cluster.traffic.is_full();
+        let full = self.cluster.link_use.is_full();
         let most = if full { FRAMES_ON_A_FULL_LINK } else { FRAMES_IN_FLIGHT };
         if self.active.len() >= most || !self.follows() {
             return false;
         }
         let ahead = u64::from(self.cluster.config.queue_ahead.max(1));
-        self.cluster.roster.staying().any(|(_, w)| w.leases < u64::from(w.threads) * ahead)
+        self.cluster.roster.active().any(|(_, w)| w.leases < u64::from(w.threads) * ahead)
     }
 
     /// Whether the next frame in the queue goes by region on the bricks of those in the making.
@@ -426,9 +431,10 @@ impl Scheduler {
         next.is_some_and(|job| self.active.iter().all(|f| beside(f, job)))
     }
 
-    /// What the others mean to frame `i`.
-    fn turn(&self, i: usize, others: bool) -> Turn {
-        Turn { others, last: i + 1 == self.active.len() && !self.follows(), only: None }
+    /// What a step of the frame at index `i` may do.
+    fn context(&self, i: usize, may_steal: bool) -> StepContext {
+        let is_last_frame = i + 1 == self.active.len() && !self.follows();
+        StepContext { may_steal, is_last_frame, freed_worker: None }
     }
 
     /// Ends scenes that have no frame left.

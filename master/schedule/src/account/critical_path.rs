@@ -4,31 +4,32 @@
 //! ms with 300 ms of rendering on ten workers may have waited for one tile or for bricks. So each
 //! phase (a slab, or the whole frame where there are no barriers) is walked back from the result
 //! that ended it: its message, its rendering, what its thread rendered before, until the phase
-//! began. What lies between two tiles is bricks on their way, as far as the worker says that the
-//! tile lacked some, and else messages and queues. All of it is on the master's clock
-//! ([`place_in_time`](crate::account::ledger::place_in_time)), so the parts add up to the frame's time.
+//! began. The gap between two tiles counts as bricks in flight, as far as the worker says that the
+//! tile lacked_bricks_us some, and else as messages and queues. All of it is on the master's clock
+//! ([`place_in_time`](crate::account::ledger::place_in_time)), so the parts add up to the frame's
+//! time.
 
 use crate::Micros;
 use crate::account::ledger::ms;
 use slabcast_common::ids::WorkerId;
 
-/// A tile that counted.
+/// A tile whose result was accepted.
 #[derive(Clone, Debug)]
-pub(crate) struct Piece {
-    /// Left column and top row.
+pub(crate) struct RenderedTile {
+    /// Left column and top row, in pixels.
     pub(crate) corner: [i32; 2],
     pub(crate) edge: u32,
-    /// Who rendered it.
+    /// The worker and its render thread.
     pub(crate) thread: (WorkerId, u32),
-    /// How long it lay at the worker without its bricks.
-    pub(crate) lacked: Micros,
+    /// Time the task waited at the worker for bricks.
+    pub(crate) lacked_bricks_us: Micros,
     pub(crate) start: Micros,
     pub(crate) end: Micros,
-    /// When its result came.
-    pub(crate) came: Micros,
+    /// When its result arrived.
+    pub(crate) arrived: Micros,
 }
 
-/// The longest tile on the path.
+/// The tile on the path that rendered longest.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Longest {
     corner: [i32; 2],
@@ -38,9 +39,9 @@ struct Longest {
     us: Micros,
 }
 
-/// What a frame waited for, phase after phase.
+/// The critical path of a frame, phase after phase.
 #[derive(Debug, Default)]
-pub(crate) struct Path {
+pub(crate) struct CriticalPath {
     phases: usize,
     render: Micros,
     bricks: Micros,
@@ -48,18 +49,18 @@ pub(crate) struct Path {
     longest: Option<Longest>,
 }
 
-impl Path {
-    /// A phase ended. `name` says who a worker is.
-    pub(crate) fn phase(
+impl CriticalPath {
+    /// Adds a phase that ended. `name` returns a worker's display name.
+    pub(crate) fn add_phase(
         &mut self,
-        pieces: &[Piece],
+        pieces: &[RenderedTile],
         began: Micros,
         name: impl Fn(WorkerId) -> String,
     ) {
         let phase = self.phases;
         self.phases += 1;
-        let Some(last) = pieces.iter().max_by_key(|p| p.came) else { return };
-        self.messages += last.came.saturating_sub(last.end.max(began));
+        let Some(last) = pieces.iter().max_by_key(|p| p.arrived) else { return };
+        self.messages += last.arrived.saturating_sub(last.end.max(began));
         let mut piece = last;
         loop {
             let us = piece.end.saturating_sub(piece.start.max(began));
@@ -74,7 +75,7 @@ impl Path {
                 .max_by_key(|p| p.end);
             let since = before.map_or(began, |p| p.end.max(began));
             let gap = piece.start.saturating_sub(since);
-            let bricks = gap.min(piece.lacked);
+            let bricks = gap.min(piece.lacked_bricks_us);
             self.bricks += bricks;
             self.messages += gap - bricks;
             match before {
@@ -84,8 +85,8 @@ impl Path {
         }
     }
 
-    /// In one sentence: of `total`, of which the master spent `cull` on culling and queues while
-    /// nobody rendered.
+    /// Describes the path in one sentence. `total`: the frame's time; `cull`: the master's time for
+    /// culling and queues while nobody rendered.
     pub(crate) fn sentence(&self, total: Micros, cull: Micros) -> String {
         let mut parts = Vec::new();
         let mut part = |us: Micros, what: &str| {
@@ -119,23 +120,30 @@ impl Path {
 mod tests {
     use super::*;
 
-    fn piece(w: u64, x: i32, lacked: Micros, start: Micros, end: Micros, came: Micros) -> Piece {
+    fn piece(
+        w: u64,
+        x: i32,
+        lacked_bricks_us: Micros,
+        start: Micros,
+        end: Micros,
+        arrived: Micros,
+    ) -> RenderedTile {
         let thread = (WorkerId(w), 0);
-        Piece { corner: [x, 64], edge: 64, thread, lacked, start, end, came }
+        RenderedTile { corner: [x, 64], edge: 64, thread, lacked_bricks_us, start, end, arrived }
     }
 
     #[test]
-    fn a_frame_that_waits_for_one_tile_says_which() {
-        let mut path = Path::default();
+    fn critical_path_names_the_tile_a_frame_waited_for() {
+        let mut path = CriticalPath::default();
         let name = |w: WorkerId| format!("host-{}", w.0);
-        // Worker 1 is done early; worker 2 lacks bricks for 3 ms, then draws two tiles.
+        // Worker 1 ends early; worker 2 lacks bricks for 3 ms, then renders two tiles.
         let first = [
             piece(1, 0, 0, 1_200, 6_000, 6_200),
             piece(2, 64, 3_000, 4_200, 9_200, 9_400),
             piece(2, 128, 0, 9_300, 39_300, 39_500),
         ];
-        path.phase(&first, 1_000, name);
-        path.phase(&[piece(1, 0, 0, 41_600, 42_600, 42_700)], 41_500, name);
+        path.add_phase(&first, 1_000, name);
+        path.add_phase(&[piece(1, 0, 0, 41_600, 42_600, 42_700)], 41_500, name);
         assert_eq!(
             path.sentence(43_000, 3_000),
             "43.0 ms, of which 36.0 ms rendering (longest: tile (128,64) 64 px of slab 0 on \
@@ -145,13 +153,13 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_without_tiles_and_clocks_gone_mad_have_a_sentence() {
-        let mut path = Path::default();
-        path.phase(&[], 5, |_| String::new());
+    fn critical_path_of_an_empty_frame_or_a_bad_clock_is_a_sentence() {
+        let mut path = CriticalPath::default();
+        path.add_phase(&[], 5, |_| String::new());
         assert_eq!(path.sentence(400, 400), "0.4 ms, of which 0.4 ms culling at the master");
-        // Tiles without length on one thread: no circle.
+        // Tiles of no duration on one thread: no cycle.
         let odd = [piece(1, 0, 9, 7, 7, 7), piece(1, 1, 9, 7, 7, 7), piece(1, 2, 9, 3, 3, 8)];
-        path.phase(&odd, 5, |_| "w".into());
+        path.add_phase(&odd, 5, |_| "w".into());
         assert!(path.sentence(8, 0).starts_with("0.0 ms"));
     }
 }

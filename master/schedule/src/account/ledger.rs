@@ -1,13 +1,13 @@
-//! What a frame cost: intervals and counts as they come, CONTRACTS.md's statistics at the end.
+//! A frame's costs: intervals and counts while it is made, CONTRACTS.md's statistics at its end.
 //!
-//! Times of two machines meet here. A worker's clock is brought to the master's by its offset
-//! (`roster`), and then cut to what the master knows for sure: a task was rendered between the
-//! lease's going and the result's coming. So no figure is negative or longer than it can be,
-//! whatever a worker's clock does.
+//! Times of two machines meet here. A worker's clock is mapped to the master's by its offset
+//! (`state::workers`) and clamped to what the master knows for sure: a task was rendered between
+//! sending its lease and receiving its result. So no figure is negative or longer than it can be,
+//! whatever a worker's clock shows.
 
-use crate::account::critical_path::{Path, Piece};
-use crate::account::spans::Flown;
-use crate::state::residency::Flight;
+use crate::account::critical_path::{CriticalPath, RenderedTile};
+use crate::account::spans::BrickTransfer;
+use crate::state::residency::Transfer;
 use crate::state::worker_map::WorkerMap;
 use crate::state::workers::Worker;
 use crate::{Micros, Span, Spans};
@@ -21,13 +21,13 @@ use slabcast_common::stats::{
 };
 use std::sync::Arc;
 
-/// Stretches of time that there is room for at once: tiles and flights of 64 workers.
-const SPANS: usize = 512;
+/// Limit: spans that memory is reserved for at first, the tiles and brick transfers of 64 workers.
+const SPANS_RESERVED: usize = 512;
 
-/// Times `[start, end)` on the master's clock.
+/// Half-open interval of times on the master's clock, in microseconds.
 type Interval = (Micros, Micros);
 
-/// One worker's part.
+/// One worker's share of a frame.
 #[derive(Debug)]
 struct Account {
     name: Arc<str>,
@@ -37,18 +37,18 @@ struct Account {
     render_us: Micros,
     p2p_us: Micros,
     renders: Vec<Interval>,
-    flights: Vec<Interval>,
+    transfers: Vec<Interval>,
     held: (u64, u64),
     bricks_sent: u64,
     bytes_sent: u64,
-    /// Drawing for other frames meanwhile.
+    /// Rendering time spent on other frames meanwhile.
     elsewhere_us: Micros,
     stalls: u64,
     parked_us: Micros,
     stall_us: Micros,
 }
 
-/// The books of one frame.
+/// The account of one frame.
 #[derive(Debug)]
 pub(crate) struct Ledger {
     began: Micros,
@@ -56,7 +56,7 @@ pub(crate) struct Ledger {
     pub(crate) composite_us: Micros,
     accounts: WorkerMap<Account>,
     pub(crate) counters: Counters,
-    /// How far pixels are off that were looked at.
+    /// Error of sampled pixels.
     sampled: Sampling,
     result_bytes: Option<u64>,
     pub(crate) slabs: Vec<SlabStats>,
@@ -65,10 +65,10 @@ pub(crate) struct Ledger {
     pub(crate) handed_over: u64,
     pub(crate) dropped_results: u64,
     pub(crate) poisoned: Vec<PoisonedTile>,
-    path: Path,
+    path: CriticalPath,
 }
 
-/// Where a task's rendering lies on the master's clock.
+/// When a task was rendered, on the master's clock.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Rendered {
     pub(crate) start: Micros,
@@ -76,7 +76,7 @@ pub(crate) struct Rendered {
     pub(crate) p2p_us: Micros,
 }
 
-/// Brings a task's times to the master's clock, between its lease and its result.
+/// Maps a task's times to the master's clock, clamped between its lease and its result.
 pub(crate) fn place_in_time(
     worker: &Worker,
     times: &TaskTimes,
@@ -101,24 +101,24 @@ impl Ledger {
             sampled: Sampling::default(),
             result_bytes: None,
             slabs: Vec::new(),
-            spans: Spans::with_room(SPANS),
+            spans: Spans::with_capacity(SPANS_RESERVED),
             retries: 0,
             handed_over: 0,
             dropped_results: 0,
             poisoned: Vec::new(),
-            path: Path::default(),
+            path: CriticalPath::default(),
         }
     }
 
-    /// A phase of the frame ended: what these tiles say of its critical path.
-    pub(crate) fn phase(&mut self, pieces: &[Piece], began: Micros) {
+    /// Adds the tiles of an ended phase (a slab, or all regions) to the critical path.
+    pub(crate) fn end_phase(&mut self, pieces: &[RenderedTile], began: Micros) {
         let accounts = &self.accounts;
         let name = |id| accounts.get(id).map_or_else(String::new, |a| a.name.to_string());
-        self.path.phase(pieces, began, name);
+        self.path.add_phase(pieces, began, name);
     }
 
-    /// A worker takes part from now on.
-    pub(crate) fn enrol(&mut self, id: WorkerId, worker: &Worker, now: Micros) {
+    /// Opens the account of a worker.
+    pub(crate) fn open_account(&mut self, id: WorkerId, worker: &Worker, now: Micros) {
         self.accounts.or_insert_with(id, || Account {
             name: worker.name.clone(),
             threads: worker.threads,
@@ -127,7 +127,7 @@ impl Ledger {
             render_us: 0,
             p2p_us: 0,
             renders: Vec::new(),
-            flights: Vec::new(),
+            transfers: Vec::new(),
             held: (0, 0),
             bricks_sent: 0,
             bytes_sent: 0,
@@ -138,14 +138,14 @@ impl Ledger {
         });
     }
 
-    /// A worker takes part no longer.
-    pub(crate) fn leave(&mut self, id: WorkerId, now: Micros) {
+    /// Closes the account of a worker.
+    pub(crate) fn close_account(&mut self, id: WorkerId, now: Micros) {
         if let Some(a) = self.accounts.get_mut(id) {
             a.until = Some(now);
         }
     }
 
-    pub(crate) fn rendered(&mut self, id: WorkerId, r: &Rendered, counters: &Counters) {
+    pub(crate) fn add_rendering(&mut self, id: WorkerId, r: &Rendered, counters: &Counters) {
         self.counters += *counters;
         if let Some(a) = self.accounts.get_mut(id) {
             a.render_us += r.end - r.start;
@@ -154,27 +154,27 @@ impl Ledger {
         }
     }
 
-    /// How long render threads drew.
-    pub(crate) fn drew_us(&self) -> Micros {
+    /// Returns the rendering time of all threads.
+    pub(crate) fn rendered_us(&self) -> Micros {
         self.accounts.values().map(|a| a.render_us).sum()
     }
 
-    /// A result came that counts, in a message of so many bytes if it crossed a network.
-    pub(crate) fn came(&mut self, bytes: Option<u32>) {
+    /// Counts the bytes of an accepted result; `None`: it crossed no network.
+    pub(crate) fn add_result_bytes(&mut self, bytes: Option<u32>) {
         if let Some(bytes) = bytes {
             self.result_bytes = Some(self.result_bytes.unwrap_or(0) + u64::from(bytes));
         }
     }
 
-    /// A worker drew for another frame while this one was in the making.
-    pub(crate) fn elsewhere(&mut self, id: WorkerId, (start, end): Interval) {
+    /// Counts time that a worker spent on another frame.
+    pub(crate) fn rendered_elsewhere(&mut self, id: WorkerId, (start, end): Interval) {
         if let Some(a) = self.accounts.get_mut(id) {
             a.elsewhere_us += end.saturating_sub(start.max(a.from));
         }
     }
 
-    /// What a region waited for. A stranger's figures: they are added up and no more.
-    pub(crate) fn stalled(&mut self, id: WorkerId, cost: &RegionCost) {
+    /// Adds a region's stalls and sampled errors. The figures are a peer's: they are only added up.
+    pub(crate) fn add_region_cost(&mut self, id: WorkerId, cost: &RegionCost) {
         if let Some(a) = self.accounts.get_mut(id) {
             a.stalls += u64::from(cost.stalls);
             a.parked_us = a.parked_us.saturating_add(cost.parked_us);
@@ -183,29 +183,29 @@ impl Ledger {
         self.sampled.add(cost.sampled);
     }
 
-    pub(crate) fn sent(&mut self, id: WorkerId, bricks: u64, bytes: u64) {
+    pub(crate) fn bricks_sent(&mut self, id: WorkerId, bricks: u64, bytes: u64) {
         if let Some(a) = self.accounts.get_mut(id) {
             a.bricks_sent += bricks;
             a.bytes_sent += bytes;
         }
     }
 
-    /// Bricks were on their way to a worker without a pause until now.
-    pub(crate) fn landed(&mut self, id: WorkerId, flight: Flight, now: Micros) {
+    /// Records a transfer of bricks that ended now.
+    pub(crate) fn transfer_ended(&mut self, id: WorkerId, transfer: Transfer, now: Micros) {
         let Some(a) = self.accounts.get_mut(id) else { return };
-        let start = flight.since.max(self.began).min(now);
-        a.flights.push((start, now));
-        let Flight { bricks, bytes, .. } = flight;
-        self.spans.bricks(Flown { worker: a.name.clone(), start, end: now, bricks, bytes });
+        let start = transfer.since.max(self.began).min(now);
+        a.transfers.push((start, now));
+        let Transfer { bricks, bytes, .. } = transfer;
+        self.spans.bricks(BrickTransfer { worker: a.name.clone(), start, end: now, bricks, bytes });
     }
 
-    pub(crate) fn holds(&mut self, id: WorkerId, held: (u64, u64)) {
+    pub(crate) fn set_held(&mut self, id: WorkerId, held: (u64, u64)) {
         if let Some(a) = self.accounts.get_mut(id) {
             a.held = held;
         }
     }
 
-    /// The frame is done.
+    /// Closes the account: returns statistics and timeline.
     pub(crate) fn close(
         mut self,
         number: u64,
@@ -215,7 +215,7 @@ impl Ledger {
         bricks: BrickStats,
         now: Micros,
     ) -> (FrameStats, Spans) {
-        let flights = union(self.accounts.values().flat_map(|a| &a.flights).copied().collect());
+        let transfers = union(self.accounts.values().flat_map(|a| &a.transfers).copied().collect());
         let renders = union(self.accounts.values().flat_map(|a| &a.renders).copied().collect());
         let mut workers: Vec<_> = self
             .accounts
@@ -226,7 +226,7 @@ impl Ledger {
                 WorkerStats {
                     id: a.name.to_string(),
                     render_ms: ms(a.render_us),
-                    distribute_ms: ms(length(&union(a.flights))),
+                    distribute_ms: ms(length(&union(a.transfers))),
                     p2p_ms: ms(a.p2p_us),
                     wait_ms: ms(threads_us.saturating_sub(a.render_us + a.elsewhere_us)),
                     stalls: a.stalls,
@@ -259,11 +259,11 @@ impl Ledger {
             ms: FrameMs {
                 total: ms(now.saturating_sub(self.began)),
                 cull: ms(self.cull_us),
-                distribute: ms(length(&flights)),
+                distribute: ms(length(&transfers)),
                 render: workers.iter().map(|w| w.render_ms).sum(),
                 composite: ms(self.composite_us),
                 wait: self.slabs.iter().map(|s| s.barrier_wait_ms).sum(),
-                overlap: ms(length(&both(&flights, &renders))),
+                overlap: ms(length(&intersection(&transfers, &renders))),
                 stall: workers.iter().map(|w| w.stall_ms).sum(),
             },
             workers,
@@ -304,12 +304,12 @@ impl Ledger {
     }
 }
 
-/// Milliseconds.
+/// Converts microseconds to milliseconds.
 pub(crate) fn ms(us: Micros) -> f64 {
     us as f64 / 1000.0
 }
 
-/// The intervals joined where they overlap, ascending.
+/// Returns the union of intervals, ascending.
 fn union(mut intervals: Vec<Interval>) -> Vec<Interval> {
     intervals.sort_unstable();
     let mut out: Vec<Interval> = Vec::new();
@@ -322,8 +322,8 @@ fn union(mut intervals: Vec<Interval>) -> Vec<Interval> {
     out
 }
 
-/// What two unions share.
-fn both(a: &[Interval], b: &[Interval]) -> Vec<Interval> {
+/// Returns the intersection of two unions.
+fn intersection(a: &[Interval], b: &[Interval]) -> Vec<Interval> {
     let (mut i, mut j) = (0, 0);
     let mut out = Vec::new();
     while i < a.len() && j < b.len() {
@@ -345,10 +345,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn intervals_are_joined_and_shared() {
+    fn interval_unions_and_intersections() {
         let a = union(vec![(5, 9), (0, 2), (1, 3), (9, 10)]);
         assert_eq!(a, [(0, 3), (5, 10)]);
-        assert_eq!(both(&a, &[(2, 6), (7, 8), (20, 30)]), [(2, 3), (5, 6), (7, 8)]);
+        assert_eq!(intersection(&a, &[(2, 6), (7, 8), (20, 30)]), [(2, 3), (5, 6), (7, 8)]);
         assert_eq!(length(&a), 8);
     }
 }

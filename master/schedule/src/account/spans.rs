@@ -1,23 +1,24 @@
-//! What happened when in a frame, as it is noted and as it is told.
+//! A frame's timeline, stored as numbers and formatted on demand.
 //!
-//! A tile's line in a trace is seven texts. Whoever takes a result in has no time for them: it notes
-//! numbers, and texts are made where somebody reads them, on a thread that finishes pictures.
+//! A tile's line in a trace is seven strings. The thread that takes results has no time for them:
+//! it stores numbers, and strings are made where somebody reads them, on a thread that finishes
+//! pictures.
 
 use crate::{Micros, Span};
 use std::sync::Arc;
 
-/// What happened in a frame, in the order in which it ended.
+/// The timeline of one frame, ordered by end times.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Spans(Vec<Noted>);
+pub struct Spans(Vec<Entry>);
 
 #[derive(Clone, Debug, PartialEq, Eq)]
-enum Noted {
+enum Entry {
     Tile(Tile),
-    Bricks(Flown),
+    Bricks(BrickTransfer),
     Other(Box<Span>),
 }
 
-/// A tile was drawn.
+/// A rendered tile.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Tile {
     pub(crate) corner: [i32; 2],
@@ -32,9 +33,9 @@ pub(crate) struct Tile {
     pub(crate) attempt: u32,
 }
 
-/// Bricks were on their way.
+/// A transfer of bricks.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Flown {
+pub(crate) struct BrickTransfer {
     pub(crate) worker: Arc<str>,
     pub(crate) start: Micros,
     pub(crate) end: Micros,
@@ -43,33 +44,33 @@ pub(crate) struct Flown {
 }
 
 impl Spans {
-    pub(crate) fn with_room(n: usize) -> Self {
+    pub(crate) fn with_capacity(n: usize) -> Self {
         Spans(Vec::with_capacity(n))
     }
 
     pub(crate) fn tile(&mut self, tile: Tile) {
-        self.0.push(Noted::Tile(tile));
+        self.0.push(Entry::Tile(tile));
     }
 
-    pub(crate) fn bricks(&mut self, flown: Flown) {
-        self.0.push(Noted::Bricks(flown));
+    pub(crate) fn bricks(&mut self, transfer: BrickTransfer) {
+        self.0.push(Entry::Bricks(transfer));
     }
 
     pub(crate) fn push(&mut self, span: Span) {
-        self.0.push(Noted::Other(Box::new(span)));
+        self.0.push(Entry::Other(Box::new(span)));
     }
 
-    /// All of it, with its texts.
+    /// Returns the timeline with all its strings.
     pub fn to_vec(&self) -> Vec<Span> {
-        self.0.iter().map(Noted::told).collect()
+        self.0.iter().map(Entry::to_span).collect()
     }
 }
 
-impl Noted {
-    fn told(&self) -> Span {
+impl Entry {
+    fn to_span(&self) -> Span {
         match self {
-            Noted::Other(span) => (**span).clone(),
-            Noted::Tile(t) => Span {
+            Entry::Other(span) => (**span).clone(),
+            Entry::Tile(t) => Span {
                 name: format!("{},{}", t.corner[0], t.corner[1]),
                 category: "tile",
                 worker: Some(t.worker.to_string()),
@@ -84,7 +85,7 @@ impl Noted {
                     ("attempt", t.attempt.to_string()),
                 ],
             },
-            Noted::Bricks(f) => Span {
+            Entry::Bricks(f) => Span {
                 name: format!("{} bricks", f.bricks),
                 category: "bricks",
                 worker: Some(f.worker.to_string()),
@@ -102,11 +103,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_was_noted_is_told_in_order() {
-        let mut spans = Spans::with_room(2);
+    fn spans_keep_their_order_and_attributes() {
+        let mut spans = Spans::with_capacity(2);
         let worker: Arc<str> = "w1".into();
         let (start, end) = (5, 9);
-        spans.bricks(Flown { worker: worker.clone(), start, end, bricks: 3, bytes: 700 });
+        spans.bricks(BrickTransfer { worker: worker.clone(), start, end, bricks: 3, bytes: 700 });
         let (corner, thread, slab, edge) = ([64, 128], 2, 0, 64);
         let (est, bricks, attempt) = (4096, 11, 1);
         let tile =
@@ -122,16 +123,16 @@ mod tests {
             args: Vec::new(),
         };
         spans.push(frame.clone());
-        let told = spans.to_vec();
-        let names: Vec<_> = told.iter().map(|s| (&*s.name, s.category, s.end)).collect();
+        let listed = spans.to_vec();
+        let names: Vec<_> = listed.iter().map(|s| (&*s.name, s.category, s.end)).collect();
         assert_eq!(
             names,
             [("3 bricks", "bricks", 9), ("64,128", "tile", 12), ("frame 7", "frame", 20)]
         );
-        assert_eq!(told[0].args, [("bytes", "700".to_string())]);
-        assert_eq!((told[1].worker.as_deref(), told[1].thread), (Some("w1"), 2));
-        let args: Vec<_> = told[1].args.iter().map(|(k, v)| format!("{k} {v}")).collect();
+        assert_eq!(listed[0].args, [("bytes", "700".to_string())]);
+        assert_eq!((listed[1].worker.as_deref(), listed[1].thread), (Some("w1"), 2));
+        let args: Vec<_> = listed[1].args.iter().map(|(k, v)| format!("{k} {v}")).collect();
         assert_eq!(args, ["slab 0", "edge 64", "est 4096", "bricks 11", "attempt 1"]);
-        assert_eq!(told[2], frame);
+        assert_eq!(listed[2], frame);
     }
 }

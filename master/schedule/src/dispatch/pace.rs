@@ -14,8 +14,8 @@ pub(crate) struct Pace {
 }
 
 impl Pace {
-    /// Medians of 64 move slowly enough to pass over a slow worker's share and quickly enough
-    /// to follow the slabs.
+    /// Medians of 64 move slowly enough to pass over a slow worker's share and quickly enough to
+    /// follow the slabs.
     const LAST: usize = 64;
     /// With fewer, one slow task is the median.
     const LEAST: usize = 4;
@@ -32,8 +32,8 @@ impl Pace {
         }
     }
 
-    /// What these tasks say about the next: medians of render time for a workload of 2^20, and
-    /// of the time beside it.
+    /// What these tasks say about the next: medians of render time for a workload of 2^20, and of
+    /// the time beside it.
     pub(crate) fn measure(&self) -> Option<Measured> {
         if self.last.len() < Self::LEAST {
             return None;

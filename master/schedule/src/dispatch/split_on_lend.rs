@@ -1,35 +1,38 @@
-//! Late splits: the last tile of a worker that would be done after all others is cut as it is lent, and others draw
-//! parts of it (`region` schedule; a frame that is alone in the making).
+//! Late splits: the last tile of a worker that would be done after all others is cut as it is lent,
+//! and others draw parts of it (`region` schedule; a frame that is alone in the making).
 //!
-//! What a frame's tiles take is known from the frame before (`region`), and shared out so that all are done at once
-//! (`alone`). But the view turns, and of 64 workers one is always 20 % later than the mean. When is that to be mended?
-//! A tile that is being drawn can't be cut: what is drawn of it would be drawn twice, which at the end of a frame costs
-//! what it wins. When somebody runs dry it is too late, too: by then all tiles are begun. But a worker that answers
-//! with all but its last tile says how late it is while that tile is still here.
+//! What a frame's tiles take is known from the frame before (`region`), and shared out so that all
+//! are done at once (`alone`). But the view turns, and of 64 workers one is always 20 % later than
+//! the mean. When is that to be mended? A tile that is being drawn can't be cut: what is drawn of
+//! it would be drawn twice, which at the end of a frame costs what it wins. When somebody runs dry
+//! it is too late, too: by then all tiles are begun. But a worker that answers with all but its
+//! last tile says how late it is while that tile is still here.
 //!
-//! Parts go to whoever is done first with them, some back to the owner. Their bricks leave at once, and so do
-//! their leases where a thread is dry. mri256 `peer-semi` at 1024x1024, 9 frames on 15 and 64 workers: 88.3 and 67.3 %
-//! of n times one core's speed without, 89.5 and 69.5 with it (docs/scaling.md, Large scenes).
+//! Parts go to whoever is done first with them, some back to the owner. Their bricks leave at once,
+//! and so do their leases where a thread is dry. mri256 `peer-semi` at 1024x1024, 9 frames on 15
+//! and 64 workers: 88.3 and 67.3 % of n times one core's speed without, 89.5 and 69.5 with it
+//! (docs/scaling.md, Large scenes).
 
 use crate::Micros;
 use crate::policy::region::Part;
 use crate::state::cluster::Cluster;
 use crate::state::frame::{Frame, Slab};
-use crate::state::leases::End;
+use crate::state::task_queue::End;
 use crate::state::worker_map::WorkerMap;
 use crate::state::workers::Roster;
 use slabcast_common::ids::WorkerId;
 
-/// How much later than the mean a worker has to be for its last tile to be cut: this part of what the tile takes, and so
-/// many microseconds. In parts a tile takes a quarter longer; at half as much 64 workers have 67.6 % where they have
-/// 69.5, and at double 68.0, which is little more than runs differ by.
+/// How much later than the mean a worker has to be for its last tile to be cut: this part of what
+/// the tile takes, and so many microseconds. In parts a tile takes a quarter longer; at half as
+/// much 64 workers have 67.6 % where they have 69.5, and at double 68.0, which is little more than
+/// runs differ by.
 const LATE: (f64, f64) = (0.2, 400.0);
 
 /// A tile that takes less is not cut, in microseconds: its parts take less than their messages.
 const LEAST: f64 = 500.0;
 
-/// What a part costs a worker that has not drawn it before beside its bricks, in microseconds: a lease on its way. At 700
-/// fewer move that would have won something.
+/// What a part costs a worker that has not drawn it before beside its bricks, in microseconds: a
+/// lease on its way. At 700 fewer move that would have won something.
 const AWAY: f64 = 300.0;
 
 /// How long each worker that stays has to do, in microseconds.
@@ -39,9 +42,10 @@ pub(crate) struct Left {
 }
 
 impl Frame {
-    /// Before a worker is lent a tile of its own: cuts it, if the worker would be done too late with it. Who has
-    /// tiles to draw for that, the worker itself among them; nobody where the tile stays whole. `known` keeps what
-    /// each has left to do while no tile is cut and no time goes by: what is lent meanwhile changes nothing of it.
+    /// Before a worker is lent a tile of its own: cuts it, if the worker would be done too late
+    /// with it. Who has tiles to draw for that, the worker itself among them; nobody where the tile
+    /// stays whole. `known` keeps what each has left to do while no tile is cut and no time goes
+    /// by: what is lent meanwhile changes nothing of it.
     pub(crate) fn split_late(
         &mut self,
         cluster: &Cluster,
@@ -60,7 +64,7 @@ impl Frame {
         let takers: Vec<WorkerId> = parts.iter().map(|p| p.1).collect();
         let first = cut.tiles.len() as u32;
         self.gained.extend(takers.iter().copied().zip(first..));
-        regions.cut_late(place, parts);
+        regions.split_waiting(place, parts);
         queue.cut(place, &tiles);
         cut.add(tiles);
         takers
@@ -78,8 +82,8 @@ impl Frame {
         let regions = slab.regions.as_ref()?;
         let us = regions.took(place).filter(|us| *us >= LEAST)?;
         let task = &slab.queue.tasks[place as usize];
-        let waits = |p: &u32| *p != place && slab.queue.any_waits(&[*p]);
-        if task.was_lent() || task.begun.is_some() || regions.owned(id).iter().any(waits) {
+        let waits = |p: &u32| *p != place && slab.queue.any_waiting(&[*p]);
+        if task.was_leased() || task.begun.is_some() || regions.owned(id).iter().any(waits) {
             return None;
         }
         if known.is_none() {
@@ -93,7 +97,7 @@ impl Frame {
         let mine = left.get_mut(id)?;
         let threads = |id| f64::from(cluster.roster.get(id).map_or(1, |w| w.threads));
         *mine -= us / threads(id);
-        let mut parts = regions.parts(place, &task.tile.rect, &cluster.memory);
+        let mut parts = regions.parts(place, &task.tile.rect, &cluster.history);
         parts.sort_by(|a, b| b.us.total_cmp(&a.us));
         let mut whose = Vec::with_capacity(parts.len());
         for part in parts {
@@ -114,7 +118,7 @@ impl Frame {
         let open = tasks.filter(|(t, _)| t.end == End::Open).map(|(_, place)| place);
         let all = regions.left(open, roster);
         let mut left: WorkerMap<f64> =
-            roster.staying().map(|(id, _)| (id, all.get(id).copied().unwrap_or(0.0))).collect();
+            roster.active().map(|(id, _)| (id, all.get(id).copied().unwrap_or(0.0))).collect();
         // But for what is drawn by now of what threads draw.
         for (id, lent) in self.lent.iter() {
             let (Some(left), Some(worker)) = (left.get_mut(id), roster.get(id)) else { continue };

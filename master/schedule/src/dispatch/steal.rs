@@ -1,5 +1,6 @@
-//! Hand-overs: a region that is being drawn is cut where it stands, and a worker that has nothing left to do draws a
-//! piece of it from there (DESIGN.md section 3: take-over with its state; `region` schedule, a frame that is alone).
+//! Hand-overs: a region that is being drawn is cut where it stands, and a worker that has nothing
+//! left to do draws a piece of it from there (DESIGN.md section 3: take-over with its state;
+//! `region` schedule, a frame that is alone).
 //!
 //! ```text
 //! nothing waits, a thread is dry        the region that takes longest yet is asked for a piece      (ask_for_pieces)
@@ -7,19 +8,21 @@
 //! the piece is a task like any other    lent with that state to who is dry, again if he is lost
 //! ```
 //!
-//! Before the frame tiles are dealt out by what they took in the view before (`alone`), and a last one that would be
-//! late is cut as it is lent (`late`). What neither knows is found out here: a view in which a tile takes longer, a worker
-//! that is slower than it was. Pieces cost no drawing twice but the voxels at their border and at the cut
-//! sheet, three ways between machines, and bricks. So they come before running a straggler's tile twice, which is left for
-//! who does not answer.
+//! Before the frame tiles are dealt out by what they took in the view before (`alone`), and a last
+//! one that would be late is cut as it is lent (`late`). What neither knows is found out here: a
+//! view in which a tile takes longer, a worker that is slower than it was. Pieces cost no drawing
+//! twice but the voxels at their border and at the cut sheet, three ways between machines, and
+//! bricks. So they come before running a straggler's tile twice, which is left for who does not
+//! answer.
 //!
-//! The first lease goes on, for what is left of its tile. So there is nothing to wait for: who has drawn his
-//! region when the question comes has nothing to give, and his result counts as ever. If he is lost after he gave a
-//! piece away, the piece is not; what he kept is drawn again from the front. The price is that a task's tile may shrink
-//! while it is lent. It must not be lent to two then: who has it as it was would send too many pixels. So where somebody else
-//! was lent it meanwhile, the piece is dropped, and so is what its giver sends.
+//! The first lease goes on, for what is left of its tile. So there is nothing to wait for: who has
+//! drawn his region when the question comes has nothing to give, and his result counts as ever. If
+//! he is lost after he gave a piece away, the piece is not; what he kept is drawn again from the
+//! front. The price is that a task's tile may shrink while it is lent. It must not be lent to two
+//! then: who has it as it was would send too many pixels. So where somebody else was lent it
+//! meanwhile, the piece is dropped, and so is what its giver sends.
 //!
-//! Statistics and what is learnt for the next frame are of the whole tile ([`Family`]).
+//! Statistics and what is learnt for the next frame are of the whole tile ([`SplitGroup`]).
 
 use crate::Micros;
 use crate::dispatch::pace::Measured;
@@ -27,7 +30,7 @@ use crate::policy::macrotile::Macrotile;
 use crate::policy::region::Regions;
 use crate::state::cluster::Cluster;
 use crate::state::frame::{Frame, Slab, check};
-use crate::state::leases::{End, Verdict};
+use crate::state::task_queue::{End, Verdict};
 use slabcast_common::ids::{Epoch, WorkerId};
 use slabcast_common::leaves::LEAF;
 use slabcast_common::message::{HandedOver, ToWorker};
@@ -36,9 +39,9 @@ use slabcast_common::region::parts;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// What goes by until a piece is drawn that is asked for now, in microseconds: the question, the piece to the master
-/// and on to who is dry, and those of its bricks that nobody thought of. At 300 and at 800 the figures of [`GAIN`] change
-/// by their noise.
+/// What goes by until a piece is drawn that is asked for now, in microseconds: the question, the
+/// piece to the master and on to who is dry, and those of its bricks that nobody thought of. At 300
+/// and at 800 the figures of [`GAIN`] change by their noise.
 const AWAY: f64 = 500.0;
 
 /// Bytes of a piece, which pass the link twice: of 64x32 pixels in a scene that fills them.
@@ -47,14 +50,15 @@ const BYTES: f64 = 48_000.0;
 /// How much longer the pieces of a region take together than it would have taken, at least.
 const MORE: f64 = 1.1;
 
-/// What a hand-over has to win, in microseconds, to be worth its messages. At 150 as many again are asked for, and 64 workers
-/// win nothing by them (mri256 `peer-semi` at 1536x1536, `plan`).
+/// What a hand-over has to win, in microseconds, to be worth its messages. At 150 as many again are
+/// asked for, and 64 workers win nothing by them (mri256 `peer-semi` at 1536x1536, `plan`).
 const GAIN: f64 = 300.0;
 
 /// The least and the most that is asked for, of what is left.
 const SHARE: (f64, f64) = (0.15, 0.95);
 
-/// So long a worker may take to answer before its tile is run twice, in microseconds: the scheduling of two busy machines.
+/// So long a worker may take to answer before its tile is run twice, in microseconds: the
+/// scheduling of two busy machines.
 const PATIENCE: Micros = 5_000;
 
 /// A lease of which a piece is to be given away: its place, whose it is, and which attempt.
@@ -65,7 +69,7 @@ pub(crate) type Questions = Vec<(Leased, u32)>;
 
 /// A tile of which pieces were given away, with all of them.
 #[derive(Debug)]
-pub(crate) struct Family {
+pub(crate) struct SplitGroup {
     /// As it was cut first, and whose it was then.
     pub(crate) tile: Rect,
     pub(crate) owner: WorkerId,
@@ -83,40 +87,42 @@ pub(crate) enum Drawn {
     /// Others have pieces of it.
     InPart,
     /// It was the last of the tile's at this place.
-    Whole(u32, Family),
+    Whole(u32, SplitGroup),
 }
 
-/// How long a region takes yet that was to take so long, in microseconds, and has taken some of it. What takes longer
-/// than it was to is slower than was known, by how much it is over so far.
+/// How long a region takes yet that was to take so long, in microseconds, and has taken some of it.
+/// What takes longer than it was to is slower than was known, by how much it is over so far.
 fn left(us: f64, elapsed: f64) -> f64 {
     (us - elapsed).abs()
 }
 
-/// How much of what is left of a region is to be given away for both pieces to be done at once, if others are so many times
-/// quicker and what is given is `away` for so long; `None`: it does not pay.
+/// How much of what is left of a region is to be given away for both pieces to be done at once, if
+/// others are so many times quicker and what is given is `away` for so long; `None`: it does not
+/// pay.
 fn share(left: f64, quicker: f64, away: f64) -> Option<f64> {
     let share = (1.0 - away / (MORE * left)) / (1.0 + 1.0 / quicker);
     let ends = MORE * left * (1.0 - share);
     (share >= SHARE.0 && ends + GAIN <= left).then(|| share.min(SHARE.1))
 }
 
-/// The least that has to be left for [`share`] to pay, where others are as quick: half of it, drawn as a piece, and half of
-/// the way are to be shorter by [`GAIN`].
+/// The least that has to be left for [`share`] to pay, where others are as quick: half of it, drawn
+/// as a piece, and half of the way are to be shorter by [`GAIN`].
 fn least(away: f64) -> f64 {
     (0.5 * away + GAIN) / (1.0 - 0.5 * MORE)
 }
 
 /// [`AWAY`], by a link as quick as was seen.
 fn away(cluster: &Cluster) -> f64 {
-    AWAY + cluster.traffic.rate().map_or(0.0, |rate| 2.0 * BYTES / rate)
+    AWAY + cluster.link_use.rate().map_or(0.0, |rate| 2.0 * BYTES / rate)
 }
 
 impl Frame {
-    /// Of which regions, those that take longest yet, pieces are asked for: one for each thread that has nothing to do soon.
+    /// Of which regions, those that take longest yet, pieces are asked for: one for each thread
+    /// that has nothing to do soon.
     pub(crate) fn find_pieces(&mut self, cluster: &Cluster, now: Micros) -> Questions {
         self.pieces_at = None;
         let Some(slab) = self.slab.as_ref().filter(|_| self.alone) else { return Vec::new() };
-        if slab.queue.waiting() > 0 || cluster.traffic.binds_alone() {
+        if slab.queue.waiting() > 0 || cluster.link_use.binds_alone() {
             return Vec::new();
         }
         // Where all tiles are short nobody need be looked at.
@@ -128,7 +134,7 @@ impl Frame {
         let price = |place: u32| {
             let tile = &slab.cut.tiles[place as usize].rect;
             let regions = slab.regions.as_ref();
-            regions.map_or(0.0, |regions| regions.price_of_piece(place, tile, &cluster.memory))
+            regions.map_or(0.0, |regions| regions.price_of_piece(place, tile, &cluster.history))
         };
         let pays = |(left, quicker, lease): (f64, f64, Leased)| {
             // What its bricks take is looked up only where it pays without.
@@ -166,8 +172,8 @@ impl Frame {
         }
     }
 
-    /// Regions that workers draw now and could give pieces of: how long they take yet, and how many times quicker others
-    /// are, longest first.
+    /// Regions that workers draw now and could give pieces of: how long they take yet, and how many
+    /// times quicker others are, longest first.
     fn being_drawn(
         &self,
         of: (&Cluster, &Slab, Option<Measured>),
@@ -182,15 +188,15 @@ impl Frame {
         drawn
     }
 
-    /// Workers that take leases, by when they have nothing more to do: in how many microseconds, and how many threads of
-    /// theirs. Who takes longer than he was to is none of them.
+    /// Workers that take leases, by when they have nothing more to do: in how many microseconds,
+    /// and how many threads of theirs. Who takes longer than he was to is none of them.
     fn free(
         &self,
         (cluster, slab, pace): (&Cluster, &Slab, Option<Measured>),
         now: Micros,
     ) -> Vec<(f64, WorkerId, u64)> {
         let mut free = Vec::new();
-        for (id, worker) in cluster.roster.staying() {
+        for (id, worker) in cluster.roster.active() {
             let threads = u64::from(worker.threads);
             let dry = threads.saturating_sub(worker.leases);
             if dry > 0 {
@@ -213,7 +219,8 @@ impl Frame {
         free
     }
 
-    /// When the first region that is drawn now will have taken so much longer than it was to that a piece of it pays.
+    /// When the first region that is drawn now will have taken so much longer than it was to that a
+    /// piece of it pays.
     fn overtime(
         &self,
         of: (&Cluster, &Slab, Option<Measured>),
@@ -228,8 +235,8 @@ impl Frame {
         self.running(of).map(at).filter(|at| *at > now).min()
     }
 
-    /// What threads are probably at that one worker alone has: its place, whose, and which attempt; how long it was to
-    /// take, and since when.
+    /// What threads are probably at that one worker alone has: its place, whose, and which attempt;
+    /// how long it was to take, and since when.
     fn running<'a>(
         &'a self,
         (cluster, slab, pace): (&'a Cluster, &'a Slab, Option<Measured>),
@@ -240,7 +247,7 @@ impl Frame {
             lent.iter().take(threads as usize).filter_map(move |lent| {
                 let place = slab.queue.place(lent.task)?;
                 let asked = slab.handing.contains_key(&place);
-                let may = !asked && slab.queue.is_alone(place, id, lent.epoch);
+                let may = !asked && slab.queue.is_only_lease(place, id, lent.epoch);
                 let us = slab.us(place, pace).filter(|_| may)?;
                 Some(((place, id, lent.epoch), us, lent.sent.max(answered)))
             })
@@ -266,9 +273,9 @@ impl Frame {
         let tile = slab.cut.tiles[place as usize].rect;
         check_pieces(tile, &piece)?;
         let HandedOver { kept, given, begun, .. } = piece;
-        if !slab.queue.is_alone(place, worker, lease.epoch) {
+        if !slab.queue.is_only_lease(place, worker, lease.epoch) {
             // Somebody else was lent it as it was.
-            slab.queue.forsake(place, worker, lease.epoch);
+            slab.queue.release(place, worker, lease.epoch);
             return Ok(());
         }
         let since = lease.sent.max(self.answered.get(worker).copied().unwrap_or(0));
@@ -283,7 +290,8 @@ impl Frame {
             let owned = regions.owned(id).iter().map(|p| slab.cut.tiles[*p as usize].rect);
             owned.map(|r| far(&r, &given)).min().unwrap_or(i32::MAX)
         };
-        // Of those who can have begun it as soon as it is there, who has drawn nearest to it and lacks least bricks.
+        // Of those who can have begun it as soon as it is there, who has drawn nearest to it and
+        // lacks least bricks.
         let away = away(cluster);
         let soon = free.iter().filter(|f| f.0 <= away && f.1 != worker);
         let first = || free.iter().find(|f| f.1 != worker);
@@ -294,7 +302,7 @@ impl Frame {
             (place, &tile),
             (elapsed + us * (1.0 - part), us * part),
             taker,
-            &cluster.memory,
+            &cluster.history,
         );
         let est = slab.cut.tiles[place as usize].est;
         let of = |rect: Rect| {
@@ -305,12 +313,12 @@ impl Frame {
         let task = &mut slab.queue.tasks[place as usize];
         task.tile = of(kept);
         task.begun = task.begun.as_ref().map(|begun| Arc::new(begun.piece(tile, kept)));
-        let at = slab.queue.add(of(given), Arc::new(begun));
+        let at = slab.queue.add_piece(of(given), Arc::new(begun));
         slab.cut.add(vec![of(given)]);
         let root = slab.roots.get(&place).copied().unwrap_or(place);
         slab.roots.insert(at, root);
-        let whole = Family { tile, owner: worker, open: 1, us: 0, touched: Vec::new() };
-        slab.families.entry(root).or_insert(whole).open += 1;
+        let whole = SplitGroup { tile, owner: worker, open: 1, us: 0, touched: Vec::new() };
+        slab.split_groups.entry(root).or_insert(whole).open += 1;
         self.ledger.handed_over += 1;
         self.progress(cluster);
         Ok(())
@@ -329,14 +337,15 @@ impl Slab {
         until.filter(|until| *until > now).collect()
     }
 
-    /// How long a region was to take: as it did in the frame before, or by what others of this one took.
+    /// How long a region was to take: as it did in the frame before, or by what others of this one
+    /// took.
     fn us(&self, place: u32, pace: Option<Measured>) -> Option<f64> {
         let guess = || pace.map(|pace| pace.expects(self.cut.tiles[place as usize].est) as f64);
         self.regions.as_ref()?.took(place).or_else(guess)
     }
 
-    /// Tiles of which pieces were given away and that were drawn: as they were cut first, with what was expected of them then,
-    /// and what their pieces took.
+    /// Tiles of which pieces were given away and that were drawn: as they were cut first, with what
+    /// was expected of them then, and what their pieces took.
     pub(crate) fn whole_tiles(&self) -> BTreeMap<u32, (Rect, u64, Micros)> {
         let mut whole = BTreeMap::new();
         for (at, root) in self.roots.iter().filter(|(at, _)| self.is_told_elsewhere(**at)) {
@@ -358,28 +367,29 @@ impl Slab {
         self.roots.get(&place).is_some_and(|root| done(*root) && done(place))
     }
 
-    /// A task was drawn, in so long and from these bricks: what that says of the tile that it is, or is a piece of.
+    /// A task was drawn, in so long and from these bricks: what that says of the tile that it is,
+    /// or is a piece of.
     pub(crate) fn drawn(&mut self, place: u32, us: Micros, touched: &[u32]) -> Drawn {
         let root = self.roots.get(&place).copied().unwrap_or(place);
-        let Some(family) = self.families.get_mut(&root) else { return Drawn::Itself };
-        family.open -= 1;
-        family.us += us;
-        family.touched.extend_from_slice(touched);
-        if family.open > 0 {
+        let Some(group) = self.split_groups.get_mut(&root) else { return Drawn::Itself };
+        group.open -= 1;
+        group.us += us;
+        group.touched.extend_from_slice(touched);
+        if group.open > 0 {
             return Drawn::InPart;
         }
-        match self.families.remove(&root) {
-            Some(mut family) => {
-                family.touched.sort_unstable();
-                family.touched.dedup();
-                Drawn::Whole(root, family)
+        match self.split_groups.remove(&root) {
+            Some(mut group) => {
+                group.touched.sort_unstable();
+                group.touched.dedup();
+                Drawn::Whole(root, group)
             }
             None => Drawn::Itself,
         }
     }
 }
 
-impl Family {
+impl SplitGroup {
     /// What its tasks took in all, and what they were drawn from.
     pub(crate) fn cost(&self) -> (Micros, &[u32]) {
         (self.us, &self.touched)

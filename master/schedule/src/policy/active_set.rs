@@ -1,41 +1,46 @@
 //! How many workers draw, where all of them would be done later than some.
 //!
-//! Whoever draws is sent bricks, and bricks at the border of two workers' tiles are sent to both. So with more workers
-//! there is less to draw for each and more to send to all, and from some number on the link binds, or the master's thread,
-//! and each one more makes frames come later: mri256 `peer-opaque` at 512x512 and 1 Gbit/s, four in flight, has 430 frames a
-//! second on 8 workers, 397 on 15, 263 on 32 and 127 on 64 (`slabcast plan --frames 72`, a core that takes 10 ms a frame).
-//! So the others are **held in reserve**: they are lent nothing and sent nothing, until more are wanted or somebody is
-//! lost. With that 32 have 371 and 64 have 356.
+//! Whoever draws is sent bricks, and bricks at the border of two workers' tiles are sent to both.
+//! So with more workers there is less to draw for each and more to send to all, and from some
+//! number on the link binds, or the master's thread, and each one more makes frames come later:
+//! mri256 `peer-opaque` at 512x512 and 1 Gbit/s, four in flight, has 430 frames a second on 8
+//! workers, 397 on 15, 263 on 32 and 127 on 64 (`slabcast plan --frames 72`, a core that takes 10
+//! ms a frame). So the others are **held in reserve**: they are lent nothing and sent nothing,
+//! until more are wanted or somebody is lost. With that 32 have 371 and 64 have 356.
 //!
-//! What binds is not asked, since of the master's thread and of what results take nothing is known here. What is known is
-//! how long frames take and how much of that render threads draw. Where they stand still for the most part half of the
-//! workers would do, and half of them is tried ([`Level`]); if frames come later then, it is taken back.
+//! What binds is not asked, since of the master's thread and of what results take nothing is known
+//! here. What is known is how long frames take and how much of that render threads draw. Where they
+//! stand still for the most part half of the workers would do, and half of them is tried
+//! ([`Level`]); if frames come later then, it is taken back.
 //!
-//! The **first frame** of a brick set is drawn by [`FIRST`] workers at most. Nobody holds a brick then, and to send a voxel takes
-//! longer than to draw it: 5 bytes are 40 ns at 1 Gbit/s, and each goes to several workers. So a first picture is there sooner
-//! if few draw it: at 1 Gbit/s mri256's after 44 ms from 16 workers and after 104 from 64, and without a limit after 5 and 10.
-//! If their threads have nearly nothing to do all the same, the others are not called.
+//! The **first frame** of a brick set is drawn by [`FIRST`] workers at most. Nobody holds a brick
+//! then, and to send a voxel takes longer than to draw it: 5 bytes are 40 ns at 1 Gbit/s, and each
+//! goes to several workers. So a first picture is there sooner if few draw it: at 1 Gbit/s mri256's
+//! after 44 ms from 16 workers and after 104 from 64, and without a limit after 5 and 10. If their
+//! threads have nearly nothing to do all the same, the others are not called.
 //!
-//! Frames that are alone and frames beside others are told apart, as in `traffic`: of those that are alone all ways
-//! and waking are part of the time, in which nobody draws.
+//! Frames that are alone and frames beside others are told apart, as in `traffic`: of those that
+//! are alone all ways and waking are part of the time, in which nobody draws.
 //!
-//! It refuses to know who is held in reserve (`roster`), and to go on with a number of workers that was not tried.
+//! It refuses to know who is held in reserve (`roster`), and to go on with a number of workers that
+//! was not tried.
 
 use crate::Micros;
 use slabcast_common::brick::BrickSetKey;
 
-/// Where threads draw for less than this of frames' time half of the workers would do: of frames beside others, and of
-/// such as are alone. Without a limit of bandwidth mri256 has 860 frames a second on 64 workers, whose threads draw for 0.14
-/// of the time, and 1340 on 32 (0.44). Of frames alone it takes 1.4 ms on 64 (0.12) and would take as long on 32; at 1 Gbit/s
-/// 4.2 and 3.6 (0.04 and 0.09). What is less is sent to fewer, so that each change costs bricks: at 0.4 and 0.1 a path of
-/// 72 frames was over before that was won back.
+/// Where threads draw for less than this of frames' time half of the workers would do: of frames
+/// beside others, and of such as are alone. Without a limit of bandwidth mri256 has 860 frames a
+/// second on 64 workers, whose threads draw for 0.14 of the time, and 1340 on 32 (0.44). Of frames
+/// alone it takes 1.4 ms on 64 (0.12) and would take as long on 32; at 1 Gbit/s 4.2 and 3.6 (0.04
+/// and 0.09). What is less is sent to fewer, so that each change costs bricks: at 0.4 and 0.1 a
+/// path of 72 frames was over before that was won back.
 const IDLE: [f64; 2] = [0.2, 0.05];
 
 /// The first of them while bricks fill the link, where bricks that a change brings are dearest.
 const IDLE_ON_A_FULL_LINK: f64 = 0.15;
 
-/// Where they draw for more than this twice as many are tried. That is far more than twice [`IDLE`], lest the two take
-/// turns.
+/// Where they draw for more than this twice as many are tried. That is far more than twice
+/// [`IDLE`], lest the two take turns.
 const BUSY: [f64; 2] = [0.85, 0.5];
 
 /// Frames after a change that say nothing: those that had begun, and bricks that the change brings.
@@ -44,26 +49,31 @@ const SETTLE: [u32; 2] = [4, 2];
 /// Frames that are looked at together. Two crews' frames come in pairs.
 const WINDOW: u32 = 6;
 
-/// Where threads draw for less than this part of [`IDLE`], a quarter of the workers is tried at once.
+/// Where threads draw for less than this part of [`IDLE`], a quarter of the workers is tried at
+/// once.
 const HARDLY: f64 = 0.5;
 
 /// Fewer workers than this always draw all.
 const LEAST: usize = 4;
 
-/// Workers that draw the first frame of a set at most. Half as many would be done with it sooner at 1 Gbit/s (33 ms), but a
-/// scene that takes long to draw has all others' bricks to wait for in its second frame.
+/// Workers that draw the first frame of a set at most. Half as many would be done with it sooner at
+/// 1 Gbit/s (33 ms), but a scene that takes long to draw has all others' bricks to wait for in its
+/// second frame.
 const FIRST: usize = 16;
 
-/// Where they draw for more than this of the first frame all are called, unless bricks filled the link: whoever is called is
-/// sent all that the view needs. Of mri256 on 16 workers it is 0.02 at 1 Gbit/s, and without a limit 0.15; of `peer-semi` at
-/// 1024x1024 0.07 and 0.5. Where that takes a core 344 ms a frame it is 0.11 at 1 Gbit/s, and when all were called the three
-/// frames after the first took 85 ms each on 32 workers and 155 on 64; now they take 28, as on 16.
+/// Where they draw for more than this of the first frame all are called, unless bricks filled the
+/// link: whoever is called is sent all that the view needs. Of mri256 on 16 workers it is 0.02 at 1
+/// Gbit/s, and without a limit 0.15; of `peer-semi` at 1024x1024 0.07 and 0.5. Where that takes a
+/// core 344 ms a frame it is 0.11 at 1 Gbit/s, and when all were called the three frames after the
+/// first took 85 ms each on 32 workers and 155 on 64; now they take 28, as on 16.
 const CALL: f64 = 0.1;
 
-/// Where that much of it is drawn already they are called before it is done: of `peer-semi` at 1024x1024 it is half at the end.
+/// Where that much of it is drawn already they are called before it is done: of `peer-semi` at
+/// 1024x1024 it is half at the end.
 const CALL_NOW: f64 = 0.25;
 
-/// Taken back is a change after which the same work takes longer by this. Two windows of one path differ by some percent.
+/// Taken back is a change after which the same work takes longer by this. Two windows of one path
+/// differ by some percent.
 const WORSE: f64 = 1.1;
 
 /// Most frames after which what was taken back is tried again.
@@ -72,8 +82,9 @@ const PATIENCE: u32 = 4096;
 /// Most times that workers are halved: a thousandth of them draws.
 const MOST: u32 = 10;
 
-/// Frames of the other kind in a row after which it goes by these. Of a path one is alone now and then, where whoever
-/// takes the pictures was late, and to call all for that one would send them bricks.
+/// Frames of the other kind in a row after which it goes by these. Of a path one is alone now and
+/// then, where whoever takes the pictures was late, and to call all for that one would send them
+/// bricks.
 const OTHERS: u32 = 4;
 
 /// Render threads' time and work over some frames.
@@ -152,28 +163,30 @@ impl Level {
 
 /// What frames tell of how many workers are best.
 #[derive(Debug, Default)]
-pub(crate) struct Reserve {
+pub(crate) struct ActiveSet {
     set: Option<BrickSetKey>,
     /// No frame of the set is done.
     first: bool,
     /// Of frames beside others, and of those that are alone.
     levels: [Level; 2],
-    /// Whether it goes by those that are alone, and how many frames in a row were of the other kind.
+    /// Whether it goes by those that are alone, and how many frames in a row were of the other
+    /// kind.
     alone: bool,
     others: u32,
-    /// When a frame was done that is of either kind, or began alone. A path's first frame begins alone and ends beside
-    /// others, so it is judged with the one after it, by the time of both: `traffic` counts each.
+    /// When a frame was done that is of either kind, or began alone. A path's first frame begins
+    /// alone and ends beside others, so it is judged with the one after it, by the time of both:
+    /// `traffic` counts each.
     since: Micros,
 }
 
-impl Reserve {
+impl ActiveSet {
     /// A frame begins, and none is in the making.
     pub(crate) fn begin(&mut self, now: Micros) {
         self.since = now;
     }
 
-    /// How often so many workers are to be halved for a frame, of which so many must be left. Of another set nothing is
-    /// known.
+    /// How often so many workers are to be halved for a frame, of which so many must be left. Of
+    /// another set nothing is known.
     pub(crate) fn halved(
         &mut self,
         set: BrickSetKey,
@@ -200,8 +213,8 @@ impl Reserve {
         self.first
     }
 
-    /// Whether all are to be called while the first frame of a set is in the making, for which so many threads drew so
-    /// long by now.
+    /// Whether all are to be called while the first frame of a set is in the making, for which so
+    /// many threads drew so long by now.
     pub(crate) fn calls_all_now(&mut self, drew: Micros, threads: u64, now: Micros) -> bool {
         let had = now.saturating_sub(self.since).saturating_mul(threads);
         let calls = self.first && drew as f64 > CALL_NOW * had as f64;
@@ -211,8 +224,8 @@ impl Reserve {
         calls
     }
 
-    /// A frame is done, for which threads drew so long, of so many workers and threads that might have; whether it was
-    /// alone.
+    /// A frame is done, for which threads drew so long, of so many workers and threads that might
+    /// have; whether it was alone.
     pub(crate) fn done(
         &mut self,
         (alone, full): (bool, bool),
@@ -250,9 +263,10 @@ mod tests {
 
     const SET: BrickSetKey = BrickSetKey(Digest32([1; 32]));
 
-    /// Frames beside others, each of which takes so long on so many workers of one thread. How many drew each.
+    /// Frames beside others, each of which takes so long on so many workers of one thread. How many
+    /// drew each.
     fn path(
-        reserve: &mut Reserve,
+        reserve: &mut ActiveSet,
         frames: usize,
         all: usize,
         takes: impl Fn(usize) -> f64,
@@ -268,11 +282,12 @@ mod tests {
     }
 
     /// Where the set is not a new one, so that all begin.
-    fn later() -> Reserve {
-        Reserve { set: Some(SET), ..Reserve::default() }
+    fn later() -> ActiveSet {
+        ActiveSet { set: Some(SET), ..ActiveSet::default() }
     }
 
-    /// What 10 ms of drawing take, and bricks that become more with the square root of workers; milliseconds.
+    /// What 10 ms of drawing take, and bricks that become more with the square root of workers;
+    /// milliseconds.
     fn linked(n: usize) -> f64 {
         (10.0 / n as f64).max(0.7 * (n as f64).sqrt())
     }
@@ -291,20 +306,20 @@ mod tests {
 
     #[test]
     fn few_draw_a_first_frame_and_the_others_come_if_it_is_drawing_that_takes_long() {
-        let bricks = path(&mut Reserve::default(), 30, 64, |n| 3.0 * n as f64);
+        let bricks = path(&mut ActiveSet::default(), 30, 64, |n| 3.0 * n as f64);
         assert!(bricks[0] == FIRST && bricks.iter().all(|n| *n <= FIRST), "{bricks:?}");
-        let long = path(&mut Reserve::default(), 30, 64, |n| 12.0 / n as f64);
+        let long = path(&mut ActiveSet::default(), 30, 64, |n| 12.0 / n as f64);
         assert_eq!((long[0], &long[1..]), (FIRST, &[64; 29][..]));
-        assert_eq!(path(&mut Reserve::default(), 3, 16, |n| 3.0 * n as f64), [16; 3]);
+        assert_eq!(path(&mut ActiveSet::default(), 3, 16, |n| 3.0 * n as f64), [16; 3]);
         // Bricks took nearly all of the time.
         for (full, drew) in [(false, 64), (true, FIRST)] {
-            let mut reserve = Reserve::default();
+            let mut reserve = ActiveSet::default();
             reserve.halved(SET, true, (64, 0));
             reserve.done((true, full), 344_000, (FIRST, FIRST as u64), 200_000);
             assert_eq!(drawing(64, reserve.halved(SET, true, (64, 0))), drew, "full: {full}");
         }
         // A quarter of what 16 threads could draw by then is drawn.
-        let mut reserve = Reserve::default();
+        let mut reserve = ActiveSet::default();
         reserve.begin(1_000);
         assert_eq!(drawing(64, reserve.halved(SET, true, (64, 0))), FIRST);
         assert!(
@@ -342,7 +357,7 @@ mod tests {
 
     #[test]
     fn as_many_draw_as_have_room_for_the_bricks() {
-        let mut reserve = Reserve::default();
+        let mut reserve = ActiveSet::default();
         let drawn = [0, 16, 17, 33, 65, usize::MAX]
             .map(|needed| drawing(64, reserve.halved(SET, false, (64, needed))));
         assert_eq!(drawn, [16, 16, 32, 64, 64, 64]);

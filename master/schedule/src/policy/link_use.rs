@@ -1,11 +1,13 @@
-//! Whether the link bears crews (`region`), each of which is sent what a view needs: most of it when they are
-//! formed, and more a frame than all together. And whether bricks fill it, where fewer frames are best.
+//! Whether the link bears crews (`region`), each of which is sent what a view needs: most of it
+//! when they are formed, and more a frame than all together. And whether bricks fill it, where
+//! fewer frames are best.
 //!
-//! Nobody tells the scheduler how fast the link is; it sees when bricks leave and when workers say that they have
-//! them. From the moment at which some are on their way to anybody until none are, what has landed by now in the
-//! time since is never more than the link carries, however few they are and however long words take; and
-//! where many leave at once, as for the first frame, it comes near. So the **rate** is the highest that was
-//! seen. What the last frames were sent takes a **share** of their time at that rate:
+//! Nobody tells the scheduler how fast the link is; it sees when bricks leave and when workers say
+//! that they have them. From the moment at which some are on their way to anybody until none are,
+//! what has landed by now in the time since is never more than the link carries, however few they
+//! are and however long words take; and where many leave at once, as for the first frame, it comes
+//! near. So the **rate** is the highest that was seen. What the last frames were sent takes a
+//! **share** of their time at that rate:
 //!
 //! | mri256 at 512x512, 15 and 32 workers | rate seen, MB/s | share, all together | share, crews |
 //! |---|--:|--:|--:|
@@ -13,60 +15,67 @@
 //! | 10 Gbit/s | 896, 990   | 0.55 to 0.6, 0.58 to 0.63 | 0.3 to 0.2, 0.8 to 0.4 |
 //! | unlimited | 1487, 2304 | 0.4, 0.3                  | 0.4 to 0.2, 0.5 to 0.2 |
 //!
-//! What workers' results take the other way is judged at the same rate, links being alike either way: until they take a good
-//! part of the time, packing them keeps render threads longer than anybody waits for bytes.
+//! What workers' results take the other way is judged at the same rate, links being alike either
+//! way: until they take a good part of the time, packing them keeps render threads longer than
+//! anybody waits for bytes.
 //!
-//! Frames that are alone are told apart: what these are sent takes another share of other time, and says whether the
-//! next one may be cut in another way than the one before it (`region`).
+//! Frames that are alone are told apart: what these are sent takes another share of other time, and
+//! says whether the next one may be cut in another way than the one before it (`region`).
 //!
 //! It refuses to forget: that a link has become slower it never learns.
 
 use crate::Micros;
 
-/// Crews are formed where the share is below this. At 0.7 they come and go at 1 Gbit/s, at 0.5 they come late at 10
-/// (70 % of n times one worker's frames with 15 workers, where 74 are with this).
+/// Crews are formed where the share is below this. At 0.7 they come and go at 1 Gbit/s, at 0.5 they
+/// come late at 10 (70 % of n times one worker's frames with 15 workers, where 74 are with this).
 const FORM: f64 = 0.6;
 
-/// The same once the first frames are over, which were sent all that the view needs: the share of those that follow is
-/// half as large. At 1 Gbit/s it is 0.5 to 1 on a turn, where crews come and go if this is as large as [`FORM`].
+/// The same once the first frames are over, which were sent all that the view needs: the share of
+/// those that follow is half as large. At 1 Gbit/s it is 0.5 to 1 on a turn, where crews come and
+/// go if this is as large as [`FORM`].
 const FORM_LATER: f64 = 0.3;
 
-/// Bricks that may not be needed are sent until the share is above [`DISSOLVE`], and again when it is below this. On a
-/// link of 1 Gbit/s the share goes up and down; if they were sent whenever it is below 0.65, or in the first frame, paths of
-/// overlapping frames would take up to a seventh longer on 15 workers (docs/scaling.md).
+/// Bricks that may not be needed are sent until the share is above [`DISSOLVE`], and again when it
+/// is below this. On a link of 1 Gbit/s the share goes up and down; if they were sent whenever it
+/// is below 0.65, or in the first frame, paths of overlapping frames would take up to a seventh
+/// longer on 15 workers (docs/scaling.md).
 const SPARE: f64 = 0.1;
 
 /// How many frames are the first.
 const FIRST: u32 = 8;
 
-/// They are dissolved where it is above this, and fewer frames are in the making ([`Traffic::is_full`]). Between the
-/// two lies what forming them is sent.
+/// They are dissolved where it is above this, and fewer frames are in the making
+/// ([`LinkUse::is_full`]). Between the two lies what forming them is sent.
 const DISSOLVE: f64 = 0.8;
 
 /// What frames before count against one. Of four that are in the making two may be done at once.
 const KEEP: f64 = 0.75;
 
-/// Bricks bind frames that are alone where their share is above the first, until it is below the second. After its first
-/// frame, which is sent all that the view needs, mri256 at 512x512 has 0.4 to 0.7 at 1 Gbit/s and 0.1 to 0.4 at 10; aneurism
-/// has 0.1 to 0.3 at 1 Gbit/s. If 0.35 were enough, aneurism's first frames at 10 Gbit/s would be, and it takes 3 % longer;
-/// and below 0.2 or 0.3 makes no difference beyond 1 %.
+/// Bricks bind frames that are alone where their share is above the first, until it is below the
+/// second. After its first frame, which is sent all that the view needs, mri256 at 512x512 has 0.4
+/// to 0.7 at 1 Gbit/s and 0.1 to 0.4 at 10; aneurism has 0.1 to 0.3 at 1 Gbit/s. If 0.35 were
+/// enough, aneurism's first frames at 10 Gbit/s would be, and it takes 3 % longer; and below 0.2 or
+/// 0.3 makes no difference beyond 1 %.
 const BIND: [f64; 2] = [0.6, 0.3];
 
-/// Results are packed once they take more than the first of the time at the rate that was seen, until, packed, they take less
-/// than the second. On one worker and two they are not at 1 Gbit/s and more, which saves 3 % of a frame of mri256; on four
-/// and more at 1 Gbit/s they are, where as they are they would take 8 % more time on eight (aneurism: 23). With 0.8 and 0.5
-/// such frames take 5 to 8 % longer, with 0.4 and 0.2 one and two workers pack (docs/scaling.md).
+/// Results are packed once they take more than the first of the time at the rate that was seen,
+/// until, packed, they take less than the second. On one worker and two they are not at 1 Gbit/s
+/// and more, which saves 3 % of a frame of mri256; on four and more at 1 Gbit/s they are, where as
+/// they are they would take 8 % more time on eight (aneurism: 23). With 0.8 and 0.5 such frames
+/// take 5 to 8 % longer, with 0.4 and 0.2 one and two workers pack (docs/scaling.md).
 const PACK: [f64; 2] = [0.55, 0.35];
 
-/// What is left of what frames that were alone told once another one was: the first of them tells of itself.
+/// What is left of what frames that were alone told once another one was: the first of them tells
+/// of itself.
 const KEEP_ALONE: f64 = 0.5;
 
-/// Frames that nothing changes for after a change: bricks that it brings are sent in the first four.
+/// Frames that nothing changes for after a change: bricks that it brings are sent in the first
+/// four.
 const SETTLE: u32 = 8;
 
 /// What bricks on their way tell.
 #[derive(Debug, Default)]
-pub(crate) struct Traffic {
+pub(crate) struct LinkUse {
     /// Workers that some are on their way to.
     aloft: usize,
     /// Since when any are, and bytes that landed since.
@@ -77,15 +86,16 @@ pub(crate) struct Traffic {
     /// Bytes that left since a frame was done, or began alone, and when that was.
     sent: u64,
     done: Micros,
-    /// How long what the last frames were sent takes at that rate, and how long they took, in microseconds; each
-    /// frame weighs less than the one after it.
+    /// How long what the last frames were sent takes at that rate, and how long they took, in
+    /// microseconds; each frame weighs less than the one after it.
     carried: f64,
     took: f64,
-    /// What bricks took of the time of frames that were alone, as far as any was; and whether they bind such.
+    /// What bricks took of the time of frames that were alone, as far as any was; and whether they
+    /// bind such.
     alone: Option<f64>,
     bind: bool,
-    /// Bytes of results since a frame was done, how long those of the last frames take at that rate, and how long these
-    /// frames took; and whether there is room for more.
+    /// Bytes of results since a frame was done, how long those of the last frames take at that
+    /// rate, and how long these frames took; and whether there is room for more.
     results: u64,
     results_took: f64,
     frames_took: f64,
@@ -98,7 +108,7 @@ pub(crate) struct Traffic {
     crowded: bool,
 }
 
-impl Traffic {
+impl LinkUse {
     /// Bricks leave for a worker; whether none were on their way to it.
     pub(crate) fn leave(&mut self, bytes: u64, first: bool, now: Micros) {
         self.sent += bytes;
@@ -128,8 +138,8 @@ impl Traffic {
         (self.sent, self.results, self.done) = (0, 0, now);
     }
 
-    /// A frame is done; whether others are in the making. Crews are for those that have others beside them, and learn
-    /// from these alone; those that are alone learn from such.
+    /// A frame is done; whether others are in the making. Crews are for those that have others
+    /// beside them, and learn from these alone; those that are alone learn from such.
     pub(crate) fn done(&mut self, beside: bool, now: Micros) {
         let took = now.saturating_sub(self.done) as f64;
         let carried = if self.sent == 0 { 0.0 } else { self.sent as f64 / self.rate };
@@ -186,8 +196,8 @@ impl Traffic {
         self.carried > DISSOLVE * self.took
     }
 
-    /// Whether frames that are alone, or such as overlap, leave room for bricks that may not be needed. Until one is done
-    /// nobody knows.
+    /// Whether frames that are alone, or such as overlap, leave room for bricks that may not be
+    /// needed. Until one is done nobody knows.
     pub(crate) fn has_room(&self, alone: bool) -> bool {
         match alone {
             true => self.alone.is_some() && !self.is_full_alone(),
@@ -205,10 +215,11 @@ impl Traffic {
 mod tests {
     use super::*;
 
-    /// Frames of 2 ms or longer, each sent so many bytes in two halves, over a link that carries so many a
-    /// microsecond and takes 100 us besides. The first is sent 3 MB. How often crews were there, and changes.
+    /// Frames of 2 ms or longer, each sent so many bytes in two halves, over a link that carries so
+    /// many a microsecond and takes 100 us besides. The first is sent 3 MB. How often crews were
+    /// there, and changes.
     fn frames(n: usize, bytes: u64, link: f64) -> (usize, usize) {
-        let mut traffic = Traffic::default();
+        let mut traffic = LinkUse::default();
         let (mut now, mut with, mut changes) = (0, 0, 0);
         traffic.begin(now);
         for i in 0..n {
@@ -239,7 +250,7 @@ mod tests {
 
     #[test]
     fn crews_are_dissolved_where_they_fill_the_link() {
-        let mut traffic = Traffic { rate: 100.0, ..Traffic::default() };
+        let mut traffic = LinkUse { rate: 100.0, ..LinkUse::default() };
         let mut frame = |i: u64, bytes| {
             traffic.leave(bytes, false, i * 2_000);
             traffic.done(true, (i + 1) * 2_000);
@@ -256,7 +267,7 @@ mod tests {
 
     #[test]
     fn what_may_not_be_needed_is_not_sent_where_the_link_was_full_until_it_is_all_but_empty() {
-        let mut traffic = Traffic { rate: 100.0, ..Traffic::default() };
+        let mut traffic = LinkUse { rate: 100.0, ..LinkUse::default() };
         assert!(!traffic.has_room(false), "of no frame is known what it was sent");
         let mut now = 0;
         let mut frames = |n: usize, bytes| {
@@ -277,7 +288,7 @@ mod tests {
 
     #[test]
     fn frames_alone_say_nothing() {
-        let mut traffic = Traffic::default();
+        let mut traffic = LinkUse::default();
         traffic.done(false, 1_000);
         assert!(!traffic.bears_crews());
         assert!(!traffic.is_full(), "of no frame is known what it was sent");
@@ -285,8 +296,9 @@ mod tests {
         assert!(traffic.bears_crews(), "nothing had to be sent");
     }
 
-    /// A path of frames one by one, of 2 ms and so many bytes each, over a link of 100 bytes a microsecond.
-    fn alone(traffic: &mut Traffic, n: usize, bytes: u64) -> Vec<bool> {
+    /// A path of frames one by one, of 2 ms and so many bytes each, over a link of 100 bytes a
+    /// microsecond.
+    fn alone(traffic: &mut LinkUse, n: usize, bytes: u64) -> Vec<bool> {
         let mut frame = || {
             traffic.begin(0);
             traffic.leave(bytes, false, 0);
@@ -298,8 +310,8 @@ mod tests {
 
     #[test]
     fn results_are_packed_where_they_would_fill_the_link_or_nobody_knows() {
-        let mut traffic = Traffic::default();
-        let frames = |traffic: &mut Traffic, n: usize, bytes: u64| {
+        let mut traffic = LinkUse::default();
+        let frames = |traffic: &mut LinkUse, n: usize, bytes: u64| {
             let mut frame = || {
                 traffic.begin(0);
                 traffic.result(bytes / 2);
@@ -319,7 +331,7 @@ mod tests {
 
     #[test]
     fn bricks_bind_frames_alone_while_they_take_half_of_their_time() {
-        let mut traffic = Traffic { rate: 100.0, ..Traffic::default() };
+        let mut traffic = LinkUse { rate: 100.0, ..LinkUse::default() };
         let nothing = !traffic.binds_alone() && !traffic.has_room(true);
         assert!(nothing, "of no frame is known what it was sent");
         assert_eq!(alone(&mut traffic, 1, 190_000), [true], "the first is sent all that it needs");

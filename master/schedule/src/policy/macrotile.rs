@@ -1,15 +1,15 @@
 //! Macrotiles: where a slab is cut, and how much work each piece is (paper section 4.3).
 //!
-//! A quadtree over the picture with leaves of 16x16 pixels, built bottom-up; a tile is empty,
-//! shut or to be rendered. Its workload is the number of its open pixels under at least one
-//! needed brick's rectangle.
+//! A quadtree over the picture with leaves of 16x16 pixels, built bottom-up; a tile is empty, shut
+//! or to be rendered. Its workload is the number of its open pixels under at least one needed
+//! brick's rectangle.
 //!
 //! The paper tells neither how the pixels under a union of rectangles are counted nor what it
 //! costs. Painting each rectangle costs its area, and a brick magnified over the whole picture
-//! makes that bricks x pixels. Here one pass over the rows carries a difference line: a
-//! rectangle adds 1 at its left edge when its first row comes and takes it back after its last,
-//! and a running sum along the line says how many rectangles lie over each pixel. That is
-//! rectangles + pixels, in integers, with one line of memory beside the leaves' counts.
+//! makes that bricks x pixels. Here one pass over the rows carries a difference line: a rectangle
+//! adds 1 at its left edge when its first row comes and takes it back after its last, and a running
+//! sum along the line says how many rectangles lie over each pixel. That is rectangles + pixels, in
+//! integers, with one line of memory beside the leaves' counts.
 
 use slabcast_common::occlusion::{Rect, ShutMap};
 use std::collections::BTreeSet;
@@ -18,8 +18,8 @@ use std::collections::BTreeSet;
 pub const LEAF: u32 = 16;
 
 /// Levels of the quadtree: 16, 32, 64, 128 and 256 pixels. The paper saw "only around three
-/// levels"; a tile of 512 has a state of 5 MiB on the wire, and one render thread would hold
-/// up the slab with it.
+/// levels"; a tile of 512 has a state of 5 MiB on the wire, and one render thread would hold up the
+/// slab with it.
 pub const LEVELS: usize = 5;
 
 /// A tile of the level that was chosen.
@@ -123,11 +123,11 @@ fn leaves(size: [u32; 2], rects: &[Rect], shut: &ShutMap) -> Grid<Node> {
     grid
 }
 
-/// Cuts a slab: chooses the coarsest level at which more than `wanted` tiles are to be
-/// rendered, or `forced`, and lists its tiles.
+/// Cuts a slab: chooses the coarsest level at which more than `wanted` tiles are to be rendered, or
+/// `forced`, and lists its tiles.
 ///
-/// `rects` are those of the needed bricks, inside the picture. With `cull` off, a tile with
-/// bricks is rendered even when it is shut.
+/// `rects` are those of the needed bricks, inside the picture. With `cull` off, a tile with bricks
+/// is rendered even when it is shut.
 pub fn cut(
     size: [u32; 2],
     rects: &[Rect],
@@ -142,8 +142,8 @@ pub fn cut(
     list(size, &tree[level], level, &to_render, |rect| shut.all_shut(rect))
 }
 
-/// The same, with all tiles but the `whole` largest cut once more, into quarters: the paper's mix of
-/// tiles of 64 and 32 pixels (section 5.1), which levels loads and costs more than it gains.
+/// Cuts a slab like [`cut`], then cuts all tiles but the `whole` largest into quarters: the paper's
+/// mix of tiles of 64 and 32 pixels (section 5.1), which levels loads and costs more than it gains.
 pub fn cut_mixed(
     size: [u32; 2],
     rects: &[Rect],
@@ -166,14 +166,14 @@ pub fn cut_mixed(
     coarse
 }
 
-/// Cuts a picture for tasks that go through all depths: nothing is shut, and pixels count as covered
-/// by leaves, which costs rectangles + leaves and no look at a pixel. So `rects` may be those of
-/// blocks of bricks.
+/// Cuts a picture for tasks that go through all depths: nothing is shut, and pixels count as
+/// covered by leaves, which costs rectangles + leaves and no look at a pixel. So `rects` may be
+/// those of blocks of bricks.
 ///
 /// A tile's size does not change what drawing it takes until it is smaller than a part of 64 pixels
-/// (docs/scaling.md), while each task costs its messages. So the coarsest level is chosen that still
-/// gives `many` tiles; one finer than that of 64 pixels only where there would be no more than
-/// `wanted`.
+/// (docs/scaling.md), while each task costs its messages. So the coarsest level is chosen that
+/// still gives `many` tiles; one finer than that of 64 pixels only where there would be no more
+/// than `wanted`.
 pub fn cut_through(
     size: [u32; 2],
     rects: &[Rect],
@@ -184,7 +184,7 @@ pub fn cut_through(
     through.cut(forced.unwrap_or_else(|| through.edge((wanted, many))))
 }
 
-/// What [`cut_through`] cuts, for who wants to know more of it.
+/// The quadtree that [`cut_through`] cuts.
 pub(crate) struct Through {
     size: [u32; 2],
     tree: Vec<Grid<Node>>,
@@ -195,12 +195,13 @@ impl Through {
         Through { size, tree: tree(covered_leaves(size, rects)) }
     }
 
-    /// How many tiles of this edge are to be rendered.
+    /// Returns the number of tiles of `edge` pixels to render.
     pub(crate) fn count(&self, edge: u32) -> usize {
         self.tree[level_of(edge)].cells.iter().filter(|n| n.covered > 0).count()
     }
 
-    /// The tiles of a coarse cut, and in the place of those that are `cut` those of a fine one.
+    /// Returns the tiles of a coarse cut, with those that are `cut` replaced by tiles of a fine
+    /// one.
     pub(crate) fn mixed(&self, coarse: &Cut, fine: &Cut, cut: &[bool]) -> Cut {
         let corner = |r: &Rect| [r.x0, r.y0].map(|at| at / coarse.edge as i32);
         let kept = coarse.tiles.iter().zip(cut).filter(|(_, cut)| !**cut).map(|(t, _)| *t);
@@ -213,13 +214,13 @@ impl Through {
         mixed
     }
 
-    /// The tiles of this edge.
+    /// Returns the tiles of `edge` pixels.
     pub(crate) fn cut(&self, edge: u32) -> Cut {
         let level = level_of(edge);
         list(self.size, &self.tree[level], level, &|n| n.covered > 0, |_| false)
     }
 
-    /// The edge of the tiles that [`cut_through`] chooses.
+    /// Returns the edge in pixels that [`cut_through`] chooses.
     pub(crate) fn edge(&self, (wanted, many): (u64, u64)) -> u32 {
         const PART: usize = 2;
         let coarsest = |wanted| coarsest(&self.tree, &|n| n.covered > 0, wanted);
@@ -230,7 +231,7 @@ impl Through {
     }
 }
 
-/// Levels of the quadtree above these leaves.
+/// Builds the levels of the quadtree above its leaves.
 fn tree(leaves: Grid<Node>) -> Vec<Grid<Node>> {
     let mut tree = vec![leaves];
     for level in 1..LEVELS {
@@ -247,13 +248,13 @@ fn level_of(edge: u32) -> usize {
     level.expect("Work::check lets only quadtree levels through")
 }
 
-/// The coarsest level at which more than `wanted` tiles are to be rendered.
+/// Returns the coarsest level at which more than `wanted` tiles are to be rendered.
 fn coarsest(tree: &[Grid<Node>], to_render: &impl Fn(&Node) -> bool, wanted: u64) -> Option<usize> {
     let count = |l: usize| tree[l].cells.iter().filter(|n| to_render(n)).count() as u64;
     (0..LEVELS).rev().find(|&l| count(l) > wanted)
 }
 
-/// Counts the pixels of leaves that a rectangle lies over, each leaf as a whole.
+/// Counts the pixels of leaves that a rectangle overlaps, each leaf as a whole.
 fn covered_leaves(size: [u32; 2], rects: &[Rect]) -> Grid<Node> {
     let [columns, rows] = size.map(|n| n.div_ceil(LEAF) as usize);
     // A rectangle adds one to its corner leaf and takes it back behind its last column and row.
@@ -284,7 +285,7 @@ fn covered_leaves(size: [u32; 2], rects: &[Rect]) -> Grid<Node> {
     grid
 }
 
-/// The tiles of one level.
+/// Lists the tiles of one level.
 fn list(
     size: [u32; 2],
     grid: &Grid<Node>,
@@ -316,15 +317,13 @@ fn list(
 }
 
 impl Cut {
-    /// Puts the tiles in the order of their workload; equal ones stay in that of the picture, or in
-    /// the one they have.
+    /// Sorts the tiles by workload, largest first; equal ones keep their order.
     pub fn sort(&mut self, size: [u32; 2]) {
         self.tiles.sort_by_key(|t| std::cmp::Reverse(t.est));
         self.index(size);
     }
 
-    /// Parts of a tile come behind all others. Nobody may look for the place
-    /// of a tile in the picture after that.
+    /// Appends parts of a tile. [`Self::first_in`] must not be called after that.
     pub(crate) fn add(&mut self, parts: Vec<Macrotile>) {
         let long = |t: &Macrotile| t.rect.width().max(t.rect.height()) as u32;
         let edge = parts.iter().map(|t| long(t).next_power_of_two()).max();
@@ -332,13 +331,13 @@ impl Cut {
         self.tiles.extend(parts);
     }
 
-    /// Edge of one of the tiles: the least level's that it fits.
+    /// Returns the edge of a tile: the least level's that it fits.
     pub fn edge_of(&self, rect: &Rect) -> u32 {
         let long = rect.width().max(rect.height()) as u32;
         long.next_power_of_two().max(self.edge)
     }
 
-    /// Notes the place of each tile.
+    /// Indexes the tiles by their position.
     fn index(&mut self, size: [u32; 2]) {
         let [columns, rows] = size.map(|n| n.div_ceil(self.edge) as usize);
         let mut first = vec![Grid::new(columns, rows, u32::MAX)];
@@ -357,9 +356,9 @@ impl Cut {
         self.first = first;
     }
 
-    /// The first place in `tiles` of a tile that `rect` (not empty, inside the picture) touches.
-    /// Descends the quadtree and turns back where nothing better can lie below, so a brick over
-    /// the whole picture costs one look and not one for every tile.
+    /// Returns the first index in `tiles` of a tile that `rect` (not empty, inside the picture)
+    /// touches. Descends the quadtree and turns back where nothing better can lie below, so a brick
+    /// over the whole picture costs one look and not one for every tile.
     pub fn first_in(&self, rect: &Rect) -> Option<u32> {
         let mut best = u32::MAX;
         let top = self.first.len() - 1;
@@ -399,7 +398,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pixels_of_leaves_at_the_border_are_counted_as_the_picture_cuts_them() {
+    fn workload_of_border_leaves_is_clipped_to_the_picture() {
         for size in [[64, 64], [70, 33], [16, 100], [17, 1]] {
             let picture = Rect::of_size(size);
             let through = Through::new(size, &[picture]);
@@ -419,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn the_coarsest_level_with_more_tiles_than_wanted_is_chosen() {
+    fn cut_chooses_the_coarsest_level_with_more_tiles_than_wanted() {
         // 512x512, all covered: 4 tiles of 256, 16 of 128, 64 of 64, 256 of 32, 1024 of 16.
         let size = [512, 512];
         let all = [Rect::of_size(size)];
@@ -436,7 +435,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mixed_cut_keeps_the_largest_tiles_whole() {
+    fn mixed_cut_keeps_the_largest_tiles_whole() {
         // Three tiles of 64: two full, one with a brick of 20 pixels in a corner.
         let size = [256, 64];
         let rects = [Rect::new(0, 0, 128, 64), Rect::new(130, 2, 150, 22)];
@@ -456,7 +455,7 @@ mod tests {
     }
 
     #[test]
-    fn cut_tiles_and_whole_ones_cover_each_pixel_once() {
+    fn mixed_cut_covers_each_pixel_once() {
         // Three tiles of 64 in a picture that cuts the last one, and nothing under the second.
         let size = [190, 50];
         let through = Through::new(size, &[Rect::new(0, 0, 60, 50), Rect::new(130, 0, 190, 50)]);
@@ -485,7 +484,7 @@ mod tests {
     }
 
     #[test]
-    fn empty_and_shut_tiles_have_no_task() {
+    fn cut_skips_empty_and_shut_tiles() {
         // 64x48 in tiles of 16: 4 x 3. One brick over the two left columns of the top row; the
         // first tile of it is shut, and so is one tile without a brick.
         let size = [64, 48];
@@ -506,7 +505,7 @@ mod tests {
     }
 
     #[test]
-    fn border_tiles_are_clipped_and_the_queue_is_sorted() {
+    fn cut_clips_border_tiles_and_sorts_by_workload() {
         let size = [40, 20];
         let c = cut(size, &[Rect::of_size(size)], &open(size), true, 0, Some(16));
         let got: Vec<_> = c.tiles.iter().map(|t| (t.rect.x0, t.rect.y0, t.est)).collect();
@@ -517,9 +516,9 @@ mod tests {
     }
 
     #[test]
-    fn the_largest_picture_takes_one_pass() {
-        // A row of leaves in 8192 columns: nothing depends on the number of pixels a brick
-        // covers, or on that of its tiles.
+    fn cut_of_the_largest_picture_takes_one_pass() {
+        // A row of leaves in 8192 columns: nothing depends on the number of pixels a brick covers,
+        // or on that of its tiles.
         let size = [8192, 64];
         let all = vec![Rect::of_size(size); 20_000];
         let c = cut(size, &all, &open(size), true, 0, Some(16));
@@ -528,7 +527,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cut_through_all_depths_is_as_coarse_as_drawing_allows() {
+    fn region_cut_is_as_coarse_as_rendering_allows() {
         let size = [512, 512];
         let all = [Rect::of_size(size)];
         let edge = |wanted, many| cut_through(size, &all, (wanted, many), None).edge;
@@ -549,7 +548,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn workload_equals_counting(
+        fn cut_workload_equals_counting_pixels(
             (w, h, rects) in (1i32..90, 1i32..70)
                 .prop_flat_map(|(w, h)| (Just(w), Just(h), rects(w, h))),
             bits in prop::collection::vec(any::<bool>(), 6300),

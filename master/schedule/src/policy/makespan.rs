@@ -1,44 +1,46 @@
-//! A frame that is alone in the making: which of its tiles are cut, and who draws what, so that all are done at
-//! once.
+//! A frame that is alone in the making: which of its tiles are cut, and who draws what, so that all
+//! are done at once.
 //!
-//! While several frames are in the making, whoever is done with one goes on with the next. Alone, a frame is there
-//! when its last tile is, and threads that are done before wait. So what counts is its *end*: how late the last
-//! thread is done. Tiles of 64 pixels may be too coarse for that (mri256 `peer-semi` at 1024x1024 has 115 of them for
-//! 64 threads, and the longest takes longer than a 64th of the frame), and tiles of 32 take a quarter longer
-//! altogether. Neither is right for all tiles of a frame: those that are longer than a thread's share have to be cut,
-//! most others need not be.
+//! While several frames are in the making, whoever is done with one goes on with the next. Alone, a
+//! frame is there when its last tile is, and threads that are done before wait. So what counts is
+//! its *end*: how late the last thread is done. Tiles of 64 pixels may be too coarse for that
+//! (mri256 `peer-semi` at 1024x1024 has 115 of them for 64 threads, and the longest takes longer
+//! than a 64th of the frame), and tiles of 32 take a quarter longer altogether. Neither is right
+//! for all tiles of a frame: those that are longer than a thread's share have to be cut, most
+//! others need not be.
 //!
-//! **Which are cut** ([`which`]) is tried on paper before the frame, with what the frames before taught: the longest
-//! tile goes to whoever is free first, and so on, for a growing number of tiles cut, the longest first, and then for a
-//! growing number of the shortest. The least end counts.
+//! **Which are cut** ([`which`]) is tried on paper before the frame, with what the frames before
+//! taught: the longest tile goes to whoever is free first, and so on, for a growing number of tiles
+//! cut, the longest first, and then for a growing number of the shortest. The least end counts.
 //!
-//! **Who draws them** ([`balance`]): who drew them last. From there tiles move, or change places, as long as the end
-//! comes earlier by more than the bricks that go along are worth.
+//! **Who draws them** ([`balance`]): who drew them last. From there tiles move, or change places,
+//! as long as the end comes earlier by more than the bricks that go along are worth.
 //!
-//! Views turn, and what a tile took in the view before is some percent off. What is late then is cut as it is lent
-//! (`frame::late`).
+//! Views turn, and what a tile took in the view before is some percent off. What is late then is
+//! cut as it is lent (`frame::late`).
 //!
 //! It refuses to know frames, tiles' places and bricks: it sees times.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
-/// What a tile costs its thread beyond drawing, in microseconds: a result and a lease (`plan` charges a worker 28 for
-/// waking and some more for the messages). At nothing or at 100 the figures of [`WORTH`] change by their noise.
+/// What a tile costs its thread beyond drawing, in microseconds: a result and a lease (`plan`
+/// charges a worker 28 for waking and some more for the messages). At nothing or at 100 the figures
+/// of [`WORTH`] change by their noise.
 const EACH: f64 = 40.0;
 
-/// What a tile costs everybody, in microseconds, since the master hears of one after the other. At nothing small
-/// scenes and large ones alike are cut into more tiles than pay: mri256 `peer-semi` on 64 workers has 61 % where it
-/// has 66.
+/// What a tile costs everybody, in microseconds, since the master hears of one after the other. At
+/// nothing small scenes and large ones alike are cut into more tiles than pay: mri256 `peer-semi`
+/// on 64 workers has 61 % where it has 66.
 const LEASE: f64 = 10.0;
 
-/// What is left of the end where more tiles are cut. Estimates are no better than that: mri256 `peer-semi` at
-/// 1024x1024 on 15, 32 and 64 workers has 89, 82, 68 % with this, and 89, 81, 66 with each tile cut that seems to
-/// win anything.
+/// What is left of the end where more tiles are cut. Estimates are no better than that: mri256
+/// `peer-semi` at 1024x1024 on 15, 32 and 64 workers has 89, 82, 68 % with this, and 89, 81, 66
+/// with each tile cut that seems to win anything.
 const WORTH: f64 = 0.99;
 
-/// An end that is so much later is not followed by one that is earlier, since all that is cut takes longer. Trying
-/// on costs the master 10 us each.
+/// An end that is so much later is not followed by one that is earlier, since all that is cut takes
+/// longer. Trying on costs the master 10 us each.
 const FAR: f64 = 1.1;
 
 /// Who is done last is later than the mean by so little that nothing moves.
@@ -47,12 +49,13 @@ const EVEN: f64 = 1.01;
 /// The least that a move has to win, as a part of the mean.
 const LEAST: f64 = 0.002;
 
-/// What bricks cost those who share the link with them, as a part of what they cost who waits for them. At nothing
-/// a third more bricks move, and at 1 no more than a tenth fewer, for a later end.
+/// What bricks cost those who share the link with them, as a part of what they cost who waits for
+/// them. At nothing a third more bricks move, and at 1 no more than a tenth fewer, for a later end.
 const PAYS: f64 = 0.2;
 
-/// Which tiles are cut for the frame to end first, on so many threads. They take so many microseconds whole; what the
-/// parts of one take is asked for only where whole tiles are not fine enough.
+/// Which tiles are cut for the frame to end first, on so many threads. They take so many
+/// microseconds whole; what the parts of one take is asked for only where whole tiles are not fine
+/// enough.
 pub(crate) fn which(us: &[f64], parts: impl Fn(usize) -> Vec<f64>, threads: usize) -> Vec<bool> {
     let n = us.len();
     let whole: Vec<u64> = us.iter().map(|us| item(*us)).collect();
@@ -126,12 +129,14 @@ fn counts(n: usize) -> impl Iterator<Item = usize> {
     std::iter::successors((n > 0).then_some(1), next)
 }
 
-/// What a tile takes its thread, in sixteenths of a microsecond, which have an order and are sorted in a third of the time.
+/// What a tile takes its thread, in sixteenths of a microsecond, which have an order and are sorted
+/// in a third of the time.
 fn item(us: f64) -> u64 {
     (16.0 * (us + EACH)) as u64
 }
 
-/// When the last thread is done, if each that is free takes the longest that is left; with what the master needs.
+/// When the last thread is done, if each that is free takes the longest that is left; with what the
+/// master needs.
 fn end(items: &mut [u64], threads: usize) -> f64 {
     items.sort_unstable();
     let mut free: BinaryHeap<Reverse<u64>> = (0..threads).map(|_| Reverse(0)).collect();
@@ -144,8 +149,9 @@ fn end(items: &mut [u64], threads: usize) -> f64 {
     last as f64 / 16.0 + LEASE * items.len() as f64
 }
 
-/// Moves tiles from who is done last, and has them change places, while that pays. `owners` says whose each tile is,
-/// `cost` what it takes a worker, and `price` what its bricks take one that it comes to.
+/// Moves tiles from who is done last, and has them change places, while that pays. `owners` says
+/// whose each tile is, `cost` what it takes a worker, and `price` what its bricks take one that it
+/// comes to.
 pub(crate) fn balance(
     owners: &mut [usize],
     workers: usize,
@@ -167,8 +173,9 @@ pub(crate) fn balance(
         if load[most] <= EVEN * mean {
             break;
         }
-        // What is won, what goes there, what comes back, and to whom. Between two that are as fast no more is won than half
-        // of what one is later by than the other; so who has most time comes first, and most others are not looked at.
+        // What is won, what goes there, what comes back, and to whom. Between two that are as fast
+        // no more is won than half of what one is later by than the other; so who has most time
+        // comes first, and most others are not looked at.
         let mut best: Option<(f64, usize, Option<usize>, usize)> = None;
         let mut others: Vec<usize> = (0..workers).filter(|&to| to != most).collect();
         others.sort_by(by);

@@ -1,61 +1,62 @@
-//! Bricks that workers will ask for, sent before they do.
+//! Prefetch: bricks that workers are expected to request, sent before they do.
 //!
-//! A region lacks three kinds of bricks: such as came out from behind others, which its worker expects by the depths at
-//! which its pixels shut; such as nobody drew from yet; and such as its neighbours were drawn from in the frame before,
-//! which have turned into it. Of the last kind no worker knows, since it is another's business what those were drawn
-//! from. Here it is known. So
+//! A region lacks three kinds of bricks: those uncovered by others, which its worker predicts from
+//! the depths at which pixels shut; those nobody used yet; and those that a neighbouring tile used
+//! in the frame before and that have turned into this one. No worker knows the last kind, since it
+//! does not know what other workers' tiles used. The master does. So
 //!
-//! - when a frame has begun, what was drawn from lately goes to those over whose tiles it lies now, once the frame's
-//!   first leases have left ([`Outlook::lacked`]);
-//! - and what is drawn from for the first time since goes to those over whose tiles of the frames in the making it lies,
-//!   when they are told something anyway ([`Outlook::lacked_of`]).
+//! - when a frame has begun, bricks used lately are sent to the workers whose tiles they overlap,
+//!   once the frame's first leases have left ([`TileOwnerGrid::lacked`]);
+//! - bricks used for the first time since go to the workers whose tiles they overlap, together with
+//!   the next message to that worker ([`TileOwnerGrid::lacked_among`]).
 //!
-//! Where a block of bricks lies over one worker's tiles alone and that has what was drawn from, no brick is looked at
-//! closer. For 11,056 bricks and 15 or 64 workers a frame
-//! takes the master less with this than without, since workers ask half as much (docs/scaling.md).
+//! Where a block of bricks overlaps the tiles of one worker only, and that worker has the bricks
+//! used lately, no brick is looked at closer. For 11,056 bricks and 15 or 64 workers a frame costs
+//! the master less with prefetch than without, since workers send half as many requests.
 //!
-//! It refuses to know what a worker has: that is `residency`'s.
+//! It refuses to know what a worker has: that is `state::residency`'s.
 
 use crate::policy::macrotile::Cut;
-use crate::state::residency::{Shelved, Shelves};
+use crate::state::residency::{BrickPresence, WorkerPresence};
 use slabcast_common::blocks::Blocks;
 use slabcast_common::ids::WorkerId;
 use slabcast_common::occlusion::Rect;
 
-/// Whose tiles lie where in a frame's picture.
+/// The owner of the tile at each cell of a grid over the picture.
 #[derive(Debug)]
-pub(crate) struct Outlook {
-    /// Edge of its cells as a power of two, and how many are in a row.
+pub(crate) struct TileOwnerGrid {
+    /// Edge of a cell as a power of two.
     shift: u32,
+    /// Cells in a row.
     columns: usize,
-    /// Row-major: one more than the owner's place among the owners; 0 where nothing is drawn.
+    /// Row-major: 1 + index of the owner in `owners`; 0 where nothing is drawn.
     cells: Vec<u16>,
     owners: Vec<WorkerId>,
 }
 
-impl Outlook {
-    /// Of a picture of this size.
-    pub(crate) fn new(size: [u32; 2], cut: &Cut, owner: impl Fn(u32) -> WorkerId) -> Outlook {
+impl TileOwnerGrid {
+    /// Builds the grid for a picture of `size` pixels.
+    pub(crate) fn new(size: [u32; 2], cut: &Cut, owner: impl Fn(u32) -> WorkerId) -> TileOwnerGrid {
         let shift = cut.edge.ilog2();
         let [columns, rows] = size.map(|n| n.div_ceil(cut.edge) as usize);
-        let mut look =
-            Outlook { shift, columns, cells: vec![0; columns * rows], owners: Vec::new() };
+        let mut grid =
+            TileOwnerGrid { shift, columns, cells: vec![0; columns * rows], owners: Vec::new() };
         for (tile, place) in cut.tiles.iter().zip(0..) {
             let owner = owner(place);
-            let known = look.owners.iter().position(|o| *o == owner);
+            let known = grid.owners.iter().position(|o| *o == owner);
             let at = known.unwrap_or_else(|| {
-                look.owners.push(owner);
-                look.owners.len() - 1
+                grid.owners.push(owner);
+                grid.owners.len() - 1
             });
             let mark = u16::try_from(at + 1).unwrap_or(0);
-            for row in look.rows(&tile.rect) {
-                look.cells[row].fill(mark);
+            for row in grid.rows(&tile.rect) {
+                grid.cells[row].fill(mark);
             }
         }
-        look
+        grid
     }
 
-    /// The cells that a rectangle of the picture lies over, row by row.
+    /// Returns the cells that a rectangle overlaps, row by row.
     #[inline]
     fn rows(&self, r: &Rect) -> impl Iterator<Item = std::ops::Range<usize>> + use<> {
         let cell = |at: i32| at as usize >> self.shift;
@@ -64,13 +65,13 @@ impl Outlook {
         (cell(r.y0)..=cell(r.y1 - 1)).map(move |y| y * columns + left..y * columns + right)
     }
 
-    /// Places of the owners whose tiles a rectangle lies over, each once.
+    /// Collects the indices of the owners whose tiles a rectangle overlaps, each once.
     #[inline]
-    fn over(&self, r: &Rect, found: &mut Vec<usize>) {
+    fn owners_over(&self, r: &Rect, found: &mut Vec<usize>) {
         found.clear();
         let mut last = 0;
         for &mark in self.rows(r).flat_map(|row| &self.cells[row]) {
-            // Of cells beside each other most are one worker's.
+            // Neighbouring cells mostly have one owner.
             if mark == last {
                 continue;
             }
@@ -82,34 +83,35 @@ impl Outlook {
         }
     }
 
-    /// What each owner lacks of the bricks that were drawn from lately, as far as they lie over its tiles. `outlines`:
-    /// where each block lies in the picture, empty where it does not; `outline`: where the brick at a place does.
+    /// Returns for each owner the bricks used lately that overlap its tiles and that it lacks.
+    /// `outlines`: the rectangle of each block of bricks, empty outside the picture. `outline`: the
+    /// rectangle of one brick.
     pub(crate) fn lacked(
         &self,
-        shelves: &Shelves,
+        presence: &BrickPresence,
         (blocks, outlines): (&Blocks, &[Rect]),
         outline: impl Fn(u32) -> Option<Rect>,
     ) -> Vec<(WorkerId, Vec<u32>)> {
         let mut lists = self.lists();
-        let places: Vec<_> = self.owners.iter().map(|o| shelves.of(*o)).collect();
+        let places: Vec<_> = self.owners.iter().map(|o| presence.of_worker(*o)).collect();
         let (mut over, mut exactly) = (Vec::new(), Vec::new());
         for (block, rect) in blocks.all().iter().zip(outlines) {
             if rect.is_empty() {
                 continue;
             }
-            self.over(rect, &mut over);
+            self.owners_over(rect, &mut over);
             for &place in blocks.places(block) {
-                if !shelves.is_late(place) {
+                if !presence.was_used_lately(place) {
                     continue;
                 }
-                // What lies over one worker's tiles alone, it has mostly drawn from.
+                // The only owner has mostly used it already.
                 if let [at] = over[..]
                     && !lacks(places[at], place)
                 {
                     continue;
                 }
                 let Some(rect) = outline(place) else { continue };
-                self.over(&rect, &mut exactly);
+                self.owners_over(&rect, &mut exactly);
                 for &at in &exactly {
                     if lacks(places[at], place) {
                         lists[at].1.push(place);
@@ -121,10 +123,10 @@ impl Outlook {
         lists
     }
 
-    /// What each owner lacks of these bricks, as far as they lie over its tiles.
-    pub(crate) fn lacked_of(
+    /// Returns for each owner those of `bricks` that overlap its tiles and that it lacks.
+    pub(crate) fn lacked_among(
         &self,
-        shelves: &Shelves,
+        presence: &BrickPresence,
         bricks: &[u32],
         outline: impl Fn(u32) -> Option<Rect>,
     ) -> Vec<(WorkerId, Vec<u32>)> {
@@ -132,9 +134,9 @@ impl Outlook {
         let mut over = Vec::new();
         for &place in bricks {
             let Some(rect) = outline(place) else { continue };
-            self.over(&rect, &mut over);
+            self.owners_over(&rect, &mut over);
             for &at in &over {
-                if lacks(shelves.of(self.owners[at]), place) {
+                if lacks(presence.of_worker(self.owners[at]), place) {
                     lists[at].1.push(place);
                 }
             }
@@ -148,9 +150,9 @@ impl Outlook {
     }
 }
 
-/// Whether a worker lacks a brick. Who has none of the set lacks all.
-fn lacks(shelved: Option<Shelved<'_>>, place: u32) -> bool {
-    shelved.is_none_or(|shelved| shelved.lacks(place))
+/// Whether a worker lacks a brick. A worker without bricks of the set lacks all.
+fn lacks(presence: Option<WorkerPresence<'_>>, place: u32) -> bool {
+    presence.is_none_or(|presence| presence.lacks(place))
 }
 
 #[cfg(test)]
@@ -204,9 +206,10 @@ mod tests {
     }
 
     proptest! {
-        /// Each brick goes to all who lack it and over whose tiles it lies, and to nobody else.
+        /// Each brick goes to every worker that lacks it and whose tiles it overlaps, and to nobody
+        /// else.
         #[test]
-        fn what_lies_over_whose_tiles_is_what_it_is_worked_out_by_hand(
+        fn prefetch_sends_each_worker_the_bricks_over_its_tiles_that_it_lacks(
             azimuth in 0.0..6.3f64,
             persp in any::<bool>(),
             height in 20.0..90.0f64,
@@ -223,7 +226,7 @@ mod tests {
             };
             let view = view(azimuth, projection);
             let mut r = Residency::default();
-            // The fourth has nothing of the set.
+            // The fourth worker has no brick of the set.
             for id in 0..3 {
                 let has = |h: &&(u64, u32)| h.0 == id;
                 let held: Vec<_> = held.iter().filter(has).map(|h| BrickId(h.1)).collect();
@@ -233,7 +236,7 @@ mod tests {
             for round in 0..3 {
                 r.open(KEY, &bricks, true);
                 let drawn: Vec<u32> = drawn.iter().filter(|d| d.1 == round).map(|d| d.0).collect();
-                r.touched(KEY, &drawn, &mut Vec::new());
+                r.mark_used(KEY, &drawn, &mut Vec::new());
                 drawn.iter().for_each(|&place| last[place as usize] = Some(round));
             }
             r.open(KEY, &bricks, true);
@@ -241,8 +244,8 @@ mod tests {
             let rects: Vec<Rect> = (0..64).filter_map(outline).collect();
             let cut = cut_through(SIZE, &rects, (0, 0), Some(edge));
             let owner = |place: u32| WorkerId(owners[place as usize % owners.len()]);
-            let look = Outlook::new(SIZE, &cut, owner);
-            let shelves = r.shelves(KEY, alone).expect("it is open");
+            let grid = TileOwnerGrid::new(SIZE, &cut, owner);
+            let presence = r.presence(KEY, alone).expect("it is open");
 
             let owes = |place: u32| -> Lists {
                 let Some(rect) = outline(place) else { return Lists::new() };
@@ -257,12 +260,12 @@ mod tests {
                 let blocks = Blocks::of(&bricks, shift, 64);
                 let lies = |b: &slabcast_common::blocks::Block| view.outline(&b.tight).unwrap_or_default();
                 let outlines: Vec<Rect> = blocks.all().iter().map(lies).collect();
-                let lists = look.lacked(&shelves, (&blocks, &outlines), outline);
+                let lists = grid.lacked(&presence, (&blocks, &outlines), outline);
                 prop_assert_eq!(&flat(lists), &by_hand, "blocks of 2^{}", shift);
             }
             let some = [1, 5, 40, 63];
             let by_hand: Lists = some.into_iter().flat_map(owes).collect();
-            prop_assert_eq!(flat(look.lacked_of(&shelves, &some, outline)), by_hand);
+            prop_assert_eq!(flat(grid.lacked_among(&presence, &some, outline)), by_hand);
         }
     }
 }

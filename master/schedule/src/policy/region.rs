@@ -1,29 +1,33 @@
 //! The `region` schedule's own part of a frame: where the picture is cut, who takes which tile, and
 //! what the frames before teach about both (DESIGN.md section 3).
 //!
-//! A task is one tile through all depths. There is no barrier, and the master culls nothing: workers do, sheet by
-//! sheet, and ask for the bricks that they lack; only what others' tiles tell of, it sends ahead (`foresight`). What is
-//! left to decide is how much work a tile is and who gets it.
+//! A task is one tile through all depths. There is no barrier, and the master culls nothing:
+//! workers do, sheet by sheet, and ask for the bricks that they lack; only what others' tiles tell
+//! of, it sends ahead (`foresight`). What is left to decide is how much work a tile is and who gets
+//! it.
 //!
-//! **How much.** The paper's workload, pixels under bricks, is the first guess; here those of blocks
-//! of 4x4x4 bricks and of whole leaves, since nothing hangs on it but the order of the first frame. From
-//! then on a tile's estimate is what it took in the frame before (half of that, half of what was
-//! estimated then: one disturbed measurement moves nothing), which knows what hides what, and which
-//! worker was slow.
+//! **How much.** The paper's workload, pixels under bricks, is the first guess; here those of
+//! blocks of 4x4x4 bricks and of whole leaves, since nothing hangs on it but the order of the first
+//! frame. From then on a tile's estimate is what it took in the frame before (half of that, half of
+//! what was estimated then: one disturbed measurement moves nothing), which knows what hides what,
+//! and which worker was slow.
 //!
-//! **Who.** At first each worker gets a band of rows: bricks at a border are sent to both sides, and when
-//! a path turns about the upright axis, bricks stay in their rows. Who was given a tile in the frame that was cut before
-//! holds its bricks, or is sent them, so it gets it again, whoever drew it then. A tile moves only when one worker would else be
-//! done more than [`SLACK`] later than the mean and the frame is shorter by more than its bricks take; those go along at once. When all of a
-//! worker's tiles are lent it takes tiles of the next frames of the path; another's tile only where there
-//! is none and its owner has work for longer than two such tiles. Where a path's frames have few tiles for so
-//! many threads, and the link bears it (`traffic`), each is one [`Crew`]'s.
+//! **Who.** At first each worker gets a band of rows: bricks at a border are sent to both sides,
+//! and when a path turns about the upright axis, bricks stay in their rows. Who was given a tile in
+//! the frame that was cut before holds its bricks, or is sent them, so it gets it again, whoever
+//! drew it then. A tile moves only when one worker would else be done more than [`SLACK`] later
+//! than the mean and the frame is shorter by more than its bricks take; those go along at once.
+//! When all of a worker's tiles are lent it takes tiles of the next frames of the path; another's
+//! tile only where there is none and its owner has work for longer than two such tiles. Where a
+//! path's frames have few tiles for so many threads, and the link bears it (`traffic`), each is one
+//! [`Crew`]'s.
 //!
-//! **Alone.** A frame that no other is in the making beside and none waits behind is there when its last tile is. Its tiles are
-//! dealt out so that all are done at once, and some are cut for that ([`makespan`]), before it and as they are lent
-//! (`frame::late`); where bricks take most of such frames' time (`traffic`) none are, since who draws what was cut otherwise
-//! before lacks bricks. So what is known is of tiles of 64 pixels in one frame and of parts of 32 in the next, and each tells
-//! of the other ([`Memory::recall`]).
+//! **Alone.** A frame that no other is in the making beside and none waits behind is there when its
+//! last tile is. Its tiles are dealt out so that all are done at once, and some are cut for that
+//! ([`makespan`]), before it and as they are lent (`frame::late`); where bricks take most of such
+//! frames' time (`traffic`) none are, since who draws what was cut otherwise before lacks bricks.
+//! So what is known is of tiles of 64 pixels in one frame and of parts of 32 in the next, and each
+//! tells of the other ([`CostHistory::recall`]).
 //!
 //! It refuses to know what time it is and which copy of a result counts.
 
@@ -39,88 +43,98 @@ use slabcast_common::ids::WorkerId;
 use slabcast_common::occlusion::Rect;
 use std::collections::BTreeMap;
 
-/// How much later than the mean a worker may be done before a tile of it moves, as a fraction. Tiles of
-/// 64 pixels are 2 % of a frame of 512 each. At half, noise of the measurement moves tiles and their
-/// bricks to and fro; at double, 15 workers wait for the slowest for a tenth of a frame.
+/// How much later than the mean a worker may be done before a tile of it moves, as a fraction.
+/// Tiles of 64 pixels are 2 % of a frame of 512 each. At half, noise of the measurement moves tiles
+/// and their bricks to and fro; at double, 15 workers wait for the slowest for a tenth of a frame.
 const SLACK: f64 = 0.06;
 
-/// Above this a worker is late enough for many tiles to move at once; below, one does. A worker of half
-/// the speed among four is late by 60 %; what the system does on the side makes one late by a tenth.
+/// Above this a worker is late enough for many tiles to move at once; below, one does. A worker of
+/// half the speed among four is late by 60 %; what the system does on the side makes one late by a
+/// tenth.
 const LATE: f64 = 0.25;
 
-/// What moving a brick costs a frame, in microseconds: 1.2 KB of it at 1 Gbit/s take 9, once, and what is gained is
-/// gained in each frame until the view has turned away; so a third. A tile of 64 pixels is drawn from some 100 in
-/// 0.6 ms, and moves when a frame is shorter by half of that. At 9 no tile ever moved where 15 workers have 1.6 ms
-/// each of a frame: it took 3.3 ms (mri256 `peer-opaque`, 512x512), and 2.9 at this, for 8 % more bricks.
+/// What moving a brick costs a frame, in microseconds: 1.2 KB of it at 1 Gbit/s take 9, once, and
+/// what is gained is gained in each frame until the view has turned away; so a third. A tile of 64
+/// pixels is drawn from some 100 in 0.6 ms, and moves when a frame is shorter by half of that. At 9
+/// no tile ever moved where 15 workers have 1.6 ms each of a frame: it took 3.3 ms (mri256
+/// `peer-opaque`, 512x512), and 2.9 at this, for 8 % more bricks.
 const BRICK: f64 = 3.0;
 
-/// How long an owner that says nothing keeps its tiles from those who have nothing to do, beyond twice
-/// what the tile takes: the scheduling of two busy machines, as for tasks that are late.
+/// How long an owner that says nothing keeps its tiles from those who have nothing to do, beyond
+/// twice what the tile takes: the scheduling of two busy machines, as for tasks that are late.
 const FORBEARANCE: Micros = 5_000;
 
-/// Tiles for a thread beyond which a coarser cut is taken: to draw, one of 128 pixels takes what four of 64 do, but each
-/// result costs the core that draws some 40 us of its own. Frames a second of 2 and 4 workers of mri256 at 1024x1024: 70 and 141
-/// in tiles of 64 pixels, 77 and 158 in such of 128 (`plan`); a real worker that has a processor to itself takes 15.3 and 14.4 ms
-/// a frame at 512x512, 37 and 34 at 1024x1024 (docs/scaling.md).
+/// Tiles for a thread beyond which a coarser cut is taken: to draw, one of 128 pixels takes what
+/// four of 64 do, but each result costs the core that draws some 40 us of its own. Frames a second
+/// of 2 and 4 workers of mri256 at 1024x1024: 70 and 141 in tiles of 64 pixels, 77 and 158 in such
+/// of 128 (`plan`); a real worker that has a processor to itself takes 15.3 and 14.4 ms a frame at
+/// 512x512, 37 and 34 at 1024x1024 (docs/scaling.md).
 const MANY: f64 = 6.0;
 
-/// The same of a frame that is alone, which is there when the last is done with its last tile, if there are others: at 6.5 for each
-/// of 8 workers mri256 `peer-semi` at 1280x1280 takes 44.4 ms a frame, and 43.4 in tiles of 64 pixels; at ten for each of 4 `peer-opaque`
-/// at 1024x1024 takes 7.4 ms, and 8.0 in tiles of 64.
+/// The same of a frame that is alone, which is there when the last is done with its last tile, if
+/// there are others: at 6.5 for each of 8 workers mri256 `peer-semi` at 1280x1280 takes 44.4 ms a
+/// frame, and 43.4 in tiles of 64 pixels; at ten for each of 4 `peer-opaque` at 1024x1024 takes 7.4
+/// ms, and 8.0 in tiles of 64.
 const MANY_ALONE: f64 = 9.0;
 
-/// The coarsest tiles of workers that are not on the master's machine: where each of few lacks bricks, nothing is drawn
-/// until some come. One worker at 1 Gbit/s has 88 % of what it could in tiles of 128 pixels (mri256 at 1024x1024), and 77 in such
-/// of 256.
+/// The coarsest tiles of workers that are not on the master's machine: where each of few lacks
+/// bricks, nothing is drawn until some come. One worker at 1 Gbit/s has 88 % of what it could in
+/// tiles of 128 pixels (mri256 at 1024x1024), and 77 in such of 256.
 const COARSEST: u32 = 128;
 
-/// A frame beside others may have so many tiles of those that are asked for, where threads that draw share the master's
-/// processors: each result then takes some 100 us of what they could draw in, and while there are tiles of four frames
-/// nobody lacks any. Two processes of a thread each on two processors take 12.9 ms a frame in tiles of 256 pixels, where they took
-/// 15.1 in such of 64 (mri256 `peer-opaque`, 512x512; docs/scaling.md).
+/// A frame beside others may have so many tiles of those that are asked for, where threads that
+/// draw share the master's processors: each result then takes some 100 us of what they could draw
+/// in, and while there are tiles of four frames nobody lacks any. Two processes of a thread each on
+/// two processors take 12.9 ms a frame in tiles of 256 pixels, where they took 15.1 in such of 64
+/// (mri256 `peer-opaque`, 512x512; docs/scaling.md).
 const SHARED: f64 = 0.6;
 
 /// The edge at which tiles are counted for that.
 const PLAIN: u32 = 64;
 
-/// A frame that is alone is cut into so many tiles of those that are asked for, one a thread where 2.5 are, before more
-/// are cut where that pays ([`makespan`]); never into such of 16 pixels while those of 32 are as many. mri256 `peer-opaque`
-/// at 512x512 on 64 workers, which began with 480 tiles of 16, takes 2.2 ms a frame where it took 3.6.
+/// A frame that is alone is cut into so many tiles of those that are asked for, one a thread where
+/// 2.5 are, before more are cut where that pays ([`makespan`]); never into such of 16 pixels while
+/// those of 32 are as many. mri256 `peer-opaque` at 512x512 on 64 workers, which began with 480
+/// tiles of 16, takes 2.2 ms a frame where it took 3.6.
 const BEGIN: f64 = 0.4;
 
-/// The same for tiles of 64 pixels, where a picture has so many. What the first frame is cut into the next ones of
-/// a path go on with, and small scenes (24 to 41 tiles) have up to a tenth fewer frames a second if that is coarse;
-/// mri256 `peer-semi` at 1024x1024 (122 tiles) on 64 workers has 68 % with one in flight where it has 66 after tiles of 32.
+/// The same for tiles of 64 pixels, where a picture has so many. What the first frame is cut into
+/// the next ones of a path go on with, and small scenes (24 to 41 tiles) have up to a tenth fewer
+/// frames a second if that is coarse; mri256 `peer-semi` at 1024x1024 (122 tiles) on 64 workers has
+/// 68 % with one in flight where it has 66 after tiles of 32.
 const LARGE: usize = 64;
 
-/// Of a path's frames for the same threads, tiles stay as large as those of the frame before where a tenth more or less of
-/// those that are asked for would be cut into such. Where a picture of a path has 40 tiles of 64 pixels and the next one 41, and 40 are asked for,
-/// everybody would be sent most bricks anew (mri256 on 16 workers at 1 Gbit/s: 1.2 MB, 13 ms).
+/// Of a path's frames for the same threads, tiles stay as large as those of the frame before where
+/// a tenth more or less of those that are asked for would be cut into such. Where a picture of a
+/// path has 40 tiles of 64 pixels and the next one 41, and 40 are asked for, everybody would be
+/// sent most bricks anew (mri256 on 16 workers at 1 Gbit/s: 1.2 MB, 13 ms).
 const STAY: f64 = 0.1;
 
-/// Of tiles that are asked for, a crew's frame has so many: one a thread where 2.5 are. Who is done with his draws one of
-/// the crew's next frame meanwhile, and 130 tiles of 32 pixels are three times as many messages as 40 of 64: mri256 at 512x512 on 40
-/// workers has 1190 frames a second so, and 800 at twice as many.
+/// Of tiles that are asked for, a crew's frame has so many: one a thread where 2.5 are. Who is done
+/// with his draws one of the crew's next frame meanwhile, and 130 tiles of 32 pixels are three
+/// times as many messages as 40 of 64: mri256 at 512x512 on 40 workers has 1190 frames a second so,
+/// and 800 at twice as many.
 const CREW_ASKS: f64 = 0.4;
 
-/// How much longer the parts of a tile of 64 pixels take together than the tile: 17 to 30 %, 24 of mri256 `peer-semi`
-/// at 1024x1024.
+/// How much longer the parts of a tile of 64 pixels take together than the tile: 17 to 30 %, 24 of
+/// mri256 `peer-semi` at 1024x1024.
 const MORE: f64 = 1.24;
 
-/// Tiles that take less say nothing of who drew them, in microseconds: tables, a block that is opened, a message on the
-/// same core.
+/// Tiles that take less say nothing of who drew them, in microseconds: tables, a block that is
+/// opened, a message on the same core.
 const LEAST_TOLD: f64 = 500.0;
 
 /// Crews that share out the frames of a path ([`Crew`]).
 pub(crate) const CREWS: u32 = 2;
 
-/// With fewer tiles of 64 pixels for a thread, crews draw frames in turn. At 2.6 tiles (mri256 at 512x512 on 15
-/// workers) crews have 79 % of n times one worker's frames, and all together 68; at 4.8 (8 workers) and 8.8 (at
-/// 1024x1024, 15 workers) one has as many as the other, and a frame is there in half the time without.
+/// With fewer tiles of 64 pixels for a thread, crews draw frames in turn. At 2.6 tiles (mri256 at
+/// 512x512 on 15 workers) crews have 79 % of n times one worker's frames, and all together 68; at
+/// 4.8 (8 workers) and 8.8 (at 1024x1024, 15 workers) one has as many as the other, and a frame is
+/// there in half the time without.
 const FEW: f64 = 4.0;
 
-/// Most blocks that stand for bricks: 60 us to project. Twice as many know the outline better by half a
-/// leaf and cost twice that on the master's one thread.
+/// Most blocks that stand for bricks: 60 us to project. Twice as many know the outline better by
+/// half a leaf and cost twice that on the master's one thread.
 const BLOCKS: usize = 2048;
 
 /// Edge of the smallest, four bricks, as a power of two.
@@ -128,7 +142,7 @@ const SMALLEST: u32 = 5;
 
 /// What is known of a tile from the frame before.
 #[derive(Clone, Debug)]
-struct Known {
+struct TileCost {
     /// Which frame taught it, in their order.
     frame: u64,
     /// Who drew it last.
@@ -141,59 +155,60 @@ struct Known {
 
 /// What frames of one kind (a brick set, a size of pictures) teach the next one.
 #[derive(Debug)]
-struct Lessons {
+struct ViewHistory {
     kind: Kind,
-    tiles: TileMap<Known>,
-    /// Whose each was to be in the frame that was cut last, drawn or not. Who has nothing to do takes a tile for once:
-    /// next time it is drawn where its neighbours are, lest borders, and with them bricks that two workers hold, become
-    /// more and more.
+    tiles: TileMap<TileCost>,
+    /// Whose each was to be in the frame that was cut last, drawn or not. Who has nothing to do
+    /// takes a tile for once: next time it is drawn where its neighbours are, lest borders, and
+    /// with them bricks that two workers hold, become more and more.
     homes: TileMap<WorkerId>,
     /// And its tiles' edge, for so many threads; none if it was alone.
     edge: Option<(u64, u32)>,
 }
 
-impl Lessons {
-    fn of(kind: Kind) -> Lessons {
+impl ViewHistory {
+    fn of(kind: Kind) -> ViewHistory {
         let size = kind.1;
-        Lessons { kind, tiles: TileMap::new(size), homes: TileMap::new(size), edge: None }
+        ViewHistory { kind, tiles: TileMap::new(size), homes: TileMap::new(size), edge: None }
     }
 }
 
 /// What is known of a tile, and what it takes by that.
-enum Taught<'a> {
+enum CostSource<'a> {
     /// It was drawn.
-    Itself(&'a Known),
+    Itself(&'a TileCost),
     /// The whole tile was, that it is a part of.
-    Whole(&'a Known, f64),
+    Whole(&'a TileCost, f64),
     /// Its parts were.
-    Parts([Option<&'a Known>; 4], f64),
+    Parts([Option<&'a TileCost>; 4], f64),
 }
 
 /// What is recalled of a tile.
-enum Recalled<'a> {
+enum Recall<'a> {
     /// As it was learnt: it was drawn as it is.
-    Itself(&'a Known),
+    Itself(&'a TileCost),
     /// As it follows from other tiles: those that it was cut into, or the one that it is a part of.
-    Others(Known),
+    Others(TileCost),
 }
 
-impl Recalled<'_> {
-    fn known(&self) -> &Known {
+impl Recall<'_> {
+    fn known(&self) -> &TileCost {
         match self {
-            Recalled::Itself(known) => known,
-            Recalled::Others(known) => known,
+            Recall::Itself(known) => known,
+            Recall::Others(known) => known,
         }
     }
 
     /// What follows from other tiles, and can't be looked up.
-    fn told(&self) -> Option<&Known> {
+    fn told(&self) -> Option<&TileCost> {
         match self {
-            Recalled::Itself(_) => None,
-            Recalled::Others(known) => Some(known),
+            Recall::Itself(_) => None,
+            Recall::Others(known) => Some(known),
         }
     }
 
-    /// How many bricks go along with the tile. Of a part of what was whole it is those that it lies under: some half.
+    /// How many bricks go along with the tile. Of a part of what was whole it is those that it lies
+    /// under: some half.
     fn bricks_along(&self) -> f64 {
         let part = if self.told().is_some() { 0.5 } else { 1.0 };
         part * self.known().touched.len() as f64
@@ -202,16 +217,17 @@ impl Recalled<'_> {
 
 /// What the schedule remembers.
 #[derive(Debug, Default)]
-pub(crate) struct Memory {
+pub(crate) struct CostHistory {
     blocks: Option<(BrickSetKey, Blocks)>,
-    lessons: Vec<Lessons>,
+    lessons: Vec<ViewHistory>,
     /// Frames that were cut.
     frames: u64,
-    /// How many times longer than others workers take, as far as tiles tell that were drawn by one and then by another.
+    /// How many times longer than others workers take, as far as tiles tell that were drawn by one
+    /// and then by another.
     slow: WorkerMap<f64>,
 }
 
-impl Memory {
+impl CostHistory {
     /// Boxes around neighbouring bricks, together around all: where anything may be seen.
     fn blocks(&mut self, key: BrickSetKey, bricks: &[BrickInfo]) -> &[Block] {
         if self.blocks.as_ref().is_none_or(|(k, _)| *k != key) {
@@ -225,23 +241,24 @@ impl Memory {
         self.blocks.as_ref().filter(|(k, _)| *k == key).map(|(_, blocks)| blocks)
     }
 
-    fn known(&self, kind: Kind, tile: &Rect) -> Option<&Known> {
+    fn known(&self, kind: Kind, tile: &Rect) -> Option<&TileCost> {
         let lessons = self.lessons.iter().find(|l| l.kind == kind)?;
         lessons.tiles.get(tile)
     }
 
-    /// What is known of a tile of [`PLAIN`] pixels, or of a quarter of one, however the last frame cut it.
-    fn recall(&self, kind: Kind, tile: &Rect) -> Option<Recalled<'_>> {
+    /// What is known of a tile of [`PLAIN`] pixels, or of a quarter of one, however the last frame
+    /// cut it.
+    fn recall(&self, kind: Kind, tile: &Rect) -> Option<Recall<'_>> {
         Some(match self.taught(kind, tile)? {
-            Taught::Itself(known) => Recalled::Itself(known),
-            Taught::Whole(whole, us) => Recalled::Others(Known { us, ..whole.clone() }),
-            Taught::Parts(parts, us) => {
+            CostSource::Itself(known) => Recall::Itself(known),
+            CostSource::Whole(whole, us) => Recall::Others(TileCost { us, ..whole.clone() }),
+            CostSource::Parts(parts, us) => {
                 let most = parts.iter().flatten().max_by(|a, b| a.us.total_cmp(&b.us))?;
                 let touched = parts.iter().flatten().flat_map(|k| k.touched.iter().copied());
                 let mut touched: Vec<u32> = touched.collect();
                 touched.sort_unstable();
                 touched.dedup();
-                Recalled::Others(Known { us, touched, ..(*most).clone() })
+                Recall::Others(TileCost { us, touched, ..(*most).clone() })
             }
         })
     }
@@ -249,8 +266,8 @@ impl Memory {
     /// How long it takes, as far as that is known.
     fn recall_us(&self, kind: Kind, tile: &Rect) -> Option<f64> {
         Some(match self.taught(kind, tile)? {
-            Taught::Itself(known) => known.us,
-            Taught::Whole(_, us) | Taught::Parts(_, us) => us,
+            CostSource::Itself(known) => known.us,
+            CostSource::Whole(_, us) | CostSource::Parts(_, us) => us,
         })
     }
 
@@ -269,9 +286,9 @@ impl Memory {
         })
     }
 
-    /// What the last frame that drew it taught of a tile: of one that it cut the sum of its parts, of parts of one that
-    /// it drew whole their share of it.
-    fn taught(&self, kind: Kind, tile: &Rect) -> Option<Taught<'_>> {
+    /// What the last frame that drew it taught of a tile: of one that it cut the sum of its parts,
+    /// of parts of one that it drew whole their share of it.
+    fn taught(&self, kind: Kind, tile: &Rect) -> Option<CostSource<'_>> {
         let lessons = &self.lessons.iter().find(|l| l.kind == kind)?.tiles;
         let whole = whole_of(tile, kind.1);
         let known = lessons.get(tile);
@@ -279,18 +296,18 @@ impl Memory {
         let parts = || quarters(&whole).map(|part| lessons.get(&part?));
         if *tile != whole {
             let Some(one) = lessons.get(&whole).filter(|one| one.frame > frame) else {
-                return known.map(Taught::Itself);
+                return known.map(CostSource::Itself);
             };
-            return Some(Taught::Whole(one, part_of((one, &whole), (known, tile), &parts())));
+            return Some(CostSource::Whole(one, part_of((one, &whole), (known, tile), &parts())));
         }
         let parts = parts();
         let last = parts.iter().flatten().map(|k| k.frame).max().unwrap_or(0);
         if last <= frame {
-            return known.map(Taught::Itself);
+            return known.map(CostSource::Itself);
         }
         let parts = parts.map(|k| k.filter(|k| k.frame == last));
         let us = parts.iter().flatten().map(|k| k.us).sum::<f64>() / MORE;
-        Some(Taught::Parts(parts, us))
+        Some(CostSource::Parts(parts, us))
     }
 
     /// The bricks that a tile was drawn from in the frame before, if by another worker.
@@ -324,16 +341,16 @@ impl Memory {
             }
             None => us,
         };
-        let known = Known { frame: regions.frame, owner, us, touched: touched.to_vec() };
+        let known = TileCost { frame: regions.frame, owner, us, touched: touched.to_vec() };
         self.of_kind(regions.kind).tiles.insert(tile, known);
     }
 
-    fn of_kind(&mut self, kind: Kind) -> &mut Lessons {
+    fn of_kind(&mut self, kind: Kind) -> &mut ViewHistory {
         let at = self.lessons.iter().position(|l| l.kind == kind).unwrap_or_else(|| {
             if self.lessons.len() == KINDS {
                 self.lessons.remove(0);
             }
-            self.lessons.push(Lessons::of(kind));
+            self.lessons.push(ViewHistory::of(kind));
             self.lessons.len() - 1
         });
         &mut self.lessons[at]
@@ -345,8 +362,8 @@ impl Memory {
         lessons.homes.get(tile).copied()
     }
 
-    /// A tile took one worker so long, and another before it: a quarter of what that says beyond what is known already
-    /// is believed of either.
+    /// A tile took one worker so long, and another before it: a quarter of what that says beyond
+    /// what is known already is believed of either.
     fn compare(&mut self, (one, here): (WorkerId, f64), (other, there): (WorkerId, f64)) {
         // Of what takes no longer than a message nothing can be said.
         if here.min(there) < LEAST_TOLD {
@@ -374,15 +391,18 @@ impl Memory {
     }
 }
 
-/// Which workers draw a frame: all, or one crew of several, while the others draw the frames beside it.
+/// Which workers draw a frame: all, or one crew of several, while the others draw the frames beside
+/// it.
 ///
-/// A frame in the making alone is everybody's, and soonest there. Of a path of which several are in the making it
-/// matters how many are done in a second, and there each worker of half of them does with half as many frames
-/// twice as much of each: it makes its tables and opens its blocks half as often, has twice as many tiles to choose
-/// from, so that they may be larger, and the master has half as many leases and messages. What it costs is a
-/// frame that takes twice as long, and bricks: both crews hold what the view needs.
+/// A frame in the making alone is everybody's, and soonest there. Of a path of which several are in
+/// the making it matters how many are done in a second, and there each worker of half of them does
+/// with half as many frames twice as much of each: it makes its tables and opens its blocks half as
+/// often, has twice as many tiles to choose from, so that they may be larger, and the master has
+/// half as many leases and messages. What it costs is a frame that takes twice as long, and bricks:
+/// both crews hold what the view needs.
 ///
-/// Whose crew a worker is in hangs on its name alone, so that nobody changes sides when another leaves.
+/// Whose crew a worker is in hangs on its name alone, so that nobody changes sides when another
+/// leaves.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Crew {
     index: u32,
@@ -405,7 +425,7 @@ impl Crew {
 
     /// Who stays of it.
     fn members(self, roster: &Roster) -> impl Iterator<Item = (WorkerId, u64)> {
-        let threads = roster.staying().map(|(id, w)| (id, u64::from(w.threads)));
+        let threads = roster.active().map(|(id, w)| (id, u64::from(w.threads)));
         threads.filter(move |(id, _)| self.has(*id))
     }
 
@@ -423,14 +443,14 @@ impl Crew {
         self.members(roster).map(|(id, threads)| (id, threads as f64)).collect()
     }
 
-    /// Whose a frame is that comes to so many tiles of 64 pixels: the `beside`th crew's, where there is more than
-    /// one frame.
+    /// Whose a frame is that comes to so many tiles of 64 pixels: the `beside`th crew's, where
+    /// there is more than one frame.
     fn of_frame(beside: Option<u32>, tiles: usize, roster: &Roster) -> Crew {
         let Some(index) = beside else { return Crew::ALL };
         let few = (tiles as f64) < FEW * roster.threads() as f64;
         let crew = |index| Crew { index, of: CREWS };
-        // A crew of one has nobody to share with, and frames come in their order: a weak crew would hold the
-        // strong one up. Names that are odd and even need not come in equal numbers.
+        // A crew of one has nobody to share with, and frames come in their order: a weak crew would
+        // hold the strong one up. Names that are odd and even need not come in equal numbers.
         let all = (0..CREWS).all(|i| crew(i).members(roster).count() > 1);
         let strong = || (0..CREWS).map(|i| crew(i).members(roster).map(|m| m.1).sum::<u64>());
         let (least, most) = (strong().min().unwrap_or(0), strong().max().unwrap_or(0));
@@ -438,8 +458,8 @@ impl Crew {
     }
 }
 
-/// The edge of as few tiles as are enough: so many are `wanted`, for so many `threads`. `beside`: other frames are in the
-/// making; `here`: the threads share the master's processors.
+/// The edge of as few tiles as are enough: so many are `wanted`, for so many `threads`. `beside`:
+/// other frames are in the making; `here`: the threads share the master's processors.
 fn edge(through: &Through, (wanted, threads): (f64, f64), beside: bool, here: bool) -> u32 {
     let shared = beside && here;
     let for_each = if beside || threads <= 1.0 { MANY } else { MANY_ALONE };
@@ -448,7 +468,8 @@ fn edge(through: &Through, (wanted, threads): (f64, f64), beside: bool, here: bo
     if shared { edge } else { edge.min(COARSEST) }
 }
 
-/// The tiles' edge of a frame beside others, where the one before it had the `last`, if it was for as many threads.
+/// The tiles' edge of a frame beside others, where the one before it had the `last`, if it was for
+/// as many threads.
 fn edge_beside(
     through: &Through,
     (wanted, threads): (f64, u64),
@@ -474,11 +495,12 @@ fn edge_alone(through: &Through, (wanted, threads): (f64, u64)) -> u32 {
     edge(BEGIN * wanted).min(coarsest).max(finest)
 }
 
-/// What a part takes of a tile that was drawn whole after it: as it was among the others, if they were known then.
+/// What a part takes of a tile that was drawn whole after it: as it was among the others, if they
+/// were known then.
 fn part_of(
-    (one, whole): (&Known, &Rect),
-    (known, part): (Option<&Known>, &Rect),
-    parts: &[Option<&Known>; 4],
+    (one, whole): (&TileCost, &Rect),
+    (known, part): (Option<&TileCost>, &Rect),
+    parts: &[Option<&TileCost>; 4],
 ) -> f64 {
     let all = parts.iter().flatten().map(|k| k.us).sum::<f64>();
     let share = match known {
@@ -488,7 +510,8 @@ fn part_of(
     MORE * share * one.us
 }
 
-/// Where a worker is among those who stay; of one in reserve, where its neighbour is, who takes its place.
+/// Where a worker is among those who stay; of one in reserve, where its neighbour is, who takes its
+/// place.
 fn place_of(staying: &[(WorkerId, f64)], id: WorkerId, roster: &Roster) -> Option<usize> {
     let beside = |at: usize| roster.has_in_reserve(id).then(|| at.saturating_sub(1));
     staying.binary_search_by_key(&id, |s| s.0).or_else(|at| beside(at).ok_or(())).ok()
@@ -505,7 +528,8 @@ fn whole_of(tile: &Rect, size: [u32; 2]) -> Rect {
     Rect::new(x0, y0, x0 + edge, y0 + edge).intersect(&Rect::of_size(size))
 }
 
-/// The parts that a tile is cut into, of half of [`PLAIN`]; at the picture's border there may be fewer.
+/// The parts that a tile is cut into, of half of [`PLAIN`]; at the picture's border there may be
+/// fewer.
 fn quarters(tile: &Rect) -> [Option<Rect>; 4] {
     let half = PLAIN as i32 / 2;
     [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(x, y)| {
@@ -526,7 +550,7 @@ pub(crate) struct Part {
     pub(crate) us: f64,
     pub(crate) price: f64,
     /// What is known of it, if the frame before did not draw it as it is.
-    told: Option<Known>,
+    told: Option<TileCost>,
 }
 
 /// A frame's regions.
@@ -535,8 +559,9 @@ pub(crate) struct Regions {
     kind: Kind,
     /// Its number among frames that were cut.
     frame: u64,
-    /// What is known of tiles that the frame before cut in another way, by their place in the queue.
-    told: BTreeMap<u32, Known>,
+    /// What is known of tiles that the frame before cut in another way, by their place in the
+    /// queue.
+    told: BTreeMap<u32, TileCost>,
     /// Whose each tile is, by its place in the queue.
     owners: Vec<WorkerId>,
     /// Places of each worker's, ascending where nothing moved.
@@ -555,20 +580,21 @@ pub(crate) struct Regions {
 }
 
 impl Regions {
-    /// Cuts a frame's picture, estimates its tiles and shares them out among those who stay, or among the
-    /// `beside`th crew of them. With where each block of bricks lies ([`Memory::blocks_of`]). `alone`: no other frame is in
-    /// the making or waits; `bind`: bricks are what such frames wait for.
+    /// Cuts a frame's picture, estimates its tiles and shares them out among those who stay, or
+    /// among the `beside`th crew of them. With where each block of bricks lies
+    /// ([`CostHistory::blocks_of`]). `alone`: no other frame is in the making or waits; `bind`:
+    /// bricks are what such frames wait for.
     pub(crate) fn cut(
         job: &FrameJob,
         (beside, alone): (Option<u32>, bool),
         (rate, bind): (Option<f64>, bool),
         roster: &Roster,
-        memory: &mut Memory,
+        history: &mut CostHistory,
     ) -> (Cut, Regions, Vec<Rect>) {
         let (key, size) = (job.scene.bricks, job.view.size);
-        memory.frames += 1;
-        let frame = memory.frames;
-        let blocks = memory.blocks(key, &job.bricks);
+        history.frames += 1;
+        let frame = history.frames;
+        let blocks = history.blocks(key, &job.bricks);
         let outline = |b: &Block| job.view.outline(&b.tight).unwrap_or_default();
         let outlines: Vec<Rect> = blocks.iter().map(outline).collect();
         let rects: Vec<Rect> = outlines.iter().filter(|r| !r.is_empty()).copied().collect();
@@ -578,7 +604,7 @@ impl Regions {
         let threads = crew.members(roster).map(|m| m.1).sum::<u64>();
         let wanted = job.work.tiles_per_worker * threads as f64;
         let kind = (key, size, crew);
-        let lessons = memory.of_kind(kind);
+        let lessons = history.of_kind(kind);
         let edge = job.work.tile.unwrap_or_else(|| {
             let last = lessons.edge.filter(|(of, _)| *of == threads).map(|(_, edge)| edge);
             match alone {
@@ -599,17 +625,18 @@ impl Regions {
         let either = job.work.tile.is_none() && (PLAIN / 2..=PLAIN).contains(&cut.edge);
         let leveled = alone && either;
         let mut fine = Parts::new(size);
-        // Which tiles are cut changes from frame to frame, and who is given a whole one lacks the bricks of parts that
-        // others drew. So where bricks bind all are of one size, and none is cut late.
+        // Which tiles are cut changes from frame to frame, and who is given a whole one lacks the
+        // bricks of parts that others drew. So where bricks bind all are of one size, and none is
+        // cut late.
         if leveled
             && !bind
-            && let Some(mixed) = mixed(&through, threads as usize, (memory, kind))
+            && let Some(mixed) = mixed(&through, threads as usize, (history, kind))
         {
             (cut, fine) = mixed;
         }
         let recall = |t: &Macrotile| match either {
-            true => memory.recall(kind, &t.rect),
-            false => memory.known(kind, &t.rect).map(Recalled::Itself),
+            true => history.recall(kind, &t.rect),
+            false => history.known(kind, &t.rect).map(Recall::Itself),
         };
         let mut taught = TileMap::new(size);
         for t in &cut.tiles {
@@ -618,7 +645,7 @@ impl Regions {
             }
         }
         let recalled = |t: &Macrotile| taught.get(&t.rect);
-        let of = |t: &Macrotile| recalled(t).map(Recalled::known);
+        let of = |t: &Macrotile| recalled(t).map(Recall::known);
         let known = |t: &Macrotile| of(t).map(|k| (k.owner, k.us));
         let unit = unit(&cut.tiles, &known);
         for t in &mut cut.tiles {
@@ -628,14 +655,14 @@ impl Regions {
         }
         cut.sort(size);
         let bricks = |t: &Macrotile| of(t).map_or(0, |k| k.touched.len());
-        let slow = |id: WorkerId| memory.slow(id);
+        let slow = |id: WorkerId| history.slow(id);
         let owners = if leveled && !taught.is_empty() {
             let price = |t: &Macrotile| recalled(t).map_or(0.0, |k| brick * k.bricks_along());
             level(&cut.tiles, roster, crew, (unit, &slow), &known, &price)
         } else {
             let there = |id: &WorkerId| roster.get(*id).is_some_and(|w| !w.leaving);
             let home = |t: &Macrotile| {
-                let home = memory.home(kind, &t.rect).filter(there);
+                let home = history.home(kind, &t.rect).filter(there);
                 home.or_else(|| Some(known(t)?.0))
             };
             share(&cut.tiles, roster, crew, (unit, &slow), &known, (&home, &bricks))
@@ -653,7 +680,7 @@ impl Regions {
         };
         let told = cut.tiles.iter().zip(0..).filter_map(told).collect();
         drop(taught);
-        let homes = &mut memory.of_kind(kind).homes;
+        let homes = &mut history.of_kind(kind).homes;
         homes.clear();
         for (t, owner) in cut.tiles.iter().zip(&owners) {
             homes.insert(&t.rect, *owner);
@@ -675,8 +702,12 @@ impl Regions {
     }
 
     /// What is known of one of its tasks, by itself or by other tiles.
-    fn known<'a>(&'a self, (place, tile): (u32, &Rect), memory: &'a Memory) -> Option<&'a Known> {
-        self.told.get(&place).or_else(|| memory.known(self.kind, tile))
+    fn known<'a>(
+        &'a self,
+        (place, tile): (u32, &Rect),
+        history: &'a CostHistory,
+    ) -> Option<&'a TileCost> {
+        self.told.get(&place).or_else(|| history.known(self.kind, tile))
     }
 
     /// Who draws it.
@@ -686,7 +717,7 @@ impl Regions {
 
     /// Those whose tiles these are and who are gone, leave, or are held in reserve.
     pub(crate) fn orphaning(&self, roster: &Roster) -> Vec<WorkerId> {
-        let gone = |id: &WorkerId| roster.get(*id).is_none_or(|w| !w.draws());
+        let gone = |id: &WorkerId| roster.get(*id).is_none_or(|w| !w.is_active());
         self.owned.ids().filter(gone).collect()
     }
 
@@ -700,9 +731,9 @@ impl Regions {
         self.owned.get(id).map_or(&[], Vec::as_slice)
     }
 
-    /// The parts of a waiting tile, what is guessed of each, and what they take, as far as that is known; none of what
-    /// can't be cut.
-    pub(crate) fn parts(&self, place: u32, tile: &Rect, memory: &Memory) -> Vec<Part> {
+    /// The parts of a waiting tile, what is guessed of each, and what they take, as far as that is
+    /// known; none of what can't be cut.
+    pub(crate) fn parts(&self, place: u32, tile: &Rect, history: &CostHistory) -> Vec<Part> {
         if *tile != whole_of(tile, self.kind.1)
             || tile.width().max(tile.height()) <= PLAIN as usize / 2
         {
@@ -714,11 +745,11 @@ impl Regions {
         let all: u64 = parts.iter().map(|p| p.1).sum();
         let Some((_, whole)) = self.took[place as usize] else { return Vec::new() };
         let part = |(rect, est): (Rect, u64)| {
-            let recalled = memory.recall(self.kind, &rect);
+            let recalled = history.recall(self.kind, &rect);
             let guess = || MORE * whole * est as f64 / all.max(1) as f64;
             let us = recalled.as_ref().map_or_else(guess, |k| k.known().us);
             let price = recalled.as_ref().map_or(0.0, |k| self.brick * k.bricks_along());
-            let told = recalled.as_ref().and_then(Recalled::told).cloned();
+            let told = recalled.as_ref().and_then(Recall::told).cloned();
             let est = in_units(us, self.unit);
             Part { tile: Macrotile { rect, est }, us, price, told }
         };
@@ -726,7 +757,7 @@ impl Regions {
     }
 
     /// A waiting tile's parts are these workers' from now on, at the places behind all others.
-    pub(crate) fn cut_late(&mut self, place: u32, parts: Vec<(Part, WorkerId)>) {
+    pub(crate) fn split_waiting(&mut self, place: u32, parts: Vec<(Part, WorkerId)>) {
         let owner = self.owners[place as usize];
         let last = self.took[place as usize].map_or(owner, |t| t.0);
         self.owned.or_default(owner).retain(|p| *p != place);
@@ -741,25 +772,25 @@ impl Regions {
         }
     }
 
-    /// How long bricks of a piece are on the link that is given away of a tile, in microseconds: of those that the tile was drawn
-    /// from before some half lies over it.
-    pub(crate) fn price_of_piece(&self, place: u32, tile: &Rect, memory: &Memory) -> f64 {
-        let known = self.known((place, tile), memory);
+    /// How long bricks of a piece are on the link that is given away of a tile, in microseconds: of
+    /// those that the tile was drawn from before some half lies over it.
+    pub(crate) fn price_of_piece(&self, place: u32, tile: &Rect, history: &CostHistory) -> f64 {
+        let known = self.known((place, tile), history);
         0.5 * (self.brick - BRICK) * known.map_or(0, |k| k.touched.len()) as f64
     }
 
-    /// Of a tile that is being drawn a piece is given away, and is this worker's, at the place behind all others. What
-    /// the tile takes in all from now on, and what the piece does.
+    /// Of a tile that is being drawn a piece is given away, and is this worker's, at the place
+    /// behind all others. What the tile takes in all from now on, and what the piece does.
     pub(crate) fn hand_over(
         &mut self,
         (place, tile): (u32, &Rect),
         (kept, given): (f64, f64),
         taker: WorkerId,
-        memory: &Memory,
+        history: &CostHistory,
     ) {
         let (last, _) = self.took[place as usize].unwrap_or((self.owner(place), 0.0));
         self.took[place as usize] = Some((last, kept));
-        let known = self.known((place, tile), memory).cloned();
+        let known = self.known((place, tile), history).cloned();
         let at = self.owners.len() as u32;
         self.owners.push(taker);
         self.took.push(Some((last, given)));
@@ -779,12 +810,14 @@ impl Regions {
         self.took[place as usize].map(|(_, us)| us)
     }
 
-    /// How long each of so many threads has to draw, in microseconds, as far as that was known when it was cut.
+    /// How long each of so many threads has to draw, in microseconds, as far as that was known when
+    /// it was cut.
     pub(crate) fn us_a_thread(&self, threads: u64) -> f64 {
         self.all_us / threads.max(1) as f64
     }
 
-    /// How long the longest of its tiles was to take, likewise; infinitely long, where nothing was known.
+    /// How long the longest of its tiles was to take, likewise; infinitely long, where nothing was
+    /// known.
     pub(crate) fn longest_us(&self) -> f64 {
         if self.all_us > 0.0 { self.longest_us } else { f64::INFINITY }
     }
@@ -802,18 +835,18 @@ impl Regions {
         left
     }
 
-    /// Whether a worker without work should take another's task, whose owner has to do for so long. Of
-    /// what was never drawn nobody holds the bricks.
+    /// Whether a worker without work should take another's task, whose owner has to do for so long.
+    /// Of what was never drawn nobody holds the bricks.
     pub(crate) fn is_worth_taking(
         &self,
         place: u32,
         worker: WorkerId,
         left: &WorkerMap<f64>,
-        memory: &Memory,
+        history: &CostHistory,
     ) -> bool {
         let Some((last, us)) = self.took[place as usize] else { return true };
         let owner = self.owners[place as usize];
-        let here = us * memory.slower(worker, last);
+        let here = us * history.slower(worker, last);
         left.get(owner).is_none_or(|left| *left > 2.0 * here)
     }
 
@@ -837,16 +870,16 @@ impl Regions {
 /// Parts that tiles can be cut into, with what is guessed of each.
 type Parts = TileMap<u64>;
 
-/// The tiles of a frame that is alone, some of them cut ([`makespan::which`]), and all parts that there may be. `None`:
-/// of too few it is known what they take.
+/// The tiles of a frame that is alone, some of them cut ([`makespan::which`]), and all parts that
+/// there may be. `None`: of too few it is known what they take.
 fn mixed(
     through: &Through,
     threads: usize,
-    (memory, kind): (&Memory, Kind),
+    (history, kind): (&CostHistory, Kind),
 ) -> Option<(Cut, Parts)> {
     let plain = through.cut(PLAIN);
     let known: Vec<Option<f64>> =
-        plain.tiles.iter().map(|t| memory.recall_us(kind, &t.rect)).collect();
+        plain.tiles.iter().map(|t| history.recall_us(kind, &t.rect)).collect();
     let told = || plain.tiles.iter().zip(&known).filter_map(|(t, us)| Some((t.est, (*us)?)));
     let (units, us) = told().fold((0, 0.0), |(a, b), (est, us)| (a + est, b + us));
     if 2 * told().count() < plain.tiles.len() || units == 0 {
@@ -867,15 +900,15 @@ fn mixed(
             let est = *parts.get(&r?)?;
             Some(us.unwrap_or_else(|| guess(est)))
         };
-        let known = memory.recall_parts_us(kind, &t.rect);
+        let known = history.recall_parts_us(kind, &t.rect);
         quarters(&t.rect).into_iter().zip(known).filter_map(part).collect()
     };
     let cut = makespan::which(&us, takes, threads);
     Some((through.mixed(&plain, &fine, &cut), parts))
 }
 
-/// Whose each tile of a frame that is alone is: whoever drew it last, unless the frame ends earlier if another does
-/// ([`makespan::balance`]).
+/// Whose each tile of a frame that is alone is: whoever drew it last, unless the frame ends earlier
+/// if another does ([`makespan::balance`]).
 fn level(
     tiles: &[Macrotile],
     roster: &Roster,
@@ -900,8 +933,8 @@ fn level(
     owners.into_iter().map(|w| staying[w].0).collect()
 }
 
-/// How much slower or faster than another a worker must look before that is believed: what a tile takes differs from
-/// frame to frame, and a core shared with somebody is slower by half.
+/// How much slower or faster than another a worker must look before that is believed: what a tile
+/// takes differs from frame to frame, and a core shared with somebody is slower by half.
 const BELIEVED: f64 = 2.0;
 
 fn believed(slower: f64) -> f64 {
@@ -915,15 +948,16 @@ fn unit(tiles: &[Macrotile], known: &impl Fn(&Macrotile) -> Option<(WorkerId, f6
     if units > 0.0 && us > 0.0 { us / units } else { 1.0 }
 }
 
-/// What a tile took, in the units that others are guessed in: so the two can stand beside each other.
+/// What a tile took, in the units that others are guessed in: so the two can stand beside each
+/// other.
 fn in_units(us: f64, unit: f64) -> u64 {
     ((us / unit) as u64).max(1)
 }
 
 /// What tiles take those who stay.
 struct Times {
-    /// What each takes who drew it, or is guessed to, in microseconds, and how slow that one is. It is looked up once:
-    /// what follows asks for it again and again.
+    /// What each takes who drew it, or is guessed to, in microseconds, and how slow that one is. It
+    /// is looked up once: what follows asks for it again and again.
     takes: Vec<(f64, f64)>,
     /// Of each who stays, how slow it is and how many threads it has.
     slows: Vec<f64>,
@@ -954,8 +988,8 @@ impl Times {
         us * believed(self.slows[worker] / slow) / self.threads[worker]
     }
 
-    /// Whose each tile is, and how long each worker has to do: whose it was, or else, in this order, whoever is done with
-    /// it soonest.
+    /// Whose each tile is, and how long each worker has to do: whose it was, or else, in this
+    /// order, whoever is done with it soonest.
     fn deal(&self, held: &[Option<usize>], order: &[usize]) -> (Vec<usize>, Vec<f64>) {
         let mut load = vec![0.0; self.threads.len()];
         let mut owners: Vec<usize> = held.iter().map(|w| w.unwrap_or(0)).collect();
@@ -974,8 +1008,9 @@ impl Times {
     }
 }
 
-/// Whose each tile is: at first in bands, then whose it was in the frame that was cut before, unless that one would be
-/// done late; a new one's whoever is done with it soonest. Loads are times.
+/// Whose each tile is: at first in bands, then whose it was in the frame that was cut before,
+/// unless that one would be done late; a new one's whoever is done with it soonest. Loads are
+/// times.
 fn share(
     tiles: &[Macrotile],
     roster: &Roster,
@@ -1012,7 +1047,8 @@ fn share(
         }
     }
     let (mut owners, mut load) = times.deal(&homes, &order);
-    // While the first frame is drawn, others begin beside it: most of what loads are made of is guessed then.
+    // While the first frame is drawn, others begin beside it: most of what loads are made of is
+    // guessed then.
     let drawn = tiles.iter().filter(|t| known(t).is_some()).count();
     let moves = if drawn > 0 && 2 * drawn < tiles.len() { 0 } else { tiles.len() };
     for moved in 0..moves {
@@ -1025,8 +1061,8 @@ fn share(
         if !(late > LATE || late > SLACK && moved == 0) {
             break;
         }
-        // Of those that leave both earlier than the later one was, by enough to be worth it and to pay for
-        // the bricks that move, the one nearest to what the other has; else the largest.
+        // Of those that leave both earlier than the later one was, by enough to be worth it and to
+        // pay for the bricks that move, the one nearest to what the other has; else the largest.
         let better = |i: &usize| {
             if owners[*i] != most {
                 return false;
@@ -1184,7 +1220,8 @@ mod tests {
         let (tiles, roster) = (tiles(24), roster(&[1, 1, 1]));
         let bands = among_all(&tiles, &roster, &|_| None);
         let at = |t: &Macrotile| (t.rect.x0 / 64) as usize;
-        // The first tiles that are drawn lie at the edge of what is to be seen, and take a hundredth of what is guessed.
+        // The first tiles that are drawn lie at the edge of what is to be seen, and take a
+        // hundredth of what is guessed.
         let shared = |drawn: usize| {
             let known = |t: &Macrotile| {
                 let us = if at(t) < 4 { 10.0 } else { 1000.0 };
@@ -1226,25 +1263,25 @@ mod tests {
     }
 
     /// What is known of a tile after frames of which each drew some tiles in so many microseconds.
-    fn after(frames: &[&[(Rect, f64, &[u32])]]) -> (Memory, Kind) {
+    fn after(frames: &[&[(Rect, f64, &[u32])]]) -> (CostHistory, Kind) {
         let kind = (BrickSetKey(Digest32([0; 32])), [512, 512], Crew::ALL);
         let mut tiles = TileMap::new(kind.1);
         for (frame, drawn) in (1..).zip(frames) {
             for (rect, us, touched) in *drawn {
                 let (owner, touched) = (WorkerId(frame), touched.to_vec());
-                let known = Known { frame, owner, us: *us, touched };
+                let known = TileCost { frame, owner, us: *us, touched };
                 tiles.insert(rect, known);
             }
         }
-        let lessons = vec![Lessons { tiles, ..Lessons::of(kind) }];
-        (Memory { lessons, ..Memory::default() }, kind)
+        let lessons = vec![ViewHistory { tiles, ..ViewHistory::of(kind) }];
+        (CostHistory { lessons, ..CostHistory::default() }, kind)
     }
 
     #[test]
     fn a_tile_is_known_by_its_parts_and_parts_by_their_tile_whichever_came_last() {
         let whole = Rect::new(64, 0, 128, 64);
         let part = |x, y| Rect::new(64 + 32 * x, 32 * y, 96 + 32 * x, 32 + 32 * y);
-        let near = |k: Option<Recalled<'_>>, us: f64| {
+        let near = |k: Option<Recall<'_>>, us: f64| {
             let k = k.expect("it is known");
             let k = k.known();
             assert!((k.us - us).abs() < 1e-6, "{} for {us}", k.us);
@@ -1270,7 +1307,7 @@ mod tests {
 
     #[test]
     fn a_tile_that_two_workers_drew_says_which_of_them_is_slow() {
-        let mut m = Memory::default();
+        let mut m = CostHistory::default();
         for _ in 0..12 {
             m.compare((WorkerId(1), 9000.0), (WorkerId(2), 900.0));
         }

@@ -1,12 +1,12 @@
-//! Where a frame is cut into slabs: by equal thickness as in the paper, or where the data ask for it
-//! (the paper's future work, its sections 5.3 and 6).
+//! Where a frame is cut into slabs: by equal thickness as in the paper, or where the data ask for
+//! it (the paper's future work, its sections 5.3 and 6).
 //!
 //! What a slab is for is that those in front hide bricks of those behind: a brick is needed unless
-//! every pixel under it is shut where its slab begins. Which pixels will be is guessed from the bricks
-//! alone: a leaf of the picture is opaque a little behind the first brick in it. With that guess, the
-//! borders under which the fewest voxels are needed are found exactly, by dynamic programming over
-//! borders a brick apart. Borders are sheet borders, so no pixel changes, and a wrong guess costs bricks
-//! and nothing else.
+//! every pixel under it is shut where its slab begins. Which pixels will be is guessed from the
+//! bricks alone: a leaf of the picture is opaque a little behind the first brick in it. With that
+//! guess, the borders under which the fewest voxels are needed are found exactly, by dynamic
+//! programming over borders a brick apart. Borders are sheet borders, so no pixel changes, and a
+//! wrong guess costs bricks and nothing else.
 
 use crate::policy::macrotile::LEAF;
 use slabcast_common::occlusion::Rect;
@@ -14,18 +14,20 @@ use slabcast_common::quality::{Borders, Work};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Projected, View};
 
-/// Vox behind a leaf's front in which it becomes opaque: one and a half bricks. What is one voxel
-/// thin is opaque within five; a skin that rises over some voxels takes ten.
-const DEEP: f64 = 12.0;
+/// Tuning (vox): depth behind a leaf's front at which it becomes opaque, one and a half bricks.
+/// What is one voxel thin is opaque within five; a skin that rises over some voxels takes ten.
+const OPAQUE_DEPTH_VOX: f64 = 12.0;
 
-/// Borders that are tried lie so many vox apart: a brick's edge. Bricks begin no finer.
-const APART: f64 = 8.0;
+/// Tuning (vox): distance between candidate borders, a brick's edge. Bricks begin no finer.
+const BORDER_STEP_VOX: f64 = 8.0;
 
-/// Borders that are tried at most; more are thinned out. The square of it is looked at.
-const MOST: usize = 96;
+/// Limit: number of candidate borders; more are thinned out. The search takes its square.
+const MAX_BORDERS: usize = 96;
 
-/// The slabs of a frame whose bricks project like this, front to back, none of them empty; `voxels` has
-/// those of each brick.
+/// Returns the slabs of a frame, front to back, none of them empty.
+///
+/// `projected`: rectangle in pixels and sheets of each brick, `None` outside the picture. `voxels`:
+/// number of voxels of a brick by index.
 pub fn slab_ranges(
     view: &View,
     projected: &[Option<Projected>],
@@ -37,10 +39,10 @@ pub fn slab_ranges(
     if work.borders == Borders::Equal || work.slabs < 2 || sheets.len() <= work.slabs {
         return sheets.slabs(work.slabs);
     }
-    let deep = (DEEP / view.thickness).ceil().clamp(1.0, 1e6) as i32;
+    let deep = (OPAQUE_DEPTH_VOX / view.thickness).ceil().clamp(1.0, 1e6) as i32;
     let bricks = hidden_from(view.size, projected, voxels, deep);
-    let apart = (APART / view.thickness).round().clamp(1.0, 1e6) as usize;
-    let apart = apart.max(sheets.len() as usize / MOST).max(1);
+    let apart = (BORDER_STEP_VOX / view.thickness).round().clamp(1.0, 1e6) as usize;
+    let apart = apart.max(sheets.len() as usize / MAX_BORDERS).max(1);
     let tried: Vec<i32> = (sheets.first..sheets.end).step_by(apart).chain([sheets.end]).collect();
     let mut slabs = Vec::new();
     let mut first = sheets.first;
@@ -51,17 +53,18 @@ pub fn slab_ranges(
     slabs
 }
 
-/// A brick as far as borders know it.
+/// A brick, for the search of borders.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Guess {
     /// Its first sheet.
     first: i32,
-    /// A slab that begins here or behind needs it no more.
+    /// A slab that begins at this sheet or behind needs the brick no more.
     hidden: i32,
     voxels: u64,
 }
 
-/// From where each brick is hidden, if every leaf is opaque `deep` sheets behind its front.
+/// Returns from which sheet each brick is hidden, if every leaf is opaque `deep` sheets behind its
+/// front.
 fn hidden_from(
     size: [u32; 2],
     projected: &[Option<Projected>],
@@ -95,12 +98,13 @@ fn hidden_from(
     projected.iter().enumerate().filter_map(guess).collect()
 }
 
-/// Ends of at most `count` slabs, of the borders `tried` (the first where slabs begin, the last where
-/// they end), under which the fewest voxels are needed; of several such the one with the front borders
-/// first.
+/// Returns the ends of at most `count` slabs under which the fewest voxels are needed, out of the
+/// borders `tried` (the first where slabs begin, the last where they end). Of several such the one
+/// with the front borders first.
 fn best(tried: &[i32], bricks: &[Guess], count: usize) -> Vec<i32> {
     let n = tried.len() - 1;
-    // Of a slab from border `a` to `b`: voxels of bricks that begin in it and are not hidden at `a`.
+    // Of a slab from border `a` to `b`: voxels of bricks that begin in it and are not hidden at
+    // `a`.
     let mut needed = vec![0u64; (n + 1) * (n + 1)];
     for b in bricks {
         // The last border at or in front of it.
@@ -117,7 +121,8 @@ fn best(tried: &[i32], bricks: &[Guess], count: usize) -> Vec<i32> {
         }
     }
     let count = count.min(n);
-    // least[k][b]: of the first k + 1 slabs that end at border b, and where the last of them begins.
+    // least[k][b]: of the first k + 1 slabs that end at border b, and where the last of them
+    // begins.
     let mut least = vec![vec![(u64::MAX, 0usize); n + 1]; count];
     for b in 1..=n {
         least[0][b] = (needed[b], 0);
@@ -156,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn a_brick_is_hidden_behind_the_last_of_the_fronts_under_it() {
+    fn brick_is_hidden_behind_the_last_front_under_it() {
         // Two leaves with data at 0 and at 30, and a brick over both.
         let wide =
             Some(Projected { rect: Rect::new(8, 0, 24, 16), sheets: SheetRange::new(60, 72) });
@@ -173,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_behind_a_wall_is_a_slab_of_its_own() {
+    fn bricks_behind_a_wall_get_a_slab_of_their_own() {
         let wall = Guess { first: 0, hidden: 12, voxels: 10 };
         let behind = Guess { first: 40, hidden: 12, voxels: 1000 };
         let tried: Vec<i32> = (0..=10).map(|i| 8 * i).collect();
@@ -194,7 +199,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_other_borders_need_less(
+        fn slab_borders_need_the_fewest_voxels(
             bricks in prop::collection::vec((0i32..39, 1i32..60, 1u64..9), 0..30),
         ) {
             let bricks: Vec<_> = bricks
@@ -213,7 +218,7 @@ mod tests {
         }
 
         #[test]
-        fn slabs_tile_the_run(
+        fn slabs_cover_all_sheets(
             bricks in prop::collection::vec((-40i32..120, -40i32..120, -50i32..50), 0..40),
             slabs in 1u32..9,
         ) {

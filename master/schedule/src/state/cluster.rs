@@ -1,8 +1,8 @@
 //! What all frames share: workers, bricks, history and the queue of actions.
 
-use crate::policy::active_set::Reserve;
-use crate::policy::link_use::Traffic;
-use crate::policy::region::Memory;
+use crate::policy::active_set::ActiveSet;
+use crate::policy::link_use::LinkUse;
+use crate::policy::region::CostHistory;
 use crate::state::residency::Residency;
 use crate::state::workers::Roster;
 use crate::{Action, Config, Totals};
@@ -16,9 +16,9 @@ pub(crate) struct Cluster {
     pub(crate) config: Config,
     pub(crate) roster: Roster,
     pub(crate) residency: Residency,
-    pub(crate) memory: Memory,
-    pub(crate) traffic: Traffic,
-    pub(crate) reserve: Reserve,
+    pub(crate) history: CostHistory,
+    pub(crate) link_use: LinkUse,
+    pub(crate) active_set: ActiveSet,
     pub(crate) out: VecDeque<Action>,
     pub(crate) next_task: u64,
     pub(crate) totals: Totals,

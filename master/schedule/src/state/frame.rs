@@ -8,27 +8,28 @@
 //!             | no task open: occlusion map updated           (end_slab)
 //! ```
 //!
-//! Under the `region` schedule it is one slab through all depths of which the master knows nothing but
-//! where something may be seen: `region` cuts it and shares it out, workers cull it and ask for bricks.
-//! Leases, results, stragglers and the lost are the same, and so is the code. Several such frames may
-//! be in the making at a time; what a worker has of the others comes as a [`Turn`].
+//! Under the `region` schedule it is one slab through all depths of which the master knows nothing
+//! but where something may be seen: `region` cuts it and shares it out, workers cull it and ask for
+//! bricks. Leases, results, stragglers and the lost are the same, and so is the code. Several such
+//! frames may be in the making at a time; what a worker has of the others comes as a
+//! [`StepContext`].
 //!
-//! `lend` says who gets which task and when, `late` cuts a tile that would be done last as it is lent, `handover` one that is
-//! being drawn, and `pace` knows how long tasks take.
+//! `lend` says who gets which task and when, `late` cuts a tile that would be done last as it is
+//! lent, `handover` one that is being drawn, and `pace` knows how long tasks take.
 //!
 //! A frame waits, with nothing lost, while there is no worker. It refuses to know who is silent
 //! (`roster`), which copy of a result counts (`queue`) and where bricks are (`residency`).
 
-use crate::account::critical_path::Piece;
+use crate::account::critical_path::RenderedTile;
 use crate::account::ledger::{Ledger, Rendered, ms, place_in_time};
 use crate::account::spans;
 use crate::policy::macrotile::{self, Cut, LEAF, LEVELS};
-use crate::policy::prefetch::Outlook;
+use crate::policy::prefetch::TileOwnerGrid;
 use crate::policy::region::{Crew, Regions};
 use crate::policy::slab_borders;
 use crate::state::cluster::Cluster;
-use crate::state::leases::{End, PARTS, Queue, Verdict};
-use crate::state::residency::{Errand, Flight};
+use crate::state::residency::{ResidencyAction, Transfer};
+use crate::state::task_queue::{End, NAMES_PER_TILE, TaskQueue, Verdict};
 use crate::state::worker_map::WorkerMap;
 use crate::{Action, Clock, FrameJob, Micros, Span};
 use slabcast_common::ids::{Epoch, TaskId, WorkerId};
@@ -43,7 +44,7 @@ use slabcast_common::view::Projected;
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::dispatch::pace::Pace;
-use crate::dispatch::steal::{Drawn, Family};
+use crate::dispatch::steal::{Drawn, SplitGroup};
 
 /// Whether a pixel with accumulated opacity `a` is shut for good.
 ///
@@ -54,8 +55,9 @@ pub fn is_shut(a: f32, eps: f64) -> bool {
     eps > 0.0 && (1.0f32 - a) < eps as f32
 }
 
-/// Finished tiles that leave for the picture together: what is left when the last one has come is laid in 20 us at most, where all of a
-/// picture of 1536x1536 take 0.6 ms (docs/scaling.md). Each time a finisher is woken, so that it is not each tile.
+/// Finished tiles that leave for the picture together: what is left when the last one has come is
+/// laid in 20 us at most, where all of a picture of 1536x1536 take 0.6 ms (docs/scaling.md). Each
+/// time a finisher is woken, so that it is not each tile.
 const LAID_TOGETHER: usize = 16;
 
 /// A lease that a worker has and has not answered; perhaps dead.
@@ -74,7 +76,7 @@ pub(crate) struct Slab {
     pub(crate) sheets: SheetRange,
     pub(crate) began: Micros,
     pub(crate) cut: Cut,
-    pub(crate) queue: Queue,
+    pub(crate) queue: TaskQueue,
     /// Places of the needed bricks, ascending, and their rectangles.
     pub(crate) needed: Vec<u32>,
     pub(crate) rects: Vec<Rect>,
@@ -91,14 +93,15 @@ pub(crate) struct Slab {
     /// End of each render thread's last task; not of regions, which have no barrier.
     pub(crate) dry: BTreeMap<(WorkerId, u32), Micros>,
     /// Tiles that counted.
-    pub(crate) pieces: Vec<Piece>,
+    pub(crate) pieces: Vec<RenderedTile>,
     /// Names that its tasks may have.
     pub(crate) names: u64,
     /// Regions of which their worker was asked for a piece, by their places.
     pub(crate) handing: BTreeMap<u32, (WorkerId, Micros)>,
-    /// The tile that each piece is of which was given away, and such tiles whose tasks are not all drawn.
+    /// The tile that each piece is of which was given away, and such tiles whose tasks are not all
+    /// drawn.
     pub(crate) roots: BTreeMap<u32, u32>,
-    pub(crate) families: BTreeMap<u32, Family>,
+    pub(crate) split_groups: BTreeMap<u32, SplitGroup>,
 }
 
 impl Slab {
@@ -137,12 +140,14 @@ pub(crate) struct Frame {
     pub(crate) outlived: Option<Micros>,
     /// When the next region may be taken from an owner that is silent, while a thread is idle.
     pub(crate) forborne: Option<Micros>,
-    /// When a region that takes longer than it was to is late enough to be cut, while a thread is idle.
+    /// When a region that takes longer than it was to is late enough to be cut, while a thread is
+    /// idle.
     pub(crate) pieces_at: Option<Micros>,
-    /// Parts of tiles that were cut late, and who is to have them: what they were drawn from goes along.
+    /// Parts of tiles that were cut late, and who is to have them: what they were drawn from goes
+    /// along.
     pub(crate) gained: Vec<(WorkerId, u32)>,
     /// Whose tiles lie where; of regions that several draw.
-    pub(crate) outlook: Option<Outlook>,
+    pub(crate) outlook: Option<TileOwnerGrid>,
     /// Where each block of bricks lies, until bricks are sent ahead.
     pub(crate) outlines: Option<Vec<Rect>>,
     pub(crate) needed_ever: Vec<bool>,
@@ -165,19 +170,19 @@ pub(crate) enum Step {
     Failed(String),
 }
 
-/// What the other frames in the making mean to one.
+/// What a step of one frame may do, given the other frames in transfer.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Turn {
-    /// No frame comes after it whose tasks could keep idle threads busy at its end.
-    pub(crate) last: bool,
-    /// Threads may take what is another worker's.
-    pub(crate) others: bool,
-    /// Only this worker's threads can have come free since the frame was asked last.
-    pub(crate) only: Option<WorkerId>,
+pub(crate) struct StepContext {
+    /// No later frame is in transfer or queued whose tasks could keep idle threads busy.
+    pub(crate) is_last_frame: bool,
+    /// Idle threads may take tasks that another worker owns.
+    pub(crate) may_steal: bool,
+    /// The only worker whose threads can have become free since the frame's last step; `None`: any.
+    pub(crate) freed_worker: Option<WorkerId>,
 }
 
-/// Whether a frame is rendered under the `region` schedule. `auto` is that, always: where nothing hides
-/// anything it needs as many bricks as the other and has no barriers.
+/// Whether a frame is rendered under the `region` schedule. `auto` is that, always: where nothing
+/// hides anything it needs as many bricks as the other and has no barriers.
 pub(crate) fn goes_by_region(job: &FrameJob) -> bool {
     job.work.schedule != Schedule::Slab
 }
@@ -202,7 +207,7 @@ impl Frame {
         cluster.residency.open(job.scene.bricks, &job.bricks, by_region);
         let mut ledger = Ledger::new(began);
         for (id, worker) in cluster.roster.iter() {
-            ledger.enrol(id, worker, began);
+            ledger.open_account(id, worker, began);
         }
         let mut frame = Frame {
             slabs,
@@ -239,11 +244,16 @@ impl Frame {
     }
 
     /// Goes as far as it can.
-    pub(crate) fn step(&mut self, cluster: &mut Cluster, turn: Turn, clock: &dyn Clock) -> Step {
+    pub(crate) fn step(
+        &mut self,
+        cluster: &mut Cluster,
+        context: StepContext,
+        clock: &dyn Clock,
+    ) -> Step {
         loop {
             match &self.slab {
                 Some(slab) if slab.queue.open() > 0 => {
-                    self.dispatch(cluster, turn, clock.now());
+                    self.dispatch(cluster, context, clock.now());
                     return Step::Waits;
                 }
                 Some(slab) => {
@@ -288,15 +298,15 @@ impl Frame {
         let (cut, regions, outlines) = Regions::cut(
             &self.job,
             (self.beside, self.alone),
-            (cluster.traffic.rate(), cluster.traffic.binds_alone()),
+            (cluster.link_use.rate(), cluster.link_use.binds_alone()),
             &cluster.roster,
-            &mut cluster.memory,
+            &mut cluster.history,
         );
         // Who draws alone has drawn all that was drawn.
-        let several = cluster.roster.staying().nth(1).is_some();
-        let ahead = several && cluster.traffic.has_room(self.alone);
+        let several = cluster.roster.active().nth(1).is_some();
+        let ahead = several && cluster.link_use.has_room(self.alone);
         let owner = |place| regions.owner(place);
-        self.outlook = ahead.then(|| Outlook::new(self.job.view.size, &cut, owner));
+        self.outlook = ahead.then(|| TileOwnerGrid::new(self.job.view.size, &cut, owner));
         self.outlines = ahead.then_some(outlines);
         self.put_on(cluster, began, cut, (Vec::new(), Vec::new()), Some(regions));
         self.ledger.cull_us += clock.now().saturating_sub(began);
@@ -307,30 +317,30 @@ impl Frame {
         self.outlines.is_some()
     }
 
-    /// Sends what was drawn from lately to those over whose tiles it lies now. Nobody waits for it: it comes after the
-    /// frame's first leases.
+    /// Sends what was drawn from lately to those over whose tiles it lies now. Nobody waits for it:
+    /// it comes after the frame's first leases.
     pub(crate) fn foresee(&mut self, cluster: &mut Cluster, now: Micros) {
         let set = self.job.scene.bricks;
         let outlines = self.outlines.take().filter(|_| self.slab.is_some());
         let (Some(outlines), Some(outlook)) = (outlines, &self.outlook) else { return };
-        let shelves = cluster.residency.shelves(set, self.alone);
-        let (Some(shelves), Some(blocks)) = (shelves, cluster.memory.blocks_of(set)) else {
+        let presence = cluster.residency.presence(set, self.alone);
+        let (Some(presence), Some(blocks)) = (presence, cluster.history.blocks_of(set)) else {
             return;
         };
-        let lacked = outlook.lacked(&shelves, (blocks, &outlines), outline(&self.job));
-        for id in cluster.residency.owe_all(set, lacked) {
+        let lacked = outlook.lacked(&presence, (blocks, &outlines), outline(&self.job));
+        for id in cluster.residency.queue_prefetch(set, lacked) {
             carry(cluster, Some(&mut self.ledger), id, now);
         }
     }
 
-    /// What was drawn from for the first time for long goes to those over whose tiles of this frame it lies, when they
-    /// are told something anyway.
+    /// What was drawn from for the first time for long goes to those over whose tiles of this frame
+    /// it lies, when they are told something anyway.
     pub(crate) fn foresee_fresh(&self, cluster: &mut Cluster, fresh: &[u32]) {
         let set = self.job.scene.bricks;
         let Some(outlook) = self.outlook.as_ref().filter(|_| self.slab.is_some()) else { return };
-        let Some(shelves) = cluster.residency.shelves(set, self.alone) else { return };
-        let lacked = outlook.lacked_of(&shelves, fresh, outline(&self.job));
-        cluster.residency.owe_all(set, lacked);
+        let Some(presence) = cluster.residency.presence(set, self.alone) else { return };
+        let lacked = outlook.lacked_among(&presence, fresh, outline(&self.job));
+        cluster.residency.queue_prefetch(set, lacked);
     }
 
     /// Culls bricks, cuts the slab into macrotiles and sorts them.
@@ -360,7 +370,7 @@ impl Frame {
         } else {
             macrotile::cut(size, &rects, &self.shut, cull, wanted, forced)
         };
-        cluster.residency.round(&needed);
+        cluster.residency.begin_slab(&needed);
         self.put_on(cluster, began, cut, (needed, rects), None);
         self.ledger.cull_us += clock.now().saturating_sub(began);
     }
@@ -377,9 +387,9 @@ impl Frame {
         let mut order: Vec<(u32, u32)> =
             needed.iter().zip(&rects).filter_map(|(&i, r)| Some((cut.first_in(r)?, i))).collect();
         order.sort_unstable();
-        let queue = Queue::new(TaskId(cluster.next_task), &cut.tiles);
+        let queue = TaskQueue::new(TaskId(cluster.next_task), &cut.tiles);
         // Of such that may be cut, in parts and then in pieces.
-        let names = if self.alone { 2 * PARTS as u64 } else { 1 };
+        let names = if self.alone { 2 * NAMES_PER_TILE as u64 } else { 1 };
         let names = names * cut.tiles.len() as u64;
         cluster.next_task += names;
         self.slab = Some(Slab {
@@ -399,7 +409,7 @@ impl Frame {
             names,
             handing: BTreeMap::new(),
             roots: BTreeMap::new(),
-            families: BTreeMap::new(),
+            split_groups: BTreeMap::new(),
         });
     }
 
@@ -412,7 +422,7 @@ impl Frame {
         }
         // What was given away of a tile is told as the tile's.
         let whole = slab.whole_tiles();
-        let tile = |(task, place): (&crate::state::leases::Task, u32)| {
+        let tile = |(task, place): (&crate::state::task_queue::Task, u32)| {
             let (worker, us) = match &task.end {
                 End::Done { worker, render_us } => (worker.to_string(), *render_us),
                 End::Open | End::Poisoned | End::Cut => (String::new(), 0),
@@ -431,7 +441,7 @@ impl Frame {
         let mut waited = 0;
         // Regions have no barrier: threads go on with the next frame.
         if !slab.queue.tasks.is_empty() && slab.regions.is_none() {
-            for (id, worker) in cluster.roster.staying() {
+            for (id, worker) in cluster.roster.active() {
                 let mut busy = 0;
                 for (_, end) in slab.dry.range((id, 0)..=(id, u32::MAX)) {
                     busy += 1;
@@ -441,7 +451,7 @@ impl Frame {
                 waited += idle * now.saturating_sub(slab.began.max(worker.since));
             }
         }
-        self.ledger.phase(&slab.pieces, slab.began);
+        self.ledger.end_phase(&slab.pieces, slab.began);
         self.ledger.retries += slab.queue.retries;
         let tasks = slab.queue.tasks.iter().zip(0..);
         let told = tasks.filter(|(t, at)| t.end != End::Cut && !slab.is_told_elsewhere(*at));
@@ -487,7 +497,7 @@ impl Frame {
         if !lent.bricks.is_empty() {
             cluster.residency.unpin(worker, &lent.bricks);
         }
-        cluster.roster.ends(worker, 1);
+        cluster.roster.end_leases(worker, 1);
         Some(lent)
     }
 
@@ -560,28 +570,28 @@ impl Frame {
             }
         }
         self.any_result = true;
-        self.ledger.came(result.bytes);
+        self.ledger.add_result_bytes(result.bytes);
         self.ledger.composite_us += clock.now().saturating_sub(now);
 
         let who = cluster.roster.get(worker).expect("a worker whose result came is known");
         let r = place_in_time(who, &result.times, lease.sent, now);
         let lasted = now.saturating_sub(lease.sent.max(before));
         self.pace.note(slab.cut.tiles[place as usize].est, r.end - r.start, lasted);
-        self.ledger.rendered(worker, &r, &result.counters);
+        self.ledger.add_rendering(worker, &r, &result.counters);
         let thread = result.times.thread.min(who.threads - 1);
         if slab.regions.is_none() {
             let dry = slab.dry.entry((worker, thread)).or_insert(r.end);
             *dry = r.end.max(*dry);
         }
         let Rendered { start, end, .. } = r;
-        slab.pieces.push(Piece {
+        slab.pieces.push(RenderedTile {
             corner: [tile.x0, tile.y0],
             edge: slab.cut.edge_of(&tile),
             thread: (worker, thread),
-            lacked: result.times.ready_us.saturating_sub(result.times.received_us),
+            lacked_bricks_us: result.times.ready_us.saturating_sub(result.times.received_us),
             start,
             end,
-            came: now,
+            arrived: now,
         });
         let mut drawn_from = lent.map_or(0, |l| l.bricks.len());
         if let Some(cost) = cost {
@@ -589,21 +599,21 @@ impl Frame {
             for &i in &cost.touched {
                 note_needed(&mut self.needed_ever, &mut self.needed, &self.job, i as usize);
             }
-            self.ledger.stalled(worker, cost);
+            self.ledger.add_region_cost(worker, cost);
             let set = self.job.scene.bricks;
-            cluster.residency.touched(set, &cost.touched, &mut cluster.fresh);
+            cluster.residency.mark_used(set, &cost.touched, &mut cluster.fresh);
         }
         slab.handing.remove(&place);
         let touched = cost.map_or(&[][..], |cost| &cost.touched[..]);
         let drawn = slab.drawn(place, end - start, touched);
         if let Some(regions) = &slab.regions {
             let mut learn = |place, tile: &Rect, owner, us, touched: &[u32]| {
-                cluster.memory.learn(regions, (place, tile), owner, us, touched);
+                cluster.history.learn(regions, (place, tile), owner, us, touched);
             };
             match &drawn {
-                Drawn::Whole(root, family) => {
-                    let (us, touched) = family.cost();
-                    learn(*root, &family.tile, family.owner, us, touched);
+                Drawn::Whole(root, group) => {
+                    let (us, touched) = group.cost();
+                    learn(*root, &group.tile, group.owner, us, touched);
                 }
                 Drawn::Itself if cost.is_some() => {
                     learn(place, &tile, worker, end - start, touched);
@@ -702,12 +712,12 @@ impl Frame {
     /// A worker came.
     pub(crate) fn joined(&mut self, cluster: &Cluster, id: WorkerId, now: Micros) {
         if let Some(worker) = cluster.roster.get(id) {
-            self.ledger.enrol(id, worker, now);
+            self.ledger.open_account(id, worker, now);
         }
     }
 
-    /// Leases of this slab that a worker has, in the order in which it got them, and how many
-    /// of them it is probably running.
+    /// Leases of this slab that a worker has, in the order in which it got them, and how many of
+    /// them it is probably running.
     fn probably(&self, id: WorkerId, threads: u32) -> (Vec<(u32, Epoch)>, usize) {
         let Some(slab) = &self.slab else { return (Vec::new(), 0) };
         let mut running = 0;
@@ -726,12 +736,12 @@ impl Frame {
         let (leases, running) = self.probably(id, threads);
         if let Some(slab) = &mut self.slab {
             let not_begun: Vec<_> = leases[running..].iter().map(|l| l.0).collect();
-            slab.queue.pass_on(&not_begun);
+            slab.queue.share_queued(&not_begun);
         }
     }
 
-    /// A worker is gone. `blame` says whether a task may have killed it; as many as it had `threads`
-    /// for were probably running. The caller has not taken its bricks off the books yet.
+    /// A worker is gone. `blame` says whether a task may have killed it; as many as it had
+    /// `threads` for were probably running. The caller has not taken its bricks off the books yet.
     pub(crate) fn lost(
         &mut self,
         cluster: &mut Cluster,
@@ -745,10 +755,10 @@ impl Frame {
         let (leases, running) = self.probably(id, threads);
         self.lent.remove(id);
         self.told.remove(&id);
-        if let Some(flight) = cluster.residency.flight(id) {
-            self.ledger.landed(id, flight, now);
+        if let Some(transfer) = cluster.residency.transfer(id) {
+            self.ledger.transfer_ended(id, transfer, now);
         }
-        self.ledger.leave(id, now);
+        self.ledger.close_account(id, now);
         if let Some(slab) = &mut self.slab {
             slab.handing.retain(|_, (asked, _)| *asked != id);
             let running = if blame { running } else { 0 };
@@ -758,14 +768,14 @@ impl Frame {
     }
 
     /// Bricks to a worker were under way until now.
-    pub(crate) fn landed(&mut self, id: WorkerId, flight: Flight, now: Micros) {
-        self.ledger.landed(id, flight, now);
+    pub(crate) fn landed(&mut self, id: WorkerId, transfer: Transfer, now: Micros) {
+        self.ledger.transfer_ended(id, transfer, now);
     }
 
     /// Time went on.
     pub(crate) fn tick(&mut self, now: Micros) {
         if let Some(slab) = &mut self.slab {
-            slab.queue.overdue(now);
+            slab.queue.requeue_overdue(now);
         }
     }
 
@@ -787,14 +797,14 @@ impl Frame {
         let mut busy = BTreeSet::new();
         for (id, lent) in std::mem::take(&mut self.lent) {
             if cluster.roster.get(id).is_some() && !lent.is_empty() {
-                cluster.roster.ends(id, lent.len() as u64);
+                cluster.roster.end_leases(id, lent.len() as u64);
                 busy.insert(id);
             }
             for lent in lent.iter().filter(|l| !l.bricks.is_empty()) {
                 cluster.residency.unpin(id, &lent.bricks);
             }
         }
-        cluster.residency.rest();
+        cluster.residency.clear_wanted();
         let frame = self.job.frame;
         for id in std::mem::take(&mut self.told) {
             if busy.contains(&id) {
@@ -809,13 +819,13 @@ impl Frame {
     /// The finished picture with what it cost.
     pub(crate) fn finish(mut self, cluster: &mut Cluster, now: Micros) -> Action {
         let now = self.ended.unwrap_or(now);
-        for (id, flight) in cluster.residency.cut_flights(now) {
-            if flight.since < now {
-                self.ledger.landed(id, flight, now);
+        for (id, transfer) in cluster.residency.split_transfers(now) {
+            if transfer.since < now {
+                self.ledger.transfer_ended(id, transfer, now);
             }
         }
         for (id, _) in cluster.roster.iter() {
-            self.ledger.holds(id, cluster.residency.held_of(id, self.job.scene.bricks));
+            self.ledger.set_held(id, cluster.residency.held_of_set(id, self.job.scene.bricks));
         }
         let mut bricks =
             BrickStats { relevant: self.job.bricks.len() as u64, ..BrickStats::default() };
@@ -838,18 +848,18 @@ pub(crate) fn carry(
     now: Micros,
 ) {
     let roster = &mut cluster.roster;
-    let mut grounded = cluster.residency.flight(id).is_none();
-    let errands = cluster.residency.flush(id, now, &mut || roster.ping(id, now));
-    for errand in errands {
-        match errand {
-            Errand::Drop { set, bricks, nonce } => {
+    let mut grounded = cluster.residency.transfer(id).is_none();
+    let actions = cluster.residency.flush(id, now, &mut || roster.ping(id, now));
+    for action in actions {
+        match action {
+            ResidencyAction::Drop { set, bricks, nonce } => {
                 cluster.send(id, ToWorker::DropBricks { set, bricks });
                 cluster.send(id, ToWorker::Ping { nonce });
             }
-            Errand::Send { set, bricks, bytes, over_budget } => {
-                cluster.traffic.leave(bytes, std::mem::take(&mut grounded), now);
+            ResidencyAction::Send { set, bricks, bytes, over_budget } => {
+                cluster.link_use.leave(bytes, std::mem::take(&mut grounded), now);
                 if let Some(ledger) = &mut ledger {
-                    ledger.sent(id, bricks.len() as u64, bytes);
+                    ledger.bricks_sent(id, bricks.len() as u64, bytes);
                 }
                 cluster.totals.over_budget += u64::from(over_budget);
                 cluster.out.push_back(Action::SendBricks { worker: id, set, bricks });

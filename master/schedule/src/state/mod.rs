@@ -1,9 +1,10 @@
-//! What the scheduler knows: frames in the making, leases, workers, and which worker holds which brick.
+//! What the scheduler knows: frames in the making, leases, workers, and which worker holds which
+//! brick.
 
 pub(crate) mod cluster;
 pub(crate) mod frame;
-pub(crate) mod leases;
 pub(crate) mod residency;
+pub(crate) mod task_queue;
 pub(crate) mod tile_map;
 pub(crate) mod worker_map;
 pub(crate) mod workers;

@@ -1,16 +1,17 @@
-//! Something about each of some workers, in the order of their ids.
+//! A map from worker ids, iterated in the order of the ids.
 //!
-//! The scheduler asks ten times for each message who a worker is and what it has. Ids are given out one after the other, so a
-//! worker mostly stands where its id says, and is found by one look there; if some before it are gone, by halving. With 64 workers
-//! a quarter of all that the scheduler does was looking up workers and tiles ([`tiled`](crate::state::tile_map)) in trees (docs/scaling.md).
+//! The scheduler looks workers up ten times for each message. Ids are handed out in sequence, so a
+//! worker is mostly found at the index that its id says, and by binary search if some before it are
+//! gone. In trees, looking up workers and tiles ([`tile_map`](crate::state::tile_map)) was a
+//! quarter of all that the scheduler did for 64 workers.
 
 use slabcast_common::ids::WorkerId;
 
-/// A map from workers that is gone through in the order of their ids.
+/// A map from [`WorkerId`], ordered by id.
 #[derive(Clone, Debug)]
 pub(crate) struct WorkerMap<T> {
     ids: Vec<WorkerId>,
-    /// Each one's, at its place.
+    /// Values, at the indices of their ids.
     values: Vec<T>,
 }
 
@@ -21,7 +22,7 @@ impl<T> Default for WorkerMap<T> {
 }
 
 impl<T> WorkerMap<T> {
-    /// Where a worker is, or would be.
+    /// Returns the index of a worker, or where it would be inserted.
     fn place(&self, id: WorkerId) -> Result<usize, usize> {
         let Some(first) = self.ids.first() else { return Err(0) };
         let guess = usize::try_from(id.0.wrapping_sub(first.0)).unwrap_or(usize::MAX);
@@ -40,7 +41,7 @@ impl<T> WorkerMap<T> {
         Some(&mut self.values[place])
     }
 
-    /// Puts a worker's value down. The one before, if there is any.
+    /// Inserts a value and returns the one before.
     pub(crate) fn insert(&mut self, id: WorkerId, value: T) -> Option<T> {
         match self.place(id) {
             Ok(place) => Some(std::mem::replace(&mut self.values[place], value)),
@@ -58,7 +59,7 @@ impl<T> WorkerMap<T> {
         Some(self.values.remove(place))
     }
 
-    /// A worker's value, made now if it had none.
+    /// Returns the worker's value; inserts `make()` first if there is none.
     pub(crate) fn or_insert_with(&mut self, id: WorkerId, make: impl FnOnce() -> T) -> &mut T {
         let place = self.place(id).unwrap_or_else(|place| {
             self.ids.insert(place, id);
@@ -127,11 +128,11 @@ impl<T> IntoIterator for WorkerMap<T> {
 
 impl<T> FromIterator<(WorkerId, T)> for WorkerMap<T> {
     fn from_iter<I: IntoIterator<Item = (WorkerId, T)>>(all: I) -> Self {
-        let mut crowd = WorkerMap::default();
+        let mut map = WorkerMap::default();
         for (id, value) in all {
-            crowd.insert(id, value);
+            map.insert(id, value);
         }
-        crowd
+        map
     }
 }
 
@@ -148,20 +149,20 @@ mod tests {
             base in prop::sample::select(vec![0u64, 1, 1000, u64::MAX - 40]),
             deeds in prop::collection::vec((0u64..40, 0u8..4, any::<u16>()), 0..200),
         ) {
-            let (mut crowd, mut tree) = (WorkerMap::default(), BTreeMap::new());
+            let (mut map, mut tree) = (WorkerMap::default(), BTreeMap::new());
             for (id, deed, value) in deeds {
                 let id = WorkerId(base + id);
                 match deed {
-                    0 => prop_assert_eq!(crowd.insert(id, value), tree.insert(id, value)),
-                    1 => prop_assert_eq!(crowd.remove(id), tree.remove(&id)),
-                    2 => *crowd.or_default(id) = *tree.entry(id).or_default(),
-                    _ => prop_assert_eq!(crowd.get_mut(id), tree.get_mut(&id)),
+                    0 => prop_assert_eq!(map.insert(id, value), tree.insert(id, value)),
+                    1 => prop_assert_eq!(map.remove(id), tree.remove(&id)),
+                    2 => *map.or_default(id) = *tree.entry(id).or_default(),
+                    _ => prop_assert_eq!(map.get_mut(id), tree.get_mut(&id)),
                 }
-                prop_assert_eq!(crowd.get(id), tree.get(&id));
-                prop_assert_eq!((crowd.len(), crowd.is_empty()), (tree.len(), tree.is_empty()));
+                prop_assert_eq!(map.get(id), tree.get(&id));
+                prop_assert_eq!((map.len(), map.is_empty()), (tree.len(), tree.is_empty()));
             }
-            prop_assert!(crowd.iter().eq(tree.iter().map(|(&id, v)| (id, v))));
-            prop_assert!(crowd.into_iter().eq(tree));
+            prop_assert!(map.iter().eq(tree.iter().map(|(&id, v)| (id, v))));
+            prop_assert!(map.into_iter().eq(tree));
         }
     }
 }

@@ -1,19 +1,18 @@
-//! The workers: who is here, who is silent, whose clock shows what.
+//! The workers: who is connected, who is silent, whose clock shows what.
 //!
 //! Every deadline of the crate is in the table below.
 //!
-//! | Deadline         | Set when                 | After                   | Then                            |
-//! |------------------|--------------------------|-------------------------|---------------------------------|
-//! | next ping        | joined, pinged           | 0, `heartbeat`          | ping again                      |
-//! | silence          | anything heard           | `silence`               | the worker is lost              |
-//! | lease (`queue`)  | task leased              | `lease` * 2^attempt     | another worker gets it too      |
-//! | outlived (`queue`) | task leased            | twice its estimate      | another gets it, if one is idle |
+//! | Deadline | Set when | After | Then |
+//! |---|---|---|---|
+//! | next ping | joined, pinged | 0, `heartbeat` | ping again |
+//! | silence | anything heard | `silence` | the worker is lost |
+//! | lease (`task_queue`) | task leased | `lease` * 2^attempt | another worker gets it too |
+//! | speculation (`speculate`) | task leased | twice its estimate | an idle worker gets a copy |
 //!
-//! **Silence is judged on a clock that was watched.** If the driver itself did not run for a
-//! while (the process was stopped, the machine slept), every worker looks silent while its
-//! messages wait in a socket. So when the time between two events is longer than two
-//! heartbeats, which can't happen to a driver that keeps `next_deadline`, the excess is added
-//! to everybody's account.
+//! **Silence is judged on a clock that was watched.** If the driver itself did not run for a while
+//! (the process was stopped, the machine slept), every worker looks silent while its messages wait
+//! in a socket. So when the time between two events is longer than two heartbeats, which can't
+//! happen to a driver that keeps `next_deadline`, the excess is added to everybody's account.
 
 use crate::policy::active_set;
 use crate::state::worker_map::WorkerMap;
@@ -25,16 +24,16 @@ use std::cmp::Reverse;
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 
-/// How fast two machines' clocks may drift apart: 100 ppm, twice what quartz is sold with. A
-/// fresh sample of an offset replaces the best one when it is no less certain than the best
-/// one has become.
+/// Limit: drift between two machines' clocks, 100 ppm, twice what quartz is sold with. A fresh
+/// sample of an offset replaces the best one when it is no less certain than the best one has
+/// become.
 const DRIFT: f64 = 100e-6;
 
-/// A worker's threads are a stranger's claim; five times the largest machine sold.
+/// Limit: render threads of a worker, a peer's claim; five times the largest machine sold.
 const MAX_THREADS: u32 = 4096;
 
-/// Pings that a worker may owe a pong for while it lives on other messages. 1024 heartbeats are
-/// a quarter of an hour; one that owes more will not answer the oldest.
+/// Limit: pings without a pong while the worker lives on other messages. 1024 heartbeats are a
+/// quarter of an hour; a worker that owes more will not answer the oldest.
 const MAX_PINGS: usize = 1024;
 
 /// One worker.
@@ -42,24 +41,24 @@ const MAX_PINGS: usize = 1024;
 pub(crate) struct Worker {
     pub(crate) name: Arc<str>,
     pub(crate) threads: u32,
-    /// It runs on the master's machine.
+    /// Whether it runs on the master's host.
     pub(crate) is_local: bool,
     pub(crate) since: Micros,
-    /// It takes no more leases.
+    /// It drains and takes no more leases.
     pub(crate) leaving: bool,
-    /// It takes none as long as the others are enough (`reserve`).
-    reserve: bool,
-    /// Scenes it was sent.
+    /// It is outside the active set (`policy::active_set`) and takes no leases for now.
+    is_spare: bool,
+    /// Scenes that were sent to it.
     pub(crate) scenes: BTreeSet<SceneId>,
-    /// Leases of frames in the making that it has not answered.
+    /// Leases of frames in flight that it has not answered.
     pub(crate) leases: u64,
-    /// Frames that are over, which it will be told with the next message.
+    /// Ended frames that it is told about with the next message.
     pub(crate) over: Vec<FrameId>,
-    /// Sets whose directories it was sent and keeps, the last one last.
+    /// Sets whose directories it keeps, the latest last.
     directories: VecDeque<BrickSetKey>,
     heard: Micros,
     next_ping: Micros,
-    /// Pings without pong, oldest first.
+    /// Pings without a pong, oldest first: nonce and time.
     pings: VecDeque<(u64, Micros)>,
     offset: Option<Offset>,
 }
@@ -68,13 +67,13 @@ pub(crate) struct Worker {
 #[derive(Clone, Copy, Debug)]
 struct Offset {
     us: i64,
-    /// Half a round trip: how wrong it may be.
+    /// Half the round trip: the offset's uncertainty.
     half_rtt: Micros,
     at: Micros,
 }
 
 impl Worker {
-    /// Whether it has to be sent the directory of a set, which it then is.
+    /// Whether the worker lacks a set's directory. Notes that it is sent now.
     pub(crate) fn lacks_directory(&mut self, set: BrickSetKey) -> bool {
         if self.directories.contains(&set) {
             return false;
@@ -86,17 +85,17 @@ impl Worker {
         true
     }
 
-    /// Whether it takes leases.
-    pub(crate) fn draws(&self) -> bool {
-        !self.leaving && !self.reserve
+    /// Whether the worker is active: it takes leases.
+    pub(crate) fn is_active(&self) -> bool {
+        !self.leaving && !self.is_spare
     }
 
-    /// Whether one of its threads has no lease.
-    pub(crate) fn is_dry(&self) -> bool {
+    /// Whether a render thread has no lease.
+    pub(crate) fn has_idle_thread(&self) -> bool {
         self.leases < u64::from(self.threads)
     }
 
-    /// A time on the worker's clock on the master's; `None` before the first pong.
+    /// Maps a time on the worker's clock to the master's; `None` before the first pong.
     pub(crate) fn to_master(&self, worker_us: u64) -> Option<Micros> {
         let o = self.offset?;
         Some((worker_us as i128 - i128::from(o.us)).clamp(0, i128::from(Micros::MAX)) as Micros)
@@ -109,16 +108,17 @@ pub(crate) struct Roster {
     workers: WorkerMap<Worker>,
     next_nonce: u64,
     watched: Option<Micros>,
-    /// No ping is due before, and nobody silent for too long. What is heard moves that, which is found out
-    /// when the time has come: to look at all workers at each message is what would take longest of all.
+    /// No ping is due and no worker is silent too long before this time. Hearing a worker moves
+    /// that later, which is noticed when the time comes: looking at all workers at each message
+    /// would take longest of all.
     quiet_until: Micros,
-    /// Render threads of those that take leases.
+    /// Render threads of active workers.
     threads: u64,
-    /// Workers that have fewer leases than threads, those among them that take none.
-    dry: usize,
-    /// Grows when somebody comes, leaves, is lost, or goes into reserve or out of it.
+    /// Workers with an idle thread, inactive ones included.
+    idle: usize,
+    /// Counts changes of who is active.
     changes: u64,
-    /// How often workers are halved, so that the others are held in reserve.
+    /// How often the active set is halved.
     halved: u32,
 }
 
@@ -136,7 +136,7 @@ impl Roster {
             is_local,
             since: now,
             leaving: false,
-            reserve: false,
+            is_spare: false,
             scenes: BTreeSet::new(),
             leases: 0,
             over: Vec::new(),
@@ -148,7 +148,7 @@ impl Roster {
         };
         self.threads += u64::from(worker.threads);
         self.workers.insert(id, worker);
-        self.dry += 1;
+        self.idle += 1;
         self.changes += 1;
         self.quiet_until = self.quiet_until.min(now);
         self.choose();
@@ -156,14 +156,14 @@ impl Roster {
 
     pub(crate) fn remove(&mut self, id: WorkerId) -> Option<Worker> {
         let worker = self.workers.remove(id)?;
-        self.dry -= usize::from(worker.is_dry());
-        self.threads -= if worker.draws() { u64::from(worker.threads) } else { 0 };
+        self.idle -= usize::from(worker.has_idle_thread());
+        self.threads -= if worker.is_active() { u64::from(worker.threads) } else { 0 };
         self.changes += 1;
         self.choose();
         Some(worker)
     }
 
-    /// Holds all in reserve but those that are left when workers were halved so often.
+    /// Halves the active set `often` times.
     pub(crate) fn halve(&mut self, often: u32) {
         if self.halved != often {
             self.halved = often;
@@ -171,18 +171,19 @@ impl Roster {
         }
     }
 
-    /// Whether a worker stays and is held in reserve.
+    /// Whether a worker stays connected outside the active set.
     pub(crate) fn has_in_reserve(&self, id: WorkerId) -> bool {
-        self.get(id).is_some_and(|w| !w.leaving && w.reserve)
+        self.get(id).is_some_and(|w| !w.leaving && w.is_spare)
     }
 
-    /// How many of those that stay are held in reserve.
+    /// Returns the number of workers outside the active set that are not leaving.
     pub(crate) fn in_reserve(&self) -> usize {
-        self.workers.values().filter(|w| !w.leaving && w.reserve).count()
+        self.workers.values().filter(|w| !w.leaving && w.is_spare).count()
     }
 
-    /// Whoever has most threads draws, since bricks are sent to each worker once; of equal ones every second, fourth, eighth
-    /// pair, so that what was two neighbours' becomes one's, and both crews (`region`) keep as many.
+    /// Chooses the active workers: those with most threads, since bricks are sent to each worker
+    /// once; of equal ones every second, fourth, eighth pair, so that what was two neighbours'
+    /// becomes one's.
     fn choose(&mut self) {
         if self.halved == 0 && self.in_reserve() == 0 {
             return;
@@ -194,50 +195,50 @@ impl Roster {
         let drawing = active_set::drawing(order.len(), self.halved);
         for (i, (Reverse(threads), _, id)) in order.into_iter().enumerate() {
             let w = self.workers.get_mut(id).expect("just listed");
-            let reserve = i >= drawing;
-            if std::mem::replace(&mut w.reserve, reserve) != reserve {
+            let is_spare = i >= drawing;
+            if std::mem::replace(&mut w.is_spare, is_spare) != is_spare {
                 let threads = u64::from(threads);
                 self.threads =
-                    if reserve { self.threads - threads } else { self.threads + threads };
+                    if is_spare { self.threads - threads } else { self.threads + threads };
                 self.changes += 1;
             }
         }
     }
 
-    /// A worker takes no more leases. Whether that is news.
+    /// Marks a worker as leaving. Returns whether it was not before.
     pub(crate) fn leaves(&mut self, id: WorkerId) -> bool {
         let Some(w) = self.workers.get_mut(id) else { return false };
         let news = !std::mem::replace(&mut w.leaving, true);
         if news {
-            self.threads -= if w.reserve { 0 } else { u64::from(w.threads) };
+            self.threads -= if w.is_spare { 0 } else { u64::from(w.threads) };
             self.changes += 1;
             self.choose();
         }
         news
     }
 
-    /// A worker has another lease.
-    pub(crate) fn lends(&mut self, id: WorkerId) {
+    /// Counts a lease.
+    pub(crate) fn add_lease(&mut self, id: WorkerId) {
         let Some(w) = self.workers.get_mut(id) else { return };
-        let before = w.is_dry();
+        let before = w.has_idle_thread();
         w.leases += 1;
-        self.dry -= usize::from(before && !w.is_dry());
+        self.idle -= usize::from(before && !w.has_idle_thread());
     }
 
-    /// A worker has so many leases less.
-    pub(crate) fn ends(&mut self, id: WorkerId, leases: u64) {
+    /// Counts `leases` as ended.
+    pub(crate) fn end_leases(&mut self, id: WorkerId, leases: u64) {
         let Some(w) = self.workers.get_mut(id) else { return };
-        let before = w.is_dry();
+        let before = w.has_idle_thread();
         w.leases -= leases;
-        self.dry += usize::from(!before && w.is_dry());
+        self.idle += usize::from(!before && w.has_idle_thread());
     }
 
-    /// Whether some thread has nothing to do, as far as is known; of workers that take no leases, too.
-    pub(crate) fn any_dry(&self) -> bool {
-        self.dry > 0
+    /// Whether any worker has an idle thread, inactive ones included.
+    pub(crate) fn any_idle_thread(&self) -> bool {
+        self.idle > 0
     }
 
-    /// Another number than before: who takes leases has changed.
+    /// Returns a number that changes whenever the set of active workers does.
     pub(crate) fn changes(&self) -> u64 {
         self.changes
     }
@@ -254,12 +255,12 @@ impl Roster {
         self.workers.iter()
     }
 
-    /// Those that take leases.
-    pub(crate) fn staying(&self) -> impl Iterator<Item = (WorkerId, &Worker)> {
-        self.iter().filter(|(_, w)| w.draws())
+    /// Returns the active workers, by id.
+    pub(crate) fn active(&self) -> impl Iterator<Item = (WorkerId, &Worker)> {
+        self.iter().filter(|(_, w)| w.is_active())
     }
 
-    /// Render threads of those that take leases.
+    /// Returns the number of render threads of active workers.
     pub(crate) fn threads(&self) -> u64 {
         self.threads
     }
@@ -268,14 +269,14 @@ impl Roster {
         self.workers.is_empty()
     }
 
-    /// Something came from the worker.
+    /// Notes that something was heard from a worker.
     pub(crate) fn heard(&mut self, id: WorkerId, now: Micros) {
         if let Some(w) = self.workers.get_mut(id) {
             w.heard = w.heard.max(now);
         }
     }
 
-    /// Time went on to `now`; see the head of this file.
+    /// Notes the time; see the head of this file.
     pub(crate) fn watch(&mut self, now: Micros, config: &Config) {
         if let Some(before) = self.watched {
             let gap = now.saturating_sub(before);
@@ -288,7 +289,7 @@ impl Roster {
         self.watched = Some(now);
     }
 
-    /// Workers that were silent too long.
+    /// Returns the workers that were silent for too long.
     pub(crate) fn silent(&self, now: Micros, config: &Config) -> Vec<WorkerId> {
         if now < self.quiet_until {
             return Vec::new();
@@ -297,7 +298,7 @@ impl Roster {
         self.iter().filter(|(_, w)| late(w)).map(|(id, _)| id).collect()
     }
 
-    /// A nonce for a ping that goes to the worker now.
+    /// Returns the nonce of a ping that is sent to a worker now.
     pub(crate) fn ping(&mut self, id: WorkerId, now: Micros) -> u64 {
         self.next_nonce += 1;
         if let Some(w) = self.workers.get_mut(id) {
@@ -309,7 +310,7 @@ impl Roster {
         self.next_nonce
     }
 
-    /// The pings that are due.
+    /// Returns the pings that are due: worker and nonce.
     pub(crate) fn beat(&mut self, now: Micros, config: &Config) -> Vec<(WorkerId, u64)> {
         if now < self.quiet_until {
             return Vec::new();
@@ -323,12 +324,12 @@ impl Roster {
                 (id, self.ping(id, now))
             })
             .collect();
-        let of = |w: &Worker| w.next_ping.min(w.heard.saturating_add(config.silence));
-        self.quiet_until = self.workers.values().map(of).min().unwrap_or(0);
+        let due = |w: &Worker| w.next_ping.min(w.heard.saturating_add(config.silence));
+        self.quiet_until = self.workers.values().map(due).min().unwrap_or(0);
         beaten
     }
 
-    /// A pong came. Whether its ping was ours and not answered before.
+    /// Takes a pong. Returns whether its ping was ours and not answered before.
     pub(crate) fn pong(&mut self, id: WorkerId, nonce: u64, clock_us: u64, now: Micros) -> bool {
         let Some(w) = self.workers.get_mut(id) else { return false };
         let Some(i) = w.pings.iter().position(|p| p.0 == nonce) else { return false };
@@ -346,7 +347,7 @@ impl Roster {
         true
     }
 
-    /// The next ping or silence, or a time before at which it is looked for.
+    /// Returns the next ping or silence, or an earlier time at which to look for them.
     pub(crate) fn next_deadline(&self) -> Option<Micros> {
         (!self.workers.is_empty()).then_some(self.quiet_until)
     }
@@ -361,7 +362,7 @@ mod tests {
     }
 
     #[test]
-    fn the_offset_comes_from_the_shortest_round_trip() {
+    fn clock_offset_comes_from_the_shortest_round_trip() {
         let mut r = Roster::default();
         let w = WorkerId(1);
         r.join(w, "a".into(), (1, false), 0);
@@ -380,9 +381,9 @@ mod tests {
     }
 
     #[test]
-    fn threads_are_those_of_who_stays() {
+    fn threads_are_those_of_active_workers() {
         let mut r = Roster::default();
-        let counted = |r: &Roster| r.staying().map(|(_, w)| u64::from(w.threads)).sum::<u64>();
+        let counted = |r: &Roster| r.active().map(|(_, w)| u64::from(w.threads)).sum::<u64>();
         for (id, threads) in [(1, 3), (2, 0), (3, u32::MAX)] {
             r.join(WorkerId(id), "a".into(), (threads, false), 0);
         }
@@ -396,12 +397,12 @@ mod tests {
     }
 
     #[test]
-    fn who_draws_is_the_largest_and_of_equals_every_second_pair() {
+    fn active_set_prefers_large_workers_then_every_second_pair() {
         let mut r = Roster::default();
         for id in 0..16 {
             r.join(WorkerId(id), "a".into(), (1, false), 0);
         }
-        let drawing = |r: &Roster| r.staying().map(|(id, _)| id.0).collect::<Vec<_>>();
+        let drawing = |r: &Roster| r.active().map(|(id, _)| id.0).collect::<Vec<_>>();
         let before = r.changes();
         r.halve(1);
         assert_eq!(drawing(&r), [0, 1, 4, 5, 8, 9, 12, 13]);
@@ -415,7 +416,7 @@ mod tests {
         assert!(!r.has_in_reserve(WorkerId(4)), "who leaves is nobody's reserve");
         r.join(WorkerId(20), "large".into(), (8, false), 0);
         assert!(drawing(&r).contains(&20), "it has the most threads: {:?}", drawing(&r));
-        let counted = r.staying().map(|(_, w)| u64::from(w.threads)).sum::<u64>();
+        let counted = r.active().map(|(_, w)| u64::from(w.threads)).sum::<u64>();
         assert_eq!(r.threads(), counted);
         r.halve(0);
         assert_eq!((drawing(&r).len(), r.in_reserve()), (15, 0));
@@ -423,7 +424,7 @@ mod tests {
     }
 
     #[test]
-    fn a_master_that_slept_blames_nobody() {
+    fn silence_is_not_blamed_on_workers_after_the_master_slept() {
         let mut r = Roster::default();
         let w = WorkerId(1);
         r.watch(0, &config());

@@ -1,19 +1,20 @@
-//! The task queue of one slab: largest first, and leases with attempt epochs.
+//! The task queue of one phase (a slab, or all regions of a frame): largest task first, and leases
+//! with attempt epochs.
 //!
-//! A task may be out on several leases: its worker was lost, or is late, or leaves. Each lease
-//! has an epoch of its own. The first result with a live epoch counts and ends all others; what
-//! comes after is counted and dropped (DESIGN.md section 3, Leases).
+//! A task may be out on several leases: its worker was lost, is late, or leaves. Each lease has its
+//! own epoch. The first result with a live epoch counts and ends all others; later ones are counted
+//! and dropped (DESIGN.md section 3, Leases).
 //!
-//! **Which task kills workers?** A lost worker tells nothing. Its first leases, as many as it
-//! has threads, were probably running, and each of them is a suspect. With several threads an
-//! innocent neighbour is blamed along with the culprit, and if both went on together they would
-//! be condemned together. So a suspect is never lent to a worker that has another, and when a
-//! worker is lost with a suspect on it, only those blamed most before are blamed again.
+//! **Which task kills workers?** A lost worker tells nothing. Its first leases, as many as it has
+//! threads, were probably running, and each of them is a suspect. With several threads an innocent
+//! neighbour is blamed along with the culprit, and if both went on together they would be condemned
+//! together. So a suspect is never lent to a worker that has another, and when a worker is lost
+//! with a suspect on it, only those blamed most before are blamed again.
 //!
-//! And a cluster may lose workers for reasons of its own (PROMISES.md R1 kills 7 of 8 in one
-//! frame): a tile that three of them happened to hold is innocent. A deadly tile is held by
-//! every worker that is lost. So each loss in the slab that a tile has an alibi for asks for
-//! one witness more against it, up to twice as many.
+//! A cluster may also lose workers for reasons of its own (PROMISES.md R1 kills 7 of 8 in one
+//! frame): a tile that three of them happened to hold is innocent. A deadly tile is held by every
+//! worker that is lost. So each loss that a tile has an alibi for asks for one more witness against
+//! it, up to twice as many.
 
 use crate::policy::macrotile::Macrotile;
 use crate::{Config, Micros};
@@ -22,55 +23,55 @@ use slabcast_common::message::Begun;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// A lease whose result would count.
+/// A live lease: its result would count.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Live {
+pub(crate) struct Lease {
     pub(crate) worker: WorkerId,
     pub(crate) epoch: Epoch,
     pub(crate) sent: Micros,
-    /// When another worker gets the task too; `None` once that has happened.
+    /// When another worker gets the task too; `None` once that happened.
     deadline: Option<Micros>,
 }
 
 /// How a task ended.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum End {
-    /// Not yet.
+    /// No result yet.
     Open,
-    /// Rendered, by whom, in what time.
+    /// Rendered.
     Done { worker: Arc<str>, render_us: Micros },
     /// Given up.
     Poisoned,
-    /// Its parts took its place before anybody had it.
+    /// Replaced by its parts before any worker was lent it.
     Cut,
 }
 
-/// One macrotile of the slab.
+/// One tile to render.
 #[derive(Clone, Debug)]
 pub(crate) struct Task {
     pub(crate) tile: Macrotile,
     pub(crate) end: End,
-    live: Vec<Live>,
+    leases: Vec<Lease>,
     attempts: u32,
-    /// Its place among those that wait, while it does.
+    /// Key in the queue's order while the task waits.
     queued: Option<i64>,
-    /// Lost workers that were probably running it.
+    /// Lost workers that were probably running it: id and name.
     pub(crate) blamed: Vec<(WorkerId, String)>,
-    /// Workers that said they could not, and why.
+    /// Workers that refused it: id, name and reason.
     pub(crate) failed: Vec<(WorkerId, String, String)>,
-    /// What is drawn of it already: a piece that somebody gave away.
+    /// State in which another worker gave the piece away; `None`: it starts from nothing.
     pub(crate) begun: Option<Arc<Begun>>,
 }
 
-/// Names, and places in the order, that a tile has for itself and for its parts.
-pub(crate) const PARTS: i64 = 5;
+/// Limit: task ids, and keys in the queue's order, reserved for a tile and its parts.
+pub(crate) const NAMES_PER_TILE: i64 = 5;
 
 impl Task {
     fn new(tile: Macrotile, order: i64) -> Task {
         Task {
             tile,
             end: End::Open,
-            live: Vec::new(),
+            leases: Vec::new(),
             attempts: 0,
             queued: Some(order),
             blamed: Vec::new(),
@@ -79,16 +80,16 @@ impl Task {
         }
     }
 
-    /// Whether it may be run twice: one worker has it, and nobody was lost with it.
-    pub(crate) fn may_double(&self) -> bool {
-        self.live.len() == 1
+    /// Whether a speculative copy may be made: one worker has it, none was lost with it.
+    pub(crate) fn may_speculate(&self) -> bool {
+        self.leases.len() == 1
             && self.queued.is_none()
             && !self.is_suspect()
             && self.failed.is_empty()
     }
 
-    /// Whether somebody had it before.
-    pub(crate) fn was_lent(&self) -> bool {
+    /// Whether any worker was lent it.
+    pub(crate) fn was_leased(&self) -> bool {
         self.attempts > 0
     }
 
@@ -97,42 +98,42 @@ impl Task {
     }
 }
 
-/// What a result is worth.
+/// Whether a result counts.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Verdict {
-    /// It counts: the task's place, and its lease.
-    Counts(u32, Live),
-    /// Late, or twice.
+    /// It counts: index of the task, and its lease.
+    Counts(u32, Lease),
+    /// Late or duplicate.
     Dead,
 }
 
-/// The tasks of one slab.
+/// The tasks of one phase.
 #[derive(Debug)]
-pub(crate) struct Queue {
+pub(crate) struct TaskQueue {
     first: TaskId,
     pub(crate) tasks: Vec<Task>,
-    /// Places of those that wait, the first one first.
+    /// Indices of waiting tasks, in the order in which they are lent.
     waiting: BTreeMap<i64, u32>,
-    /// The place of who is put in front of all next.
+    /// Key of the next task that is put in front of all.
     front: i64,
     deadlines: BTreeSet<(Micros, u32, Epoch)>,
     open: u32,
-    /// Tasks whose parts took their place.
+    /// Tasks replaced by their parts.
     cut: u32,
-    /// Workers lost while it was rendered, that a task may have killed.
+    /// Workers lost meanwhile that a task may have killed.
     losses: usize,
     /// Leases beyond the first of a task.
     pub(crate) retries: u64,
 }
 
-impl Queue {
-    /// A queue of these tiles in this order; the first is called `first`, and so on.
+impl TaskQueue {
+    /// Makes a queue of tiles in this order; their ids count up from `first`.
     pub(crate) fn new(first: TaskId, tiles: &[Macrotile]) -> Self {
-        let task = |(&tile, order): (&Macrotile, i64)| Task::new(tile, order * PARTS);
-        Queue {
+        let task = |(&tile, order): (&Macrotile, i64)| Task::new(tile, order * NAMES_PER_TILE);
+        TaskQueue {
             first,
             tasks: tiles.iter().zip(0..).map(task).collect(),
-            waiting: (0..).step_by(PARTS as usize).zip(0..tiles.len() as u32).collect(),
+            waiting: (0..).step_by(NAMES_PER_TILE as usize).zip(0..tiles.len() as u32).collect(),
             front: -1,
             deadlines: BTreeSet::new(),
             open: tiles.len() as u32,
@@ -142,21 +143,24 @@ impl Queue {
         }
     }
 
-    /// Tasks without an end.
+    /// Returns the number of tasks without an end.
     pub(crate) fn open(&self) -> u32 {
         self.open
     }
 
-    /// Tasks that have, had or will have a result.
+    /// Returns the number of tasks that are not replaced by parts.
     pub(crate) fn all(&self) -> u32 {
         self.tasks.len() as u32 - self.cut
     }
 
-    /// Puts the parts of a waiting task that nobody had yet in its place, in their order. Places and names are those
-    /// behind all others; who makes the queue leaves room for [`PARTS`] names of each tile.
+    /// Replaces a waiting task that was never lent by its parts, in their order. The caller
+    /// reserves [`NAMES_PER_TILE`] ids for each tile.
     pub(crate) fn cut(&mut self, place: u32, parts: &[Macrotile]) {
         let task = &mut self.tasks[place as usize];
-        assert!(!task.was_lent() && parts.len() < PARTS as usize, "only whole tiles are cut");
+        assert!(
+            !task.was_leased() && parts.len() < NAMES_PER_TILE as usize,
+            "only whole tiles are cut"
+        );
         let order = task.queued.take().expect("a task is cut while it waits");
         task.end = End::Cut;
         self.waiting.remove(&order);
@@ -169,9 +173,8 @@ impl Queue {
         }
     }
 
-    /// Puts a piece of a tile in front of all that wait: its place, which is behind all others'. Who makes the queue leaves
-    /// room for its name.
-    pub(crate) fn add(&mut self, piece: Macrotile, begun: Arc<Begun>) -> u32 {
+    /// Queues a piece of a tile in front of all. Returns its index. The caller reserves its id.
+    pub(crate) fn add_piece(&mut self, piece: Macrotile, begun: Arc<Begun>) -> u32 {
         let place = self.tasks.len() as u32;
         let mut task = Task::new(piece, self.front);
         task.begun = Some(begun);
@@ -182,50 +185,49 @@ impl Queue {
         place
     }
 
-    /// Whether this lease of a task is the only one, and nobody else is to have it. Of one that took a worker with it, or
-    /// was refused, that is never said.
-    pub(crate) fn is_alone(&self, place: u32, worker: WorkerId, epoch: Epoch) -> bool {
+    /// Whether this is the task's only lease and no other worker is to get the task. False for
+    /// tasks that were refused or lost a worker.
+    pub(crate) fn is_only_lease(&self, place: u32, worker: WorkerId, epoch: Epoch) -> bool {
         let task = &self.tasks[place as usize];
-        task.may_double() && task.live.iter().all(|l| l.worker == worker && l.epoch == epoch)
+        task.may_speculate() && task.leases.iter().all(|l| l.worker == worker && l.epoch == epoch)
     }
 
-    /// A lease ends without a result that counts, through nobody's fault.
-    pub(crate) fn forsake(&mut self, place: u32, worker: WorkerId, epoch: Epoch) {
+    /// Ends a lease without a result, through no fault of its worker.
+    pub(crate) fn release(&mut self, place: u32, worker: WorkerId, epoch: Epoch) {
         self.end_lease(place, worker, epoch);
-        if self.tasks[place as usize].live.is_empty() {
+        if self.tasks[place as usize].leases.is_empty() {
             self.requeue(place);
         }
     }
 
-    /// Tasks waiting for a worker.
+    /// Returns the number of waiting tasks.
     pub(crate) fn waiting(&self) -> usize {
         self.waiting.len()
     }
 
-    /// Those that wait.
+    /// Returns the indices of waiting tasks, in order.
     pub(crate) fn all_waiting(&self) -> impl Iterator<Item = u32> {
         self.waiting.values().copied()
     }
 
-    /// Whether any of these waits.
-    pub(crate) fn any_waits(&self, places: &[u32]) -> bool {
+    /// Whether any of these tasks waits.
+    pub(crate) fn any_waiting(&self, places: &[u32]) -> bool {
         places.iter().any(|&place| self.tasks[place as usize].queued.is_some())
     }
 
-    /// A task's name.
+    /// Returns the id of the task at an index.
     pub(crate) fn id(&self, place: u32) -> TaskId {
         TaskId(self.first.0 + u64::from(place))
     }
 
-    /// A task's place.
+    /// Returns the index of a task id; `None` if it is not of this queue.
     pub(crate) fn place(&self, id: TaskId) -> Option<u32> {
         let place = id.0.checked_sub(self.first.0)?;
         (place < self.tasks.len() as u64).then_some(place as u32)
     }
 
-    /// The first waiting task among those of which `worker` may have any, if it `suits` it. `mine` are
-    /// the tasks of this slab that it has leases of; `others` says whether some other worker could have
-    /// it.
+    /// Returns the first waiting task with `among` and `suits` that the worker may have. `mine`:
+    /// tasks it has leases of. `others`: whether another worker could have the task.
     pub(crate) fn next_for(
         &self,
         worker: WorkerId,
@@ -238,7 +240,8 @@ impl Queue {
         self.waiting.values().copied().find(|&place| among(place) && fits(place) && suits(place))
     }
 
-    /// Whether a worker may have a task.
+    /// Returns a test for whether a worker may have a task: not one it has, not one it refused
+    /// unless nobody else could have it, and no second suspect.
     fn fits(
         &self,
         worker: WorkerId,
@@ -255,8 +258,8 @@ impl Queue {
         }
     }
 
-    /// The same among a few places, whether they wait or not: who has a list of its own need not go through
-    /// all that wait.
+    /// Returns the first of the waiting tasks among `places` that the worker may have. Faster than
+    /// [`Self::next_for`] for a worker with a list of its own.
     pub(crate) fn next_among(
         &self,
         worker: WorkerId,
@@ -270,7 +273,7 @@ impl Queue {
         may.min().map(|(_, place)| place)
     }
 
-    /// Lends a waiting task to a worker.
+    /// Lends a waiting task.
     pub(crate) fn lease(
         &mut self,
         place: u32,
@@ -281,51 +284,51 @@ impl Queue {
         let task = &mut self.tasks[place as usize];
         let order = task.queued.take().expect("only a waiting task is lent");
         self.waiting.remove(&order);
-        self.lend(place, worker, now, config)
+        self.add_lease(place, worker, now, config)
     }
 
-    /// Lends a task to a second worker while a first one has it.
-    pub(crate) fn lend_again(
+    /// Lends a task to a second worker while a first one has it: a speculative copy.
+    pub(crate) fn lease_again(
         &mut self,
         place: u32,
         worker: WorkerId,
         now: Micros,
         config: &Config,
     ) -> Epoch {
-        self.lend(place, worker, now, config)
+        self.add_lease(place, worker, now, config)
     }
 
-    fn lend(&mut self, place: u32, worker: WorkerId, now: Micros, config: &Config) -> Epoch {
+    fn add_lease(&mut self, place: u32, worker: WorkerId, now: Micros, config: &Config) -> Epoch {
         let task = &mut self.tasks[place as usize];
         let epoch = Epoch(task.attempts);
         self.retries += u64::from(task.attempts > 0);
         let patience = config.lease.saturating_mul(1 << task.attempts.min(20));
         let deadline = now.saturating_add(patience);
         task.attempts += 1;
-        task.live.push(Live { worker, epoch, sent: now, deadline: Some(deadline) });
+        task.leases.push(Lease { worker, epoch, sent: now, deadline: Some(deadline) });
         self.deadlines.insert((deadline, place, epoch));
         epoch
     }
 
-    /// What a result from `worker` is worth. Changes nothing.
+    /// Judges a result from `worker`. Changes nothing.
     pub(crate) fn judge(&self, id: TaskId, epoch: Epoch, worker: WorkerId) -> Verdict {
         let Some(place) = self.place(id) else { return Verdict::Dead };
-        let live = &self.tasks[place as usize].live;
-        match live.iter().find(|l| l.epoch == epoch && l.worker == worker) {
+        let leases = &self.tasks[place as usize].leases;
+        match leases.iter().find(|l| l.epoch == epoch && l.worker == worker) {
             Some(&lease) => Verdict::Counts(place, lease),
             None => Verdict::Dead,
         }
     }
 
-    /// A task ended: its leases die.
+    /// Ends a task and all its leases.
     pub(crate) fn finish(&mut self, place: u32, end: End) {
         let task = &mut self.tasks[place as usize];
         assert!(task.end == End::Open, "a task ends once");
         task.end = end;
         self.open -= 1;
-        for live in task.live.drain(..) {
-            if let Some(deadline) = live.deadline {
-                self.deadlines.remove(&(deadline, place, live.epoch));
+        for leases in task.leases.drain(..) {
+            if let Some(deadline) = leases.deadline {
+                self.deadlines.remove(&(deadline, place, leases.epoch));
             }
         }
         if let Some(order) = task.queued.take() {
@@ -333,18 +336,19 @@ impl Queue {
         }
     }
 
-    /// One lease ends without a result.
+    /// Ends one lease without a result.
     fn end_lease(&mut self, place: u32, worker: WorkerId, epoch: Epoch) {
         let task = &mut self.tasks[place as usize];
-        let Some(at) = task.live.iter().position(|l| l.worker == worker && l.epoch == epoch) else {
+        let Some(at) = task.leases.iter().position(|l| l.worker == worker && l.epoch == epoch)
+        else {
             return;
         };
-        if let Some(deadline) = task.live.remove(at).deadline {
+        if let Some(deadline) = task.leases.remove(at).deadline {
             self.deadlines.remove(&(deadline, place, epoch));
         }
     }
 
-    /// Puts a task in front, unless it waits already.
+    /// Puts a task in front of all, unless it waits already.
     fn requeue(&mut self, place: u32) {
         let task = &mut self.tasks[place as usize];
         if task.end == End::Open && task.queued.is_none() {
@@ -354,8 +358,8 @@ impl Queue {
         }
     }
 
-    /// A worker is lost with leases on these tasks, in the order in which it got them. Returns
-    /// the tasks that are given up for it. `running` of them are blamed, from the front.
+    /// Takes back the leases of a lost worker, given in the order in which it got them. The first
+    /// `running` of them are blamed. Returns the tasks that are given up for it.
     pub(crate) fn lose(
         &mut self,
         worker: WorkerId,
@@ -377,7 +381,7 @@ impl Queue {
         self.take_back(worker, leases, config)
     }
 
-    /// A worker can't do a task. Returns it if it is given up.
+    /// Takes back a task that a worker refused. Returns it if it is given up.
     pub(crate) fn fail(
         &mut self,
         place: u32,
@@ -391,9 +395,9 @@ impl Queue {
         self.take_back(worker, &[(place, epoch)], config)
     }
 
-    /// Ends leases and puts their tasks in front in their old order. A task that has another
-    /// live lease goes on with that one; one that has none and was blamed or refused often
-    /// enough is returned, to be given up.
+    /// Ends leases and puts their tasks in front in their old order. A task with another live lease
+    /// goes on with that one; one without, that was blamed or refused often enough, is returned to
+    /// be given up.
     fn take_back(
         &mut self,
         worker: WorkerId,
@@ -404,7 +408,7 @@ impl Queue {
         for &(place, epoch) in leases.iter().rev() {
             self.end_lease(place, worker, epoch);
             let task = &self.tasks[place as usize];
-            if task.end != End::Open || !task.live.is_empty() {
+            if task.end != End::Open || !task.leases.is_empty() {
                 continue;
             }
             let limit = config.poison_after.max(1) as usize;
@@ -418,28 +422,28 @@ impl Queue {
         given_up
     }
 
-    /// A worker that leaves has not begun these: others get them too.
-    pub(crate) fn pass_on(&mut self, places: &[u32]) {
+    /// Requeues tasks that a leaving worker has not begun; its leases stay live.
+    pub(crate) fn share_queued(&mut self, places: &[u32]) {
         for &place in places.iter().rev() {
             self.requeue(place);
         }
     }
 
-    /// Puts tasks whose lease is past its deadline in front, for another worker.
-    pub(crate) fn overdue(&mut self, now: Micros) {
+    /// Requeues tasks whose lease is past its deadline, for another worker.
+    pub(crate) fn requeue_overdue(&mut self, now: Micros) {
         while let Some(&(deadline, place, epoch)) = self.deadlines.first()
             && deadline <= now
         {
             self.deadlines.pop_first();
             let task = &mut self.tasks[place as usize];
-            for live in task.live.iter_mut().filter(|l| l.epoch == epoch) {
-                live.deadline = None;
+            for leases in task.leases.iter_mut().filter(|l| l.epoch == epoch) {
+                leases.deadline = None;
             }
             self.requeue(place);
         }
     }
 
-    /// The next lease deadline.
+    /// Returns the next lease deadline.
     pub(crate) fn next_deadline(&self) -> Option<Micros> {
         self.deadlines.first().map(|d| d.0)
     }
@@ -450,17 +454,17 @@ mod tests {
     use super::*;
     use slabcast_common::occlusion::Rect;
 
-    fn queue(n: u64) -> Queue {
+    fn queue(n: u64) -> TaskQueue {
         let tiles: Vec<_> =
             (0..n).map(|i| Macrotile { rect: Rect::new(0, 0, 16, 16), est: 100 - i }).collect();
-        Queue::new(TaskId(10), &tiles)
+        TaskQueue::new(TaskId(10), &tiles)
     }
 
-    fn next(q: &Queue, w: u64, mine: &[u32]) -> Option<u32> {
+    fn next(q: &TaskQueue, w: u64, mine: &[u32]) -> Option<u32> {
         q.next_for(WorkerId(w), mine, |_| true, |_| true, |_| true)
     }
 
-    fn take(q: &mut Queue, w: u64, mine: &[u32], now: Micros) -> (u32, Epoch) {
+    fn take(q: &mut TaskQueue, w: u64, mine: &[u32], now: Micros) -> (u32, Epoch) {
         let place = next(q, w, mine).expect("something waits");
         (place, q.lease(place, WorkerId(w), now, &Config::default()))
     }
@@ -470,7 +474,7 @@ mod tests {
     }
 
     #[test]
-    fn largest_first_and_returned_tasks_before_all() {
+    fn queue_lends_returned_tasks_first_then_the_largest() {
         let c = Config::default();
         let mut q = queue(4);
         assert_eq!(take(&mut q, 1, &[], 0), (0, Epoch(0)));
@@ -491,13 +495,13 @@ mod tests {
     }
 
     #[test]
-    fn a_list_of_ones_own_gives_what_going_through_all_that_wait_gives() {
+    fn next_among_agrees_with_a_search_of_all_waiting_tasks() {
         let c = Config::default();
         let mut q = queue(6);
-        let same = |q: &Queue, own: &[u32], mine: &[u32]| {
+        let same = |q: &TaskQueue, own: &[u32], mine: &[u32]| {
             let all = q.next_for(WorkerId(1), mine, |p| own.contains(&p), |_| true, |_| true);
             assert_eq!(q.next_among(WorkerId(1), mine, own, |_| true), all);
-            assert_eq!(q.any_waits(own), own.iter().any(|p| q.all_waiting().any(|w| w == *p)));
+            assert_eq!(q.any_waiting(own), own.iter().any(|p| q.all_waiting().any(|w| w == *p)));
             all
         };
         assert_eq!(same(&q, &[5, 2, 4], &[]), Some(2), "the first in the queue, not in the list");
@@ -507,7 +511,7 @@ mod tests {
         assert_eq!(same(&q, &[5, 2], &[2]), None);
         // What comes back is before all others, the last one first.
         q.lose(WorkerId(2), "two", &[(5, Epoch(0))], 0, &c);
-        q.pass_on(&[2]);
+        q.share_queued(&[2]);
         assert_eq!(q.all_waiting().collect::<Vec<_>>(), [2, 5, 0, 1, 3, 4]);
         assert_eq!(same(&q, &[4, 2, 5], &[2]), Some(5), "it has the first");
         q.finish(2, done());
@@ -515,12 +519,12 @@ mod tests {
     }
 
     #[test]
-    fn a_late_lease_stays_live_until_one_of_two_wins() {
+    fn lease_expires_and_stays_live_until_one_of_two_wins() {
         let c = Config::default();
         let mut q = queue(1);
         take(&mut q, 1, &[], 0);
         assert_eq!(q.next_deadline(), Some(c.lease));
-        q.overdue(c.lease);
+        q.requeue_overdue(c.lease);
         assert_eq!(next(&q, 1, &[0]), None, "another worker, not the same");
         assert_eq!(take(&mut q, 2, &[], c.lease), (0, Epoch(1)));
         assert_eq!(q.next_deadline(), Some(c.lease + 2 * c.lease), "doubled");
@@ -531,12 +535,12 @@ mod tests {
     }
 
     #[test]
-    fn what_a_leaving_worker_has_not_begun_goes_to_others_and_stays_live() {
+    fn leaving_worker_shares_tasks_it_has_not_begun() {
         let mut q = queue(4);
         for mine in [&[][..], &[0], &[0, 1]] {
             take(&mut q, 1, mine, 0);
         }
-        q.pass_on(&[1, 2]);
+        q.share_queued(&[1, 2]);
         assert_eq!(take(&mut q, 2, &[], 0), (1, Epoch(1)));
         assert!(matches!(q.judge(TaskId(11), Epoch(0), WorkerId(1)), Verdict::Counts(1, _)));
         // It had begun it after all.
@@ -545,7 +549,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_take_the_place_of_a_tile_that_nobody_had() {
+    fn parts_replace_a_tile_that_was_never_lent() {
         let c = Config::default();
         let mut q = queue(3);
         assert_eq!(take(&mut q, 1, &[], 0), (0, Epoch(0)));
@@ -566,7 +570,7 @@ mod tests {
     }
 
     #[test]
-    fn a_task_that_takes_three_workers_is_given_up() {
+    fn task_that_three_workers_die_with_is_given_up() {
         let c = Config::default();
         let mut q = queue(2);
         for w in 1..=3 {
@@ -578,7 +582,7 @@ mod tests {
     }
 
     #[test]
-    fn an_innocent_neighbour_is_not_condemned_with_the_culprit() {
+    fn poison_blame_spares_the_neighbour_of_a_deadly_task() {
         // Workers of two threads; task 0 kills whoever runs it, tasks 1 and up are harmless.
         let c = Config::default();
         let mut q = queue(6);
@@ -595,7 +599,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cluster_that_loses_workers_anyway_needs_more_witnesses() {
+    fn poison_needs_more_losses_where_workers_die_anyway() {
         let c = Config::default();
         let mut q = queue(3);
         // A loss that task 0 has nothing to do with: it is with worker 1 meanwhile.
@@ -615,7 +619,7 @@ mod tests {
     }
 
     #[test]
-    fn three_refusals_end_a_task() {
+    fn task_refused_three_times_is_given_up() {
         let c = Config::default();
         let mut q = queue(1);
         for w in [1, 1, 2] {

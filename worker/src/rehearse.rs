@@ -1,14 +1,14 @@
-//! A worker that holds tiles instead of drawing them.
+//! A worker that holds tiles for their recorded time instead of drawing them.
 //!
 //! Everything else is real: link, hello, bricks, leases, results of the right size. So processes on
 //! one machine rehearse a cluster of many: a core draws one tile at a time, but any number of
-//! threads can wait. What a tile takes is in a [`Trace`]; its pixels are those of
-//! [`slabcast_trace::filled`], which shut what the real ones would have shut. Only a master
-//! that was started for it lets such a worker in, and it marks its pictures.
+//! threads can wait. Times come from a [`Trace`]; pixels are placeholders of the recorded size,
+//! shut where the real ones were shut. Only a master that was started for rehearsals admits such a
+//! worker, and it marks its pictures.
 //!
-//! **Time is held on the threads' own account.** The system wakes a sleeping thread some 60 us too
+//! **A late wake-up never delays the next tile.** The system wakes a sleeping thread some 60 us too
 //! late; over a thousand tiles that is a frame. So a thread's next tile begins when the one before
-//! should have ended, or when it came, and only a result is late, never the work behind it.
+//! should have ended, or when it arrived. Only the result is late.
 
 use crate::brick_table::Shelf;
 use crate::pool::{Came, Drawn, FrameSlot, Going, Ready, locked};
@@ -18,14 +18,17 @@ use slabcast_common::occlusion::Rect;
 use slabcast_common::region::parts;
 use slabcast_common::slab::SheetRange;
 use slabcast_render::region::BrickSupply;
-use slabcast_trace::{Course, Trace, filled, filled_through, finished_through, view_sha256};
+use slabcast_trace::{
+    FrameTrace, RegionProgress, Trace, placeholder_finished, placeholder_slab, placeholder_sums,
+    view_sha256,
+};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// What tiles take, ready to be looked up.
+/// A trace, ready to be looked up by a worker's threads.
 pub struct Rehearsal {
     trace: Trace,
-    /// For each frame and slab its shut pixels.
+    /// Shut pixels by frame and slab.
     shut: Vec<Vec<Arc<Vec<bool>>>>,
 }
 
@@ -36,42 +39,39 @@ impl std::fmt::Debug for Rehearsal {
 }
 
 impl Rehearsal {
-    /// Makes a trace ready: a byte for each pixel of each slab of each frame.
+    /// Prepares a trace. Takes a byte of memory for each pixel of each slab of each frame.
     pub fn new(trace: Trace) -> Self {
         let size = trace.about.size;
-        let slabs = |f: &slabcast_trace::FrameTrace| {
-            f.slabs.iter().map(|s| Arc::new(s.shut(size))).collect()
-        };
+        let slabs = |f: &FrameTrace| f.slabs.iter().map(|s| Arc::new(s.shut(size))).collect();
         Rehearsal { shut: trace.frames.iter().map(slabs).collect(), trace }
     }
 
-    /// The place of a frame in the trace.
-    fn find(&self, frame: &FrameSlot) -> Option<usize> {
-        let name = view_sha256(&frame.scene.spec, &frame.view).to_string();
-        self.trace.frames.iter().position(|f| f.view == name)
+    /// The index of a frame in the trace, looked up once a frame.
+    fn index(&self, frame: &FrameSlot) -> Option<usize> {
+        *frame.rehearsed.get_or_init(|| {
+            let name = view_sha256(&frame.scene.spec, &frame.view).to_string();
+            self.trace.frames.iter().position(|f| f.view == name)
+        })
     }
 
-    /// When a thread that is free from `free` on begins and ends a task, and its pixels; an error if
-    /// the trace does not know it.
+    /// Looks up when a thread that is free from `free` on begins and ends a slab's tile, and its
+    /// pixels.
+    ///
+    /// # Errors
+    /// A sentence if the trace has no such tile.
     pub(crate) fn task(&self, task: &Ready, free: Instant) -> Result<(Held, TilePixels), String> {
         let Ready { lease, frame, .. } = task;
+        let SheetRange { first, end } = lease.slab;
         let unknown = || {
+            let Rect { x0, y0, x1, y1 } = lease.tile;
             format!(
-                "the trace that is rehearsed has no tile ({},{}) to ({},{}) of sheets {} to {} of \
-                 this view",
-                lease.tile.x0,
-                lease.tile.y0,
-                lease.tile.x1,
-                lease.tile.y1,
-                lease.slab.first,
-                lease.slab.end
+                "the trace that is rehearsed has no tile ({x0},{y0}) to ({x1},{y1}) of sheets \
+                 {first} to {end} of this view"
             )
         };
-        let at = *frame.rehearsed.get_or_init(|| self.find(frame));
-        let at = at.ok_or_else(unknown)?;
-        let traced = &self.trace.frames[at];
+        let index = self.index(frame).ok_or_else(unknown)?;
+        let traced = &self.trace.frames[index];
         let size = self.trace.about.size;
-        let SheetRange { first, end } = lease.slab;
         let slab = traced.slabs.iter().position(|s| s.first == first && s.end == end);
         let slab = slab.ok_or_else(unknown)?;
         let tile = traced.slabs[slab].tile(&lease.tile, size).ok_or_else(unknown)?;
@@ -80,24 +80,28 @@ impl Rehearsal {
         let setup = Duration::from_nanos(traced.setup_ns);
         let made = *frame.made.get_or_init(|| start + setup);
         let end = made.max(start) + Duration::from_nanos(tile.ns);
-        let pixels = filled(&lease.tile, &self.shut[at][slab], size, tile.result_bytes);
-        Ok((Held { start, end }, pixels))
+        let shut = &self.shut[index][slab];
+        Ok((Held { start, end }, placeholder_slab(&lease.tile, shut, size, tile.result_bytes)))
     }
 
-    /// What a region will need by the frame before it, if that was held here: places of bricks that are not here.
+    /// Places of the bricks that a worker would prefetch for a region, if it held the region's
+    /// parts in the frame before; bricks that are here are left out.
     pub(crate) fn expected(&self, frame: &FrameSlot, shelf: &Shelf, tile: Rect) -> Vec<u32> {
-        let at = *frame.rehearsed.get_or_init(|| self.find(frame));
-        let known = at.and_then(|at| self.trace.frames[at].region(&tile, self.trace.about.size));
+        let index = self.index(frame);
+        let known = index.and_then(|i| self.trace.frames[i].region(&tile, self.trace.about.size));
         let held = locked(&frame.scene.parts);
         let (Some(known), true) = (known, parts(tile).all(|p| held.contains(&[p.x0, p.y0]))) else {
             return Vec::new();
         };
-        let there = |place: &u32| (*place as usize) < shelf.bricks().len() && !shelf.has(*place);
-        known.expected.iter().copied().filter(there).collect()
+        let lacks = |place: &u32| (*place as usize) < shelf.bricks().len() && !shelf.has(*place);
+        known.expected.iter().copied().filter(lacks).collect()
     }
 
-    /// Holds a region from where it stands, from `start` on: where it comes to, and when. As one that is drawn, it goes as
-    /// far as bricks are here, those among them that come meanwhile.
+    /// Holds a region from `start` on until it is done or lacks bricks. Returns the result or the
+    /// bricks, and when that was. Bricks that arrive meanwhile let it go on.
+    ///
+    /// # Errors
+    /// A sentence if the trace has no such tile.
     pub(crate) fn region(
         &self,
         going: &mut Going,
@@ -106,32 +110,32 @@ impl Rehearsal {
         let tile = going.lease.tile;
         let (frame, shelf, size) = (&going.frame, &going.shelf, self.trace.about.size);
         let unknown = || {
+            let Rect { x0, y0, x1, y1 } = tile;
             format!(
-                "the trace that is rehearsed has no tile ({},{}) to ({},{}) through all depths of \
-                 this view",
-                tile.x0, tile.y0, tile.x1, tile.y1
+                "the trace that is rehearsed has no tile ({x0},{y0}) to ({x1},{y1}) through all \
+                 depths of this view"
             )
         };
-        let at = *frame.rehearsed.get_or_init(|| self.find(frame));
-        let traced = &self.trace.frames[at.ok_or_else(unknown)?];
+        let traced = &self.trace.frames[self.index(frame).ok_or_else(unknown)?];
         let known = traced.region(&tile, size).ok_or_else(unknown)?;
         let bricks = shelf.bricks();
         if known.touched.last().is_some_and(|&last| last as usize >= bricks.len()) {
             return Err(unknown());
         }
-        let sees = |place: u32| frame.view.project(&bricks.get(place as usize)?.tight);
-        let course = match &mut going.course {
-            Some(course) => course,
-            course => {
-                let of = Course::of(traced, &tile, size, &sees);
-                course.insert(of.ok_or_else(unknown)?)
+        let project = |place: u32| frame.view.project(&bricks.get(place as usize)?.tight);
+        let progress = match &mut going.course {
+            Some(progress) => progress,
+            none => {
+                let new = RegionProgress::new(traced, &tile, size, &project);
+                none.insert(new.ok_or_else(unknown)?)
             }
         };
-        // A tile's parts may name bricks that it does not.
+        // The parts of a tile may name bricks that the tile does not.
         let has = |place: u32| place as usize >= bricks.len() || shelf.has(place);
-        course.take();
-        if course.goes(&has) <= 0.0 && !course.is_over() {
-            return Ok((Came::Lacks(course.lacks(&has, going.ahead, &sees), true), start));
+        progress.resume();
+        if progress.runs_ns(&has) <= 0.0 && !progress.is_done() {
+            let missing = progress.missing(&has, going.ahead, &project);
+            return Ok((Came::Lacks(missing, true), start));
         }
         let setup = Duration::from_nanos(traced.setup_ns + traced.outlook_ns);
         let mut end = (*frame.made.get_or_init(|| start + setup)).max(start);
@@ -141,25 +145,27 @@ impl Rehearsal {
             let fresh = known.opened.iter().filter(|b| opened.insert(**b)).count();
             end += Duration::from_nanos(traced.block_ns.saturating_mul(fresh as u64));
         }
-        // Made while the tile is held, and not when that is over.
+        // Made while the tile is held, not afterwards.
         let pixels = match &frame.finish {
             Some(finish) => {
-                Pixels::Finished(finished_through(&tile, known.bytes(frame.plain), finish))
+                let bytes = known.wire_bytes(frame.plain);
+                Pixels::Finished(placeholder_finished(&tile, bytes, finish))
             }
-            None => Pixels::Sums(filled_through(&tile, known.result_bytes)),
+            None => Pixels::Sums(placeholder_sums(&tile, known.result_bytes)),
         };
         loop {
-            let ns = course.goes(&has);
+            let ns = progress.runs_ns(&has);
             if ns <= 0.0 {
                 break;
             }
             end += Duration::from_nanos(ns.round() as u64);
             Held { start, end }.wait();
-            course.go(ns, &has);
+            progress.advance(ns, &has);
         }
         going.drawn += end - begun;
-        if !course.is_over() {
-            return Ok((Came::Lacks(course.lacks(&has, going.ahead, &sees), true), end));
+        if !progress.is_done() {
+            let missing = progress.missing(&has, going.ahead, &project);
+            return Ok((Came::Lacks(missing, true), end));
         }
         locked(&frame.scene.parts).extend(parts(tile).map(|p| [p.x0, p.y0]));
         let (counters, sampled) = (Counters::default(), Sampling::default());
@@ -168,7 +174,7 @@ impl Rehearsal {
     }
 }
 
-/// When a task is held.
+/// The time for which a thread holds a task.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Held {
     pub(crate) start: Instant,
@@ -176,7 +182,7 @@ pub(crate) struct Held {
 }
 
 impl Held {
-    /// Waits for its end. Counts no voxels: nobody drew any.
+    /// Sleeps until the end. Returns empty counters, since no voxel was drawn.
     pub(crate) fn wait(&self) -> Counters {
         std::thread::sleep(self.end.saturating_duration_since(Instant::now()));
         Counters::default()

@@ -7,7 +7,7 @@ use slabcast_common::leaves::Finish;
 use slabcast_common::message::{Pixels, TaskTimes, TileResult, ToMaster};
 use slabcast_common::occlusion::Rect;
 use slabcast_proto::convert;
-use slabcast_trace::finished_through;
+use slabcast_trace::placeholder_finished;
 
 #[test]
 fn placeholder_pixels_have_the_traced_size_on_the_wire() {
@@ -26,7 +26,7 @@ fn placeholder_pixels_have_the_traced_size_on_the_wire() {
             let result = ToMaster::Result(Box::new(TileResult {
                 task: TaskId(5000),
                 epoch: Epoch(0),
-                pixels: Pixels::Finished(finished_through(&rect, bytes as u32, &finish)),
+                pixels: Pixels::Finished(placeholder_finished(&rect, bytes as u32, &finish)),
                 bytes: None,
                 counters: Default::default(),
                 times,

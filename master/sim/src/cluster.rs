@@ -17,7 +17,7 @@ use slabcast_common::region::{Lookahead, PART, parts};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::Projected;
 use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
-use slabcast_trace::{Course, RegionTile, Trace};
+use slabcast_trace::{RegionProgress, RegionTile, Trace};
 use std::borrow::Cow;
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -146,7 +146,7 @@ struct Lent<'a> {
     task: Task,
     known: Known<'a>,
     /// Of a region.
-    course: Option<Course>,
+    course: Option<RegionProgress>,
     received: Nanos,
     /// The order in which threads take what is there.
     order: u64,
@@ -189,7 +189,7 @@ impl Running<'_> {
     fn follow(&mut self, present: &[bool], now: Nanos, stretch: f64) {
         if let Some(course) = &mut self.lent.course {
             let went = now.saturating_sub(self.followed);
-            course.go(went as f64 / stretch, &has(present));
+            course.advance(went as f64 / stretch, &has(present));
             self.followed += went;
         }
     }
@@ -263,7 +263,7 @@ struct World<'a> {
     watched: Option<Nanos>,
     closed: bool,
     /// Pieces by the corners of their tiles.
-    pieces: BTreeMap<(FrameId, [i32; 4]), Course>,
+    pieces: BTreeMap<(FrameId, [i32; 4]), RegionProgress>,
     /// When the driver lent what has not begun yet.
     decided: BTreeMap<(WorkerId, TaskId, Epoch), Nanos>,
     finished: usize,
@@ -781,7 +781,7 @@ impl<'a> World<'a> {
                     lease_bytes: SMALL,
                     result_bytes: [SMALL + 3 * l.tile.area() as u64; 2],
                     region: Cow::Owned(RegionTile {
-                        touched: piece.needs(),
+                        touched: piece.upcoming(),
                         ..RegionTile::default()
                     }),
                 })
@@ -790,7 +790,7 @@ impl<'a> World<'a> {
                 // A bit or so for each touched brick, and the cost's other figures.
                 let beside = 20 + region.touched.len() as u64;
                 let result_bytes =
-                    [false, true].map(|plain| u64::from(region.bytes(plain)) + beside);
+                    [false, true].map(|plain| u64::from(region.wire_bytes(plain)) + beside);
                 Known { ns: region.ns, lease_bytes: SMALL, result_bytes, region }
             }),
         };
@@ -836,7 +836,7 @@ impl<'a> World<'a> {
         let Some(r) = &mut w.running[thread] else { return };
         let Some(course) = &r.lent.course else { return };
         let set = self.jobs[r.lent.task.frame().0 as usize - 1].scene.bricks;
-        let goes = course.goes(&has(&w.present[&set]));
+        let goes = course.runs_ns(&has(&w.present[&set]));
         let end = r.followed + (goes * stretch).round() as Nanos;
         if end != r.end {
             (r.end, r.ends) = (end, ends);
@@ -860,7 +860,7 @@ impl<'a> World<'a> {
             Task::Region(l) if l.begun.is_some() => self.piece_of(frame, &l.tile),
             Task::Region(l) => {
                 let traced = &self.trace.frames[frame.0 as usize - 1];
-                Course::of(traced, &l.tile, self.trace.about.size, &self.sees(frame))
+                RegionProgress::new(traced, &l.tile, self.trace.about.size, &self.sees(frame))
             }
         };
         self.order += 1;
@@ -913,9 +913,9 @@ impl<'a> World<'a> {
             let first = *w.first.entry(set).or_insert(frame) == frame;
             lent.ahead = w.look.sheets(now, self.cluster.threads, (lent.stalls, first));
             if let Some(course) = &mut lent.course {
-                course.take();
+                course.resume();
                 let present = &w.present[&set];
-                if !course.is_over() && course.goes(&has(present)) <= 0.0 {
+                if !course.is_done() && course.runs_ns(&has(present)) <= 0.0 {
                     self.park(id, lent);
                     continue;
                 }
@@ -965,7 +965,7 @@ impl<'a> World<'a> {
         let sees = self.sees(lent.task.frame());
         let w = self.workers.get_mut(&id).expect("a worker stays");
         let lacks = match &lent.course {
-            Some(course) => course.lacks(&has(&w.present[&set]), lent.ahead, &sees),
+            Some(course) => course.missing(&has(&w.present[&set]), lent.ahead, &sees),
             None => Vec::new(),
         };
         let ids = lacks.iter().map(|&place| job.bricks[place as usize].id);
@@ -1025,7 +1025,7 @@ impl<'a> World<'a> {
             let from = now + tables + blocks;
             let set = self.jobs[frame.0 as usize - 1].scene.bricks;
             let ns = match &lent.course {
-                Some(course) => course.goes(&has(&w.present[&set])),
+                Some(course) => course.runs_ns(&has(&w.present[&set])),
                 None => lent.known.ns as f64,
             };
             let end = from + (ns * stretch).round() as Nanos;
@@ -1062,8 +1062,8 @@ impl<'a> World<'a> {
         if let Some(course) = &mut lent.course {
             let set = self.jobs[frame.0 as usize - 1].scene.bricks;
             let present = &self.workers[&id].present[&set];
-            course.go(f64::INFINITY, &has(present));
-            if !course.is_over() {
+            course.advance(f64::INFINITY, &has(present));
+            if !course.is_done() {
                 self.park(id, lent);
                 return None;
             }

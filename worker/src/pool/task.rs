@@ -6,7 +6,7 @@ use slabcast_common::brick::{Brick, BrickSetKey};
 use slabcast_common::image::TilePixels;
 use slabcast_common::message::{Counters, HandedOver, Lease, Pixels, RegionLease, Sampling};
 use slabcast_render::region::{BrickSupply, Region};
-use slabcast_trace::Course;
+use slabcast_trace::RegionProgress;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
@@ -86,7 +86,7 @@ pub(crate) struct Going {
     /// What is drawn so far; `None` before it began.
     pub(super) region: Option<Region>,
     /// The same of a rehearsal.
-    pub(crate) course: Option<Course>,
+    pub(crate) course: Option<RegionProgress>,
     /// Whether what it will need was looked for.
     pub(super) looked: bool,
 }

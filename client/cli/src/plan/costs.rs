@@ -183,7 +183,7 @@ fn region_bytes(trace: &Trace) -> Option<f64> {
 fn region(trace: &Trace) -> Leaves {
     let bytes = region_bytes(trace).unwrap_or(0.5) * 64.0 * 64.0;
     let tile = Rect::new(0, 0, 64, 64);
-    let mut leaves = trace::finished_through(&tile, (2.0 * bytes) as u32, &FINISH);
+    let mut leaves = trace::placeholder_finished(&tile, (2.0 * bytes) as u32, &FINISH);
     leaves.data.iter_mut().skip(1).step_by(2).for_each(|b| *b = 0);
     let mid = leaves.data.len() / 2;
     let (first, rest) = leaves.data.split_at_mut(mid);
@@ -235,8 +235,8 @@ fn mark(size: [u32; 2]) -> f64 {
 fn fill(by_region: bool) -> f64 {
     let (rect, size) = (Rect::new(0, 0, 64, 64), [64, 64]);
     let shut = vec![false; 64 * 64];
-    let sums = || drop(std::hint::black_box(trace::filled(&rect, &shut, size, 100_000)));
-    let finished = || drop(std::hint::black_box(trace::finished_through(&rect, 4_000, &FINISH)));
+    let sums = || drop(std::hint::black_box(trace::placeholder_slab(&rect, &shut, size, 100_000)));
+    let finished = || drop(std::hint::black_box(trace::placeholder_finished(&rect, 4_000, &FINISH)));
     (if by_region { best(finished) } else { best(sums) }) / 4096.0
 }
 

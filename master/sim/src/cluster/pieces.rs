@@ -7,7 +7,7 @@ use slabcast_common::message::{Begun, HandedOver};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::{cut, parts, square_of};
 use slabcast_schedule::{Event, FrameJob};
-use slabcast_trace::{Course, RegionTile, Trace};
+use slabcast_trace::{RegionProgress, RegionTile, Trace};
 use std::borrow::Cow;
 
 /// Bytes of a piece's state: an opacity, three colours and four sums a pixel.
@@ -23,7 +23,7 @@ fn corners(r: &Rect) -> [i32; 4] {
 
 impl<'a> World<'a> {
     /// A piece that was given away, or what is left of one of which pieces were.
-    pub(super) fn piece_of(&self, frame: FrameId, tile: &Rect) -> Option<Course> {
+    pub(super) fn piece_of(&self, frame: FrameId, tile: &Rect) -> Option<RegionProgress> {
         let of_frame = (frame, [i32::MIN; 4])..=(frame, [i32::MAX; 4]);
         let around = self.pieces.range(of_frame).filter_map(|((_, [x0, y0, x1, y1]), piece)| {
             let whole = Rect::new(*x0, *y0, *x1, *y1);
@@ -85,7 +85,7 @@ impl<'a> World<'a> {
             return;
         }
         let (frame, tile) = (lease.frame, lease.tile);
-        let Some((kept, given)) = cut(tile, share, |piece| course.left_in(piece)) else { return };
+        let Some((kept, given)) = cut(tile, share, |piece| course.left_in_ns(piece)) else { return };
         let job: &'a FrameJob = {
             let jobs: &'a [FrameJob] = self.jobs;
             &jobs[frame.0 as usize - 1]
@@ -98,14 +98,14 @@ impl<'a> World<'a> {
         let part = |bytes| bytes * kept.area() as u64 / tile.area() as u64;
         known.result_bytes = known.result_bytes.map(part);
         // What it still waits for, it may no longer need.
-        let still = course.needs();
+        let still = course.upcoming();
         lent.waits.retain(|place| still.binary_search(place).is_ok());
         let n = given.area();
-        let (all, left) = piece.takes();
+        let (all, left) = (piece.total_ns(), piece.left_ns());
         // Of one that nothing was drawn into there are no sums.
         let last = (left < all).then(|| vec![[0; 4]; n]);
         let pixels = TilePixels { a: vec![0.0; n], colour: vec![[0; 3]; n], last };
-        let begun = Begun { sheets: piece.sheets(given, &sees), pixels };
+        let begun = Begun { sheets: piece.next_sheets(given, &sees), pixels };
         if let Some(thread) = thread {
             self.goes_until(id, thread);
         }

@@ -236,7 +236,8 @@ fn fill(by_region: bool) -> f64 {
     let (rect, size) = (Rect::new(0, 0, 64, 64), [64, 64]);
     let shut = vec![false; 64 * 64];
     let sums = || drop(std::hint::black_box(trace::placeholder_slab(&rect, &shut, size, 100_000)));
-    let finished = || drop(std::hint::black_box(trace::placeholder_finished(&rect, 4_000, &FINISH)));
+    let finished =
+        || drop(std::hint::black_box(trace::placeholder_finished(&rect, 4_000, &FINISH)));
     (if by_region { best(finished) } else { best(sums) }) / 4096.0
 }
 

@@ -85,7 +85,9 @@ impl<'a> World<'a> {
             return;
         }
         let (frame, tile) = (lease.frame, lease.tile);
-        let Some((kept, given)) = cut(tile, share, |piece| course.left_in_ns(piece)) else { return };
+        let Some((kept, given)) = cut(tile, share, |piece| course.left_in_ns(piece)) else {
+            return;
+        };
         let job: &'a FrameJob = {
             let jobs: &'a [FrameJob] = self.jobs;
             &jobs[frame.0 as usize - 1]

@@ -1,6 +1,6 @@
 //! Rules of the house that a compiler does not keep.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 fn root() -> PathBuf {
@@ -8,7 +8,7 @@ fn root() -> PathBuf {
 }
 
 /// The crates and what each may see (ARCHITECTURE.md). A new arrow is rare and argued for.
-const ARROWS: [(&str, &[&str]); 11] = [
+const ARROWS: [(&str, &[&str]); 13] = [
     ("common", &[]),
     ("common/trace", &["common"]),
     ("proto", &["common"]),
@@ -19,11 +19,19 @@ const ARROWS: [(&str, &[&str]); 11] = [
     ("worker", &["common", "proto", "render", "trace"]),
     ("master", &["common", "proto", "schedule", "volumes"]),
     ("client", &["common", "proto"]),
+    ("client/session", &["client", "common", "master", "render", "volumes", "worker"]),
+    (
+        "client/lab",
+        &[
+            "client", "common", "master", "proto", "render", "schedule", "session", "sim", "trace",
+            "volumes", "worker",
+        ],
+    ),
     (
         "client/cli",
         &[
-            "client", "common", "master", "proto", "render", "schedule", "sim", "trace", "volumes",
-            "worker",
+            "client", "common", "lab", "master", "proto", "render", "schedule", "session", "sim",
+            "trace", "volumes", "worker",
         ],
     ),
 ];
@@ -56,7 +64,7 @@ fn arrows_between_rooms_are_those_of_the_map() {
                  ARCHITECTURE.md and here"
             );
         }
-        if !["worker", "master", "client", "client/cli", "proto"].contains(&room) {
+        if !room.starts_with("client") && !["worker", "master", "proto"].contains(&room) {
             for banned in NETWORKED {
                 assert!(
                     !names.iter().any(|n| n == banned),
@@ -76,6 +84,129 @@ fn sources(dir: &Path, into: &mut Vec<PathBuf>) {
             into.push(path);
         }
     }
+}
+
+/// Modules of a crate by their paths (`output::png`), each with its source without comments.
+fn modules(room: &str) -> BTreeMap<String, String> {
+    let src = root().join(room).join("src");
+    let mut files = Vec::new();
+    sources(&src, &mut files);
+    let module = |file: &Path| {
+        let inside = file.strip_prefix(&src).expect("inside").with_extension("");
+        let mut words: Vec<_> = inside.iter().map(|w| w.to_string_lossy().into_owned()).collect();
+        if words.last().is_some_and(|w| ["mod", "lib", "main"].contains(&w.as_str())) {
+            words.pop();
+        }
+        words.join("::")
+    };
+    let text = |file: &Path| {
+        let text = std::fs::read_to_string(file).expect("a source");
+        let code = text.lines().map(|line| line.split("//").next().unwrap_or(""));
+        code.collect::<Vec<_>>().join("\n")
+    };
+    files.iter().map(|file| (module(file), text(file))).collect()
+}
+
+/// Paths that code names from `crate` or `super`: of `use crate::a::{b, c::d}` both `a::b` and
+/// `a::c::d`.
+fn paths(code: &str, module: &str) -> Vec<String> {
+    let mut found = Vec::new();
+    let words = |c: char| c.is_alphanumeric() || c == '_';
+    for start in ["crate::", "super::"] {
+        for (n, _) in code.match_indices(start) {
+            if code[..n].ends_with(|c: char| words(c) || c == ':') {
+                continue;
+            }
+            let mut base: Vec<&str> = module.split("::").collect();
+            let mut rest = &code[n..];
+            if start == "crate::" {
+                base.clear();
+                rest = &rest[start.len()..];
+            }
+            while let Some(above) = rest.strip_prefix("super::") {
+                base.pop();
+                rest = above;
+            }
+            expand(&base.join("::"), rest, &mut found);
+        }
+    }
+    found
+}
+
+/// Adds the paths of a use tree that begins at `tree` under `base`; returns the rest of the code.
+fn expand<'a>(base: &str, tree: &'a str, found: &mut Vec<String>) -> &'a str {
+    let join = |word: &str| if base.is_empty() { word.into() } else { format!("{base}::{word}") };
+    let tree = tree.trim_start();
+    if let Some(mut inner) = tree.strip_prefix('{') {
+        loop {
+            inner = expand(base, inner, found).trim_start();
+            match inner.strip_prefix(',') {
+                Some(more) => inner = more,
+                None => return inner.strip_prefix('}').unwrap_or(inner),
+            }
+        }
+    }
+    let end = tree.find(|c: char| !(c.is_alphanumeric() || c == '_')).unwrap_or(tree.len());
+    let (word, rest) = tree.split_at(end);
+    match rest.strip_prefix("::") {
+        Some(more) => expand(&join(word), more, found),
+        None => {
+            found.push(join(word));
+            let renamed = rest.trim_start().strip_prefix("as ");
+            renamed
+                .map_or(rest, |r| r.trim_start_matches(|c: char| c.is_alphanumeric() || c == '_'))
+        }
+    }
+}
+
+/// A module may name its own parents, as a file of a folder does; those do not count.
+#[test]
+fn modules_of_the_client_crates_have_no_circular_imports() {
+    let mut imports = 0;
+    for room in ["client/session", "client/lab", "client/cli"] {
+        let modules = modules(room);
+        let mut sees: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+        for (module, code) in &modules {
+            let own = sees.entry(module).or_default();
+            for path in paths(code, module) {
+                let known = modules
+                    .keys()
+                    .filter(|other| path == **other || path.starts_with(&format!("{other}::")));
+                let Some(other) = known.max_by_key(|other| other.len()) else { continue };
+                let parent = module == other || module.starts_with(&format!("{other}::"));
+                if !parent && !other.is_empty() {
+                    own.insert(other);
+                }
+            }
+        }
+        // What a module reaches, by as many rounds as there are modules at most.
+        let mut reach = sees.clone();
+        loop {
+            let before = reach.clone();
+            for all in reach.values_mut() {
+                let more: Vec<&str> = all.iter().flat_map(|m| &before[m]).copied().collect();
+                all.extend(more);
+            }
+            if reach == before {
+                break;
+            }
+        }
+        let circle: Vec<&str> =
+            reach.iter().filter(|(m, all)| all.contains(*m)).map(|(m, _)| *m).collect();
+        assert!(
+            circle.is_empty(),
+            "{room}: {circle:?} import each other in a circle. Move what they share into a module \
+             of its own that sees none of them"
+        );
+        imports += sees.values().map(BTreeSet::len).sum::<usize>();
+    }
+    assert!(imports > 100, "only {imports} imports were read: the parser of this test is blind");
+}
+
+#[test]
+fn use_trees_are_expanded_to_paths() {
+    let code = "use crate::a::{self, b::{c, d as e}};\nfn f() { super::g::h(); not_crate::x }";
+    assert_eq!(paths(code, "m::n"), ["a::self", "a::b::c", "a::b::d", "m::g::h"]);
 }
 
 /// Words that do not belong into a deciding crate, and why.

@@ -1,9 +1,9 @@
 //! `slabcast convert`: a volume of any format as NRRD or NIfTI.
 
-use crate::fail::{Fail, say};
-use crate::progress::{self, Progress};
-use crate::{output, signals, volume};
 use slabcast_common::volume::Volume;
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::progress::{self, Progress};
+use slabcast_session::{output, signals, volume};
 use slabcast_volumes::write::{self, Format};
 use std::path::{Path, PathBuf};
 

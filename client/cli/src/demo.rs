@@ -1,8 +1,8 @@
 //! `slabcast demo`: pictures without a file, and what to type next.
 
-use crate::fail::{Fail, say};
 use crate::render::{self, RenderArgs};
 use clap::{Args, FromArgMatches};
+use slabcast_session::fail::{Fail, say};
 use std::ffi::OsString;
 use std::path::PathBuf;
 

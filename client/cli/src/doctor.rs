@@ -3,14 +3,14 @@
 //! Each check gives one line: what was found, and the remedy where it is not well. Checks never
 //! change anything but a probe file that is gone again.
 
-use crate::embedded::cores;
-use crate::fail::{Fail, reason, say};
-use crate::progress::bytes;
-use crate::{parse, runtime};
 use slabcast_client::Client;
 use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
 use slabcast_render::Simd;
 use slabcast_render::selftest;
+use slabcast_session::fail::{Fail, reason, say};
+use slabcast_session::machine::cores;
+use slabcast_session::progress::bytes;
+use slabcast_session::{parse, runtime};
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};

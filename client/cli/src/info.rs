@@ -1,9 +1,5 @@
 //! `slabcast info`: what is in a file, before anybody waits for a picture of it.
 
-use crate::fail::{Fail, say};
-use crate::progress::bytes;
-use crate::request::AxisArgs;
-use crate::volume;
 use glam::DVec3;
 use slabcast_common::brick::{BRICK_VOXELS, BrickGrid};
 use slabcast_common::path::Orientation;
@@ -11,6 +7,10 @@ use slabcast_common::presets;
 use slabcast_common::quality::Compositing;
 use slabcast_common::transfer::Classifier;
 use slabcast_common::volume::{Lattice, Samples, Volume, VolumeInfo};
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::progress::bytes;
+use slabcast_session::request::AxisArgs;
+use slabcast_session::volume;
 use std::fmt::Write;
 use std::path::PathBuf;
 

@@ -3,8 +3,8 @@
 //! Under systemd (JOURNAL_STREAM) there are no timestamps and no colour, since the journal has
 //! its own; each line then begins with its syslog priority (`<4>`), as sd-daemon(3) has it.
 
-use crate::fail::Fail;
-use crate::{progress, style};
+use slabcast_session::fail::Fail;
+use slabcast_session::{progress, terminal};
 use std::io::Write;
 use tracing::{Level, Metadata};
 use tracing_subscriber::EnvFilter;
@@ -57,7 +57,7 @@ pub(crate) fn begin(args: &LogArgs, default: &str) -> Result<(), Fail> {
         (true, true) => base.json().without_time().try_init(),
         (true, false) => base.json().try_init(),
         (false, true) => base.with_ansi(false).without_time().with_level(false).try_init(),
-        (false, false) => base.with_ansi(style::colours()).try_init(),
+        (false, false) => base.with_ansi(terminal::colours()).try_init(),
     };
     Ok(())
 }

@@ -24,52 +24,24 @@
 //! This is the only crate that sees all others. It decides nothing about pixels and schedules.
 //! Results go to stdout, everything else to stderr; every failure is one line ([`fail`]).
 
-mod ask;
-mod bench;
-mod canvas;
-mod chart;
-mod check;
 mod config;
 mod convert;
-mod daemon;
 mod demo;
 mod doctor;
-mod embedded;
-mod error;
-mod explain;
-mod fail;
-mod front;
 mod info;
-mod local;
 mod logging;
-mod machine;
-mod needs;
-mod output;
-mod parse;
-mod plan;
-mod plot;
-mod progress;
-mod record;
-mod remote;
+mod master;
+mod read_dicom;
 mod render;
-mod report;
-mod request;
 mod rerender;
-mod runtime;
-mod show;
-mod signals;
-mod source;
-mod stage;
-mod still;
-mod study;
-mod style;
+mod status;
 mod tf;
-mod transfer;
-mod volume;
 
 use clap::error::ErrorKind;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
-use fail::Fail;
+use slabcast_lab::{bench, check, error, explain, plan, replay, report, study};
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::terminal::one_line;
 use std::process::ExitCode;
 
 /// Renders volume data (CT, MRI, simulations) on CPUs, alone or as a cluster.
@@ -109,13 +81,13 @@ enum Command {
     Info(info::InfoArgs),
     Tf(Box<tf::TfArgs>),
     Convert(convert::ConvertArgs),
-    Master(daemon::MasterArgs),
-    Worker(daemon::WorkerArgs),
-    Status(ask::StatusArgs),
-    Jobs(ask::JobsArgs),
-    Cancel(ask::CancelArgs),
+    Master(master::MasterArgs),
+    Worker(master::WorkerArgs),
+    Status(status::StatusArgs),
+    Jobs(status::JobsArgs),
+    Cancel(status::CancelArgs),
     Plan(Box<plan::PlanArgs>),
-    Replay(record::ReplayArgs),
+    Replay(replay::ReplayArgs),
     Error(Box<error::ErrorArgs>),
     Explain(Box<explain::ExplainArgs>),
     Bench(Box<bench::BenchArgs>),
@@ -125,7 +97,7 @@ enum Command {
     Config(config::ConfigArgs),
     Doctor(doctor::DoctorArgs),
     #[command(hide = true)]
-    ReadDicom(volume::DicomArgs),
+    ReadDicom(read_dicom::DicomArgs),
     /// Prints completions for a shell.
     #[command(after_help = "\
 Examples:
@@ -172,13 +144,13 @@ fn run(cli: &Cli) -> Result<(), Fail> {
         Command::Info(args) => info::run(args),
         Command::Tf(args) => tf::run(args),
         Command::Convert(args) => convert::run(args),
-        Command::Master(args) => daemon::master(args),
-        Command::Worker(args) => daemon::worker(args),
-        Command::Status(args) => ask::status(args),
-        Command::Jobs(args) => ask::jobs(args),
-        Command::Cancel(args) => ask::cancel(args),
+        Command::Master(args) => master::master(args),
+        Command::Worker(args) => master::worker(args),
+        Command::Status(args) => status::status(args),
+        Command::Jobs(args) => status::jobs(args),
+        Command::Cancel(args) => status::cancel(args),
         Command::Plan(args) => plan::run(args),
-        Command::Replay(args) => record::run(args),
+        Command::Replay(args) => replay::run(args),
         Command::Error(args) => error::run(args),
         Command::Explain(args) => explain::run(args),
         Command::Bench(args) => bench::run(args),
@@ -189,18 +161,18 @@ fn run(cli: &Cli) -> Result<(), Fail> {
             doctor::run(args, config::path(cli.config.as_deref(), Cli::command()))
         }
         Command::Config(args) => config::run::<Cli>(args, cli.config.as_deref(), understood),
-        Command::ReadDicom(args) => volume::read_dicom(args),
+        Command::ReadDicom(args) => read_dicom::run(args),
         Command::Completions { shell } => {
             let mut script = Vec::new();
             clap_complete::generate(*shell, &mut Cli::command(), "slabcast", &mut script);
-            fail::say(&String::from_utf8_lossy(&script))
+            say(&String::from_utf8_lossy(&script))
         }
         Command::Man { dir: None } => {
             let mut page = Vec::new();
             clap_mangen::Man::new(Cli::command())
                 .render(&mut page)
                 .map_err(|e| Fail::failed(e.to_string()))?;
-            fail::say(&String::from_utf8_lossy(&page))
+            say(&String::from_utf8_lossy(&page))
         }
         Command::Man { dir: Some(dir) } => clap_mangen::generate_to(Cli::command(), dir)
             .map_err(|e| Fail::io(dir, "writing manual pages", &e)),
@@ -291,7 +263,7 @@ fn on_panic(panic: &std::panic::PanicHookInfo<'_>) {
     if std::thread::current().name() == Some("main") {
         std::process::exit(Fail::failed(line).end().into());
     }
-    tracing::error!("{}", fail::one_line(&line));
+    tracing::error!("{}", one_line(&line));
 }
 
 #[cfg(test)]

@@ -4,13 +4,15 @@
 //! ten seconds and end with 0. Every flag has a variable of the environment ([`crate::config`]),
 //! so that a unit file needs none.
 
-use crate::embedded::{cores, start_master};
-use crate::fail::{Fail, reason, say};
-use crate::request::AxisArgs;
-use crate::{parse, plan, record, runtime, signals, volume};
 use slabcast_common::path::Axis;
+use slabcast_lab::plan;
 use slabcast_master::{Handle, MasterConfig};
 use slabcast_render::Simd;
+use slabcast_session::embedded::start_master;
+use slabcast_session::fail::{Fail, reason, say};
+use slabcast_session::machine::cores;
+use slabcast_session::request::AxisArgs;
+use slabcast_session::{parse, record, runtime, signals, volume};
 use slabcast_worker::{Config, Ended, Rehearsal};
 use std::net::SocketAddr;
 use std::path::PathBuf;

@@ -1,10 +1,10 @@
 //! `slabcast rerender`: a picture once more, from what it says of itself.
 
-use crate::fail::{Fail, say};
-use crate::output::provenance::{self, Provenance};
-use crate::output::{Output, OutputArgs};
-use crate::request::Asked;
-use crate::{progress, render, volume};
+use crate::render;
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::output::provenance::{self, Provenance};
+use slabcast_session::output::{Output, OutputArgs};
+use slabcast_session::{progress, volume};
 use std::path::PathBuf;
 
 /// Draws a picture again from what it says of itself, and compares the two files.
@@ -54,7 +54,7 @@ pub(crate) fn run(args: &RerenderArgs) -> Result<(), Fail> {
     let ending = args.picture.extension().unwrap_or_default();
     let target =
         args.output.clone().unwrap_or_else(|| PathBuf::from("again").with_extension(ending));
-    let asked = Asked::again(&made);
+    let asked = made.request();
     let output = OutputArgs {
         output: target.clone(),
         format: Some(made.format),

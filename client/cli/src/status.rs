@@ -1,9 +1,9 @@
 //! `slabcast status`, `jobs` and `cancel`: questions to a running master.
 
-use crate::fail::{Fail, say};
-use crate::progress::{bytes, time};
-use crate::remote::{connect, fail};
 use slabcast_client::{Client, ClientError, Job, JobState, VolumeDescription, Worker};
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::progress::{bytes, time};
+use slabcast_session::remote::{connect, fail};
 use std::fmt::Write;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -12,7 +12,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 struct MasterArg {
     /// The master
     #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:7433",
-          env = "SLABCAST_MASTER", hide_env_values = true, value_parser = crate::parse::master)]
+          env = "SLABCAST_MASTER", hide_env_values = true, value_parser = slabcast_session::parse::master)]
     master: String,
 }
 

@@ -1,14 +1,14 @@
 //! `slabcast tf`: transfer functions as files, for people who want to change one, and for ParaView.
 
-use crate::fail::{Fail, say};
-use crate::output::write_atomic;
-use crate::transfer::{LookFlags, Transfer};
-use crate::volume::InputArgs;
 use slabcast_common::paraview;
 use slabcast_common::presets;
 use slabcast_common::transfer::{Domain, TransferFunction};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_common::volume::{Samples, ValueMap, ValueSummary, VolumeInfo};
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::output::write_atomic;
+use slabcast_session::transfer::{LookFlags, Transfer};
+use slabcast_session::volume::InputArgs;
 use std::io::Write;
 use std::path::PathBuf;
 

@@ -3,11 +3,6 @@
 //! Each row is measured: the scene is drawn as it is and with the thing kept (or the test switched
 //! off), in turn, and the two pictures are compared, to the bit.
 
-use crate::fail::Fail;
-use crate::local::{self, Cut};
-use crate::progress::{self, Progress};
-use crate::request::{Asked, Opened, PictureOf};
-use crate::stage::Stage;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::message::SceneSpec;
@@ -16,6 +11,11 @@ use slabcast_common::quality::{Keep, Quality, Work};
 use slabcast_common::view::Projection;
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_render::{Frame, Scene};
+use slabcast_session::direct::{self, Cut};
+use slabcast_session::fail::Fail;
+use slabcast_session::path_scenes::Stage;
+use slabcast_session::progress::{self, Progress};
+use slabcast_session::request::{Asked, Opened, PictureOf};
 use std::fmt::Write;
 use std::sync::Arc;
 use std::time::Instant;
@@ -103,7 +103,7 @@ fn in_turn(ways: [(&Way, Quality); 2], threads: usize) -> Result<([f64; 2], bool
             let view = way.stage.view(0, &scene.quality)?;
             let began = Instant::now();
             let frame = Frame::new(scene.clone(), view);
-            let picture = local::picture(&frame, &way.stage.bricks, cut);
+            let picture = direct::picture(&frame, &way.stage.bricks, cut);
             // The first fills tables and caches.
             if turn > 0 {
                 ms[i].push(began.elapsed().as_secs_f64() * 1e3);
@@ -190,7 +190,7 @@ pub(crate) fn find(of: &PictureOf, threads: usize) -> Result<Needs, Fail> {
     let look = Quality { cull: false, ..quality };
     let ([ms, blind], same) = in_turn([(&base, quality), (&base, look)], threads)?;
     let frame = base.stage.frame(0)?;
-    let picture = local::picture(&frame, &base.stage.bricks, Cut::on(threads));
+    let picture = direct::picture(&frame, &base.stage.bricks, Cut::on(threads));
     let shut = picture.pixels.iter().filter(|p| 1.0 - p[3] < quality.eps as f32).count();
     let covered = picture.pixels.iter().filter(|p| p[3] > 0.0).count();
     if shut > 0 {

@@ -5,18 +5,18 @@
 //! warms up and is left out; every view is another one, so nothing can be kept from one to the
 //! next but what a worker keeps, too.
 
-use crate::fail::{Fail, say};
-use crate::front::choose::settle;
-use crate::front::magnify::magnified;
-use crate::local::{self, Cut};
-use crate::progress::{self, Progress};
-use crate::request::{KeepArg, Opened, PictureOf, ThreadArg};
-use crate::stage::Stage;
+use crate::autotune::choose::settle;
 use slabcast_common::message::Counters;
 use slabcast_common::quality::Work;
 use slabcast_render::Frame;
 use slabcast_render::Simd;
 use slabcast_render::judge::reference::{ErrorFigures, Reference, stratified};
+use slabcast_session::direct::{self, Cut};
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::magnify::magnified;
+use slabcast_session::path_scenes::Stage;
+use slabcast_session::progress::{self, Progress};
+use slabcast_session::request::{KeepArg, Opened, PictureOf, ThreadArg};
 use std::fmt::Write;
 use std::sync::Arc;
 use std::time::Instant;
@@ -30,7 +30,7 @@ use std::time::Instant;
 Examples:
   slabcast bench brain.nii.gz --threads 1
   slabcast bench brain.nii.gz --tf peer-semi --size 1024x1024 --projection persp --json")]
-pub(crate) struct BenchArgs {
+pub struct BenchArgs {
     #[command(flatten)]
     of: PictureOf,
     #[command(flatten)]
@@ -54,9 +54,9 @@ pub(crate) struct BenchArgs {
 }
 
 /// Runs the command.
-pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
+pub fn run(args: &BenchArgs) -> Result<(), Fail> {
     let work = Work { keep: args.keep.keep(), ..Work::default() };
-    let mut asked = args.of.look.aimed(work)?;
+    let mut asked = args.of.look.asked_or_target(work)?;
     let threads = args.threads.count();
     let Opened { volume, info, orientation } = args.of.open(&asked)?;
     let volume = Arc::new(volume);
@@ -74,7 +74,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
         let (view, scene) = (stage.view(i, &asked.quality)?, stage.scene(i));
         let began = Instant::now();
         let frame = Frame::new(scene, view);
-        let (picture, counted) = local::counted_picture(&frame, bricks, cut);
+        let (picture, counted) = direct::counted_picture(&frame, bricks, cut);
         let picture = magnified(picture, asked.magnify, threads);
         let took = began.elapsed().as_secs_f64() * 1e3;
         each.push(took);
@@ -100,7 +100,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), Fail> {
         let reference = Reference::new(&stage.spec(views / 2), view, bricks);
         let mut progress = Progress::new(false).of("pixel");
         progress.frames(sample.len() as u64, "the reference");
-        let truth = local::judge(&sample, threads, (&mut progress, 0), |[x, y]| {
+        let truth = direct::judge(&sample, threads, (&mut progress, 0), |[x, y]| {
             (reference.pixel(x, y), reference.at_same_thickness(x, y))
         });
         progress.end();

@@ -5,12 +5,12 @@
 //! [`Sheet`] hides which, and how large a pixel is. Text is measured by the same font, so labels
 //! keep apart in both.
 
-use crate::fail::Fail;
-use crate::output::write_atomic;
 use ab_glyph::{Font, FontRef, ScaleFont};
 use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
+use slabcast_session::fail::Fail;
+use slabcast_session::output::write_atomic;
 use std::io::Write;
 use std::path::Path;
 use std::sync::Once;
@@ -383,11 +383,12 @@ pub(crate) fn write_png(image: &Pixels, out: &mut impl std::io::Write) -> std::i
     png.set_color(png::ColorType::Rgb);
     png.set_depth(png::BitDepth::Eight);
     png.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
-    let plain = crate::output::png::plain;
-    png.add_text_chunk("Software".into(), crate::output::SOFTWARE.into()).map_err(plain)?;
-    let mut png = png.write_header().map_err(plain)?;
-    png.write_image_data(&image.rgb).map_err(plain)?;
-    png.finish().map_err(plain)
+    let io_error = slabcast_session::software::io_error;
+    png.add_text_chunk("Software".into(), slabcast_session::software::SOFTWARE.into())
+        .map_err(io_error)?;
+    let mut png = png.write_header().map_err(io_error)?;
+    png.write_image_data(&image.rgb).map_err(io_error)?;
+    png.finish().map_err(io_error)
 }
 
 /// Writes it as `stem`.svg and `stem`.png into a folder.

@@ -1,17 +1,18 @@
-//! `slabcast explain`: why a pixel is as it is, and what a scene does not need ([`crate::needs`]).
+//! `slabcast explain`: why a pixel is as it is, and what a scene does not need ([`crate::ablation`]).
 //!
 //! The numbers are the renderer's own ([`slabcast_render::oracle::explain`]): the pixel that they lead to
 //! is the pixel of the picture, to the bit. Beside each sheet stands what the same sheets are in
 //! f64, and below all of them the limit.
 
-use crate::fail::{Fail, say};
-use crate::parse;
-use crate::request::{PictureOf, ThreadArg};
-use crate::still::Still;
-use crate::{needs, signals};
+use crate::ablation;
+use crate::single_frame::Still;
 use slabcast_common::volume::ValueMap;
 use slabcast_render::judge::reference::{Sheet, Sheets};
 use slabcast_render::oracle::explain::{PixelExplanation, SectionAtPixel, SheetAtPixel, explain};
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::parse;
+use slabcast_session::request::{PictureOf, ThreadArg};
+use slabcast_session::signals;
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
@@ -47,7 +48,7 @@ raw, peek, sections, bricks, reference: {tau, colour, t}, voxels: [{voxel, brick
 tau, colour}]}]}. rgba, same_thickness and limit are linear, premultiplied; errors are the largest
 of four channels in 1/255; t is what is let through by this sheet and all in front of it; shut_in is
 null where the pixel stays open; reference is null where f64 sheets have nothing there.")]
-pub(crate) struct ExplainArgs {
+pub struct ExplainArgs {
     #[command(flatten)]
     of: PictureOf,
     /// The pixel, from 0,0 at the top left
@@ -78,13 +79,13 @@ struct Found {
 }
 
 /// Runs the command.
-pub(crate) fn run(args: &ExplainArgs) -> Result<(), Fail> {
+pub fn run(args: &ExplainArgs) -> Result<(), Fail> {
     let Some(pixel) = args.pixel else {
         let needs = {
             let args = args.clone();
-            signals::unless_stopped(move || needs::find(&args.of, args.threads.count()))?
+            signals::unless_stopped(move || ablation::find(&args.of, args.threads.count()))?
         };
-        return say(&if args.json { needs::json(&needs) } else { needs::text(&needs) });
+        return say(&if args.json { ablation::json(&needs) } else { ablation::text(&needs) });
     };
     let found = {
         let args = args.clone();

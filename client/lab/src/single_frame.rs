@@ -1,18 +1,18 @@
 //! One view of one volume, for commands that look closely at a single picture: `error` and
 //! `explain`.
 
-use crate::fail::Fail;
-use crate::front::choose::settle;
-use crate::front::magnify::magnified;
-use crate::local::{self, Bricks, Cut};
-use crate::request::{Opened, PictureOf};
-use crate::stage::Stage;
+use crate::autotune::choose::settle;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::view::View;
 use slabcast_render::judge::reference::Reference;
 use slabcast_render::{Frame, Scene};
+use slabcast_session::direct::{self, Bricks, Cut};
+use slabcast_session::fail::Fail;
+use slabcast_session::magnify::magnified;
+use slabcast_session::path_scenes::Stage;
+use slabcast_session::request::{Opened, PictureOf};
 use std::sync::Arc;
 
 /// The first view of a path, ready to be drawn and judged.
@@ -34,7 +34,7 @@ impl Still {
         threads: usize,
         check: impl FnOnce([u32; 2]) -> Result<(), Fail>,
     ) -> Result<Still, Fail> {
-        let mut asked = of.look.aimed(Work::default())?;
+        let mut asked = of.look.asked_or_target(Work::default())?;
         check(asked.path.size)?;
         let Opened { volume, info, orientation } = of.open(&asked)?;
         let volume = Arc::new(volume);
@@ -63,7 +63,7 @@ impl Still {
     }
 
     fn draw_frame(&self, frame: &Frame, threads: usize) -> Picture {
-        let picture = local::picture(frame, &self.bricks, Cut::on(threads));
+        let picture = direct::picture(frame, &self.bricks, Cut::on(threads));
         magnified(picture, self.magnify, threads)
     }
 

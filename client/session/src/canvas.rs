@@ -1,12 +1,12 @@
 //! A small drawing board for pictures about pictures: fills, pictures side by side, a scale of
 //! colours, and words in a font of dots.
 
-use crate::output::png::plain;
+use crate::software::{SOFTWARE, io_error};
 use slabcast_common::image::{Background, Picture, PixelFormat};
 use std::io::Write;
 
 /// Viridis at tenths (matplotlib, CC0): ascends evenly in lightness, also for the colour-blind.
-pub(crate) const VIRIDIS: [[u8; 3]; 11] = [
+pub const VIRIDIS: [[u8; 3]; 11] = [
     [68, 1, 84],
     [72, 36, 117],
     [65, 68, 135],
@@ -20,14 +20,15 @@ pub(crate) const VIRIDIS: [[u8; 3]; 11] = [
     [253, 231, 37],
 ];
 /// What lies under everything.
-pub(crate) const PAPER: [u8; 3] = [24; 3];
-pub(crate) const WHITE: [u8; 3] = [255; 3];
+pub const PAPER: [u8; 3] = [24; 3];
+/// White, for text.
+pub const WHITE: [u8; 3] = [255; 3];
 /// Height and width of a letter's cell, in dots.
-pub(crate) const LINE: usize = 9;
+pub const LINE: usize = 9;
 const CELL: usize = 6;
 
 /// Viridis at `t` from 0 to 1.
-pub(crate) fn viridis(t: f64) -> [u8; 3] {
+pub fn viridis(t: f64) -> [u8; 3] {
     let at = t.clamp(0.0, 1.0) * 10.0;
     let i = (at as usize).min(9);
     let t = at - i as f64;
@@ -38,18 +39,21 @@ pub(crate) fn viridis(t: f64) -> [u8; 3] {
 }
 
 /// 8-bit sRGB, row-major.
-pub(crate) struct Canvas {
-    pub(crate) size: [usize; 2],
-    pub(crate) bytes: Vec<u8>,
+pub struct Canvas {
+    /// Width and height in pixels.
+    pub size: [usize; 2],
+    /// Three bytes a pixel, sRGB, row-major from the top left.
+    pub bytes: Vec<u8>,
 }
 
 impl Canvas {
-    pub(crate) fn new(size: [usize; 2]) -> Canvas {
+    /// Returns a board of `size` pixels filled with [`PAPER`].
+    pub fn new(size: [usize; 2]) -> Canvas {
         Canvas { size, bytes: PAPER.repeat(size[0] * size[1]) }
     }
 
     /// Fills a rectangle; what lies outside is left out.
-    pub(crate) fn fill(&mut self, [x, y]: [usize; 2], [w, h]: [usize; 2], colour: [u8; 3]) {
+    pub fn fill(&mut self, [x, y]: [usize; 2], [w, h]: [usize; 2], colour: [u8; 3]) {
         for y in y..(y + h).min(self.size[1]) {
             for x in x..(x + w).min(self.size[0]) {
                 let i = (y * self.size[0] + x) * 3;
@@ -59,14 +63,14 @@ impl Canvas {
     }
 
     /// Puts rows of RGB, `w` pixels each, with their top left corner at `x`, `y`; they must fit.
-    pub(crate) fn put(&mut self, [x, y]: [usize; 2], w: usize, rgb: &[u8]) {
+    pub fn put(&mut self, [x, y]: [usize; 2], w: usize, rgb: &[u8]) {
         for (j, row) in rgb.chunks_exact(w * 3).enumerate() {
             self.bytes[((y + j) * self.size[0] + x) * 3..][..w * 3].copy_from_slice(row);
         }
     }
 
     /// Puts a picture, over black where it is transparent.
-    pub(crate) fn picture(&mut self, at: [usize; 2], picture: &Picture, background: Background) {
+    pub fn picture(&mut self, at: [usize; 2], picture: &Picture, background: Background) {
         let behind = match background {
             Background::Transparent => Background::Colour([0.0; 3]),
             colour => colour,
@@ -76,7 +80,7 @@ impl Canvas {
     }
 
     /// Writes a line; each dot is `dot` pixels wide. Characters that the font lacks are left blank.
-    pub(crate) fn text(&mut self, [x, y]: [usize; 2], dot: usize, text: &str, colour: [u8; 3]) {
+    pub fn text(&mut self, [x, y]: [usize; 2], dot: usize, text: &str, colour: [u8; 3]) {
         for (n, c) in text.chars().enumerate() {
             let Some(glyph) = (c as usize).checked_sub(32).and_then(|i| FONT.get(i)) else {
                 continue;
@@ -91,29 +95,25 @@ impl Canvas {
     }
 
     /// As a PNG, with words about it.
-    pub(crate) fn png(
-        &self,
-        out: &mut impl Write,
-        about: &[(&str, String)],
-    ) -> std::io::Result<()> {
+    pub fn png(&self, out: &mut impl Write, about: &[(&str, String)]) -> std::io::Result<()> {
         let [w, h] = self.size.map(|n| n as u32);
         let mut png = png::Encoder::new(out, w, h);
         png.set_color(png::ColorType::Rgb);
         png.set_depth(png::BitDepth::Eight);
         png.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
         png.set_compression(png::Compression::Balanced);
-        png.add_text_chunk("Software".into(), crate::output::SOFTWARE.into()).map_err(plain)?;
+        png.add_text_chunk("Software".into(), SOFTWARE.into()).map_err(io_error)?;
         for (key, text) in about {
-            png.add_text_chunk((*key).into(), text.clone()).map_err(plain)?;
+            png.add_text_chunk((*key).into(), text.clone()).map_err(io_error)?;
         }
-        let mut png = png.write_header().map_err(plain)?;
-        png.write_image_data(&self.bytes).map_err(plain)?;
-        png.finish().map_err(plain)
+        let mut png = png.write_header().map_err(io_error)?;
+        png.write_image_data(&self.bytes).map_err(io_error)?;
+        png.finish().map_err(io_error)
     }
 }
 
 /// Width of a line of text in pixels.
-pub(crate) fn width(text: &str, dot: usize) -> usize {
+pub fn width(text: &str, dot: usize) -> usize {
     (text.chars().count() * CELL).saturating_sub(1) * dot
 }
 

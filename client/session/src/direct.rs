@@ -21,39 +21,39 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// How a picture is cut. Never changes a byte.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Cut {
+pub struct Cut {
     /// Threads.
-    pub(crate) threads: usize,
+    pub threads: usize,
     /// Edge of the tiles in pixels; any number.
-    pub(crate) tile: u32,
+    pub tile: u32,
     /// Slabs.
-    pub(crate) slabs: u32,
+    pub slabs: u32,
 }
 
 impl Cut {
     /// One slab, tiles of 128 pixels.
-    pub(crate) fn on(threads: usize) -> Cut {
+    pub fn on(threads: usize) -> Cut {
         Cut { threads, tile: 128, slabs: 1 }
     }
 }
 
 /// Bricks of a scene, by id, and what tells which of them lie where.
 #[derive(Clone)]
-pub(crate) struct Bricks {
+pub struct Bricks {
     all: Vec<Arc<Brick>>,
     directory: Arc<Directory>,
 }
 
 impl Bricks {
     /// Those of a store.
-    pub(crate) fn of(store: &BrickStore) -> Bricks {
+    pub fn of(store: &BrickStore) -> Bricks {
         let brick = |i: &BrickInfo| store.brick(i.id).expect("a brick that the store knows");
         let all = store.infos().iter().map(brick).collect();
         Bricks { all, directory: Arc::new(Directory::new(store.infos().clone())) }
     }
 
     /// The directory of them.
-    pub(crate) fn directory(&self) -> &Arc<Directory> {
+    pub fn directory(&self) -> &Arc<Directory> {
         &self.directory
     }
 }
@@ -73,17 +73,17 @@ impl BrickSupply for Bricks {
 }
 
 /// A whole frame by the tile renderer.
-pub(crate) fn picture(frame: &Frame, bricks: &Bricks, cut: Cut) -> Picture {
+pub fn picture(frame: &Frame, bricks: &Bricks, cut: Cut) -> Picture {
     counted_picture(frame, bricks, cut).0
 }
 
 /// A whole frame by the tile renderer, and what it took.
-pub(crate) fn counted_picture(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
+pub fn counted_picture(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
     if cut.slabs > 1 { in_slabs(frame, bricks, cut) } else { through(frame, bricks, cut) }
 }
 
 /// Tiles of a picture, row by row.
-pub(crate) fn tiles(whole: Rect, edge: u32) -> impl Iterator<Item = Rect> {
+pub fn tiles(whole: Rect, edge: u32) -> impl Iterator<Item = Rect> {
     let (step, edge) = (edge as usize, edge as i32);
     let corners = (0..whole.y1)
         .step_by(step)
@@ -200,7 +200,7 @@ const PROJECTED: usize = 512;
 
 /// `work` for each of `n` items on `threads` threads; results in order. Each thread has an `S`
 /// of its own. Not to be called inside `work`.
-pub(crate) fn shared<S: Default, T: Send>(
+pub fn shared<S: Default, T: Send>(
     n: usize,
     threads: usize,
     work: impl Fn(usize, &mut S) -> T + Sync,
@@ -244,7 +244,7 @@ const PORTION: usize = 64;
 
 /// What `pixel` says of each of `sample`, in portions, so that there is something to see
 /// meanwhile. `before` pixels of the progress were done earlier.
-pub(crate) fn judge<T: Send>(
+pub fn judge<T: Send>(
     sample: &[[u32; 2]],
     threads: usize,
     (progress, before): (&mut Progress, usize),

@@ -4,6 +4,7 @@
 //! (DESIGN.md section 2). Bricks are shared, not copied.
 
 use crate::fail::Fail;
+use crate::machine::cores;
 use crate::output::Frame;
 use crate::progress::Step;
 use crate::request::Asked;
@@ -37,16 +38,16 @@ const SILENCE: u64 = 86_400_000_000;
 
 /// What embedded workers are like.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Crew {
+pub struct Crew {
     /// Workers.
-    pub(crate) workers: u32,
+    pub workers: u32,
     /// Render threads of each.
-    pub(crate) threads: u32,
+    pub threads: u32,
 }
 
 impl Crew {
     /// `workers` workers of `threads` threads, or of their share of this machine's cores.
-    pub(crate) fn new(workers: u32, threads: Option<u32>) -> Result<Self, Fail> {
+    pub fn new(workers: u32, threads: Option<u32>) -> Result<Self, Fail> {
         let threads = threads.unwrap_or_else(|| (cores() / workers).max(1));
         if workers * threads > 4096 {
             return Err(Fail::usage(format!(
@@ -65,13 +66,8 @@ impl std::fmt::Display for Crew {
     }
 }
 
-/// Cores that this process may use.
-pub(crate) fn cores() -> u32 {
-    std::thread::available_parallelism().map_or(1, |n| n.get().min(1024) as u32)
-}
-
 /// A small cluster in this process.
-pub(crate) struct Cluster {
+pub struct Cluster {
     master: Master,
     stop: watch::Sender<bool>,
     workers: JoinSet<Result<Ended, std::io::Error>>,
@@ -79,7 +75,7 @@ pub(crate) struct Cluster {
 
 impl Cluster {
     /// Starts it. Must be called inside a tokio runtime.
-    pub(crate) fn start(
+    pub fn start(
         volume: impl Into<Arc<Volume>>,
         orientation: Orientation,
         crew: Crew,
@@ -111,12 +107,12 @@ impl Cluster {
     }
 
     /// A way to speak to its master.
-    pub(crate) fn handle(&self) -> Handle {
+    pub fn handle(&self) -> Handle {
         self.master.handle()
     }
 
     /// Waits for a worker to end before it was told to, which should not happen; says why.
-    pub(crate) async fn trouble(&mut self) -> Fail {
+    pub async fn trouble(&mut self) -> Fail {
         let why = match self.workers.join_next().await {
             None => return std::future::pending().await,
             Some(Ok(Ok(Ended::Refused(reason)))) => reason,
@@ -130,7 +126,7 @@ impl Cluster {
 
     /// Ends master and workers. The master first: it says goodbye, so that nobody takes the
     /// workers for lost.
-    pub(crate) async fn end(mut self) {
+    pub async fn end(mut self) {
         let leave = async {
             self.master.shutdown().await;
             while self.workers.join_next().await.is_some() {}
@@ -141,18 +137,14 @@ impl Cluster {
 }
 
 /// A master that runs, or why the system does not let it.
-pub(crate) fn start_master(config: MasterConfig) -> Result<Master, Fail> {
+pub fn start_master(config: MasterConfig) -> Result<Master, Fail> {
     Master::start(config).map_err(|e| {
         Fail::failed(format!("starting the master's threads failed: {}", crate::fail::reason(&e)))
     })
 }
 
 /// Submits a path to a master of this process and follows it.
-pub(crate) async fn submit(
-    handle: &Handle,
-    asked: &Asked,
-    request: PathRequest,
-) -> Result<Source, Fail> {
+pub async fn submit(handle: &Handle, asked: &Asked, request: PathRequest) -> Result<Source, Fail> {
     let job = handle.submit(request).await.map_err(|e| match e {
         SubmitError::Refused(refused) => asked.blame(&refused),
         other => Fail::failed(format!("the master of this process takes no job: {other:?}")),
@@ -204,5 +196,9 @@ pub(crate) async fn submit(
             }
         }
     });
-    Ok(Source { updates, cancel: Cancel::Embedded(handle.clone(), job) })
+    let handle = handle.clone();
+    let cancel = Cancel::new(async move {
+        handle.cancel(job).await;
+    });
+    Ok(Source { updates, cancel })
 }

@@ -5,7 +5,7 @@
 //! written order of operations, like all that decides pixels; libraries for this choose theirs by
 //! the machine, or take as long as drawing does.
 
-use crate::local;
+use crate::direct;
 use slabcast_common::image::Picture;
 
 /// Rows that a thread magnifies at a time.
@@ -13,7 +13,7 @@ const ROWS: usize = 32;
 
 /// `small`, `factor` times as large along each edge, on so many threads. Colours are kept between
 /// nothing and their alpha, alpha between nothing and one.
-pub(crate) fn magnified(small: Picture, factor: u32, threads: usize) -> Picture {
+pub fn magnified(small: Picture, factor: u32, threads: usize) -> Picture {
     if factor == 1 {
         return small;
     }
@@ -22,7 +22,7 @@ pub(crate) fn magnified(small: Picture, factor: u32, threads: usize) -> Picture 
     let size = [small.size[0] * factor, small.size[1] * factor];
     let phases: Vec<(isize, [f32; 4])> = (0..by).map(|i| phase(i, by)).collect();
     let high = h * by;
-    let bands = local::shared(high.div_ceil(ROWS), threads, |band, _: &mut ()| {
+    let bands = direct::shared(high.div_ceil(ROWS), threads, |band, _: &mut ()| {
         let mut out = Vec::with_capacity(ROWS * w * by);
         let mut line = vec![[0.0f32; 4]; w];
         for y in band * ROWS..high.min((band + 1) * ROWS) {

@@ -7,7 +7,7 @@ use slabcast_common::transfer::NanLook;
 use slabcast_common::view::MAX_EDGE;
 
 /// A finite number.
-pub(crate) fn number(text: &str) -> Result<f64, String> {
+pub fn number(text: &str) -> Result<f64, String> {
     match text.trim().parse::<f64>() {
         Ok(x) if x.is_finite() => Ok(x),
         Ok(_) => Err("must be finite".into()),
@@ -16,7 +16,7 @@ pub(crate) fn number(text: &str) -> Result<f64, String> {
 }
 
 /// A finite number above zero.
-pub(crate) fn positive(text: &str) -> Result<f64, String> {
+pub fn positive(text: &str) -> Result<f64, String> {
     match number(text)? {
         x if x > 0.0 => Ok(x),
         _ => Err("give a number above 0".into()),
@@ -24,7 +24,7 @@ pub(crate) fn positive(text: &str) -> Result<f64, String> {
 }
 
 /// A number or a fraction (`1/512`).
-pub(crate) fn fraction(text: &str) -> Result<f64, String> {
+pub fn fraction(text: &str) -> Result<f64, String> {
     let bad = || "give a number or a fraction, like 0.002 or 1/512".to_string();
     let x = match text.split_once('/') {
         None => number(text).map_err(|_| bad())?,
@@ -40,7 +40,7 @@ pub(crate) fn fraction(text: &str) -> Result<f64, String> {
 }
 
 /// A time with its unit (`100ms`, `0.5s`), in milliseconds.
-pub(crate) fn time(text: &str) -> Result<f64, String> {
+pub fn time(text: &str) -> Result<f64, String> {
     let bad = || "give a time above 0 with its unit, like 100ms or 0.5s".to_string();
     let digits = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
     let (count, unit) = text.split_at(digits);
@@ -54,7 +54,7 @@ pub(crate) fn time(text: &str) -> Result<f64, String> {
 }
 
 /// `WxH` in pixels.
-pub(crate) fn size(text: &str) -> Result<[u32; 2], String> {
+pub fn size(text: &str) -> Result<[u32; 2], String> {
     let bad = || format!("give WIDTHxHEIGHT in pixels, 1 to {MAX_EDGE} each, like 512x512");
     let (w, h) = text.split_once(['x', 'X']).ok_or_else(bad)?;
     let edge = |t: &str| match t.parse::<u32>() {
@@ -65,7 +65,7 @@ pub(crate) fn size(text: &str) -> Result<[u32; 2], String> {
 }
 
 /// `transparent`, `black`, `white`, `R,G,B` in 0 to 1, or `#rrggbb`.
-pub(crate) fn background(text: &str) -> Result<Background, String> {
+pub fn background(text: &str) -> Result<Background, String> {
     let bad = "give transparent, R,G,B with numbers from 0 to 1 (like 0.1,0.1,0.2), or #rrggbb";
     match text {
         "transparent" => return Ok(Background::Transparent),
@@ -94,7 +94,7 @@ pub(crate) fn background(text: &str) -> Result<Background, String> {
 }
 
 /// Bytes: `512MiB`, `2GB`, `1073741824`. At least 16 MiB, at most 1 PiB.
-pub(crate) fn memory(text: &str) -> Result<u64, String> {
+pub fn memory(text: &str) -> Result<u64, String> {
     let bad = || "give bytes with a unit, from 16MiB to 1024TiB, like 512MiB or 2GiB".to_string();
     let digits = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
     let (count, unit) = text.split_at(digits);
@@ -136,17 +136,17 @@ fn host_port(text: &str, any_port: bool) -> Result<String, String> {
 }
 
 /// Where a master is.
-pub(crate) fn master(text: &str) -> Result<String, String> {
+pub fn master(text: &str) -> Result<String, String> {
     host_port(text, false)
 }
 
 /// Where a master listens.
-pub(crate) fn listen(text: &str) -> Result<String, String> {
+pub fn listen(text: &str) -> Result<String, String> {
     host_port(text, true)
 }
 
 /// A macrotile's edge, or `auto` for the quadtree to choose.
-pub(crate) fn tile(text: &str) -> Result<Tile, String> {
+pub fn tile(text: &str) -> Result<Tile, String> {
     match text {
         "auto" => Ok(Tile(None)),
         "16" | "32" | "64" | "128" | "256" => Ok(Tile(text.parse().ok())),
@@ -157,10 +157,10 @@ pub(crate) fn tile(text: &str) -> Result<Tile, String> {
 /// Edge of a macrotile; `None` is `auto`. (A type of its own: clap takes a bare `Option` for a
 /// flag that may be left out.)
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Tile(pub(crate) Option<u32>);
+pub struct Tile(pub Option<u32>);
 
 /// A worker's name: what fits a line of a table.
-pub(crate) fn worker_name(text: &str) -> Result<String, String> {
+pub fn worker_name(text: &str) -> Result<String, String> {
     if (1..=100).contains(&text.len()) && !text.chars().any(char::is_control) {
         Ok(text.into())
     } else {
@@ -169,13 +169,13 @@ pub(crate) fn worker_name(text: &str) -> Result<String, String> {
 }
 
 /// Three sizes, `AxBxC`.
-pub(crate) fn dims(text: &str) -> Result<[u64; 3], String> {
+pub fn dims(text: &str) -> Result<[u64; 3], String> {
     three(text, |n: &u64| (1..=16384).contains(n))
         .ok_or_else(|| "give AxBxC, like 256x256x128, each from 1 to 16384".into())
 }
 
 /// Three lengths, `AxBxC`.
-pub(crate) fn spacing(text: &str) -> Result<[f64; 3], String> {
+pub fn spacing(text: &str) -> Result<[f64; 3], String> {
     three(text, |x: &f64| x.is_normal() && *x > 0.0)
         .ok_or_else(|| "give three lengths above 0 as AxBxC, like 0.5x0.5x1.25".into())
 }
@@ -186,7 +186,7 @@ fn three<T: std::str::FromStr>(text: &str, good: impl Fn(&T) -> bool) -> Option<
 }
 
 /// The type of raw numbers.
-pub(crate) fn number_type(text: &str) -> Result<String, String> {
+pub fn number_type(text: &str) -> Result<String, String> {
     let types = slabcast_volumes::RawHints::TYPES;
     match slabcast_volumes::RawHints::default().with_type(text) {
         Some(_) => Ok(text.into()),
@@ -195,7 +195,7 @@ pub(crate) fn number_type(text: &str) -> Result<String, String> {
 }
 
 /// `little` or `big`; true is big.
-pub(crate) fn byte_order(text: &str) -> Result<bool, String> {
+pub fn byte_order(text: &str) -> Result<bool, String> {
     match text {
         "little" => Ok(false),
         "big" => Ok(true),
@@ -204,7 +204,7 @@ pub(crate) fn byte_order(text: &str) -> Result<bool, String> {
 }
 
 /// `on` or `off`.
-pub(crate) fn on_off(text: &str) -> Result<bool, String> {
+pub fn on_off(text: &str) -> Result<bool, String> {
     match text {
         "on" => Ok(true),
         "off" => Ok(false),
@@ -214,10 +214,10 @@ pub(crate) fn on_off(text: &str) -> Result<bool, String> {
 
 /// Numbers of workers, ascending.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Workers(pub(crate) Vec<u32>);
+pub struct Workers(pub Vec<u32>);
 
 /// `16`, `1..64`, `1,2,4,8` or a mixture.
-pub(crate) fn workers(text: &str) -> Result<Workers, String> {
+pub fn workers(text: &str) -> Result<Workers, String> {
     let bad = || "give numbers from 1 to 1024, as 1..64 or 1,2,4,8".to_string();
     let number = |t: &str| {
         let n = t.trim().parse::<u32>().ok();
@@ -243,7 +243,7 @@ pub(crate) fn workers(text: &str) -> Result<Workers, String> {
 
 /// Bits a second; `None`: no limit.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Rate(pub(crate) Option<f64>);
+pub struct Rate(pub Option<f64>);
 
 impl std::fmt::Display for Rate {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
@@ -256,7 +256,7 @@ impl std::fmt::Display for Rate {
 }
 
 /// `1gbit`, `2.5gbit`, `100mbit` or `unlimited`.
-pub(crate) fn link(text: &str) -> Result<Rate, String> {
+pub fn link(text: &str) -> Result<Rate, String> {
     let bad = || "give a rate, as 1gbit, 10gbit or 100mbit, or unlimited".to_string();
     if text == "unlimited" {
         return Ok(Rate(None));
@@ -273,7 +273,7 @@ pub(crate) fn link(text: &str) -> Result<Rate, String> {
 }
 
 /// `100us`, `1.5ms`, `0`: in nanoseconds.
-pub(crate) fn latency(text: &str) -> Result<u64, String> {
+pub fn latency(text: &str) -> Result<u64, String> {
     let bad = || "give a time, as 50us or 1ms, at most 10s".to_string();
     let (digits, unit) = match text {
         "0" => ("0", 1.0),
@@ -288,7 +288,7 @@ pub(crate) fn latency(text: &str) -> Result<u64, String> {
 
 /// How many pixels are looked at.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Pixels {
+pub enum Pixels {
     /// Each.
     All,
     /// A sample of so many; each if there are no more.
@@ -297,7 +297,7 @@ pub(crate) enum Pixels {
 
 impl Pixels {
     /// How many of a picture of this size.
-    pub(crate) fn count(self, size: [u32; 2]) -> usize {
+    pub fn count(self, size: [u32; 2]) -> usize {
         let all = size[0] as usize * size[1] as usize;
         match self {
             Pixels::All => all,
@@ -307,7 +307,7 @@ impl Pixels {
 }
 
 /// A number of pixels, or `all`.
-pub(crate) fn pixels(text: &str) -> Result<Pixels, String> {
+pub fn pixels(text: &str) -> Result<Pixels, String> {
     match text.parse::<u32>() {
         _ if text == "all" => Ok(Pixels::All),
         Ok(n) if n > 0 => Ok(Pixels::Some(n)),
@@ -316,7 +316,7 @@ pub(crate) fn pixels(text: &str) -> Result<Pixels, String> {
 }
 
 /// A pixel, `X,Y` from the top left.
-pub(crate) fn pixel(text: &str) -> Result<[u32; 2], String> {
+pub fn pixel(text: &str) -> Result<[u32; 2], String> {
     let bad = || "give a pixel as X,Y, from 0,0 at the top left".to_string();
     let (x, y) = text.split_once(',').ok_or_else(bad)?;
     let number = |t: &str| t.trim().parse::<u32>().map_err(|_| bad());
@@ -324,7 +324,7 @@ pub(crate) fn pixel(text: &str) -> Result<[u32; 2], String> {
 }
 
 /// A file for a PNG.
-pub(crate) fn png(text: &str) -> Result<std::path::PathBuf, String> {
+pub fn png(text: &str) -> Result<std::path::PathBuf, String> {
     let path = std::path::PathBuf::from(text);
     match path.extension() {
         Some(e) if e.eq_ignore_ascii_case("png") => Ok(path),
@@ -334,7 +334,7 @@ pub(crate) fn png(text: &str) -> Result<std::path::PathBuf, String> {
 
 /// How many frames, or which.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Frames {
+pub enum Frames {
     /// As many.
     Count(u32),
     /// The first and the last, both wanted.
@@ -342,7 +342,7 @@ pub(crate) enum Frames {
 }
 
 /// `18` or `30..60`.
-pub(crate) fn frames(text: &str) -> Result<Frames, String> {
+pub fn frames(text: &str) -> Result<Frames, String> {
     let bad =
         || format!("give 1..={MAX_FRAMES} frames, or the first and last wanted, as in 30..60");
     let number = |t: &str| {
@@ -361,7 +361,7 @@ pub(crate) fn frames(text: &str) -> Result<Frames, String> {
 }
 
 /// `head` or `X,Y,Z`.
-pub(crate) fn light(text: &str) -> Result<Light, String> {
+pub fn light(text: &str) -> Result<Light, String> {
     if text == "head" {
         return Ok(Light::Head(HeadWord::Head));
     }
@@ -375,7 +375,7 @@ pub(crate) fn light(text: &str) -> Result<Light, String> {
 }
 
 /// `COLOUR` or `COLOUR:OPACITY`.
-pub(crate) fn nan(text: &str) -> Result<NanLook, String> {
+pub fn nan(text: &str) -> Result<NanLook, String> {
     let bad = || {
         "give a colour, R,G,B (0 to 1) or #rrggbb, and after a colon its opacity (0 to 1)"
             .to_string()

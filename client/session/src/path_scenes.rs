@@ -2,22 +2,68 @@
 //! `render --show` share. Each frame is what a cluster would draw, also where transfer functions
 //! change on the way.
 
-use crate::check::shot::Drawn;
+use crate::direct::Bricks;
 use crate::fail::Fail;
-use crate::local::Bricks;
 use crate::request::Asked;
+use slabcast_common::ids::SceneId;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::path::Orientation;
 use slabcast_common::quality::Quality;
+use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::tween::Tween;
 use slabcast_common::view::View;
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_common::wanted::Wanted;
 use slabcast_render::{Frame, Scene};
+use slabcast_volumes::BrickStore;
 use std::sync::Arc;
 
+/// A scene's specification and all its bricks.
+#[derive(Clone)]
+pub struct Drawn {
+    /// Specification, sums decided.
+    pub spec: SceneSpec,
+    /// All bricks of the scene.
+    pub bricks: Bricks,
+}
+
+impl Drawn {
+    /// Cuts the bricks of `volume` under `transfer`, and decides the sums, as the master does.
+    pub fn new(
+        volume: &Volume,
+        info: &VolumeInfo,
+        transfer: &TransferFunction,
+        quality: Quality,
+    ) -> Result<Drawn, Fail> {
+        let wanted = Wanted::of(transfer, info, quality.compositing);
+        Drawn::holding(volume, info, transfer, quality, &wanted)
+    }
+
+    /// The same with bricks that hold what is wanted.
+    pub fn holding(
+        volume: &Volume,
+        info: &VolumeInfo,
+        transfer: &TransferFunction,
+        quality: Quality,
+        wanted: &Wanted,
+    ) -> Result<Drawn, Fail> {
+        let classifier = Classifier::new(transfer, info, quality.compositing);
+        let sums = classifier.sums(&quality, &info.lattice).map_err(|e| Fail::flag(&e))?;
+        let store = BrickStore::build(volume, info.digest, wanted);
+        let bricks = Bricks::of(&store);
+        let spec = SceneSpec {
+            id: SceneId(0),
+            volume: info.clone(),
+            transfer: transfer.clone(),
+            quality: Quality { sums, ..quality },
+            bricks: store.key(),
+        };
+        Ok(Drawn { spec, bricks })
+    }
+}
+
 /// A path's bricks, scenes and views.
-pub(crate) struct Stage {
+pub struct Stage {
     asked: Asked,
     orientation: Orientation,
     /// Of all frames, or of those of a tween but for the transfer function.
@@ -26,12 +72,12 @@ pub(crate) struct Stage {
     /// What frames share if there is no tween: they keep footprints in it.
     shared: Arc<Scene>,
     /// Enough for all frames.
-    pub(crate) bricks: Bricks,
+    pub bricks: Bricks,
 }
 
 impl Stage {
     /// Cuts the bricks of a volume, which fits what is asked.
-    pub(crate) fn new(
+    pub fn new(
         volume: &Volume,
         info: &VolumeInfo,
         asked: &Asked,
@@ -51,14 +97,14 @@ impl Stage {
     }
 
     /// What frame `i` of those that are wanted is drawn with; sums decided.
-    pub(crate) fn spec(&self, i: usize) -> SceneSpec {
+    pub fn spec(&self, i: usize) -> SceneSpec {
         let Some(tween) = &self.tween else { return self.base.clone() };
         let at = (self.asked.path.first_frame() + i) as f64;
         tween.scene(&self.base, self.asked.quality.sums, at)
     }
 
     /// The same, made ready.
-    pub(crate) fn scene(&self, i: usize) -> Arc<Scene> {
+    pub fn scene(&self, i: usize) -> Arc<Scene> {
         match self.tween {
             None => self.shared.clone(),
             Some(_) => Arc::new(Scene::new(&self.spec(i))),
@@ -66,17 +112,12 @@ impl Stage {
     }
 
     /// The view of frame `i` at a quality.
-    pub(crate) fn view(&self, i: usize, quality: &Quality) -> Result<View, Fail> {
+    pub fn view(&self, i: usize, quality: &Quality) -> Result<View, Fail> {
         self.view_of(i, quality, self.asked.path.size)
     }
 
     /// The same in a picture of another size.
-    pub(crate) fn view_of(
-        &self,
-        i: usize,
-        quality: &Quality,
-        size: [u32; 2],
-    ) -> Result<View, Fail> {
+    pub fn view_of(&self, i: usize, quality: &Quality, size: [u32; 2]) -> Result<View, Fail> {
         let lattice = &self.base.volume.lattice;
         let camera = self.asked.path.camera(i, lattice, self.orientation);
         let view = camera.and_then(|c| View::new(lattice, &c, size, quality));
@@ -84,21 +125,17 @@ impl Stage {
     }
 
     /// Whether frames have transfer functions of their own.
-    pub(crate) fn is_tween(&self) -> bool {
+    pub fn is_tween(&self) -> bool {
         self.tween.is_some()
     }
 
     /// Tables of frame `i`.
-    pub(crate) fn frame(&self, i: usize) -> Result<Frame, Fail> {
+    pub fn frame(&self, i: usize) -> Result<Frame, Fail> {
         Ok(Frame::new(self.scene(i), self.view(i, &self.base.quality)?))
     }
 
     /// The same at another quality.
-    pub(crate) fn other(
-        &self,
-        i: usize,
-        change: impl FnOnce(Quality) -> Quality,
-    ) -> Result<Frame, Fail> {
+    pub fn other(&self, i: usize, change: impl FnOnce(Quality) -> Quality) -> Result<Frame, Fail> {
         let spec = self.spec(i);
         let quality = change(spec.quality);
         let scene = Arc::new(Scene::new(&SceneSpec { quality, ..spec }));
@@ -109,7 +146,7 @@ impl Stage {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::local::{self, Cut};
+    use crate::direct::{self, Cut};
     use slabcast_common::path::ViewPath;
 
     #[test]
@@ -120,7 +157,7 @@ mod tests {
         let picture = |path: &str, tf: &str, i: usize| {
             let asked = Asked::plain(ViewPath::from_json(path).unwrap(), tf).unwrap();
             let stage = Stage::new(&volume, &info, &asked, o).unwrap();
-            local::picture(&stage.frame(i).unwrap(), &stage.bricks, Cut::on(2)).sha256()
+            direct::picture(&stage.frame(i).unwrap(), &stage.bricks, Cut::on(2)).sha256()
         };
         let path = |range: &str| {
             format!(

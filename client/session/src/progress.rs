@@ -3,7 +3,7 @@
 //! On a terminal: one bar that moves with the macrotiles of the frame at hand. Elsewhere: a
 //! line now and then, so that a log of a long run stays short.
 
-use crate::style;
+use crate::terminal;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::io::Write;
 use std::sync::OnceLock;
@@ -17,7 +17,7 @@ const PLAIN_EVERY: Duration = Duration::from_secs(5);
 fn terminal() -> &'static MultiProgress {
     static ALL: OnceLock<MultiProgress> = OnceLock::new();
     ALL.get_or_init(|| {
-        let target = if style::terminal() {
+        let target = if terminal::terminal() {
             ProgressDrawTarget::stderr_with_hz(10)
         } else {
             ProgressDrawTarget::hidden()
@@ -27,50 +27,50 @@ fn terminal() -> &'static MultiProgress {
 }
 
 /// Writes to stderr without tearing a bar. A stderr that is gone is nobody's concern.
-pub(crate) fn write_on_stderr(bytes: &[u8]) {
+pub fn write_on_stderr(bytes: &[u8]) {
     terminal().suspend(|| {
         let _ = std::io::stderr().lock().write_all(bytes);
     });
 }
 
 /// A line on stderr.
-pub(crate) fn say_on_stderr(line: &str) {
+pub fn say_on_stderr(line: &str) {
     write_on_stderr(format!("{line}\n").as_bytes());
 }
 
 /// Takes all bars away: the command ends.
-pub(crate) fn end() {
+pub fn end() {
     // A terminal that is gone is nobody's concern.
     let _ = terminal().clear();
 }
 
 /// `warning: ...` on stderr.
-pub(crate) fn warn(line: &str) {
-    say_on_stderr(&format!("{} {}", style::warning(), crate::fail::one_line(line)));
+pub fn warn(line: &str) {
+    say_on_stderr(&format!("{} {}", terminal::warning(), crate::terminal::one_line(line)));
 }
 
 /// `note: ...` on stderr.
-pub(crate) fn note(line: &str) {
-    say_on_stderr(&format!("{} {}", style::note(), crate::fail::one_line(line)));
+pub fn note(line: &str) {
+    say_on_stderr(&format!("{} {}", terminal::note(), crate::terminal::one_line(line)));
 }
 
 /// Where a run is.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct Step {
+pub struct Step {
     /// What it waits for; empty while frames are rendered.
-    pub(crate) waiting: String,
+    pub waiting: String,
     /// Frames rendered.
-    pub(crate) frames: u64,
+    pub frames: u64,
     /// Macrotiles of the slab at hand, done and in all; (0, 0) where that is not known.
-    pub(crate) tiles: (u32, u32),
+    pub tiles: (u32, u32),
     /// Slab at hand (from 0) and slabs of the frame at hand.
-    pub(crate) slab: (u32, u32),
+    pub slab: (u32, u32),
     /// The same in the master's words, where it has no numbers.
-    pub(crate) detail: String,
+    pub detail: String,
 }
 
 /// The progress of one run.
-pub(crate) struct Progress {
+pub struct Progress {
     /// What is counted: `frame`.
     noun: &'static str,
     total: u64,
@@ -84,9 +84,9 @@ pub(crate) struct Progress {
 
 impl Progress {
     /// Begins. `quiet` shows nothing but warnings.
-    pub(crate) fn new(quiet: bool) -> Self {
+    pub fn new(quiet: bool) -> Self {
         let now = Instant::now();
-        let bar = (style::terminal() && !quiet).then(|| {
+        let bar = (terminal::terminal() && !quiet).then(|| {
             let bar = terminal().add(ProgressBar::new_spinner());
             bar.enable_steady_tick(Duration::from_millis(120));
             bar
@@ -104,24 +104,24 @@ impl Progress {
     }
 
     /// Counts something else than frames.
-    pub(crate) fn of(mut self, noun: &'static str) -> Self {
+    pub fn of(mut self, noun: &'static str) -> Self {
         self.noun = noun;
         self
     }
 
     /// Something that takes a while before the first frame (`reading brain.nii.gz`).
-    pub(crate) fn stage(&mut self, what: &str) {
+    pub fn stage(&mut self, what: &str) {
         if let Some(bar) = &self.bar {
             bar.set_message(what.to_string());
         }
     }
 
     /// Frames begin.
-    pub(crate) fn frames(&mut self, total: u64, what: &str) {
+    pub fn frames(&mut self, total: u64, what: &str) {
         self.total = total;
         self.began = Instant::now();
         if let Some(bar) = &self.bar {
-            let template = if style::colours() {
+            let template = if terminal::colours() {
                 "{prefix:32} [{bar:28.cyan/dim}] {wide_msg}"
             } else {
                 "{prefix:32} [{bar:28}] {wide_msg}"
@@ -139,7 +139,7 @@ impl Progress {
     }
 
     /// The run went on.
-    pub(crate) fn step(&mut self, step: Step) {
+    pub fn step(&mut self, step: Step) {
         if step.frames > 0 && self.first.is_none() {
             self.first = Some(Instant::now());
         }
@@ -205,12 +205,12 @@ impl Progress {
     }
 
     /// Writes something else meanwhile, without tearing the bar.
-    pub(crate) fn aside<T>(&self, write: impl FnOnce() -> T) -> T {
+    pub fn aside<T>(&self, write: impl FnOnce() -> T) -> T {
         terminal().suspend(write)
     }
 
     /// Takes the bar away.
-    pub(crate) fn end(&self) {
+    pub fn end(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
@@ -224,7 +224,7 @@ impl Drop for Progress {
 }
 
 /// A time as a person says it.
-pub(crate) fn time(d: Duration) -> String {
+pub fn time(d: Duration) -> String {
     let s = d.as_secs_f64();
     match s {
         _ if s < 1.0 => format!("{:.0} ms", s * 1e3),
@@ -235,7 +235,7 @@ pub(crate) fn time(d: Duration) -> String {
 }
 
 /// Bytes as a person says them.
-pub(crate) fn bytes(n: u64) -> String {
+pub fn bytes(n: u64) -> String {
     match n {
         0..1024 => format!("{n} B"),
         1024..1_048_576 => format!("{:.0} KiB", n as f64 / 1024.0),

@@ -4,7 +4,7 @@ use crate::fail::Fail;
 use crate::output::Frame;
 use crate::progress::Step;
 use crate::request::Asked;
-use crate::source::{self, Source, Update};
+use crate::source::{Cancel, Source, Update};
 use slabcast_client::{Client, ClientError, JobState, PATIENCE, VolumeDescription};
 use slabcast_common::message::PathRequest;
 use slabcast_common::quality::Refused;
@@ -21,7 +21,7 @@ const SILENCE: Duration = Duration::from_secs(5);
 const ANEW: u32 = 3;
 
 /// What a client's error says on a terminal.
-pub(crate) fn fail(e: &ClientError) -> Fail {
+pub fn fail(e: &ClientError) -> Fail {
     match e {
         ClientError::Address { .. } => Fail::usage(format!("--master: {e}")),
         _ => Fail::failed(e.to_string()),
@@ -29,12 +29,12 @@ pub(crate) fn fail(e: &ClientError) -> Fail {
 }
 
 /// A client that is connected.
-pub(crate) async fn connect(master: &str) -> Result<Client, Fail> {
+pub async fn connect(master: &str) -> Result<Client, Fail> {
     Client::connect(master).await.map_err(|e| fail(&e))
 }
 
 /// What the master serves.
-pub(crate) async fn describe(client: &Client) -> Result<VolumeDescription, Fail> {
+pub async fn describe(client: &Client) -> Result<VolumeDescription, Fail> {
     let served = client.volume().await.map_err(|e| fail(&e))?;
     if served.pixels_version != slabcast_common::PIXELS_VERSION {
         crate::progress::warn(&format!(
@@ -49,11 +49,7 @@ pub(crate) async fn describe(client: &Client) -> Result<VolumeDescription, Fail>
 }
 
 /// Submits a path and follows it.
-pub(crate) async fn submit(
-    client: Client,
-    asked: &Asked,
-    request: PathRequest,
-) -> Result<Source, Fail> {
+pub async fn submit(client: Client, asked: &Asked, request: PathRequest) -> Result<Source, Fail> {
     let job = client.submit(&request).await.map_err(|e| match &e {
         // The master's words begin with the field.
         ClientError::Refused { message } => match message.split_once(": ") {
@@ -64,13 +60,13 @@ pub(crate) async fn submit(
     })?;
     let (name, job_now) = watch::channel(job);
     let (to, updates) = mpsc::channel(1);
-    let cancel = Cancel { client: client.clone(), job: job_now };
+    let cancel = Cancel::new(cancel(client.clone(), job_now));
     tokio::spawn(async move {
         if let Err(e) = pump(&client, request, name, &to).await {
             let _ = to.send(Err(e)).await;
         }
     });
-    Ok(Source { updates, cancel: source::Cancel::Remote(cancel) })
+    Ok(Source { updates, cancel })
 }
 
 /// Passes a job's updates on until its last frame.
@@ -176,17 +172,10 @@ fn step(n: &slabcast_client::JobNotice, master: &str) -> Step {
     Step { waiting, detail, frames: n.frames_done, ..Step::default() }
 }
 
-/// How a job of a cluster is cancelled; its name changes when it is submitted anew.
-pub(crate) struct Cancel {
-    client: Client,
-    job: watch::Receiver<String>,
-}
-
-impl Cancel {
-    pub(crate) async fn now(self) {
-        let job = self.job.borrow().clone();
-        if let Err(e) = self.client.cancel(&job).await {
-            tracing::warn!(job, error = %e, "the job could not be cancelled");
-        }
+/// Cancels a job of a cluster. Its name changes when it is submitted anew; the last one counts.
+async fn cancel(client: Client, job: watch::Receiver<String>) {
+    let job = job.borrow().clone();
+    if let Err(e) = client.cancel(&job).await {
+        tracing::warn!(job, error = %e, "the job could not be cancelled");
     }
 }

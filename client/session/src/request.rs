@@ -5,9 +5,8 @@
 //! which names the flag (or the file and its field) that is to blame.
 
 use crate::fail::Fail;
-use crate::front::choose::Aim;
-use crate::output::provenance::Provenance;
 use crate::parse::{self, Frames, Tile};
+use crate::quality_target::QualityTarget;
 use crate::transfer::{LookFlags, Transfer, read_json};
 use crate::volume::InputArgs;
 use clap::builder::{PossibleValuesParser, TypedValueParser, ValueParser};
@@ -35,24 +34,24 @@ fn words<T: Copy + Send + Sync + 'static>(list: &'static [(&'static str, T)]) ->
 
 /// Which axes are up and front.
 #[derive(clap::Args, Clone, Debug)]
-pub(crate) struct AxisArgs {
+pub struct AxisArgs {
     /// World axis that is up: x, y or z with + or - [default: +z]
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
-    pub(crate) up: Option<Axis>,
+    pub up: Option<Axis>,
     /// World axis that faces the eye at azimuth 0 [default: +y, or +z where up lies along y; -y of
     /// a CT whose file has no anatomical axes, as slices are stored]
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
-    pub(crate) front: Option<Axis>,
+    pub front: Option<Axis>,
 }
 
 impl AxisArgs {
     /// Both, with defaults for what is missing.
-    pub(crate) fn orientation(&self) -> Result<Orientation, Fail> {
+    pub fn orientation(&self) -> Result<Orientation, Fail> {
         Orientation::new(self.up, self.front).map_err(|e| Fail::flag(&e))
     }
 
     /// Both, with the defaults that fit a volume.
-    pub(crate) fn of(&self, volume: &Volume) -> Result<Orientation, Fail> {
+    pub fn of(&self, volume: &Volume) -> Result<Orientation, Fail> {
         Orientation::of(self.up, self.front, &volume.summary, volume.anatomical)
             .map_err(|e| Fail::flag(&e))
     }
@@ -61,7 +60,7 @@ impl AxisArgs {
 /// Where the eye is.
 #[derive(clap::Args, Clone, Debug)]
 #[command(next_help_heading = "View path (a turn about the volume, unless --path)")]
-pub(crate) struct ViewArgs {
+pub struct ViewArgs {
     /// Azimuth of the first frame in degrees: 0 looks at the front
     #[arg(long, value_name = "DEG", default_value = "20", value_parser = parse::number,
           allow_negative_numbers = true)]
@@ -97,13 +96,14 @@ pub(crate) struct ViewArgs {
     /// Vertical, full field of view in degrees, of --projection persp [default: 30]
     #[arg(long, value_name = "DEG", value_parser = parse::positive, allow_negative_numbers = true)]
     fov: Option<f64>,
+    /// Which world axes are up and front.
     #[command(flatten)]
-    pub(crate) axes: AxisArgs,
+    pub axes: AxisArgs,
     /// Views, a turntable, key frames or a flight from a file instead; its size holds unless --size
     /// is given
     #[arg(long, value_name = "FILE.json", conflicts_with_all = [
         "start", "step", "azimuth", "view", "elevation", "height", "projection", "fov"])]
-    pub(crate) path: Option<PathBuf>,
+    pub path: Option<PathBuf>,
     /// Only what lies in a box: FROM:TO along x, y and z, in mm or in percent of the volume's box; an
     /// empty end does not crop (-40:40,:,50:)
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true)]
@@ -113,7 +113,7 @@ pub(crate) struct ViewArgs {
 /// What the picture shows.
 #[derive(clap::Args, Clone, Debug)]
 #[command(next_help_heading = "Picture")]
-pub(crate) struct PictureArgs {
+pub struct PictureArgs {
     /// Transfer function: a preset (auto, skin, bone, vessels, ...), a colour map (viridis, ...) or a
     /// JSON file, ours or ParaView's; `slabcast tf --list` has all names, `slabcast info VOLUME`
     /// shows what each preset would draw
@@ -127,13 +127,13 @@ pub(crate) struct PictureArgs {
     /// transparent, black, white, R,G,B (0 to 1) or #rrggbb
     #[arg(long, value_name = "COLOUR", default_value = "black", value_parser = parse::background,
           allow_hyphen_values = true)]
-    pub(crate) background: Background,
+    pub background: Background,
 }
 
 /// What decides the pixels.
 #[derive(clap::Args, Clone, Debug)]
 #[command(next_help_heading = "Quality (part of the pixels)")]
-pub(crate) struct QualityArgs {
+pub struct QualityArgs {
     /// Thickness of a sheet, in vox (the smallest sample spacing)
     #[arg(long, value_name = "VOX", default_value = "1.0", value_parser = parse::number,
           allow_negative_numbers = true)]
@@ -174,7 +174,7 @@ pub(crate) struct QualityArgs {
           action = clap::ArgAction::Set)]
     cull: bool,
     #[command(flatten)]
-    aim: Aim,
+    target: QualityTarget,
 }
 
 impl QualityArgs {
@@ -198,9 +198,10 @@ impl QualityArgs {
 
 /// Where from, what and how well: everything that decides a picture of a given volume.
 #[derive(clap::Args, Clone, Debug)]
-pub(crate) struct LookArgs {
+pub struct LookArgs {
+    /// Views or path.
     #[command(flatten)]
-    pub(crate) view: ViewArgs,
+    pub view: ViewArgs,
     #[command(flatten)]
     picture: PictureArgs,
     #[command(flatten)]
@@ -209,43 +210,45 @@ pub(crate) struct LookArgs {
 
 impl LookArgs {
     /// What the flags ask for, of a command that draws in the quality that is given.
-    pub(crate) fn asked(&self, work: Work) -> Result<Asked, Fail> {
-        let aim = &self.quality.aim;
-        if aim.is_empty() {
-            return self.aimed(work);
+    pub fn asked(&self, work: Work) -> Result<Asked, Fail> {
+        let target = &self.quality.target;
+        if target.is_empty() {
+            return self.asked_or_target(work);
         }
         Err(Fail::usage(format!(
             "{}: this command compares qualities that are given; leave it out (render, bench and \
              error choose by it)",
-            aim.flags()
+            target.flags()
         )))
     }
 
     /// The same where quality may still have to be chosen (`front::choose::settle`).
-    pub(crate) fn aimed(&self, work: Work) -> Result<Asked, Fail> {
+    pub fn asked_or_target(&self, work: Work) -> Result<Asked, Fail> {
         Asked::new(&self.view, &self.picture, &self.quality, work)
     }
 }
 
 /// A picture of a volume, for commands that look closely at one.
 #[derive(clap::Args, Clone, Debug)]
-pub(crate) struct PictureOf {
+pub struct PictureOf {
+    /// File, folder or formula of the volume.
     #[arg(help = crate::volume::VOLUME)]
-    pub(crate) volume: PathBuf,
+    pub volume: PathBuf,
+    /// Views, colours and quality.
     #[command(flatten)]
-    pub(crate) look: LookArgs,
+    pub look: LookArgs,
     #[command(flatten)]
     input: InputArgs,
 }
 
 impl PictureOf {
     /// Whether nothing is said of what is in the file.
-    pub(crate) fn input_is_empty(&self) -> bool {
+    pub fn input_is_empty(&self) -> bool {
         self.input.is_empty()
     }
 
     /// Opens the volume and sees whether what was asked for can be drawn of it.
-    pub(crate) fn open(&self, asked: &Asked) -> Result<Opened, Fail> {
+    pub fn open(&self, asked: &Asked) -> Result<Opened, Fail> {
         let volume = self.input.open(&self.volume)?;
         let orientation = self.look.view.axes.of(&volume)?;
         let info = volume.info(volume.digest());
@@ -255,16 +258,18 @@ impl PictureOf {
 }
 
 /// A volume that what was asked for can be drawn of.
-pub(crate) struct Opened {
-    pub(crate) volume: Volume,
+pub struct Opened {
+    /// The volume with its voxels.
+    pub volume: Volume,
     /// With its digest.
-    pub(crate) info: VolumeInfo,
-    pub(crate) orientation: Orientation,
+    pub info: VolumeInfo,
+    /// Axes that are up and front, flags and defaults resolved.
+    pub orientation: Orientation,
 }
 
 /// `--threads` of commands that draw in this process alone.
 #[derive(clap::Args, Clone, Debug)]
-pub(crate) struct ThreadArg {
+pub struct ThreadArg {
     /// Threads [default: all cores]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     threads: Option<u32>,
@@ -272,15 +277,15 @@ pub(crate) struct ThreadArg {
 
 impl ThreadArg {
     /// As many as asked for, or as there are cores.
-    pub(crate) fn count(&self) -> usize {
-        self.threads.unwrap_or_else(crate::embedded::cores) as usize
+    pub fn count(&self) -> usize {
+        self.threads.unwrap_or_else(crate::machine::cores) as usize
     }
 }
 
 /// How the work is cut.
 #[derive(clap::Args, Clone, Debug)]
 #[command(next_help_heading = "Work (never changes a pixel)")]
-pub(crate) struct WorkArgs {
+pub struct WorkArgs {
     /// Slabs a frame is cut into
     #[arg(long, value_name = "N", default_value = "3",
           value_parser = clap::value_parser!(u32).range(1..=1000))]
@@ -307,7 +312,7 @@ pub(crate) struct WorkArgs {
 
 /// What is kept although nothing needs it.
 #[derive(clap::Args, Clone, Debug, Default)]
-pub(crate) struct KeepArg {
+pub struct KeepArg {
     /// Keeps what the scene does not need, to see what leaving it out saves: in bricks empty (voxels that
     /// nothing shows), normals (that nothing shades), gradients (that modulate nothing); of a grey
     /// scene all three colours
@@ -331,7 +336,8 @@ enum Kept {
 }
 
 impl KeepArg {
-    pub(crate) fn keep(&self) -> Keep {
+    /// Returns what is kept in bricks.
+    pub fn keep(&self) -> Keep {
         let has = |kept| self.keep.contains(&kept);
         Keep {
             empty: has(Kept::Empty),
@@ -343,7 +349,11 @@ impl KeepArg {
 }
 
 impl WorkArgs {
-    pub(crate) fn work(&self) -> Result<Work, Fail> {
+    /// Returns how the work is cut.
+    ///
+    /// # Errors
+    /// A value is out of its range; the error names the flag.
+    pub fn work(&self) -> Result<Work, Fail> {
         let w = Work {
             slabs: self.slabs,
             tiles_per_worker: self.tiles_per_worker,
@@ -360,28 +370,34 @@ impl WorkArgs {
 
 /// A request as far as the command line tells it.
 #[derive(Clone, Debug)]
-pub(crate) struct Asked {
-    pub(crate) path: ViewPath,
-    pub(crate) path_file: Option<PathBuf>,
+pub struct Asked {
+    /// Views and size, the range of frames applied.
+    pub path: ViewPath,
+    /// File that the path was read from.
+    pub path_file: Option<PathBuf>,
     /// The axes that were given, if a side of the body was asked for.
     side: Option<AxisArgs>,
-    pub(crate) transfer: Transfer,
-    pub(crate) quality: Quality,
+    /// Colours and opacities.
+    pub transfer: Transfer,
+    /// What decides the pixels.
+    pub quality: Quality,
     /// What quality is to be chosen by, if anything.
-    pub(crate) aim: Aim,
+    pub target: QualityTarget,
     /// Pictures are magnified so many times; the path's size is what is drawn.
-    pub(crate) magnify: u32,
-    pub(crate) work: Work,
-    pub(crate) background: Background,
+    pub magnify: u32,
+    /// How the work is cut; never changes a pixel.
+    pub work: Work,
+    /// What lies behind transparent pixels.
+    pub background: Background,
     /// Statistics are to have the hash of the linear picture.
-    pub(crate) hashed: bool,
+    pub hashed: bool,
     /// Pictures are to say it of themselves, as they did once.
-    pub(crate) hash_inside: bool,
+    pub hash_inside: bool,
 }
 
 impl Asked {
     /// Everything that the flags say; refuses what is wrong in itself.
-    pub(crate) fn new(
+    pub fn new(
         view: &ViewArgs,
         picture: &PictureArgs,
         parsed: &QualityArgs,
@@ -404,7 +420,7 @@ impl Asked {
             side: view.view.is_some().then(|| view.axes.clone()),
             transfer: Transfer::parse(&picture.tf, &picture.look)?,
             quality,
-            aim: parsed.aim,
+            target: parsed.target,
             magnify: 1,
             work,
             background: picture.background,
@@ -413,55 +429,45 @@ impl Asked {
         })
     }
 
-    /// A path under a preset, all else as it is by itself.
-    #[cfg(test)]
-    pub(crate) fn plain(path: ViewPath, tf: &str) -> Result<Self, Fail> {
-        Ok(Asked {
+    /// Returns a request for a path under a preset; everything else has its default.
+    ///
+    /// # Errors
+    /// No preset or colour map has that name.
+    pub fn plain(path: ViewPath, tf: &str) -> Result<Self, Fail> {
+        Ok(Asked::with_defaults(path, Transfer::plain(tf)?))
+    }
+
+    /// Size of the pictures that come out.
+    pub fn size(&self) -> [u32; 2] {
+        self.path.size.map(|n| n * self.magnify)
+    }
+
+    /// The numbers of its frames on the whole path.
+    pub fn frames(&self) -> std::ops::Range<u64> {
+        let first = self.path.first_frame() as u64;
+        first..first + self.path.frames() as u64
+    }
+
+    /// Returns a request for a path under a transfer function; everything else has its default.
+    pub fn with_defaults(path: ViewPath, transfer: Transfer) -> Self {
+        Asked {
             path,
             path_file: None,
             side: None,
-            transfer: Transfer::plain(tf)?,
+            transfer,
             quality: Quality::default(),
-            aim: Aim::default(),
+            target: QualityTarget::default(),
             magnify: 1,
             work: Work::default(),
             background: Background::Colour([0.0; 3]),
             hashed: true,
             hash_inside: false,
-        })
-    }
-
-    /// Size of the pictures that come out.
-    pub(crate) fn size(&self) -> [u32; 2] {
-        self.path.size.map(|n| n * self.magnify)
-    }
-
-    /// The numbers of its frames on the whole path.
-    pub(crate) fn frames(&self) -> std::ops::Range<u64> {
-        let first = self.path.first_frame() as u64;
-        first..first + self.path.frames() as u64
-    }
-
-    /// What made a picture, to make it again.
-    pub(crate) fn again(p: &Provenance) -> Self {
-        Asked {
-            path: p.path.clone(),
-            path_file: None,
-            side: None,
-            transfer: Transfer::again(&p.transfer, p.preset.clone()),
-            quality: p.quality,
-            aim: Aim::default(),
-            magnify: p.magnify,
-            work: Work::default(),
-            background: p.background(),
-            hashed: p.pixels_sha256.is_some(),
-            hash_inside: p.pixels_sha256.is_some(),
         }
     }
 
     /// Whether all of it can be drawn of this volume; `anatomical` says whether its file knows
     /// left from right.
-    pub(crate) fn fit(
+    pub fn fit(
         &self,
         info: &VolumeInfo,
         orientation: Orientation,
@@ -511,7 +517,7 @@ impl Asked {
     }
 
     /// Puts a refusal where the user wrote what is refused: at a flag or in a file.
-    pub(crate) fn blame(&self, refused: &Refused) -> Fail {
+    pub fn blame(&self, refused: &Refused) -> Fail {
         const FLAGS: [&str; 24] = [
             "thickness",
             "eps",
@@ -580,12 +586,7 @@ impl Asked {
     }
 
     /// The request, under a name that no other has, for a volume with these values.
-    pub(crate) fn request(
-        &self,
-        info: &VolumeInfo,
-        format: PixelFormat,
-        want_trace: bool,
-    ) -> PathRequest {
+    pub fn request(&self, info: &VolumeInfo, format: PixelFormat, want_trace: bool) -> PathRequest {
         PathRequest {
             client_key: client_key(),
             path: self.path.clone(),
@@ -682,7 +683,7 @@ impl ViewArgs {
 }
 
 /// A key that no other request of any client has: time, process and a counter.
-pub(crate) fn client_key() -> String {
+pub fn client_key() -> String {
     use std::sync::atomic::{AtomicU64, Ordering};
     static COUNT: AtomicU64 = AtomicU64::new(0);
     let now = std::time::SystemTime::now()

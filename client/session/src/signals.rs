@@ -11,7 +11,7 @@ static TOLD: Notify = Notify::const_new();
 /// Starts to listen; without it signals end the process at once, as ever. A second signal does
 /// that all the same: whoever presses Ctrl-C twice means it.
 #[cfg(unix)]
-pub(crate) fn listen() {
+pub fn listen() {
     use tokio::signal::unix::{SignalKind, signal};
     for (kind, code) in [(SignalKind::interrupt(), 130), (SignalKind::terminate(), 143)] {
         // No handler can be had on systems without signals: they keep their own ways.
@@ -29,7 +29,7 @@ pub(crate) fn listen() {
 
 /// Starts to listen.
 #[cfg(not(unix))]
-pub(crate) fn listen() {
+pub fn listen() {
     tokio::spawn(async {
         while tokio::signal::ctrl_c().await.is_ok() {
             if CODE.swap(130, Ordering::SeqCst) != 0 {
@@ -41,7 +41,7 @@ pub(crate) fn listen() {
 }
 
 /// Waits until the process is told to stop; gives the exit code for it (128 + signal).
-pub(crate) async fn stopped() -> u8 {
+pub async fn stopped() -> u8 {
     loop {
         let told = TOLD.notified();
         match CODE.load(Ordering::SeqCst) {
@@ -52,14 +52,14 @@ pub(crate) async fn stopped() -> u8 {
 }
 
 /// Whether the process was told to stop, for work that looks now and then.
-pub(crate) fn told() -> bool {
+pub fn told() -> bool {
     CODE.load(Ordering::SeqCst) != 0
 }
 
 /// Does `work` on a thread of its own and waits for it, or for Ctrl-C or SIGTERM, which end the
 /// command at once (code 130 or 143; the thread ends with the process). So `work` must leave
 /// nothing half done on disk; who writes files does so with what comes back.
-pub(crate) fn unless_stopped<T: Send + 'static>(
+pub fn unless_stopped<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, Fail> + Send + 'static,
 ) -> Result<T, Fail> {
     watched(work, false)
@@ -67,7 +67,7 @@ pub(crate) fn unless_stopped<T: Send + 'static>(
 
 /// As [`unless_stopped`], but a stop waits for `work`, which asks [`told`] often, ends early and
 /// takes its half-written files away.
-pub(crate) fn to_its_end<T: Send + 'static>(
+pub fn to_its_end<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, Fail> + Send + 'static,
 ) -> Result<T, Fail> {
     watched(work, true)

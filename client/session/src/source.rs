@@ -3,9 +3,9 @@
 use crate::fail::Fail;
 use crate::output::Frame;
 use crate::progress::Step;
-use crate::remote;
-use slabcast_common::ids::JobId;
 use slabcast_common::stats::FrameStats;
+use std::future::Future;
+use std::pin::Pin;
 use std::time::Duration;
 use tokio::sync::mpsc;
 
@@ -13,15 +13,18 @@ use tokio::sync::mpsc;
 const CANCEL: Duration = Duration::from_secs(2);
 
 /// News of the job.
-pub(crate) enum Update {
+pub enum Update {
     /// Where it stands.
     Step(Step),
     /// A frame, its statistics, those as JSON, and its trace.
     Frame {
+        /// Its pixels.
         frame: Frame,
         /// Where a master made the frame.
         stats: Option<Box<FrameStats>>,
+        /// Statistics as one line of JSON.
         stats_json: String,
+        /// Time line as JSON; empty unless asked for.
         trace_json: String,
     },
     /// It ended with all frames delivered.
@@ -30,31 +33,29 @@ pub(crate) enum Update {
 
 /// Where updates come from, and how to cancel. One message of room: frames wait at the master,
 /// not here.
-pub(crate) struct Source {
-    pub(crate) updates: mpsc::Receiver<Result<Update, Fail>>,
-    pub(crate) cancel: Cancel,
+pub struct Source {
+    /// Updates of the job, in order; the last is `Done` or an error.
+    pub updates: mpsc::Receiver<Result<Update, Fail>>,
+    /// Cancels the job.
+    pub cancel: Cancel,
 }
 
-/// How a job is cancelled.
-pub(crate) enum Cancel {
-    /// Nobody waits for it.
-    None,
-    Embedded(slabcast_master::Handle, JobId),
-    Remote(remote::Cancel),
-}
+/// Cancels one job, whoever renders it.
+pub struct Cancel(Pin<Box<dyn Future<Output = ()> + Send>>);
 
 impl Cancel {
-    /// Cancels, in bounded time, whether the master hears it or not.
-    pub(crate) async fn now(self) {
-        let cancelled = async {
-            match self {
-                Cancel::None => {}
-                Cancel::Embedded(handle, job) => {
-                    handle.cancel(job).await;
-                }
-                Cancel::Remote(cancel) => cancel.now().await,
-            }
-        };
-        let _ = tokio::time::timeout(CANCEL, cancelled).await;
+    /// Wraps the future that tells the master; it runs only if [`Cancel::now`] is called.
+    pub fn new(cancel: impl Future<Output = ()> + Send + 'static) -> Cancel {
+        Cancel(Box::pin(cancel))
+    }
+
+    /// Returns a `Cancel` that does nothing, for frames that no job delivers.
+    pub fn none() -> Cancel {
+        Cancel::new(std::future::ready(()))
+    }
+
+    /// Tells the master, and waits at most [`CANCEL`] for its answer.
+    pub async fn now(self) {
+        let _ = tokio::time::timeout(CANCEL, self.0).await;
     }
 }

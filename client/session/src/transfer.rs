@@ -18,7 +18,7 @@ const MAX_JSON_BYTES: u64 = 64 << 20;
 
 /// What flags change of a transfer function.
 #[derive(clap::Args, Clone, Debug)]
-pub(crate) struct LookFlags {
+pub struct LookFlags {
     /// Colours of a map (viridis, inferno, magma, plasma, cividis, turbo, cool-warm, greys) or of a
     /// ParaView file, spread over what the transfer function shows
     #[arg(long, value_name = "MAP|FILE")]
@@ -36,7 +36,7 @@ pub(crate) struct LookFlags {
 
 /// A transfer function and where it came from.
 #[derive(Clone, Debug)]
-pub(crate) struct Transfer {
+pub struct Transfer {
     base: TransferChoice,
     file: Option<PathBuf>,
     /// What ParaView calls it, if it is ParaView's.
@@ -53,7 +53,7 @@ pub(crate) struct Transfer {
 impl Transfer {
     /// A preset or map by name, or a file if it exists or its name ends in `.json`. A preset's name
     /// means the preset even beside a file of that name; `./bone` means the file.
-    pub(crate) fn parse(text: &str, flags: &LookFlags) -> Result<Self, Fail> {
+    pub fn parse(text: &str, flags: &LookFlags) -> Result<Self, Fail> {
         let colours = flags.colors.as_deref().map(colours).transpose()?;
         let LookFlags { light, shading, nan, .. } = *flags;
         let mut title = None;
@@ -79,15 +79,17 @@ impl Transfer {
         Ok(Transfer { base, file, title, preset: None, colours, light, shading, nan })
     }
 
-    /// A preset as it is by itself.
-    #[cfg(test)]
-    pub(crate) fn plain(name: &str) -> Result<Self, Fail> {
+    /// Returns a preset unchanged by flags.
+    ///
+    /// # Errors
+    /// No preset or colour map has that name.
+    pub fn plain(name: &str) -> Result<Self, Fail> {
         let flags = LookFlags { colors: None, light: None, shading: None, nan: None };
         Transfer::parse(name, &flags)
     }
 
     /// What a picture says that it was drawn with.
-    pub(crate) fn again(tf: &TransferFunction, preset: Option<String>) -> Self {
+    pub fn again(tf: &TransferFunction, preset: Option<String>) -> Self {
         let base = TransferChoice::Function(Box::new(tf.clone()));
         Transfer {
             base,
@@ -102,12 +104,12 @@ impl Transfer {
     }
 
     /// The same without light.
-    pub(crate) fn unshaded(&self) -> Self {
+    pub fn unshaded(&self) -> Self {
         Transfer { light: None, shading: Some(false), ..self.clone() }
     }
 
     /// The preset that it is or came from.
-    pub(crate) fn preset(&self) -> Option<&str> {
+    pub fn preset(&self) -> Option<&str> {
         match &self.base {
             TransferChoice::Name(name) => Some(name),
             TransferChoice::Function(_) => self.preset.as_deref(),
@@ -115,12 +117,12 @@ impl Transfer {
     }
 
     /// Its file, if it has one.
-    pub(crate) fn file(&self) -> Option<&Path> {
+    pub fn file(&self) -> Option<&Path> {
         self.file.as_deref()
     }
 
     /// What it is called in ParaView: as there, else after the preset or the file.
-    pub(crate) fn title(&self) -> String {
+    pub fn title(&self) -> String {
         let own = || {
             let name = self.name();
             let stem = Path::new(&name).file_stem().map(|s| s.to_string_lossy().into_owned());
@@ -130,7 +132,7 @@ impl Transfer {
     }
 
     /// What it is called in messages.
-    pub(crate) fn name(&self) -> String {
+    pub fn name(&self) -> String {
         match (&self.base, &self.file) {
             (TransferChoice::Name(name), _) => name.clone(),
             (_, Some(file)) => file.display().to_string(),
@@ -139,7 +141,7 @@ impl Transfer {
     }
 
     /// In full, for a volume with these values.
-    pub(crate) fn function(&self, info: &VolumeInfo) -> Result<TransferFunction, Refused> {
+    pub fn function(&self, info: &VolumeInfo) -> Result<TransferFunction, Refused> {
         let mut tf = match &self.base {
             TransferChoice::Name(name) => presets::by_name(name, &info.summary)?,
             TransferChoice::Function(tf) => (**tf).clone(),
@@ -160,7 +162,7 @@ impl Transfer {
     }
 
     /// What is sent: a name as it is, so that a master may know it better, unless flags change it.
-    pub(crate) fn choice(&self, info: &VolumeInfo) -> TransferChoice {
+    pub fn choice(&self, info: &VolumeInfo) -> TransferChoice {
         let changed = self.colours.is_some()
             || self.light.is_some()
             || self.shading.is_some()
@@ -226,7 +228,11 @@ fn colours(text: &str) -> Result<Vec<[f64; 4]>, Fail> {
     Ok(read.unit_colours())
 }
 
-pub(crate) fn read_json(path: &Path) -> Result<String, Fail> {
+/// Reads a JSON file as text.
+///
+/// # Errors
+/// The file can't be read or is larger than any path or transfer function.
+pub fn read_json(path: &Path) -> Result<String, Fail> {
     let fail = |e: &std::io::Error| Fail::io(path, "reading", e);
     let file = std::fs::File::open(path).map_err(|e| fail(&e))?;
     if file.metadata().map_err(|e| fail(&e))?.is_dir() {

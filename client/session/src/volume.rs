@@ -7,14 +7,14 @@ use crate::progress;
 use slabcast_common::volume::Volume;
 use slabcast_volumes::{Hints, Opened, RawHints};
 use std::ffi::OsString;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// What the help of every command says of its volume.
-pub(crate) const VOLUME: &str = "Volume file, folder with a stack or series, or formula:NAME";
+pub const VOLUME: &str = "Volume file, folder with a stack or series, or formula:NAME";
 
 /// What the file does not say of itself.
 #[derive(clap::Args, Clone, Debug, Default, PartialEq)]
-pub(crate) struct InputArgs {
+pub struct InputArgs {
     /// Samples of raw numbers along x, y, z, such as 256x256x128 [default: as in the file's name]
     #[arg(long, value_name = "AxBxC", value_parser = parse::dims, help_heading = HEADING)]
     dims: Option<[u64; 3]>,
@@ -61,75 +61,28 @@ impl InputArgs {
     }
 
     /// Whether nothing was said.
-    pub(crate) fn is_empty(&self) -> bool {
+    pub fn is_empty(&self) -> bool {
         *self == InputArgs::default()
     }
 
     /// Opens a file, a folder or a `formula:` volume.
-    pub(crate) fn open(&self, path: &Path) -> Result<Volume, Fail> {
+    pub fn open(&self, path: &Path) -> Result<Volume, Fail> {
         let opened = open_with(path, &self.hints())?;
         opened.notes.iter().for_each(|note| progress::note(note));
         Ok(opened.volume)
     }
 }
 
-/// This program as it parses DICOM for another of its processes ([`DicomArgs`]). Where the system
+/// This program as it parses DICOM for another of its processes (`slabcast read-dicom`). Where the system
 /// doesn't say which file we are, a thread has to do.
 fn dicom_reader() -> Option<Vec<OsString>> {
     let program = std::env::current_exe().ok()?;
     Some(vec![program.into(), "read-dicom".into()])
 }
 
-/// Parses a folder of DICOM for another process of ours, within limits: series and samples to stdout.
-#[derive(clap::Args, Clone, Debug)]
-#[command(after_help = "\
-Examples:
-  slabcast read-dicom slices/")]
-pub(crate) struct DicomArgs {
-    /// Folder of the slices
-    folder: PathBuf,
-    /// Which series
-    #[arg(long)]
-    series: Option<String>,
-    /// A slice of the series
-    #[arg(long)]
-    file: Option<PathBuf>,
-}
-
-/// Runs the hidden command: series and samples to stdout.
-#[cfg(feature = "dicom")]
-pub(crate) fn read_dicom(args: &DicomArgs) -> Result<(), Fail> {
-    let mut out = std::io::BufWriter::with_capacity(1 << 16, std::io::stdout().lock());
-    let DicomArgs { folder, series, file } = args;
-    slabcast_volumes::dicom::serve(folder, series.as_deref(), file.as_deref(), &mut out)
-        .map_err(|e| Fail::failed(e.to_string()))
-}
-
-#[cfg(not(feature = "dicom"))]
-pub(crate) fn read_dicom(args: &DicomArgs) -> Result<(), Fail> {
-    let DicomArgs { folder, .. } = args;
-    Err(Fail::failed(format!("{}: this build does not read DICOM", folder.display())))
-}
-
 /// Opens a file, a folder or a `formula:` volume of which nothing else is known.
-pub(crate) fn open(path: &Path) -> Result<Volume, Fail> {
+pub fn open(path: &Path) -> Result<Volume, Fail> {
     InputArgs::default().open(path)
-}
-
-/// A volume of ../shared/data and how it stands with this axis up; nothing, which is said, where it is not here.
-#[cfg(test)]
-pub(crate) fn of_the_data(
-    file: &str,
-    up: &str,
-) -> Option<(Volume, slabcast_common::path::Orientation)> {
-    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data").join(file);
-    if !file.exists() {
-        println!("skipped: {} is not here", file.display());
-        return None;
-    }
-    let up = up.parse().expect("an axis");
-    let orientation = slabcast_common::path::Orientation::new(Some(up), None).expect("axes");
-    Some((open(&file).expect("a volume"), orientation))
 }
 
 fn open_with(path: &Path, hints: &Hints) -> Result<Opened, Fail> {

@@ -1,8 +1,9 @@
 //! The file: found, read, and each of its names known.
 
 use super::{LAYERED, layered_args, nearest};
-use crate::fail::{Fail, one_line};
 use clap::Command;
+use slabcast_session::fail::Fail;
+use slabcast_session::terminal::one_line;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 

@@ -16,13 +16,13 @@ mod show;
 
 pub(crate) use show::{ConfigArgs, run};
 
-use crate::fail::Fail;
-use crate::progress;
 use clap::error::{ContextKind, ContextValue};
 use clap::parser::ValueSource;
 use clap::{Arg, ArgAction, ArgMatches, Command};
 use file::File;
 use slabcast_common::presets::distance;
+use slabcast_session::fail::Fail;
+use slabcast_session::progress;
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::path::PathBuf;

@@ -1,8 +1,8 @@
 //! `slabcast config show`: every value and where it comes from.
 
 use super::{Given, LAYERED, Source, Trouble, file, layers, misfit, with_defaults};
-use crate::fail::{Fail, say};
 use clap::{Command, CommandFactory};
+use slabcast_session::fail::{Fail, say};
 use std::ffi::OsString;
 use std::fmt::Write;
 

@@ -5,15 +5,15 @@
 //! tiles with their owners are in a frame's statistics. Each is drawn over the same view as the
 //! frame would be, with a legend below that says what the colours mean.
 
-use crate::canvas::{Canvas, LINE, WHITE, viridis, width};
-use crate::fail::Fail;
-use crate::local::{self, Cut};
-use crate::output::Frame;
-use crate::stage::Stage;
 use slabcast_common::image::{Picture, PixelFormat};
 use slabcast_common::quality::{Compositing, Quality};
 use slabcast_common::stats::FrameStats;
 use slabcast_render::oracle::work_counters::{WorkCounters, count_work};
+use slabcast_session::canvas::{Canvas, LINE, WHITE, viridis, width};
+use slabcast_session::direct::{self, Cut};
+use slabcast_session::fail::Fail;
+use slabcast_session::output::Frame;
+use slabcast_session::path_scenes::Stage;
 
 /// What is shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -75,8 +75,8 @@ pub(crate) fn draw(stage: &Stage, show: Show, i: usize, threads: usize) -> Resul
     let tables = stage.frame(i)?;
     let quality = tables.scene.quality;
     let canvas = if show == Show::Error {
-        let picture = local::picture(&tables, &stage.bricks, Cut::on(threads));
-        let finer = local::picture(&stage.other(i, half)?, &stage.bricks, Cut::on(threads));
+        let picture = direct::picture(&tables, &stage.bricks, Cut::on(threads));
+        let finer = direct::picture(&stage.other(i, half)?, &stage.bricks, Cut::on(threads));
         error(&picture, &estimate(&picture, &finer, quality.compositing))
     } else {
         let (picture, notes) = count_work(&tables, &stage.bricks);
@@ -297,12 +297,12 @@ pub(crate) fn owner(picture: &Frame, stats: &FrameStats) -> Frame {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::request::Asked;
     use slabcast_common::path::{Orientation, ViewPath};
     use slabcast_render::judge::reference::{Reference, stratified};
+    use slabcast_session::request::Asked;
 
     fn stage(tf: &str) -> Stage {
-        let volume = crate::volume::open("formula:spheres:48".as_ref()).unwrap();
+        let volume = slabcast_session::volume::open("formula:spheres:48".as_ref()).unwrap();
         let info = volume.info(volume.digest());
         let path = r#"{"version":1,"size":[64,64],"turntable":{"frames":1}}"#;
         let asked = Asked::plain(ViewPath::from_json(path).unwrap(), tf).unwrap();
@@ -318,7 +318,7 @@ mod tests {
             let quality = Quality { eps: 0.0, ..stage.spec(0).quality };
             let draw = |thickness: f64| {
                 let tables = stage.other(0, |_| Quality { thickness, ..quality }).unwrap();
-                local::picture(&tables, &stage.bricks, Cut::on(2))
+                direct::picture(&tables, &stage.bricks, Cut::on(2))
             };
             let (picture, finer) = (draw(2.0), draw(1.0));
             let guess = estimate(&picture, &finer, quality.compositing);

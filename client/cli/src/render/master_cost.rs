@@ -79,7 +79,7 @@ async fn plain(
             let frame = stage.frame(i).expect("a frame");
             let view = view_sha256(&stage.spec(i), None, &frame.view);
             let cut = Cut { tile: 64, ..Cut::on(threads) };
-            let picture = crate::local::picture(&frame, &stage.bricks, cut);
+            let picture = slabcast_session::direct::picture(&frame, &stage.bricks, cut);
             if drawn.send((picture, view)).is_err() {
                 return;
             }
@@ -100,7 +100,7 @@ async fn plain(
         }
         let _ = to.blocking_send(Ok(Update::Done));
     });
-    let done = run.go(Source { updates, cancel: Cancel::None }, "", &info, &recipe).await;
+    let done = run.go(Source { updates, cancel: Cancel::none() }, "", &info, &recipe).await;
     for thread in [draw, encode] {
         thread.join().expect("a thread that draws or encodes");
     }
@@ -111,9 +111,11 @@ async fn plain(
 #[test]
 #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_a_master -- --ignored --nocapture"]
 fn what_a_master_in_the_process_takes() {
-    let threads = embedded::cores();
+    let threads = slabcast_session::machine::cores();
     for (file, axis, tf, edge, frames) in SCENES {
-        let Some((volume, orientation)) = volume::of_the_data(file, axis) else { continue };
+        let Some((volume, orientation)) = slabcast_session::testing::data_volume(file, axis) else {
+            continue;
+        };
         let volume = Arc::new(volume);
         let runtime = runtime::start_embedded().expect("a runtime");
         let folder = tempfile::tempdir().expect("a folder");

@@ -2,26 +2,30 @@
 //!
 //! Both ways are one loop over [`Update`]s; only where these come from differs ([`Source`]).
 
-use crate::embedded::{self, Cluster, Crew};
-use crate::fail::{Fail, say};
-use crate::front::choose::{choose, lab};
-use crate::front::cluster::{There, Through, Wire};
-use crate::front::place::{Clock, Here};
-use crate::local::Cut;
-use crate::output::provenance::Recipe;
-use crate::output::{Format, Frame, Lines, Output, OutputArgs, Patience, Writer};
-use crate::progress::{self, Progress, Step};
-use crate::record::{self, Recording};
-use crate::request::{Asked, LookArgs, WorkArgs};
-use crate::show::{self, Show};
-use crate::source::{Cancel, Source, Update};
-use crate::stage::Stage;
-use crate::{remote, runtime, signals, volume};
+mod debug_views;
+#[cfg(test)]
+mod master_cost;
+
+use debug_views::Show;
 use slabcast_client::{Client, VolumeDescription};
 use slabcast_common::message::PathRequest;
 use slabcast_common::path::Orientation;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_lab::autotune::choose::{choose, lab};
+use slabcast_lab::autotune::cluster::{There, Through, Wire};
+use slabcast_lab::autotune::here::{Clock, Here};
+use slabcast_session::direct::Cut;
+use slabcast_session::embedded::{self, Cluster, Crew};
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::output::provenance::Recipe;
+use slabcast_session::output::{Format, Frame, Lines, Output, OutputArgs, Patience, Writer};
+use slabcast_session::path_scenes::Stage;
+use slabcast_session::progress::{self, Progress, Step};
+use slabcast_session::record::{self, Recording};
+use slabcast_session::request::{Asked, LookArgs, WorkArgs};
+use slabcast_session::source::{Cancel, Source, Update};
+use slabcast_session::{remote, runtime, signals, volume};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -66,7 +70,7 @@ pub(crate) struct RenderArgs {
     #[command(flatten)]
     input: volume::InputArgs,
     /// Render on this master's cluster
-    #[arg(long, value_name = "HOST:PORT", value_parser = crate::parse::master)]
+    #[arg(long, value_name = "HOST:PORT", value_parser = slabcast_session::parse::master)]
     master: Option<String>,
     #[command(flatten)]
     look: LookArgs,
@@ -171,13 +175,13 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         }
     }
     let crew = Crew::new(args.workers.unwrap_or(1), args.threads)?;
-    let mut asked = args.look.aimed(args.work.work()?)?;
+    let mut asked = args.look.asked_or_target(args.work.work()?)?;
     asked.work.estimate = args.stats.is_some();
     asked.hashed = args.stats.is_some() && !args.no_hash;
-    if !asked.aim.is_empty() && args.show.is_some() {
+    if !asked.target.is_empty() && args.show.is_some() {
         return Err(Fail::usage(format!(
             "{}, --show: shows how pictures of a given quality come about; leave one of the two out",
-            asked.aim.flags()
+            asked.target.flags()
         )));
     }
     let frames = asked.frames();
@@ -220,7 +224,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
             run.progress.stage(&format!("reading {}", file.display()));
             let volume = Arc::new(args.input.open(file)?);
             let orientation = args.look.view.axes.of(&volume)?;
-            let tried = if run.asked.aim.is_empty() {
+            let tried = if run.asked.target.is_empty() {
                 None
             } else {
                 aim_here(&mut run, &volume, orientation, crew, &runtime, args.quiet)?
@@ -237,7 +241,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
             run.progress.stage(&format!("dialling {master}"));
             let client = runtime.block_on(remote::connect(&master))?;
             let served = runtime.block_on(remote::describe(&client))?;
-            if !run.asked.aim.is_empty() {
+            if !run.asked.target.is_empty() {
                 aim_there(&mut run, &client, &served, &master, &runtime, args.quiet)?;
             }
             runtime.block_on(cluster(run, client, served, &master))
@@ -260,11 +264,11 @@ fn aim_here(
 ) -> Result<Option<Cluster>, Fail> {
     let info = volume.info(volume.digest());
     run.asked.fit(&info, orientation, volume.anatomical)?;
-    let (aim, threads) = (run.asked.aim, (crew.workers * crew.threads) as usize);
+    let (target, threads) = (run.asked.target, (crew.workers * crew.threads) as usize);
     let lab = lab(volume, &info, &run.asked, orientation, threads)?;
-    if aim.budget.is_none() {
+    if target.budget.is_none() {
         let clock = Clock::Plain(Cut { tile: 64, ..Cut::on(threads) });
-        choose(&mut Here::new(lab, clock), &aim, quiet)?.settle(&mut run.asked);
+        choose(&mut Here::new(lab, clock), &target, quiet)?.settle(&mut run.asked);
         return Ok(None);
     }
     let cluster =
@@ -272,7 +276,7 @@ fn aim_here(
     let (handle, asked) = (cluster.handle(), run.asked.clone());
     let wire = Wire::Embedded(&handle);
     let through = Through { runtime, wire, info, asked, crew: crew.to_string() };
-    match choose(&mut Here::new(lab, Clock::Cluster(Box::new(through))), &aim, quiet) {
+    match choose(&mut Here::new(lab, Clock::Cluster(Box::new(through))), &target, quiet) {
         // A record begins with the first worker.
         Ok(chosen) if run.record.is_none() => {
             chosen.settle(&mut run.asked);
@@ -297,10 +301,10 @@ fn aim_there(
 ) -> Result<(), Fail> {
     let info = served.info.clone();
     run.asked.fit(&info, served.orientation, served.anatomical)?;
-    let (aim, asked) = (run.asked.aim, run.asked.clone());
+    let (target, asked) = (run.asked.target, run.asked.clone());
     let crew = format!("the cluster of {master}");
     let through = Through { runtime, wire: Wire::Remote(client), info, asked, crew };
-    choose(&mut There::new(through), &aim, quiet)?.settle(&mut run.asked);
+    choose(&mut There::new(through), &target, quiet)?.settle(&mut run.asked);
     Ok(())
 }
 
@@ -353,7 +357,7 @@ async fn embedded(
 /// What can be shown how.
 fn showable(show: Show, args: &RenderArgs, format: Format, asked: &Asked) -> Result<(), Fail> {
     if show == Show::Error {
-        show::can_estimate(&asked.quality)?;
+        debug_views::can_estimate(&asked.quality)?;
     }
     if matches!(format, Format::Png16 | Format::Exr) {
         return Err(Fail::usage("--format: what --show draws has 8 bits; give png, apng or y4m"));
@@ -396,7 +400,7 @@ async fn drawn(
     let frames = run.asked.path.frames();
     tokio::task::spawn_blocking(move || {
         for i in 0..frames {
-            let update = show::draw(&stage, show, i, threads).map(|frame| {
+            let update = debug_views::draw(&stage, show, i, threads).map(|frame| {
                 let (stats_json, trace_json) = (String::new(), String::new());
                 Update::Frame { frame, stats: None, stats_json, trace_json }
             });
@@ -408,7 +412,7 @@ async fn drawn(
         }
         let _ = to.blocking_send(Ok(Update::Done));
     });
-    run.go(Source { updates, cancel: Cancel::None }, &what, &info, &recipe).await
+    run.go(Source { updates, cancel: Cancel::none() }, &what, &info, &recipe).await
 }
 
 async fn cluster(
@@ -520,7 +524,7 @@ impl Run {
                             trace.put(&trace_json)?;
                             progress.step(step.clone());
                             if show == Some(Show::Owner) {
-                                writer.put(show::owner(&frame, &facts), None);
+                                writer.put(debug_views::owner(&frame, &facts), None);
                                 continue;
                             }
                             let made = match output.format {
@@ -707,6 +711,3 @@ impl Look {
         }
     }
 }
-
-#[cfg(test)]
-mod plain;

@@ -3,11 +3,11 @@
 //! A file's name is a hash of all that the figures hang on, so nothing in it is ever out of date; a
 //! file that can't be read or written costs a measurement and nothing else.
 
-use super::lab::Off;
 use super::setting::Setting;
-use crate::progress;
+use super::trial::Off;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use slabcast_session::progress;
 use std::path::PathBuf;
 
 /// Largest file that is read: a hundred times what is written.
@@ -94,13 +94,16 @@ impl Kept {
     /// Writes it down. Where that fails, it is measured again the next time.
     pub(crate) fn save(&self) {
         let Some(path) = &self.path else { return };
-        let written = || -> Result<(), crate::fail::Fail> {
+        let written = || -> Result<(), slabcast_session::fail::Fail> {
             if let Some(folder) = path.parent() {
-                std::fs::create_dir_all(folder)
-                    .map_err(|e| crate::fail::Fail::io(folder, "making the folder", &e))?;
+                std::fs::create_dir_all(folder).map_err(|e| {
+                    slabcast_session::fail::Fail::io(folder, "making the folder", &e)
+                })?;
             }
             let text = serde_json::to_string_pretty(&self.file).unwrap_or_default();
-            crate::output::write_atomic(path, |f| std::io::Write::write_all(f, text.as_bytes()))
+            slabcast_session::output::write_atomic(path, |f| {
+                std::io::Write::write_all(f, text.as_bytes())
+            })
         };
         if let Err(e) = written() {
             progress::note(&format!(

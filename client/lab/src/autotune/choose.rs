@@ -2,24 +2,25 @@
 //!
 //! A ladder of settings is climbed from fast to near. For an error: until some rungs keep it, and
 //! the fastest of these is taken; for a time: until some rungs overrun it, and the nearest of those
-//! before is taken. Rungs are measured when they are needed, and [`super::kept`] remembers them.
+//! before is taken. Rungs are measured when they are needed, and [`super::cache`] remembers them.
 //!
 //! The word is kept with room to spare: views between those that are judged, and pixels between
 //! those that are looked at, may be worse. How often it holds is in docs/accuracy.md.
 
+use super::cache::Kept;
 use super::cluster::all_around;
-use super::kept::Kept;
-use super::lab::{Lab, Off};
-use super::place::{Clock, Here, Place, stopped};
+use super::here::{Clock, Here};
+use super::place::{Place, stopped};
 use super::setting::{Setting, fraction};
-use crate::fail::Fail;
-use crate::local::Cut;
-use crate::parse;
-use crate::progress::{self, Progress};
-use crate::request::Asked;
+use super::trial::{Lab, Off};
 use slabcast_common::path::Orientation;
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_session::direct::Cut;
+use slabcast_session::fail::Fail;
+use slabcast_session::progress::{self, Progress};
+use slabcast_session::quality_target::QualityTarget;
+use slabcast_session::request::Asked;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -33,70 +34,27 @@ const ROOM_TIME: f64 = 1.1;
 /// Rungs beyond the first that keeps an error, of which one may be faster.
 const BEYOND: usize = 3;
 
-/// What a person wants of a picture.
-#[derive(clap::Args, Clone, Copy, Debug, Default, PartialEq)]
-#[command(
-    next_help_heading = "Quality by what it should come to (chooses --thickness, --eps, --sums)"
-)]
-pub(crate) struct Aim {
-    /// Largest RMSE against the limit over the pixels that are not blank, of full intensity (1/255);
-    /// the fastest setting that keeps it is chosen, from measurements of this volume and transfer
-    /// function that are kept for the next time
-    #[arg(long, value_name = "X", value_parser = error_bound,
-          conflicts_with_all = ["thickness", "eps", "sums"])]
-    pub(crate) error: Option<f64>,
-    /// The same for each channel of 99.9 % of the pixels
-    #[arg(long, value_name = "X", value_parser = error_bound,
-          conflicts_with_all = ["thickness", "eps", "sums"])]
-    pub(crate) error_max: Option<f64>,
-    /// Longest time a frame may take (100ms); the nearest setting to the limit that keeps it is chosen,
-    /// if need be in a smaller picture, magnified
-    #[arg(long, value_name = "TIME", allow_hyphen_values = true, value_parser = parse::time,
-          conflicts_with_all = ["thickness", "eps", "sums"])]
-    pub(crate) budget: Option<f64>,
+/// Returns whether a measured error keeps the target's bounds with room to spare.
+fn keeps_error(target: &QualityTarget, off: &Off) -> bool {
+    let under =
+        |bound: Option<f64>, got: f64, room: f64| bound.is_none_or(|b| got * room <= b * 255.0);
+    under(target.error, off.rmse, ROOM_RMSE) && under(target.error_max, off.most_999, ROOM_MOST)
 }
 
-/// An error from 0 to 1, not 0.
-fn error_bound(text: &str) -> Result<f64, String> {
-    match parse::fraction(text)? {
-        x if x > 0.0 && x <= 1.0 => Ok(x),
-        _ => Err("give a number above 0, at most 1, like 1/255".into()),
-    }
-}
-
-impl Aim {
-    pub(crate) fn is_empty(&self) -> bool {
-        *self == Aim::default()
-    }
-
-    /// The flags that are given, for messages.
-    pub(crate) fn flags(&self) -> String {
-        let given = [
-            ("--error", self.error.is_some()),
-            ("--error-max", self.error_max.is_some()),
-            ("--budget", self.budget.is_some()),
-        ];
-        given.iter().filter(|g| g.1).map(|g| g.0).collect::<Vec<_>>().join(", ")
-    }
-
-    fn keeps_error(&self, off: &Off) -> bool {
-        let under =
-            |bound: Option<f64>, got: f64, room: f64| bound.is_none_or(|b| got * room <= b * 255.0);
-        under(self.error, off.rmse, ROOM_RMSE) && under(self.error_max, off.most_999, ROOM_MOST)
-    }
-
-    fn keeps_time(&self, ms: f64) -> bool {
-        self.budget.is_none_or(|b| ms * ROOM_TIME <= b)
-    }
+/// Returns whether a frame time in ms keeps the target's budget with room to spare.
+fn keeps_time(target: &QualityTarget, ms: f64) -> bool {
+    target.budget.is_none_or(|b| ms * ROOM_TIME <= b)
 }
 
 /// What was chosen, and by what.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Chosen {
-    pub(crate) setting: Setting,
-    pub(crate) off: Off,
+pub struct Chosen {
+    /// Setting that was chosen.
+    pub setting: Setting,
+    /// Its measured error.
+    pub off: Off,
     /// Median of a frame.
-    pub(crate) ms: f64,
+    pub ms: f64,
 }
 
 /// The rungs, each as fast as the ones before or nearer to the limit.
@@ -186,14 +144,14 @@ impl Climb<'_> {
     }
 
     /// The fastest of those that keep an error.
-    fn by_error(&mut self, aim: &Aim, rungs: &[Setting]) -> Result<Chosen, Fail> {
+    fn by_error(&mut self, target: &QualityTarget, rungs: &[Setting]) -> Result<Chosen, Fail> {
         let (mut best, mut beyond): (Option<Chosen>, usize) = (None, 0);
         let mut nearest: Option<(f64, f64)> = None;
         for setting in rungs {
             let off = self.off(setting)?;
             let least = nearest.get_or_insert((off.rmse, off.most_999));
             *least = (least.0.min(off.rmse), least.1.min(off.most_999));
-            if aim.keeps_error(&off) {
+            if keeps_error(target, &off) {
                 let chosen = self.chosen(*setting)?;
                 if best.is_none_or(|b| chosen.ms < b.ms) {
                     best = Some(chosen);
@@ -206,7 +164,7 @@ impl Climb<'_> {
         }
         let Some(best) = best else {
             let (rmse, most) = nearest.unwrap_or_default();
-            let (flag, least) = match (aim.error, aim.error_max) {
+            let (flag, least) = match (target.error, target.error_max) {
                 (Some(e), _) if rmse * ROOM_RMSE > e * 255.0 => ("error", rmse * ROOM_RMSE),
                 _ => ("error-max", most * ROOM_MOST),
             };
@@ -217,11 +175,11 @@ impl Climb<'_> {
                 least / 255.0 * 1.005
             )));
         };
-        if !aim.keeps_time(best.ms) {
+        if !keeps_time(target, best.ms) {
             return Err(Fail::usage(format!(
                 "--budget: the fastest setting that keeps {} takes {:.1} ms ({}); give {:.0}ms or \
                  more, a larger error or a smaller --size",
-                Aim { budget: None, ..*aim }.flags(),
+                QualityTarget { budget: None, ..*target }.flags(),
                 best.ms,
                 best.setting.name(&self.place.base()),
                 (best.ms * ROOM_TIME).ceil()
@@ -231,13 +189,13 @@ impl Climb<'_> {
     }
 
     /// The nearest of those that keep a time.
-    fn by_time(&mut self, aim: &Aim, rungs: &[Setting]) -> Result<Chosen, Fail> {
+    fn by_time(&mut self, target: &QualityTarget, rungs: &[Setting]) -> Result<Chosen, Fail> {
         let (mut within, mut over) = (Vec::new(), 0);
         let mut fastest = f64::INFINITY;
         for setting in rungs {
             let ms = self.ms(setting)?;
             fastest = fastest.min(ms);
-            if aim.keeps_time(ms) {
+            if keeps_time(target, ms) {
                 within.push(*setting);
                 over = 0;
             } else {
@@ -272,7 +230,7 @@ impl Climb<'_> {
 ///
 /// # Errors
 /// Nothing keeps it: names what would.
-pub(crate) fn choose(place: &mut dyn Place, aim: &Aim, quiet: bool) -> Result<Chosen, Fail> {
+pub fn choose(place: &mut dyn Place, target: &QualityTarget, quiet: bool) -> Result<Chosen, Fail> {
     let began = Instant::now();
     let mut kept = Kept::of(place.identity());
     let (base, size) = (place.base(), place.size());
@@ -283,13 +241,14 @@ pub(crate) fn choose(place: &mut dyn Place, aim: &Aim, quiet: bool) -> Result<Ch
     if known == 0 && !quiet {
         progress::note(&format!(
             "{}: this scene is measured first; that is kept for the next time",
-            aim.flags()
+            target.flags()
         ));
     }
     let times = Vec::new();
     let mut climb = Climb { place, kept: &mut kept, times, progress, measured: 0 };
-    let by_error = aim.error.is_some() || aim.error_max.is_some();
-    let chosen = if by_error { climb.by_error(aim, &rungs) } else { climb.by_time(aim, &rungs) };
+    let by_error = target.error.is_some() || target.error_max.is_some();
+    let chosen =
+        if by_error { climb.by_error(target, &rungs) } else { climb.by_time(target, &rungs) };
     let measured = climb.measured;
     climb.progress.end();
     // What was measured serves also where nothing was found.
@@ -311,7 +270,7 @@ pub(crate) fn choose(place: &mut dyn Place, aim: &Aim, quiet: bool) -> Result<Ch
         progress::note(&format!(
             "{}: thickness {}, eps {}, sums {}{size}{}; RMSE {:.3}/255, 99.9 % within {:.2}/255, {:.1} \
              ms a frame ({how})",
-            aim.flags(),
+            target.flags(),
             q.thickness,
             fraction(q.eps),
             super::setting::lower(&q.sums),
@@ -326,8 +285,8 @@ pub(crate) fn choose(place: &mut dyn Place, aim: &Aim, quiet: bool) -> Result<Ch
 
 impl Chosen {
     /// Puts it into what was asked for.
-    pub(crate) fn settle(&self, asked: &mut Asked) {
-        asked.aim = Aim::default();
+    pub fn settle(&self, asked: &mut Asked) {
+        asked.target = QualityTarget::default();
         asked.quality = self.setting.quality;
         if let Some(size) = self.setting.drawn_size(asked.path.size) {
             asked.path.size = size;
@@ -336,8 +295,8 @@ impl Chosen {
     }
 }
 
-/// A scene that is asked for with an aim, to be tried out by this process.
-pub(crate) fn lab(
+/// A scene that is asked for with a target, to be tried out by this process.
+pub fn lab(
     volume: &Arc<Volume>,
     info: &VolumeInfo,
     asked: &Asked,
@@ -351,19 +310,19 @@ pub(crate) fn lab(
 
 /// Chooses the quality of what was asked for if it names none but what it should come to, by plain
 /// drawing. `volume` fits it.
-pub(crate) fn settle(
+pub fn settle(
     volume: &Arc<Volume>,
     info: &VolumeInfo,
     asked: &mut Asked,
     orientation: Orientation,
     threads: usize,
 ) -> Result<(), Fail> {
-    if asked.aim.is_empty() {
+    if asked.target.is_empty() {
         return Ok(());
     }
     let lab = lab(volume, info, asked, orientation, threads)?;
     let clock = Clock::Plain(Cut { tile: 64, ..Cut::on(threads) });
-    choose(&mut Here::new(lab, clock), &asked.aim.clone(), false)?.settle(asked);
+    choose(&mut Here::new(lab, clock), &asked.target.clone(), false)?.settle(asked);
     Ok(())
 }
 
@@ -386,13 +345,13 @@ mod tests {
 
     #[test]
     fn room_is_left() {
-        let aim = Aim { error: Some(1.0 / 255.0), ..Aim::default() };
+        let target = QualityTarget { error: Some(1.0 / 255.0), ..QualityTarget::default() };
         let off = |rmse| Off { rmse, ..Off::default() };
-        assert!(aim.keeps_error(&off(0.8)) && !aim.keeps_error(&off(0.95)));
-        let aim = Aim { budget: Some(100.0), error_max: Some(2.0 / 255.0), ..aim };
-        assert!(aim.keeps_time(90.0) && !aim.keeps_time(91.5));
-        assert_eq!(aim.flags(), "--error, --error-max, --budget");
+        assert!(keeps_error(&target, &off(0.8)) && !keeps_error(&target, &off(0.95)));
+        let target = QualityTarget { budget: Some(100.0), error_max: Some(2.0 / 255.0), ..target };
+        assert!(keeps_time(&target, 90.0) && !keeps_time(&target, 91.5));
+        assert_eq!(target.flags(), "--error, --error-max, --budget");
         let most = Off { rmse: 0.1, most_999: 1.9, ..Off::default() };
-        assert!(!aim.keeps_error(&most) && Aim::default().keeps_error(&most));
+        assert!(!keeps_error(&target, &most) && keeps_error(&QualityTarget::default(), &most));
     }
 }

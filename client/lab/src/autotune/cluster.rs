@@ -4,16 +4,9 @@
 //! What is timed is what a person waits for: frames of the path, one after the other, magnified and made
 //! PNGs as they arrive, which takes the same cores where the cluster is in this process.
 
-use super::lab::Off;
 use super::place::{Place, VIEWS};
 use super::setting::Setting;
-use crate::fail::Fail;
-use crate::front::magnify::magnified;
-use crate::output::{Frame, png};
-use crate::progress::{self, Progress};
-use crate::request::Asked;
-use crate::source::{Source, Update};
-use crate::{embedded, remote, signals};
+use super::trial::Off;
 use slabcast_client::Client;
 use slabcast_common::image::{Background, Picture, PixelFormat};
 use slabcast_common::path::ViewPath;
@@ -21,6 +14,13 @@ use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::volume::VolumeInfo;
 use slabcast_master::Handle;
 use slabcast_render::judge::reference::ErrorFigures;
+use slabcast_session::fail::Fail;
+use slabcast_session::magnify::magnified;
+use slabcast_session::output::{Frame, png};
+use slabcast_session::progress::{self, Progress};
+use slabcast_session::request::Asked;
+use slabcast_session::source::{Source, Update};
+use slabcast_session::{embedded, machine, remote, signals};
 use std::time::Instant;
 use tokio::runtime::Runtime;
 use tokio::task::JoinSet;
@@ -44,7 +44,7 @@ struct Finest {
 }
 
 /// Whom frames are asked of.
-pub(crate) enum Wire<'a> {
+pub enum Wire<'a> {
     /// A master of this process.
     Embedded(&'a Handle),
     /// One behind a network.
@@ -52,26 +52,30 @@ pub(crate) enum Wire<'a> {
 }
 
 /// A cluster, and the job that it is to be tried with.
-pub(crate) struct Through<'a> {
-    pub(crate) runtime: &'a Runtime,
-    pub(crate) wire: Wire<'a>,
-    pub(crate) info: VolumeInfo,
+pub struct Through<'a> {
+    /// Runs the connection.
+    pub runtime: &'a Runtime,
+    /// The master that renders.
+    pub wire: Wire<'a>,
+    /// The volume, with its digest.
+    pub info: VolumeInfo,
     /// What was asked for; it fits the volume.
-    pub(crate) asked: Asked,
+    pub asked: Asked,
     /// What the cluster is, for messages.
-    pub(crate) crew: String,
+    pub crew: String,
 }
 
 impl Through<'_> {
-    pub(crate) fn crew(&self) -> &str {
+    /// Returns a description of the cluster for messages.
+    pub fn crew(&self) -> &str {
         &self.crew
     }
 
     /// Milliseconds from one frame of the path to the next. Views are far apart, so that a few stand for
     /// all; the first is left out, for which bricks are cut and sent.
-    pub(crate) fn ms(&self, setting: &Setting) -> Result<f64, Fail> {
+    pub fn ms(&self, setting: &Setting) -> Result<f64, Fail> {
         let few = self.each(setting, FRAMES)?;
-        let budget = self.asked.aim.budget.unwrap_or(f64::INFINITY);
+        let budget = self.asked.target.budget.unwrap_or(f64::INFINITY);
         let near = few < NEAR * budget && few * NEAR > budget;
         if near { self.each(setting, MORE) } else { Ok(few) }
     }
@@ -188,7 +192,7 @@ fn spread(path: &ViewPath, views: u32) -> ViewPath {
 }
 
 /// A cluster whose volume is not here.
-pub(crate) struct There<'a> {
+pub struct There<'a> {
     through: Through<'a>,
     base: Setting,
     /// Pictures of the finest setting.
@@ -196,7 +200,8 @@ pub(crate) struct There<'a> {
 }
 
 impl<'a> There<'a> {
-    pub(crate) fn new(through: Through<'a>) -> There<'a> {
+    /// Returns a test bed on a cluster that alone has the volume.
+    pub fn new(through: Through<'a>) -> There<'a> {
         let base = Setting::asked(through.asked.quality);
         There { through, base, truths: Vec::new() }
     }
@@ -206,7 +211,7 @@ impl<'a> There<'a> {
         let [(frame, _)] = &frames[..] else {
             return Err(Fail::failed(format!("one frame was asked for, {} came", frames.len())));
         };
-        Ok(magnified(frame.picture(), setting.shrink, embedded::cores() as usize))
+        Ok(magnified(frame.picture(), setting.shrink, machine::cores() as usize))
     }
 
     fn finest(&self) -> Setting {
@@ -293,7 +298,7 @@ impl Place for There<'_> {
 
 /// What stands for a turn: views far apart all around, wherever the turn itself goes, so that what is
 /// measured serves any turn of the scene. Other paths stand for themselves.
-pub(crate) fn all_around(path: &ViewPath) -> ViewPath {
+pub fn all_around(path: &ViewPath) -> ViewPath {
     let mut path = path.clone();
     if let Some(turn) = &mut path.turntable {
         (turn.start, turn.step, turn.frames) = (20.0, 71.0, VIEWS as u32);

@@ -6,7 +6,8 @@ use slabcast_common::quality::{Kernel, Quality, Sums};
 /// What may be chosen of a picture, beside what it shows.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Setting {
+pub struct Setting {
+    /// Quality at which the picture is drawn.
     pub(crate) quality: Quality,
     /// The picture is drawn so many times smaller along each edge, and magnified.
     pub(crate) shrink: u32,
@@ -103,12 +104,12 @@ impl Setting {
 }
 
 /// A word of a flag.
-pub(crate) fn lower(word: &impl std::fmt::Debug) -> String {
+pub fn lower(word: &impl std::fmt::Debug) -> String {
     format!("{word:?}").to_lowercase()
 }
 
 /// `1/512` where it is one over a whole number.
-pub(crate) fn fraction(x: f64) -> String {
+pub fn fraction(x: f64) -> String {
     let over = (1.0 / x).round();
     if x > 0.0 && over > 1.0 && over < 1e7 && (1.0 / over - x).abs() <= 1e-12 * x {
         return format!("1/{over}");

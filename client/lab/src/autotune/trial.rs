@@ -4,13 +4,7 @@
 //! size. A setting that changes the model (another kernel, no light) is judged by that truth like
 //! any other, and beside it by its own.
 
-use super::magnify::magnified;
 use super::setting::Setting;
-use crate::fail::Fail;
-use crate::local::{self, Cut};
-use crate::progress::Progress;
-use crate::request::Asked;
-use crate::stage::Stage;
 use serde::{Deserialize, Serialize};
 use slabcast_common::image::Picture;
 use slabcast_common::message::{Counters, SceneSpec};
@@ -20,6 +14,12 @@ use slabcast_common::transfer::Classifier;
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_render::judge::reference::{ErrorFigures, Reference, stratified};
 use slabcast_render::{Frame, Scene};
+use slabcast_session::direct::{self, Cut};
+use slabcast_session::fail::Fail;
+use slabcast_session::magnify::magnified;
+use slabcast_session::path_scenes::Stage;
+use slabcast_session::progress::Progress;
+use slabcast_session::request::Asked;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -32,7 +32,7 @@ const LONG: f64 = 1.0;
 const MOST_FRAMES: usize = 51;
 
 /// What one view should look like, at a sample of its pixels.
-pub(crate) struct Truth {
+pub struct Truth {
     /// Number of the view among those that are wanted.
     pub(crate) view: usize,
     sample: Vec<[u32; 2]>,
@@ -41,7 +41,8 @@ pub(crate) struct Truth {
 
 /// Milliseconds from camera set to picture in memory.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Timing {
+pub struct Timing {
+    /// Median time of a frame, in ms.
     pub(crate) median: f64,
     pub(crate) min: f64,
     pub(crate) max: f64,
@@ -62,7 +63,7 @@ impl Timing {
 
 /// How far some pictures are from the truth: the worst view of each figure, in 1/255.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Off {
+pub struct Off {
     pub(crate) rmse: f64,
     pub(crate) max: f64,
     pub(crate) most_999: f64,
@@ -87,7 +88,7 @@ impl Off {
 }
 
 /// A setting's picture of each judged view.
-pub(crate) struct Judged {
+pub struct Judged {
     /// What sheets added in.
     pub(crate) sums: Sums,
     /// Against the truth.
@@ -102,7 +103,7 @@ pub(crate) struct Judged {
 
 /// How its time is measured.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Effort {
+pub struct Effort {
     pub(crate) cut: Cut,
     /// As many frames as fit, after the least.
     pub(crate) seconds: f64,
@@ -112,7 +113,7 @@ pub(crate) struct Effort {
 type Ground = (bool, bool);
 
 /// One volume and path, to be drawn in many ways.
-pub(crate) struct Lab {
+pub struct Lab {
     volume: Arc<Volume>,
     info: VolumeInfo,
     asked: Asked,
@@ -219,7 +220,7 @@ impl Lab {
         let stage = self.stage(&base)?;
         let spec = SceneSpec { quality: base.quality, ..stage.spec(view) };
         let reference = Reference::new(&spec, stage.view(view, &base.quality)?, &stage.bricks);
-        let limit = local::judge(&sample, threads, progress, |[x, y]| reference.pixel(x, y));
+        let limit = direct::judge(&sample, threads, progress, |[x, y]| reference.pixel(x, y));
         Ok(Truth { view, sample, limit })
     }
 
@@ -231,7 +232,7 @@ impl Lab {
         let view = stage.view(of.view, &setting.quality)?;
         let reference = Reference::new(&spec, view, &stage.bricks);
         let sample = of.sample.clone();
-        let limit = local::shared(sample.len(), threads, |i, _: &mut ()| {
+        let limit = direct::shared(sample.len(), threads, |i, _: &mut ()| {
             reference.pixel(sample[i][0], sample[i][1])
         });
         Ok(Truth { view: of.view, sample, limit })
@@ -326,7 +327,7 @@ impl Lab {
         let stage = self.stage(setting)?;
         let view = stage.view_of(view, &way.quality, drawn)?;
         let frame = Frame::new(way.scene.clone(), view);
-        let (picture, counters) = local::counted_picture(&frame, &stage.bricks, cut);
+        let (picture, counters) = direct::counted_picture(&frame, &stage.bricks, cut);
         let factor = if drawn == size { 1 } else { setting.shrink };
         Ok((magnified(picture, factor, cut.threads), counters))
     }
@@ -348,7 +349,7 @@ mod tests {
     use slabcast_common::path::{Turntable, ViewPath};
 
     fn lab(tf: &str) -> Lab {
-        let volume = crate::volume::open("formula:spheres:32".as_ref()).unwrap();
+        let volume = slabcast_session::volume::open("formula:spheres:32".as_ref()).unwrap();
         let path = ViewPath::turn([64, 64], Turntable { frames: 3, ..Turntable::default() });
         let asked = Asked::plain(path, tf).unwrap();
         let info = volume.info(volume.digest());

@@ -1,12 +1,9 @@
 //! What the invariances are tried on: four scenes from four sides, the bounds of their roundings,
 //! and the ways to compare and turn pictures.
 
+use super::case::Row;
 use super::cases;
 use super::shot::{Shot, Tools};
-use super::table::Row;
-use crate::fail::Fail;
-use crate::local::Cut;
-use crate::volume;
 use glam::DVec3;
 use slabcast_common::image::Picture;
 use slabcast_common::path::PathView;
@@ -16,6 +13,9 @@ use slabcast_common::quality::Quality;
 use slabcast_common::shade::Light;
 use slabcast_common::transfer::SIGMA_MAX;
 use slabcast_common::volume::Lattice;
+use slabcast_session::direct::Cut;
+use slabcast_session::fail::Fail;
+use slabcast_session::volume;
 use std::sync::Arc;
 
 /// How much is drawn.

@@ -1,10 +1,7 @@
 //! What is rendered for comparison: volumes, looks, two cameras; and the serial renderer's
 //! answer to each.
 
-use super::shot::Drawn;
 use super::{cluster, looks};
-use crate::fail::Fail;
-use crate::volume;
 use glam::DVec3;
 use slabcast_common::message::PathRequest;
 use slabcast_common::path::{Orientation, PathView, ProjectionKind, ViewPath};
@@ -15,6 +12,9 @@ use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
 use slabcast_render::oracle::serial;
 use slabcast_render::{Frame, Scene};
+use slabcast_session::fail::Fail;
+use slabcast_session::path_scenes::Drawn;
+use slabcast_session::volume;
 use std::path::Path;
 use std::sync::Arc;
 

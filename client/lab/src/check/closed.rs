@@ -1,11 +1,8 @@
 //! Scenes whose pictures are known on paper (`slabcast_render::judge::analytic`), each within bounds that
 //! count roundings.
 
+use super::case::{Case, Row};
 use super::shot::{Ready, Shot, sane};
-use super::table::{Case, Row};
-use crate::fail::Fail;
-use crate::local::Cut;
-use crate::volume;
 use slabcast_common::image::Picture;
 use slabcast_common::path::{PathView, ProjectionKind};
 use slabcast_common::quality::{Compositing, Quality, Sums};
@@ -15,6 +12,9 @@ use slabcast_common::transfer::{
 };
 use slabcast_common::view::SUBPIXELS;
 use slabcast_render::judge::analytic::{Bell, Layer, Profile, Rounding, Stack};
+use slabcast_session::direct::Cut;
+use slabcast_session::fail::Fail;
+use slabcast_session::volume;
 use std::path::Path;
 use std::sync::Arc;
 

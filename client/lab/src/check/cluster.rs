@@ -1,7 +1,5 @@
 //! Clusters in this process, over either link, and the hashes of what they draw.
 
-use crate::embedded::{Cluster, Crew, start_master};
-use crate::fail::Fail;
 use sha2::{Digest, Sha256};
 use slabcast_client::Client;
 use slabcast_common::image::{Background, PixelFormat};
@@ -14,6 +12,8 @@ use slabcast_master::SubmitError;
 use slabcast_master::jobs::{FinishedFrame, JobState, WatchItem};
 use slabcast_master::{Handle, Master, MasterConfig};
 use slabcast_render::Simd;
+use slabcast_session::embedded::{Cluster, Crew, start_master};
+use slabcast_session::fail::Fail;
 use std::time::Duration;
 use tokio::net::TcpListener;
 use tokio::sync::watch;
@@ -30,7 +30,7 @@ pub(super) fn request(
     work: Work,
 ) -> PathRequest {
     PathRequest {
-        client_key: crate::request::client_key(),
+        client_key: slabcast_session::request::client_key(),
         path,
         transfer: TransferChoice::Function(Box::new(transfer.clone())),
         quality,
@@ -198,12 +198,13 @@ impl Tcp {
             let run = slabcast_worker::dial::run(config, address.clone(), stopped.clone());
             tasks.spawn(async move { run.await.map(|_| ()) });
         }
-        let client = Client::connect(&address).await.map_err(|e| crate::remote::fail(&e))?;
+        let client =
+            Client::connect(&address).await.map_err(|e| slabcast_session::remote::fail(&e))?;
         Ok(Tcp { master, client, stop, tasks })
     }
 
     async fn hashes(&mut self, request: PathRequest) -> Result<Vec<String>, Fail> {
-        let fail = |e| crate::remote::fail(&e);
+        let fail = |e| slabcast_session::remote::fail(&e);
         let job = self.client.submit(&request).await.map_err(fail)?;
         let mut frames = self.client.watch(&job, 0).await.map_err(fail)?;
         let mut hashes = Vec::new();

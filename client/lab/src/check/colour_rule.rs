@@ -6,17 +6,18 @@
 //! with the eye where it was, moves the sheets through the volume and nothing else; what then
 //! changes in the picture is seen as flicker on a slow path.
 
-use super::shot::{Drawn, finely};
-use super::table::number;
-use crate::fail::{Fail, say};
-use crate::local::{self, Cut};
-use crate::progress::{self, Progress};
-use crate::request::{Opened, PictureOf, ThreadArg};
+use super::case::number;
+use super::shot::finely;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::quality::{Compositing, Quality, Work};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_render::judge::reference::{ErrorFigures, Reference, stratified};
 use slabcast_render::{Frame, Scene};
+use slabcast_session::direct::{self, Cut};
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::path_scenes::Drawn;
+use slabcast_session::progress::{self, Progress};
+use slabcast_session::request::{Opened, PictureOf, ThreadArg};
 use std::fmt::Write;
 use std::sync::Arc;
 use std::time::Instant;
@@ -118,7 +119,7 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
         let reference = Reference::new(&drawn.spec, view(&camera, &quality)?, &drawn.bricks);
         let reference = reference.with_what_sheets_add();
         let told = (&mut progress, limits.len() * sample.len());
-        limits.push(local::judge(&sample, threads, told, |[x, y]| reference.pixel(x, y)));
+        limits.push(direct::judge(&sample, threads, told, |[x, y]| reference.pixel(x, y)));
     }
     progress.end();
 
@@ -137,7 +138,11 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
                 let by = thickness * info.lattice.vox() * f64::from(step) / f64::from(args.steps);
                 let view = view(&nearer(&camera, by), &drawn.spec.quality)?;
                 let began = Instant::now();
-                pictures.push(local::picture(&Frame::new(scene.clone(), view), &drawn.bricks, cut));
+                pictures.push(direct::picture(
+                    &Frame::new(scene.clone(), view),
+                    &drawn.bricks,
+                    cut,
+                ));
                 times.push(began.elapsed().as_secs_f64() * 1e3);
             }
             times.sort_by(f64::total_cmp);

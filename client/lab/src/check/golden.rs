@@ -3,12 +3,12 @@
 use super::cases::{self, VIEWS};
 use super::cluster::embedded_hashes;
 use super::matrix::SAMPLE;
-use crate::embedded::{Cluster, Crew};
-use crate::fail::{Fail, say};
-use crate::progress::{self, Progress};
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::path::Orientation;
 use slabcast_common::quality::Work;
+use slabcast_session::embedded::{Cluster, Crew};
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::progress::{self, Progress};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -34,7 +34,7 @@ pub(crate) fn run(args: &GoldenArgs) -> Result<(), Fail> {
     let want = args.verify.as_deref().map(read).transpose()?;
     let began = Instant::now();
     let cases = cases::of_golden(&args.sample)?;
-    let runtime = crate::runtime::start()?;
+    let runtime = slabcast_session::runtime::start()?;
     let mut progress = Progress::new(false);
     let total = (cases.len() * VIEWS.len()) as u64;
     progress.frames(total, &format!("{total} golden frames"));

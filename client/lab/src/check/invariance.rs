@@ -11,17 +11,17 @@ use super::asked::{
     Asked, BYTES, Effort, LARGEST, Scene, VIEWS, cropped, largest, mirrored, pixels_that_differ,
     rolled,
 };
+use super::case::{Case, Row};
 use super::changes::Turn;
 use super::shot::{Against, Shot};
-use super::table::{Case, Row};
-use crate::fail::Fail;
-use crate::local::Cut;
 use glam::DVec3;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::quality::Quality;
 use slabcast_common::shade::{HeadWord, Light};
 use slabcast_common::transfer::{ColorSpace, TransferFunction};
 use slabcast_render::judge::reference::ErrorFigures;
+use slabcast_session::direct::Cut;
+use slabcast_session::fail::Fail;
 
 /// A picture on its side against the upright one where the kernel leans, in 1/255. Such a kernel is a product of
 /// profiles along two axes across the depth, and these are others then; a Gaussian does not feel that, but each profile

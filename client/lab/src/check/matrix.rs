@@ -3,11 +3,11 @@
 use super::cases::{self, Case};
 use super::cluster::{Either, Link};
 use super::pairwise;
-use crate::embedded::Crew;
-use crate::fail::{Fail, say};
-use crate::progress::{self, Progress};
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::volume::Digest32;
+use slabcast_session::embedded::Crew;
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::progress::{self, Progress};
 use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -39,7 +39,7 @@ pub(crate) struct MatrixArgs {
     #[arg(long)]
     pairwise: bool,
     /// Size of the pictures
-    #[arg(long, value_name = "WxH", default_value = "320x272", value_parser = crate::parse::size)]
+    #[arg(long, value_name = "WxH", default_value = "320x272", value_parser = slabcast_session::parse::size)]
     size: [u32; 2],
 }
 
@@ -144,7 +144,7 @@ pub(crate) fn run(args: &MatrixArgs) -> Result<(), Fail> {
     let cases = cases::of_matrix(file, args.size)?;
     let settings = Setting::all(args.pairwise);
     let began = Instant::now();
-    let runtime = crate::runtime::start()?;
+    let runtime = slabcast_session::runtime::start()?;
     let progress = RefCell::new(Progress::new(false).of("setting"));
     let done = Cell::new(0);
     let step = || {

@@ -9,6 +9,7 @@
 //! be seen.
 
 mod asked;
+mod case;
 mod cases;
 mod changes;
 mod closed;
@@ -26,7 +27,7 @@ mod scenes;
 pub(crate) mod shot;
 mod table;
 
-use crate::fail::Fail;
+use slabcast_session::fail::Fail;
 
 /// Checks that pictures are right, stable and exact.
 ///
@@ -47,7 +48,7 @@ Examples:
   slabcast check colour-rule brain.nii.gz   what each rule of compositing buys and costs
   slabcast check golden --verify tests/golden.txt"
 )]
-pub(crate) struct CheckArgs {
+pub struct CheckArgs {
     #[command(subcommand)]
     what: Option<What>,
     #[command(flatten)]
@@ -63,7 +64,7 @@ enum What {
 }
 
 /// Runs the command.
-pub(crate) fn run(args: &CheckArgs) -> Result<(), Fail> {
+pub fn run(args: &CheckArgs) -> Result<(), Fail> {
     match &args.what {
         None => table::run(&args.table),
         Some(What::Matrix(args)) => matrix::run(args),

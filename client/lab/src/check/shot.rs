@@ -5,10 +5,6 @@
 //! clusters, the reference.
 
 use super::cluster::{self, Either, Link};
-use crate::embedded::Crew;
-use crate::fail::Fail;
-use crate::local::{self, Bricks, Cut};
-use slabcast_common::ids::SceneId;
 use slabcast_common::image::Picture;
 use slabcast_common::message::{PathRequest, SceneSpec};
 use slabcast_common::path::{Orientation, PathView, ViewPath};
@@ -16,11 +12,13 @@ use slabcast_common::quality::{Quality, Sums, Work};
 use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
-use slabcast_common::wanted::Wanted;
 use slabcast_render::judge::reference::{Reference, stratified};
 use slabcast_render::oracle::serial;
 use slabcast_render::{Frame, Scene};
-use slabcast_volumes::BrickStore;
+use slabcast_session::direct::{self, Bricks, Cut};
+use slabcast_session::embedded::Crew;
+use slabcast_session::fail::Fail;
+use slabcast_session::path_scenes::Drawn;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -49,13 +47,6 @@ pub(crate) struct Shot {
     pub(crate) view: PathView,
 }
 
-/// A scene's specification and all its bricks.
-#[derive(Clone)]
-pub(crate) struct Drawn {
-    pub(crate) spec: SceneSpec,
-    pub(crate) bricks: Bricks,
-}
-
 /// `quality` with sums of 32 bits or floats where they are for the program to decide: what is judged
 /// here is off by so little that 16 bits would show.
 pub(crate) fn finely(quality: Quality, transfer: &TransferFunction, info: &VolumeInfo) -> Quality {
@@ -63,41 +54,6 @@ pub(crate) fn finely(quality: Quality, transfer: &TransferFunction, info: &Volum
     match (quality.sums, classifier.sums(&quality, &info.lattice)) {
         (Sums::Auto, Ok(Sums::I16)) => Quality { sums: Sums::I32, ..quality },
         _ => quality,
-    }
-}
-
-impl Drawn {
-    /// Cuts the bricks of `volume` under `transfer`, and decides the sums, as the master does.
-    pub(crate) fn new(
-        volume: &Volume,
-        info: &VolumeInfo,
-        transfer: &TransferFunction,
-        quality: Quality,
-    ) -> Result<Drawn, Fail> {
-        let wanted = Wanted::of(transfer, info, quality.compositing);
-        Drawn::holding(volume, info, transfer, quality, &wanted)
-    }
-
-    /// The same with bricks that hold what is wanted.
-    pub(crate) fn holding(
-        volume: &Volume,
-        info: &VolumeInfo,
-        transfer: &TransferFunction,
-        quality: Quality,
-        wanted: &Wanted,
-    ) -> Result<Drawn, Fail> {
-        let classifier = Classifier::new(transfer, info, quality.compositing);
-        let sums = classifier.sums(&quality, &info.lattice).map_err(|e| Fail::flag(&e))?;
-        let store = BrickStore::build(volume, info.digest, wanted);
-        let bricks = Bricks::of(&store);
-        let spec = SceneSpec {
-            id: SceneId(0),
-            volume: info.clone(),
-            transfer: transfer.clone(),
-            quality: Quality { sums, ..quality },
-            bricks: store.key(),
-        };
-        Ok(Drawn { spec, bricks })
     }
 }
 
@@ -223,12 +179,12 @@ impl Ready {
 
     /// The tile renderer's picture on threads of this process.
     pub(crate) fn picture(&self, cut: Cut) -> Picture {
-        local::picture(&self.frame(), &self.bricks, cut)
+        direct::picture(&self.frame(), &self.bricks, cut)
     }
 
     /// The same with no pixel ever shut.
     pub(crate) fn never_shut(&self, cut: Cut) -> Picture {
-        local::picture(&self.frame().never_shut(), &self.bricks, cut)
+        direct::picture(&self.frame().never_shut(), &self.bricks, cut)
     }
 
     /// A seeded sample of at most `n` pixels, one from each of about `n` equal cells.
@@ -244,7 +200,7 @@ impl Ready {
         tools: &Tools,
     ) -> Vec<[f64; 4]> {
         let reference = Reference::new(&self.spec, self.view, &self.bricks);
-        local::shared(sample.len(), tools.threads, |i, _: &mut ()| {
+        direct::shared(sample.len(), tools.threads, |i, _: &mut ()| {
             let [x, y] = sample[i];
             match against {
                 Against::Limit => reference.pixel(x, y),

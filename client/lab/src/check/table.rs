@@ -5,11 +5,12 @@
 //! prints them as they come, and counts. A case that panics, or that ends with an error, has not
 //! held, and the others go on.
 
+use super::case::{Case, Row};
 use super::shot::Tools;
 use super::{closed, extreme, invariance};
-use crate::fail::{Fail, say};
-use crate::progress::{self, Progress};
-use crate::request::ThreadArg;
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::progress::{self, Progress};
+use slabcast_session::request::ThreadArg;
 use std::time::{Duration, Instant};
 
 /// Some cases that belong together.
@@ -41,87 +42,6 @@ pub(crate) const GROUPS: &[Group] = &[
         cases: invariance::cases,
     },
 ];
-
-/// What a case does.
-type Work = Box<dyn Fn(&Tools) -> Result<Vec<Row>, Fail> + Send + Sync>;
-
-/// One scene, or a few that are compared with each other.
-pub(crate) struct Case {
-    /// What is drawn, unique in its group.
-    pub(crate) name: String,
-    /// Whether it takes so long that only `--long` runs it.
-    pub(crate) long: bool,
-    /// Draws and compares.
-    pub(crate) work: Work,
-}
-
-impl Case {
-    /// A case that every run has.
-    pub(crate) fn new(
-        name: impl Into<String>,
-        work: impl Fn(&Tools) -> Result<Vec<Row>, Fail> + Send + Sync + 'static,
-    ) -> Case {
-        Case { name: name.into(), long: false, work: Box::new(work) }
-    }
-
-    /// The same, for `--long` only.
-    pub(crate) fn long(self) -> Case {
-        Case { long: true, ..self }
-    }
-}
-
-/// One thing that must hold.
-#[derive(Clone, Debug)]
-pub(crate) struct Row {
-    /// What the error is of: `max against the limit`, `bytes that differ`.
-    pub(crate) what: String,
-    /// What was found, in 1/255 unless `what` says otherwise. Not a number: not held.
-    pub(crate) error: f64,
-    /// What it may be at most, in the same unit.
-    pub(crate) bound: f64,
-    /// What else went wrong (hashes that differ, values that are not finite), if anything did.
-    pub(crate) trouble: Option<String>,
-}
-
-impl Row {
-    /// A row without other trouble.
-    pub(crate) fn new(what: impl Into<String>, error: f64, bound: f64) -> Row {
-        Row { what: what.into(), error, bound, trouble: None }
-    }
-
-    /// The same with what else went wrong.
-    pub(crate) fn with(self, trouble: Option<String>) -> Row {
-        let all: Vec<String> = self.trouble.iter().cloned().chain(trouble).collect();
-        Row { trouble: (!all.is_empty()).then(|| all.join("; ")), ..self }
-    }
-
-    /// Whether it held.
-    pub(crate) fn held(&self) -> bool {
-        self.trouble.is_none() && self.error <= self.bound
-    }
-
-    /// As one line.
-    fn text(&self, group: &str, case: &str) -> String {
-        format!(
-            "{group:<11} {case:<44} {:<34} {:>9} <= {:<9} {}{}\n",
-            self.what,
-            number(self.error),
-            number(self.bound),
-            if self.held() { "held" } else { "NOT HELD" },
-            self.trouble.as_ref().map(|t| format!(": {t}")).unwrap_or_default(),
-        )
-    }
-
-    /// As one line of JSON.
-    fn json(&self, group: &str, case: &str, took: Duration) -> String {
-        let row = serde_json::json!({
-            "group": group, "case": case, "what": self.what, "error": self.error,
-            "bound": self.bound, "held": self.held(), "trouble": self.trouble,
-            "case_ms": took.as_secs_f64() * 1e3
-        });
-        format!("{row}\n")
-    }
-}
 
 /// What `slabcast check` without a subcommand takes.
 #[derive(clap::Args, Clone, Debug)]
@@ -173,7 +93,7 @@ pub(crate) fn run(args: &TableArgs) -> Result<(), Fail> {
             n => format!("{n} cases fit, all of them long; add --long"),
         }));
     }
-    let runtime = crate::runtime::start()?;
+    let runtime = slabcast_session::runtime::start()?;
     let threads = args.threads.count();
     let tools = Tools { threads, runtime };
     let began = Instant::now();
@@ -255,19 +175,6 @@ fn list(all: &[(&Group, Case)]) -> Result<(), Fail> {
         text += &format!("    {}{}\n", case.name, if case.long { " (--long)" } else { "" });
     }
     say(&text)
-}
-
-/// Three digits, wherever they begin.
-pub(crate) fn number(x: f64) -> String {
-    if x == 0.0 {
-        "0".into()
-    } else if !(1e-3..1e4).contains(&x.abs()) {
-        format!("{x:.1e}")
-    } else if x.abs() < 1.0 {
-        format!("{x:.4}")
-    } else {
-        format!("{x:.3}")
-    }
 }
 
 #[cfg(test)]

@@ -5,12 +5,12 @@
 //! A sample is shown as what it is: each cell as one block, in the colour of its one pixel.
 
 use super::Found;
-use crate::canvas::{self, Canvas, LINE, WHITE, viridis};
-use crate::fail::Fail;
-use crate::output::write_atomic;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::occlusion::Rect;
 use slabcast_render::judge::reference::cells;
+use slabcast_session::canvas::{self, Canvas, LINE, WHITE, viridis};
+use slabcast_session::fail::Fail;
+use slabcast_session::output::write_atomic;
 use std::path::Path;
 
 /// Ends of the scale in 1/255. Three decades: at 0.01 a pixel is as good as exact in any 8-bit
@@ -127,7 +127,7 @@ pub(super) fn caption(path: &Path, found: &Found) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::canvas::{PAPER, VIRIDIS};
+    use slabcast_session::canvas::{PAPER, VIRIDIS};
 
     #[test]
     fn the_scale_ascends_in_lightness_and_has_no_grey() {

@@ -14,16 +14,16 @@
 mod map;
 mod report;
 
-use crate::fail::{Fail, say};
-use crate::local;
-use crate::parse::Pixels;
-use crate::progress::Progress;
-use crate::request::{PictureOf, ThreadArg};
-use crate::still::Still;
-use crate::{parse, signals};
+use crate::single_frame::Still;
 use slabcast_common::image::Picture;
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_render::judge::reference::{ErrorFigures, Sheets, stratified};
+use slabcast_session::direct;
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::parse::Pixels;
+use slabcast_session::progress::Progress;
+use slabcast_session::request::{PictureOf, ThreadArg};
+use slabcast_session::{parse, signals};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
@@ -60,7 +60,7 @@ share_above_1, rmse_srgb8, pixels}: 1/255 (most_999 is kept by 99.9 % of the pix
 measured}, of thickness to rounding against limit. sampled and sampled_model: pixels looked at,
 blank ones included, for the sum and for truncation and ripple. size; pixels_sha256 of the picture; quality; draw_ms, judge_ms, total_ms; map: the file,
 if any.")]
-pub(crate) struct ErrorArgs {
+pub struct ErrorArgs {
     #[command(flatten)]
     of: PictureOf,
     /// Pixels to compare, one at random in each of as many cells; or all
@@ -115,7 +115,7 @@ struct Found {
 }
 
 /// Runs the command.
-pub(crate) fn run(args: &ErrorArgs) -> Result<(), Fail> {
+pub fn run(args: &ErrorArgs) -> Result<(), Fail> {
     if let Some(map) = &args.map {
         map::check(map, &args.of.volume)?;
     }
@@ -167,13 +167,13 @@ fn find(args: &ErrorArgs) -> Result<Found, Fail> {
     let reference = still.reference();
     let judging = Instant::now();
     let rounded = Sheets { rounded: true, ..Sheets::default() };
-    let truth = local::judge(&sample, threads, (&mut progress, 0), |[x, y]| {
+    let truth = direct::judge(&sample, threads, (&mut progress, 0), |[x, y]| {
         let limit = reference.pixel(x, y);
         [limit, reference.at_same_thickness(x, y), reference.by_sheets(x, y, rounded)]
     });
     let judge = || still.reference().with_tolerance(MODEL_TOLERANCE);
     let (limit, whole, level) = (judge(), judge().without_truncation(), judge().without_ripple());
-    let ideals = local::judge(&model, threads, (&mut progress, sample.len()), |[x, y]| {
+    let ideals = direct::judge(&model, threads, (&mut progress, sample.len()), |[x, y]| {
         [limit.pixel(x, y), whole.pixel(x, y), level.pixel(x, y)]
     });
     let judged = judging.elapsed();

@@ -1,7 +1,7 @@
 //! What was found, as text and as JSON.
 
 use super::{Found, Row};
-use crate::progress;
+use slabcast_session::progress;
 use std::fmt::Write;
 use std::path::Path;
 

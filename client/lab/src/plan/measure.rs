@@ -12,11 +12,6 @@
 //! A tile of one part is drawn once more, to see when it comes to each of its bricks: who lacks one draws as far as that.
 
 use super::clock::cpu_ns;
-use crate::fail::Fail;
-use crate::local;
-use crate::progress::{Progress, Step};
-use crate::signals;
-use crate::stage::Stage;
 use prost::Message;
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::brick::Brick;
@@ -39,6 +34,11 @@ use slabcast_render::tile::{self, Scratch};
 use slabcast_render::visibility::ClosingDepths;
 use slabcast_render::visibility::VisibleBricks;
 use slabcast_schedule::{FrameJob, is_shut, macrotile};
+use slabcast_session::direct;
+use slabcast_session::fail::Fail;
+use slabcast_session::path_scenes::Stage;
+use slabcast_session::progress::{Progress, Step};
+use slabcast_session::signals;
 use slabcast_trace::{
     About, FrameTrace, Level, Packing, Pings, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace,
     VERSION, view_sha256,
@@ -414,7 +414,7 @@ impl Bench {
         let mut of = |edge: u32| {
             let outlook = VisibleBricks::new(&frame.view, bricks.directory());
             let tiles: Vec<Rect> =
-                local::tiles(whole, edge).filter(|tile| outlook.weight(tile) > 0).collect();
+                direct::tiles(whole, edge).filter(|tile| outlook.weight(tile) > 0).collect();
             let mut draw = |tile| {
                 region::draw(frame, &outlook, bricks, simd, tile, &mut self.scratch, &mut pixels);
             };
@@ -524,12 +524,12 @@ pub(crate) fn fits(trace: &Trace, jobs: &[FrameJob]) -> Result<(), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::local::Cut;
-    use crate::request::Asked;
     use slabcast_common::leaves::Mosaic;
     use slabcast_common::path::{Turntable, ViewPath};
     use slabcast_render::tile::ProjectedBrick;
     use slabcast_render::visibility::Directory;
+    use slabcast_session::direct::Cut;
+    use slabcast_session::request::Asked;
 
     /// Volume, axis that is up, and transfer function.
     type Named = (&'static str, &'static str, &'static str);
@@ -542,7 +542,7 @@ mod tests {
 
     /// Four views of 512x512 of it, or nothing, which is said, where the volume is not here.
     fn staged((file, axis, tf): Named) -> Option<Stage> {
-        let (volume, orientation) = crate::volume::of_the_data(file, axis)?;
+        let (volume, orientation) = slabcast_session::testing::data_volume(file, axis)?;
         let info = volume.info(volume.digest());
         let turn = Turntable { frames: 4, step: 22.5, ..Turntable::default() };
         let asked = Asked::plain(ViewPath::turn([512, 512], turn), tf).expect("a request");
@@ -562,7 +562,7 @@ mod tests {
             let (mut bytes, mut ns, mut composed, mut tiles) = ([0; 3], [0; 6], 0, 0);
             for i in 0..4 {
                 let frame = stage.frame(i).expect("a frame");
-                let picture = local::picture(&frame, &stage.bricks, Cut::on(2));
+                let picture = direct::picture(&frame, &stage.bricks, Cut::on(2));
                 let mut state = FrameState::new([512, 512]);
                 for (rect, sums) in tiles_of(&picture.pixels) {
                     tiles += 1;
@@ -648,7 +648,7 @@ mod tests {
                 let infos = bricks.directory().bricks().clone();
                 let directory = Arc::new(Directory::with_blocks(infos, shift, usize::MAX));
                 let all = VisibleBricks::new(&frame.view, &directory);
-                let tiles = local::tiles(Rect::of_size([512; 2]), 64);
+                let tiles = direct::tiles(Rect::of_size([512; 2]), 64);
                 let tiles: Vec<Rect> = tiles.filter(|tile| all.weight(tile) > 0).collect();
                 let (mut scratch, mut pixels) = Default::default();
                 let mut look = |tiles: &[Rect]| {

@@ -14,16 +14,16 @@ pub(crate) mod predict;
 mod rehearse;
 
 use crate::chart::{LIGHT, save};
-use crate::fail::{Fail, say};
-use crate::output::{Made, probe, write_atomic};
-use crate::progress::{Progress, warn};
-use crate::request::{Asked, Opened, PictureOf, WorkArgs};
-use crate::stage::Stage;
-use crate::{embedded, parse, signals};
 use predict::{IN_FLIGHT, LOSSES, Question, Row, STEADILY};
 use rehearse::Over;
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_schedule::FrameJob;
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::output::{Made, probe, write_atomic};
+use slabcast_session::path_scenes::Stage;
+use slabcast_session::progress::{Progress, warn};
+use slabcast_session::request::{Asked, Opened, PictureOf, WorkArgs};
+use slabcast_session::{machine, parse, signals};
 use slabcast_sim::{Link, alone_ms};
 use slabcast_trace::{MAX_BYTES, Pings, Trace};
 use std::fmt::Write as _;
@@ -49,7 +49,7 @@ Examples:
   slabcast plan ct.nrrd --tf bone --trace ct.trace --rehearse 2,8,15
 
 The first command with --trace FILE measures and writes FILE; later ones read it, and only predict.")]
-pub(crate) struct PlanArgs {
+pub struct PlanArgs {
     #[command(flatten)]
     of: PictureOf,
     #[command(flatten)]
@@ -103,7 +103,7 @@ pub(crate) struct PlanArgs {
 }
 
 /// Runs the command.
-pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
+pub fn run(args: &PlanArgs) -> Result<(), Fail> {
     let work = args.work.work()?;
     // Whoever leaves it to the master sees what there is to choose from.
     let schedules = match work.schedule {
@@ -199,7 +199,7 @@ pub(crate) fn run(args: &PlanArgs) -> Result<(), Fail> {
     };
     let question =
         Question { threads: args.threads, link, cores: None, stretch: 1.0, mixed: false };
-    let threads = embedded::cores() as usize;
+    let threads = machine::cores() as usize;
     let mut predicted = Vec::new();
     for schedule in schedules {
         let under = |job: &FrameJob| Work { schedule, ..job.work };
@@ -259,7 +259,7 @@ pub(crate) fn pinged() -> Option<Pings> {
 }
 
 /// Reads a trace.
-pub(crate) fn read(file: &Path) -> Result<Trace, Fail> {
+pub fn read(file: &Path) -> Result<Trace, Fail> {
     let mut bytes = Vec::new();
     std::fs::File::open(file)
         .and_then(|f| f.take(MAX_BYTES + 1).read_to_end(&mut bytes))

@@ -2,15 +2,15 @@
 
 use super::clock::cpu_ns;
 use super::costs;
-use crate::fail::Fail;
-use crate::local::shared;
-use crate::study::order::spearman;
+use crate::statistics::spearman;
 use slabcast_common::ids::FrameId;
 use slabcast_common::link::{FRAMES_IN_FLIGHT, stream_threads};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Schedule;
 use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{FrameJob, Spans};
+use slabcast_session::direct::shared;
+use slabcast_session::fail::Fail;
 use slabcast_sim::{self as sim, Cluster, Costs, Link, Outcome, Stopwatch, Took, Unmeasured};
 use slabcast_trace::Trace;
 

@@ -7,16 +7,16 @@
 
 use super::measure::FINISH;
 use super::predict::{self, Question};
-use crate::fail::Fail;
-use crate::progress::Progress;
-use crate::request::{Asked, AxisArgs};
-use crate::{embedded, remote, runtime};
 use slabcast_client::{Client, Update};
 use slabcast_common::ids::FrameId;
 use slabcast_common::leaves::Finish;
 use slabcast_common::message::PathRequest;
 use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{FrameJob, Spans};
+use slabcast_session::fail::Fail;
+use slabcast_session::progress::Progress;
+use slabcast_session::request::{Asked, AxisArgs};
+use slabcast_session::{machine, remote, runtime};
 use slabcast_sim::{Costs, Link, Nanos, Outcome, Stopwatch};
 use slabcast_trace::Trace;
 use std::collections::VecDeque;
@@ -226,7 +226,7 @@ impl Stage<'_> {
 
     /// What is predicted for this machine, and what the scheduler says there that a later frame takes, in ms.
     fn predict(&self, workers: u32) -> Result<(Outcome, f64), Fail> {
-        let cores = Some(embedded::cores());
+        let cores = Some(machine::cores());
         let of = (workers, self.threads);
         let (costs, _) =
             predict::decided(self.jobs, self.trace, of, self.costs, predict::IN_FLIGHT)?;
@@ -256,7 +256,7 @@ impl Stage<'_> {
 
     /// What was measured, beside what is predicted.
     fn beside(&self, workers: u32, played: &Played) -> Result<Rehearsed, Fail> {
-        let cores = embedded::cores();
+        let cores = machine::cores();
         let (predicted, predicted_ms) = self.predict(workers)?;
         // The first frame is left out on both sides.
         let frames = played.totals.len().saturating_sub(1).max(1) as f64;
@@ -371,7 +371,7 @@ pub(super) fn table(schedule: &str, at: Option<IpAddr>, rows: &[Rehearsed]) -> S
         "\n{schedule} schedule, rehearsed on this machine ({over}, {} cores for all), measured \
          beside predicted:\n\n\
          {:>7} {:>9} {:>9} {:>6} {:>9} {:>9} {:>6} {:>13} {:>13} {:>6}\n",
-        embedded::cores(),
+        machine::cores(),
         "workers",
         "ms",
         "pred.",
@@ -417,7 +417,7 @@ pub(super) fn json(schedule: &str, rows: &[Rehearsed]) -> Vec<serde_json::Value>
             "each_ms": r.each_ms, "predicted_each_ms": r.predicted_each_ms,
             "master_cpu_ms": r.master_ms, "predicted_master_cpu_ms": r.predicted_master_ms,
             "workers_cpu_ms": r.workers_ms, "predicted_workers_cpu_ms": r.predicted_workers_ms,
-            "busy": r.busy, "cores": embedded::cores(),
+            "busy": r.busy, "cores": machine::cores(),
         })
     };
     rows.iter().map(row).collect()

@@ -7,16 +7,16 @@ mod chart;
 mod sweep;
 mod write;
 
-use crate::fail::{Fail, say};
-use crate::front::lab::{Effort, Judged, Lab, Off, Timing, Truth};
-use crate::front::pareto::{self, Point};
-use crate::front::setting::{Setting, lower};
-use crate::local::Cut;
-use crate::progress::{self, Progress};
-use crate::request::{Opened, PictureOf, ThreadArg};
-use crate::signals;
+use crate::autotune::pareto::{self, Point};
+use crate::autotune::setting::{Setting, lower};
+use crate::autotune::trial::{Effort, Judged, Lab, Off, Timing, Truth};
 use serde::Serialize;
 use slabcast_common::quality::{Quality, Sums, Work};
+use slabcast_session::direct::Cut;
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::progress::{self, Progress};
+use slabcast_session::request::{Opened, PictureOf, ThreadArg};
+use slabcast_session::signals;
 use std::path::PathBuf;
 use std::time::Instant;
 use sweep::{Group, Knob, Trial};
@@ -47,7 +47,7 @@ share_above_1, rmse_srgb8, pixels}, own_error, ms: {one: {median, min, max, fram
 1/255; own_error is against the limit of the setting's own model, null where that is the same; bytes
 are those of its bricks as they are sent; front and knee are by the time on all threads; skipped
 settings have sheets so thin that thinner ones bought nothing any more.")]
-pub(crate) struct ReportArgs {
+pub struct ReportArgs {
     #[command(flatten)]
     of: PictureOf,
     /// Folder for the files; it is made
@@ -68,7 +68,7 @@ pub(crate) struct ReportArgs {
     #[arg(long, value_name = "N", default_value = "1")]
     seed: u64,
     /// Seconds of drawing for each time; three frames are timed at least
-    #[arg(long, value_name = "S", default_value = "0.6", value_parser = crate::parse::positive)]
+    #[arg(long, value_name = "S", default_value = "0.6", value_parser = slabcast_session::parse::positive)]
     seconds: f64,
     /// Knobs to turn, of thickness, eps, kernel, sums, compositing, shading, size, combinations and
     /// work [default: all]
@@ -197,7 +197,7 @@ impl Report {
 }
 
 /// Runs the command.
-pub(crate) fn run(args: &ReportArgs) -> Result<(), Fail> {
+pub fn run(args: &ReportArgs) -> Result<(), Fail> {
     let made = write::check(args)?;
     let args = args.clone();
     signals::to_its_end(move || {
@@ -249,8 +249,8 @@ fn measure(args: &ReportArgs) -> Result<Report, Fail> {
         judged_views: judged,
         pixels: args.pixels as usize,
         machine: Machine {
-            cpu: crate::machine::cpu(),
-            cores: crate::embedded::cores() as usize,
+            cpu: slabcast_session::machine::cpu(),
+            cores: slabcast_session::machine::cores() as usize,
             simd: slabcast_render::Simd::detect().name(),
             threads,
         },

@@ -1,11 +1,11 @@
 //! Which settings are tried: each knob alone, the combinations that may be worth it, and the work
 //! knobs, which change time alone.
 
-use crate::front::lab::Lab;
-use crate::front::setting::Setting;
-use crate::local::Cut;
+use crate::autotune::setting::Setting;
+use crate::autotune::trial::Lab;
 use serde::Serialize;
 use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
+use slabcast_session::direct::Cut;
 use std::fmt;
 
 /// What a trial turns.

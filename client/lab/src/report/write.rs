@@ -3,10 +3,10 @@
 use super::chart::Chart;
 use super::sweep::Group;
 use super::{Line, Report, ReportArgs};
+use crate::autotune::setting::{fraction, lower};
 use crate::chart::{self, DARK, LIGHT};
-use crate::fail::Fail;
-use crate::front::setting::{fraction, lower};
-use crate::output::{Made, write_atomic};
+use slabcast_session::fail::Fail;
+use slabcast_session::output::{Made, write_atomic};
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::Path;

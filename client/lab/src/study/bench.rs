@@ -6,16 +6,16 @@ use super::simulate::{Bed, Pace};
 use super::{
     Effects, Machine, Study, StudyArgs, effects, live, nodes, order, runs, verdict, write,
 };
-use crate::embedded;
-use crate::fail::Fail;
 use crate::plan::measure::{self, Path as Measured};
 use crate::plan::{GOODPUT, pinged};
-use crate::progress::{self, Progress, Step};
-use crate::request::{Asked, Opened};
-use crate::signals;
-use crate::stage::Stage;
 use slabcast_common::quality::{Borders, Kernel, Quality, Schedule, Work};
 use slabcast_common::view::MAX_EDGE;
+use slabcast_session::fail::Fail;
+use slabcast_session::machine;
+use slabcast_session::path_scenes::Stage;
+use slabcast_session::progress::{self, Progress, Step};
+use slabcast_session::request::{Asked, Opened};
+use slabcast_session::signals;
 use slabcast_sim::Link;
 use slabcast_trace::Pings;
 
@@ -38,7 +38,7 @@ fn work(slabs: u32) -> Work {
 }
 
 /// What a study is made with.
-pub(super) struct Lab<'a> {
+pub(super) struct Bench<'a> {
     args: &'a StudyArgs,
     asked: Asked,
     opened: Opened,
@@ -53,9 +53,9 @@ pub(super) struct Lab<'a> {
     done: usize,
 }
 
-impl Lab<'_> {
+impl Bench<'_> {
     /// Opens the volume and refuses what can't be drawn of it.
-    pub(super) fn open(args: &StudyArgs) -> Result<Lab<'_>, Fail> {
+    pub(super) fn open(args: &StudyArgs) -> Result<Bench<'_>, Fail> {
         let mut asked = args.of.look.asked(work(paper::SLABS[0]))?;
         if args.quick && asked.path.frames() > QUICK_VIEWS {
             let first = asked.path.first_frame() as u32;
@@ -66,11 +66,11 @@ impl Lab<'_> {
         let opened = args.of.open(&asked)?;
         progress.stage("measuring what messages take");
         let pings = pinged();
-        let cores = embedded::cores();
+        let cores = machine::cores();
         let views = asked.path.frames();
         // 2, 4, 8, 12 and 15 rendering nodes, and one.
         let live = std::iter::once(1).chain(NODES.map(|n| n - 1)).filter(|n| *n <= cores).collect();
-        Ok(Lab {
+        Ok(Bench {
             args,
             asked,
             opened,
@@ -122,7 +122,7 @@ impl Lab<'_> {
 
     /// All of it, or what was finished when somebody said stop.
     pub(super) fn study(mut self) -> Result<Study, Fail> {
-        let threads = embedded::cores() as usize;
+        let threads = machine::cores() as usize;
         let mut asked = self.asked.clone();
         self.progress.stage("cutting the volume into bricks");
         let stage = self.stage(&asked)?;
@@ -269,11 +269,11 @@ impl Lab<'_> {
             views: self.views,
             kernel: format!(
                 "{}, {std:.2} wide, cut at {radius}",
-                crate::front::setting::lower(&q.kernel)
+                crate::autotune::setting::lower(&q.kernel)
             ),
             machine: Machine {
-                cpu: crate::machine::cpu(),
-                cores: embedded::cores() as usize,
+                cpu: slabcast_session::machine::cpu(),
+                cores: machine::cores() as usize,
                 simd: slabcast_render::Simd::detect().name(),
             },
             link: self.args.link.to_string(),

@@ -8,16 +8,16 @@
 use super::nodes::{later, longest_wait, shares};
 use super::paper::{NODES, VOXEL_BYTES};
 use super::simulate::{Ask, Bed, Pace};
-use crate::fail::Fail;
-use crate::local::{self, Cut};
 use crate::plan::clock::cpu_ns;
-use crate::stage::Stage;
 use serde::Serialize;
 use slabcast_common::brick::{Brick, BrickGrid, TightBox};
 use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::quality::{Quality, Schedule};
 use slabcast_common::view::{Projected, View};
 use slabcast_schedule::macrotile;
+use slabcast_session::direct::{self, Cut};
+use slabcast_session::fail::Fail;
+use slabcast_session::path_scenes::Stage;
 use slabcast_trace::FrameTrace;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -176,7 +176,7 @@ pub(super) fn culling(stage: &Stage, frames: usize) -> Result<Culling, Fail> {
         for (best, cull) in best.iter_mut().zip([true, false]) {
             let frame = stage.other(frames / 2, |q| Quality { cull, ..q })?;
             let began = cpu_ns();
-            local::picture(&frame, &stage.bricks, Cut { tile: 64, ..Cut::on(1) });
+            direct::picture(&frame, &stage.bricks, Cut { tile: 64, ..Cut::on(1) });
             *best = best.min((cpu_ns() - began) as f64 / 1e6);
         }
     }

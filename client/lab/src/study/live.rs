@@ -4,13 +4,13 @@
 //! The master has no core of its own here: with as many workers as cores, it takes from theirs.
 
 use crate::check::cluster::{embedded_frames, joined};
-use crate::embedded::{Cluster, Crew};
-use crate::fail::Fail;
-use crate::request::{Asked, Opened};
-use crate::runtime;
 use slabcast_common::image::PixelFormat;
 use slabcast_common::quality::Work;
 use slabcast_common::stats::FrameStats;
+use slabcast_session::embedded::{Cluster, Crew};
+use slabcast_session::fail::Fail;
+use slabcast_session::request::{Asked, Opened};
+use slabcast_session::runtime;
 
 /// Renders the path with `workers`, once for each of `works`; the frames' statistics.
 pub(super) fn run(

@@ -1,16 +1,16 @@
 //! `slabcast study`: the paper's evaluation again, of any volume.
 //!
 //! What was drawn and timed here and what is simulated from it are kept apart in every figure:
-//! [`simulate`] has the clusters that are not there, [`live`] those that are, [`lab`] the order in
+//! [`simulate`] has the clusters that are not there, [`live`] those that are, [`bench`] the order in
 //! which all is measured. [`order`] is Figure 1, [`nodes`] Figure 3 and Table 1, [`runs`] Figures 4, 5
 //! and 7, [`effects`] what section 5.1 says without numbers. [`paper`] has the paper's numbers,
 //! [`verdict`] what became of its sentences; [`write`](mod@write), [`tables`], [`charts`] (by [`draw`]),
 //! [`page`] and its [`parts`] put all of it down.
 
+mod bench;
 mod charts;
 mod draw;
 mod effects;
-mod lab;
 mod live;
 mod nodes;
 pub(crate) mod order;
@@ -23,12 +23,12 @@ mod tables;
 mod verdict;
 mod write;
 
-use crate::fail::{Fail, say};
-use crate::output::Made;
-use crate::request::PictureOf;
-use crate::{parse, signals};
 use runs::Run;
 use serde::Serialize;
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::output::Made;
+use slabcast_session::request::PictureOf;
+use slabcast_session::{parse, signals};
 use std::path::PathBuf;
 
 /// Does the paper's evaluation again with a volume of yours: its Table 1, Figures 1, 3, 4, 5 and 7 and
@@ -49,7 +49,7 @@ CSV, and charts as SVG and PNG, light and dark.
 The paper: A Parallel Splatting Algorithm With Occlusion Culling (Huang, Shareef, Crawfis,
 Sadayappan, Mueller, 2000). Its setup is the subject: slab after slab in 3 and 5 slabs of equal
 thickness, 18 views 5 degrees apart, 512x512, a master and 2 to 15 rendering nodes.")]
-pub(crate) struct StudyArgs {
+pub struct StudyArgs {
     #[command(flatten)]
     of: PictureOf,
     /// Folder for the files; it is made
@@ -134,14 +134,14 @@ struct Study {
 }
 
 /// Runs the command.
-pub(crate) fn run(args: &StudyArgs) -> Result<(), Fail> {
+pub fn run(args: &StudyArgs) -> Result<(), Fail> {
     write::check(args)?;
     let made = Made::new(&args.out)?;
     let args = args.clone();
     signals::to_its_end(move || {
         // Held until the files are there.
         let _made = made;
-        let study = lab::Lab::open(&args)?.study()?;
+        let study = bench::Bench::open(&args)?.study()?;
         write::files(&args.out, &study)?;
         if args.json {
             return say(&write::json(&study));

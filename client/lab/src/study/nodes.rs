@@ -3,10 +3,10 @@
 
 use super::paper::{self, NODES};
 use super::simulate::{Ask, Bed, Pace, Told};
-use crate::fail::Fail;
 use serde::Serialize;
 use slabcast_common::quality::Schedule;
 use slabcast_schedule::Span;
+use slabcast_session::fail::Fail;
 use std::collections::BTreeMap;
 
 /// What one node did in a frame, in ms: the paper's four states (5.1).

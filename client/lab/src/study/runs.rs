@@ -4,10 +4,10 @@
 use super::nodes::later;
 use super::paper::{self, NODES, SLABS};
 use super::simulate::{Ask, Bed, Pace};
-use crate::fail::Fail;
 use serde::Serialize;
 use slabcast_common::quality::Schedule;
 use slabcast_common::stats::FrameStats;
+use slabcast_session::fail::Fail;
 
 /// Where a figure comes from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]

@@ -7,13 +7,13 @@
 //! stays as it is here.
 
 use super::paper;
-use crate::fail::Fail;
-use crate::local::shared;
 use crate::plan::predict::{self, Question};
 use serde::Serialize;
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{FrameJob, Span, Spans};
+use slabcast_session::direct::shared;
+use slabcast_session::fail::Fail;
 use slabcast_sim::{Costs, Link, Nanos, Stopwatch, alone_ms};
 use slabcast_trace::Trace;
 

@@ -31,11 +31,11 @@ fn f(x: f64) -> String {
 }
 
 fn pace(pace: Pace) -> String {
-    crate::front::setting::lower(&pace)
+    crate::autotune::setting::lower(&pace)
 }
 
 fn origin(origin: Origin) -> String {
-    crate::front::setting::lower(&origin)
+    crate::autotune::setting::lower(&origin)
 }
 
 /// Every table, by the name of its file.

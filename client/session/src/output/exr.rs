@@ -21,7 +21,7 @@ const MAX_HEADER: usize = 16 << 20;
 const CHROMATICITIES: [f32; 8] = [0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290];
 
 /// Encodes a frame of floats.
-pub(crate) fn encode(frame: &Frame, provenance: &str, out: &mut impl Write) -> Result<()> {
+pub fn encode(frame: &Frame, provenance: &str, out: &mut impl Write) -> Result<()> {
     if frame.format != PixelFormat::Rgba32F {
         return Err(Error::other("an EXR takes floats"));
     }
@@ -53,7 +53,7 @@ pub(crate) fn encode(frame: &Frame, provenance: &str, out: &mut impl Write) -> R
     attribute("pixelAspectRatio", "float", &floats(&[1.0]));
     attribute("screenWindowCenter", "v2f", &floats(&[0.0; 2]));
     attribute("screenWindowWidth", "float", &floats(&[1.0]));
-    attribute("software", "string", super::SOFTWARE.as_bytes());
+    attribute("software", "string", crate::software::SOFTWARE.as_bytes());
     if !provenance.is_empty() {
         attribute(ATTRIBUTE, "string", provenance.as_bytes());
     }
@@ -107,7 +107,7 @@ fn pack(bytes: &[u8]) -> Result<Vec<u8>> {
 }
 
 /// The provenance in an EXR; `None` where it has none.
-pub(crate) fn provenance(bytes: &[u8]) -> std::result::Result<Option<String>, String> {
+pub fn provenance(bytes: &[u8]) -> std::result::Result<Option<String>, String> {
     let cut = || "its header ends early".to_string();
     let mut rest = bytes[..bytes.len().min(MAX_HEADER)].get(8..).ok_or_else(cut)?;
     if bytes[..4] != MAGIC[..4] {

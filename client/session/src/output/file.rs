@@ -4,8 +4,9 @@
 //! holds all of it, whatever happens (full disk, Ctrl-C, power). A full disk is weather, not an
 //! end: hours of rendering wait at the master for somebody to make room ([`Patience`]).
 
-use crate::fail::{Fail, one_line};
+use crate::fail::Fail;
 use crate::progress;
+use crate::terminal::one_line;
 use std::fs::{File, Permissions};
 use std::io::{BufWriter, Error, ErrorKind, Result, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -34,7 +35,7 @@ pub(super) fn beside(path: &Path) -> Result<NamedTempFile> {
 }
 
 /// Sees whether a file can be made beside `path`.
-pub(crate) fn probe(path: &Path) -> std::result::Result<(), Fail> {
+pub fn probe(path: &Path) -> std::result::Result<(), Fail> {
     beside(path).map(drop).map_err(|e| Fail::io(path, "making the file", &e))
 }
 
@@ -54,7 +55,7 @@ fn whole(path: &Path, fill: impl FnOnce(&mut BufWriter<&File>) -> Result<()>) ->
 }
 
 /// Writes a whole file or none; a disk without room is a failure.
-pub(crate) fn write_atomic(
+pub fn write_atomic(
     path: &Path,
     fill: impl FnOnce(&mut BufWriter<&File>) -> Result<()>,
 ) -> std::result::Result<(), Fail> {
@@ -67,14 +68,14 @@ const TRY_AGAIN: Duration = Duration::from_secs(1);
 
 /// Waits for room on a full disk, says so once, and goes on.
 #[derive(Debug, Default)]
-pub(crate) struct Patience {
+pub struct Patience {
     given_up: AtomicBool,
     waiting: AtomicBool,
 }
 
 impl Patience {
     /// Nobody waits any more: what has no room fails.
-    pub(crate) fn give_up(&self) {
+    pub fn give_up(&self) {
         self.given_up.store(true, Ordering::SeqCst);
     }
 
@@ -114,7 +115,7 @@ impl Patience {
     }
 
     /// Writes a whole file or none, and waits where there is no room for it.
-    pub(crate) fn write_atomic(
+    pub fn write_atomic(
         &self,
         path: &Path,
         fill: impl Fn(&mut BufWriter<&File>) -> Result<()>,

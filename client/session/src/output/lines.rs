@@ -11,7 +11,7 @@ use std::sync::Arc;
 const GATHER: usize = 1 << 20;
 
 /// A file of lines that gets its name at the end.
-pub(crate) struct Kept {
+pub struct Kept {
     path: PathBuf,
     file: Option<Growing>,
     gathered: Vec<u8>,
@@ -35,11 +35,15 @@ impl Kept {
 
 /// Text that is written line by line and gets its name only when the run ends: `--stats`,
 /// `--trace`. A pipe, a device or stdout (`-`) gets it at once.
-pub(crate) enum Lines {
+pub enum Lines {
+    /// Nothing is written.
     None,
+    /// Standard output; closed once its reader has gone away.
     Stdout {
+        /// Whether somebody still reads.
         open: bool,
     },
+    /// A pipe or a device.
     Stream(PathBuf, File),
     /// Made with the first line, so that a run that fails before has nothing to clean up.
     Kept(Kept),
@@ -47,7 +51,7 @@ pub(crate) enum Lines {
 
 impl Lines {
     /// Opens what the flag says; refuses places where no file can be made, and `inputs`.
-    pub(crate) fn open(
+    pub fn open(
         path: Option<&Path>,
         flag: &str,
         inputs: &[&Path],
@@ -78,7 +82,7 @@ impl Lines {
     }
 
     /// Adds text as it is.
-    pub(crate) fn put(&mut self, text: &str) -> Result<(), Fail> {
+    pub fn put(&mut self, text: &str) -> Result<(), Fail> {
         match self {
             Lines::None | Lines::Stdout { open: false } => Ok(()),
             Lines::Stdout { open } => match crate::fail::say(text) {
@@ -104,17 +108,17 @@ impl Lines {
     }
 
     /// Whether lines go to stdout.
-    pub(crate) fn on_stdout(&self) -> bool {
+    pub fn on_stdout(&self) -> bool {
         matches!(self, Lines::Stdout { .. })
     }
 
     /// Whether lines are wanted.
-    pub(crate) fn wanted(&self) -> bool {
+    pub fn wanted(&self) -> bool {
         !matches!(self, Lines::None)
     }
 
     /// Puts the file under its name.
-    pub(crate) fn keep(self) -> Result<(), Fail> {
+    pub fn keep(self) -> Result<(), Fail> {
         match self {
             Lines::Kept(mut kept) => {
                 kept.write()?;

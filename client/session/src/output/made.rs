@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 /// A folder that files can be made in. Whoever writes there holds it until all is written.
 #[derive(Debug)]
-pub(crate) struct Made {
+pub struct Made {
     /// Folders that were missing, outermost first.
     made: Vec<PathBuf>,
 }
@@ -14,7 +14,7 @@ pub(crate) struct Made {
 impl Made {
     /// Makes the folder and those it lies in, where they are missing, and sees whether files can be made
     /// in it: better now than after the work.
-    pub(crate) fn new(path: &Path) -> Result<Made, Fail> {
+    pub fn new(path: &Path) -> Result<Made, Fail> {
         let mut missing: Vec<&Path> =
             path.ancestors().take_while(|p| !p.as_os_str().is_empty() && !p.exists()).collect();
         missing.reverse();

@@ -5,21 +5,21 @@
 //! a file is whole or not there.
 
 mod contact;
-pub(crate) mod exr;
+pub mod exr;
 mod file;
 mod folder;
 mod lines;
 mod made;
-pub(crate) mod png;
-pub(crate) mod provenance;
+pub mod png;
+pub mod provenance;
 mod y4m;
 
-pub(crate) use file::{Patience, probe, write_atomic};
-pub(crate) use lines::Lines;
-pub(crate) use made::Made;
+pub use file::{Patience, probe, write_atomic};
+pub use lines::Lines;
+pub use made::Made;
 
 use crate::fail::Fail;
-use crate::front::magnify::magnified;
+use crate::magnify::magnified;
 use crate::parse;
 use contact::Contact;
 use file::Growing;
@@ -33,21 +33,22 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use tokio::task::JoinSet;
 
-/// Who made a file, for programs that show that.
-pub(crate) const SOFTWARE: &str = concat!("slabcast ", env!("CARGO_PKG_VERSION"));
-
 /// A finished frame on its way to disk.
 #[derive(Clone, Debug)]
-pub(crate) struct Frame {
-    pub(crate) number: u64,
-    pub(crate) size: [u32; 2],
-    pub(crate) format: PixelFormat,
-    pub(crate) bytes: bytes::Bytes,
+pub struct Frame {
+    /// Number of the frame on its whole path.
+    pub number: u64,
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+    /// What `bytes` holds.
+    pub format: PixelFormat,
+    /// Pixels, row-major from the top left, in `format`.
+    pub bytes: bytes::Bytes,
 }
 
 impl Frame {
     /// As 8-bit sRGB, over black where it is transparent.
-    pub(crate) fn rgb8(&self) -> Vec<u8> {
+    pub fn rgb8(&self) -> Vec<u8> {
         let over = |c: u8, a: u8| {
             let light = linear_from_srgb(f64::from(c) / 255.0) * f64::from(a) / 255.0;
             (srgb_from_linear(light) * 255.0 + 0.5) as u8
@@ -69,7 +70,7 @@ impl Frame {
     }
 
     /// The picture of a frame of floats.
-    pub(crate) fn picture(&self) -> Picture {
+    pub fn picture(&self) -> Picture {
         let float = |p: &[u8], c: usize| f32::from_le_bytes(std::array::from_fn(|i| p[c * 4 + i]));
         let pixels = self.bytes.chunks_exact(16).map(|p| std::array::from_fn(|c| float(p, c)));
         Picture { size: self.size, pixels: pixels.collect() }
@@ -79,7 +80,7 @@ impl Frame {
 /// What frames become.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
-pub(crate) enum Format {
+pub enum Format {
     /// 8-bit PNG
     Png,
     /// 16-bit PNG
@@ -94,7 +95,7 @@ pub(crate) enum Format {
 
 impl Format {
     /// What the master sends.
-    pub(crate) fn pixels(self, background: Background) -> PixelFormat {
+    pub fn pixels(self, background: Background) -> PixelFormat {
         match (self, background) {
             (Format::Png16, _) => PixelFormat::Rgba16,
             (Format::Exr, _) => PixelFormat::Rgba32F,
@@ -124,25 +125,25 @@ impl Format {
 /// `-o` and what belongs to it.
 #[derive(clap::Args, Clone, Debug)]
 #[command(next_help_heading = "Output")]
-pub(crate) struct OutputArgs {
+pub struct OutputArgs {
     /// A folder for frame_0000.png and so on, made if missing; or one file: NAME.png or NAME.exr
     /// of one frame, NAME.apng or NAME.y4m of all; - writes Y4M video to stdout
     #[arg(short, long, value_name = "DIR|FILE|-", default_value = "slabcast-out/")]
-    pub(crate) output: PathBuf,
+    pub output: PathBuf,
     /// png, png16 (16 bits), exr (linear floats, no background), apng or y4m (one moving picture)
     /// [default: by the name of the file, png in a folder]
     #[arg(long, value_name = "FORMAT", hide_possible_values = true, value_enum)]
-    pub(crate) format: Option<Format>,
+    pub format: Option<Format>,
     /// Frames a second of a moving picture
     #[arg(long, value_name = "N", default_value = "12",
           value_parser = clap::value_parser!(u16).range(1..=240))]
-    pub(crate) fps: u16,
+    pub fps: u16,
     /// Also all frames, small, on one PNG
     #[arg(long, value_name = "FILE.png", value_parser = parse::png)]
-    pub(crate) contact_sheet: Option<PathBuf>,
+    pub contact_sheet: Option<PathBuf>,
     /// Replace files that are there already
     #[arg(long)]
-    pub(crate) force: bool,
+    pub force: bool,
 }
 
 /// Where frames go.
@@ -160,9 +161,10 @@ enum Target {
 
 /// Where frames go and as what.
 #[derive(Debug)]
-pub(crate) struct Output {
+pub struct Output {
     target: Target,
-    pub(crate) format: Format,
+    /// Format of the files.
+    pub format: Format,
     fps: u16,
     contact: Option<PathBuf>,
     /// What frames that come as small pictures of floats become.
@@ -177,7 +179,7 @@ struct Magnify {
 }
 
 /// Refuses a file to write that is one of those to read.
-pub(crate) fn not_an_input(path: &Path, flag: &str, inputs: &[&Path]) -> Result<(), Fail> {
+pub fn not_an_input(path: &Path, flag: &str, inputs: &[&Path]) -> Result<(), Fail> {
     let same = |input: &&Path| matches!((path.canonicalize(), input.canonicalize()), (Ok(a), Ok(b)) if a == b);
     if inputs.iter().any(same) {
         return Err(Fail::usage(format!(
@@ -232,7 +234,7 @@ fn other_programs(path: &Path, ends: &str) -> Result<(), Fail> {
 impl Output {
     /// Looks at what is there, refuses what would be spoilt or cannot be, and writes nothing. Also
     /// says which files of an earlier run will stay beside the new ones.
-    pub(crate) fn look(
+    pub fn look(
         args: &OutputArgs,
         stem: &'static str,
         frames: std::ops::Range<u64>,
@@ -330,7 +332,7 @@ impl Output {
 
     /// What the master should send for pictures over `background` that are drawn `times` smaller
     /// than they come out.
-    pub(crate) fn takes(&mut self, times: u32, background: Background) -> PixelFormat {
+    pub fn takes(&mut self, times: u32, background: Background) -> PixelFormat {
         self.magnify = (times > 1).then_some(Magnify { times, background });
         if times > 1 { PixelFormat::Rgba32F } else { self.format.pixels(background) }
     }
@@ -345,12 +347,12 @@ impl Output {
     }
 
     /// Frames a second, where there is such a thing.
-    pub(crate) fn fps(&self) -> Option<u16> {
+    pub fn fps(&self) -> Option<u16> {
         self.format.moves().then_some(self.fps)
     }
 
     /// Makes what must be there before the first frame.
-    pub(crate) fn make(&mut self) -> Result<(), Fail> {
+    pub fn make(&mut self) -> Result<(), Fail> {
         match &mut self.target {
             Target::Folder(folder) => folder.make(),
             _ => Ok(()),
@@ -358,12 +360,12 @@ impl Output {
     }
 
     /// Whether frames go to stdout, where nothing else may be written then.
-    pub(crate) fn on_stdout(&self) -> bool {
+    pub fn on_stdout(&self) -> bool {
         matches!(self.target, Target::Pipe(None))
     }
 
     /// `slabcast-out/ (frame_0000.png ... frame_0017.png)`, `turn.y4m`, `stdout`.
-    pub(crate) fn shown(&self, written: &[u64]) -> String {
+    pub fn shown(&self, written: &[u64]) -> String {
         match &self.target {
             Target::Folder(folder) => format!("{} ({})", folder.shown(), folder.list(written)),
             Target::Still(path) | Target::Movie(path) | Target::Pipe(Some(path)) => {
@@ -450,7 +452,7 @@ impl Movie {
 }
 
 /// Frames on their way out, encoded on blocking threads of the runtime.
-pub(crate) struct Writer {
+pub struct Writer {
     output: Arc<Output>,
     movie: Option<Arc<Mutex<Movie>>>,
     contact: Option<Arc<Mutex<Contact>>>,
@@ -466,11 +468,7 @@ const AT_ONCE: usize = 2;
 
 impl Writer {
     /// For `frames` frames. Opens pipes.
-    pub(crate) fn new(
-        output: Arc<Output>,
-        frames: u64,
-        patience: Arc<Patience>,
-    ) -> Result<Self, Fail> {
+    pub fn new(output: Arc<Output>, frames: u64, patience: Arc<Patience>) -> Result<Self, Fail> {
         let coder = || match output.format {
             Format::Apng => Coder::Apng(png::Moving::new(output.fps)),
             _ => Coder::Y4m { fps: output.fps },
@@ -492,18 +490,18 @@ impl Writer {
     }
 
     /// Whether another frame may come.
-    pub(crate) fn has_room(&self) -> bool {
+    pub fn has_room(&self) -> bool {
         // Frames of a moving picture follow each other.
         self.busy.len() < if self.movie.is_some() { 1 } else { AT_ONCE }
     }
 
     /// Whether a frame is on its way.
-    pub(crate) fn is_busy(&self) -> bool {
+    pub fn is_busy(&self) -> bool {
         !self.busy.is_empty()
     }
 
     /// Takes a frame, the next one in order. Call [`Writer::has_room`] first.
-    pub(crate) fn put(&mut self, frame: Frame, made: Option<Provenance>) {
+    pub fn put(&mut self, frame: Frame, made: Option<Provenance>) {
         let (output, movie) = (self.output.clone(), self.movie.clone());
         let (contact, patience) = (self.contact.clone(), self.patience.clone());
         self.busy.spawn_blocking(move || {
@@ -533,7 +531,7 @@ impl Writer {
     }
 
     /// Waits for the next frame to be on disk. Pending for ever where none is on its way.
-    pub(crate) async fn next_written(&mut self) -> Result<u64, Fail> {
+    pub async fn next_written(&mut self) -> Result<u64, Fail> {
         match self.busy.join_next().await {
             None => std::future::pending().await,
             Some(Ok(done)) => {
@@ -547,7 +545,7 @@ impl Writer {
 
     /// Waits for all that are on their way; the first failure counts, the others go on. Then ends
     /// what is in one file, with as many frames as there are, and the contact sheet.
-    pub(crate) async fn end(&mut self) -> Result<(), Fail> {
+    pub async fn end(&mut self) -> Result<(), Fail> {
         let mut first = Ok(());
         while self.is_busy() {
             if let Err(e) = self.next_written().await
@@ -578,7 +576,7 @@ impl Writer {
     }
 
     /// Frames on disk, ascending.
-    pub(crate) fn written(&mut self) -> &[u64] {
+    pub fn written(&mut self) -> &[u64] {
         self.written.sort_unstable();
         &self.written
     }

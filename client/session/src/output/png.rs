@@ -5,16 +5,17 @@
 //! and what is done is kept. Any viewer that knows no APNG shows its first frame.
 
 use super::Frame;
+use crate::software::{SOFTWARE, io_error};
 use slabcast_common::image::PixelFormat;
 use std::io::{Error, Result, Write};
 
 /// The chunk that holds the provenance.
-pub(crate) const KEYWORD: &str = "slabcast";
+pub const KEYWORD: &str = "slabcast";
 /// Longer provenances (a transfer function of many points) are compressed.
 const PLAIN: usize = 2048;
 
 /// Encodes a frame, with `provenance` as text unless it is empty.
-pub(crate) fn encode(frame: &Frame, provenance: &str, out: &mut impl Write) -> Result<()> {
+pub fn encode(frame: &Frame, provenance: &str, out: &mut impl Write) -> Result<()> {
     let mut png = png::Encoder::new(out, frame.size[0], frame.size[1]);
     let (colour, depth, bytes) = match frame.format {
         PixelFormat::Rgb8 => (png::ColorType::Rgb, png::BitDepth::Eight, None),
@@ -38,29 +39,20 @@ pub(crate) fn encode(frame: &Frame, provenance: &str, out: &mut impl Write) -> R
     // better one (Balanced) takes 23 ms and 2.7 s, for files a fifth to a third smaller: longer
     // than rendering on a good machine.
     png.set_compression(png::Compression::Fast);
-    png.add_text_chunk("Software".into(), super::SOFTWARE.into()).map_err(plain)?;
+    png.add_text_chunk("Software".into(), SOFTWARE.into()).map_err(io_error)?;
     match provenance.len() {
         0 => Ok(()),
         1..PLAIN => png.add_itxt_chunk(KEYWORD.into(), provenance.into()),
         _ => png.add_ztxt_chunk(KEYWORD.into(), provenance.into()),
     }
-    .map_err(plain)?;
-    let mut png = png.write_header().map_err(plain)?;
-    png.write_image_data(bytes.as_deref().unwrap_or(&frame.bytes)).map_err(plain)?;
-    png.finish().map_err(plain)
-}
-
-/// The system's own error where there is one: the crate's conversion forgets its kind, and a full
-/// disk would be no full disk any more.
-pub(crate) fn plain(e: png::EncodingError) -> Error {
-    match e {
-        png::EncodingError::IoError(e) => e,
-        other => Error::other(other),
-    }
+    .map_err(io_error)?;
+    let mut png = png.write_header().map_err(io_error)?;
+    png.write_image_data(bytes.as_deref().unwrap_or(&frame.bytes)).map_err(io_error)?;
+    png.finish().map_err(io_error)
 }
 
 /// The provenance in a PNG; `None` where it has none.
-pub(crate) fn provenance(bytes: &[u8]) -> std::result::Result<Option<String>, String> {
+pub fn provenance(bytes: &[u8]) -> std::result::Result<Option<String>, String> {
     let reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info();
     let reader = reader.map_err(|e| e.to_string())?;
     let info = reader.info();

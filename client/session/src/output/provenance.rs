@@ -6,6 +6,7 @@
 use super::{Format, Frame, exr, png};
 use crate::fail::Fail;
 use crate::request::Asked;
+use crate::transfer::Transfer;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use slabcast_common::PIXELS_VERSION;
@@ -26,40 +27,43 @@ const MAX_BYTES: u64 = 2 << 30;
 /// All that decides a picture's bytes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Provenance {
+pub struct Provenance {
     /// Format version, 1.
     version: u32,
     /// The program's version.
-    pub(crate) slabcast: String,
-    pub(crate) pixels_version: u32,
+    pub slabcast: String,
+    /// Version of the pixels that the program drew (`PIXELS_VERSION`).
+    pub pixels_version: u32,
     /// The volume's digest.
-    pub(crate) volume_sha256: String,
+    pub volume_sha256: String,
     /// The view; the whole path of a moving picture.
-    pub(crate) path: ViewPath,
+    pub path: ViewPath,
     /// The preset that the transfer function came from.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(crate) preset: Option<String>,
-    pub(crate) transfer: TransferFunction,
+    pub preset: Option<String>,
+    /// Transfer function, presets resolved.
+    pub transfer: TransferFunction,
     /// Sums decided.
-    pub(crate) quality: Quality,
+    pub quality: Quality,
     /// The picture was drawn at the path's size and is so many times as large.
     #[serde(default = "one", skip_serializing_if = "is_one")]
-    pub(crate) magnify: u32,
+    pub magnify: u32,
     background: Ground,
-    pub(crate) format: Format,
+    /// Format of the file.
+    pub format: Format,
     /// Frames a second of a moving picture.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(crate) fps: Option<u16>,
+    pub fps: Option<u16>,
     /// Hash of the view and all else that decides the pixels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     view_sha256: Option<String>,
     /// Hash of the linear picture. Pictures said it while masters hashed each; who draws one of them again
     /// has it hashed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(crate) pixels_sha256: Option<String>,
+    pub pixels_sha256: Option<String>,
     /// Hash of the pixels that are in the file, as bytes of the format that a master sends for it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(crate) picture_sha256: Option<String>,
+    pub picture_sha256: Option<String>,
 }
 
 fn one() -> u32 {
@@ -79,7 +83,21 @@ enum Ground {
 }
 
 impl Provenance {
-    pub(crate) fn background(&self) -> Background {
+    /// Returns the request that makes the picture again.
+    pub fn request(&self) -> Asked {
+        let hash_inside = self.pixels_sha256.is_some();
+        let transfer = Transfer::again(&self.transfer, self.preset.clone());
+        let mut asked = Asked::with_defaults(self.path.clone(), transfer);
+        asked.quality = self.quality;
+        asked.magnify = self.magnify;
+        asked.background = self.background();
+        asked.hashed = hash_inside;
+        asked.hash_inside = hash_inside;
+        asked
+    }
+
+    /// Returns what lies behind transparent pixels.
+    pub fn background(&self) -> Background {
         match self.background {
             Ground::Word(_) => Background::Transparent,
             Ground::Colour(c) => Background::Colour(c),
@@ -96,13 +114,13 @@ impl Provenance {
     }
 
     /// Whether two pictures say that they have the same pixels.
-    pub(crate) fn same_pixels(&self, other: &Provenance) -> bool {
+    pub fn same_pixels(&self, other: &Provenance) -> bool {
         let hashes = |p: &Provenance| (p.pixels_sha256.clone(), p.picture_sha256.clone());
         hashes(self) == hashes(other)
     }
 
     /// What made the picture in a file.
-    pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Provenance, Fail> {
+    pub fn read(path: &Path, bytes: &[u8]) -> Result<Provenance, Fail> {
         let file = path.display();
         let text = if bytes.starts_with(b"\x89PNG") {
             png::provenance(bytes)
@@ -151,7 +169,7 @@ impl Provenance {
 }
 
 /// The bytes of a picture's file, if it is no larger than pictures are.
-pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Fail> {
+pub fn read(path: &Path) -> Result<Vec<u8>, Fail> {
     let fail = |e: std::io::Error| Fail::io(path, "reading", &e);
     let meta = std::fs::metadata(path).map_err(fail)?;
     if meta.is_dir() {
@@ -168,7 +186,7 @@ pub(crate) fn read(path: &Path) -> Result<Vec<u8>, Fail> {
 }
 
 /// Says of each frame of a run what made it.
-pub(crate) struct Recipe {
+pub struct Recipe {
     base: Provenance,
     /// With the hash of the linear picture instead of the file's own.
     hash_inside: bool,
@@ -176,7 +194,7 @@ pub(crate) struct Recipe {
 
 impl Recipe {
     /// For a run on the volume that `info` describes.
-    pub(crate) fn new(
+    pub fn new(
         asked: &Asked,
         info: &VolumeInfo,
         orientation: Orientation,
@@ -240,7 +258,7 @@ impl Recipe {
     }
 
     /// What made the frame of these statistics, alone.
-    pub(crate) fn frame(&self, stats: &FrameStats) -> Provenance {
+    pub fn frame(&self, stats: &FrameStats) -> Provenance {
         let mut p = self.whole(stats.quality.sums);
         p.path = p.path.only(stats.frame as usize);
         p.view_sha256 = Some(stats.view_sha256.clone());
@@ -249,7 +267,7 @@ impl Recipe {
     }
 
     /// What makes all frames, with sums as the master decided them.
-    pub(crate) fn movie(&self, stats: &FrameStats) -> Provenance {
+    pub fn movie(&self, stats: &FrameStats) -> Provenance {
         self.whole(stats.quality.sums)
     }
 

@@ -9,15 +9,16 @@
 
 mod sweep;
 
+use super::case::number;
 use super::scenes::SCENES;
-use super::table::number;
-use crate::fail::{Fail, say};
-use crate::progress::{self, Progress};
-use crate::request::{Asked, LookArgs, ThreadArg};
-use crate::{plot, volume};
+use crate::plot;
 use slabcast_common::path::{Orientation, ProjectionKind, Turntable, ViewPath};
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::transfer::TransferFunction;
+use slabcast_session::fail::{Fail, say};
+use slabcast_session::progress::{self, Progress};
+use slabcast_session::request::{Asked, LookArgs, ThreadArg};
+use slabcast_session::volume;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::time::Instant;

@@ -1,9 +1,5 @@
 //! One scene in one projection at one thickness after another, and what the errors are made of.
 
-use crate::check::shot::Drawn;
-use crate::fail::Fail;
-use crate::local::{self, Cut};
-use crate::progress::Progress;
 use slabcast_common::image::Picture;
 use slabcast_common::quality::{Compositing, Quality, Sums};
 use slabcast_common::transfer::TransferFunction;
@@ -11,6 +7,10 @@ use slabcast_common::view::{Camera, View};
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_render::judge::reference::{Reference, Section, Sheets, stratified};
 use slabcast_render::{Frame, Scene};
+use slabcast_session::direct::{self, Cut};
+use slabcast_session::fail::Fail;
+use slabcast_session::path_scenes::Drawn;
+use slabcast_session::progress::Progress;
 use std::sync::Arc;
 
 /// What is swept.
@@ -145,13 +145,13 @@ pub(super) fn sweep(
         Ok::<_, Fail>(Reference::new(&drawn.spec, view(quality)?, &drawn.bricks))
     };
     let each = |pixel: &(dyn Fn(u32, u32) -> [f64; 4] + Sync)| {
-        local::shared(sample.len(), threads, |i, _: &mut ()| pixel(sample[i][0], sample[i][1]))
+        direct::shared(sample.len(), threads, |i, _: &mut ()| pixel(sample[i][0], sample[i][1]))
     };
     let picture = |drawn: &Drawn, quality: Quality| {
         let view = view(&quality)?;
         let spec = slabcast_common::message::SceneSpec { quality, ..drawn.spec.clone() };
         let frame = Frame::new(Arc::new(Scene::new(&spec)), view);
-        let picture: Picture = local::picture(&frame, &drawn.bricks, Cut::on(threads));
+        let picture: Picture = direct::picture(&frame, &drawn.bricks, Cut::on(threads));
         let at = |p: &[u32; 2]| picture.pixels[(p[1] * subject.size[0] + p[0]) as usize];
         Ok::<_, Fail>(sample.iter().map(|p| at(p).map(f64::from)).collect::<Vec<_>>())
     };
@@ -181,7 +181,7 @@ pub(super) fn sweep(
 
         let ours_in_f64 = reference(&ours, &of(linear, decided))?;
         let both = |how: Sheets| {
-            let pixels = local::shared(sample.len(), threads, |i, _: &mut ()| {
+            let pixels = direct::shared(sample.len(), threads, |i, _: &mut ()| {
                 ours_in_f64.by_sheets_linear_and_constant(sample[i][0], sample[i][1], how)
             });
             pixels.into_iter().map(|[l, c]| (l, c)).unzip::<_, _, Vec<_>, Vec<_>>()

@@ -3,12 +3,12 @@
 
 use super::mixed;
 use super::scene::{against_truth, from, rough, shot};
+use crate::check::case::Case;
 use crate::check::shot::Shot;
-use crate::check::table::Case;
-use crate::embedded::Crew;
-use crate::local::Cut;
 use slabcast_common::path::PathView;
 use slabcast_common::quality::{Quality, Work};
+use slabcast_session::direct::Cut;
+use slabcast_session::embedded::Crew;
 
 pub(super) fn cases() -> Vec<Case> {
     // The volume covers a tenth of the height, so that a voxel is 64 pixels wide: a magnified

@@ -10,10 +10,8 @@ mod scene;
 mod stiff;
 mod values;
 
+use super::case::{Case, Row};
 use super::shot::Shot;
-use super::table::{Case, Row};
-use crate::embedded::Crew;
-use crate::local::{self, Cut};
 use scene::{
     apart, cutoff, extinction, from, judge, look, on_lattice, persp, ramp, rough, shaded, shot,
 };
@@ -23,6 +21,8 @@ use slabcast_common::path::PathView;
 use slabcast_common::quality::{Compositing, Quality, Sums, Work};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::volume::Volume;
+use slabcast_session::direct::{self, Cut};
+use slabcast_session::embedded::Crew;
 
 /// Pixels of a case that are judged: one cell in eleven of a picture of 61x47.
 const PIXELS: usize = 256;
@@ -228,7 +228,7 @@ fn settings() -> Vec<Case> {
         all.push(Case::new(format!("eps {name} against eps 0"), move |tools| {
             let shut = scene(eps, Sums::Auto).ready()?;
             let frame = shut.frame().never_shut();
-            let open = local::picture(&frame, &shut.bricks, Cut::on(tools.threads));
+            let open = direct::picture(&frame, &shut.bricks, Cut::on(tools.threads));
             let left_out = apart(&shut.serial(), &open);
             Ok(vec![Row::new("max that the cut-off leaves out", left_out, cutoff(&shut))])
         }));

@@ -1,10 +1,8 @@
 //! What extreme scenes are made of: volumes, looks and cameras, and how one is judged.
 
+use crate::check::case::Row;
 use crate::check::enclose::Enclosure;
 use crate::check::shot::{Against, Ready, Shot, Tools, largest, sane_within};
-use crate::check::table::Row;
-use crate::fail::Fail;
-use crate::local::{self, Cut};
 use glam::DVec3;
 use slabcast_common::bounds;
 use slabcast_common::brick::TightBox;
@@ -15,6 +13,8 @@ use slabcast_common::shade::Shading;
 use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
 use slabcast_common::view::Projection;
 use slabcast_common::volume::{Lattice, Volume};
+use slabcast_session::direct::{self, Cut};
+use slabcast_session::fail::Fail;
 use std::sync::Arc;
 
 /// What the reference itself may be off by, in 1/255: its head gives 7e-5 at its tolerance.
@@ -159,7 +159,7 @@ pub(super) fn against_truth(
     tools: &Tools,
 ) -> Vec<Row> {
     let enclosure = Enclosure::new(ready);
-    let spans = local::shared(sample.len(), tools.threads, |i, _: &mut ()| {
+    let spans = direct::shared(sample.len(), tools.threads, |i, _: &mut ()| {
         enclosure.pixel(sample[i][0], sample[i][1])
     });
     let parallel = matches!(ready.view.projection, Projection::Ortho { .. });

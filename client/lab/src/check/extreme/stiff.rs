@@ -2,8 +2,8 @@
 //! one, and halving the sheets never makes a picture worse, down to the floor of rounding.
 
 use super::scene::{extinction, rough, shot};
+use crate::check::case::{Case, Row};
 use crate::check::shot::{Against, Shot};
-use crate::check::table::{Case, Row};
 use slabcast_common::quality::Quality;
 
 /// From twice a vox to a sixteenth.

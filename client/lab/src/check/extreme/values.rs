@@ -2,12 +2,12 @@
 
 use super::scene::{look, shot};
 use super::{PIXELS, judge, one};
+use crate::check::case::Case;
 use crate::check::shot::Shot;
-use crate::check::table::Case;
-use crate::fail::Fail;
-use crate::volume;
 use slabcast_common::transfer::{Domain, NanLook, TransferFunction};
 use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
+use slabcast_session::fail::Fail;
+use slabcast_session::volume;
 
 pub(super) fn cases() -> Vec<Case> {
     vec![

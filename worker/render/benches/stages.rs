@@ -8,8 +8,8 @@
 //! Items a second are what the situation is about: voxels tossed, sections added, pixels closed, bricks.
 //! Every scene's picture is compared, to the bit, with that of the plain renderer before it is timed.
 
-#[path = "../tests/world/mod.rs"]
-mod world;
+#[path = "../tests/render/support/mod.rs"]
+mod support;
 
 use divan::Bencher;
 use divan::counter::ItemsCount;
@@ -110,7 +110,7 @@ impl How {
         let whole = TightBox::whole(volume.lattice.dims);
         let sheets = view.project(&whole).expect("in sight").sheets;
         let frame = Frame::new(Arc::new(Scene::new(&spec)), view);
-        Stage { frame, bricks: world::bricks_of(&volume), sheets, scratch: Scratch::default() }
+        Stage { frame, bricks: support::bricks_of(&volume), sheets, scratch: Scratch::default() }
     }
 }
 
@@ -271,7 +271,7 @@ fn finish_a_tile(bencher: Bencher<'_, '_>, (format, background): (PixelFormat, [
 /// Bricks as they travel.
 #[divan::bench]
 fn encode_bricks(bencher: Bencher<'_, '_>) {
-    let bricks = world::bricks_of(&How::volume());
+    let bricks = support::bricks_of(&How::volume());
     let mut out = Vec::new();
     for brick in &bricks {
         out.clear();
@@ -291,7 +291,7 @@ fn encode_bricks(bencher: Bencher<'_, '_>) {
 /// And as they arrive, checksums included.
 #[divan::bench]
 fn decode_bricks(bencher: Bencher<'_, '_>) {
-    let bricks = world::bricks_of(&How::volume());
+    let bricks = support::bricks_of(&How::volume());
     let encoded: Vec<Vec<u8>> = bricks
         .iter()
         .map(|brick| {

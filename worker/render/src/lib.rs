@@ -20,19 +20,21 @@
 
 pub mod judge;
 pub mod oracle;
-pub mod primitives;
 pub mod region;
 pub mod scene;
 pub mod selftest;
 pub mod tile;
 pub mod visibility;
 
-// For this crate and its own tests.
+// The rooms below are public for this crate's tests alone.
+#[doc(hidden)]
+pub mod geometry;
 #[doc(hidden)]
 pub mod kernels;
-
-mod geometry;
-mod part;
+#[doc(hidden)]
+pub mod part;
+#[doc(hidden)]
+pub mod primitives;
 
 pub use kernels::Simd;
 pub use scene::{Frame, Scene};

@@ -94,20 +94,20 @@ pub struct Frame {
     /// Unit direction to the eye in world axes, where it is the same for all voxels.
     pub(crate) to_eye: Option<Vec3>,
     /// Positions, where all sections of all voxels share one footprint, be they in one place or aside of it.
-    pub(crate) flat: Option<Flat>,
+    pub flat: Option<Flat>,
     /// Where sections and rows lie, where the kernel leans.
-    pub(crate) leaning: Option<Leaning>,
+    pub leaning: Option<Leaning>,
     /// What lies level, where voxels are added to rows of it.
-    pub(crate) lattice_rows: Option<LatticeRows>,
+    pub lattice_rows: Option<LatticeRows>,
 }
 
 /// What an orthographic view has whose footprints are in a table and small enough for masks.
 #[derive(Debug)]
-pub(crate) struct Flat {
+pub struct Flat {
     /// Where voxels land.
-    pub(crate) places: Places,
+    pub places: Places,
     /// Pixels along x and y that a footprint reaches at most from the one that holds its voxel's centre.
-    pub(crate) reach: [i32; 2],
+    pub reach: [i32; 2],
 }
 
 /// Local index of the voxel at a place in its brick.
@@ -119,11 +119,11 @@ fn local_of([i, j, k]: [u32; 3]) -> u16 {
 #[derive(Clone, Copy, Debug)]
 pub struct Corner {
     /// Index position of its first voxel.
-    pub(crate) index: [u32; 3],
+    pub index: [u32; 3],
     /// Eye coordinates in vox.
     pub eye: DVec3,
     /// Where the view is flat.
-    pub(crate) flat: FlatCorner,
+    pub flat: FlatCorner,
 }
 
 /// A voxel, seen by the eye.
@@ -245,7 +245,7 @@ impl Frame {
     }
 
     /// Offsets of a brick's voxels from its corner, in vox along each of the eye's axes.
-    pub(crate) fn offsets(&self) -> &[[f64; 512]; 3] {
+    pub fn offsets(&self) -> &[[f64; 512]; 3] {
         &self.offsets
     }
 
@@ -295,7 +295,7 @@ impl Frame {
 
     /// The lattice row of a voxel, in a level view: its brick's corner and its local index.
     #[inline]
-    pub(crate) fn lattice_row(&self, corner: &Corner, of: u16) -> Option<u32> {
+    pub fn lattice_row(&self, corner: &Corner, of: u16) -> Option<u32> {
         let (at, lattice_rows) = (local(of), self.lattice_rows.as_ref()?);
         Some(lattice_rows.of_voxel(std::array::from_fn(|axis| corner.index[axis] + at[axis])))
     }

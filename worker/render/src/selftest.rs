@@ -22,7 +22,7 @@ use slabcast_common::volume::{Digest32, Samples, Volume};
 use std::sync::Arc;
 
 /// `volume` as a scene of its own, in three colours.
-pub(crate) fn spec(volume: &Volume, quality: Quality) -> SceneSpec {
+pub fn spec(volume: &Volume, quality: Quality) -> SceneSpec {
     SceneSpec {
         id: SceneId(0),
         volume: volume.info(Digest32::default()),
@@ -84,7 +84,7 @@ pub fn run(simd: Simd) -> Digest32 {
 }
 
 /// All voxels of an 8-bit volume that are not zero, as bricks, with normals.
-pub(crate) fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
+pub fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
     let grid = BrickGrid::of(volume.lattice.dims);
     let Samples::U8(samples) = &volume.samples else { unreachable!("made above") };
     let [nx, ny, _] = volume.lattice.dims.map(|n| n as usize);
@@ -112,16 +112,4 @@ pub(crate) fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
             })
         })
         .collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_instruction_set_of_this_machine_passes() {
-        for simd in Simd::all() {
-            assert_eq!(run(simd).to_string(), slabcast_common::SELF_TEST_SHA256, "{}", simd.name());
-        }
-    }
 }

@@ -4,7 +4,8 @@
 //! tile finds the memory that it needs. What is made for a frame (its tables, its bricks as it sees
 //! them) takes a number of allocations that does not hang on bricks, voxels, tiles or pixels.
 
-mod world;
+#[path = "render/support/mod.rs"]
+mod support;
 
 use allocation_counter::measure;
 use glam::DVec3;
@@ -16,7 +17,7 @@ use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Compositing, Quality, Sums};
 use slabcast_common::shade::Shading;
 use slabcast_common::slab::SheetRange;
-use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
+use slabcast_common::transfer::{ColorSpace, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_render::Simd;
@@ -25,7 +26,7 @@ use slabcast_render::tile::{self, ProjectedBrick, Scratch};
 use slabcast_render::visibility::{Directory, VisibleBricks};
 use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
-use world::{bricks_of, infos_of};
+use support::{bricks_of, infos_of};
 
 /// Views of a turn.
 const VIEWS: u32 = 10;
@@ -46,17 +47,10 @@ fn ball() -> Volume {
 }
 
 fn transfer(unit: OpacityUnit) -> TransferFunction {
-    TransferFunction {
-        version: 1,
-        domain: Domain::Value,
-        colors: vec![[0.0, 0.9, 0.3, 0.1], [255.0, 0.2, 0.8, 1.0]],
-        opacities: vec![[30.0, 0.0], [150.0, 0.05], [200.0, 0.9], [255.0, 0.9]],
-        color_space: ColorSpace::Srgb,
-        opacity_unit: unit,
-        nan: NanLook::default(),
-        gradient_opacity: vec![],
-        shading: Shading::default(),
-    }
+    let colors = vec![[0.0, 0.9, 0.3, 0.1], [255.0, 0.2, 0.8, 1.0]];
+    let opacities = vec![[30.0, 0.0], [150.0, 0.05], [200.0, 0.9], [255.0, 0.9]];
+    let (color_space, shading) = (ColorSpace::Srgb, Shading::default());
+    TransferFunction { color_space, shading, ..support::transfer(colors, opacities, unit) }
 }
 
 /// Every brick is here.
@@ -131,7 +125,7 @@ fn draw(scene: &Arc<Scene>, view: View, bricks: &[Arc<Brick>], kept: &mut Kept) 
 }
 
 #[test]
-fn a_second_turn_allocates_nothing_while_it_draws() {
+fn second_turntable_allocates_nothing_while_drawing() {
     let volume = ball();
     let bricks = bricks_of(&volume);
     let rooms = [

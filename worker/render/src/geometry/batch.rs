@@ -14,7 +14,7 @@ use crate::visibility::open_mask::OpenMask;
 use slabcast_common::message::Counters;
 
 /// Voxels of one bucket, and where their sections lie.
-pub(crate) struct Batch {
+pub struct Batch {
     pub(crate) samples: Each<u32>,
     pub(crate) normals: Each<u16>,
     pub(crate) apart: Apart,
@@ -36,15 +36,15 @@ impl Default for Batch {
 }
 
 /// Footprints by slot: their weights, and where those across and down lie.
-pub(crate) struct Axes<'a, S: Recorded, const N: usize> {
-    pub(crate) layers: Layers<'a, S, N>,
-    pub(crate) phases: [[Phases; N]; 2],
+pub struct Axes<'a, S: Recorded, const N: usize> {
+    pub layers: Layers<'a, S, N>,
+    pub phases: [[Phases; N]; 2],
 }
 
 impl<'a, S: Recorded, const N: usize> Axes<'a, S, N> {
     /// With one footprint in all slots, for voxels that begin in sheet `k`.
     #[inline(always)]
-    pub(crate) fn new(frame: &'a Frame, k: i32, footprint: &Footprint<'a>) -> Self {
+    pub fn new(frame: &'a Frame, k: i32, footprint: &Footprint<'a>) -> Self {
         let [(x, phases_x), (y, phases_y)] = [along::<S>(footprint, 0), along::<S>(footprint, 1)];
         let deep = Table { weights: S::deep(&frame.sections), len: frame.sections.most() };
         let alike = frame.has_columns_alike();

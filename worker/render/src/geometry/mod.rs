@@ -10,10 +10,10 @@
 //!
 //! [`open_sheets`] and [`batch`] are shared by the fast ones.
 
-pub(crate) mod batch;
-pub(crate) mod general;
-pub(crate) mod open_sheets;
-pub(crate) mod ortho;
-pub(crate) mod perspective;
-pub(crate) mod shared_rows;
-pub(crate) mod sheared;
+pub mod batch;
+pub mod general;
+pub mod open_sheets;
+pub mod ortho;
+pub mod perspective;
+pub mod shared_rows;
+pub mod sheared;

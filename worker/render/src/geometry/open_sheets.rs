@@ -8,7 +8,6 @@ use crate::kernels::Simd;
 use crate::kernels::composite::rows::close_rows;
 use crate::kernels::composite::{LANES, Row};
 use crate::kernels::pixel_records::{Line, Record, Recorded, STRIDE};
-#[cfg(test)]
 use crate::kernels::row_records::Tiers;
 use crate::kernels::row_records::{Folded, Shape};
 use crate::kernels::touched::{Places, Some16, column_and_row, put, take, unpack};
@@ -18,10 +17,10 @@ use crate::visibility::open_mask::{OpenMask, doubling};
 use slabcast_common::message::Counters;
 use slabcast_common::view::Projection;
 
-pub(crate) const EDGE: usize = PART as usize;
+pub const EDGE: usize = PART as usize;
 
 /// Memory for sums of one kind.
-pub(crate) struct Store<S: Recorded> {
+pub struct Store<S: Recorded> {
     /// Records of any number of sheets; nothing in them between parts.
     lines: Vec<Line>,
     pub(crate) closes: Closes<S>,
@@ -52,7 +51,7 @@ impl<S: Recorded> LevelStore<S> {
 }
 
 /// Memory for sheets that are closed, and what is known of the one before.
-pub(crate) struct Closes<S: Recorded> {
+pub struct Closes<S: Recorded> {
     /// Sums of the sheet before, where it was touched; elsewhere anything.
     before: Vec<S::Pixel>,
     /// Pixels of `before` that are the sheet's before.
@@ -69,10 +68,9 @@ impl<S: Recorded> Default for Store<S> {
     }
 }
 
-#[cfg(test)]
 impl<S: Recorded> Store<S> {
     /// Whether there are no sums of any part, and whether there are tiers at all.
-    pub(crate) fn is_empty(&mut self) -> (bool, bool) {
+    pub fn is_empty(&mut self) -> (bool, bool) {
         let LevelStore { tiers, shape: (shape, sheets), .. } = &mut self.level;
         let empty = match *sheets {
             4 => Tiers::<S, 4>::new(tiers, *shape).are_empty(),
@@ -97,7 +95,7 @@ impl<S: Recorded> Default for Closes<S> {
 
 /// Voxels of one bucket: the first `n` items; what is behind them is there from before, so that a voxel is added by one
 /// store.
-pub(crate) struct Bucket<V> {
+pub struct Bucket<V> {
     items: Vec<V>,
     n: usize,
 }
@@ -131,8 +129,8 @@ impl<V: Copy> Bucket<V> {
 }
 
 /// Voxels that wait.
-pub(crate) struct Queues<V> {
-    pub(crate) buckets: Vec<Bucket<V>>,
+pub struct Queues<V> {
+    pub buckets: Vec<Bucket<V>>,
     /// Voxels that begin before the slab, and where.
     pub(crate) carried: Vec<(V, i32)>,
 }
@@ -144,7 +142,7 @@ impl<V> Default for Queues<V> {
 }
 
 /// Open sheets of a part, whatever they keep their sums in.
-pub(crate) trait Open<S: Recorded> {
+pub trait Open<S: Recorded> {
     /// Sums of the sheet before by pixel, and where these are.
     fn before(&mut self) -> (&mut [S::Pixel], &mut Rows);
     /// From now on voxels begin at sheet `k`.
@@ -156,7 +154,7 @@ pub(crate) trait Open<S: Recorded> {
 }
 
 /// How voxels of one kind of view get into sheets, which are kept in `H`.
-pub(crate) trait Stage<H> {
+pub trait Stage<H> {
     /// A voxel waiting in the bucket of its first sheet.
     type Voxel: Copy;
 
@@ -183,13 +181,13 @@ pub(crate) trait Stage<H> {
 
 /// Voxels that are drawn from some sheet on: those that begin there, and those that began before the slab, with their
 /// first sheets.
-pub(crate) struct Due<'a, V> {
+pub struct Due<'a, V> {
     here: &'a [V],
     before: &'a [(V, i32)],
 }
 
 /// Some that are due, of one kind.
-pub(crate) enum Chunk<'a, V> {
+pub enum Chunk<'a, V> {
     Here(&'a [V]),
     Before(&'a [(V, i32)]),
 }
@@ -241,7 +239,7 @@ impl<V> Chunk<'_, V> {
 
 /// Walks through the sheets of `part`'s slab.
 #[inline(always)]
-pub(crate) fn walk<S: Recorded, H: Open<S>, T: Stage<H>>(
+pub fn walk<S: Recorded, H: Open<S>, T: Stage<H>>(
     part: &Part<'_>,
     mut stage: T,
     mut sheets: H,
@@ -309,7 +307,7 @@ pub(crate) fn walk<S: Recorded, H: Open<S>, T: Stage<H>>(
 }
 
 /// Pixels of a part, a bit each, row by row.
-pub(crate) type Rows = [u64; EDGE];
+pub type Rows = [u64; EDGE];
 
 /// When to look for touched pixels that nothing reached. In 16-bit sums a footprint's corners and much of its
 /// outermost sections round to nothing: of mri256 a quarter of what is touched, of aneurism more than a third;
@@ -345,7 +343,7 @@ impl Sifting {
 
 /// Closes the pixels of a sheet that are beside each other.
 #[inline(always)]
-pub(crate) fn close_folded<S: Recorded>(
+pub fn close_folded<S: Recorded>(
     simd: Simd,
     folded: &Folded<S>,
     part: &Part<'_>,
@@ -422,7 +420,7 @@ impl<S: Recorded> Closes<S> {
 }
 
 /// The open sheets of a part, in records.
-pub(crate) struct Sheets<'a, S: Recorded, const N: usize> {
+pub struct Sheets<'a, S: Recorded, const N: usize> {
     pub(crate) simd: Simd,
     pub(crate) records: &'a mut [Record<S, N>],
     closes: &'a mut Closes<S>,
@@ -435,7 +433,7 @@ pub(crate) struct Sheets<'a, S: Recorded, const N: usize> {
 }
 
 #[inline(always)]
-pub(crate) fn slot<const N: usize>(k: i32) -> usize {
+pub fn slot<const N: usize>(k: i32) -> usize {
     k as usize % N
 }
 
@@ -479,7 +477,7 @@ impl<S: Recorded, const N: usize> Open<S> for Sheets<'_, S, N> {
 
 impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
     /// In memory of `store`, for voxels that touch `most` sheets at most.
-    pub(crate) fn new(simd: Simd, store: &'a mut Store<S>, most: usize) -> Self {
+    pub fn new(simd: Simd, store: &'a mut Store<S>, most: usize) -> Self {
         let Store { lines: all, closes, .. } = store;
         let lines = STRIDE * EDGE * size_of::<Record<S, N>>() / size_of::<Line>();
         if all.len() < lines {
@@ -499,7 +497,7 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
     /// Notes that voxels that begin at sheet `k` touch so many columns and rows from where `corners` has
     /// bits.
     #[inline(always)]
-    pub(crate) fn touch_all(&mut self, k: i32, corners: &Rows, [wide, high]: [usize; 2]) {
+    pub fn touch_all(&mut self, k: i32, corners: &Rows, [wide, high]: [usize; 2]) {
         let added = &mut self.added[slot::<N>(k)];
         let mut grown = *corners;
         // Columns and rows double until so many are there, or the part ends.
@@ -521,7 +519,7 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
 
     /// Pixels that voxels which begin at sheets `from` to `k` touch.
     #[inline(always)]
-    fn touched(&self, from: i32, k: i32) -> Rows {
+    pub fn touched(&self, from: i32, k: i32) -> Rows {
         let mut rows = [0; EDGE];
         for first in from..=k {
             for (row, added) in rows.iter_mut().zip(&self.added[slot::<N>(first)]) {
@@ -595,33 +593,6 @@ impl Closing<'_> {
                 open.close(y, 1 << x);
                 shut &= shut - 1;
             }
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
-
-    proptest! {
-        #[test]
-        fn voxels_touch_together_what_they_touch_one_by_one(
-            [wide, high] in prop::array::uniform2(1..=64usize),
-            corners in prop::collection::vec(any::<[usize; 2]>(), 0..20),
-        ) {
-            let mut store = Store::<i32>::default();
-            let mut together = Sheets::<i32, 4>::new(Simd::plain(), &mut store, 4);
-            let [mut rows, mut one_by_one] = [[0u64; EDGE]; 2];
-            for [x, y] in corners {
-                let [x, y] = [x % EDGE, y % EDGE];
-                rows[y] |= 1 << x;
-                for row in &mut one_by_one[y..EDGE.min(y + high)] {
-                    *row |= (u64::MAX >> (EDGE - wide)) << x;
-                }
-            }
-            together.touch_all(2, &rows, [wide, high]);
-            prop_assert_eq!(together.touched(0, 3), one_by_one);
         }
     }
 }

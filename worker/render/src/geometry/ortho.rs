@@ -16,7 +16,7 @@
 
 use crate::geometry::open_sheets::{Chunk, Due, EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::kernels::pixel_records::{Recorded, Splat, Table, Tables, splat};
-use crate::kernels::toss::{self, Packing, Sieve, Sifted, Tossing, prefetch};
+pub use crate::kernels::toss::{self, Packing, Sieve, Sifted, Tossing, prefetch};
 use crate::kernels::{Simd, Work, whole_registers};
 use crate::part::{Io, Part, Pixels};
 use crate::primitives::footprint::Phases;
@@ -29,7 +29,7 @@ use slabcast_common::view::SUBPIXELS;
 
 /// Memory for voxels that a render thread keeps from part to part.
 #[derive(Default)]
-pub(crate) struct Waiting {
+pub struct Waiting {
     pub(crate) queues: Queues<Splat>,
     pub(crate) tossing: Tossing,
     pub(crate) batch: Batch,
@@ -37,10 +37,10 @@ pub(crate) struct Waiting {
 
 /// Voxels that are shaded and splatted together. A bucket of a part has some 50; at 16 loops are
 /// too short for lanes, at 1024 this is more than a first cache.
-pub(crate) const BATCH: usize = 128;
+pub const BATCH: usize = 128;
 
 /// Voxels on their way from a bucket to the records.
-pub(crate) struct Batch {
+pub struct Batch {
     pub(crate) voxels: [Splat; BATCH],
     /// Of those that began before the slab, how many of their sheets lie there.
     pub(crate) gone: [u32; BATCH],
@@ -101,7 +101,7 @@ impl Batch {
 }
 
 /// Renders a part: compiled for each instruction set as a whole.
-pub(crate) struct RenderFlat<'a, S: Recorded, const N: usize> {
+pub struct RenderFlat<'a, S: Recorded, const N: usize> {
     pub(crate) part: Part<'a>,
     pub(crate) view: &'a Flat,
     pub(crate) store: &'a mut Store<S>,

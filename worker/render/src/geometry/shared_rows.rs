@@ -156,7 +156,7 @@ impl<'a, W: Weight> Down<'a, W> {
 }
 
 /// The open sheets of a part, in tiers.
-pub(crate) struct LevelSheets<'a, S: Recorded, const N: usize> {
+pub struct LevelSheets<'a, S: Recorded, const N: usize> {
     pub(crate) simd: Simd,
     pub(crate) tiers: Tiers<'a, S, N>,
     closes: &'a mut Closes<S>,
@@ -300,7 +300,7 @@ impl Hull {
 }
 
 /// Which columns are open in any of some rows that follow each other.
-struct AnyOpen {
+pub struct AnyOpen {
     /// Of the `i`th power of two of rows, from each on.
     rows: [Rows; AnyOpen::POWERS],
 }
@@ -310,7 +310,7 @@ impl AnyOpen {
 
     /// For at most so many rows.
     #[inline(always)]
-    fn new(open: &Rows, most: usize) -> AnyOpen {
+    pub fn new(open: &Rows, most: usize) -> AnyOpen {
         let mut rows = [[0; EDGE]; AnyOpen::POWERS];
         rows[0] = *open;
         for power in 1..=most.clamp(1, EDGE).ilog2() as usize {
@@ -325,7 +325,7 @@ impl AnyOpen {
 
     /// Of the rows from `begin` to the one before `end`, where the part has any.
     #[inline(always)]
-    fn of(&self, begin: i32, end: i32) -> u64 {
+    pub fn of(&self, begin: i32, end: i32) -> u64 {
         let [begin, end] = [begin.max(0), end.min(PART)];
         if begin >= end {
             return 0;
@@ -449,7 +449,7 @@ impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
 }
 
 /// Renders a part of a flat view: compiled for each instruction set as a whole.
-pub(crate) struct RenderLevel<'a, S: Recorded, const N: usize> {
+pub struct RenderLevel<'a, S: Recorded, const N: usize> {
     pub(crate) part: Part<'a>,
     pub(crate) view: LevelView<'a>,
     pub(crate) store: &'a mut Store<S>,
@@ -594,26 +594,5 @@ impl<S: Tiered, const N: usize> Stage<LevelSheets<'_, S, N>> for LevelStage<'_, 
             }
         }
         sheets.touch_all(k, deep.len, columns);
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
-
-    proptest! {
-        #[test]
-        fn any_open_is_what_rows_have_together(
-            set in prop::collection::vec((0..EDGE, 0..64u32), 0..40),
-            begin in -70..70i32, high in 0..=64i32,
-        ) {
-            let mut rows = [0; EDGE];
-            set.iter().for_each(|&(y, x)| rows[y] |= 1 << x);
-            let any = AnyOpen::new(&rows, high as usize);
-            let want = (0..PART).filter(|y| (begin..begin + high).contains(y));
-            let want = want.fold(0, |all, y| all | rows[y as usize]);
-            prop_assert_eq!(any.of(begin, begin + high), want);
-        }
     }
 }

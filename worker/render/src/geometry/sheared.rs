@@ -30,13 +30,13 @@ pub(crate) struct Waiting {
 
 /// What a frame needs for its parts to be rendered here.
 #[derive(Clone, Copy)]
-pub(crate) struct Lean<'a> {
-    pub(crate) flat: &'a Flat,
+pub struct Lean<'a> {
+    pub flat: &'a Flat,
     leaning: &'a Leaning,
 }
 
 /// Whether parts of `frame` may be rendered here.
-pub(crate) fn takes(frame: &Frame) -> Option<Lean<'_>> {
+pub fn takes(frame: &Frame) -> Option<Lean<'_>> {
     let (flat, leaning) = (frame.flat.as_ref()?, frame.leaning.as_ref()?);
     let fits = flat.reach.iter().all(|reach| 2 * reach + 2 < WINDOW as i32);
     fits.then_some(Lean { flat, leaning })
@@ -44,7 +44,7 @@ pub(crate) fn takes(frame: &Frame) -> Option<Lean<'_>> {
 
 /// Renders a part, in records of eight sheets, since few kernels that lean reach through four: compiled for each
 /// instruction set as a whole.
-pub(crate) struct RenderLeaning<'a, S: Recorded> {
+pub struct RenderLeaning<'a, S: Recorded> {
     pub(crate) part: Part<'a>,
     pub(crate) lean: Lean<'a>,
     pub(crate) store: &'a mut Store<S>,

@@ -25,7 +25,8 @@ const ULP: f64 = 1.0 / 16_777_216.0;
 #[derive(Clone, Copy, Debug)]
 pub struct Profile {
     std: f64,
-    radius: f64,
+    #[doc(hidden)]
+    pub radius: f64,
     norm: f64,
     /// Degree, where it is a B-spline of steps of one vox.
     degree: Option<i32>,
@@ -135,12 +136,12 @@ pub struct Stack {
 
 impl Stack {
     /// The product of the two sums across at index position (u, v).
-    fn lateral(&self, [u, v]: [f64; 2]) -> f64 {
+    pub fn lateral(&self, [u, v]: [f64; 2]) -> f64 {
         self.profile.sum(u, &self.across[0]) * self.profile.sum(v, &self.across[1])
     }
 
     /// Depth of layer `j`.
-    fn z(&self, j: usize) -> f64 {
+    pub fn z(&self, j: usize) -> f64 {
         j as f64 - (self.layers.len() as f64 - 1.0) / 2.0
     }
 
@@ -249,7 +250,7 @@ impl Stack {
 
 /// Steps of [`Stack::pixel`] where colours differ: at 1/256 vox what they add to the error stays
 /// below 1e-3/255 for the scenes here; at 1/128 it is four times that.
-const STEP: f64 = 1.0 / 256.0;
+pub const STEP: f64 = 1.0 / 256.0;
 
 /// How a picture was rounded: what bounds are made of.
 #[derive(Clone, Copy, Debug)]
@@ -315,12 +316,13 @@ pub struct Bell {
 }
 
 impl Bell {
-    fn of(&self, u: f64) -> f64 {
+    #[doc(hidden)]
+    pub fn of(&self, u: f64) -> f64 {
         libm::exp(-u * u / (2.0 * self.wide * self.wide))
     }
 
     /// Lattice points from the centre, along one axis.
-    fn places(&self) -> impl Iterator<Item = f64> + use<> {
+    pub fn places(&self) -> impl Iterator<Item = f64> + use<> {
         let n = self.voxels;
         (0..n).map(move |i| f64::from(i) - (f64::from(n) - 1.0) / 2.0)
     }
@@ -421,75 +423,5 @@ impl Bell {
         // Samples are floats themselves: one rounding more, which the 16 have room for.
         let reach = 2.0 * self.profile.radius + 1.0;
         how.bound(tau, moved, reach * reach, f64::from(self.voxels) * 1.8, self.profile)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use glam::DVec3;
-
-    const PROFILE: fn() -> Profile = || Profile::new(0.6, 2.0);
-
-    #[test]
-    fn a_stack_is_what_small_steps_find() {
-        let layers = (0..12)
-            .map(|j| Layer { sigma: 0.05 * f64::from(j), rgb: [f64::from(j) / 11.0, 0.5, 1.0] })
-            .collect();
-        let stack = Stack { profile: PROFILE(), across: [0..9, 0..9], layers };
-        for at in [[4.1, 3.7], [-0.4, 4.0], [9.3, 8.2]] {
-            let lateral = stack.lateral(at);
-            let (mut depth, mut light, n) = (0.0f64, 0.0, 100_000);
-            let h = 16.0 / f64::from(n);
-            for i in 0..n {
-                let z = -8.0 + (f64::from(i) + 0.5) * h;
-                let (mut sigma, mut red) = (0.0, 0.0);
-                for (j, l) in stack.layers.iter().enumerate() {
-                    let w = l.sigma * stack.profile.at(z - stack.z(j)) * lateral;
-                    sigma += w;
-                    red += w * l.rgb[0];
-                }
-                light += red * h * (-(depth + sigma * h * 0.5)).exp();
-                depth += sigma * h;
-            }
-            let got = stack.pixel(at);
-            assert!((got[3] + libm::expm1(-depth)).abs() < 1e-7, "{at:?}");
-            assert!((got[0] - light).abs() < 1e-3 / 255.0, "{at:?}: {} {light}", got[0]);
-            assert!((got[0] - light).abs() <= stack.thickness(at, STEP) + 1e-7, "{at:?}");
-        }
-    }
-
-    #[test]
-    fn a_bell_from_any_side_is_a_sum_of_voxels_but_for_aliasing() {
-        let bell = Bell { profile: PROFILE(), peak: 0.2, wide: 4.0, voxels: 48 };
-        for (direction, alone) in [
-            (DVec3::new(0.53, 0.71, 0.36), true),
-            (DVec3::new(0.2, 0.9, -0.5), true),
-            (DVec3::Y, false),
-        ] {
-            let z = direction.normalize();
-            let x = z.cross(DVec3::Z).normalize();
-            let m = DMat3::from_cols(x, z.cross(x), z).transpose();
-            for (px, py) in [(0.0, 0.0), (1.37, -2.9), (6.2, 0.4)] {
-                let mut sum = 0.0;
-                for (i, j, k) in bell.places().flat_map(|i| {
-                    bell.places().flat_map(move |j| bell.places().map(move |k| (i, j, k)))
-                }) {
-                    let eye = m * DVec3::new(i, j, k);
-                    let w = bell.profile.at(px - eye.x) * bell.profile.at(py - eye.y);
-                    sum += bell.peak * bell.of(i) * bell.of(j) * bell.of(k) * w;
-                }
-                let smooth = bell.from_any_side([px, py]);
-                let aliasing = bell.aliasing([px, py], &m);
-                println!("{direction}: {sum} {smooth} off {:e} of {aliasing:e}", sum - smooth);
-                assert!((sum - smooth).abs() <= aliasing + 1e-6 * smooth, "{direction}, {px},{py}");
-                if alone {
-                    assert!(aliasing < 2e-3 * bell.from_any_side([0.0, 0.0]), "{aliasing}");
-                } else {
-                    let exact = bell.along_an_axis([px, py]);
-                    assert!((exact - sum).abs() < 1e-9, "{exact} {sum}");
-                }
-            }
-        }
     }
 }

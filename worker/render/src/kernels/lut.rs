@@ -8,7 +8,7 @@ use slabcast_common::transfer::Look;
 /// # Panics
 /// If a code is not in the table.
 #[inline(always)]
-pub(crate) fn take<const MOST: usize>(
+pub fn take<const MOST: usize>(
     simd: Simd,
     table: &[Look],
     codes: &[u32],
@@ -26,7 +26,7 @@ pub(crate) fn take<const MOST: usize>(
 }
 
 #[inline(always)]
-fn one_by_one<const MOST: usize>(
+pub fn one_by_one<const MOST: usize>(
     table: &[Look],
     codes: &[u32],
     from: usize,
@@ -89,26 +89,5 @@ mod wide {
             }
         }
         one_by_one(table, codes, whole, out);
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_instruction_set_takes_the_same_looks() {
-        let look = |i: u32| Look { sigma: i as f32, rgb: [0.1, 0.2, 0.3].map(|c| c * i as f32) };
-        let table: Vec<Look> = (0..256).map(look).collect();
-        for n in 0..=70 {
-            let codes: Vec<u32> = (0..n).map(|i| i * 37 % 256).collect();
-            let mut want = [[0.0; 64]; 4];
-            one_by_one(&table, &codes, 0, &mut want);
-            for simd in Simd::all() {
-                let mut got = [[0.0; 64]; 4];
-                take(simd, &table, &codes, &mut got);
-                assert_eq!(got, want, "{n} by {}", simd.name());
-            }
-        }
     }
 }

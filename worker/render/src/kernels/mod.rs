@@ -42,14 +42,14 @@ macro_rules! at_level {
     };
 }
 
-pub(crate) mod composite;
+pub mod composite;
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 mod lanes;
-pub(crate) mod lut;
-pub(crate) mod pixel_records;
-pub(crate) mod row_records;
-pub(crate) mod toss;
-pub(crate) mod touched;
+pub mod lut;
+pub mod pixel_records;
+pub mod row_records;
+pub mod toss;
+pub mod touched;
 
 use crate::kernels::composite::Sum;
 pub use crate::primitives::Tap;
@@ -145,19 +145,19 @@ pub struct Section(f32);
 impl Section {
     /// What is negative or not a number is nothing.
     #[inline(always)]
-    fn new(section: f32) -> Self {
+    pub fn new(section: f32) -> Self {
         // A select, so that NaN too ends inside.
         Section(if section > 0.0 { section } else { 0.0 })
     }
 }
 
 /// The largest f32 below 2^31.
-const LARGEST: f32 = 2_147_483_520.0;
+pub const LARGEST: f32 = 2_147_483_520.0;
 
 /// The whole number nearest to `x`, which is not negative, of two the even one; the largest that an f32 can
 /// be below 2^31 for what is larger or not a number. One instruction on lanes, where nothing is larger.
 #[inline(always)]
-fn nearest(x: f32) -> i32 {
+pub fn nearest(x: f32) -> i32 {
     let x = if x < LARGEST { x } else { LARGEST };
     // From here up f32s are whole, and a sum with it has no bits left for halves.
     const WHOLE: f32 = 8_388_608.0;
@@ -292,7 +292,7 @@ impl Accumulate for f32 {
 
 /// The product of two numbers in units of 2^-15, rounded to nearest: one instruction on lanes.
 #[inline(always)]
-fn times(a: i16, b: i16) -> i16 {
+pub fn times(a: i16, b: i16) -> i16 {
     ((i32::from(a) * i32::from(b) + 0x4000) >> 15) as i16
 }
 
@@ -332,13 +332,13 @@ impl Accumulate for i16 {
 
 /// The section of a 16-bit payload: each channel times `wz`.
 #[inline(always)]
-pub(crate) fn section_fixed(payload: [i16; 4], wz: i16) -> [i16; 4] {
+pub fn section_fixed(payload: [i16; 4], wz: i16) -> [i16; 4] {
     payload.map(|p| times(p, wz))
 }
 
 /// A payload of 16-bit sums: rounded to nearest, 0 to 32767.
 #[inline(always)]
-pub(crate) fn whole(payload: f32) -> i16 {
+pub fn whole(payload: f32) -> i16 {
     let bounded = bounded(payload + 0.5, 32767.0);
     // SAFETY: it is 0 to 32767.
     unsafe { bounded.to_int_unchecked::<i32>() as i16 }
@@ -353,7 +353,7 @@ fn bounded(x: f32, most: f32) -> f32 {
 
 /// The whole number below `x`, 0 to 2^31: of what is negative or not a number 0.
 #[inline(always)]
-pub(crate) fn truncate(x: f32) -> u32 {
+pub fn truncate(x: f32) -> u32 {
     let bounded = bounded(x, LARGEST);
     // SAFETY: it is 0 to the largest f32 below 2^31.
     unsafe { bounded.to_int_unchecked::<i32>() as u32 }
@@ -364,7 +364,7 @@ pub(crate) fn truncate(x: f32) -> u32 {
 pub struct Simd(Level);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Level {
+pub enum Level {
     Plain,
     #[cfg(target_arch = "x86_64")]
     Avx2,
@@ -433,7 +433,7 @@ impl Simd {
 /// `n`, or a few more for the last register of a loop to be full: what does not fill one is worked out one by
 /// one, and there may be as much of that as of the rest. No more than `MOST`, which compilers then know.
 #[inline(always)]
-pub(crate) fn whole_registers<const MOST: usize>(n: usize) -> usize {
+pub fn whole_registers<const MOST: usize>(n: usize) -> usize {
     const { assert!(MOST.is_multiple_of(16)) };
     n.next_multiple_of(16).min(MOST)
 }
@@ -533,93 +533,5 @@ pub fn splat<S: Accumulate>(
                 pixel[c] = pixel[c].plus(p[c], w);
             }
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// One splat, as work.
-    struct One<'a, S: Accumulate> {
-        sheet: &'a mut Pixels<S>,
-        wx: &'a [S::Weight],
-        wy: &'a [S::Weight],
-        section: [S::Section; 4],
-    }
-
-    impl<S: Accumulate> Work for One<'_, S> {
-        type Out = ();
-        #[inline(always)]
-        fn run(self, _: Simd) {
-            splat(self.sheet, 64, (3, self.wx), (1, self.wy), self.section);
-        }
-    }
-
-    #[test]
-    fn every_instruction_set_gives_the_same_bytes() {
-        for n in 0..40usize {
-            let wx: Vec<f32> = (0..n).map(|i| 1.0 / (1.7 + i as f32)).collect();
-            let wy: Vec<f32> = (0..7).map(|i| 0.9 / (1.0 + i as f32)).collect();
-            let taps = |w: &[f32]| w.iter().map(|&w| Tap::new(w)).collect::<Vec<_>>();
-            let units = |w: &[f32]| w.iter().map(|&w| (w * 32768.0) as i16).collect::<Vec<_>>();
-            let (tx, ty, ix, iy) = (taps(&wx), taps(&wy), units(&wx), units(&wy));
-            let section = [1.9e8, 1.1e8, 7.7, 0.3];
-            let run = |simd: Simd| {
-                let mut ints = vec![[5i32; 4]; 64 * 9];
-                let mut floats = vec![[0.1f32; 4]; 64 * 9];
-                let mut shorts = vec![[5i16; 4]; 64 * 9];
-                let bounded = section.map(Section);
-                simd.run(One { sheet: &mut ints[..], wx: &tx, wy: &ty, section: bounded });
-                simd.run(One { sheet: &mut floats[..], wx: &tx, wy: &ty, section });
-                let section = [31_000, 17_003, 77, 3];
-                simd.run(One { sheet: &mut shorts[..], wx: &ix, wy: &iy, section });
-                (ints, floats, shorts)
-            };
-            let want = run(Simd::plain());
-            for simd in Simd::all() {
-                assert!(run(simd) == want, "{} differs at width {n}", simd.name());
-            }
-        }
-    }
-
-    #[test]
-    fn integers_round_to_nearest() {
-        let mut sheet = vec![[0i32; 4]; 1];
-        let one = [Tap::new(1.0)];
-        splat(&mut sheet, 1, (0, &one), (0, &one), [2.4, 2.6, 0.49, 0.0].map(Section));
-        assert_eq!(sheet[0], [2, 3, 0, 0]);
-        assert_eq!([times(3, 16384), times(5, 13107), times(32767, 32767)], [2, 2, 32766]);
-        assert_eq!([whole(0.49), whole(0.5), whole(-3.0), whole(f32::NAN)], [0, 1, 0, 0]);
-    }
-
-    #[test]
-    fn the_nearest_whole_number_is_the_one_of_the_standard() {
-        let ties = (0..100).map(|i| i as f32 * 0.5);
-        let whole = (20..31).flat_map(|bits| {
-            let x = (1u32 << bits) as f32;
-            [x.next_down(), x, x.next_up(), x - 0.5, x + 0.5, x + 1.0]
-        });
-        let odd = [0.0, 0.499_999_97, 0.500_000_06, 4_194_303.8, 8_388_607.5, 8_388_609.0];
-        for x in ties.chain(whole).chain(odd).chain((0..10_000).map(|i| i as f32 * 0.37)) {
-            assert_eq!(nearest(x), x.round_ties_even() as i32, "{x}");
-        }
-        let most = LARGEST as i32;
-        assert_eq!([LARGEST, 3e9, f32::INFINITY, f32::NAN].map(nearest), [most; 4]);
-    }
-
-    #[test]
-    fn nothing_leaves_the_integers() {
-        let mut sheet = vec![[0i32; 4]; 1];
-        let one = [Tap::new(1.0)];
-        assert_eq!([f32::NAN, -1.0].map(|w| Tap::new(w).get()), [0.0, 0.0]);
-        splat(&mut sheet, 1, (0, &one), (0, &one), [3e9, f32::INFINITY, 0.0, 1.0].map(Section));
-        assert_eq!(sheet[0], [2_147_483_520, 2_147_483_520, 0, 1]);
-        let nothing = [Tap::new(0.0)];
-        splat(&mut sheet, 1, (0, &nothing), (0, &one), [0.0, 0.0, f32::INFINITY, 0.0].map(Section));
-        assert_eq!(sheet[0][2], 2_147_483_520);
-        let mut sheet = vec![[30_000i16; 4]; 1];
-        splat(&mut sheet, 1, (0, &[32767]), (0, &[32767]), [9_000, 1, 0, 32767]);
-        assert_eq!(sheet[0], [32767, 30_001, 30_000, 32767]);
     }
 }

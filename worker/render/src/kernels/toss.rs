@@ -19,7 +19,7 @@ use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS, View, round_i32};
 use slabcast_common::volume::Samples;
 
 /// Where the voxels of a brick are: x and y in subpixels from the part's corner, depth in phases.
-pub(crate) trait Placing {
+pub trait Placing {
     /// Whether what is kept are places; local indices, if not.
     const KEPT: bool;
     /// The places of voxels with these local indices.
@@ -27,23 +27,23 @@ pub(crate) trait Placing {
 }
 
 /// In a flat view, from the part's corner and the front of some sheet.
-pub(crate) struct FlatBrick<'a> {
-    pub(crate) places: &'a Places,
+pub struct FlatBrick<'a> {
+    pub places: &'a Places,
     /// [What](Places::from) the places of the brick are counted from.
-    pub(crate) from: FlatCorner,
+    pub from: FlatCorner,
 }
 
 /// In perspective, at the voxels' own depths.
-pub(crate) struct DeepBrick<'a> {
-    pub(crate) view: &'a View,
+pub struct DeepBrick<'a> {
+    pub view: &'a View,
     /// Eye offsets of a brick's voxels by axis, and its corner.
-    pub(crate) offsets: &'a [[f64; 512]; 3],
-    pub(crate) corner: [f64; 3],
+    pub offsets: &'a [[f64; 512]; 3],
+    pub corner: [f64; 3],
     /// Subpixels a vox at depth 1, and the distance of depth 0.
-    pub(crate) per_depth: f64,
-    pub(crate) distance: f64,
+    pub per_depth: f64,
+    pub distance: f64,
     /// The middle of the picture, in subpixels from the part's corner.
-    pub(crate) middle: [f64; 2],
+    pub middle: [f64; 2],
 }
 
 /// Places are tests, not pixels: far ones may be anything that is far.
@@ -77,7 +77,7 @@ impl Placing for DeepBrick<'_> {
 impl DeepBrick<'_> {
     /// Eye coordinates of a voxel of the brick.
     #[inline(always)]
-    pub(crate) fn eye(&self, local: u16) -> [f64; 3] {
+    pub fn eye(&self, local: u16) -> [f64; 3] {
         let [x, y, z] = self.offsets;
         let local = usize::from(local) % 512;
         [self.corner[0] + x[local], self.corner[1] + y[local], self.corner[2] + z[local]]
@@ -85,27 +85,27 @@ impl DeepBrick<'_> {
 }
 
 /// What is asked of the voxels of a brick.
-pub(crate) struct Sieve<'a, P> {
-    pub(crate) places: P,
-    pub(crate) open: &'a OpenMask,
+pub struct Sieve<'a, P> {
+    pub places: P,
+    pub open: &'a OpenMask,
     /// Whether voxels around which nothing is open are left out.
-    pub(crate) cull: bool,
-    pub(crate) sections: &'a Sections,
+    pub cull: bool,
+    pub sections: &'a Sections,
     /// The first sheet of the slab and the one behind its last, counted from where depths are.
-    pub(crate) sheets: [i32; 2],
+    pub sheets: [i32; 2],
 }
 
 /// How many voxels of a brick
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Sifted {
+pub struct Sifted {
     /// may touch the part in the slab's sheets,
-    pub(crate) reached: usize,
+    pub reached: usize,
     /// and were kept.
-    pub(crate) kept: usize,
+    pub kept: usize,
 }
 
 /// Voxels of a brick on their way to buckets.
-pub(crate) struct Tossing {
+pub struct Tossing {
     /// Positions and depths.
     at: [[i32; 512]; 3],
     /// First sheets.
@@ -140,19 +140,19 @@ impl Default for Tossing {
 
 /// A voxel that was kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Kept {
+pub struct Kept {
     /// Its first sheet.
-    pub(crate) first: i32,
-    pub(crate) local: u16,
+    pub first: i32,
+    pub local: u16,
     /// The pixel of the part that is nearest to its centre.
-    pub(crate) cell: u16,
+    pub cell: u16,
     pub(crate) normal: u16,
     pub(crate) sample: u32,
 }
 
 /// How the voxels of a flat view that are kept are packed.
 #[derive(Clone, Copy)]
-pub(crate) enum Packing<'a> {
+pub enum Packing<'a> {
     /// With a window of the part and where weights across and down lie.
     Window(&'a [Phases; 2]),
     /// With their [places](Splat::aside_of).
@@ -164,14 +164,14 @@ pub(crate) enum Packing<'a> {
 /// Which tier a voxel belongs to by where it lies down the part: `(y - base) * per`, in units of
 /// [`TIER_BITS`], rounded to nearest.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct TierOf {
-    pub(crate) base: i32,
-    pub(crate) per: i32,
+pub struct TierOf {
+    pub base: i32,
+    pub per: i32,
 }
 
 /// Tiers lie 192 subpixels apart and more ([`crate::primitives::lattice_rows`]), and voxels less than 2^15 from the part's first
 /// row: so products stay below 2^28, and a thousandth of a tier is told apart.
-pub(crate) const TIER_BITS: u32 = 20;
+pub const TIER_BITS: u32 = 20;
 
 impl TierOf {
     #[inline(always)]
@@ -184,13 +184,13 @@ impl TierOf {
 impl Tossing {
     /// The first `kept` voxels of a flat view, with their first sheets.
     #[inline(always)]
-    pub(crate) fn ready(&self, kept: usize) -> impl Iterator<Item = (&i32, &Splat)> {
+    pub fn ready(&self, kept: usize) -> impl Iterator<Item = (&i32, &Splat)> {
         self.first[..kept].iter().zip(&self.ready[..kept])
     }
 
     /// The first `kept` voxels in perspective.
     #[inline(always)]
-    pub(crate) fn kept(&self, kept: usize) -> impl Iterator<Item = Kept> {
+    pub fn kept(&self, kept: usize) -> impl Iterator<Item = Kept> {
         (0..kept).map(|i| Kept {
             first: self.first[i],
             local: self.locals[i] as u16,
@@ -204,7 +204,7 @@ impl Tossing {
 /// Has the memory of a brick that is sifted next come nearer: samples and normals of most bricks were
 /// last looked at a frame ago.
 #[inline(always)]
-pub(crate) fn prefetch(brick: &Brick) {
+pub fn prefetch(brick: &Brick) {
     let Brick { values, normals, .. } = brick;
     match values {
         Samples::U8(v) => prefetch_all(v),
@@ -233,12 +233,7 @@ fn prefetch_all<T>(items: &[T]) {
 
 /// Whether rows from `begin` to the one before `end` have any bit of `columns`.
 #[inline(always)]
-pub(crate) fn any_in_rows(
-    simd: Simd,
-    rows: &[u64; 64],
-    [begin, end]: [usize; 2],
-    columns: u64,
-) -> bool {
+pub fn any_in_rows(simd: Simd, rows: &[u64; 64], [begin, end]: [usize; 2], columns: u64) -> bool {
     match simd.0 {
         // SAFETY: the value proves that the instructions are there.
         #[cfg(target_arch = "x86_64")]
@@ -317,7 +312,7 @@ fn keep(simd: Simd, tossing: &mut Tossing, n: usize, wanted: u32, places: bool) 
 impl Sieve<'_, DeepBrick<'_>> {
     /// Sifts the voxels of `brick` into `tossing`.
     #[inline(always)]
-    pub(crate) fn sift(&self, simd: Simd, brick: &Brick, tossing: &mut Tossing) -> Sifted {
+    pub fn sift(&self, simd: Simd, brick: &Brick, tossing: &mut Tossing) -> Sifted {
         match simd.0 {
             // SAFETY: the value proves that the instructions are there.
             #[cfg(target_arch = "x86_64")]
@@ -348,7 +343,7 @@ impl Sieve<'_, FlatBrick<'_>> {
 
     /// Sifts the voxels of `brick`, and packs those that are kept.
     #[inline(always)]
-    pub(crate) fn sift_ready(
+    pub fn sift_ready(
         &self,
         simd: Simd,
         brick: &Brick,
@@ -858,150 +853,5 @@ mod sixteen {
             any |= _mm512_test_epi64_mask(rows, columns);
         }
         any != 0
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::scene::{Frame, Scene};
-    use crate::selftest;
-    use glam::DVec3;
-    use proptest::prelude::*;
-    use slabcast_common::ids::BrickId;
-    use slabcast_common::occlusion::Rect;
-    use slabcast_common::quality::Quality;
-    use slabcast_common::view::{Camera, CameraProjection, Projection};
-    use slabcast_common::volume::Volume;
-    use std::sync::Arc;
-
-    /// A picture of 64x64 of 16x16x16 voxels, seen from anywhere.
-    fn frame(to_eye: DVec3, projection: CameraProjection, thickness: f64) -> Frame {
-        let volume = Volume::from_fn_u8("any", [16; 3], |i, j, k| (i + 3 * j + 7 * k) as u8);
-        let quality = Quality { thickness, ..Quality::default() };
-        let spec = selftest::spec(&volume, quality);
-        let camera = Camera { to_eye, up: DVec3::Z, target: DVec3::ZERO, projection };
-        let view = View::new(&volume.lattice, &camera, [64; 2], &quality).expect("a view");
-        Frame::new(Arc::new(Scene::new(&spec)), view)
-    }
-
-    /// A brick with some share of its voxels, chosen by `seed`, of one kind of samples.
-    fn brick(which: u32, share: f64, seed: u64, kind: u8, shaded: bool) -> Brick {
-        let hash = |i: u16| (seed ^ u64::from(i)).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32;
-        let there = |i: &u16| (hash(*i) as f64) < share * 4_294_967_296.0;
-        let index: Vec<u16> = (0..512).filter(there).collect();
-        let values = match kind {
-            0 => Samples::U8(index.iter().map(|&i| hash(i) as u8).collect()),
-            1 => Samples::U16(index.iter().map(|&i| hash(i) as u16).collect()),
-            _ => Samples::F32(index.iter().map(|&i| hash(i) as f32).collect()),
-        };
-        let normals = shaded.then(|| index.iter().map(|&i| hash(i + 600) as u16).collect());
-        Brick::new(BrickId(which), index, values, normals)
-    }
-
-    proptest! {
-        #[test]
-        fn every_instruction_set_sifts_the_same(
-            eye in prop::array::uniform3(0.1..1.0f64), height in 6.0..60.0f64,
-            thickness in prop::sample::select(vec![0.5, 1.0, 2.0]),
-            which in 0..8u32, share in 0.0..1.0f64, seed in any::<u64>(),
-            kind in 0..3u8, shaded in any::<bool>(), cull in any::<bool>(),
-            open in prop::collection::vec((0..64usize, 0..64u32), 0..40),
-            begin in -16..16i32, count in 0..24i32,
-            reach in prop::array::uniform2(0..9i32), packed in 0..3u8,
-        ) {
-            let flat = CameraProjection::Ortho { height };
-            let frame = frame(DVec3::from_array(eye), flat, thickness);
-            let Some(flat) = &frame.flat else { return Ok(()) };
-            let brick = brick(which, share, seed, kind, shaded);
-            let mut mask = OpenMask::shut(Rect::new(0, 0, 64, 64));
-            open.iter().for_each(|&(y, x)| mask.open_row(y, 1 << x));
-            mask.grow(flat.reach);
-            let footprint = frame.footprints.at(0).expect("sheets that are all drawn");
-            let from = Places::from(frame.corner(brick.id).flat, [0; 3]);
-            let sieve = Sieve {
-                places: FlatBrick { places: &flat.places, from },
-                open: &mask,
-                cull,
-                sections: &frame.sections,
-                sheets: [begin, begin + count],
-            };
-            let phases = [0, 1].map(|axis| footprint.phases(axis).expect("a table"));
-            let shape = Shape::new::<i16>(40, phases[0].len.min(63));
-            let tier = TierOf { base: -700, per: (1 << TIER_BITS) / (200 + (seed % 3000) as i32) };
-            let packing = match packed {
-                0 => Packing::Window(&phases),
-                1 => Packing::Aside,
-                _ => Packing::Tier(&phases[0], shape, &tier),
-            };
-            let sift = |simd| {
-                let mut tossing = Tossing::default();
-                let sifted = sieve.sift_ready(simd, &brick, packing, &mut tossing);
-                let voxel = |(first, v): (&i32, &Splat)| (*first, v.place, v.rows, v.deep, v.sample);
-                (sifted, tossing.ready(sifted.kept).map(voxel).collect::<Vec<_>>())
-            };
-            let want = sift(Simd::plain());
-            prop_assert!(want.0.kept <= want.0.reached && want.0.reached <= brick.len());
-            for simd in Simd::all() {
-                prop_assert_eq!(&sift(simd), &want, "{}", simd.name());
-            }
-            // The same brick in perspective.
-            let (fov, distance) = (30.0, 30.0 + height);
-            let deep = CameraProjection::Persp { fov, distance };
-            let frame = self::frame(DVec3::from_array(eye), deep, thickness);
-            let Projection::Persp { focal, distance } = frame.view.projection else {
-                unreachable!("a perspective view");
-            };
-            mask.grow(reach);
-            let sieve = Sieve {
-                places: DeepBrick {
-                    view: &frame.view,
-                    offsets: frame.offsets(),
-                    corner: frame.corner(brick.id).eye.to_array(),
-                    per_depth: focal * f64::from(SUBPIXELS),
-                    distance,
-                    middle: [32.0 * f64::from(SUBPIXELS); 2],
-                },
-                open: &mask,
-                cull,
-                sections: &frame.sections,
-                sheets: [begin, begin + count],
-            };
-            let sift = |simd| {
-                let mut tossing = Tossing::default();
-                let sifted = sieve.sift(simd, &brick, &mut tossing);
-                (sifted, tossing.kept(sifted.kept).collect::<Vec<_>>())
-            };
-            let want = sift(Simd::plain());
-            for kept in &want.1 {
-                let eye = DVec3::from_array(sieve.places.eye(kept.local));
-                let depth = frame.view.depth_in_phases(eye.z);
-                prop_assert_eq!(kept.first, frame.sections.first(depth));
-                let scale = focal / (eye.z + distance);
-                let [x, y] = [eye.x, eye.y].map(|v| (v * scale + 32.0).clamp(0.0, 63.9));
-                let cell = [i32::from(kept.cell & 63), i32::from(kept.cell >> 6)];
-                // A position is rounded to a subpixel, which may be the next pixel's first.
-                let apart = [x, y].into_iter().zip(cell).map(|(at, c)| at - f64::from(c));
-                prop_assert!(apart.into_iter().all(|d| (-0.01..1.01).contains(&d)));
-            }
-            for simd in Simd::all() {
-                prop_assert_eq!(&sift(simd), &want, "{}", simd.name());
-            }
-        }
-
-        #[test]
-        fn rows_are_looked_through_as_one_by_one(
-            set in prop::collection::vec((0..64usize, 0..64u32), 0..20),
-            begin in 0..=64usize, end in 0..=64usize, columns in any::<u64>(), shift in 0..64u32,
-        ) {
-            let mut rows = [0; 64];
-            set.iter().for_each(|&(y, x)| rows[y] |= 1u64 << x);
-            let (begin, end) = (begin.min(end), end.max(begin));
-            let columns = columns >> shift;
-            let want = rows[begin..end].iter().any(|row| row & columns != 0);
-            for simd in Simd::all() {
-                prop_assert_eq!(any_in_rows(simd, &rows, [begin, end], columns), want);
-            }
-        }
     }
 }

@@ -12,10 +12,10 @@ use crate::kernels::composite::{LANES, Row};
 const MOST: usize = 64 * 64 + LANES;
 
 /// Places of a part.
-const PART: usize = 64 * STRIDE;
+pub const PART: usize = 64 * STRIDE;
 
 /// Places of pixels in a part: `row * STRIDE + column`.
-pub(crate) struct Places {
+pub struct Places {
     at: Box<[u32; MOST]>,
     n: usize,
     /// Memory for places that are dropped.
@@ -30,7 +30,7 @@ impl Default for Places {
 
 /// Sixteen places, each inside a part: that only [`Places`] makes them is the proof.
 #[derive(Clone, Copy)]
-pub(crate) struct Some16<'a> {
+pub struct Some16<'a> {
     at: &'a [u32; LANES],
     n: usize,
 }
@@ -38,13 +38,13 @@ pub(crate) struct Some16<'a> {
 impl<'a> Some16<'a> {
     /// All of them.
     #[inline(always)]
-    pub(crate) fn at(self) -> &'a [u32; LANES] {
+    pub fn at(self) -> &'a [u32; LANES] {
         self.at
     }
 
     /// How many of them count.
     #[inline(always)]
-    pub(crate) fn len(self) -> usize {
+    pub fn len(self) -> usize {
         self.n
     }
 }
@@ -52,7 +52,7 @@ impl<'a> Some16<'a> {
 impl Places {
     /// Those of the bits in `rows`.
     #[inline(always)]
-    pub(crate) fn list(&mut self, simd: Simd, rows: &[u64; 64]) {
+    pub fn list(&mut self, simd: Simd, rows: &[u64; 64]) {
         self.n = 0;
         match simd.0 {
             super::Level::Plain => self.list_plain(rows),
@@ -68,7 +68,7 @@ impl Places {
         }
     }
 
-    fn list_plain(&mut self, rows: &[u64; 64]) {
+    pub fn list_plain(&mut self, rows: &[u64; 64]) {
         for (y, row) in rows.iter().enumerate() {
             let mut row = *row;
             while row != 0 {
@@ -85,7 +85,7 @@ impl Places {
     /// # Panics
     /// If there are fewer records or sums than a part has.
     #[inline(always)]
-    pub(crate) fn sift<S: Recorded, const N: usize>(
+    pub fn sift<S: Recorded, const N: usize>(
         &mut self,
         simd: Simd,
         sums: SumsOf<'_, S, N>,
@@ -139,19 +139,18 @@ impl Places {
     }
 
     /// All of them.
-    #[cfg(test)]
-    pub(crate) fn all(&self) -> &[u32] {
+    pub fn all(&self) -> &[u32] {
         &self.at[..self.n]
     }
 
     /// How many there are.
-    pub(crate) fn len(&self) -> usize {
+    pub fn len(&self) -> usize {
         self.n
     }
 
     /// Those from the `i`th on, at most sixteen. Lanes behind the last hold places that there are, too.
     #[inline(always)]
-    pub(crate) fn from(&self, i: usize) -> Some16<'_> {
+    pub fn from(&self, i: usize) -> Some16<'_> {
         let at = self.at[i..].first_chunk().expect("room behind the last");
         Some16 { at, n: (self.n - i).min(LANES) }
     }
@@ -159,14 +158,14 @@ impl Places {
 
 /// Column and row of a place.
 #[inline(always)]
-pub(crate) fn column_and_row(place: u32) -> [usize; 2] {
+pub fn column_and_row(place: u32) -> [usize; 2] {
     let place = place as usize;
     [place % STRIDE, place / STRIDE]
 }
 
 /// A pixel's first 32 bits: its extinction, and no more than one colour beside it. Zero: it has none.
 #[inline(always)]
-fn first_word<P: bytemuck::Pod>(pixel: &P) -> u32 {
+pub fn first_word<P: bytemuck::Pod>(pixel: &P) -> u32 {
     bytemuck::pod_read_unaligned(&bytemuck::bytes_of(pixel)[..4])
 }
 
@@ -181,7 +180,7 @@ pub(crate) type SumsOf<'a, S, const N: usize> =
 /// # Panics
 /// If there are fewer records, sums or pixels than a part has.
 #[inline(always)]
-pub(crate) fn take<S: Recorded, const N: usize>(
+pub fn take<S: Recorded, const N: usize>(
     simd: Simd,
     sums: SumsOf<'_, S, N>,
     pixels: &[[u32; 4]],
@@ -232,7 +231,7 @@ fn take_plain<S: Recorded, const N: usize>(
 
 /// The same of pixels whose sums are beside each other, sheet by sheet, as are their opacities.
 #[inline(always)]
-pub(crate) fn unpack<S: Recorded>(
+pub fn unpack<S: Recorded>(
     simd: Simd,
     sheets: [&[S::Pixel; LANES]; 3],
     opacities: &[f32; LANES],
@@ -267,7 +266,7 @@ pub(crate) fn unpack<S: Recorded>(
 /// # Panics
 /// If a place is none of the part.
 #[inline(always)]
-pub(crate) fn put(simd: Simd, row: &Row, at: &[u32], pixels: &mut [[u32; 4]]) {
+pub fn put(simd: Simd, row: &Row, at: &[u32], pixels: &mut [[u32; 4]]) {
     let mut fours = [[0; 4]; LANES];
     match simd.0 {
         super::Level::Plain => {
@@ -546,150 +545,6 @@ mod wide {
                 let [r, g, b] = [r, g, b].map(|light| L::load(light[some.clone()].as_ptr()));
                 L::store_fours(to[some].as_mut_ptr().cast(), [a, r, g, b]);
             }
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::kernels::Grey;
-    use proptest::prelude::*;
-
-    /// Numbers that look random.
-    fn numbers(seed: u32) -> impl FnMut() -> u32 {
-        let mut state = u64::from(seed) | 1 << 40;
-        move || {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(99);
-            (state >> 32) as u32
-        }
-    }
-
-    /// Pixels by rows: few, some or all of a row's.
-    fn rows() -> impl Strategy<Value = [u64; 64]> {
-        let row =
-            prop_oneof![Just(0), any::<u64>(), (0..64u32).prop_map(|x| 1 << x), Just(u64::MAX)];
-        let rows = prop::collection::vec(row, 64);
-        rows.prop_map(|rows| rows.try_into().expect("64 of them"))
-    }
-
-    /// Everything that closing does at some places but for the arithmetic, by every instruction set.
-    fn go_everywhere<S: Recorded, const N: usize>(
-        (rows, sifted): (&[u64; 64], bool),
-        slot: usize,
-        seed: u32,
-    ) -> Result<(), TestCaseError> {
-        let mut next = numbers(seed);
-        // One of four has nothing.
-        let mut sums = || match next() % 4 {
-            0 => S::Pixel::default(),
-            _ => S::from_raw([(); 4].map(|()| S::from_bits(next()).bits())),
-        };
-        let records: Vec<Record<S, N>> = (0..PART).map(|_| [(); N].map(|()| sums())).collect();
-        let before: Vec<S::Pixel> = (0..PART).map(|_| sums()).collect();
-        let pixels: Vec<[u32; 4]> =
-            (0..PART as u32).map(|i| [(i as f32).to_bits(), i, 2 * i, u32::MAX - i]).collect();
-        let run = |simd| {
-            let (mut records, mut before) = (records.clone(), before.clone());
-            let (mut pixels, mut taken) = (pixels.clone(), Vec::new());
-            let mut places = Places::default();
-            places.list(simd, rows);
-            if sifted {
-                places.sift::<S, N>(simd, (&mut records, &mut before), slot);
-            }
-            for i in (0..places.len()).step_by(LANES) {
-                let mut row = Row::default();
-                let some = places.from(i);
-                take::<S, N>(simd, (&mut records, &mut before), &pixels, some, slot, &mut row);
-                let there = if S::GREY { 2 } else { 4 };
-                let channels = [row.before, row.here, row.behind].map(|c| c[..there].to_vec());
-                for lane in 0..some.len() {
-                    let sums =
-                        channels.each_ref().map(|c| c.iter().map(|c| c[lane]).collect::<Vec<_>>());
-                    taken.push((some.at()[lane], row.a[lane], sums));
-                    row.light = row.light.map(|mut light| {
-                        light[lane] = 3 * some.at()[lane];
-                        light
-                    });
-                    row.a[lane] += 0.5;
-                }
-                put(simd, &row, &some.at()[..some.len()], &mut pixels);
-            }
-            (records, before, pixels, taken)
-        };
-        let want = run(Simd::plain());
-        let mut of_row = want.3.iter();
-        let value = |pixel: &S::Pixel| S::from_bits(S::raw(pixel)[0]).value();
-        for y in 0..64 {
-            for x in (0..64).filter(|x| rows[y] >> x & 1 == 1) {
-                let i = y * STRIDE + x;
-                prop_assert!(want.1[i] == records[i][slot]);
-                prop_assert!(want.0[i][slot] == S::Pixel::default());
-                if sifted && first_word(&records[i][slot]) == 0 {
-                    prop_assert_eq!(want.2[i], pixels[i]);
-                    continue;
-                }
-                let (at, a, sums) = of_row.next().expect("every pixel is taken");
-                prop_assert_eq!(column_and_row(*at), [x, y]);
-                prop_assert_eq!(*a, i as f32);
-                let behind = (slot + 1) % N;
-                let sheets = [&before[i], &records[i][slot], &records[i][behind]];
-                prop_assert_eq!(sums.each_ref().map(|c| c[0]), sheets.map(value));
-                let light = 3 * i as u32;
-                let [_, r, g, b] = pixels[i];
-                let added = [r, g, b].map(|c| c.wrapping_add(light));
-                prop_assert_eq!(want.2[i], [(*a + 0.5).to_bits(), added[0], added[1], added[2]]);
-            }
-        }
-        prop_assert!(of_row.next().is_none());
-        for simd in Simd::all() {
-            prop_assert!(run(simd) == want, "{}", simd.name());
-        }
-        // The same sums beside each other are taken as they are from where they lie.
-        let mut places = Places::default();
-        places.list_plain(rows);
-        for simd in Simd::all() {
-            let (mut records, mut old) = (records.clone(), before.clone());
-            for i in (0..places.len()).step_by(LANES) {
-                let (some, behind) = (places.from(i), (slot + 1) % N);
-                let (mut sheets, mut opacities) = ([[S::Pixel::default(); LANES]; 3], [0.0; LANES]);
-                for (i, &at) in some.at()[..some.len()].iter().enumerate() {
-                    let (at, record) = (at as usize, records[at as usize]);
-                    let sums = [old[at], record[slot], record[behind]];
-                    sheets.iter_mut().zip(sums).for_each(|(to, sums)| to[i] = sums);
-                    opacities[i] = f32::from_bits(pixels[at][0]);
-                }
-                let [mut want, mut got] = [Row::default(), Row::default()];
-                let plain = Simd::plain();
-                take::<S, N>(plain, (&mut records, &mut old), &pixels, some, slot, &mut want);
-                unpack::<S>(simd, sheets.each_ref(), &opacities, &mut got);
-                let there = if S::GREY { 2 } else { 4 };
-                let of = |row: &Row| {
-                    let lanes = |of: &[f32; LANES]| of[..some.len()].to_vec();
-                    let sheets = [&row.before, &row.here, &row.behind];
-                    (
-                        lanes(&row.a),
-                        sheets.map(|c| c[..there].iter().map(lanes).collect::<Vec<_>>()),
-                    )
-                };
-                prop_assert!(of(&got) == of(&want), "{}", simd.name());
-            }
-        }
-        Ok(())
-    }
-
-    proptest! {
-        #[test]
-        fn pixels_from_anywhere_are_taken_and_put_as_the_plain_loops_do(
-            rows in rows(), sifted in any::<bool>(), slot in 0..8usize, seed in any::<u32>(),
-        ) {
-            let rows = (&rows, sifted);
-            go_everywhere::<i16, 4>(rows, slot % 4, seed)?;
-            go_everywhere::<i16, 8>(rows, slot, seed)?;
-            go_everywhere::<i32, 4>(rows, slot % 4, seed)?;
-            go_everywhere::<i32, 8>(rows, slot, seed)?;
-            go_everywhere::<Grey, 4>(rows, slot % 4, seed)?;
-            go_everywhere::<Grey, 8>(rows, slot, seed)?;
         }
     }
 }

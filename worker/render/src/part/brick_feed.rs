@@ -38,10 +38,10 @@ pub(crate) struct Taken {
 }
 
 /// A list that grows while what is in it is looked at. Its memory stays when it is emptied.
-pub(crate) struct Growing<T> {
+pub struct Growing<T> {
     len: Cell<usize>,
     /// Each twice as long as the one before.
-    chunks: [OnceCell<Vec<OnceCell<T>>>; 26],
+    pub chunks: [OnceCell<Vec<OnceCell<T>>>; 26],
 }
 
 /// Items of the first chunk: what a part of a head takes fits two or three.
@@ -54,7 +54,7 @@ impl<T> Default for Growing<T> {
 }
 
 impl<T> Growing<T> {
-    pub(crate) fn len(&self) -> usize {
+    pub fn len(&self) -> usize {
         self.len.get()
     }
 
@@ -64,24 +64,24 @@ impl<T> Growing<T> {
         (chunk, i + CHUNK - (CHUNK << chunk))
     }
 
-    fn push(&self, item: T) {
+    pub fn push(&self, item: T) {
         let (chunk, at) = Self::place(self.len.replace(self.len.get() + 1));
         let chunk = self.chunks[chunk]
             .get_or_init(|| std::iter::repeat_with(OnceCell::new).take(CHUNK << chunk).collect());
         chunk[at].get_or_init(|| item);
     }
 
-    fn get(&self, i: usize) -> &T {
+    pub fn get(&self, i: usize) -> &T {
         let (chunk, at) = Self::place(i);
         let chunk = self.chunks[chunk].get();
         chunk.and_then(|c| c[at].get()).expect("what is in the list")
     }
 
-    pub(crate) fn iter(&self) -> impl Iterator<Item = &T> {
+    pub fn iter(&self) -> impl Iterator<Item = &T> {
         (0..self.len()).map(|i| self.get(i))
     }
 
-    pub(crate) fn clear(&mut self) {
+    pub fn clear(&mut self) {
         let used = self.chunks.iter_mut().filter_map(OnceCell::get_mut).flatten();
         used.take(self.len.replace(0)).for_each(|item| *item = OnceCell::new());
     }
@@ -114,13 +114,13 @@ const NONE: u32 = u32::MAX;
 
 /// Memory that a thread keeps for parts whose bricks come one by one.
 #[derive(Default)]
-pub(crate) struct Memory {
+pub struct Memory {
     pub(crate) waiting: Waiting,
     pub(crate) taken: Growing<Taken>,
 }
 
 /// Bricks of a part that come when they are needed.
-pub(crate) struct Coming<'a> {
+pub struct Coming<'a> {
     frame: &'a Frame,
     outlook: &'a VisibleBricks,
     supply: &'a dyn BrickSupply,
@@ -340,28 +340,5 @@ impl<'a> Coming<'a> {
         let waiting = self.waiting.borrow();
         let blocks = self.blocks[waiting.blocks..].iter();
         waiting.voxels + blocks.map(|&i| self.share(i)).sum::<u64>()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_list_grows_and_is_emptied_while_its_memory_stays() {
-        let mut list = Growing::default();
-        for n in [0, 1, 63, 64, 65, 191, 192, 1000, 5] {
-            let first = (n > 0).then(|| {
-                list.push(7);
-                list.get(0)
-            });
-            (1..n).for_each(|i| list.push(i * 3 + 7));
-            assert!(first.is_none_or(|f| *f == 7));
-            assert_eq!(list.len(), n);
-            assert!(list.iter().copied().eq((0..n).map(|i| i * 3 + 7)));
-            list.clear();
-            assert_eq!(list.iter().count(), 0);
-        }
-        assert_eq!(list.chunks.iter().filter(|c| c.get().is_some()).count(), 5);
     }
 }

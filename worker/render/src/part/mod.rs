@@ -1,7 +1,7 @@
 //! A part of a tile, at most 64x64 pixels: its bricks, its pixels, and the way between both and the
 //! tile's planes. Every geometry draws parts.
 
-pub(crate) mod brick_feed;
+pub mod brick_feed;
 
 use crate::kernels::pixel_records::STRIDE;
 use crate::primitives::sizes::PART;
@@ -44,11 +44,11 @@ impl ProjectedBrick {
 }
 
 /// The tile's pixels, from which a part starts and which it takes farther, and what it counts.
-pub(crate) type Io<'a> = (&'a mut TilePixels, &'a mut Counters);
+pub type Io<'a> = (&'a mut TilePixels, &'a mut Counters);
 
 /// Where a part's bricks are.
 #[derive(Clone, Copy)]
-pub(crate) enum Among<'a> {
+pub enum Among<'a> {
     /// All of the tile's are here.
     Here(&'a [&'a ProjectedBrick]),
     /// They come when they are looked at, if they can be had.
@@ -56,7 +56,7 @@ pub(crate) enum Among<'a> {
 }
 
 /// A part of a tile.
-pub(crate) struct Part<'a> {
+pub struct Part<'a> {
     pub(crate) frame: &'a Frame,
     pub(crate) rect: Rect,
     pub(crate) tile: Rect,
@@ -67,7 +67,7 @@ pub(crate) struct Part<'a> {
 }
 
 /// A part's pixels, in rows of [`STRIDE`] whatever the part's width.
-pub(crate) struct Pixels {
+pub struct Pixels {
     /// Lengths of rays in a sheet over its thickness.
     pub(crate) secants: Vec<f32>,
     /// The bits of each one's opacity, and three colours.
@@ -237,7 +237,7 @@ impl Part<'_> {
 /// Takes the sums of a part's last sheet to where the next sheet's drawing finds them.
 ///
 /// Where a part stops before its slab does, they are wanted though nobody asked for them at first.
-pub(crate) fn keep_last<'a>(
+pub fn keep_last<'a>(
     part: &Part<'_>,
     stopped: bool,
     out: &'a mut TilePixels,

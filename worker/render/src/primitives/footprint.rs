@@ -51,7 +51,7 @@ pub struct Sections {
 /// The share of a voxel beyond the m - 1 sheets in its middle up to which slivers are given away: the
 /// default kernel has 0.0045 beyond 1.5 vox from its centre, which is as much as a sliver can be at sheets
 /// of 1 vox; at 2 vox it would be 0.05, and the picture of other sheets.
-const SLIVER: f64 = 0.005;
+pub const SLIVER: f64 = 0.005;
 
 /// By how much of a sheet the sheets that are kept lie before a voxel's middle, as a divisor. What is in front
 /// of an opaque voxel's first sheet is seen whole, what is behind its last one through all of the voxel:
@@ -167,13 +167,13 @@ impl Sections {
 
     /// Weights of [`Sections::of`] by phase, [`Sections::most`] a phase, those that a phase does not
     /// need zero.
-    pub(crate) fn all(&self) -> &[f32] {
+    pub fn all(&self) -> &[f32] {
         &self.weights
     }
 
     /// Weights of [`Sections::of_fixed`] by phase, [`Sections::most`] a phase, those that a phase does
     /// not need zero.
-    pub(crate) fn all_fixed(&self) -> &[i16] {
+    pub fn all_fixed(&self) -> &[i16] {
         &self.fixed
     }
 
@@ -192,23 +192,23 @@ impl Sections {
 /// How sections of voxels lie aside of each other.
 #[derive(Clone, Copy, Debug)]
 #[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))] // Some of it is read in lanes alone.
-pub(crate) struct Slant<'a> {
+pub struct Slant<'a> {
     /// [`Leaning::subpixels`](Leaning::subpixels).
-    pub(crate) subpixels: [&'a [i32]; 2],
+    pub subpixels: [&'a [i32]; 2],
     /// Where weights across and down lie.
     pub(crate) phases: [Phases; 2],
     /// [`Leaning::row`](Leaning::row): less than 2^20 either way.
-    pub(crate) row: i32,
+    pub row: i32,
     /// Whether sections or rows have columns of their own.
-    pub(crate) skewed: bool,
+    pub skewed: bool,
     /// Columns of a row that all sections of a voxel have together, at most: [`SHEAR_COLUMNS`], or if they all have the same
     /// [`LINE`].
-    pub(crate) wide: usize,
+    pub wide: usize,
 }
 
 /// Where sections and rows of a kernel that leans lie ([`slabcast_common::kernel`]).
 #[derive(Debug)]
-pub(crate) struct Leaning {
+pub struct Leaning {
     /// How far each section lies beside its voxel along x and y, in vox: as [`Sections::all`] has weights.
     aside: [Vec<f64>; 2],
     /// The same in subpixels, where a view is parallel.
@@ -288,7 +288,7 @@ impl Leaning {
     }
 
     /// How sections of voxels lie aside of each other, if they have no more rows and columns than are added so.
-    pub(crate) fn slant(&self, phases: [Phases; 2]) -> Option<Slant<'_>> {
+    pub fn slant(&self, phases: [Phases; 2]) -> Option<Slant<'_>> {
         let [x, down] = &phases;
         let skewed = self.row != 0;
         if !skewed && self.most[0] > 0.0 {
@@ -395,10 +395,10 @@ impl First {
 
 /// Where the weights of each phase lie in a table along one axis.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Phases {
+pub struct Phases {
     first: First,
     /// Pixels of one at most.
-    pub(crate) len: usize,
+    pub len: usize,
     /// Zeros before and after the weights of each.
     margin: usize,
 }
@@ -412,7 +412,7 @@ impl Phases {
 
     /// First pixel of a footprint at a place in subpixels.
     #[inline(always)]
-    pub(crate) fn first_at(&self, place: i32) -> i32 {
+    pub fn first_at(&self, place: i32) -> i32 {
         (place >> SUBPIXEL_BITS) + self.first(place & (SUBPIXELS - 1))
     }
 
@@ -424,7 +424,7 @@ impl Phases {
 
     /// Where the weights of phase `p` begin.
     #[inline(always)]
-    pub(crate) fn begin(&self, p: usize) -> usize {
+    pub fn begin(&self, p: usize) -> usize {
         p * (self.len + 2 * self.margin) + self.margin
     }
 }
@@ -514,7 +514,7 @@ pub struct Footprints {
 #[derive(Debug, Default)]
 pub struct Shelf {
     tables: Mutex<BTreeMap<Key, Arc<Tables>>>,
-    sections: Mutex<BTreeMap<Deep, Arc<Sections>>>,
+    pub sections: Mutex<BTreeMap<Deep, Arc<Sections>>>,
     profiles: Mutex<BTreeMap<Cut, Arc<ProfileTable>>>,
 }
 
@@ -595,7 +595,7 @@ fn shelved<K: Ord, V>(
 
 /// Sections that a shelf keeps, and profiles, of some 8 KB each. A view of a lattice that is not cubic has its own, and none
 /// of them is asked for again.
-const SECTIONS: usize = 64;
+pub const SECTIONS: usize = 64;
 
 /// Weights along one axis, inside a clip: the first pixel and one weight a pixel.
 pub type Span<'a> = (i32, &'a [Tap]);
@@ -733,7 +733,7 @@ impl<'a> Footprint<'a> {
     }
 
     /// Where they lie.
-    pub(crate) fn phases(&self, axis: usize) -> Option<Phases> {
+    pub fn phases(&self, axis: usize) -> Option<Phases> {
         self.table.map(|t| t.along(axis).phases())
     }
 
@@ -766,155 +766,5 @@ impl<'a> Footprint<'a> {
                 (from, &buffer[..])
             }
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
-    use slabcast_common::quality::Quality;
-
-    /// Each kernel, in several widths.
-    fn profiles() -> Vec<Profile> {
-        let gaussians = [(0.6, 2.0), (0.5, 2.0), (0.7, 2.0), (0.4, 1.0), (1.0, 3.0)];
-        let mut all: Vec<_> = gaussians.map(|(std, r)| Profile::gaussian(std, r)).to_vec();
-        for kernel in [Kernel::Bspline, Kernel::Tent] {
-            let [std, radius] = Quality { kernel, ..Quality::default() }.shape();
-            all.extend([1.0, 2.5].map(|step| Profile::new(kernel, std * step, radius * step)));
-        }
-        all
-    }
-
-    #[test]
-    fn sections_are_made_once_for_all_frames_that_have_the_same() {
-        let shelf = Shelf::default();
-        for p in profiles() {
-            for (thickness, phases, merged) in
-                [(1.0, 256, true), (1.0, 256, false), (0.5, 512, false)]
-            {
-                let kept = shelf.sections(&p, thickness, phases, merged);
-                assert!(Arc::ptr_eq(&kept, &shelf.sections(&p, thickness, phases, merged)));
-                let made = Sections::new(&p, thickness, phases, merged);
-                assert_eq!(kept.all(), made.all(), "{p:?} {thickness} {phases} {merged}");
-                assert_eq!(kept.all_fixed(), made.all_fixed());
-            }
-        }
-        assert!(shelf.sections.into_inner().expect("no panic").len() <= SECTIONS);
-    }
-
-    #[test]
-    fn the_profile_integrates_to_one_and_ends_at_zero() {
-        for p in profiles() {
-            let (radius, n) = (p.radius, 20_000);
-            let h = 2.0 * radius / f64::from(n);
-            let (mut sum, mut square) = (0.0, 0.0);
-            for i in 0..n {
-                let u = -radius + (f64::from(i) + 0.5) * h;
-                assert!((p.integral_to(u - 0.5 * h) - sum).abs() < 1e-7, "{p:?} at {u}");
-                sum += p.at(u) * h;
-                square += p.at(u) * h * u * u;
-            }
-            assert!((sum - 1.0).abs() < 1e-7, "{p:?}: {sum}");
-            // A Gaussian's is that before it was cut.
-            let cut = if p.kernel == Kernel::Gaussian { 0.2 * p.std } else { 1e-7 };
-            assert!((square.sqrt() - p.std).abs() < cut, "{p:?}: {square}");
-            assert!((p.integral_to(radius) - 1.0).abs() < 1e-12);
-            assert!(p.integral_to(-radius).abs() < 1e-12);
-            assert!((p.integral_to(0.0) - 0.5).abs() < 1e-12);
-            assert!(p.at(radius - 1e-9) < 1e-6);
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn splines_add_up_to_one_on_the_lattice_at_any_phase(
-            phase in 0.0..1.0f64, step in 0.1..50.0f64, tent in any::<bool>(),
-        ) {
-            let kernel = if tent { Kernel::Tent } else { Kernel::Bspline };
-            let [std, radius] = Quality { kernel, ..Quality::default() }.shape();
-            let p = Profile::new(kernel, std * step, radius * step);
-            let at = |k: i32| (f64::from(k) + phase) * step;
-            let sum: f64 = (-3..=3).map(|k| p.at(at(k)) * step).sum();
-            prop_assert!((sum - 1.0).abs() < 1e-14, "{sum}");
-            // And so do their sections, of any thickness.
-            let d = step * (0.01 + phase * 3.0);
-            let sheet: f64 =
-                (-9..=9).map(|k| p.integral_to(at(k) + d) - p.integral_to(at(k))).sum();
-            prop_assert!((sheet * step / d - 1.0).abs() < 1e-12, "{sheet}");
-        }
-    }
-
-    #[test]
-    fn little_light_changes_its_sheet() {
-        let [std, radius] = Quality::default().shape();
-        let p = Profile::new(Kernel::Gaussian, std, radius);
-        let given = |d: f64, most: f64| Sections::given_away(&p, d, 256, most);
-        let opaque = given(1.0, 16.0 * std::f64::consts::LN_2);
-        assert!((0.0078..5.0 / 512.0).contains(&opaque), "{opaque}");
-        // Most shows where an optical depth of 1 lies in front.
-        let one = given(1.0, 1.0);
-        assert!((one - 0.0164 * (-1.0f64).exp()).abs() < 1e-4, "{one}");
-        assert!(given(1.0, 0.01) < 2e-4);
-        assert!(given(0.5, 1.0) < one);
-        assert_eq!(given(2.0, 1.0), 0.0, "such sheets are not merged");
-    }
-
-    #[test]
-    fn sections_of_a_voxel_add_up_to_it() {
-        let all = [Kernel::Gaussian, Kernel::Bspline, Kernel::Tent];
-        let all = all.map(|kernel| Quality { kernel, ..Quality::default() });
-        let thick = [1.0 / 64.0, 0.25, 1.0, 1.7, 5.0, 300.0];
-        for (q, d) in all.iter().flat_map(|q| thick.map(|d| (q, d))) {
-            let [std, radius] = q.shape();
-            let p = Profile::new(q.kernel, std, radius);
-            let [whole, merged] = [false, true].map(|merged| Sections::new(&p, d, 256, merged));
-            for z in [-5000, -257, -256, -1, 0, 1, 77, 255, 256, 9999] {
-                for s in [&whole, &merged] {
-                    let (first, w) = s.of(z);
-                    let sum: f32 = w.iter().sum();
-                    assert!((sum - 1.0).abs() < 2e-6, "d {d}, z {z}: {sum}");
-                    assert_eq!(first, s.first(z));
-                    assert!(w.len() <= s.most());
-                }
-                // Exactly the sheets that the support [z - R, z + R] meets.
-                let at = f64::from(z) / 256.0;
-                let (front, w) = whole.of(z);
-                let end = front + w.len() as i32;
-                assert_eq!(front, (at - radius / d).floor() as i32);
-                assert_eq!(end, (at + radius / d).ceil() as i32);
-                // Or those but for slivers.
-                let (first, w) = merged.of(z);
-                let last = first + w.len() as i32;
-                assert!(front <= first && last <= end && end - front - 1 <= last - first);
-                let before = p.integral_to((f64::from(first) - at) * d);
-                let behind = 1.0 - p.integral_to((f64::from(last) - at) * d);
-                assert!(before < SLIVER / 5.0, "d {d}, z {z}: {before}");
-                assert!(behind < SLIVER * 4.0, "d {d}, z {z}: {behind}");
-            }
-        }
-    }
-
-    #[test]
-    fn without_slivers_a_voxel_lies_in_four_sheets_of_a_vox() {
-        let p = Profile::gaussian(0.6, 2.0);
-        let most =
-            |merged| [0.25, 0.5, 1.0, 2.0, 40.0].map(|d| Sections::new(&p, d, 256, merged).most());
-        assert_eq!(most(false), [17, 9, 5, 3, 2]);
-        assert_eq!(most(true), [16, 8, 4, 3, 2]);
-    }
-
-    /// The ripple of the default kernel on a constant field, worked out in NUMERICS.md
-    /// section 4: at most 0.6 % in any direction; here along the lattice and on a diagonal.
-    #[test]
-    fn a_constant_field_comes_back_with_little_ripple() {
-        let p = Profile::gaussian(0.6, 2.0);
-        let mut worst = 0.0f64;
-        for i in 0..200 {
-            let x = i as f64 / 200.0;
-            let sum: f64 = (-4..=4).map(|k| p.at(x + k as f64)).sum();
-            worst = worst.max((sum - 1.0).abs());
-        }
-        assert!(worst < 2e-3, "1-D ripple {worst}");
     }
 }

@@ -3,10 +3,10 @@
 //! Imports nothing of this crate but itself.
 
 pub mod footprint;
-pub(crate) mod lattice_rows;
-pub(crate) mod positions;
-pub(crate) mod profile_table;
-pub(crate) mod sizes;
+pub mod lattice_rows;
+pub mod positions;
+pub mod profile_table;
+pub mod sizes;
 mod tap;
 
 pub use tap::Tap;

@@ -27,7 +27,7 @@ fn whole(x: f64) -> i64 {
 
 /// Positions in a flat view.
 #[derive(Clone, Debug)]
-pub(crate) struct Places {
+pub struct Places {
     /// Pixels a vox.
     scale: f64,
     /// Finer units a vox of depth.
@@ -39,7 +39,7 @@ pub(crate) struct Places {
 }
 
 /// A brick's corner: x and y in 2^-24 subpixels of absolute image coordinates, depth in 2^-24 phases.
-pub(crate) type FlatCorner = [i64; 3];
+pub type FlatCorner = [i64; 3];
 
 impl Places {
     /// The positions of `view`, if it is orthographic.
@@ -70,7 +70,7 @@ impl Places {
     }
 
     /// Screen position of a voxel in subpixels, and its depth in phases.
-    pub(crate) fn at(&self, corner: FlatCorner, local: u16) -> ([i64; 2], i32) {
+    pub fn at(&self, corner: FlatCorner, local: u16) -> ([i64; 2], i32) {
         let at = |axis: usize| {
             let offset = self.offsets[axis][usize::from(local & 511)];
             (corner[axis] + offset + HALF) >> FINER_BITS
@@ -81,7 +81,7 @@ impl Places {
     /// What offsets are added to for [`Places::at`] counted from `origin` (subpixels and phases), which
     /// is near: positions fit i32.
     #[inline(always)]
-    pub(crate) fn from(corner: FlatCorner, origin: [i64; 3]) -> FlatCorner {
+    pub fn from(corner: FlatCorner, origin: [i64; 3]) -> FlatCorner {
         std::array::from_fn(|axis| corner[axis] - (origin[axis] << FINER_BITS) + HALF)
     }
 

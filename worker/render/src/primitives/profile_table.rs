@@ -5,7 +5,7 @@ const NODES: usize = 2048;
 
 /// A profile by its distance: nodes to its radius, lines between.
 #[derive(Debug)]
-pub(crate) struct ProfileTable {
+pub struct ProfileTable {
     nodes: Vec<f32>,
     per_step: f64,
 }

@@ -4,26 +4,26 @@
 /// second-level cache of 512 KiB. At 32 a head takes 12 % more splats (286 k instead of 256 k a
 /// frame) for their overlap and no less time (docs/measurements.md); at 128 a row would need two
 /// words, and the sheets 1.5 MiB.
-pub(crate) const PART: i32 = 64;
+pub const PART: i32 = 64;
 const _: () = assert!(PART == slabcast_common::region::PART);
 
 /// Most sheets of one pixel record.
-pub(crate) const MOST: usize = 8;
+pub const MOST: usize = 8;
 
 /// Most pixels of a footprint along one axis whose weights are read as one register.
-pub(crate) const LINE: usize = 16;
+pub const LINE: usize = 16;
 
 /// Most pixel rows that all sections of a sheared voxel have together, and least number of zeros
 /// around a phase's weights. A lattice of slices twice as thick as its pixels, seen at two pixels a
 /// voxel from 30 degrees above, has some 20.
-pub(crate) const SHEAR_ROWS: usize = 32;
+pub const SHEAR_ROWS: usize = 32;
 
 /// Most columns of one pixel row that all sections of a sheared voxel have together.
-pub(crate) const SHEAR_COLUMNS: usize = 24;
+pub const SHEAR_COLUMNS: usize = 24;
 
 /// Most lattice rows that reach a pixel: kernels with a radius of seven lattice steps.
-pub(crate) const REACHING: usize = 16;
+pub const REACHING: usize = 16;
 
 /// Most lattice rows of a part of 64 pixels, with those that reach in from outside. It needs 104;
 /// a power of two makes the division cheap.
-pub(crate) const LATTICE_ROWS: usize = 128;
+pub const LATTICE_ROWS: usize = 128;

@@ -25,7 +25,7 @@ pub(crate) const CELL: i32 = 8;
 const ROW: usize = (PART / CELL) as usize;
 
 /// How often a part looks which of its cells are shut, in sheets.
-pub(crate) const LOOKS: i32 = 8;
+pub const LOOKS: i32 = 8;
 
 /// A cell with fewer open pixels is shut.
 const LEAST: u8 = 8;
@@ -50,7 +50,7 @@ fn bits_of_bytes(x: u64) -> u64 {
 
 /// The sheets at which a part's cells were found shut; `i32::MAX`: they are open.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Cells([i32; ROW * ROW]);
+pub struct Cells(pub [i32; ROW * ROW]);
 
 impl Default for Cells {
     fn default() -> Self {
@@ -60,7 +60,7 @@ impl Default for Cells {
 
 impl Cells {
     /// Before sheet `k`, these pixels are open.
-    pub(crate) fn look(&mut self, k: i32, open: &OpenMask) {
+    pub fn look(&mut self, k: i32, open: &OpenMask) {
         for (rows, cells) in open.rows().chunks(CELL as usize).zip(self.0.chunks_mut(ROW)) {
             // At most 64 in a byte.
             let open: u64 = rows.iter().map(|row| bits_of_bytes(*row)).sum();
@@ -71,7 +71,7 @@ impl Cells {
     }
 
     /// Nothing is open from sheet `k` on.
-    pub(crate) fn shut(&mut self, k: i32) {
+    pub fn shut(&mut self, k: i32) {
         self.0.iter_mut().for_each(|cell| *cell = k.min(*cell));
     }
 }
@@ -102,14 +102,14 @@ impl ClosingDepths {
     }
 
     /// What a part of the picture came to. It begins at a cell's corner.
-    pub(crate) fn note(&self, part: &Rect, cells: &Cells) {
+    pub fn note(&self, part: &Rect, cells: &Cells) {
         let wide = part.width().div_ceil(CELL as usize);
         let of_part = cells.0.chunks(ROW).flat_map(|row| &row[..wide.min(ROW)]);
         self.under(part).zip(of_part).for_each(|(to, depth)| to.store(*depth, Ordering::Relaxed));
     }
 
     /// Whether a brick over this rectangle that begins at that sheet is expected.
-    pub(crate) fn expects(&self, r: &Rect, first: i32) -> bool {
+    pub fn expects(&self, r: &Rect, first: i32) -> bool {
         let r = match r.width().min(r.height()) as i32 > 2 * BORDER {
             true => Rect::new(r.x0 + BORDER, r.y0 + BORDER, r.x1 - BORDER, r.y1 - BORDER),
             false => *r,
@@ -118,51 +118,7 @@ impl ClosingDepths {
     }
 
     /// The deepest sheet at which anything under a rectangle was open; `i32::MIN` where nothing was ever drawn.
-    pub(crate) fn deepest(&self, r: &Rect) -> i32 {
+    pub fn deepest(&self, r: &Rect) -> i32 {
         self.under(r).map(|cell| cell.load(Ordering::Relaxed)).max().unwrap_or(i32::MIN)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn cells_are_as_deep_as_their_last_open_pixel() {
-        let part = Rect::new(64, 128, 128, 192);
-        let mut open = OpenMask::shut(part);
-        (0..64).for_each(|y| open.open_row(y, u64::MAX));
-        let mut cells = Cells::default();
-        cells.look(0, &open);
-        assert_eq!(cells, Cells::default());
-        // All but a row of the first cell, and all but a pixel less of the one beside it.
-        (0..8).for_each(|y| open.close(y, 0xffff));
-        open.open_row(3, 0x7fff);
-        cells.look(8, &open);
-        open.close(3, 1);
-        cells.look(16, &open);
-        cells.look(24, &open);
-        assert_eq!(cells.0[..3], [16, 8, i32::MAX]);
-        let depths = ClosingDepths::new([130, 190]);
-        depths.note(&part, &cells);
-        let deepest = |x, y, w| depths.deepest(&Rect::new(x, y, x + w, y + 1));
-        assert_eq!((deepest(64, 128, 8), deepest(72, 130, 8), deepest(71, 130, 2)), (16, 8, 16));
-        assert_eq!((deepest(79, 135, 2), deepest(0, 128, 64)), (i32::MAX, i32::MIN));
-        assert_eq!(deepest(128, 128, 9), i32::MIN, "the part to the right");
-        cells.shut(40);
-        assert_eq!(cells.0[..3], [16, 8, 40]);
-        // A part of half the size, in the middle of another.
-        depths.note(&Rect::new(96, 160, 128, 190), &cells);
-        assert_eq!(depths.deepest(&Rect::new(96, 160, 97, 161)), 16);
-        assert_eq!(depths.deepest(&Rect::new(104, 160, 105, 161)), 8);
-        assert_eq!(depths.deepest(&Rect::new(88, 160, 96, 161)), i32::MAX);
-        assert_eq!(depths.deepest(&Rect::new(-50, -50, 0, 0)), i32::MIN);
-        assert_eq!(depths.deepest(&Rect::new(500, 500, 900, 900)), i32::MIN);
-        // Two bricks before that, and not at its border.
-        let brick = |x0, x1, first| depths.expects(&Rect::new(x0, 128, x1, 136), first);
-        assert_eq!((brick(64, 72, 0), brick(64, 72, 1), brick(72, 80, 0)), (true, false, false));
-        assert_eq!((brick(68, 80, 0), brick(70, 80, 0)), (true, false));
-        assert!(depths.expects(&Rect::new(76, 128, 90, 136), 999));
-        assert!(!depths.expects(&Rect::new(0, 128, 20, 136), -999), "nobody knows");
     }
 }

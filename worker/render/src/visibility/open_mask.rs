@@ -11,7 +11,7 @@ use slabcast_common::view::SUBPIXEL_BITS;
 
 /// Open pixels of a part of at most 64x64 pixels.
 #[derive(Clone, Debug)]
-pub(crate) struct OpenMask {
+pub struct OpenMask {
     rect: Rect,
     rows: [u64; 64],
     /// Pixels with an open one at most so many columns and rows away.
@@ -21,7 +21,7 @@ pub(crate) struct OpenMask {
 
 /// By how much one pixel has to be moved, step by step together with all that it has become, to be `n`.
 #[inline(always)]
-pub(crate) fn doubling(n: usize) -> impl Iterator<Item = usize> {
+pub fn doubling(n: usize) -> impl Iterator<Item = usize> {
     let mut done = 1;
     std::iter::from_fn(move || {
         let step = done.min(n - done);
@@ -31,27 +31,27 @@ pub(crate) fn doubling(n: usize) -> impl Iterator<Item = usize> {
 }
 
 /// Farthest that a mask is grown: beyond it every footprint covers most of a part anyway.
-pub(crate) const REACH_MOST: i32 = 31;
+pub const REACH_MOST: i32 = 31;
 
 impl OpenMask {
     /// Every pixel of `rect` is shut.
     ///
     /// # Panics
     /// If `rect` has more than 64 columns or rows.
-    pub(crate) fn shut(rect: Rect) -> Self {
+    pub fn shut(rect: Rect) -> Self {
         assert!(rect.width() <= 64 && rect.height() <= 64, "a part is at most 64x64");
         OpenMask { rect, rows: [0; 64], grown: [0; 64], reach: [0; 2] }
     }
 
     /// Opens the pixels of row `y` whose bits are set.
     #[inline(always)]
-    pub(crate) fn open_row(&mut self, y: usize, bits: u64) {
+    pub fn open_row(&mut self, y: usize, bits: u64) {
         self.rows[y & 63] |= bits;
     }
 
     /// Shuts the pixels of row `y` whose bits are set.
     #[inline(always)]
-    pub(crate) fn close(&mut self, y: usize, bits: u64) {
+    pub fn close(&mut self, y: usize, bits: u64) {
         self.rows[y & 63] &= !bits;
     }
 
@@ -70,7 +70,7 @@ impl OpenMask {
     /// Grows the mask by so many columns and rows, each at most [`REACH_MOST`]: to be done again after pixels
     /// shut.
     #[inline(always)]
-    pub(crate) fn grow(&mut self, reach: [i32; 2]) {
+    pub fn grow(&mut self, reach: [i32; 2]) {
         self.reach = reach.map(|reach| reach.min(REACH_MOST));
         self.grown = self.rows;
         // To both sides at once: a pixel and so many on either side.
@@ -92,7 +92,7 @@ impl OpenMask {
     /// The nearest pixels of the part to many centres in subpixels, and whether a footprint of the
     /// mask's reach around them may touch the part (1) or an open pixel of it, too (3).
     #[inline(always)]
-    pub(crate) fn near_all(&self, x: &[i32], y: &[i32], cells: &mut [u32], fate: &mut [u32]) {
+    pub fn near_all(&self, x: &[i32], y: &[i32], cells: &mut [u32], fate: &mut [u32]) {
         let [wide, high] = self.reach.map(|reach| (64 + 2 * reach) as u32);
         let [across, down] = self.reach;
         for (((x, y), cell), fate) in x.iter().zip(y).zip(cells).zip(fate) {
@@ -113,7 +113,7 @@ impl OpenMask {
 
     /// Whether something may be open near the pixel of the part that [`OpenMask::near_all`] named.
     #[inline(always)]
-    pub(crate) fn is_near(&self, cell: u32) -> bool {
+    pub fn is_near(&self, cell: u32) -> bool {
         self.grown[(cell >> 6 & 63) as usize] >> (cell & 63) & 1 == 1
     }
 
@@ -124,7 +124,7 @@ impl OpenMask {
 
     /// Whether any pixel of `rect` (picture coordinates) is open.
     #[inline(always)]
-    pub(crate) fn any(&self, rect: &Rect) -> bool {
+    pub fn any(&self, rect: &Rect) -> bool {
         let x0 = rect.x0.max(self.rect.x0) - self.rect.x0;
         let x1 = rect.x1.min(self.rect.x1) - self.rect.x0;
         let y0 = rect.y0.max(self.rect.y0) - self.rect.y0;
@@ -138,47 +138,5 @@ impl OpenMask {
             any |= row;
         }
         any & columns != 0
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
-
-    proptest! {
-        #[test]
-        fn a_rectangle_is_open_where_a_pixel_is(
-            w in 1..=64i32, h in 1..=64i32, x in -9..9i32, y in -9..9i32,
-            open in prop::collection::vec((0..64i32, 0..64i32), 0..6),
-            rects in prop::collection::vec((-20..80i32, -20..80i32, -3..40i32, -3..40i32), 1..40),
-        ) {
-            let part = Rect::new(x, y, x + w, y + h);
-            let mut mask = OpenMask::shut(part);
-            let open: Vec<_> = open.into_iter().filter(|&(i, j)| i < w && j < h).collect();
-            for &(i, j) in &open {
-                mask.open_row(j as usize, 1 << i);
-            }
-            for (x0, y0, dx, dy) in rects {
-                let r = Rect::new(x0, y0, x0 + dx, y0 + dy);
-                // A rectangle around a centre is open only where the grown mask says it may be.
-                let ([rx, ry], cx, cy) = ([dx, dy].map(|d| d.clamp(0, REACH_MOST)), x0, y0);
-                mask.grow([rx, ry]);
-                let around =
-                    Rect::new(x + cx - rx, y + cy - ry, x + cx + rx + 1, y + cy + ry + 1);
-                let (mut cell, mut fate) = ([0], [9]);
-                mask.near_all(&[cx * 256 + 255], &[cy * 256], &mut cell, &mut fate);
-                let near = fate[0] == 3;
-                prop_assert!(near || !mask.any(&around), "{around:?} in {part:?}");
-                let inside = (0..64).contains(&cx) && (0..64).contains(&cy);
-                prop_assert!(!inside || near == mask.any(&around));
-                prop_assert!(fate[0] == 0 || near == mask.is_near(cell[0]));
-                let inside = |&(i, j): &(i32, i32)| {
-                    let (i, j) = (i + x, j + y);
-                    r.x0 <= i && i < r.x1 && r.y0 <= j && j < r.y1
-                };
-                prop_assert_eq!(mask.any(&r), open.iter().any(inside), "{:?} in {:?}", r, part);
-            }
-        }
     }
 }

@@ -22,7 +22,7 @@ use slabcast_common::view::Projection;
 
 /// A voxel waiting in the bucket of its first sheet.
 #[derive(Clone, Copy, Default)]
-struct Waiting {
+pub struct Waiting {
     /// Which of the part's bricks.
     brick: u32,
     /// Which voxel of it.
@@ -33,7 +33,7 @@ struct Waiting {
 
 /// Memory that a render thread keeps from part to part.
 #[derive(Default)]
-pub(crate) struct GeneralScratch {
+pub struct GeneralScratch {
     pub(crate) kinds: Kinds,
     pub(crate) queues: Queues,
 }
@@ -50,7 +50,7 @@ pub(crate) struct Kinds {
 type OfSheet<W> = (Option<i32>, Reaching<W>);
 
 /// Memory for sums of one kind.
-pub(crate) struct Kind<S: Accumulate> {
+pub struct Kind<S: Accumulate> {
     planes: Planes<S>,
     /// In level views, from which `planes` are filled when a sheet closes.
     lofts: Lofts<S>,
@@ -73,17 +73,17 @@ impl<S: Accumulate> Default for Kind<S> {
 
 /// Voxels that wait.
 #[derive(Default)]
-pub(crate) struct Queues {
-    buckets: Vec<Vec<Waiting>>,
+pub struct Queues {
+    pub buckets: Vec<Vec<Waiting>>,
     /// Buckets behind this hold nothing: a part that stops often doesn't look at those of all sheets each time.
-    filled: usize,
+    pub filled: usize,
     carried: Vec<Waiting>,
 }
 
 impl Queues {
     /// Empties what an earlier part left, and makes room for one of `sheets`.
     #[inline(always)]
-    fn begin(&mut self, sheets: usize) {
+    pub fn begin(&mut self, sheets: usize) {
         if self.buckets.len() < sheets {
             self.buckets.resize_with(sheets, Vec::new);
         }
@@ -94,19 +94,19 @@ impl Queues {
 
     /// Puts a voxel before the sheet where it begins, counted from the slab's first.
     #[inline(always)]
-    fn put(&mut self, sheet: usize, voxel: Waiting) {
+    pub fn put(&mut self, sheet: usize, voxel: Waiting) {
         self.buckets[sheet].push(voxel);
         self.filled = self.filled.max(sheet + 1);
     }
 
     /// Voxels whose sheets were not come to.
-    fn waiting(&self) -> u64 {
+    pub fn waiting(&self) -> u64 {
         self.buckets[..self.filled].iter().map(|b| b.len() as u64).sum()
     }
 }
 
 /// A part with what it works on: compiled for each instruction set as a whole.
-pub(crate) struct RenderGeneral<'a, S: Accumulate> {
+pub struct RenderGeneral<'a, S: Accumulate> {
     pub(crate) part: Part<'a>,
     pub(crate) kind: &'a mut Kind<S>,
     pub(crate) queues: &'a mut Queues,
@@ -446,27 +446,5 @@ impl General<'_> {
             }
         }
         any_shut
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::{Queues, Waiting};
-
-    #[test]
-    fn what_a_part_left_is_gone_and_only_sheets_that_it_filled_are_looked_at() {
-        let mut queues = Queues::default();
-        queues.begin(1 << 20);
-        queues.put(700, Waiting::default());
-        queues.put(3, Waiting::default());
-        assert_eq!((queues.waiting(), queues.filled), (2, 701));
-        // It stopped there; the same worker draws a part of fewer sheets, then of more.
-        for sheets in [10, 1000] {
-            queues.begin(sheets);
-            assert_eq!((queues.waiting(), queues.filled), (0, 0));
-            queues.put(sheets - 1, Waiting::default());
-        }
-        queues.begin(1 << 20);
-        assert!(queues.buckets.iter().all(Vec::is_empty), "nothing is left over");
     }
 }

@@ -27,10 +27,10 @@ use std::sync::Arc;
 const BLOCK: i32 = 8;
 
 /// Of so many pixels one is drawn again, in a picture of some size.
-const ONE_IN: u32 = 128;
+pub const ONE_IN: u32 = 128;
 
 /// Blocks of a small picture at least. From half as many the estimate was off by more than two.
-const AT_LEAST: u32 = 32;
+pub const AT_LEAST: u32 = 32;
 
 /// Of eps, what is left where thickness alone is to show: a shut pixel is as far off as thickness makes it.
 const EPS: f64 = 1.0 / 16.0;
@@ -60,7 +60,7 @@ impl ThicknessPair {
 
 /// The blocks of a tile that are drawn again: of a large picture one of 8x8 pixels in every other part of 64x64, and in
 /// a smaller tile sometimes. Of a larger one they are those of its parts, so that they lie as far apart.
-fn blocks(tile: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
+pub fn blocks(tile: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
     parts(tile).flat_map(move |part| blocks_of_part(part, size))
 }
 
@@ -149,42 +149,5 @@ fn thinner(
         let colours = (0..3).map(|k| light(&coarse, k) - light(&fine, k));
         let squares = colours.fold((a - b) * (a - b), |sum, off| sum + off * off);
         sampled.put(a > 0.0 || b > 0.0, squares);
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn so_many_pixels_are_drawn_again_whatever_the_tiles() {
-        for edge in [16, 32, 64, 128, 256] {
-            let mut pixels = 0;
-            for y in (0..2048).step_by(edge as usize) {
-                for x in (0..2048).step_by(edge as usize) {
-                    let tile = Rect::new(x, y, x + edge, y + edge);
-                    for block in blocks(tile, [2048; 2]) {
-                        assert!(block.intersect(&tile) == block, "{block:?} in {tile:?}");
-                        pixels += block.area();
-                    }
-                }
-            }
-            let share = pixels as f64 / (2048.0 * 2048.0) * f64::from(ONE_IN);
-            assert!((0.9..1.1).contains(&share), "{share} of what was meant at {edge}");
-        }
-        let of = |edge: i32| {
-            let tiles = (0..256).step_by(edge as usize);
-            let tiles = tiles.flat_map(|y| (0..256).step_by(edge as usize).map(move |x| (x, y)));
-            let mut all: Vec<_> = tiles
-                .flat_map(|(x, y)| blocks(Rect::new(x, y, x + edge, y + edge), [256; 2]))
-                .map(|block| (block.y0, block.x0))
-                .collect();
-            all.sort_unstable();
-            all
-        };
-        assert!(of(64) == of(128) && of(64) == of(256), "the same of large tiles");
-        assert_eq!(blocks(Rect::new(0, 0, 7, 7), [7; 2]).count(), 0, "no block fits");
-        let small = (0..4).flat_map(|i| blocks(Rect::new(64 * i, 0, 64 * i + 64, 64), [256, 64]));
-        assert_eq!(small.count(), AT_LEAST as usize, "an eighth of a small picture");
     }
 }

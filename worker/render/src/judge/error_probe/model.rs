@@ -47,7 +47,7 @@ struct Wave {
 }
 
 /// A frame's tables.
-pub(crate) struct Model {
+pub struct Model {
     cut: [Arc<ProfileTable>; 3],
     whole: [Arc<ProfileTable>; 3],
     waves: Vec<Wave>,

@@ -31,12 +31,15 @@
 
 mod figures;
 mod ideal;
-mod profile;
-mod quadrature;
+#[doc(hidden)]
+pub mod profile;
+#[doc(hidden)]
+pub mod quadrature;
 mod sample;
 mod sheets;
 mod upright;
-mod walk;
+#[doc(hidden)]
+pub mod walk;
 
 pub use figures::ErrorFigures;
 pub use sample::{cells, stratified};

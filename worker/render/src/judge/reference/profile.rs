@@ -12,16 +12,16 @@ const NODES_PER_STD: f64 = 160.0;
 
 /// One axis of the kernel.
 #[derive(Clone, Debug)]
-pub(super) struct Profile {
-    pub(super) radius: f64,
-    form: Form,
+pub struct Profile {
+    pub radius: f64,
+    pub form: Form,
     /// The profile from the middle to the radius, with its slope times the step.
     table: Arc<[[f64; 2]]>,
     per_step: f64,
 }
 
 #[derive(Clone, Copy, Debug)]
-enum Form {
+pub enum Form {
     /// `(exp(-u^2 / 2 std^2) - edge) / norm` inside the radius.
     Gaussian(Gaussian),
     /// A spline: its pieces are cubics or lines, of which a table's cells hold one each.
@@ -29,12 +29,12 @@ enum Form {
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Gaussian {
+pub struct Gaussian {
     std: f64,
     /// `1 / 2 std^2`.
-    steep: f64,
-    edge: f64,
-    per_norm: f64,
+    pub steep: f64,
+    pub edge: f64,
+    pub per_norm: f64,
     /// Half the integral of the Gaussian inside the radius, without edge and norm.
     half_bell: f64,
 }
@@ -45,7 +45,7 @@ const THREE: [(f64, f64); 3] =
     [(-0.774_596_669_241_483_4, 5.0 / 9.0), (0.0, 8.0 / 9.0), (0.774_596_669_241_483_4, 5.0 / 9.0)];
 
 impl Profile {
-    pub(super) fn new(kernel: Kernel, std: f64, radius: f64) -> Profile {
+    pub fn new(kernel: Kernel, std: f64, radius: f64) -> Profile {
         // Values and slopes of B-splines at their knots, in steps.
         match kernel {
             Kernel::Gaussian => Profile::gaussian(std, radius),
@@ -63,7 +63,7 @@ impl Profile {
         Profile { radius, form: Form::Pieces, table, per_step }
     }
 
-    fn gaussian(std: f64, radius: f64) -> Profile {
+    pub fn gaussian(std: f64, radius: f64) -> Profile {
         let steep = 0.5 / (std * std);
         let edge = libm::exp(-radius * radius * steep);
         let bell = std * (2.0 * std::f64::consts::PI).sqrt() * libm::erf(radius * steep.sqrt());
@@ -88,7 +88,7 @@ impl Profile {
 
     /// The whole Gaussian: out to where all that is beyond, times `most`, is below 1e-9. Of splines
     /// nothing was cut.
-    pub(super) fn untruncated(&self, most: f64) -> Profile {
+    pub fn untruncated(&self, most: f64) -> Profile {
         let Form::Gaussian(g) = self.form else { return self.clone() };
         let tail = |radius: f64| libm::erfc(radius * g.steep.sqrt()) * most.max(1.0);
         let mut radius = self.radius;
@@ -100,7 +100,7 @@ impl Profile {
     }
 
     #[inline]
-    pub(super) fn at(&self, u: f64) -> f64 {
+    pub fn at(&self, u: f64) -> f64 {
         let u = u.abs();
         if u >= self.radius {
             return 0.0;
@@ -118,7 +118,7 @@ impl Profile {
     }
 
     /// The integral from the left edge to `u`.
-    pub(super) fn integral_to(&self, u: f64) -> f64 {
+    pub fn integral_to(&self, u: f64) -> f64 {
         if u <= -self.radius {
             return 0.0;
         }
@@ -134,7 +134,7 @@ impl Profile {
     }
 
     /// The integral of `u` times the profile from `u` to `u + d`.
-    pub(super) fn moment(&self, u: f64, d: f64) -> f64 {
+    pub fn moment(&self, u: f64, d: f64) -> f64 {
         let [from, to] = [u, u + d].map(|u| u.clamp(-self.radius, self.radius));
         match self.form {
             Form::Gaussian(g) => {
@@ -161,74 +161,5 @@ impl Profile {
             }
         }
         sum
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_table_is_the_formula() {
-        for (std, radius) in [(0.6, 2.0), (0.5, 2.0), (0.7, 2.0), (0.3, 1.0), (1.9, 6.1)] {
-            let cut = Profile::gaussian(std, radius);
-            for p in [cut.clone(), cut.untruncated(11.0)] {
-                let Form::Gaussian(g) = p.form else { panic!("a Gaussian") };
-                let peak = p.at(0.0);
-                let (mut off, mut share) = (0.0f64, 0.0f64);
-                for i in 0..100_000 {
-                    let u = p.radius * (f64::from(i) + 0.37) / 1e5;
-                    let want = (libm::exp(-u * u * g.steep) - g.edge) * g.per_norm;
-                    off = off.max((p.at(u) - want).abs() / peak);
-                    share = share.max((p.at(u) - want).abs() / want);
-                    assert_eq!(p.at(u), p.at(-u));
-                }
-                println!("std {std}, radius {}: {off:e} of the peak, {share:e}", p.radius);
-                assert!(off < 2e-11 && share < 1e-7, "std {std}: {off:e} {share:e}");
-                assert_eq!([p.at(p.radius), p.at(p.radius * 2.0)], [0.0; 2]);
-            }
-        }
-    }
-
-    #[test]
-    fn the_whole_gaussian_leaves_nothing_out() {
-        let p = Profile::gaussian(0.6, 2.0).untruncated(11.0);
-        assert!((3.6..4.5).contains(&p.radius), "{}", p.radius);
-        assert!((p.integral_to(p.radius) - 1.0).abs() < 1e-10);
-        let stiff = Profile::gaussian(0.6, 2.0).untruncated(1e9);
-        assert!(stiff.radius > p.radius + 1.0);
-        assert!(libm::erfc(stiff.radius / (0.6 * 2f64.sqrt())) * 1e9 < 1e-9);
-    }
-
-    #[test]
-    fn splines_are_convolutions_of_a_box() {
-        // The tent is a box of one step with itself; twice more that box make the cubic one.
-        let step = 1.7;
-        let tent = Profile::new(Kernel::Tent, step / 6f64.sqrt(), step);
-        let cubic = Profile::new(Kernel::Bspline, step / 3f64.sqrt(), 2.0 * step);
-        let n = 400;
-        for i in -50..=50 {
-            let u = f64::from(i) * 0.05 * step;
-            assert!((tent.at(u) - (1.0 - u.abs() / step).max(0.0) / step).abs() < 1e-15, "{u}");
-            // The tent with itself.
-            let h = 2.0 * step / f64::from(n);
-            let at = |j: i32| -step + (f64::from(j) + 0.5) * h;
-            let want: f64 = (0..n).map(|j| tent.at(at(j)) * tent.at(u - at(j)) * h).sum();
-            assert!((cubic.at(u) - want).abs() < 1e-5, "{u}: {} {want}", cubic.at(u));
-            for p in [&tent, &cubic] {
-                let h = 0.2 * step / f64::from(n);
-                let at = |j: i32| u + (f64::from(j) + 0.5) * h;
-                let (mut sum, mut moment) = (0.0, 0.0);
-                for j in 0..n {
-                    sum += p.at(at(j)) * h;
-                    moment += p.at(at(j)) * at(j) * h;
-                }
-                let d = 0.2 * step;
-                assert!((p.integral_to(u + d) - p.integral_to(u) - sum).abs() < 1e-6, "{u}");
-                assert!((p.moment(u, d) - moment).abs() < 1e-6, "{u}");
-                assert!((p.integral_to(p.radius) - 1.0).abs() < 1e-14);
-                assert_eq!(p.untruncated(11.0).radius, p.radius);
-            }
-        }
     }
 }

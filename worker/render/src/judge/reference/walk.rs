@@ -15,7 +15,7 @@ const PANEL: f64 = 0.8;
 
 /// A pixel's ray by depth z: `(at + slope z, z)`, upright.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Ray {
+pub struct Ray {
     pub(super) at: [f64; 2],
     pub(super) slope: [f64; 2],
     /// What part of the slope is the kernel's lean and not the eye's.
@@ -84,7 +84,7 @@ impl Reference {
 
 /// A voxel whose kernel the ray meets.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Near {
+pub struct Near {
     /// Depths between which the ray is inside its support.
     pub(super) enter: f64,
     pub(super) leave: f64,

@@ -14,7 +14,7 @@ use std::marker::PhantomData;
 
 /// [`Rule::close_row`] for some rows.
 #[inline(always)]
-pub(crate) fn close_rows<S: Sum, const ROWS: usize>(
+pub fn close_rows<S: Sum, const ROWS: usize>(
     simd: Simd,
     rule: &Rule,
     rows: &mut [Row; ROWS],

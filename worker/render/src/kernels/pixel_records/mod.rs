@@ -65,34 +65,34 @@ macro_rules! by_width {
 mod long;
 #[cfg(target_arch = "aarch64")]
 mod neon;
-pub(crate) mod shear;
-pub(crate) mod sheet_offsets;
+pub mod shear;
+pub mod sheet_offsets;
 mod short;
 
 use self::sheet_offsets::{Apart, Layers, Woven};
 use super::{Accumulate, Grey, Level, Section, Simd, Tap, section_fixed, whole};
 use crate::kernels::composite::Sum;
 use crate::primitives::footprint::{Footprint, Sections};
-pub(crate) use crate::primitives::sizes::MOST;
+pub use crate::primitives::sizes::MOST;
 use slabcast_common::image::RawSums;
 
 /// Records from a row of a part to the next: two more than a part has columns. Rows of 64 records
 /// would lie 2048 or 4096 bytes apart, where a footprint's rows fall into few sets of the cache and
 /// loads wait for stores of the row before, which they are mistaken for. Even, so that two records
 /// that begin at an even column never lie across two lines of the cache.
-pub(crate) const STRIDE: usize = 66;
+pub const STRIDE: usize = 66;
 
 /// The sums of N sheets at one pixel: extinction and three colours each, or extinction and grey.
-pub(crate) type Record<S, const N: usize> = [<S as Recorded>::Pixel; N];
+pub type Record<S, const N: usize> = [<S as Recorded>::Pixel; N];
 
 /// Memory of records: a line of the cache.
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
-pub(crate) struct Line([u8; 64]);
+pub struct Line([u8; 64]);
 
 impl Line {
     /// Nothing.
-    pub(crate) const ZERO: Line = Line([0; 64]);
+    pub const ZERO: Line = Line([0; 64]);
 }
 
 // SAFETY: 64 bytes and no padding, zero among their values.
@@ -102,9 +102,9 @@ unsafe impl bytemuck::Pod for Line {}
 
 /// Weights along one axis: wherever a row begins, `len` of them are one's.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Table<'a, W> {
-    pub(crate) weights: &'a [W],
-    pub(crate) len: usize,
+pub struct Table<'a, W> {
+    pub weights: &'a [W],
+    pub len: usize,
 }
 
 impl<'a, W> Table<'a, W> {
@@ -117,28 +117,28 @@ impl<'a, W> Table<'a, W> {
 
 /// The tables of a view.
 #[derive(Clone, Copy)]
-pub(crate) struct Tables<'a, S: Recorded> {
+pub struct Tables<'a, S: Recorded> {
     /// Across and down.
-    pub(crate) across: [Table<'a, S::Weight>; 2],
+    pub across: [Table<'a, S::Weight>; 2],
     /// In depth.
-    pub(crate) deep: Table<'a, S::Depth>,
+    pub deep: Table<'a, S::Depth>,
 }
 
 /// A voxel whose footprint, moved if need be, lies inside the part: sixteen bytes, packed as they are
 /// so that many are made on lanes.
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(16))]
-pub(crate) struct Splat {
+pub struct Splat {
     /// First column and row of its footprint, a byte each, and above them the pixel of the part that
     /// is nearest to its centre: 64 times the row, and the column.
-    pub(crate) place: u32,
+    pub place: u32,
     /// Where its weights across begin and, above that, those down; of a voxel whose sections lie aside of each
     /// other, where it is itself.
-    pub(crate) rows: u32,
+    pub rows: u32,
     /// Depth in phases from its sheet's front and, above that, its normal.
-    pub(crate) deep: u32,
+    pub deep: u32,
     /// Its sample's bits.
-    pub(crate) sample: u32,
+    pub sample: u32,
 }
 
 /// A voxel's weights across, down and in depth.
@@ -197,23 +197,23 @@ impl Splat {
 }
 
 /// A weight for each slot.
-pub(crate) type BySlot<W, const N: usize> = [W; N];
+pub type BySlot<W, const N: usize> = [W; N];
 
 /// Weights by column and slot, and by row and slot.
 pub(crate) type Across<'a, W, const N: usize> = (&'a [BySlot<W, N>], &'a [BySlot<W, N>]);
 
 /// A row of weights among others, and which column its first belongs to.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct RowAt<'a, W> {
-    pub(crate) table: &'a [W],
-    pub(crate) from: usize,
-    pub(crate) len: usize,
-    pub(crate) column: i32,
+pub struct RowAt<'a, W> {
+    pub table: &'a [W],
+    pub from: usize,
+    pub len: usize,
+    pub column: i32,
 }
 
 impl<'a, W> RowAt<'a, W> {
     /// No weights.
-    pub(crate) const NONE: Self = RowAt { table: &[], from: 0, len: 0, column: 0 };
+    pub const NONE: Self = RowAt { table: &[], from: 0, len: 0, column: 0 };
 
     /// The same beside a table. A load of no lanes takes a machine hundreds of cycles where nothing is that it
     /// could have read.
@@ -235,13 +235,13 @@ impl<'a, W> RowAt<'a, W> {
 
     /// The weights.
     #[inline(always)]
-    fn row(&self) -> &'a [W] {
+    pub fn row(&self) -> &'a [W] {
         &self.table[self.from..self.from + self.len]
     }
 }
 
 /// Sums that records are made of.
-pub(crate) trait Recorded: Accumulate {
+pub trait Recorded: Accumulate {
     /// Sums of one sheet at a pixel.
     type Pixel: bytemuck::Pod + Default + PartialEq + std::fmt::Debug;
     /// A weight in depth.
@@ -725,149 +725,5 @@ fn splat_deep<S: Recorded, const N: usize>(
                 S::add(&mut record[slot], &row, wx[slot]);
             }
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Nine voxels with odd weights, by every instruction set.
-    fn splat_everywhere<S: Recorded + std::fmt::Debug, const N: usize>(
-        across: usize,
-        deep: usize,
-        w: [&[S::Weight]; 2],
-        z: &[S::Depth],
-    ) {
-        let high = 1 + across % 7;
-        let tables: Tables<'_, S> = Tables {
-            across: [Table { weights: w[0], len: across }, Table { weights: w[1], len: high }],
-            deep: Table { weights: z, len: deep },
-        };
-        let voxels: Vec<Splat> = (0..9u32)
-            .map(|i| Splat {
-                place: (3 + i) | i << 8,
-                rows: (i % 4) | ((i / 2 % 4) << 16),
-                deep: i / 3 % 4,
-                ..Splat::default()
-            })
-            .collect();
-        let light = |i: usize| [31_000.0 - 700.0 * i as f32, 17_003.4, 77.7, i as f32];
-        let payloads: Vec<S::Payload> = (0..9).map(|i| S::payload(light(i))).collect();
-        let run = |simd| {
-            let mut records: Vec<Record<S, N>> = vec![[S::from_raw([11; 4]); N]; STRIDE * 24];
-            S::splat_all(simd, &mut records, (&voxels, &payloads), deep * 3 % N, &tables);
-            records
-        };
-        let want = run(Simd::plain());
-        assert!(want.iter().any(|r| *r != [S::from_raw([11; 4]); N]));
-        for simd in Simd::all() {
-            assert!(run(simd) == want, "{} differs at {across}, {deep} of {N}", simd.name());
-        }
-    }
-
-    #[test]
-    fn every_instruction_set_adds_what_the_plain_loop_adds() {
-        let fixed = |n: usize| (0..n).map(|i| (i * 7919 % 23_000) as i16).collect::<Vec<_>>();
-        for across in 1..20 {
-            for deep in 1..=MOST {
-                let [x, y, z] = [across, 1 + across % 7, deep].map(|n| fixed(4 * n));
-                let real = |w: &[i16]| w.iter().map(|&w| f32::from(w) * 7.1e-5).collect::<Vec<_>>();
-                let taps = |w: &[i16]| real(w).into_iter().map(Tap::new).collect::<Vec<_>>();
-                if deep <= 4 {
-                    splat_everywhere::<i16, 4>(across, deep, [&x, &y], &z);
-                    splat_everywhere::<i32, 4>(across, deep, [&taps(&x), &taps(&y)], &real(&z));
-                }
-                splat_everywhere::<i16, MOST>(across, deep, [&x, &y], &z);
-                splat_everywhere::<i32, MOST>(across, deep, [&taps(&x), &taps(&y)], &real(&z));
-                if deep <= 4 {
-                    splat_everywhere::<Grey, 4>(across, deep, [&taps(&x), &taps(&y)], &real(&z));
-                }
-                splat_everywhere::<Grey, MOST>(across, deep, [&taps(&x), &taps(&y)], &real(&z));
-            }
-        }
-    }
-
-    /// Sections with footprints of their own, by every instruction set.
-    fn splat_deep_everywhere<S: Recorded, const N: usize>(
-        weight: impl Fn(i16) -> S::Weight,
-        depth: impl Fn(i16) -> S::Depth,
-    ) {
-        let number = |i: usize, slot: usize| ((i * 7919 + slot * 3001) % 23_000) as i16;
-        let by_slot = |i: usize| std::array::from_fn(|slot| weight(number(i, slot)));
-        let z = std::array::from_fn(|slot| depth(number(3, slot)));
-        for (columns, rows) in [(1, 1), (2, 3), (5, 3), (8, 8), (9, 7), (16, 9), (18, 12)] {
-            let x: Vec<BySlot<S::Weight, N>> = (0..columns).map(by_slot).collect();
-            let y: Vec<_> = (0..rows).map(|i| by_slot(i + 5)).collect();
-            let payload = S::payload([31_000.0, 17_003.4, 77.7, 3.0]);
-            let before = [S::from_raw([11; 4]); N];
-            let run = |simd| {
-                let mut records: Vec<Record<S, N>> = vec![before; STRIDE * 24];
-                S::splat_deep(simd, &mut records, 6, (&x, &y), payload, &z);
-                records
-            };
-            let want = run(Simd::plain());
-            assert!(want[6] != before);
-            for simd in Simd::all() {
-                assert!(run(simd) == want, "{} differs at {columns}x{rows} of {N}", simd.name());
-            }
-        }
-    }
-
-    #[test]
-    fn sections_with_footprints_of_their_own_are_added_as_the_plain_loop_adds_them() {
-        let real = |w| f32::from(w) * 7.1e-5;
-        splat_deep_everywhere::<i16, 4>(|w| w, |w| w);
-        splat_deep_everywhere::<i16, MOST>(|w| w, |w| w);
-        splat_deep_everywhere::<i32, 4>(|w| Tap::new(real(w)), real);
-        splat_deep_everywhere::<i32, MOST>(|w| Tap::new(real(w)), real);
-    }
-
-    /// Rows woven by every instruction set, of weights that are none of them zero.
-    fn weave_everywhere<S: Recorded, const N: usize>(weights: &[S::Weight])
-    where
-        S::Weight: PartialEq,
-    {
-        let (none, other) = (S::Weight::default(), weights[98]);
-        for wide in 1..24usize {
-            for i in 0..60i32 {
-                let mut rows = [RowAt::NONE; N];
-                for (slot, row) in rows.iter_mut().enumerate() {
-                    // Rows before, across and behind the window, at the table's ends and in its middle;
-                    // one is none at all.
-                    let len = (i as usize * 5 + slot * 3) % 38;
-                    let from = (weights.len() - len) * slot / (N - 1);
-                    let column = (i * 7 + slot as i32 * 2) % 40 - 16;
-                    *row = RowAt { table: weights, from, len, column };
-                }
-                let run = |simd| {
-                    let mut to = [[other; N]; 40];
-                    S::weave(simd, rows, wide, &mut to);
-                    to[..wide].to_vec()
-                };
-                let want = run(Simd::plain());
-                let weight = |slot: usize, j: i32| {
-                    let k = usize::try_from(j - rows[slot].column);
-                    k.ok().and_then(|k| rows[slot].row().get(k)).copied().unwrap_or(none)
-                };
-                for (j, got) in want.iter().enumerate() {
-                    let want: [_; N] = std::array::from_fn(|slot| weight(slot, j as i32));
-                    assert_eq!(*got, want);
-                }
-                for simd in Simd::all() {
-                    assert_eq!(run(simd), want, "{} at {wide}, {i} of {N}", simd.name());
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn rows_are_woven_as_the_plain_loop_weaves_them() {
-        let short: Vec<i16> = (1..200).collect();
-        let long: Vec<Tap> = short.iter().map(|&w| Tap::new(f32::from(w))).collect();
-        weave_everywhere::<i16, 4>(&short);
-        weave_everywhere::<i16, MOST>(&short);
-        weave_everywhere::<i32, 4>(&long);
-        weave_everywhere::<i32, MOST>(&long);
     }
 }

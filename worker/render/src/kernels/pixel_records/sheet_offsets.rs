@@ -18,32 +18,32 @@ use crate::primitives::sizes::PART;
 use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
 
 /// Voxels that are placed, shaded and splatted together.
-pub(crate) const BATCH: usize = 64;
+pub const BATCH: usize = 64;
 
 /// A number a voxel.
-pub(crate) type Each<T> = [T; BATCH];
+pub type Each<T> = [T; BATCH];
 
 /// Pixels of a window at most, along an axis: a footprint of eight pixels a vox.
-pub(crate) const WINDOW: usize = 40;
+pub const WINDOW: usize = 40;
 
 /// Where the sections of some voxels lie.
-pub(crate) struct Apart {
+pub struct Apart {
     /// First pixels of footprints, from the part's corner, and where weights begin: by axis and slot.
-    pub(crate) first: [[Each<i32>; MOST]; 2],
-    pub(crate) from: [[Each<u32>; MOST]; 2],
+    pub first: [[Each<i32>; MOST]; 2],
+    pub from: [[Each<u32>; MOST]; 2],
     /// Where footprints lie themselves, in subpixels from the part's corner: known where rows lie aside.
-    pub(crate) places: [[Each<i32>; MOST]; 2],
+    pub places: [[Each<i32>; MOST]; 2],
     /// Where voxels do, where their sections lie aside of them.
-    pub(crate) at: [Each<i32>; 2],
+    pub at: [Each<i32>; 2],
     /// By axis, the window inside the part that holds all footprints of a voxel: its first pixel, and the
     /// one behind its last.
-    pub(crate) lo: [Each<i32>; 2],
-    pub(crate) hi: [Each<i32>; 2],
+    pub lo: [Each<i32>; 2],
+    pub hi: [Each<i32>; 2],
     /// Sheets that a voxel has left, from the one at hand, and where its weights in depth for these begin.
-    pub(crate) left: Each<i32>,
-    pub(crate) deep: Each<u32>,
+    pub left: Each<i32>,
+    pub deep: Each<u32>,
     /// Voxels that are added.
-    pub(crate) kept: Each<u32>,
+    pub kept: Each<u32>,
 }
 
 impl Default for Apart {
@@ -67,7 +67,7 @@ impl Apart {
     /// ([`Leaning::subpixels`](crate::primitives::footprint::Leaning::subpixels)): in so many sheets from that on which slot `first`
     /// holds. What lies behind a voxel's last section may lie anywhere.
     #[inline(always)]
-    pub(crate) fn lean<const N: usize>(
+    pub fn lean<const N: usize>(
         &mut self,
         simd: Simd,
         axis: usize,
@@ -108,7 +108,7 @@ impl Apart {
     /// Has the windows hold footprints of `len` pixels along `axis` in a slot, of which voxels have some if they have
     /// more than `sheets` left.
     #[inline(always)]
-    pub(crate) fn hold(&mut self, axis: usize, slot: usize, n: usize, (len, sheets): (i32, i32)) {
+    pub fn hold(&mut self, axis: usize, slot: usize, n: usize, (len, sheets): (i32, i32)) {
         let first = &self.first[axis][slot];
         let (lo, hi) = (&mut self.lo[axis], &mut self.hi[axis]);
         for i in 0..n {
@@ -120,7 +120,7 @@ impl Apart {
 
     /// The same across where rows lie aside of each other: `row` is [`Lean::row_fixed`], and rows are placed.
     #[inline(always)]
-    pub(crate) fn hold_skewed(
+    pub fn hold_skewed(
         &mut self,
         slot: usize,
         n: usize,
@@ -142,7 +142,7 @@ impl Apart {
 
     /// Cuts windows along `axis` where the part ends.
     #[inline(always)]
-    pub(crate) fn cut(&mut self, axis: usize, n: usize) {
+    pub fn cut(&mut self, axis: usize, n: usize) {
         for lo in &mut self.lo[axis][..n] {
             *lo = (*lo).max(0);
         }
@@ -218,17 +218,17 @@ mod lean {
 
 /// What the sheets are that voxels reach from one on.
 #[derive(Clone, Copy)]
-pub(crate) struct Layers<'a, S: Recorded, const N: usize> {
+pub struct Layers<'a, S: Recorded, const N: usize> {
     /// Weights across and down, by slot.
-    pub(crate) across: [[Table<'a, S::Weight>; N]; 2],
+    pub across: [[Table<'a, S::Weight>; N]; 2],
     /// In depth.
-    pub(crate) deep: Table<'a, S::Depth>,
+    pub deep: Table<'a, S::Depth>,
     /// Of the first of them.
-    pub(crate) slot: usize,
+    pub slot: usize,
     /// Whether a voxel has the same columns in all of them, with the same weights.
-    pub(crate) alike: bool,
+    pub alike: bool,
     /// How sections lie aside of each other, if where they are is looked up as voxels are added ([`slant`](super::slant)).
-    pub(crate) slant: Option<Slant<'a>>,
+    pub slant: Option<Slant<'a>>,
 }
 
 impl<'a, S: Recorded, const N: usize> Layers<'a, S, N> {
@@ -261,19 +261,19 @@ impl<'a, S: Recorded, const N: usize> Layers<'a, S, N> {
 
     /// How many sheets behind the first `slot` belongs to.
     #[inline(always)]
-    pub(crate) fn after(&self, slot: usize) -> i32 {
+    pub fn after(&self, slot: usize) -> i32 {
         after::<N>(self.slot, slot)
     }
 }
 
 /// How many sheets behind the one that slot `first` holds is the next one that `slot` does.
 #[inline(always)]
-pub(crate) fn after<const N: usize>(first: usize, slot: usize) -> i32 {
+pub fn after<const N: usize>(first: usize, slot: usize) -> i32 {
     ((slot + N - first) % N) as i32
 }
 
 /// Memory for weights that are put side by side.
-pub(crate) struct Woven<W, const N: usize> {
+pub struct Woven<W, const N: usize> {
     /// By slot, of a window's columns and of its rows.
     by_slot: [[BySlot<W, N>; WINDOW]; 2],
     /// Across and down.
@@ -332,7 +332,7 @@ pub(crate) fn along_row(row: i64, [x, y_of]: [i32; 2], y: i32) -> i32 {
 /// [`splat_apart`] of voxels whose rows lie aside of each other, too: each row has weights of its own. `phases`:
 /// where those across lie in each slot.
 #[inline(always)]
-pub(crate) fn splat_skewed<S: Recorded, const N: usize>(
+pub fn splat_skewed<S: Recorded, const N: usize>(
     simd: Simd,
     records: &mut [Record<S, N>],
     (apart, payloads): (&Apart, &[S::Payload]),
@@ -516,129 +516,6 @@ pub(super) mod lines {
                 let at = self.spans.at[slot][i] + j as i32;
                 if is_present { self.weights[slot][at as usize] } else { W::default() }
             })
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::kernels::Tap;
-    use proptest::prelude::*;
-
-    /// Where the sections of a voxel lie: around a pixel, each so far aside of it and with weights from here
-    /// on, by axis; and how many sheets it has left.
-    type Somewhere = ([i32; 2], [[(i32, u32); MOST]; 2], i32);
-
-    fn somewhere() -> impl Strategy<Value = Somewhere> {
-        let aside = prop::array::uniform8((0..4i32, 0..150u32));
-        (prop::array::uniform2(-12..70i32), prop::array::uniform2(aside), 1..=MOST as i32)
-    }
-
-    /// Voxels by every instruction set; `lens`: widths of footprints by axis and slot.
-    fn add_everywhere<S: Recorded, const N: usize>(
-        voxels: &[Somewhere],
-        lens: [[usize; MOST]; 2],
-        (slot, alike): (usize, bool),
-        weights: &[S::Weight],
-        deep: &[S::Depth],
-    ) -> Result<(), TestCaseError> {
-        let slot = slot % N;
-        // Columns that are alike are those of the first slot.
-        let of = |axis: usize, at: usize| if alike && axis == 0 { slot } else { at };
-        let across = [0, 1]
-            .map(|axis| std::array::from_fn(|at| Table { weights, len: lens[axis][of(axis, at)] }));
-        let deep = Table { weights: deep, len: N };
-        let layers = Layers::<S, N> { across, deep, slot, alike, slant: None };
-        let mut apart = Apart::default();
-        let mut payloads = Vec::new();
-        for (i, (around, aside, left)) in voxels.iter().enumerate() {
-            let left = *left.min(&(N as i32));
-            (apart.left[i], apart.deep[i]) = (left, i as u32 % 5);
-            for axis in 0..2 {
-                let (mut lo, mut hi) = (i32::MAX, i32::MIN);
-                for at in 0..N {
-                    let (by, from) = aside[axis][of(axis, at)];
-                    let first = around[axis] + by;
-                    (apart.first[axis][at][i], apart.from[axis][at][i]) = (first, from);
-                    if layers.after(at) < left {
-                        let len = layers.across[axis][at].len as i32;
-                        (lo, hi) = (lo.min(first), hi.max(first + len));
-                    }
-                }
-                (apart.lo[axis][i], apart.hi[axis][i]) = (lo.max(0), hi.min(64));
-            }
-            if (0..2).all(|axis| apart.lo[axis][i] < apart.hi[axis][i]) {
-                apart.kept[payloads.len()] = i as u32;
-                payloads.push(S::payload([31_000.0 - i as f32, 17_003.4, 77.7, i as f32]));
-            }
-        }
-        let before = [S::from_raw([11; 4]); N];
-        let run = |simd| {
-            let mut records: Vec<Record<S, N>> = vec![before; STRIDE * 64];
-            let mut woven = Woven::default();
-            S::splat_apart(simd, &mut records, (&apart, &payloads), &layers, &mut woven);
-            records
-        };
-        let want = run(Simd::plain());
-        prop_assert_eq!(want.iter().any(|r| *r != before), !payloads.is_empty());
-        for simd in Simd::all() {
-            prop_assert!(run(simd) == want, "{} of {N}", simd.name());
-        }
-        Ok(())
-    }
-
-    proptest! {
-        #[test]
-        fn every_instruction_set_has_sections_lie_as_far_aside(
-            at in prop::collection::vec(-9000..9000i32, BATCH),
-            deep in prop::collection::vec(0..48u32, BATCH),
-            n in 0..=BATCH, first in 0..MOST, sheets in 1..=MOST, axis in 0..2usize,
-        ) {
-            let aside: Vec<i32> = (0..40 + MOST as i32).map(|i| i * 37 % 301 - 150).collect();
-            let at: Each<i32> = at.try_into().expect("a batch");
-            let deep: Each<u32> = deep.try_into().expect("a batch");
-            let of = |simd| {
-                let mut apart = Apart::default();
-                (apart.deep, apart.at[axis]) = (deep, at);
-                apart.lean::<MOST>(simd, axis, n, &aside, (first, sheets));
-                // What lies behind the last section may lie anywhere.
-                let some = |i: &usize| deep[*i] as usize + sheets <= 40;
-                let voxel = |i: usize| (0..sheets).map(move |sheet| (sheet, i));
-                let places = (0..n).filter(some).flat_map(voxel);
-                places.map(|(s, i)| apart.places[axis][(first + s) % MOST][i]).collect::<Vec<_>>()
-            };
-            let want = of(Simd::plain());
-            let on_paper = (0..n).find(|&i| deep[i] as usize + sheets <= 40);
-            if let Some(i) = on_paper {
-                prop_assert_eq!(want[0], at[i] + aside[deep[i] as usize]);
-            }
-            for simd in Simd::all() {
-                prop_assert_eq!(&of(simd), &want, "{}", simd.name());
-            }
-        }
-
-        #[test]
-        fn every_instruction_set_adds_voxels_as_one_by_one(
-            voxels in prop::collection::vec(somewhere(), 0..BATCH), slot in 0..MOST,
-            len in prop_oneof![1..8usize, 1..WINDOW - 4], alike in any::<bool>(),
-            more in prop::array::uniform2(prop::array::uniform8(0..2usize)), edge in any::<bool>(),
-        ) {
-            let mut voxels = voxels;
-            if edge {
-                // All reach in over the part's first columns and rows, or end before them.
-                for (around, ..) in &mut voxels {
-                    *around = around.map(|at| at.rem_euclid(12) - len as i32);
-                }
-            }
-            let (lens, at) = (more.map(|more| more.map(|more| len + more)), (slot, alike));
-            let short: Vec<i16> = (0..190).map(|i| 4000 + (i * 7919 % 19_000) as i16).collect();
-            let real: Vec<f32> = short.iter().map(|&w| f32::from(w) * 7.1e-5).collect();
-            let taps: Vec<Tap> = real.iter().map(|&w| Tap::new(w)).collect();
-            add_everywhere::<i16, 4>(&voxels, lens, at, &short, &short)?;
-            add_everywhere::<i32, 4>(&voxels, lens, at, &taps, &real)?;
-            add_everywhere::<i16, MOST>(&voxels, lens, at, &short, &short)?;
-            add_everywhere::<i32, MOST>(&voxels, lens, at, &taps, &real)?;
         }
     }
 }

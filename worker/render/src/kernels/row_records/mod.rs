@@ -24,13 +24,13 @@ use crate::primitives::sizes::{LATTICE_ROWS as ROWS, REACHING};
 
 /// Which memory the tiers of a part take.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Shape {
+pub struct Shape {
     /// Tiers of a sheet.
     pub(crate) rows: usize,
     /// Lines of the cache of a tier.
     wide: usize,
     /// Columns before a part's first.
-    pub(crate) margin: usize,
+    pub margin: usize,
     /// Pixels of a line.
     line: usize,
     /// Columns of a footprint at most.
@@ -50,7 +50,7 @@ fn groups(len: usize, columns: usize) -> usize {
 
 impl Shape {
     /// For footprints of at most `len` columns and so many tiers.
-    pub(crate) fn new<S: Recorded>(rows: usize, len: usize) -> Shape {
+    pub fn new<S: Recorded>(rows: usize, len: usize) -> Shape {
         assert!(rows <= ROWS && len < 64, "{rows} tiers for footprints of {len}");
         let margin = len.next_multiple_of(8);
         let groups = groups(len, a_line::<S>());
@@ -62,19 +62,19 @@ impl Shape {
     }
 
     /// Lines of tiers for `sheets`.
-    pub(crate) fn lines(&self, sheets: usize) -> usize {
+    pub fn lines(&self, sheets: usize) -> usize {
         sheets * self.rows * self.wide
     }
 
     /// The place of a footprint's first pixel, which is at `first` in the part: it may lie outside.
     #[inline(always)]
-    pub(crate) fn place(&self, first: i32) -> u32 {
+    pub fn place(&self, first: i32) -> u32 {
         (first + self.margin as i32).clamp(0, self.margin as i32 + PART) as u32
     }
 
     /// The same among the pixels of all tiers of a sheet.
     #[inline(always)]
-    pub(crate) fn place_in(&self, tier: u32, first: i32) -> u32 {
+    pub fn place_in(&self, tier: u32, first: i32) -> u32 {
         tier * (self.wide * self.line) as u32 + self.place(first)
     }
 
@@ -87,7 +87,7 @@ impl Shape {
 }
 
 /// The open sheets of a part, tier by tier.
-pub(crate) struct Tiers<'a, S: Recorded, const N: usize> {
+pub struct Tiers<'a, S: Recorded, const N: usize> {
     lines: &'a mut [Line],
     shape: Shape,
     kind: std::marker::PhantomData<S>,
@@ -95,16 +95,16 @@ pub(crate) struct Tiers<'a, S: Recorded, const N: usize> {
 
 /// Weights across and in depth.
 #[derive(Clone, Copy)]
-pub(crate) struct Weights<'a, S: Recorded> {
-    pub(crate) across: Table<'a, S::Weight>,
-    pub(crate) deep: Table<'a, S::Depth>,
+pub struct Weights<'a, S: Recorded> {
+    pub across: Table<'a, S::Weight>,
+    pub deep: Table<'a, S::Depth>,
 }
 
 /// Rows of a part.
-const EDGE: usize = PART as usize;
+pub const EDGE: usize = PART as usize;
 
 /// The tiers that reach each row of pixels in a sheet, and what they weigh there.
-pub(crate) struct ByRow<W> {
+pub struct ByRow<W> {
     /// The first of them, and how many there are: four at least.
     reach: [[u8; 2]; EDGE],
     weights: [[W; REACHING]; EDGE],
@@ -120,13 +120,13 @@ impl<W: Weight> Default for ByRow<W> {
 
 /// Tiers that reach a row of pixels at least, some with no weight: as many as do if a kernel reaches two steps of the
 /// lattice to either side.
-pub(crate) const FOUR: usize = 4;
+pub const FOUR: usize = 4;
 
 impl<W: Weight> ByRow<W> {
     /// Has `n` tiers from `begin` on reach row `y`, by the weight of each: those before the first and behind the last
     /// with any are left out, but for four.
     #[inline(always)]
-    pub(crate) fn set(&mut self, y: usize, [begin, n]: [usize; 2], weight: impl Fn(usize) -> W) {
+    pub fn set(&mut self, y: usize, [begin, n]: [usize; 2], weight: impl Fn(usize) -> W) {
         let (mut from, mut to) = (0, n.min(REACHING));
         let row = &mut self.weights[y % EDGE];
         for (i, w) in row[..to].iter_mut().enumerate() {
@@ -152,26 +152,26 @@ impl<W: Weight> ByRow<W> {
 }
 
 /// A sheet that closes, and what is known of the one before.
-pub(crate) struct Ends<'a, S: Recorded> {
+pub struct Ends<'a, S: Recorded> {
     /// Pixels that are open and that something was added to.
-    pub(crate) open: &'a [u64; EDGE],
+    pub open: &'a [u64; EDGE],
     /// Of the sheet and of the one behind.
-    pub(crate) slots: [usize; 2],
-    pub(crate) by_row: [&'a ByRow<S::Weight>; 2],
+    pub slots: [usize; 2],
+    pub by_row: [&'a ByRow<S::Weight>; 2],
     /// Sums of the sheet before, in rows of [`STRIDE`]; then of this one.
-    pub(crate) before: &'a mut [S::Pixel],
+    pub before: &'a mut [S::Pixel],
     /// Pixels that `before` is of: elsewhere there is nothing, whatever it says.
-    pub(crate) was: &'a mut [u64; EDGE],
+    pub was: &'a mut [u64; EDGE],
     /// As [`crate::tile::Pixels`] has them.
-    pub(crate) pixels: &'a [[u32; 4]],
+    pub pixels: &'a [[u32; 4]],
 }
 
 /// Pixels that close, beside each other: where they are, what they have of the sheet before, of theirs and of the one
 /// behind, and how opaque they are.
-pub(crate) struct Folded<S: Recorded> {
-    places: Places,
-    sheets: Box<[[S::Pixel; MOST_CLOSING]; 3]>,
-    opacities: Box<[f32; MOST_CLOSING]>,
+pub struct Folded<S: Recorded> {
+    pub places: Places,
+    pub sheets: Box<[[S::Pixel; MOST_CLOSING]; 3]>,
+    pub opacities: Box<[f32; MOST_CLOSING]>,
 }
 
 /// Pixels that are closed together, or up to a row more: these are what a first cache holds, and of the lanes behind the last
@@ -214,7 +214,7 @@ impl<'a, S: Recorded, const N: usize> Tiers<'a, S, N> {
     ///
     /// # Panics
     /// If there are not as many lines.
-    pub(crate) fn new(lines: &'a mut [Line], shape: Shape) -> Self {
+    pub fn new(lines: &'a mut [Line], shape: Shape) -> Self {
         let lines = &mut lines[..shape.lines(N)];
         Tiers { lines, shape, kind: std::marker::PhantomData }
     }
@@ -239,7 +239,6 @@ impl<'a, S: Recorded, const N: usize> Tiers<'a, S, N> {
     }
 
     /// Whether nothing was added in the part, in any tier.
-    #[cfg(test)]
     pub(crate) fn are_empty(&self) -> bool {
         let all = (0..N).flat_map(|slot| (0..self.shape.rows).map(move |row| (slot, row)));
         let mut pixels = all.flat_map(|(slot, row)| self.pixels(self.begin(slot, row)));
@@ -247,7 +246,7 @@ impl<'a, S: Recorded, const N: usize> Tiers<'a, S, N> {
     }
 
     #[inline(always)]
-    fn tier_mut(&mut self, slot: usize, row: usize) -> &mut [S::Pixel] {
+    pub fn tier_mut(&mut self, slot: usize, row: usize) -> &mut [S::Pixel] {
         let Shape { rows, wide, .. } = self.shape;
         bytemuck::cast_slice_mut(&mut self.lines[(slot * rows + row) * wide..][..wide])
     }
@@ -298,7 +297,7 @@ fn firsts_of(columns: u64, n: usize) -> u64 {
 }
 
 /// Sums whose tiers are added to and folded in lanes.
-pub(crate) trait Tiered: Recorded {
+pub trait Tiered: Recorded {
     /// Adds `voxels` with `payloads`, which begin at the sheet that `slot` holds, to the tiers that their
     /// [rows](Splat::first) name.
     fn add_flat<const N: usize>(
@@ -495,148 +494,3 @@ macro_rules! tiered {
 tiered!(i16, [i16; 4], Shorts);
 tiered!(i32, [i32; 4], Longs<4>);
 tiered!(Grey, [i32; 2], Longs<2>);
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::kernels::Tap;
-    use proptest::prelude::*;
-
-    /// Numbers that look random.
-    fn numbers(seed: u32) -> impl FnMut(u32) -> u32 {
-        let mut state = u64::from(seed) | 1 << 40;
-        move |below| {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(99);
-            ((state >> 32) as u32) % below
-        }
-    }
-
-    /// Voxels added flat and apart, and some rows folded, by every instruction set as by the plain loops.
-    fn everywhere<S: Tiered, const N: usize>(
-        (len, rows, reaching): (usize, usize, usize),
-        seed: u32,
-        weight: impl Fn(u32) -> S::Weight,
-        deep: impl Fn(u32) -> S::Depth,
-    ) -> Result<(), TestCaseError> {
-        let mut next = numbers(seed);
-        let shape = Shape::new::<S>(rows, len);
-        let phases = 5;
-        let table: Vec<S::Weight> = (0..phases * len).map(|_| weight(next(1000))).collect();
-        let across = Table { weights: &table[..], len };
-        let depths: Vec<S::Depth> = (0..3 * N).map(|_| deep(next(1000))).collect();
-        let weights = Weights { across, deep: Table { weights: &depths[..], len: N } };
-        let payloads: Vec<S::Payload> = (0..40)
-            .map(|_| S::payload([next(9000), next(9000), next(9000), next(9000)].map(|x| x as f32)))
-            .collect();
-        let mut place = || {
-            let first = next(64 + 2 * len as u32) as i32 - 2 * len as i32;
-            (first, shape.place(first), next(rows as u32), next(phases as u32) * len as u32)
-        };
-        let voxels: Vec<Splat> = (0..40)
-            .map(|_| {
-                let (_, place, row, from) = place();
-                Splat { place: place | row << 8, rows: from, deep: from % 3, sample: 0 }
-            })
-            .collect();
-        let (mut apart, mut places) = (Apart::default(), [[0; BATCH]; MOST]);
-        for i in 0..40 {
-            apart.kept[i] = i as u32;
-            apart.left[i] = 1 + (i % N) as i32;
-            for slot in 0..N {
-                let (first, _, row, from) = place();
-                (apart.first[0][slot][i], apart.from[0][slot][i]) = (first, from);
-                places[slot][i] = shape.place_in(row, first);
-            }
-        }
-        let layers = Layers {
-            across: [[across; N]; 2],
-            deep: weights.deep,
-            slot: 1 % N,
-            alike: false,
-            slant: None,
-        };
-        // Some rows of pixels, one after the other reached by tiers farther down, sheet by sheet.
-        let mut by_row = [ByRow::default(), ByRow::default()];
-        for y in 0..EDGE {
-            let begin = y * (rows - reaching - FOUR) / EDGE;
-            for (sheet, by_row) in by_row.iter_mut().enumerate() {
-                let reaching = reaching + next(2) as usize * sheet;
-                let weights: Vec<S::Weight> = (0..reaching).map(|_| weight(next(1000))).collect();
-                by_row.set(y, [begin, reaching.max(FOUR)], |tier| {
-                    weights.get(tier - begin).copied().unwrap_or_default()
-                });
-            }
-        }
-        let mut bits = || {
-            let mut row = || u64::from(next(u32::MAX)) << 32 | u64::from(next(u32::MAX));
-            match row() % 4 {
-                0 => 0,
-                1 => row() & row() & row(),
-                2 => row() | row(),
-                _ => u64::MAX,
-            }
-        };
-        let sheets: Vec<[u64; EDGE]> = (0..4).map(|_| [(); EDGE].map(|()| bits())).collect();
-        let fours: Vec<[u32; 4]> =
-            (0..EDGE * STRIDE).map(|i| [(i as f32).to_bits(), 1, 2, 3]).collect();
-        let run = |simd| {
-            let mut lines = vec![Line::ZERO; shape.lines(N)];
-            let mut tiers = Tiers::<S, N>::new(&mut lines, shape);
-            S::add_flat(simd, &mut tiers, (&voxels, &payloads), 2 % N, &weights);
-            S::add_apart(simd, &mut tiers, (&apart, &payloads), &places, &layers);
-            let (mut before, mut was) = (vec![S::Pixel::default(); EDGE * STRIDE], [0; EDGE]);
-            let mut all = Vec::new();
-            for (k, open) in sheets.iter().enumerate() {
-                let (slots, mut to, mut y) = ([k, k + 1].map(|k| k % N), Folded::default(), 0);
-                let mut n = 0;
-                while y < EDGE {
-                    let (by_row, before) = (by_row.each_ref(), &mut before[..]);
-                    let ends = Ends { open, slots, by_row, before, was: &mut was, pixels: &fours };
-                    y = S::fold(simd, &tiers, ends, y, &mut to);
-                    n += to.places.len();
-                    all.extend(to.places.all().iter().enumerate().map(|(i, &at)| {
-                        let sums = to.sheets.each_ref().map(|sums| sums[i]);
-                        (at, sums, before[at as usize], to.opacities[i])
-                    }));
-                }
-                assert_eq!(was.iter().map(|row| row.count_ones() as usize).sum::<usize>(), n);
-            }
-            let margin = shape.margin;
-            let seen: Vec<Vec<S::Pixel>> = (0..N * rows)
-                .map(|i| {
-                    tiers.tier_mut(i / rows, i % rows)[margin..margin + PART as usize].to_vec()
-                })
-                .collect();
-            (seen, all, was)
-        };
-        let want = run(Simd::plain());
-        let nothing = S::Pixel::default();
-        prop_assert!(want.0.iter().flatten().any(|sums| *sums != nothing));
-        for (at, [_, here, _], before, a) in &want.1 {
-            prop_assert!(S::raw(here)[0] != 0 && *a == *at as f32);
-            prop_assert!(*at as usize % STRIDE < EDGE && here == before);
-        }
-        for simd in Simd::all() {
-            prop_assert!(run(simd) == want, "{}", simd.name());
-        }
-        Ok(())
-    }
-
-    proptest! {
-        #[test]
-        fn every_instruction_set_adds_to_tiers_and_folds_them_as_the_plain_loops_do(
-            len in prop::sample::select(vec![1, 3, 4, 5, 7, 8, 9, 13, 14, 17, 25, 26, 41, 63]),
-            rows in 24..60usize, reaching in 1..9usize, seed in any::<u32>(),
-        ) {
-            let shape = (len, rows, reaching);
-            let short = |x| x as i16 * 20;
-            everywhere::<i16, 4>(shape, seed, short, short)?;
-            everywhere::<i16, 8>(shape, seed, short, short)?;
-            let (tap, deep) = (|x| Tap::new(x as f32 * 1e-3), |x| x as f32 * 1e-3);
-            everywhere::<i32, 4>(shape, seed, tap, deep)?;
-            everywhere::<i32, 8>(shape, seed, tap, deep)?;
-            everywhere::<Grey, 4>(shape, seed, tap, deep)?;
-            everywhere::<Grey, 8>(shape, seed, tap, deep)?;
-        }
-    }
-}

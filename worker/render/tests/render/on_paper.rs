@@ -1,19 +1,15 @@
 //! Rendered pictures against `slabcast_render::judge::analytic`: what is known on paper, within bounds
 //! that count roundings.
 
-mod world;
-
+use crate::support::{bricks_of, transfer};
 use glam::DVec3;
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::{FrameState, Picture, TilePixels};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
-use slabcast_common::shade::Shading;
 use slabcast_common::slab::SheetRange;
-use slabcast_common::transfer::{
-    Classifier, ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction,
-};
+use slabcast_common::transfer::{Classifier, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, SUBPIXELS, View};
 use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
 use slabcast_render::Simd;
@@ -22,24 +18,13 @@ use slabcast_render::oracle::serial;
 use slabcast_render::tile::{self, Scratch};
 use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
-use world::bricks_of;
 
 fn profile() -> Profile {
     Profile::new(0.6, 2.0)
 }
 
 fn extinctions(colors: Vec<[f64; 4]>, opacities: Vec<[f64; 2]>) -> TransferFunction {
-    TransferFunction {
-        version: 1,
-        domain: Domain::Value,
-        colors,
-        opacities,
-        color_space: ColorSpace::Linear,
-        opacity_unit: OpacityUnit::Extinction,
-        nan: NanLook::default(),
-        gradient_opacity: vec![],
-        shading: Shading { on: false, ..Shading::default() },
-    }
+    transfer(colors, opacities, OpacityUnit::Extinction)
 }
 
 /// One scene with an eye that shuts nothing.
@@ -110,7 +95,7 @@ fn stack(across: u32, layers: Vec<Layer>) -> Stack {
 /// The tent only where no position is rounded: its slope jumps, and what a shift does to it is not
 /// bounded by the slope where it was.
 #[test]
-fn walls_of_splines_keep_their_bounds() {
+fn spline_kernel_walls_stay_within_rounding_bounds() {
     let n = 8;
     for (kernel, scale) in [(Kernel::Bspline, 4.0), (Kernel::Bspline, 3.7), (Kernel::Tent, 4.0)] {
         for (sigma, thickness) in [(0.05, 1.0), (2.0, 1.0), (2.0, 0.3), (0.5, 3.5)] {
@@ -151,7 +136,7 @@ fn judge(shot: &Shot, picture: &Picture, stack: &Stack, scale: f64, shift: f64, 
 }
 
 #[test]
-fn extinctions_from_faint_to_stiff_keep_their_bounds() {
+fn extinctions_from_faint_to_stiff_stay_within_rounding_bounds() {
     let (n, scale) = (8, 4.0);
     for e in [-9, -6, -3, 0, 3, 6, 9] {
         let sigma = libm::pow(10.0, f64::from(e));
@@ -167,7 +152,7 @@ fn extinctions_from_faint_to_stiff_keep_their_bounds() {
 
 /// Where voxels miss the subpixels, rounded positions are the largest error, and have a bound.
 #[test]
-fn a_wall_off_the_grid_keeps_the_bound_of_rounded_positions() {
+fn off_grid_wall_stays_within_position_rounding_bound() {
     let (n, scale) = (10, 3.7);
     for sigma in [0.05, 2.0] {
         let tf = extinctions(vec![[0.0, 1.0, 0.5, 0.25]], vec![[0.0, sigma]]);
@@ -182,7 +167,7 @@ fn a_wall_off_the_grid_keeps_the_bound_of_rounded_positions() {
 }
 
 #[test]
-fn ten_thousand_layers_of_a_millionth_add_up() {
+fn ten_thousand_layers_of_extinction_1e_minus_6_add_up() {
     let (n, deep, scale) = (2, 10_000, 4.0);
     let sigma = -libm::log1p(-1e-6);
     let tf = extinctions(vec![[0.0, 1.0, 1.0, 1.0]], vec![[0.0, sigma]]);
@@ -194,7 +179,7 @@ fn ten_thousand_layers_of_a_millionth_add_up() {
 
 /// Sheets up to a depth hold just what lies in front of it: error functions, not layers.
 #[test]
-fn the_first_sheets_of_a_slab_have_the_depth_in_front_of_their_border() {
+fn partial_slab_has_the_optical_depth_in_front_of_its_border() {
     let (n, scale, d) = (8, 4.0, 0.7);
     let sigma = 0.3;
     let tf = extinctions(vec![[0.0, 1.0, 1.0, 1.0]], vec![[0.0, sigma]]);
@@ -230,7 +215,7 @@ fn the_first_sheets_of_a_slab_have_the_depth_in_front_of_their_border() {
 /// A Gaussian from an axis, where sums over voxels are products, and from a side where they are
 /// not, and Poisson's formula says how far a smooth field is.
 #[test]
-fn a_bell_has_its_line_integrals() {
+fn gaussian_blob_renders_its_line_integrals() {
     let (n, scale, peak) = (36u32, 3.0, 0.2);
     let wide = f64::from(n) / 12.0;
     let centre = (f64::from(n) - 1.0) / 2.0;
@@ -273,7 +258,7 @@ fn a_bell_has_its_line_integrals() {
 /// The order of convergence from rendered pictures, against a closed form: a colour ramp through
 /// a medium, seen along an axis with voxels on the subpixels, so that no position is rounded.
 #[test]
-fn rendered_pictures_converge_with_the_order_of_their_rule() {
+fn pictures_converge_with_sheet_thickness_at_the_order_of_the_colour_rule() {
     let (n, deep, scale) = (9u32, 20u32, 4.0);
     let sigma = 0.29;
     let ramp = |j: u32| f64::from(j) / f64::from(deep - 1);

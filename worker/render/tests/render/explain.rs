@@ -1,13 +1,12 @@
 //! What `explain` says is what the renderer did.
 
-mod world;
-
+use crate::support::{bricks_of, transfer};
 use glam::DVec3;
 use slabcast_common::ids::SceneId;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Compositing, Quality, Sums};
 use slabcast_common::shade::Shading;
-use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
+use slabcast_common::transfer::{OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_render::oracle::explain::{PixelExplanation, explain};
@@ -15,7 +14,6 @@ use slabcast_render::oracle::serial;
 use slabcast_render::oracle::work_counters::count_work;
 use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
-use world::bricks_of;
 
 const SIZE: u32 = 40;
 
@@ -31,25 +29,18 @@ fn onion() -> Volume {
 }
 
 /// Translucent outside, opaque within, lit: so that pixels shut, some late and some never.
-fn transfer() -> TransferFunction {
-    TransferFunction {
-        version: 1,
-        domain: Domain::Value,
-        colors: vec![[0.0, 0.1, 0.2, 0.9], [90.0, 0.9, 0.4, 0.1], [255.0, 1.0, 0.9, 0.8]],
-        opacities: vec![[0.0, 0.0], [30.0, 0.05], [100.0, 0.2], [140.0, 0.999]],
-        color_space: ColorSpace::Linear,
-        opacity_unit: OpacityUnit::AlphaPerVox,
-        nan: NanLook::default(),
-        gradient_opacity: vec![],
-        shading: Shading::default(),
-    }
+fn lit() -> TransferFunction {
+    let colors = vec![[0.0, 0.1, 0.2, 0.9], [90.0, 0.9, 0.4, 0.1], [255.0, 1.0, 0.9, 0.8]];
+    let opacities = vec![[0.0, 0.0], [30.0, 0.05], [100.0, 0.2], [140.0, 0.999]];
+    let unlit = transfer(colors, opacities, OpacityUnit::AlphaPerVox);
+    TransferFunction { shading: Shading::default(), ..unlit }
 }
 
 fn frame(volume: &Volume, quality: Quality, projection: CameraProjection) -> Frame {
     let spec = SceneSpec {
         id: SceneId(1),
         volume: volume.info(Digest32::default()),
-        transfer: transfer(),
+        transfer: lit(),
         quality,
         bricks: Default::default(),
     };
@@ -88,7 +79,7 @@ fn qualities() -> Vec<Quality> {
 }
 
 #[test]
-fn the_explained_pixel_is_the_rendered_pixel_to_the_bit() {
+fn explained_pixel_equals_rendered_pixel_bit_for_bit() {
     let volume = onion();
     let bricks = bricks_of(&volume);
     for quality in qualities() {
@@ -111,7 +102,7 @@ fn the_explained_pixel_is_the_rendered_pixel_to_the_bit() {
 }
 
 #[test]
-fn a_survey_counts_what_explain_lists() {
+fn work_counters_match_explained_sheets_and_sections() {
     let volume = onion();
     let bricks = bricks_of(&volume);
     for (sums, projection) in [(Sums::I32, PROJECTIONS[0]), (Sums::F32, PROJECTIONS[1])] {
@@ -169,7 +160,7 @@ fn agrees_with_itself(e: &PixelExplanation, quality: &Quality, what: &str) {
 
 /// All of a sheet's voxels together are the sheet.
 #[test]
-fn voxels_add_up_to_their_sheet() {
+fn explained_sections_sum_to_their_sheet() {
     let volume = onion();
     let bricks = bricks_of(&volume);
     let quality = Quality { sums: Sums::I32, ..Quality::default() };

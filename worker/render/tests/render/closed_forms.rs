@@ -7,50 +7,21 @@
 //! optical depths are known in closed form, edges included. Scales are chosen so that voxel
 //! centres fall on the 1/256 pixel grid: no rounding of positions hides an error here.
 
-mod world;
-
+use crate::support::{bricks_of, g, sum, transfer};
 use glam::DVec3;
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::Picture;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Compositing, Quality, Sums};
-use slabcast_common::shade::Shading;
-use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
+use slabcast_common::transfer::{OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_render::oracle::serial;
 use slabcast_render::{Frame, Scene};
 use std::sync::Arc;
-use world::bricks_of;
 
-const STD: f64 = 0.6;
-const RADIUS: f64 = 2.0;
-
-/// The profile of DESIGN.md section 1, written down anew.
-fn g(u: f64) -> f64 {
-    let bell = |u: f64| (-u * u / (2.0 * STD * STD)).exp();
-    let root = STD * (2.0 * std::f64::consts::PI).sqrt();
-    let norm = root * libm::erf(RADIUS / (STD * 2f64.sqrt())) - 2.0 * RADIUS * bell(RADIUS);
-    if u.abs() < RADIUS { (bell(u) - bell(RADIUS)) / norm } else { 0.0 }
-}
-
-/// Sum of the profile over lattice points `range` at `u`.
-fn sum(u: f64, range: std::ops::Range<i32>) -> f64 {
-    range.map(|i| g(u - f64::from(i))).sum()
-}
-
-fn transfer(colors: Vec<[f64; 4]>, opacities: Vec<[f64; 2]>) -> TransferFunction {
-    TransferFunction {
-        version: 1,
-        domain: Domain::Value,
-        colors,
-        opacities,
-        color_space: ColorSpace::Linear,
-        opacity_unit: OpacityUnit::AlphaPerVox,
-        nan: NanLook::default(),
-        gradient_opacity: vec![],
-        shading: Shading { on: false, ..Shading::default() },
-    }
+fn alphas(colors: Vec<[f64; 4]>, opacities: Vec<[f64; 2]>) -> TransferFunction {
+    transfer(colors, opacities, OpacityUnit::AlphaPerVox)
 }
 
 /// Renders from +y (x to the left, z up) with 4 pixels a voxel.
@@ -88,11 +59,11 @@ fn looks_at(volume: &Volume, size: u32, x: u32, y: u32) -> (f64, f64) {
 }
 
 #[test]
-fn a_homogeneous_block_is_as_opaque_as_its_depth_everywhere() {
+fn homogeneous_block_has_the_opacity_of_its_optical_depth() {
     let n = 12u32;
     let volume = Volume::from_fn_u8("block", [n, 7, n], |_, _, _| 100);
     for alpha in [1e-6, 0.02, 0.3, 0.999] {
-        let tf = transfer(vec![[0.0, 0.25, 0.5, 1.0]], vec![[0.0, alpha]]);
+        let tf = alphas(vec![[0.0, 0.25, 0.5, 1.0]], vec![[0.0, alpha]]);
         for thickness in [0.25, 1.0, 2.7] {
             let q = Quality { thickness, ..Quality::default() };
             let p = picture(&volume, tf.clone(), q, None);
@@ -120,7 +91,7 @@ fn a_homogeneous_block_is_as_opaque_as_its_depth_everywhere() {
 
 /// Two walls with a gap wider than the kernel: I = c1 a1 + (1 - a1) c2 a2.
 #[test]
-fn a_wall_hides_the_wall_behind_it_by_just_its_opacity() {
+fn front_wall_attenuates_back_wall_by_its_opacity() {
     let n = 10u32;
     // The eye is at +y: the wall at high j is in front.
     let volume = Volume::from_fn_u8("walls", [n, 16, n], |_, j, _| match j {
@@ -129,7 +100,7 @@ fn a_wall_hides_the_wall_behind_it_by_just_its_opacity() {
         _ => 0,
     });
     for (front, back) in [(0.2, 0.4), (0.9, 0.5), (1.0, 1.0)] {
-        let tf = transfer(
+        let tf = alphas(
             vec![[50.0, 0.0, 0.0, 1.0], [200.0, 1.0, 0.0, 0.0]],
             vec![[0.0, 0.0], [49.0, 0.0], [50.0, back], [199.0, back], [200.0, front]],
         );
@@ -160,11 +131,11 @@ fn a_wall_hides_the_wall_behind_it_by_just_its_opacity() {
 /// A medium whose colour changes from layer to layer: the field's colour along the ray is
 /// sum(c_j g(y - j)) / sum(g(y - j)), and the integral is done here in 4000 steps of f64.
 #[test]
-fn colour_through_a_medium_is_the_emission_absorption_integral() {
+fn colour_ramp_is_the_emission_absorption_integral() {
     let (n, depth) = (9u32, 20u32);
     let volume = Volume::from_fn_u8("ramp", [n, depth, n], |_, j, _| 10 + 10 * j as u8);
     let alpha = 0.25f64;
-    let tf = transfer(vec![[10.0, 0.0, 0.2, 1.0], [200.0, 1.0, 0.8, 0.0]], vec![[0.0, alpha]]);
+    let tf = alphas(vec![[10.0, 0.0, 0.2, 1.0], [200.0, 1.0, 0.8, 0.0]], vec![[0.0, alpha]]);
     let colour = |j: i32| f64::from(j) * 10.0 / 190.0;
     let sigma = -libm::log1p(-alpha);
     let lateral = sum(4.125, 0..n as i32) * sum(4.125, 0..n as i32);
@@ -199,7 +170,7 @@ fn colour_through_a_medium_is_the_emission_absorption_integral() {
 
 /// A body with a red ball towards +x, a green one towards +z and a blue one towards the eye.
 #[test]
-fn pictures_are_upright_and_not_mirrored() {
+fn pictures_are_neither_flipped_nor_mirrored() {
     let ball =
         |p: [u32; 3], c: [i32; 3]| (0..3).map(|a| (p[a] as i32 - c[a]).pow(2)).sum::<i32>() <= 9;
     let volume = Volume::from_fn_u8("marker", [31; 3], |i, j, k| {
@@ -214,7 +185,7 @@ fn pictures_are_upright_and_not_mirrored() {
             0
         }
     });
-    let tf = transfer(
+    let tf = alphas(
         vec![
             [100.0, 1.0, 0.0, 0.0],
             [149.0, 1.0, 0.0, 0.0],

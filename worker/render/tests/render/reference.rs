@@ -1,8 +1,7 @@
 //! The judge is judged: by closed forms, by brute force along a ray, and by the splatter, which
 //! must come to the same picture when its sheets are thin.
 
-mod world;
-
+use crate::support::{RADIUS, STD, bell, bricks_of, g, sum, transfer};
 use glam::DVec3;
 use slabcast_common::bounds;
 use slabcast_common::brick::TightBox;
@@ -11,7 +10,7 @@ use slabcast_common::image::{Background, Picture};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
 use slabcast_common::shade::Shading;
-use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
+use slabcast_common::transfer::{OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
 use slabcast_render::judge::analytic::{Layer, Profile, Stack};
@@ -19,49 +18,9 @@ use slabcast_render::judge::reference::{ErrorFigures, Reference, Section, Sheets
 use slabcast_render::oracle::serial;
 use slabcast_render::{Frame, Scene};
 use std::f64::consts::PI;
-use std::sync::{Arc, LazyLock};
-use world::bricks_of;
+use std::sync::Arc;
 
-const STD: f64 = 0.6;
-const RADIUS: f64 = 2.0;
 const BLACK: Background = Background::Colour([0.0; 3]);
-
-fn bell(u: f64) -> f64 {
-    (-u * u / (2.0 * STD * STD)).exp()
-}
-
-static NORM: LazyLock<f64> = LazyLock::new(|| {
-    let root = STD * (2.0 * PI).sqrt();
-    root * libm::erf(RADIUS / (STD * 2f64.sqrt())) - 2.0 * RADIUS * bell(RADIUS)
-});
-
-/// The profile of DESIGN.md section 1, written down anew.
-fn g(u: f64) -> f64 {
-    if u.abs() < RADIUS { (bell(u) - bell(RADIUS)) / *NORM } else { 0.0 }
-}
-
-/// Sum of the profile over lattice points `range` at `u`.
-fn sum(u: f64, range: std::ops::Range<i32>) -> f64 {
-    range.map(|i| g(u - f64::from(i))).sum()
-}
-
-fn transfer(
-    colors: Vec<[f64; 4]>,
-    opacities: Vec<[f64; 2]>,
-    unit: OpacityUnit,
-) -> TransferFunction {
-    TransferFunction {
-        version: 1,
-        domain: Domain::Value,
-        colors,
-        opacities,
-        color_space: ColorSpace::Linear,
-        opacity_unit: unit,
-        nan: NanLook::default(),
-        gradient_opacity: vec![],
-        shading: Shading { on: false, ..Shading::default() },
-    }
-}
 
 fn alpha(colors: Vec<[f64; 4]>, opacities: Vec<[f64; 2]>) -> TransferFunction {
     transfer(colors, opacities, OpacityUnit::AlphaPerVox)
@@ -201,7 +160,7 @@ fn assert_near(got: [f64; 4], want: [f64; 4], within: f64, what: &str) {
 }
 
 #[test]
-fn a_homogeneous_block_is_as_opaque_as_its_depth() {
+fn reference_homogeneous_block_has_the_opacity_of_its_optical_depth() {
     let n = 12u32;
     for a in [1e-9, 0.02, 0.3, 0.999, 1.0] {
         let volume = Volume::from_fn_u8("block", [n, 7, n], |_, _, _| 100);
@@ -227,7 +186,7 @@ fn a_homogeneous_block_is_as_opaque_as_its_depth() {
 
 /// Two walls with a gap wider than the kernel: I = c1 a1 + (1 - a1) c2 a2.
 #[test]
-fn a_wall_hides_the_wall_behind_it_by_just_its_opacity() {
+fn reference_front_wall_attenuates_back_wall_by_its_opacity() {
     let n = 10u32;
     for (front_a, back_a) in [(0.2, 0.4), (0.9, 0.5), (1.0, 1.0)] {
         let volume = Volume::from_fn_u8("walls", [n, 40, n], |_, j, _| match j {
@@ -255,7 +214,7 @@ fn a_wall_hides_the_wall_behind_it_by_just_its_opacity() {
 }
 
 #[test]
-fn colour_through_a_medium_is_the_emission_absorption_integral() {
+fn reference_colour_ramp_is_the_emission_absorption_integral() {
     let depth = 20u32;
     let volume = Volume::from_fn_u8("ramp", [9, depth, 9], |_, j, _| 10 + 10 * j as u8);
     let (camera, size) = front(&volume);
@@ -273,7 +232,7 @@ fn colour_through_a_medium_is_the_emission_absorption_integral() {
 }
 
 #[test]
-fn a_single_voxel_weighs_its_profile_across_the_ray_from_any_side() {
+fn reference_single_voxel_weighs_the_profile_across_the_ray() {
     let sigma = 3.0;
     let tf = || transfer(vec![[0.0, 1.0, 0.5, 0.25]], vec![[0.0, sigma]], OpacityUnit::Extinction);
     let one = || Volume::from_fn_u8("one", [1, 1, 1], |_, _, _| 9);
@@ -300,7 +259,7 @@ fn a_single_voxel_weighs_its_profile_across_the_ray_from_any_side() {
 /// A Gaussian of deviation S blurred by a kernel of deviation s is one of S^2 + s^2, and its line
 /// integral is a Gaussian of the distance from the ray.
 #[test]
-fn a_gaussian_blob_has_its_line_integral() {
+fn reference_gaussian_blob_has_its_line_integral() {
     let (n, s) = (33, 3.0f64);
     let lattice = Lattice::from_spacing([n; 3], [1.0; 3]);
     let samples = (0..n * n * n)
@@ -340,7 +299,7 @@ fn a_gaussian_blob_has_its_line_integral() {
 }
 
 #[test]
-fn oblique_and_perspective_rays_are_what_brute_force_finds() {
+fn reference_equals_brute_force_on_oblique_and_perspective_rays() {
     let look = |[i, j, k]: [u32; 3]| {
         let h = (i * 7 + j * 13 + k * 29 + i * j * k) % 11;
         (h > 3).then_some((f64::from(h) * 0.09, [f64::from(i) / 7.0, f64::from(j) / 7.0, 0.5]))
@@ -388,7 +347,7 @@ fn lattices(n: u32) -> [Lattice; 3] {
 
 /// The kernel of a lattice that is not cubic is a ball in index space, looked at from anywhere.
 #[test]
-fn leaning_kernels_are_what_brute_force_finds_in_index_space() {
+fn reference_sheared_kernels_equal_brute_force_in_index_space() {
     let samples = |[i, j, k]: [u32; 3]| (i * 7 + j * 13 + k * 29 + i * j * k) % 11;
     let n = 5;
     let mut volume = Volume::from_fn_u8("dice", [n; 3], |i, j, k| samples([i, j, k]) as u8);
@@ -454,7 +413,7 @@ fn leaning_kernels_are_what_brute_force_finds_in_index_space() {
 
 /// Rays that cross a wall at a slant cross more of it: by the secant.
 #[test]
-fn a_slanted_ray_is_longer_by_the_secant() {
+fn reference_slanted_ray_is_longer_by_the_secant() {
     let n = 60u32;
     let volume = Volume::from_fn_u8("wall", [n, 4, n], |_, _, _| 1);
     let sigma = 0.1;
@@ -474,7 +433,7 @@ fn a_slanted_ray_is_longer_by_the_secant() {
 }
 
 #[test]
-fn extinctions_from_faint_to_stiff_are_finite_and_right() {
+fn reference_handles_extinctions_from_faint_to_stiff() {
     let n = 8u32;
     let volume = Volume::from_fn_u8("block", [n; 3], |_, j, _| 10 + j as u8);
     let (camera, size) = front(&volume);
@@ -561,7 +520,7 @@ fn same_sheets(reference: &Reference, sample: &[[u32; 2]]) -> Vec<[f64; 4]> {
 }
 
 #[test]
-fn thin_sheets_come_to_the_limit_in_both_projections() {
+fn thin_sheets_converge_to_the_reference_in_both_projections() {
     let n = 24;
     for projection in projections(n) {
         let q = Quality { thickness: 1.0 / 16.0, ..i32_sums() };
@@ -574,7 +533,7 @@ fn thin_sheets_come_to_the_limit_in_both_projections() {
 }
 
 #[test]
-fn thin_sheets_of_leaning_kernels_come_to_the_limit() {
+fn thin_sheets_of_sheared_kernels_converge_to_the_reference() {
     let n = 16;
     for (lattice, projection) in lattices(n).into_iter().zip(projections(n).into_iter().cycle()) {
         let mut volume = balls(n);
@@ -590,7 +549,7 @@ fn thin_sheets_of_leaning_kernels_come_to_the_limit() {
 
 /// Each section is drawn in one place, where it truly is smeared: that shows little.
 #[test]
-fn sheets_of_leaning_kernels_are_near_the_same_sheets_in_f64() {
+fn sheared_kernel_sheets_match_the_same_sheets_in_f64() {
     let n = 16;
     for (lattice, thickness) in
         lattices(n).into_iter().flat_map(|l| [0.5, 1.0, 3.0, 40.0].map(|d| (l, d)))
@@ -611,7 +570,7 @@ fn sheets_of_leaning_kernels_are_near_the_same_sheets_in_f64() {
 /// The splatter and the same sheets in f64 differ by rounding alone: in positions (1/256 pixel),
 /// depths (1/256 sheet), tables and sums.
 #[test]
-fn the_same_sheets_in_f64_are_what_the_splatter_draws() {
+fn splatter_matches_the_same_sheets_in_f64() {
     let n = 24;
     for projection in projections(n) {
         for compositing in [Compositing::Linear, Compositing::Constant, Compositing::Paper] {
@@ -657,7 +616,7 @@ fn orders(e: [f64; 4]) -> [f64; 3] {
 }
 
 #[test]
-fn constant_colour_converges_with_the_second_order_and_linear_faster() {
+fn constant_colour_rule_converges_at_second_order_and_linear_faster() {
     for projection in projections(20) {
         let [linear, constant] = errors(projection, Section::MidPlane);
         println!("{projection:?}: constant {constant:?}, order {:?}", orders(constant));
@@ -678,7 +637,7 @@ fn constant_colour_converges_with_the_second_order_and_linear_faster() {
 /// The mid-plane is the whole reason: with the kernel integrated along the slanted ray in each
 /// sheet, a perspective view converges as a parallel one does.
 #[test]
-fn sections_along_the_slanted_ray_bring_the_order_back() {
+fn exact_sections_restore_the_convergence_order_in_perspective() {
     let [_, persp] = projections(20);
     let [linear, _] = errors(persp, Section::Exact);
     println!("exact: linear {linear:?}, order {:?}", orders(linear));
@@ -695,7 +654,7 @@ fn sections_along_the_slanted_ray_bring_the_order_back() {
 /// depth, also where the limit ripples. (Its front and back add up to no more and no less, since
 /// what one place of the lattice misses before a face, its mirror image has behind it.)
 #[test]
-fn without_ripple_a_constant_field_comes_back_constant() {
+fn reference_without_ripple_keeps_a_constant_field_constant() {
     let n = 12u32;
     let volume = Volume::from_fn_u8("block", [n, 7, n], |_, _, _| 100);
     let (camera, size) = front(&volume);
@@ -722,7 +681,7 @@ fn without_ripple_a_constant_field_comes_back_constant() {
 
 /// From any side, in both projections: kernel sums divided place by place, against brute force.
 #[test]
-fn without_ripple_is_what_brute_force_over_a_wide_lattice_finds() {
+fn reference_without_ripple_equals_brute_force() {
     let n = 6u32;
     let volume = Volume::from_fn_u8("block", [n; 3], |_, _, _| 100);
     let sigma = 0.2;
@@ -772,7 +731,7 @@ fn without_ripple_is_what_brute_force_over_a_wide_lattice_finds() {
 
 /// A voxel with the whole Gaussian weighs that Gaussian across the ray, beyond the radius too.
 #[test]
-fn without_truncation_a_voxel_is_a_gaussian() {
+fn reference_without_truncation_makes_a_voxel_a_full_gaussian() {
     let sigma = 3.0;
     let tf = transfer(vec![[0.0, 1.0, 0.5, 0.25]], vec![[0.0, sigma]], OpacityUnit::Extinction);
     let one = Volume::from_fn_u8("one", [1, 1, 1], |_, _, _| 9);
@@ -798,7 +757,7 @@ fn without_truncation_a_voxel_is_a_gaussian() {
 
 /// Walls under B-splines, against truncated powers.
 #[test]
-fn splines_are_judged_by_what_is_known_on_paper() {
+fn reference_spline_kernels_equal_closed_forms() {
     for kernel in [Kernel::Bspline, Kernel::Tent] {
         let quality = Quality { kernel, ..i32_sums() };
         let (n, deep) = (8, 6);
@@ -833,7 +792,7 @@ fn splines_are_judged_by_what_is_known_on_paper() {
 /// soft and stiff, even and rough, seen along an axis (walls that rays graze), from anywhere and in
 /// perspective.
 #[test]
-fn bounds_of_the_model_hold_on_every_pixel() {
+fn model_error_bounds_hold_on_every_pixel() {
     let rough = |i: u32, j: u32, k: u32| {
         let h = (i * 73_856_093) ^ (j * 19_349_663) ^ (k * 83_492_791);
         if h % 7 < 3 { 0 } else { (40 + h % 200) as u8 }

@@ -3,8 +3,7 @@
 //! Random small volumes with opaque, faint and empty parts; random cameras of both kinds;
 //! thin and thick sheets; any tiles, slabs, instruction set, with culling and without.
 
-mod world;
-
+use crate::support::{bricks_of, infos_of, transfer};
 use glam::DVec3;
 use proptest::prelude::*;
 use slabcast_common::brick::Brick;
@@ -15,7 +14,7 @@ use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
 use slabcast_common::shade::Shading;
 use slabcast_common::slab::SheetRange;
-use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
+use slabcast_common::transfer::{ColorSpace, Domain, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
 use slabcast_render::Simd;
@@ -27,20 +26,12 @@ use slabcast_render::visibility::{Directory, VisibleBricks};
 use slabcast_render::{Frame, Scene};
 use std::cell::{Cell, RefCell};
 use std::sync::Arc;
-use world::{bricks_of, infos_of};
 
-fn transfer(top: f64, unit: OpacityUnit) -> TransferFunction {
-    TransferFunction {
-        version: 1,
-        domain: Domain::Value,
-        colors: vec![[0.0, 0.9, 0.3, 0.1], [255.0, 0.2, 0.8, 1.0]],
-        opacities: vec![[0.0, 0.0], [20.0, 0.002], [60.0, 0.05], [128.0, top], [255.0, top]],
-        color_space: ColorSpace::Srgb,
-        opacity_unit: unit,
-        nan: NanLook::default(),
-        gradient_opacity: vec![],
-        shading: Shading::default(),
-    }
+fn lit(top: f64, unit: OpacityUnit) -> TransferFunction {
+    let colors = vec![[0.0, 0.9, 0.3, 0.1], [255.0, 0.2, 0.8, 1.0]];
+    let opacities = vec![[0.0, 0.0], [20.0, 0.002], [60.0, 0.05], [128.0, top], [255.0, top]];
+    let (color_space, shading) = (ColorSpace::Srgb, Shading::default());
+    TransferFunction { color_space, shading, ..transfer(colors, opacities, unit) }
 }
 
 fn tiled(
@@ -189,7 +180,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 80, ..ProptestConfig::default() })]
 
     #[test]
-    fn tiles_and_slabs_give_the_bytes_of_the_serial_renderer(
+    fn tiles_slabs_and_regions_equal_the_serial_oracle_bit_for_bit(
         dims in (1u32..22, 1u32..22, 1u32..22),
         seed in any::<u64>(),
         // Half of the views are level, where voxels are added to lattice rows.
@@ -240,7 +231,7 @@ proptest! {
         let unit = if sums == Sums::F32 { OpacityUnit::Extinction } else { OpacityUnit::AlphaPerVox };
         let view = View::new(&v.lattice, &camera, size, &quality).unwrap();
         let bricks = bricks_of(&v);
-        let mut look = transfer(top, unit);
+        let mut look = lit(top, unit);
         // Grey is drawn in two channels where views are flat, and in perspective where they are level.
         if seed & 1 == 0 {
             look.colors = look.colors.iter().map(|c| [c[0], c[1], c[1], c[1]]).collect();
@@ -301,12 +292,12 @@ proptest! {
 
 /// Values of a float volume that nobody sane would draw.
 #[test]
-fn wild_floats_give_finite_pixels() {
+fn nan_infinite_and_huge_samples_give_finite_pixels() {
     let wild = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e-42, 3e38, -3e38, 5.0, 0.5];
     let samples: Vec<f32> = (0..1000).map(|i| wild[i * 7 % 8]).collect();
     let lattice = Lattice::from_spacing([10; 3], [1e-9; 3]);
     let v = Volume::new("wild", "float", false, lattice, Samples::F32(samples), ValueMap::IDENTITY);
-    let mut tf = transfer(1.0, OpacityUnit::AlphaPerVox);
+    let mut tf = lit(1.0, OpacityUnit::AlphaPerVox);
     tf.domain = Domain::Unit;
     tf.opacities = vec![[0.0, 0.3], [1.0, 1.0]];
     tf.nan.opacity = 0.2;

@@ -170,7 +170,9 @@ fn shrink(words: &mut [String]) {
             "--size" => size.into(),
             "--pixels" | "--model-pixels" => pixels.into(),
             "--frames" => match words[i].split_once("..") {
-                Some((from, _)) => format!("{from}..{}", from.parse::<u32>().expect("a number") + 1),
+                Some((from, _)) => {
+                    format!("{from}..{}", from.parse::<u32>().expect("a number") + 1)
+                }
                 None => frames.into(),
             },
             _ => continue,
@@ -379,15 +381,14 @@ fn links_between_documents_lead_somewhere() {
                 continue;
             }
             let (file, at) = target.split_once('#').unwrap_or((target, ""));
-            let path =
-                if file.is_empty() { root().join(document) } else { folder.join(file) };
+            let path = if file.is_empty() { root().join(document) } else { folder.join(file) };
             if !path.exists() {
                 broken.push(format!("{document}: {target}: no such file"));
             } else if !at.is_empty() {
                 let text = std::fs::read_to_string(&path).expect("a document");
-                let has = text.lines().any(|l| {
-                    l.starts_with('#') && anchor(l.trim_start_matches('#').trim()) == at
-                });
+                let has = text
+                    .lines()
+                    .any(|l| l.starts_with('#') && anchor(l.trim_start_matches('#').trim()) == at);
                 if !has {
                     broken.push(format!("{document}: {target}: no such heading"));
                 }
@@ -405,7 +406,10 @@ fn sources() -> Vec<PathBuf> {
             let name = path.file_name().expect("a name").to_string_lossy().into_owned();
             if path.is_dir() && !name.starts_with('.') && !name.starts_with("target") {
                 below(&path, found);
-            } else if ["rs", "proto", "toml", "py", "sh"].iter().any(|e| name.ends_with(&format!(".{e}"))) {
+            } else if ["rs", "proto", "toml", "py", "sh"]
+                .iter()
+                .any(|e| name.ends_with(&format!(".{e}")))
+            {
                 found.push(path);
             }
         }
@@ -451,5 +455,8 @@ fn tests_that_the_promises_name_are_there() {
         sources().iter().map(|p| std::fs::read_to_string(p).expect("a source file")).collect();
     let missing: Vec<&String> =
         names.iter().filter(|n| !all.iter().any(|t| t.contains(&format!("fn {n}(")))).collect();
-    assert!(missing.is_empty(), "docs/design/promises.md names tests that are not there: {missing:?}");
+    assert!(
+        missing.is_empty(),
+        "docs/design/promises.md names tests that are not there: {missing:?}"
+    );
 }

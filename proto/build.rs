@@ -3,12 +3,13 @@
 use prost::Message;
 use std::path::PathBuf;
 
+/// The two packages; what these import is compiled with them.
+const FILES: [&str; 2] =
+    ["slabcast/render/v1/render.proto", "slabcast/cluster/v1/cluster.proto"];
+
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let files = ["slabcast/v1/render.proto", "slabcast/v1/cluster.proto"];
-    for file in files {
-        println!("cargo::rerun-if-changed={file}");
-    }
-    let descriptors = protox::compile(files, ["."])?;
+    println!("cargo::rerun-if-changed=slabcast");
+    let descriptors = protox::compile(FILES, ["."])?;
     let out = PathBuf::from(std::env::var_os("OUT_DIR").ok_or("cargo sets OUT_DIR")?);
     std::fs::write(out.join("slabcast_descriptor.bin"), descriptors.encode_to_vec())?;
     // `Bytes` everywhere: a received brick or chunk is a part of the buffer it came in, not a

@@ -1,20 +1,24 @@
-//! What the Render service says about jobs, workers and frames, as values.
+//! Jobs, workers and frames as RenderService tells of them.
 //!
-//! Master and client share these; they are not in `common` because no pixel and no schedule
+//! Master and client share these types; they are not in `common` because no pixel and no schedule
 //! depends on them. Meanings are those of `render.proto`.
 
+use crate::convert::StatisticsPart;
 use bytes::Bytes;
 use slabcast_common::ids::WorkerId;
 use slabcast_common::image::PixelFormat;
 use slabcast_common::path::Orientation;
 use slabcast_common::volume::VolumeInfo;
+use std::time::Duration;
 
-/// What becomes of a job.
+/// State of a job.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum JobState {
-    /// Others come first.
+    /// Other jobs come first.
     Queued,
-    /// It would run, but no worker is there.
+    /// Its bricks are being cut from the volume.
+    Preparing,
+    /// It would run, but no worker is connected.
     WaitingForWorkers,
     /// Its frames are being rendered.
     Running,
@@ -22,12 +26,12 @@ pub enum JobState {
     Done,
     /// It can't be finished.
     Failed,
-    /// Somebody cancelled it.
+    /// It was cancelled.
     Cancelled,
 }
 
 impl JobState {
-    /// Whether nothing more will happen to it.
+    /// Returns whether the job stays in this state for ever.
     pub fn is_final(self) -> bool {
         matches!(self, JobState::Done | JobState::Failed | JobState::Cancelled)
     }
@@ -37,6 +41,7 @@ impl std::fmt::Display for JobState {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {
             JobState::Queued => "queued",
+            JobState::Preparing => "preparing",
             JobState::WaitingForWorkers => "waiting for workers",
             JobState::Running => "running",
             JobState::Done => "done",
@@ -46,7 +51,7 @@ impl std::fmt::Display for JobState {
     }
 }
 
-/// News of a job, between its frames.
+/// State of a job, sent between its frames.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct JobNotice {
     /// Its state.
@@ -55,22 +60,22 @@ pub struct JobNotice {
     pub frames_done: u64,
     /// Frames of the path.
     pub frames_total: u64,
-    /// Workers that are there.
-    pub workers: u32,
-    /// For people: why it waits or failed, and what to do. May be empty.
+    /// Render threads of the workers that are connected.
+    pub render_threads: u32,
+    /// For people: why the job waits or failed, and what to do. May be empty.
     pub message: String,
 }
 
 /// A job as the master knows it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Job {
-    /// Its name.
+    /// Id of the job, for all calls (`job-7`).
     pub job_id: String,
     /// The submitter's name for it.
     pub client_key: String,
     /// Its state.
     pub state: JobState,
-    /// Why it waits or failed, and what to do. May be empty.
+    /// For people: why the job waits or failed, and what to do. May be empty.
     pub message: String,
     /// Frames that are finished.
     pub frames_done: u64,
@@ -82,14 +87,14 @@ pub struct Job {
     pub format: PixelFormat,
     /// When it was submitted, in milliseconds since 1970 UTC.
     pub submitted_unix_ms: i64,
-    /// When it reached a final state, likewise; 0 before.
+    /// When it reached a final state, in milliseconds since 1970 UTC; 0 before.
     pub finished_unix_ms: i64,
 }
 
 /// The volume that a master serves.
 #[derive(Clone, Debug, PartialEq)]
 pub struct VolumeDescription {
-    /// What it is called.
+    /// Name of the volume: that of its file, without folders.
     pub name: String,
     /// The sample type in the file, for people.
     pub file_type: String,
@@ -97,28 +102,28 @@ pub struct VolumeDescription {
     pub anatomical: bool,
     /// Lattice, values and digest.
     pub info: VolumeInfo,
-    /// Up and front unless a path says otherwise.
+    /// Axes that are up and front unless a path says otherwise.
     pub orientation: Orientation,
-    /// `PIXELS_VERSION` of the master.
+    /// The master's `PIXELS_VERSION`.
     pub pixels_version: u32,
-    /// `PROTOCOL_VERSION` of the master.
+    /// The master's `PROTOCOL_VERSION`: the newest version of `slabcast.cluster.v1` it speaks.
     pub protocol_version: u32,
-    /// The master's clock, milliseconds since 1970; 0 where it does not say.
+    /// The master's clock, in milliseconds since 1970 UTC; 0 if it does not say.
     pub now_unix_ms: i64,
 }
 
 /// A worker as the master knows it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Worker {
-    /// Its number.
+    /// Id of the worker, never given to another.
     pub id: WorkerId,
-    /// Its name for people.
+    /// Name for people (host and process), which statistics use.
     pub name: String,
-    /// Where it called from; empty for one inside the master's process.
+    /// Address that it called from; empty for a worker within the master's process.
     pub address: String,
     /// Render threads.
     pub threads: u32,
-    /// Instruction set of its splat loops.
+    /// Instruction set of its renderer.
     pub simd: String,
     /// Bytes of bricks that it may hold.
     pub memory_budget_bytes: u64,
@@ -128,42 +133,42 @@ pub struct Worker {
     pub held_bricks: u64,
     /// Tasks that are lent to it now.
     pub tasks_lent: u32,
-    /// Tasks that it has finished since it came.
+    /// Tasks that it has finished since it joined.
     pub tasks_done: u64,
-    /// Milliseconds since the master last heard of it.
-    pub silent_ms: u64,
-    /// Milliseconds since it came.
-    pub here_ms: u64,
-    /// It is lent nothing for now: the others draw as many frames without it.
+    /// Time since the master last heard from it.
+    pub silent: Duration,
+    /// Time since it joined.
+    pub connected: Duration,
+    /// Whether it is lent nothing for now, since frames would not be finished sooner with it.
     pub in_reserve: bool,
 }
 
 /// A piece of a frame.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct PixelsChunk {
-    /// Which frame of the path.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FrameChunk {
+    /// Number of the frame in its job.
     pub frame: u64,
     /// Width and height in pixels, 1 to 8192 each.
     pub size: [u32; 2],
     /// Format of the pixels.
     pub format: PixelFormat,
-    /// Where `data` belongs in the frame's bytes.
+    /// Offset of `data` within the frame, in bytes.
     pub offset: u64,
     /// Pixels; `offset + data.len()` is not beyond the frame's end.
     pub data: Bytes,
-    /// Whether the frame is whole with this chunk.
+    /// Whether the frame is complete with this chunk.
     pub last: bool,
-    /// A piece of the frame's statistics.
-    pub stats_json: String,
-    /// A piece of the frame's trace.
+    /// A part of the frame's statistics.
+    pub statistics: Option<StatisticsPart>,
+    /// A piece of the frame's trace, in JSON.
     pub trace_json: String,
 }
 
 /// One message of a watch.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum FrameChunk {
+#[derive(Clone, Debug, PartialEq)]
+pub enum WatchMessage {
     /// A piece of a frame.
-    Pixels(PixelsChunk),
+    Chunk(FrameChunk),
     /// News of the job.
     Notice(JobNotice),
 }

@@ -1,22 +1,23 @@
-//! Why a stranger's message is refused.
+//! The error of a message that can't be read.
 
+use crate::status;
 use slabcast_common::quality::Refused;
 
-/// Why a stranger's message is refused. Each names the field as the `.proto` writes it.
+/// Why a stranger's message is refused. Every variant names the field as the `.proto` writes it.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum WireError {
-    /// A required field is not there, or a message is of a kind that this version can't know.
+    /// A required field is missing, or a message is of a kind that this version can't know.
     #[error("{field}: missing; it is required")]
     Missing {
-        /// Which.
+        /// Path of the field.
         field: String,
     },
     /// A field must have an exact length.
     #[error("{field}: has {have} entries; give exactly {need}")]
     Length {
-        /// Which.
+        /// Path of the field.
         field: String,
-        /// Its length (bytes, or numbers).
+        /// Its length (bytes, or entries).
         have: usize,
         /// The only one allowed.
         need: usize,
@@ -24,27 +25,27 @@ pub enum WireError {
     /// A field is longer than allowed.
     #[error("{field}: has {have} entries; give at most {most}")]
     TooLong {
-        /// Which.
+        /// Path of the field.
         field: String,
         /// Its length (bytes, or entries).
         have: usize,
         /// The largest allowed.
         most: usize,
     },
-    /// An enum has a number that this version does not know.
+    /// An enum has a value that this version does not know.
     #[error("{field}: {value} has no meaning in this version")]
     Unknown {
-        /// Which.
+        /// Path of the field.
         field: String,
-        /// The number.
+        /// Its number.
         value: i32,
     },
     /// A value can't be used.
     #[error("{field}: {problem}")]
     Value {
-        /// Which.
+        /// Path of the field.
         field: String,
-        /// What is wrong and what to do.
+        /// What is wrong, and what to do.
         problem: String,
     },
 }
@@ -70,7 +71,7 @@ impl WireError {
         WireError::Value { field: field.into(), problem: problem.into() }
     }
 
-    /// The field that is wrong, as the `.proto` writes it.
+    /// Returns the path of the wrong field within its message, as the `.proto` writes it.
     pub fn field(&self) -> &str {
         match self {
             WireError::Missing { field }
@@ -81,7 +82,13 @@ impl WireError {
         }
     }
 
-    /// The same, with the field as part of `outer`.
+    /// Returns what is wrong with the field, without its path.
+    pub fn problem(&self) -> String {
+        let text = self.to_string();
+        text[self.field().len()..].trim_start_matches(": ").to_owned()
+    }
+
+    /// Prefixes the path of the field with that of the message it is in.
     pub(crate) fn within(mut self, outer: &str) -> Self {
         let (WireError::Missing { field }
         | WireError::Length { field, .. }
@@ -100,7 +107,8 @@ impl From<Refused> for WireError {
 }
 
 impl From<WireError> for tonic::Status {
+    /// INVALID_ARGUMENT with BadRequest and ErrorInfo, as `render.proto` says.
     fn from(wrong: WireError) -> Self {
-        tonic::Status::invalid_argument(wrong.to_string())
+        status::invalid_field(wrong.field(), &wrong.problem())
     }
 }

@@ -1,22 +1,23 @@
 //! Planes of a tile, exact to the bit and without what is blank.
 //!
-//! How should a tile's A, colour and sums cross? As they stand they take 32 bytes a pixel, 2 MiB
-//! a full tile. A general compressor would find the blank pixels too, at some 20 us for 16 KiB
+//! How should a tile's opacity, colour and sums cross? Uncompressed they take 32 bytes a pixel,
+//! 2 MiB a full tile. A general compressor would find the blank pixels too, at some 20 us for 16 KiB
 //! (TRANSPORT.md section 6). Here the data is known: a pixel that no voxel touched is zero in
 //! all its words, and in many tiles that is most of them. One bit a pixel says so, at the cost
 //! of a copy: a 64x64 result takes 35 us to write and 10 us to read when every pixel is there
 //! (131 KB), 20 and 15 us with 3 in 8 (51 KB), 7 and 2 us when blank (15 bytes); release build, 2
-//! vCPU EPYC, a loop over `from_worker_to_wire` and `from_worker_from_wire`. "Zero" is of bits: -0.0 is a value like any other and crosses as such.
+//! vCPU EPYC, a loop over `from_worker_to_wire` and `from_worker_from_wire`. "Zero" is of bits:
+//! -0.0 is a value like any other and crosses as such.
 
-use super::WireError;
-use crate::v1;
+use super::wire;
+use crate::convert::WireError;
 use bytes::Bytes;
 
 /// Writes `n` pixels of `W` words.
-pub(super) fn to_wire<const W: usize>(n: usize, words: impl Fn(usize) -> [u32; W]) -> v1::Plane {
+pub(super) fn to_wire<const W: usize>(n: usize, words: impl Fn(usize) -> [u32; W]) -> wire::Plane {
     let blank = if n > 0 { words(0)[0] } else { 0 };
     if (0..n).all(|i| words(i) == [blank; W]) {
-        return v1::Plane { blank, ..v1::Plane::default() };
+        return wire::Plane { blank, ..wire::Plane::default() };
     }
     let mut mask = vec![0u8; n.div_ceil(8)];
     let mut there = 0;
@@ -37,16 +38,16 @@ pub(super) fn to_wire<const W: usize>(n: usize, words: impl Fn(usize) -> [u32; W
         }
     }
     let mask = if whole { Bytes::new() } else { mask.into() };
-    v1::Plane { blank: 0, mask, values: values.into() }
+    wire::Plane { blank: 0, mask, values: values.into() }
 }
 
 /// Reads `n` pixels (a number that was checked) of `W` words.
 pub(super) fn from_wire<const W: usize, T: Clone>(
-    plane: Option<v1::Plane>,
+    plane: wire::Plane,
     n: usize,
     pixel: impl Fn([u32; W]) -> T,
 ) -> Result<Vec<T>, WireError> {
-    let v1::Plane { blank, mask, values } = plane.ok_or_else(|| WireError::missing("values"))?;
+    let wire::Plane { blank, mask, values } = plane;
     let blank = [blank; W];
     let values_of = |bytes: &[u8]| {
         pixel(std::array::from_fn(|w| {
@@ -87,14 +88,14 @@ mod tests {
     fn there_and_back<const W: usize>(pixels: &[[u32; W]]) -> usize {
         let plane = to_wire(pixels.len(), |i| pixels[i]);
         let bytes = plane.encode_to_vec();
-        let back = v1::Plane::decode(&bytes[..]).unwrap();
-        let back = from_wire(Some(back), pixels.len(), |p: [u32; W]| p).unwrap();
+        let back = wire::Plane::decode(&bytes[..]).unwrap();
+        let back = from_wire(back, pixels.len(), |p: [u32; W]| p).unwrap();
         assert_eq!(back, pixels);
         bytes.len()
     }
 
     #[test]
-    fn every_length_and_filling_comes_back() {
+    fn plane_of_every_length_and_filling_comes_back() {
         for n in 1..70usize {
             for filling in 0..=4usize {
                 let pixels: Vec<[u32; 3]> = (0..n)
@@ -106,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn blank_planes_cost_nothing_and_sparse_ones_little() {
+    fn blank_plane_takes_no_bytes_and_a_sparse_one_few() {
         assert!(there_and_back(&[[0u32; 4]; 4096]) == 0);
         assert!(there_and_back(&[[0.75f32.to_bits(); 1]; 4096]) == 5);
         assert!(there_and_back(&[[(-0.0f32).to_bits(); 1]; 4096]) == 5);
@@ -120,8 +121,8 @@ mod tests {
     #[test]
     fn planes_of_another_size_are_refused() {
         let read = |mask: &'static [u8], values: &'static [u8]| {
-            let plane = v1::Plane { blank: 0, mask: mask.into(), values: values.into() };
-            from_wire(Some(plane), 10, |[w]: [u32; 1]| w).map_err(|e| e.field().to_owned())
+            let plane = wire::Plane { blank: 0, mask: mask.into(), values: values.into() };
+            from_wire(plane, 10, |[w]: [u32; 1]| w).map_err(|e| e.field().to_owned())
         };
         assert!(read(&[], &[0; 40]).is_ok());
         assert_eq!(read(&[], &[0; 36]), Err("values".into()));

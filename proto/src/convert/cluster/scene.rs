@@ -1,0 +1,210 @@
+//! Scenes, frames and views: what a worker draws from.
+
+use super::shared::{
+    background_from_wire, background_to_wire, format_from_wire, format_to_wire, kind_from_wire,
+    kind_to_wire, quality_from_wire, quality_to_wire, transfer_from_wire, transfer_to_wire,
+};
+use super::{digest_from_wire, required, wire};
+use crate::convert::WireError;
+use crate::convert::numbers::{
+    check_lattice, check_summary, finite, matrix_from_wire, positive, size_from_wire,
+    triple_from_wire, vector_from_wire,
+};
+use bytes::Bytes;
+use slabcast_common::brick::BrickSetKey;
+use slabcast_common::ids::{FrameId, SceneId};
+use slabcast_common::kernel::Lean;
+use slabcast_common::leaves::Finish;
+use slabcast_common::message::{SceneSpec, ToWorker};
+use slabcast_common::quality::Sums;
+use slabcast_common::view::{Projection, View};
+use slabcast_common::volume::{Lattice, ValueMap, ValueSummary, VolumeInfo};
+
+fn volume_to_wire(info: &VolumeInfo) -> wire::Volume {
+    let (l, s) = (&info.lattice, &info.summary);
+    wire::Volume {
+        digest: Bytes::copy_from_slice(&info.digest.0),
+        dims: l.dims.to_vec(),
+        steps: l.world_from_index().to_cols_array().to_vec(),
+        origin: l.origin.to_array().to_vec(),
+        kind: kind_to_wire(s.kind),
+        value_scale: Some(s.map.scale),
+        value_offset: Some(s.map.offset),
+        min_code: Some(s.min_code),
+        max_code: Some(s.max_code),
+        histogram: s.histogram.clone(),
+        nan_samples: s.nan,
+        infinite_samples: s.infinite,
+    }
+}
+
+fn volume_from_wire(info: wire::Volume) -> Result<VolumeInfo, WireError> {
+    let Ok(dims) = <[u32; 3]>::try_from(&info.dims[..]) else {
+        return Err(WireError::length("dims", info.dims.len(), 3));
+    };
+    let steps = matrix_from_wire("steps", &info.steps)?;
+    let lattice = Lattice {
+        dims,
+        steps: [steps.x_axis, steps.y_axis, steps.z_axis],
+        origin: vector_from_wire("origin", &info.origin)?,
+    };
+    check_lattice(&lattice, "dims", "dims, steps, origin")?;
+    let summary = ValueSummary {
+        kind: kind_from_wire("kind", info.kind)?,
+        map: ValueMap {
+            scale: finite("value_scale", info.value_scale.unwrap_or(1.0))?,
+            offset: finite("value_offset", info.value_offset.unwrap_or(0.0))?,
+        },
+        min_code: finite("min_code", info.min_code.unwrap_or(0.0))?,
+        max_code: finite("max_code", info.max_code.unwrap_or(0.0))?,
+        histogram: info.histogram,
+        nan: info.nan_samples,
+        infinite: info.infinite_samples,
+    };
+    check_summary(&summary)?;
+    Ok(VolumeInfo { digest: digest_from_wire("digest", &info.digest)?, lattice, summary })
+}
+
+/// Writes a scene.
+pub fn scene_to_wire(scene: &SceneSpec) -> wire::Scene {
+    wire::Scene {
+        scene: scene.id.0,
+        volume: Some(volume_to_wire(&scene.volume)),
+        transfer: Some(transfer_to_wire(&scene.transfer)),
+        quality: Some(quality_to_wire(&scene.quality)),
+        set: Bytes::copy_from_slice(&scene.bricks.0.0),
+    }
+}
+
+/// Reads a scene.
+///
+/// # Errors
+/// [`WireError`] names the field that is wrong.
+pub fn scene_from_wire(scene: wire::Scene) -> Result<SceneSpec, WireError> {
+    let volume =
+        volume_from_wire(required("volume", scene.volume)?).map_err(|e| e.within("volume"))?;
+    let transfer = transfer_from_wire(required("transfer", scene.transfer)?)
+        .map_err(|e| e.within("transfer"))?;
+    let quality =
+        quality_from_wire(required("quality", scene.quality)?).map_err(|e| e.within("quality"))?;
+    if quality.sums == Sums::Auto {
+        return Err(WireError::value("quality.sums", "is undecided; a scene says which sums"));
+    }
+    let bricks = BrickSetKey(digest_from_wire("set", &scene.set)?);
+    Ok(SceneSpec { id: SceneId(scene.scene), volume, transfer, quality, bricks })
+}
+
+/// Writes a frame; results are `uncompressed` or not.
+pub(super) fn frame_to_wire(
+    (frame, scene): (FrameId, SceneId),
+    view: &View,
+    finish: Option<&Finish>,
+    uncompressed: bool,
+) -> wire::Frame {
+    let compression =
+        if uncompressed { wire::Compression::None } else { wire::Compression::Unspecified };
+    wire::Frame {
+        frame: frame.0,
+        scene: scene.0,
+        view: Some(view_to_wire(view)),
+        finish: finish.map(|finish| wire::Finish {
+            format: format_to_wire(finish.format),
+            background: Some(background_to_wire(finish.background)),
+        }),
+        compression: compression as i32,
+    }
+}
+
+pub(super) fn frame_from_wire(frame: wire::Frame) -> Result<ToWorker, WireError> {
+    let finish = |finish: wire::Finish| {
+        Ok::<_, WireError>(Finish {
+            format: format_from_wire("format", finish.format)?,
+            background: background_from_wire(required("background", finish.background)?)?,
+        })
+    };
+    Ok(ToWorker::Frame {
+        frame: FrameId(frame.frame),
+        scene: SceneId(frame.scene),
+        view: view_from_wire(required("view", frame.view)?).map_err(|e| e.within("view"))?,
+        finish: frame.finish.map(|f| finish(f).map_err(|e| e.within("finish"))).transpose()?,
+        // One that this version does not know is a wish that it can't fulfil: LZ4.
+        plain: frame.compression == wire::Compression::None as i32,
+    })
+}
+
+/// Writes a view.
+pub fn view_to_wire(view: &View) -> wire::View {
+    wire::View {
+        width: view.size[0],
+        height: view.size[1],
+        eye_from_index: view.eye_from_index.to_cols_array().to_vec(),
+        eye_origin: view.eye_origin.to_array().to_vec(),
+        eye_from_world: view.eye_from_world.to_cols_array().to_vec(),
+        projection: Some(match view.projection {
+            Projection::Ortho { scale } => wire::view::Projection::Ortho(wire::Ortho { scale }),
+            Projection::Persp { focal, distance } => {
+                wire::view::Projection::Persp(wire::Persp { focal, distance })
+            }
+        }),
+        thickness: view.thickness,
+        kernel_std: view.kernel_std.to_array().to_vec(),
+        kernel_radius: view.kernel_radius.to_array().to_vec(),
+        cell: view.cell,
+        kernel_lean: view.kernel_lean.to_array().to_vec(),
+    }
+}
+
+/// Checks that a view's depths fit its scene's volume. A view alone can't tell; whoever knows the
+/// lattice MUST call this before the view is drawn (`View::new` has the same rule for cameras).
+///
+/// # Errors
+/// [`WireError`] if the eye is so far away that sheet numbers would not fit 32 bits.
+pub fn check_view(lattice: &Lattice, view: &View) -> Result<(), WireError> {
+    let m = &view.eye_from_index;
+    let reach = [m.x_axis, m.y_axis, m.z_axis]
+        .iter()
+        .zip(lattice.dims)
+        .fold(view.eye_origin.abs(), |sum, (step, n)| sum + step.abs() * f64::from(n));
+    // Boxes are grown by 1e-9 of their farthest coordinate (`View::project`); here by twice that.
+    let far = reach.z + 2e-9 * (1.0 + reach.max_element()) + view.kernel_radius.z + 1.0;
+    let depth = far / view.thickness * f64::from(view.depth_phases());
+    // Twice what `View::new` allows, since its box is tighter; phases still fit i32.
+    if depth < (1u32 << 31) as f64 - 1e6 {
+        Ok(())
+    } else {
+        Err(WireError::value("frame.view.eye_origin", "is too far from the volume for its sheets"))
+    }
+}
+
+/// Reads a view.
+///
+/// # Errors
+/// [`WireError`] names the field that is wrong.
+pub fn view_from_wire(view: wire::View) -> Result<View, WireError> {
+    let projection = match required("projection", view.projection)? {
+        wire::view::Projection::Ortho(o) => {
+            Projection::Ortho { scale: positive("ortho.scale", o.scale)? }
+        }
+        wire::view::Projection::Persp(p) => Projection::Persp {
+            focal: positive("persp.focal", p.focal)?,
+            distance: positive("persp.distance", p.distance)?,
+        },
+    };
+    let positive_vector = |field: &str, numbers: &[f64]| {
+        let v = vector_from_wire(field, numbers)?;
+        v.to_array().into_iter().try_for_each(|x| positive(field, x).map(drop))?;
+        Ok::<_, WireError>(v)
+    };
+    Ok(View {
+        size: size_from_wire(view.width, view.height)?,
+        eye_from_index: matrix_from_wire("eye_from_index", &view.eye_from_index)?,
+        eye_origin: vector_from_wire("eye_origin", &view.eye_origin)?,
+        eye_from_world: matrix_from_wire("eye_from_world", &view.eye_from_world)?,
+        projection,
+        thickness: positive("thickness", view.thickness)?,
+        kernel_std: positive_vector("kernel_std", &view.kernel_std)?,
+        kernel_radius: positive_vector("kernel_radius", &view.kernel_radius)?,
+        kernel_lean: Lean::from_array(triple_from_wire("kernel_lean", &view.kernel_lean)?),
+        cell: positive("cell", view.cell)?,
+    })
+}

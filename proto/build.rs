@@ -4,8 +4,7 @@ use prost::Message;
 use std::path::PathBuf;
 
 /// The two packages; what these import is compiled with them.
-const FILES: [&str; 2] =
-    ["slabcast/render/v1/render.proto", "slabcast/cluster/v1/cluster.proto"];
+const FILES: [&str; 2] = ["slabcast/render/v1/render.proto", "slabcast/cluster/v1/cluster.proto"];
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     println!("cargo::rerun-if-changed=slabcast");

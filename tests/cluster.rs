@@ -329,7 +329,9 @@ async fn a_master_that_comes_back_gets_its_workers_back() {
 #[tokio::test]
 async fn a_worker_of_another_protocol_is_refused_by_name() {
     use slabcast_common::message::{Hello, ToMaster, ToWorker};
-    use slabcast_proto::{convert, v1::cluster_client::ClusterClient};
+    use slabcast_proto::{
+        cluster_v1::cluster_service_client::ClusterServiceClient as ClusterClient, convert,
+    };
     let (_master, address) = master();
     let hello = |protocol_version: u32, pixels_version: u32, hash: &str| Hello {
         protocol_version,
@@ -373,7 +375,9 @@ async fn a_worker_of_another_protocol_is_refused_by_name() {
 async fn a_worker_of_the_masters_machine_is_told_to_send_results_as_they_are() {
     use slabcast_common::message::{Hello, ToMaster, ToWorker};
     use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
-    use slabcast_proto::{convert, v1::cluster_client::ClusterClient};
+    use slabcast_proto::{
+        cluster_v1::cluster_service_client::ClusterServiceClient as ClusterClient, convert,
+    };
     let named = Path::new("/proc/sys/kernel/random/boot_id").exists();
     for (machine, here) in [("", true), ("another", !named)] {
         let ((_master, address), dir) = (master(), tempfile::tempdir().unwrap());
@@ -421,7 +425,7 @@ async fn health_and_reflection_answer_and_round_trips_are_quick() {
         .await
         .unwrap();
     let mut health = HealthClient::new(channel.clone());
-    for service in ["slabcast.v1.Render", "slabcast.v1.Cluster"] {
+    for service in ["slabcast.render.v1.RenderService", "slabcast.cluster.v1.ClusterService"] {
         let request = HealthCheckRequest { service: service.into() };
         let status = health.check(request).await.unwrap().into_inner().status;
         assert_eq!(status, 1, "{service} serves");
@@ -442,7 +446,10 @@ async fn health_and_reflection_answer_and_round_trips_are_quick() {
     let answer = answers.message().await.unwrap().unwrap().message_response;
     let Some(MessageResponse::ListServicesResponse(list)) = answer else { panic!("a list") };
     let names: Vec<_> = list.service.iter().map(|s| s.name.as_str()).collect();
-    assert!(names.contains(&"slabcast.v1.Render") && names.contains(&"slabcast.v1.Cluster"));
+    assert!(
+        names.contains(&"slabcast.render.v1.RenderService")
+            && names.contains(&"slabcast.cluster.v1.ClusterService")
+    );
 
     // Without TCP_NODELAY a round trip takes 40 ms; the best of many is far below.
     let client = Client::connect(&address).await.unwrap();

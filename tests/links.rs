@@ -18,8 +18,8 @@ use slabcast_common::volume::Volume;
 use slabcast_common::wanted::Wanted;
 use slabcast_master::jobs::{FinishedFrame, JobState, WatchItem};
 use slabcast_master::{Handle, Master, MasterConfig};
-use slabcast_proto::convert::{self, Bricks, Down};
-use slabcast_proto::v1;
+use slabcast_proto::cluster_v1;
+use slabcast_proto::convert::{self, BrickBatches, Bricks, Down};
 use slabcast_render::Simd;
 use slabcast_render::oracle::serial;
 use slabcast_render::{Frame, Scene};
@@ -198,7 +198,7 @@ fn through_codec(handle: &Handle) -> Link {
                 Down::Bricks(_) => panic!("only bricks go on the other stream"),
             };
             for wire in wires {
-                let wire = v1::ToWorker::decode(&wire.encode_to_vec()[..]).unwrap();
+                let wire = cluster_v1::ControlResponse::decode(&wire.encode_to_vec()[..]).unwrap();
                 let (message, _) = convert::to_worker_from_wire(wire).expect("our own message");
                 if control_tx.send(message).is_err() {
                     return;
@@ -215,7 +215,7 @@ fn through_codec(handle: &Handle) -> Link {
                         b.encode(&mut bytes);
                         bytes.into()
                     });
-                    convert::brick_batches_to_wire(&batch.set, encoded)
+                    BrickBatches::new(&batch.set, encoded).collect()
                 }
                 Bricks::Message(message @ ToWorker::DropBricks { .. }) => {
                     match convert::to_worker_to_wire(&message, 7) {
@@ -226,7 +226,7 @@ fn through_codec(handle: &Handle) -> Link {
                 Bricks::Message(m) => panic!("{m:?} among bricks"),
             };
             for wire in wires {
-                let wire = v1::BricksDown::decode(&wire.encode_to_vec()[..]).unwrap();
+                let wire = cluster_v1::BricksResponse::decode(&wire.encode_to_vec()[..]).unwrap();
                 let bricks = convert::bricks_from_wire(wire).expect("our own message");
                 if to_bricks.send(bricks).await.is_err() {
                     return;
@@ -238,7 +238,7 @@ fn through_codec(handle: &Handle) -> Link {
     tokio::spawn(async move {
         while let Some(message) = reply_rx.recv().await {
             let wire = convert::from_worker_to_wire(&message).encode_to_vec();
-            let wire = v1::FromWorker::decode(&wire[..]).unwrap();
+            let wire = cluster_v1::ControlRequest::decode(&wire[..]).unwrap();
             let message = convert::from_worker_from_wire(wire).expect("our own message");
             if end.replies.send(message).await.is_err() {
                 return;

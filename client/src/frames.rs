@@ -4,8 +4,9 @@ use crate::error::one_line;
 use crate::{ANSWER, Client, ClientError, JobNotice, JobState};
 use slabcast_common::image::PixelFormat;
 use slabcast_common::stats::FrameStats;
-use slabcast_proto::model::{FrameChunk, PixelsChunk};
-use slabcast_proto::{convert, v1};
+use slabcast_proto::convert::{self, StatisticsParts};
+use slabcast_proto::model::{FrameChunk, WatchMessage};
+use slabcast_proto::render_v1 as wire;
 use std::time::Duration;
 use tokio::time::Instant;
 use tonic::Streaming;
@@ -26,9 +27,8 @@ const GOOD: Duration = Duration::from_secs(10);
 /// floats has 1 GiB; the rest of it is made room for as it comes.
 const ON_TRUST: usize = 64 << 20;
 
-/// Longest statistics or trace of one frame. 8192x8192 pixels in tiles of 16 and three slabs
-/// have 80 MB of statistics.
-const MAX_TEXT: usize = 256 << 20;
+/// Longest trace of one frame, in bytes.
+const MAX_TRACE: usize = 256 << 20;
 
 /// What comes of a job.
 #[derive(Clone, Debug, PartialEq)]
@@ -52,7 +52,7 @@ pub struct ReceivedFrame {
     pub bytes: Vec<u8>,
     /// Its statistics.
     pub stats: FrameStats,
-    /// Its statistics as the master wrote them, with fields that this version does not know.
+    /// Its statistics as one line of JSON, version 1 (docs: statistics).
     pub stats_json: String,
     /// Spans for a trace, if the request wanted them.
     pub trace_json: Option<String>,
@@ -78,7 +78,7 @@ pub struct FrameStream {
 
 #[derive(Debug)]
 struct Open {
-    chunks: Streaming<v1::FrameChunk>,
+    chunks: Streaming<wire::WatchFramesResponse>,
     since: Instant,
 }
 
@@ -171,12 +171,12 @@ impl FrameStream {
             }
             Err(status) => return Err(ClientError::of_status(self.client.address(), &status)),
         };
-        match convert::chunk_from_wire(chunk).map_err(|e| self.client.nonsense(&e))? {
-            FrameChunk::Notice(notice) => {
+        match convert::watch_from_wire(chunk).map_err(|e| self.client.nonsense(&e))? {
+            WatchMessage::Notice(notice) => {
                 self.latest = Some(notice.clone());
                 Ok(Some(Update::Notice(notice)))
             }
-            FrameChunk::Pixels(chunk) => {
+            WatchMessage::Chunk(chunk) => {
                 let frame = self.take(chunk).map_err(|problem| self.client.nonsense(&problem))?;
                 Ok(frame.map(|f| Update::Frame(Box::new(f))))
             }
@@ -195,7 +195,7 @@ impl FrameStream {
     /// Watches from the first frame that is not whole.
     async fn reopen(&mut self) -> Result<(), ClientError> {
         self.partial = None;
-        let request = v1::WatchRequest { job_id: self.job.clone(), from_frame: self.next };
+        let request = wire::WatchFramesRequest { job_id: self.job.clone(), from_frame: self.next };
         let mut render = self.client.render.clone();
         // Not the call's own deadline: that would end the stream, too.
         let stream = match tokio::time::timeout(ANSWER, render.watch_frames(request)).await {
@@ -244,7 +244,7 @@ impl FrameStream {
     }
 
     /// Takes in a chunk, which may complete the frame.
-    fn take(&mut self, chunk: PixelsChunk) -> Result<Option<ReceivedFrame>, String> {
+    fn take(&mut self, chunk: FrameChunk) -> Result<Option<ReceivedFrame>, String> {
         if chunk.frame != self.next {
             return Err(format!("frame {} came instead of {}", chunk.frame, self.next));
         }
@@ -268,24 +268,24 @@ struct Partial {
     format: PixelFormat,
     whole: usize,
     bytes: Vec<u8>,
-    stats_json: String,
+    statistics: StatisticsParts,
     trace_json: String,
 }
 
 impl Partial {
-    fn new(first: &PixelsChunk) -> Self {
+    fn new(first: &FrameChunk) -> Self {
         let whole = first.size[0] as usize * first.size[1] as usize * first.format.bytes();
         Partial {
             size: first.size,
             format: first.format,
             whole,
             bytes: Vec::with_capacity(whole.min(ON_TRUST)),
-            stats_json: String::new(),
+            statistics: StatisticsParts::default(),
             trace_json: String::new(),
         }
     }
 
-    fn take(&mut self, chunk: PixelsChunk) -> Result<(), String> {
+    fn take(&mut self, chunk: FrameChunk) -> Result<(), String> {
         if (chunk.size, chunk.format) != (self.size, self.format) {
             return Err(format!("frame {} changes its size or format", chunk.frame));
         }
@@ -298,14 +298,14 @@ impl Partial {
             ));
         }
         self.bytes.extend_from_slice(&chunk.data);
-        for (text, piece) in
-            [(&mut self.stats_json, &chunk.stats_json), (&mut self.trace_json, &chunk.trace_json)]
-        {
-            if text.len() + piece.len() > MAX_TEXT {
-                return Err(format!("frame {} has too long statistics", chunk.frame));
-            }
-            text.push_str(piece);
+        if let Some(part) = chunk.statistics {
+            let added = self.statistics.add(part);
+            added.map_err(|e| format!("frame {}: {e}", chunk.frame))?;
         }
+        if self.trace_json.len() + chunk.trace_json.len() > MAX_TRACE {
+            return Err(format!("frame {} has too long a trace", chunk.frame));
+        }
+        self.trace_json.push_str(&chunk.trace_json);
         Ok(())
     }
 
@@ -317,15 +317,14 @@ impl Partial {
                 self.whole
             ));
         }
-        let stats = serde_json::from_str(&self.stats_json)
-            .map_err(|e| format!("statistics of frame {number}: {e}"))?;
+        let stats = self.statistics.finish().map_err(|e| format!("frame {number}: {e}"))?;
         Ok(ReceivedFrame {
             number,
             size: self.size,
             format: self.format,
             bytes: self.bytes,
+            stats_json: serde_json::to_string(&stats).map_err(|e| e.to_string())?,
             stats,
-            stats_json: self.stats_json,
             trace_json: Some(self.trace_json).filter(|t| !t.is_empty()),
         })
     }

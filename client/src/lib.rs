@@ -32,8 +32,8 @@ pub use slabcast_proto::model::{Job, JobNotice, JobState, VolumeDescription, Wor
 
 use prost::Message;
 use slabcast_common::message::PathRequest;
-use slabcast_proto::v1::render_client::RenderClient;
-use slabcast_proto::{MAX_RENDER_MESSAGE, convert, v1};
+use slabcast_proto::render_v1::{self as wire, render_service_client::RenderServiceClient};
+use slabcast_proto::{MAX_RENDER_MESSAGE, convert};
 use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
@@ -48,13 +48,16 @@ const CONNECT: Duration = Duration::from_secs(5);
 /// being read or a machine that swaps takes seconds.
 pub(crate) const ANSWER: Duration = Duration::from_secs(30);
 
+/// Jobs or workers of a page: the most that a master takes.
+const MAX_PAGE: usize = 1000;
+
 /// Wait before a call is made a second time.
 const AGAIN: Duration = Duration::from_millis(100);
 
 /// A master, as its clients see it. Clones share one connection, which comes back by itself.
 #[derive(Clone, Debug)]
 pub struct Client {
-    render: RenderClient<Channel>,
+    render: RenderServiceClient<Channel>,
     address: Arc<str>,
 }
 
@@ -86,7 +89,7 @@ impl Client {
             Ok(channel) => channel.map_err(|e| refused(&e))?,
             Err(late) => return Err(refused(&late)),
         };
-        let render = RenderClient::new(channel)
+        let render = RenderServiceClient::new(channel)
             .max_decoding_message_size(MAX_RENDER_MESSAGE)
             .max_encoding_message_size(MAX_RENDER_MESSAGE);
         Ok(Client { render, address: address.into() })
@@ -100,7 +103,7 @@ impl Client {
     /// Submits a path and gives the job's name. Calling again with the same `client_key` and
     /// the same request gives the same job.
     pub async fn submit(&self, request: &PathRequest) -> Result<String, ClientError> {
-        let request = convert::path_request_to_wire(request);
+        let request = convert::submit_to_wire(request);
         let bytes = request.encoded_len();
         if bytes > MAX_RENDER_MESSAGE {
             return Err(ClientError::TooLong { bytes, most: MAX_RENDER_MESSAGE });
@@ -135,41 +138,83 @@ impl Client {
 
     /// One job.
     pub async fn job(&self, job: &str) -> Result<Job, ClientError> {
-        let request = v1::GetJobRequest { job_id: job.to_owned() };
-        let job = self.call(async |mut r, request| r.get_job(request).await, request).await?;
-        convert::job_from_wire(job).map_err(|e| self.nonsense(&e))
+        let request = wire::GetJobRequest { job_id: job.to_owned() };
+        let response = self.call(async |mut r, request| r.get_job(request).await, request).await?;
+        self.read_job(response.job)
     }
 
-    /// The master's jobs, newest first, at most `limit` (1 to 1000).
-    pub async fn jobs(&self, limit: u32) -> Result<Vec<Job>, ClientError> {
-        let request = v1::ListJobsRequest { limit };
-        let reply = self.call(async |mut r, request| r.list_jobs(request).await, request).await?;
-        let jobs = reply.jobs.into_iter().map(convert::job_from_wire);
-        jobs.collect::<Result<_, _>>().map_err(|e| self.nonsense(&e))
+    /// Returns the master's jobs, newest first, at most `limit`.
+    ///
+    /// # Errors
+    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Nonsense`] if it does not
+    /// talk like one.
+    pub async fn jobs(&self, limit: usize) -> Result<Vec<Job>, ClientError> {
+        let mut jobs = Vec::new();
+        let mut page_token = String::new();
+        while jobs.len() < limit {
+            let page_size = (limit - jobs.len()).min(MAX_PAGE) as u32;
+            let request = wire::ListJobsRequest { page_size, page_token };
+            let response =
+                self.call(async |mut r, request| r.list_jobs(request).await, request).await?;
+            let page = response.jobs.into_iter().map(convert::job_from_wire);
+            let page = page.collect::<Result<Vec<_>, _>>().map_err(|e| self.nonsense(&e))?;
+            page_token = response.next_page_token;
+            if page.is_empty() && !page_token.is_empty() {
+                return Err(self.nonsense("a page of jobs is empty and not the last"));
+            }
+            jobs.extend(page);
+            if page_token.is_empty() {
+                break;
+            }
+        }
+        jobs.truncate(limit);
+        Ok(jobs)
     }
 
     /// Cancels a job and gives what became of it: one that was done before stays done.
     pub async fn cancel(&self, job: &str) -> Result<Job, ClientError> {
-        let request = v1::CancelJobRequest { job_id: job.to_owned() };
-        let job = self.call(async |mut r, request| r.cancel_job(request).await, request).await?;
-        convert::job_from_wire(job).map_err(|e| self.nonsense(&e))
+        let request = wire::CancelJobRequest { job_id: job.to_owned() };
+        let response =
+            self.call(async |mut r, request| r.cancel_job(request).await, request).await?;
+        self.read_job(response.job)
     }
 
     /// The volume that the master serves.
     pub async fn volume(&self) -> Result<VolumeDescription, ClientError> {
-        let request = v1::DescribeVolumeRequest {};
+        let request = wire::DescribeVolumeRequest {};
         let volume =
             self.call(async |mut r, request| r.describe_volume(request).await, request).await?;
         convert::volume_from_wire(volume).map_err(|e| self.nonsense(&e))
     }
 
-    /// The master's workers, in the order in which they came.
+    /// Returns the master's workers, in the order in which they joined.
+    ///
+    /// # Errors
+    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Nonsense`] if it does not
+    /// talk like one.
     pub async fn workers(&self) -> Result<Vec<Worker>, ClientError> {
-        let request = v1::ListWorkersRequest {};
-        let reply =
-            self.call(async |mut r, request| r.list_workers(request).await, request).await?;
-        let workers = reply.workers.into_iter().map(convert::worker_from_wire);
-        workers.collect::<Result<_, _>>().map_err(|e| self.nonsense(&e))
+        let mut workers = Vec::new();
+        let mut page_token = String::new();
+        loop {
+            let request = wire::ListWorkersRequest { page_size: MAX_PAGE as u32, page_token };
+            let response =
+                self.call(async |mut r, request| r.list_workers(request).await, request).await?;
+            let page = response.workers.into_iter().map(convert::worker_from_wire);
+            let page = page.collect::<Result<Vec<_>, _>>().map_err(|e| self.nonsense(&e))?;
+            page_token = response.next_page_token;
+            if page.is_empty() && !page_token.is_empty() {
+                return Err(self.nonsense("a page of workers is empty and not the last"));
+            }
+            workers.extend(page);
+            if page_token.is_empty() {
+                return Ok(workers);
+            }
+        }
+    }
+
+    fn read_job(&self, job: Option<wire::Job>) -> Result<Job, ClientError> {
+        let job = job.ok_or_else(|| self.nonsense("job: missing; it is required"))?;
+        convert::job_from_wire(job).map_err(|e| self.nonsense(&e))
     }
 
     /// Makes a call, and once more when the connection turns out to be broken: a master that was
@@ -177,7 +222,7 @@ impl Client {
     /// (`render.proto`).
     async fn call<Q: Clone, R, F>(
         &self,
-        call: impl Fn(RenderClient<Channel>, Request<Q>) -> F,
+        call: impl Fn(RenderServiceClient<Channel>, Request<Q>) -> F,
         request: Q,
     ) -> Result<R, ClientError>
     where

@@ -8,8 +8,8 @@ use slabcast_common::path::{Turntable, ViewPath};
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::stats::{FrameMs, FrameStats};
 use slabcast_proto::model::{Job, JobNotice};
-use slabcast_proto::v1::render_server::{Render, RenderServer};
-use slabcast_proto::{convert, v1};
+use slabcast_proto::render_v1::render_service_server::{RenderService, RenderServiceServer};
+use slabcast_proto::{convert, render_v1 as wire};
 use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::pin::Pin;
@@ -21,7 +21,7 @@ use tokio_stream::wrappers::TcpListenerStream;
 use tokio_stream::{Stream, StreamExt};
 use tonic::{Request, Response, Status};
 
-type Chunks = Vec<Result<v1::FrameChunk, Status>>;
+type Chunks = Vec<Result<wire::WatchFramesResponse, Status>>;
 
 /// A master that answers by a script: what each watch, by its first frame, sends, and whether it
 /// ends then or stays silent.
@@ -33,25 +33,26 @@ struct Script {
 }
 
 #[tonic::async_trait]
-impl Render for Script {
-    type WatchFramesStream = Pin<Box<dyn Stream<Item = Result<v1::FrameChunk, Status>> + Send>>;
+impl RenderService for Script {
+    type WatchFramesStream =
+        Pin<Box<dyn Stream<Item = Result<wire::WatchFramesResponse, Status>> + Send>>;
 
     async fn submit_path(
         &self,
-        request: Request<v1::PathRequest>,
-    ) -> Result<Response<v1::SubmitReply>, Status> {
-        let request = convert::path_request_from_wire(request.into_inner())?;
+        request: Request<wire::SubmitPathRequest>,
+    ) -> Result<Response<wire::SubmitPathResponse>, Status> {
+        let request = convert::submit_from_wire(request.into_inner())?;
         let mut keys = self.keys.lock().unwrap();
         let number = keys.iter().position(|k| *k == request.client_key).unwrap_or_else(|| {
             keys.push(request.client_key);
             keys.len() - 1
         });
-        Ok(Response::new(v1::SubmitReply { job_id: format!("job-{number}") }))
+        Ok(Response::new(wire::SubmitPathResponse { job_id: format!("job-{number}") }))
     }
 
     async fn watch_frames(
         &self,
-        request: Request<v1::WatchRequest>,
+        request: Request<wire::WatchFramesRequest>,
     ) -> Result<Response<Self::WatchFramesStream>, Status> {
         let from = request.into_inner().from_frame;
         self.watched_from.lock().unwrap().push(from);
@@ -65,37 +66,48 @@ impl Render for Script {
         }))
     }
 
-    async fn get_job(&self, r: Request<v1::GetJobRequest>) -> Result<Response<v1::Job>, Status> {
-        Ok(Response::new(convert::job_to_wire(&job(&r.into_inner().job_id, JobState::Running))))
+    async fn get_job(
+        &self,
+        r: Request<wire::GetJobRequest>,
+    ) -> Result<Response<wire::GetJobResponse>, Status> {
+        let job = convert::job_to_wire(&job(&r.into_inner().job_id, JobState::Running));
+        Ok(Response::new(wire::GetJobResponse { job: Some(job) }))
     }
 
     async fn list_jobs(
         &self,
-        r: Request<v1::ListJobsRequest>,
-    ) -> Result<Response<v1::ListJobsReply>, Status> {
-        let jobs = (0..r.into_inner().limit).map(|i| job(&format!("job-{i}"), JobState::Done));
+        r: Request<wire::ListJobsRequest>,
+    ) -> Result<Response<wire::ListJobsResponse>, Status> {
+        // 2500 jobs, in pages of at most 1000.
+        let r = r.into_inner();
+        let page = convert::page_from_wire(r.page_size, &r.page_token)?;
+        let end = page.after.unwrap_or(2500);
+        let begin = end.saturating_sub(page.size as u64);
+        let jobs = (begin..end).rev().map(|i| job(&format!("job-{i}"), JobState::Done));
         let jobs = jobs.map(|j| convert::job_to_wire(&j)).collect();
-        Ok(Response::new(v1::ListJobsReply { jobs }))
+        let next_page_token = if begin > 0 { convert::page_token(begin) } else { String::new() };
+        Ok(Response::new(wire::ListJobsResponse { jobs, next_page_token }))
     }
 
     async fn cancel_job(
         &self,
-        r: Request<v1::CancelJobRequest>,
-    ) -> Result<Response<v1::Job>, Status> {
-        Ok(Response::new(convert::job_to_wire(&job(&r.into_inner().job_id, JobState::Cancelled))))
+        r: Request<wire::CancelJobRequest>,
+    ) -> Result<Response<wire::CancelJobResponse>, Status> {
+        let job = convert::job_to_wire(&job(&r.into_inner().job_id, JobState::Cancelled));
+        Ok(Response::new(wire::CancelJobResponse { job: Some(job) }))
     }
 
     async fn describe_volume(
         &self,
-        _: Request<v1::DescribeVolumeRequest>,
-    ) -> Result<Response<v1::VolumeDescription>, Status> {
-        Ok(Response::new(v1::VolumeDescription::default()))
+        _: Request<wire::DescribeVolumeRequest>,
+    ) -> Result<Response<wire::DescribeVolumeResponse>, Status> {
+        Ok(Response::new(wire::DescribeVolumeResponse::default()))
     }
 
     async fn list_workers(
         &self,
-        _: Request<v1::ListWorkersRequest>,
-    ) -> Result<Response<v1::ListWorkersReply>, Status> {
+        _: Request<wire::ListWorkersRequest>,
+    ) -> Result<Response<wire::ListWorkersResponse>, Status> {
         Err(Status::resource_exhausted("64 watchers\nare enough"))
     }
 }
@@ -115,13 +127,17 @@ fn job(id: &str, state: JobState) -> Job {
     }
 }
 
-fn notice(state: JobState, frames_total: u64, message: &str) -> Result<v1::FrameChunk, Status> {
+fn notice(
+    state: JobState,
+    frames_total: u64,
+    message: &str,
+) -> Result<wire::WatchFramesResponse, Status> {
     let message = message.into();
     Ok(convert::notice_to_wire(&JobNotice {
         state,
         frames_done: 0,
         frames_total,
-        workers: 1,
+        render_threads: 1,
         message,
     }))
 }
@@ -158,7 +174,7 @@ fn pixels(frame: u64, size: [u32; 2]) -> Bytes {
 }
 
 fn chunks(frame: u64, size: [u32; 2], trace: &str) -> Chunks {
-    let stats = serde_json::to_string(&stats(frame)).unwrap();
+    let stats = stats(frame);
     let bytes = pixels(frame, size);
     let chunks = convert::frame_to_wire(frame, size, PixelFormat::Rgba8, &bytes, &stats, trace);
     chunks.into_iter().map(Ok).collect()
@@ -168,7 +184,7 @@ async fn serve(script: &Script) -> SocketAddr {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let server = tonic::transport::Server::builder()
-        .add_service(RenderServer::new(script.clone()))
+        .add_service(RenderServiceServer::new(script.clone()))
         .serve_with_incoming(TcpListenerStream::new(listener));
     tokio::spawn(server);
     address
@@ -428,7 +444,9 @@ async fn the_same_key_gives_the_same_job_and_futures_may_move() {
     assert_eq!(submitted.await.unwrap().unwrap(), "job-0");
     assert_eq!(client.submit(&request("b")).await.unwrap(), "job-1");
     assert_eq!(client.submit(&request("a")).await.unwrap(), "job-0");
-    assert_eq!(client.jobs(3).await.unwrap().len(), 3);
+    let jobs = client.jobs(2345).await.unwrap();
+    assert_eq!((jobs.len(), jobs[2344].job_id.as_str()), (2345, "job-155"), "over three pages");
+    assert_eq!(client.jobs(9999).await.unwrap().len(), 2500);
     assert_eq!(client.cancel("job-1").await.unwrap().state, JobState::Cancelled);
 }
 
@@ -451,8 +469,8 @@ async fn chunks_that_break_the_promise_are_named() {
     }
 }
 
-fn last_at_once(mut chunk: v1::FrameChunk) -> v1::FrameChunk {
-    if let Some(v1::frame_chunk::What::Pixels(p)) = &mut chunk.what {
+fn last_at_once(mut chunk: wire::WatchFramesResponse) -> wire::WatchFramesResponse {
+    if let Some(wire::watch_frames_response::Message::Chunk(p)) = &mut chunk.message {
         p.last = true;
     }
     chunk

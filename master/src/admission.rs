@@ -204,8 +204,8 @@ impl WorkerTable {
             held_bricks: seen.bricks_held,
             tasks_lent: seen.leases,
             tasks_done: attached.tasks_done,
-            silent_ms: ms(attached.last_heard),
-            here_ms: ms(attached.joined),
+            silent: attached.last_heard.elapsed(),
+            connected: attached.joined.elapsed(),
             in_reserve: seen.in_reserve,
         })
     }

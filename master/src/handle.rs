@@ -206,6 +206,12 @@ impl Handle {
         self.jobs.lock().get(job).map(|job| job.view.clone())
     }
 
+    /// Returns the first frame of a job, from `frame` on, whose pixels are kept.
+    pub fn first_kept_frame(&self, job: JobId, frame: u64) -> Option<u64> {
+        let table = self.jobs.lock();
+        table.get(job)?.frames.range(frame..).next().map(|(number, _)| *number)
+    }
+
     /// Returns all jobs that are remembered, oldest first.
     pub fn jobs(&self) -> Vec<JobView> {
         self.jobs.lock().jobs().map(|job| job.view.clone()).collect()

@@ -4,7 +4,7 @@ use slabcast_common::presets;
 use slabcast_common::quality::Compositing;
 use slabcast_common::volume::Volume;
 use slabcast_common::wanted::Wanted;
-use slabcast_proto::convert;
+use slabcast_proto::convert::BrickBatches;
 use slabcast_volumes::BrickStore;
 use std::time::Instant;
 
@@ -29,7 +29,7 @@ fn ten_thousand_bricks_for_sixteen_workers() {
         let mut queues = Vec::new();
         for _ in 0..16 {
             let encoded = ids.iter().filter_map(|id| store.encoded(*id));
-            queues.push(convert::brick_batches_to_wire(&store.key(), encoded));
+            queues.push(BrickBatches::new(&store.key(), encoded).collect::<Vec<_>>());
         }
         let ms = began.elapsed().as_secs_f64() * 1e3;
         for message in queues.iter().flatten() {

@@ -144,9 +144,7 @@ impl Details {
         Details {
             reason: info
                 .and_then(|i| Reason::ALL.into_iter().find(|reason| reason.name() == i.reason)),
-            metadata: info
-                .map(|i| i.metadata.clone().into_iter().collect())
-                .unwrap_or_default(),
+            metadata: info.map(|i| i.metadata.clone().into_iter().collect()).unwrap_or_default(),
             field: violation.map(|v| (v.field.clone(), v.description.clone())),
             retry_after: found.retry_info().and_then(|retry| retry.retry_delay),
         }
@@ -190,8 +188,15 @@ mod tests {
         assert_eq!(Details::from_status(&Status::not_found("no")), none);
         let garbage = Status::with_details(Code::NotFound, "no", vec![0xff; 40].into());
         assert_eq!(Details::from_status(&garbage), none);
-        let info = ErrorDetails::with_error_info("JOB_NOT_FOUND", "example.com", [("a", "b")]);
-        assert_eq!(Details::from_status(&Status::with_error_details(Code::NotFound, "", info)), none);
+        let info = ErrorDetails::with_error_info(
+            "JOB_NOT_FOUND",
+            "example.com",
+            [("a".into(), "b".into())],
+        );
+        assert_eq!(
+            Details::from_status(&Status::with_error_details(Code::NotFound, "", info)),
+            none
+        );
     }
 
     #[test]

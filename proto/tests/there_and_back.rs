@@ -9,10 +9,12 @@ use slabcast_common::brick::Brick;
 use slabcast_common::ids::BrickId;
 use slabcast_common::image::{PixelFormat, RawSums};
 use slabcast_common::message::{Pixels, ToMaster, ToWorker};
+use slabcast_common::quality::{Quality, Schedule};
+use slabcast_common::stats::{FrameStats, SlabStats, TileStats};
 use slabcast_common::volume::Samples;
-use slabcast_proto::convert::{self, Bricks, Down};
-use slabcast_proto::model::FrameChunk;
-use slabcast_proto::{MAX_BRICKS_MESSAGE, MAX_CONTROL_MESSAGE, MAX_FRAME_CHUNK, v1};
+use slabcast_proto::convert::{self, BrickBatches, Bricks, Down, StatisticsParts};
+use slabcast_proto::model::WatchMessage;
+use slabcast_proto::{MAX_BRICKS_MESSAGE, MAX_CONTROL_MESSAGE, MAX_FRAME_CHUNK, cluster_v1};
 
 /// Over the wire: encoded, decoded.
 fn wire<M: Message + Default>(message: M) -> M {
@@ -42,7 +44,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(192))]
 
     #[test]
-    fn to_master(message in any::to_master()) {
+    fn worker_messages_arrive_unchanged(message in any::to_master()) {
         let back = convert::from_worker_from_wire(wire(convert::from_worker_to_wire(&message)));
         let mut back = back.map_err(|e| TestCaseError::fail(e.to_string()))?;
         if let ToMaster::Result(b) = &mut back {
@@ -58,7 +60,7 @@ proptest! {
     }
 
     #[test]
-    fn to_worker(message in any::to_worker(), session in 1u64..) {
+    fn master_messages_arrive_unchanged(message in any::to_worker(), session in 1u64..) {
         let is_welcome = matches!(message, ToWorker::Welcome { .. });
         let back = match convert::to_worker_to_wire(&message, session) {
             Down::Control(m) => {
@@ -90,32 +92,52 @@ proptest! {
     }
 
     #[test]
-    fn path_requests(request in any::path_request()) {
-        let back = convert::path_request_from_wire(wire(convert::path_request_to_wire(&request)));
+    fn submit_requests_arrive_unchanged(request in any::path_request()) {
+        let back = convert::submit_from_wire(wire(convert::submit_to_wire(&request)));
         prop_assert_eq!(shown(&back.map_err(|e| TestCaseError::fail(e.to_string()))?), shown(&request));
     }
 
     #[test]
-    fn what_a_client_looks_at(
+    fn jobs_notices_volumes_and_workers_arrive_unchanged(
         job in any::job(), notice in any::notice(), volume in any::volume(), worker in any::worker(),
     ) {
         prop_assert_eq!(convert::job_from_wire(wire(convert::job_to_wire(&job))), Ok(job));
-        let chunk = convert::chunk_from_wire(wire(convert::notice_to_wire(&notice)));
-        prop_assert_eq!(chunk, Ok(FrameChunk::Notice(notice)));
+        let chunk = convert::watch_from_wire(wire(convert::notice_to_wire(&notice)));
+        prop_assert_eq!(chunk, Ok(WatchMessage::Notice(notice)));
         prop_assert_eq!(convert::worker_from_wire(wire(convert::worker_to_wire(&worker))), Ok(worker));
         let back = convert::volume_from_wire(wire(convert::volume_to_wire(&volume)));
         prop_assert_eq!(shown(&back), shown(&Ok::<_, ()>(volume)));
     }
 
+    /// Statistics cross as messages, and the JSON on the other side is the same to the byte.
     #[test]
-    fn bricks(set in any::key(), bricks in prop::collection::vec(any::brick(), 1..90)) {
+    fn statistics_arrive_unchanged(stats in any::stats(), pixels in 1usize..99) {
+        let bytes = Bytes::from(vec![1; pixels]);
+        let size = [pixels as u32, 1];
+        let mut parts = StatisticsParts::default();
+        for chunk in convert::frame_to_wire(7, size, PixelFormat::Rgb8, &bytes, &stats, "") {
+            let Ok(WatchMessage::Chunk(chunk)) = convert::watch_from_wire(wire(chunk)) else {
+                return Err(TestCaseError::fail("refused"));
+            };
+            if let Some(part) = chunk.statistics {
+                parts.add(part).map_err(|e| TestCaseError::fail(e.to_string()))?;
+            }
+        }
+        let back = parts.finish().map_err(|e| TestCaseError::fail(e.to_string()))?;
+        prop_assert_eq!(shown(&back), shown(&stats));
+        let [there, here] = [&back, &stats].map(|s| serde_json::to_string(s).unwrap());
+        prop_assert_eq!(there, here);
+    }
+
+    #[test]
+    fn brick_batches_arrive_unchanged(set in any::key(), bricks in prop::collection::vec(any::brick(), 1..90)) {
         let encoded = bricks.iter().map(|b| {
             let mut bytes = Vec::new();
             b.encode(&mut bytes);
             Bytes::from(bytes)
         });
         let mut back: Vec<Brick> = Vec::new();
-        for message in convert::brick_batches_to_wire(&set, encoded) {
+        for message in BrickBatches::new(&set, encoded) {
             prop_assert!(message.encoded_len() <= MAX_BRICKS_MESSAGE);
             let Ok(Bricks::Batch(batch)) = convert::bricks_from_wire(wire(message)) else {
                 return Err(TestCaseError::fail("refused"));
@@ -128,7 +150,7 @@ proptest! {
 }
 
 #[test]
-fn a_broken_brick_is_named_and_the_others_are_taken() {
+fn broken_brick_is_named_and_the_others_are_taken() {
     let encode = |id| {
         let mut bytes = Vec::new();
         let values = Samples::U8(vec![8, 9]);
@@ -140,24 +162,27 @@ fn a_broken_brick_is_named_and_the_others_are_taken() {
     flipped[8] ^= 1;
     short.truncate(9);
     let batch = [good, flipped, short].map(Bytes::from);
-    let message = convert::brick_batches_to_wire(&Default::default(), batch).remove(0);
+    let message = BrickBatches::new(&Default::default(), batch).next().unwrap();
     let Ok(Bricks::Batch(batch)) = convert::bricks_from_wire(message) else { panic!("refused") };
     assert_eq!(batch.bricks.iter().map(|b| b.id).collect::<Vec<_>>(), [BrickId(1)]);
     assert_eq!(batch.broken, [BrickId(2), BrickId(3)]);
-    let nameless = convert::brick_batches_to_wire(&Default::default(), [Bytes::from_static(b"ab")]);
-    let e = convert::bricks_from_wire(nameless[0].clone()).unwrap_err();
+    let nameless = BrickBatches::new(&Default::default(), [Bytes::from_static(b"ab")]);
+    let e = convert::bricks_from_wire(nameless.last().unwrap()).unwrap_err();
     assert_eq!(e.field(), "batch.bricks[0]");
 }
 
 #[test]
-fn many_bricks_are_cut_into_messages_of_one_http_frame() {
+fn brick_batches_fit_one_http2_frame_each() {
     let brick = Bytes::from(vec![5; 3595]);
-    let batches = convert::brick_batches_to_wire(&Default::default(), vec![brick.clone(); 100]);
+    let batches: Vec<_> =
+        BrickBatches::new(&Default::default(), vec![brick.clone(); 100]).collect();
     assert!(batches.iter().all(|b| b.encoded_len() <= MAX_BRICKS_MESSAGE));
     assert_eq!(batches.len(), 6, "18 bricks of 3598 bytes fit into 65,000");
-    let Some(v1::bricks_down::Message::Batch(first)) = &batches[0].message else { panic!() };
+    let Some(cluster_v1::bricks_response::Message::Batch(first)) = &batches[0].message else {
+        panic!()
+    };
     assert_eq!(first.bricks[0].as_ptr(), brick.as_ptr(), "passed on, not copied");
-    assert!(convert::brick_batches_to_wire(&Default::default(), []).is_empty());
+    assert!(BrickBatches::new(&Default::default(), []).next().is_none());
 
     let drop = ToWorker::DropBricks {
         set: Default::default(),
@@ -168,7 +193,7 @@ fn many_bricks_are_cut_into_messages_of_one_http_frame() {
 }
 
 #[test]
-fn the_largest_lease_and_result_fit_a_control_message() {
+fn largest_lease_and_result_fit_a_control_message() {
     use slabcast_common::ids::*;
     use slabcast_common::image::{TilePixels, TileState};
     use slabcast_common::message::{Lease, TileResult};
@@ -208,7 +233,7 @@ fn the_largest_lease_and_result_fit_a_control_message() {
 }
 
 #[test]
-fn a_large_directory_goes_in_parts_that_follow_each_other() {
+fn large_directory_is_sent_in_parts_without_gaps() {
     use slabcast_common::brick::{BrickGrid, BrickInfo, BrickSetKey, TightBox};
     let grid = BrickGrid { dims: [40, 40, 40] };
     let info = |id: u32| {
@@ -232,36 +257,68 @@ fn a_large_directory_goes_in_parts_that_follow_each_other() {
 }
 
 #[test]
-fn a_frame_of_any_length_is_cut_and_put_together() {
-    let put_together = |pixels: usize, stats: &str, trace: &str| {
+fn frame_of_any_length_is_cut_into_chunks_and_put_together() {
+    let put_together = |pixels: usize, tiles: usize, trace: &str| {
         let size = [pixels as u32 / 4096 + 1, 1024];
         let bytes = Bytes::from((0..pixels).map(|i| (i % 251) as u8).collect::<Vec<_>>());
-        let chunks = convert::frame_to_wire(7, size, PixelFormat::Rgba8, &bytes, stats, trace);
-        let (mut data, mut s, mut t) = (Vec::new(), String::new(), String::new());
+        let stats = stats_with(tiles);
+        let chunks = convert::frame_to_wire(7, size, PixelFormat::Rgba8, &bytes, &stats, trace);
+        let (mut data, mut parts, mut t) = (Vec::new(), StatisticsParts::default(), String::new());
         for (i, chunk) in chunks.iter().enumerate() {
             assert!(chunk.encoded_len() <= MAX_FRAME_CHUNK, "{}", chunk.encoded_len());
-            let Ok(FrameChunk::Pixels(p)) = convert::chunk_from_wire(wire(chunk.clone())) else {
+            let Ok(WatchMessage::Chunk(p)) = convert::watch_from_wire(wire(chunk.clone())) else {
                 panic!("refused")
             };
             assert_eq!((p.frame, p.size, p.offset), (7, size, data.len() as u64));
             assert_eq!(p.last, i + 1 == chunks.len());
             data.extend_from_slice(&p.data);
-            s += &p.stats_json;
+            p.statistics.map_or(Ok(()), |part| parts.add(part)).unwrap();
             t += &p.trace_json;
         }
-        assert!(data == bytes && s == stats && t == trace);
+        assert!(data == bytes && t == trace);
+        let back = parts.finish().unwrap();
+        assert_eq!(serde_json::to_string(&back).unwrap(), serde_json::to_string(&stats).unwrap());
         chunks.len()
     };
-    assert_eq!(put_together(3, "{}", ""), 1);
-    assert_eq!(put_together(MAX_FRAME_CHUNK - 256, "", ""), 1);
-    assert_eq!(put_together(MAX_FRAME_CHUNK - 256, "{}", "[]"), 2);
-    assert_eq!(put_together(MAX_FRAME_CHUNK - 255, "{}", "[]"), 2);
+    assert_eq!(put_together(3, 1, ""), 1);
+    assert_eq!(put_together(MAX_FRAME_CHUNK - 256 - 2000, 1, ""), 1);
+    assert_eq!(put_together(MAX_FRAME_CHUNK - 256, 1, "[]"), 2);
+    assert_eq!(put_together(MAX_FRAME_CHUNK - 255, 1, "[]"), 2);
     let long = "\u{20ac}\"a".repeat(600_000);
-    assert_eq!(put_together(5, &long, &long), 6);
+    assert_eq!(put_together(5, 100_000, &long), 7);
+}
+
+/// Statistics of a frame with one slab of so many tiles.
+fn stats_with(tiles: usize) -> FrameStats {
+    let tile = |i| TileStats { x: i, y: i / 2, size: 16, est: 7, ms: 0.1, worker: "node:1".into() };
+    let slab = SlabStats { tiles: (0..tiles as u32).map(tile).collect(), ..Default::default() };
+    FrameStats {
+        v: 1,
+        frame: 7,
+        schedule: Schedule::Region,
+        view_sha256: "0".repeat(64),
+        pixels_sha256: "1".repeat(64),
+        pixels_version: 10,
+        ms: Default::default(),
+        workers: vec![],
+        voxels: Default::default(),
+        bricks: Default::default(),
+        result_bytes: None,
+        slabs: vec![slab],
+        quality: Quality::default(),
+        left_out: vec![],
+        error: Default::default(),
+        retries: 0,
+        handed_over: 0,
+        dropped_results: 0,
+        poisoned: vec![],
+        critical_path: None,
+        rehearsed: false,
+    }
 }
 
 #[test]
-fn whatever_bit_is_flipped_on_the_way_one_brick_is_sent_again() {
+fn checksum_finds_every_flipped_bit_of_a_brick() {
     let mut state = 0x9e37_79b9_7f4a_7c15u64;
     let mut next = move |below: usize| {
         state =
@@ -292,7 +349,7 @@ fn whatever_bit_is_flipped_on_the_way_one_brick_is_sent_again() {
         spoilt[at / 8] ^= 1 << (at % 8);
         let mut batch = encoded.clone();
         batch[which] = spoilt.into();
-        let message = convert::brick_batches_to_wire(&Default::default(), batch).remove(0);
+        let message = BrickBatches::new(&Default::default(), batch).next().unwrap();
         let Ok(Bricks::Batch(batch)) = convert::bricks_from_wire(message) else {
             panic!("flip {flip}: all bricks were refused for one")
         };

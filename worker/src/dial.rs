@@ -7,11 +7,10 @@
 use crate::cache::BrickCache;
 use crate::session::{self, Config, Ended, Link};
 use slabcast_common::link::BRICK_BATCHES_IN_FLIGHT;
-use slabcast_common::message::ToWorker;
-use slabcast_proto::convert;
-use slabcast_proto::v1::cluster_client::ClusterClient;
+use slabcast_common::message::{ToMaster, ToWorker};
+use slabcast_proto::cluster_v1::cluster_service_client::ClusterServiceClient;
+use slabcast_proto::convert::{self, Compression};
 use slabcast_proto::{MAX_BRICKS_MESSAGE, MAX_CONTROL_MESSAGE};
-use std::hash::{BuildHasher, Hasher};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -19,18 +18,25 @@ use tokio::sync::{mpsc, watch};
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::transport::{Channel, Endpoint};
+use tonic::{Code, Status};
 use tracing::{info, warn};
 
-/// How long a connection may take.
+/// Time that a connection may take to be made.
 const CONNECT: Duration = Duration::from_secs(5);
-/// First and longest wait before dialling again (cluster.proto).
-const WAIT: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(5));
+
+/// First wait before dialling again; it doubles up to [`LONGEST_WAIT`] (cluster.proto).
+const FIRST_WAIT: Duration = Duration::from_millis(100);
+
+/// Longest wait before dialling again. A link that lived longer was a good one: the wait after it
+/// is the first again.
+const LONGEST_WAIT: Duration = Duration::from_secs(5);
+
 /// Serves the master at `master` (`host:port`) until `stop` turns true or the master refuses
-/// this worker. A master that is not there, or leaves, is dialled again for ever; bricks are
+/// this worker. A master that is not there, or ends, is dialled again for ever; bricks are
 /// kept meanwhile.
 ///
 /// # Errors
-/// A master address that can't be one, or a system that gives no threads.
+/// An address that can't be one, or a system that gives no threads.
 pub async fn run(
     config: Config,
     master: String,
@@ -44,7 +50,7 @@ pub async fn run(
         .http2_keep_alive_interval(Duration::from_secs(10))
         .keep_alive_timeout(Duration::from_secs(5));
     let mut cache = BrickCache::default();
-    let mut wait = WAIT.0;
+    let mut wait = FIRST_WAIT;
     let mut told = false;
     loop {
         if *stop.borrow() {
@@ -66,8 +72,8 @@ pub async fn run(
                     Ended::Lost(reason) => warn!(master, reason, "link lost, dialling again"),
                     Ended::MasterLeft(reason) => info!(master, reason, "waiting for the master"),
                 }
-                if before.elapsed() > WAIT.1 {
-                    wait = WAIT.0;
+                if before.elapsed() > LONGEST_WAIT {
+                    wait = FIRST_WAIT;
                 }
             }
             Err(e) => {
@@ -78,12 +84,14 @@ pub async fn run(
                 }
             }
         }
-        let nap = wait.mul_f64(1.0 - 0.5 * fraction());
+        // Less a random part: many workers that lost one master do not call at once.
+        let nap = wait.mul_f64(1.0 - 0.5 * fastrand::f64());
         tokio::select! { () = tokio::time::sleep(nap) => {}, _ = stop.changed() => {} }
-        wait = (wait * 2).min(WAIT.1);
+        wait = (wait * 2).min(LONGEST_WAIT);
     }
 }
 
+/// The endpoint of the Control stream.
 fn control_endpoint(endpoint: &Endpoint) -> Endpoint {
     endpoint
         .clone()
@@ -92,8 +100,8 @@ fn control_endpoint(endpoint: &Endpoint) -> Endpoint {
         .max_frame_size(64 * 1024)
 }
 
-/// Small windows: what is on its way on this connection is bandwidth times round trip, and
-/// more than that only queues in the network.
+/// The endpoint of the Bricks stream, with small windows: bandwidth times round trip is in flight on
+/// this connection, and more only queues in the network.
 fn bricks_endpoint(endpoint: &Endpoint) -> Endpoint {
     endpoint
         .clone()
@@ -102,14 +110,7 @@ fn bricks_endpoint(endpoint: &Endpoint) -> Endpoint {
         .max_frame_size(64 * 1024)
 }
 
-/// A number in [0, 1) that differs from worker to worker.
-fn fraction() -> f64 {
-    let mut h = std::hash::RandomState::new().build_hasher();
-    h.write_u64(1);
-    (h.finish() >> 11) as f64 / (1u64 << 53) as f64
-}
-
-/// An error with what lies behind it: tonic's own text is just "transport error".
+/// Returns the text of an error and of all its sources: tonic's own is just "transport error".
 fn causes(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut next = error.source();
@@ -120,7 +121,32 @@ fn causes(error: &dyn std::error::Error) -> String {
     text
 }
 
-/// One link, from hello to its end.
+/// Why a link's streams ended.
+enum Broken {
+    /// The connection broke, or the master ended a stream: dial again.
+    Lost(String),
+    /// The master does not serve workers like this one: dialling again would not help.
+    Refused(String),
+}
+
+impl From<Status> for Broken {
+    fn from(status: Status) -> Self {
+        match status.code() {
+            Code::Unimplemented => Broken::Refused(
+                "the master does not speak slabcast.cluster.v1; it is of an older version of \
+                 slabcast, or no slabcast master: run the same version on both"
+                    .into(),
+            ),
+            Code::Unauthenticated | Code::PermissionDenied => {
+                Broken::Refused(format!("the master wants credentials: {}", status.message()))
+            }
+            // A status that was made on this side has the cause as its source.
+            _ => Broken::Lost(causes(&status)),
+        }
+    }
+}
+
+/// Serves one link, from its hello to its end.
 async fn link(
     config: &Config,
     endpoint: &Endpoint,
@@ -132,66 +158,13 @@ async fn link(
     // Unbounded, bounded by the leases that the master gives and its pings.
     let (control_tx, control) = mpsc::unbounded_channel();
     let (bricks_tx, bricks) = mpsc::channel(BRICK_BATCHES_IN_FLIGHT);
-    // Whether results go as they are, by the frame that came last.
-    let plain = Arc::new(AtomicBool::new(false));
-    let as_is = plain.clone();
-    let outbound = ReceiverStream::new(reply_rx).map(move |message| {
-        convert::from_worker_to_wire_as(&message, !as_is.load(Ordering::Relaxed))
-    });
-    let bricks_endpoint = bricks_endpoint(endpoint);
-    let mut carrying = tokio::spawn(async move {
-        let mut client = ClusterClient::new(channel)
-            .max_decoding_message_size(MAX_CONTROL_MESSAGE)
-            .max_encoding_message_size(MAX_CONTROL_MESSAGE);
-        let mut inbound = client.control(outbound).await.map_err(|e| causes(&e))?.into_inner();
-        let mut bricks_stream: Option<tokio::task::JoinHandle<String>> = None;
-        let carried = loop {
-            let bricks_ended = async {
-                match &mut bricks_stream {
-                    Some(task) => task.await.unwrap_or_else(|e| e.to_string()),
-                    None => std::future::pending().await,
-                }
-            };
-            let message = tokio::select! {
-                message = inbound.message() => message,
-                reason = bricks_ended => {
-                    bricks_stream = None;
-                    break Err(reason);
-                }
-            };
-            let message = match message {
-                Ok(Some(message)) => message,
-                Ok(None) => break Ok(()),
-                Err(status) => break Err(status.message().to_string()),
-            };
-            match convert::to_worker_from_wire(message) {
-                Ok((message, session)) => {
-                    if let ToWorker::Frame { plain: told, .. } = message {
-                        plain.store(told, Ordering::Relaxed);
-                    }
-                    if let Some(session) = session {
-                        let (endpoint, to) = (bricks_endpoint.clone(), bricks_tx.clone());
-                        bricks_stream = Some(tokio::spawn(carry_bricks(endpoint, session, to)));
-                    }
-                    // A desk that is gone has said good-bye, which is lost if the stream ends before it
-                    // has left: then the master ends the stream.
-                    let _ = control_tx.send(message);
-                }
-                Err(e) => break Err(format!("the master sent what can't be read: {e}")),
-            }
-        };
-        // Both streams end together, before anybody dials again.
-        if let Some(task) = bricks_stream {
-            task.abort();
-            let _ = task.await;
-        }
-        carried
-    });
+    let carry = carry(channel, bricks_endpoint(endpoint), reply_rx, control_tx, bricks_tx);
+    let mut carrying = tokio::spawn(carry);
     let ended = session::run(config, Link { control, replies, bricks }, cache, stop).await;
     let ended = ended.map_err(|e| format!("render threads: {e}"))?;
-    // The desk dropped its ends. What it said last still leaves; then the streams are over.
+    // The session dropped its ends. Its last messages still leave; then the streams are over.
     let carried = match tokio::time::timeout(Duration::from_secs(1), &mut carrying).await {
-        Ok(joined) => joined.unwrap_or_else(|e| Err(e.to_string())),
+        Ok(joined) => joined.unwrap_or_else(|e| Err(Broken::Lost(e.to_string()))),
         Err(_) => {
             carrying.abort();
             let _ = carrying.await;
@@ -199,9 +172,83 @@ async fn link(
         }
     };
     Ok(match (ended, carried) {
-        (Ended::Lost(_), Err(reason)) => Ended::Lost(reason),
+        (Ended::Lost(_), Err(Broken::Lost(reason))) => Ended::Lost(reason),
+        (Ended::Lost(_), Err(Broken::Refused(reason))) => Ended::Refused(reason),
         (ended, _) => ended,
     })
+}
+
+/// Carries both streams of a link until either ends; then neither is left, before anybody dials
+/// again.
+async fn carry(
+    channel: Channel,
+    bricks_endpoint: Endpoint,
+    replies: mpsc::Receiver<ToMaster>,
+    control: mpsc::UnboundedSender<ToWorker>,
+    bricks: mpsc::Sender<convert::Bricks>,
+) -> Result<(), Broken> {
+    // How results are compressed, by the frame that came last.
+    let uncompressed = Arc::new(AtomicBool::new(false));
+    // Encoded on this runtime thread: handing a message to another thread and back takes some 25
+    // us (TRANSPORT.md section 0), and the message of a 64x64 tile 35 us. Of the largest tiles it
+    // takes 0.6 ms, during which a ping waits.
+    let outbound = ReceiverStream::new(replies).map({
+        let uncompressed = uncompressed.clone();
+        move |message| {
+            let compression = match uncompressed.load(Ordering::Relaxed) {
+                true => Compression::None,
+                false => Compression::Lz4,
+            };
+            convert::from_worker_to_wire_as(&message, compression)
+        }
+    });
+    let mut client = ClusterServiceClient::new(channel)
+        .max_decoding_message_size(MAX_CONTROL_MESSAGE)
+        .max_encoding_message_size(MAX_CONTROL_MESSAGE);
+    let mut inbound = client.control(outbound).await?.into_inner();
+    let mut bricks_stream: Option<tokio::task::JoinHandle<Broken>> = None;
+    let carried = loop {
+        let bricks_ended = async {
+            match &mut bricks_stream {
+                Some(task) => task.await.unwrap_or_else(|e| Broken::Lost(e.to_string())),
+                None => std::future::pending().await,
+            }
+        };
+        let message = tokio::select! {
+            message = inbound.message() => message,
+            broken = bricks_ended => {
+                bricks_stream = None;
+                break Err(broken);
+            }
+        };
+        let message = match message {
+            Ok(Some(message)) => message,
+            Ok(None) => break Ok(()),
+            Err(status) => break Err(status.into()),
+        };
+        match convert::to_worker_from_wire(message) {
+            Ok((message, session)) => {
+                if let ToWorker::Frame { plain, .. } = message {
+                    uncompressed.store(plain, Ordering::Relaxed);
+                }
+                if let Some(session) = session {
+                    let (endpoint, to) = (bricks_endpoint.clone(), bricks.clone());
+                    bricks_stream = Some(tokio::spawn(carry_bricks(endpoint, session, to)));
+                }
+                // A session that has ended has sent Goodbye, which would be lost if this stream
+                // ended before it left: then the master ends the stream.
+                let _ = control.send(message);
+            }
+            Err(e) => {
+                break Err(Broken::Lost(format!("the master sent what can't be read: {e}")));
+            }
+        }
+    };
+    if let Some(task) = bricks_stream {
+        task.abort();
+        let _ = task.await;
+    }
+    carried
 }
 
 /// Carries the Bricks stream; returns why it ended.
@@ -209,27 +256,30 @@ async fn carry_bricks(
     endpoint: Endpoint,
     session: u64,
     to: mpsc::Sender<convert::Bricks>,
-) -> String {
+) -> Broken {
+    let lost = |reason: String| Broken::Lost(format!("bricks: {reason}"));
     let channel = match endpoint.connect().await {
         Ok(channel) => channel,
-        Err(e) => return format!("no second connection for bricks: {}", causes(&e)),
+        Err(e) => return lost(format!("no second connection: {}", causes(&e))),
     };
-    let mut client = ClusterClient::new(channel).max_decoding_message_size(2 * MAX_BRICKS_MESSAGE);
+    let mut client =
+        ClusterServiceClient::new(channel).max_decoding_message_size(2 * MAX_BRICKS_MESSAGE);
     let open = tokio_stream::once(convert::bricks_open_to_wire(session));
     let outbound = open.chain(tokio_stream::pending());
     let mut inbound = match client.bricks(outbound).await {
         Ok(response) => response.into_inner(),
-        Err(status) => return format!("bricks: {}", status.message()),
+        Err(status) => return lost(causes(&status)),
     };
     loop {
         match inbound.message().await {
             Ok(Some(message)) => match convert::bricks_from_wire(message) {
-                // A desk that is gone needs none. This stream ends with the other, which still carries its good-bye.
+                // A session that has ended needs none. This stream ends with Control, which still
+                // carries its Goodbye.
                 Ok(bricks) => drop(to.send(bricks).await),
-                Err(e) => return format!("the master sent bricks that can't be read: {e}"),
+                Err(e) => return lost(format!("the master sent what can't be read: {e}")),
             },
-            Ok(None) => return "the master closed the bricks stream".into(),
-            Err(status) => return format!("bricks: {}", status.message()),
+            Ok(None) => return lost("the master closed the stream".into()),
+            Err(status) => return lost(causes(&status)),
         }
     }
 }

@@ -132,7 +132,7 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), Fail> {
                 bytes(w.memory_budget_bytes),
                 w.tasks_done.to_string(),
                 if w.in_reserve { "in reserve".into() } else { w.tasks_lent.to_string() },
-                time(Duration::from_millis(w.here_ms)),
+                time(w.connected),
             ]
         }));
         table(&mut out, &rows);
@@ -150,7 +150,7 @@ pub(crate) fn status(args: &StatusArgs) -> Result<(), Fail> {
 
 /// Runs `slabcast jobs`.
 pub(crate) fn jobs(args: &JobsArgs) -> Result<(), Fail> {
-    let jobs = ask(&args.master.master, async |client| client.jobs(args.limit).await)?;
+    let jobs = ask(&args.master.master, async |client| client.jobs(args.limit as usize).await)?;
     if args.json {
         let jobs: Vec<_> = jobs.iter().map(job_json).collect();
         return say(&format!("{:#}\n", serde_json::Value::Array(jobs)));
@@ -225,11 +225,12 @@ fn volume_json(v: &VolumeDescription) -> serde_json::Value {
 }
 
 fn worker_json(w: &Worker) -> serde_json::Value {
+    let ms = |duration: Duration| duration.as_millis() as u64;
     serde_json::json!({
         "id": w.id.to_string(), "name": w.name, "address": w.address, "threads": w.threads,
         "simd": w.simd, "memory_budget_bytes": w.memory_budget_bytes,
         "held_bytes": w.held_bytes, "held_bricks": w.held_bricks, "tasks_lent": w.tasks_lent,
-        "tasks_done": w.tasks_done, "silent_ms": w.silent_ms, "here_ms": w.here_ms,
+        "tasks_done": w.tasks_done, "silent_ms": ms(w.silent), "here_ms": ms(w.connected),
         "in_reserve": w.in_reserve,
     })
 }

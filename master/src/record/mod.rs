@@ -29,6 +29,7 @@
 //!
 //! What it costs is in docs/scaling.md.
 
+mod legacy;
 mod read;
 #[cfg(test)]
 mod tests;
@@ -48,9 +49,13 @@ use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{Action, Event};
 use std::fmt;
 
-/// Version of the file's format. Since 2 results may be finished, and statistics count their bytes; since 3 regions may be
-/// handed over in part.
-const VERSION: u32 = 3;
+/// Version of the file's format. Since 2 results may be finished, and statistics count their
+/// bytes; since 3 regions may be handed over in part; since 4 scenes have their transfer function
+/// as a message ([`legacy`] reads those of 3).
+const VERSION: u32 = 4;
+
+/// Oldest version that is read.
+const OLDEST_VERSION: u32 = 3;
 
 /// Entries between driver and disk: some twenty frames' of 512x512, 4 MiB where tiles are shut in
 /// patterns. At a tenth, one slow `fsync` of somebody else's cuts the record.

@@ -4,8 +4,8 @@
 //! wrong is named by its line.
 
 use super::{
-    Decision, Head, Line, Noted, NotedJob, NotedPiece, NotedResult, NotedWorker, VERSION, bits,
-    from_hex,
+    Decision, Head, Line, Noted, NotedJob, NotedPiece, NotedResult, NotedWorker, OLDEST_VERSION,
+    VERSION, bits, from_hex, legacy,
 };
 use prost::Message;
 use slabcast_common::PIXELS_VERSION;
@@ -19,7 +19,7 @@ use slabcast_common::message::{
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::volume::Digest32;
-use slabcast_proto::{convert, v1};
+use slabcast_proto::{cluster_v1, convert};
 use slabcast_schedule::{Clock, Config, Event, FrameJob, Micros, Scheduler};
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -259,9 +259,10 @@ pub fn replay(from: impl BufRead) -> Result<Replayed, Broken> {
 }
 
 fn config(head: &Head) -> Result<Config, String> {
-    if head.version != VERSION {
+    if !(OLDEST_VERSION..=VERSION).contains(&head.version) {
         return Err(format!(
-            "is a record of version {}, this program reads {VERSION}; replay it with slabcast {}",
+            "is a record of version {}, this program reads {OLDEST_VERSION} to {VERSION}; replay \
+             it with slabcast {}",
             head.version, head.program
         ));
     }
@@ -309,8 +310,7 @@ fn infos(bricks: &[[u32; 9]]) -> Result<Arc<[BrickInfo]>, String> {
 
 fn scene(id: SceneId, wire: &str) -> Result<Arc<SceneSpec>, String> {
     let bytes = from_hex(wire).ok_or("`wire` is not hexadecimal")?;
-    let scene = v1::Scene::decode(&bytes[..]).map_err(|e| format!("`wire` is no scene: {e}"))?;
-    let scene = convert::scene_from_wire(scene).map_err(|e| format!("`wire`: {e}"))?;
+    let scene = legacy::scene(&bytes).map_err(|e| format!("`wire` {e}"))?;
     if scene.id != id {
         return Err(format!("`id` is {id}, the scene says {}", scene.id));
     }
@@ -387,7 +387,7 @@ fn queued(job: NotedJob, seen: &mut Seen) -> Result<FrameJob, String> {
     let scene = scene.ok_or_else(|| format!("its scene {} has no line", job.scene))?;
     let bricks = seen.sets.get(&scene.bricks).cloned().ok_or("its brick set has no line")?;
     let bytes = from_hex(&job.view).ok_or("`view` is not hexadecimal")?;
-    let view = v1::View::decode(&bytes[..]).map_err(|e| format!("`view` is none: {e}"))?;
+    let view = cluster_v1::View::decode(&bytes[..]).map_err(|e| format!("`view` is none: {e}"))?;
     let view = convert::view_from_wire(view).map_err(|e| format!("`view`: {e}"))?;
     convert::check_view(&scene.volume.lattice, &view).map_err(|e| format!("`view`: {e}"))?;
     job.work.check().map_err(|e| format!("`work`: {}: {}", e.field, e.problem))?;

@@ -368,7 +368,7 @@ fn broken_files_are_refused_with_their_line() {
     let (line, bad) = tampered(&bytes, any, |_| "{\"event\":5}".into());
     assert!(says(&bad).starts_with(&format!("line {line}: is no line of a record")));
     let head = |l: &str| l.starts_with("{\"record\"");
-    let (_, bad) = tampered(&bytes, head, |l| l.replace("\"version\":3", "\"version\":7"));
+    let (_, bad) = tampered(&bytes, head, |l| l.replace("\"version\":4", "\"version\":7"));
     assert!(says(&bad).contains("version 7"), "{}", says(&bad));
     let scene = |l: &str| l.starts_with("{\"scene\"");
     let (line, bad) = tampered(&bytes, scene, |l| l.replace("\"wire\":\"", "\"wire\":\"ff"));

@@ -126,8 +126,7 @@ pub(super) fn transfer_to_wire(tf: &TransferFunction) -> wire::TransferFunction 
         b: Some(b),
     };
     let opacity = |&[x, a]: &[f64; 2]| wire::OpacityPoint { x: Some(x), opacity: Some(a) };
-    let gradient =
-        |&[g, a]: &[f64; 2]| wire::GradientPoint { magnitude: Some(g), factor: Some(a) };
+    let gradient = |&[g, a]: &[f64; 2]| wire::GradientPoint { magnitude: Some(g), factor: Some(a) };
     let s = &tf.shading;
     wire::TransferFunction {
         domain: domain_to_wire(tf.domain),
@@ -183,9 +182,7 @@ pub(super) fn transfer_from_wire(
             power: s.power.unwrap_or(d.power),
             light: match s.light {
                 None => d.light,
-                Some(wire::shading::Light::Head(wire::Headlight {})) => {
-                    Light::Head(HeadWord::Head)
-                }
+                Some(wire::shading::Light::Head(wire::Headlight {})) => Light::Head(HeadWord::Head),
                 Some(wire::shading::Light::Direction(v)) => {
                     Light::Direction(vec3_from_wire("shading.direction", v)?)
                 }

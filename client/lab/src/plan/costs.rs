@@ -15,8 +15,8 @@ use slabcast_common::message::{
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Schedule;
 use slabcast_common::slab::SheetRange;
-use slabcast_proto::convert::{self, Down};
-use slabcast_proto::v1;
+use slabcast_proto::cluster_v1::{ControlRequest, ControlResponse};
+use slabcast_proto::convert::{self, Compression, Down};
 use slabcast_sim::{Costs, Toll};
 use slabcast_trace::{self as trace, Pings, Trace};
 use std::time::Instant;
@@ -124,18 +124,18 @@ pub(super) fn messages(trace: &Trace, schedule: Schedule) -> Costs {
         Down::Parts(_) | Down::Bricks(_) => Vec::new(),
     };
     // What packing takes the trace says.
-    let up = |m: &ToMaster| convert::from_worker_to_wire_as(m, false).encode_to_vec();
+    let up = |m: &ToMaster| convert::from_worker_to_wire_as(m, Compression::None).encode_to_vec();
     let (lease_bytes, result_bytes) = (down(&lease), up(&result));
     let price = Prices::of(trace.about.pings.as_ref().unwrap_or(&KNOWN));
     let byte = |ns: f64, bytes: &[u8]| BYTE + ns / bytes.len().max(1) as f64;
     let send = best(|| drop(down(&lease)));
     let worker_send = best(|| drop(up(&result)));
     let receive = best(|| {
-        let message = v1::FromWorker::decode(&result_bytes[..]).expect("written above");
+        let message = ControlRequest::decode(&result_bytes[..]).expect("written above");
         drop(convert::from_worker_from_wire(message));
     });
     let worker_receive = best(|| {
-        let message = v1::ToWorker::decode(&lease_bytes[..]).expect("written above");
+        let message = ControlResponse::decode(&lease_bytes[..]).expect("written above");
         drop(convert::to_worker_from_wire(message));
     });
     Costs {

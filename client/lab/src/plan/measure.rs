@@ -26,7 +26,8 @@ use slabcast_common::quality::Work;
 use slabcast_common::region::PART;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::Projected;
-use slabcast_proto::convert::{self, Down};
+use slabcast_proto::cluster_v1::ControlRequest;
+use slabcast_proto::convert::{self, Compression, Down};
 use slabcast_render::Frame;
 use slabcast_render::Simd;
 use slabcast_render::region::{self, BrickSupply, FinishedRegion, Region};
@@ -153,7 +154,8 @@ impl Packed {
         self.bytes += leaves.data.len() as u64;
         let result = result_of(Pixels::Finished(leaves), counters);
         let [packed, plain] = [true, false].map(|packs| {
-            let to_wire = || convert::from_worker_to_wire_as(&result, packs);
+            let compression = if packs { Compression::Lz4 } else { Compression::None };
+            let to_wire = || convert::from_worker_to_wire_as(&result, compression);
             let (to_ns, message) = shortest(repeats, to_wire);
             let read = || drop(convert::from_worker_from_wire(message.clone()));
             (to_ns, shortest(repeats, read).0, message.encoded_len() as u32)
@@ -754,7 +756,7 @@ mod tests {
 
     fn read(bytes: &[u8]) -> u64 {
         let read = || {
-            let message = slabcast_proto::v1::FromWorker::decode(bytes).expect("written above");
+            let message = ControlRequest::decode(bytes).expect("written above");
             convert::from_worker_from_wire(message).expect("written above")
         };
         shortest(9, read).0

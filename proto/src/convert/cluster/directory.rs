@@ -26,7 +26,8 @@ pub(super) fn to_wire(
     bricks: &[BrickInfo],
 ) -> Vec<wire::ControlResponse> {
     let word = |b: &BrickInfo| {
-        let local = |place: [u32; 3]| place.iter().rev().fold(0, |word, x| (word << 3) | (x % BRICK));
+        let local =
+            |place: [u32; 3]| place.iter().rev().fold(0, |word, x| (word << 3) | (x % BRICK));
         local(b.tight.lo) | local(b.tight.hi) << 9 | (u32::from(b.voxels) - 1) << 18
     };
     let part = |(i, bricks): (usize, &[BrickInfo])| {

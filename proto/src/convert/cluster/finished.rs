@@ -62,8 +62,7 @@ pub(super) fn from_wire(pixels: wire::FinishedPixels) -> Result<Leaves, WireErro
         Ok(_) => return Err(WireError::length("data", data.len(), len)),
         Err(_) => return Err(WireError::unknown("compression", compression)),
     };
-    let leaves =
-        Leaves { size, format, mask: blocks.to_vec(), data, alpha_most: max_opacity };
+    let leaves = Leaves { size, format, mask: blocks.to_vec(), data, alpha_most: max_opacity };
     match leaves.check() {
         Ok(()) => Ok(leaves),
         Err(problem) => Err(WireError::value("blocks", problem)),

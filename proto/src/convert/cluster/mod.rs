@@ -68,10 +68,9 @@ pub fn from_worker_to_wire_as(message: &ToMaster, compress: Compression) -> wire
             epoch: epoch.0,
             reason: reason_to_wire(reason),
         }),
-        ToMaster::BricksIn { set, bricks } => Message::BricksReceived(wire::BricksReceived {
-            set: key_to_wire(set),
-            bricks: *bricks,
-        }),
+        ToMaster::BricksIn { set, bricks } => {
+            Message::BricksReceived(wire::BricksReceived { set: key_to_wire(set), bricks: *bricks })
+        }
         ToMaster::BricksBroken { set, bricks } => Message::BricksBroken(wire::BricksBroken {
             set: key_to_wire(set),
             bricks: Some(brick_ids_to_wire(bricks)),

@@ -60,8 +60,7 @@ fn opacity_from_wire(a: Option<wire::Plane>, n: usize) -> Result<Vec<f32>, WireE
 }
 
 fn colour_from_wire(colour: Option<wire::Plane>, n: usize) -> Result<Vec<[u32; 3]>, WireError> {
-    plane::from_wire(colour.unwrap_or_default(), n, |p: [u32; 3]| p)
-        .map_err(|e| e.within("colour"))
+    plane::from_wire(colour.unwrap_or_default(), n, |p: [u32; 3]| p).map_err(|e| e.within("colour"))
 }
 
 fn last_to_wire(last: &Option<Vec<RawSums>>, n: usize) -> Option<wire::Plane> {
@@ -71,10 +70,7 @@ fn last_to_wire(last: &Option<Vec<RawSums>>, n: usize) -> Option<wire::Plane> {
     })
 }
 
-fn last_from_wire(
-    last: Option<wire::Plane>,
-    n: usize,
-) -> Result<Option<Vec<RawSums>>, WireError> {
+fn last_from_wire(last: Option<wire::Plane>, n: usize) -> Result<Option<Vec<RawSums>>, WireError> {
     last.map(|sums| plane::from_wire(sums, n, |p: RawSums| p).map_err(|e| e.within("last_sheet")))
         .transpose()
 }
@@ -293,8 +289,7 @@ fn region_cost_to_wire(cost: &RegionCost) -> wire::RegionCost {
 
 /// `None` where no pixel was sampled.
 fn sampled_to_wire(s: Sampled) -> Option<wire::SampledError> {
-    (s != Sampled::default())
-        .then_some(wire::SampledError { pixels: s.pixels, squares: s.squares })
+    (s != Sampled::default()).then_some(wire::SampledError { pixels: s.pixels, squares: s.squares })
 }
 
 fn region_cost_from_wire(cost: wire::RegionCost) -> Result<RegionCost, WireError> {

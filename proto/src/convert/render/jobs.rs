@@ -5,8 +5,7 @@ use super::watch::{state_from_wire, state_to_wire};
 use super::wire;
 use crate::convert::numbers::size_from_wire;
 use crate::convert::{
-    MAX_NAME, WireError, name_from_wire, optional_name_from_wire, reason_from_wire,
-    reason_to_wire,
+    MAX_NAME, WireError, name_from_wire, optional_name_from_wire, reason_from_wire, reason_to_wire,
 };
 use crate::model::{Job, Worker};
 use prost_types::{Duration as WireDuration, Timestamp};

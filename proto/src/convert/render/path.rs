@@ -205,8 +205,7 @@ fn key_to_wire(key: &Key) -> wire::Key {
 fn key_from_wire(key: wire::Key) -> Result<Key, WireError> {
     use wire::key::Viewpoint;
     let number = |field: &str, x: Option<f64>| x.map(|x| finite(field, x)).transpose();
-    let vec3 =
-        |field: &str, v: Option<wire::Vec3>| v.map(|v| vec3_from_wire(field, v)).transpose();
+    let vec3 = |field: &str, v: Option<wire::Vec3>| v.map(|v| vec3_from_wire(field, v)).transpose();
     let mut out = Key {
         at: number("frame", key.frame)?,
         target: vec3("target", key.target)?,
@@ -214,10 +213,7 @@ fn key_from_wire(key: wire::Key) -> Result<Key, WireError> {
         projection: projection_from_wire("projection", key.projection)?,
         height: number("height", key.height)?,
         fov: number("fov", key.fov)?,
-        tf: key
-            .transfer
-            .map_or(Ok(None), choice_from_wire)
-            .map_err(|e| e.within("transfer"))?,
+        tf: key.transfer.map_or(Ok(None), choice_from_wire).map_err(|e| e.within("transfer"))?,
         ..Key::default()
     };
     match key.viewpoint {
@@ -235,8 +231,7 @@ fn key_from_wire(key: wire::Key) -> Result<Key, WireError> {
 fn flythrough_from_wire(f: wire::FlyThrough) -> Result<FlyThrough, WireError> {
     let eyes = f.eyes.into_iter().enumerate();
     let eyes = eyes.map(|(i, eye)| vec3_from_wire(&format!("eyes[{i}]"), eye));
-    let vec3 =
-        |field: &str, v: Option<wire::Vec3>| v.map(|v| vec3_from_wire(field, v)).transpose();
+    let vec3 = |field: &str, v: Option<wire::Vec3>| v.map(|v| vec3_from_wire(field, v)).transpose();
     Ok(FlyThrough {
         frames: f.frames,
         eyes: eyes.collect::<Result<_, _>>()?,

@@ -39,16 +39,12 @@ pub fn volume_from_wire(
         }
     }
     let (up, front) = (axis_from_wire("up", volume.up)?, axis_from_wire("front", volume.front)?);
-    let orientation = Orientation::new(
-        Some(required("up", up)?),
-        Some(required("front", front)?),
-    )?;
+    let orientation = Orientation::new(Some(required("up", up)?), Some(required("front", front)?))?;
     Ok(VolumeDescription {
         name: volume.name,
         file_type: volume.file_type,
         anatomical: volume.anatomical,
-        info: info_from_wire(required("volume", volume.volume)?)
-            .map_err(|e| e.within("volume"))?,
+        info: info_from_wire(required("volume", volume.volume)?).map_err(|e| e.within("volume"))?,
         orientation,
         pixels_version: volume.pixels_version,
         protocol_version: volume.protocol_version,

@@ -1,6 +1,7 @@
-//! What can go wrong between a client and its master, each in one line with its remedy.
+//! Errors between a client and its master, each in one line with its remedy.
 
 use slabcast_proto::convert::MAX_REASON;
+use slabcast_proto::status::{Details, Reason};
 use std::error::Error;
 use std::time::Duration;
 use tonic::{Code, Status};
@@ -11,17 +12,17 @@ pub enum ClientError {
     /// The address can't be called.
     #[error("`{address}` {problem}")]
     Address {
-        /// As it was given.
+        /// The address as it was given.
         address: String,
-        /// What is wrong and what to do.
+        /// What is wrong with it, and what to do.
         problem: &'static str,
     },
-    /// Nobody answers.
+    /// Nobody answers at the address.
     #[error(
         "no master at {address} ({cause}): start one with `slabcast master`, or check host and port"
     )]
     Connect {
-        /// Where.
+        /// The master's address.
         address: String,
         /// What the system says.
         cause: String,
@@ -29,10 +30,12 @@ pub enum ClientError {
     /// The connection broke, or the master is ending or starting.
     #[error("lost the master at {address} ({cause}): the job goes on; call again")]
     Lost {
-        /// Where.
+        /// The master's address.
         address: String,
         /// What the system or the master says.
         cause: String,
+        /// How long the master asks to wait before the call is made again.
+        retry_after: Option<Duration>,
     },
     /// The master stayed away for longer than was allowed.
     #[error(
@@ -40,7 +43,7 @@ pub enum ClientError {
          watch it from frame {next_frame} when the master is back", after.as_secs_f64()
     )]
     GaveUp {
-        /// Where.
+        /// The master's address.
         address: String,
         /// How long it was waited for.
         after: Duration,
@@ -49,11 +52,15 @@ pub enum ClientError {
         /// The first frame that is not whole.
         next_frame: u64,
     },
-    /// The master refused a field of the request.
-    #[error("refused: {message}")]
-    Refused {
-        /// The field, what is wrong with it and what to do.
-        message: String,
+    /// A field of the request is wrong.
+    #[error("refused: {field}: {problem}")]
+    InvalidField {
+        /// Path of the field within the request, as the `.proto` writes it
+        /// (`path.views.views[3].eye`); [`crate::local_field`] gives the name that flags and JSON
+        /// files have for it.
+        field: String,
+        /// What is wrong with it, and what to do.
+        problem: String,
     },
     /// The request is longer than a master takes.
     #[error(
@@ -61,9 +68,9 @@ pub enum ClientError {
          turntable, or give the transfer function fewer points"
     )]
     TooLong {
-        /// Its bytes.
+        /// Bytes of the request.
         bytes: usize,
-        /// The most that are taken.
+        /// The most bytes that are taken.
         most: usize,
     },
     /// The master does not know the job.
@@ -72,11 +79,32 @@ pub enum ClientError {
         /// What the master says.
         message: String,
     },
-    /// The master said no.
+    /// The master no longer keeps the pixels of a frame.
+    #[error("{message}{}", match first_kept_frame {
+        Some(frame) => format!(": or watch from frame {frame}, the first that is kept"),
+        None => String::new(),
+    })]
+    FrameNotKept {
+        /// The first frame after it that the master keeps; `None` if it keeps none.
+        first_kept_frame: Option<u64>,
+        /// What the master says.
+        message: String,
+    },
+    /// The master has as many jobs or watchers as it takes.
+    #[error("{message} (ResourceExhausted): the master is full; try later, or cancel a job")]
+    Full {
+        /// What the master says.
+        message: String,
+        /// How long the master asks to wait before the call is made again.
+        retry_after: Option<Duration>,
+    },
+    /// The master answered with another status.
     #[error("{message} ({code:?}): {remedy}")]
-    Said {
-        /// Its status.
+    Status {
+        /// Code of the status.
         code: Code,
+        /// Reason of the status, if the master gave one that this version knows.
+        reason: Option<Reason>,
         /// What the master says.
         message: String,
         /// What to do.
@@ -85,23 +113,24 @@ pub enum ClientError {
     /// The job can't be finished.
     #[error("{job} failed: {reason}")]
     JobFailed {
-        /// Which job.
+        /// Id of the job.
         job: String,
         /// Why, and what to do.
         reason: String,
     },
-    /// Somebody cancelled the job.
+    /// The job was cancelled.
     #[error("{job} was cancelled: submit the path again to have the rest of it")]
     JobCancelled {
-        /// Which job.
+        /// Id of the job.
         job: String,
     },
     /// The master broke the protocol.
     #[error(
-        "{address} does not talk like a slabcast master of this version ({problem}): check the address and both versions"
+        "{address} does not talk like a slabcast master of this version ({problem}): check the \
+         address and both versions"
     )]
     Nonsense {
-        /// Where.
+        /// The master's address.
         address: String,
         /// What it did.
         problem: String,
@@ -109,46 +138,70 @@ pub enum ClientError {
 }
 
 impl ClientError {
-    /// What a status of a call means.
-    pub(crate) fn of_status(address: &str, status: &Status) -> ClientError {
-        if is_weather(status) {
+    /// Reads the status of a call, by its code and its details.
+    pub(crate) fn from_status(address: &str, status: &Status) -> ClientError {
+        let details = Details::from_status(status);
+        if is_transient(status) {
             let cause = match status.source() {
                 Some(source) => root_cause(source),
                 None => one_line(status.message()),
             };
-            return ClientError::Lost { address: address.to_owned(), cause };
+            let retry_after = details.retry_after;
+            return ClientError::Lost { address: address.to_owned(), cause, retry_after };
         }
         let message = match one_line(status.message()) {
             empty if empty.is_empty() => status.code().description().to_owned(),
             message => message,
         };
+        if let Some((field, problem)) = &details.field {
+            let (field, problem) = (one_line(field), one_line(problem));
+            return ClientError::InvalidField { field, problem };
+        }
         let remedy = match status.code() {
-            Code::InvalidArgument => return ClientError::Refused { message },
             Code::NotFound => return ClientError::NotFound { message },
             Code::Unimplemented => {
                 return ClientError::Nonsense { address: address.to_owned(), problem: message };
             }
+            Code::ResourceExhausted => {
+                return ClientError::Full { message, retry_after: details.retry_after };
+            }
+            Code::FailedPrecondition if details.reason == Some(Reason::FrameNotKept) => {
+                let first_kept_frame = details.number("first_kept_frame");
+                return ClientError::FrameNotKept { first_kept_frame, message };
+            }
+            Code::InvalidArgument => "change the request",
             Code::AlreadyExists => "the key belongs to another request; choose a fresh one",
-            Code::ResourceExhausted => "the master is full; try later, or cancel a job",
             Code::OutOfRange => "ask for less: an earlier frame, or a shorter request",
             Code::FailedPrecondition => "watch from a later frame, or submit the path again",
             Code::DeadlineExceeded | Code::Cancelled => "the master is slow; try again",
-            Code::PermissionDenied | Code::Unauthenticated => "ask who runs the master",
+            Code::PermissionDenied | Code::Unauthenticated => {
+                "the master wants credentials, which this version can't send; ask who runs it"
+            }
             _ => "the master is at fault; report it",
         };
-        ClientError::Said { code: status.code(), message, remedy }
+        ClientError::Status { code: status.code(), reason: details.reason, message, remedy }
     }
 
-    /// Whether the same call may succeed a little later without anybody doing anything.
+    /// Returns whether the same call may succeed a little later without anybody doing anything.
     pub fn is_passing(&self) -> bool {
         matches!(self, ClientError::Lost { .. } | ClientError::Connect { .. })
+    }
+
+    /// Returns how long the master asks to wait before the call is made again, if it does.
+    pub fn retry_after(&self) -> Option<Duration> {
+        match self {
+            ClientError::Lost { retry_after, .. } | ClientError::Full { retry_after, .. } => {
+                *retry_after
+            }
+            _ => None,
+        }
     }
 }
 
 /// Whether a call ended because of the connection or because the master asks to call again. A
 /// status that was made on this side, by a connection that broke, has a source; one that a
 /// master sent has none.
-pub(crate) fn is_weather(status: &Status) -> bool {
+pub(crate) fn is_transient(status: &Status) -> bool {
     let sent_by_master = status.source().is_none();
     match status.code() {
         Code::Unavailable => true,

@@ -11,8 +11,8 @@ use std::time::Duration;
 use tokio::time::Instant;
 use tonic::Streaming;
 
-/// How long to wait for a master that is away, where nobody says otherwise: a restart takes
-/// seconds, reading a large volume again up to a minute.
+/// Time to wait for a master that is away, unless the caller says otherwise: a restart takes seconds,
+/// reading a large volume again up to a minute.
 pub const PATIENCE: Duration = Duration::from_secs(120);
 
 /// First wait before a connection is made again; it doubles up to [`LONGEST_WAIT`].
@@ -30,7 +30,7 @@ const ON_TRUST: usize = 64 << 20;
 /// Longest trace of one frame, in bytes.
 const MAX_TRACE: usize = 256 << 20;
 
-/// What comes of a job.
+/// An event of a job: news, or a frame.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Update {
     /// News of the job.
@@ -42,7 +42,7 @@ pub enum Update {
 /// A whole frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ReceivedFrame {
-    /// Its number in the path.
+    /// Number of the frame in its job, from 0.
     pub number: u64,
     /// Width and height in pixels.
     pub size: [u32; 2],
@@ -50,9 +50,9 @@ pub struct ReceivedFrame {
     pub format: PixelFormat,
     /// Pixels, row-major from the top left, without padding.
     pub bytes: Vec<u8>,
-    /// Its statistics.
+    /// Statistics of the frame.
     pub stats: FrameStats,
-    /// Its statistics as one line of JSON, version 1 (docs: statistics).
+    /// Statistics as one line of JSON, version 1 (docs: statistics).
     pub stats_json: String,
     /// Spans for a trace, if the request wanted them.
     pub trace_json: Option<String>,
@@ -115,20 +115,27 @@ impl FrameStream {
         Ok(frames)
     }
 
-    /// The job whose frames these are.
+    /// Returns the id of the job whose frames these are.
     pub fn job(&self) -> &str {
         &self.job
     }
 
-    /// The first frame that has not come whole: where to take up after an error.
+    /// Returns the number of the first frame that has not come whole: where to continue after an
+    /// error.
     pub fn next_frame(&self) -> u64 {
         self.next
     }
 
-    /// The next notice or whole frame; `None` after the last frame of a job that is done. A job
-    /// that fails or is cancelled says so in a notice, and at the end in an error.
+    /// Returns the next notice or whole frame; `None` after the last frame of a job that is done.
     ///
     /// May be dropped before it is ready (in a `select!`) without losing anything.
+    ///
+    /// # Errors
+    /// [`ClientError::JobFailed`] and [`ClientError::JobCancelled`] after the last frame of such a
+    /// job; [`ClientError::Lost`] or [`ClientError::GaveUp`] if the connection breaks, by
+    /// [`Client::watch`] or [`Client::follow`]; [`ClientError::FrameNotKept`] if the master no
+    /// longer keeps the next frame; [`ClientError::Nonsense`] if the chunks of a frame do not fit
+    /// together.
     pub async fn next(&mut self) -> Result<Option<Update>, ClientError> {
         loop {
             if self.over {
@@ -167,9 +174,10 @@ impl FrameStream {
                 return Err(ClientError::Lost {
                     address: self.client.address().to_owned(),
                     cause: "the stream ended before the job did".into(),
+                    retry_after: None,
                 });
             }
-            Err(status) => return Err(ClientError::of_status(self.client.address(), &status)),
+            Err(status) => return Err(ClientError::from_status(self.client.address(), &status)),
         };
         match convert::watch_from_wire(chunk).map_err(|e| self.client.nonsense(&e))? {
             WatchMessage::Notice(notice) => {
@@ -200,12 +208,13 @@ impl FrameStream {
         // Not the call's own deadline: that would end the stream, too.
         let stream = match tokio::time::timeout(ANSWER, render.watch_frames(request)).await {
             Ok(stream) => stream
-                .map_err(|status| ClientError::of_status(self.client.address(), &status))?
+                .map_err(|status| ClientError::from_status(self.client.address(), &status))?
                 .into_inner(),
             Err(_) => {
                 return Err(ClientError::Lost {
                     address: self.client.address().to_owned(),
                     cause: format!("no answer in {} s", ANSWER.as_secs()),
+                    retry_after: None,
                 });
             }
         };
@@ -225,7 +234,8 @@ impl FrameStream {
         }
         let now = Instant::now();
         let trouble = self.trouble.get_or_insert(Trouble { since: now, wait: FIRST_WAIT });
-        let wait = trouble.wait;
+        // A master that asks for more is waited for longer, within reason.
+        let wait = trouble.wait.max(error.retry_after().unwrap_or_default()).min(LONGEST_WAIT);
         trouble.wait = (2 * wait).min(LONGEST_WAIT);
         let after = now - trouble.since;
         if after + wait > patience {

@@ -28,7 +28,9 @@ mod frames;
 
 pub use error::ClientError;
 pub use frames::{FrameStream, PATIENCE, ReceivedFrame, Update};
+pub use slabcast_proto::convert::local_field;
 pub use slabcast_proto::model::{Job, JobNotice, JobState, VolumeDescription, Worker};
+pub use slabcast_proto::status::Reason;
 
 use prost::Message;
 use slabcast_common::message::PathRequest;
@@ -40,12 +42,12 @@ use std::time::Duration;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Request, Response, Status};
 
-/// How long a connection may take to stand. A host that is there answers within a round trip;
-/// one that is not is found out by this.
+/// Time that a connection may take to be made. A host that is there answers within a round trip; one
+/// that is not is found out by this.
 const CONNECT: Duration = Duration::from_secs(5);
 
-/// How long a master may take to answer. It answers from memory; only a volume that is still
-/// being read or a machine that swaps takes seconds.
+/// Time that a master may take to answer. It answers from memory; only a machine that swaps takes
+/// seconds.
 pub(crate) const ANSWER: Duration = Duration::from_secs(30);
 
 /// Jobs or workers of a page: the most that a master takes.
@@ -53,6 +55,9 @@ const MAX_PAGE: usize = 1000;
 
 /// Wait before a call is made a second time.
 const AGAIN: Duration = Duration::from_millis(100);
+
+/// Longest such wait, whatever the master asks for.
+const LONGEST_AGAIN: Duration = Duration::from_secs(2);
 
 /// A master, as its clients see it. Clones share one connection, which comes back by itself.
 #[derive(Clone, Debug)]
@@ -95,14 +100,23 @@ impl Client {
         Ok(Client { render, address: address.into() })
     }
 
-    /// The master's address, as `host:port`.
+    /// Returns the master's address, as `host:port`.
     pub fn address(&self) -> &str {
         &self.address
     }
 
-    /// Submits a path and gives the job's name. Calling again with the same `client_key` and
+    /// Submits a path and returns the job's id. Calling again with the same `client_key` and
     /// the same request gives the same job.
+    ///
+    /// # Errors
+    /// [`ClientError::InvalidField`] if a field is wrong, [`ClientError::TooLong`] if the request
+    /// is, [`ClientError::Full`] if the master takes no more jobs; [`ClientError::Status`] with
+    /// [`Reason::ClientKeyTaken`] if the key belongs to another request.
     pub async fn submit(&self, request: &PathRequest) -> Result<String, ClientError> {
+        request.path.check().map_err(|e| ClientError::InvalidField {
+            field: convert::wire_field(&e.field, &request.path),
+            problem: e.problem,
+        })?;
         let request = convert::submit_to_wire(request);
         let bytes = request.encoded_len();
         if bytes > MAX_RENDER_MESSAGE {
@@ -117,16 +131,22 @@ impl Client {
         Ok(reply.job_id)
     }
 
-    /// The frames of a job from `from_frame` on, over one connection: when that breaks, so does
-    /// the stream. [`Client::follow`] takes up again.
+    /// Streams the frames of a job from `from_frame` on, over one connection: when that breaks, so
+    /// does the stream. [`Client::follow`] continues.
+    ///
+    /// # Errors
+    /// [`ClientError::NotFound`] if the master does not know the job, [`ClientError::Lost`] if it is
+    /// out of reach, [`ClientError::Full`] if it has no room for another watcher.
     pub async fn watch(&self, job: &str, from_frame: u64) -> Result<FrameStream, ClientError> {
         FrameStream::open(self.clone(), job.to_owned(), from_frame, None).await
     }
 
-    /// The frames of a job from `from_frame` on. When the connection breaks it is made again and
-    /// the stream goes on at the first frame that is not whole, as often as need be; only when
-    /// the master stays away for `patience` does the stream end with
-    /// [`ClientError::GaveUp`].
+    /// Streams the frames of a job from `from_frame` on. When the connection breaks it is made again
+    /// and the stream continues at the first frame that is not whole, as often as need be.
+    ///
+    /// # Errors
+    /// [`ClientError::GaveUp`] if the master stays away for `patience`; else as [`Client::watch`],
+    /// but for [`ClientError::Lost`].
     pub async fn follow(
         &self,
         job: &str,
@@ -136,7 +156,11 @@ impl Client {
         FrameStream::open(self.clone(), job.to_owned(), from_frame, Some(patience)).await
     }
 
-    /// One job.
+    /// Returns one job.
+    ///
+    /// # Errors
+    /// [`ClientError::NotFound`] if the master does not know it, [`ClientError::Lost`] if the master
+    /// is out of reach.
     pub async fn job(&self, job: &str) -> Result<Job, ClientError> {
         let request = wire::GetJobRequest { job_id: job.to_owned() };
         let response = self.call(async |mut r, request| r.get_job(request).await, request).await?;
@@ -171,7 +195,11 @@ impl Client {
         Ok(jobs)
     }
 
-    /// Cancels a job and gives what became of it: one that was done before stays done.
+    /// Cancels a job and returns it as it is then: one that was done before stays done.
+    ///
+    /// # Errors
+    /// [`ClientError::NotFound`] if the master does not know it, [`ClientError::Lost`] if the master
+    /// is out of reach.
     pub async fn cancel(&self, job: &str) -> Result<Job, ClientError> {
         let request = wire::CancelJobRequest { job_id: job.to_owned() };
         let response =
@@ -179,7 +207,11 @@ impl Client {
         self.read_job(response.job)
     }
 
-    /// The volume that the master serves.
+    /// Returns the volume that the master serves.
+    ///
+    /// # Errors
+    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Nonsense`] if it does not
+    /// talk like one.
     pub async fn volume(&self) -> Result<VolumeDescription, ClientError> {
         let request = wire::DescribeVolumeRequest {};
         let volume =
@@ -234,14 +266,16 @@ impl Client {
             call(self.render.clone(), request)
         };
         match once().await {
-            Err(status) if error::is_weather(&status) => {
-                tokio::time::sleep(AGAIN).await;
+            Err(status) if error::is_transient(&status) => {
+                let lost = ClientError::from_status(&self.address, &status);
+                let wait = lost.retry_after().unwrap_or(AGAIN);
+                tokio::time::sleep(wait.clamp(AGAIN, LONGEST_AGAIN)).await;
                 once().await
             }
             other => other,
         }
         .map(Response::into_inner)
-        .map_err(|status| ClientError::of_status(&self.address, &status))
+        .map_err(|status| ClientError::from_status(&self.address, &status))
     }
 
     /// The master said what `render.proto` rules out.

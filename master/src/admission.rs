@@ -191,7 +191,6 @@ impl WorkerTable {
 
     /// A worker as `slabcast status` lists it: what the scheduler says, with its link's figures.
     pub(crate) fn view(&self, seen: WorkerView) -> Option<Worker> {
-        let ms = |since: Instant| since.elapsed().as_millis() as u64;
         let attached = self.attached.get(&seen.id)?;
         Some(Worker {
             id: seen.id,

@@ -5,7 +5,7 @@ use crate::output::Frame;
 use crate::progress::Step;
 use crate::request::Asked;
 use crate::source::{Cancel, Source, Update};
-use slabcast_client::{Client, ClientError, JobState, PATIENCE, VolumeDescription};
+use slabcast_client::{Client, ClientError, JobState, PATIENCE, VolumeDescription, local_field};
 use slabcast_common::message::PathRequest;
 use slabcast_common::quality::Refused;
 use std::time::{Duration, Instant};
@@ -51,11 +51,9 @@ pub async fn describe(client: &Client) -> Result<VolumeDescription, Fail> {
 /// Submits a path and follows it.
 pub async fn submit(client: Client, asked: &Asked, request: PathRequest) -> Result<Source, Fail> {
     let job = client.submit(&request).await.map_err(|e| match &e {
-        // The master's words begin with the field.
-        ClientError::Refused { message } => match message.split_once(": ") {
-            Some((field, problem)) => asked.blame(&Refused::new(field, problem)),
-            None => Fail::usage(message.clone()),
-        },
+        ClientError::InvalidField { field, problem } => {
+            asked.blame(&Refused::new(local_field(field), problem))
+        }
         _ => fail(&e),
     })?;
     let (name, job_now) = watch::channel(job);
@@ -123,7 +121,7 @@ async fn follow(
                 match update? {
                     Some(slabcast_client::Update::Notice(n)) => {
                         latest = step(&n, client.address());
-                        queued = n.state == JobState::Queued && n.message.is_empty();
+                        queued = n.state == JobState::Queued;
                         Update::Step(latest.clone())
                     }
                     Some(slabcast_client::Update::Frame(f)) => {
@@ -165,8 +163,8 @@ fn step(n: &slabcast_client::JobNotice, master: &str) -> Step {
         // "frame 3: slab 1 of 3, ...": the bar has the frame already.
         JobState::Running => message.split_once(": ").map_or(message, |(_, rest)| rest).into(),
         // For a moment every job is: worth a word only when it lasts.
-        JobState::Queued if message.is_empty() => "queued".into(),
-        JobState::Queued => message.into(),
+        JobState::Queued => "queued".into(),
+        JobState::Preparing => message.into(),
         _ => String::new(),
     };
     Step { waiting, detail, frames: n.frames_done, ..Step::default() }

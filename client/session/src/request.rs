@@ -544,8 +544,19 @@ impl Asked {
             "up",
             "front",
         ];
+        // Fields of a transfer function's file.
+        const TRANSFER: [&str; 8] = [
+            "transfer function",
+            "domain",
+            "colors",
+            "opacities",
+            "color_space",
+            "opacity_unit",
+            "gradient_opacity",
+            "shading",
+        ];
         // A box names its axis.
-        if refused.field.starts_with("crop") || refused.field.starts_with("path.crop") {
+        if refused.field.starts_with("crop") {
             return Fail::usage(format!("--crop: {}", refused.problem));
         }
         const OF_PATHS: [&str; 10] = [
@@ -574,10 +585,10 @@ impl Asked {
         {
             return Fail::field(file, "view path", refused);
         }
-        if refused.field.starts_with("transfer_json")
+        if TRANSFER.iter().any(|name| refused.field.starts_with(name))
             && let Some(file) = self.transfer.file()
         {
-            return Fail::field(file, "transfer_json", refused);
+            return Fail::field(file, "transfer function", refused);
         }
         if FLAGS.contains(&field) {
             return Fail::flag(&Refused::new(field, &refused.problem));

@@ -1,8 +1,8 @@
 //! RenderService: jobs, frames, the volume and the workers.
 
 use super::Responses;
-use crate::{Handle, SubmitError};
 use crate::jobs::{JobState, JobView, Watch, WatchItem};
+use crate::{Handle, SubmitError};
 use slabcast_common::ids::JobId;
 use slabcast_proto::MAX_RENDER_MESSAGE;
 use slabcast_proto::convert::{self, Page};

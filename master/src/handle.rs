@@ -208,8 +208,7 @@ impl Handle {
 
     /// Returns the first frame of a job, from `frame` on, whose pixels are kept.
     pub fn first_kept_frame(&self, job: JobId, frame: u64) -> Option<u64> {
-        let table = self.jobs.lock();
-        table.get(job)?.frames.range(frame..).next().map(|(number, _)| *number)
+        self.jobs.lock().get(job)?.first_kept(frame)
     }
 
     /// Returns all jobs that are remembered, oldest first.

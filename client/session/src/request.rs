@@ -571,10 +571,8 @@ impl Asked {
             "up",
             "front",
         ];
-        // Refusals that crossed the wire carry where in the message the field was.
         let inner = refused.field.rsplit('.').next().unwrap_or_default();
         let field = match inner {
-            "tiles_per_worker" => "tiles-per-worker",
             // A turntable's eye is as far as its height and field of view put it.
             "eye" | "target" if self.path.turntable.is_some() => "height",
             field => field,

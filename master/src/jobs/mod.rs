@@ -134,6 +134,11 @@ impl Job {
         }
     }
 
+    /// Returns the first frame from `number` on whose pixels are kept.
+    pub(crate) fn first_kept(&self, number: u64) -> Option<u64> {
+        self.frames.range(number..).next().map(|(number, _)| *number)
+    }
+
     /// Whether it keeps a frame that nobody has taken.
     pub(crate) fn has_untaken(&self) -> bool {
         self.untaken.0 > 0

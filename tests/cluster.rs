@@ -333,8 +333,9 @@ async fn a_worker_of_another_protocol_is_refused_by_name() {
         cluster_v1::cluster_service_client::ClusterServiceClient as ClusterClient, convert,
     };
     let (_master, address) = master();
+    use slabcast_common::protocol::{PROTOCOL_VERSIONS, ProtocolVersions};
     let hello = |protocol_version: u32, pixels_version: u32, hash: &str| Hello {
-        protocol_version,
+        protocol_versions: ProtocolVersions { oldest: protocol_version, newest: protocol_version },
         pixels_version,
         name: "stranger".into(),
         threads: 1,
@@ -349,7 +350,7 @@ async fn a_worker_of_another_protocol_is_refused_by_name() {
     let good = SELF_TEST_SHA256;
     let wrong = "0".repeat(64);
     let [this, expects] =
-        [format!("this master {PROTOCOL_VERSION}"), format!("expects {PIXELS_VERSION}")];
+        [format!("this master {PROTOCOL_VERSIONS}"), format!("expects {PIXELS_VERSION}")];
     for (hello, both) in [
         (hello(99, PIXELS_VERSION, good), ["99", &this]),
         (hello(PROTOCOL_VERSION, 99, good), ["99", &expects]),
@@ -374,7 +375,7 @@ async fn a_worker_of_another_protocol_is_refused_by_name() {
 #[tokio::test]
 async fn a_worker_of_the_masters_machine_is_told_to_send_results_as_they_are() {
     use slabcast_common::message::{Hello, ToMaster, ToWorker};
-    use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
+    use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
     use slabcast_proto::{
         cluster_v1::cluster_service_client::ClusterServiceClient as ClusterClient, convert,
     };
@@ -382,7 +383,7 @@ async fn a_worker_of_the_masters_machine_is_told_to_send_results_as_they_are() {
     for (machine, here) in [("", true), ("another", !named)] {
         let ((_master, address), dir) = (master(), tempfile::tempdir().unwrap());
         let hello = Hello {
-            protocol_version: PROTOCOL_VERSION,
+            protocol_versions: slabcast_common::protocol::PROTOCOL_VERSIONS,
             pixels_version: PIXELS_VERSION,
             name: "stub".into(),
             threads: 1,

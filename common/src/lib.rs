@@ -24,6 +24,7 @@ pub mod occlusion;
 pub mod paraview;
 pub mod path;
 pub mod presets;
+pub mod protocol;
 pub mod quality;
 pub mod region;
 pub mod shade;
@@ -39,8 +40,7 @@ pub mod wanted;
 /// bytes for the same view; a change of any golden hash raises it (CONTRACTS.md, Exactness).
 pub const PIXELS_VERSION: u32 = 10;
 
-/// Version of the messages between master, worker and client.
-pub const PROTOCOL_VERSION: u32 = 6;
+pub use protocol::PROTOCOL_VERSION;
 
 /// SHA-256 of the self-test tile that every worker draws before it says hello
 /// (`slabcast_render::selftest`, which also has the test that keeps this constant true).

@@ -10,6 +10,7 @@ use crate::image::{Background, PixelFormat, TilePixels, TileState};
 use crate::leaves::{Finish, Leaves};
 use crate::occlusion::Rect;
 use crate::path::ViewPath;
+use crate::protocol::ProtocolVersions;
 use crate::quality::{Quality, Work};
 use crate::region::parts;
 use crate::slab::SheetRange;
@@ -124,6 +125,8 @@ pub enum ToWorker {
         worker: WorkerId,
         /// How often the master pings; silence for three times as long means it is gone.
         heartbeat_ms: u32,
+        /// Version of the protocol that both speak on this link.
+        protocol_version: u32,
     },
     /// The hello was not good; the link ends. Says why and what to do.
     Refused {
@@ -209,9 +212,9 @@ pub enum ToWorker {
 /// Who a worker is.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Hello {
-    /// `PROTOCOL_VERSION`.
-    pub protocol_version: u32,
-    /// `PIXELS_VERSION`.
+    /// Versions of the protocol that the worker speaks.
+    pub protocol_versions: ProtocolVersions,
+    /// The worker's `PIXELS_VERSION`.
     pub pixels_version: u32,
     /// A name for people (host and process).
     pub name: String,

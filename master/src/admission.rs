@@ -6,27 +6,25 @@
 use crate::link::{Caller, WorkerLink};
 use slabcast_common::ids::WorkerId;
 use slabcast_common::message::{Hello, ToMaster, ToWorker};
-use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
+use slabcast_common::protocol::{MAX_THREADS, PROTOCOL_VERSIONS, ProtocolVersions};
+use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
 use slabcast_proto::model::Worker;
 use slabcast_schedule::WorkerView;
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-/// Most render threads of one worker.
-pub const MAX_THREADS: u32 = 4096;
-
 /// Why a worker is not let in. Its text names what the worker has, what the master has, and the
 /// remedy.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum AttachError {
-    /// The worker speaks another protocol version.
+    /// The worker and the master speak no protocol version in common.
     #[error(
-        "the worker speaks protocol {worker}, this master {PROTOCOL_VERSION}; run the same version \
+        "the worker speaks protocol {worker}, this master {PROTOCOL_VERSIONS}; run the same version \
          of slabcast on both"
     )]
     Protocol {
-        /// The worker's protocol version.
-        worker: u32,
+        /// The versions that the worker speaks.
+        worker: ProtocolVersions,
     },
     /// The worker draws other pixels.
     #[error(
@@ -69,11 +67,12 @@ pub enum AttachError {
     ShuttingDown,
 }
 
-/// Checks a hello. `rehearses`: whether the master does.
-fn check(hello: &Hello, rehearses: bool) -> Result<(), AttachError> {
-    if hello.protocol_version != PROTOCOL_VERSION {
-        return Err(AttachError::Protocol { worker: hello.protocol_version });
-    }
+/// Checks a hello and returns the protocol version that both speak. `rehearses`: whether the
+/// master does.
+fn check(hello: &Hello, rehearses: bool) -> Result<u32, AttachError> {
+    let Some(version) = PROTOCOL_VERSIONS.newest_common(hello.protocol_versions) else {
+        return Err(AttachError::Protocol { worker: hello.protocol_versions });
+    };
     if hello.pixels_version != PIXELS_VERSION {
         return Err(AttachError::Pixels { worker: hello.pixels_version });
     }
@@ -87,7 +86,7 @@ fn check(hello: &Hello, rehearses: bool) -> Result<(), AttachError> {
     match (hello.rehearses, rehearses) {
         (true, false) => Err(AttachError::Rehearses),
         (false, true) => Err(AttachError::Draws),
-        _ => Ok(()),
+        _ => Ok(version),
     }
 }
 
@@ -138,12 +137,13 @@ impl WorkerTable {
         caller: Caller,
         link: WorkerLink,
     ) -> Result<Admitted, AttachError> {
-        check(hello, self.rehearses)?;
+        let protocol_version = check(hello, self.rehearses)?;
         let worker = WorkerId(self.next_id);
         self.next_id += 1;
         // A worker that rehearses stands for one on another machine.
         let is_local = caller.is_on(&hello.machine, &self.machine) && !hello.rehearses;
-        let _ = link.control.send(ToWorker::Welcome { worker, heartbeat_ms: self.heartbeat_ms });
+        let heartbeat_ms = self.heartbeat_ms;
+        let _ = link.control.send(ToWorker::Welcome { worker, heartbeat_ms, protocol_version });
         let now = Instant::now();
         let attached = Attached {
             link,
@@ -216,7 +216,7 @@ mod tests {
 
     fn hello() -> Hello {
         Hello {
-            protocol_version: PROTOCOL_VERSION,
+            protocol_versions: PROTOCOL_VERSIONS,
             pixels_version: PIXELS_VERSION,
             name: "w".into(),
             threads: 2,
@@ -231,13 +231,21 @@ mod tests {
 
     #[test]
     fn hello_that_does_not_fit_is_refused_and_the_text_names_both_sides() {
-        let next = PROTOCOL_VERSION + 1;
+        let newer = PROTOCOL_VERSIONS.newest + 1;
+        let newer = ProtocolVersions { oldest: newer, newest: newer + 1 };
+        let older = PROTOCOL_VERSIONS.oldest - 1;
+        let older = ProtocolVersions { oldest: older, newest: older };
         let wrong = "0".repeat(70);
         for (hello, want, says) in [
             (
-                Hello { protocol_version: next, ..hello() },
-                AttachError::Protocol { worker: next },
-                [format!("protocol {next}"), format!("master {PROTOCOL_VERSION}")],
+                Hello { protocol_versions: newer, ..hello() },
+                AttachError::Protocol { worker: newer },
+                ["protocol 8 to 9".into(), format!("master {PROTOCOL_VERSIONS};")],
+            ),
+            (
+                Hello { protocol_versions: older, ..hello() },
+                AttachError::Protocol { worker: older },
+                ["protocol 6,".into(), format!("master {PROTOCOL_VERSIONS};")],
             ),
             (
                 Hello { pixels_version: 99, ..hello() },
@@ -268,11 +276,18 @@ mod tests {
     }
 
     #[test]
+    fn worker_of_a_newer_version_is_admitted_if_it_still_speaks_the_masters() {
+        let newest = PROTOCOL_VERSIONS.newest;
+        let next = ProtocolVersions { oldest: newest, newest: newest + 1 };
+        assert_eq!(check(&Hello { protocol_versions: next, ..hello() }, false), Ok(newest));
+    }
+
+    #[test]
     fn workers_that_rehearse_and_masters_that_do_not_are_kept_apart() {
         let rehearsing = Hello { rehearses: true, ..hello() };
         assert_eq!(check(&rehearsing, false), Err(AttachError::Rehearses));
         assert_eq!(check(&hello(), true), Err(AttachError::Draws));
-        assert_eq!(check(&rehearsing, true), Ok(()));
-        assert_eq!(check(&hello(), false), Ok(()));
+        assert_eq!(check(&rehearsing, true), Ok(PROTOCOL_VERSIONS.newest));
+        assert_eq!(check(&hello(), false), Ok(PROTOCOL_VERSIONS.newest));
     }
 }

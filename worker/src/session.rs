@@ -11,6 +11,7 @@ use crate::pool::{
 };
 use crate::rehearse::Rehearsal;
 use crate::stalls::{Parking, Say, Who};
+use slabcast_common::PIXELS_VERSION;
 use slabcast_common::brick::{BrickGrid, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId};
 use slabcast_common::message::{
@@ -18,7 +19,7 @@ use slabcast_common::message::{
     ToWorker,
 };
 use slabcast_common::occlusion::Rect;
-use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION};
+use slabcast_common::protocol::PROTOCOL_VERSIONS;
 use slabcast_proto::convert::{self, Bricks};
 use slabcast_render::Simd;
 use std::collections::BTreeMap;
@@ -77,7 +78,7 @@ pub enum Ended {
 /// The hello of a worker with `cache`. Draws the self-test tile (some milliseconds).
 pub fn hello(config: &Config, cache: &BrickCache) -> Hello {
     Hello {
-        protocol_version: PROTOCOL_VERSION,
+        protocol_versions: PROTOCOL_VERSIONS,
         pixels_version: PIXELS_VERSION,
         name: config.name.clone(),
         threads: config.threads,
@@ -147,6 +148,14 @@ pub async fn run(
             message = link.control.recv() => match message {
                 None => return Ok(Ended::Lost("the master closed the link".into())),
                 Some(ToWorker::Refused { reason }) => return Ok(Ended::Refused(reason)),
+                Some(ToWorker::Welcome { protocol_version, .. })
+                    if !PROTOCOL_VERSIONS.contains(protocol_version) =>
+                {
+                    return Ok(Ended::Refused(format!(
+                        "the master chose protocol {protocol_version}, this worker speaks \
+                         {PROTOCOL_VERSIONS}; run the same version of slabcast on both"
+                    )));
+                }
                 Some(ToWorker::Leave { reason }) => return Ok(Ended::MasterLeft(reason)),
                 Some(message) => {
                     desk.heard = tokio::time::Instant::now();
@@ -231,8 +240,8 @@ impl Drop for Desk<'_> {
 impl Desk<'_> {
     fn told(&mut self, message: ToWorker) {
         match message {
-            ToWorker::Welcome { worker, heartbeat_ms } => {
-                info!(%worker, "let in");
+            ToWorker::Welcome { worker, heartbeat_ms, protocol_version } => {
+                info!(%worker, protocol_version, "admitted by the master");
                 self.patience = Duration::from_millis(u64::from(heartbeat_ms) * 3);
             }
             ToWorker::Scene(spec) => {

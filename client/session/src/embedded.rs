@@ -11,6 +11,7 @@ use crate::request::Asked;
 use crate::source::{Cancel, Source, Update};
 use slabcast_common::message::PathRequest;
 use slabcast_common::path::Orientation;
+use slabcast_common::protocol::MAX_THREADS;
 use slabcast_common::volume::Volume;
 use slabcast_master::SubmitError;
 use slabcast_master::jobs::{JobState, WatchItem};
@@ -49,9 +50,9 @@ impl Crew {
     /// `workers` workers of `threads` threads, or of their share of this machine's cores.
     pub fn new(workers: u32, threads: Option<u32>) -> Result<Self, Fail> {
         let threads = threads.unwrap_or_else(|| (cores() / workers).max(1));
-        if workers * threads > 4096 {
+        if workers.saturating_mul(threads) > MAX_THREADS {
             return Err(Fail::usage(format!(
-                "--workers, --threads: {workers} x {threads} threads; give 4096 in all at most"
+                "--workers, --threads: {workers} x {threads} threads; give {MAX_THREADS} in all at most"
             )));
         }
         Ok(Crew { workers, threads })

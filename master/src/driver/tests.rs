@@ -9,7 +9,7 @@ use slabcast_common::message::{
 };
 use slabcast_common::path::{Orientation, Turntable, ViewPath};
 use slabcast_common::quality::{Quality, Work};
-use slabcast_common::{PIXELS_VERSION, PROTOCOL_VERSION, SELF_TEST_SHA256};
+use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Condvar, Mutex};
 
@@ -43,7 +43,7 @@ fn join(handle: &Handle, pings: Arc<AtomicUsize>) {
     let mut end = crate::link::embedded(handle.clone());
     tokio::spawn(async move {
         let hello = Hello {
-            protocol_version: PROTOCOL_VERSION,
+            protocol_versions: slabcast_common::protocol::PROTOCOL_VERSIONS,
             pixels_version: PIXELS_VERSION,
             name: "clear".into(),
             threads: 1,

@@ -15,6 +15,7 @@ use slabcast_common::image::{Background, PixelFormat, TilePixels, TileState};
 use slabcast_common::leaves::{Finish, Leaves};
 use slabcast_common::message::*;
 use slabcast_common::occlusion::Rect;
+use slabcast_common::protocol::ProtocolVersions;
 use slabcast_common::region::parts;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::volume::Samples;
@@ -189,7 +190,10 @@ pub fn hello() -> impl Strategy<Value = Hello> {
     )
         .prop_flat_map(|(versions, name, threads, memory, simd, hash)| {
             vec((key(), ids(50)), 0..4).prop_map(move |held| Hello {
-                protocol_version: versions[0],
+                protocol_versions: ProtocolVersions {
+                    oldest: versions[0].min(versions[1]),
+                    newest: versions[0].max(versions[1]),
+                },
                 pixels_version: versions[1],
                 name: name.clone(),
                 threads,
@@ -224,9 +228,12 @@ pub fn to_master() -> impl Strategy<Value = ToMaster> {
 
 pub fn to_worker() -> impl Strategy<Value = ToWorker> {
     prop_oneof![
-        (any::<u64>(), 1u32..=600_000).prop_map(|(w, heartbeat_ms)| {
-            ToWorker::Welcome { worker: WorkerId(w), heartbeat_ms }
-        }),
+        (any::<u64>(), 1u32..=600_000, any::<u32>()).prop_map(
+            |(w, heartbeat_ms, protocol_version)| {
+                let worker = WorkerId(w);
+                ToWorker::Welcome { worker, heartbeat_ms, protocol_version }
+            }
+        ),
         ".{0,50}".prop_map(|reason| ToWorker::Refused { reason }),
         scene().prop_map(|s| ToWorker::Scene(Arc::new(s))),
         (any::<[u64; 2]>(), view(), prop::option::of(finish()), any::<bool>()).prop_map(

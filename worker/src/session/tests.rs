@@ -71,7 +71,8 @@ impl World {
         let volume = volume.info(Digest32::default());
         let spec = SceneSpec { id, volume, transfer, quality, bricks: SET };
         let (worker, heartbeat_ms) = (WorkerId(1), 60_000);
-        world.say(ToWorker::Welcome { worker, heartbeat_ms });
+        let protocol_version = slabcast_common::PROTOCOL_VERSION;
+        world.say(ToWorker::Welcome { worker, heartbeat_ms, protocol_version });
         world.known = Some((spec.clone(), view));
         world.say(ToWorker::Scene(Arc::new(spec)));
         for (frame, finish) in [(FRAME, None), (FINISHED, Some(FINISH))] {

@@ -26,7 +26,6 @@ use slabcast_common::quality::Work;
 use slabcast_common::region::PART;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::Projected;
-use slabcast_proto::cluster_v1::ControlRequest;
 use slabcast_proto::convert::{self, Compression, Down};
 use slabcast_render::Frame;
 use slabcast_render::Simd;
@@ -756,7 +755,8 @@ mod tests {
 
     fn read(bytes: &[u8]) -> u64 {
         let read = || {
-            let message = ControlRequest::decode(bytes).expect("written above");
+            let message = slabcast_proto::cluster_v1::ControlRequest::decode(bytes);
+            let message = message.expect("written above");
             convert::from_worker_from_wire(message).expect("written above")
         };
         shortest(9, read).0

@@ -20,6 +20,7 @@ use crate::{Config, Micros};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, SceneId, WorkerId};
 use slabcast_common::message::DIRECTORIES;
+use slabcast_common::protocol::MAX_THREADS;
 use std::cmp::Reverse;
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -28,9 +29,6 @@ use std::sync::Arc;
 /// sample of an offset replaces the best one when it is no less certain than the best one has
 /// become.
 const DRIFT: f64 = 100e-6;
-
-/// Limit: render threads of a worker, a peer's claim; five times the largest machine sold.
-const MAX_THREADS: u32 = 4096;
 
 /// Limit: pings without a pong while the worker lives on other messages. 1024 heartbeats are a
 /// quarter of an hour; a worker that owes more will not answer the oldest.

@@ -6,6 +6,7 @@ use super::bricks::{
 use super::{WorkerId, wire};
 use crate::convert::{MAX_BRICK_LIST, WireError, name_from_wire, optional_name_from_wire};
 use slabcast_common::message::{Hello, ToWorker};
+use slabcast_common::protocol::{MAX_THREADS, ProtocolVersions};
 
 pub(super) fn to_wire(hello: &Hello) -> wire::Hello {
     let mut room = MAX_BRICK_LIST;
@@ -19,8 +20,8 @@ pub(super) fn to_wire(hello: &Hello) -> wire::Hello {
         })
         .collect();
     wire::Hello {
-        min_protocol_version: hello.protocol_version,
-        max_protocol_version: hello.protocol_version,
+        min_protocol_version: hello.protocol_versions.oldest,
+        max_protocol_version: hello.protocol_versions.newest,
         pixels_version: hello.pixels_version,
         name: hello.name.clone(),
         threads: hello.threads,
@@ -34,8 +35,12 @@ pub(super) fn to_wire(hello: &Hello) -> wire::Hello {
 }
 
 pub(super) fn from_wire(hello: wire::Hello) -> Result<Hello, WireError> {
-    if !(1..=65536).contains(&hello.threads) {
-        return Err(WireError::value("threads", format!("{}; give 1 to 65536", hello.threads)));
+    if hello.min_protocol_version > hello.max_protocol_version {
+        return Err(WireError::value("max_protocol_version", "is below min_protocol_version"));
+    }
+    if !(1..=MAX_THREADS).contains(&hello.threads) {
+        let problem = format!("{}; give 1 to {MAX_THREADS}", hello.threads);
+        return Err(WireError::value("threads", problem));
     }
     let hash = hello.self_test_sha256;
     if hash.len() != 64 {
@@ -56,7 +61,10 @@ pub(super) fn from_wire(hello: wire::Hello) -> Result<Hello, WireError> {
         held.push((key_from_wire(&name("set"), &set.set)?, bricks));
     }
     Ok(Hello {
-        protocol_version: hello.max_protocol_version,
+        protocol_versions: ProtocolVersions {
+            oldest: hello.min_protocol_version,
+            newest: hello.max_protocol_version,
+        },
         pixels_version: hello.pixels_version,
         name: name_from_wire("name", hello.name)?,
         threads: hello.threads,
@@ -71,10 +79,11 @@ pub(super) fn from_wire(hello: wire::Hello) -> Result<Hello, WireError> {
 
 /// The welcome and the session.
 pub(super) fn welcome_from_wire(welcome: wire::Welcome) -> Result<(ToWorker, u64), WireError> {
-    let wire::Welcome { worker, heartbeat_ms, session, protocol_version: _ } = welcome;
+    let wire::Welcome { worker, heartbeat_ms, session, protocol_version } = welcome;
     if !(1..=600_000).contains(&heartbeat_ms) {
         return Err(WireError::value("heartbeat_ms", format!("{heartbeat_ms}; give 1 to 600000")));
     }
-    let welcome = ToWorker::Welcome { worker: WorkerId(worker), heartbeat_ms };
+    let worker = WorkerId(worker);
+    let welcome = ToWorker::Welcome { worker, heartbeat_ms, protocol_version };
     Ok((welcome, session_from_wire("session", session)?))
 }

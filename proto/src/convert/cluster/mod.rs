@@ -150,12 +150,14 @@ pub fn from_worker_from_wire(message: wire::ControlRequest) -> Result<ToMaster, 
 pub fn to_worker_to_wire(message: &ToWorker, session: u64) -> Down {
     use wire::control_response::Message;
     let message = match message {
-        ToWorker::Welcome { worker, heartbeat_ms } => Message::Welcome(wire::Welcome {
-            worker: worker.0,
-            heartbeat_ms: *heartbeat_ms,
-            session,
-            protocol_version: slabcast_common::PROTOCOL_VERSION,
-        }),
+        ToWorker::Welcome { worker, heartbeat_ms, protocol_version } => {
+            Message::Welcome(wire::Welcome {
+                worker: worker.0,
+                heartbeat_ms: *heartbeat_ms,
+                session,
+                protocol_version: *protocol_version,
+            })
+        }
         ToWorker::Refused { reason } => {
             Message::Refused(wire::Refused { reason: reason_to_wire(reason) })
         }

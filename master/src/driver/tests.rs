@@ -172,9 +172,10 @@ fn picture_whose_composing_panicked_is_not_finished() {
         background: Background::Transparent,
     };
     let assembly = Assembly::new([32, 32], finish);
-    // A tile that leaves the picture.
-    let tile = Rect::new(16, 16, 48, 48);
-    assembly.add(vec![(tile, Leaves::blank([32, 32], PixelFormat::Rgb8))]);
+    // A tile that says to have a leaf and lacks its bytes.
+    let mut leaves = Leaves::blank([32, 32], PixelFormat::Rgb8);
+    leaves.mask[0] = 1;
+    assembly.add(vec![(Rect::new(0, 0, 32, 32), leaves)]);
     let panicked = caught("composing tiles", || assembly.compose()).expect_err("it panics");
     assert_eq!(panicked.work, "composing tiles");
     caught("composing tiles", || assembly.compose()).expect_err("and ever after");

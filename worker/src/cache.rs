@@ -1,27 +1,30 @@
-//! Bricks that a worker holds, by set, and the directories of sets.
+//! The bricks that a worker holds, by set, and the directories of sets.
 
-use crate::brick_table::Shelf;
+use crate::brick_table::BrickTable;
 use slabcast_common::brick::{Brick, BrickGrid, BrickInfo, BrickSetKey};
 use slabcast_common::ids::BrickId;
 use slabcast_common::message::DIRECTORIES;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// Bricks by set and id. Under the `slab` schedule the master decides what stays and what goes
-/// (`DropBricks`), since it decides what is needed; under `region` the worker does, and tells it
-/// (`parking`). So both always agree on what is here.
+/// The bricks that a worker holds, by set and id. They outlive a link: a worker that comes back
+/// lists them in its hello.
+///
+/// Under the `slab` schedule the master decides which bricks stay (`DropBricks`), since it decides
+/// which are needed; under `region` the worker decides and tells the master (`stalls`). So both
+/// always agree on which bricks are here.
 #[derive(Default)]
 pub struct BrickCache {
     sets: BTreeMap<BrickSetKey, BTreeMap<BrickId, Arc<Brick>>>,
-    /// Bytes of all, as they are encoded.
+    /// Encoded bytes of all bricks.
     encoded: u64,
-    /// Sets whose directories are here, the last that came last.
-    shelves: VecDeque<(BrickSetKey, Arc<Shelf>)>,
-    /// A directory that is still coming.
+    /// Sets whose directories are here, the latest last.
+    tables: VecDeque<(BrickSetKey, Arc<BrickTable>)>,
+    /// A directory of which more parts are to come.
     coming: Option<Coming>,
 }
 
-/// The parts of a directory that came.
+/// The first parts of a directory.
 struct Coming {
     set: BrickSetKey,
     grid: BrickGrid,
@@ -30,10 +33,10 @@ struct Coming {
 }
 
 impl BrickCache {
-    /// Takes a brick in; a second copy of one replaces the first.
+    /// Adds a brick. A second copy of a brick replaces the first.
     pub fn put(&mut self, set: BrickSetKey, brick: Arc<Brick>) {
-        if let Some(shelf) = self.shelf(set) {
-            shelf.put(brick.id, Some(brick.clone()));
+        if let Some(table) = self.table(set) {
+            table.put(brick.id, Some(brick.clone()));
         }
         self.encoded += brick.encoded_len() as u64;
         if let Some(before) = self.sets.entry(set).or_default().insert(brick.id, brick) {
@@ -41,21 +44,21 @@ impl BrickCache {
         }
     }
 
-    /// A brick, if it is here.
+    /// Returns a brick, if it is here.
     pub fn get(&self, set: BrickSetKey, id: BrickId) -> Option<&Arc<Brick>> {
         self.sets.get(&set)?.get(&id)
     }
 
-    /// Forgets bricks.
+    /// Drops the bricks of `set` with these ids; ids of bricks that are not here are ignored.
     pub fn remove(&mut self, set: BrickSetKey, ids: &[BrickId]) {
-        let shelf = self.shelf(set).cloned();
+        let table = self.table(set).cloned();
         if let Some(bricks) = self.sets.get_mut(&set) {
             for id in ids {
                 if let Some(brick) = bricks.remove(id) {
                     self.encoded -= brick.encoded_len() as u64;
                 }
-                if let Some(shelf) = &shelf {
-                    shelf.put(*id, None);
+                if let Some(table) = &table {
+                    table.put(*id, None);
                 }
             }
             if bricks.is_empty() {
@@ -64,35 +67,35 @@ impl BrickCache {
         }
     }
 
-    /// What is here, for the hello.
+    /// Returns the ids of all bricks that are here, by set, ascending: what a hello lists.
     pub fn held(&self) -> Vec<(BrickSetKey, Vec<BrickId>)> {
         self.sets.iter().map(|(key, bricks)| (*key, bricks.keys().copied().collect())).collect()
     }
 
-    /// Number of bricks.
+    /// Returns the number of bricks.
     pub fn len(&self) -> usize {
         self.sets.values().map(BTreeMap::len).sum()
     }
 
-    /// Whether there is none.
+    /// Returns whether there is no brick.
     pub fn is_empty(&self) -> bool {
         self.sets.is_empty()
     }
 
-    /// Bytes they take in memory.
+    /// Returns the bytes that the bricks take in memory.
     pub fn bytes(&self) -> usize {
         self.sets.values().flat_map(BTreeMap::values).map(|b| b.bytes_in_memory()).sum()
     }
 
-    /// Bytes that they take encoded: the measure of budgets.
+    /// Returns the encoded bytes of the bricks, which memory budgets count.
     pub fn encoded_bytes(&self) -> u64 {
         self.encoded
     }
 
-    /// Takes in a part of a directory.
+    /// Adds a part of a directory: `bricks` from index `first` on, of `total`.
     ///
     /// # Errors
-    /// A part that does not go on where the one before ended. The directory is not there then.
+    /// If the part does not go on where the one before ended. The directory is dropped then.
     pub(crate) fn directory(
         &mut self,
         set: BrickSetKey,
@@ -102,9 +105,9 @@ impl BrickCache {
     ) -> Result<(), &'static str> {
         let mut coming = match self.coming.take() {
             _ if first == 0 => {
-                self.shelves.retain(|(key, _)| *key != set);
+                self.tables.retain(|(key, _)| *key != set);
                 if bricks.len() == total as usize {
-                    self.take_up(set, Shelf::new(grid, bricks));
+                    self.add_table(set, BrickTable::new(grid, bricks));
                     return Ok(());
                 }
                 Coming { set, grid, total, bricks: Vec::new() }
@@ -118,32 +121,32 @@ impl BrickCache {
         }
         coming.bricks.extend_from_slice(&bricks);
         if coming.bricks.len() == total as usize {
-            self.take_up(set, Shelf::new(grid, coming.bricks.into()));
+            self.add_table(set, BrickTable::new(grid, coming.bricks.into()));
         } else {
             self.coming = Some(coming);
         }
         Ok(())
     }
 
-    fn take_up(&mut self, set: BrickSetKey, shelf: Shelf) {
+    fn add_table(&mut self, set: BrickSetKey, table: BrickTable) {
         for brick in self.sets.get(&set).into_iter().flat_map(BTreeMap::values) {
-            shelf.put(brick.id, Some(brick.clone()));
+            table.put(brick.id, Some(brick.clone()));
         }
-        self.shelves.push_back((set, Arc::new(shelf)));
-        if self.shelves.len() > DIRECTORIES {
-            self.shelves.pop_front();
+        self.tables.push_back((set, Arc::new(table)));
+        if self.tables.len() > DIRECTORIES {
+            self.tables.pop_front();
         }
     }
 
-    /// A link begins: its master sends directories anew.
+    /// Drops all directories, since the master of a new link sends them anew.
     pub(crate) fn forget_directories(&mut self) {
-        self.shelves.clear();
+        self.tables.clear();
         self.coming = None;
     }
 
-    /// A set with its directory, if that is here.
-    pub(crate) fn shelf(&self, set: BrickSetKey) -> Option<&Arc<Shelf>> {
-        self.shelves.iter().find(|(key, _)| *key == set).map(|(_, shelf)| shelf)
+    /// Returns a set with its directory, if the directory is here.
+    pub(crate) fn table(&self, set: BrickSetKey) -> Option<&Arc<BrickTable>> {
+        self.tables.iter().find(|(key, _)| *key == set).map(|(_, table)| table)
     }
 }
 
@@ -170,14 +173,14 @@ mod tests {
     }
 
     #[test]
-    fn directories_come_in_parts_and_find_what_is_here_and_what_comes() {
+    fn directory_in_parts_knows_bricks_that_came_before_and_after_it() {
         let mut cache = BrickCache::default();
         cache.put(key(1), brick(9));
         assert!(cache.directory(key(1), GRID, (0, 4), infos(&[3, 9])).is_ok());
-        assert!(cache.shelf(key(1)).is_none(), "half of it");
+        assert!(cache.table(key(1)).is_none(), "half of it");
         assert!(cache.directory(key(1), GRID, (2, 4), infos(&[11, 30])).is_ok());
-        let shelf = cache.shelf(key(1)).expect("all of it").clone();
-        let here = || (0..4).map(|i| shelf.has(i)).collect::<Vec<_>>();
+        let table = cache.table(key(1)).expect("all of it").clone();
+        let here = || (0..4).map(|i| table.has(i)).collect::<Vec<_>>();
         assert_eq!(here(), [false, true, false, false]);
         cache.put(key(1), brick(30));
         cache.put(key(1), brick(31));
@@ -189,23 +192,23 @@ mod tests {
     }
 
     #[test]
-    fn parts_that_do_not_follow_are_refused() {
+    fn directory_parts_out_of_order_are_refused() {
         for (first, ids) in [(1, [11, 30]), (2, [5, 30])] {
             let mut cache = BrickCache::default();
             assert!(cache.directory(key(1), GRID, (0, 4), infos(&[3, 9])).is_ok());
             assert!(cache.directory(key(1), GRID, (first, 4), infos(&ids)).is_err());
             assert!(cache.directory(key(1), GRID, (2, 4), infos(&[11, 30])).is_err());
-            assert!(cache.shelf(key(1)).is_none());
+            assert!(cache.table(key(1)).is_none());
         }
     }
 
     #[test]
-    fn the_directories_that_came_last_are_kept() {
+    fn latest_directories_are_kept() {
         let mut cache = BrickCache::default();
         for n in 0..DIRECTORIES as u8 + 1 {
             assert!(cache.directory(key(n), GRID, (0, 1), infos(&[3])).is_ok());
         }
-        assert!(cache.shelf(key(0)).is_none());
-        assert!((1..=DIRECTORIES as u8).all(|n| cache.shelf(key(n)).is_some()));
+        assert!(cache.table(key(0)).is_none());
+        assert!((1..=DIRECTORIES as u8).all(|n| cache.table(key(n)).is_some()));
     }
 }

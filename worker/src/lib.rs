@@ -1,14 +1,40 @@
-//! A worker: it caches bricks, renders macrotiles and answers the master.
+//! A worker: it caches bricks, draws macrotiles and answers the master.
 //!
-//! - [`session`] is where everything arrives: leases, bricks, results. It decides what can start.
-//! - `stalls` is regions that stand still: what is asked for, what makes room, who goes on.
+//! - [`session`] serves one master over one link: leases, bricks and results meet there.
+//! - `stalls` has the regions that wait for bricks: which bricks are asked for, which make room.
 //! - `pool` is the render threads: plain threads, never tokio's.
+//! - [`cache`] is the bricks that the worker holds; they outlive a link, so that a worker which
+//!   comes back after its master restarted still has them. `brick_table` is one set of them, as
+//!   render threads see it.
+//! - [`dial`] is the TCP link, which dials again when it breaks. The embedded link needs none of
+//!   it.
 //! - [`rehearse`] holds tiles for a recorded time instead of drawing them.
-//! - [`cache`] is the bricks it holds; they outlive a link, so a worker that comes back after
-//!   its master restarted brings them along; `brick_table` is one set of them, as render threads see it.
-//! - [`dial`] is the TCP link and the patience to come back; the embedded link needs none of it.
 //!
 //! A worker never sees the volume, the queue or another worker.
+//!
+//! # Example
+//!
+//! A worker of two threads that serves the master at an address until it is told to stop.
+//!
+//! ```no_run
+//! # async fn example() -> Result<(), Box<dyn std::error::Error>> {
+//! use slabcast_worker::{Config, Ended, dial};
+//!
+//! let config = Config {
+//!     name: "desk-7".into(),
+//!     threads: 2,
+//!     memory_budget_bytes: 4 << 30,
+//!     simd: slabcast_render::Simd::detect(),
+//!     rehearsal: None,
+//!     machine: String::new(),
+//! };
+//! let (stop, stopped) = tokio::sync::watch::channel(false);
+//! let worker = tokio::spawn(dial::run(config, "master.lan:9140".into(), stopped));
+//! stop.send(true)?;
+//! assert_eq!(worker.await??, Ended::Stopped);
+//! # Ok(())
+//! # }
+//! ```
 
 mod brick_table;
 pub mod cache;

@@ -10,8 +10,8 @@
 //! late; over a thousand tiles that is a frame. So a thread's next tile begins when the one before
 //! should have ended, or when it arrived. Only the result is late.
 
-use crate::brick_table::Shelf;
-use crate::pool::{Came, Drawn, FrameSlot, Going, Ready, locked};
+use crate::brick_table::BrickTable;
+use crate::pool::{DrawnRegion, FrameSlot, Progress, RegionTask, SlabTask, locked};
 use slabcast_common::image::TilePixels;
 use slabcast_common::message::{Counters, Pixels, Sampling};
 use slabcast_common::occlusion::Rect;
@@ -59,8 +59,12 @@ impl Rehearsal {
     ///
     /// # Errors
     /// A sentence if the trace has no such tile.
-    pub(crate) fn task(&self, task: &Ready, free: Instant) -> Result<(Held, TilePixels), String> {
-        let Ready { lease, frame, .. } = task;
+    pub(crate) fn task(
+        &self,
+        task: &SlabTask,
+        free: Instant,
+    ) -> Result<(Held, TilePixels), String> {
+        let SlabTask { lease, frame, .. } = task;
         let SheetRange { first, end } = lease.slab;
         let unknown = || {
             let Rect { x0, y0, x1, y1 } = lease.tile;
@@ -86,14 +90,14 @@ impl Rehearsal {
 
     /// Places of the bricks that a worker would prefetch for a region, if it held the region's
     /// parts in the frame before; bricks that are here are left out.
-    pub(crate) fn expected(&self, frame: &FrameSlot, shelf: &Shelf, tile: Rect) -> Vec<u32> {
+    pub(crate) fn expected(&self, frame: &FrameSlot, table: &BrickTable, tile: Rect) -> Vec<u32> {
         let index = self.index(frame);
         let known = index.and_then(|i| self.trace.frames[i].region(&tile, self.trace.about.size));
         let held = locked(&frame.scene.parts);
         let (Some(known), true) = (known, parts(tile).all(|p| held.contains(&[p.x0, p.y0]))) else {
             return Vec::new();
         };
-        let lacks = |place: &u32| (*place as usize) < shelf.bricks().len() && !shelf.has(*place);
+        let lacks = |place: &u32| (*place as usize) < table.bricks().len() && !table.has(*place);
         known.expected.iter().copied().filter(lacks).collect()
     }
 
@@ -104,11 +108,11 @@ impl Rehearsal {
     /// A sentence if the trace has no such tile.
     pub(crate) fn region(
         &self,
-        going: &mut Going,
+        task: &mut RegionTask,
         start: Instant,
-    ) -> Result<(Came, Instant), String> {
-        let tile = going.lease.tile;
-        let (frame, shelf, size) = (&going.frame, &going.shelf, self.trace.about.size);
+    ) -> Result<(Progress, Instant), String> {
+        let tile = task.lease.tile;
+        let (frame, table, size) = (&task.frame, &task.table, self.trace.about.size);
         let unknown = || {
             let Rect { x0, y0, x1, y1 } = tile;
             format!(
@@ -118,12 +122,12 @@ impl Rehearsal {
         };
         let traced = &self.trace.frames[self.index(frame).ok_or_else(unknown)?];
         let known = traced.region(&tile, size).ok_or_else(unknown)?;
-        let bricks = shelf.bricks();
+        let bricks = table.bricks();
         if known.touched.last().is_some_and(|&last| last as usize >= bricks.len()) {
             return Err(unknown());
         }
         let project = |place: u32| frame.view.project(&bricks.get(place as usize)?.tight);
-        let progress = match &mut going.course {
+        let progress = match &mut task.course {
             Some(progress) => progress,
             none => {
                 let new = RegionProgress::new(traced, &tile, size, &project);
@@ -131,16 +135,16 @@ impl Rehearsal {
             }
         };
         // The parts of a tile may name bricks that the tile does not.
-        let has = |place: u32| place as usize >= bricks.len() || shelf.has(place);
+        let has = |place: u32| place as usize >= bricks.len() || table.has(place);
         progress.resume();
         if progress.runs_ns(&has) <= 0.0 && !progress.is_done() {
-            let missing = progress.missing(&has, going.ahead, &project);
-            return Ok((Came::Lacks(missing, true), start));
+            let missing = progress.missing(&has, task.ahead, &project);
+            return Ok((Progress::Stalled { missing, is_deeper: true }, start));
         }
         let setup = Duration::from_nanos(traced.setup_ns + traced.outlook_ns);
         let mut end = (*frame.made.get_or_init(|| start + setup)).max(start);
         let begun = end;
-        if going.drawn.is_zero() {
+        if task.drawn.is_zero() {
             let mut opened = locked(&frame.held);
             let fresh = known.opened.iter().filter(|b| opened.insert(**b)).count();
             end += Duration::from_nanos(traced.block_ns.saturating_mul(fresh as u64));
@@ -162,15 +166,15 @@ impl Rehearsal {
             Held { start, end }.wait();
             progress.advance(ns, &has);
         }
-        going.drawn += end - begun;
+        task.drawn += end - begun;
         if !progress.is_done() {
-            let missing = progress.missing(&has, going.ahead, &project);
-            return Ok((Came::Lacks(missing, true), end));
+            let missing = progress.missing(&has, task.ahead, &project);
+            return Ok((Progress::Stalled { missing, is_deeper: true }, end));
         }
         locked(&frame.scene.parts).extend(parts(tile).map(|p| [p.x0, p.y0]));
         let (counters, sampled) = (Counters::default(), Sampling::default());
-        let drawn = Drawn { pixels, counters, touched: known.into_owned().touched, sampled };
-        Ok((Came::Done(Box::new(drawn)), end))
+        let drawn = DrawnRegion { pixels, counters, touched: known.into_owned().touched, sampled };
+        Ok((Progress::Done(Box::new(drawn)), end))
     }
 }
 

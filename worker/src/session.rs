@@ -1,19 +1,22 @@
-//! Where a worker's messages, bricks and results meet.
+//! A worker's session with a master, from the hello to the end of the link.
 //!
-//! One task on the runtime; it decides and never computes. A lease waits here until its last
-//! brick is there and then goes to the render threads; so the first tiles render while bricks
-//! of the others are still on their way. A region goes to them at once, and comes back when it lacks
-//! bricks: `parking` says what is asked for.
+//! One task on the runtime; it decides and never computes. A slab lease waits here until its last
+//! brick has come and then goes to the render threads, so that the first tiles are drawn while
+//! bricks of the others are still on their way. A region goes to the threads at once and comes back
+//! when it stalls for want of bricks: `stalls` decides which bricks are asked for.
+
+mod waiting;
 
 use crate::cache::BrickCache;
 use crate::pool::{
-    Came, FrameSlot, Going, Gone, Outcome, Pool, Ready, Rendered, SceneSlot, Task, Wish,
+    FrameSlot, Pool, Progress, RegionReport, RegionTask, Report, SceneSlot, SlabReport, SlabTask,
+    SplitRequest, Task,
 };
 use crate::rehearse::Rehearsal;
-use crate::stalls::{Parking, Say, Who};
+use crate::stalls::{BrickRequest, RegionKey, Stalls};
 use slabcast_common::PIXELS_VERSION;
-use slabcast_common::brick::{BrickGrid, BrickSetKey};
-use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId};
+use slabcast_common::brick::BrickGrid;
+use slabcast_common::ids::{Epoch, FrameId, SceneId, TaskId};
 use slabcast_common::message::{
     BrickBatch, Hello, Lease, Pixels, RegionCost, RegionLease, TaskTimes, TileResult, ToMaster,
     ToWorker,
@@ -28,54 +31,57 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, watch};
 use tracing::{debug, info, warn};
+use waiting::{WaitingLease, WaitingLeases};
 
-/// How long a worker that is told to stop waits for the tasks it has begun.
+/// Longest time that a worker which is told to stop waits for the tasks it has begun.
 const DRAIN: Duration = Duration::from_secs(8);
 
-/// How long a master may take to answer the hello.
+/// Longest time that a master may take to answer the hello.
 const UNTIL_WELCOME: Duration = Duration::from_secs(10);
 
-/// What a worker is started with.
+/// Settings of a worker.
 #[derive(Clone, Debug)]
 pub struct Config {
-    /// A name for people.
+    /// Name of the worker, for people.
     pub name: String,
-    /// Render threads, at least 1.
+    /// Number of render threads, at least 1.
     pub threads: u32,
-    /// Bytes of bricks that it may hold.
+    /// Encoded bytes of bricks that the worker may hold.
     pub memory_budget_bytes: u64,
-    /// Instruction set.
+    /// Instruction set of the renderer.
     pub simd: Simd,
-    /// Tiles are held for the times of this trace, and nothing is drawn.
+    /// A trace to rehearse: tiles are held for the trace's times, and nothing is drawn.
     pub rehearsal: Option<Arc<Rehearsal>>,
-    /// Which machine this is, for the master to tell whether it is its own; empty if unknown.
+    /// Name of this machine, by which the master tells whether it is its own; empty if unknown.
     pub machine: String,
 }
 
-/// A link to a master, over a network or not.
+/// The worker's end of a link to a master, over a network or inside a process.
 pub struct Link {
-    /// From the master.
+    /// Control messages from the master. Unbounded; the leases that the master lends and its pings
+    /// bound it.
     pub control: mpsc::UnboundedReceiver<ToWorker>,
-    /// To the master.
+    /// Messages to the master; the first is the hello.
     pub replies: mpsc::Sender<ToMaster>,
-    /// Bricks.
+    /// Bricks from the master, and orders to forget some.
     pub bricks: mpsc::Receiver<Bricks>,
 }
 
-/// Why a link ended.
+/// Why a session ended.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Ended {
-    /// The connection was lost; dial again.
+    /// The connection was lost, for this reason; dial again.
     Lost(String),
-    /// The master does not take this worker; dialling again would not help.
+    /// The master does not let this worker in, for this reason; dialling again would not help.
     Refused(String),
-    /// The master ended; dial again later.
+    /// The master ended, for this reason; dial again later.
     MasterLeft(String),
-    /// This worker was told to stop.
+    /// The worker was told to stop.
     Stopped,
 }
 
-/// The hello of a worker with `cache`. Draws the self-test tile (some milliseconds).
+/// Makes the hello of a worker that holds the bricks of `cache`. Draws the self-test tile, which
+/// takes some milliseconds.
 pub fn hello(config: &Config, cache: &BrickCache) -> Hello {
     Hello {
         protocol_versions: PROTOCOL_VERSIONS,
@@ -91,15 +97,19 @@ pub fn hello(config: &Config, cache: &BrickCache) -> Hello {
     }
 }
 
-/// Serves one master over `link`, from the hello to its end. `stop` turning true drains the
-/// worker: it takes no more leases, finishes what it has begun and leaves.
+/// Serves one master over `link`, from the hello to its end, and returns why it ended. When `stop`
+/// turns true the worker drains: it takes no more leases, finishes what it has begun, says that it
+/// leaves and ends. Bricks stay in `cache` for the next session.
+///
+/// # Errors
+/// If the system gives no render threads.
 pub async fn run(
     config: &Config,
     mut link: Link,
     cache: &mut BrickCache,
     mut stop: watch::Receiver<bool>,
 ) -> std::io::Result<Ended> {
-    let (pool, mut results) = Pool::start(config.threads, config.simd, config.rehearsal.as_ref())?;
+    let (pool, mut reports) = Pool::start(config.threads, config.simd, config.rehearsal.as_ref())?;
     let hello = {
         // The self-test draws: not on the runtime's thread.
         let (config, held) = (config.clone(), cache.held());
@@ -112,37 +122,21 @@ pub async fn run(
         return Ok(Ended::Lost("the master closed the link before the hello".into()));
     }
     cache.forget_directories();
-    let mut desk = Desk {
-        pool,
-        cache,
-        parking: Parking::new(config.memory_budget_bytes),
-        parked: BTreeMap::new(),
-        wishes: BTreeMap::new(),
-        scenes: BTreeMap::new(),
-        frames: BTreeMap::new(),
-        waiting: BTreeMap::new(),
-        missing: BTreeMap::new(),
-        in_pool: 0,
-        epoch: Instant::now(),
-        leaving: false,
-        heard: tokio::time::Instant::now(),
-        patience: UNTIL_WELCOME,
-        replies: Vec::new(),
-    };
+    let mut session = Session::new(pool, cache, config.memory_budget_bytes);
     let mut drain_until: Option<tokio::time::Instant> = None;
-    let mut bricks_open = true;
+    let mut are_bricks_open = true;
     loop {
-        if desk.leaving && desk.in_pool == 0 && desk.parked.is_empty() {
+        if session.is_leaving && session.in_pool == 0 && session.stalled.is_empty() {
             return Ok(Ended::Stopped);
         }
         let drained = async {
             match drain_until {
-                Some(at) => tokio::time::sleep_until(at).await,
+                Some(until) => tokio::time::sleep_until(until).await,
                 None => std::future::pending().await,
             }
         };
         tokio::select! {
-            () = tokio::time::sleep_until(desk.heard + desk.patience) => {
+            () = tokio::time::sleep_until(session.last_heard + session.patience) => {
                 return Ok(Ended::Lost("the master was silent for three heartbeats".into()));
             }
             message = link.control.recv() => match message {
@@ -158,36 +152,36 @@ pub async fn run(
                 }
                 Some(ToWorker::Leave { reason }) => return Ok(Ended::MasterLeft(reason)),
                 Some(message) => {
-                    desk.heard = tokio::time::Instant::now();
-                    desk.told(message);
+                    session.last_heard = tokio::time::Instant::now();
+                    session.on_message(message);
                 }
             },
-            batch = link.bricks.recv(), if bricks_open => match batch {
-                Some(Bricks::Batch(batch)) => desk.bricks_in(batch),
-                Some(Bricks::Message(message)) => desk.told(message),
-                None => bricks_open = false,
+            batch = link.bricks.recv(), if are_bricks_open => match batch {
+                Some(Bricks::Batch(batch)) => session.on_bricks(batch),
+                Some(Bricks::Message(message)) => session.on_message(message),
+                None => are_bricks_open = false,
             },
-            Some(outcome) = results.recv() => {
-                desk.came_back(outcome);
-                // What regions lack together is asked for together.
-                while let Ok(outcome) = results.try_recv() {
-                    desk.came_back(outcome);
+            Some(report) = reports.recv() => {
+                session.on_report(report);
+                // Bricks that several regions lack are asked for in one message.
+                while let Ok(report) = reports.try_recv() {
+                    session.on_report(report);
                 }
             }
-            changed = stop.changed(), if !desk.leaving => {
+            changed = stop.changed(), if !session.is_leaving => {
                 if changed.is_err() || *stop.borrow() {
-                    info!("stopping: finishing what has begun");
-                    desk.leave();
+                    info!(tasks = session.in_pool, "stopping, finishing tasks first");
+                    session.leave();
                     drain_until = Some(tokio::time::Instant::now() + DRAIN);
                 }
             }
             () = drained => {
-                warn!(tasks = desk.in_pool, "gave up waiting for tasks");
+                warn!(tasks = session.in_pool, "tasks not finished in time, stopping all the same");
                 return Ok(Ended::Stopped);
             }
         }
-        desk.ask();
-        for reply in desk.replies.drain(..) {
+        session.request_bricks();
+        for reply in session.replies.drain(..) {
             if link.replies.send(reply).await.is_err() {
                 return Ok(Ended::Lost("the master closed the link".into()));
             }
@@ -195,50 +189,62 @@ pub async fn run(
     }
 }
 
-/// A lease whose bricks are not all here.
-struct Waiting {
-    lease: Box<Lease>,
-    frame: Arc<FrameSlot>,
-    missing: usize,
-    received: Instant,
-}
-
-struct Desk<'a> {
+struct Session<'a> {
     pool: Pool,
     cache: &'a mut BrickCache,
-    parking: Parking,
-    /// Regions that stand still.
-    parked: BTreeMap<Who, Box<Going>>,
-    /// Where each region that is not at its end is told to give some of its tile away.
-    wishes: BTreeMap<Who, (Epoch, Arc<Wish>)>,
+    stalls: Stalls,
+    /// Regions that are stalled.
+    stalled: BTreeMap<RegionKey, Box<RegionTask>>,
+    /// Split requests of all regions that are not done.
+    splits: BTreeMap<RegionKey, (Epoch, Arc<SplitRequest>)>,
     scenes: BTreeMap<SceneId, Arc<SceneSlot>>,
     frames: BTreeMap<FrameId, Arc<FrameSlot>>,
-    waiting: BTreeMap<TaskId, Waiting>,
-    /// Who waits for a brick.
-    missing: BTreeMap<(BrickSetKey, BrickId), Vec<TaskId>>,
+    waiting: WaitingLeases,
     /// Tasks that render threads have or will take.
     in_pool: usize,
     /// Zero of this worker's clock.
     epoch: Instant,
-    leaving: bool,
+    is_leaving: bool,
     /// When the master last said something.
-    heard: tokio::time::Instant,
-    /// How long it may be silent.
+    last_heard: tokio::time::Instant,
+    /// How long the master may be silent.
     patience: Duration,
     replies: Vec<ToMaster>,
 }
 
-impl Drop for Desk<'_> {
-    /// Tasks of a link that is gone need not be rendered.
+impl Drop for Session<'_> {
+    /// Tasks of a link that is gone need not be drawn.
     fn drop(&mut self) {
         for slot in self.frames.values() {
-            slot.over.store(true, Ordering::Relaxed);
+            slot.has_ended.store(true, Ordering::Relaxed);
         }
     }
 }
 
-impl Desk<'_> {
-    fn told(&mut self, message: ToWorker) {
+impl<'a> Session<'a> {
+    fn new(pool: Pool, cache: &'a mut BrickCache, memory_budget_bytes: u64) -> Self {
+        Session {
+            pool,
+            cache,
+            stalls: Stalls::new(memory_budget_bytes),
+            stalled: BTreeMap::new(),
+            splits: BTreeMap::new(),
+            scenes: BTreeMap::new(),
+            frames: BTreeMap::new(),
+            waiting: WaitingLeases::default(),
+            in_pool: 0,
+            epoch: Instant::now(),
+            is_leaving: false,
+            last_heard: tokio::time::Instant::now(),
+            patience: UNTIL_WELCOME,
+            replies: Vec::new(),
+        }
+    }
+
+    // -----------------------------------------------------------------------------------------
+    // From the master
+
+    fn on_message(&mut self, message: ToWorker) {
         match message {
             ToWorker::Welcome { worker, heartbeat_ms, protocol_version } => {
                 info!(%worker, protocol_version, "admitted by the master");
@@ -249,46 +255,46 @@ impl Desk<'_> {
             }
             ToWorker::Frame { frame, scene, view, finish, plain } => {
                 if let Some(scene) = self.scenes.get(&scene) {
-                    // A view alone looks right; only with its volume can its depths be judged.
+                    // The depths of a view can be checked against its volume only.
                     match convert::check_view(&scene.spec.volume.lattice, &view) {
                         Ok(()) => {
                             let slot = FrameSlot::new(scene.clone(), view, finish, plain);
                             self.frames.insert(frame, Arc::new(slot));
                         }
-                        Err(e) => warn!(%frame, error = %e, "the master sent a view that is wrong"),
+                        Err(e) => warn!(%frame, error = %e, "ignoring a wrong view of the master"),
                     }
                 }
             }
             ToWorker::Directory { set, grid, first, total, bricks } => {
                 debug!(bricks = bricks.len(), first, total, "directory");
                 if let Err(problem) = self.cache.directory(set, grid, (first, total), bricks) {
-                    warn!(first, total, problem, "the master sent a directory that is wrong");
+                    warn!(first, total, problem, "ignoring a wrong directory of the master");
                 }
             }
-            ToWorker::Lease(lease) => self.lease(lease),
-            ToWorker::Region(lease) => self.region(lease),
+            ToWorker::Lease(lease) => self.on_lease(lease),
+            ToWorker::Region(lease) => self.on_region_lease(lease),
             ToWorker::HandOver { frame, task, epoch, share } => {
-                let who = (frame, task);
-                match self.wishes.get(&who) {
-                    Some((of, wish)) if *of == epoch => wish.give(share),
+                let key = (frame, task);
+                match self.splits.get(&key) {
+                    Some((of, split)) if *of == epoch => split.ask_for(share),
                     _ => return,
                 }
-                // One that stands still does not wait for its bricks to do so.
-                if let Some(going) = self.parked.remove(&who) {
-                    self.go_on(going);
-                    self.pool.parked(!self.parked.is_empty());
+                // A stalled region is split without waiting for its bricks.
+                if let Some(task) = self.stalled.remove(&key) {
+                    self.resume(task);
+                    self.tell_pool_of_stalls();
                 }
             }
             ToWorker::EndFrame { frame } => {
                 if let Some(slot) = self.frames.remove(&frame) {
-                    slot.over.store(true, Ordering::Relaxed);
+                    slot.has_ended.store(true, Ordering::Relaxed);
                 }
-                self.waiting.retain(|_, w| w.lease.frame != frame);
-                for who in self.parking.end_frame(frame) {
-                    self.parked.remove(&who);
-                    self.wishes.remove(&who);
+                self.waiting.end_frame(frame);
+                for key in self.stalls.end_frame(frame) {
+                    self.stalled.remove(&key);
+                    self.splits.remove(&key);
                 }
-                self.pool.parked(!self.parked.is_empty());
+                self.tell_pool_of_stalls();
             }
             ToWorker::EndScene { scene } => {
                 self.scenes.remove(&scene);
@@ -298,7 +304,7 @@ impl Desk<'_> {
                 self.cache.remove(set, &bricks);
                 // A lease may have come before this message although it was written after it:
                 // control and bricks have no order. Its bricks come again.
-                self.wait_again(set, &bricks);
+                self.waiting.bricks_dropped(set, &bricks);
             }
             ToWorker::Ping { nonce } => {
                 let clock_us = self.us(Instant::now());
@@ -308,92 +314,128 @@ impl Desk<'_> {
         }
     }
 
-    fn lease(&mut self, lease: Box<Lease>) {
+    /// The frame of a lease, or why the lease can't be taken.
+    fn frame_of_lease(&self, frame: FrameId) -> Result<Arc<FrameSlot>, &'static str> {
+        if self.is_leaving {
+            return Err("the worker is leaving");
+        }
+        self.frames.get(&frame).cloned().ok_or("its frame was never announced")
+    }
+
+    fn refuse(&mut self, task: TaskId, epoch: Epoch, reason: &str) {
+        self.replies.push(ToMaster::Failed { task, epoch, reason: reason.into() });
+    }
+
+    fn on_lease(&mut self, lease: Box<Lease>) {
         let received = Instant::now();
-        let fail = |reason: &str| ToMaster::Failed {
-            task: lease.task,
-            epoch: lease.epoch,
-            reason: reason.into(),
+        let frame = match self.frame_of_lease(lease.frame) {
+            Ok(frame) => frame,
+            Err(reason) => return self.refuse(lease.task, lease.epoch, reason),
         };
-        if self.leaving {
-            self.replies.push(fail("the worker is leaving"));
-            return;
-        }
-        let Some(frame) = self.frames.get(&lease.frame).cloned() else {
-            self.replies.push(fail("its frame was never announced"));
-            return;
-        };
-        if lease.state.a.len() != lease.tile.area()
-            || lease.state.last.as_ref().is_some_and(|l| l.len() != lease.tile.area())
+        let area = lease.tile.area();
+        if lease.state.a.len() != area
+            || lease.state.last.as_ref().is_some_and(|last| last.len() != area)
         {
-            self.replies.push(fail("its planes do not have the tile's size"));
-            return;
+            let reason = "its planes do not have the tile's size";
+            return self.refuse(lease.task, lease.epoch, reason);
         }
-        let set = frame.scene.spec.bricks;
-        let mut missing = 0;
-        for id in &lease.bricks {
-            if self.cache.get(set, *id).is_none() {
-                self.missing.entry((set, *id)).or_default().push(lease.task);
-                missing += 1;
-            }
-        }
-        let waiting = Waiting { lease, frame, missing, received };
-        if missing == 0 {
-            self.start(waiting);
-        } else {
-            self.waiting.insert(waiting.lease.task, waiting);
+        if let Some(ready) = self.waiting.add(lease, frame, received, self.cache) {
+            self.start(ready);
         }
     }
 
-    fn region(&mut self, lease: RegionLease) {
+    fn on_region_lease(&mut self, lease: RegionLease) {
         let received = Instant::now();
-        let refuse = |reason: &str| ToMaster::Failed {
-            task: lease.task,
-            epoch: lease.epoch,
-            reason: reason.into(),
-        };
-        if self.leaving {
-            self.replies.push(refuse("the worker is leaving"));
-            return;
-        }
-        let Some(frame) = self.frames.get(&lease.frame).cloned() else {
-            self.replies.push(refuse("its frame was never announced"));
-            return;
+        let frame = match self.frame_of_lease(lease.frame) {
+            Ok(frame) => frame,
+            Err(reason) => return self.refuse(lease.task, lease.epoch, reason),
         };
         let (tile, spec) = (lease.tile, &frame.scene.spec);
         let picture = Rect::of_size(frame.view.size);
         if tile.is_empty() || tile.intersect(&picture) != tile {
-            self.replies.push(refuse("its tile is not inside the picture"));
-            return;
+            let reason = "its tile is not inside the picture";
+            return self.refuse(lease.task, lease.epoch, reason);
         }
         let grid = BrickGrid::of(spec.volume.lattice.dims);
-        let Some(shelf) = self.cache.shelf(spec.bricks).filter(|s| s.grid() == grid).cloned()
+        let Some(table) = self.cache.table(spec.bricks).filter(|t| t.grid() == grid).cloned()
         else {
-            self.replies.push(refuse("the directory of its bricks never came"));
-            return;
+            let reason = "the directory of its bricks never came";
+            return self.refuse(lease.task, lease.epoch, reason);
         };
-        let (who, epoch) = ((lease.frame, lease.task), lease.epoch);
-        self.parking.enter(who, spec.bricks, shelf.clone());
-        let going = Going::new(lease, frame, shelf, received);
-        self.wishes.insert(who, (epoch, going.wish.clone()));
-        self.go_on(Box::new(going));
+        let (key, epoch) = ((lease.frame, lease.task), lease.epoch);
+        self.stalls.add(key, spec.bricks, table.clone());
+        let task = RegionTask::new(lease, frame, table, received);
+        self.splits.insert(key, (epoch, task.split.clone()));
+        self.resume(Box::new(task));
     }
 
-    fn go_on(&mut self, mut going: Box<Going>) {
-        if let Some(at) = going.parked_at.take() {
-            going.parked += at.elapsed();
+    fn on_bricks(&mut self, batch: BrickBatch) {
+        let set = batch.set;
+        let (mut arrived, mut unstalled) = (0, Vec::new());
+        for brick in batch.bricks {
+            let id = brick.id;
+            self.cache.put(set, brick);
+            arrived += 1;
+            if let Some(table) = self.cache.table(set) {
+                self.stalls.brick_arrived(set, table, id, &mut unstalled);
+            }
+            for ready in self.waiting.brick_arrived(set, id) {
+                self.start(ready);
+            }
+        }
+        for key in unstalled {
+            if let Some(task) = self.stalled.remove(&key) {
+                self.resume(task);
+            }
+        }
+        self.tell_pool_of_stalls();
+        if arrived > 0 {
+            self.replies.push(ToMaster::BricksIn { set, bricks: arrived });
+        }
+        if !batch.broken.is_empty() {
+            warn!(bricks = batch.broken.len(), "bricks damaged in transit, asking for them again");
+            self.replies.push(ToMaster::BricksBroken { set, bricks: batch.broken });
+        }
+    }
+
+    // -----------------------------------------------------------------------------------------
+    // To and from render threads
+
+    /// Queues a slab lease whose bricks have come.
+    fn start(&mut self, ready: WaitingLease) {
+        let WaitingLease { lease, frame, received, .. } = ready;
+        let set = frame.scene.spec.bricks;
+        let bricks = lease.bricks.iter().filter_map(|id| self.cache.get(set, *id).cloned());
+        let bricks: Vec<_> = bricks.collect();
+        if bricks.len() != lease.bricks.len() {
+            let reason = "bricks were dropped while it waited";
+            return self.refuse(lease.task, lease.epoch, reason);
         }
         self.in_pool += 1;
-        self.pool.submit(Task::Region(going));
+        let ready = Instant::now();
+        self.pool.submit(Task::Slab(SlabTask { lease, frame, bricks, received, ready }));
     }
 
-    fn came_back(&mut self, outcome: Outcome) {
-        match outcome {
-            Outcome::Slab(done) => self.rendered(done),
-            Outcome::Region(gone) => self.went(gone),
-            Outcome::Handed(piece) => self.replies.push(ToMaster::HandedOver(piece)),
-            Outcome::Expected(set, shelf, places) => {
-                let bricks = self.parking.expect(set, &shelf, &places, self.cache);
+    /// Queues a region that begins or goes on.
+    fn resume(&mut self, mut task: Box<RegionTask>) {
+        if let Some(since) = task.stalled_at.take() {
+            task.stalled += since.elapsed();
+        }
+        self.in_pool += 1;
+        self.pool.submit(Task::Region(task));
+    }
+
+    fn tell_pool_of_stalls(&self) {
+        self.pool.set_stalled(!self.stalled.is_empty());
+    }
+
+    fn on_report(&mut self, report: Report) {
+        match report {
+            Report::Slab(report) => self.on_slab_report(report),
+            Report::Region(report) => self.on_region_report(report),
+            Report::Piece(piece) => self.replies.push(ToMaster::HandedOver(piece)),
+            Report::Prefetch(set, table, places) => {
+                let bricks = self.stalls.prefetch(set, &table, &places, self.cache);
                 if !bricks.is_empty() {
                     self.replies.push(ToMaster::BricksWanted { set, bricks });
                 }
@@ -401,148 +443,10 @@ impl Desk<'_> {
         }
     }
 
-    /// Leases that wait have these bricks no longer.
-    fn wait_again(&mut self, set: BrickSetKey, bricks: &[BrickId]) {
-        for (task, w) in &mut self.waiting {
-            let needs = |id: &&BrickId| w.lease.bricks.binary_search(id).is_ok();
-            if w.frame.scene.spec.bricks == set {
-                for id in bricks.iter().filter(needs) {
-                    let waiters = self.missing.entry((set, *id)).or_default();
-                    if !waiters.contains(task) {
-                        waiters.push(*task);
-                        w.missing += 1;
-                    }
-                }
-            }
-        }
-    }
-
-    /// A region came to its end, or stands still.
-    fn went(&mut self, gone: Gone) {
+    fn on_slab_report(&mut self, report: SlabReport) {
         self.in_pool -= 1;
-        let Gone { mut going, end, thread, came } = gone;
-        let RegionLease { task, epoch, frame, .. } = going.lease;
-        let who = (frame, task);
-        let stands = matches!(came, Came::Lacks(..)) && self.frames.contains_key(&frame);
-        if !stands {
-            self.wishes.remove(&who);
-        }
-        match came {
-            Came::Lacks(lacks, farther) if stands => {
-                going.stalls += 1;
-                if self.parking.park(who, &lacks, farther) || going.wish.is_there() {
-                    self.go_on(going);
-                } else {
-                    going.parked_at = Some(Instant::now());
-                    self.parked.insert(who, going);
-                    self.pool.parked(true);
-                }
-            }
-            Came::Over | Came::Lacks(..) => self.parking.leave(who, &[]),
-            Came::Done(done) => {
-                self.parking.leave(who, &done.touched);
-                let times = TaskTimes {
-                    received_us: self.us(going.received),
-                    ready_us: self.us(going.received + going.parked),
-                    start_us: self.us(end - going.drawn),
-                    end_us: self.us(end),
-                    thread,
-                };
-                let region = Some(RegionCost {
-                    touched: done.touched,
-                    stalls: going.stalls,
-                    parked_us: going.parked.as_micros() as u64,
-                    idle_us: self.pool.waited().as_micros() as u64,
-                    sampled: done.sampled,
-                });
-                let (pixels, counters, bytes) = (done.pixels, done.counters, None);
-                let result = TileResult { task, epoch, pixels, bytes, counters, times, region };
-                self.replies.push(ToMaster::Result(Box::new(result)));
-            }
-            Came::Failed(reason) => {
-                self.parking.leave(who, &[]);
-                warn!(%task, reason, "region failed");
-                self.replies.push(ToMaster::Failed { task, epoch, reason });
-            }
-        }
-    }
-
-    /// Asks for what regions lack, after making room.
-    fn ask(&mut self) {
-        for say in self.parking.ask(self.cache) {
-            let reply = match say {
-                Say::Forgotten(set, bricks) => {
-                    debug!(bricks = bricks.len(), "bricks forgotten");
-                    self.wait_again(set, &bricks);
-                    ToMaster::BricksForgotten { set, bricks }
-                }
-                Say::Wanted(set, bricks) => ToMaster::BricksWanted { set, bricks },
-            };
-            self.replies.push(reply);
-        }
-    }
-
-    fn start(&mut self, w: Waiting) {
-        let set = w.frame.scene.spec.bricks;
-        let bricks = w.lease.bricks.iter().filter_map(|id| self.cache.get(set, *id).cloned());
-        let bricks: Vec<_> = bricks.collect();
-        if bricks.len() != w.lease.bricks.len() {
-            self.replies.push(ToMaster::Failed {
-                task: w.lease.task,
-                epoch: w.lease.epoch,
-                reason: "bricks were dropped while it waited".into(),
-            });
-            return;
-        }
-        self.in_pool += 1;
-        self.pool.submit(Task::Slab(Ready {
-            lease: w.lease,
-            frame: w.frame,
-            bricks,
-            received: w.received,
-            ready: Instant::now(),
-        }));
-    }
-
-    fn bricks_in(&mut self, batch: BrickBatch) {
-        let set = batch.set;
-        let (mut whole, mut on) = (0, Vec::new());
-        for brick in batch.bricks {
-            let id = brick.id;
-            self.cache.put(set, brick);
-            whole += 1;
-            if let Some(shelf) = self.cache.shelf(set) {
-                self.parking.came(set, shelf, id, &mut on);
-            }
-            for task in self.missing.remove(&(set, id)).unwrap_or_default() {
-                let Some(w) = self.waiting.get_mut(&task) else { continue };
-                w.missing -= 1;
-                if w.missing == 0
-                    && let Some(w) = self.waiting.remove(&task)
-                {
-                    self.start(w);
-                }
-            }
-        }
-        for who in on {
-            if let Some(going) = self.parked.remove(&who) {
-                self.go_on(going);
-            }
-        }
-        self.pool.parked(!self.parked.is_empty());
-        if whole > 0 {
-            self.replies.push(ToMaster::BricksIn { set, bricks: whole });
-        }
-        if !batch.broken.is_empty() {
-            warn!(bricks = batch.broken.len(), "bricks failed their checksum");
-            self.replies.push(ToMaster::BricksBroken { set, bricks: batch.broken });
-        }
-    }
-
-    fn rendered(&mut self, done: Rendered) {
-        self.in_pool -= 1;
-        let Some(outcome) = done.outcome else { return };
-        let (task, epoch) = (done.lease.task, done.lease.epoch);
+        let Some(outcome) = report.outcome else { return };
+        let (task, epoch) = (report.lease.task, report.lease.epoch);
         self.replies.push(match outcome {
             Ok((pixels, counters)) => ToMaster::Result(Box::new(TileResult {
                 task,
@@ -551,30 +455,107 @@ impl Desk<'_> {
                 bytes: None,
                 counters,
                 times: TaskTimes {
-                    received_us: self.us(done.received),
-                    ready_us: self.us(done.ready),
-                    start_us: self.us(done.start),
-                    end_us: self.us(done.end),
-                    thread: done.thread,
+                    received_us: self.us(report.received),
+                    ready_us: self.us(report.ready),
+                    start_us: self.us(report.start),
+                    end_us: self.us(report.end),
+                    thread: report.thread,
                 },
                 region: None,
             })),
             Err(reason) => {
-                warn!(%task, reason, "task failed");
+                warn!(%task, reason, "tile failed");
                 ToMaster::Failed { task, epoch, reason }
             }
         });
     }
 
-    /// Takes no more work. Tasks whose bricks are here are finished, and regions that have begun.
+    /// A region is done, stalled or failed.
+    fn on_region_report(&mut self, report: RegionReport) {
+        self.in_pool -= 1;
+        let RegionReport { task: mut region, end, thread, progress } = report;
+        let RegionLease { task, epoch, frame, .. } = region.lease;
+        let key = (frame, task);
+        let is_stalled =
+            matches!(progress, Progress::Stalled { .. }) && self.frames.contains_key(&frame);
+        if !is_stalled {
+            self.splits.remove(&key);
+        }
+        match progress {
+            Progress::Stalled { missing, is_deeper } if is_stalled => {
+                region.stalls += 1;
+                if self.stalls.stall(key, &missing, is_deeper) || region.split.is_pending() {
+                    self.resume(region);
+                } else {
+                    region.stalled_at = Some(Instant::now());
+                    self.stalled.insert(key, region);
+                    self.tell_pool_of_stalls();
+                }
+            }
+            Progress::FrameEnded | Progress::Stalled { .. } => self.stalls.remove(key, &[]),
+            Progress::Done(drawn) => {
+                self.stalls.remove(key, &drawn.touched);
+                let times = TaskTimes {
+                    received_us: self.us(region.received),
+                    ready_us: self.us(region.received + region.stalled),
+                    start_us: self.us(end - region.drawn),
+                    end_us: self.us(end),
+                    thread,
+                };
+                let cost = RegionCost {
+                    touched: drawn.touched,
+                    stalls: region.stalls,
+                    parked_us: region.stalled.as_micros() as u64,
+                    idle_us: self.pool.take_idle().as_micros() as u64,
+                    sampled: drawn.sampled,
+                };
+                self.replies.push(ToMaster::Result(Box::new(TileResult {
+                    task,
+                    epoch,
+                    pixels: drawn.pixels,
+                    bytes: None,
+                    counters: drawn.counters,
+                    times,
+                    region: Some(cost),
+                })));
+            }
+            Progress::Failed(reason) => {
+                self.stalls.remove(key, &[]);
+                warn!(%task, reason, "region failed");
+                self.replies.push(ToMaster::Failed { task, epoch, reason });
+            }
+        }
+    }
+
+    // -----------------------------------------------------------------------------------------
+    // To the master
+
+    /// Asks for the bricks that stalled regions lack, after making room.
+    fn request_bricks(&mut self) {
+        for request in self.stalls.requests(self.cache) {
+            let reply = match request {
+                BrickRequest::Forgotten(set, bricks) => {
+                    debug!(bricks = bricks.len(), "bricks dropped for others");
+                    self.waiting.bricks_dropped(set, &bricks);
+                    ToMaster::BricksForgotten { set, bricks }
+                }
+                BrickRequest::Wanted(set, bricks) => ToMaster::BricksWanted { set, bricks },
+            };
+            self.replies.push(reply);
+        }
+    }
+
+    /// Takes no more leases. Slab tiles whose bricks are here are finished, and regions that have
+    /// begun.
     fn leave(&mut self) {
-        self.leaving = true;
+        self.is_leaving = true;
         self.waiting.clear();
         self.replies.push(ToMaster::Leaving { reason: "told to stop".into() });
     }
 
-    fn us(&self, at: Instant) -> u64 {
-        at.saturating_duration_since(self.epoch).as_micros() as u64
+    /// Microseconds on this worker's clock.
+    fn us(&self, time: Instant) -> u64 {
+        time.saturating_duration_since(self.epoch).as_micros() as u64
     }
 }
 

@@ -1,19 +1,21 @@
-//! Regions that stand still for want of bricks: what is asked for, what makes room, who goes on.
+//! Regions that are stalled for want of bricks: which bricks are asked for, which make room, and
+//! which regions go on.
 //!
-//! A region that lacks bricks is *parked* here, and its render thread takes another. What all parked
-//! regions lack is asked for together, each brick once; a region goes on when all that it asked for is
+//! A region that missing bricks waits here, and its render thread takes another task. Bricks that
+//! several stalled regions lack are asked for once; a region goes on when all that it asked for are
 //! here.
 //!
-//! **Memory.** Under this schedule the worker keeps its own budget: nobody else knows what its regions
-//! stand on. Before bricks are asked for, room is made: least recently drawn first, of any set. What a
-//! parked region waited for, and a region that goes on has not got past yet, is *kept*. So a region that
-//! comes to the same sheet again waits for more and loses nothing. Where all that is here is kept, a
-//! region's wish is put off until another ends, except the oldest one's: that goes over the budget,
-//! since the picture comes first, and is counted.
+//! **Memory.** Under the `region` schedule the worker keeps its own budget: nobody else knows which
+//! bricks its regions need. Before bricks are asked for, room is made: least recently drawn first,
+//! of any set. Bricks that a stalled region waited for, and that a region which goes on has not
+//! passed yet, are *kept*. So a region that comes to the same sheet again waits for more and loses
+//! nothing. If all bricks that are here are kept, a region's request is put off until another
+//! region ends, except that of the oldest region: it goes over the budget, since the picture comes
+//! first, and is counted.
 //!
-//! It refuses to know threads, links and time.
+//! This module knows neither threads nor links nor time.
 
-use crate::brick_table::Shelf;
+use crate::brick_table::BrickTable;
 use crate::cache::BrickCache;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, FrameId, TaskId};
@@ -21,116 +23,123 @@ use slabcast_render::region::BrickSupply;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// A region, the older frame's first.
-pub(crate) type Who = (FrameId, TaskId);
+/// A region of a frame. Regions of older frames sort first.
+pub(crate) type RegionKey = (FrameId, TaskId);
 
-/// A brick: its set, and its place in the directory.
-type Which = (BrickSetKey, u32);
+/// A brick: its set, and its index in the set's directory.
+type BrickKey = (BrickSetKey, u32);
 
-/// Part of the budget that is freed beyond what is needed, as a divisor, so that not every wish looks
-/// through all bricks. At twice this each look frees 3 %; at half, an eighth of the memory lies idle.
-const SPARE: u64 = 16;
+/// Divisor of the budget: this part of it is freed beyond what is needed, so that not every request
+/// searches all bricks. At twice this, a search frees 3 % of the budget; at half, an eighth of the
+/// memory lies idle.
+const SPARE_DIVISOR: u64 = 16;
 
-/// A region that the worker has.
-struct Stay {
+/// Bricks that one region of this worker waits for, by place.
+struct RegionNeeds {
     set: BrickSetKey,
-    shelf: Arc<Shelf>,
-    /// What it waited for since it last came farther.
+    table: Arc<BrickTable>,
+    /// Bricks that it has waited for since it last got deeper.
     keeps: BTreeSet<u32>,
-    /// What it waits for.
-    lacks: BTreeSet<u32>,
-    /// All of that was asked for.
+    /// Bricks that it waits for; none while it is not stalled.
+    missing: BTreeSet<u32>,
+    /// Whether all of `missing` were asked for.
     asked: bool,
 }
 
-/// What is to be said to the master, in this order.
+/// A message to the master about bricks. The order of messages matters.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Say {
+pub(crate) enum BrickRequest {
+    /// These were dropped to make room.
     Forgotten(BrickSetKey, Vec<BrickId>),
+    /// These are to be sent.
     Wanted(BrickSetKey, Vec<BrickId>),
 }
 
 /// See the head of the file.
-pub(crate) struct Parking {
-    budget: u64,
-    stays: BTreeMap<Who, Stay>,
-    /// Bricks that were asked for and are not here, with those who wait.
-    coming: BTreeMap<Which, BTreeSet<Who>>,
-    /// Encoded bytes of those.
-    coming_bytes: u64,
-    /// How many regions keep a brick.
-    kept: BTreeMap<Which, u32>,
-    /// When a brick was drawn last, or came.
-    drawn: BTreeMap<BrickSetKey, Vec<u64>>,
+pub(crate) struct Stalls {
+    budget_bytes: u64,
+    regions: BTreeMap<RegionKey, RegionNeeds>,
+    /// Bricks that were asked for and are not here, with the regions that wait for each.
+    requested: BTreeMap<BrickKey, BTreeSet<RegionKey>>,
+    /// Encoded bytes of `requested`.
+    requested_bytes: u64,
+    /// Number of regions that keep a brick.
+    kept: BTreeMap<BrickKey, u32>,
+    /// Value of `clock` when a brick was drawn last, or arrived, by place.
+    last_used: BTreeMap<BrickSetKey, Vec<u64>>,
     clock: u64,
-    /// Wishes that went over the budget.
+    /// Number of requests that went over the budget.
     pub(crate) over_budget: u64,
 }
 
-impl Parking {
-    pub(crate) fn new(budget: u64) -> Parking {
-        Parking {
-            budget,
-            stays: BTreeMap::new(),
-            coming: BTreeMap::new(),
-            coming_bytes: 0,
+impl Stalls {
+    pub(crate) fn new(budget_bytes: u64) -> Stalls {
+        Stalls {
+            budget_bytes,
+            regions: BTreeMap::new(),
+            requested: BTreeMap::new(),
+            requested_bytes: 0,
             kept: BTreeMap::new(),
-            drawn: BTreeMap::new(),
+            last_used: BTreeMap::new(),
             clock: 0,
             over_budget: 0,
         }
     }
 
-    /// A region comes.
-    pub(crate) fn enter(&mut self, who: Who, set: BrickSetKey, shelf: Arc<Shelf>) {
-        let (keeps, lacks) = Default::default();
-        self.stays.insert(who, Stay { set, shelf, keeps, lacks, asked: true });
+    /// Adds a region, which waits for nothing yet.
+    pub(crate) fn add(&mut self, key: RegionKey, set: BrickSetKey, table: Arc<BrickTable>) {
+        let (keeps, missing) = Default::default();
+        self.regions.insert(key, RegionNeeds { set, table, keeps, missing, asked: true });
     }
 
-    /// A region lacks bricks (places in its directory). `farther`: it came farther since it last did.
-    /// True: they came meanwhile, it goes on. False: it is parked.
-    pub(crate) fn park(&mut self, who: Who, lacks: &[u32], farther: bool) -> bool {
-        let Some(stay) = self.stays.get_mut(&who) else { return false };
-        let before = if farther { std::mem::take(&mut stay.keeps) } else { BTreeSet::new() };
-        for &place in lacks {
-            if stay.keeps.insert(place) {
-                *self.kept.entry((stay.set, place)).or_default() += 1;
+    /// Notes that a region lacks the bricks at the places `missing`. `is_deeper`: at a deeper sheet
+    /// than when it lacked some before. Returns true if all have come meanwhile, so that the
+    /// region goes on, and false if it is stalled.
+    pub(crate) fn stall(&mut self, key: RegionKey, missing: &[u32], is_deeper: bool) -> bool {
+        let Some(region) = self.regions.get_mut(&key) else { return false };
+        let before = if is_deeper { std::mem::take(&mut region.keeps) } else { BTreeSet::new() };
+        for &place in missing {
+            if region.keeps.insert(place) {
+                *self.kept.entry((region.set, place)).or_default() += 1;
             }
-            if !stay.shelf.has(place) {
-                stay.lacks.insert(place);
+            if !region.table.has(place) {
+                region.missing.insert(place);
             }
         }
-        stay.asked = stay.lacks.is_empty();
-        let (set, on) = (stay.set, stay.lacks.is_empty());
-        self.let_go(set, before);
-        on
+        region.asked = region.missing.is_empty();
+        let (set, goes_on) = (region.set, region.missing.is_empty());
+        self.release(set, before);
+        goes_on
     }
 
-    /// Regions that are not begun will need these: which of them are to be asked for. Nothing is forgotten for that.
-    pub(crate) fn expect(
+    /// Returns the bricks to ask for so that regions which are not begun find them here: those of
+    /// `places` that are neither here nor on their way, as far as the budget has room. Nothing is
+    /// dropped to make room.
+    pub(crate) fn prefetch(
         &mut self,
         set: BrickSetKey,
-        shelf: &Shelf,
+        table: &BrickTable,
         places: &[u32],
         cache: &BrickCache,
     ) -> Vec<BrickId> {
         let mut ids = Vec::new();
         for &place in places {
-            let brick = &shelf.bricks()[place as usize];
-            let after = cache.encoded_bytes() + self.coming_bytes + u64::from(brick.bytes);
-            if after > self.budget {
+            let brick = &table.bricks()[place as usize];
+            let after = cache.encoded_bytes() + self.requested_bytes + u64::from(brick.bytes);
+            if after > self.budget_bytes {
                 break;
             }
-            if !shelf.has(place) && !self.coming.contains_key(&(set, place)) {
-                self.coming.insert((set, place), BTreeSet::new());
-                self.coming_bytes += u64::from(brick.bytes);
+            if !table.has(place) && !self.requested.contains_key(&(set, place)) {
+                self.requested.insert((set, place), BTreeSet::new());
+                self.requested_bytes += u64::from(brick.bytes);
                 ids.push(brick.id);
             }
         }
         ids
     }
 
-    fn let_go(&mut self, set: BrickSetKey, places: impl IntoIterator<Item = u32>) {
+    /// Ends a region's claim on bricks.
+    fn release(&mut self, set: BrickSetKey, places: impl IntoIterator<Item = u32>) {
         for place in places {
             if let Some(n) = self.kept.get_mut(&(set, place)) {
                 *n -= 1;
@@ -141,140 +150,148 @@ impl Parking {
         }
     }
 
-    /// A region is at its end, having drawn from these; or its frame is, in whatever way.
-    pub(crate) fn leave(&mut self, who: Who, touched: &[u32]) {
-        let Some(stay) = self.stays.remove(&who) else { return };
+    /// Removes a region that is done, failed, or of a frame that has ended. `touched`: places of the
+    /// bricks that it drew.
+    pub(crate) fn remove(&mut self, key: RegionKey, touched: &[u32]) {
+        let Some(region) = self.regions.remove(&key) else { return };
         self.clock += 1;
-        let drawn = self.drawn.entry(stay.set).or_default();
-        drawn.resize(stay.shelf.bricks().len().max(drawn.len()), 0);
+        let last_used = self.last_used.entry(region.set).or_default();
+        last_used.resize(region.table.bricks().len().max(last_used.len()), 0);
         for &place in touched {
-            drawn[place as usize] = self.clock;
+            last_used[place as usize] = self.clock;
         }
-        for place in stay.lacks {
-            let which = (stay.set, place);
-            if let Some(waiting) = self.coming.get_mut(&which) {
-                waiting.remove(&who);
-                // Nobody waits for it. It may come all the same, or be asked for again.
+        for place in region.missing {
+            let brick = (region.set, place);
+            if let Some(waiting) = self.requested.get_mut(&brick) {
+                waiting.remove(&key);
+                // No region waits for it. It may arrive all the same, or be asked for again.
                 if waiting.is_empty() {
-                    self.coming.remove(&which);
-                    self.coming_bytes -= u64::from(stay.shelf.bricks()[place as usize].bytes);
+                    self.requested.remove(&brick);
+                    self.requested_bytes -= u64::from(region.table.bricks()[place as usize].bytes);
                 }
             }
         }
-        self.let_go(stay.set, stay.keeps);
+        self.release(region.set, region.keeps);
     }
 
-    /// A frame is over: those of its regions that were parked.
-    pub(crate) fn end_frame(&mut self, frame: FrameId) -> Vec<Who> {
+    /// Removes the regions of a frame that were stalled, and returns them.
+    pub(crate) fn end_frame(&mut self, frame: FrameId) -> Vec<RegionKey> {
         let range = (frame, TaskId(0))..=(frame, TaskId(u64::MAX));
-        let parked: Vec<Who> = self
-            .stays
+        let stalled: Vec<RegionKey> = self
+            .regions
             .range(range)
-            .filter(|(_, s)| !s.lacks.is_empty())
-            .map(|(who, _)| *who)
+            .filter(|(_, s)| !s.missing.is_empty())
+            .map(|(key, _)| *key)
             .collect();
-        for &who in &parked {
-            self.leave(who, &[]);
+        for &key in &stalled {
+            self.remove(key, &[]);
         }
-        parked
+        stalled
     }
 
-    /// A brick came and is on its shelf. Who goes on now is added to `on`.
-    pub(crate) fn came(&mut self, set: BrickSetKey, shelf: &Shelf, id: BrickId, on: &mut Vec<Who>) {
-        let Some(place) = shelf.place(id) else { return };
+    /// Notes that a brick has come into its table. Adds the regions that go on now to `on`.
+    pub(crate) fn brick_arrived(
+        &mut self,
+        set: BrickSetKey,
+        table: &BrickTable,
+        id: BrickId,
+        on: &mut Vec<RegionKey>,
+    ) {
+        let Some(place) = table.place(id) else { return };
         self.clock += 1;
-        let drawn = self.drawn.entry(set).or_default();
-        drawn.resize(shelf.bricks().len().max(drawn.len()), 0);
-        drawn[place as usize] = self.clock;
-        if self.coming.remove(&(set, place)).is_some() {
-            self.coming_bytes -= u64::from(shelf.bricks()[place as usize].bytes);
+        let last_used = self.last_used.entry(set).or_default();
+        last_used.resize(table.bricks().len().max(last_used.len()), 0);
+        last_used[place as usize] = self.clock;
+        if self.requested.remove(&(set, place)).is_some() {
+            self.requested_bytes -= u64::from(table.bricks()[place as usize].bytes);
         }
-        // Those whose wish was put off as well as those who asked.
-        for (who, stay) in self.stays.iter_mut().filter(|(_, s)| s.set == set) {
-            if stay.lacks.remove(&place) && stay.lacks.is_empty() {
-                stay.asked = true;
-                on.push(*who);
+        // Regions whose request was put off as well as those that asked.
+        for (key, region) in self.regions.iter_mut().filter(|(_, s)| s.set == set) {
+            if region.missing.remove(&place) && region.missing.is_empty() {
+                region.asked = true;
+                on.push(*key);
             }
         }
     }
 
-    /// Asks for what is lacked, as far as there is room or can be made; forgets what makes it.
-    pub(crate) fn ask(&mut self, cache: &mut BrickCache) -> Vec<Say> {
-        let mut say = Vec::new();
-        if self.stays.is_empty() {
-            // The master keeps the budget: under the other schedule, it knows what is needed.
-            return say;
+    /// Asks for the bricks that stalled regions lack, as far as there is room or room can be made.
+    /// Returns the messages to the master; bricks that make room are dropped from `cache`.
+    pub(crate) fn requests(&mut self, cache: &mut BrickCache) -> Vec<BrickRequest> {
+        let mut requests = Vec::new();
+        if self.regions.is_empty() {
+            // No regions: the schedule is `slab`, and the master keeps this worker's budget.
+            return requests;
         }
-        // What came without being asked for may be too much, too.
-        self.make_room(cache, 0, true, &mut say);
-        let oldest = self.stays.keys().next().copied();
-        let wishes: Vec<Who> =
-            self.stays.iter().filter(|(_, s)| !s.asked).map(|(who, _)| *who).collect();
-        for who in wishes {
-            let stay = &self.stays[&who];
-            let (set, shelf) = (stay.set, stay.shelf.clone());
-            let fresh: Vec<u32> = stay
-                .lacks
+        // Bricks that came without being asked for may exceed the budget, too.
+        self.make_room(cache, 0, true, &mut requests);
+        let oldest = self.regions.keys().next().copied();
+        let pending: Vec<RegionKey> =
+            self.regions.iter().filter(|(_, s)| !s.asked).map(|(key, _)| *key).collect();
+        for key in pending {
+            let region = &self.regions[&key];
+            let (set, table) = (region.set, region.table.clone());
+            let fresh: Vec<u32> = region
+                .missing
                 .iter()
-                .filter(|&&place| !self.coming.contains_key(&(set, place)))
+                .filter(|&&place| !self.requested.contains_key(&(set, place)))
                 .copied()
                 .collect();
             let bytes: u64 =
-                fresh.iter().map(|&i| u64::from(shelf.bricks()[i as usize].bytes)).sum();
-            let urgent = Some(who) == oldest;
-            if !self.make_room(cache, bytes, urgent, &mut say) {
+                fresh.iter().map(|&i| u64::from(table.bricks()[i as usize].bytes)).sum();
+            let urgent = Some(key) == oldest;
+            if !self.make_room(cache, bytes, urgent, &mut requests) {
                 if !urgent {
                     continue;
                 }
                 self.over_budget += 1;
             }
-            self.coming_bytes += bytes;
-            let stay = self.stays.get_mut(&who).expect("it wishes");
-            stay.asked = true;
-            for &place in &stay.lacks {
-                self.coming.entry((set, place)).or_default().insert(who);
+            self.requested_bytes += bytes;
+            let region = self.regions.get_mut(&key).expect("a pending region is there");
+            region.asked = true;
+            for &place in &region.missing {
+                self.requested.entry((set, place)).or_default().insert(key);
             }
-            let ids = fresh.iter().map(|&i| shelf.bricks()[i as usize].id);
-            match say.last_mut() {
-                Some(Say::Wanted(of, wanted)) if *of == set => wanted.extend(ids),
+            let ids = fresh.iter().map(|&i| table.bricks()[i as usize].id);
+            match requests.last_mut() {
+                Some(BrickRequest::Wanted(of, wanted)) if *of == set => wanted.extend(ids),
                 _ if fresh.is_empty() => {}
-                _ => say.push(Say::Wanted(set, ids.collect())),
+                _ => requests.push(BrickRequest::Wanted(set, ids.collect())),
             }
         }
-        say
+        requests
     }
 
-    /// Whether so many bytes fit, after forgetting what can be forgotten. Nothing is where that would
-    /// be in vain, unless it is urgent.
+    /// Drops bricks that no region keeps until `bytes` more fit into the budget, and returns whether
+    /// they do. If they can't fit, nothing is dropped, unless it is urgent.
     fn make_room(
         &mut self,
         cache: &mut BrickCache,
         bytes: u64,
         urgent: bool,
-        say: &mut Vec<Say>,
+        requests: &mut Vec<BrickRequest>,
     ) -> bool {
-        let after = cache.encoded_bytes() + self.coming_bytes + bytes;
-        if after <= self.budget {
+        let after = cache.encoded_bytes() + self.requested_bytes + bytes;
+        if after <= self.budget_bytes {
             return true;
         }
-        let excess = (after - self.budget) + self.budget / SPARE;
+        let excess = (after - self.budget_bytes) + self.budget_bytes / SPARE_DIVISOR;
         let mut victims: Vec<(u64, BrickSetKey, BrickId, u64)> = Vec::new();
         for (set, ids) in cache.held() {
-            let shelf = cache.shelf(set);
-            let drawn = self.drawn.get(&set);
+            let table = cache.table(set);
+            let last_used = self.last_used.get(&set);
             for id in ids {
-                // Where there is no directory, no region stands on it.
-                let place = shelf.and_then(|s| s.place(id));
+                // Without its directory, no region draws from a set.
+                let place = table.and_then(|s| s.place(id));
                 if place.is_some_and(|place| self.kept.contains_key(&(set, place))) {
                     continue;
                 }
-                let last = place.and_then(|p| drawn?.get(p as usize).copied()).unwrap_or(0);
+                let last = place.and_then(|p| last_used?.get(p as usize).copied()).unwrap_or(0);
                 let size = cache.get(set, id).map_or(0, |b| b.encoded_len() as u64);
                 victims.push((last, set, id, size));
             }
         }
         let all: u64 = victims.iter().map(|v| v.3).sum();
-        if !urgent && after - all.min(after) > self.budget {
+        if !urgent && after - all.min(after) > self.budget_bytes {
             return false;
         }
         victims.sort_unstable();
@@ -289,9 +306,9 @@ impl Parking {
         }
         for (set, ids) in gone {
             cache.remove(set, &ids);
-            say.push(Say::Forgotten(set, ids));
+            requests.push(BrickRequest::Forgotten(set, ids));
         }
-        after - freed.min(after) <= self.budget
+        after - freed.min(after) <= self.budget_bytes
     }
 }
 

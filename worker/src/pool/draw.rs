@@ -1,6 +1,8 @@
 //! Drawing one task on one render thread.
 
-use super::task::{Came, Drawn, Going, Gone, Ready, Rendered, Watched};
+use super::task::{
+    DrawnRegion, Progress, RegionReport, RegionTask, SlabReport, SlabTask, StoppableSupply,
+};
 use slabcast_common::leaves::Leaves;
 use slabcast_common::message::{HandedOver, Pixels, Sampling};
 use slabcast_render::Simd;
@@ -10,7 +12,8 @@ use std::panic::AssertUnwindSafe;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
-/// What `work` gives, or in words how the renderer failed; its memory is not used again then.
+/// Runs `work`. A panic of the renderer comes back as its message, and the scratch memory is made
+/// anew.
 pub(super) fn caught<T>(
     scratch: &mut Scratch,
     work: impl FnOnce(&mut Scratch) -> T,
@@ -21,13 +24,19 @@ pub(super) fn caught<T>(
             .downcast_ref::<String>()
             .map(String::as_str)
             .or_else(|| panic.downcast_ref::<&str>().copied())
-            .unwrap_or("a panic without words");
+            .unwrap_or("a panic without a message");
         format!("the renderer failed: {text}")
     })
 }
 
-pub(super) fn render(thread: u32, simd: Simd, task: Ready, scratch: &mut Scratch) -> Rendered {
-    let Ready { lease, frame, bricks, received, ready } = task;
+/// Draws a tile of one slab.
+pub(super) fn draw_slab(
+    thread: u32,
+    simd: Simd,
+    task: SlabTask,
+    scratch: &mut Scratch,
+) -> SlabReport {
+    let SlabTask { lease, frame, bricks, received, ready } = task;
     let span = tracing::debug_span!(
         "tile", frame = %lease.frame, task = %lease.task, x = lease.tile.x0, y = lease.tile.y0,
         slab = lease.slab.first
@@ -35,93 +44,101 @@ pub(super) fn render(thread: u32, simd: Simd, task: Ready, scratch: &mut Scratch
     let _in = span.enter();
     let start = Instant::now();
     let (tile, slab, state) = (lease.tile, lease.slab, &lease.state);
-    let outcome = (!frame.over.load(Ordering::Relaxed)).then(|| {
+    let outcome = (!frame.has_ended.load(Ordering::Relaxed)).then(|| {
         caught(scratch, |scratch| {
             tile::render(frame.get(), simd, tile, slab, &bricks, state, scratch)
         })
     });
     let end = Instant::now();
-    tracing::debug!(ms = (end - start).as_secs_f64() * 1e3, "rendered");
-    Rendered { lease, received, ready, start, end, thread, outcome }
+    tracing::debug!(ms = (end - start).as_secs_f64() * 1e3, "tile drawn");
+    SlabReport { lease, received, ready, start, end, thread, outcome }
 }
 
-pub(super) fn advance(
+/// Draws a region as far as its bricks are here. `give` is handed each piece that is split off.
+pub(super) fn draw_region(
     thread: u32,
     simd: Simd,
-    mut going: Box<Going>,
+    mut task: Box<RegionTask>,
     scratch: &mut Scratch,
     give: &dyn Fn(HandedOver),
-) -> Gone {
+) -> RegionReport {
     let span = tracing::debug_span!(
-        "region", frame = %going.lease.frame, task = %going.lease.task, x = going.lease.tile.x0,
-        y = going.lease.tile.y0
+        "region", frame = %task.lease.frame, task = %task.lease.task, x = task.lease.tile.x0,
+        y = task.lease.tile.y0
     );
     let _in = span.enter();
-    let came = if going.frame.over.load(Ordering::Relaxed) {
-        Came::Over
+    let progress = if task.frame.has_ended.load(Ordering::Relaxed) {
+        Progress::FrameEnded
     } else {
-        caught(scratch, |scratch| go(simd, &mut going, scratch, give)).unwrap_or_else(Came::Failed)
+        caught(scratch, |scratch| advance(simd, &mut task, scratch, give))
+            .unwrap_or_else(Progress::Failed)
     };
-    Gone { going, end: Instant::now(), thread, came }
+    RegionReport { task, end: Instant::now(), thread, progress }
 }
 
-fn go(simd: Simd, going: &mut Going, scratch: &mut Scratch, give: &dyn Fn(HandedOver)) -> Came {
-    let Going { lease, frame: slot, shelf, wish, drawn, region, ahead, .. } = going;
+fn advance(
+    simd: Simd,
+    task: &mut RegionTask,
+    scratch: &mut Scratch,
+    give: &dyn Fn(HandedOver),
+) -> Progress {
+    let RegionTask { lease, frame: slot, table, split, drawn, region, ahead, .. } = task;
     let frame = slot.get();
-    let outlook = slot.outlook(shelf.directory());
+    let visible = slot.visible_bricks(table.directory());
     let start = Instant::now();
-    let before = region.as_ref().and_then(Region::depth);
-    let on = match region {
-        Some(on) => on,
+    let depth_before = region.as_ref().and_then(Region::depth);
+    let current = match region {
+        Some(region) => region,
         None => region.insert(match &lease.begun {
-            None => Region::new(outlook, lease.tile),
-            Some(begun) => match Region::resume(outlook, lease.tile, begun) {
-                Ok(on) => on,
-                Err(why) => return Came::Failed(format!("what was begun of its tile: {why}")),
+            None => Region::new(visible, lease.tile),
+            Some(begun) => match Region::resume(visible, lease.tile, begun) {
+                Ok(region) => region,
+                Err(why) => {
+                    return Progress::Failed(format!("the state to resume its tile from: {why}"));
+                }
             },
         }),
     };
-    let supply = Watched(shelf, wish);
-    let lacks = loop {
-        let lacks = on.advance(frame, simd, outlook, &supply, *ahead, scratch);
-        let Some(share) = wish.take().filter(|_| on.depth().is_some()) else { break lacks };
+    let supply = StoppableSupply { table, split };
+    let missing = loop {
+        let missing = current.advance(frame, simd, visible, &supply, *ahead, scratch);
+        let Some(share) = split.take().filter(|_| current.depth().is_some()) else {
+            break missing;
+        };
         let eps = frame.scene.quality.eps;
-        if let Some((kept, given, begun)) = on.split_off(outlook, eps, share) {
+        if let Some((kept, given, begun)) = current.split_off(visible, eps, share) {
             let (task, epoch) = (lease.task, lease.epoch);
             lease.tile = kept;
             give(HandedOver { task, epoch, kept, given, begun });
         }
     };
     *drawn += start.elapsed();
-    tracing::debug!(ms = start.elapsed().as_secs_f64() * 1e3, lacks = lacks.len(), "drawn");
-    if !lacks.is_empty() {
-        let farther = on.depth() != before;
-        return Came::Lacks(lacks, farther);
+    let ms = start.elapsed().as_secs_f64() * 1e3;
+    tracing::debug!(ms, missing = missing.len(), "region drawn");
+    if !missing.is_empty() {
+        let is_deeper = current.depth() != depth_before;
+        return Progress::Stalled { missing, is_deeper };
     }
-    match region.take() {
-        Some(region) => {
-            let begun = Instant::now();
-            let done = region.finish();
-            done.record_depths(slot.depths());
-            let FinishedRegion { pixels, counters, touched, .. } = done;
-            let size = [lease.tile.width() as u32, lease.tile.height() as u32];
-            let pixels = match &slot.finish {
-                Some(finish) => Pixels::Finished(Leaves::of(&pixels, size, finish)),
-                None => Pixels::Sums(pixels),
-            };
-            *drawn += begun.elapsed();
-            let mut sampled = Sampling::default();
-            // Of what another began, its bricks are not here.
-            if lease.estimate && lease.begun.is_none() {
-                let bricks = touched.iter().map(|&place| shelf.get(place));
-                // One that was forgotten since is not sent again for this.
-                let bricks: Option<Vec<_>> = bricks.collect();
-                if let Some(bricks) = bricks {
-                    sampled = slot.probe().sample(frame, simd, lease.tile, &bricks, scratch);
-                }
-            }
-            Came::Done(Box::new(Drawn { pixels, counters, touched, sampled }))
+    let Some(region) = region.take() else { return Progress::FrameEnded };
+    let finishing = Instant::now();
+    let finished = region.finish();
+    finished.record_depths(slot.depths());
+    let FinishedRegion { pixels, counters, touched, .. } = finished;
+    let size = [lease.tile.width() as u32, lease.tile.height() as u32];
+    let pixels = match &slot.finish {
+        Some(finish) => Pixels::Finished(Leaves::of(&pixels, size, finish)),
+        None => Pixels::Sums(pixels),
+    };
+    *drawn += finishing.elapsed();
+    let mut sampled = Sampling::default();
+    // The bricks of sheets that another worker drew are not here.
+    if lease.estimate && lease.begun.is_none() {
+        let bricks = touched.iter().map(|&place| table.get(place));
+        // A brick that was dropped since is not sent again for this.
+        let bricks: Option<Vec<_>> = bricks.collect();
+        if let Some(bricks) = bricks {
+            sampled = slot.probe().sample(frame, simd, lease.tile, &bricks, scratch);
         }
-        None => Came::Over,
     }
+    Progress::Done(Box::new(DrawnRegion { pixels, counters, touched, sampled }))
 }

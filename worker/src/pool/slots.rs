@@ -1,4 +1,5 @@
-//! Scenes and frames as render threads share them; their tables are made by the first thread that needs them.
+//! Scenes and frames as render threads share them. The first thread that needs a table of one
+//! makes it.
 
 use slabcast_common::ids::FrameId;
 use slabcast_common::leaves::Finish;
@@ -13,17 +14,18 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::Instant;
 
-/// A scene that tiles share; its tables are made by the first thread that needs them.
+/// A scene.
 pub(crate) struct SceneSlot {
     pub(crate) spec: Arc<SceneSpec>,
     scene: OnceLock<Arc<Scene>>,
-    /// How deep its last pictures were open, by their size.
+    /// How deep the last pictures were open, by picture size: tells which bricks to prefetch.
     depths: Mutex<BTreeMap<[u32; 2], Arc<ClosingDepths>>>,
-    /// Of a rehearsal: parts of pictures that were held.
+    /// Corners of the picture parts that were rehearsed (rehearsal only).
     pub(crate) parts: Mutex<BTreeSet<[i32; 2]>>,
-    /// What the thickness costs is found by; `None` where sheets can't be thinner.
+    /// Two thicknesses whose difference tells the error of sheets; `None` where sheets can't be
+    /// thinner.
     pair: OnceLock<Option<ThicknessPair>>,
-    /// The frame that was drawn first.
+    /// The frame of which a thread took a region first.
     pub(super) first: OnceLock<FrameId>,
 }
 
@@ -34,25 +36,26 @@ impl SceneSlot {
     }
 }
 
-/// A frame that tiles share.
+/// A frame.
 pub(crate) struct FrameSlot {
     pub(crate) scene: Arc<SceneSlot>,
     pub(crate) view: View,
-    /// What its regions are finished to.
+    /// Format and background for regions that are finished here; `None`: their sums are sent.
     pub(crate) finish: Option<Finish>,
-    /// Of a rehearsal: whether they weigh what they do as they are.
+    /// Whether results are sent as they are, not packed (rehearsal only).
     pub(crate) plain: bool,
     frame: OnceLock<Frame>,
     probe: OnceLock<ErrorProbe>,
-    outlook: OnceLock<VisibleBricks>,
+    visible: OnceLock<VisibleBricks>,
     depths: OnceLock<Arc<ClosingDepths>>,
-    /// Of a rehearsal: its place in the trace, and when its tables are made.
+    /// Index of the frame in the trace (rehearsal only).
     pub(crate) rehearsed: OnceLock<Option<usize>>,
+    /// When its tables are made (rehearsal only).
     pub(crate) made: OnceLock<Instant>,
-    /// Of a rehearsal: blocks of bricks that its tiles opened.
+    /// Blocks of bricks that its tiles opened (rehearsal only).
     pub(crate) held: Mutex<BTreeSet<u32>>,
-    /// Set when the master ends the frame: tasks of it that have not begun are dropped.
-    pub(crate) over: AtomicBool,
+    /// Whether the master has ended the frame: its tasks that have not begun are dropped.
+    pub(crate) has_ended: AtomicBool,
 }
 
 impl FrameSlot {
@@ -62,7 +65,7 @@ impl FrameSlot {
         finish: Option<Finish>,
         plain: bool,
     ) -> Self {
-        let (frame, probe, outlook, depths, rehearsed, made, held, over) = Default::default();
+        let (frame, probe, visible, depths, rehearsed, made, held, has_ended) = Default::default();
         FrameSlot {
             scene,
             view,
@@ -70,15 +73,16 @@ impl FrameSlot {
             plain,
             frame,
             probe,
-            outlook,
+            visible,
             depths,
             rehearsed,
             made,
             held,
-            over,
+            has_ended,
         }
     }
 
+    /// The frame's tables.
     pub(super) fn get(&self) -> &Frame {
         self.frame.get_or_init(|| {
             let scene = self.scene.scene.get_or_init(|| Arc::new(Scene::new(&self.scene.spec)));
@@ -86,12 +90,12 @@ impl FrameSlot {
         })
     }
 
-    /// What it sees of a directory.
-    pub(super) fn outlook(&self, directory: &Arc<Directory>) -> &VisibleBricks {
-        self.outlook.get_or_init(|| VisibleBricks::new(&self.get().view, directory))
+    /// The directory's bricks that the frame sees. Each frame has one directory.
+    pub(super) fn visible_bricks(&self, directory: &Arc<Directory>) -> &VisibleBricks {
+        self.visible.get_or_init(|| VisibleBricks::new(&self.get().view, directory))
     }
 
-    /// How deep pictures of its scene and size were open.
+    /// How deep pictures of this scene and size were open.
     pub(super) fn depths(&self) -> &ClosingDepths {
         self.depths.get_or_init(|| {
             let size = self.view.size;
@@ -100,7 +104,7 @@ impl FrameSlot {
         })
     }
 
-    /// What tells how far its pixels are off.
+    /// The probe that measures errors of the frame's pixels.
     pub(super) fn probe(&self) -> &ErrorProbe {
         self.probe.get_or_init(|| {
             let pair = self.scene.pair.get_or_init(|| ThicknessPair::new(&self.scene.spec));
@@ -109,6 +113,7 @@ impl FrameSlot {
     }
 }
 
+/// Locks a mutex, also after a panic of another thread.
 pub(crate) fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -1,7 +1,7 @@
-//! What render threads take, and what they give back.
+//! Tasks of render threads, and their reports.
 
 use super::slots::FrameSlot;
-use crate::brick_table::Shelf;
+use crate::brick_table::BrickTable;
 use slabcast_common::brick::{Brick, BrickSetKey};
 use slabcast_common::image::TilePixels;
 use slabcast_common::message::{Counters, HandedOver, Lease, Pixels, RegionLease, Sampling};
@@ -11,8 +11,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-/// A task whose bricks are all here.
-pub(crate) struct Ready {
+/// A tile of one slab whose bricks are all here (`slab` schedule).
+pub(crate) struct SlabTask {
     pub(crate) lease: Box<Lease>,
     pub(crate) frame: Arc<FrameSlot>,
     pub(crate) bricks: Vec<Arc<Brick>>,
@@ -20,151 +20,164 @@ pub(crate) struct Ready {
     pub(crate) ready: Instant,
 }
 
-/// What became of it.
-pub(crate) struct Rendered {
+/// The end of a [`SlabTask`].
+pub(crate) struct SlabReport {
     pub(crate) lease: Box<Lease>,
     pub(crate) received: Instant,
     pub(crate) ready: Instant,
     pub(crate) start: Instant,
     pub(crate) end: Instant,
     pub(crate) thread: u32,
-    /// `None` when its frame was over before it began.
+    /// `None` if its frame had ended before it began.
     pub(crate) outcome: Option<Result<(TilePixels, Counters), String>>,
 }
 
-/// How much of what is left of a region is to be given away, in thousandths; 0: none.
+/// The master's request that a region gives part of its work away (work stealing): the share of
+/// what is left of it, in thousandths; 0 if nothing is asked for.
 #[derive(Default)]
-pub(crate) struct Wish(AtomicU32);
+pub(crate) struct SplitRequest(AtomicU32);
 
-impl Wish {
-    pub(crate) fn give(&self, share: u32) {
+impl SplitRequest {
+    pub(crate) fn ask_for(&self, share: u32) {
         self.0.store(share.clamp(1, 1000), Ordering::Relaxed);
     }
 
-    pub(crate) fn is_there(&self) -> bool {
+    pub(crate) fn is_pending(&self) -> bool {
         self.0.load(Ordering::Relaxed) > 0
     }
 
+    /// Takes the request: the share, from 0 to 1.
     pub(super) fn take(&self) -> Option<f64> {
         let share = self.0.swap(0, Ordering::Relaxed);
         (share > 0).then(|| f64::from(share) / 1000.0)
     }
 }
 
-/// A shelf, of which a region takes bricks as long as it need not give any of its tile away.
-pub(super) struct Watched<'a>(pub(super) &'a Shelf, pub(super) &'a Wish);
+/// The bricks of a table, until the region that draws from it is to be split.
+pub(super) struct StoppableSupply<'a> {
+    pub(super) table: &'a BrickTable,
+    pub(super) split: &'a SplitRequest,
+}
 
-impl BrickSupply for Watched<'_> {
+impl BrickSupply for StoppableSupply<'_> {
     fn get(&self, place: u32) -> Option<Arc<Brick>> {
-        self.0.get(place)
+        self.table.get(place)
     }
 
     fn has(&self, place: u32) -> bool {
-        self.0.has(place)
+        self.table.has(place)
     }
 
     fn stops(&self) -> bool {
-        self.1.is_there()
+        self.split.is_pending()
     }
 }
 
-/// A region on its way.
-pub(crate) struct Going {
+/// A region from its lease to its result (`region` schedule). It goes to a render thread and comes
+/// back as often as it stalls.
+pub(crate) struct RegionTask {
     pub(crate) lease: RegionLease,
     pub(crate) frame: Arc<FrameSlot>,
-    pub(crate) shelf: Arc<Shelf>,
-    pub(crate) wish: Arc<Wish>,
+    pub(crate) table: Arc<BrickTable>,
+    pub(crate) split: Arc<SplitRequest>,
     pub(crate) received: Instant,
-    /// When it stood still last.
-    pub(crate) parked_at: Option<Instant>,
-    pub(crate) parked: Duration,
+    /// When it stalled last, while it is stalled.
+    pub(crate) stalled_at: Option<Instant>,
+    /// Time that it was stalled so far.
+    pub(crate) stalled: Duration,
+    /// How often it stalled.
     pub(crate) stalls: u32,
-    /// How many sheets it looks ahead since a thread took it.
+    /// Sheets that it looks ahead, as of when a thread took it.
     pub(crate) ahead: u32,
-    /// Time of its drawing so far.
+    /// Time that threads drew it so far.
     pub(crate) drawn: Duration,
-    /// What is drawn so far; `None` before it began.
+    /// The pixels so far; `None` before it began.
     pub(super) region: Option<Region>,
-    /// The same of a rehearsal.
+    /// The progress of a rehearsed region; `None` before it began.
     pub(crate) course: Option<RegionProgress>,
-    /// Whether what it will need was looked for.
-    pub(super) looked: bool,
+    /// Whether the bricks that it will need were asked for in advance.
+    pub(super) was_prefetched: bool,
 }
 
-impl Going {
+impl RegionTask {
     pub(crate) fn new(
         lease: RegionLease,
         frame: Arc<FrameSlot>,
-        shelf: Arc<Shelf>,
+        table: Arc<BrickTable>,
         received: Instant,
-    ) -> Going {
-        let (wish, parked_at, parked, stalls, ahead) = Default::default();
-        let (drawn, region, course, looked) = Default::default();
-        Going {
+    ) -> RegionTask {
+        let (split, stalled_at, stalled, stalls, ahead) = Default::default();
+        let (drawn, region, course, was_prefetched) = Default::default();
+        RegionTask {
             lease,
             frame,
-            shelf,
-            wish,
+            table,
+            split,
             received,
-            parked_at,
-            parked,
+            stalled_at,
+            stalled,
             stalls,
             ahead,
             drawn,
             region,
             course,
-            looked,
+            was_prefetched,
         }
     }
 
-    /// Whether no thread has come to it.
-    pub(super) fn begins(&self) -> bool {
+    /// Whether no thread has begun it.
+    pub(super) fn is_new(&self) -> bool {
         self.region.is_none() && self.course.is_none()
     }
 }
 
 /// A region that was drawn to its end.
-pub(crate) struct Drawn {
+pub(crate) struct DrawnRegion {
     pub(crate) pixels: Pixels,
     pub(crate) counters: Counters,
     /// Places in the directory of the bricks that it touched, ascending.
     pub(crate) touched: Vec<u32>,
-    /// How far some of its pixels are off, where that was asked for.
+    /// Measured errors of some of its pixels, if the lease asked for them.
     pub(crate) sampled: Sampling,
 }
 
-/// Where a region came to.
-pub(crate) enum Came {
-    /// Its frame was over.
-    Over,
+/// How far a thread got with a region.
+pub(crate) enum Progress {
+    /// The frame had ended.
+    FrameEnded,
     /// To its end.
-    Done(Box<Drawn>),
-    /// To a sheet at which it lacks bricks; whether that is farther than before.
-    Lacks(Vec<u32>, bool),
-    /// Nowhere.
+    Done(Box<DrawnRegion>),
+    /// To a sheet at which it lacks bricks.
+    Stalled {
+        /// Places of the bricks in the directory.
+        missing: Vec<u32>,
+        /// Whether the sheet lies deeper than the one at which it stalled before.
+        is_deeper: bool,
+    },
+    /// Nowhere, for this reason.
     Failed(String),
 }
 
-/// What became of a region.
-pub(crate) struct Gone {
-    pub(crate) going: Box<Going>,
+/// A thread's report on a region.
+pub(crate) struct RegionReport {
+    pub(crate) task: Box<RegionTask>,
     pub(crate) end: Instant,
     pub(crate) thread: u32,
-    pub(crate) came: Came,
+    pub(crate) progress: Progress,
 }
 
-/// What threads take.
+/// A task for a render thread.
 pub(crate) enum Task {
-    Slab(Ready),
-    Region(Box<Going>),
+    Slab(SlabTask),
+    Region(Box<RegionTask>),
 }
 
-/// What they give back.
-pub(crate) enum Outcome {
-    Slab(Rendered),
-    Region(Gone),
-    /// A piece of a region that goes on.
-    Handed(Box<HandedOver>),
-    /// What regions that nobody has begun will need, by frames before: places on a shelf.
-    Expected(BrickSetKey, Arc<Shelf>, Vec<u32>),
+/// A report of a render thread.
+pub(crate) enum Report {
+    Slab(SlabReport),
+    Region(RegionReport),
+    /// A piece split off a region that goes on.
+    Piece(Box<HandedOver>),
+    /// Places of bricks in a table that regions in the queue will need, judged by earlier frames.
+    Prefetch(BrickSetKey, Arc<BrickTable>, Vec<u32>),
 }

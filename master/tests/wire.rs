@@ -1,0 +1,215 @@
+//! RenderService and ClusterService over a socket, as a client in any language meets them.
+
+use slabcast_common::message::{Hello, ToMaster, ToWorker};
+use slabcast_common::path::Orientation;
+use slabcast_common::protocol::{PROTOCOL_VERSIONS, ProtocolVersions};
+use slabcast_common::volume::Volume;
+use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
+use slabcast_master::{Master, MasterConfig, serve};
+use slabcast_proto::cluster_v1::cluster_service_client::ClusterServiceClient;
+use slabcast_proto::convert;
+use slabcast_proto::render_v1::render_service_client::RenderServiceClient;
+use slabcast_proto::render_v1::{
+    GetJobRequest, JobState, ListJobsRequest, ListWorkersRequest, SubmitPathRequest, Turntable,
+    ViewPath, WatchFramesRequest, view_path::Cameras,
+};
+use slabcast_proto::status::{Details, Reason};
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tokio_stream::StreamExt;
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Code, Status};
+
+/// A master without workers that serves a socket while it lives.
+struct Served {
+    _master: Master,
+    stop: watch::Sender<bool>,
+    channel: Channel,
+}
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        self.stop.send_replace(true);
+    }
+}
+
+async fn served() -> Served {
+    let volume = Volume::from_fn_u8("cube", [16; 3], |i, j, k| (i + j + k) as u8);
+    let orientation = Orientation::new(None, None).expect("the defaults");
+    let master = Master::start(MasterConfig::new(volume, orientation)).expect("threads");
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let (stop, stopped) = watch::channel(false);
+    tokio::spawn(serve::serve(master.handle(), listener, stopped));
+    let endpoint = Endpoint::from_shared(format!("http://{address}")).unwrap();
+    let channel = endpoint.connect().await.unwrap();
+    Served { _master: master, stop, channel }
+}
+
+fn request(key: &str, turntable: Turntable) -> SubmitPathRequest {
+    SubmitPathRequest {
+        client_key: key.into(),
+        path: Some(ViewPath {
+            width: 32,
+            height: 32,
+            cameras: Some(Cameras::Turntable(turntable)),
+            ..ViewPath::default()
+        }),
+        ..SubmitPathRequest::default()
+    }
+}
+
+fn assert_status(status: &Status, code: Code, reason: Reason) -> Details {
+    let details = Details::from_status(status);
+    assert_eq!((status.code(), details.reason), (code, Some(reason)), "{status:?}");
+    details
+}
+
+#[tokio::test]
+async fn error_details_name_reason_field_and_metadata() {
+    let served = served().await;
+    let mut render = RenderServiceClient::new(served.channel.clone());
+    let ask = GetJobRequest { job_id: "job-7".into() };
+    let status = render.get_job(ask).await.unwrap_err();
+    let details = assert_status(&status, Code::NotFound, Reason::JobNotFound);
+    assert_eq!(details.metadata["job_id"], "job-7");
+
+    // Refused at the door, and by a check behind it: both name the field by its path.
+    let frames = request("a", Turntable { frames: Some(0), ..Turntable::default() });
+    let status = render.submit_path(frames).await.unwrap_err();
+    let details = assert_status(&status, Code::InvalidArgument, Reason::InvalidField);
+    assert_eq!(details.field.unwrap().0, "path.turntable.frames");
+    let elevation = request("a", Turntable { elevation: Some(91.0), ..Turntable::default() });
+    let status = render.submit_path(elevation).await.unwrap_err();
+    let details = assert_status(&status, Code::InvalidArgument, Reason::InvalidField);
+    assert_eq!(details.field.unwrap().0, "path.turntable.elevation");
+
+    let good = request("a", Turntable { frames: Some(3), ..Turntable::default() });
+    let job_id = render.submit_path(good.clone()).await.unwrap().into_inner().job_id;
+    let again = render.submit_path(good).await.unwrap().into_inner().job_id;
+    assert_eq!(again, job_id, "the same key and request give the same job");
+    let other = request("a", Turntable { frames: Some(4), ..Turntable::default() });
+    let status = render.submit_path(other).await.unwrap_err();
+    assert_status(&status, Code::AlreadyExists, Reason::ClientKeyTaken);
+
+    let ask = WatchFramesRequest { job_id, from_frame: 4 };
+    let status = render.watch_frames(ask).await.unwrap_err();
+    let details = assert_status(&status, Code::OutOfRange, Reason::FrameBeyondEnd);
+    assert_eq!(details.number("frames_total"), Some(3));
+}
+
+#[tokio::test]
+async fn jobs_are_listed_in_pages_newest_first() {
+    let served = served().await;
+    let mut render = RenderServiceClient::new(served.channel.clone());
+    let mut submitted = Vec::new();
+    for key in ["a", "b", "c", "d", "e"] {
+        let request = request(key, Turntable::default());
+        submitted.push(render.submit_path(request).await.unwrap().into_inner().job_id);
+    }
+    let (mut listed, mut pages, mut page_token) = (Vec::new(), 0, String::new());
+    loop {
+        let ask = ListJobsRequest { page_size: 2, page_token };
+        let page = render.list_jobs(ask).await.unwrap().into_inner();
+        assert!(page.jobs.len() <= 2);
+        for job in page.jobs {
+            let waiting = [JobState::Queued, JobState::Preparing, JobState::WaitingForWorkers];
+            assert!(waiting.contains(&job.state()), "{job:?}");
+            assert!(job.submit_time.is_some() && job.finish_time.is_none());
+            listed.push(job.job_id);
+        }
+        pages += 1;
+        page_token = page.next_page_token;
+        if page_token.is_empty() {
+            break;
+        }
+    }
+    submitted.reverse();
+    assert_eq!((listed, pages), (submitted, 3));
+
+    let ask = ListJobsRequest { page_size: 2, page_token: "x".into() };
+    let status = render.list_jobs(ask).await.unwrap_err();
+    let details = assert_status(&status, Code::InvalidArgument, Reason::InvalidField);
+    assert_eq!(details.field.unwrap().0, "page_token");
+    let workers = render.list_workers(ListWorkersRequest::default()).await.unwrap().into_inner();
+    assert!(workers.workers.is_empty() && workers.next_page_token.is_empty());
+}
+
+fn hello(protocol_versions: ProtocolVersions) -> Hello {
+    Hello {
+        protocol_versions,
+        pixels_version: PIXELS_VERSION,
+        name: "stub".into(),
+        threads: 1,
+        memory_budget_bytes: 1 << 20,
+        simd: "plain".into(),
+        self_test_sha256: SELF_TEST_SHA256.into(),
+        held: vec![],
+        rehearses: false,
+        machine: String::new(),
+    }
+}
+
+/// The master's first answer to a hello, and whether the stream ends with it.
+async fn answer(served: &Served, hello: Hello) -> (ToWorker, bool) {
+    let first = convert::from_worker_to_wire(&ToMaster::Hello(hello));
+    let stream = tokio_stream::once(first).chain(tokio_stream::pending());
+    let mut cluster = ClusterServiceClient::new(served.channel.clone());
+    let mut answers = cluster.control(stream).await.unwrap().into_inner();
+    let (answer, _) =
+        convert::to_worker_from_wire(answers.message().await.unwrap().unwrap()).unwrap();
+    let refused = matches!(answer, ToWorker::Refused { .. });
+    (answer, refused && answers.message().await.unwrap().is_none())
+}
+
+#[tokio::test]
+async fn protocol_version_is_the_newest_that_both_speak_or_the_refusal_names_both() {
+    let served = served().await;
+    let ProtocolVersions { oldest, newest } = PROTOCOL_VERSIONS;
+    // Rolling upgrade: a worker of the next version that still speaks the master's.
+    for worker in [PROTOCOL_VERSIONS, ProtocolVersions { oldest: newest, newest: newest + 1 }] {
+        let (welcome, _) = answer(&served, hello(worker)).await;
+        let ToWorker::Welcome { protocol_version, .. } = welcome else { panic!("{welcome:?}") };
+        assert_eq!(protocol_version, newest);
+    }
+    for (first, last) in [(oldest - 1, oldest - 1), (newest + 1, newest + 2)] {
+        let worker = ProtocolVersions { oldest: first, newest: last };
+        let (refused, ends) = answer(&served, hello(worker)).await;
+        let ToWorker::Refused { reason } = refused else { panic!("{refused:?}") };
+        assert!(ends, "the master ends the link");
+        let (theirs, ours) =
+            (format!("protocol {worker},"), format!("master {PROTOCOL_VERSIONS};"));
+        assert!(reason.contains(&theirs) && reason.contains(&ours), "{reason}");
+    }
+}
+
+#[tokio::test]
+async fn reflection_v1_and_v1alpha_list_both_services() {
+    macro_rules! services {
+        ($pb:ident, $channel:expr) => {{
+            use tonic_reflection::pb::$pb::server_reflection_client::ServerReflectionClient;
+            use tonic_reflection::pb::$pb::{
+                ServerReflectionRequest, server_reflection_request::MessageRequest,
+                server_reflection_response::MessageResponse,
+            };
+            let message_request = Some(MessageRequest::ListServices(String::new()));
+            let ask = ServerReflectionRequest { host: String::new(), message_request };
+            let mut client = ServerReflectionClient::new($channel);
+            let answers = client.server_reflection_info(tokio_stream::once(ask)).await;
+            let answer = answers.unwrap().into_inner().message().await.unwrap().unwrap();
+            match answer.message_response {
+                Some(MessageResponse::ListServicesResponse(list)) => {
+                    list.service.into_iter().map(|s| s.name).collect::<Vec<_>>()
+                }
+                other => panic!("no list of services: {other:?}"),
+            }
+        }};
+    }
+    let served = served().await;
+    for names in [services!(v1, served.channel.clone()), services!(v1alpha, served.channel.clone())]
+    {
+        for service in ["slabcast.render.v1.RenderService", "slabcast.cluster.v1.ClusterService"] {
+            assert!(names.iter().any(|name| name == service), "{service} in {names:?}");
+        }
+    }
+}

@@ -129,7 +129,7 @@ pub enum ClientError {
         "{address} does not talk like a slabcast master of this version ({problem}): check the \
          address and both versions"
     )]
-    Nonsense {
+    Protocol {
         /// The master's address.
         address: String,
         /// What it did.
@@ -160,7 +160,7 @@ impl ClientError {
         let remedy = match status.code() {
             Code::NotFound => return ClientError::NotFound { message },
             Code::Unimplemented => {
-                return ClientError::Nonsense { address: address.to_owned(), problem: message };
+                return ClientError::Protocol { address: address.to_owned(), problem: message };
             }
             Code::ResourceExhausted => {
                 return ClientError::Full { message, retry_after: details.retry_after };

@@ -1,4 +1,4 @@
-//! A job's frames as they come: put together from chunks, taken up again after a break.
+//! Receives a job's frames: assembles them from chunks, and continues after a break.
 
 use crate::error::one_line;
 use crate::{ANSWER, Client, ClientError, JobNotice, JobState};
@@ -19,16 +19,16 @@ pub const PATIENCE: Duration = Duration::from_secs(120);
 const FIRST_WAIT: Duration = Duration::from_millis(100);
 const LONGEST_WAIT: Duration = Duration::from_secs(2);
 
-/// A stream that lived this long was a good one: when it breaks, patience starts anew. Shorter,
+/// A stream that lived this long was healthy: when it breaks, patience starts anew. Shorter,
 /// and a master that dies of each watch would be called for ever.
-const GOOD: Duration = Duration::from_secs(10);
+const HEALTHY: Duration = Duration::from_secs(10);
 
-/// Memory that is set aside for a frame on the strength of its first chunk. A frame of 8192x8192
-/// floats has 1 GiB; the rest of it is made room for as it comes.
-const ON_TRUST: usize = 64 << 20;
+/// Bytes that are allocated for a frame on the word of its first chunk. A frame of 8192x8192 floats
+/// has 1 GiB; memory for the rest is allocated as it arrives.
+const PREALLOCATED_BYTES: usize = 64 << 20;
 
-/// Longest trace of one frame, in bytes.
-const MAX_TRACE: usize = 256 << 20;
+/// Bytes of the longest trace of one frame.
+const MAX_TRACE_BYTES: usize = 256 << 20;
 
 /// An event of a job: news, or a frame.
 #[derive(Clone, Debug, PartialEq)]
@@ -71,9 +71,9 @@ pub struct FrameStream {
     latest: Option<JobNotice>,
     /// Whether the master ended the stream with all that was to come.
     over: bool,
-    /// How long to bear with breaks; `None`: not at all.
+    /// Time that the master may stay away; `None`: a break is an error.
     patience: Option<Duration>,
-    trouble: Option<Trouble>,
+    outage: Option<Outage>,
 }
 
 #[derive(Debug)]
@@ -82,9 +82,9 @@ struct Open {
     since: Instant,
 }
 
-/// A master that is away.
+/// A time without a master.
 #[derive(Debug)]
-struct Trouble {
+struct Outage {
     since: Instant,
     wait: Duration,
 }
@@ -105,11 +105,11 @@ impl FrameStream {
             latest: None,
             over: false,
             patience,
-            trouble: None,
+            outage: None,
         };
         while frames.stream.is_none() {
             if let Err(e) = frames.reopen().await {
-                frames.bear(e).await?;
+                frames.wait_out(e).await?;
             }
         }
         Ok(frames)
@@ -134,7 +134,7 @@ impl FrameStream {
     /// [`ClientError::JobFailed`] and [`ClientError::JobCancelled`] after the last frame of such a
     /// job; [`ClientError::Lost`] or [`ClientError::GaveUp`] if the connection breaks, by
     /// [`Client::watch`] or [`Client::follow`]; [`ClientError::FrameNotKept`] if the master no
-    /// longer keeps the next frame; [`ClientError::Nonsense`] if the chunks of a frame do not fit
+    /// longer keeps the next frame; [`ClientError::Protocol`] if the chunks of a frame do not fit
     /// together.
     pub async fn next(&mut self) -> Result<Option<Update>, ClientError> {
         loop {
@@ -153,12 +153,12 @@ impl FrameStream {
             match self.step().await {
                 Ok(Some(update)) => return Ok(Some(update)),
                 Ok(None) => {}
-                Err(e) => self.bear(e).await?,
+                Err(e) => self.wait_out(e).await?,
             }
         }
     }
 
-    /// One message, which may complete something.
+    /// Reads one message; returns an update if that completes one.
     async fn step(&mut self) -> Result<Option<Update>, ClientError> {
         let Some(open) = &mut self.stream else {
             self.reopen().await?;
@@ -179,19 +179,20 @@ impl FrameStream {
             }
             Err(status) => return Err(ClientError::from_status(self.client.address(), &status)),
         };
-        match convert::watch_from_wire(chunk).map_err(|e| self.client.nonsense(&e))? {
+        match convert::watch_from_wire(chunk).map_err(|e| self.client.protocol_error(&e))? {
             WatchMessage::Notice(notice) => {
                 self.latest = Some(notice.clone());
                 Ok(Some(Update::Notice(notice)))
             }
             WatchMessage::Chunk(chunk) => {
-                let frame = self.take(chunk).map_err(|problem| self.client.nonsense(&problem))?;
+                let frame =
+                    self.add(chunk).map_err(|problem| self.client.protocol_error(&problem))?;
                 Ok(frame.map(|f| Update::Frame(Box::new(f))))
             }
         }
     }
 
-    /// Whether a stream that ends here has told everything.
+    /// Whether nothing is missing of a stream that ends here.
     fn has_all(&self) -> bool {
         self.partial.is_none()
             && self.latest.as_ref().is_some_and(|notice| match notice.state {
@@ -222,22 +223,25 @@ impl FrameStream {
         Ok(())
     }
 
-    /// After an error: either it is final, or it is time to call again when this returns.
-    async fn bear(&mut self, error: ClientError) -> Result<(), ClientError> {
+    /// Waits after an error until it is time to call again.
+    ///
+    /// # Errors
+    /// The error itself if it will not pass, or [`ClientError::GaveUp`] if patience is used up.
+    async fn wait_out(&mut self, error: ClientError) -> Result<(), ClientError> {
         let lived = self.stream.take().map(|open| open.since.elapsed());
         self.partial = None;
         let Some(patience) = self.patience.filter(|_| error.is_passing()) else {
             return Err(error);
         };
-        if lived.is_some_and(|lived| lived >= GOOD) {
-            self.trouble = None;
+        if lived.is_some_and(|lived| lived >= HEALTHY) {
+            self.outage = None;
         }
         let now = Instant::now();
-        let trouble = self.trouble.get_or_insert(Trouble { since: now, wait: FIRST_WAIT });
+        let outage = self.outage.get_or_insert(Outage { since: now, wait: FIRST_WAIT });
         // A master that asks for more is waited for longer, within reason.
-        let wait = trouble.wait.max(error.retry_after().unwrap_or_default()).min(LONGEST_WAIT);
-        trouble.wait = (2 * wait).min(LONGEST_WAIT);
-        let after = now - trouble.since;
+        let wait = outage.wait.max(error.retry_after().unwrap_or_default()).min(LONGEST_WAIT);
+        outage.wait = (2 * wait).min(LONGEST_WAIT);
+        let after = now - outage.since;
         if after + wait > patience {
             return Err(ClientError::GaveUp {
                 address: self.client.address().to_owned(),
@@ -253,29 +257,30 @@ impl FrameStream {
         Ok(())
     }
 
-    /// Takes in a chunk, which may complete the frame.
-    fn take(&mut self, chunk: FrameChunk) -> Result<Option<ReceivedFrame>, String> {
+    /// Adds a chunk; returns the frame if that completes it.
+    fn add(&mut self, chunk: FrameChunk) -> Result<Option<ReceivedFrame>, String> {
         if chunk.frame != self.next {
             return Err(format!("frame {} came instead of {}", chunk.frame, self.next));
         }
         let partial = self.partial.get_or_insert_with(|| Partial::new(&chunk));
         let last = chunk.last;
-        partial.take(chunk)?;
+        partial.add(chunk)?;
         if !last {
             return Ok(None);
         }
-        let whole = self.partial.take().expect("it was there a moment ago").finish(self.next)?;
+        let whole = self.partial.take().expect("a chunk was added to it").finish(self.next)?;
         self.next += 1;
-        self.trouble = None;
+        self.outage = None;
         Ok(Some(whole))
     }
 }
 
-/// A frame while its chunks come.
+/// A frame of which chunks are missing.
 #[derive(Debug)]
 struct Partial {
     size: [u32; 2],
     format: PixelFormat,
+    /// Bytes of the whole frame.
     whole: usize,
     bytes: Vec<u8>,
     statistics: StatisticsParts,
@@ -289,13 +294,13 @@ impl Partial {
             size: first.size,
             format: first.format,
             whole,
-            bytes: Vec::with_capacity(whole.min(ON_TRUST)),
+            bytes: Vec::with_capacity(whole.min(PREALLOCATED_BYTES)),
             statistics: StatisticsParts::default(),
             trace_json: String::new(),
         }
     }
 
-    fn take(&mut self, chunk: FrameChunk) -> Result<(), String> {
+    fn add(&mut self, chunk: FrameChunk) -> Result<(), String> {
         if (chunk.size, chunk.format) != (self.size, self.format) {
             return Err(format!("frame {} changes its size or format", chunk.frame));
         }
@@ -312,7 +317,7 @@ impl Partial {
             let added = self.statistics.add(part);
             added.map_err(|e| format!("frame {}: {e}", chunk.frame))?;
         }
-        if self.trace_json.len() + chunk.trace_json.len() > MAX_TRACE {
+        if self.trace_json.len() + chunk.trace_json.len() > MAX_TRACE_BYTES {
             return Err(format!("frame {} has too long a trace", chunk.frame));
         }
         self.trace_json.push_str(&chunk.trace_json);

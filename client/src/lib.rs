@@ -1,13 +1,13 @@
 //! Submit a view path to a master and stream its frames.
 //!
 //! 1. [`Client::connect`] to a master.
-//! 2. [`Client::submit`] a path; the reply names the job.
-//! 3. [`Client::follow`] the job and take what comes until it ends:
+//! 2. [`Client::submit`] a path; the response names the job.
+//! 3. [`Client::follow`] the job and read updates until it ends:
 //!
 //! ```no_run
 //! # async fn f(request: slabcast_common::message::PathRequest) -> Result<(), slabcast_client::ClientError> {
 //! use slabcast_client::{Client, PATIENCE, Update};
-//! let client = Client::connect("127.0.0.1:7070").await?;
+//! let client = Client::connect("127.0.0.1:7433").await?;
 //! let job = client.submit(&request).await?;
 //! let mut frames = client.follow(&job, 0, PATIENCE).await?;
 //! while let Some(update) = frames.next().await? {
@@ -19,8 +19,9 @@
 //! # Ok(()) }
 //! ```
 //!
-//! Nothing that a client drops, loses or forgets cancels a job; [`Client::cancel`] does. This
-//! crate refuses to know files, flags and progress bars: those are the program's.
+//! Dropping a client or a stream never cancels a job; [`Client::cancel`] does. Errors are told apart
+//! by [`ClientError`], which reads the details of a master's status, not its text. This crate
+//! refuses to know files, flags and progress bars: those are the program's.
 
 mod address;
 mod error;
@@ -59,7 +60,7 @@ const AGAIN: Duration = Duration::from_millis(100);
 /// Longest such wait, whatever the master asks for.
 const LONGEST_AGAIN: Duration = Duration::from_secs(2);
 
-/// A master, as its clients see it. Clones share one connection, which comes back by itself.
+/// A connection to a master. Clones share it; when it breaks, the next call makes it again.
 #[derive(Clone, Debug)]
 pub struct Client {
     render: RenderServiceClient<Channel>,
@@ -126,7 +127,7 @@ impl Client {
             .call(async |mut render, request| render.submit_path(request).await, request)
             .await?;
         if reply.job_id.is_empty() {
-            return Err(self.nonsense("job_id is empty"));
+            return Err(self.protocol_error("job_id is empty"));
         }
         Ok(reply.job_id)
     }
@@ -170,7 +171,7 @@ impl Client {
     /// Returns the master's jobs, newest first, at most `limit`.
     ///
     /// # Errors
-    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Nonsense`] if it does not
+    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Protocol`] if it does not
     /// talk like one.
     pub async fn jobs(&self, limit: usize) -> Result<Vec<Job>, ClientError> {
         let mut jobs = Vec::new();
@@ -181,10 +182,10 @@ impl Client {
             let response =
                 self.call(async |mut r, request| r.list_jobs(request).await, request).await?;
             let page = response.jobs.into_iter().map(convert::job_from_wire);
-            let page = page.collect::<Result<Vec<_>, _>>().map_err(|e| self.nonsense(&e))?;
+            let page = page.collect::<Result<Vec<_>, _>>().map_err(|e| self.protocol_error(&e))?;
             page_token = response.next_page_token;
             if page.is_empty() && !page_token.is_empty() {
-                return Err(self.nonsense("a page of jobs is empty and not the last"));
+                return Err(self.protocol_error("a page of jobs is empty and not the last"));
             }
             jobs.extend(page);
             if page_token.is_empty() {
@@ -210,19 +211,19 @@ impl Client {
     /// Returns the volume that the master serves.
     ///
     /// # Errors
-    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Nonsense`] if it does not
+    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Protocol`] if it does not
     /// talk like one.
     pub async fn volume(&self) -> Result<VolumeDescription, ClientError> {
         let request = wire::DescribeVolumeRequest {};
         let volume =
             self.call(async |mut r, request| r.describe_volume(request).await, request).await?;
-        convert::volume_from_wire(volume).map_err(|e| self.nonsense(&e))
+        convert::volume_from_wire(volume).map_err(|e| self.protocol_error(&e))
     }
 
     /// Returns the master's workers, in the order in which they joined.
     ///
     /// # Errors
-    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Nonsense`] if it does not
+    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Protocol`] if it does not
     /// talk like one.
     pub async fn workers(&self) -> Result<Vec<Worker>, ClientError> {
         let mut workers = Vec::new();
@@ -232,10 +233,10 @@ impl Client {
             let response =
                 self.call(async |mut r, request| r.list_workers(request).await, request).await?;
             let page = response.workers.into_iter().map(convert::worker_from_wire);
-            let page = page.collect::<Result<Vec<_>, _>>().map_err(|e| self.nonsense(&e))?;
+            let page = page.collect::<Result<Vec<_>, _>>().map_err(|e| self.protocol_error(&e))?;
             page_token = response.next_page_token;
             if page.is_empty() && !page_token.is_empty() {
-                return Err(self.nonsense("a page of workers is empty and not the last"));
+                return Err(self.protocol_error("a page of workers is empty and not the last"));
             }
             workers.extend(page);
             if page_token.is_empty() {
@@ -245,8 +246,8 @@ impl Client {
     }
 
     fn read_job(&self, job: Option<wire::Job>) -> Result<Job, ClientError> {
-        let job = job.ok_or_else(|| self.nonsense("job: missing; it is required"))?;
-        convert::job_from_wire(job).map_err(|e| self.nonsense(&e))
+        let job = job.ok_or_else(|| self.protocol_error("job: missing; it is required"))?;
+        convert::job_from_wire(job).map_err(|e| self.protocol_error(&e))
     }
 
     /// Makes a call, and once more when the connection turns out to be broken: a master that was
@@ -278,8 +279,8 @@ impl Client {
         .map_err(|status| ClientError::from_status(&self.address, &status))
     }
 
-    /// The master said what `render.proto` rules out.
-    pub(crate) fn nonsense(&self, problem: &(impl ToString + ?Sized)) -> ClientError {
-        ClientError::Nonsense { address: self.address.to_string(), problem: problem.to_string() }
+    /// Makes the error of a master that breaks the rules of `render.proto`.
+    pub(crate) fn protocol_error(&self, problem: &(impl ToString + ?Sized)) -> ClientError {
+        ClientError::Protocol { address: self.address.to_string(), problem: problem.to_string() }
     }
 }

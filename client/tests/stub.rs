@@ -9,6 +9,7 @@ use slabcast_common::quality::{Quality, Work};
 use slabcast_common::stats::{FrameMs, FrameStats};
 use slabcast_proto::model::{Job, JobNotice};
 use slabcast_proto::render_v1::render_service_server::{RenderService, RenderServiceServer};
+use slabcast_proto::status::Reason;
 use slabcast_proto::{convert, render_v1 as wire};
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -57,7 +58,10 @@ impl RenderService for Script {
         let from = request.into_inner().from_frame;
         self.watched_from.lock().unwrap().push(from);
         let Some((chunks, ends)) = self.watches.lock().unwrap().get(&from).cloned() else {
-            return Err(Status::not_found("job-9 is not known"));
+            return Err(match from {
+                7 => Reason::FrameNotKept.status("gone", &[("first_kept_frame", "9".into())]),
+                _ => Reason::JobNotFound.status("job-9 is not known", &[]),
+            });
         };
         let chunks = tokio_stream::iter(chunks);
         Ok(Response::new(match ends {
@@ -108,7 +112,8 @@ impl RenderService for Script {
         &self,
         _: Request<wire::ListWorkersRequest>,
     ) -> Result<Response<wire::ListWorkersResponse>, Status> {
-        Err(Status::resource_exhausted("64 watchers\nare enough"))
+        let delay = Duration::from_millis(1500);
+        Err(Reason::TooManyWatchers.retry("64 watchers\nare enough", delay))
     }
 }
 
@@ -248,7 +253,7 @@ fn request(key: &str) -> PathRequest {
 }
 
 #[tokio::test]
-async fn a_frame_in_many_chunks_comes_whole_with_its_statistics() {
+async fn frame_in_many_chunks_is_assembled_with_its_statistics() {
     let script = Script::default();
     let size = [1000, 900];
     let mut all = vec![notice(JobState::Running, 2, "")];
@@ -284,7 +289,7 @@ async fn a_frame_in_many_chunks_comes_whole_with_its_statistics() {
 }
 
 #[tokio::test]
-async fn a_broken_connection_is_taken_up_at_the_first_frame_that_is_not_whole() {
+async fn follow_reconnects_and_continues_at_the_first_incomplete_frame() {
     let script = Script::default();
     let size = [1000, 900];
     let mut broken = vec![notice(JobState::Running, 3, "")];
@@ -316,7 +321,7 @@ async fn a_broken_connection_is_taken_up_at_the_first_frame_that_is_not_whole() 
 }
 
 #[tokio::test]
-async fn without_patience_a_break_is_an_error_that_says_so() {
+async fn watch_does_not_reconnect_and_names_the_master() {
     let script = Script::default();
     let broken = vec![notice(JobState::Running, 3, "")];
     script.watches.lock().unwrap().insert(0, (broken, false));
@@ -331,7 +336,7 @@ async fn without_patience_a_break_is_an_error_that_says_so() {
 }
 
 #[tokio::test]
-async fn a_master_that_stays_away_is_given_up_in_time() {
+async fn follow_gives_up_after_its_patience() {
     let script = Script::default();
     let mut broken = vec![notice(JobState::Running, 3, "")];
     broken.extend(chunks(0, [3, 3], ""));
@@ -351,7 +356,7 @@ async fn a_master_that_stays_away_is_given_up_in_time() {
 }
 
 #[tokio::test]
-async fn a_stream_that_ends_too_early_is_taken_up() {
+async fn follow_reconnects_when_a_stream_ends_early() {
     let script = Script::default();
     let mut short = vec![notice(JobState::Running, 2, "")];
     short.extend(chunks(0, [3, 3], ""));
@@ -373,7 +378,7 @@ async fn a_stream_that_ends_too_early_is_taken_up() {
 }
 
 #[tokio::test]
-async fn what_a_job_ends_with_cannot_be_overlooked() {
+async fn failed_or_cancelled_job_ends_its_stream_with_an_error() {
     let script = Script::default();
     let mut failed = vec![notice(JobState::Running, 2, "")];
     failed.extend(chunks(0, [3, 3], ""));
@@ -398,26 +403,37 @@ async fn what_a_job_ends_with_cannot_be_overlooked() {
 }
 
 #[tokio::test]
-async fn statuses_become_one_line_with_a_remedy() {
+async fn status_details_become_typed_errors_with_a_remedy() {
     let client = Client::connect(&serve(&Script::default()).await.to_string()).await.unwrap();
     let e = client.watch("job-9", 0).await.unwrap_err();
     assert!(matches!(e, ClientError::NotFound { .. }), "{e}");
     let e = client.follow("job-9", 0, Duration::from_secs(60)).await.unwrap_err();
     assert!(matches!(e, ClientError::NotFound { .. }), "no patience with what will not pass: {e}");
     let bad = PathRequest { path: ViewPath::turn([0, 64], Turntable::default()), ..request("a") };
-    let e = client.submit(&bad).await.unwrap_err().to_string();
-    assert_eq!(e, "refused: path.width: 0 pixels; give 1 to 8192");
-    let e = client.workers().await.unwrap_err().to_string();
+    let e = client.submit(&bad).await.unwrap_err();
+    assert_eq!(e.to_string(), "refused: path.width: 0 pixels; give 1 to 8192");
+    let (field, problem) = ("path.width".into(), "0 pixels; give 1 to 8192".into());
+    assert_eq!(e, ClientError::InvalidField { field, problem });
+    let path = ViewPath::turn([64, 64], Turntable { frames: 0, ..Turntable::default() });
+    let e = client.submit(&PathRequest { path, ..request("a") }).await.unwrap_err();
+    assert!(
+        matches!(&e, ClientError::InvalidField { field, .. } if field == "path.turntable.frames"),
+        "refused by this side: {e}"
+    );
+    let e = client.watch("job-0", 7).await.unwrap_err();
+    assert!(matches!(e, ClientError::FrameNotKept { first_kept_frame: Some(9), .. }), "{e}");
+    let e = client.workers().await.unwrap_err();
+    assert_eq!(e.retry_after(), Some(Duration::from_millis(1500)));
     assert_eq!(
-        e,
+        e.to_string(),
         "64 watchers are enough (ResourceExhausted): the master is full; try later, or cancel a job"
     );
     let e = client.volume().await.unwrap_err();
-    assert!(matches!(e, ClientError::Nonsense { .. }), "{e}");
+    assert!(matches!(e, ClientError::Protocol { .. }), "{e}");
 }
 
 #[tokio::test]
-async fn a_request_too_long_is_refused_before_it_is_sent() {
+async fn request_too_long_is_refused_before_it_is_sent() {
     let client = Client::connect(&serve(&Script::default()).await.to_string()).await.unwrap();
     let view = slabcast_common::path::PathView {
         eye: [1.0; 3],
@@ -434,7 +450,7 @@ async fn a_request_too_long_is_refused_before_it_is_sent() {
 }
 
 #[tokio::test]
-async fn the_same_key_gives_the_same_job_and_futures_may_move() {
+async fn same_client_key_gives_the_same_job_and_lists_are_paged() {
     let script = Script::default();
     let client = Client::connect(&serve(&script).await.to_string()).await.unwrap();
     let submitted = tokio::spawn({
@@ -451,7 +467,7 @@ async fn the_same_key_gives_the_same_job_and_futures_may_move() {
 }
 
 #[tokio::test]
-async fn chunks_that_break_the_promise_are_named() {
+async fn chunks_that_do_not_fit_together_are_refused() {
     let [a, b] = [0, 1].map(|f| chunks(f, [1000, 900], ""));
     let cases: [(&str, Chunks, &str); 4] = [
         ("a gap", vec![a[0].clone(), a[2].clone()], "goes on at byte"),
@@ -477,7 +493,7 @@ fn last_at_once(mut chunk: wire::WatchFramesResponse) -> wire::WatchFramesRespon
 }
 
 #[tokio::test]
-async fn nobody_there_is_said_with_the_address() {
+async fn connection_refused_names_the_address() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap().to_string();
     drop(listener);
@@ -488,7 +504,7 @@ async fn nobody_there_is_said_with_the_address() {
 
 /// A web server, say: it takes the connection and speaks something else.
 #[tokio::test]
-async fn somebody_else_there_is_an_error_and_no_panic() {
+async fn server_that_is_no_master_is_an_error_and_no_panic() {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap().to_string();

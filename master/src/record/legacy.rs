@@ -39,3 +39,35 @@ pub(super) fn scene(bytes: &[u8]) -> Result<SceneSpec, String> {
     }
     Ok(scene)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use prost::Message;
+    use slabcast_common::brick::BrickSetKey;
+    use slabcast_common::ids::SceneId;
+    use slabcast_common::presets;
+    use slabcast_common::quality::{Quality, Sums};
+    use slabcast_common::volume::{Digest32, Volume};
+
+    #[test]
+    fn scene_of_format_3_is_read_with_its_transfer_function_from_json() {
+        let volume = Volume::from_fn_u8("cube", [8; 3], |i, j, k| (i + j + k) as u8);
+        let spec = SceneSpec {
+            id: SceneId(5),
+            transfer: presets::by_name("peer-semi", &volume.summary).unwrap(),
+            volume: volume.info(Digest32([7; 32])),
+            quality: Quality { sums: Sums::I32, ..Quality::default() },
+            bricks: BrickSetKey(Digest32([9; 32])),
+        };
+        let new = convert::scene_to_wire(&spec);
+        assert_eq!(scene(&new.encode_to_vec()), Ok(spec.clone()));
+        let without = wire::Scene { transfer: None, ..new };
+        let written = |transfer_json: String| {
+            [without.encode_to_vec(), OldScene { transfer_json }.encode_to_vec()].concat()
+        };
+        assert_eq!(scene(&written(spec.transfer.to_json())), Ok(spec));
+        let refused = scene(&written("{".into())).unwrap_err();
+        assert!(refused.starts_with("transfer_json."), "{refused}");
+    }
+}

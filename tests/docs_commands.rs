@@ -442,6 +442,25 @@ fn documents_that_the_code_cites_are_there() {
 }
 
 #[test]
+fn paths_that_the_documents_name_are_there() {
+    let rooms =
+        ["client/", "common/", "master/", "worker/", "proto/", "tests/", "deploy/", "docs/"];
+    let mut broken = Vec::new();
+    for document in documents().iter().filter(|d| d.starts_with("docs/design/")) {
+        for (i, line) in read(document).lines().enumerate() {
+            for word in line.split('`').skip(1).step_by(2) {
+                let is_path =
+                    rooms.iter().any(|r| word.starts_with(r)) && !word.contains([' ', '{', '*']);
+                if is_path && !root().join(word).exists() {
+                    broken.push(format!("{document}:{}: {word}", i + 1));
+                }
+            }
+        }
+    }
+    assert!(broken.is_empty(), "named, and not there:\n{}", broken.join("\n"));
+}
+
+#[test]
 fn tests_that_the_promises_name_are_there() {
     let names: Vec<String> = read("docs/design/promises.md")
         .split('`')

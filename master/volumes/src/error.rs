@@ -69,6 +69,20 @@ impl Problem {
         Problem::new(OpenErrorKind::Unsupported, field, what, remedy)
     }
 
+    /// A reader's thread panicked: a mistake of this program, which the file brought out.
+    pub(crate) fn panicked(field: impl Into<String>, panic: &(dyn std::any::Any + Send)) -> Self {
+        let message = panic
+            .downcast_ref::<String>()
+            .map(String::as_str)
+            .or_else(|| panic.downcast_ref::<&str>().copied())
+            .unwrap_or("a panic without a message");
+        Problem::unsupported(
+            field,
+            format!("the reader panicked ({message})"),
+            "report the file as a bug of slabcast, and convert it with another program",
+        )
+    }
+
     pub(crate) fn io(field: impl Into<String>, e: &std::io::Error) -> Self {
         Problem::new(
             OpenErrorKind::Unreadable,

@@ -19,6 +19,7 @@ use crate::wide;
 use slabcast_common::brick::{BrickGrid, MAX_BRICKS};
 use slabcast_common::volume::{Samples, ValueMap};
 use std::io::Read;
+use std::panic::AssertUnwindSafe;
 use std::sync::mpsc;
 
 /// Largest size along one axis. A header that asks for more is far likelier wrong than large:
@@ -334,7 +335,12 @@ impl Data<'_> {
             let ahead = move || {
                 loop {
                     let mut chunk = spare.try_recv().unwrap_or_default();
-                    let next = bytes.next(&mut chunk).map(|more| more.then_some(chunk));
+                    // A panic comes out as a problem: the scope would pass it on to whoever opens
+                    // the file.
+                    let next = AssertUnwindSafe(|| bytes.next(&mut chunk));
+                    let next = std::panic::catch_unwind(next)
+                        .unwrap_or_else(|panic| Err(Problem::panicked("data", &*panic)))
+                        .map(|more| more.then_some(chunk));
                     let last = !matches!(next, Ok(Some(_)));
                     // Nobody listens any more after a problem at the other end.
                     if filled.send(next).is_err() || last {
@@ -344,7 +350,6 @@ impl Data<'_> {
             };
             let named = std::thread::Builder::new().name("slabcast-unpack".into());
             named.spawn_scoped(scope, ahead).map_err(|e| Problem::io("data", &e))?;
-            // A sender that is gone without a last word has panicked, which the scope passes on.
             while let Ok(next) = chunks.recv() {
                 let Some(chunk) = next? else { break };
                 take(&chunk)?;
@@ -467,6 +472,28 @@ mod tests {
 
     fn values((samples, map): &(Samples, ValueMap)) -> Vec<f64> {
         (0..samples.len()).map(|i| map.value(samples.code(i))).collect()
+    }
+
+    /// A stream whose decoder panics after so many bytes.
+    struct Panics(usize);
+
+    impl Read for Panics {
+        fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+            assert!(self.0 > 0, "injected into the decoder");
+            let n = buffer.len().min(self.0);
+            self.0 -= n;
+            Ok(n)
+        }
+    }
+
+    #[test]
+    fn panic_of_the_unpacking_thread_is_an_error_of_the_file() {
+        let need = 4 * AHEAD_FROM_BYTES;
+        let layout = Layout::new([need, 1, 1], Number::U8, Endian::Little, "sizes").unwrap();
+        let supply = Supply::Encoded { name: "gzip", bytes: need, ratio: 64 };
+        let error = read(&mut Panics(need as usize / 2), supply, &layout).expect_err("it panics");
+        assert_eq!((error.kind, &error.field[..]), (OpenErrorKind::Unsupported, "data"));
+        assert!(error.what.contains("panicked (injected into the decoder)"), "{error}");
     }
 
     macro_rules! both_orders {

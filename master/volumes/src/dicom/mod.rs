@@ -48,8 +48,11 @@ pub(crate) fn open(
         let (from, mut to) = std::io::pipe().map_err(|e| Problem::io("pipe", &e))?;
         return std::thread::scope(|scope| {
             scope.spawn(move || {
-                // A reader that has gone away has its reasons.
-                let _ = told(files, &Wish { series, file }, &mut to);
+                // Whoever receives tells of a panic: the pipe ends before the series does.
+                let _ = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+                    // A receiver that has gone away has its reasons.
+                    let _ = told(files, &Wish { series, file }, &mut to);
+                }));
             });
             received(from, bytes).unwrap_or_else(|| Err(ended("it panicked")))
         });

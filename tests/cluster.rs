@@ -3,16 +3,18 @@
 //! The story of each test: build a small cluster, let it render, do something to it, compare
 //! pixels with a run inside one process. A worker that is to die is first stopped (SIGSTOP), so
 //! that what it holds it holds when it is killed; the master's own word says that it held a
-//! tile. Waiting is polling with a deadline, never a sleep that hopes.
+//! tile. Waiting is asking the master until it answers so, with a deadline.
 
+#[path = "support/processes.rs"]
+mod processes;
+
+use processes::{Process, SLABCAST};
 use slabcast_client::Client;
 use slabcast_common::stats::FrameStats;
-use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-const SLABCAST: &str = env!("CARGO_BIN_EXE_slabcast");
 const VOLUME: &str = "formula:spheres:64";
 /// Thin sheets and a large picture: each tile takes long enough to be caught in the act.
 const VIEWS: [&str; 10] = [
@@ -28,57 +30,12 @@ const VIEWS: [&str; 10] = [
     "auto",
 ];
 
-/// A process that does not outlive its test.
-struct Process(Child);
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-impl Process {
-    fn signal(&self, name: &str) {
-        let status = Command::new("kill").args([name, &self.0.id().to_string()]).status();
-        assert!(status.expect("kill is there").success());
-    }
-
-    fn exit_within(&mut self, limit: Duration) -> Option<i32> {
-        let until = Instant::now() + limit;
-        while Instant::now() < until {
-            if let Some(status) = self.0.try_wait().expect("a child of ours") {
-                return status.code();
-            }
-            std::thread::sleep(Duration::from_millis(10));
-        }
-        panic!("still running after {limit:?}");
-    }
-}
-
 fn master() -> (Process, String) {
-    let mut child = Command::new(SLABCAST)
-        .args(["master", "--volume", VOLUME, "--listen", "127.0.0.1:0"])
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .expect("the master starts");
-    let mut line = String::new();
-    let out = child.stdout.take().expect("piped");
-    BufReader::new(out).read_line(&mut line).expect("a line");
-    let address = line.trim().strip_prefix("listening on ").expect(&line).to_string();
-    (Process(child), address)
+    processes::master(Path::new("."), VOLUME, &[])
 }
 
 fn worker(master: &str, name: &str) -> Process {
-    let child = Command::new(SLABCAST)
-        .args(["worker", "--master", master, "--name", name, "--threads", "1"])
-        .args(["--memory", "16MiB"])
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .spawn()
-        .expect("the worker starts");
-    Process(child)
+    processes::worker(Path::new("."), master, name, &["--threads", "1", "--memory", "16MiB"])
 }
 
 fn stats(file: &Path) -> Vec<FrameStats> {
@@ -96,7 +53,7 @@ fn run(command: &mut Command) -> Output {
     out
 }
 
-/// The same views inside one process, under the paper's schedule.
+/// Renders [`VIEWS`] inside one process, under the paper's schedule. Returns the frames' hashes.
 fn embedded(dir: &Path) -> Vec<String> {
     let file = dir.join("embedded.jsonl");
     run(Command::new(SLABCAST)
@@ -109,6 +66,7 @@ fn embedded(dir: &Path) -> Vec<String> {
     hashes(&stats(&file))
 }
 
+/// Starts a client that renders [`VIEWS`] on a master. Returns it with its file of statistics.
 fn render(dir: &Path, master: &str, name: &str, schedule: &str) -> (Process, PathBuf) {
     let file = dir.join(format!("{name}.jsonl"));
     let child = Command::new(SLABCAST)
@@ -125,6 +83,7 @@ fn render(dir: &Path, master: &str, name: &str, schedule: &str) -> (Process, Pat
     (Process(child), file)
 }
 
+/// Asks until there is an answer; each question is a round trip to the master.
 async fn until<T>(what: &str, mut look: impl AsyncFnMut() -> Option<T>) -> T {
     let deadline = Instant::now() + Duration::from_secs(60);
     loop {
@@ -132,23 +91,30 @@ async fn until<T>(what: &str, mut look: impl AsyncFnMut() -> Option<T>) -> T {
             return seen;
         }
         assert!(Instant::now() < deadline, "never seen: {what}");
-        tokio::time::sleep(Duration::from_millis(5)).await;
+        tokio::task::yield_now().await;
     }
 }
 
-/// How many tiles the master says that a worker holds.
+async fn until_workers(client: &Client, count: usize) {
+    until("the workers", async || {
+        (client.workers().await.expect("the master answers").len() == count).then_some(())
+    })
+    .await;
+}
+
+/// Tiles that the master says a worker holds.
 async fn lent(client: &Client, name: &str) -> Option<u32> {
     let workers = client.workers().await.expect("the master answers");
     workers.iter().find(|w| w.name == name).map(|w| w.tasks_lent)
 }
 
 #[tokio::test]
-async fn a_worker_killed_with_a_tile_in_its_hands_costs_no_pixel() {
+async fn worker_killed_with_leased_slab_tiles_costs_no_pixel() {
     killed_with_a_tile("slab").await;
 }
 
 #[tokio::test]
-async fn a_worker_killed_with_a_region_in_its_hands_costs_no_pixel() {
+async fn worker_killed_with_leased_regions_costs_no_pixel() {
     killed_with_a_tile("region").await;
 }
 
@@ -159,19 +125,18 @@ async fn killed_with_a_tile(schedule: &str) {
     let client = Client::connect(&address).await.unwrap();
     let (_a, victim, _c) =
         (worker(&address, "a"), worker(&address, "victim"), worker(&address, "c"));
-    until("three workers", async || (client.workers().await.unwrap().len() == 3).then_some(()))
-        .await;
+    until_workers(&client, 3).await;
 
     let (mut rendering, file) = render(dir.path(), &address, "out", schedule);
     until("a tile lent to the victim", async || lent(&client, "victim").await.filter(|&n| n > 0))
         .await;
     victim.signal("-STOP");
-    // It can't answer any more. What was on its way meanwhile has arrived when two looks in a
-    // row say the same; a new lease may have come, too.
+    // It can't answer any more. When the master has heard nothing from it for a while, all that was
+    // on its way has arrived.
     let held = until("the victim's tiles", async || {
-        let before = lent(&client, "victim").await;
-        tokio::time::sleep(Duration::from_millis(50)).await;
-        lent(&client, "victim").await.filter(|&n| n > 0 && Some(n) == before)
+        let workers = client.workers().await.expect("the master answers");
+        let victim = workers.into_iter().find(|w| w.name == "victim")?;
+        (victim.silent_ms >= 50 && victim.tasks_lent > 0).then_some(victim.tasks_lent)
     })
     .await;
     assert!(held > 0, "the victim is killed while tiles are leased to it");
@@ -188,10 +153,10 @@ async fn killed_with_a_tile(schedule: &str) {
     }
 }
 
-/// Frames one by one on more threads than there are tiles to share out evenly: what the first ones teach has
-/// tiles cut into parts.
+/// Single frames on more threads than there are tiles to share out evenly: after the first frames have
+/// taught the master what tiles cost, it splits some before they are drawn.
 #[tokio::test]
-async fn tiles_that_are_cut_for_a_frame_alone_cost_no_pixel() {
+async fn split_tiles_of_a_sole_frame_cost_no_pixel() {
     let dir = tempfile::tempdir().expect("a folder");
     let views = ["--size", "300x280", "--frames", "1", "--thickness", "0.125", "--tf", "auto"];
     let render = |name: &str, how: &[&str]| {
@@ -209,15 +174,10 @@ async fn tiles_that_are_cut_for_a_frame_alone_cost_no_pixel() {
     let one = ["--workers", "1", "--threads", "1", "--schedule", "slab"];
     let want = render("embedded", &[&[VOLUME], &one[..]].concat()).pixels_sha256;
     let (_master, address) = master();
-    let _workers = ["a", "b", "c"].map(|name| {
-        let mut child = Command::new(SLABCAST);
-        child.args(["worker", "--master", &address, "--name", name, "--threads", "5"]);
-        let child = child.stdout(Stdio::null()).stderr(Stdio::null()).spawn();
-        Process(child.expect("the worker starts"))
-    });
+    let _workers = ["a", "b", "c"]
+        .map(|name| processes::worker(Path::new("."), &address, name, &["--threads", "5"]));
     let client = Client::connect(&address).await.unwrap();
-    until("three workers", async || (client.workers().await.unwrap().len() == 3).then_some(()))
-        .await;
+    until_workers(&client, 3).await;
     let mut cut = false;
     for i in 0..5 {
         let frame = render(&i.to_string(), &["--master", &address, "--schedule", "region"]);
@@ -228,9 +188,10 @@ async fn tiles_that_are_cut_for_a_frame_alone_cost_no_pixel() {
     assert!(cut, "no frame had tiles of two sizes");
 }
 
-/// One tile that holds nearly all of the picture: who has none of it is given a piece as it is drawn.
+/// One tile holds nearly all of the picture: a worker without one steals a piece of it while it is
+/// drawn.
 #[tokio::test]
-async fn a_tile_that_is_handed_over_while_it_is_drawn_costs_no_pixel() {
+async fn work_stealing_while_a_tile_is_drawn_costs_no_pixel() {
     let dir = tempfile::tempdir().expect("a folder");
     let views = ["--size", "300x280", "--frames", "1", "--thickness", "0.125", "--tile", "256"];
     let render = |name: &str, how: &[&str]| {
@@ -243,7 +204,7 @@ async fn a_tile_that_is_handed_over_while_it_is_drawn_costs_no_pixel() {
     let (_master, address) = master();
     let client = Client::connect(&address).await.unwrap();
     let _workers = ["a", "b"].map(|name| worker(&address, name));
-    until("two workers", async || (client.workers().await.unwrap().len() == 2).then_some(())).await;
+    until_workers(&client, 2).await;
     let mut pieces = 0;
     for i in 0..4 {
         let file = dir.path().join(format!("{i}.jsonl"));
@@ -256,15 +217,16 @@ async fn a_tile_that_is_handed_over_while_it_is_drawn_costs_no_pixel() {
     assert!(pieces > 0);
 }
 
-/// Workers that call from the master's machine share its processors, so that a path's frames have few, large tiles.
+/// Workers on the master's machine share its processors, so that the frames of a path have few,
+/// large tiles.
 #[tokio::test]
-async fn workers_of_the_masters_machine_draw_large_tiles_of_the_same_pixels() {
+async fn workers_on_the_masters_machine_get_large_tiles_of_the_same_pixels() {
     let dir = tempfile::tempdir().expect("a folder");
     let want = embedded(dir.path());
     let (_master, address) = master();
     let client = Client::connect(&address).await.expect("the master answers");
     let _workers = ["a", "b"].map(|name| worker(&address, name));
-    until("two workers", async || (client.workers().await.unwrap().len() == 2).then_some(())).await;
+    until_workers(&client, 2).await;
     let (mut rendering, file) = render(dir.path(), &address, "out", "region");
     assert_eq!(rendering.exit_within(Duration::from_secs(120)), Some(0));
     let frames = stats(&file);
@@ -277,7 +239,7 @@ async fn workers_of_the_masters_machine_draw_large_tiles_of_the_same_pixels() {
 }
 
 #[tokio::test]
-async fn a_job_waits_for_workers_and_goes_on_with_those_that_come() {
+async fn job_waits_for_workers_and_goes_on_with_late_joiners() {
     let dir = tempfile::tempdir().unwrap();
     let want = embedded(dir.path());
     let (_master, address) = master();
@@ -294,7 +256,7 @@ async fn a_job_waits_for_workers_and_goes_on_with_those_that_come() {
     until("a tile lent", async || lent(&client, "first").await.filter(|&n| n > 0)).await;
     // One comes and one goes, politely, while a frame is rendered.
     let _second = worker(&address, "second");
-    until("two workers", async || (client.workers().await.unwrap().len() == 2).then_some(())).await;
+    until_workers(&client, 2).await;
     first.signal("-TERM");
     let mut first = first;
     assert_eq!(first.exit_within(Duration::from_secs(10)), Some(0), "a clean goodbye");
@@ -303,7 +265,7 @@ async fn a_job_waits_for_workers_and_goes_on_with_those_that_come() {
 }
 
 #[tokio::test]
-async fn a_master_that_comes_back_gets_its_workers_back() {
+async fn workers_reconnect_after_a_master_restart() {
     let (first, address) = master();
     let _worker = worker(&address, "patient");
     let client = Client::connect(&address).await.unwrap();
@@ -325,9 +287,9 @@ async fn a_master_that_comes_back_gets_its_workers_back() {
     .await;
 }
 
-/// A worker of another version is told so, with both versions, and does not try again.
+/// A worker of another version is told both versions and does not dial again.
 #[tokio::test]
-async fn a_worker_of_another_protocol_is_refused_by_name() {
+async fn worker_of_another_version_is_refused_with_both_versions() {
     use slabcast_common::message::{Hello, ToMaster, ToWorker};
     use slabcast_proto::{
         cluster_v1::cluster_service_client::ClusterServiceClient as ClusterClient, convert,
@@ -371,9 +333,10 @@ async fn a_worker_of_another_protocol_is_refused_by_name() {
     }
 }
 
-/// One whose address may be one end of a tunnel, but whose machine has another name, packs them.
+/// A worker from the master's address whose machine has another name is at the end of a tunnel, and
+/// packs its results.
 #[tokio::test]
-async fn a_worker_of_the_masters_machine_is_told_to_send_results_as_they_are() {
+async fn worker_on_the_masters_machine_sends_results_unpacked() {
     use slabcast_common::message::{Hello, ToMaster, ToWorker};
     use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
     use slabcast_proto::{
@@ -415,7 +378,7 @@ async fn a_worker_of_the_masters_machine_is_told_to_send_results_as_they_are() {
     }
 }
 
-/// What any gRPC client relies on: health, reflection, quick round trips.
+/// Services that any gRPC client relies on, and round trips without delayed acknowledgements.
 #[tokio::test]
 async fn health_and_reflection_answer_and_round_trips_are_quick() {
     use tonic_health::pb::{HealthCheckRequest, health_client::HealthClient};
@@ -463,9 +426,9 @@ async fn health_and_reflection_answer_and_round_trips_are_quick() {
     assert!(best < Duration::from_millis(20), "best round trip {best:?}");
 }
 
-/// A peer that says nothing is not held for ever.
+/// A peer that says nothing, or half a preface, does not keep its connection.
 #[tokio::test]
-async fn a_silent_connection_is_closed() {
+async fn silent_connection_is_closed() {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     let (_master, address) = master();
     for words in [&b""[..], b"PRI * HTTP"] {

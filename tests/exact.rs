@@ -1,5 +1,5 @@
-//! Pixels are exact: golden frames, and one hash whatever the cluster looks like. With [`extremes`] in one program,
-//! since each has a long test that leaves a processor free now and then.
+//! Pixels are exact: golden frames, and one hash whatever the cluster looks like. In one program
+//! with [`extremes`], since each has a long test that leaves a processor free now and then.
 
 mod extremes;
 
@@ -28,6 +28,6 @@ fn golden_frames_have_their_hashes() {
 /// Every pair of workers, tile size, slabs, threads, culling and link; `slabcast check matrix`
 /// runs all combinations.
 #[test]
-fn any_cluster_gives_the_serial_pixels() {
+fn every_cluster_gives_the_serial_pixels() {
     check(&["matrix", "--pairwise", "--size", "136x104"]);
 }

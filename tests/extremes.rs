@@ -3,13 +3,14 @@
 use std::collections::BTreeMap;
 use std::process::Command;
 
-/// Groups that the table has at least.
+/// Groups of cases that the table has at least.
 const GROUPS: [&str; 1] = ["extreme"];
 
-/// Cases of the group `extreme`, at least. One that is taken out has to be taken out here too.
+/// Number of cases in the group `extreme`, at least: a case that is removed is removed here too.
 const EXTREMES: usize = 64;
 
-/// Runs `group` of the table; gives its cases and how many rows each has. Every row must hold.
+/// Runs `group` of the table, of which every row must hold. Returns its cases with their numbers of
+/// rows.
 fn table(group: &str) -> BTreeMap<String, usize> {
     let root = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
     let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
@@ -74,7 +75,7 @@ fn extreme_scenes_keep_their_bounds() {
 }
 
 #[test]
-fn the_table_has_all_its_groups_and_says_which_cases_are_long() {
+fn check_list_names_all_groups_and_the_long_cases() {
     let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
         .args(["check", "--list"])
         .output()

@@ -1,21 +1,21 @@
-//! Who is told to stop leaves, and is not lost, however much the master says meanwhile.
+//! Workers that are told to stop leave in order and are not taken for lost, whatever the master
+//! says meanwhile.
 
 use slabcast_common::path::Orientation;
 use slabcast_master::{Master, MasterConfig};
 use slabcast_render::Simd;
 use slabcast_worker::{Config, Ended};
 use std::io::Write;
-use std::sync::{Arc, Mutex};
 use std::time::Duration;
 use tokio::sync::watch;
 
-/// What the master says of its workers.
-#[derive(Clone, Default)]
-struct Log(Arc<Mutex<Vec<u8>>>);
+/// The master's log, which wakes whoever waits for a line.
+#[derive(Clone)]
+struct Log(watch::Sender<Vec<u8>>);
 
 impl Write for Log {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        self.0.lock().expect("no writer panics").extend_from_slice(bytes);
+        self.0.send_modify(|all| all.extend_from_slice(bytes));
         Ok(bytes.len())
     }
 
@@ -24,17 +24,25 @@ impl Write for Log {
     }
 }
 
+fn count(log: &[u8], what: &str) -> usize {
+    String::from_utf8_lossy(log).matches(what).count()
+}
+
 impl Log {
-    fn count(&self, what: &str) -> usize {
-        String::from_utf8_lossy(&self.0.lock().expect("no writer panics")).matches(what).count()
+    /// Waits until so many lines have one of these words.
+    async fn until(&self, words: &[&str], lines: usize) {
+        let mut log = self.0.subscribe();
+        let there = log.wait_for(|log| words.iter().map(|w| count(log, w)).sum::<usize>() >= lines);
+        let in_time = tokio::time::timeout(Duration::from_secs(60), there).await;
+        assert!(in_time.is_ok(), "{lines} lines with one of {words:?} in time");
     }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn workers_that_stop_under_pings_leave() {
+async fn stopping_workers_leave_in_order_while_the_master_pings() {
     const ROUNDS: usize = 20;
     const WORKERS: usize = 8;
-    let log = Log::default();
+    let log = Log(watch::channel(Vec::new()).0);
     let to = log.clone();
     // The driver has a thread of its own.
     tracing_subscriber::fmt().with_ansi(false).with_writer(move || to.clone()).init();
@@ -60,18 +68,15 @@ async fn workers_that_stop_under_pings_leave() {
             tokio::spawn(slabcast_worker::dial::run(config, address.clone(), left.clone()))
         });
         let workers: Vec<_> = workers.collect();
-        while master.handle().workers().await.len() < WORKERS {
-            tokio::time::sleep(Duration::from_millis(2)).await;
-        }
+        log.until(&["worker joined"], (round + 1) * WORKERS).await;
         leave.send_replace(true);
         for worker in workers {
             assert_eq!(worker.await.unwrap(), Ok(Ended::Stopped));
         }
-        while log.count("worker left") + log.count("worker lost") < (round + 1) * WORKERS {
-            tokio::time::sleep(Duration::from_millis(2)).await;
-        }
+        log.until(&["worker left", "worker lost"], (round + 1) * WORKERS).await;
     }
     stop.send_replace(true);
     master.shutdown().await;
-    assert_eq!((log.count("worker left"), log.count("worker lost")), (ROUNDS * WORKERS, 0));
+    let log = log.0.borrow();
+    assert_eq!((count(&log, "worker left"), count(&log, "worker lost")), (ROUNDS * WORKERS, 0));
 }

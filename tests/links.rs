@@ -51,7 +51,7 @@ fn orientation() -> Orientation {
     Orientation::new(None, None).expect("the defaults")
 }
 
-/// The hashes of the serial renderer.
+/// Returns the hashes of the frames as the serial renderer draws them.
 fn truth(request: &PathRequest) -> Vec<String> {
     let volume = volume();
     let digest = volume.digest();
@@ -87,7 +87,7 @@ fn master() -> Master {
     Master::start(MasterConfig::new(volume(), orientation())).expect("a master")
 }
 
-/// Runs a job to its end; its frames' statistics in order.
+/// Runs a job to its end. Returns the statistics of its frames in order.
 async fn run(handle: &Handle, request: PathRequest) -> Vec<FrameStats> {
     let job = handle.submit(request).await.expect("a good request");
     let mut watch = handle.watch(job, 0).expect("a job that was just submitted");
@@ -164,7 +164,7 @@ async fn embedded_workers_give_the_serial_bytes_and_true_statistics() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn regions_ask_for_what_they_lack_over_an_embedded_link() {
+async fn regions_request_missing_bricks_over_an_embedded_link() {
     let master = master();
     let handle = master.handle();
     let _stop = embed(&handle, config("a", 2));
@@ -182,7 +182,7 @@ async fn regions_ask_for_what_they_lack_over_an_embedded_link() {
     master.shutdown().await;
 }
 
-/// What the wire makes of a master's messages, both ways.
+/// An embedded link with the codec of the wire in its middle, both ways.
 fn through_codec(handle: &Handle) -> Link {
     use prost::Message;
     let mut end = slabcast_master::link::embedded(handle.clone());
@@ -249,7 +249,7 @@ fn through_codec(handle: &Handle) -> Link {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_codec_inside_the_embedded_link_changes_nothing() {
+async fn wire_codec_inside_an_embedded_link_changes_no_byte() {
     let master = master();
     let handle = master.handle();
     let link = through_codec(&handle);
@@ -267,7 +267,7 @@ async fn the_codec_inside_the_embedded_link_changes_nothing() {
     master.shutdown().await;
 }
 
-/// Runs a job to its end; its frames in order.
+/// Runs a job to its end. Returns its frames in order.
 async fn frames(handle: &Handle, request: PathRequest) -> Vec<Arc<FinishedFrame>> {
     let job = handle.submit(request).await.expect("a good request");
     let mut watch = handle.watch(job, 0).expect("a job that was just submitted");
@@ -281,7 +281,7 @@ async fn frames(handle: &Handle, request: PathRequest) -> Vec<Arc<FinishedFrame>
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn tiles_that_come_finished_make_the_bytes_of_those_that_come_as_sums() {
+async fn tiles_finished_on_workers_give_the_bytes_of_tiles_sent_as_sums() {
     let formats =
         [PixelFormat::Rgb8, PixelFormat::Rgba8, PixelFormat::Rgba16, PixelFormat::Rgba32F];
     let (mut of_sums, mut of_finished) = (0, 0);
@@ -337,8 +337,8 @@ async fn tiles_that_come_finished_make_the_bytes_of_those_that_come_as_sums() {
     assert!(of_finished * 3 < of_sums, "{of_finished} bytes, and {of_sums} of sums");
 }
 
-/// The hashes of the serial renderer when each frame is a job of its own: bricks of its own
-/// transfer function, and no more.
+/// Returns the hashes of the serial renderer when each frame is a job of its own, with the bricks
+/// of its own transfer function and no more.
 fn truth_of_each(path: &ViewPath, default: &TransferFunction) -> Vec<String> {
     let volume = volume();
     let info = volume.info(volume.digest());
@@ -363,10 +363,10 @@ fn truth_of_each(path: &ViewPath, default: &TransferFunction) -> Vec<String> {
     (0..path.frames()).map(frame).collect()
 }
 
-/// Three functions on one set of bricks, a box, a range, and a look that hangs on gradients: every
-/// frame has the bytes of a job that knew of nothing else.
+/// Three transfer functions on one set of bricks, a cropping box, a range of frames, and opacity by
+/// gradient: every frame has the bytes of a job of that frame alone.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_tween_a_crop_and_gradients_give_each_frame_the_bytes_of_its_own_job() {
+async fn tween_crop_and_gradients_give_each_frame_the_bytes_of_its_own_job() {
     let path = ViewPath::from_json(
         r#"{"version":1,"size":[150,110],"crop":{"x":[null,25],"z":[8,null]},"range":[1,5],
         "keyframes":{"frames":7,"keys":[{"view":"left","tf":"bone"},
@@ -402,7 +402,7 @@ async fn a_tween_a_crop_and_gradients_give_each_frame_the_bytes_of_its_own_job()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn workers_over_tcp_and_one_in_the_process_share_a_frame() {
+async fn tcp_workers_and_an_embedded_worker_share_a_frame() {
     let master = master();
     let handle = master.handle();
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();

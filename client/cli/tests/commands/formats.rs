@@ -4,6 +4,7 @@
 
 use crate::program::{good, run, text};
 use std::collections::BTreeMap;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 fn data() -> Option<PathBuf> {
@@ -11,7 +12,8 @@ fn data() -> Option<PathBuf> {
     match folder.canonicalize() {
         Ok(folder) => Some(folder),
         Err(_) => {
-            println!("skipped: ../shared/data is not here");
+            // A direct write: the test harness captures only what the macros print.
+            let _ = writeln!(std::io::stderr(), "skipped: needs shared/data (formats)");
             None
         }
     }

@@ -1,21 +1,13 @@
 //! The real program, run by tests in folders of their own.
 
-use std::io::{BufRead, BufReader};
+#[path = "../../../../tests/support/processes.rs"]
+mod processes;
+
+pub(crate) use processes::{Process, SLABCAST, master, signal, slabcast};
+
 use std::path::Path;
-use std::process::{Child, Command, Output, Stdio};
-use std::time::{Duration, Instant};
-
-pub(crate) const SLABCAST: &str = env!("CARGO_BIN_EXE_slabcast");
-
-/// The program in `dir`, without what this machine's user has told it by other ways.
-pub(crate) fn slabcast(dir: &Path, args: &[&str]) -> Command {
-    let mut command = Command::new(SLABCAST);
-    command.args(args).current_dir(dir).stdin(Stdio::null());
-    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("SLABCAST_")) {
-        command.env_remove(name);
-    }
-    command
-}
+use std::process::{Child, Output};
+use std::time::Duration;
 
 pub(crate) fn run(dir: &Path, args: &[&str]) -> Output {
     slabcast(dir, args).output().expect("the program starts")
@@ -42,44 +34,7 @@ pub(crate) fn names(dir: &Path) -> Vec<String> {
     names
 }
 
-/// Waits for an end, or fails the test.
+/// Waits for the exit code; -1 if a signal ended the child. Fails the test after `within`.
 pub(crate) fn end(child: &mut Child, within: Duration) -> i32 {
-    let until = Instant::now() + within;
-    while Instant::now() < until {
-        if let Some(status) = child.try_wait().unwrap() {
-            return status.code().unwrap_or(-1);
-        }
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    let _ = child.kill();
-    panic!("still running after {within:?}");
-}
-
-pub(crate) fn signal(child: &Child, name: &str) {
-    let status = Command::new("kill").args([name, &child.id().to_string()]).status().unwrap();
-    assert!(status.success());
-}
-
-/// A process that does not outlive its test.
-pub(crate) struct Process(pub(crate) Child);
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-/// A master of a volume at a free port, and its address.
-pub(crate) fn master(dir: &Path, volume: &str, more: &[&str]) -> (Process, String) {
-    let args = ["master", "--listen", "127.0.0.1:0", "--volume", volume];
-    let mut child = slabcast(dir, &[&args[..], more].concat())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
-    let mut line = String::new();
-    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-    let address = line.trim().rsplit(' ').next().unwrap().to_string();
-    (Process(child), address)
+    processes::exit_within(child, within).unwrap_or(-1)
 }

@@ -1,0 +1,73 @@
+#!/usr/bin/env bash
+# The long campaigns, for nights: bash tests/nightly.sh [mutants|simd|faults|matrix]...
+#
+#   mutants   100,000 mutants of small files through every parser (SLABCAST_MUTANTS)
+#   simd      the renderer's tests on every instruction set of this machine
+#   faults    10,000 seeds of faults in the virtual cluster (SLABCAST_SEEDS)
+#   matrix    every combination of workers, threads, tiles, slabs, culling and links
+#
+# Prints one line for each campaign: its name, ok or FAILED, seconds, and its figure. What each
+# campaign printed is in target/nightly. Ends with 1 if one failed.
+set -uo pipefail
+cd "$(dirname "$0")/.."
+exec </dev/null
+logs=${CARGO_TARGET_DIR:-target}/nightly
+mkdir -p "$logs"
+failed=0
+
+campaign() { # campaign NAME FIGURE COMMAND...: FIGURE is an awk program over the command's output
+    local name=$1 figure=$2 begin=$SECONDS state=ok
+    shift 2
+    "$@" >"$logs/$name.log" 2>&1 || { state=FAILED; failed=1; }
+    printf '%-8s %-6s %5d s  %s\n' "$name" "$state" $((SECONDS - begin)) \
+        "$(awk "$figure" "$logs/$name.log")"
+    [ $state = ok ] || tail -n 20 "$logs/$name.log" >&2
+}
+
+# Sums the tests of all test programs.
+tests='/^test result:/ { passed += $4; failed += $6 } END { printf "%d tests passed, %d failed", passed, failed }'
+
+[ $# -gt 0 ] || set -- mutants simd faults matrix
+for name in "$@"; do
+    case $name in
+    mutants)
+        campaign mutants \
+            '/ mutants in / {
+                 parsers++
+                 for (i = 2; i <= NF; i++) {
+                     if ($i == "mutants") mutants += $(i - 1)
+                     if ($i == "opened,") opened += $(i - 1)
+                 }
+             }
+             END { printf "%d mutants of %d parsers, %d opened", mutants, parsers, opened }' \
+            env SLABCAST_MUTANTS="${SLABCAST_MUTANTS:-100000}" \
+            cargo test --release --locked -p slabcast-volumes mutants -- --nocapture
+        ;;
+    simd)
+        campaign simd "$tests" \
+            env SLABCAST_TEST_ALL_SIMD=1 cargo test --locked -p slabcast-render
+        ;;
+    faults)
+        campaign faults \
+            '/ frames, .* leases, / {
+                 campaigns++
+                 for (i = 2; i <= NF; i++) {
+                     if ($i == "frames,") frames += $(i - 1)
+                     if ($i == "retries,") retries += $(i - 1)
+                 }
+             }
+             END { printf "%d campaigns, %d frames, %d retries", campaigns, frames, retries }' \
+            env SLABCAST_SEEDS="${SLABCAST_SEEDS:-10000}" \
+            cargo test --release --locked -p slabcast-sim --test faults -- --nocapture
+        ;;
+    matrix)
+        campaign matrix '/^exact: / { line = $0 } END { print line }' \
+            cargo run --release --locked -- lab check matrix
+        ;;
+    *)
+        echo "nightly: no campaign $name; there are mutants, simd, faults and matrix" >&2
+        exit 2
+        ;;
+    esac
+done
+exit $failed

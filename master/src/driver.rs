@@ -19,7 +19,7 @@ use crate::jobs::{FinishedFrame, JobState, Jobs};
 use crate::link::{BrickOrder, Caller, WorkerLink};
 use crate::memory;
 use crate::panics::{Panicked, caught};
-use crate::record::Watched;
+use crate::record::RecordedScheduler;
 use slabcast_common::ids::{FrameId, JobId, WorkerId};
 use slabcast_common::image::FrameState;
 use slabcast_common::leaves::Leaves;
@@ -101,7 +101,7 @@ pub(crate) struct Driver {
     rehearse: bool,
     /// Workers in reserve when the log told of it last.
     logged_reserve: usize,
-    scheduler: Watched,
+    scheduler: RecordedScheduler,
     workers: WorkerTable,
     last_frame_id: u64,
     jobs: Arc<Jobs>,
@@ -118,7 +118,7 @@ impl Driver {
         (volume, served): (Arc<Volume>, Arc<ServedVolume>),
         frame_budget_bytes: usize,
         rehearse: bool,
-        scheduler: Watched,
+        scheduler: RecordedScheduler,
         workers: WorkerTable,
         jobs: Arc<Jobs>,
         (inbox, finishers): (mpsc::Sender<Event>, Finishers),

@@ -8,7 +8,7 @@ use crate::jobs::submit::{Plan, SubmitError, check_key};
 use crate::jobs::{JobView, Jobs, Watch};
 use crate::link::{Caller, WorkerLink};
 use crate::panics::caught;
-use crate::record::{Recorder, Watched};
+use crate::record::{RecordedScheduler, Recorder};
 use slabcast_common::ids::{JobId, WorkerId};
 use slabcast_common::message::{Hello, PathRequest, ToMaster};
 use slabcast_common::path::Orientation;
@@ -114,7 +114,7 @@ impl Master {
         // after `silence`.
         let heartbeat_ms = (config.schedule.silence / 3000).min(u32::MAX.into()) as u32;
         let workers = WorkerTable::new(config.rehearse, config.machine, heartbeat_ms);
-        let scheduler = Watched::new(config.schedule, config.record);
+        let scheduler = RecordedScheduler::new(config.schedule, config.record);
         let driver = Driver::new(
             (config.volume, served),
             config.frame_budget_bytes,

@@ -1,36 +1,36 @@
-//! Whether a frame's picture fits in memory, asked before any is taken.
+//! Checks that pictures fit in memory before any memory is taken.
 //!
-//! A picture in the making and the finished one stand side by side while it is encoded. At
-//! 512x512 that is 18 MB and nobody's concern; at 8192x8192 it is 4.5 GB and may be the machine's
-//! end, or that of every other job of this master.
+//! A picture's sums and its finished pixels exist side by side while it is encoded. At 512x512 they
+//! take 18 MB, which matters to nobody; at 8192x8192 they take 4.5 GB, which may end the machine or
+//! every other job of this master.
 
 use slabcast_common::image::{FrameState, PixelFormat};
 use slabcast_common::quality::Refused;
 
-/// Frames of more bytes than this are made one at a time, not four: workers then run dry between
-/// two frames for as long as one is encoded, some seconds of minutes. At half, pictures of
-/// 4096x4096 lose their overlap; four of just under this take 8.6 GB, and at double twice that.
-const ONE_AT_A_TIME: u64 = 2 << 30;
+/// Frames of more bytes than this are rendered one at a time, not four: workers then idle between
+/// two frames while one is encoded, seconds of minutes. At half, pictures of 4096x4096 lose their
+/// overlap; four frames of just under this take 8.6 GB, and at twice this, twice as much.
+const ONE_AT_A_TIME_BYTES: u64 = 2 << 30;
 
-/// Bytes of a picture in the making and of what is made of it.
-fn in_the_making(size: [u32; 2], format: PixelFormat) -> u64 {
+/// Returns the bytes of a picture's sums and of its finished pixels.
+fn frame_bytes(size: [u32; 2], format: PixelFormat) -> u64 {
     const FINISHED: u64 = 16;
     let pixels = u64::from(size[0]) * u64::from(size[1]);
     pixels * (FrameState::BYTES_A_PIXEL + FINISHED + format.bytes() as u64)
 }
 
-/// Whether a frame may be begun while others are in the making.
+/// Returns whether frames of this size may be in flight with others.
 pub(crate) fn beside_others(size: [u32; 2], format: PixelFormat) -> bool {
-    in_the_making(size, format) <= ONE_AT_A_TIME
+    frame_bytes(size, format) <= ONE_AT_A_TIME_BYTES
 }
 
-/// Refuses pictures that this machine has no memory for now.
+/// Checks that this machine has memory for a picture now.
 pub(crate) fn check(size: [u32; 2], format: PixelFormat) -> Result<(), Refused> {
     available().map_or(Ok(()), |free| fits(size, format, free))
 }
 
 fn fits(size: [u32; 2], format: PixelFormat, free: u64) -> Result<(), Refused> {
-    let need = in_the_making(size, format);
+    let need = frame_bytes(size, format);
     if need <= free {
         return Ok(());
     }
@@ -47,19 +47,19 @@ fn fits(size: [u32; 2], format: PixelFormat, free: u64) -> Result<(), Refused> {
     ))
 }
 
-/// Bytes that this process may still take: what the system could free, or what is left to its
-/// control group if that is less. `None` where neither is told; then nothing is refused.
+/// Returns the bytes that this process may still take: the system's available memory, or the memory
+/// left to its control group if that is less. `None` if neither is known; then nothing is refused.
 fn available() -> Option<u64> {
     let number = |path: &str| std::fs::read_to_string(path).ok()?.trim().parse::<u64>().ok();
-    let system = std::fs::read_to_string("/proc/meminfo").ok().as_deref().and_then(of_meminfo);
+    let system = std::fs::read_to_string("/proc/meminfo").ok().as_deref().and_then(parse_meminfo);
     let group = number("/sys/fs/cgroup/memory.max")
         .zip(number("/sys/fs/cgroup/memory.current"))
         .map(|(max, current)| max.saturating_sub(current));
     system.into_iter().chain(group).min()
 }
 
-/// `MemAvailable` in bytes.
-fn of_meminfo(text: &str) -> Option<u64> {
+/// Returns `MemAvailable` of /proc/meminfo in bytes.
+fn parse_meminfo(text: &str) -> Option<u64> {
     let line = text.lines().find_map(|l| l.strip_prefix("MemAvailable:"))?;
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib * 1024)
 }
@@ -69,7 +69,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_picture_without_room_is_refused_with_what_it_takes_and_what_there_is() {
+    fn picture_beyond_memory_is_refused_with_both_figures() {
         let e = fits([8192, 8192], PixelFormat::Rgba8, 4 << 30).unwrap_err();
         assert_eq!(e.field, "size");
         assert_eq!(
@@ -82,15 +82,15 @@ mod tests {
     }
 
     #[test]
-    fn only_huge_frames_are_made_one_at_a_time() {
+    fn only_huge_frames_are_rendered_one_at_a_time() {
         assert!(beside_others([4096, 4096], PixelFormat::Rgba32F));
         assert!(!beside_others([8192, 8192], PixelFormat::Rgb8));
     }
 
     #[test]
-    fn what_the_system_says_is_read_or_left() {
+    fn available_memory_is_read_or_unknown() {
         let text = "MemTotal:       24000000 kB\nMemAvailable:   1024 kB\n";
-        assert_eq!(of_meminfo(text), Some(1 << 20));
-        assert_eq!(of_meminfo("MemTotal: 3 kB\nMemAvailable: some\n"), None);
+        assert_eq!(parse_meminfo(text), Some(1 << 20));
+        assert_eq!(parse_meminfo("MemTotal: 3 kB\nMemAvailable: some\n"), None);
     }
 }

@@ -1,4 +1,4 @@
-//! What a large delta costs the master before it is on its way.
+//! Time that the master takes to encode a large delta of bricks.
 
 use slabcast_common::presets;
 use slabcast_common::quality::Compositing;
@@ -8,11 +8,12 @@ use slabcast_proto::convert::BrickBatches;
 use slabcast_volumes::BrickStore;
 use std::time::Instant;
 
-/// A delta of 10,000 bricks for 16 workers, as [`slabcast_master`]'s brick streams make it. A figure, not
-/// a test of speed: `cargo test --release -p slabcast-master --test delta -- --ignored --nocapture`.
+/// Encodes a delta of 10,000 bricks for 16 workers, as [`slabcast_master`]'s brick streams do. A
+/// measurement, not a test:
+/// `cargo test --release -p slabcast-master --test delta -- --ignored --nocapture`.
 #[test]
 #[ignore = "a measurement, by hand"]
-fn ten_thousand_bricks_for_sixteen_workers() {
+fn encoding_ten_thousand_bricks_for_sixteen_workers() {
     let edge = 184;
     let volume = Volume::from_fn_u8("noise", [edge; 3], |i, j, k| {
         (i.wrapping_mul(73) ^ j.wrapping_mul(151) ^ k.wrapping_mul(29)) as u8 | 1

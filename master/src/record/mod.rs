@@ -1,9 +1,9 @@
-//! What a scheduler was told and what it decided, as a file; and the same decisions made again.
+//! A scheduler's events and decisions as a file, and their replay.
 //!
 //! The scheduler is pure: the same events at the same times give the same actions. So a run that
-//! went wrong on forty machines can be looked at on one: `--record` writes down each event with
-//! every reading of the clock that was taken while it was handled, and a line for each decision;
-//! [`replay()`] hands the events to a new scheduler and compares.
+//! went wrong on forty machines can be examined on one: `--record` writes down each event with
+//! every reading of the clock that was taken while it was handled, and each decision; [`replay()`]
+//! hands the events to a new scheduler and compares its decisions.
 //!
 //! # The file
 //!
@@ -18,16 +18,15 @@
 //! | `{"out":[..]}` | the decisions since the line before, as text |
 //! | `{"end":{..}}` | last: how many of both; `cut` where the file could not keep up |
 //!
-//! **Pixels are not stored.** Of a result's planes the scheduler looks at two things: whether
-//! they have the tile's size and are finite, and which pixels are shut. So a result keeps its
-//! lengths and one bit a pixel, as runs; of finished pixels it keeps their size and format. What leases carry of other pixels is not compared either:
-//! a decision is who gets which tile, with which bricks, when.
+//! **Pixels are not stored.** The scheduler looks at two properties of a result's planes: whether
+//! they have the tile's size and are finite, and which pixels are shut. So the record keeps their
+//! lengths and one bit a pixel, as runs; of finished pixels it keeps size and format. Pixels inside
+//! leases are not compared either: a decision is which worker gets which tile, with which bricks,
+//! and when.
 //!
-//! **The driver never waits for the disk.** It puts down what it has in hand and goes on; a thread
-//! writes. Between them is a buffer of `ROOM` entries; if the disk falls behind that far, the
-//! record ends there, says so, and rendering goes on.
-//!
-//! What it costs is in docs/scaling.md.
+//! **The driver never waits for the disk.** It queues entries and goes on; a thread writes them. If
+//! the disk falls behind by `QUEUE_ENTRIES`, the record ends there and says so, and rendering goes
+//! on.
 
 mod legacy;
 mod read;
@@ -36,7 +35,7 @@ mod tests;
 mod write;
 
 pub use read::{Broken, Difference, Replayed, replay};
-pub(crate) use write::Watched;
+pub(crate) use write::RecordedScheduler;
 pub use write::{Recorder, Written, start};
 
 use serde::{Deserialize, Serialize};
@@ -57,9 +56,9 @@ const VERSION: u32 = 4;
 /// Oldest version that is read.
 const OLDEST_VERSION: u32 = 3;
 
-/// Entries between driver and disk: some twenty frames' of 512x512, 4 MiB where tiles are shut in
-/// patterns. At a tenth, one slow `fsync` of somebody else's cuts the record.
-const ROOM: usize = 16384;
+/// Entries between driver and disk: those of some twenty frames of 512x512, 4 MiB if tiles are shut
+/// in patterns. At a tenth, one slow `fsync` of another program cuts the record.
+const QUEUE_ENTRIES: usize = 16384;
 
 /// One line.
 #[derive(Debug, Serialize, Deserialize)]
@@ -127,7 +126,7 @@ struct NotedJob {
     scene: u64,
     view: String,
     work: slabcast_common::quality::Work,
-    /// What its regions are finished to.
+    /// Format and background for regions that are finished on workers.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     finish: Option<Finish>,
 }
@@ -137,33 +136,34 @@ struct NotedResult {
     w: u64,
     task: u64,
     epoch: u32,
-    /// Pixels of its planes: a, colour, last (`None`: it has none). Of finished pixels the first only.
+    /// Lengths of its planes in pixels: a, colour, last (`None`: it has none). Finished pixels have
+    /// the first only.
     planes: (usize, usize, Option<usize>),
     /// Whether all opacities are finite.
     finite: bool,
     /// Runs of open and shut pixels in turn, the open first, as varints in hexadecimal; empty
     /// where all are open.
     shut: String,
-    /// Tossed, splatted, culled.
+    /// Voxels tossed, splatted, culled.
     voxels: [u64; 3],
-    /// Received, ready, start, end, on the worker's clock.
+    /// Received, ready, start and end, on the worker's clock.
     us: [u64; 4],
     thread: u32,
-    /// Of a region: places that it touched; stalls, parked, idle.
+    /// Costs of a region: places that it touched, stalls, time stalled and idle time (us).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     region: Option<(Vec<u32>, u32, u64, u64)>,
-    /// Of each source of error: pixels looked at, and the sum of squares of how far they are off.
+    /// For each source of error: pixels sampled, and the sum of their squared errors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     sampled: Option<Box<[(u32, u64); 4]>>,
     /// Bytes of its message.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     bytes: Option<u32>,
-    /// Of finished pixels: columns and rows, format, and whether its parts fit each other.
+    /// Finished pixels: columns and rows, format, and whether their parts fit each other.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     finished: Option<([u32; 2], PixelFormat, bool)>,
 }
 
-/// A piece of a region that was given away.
+/// A piece of a region that a worker split off.
 #[derive(Debug, Serialize, Deserialize)]
 struct NotedPiece {
     w: u64,
@@ -172,13 +172,13 @@ struct NotedPiece {
     kept: Rect,
     given: Rect,
     sheets: Vec<Option<i32>>,
-    /// As of a result.
+    /// Lengths of its planes in pixels, as in [`NotedResult::planes`].
     planes: (usize, usize, Option<usize>),
     finite: bool,
 }
 
 impl NotedPiece {
-    fn of(worker: u64, piece: &HandedOver) -> Self {
+    fn new(worker: u64, piece: &HandedOver) -> Self {
         let p = &piece.begun.pixels;
         NotedPiece {
             w: worker,
@@ -194,13 +194,13 @@ impl NotedPiece {
 }
 
 impl NotedResult {
-    fn of(worker: u64, result: &TileResult, shut: impl Fn(f32) -> bool) -> Self {
+    fn new(worker: u64, result: &TileResult, is_shut: impl Fn(f32) -> bool) -> Self {
         let (c, t) = (&result.counters, &result.times);
         let (planes, finite, shut, finished) = match &result.pixels {
             Pixels::Sums(p) => (
                 (p.a.len(), p.colour.len(), p.last.as_ref().map(Vec::len)),
                 p.a.iter().all(|a| a.is_finite()),
-                runs(p.a.iter().map(|&a| shut(a))),
+                runs(p.a.iter().map(|&a| is_shut(a))),
                 None,
             ),
             Pixels::Finished(leaves) => {
@@ -233,11 +233,11 @@ impl NotedResult {
     }
 }
 
-/// What the scheduler decided, as far as it is compared.
+/// A decision of the scheduler, as far as it is compared.
 #[derive(Debug)]
 enum Decision {
     Message { worker: u64, what: String },
-    Lease { worker: u64, lease: LeaseOf },
+    Lease { worker: u64, lease: LeaseDecision },
     Bricks { worker: u64, count: usize, hash: u64 },
     Drop { worker: u64, reason: String },
     Progress { frame: u64, tiles: (u32, u32), slab: (u32, u32) },
@@ -247,7 +247,7 @@ enum Decision {
 }
 
 #[derive(Debug)]
-struct LeaseOf {
+struct LeaseDecision {
     task: u64,
     epoch: u32,
     frame: u64,
@@ -257,37 +257,37 @@ struct LeaseOf {
     hash: u64,
 }
 
-/// FNV-1a: what tells lists of bricks apart.
+/// Returns the FNV-1a hash of bytes, which tells lists of bricks apart.
 fn hash(bytes: impl IntoIterator<Item = u8>) -> u64 {
     bytes
         .into_iter()
         .fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3))
 }
 
-fn hash_of(bricks: &[slabcast_common::ids::BrickId]) -> u64 {
+fn hash_bricks(bricks: &[slabcast_common::ids::BrickId]) -> u64 {
     hash(bricks.iter().flat_map(|b| b.0.to_le_bytes()))
 }
 
 impl Decision {
-    fn of(action: &Action) -> Self {
+    fn new(action: &Action) -> Self {
         match action {
             Action::Send { worker, message } => match message {
                 ToWorker::Lease(l) => Decision::Lease {
                     worker: worker.0,
-                    lease: LeaseOf {
+                    lease: LeaseDecision {
                         task: l.task.0,
                         epoch: l.epoch.0,
                         frame: l.frame.0,
                         tile: [l.tile.x0, l.tile.y0, l.tile.x1, l.tile.y1],
                         sheets: [l.slab.first, l.slab.end],
                         bricks: l.bricks.len(),
-                        hash: hash_of(&l.bricks),
+                        hash: hash_bricks(&l.bricks),
                     },
                 },
-                other => Decision::Message { worker: worker.0, what: say(other) },
+                other => Decision::Message { worker: worker.0, what: describe(other) },
             },
             Action::SendBricks { worker, bricks, .. } => {
-                let (count, hash) = (bricks.len(), hash_of(bricks));
+                let (count, hash) = (bricks.len(), hash_bricks(bricks));
                 Decision::Bricks { worker: worker.0, count, hash }
             }
             Action::Drop { worker, reason } => {
@@ -309,8 +309,8 @@ impl Decision {
     }
 }
 
-/// A message but a lease, in words.
-fn say(message: &ToWorker) -> String {
+/// Describes a message other than a lease.
+fn describe(message: &ToWorker) -> String {
     match message {
         ToWorker::Scene(scene) => format!("{}", scene.id),
         ToWorker::Frame { frame, scene, plain, .. } => {
@@ -328,17 +328,17 @@ fn say(message: &ToWorker) -> String {
         ToWorker::Directory { set, bricks, .. } => {
             let ids: Vec<_> = bricks.iter().map(|b| b.id).collect();
             let set = &set.0.to_string()[..16];
-            format!("directory of {set}, {} bricks {:016x}", ids.len(), hash_of(&ids))
+            format!("directory of {set}, {} bricks {:016x}", ids.len(), hash_bricks(&ids))
         }
         ToWorker::DropBricks { bricks, .. } => {
-            format!("forget {} bricks {:016x}", bricks.len(), hash_of(bricks))
+            format!("forget {} bricks {:016x}", bricks.len(), hash_bricks(bricks))
         }
         ToWorker::HandOver { frame, task, epoch, share } => {
             format!("hand over {share} of 1000 of {task} {epoch} of {frame}")
         }
         ToWorker::Ping { nonce } => format!("ping {nonce}"),
         ToWorker::Lease(_) | ToWorker::Welcome { .. } | ToWorker::Refused { .. } => {
-            unreachable!("leases are told apart; the driver greets")
+            unreachable!("leases are decisions of their own, and the driver welcomes and refuses")
         }
         ToWorker::Leave { .. } => "leave".into(),
     }
@@ -375,7 +375,8 @@ impl fmt::Display for Decision {
                 write!(f, "f{frame}: {tiles} finished tiles for its picture")
             }
             Decision::Done { frame, stats } => {
-                let text = serde_json::to_string(stats).unwrap_or_default();
+                let text = serde_json::to_string(stats);
+                let text = text.expect("statistics have no map keys but strings");
                 let (ms, hash) = (stats.ms.total, hash(text.bytes()));
                 write!(f, "f{frame}: done in {ms} ms, statistics {hash:016x}")
             }
@@ -389,7 +390,7 @@ fn brick_to_line(b: &BrickInfo) -> [u32; 9] {
     [b.id.0, lo[0], lo[1], lo[2], hi[0], hi[1], hi[2], u32::from(b.voxels), b.bytes]
 }
 
-/// Lengths of runs, the first of `false`, as varints in hexadecimal.
+/// Returns the lengths of runs of equal bits, the first of `false`, as varints in hexadecimal.
 fn runs(bits: impl Iterator<Item = bool>) -> String {
     let (mut bytes, mut at, mut run) = (Vec::new(), false, 0u32);
     let mut put = |mut n: u32| {
@@ -406,14 +407,14 @@ fn runs(bits: impl Iterator<Item = bool>) -> String {
         }
         run += 1;
     }
-    // The last run is what is left; one of open pixels says nothing.
+    // A last run of open pixels is left out: the number of pixels tells it.
     if at {
         put(run);
     }
     to_hex(&bytes)
 }
 
-/// The `n` bits behind [`runs`]; `None` where they are not that many.
+/// Returns the `n` bits that [`runs`] encoded; `None` if they are more.
 fn bits(runs: &str, n: usize) -> Option<Vec<bool>> {
     let (mut out, mut at) = (Vec::with_capacity(n), false);
     let bytes = from_hex(runs)?;
@@ -456,8 +457,9 @@ fn from_hex(text: &str) -> Option<Vec<u8>> {
     bytes.chunks_exact(2).map(|p| Some(digit(p[0])? << 4 | digit(p[1])?)).collect()
 }
 
-/// What of an event can be said without its frame's cut-off and its scene's bytes.
-fn noted(event: &Event, shut: impl Fn(&TileResult, f32) -> bool) -> Option<Noted> {
+/// Returns an event without its pixels; `None` for a queued frame, whose scene and bricks are written
+/// once. `is_shut` tells of a pixel of a result whether it is shut.
+fn noted(event: &Event, is_shut: impl Fn(&TileResult, f32) -> bool) -> Option<Noted> {
     let set = |key: &slabcast_common::brick::BrickSetKey| key.0.to_string();
     Some(match event {
         Event::WorkerJoined { worker, name, threads, is_local, memory_budget_bytes, held } => {
@@ -476,17 +478,17 @@ fn noted(event: &Event, shut: impl Fn(&TileResult, f32) -> bool) -> Option<Noted
         Event::WorkerHeard { worker } => Noted::Heard { w: worker.0 },
         Event::WorkerLost { worker, reason } => Noted::Lost { w: worker.0, reason: reason.clone() },
         Event::WorkerLeaving { worker } => Noted::Leaving { w: worker.0 },
-        // Its scene and bricks are written once; the thread that writes has seen which.
+        // The thread that writes knows which scenes and bricks it has written.
         Event::FrameQueued(_) => return None,
         Event::CancelFrame { frame } => Noted::Cancelled { frame: frame.0 },
         Event::SceneEnded { scene } => Noted::SceneEnded { scene: scene.0 },
         Event::Result { worker, result } => {
-            Noted::Result(NotedResult::of(worker.0, result, |a| shut(result, a)))
+            Noted::Result(NotedResult::new(worker.0, result, |a| is_shut(result, a)))
         }
         Event::Failed { worker, task, epoch, reason } => {
             Noted::Failed { w: worker.0, task: task.0, epoch: epoch.0, reason: reason.clone() }
         }
-        Event::HandedOver { worker, piece } => Noted::HandedOver(NotedPiece::of(worker.0, piece)),
+        Event::HandedOver { worker, piece } => Noted::HandedOver(NotedPiece::new(worker.0, piece)),
         Event::BricksIn { worker, set: key, bricks } => {
             Noted::BricksIn { w: worker.0, set: set(key), bricks: *bricks }
         }

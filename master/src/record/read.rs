@@ -1,7 +1,7 @@
-//! Reading a record, and making its decisions again.
+//! Reading a record and replaying it.
 //!
-//! A record is a stranger's file: every line is checked before the scheduler sees it, and what is
-//! wrong is named by its line.
+//! A record may come from anywhere: every line is checked before the scheduler sees it, and an
+//! error names its line.
 
 use super::{
     Decision, Head, Line, Noted, NotedJob, NotedPiece, NotedResult, NotedWorker, OLDEST_VERSION,
@@ -27,55 +27,55 @@ use std::io::{BufRead, Read};
 use std::sync::Arc;
 
 /// Bytes of the longest line: the bricks of a volume of 2048^3 that is relevant everywhere take
-/// 0.9 GB. Above that it is no record.
-const LONGEST: u64 = 1 << 30;
+/// 0.9 GB. A longer line is of no record.
+const MAX_LINE_BYTES: u64 = 1 << 30;
 
-/// A file that is no whole record.
+/// Error of a file that is no record, or a damaged one.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}: {problem}")]
 pub struct Broken {
-    /// Counted from 1.
+    /// Line, counted from 1.
     pub line: u64,
-    /// What is wrong, and what to do.
+    /// Problem of the line, and the remedy.
     pub problem: String,
 }
 
-/// Where a scheduler decided something else.
+/// The first decision of a replay that differs from the record.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Difference {
     /// Line of the decision, counted from 1.
     pub line: u64,
-    /// What the record says.
+    /// Decision in the record.
     pub recorded: String,
-    /// What the scheduler says now.
+    /// Decision of the scheduler that replays.
     pub replayed: String,
 }
 
-/// What came of it.
+/// Outcome of a replay.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Replayed {
-    /// Events handed in.
+    /// Number of events that were handed to the scheduler.
     pub events: u64,
-    /// Decisions that are the same.
+    /// Number of decisions that agree.
     pub decisions: u64,
-    /// Frames that were finished.
+    /// Number of frames that were finished.
     pub frames: u64,
-    /// Version of the program that recorded it.
+    /// Version of the program that recorded the file.
     pub program: String,
-    /// Why the record ends early, if it does.
+    /// Reason why the record ends early, if it does.
     pub cut: Option<String>,
     /// The first difference, if there is one.
     pub difference: Option<Difference>,
 }
 
-/// The readings that were taken.
-struct Taken {
+/// A clock that gives the recorded readings.
+struct RecordedClock {
     left: RefCell<VecDeque<Micros>>,
     last: Cell<Micros>,
     too_many: Cell<bool>,
 }
 
-impl Clock for Taken {
+impl Clock for RecordedClock {
     fn now(&self) -> Micros {
         match self.left.borrow_mut().pop_front() {
             Some(now) => self.last.set(now),
@@ -100,13 +100,13 @@ impl<R: BufRead> Reader<R> {
     fn next(&mut self) -> Result<Option<Line>, Broken> {
         self.line += 1;
         self.text.clear();
-        let read = (&mut self.from).take(LONGEST).read_until(b'\n', &mut self.text);
+        let read = (&mut self.from).take(MAX_LINE_BYTES).read_until(b'\n', &mut self.text);
         let n = read.map_err(|e| self.broken(format!("reading failed: {e}")))?;
         if n == 0 {
             return Ok(None);
         }
         if self.text.last() != Some(&b'\n') {
-            let problem = if n as u64 == LONGEST {
+            let problem = if n as u64 == MAX_LINE_BYTES {
                 "is longer than a record's lines are; give a file of --record"
             } else {
                 "ends in the middle; the recording was cut off there"
@@ -134,7 +134,7 @@ fn split_place(text: &str) -> (String, String) {
     }
 }
 
-/// What was read so far that later lines lean on.
+/// Things that earlier lines named and later lines refer to.
 #[derive(Default)]
 struct Seen {
     sets: BTreeMap<BrickSetKey, Arc<[BrickInfo]>>,
@@ -144,11 +144,11 @@ struct Seen {
     now: Micros,
 }
 
-/// Hands a record's events to a new scheduler, and compares its decisions with the record's until
-/// the first difference.
+/// Hands the events of a record to a new scheduler and compares its decisions with the recorded ones,
+/// until the first difference.
 ///
 /// # Errors
-/// [`Broken`] names the line that is not as the recorder writes it.
+/// If a line is not as the recorder writes it, or reading fails.
 pub fn replay(from: impl BufRead) -> Result<Replayed, Broken> {
     let mut reader = Reader { from, line: 0, text: Vec::new() };
     let head = match reader.next()? {
@@ -171,7 +171,7 @@ pub fn replay(from: impl BufRead) -> Result<Replayed, Broken> {
         let line = match reader.next() {
             Ok(Some(line)) => line,
             Ok(None) => return Ok(done),
-            // Whoever was killed in the middle of a line wrote all before it.
+            // A recorder that was killed in the middle of a line wrote all before it.
             Err(e) if e.problem.contains("was cut off there") => {
                 done.cut = Some(format!("line {} {}", e.line, e.problem));
                 return Ok(done);
@@ -195,7 +195,7 @@ pub fn replay(from: impl BufRead) -> Result<Replayed, Broken> {
             }
             Line::Event { t, e } => {
                 let event = event(e, &mut seen).map_err(|e| reader.broken(e))?;
-                let clock = taken(t, &mut seen).map_err(|e| reader.broken(e))?;
+                let clock = recorded_clock(t, &mut seen).map_err(|e| reader.broken(e))?;
                 scheduler.handle(&clock, event);
                 done.events += 1;
                 let left = clock.left.borrow().len();
@@ -213,7 +213,7 @@ pub fn replay(from: impl BufRead) -> Result<Replayed, Broken> {
                 let mut recorded = recorded.into_iter();
                 loop {
                     let action = scheduler.next_action();
-                    let replayed = action.as_ref().map(|a| Decision::of(a).to_string());
+                    let replayed = action.as_ref().map(|a| Decision::new(a).to_string());
                     let recorded = recorded.next();
                     if replayed.is_none() && recorded.is_none() {
                         break;
@@ -245,7 +245,7 @@ pub fn replay(from: impl BufRead) -> Result<Replayed, Broken> {
                     done.difference = Some(Difference {
                         line: reader.line,
                         recorded: "nothing".into(),
-                        replayed: Decision::of(&action).to_string(),
+                        replayed: Decision::new(&action).to_string(),
                     });
                 }
                 done.cut = cut;
@@ -317,7 +317,7 @@ fn scene(id: SceneId, wire: &str) -> Result<Arc<SceneSpec>, String> {
     Ok(Arc::new(scene))
 }
 
-fn taken(t: Vec<u64>, seen: &mut Seen) -> Result<Taken, String> {
+fn recorded_clock(t: Vec<u64>, seen: &mut Seen) -> Result<RecordedClock, String> {
     let (mut at, mut left) = (0u64, VecDeque::with_capacity(t.len()));
     for t in t {
         at = at.checked_add(t).filter(|t| *t < 1 << 62).ok_or("`t` overflows")?;
@@ -328,7 +328,7 @@ fn taken(t: Vec<u64>, seen: &mut Seen) -> Result<Taken, String> {
     }
     seen.now = at.max(seen.now);
     let last = Cell::new(seen.now);
-    Ok(Taken { left: RefCell::new(left), last, too_many: Cell::new(false) })
+    Ok(RecordedClock { left: RefCell::new(left), last, too_many: Cell::new(false) })
 }
 
 fn event(e: Noted, seen: &mut Seen) -> Result<Event, String> {
@@ -396,7 +396,7 @@ fn queued(job: NotedJob, seen: &mut Seen) -> Result<FrameJob, String> {
     Ok(FrameJob { frame, number, scene, bricks, view, work, finish })
 }
 
-/// Finished pixels that the scheduler takes for those that were recorded: none is there.
+/// Returns blank finished pixels that the scheduler takes for the recorded ones.
 fn finished(r: &NotedResult) -> Result<Option<Leaves>, String> {
     let Some((size, format, fits)) = r.finished else { return Ok(None) };
     let n = u64::from(size[0]) * u64::from(size[1]);
@@ -410,9 +410,7 @@ fn finished(r: &NotedResult) -> Result<Option<Leaves>, String> {
     Ok(Some(leaves))
 }
 
-/// A result that the scheduler takes for the one that was recorded: shut pixels have opacity 1,
-/// open ones 0, and there is no light.
-/// A piece with pixels that the scheduler takes for those that were recorded.
+/// Returns a piece with clear pixels that the scheduler takes for the recorded ones.
 fn piece(p: NotedPiece) -> Result<HandedOver, String> {
     let (a, colour, last) = p.planes;
     let n = [a, colour, last.unwrap_or(0), p.sheets.len()];
@@ -436,9 +434,11 @@ fn piece(p: NotedPiece) -> Result<HandedOver, String> {
     Ok(HandedOver { task, epoch, kept: p.kept, given: p.given, begun })
 }
 
+/// Returns a result that the scheduler takes for the recorded one: shut pixels have opacity 1, open
+/// ones 0, and all are black.
 fn result(r: &NotedResult) -> Result<TileResult, String> {
     let (a, colour, last) = r.planes;
-    // A liar's planes may have any length; it is compared, no more.
+    // The planes of a worker that lies have any length: the scheduler only compares it.
     if [a, colour, last.unwrap_or(0)].iter().any(|n| *n > 2 * convert::MAX_TILE_PIXELS) {
         return Err("its planes are larger than the wire lets through".into());
     }

@@ -1,6 +1,6 @@
-//! Records of runs from seeds: workers come, go, lie, fall silent and answer late.
+//! Records of seeded runs: workers join, leave, lie, fall silent and answer late.
 
-use super::{Broken, Difference, Replayed, Watched, Written, bits, replay, runs, start};
+use super::{Broken, Difference, RecordedScheduler, Replayed, Written, bits, replay, runs, start};
 use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId, WorkerId};
 use slabcast_common::image::{Background, PixelFormat, TilePixels};
@@ -110,7 +110,7 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
     let out = Shared::default();
     let (recorder, thread) = start(out.clone()).expect("a thread");
     let config = Config { silence: 400_000, heartbeat: 100_000, ..Config::default() };
-    let mut s = Watched::new(config, Some(recorder));
+    let mut s = RecordedScheduler::new(config, Some(recorder));
     let clock = Virtual(Cell::new(1000));
     let mut workers: Vec<WorkerId> = Vec::new();
     let mut next = 1;
@@ -278,7 +278,7 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
 }
 
 #[test]
-fn a_recorded_run_replays_identically() {
+fn recorded_runs_replay_identically() {
     let (mut frames, mut dropped, mut dropped_finished) = (0, 0, [0; 3]);
     let mut pieces = 0;
     for seed in 0..48 {
@@ -326,7 +326,7 @@ fn tampered(
 }
 
 #[test]
-fn a_changed_decision_is_found_at_its_line() {
+fn replay_finds_a_changed_decision_at_its_line() {
     let (bytes, _) = recorded(3, Schedule::Slab);
     let lease = |l: &str| l.starts_with("{\"out\"") && l.contains("lease t");
     let (line, changed) = tampered(&bytes, lease, |l| l.replacen("lease t", "lease t9", 1));
@@ -339,7 +339,7 @@ fn a_changed_decision_is_found_at_its_line() {
 }
 
 #[test]
-fn a_changed_event_shows_in_what_is_decided() {
+fn replay_finds_changed_events_by_their_decisions() {
     let (bytes, _) = recorded(5, Schedule::Slab);
     let result = |l: &str| l.contains("\"result\"") && l.contains("\"shut\":\"0");
     let (line, changed) = tampered(&bytes, result, |l| {
@@ -358,7 +358,7 @@ fn a_changed_event_shows_in_what_is_decided() {
 }
 
 #[test]
-fn broken_files_are_refused_with_their_line() {
+fn replay_names_the_line_of_a_broken_file() {
     let (bytes, _) = recorded(1, Schedule::Slab);
     let says = |bytes: &[u8]| replay(bytes).expect_err("it is broken").to_string();
     assert!(says(b"").starts_with("line 1: is not a record's first line"));
@@ -386,7 +386,7 @@ fn broken_files_are_refused_with_their_line() {
 }
 
 #[test]
-fn runs_come_back_for_every_pattern() {
+fn run_lengths_round_trip_for_every_pattern() {
     for n in [0usize, 1, 5, 64, 300, 70_000] {
         for pattern in 0..5 {
             let of = |i: usize| match pattern {

@@ -1,6 +1,8 @@
-//! Writing a record beside a scheduler that runs.
+//! Writing a record beside a running scheduler.
 
-use super::{Decision, Head, Line, Noted, NotedJob, ROOM, VERSION, brick_to_line, noted, to_hex};
+use super::{
+    Decision, Head, Line, Noted, NotedJob, QUEUE_ENTRIES, VERSION, brick_to_line, noted, to_hex,
+};
 use prost::Message;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, SceneId, TaskId};
@@ -17,11 +19,11 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 use tracing::warn;
 
-/// What was written is on its way to the disk after this long at the latest: a second of a run
-/// that somebody kills is lost, no more.
+/// Longest time that an entry waits in the writer's buffer: of a run that is killed, no more than a
+/// second is lost.
 const FLUSH: Duration = Duration::from_secs(1);
 
-/// What goes from the driver to the thread that writes.
+/// An entry from the driver to the thread that writes.
 enum Entry {
     Begin(Config),
     Event(Vec<Micros>, Noted),
@@ -30,31 +32,31 @@ enum Entry {
     End,
 }
 
-/// The driver's end of a record: [`crate::MasterConfig::record`].
+/// The driver's end of a record, for [`crate::MasterConfig::record`].
 pub struct Recorder {
     to: SyncSender<Entry>,
 }
 
-/// What was written.
+/// Summary of a record that was written.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Written {
-    /// Events.
+    /// Number of events.
     pub events: u64,
-    /// Decisions.
+    /// Number of decisions.
     pub decisions: u64,
-    /// Why it ends early, if it does.
+    /// Reason why the record ends early, if it does.
     pub cut: Option<String>,
 }
 
-/// Starts a thread that writes a record to `out`. It ends, and says what it wrote, when the
-/// master that was given the [`Recorder`] has ended.
+/// Starts a thread that writes a record to `out`. The thread ends when the master that was given the
+/// [`Recorder`] has ended, and returns the record's summary, or the error of a write that failed.
 ///
 /// # Errors
 /// If the system gives no thread.
 pub fn start(
     out: impl Write + Send + 'static,
 ) -> std::io::Result<(Recorder, JoinHandle<std::io::Result<Written>>)> {
-    let (to, entries) = sync_channel(ROOM);
+    let (to, entries) = sync_channel(QUEUE_ENTRIES);
     let thread = std::thread::Builder::new()
         .name("slabcast-record".into())
         .spawn(move || write(BufWriter::with_capacity(1 << 18, out), &entries))?;
@@ -122,7 +124,7 @@ fn write(mut out: impl Write, entries: &Receiver<Entry>) -> std::io::Result<Writ
     Ok(written)
 }
 
-/// The first line.
+/// Returns the first line of a record.
 fn head(config: &Config) -> Head {
     let &Config { heartbeat, silence, lease, poison_after, queue_ahead, mixed: _ } = config;
     Head {
@@ -138,7 +140,7 @@ fn head(config: &Config) -> Head {
     }
 }
 
-/// The first in full, the others as differences to the one before.
+/// Returns the first time as it is, the others as differences to the one before.
 fn differences(mut t: Vec<Micros>) -> Vec<Micros> {
     for i in (1..t.len()).rev() {
         t[i] = t[i].saturating_sub(t[i - 1]);
@@ -146,7 +148,7 @@ fn differences(mut t: Vec<Micros>) -> Vec<Micros> {
     t
 }
 
-/// A clock whose readings are kept.
+/// A clock that notes its readings.
 struct Readings<'a> {
     clock: &'a dyn Clock,
     taken: RefCell<Vec<Micros>>,
@@ -160,19 +162,19 @@ impl Clock for Readings<'_> {
     }
 }
 
-/// What a record needs to know on the way.
+/// The state of a record while it is written.
 struct Tape {
     to: SyncSender<Entry>,
-    /// Cut-offs of the frames that were queued.
+    /// Termination thresholds of the frames in progress.
     eps: BTreeMap<FrameId, f64>,
-    /// Which frame a task belongs to.
+    /// Frames of the tasks in progress.
     frames: BTreeMap<TaskId, FrameId>,
     pending: Vec<Decision>,
 }
 
 impl Tape {
     fn decided(&mut self, action: &Action) {
-        self.pending.push(Decision::of(action));
+        self.pending.push(Decision::new(action));
         match action {
             Action::Send { message: ToWorker::Lease(lease), .. } => {
                 self.frames.insert(lease.task, lease.frame);
@@ -193,13 +195,13 @@ impl Tape {
     }
 }
 
-/// A scheduler, and perhaps a record of it.
-pub(crate) struct Watched {
+/// A scheduler that may be recorded.
+pub(crate) struct RecordedScheduler {
     scheduler: Scheduler,
     tape: Option<Tape>,
 }
 
-impl Deref for Watched {
+impl Deref for RecordedScheduler {
     type Target = Scheduler;
 
     fn deref(&self) -> &Scheduler {
@@ -207,7 +209,7 @@ impl Deref for Watched {
     }
 }
 
-impl Watched {
+impl RecordedScheduler {
     pub(crate) fn new(config: Config, recorder: Option<Recorder>) -> Self {
         let tape = recorder.map(|Recorder { to }| Tape {
             to,
@@ -215,12 +217,12 @@ impl Watched {
             frames: BTreeMap::new(),
             pending: Vec::new(),
         });
-        let mut watched = Watched { scheduler: Scheduler::new(config), tape };
+        let mut watched = RecordedScheduler { scheduler: Scheduler::new(config), tape };
         watched.send(Entry::Begin(config));
         watched
     }
 
-    /// [`Scheduler::handle`].
+    /// Calls [`Scheduler::handle`] and records the event.
     pub(crate) fn handle(&mut self, clock: &dyn Clock, event: Event) {
         let Some(tape) = &mut self.tape else { return self.scheduler.handle(clock, event) };
         if let Event::FrameQueued(job) = &event {
@@ -230,7 +232,7 @@ impl Watched {
             tape.forget(*frame);
         }
         let note = noted(&event, |result, a| {
-            // A task that nobody knows is one whose result is dropped.
+            // The result of an unknown task is dropped.
             let eps = tape.frames.get(&result.task).and_then(|f| tape.eps.get(f));
             eps.is_some_and(|&eps| is_shut(a, eps))
         });
@@ -248,7 +250,7 @@ impl Watched {
         }
     }
 
-    /// [`Scheduler::next_action`].
+    /// Calls [`Scheduler::next_action`] and records the decision.
     pub(crate) fn next_action(&mut self) -> Option<Action> {
         let action = self.scheduler.next_action();
         let Some(tape) = &mut self.tape else { return action };
@@ -268,21 +270,21 @@ impl Watched {
         match tape.to.try_send(entry) {
             Ok(()) => {}
             Err(TrySendError::Full(_)) => {
-                warn!("the record ends here: the disk fell behind the master");
+                warn!("recording stopped: the disk fell behind the master");
                 self.tape = None;
             }
-            // Writing failed; whoever waits for the thread says why.
+            // Writing failed; the thread returns why.
             Err(TrySendError::Disconnected(_)) => {
-                warn!("the record ends here: it could not be written");
+                warn!("recording stopped: the record could not be written");
                 self.tape = None;
             }
         }
     }
 }
 
-impl Drop for Watched {
-    /// A record whose last line says that it is whole. What nobody asked for any more (a master that
-    /// ends carries nothing out) is in it.
+impl Drop for RecordedScheduler {
+    /// Writes the last line, which says that the record is whole. Decisions that a master which ends
+    /// did not carry out are in it.
     fn drop(&mut self) {
         if self.tape.is_some() {
             while self.next_action().is_some() {}

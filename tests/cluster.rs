@@ -136,7 +136,8 @@ async fn killed_with_a_tile(schedule: &str) {
     let held = until("the victim's tiles", async || {
         let workers = client.workers().await.expect("the master answers");
         let victim = workers.into_iter().find(|w| w.name == "victim")?;
-        (victim.silent_ms >= 50 && victim.tasks_lent > 0).then_some(victim.tasks_lent)
+        (victim.silent >= Duration::from_millis(50) && victim.tasks_lent > 0)
+            .then_some(victim.tasks_lent)
     })
     .await;
     assert!(held > 0, "the victim is killed while tiles are leased to it");

@@ -1,4 +1,4 @@
-//! Workers of this master: who is let in, and the link to each.
+//! Admission of workers, and their links.
 //!
 //! The scheduler knows workers by id, threads and memory; this table has what it need not know:
 //! links, addresses, names, when each was last heard.
@@ -13,8 +13,8 @@ use slabcast_schedule::WorkerView;
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-/// Why a worker is not let in. Its text names what the worker has, what the master has, and the
-/// remedy.
+/// Reason why a worker is not let in. The text names the worker's property, the master's, and the
+/// remedy, for the worker's operator.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum AttachError {
     /// The worker and the master speak no protocol version in common.

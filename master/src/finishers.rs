@@ -11,7 +11,7 @@ use slabcast_common::ids::FrameId;
 use slabcast_common::link::FINISHER_THREADS;
 use std::sync::{Arc, Mutex, PoisonError, mpsc};
 
-/// What a finisher does next.
+/// A task of a finisher.
 pub(crate) enum FinishTask {
     /// Composes the tiles that came finished into the picture of a frame that is still drawn.
     Compose(FrameId, Arc<Assembly>),
@@ -83,7 +83,7 @@ impl Finishers {
     }
 }
 
-/// Does a task; the event that tells of a finished frame.
+/// Does a task. Returns the event that tells of a finished frame, if it was the frame's last.
 fn run(task: FinishTask, hooks: &Hooks) -> Result<Option<Event>, crate::panics::Panicked> {
     match task {
         FinishTask::Compose(_, assembly) => caught("composing tiles", || {

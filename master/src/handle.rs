@@ -1,4 +1,4 @@
-//! Starting a master, and speaking to it: for links, services and embedding programs.
+//! Starting a master, and the handle by which links, services and embedding programs speak to it.
 
 use crate::admission::{AttachError, WorkerTable};
 use crate::driver::{Driver, Event};
@@ -35,7 +35,7 @@ pub struct MasterConfig {
     pub frame_budget_bytes: usize,
     /// Settings of the scheduler.
     pub schedule: slabcast_schedule::Config,
-    /// Where the scheduler's events and decisions are recorded ([`crate::record::start`]).
+    /// Recorder of the scheduler's events and decisions ([`crate::record::start`]).
     pub record: Option<Recorder>,
     /// Whether to let in only workers that rehearse, and mark the pictures.
     pub rehearse: bool,

@@ -13,7 +13,7 @@ pub(crate) enum Stage {
     Finish,
 }
 
-/// What tests do at each [`Stage`].
+/// Functions that tests have called at each [`Stage`].
 #[derive(Clone, Default)]
 pub(crate) struct Hooks {
     #[cfg(test)]

@@ -67,7 +67,7 @@ pub struct Link {
     pub bricks: mpsc::Receiver<Bricks>,
 }
 
-/// Why a session ended.
+/// Reason why a session ended.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Ended {
     /// The connection was lost, for this reason; dial again.
@@ -207,7 +207,7 @@ struct Session<'a> {
     is_leaving: bool,
     /// When the master last said something.
     last_heard: tokio::time::Instant,
-    /// How long the master may be silent.
+    /// Longest time that the master may be silent.
     patience: Duration,
     replies: Vec<ToMaster>,
 }

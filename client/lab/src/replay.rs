@@ -1,6 +1,6 @@
 //! `slabcast lab replay`: makes a recorded scheduler's decisions again and compares them.
 
-use slabcast_master::record::{Broken, Replayed, replay};
+use slabcast_master::record::{RecordError, ReplaySummary, replay};
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress;
 use std::fs::File;
@@ -38,10 +38,10 @@ pub fn run(args: &ReplayArgs) -> Result<(), Fail> {
             )));
         }
     };
-    let done = done.map_err(|Broken { line, problem }| {
+    let done = done.map_err(|RecordError { line, problem }| {
         Fail::failed(format!("{shown}: line {line}: {problem}"))
     })?;
-    let Replayed { events, decisions, frames, program, cut, difference } = &done;
+    let ReplaySummary { events, decisions, frames, program, cut, difference } = &done;
     if args.json {
         let json = serde_json::json!({
             "events": events, "decisions": decisions, "frames": frames, "recorded_by": program,

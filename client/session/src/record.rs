@@ -5,7 +5,7 @@
 
 use crate::fail::Fail;
 use crate::progress;
-use slabcast_master::record::{Recorder, Written, start};
+use slabcast_master::record::{RecordSummary, Recorder, start};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::thread::JoinHandle;
@@ -14,7 +14,7 @@ use std::thread::JoinHandle;
 pub struct Recording {
     path: PathBuf,
     part: PathBuf,
-    thread: JoinHandle<std::io::Result<Written>>,
+    thread: JoinHandle<std::io::Result<RecordSummary>>,
 }
 
 /// Whether the record that `--record` asks for may lie there.

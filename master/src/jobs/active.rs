@@ -15,7 +15,7 @@ use std::sync::Arc;
 /// Finished jobs that can be watched again from the start without being submitted anew.
 const RENDERABLE_WHEN_DONE: usize = 4;
 
-/// How to render a job's frames.
+/// A job with all that its frames are rendered from.
 pub(crate) struct ActiveJob {
     pub(crate) request: Arc<PathRequest>,
     /// The scene of all frames; of a tween, all but the transfer function.

@@ -1,10 +1,10 @@
-//! Jobs: view paths that clients submitted, their frames, and those who wait for them.
+//! Jobs: view paths that clients submitted, their frames, and their watchers.
 //!
-//! The table is shared: the driver puts frames in, watchers take them out. A watcher is a
-//! cursor, so it may come late, twice, or again after its connection broke. Frames that nobody
-//! has taken yet are never dropped; instead the driver stops rendering ahead when they fill the
-//! budget. Frames that were taken are kept while there is room and rendered again when somebody
-//! asks for one that is gone: a frame is a pure function of its job.
+//! The table is shared: the driver puts frames in, watchers take them out. A watcher is a cursor,
+//! so that it may come late, twice, or again after its connection broke. Frames that no watcher has
+//! taken are never dropped; instead the driver stops rendering ahead when they fill the budget
+//! (back-pressure). Frames that were taken are kept while there is room, and rendered again when a
+//! watcher asks for one that was dropped: a frame is a pure function of its job.
 
 pub(crate) mod active;
 pub mod submit;
@@ -47,7 +47,7 @@ pub enum JobState {
 }
 
 impl JobState {
-    /// Whether the job is done, failed or cancelled, so that its state changes no more.
+    /// Returns whether the job is done, failed or cancelled, so that its state changes no more.
     pub fn is_over(&self) -> bool {
         matches!(self, JobState::Done | JobState::Failed(_) | JobState::Cancelled)
     }

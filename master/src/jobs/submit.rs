@@ -24,10 +24,10 @@ use std::sync::Arc;
 /// Bytes of the longest `client_key`.
 const MAX_KEY_BYTES: usize = 200;
 
-/// Why a request did not become a job.
+/// Reason why a request did not become a job.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum SubmitError {
-    /// A field can't be used.
+    /// A field of the request can't be used.
     #[error(transparent)]
     Refused(#[from] Refused),
     /// The client's key belongs to another request.

@@ -9,7 +9,7 @@ use tokio::sync::mpsc;
 use tokio::sync::watch::{self, error::RecvError};
 use tokio::time::Instant;
 
-/// What a watcher gets next.
+/// An item that a watcher of a job gets.
 #[derive(Clone, Debug)]
 pub enum WatchItem {
     /// The job changed; also sent before the first frame.
@@ -22,7 +22,7 @@ pub enum WatchItem {
 /// a notice for each tile woke a thread some 3000 times a second, 3 % of a processor.
 pub(crate) const TILE_NEWS: Duration = Duration::from_millis(40);
 
-/// What a notice tells, to be compared with the next one.
+/// The facts that a notice tells, to be compared with the next notice.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct News {
     state: JobState,

@@ -34,9 +34,9 @@ mod read;
 mod tests;
 mod write;
 
-pub use read::{Broken, Difference, Replayed, replay};
+pub use read::{Difference, RecordError, ReplaySummary, replay};
 pub(crate) use write::RecordedScheduler;
-pub use write::{Recorder, Written, start};
+pub use write::{RecordSummary, Recorder, start};
 
 use serde::{Deserialize, Serialize};
 use slabcast_common::brick::BrickInfo;

@@ -33,7 +33,7 @@ const MAX_LINE_BYTES: u64 = 1 << 30;
 /// Error of a file that is no record, or a damaged one.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}: {problem}")]
-pub struct Broken {
+pub struct RecordError {
     /// Line, counted from 1.
     pub line: u64,
     /// Problem of the line, and the remedy.
@@ -53,7 +53,7 @@ pub struct Difference {
 
 /// Outcome of a replay.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Replayed {
+pub struct ReplaySummary {
     /// Number of events that were handed to the scheduler.
     pub events: u64,
     /// Number of decisions that agree.
@@ -92,12 +92,12 @@ struct Reader<R> {
 }
 
 impl<R: BufRead> Reader<R> {
-    fn broken(&self, problem: impl Into<String>) -> Broken {
-        Broken { line: self.line, problem: problem.into() }
+    fn broken(&self, problem: impl Into<String>) -> RecordError {
+        RecordError { line: self.line, problem: problem.into() }
     }
 
     /// The next line; `None` at the end of the file.
-    fn next(&mut self) -> Result<Option<Line>, Broken> {
+    fn next(&mut self) -> Result<Option<Line>, RecordError> {
         self.line += 1;
         self.text.clear();
         let read = (&mut self.from).take(MAX_LINE_BYTES).read_until(b'\n', &mut self.text);
@@ -149,7 +149,7 @@ struct Seen {
 ///
 /// # Errors
 /// If a line is not as the recorder writes it, or reading fails.
-pub fn replay(from: impl BufRead) -> Result<Replayed, Broken> {
+pub fn replay(from: impl BufRead) -> Result<ReplaySummary, RecordError> {
     let mut reader = Reader { from, line: 0, text: Vec::new() };
     let head = match reader.next()? {
         Some(Line::Record(head)) => head,
@@ -159,7 +159,7 @@ pub fn replay(from: impl BufRead) -> Result<Replayed, Broken> {
     };
     let mut scheduler = Scheduler::new(config(&head).map_err(|e| reader.broken(e))?);
     let mut seen = Seen::default();
-    let mut done = Replayed {
+    let mut done = ReplaySummary {
         events: 0,
         decisions: 0,
         frames: 0,

@@ -1,6 +1,9 @@
 //! Records of seeded runs: workers join, leave, lie, fall silent and answer late.
 
-use super::{Broken, Difference, RecordedScheduler, Replayed, Written, bits, replay, runs, start};
+use super::{
+    Difference, RecordError, RecordSummary, RecordedScheduler, ReplaySummary, bits, replay, runs,
+    start,
+};
 use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId, WorkerId};
 use slabcast_common::image::{Background, PixelFormat, TilePixels};
@@ -57,7 +60,7 @@ impl Rng {
     }
 }
 
-/// What every other frame is finished to.
+/// Format of every other frame, which workers finish.
 fn finish(frame: FrameId) -> Option<Finish> {
     let (format, background) = (PixelFormat::Rgb8, Background::Colour([0.5; 3]));
     frame.0.is_multiple_of(2).then_some(Finish { format, background })
@@ -105,7 +108,7 @@ fn area(r: &Rect) -> f64 {
 }
 
 /// A run of one seed, recorded.
-fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, Written) {
+fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, RecordSummary) {
     let mut rng = Rng(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1);
     let out = Shared::default();
     let (recorder, thread) = start(out.clone()).expect("a thread");
@@ -330,7 +333,8 @@ fn replay_finds_a_changed_decision_at_its_line() {
     let (bytes, _) = recorded(3, Schedule::Slab);
     let lease = |l: &str| l.starts_with("{\"out\"") && l.contains("lease t");
     let (line, changed) = tampered(&bytes, lease, |l| l.replacen("lease t", "lease t9", 1));
-    let Replayed { difference: Some(d), .. } = replay(&changed[..]).expect("it can be read") else {
+    let ReplaySummary { difference: Some(d), .. } = replay(&changed[..]).expect("it can be read")
+    else {
         panic!("nothing was found");
     };
     let Difference { line: at, recorded, replayed } = d;
@@ -353,7 +357,7 @@ fn replay_finds_changed_events_by_their_decisions() {
     let (line, changed) = tampered(&bytes, time, |l| l.replacen("{\"t\":[", "{\"t\":[1,", 1));
     match replay(&changed[..]) {
         Ok(done) => assert!(done.difference.is_some_and(|d| d.line >= line)),
-        Err(Broken { line: at, problem }) => assert!(at == line && problem.contains("time")),
+        Err(RecordError { line: at, problem }) => assert!(at == line && problem.contains("time")),
     }
 }
 

@@ -39,7 +39,7 @@ pub struct Recorder {
 
 /// Summary of a record that was written.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Written {
+pub struct RecordSummary {
     /// Number of events.
     pub events: u64,
     /// Number of decisions.
@@ -55,7 +55,7 @@ pub struct Written {
 /// If the system gives no thread.
 pub fn start(
     out: impl Write + Send + 'static,
-) -> std::io::Result<(Recorder, JoinHandle<std::io::Result<Written>>)> {
+) -> std::io::Result<(Recorder, JoinHandle<std::io::Result<RecordSummary>>)> {
     let (to, entries) = sync_channel(QUEUE_ENTRIES);
     let thread = std::thread::Builder::new()
         .name("slabcast-record".into())
@@ -68,9 +68,12 @@ fn put(out: &mut impl Write, line: &Line) -> std::io::Result<()> {
     out.write_all(b"\n")
 }
 
-fn write(mut out: impl Write, entries: &Receiver<Entry>) -> std::io::Result<Written> {
-    let mut written =
-        Written { events: 0, decisions: 0, cut: Some("the disk fell behind the master".into()) };
+fn write(mut out: impl Write, entries: &Receiver<Entry>) -> std::io::Result<RecordSummary> {
+    let mut written = RecordSummary {
+        events: 0,
+        decisions: 0,
+        cut: Some("the disk fell behind the master".into()),
+    };
     let (mut sets, mut scenes) = (BTreeSet::<BrickSetKey>::new(), BTreeSet::<SceneId>::new());
     loop {
         let entry = match entries.recv_timeout(FLUSH) {
@@ -118,7 +121,7 @@ fn write(mut out: impl Write, entries: &Receiver<Entry>) -> std::io::Result<Writ
             }
         }
     }
-    let Written { events, decisions, cut } = written.clone();
+    let RecordSummary { events, decisions, cut } = written.clone();
     put(&mut out, &Line::End { events, decisions, cut })?;
     out.flush()?;
     Ok(written)

@@ -18,7 +18,7 @@ use std::time::Instant;
 pub(crate) struct SceneSlot {
     pub(crate) spec: Arc<SceneSpec>,
     scene: OnceLock<Arc<Scene>>,
-    /// How deep the last pictures were open, by picture size: tells which bricks to prefetch.
+    /// Depths at which pixels of the last pictures closed, by picture size. Prefetch goes by them.
     depths: Mutex<BTreeMap<[u32; 2], Arc<ClosingDepths>>>,
     /// Corners of the picture parts that were rehearsed (rehearsal only).
     pub(crate) parts: Mutex<BTreeSet<[i32; 2]>>,
@@ -95,7 +95,7 @@ impl FrameSlot {
         self.visible.get_or_init(|| VisibleBricks::new(&self.get().view, directory))
     }
 
-    /// How deep pictures of this scene and size were open.
+    /// Depths at which pixels of this scene's pictures of this size closed.
     pub(super) fn depths(&self) -> &ClosingDepths {
         self.depths.get_or_init(|| {
             let size = self.view.size;

@@ -85,7 +85,7 @@ pub(crate) struct RegionTask {
     pub(crate) stalled_at: Option<Instant>,
     /// Time that it was stalled so far.
     pub(crate) stalled: Duration,
-    /// How often it stalled.
+    /// Number of times that it stalled.
     pub(crate) stalls: u32,
     /// Sheets that it looks ahead, as of when a thread took it.
     pub(crate) ahead: u32,
@@ -141,7 +141,7 @@ pub(crate) struct DrawnRegion {
     pub(crate) sampled: Sampling,
 }
 
-/// How far a thread got with a region.
+/// The state in which a thread leaves a region.
 pub(crate) enum Progress {
     /// The frame had ended.
     FrameEnded,

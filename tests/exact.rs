@@ -9,7 +9,7 @@ fn check(arguments: &[&str]) {
     let root = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
     let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
         .current_dir(root)
-        .arg("check")
+        .args(["lab", "check"])
         .args(arguments)
         .output()
         .expect("slabcast runs");
@@ -25,7 +25,7 @@ fn golden_frames_have_their_hashes() {
     check(&["golden", "--verify", "tests/golden.txt"]);
 }
 
-/// Every pair of workers, tile size, slabs, threads, culling and link; `slabcast check matrix`
+/// Every pair of workers, tile size, slabs, threads, culling and link; `slabcast lab check matrix`
 /// runs all combinations.
 #[test]
 fn every_cluster_gives_the_serial_pixels() {

@@ -1,4 +1,4 @@
-//! Stiff and extreme scenes keep their bounds: the table of `slabcast check`.
+//! Stiff and extreme scenes keep their bounds: the table of `slabcast lab check`.
 
 use std::collections::BTreeMap;
 use std::process::Command;
@@ -15,7 +15,7 @@ fn table(group: &str) -> BTreeMap<String, usize> {
     let root = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
     let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
         .current_dir(root)
-        .args(["check", "--json", "--group", group])
+        .args(["lab", "check", "--json", "--group", group])
         .output()
         .expect("slabcast runs");
     let text = String::from_utf8_lossy(&out.stdout);
@@ -77,7 +77,7 @@ fn extreme_scenes_keep_their_bounds() {
 #[test]
 fn check_list_names_all_groups_and_the_long_cases() {
     let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
-        .args(["check", "--list"])
+        .args(["lab", "check", "--list"])
         .output()
         .expect("slabcast runs");
     let text = String::from_utf8_lossy(&out.stdout);

@@ -7,7 +7,9 @@ use slabcast_session::{output, signals, volume};
 use slabcast_volumes::write::{self, Format};
 use std::path::{Path, PathBuf};
 
-/// Writes a volume as NRRD or NIfTI, with its values, place and orientation.
+/// Writes a volume as NRRD or NIfTI.
+///
+/// Values, place and orientation stay.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 The file is whole or not there. Values keep their type; where they have a slope, NRRD gets floats.

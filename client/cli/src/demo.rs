@@ -6,7 +6,7 @@ use slabcast_session::fail::{Fail, say};
 use std::ffi::OsString;
 use std::path::PathBuf;
 
-/// Renders a volume by formula: needs no file, and says where the pictures are.
+/// Renders a volume by formula; needs no file.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:

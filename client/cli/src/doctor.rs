@@ -23,7 +23,7 @@ const ENOUGH_DISK: u64 = 200 << 20;
 /// set by NTP differ by some hundredths.
 const SKEW: Duration = Duration::from_secs(2);
 
-/// Checks this machine, the disk, the port and the master, and says the remedy for what is amiss.
+/// Checks machine, disk, port and master, and names remedies.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -103,24 +103,24 @@ pub(crate) fn run(args: &DoctorArgs, config: Result<PathBuf, Fail>) -> Result<()
             "mend the file; see `slabcast config --help`",
         ),
     });
-    let asked = args.master.clone().unwrap_or_else(|| args.listen.clone());
+    let address = args.master.clone().unwrap_or_else(|| args.listen.clone());
     let runtime = runtime::start()?;
-    let answers = runtime.block_on(master(&asked));
+    let answers = runtime.block_on(master(&address));
     runtime::end(runtime);
     let there = answers.as_ref().is_ok_and(|a| !a.is_empty());
-    all.push(port(&args.listen, there && asked == args.listen));
+    all.push(port(&args.listen, there && address == args.listen));
     match answers {
         Ok(answers) => all.extend(answers),
         Err(why) if args.master.is_some() => all.push(found(
             "master",
             State::Bad,
-            format!("{asked} does not answer as a master does"),
+            format!("{address} does not answer as a master does"),
             why,
         )),
         Err(_) => all.push(found(
             "master",
             State::Skipped,
-            format!("none at {asked}, which `slabcast render VOLUME` does not need"),
+            format!("none at {address}, which `slabcast render VOLUME` does not need"),
             "",
         )),
     }
@@ -228,11 +228,11 @@ fn port(address: &str, master: bool) -> Found {
 async fn master(address: &str) -> Result<Vec<Found>, String> {
     let fail = |e: slabcast_client::ClientError| e.to_string();
     let client = Client::connect(address).await.map_err(fail)?;
-    let (asked, now) = (Instant::now(), SystemTime::now());
+    let (began, now) = (Instant::now(), SystemTime::now());
     let volume = client.volume().await.map_err(fail)?;
     // The answer was given half-way.
-    let trip = asked.elapsed();
-    let here = now.duration_since(UNIX_EPOCH).unwrap_or_default() + trip / 2;
+    let round_trip = began.elapsed();
+    let here = now.duration_since(UNIX_EPOCH).unwrap_or_default() + round_trip / 2;
     let workers = client.workers().await.map_err(fail)?;
     let threads: u32 = workers.iter().map(|w| w.threads).sum();
     let says = format!(
@@ -258,12 +258,12 @@ async fn master(address: &str) -> Result<Vec<Found>, String> {
         let remedy = "run the same version of slabcast on all machines";
         found("versions", State::Bad, versions, remedy)
     });
-    all.push(clock(volume.now_unix_ms, here, trip));
+    all.push(clock(volume.now_unix_ms, here, round_trip));
     Ok(all)
 }
 
 /// How far the master's clock is from ours.
-fn clock(theirs_unix_ms: i64, here: Duration, trip: Duration) -> Found {
+fn clock(theirs_unix_ms: i64, here: Duration, round_trip: Duration) -> Found {
     let name = "clock";
     if theirs_unix_ms == 0 {
         let says = "the master's version does not say what time it has".into();
@@ -274,9 +274,9 @@ fn clock(theirs_unix_ms: i64, here: Duration, trip: Duration) -> Found {
         "the master's is {} ms {} (asked in {} ms)",
         ahead_ms.abs(),
         if ahead_ms < 0 { "behind" } else { "ahead" },
-        trip.as_millis()
+        round_trip.as_millis()
     );
-    if Duration::from_millis(ahead_ms.unsigned_abs()) > SKEW + trip {
+    if Duration::from_millis(ahead_ms.unsigned_abs()) > SKEW + round_trip {
         let remedy = "pictures do not depend on it, but ages of jobs and times in logs do; set \
                       both clocks by NTP (timedatectl set-ntp true)";
         return found(name, State::Warning, says, remedy);
@@ -323,7 +323,7 @@ mod tests {
     #[test]
     fn clocks_may_differ_by_what_ntp_leaves_and_the_way_takes() {
         let here = Duration::from_secs(1_000_000);
-        let trip = Duration::from_millis(40);
+        let round_trip = Duration::from_millis(40);
         let ms = here.as_millis() as i64;
         for (theirs, state) in [
             (ms, State::Ok),
@@ -333,7 +333,7 @@ mod tests {
             (ms - 3_600_000, State::Warning),
             (0, State::Skipped),
         ] {
-            let f = clock(theirs, here, trip);
+            let f = clock(theirs, here, round_trip);
             assert!(f.state == state, "{theirs}: {}", f.says);
             assert_eq!(f.remedy.is_empty(), state != State::Warning, "{theirs}");
         }

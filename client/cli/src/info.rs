@@ -14,7 +14,9 @@ use slabcast_session::volume;
 use std::fmt::Write;
 use std::path::PathBuf;
 
-/// Says what is in a volume file: size, orientation, values, and what each preset would draw.
+/// Shows what is in a volume file.
+///
+/// Size, orientation, values, and what each preset would draw.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -45,7 +47,7 @@ struct Share {
 pub(crate) fn run(args: &InfoArgs) -> Result<(), Fail> {
     args.axes.orientation()?;
     let volume = args.input.open(&args.volume)?;
-    let orientation = args.axes.of(&volume)?;
+    let orientation = args.axes.for_volume(&volume)?;
     let info = volume.info(volume.digest());
     let shares = shares(&volume, &info)?;
     if args.json {

@@ -15,11 +15,11 @@ use tracing_subscriber::fmt::MakeWriter;
 #[command(next_help_heading = "Logs")]
 pub(crate) struct LogArgs {
     /// Logs on stderr as text or as JSON, one object a line
-    #[arg(long, global = true, value_name = "text|json", default_value = "text", value_parser = ["text", "json"])]
+    #[arg(long, global = true, hide_short_help = true, value_name = "text|json", default_value = "text", value_parser = ["text", "json"])]
     log: String,
     /// off, error, warn, info, debug or trace, or filters such as slabcast_master=debug
     /// [default: info for master and worker, else warn]
-    #[arg(long, global = true, value_name = "LEVEL")]
+    #[arg(long, global = true, value_name = "LEVEL", hide_short_help = true)]
     log_level: Option<String>,
 }
 

@@ -1,29 +1,22 @@
-//! `slabcast master` and `slabcast worker`: processes that somebody else looks after.
+//! `slabcast master`: serves a volume to workers and takes jobs from clients.
 //!
-//! Both say READY to systemd, answer its watchdog, stop gracefully on SIGTERM or Ctrl-C within
-//! ten seconds and end with 0. Every flag has a variable of the environment ([`crate::config`]),
-//! so that a unit file needs none.
+//! Says READY to systemd, answers its watchdog, and on SIGTERM or Ctrl-C stops gracefully within ten
+//! seconds and ends with 0. Every flag has a variable of the environment ([`crate::config`]), so that
+//! a unit file needs none.
 
+use crate::systemd::{self, DRAIN};
 use slabcast_common::path::Axis;
-use slabcast_lab::plan;
-use slabcast_master::{Handle, MasterConfig};
-use slabcast_render::Simd;
+use slabcast_master::MasterConfig;
 use slabcast_session::embedded::start_master;
 use slabcast_session::fail::{Fail, reason, say};
-use slabcast_session::machine::cores;
+use slabcast_session::machine::boot_id;
 use slabcast_session::request::AxisArgs;
 use slabcast_session::{parse, record, runtime, signals, volume};
-use slabcast_worker::{Config, Ended, Rehearsal};
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::time::Duration;
 use tokio::net::{TcpListener, TcpSocket};
 use tokio::sync::watch;
 use tracing::{info, warn};
-
-/// How long a daemon that is told to stop may take (PROMISES R29).
-const DRAIN: Duration = Duration::from_secs(10);
 
 const MASTER_EXAMPLES: &str = "\
 Examples:
@@ -34,7 +27,7 @@ Examples:
   For workers on other machines, on a network that you trust:
   slabcast master --volume brain.nii.gz --listen 0.0.0.0:7433 --insecure";
 
-/// Serves a volume to workers and takes view paths from clients.
+/// Serves a volume to workers and takes jobs from clients.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = MASTER_EXAMPLES)]
 pub(crate) struct MasterArgs {
@@ -56,7 +49,7 @@ pub(crate) struct MasterArgs {
     #[arg(long,
           value_parser = clap::builder::FalseyValueParser::new())]
     insecure: bool,
-    /// What the scheduler is told and decides, for `slabcast replay`; some 25 KB a frame
+    /// What the scheduler is told and decides, for `slabcast lab replay`; some 25 KB a frame
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
     /// Take workers that hold tiles for recorded times (`slabcast worker --rehearse`), and no others;
@@ -65,41 +58,8 @@ pub(crate) struct MasterArgs {
     rehearse: bool,
 }
 
-const WORKER_EXAMPLES: &str = "\
-Examples:
-  slabcast worker --master node1:7433
-  slabcast worker --master node1:7433 --threads 8 --memory 4GiB --name node2
-  slabcast worker --master 127.0.0.1:7433 --threads 1 --rehearse ct.trace
-
-A worker may come and go at any time, also in mid-frame. When its master is away it dials again
-until the master is back.";
-
-/// Renders for a master.
-#[derive(clap::Args, Clone, Debug)]
-#[command(after_help = WORKER_EXAMPLES)]
-pub(crate) struct WorkerArgs {
-    /// The master
-    #[arg(long, value_name = "HOST:PORT", value_parser = parse::master)]
-    master: String,
-    /// A name for people [default: host and process number]
-    #[arg(long, value_name = "NAME", value_parser = parse::worker_name)]
-    name: Option<String>,
-    /// Render threads [default: all cores]
-    #[arg(long, value_name = "N",
-          value_parser = clap::value_parser!(u32).range(1..=1024))]
-    threads: Option<u32>,
-    /// Memory for bricks; the process takes some 30 MiB beside them
-    #[arg(long, value_name = "BYTES", default_value = "512MiB",
-          value_parser = parse::memory)]
-    memory: u64,
-    /// Draw nothing, but hold each tile for the time that this file of `slabcast plan --trace` says; for
-    /// a master with --rehearse
-    #[arg(long, value_name = "TRACE")]
-    rehearse: Option<PathBuf>,
-}
-
 /// Runs `slabcast master`.
-pub(crate) fn master(args: &MasterArgs) -> Result<(), Fail> {
+pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
     let axes = AxisArgs { up: args.up, front: args.front };
     axes.orientation()?;
     let runtime = runtime::start()?;
@@ -108,10 +68,10 @@ pub(crate) fn master(args: &MasterArgs) -> Result<(), Fail> {
     let socket = runtime.block_on(bind(&args.listen, args.insecure))?;
     let volume = args.input.open(&args.volume)?;
     let (name, lattice) = (volume.name.clone(), volume.lattice);
-    let orientation = axes.of(&volume)?;
+    let orientation = axes.for_volume(&volume)?;
     let mut config = MasterConfig::new(volume, orientation);
     config.rehearse = args.rehearse;
-    config.machine = machine();
+    config.machine = boot_id();
     if args.rehearse {
         warn!("--rehearse: this master's pictures are stripes, whatever is asked for");
     }
@@ -231,129 +191,4 @@ fn cannot_listen(text: &str, e: &std::io::Error) -> Fail {
 
 fn local(listener: &TcpListener) -> Result<SocketAddr, Fail> {
     listener.local_addr().map_err(|e| Fail::failed(format!("listening failed: {}", reason(&e))))
-}
-
-/// Which machine this is, the same for all processes and containers of it until it is started again; empty
-/// where the system does not say.
-fn machine() -> String {
-    let id = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
-    id.trim().to_owned()
-}
-
-/// Runs `slabcast worker`.
-pub(crate) fn worker(args: &WorkerArgs) -> Result<(), Fail> {
-    let rehearsal = match &args.rehearse {
-        Some(file) => Some(Arc::new(Rehearsal::new(plan::read(file)?))),
-        None => None,
-    };
-    let config = Config {
-        rehearsal,
-        name: args.name.clone().unwrap_or_else(host_and_process),
-        threads: args.threads.unwrap_or_else(cores),
-        memory_budget_bytes: args.memory,
-        simd: Simd::detect(),
-        machine: machine(),
-    };
-    let runtime = runtime::start_worker(config.threads)?;
-    let result = runtime.block_on(async {
-        signals::listen();
-        let (stop, stopped) = watch::channel(false);
-        info!(
-            name = config.name,
-            master = args.master,
-            threads = config.threads,
-            memory = args.memory,
-            simd = config.simd.name(),
-            "worker starts"
-        );
-        let dialling = slabcast_worker::dial::run(config, args.master.clone(), stopped);
-        let mut running = tokio::spawn(dialling);
-        systemd::ready(&format!("rendering for {}", args.master));
-        let beat = tokio::spawn(systemd::watchdog(None));
-        let ended = tokio::select! {
-            ended = &mut running => ended,
-            _ = signals::stopped() => {
-                systemd::stopping();
-                let _ = stop.send(true);
-                match tokio::time::timeout(DRAIN, &mut running).await {
-                    Ok(ended) => ended,
-                    Err(_) => {
-                        warn!("gave up waiting for tasks");
-                        return Ok(());
-                    }
-                }
-            }
-        };
-        beat.abort();
-        match ended {
-            Ok(Ok(Ended::Stopped)) => Ok(()),
-            Ok(Ok(Ended::Refused(why))) => Err(Fail::failed(format!(
-                "the master at {} refuses this worker: {why}",
-                args.master
-            ))),
-            Ok(Ok(Ended::Lost(why) | Ended::MasterLeft(why)) | Err(why)) => {
-                Err(Fail::failed(format!("master at {}: {why}", args.master)))
-            }
-            Err(e) => Err(Fail::failed(format!("the worker failed: {e}"))),
-        }
-    });
-    // Render threads end after the tile at hand; nobody waits for it.
-    runtime::end(runtime);
-    result
-}
-
-fn host_and_process() -> String {
-    let host = std::fs::read_to_string("/proc/sys/kernel/hostname")
-        .ok()
-        .or_else(|| std::env::var("HOSTNAME").ok())
-        .unwrap_or_default();
-    let host: String = host.trim().chars().filter(|c| !c.is_control()).take(64).collect();
-    let host = if host.is_empty() { "worker".into() } else { host };
-    format!("{host}-{}", std::process::id())
-}
-
-/// What systemd is told (sd_notify), where it listens.
-mod systemd {
-    use super::{Duration, Handle};
-
-    #[cfg(target_os = "linux")]
-    fn tell(states: &[sd_notify::NotifyState<'_>]) {
-        if let Err(e) = sd_notify::notify(states) {
-            tracing::warn!(error = %e, "systemd was not told");
-        }
-    }
-
-    /// It serves.
-    pub(super) fn ready(status: &str) {
-        #[cfg(target_os = "linux")]
-        tell(&[sd_notify::NotifyState::Ready, sd_notify::NotifyState::Status(status)]);
-        #[cfg(not(target_os = "linux"))]
-        let _ = status;
-    }
-
-    /// It ends.
-    pub(super) fn stopping() {
-        #[cfg(target_os = "linux")]
-        tell(&[sd_notify::NotifyState::Stopping]);
-    }
-
-    /// Answers the watchdog twice in its time. A master answers only while its driver does: a
-    /// process that breathes but takes no event is to be restarted.
-    pub(super) async fn watchdog(handle: Option<Handle>) {
-        #[cfg(target_os = "linux")]
-        if let Some(within) = sd_notify::watchdog_enabled() {
-            let mut beat = tokio::time::interval((within / 2).max(Duration::from_millis(1)));
-            loop {
-                beat.tick().await;
-                if let Some(handle) = &handle
-                    && tokio::time::timeout(within, handle.workers()).await.is_err()
-                {
-                    continue;
-                }
-                tell(&[sd_notify::NotifyState::Watchdog]);
-            }
-        }
-        #[cfg(not(target_os = "linux"))]
-        let _ = (handle, Duration::ZERO);
-    }
 }

@@ -7,9 +7,9 @@ use slabcast_session::output::{Output, OutputArgs};
 use slabcast_session::{progress, volume};
 use std::path::PathBuf;
 
-/// Draws a picture again from what it says of itself, and compares the two files.
+/// Renders a picture again from the record inside it.
 ///
-/// Pictures that slabcast writes (PNG of 8 or 16 bits, EXR, moving PNG) say what made them: the
+/// Then compares the two files. Pictures that slabcast writes (PNG of 8 or 16 bits, EXR, moving PNG) say what made them: the
 /// volume's digest, transfer function, view, quality and version. With the same volume the new
 /// file has the same bytes, on any machine.
 #[derive(clap::Args, Clone, Debug)]
@@ -54,7 +54,7 @@ pub(crate) fn run(args: &RerenderArgs) -> Result<(), Fail> {
     let ending = args.picture.extension().unwrap_or_default();
     let target =
         args.output.clone().unwrap_or_else(|| PathBuf::from("again").with_extension(ending));
-    let asked = made.request();
+    let request = made.request();
     let output = OutputArgs {
         output: target.clone(),
         format: Some(made.format),
@@ -62,9 +62,9 @@ pub(crate) fn run(args: &RerenderArgs) -> Result<(), Fail> {
         contact_sheet: None,
         force: args.force,
     };
-    let frames = asked.frames();
+    let frames = request.frames();
     let inputs = [args.picture.as_path(), file.as_path()];
-    let (output, _) = Output::look(&output, "frame", frames, asked.background, &inputs)?;
+    let (output, _) = Output::look(&output, "frame", frames, request.background, &inputs)?;
     let volume = args.input.open(file)?;
     let digest = volume.digest().to_string();
     if digest != made.volume_sha256 {
@@ -75,7 +75,7 @@ pub(crate) fn run(args: &RerenderArgs) -> Result<(), Fail> {
             file.display()
         )));
     }
-    render::again(asked, output, volume, args.quiet)?;
+    render::again(request, output, volume, args.quiet)?;
     let after = provenance::read(&target)?;
     let (old, new) = (args.picture.display(), target.display());
     if before == after {

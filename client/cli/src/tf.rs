@@ -7,13 +7,15 @@ use slabcast_common::volume::{Digest32, Volume};
 use slabcast_common::volume::{Samples, ValueMap, ValueSummary, VolumeInfo};
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::output::write_atomic;
-use slabcast_session::transfer::{LookFlags, Transfer};
+use slabcast_session::transfer::{Transfer, TransferFlags};
 use slabcast_session::volume::InputArgs;
 use std::io::Write;
 use std::path::PathBuf;
 
-/// Writes a transfer function as JSON: a preset or map fitted to a volume, or a file of ours or of
-/// ParaView's, with what flags change of it.
+/// Writes a transfer function as JSON, to change by hand.
+///
+/// A preset or map fitted to a volume, or a file of ours or of ParaView's, with what flags change of
+/// it.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -35,7 +37,7 @@ pub(crate) struct TfArgs {
     #[command(flatten)]
     input: InputArgs,
     #[command(flatten)]
-    look: LookFlags,
+    flags: TransferFlags,
     /// For ParaView: a list of one colour map, with RGBPoints and Points
     #[arg(long)]
     paraview: bool,
@@ -53,7 +55,7 @@ pub(crate) struct TfArgs {
 /// Runs the command.
 pub(crate) fn run(args: &TfArgs) -> Result<(), Fail> {
     let Some(name) = args.tf.as_ref().filter(|_| !args.list) else { return say(&list()) };
-    let transfer = Transfer::parse(name, &args.look)?;
+    let transfer = Transfer::parse(name, &args.flags)?;
     if let Some(path) = &args.output
         && path.exists()
         && !args.force

@@ -1,4 +1,4 @@
-//! What a scene does not need, and what leaving it out saves: `slabcast explain` without a pixel.
+//! What a scene does not need, and what leaving it out saves: `slabcast lab explain` without a pixel.
 //!
 //! Each row is measured: the scene is drawn as it is and with the thing kept (or the test switched
 //! off), in turn, and the two pictures are compared, to the bit.
@@ -15,7 +15,7 @@ use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::Fail;
 use slabcast_session::path_scenes::Stage;
 use slabcast_session::progress::{self, Progress};
-use slabcast_session::request::{Asked, Opened, PictureOf};
+use slabcast_session::request::{OpenedVolume, RenderRequest, VolumeSceneArgs};
 use std::fmt::Write;
 use std::sync::Arc;
 use std::time::Instant;
@@ -65,15 +65,15 @@ impl Way {
     fn new(
         volume: &Volume,
         info: &VolumeInfo,
-        asked: &Asked,
+        request: &RenderRequest,
         o: Orientation,
         keep: Keep,
     ) -> Result<Way, Fail> {
-        let mut asked = asked.clone();
-        asked.work.keep = keep;
-        let asked = asked;
+        let mut request = request.clone();
+        request.work.keep = keep;
+        let request = request;
         let began = Instant::now();
-        let stage = Stage::new(volume, info, &asked, o)?;
+        let stage = Stage::new(volume, info, &request, o)?;
         let cut_ms = began.elapsed().as_secs_f64() * 1e3;
         let frame_of = stage.spec(0).quality;
         Ok(Way { stage, frame_of, cut_ms })
@@ -120,12 +120,12 @@ fn in_turn(ways: [(&Way, Quality); 2], threads: usize) -> Result<([f64; 2], bool
 }
 
 /// Finds it out.
-pub(crate) fn find(of: &PictureOf, threads: usize) -> Result<Needs, Fail> {
-    let asked = of.look.asked(Work::default())?;
-    let Opened { volume, info, orientation } = of.open(&asked)?;
+pub(crate) fn find(of: &VolumeSceneArgs, threads: usize) -> Result<Needs, Fail> {
+    let request = of.scene.request(Work::default())?;
+    let OpenedVolume { volume, info, orientation } = of.open(&request)?;
     let mut progress = Progress::new(false);
     progress.stage("drawing with and without");
-    let way = |keep| Way::new(&volume, &info, &asked, orientation, keep);
+    let way = |keep| Way::new(&volume, &info, &request, orientation, keep);
     let base = way(Keep::default())?;
     let spec = base.stage.spec(0);
     let quality = base.frame_of;
@@ -229,7 +229,7 @@ pub(crate) fn find(of: &PictureOf, threads: usize) -> Result<Needs, Fail> {
             },
         )
     });
-    let opaque = asked.background != Background::Transparent;
+    let opaque = request.background != Background::Transparent;
     rows.push(Row {
         left_out: opaque,
         bytes: opaque.then(|| view.size.iter().map(|&n| u64::from(n)).product()),
@@ -267,7 +267,7 @@ pub(crate) fn find(of: &PictureOf, threads: usize) -> Result<Needs, Fail> {
     }
     progress.end();
     Ok(Needs {
-        scene: format!("{}, {}", volume.name, asked.transfer.name()),
+        scene: format!("{}, {}", volume.name, request.transfer.name()),
         size: view.size,
         threads,
         ms,

@@ -1,4 +1,4 @@
-//! `slabcast bench`: how long a frame takes in this process, without a cluster.
+//! `slabcast lab bench`: how long a frame takes in this process, without a cluster.
 //!
 //! A frame's time runs from camera set to picture in memory: tables, projection of bricks,
 //! rendering, compositing. Reading, bricking and writing pictures are not in it. The first view
@@ -16,27 +16,29 @@ use slabcast_session::fail::{Fail, say};
 use slabcast_session::magnify::magnified;
 use slabcast_session::path_scenes::Stage;
 use slabcast_session::progress::{self, Progress};
-use slabcast_session::request::{KeepArg, Opened, PictureOf, ThreadArg};
+use slabcast_session::request::{KeepArgs, OpenedVolume, ThreadArgs, VolumeSceneArgs};
 use std::fmt::Write;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Times the frames of a view path in this process: milliseconds, counts and error of one run.
+/// Times the frames of a view path in this process.
+///
+/// Milliseconds, counts and error of one run.
 ///
 /// A frame's time runs from camera set to picture in memory. The first view warms up and is left
-/// out. The error is that of the middle view, as `slabcast error` has it.
+/// out. The error is that of the middle view, as `slabcast lab error` has it.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
-  slabcast bench brain.nii.gz --threads 1
-  slabcast bench brain.nii.gz --tf peer-semi --size 1024x1024 --projection persp --json")]
+  slabcast lab bench brain.nii.gz --threads 1
+  slabcast lab bench brain.nii.gz --tf peer-semi --size 1024x1024 --projection persp --json")]
 pub struct BenchArgs {
     #[command(flatten)]
-    of: PictureOf,
+    of: VolumeSceneArgs,
     #[command(flatten)]
-    threads: ThreadArg,
+    threads: ThreadArgs,
     #[command(flatten)]
-    keep: KeepArg,
+    keep: KeepArgs,
     /// Edge of the tiles that threads share, in pixels
     #[arg(long, value_name = "N", default_value = "64",
           value_parser = clap::value_parser!(u32).range(16..=256))]
@@ -56,26 +58,26 @@ pub struct BenchArgs {
 /// Runs the command.
 pub fn run(args: &BenchArgs) -> Result<(), Fail> {
     let work = Work { keep: args.keep.keep(), ..Work::default() };
-    let mut asked = args.of.look.asked_or_target(work)?;
+    let mut request = args.of.scene.request_with_target(work)?;
     let threads = args.threads.count();
-    let Opened { volume, info, orientation } = args.of.open(&asked)?;
+    let OpenedVolume { volume, info, orientation } = args.of.open(&request)?;
     let volume = Arc::new(volume);
-    settle(&volume, &info, &mut asked, orientation, threads)?;
-    let stage = Stage::new(&volume, &info, &asked, orientation)?;
+    settle(&volume, &info, &mut request, orientation, threads)?;
+    let stage = Stage::new(&volume, &info, &request, orientation)?;
     let bricks = &stage.bricks;
     drop(volume);
     let cut = Cut { threads, tile: args.tile, slabs: 1 };
-    let views = asked.path.frames();
+    let views = request.path.frames();
     let mut progress = Progress::new(false).of("frame");
     progress.frames(views as u64, &format!("{views} views"));
     let (mut each, mut counters, mut middle) = (Vec::new(), Counters::default(), None);
     let (mut sha256, mut adds) = (String::new(), None);
     for i in 0..views {
-        let (view, scene) = (stage.view(i, &asked.quality)?, stage.scene(i));
+        let (view, scene) = (stage.view(i, &request.quality)?, stage.scene(i));
         let began = Instant::now();
         let frame = Frame::new(scene, view);
         let (picture, counted) = direct::counted_picture(&frame, bricks, cut);
-        let picture = magnified(picture, asked.magnify, threads);
+        let picture = magnified(picture, request.magnify, threads);
         let took = began.elapsed().as_secs_f64() * 1e3;
         each.push(took);
         if i > 0 || views == 1 {
@@ -84,7 +86,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
         if i == views / 2 {
             sha256 = picture.sha256().to_string();
             adds = frame.footprint_cost();
-            middle = Some((stage.view_of(i, &asked.quality, asked.size())?, picture));
+            middle = Some((stage.view_of(i, &request.quality, request.size())?, picture));
         }
         progress.step(progress::Step { frames: i as u64 + 1, ..Default::default() });
     }
@@ -96,7 +98,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
     let (median, least, most) = (ms[ms.len() / 2], ms[0], ms[ms.len() - 1]);
     let relevant: u64 = bricks.iter().map(|b| b.len() as u64).sum();
     let errors = middle.filter(|_| args.pixels > 0).map(|(view, picture)| {
-        let sample = stratified(asked.size(), args.pixels as usize, args.seed);
+        let sample = stratified(request.size(), args.pixels as usize, args.seed);
         let reference = Reference::new(&stage.spec(views / 2), view, bricks);
         let mut progress = Progress::new(false).of("pixel");
         progress.frames(sample.len() as u64, "the reference");
@@ -105,9 +107,9 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
         });
         progress.end();
         let (limit, same): (Vec<_>, Vec<_>) = truth.into_iter().unzip();
-        let at = |p: &[u32; 2]| picture.pixels[(p[1] * asked.size()[0] + p[0]) as usize];
+        let at = |p: &[u32; 2]| picture.pixels[(p[1] * request.size()[0] + p[0]) as usize];
         let got: Vec<_> = sample.iter().map(at).collect();
-        [limit, same].map(|want| ErrorFigures::compare(&got, &want, asked.background))
+        [limit, same].map(|want| ErrorFigures::compare(&got, &want, request.background))
     });
     let simd = Simd::detect().name();
     if args.json {
@@ -119,8 +121,8 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
             // In the order of the path, the warming-up first: whoever runs this several times can
             // tell a slow view from a machine that was disturbed.
             "each_ms": each,
-            "threads": threads, "tile": args.tile, "simd": simd, "size": asked.size(),
-            "magnify": asked.magnify,
+            "threads": threads, "tile": args.tile, "simd": simd, "size": request.size(),
+            "magnify": request.magnify,
             "quality": quality, "relevant": relevant, "pixels_sha256": sha256,
             "tossed": counters.tossed / n, "splatted": counters.splatted / n,
             "culled": counters.culled / n,

@@ -1,4 +1,4 @@
-//! `slabcast explain`: why a pixel is as it is, and what a scene does not need ([`crate::ablation`]).
+//! `slabcast lab explain`: why a pixel is as it is, and what a scene does not need ([`crate::ablation`]).
 //!
 //! The numbers are the renderer's own ([`slabcast_render::oracle::explain`]): the pixel that they lead to
 //! is the pixel of the picture, to the bit. Beside each sheet stands what the same sheets are in
@@ -11,13 +11,15 @@ use slabcast_render::judge::reference::{Sheet, Sheets};
 use slabcast_render::oracle::explain::{PixelExplanation, SectionAtPixel, SheetAtPixel, explain};
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::parse;
-use slabcast_session::request::{PictureOf, ThreadArg};
+use slabcast_session::request::{ThreadArgs, VolumeSceneArgs};
 use slabcast_session::signals;
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
-/// Explains what a scene does not need and what leaving it out saves; with --pixel, a pixel sheet by
-/// sheet: what is in it, which voxels made it, where it was shut.
+/// Explains a pixel, or what a scene does not need.
+///
+/// What leaving it out saves; with --pixel, a pixel sheet by sheet: what is in it, which voxels made
+/// it, where it was shut.
 ///
 /// The first view of the path is taken. Without --pixel the scene is drawn as it is and with each
 /// thing kept that it leaves out, in turn, and the pictures are compared. With it, for each sheet that holds something at the pixel, front to
@@ -29,10 +31,10 @@ use std::fmt::Write;
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
-  slabcast explain brain.nii.gz --tf fog
-  slabcast explain brain.nii.gz --pixel 256,200
-  slabcast explain brain.nii.gz --tf peer-semi --azimuth 30 --pixel 256,200 --voxels 0
-  slabcast explain brain.nii.gz --thickness 0.5 --pixel 256,200 --json | jq .sheets[0]
+  slabcast lab explain brain.nii.gz --tf fog
+  slabcast lab explain brain.nii.gz --pixel 256,200
+  slabcast lab explain brain.nii.gz --tf peer-semi --azimuth 30 --pixel 256,200 --voxels 0
+  slabcast lab explain brain.nii.gz --thickness 0.5 --pixel 256,200 --json | jq .sheets[0]
 
 Depths are in vox behind the target; sheet k lies between k and k + 1 thicknesses. Colours are
 linear, from 0 to 1; pixels linear, premultiplied. A voxel's weights are those of its footprint
@@ -50,7 +52,7 @@ of four channels in 1/255; t is what is let through by this sheet and all in fro
 null where the pixel stays open; reference is null where f64 sheets have nothing there.")]
 pub struct ExplainArgs {
     #[command(flatten)]
-    of: PictureOf,
+    of: VolumeSceneArgs,
     /// The pixel, from 0,0 at the top left
     #[arg(long, value_name = "X,Y", value_parser = parse::pixel)]
     pixel: Option<[u32; 2]>,
@@ -58,7 +60,7 @@ pub struct ExplainArgs {
     #[arg(long, value_name = "N", default_value = "3")]
     voxels: usize,
     #[command(flatten)]
-    threads: ThreadArg,
+    threads: ThreadArgs,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -96,7 +98,7 @@ pub fn run(args: &ExplainArgs) -> Result<(), Fail> {
 
 fn find(args: &ExplainArgs, at: [u32; 2]) -> Result<Found, Fail> {
     // A pixel that was magnified comes from no sheets of its own.
-    args.of.look.asked(Default::default())?;
+    args.of.scene.request(Default::default())?;
     let still = Still::read(&args.of, 1, |[w, h]| {
         if at[0] < w && at[1] < h {
             return Ok(());

@@ -7,7 +7,7 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::PathBuf;
 
-/// Makes the decisions of a recorded run again, and says whether they are the same.
+/// Makes a recorded run's decisions again and compares.
 ///
 /// Exit code 0 where they are, 1 where one differs or the file is broken; the line is named.
 #[derive(clap::Args, Clone, Debug)]
@@ -15,7 +15,7 @@ use std::path::PathBuf;
 Examples:
   slabcast master --volume brain.nii.gz --record events.log
   slabcast render brain.nii.gz --workers 4 --record events.log
-  slabcast replay events.log")]
+  slabcast lab replay events.log")]
 pub struct ReplayArgs {
     /// What --record wrote; FILE.part of a master that was killed will do
     file: PathBuf,
@@ -24,7 +24,7 @@ pub struct ReplayArgs {
     json: bool,
 }
 
-/// Runs `slabcast replay`.
+/// Runs `slabcast lab replay`.
 pub fn run(args: &ReplayArgs) -> Result<(), Fail> {
     let shown = args.file.display().to_string();
     let file = File::open(&args.file).map_err(|e| Fail::io(&args.file, "opening", &e))?;

@@ -12,7 +12,7 @@ use slabcast_session::direct::{self, Bricks, Cut};
 use slabcast_session::fail::Fail;
 use slabcast_session::magnify::magnified;
 use slabcast_session::path_scenes::Stage;
-use slabcast_session::request::{Opened, PictureOf};
+use slabcast_session::request::{OpenedVolume, VolumeSceneArgs};
 use std::sync::Arc;
 
 /// The first view of a path, ready to be drawn and judged.
@@ -30,19 +30,19 @@ pub(crate) struct Still {
 impl Still {
     /// Reads the volume and cuts its bricks. `check` is asked before anything is read.
     pub(crate) fn read(
-        of: &PictureOf,
+        of: &VolumeSceneArgs,
         threads: usize,
         check: impl FnOnce([u32; 2]) -> Result<(), Fail>,
     ) -> Result<Still, Fail> {
-        let mut asked = of.look.asked_or_target(Work::default())?;
-        check(asked.path.size)?;
-        let Opened { volume, info, orientation } = of.open(&asked)?;
+        let mut request = of.scene.request_with_target(Work::default())?;
+        check(request.path.size)?;
+        let OpenedVolume { volume, info, orientation } = of.open(&request)?;
         let volume = Arc::new(volume);
-        settle(&volume, &info, &mut asked, orientation, threads)?;
-        let stage = Stage::new(&volume, &info, &asked, orientation)?;
-        let (spec, small) = (stage.spec(0), stage.view(0, &asked.quality)?);
-        let view = stage.view_of(0, &asked.quality, asked.size())?;
-        let (background, magnify) = (asked.background, asked.magnify);
+        settle(&volume, &info, &mut request, orientation, threads)?;
+        let stage = Stage::new(&volume, &info, &request, orientation)?;
+        let (spec, small) = (stage.spec(0), stage.view(0, &request.quality)?);
+        let view = stage.view_of(0, &request.quality, request.size())?;
+        let (background, magnify) = (request.background, request.magnify);
         Ok(Still { spec, view, small, magnify, bricks: stage.bricks, background })
     }
 

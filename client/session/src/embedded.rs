@@ -7,7 +7,7 @@ use crate::fail::Fail;
 use crate::machine::cores;
 use crate::output::Frame;
 use crate::progress::Step;
-use crate::request::Asked;
+use crate::request::RenderRequest;
 use crate::source::{Cancel, Source, Update};
 use slabcast_common::message::PathRequest;
 use slabcast_common::path::Orientation;
@@ -145,16 +145,20 @@ pub fn start_master(config: MasterConfig) -> Result<Master, Fail> {
 }
 
 /// Submits a path to a master of this process and follows it.
-pub async fn submit(handle: &Handle, asked: &Asked, request: PathRequest) -> Result<Source, Fail> {
-    let job = handle.submit(request).await.map_err(|e| match e {
-        SubmitError::Refused(refused) => asked.blame(&refused),
+pub async fn submit(
+    handle: &Handle,
+    request: &RenderRequest,
+    message: PathRequest,
+) -> Result<Source, Fail> {
+    let job = handle.submit(message).await.map_err(|e| match e {
+        SubmitError::Refused(refused) => request.blame(&refused),
         other => Fail::failed(format!("the master of this process takes no job: {other:?}")),
     })?;
     let Some(mut watch) = handle.watch(job, 0) else {
         return Err(Fail::failed(format!("{job} was forgotten by the master of this process")));
     };
     let (to, updates) = mpsc::channel(1);
-    let total = asked.path.frames() as u64;
+    let total = request.path.frames() as u64;
     tokio::spawn(async move {
         let mut taken = 0;
         loop {

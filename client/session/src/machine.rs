@@ -14,3 +14,10 @@ pub fn cpu() -> String {
 pub fn cores() -> u32 {
     std::thread::available_parallelism().map_or(1, |n| n.get().min(1024) as u32)
 }
+
+/// Returns the id of this boot of this machine, which all its processes and containers share; empty
+/// where the system has none.
+pub fn boot_id() -> String {
+    let id = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
+    id.trim().to_owned()
+}

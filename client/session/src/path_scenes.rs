@@ -4,7 +4,7 @@
 
 use crate::direct::Bricks;
 use crate::fail::Fail;
-use crate::request::Asked;
+use crate::request::RenderRequest;
 use slabcast_common::ids::SceneId;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::path::Orientation;
@@ -64,7 +64,7 @@ impl Drawn {
 
 /// A path's bricks, scenes and views.
 pub struct Stage {
-    asked: Asked,
+    request: RenderRequest,
     orientation: Orientation,
     /// Of all frames, or of those of a tween but for the transfer function.
     base: SceneSpec,
@@ -80,27 +80,27 @@ impl Stage {
     pub fn new(
         volume: &Volume,
         info: &VolumeInfo,
-        asked: &Asked,
+        request: &RenderRequest,
         orientation: Orientation,
     ) -> Result<Stage, Fail> {
-        let blame = |e| asked.blame(&e);
-        let transfer = asked.transfer.function(info).map_err(blame)?;
-        let tween = Tween::of(&asked.path, &info.summary).map_err(blame)?;
-        let compositing = asked.quality.compositing;
-        let wanted = Wanted::of_path(&asked.path, &transfer, tween.as_ref(), info, compositing)
+        let blame = |e| request.blame(&e);
+        let transfer = request.transfer.function(info).map_err(blame)?;
+        let tween = Tween::of(&request.path, &info.summary).map_err(blame)?;
+        let compositing = request.quality.compositing;
+        let wanted = Wanted::of_path(&request.path, &transfer, tween.as_ref(), info, compositing)
             .map_err(blame)?
-            .keeping(asked.work.keep);
+            .keeping(request.work.keep);
         let Drawn { spec: base, bricks } =
-            Drawn::holding(volume, info, &transfer, asked.quality, &wanted)?;
+            Drawn::holding(volume, info, &transfer, request.quality, &wanted)?;
         let shared = Arc::new(Scene::new(&base));
-        Ok(Stage { asked: asked.clone(), orientation, base, tween, shared, bricks })
+        Ok(Stage { request: request.clone(), orientation, base, tween, shared, bricks })
     }
 
     /// What frame `i` of those that are wanted is drawn with; sums decided.
     pub fn spec(&self, i: usize) -> SceneSpec {
         let Some(tween) = &self.tween else { return self.base.clone() };
-        let at = (self.asked.path.first_frame() + i) as f64;
-        tween.scene(&self.base, self.asked.quality.sums, at)
+        let at = (self.request.path.first_frame() + i) as f64;
+        tween.scene(&self.base, self.request.quality.sums, at)
     }
 
     /// The same, made ready.
@@ -113,15 +113,15 @@ impl Stage {
 
     /// The view of frame `i` at a quality.
     pub fn view(&self, i: usize, quality: &Quality) -> Result<View, Fail> {
-        self.view_of(i, quality, self.asked.path.size)
+        self.view_of(i, quality, self.request.path.size)
     }
 
     /// The same in a picture of another size.
     pub fn view_of(&self, i: usize, quality: &Quality, size: [u32; 2]) -> Result<View, Fail> {
         let lattice = &self.base.volume.lattice;
-        let camera = self.asked.path.camera(i, lattice, self.orientation);
+        let camera = self.request.path.camera(i, lattice, self.orientation);
         let view = camera.and_then(|c| View::new(lattice, &c, size, quality));
-        view.map_err(|e| self.asked.blame(&e))
+        view.map_err(|e| self.request.blame(&e))
     }
 
     /// Whether frames have transfer functions of their own.
@@ -155,8 +155,8 @@ mod tests {
         let info = volume.info(volume.digest());
         let o = Orientation::new(None, None).unwrap();
         let picture = |path: &str, tf: &str, i: usize| {
-            let asked = Asked::plain(ViewPath::from_json(path).unwrap(), tf).unwrap();
-            let stage = Stage::new(&volume, &info, &asked, o).unwrap();
+            let request = RenderRequest::plain(ViewPath::from_json(path).unwrap(), tf).unwrap();
+            let stage = Stage::new(&volume, &info, &request, o).unwrap();
             direct::picture(&stage.frame(i).unwrap(), &stage.bricks, Cut::on(2)).sha256()
         };
         let path = |range: &str| {

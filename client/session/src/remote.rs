@@ -3,7 +3,7 @@
 use crate::fail::Fail;
 use crate::output::Frame;
 use crate::progress::Step;
-use crate::request::Asked;
+use crate::request::RenderRequest;
 use crate::source::{Cancel, Source, Update};
 use slabcast_client::{Client, ClientError, JobState, PATIENCE, VolumeDescription, local_field};
 use slabcast_common::message::PathRequest;
@@ -49,10 +49,14 @@ pub async fn describe(client: &Client) -> Result<VolumeDescription, Fail> {
 }
 
 /// Submits a path and follows it.
-pub async fn submit(client: Client, asked: &Asked, request: PathRequest) -> Result<Source, Fail> {
-    let job = client.submit(&request).await.map_err(|e| match &e {
+pub async fn submit(
+    client: Client,
+    request: &RenderRequest,
+    message: PathRequest,
+) -> Result<Source, Fail> {
+    let job = client.submit(&message).await.map_err(|e| match &e {
         ClientError::InvalidField { field, problem } => {
-            asked.blame(&Refused::new(local_field(field), problem))
+            request.blame(&Refused::new(local_field(field), problem))
         }
         _ => fail(&e),
     })?;
@@ -60,7 +64,7 @@ pub async fn submit(client: Client, asked: &Asked, request: PathRequest) -> Resu
     let (to, updates) = mpsc::channel(1);
     let cancel = Cancel::new(cancel(client.clone(), job_now));
     tokio::spawn(async move {
-        if let Err(e) = pump(&client, request, name, &to).await {
+        if let Err(e) = pump(&client, message, name, &to).await {
             let _ = to.send(Err(e)).await;
         }
     });
@@ -70,7 +74,7 @@ pub async fn submit(client: Client, asked: &Asked, request: PathRequest) -> Resu
 /// Passes a job's updates on until its last frame.
 async fn pump(
     client: &Client,
-    mut request: PathRequest,
+    mut message: PathRequest,
     job: watch::Sender<String>,
     to: &mpsc::Sender<Result<Update, Fail>>,
 ) -> Result<(), Fail> {
@@ -82,8 +86,8 @@ async fn pump(
             Err(ClientError::NotFound { .. }) if anew < ANEW => {
                 anew += 1;
                 tracing::warn!(job = name, "the master has forgotten the job: submitted again");
-                request.client_key = crate::request::client_key();
-                let name = client.submit(&request).await.map_err(|e| fail(&e))?;
+                message.client_key = crate::request::client_key();
+                let name = client.submit(&message).await.map_err(|e| fail(&e))?;
                 job.send_replace(name);
             }
             Err(e) => return Err(fail(&e)),

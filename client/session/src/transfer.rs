@@ -18,19 +18,22 @@ const MAX_JSON_BYTES: u64 = 64 << 20;
 
 /// What flags change of a transfer function.
 #[derive(clap::Args, Clone, Debug)]
-pub struct LookFlags {
-    /// Colours of a map (viridis, inferno, magma, plasma, cividis, turbo, cool-warm, greys) or of a
-    /// ParaView file, spread over what the transfer function shows
+pub struct TransferFlags {
+    /// Colours of a colour map or ParaView file instead
+    ///
+    /// viridis, inferno, magma, plasma, cividis, turbo, cool-warm, greys, or a ParaView file; spread
+    /// over the values that the transfer function shows.
     #[arg(long, value_name = "MAP|FILE")]
     colors: Option<String>,
     /// Where light comes from: head (the eye), or a direction in world axes
-    #[arg(long, value_name = "head|X,Y,Z", value_parser = parse::light, allow_hyphen_values = true)]
+    #[arg(long, value_name = "head|X,Y,Z", value_parser = parse::light, allow_hyphen_values = true,
+          hide_short_help = true)]
     light: Option<Light>,
     /// Light on voxels: on or off
-    #[arg(long, value_name = "on|off", value_parser = parse::on_off)]
+    #[arg(long, value_name = "on|off", value_parser = parse::on_off, hide_short_help = true)]
     shading: Option<bool>,
     /// Look of NaN: a colour, and after a colon its opacity [default: invisible]
-    #[arg(long, value_name = "COLOUR[:A]", value_parser = parse::nan)]
+    #[arg(long, value_name = "COLOUR[:A]", value_parser = parse::nan, hide_short_help = true)]
     nan: Option<NanLook>,
 }
 
@@ -53,9 +56,9 @@ pub struct Transfer {
 impl Transfer {
     /// A preset or map by name, or a file if it exists or its name ends in `.json`. A preset's name
     /// means the preset even beside a file of that name; `./bone` means the file.
-    pub fn parse(text: &str, flags: &LookFlags) -> Result<Self, Fail> {
+    pub fn parse(text: &str, flags: &TransferFlags) -> Result<Self, Fail> {
         let colours = flags.colors.as_deref().map(colours).transpose()?;
-        let LookFlags { light, shading, nan, .. } = *flags;
+        let TransferFlags { light, shading, nan, .. } = *flags;
         let mut title = None;
         let (base, file) = if is_name(text) {
             (TransferChoice::Name(text.into()), None)
@@ -84,7 +87,7 @@ impl Transfer {
     /// # Errors
     /// No preset or colour map has that name.
     pub fn plain(name: &str) -> Result<Self, Fail> {
-        let flags = LookFlags { colors: None, light: None, shading: None, nan: None };
+        let flags = TransferFlags { colors: None, light: None, shading: None, nan: None };
         Transfer::parse(name, &flags)
     }
 

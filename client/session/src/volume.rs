@@ -16,29 +16,37 @@ pub const VOLUME: &str = "Volume file, folder with a stack or series, or formula
 #[derive(clap::Args, Clone, Debug, Default, PartialEq)]
 pub struct InputArgs {
     /// Samples of raw numbers along x, y, z, such as 256x256x128 [default: as in the file's name]
-    #[arg(long, value_name = "AxBxC", value_parser = parse::dims, help_heading = HEADING)]
+    #[arg(long, value_name = "AxBxC", value_parser = parse::dims, help_heading = HEADING,
+          hide_short_help = true)]
     dims: Option<[u64; 3]>,
     /// Type of raw numbers: uint8, int16, float32 and so on [default: as in the file's name]
     #[arg(long = "type", value_name = "TYPE", value_parser = parse::number_type,
-          help_heading = HEADING)]
+          help_heading = HEADING,
+          hide_short_help = true)]
     kind: Option<String>,
     /// Byte order of raw numbers: little or big [default: little]
-    #[arg(long, value_name = "ORDER", value_parser = parse::byte_order, help_heading = HEADING)]
+    #[arg(long, value_name = "ORDER", value_parser = parse::byte_order, help_heading = HEADING,
+          hide_short_help = true)]
     byte_order: Option<bool>,
     /// Distances of samples of raw numbers or TIFF pictures, such as 0.5x0.5x1.25 [default: 1x1x1]
-    #[arg(long, value_name = "AxBxC", value_parser = parse::spacing, help_heading = HEADING)]
+    #[arg(long, value_name = "AxBxC", value_parser = parse::spacing, help_heading = HEADING,
+          hide_short_help = true)]
     spacing: Option<[f64; 3]>,
     /// Bytes before the first of raw numbers [default: 0]
-    #[arg(long, value_name = "BYTES", allow_negative_numbers = true, help_heading = HEADING)]
+    #[arg(long, value_name = "BYTES", allow_negative_numbers = true, help_heading = HEADING,
+          hide_short_help = true)]
     skip: Option<u64>,
     /// Which DICOM series of a folder: its number, description or UID [default: the only one]
-    #[arg(long, value_name = "NAME", help_heading = HEADING)]
+    #[arg(long, value_name = "NAME", help_heading = HEADING,
+          hide_short_help = true)]
     series: Option<String>,
     /// Which level of an OME-Zarr pyramid, 0 the finest [default: the finest that fits]
-    #[arg(long, value_name = "N", allow_negative_numbers = true, help_heading = HEADING)]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, help_heading = HEADING,
+          hide_short_help = true)]
     level: Option<u32>,
     /// Most bytes of samples that a Zarr level may have [default: a quarter of the free memory]
-    #[arg(long, value_name = "BYTES", value_parser = parse::memory, help_heading = HEADING)]
+    #[arg(long, value_name = "BYTES", value_parser = parse::memory, help_heading = HEADING,
+          hide_short_help = true)]
     max_bytes: Option<u64>,
 }
 

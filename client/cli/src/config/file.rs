@@ -1,6 +1,6 @@
 //! The file: found, read, and each of its names known.
 
-use super::{LAYERED, layered_args, nearest};
+use super::{LAYERED, layered_args, names, nearest};
 use clap::Command;
 use slabcast_session::fail::Fail;
 use slabcast_session::terminal::one_line;
@@ -27,10 +27,10 @@ pub(crate) fn own() -> Option<PathBuf> {
 impl File {
     /// The file that was asked for (`--config`, then SLABCAST_CONFIG), or the user's own if there
     /// is one. An empty name means none.
-    pub(crate) fn find(asked: Option<PathBuf>, root: &Command) -> Result<File, Fail> {
-        let asked = asked.or_else(|| std::env::var_os("SLABCAST_CONFIG").map(PathBuf::from));
+    pub(crate) fn find(request: Option<PathBuf>, root: &Command) -> Result<File, Fail> {
+        let request = request.or_else(|| std::env::var_os("SLABCAST_CONFIG").map(PathBuf::from));
         let none = File { path: PathBuf::new(), table: toml::Table::new() };
-        match asked.or_else(|| own().filter(|p| p.is_file())) {
+        match request.or_else(|| own().filter(|p| p.is_file())) {
             Some(path) if !path.as_os_str().is_empty() => File::read(&path, root),
             _ => Ok(none),
         }
@@ -69,8 +69,7 @@ impl File {
                     "{shown}: {section}: is a section; write [{section}] and its keys below it"
                 )));
             };
-            let keys: Vec<&str> =
-                layered_args(root, section).iter().filter_map(|a| a.get_long()).collect();
+            let keys: Vec<&str> = layered_args(root, section).into_iter().flat_map(names).collect();
             for (key, value) in values {
                 let name = format!("{shown}: [{section}] {key}");
                 if !keys.contains(&key.as_str()) {

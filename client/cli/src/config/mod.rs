@@ -2,8 +2,8 @@
 //! `worker`.
 //!
 //! A flag beats a variable of the environment, that beats the file, and that beats the default.
-//! Every flag has its variable (`--tiles-per-worker`: SLABCAST_TILES_PER_WORKER) and its key
-//! (`tiles-per-worker` under the command's name). The lower three are one thing to clap: what the
+//! Every flag has its variable (`--tiles-per-thread`: SLABCAST_TILES_PER_THREAD) and its key
+//! (`tiles-per-thread` under the command's name); aliases of a flag have theirs. The lower three are one thing to clap: what the
 //! environment and the file say becomes the default of an argument before the command line is
 //! parsed. So each value is checked by the parser of its flag, whoever gave it, and a command's
 //! code does not know that there are layers.
@@ -124,9 +124,9 @@ impl Given {
 }
 
 /// The file that commands would read, if it is understood; empty for none.
-pub(crate) fn path(asked: Option<&std::path::Path>, mut root: Command) -> Result<PathBuf, Fail> {
+pub(crate) fn path(request: Option<&std::path::Path>, mut root: Command) -> Result<PathBuf, Fail> {
     root.build();
-    File::find(asked.map(PathBuf::from), &root).map(|file| file.path)
+    File::find(request.map(PathBuf::from), &root).map(|file| file.path)
 }
 
 /// The variable of a flag.
@@ -153,6 +153,11 @@ fn layered_args<'a>(root: &'a Command, name: &str) -> Vec<&'a Arg> {
     all
 }
 
+/// Long names of a flag: its own, then its aliases.
+fn names(arg: &Arg) -> impl Iterator<Item = &str> {
+    arg.get_long().into_iter().chain(arg.get_all_aliases().unwrap_or_default())
+}
+
 /// Which command the line is, and what each of its arguments is given by which layer. `None`
 /// where the command has no layers.
 fn layers(command: &Command, line: &[OsString]) -> Result<Option<(String, Vec<Given>)>, Trouble> {
@@ -165,8 +170,8 @@ fn layers(command: &Command, line: &[OsString]) -> Result<Option<(String, Vec<Gi
     if !LAYERED.contains(&name) {
         return Ok(None);
     }
-    let asked = sub.get_one::<PathBuf>("config").cloned();
-    given(command, name, sub, asked)
+    let request = sub.get_one::<PathBuf>("config").cloned();
+    given(command, name, sub, request)
         .map(|given| Some((name.to_string(), given)))
         .map_err(Trouble::Layer)
 }
@@ -205,17 +210,19 @@ fn given(
     for layer in 0..2 {
         let mut here: Vec<(&Arg, String, Source)> = Vec::new();
         for &arg in &args {
-            let (id, key) = (arg.get_id().as_str(), arg.get_long().unwrap_or_default());
+            let id = arg.get_id().as_str();
             if taken.iter().any(|t| t == id || excludes(arg, t)) {
                 continue;
             }
-            let found = if layer == 0 {
-                let name = variable(key);
-                let text = std::env::var_os(&name).filter(|v| !v.is_empty());
-                text.map(|v| (v.to_string_lossy().into_owned(), Source::Environment(name)))
-            } else {
-                file.value(name, key).map(|v| (v, Source::File(file.path.clone())))
-            };
+            let found = names(arg).find_map(|key| {
+                if layer == 0 {
+                    let name = variable(key);
+                    let text = std::env::var_os(&name).filter(|v| !v.is_empty());
+                    text.map(|v| (v.to_string_lossy().into_owned(), Source::Environment(name)))
+                } else {
+                    file.value(name, key).map(|v| (v, Source::File(file.path.clone())))
+                }
+            });
             if let Some((text, source)) = found {
                 here.push((arg, text, source));
             }
@@ -343,7 +350,7 @@ fn nearest<'a>(word: &str, names: impl Iterator<Item = &'a str>) -> Option<&'a s
 fn misspelt(root: &Command) {
     let mut known: Vec<String> = OTHERS.map(String::from).to_vec();
     for name in LAYERED {
-        known.extend(layered_args(root, name).iter().filter_map(|a| a.get_long()).map(variable));
+        known.extend(layered_args(root, name).into_iter().flat_map(names).map(variable));
     }
     for (name, _) in std::env::vars_os() {
         let Some(name) = name.to_str().filter(|n| n.starts_with("SLABCAST_")) else { continue };

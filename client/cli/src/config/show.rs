@@ -1,12 +1,12 @@
 //! `slabcast config show`: every value and where it comes from.
 
 use super::{Given, LAYERED, Source, Trouble, file, layers, misfit, with_defaults};
-use clap::{Command, CommandFactory};
+use clap::Command;
 use slabcast_session::fail::{Fail, say};
 use std::ffi::OsString;
 use std::fmt::Write;
 
-/// Shows the values that render, master and worker are given, and by whom.
+/// Shows the values of render, master and worker.
 ///
 /// A flag beats a variable of the environment, that beats the file, and that beats the default.
 /// The variable of a flag is its name in capitals: SLABCAST_SIZE for --size (SLABCAST_LOG for
@@ -54,9 +54,10 @@ Examples:
 }
 
 /// Runs the command.
-pub(crate) fn run<C: CommandFactory>(
+pub(crate) fn run(
     args: &ConfigArgs,
     config: Option<&std::path::Path>,
+    root: &Command,
     understand: impl Fn(&clap::Error) -> Fail,
 ) -> Result<(), Fail> {
     let What::Show { json, line } = &args.what;
@@ -69,7 +70,7 @@ pub(crate) fn run<C: CommandFactory>(
             for name in LAYERED {
                 all.push((
                     name.to_string(),
-                    resolve(C::command(), name, &[], config, &understand)?,
+                    resolve(root.clone(), name, &[], config, &understand)?,
                 ));
             }
         }
@@ -81,7 +82,7 @@ pub(crate) fn run<C: CommandFactory>(
                     LAYERED.join(", ")
                 )));
             }
-            let given = resolve(C::command(), &name, flags, config, &understand)?;
+            let given = resolve(root.clone(), &name, flags, config, &understand)?;
             all.push((name, given));
         }
     }

@@ -67,7 +67,7 @@ const BLANK: [u8; 3] = [0; 3];
 const LEAST: usize = 330;
 const MARGIN: usize = 6;
 const BAR: usize = 10;
-/// Ends of the error's scale in 1/255, as in `slabcast error --map`.
+/// Ends of the error's scale in 1/255, as in `slabcast lab error --map`.
 const ERRORS: [f64; 2] = [0.01, 10.0];
 
 /// The picture about frame `i` of a path.
@@ -299,15 +299,15 @@ mod tests {
     use super::*;
     use slabcast_common::path::{Orientation, ViewPath};
     use slabcast_render::judge::reference::{Reference, stratified};
-    use slabcast_session::request::Asked;
+    use slabcast_session::request::RenderRequest;
 
     fn stage(tf: &str) -> Stage {
         let volume = slabcast_session::volume::open("formula:spheres:48".as_ref()).unwrap();
         let info = volume.info(volume.digest());
         let path = r#"{"version":1,"size":[64,64],"turntable":{"frames":1}}"#;
-        let asked = Asked::plain(ViewPath::from_json(path).unwrap(), tf).unwrap();
+        let request = RenderRequest::plain(ViewPath::from_json(path).unwrap(), tf).unwrap();
         let o = Orientation::new(None, None).unwrap();
-        Stage::new(&volume, &info, &asked, o).unwrap()
+        Stage::new(&volume, &info, &request, o).unwrap()
     }
 
     #[test]

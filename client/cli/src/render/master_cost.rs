@@ -26,8 +26,8 @@ const WARM: u32 = 12;
 fn run(tf: &str, edge: u32, frames: u32, folder: &Path) -> Run {
     let turn = Turntable { frames, step: 1.0, ..Turntable::default() };
     let path = ViewPath::turn([edge, edge], turn);
-    let mut asked = Asked::plain(path, tf).expect("a request");
-    asked.hashed = false;
+    let mut request = RenderRequest::plain(path, tf).expect("a request");
+    request.hashed = false;
     let args = OutputArgs {
         output: folder.to_path_buf(),
         format: None,
@@ -35,8 +35,8 @@ fn run(tf: &str, edge: u32, frames: u32, folder: &Path) -> Run {
         contact_sheet: None,
         force: true,
     };
-    let looked = Output::look(&args, "frame", asked.frames(), asked.background, &[]);
-    Run::bare(asked, looked.expect("a folder").0, true)
+    let looked = Output::look(&args, "frame", request.frames(), request.background, &[]);
+    Run::bare(request, looked.expect("a folder").0, true)
 }
 
 /// What a master tells of a frame.
@@ -44,8 +44,8 @@ async fn told(run: &mut Run, volume: Arc<Volume>, orientation: Orientation) -> B
     let crew = Crew::new(1, None).expect("a crew");
     let cluster = Cluster::start(volume, orientation, crew, None).expect("a cluster");
     let handle = cluster.handle();
-    let request = run.request(&handle.volume().info);
-    let mut source = embedded::submit(&handle, &run.asked, request).await.expect("a job");
+    let message = run.request(&handle.volume().info);
+    let mut source = embedded::submit(&handle, &run.request, message).await.expect("a job");
     loop {
         match source.updates.recv().await.expect("a frame").expect("no trouble") {
             Update::Frame { stats, .. } => {
@@ -69,10 +69,10 @@ async fn plain(
 ) -> Result<(), Fail> {
     let info = volume.info(volume.digest());
     let recipe = run.ready(&info, orientation, volume.anatomical)?;
-    let stage = Stage::new(&volume, &info, &run.asked, orientation)?;
+    let stage = Stage::new(&volume, &info, &run.request, orientation)?;
     let (to, updates) = mpsc::channel(1);
     let (drawn, pictures) = sync_channel::<(Picture, Digest32)>(1);
-    let (frames, background) = (run.asked.path.frames(), run.asked.background);
+    let (frames, background) = (run.request.path.frames(), run.request.background);
     let format = run.output.takes(1, background);
     let draw = std::thread::spawn(move || {
         for i in 0..frames {

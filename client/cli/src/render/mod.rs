@@ -23,7 +23,7 @@ use slabcast_session::output::{Format, Frame, Lines, Output, OutputArgs, Patienc
 use slabcast_session::path_scenes::Stage;
 use slabcast_session::progress::{self, Progress, Step};
 use slabcast_session::record::{self, Recording};
-use slabcast_session::request::{Asked, LookArgs, WorkArgs};
+use slabcast_session::request::{RenderRequest, SceneArgs, WorkArgs};
 use slabcast_session::source::{Cancel, Source, Update};
 use slabcast_session::{remote, runtime, signals, volume};
 use std::path::{Path, PathBuf};
@@ -35,6 +35,9 @@ use tokio::sync::mpsc;
 /// How long what is being written may take once the run has failed or was stopped: ten times what
 /// the largest picture takes on a slow disk.
 const LAST: Duration = Duration::from_secs(20);
+
+const SHORT_EXAMPLES: &str = "\
+Examples, and the flags of raw files, kernels, sums, slabs and tiles: slabcast help render";
 
 const EXAMPLES: &str = "\
 With VOLUME, a master and workers are started inside this process; with --master, a cluster
@@ -63,7 +66,7 @@ A path file looks like this:
 
 /// Renders a view path of a volume to pictures.
 #[derive(clap::Args, Clone, Debug)]
-#[command(after_help = EXAMPLES)]
+#[command(after_help = SHORT_EXAMPLES, after_long_help = EXAMPLES)]
 pub(crate) struct RenderArgs {
     #[arg(help = volume::VOLUME)]
     volume: Option<PathBuf>,
@@ -73,21 +76,23 @@ pub(crate) struct RenderArgs {
     #[arg(long, value_name = "HOST:PORT", value_parser = slabcast_session::parse::master)]
     master: Option<String>,
     #[command(flatten)]
-    look: LookArgs,
+    scene: SceneArgs,
     #[command(flatten)]
     work: WorkArgs,
     /// Workers inside this process [default: 1]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=64),
           help_heading = "Work (never changes a pixel)")]
     workers: Option<u32>,
-    /// Render threads of each worker [default: all cores, shared by the workers]
+    /// Render threads of each worker [default: all cores]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024),
           help_heading = "Work (never changes a pixel)")]
     threads: Option<u32>,
     #[command(flatten)]
     output: OutputArgs,
-    /// Instead of the volume, how its pictures come about: depth (where pixels were shut), owner
-    /// (who drew which tile), work, sheets, error (an estimate); each with a legend
+    /// Draw how pictures come about: depth, owner, work, ...
+    ///
+    /// depth: where pixels were shut; owner: which worker drew which tile; work; sheets; error: an
+    /// estimate. Each has a legend.
     #[arg(
         long,
         value_name = "WHAT",
@@ -96,19 +101,22 @@ pub(crate) struct RenderArgs {
         help_heading = "Output"
     )]
     show: Option<Show>,
-    /// Statistics, one line of JSON a frame; - writes them to stdout. For their estimates of errors
-    /// one pixel in 128 is drawn again in other ways: up to a quarter more time
+    /// Statistics, one line of JSON a frame; - is stdout
+    ///
+    /// For their estimates of errors one pixel in 128 is drawn again in other ways: up to a quarter more
+    /// time.
     #[arg(long, value_name = "FILE|-", help_heading = "Output")]
     stats: Option<PathBuf>,
-    /// Statistics without the hash of the linear picture: tiles then cross a network as they do without
-    /// --stats, finished, in a fifth of the bytes
-    #[arg(long, requires = "stats", help_heading = "Output")]
+    /// Statistics without the hash of the linear picture
+    ///
+    /// Tiles then cross a network as they do without --stats, finished, in a fifth of the bytes.
+    #[arg(long, requires = "stats", help_heading = "Output", hide_short_help = true)]
     no_hash: bool,
     /// Time line of all workers for Perfetto or chrome://tracing
-    #[arg(long, value_name = "FILE.json", help_heading = "Output")]
+    #[arg(long, value_name = "FILE.json", help_heading = "Output", hide_short_help = true)]
     trace: Option<PathBuf>,
-    /// What the scheduler of this process is told and decides, for `slabcast replay`
-    #[arg(long, value_name = "FILE", help_heading = "Output")]
+    /// Events and decisions of this process's scheduler, for `slabcast lab replay`
+    #[arg(long, value_name = "FILE", help_heading = "Output", hide_short_help = true)]
     record: Option<PathBuf>,
     /// No progress, only warnings and the result
     #[arg(short, long, help_heading = "Output")]
@@ -117,7 +125,7 @@ pub(crate) struct RenderArgs {
 
 /// What all of a run shares.
 struct Run {
-    asked: Asked,
+    request: RenderRequest,
     /// Whether somebody said what is up, or it does not matter.
     stands: bool,
     output: Output,
@@ -175,25 +183,25 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         }
     }
     let crew = Crew::new(args.workers.unwrap_or(1), args.threads)?;
-    let mut asked = args.look.asked_or_target(args.work.work()?)?;
-    asked.work.estimate = args.stats.is_some();
-    asked.hashed = args.stats.is_some() && !args.no_hash;
-    if !asked.target.is_empty() && args.show.is_some() {
+    let mut request = args.scene.request_with_target(args.work.work()?)?;
+    request.work.estimate = args.stats.is_some();
+    request.hashed = args.stats.is_some() && !args.no_hash;
+    if !request.target.is_empty() && args.show.is_some() {
         return Err(Fail::usage(format!(
             "{}, --show: shows how pictures of a given quality come about; leave one of the two out",
-            asked.target.flags()
+            request.target.flags()
         )));
     }
-    let frames = asked.frames();
+    let frames = request.frames();
     let stem = args.show.map_or("frame", Show::stem);
     let inputs: Vec<&Path> =
-        [&args.volume, &args.look.view.path].into_iter().flatten().map(PathBuf::as_path).collect();
-    let (output, stays) = Output::look(&args.output, stem, frames, asked.background, &inputs)?;
+        [&args.volume, &args.scene.view.path].into_iter().flatten().map(PathBuf::as_path).collect();
+    let (output, stays) = Output::look(&args.output, stem, frames, request.background, &inputs)?;
     if output.on_stdout() && args.stats.as_deref() == Some(Path::new("-")) {
         return Err(Fail::usage("--stats: stdout has the frames; give a file"));
     }
     if let Some(show) = args.show {
-        showable(show, args, output.format, &asked)?;
+        showable(show, args, output.format, &request)?;
     }
     if let Some(path) = &args.record {
         record::may(path, &inputs)?;
@@ -206,10 +214,10 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         progress: Progress::new(args.quiet),
         began: Instant::now(),
         stands: args.quiet
-            || args.look.view.path.is_some()
-            || args.look.view.axes.up.is_some()
-            || args.look.view.axes.front.is_some(),
-        asked,
+            || args.scene.view.path.is_some()
+            || args.scene.view.axes.up.is_some()
+            || args.scene.view.axes.front.is_some(),
+        request,
         output,
         show: args.show,
         patience,
@@ -223,8 +231,8 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
             let mut run = run;
             run.progress.stage(&format!("reading {}", file.display()));
             let volume = Arc::new(args.input.open(file)?);
-            let orientation = args.look.view.axes.of(&volume)?;
-            let tried = if run.asked.target.is_empty() {
+            let orientation = args.scene.view.axes.for_volume(&volume)?;
+            let tried = if run.request.target.is_empty() {
                 None
             } else {
                 aim_here(&mut run, &volume, orientation, crew, &runtime, args.quiet)?
@@ -241,7 +249,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
             run.progress.stage(&format!("dialling {master}"));
             let client = runtime.block_on(remote::connect(&master))?;
             let served = runtime.block_on(remote::describe(&client))?;
-            if !run.asked.target.is_empty() {
+            if !run.request.target.is_empty() {
                 aim_there(&mut run, &client, &served, &master, &runtime, args.quiet)?;
             }
             runtime.block_on(cluster(run, client, served, &master))
@@ -263,28 +271,28 @@ fn aim_here(
     quiet: bool,
 ) -> Result<Option<Cluster>, Fail> {
     let info = volume.info(volume.digest());
-    run.asked.fit(&info, orientation, volume.anatomical)?;
-    let (target, threads) = (run.asked.target, (crew.workers * crew.threads) as usize);
-    let lab = lab(volume, &info, &run.asked, orientation, threads)?;
+    run.request.fit(&info, orientation, volume.anatomical)?;
+    let (target, threads) = (run.request.target, (crew.workers * crew.threads) as usize);
+    let lab = lab(volume, &info, &run.request, orientation, threads)?;
     if target.budget.is_none() {
         let clock = Clock::Plain(Cut { tile: 64, ..Cut::on(threads) });
-        choose(&mut Here::new(lab, clock), &target, quiet)?.settle(&mut run.asked);
+        choose(&mut Here::new(lab, clock), &target, quiet)?.settle(&mut run.request);
         return Ok(None);
     }
     let cluster =
         runtime.block_on(async { Cluster::start(volume.clone(), orientation, crew, None) })?;
-    let (handle, asked) = (cluster.handle(), run.asked.clone());
+    let (handle, request) = (cluster.handle(), run.request.clone());
     let wire = Wire::Embedded(&handle);
-    let through = Through { runtime, wire, info, asked, crew: crew.to_string() };
+    let through = Through { runtime, wire, info, request, crew: crew.to_string() };
     match choose(&mut Here::new(lab, Clock::Cluster(Box::new(through))), &target, quiet) {
         // A record begins with the first worker.
         Ok(chosen) if run.record.is_none() => {
-            chosen.settle(&mut run.asked);
+            chosen.settle(&mut run.request);
             Ok(Some(cluster))
         }
         chosen => {
             runtime.block_on(cluster.end());
-            chosen?.settle(&mut run.asked);
+            chosen?.settle(&mut run.request);
             Ok(None)
         }
     }
@@ -300,17 +308,22 @@ fn aim_there(
     quiet: bool,
 ) -> Result<(), Fail> {
     let info = served.info.clone();
-    run.asked.fit(&info, served.orientation, served.anatomical)?;
-    let (target, asked) = (run.asked.target, run.asked.clone());
+    run.request.fit(&info, served.orientation, served.anatomical)?;
+    let (target, request) = (run.request.target, run.request.clone());
     let crew = format!("the cluster of {master}");
-    let through = Through { runtime, wire: Wire::Remote(client), info, asked, crew };
-    choose(&mut There::new(through), &target, quiet)?.settle(&mut run.asked);
+    let through = Through { runtime, wire: Wire::Remote(client), info, request, crew };
+    choose(&mut There::new(through), &target, quiet)?.settle(&mut run.request);
     Ok(())
 }
 
 /// Draws what a picture says of itself, by this process alone. Says nothing at the end.
-pub(crate) fn again(asked: Asked, output: Output, volume: Volume, quiet: bool) -> Result<(), Fail> {
-    let run = Run::bare(asked, output, quiet);
+pub(crate) fn again(
+    request: RenderRequest,
+    output: Output,
+    volume: Volume,
+    quiet: bool,
+) -> Result<(), Fail> {
+    let run = Run::bare(request, output, quiet);
     let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
     let runtime = runtime::start_embedded()?;
     let result =
@@ -342,8 +355,8 @@ async fn embedded(
     let handle = cluster.handle();
     let info = handle.volume().info.clone();
     let recipe = run.ready(&info, orientation, anatomical)?;
-    let request = run.request(&info);
-    let source = embedded::submit(&handle, &run.asked, request).await?;
+    let message = run.request(&info);
+    let source = embedded::submit(&handle, &run.request, message).await?;
     let what = format!("{name} by {crew}");
     let result = tokio::select! {
         result = run.go(source, &what, &info, &recipe) => result,
@@ -355,9 +368,14 @@ async fn embedded(
 }
 
 /// What can be shown how.
-fn showable(show: Show, args: &RenderArgs, format: Format, asked: &Asked) -> Result<(), Fail> {
+fn showable(
+    show: Show,
+    args: &RenderArgs,
+    format: Format,
+    request: &RenderRequest,
+) -> Result<(), Fail> {
     if show == Show::Error {
-        debug_views::can_estimate(&asked.quality)?;
+        debug_views::can_estimate(&request.quality)?;
     }
     if matches!(format, Format::Png16 | Format::Exr) {
         return Err(Fail::usage("--format: what --show draws has 8 bits; give png, apng or y4m"));
@@ -393,11 +411,11 @@ async fn drawn(
     let info = volume.info(volume.digest());
     let recipe = run.ready(&info, orientation, volume.anatomical)?;
     let threads = (crew.workers * crew.threads) as usize;
-    let stage = Stage::new(&volume, &info, &run.asked, orientation)?;
+    let stage = Stage::new(&volume, &info, &run.request, orientation)?;
     let what = format!("{}, showing {}", volume.name, show.stem());
     drop(volume);
     let (to, updates) = mpsc::channel(1);
-    let frames = run.asked.path.frames();
+    let frames = run.request.path.frames();
     tokio::task::spawn_blocking(move || {
         for i in 0..frames {
             let update = debug_views::draw(&stage, show, i, threads).map(|frame| {
@@ -422,9 +440,9 @@ async fn cluster(
     master: &str,
 ) -> Result<(), Fail> {
     let recipe = run.ready(&served.info, served.orientation, served.anatomical)?;
-    let request = run.request(&served.info);
+    let message = run.request(&served.info);
     let source = tokio::select! {
-        source = remote::submit(client, &run.asked, request) => source?,
+        source = remote::submit(client, &run.request, message) => source?,
         code = signals::stopped() => return Err(Fail::silent(code)),
     };
     let what = format!("{} on the cluster of {master}", served.name);
@@ -433,9 +451,9 @@ async fn cluster(
 
 impl Run {
     /// Pictures alone, of which nothing is said at the end.
-    fn bare(asked: Asked, output: Output, quiet: bool) -> Run {
+    fn bare(request: RenderRequest, output: Output, quiet: bool) -> Run {
         Run {
-            asked,
+            request,
             stands: true,
             output,
             show: None,
@@ -451,8 +469,8 @@ impl Run {
     }
 
     fn request(&mut self, info: &VolumeInfo) -> PathRequest {
-        let format = self.output.takes(self.asked.magnify, self.asked.background);
-        self.asked.request(info, format, self.trace.wanted())
+        let format = self.output.takes(self.request.magnify, self.request.background);
+        self.request.to_message(info, format, self.trace.wanted())
     }
 
     /// All that can be refused is; the folder is there.
@@ -464,9 +482,9 @@ impl Run {
     ) -> Result<Recipe, Fail> {
         // From here on there may be files to clean up.
         signals::listen();
-        self.asked.fit(info, orientation, anatomical)?;
+        self.request.fit(info, orientation, anatomical)?;
         let as_what = (self.output.format, self.output.fps());
-        let recipe = Recipe::new(&self.asked, info, orientation, as_what)?;
+        let recipe = Recipe::new(&self.request, info, orientation, as_what)?;
         self.output.make()?;
         self.notes.iter().for_each(|n| progress::note(n));
         Ok(recipe)
@@ -481,10 +499,19 @@ impl Run {
         recipe: &Recipe,
     ) -> Result<(), Fail> {
         let Run {
-            asked, output, show, patience, mut stats, trace, mut progress, began, tell, ..
+            request,
+            output,
+            show,
+            patience,
+            mut stats,
+            trace,
+            mut progress,
+            began,
+            tell,
+            ..
         } = self;
-        let total = asked.path.frames() as u64;
-        let [w, h] = asked.size();
+        let total = request.path.frames() as u64;
+        let [w, h] = request.size();
         let s = if total == 1 { "" } else { "s" };
         progress.frames(total, &format!("rendering {total} frame{s} of {w}x{h} of {what}"));
         let output = Arc::new(output);
@@ -509,7 +536,7 @@ impl Run {
                             let begins = frame.number == 0;
                             step.frames = step.frames.max(frame.number + 1);
                             // People count frames of the whole path.
-                            let number = frame.number + asked.path.first_frame() as u64;
+                            let number = frame.number + request.path.first_frame() as u64;
                             let frame = Frame { number, ..frame };
                             last = Instant::now();
                             first.get_or_insert(last);
@@ -519,7 +546,7 @@ impl Run {
                                 writer.put(frame, None);
                                 continue;
                             };
-                            look.at(&frame, &facts, info, &asked);
+                            look.at(&frame, &facts, info, &request);
                             stats.put(&format!("{stats_json}\n"))?;
                             trace.put(&trace_json)?;
                             progress.step(step.clone());
@@ -646,7 +673,13 @@ struct Look {
 }
 
 impl Look {
-    fn at(&mut self, frame: &Frame, facts: &FrameStats, info: &VolumeInfo, asked: &Asked) {
+    fn at(
+        &mut self,
+        frame: &Frame,
+        facts: &FrameStats,
+        info: &VolumeInfo,
+        request: &RenderRequest,
+    ) {
         self.rehearsed |= facts.rehearsed;
         if !facts.poisoned.is_empty() {
             self.incomplete.push(frame.number);
@@ -656,10 +689,10 @@ impl Look {
         let all_same = frame.bytes.len() < pixel
             || frame.bytes[pixel..] == frame.bytes[..frame.bytes.len() - pixel];
         let (lo, hi) = info.summary.range();
-        let tf = asked.transfer.name();
+        let tf = request.transfer.name();
         let why = if facts.voxels.relevant == 0 && lo == hi {
             format!("every value of the volume is {lo}, and `--tf {tf}` leaves that invisible")
-        } else if facts.voxels.relevant == 0 && asked.path.crop.is_some() {
+        } else if facts.voxels.relevant == 0 && request.path.crop.is_some() {
             format!("no voxel in the cropping box is visible under `--tf {tf}`; widen --crop")
         } else if facts.voxels.relevant == 0 {
             format!(
@@ -670,7 +703,7 @@ impl Look {
             return;
         } else if facts.voxels.splatted == 0 {
             "the volume lies outside the view, or between its pixels; check eye, target and height, or ask for a larger --size".into()
-        } else if asked.background == slabcast_common::image::Background::Transparent
+        } else if request.background == slabcast_common::image::Background::Transparent
             || frame.bytes[..pixel.div_ceil(4) * 3].iter().all(|&b| b == 0)
         {
             format!("what is in view is too faint to see; raise the opacities of `--tf {tf}`")

@@ -1,10 +1,10 @@
-//! `slabcast check colour-rule` as a user runs it.
+//! `slabcast lab check colour-rule` as a user runs it.
 
 use std::process::{Command, Output};
 
 fn colour_rule(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_slabcast"))
-        .args(["check", "colour-rule", "formula:spheres:24", "--tf", "peer-opaque"])
+        .args(["lab", "check", "colour-rule", "formula:spheres:24", "--tf", "peer-opaque"])
         .args([
             "--size",
             "56x48",

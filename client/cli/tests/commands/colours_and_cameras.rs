@@ -117,7 +117,8 @@ fn what_hangs_on_gradients_is_exact_and_right() {
     let look = ["--tf", &glass, "--azimuth", "30", "--size", "64x48"];
     let cluster = [&look[..], &["--workers", "2", "--tile", "16", "--slabs", "5"]].concat();
     let drawn = draw(dir.path(), &cluster).remove(0);
-    let out = run(dir.path(), &[&["error", "formula:spheres:24", "--json"][..], &look].concat());
+    let out =
+        run(dir.path(), &[&["lab", "error", "formula:spheres:24", "--json"][..], &look].concat());
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
     let judged: serde_json::Value = serde_json::from_slice(&out.stdout).unwrap();
     assert_eq!(judged["pixels_sha256"], serde_json::json!(drawn.pixels_sha256));

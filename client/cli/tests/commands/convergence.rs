@@ -1,4 +1,4 @@
-//! `slabcast check convergence` as a user runs it.
+//! `slabcast lab check convergence` as a user runs it.
 
 use std::process::Command;
 
@@ -11,7 +11,7 @@ fn orders_are_printed_and_figures_drawn() {
     std::fs::write(&tf, look).expect("a file");
     let run = |more: &[&str]| {
         let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
-            .args(["check", "convergence", "formula:ramp:12", "--size", "48x48", "--tf"])
+            .args(["lab", "check", "convergence", "formula:ramp:12", "--size", "48x48", "--tf"])
             .arg(&tf)
             .args(["--azimuth", "25", "--elevation", "20", "--pixels", "128", "--thinnest", "4"])
             .args(more)

@@ -1,10 +1,10 @@
-//! `slabcast error` as a user runs it: figures that make sense of each other.
+//! `slabcast lab error` as a user runs it: figures that make sense of each other.
 
 use std::process::Command;
 
 fn error(arguments: &[&str]) -> serde_json::Value {
     let mut command = Command::new(env!("CARGO_BIN_EXE_slabcast"));
-    command.args(["error", "formula:spheres:32", "--json"]).args(arguments);
+    command.args(["lab", "error", "formula:spheres:32", "--json"]).args(arguments);
     for (flag, value) in [("--size", "96x80"), ("--pixels", "1500")] {
         if !arguments.contains(&flag) {
             command.args([flag, value]);
@@ -124,7 +124,7 @@ fn a_map_shows_where_the_error_is() {
 fn a_map_never_replaces_the_volume_and_needs_the_name_of_a_picture() {
     let refused = |arguments: &[&str]| {
         let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
-            .arg("error")
+            .args(["lab", "error"])
             .args(arguments)
             .output()
             .expect("slabcast runs");
@@ -149,7 +149,7 @@ fn ctrl_c_ends_it_at_once() {
     let dir = tempfile::tempdir().expect("a folder");
     let map = dir.path().join("map.png");
     let mut child = Command::new(env!("CARGO_BIN_EXE_slabcast"))
-        .args(["error", "formula:spheres:96", "--size", "1024x1024", "--pixels", "all"])
+        .args(["lab", "error", "formula:spheres:96", "--size", "1024x1024", "--pixels", "all"])
         .args(["--map", map.to_str().expect("text")])
         .stderr(std::process::Stdio::null())
         .spawn()

@@ -1,10 +1,10 @@
-//! `slabcast explain` as a user runs it.
+//! `slabcast lab explain` as a user runs it.
 
 use std::process::{Command, Output};
 
 fn run(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_slabcast"))
-        .arg("explain")
+        .args(["lab", "explain"])
         .args(arguments)
         .output()
         .expect("slabcast runs")

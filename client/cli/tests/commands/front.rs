@@ -1,4 +1,4 @@
-//! `slabcast report`, `--error` and `--budget` as a user runs them: figures that are what they say,
+//! `slabcast lab report`, `--error` and `--budget` as a user runs them: figures that are what they say,
 //! words that are kept.
 
 use crate::program::{Process, master, slabcast};
@@ -23,7 +23,7 @@ fn a_report_has_every_file_a_front_and_the_default() {
     let dir = tempfile::tempdir().unwrap();
     let only =
         ["--only", "thickness,eps,sums,shading,work", "--pixels", "900", "--seconds", "0.01"];
-    let out = run(dir.path(), &[&["report"], &SCENE, &only, &["-o", "r"]]);
+    let out = run(dir.path(), &[&["lab", "report"], &SCENE, &only, &["-o", "r"]]);
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
     let said = String::from_utf8_lossy(&out.stdout).into_owned();
     assert!(said.contains("all the same picture, to the bit"), "{said}");
@@ -66,7 +66,7 @@ fn a_report_has_every_file_a_front_and_the_default() {
         assert_eq!((info.info().width, info.info().height), (2160, 1400));
     }
     // What is there stays, unless --force.
-    let again = run(dir.path(), &[&["report"], &SCENE, &only, &["-o", "r"]]);
+    let again = run(dir.path(), &[&["lab", "report"], &SCENE, &only, &["-o", "r"]]);
     assert_eq!(again.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&again.stderr).contains("--force"));
 }
@@ -74,7 +74,7 @@ fn a_report_has_every_file_a_front_and_the_default() {
 /// Draws with flags and says what it came to: (RMSE, 99.9 %, quality, magnified, notes).
 fn bench(dir: &Path, flags: &[&str]) -> (f64, f64, Value, u64, String) {
     let how = ["--frames", "3", "--seed", "7", "--pixels", "9216", "--json"];
-    let out = run(dir, &[&["bench"], &SCENE, &how, flags]);
+    let out = run(dir, &[&["lab", "bench"], &SCENE, &how, flags]);
     let said = String::from_utf8_lossy(&out.stderr).into_owned();
     assert!(out.status.success(), "{said}");
     let b: Value = serde_json::from_slice(&out.stdout).unwrap();
@@ -212,7 +212,7 @@ fn statistics_tell_errors_by_source() {
             let stats: Value = serde_json::from_str(line).unwrap();
             let said = &stats["error"];
             let how = ["--azimuth", azimuth, "--model-pixels", "1024", "--json"];
-            let judged = run(dir, &[&["error"], &scene, &how]);
+            let judged = run(dir, &[&["lab", "error"], &scene, &how]);
             let judged: Value = serde_json::from_slice(&judged.stdout).unwrap();
             all += 1;
             for (near, (name, found)) in near.iter_mut().zip(sources) {

@@ -1,10 +1,10 @@
-//! `slabcast plan`: what is measured, what is predicted, and what is refused.
+//! `slabcast lab plan`: what is measured, what is predicted, and what is refused.
 
 use crate::program::{good, names, run, text};
 use serde_json::Value;
 
-const SMALL: [&str; 7] =
-    ["plan", "formula:spheres:32", "--size", "128x128", "--frames", "3", "--quiet"];
+const SMALL: [&str; 8] =
+    ["lab", "plan", "formula:spheres:32", "--size", "128x128", "--frames", "3", "--quiet"];
 
 fn json(text: &str) -> Value {
     serde_json::from_str(text).expect("JSON")
@@ -85,7 +85,8 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
 #[test]
 fn a_longer_plan_says_where_the_threads_time_goes() {
     let dir = tempfile::tempdir().unwrap();
-    let frames = ["plan", "formula:spheres:32", "--size", "128x128", "--frames", "16", "--quiet"];
+    let frames =
+        ["lab", "plan", "formula:spheres:32", "--size", "128x128", "--frames", "16", "--quiet"];
     let cluster = ["--workers", "2", "--schedule", "region", "--trace", "s.trace"];
     let said = good(dir.path(), &[&frames[..], &cluster].concat());
     assert!(said.contains("four in flight: % of the render threads' time"), "{said}");
@@ -110,18 +111,18 @@ fn flags_of_a_plan_are_refused_by_name_and_with_a_remedy() {
         ("--threads", "0", "1..=1024"),
         ("--repeats", "0", "1..=100"),
     ] {
-        let out = run(dir.path(), &["plan", "formula:spheres:16", flag, value]);
+        let out = run(dir.path(), &["lab", "plan", "formula:spheres:16", flag, value]);
         let said = text(&out.stderr);
         assert_eq!(out.status.code(), Some(2), "{flag} {value}: {said}");
         assert!(said.contains(flag) && said.contains(remedy), "{flag} {value}: {said}");
         assert_eq!(said.lines().count(), 1, "{said}");
     }
-    let many = ["plan", "formula:spheres:16", "--workers", "1000", "--threads", "1000"];
+    let many = ["lab", "plan", "formula:spheres:16", "--workers", "1000", "--threads", "1000"];
     let out = run(dir.path(), &many);
     assert_eq!(out.status.code(), Some(2));
     assert!(text(&out.stderr).contains("--workers, --threads"), "{}", text(&out.stderr));
     // Before anything is opened, let alone drawn for minutes.
-    let nowhere = ["plan", "missing.nrrd", "--trace", "nowhere/s.trace"];
+    let nowhere = ["lab", "plan", "missing.nrrd", "--trace", "nowhere/s.trace"];
     let out = run(dir.path(), &nowhere);
     assert_eq!(out.status.code(), Some(1));
     let said = text(&out.stderr);

@@ -1,4 +1,4 @@
-//! `--record` and `slabcast replay` on real runs.
+//! `--record` and `slabcast lab replay` on real runs.
 
 use crate::program::{end, good, names, run, signal, slabcast, text};
 use std::process::Stdio;
@@ -12,10 +12,10 @@ fn a_run_of_this_process_is_recorded_and_replays_identically() {
     let more = ["--workers", "3", "--tile", "32", "--record", "events.log", "--stats", "s.jsonl"];
     good(dir, &[&views[..], &more].concat());
     assert_eq!(names(dir), ["events.log", "s.jsonl", "slabcast-out"], "no .part is left");
-    let said = good(dir, &["replay", "events.log"]);
+    let said = good(dir, &["lab", "replay", "events.log"]);
     assert!(said.ends_with(" decisions, 3 frames: identical\n"), "{said}");
     let json: serde_json::Value =
-        serde_json::from_str(&good(dir, &["replay", "events.log", "--json"])).unwrap();
+        serde_json::from_str(&good(dir, &["lab", "replay", "events.log", "--json"])).unwrap();
     assert_eq!(json["identical"], true);
     assert!(json["events"].as_u64().unwrap() > 60, "{json}");
     // A frame says what it waited for.
@@ -30,18 +30,18 @@ fn a_run_of_this_process_is_recorded_and_replays_identically() {
     let line = record[..at].lines().count();
     let bad = format!("{}{}", &record[..at], record[at..].replacen(" e0 of", " e1 of", 1));
     std::fs::write(dir.join("bad.log"), bad).unwrap();
-    let out = run(dir, &["replay", "bad.log"]);
+    let out = run(dir, &["lab", "replay", "bad.log"]);
     let said = text(&out.stderr);
     assert_eq!(out.status.code(), Some(1), "{said}");
     assert!(said.contains(&format!("bad.log: line {line}: ")), "{line}: {said}");
     assert!(said.contains("recorded `") && said.contains(" e1 of"), "{said}");
     std::fs::write(dir.join("broken.log"), record[..record.len() / 2].replace("\"t\"", "\"u\""))
         .unwrap();
-    let out = run(dir, &["replay", "broken.log"]);
+    let out = run(dir, &["lab", "replay", "broken.log"]);
     assert_eq!(out.status.code(), Some(1));
     let said = text(&out.stderr);
     assert!(said.contains("broken.log: line ") && said.contains("no line of a record"), "{said}");
-    let out = run(dir, &["replay", "slabcast-out/frame_0000.png"]);
+    let out = run(dir, &["lab", "replay", "slabcast-out/frame_0000.png"]);
     assert!(text(&out.stderr).contains("line 1: is not a record's first line"));
 }
 
@@ -70,7 +70,7 @@ fn a_master_records_until_it_is_told_to_stop() {
     assert_eq!(end(&mut master.0, Duration::from_secs(12)), 0);
     workers[1].kill().unwrap();
     workers[1].wait().unwrap();
-    let said = good(dir, &["replay", "events.log"]);
+    let said = good(dir, &["lab", "replay", "events.log"]);
     assert!(said.ends_with(" decisions, 4 frames: identical\n"), "{said}");
     let record = std::fs::read_to_string(dir.join("events.log")).unwrap();
     assert!(record.contains("\"joined\"") && record.contains("\"lost\""));

@@ -16,7 +16,8 @@ fn a_cluster_of_two_is_rehearsed_beside_its_prediction() {
     let dir = tempfile::tempdir().unwrap();
     let more = ["--trace", "s.trace", "--workers", "2", "--rehearse", "2", "--json"];
     let plan: Value =
-        serde_json::from_str(&good(dir.path(), &[&["plan"][..], &SCENE, &more].concat())).unwrap();
+        serde_json::from_str(&good(dir.path(), &[&["lab", "plan"][..], &SCENE, &more].concat()))
+            .unwrap();
     for (i, schedule) in ["region", "slab"].into_iter().enumerate() {
         let row = &plan["rehearsed"][i];
         assert_eq!(row["schedule"], schedule, "{plan}");
@@ -30,7 +31,7 @@ fn a_cluster_of_two_is_rehearsed_beside_its_prediction() {
             assert!(n("master_cpu_ms") > 0.0 && n("workers_cpu_ms") > 0.0, "{row}");
         }
     }
-    let without = ["plan", "formula:spheres:16", "--rehearse", "2"];
+    let without = ["lab", "plan", "formula:spheres:16", "--rehearse", "2"];
     let out = run(dir.path(), &without);
     assert_eq!(out.status.code(), Some(2));
     assert!(text(&out.stderr).contains("--trace"), "{}", text(&out.stderr));
@@ -42,7 +43,8 @@ fn a_rehearsal_goes_over_the_address_that_is_named() {
     // All of 127.0.0.0/8 is this machine, on Linux.
     let at = if cfg!(target_os = "linux") { "127.0.0.2" } else { "127.0.0.1" };
     let more = ["--schedule", "region", "--trace", "s.trace", "--workers", "2", "--rehearse", "2"];
-    let plan = |over: &[&str]| run(dir.path(), &[&["plan"][..], &SCENE, &more, over].concat());
+    let plan =
+        |over: &[&str]| run(dir.path(), &[&["lab", "plan"][..], &SCENE, &more, over].concat());
     let out = plan(&["--rehearse-at", at, "--rehearse-by", "env PASSED=1"]);
     let said = text(&out.stdout);
     assert_eq!(out.status.code(), Some(0), "{}", text(&out.stderr));
@@ -73,7 +75,7 @@ fn what_is_rehearsed_is_never_taken_for_a_picture() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     let plan = ["--trace", "s.trace", "--workers", "1"];
-    good(dir, &[&["plan"][..], &SCENE, &plan].concat());
+    good(dir, &[&["lab", "plan"][..], &SCENE, &plan].concat());
     let worker = |address: &str, more: &[&str]| {
         let args = ["worker", "--master", address, "--threads", "1", "--log-level", "error"];
         slabcast(dir, &[&args[..], more].concat())

@@ -1,4 +1,4 @@
-//! `slabcast study`: what it writes, that its figures agree with each other, and what it refuses.
+//! `slabcast lab study`: what it writes, that its figures agree with each other, and what it refuses.
 
 use crate::program::{good, names, run, text};
 use serde_json::Value;
@@ -55,7 +55,7 @@ fn a_study_agrees_with_itself() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     let name = volume(dir);
-    let said = good(dir, &[&["study", name, "-o", "out/s"], &SMALL[..]].concat());
+    let said = good(dir, &[&["lab", "study", name, "-o", "out/s"], &SMALL[..]].concat());
     assert!(said.contains("Table 1") && said.contains("Speed-up over one node"), "{said}");
     let out = dir.join("out/s");
     let files = names(&out);
@@ -133,14 +133,14 @@ fn a_study_agrees_with_itself() {
         assert!(page.contains(&format!("<td>{origin}</td>")) || page.contains(origin), "{origin}");
     }
     // Of nothing there is none, and no folder of it.
-    let nothing = ["study", name, "-o", "none", "--quick", "--crop", "0%:1%,0%:1%,0%:1%"];
+    let nothing = ["lab", "study", name, "-o", "none", "--quick", "--crop", "0%:1%,0%:1%,0%:1%"];
     let out = run(dir, &[&nothing[..], &SMALL[..2]].concat());
     let said = text(&out.stderr);
     assert_eq!(out.status.code(), Some(1), "{said}");
     assert!(said.contains("no view shows anything") && said.contains("--tf"), "{said}");
     assert!(!dir.join("none").exists());
     // A study is not written over.
-    let again = run(dir, &[&["study", name, "-o", "out/s"], &SMALL[..]].concat());
+    let again = run(dir, &[&["lab", "study", name, "-o", "out/s"], &SMALL[..]].concat());
     let said = text(&again.stderr);
     assert_eq!(again.status.code(), Some(2), "{said}");
     assert!(said.contains("--force"), "{said}");

@@ -16,7 +16,7 @@ fn thin(volume: &str, look: &[&str]) {
     ];
     for view in views {
         let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
-            .args(["error", volume, "--height", "15", "--size", "24x24", "--azimuth", "20"])
+            .args(["lab", "error", volume, "--height", "15", "--size", "24x24", "--azimuth", "20"])
             .args(["--thickness", "0.0625", "--sums", "i32", "--eps", "0"])
             .args(["--pixels", "48", "--model-pixels", "1", "--json"])
             .args(view)

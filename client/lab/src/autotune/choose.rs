@@ -20,7 +20,7 @@ use slabcast_session::direct::Cut;
 use slabcast_session::fail::Fail;
 use slabcast_session::progress::{self, Progress};
 use slabcast_session::quality_target::QualityTarget;
-use slabcast_session::request::Asked;
+use slabcast_session::request::RenderRequest;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -59,7 +59,7 @@ pub struct Chosen {
 
 /// The rungs, each as fast as the ones before or nearer to the limit.
 ///
-/// From the fronts of `slabcast report` (docs/accuracy.md): 16-bit sums with eps falling as sheets
+/// From the fronts of `slabcast lab report` (docs/accuracy.md): 16-bit sums with eps falling as sheets
 /// become thin, then 32 bits where those round too much. 16 bits are tried only where they have room
 /// for a sheet.
 pub(super) fn ladder(base: &Setting, size: [u32; 2]) -> Vec<Setting> {
@@ -285,12 +285,12 @@ pub fn choose(place: &mut dyn Place, target: &QualityTarget, quiet: bool) -> Res
 
 impl Chosen {
     /// Puts it into what was asked for.
-    pub fn settle(&self, asked: &mut Asked) {
-        asked.target = QualityTarget::default();
-        asked.quality = self.setting.quality;
-        if let Some(size) = self.setting.drawn_size(asked.path.size) {
-            asked.path.size = size;
-            asked.magnify = self.setting.shrink;
+    pub fn settle(&self, request: &mut RenderRequest) {
+        request.target = QualityTarget::default();
+        request.quality = self.setting.quality;
+        if let Some(size) = self.setting.drawn_size(request.path.size) {
+            request.path.size = size;
+            request.magnify = self.setting.shrink;
         }
     }
 }
@@ -299,12 +299,12 @@ impl Chosen {
 pub fn lab(
     volume: &Arc<Volume>,
     info: &VolumeInfo,
-    asked: &Asked,
+    request: &RenderRequest,
     orientation: Orientation,
     threads: usize,
 ) -> Result<Lab, Fail> {
-    let mut around = asked.clone();
-    around.path = all_around(&asked.path);
+    let mut around = request.clone();
+    around.path = all_around(&request.path);
     Lab::new(volume.clone(), info.clone(), &around, orientation, threads)
 }
 
@@ -313,16 +313,16 @@ pub fn lab(
 pub fn settle(
     volume: &Arc<Volume>,
     info: &VolumeInfo,
-    asked: &mut Asked,
+    request: &mut RenderRequest,
     orientation: Orientation,
     threads: usize,
 ) -> Result<(), Fail> {
-    if asked.target.is_empty() {
+    if request.target.is_empty() {
         return Ok(());
     }
-    let lab = lab(volume, info, asked, orientation, threads)?;
+    let lab = lab(volume, info, request, orientation, threads)?;
     let clock = Clock::Plain(Cut { tile: 64, ..Cut::on(threads) });
-    choose(&mut Here::new(lab, clock), &asked.target.clone(), false)?.settle(asked);
+    choose(&mut Here::new(lab, clock), &request.target.clone(), false)?.settle(request);
     Ok(())
 }
 

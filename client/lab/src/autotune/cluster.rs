@@ -18,7 +18,7 @@ use slabcast_session::fail::Fail;
 use slabcast_session::magnify::magnified;
 use slabcast_session::output::{Frame, png};
 use slabcast_session::progress::{self, Progress};
-use slabcast_session::request::Asked;
+use slabcast_session::request::RenderRequest;
 use slabcast_session::source::{Source, Update};
 use slabcast_session::{embedded, machine, remote, signals};
 use std::time::Instant;
@@ -60,7 +60,7 @@ pub struct Through<'a> {
     /// The volume, with its digest.
     pub info: VolumeInfo,
     /// What was asked for; it fits the volume.
-    pub asked: Asked,
+    pub request: RenderRequest,
     /// What the cluster is, for messages.
     pub crew: String,
 }
@@ -75,16 +75,16 @@ impl Through<'_> {
     /// all; the first is left out, for which bricks are cut and sent.
     pub fn ms(&self, setting: &Setting) -> Result<f64, Fail> {
         let few = self.each(setting, FRAMES)?;
-        let budget = self.asked.target.budget.unwrap_or(f64::INFINITY);
+        let budget = self.request.target.budget.unwrap_or(f64::INFINITY);
         let near = few < NEAR * budget && few * NEAR > budget;
         if near { self.each(setting, MORE) } else { Ok(few) }
     }
 
     fn each(&self, setting: &Setting, frames: u32) -> Result<f64, Fail> {
-        let path = spread(&self.asked.path, frames + 1);
+        let path = spread(&self.request.path, frames + 1);
         // Floats are what small pictures are sent as.
         let format = if setting.shrink > 1 { PixelFormat::Rgba32F } else { PixelFormat::Rgb8 };
-        let written = Some((setting.shrink, self.asked.background));
+        let written = Some((setting.shrink, self.request.background));
         let mut came: Vec<f64> =
             self.frames(setting, path, format, written)?.iter().map(|f| f.1).collect();
         came.sort_unstable_by(f64::total_cmp);
@@ -101,15 +101,17 @@ impl Through<'_> {
         format: PixelFormat,
         written: Option<(u32, Background)>,
     ) -> Result<Vec<(Frame, f64)>, Fail> {
-        let mut asked = self.asked.clone();
-        asked.quality = setting.quality;
-        asked.path = path;
-        asked.path.size = setting.drawn_size(asked.path.size).unwrap_or(asked.path.size);
-        let request = asked.request(&self.info, format, false);
+        let mut request = self.request.clone();
+        request.quality = setting.quality;
+        request.path = path;
+        request.path.size = setting.drawn_size(request.path.size).unwrap_or(request.path.size);
+        let message = request.to_message(&self.info, format, false);
         self.runtime.block_on(async {
             let mut source = match &self.wire {
-                Wire::Embedded(handle) => embedded::submit(handle, &asked, request).await?,
-                Wire::Remote(client) => remote::submit((*client).clone(), &asked, request).await?,
+                Wire::Embedded(handle) => embedded::submit(handle, &request, message).await?,
+                Wire::Remote(client) => {
+                    remote::submit((*client).clone(), &request, message).await?
+                }
             };
             let taken = take(&mut source, written).await;
             if taken.is_err() {
@@ -202,7 +204,7 @@ pub struct There<'a> {
 impl<'a> There<'a> {
     /// Returns a test bed on a cluster that alone has the volume.
     pub fn new(through: Through<'a>) -> There<'a> {
-        let base = Setting::asked(through.asked.quality);
+        let base = Setting::asked(through.request.quality);
         There { through, base, truths: Vec::new() }
     }
 
@@ -234,7 +236,7 @@ impl Place for There<'_> {
     }
 
     fn size(&self) -> [u32; 2] {
-        self.through.asked.path.size
+        self.through.request.path.size
     }
 
     fn crew(&self) -> String {
@@ -242,16 +244,16 @@ impl Place for There<'_> {
     }
 
     fn identity(&self) -> String {
-        let Through { asked, info, .. } = &self.through;
-        let around = all_around(&asked.path);
+        let Through { request, info, .. } = &self.through;
+        let around = all_around(&request.path);
         format!(
             "judged by its finest pictures: volume {} transfer {:?} path {} quality {:?} background \
              {:?} pixels {} slabcast {}",
             info.digest,
-            asked.transfer.choice(info),
+            request.transfer.choice(info),
             serde_json::to_string(&around).unwrap_or_default(),
-            asked.quality,
-            asked.background,
+            request.quality,
+            request.background,
             slabcast_common::PIXELS_VERSION,
             env!("CARGO_PKG_VERSION")
         )
@@ -264,7 +266,7 @@ impl Place for There<'_> {
 
     fn off(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Off, Fail> {
         if self.truths.is_empty() {
-            let path = all_around(&self.through.asked.path);
+            let path = all_around(&self.through.request.path);
             let (views, finest) = (path.frames(), self.finest());
             let n = VIEWS.min(views);
             for i in 0..n {
@@ -280,7 +282,7 @@ impl Place for There<'_> {
         for (view, truth) in &self.truths {
             let picture = self.picture(setting, view)?;
             let figures =
-                ErrorFigures::compare(&picture.pixels, truth, self.through.asked.background);
+                ErrorFigures::compare(&picture.pixels, truth, self.through.request.background);
             off = off.with(&figures);
         }
         off.rmse = libm::hypot(off.rmse, FINEST.off);

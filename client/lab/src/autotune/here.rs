@@ -16,7 +16,7 @@ const SECONDS: f64 = 0.25;
 
 /// What times a frame.
 pub enum Clock<'a> {
-    /// Plain drawing, as `slabcast bench` does.
+    /// Plain drawing, as `slabcast lab bench` does.
     Plain(Cut),
     /// A cluster of this process, as `slabcast render` has.
     Cluster(Box<Through<'a>>),

@@ -19,7 +19,7 @@ use slabcast_session::fail::Fail;
 use slabcast_session::magnify::magnified;
 use slabcast_session::path_scenes::Stage;
 use slabcast_session::progress::Progress;
-use slabcast_session::request::Asked;
+use slabcast_session::request::RenderRequest;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -116,7 +116,7 @@ type Ground = (bool, bool);
 pub struct Lab {
     volume: Arc<Volume>,
     info: VolumeInfo,
-    asked: Asked,
+    request: RenderRequest,
     orientation: Orientation,
     pub(crate) base: Setting,
     pub(crate) threads: usize,
@@ -128,16 +128,24 @@ impl Lab {
     pub(crate) fn new(
         volume: impl Into<Arc<Volume>>,
         info: VolumeInfo,
-        asked: &Asked,
+        request: &RenderRequest,
         orientation: Orientation,
         threads: usize,
     ) -> Result<Lab, Fail> {
         let volume = volume.into();
-        let stage = Stage::new(&volume, &info, asked, orientation)?;
-        let base = Setting::asked(asked.quality);
+        let stage = Stage::new(&volume, &info, request, orientation)?;
+        let base = Setting::asked(request.quality);
         let ground = ground(&base);
-        let asked = asked.clone();
-        Ok(Lab { volume, info, asked, orientation, base, threads, grounds: vec![(ground, stage)] })
+        let request = request.clone();
+        Ok(Lab {
+            volume,
+            info,
+            request,
+            orientation,
+            base,
+            threads,
+            grounds: vec![(ground, stage)],
+        })
     }
 
     /// All that the figures of a setting hang on but the machine. Where on its path a view of a turn
@@ -145,7 +153,7 @@ impl Lab {
     pub(crate) fn identity(&self) -> String {
         let stage = &self.grounds[0].1;
         let transfer = stage.spec(0).transfer.to_json();
-        let path = &self.asked.path;
+        let path = &self.request.path;
         let how = match &path.turntable {
             Some(t) => format!(
                 "{:?} {:?} {} {} {:?} {:?} {:?}",
@@ -156,7 +164,7 @@ impl Lab {
         format!(
             "volume {} transfer {transfer} path {how} quality {:?} pixels {} slabcast {}",
             self.info.digest,
-            self.asked.quality,
+            self.request.quality,
             slabcast_common::PIXELS_VERSION,
             env!("CARGO_PKG_VERSION")
         )
@@ -164,12 +172,12 @@ impl Lab {
 
     /// Size of the pictures.
     pub(crate) fn size(&self) -> [u32; 2] {
-        self.asked.path.size
+        self.request.path.size
     }
 
     /// Number of views.
     pub(crate) fn views(&self) -> usize {
-        self.asked.path.frames()
+        self.request.path.frames()
     }
 
     /// Whether light falls on voxels in what was asked for.
@@ -194,12 +202,12 @@ impl Lab {
         let place = match found {
             Some(place) => place,
             None => {
-                let mut asked = self.asked.clone();
+                let mut request = self.request.clone();
                 if !setting.shaded {
-                    asked.transfer = asked.transfer.unshaded();
+                    request.transfer = request.transfer.unshaded();
                 }
-                asked.quality.compositing = setting.quality.compositing;
-                let stage = Stage::new(&self.volume, &self.info, &asked, self.orientation)?;
+                request.quality.compositing = setting.quality.compositing;
+                let stage = Stage::new(&self.volume, &self.info, &request, self.orientation)?;
                 self.grounds.push((wanted, stage));
                 self.grounds.len() - 1
             }
@@ -245,7 +253,7 @@ impl Lab {
         truths: &[Truth],
         own: Option<&[Truth]>,
     ) -> Result<Judged, Fail> {
-        let (threads, background) = (self.threads, self.asked.background);
+        let (threads, background) = (self.threads, self.request.background);
         let mut judged = Judged {
             sums: setting.quality.sums,
             off: Off::default(),
@@ -351,9 +359,9 @@ mod tests {
     fn lab(tf: &str) -> Lab {
         let volume = slabcast_session::volume::open("formula:spheres:32".as_ref()).unwrap();
         let path = ViewPath::turn([64, 64], Turntable { frames: 3, ..Turntable::default() });
-        let asked = Asked::plain(path, tf).unwrap();
+        let request = RenderRequest::plain(path, tf).unwrap();
         let info = volume.info(volume.digest());
-        Lab::new(volume, info, &asked, Orientation::new(None, None).unwrap(), 2).unwrap()
+        Lab::new(volume, info, &request, Orientation::new(None, None).unwrap(), 2).unwrap()
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! `slabcast check colour-rule`: what a rule of compositing and a thickness of sheets buy and cost.
+//! `slabcast lab check colour-rule`: what a rule of compositing and a thickness of sheets buy and cost.
 //!
 //! Whole frames of one view by each rule in sheets of several thicknesses: error against the
 //! limit, time, and how much the picture *pops* when its sheets move. The sheet grid hangs on the
@@ -17,7 +17,7 @@ use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::path_scenes::Drawn;
 use slabcast_session::progress::{self, Progress};
-use slabcast_session::request::{Opened, PictureOf, ThreadArg};
+use slabcast_session::request::{OpenedVolume, ThreadArgs, VolumeSceneArgs};
 use std::fmt::Write;
 use std::sync::Arc;
 use std::time::Instant;
@@ -32,12 +32,12 @@ use std::time::Instant;
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
-  slabcast check colour-rule brain.nii.gz
-  slabcast check colour-rule head.nrrd --up=-y --tf peer-opaque --azimuth 20 --times
-  slabcast check colour-rule head.nrrd --eps 0 --json")]
+  slabcast lab check colour-rule brain.nii.gz
+  slabcast lab check colour-rule head.nrrd --up=-y --tf peer-opaque --azimuth 20 --times
+  slabcast lab check colour-rule head.nrrd --eps 0 --json")]
 pub(crate) struct ColourRuleArgs {
     #[command(flatten)]
-    of: PictureOf,
+    of: VolumeSceneArgs,
     /// Pixels to compare with the reference; all of them if there are no more
     #[arg(long, value_name = "N", default_value = "8192",
           value_parser = clap::value_parser!(u32).range(1..=1 << 26))]
@@ -50,7 +50,7 @@ pub(crate) struct ColourRuleArgs {
     #[arg(long)]
     times: bool,
     #[command(flatten)]
-    threads: ThreadArg,
+    threads: ThreadArgs,
     /// As JSON
     #[arg(long)]
     json: bool,
@@ -90,23 +90,24 @@ struct Line {
 
 /// Runs the command.
 pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
-    let asked = args.of.look.asked(Work::default())?;
+    let request = args.of.scene.request(Work::default())?;
     let given = Quality::default();
     for (flag, given) in [
-        ("thickness", asked.quality.thickness != given.thickness),
-        ("compositing", asked.quality.compositing != given.compositing),
+        ("thickness", request.quality.thickness != given.thickness),
+        ("compositing", request.quality.compositing != given.compositing),
     ] {
         if given {
             return Err(Fail::usage(format!("--{flag}: is what is compared; leave it out")));
         }
     }
     let threads = args.threads.count();
-    let Opened { volume, info, orientation } = args.of.open(&asked)?;
-    let transfer = asked.transfer.function(&info).map_err(|e| asked.blame(&e))?;
-    let camera = asked.path.camera(0, &info.lattice, orientation).map_err(|e| asked.blame(&e))?;
-    let size = asked.path.size;
+    let OpenedVolume { volume, info, orientation } = args.of.open(&request)?;
+    let transfer = request.transfer.function(&info).map_err(|e| request.blame(&e))?;
+    let camera =
+        request.path.camera(0, &info.lattice, orientation).map_err(|e| request.blame(&e))?;
+    let size = request.path.size;
     let view = |camera: &Camera, quality: &Quality| {
-        View::new(&info.lattice, camera, size, quality).map_err(|e| asked.blame(&e))
+        View::new(&info.lattice, camera, size, quality).map_err(|e| request.blame(&e))
     };
 
     let mut progress = Progress::new(args.json).of("pixel");
@@ -114,7 +115,7 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
     progress.frames(2 * sample.len() as u64, &format!("{} pixels of the reference", sample.len()));
     let mut limits = Vec::new();
     for (_, compositing) in [RULES[0], RULES[2]] {
-        let quality = Quality { compositing, ..asked.quality };
+        let quality = Quality { compositing, ..request.quality };
         let drawn = Drawn::new(&volume, &info, &transfer, finely(quality, &transfer, &info))?;
         let reference = Reference::new(&drawn.spec, view(&camera, &quality)?, &drawn.bricks);
         let reference = reference.with_what_sheets_add();
@@ -129,7 +130,7 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
     let mut lines = Vec::new();
     for (rule, compositing) in RULES {
         for thickness in THICKNESSES {
-            let quality = Quality { compositing, thickness, ..asked.quality };
+            let quality = Quality { compositing, thickness, ..request.quality };
             let drawn = Drawn::new(&volume, &info, &transfer, finely(quality, &transfer, &info))?;
             let scene = Arc::new(Scene::new(&drawn.spec));
             let cut = Cut::on(if args.times { 1 } else { threads });
@@ -150,7 +151,7 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
                 .iter()
                 .map(|[x, y]| pictures[0].pixels[(y * size[0] + x) as usize])
                 .collect();
-            let compare = |want| ErrorFigures::compare(&got, want, asked.background);
+            let compare = |want| ErrorFigures::compare(&got, want, request.background);
             let (pop, pop_max) = apart(&pictures, pictures.len() / 2);
             lines.push(Line {
                 rule,

@@ -18,8 +18,8 @@ use std::time::{Duration, Instant};
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
-  slabcast check golden --verify tests/golden.txt
-  slabcast check golden > tests/golden.txt      (raise PIXELS_VERSION and say why in CHANGELOG.md)")]
+  slabcast lab check golden --verify tests/golden.txt
+  slabcast lab check golden > tests/golden.txt      (raise PIXELS_VERSION and say why in CHANGELOG.md)")]
 pub(crate) struct GoldenArgs {
     /// The sample volume
     #[arg(long, value_name = "FILE", default_value = SAMPLE)]
@@ -59,7 +59,7 @@ pub(crate) fn run(args: &GoldenArgs) -> Result<(), Fail> {
     runtime.shutdown_timeout(Duration::from_secs(1));
     let Some(want) = want else {
         let mut out = format!(
-            "# pixels_sha256 of golden frames, PIXELS_VERSION {PIXELS_VERSION}: slabcast check golden\n"
+            "# pixels_sha256 of golden frames, PIXELS_VERSION {PIXELS_VERSION}: slabcast lab check golden\n"
         );
         for (name, hash) in &lines {
             out += &format!("{name} {hash}\n");
@@ -83,7 +83,7 @@ fn read(file: &Path) -> Result<BTreeMap<String, String>, Fail> {
             line.split_once(' ').map(|(n, h)| (n, h.trim())).filter(|(_, h)| hash(h))
         else {
             return Err(Fail::failed(format!(
-                "{}: line {}: is not NAME SHA256; make the file with `slabcast check golden`",
+                "{}: line {}: is not NAME SHA256; make the file with `slabcast lab check golden`",
                 file.display(),
                 i + 1
             )));

@@ -7,12 +7,12 @@
 //! two ways to compute one position could fall on two sides of a boundary. They differ by 1e-13
 //! pixels or so and boundaries are 1/256 pixel apart: no scene here has a voxel that near to one.
 
-use super::asked::{
-    Asked, BYTES, Effort, LARGEST, Scene, VIEWS, cropped, largest, mirrored, pixels_that_differ,
-    rolled,
-};
 use super::case::{Case, Row};
 use super::changes::Turn;
+use super::invariance_scenes::{
+    BYTES, Effort, InvarianceCase, LARGEST, Scene, VIEWS, cropped, largest, mirrored,
+    pixels_that_differ, rolled,
+};
 use super::shot::{Against, Shot};
 use glam::DVec3;
 use slabcast_common::image::{Background, Picture};
@@ -37,7 +37,7 @@ pub(crate) fn cases() -> Vec<Case> {
 fn with(effort: Effort) -> Vec<Case> {
     let mut cases = Vec::new();
     for scene in [Scene::Opaque, Scene::Translucent, Scene::Stiff, Scene::Boxes] {
-        let asked: [(&str, Check); 8] = [
+        let checks: [(&str, Check); 8] = [
             ("unit of length", units),
             ("origin", origins),
             ("axes", axes),
@@ -47,33 +47,33 @@ fn with(effort: Effort) -> Vec<Case> {
             ("more opacity", opacity),
             ("thinner sheets", sheets),
         ];
-        for (name, check) in asked {
+        for (name, check) in checks {
             cases.push(Case::new(format!("{name}, {}", scene.name()), move |tools| {
-                check(&Asked { scene, effort, shot: scene.shot(effort)?, tools })
+                check(&InvarianceCase { scene, effort, shot: scene.shot(effort)?, tools })
             }));
         }
     }
     cases.push(Case::new("points on a transfer function's lines", move |tools| {
         let scene = Scene::Opaque;
-        points(&Asked { scene, effort, shot: scene.shot(effort)?, tools })
+        points(&InvarianceCase { scene, effort, shot: scene.shot(effort)?, tools })
     }));
     cases
 }
 
 /// One invariance of one scene.
-type Check = fn(&Asked) -> Result<Vec<Row>, Fail>;
+type Check = fn(&InvarianceCase) -> Result<Vec<Row>, Fail>;
 
 /// Lengths in another unit. Powers of two change nothing. Other factors round lengths in their
 /// last bit, 1e-16 of them, and weights and looks, kept in f32, then change in one case of 10^8.
 /// What is demanded is at most 1/255 in at most 0.01 % of the pixels.
-fn units(asked: &Asked) -> Result<Vec<Row>, Fail> {
-    let powers = asked.same_bytes("powers of 2", |s| {
+fn units(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
+    let powers = case.same_bytes("powers of 2", |s| {
         [-60, -30, -1, 10, 30, 60].map(|e| s.scaled(2f64.powi(e))).into()
     })?;
     let (mut off, mut share) = (0.0f64, 0.0f64);
-    for (shot, want) in asked.views()? {
+    for (shot, want) in case.views()? {
         for s in [1e-9, 1e-6, 0.0706, 0.7, 3.0, 25.4, 1e6, 1e9] {
-            let got = asked.picture(&shot.scaled(s))?;
+            let got = case.picture(&shot.scaled(s))?;
             off = off.max(largest(&want, &got));
             let differ = pixels_that_differ(&want, &got) as f64;
             share = share.max(100.0 * differ / want.pixels.len() as f64);
@@ -89,16 +89,16 @@ fn units(asked: &Asked) -> Result<Vec<Row>, Fail> {
 /// 10^7 voxels away. Nothing differs while corner, centre, eye and target can be represented
 /// there: they are multiples of 2^-29, since 10^7 < 2^24 and f64 has 53 bits. Where the eye
 /// cannot be, it is off by at most 2^-30; see `units` for what that does.
-fn origins(asked: &Asked) -> Result<Vec<Row>, Fail> {
-    let vox = asked.shot.volume.lattice.vox();
-    let exact = asked.same_bytes("1e7 voxels away", |s| {
+fn origins(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
+    let vox = case.shot.volume.lattice.vox();
+    let exact = case.same_bytes("1e7 voxels away", |s| {
         [DVec3::splat(1e7), DVec3::new(-1e7, 3e6, 0.5)].map(|by| s.moved(by * vox)).into()
     })?;
-    let (mut off, n) = (0.0f64, asked.shot.volume.lattice.largest_extent());
-    for (mut shot, _) in asked.views()? {
+    let (mut off, n) = (0.0f64, case.shot.volume.lattice.largest_extent());
+    for (mut shot, _) in case.views()? {
         shot.view.eye.iter_mut().for_each(|x| *x += n * 0.1);
-        let want = asked.picture(&shot)?;
-        let got = asked.picture(&shot.moved(DVec3::new(1e7, 3e6, -1e7) * vox))?;
+        let want = case.picture(&shot)?;
+        let got = case.picture(&shot.moved(DVec3::new(1e7, 3e6, -1e7) * vox))?;
         off = off.max(largest(&want, &got));
     }
     Ok(vec![exact, Row::new(format!("{LARGEST}: eye rounded"), off, 1.0)])
@@ -111,24 +111,24 @@ fn origins(asked: &Asked) -> Result<Vec<Row>, Fail> {
 /// The other world is lit from the eye. A light from aside has a jump: a normal at right angles
 /// to the eye's direction is turned towards the eye by its last bit, and then faces the light
 /// or does not. With such a light pixels at silhouettes differ by 15/255 and more.
-fn axes(asked: &Asked) -> Result<Vec<Row>, Fail> {
-    let turns: Vec<Turn> = Turn::all().into_iter().skip(1).step_by(asked.effort.every).collect();
+fn axes(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
+    let turns: Vec<Turn> = Turn::all().into_iter().skip(1).step_by(case.effort.every).collect();
     let (mut stored, mut turned) = (0.0f64, 0.0f64);
-    for (shot, want) in asked.views()? {
+    for (shot, want) in case.views()? {
         for t in &turns {
-            stored = stored.max(largest(&want, &asked.picture(&shot.stored(*t))?));
+            stored = stored.max(largest(&want, &case.picture(&shot.stored(*t))?));
         }
         let mut lit = shot.clone();
         lit.transfer.shading.light = Light::Head(HeadWord::Head);
-        let want = asked.picture(&lit)?;
+        let want = case.picture(&lit)?;
         for t in &turns {
-            let got = asked.picture(&lit.turned(*t))?;
+            let got = case.picture(&lit.turned(*t))?;
             let got = if t.mirrors() { mirrored(&got) } else { got };
             turned = turned.max(largest(&want, &got));
         }
     }
-    let order = if asked.scene == Scene::Stiff { 2.0 * asked.rounding() } else { 0.0 };
-    let normals = if asked.shot.transfer.shading.on { asked.normals() } else { 0.0 };
+    let order = if case.scene == Scene::Stiff { 2.0 * case.rounding() } else { 0.0 };
+    let normals = if case.shot.transfer.shading.on { case.normals() } else { 0.0 };
     Ok(vec![
         Row::new(format!("{LARGEST}: of storage"), stored, 255.0 * order),
         Row::new(format!("{LARGEST}: with the camera"), turned, 255.0 * (order + normals)),
@@ -138,26 +138,26 @@ fn axes(asked: &Asked) -> Result<Vec<Row>, Fail> {
 /// More empty samples around a volume that has one layer of them (gradients look one sample
 /// far). The camera stays; bricks and the volume's centre move, and with the bricks the order in
 /// which floats are added.
-fn borders(asked: &Asked) -> Result<Vec<Row>, Fail> {
+fn borders(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
     let mut off = 0.0f64;
-    for (shot, _) in asked.views()? {
-        let want = asked.picture(&shot.padded(1))?;
+    for (shot, _) in case.views()? {
+        let want = case.picture(&shot.padded(1))?;
         for n in [2, 4, 9] {
-            off = off.max(largest(&want, &asked.picture(&shot.padded(n))?));
+            off = off.max(largest(&want, &case.picture(&shot.padded(n))?));
         }
     }
-    let order = if asked.scene == Scene::Stiff { 2.0 * asked.rounding() } else { 0.0 };
+    let order = if case.scene == Scene::Stiff { 2.0 * case.rounding() } else { 0.0 };
     Ok(vec![Row::new(LARGEST, off, 255.0 * order)])
 }
 
 /// The same values as 8-bit codes, 16-bit codes and floats.
-fn types(asked: &Asked) -> Result<Vec<Row>, Fail> {
-    if asked.scene == Scene::Stiff {
+fn types(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
+    if case.scene == Scene::Stiff {
         // Its values have 16 bits, of which floats hold all.
-        return Ok(vec![asked.same_bytes("u16, f32", |s| vec![s.in_floats()])?]);
+        return Ok(vec![case.same_bytes("u16, f32", |s| vec![s.in_floats()])?]);
     }
     Ok(vec![
-        asked.same_bytes("u8, u16, f32", |s| {
+        case.same_bytes("u8, u16, f32", |s| {
             vec![s.in_16_bits(1), s.in_16_bits(256), s.in_floats()]
         })?,
     ])
@@ -165,35 +165,35 @@ fn types(asked: &Asked) -> Result<Vec<Row>, Fail> {
 
 /// A part of a larger picture; red and blue exchanged; the camera on its side, where weights are
 /// multiplied in another order; opacity from behind, where sheets come in the other order.
-fn pictures(asked: &Asked) -> Result<Vec<Row>, Fail> {
-    let [w, h] = asked.shot.size;
-    let (shot, want) = asked.views()?.swap_remove(0);
+fn pictures(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
+    let [w, h] = case.shot.size;
+    let (shot, want) = case.views()?.swap_remove(0);
     let mut large = Shot { size: [w + 64, h + h / 2], ..shot.clone() };
     large.view.height = large.view.height.map(|x| x * 1.5);
-    let part = cropped(&asked.picture(&large)?, [32, h / 4], [w, h]);
+    let part = cropped(&case.picture(&large)?, [32, h / 4], [w, h]);
 
     let mut swapped = shot.clone();
     swapped.transfer.colors.iter_mut().for_each(|c| c.swap(1, 3));
-    let mut swapped = asked.picture(&swapped)?;
+    let mut swapped = case.picture(&swapped)?;
     swapped.pixels.iter_mut().for_each(|p| p.swap(0, 2));
 
     let mut square = Shot { size: [h, h], ..shot };
     square.quality.eps = 0.0;
-    let upright = asked.picture(&square)?;
+    let upright = case.picture(&square)?;
     let target = DVec3::from_array(square.view.target);
     let to_eye = DVec3::from_array(square.view.eye) - target;
     let mut side = square.clone();
     side.view.up = to_eye.cross(DVec3::from_array(square.view.up)).to_array();
-    let side = rolled(&asked.picture(&side)?);
+    let side = rolled(&case.picture(&side)?);
     let mut behind = square;
     behind.view.eye = (target - to_eye).to_array();
-    let behind = mirrored(&asked.picture(&behind)?);
+    let behind = mirrored(&case.picture(&behind)?);
     let alpha = |p: &Picture| {
         let pixels = p.pixels.iter().map(|p| [p[3]; 4]).collect();
         Picture { size: p.size, pixels }
     };
-    let bound = 255.0 * 2.0 * asked.rounding();
-    let side_bound = if asked.scene == Scene::Boxes { CUT_OTHERWISE } else { bound };
+    let bound = 255.0 * 2.0 * case.rounding();
+    let side_bound = if case.scene == Scene::Boxes { CUT_OTHERWISE } else { bound };
     let bytes = |what: &str, got: &Picture| {
         Row::new(format!("{BYTES}: {what}"), pixels_that_differ(&want, got) as f64, 0.0)
     };
@@ -211,24 +211,24 @@ fn pictures(asked: &Asked) -> Result<Vec<Row>, Fail> {
 
 /// Opacities raised, point by point: no pixel becomes less opaque but by rounding, and, where
 /// pixels are shut, by what that leaves out, at most eps.
-fn opacity(asked: &Asked) -> Result<Vec<Row>, Fail> {
+fn opacity(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
     let raises = [|a: f64| 1.01 * a, |a: f64| 2.0 * a, |a: f64| a * (1.25 - 0.25 * a.min(1.0))];
-    let most = if asked.scene == Scene::Stiff { f64::INFINITY } else { 1.0 };
+    let most = if case.scene == Scene::Stiff { f64::INFINITY } else { 1.0 };
     let mut rows = Vec::new();
     for eps in [0.0, Quality::default().eps] {
         let mut lost = 0.0f64;
-        for (mut shot, _) in asked.views()? {
+        for (mut shot, _) in case.views()? {
             shot.quality.eps = eps;
-            let less = asked.picture(&shot)?;
+            let less = case.picture(&shot)?;
             for raise in raises {
                 let mut more = shot.clone();
                 more.transfer.opacities.iter_mut().for_each(|o| o[1] = raise(o[1]).min(most));
-                let more = asked.picture(&more)?;
+                let more = case.picture(&more)?;
                 let pairs = less.pixels.iter().zip(&more.pixels);
                 lost = pairs.map(|(l, m)| f64::from(l[3] - m[3])).fold(lost, f64::max);
             }
         }
-        let bound = 255.0 * (eps + 2.0 * asked.rounding());
+        let bound = 255.0 * (eps + 2.0 * case.rounding());
         rows.push(Row::new(format!("opacity lost, eps {eps:.4}"), 255.0 * lost, bound));
     }
     Ok(rows)
@@ -236,19 +236,19 @@ fn opacity(asked: &Asked) -> Result<Vec<Row>, Fail> {
 
 /// Sheets half as thick are not worse than before by more than 5 %, down to the floor: what
 /// rounded positions and sums leave at that thickness, found against the same sheets in f64.
-fn sheets(asked: &Asked) -> Result<Vec<Row>, Fail> {
+fn sheets(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
     let mut rows = Vec::new();
     for at in [0, 2] {
-        let (mut shot, _) = asked.views()?.swap_remove(at);
+        let (mut shot, _) = case.views()?.swap_remove(at);
         shot.quality.eps = 0.0;
-        let sample = shot.ready()?.sample(asked.effort.pixels);
-        let limit = shot.ready()?.truth(Against::Limit, &sample, asked.tools);
+        let sample = shot.ready()?.sample(case.effort.pixels);
+        let limit = shot.ready()?.truth(Against::Limit, &sample, case.tools);
         let (mut before, mut worst) = (f64::INFINITY, 0.0f64);
         for d in [2.0, 1.0, 0.5, 0.25, 0.125] {
             shot.quality.thickness = d;
             let ready = shot.ready()?;
-            let got = ready.at(&ready.picture(Cut::on(asked.tools.threads)), &sample);
-            let same = ready.truth(Against::SameSheets, &sample, asked.tools);
+            let got = ready.at(&ready.picture(Cut::on(case.tools.threads)), &sample);
+            let same = ready.truth(Against::SameSheets, &sample, case.tools);
             let black = Background::Colour([0.0; 3]);
             let rmse = |want: &[[f64; 4]]| ErrorFigures::compare(&got, want, black).rmse;
             let (now, floor) = (rmse(&limit), rmse(&same));
@@ -263,17 +263,17 @@ fn sheets(asked: &Asked) -> Result<Vec<Row>, Fail> {
 /// Points on the lines of a transfer function. Those that can be represented, and whose lines can
 /// be computed without rounding, change nothing; the others are off their line by the last bit of
 /// f64, and looks, kept in f32, change by their last bit in one case of 10^8.
-fn points(asked: &Asked) -> Result<Vec<Row>, Fail> {
-    let mut asked = Asked { shot: asked.shot.clone(), ..*asked };
+fn points(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
+    let mut case = InvarianceCase { shot: case.shot.clone(), ..*case };
     let colors = [[0.0, 1.0, 0.5, 0.25], [128.0, 0.25, 1.0, 0.5], [192.0, 0.0, 0.5, 1.0]];
     let opacities = [[32.0, 0.0], [64.0, 0.5], [64.0, 0.125], [192.0, 0.875]];
-    asked.shot.transfer = TransferFunction {
+    case.shot.transfer = TransferFunction {
         colors: colors.into(),
         opacities: opacities.into(),
         color_space: ColorSpace::Linear,
-        ..asked.shot.transfer
+        ..case.shot.transfer
     };
-    let exact = asked.same_bytes("exact points", |s| {
+    let exact = case.same_bytes("exact points", |s| {
         let mut s = s.clone();
         let tf = &mut s.transfer;
         tf.colors.insert(2, [160.0, 0.125, 0.75, 0.75]);
@@ -288,7 +288,7 @@ fn points(asked: &Asked) -> Result<Vec<Row>, Fail> {
         vec![s]
     })?;
     let mut off = 0.0f64;
-    for (mut shot, want) in asked.views()? {
+    for (mut shot, want) in case.views()? {
         let tf = &mut shot.transfer;
         let on = |a: f64, b: f64, t: f64| a + (b - a) * t;
         for t in [0.1, 0.3, 0.7, 0.9] {
@@ -298,10 +298,10 @@ fn points(asked: &Asked) -> Result<Vec<Row>, Fail> {
         }
         tf.opacities.sort_by(|a, b| a[0].total_cmp(&b[0]));
         tf.colors.sort_by(|a, b| a[0].total_cmp(&b[0]));
-        off = off.max(largest(&want, &asked.picture(&shot)?));
+        off = off.max(largest(&want, &case.picture(&shot)?));
     }
     // 2^-23 of an extinction and of a colour, and what sums make of it.
-    let bound = 255.0 * (2f64.powi(-22) + 2.0 * asked.rounding());
+    let bound = 255.0 * (2f64.powi(-22) + 2.0 * case.rounding());
     Ok(vec![exact, Row::new(format!("{LARGEST}: rounded points"), off, bound)])
 }
 

@@ -30,8 +30,8 @@ const SCHEDULES: [Schedule; 2] = [Schedule::Slab, Schedule::Region];
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
-  slabcast check matrix --pairwise
-  slabcast check matrix brain.nii.gz")]
+  slabcast lab check matrix --pairwise
+  slabcast lab check matrix brain.nii.gz")]
 pub(crate) struct MatrixArgs {
     /// A volume to check beside formula volumes [default: samples/mni152_t1.nii.gz, if there]
     volume: Option<PathBuf>,

@@ -1,4 +1,4 @@
-//! `slabcast check`: does it hold what it promises?
+//! `slabcast lab check`: does it hold what it promises?
 //!
 //! Without a subcommand: a [`table`] of cases, each with an error, its bound and a verdict. A
 //! frame's bytes must not depend on who rendered it either (DESIGN.md, Pixels are exact):
@@ -8,7 +8,6 @@
 //! of compositing buy and cost. This room belongs to the program because only here all crates can
 //! be seen.
 
-mod asked;
 mod case;
 mod cases;
 mod changes;
@@ -20,6 +19,7 @@ mod enclose;
 mod extreme;
 mod golden;
 mod invariance;
+mod invariance_scenes;
 mod looks;
 mod matrix;
 mod pairwise;
@@ -39,14 +39,14 @@ use slabcast_session::fail::Fail;
     args_conflicts_with_subcommands = true,
     after_help = "\
 Examples:
-  slabcast check                            every case of the table: two minutes
-  slabcast check --group extreme --long     one group, with its long cases
-  slabcast check --list                     which cases there are
-  slabcast check matrix --pairwise          every pair of settings at least once: minutes
-  slabcast check matrix brain.nii.gz        all of them: an hour
-  slabcast check convergence                how fast thin sheets come to the limit: a minute
-  slabcast check colour-rule brain.nii.gz   what each rule of compositing buys and costs
-  slabcast check golden --verify tests/golden.txt"
+  slabcast lab check                            every case of the table: two minutes
+  slabcast lab check --group extreme --long     one group, with its long cases
+  slabcast lab check --list                     which cases there are
+  slabcast lab check matrix --pairwise          every pair of settings at least once: minutes
+  slabcast lab check matrix brain.nii.gz        all of them: an hour
+  slabcast lab check convergence                how fast thin sheets come to the limit: a minute
+  slabcast lab check colour-rule brain.nii.gz   what each rule of compositing buys and costs
+  slabcast lab check golden --verify tests/golden.txt"
 )]
 pub struct CheckArgs {
     #[command(subcommand)]

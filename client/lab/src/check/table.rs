@@ -1,4 +1,4 @@
-//! The table of `slabcast check`: groups of cases, one row for each thing that must hold.
+//! The table of `slabcast lab check`: groups of cases, one row for each thing that must hold.
 //!
 //! A group is a name and a function that gives its cases; [`GROUPS`] lists them. A case draws
 //! what it needs with the [`Tools`] and gives back rows; the table adds group and case to them,
@@ -10,7 +10,7 @@ use super::shot::Tools;
 use super::{closed, extreme, invariance};
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress::{self, Progress};
-use slabcast_session::request::ThreadArg;
+use slabcast_session::request::ThreadArgs;
 use std::time::{Duration, Instant};
 
 /// Some cases that belong together.
@@ -43,7 +43,7 @@ pub(crate) const GROUPS: &[Group] = &[
     },
 ];
 
-/// What `slabcast check` without a subcommand takes.
+/// What `slabcast lab check` without a subcommand takes.
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct TableArgs {
     /// Run this group only; may be given more than once
@@ -62,7 +62,7 @@ pub(crate) struct TableArgs {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
-    threads: ThreadArg,
+    threads: ThreadArgs,
 }
 
 /// Runs the table.
@@ -89,7 +89,9 @@ pub(crate) fn run(args: &TableArgs) -> Result<(), Fail> {
     let cases: Vec<&(&Group, Case)> = all.iter().filter(|(_, c)| args.long || !c.long).collect();
     if cases.is_empty() {
         return Err(Fail::usage(match skipped {
-            0 => "--case: no case has this in its name; see `slabcast check --list`".to_string(),
+            0 => {
+                "--case: no case has this in its name; see `slabcast lab check --list`".to_string()
+            }
             n => format!("{n} cases fit, all of them long; add --long"),
         }));
     }

@@ -102,8 +102,11 @@ pub(super) fn write(path: &Path, found: &Found) -> Result<(), Fail> {
     let canvas = draw(&found.picture, found.still.background, &blocks);
     let figures = found.whole[0].figures;
     let about = [
-        ("slabcast error scale", scale()),
-        ("slabcast error figures", format!("RMSE {} max {} of 1/255", figures.rmse, figures.max)),
+        ("slabcast lab error scale", scale()),
+        (
+            "slabcast lab error figures",
+            format!("RMSE {} max {} of 1/255", figures.rmse, figures.max),
+        ),
         ("slabcast pixels_sha256", found.picture.sha256().to_string()),
     ];
     write_atomic(path, |out| canvas.png(out, &about))

@@ -1,4 +1,4 @@
-//! `slabcast error`: how far a picture is from the truth, and why.
+//! `slabcast lab error`: how far a picture is from the truth, and why.
 //!
 //! The truth is the reference (a gather in f64 along true rays, which shares nothing with the
 //! splatter) at a stratified sample of pixels, or at all. Sources are found by switching the
@@ -22,7 +22,7 @@ use slabcast_session::direct;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::parse::Pixels;
 use slabcast_session::progress::Progress;
-use slabcast_session::request::{PictureOf, ThreadArg};
+use slabcast_session::request::{ThreadArgs, VolumeSceneArgs};
 use slabcast_session::{parse, signals};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -31,7 +31,9 @@ use std::time::{Duration, Instant};
 /// by some 0.001/255, where truncation and ripple begin at 0.01, for half the kernel values.
 const MODEL_TOLERANCE: f64 = 1e-5;
 
-/// Says how far a picture is from the truth, in 1/255, and what the error is made of.
+/// Measures how far a picture is from the truth.
+///
+/// In 1/255, and what the error is made of.
 ///
 /// The first view of the path is rendered and compared, at a stratified sample of pixels, with a
 /// reference that integrates along true rays in double precision. Errors are of linear
@@ -47,11 +49,11 @@ const MODEL_TOLERANCE: f64 = 1e-5;
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
-  slabcast error brain.nii.gz
-  slabcast error brain.nii.gz --tf peer-semi --thickness 0.5 --azimuth 30
-  slabcast error brain.nii.gz --map error.png                  where it is, cell by cell
-  slabcast error brain.nii.gz --map error.png --pixels all     pixel by pixel (minutes)
-  slabcast error brain.nii.gz --compositing paper --pixels 16384 --json
+  slabcast lab error brain.nii.gz
+  slabcast lab error brain.nii.gz --tf peer-semi --thickness 0.5 --azimuth 30
+  slabcast lab error brain.nii.gz --map error.png                  where it is, cell by cell
+  slabcast lab error brain.nii.gz --map error.png --pixels all     pixel by pixel (minutes)
+  slabcast lab error brain.nii.gz --compositing paper --pixels 16384 --json
 
 JSON: one object. Each of limit, same_thickness, thickness, cutoff, slivers, quantisation, rounding,
 rounding_positions, rounding_arithmetic, truncation and ripple is {rmse, max, most_999,
@@ -62,7 +64,7 @@ blank ones included, for the sum and for truncation and ripple. size; pixels_sha
 if any.")]
 pub struct ErrorArgs {
     #[command(flatten)]
-    of: PictureOf,
+    of: VolumeSceneArgs,
     /// Pixels to compare, one at random in each of as many cells; or all
     #[arg(long, value_name = "N|all", default_value = "4096", value_parser = parse::pixels)]
     pixels: Pixels,
@@ -79,7 +81,7 @@ pub struct ErrorArgs {
     #[arg(long, value_name = "FILE.png", value_parser = parse::png)]
     map: Option<PathBuf>,
     #[command(flatten)]
-    threads: ThreadArg,
+    threads: ThreadArgs,
     /// As JSON
     #[arg(long)]
     json: bool,

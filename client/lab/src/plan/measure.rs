@@ -530,7 +530,7 @@ mod tests {
     use slabcast_render::tile::ProjectedBrick;
     use slabcast_render::visibility::Directory;
     use slabcast_session::direct::Cut;
-    use slabcast_session::request::Asked;
+    use slabcast_session::request::RenderRequest;
 
     /// Volume, axis that is up, and transfer function.
     type Named = (&'static str, &'static str, &'static str);
@@ -546,8 +546,9 @@ mod tests {
         let (volume, orientation) = slabcast_session::testing::data_volume(file, axis)?;
         let info = volume.info(volume.digest());
         let turn = Turntable { frames: 4, step: 22.5, ..Turntable::default() };
-        let asked = Asked::plain(ViewPath::turn([512, 512], turn), tf).expect("a request");
-        Some(Stage::new(&volume, &info, &asked, orientation).expect("a stage"))
+        let request =
+            RenderRequest::plain(ViewPath::turn([512, 512], turn), tf).expect("a request");
+        Some(Stage::new(&volume, &info, &request, orientation).expect("a stage"))
     }
 
     /// Bytes of a frame's results and what a tile takes to write and to read, for docs/scaling.md.

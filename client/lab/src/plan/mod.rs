@@ -1,4 +1,4 @@
-//! `slabcast plan`: what a cluster would do that is not there.
+//! `slabcast lab plan`: what a cluster would do that is not there.
 //!
 //! Two halves, and it says which is which: [`measure`] draws every tile of the path here, on one
 //! core, and weighs its messages; [`predict`] runs the scheduler itself with these tiles against
@@ -22,7 +22,7 @@ use slabcast_session::fail::{Fail, say};
 use slabcast_session::output::{Made, probe, write_atomic};
 use slabcast_session::path_scenes::Stage;
 use slabcast_session::progress::{Progress, warn};
-use slabcast_session::request::{Asked, Opened, PictureOf, WorkArgs};
+use slabcast_session::request::{OpenedVolume, RenderRequest, VolumeSceneArgs, WorkArgs};
 use slabcast_session::{machine, parse, signals};
 use slabcast_sim::{Link, alone_ms};
 use slabcast_trace::{MAX_BYTES, Pings, Trace};
@@ -36,22 +36,24 @@ use std::time::Instant;
 /// were measured on an emulated link of 1 Gbit/s (TRANSPORT.md, answer 7).
 pub(crate) const GOODPUT: f64 = 0.94;
 
-/// Predicts time, efficiency and bytes of a cluster before it is there.
+/// Predicts frame times of a cluster before it is there.
+///
+/// And its efficiency and bytes.
 ///
 /// The path's tiles are drawn here once, on one core, and timed; then the scheduler itself runs with
 /// them against virtual workers and links. The table says what was measured and what is predicted.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
-  slabcast plan brain.nii.gz --workers 1..64 --link 1gbit
-  slabcast plan ct.nrrd --tf bone --size 1024x1024 --workers 8,16,32 --link 10gbit --threads 16 -o plan/
-  slabcast plan ct.nrrd --tf bone --trace ct.trace --workers 40 --link 1gbit --latency 500us
-  slabcast plan ct.nrrd --tf bone --trace ct.trace --rehearse 2,8,15
+  slabcast lab plan brain.nii.gz --workers 1..64 --link 1gbit
+  slabcast lab plan ct.nrrd --tf bone --size 1024x1024 --workers 8,16,32 --link 10gbit --threads 16 -o plan/
+  slabcast lab plan ct.nrrd --tf bone --trace ct.trace --workers 40 --link 1gbit --latency 500us
+  slabcast lab plan ct.nrrd --tf bone --trace ct.trace --rehearse 2,8,15
 
 The first command with --trace FILE measures and writes FILE; later ones read it, and only predict.")]
 pub struct PlanArgs {
     #[command(flatten)]
-    of: PictureOf,
+    of: VolumeSceneArgs,
     #[command(flatten)]
     work: WorkArgs,
     /// Workers: numbers and ranges, as 1..64 or 1,2,4,8
@@ -110,7 +112,7 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
         Schedule::Auto => vec![Schedule::Region, Schedule::Slab],
         one => vec![one],
     };
-    let asked = args.of.look.asked(work)?;
+    let request = args.of.scene.request(work)?;
     let workers = &args.workers.0;
     let most = workers.iter().copied().max().unwrap_or(1);
     if u64::from(most) * u64::from(args.threads) > 65536 {
@@ -139,12 +141,12 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
     if let Some(file) = args.trace.as_deref().filter(|file| !file.exists()) {
         probe(file)?;
     }
-    let Opened { volume, info, orientation } = args.of.open(&asked)?;
+    let OpenedVolume { volume, info, orientation } = args.of.open(&request)?;
     progress.stage("cutting the volume into bricks");
-    let names = (volume.name.clone(), asked.transfer.name().to_string());
-    let stage = Stage::new(&volume, &info, &asked, orientation)?;
+    let names = (volume.name.clone(), request.transfer.name().to_string());
+    let stage = Stage::new(&volume, &info, &request, orientation)?;
     drop(volume);
-    let frames = asked.path.frames();
+    let frames = request.path.frames();
     let jobs = measure::jobs(&stage, frames, work)?;
     let more = args.rehearse.iter().flat_map(|list| &list.0);
     let wanted = workers.iter().chain(more).map(|n| {
@@ -209,15 +211,15 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
         let costs = costs::messages(trace, schedule);
         let rehearsed = match (&args.rehearse, &args.trace) {
             (Some(list), Some(file)) => {
-                let mut asked: Asked = asked.clone();
-                asked.work.schedule = schedule;
+                let mut request: RenderRequest = request.clone();
+                request.work.schedule = schedule;
                 let stage = rehearse::Stage {
                     volume: &args.of.volume,
                     file,
                     trace,
                     jobs: &jobs,
-                    asked: &asked,
-                    axes: &args.of.look.view.axes,
+                    request: &request,
+                    axes: &args.of.scene.view.axes,
                     threads: args.threads,
                     costs,
                     over: match args.rehearse_at {

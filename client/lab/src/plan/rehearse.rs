@@ -15,7 +15,7 @@ use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{FrameJob, Spans};
 use slabcast_session::fail::Fail;
 use slabcast_session::progress::Progress;
-use slabcast_session::request::{Asked, AxisArgs};
+use slabcast_session::request::{AxisArgs, RenderRequest};
 use slabcast_session::{machine, remote, runtime};
 use slabcast_sim::{Costs, Link, Nanos, Outcome, Stopwatch};
 use slabcast_trace::Trace;
@@ -122,7 +122,7 @@ pub(super) struct Stage<'a> {
     pub(super) file: &'a Path,
     pub(super) trace: &'a Trace,
     pub(super) jobs: &'a [FrameJob],
-    pub(super) asked: &'a Asked,
+    pub(super) request: &'a RenderRequest,
     pub(super) axes: &'a AxisArgs,
     pub(super) threads: u32,
     pub(super) costs: Costs,
@@ -215,9 +215,9 @@ impl Stage<'_> {
             .map(|_| {
                 // As a plain `render` asks.
                 let Finish { format, background } = FINISH;
-                let mut asked = self.asked.clone();
-                (asked.hashed, asked.background) = (false, background);
-                asked.request(&served.info, format, false)
+                let mut request = self.request.clone();
+                (request.hashed, request.background) = (false, background);
+                request.to_message(&served.info, format, false)
             })
             .collect();
         let played = tokio::time::timeout(PLAY, play(&client, &requests, &master, &workers)).await;
@@ -336,8 +336,8 @@ async fn play(
             if came.len() == 1 {
                 // Before the first frame the volume is cut into bricks and all of them are sent: from
                 // here on it counts.
-                for request in rest.by_ref() {
-                    jobs.push_back(client.submit(request).await.map_err(|e| remote::fail(&e))?);
+                for message in rest.by_ref() {
+                    jobs.push_back(client.submit(message).await.map_err(|e| remote::fail(&e))?);
                 }
                 (began, before) = (Instant::now(), (master.cpu(), of_workers()));
             }

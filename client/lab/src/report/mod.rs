@@ -1,4 +1,4 @@
-//! `slabcast report`: error against run time, as a table, a chart and files for programs.
+//! `slabcast lab report`: error against run time, as a table, a chart and files for programs.
 //!
 //! [`sweep`] says which settings are drawn, [`chart`] draws what came out, [`write`](mod@write) puts
 //! it down. What measures is `front`.
@@ -15,14 +15,16 @@ use slabcast_common::quality::{Quality, Sums, Work};
 use slabcast_session::direct::Cut;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress::{self, Progress};
-use slabcast_session::request::{Opened, PictureOf, ThreadArg};
+use slabcast_session::request::{OpenedVolume, ThreadArgs, VolumeSceneArgs};
 use slabcast_session::signals;
 use std::path::PathBuf;
 use std::time::Instant;
 use sweep::{Group, Knob, Trial};
 
-/// Says what each knob of quality costs and what it buys: error against the limit and time a frame,
-/// for many settings of one scene; marks those that no other beats.
+/// Sweeps the settings of quality for error against time.
+///
+/// Error against the limit and time a frame, for many settings of one scene; marks those that no
+/// other beats.
 ///
 /// Errors are of the middle view of the path (of --views, spread over it), at a sample of its
 /// pixels, against the limit of what was asked for: its kernel, its light, its size. Times are from
@@ -31,9 +33,9 @@ use sweep::{Group, Knob, Trial};
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
-  slabcast report brain.nii.gz
-  slabcast report head.nrrd --up=-y --tf peer-opaque -o report/
-  slabcast report ct.nrrd --tf bone --size 1024x1024 --only thickness,eps,sums --seconds 0.3
+  slabcast lab report brain.nii.gz
+  slabcast lab report head.nrrd --up=-y --tf peer-opaque -o report/
+  slabcast lab report ct.nrrd --tf bone --size 1024x1024 --only thickness,eps,sums --seconds 0.3
 
 Files: report.json (all of it), report.csv (a line a setting), report.svg, report-dark.svg,
 report.png, report-dark.png (error down, time across).
@@ -49,7 +51,7 @@ are those of its bricks as they are sent; front and knee are by the time on all 
 settings have sheets so thin that thinner ones bought nothing any more.")]
 pub struct ReportArgs {
     #[command(flatten)]
-    of: PictureOf,
+    of: VolumeSceneArgs,
     /// Folder for the files; it is made
     #[arg(short, long, value_name = "DIR", default_value = "slabcast-report")]
     out: PathBuf,
@@ -75,7 +77,7 @@ pub struct ReportArgs {
     #[arg(long, value_name = "KNOB,...", value_delimiter = ',', value_enum)]
     only: Vec<Group>,
     #[command(flatten)]
-    threads: ThreadArg,
+    threads: ThreadArgs,
     /// The table as JSON on stdout, beside the files
     #[arg(long)]
     json: bool,
@@ -213,13 +215,13 @@ pub fn run(args: &ReportArgs) -> Result<(), Fail> {
 }
 
 fn measure(args: &ReportArgs) -> Result<Report, Fail> {
-    let asked = args.of.look.asked(Work::default())?;
+    let request = args.of.scene.request(Work::default())?;
     let threads = args.threads.count();
     let mut progress = Progress::new(false).of("setting");
     progress.stage(&format!("reading {}", args.of.volume.display()));
-    let Opened { volume, info, orientation } = args.of.open(&asked)?;
+    let OpenedVolume { volume, info, orientation } = args.of.open(&request)?;
     let (name, digest) = (volume.name.clone(), info.digest.to_string());
-    let mut lab = Lab::new(volume, info, &asked, orientation, threads)?;
+    let mut lab = Lab::new(volume, info, &request, orientation, threads)?;
     let trials = sweep::trials(&lab, &args.only);
 
     let views = lab.views();
@@ -243,7 +245,7 @@ fn measure(args: &ReportArgs) -> Result<Report, Fail> {
         pixels_version: slabcast_common::PIXELS_VERSION,
         volume: name,
         digest,
-        tf: asked.transfer.name(),
+        tf: request.transfer.name(),
         size: lab.size(),
         views,
         judged_views: judged,

@@ -14,7 +14,7 @@ use slabcast_session::fail::Fail;
 use slabcast_session::machine;
 use slabcast_session::path_scenes::Stage;
 use slabcast_session::progress::{self, Progress, Step};
-use slabcast_session::request::{Asked, Opened};
+use slabcast_session::request::{OpenedVolume, RenderRequest};
 use slabcast_session::signals;
 use slabcast_sim::Link;
 use slabcast_trace::Pings;
@@ -40,8 +40,8 @@ fn work(slabs: u32) -> Work {
 /// What a study is made with.
 pub(super) struct Bench<'a> {
     args: &'a StudyArgs,
-    asked: Asked,
-    opened: Opened,
+    request: RenderRequest,
+    opened: OpenedVolume,
     link: Link,
     repeats: u32,
     views: usize,
@@ -56,23 +56,23 @@ pub(super) struct Bench<'a> {
 impl Bench<'_> {
     /// Opens the volume and refuses what can't be drawn of it.
     pub(super) fn open(args: &StudyArgs) -> Result<Bench<'_>, Fail> {
-        let mut asked = args.of.look.asked(work(paper::SLABS[0]))?;
-        if args.quick && asked.path.frames() > QUICK_VIEWS {
-            let first = asked.path.first_frame() as u32;
-            asked.path.range = Some([first, first + QUICK_VIEWS as u32 - 1]);
+        let mut request = args.of.scene.request(work(paper::SLABS[0]))?;
+        if args.quick && request.path.frames() > QUICK_VIEWS {
+            let first = request.path.first_frame() as u32;
+            request.path.range = Some([first, first + QUICK_VIEWS as u32 - 1]);
         }
         let mut progress = Progress::new(false).of("view");
         progress.stage(&format!("reading {}", args.of.volume.display()));
-        let opened = args.of.open(&asked)?;
+        let opened = args.of.open(&request)?;
         progress.stage("measuring what messages take");
         let pings = pinged();
         let cores = machine::cores();
-        let views = asked.path.frames();
+        let views = request.path.frames();
         // 2, 4, 8, 12 and 15 rendering nodes, and one.
         let live = std::iter::once(1).chain(NODES.map(|n| n - 1)).filter(|n| *n <= cores).collect();
         Ok(Bench {
             args,
-            asked,
+            request,
             opened,
             link: Link {
                 bytes_per_s: args.link.0.map(|bits| bits / 8.0 * GOODPUT),
@@ -87,15 +87,15 @@ impl Bench<'_> {
         })
     }
 
-    fn stage(&self, asked: &Asked) -> Result<Stage, Fail> {
-        Stage::new(&self.opened.volume, &self.opened.info, asked, self.opened.orientation)
+    fn stage(&self, request: &RenderRequest) -> Result<Stage, Fail> {
+        Stage::new(&self.opened.volume, &self.opened.info, request, self.opened.orientation)
     }
 
     /// Draws the tiles of some views and makes them ready to be simulated.
     fn bed(
         &mut self,
         stage: &Stage,
-        asked: &Asked,
+        request: &RenderRequest,
         views: usize,
         schedules: &[Schedule],
         repeats: u32,
@@ -105,16 +105,16 @@ impl Bench<'_> {
         let path = Measured {
             stage,
             frames: views,
-            work: asked.work,
+            work: request.work,
             wanted: wanted.map(|n| (TILES_A_NODE * f64::from(n)).ceil() as u64).collect(),
             edges: vec![32, 64],
             slab: true,
             region: schedules.contains(&Schedule::Region),
             repeats,
             pings: self.pings,
-            names: (self.opened.volume.name.clone(), asked.transfer.name()),
+            names: (self.opened.volume.name.clone(), request.transfer.name()),
         };
-        let jobs = measure::jobs(stage, views, asked.work)?;
+        let jobs = measure::jobs(stage, views, request.work)?;
         let trace = measure::measure(&path, (&mut self.progress, self.done))?;
         self.done += views;
         Bed::new(jobs, trace, self.link, schedules, NODES[4] - 1)
@@ -123,18 +123,18 @@ impl Bench<'_> {
     /// All of it, or what was finished when somebody said stop.
     pub(super) fn study(mut self) -> Result<Study, Fail> {
         let threads = machine::cores() as usize;
-        let mut asked = self.asked.clone();
+        let mut request = self.request.clone();
         self.progress.stage("cutting the volume into bricks");
-        let stage = self.stage(&asked)?;
+        let stage = self.stage(&request)?;
         let settings = self.settings();
         let of_effects: usize = settings.iter().map(|_| EFFECT_FRAMES.min(self.views)).sum();
-        let of_live = self.live.len() * 2 * self.asked.path.frames();
+        let of_live = self.live.len() * 2 * self.request.path.frames();
         let total = 2 * self.views + of_live + of_effects;
         self.progress.frames(total as u64, &format!("drawing the tiles of {total} views"));
 
         let schedules = [Schedule::Slab, Schedule::Region];
         let views = self.views;
-        let bed = self.bed(&stage, &asked, views, &schedules, self.repeats)?;
+        let bed = self.bed(&stage, &request, views, &schedules, self.repeats)?;
         let mut study = self.empty(&stage, &bed);
         if bed.trace.frames.len() < 2.min(views) {
             self.progress.end();
@@ -167,19 +167,19 @@ impl Bench<'_> {
                     detail: format!("{workers} workers of this machine"),
                     ..Step::default()
                 });
-                let told = live::run(&self.opened, &self.asked, workers, &works)?;
+                let told = live::run(&self.opened, &self.request, workers, &works)?;
                 for (slabs, frames) in paper::SLABS.into_iter().zip(&told) {
                     study.runs.push(runs::measured(slabs, workers, alone, frames));
                 }
-                self.done += 2 * self.asked.path.frames();
+                self.done += 2 * self.request.path.frames();
                 if signals::told() {
                     break;
                 }
             }
         }
         if !(stopped || signals::told()) {
-            asked.work = work(paper::SLABS[1]);
-            let five = self.bed(&stage, &asked, views, &[Schedule::Slab], self.repeats)?;
+            request.work = work(paper::SLABS[1]);
+            let five = self.bed(&stage, &request, views, &[Schedule::Slab], self.repeats)?;
             if five.trace.frames.len() == views {
                 study.runs.extend(runs::simulated(&five, Schedule::Slab, &self.live, threads)?);
             }
@@ -187,13 +187,13 @@ impl Bench<'_> {
         }
         drop(stage);
         let stretch = bed.stretch(Pace::Paper);
-        for (name, asked) in settings {
+        for (name, request) in settings {
             if stopped || signals::told() {
                 break;
             }
-            let stage = self.stage(&asked)?;
+            let stage = self.stage(&request)?;
             let n = EFFECT_FRAMES.min(views);
-            let bed = self.bed(&stage, &asked, n, &[Schedule::Slab], 1)?;
+            let bed = self.bed(&stage, &request, n, &[Schedule::Slab], 1)?;
             if bed.trace.frames.len() == n {
                 let is_radius = name.starts_with("radius");
                 let setting = effects::Setting::new(name, &bed, stretch)?;
@@ -214,16 +214,16 @@ impl Bench<'_> {
     }
 
     /// Radius and size, one at a time: a name and what is asked for.
-    fn settings(&self) -> Vec<(String, Asked)> {
+    fn settings(&self) -> Vec<(String, RenderRequest)> {
         let mut all = Vec::new();
-        let base = &self.asked;
+        let base = &self.request;
         if base.quality.kernel == Kernel::Gaussian {
             for radius in [1.0, 1.5, 2.0] {
                 let quality = Quality { radius, ..base.quality };
                 if quality.check().is_ok() {
-                    let mut asked = base.clone();
-                    asked.quality = quality;
-                    all.push((format!("radius {radius}"), asked));
+                    let mut request = base.clone();
+                    request.quality = quality;
+                    all.push((format!("radius {radius}"), request));
                 }
             }
         }
@@ -232,9 +232,9 @@ impl Bench<'_> {
         for n in times {
             let [w, h] = base.path.size.map(|x| x * n);
             if w.max(h) <= MAX_EDGE {
-                let mut asked = base.clone();
-                asked.path.size = [w, h];
-                all.push((format!("{w}x{h}"), asked));
+                let mut request = base.clone();
+                request.path.size = [w, h];
+                all.push((format!("{w}x{h}"), request));
             }
         }
         all
@@ -247,7 +247,7 @@ impl Bench<'_> {
              no numbers for them either."
                 .to_string(),
         ];
-        if self.asked.quality.kernel != Kernel::Gaussian {
+        if self.request.quality.kernel != Kernel::Gaussian {
             left_out.push("The kernel has one radius: only --kernel gaussian has several.".into());
         }
         if self.args.quick {
@@ -255,7 +255,7 @@ impl Bench<'_> {
                 "--quick: six views at most, each tile drawn once, not four times the size.".into(),
             );
         }
-        let q = &self.asked.quality;
+        let q = &self.request.quality;
         let [std, radius] = q.shape();
         Study {
             version: 1,
@@ -264,8 +264,8 @@ impl Bench<'_> {
             command: write::command(),
             volume: self.opened.volume.name.clone(),
             digest: self.opened.info.digest.to_string(),
-            tf: self.asked.transfer.name(),
-            size: self.asked.path.size,
+            tf: self.request.transfer.name(),
+            size: self.request.path.size,
             views: self.views,
             kernel: format!(
                 "{}, {std:.2} wide, cut at {radius}",

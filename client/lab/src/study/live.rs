@@ -9,13 +9,13 @@ use slabcast_common::quality::Work;
 use slabcast_common::stats::FrameStats;
 use slabcast_session::embedded::{Cluster, Crew};
 use slabcast_session::fail::Fail;
-use slabcast_session::request::{Asked, Opened};
+use slabcast_session::request::{OpenedVolume, RenderRequest};
 use slabcast_session::runtime;
 
 /// Renders the path with `workers`, once for each of `works`; the frames' statistics.
 pub(super) fn run(
-    opened: &Opened,
-    asked: &Asked,
+    opened: &OpenedVolume,
+    request: &RenderRequest,
     workers: u32,
     works: &[Work],
 ) -> Result<Vec<Vec<FrameStats>>, Fail> {
@@ -27,10 +27,10 @@ pub(super) fn run(
         joined(&cluster.handle(), workers).await?;
         let mut all = Vec::new();
         for &work in works {
-            let mut asked = asked.clone();
-            asked.work = work;
-            let request = asked.request(info, PixelFormat::Rgb8, false);
-            let frames = embedded_frames(cluster.handle(), request, |f| Ok(f.stats.clone()));
+            let mut request = request.clone();
+            request.work = work;
+            let message = request.to_message(info, PixelFormat::Rgb8, false);
+            let frames = embedded_frames(cluster.handle(), message, |f| Ok(f.stats.clone()));
             all.push(tokio::select! {
                 frames = frames => frames?,
                 trouble = cluster.trouble() => return Err(trouble),

@@ -1,4 +1,4 @@
-//! `slabcast study`: the paper's evaluation again, of any volume.
+//! `slabcast lab study`: the paper's evaluation again, of any volume.
 //!
 //! What was drawn and timed here and what is simulated from it are kept apart in every figure:
 //! [`simulate`] has the clusters that are not there, [`live`] those that are, [`bench`] the order in
@@ -27,12 +27,14 @@ use runs::Run;
 use serde::Serialize;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::output::Made;
-use slabcast_session::request::PictureOf;
+use slabcast_session::request::VolumeSceneArgs;
 use slabcast_session::{parse, signals};
 use std::path::PathBuf;
 
-/// Does the paper's evaluation again with a volume of yours: its Table 1, Figures 1, 3, 4, 5 and 7 and
-/// the effects of section 5.1, beside the paper's numbers, and says which of its sentences hold.
+/// Repeats the paper's evaluation with a volume of yours.
+///
+/// Its Table 1, Figures 1, 3, 4, 5 and 7 and the effects of section 5.1, beside the paper's numbers,
+/// and which of its sentences hold.
 ///
 /// Every macrotile of the path is drawn here, on one core, and timed. Clusters as large as this
 /// machine has cores are run for real; the paper's 3 to 16 nodes are simulated by the scheduler
@@ -40,9 +42,9 @@ use std::path::PathBuf;
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
-  slabcast study head.nrrd --up=-y --tf peer-opaque -o study/
-  slabcast study ct.nrrd --tf bone --quick
-  slabcast study ct.nrrd --tf vessels --link 1gbit --latency 100us -o study/ --force
+  slabcast lab study head.nrrd --up=-y --tf peer-opaque -o study/
+  slabcast lab study ct.nrrd --tf bone --quick
+  slabcast lab study ct.nrrd --tf vessels --link 1gbit --latency 100us -o study/ --force
 
 Files: index.html (all of it, with nothing beside it), study.json, and for each table and figure a
 CSV, and charts as SVG and PNG, light and dark.
@@ -51,7 +53,7 @@ Sadayappan, Mueller, 2000). Its setup is the subject: slab after slab in 3 and 5
 thickness, 18 views 5 degrees apart, 512x512, a master and 2 to 15 rendering nodes.")]
 pub struct StudyArgs {
     #[command(flatten)]
-    of: PictureOf,
+    of: VolumeSceneArgs,
     /// Folder for the files; it is made
     #[arg(short, long, value_name = "DIR", default_value = "slabcast-study")]
     out: PathBuf,

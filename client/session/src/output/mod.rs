@@ -126,12 +126,16 @@ impl Format {
 #[derive(clap::Args, Clone, Debug)]
 #[command(next_help_heading = "Output")]
 pub struct OutputArgs {
-    /// A folder for frame_0000.png and so on, made if missing; or one file: NAME.png or NAME.exr
-    /// of one frame, NAME.apng or NAME.y4m of all; - writes Y4M video to stdout
+    /// Folder for frame_0000.png and so on, or one file
+    ///
+    /// A folder is made if missing. NAME.png or NAME.exr has one frame, NAME.apng or NAME.y4m all of
+    /// them; - writes Y4M video to stdout.
     #[arg(short, long, value_name = "DIR|FILE|-", default_value = "slabcast-out/")]
     pub output: PathBuf,
-    /// png, png16 (16 bits), exr (linear floats, no background), apng or y4m (one moving picture)
-    /// [default: by the name of the file, png in a folder]
+    /// png, png16, exr, apng or y4m [default: by the name of -o]
+    ///
+    /// png16 has 16 bits, exr linear floats and no background; apng and y4m are one moving picture. A
+    /// folder gets png by default.
     #[arg(long, value_name = "FORMAT", hide_possible_values = true, value_enum)]
     pub format: Option<Format>,
     /// Frames a second of a moving picture
@@ -139,7 +143,7 @@ pub struct OutputArgs {
           value_parser = clap::value_parser!(u16).range(1..=240))]
     pub fps: u16,
     /// Also all frames, small, on one PNG
-    #[arg(long, value_name = "FILE.png", value_parser = parse::png)]
+    #[arg(long, value_name = "FILE.png", value_parser = parse::png, hide_short_help = true)]
     pub contact_sheet: Option<PathBuf>,
     /// Replace files that are there already
     #[arg(long)]

@@ -5,7 +5,7 @@
 
 use super::{Format, Frame, exr, png};
 use crate::fail::Fail;
-use crate::request::Asked;
+use crate::request::RenderRequest;
 use crate::transfer::Transfer;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -84,16 +84,16 @@ enum Ground {
 
 impl Provenance {
     /// Returns the request that makes the picture again.
-    pub fn request(&self) -> Asked {
+    pub fn request(&self) -> RenderRequest {
         let hash_inside = self.pixels_sha256.is_some();
         let transfer = Transfer::again(&self.transfer, self.preset.clone());
-        let mut asked = Asked::with_defaults(self.path.clone(), transfer);
-        asked.quality = self.quality;
-        asked.magnify = self.magnify;
-        asked.background = self.background();
-        asked.hashed = hash_inside;
-        asked.hash_inside = hash_inside;
-        asked
+        let mut request = RenderRequest::with_defaults(self.path.clone(), transfer);
+        request.quality = self.quality;
+        request.magnify = self.magnify;
+        request.background = self.background();
+        request.hashed = hash_inside;
+        request.hash_inside = hash_inside;
+        request
     }
 
     /// Returns what lies behind transparent pixels.
@@ -195,7 +195,7 @@ pub struct Recipe {
 impl Recipe {
     /// For a run on the volume that `info` describes.
     pub fn new(
-        asked: &Asked,
+        request: &RenderRequest,
         info: &VolumeInfo,
         orientation: Orientation,
         (format, fps): (Format, Option<u16>),
@@ -211,7 +211,7 @@ impl Recipe {
             background,
             want_trace: _,
             want_hash: _,
-        } = asked.request(info, format.pixels(asked.background), false);
+        } = request.to_message(info, format.pixels(request.background), false);
         let mut path = path;
         if let Some(t) = &mut path.turntable {
             // Another machine may have been told of other axes.
@@ -226,7 +226,7 @@ impl Recipe {
             k.front = k.front.or(front);
             k.up = k.up.or(Some(orientation.up));
             // Presets may get better; the picture stays.
-            Tween::fix(k, &info.summary).map_err(|e| asked.blame(&e))?;
+            Tween::fix(k, &info.summary).map_err(|e| request.blame(&e))?;
         }
         if let Some(f) = &mut path.flythrough {
             f.up = f.up.or(Some(orientation.up.vector().to_array()));
@@ -238,11 +238,11 @@ impl Recipe {
                 pixels_version: PIXELS_VERSION,
                 volume_sha256: info.digest.to_string(),
                 path,
-                preset: asked.transfer.preset().map(String::from),
-                transfer: asked.transfer.function(info).map_err(|e| asked.blame(&e))?,
+                preset: request.transfer.preset().map(String::from),
+                transfer: request.transfer.function(info).map_err(|e| request.blame(&e))?,
                 // Neither changes a byte.
                 quality: Quality { cull: true, grey: true, ..quality },
-                magnify: asked.magnify,
+                magnify: request.magnify,
                 background: match background {
                     Background::Transparent => Ground::Word("transparent".into()),
                     Background::Colour(c) => Ground::Colour(c),
@@ -253,7 +253,7 @@ impl Recipe {
                 pixels_sha256: None,
                 picture_sha256: None,
             },
-            hash_inside: asked.hash_inside,
+            hash_inside: request.hash_inside,
         })
     }
 

@@ -1,4 +1,4 @@
-//! `slabcast check convergence`: how fast do sheets come to the limit, and what stops them?
+//! `slabcast lab check convergence`: how fast do sheets come to the limit, and what stops them?
 //!
 //! The model says: with one colour in a sheet the error falls with the square of the thickness,
 //! with the linear rule with up to its fourth power, and the paper's additive opacity with its
@@ -17,7 +17,7 @@ use slabcast_common::quality::{Quality, Work};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress::{self, Progress};
-use slabcast_session::request::{Asked, LookArgs, ThreadArg};
+use slabcast_session::request::{RenderRequest, SceneArgs, ThreadArgs};
 use slabcast_session::volume;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -33,14 +33,14 @@ use sweep::{Off, Subject, Sweep};
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
-  slabcast check convergence
-  slabcast check convergence brain.nii.gz --tf brain --azimuth 30 --size 256x256
-  slabcast check convergence brain.nii.gz --plot plots/ --json")]
+  slabcast lab check convergence
+  slabcast lab check convergence brain.nii.gz --tf brain --azimuth 30 --size 256x256
+  slabcast lab check convergence brain.nii.gz --plot plots/ --json")]
 pub(crate) struct ConvergenceArgs {
     /// NRRD (.nrrd, .nhdr) or NIfTI (.nii, .nii.gz) files, or formula:NAME
     volumes: Vec<PathBuf>,
     #[command(flatten)]
-    look: LookArgs,
+    scene: SceneArgs,
     /// Pixels to compare; all of them if there are no more
     #[arg(long, value_name = "N", default_value = "512",
           value_parser = clap::value_parser!(u32).range(1..=1 << 26))]
@@ -59,7 +59,7 @@ pub(crate) struct ConvergenceArgs {
     #[arg(long, value_name = "DIR")]
     plot: Option<PathBuf>,
     #[command(flatten)]
-    threads: ThreadArg,
+    threads: ThreadArgs,
     /// One line of JSON a scene and projection
     #[arg(long)]
     json: bool,
@@ -76,8 +76,8 @@ pub(crate) fn run(args: &ConvergenceArgs) -> Result<(), Fail> {
             args.thinnest
         )));
     }
-    let asked = args.look.asked(Work::default())?;
-    let orientation = args.look.view.axes.orientation()?;
+    let request = args.scene.request(Work::default())?;
+    let orientation = args.scene.view.axes.orientation()?;
     let threads = args.threads.count();
     let thicknesses: Vec<f64> =
         (0..=args.thinnest.ilog2() + 1).map(|i| 2.0 / f64::from(1u32 << i)).collect();
@@ -86,7 +86,7 @@ pub(crate) fn run(args: &ConvergenceArgs) -> Result<(), Fail> {
     }
     let began = Instant::now();
     let mut progress = Progress::new(args.json).of("sweep");
-    let scenes = subjects(args, &asked, orientation)?;
+    let scenes = subjects(args, &request, orientation)?;
     progress.frames(scenes.iter().map(|s| s.1.len() as u64).sum(), "sweeps");
     let mut done = 0;
     for (subject, paths) in scenes {
@@ -94,7 +94,7 @@ pub(crate) fn run(args: &ConvergenceArgs) -> Result<(), Fail> {
         let mut sweeps = Vec::new();
         for (name, path) in &paths {
             let camera = path.camera(0, &subject.info.lattice, orientation);
-            let camera = camera.map_err(|e| asked.blame(&e))?;
+            let camera = camera.map_err(|e| request.blame(&e))?;
             let placed = args.placement && *name == "persp";
             let swept = sweep::sweep(
                 &subject,
@@ -129,7 +129,7 @@ type Made<'a> = Box<dyn Fn() -> Result<Subject, Fail> + 'a>;
 /// What is swept, each made when its turn comes, with the views of it.
 fn subjects<'a>(
     args: &'a ConvergenceArgs,
-    asked: &'a Asked,
+    request: &'a RenderRequest,
     orientation: Orientation,
 ) -> Result<Vec<(Made<'a>, Views)>, Fail> {
     let both = |path: &ViewPath| -> Views {
@@ -149,8 +149,8 @@ fn subjects<'a>(
             Some(json) => TransferFunction::from_json(json)
                 .map_err(|e| Fail::failed(format!("{name}: {e}")))?,
             None => {
-                asked.fit(&info, orientation, volume.anatomical)?;
-                asked.transfer.function(&info).map_err(|e| asked.blame(&e))?
+                request.fit(&info, orientation, volume.anatomical)?;
+                request.transfer.function(&info).map_err(|e| request.blame(&e))?
             }
         };
         let pixels = args.pixels as usize;
@@ -176,8 +176,9 @@ fn subjects<'a>(
         .volumes
         .iter()
         .map(|file| {
-            let make = move || subject(name_of(file), file, None, asked.path.size, asked.quality);
-            (Box::new(make) as Made, both(&asked.path))
+            let make =
+                move || subject(name_of(file), file, None, request.path.size, request.quality);
+            (Box::new(make) as Made, both(&request.path))
         })
         .collect())
 }

@@ -31,7 +31,7 @@ pub(super) struct Effort {
 }
 
 /// One scene, ready to be changed and drawn.
-pub(super) struct Asked<'a> {
+pub(super) struct InvarianceCase<'a> {
     pub(super) scene: Scene,
     pub(super) effort: Effort,
     pub(super) shot: Shot,
@@ -113,7 +113,7 @@ fn view(lattice: &Lattice, to_eye: [f64; 3], projection: ProjectionKind) -> Path
 pub(super) const BYTES: &str = "pixels whose bytes differ";
 pub(super) const LARGEST: &str = "largest difference";
 
-impl Asked<'_> {
+impl InvarianceCase<'_> {
     pub(super) fn picture(&self, shot: &Shot) -> Result<Picture, Fail> {
         Ok(shot.ready()?.picture(Cut::on(self.tools.threads)))
     }

@@ -1,0 +1,79 @@
+//! What becomes of a command line that is not understood: one line that says what to do.
+
+use crate::command::command;
+use clap::error::ErrorKind;
+use slabcast_session::fail::Fail;
+
+/// Ends a command line that clap didn't accept: prints help or version to stdout, or one line about
+/// the mistake to stderr. Returns the exit code.
+pub(crate) fn not_understood(e: &clap::Error) -> u8 {
+    match e.kind() {
+        ErrorKind::DisplayHelp | ErrorKind::DisplayVersion => {
+            // Colour follows stdout's own nature; a reader that has gone away is silent.
+            let _ = e.print();
+            0
+        }
+        ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => {
+            let _ = e.print();
+            2
+        }
+        _ => understood(e).end(),
+    }
+}
+
+/// Returns clap's refusal of the command line as one line.
+pub(crate) fn understood(e: &clap::Error) -> Fail {
+    let typed = std::env::args_os().skip(1).map(|a| a.to_string_lossy().into_owned());
+    Fail::usage(one_sentence(&e.to_string(), &typed.collect::<Vec<_>>()))
+}
+
+/// Returns clap's paragraphs as one line: what is wrong, its tips, and where to read on.
+fn one_sentence(text: &str, typed: &[String]) -> String {
+    let mut parts: Vec<String> = Vec::new();
+    // Where clap says no usage, the first word tells.
+    let mut help = match typed.first() {
+        Some(name) if command().find_subcommand(name).is_some() => {
+            format!("slabcast {name} --help")
+        }
+        _ => "slabcast --help".to_string(),
+    };
+    for line in text.lines().map(str::trim).filter(|l| !l.is_empty()) {
+        if let Some(usage) = line.strip_prefix("Usage: ") {
+            // `slabcast render [OPTIONS] ...`: the program, whatever it is called here, and the words before
+            // the first that is no name.
+            let name = |w: &&str| w.chars().all(|c| c.is_ascii_lowercase());
+            let mut words = usage.split_whitespace();
+            help = words.next().unwrap_or("slabcast").to_string();
+            for word in words.take_while(name) {
+                help = format!("{help} {word}");
+            }
+            help += " --help";
+        } else if line.starts_with("For more information") {
+            // Said in fewer words below.
+        } else if let Some(tip) = line.strip_prefix("tip: ") {
+            parts.push(tip.replace('\'', "`"));
+        } else {
+            let line = line.strip_prefix("error: ").unwrap_or(line);
+            let line = line.strip_prefix('[').and_then(|l| l.strip_suffix(']')).unwrap_or(line);
+            match parts.last_mut() {
+                // The list that a colon announced.
+                Some(last) if last.ends_with(':') || last.ends_with('>') => {
+                    last.push(' ');
+                    last.push_str(line);
+                }
+                _ => parts.push(line.replace('\'', "`")),
+            }
+        }
+    }
+    // Who gives a file alone wants to see it.
+    if let Some(word) = typed.first()
+        && parts.first().is_some_and(|p| p.starts_with("unrecognized subcommand"))
+        && (std::path::Path::new(word).exists() || word.starts_with("formula:"))
+    {
+        parts.push(format!("to see it, `slabcast render {word}`"));
+    }
+    format!("{}; see `{help}`", parts.join("; "))
+}
+
+#[cfg(test)]
+mod tests;

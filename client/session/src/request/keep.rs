@@ -1,0 +1,43 @@
+//! `--keep`: what is kept although the scene does not need it.
+
+use slabcast_common::quality::Keep;
+
+/// The flag.
+#[derive(clap::Args, Clone, Debug, Default)]
+pub struct KeepArgs {
+    /// Keep what the scene does not need: empty, normals, gradients, colours
+    ///
+    /// To see what leaving it out saves. In bricks: empty (voxels that nothing shows), normals (that
+    /// nothing shades), gradients (that modulate nothing); of a grey scene all three colours.
+    #[arg(
+        long,
+        value_name = "WHAT,...",
+        value_delimiter = ',',
+        value_enum,
+        hide_possible_values = true,
+        hide_short_help = true
+    )]
+    keep: Vec<Kept>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Kept {
+    Empty,
+    Normals,
+    Gradients,
+    #[value(alias = "colors")]
+    Colours,
+}
+
+impl KeepArgs {
+    /// Returns what is kept.
+    pub fn keep(&self) -> Keep {
+        let has = |kept| self.keep.contains(&kept);
+        Keep {
+            empty: has(Kept::Empty),
+            normals: has(Kept::Normals),
+            gradients: has(Kept::Gradients),
+            colours: has(Kept::Colours),
+        }
+    }
+}

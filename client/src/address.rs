@@ -1,8 +1,8 @@
-//! Where a master is: `host:port`, as people write it.
+//! Addresses of masters, `host:port`, as people write them.
 
 use crate::ClientError;
 
-/// The `host:port` of an address, with or without `http://`.
+/// Returns the `host:port` of an address that may begin with `http://`.
 pub(crate) fn authority(address: &str) -> Result<String, ClientError> {
     let wrong =
         |problem: &'static str| Err(ClientError::Address { address: address.to_owned(), problem });

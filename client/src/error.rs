@@ -6,7 +6,7 @@ use std::error::Error;
 use std::time::Duration;
 use tonic::{Code, Status};
 
-/// What went wrong, and what to do, in one line.
+/// An error of a call, or of a job; its text is one line with the remedy.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ClientError {
     /// The address can't be called.
@@ -14,7 +14,7 @@ pub enum ClientError {
     Address {
         /// The address as it was given.
         address: String,
-        /// What is wrong with it, and what to do.
+        /// Problem and remedy, for people.
         problem: &'static str,
     },
     /// Nobody answers at the address.
@@ -24,7 +24,7 @@ pub enum ClientError {
     Connect {
         /// The master's address.
         address: String,
-        /// What the system says.
+        /// Text of the system's error.
         cause: String,
     },
     /// The connection broke, or the master is ending or starting.
@@ -32,9 +32,9 @@ pub enum ClientError {
     Lost {
         /// The master's address.
         address: String,
-        /// What the system or the master says.
+        /// Text of the system's error, or of the master's status.
         cause: String,
-        /// How long the master asks to wait before the call is made again.
+        /// Time that the master asks to wait before the call is made again.
         retry_after: Option<Duration>,
     },
     /// The master stayed away for longer than was allowed.
@@ -45,9 +45,9 @@ pub enum ClientError {
     GaveUp {
         /// The master's address.
         address: String,
-        /// How long it was waited for.
+        /// Time that was spent waiting for it.
         after: Duration,
-        /// What the last try said.
+        /// Text of the last attempt's error.
         last: String,
         /// The first frame that is not whole.
         next_frame: u64,
@@ -59,7 +59,7 @@ pub enum ClientError {
         /// (`path.views.views[3].eye`); [`crate::local_field`] gives the name that flags and JSON
         /// files have for it.
         field: String,
-        /// What is wrong with it, and what to do.
+        /// Problem and remedy, for people.
         problem: String,
     },
     /// The request is longer than a master takes.
@@ -76,7 +76,7 @@ pub enum ClientError {
     /// The master does not know the job.
     #[error("{message}: list the jobs it knows, or submit the path again (same pixels)")]
     NotFound {
-        /// What the master says.
+        /// The master's message, for people.
         message: String,
     },
     /// The master no longer keeps the pixels of a frame.
@@ -87,15 +87,15 @@ pub enum ClientError {
     FrameNotKept {
         /// The first frame after it that the master keeps; `None` if it keeps none.
         first_kept_frame: Option<u64>,
-        /// What the master says.
+        /// The master's message, for people.
         message: String,
     },
     /// The master has as many jobs or watchers as it takes.
     #[error("{message} (ResourceExhausted): the master is full; try later, or cancel a job")]
     Full {
-        /// What the master says.
+        /// The master's message, for people.
         message: String,
-        /// How long the master asks to wait before the call is made again.
+        /// Time that the master asks to wait before the call is made again.
         retry_after: Option<Duration>,
     },
     /// The master answered with another status.
@@ -105,9 +105,9 @@ pub enum ClientError {
         code: Code,
         /// Reason of the status, if the master gave one that this version knows.
         reason: Option<Reason>,
-        /// What the master says.
+        /// The master's message, for people.
         message: String,
-        /// What to do.
+        /// Remedy, for people.
         remedy: &'static str,
     },
     /// The job can't be finished.
@@ -115,7 +115,7 @@ pub enum ClientError {
     JobFailed {
         /// Id of the job.
         job: String,
-        /// Why, and what to do.
+        /// The master's reason and remedy, for people.
         reason: String,
     },
     /// The job was cancelled.
@@ -132,7 +132,7 @@ pub enum ClientError {
     Protocol {
         /// The master's address.
         address: String,
-        /// What it did.
+        /// The rule that it broke, for people.
         problem: String,
     },
 }

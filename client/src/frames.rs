@@ -11,8 +11,8 @@ use std::time::Duration;
 use tokio::time::Instant;
 use tonic::Streaming;
 
-/// Time to wait for a master that is away, unless the caller says otherwise: a restart takes seconds,
-/// reading a large volume again up to a minute.
+/// Time to wait for a master that is away, unless the caller says otherwise: a restart takes
+/// seconds, reading a large volume again up to a minute.
 pub const PATIENCE: Duration = Duration::from_secs(120);
 
 /// First wait before a connection is made again; it doubles up to [`LONGEST_WAIT`].

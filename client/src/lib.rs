@@ -5,7 +5,9 @@
 //! 3. [`Client::follow`] the job and read updates until it ends:
 //!
 //! ```no_run
-//! # async fn f(request: slabcast_common::message::PathRequest) -> Result<(), slabcast_client::ClientError> {
+//! # use slabcast_client::ClientError;
+//! # use slabcast_common::message::PathRequest;
+//! # async fn f(request: PathRequest) -> Result<(), ClientError> {
 //! use slabcast_client::{Client, PATIENCE, Update};
 //! let client = Client::connect("127.0.0.1:7433").await?;
 //! let job = client.submit(&request).await?;
@@ -19,8 +21,8 @@
 //! # Ok(()) }
 //! ```
 //!
-//! Dropping a client or a stream never cancels a job; [`Client::cancel`] does. Errors are told apart
-//! by [`ClientError`], which reads the details of a master's status, not its text. This crate
+//! Dropping a client or a stream never cancels a job; [`Client::cancel`] does. Errors are told
+//! apart by [`ClientError`], which reads the details of a master's status, not its text. This crate
 //! refuses to know files, flags and progress bars: those are the program's.
 
 mod address;
@@ -43,8 +45,8 @@ use std::time::Duration;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Request, Response, Status};
 
-/// Time that a connection may take to be made. A host that is there answers within a round trip; one
-/// that is not is found out by this.
+/// Time that a connection may take to be made. A host that is there answers within a round trip;
+/// one that is not is found out by this.
 const CONNECT: Duration = Duration::from_secs(5);
 
 /// Time that a master may take to answer. It answers from memory; only a machine that swaps takes
@@ -136,14 +138,14 @@ impl Client {
     /// does the stream. [`Client::follow`] continues.
     ///
     /// # Errors
-    /// [`ClientError::NotFound`] if the master does not know the job, [`ClientError::Lost`] if it is
-    /// out of reach, [`ClientError::Full`] if it has no room for another watcher.
+    /// [`ClientError::NotFound`] if the master does not know the job, [`ClientError::Lost`] if it
+    /// is out of reach, [`ClientError::Full`] if it has no room for another watcher.
     pub async fn watch(&self, job: &str, from_frame: u64) -> Result<FrameStream, ClientError> {
         FrameStream::open(self.clone(), job.to_owned(), from_frame, None).await
     }
 
-    /// Streams the frames of a job from `from_frame` on. When the connection breaks it is made again
-    /// and the stream continues at the first frame that is not whole, as often as need be.
+    /// Streams the frames of a job from `from_frame` on. When the connection breaks it is made
+    /// again and the stream continues at the first frame that is not whole, as often as need be.
     ///
     /// # Errors
     /// [`ClientError::GaveUp`] if the master stays away for `patience`; else as [`Client::watch`],
@@ -160,8 +162,8 @@ impl Client {
     /// Returns one job.
     ///
     /// # Errors
-    /// [`ClientError::NotFound`] if the master does not know it, [`ClientError::Lost`] if the master
-    /// is out of reach.
+    /// [`ClientError::NotFound`] if the master does not know it, [`ClientError::Lost`] if the
+    /// master is out of reach.
     pub async fn job(&self, job: &str) -> Result<Job, ClientError> {
         let request = wire::GetJobRequest { job_id: job.to_owned() };
         let response = self.call(async |mut r, request| r.get_job(request).await, request).await?;
@@ -171,8 +173,8 @@ impl Client {
     /// Returns the master's jobs, newest first, at most `limit`.
     ///
     /// # Errors
-    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Protocol`] if it does not
-    /// talk like one.
+    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Protocol`] if it does
+    /// not talk like one.
     pub async fn jobs(&self, limit: usize) -> Result<Vec<Job>, ClientError> {
         let mut jobs = Vec::new();
         let mut page_token = String::new();
@@ -199,8 +201,8 @@ impl Client {
     /// Cancels a job and returns it as it is then: one that was done before stays done.
     ///
     /// # Errors
-    /// [`ClientError::NotFound`] if the master does not know it, [`ClientError::Lost`] if the master
-    /// is out of reach.
+    /// [`ClientError::NotFound`] if the master does not know it, [`ClientError::Lost`] if the
+    /// master is out of reach.
     pub async fn cancel(&self, job: &str) -> Result<Job, ClientError> {
         let request = wire::CancelJobRequest { job_id: job.to_owned() };
         let response =
@@ -211,8 +213,8 @@ impl Client {
     /// Returns the volume that the master serves.
     ///
     /// # Errors
-    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Protocol`] if it does not
-    /// talk like one.
+    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Protocol`] if it does
+    /// not talk like one.
     pub async fn volume(&self) -> Result<VolumeDescription, ClientError> {
         let request = wire::DescribeVolumeRequest {};
         let volume =
@@ -223,8 +225,8 @@ impl Client {
     /// Returns the master's workers, in the order in which they joined.
     ///
     /// # Errors
-    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Protocol`] if it does not
-    /// talk like one.
+    /// [`ClientError::Lost`] if the master is out of reach, [`ClientError::Protocol`] if it does
+    /// not talk like one.
     pub async fn workers(&self) -> Result<Vec<Worker>, ClientError> {
         let mut workers = Vec::new();
         let mut page_token = String::new();

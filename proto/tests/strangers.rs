@@ -1,5 +1,5 @@
-//! What strangers send: refused with the field's name, never a panic, and what is let in can be
-//! worked with.
+//! Messages of strangers: wrong ones are refused with the field's name and never panic, and those
+//! that are let in can be worked with.
 
 mod any;
 
@@ -47,7 +47,7 @@ fn take_apart(message: WatchMessage) {
     }
 }
 
-/// What was let in must hold what later code relies on.
+/// Uses a message that was let in as later code does.
 fn work_with(message: ToWorker) {
     match message {
         ToWorker::Scene(scene) => {
@@ -117,7 +117,8 @@ proptest! {
         all_doors(&spoil(bytes, &how));
         all_doors(&spoil(convert::submit_to_wire(&request).encode_to_vec(), &how));
         all_doors(&spoil(convert::volume_to_wire(&volume).encode_to_vec(), &how));
-        let frame = convert::frame_to_wire(0, [1, 1], PixelFormat::Rgb8, &vec![1; 3].into(), &stats, "");
+        let pixels = vec![1; 3].into();
+        let frame = convert::frame_to_wire(0, [1, 1], PixelFormat::Rgb8, &pixels, &stats, "");
         all_doors(&spoil(frame[0].encode_to_vec(), &how));
     }
 

@@ -100,8 +100,8 @@ fn control_endpoint(endpoint: &Endpoint) -> Endpoint {
         .max_frame_size(64 * 1024)
 }
 
-/// The endpoint of the Bricks stream, with small windows: bandwidth times round trip is in flight on
-/// this connection, and more only queues in the network.
+/// The endpoint of the Bricks stream, with small windows: bandwidth times round trip is in flight
+/// on this connection, and more only queues in the network.
 fn bricks_endpoint(endpoint: &Endpoint) -> Endpoint {
     endpoint
         .clone()

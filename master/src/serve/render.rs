@@ -57,7 +57,9 @@ fn job_not_found(id: &str) -> Status {
 fn state(state: &JobState) -> (model::JobState, String) {
     match state {
         JobState::Queued => (model::JobState::Queued, String::new()),
-        JobState::Preparing => (model::JobState::Preparing, "cutting the volume into bricks".into()),
+        JobState::Preparing => {
+            (model::JobState::Preparing, "cutting the volume into bricks".into())
+        }
         JobState::WaitingForWorkers => (
             model::JobState::WaitingForWorkers,
             "no worker is there; start one with `slabcast worker --master HOST:PORT`".into(),

@@ -45,7 +45,7 @@ pub enum WireError {
     Value {
         /// Path of the field.
         field: String,
-        /// What is wrong, and what to do.
+        /// Problem and remedy, for people.
         problem: String,
     },
 }

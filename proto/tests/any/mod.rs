@@ -130,7 +130,7 @@ fn leaves(pixels: &TilePixels, format: u64) -> Leaves {
     leaves
 }
 
-/// What frames are finished to.
+/// Formats of finished frames.
 fn finish() -> impl Strategy<Value = Finish> {
     let background = prop_oneof![
         Just(Background::Transparent),

@@ -166,8 +166,8 @@ pub(super) fn drop_to_wire(set: &BrickSetKey, bricks: &[BrickId]) -> Vec<wire::B
 /// Reads a message of the Bricks stream.
 ///
 /// A brick whose bytes are not whole is no error of the message: its id goes to
-/// [`BrickBatch::broken`], so that it is sent again. (Should the id be what broke, the brick that it
-/// was is missed by the lease that waits for it, which comes back by its deadline.)
+/// [`BrickBatch::broken`], so that it is sent again. (Should the id be what broke, the brick that
+/// it was is missed by the lease that waits for it, which comes back by its deadline.)
 ///
 /// # Errors
 /// [`WireError`] names the field that is wrong; bytes too short for an id are.

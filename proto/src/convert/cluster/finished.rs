@@ -11,7 +11,7 @@ use crate::convert::{MAX_TILE_PIXELS, WireError};
 use lz4_flex::block;
 use slabcast_common::leaves::Leaves;
 
-/// How finished pixels are compressed on their way to the master.
+/// Compression of finished pixels on their way to the master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Compression {
     /// They are not: the link has room, and compressing takes longer than it saves.

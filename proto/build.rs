@@ -6,6 +6,11 @@ use std::path::PathBuf;
 /// The two packages; what these import is compiled with them.
 const FILES: [&str; 2] = ["slabcast/render/v1/render.proto", "slabcast/cluster/v1/cluster.proto"];
 
+/// Fields of repeated messages, on the heap: an empty view takes two bytes on the wire, and a
+/// stranger may send two million of them (`MAX_RENDER_MESSAGE`).
+const BOXED: [&str; 6] =
+    ["PathView.eye", "PathView.target", "PathView.up", "Key.target", "Key.up", "Key.transfer"];
+
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     println!("cargo::rerun-if-changed=slabcast");
     let descriptors = protox::compile(FILES, ["."])?;
@@ -13,6 +18,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     std::fs::write(out.join("slabcast_descriptor.bin"), descriptors.encode_to_vec())?;
     // `Bytes` everywhere: a received brick or chunk is a part of the buffer it came in, not a
     // copy.
-    tonic_prost_build::configure().bytes(".").compile_fds(descriptors)?;
+    let mut configured = tonic_prost_build::configure().bytes(".");
+    for field in BOXED {
+        configured = configured.boxed(format!(".slabcast.render.v1.{field}"));
+    }
+    configured.compile_fds(descriptors)?;
     Ok(())
 }

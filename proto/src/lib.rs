@@ -79,8 +79,8 @@ pub const MAX_BRICKS_MESSAGE: usize = slabcast_common::link::MAX_BRICK_BATCH_BYT
 /// Largest message of RenderService in bytes, requests and responses: a path of 38,000 explicit
 /// views, or a transfer function of 65,536 points.
 ///
-/// A message costs up to 60 times its bytes in memory when it is made of empty views, hence no
-/// more than this for strangers; turntables and several jobs have no such limit.
+/// A message costs up to 70 times its bytes in memory when it is made of empty keys, hence no more
+/// than this for strangers; turntables and several jobs have no such limit.
 pub const MAX_RENDER_MESSAGE: usize = 4 << 20;
 
 /// Largest [`render_v1::WatchFramesResponse`] in bytes, as promised in `render.proto`.

@@ -316,7 +316,7 @@ fn wrong_path_is_refused_by_its_field_in_the_proto() {
         }),
         "transfer.function.colors: no point",
     );
-    let vec3 = |x| Some(Vec3 { x: Some(x), ..Vec3::default() });
+    let vec3 = |x| Some(Box::new(Vec3 { x: Some(x), ..Vec3::default() }));
     let view = render_v1::PathView {
         eye: vec3(f64::INFINITY),
         target: vec3(0.0),
@@ -338,6 +338,23 @@ fn wrong_path_is_refused_by_its_field_in_the_proto() {
     assert_eq!(status.code(), tonic::Code::InvalidArgument);
     let details = slabcast_proto::status::Details::from_status(&status);
     assert_eq!(details.field.map(|(field, _)| field).as_deref(), Some("client_key"));
+}
+
+/// The promise of `MAX_RENDER_MESSAGE`: an empty message in a list takes two bytes on the wire, and
+/// at most 70 times that in memory.
+#[test]
+fn empty_messages_in_lists_are_small_in_memory() {
+    use render_v1::{ColorPoint, GradientPoint, Key, OpacityPoint, PathView, Vec3};
+    for (name, bytes) in [
+        ("PathView", size_of::<PathView>()),
+        ("Key", size_of::<Key>()),
+        ("Vec3", size_of::<Vec3>()),
+        ("ColorPoint", size_of::<ColorPoint>()),
+        ("OpacityPoint", size_of::<OpacityPoint>()),
+        ("GradientPoint", size_of::<GradientPoint>()),
+    ] {
+        assert!(bytes <= 140, "{name} takes {bytes} bytes; put its messages into boxes (build.rs)");
+    }
 }
 
 #[test]

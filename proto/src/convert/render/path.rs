@@ -110,9 +110,9 @@ fn crop_from_wire(crop: wire::Crop) -> Result<Crop, WireError> {
 
 fn view_to_wire(v: &PathView) -> wire::PathView {
     wire::PathView {
-        eye: Some(vec3_to_wire(v.eye)),
-        target: Some(vec3_to_wire(v.target)),
-        up: Some(vec3_to_wire(v.up)),
+        eye: Some(Box::new(vec3_to_wire(v.eye))),
+        target: Some(Box::new(vec3_to_wire(v.target))),
+        up: Some(Box::new(vec3_to_wire(v.up))),
         projection: projection_to_wire(v.projection),
         height: v.height,
         fov: v.fov,
@@ -120,7 +120,7 @@ fn view_to_wire(v: &PathView) -> wire::PathView {
 }
 
 fn view_from_wire(view: wire::PathView) -> Result<PathView, WireError> {
-    let vec3 = |field: &str, v| vec3_from_wire(field, required(field, v)?);
+    let vec3 = |field: &str, v: Option<Box<_>>| vec3_from_wire(field, *required(field, v)?);
     Ok(PathView {
         eye: vec3("eye", view.eye)?,
         target: vec3("target", view.target)?,
@@ -193,19 +193,19 @@ fn key_to_wire(key: &Key) -> wire::Key {
     wire::Key {
         frame: key.at,
         viewpoint,
-        target: key.target.map(vec3_to_wire),
-        up: key.up.map(vec3_to_wire),
+        target: key.target.map(|v| Box::new(vec3_to_wire(v))),
+        up: key.up.map(|v| Box::new(vec3_to_wire(v))),
         projection: projection_to_wire(key.projection),
         height: key.height,
         fov: key.fov,
-        transfer: key.tf.as_ref().map(choice_to_wire),
+        transfer: key.tf.as_ref().map(|tf| Box::new(choice_to_wire(tf))),
     }
 }
 
 fn key_from_wire(key: wire::Key) -> Result<Key, WireError> {
     use wire::key::Viewpoint;
     let number = |field: &str, x: Option<f64>| x.map(|x| finite(field, x)).transpose();
-    let vec3 = |field: &str, v: Option<wire::Vec3>| v.map(|v| vec3_from_wire(field, v)).transpose();
+    let vec3 = |field: &str, v: Option<Box<_>>| v.map(|v| vec3_from_wire(field, *v)).transpose();
     let mut out = Key {
         at: number("frame", key.frame)?,
         target: vec3("target", key.target)?,
@@ -213,7 +213,10 @@ fn key_from_wire(key: wire::Key) -> Result<Key, WireError> {
         projection: projection_from_wire("projection", key.projection)?,
         height: number("height", key.height)?,
         fov: number("fov", key.fov)?,
-        tf: key.transfer.map_or(Ok(None), choice_from_wire).map_err(|e| e.within("transfer"))?,
+        tf: key
+            .transfer
+            .map_or(Ok(None), |choice| choice_from_wire(*choice))
+            .map_err(|e| e.within("transfer"))?,
         ..Key::default()
     };
     match key.viewpoint {

@@ -1,9 +1,9 @@
 //! Workers that are told to stop leave in order and are not taken for lost, whatever the master
 //! says meanwhile.
 
-use slabcast_common::path::Orientation;
 use slabcast_master::{Master, MasterConfig};
 use slabcast_render::Simd;
+use slabcast_scene::path::Orientation;
 use slabcast_worker::{Config, Ended};
 use std::io::Write;
 use std::time::Duration;

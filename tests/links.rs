@@ -6,16 +6,12 @@
 
 use slabcast_common::ids::SceneId;
 use slabcast_common::image::{Background, PixelFormat};
-use slabcast_common::message::{PathRequest, SceneSpec, ToWorker, TransferChoice};
-use slabcast_common::path::{Orientation, ProjectionKind, Turntable, ViewPath};
-use slabcast_common::presets;
+use slabcast_common::message::{SceneSpec, ToWorker};
 use slabcast_common::quality::{Borders, Quality, Schedule, Sums, Work};
 use slabcast_common::stats::FrameStats;
 use slabcast_common::transfer::{Classifier, TransferFunction};
-use slabcast_common::tween::Tween;
 use slabcast_common::view::View;
 use slabcast_common::volume::Volume;
-use slabcast_common::wanted::Wanted;
 use slabcast_master::jobs::{FinishedFrame, JobState, WatchItem};
 use slabcast_master::{Handle, Master, MasterConfig};
 use slabcast_proto::cluster_v1;
@@ -23,6 +19,12 @@ use slabcast_proto::convert::{self, BrickBatches, Bricks, Down};
 use slabcast_render::Simd;
 use slabcast_render::oracle::serial;
 use slabcast_render::{Frame, Scene};
+use slabcast_scene::brick_needs::BrickNeeds;
+use slabcast_scene::path::{Orientation, ProjectionKind, Turntable, ViewPath};
+use slabcast_scene::presets;
+use slabcast_scene::request::PathRequest;
+use slabcast_scene::transfer::TransferChoice;
+use slabcast_scene::tween::Tween;
 use slabcast_volumes::BrickStore;
 use slabcast_worker::{BrickCache, Config, Link};
 use std::sync::Arc;
@@ -36,7 +38,7 @@ fn request(key: &str, projection: ProjectionKind, work: Work) -> PathRequest {
     let turn = Turntable { frames: 3, elevation: 20.0, projection, ..Turntable::default() };
     PathRequest {
         client_key: key.into(),
-        path: ViewPath::turn([150, 110], turn),
+        path: ViewPath::from_turntable([150, 110], turn),
         transfer: TransferChoice::Name("auto".into()),
         quality: Quality::default(),
         work,
@@ -58,7 +60,7 @@ fn truth(request: &PathRequest) -> Vec<String> {
     let info = volume.info(digest);
     let transfer = presets::by_name("auto", &info.summary).unwrap();
     let quality = Quality { sums: Sums::I32, ..request.quality };
-    let wanted = Wanted::of(&transfer, &info, quality.compositing);
+    let wanted = BrickNeeds::for_transfer(&transfer, &info, quality.compositing);
     let store = BrickStore::build(&volume, digest, &wanted);
     let bricks: Vec<_> = store.infos().iter().map(|i| store.brick(i.id).unwrap()).collect();
     let spec = SceneSpec { id: SceneId(1), volume: info, transfer, quality, bricks: store.key() };
@@ -342,16 +344,17 @@ async fn tiles_finished_on_workers_give_the_bytes_of_tiles_sent_as_sums() {
 fn truth_of_each(path: &ViewPath, default: &TransferFunction) -> Vec<String> {
     let volume = volume();
     let info = volume.info(volume.digest());
-    let tween = Tween::of(path, &info.summary).unwrap();
+    let tween = Tween::from_path(path, &info.summary).unwrap();
     let cameras = path.prepare(&info.lattice, orientation()).unwrap();
     let frame = |i: usize| {
         let at = (path.first_frame() + i) as f64;
-        let transfer = tween.as_ref().map_or(default.clone(), |t| t.at(at));
+        let transfer = tween.as_ref().map_or(default.clone(), |t| t.transfer_at(at));
         let classifier = Classifier::new(&transfer, &info, Quality::default().compositing);
-        let sums = classifier.sums(&Quality::default(), &info.lattice).unwrap();
+        let sums = classifier.choose_sums(&Quality::default(), &info.lattice).unwrap();
         let quality = Quality { sums, ..Quality::default() };
-        let crop = path.crop.map(|c| c.of(&info.lattice).unwrap());
-        let wanted = Wanted { crop, ..Wanted::of(&transfer, &info, quality.compositing) };
+        let crop = path.crop.map(|c| c.resolve(&info.lattice).unwrap());
+        let wanted =
+            BrickNeeds { crop, ..BrickNeeds::for_transfer(&transfer, &info, quality.compositing) };
         let store = BrickStore::build(&volume, info.digest, &wanted);
         let bricks: Vec<_> = store.infos().iter().map(|i| store.brick(i.id).unwrap()).collect();
         let volume = info.clone();

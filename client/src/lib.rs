@@ -6,7 +6,7 @@
 //!
 //! ```no_run
 //! # use slabcast_client::ClientError;
-//! # use slabcast_common::message::PathRequest;
+//! # use slabcast_scene::request::PathRequest;
 //! # async fn f(request: PathRequest) -> Result<(), ClientError> {
 //! use slabcast_client::{Client, PATIENCE, Update};
 //! let client = Client::connect("127.0.0.1:7433").await?;
@@ -36,9 +36,9 @@ pub use slabcast_proto::model::{Job, JobNotice, JobState, VolumeDescription, Wor
 pub use slabcast_proto::status::Reason;
 
 use prost::Message;
-use slabcast_common::message::PathRequest;
 use slabcast_proto::render_v1::{self as wire, render_service_client::RenderServiceClient};
 use slabcast_proto::{MAX_RENDER_MESSAGE, convert};
+use slabcast_scene::request::PathRequest;
 use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;

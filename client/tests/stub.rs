@@ -3,14 +3,15 @@
 use bytes::Bytes;
 use slabcast_client::{Client, ClientError, FrameStream, JobState, ReceivedFrame, Update};
 use slabcast_common::image::{Background, PixelFormat};
-use slabcast_common::message::{PathRequest, TransferChoice};
-use slabcast_common::path::{Turntable, ViewPath};
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::stats::{FrameMs, FrameStats};
 use slabcast_proto::model::{Job, JobNotice};
 use slabcast_proto::render_v1::render_service_server::{RenderService, RenderServiceServer};
 use slabcast_proto::status::Reason;
 use slabcast_proto::{convert, render_v1 as wire};
+use slabcast_scene::path::{Turntable, ViewPath};
+use slabcast_scene::request::PathRequest;
+use slabcast_scene::transfer::TransferChoice;
 use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::pin::Pin;
@@ -241,7 +242,7 @@ async fn frame(frames: &mut FrameStream) -> ReceivedFrame {
 fn request(key: &str) -> PathRequest {
     PathRequest {
         client_key: key.into(),
-        path: ViewPath::turn([64, 64], Turntable::default()),
+        path: ViewPath::from_turntable([64, 64], Turntable::default()),
         transfer: TransferChoice::Name("auto".into()),
         quality: Quality::default(),
         work: Work::default(),
@@ -409,12 +410,15 @@ async fn status_details_become_typed_errors_with_a_remedy() {
     assert!(matches!(e, ClientError::NotFound { .. }), "{e}");
     let e = client.follow("job-9", 0, Duration::from_secs(60)).await.unwrap_err();
     assert!(matches!(e, ClientError::NotFound { .. }), "no patience with what will not pass: {e}");
-    let bad = PathRequest { path: ViewPath::turn([0, 64], Turntable::default()), ..request("a") };
+    let bad = PathRequest {
+        path: ViewPath::from_turntable([0, 64], Turntable::default()),
+        ..request("a")
+    };
     let e = client.submit(&bad).await.unwrap_err();
     assert_eq!(e.to_string(), "refused: path.width: 0 pixels; give 1 to 8192");
     let (field, problem) = ("path.width".into(), "0 pixels; give 1 to 8192".into());
     assert_eq!(e, ClientError::InvalidField { field, problem });
-    let path = ViewPath::turn([64, 64], Turntable { frames: 0, ..Turntable::default() });
+    let path = ViewPath::from_turntable([64, 64], Turntable { frames: 0, ..Turntable::default() });
     let e = client.submit(&PathRequest { path, ..request("a") }).await.unwrap_err();
     assert!(
         matches!(&e, ClientError::InvalidField { field, .. } if field == "path.turntable.frames"),
@@ -435,7 +439,7 @@ async fn status_details_become_typed_errors_with_a_remedy() {
 #[tokio::test]
 async fn request_too_long_is_refused_before_it_is_sent() {
     let client = Client::connect(&serve(&Script::default()).await.to_string()).await.unwrap();
-    let view = slabcast_common::path::PathView {
+    let view = slabcast_scene::path::PathView {
         eye: [1.0; 3],
         target: [0.0; 3],
         up: [0.0, 0.0, 1.0],
@@ -444,7 +448,7 @@ async fn request_too_long_is_refused_before_it_is_sent() {
         fov: None,
     };
     let views = vec![view; 100_000];
-    let path = ViewPath::of_views([64, 64], views);
+    let path = ViewPath::from_views([64, 64], views);
     let e = client.submit(&PathRequest { path, ..request("a") }).await.unwrap_err();
     assert!(matches!(e, ClientError::TooLong { .. }), "{e}");
 }

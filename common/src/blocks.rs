@@ -29,7 +29,7 @@ pub struct Block {
 impl Blocks {
     /// Blocks of `2^shift` voxels along each axis, or of twice as many again and again, until there are
     /// at most `most` (or one).
-    pub fn of(bricks: &[BrickInfo], shift: u32, most: usize) -> Blocks {
+    pub fn new(bricks: &[BrickInfo], shift: u32, most: usize) -> Blocks {
         let mut keyed: Vec<([u32; 3], u32)> = Vec::with_capacity(bricks.len());
         for shift in shift..32 {
             keyed.clear();
@@ -90,7 +90,7 @@ mod tests {
             BrickInfo { id: BrickId(i), tight, voxels: 512, bytes: 99 }
         };
         let bricks: Vec<_> = (0..125_000).filter(|i| i % 3 > 0).map(brick).collect();
-        let blocks = Blocks::of(&bricks, 5, 2048);
+        let blocks = Blocks::new(&bricks, 5, 2048);
         let n = blocks.all().len();
         assert!(n <= 2048 && n > 2048 / 16, "{n}");
         let mut seen = vec![false; bricks.len()];
@@ -104,8 +104,8 @@ mod tests {
             }
         }
         assert!(seen.iter().all(|s| *s));
-        assert_eq!(Blocks::of(&bricks, 5, 0).all().len(), 1);
-        assert!(Blocks::of(&[], 5, 2048).all().is_empty());
+        assert_eq!(Blocks::new(&bricks, 5, 0).all().len(), 1);
+        assert!(Blocks::new(&[], 5, 2048).all().is_empty());
     }
 
     proptest! {

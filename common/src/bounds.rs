@@ -21,14 +21,14 @@ const HEADROOM: f64 = 1.05;
 
 /// Raw units of an integer sum for one unit of payload: 2^30 is a sheet of `thickness` vox full
 /// of the largest payload (NUMERICS.md section 3).
-pub fn raw_per_payload(payload_max: f64, thickness: f64) -> f32 {
+pub fn i32_units_per_payload(payload_max: f64, thickness: f64) -> f32 {
     let solid = HEADROOM * payload_max * thickness;
     if solid > 0.0 { (f64::from(1u32 << 30) / solid) as f32 } else { 1.0 }
 }
 
 /// Raw units of a 16-bit sum for one unit of payload: 32767 is a sheet of `thickness` vox full of
 /// the largest payload.
-pub fn short_per_payload(payload_max: f64, thickness: f64) -> f64 {
+pub fn i16_units_per_payload(payload_max: f64, thickness: f64) -> f64 {
     let solid = HEADROOM * payload_max * thickness;
     if solid > 0.0 { 32767.0 / solid } else { 1.0 }
 }
@@ -81,12 +81,12 @@ pub fn quantisation(scene: &SceneSpec, view: &View, within: &TightBox) -> f64 {
     let unit = match q.sums {
         // Payload, section, row and contribution are each rounded by half a unit, and then times
         // weights below one; three weights by 2^-16, times a payload below 2^15: 3.5 units.
-        Sums::I16 => 3.5 / short_per_payload(payload_max, d),
+        Sums::I16 => 3.5 / i16_units_per_payload(payload_max, d),
         _ => {
-            let [std, _] = q.shape();
+            let [std, _] = q.kernel_shape();
             let down = Profile::new(q.kernel, view.kernel_std.y, view.kernel_radius.y);
             let weight = down.at(0.0) * view.kernel_std.y / std;
-            0.5 * weight.max(1.0) / f64::from(raw_per_payload(payload_max, d))
+            0.5 * weight.max(1.0) / f64::from(i32_units_per_payload(payload_max, d))
         }
     };
     let delta = (met + 1.0) * unit * longest_secant(view);
@@ -144,7 +144,7 @@ struct Change<'a> {
 /// What the sum over a lattice of ones is at most: one and the kernel's ripple, which is below 0.6 % for
 /// Gaussians of 0.6 (NUMERICS.md section 4) and grows to either side. A tent's is 39 %.
 fn ripple(quality: &Quality) -> f64 {
-    let [std, _] = quality.shape();
+    let [std, _] = quality.kernel_shape();
     let even = quality.kernel != Kernel::Tent && std >= 0.55;
     if even { HEADROOM } else { 1.6 }
 }
@@ -154,7 +154,7 @@ impl Change<'_> {
         scene: &SceneSpec,
         view: &'a View,
         within: &TightBox,
-        alpha_most: Option<f64>,
+        max_alpha: Option<f64>,
         beyond: [f64; 3],
     ) -> Change<'a> {
         let q = &scene.quality;
@@ -168,7 +168,7 @@ impl Change<'_> {
             .is_some_and(|Projected { rect: r, .. }| r.x0 > 0 && r.y0 > 0 && r.x1 < w && r.y1 < h);
         let parallel = matches!(view.projection, Projection::Ortho { .. });
         let straight = parallel && view.kernel_lean.is_none();
-        let open = alpha_most.filter(|&a| straight && inside && 1.0 - a > q.eps.max(1e-6));
+        let open = max_alpha.filter(|&a| straight && inside && 1.0 - a > q.eps.max(1e-6));
         Change {
             view,
             drawn: std::array::from_fn(|a| Profile::new(q.kernel, std[a], radius[a])),
@@ -281,7 +281,7 @@ impl Axis {
     }
 }
 
-/// Bound of rounded positions: half a part of a pixel across and half a phase in depth. `alpha_most` is the
+/// Bound of rounded positions: half a part of a pixel across and half a phase in depth. `max_alpha` is the
 /// picture's largest opacity, where it is known. `None` for the paper's opacities, which add up to another
 /// picture.
 ///
@@ -294,7 +294,7 @@ pub fn rounding(
     scene: &SceneSpec,
     view: &View,
     within: &TightBox,
-    alpha_most: Option<f64>,
+    max_alpha: Option<f64>,
 ) -> Option<f64> {
     let q = &scene.quality;
     if q.compositing == Compositing::Paper {
@@ -316,7 +316,7 @@ pub fn rounding(
     let along = across + lean_x.abs() * deep;
     let along = if row == 0.0 { along } else { along + across + row.abs() * down };
     let off = [along + width * view.kernel_radius[0], down + width * view.kernel_radius[1], deep];
-    let change = Change::new(scene, view, within, alpha_most, off);
+    let change = Change::new(scene, view, within, max_alpha, off);
     let moved = |a: usize, x: f64| {
         let p = &change.drawn[a];
         let here = p.at(x);
@@ -341,7 +341,7 @@ pub fn truncation(
     scene: &SceneSpec,
     view: &View,
     within: &TightBox,
-    alpha_most: Option<f64>,
+    max_alpha: Option<f64>,
 ) -> Option<f64> {
     let q = &scene.quality;
     if q.compositing == Compositing::Paper {
@@ -352,7 +352,7 @@ pub fn truncation(
     }
     // Beyond 6.5 deviations a Gaussian has 1e-10 of its integral.
     let beyond = [0, 1, 2].map(|a| (6.5 * view.kernel_std[a] - view.kernel_radius[a]).max(0.0));
-    let change = Change::new(scene, view, within, alpha_most, beyond);
+    let change = Change::new(scene, view, within, max_alpha, beyond);
     let cut = |a: usize, x: f64| {
         let std = view.kernel_std[a];
         let bell = libm::exp(-0.5 * x * x / (std * std)) / (std * (2.0 * PI).sqrt());

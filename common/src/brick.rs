@@ -8,7 +8,7 @@ use crate::ids::BrickId;
 use crate::volume::{Digest32, SampleKind, Samples};
 
 /// Edge of a brick in voxels (the paper's choice, section 4.2).
-pub const BRICK: u32 = 8;
+pub const BRICK_EDGE: u32 = 8;
 /// Voxels of a full brick.
 pub const BRICK_VOXELS: usize = 512;
 /// Most bricks a volume may have: a 4096^3 volume has 2^27.
@@ -23,8 +23,8 @@ pub struct BrickGrid {
 
 impl BrickGrid {
     /// The grid of a volume with `dims` samples.
-    pub fn of(dims: [u32; 3]) -> Self {
-        BrickGrid { dims: dims.map(|n| n.div_ceil(BRICK)) }
+    pub fn new(dims: [u32; 3]) -> Self {
+        BrickGrid { dims: dims.map(|n| n.div_ceil(BRICK_EDGE)) }
     }
 
     /// Number of bricks, relevant or not.
@@ -41,7 +41,7 @@ impl BrickGrid {
     #[inline]
     pub fn corner(&self, id: BrickId) -> [u32; 3] {
         let [nx, ny, _] = self.dims;
-        [id.0 % nx * BRICK, id.0 / nx % ny * BRICK, id.0 / nx / ny * BRICK]
+        [id.0 % nx * BRICK_EDGE, id.0 / nx % ny * BRICK_EDGE, id.0 / nx / ny * BRICK_EDGE]
     }
 
     /// The brick at grid position (x, y, z).
@@ -159,7 +159,7 @@ impl Brick {
         for &i in &index {
             let i = i % BRICK_VOXELS as u16;
             present[usize::from(i) / 64] |= 1 << (i % 64);
-            let p = local(i);
+            let p = local_position(i);
             for a in 0..3 {
                 lo[a] = lo[a].min(p[a] as u8);
                 hi[a] = hi[a].max(p[a] as u8);
@@ -190,20 +190,20 @@ impl Brick {
 
     /// Which of its 512 voxels there are: a bit each, by local index.
     #[inline]
-    pub fn present(&self) -> &[u64; BRICK_VOXELS / 64] {
+    pub fn occupancy(&self) -> &[u64; BRICK_VOXELS / 64] {
         &self.present
     }
 
     /// The tight box, in index coordinates of the volume.
     #[inline]
-    pub fn tight(&self, grid: &BrickGrid) -> TightBox {
+    pub fn tight_box(&self, grid: &BrickGrid) -> TightBox {
         let corner = grid.corner(self.id);
         let at = |end: usize| std::array::from_fn(|a| corner[a] + u32::from(self.tight[end][a]));
         TightBox { lo: at(0), hi: at(1) }
     }
 
     /// Bytes it takes in memory, its own overhead included.
-    pub fn bytes_in_memory(&self) -> usize {
+    pub fn memory_bytes(&self) -> usize {
         let n = self.len();
         std::mem::size_of::<Brick>()
             + n * (2
@@ -265,7 +265,7 @@ impl Brick {
 
     /// The name of a brick whose encoding is broken, to ask for it again; `None` where there is none. If a
     /// single bit of the name is what is wrong, the checksum tells which one.
-    pub fn name(bytes: &[u8]) -> Option<BrickId> {
+    pub fn peek_id(bytes: &[u8]) -> Option<BrickId> {
         let (body, crc) = bytes.split_at_checked(bytes.len().checked_sub(TAIL)?)?;
         let id = u32::from_le_bytes(*bytes.first_chunk()?);
         let (Ok(crc), Some(rest)) = (crc.try_into(), body.get(4..)) else {
@@ -347,7 +347,7 @@ impl Brick {
 
 /// Position inside its brick of local index `i`.
 #[inline]
-pub fn local(i: u16) -> [u32; 3] {
+pub fn local_position(i: u16) -> [u32; 3] {
     let i = u32::from(i);
     [i & 7, (i >> 3) & 7, i >> 6]
 }
@@ -426,11 +426,11 @@ mod tests {
 
     #[test]
     fn grid_names_every_brick_once() {
-        let g = BrickGrid::of([17, 8, 9]);
+        let g = BrickGrid::new([17, 8, 9]);
         assert_eq!(g.dims, [3, 1, 2]);
         for id in 0..g.len() as u32 {
             let c = g.corner(BrickId(id));
-            assert_eq!(g.id(c.map(|x| x / BRICK)), BrickId(id));
+            assert_eq!(g.id(c.map(|x| x / BRICK_EDGE)), BrickId(id));
         }
     }
 }

@@ -31,7 +31,7 @@ mod tests {
 
     #[test]
     fn magnitudes_come_back_within_half_a_step() {
-        let s = ValueSummary::of(&Samples::U8(vec![10, 210]), ValueMap::IDENTITY);
+        let s = ValueSummary::from_samples(&Samples::U8(vec![10, 210]), ValueMap::IDENTITY);
         for i in 0..=1000 {
             let share = f64::from(i) / 1000.0;
             let back = decode_magnitude(encode_magnitude(share * 200.0, &s));
@@ -40,7 +40,7 @@ mod tests {
         assert_eq!(encode_magnitude(f64::NAN, &s), 0);
         assert_eq!(encode_magnitude(f64::INFINITY, &s), 255);
         assert_eq!(encode_magnitude(1e9, &s), 255);
-        let flat = ValueSummary::of(&Samples::U8(vec![7]), ValueMap::IDENTITY);
+        let flat = ValueSummary::from_samples(&Samples::U8(vec![7]), ValueMap::IDENTITY);
         assert_eq!(encode_magnitude(3.0, &flat), 0);
     }
 }

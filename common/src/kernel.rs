@@ -36,10 +36,10 @@ pub struct Profile {
 }
 
 impl Profile {
-    /// `kernel` of deviation `std` and `radius`, which are those of [`Quality::shape`] times the
+    /// `kernel` of deviation `std` and `radius`, which are those of [`Quality::kernel_shape`] times the
     /// length of a step of the lattice.
     ///
-    /// [`Quality::shape`]: crate::quality::Quality::shape
+    /// [`Quality::kernel_shape`]: crate::quality::Quality::kernel_shape
     pub fn new(kernel: Kernel, std: f64, radius: f64) -> Self {
         match kernel {
             Kernel::Gaussian => Profile::gaussian(std, radius),
@@ -333,7 +333,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn profiles() -> [Profile; 4] {
-        let shape = |kernel| Quality { kernel, ..Quality::default() }.shape();
+        let shape = |kernel| Quality { kernel, ..Quality::default() }.kernel_shape();
         let of = |kernel, step: f64| {
             let [std, radius] = shape(kernel);
             Profile::new(kernel, std * step, radius * step)

@@ -11,30 +11,25 @@
 pub mod blocks;
 pub mod bounds;
 pub mod brick;
-pub mod colour;
 pub mod gradient;
 pub mod ids;
 pub mod image;
 pub mod kernel;
-pub mod leaves;
 pub mod link;
+pub mod lookahead;
 pub mod math;
 pub mod message;
 pub mod occlusion;
-pub mod paraview;
-pub mod path;
-pub mod presets;
 pub mod protocol;
 pub mod quality;
 pub mod region;
 pub mod shade;
 pub mod slab;
+pub mod spelling;
 pub mod stats;
 pub mod transfer;
-pub mod tween;
 pub mod view;
 pub mod volume;
-pub mod wanted;
 
 /// Version of the arithmetic behind the pixels. Two programs that agree on it give the same
 /// bytes for the same view; a change of any golden hash raises it (CONTRACTS.md, Exactness).

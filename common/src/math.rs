@@ -7,7 +7,7 @@
 //! `|r| <= ln 2 / 2`, whose remainder (5e-9) is below half an ulp of f32.
 
 /// 1.5 * 2^23: floats from there on are integers.
-pub const MAGIC: f32 = 12_582_912.0;
+pub const ROUND_F32: f32 = 12_582_912.0;
 /// ln 2 in two parts; the first has 15 trailing zero bits, so that its products with small integers are
 /// exact.
 pub const LN2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
@@ -34,11 +34,11 @@ fn exp_parts(x: f32) -> (f32, f32) {
     let x = if x > -87.0 { x } else { -87.0 };
     // Adding it rounds to the nearest integer, ties to even, and leaves that integer in the low bits: no
     // conversion instruction, the same on every machine.
-    let shifted = x * std::f32::consts::LOG2_E + MAGIC;
-    let n = shifted - MAGIC;
+    let shifted = x * std::f32::consts::LOG2_E + ROUND_F32;
+    let n = shifted - ROUND_F32;
     let r = (x - n * LN2[0]) - n * LN2[1];
     let p = polynomial(&TAYLOR, r);
-    let exponent = (shifted.to_bits() as i32).wrapping_sub(MAGIC.to_bits() as i32);
+    let exponent = (shifted.to_bits() as i32).wrapping_sub(ROUND_F32.to_bits() as i32);
     (f32::from_bits(((exponent + 127) as u32) << 23), p * r)
 }
 
@@ -59,20 +59,20 @@ pub fn opacity(tau: f32) -> f32 {
 }
 
 /// Below this optical depth the series of [`phi`] takes over from its closed form.
-pub const SWITCH: f32 = 0.25;
+pub const PHI_SERIES_BELOW: f32 = 0.25;
 
 /// The weight of a colour's change through a sheet: `phi = a / tau + a / 2 - 1` (NUMERICS.md
 /// section 1.1). `a` must be `opacity(tau)` and `per_tau` 1 / tau to some digits; `tau > 0`.
 #[inline(always)]
 pub fn phi(tau: f32, per_tau: f32, a: f32) -> f32 {
-    let (small, large) = phis(tau, per_tau, a);
-    if tau < SWITCH { small } else { large }
+    let (small, large) = phi_both(tau, per_tau, a);
+    if tau < PHI_SERIES_BELOW { small } else { large }
 }
 
-/// Both forms of [`phi`]: for depths below [`SWITCH`], and for others. Who needs them on lanes works
+/// Both forms of [`phi`]: for depths below [`PHI_SERIES_BELOW`], and for others. Who needs them on lanes works
 /// out both and then chooses.
 #[inline(always)]
-pub fn phis(tau: f32, per_tau: f32, a: f32) -> (f32, f32) {
+pub fn phi_both(tau: f32, per_tau: f32, a: f32) -> (f32, f32) {
     // The closed form loses all digits below tau = 1e-3; the series takes over where both are
     // good to 1e-7 absolute.
     let small = polynomial(&PHI, tau) * tau * tau;

@@ -6,15 +6,12 @@
 
 use crate::brick::{Brick, BrickGrid, BrickInfo, BrickSetKey};
 use crate::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
-use crate::image::{Background, PixelFormat, TilePixels, TileState};
-use crate::leaves::{Finish, Leaves};
+use crate::image::{PixelEncoding, SparseTile, TilePixels, TileState};
 use crate::occlusion::Rect;
-use crate::path::ViewPath;
 use crate::protocol::ProtocolVersions;
-use crate::quality::{Quality, Work};
+use crate::quality::Quality;
 use crate::region::parts;
 use crate::slab::SheetRange;
-pub use crate::transfer::TransferChoice;
 use crate::transfer::TransferFunction;
 use crate::view::View;
 use crate::volume::VolumeInfo;
@@ -70,35 +67,35 @@ pub struct RegionLease {
     /// Some of its pixels are drawn in thinner sheets, too.
     pub estimate: bool,
     /// What another worker has drawn of it; `None`: it starts from nothing.
-    pub begun: Option<Arc<Begun>>,
+    pub begun: Option<Arc<Checkpoint>>,
 }
 
 /// A region as somebody left it who gave it away.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Begun {
+pub struct Checkpoint {
     /// The next sheet to draw of each of its parts ([`crate::region::parts`]), in their order; `None`: it is at its end.
     pub sheets: Vec<Option<i32>>,
     /// Its pixels after the sheets before these.
     pub pixels: TilePixels,
 }
 
-impl Begun {
+impl Checkpoint {
     /// The same of a piece of its `tile`.
     ///
     /// # Panics
     /// If the piece is not inside the tile.
-    pub fn piece(&self, tile: Rect, piece: Rect) -> Begun {
+    pub fn crop(&self, tile: Rect, piece: Rect) -> Checkpoint {
         let of = |part: Rect| {
             let mut all = parts(tile).zip(&self.sheets);
             all.find(|(whole, _)| !whole.intersect(&part).is_empty()).and_then(|(_, at)| *at)
         };
-        Begun { sheets: parts(piece).map(of).collect(), pixels: self.pixels.piece(tile, piece) }
+        Checkpoint { sheets: parts(piece).map(of).collect(), pixels: self.pixels.crop(tile, piece) }
     }
 }
 
 /// What a worker gives away of a region that it draws.
 #[derive(Clone, Debug, PartialEq)]
-pub struct HandedOver {
+pub struct RegionSplit {
     /// Its lease: which task.
     pub task: TaskId,
     /// And which attempt at it.
@@ -108,12 +105,12 @@ pub struct HandedOver {
     /// What it gives away: the rest.
     pub given: Rect,
     /// How that stands.
-    pub begun: Begun,
+    pub begun: Checkpoint,
 }
 
 /// Sets whose directories a worker keeps: as many as a master keeps brick sets, and one for a job that
 /// is just ending. Master and worker count alike, by what was sent, so that neither has to say.
-pub const DIRECTORIES: usize = 4;
+pub const DIRECTORIES_KEPT: usize = 4;
 
 /// From master to worker.
 #[derive(Clone, Debug, PartialEq)]
@@ -145,13 +142,13 @@ pub enum ToWorker {
         view: View,
         /// What its regions are finished to; `None`: their results are sums. Those of leases are sums
         /// always.
-        finish: Option<Finish>,
+        finish: Option<PixelEncoding>,
         /// Whether finished pixels go as they are: packing them takes longer than it saves.
         plain: bool,
     },
     /// Bricks that there are of a set, some of them or all: from the `first`, ascending by id. The
     /// parts of a directory come in order, and before the first region of the set. Those of the
-    /// [`DIRECTORIES`] sets that came last are kept.
+    /// [`DIRECTORIES_KEPT`] sets that came last are kept.
     Directory {
         /// Of which set.
         set: BrickSetKey,
@@ -168,9 +165,9 @@ pub enum ToWorker {
     Lease(Box<Lease>),
     /// Work through all depths.
     Region(RegionLease),
-    /// Others have time: some of what is left of a region is to be given away ([`ToMaster::HandedOver`]). Who has
+    /// Others have time: some of what is left of a region is to be given away ([`ToMaster::RegionSplit`]). Who has
     /// drawn it already, or can't cut it, does nothing.
-    HandOver {
+    SplitRegion {
         /// Of which frame.
         frame: FrameId,
         /// The lease: which task.
@@ -280,35 +277,37 @@ pub struct RegionCost {
     /// For how long render threads had nothing to do since the last result of the link, while some
     pub idle_us: u64,
     /// How far some of its pixels are off, where that was asked for.
-    pub sampled: Sampling,
+    pub sampled: ErrorsBySource,
 }
 
 /// How far pixels that were looked at are off, by source.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Sampling {
+pub struct ErrorsBySource {
     /// What sheets of half the thickness change.
-    pub thickness: Sampled,
+    pub thickness: SampledError,
     /// What rounding of positions changes.
-    pub positions: Sampled,
+    pub positions: SampledError,
     /// What the kernel's cut changes.
-    pub truncation: Sampled,
+    pub truncation: SampledError,
     /// What the kernel's ripple changes.
-    pub ripple: Sampled,
+    pub ripple: SampledError,
 }
 
-impl Sampling {
+impl ErrorsBySource {
     /// Each, in order.
-    pub fn each(self) -> [Sampled; 4] {
+    pub fn to_array(self) -> [SampledError; 4] {
         [self.thickness, self.positions, self.truncation, self.ripple]
     }
 
     /// From each, in order.
-    pub fn of([thickness, positions, truncation, ripple]: [Sampled; 4]) -> Sampling {
-        Sampling { thickness, positions, truncation, ripple }
+    pub fn from_array(
+        [thickness, positions, truncation, ripple]: [SampledError; 4],
+    ) -> ErrorsBySource {
+        ErrorsBySource { thickness, positions, truncation, ripple }
     }
 
     /// Adds others'.
-    pub fn add(&mut self, other: Sampling) {
+    pub fn add(&mut self, other: ErrorsBySource) {
         self.thickness.add(other.thickness);
         self.positions.add(other.positions);
         self.truncation.add(other.truncation);
@@ -318,26 +317,26 @@ impl Sampling {
 
 /// How far pixels are off. Integers, since their sum has no order.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Sampled {
+pub struct SampledError {
     /// Pixels that are not blank in both.
     pub pixels: u32,
     /// Sum of the squares of their differences, over all four channels, in units of 2^-48.
     pub squares: u64,
 }
 
-impl Sampled {
+impl SampledError {
     const UNIT: f64 = (1u64 << 48) as f64;
 
     /// Counts a pixel, unless it is blank in both; squares of at most 4.
     pub fn put(&mut self, there: bool, squares: f64) {
         if there {
             self.pixels += 1;
-            self.squares += (squares.clamp(0.0, 4.0) * Sampled::UNIT) as u64;
+            self.squares += (squares.clamp(0.0, 4.0) * SampledError::UNIT) as u64;
         }
     }
 
     /// Adds others'.
-    pub fn add(&mut self, other: Sampled) {
+    pub fn add(&mut self, other: SampledError) {
         self.pixels = self.pixels.saturating_add(other.pixels);
         self.squares = self.squares.saturating_add(other.squares);
     }
@@ -345,7 +344,7 @@ impl Sampled {
     /// Root of the mean square over pixels and channels, in 1/255; `None` of no pixel.
     pub fn rmse(&self) -> Option<f64> {
         let n = 4.0 * f64::from(self.pixels);
-        (self.pixels > 0).then(|| (self.squares as f64 / Sampled::UNIT / n).sqrt() * 255.0)
+        (self.pixels > 0).then(|| (self.squares as f64 / SampledError::UNIT / n).sqrt() * 255.0)
     }
 }
 
@@ -355,7 +354,7 @@ pub enum Pixels {
     /// What it adds to the picture, which the master finishes.
     Sums(TilePixels),
     /// A piece of the picture as it leaves the master.
-    Finished(Leaves),
+    Finished(SparseTile),
 }
 
 impl Pixels {
@@ -410,7 +409,7 @@ pub enum ToMaster {
         reason: String,
     },
     /// A part of a region is given away, as the master asked for.
-    HandedOver(Box<HandedOver>),
+    RegionSplit(Box<RegionSplit>),
     /// Bricks came in.
     BricksIn {
         /// Of which set.
@@ -463,35 +462,4 @@ pub struct BrickBatch {
     pub bricks: Vec<Arc<Brick>>,
     /// Bricks whose bytes were not whole.
     pub broken: Vec<BrickId>,
-}
-
-/// What a client asks for.
-#[derive(Clone, Debug, PartialEq)]
-pub struct PathRequest {
-    /// The client's own name for the request: the same key gives the same job.
-    pub client_key: String,
-    /// The views.
-    pub path: ViewPath,
-    /// Colours and opacities.
-    pub transfer: TransferChoice,
-    /// Quality.
-    pub quality: Quality,
-    /// How the work is cut.
-    pub work: Work,
-    /// How pixels leave the master.
-    pub format: PixelFormat,
-    /// Over which background.
-    pub background: Background,
-    /// Whether each frame's statistics come with spans for a trace.
-    pub want_trace: bool,
-    /// Whether each frame's statistics have the hash of its linear picture. Without it tiles travel as
-    /// finished pixels, which are fewer bytes.
-    pub want_hash: bool,
-}
-
-impl PathRequest {
-    /// What frames are finished to.
-    pub fn finish(&self) -> Finish {
-        Finish { format: self.format, background: self.background }
-    }
 }

@@ -27,7 +27,7 @@ impl Rect {
     }
 
     /// A picture's rectangle.
-    pub fn of_size(size: [u32; 2]) -> Self {
+    pub fn from_size(size: [u32; 2]) -> Self {
         Rect::new(0, 0, size[0] as i32, size[1] as i32)
     }
 

@@ -1,6 +1,7 @@
 //! What a client may ask of a picture (quality: part of the pixels) and of the work behind it
 //! (work: never changes a byte). Names are those of CONTRACTS.md, in flags, JSON and proto.
 
+use crate::spelling::nearest;
 use serde::{Deserialize, Serialize};
 
 /// Reconstruction kernel.
@@ -43,7 +44,7 @@ pub enum Splat {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Sums {
-    /// The master decides from transfer function and quality (`Classifier::sums`).
+    /// The master decides from transfer function and quality (`Classifier::choose_sums`).
     Auto,
     /// 16-bit fixed point.
     I16,
@@ -105,46 +106,44 @@ impl Default for Quality {
 /// A value that can't be used, with the flag (or field) that carries it and what to do.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{field}: {problem}")]
-pub struct Refused {
+pub struct InvalidField {
     /// The flag or JSON field, as the user wrote it (`thickness`, `views[3].eye`).
     pub field: String,
     /// What is wrong with it and what to do.
     pub problem: String,
 }
 
-impl Refused {
+impl InvalidField {
     /// A refusal of `field`.
     pub fn new(field: impl Into<String>, problem: impl Into<String>) -> Self {
-        Refused { field: field.into(), problem: problem.into() }
+        InvalidField { field: field.into(), problem: problem.into() }
     }
 }
 
 /// The refusal of a JSON text. An unknown key names the nearest one that there is: serde lists all of
 /// them, which is long, and the one that was meant is not easily found.
-pub(crate) fn json_error(whole: &str, e: &serde_json::Error) -> Refused {
+pub fn json_error(whole: &str, e: &serde_json::Error) -> InvalidField {
     let said = e.to_string();
     let quoted: Vec<&str> = said.split('`').skip(1).step_by(2).collect();
     let meant = match quoted[..] {
-        [wrong, ref known @ ..] if said.starts_with("unknown ") => {
-            crate::presets::nearest(wrong, known)
-        }
+        [wrong, ref known @ ..] if said.starts_with("unknown ") => nearest(wrong, known),
         _ => None,
     };
     let meant = meant.map(|m| format!("; did you mean `{m}`?")).unwrap_or_default();
-    Refused::new(whole, format!("not valid: {said}{meant}"))
+    InvalidField::new(whole, format!("not valid: {said}{meant}"))
 }
 
-fn within(field: &str, x: f64, lo: f64, hi: f64) -> Result<(), Refused> {
+fn within(field: &str, x: f64, lo: f64, hi: f64) -> Result<(), InvalidField> {
     if x >= lo && x <= hi {
         Ok(())
     } else {
-        Err(Refused::new(field, format!("{x} is out of range; give {lo} to {hi}")))
+        Err(InvalidField::new(field, format!("{x} is out of range; give {lo} to {hi}")))
     }
 }
 
 impl Quality {
     /// Standard deviation and support radius of the kernel, in lattice steps.
-    pub fn shape(&self) -> [f64; 2] {
+    pub fn kernel_shape(&self) -> [f64; 2] {
         match self.kernel {
             Kernel::Gaussian => [self.std, self.radius],
             Kernel::Bspline => [(1.0f64 / 3.0).sqrt(), 2.0],
@@ -154,13 +153,13 @@ impl Quality {
 
     /// Whether 16-bit sums have room for a sheet's ripple: not that of a tent, of a Gaussian that is
     /// narrow or wide, or of opacities that add up to more than one.
-    pub fn fits_short(&self) -> bool {
+    pub fn fits_i16(&self) -> bool {
         let even = self.kernel != Kernel::Gaussian || (self.std >= 0.5 && self.radius <= 2.0);
         self.compositing != Compositing::Paper && self.kernel != Kernel::Tent && even
     }
 
     /// Checks ranges and names what this version does not draw yet.
-    pub fn check(&self) -> Result<(), Refused> {
+    pub fn check(&self) -> Result<(), InvalidField> {
         // From vox/64 to thicker than any volume (DESIGN.md section 5).
         within("thickness", self.thickness, 1.0 / 64.0, 65536.0)?;
         within("eps", self.eps, 0.0, 0.5)?;
@@ -173,7 +172,7 @@ impl Quality {
             for (field, given) in [("std", self.std != d.std), ("radius", self.radius != d.radius)]
             {
                 if given {
-                    return Err(Refused::new(
+                    return Err(InvalidField::new(
                         field,
                         "is of the `gaussian` kernel; the others have one width. Leave it out, or \
                          use `gaussian`",
@@ -182,13 +181,13 @@ impl Quality {
             }
         }
         if self.kernel == Kernel::Tent && self.sums == Sums::I16 {
-            return Err(Refused::new(
+            return Err(InvalidField::new(
                 "sums",
                 "`i16` has no room for the ripple of the `tent` kernel; use `i32` or `auto`",
             ));
         }
         if self.splat != Splat::Direct {
-            return Err(Refused::new(
+            return Err(InvalidField::new(
                 "splat",
                 "this version draws `direct` splats only, which were faster; use them",
             ));
@@ -272,15 +271,18 @@ impl Default for Work {
 
 impl Work {
     /// Checks ranges.
-    pub fn check(&self) -> Result<(), Refused> {
+    pub fn check(&self) -> Result<(), InvalidField> {
         if !(1..=1000).contains(&self.slabs) {
-            return Err(Refused::new("slabs", format!("{} slabs; give 1 to 1000", self.slabs)));
+            return Err(InvalidField::new(
+                "slabs",
+                format!("{} slabs; give 1 to 1000", self.slabs),
+            ));
         }
         within("tiles-per-worker", self.tiles_per_worker, 0.1, 1000.0)?;
         if let Some(tile) = self.tile
             && !(tile.is_power_of_two() && (16..=256).contains(&tile))
         {
-            return Err(Refused::new(
+            return Err(InvalidField::new(
                 "tile",
                 format!("{tile} is not a quadtree level; give 16, 32, 64, 128, 256 or auto"),
             ));

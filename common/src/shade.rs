@@ -194,23 +194,23 @@ impl Shader {
     /// direction towards the eye in world axes. Linear RGB in `[0, 1]`.
     #[inline]
     pub fn shade(&self, base: [f32; 3], normal: u16, to_eye: Vec3) -> [f32; 3] {
-        let light = self.light(normal, to_eye);
-        base.map(|c| light.on(c))
+        let light = self.light_terms(normal, to_eye);
+        base.map(|c| light.apply(c))
     }
 
     /// The light on a voxel with this normal code.
     #[inline]
-    pub fn light(&self, normal: u16, to_eye: Vec3) -> Lit {
+    pub fn light_terms(&self, normal: u16, to_eye: Vec3) -> LightTerms {
         let mut lit = [[0.0]; 2];
-        self.light_all(&[normal], |_| to_eye, &mut lit);
-        Lit { lambert: lit[0][0], gloss: lit[1][0] }
+        self.light_terms_all(&[normal], |_| to_eye, &mut lit);
+        LightTerms { lambert: lit[0][0], gloss: lit[1][0] }
     }
 
-    /// [`Shader::light`] of many voxels, of which the `i`th sees the eye in direction `to_eye(i)`: what
+    /// [`Shader::light_terms`] of many voxels, of which the `i`th sees the eye in direction `to_eye(i)`: what
     /// their base colours are multiplied by, and what is added. Loops over plain arrays of a length
     /// that compilers do not know, so that they run them on lanes.
     #[inline(always)]
-    pub fn light_all<const MOST: usize>(
+    pub fn light_terms_all<const MOST: usize>(
         &self,
         normals: &[u16],
         to_eye: impl Fn(usize) -> Vec3,
@@ -255,17 +255,17 @@ impl Shader {
 
 /// The light on a voxel: what its base colour is multiplied by, and what is added in white.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Lit {
+pub struct LightTerms {
     /// Ambient and diffuse.
     pub lambert: f32,
     /// Specular.
     pub gloss: f32,
 }
 
-impl Lit {
+impl LightTerms {
     /// One component of the colour, in `[0, 1]`.
     #[inline(always)]
-    pub fn on(self, base: f32) -> f32 {
+    pub fn apply(self, base: f32) -> f32 {
         (base * self.lambert + self.gloss).clamp(0.0, 1.0)
     }
 }

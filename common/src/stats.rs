@@ -158,7 +158,7 @@ pub struct Estimate {
 /// The error itself by what sheets of half the thickness change: 1 / (1 - 2^-p) at the order p = 3.
 /// About one vox the error falls so steeply, steeper than in the limit (docs/accuracy.md); at p = 2 the
 /// estimate would be a sixth larger.
-pub const EXTRAPOLATION: f64 = 8.0 / 7.0;
+pub const THICKNESS_EXTRAPOLATION: f64 = 8.0 / 7.0;
 
 /// Error by source.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]

@@ -9,7 +9,7 @@
 use crate::brick::TightBox;
 use crate::kernel::{Lean, drawn_ellipsoid};
 use crate::occlusion::Rect;
-use crate::quality::{Quality, Refused};
+use crate::quality::{InvalidField, Quality};
 use crate::slab::SheetRange;
 use crate::volume::Lattice;
 use glam::{DMat3, DVec2, DVec3, Vec3};
@@ -122,9 +122,9 @@ impl View {
         camera: &Camera,
         size: [u32; 2],
         quality: &Quality,
-    ) -> Result<View, Refused> {
+    ) -> Result<View, InvalidField> {
         if size.iter().any(|&n| n == 0 || n > MAX_EDGE) {
-            return Err(Refused::new(
+            return Err(InvalidField::new(
                 "size",
                 format!("{}x{} pixels; give 1 to {MAX_EDGE} each", size[0], size[1]),
             ));
@@ -132,13 +132,13 @@ impl View {
         let unit = |field: &str, v: DVec3| {
             let largest = v.abs().max_element();
             if !(largest > 0.0 && largest.is_finite()) {
-                return Err(Refused::new(field, "must be finite and not zero"));
+                return Err(InvalidField::new(field, "must be finite and not zero"));
             }
             let v = v / largest;
             Ok(v / v.length())
         };
         if !camera.target.is_finite() {
-            return Err(Refused::new("target", "must be finite"));
+            return Err(InvalidField::new("target", "must be finite"));
         }
         let back = unit("eye", camera.to_eye)?;
         let forward = -back;
@@ -166,7 +166,7 @@ impl View {
         let projection = match camera.projection {
             CameraProjection::Ortho { height } => {
                 if !(height.is_finite() && height / vox > 1e-6 && height / vox < 1e9) {
-                    return Err(Refused::new(
+                    return Err(InvalidField::new(
                         "height",
                         format!("{height} world units; give a positive height near the volume's"),
                     ));
@@ -175,10 +175,13 @@ impl View {
             }
             CameraProjection::Persp { fov, distance } => {
                 if !(0.01..=179.0).contains(&fov) {
-                    return Err(Refused::new("fov", format!("{fov} degrees; give 0.01 to 179")));
+                    return Err(InvalidField::new(
+                        "fov",
+                        format!("{fov} degrees; give 0.01 to 179"),
+                    ));
                 }
                 if !(distance.is_finite() && distance / vox > 1e-6 && distance / vox < 1e9) {
-                    return Err(Refused::new(
+                    return Err(InvalidField::new(
                         "eye",
                         format!(
                             "{distance} world units from the target; move it nearer the volume"
@@ -194,7 +197,7 @@ impl View {
             Projection::Persp { focal, distance } => ("eye", focal / (NEAR * distance)),
         };
         if largest > LARGEST_SCALE {
-            return Err(Refused::new(
+            return Err(InvalidField::new(
                 field,
                 "magnifies a voxel over more than 10^11 pixels; move the eye away from the target \
                  or widen what is shown",
@@ -205,7 +208,7 @@ impl View {
         let eye_from_index = DMat3::from_cols(steps[0], steps[1], steps[2]);
         let target = eye_from_world * (camera.target / vox);
         let eye_origin = -(eye_from_index * lattice.centre_index()) - target;
-        let [std, radius] = quality.shape();
+        let [std, radius] = quality.kernel_shape();
         let mut view = View {
             size,
             eye_from_index,
@@ -228,7 +231,7 @@ impl View {
         let depth = (hi.z.abs().max(lo.z.abs()) + view.kernel_radius.z + 1.0) / view.thickness
             * f64::from(view.depth_phases());
         if !depth.is_finite() || depth >= (1u32 << 30) as f64 {
-            return Err(Refused::new(
+            return Err(InvalidField::new(
                 "target",
                 "too far from the volume for sheets this thin; move it nearer or raise thickness",
             ));
@@ -239,7 +242,7 @@ impl View {
     /// The same camera in the sheets of another quality, whose kernel is the same: where it leans, how wide it
     /// is drawn depends on how thick sheets are.
     #[must_use]
-    pub fn in_sheets_of(&self, quality: &Quality) -> View {
+    pub fn with_thickness_of(&self, quality: &Quality) -> View {
         let mut view = View { thickness: quality.thickness, ..*self };
         if self.kernel_lean.depth != [0.0; 2] {
             view.lean(quality);
@@ -249,7 +252,7 @@ impl View {
 
     /// Gives a lattice that is not cubic its kernel.
     fn lean(&mut self, quality: &Quality) {
-        let [std, radius] = quality.shape();
+        let [std, radius] = quality.kernel_shape();
         let shape = (quality.kernel, std, radius);
         let (spread, lean) = drawn_ellipsoid(&self.eye_from_index, shape, quality.thickness);
         self.kernel_std = spread * std;
@@ -307,12 +310,12 @@ impl View {
     /// (x, y) on a plane with `scale` pixels a vox.
     #[inline]
     pub fn screen(&self, x: f64, y: f64, scale: f64) -> [i64; 2] {
-        [self.screen_along(0, x, scale), self.screen_along(1, y, scale)]
+        [self.screen_coordinate(0, x, scale), self.screen_coordinate(1, y, scale)]
     }
 
     /// [`View::screen`] along one axis (0: x, 1: y).
     #[inline(always)]
-    pub fn screen_along(&self, axis: usize, v: f64, scale: f64) -> i64 {
+    pub fn screen_coordinate(&self, axis: usize, v: f64, scale: f64) -> i64 {
         // 2^42 pixels off the picture is farther than any footprint reaches: `View::new` refuses
         // cameras that magnify more than 2^39 pixels a vox.
         const FAR: f64 = (1u64 << 42) as f64;
@@ -337,7 +340,7 @@ impl View {
 
     /// Unit direction from an eye position towards the eye, in world axes.
     #[inline]
-    pub fn to_eye(&self, p: DVec3) -> Vec3 {
+    pub fn direction_to_eye(&self, p: DVec3) -> Vec3 {
         let d = match self.projection {
             Projection::Ortho { .. } => DVec3::new(0.0, 0.0, -1.0),
             Projection::Persp { distance, .. } => {
@@ -351,12 +354,12 @@ impl View {
         Vec3::new(w.x as f32, w.y as f32, w.z as f32)
     }
 
-    /// [`View::to_eye`] of many eye positions, by axis, in a perspective view; the same in every bit.
+    /// [`View::direction_to_eye`] of many eye positions, by axis, in a perspective view; the same in every bit.
     ///
     /// # Panics
     /// In an orthographic view, where one direction is all there is.
     #[inline(always)]
-    pub fn to_eye_all<const MOST: usize>(
+    pub fn directions_to_eye<const MOST: usize>(
         &self,
         [x, y, z]: [&[f64]; 3],
         out: &mut [[f32; MOST]; 3],
@@ -431,7 +434,7 @@ impl View {
 
     /// The pixels of [`Self::project`] alone. In parallel projection they hang on no sheet, and none
     /// is worked out.
-    pub fn outline(&self, b: &TightBox) -> Option<Rect> {
+    pub fn project_rect(&self, b: &TightBox) -> Option<Rect> {
         let Projection::Ortho { scale } = self.projection else {
             return self.project(b).map(|p| p.rect);
         };
@@ -461,19 +464,19 @@ impl View {
 
 /// 1.5 * 2^52: added to a number below 2^51 it leaves the nearest integer, ties to even, in the
 /// low bits of the sum.
-pub const MAGIC: f64 = 6_755_399_441_055_744.0;
+pub const ROUND_F64: f64 = 6_755_399_441_055_744.0;
 
 /// Nearest integer, ties to even, without a library call. `|x| < 2^31`.
 #[inline(always)]
 pub fn round_i32(x: f64) -> i32 {
-    (x + MAGIC).to_bits() as i32
+    (x + ROUND_F64).to_bits() as i32
 }
 
 /// The largest integer that is not above `x`. Six calls of the library were a third of what projecting a
 /// box takes.
 #[inline(always)]
 fn floor(x: f64) -> f64 {
-    let near = (x + MAGIC) - MAGIC;
+    let near = (x + ROUND_F64) - ROUND_F64;
     if x.abs() < 2_251_799_813_685_248.0 {
         near - f64::from(u8::from(near > x))
     } else {
@@ -490,7 +493,7 @@ fn ceil(x: f64) -> f64 {
 /// Nearest integer, ties to even, without a library call. `|x| < 2^51`.
 #[inline(always)]
 pub fn round_i64(x: f64) -> i64 {
-    (x + MAGIC).to_bits().wrapping_sub(MAGIC.to_bits()) as i64
+    (x + ROUND_F64).to_bits().wrapping_sub(ROUND_F64.to_bits()) as i64
 }
 
 #[cfg(test)]
@@ -537,9 +540,9 @@ mod tests {
             let axis = |i: usize| at.iter().map(|p| p[i]).collect::<Vec<_>>();
             let (x, y, z) = (axis(0), axis(1), axis(2));
             let mut out = [[0.0; 32]; 3];
-            v.to_eye_all([&x, &y, &z], &mut out);
+            v.directions_to_eye([&x, &y, &z], &mut out);
             for (i, p) in at.iter().enumerate() {
-                let want = v.to_eye(DVec3::from_array(*p)).to_array();
+                let want = v.direction_to_eye(DVec3::from_array(*p)).to_array();
                 prop_assert_eq!(out.map(|axis| axis[i].to_bits()), want.map(f32::to_bits));
             }
         }
@@ -583,7 +586,7 @@ mod tests {
                 let of = |q| View::new(&l, &camera(0.3, tilt, p), [64, 48], &q).unwrap();
                 let q = Quality::default();
                 let other = Quality { thickness: 0.5 * q.thickness, ..q };
-                assert_eq!(of(q).in_sheets_of(&other), of(other), "{spacing:?}, tilt {tilt}");
+                assert_eq!(of(q).with_thickness_of(&other), of(other), "{spacing:?}, tilt {tilt}");
                 assert_ne!(of(q), of(other));
             }
         }
@@ -591,7 +594,7 @@ mod tests {
         let l = Lattice::from_spacing([9, 7, 5], [1.0, 1.0, 2.5]);
         let q = Quality::default();
         let leaning = View::new(&l, &camera(0.3, 0.7, p), [64, 48], &q).unwrap();
-        let thin = leaning.in_sheets_of(&Quality { thickness: 0.25, ..q });
+        let thin = leaning.with_thickness_of(&Quality { thickness: 0.25, ..q });
         assert!(thin.kernel_std.y < leaning.kernel_std.y, "{thin:?}");
     }
 
@@ -633,7 +636,7 @@ mod tests {
             let base = [corner.0 * 8, corner.1 * 8, corner.2 * 8];
             let boxed = TightBox { lo: base, hi: base.map(|x| x + 7) };
             let projected = v.project(&boxed);
-            prop_assert_eq!(v.outline(&boxed), projected.map(|p| p.rect));
+            prop_assert_eq!(v.project_rect(&boxed), projected.map(|p| p.rect));
             let eye = v.corner_in_eye(base) + v.offset_in_eye([pick.0, pick.1, pick.2]);
             let phases = v.depth_phases();
             let zq = f64::from(v.depth_in_phases(eye.z)) / f64::from(phases);

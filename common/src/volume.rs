@@ -171,7 +171,7 @@ impl Samples {
 
     /// Samples as bits: their codes, or those of floats. As many as there are and fit.
     #[inline(always)]
-    pub fn bits(&self, to: &mut [u32]) {
+    pub fn write_bits(&self, to: &mut [u32]) {
         match self {
             Samples::U8(v) => to.iter_mut().zip(v).for_each(|(to, &s)| *to = s.into()),
             Samples::U16(v) => to.iter_mut().zip(v).for_each(|(to, &s)| *to = s.into()),
@@ -261,7 +261,7 @@ pub struct ValueSummary {
 
 impl ValueSummary {
     /// Counts `samples`.
-    pub fn of(samples: &Samples, map: ValueMap) -> Self {
+    pub fn from_samples(samples: &Samples, map: ValueMap) -> Self {
         let mut s = ValueSummary {
             kind: samples.kind(),
             map,
@@ -382,7 +382,7 @@ impl Volume {
         map: ValueMap,
     ) -> Self {
         assert_eq!(lattice.len(), samples.len(), "one sample for each lattice point");
-        let summary = ValueSummary::of(&samples, map);
+        let summary = ValueSummary::from_samples(&samples, map);
         Volume {
             name: name.into(),
             file_type: file_type.into(),
@@ -577,10 +577,10 @@ mod tests {
     #[test]
     fn summary_counts_the_unusual() {
         let v = vec![f32::NAN, f32::INFINITY, -1.0, 3.0, 1e-40, f32::NEG_INFINITY];
-        let s = ValueSummary::of(&Samples::F32(v), ValueMap { scale: 2.0, offset: 1.0 });
+        let s = ValueSummary::from_samples(&Samples::F32(v), ValueMap { scale: 2.0, offset: 1.0 });
         assert_eq!((s.nan, s.infinite, s.total()), (1, 2, 6));
         assert_eq!(s.range(), (-1.0, 7.0));
-        let empty = ValueSummary::of(&Samples::F32(vec![f32::NAN]), ValueMap::IDENTITY);
+        let empty = ValueSummary::from_samples(&Samples::F32(vec![f32::NAN]), ValueMap::IDENTITY);
         assert_eq!(empty.range(), (0.0, 0.0));
     }
 }

@@ -1,7 +1,7 @@
 //! Brick sets that the master keeps, the last used last.
 
 use slabcast_common::brick::BrickSetKey;
-use slabcast_common::wanted::Wanted;
+use slabcast_scene::brick_needs::BrickNeeds;
 use slabcast_volumes::BrickStore;
 use std::sync::Arc;
 
@@ -17,7 +17,7 @@ pub(crate) struct BrickSets {
 
 impl BrickSets {
     /// A set that covers `wanted`.
-    pub(crate) fn covering(&self, wanted: &Wanted) -> Option<&Arc<BrickStore>> {
+    pub(crate) fn covering(&self, wanted: &BrickNeeds) -> Option<&Arc<BrickStore>> {
         self.sets.iter().find(|s| s.wanted().covers(wanted))
     }
 

@@ -21,8 +21,7 @@ use crate::memory;
 use crate::panics::{Panicked, caught};
 use crate::record::RecordedScheduler;
 use slabcast_common::ids::{FrameId, JobId, WorkerId};
-use slabcast_common::image::FrameState;
-use slabcast_common::leaves::Leaves;
+use slabcast_common::image::{FrameState, SparseTile};
 use slabcast_common::link::FRAMES_IN_FLIGHT;
 use slabcast_common::message::{Hello, SceneSpec, ToMaster, ToWorker};
 use slabcast_common::occlusion::Rect;
@@ -287,7 +286,7 @@ impl Driver {
                 warn!(%worker, %task, reason, "task failed");
                 Happened::Failed { worker, task, epoch, reason }
             }
-            ToMaster::HandedOver(piece) => Happened::HandedOver { worker, piece },
+            ToMaster::RegionSplit(piece) => Happened::HandedOver { worker, piece },
             ToMaster::BricksIn { set, bricks } => Happened::BricksIn { worker, set, bricks },
             ToMaster::BricksBroken { set, bricks } => {
                 warn!(%worker, bricks = bricks.len(), "bricks damaged in transit, sending them again");
@@ -347,7 +346,7 @@ impl Driver {
 
         let bricks = match &store {
             Some(store) => store.key(),
-            None => plan.wanted.key(self.served.info.digest),
+            None => plan.wanted.set_key(self.served.info.digest),
         };
         let must_cut = store.is_none();
         let job = plan.activate(id, self.served.info.clone(), bricks, store);
@@ -426,7 +425,7 @@ impl Driver {
                 bricks: store.infos().clone(),
                 view: job.views[number as usize],
                 work: job.request.work,
-                finish: (!job.request.want_hash).then(|| job.request.finish()),
+                finish: (!job.request.want_hash).then(|| job.request.encoding()),
             };
             self.scheduler.handle(&self.clock, Happened::FrameQueued(Box::new(queued)));
             if let Some(scene) = own_scene {
@@ -566,13 +565,13 @@ impl Driver {
     }
 
     /// Has finished tiles composed into their frame's picture while others are drawn.
-    fn compose(&mut self, frame: FrameId, tiles: Vec<(Rect, Leaves)>) {
+    fn compose(&mut self, frame: FrameId, tiles: Vec<(Rect, SparseTile)>) {
         // A rehearsed frame has no pixels.
         let Some(flight) = self.flights.get_mut(&frame).filter(|_| !self.rehearse) else { return };
         let Some(job) = self.active.get(flight.job) else { return };
         let assembly = flight.assembly.get_or_insert_with(|| {
             let size = job.views[flight.number as usize].size;
-            Arc::new(Assembly::new(size, job.request.finish()))
+            Arc::new(Assembly::new(size, job.request.encoding()))
         });
         assembly.add(tiles);
         let task = FinishTask::Compose(frame, assembly.clone());

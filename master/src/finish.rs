@@ -9,15 +9,17 @@ use sha2::{Digest, Sha256};
 use slabcast_common::bounds;
 use slabcast_common::brick::TightBox;
 use slabcast_common::ids::{FrameId, JobId};
-use slabcast_common::image::{Encoded, FrameState, Picture, PixelFormat};
-use slabcast_common::leaves::{Finish, Leaves, Mosaic};
-use slabcast_common::message::{PathRequest, SceneSpec};
+use slabcast_common::image::{
+    Encoded, FrameAssembler, FrameState, Picture, PixelEncoding, PixelFormat, SparseTile,
+};
+use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::path::CropBox;
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::stats::{BrickStats, ErrorStats, FrameStats, LeftOut};
 use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::Digest32;
+use slabcast_scene::path::CropBox;
+use slabcast_scene::request::PathRequest;
 use slabcast_schedule::{Span, Spans};
 use slabcast_volumes::BrickStore;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -25,21 +27,21 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 /// A picture that finished tiles are composed into as they come.
 pub(crate) struct Assembly {
     size: [u32; 2],
-    finish: Finish,
+    finish: PixelEncoding,
     /// Tiles that came and are not in the picture yet.
-    pending: Mutex<Vec<(Rect, Leaves)>>,
+    pending: Mutex<Vec<(Rect, SparseTile)>>,
     /// `None` before the first tile: allocating it takes the longer the larger it is, so the
     /// driver leaves that to a finisher.
-    picture: Mutex<Option<Mosaic>>,
+    picture: Mutex<Option<FrameAssembler>>,
 }
 
 impl Assembly {
-    pub(crate) fn new(size: [u32; 2], finish: Finish) -> Assembly {
+    pub(crate) fn new(size: [u32; 2], finish: PixelEncoding) -> Assembly {
         Assembly { size, finish, pending: Mutex::default(), picture: Mutex::default() }
     }
 
     /// Adds tiles that are to be composed.
-    pub(crate) fn add(&self, tiles: Vec<(Rect, Leaves)>) {
+    pub(crate) fn add(&self, tiles: Vec<(Rect, SparseTile)>) {
         self.pending.lock().unwrap_or_else(PoisonError::into_inner).extend(tiles);
     }
 
@@ -55,23 +57,23 @@ impl Assembly {
     ///
     /// # Panics
     /// If an earlier call panicked: its tiles are lost.
-    fn end(&self) -> Mosaic {
+    fn end(&self) -> FrameAssembler {
         let mut picture = self.picture();
         self.compose_into(&mut picture);
-        picture.take().unwrap_or_else(|| Mosaic::new(self.size, &self.finish))
+        picture.take().unwrap_or_else(|| FrameAssembler::new(self.size, &self.finish))
     }
 
-    fn picture(&self) -> MutexGuard<'_, Option<Mosaic>> {
+    fn picture(&self) -> MutexGuard<'_, Option<FrameAssembler>> {
         self.picture.lock().expect("no finisher panicked while it composed this picture")
     }
 
-    fn compose_into(&self, picture: &mut Option<Mosaic>) {
+    fn compose_into(&self, picture: &mut Option<FrameAssembler>) {
         // Taken while the picture is locked, so that whoever ends the picture finds no tile that
         // another thread has taken and not composed.
         let mut pending = self.pending.lock().unwrap_or_else(PoisonError::into_inner);
         let tiles = std::mem::take(&mut *pending);
         drop(pending);
-        picture.get_or_insert_with(|| Mosaic::new(self.size, &self.finish)).lay(&tiles);
+        picture.get_or_insert_with(|| FrameAssembler::new(self.size, &self.finish)).place(&tiles);
     }
 }
 
@@ -135,25 +137,25 @@ pub fn view_sha256(scene: &SceneSpec, crop: Option<&CropBox>, view: &View) -> Di
 }
 
 /// Writes the bounds that are known without a reference (DESIGN.md section 5) into `stats`, in
-/// 1/255. `within`: box of the voxels that are drawn; `alpha_most`: largest opacity of a pixel.
+/// 1/255. `within`: box of the voxels that are drawn; `max_alpha`: largest opacity of a pixel.
 fn error(
     stats: &mut ErrorStats,
     scene: &SceneSpec,
     view: &View,
     within: &TightBox,
-    alpha_most: f64,
+    max_alpha: f64,
 ) {
     // A bound of 255 says nothing (16-bit sums, whose errors are a thousandth of it).
     let says = |bound: f64| Some(bound).filter(|&bound| bound < 255.0);
-    let alpha_most = Some(alpha_most);
+    let max_alpha = Some(max_alpha);
     stats.cutoff.bound = Some(bounds::cutoff(&scene.quality));
     stats.quantisation.bound = says(bounds::quantisation(scene, view, within));
     stats.accumulation.bound = Some(bounds::accumulation(view, within));
-    stats.rounding.bound = bounds::rounding(scene, view, within, alpha_most).and_then(says);
-    stats.truncation.bound = bounds::truncation(scene, view, within, alpha_most).and_then(says);
+    stats.rounding.bound = bounds::rounding(scene, view, within, max_alpha).and_then(says);
+    stats.truncation.bound = bounds::truncation(scene, view, within, max_alpha).and_then(says);
     // Where solids hide everything behind them, a few pixels at their edges decide, and a sample
     // misses those.
-    if alpha_most.is_some_and(|a| 1.0 - a < scene.quality.eps) {
+    if max_alpha.is_some_and(|a| 1.0 - a < scene.quality.eps) {
         stats.truncation.estimate = None;
     }
 }
@@ -177,7 +179,7 @@ fn left_out(
     let mut put = |name: &str, saved_bytes: Option<u64>| {
         list.push(LeftOut { name: name.into(), saved_ms: None, saved_bytes });
     };
-    if !wanted.keeps_empty() {
+    if !wanted.keeps_invisible() {
         put("empty", Some(bytes(all.saturating_sub(voxels))));
     }
     if bricks.needed < bricks.relevant {
@@ -215,12 +217,12 @@ fn marked(size: [u32; 2]) -> Picture {
 
 /// Encodes and hashes a frame, and completes its statistics.
 pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
-    let (size, finish) = (s.state.size(), s.request.finish());
-    let alpha_most = f64::from(s.state.alpha_most());
+    let (size, finish) = (s.state.size(), s.request.encoding());
+    let max_alpha = f64::from(s.state.max_alpha());
     let Encoded { sha256, bytes } = if s.rehearsed {
         Encoded { sha256: None, bytes: marked(size).encode(finish.format, finish.background) }
     } else if let Some(assembly) = &s.assembly {
-        s.state.encode_on(assembly.end())
+        s.state.encode_onto(assembly.end())
     } else {
         s.state.encode(&finish, s.request.want_hash)
     };
@@ -240,7 +242,7 @@ pub(crate) fn finish(s: FrameSums) -> FinishedFrame {
     stats.pixels_version = slabcast_common::PIXELS_VERSION;
     let within = s.store.as_ref().and_then(|store| store.extent());
     let within = within.unwrap_or_else(|| TightBox::whole(s.scene.volume.lattice.dims));
-    error(&mut stats.error, &s.scene, &s.view, &within, alpha_most);
+    error(&mut stats.error, &s.scene, &s.view, &within, max_alpha);
     stats.left_out = match &s.store {
         Some(store) => left_out(store, &s.scene, &s.view, &s.request, &stats.bricks),
         None => Vec::new(),

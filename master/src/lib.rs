@@ -21,8 +21,8 @@
 //!
 //! ```no_run
 //! # async fn example(volume: slabcast_common::volume::Volume,
-//! #     request: slabcast_common::message::PathRequest) -> Result<(), Box<dyn std::error::Error>> {
-//! use slabcast_common::path::Orientation;
+//! #     request: slabcast_scene::request::PathRequest) -> Result<(), Box<dyn std::error::Error>> {
+//! use slabcast_scene::path::Orientation;
 //! use slabcast_master::{Master, MasterConfig, jobs::WatchItem, serve};
 //!
 //! let master = Master::start(MasterConfig::new(volume, Orientation::new(None, None)?))?;

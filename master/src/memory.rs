@@ -5,7 +5,7 @@
 //! every other job of this master.
 
 use slabcast_common::image::{FrameState, PixelFormat};
-use slabcast_common::quality::Refused;
+use slabcast_common::quality::InvalidField;
 
 /// Frames of more bytes than this are rendered one at a time, not four: workers then idle between
 /// two frames while one is encoded, seconds of minutes. At half, pictures of 4096x4096 lose their
@@ -25,17 +25,17 @@ pub(crate) fn beside_others(size: [u32; 2], format: PixelFormat) -> bool {
 }
 
 /// Checks that this machine has memory for a picture now.
-pub(crate) fn check(size: [u32; 2], format: PixelFormat) -> Result<(), Refused> {
+pub(crate) fn check(size: [u32; 2], format: PixelFormat) -> Result<(), InvalidField> {
     available().map_or(Ok(()), |free| fits(size, format, free))
 }
 
-fn fits(size: [u32; 2], format: PixelFormat, free: u64) -> Result<(), Refused> {
+fn fits(size: [u32; 2], format: PixelFormat, free: u64) -> Result<(), InvalidField> {
     let need = frame_bytes(size, format);
     if need <= free {
         return Ok(());
     }
     let gib = |n: u64| n as f64 / f64::from(1 << 30);
-    Err(Refused::new(
+    Err(InvalidField::new(
         "size",
         format!(
             "{}x{} pixels take the master {:.1} GiB, and it has {:.1} GiB free; give a smaller size",

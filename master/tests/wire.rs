@@ -1,7 +1,6 @@
 //! RenderService and ClusterService over a socket, as a client in any language meets them.
 
 use slabcast_common::message::{Hello, ToMaster, ToWorker};
-use slabcast_common::path::Orientation;
 use slabcast_common::protocol::{PROTOCOL_VERSIONS, ProtocolVersions};
 use slabcast_common::volume::Volume;
 use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
@@ -14,6 +13,7 @@ use slabcast_proto::render_v1::{
     ViewPath, WatchFramesRequest, view_path::Cameras,
 };
 use slabcast_proto::status::{Details, Reason};
+use slabcast_scene::path::Orientation;
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio_stream::StreamExt;

@@ -7,8 +7,8 @@ use crate::convert::StatisticsPart;
 use bytes::Bytes;
 use slabcast_common::ids::WorkerId;
 use slabcast_common::image::PixelFormat;
-use slabcast_common::path::Orientation;
 use slabcast_common::volume::VolumeInfo;
+use slabcast_scene::path::Orientation;
 use std::time::Duration;
 
 /// State of a job.

@@ -8,10 +8,10 @@ use prost::Message;
 use slabcast_common::brick::{BrickGrid, TightBox};
 use slabcast_common::image::PixelFormat;
 use slabcast_common::message::ToWorker;
-use slabcast_common::wanted::Wanted;
 use slabcast_proto::convert::{self, Bricks, Down, StatisticsParts};
 use slabcast_proto::model::{FrameChunk, WatchMessage};
 use slabcast_proto::{FILE_DESCRIPTOR_SET, cluster_v1, render_v1};
+use slabcast_scene::brick_needs::BrickNeeds;
 
 /// Through every door, whatever the bytes are.
 fn all_doors(bytes: &[u8]) {
@@ -52,10 +52,10 @@ fn work_with(message: ToWorker) {
     match message {
         ToWorker::Scene(scene) => {
             let volume = &scene.volume;
-            let _ =
-                Wanted::of(&scene.transfer, volume, scene.quality.compositing).key(volume.digest);
+            let _ = BrickNeeds::for_transfer(&scene.transfer, volume, scene.quality.compositing)
+                .set_key(volume.digest);
             let _ = (volume.summary.total(), volume.summary.range(), volume.summary.bin(0.0));
-            assert!(BrickGrid::of(volume.lattice.dims).len() <= 1 << 27);
+            assert!(BrickGrid::new(volume.lattice.dims).len() <= 1 << 27);
         }
         ToWorker::Frame { view, .. } => {
             let lattice = slabcast_common::volume::Lattice::from_spacing([100, 90, 80], [1.0; 3]);

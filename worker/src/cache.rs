@@ -3,7 +3,7 @@
 use crate::brick_table::BrickTable;
 use slabcast_common::brick::{Brick, BrickGrid, BrickInfo, BrickSetKey};
 use slabcast_common::ids::BrickId;
-use slabcast_common::message::DIRECTORIES;
+use slabcast_common::message::DIRECTORIES_KEPT;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
@@ -84,7 +84,7 @@ impl BrickCache {
 
     /// Returns the bytes that the bricks take in memory.
     pub fn bytes(&self) -> usize {
-        self.sets.values().flat_map(BTreeMap::values).map(|b| b.bytes_in_memory()).sum()
+        self.sets.values().flat_map(BTreeMap::values).map(|b| b.memory_bytes()).sum()
     }
 
     /// Returns the encoded bytes of the bricks, which memory budgets count.
@@ -133,7 +133,7 @@ impl BrickCache {
             table.put(brick.id, Some(brick.clone()));
         }
         self.tables.push_back((set, Arc::new(table)));
-        if self.tables.len() > DIRECTORIES {
+        if self.tables.len() > DIRECTORIES_KEPT {
             self.tables.pop_front();
         }
     }
@@ -205,10 +205,10 @@ mod tests {
     #[test]
     fn latest_directories_are_kept() {
         let mut cache = BrickCache::default();
-        for n in 0..DIRECTORIES as u8 + 1 {
+        for n in 0..DIRECTORIES_KEPT as u8 + 1 {
             assert!(cache.directory(key(n), GRID, (0, 1), infos(&[3])).is_ok());
         }
         assert!(cache.table(key(0)).is_none());
-        assert!((1..=DIRECTORIES as u8).all(|n| cache.table(key(n)).is_some()));
+        assert!((1..=DIRECTORIES_KEPT as u8).all(|n| cache.table(key(n)).is_some()));
     }
 }

@@ -13,7 +13,7 @@
 use crate::brick_table::BrickTable;
 use crate::pool::{DrawnRegion, FrameSlot, Progress, RegionTask, SlabTask, locked};
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::{Counters, Pixels, Sampling};
+use slabcast_common::message::{Counters, ErrorsBySource, Pixels};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::parts;
 use slabcast_common::slab::SheetRange;
@@ -172,7 +172,7 @@ impl Rehearsal {
             return Ok((Progress::Stalled { missing, is_deeper: true }, end));
         }
         locked(&frame.scene.parts).extend(parts(tile).map(|p| [p.x0, p.y0]));
-        let (counters, sampled) = (Counters::default(), Sampling::default());
+        let (counters, sampled) = (Counters::default(), ErrorsBySource::default());
         let drawn = DrawnRegion { pixels, counters, touched: known.into_owned().touched, sampled };
         Ok((Progress::Done(Box::new(drawn)), end))
     }

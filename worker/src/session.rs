@@ -273,7 +273,7 @@ impl<'a> Session<'a> {
             }
             ToWorker::Lease(lease) => self.on_lease(lease),
             ToWorker::Region(lease) => self.on_region_lease(lease),
-            ToWorker::HandOver { frame, task, epoch, share } => {
+            ToWorker::SplitRegion { frame, task, epoch, share } => {
                 let key = (frame, task);
                 match self.splits.get(&key) {
                     Some((of, split)) if *of == epoch => split.ask_for(share),
@@ -351,12 +351,12 @@ impl<'a> Session<'a> {
             Err(reason) => return self.refuse(lease.task, lease.epoch, reason),
         };
         let (tile, spec) = (lease.tile, &frame.scene.spec);
-        let picture = Rect::of_size(frame.view.size);
+        let picture = Rect::from_size(frame.view.size);
         if tile.is_empty() || tile.intersect(&picture) != tile {
             let reason = "its tile is not inside the picture";
             return self.refuse(lease.task, lease.epoch, reason);
         }
-        let grid = BrickGrid::of(spec.volume.lattice.dims);
+        let grid = BrickGrid::new(spec.volume.lattice.dims);
         let Some(table) = self.cache.table(spec.bricks).filter(|t| t.grid() == grid).cloned()
         else {
             let reason = "the directory of its bricks never came";
@@ -433,7 +433,7 @@ impl<'a> Session<'a> {
         match report {
             Report::Slab(report) => self.on_slab_report(report),
             Report::Region(report) => self.on_region_report(report),
-            Report::Piece(piece) => self.replies.push(ToMaster::HandedOver(piece)),
+            Report::Piece(piece) => self.replies.push(ToMaster::RegionSplit(piece)),
             Report::Prefetch(set, table, places) => {
                 let bricks = self.stalls.prefetch(set, &table, &places, self.cache);
                 if !bricks.is_empty() {

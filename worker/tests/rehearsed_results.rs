@@ -2,8 +2,7 @@
 
 use prost::Message;
 use slabcast_common::ids::{Epoch, TaskId};
-use slabcast_common::image::{Background, PixelFormat};
-use slabcast_common::leaves::Finish;
+use slabcast_common::image::{Background, PixelEncoding, PixelFormat};
 use slabcast_common::message::{Pixels, TaskTimes, TileResult, ToMaster};
 use slabcast_common::occlusion::Rect;
 use slabcast_proto::convert;
@@ -16,7 +15,7 @@ fn placeholder_pixels_have_the_traced_size_on_the_wire() {
     for (format, edge) in
         [(PixelFormat::Rgb8, 64), (PixelFormat::Rgb8, 256), (PixelFormat::Rgba32F, 32)]
     {
-        let finish = Finish { format, background: Background::Transparent };
+        let finish = PixelEncoding { format, background: Background::Transparent };
         let whole = (edge * edge) as usize * format.bytes();
         for bytes in [100, 300, 1_000, 7_777, whole / 2, whole] {
             if bytes > whole {

@@ -2,11 +2,11 @@
 
 use glam::DVec3;
 use slabcast_common::brick::{BRICK_VOXELS, BrickGrid};
-use slabcast_common::path::Orientation;
-use slabcast_common::presets;
 use slabcast_common::quality::Compositing;
 use slabcast_common::transfer::Classifier;
 use slabcast_common::volume::{Lattice, Samples, Volume, VolumeInfo};
+use slabcast_scene::path::Orientation;
+use slabcast_scene::presets;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress::bytes;
 use slabcast_session::request::AxisArgs;
@@ -71,14 +71,14 @@ fn shares(volume: &Volume, info: &VolumeInfo) -> Result<Vec<Share>, Fail> {
             let c = Classifier::new(&tf, info, Compositing::Linear);
             let voxels = match (&counts, &volume.samples) {
                 (Some(counts), _) => {
-                    let visible = |(look, n): (&slabcast_common::transfer::Look, &u64)| {
+                    let visible = |(look, n): (&slabcast_common::transfer::OpticalSample, &u64)| {
                         if look.sigma > 0.0 { *n } else { 0 }
                     };
                     c.table().iter().zip(counts).map(visible).sum()
                 }
-                (None, samples) => {
-                    (0..samples.len()).filter(|&i| c.look(samples, i).sigma > 0.0).count() as u64
-                }
+                (None, samples) => (0..samples.len())
+                    .filter(|&i| c.classify(samples, i).sigma > 0.0)
+                    .count() as u64,
             };
             let each = 2 + info.summary.kind.bytes() as u64 + if tf.shading.on { 2 } else { 0 };
             Ok(Share { name, what, voxels, bytes: voxels * each })
@@ -118,7 +118,7 @@ fn along(step: DVec3) -> (usize, bool, bool) {
 const ANATOMY: [[&str; 2]; 3] =
     [["left", "right"], ["posterior", "anterior"], ["inferior", "superior"]];
 
-fn anatomy(axis: slabcast_common::path::Axis) -> &'static str {
+fn anatomy(axis: slabcast_scene::path::Axis) -> &'static str {
     ANATOMY[axis.index][usize::from(!axis.negative)]
 }
 
@@ -217,7 +217,7 @@ fn text(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
     if s.nan + s.infinite > 0 {
         row("", format!("{} NaN, {} infinite", s.nan, s.infinite));
     }
-    row("air ends at", number(lo + (hi - lo) * presets::air_cut(s)));
+    row("air ends at", number(lo + (hi - lo) * presets::air_threshold(s)));
     let sketch = slabcast_volumes::histogram_sketch(s, 60);
     for (i, line) in sketch.lines().enumerate() {
         row(if i == 0 { "histogram" } else { "" }, line.to_string());
@@ -250,7 +250,7 @@ fn json(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
     let s = &info.summary;
     let (lo, hi) = s.range();
     let total = lattice.len() as u64;
-    let grid = BrickGrid::of(lattice.dims);
+    let grid = BrickGrid::new(lattice.dims);
     serde_json::json!({
         "version": 1,
         "name": volume.name,
@@ -273,7 +273,7 @@ fn json(volume: &Volume, info: &VolumeInfo, o: Orientation, shares: &[Share]) ->
         "values": {
             "min": lo, "max": hi, "scale": s.map.scale, "offset": s.map.offset,
             "nan": s.nan, "infinite": s.infinite,
-            "air_ends": lo + (hi - lo) * presets::air_cut(s),
+            "air_ends": lo + (hi - lo) * presets::air_threshold(s),
             "histogram": s.histogram,
         },
         "bricks": { "edge": 8, "count": grid.len(), "voxels": BRICK_VOXELS },

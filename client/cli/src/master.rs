@@ -5,8 +5,8 @@
 //! a unit file needs none.
 
 use crate::systemd::{self, DRAIN};
-use slabcast_common::path::Axis;
 use slabcast_master::MasterConfig;
+use slabcast_scene::path::Axis;
 use slabcast_session::embedded::start_master;
 use slabcast_session::fail::{Fail, reason, say};
 use slabcast_session::machine::boot_id;

@@ -1,10 +1,10 @@
 //! `slabcast tf`: transfer functions as files, for people who want to change one, and for ParaView.
 
-use slabcast_common::paraview;
-use slabcast_common::presets;
 use slabcast_common::transfer::{Domain, TransferFunction};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_common::volume::{Samples, ValueMap, ValueSummary, VolumeInfo};
+use slabcast_scene::paraview;
+use slabcast_scene::presets;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::output::write_atomic;
 use slabcast_session::transfer::{Transfer, TransferFlags};
@@ -78,7 +78,7 @@ pub(crate) fn run(args: &TfArgs) -> Result<(), Fail> {
     let mut tf = transfer.function(info.as_ref().unwrap_or(&any())).map_err(refused)?;
     let range = info.as_ref().map(|i| i.summary.range());
     let text = if args.paraview {
-        paraview::write(&tf, &transfer.title(), range).map_err(refused)?
+        paraview::to_json(&tf, &transfer.title(), range).map_err(refused)?
     } else {
         if let Some((lo, hi)) = range {
             in_values(&mut tf, lo, hi);
@@ -94,7 +94,7 @@ pub(crate) fn run(args: &TfArgs) -> Result<(), Fail> {
 /// A volume of which nothing is known: presets over 0 to 1.
 fn any() -> VolumeInfo {
     let samples = Samples::U8((0..=255).collect());
-    let summary = ValueSummary::of(&samples, ValueMap::IDENTITY);
+    let summary = ValueSummary::from_samples(&samples, ValueMap::IDENTITY);
     let volume = Volume::from_fn_u8("any", [1; 3], |_, _, _| 0);
     VolumeInfo { summary, ..volume.info(Digest32::default()) }
 }

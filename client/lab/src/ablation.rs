@@ -6,11 +6,11 @@
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::message::SceneSpec;
-use slabcast_common::path::Orientation;
 use slabcast_common::quality::{Keep, Quality, Work};
 use slabcast_common::view::Projection;
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_render::{Frame, Scene};
+use slabcast_scene::path::Orientation;
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::Fail;
 use slabcast_session::path_scenes::Stage;

@@ -93,7 +93,7 @@ pub fn tiles(whole: Rect, edge: u32) -> impl Iterator<Item = Rect> {
 
 /// Each tile through all sheets, as a cluster's workers draw it.
 fn through(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
-    let whole = Rect::of_size(frame.view.size);
+    let whole = Rect::from_size(frame.view.size);
     let edge = cut.tile as i32;
     let outlook = VisibleBricks::new(&frame.view, &bricks.directory);
     // What nothing lies in is not drawn; what may have most to draw comes first.
@@ -123,7 +123,7 @@ fn through(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
 
 /// Slab after slab, as under the paper's schedule.
 fn in_slabs(frame: &Frame, bricks: &[Arc<Brick>], cut: Cut) -> (Picture, Counters) {
-    let whole = Rect::of_size(frame.view.size);
+    let whole = Rect::from_size(frame.view.size);
     let edge = cut.tile as i32;
     let across = (whole.x1 + edge - 1) / edge;
     // In portions, so that threads share the work and a portion is worth taking.
@@ -153,16 +153,16 @@ fn in_slabs(frame: &Frame, bricks: &[Arc<Brick>], cut: Cut) -> (Picture, Counter
     for slab in sheets.slabs(cut.slabs) {
         let done = shared(tiles.len(), cut.threads, |i, Kept(memory): &mut Kept| {
             let (tile, bricks) = &tiles[i];
-            let before = state.tile(*tile);
+            let before = state.tile_state(*tile);
             tile::render_seen(frame, simd, *tile, slab, bricks, &before, &mut memory.scratch)
         });
         for ((tile, _), (pixels, counted)) in tiles.iter().zip(&done) {
-            state.put(*tile, pixels);
+            state.add_slab_tile(*tile, pixels);
             counters += *counted;
         }
         state.end_slab();
     }
-    (state.finish(), counters)
+    (state.to_picture(), counters)
 }
 
 /// What a thread draws in.

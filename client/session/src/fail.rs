@@ -5,7 +5,7 @@
 
 use crate::progress;
 use crate::terminal::{self, one_line};
-use slabcast_common::quality::Refused;
+use slabcast_common::quality::InvalidField;
 use std::io::{ErrorKind, Write};
 use std::path::Path;
 
@@ -34,14 +34,14 @@ impl Fail {
     }
 
     /// A value of a flag is wrong.
-    pub fn flag(refused: &Refused) -> Self {
+    pub fn flag(refused: &InvalidField) -> Self {
         Fail::usage(format!("--{}: {}", refused.field, refused.problem))
     }
 
     /// A field of a file is wrong. `whole` is what the reader calls the file when no field is
     /// to blame.
-    pub fn field(file: &Path, whole: &str, refused: &Refused) -> Self {
-        let Refused { field, problem } = refused;
+    pub fn field(file: &Path, whole: &str, refused: &InvalidField) -> Self {
+        let InvalidField { field, problem } = refused;
         let file = file.display();
         Fail::failed(if field == whole {
             format!("{file}: {problem}")

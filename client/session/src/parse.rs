@@ -1,10 +1,10 @@
 //! Values of flags: from text to what is meant, or what to give instead.
 
 use slabcast_common::image::Background;
-use slabcast_common::path::MAX_FRAMES;
 use slabcast_common::shade::{HeadWord, Light};
-use slabcast_common::transfer::NanLook;
+use slabcast_common::transfer::NanColour;
 use slabcast_common::view::MAX_EDGE;
+use slabcast_scene::path::MAX_FRAMES;
 
 /// A finite number.
 pub fn number(text: &str) -> Result<f64, String> {
@@ -375,7 +375,7 @@ pub fn light(text: &str) -> Result<Light, String> {
 }
 
 /// `COLOUR` or `COLOUR:OPACITY`.
-pub fn nan(text: &str) -> Result<NanLook, String> {
+pub fn nan(text: &str) -> Result<NanColour, String> {
     let bad = || {
         "give a colour, R,G,B (0 to 1) or #rrggbb, and after a colon its opacity (0 to 1)"
             .to_string()
@@ -383,7 +383,7 @@ pub fn nan(text: &str) -> Result<NanLook, String> {
     let (colour, opacity) = text.split_once(':').unwrap_or((text, "1"));
     let Ok(Background::Colour(color)) = background(colour) else { return Err(bad()) };
     let opacity = number(opacity).ok().filter(|a| (0.0..=1.0).contains(a)).ok_or_else(bad)?;
-    Ok(NanLook { color, opacity })
+    Ok(NanColour { color, opacity })
 }
 
 #[cfg(test)]

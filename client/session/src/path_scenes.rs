@@ -7,14 +7,14 @@ use crate::fail::Fail;
 use crate::request::RenderRequest;
 use slabcast_common::ids::SceneId;
 use slabcast_common::message::SceneSpec;
-use slabcast_common::path::Orientation;
 use slabcast_common::quality::Quality;
 use slabcast_common::transfer::{Classifier, TransferFunction};
-use slabcast_common::tween::Tween;
 use slabcast_common::view::View;
 use slabcast_common::volume::{Volume, VolumeInfo};
-use slabcast_common::wanted::Wanted;
 use slabcast_render::{Frame, Scene};
+use slabcast_scene::brick_needs::BrickNeeds;
+use slabcast_scene::path::Orientation;
+use slabcast_scene::tween::Tween;
 use slabcast_volumes::BrickStore;
 use std::sync::Arc;
 
@@ -35,7 +35,7 @@ impl Drawn {
         transfer: &TransferFunction,
         quality: Quality,
     ) -> Result<Drawn, Fail> {
-        let wanted = Wanted::of(transfer, info, quality.compositing);
+        let wanted = BrickNeeds::for_transfer(transfer, info, quality.compositing);
         Drawn::holding(volume, info, transfer, quality, &wanted)
     }
 
@@ -45,10 +45,10 @@ impl Drawn {
         info: &VolumeInfo,
         transfer: &TransferFunction,
         quality: Quality,
-        wanted: &Wanted,
+        wanted: &BrickNeeds,
     ) -> Result<Drawn, Fail> {
         let classifier = Classifier::new(transfer, info, quality.compositing);
-        let sums = classifier.sums(&quality, &info.lattice).map_err(|e| Fail::flag(&e))?;
+        let sums = classifier.choose_sums(&quality, &info.lattice).map_err(|e| Fail::flag(&e))?;
         let store = BrickStore::build(volume, info.digest, wanted);
         let bricks = Bricks::of(&store);
         let spec = SceneSpec {
@@ -85,11 +85,12 @@ impl Stage {
     ) -> Result<Stage, Fail> {
         let blame = |e| request.blame(&e);
         let transfer = request.transfer.function(info).map_err(blame)?;
-        let tween = Tween::of(&request.path, &info.summary).map_err(blame)?;
+        let tween = Tween::from_path(&request.path, &info.summary).map_err(blame)?;
         let compositing = request.quality.compositing;
-        let wanted = Wanted::of_path(&request.path, &transfer, tween.as_ref(), info, compositing)
-            .map_err(blame)?
-            .keeping(request.work.keep);
+        let wanted =
+            BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, compositing)
+                .map_err(blame)?
+                .with_kept(request.work.keep);
         let Drawn { spec: base, bricks } =
             Drawn::holding(volume, info, &transfer, request.quality, &wanted)?;
         let shared = Arc::new(Scene::new(&base));
@@ -100,7 +101,7 @@ impl Stage {
     pub fn spec(&self, i: usize) -> SceneSpec {
         let Some(tween) = &self.tween else { return self.base.clone() };
         let at = (self.request.path.first_frame() + i) as f64;
-        tween.scene(&self.base, self.request.quality.sums, at)
+        tween.scene_at(&self.base, self.request.quality.sums, at)
     }
 
     /// The same, made ready.
@@ -147,7 +148,7 @@ impl Stage {
 mod tests {
     use super::*;
     use crate::direct::{self, Cut};
-    use slabcast_common::path::ViewPath;
+    use slabcast_scene::path::ViewPath;
 
     #[test]
     fn each_frame_of_a_tween_is_drawn_with_its_own_function() {

@@ -6,8 +6,8 @@ use crate::progress::Step;
 use crate::request::RenderRequest;
 use crate::source::{Cancel, Source, Update};
 use slabcast_client::{Client, ClientError, JobState, PATIENCE, VolumeDescription, local_field};
-use slabcast_common::message::PathRequest;
-use slabcast_common::quality::Refused;
+use slabcast_common::quality::InvalidField;
+use slabcast_scene::request::PathRequest;
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, watch};
 
@@ -56,7 +56,7 @@ pub async fn submit(
 ) -> Result<Source, Fail> {
     let job = client.submit(&message).await.map_err(|e| match &e {
         ClientError::InvalidField { field, problem } => {
-            request.blame(&Refused::new(local_field(field), problem))
+            request.blame(&InvalidField::new(local_field(field), problem))
         }
         _ => fail(&e),
     })?;

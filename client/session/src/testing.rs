@@ -1,8 +1,8 @@
 //! Help for tests: volumes that are too large for the repository.
 
 use crate::volume;
-use slabcast_common::path::Orientation;
 use slabcast_common::volume::Volume;
+use slabcast_scene::path::Orientation;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 

@@ -3,13 +3,14 @@
 
 use crate::fail::Fail;
 use crate::parse;
-use slabcast_common::message::TransferChoice;
-use slabcast_common::paraview;
-use slabcast_common::presets;
-use slabcast_common::quality::Refused;
+use slabcast_common::quality::InvalidField;
 use slabcast_common::shade::Light;
-use slabcast_common::transfer::{ColorSpace, Domain, NanLook, TransferFunction};
+use slabcast_common::spelling;
+use slabcast_common::transfer::{ColorSpace, Domain, NanColour, TransferFunction};
 use slabcast_common::volume::VolumeInfo;
+use slabcast_scene::paraview;
+use slabcast_scene::presets;
+use slabcast_scene::transfer::TransferChoice;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -34,7 +35,7 @@ pub struct TransferFlags {
     shading: Option<bool>,
     /// Look of NaN: a colour, and after a colon its opacity [default: invisible]
     #[arg(long, value_name = "COLOUR[:A]", value_parser = parse::nan, hide_short_help = true)]
-    nan: Option<NanLook>,
+    nan: Option<NanColour>,
 }
 
 /// A transfer function and where it came from.
@@ -50,7 +51,7 @@ pub struct Transfer {
     colours: Option<Vec<[f64; 4]>>,
     light: Option<Light>,
     shading: Option<bool>,
-    nan: Option<NanLook>,
+    nan: Option<NanColour>,
 }
 
 impl Transfer {
@@ -65,14 +66,14 @@ impl Transfer {
         } else {
             let path = Path::new(text);
             if !is_file(path) {
-                return Err(Fail::flag(&presets::unknown(text)));
+                return Err(Fail::flag(&presets::unknown_name(text)));
             }
             let json = read_json(path)?;
-            let tf = if paraview::is(&json) {
+            let tf = if paraview::looks_like_paraview(&json) {
                 let wrong = |e| Fail::field(path, "colour map", &e);
-                let mut map = paraview::read(&json).map_err(wrong)?;
+                let mut map = paraview::parse(&json).map_err(wrong)?;
                 title = map.name.take();
-                map.function().map_err(wrong)?
+                map.into_function().map_err(wrong)?
             } else {
                 TransferFunction::from_json(&json)
                     .map_err(|e| Fail::field(path, "transfer function", &e))?
@@ -144,14 +145,14 @@ impl Transfer {
     }
 
     /// In full, for a volume with these values.
-    pub fn function(&self, info: &VolumeInfo) -> Result<TransferFunction, Refused> {
+    pub fn function(&self, info: &VolumeInfo) -> Result<TransferFunction, InvalidField> {
         let mut tf = match &self.base {
             TransferChoice::Name(name) => presets::by_name(name, &info.summary)?,
             TransferChoice::Function(tf) => (**tf).clone(),
         };
         if let Some(colours) = &self.colours {
             let (from, to) = shown(&tf, info);
-            tf.colors = presets::spread(colours, from, to);
+            tf.colors = presets::stretch_colours(colours, from, to);
             tf.color_space = ColorSpace::Srgb;
         }
         if let Some(light) = self.light {
@@ -206,13 +207,13 @@ fn is_file(path: &Path) -> bool {
 
 /// Colours of a map or a ParaView file, over 0 to 1.
 fn colours(text: &str) -> Result<Vec<[f64; 4]>, Fail> {
-    if let Some(colours) = presets::map_colours(text) {
+    if let Some(colours) = presets::colour_map(text) {
         return Ok(colours);
     }
     let path = Path::new(text);
     if !is_file(path) {
         let names = presets::MAPS.map(|(name, _)| name);
-        let meant = presets::nearest(text, &names)
+        let meant = spelling::nearest(text, &names)
             .map(|n| format!("did you mean `{n}`? "))
             .unwrap_or_default();
         return Err(Fail::usage(format!(
@@ -221,13 +222,13 @@ fn colours(text: &str) -> Result<Vec<[f64; 4]>, Fail> {
         )));
     }
     let json = read_json(path)?;
-    if !paraview::is(&json) {
+    if !paraview::looks_like_paraview(&json) {
         return Err(Fail::failed(format!(
             "{}: is no colour map of ParaView; a transfer function goes with --tf",
             path.display()
         )));
     }
-    let read = paraview::read(&json).map_err(|e| Fail::field(path, "colour map", &e))?;
+    let read = paraview::parse(&json).map_err(|e| Fail::field(path, "colour map", &e))?;
     Ok(read.unit_colours())
 }
 

@@ -294,7 +294,7 @@ impl FrameTrace {
 fn is_tile(rect: &Rect, edge: u32, size: [u32; 2]) -> bool {
     let edge = edge as i32;
     let whole = Rect::new(rect.x0, rect.y0, rect.x0 + edge, rect.y0 + edge);
-    let cut = whole.intersect(&Rect::of_size(size));
+    let cut = whole.intersect(&Rect::from_size(size));
     cut == *rect && rect.x0 % edge == 0 && rect.y0 % edge == 0
 }
 

@@ -1,8 +1,7 @@
 //! Pixels for results of tiles that nobody drew. A rehearsal sends them so that messages have the
 //! recorded size; they look like noise, and the master marks the picture.
 
-use slabcast_common::image::TilePixels;
-use slabcast_common::leaves::{Finish, LEAF, Leaves};
+use slabcast_common::image::{LEAF_EDGE, PixelEncoding, SparseTile, TilePixels};
 use slabcast_common::occlusion::Rect;
 
 /// Returns pixels of a slab's tile: shut where `shut` says so, and filled until the result takes
@@ -58,13 +57,13 @@ pub fn placeholder_sums(rect: &Rect, bytes: u32) -> TilePixels {
 ///
 /// Leaves are filled one after another. Their bytes have no pattern, so that nothing packs them; the
 /// rest of the last leaf is zeros, which pack to nearly nothing.
-pub fn placeholder_finished(rect: &Rect, bytes: u32, finish: &Finish) -> Leaves {
+pub fn placeholder_finished(rect: &Rect, bytes: u32, finish: &PixelEncoding) -> SparseTile {
     let size = [rect.width() as u32, rect.height() as u32];
-    let mut leaves = Leaves::blank(size, finish.format);
+    let mut leaves = SparseTile::blank(size, finish.format);
     let left = (bytes as usize).saturating_sub(70 + leaves.mask.len());
-    let columns = (size[0] as usize).div_ceil(LEAF);
-    for i in 0..columns * (size[1] as usize).div_ceil(LEAF) {
-        if Leaves::data_len(size, finish.format, &leaves.mask) >= left {
+    let columns = (size[0] as usize).div_ceil(LEAF_EDGE);
+    for i in 0..columns * (size[1] as usize).div_ceil(LEAF_EDGE) {
+        if SparseTile::data_len(size, finish.format, &leaves.mask) >= left {
             break;
         }
         leaves.mask[i / 8] |= 1 << (i % 8);
@@ -77,7 +76,7 @@ pub fn placeholder_finished(rect: &Rect, bytes: u32, finish: &Finish) -> Leaves 
         (x >> 32) as u8
     });
     leaves.data.extend(noise.take(left));
-    leaves.data.resize(Leaves::data_len(size, finish.format, &leaves.mask), 0);
-    leaves.alpha_most = if left > 0 { 0.25 } else { 0.0 };
+    leaves.data.resize(SparseTile::data_len(size, finish.format, &leaves.mask), 0);
+    leaves.max_alpha = if left > 0 { 0.25 } else { 0.0 };
     leaves
 }

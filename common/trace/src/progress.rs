@@ -10,7 +10,7 @@
 
 use crate::{FrameTrace, RegionTile};
 use slabcast_common::occlusion::Rect;
-use slabcast_common::region::{parts, square_of};
+use slabcast_common::region::{enclosing_square, parts};
 use slabcast_common::view::Projected;
 
 /// Pixels by which the footprints of a tile reach beyond it, both sides together. Tiles of 32 pixels
@@ -143,7 +143,7 @@ impl RegionProgress {
             if let Some(known) = traced.region(&rect, size) {
                 return Some(recorded_part(rect, &known));
             }
-            let square = square_of(&rect, size);
+            let square = enclosing_square(&rect, size);
             let known = traced.region(&square, size)?;
             recorded_part(square, &known).within(&rect, border_slowdown(&rect, &square), project)
         };

@@ -1,5 +1,5 @@
 use super::*;
-use slabcast_common::leaves::{Finish, LEAF};
+use slabcast_common::image::{LEAF_EDGE, PixelEncoding};
 
 fn trace() -> Trace {
     let tile = |x, y, ns| TileTrace { x, y, ns, lease_bytes: 300, result_bytes: 16_000 };
@@ -126,7 +126,7 @@ fn placeholder_slab_pixels_are_shut_where_recorded() {
 fn placeholder_finished_pixels_fit_their_tile() {
     use slabcast_common::image::{Background, PixelFormat};
     for format in [PixelFormat::Rgb8, PixelFormat::Rgba32F] {
-        let finish = Finish { format, background: Background::Transparent };
+        let finish = PixelEncoding { format, background: Background::Transparent };
         for (w, h) in [(64, 64), (37, 5)] {
             let rect = Rect::new(100, 0, 100 + w, h);
             for bytes in [0, 60, 100, 3_000, 12_000, 10_000_000] {
@@ -134,7 +134,7 @@ fn placeholder_finished_pixels_fit_their_tile() {
                 assert_eq!(leaves.check(), Ok(()));
                 assert_eq!(leaves.pixels(), rect.area());
                 let all = rect.area() * format.bytes();
-                let leaf = LEAF * LEAF * format.bytes();
+                let leaf = LEAF_EDGE * LEAF_EDGE * format.bytes();
                 let most = (bytes as usize + leaf).min(all);
                 assert!(leaves.data.len() <= most, "{} of {bytes}", leaves.data.len());
                 assert!(leaves.data.len() + 80 >= all.min(bytes as usize));

@@ -3,8 +3,7 @@
 use crate::{Micros, Spans};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, FrameId, WorkerId};
-use slabcast_common::image::FrameState;
-use slabcast_common::leaves::Leaves;
+use slabcast_common::image::{FrameState, SparseTile};
 use slabcast_common::message::ToWorker;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::stats::FrameStats;
@@ -55,7 +54,7 @@ pub enum Action {
         /// The frame.
         frame: FrameId,
         /// Tile rectangles in pixels, with their finished pixels.
-        tiles: Vec<(Rect, Leaves)>,
+        tiles: Vec<(Rect, SparseTile)>,
     },
     /// A frame is complete.
     FrameDone {

@@ -2,8 +2,8 @@
 
 use slabcast_common::brick::{BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
-use slabcast_common::leaves::Finish;
-use slabcast_common::message::{HandedOver, SceneSpec, TileResult};
+use slabcast_common::image::PixelEncoding;
+use slabcast_common::message::{RegionSplit, SceneSpec, TileResult};
 use slabcast_common::quality::Work;
 use slabcast_common::view::View;
 use std::sync::Arc;
@@ -25,7 +25,7 @@ pub struct FrameJob {
     pub work: Work,
     /// Format to which workers finish the pixels of regions. `None`: results are sums of light and
     /// opacity. Results of the `slab` schedule always are.
-    pub finish: Option<Finish>,
+    pub finish: Option<PixelEncoding>,
 }
 
 /// An input of [`Scheduler::handle`](crate::Scheduler::handle).
@@ -97,12 +97,12 @@ pub enum Event {
         reason: String,
     },
     /// A worker gave away a piece of a region it is rendering, in answer to
-    /// [`ToWorker::HandOver`](slabcast_common::message::ToWorker::HandOver).
+    /// [`ToWorker::SplitRegion`](slabcast_common::message::ToWorker::SplitRegion).
     HandedOver {
         /// The worker that gave it away.
         worker: WorkerId,
         /// The piece, with its state so far.
-        piece: Box<HandedOver>,
+        piece: Box<RegionSplit>,
     },
     /// Bricks arrived intact. Bricks of a set arrive in the order in which they were sent, so a count
     /// is enough. Damaged bricks are not counted.

@@ -2,14 +2,14 @@
 //! --nocapture --include-ignored` prints it. A slab's planning is on the critical path of every
 //! frame (nothing is rendered meanwhile), so it has to stay far below a slab's rendering.
 
-use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox};
+use slabcast_common::brick::{BRICK_EDGE, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId, WorkerId};
 use slabcast_common::image::TilePixels;
 use slabcast_common::message::{Pixels, SceneSpec, TaskTimes, TileResult, ToWorker};
-use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
+use slabcast_scene::presets;
 use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
 use std::sync::Arc;
 use std::time::Instant;
@@ -29,7 +29,7 @@ fn slab() -> Work {
 /// A frame of `edge` pixels over a cube of `n` bricks each way, on `workers` workers that answer
 /// at once. Prints milliseconds a slab and lease.
 fn cost(n: u32, edge: u32, height: f64, workers: u64, work: Work) -> f64 {
-    let dims = [n * BRICK; 3];
+    let dims = [n * BRICK_EDGE; 3];
     let small = Volume::from_fn_u8("cost", [4; 3], |i, _, _| i as u8);
     let mut info = small.info(Digest32([1; 32]));
     info.lattice.dims = dims;
@@ -42,11 +42,11 @@ fn cost(n: u32, edge: u32, height: f64, workers: u64, work: Work) -> f64 {
         projection: CameraProjection::Ortho { height: height * f64::from(dims[0]) },
     };
     let view = View::new(&info.lattice, &camera, [edge, edge], &quality).expect("drawable");
-    let grid = BrickGrid::of(dims);
+    let grid = BrickGrid::new(dims);
     let bricks: Arc<[BrickInfo]> = (0..grid.len() as u32)
         .map(|id| {
             let lo = grid.corner(BrickId(id));
-            let tight = TightBox { lo, hi: lo.map(|x| x + BRICK - 1) };
+            let tight = TightBox { lo, hi: lo.map(|x| x + BRICK_EDGE - 1) };
             BrickInfo { id: BrickId(id), tight, voxels: 512, bytes: 1547 }
         })
         .collect();

@@ -6,14 +6,14 @@ use super::{
 };
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{BrickId, Epoch, FrameId, TaskId, WorkerId};
-use slabcast_common::image::TilePixels;
-use slabcast_common::leaves::Leaves;
+use slabcast_common::image::{SparseTile, TilePixels};
 use slabcast_common::link::{FINISHER_THREADS, stream_threads};
+use slabcast_common::lookahead::Lookahead;
 use slabcast_common::message::{
     Counters, Lease, Pixels, RegionCost, RegionLease, TaskTimes, TileResult, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
-use slabcast_common::region::{Lookahead, PART, parts};
+use slabcast_common::region::{PART_EDGE, parts};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::Projected;
 use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
@@ -729,7 +729,7 @@ impl<'a> World<'a> {
                 let at = self.read(id, bytes);
                 self.later(at, Coming::Lease(id, Task::Region(lease)));
             }
-            ToWorker::HandOver { task, epoch, share, .. } => {
+            ToWorker::SplitRegion { task, epoch, share, .. } => {
                 let at = self.read(id, SMALL);
                 self.hand_over(id, (task, epoch), f64::from(share) / 1000.0, at);
                 self.begin(id, None)?;
@@ -911,7 +911,7 @@ impl<'a> World<'a> {
             let mut lent = w.leases.remove(at);
             let frame = lent.task.frame();
             let first = *w.first.entry(set).or_insert(frame) == frame;
-            lent.ahead = w.look.sheets(now, self.cluster.threads, (lent.stalls, first));
+            lent.ahead = w.look.sheets(now, self.cluster.threads, lent.stalls, first);
             if let Some(course) = &mut lent.course {
                 course.resume();
                 let present = &w.present[&set];
@@ -937,7 +937,9 @@ impl<'a> World<'a> {
             let Task::Region(lease) = &lent.task else { continue };
             let job = &self.jobs[lease.frame.0 as usize - 1];
             let set = job.scene.bricks;
-            if !parts(lease.tile).all(|p| w.drawn.contains(&(set, p.x0 / PART, p.y0 / PART))) {
+            if !parts(lease.tile)
+                .all(|p| w.drawn.contains(&(set, p.x0 / PART_EDGE, p.y0 / PART_EDGE)))
+            {
                 continue;
             }
             let here = has(&w.present[&set]);
@@ -999,7 +1001,7 @@ impl<'a> World<'a> {
                 self.was_idle(idle, decided, lacking, self.now());
                 let came = self.now();
                 let waited = came - lacking.unwrap_or(came).clamp(idle.since, came);
-                self.workers.get_mut(&id).expect("a worker stays").look.waited(waited);
+                self.workers.get_mut(&id).expect("a worker stays").look.add_idle_ns(waited);
                 self.spend(self.now(), now, |s| &mut s.way);
             }
             let frame = lent.task.frame();
@@ -1071,7 +1073,7 @@ impl<'a> World<'a> {
         if let Task::Region(lease) = &lent.task {
             let set = self.jobs[frame.0 as usize - 1].scene.bricks;
             let w = self.workers.get_mut(&id).expect("a worker stays");
-            w.drawn.extend(parts(lease.tile).map(|p| (set, p.x0 / PART, p.y0 / PART)));
+            w.drawn.extend(parts(lease.tile).map(|p| (set, p.x0 / PART_EDGE, p.y0 / PART_EDGE)));
         }
         Some(lent)
     }
@@ -1114,7 +1116,7 @@ impl<'a> World<'a> {
             (Task::Region(_), Some(finish)) => {
                 weight = if self.workers[&id].plain { (plain, 0) } else { (packed, plain) };
                 let size = [tile.width() as u32, tile.height() as u32];
-                Pixels::Finished(Leaves::blank(size, finish.format))
+                Pixels::Finished(SparseTile::blank(size, finish.format))
             }
             _ => Pixels::Sums(TilePixels { a, colour: vec![[0; 3]; tile.area()], last: None }),
         };
@@ -1334,7 +1336,7 @@ impl<'a> World<'a> {
                 let Costs { finish_pixel, mark_pixel, .. } = self.cluster.costs;
                 let ns = if self.machine.is_some() { mark_pixel } else { finish_pixel };
                 // Of tiles that came finished only the last ones are left.
-                let left = state.finished().iter().map(|(tile, _)| tile.area()).sum::<usize>();
+                let left = state.encoded_tiles().iter().map(|(tile, _)| tile.area()).sum::<usize>();
                 let pixels = match self.jobs[i].finish {
                     Some(_) if self.machine.is_none() => left as f64,
                     _ => self.pixels(frame),

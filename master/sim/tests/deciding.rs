@@ -2,16 +2,15 @@
 //!
 //! `slabcast plan` measures the same on a path that was drawn; here nothing has to be.
 
-use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox};
+use slabcast_common::brick::{BRICK_EDGE, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId};
-use slabcast_common::image::{Background, PixelFormat};
-use slabcast_common::leaves::Finish;
+use slabcast_common::image::{Background, PixelEncoding, PixelFormat};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
+use slabcast_scene::presets;
 use slabcast_schedule::{FrameJob, macrotile};
 use slabcast_sim::{self as sim, Cluster, Costs, Link, Nanos, Stopwatch, Toll};
 use slabcast_trace::{
@@ -28,22 +27,23 @@ fn ball(frames: usize) -> (Vec<FrameJob>, Trace) {
     let info = Volume::from_fn_u8("v", DIMS, |i, _, _| i as u8).info(Digest32([1; 32]));
     let transfer = presets::by_name("grey", &info.summary).expect("a known name");
     let quality = Quality::default();
-    let grid = BrickGrid::of(DIMS);
+    let grid = BrickGrid::new(DIMS);
     let from_centre = |id: u32| -> [f64; 3] {
-        grid.corner(BrickId(id)).map(|x| f64::from(x) + f64::from(BRICK) / 2.0 - 128.0)
+        grid.corner(BrickId(id)).map(|x| f64::from(x) + f64::from(BRICK_EDGE) / 2.0 - 128.0)
     };
     let bricks: Arc<[BrickInfo]> = (0..grid.len() as u32)
         .filter(|&id| from_centre(id).iter().map(|x| x * x).sum::<f64>() < 110.0 * 110.0)
         .map(|id| {
             let lo = grid.corner(BrickId(id));
-            let tight = TightBox { lo, hi: lo.map(|x| x + BRICK - 1) };
+            let tight = TightBox { lo, hi: lo.map(|x| x + BRICK_EDGE - 1) };
             BrickInfo { id: BrickId(id), tight, voxels: 512, bytes: 1_200 }
         })
         .collect();
     let set = BrickSetKey(Digest32([2; 32]));
     let scene = SceneSpec { id: SceneId(1), volume: info, transfer, quality, bricks: set };
     let scene = Arc::new(scene);
-    let finish = Finish { format: PixelFormat::Rgb8, background: Background::Colour([0.0; 3]) };
+    let finish =
+        PixelEncoding { format: PixelFormat::Rgb8, background: Background::Colour([0.0; 3]) };
     let mut jobs = Vec::new();
     let mut traced = Vec::new();
     for i in 0..frames {

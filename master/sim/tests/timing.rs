@@ -1,16 +1,15 @@
 //! Simulated clusters whose times can be worked out by hand.
 
-use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox};
+use slabcast_common::brick::{BRICK_EDGE, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId};
-use slabcast_common::image::{Background, PixelFormat};
-use slabcast_common::leaves::Finish;
+use slabcast_common::image::{Background, PixelEncoding, PixelFormat};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::{Rect, ShutMap};
-use slabcast_common::presets;
 use slabcast_common::quality::{Borders, Quality, Schedule, Work};
 use slabcast_common::stats::FrameStats;
 use slabcast_common::view::{Camera, CameraProjection, Projected, View};
 use slabcast_common::volume::{Digest32, Volume};
+use slabcast_scene::presets;
 use slabcast_schedule::{FrameJob, Span, Spans, macrotile, slab_ranges};
 use slabcast_sim::{self as sim, Cluster, Costs, Link, Outcome, Toll, Unknown, Unmeasured};
 use slabcast_trace::{
@@ -30,11 +29,11 @@ fn world(frames: usize) -> (Vec<FrameJob>, Trace) {
     let info = Volume::from_fn_u8("v", dims, |i, _, _| i as u8).info(Digest32([1; 32]));
     let transfer = presets::by_name("grey", &info.summary).expect("a known name");
     let quality = Quality::default();
-    let grid = BrickGrid::of(dims);
+    let grid = BrickGrid::new(dims);
     let bricks: Arc<[BrickInfo]> = (0..grid.len() as u32)
         .map(|id| {
             let lo = grid.corner(BrickId(id));
-            let tight = TightBox { lo, hi: lo.map(|x| x + BRICK - 1) };
+            let tight = TightBox { lo, hi: lo.map(|x| x + BRICK_EDGE - 1) };
             BrickInfo { id: BrickId(id), tight, voxels: 512, bytes: BRICK_BYTES }
         })
         .collect();
@@ -77,7 +76,7 @@ fn world(frames: usize) -> (Vec<FrameJob>, Trace) {
 
 fn frame(job: &FrameJob, quality: &Quality) -> FrameTrace {
     let projected: Vec<_> = job.bricks.iter().map(|b| job.view.project(&b.tight)).collect();
-    let mut shut = ShutMap::open(Rect::of_size(SIZE));
+    let mut shut = ShutMap::open(Rect::from_size(SIZE));
     let mut slabs = Vec::new();
     for (n, range) in slab_ranges(&job.view, &projected, &|i| job.bricks[i].voxels, &job.work)
         .into_iter()
@@ -283,7 +282,8 @@ fn what_a_result_takes_is_taken_from_what_is_drawn_next() {
 #[test]
 fn results_are_packed_where_they_would_fill_the_link() {
     let (jobs, trace) = world(6);
-    let finish = Finish { format: PixelFormat::Rgb8, background: Background::Colour([0.0; 3]) };
+    let finish =
+        PixelEncoding { format: PixelFormat::Rgb8, background: Background::Colour([0.0; 3]) };
     let jobs = under(Schedule::Region, &jobs)
         .into_iter()
         .map(|job| FrameJob { finish: Some(finish), ..job })

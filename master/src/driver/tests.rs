@@ -4,12 +4,12 @@ use super::*;
 use crate::handle::{Handle, Master, MasterConfig};
 use crate::jobs::WatchItem;
 use slabcast_common::image::{Background, PixelFormat, TilePixels};
-use slabcast_common::message::{
-    Counters, PathRequest, Pixels, RegionCost, TaskTimes, TileResult, TransferChoice,
-};
-use slabcast_common::path::{Orientation, Turntable, ViewPath};
+use slabcast_common::message::{Counters, Pixels, RegionCost, TaskTimes, TileResult};
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
+use slabcast_scene::path::{Orientation, Turntable, ViewPath};
+use slabcast_scene::request::PathRequest;
+use slabcast_scene::transfer::TransferChoice;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Condvar, Mutex};
 
@@ -26,7 +26,7 @@ fn master(hooks: Hooks, heartbeat: Micros) -> Master {
 fn request(key: &str, frames: u32, preset: &str) -> PathRequest {
     PathRequest {
         client_key: key.into(),
-        path: ViewPath::turn(SIZE, Turntable { frames, ..Turntable::default() }),
+        path: ViewPath::from_turntable(SIZE, Turntable { frames, ..Turntable::default() }),
         transfer: TransferChoice::Name(preset.into()),
         quality: Quality::default(),
         work: Work::default(),
@@ -131,7 +131,7 @@ async fn panic_in_a_finisher_fails_the_job_and_the_master_goes_on() {
             assert_eq!(frames, 3);
             done += 1;
         } else {
-            let words = ["finishing the frame panicked", "injected into Finish"];
+            let words = ["finishing the frame panicked", "injected into PixelEncoding"];
             assert!(failed_with(&state, words), "{state:?}");
             failed += 1;
         }
@@ -167,13 +167,13 @@ async fn panic_while_a_request_is_checked_is_answered_and_the_master_goes_on() {
 /// Tiles that a finisher took and lost are not to be missing from a picture.
 #[test]
 fn picture_whose_composing_panicked_is_not_finished() {
-    let finish = slabcast_common::leaves::Finish {
+    let finish = slabcast_common::image::PixelEncoding {
         format: PixelFormat::Rgb8,
         background: Background::Transparent,
     };
     let assembly = Assembly::new([32, 32], finish);
     // A tile that says to have a leaf and lacks its bytes.
-    let mut leaves = Leaves::blank([32, 32], PixelFormat::Rgb8);
+    let mut leaves = SparseTile::blank([32, 32], PixelFormat::Rgb8);
     leaves.mask[0] = 1;
     assembly.add(vec![(Rect::new(0, 0, 32, 32), leaves)]);
     let panicked = caught("composing tiles", || assembly.compose()).expect_err("it panics");

@@ -4,10 +4,11 @@ use super::Table;
 use crate::brick_sets::BrickSets;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, JobId, SceneId};
-use slabcast_common::message::{PathRequest, SceneSpec};
-use slabcast_common::tween::Tween;
+use slabcast_common::message::SceneSpec;
 use slabcast_common::view::View;
-use slabcast_common::wanted::Wanted;
+use slabcast_scene::brick_needs::BrickNeeds;
+use slabcast_scene::request::PathRequest;
+use slabcast_scene::tween::Tween;
 use slabcast_volumes::BrickStore;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -21,7 +22,7 @@ pub(crate) struct ActiveJob {
     /// The scene of all frames; of a tween, all but the transfer function.
     pub(crate) scene: Arc<SceneSpec>,
     pub(crate) tween: Option<Tween>,
-    pub(crate) wanted: Wanted,
+    pub(crate) wanted: BrickNeeds,
     /// One view a frame.
     pub(crate) views: Vec<View>,
     /// Its bricks, once they are cut.
@@ -40,7 +41,7 @@ impl ActiveJob {
     pub(crate) fn scene_of(&self, number: u64, frame: FrameId) -> Arc<SceneSpec> {
         let Some(tween) = &self.tween else { return self.scene.clone() };
         let position = (self.request.path.first_frame() as u64 + number) as f64;
-        let scene = tween.scene(&self.scene, self.request.quality.sums, position);
+        let scene = tween.scene_at(&self.scene, self.request.quality.sums, position);
         Arc::new(SceneSpec { id: SceneId(frame.0 | SINGLE_FRAME), ..scene })
     }
 }

@@ -10,14 +10,16 @@ use crate::handle::{ServedVolume, unix_ms};
 use crate::memory;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{JobId, SceneId};
-use slabcast_common::message::{PathRequest, SceneSpec, TransferChoice};
-use slabcast_common::presets;
-use slabcast_common::quality::{Quality, Refused};
+use slabcast_common::message::SceneSpec;
+use slabcast_common::quality::{InvalidField, Quality};
 use slabcast_common::transfer::{Classifier, TransferFunction};
-use slabcast_common::tween::Tween;
 use slabcast_common::view::View;
 use slabcast_common::volume::VolumeInfo;
-use slabcast_common::wanted::Wanted;
+use slabcast_scene::brick_needs::BrickNeeds;
+use slabcast_scene::presets;
+use slabcast_scene::request::PathRequest;
+use slabcast_scene::transfer::TransferChoice;
+use slabcast_scene::tween::Tween;
 use slabcast_volumes::BrickStore;
 use std::sync::Arc;
 
@@ -29,7 +31,7 @@ const MAX_KEY_BYTES: usize = 200;
 pub enum SubmitError {
     /// A field of the request can't be used.
     #[error(transparent)]
-    Refused(#[from] Refused),
+    Refused(#[from] InvalidField),
     /// The client's key belongs to another request.
     #[error("client_key: belongs to another request; choose a fresh key")]
     KeyTaken,
@@ -47,7 +49,7 @@ pub enum SubmitError {
 /// A request that was checked, with all that its frames need.
 pub(crate) struct Plan {
     pub(crate) request: Arc<PathRequest>,
-    pub(crate) wanted: Wanted,
+    pub(crate) wanted: BrickNeeds,
     transfer: TransferFunction,
     quality: Quality,
     tween: Option<Tween>,
@@ -55,10 +57,10 @@ pub(crate) struct Plan {
 }
 
 /// Checks a client's key.
-pub(crate) fn check_key(key: &str) -> Result<(), Refused> {
+pub(crate) fn check_key(key: &str) -> Result<(), InvalidField> {
     if key.is_empty() || key.len() > MAX_KEY_BYTES {
         let problem = format!("give 1 to {MAX_KEY_BYTES} bytes, new for each request");
-        return Err(Refused::new("client_key", problem));
+        return Err(InvalidField::new("client_key", problem));
     }
     Ok(())
 }
@@ -68,7 +70,7 @@ impl Plan {
     ///
     /// # Errors
     /// The field that can't be used.
-    pub(crate) fn new(request: PathRequest, served: &ServedVolume) -> Result<Plan, Refused> {
+    pub(crate) fn new(request: PathRequest, served: &ServedVolume) -> Result<Plan, InvalidField> {
         let info = &served.info;
         request.quality.check()?;
         request.work.check()?;
@@ -86,17 +88,18 @@ impl Plan {
             .map(|i| {
                 View::new(&info.lattice, &cameras.camera(i)?, request.path.size, &request.quality)
             })
-            .collect::<Result<Vec<View>, Refused>>()?;
+            .collect::<Result<Vec<View>, InvalidField>>()?;
         let compositing = request.quality.compositing;
-        let tween = Tween::of(&request.path, &info.summary)?;
+        let tween = Tween::from_path(&request.path, &info.summary)?;
         let mut sums = request.quality.sums;
-        for tf in tween.iter().flat_map(Tween::ends).chain([&transfer]) {
+        for tf in tween.iter().flat_map(Tween::key_functions).chain([&transfer]) {
             let classifier = Classifier::new(tf, info, compositing);
-            sums = classifier.sums(&request.quality, &info.lattice)?;
+            sums = classifier.choose_sums(&request.quality, &info.lattice)?;
         }
         let quality = Quality { sums, ..request.quality };
-        let wanted = Wanted::of_path(&request.path, &transfer, tween.as_ref(), info, compositing)?
-            .keeping(request.work.keep);
+        let wanted =
+            BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, compositing)?
+                .with_kept(request.work.keep);
         Ok(Plan { request: Arc::new(request), wanted, transfer, quality, tween, views })
     }
 

@@ -4,9 +4,9 @@ use super::watcher::{TILE_NEWS, Watch, WatchItem};
 use super::*;
 use crate::driver::Event;
 use slabcast_common::image::Background;
-use slabcast_common::message::TransferChoice;
-use slabcast_common::path::{Turntable, ViewPath};
 use slabcast_common::quality::{Quality, Work};
+use slabcast_scene::path::{Turntable, ViewPath};
+use slabcast_scene::transfer::TransferChoice;
 use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio::time::Instant;
@@ -53,7 +53,7 @@ fn job(id: JobId, frames: u64) -> Job {
     let client_key = format!("key {id}");
     let request = PathRequest {
         client_key: client_key.clone(),
-        path: ViewPath::turn([1, 1], Turntable::default()),
+        path: ViewPath::from_turntable([1, 1], Turntable::default()),
         transfer: TransferChoice::Name("auto".into()),
         quality: Quality::default(),
         work: Work::default(),

@@ -46,9 +46,9 @@ mod tests {
     use prost::Message;
     use slabcast_common::brick::BrickSetKey;
     use slabcast_common::ids::SceneId;
-    use slabcast_common::presets;
     use slabcast_common::quality::{Quality, Sums};
     use slabcast_common::volume::{Digest32, Volume};
+    use slabcast_scene::presets;
 
     #[test]
     fn scene_of_format_3_is_read_with_its_transfer_function_from_json() {

@@ -40,9 +40,8 @@ pub use write::{RecordSummary, Recorder, start};
 
 use serde::{Deserialize, Serialize};
 use slabcast_common::brick::BrickInfo;
-use slabcast_common::image::PixelFormat;
-use slabcast_common::leaves::Finish;
-use slabcast_common::message::{HandedOver, Pixels, Sampling, TileResult, ToWorker};
+use slabcast_common::image::{PixelEncoding, PixelFormat};
+use slabcast_common::message::{ErrorsBySource, Pixels, RegionSplit, TileResult, ToWorker};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{Action, Event};
@@ -128,7 +127,7 @@ struct NotedJob {
     work: slabcast_common::quality::Work,
     /// Format and background for regions that are finished on workers.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    finish: Option<Finish>,
+    finish: Option<PixelEncoding>,
 }
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -178,7 +177,7 @@ struct NotedPiece {
 }
 
 impl NotedPiece {
-    fn new(worker: u64, piece: &HandedOver) -> Self {
+    fn new(worker: u64, piece: &RegionSplit) -> Self {
         let p = &piece.begun.pixels;
         NotedPiece {
             w: worker,
@@ -225,8 +224,8 @@ impl NotedResult {
             sampled: result
                 .region
                 .as_ref()
-                .filter(|r| r.sampled != Sampling::default())
-                .map(|r| Box::new(r.sampled.each().map(|s| (s.pixels, s.squares)))),
+                .filter(|r| r.sampled != ErrorsBySource::default())
+                .map(|r| Box::new(r.sampled.to_array().map(|s| (s.pixels, s.squares)))),
             bytes: result.bytes,
             finished,
         }
@@ -333,7 +332,7 @@ fn describe(message: &ToWorker) -> String {
         ToWorker::DropBricks { bricks, .. } => {
             format!("forget {} bricks {:016x}", bricks.len(), hash_bricks(bricks))
         }
-        ToWorker::HandOver { frame, task, epoch, share } => {
+        ToWorker::SplitRegion { frame, task, epoch, share } => {
             format!("hand over {share} of 1000 of {task} {epoch} of {frame}")
         }
         ToWorker::Ping { nonce } => format!("ping {nonce}"),

@@ -11,11 +11,10 @@ use prost::Message;
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::brick::{BRICK_VOXELS, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
-use slabcast_common::image::TilePixels;
-use slabcast_common::leaves::Leaves;
+use slabcast_common::image::{SparseTile, TilePixels};
 use slabcast_common::message::{
-    Begun, Counters, HandedOver, Pixels, RegionCost, Sampled, Sampling, SceneSpec, TaskTimes,
-    TileResult,
+    Checkpoint, Counters, ErrorsBySource, Pixels, RegionCost, RegionSplit, SampledError, SceneSpec,
+    TaskTimes, TileResult,
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::volume::Digest32;
@@ -397,13 +396,13 @@ fn queued(job: NotedJob, seen: &mut Seen) -> Result<FrameJob, String> {
 }
 
 /// Returns blank finished pixels that the scheduler takes for the recorded ones.
-fn finished(r: &NotedResult) -> Result<Option<Leaves>, String> {
+fn finished(r: &NotedResult) -> Result<Option<SparseTile>, String> {
     let Some((size, format, fits)) = r.finished else { return Ok(None) };
     let n = u64::from(size[0]) * u64::from(size[1]);
     if n == 0 || n > 2 * convert::MAX_TILE_PIXELS as u64 {
         return Err("its leaves are none, or more than the wire lets through".into());
     }
-    let mut leaves = Leaves::blank(size, format);
+    let mut leaves = SparseTile::blank(size, format);
     if !fits {
         leaves.data.push(0);
     }
@@ -411,7 +410,7 @@ fn finished(r: &NotedResult) -> Result<Option<Leaves>, String> {
 }
 
 /// Returns a piece with clear pixels that the scheduler takes for the recorded ones.
-fn piece(p: NotedPiece) -> Result<HandedOver, String> {
+fn piece(p: NotedPiece) -> Result<RegionSplit, String> {
     let (a, colour, last) = p.planes;
     let n = [a, colour, last.unwrap_or(0), p.sheets.len()];
     if n.iter().any(|n| *n > 2 * convert::MAX_TILE_PIXELS) {
@@ -429,9 +428,9 @@ fn piece(p: NotedPiece) -> Result<HandedOver, String> {
     if ![&p.kept, &p.given].into_iter().all(|r| inside(r) && !r.is_empty()) {
         return Err("`kept` and `given` are no rectangles of a picture".into());
     }
-    let begun = Begun { sheets: p.sheets, pixels };
+    let begun = Checkpoint { sheets: p.sheets, pixels };
     let (task, epoch) = (TaskId(p.task), Epoch(p.epoch));
-    Ok(HandedOver { task, epoch, kept: p.kept, given: p.given, begun })
+    Ok(RegionSplit { task, epoch, kept: p.kept, given: p.given, begun })
 }
 
 /// Returns a result that the scheduler takes for the recorded one: shut pixels have opacity 1, open
@@ -456,8 +455,8 @@ fn result(r: &NotedResult) -> Result<TileResult, String> {
         .as_deref()
         .copied()
         .unwrap_or_default()
-        .map(|(pixels, squares)| Sampled { pixels, squares });
-    let sampled = Sampling::of(sampled);
+        .map(|(pixels, squares)| SampledError { pixels, squares });
+    let sampled = ErrorsBySource::from_array(sampled);
     let ([tossed, splatted, culled], [received_us, ready_us, start_us, end_us]) = (r.voxels, r.us);
     Ok(TileResult {
         task: TaskId(r.task),

@@ -4,22 +4,21 @@ use super::{
     Difference, RecordError, RecordSummary, RecordedScheduler, ReplaySummary, bits, replay, runs,
     start,
 };
-use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox};
+use slabcast_common::brick::{BRICK_EDGE, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId, WorkerId};
-use slabcast_common::image::{Background, PixelFormat, TilePixels};
-use slabcast_common::leaves::{Finish, Leaves};
+use slabcast_common::image::{Background, PixelEncoding, PixelFormat, SparseTile, TilePixels};
 use slabcast_common::message::{
-    Begun, Counters, HandedOver, Pixels, RegionCost, Sampled, Sampling, SceneSpec, TaskTimes,
-    TileResult, ToWorker,
+    Checkpoint, Counters, ErrorsBySource, Pixels, RegionCost, RegionSplit, SampledError, SceneSpec,
+    TaskTimes, TileResult, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
-use slabcast_common::path::Orientation;
-use slabcast_common::path::{Turntable, ViewPath};
-use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Schedule, Sums, Work};
-use slabcast_common::region::{cut, parts};
+use slabcast_common::region::{parts, split_tile};
 use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, Volume};
+use slabcast_scene::path::Orientation;
+use slabcast_scene::path::{Turntable, ViewPath};
+use slabcast_scene::presets;
 use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros};
 use std::cell::Cell;
 use std::io::Write;
@@ -61,9 +60,9 @@ impl Rng {
 }
 
 /// Format of every other frame, which workers finish.
-fn finish(frame: FrameId) -> Option<Finish> {
+fn finish(frame: FrameId) -> Option<PixelEncoding> {
     let (format, background) = (PixelFormat::Rgb8, Background::Colour([0.5; 3]));
-    frame.0.is_multiple_of(2).then_some(Finish { format, background })
+    frame.0.is_multiple_of(2).then_some(PixelEncoding { format, background })
 }
 
 fn jobs(rng: &mut Rng, schedule: Schedule) -> Vec<FrameJob> {
@@ -72,11 +71,11 @@ fn jobs(rng: &mut Rng, schedule: Schedule) -> Vec<FrameJob> {
     let transfer = presets::by_name("grey", &info.summary).expect("a known name");
     let quality = Quality { sums: Sums::I32, ..Quality::default() };
     let set = BrickSetKey(Digest32([9; 32]));
-    let grid = BrickGrid::of(info.lattice.dims);
+    let grid = BrickGrid::new(info.lattice.dims);
     let bricks: Arc<[BrickInfo]> = (0..grid.len() as u32)
         .map(|id| {
             let lo = grid.corner(BrickId(id));
-            let tight = TightBox { lo, hi: lo.map(|x| x + BRICK - 1) };
+            let tight = TightBox { lo, hi: lo.map(|x| x + BRICK_EDGE - 1) };
             BrickInfo { id: BrickId(id), tight, voxels: 512, bytes: 1547 }
         })
         .collect();
@@ -87,7 +86,7 @@ fn jobs(rng: &mut Rng, schedule: Schedule) -> Vec<FrameJob> {
         quality,
         bricks: set,
     });
-    let path = ViewPath::turn([96, 80], Turntable { frames: 3, ..Turntable::default() });
+    let path = ViewPath::from_turntable([96, 80], Turntable { frames: 3, ..Turntable::default() });
     let orientation = Orientation::new(None, None).expect("the default");
     (0..3)
         .map(|i| {
@@ -163,8 +162,12 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, RecordSummary) {
             }
             _ if !leases.is_empty() => {
                 let which = rng.below(leases.len() as u64) as usize;
-                let (worker, (task, epoch), tile, finish): (WorkerId, _, Rect, Option<Finish>) =
-                    leases.remove(which);
+                let (worker, (task, epoch), tile, finish): (
+                    WorkerId,
+                    _,
+                    Rect,
+                    Option<PixelEncoding>,
+                ) = leases.remove(which);
                 let n = tile.area();
                 let mut pixels = TilePixels {
                     a: (0..n).map(|i| ((i as u64 + rng.0) % 7) as f32 / 6.0).collect(),
@@ -179,14 +182,14 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, RecordSummary) {
                 let pixels = match finish {
                     Some(finish) => {
                         let size = [tile.width() as u32, tile.height() as u32];
-                        let mut leaves = Leaves::blank(size, finish.format);
+                        let mut leaves = SparseTile::blank(size, finish.format);
                         leaves.mask[0] = 1;
-                        let len = Leaves::data_len(size, finish.format, &leaves.mask);
+                        let len = SparseTile::data_len(size, finish.format, &leaves.mask);
                         leaves.data.resize(len, 7);
                         match rng.below(60) {
-                            0 => leaves.alpha_most = f32::NAN,
-                            1 => leaves = Leaves::blank([3, 1], finish.format),
-                            2 => leaves = Leaves::blank(size, PixelFormat::Rgba8),
+                            0 => leaves.max_alpha = f32::NAN,
+                            1 => leaves = SparseTile::blank([3, 1], finish.format),
+                            2 => leaves = SparseTile::blank(size, PixelFormat::Rgba8),
                             _ => {}
                         }
                         Pixels::Finished(leaves)
@@ -197,16 +200,17 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, RecordSummary) {
                 let times = TaskTimes { start_us, end_us: start_us + 700, ..TaskTimes::default() };
                 let touched =
                     (0..60).filter(|i| (i + rng.0).is_multiple_of(5)).map(|i| i as u32).collect();
-                let region = by_region.then_some(RegionCost {
-                    touched,
-                    stalls: 1,
-                    parked_us: 20,
-                    idle_us: 5,
-                    sampled: Sampling::of(
-                        [0, 1, 2, 3]
-                            .map(|i| Sampled { pixels: 9 - i, squares: 1 << 50 | rng.below(99) }),
-                    ),
-                });
+                let region =
+                    by_region.then_some(RegionCost {
+                        touched,
+                        stalls: 1,
+                        parked_us: 20,
+                        idle_us: 5,
+                        sampled: ErrorsBySource::from_array([0, 1, 2, 3].map(|i| SampledError {
+                            pixels: 9 - i,
+                            squares: 1 << 50 | rng.below(99),
+                        })),
+                    });
                 let counters = Counters { tossed: 3, splatted: 2, culled: 1 };
                 if rng.below(50) == 0 {
                     Some(Event::Failed { worker, task, epoch, reason: "no \"reason\"".into() })
@@ -233,11 +237,14 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, RecordSummary) {
                 Action::Send { worker, message: ToWorker::Region(l) } => {
                     leases.push((worker, (l.task, l.epoch), l.tile, finish(l.frame)));
                 }
-                Action::Send { worker, message: ToWorker::HandOver { task, epoch, share, .. } } => {
+                Action::Send {
+                    worker,
+                    message: ToWorker::SplitRegion { task, epoch, share, .. },
+                } => {
                     let name = (task, epoch);
                     let lease = leases.iter_mut().find(|l| l.0 == worker && l.1 == name);
                     let share = f64::from(share) / 1000.0;
-                    let pieces = lease.and_then(|l| Some((cut(l.2, share, area)?, l)));
+                    let pieces = lease.and_then(|l| Some((split_tile(l.2, share, area)?, l)));
                     if let Some(((kept, given), lease)) = pieces {
                         let n = given.area();
                         let mut pixels = TilePixels {
@@ -249,9 +256,9 @@ fn recorded(seed: u64, schedule: Schedule) -> (Vec<u8>, RecordSummary) {
                             pixels.a[0] = f32::NAN;
                         }
                         let sheets = parts(given).map(|_| (rng.below(9) > 0).then_some(-3));
-                        let begun = Begun { sheets: sheets.collect(), pixels };
+                        let begun = Checkpoint { sheets: sheets.collect(), pixels };
                         lease.2 = kept;
-                        let piece = Box::new(HandedOver { task, epoch, kept, given, begun });
+                        let piece = Box::new(RegionSplit { task, epoch, kept, given, begun });
                         arrived.push(Event::HandedOver { worker, piece });
                     }
                 }

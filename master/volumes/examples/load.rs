@@ -2,9 +2,9 @@
 //!
 //! `cargo run --release -p slabcast-volumes --example load -- FILE [PRESET]`
 
-use slabcast_common::presets;
 use slabcast_common::quality::Compositing;
-use slabcast_common::wanted::Wanted;
+use slabcast_scene::brick_needs::BrickNeeds;
+use slabcast_scene::presets;
 use slabcast_volumes::{BrickStore, histogram_sketch, open};
 use std::path::Path;
 use std::time::Instant;
@@ -36,7 +36,7 @@ fn main() {
             std::process::exit(1);
         }
     };
-    let wanted = Wanted::of(&tf, &volume.info(digest), Compositing::Linear);
+    let wanted = BrickNeeds::for_transfer(&tf, &volume.info(digest), Compositing::Linear);
     let start = Instant::now();
     let store = BrickStore::build(&volume, digest, &wanted);
     let built = ms(start);

@@ -15,7 +15,7 @@ use flate2::Compression;
 use flate2::write::GzEncoder;
 use slabcast_common::transfer::Support;
 use slabcast_common::volume::{Digest32, Volume};
-use slabcast_common::wanted::Wanted;
+use slabcast_scene::brick_needs::BrickNeeds;
 use std::io::Write;
 use std::panic::AssertUnwindSafe;
 use std::path::Path;
@@ -216,7 +216,7 @@ fn survive(
         return;
     }
     let support = Support { intervals: vec![(0.0, f64::MAX)], nan: true };
-    let wanted = Wanted { support, normals: true, gradients: true, crop: None };
+    let wanted = BrickNeeds { support, normals: true, gradients: true, crop: None };
     // The peak begins anew, where the system lets it.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
     let before_kib = resident_kib("VmHWM:");

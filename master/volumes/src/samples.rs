@@ -182,7 +182,7 @@ impl Layout {
             );
         }
         let dims = dims.map(|n| n as u32);
-        if BrickGrid::of(dims).dims.iter().map(|&n| u64::from(n)).product::<u64>() > MAX_BRICKS {
+        if BrickGrid::new(dims).dims.iter().map(|&n| u64::from(n)).product::<u64>() > MAX_BRICKS {
             return too_large(
                 format!("{shown} has more than {MAX_BRICKS} bricks"),
                 "crop or downsample it",

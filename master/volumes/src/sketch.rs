@@ -59,7 +59,7 @@ mod tests {
     fn a_sea_of_air_does_not_drown_a_thin_object() {
         let mut v = vec![0u8; 100_000];
         v.extend([200; 30]);
-        let s = ValueSummary::of(&Samples::U8(v), ValueMap::IDENTITY);
+        let s = ValueSummary::from_samples(&Samples::U8(v), ValueMap::IDENTITY);
         let sketch = histogram_sketch(&s, 40);
         let lines: Vec<&str> = sketch.lines().collect();
         assert_eq!(lines.len(), 2);
@@ -79,7 +79,7 @@ mod tests {
             Samples::F32(vec![-1e30, f32::INFINITY, 1e30]),
         ] {
             for map in [ValueMap::IDENTITY, flipped] {
-                let s = ValueSummary::of(&samples, map);
+                let s = ValueSummary::from_samples(&samples, map);
                 for width in [0, 1, 7, 80, 256, 9999] {
                     let sketch = histogram_sketch(&s, width);
                     assert_eq!(sketch.lines().count(), 2, "{sketch}");
@@ -89,7 +89,7 @@ mod tests {
             }
         }
         // A slope below zero turns the values around: the bars stand over their values.
-        let s = ValueSummary::of(&Samples::U8(vec![0, 0, 0, 9]), flipped);
+        let s = ValueSummary::from_samples(&Samples::U8(vec![0, 0, 0, 9]), flipped);
         assert!(histogram_sketch(&s, 10).starts_with('▄'), "{}", histogram_sketch(&s, 10));
     }
 }

@@ -10,20 +10,20 @@
 use bytes::Bytes;
 use rayon::prelude::*;
 use slabcast_common::brick::{
-    BRICK, BRICK_VOXELS, Brick, BrickGrid, BrickInfo, BrickSetKey, TightBox,
+    BRICK_EDGE, BRICK_VOXELS, Brick, BrickGrid, BrickInfo, BrickSetKey, TightBox,
 };
 use slabcast_common::gradient::encode_magnitude;
 use slabcast_common::ids::BrickId;
 use slabcast_common::shade::encode_normal;
 use slabcast_common::transfer::Support;
 use slabcast_common::volume::{Digest32, Samples, Volume};
-use slabcast_common::wanted::Wanted;
+use slabcast_scene::brick_needs::BrickNeeds;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// The relevant bricks of a volume for one support, in ascending id.
 pub struct BrickStore {
     key: BrickSetKey,
-    wanted: Wanted,
+    wanted: BrickNeeds,
     infos: Arc<[BrickInfo]>,
     /// The bricks, in the order of `infos`.
     held: Vec<Mutex<Held>>,
@@ -43,7 +43,7 @@ enum Held {
 impl BrickStore {
     /// Cuts a volume on all cores. `digest` is [`Volume::digest`]; bricks without a relevant
     /// voxel are left out, and so is all that `wanted` does not ask for.
-    pub fn build(volume: &Volume, digest: Digest32, wanted: &Wanted) -> Self {
+    pub fn build(volume: &Volume, digest: Digest32, wanted: &BrickNeeds) -> Self {
         let support = &wanted.support;
         let cut = match &volume.samples {
             Samples::U8(v) => {
@@ -60,7 +60,7 @@ impl BrickStore {
         };
         let (infos, held): (Vec<BrickInfo>, Vec<Mutex<Held>>) = cut.into_iter().unzip();
         BrickStore {
-            key: wanted.key(digest),
+            key: wanted.set_key(digest),
             wanted: wanted.clone(),
             relevant_voxels: infos.iter().map(|b| u64::from(b.voxels)).sum(),
             bytes: infos.iter().map(|b| u64::from(b.bytes)).sum(),
@@ -76,7 +76,7 @@ impl BrickStore {
     }
 
     /// What the bricks hold.
-    pub fn wanted(&self) -> &Wanted {
+    pub fn wanted(&self) -> &BrickNeeds {
         &self.wanted
     }
 
@@ -163,12 +163,12 @@ fn table(support: &Support, codes: usize) -> Vec<bool> {
 fn cut<T: Copy + Into<f64> + Sync>(
     volume: &Volume,
     codes: &[T],
-    wanted: &Wanted,
+    wanted: &BrickNeeds,
     samples: fn(Vec<T>) -> Samples,
     relevant: impl Fn(T) -> bool + Sync,
 ) -> Vec<(BrickInfo, Mutex<Held>)> {
     let field = Field { codes, dims: volume.lattice.dims };
-    let grid = BrickGrid::of(field.dims);
+    let grid = BrickGrid::new(field.dims);
     let gradient_matrix = volume.gradient_matrix();
     let row = |row: u32| {
         let mut bricks = Vec::new();
@@ -177,8 +177,8 @@ fn cut<T: Copy + Into<f64> + Sync>(
         for x in 0..grid.dims[0] {
             let id = grid.id([x, y, z]);
             found.clear();
-            let inside = |at| wanted.crop.is_none_or(|c| c.holds(&volume.lattice, at));
-            field.search([x, y, z].map(|n| n * BRICK), &relevant, &inside, &mut found);
+            let inside = |at| wanted.crop.is_none_or(|c| c.contains(&volume.lattice, at));
+            field.search([x, y, z].map(|n| n * BRICK_EDGE), &relevant, &inside, &mut found);
             let index = &found.index[..found.voxels];
             if index.is_empty() {
                 continue;
@@ -186,7 +186,7 @@ fn cut<T: Copy + Into<f64> + Sync>(
             let offsets = &found.offset[..found.voxels];
             let corner = grid.corner(id);
             let gradient = |(&i, &offset)| {
-                let local = slabcast_common::brick::local(i);
+                let local = slabcast_common::brick::local_position(i);
                 let at = std::array::from_fn(|a| corner[a] + local[a]);
                 gradient_matrix * field.difference(at, offset)
             };
@@ -258,7 +258,7 @@ impl<T: Copy + Into<f64>> Field<'_, T> {
         found: &mut Found,
     ) {
         let [nx, ny, _] = self.dims.map(|n| n as usize);
-        let end: [u32; 3] = std::array::from_fn(|a| (corner[a] + BRICK).min(self.dims[a]));
+        let end: [u32; 3] = std::array::from_fn(|a| (corner[a] + BRICK_EDGE).min(self.dims[a]));
         for z in corner[2]..end[2] {
             for y in corner[1]..end[1] {
                 let start = (z as usize * ny + y as usize) * nx + corner[0] as usize;
@@ -312,10 +312,10 @@ impl<T: Copy + Into<f64>> Field<'_, T> {
 mod tests {
     use super::*;
     use proptest::prelude::*;
-    use slabcast_common::brick::local;
-    use slabcast_common::path::{Crop, CropUnit};
+    use slabcast_common::brick::local_position;
     use slabcast_common::shade::NO_NORMAL;
     use slabcast_common::volume::{Lattice, ValueMap};
+    use slabcast_scene::path::{Crop, CropUnit};
 
     fn span(a: f64, b: f64) -> Support {
         Support { intervals: vec![(a, b)], nan: false }
@@ -324,17 +324,17 @@ mod tests {
     /// Looks at every voxel of a volume, plainly, and compares with what the store holds.
     fn check(volume: &Volume, support: &Support, normals: bool) -> BrickStore {
         let support = support.clone();
-        check_all(volume, &Wanted { support, normals, gradients: false, crop: None })
+        check_all(volume, &BrickNeeds { support, normals, gradients: false, crop: None })
     }
 
-    fn check_all(volume: &Volume, wanted: &Wanted) -> BrickStore {
+    fn check_all(volume: &Volume, wanted: &BrickNeeds) -> BrickStore {
         let (support, normals) = (&wanted.support, wanted.normals);
         let digest = volume.digest();
         let store = BrickStore::build(volume, digest, wanted);
         let dims = volume.lattice.dims;
-        let grid = BrickGrid::of(dims);
+        let grid = BrickGrid::new(dims);
         let m = volume.gradient_matrix();
-        assert_eq!(store.key(), wanted.key(digest));
+        assert_eq!(store.key(), wanted.set_key(digest));
         assert!(store.infos().windows(2).all(|w| w[0].id < w[1].id), "ids ascend");
         let mut seen = std::collections::BTreeMap::new();
         let mut bytes = 0;
@@ -350,7 +350,7 @@ mod tests {
             assert_eq!(brick.id, info.id);
             assert_eq!(brick.len(), usize::from(info.voxels));
             assert!(!brick.is_empty() && brick.index.windows(2).all(|w| w[0] < w[1]));
-            assert_eq!(brick.tight(&grid), info.tight);
+            assert_eq!(brick.tight_box(&grid), info.tight);
             assert_eq!(brick.normals.is_some(), normals);
             assert_eq!(brick.gradients.is_some(), wanted.gradients);
             // NaN is not equal to itself; its bytes are.
@@ -361,7 +361,7 @@ mod tests {
             bytes += encoded.len() as u64;
             let corner = grid.corner(info.id);
             for (n, &i) in brick.index.iter().enumerate() {
-                let l = local(i);
+                let l = local_position(i);
                 let at: [u32; 3] = std::array::from_fn(|a| corner[a] + l[a]);
                 let normal = brick.normals.as_ref().map(|v| v[n]);
                 if let Some(g) = &brick.gradients {
@@ -380,7 +380,7 @@ mod tests {
                     let offset = ((k * dims[1] + j) * dims[0] + i) as usize;
                     let code = volume.samples.code(offset);
                     let found = seen.remove(&[k, j, i]);
-                    let inside = wanted.crop.is_none_or(|c| c.holds(&volume.lattice, [i, j, k]));
+                    let inside = wanted.crop.is_none_or(|c| c.contains(&volume.lattice, [i, j, k]));
                     if !support.contains(code) || !inside {
                         assert!(found.is_none(), "({i}, {j}, {k}) is not relevant");
                         continue;
@@ -427,9 +427,9 @@ mod tests {
             let crop = crop.then(|| {
                 let share = Some(f64::from(seed % 7) / 10.0);
                 let crop = Crop { unit: CropUnit::Unit, x: [None, share.map(|s| s + 0.2)], y: [share, None], ..Crop::default() };
-                crop.of(&volume.lattice).unwrap()
+                crop.resolve(&volume.lattice).unwrap()
             });
-            check_all(&volume, &Wanted { support, normals, gradients: seed % 3 == 0, crop });
+            check_all(&volume, &BrickNeeds { support, normals, gradients: seed % 3 == 0, crop });
         }
     }
 
@@ -485,7 +485,7 @@ mod tests {
     fn many_threads_get_the_same_bytes() {
         let v = Volume::from_fn_u8("v", [32; 3], |i, j, k| (i * j + k) as u8 | 1);
         let wanted =
-            Wanted { support: span(1.0, 255.0), normals: true, gradients: false, crop: None };
+            BrickNeeds { support: span(1.0, 255.0), normals: true, gradients: false, crop: None };
         let store = BrickStore::build(&v, Digest32::default(), &wanted);
         let id = store.infos()[7].id;
         let seen: Vec<usize> = std::thread::scope(|s| {

@@ -2,11 +2,11 @@
 //! for the sample; where they are missing the tests say so and pass.
 
 use glam::DVec3;
-use slabcast_common::presets;
 use slabcast_common::quality::Compositing;
 use slabcast_common::shade::encode_normal;
 use slabcast_common::volume::Volume;
-use slabcast_common::wanted::Wanted;
+use slabcast_scene::brick_needs::BrickNeeds;
+use slabcast_scene::presets;
 use slabcast_volumes::{BrickStore, OpenErrorKind, open};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -168,16 +168,16 @@ fn a_head_is_cut_as_the_plain_loop_says() {
     let v = volume(&path);
     let digest = v.digest();
     let tf = presets::by_name("peer-opaque", &v.summary).unwrap();
-    let wanted = Wanted::of(&tf, &v.info(digest), Compositing::Linear);
+    let wanted = BrickNeeds::for_transfer(&tf, &v.info(digest), Compositing::Linear);
     let store = BrickStore::build(&v, digest, &wanted);
     println!("mri256: open, digest, build {:?}", start.elapsed());
     let m = v.gradient_matrix();
-    let grid = slabcast_common::brick::BrickGrid::of(v.lattice.dims);
+    let grid = slabcast_common::brick::BrickGrid::new(v.lattice.dims);
     for info in store.infos().iter().step_by(37) {
         let brick = store.brick(info.id).unwrap();
         let corner = grid.corner(info.id);
         for (n, &i) in brick.index.iter().enumerate() {
-            let l = slabcast_common::brick::local(i);
+            let l = slabcast_common::brick::local_position(i);
             let at = std::array::from_fn(|a| corner[a] + l[a]);
             assert_eq!(brick.normals.as_ref().unwrap()[n], encode_normal(v.gradient(at, &m)));
         }

@@ -1,7 +1,7 @@
 //! The error of a message that can't be read.
 
 use crate::status;
-use slabcast_common::quality::Refused;
+use slabcast_common::quality::InvalidField;
 
 /// Why a stranger's message is refused. Every variant names the field as the `.proto` writes it.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -100,8 +100,8 @@ impl WireError {
     }
 }
 
-impl From<Refused> for WireError {
-    fn from(refused: Refused) -> Self {
+impl From<InvalidField> for WireError {
+    fn from(refused: InvalidField) -> Self {
         WireError::Value { field: refused.field, problem: refused.problem }
     }
 }

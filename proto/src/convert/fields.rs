@@ -5,7 +5,7 @@
 //! `quality.thickness`, `path.views.views[3].eye`. These two functions go both ways, so that a
 //! command says the same of a field wherever it was refused.
 
-use slabcast_common::path::ViewPath;
+use slabcast_scene::path::ViewPath;
 
 const QUALITY: [&str; 10] = [
     "thickness",
@@ -125,11 +125,11 @@ pub fn local_field(path: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use slabcast_common::path::Turntable;
+    use slabcast_scene::path::Turntable;
 
     #[test]
     fn field_names_go_to_the_wire_and_back() {
-        let path = ViewPath::turn([1, 1], Turntable::default());
+        let path = ViewPath::from_turntable([1, 1], Turntable::default());
         for (ours, wire) in [
             ("thickness", "quality.thickness"),
             ("std", "quality.std"),

@@ -2,7 +2,7 @@
 
 use super::WireError;
 use glam::{DMat3, DVec3};
-use slabcast_common::brick::{BRICK, MAX_BRICKS};
+use slabcast_common::brick::{BRICK_EDGE, MAX_BRICKS};
 use slabcast_common::view::MAX_EDGE;
 use slabcast_common::volume::{Lattice, SampleKind, ValueSummary};
 
@@ -61,7 +61,7 @@ pub(super) fn size_from_wire(width: u32, height: u32) -> Result<[u32; 2], WireEr
 
 /// Checks a lattice whose numbers are finite; errors name `fields`.
 pub(super) fn check_lattice(lattice: &Lattice, dims: &str, fields: &str) -> Result<(), WireError> {
-    let bricks = lattice.dims.iter().map(|n| u128::from(n.div_ceil(BRICK))).product::<u128>();
+    let bricks = lattice.dims.iter().map(|n| u128::from(n.div_ceil(BRICK_EDGE))).product::<u128>();
     if bricks > u128::from(MAX_BRICKS) {
         let problem = format!("{bricks} bricks; a volume has at most {MAX_BRICKS}");
         return Err(WireError::value(dims, problem));

@@ -10,7 +10,7 @@ use crate::convert::{WireError, enum_conversions};
 use slabcast_common::image::{Background, PixelFormat};
 use slabcast_common::quality::{Compositing, Kernel, Quality, Splat, Sums};
 use slabcast_common::shade::{HeadWord, Light, Shading};
-use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
+use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 use slabcast_common::volume::SampleKind;
 
 enum_conversions!(kernel_to_wire, kernel_from_wire, Kernel, wire::Kernel, Some(Kernel::Gaussian),
@@ -169,7 +169,7 @@ pub(super) fn transfer_from_wire(
         opacities: tf.opacities.iter().map(|p| pair(p.x, p.opacity)).collect(),
         color_space: space_from_wire("color_space", tf.color_space)?,
         opacity_unit: unit_from_wire("opacity_unit", tf.opacity_unit)?,
-        nan: NanLook {
+        nan: NanColour {
             color: rgb_from_wire(nan.color.unwrap_or_default()),
             opacity: number(nan.opacity),
         },

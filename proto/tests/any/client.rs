@@ -5,14 +5,15 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 use slabcast_common::ids::WorkerId;
 use slabcast_common::image::{Background, PixelFormat};
-use slabcast_common::message::{PathRequest, TransferChoice};
-use slabcast_common::path::{
-    Axis, Crop, CropUnit, Easing, FlyThrough, Key, KeyFrames, Orientation, PathView,
-    ProjectionKind, Side, Turntable, ViewPath,
-};
 use slabcast_common::quality::{Borders, Keep, Schedule, Sums, Work};
 use slabcast_common::stats::*;
 use slabcast_proto::model;
+use slabcast_scene::path::{
+    Axis, Crop, CropUnit, Easing, FlyThrough, Key, KeyFrames, Orientation, PathView,
+    ProjectionKind, Side, Turntable, ViewPath,
+};
+use slabcast_scene::request::PathRequest;
+use slabcast_scene::transfer::TransferChoice;
 use std::time::Duration;
 
 fn axis() -> impl Strategy<Value = Axis> {
@@ -120,13 +121,13 @@ pub fn path_request() -> impl Strategy<Value = PathRequest> {
     let path = (
         size(),
         prop_oneof![
-            vec(view, 1..5).prop_map(|views| ViewPath::of_views([1, 1], views)),
-            turntable.prop_map(|t| ViewPath::turn([1, 1], t)),
+            vec(view, 1..5).prop_map(|views| ViewPath::from_views([1, 1], views)),
+            turntable.prop_map(|t| ViewPath::from_turntable([1, 1], t)),
             keyframes().prop_map(|k| {
-                ViewPath { keyframes: Some(k), ..ViewPath::of_views([1, 1], vec![]) }
+                ViewPath { keyframes: Some(k), ..ViewPath::from_views([1, 1], vec![]) }
             }),
             flythrough().prop_map(|f| {
-                ViewPath { flythrough: Some(f), ..ViewPath::of_views([1, 1], vec![]) }
+                ViewPath { flythrough: Some(f), ..ViewPath::from_views([1, 1], vec![]) }
             }),
         ],
         prop::option::of(crop()),

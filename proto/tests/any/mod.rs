@@ -11,8 +11,9 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 use slabcast_common::brick::{Brick, BrickGrid, BrickInfo, TightBox};
 use slabcast_common::ids::*;
-use slabcast_common::image::{Background, PixelFormat, TilePixels, TileState};
-use slabcast_common::leaves::{Finish, Leaves};
+use slabcast_common::image::{
+    Background, PixelEncoding, PixelFormat, SparseTile, TilePixels, TileState,
+};
 use slabcast_common::message::*;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::protocol::ProtocolVersions;
@@ -68,17 +69,17 @@ pub fn region() -> impl Strategy<Value = RegionLease> {
 }
 
 /// A lease's tile as somebody left it.
-fn begun(lease: &Lease, sheets: u8) -> Begun {
+fn begun(lease: &Lease, sheets: u8) -> Checkpoint {
     let Lease { state, tile, slab, .. } = lease;
     let (a, last) = (state.a.clone(), state.last.clone());
     let colour = a.iter().map(|a| [a.to_bits(), 0, a.to_bits() >> 3]).collect();
     let part = |i: u32| (u32::from(sheets) >> (i % 8) & 1 == 0).then_some(slab.first);
     let sheets = parts(*tile).zip(0..).map(|(_, i)| part(i)).collect();
-    Begun { sheets, pixels: TilePixels { a, colour, last } }
+    Checkpoint { sheets, pixels: TilePixels { a, colour, last } }
 }
 
-pub fn handed_over() -> impl Strategy<Value = HandedOver> {
-    (lease(), lease(), any::<u8>()).prop_map(|(l, other, sheets)| HandedOver {
+pub fn handed_over() -> impl Strategy<Value = RegionSplit> {
+    (lease(), lease(), any::<u8>()).prop_map(|(l, other, sheets)| RegionSplit {
         task: l.task,
         epoch: l.epoch,
         kept: other.tile,
@@ -114,29 +115,29 @@ pub fn directory() -> impl Strategy<Value = ToWorker> {
 }
 
 /// Some leaves of a tile of one row or more, from words that mean nothing.
-fn leaves(pixels: &TilePixels, format: u64) -> Leaves {
+fn leaves(pixels: &TilePixels, format: u64) -> SparseTile {
     let n = pixels.a.len() as u32;
     let rows = if n.is_multiple_of(7) { 7 } else { 1 };
     let formats =
         [PixelFormat::Rgb8, PixelFormat::Rgba8, PixelFormat::Rgba16, PixelFormat::Rgba32F];
-    let mut leaves = Leaves::blank([n / rows, rows], formats[format as usize]);
+    let mut leaves = SparseTile::blank([n / rows, rows], formats[format as usize]);
     let columns = (n / rows).div_ceil(16);
     for (i, word) in (0..columns as usize).zip(pixels.colour.iter().flatten()) {
         leaves.mask[i / 8] |= (word.count_ones() as u8 & 1) << (i % 8);
     }
     let bytes = pixels.colour.iter().flatten().flat_map(|w| w.to_le_bytes()).cycle();
-    leaves.data.extend(bytes.take(Leaves::data_len(leaves.size, leaves.format, &leaves.mask)));
-    leaves.alpha_most = n as f32 * 1e-3;
+    leaves.data.extend(bytes.take(SparseTile::data_len(leaves.size, leaves.format, &leaves.mask)));
+    leaves.max_alpha = n as f32 * 1e-3;
     leaves
 }
 
 /// Formats of finished frames.
-fn finish() -> impl Strategy<Value = Finish> {
+fn finish() -> impl Strategy<Value = PixelEncoding> {
     let background = prop_oneof![
         Just(Background::Transparent),
         [0.0..=1.0f64, 0.0..=1.0, 0.0..=1.0].prop_map(Background::Colour)
     ];
-    (format(), background).prop_map(|(format, background)| Finish { format, background })
+    (format(), background).prop_map(|(format, background)| PixelEncoding { format, background })
 }
 
 pub fn result() -> impl Strategy<Value = TileResult> {
@@ -148,7 +149,7 @@ pub fn result() -> impl Strategy<Value = TileResult> {
                 stalls,
                 parked_us,
                 idle_us,
-                sampled: Sampling::of(std::array::from_fn(|i| Sampled {
+                sampled: ErrorsBySource::from_array(std::array::from_fn(|i| SampledError {
                     pixels: pixels[i],
                     squares: squares[i],
                 })),
@@ -220,7 +221,7 @@ pub fn to_master() -> impl Strategy<Value = ToMaster> {
         (key(), ids(50)).prop_map(|(set, bricks)| ToMaster::BricksBroken { set, bricks }),
         (key(), ids(50)).prop_map(|(set, bricks)| ToMaster::BricksWanted { set, bricks }),
         (key(), ids(50)).prop_map(|(set, bricks)| ToMaster::BricksForgotten { set, bricks }),
-        handed_over().prop_map(|piece| ToMaster::HandedOver(Box::new(piece))),
+        handed_over().prop_map(|piece| ToMaster::RegionSplit(Box::new(piece))),
         any::<[u64; 2]>().prop_map(|[nonce, clock_us]| ToMaster::Pong { nonce, clock_us }),
         ".{0,50}".prop_map(|reason| ToMaster::Leaving { reason }),
     ]
@@ -246,7 +247,7 @@ pub fn to_worker() -> impl Strategy<Value = ToWorker> {
         region().prop_map(ToWorker::Region),
         (any::<[u64; 2]>(), any::<u32>(), 1u32..=999).prop_map(|([f, t], e, share)| {
             let (frame, task, epoch) = (FrameId(f), TaskId(t), Epoch(e));
-            ToWorker::HandOver { frame, task, epoch, share }
+            ToWorker::SplitRegion { frame, task, epoch, share }
         }),
         any::<u64>().prop_map(|f| ToWorker::EndFrame { frame: FrameId(f) }),
         any::<u64>().prop_map(|s| ToWorker::EndScene { scene: SceneId(s) }),

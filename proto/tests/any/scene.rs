@@ -9,7 +9,7 @@ use slabcast_common::kernel::Lean;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
 use slabcast_common::shade::{Light, Shading};
-use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
+use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Projection, View};
 use slabcast_common::volume::{Digest32, Lattice, SampleKind, ValueMap, ValueSummary, VolumeInfo};
 
@@ -143,7 +143,7 @@ pub fn transfer() -> impl Strategy<Value = TransferFunction> {
                 } else {
                     OpacityUnit::Extinction
                 },
-                nan: NanLook { color: [nan[0], nan[1], nan[2]], opacity: nan[3] },
+                nan: NanColour { color: [nan[0], nan[1], nan[2]], opacity: nan[3] },
                 gradient_opacity: gradients.into_iter().map(|(g, a)| [g, a]).collect(),
                 shading: Shading {
                     on: yes[0],

@@ -16,14 +16,16 @@ use divan::counter::ItemsCount;
 use glam::DVec3;
 use slabcast_common::brick::{Brick, TightBox};
 use slabcast_common::ids::SceneId;
-use slabcast_common::image::{Background, FrameState, PixelFormat, TilePixels, TileState};
-use slabcast_common::leaves::{Finish, LEAF, Leaves};
+use slabcast_common::image::{
+    Background, FrameState, LEAF_EDGE, PixelEncoding, PixelFormat, SparseTile, TilePixels,
+    TileState,
+};
 use slabcast_common::message::{Counters, SceneSpec};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Compositing, Quality, Sums};
 use slabcast_common::shade::Shading;
 use slabcast_common::slab::SheetRange;
-use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
+use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_render::Simd;
@@ -87,7 +89,7 @@ impl How {
             opacities: vec![[0.0, 0.0], [50.0, self.opacity]],
             color_space: ColorSpace::Linear,
             opacity_unit: OpacityUnit::AlphaPerVox,
-            nan: NanLook::default(),
+            nan: NanColour::default(),
             gradient_opacity: vec![],
             shading: Shading { on: self.shaded, ..Shading::default() },
         };
@@ -144,10 +146,10 @@ impl Stage {
         let (tiles, counters) = self.draw();
         let mut state = FrameState::new(self.frame.view.size);
         for (rect, pixels) in tiles {
-            state.put(rect, &pixels);
+            state.add_slab_tile(rect, &pixels);
         }
         let plain = serial::render(&self.frame, &self.bricks);
-        assert_eq!(state.finish().sha256(), plain.sha256(), "the plain renderer's picture");
+        assert_eq!(state.to_picture().sha256(), plain.sha256(), "the plain renderer's picture");
         let items = items(counters);
         assert!(items > 0, "{counters:?}: something to do");
         bencher.counter(ItemsCount::new(items)).bench_local(|| self.draw());
@@ -253,17 +255,17 @@ fn finish_a_tile(bencher: Bencher<'_, '_>, (format, background): (PixelFormat, [
         x = x.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
         x >> 4
     };
-    let there = |i: usize| !(i % EDGE / LEAF + i / EDGE / LEAF).is_multiple_of(4);
+    let there = |i: usize| !(i % EDGE / LEAF_EDGE + i / EDGE / LEAF_EDGE).is_multiple_of(4);
     let a = (0..EDGE * EDGE).map(|i| if there(i) { 0.5 } else { 0.0 }).collect();
     let colour = |i| if there(i) { [next(), next(), next()] } else { [0; 3] };
     let pixels = TilePixels { a, colour: (0..EDGE * EDGE).map(colour).collect(), last: None };
     let (tile, size) = (Rect::new(0, 0, EDGE as i32, EDGE as i32), [EDGE as u32; 2]);
-    let finish = Finish { format, background: Background::Colour(background) };
-    let leaves = || Leaves::of(&pixels, size, &finish);
+    let finish = PixelEncoding { format, background: Background::Colour(background) };
+    let leaves = || SparseTile::encode(&pixels, size, &finish);
     let (mut sums, mut done) = (FrameState::new(size), FrameState::new(size));
-    sums.put(tile, &pixels);
-    done.lay_finished(tile, leaves());
-    let plain = sums.finish().encode(format, finish.background);
+    sums.add_slab_tile(tile, &pixels);
+    done.place_encoded(tile, leaves());
+    let plain = sums.to_picture().encode(format, finish.background);
     assert!(done.encode(&finish, false).bytes == plain, "the bytes of the finished picture");
     bencher.counter(ItemsCount::new(EDGE * EDGE)).bench_local(leaves);
 }

@@ -30,11 +30,10 @@ use crate::scene::Frame;
 use crate::tile::Scratch;
 use crate::visibility::closing_depth::{Cells, ClosingDepths};
 use crate::visibility::visible_bricks::{VisibleBrick, VisibleBricks};
-use slabcast_common::image::TilePixels;
-use slabcast_common::leaves::LEAF;
-use slabcast_common::message::{Begun, Counters};
+use slabcast_common::image::{LEAF_EDGE, TilePixels};
+use slabcast_common::message::{Checkpoint, Counters};
 use slabcast_common::occlusion::Rect;
-use slabcast_common::region::{cut, parts};
+use slabcast_common::region::{parts, split_tile};
 
 /// What a part is drawn from.
 #[derive(Clone, Copy)]
@@ -232,7 +231,7 @@ impl Region {
     pub fn resume(
         outlook: &VisibleBricks,
         tile: Rect,
-        begun: &Begun,
+        begun: &Checkpoint,
     ) -> Result<Region, &'static str> {
         let (n, pixels) = (tile.area(), &begun.pixels);
         let last = pixels.last.as_ref().is_none_or(|last| last.len() == n);
@@ -262,7 +261,7 @@ impl Region {
         outlook: &VisibleBricks,
         eps: f64,
         share: f64,
-    ) -> Option<(Rect, Rect, Begun)> {
+    ) -> Option<(Rect, Rect, Checkpoint)> {
         let (tile, all) = (self.tile, outlook.sheets());
         let mut leaves = Leaves::new(tile);
         for strand in &self.open {
@@ -272,13 +271,13 @@ impl Region {
                 if shut { 0.0 } else { todo }
             });
         }
-        let (kept, given) = cut(tile, share, |r| leaves.sum(r))?;
+        let (kept, given) = split_tile(tile, share, |r| leaves.sum(r))?;
         let at = |rect: Rect| {
             let on = self.open.iter().find(|s| !s.rect.intersect(&rect).is_empty());
             on.map(|s| s.at)
         };
         let sheets = parts(given).map(at).collect();
-        let begun = Begun { sheets, pixels: self.pixels.piece(tile, given) };
+        let begun = Checkpoint { sheets, pixels: self.pixels.crop(tile, given) };
         for strand in &mut self.open {
             let rect = strand.rect.intersect(&kept);
             if rect != strand.rect {
@@ -287,7 +286,7 @@ impl Region {
             }
         }
         self.open.retain(|s| !s.rect.is_empty());
-        self.pixels = self.pixels.piece(tile, kept);
+        self.pixels = self.pixels.crop(tile, kept);
         self.tile = kept;
         Some((kept, given, begun))
     }
@@ -375,7 +374,8 @@ impl Leaves {
 
     /// Column and row of the leaf that a pixel lies in.
     fn of(&self, x: i32, y: i32) -> [usize; 2] {
-        let leaf = |at: i32, first: i32| (at / LEAF as i32 - first / LEAF as i32) as usize;
+        let leaf =
+            |at: i32, first: i32| (at / LEAF_EDGE as i32 - first / LEAF_EDGE as i32) as usize;
         [leaf(x, self.tile.x0), leaf(y, self.tile.y0)]
     }
 

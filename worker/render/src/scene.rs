@@ -9,12 +9,12 @@ use crate::primitives::lattice_rows::LatticeRows;
 use crate::primitives::positions::{FlatCorner, Places};
 use crate::visibility::open_mask::REACH_MOST;
 use glam::{DVec3, Vec3};
-use slabcast_common::bounds::{raw_per_payload, short_per_payload};
-use slabcast_common::brick::{Brick, BrickGrid, TightBox, local};
+use slabcast_common::bounds::{i16_units_per_payload, i32_units_per_payload};
+use slabcast_common::brick::{Brick, BrickGrid, TightBox, local_position};
 use slabcast_common::ids::BrickId;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Compositing, Quality, Sums};
-use slabcast_common::shade::{Lit, NO_NORMAL, Shader};
+use slabcast_common::shade::{LightTerms, NO_NORMAL, Shader};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::transfer::Classifier;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, View};
@@ -50,7 +50,7 @@ impl Scene {
             classifier,
             shader: spec.transfer.shading.on.then(|| Shader::new(&spec.transfer.shading)),
             quality: spec.quality,
-            grid: BrickGrid::of(spec.volume.lattice.dims),
+            grid: BrickGrid::new(spec.volume.lattice.dims),
             dims: spec.volume.lattice.dims,
             payload_max,
             grey: spec.quality.grey && spec.transfer.is_grey(),
@@ -152,7 +152,7 @@ impl Frame {
         let range = view.project(&whole).map_or(SheetRange::new(0, 0), |p| p.sheets);
         // One sheet farther for the peek.
         let range = SheetRange::new(range.first, range.end + 1);
-        let spread = view.kernel_std / q.shape()[0];
+        let spread = view.kernel_std / q.kernel_shape()[0];
         let profile = Profile::new(q.kernel, view.kernel_std.z, view.kernel_radius.z);
         let profile = profile.with_spread(spread.z);
         let d = view.thickness;
@@ -167,7 +167,7 @@ impl Frame {
             }
         };
         let to_eye = match view.projection {
-            Projection::Ortho { .. } => Some(view.to_eye(DVec3::ZERO)),
+            Projection::Ortho { .. } => Some(view.direction_to_eye(DVec3::ZERO)),
             Projection::Persp { .. } => None,
         };
         let footprints = Footprints::new(&view, q.kernel, range, spread, scene.shelf.clone());
@@ -186,11 +186,11 @@ impl Frame {
             // these factors. It is at most 31,207, since a cell is no larger than the product of
             // the spreads.
             Sums::I16 => {
-                let units = short_per_payload(scene.payload_max, d);
+                let units = i16_units_per_payload(scene.payload_max, d);
                 ((units * d / (spread.x * spread.y * spread.z)) as f32, (1.0 / units) as f32)
             }
             Sums::I32 | Sums::Auto => {
-                let scale = raw_per_payload(scene.payload_max, d);
+                let scale = i32_units_per_payload(scene.payload_max, d);
                 // A solid's lattice rows are as its sums.
                 let of_rows = if lattice_rows.is_some() {
                     f64::from(scale) / spread.y
@@ -221,7 +221,7 @@ impl Frame {
         }
         let mut offsets = Box::new([[0.0; 512]; 3]);
         for i in 0..512u16 {
-            let v = view.offset_in_eye(local(i)).to_array();
+            let v = view.offset_in_eye(local_position(i)).to_array();
             offsets.iter_mut().zip(v).for_each(|(offsets, v)| offsets[usize::from(i)] = v);
         }
         Frame {
@@ -296,7 +296,7 @@ impl Frame {
     /// The lattice row of a voxel, in a level view: its brick's corner and its local index.
     #[inline]
     pub fn lattice_row(&self, corner: &Corner, of: u16) -> Option<u32> {
-        let (at, lattice_rows) = (local(of), self.lattice_rows.as_ref()?);
+        let (at, lattice_rows) = (local_position(of), self.lattice_rows.as_ref()?);
         Some(lattice_rows.of_voxel(std::array::from_fn(|axis| corner.index[axis] + at[axis])))
     }
 
@@ -339,14 +339,14 @@ impl Frame {
     /// raw units: extinction and the three sigma-weighted shaded colours.
     #[inline]
     pub fn payload(&self, brick: &Brick, i: usize, eye: DVec3) -> [f32; 4] {
-        let look = self.scene.classifier.look_of(brick, i);
+        let look = self.scene.classifier.classify_voxel(brick, i);
         let rgb = match &self.scene.shader {
             None => look.rgb,
             Some(shader) => {
                 let normal = brick.normals.as_ref().map_or(NO_NORMAL, |n| n[i]);
                 let to_eye = match self.to_eye {
                     Some(d) => d,
-                    None => self.view.to_eye(eye),
+                    None => self.view.direction_to_eye(eye),
                 };
                 shader.shade(look.rgb, normal, to_eye)
             }
@@ -379,7 +379,7 @@ impl<const MOST: usize> Work for Payloads<'_, MOST> {
         }
         let [sigma, colours @ ..] = out;
         for (i, &sample) in samples.iter().enumerate().take(if table.is_empty() { n } else { 0 }) {
-            let look = frame.scene.classifier.look_of_bits(sample);
+            let look = frame.scene.classifier.classify_bits(sample);
             sigma[i] = look.sigma;
             for c in 0..3 {
                 colours[c][i] = look.rgb[c];
@@ -388,17 +388,18 @@ impl<const MOST: usize> Work for Payloads<'_, MOST> {
         if let Some(shader) = &frame.scene.shader {
             let mut lit = [[0.0; MOST]; 2];
             match (frame.to_eye, eyes) {
-                (Some(to_eye), _) => shader.light_all(normals, |_| to_eye, &mut lit),
+                (Some(to_eye), _) => shader.light_terms_all(normals, |_| to_eye, &mut lit),
                 (None, eyes) => {
                     let mut to_eye = [[0.0; MOST]; 3];
-                    frame.view.to_eye_all(eyes.expect("eyes in perspective"), &mut to_eye);
+                    frame.view.directions_to_eye(eyes.expect("eyes in perspective"), &mut to_eye);
                     let [x, y, z] = &to_eye;
-                    shader.light_all(normals, |i| Vec3::new(x[i], y[i], z[i]), &mut lit);
+                    shader.light_terms_all(normals, |i| Vec3::new(x[i], y[i], z[i]), &mut lit);
                 }
             }
             for colour in &mut *colours {
                 for i in 0..n {
-                    colour[i] = Lit { lambert: lit[0][i], gloss: lit[1][i] }.on(colour[i]);
+                    colour[i] =
+                        LightTerms { lambert: lit[0][i], gloss: lit[1][i] }.apply(colour[i]);
                 }
             }
         }

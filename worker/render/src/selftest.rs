@@ -8,25 +8,46 @@ use crate::kernels::Simd;
 use crate::scene::{Frame, Scene};
 use crate::tile::{self, Scratch};
 use glam::DVec3;
-use slabcast_common::brick::{BRICK, Brick, BrickGrid};
+use slabcast_common::brick::{BRICK_EDGE, Brick, BrickGrid};
 use slabcast_common::ids::{BrickId, SceneId};
 use slabcast_common::image::FrameState;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Sums};
-use slabcast_common::shade::encode_normal;
+use slabcast_common::shade::{Shading, encode_normal};
 use slabcast_common::slab::SheetRange;
+use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Samples, Volume};
 use std::sync::Arc;
+
+/// The self-test's transfer function, over 8-bit values: the preset `peer-vessels`, written out so that
+/// the renderer depends on no presets.
+fn vessels() -> TransferFunction {
+    TransferFunction {
+        version: 1,
+        domain: Domain::Value,
+        colors: vec![
+            [0.0, 0.7, 0.1, 0.1],
+            [60.0, 0.8, 0.2, 0.15],
+            [160.0, 0.95, 0.45, 0.35],
+            [255.0, 1.0, 0.9, 0.8],
+        ],
+        opacities: vec![[0.0, 0.0], [60.0, 0.0], [120.0, 0.8], [255.0, 1.0]],
+        color_space: ColorSpace::Srgb,
+        opacity_unit: OpacityUnit::AlphaPerVox,
+        nan: NanColour::default(),
+        gradient_opacity: Vec::new(),
+        shading: Shading::default(),
+    }
+}
 
 /// `volume` as a scene of its own, in three colours.
 pub fn spec(volume: &Volume, quality: Quality) -> SceneSpec {
     SceneSpec {
         id: SceneId(0),
         volume: volume.info(Digest32::default()),
-        transfer: presets::by_name("peer-vessels", &volume.summary).expect("a preset"),
+        transfer: vessels(),
         quality,
         bricks: Default::default(),
     }
@@ -70,14 +91,14 @@ pub fn run(simd: Simd) -> Digest32 {
         let frame = Frame::new(Arc::new(Scene::new(&spec)), view);
         let mut state = FrameState::new(size);
         let mut scratch = Scratch::default();
-        let rect = Rect::of_size(size);
+        let rect = Rect::from_size(size);
         for slab in [SheetRange::new(-40, 3), SheetRange::new(3, 40)] {
-            let from = state.tile(rect);
+            let from = state.tile_state(rect);
             let (pixels, _) = tile::render(&frame, simd, rect, slab, &bricks, &from, &mut scratch);
-            state.put(rect, &pixels);
+            state.add_slab_tile(rect, &pixels);
             state.end_slab();
         }
-        hashes.extend(state.finish().sha256().0);
+        hashes.extend(state.to_picture().sha256().0);
     }
     use sha2::{Digest, Sha256};
     Digest32(Sha256::digest(&hashes).into())
@@ -85,7 +106,7 @@ pub fn run(simd: Simd) -> Digest32 {
 
 /// All voxels of an 8-bit volume that are not zero, as bricks, with normals.
 pub fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
-    let grid = BrickGrid::of(volume.lattice.dims);
+    let grid = BrickGrid::new(volume.lattice.dims);
     let Samples::U8(samples) = &volume.samples else { unreachable!("made above") };
     let [nx, ny, _] = volume.lattice.dims.map(|n| n as usize);
     let matrix = volume.gradient_matrix();
@@ -94,8 +115,9 @@ pub fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
             let corner = grid.corner(BrickId(id));
             let (mut index, mut values, mut normals) = (Vec::new(), Vec::new(), Vec::new());
             for l in 0..512u16 {
-                let p: [u32; 3] =
-                    std::array::from_fn(|a| corner[a] + slabcast_common::brick::local(l)[a]);
+                let p: [u32; 3] = std::array::from_fn(|a| {
+                    corner[a] + slabcast_common::brick::local_position(l)[a]
+                });
                 if (0..3).any(|a| p[a] >= volume.lattice.dims[a]) {
                     continue;
                 }
@@ -106,7 +128,7 @@ pub fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
                     normals.push(encode_normal(volume.gradient(p, &matrix)));
                 }
             }
-            debug_assert!(corner.iter().all(|c| c % BRICK == 0));
+            debug_assert!(corner.iter().all(|c| c % BRICK_EDGE == 0));
             (!index.is_empty()).then(|| {
                 Arc::new(Brick::new(BrickId(id), index, Samples::U8(values), Some(normals)))
             })

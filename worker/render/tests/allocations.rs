@@ -77,7 +77,7 @@ struct Kept {
 
 fn tiles() -> Vec<Rect> {
     let starts = || (0..SIZE as i32).step_by(TILE as usize);
-    let whole = Rect::of_size([SIZE; 2]);
+    let whole = Rect::from_size([SIZE; 2]);
     let tile = |x, y| Rect::new(x, y, x + TILE, y + TILE).intersect(&whole);
     starts().flat_map(|y| starts().map(move |x| tile(x, y))).collect()
 }

@@ -3,8 +3,8 @@
 use super::task::{
     DrawnRegion, Progress, RegionReport, RegionTask, SlabReport, SlabTask, StoppableSupply,
 };
-use slabcast_common::leaves::Leaves;
-use slabcast_common::message::{HandedOver, Pixels, Sampling};
+use slabcast_common::image::SparseTile;
+use slabcast_common::message::{ErrorsBySource, Pixels, RegionSplit};
 use slabcast_render::Simd;
 use slabcast_render::region::{BrickSupply, FinishedRegion, Region};
 use slabcast_render::tile::{self, Scratch};
@@ -60,7 +60,7 @@ pub(super) fn draw_region(
     simd: Simd,
     mut task: Box<RegionTask>,
     scratch: &mut Scratch,
-    give: &dyn Fn(HandedOver),
+    give: &dyn Fn(RegionSplit),
 ) -> RegionReport {
     let span = tracing::debug_span!(
         "region", frame = %task.lease.frame, task = %task.lease.task, x = task.lease.tile.x0,
@@ -80,7 +80,7 @@ fn advance(
     simd: Simd,
     task: &mut RegionTask,
     scratch: &mut Scratch,
-    give: &dyn Fn(HandedOver),
+    give: &dyn Fn(RegionSplit),
 ) -> Progress {
     let RegionTask { lease, frame: slot, table, split, drawn, region, ahead, .. } = task;
     let frame = slot.get();
@@ -109,7 +109,7 @@ fn advance(
         if let Some((kept, given, begun)) = current.split_off(visible, eps, share) {
             let (task, epoch) = (lease.task, lease.epoch);
             lease.tile = kept;
-            give(HandedOver { task, epoch, kept, given, begun });
+            give(RegionSplit { task, epoch, kept, given, begun });
         }
     };
     *drawn += start.elapsed();
@@ -126,11 +126,11 @@ fn advance(
     let FinishedRegion { pixels, counters, touched, .. } = finished;
     let size = [lease.tile.width() as u32, lease.tile.height() as u32];
     let pixels = match &slot.finish {
-        Some(finish) => Pixels::Finished(Leaves::of(&pixels, size, finish)),
+        Some(finish) => Pixels::Finished(SparseTile::encode(&pixels, size, finish)),
         None => Pixels::Sums(pixels),
     };
     *drawn += finishing.elapsed();
-    let mut sampled = Sampling::default();
+    let mut sampled = ErrorsBySource::default();
     // The bricks of sheets that another worker drew are not here.
     if lease.estimate && lease.begun.is_none() {
         let bricks = touched.iter().map(|&place| table.get(place));

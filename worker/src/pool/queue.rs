@@ -4,8 +4,8 @@ use super::slots::{FrameSlot, locked};
 use super::task::{RegionTask, Task};
 use crate::brick_table::BrickTable;
 use slabcast_common::ids::FrameId;
+use slabcast_common::lookahead::Lookahead;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::region::Lookahead;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -45,7 +45,7 @@ impl State {
         {
             let idle = (now - since) * self.idle_threads;
             self.idle += idle;
-            self.lookahead.waited(idle.as_nanos() as u64);
+            self.lookahead.add_idle_ns(idle.as_nanos() as u64);
         }
     }
 
@@ -54,7 +54,7 @@ impl State {
         let now_ns = self.began.get_or_insert_with(Instant::now).elapsed().as_nanos() as u64;
         let frame = task.lease.frame;
         let is_first = *task.frame.scene.first.get_or_init(|| frame) == frame;
-        self.lookahead.sheets(now_ns, self.threads, (task.stalls, is_first))
+        self.lookahead.sheets(now_ns, self.threads, task.stalls, is_first)
     }
 }
 

@@ -2,7 +2,7 @@
 //! makes it.
 
 use slabcast_common::ids::FrameId;
-use slabcast_common::leaves::Finish;
+use slabcast_common::image::PixelEncoding;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::view::View;
 use slabcast_render::judge::error_probe::{ErrorProbe, ThicknessPair};
@@ -41,7 +41,7 @@ pub(crate) struct FrameSlot {
     pub(crate) scene: Arc<SceneSlot>,
     pub(crate) view: View,
     /// Format and background for regions that are finished here; `None`: their sums are sent.
-    pub(crate) finish: Option<Finish>,
+    pub(crate) finish: Option<PixelEncoding>,
     /// Whether results are sent as they are, not packed (rehearsal only).
     pub(crate) plain: bool,
     frame: OnceLock<Frame>,
@@ -62,7 +62,7 @@ impl FrameSlot {
     pub(crate) fn new(
         scene: Arc<SceneSlot>,
         view: View,
-        finish: Option<Finish>,
+        finish: Option<PixelEncoding>,
         plain: bool,
     ) -> Self {
         let (frame, probe, visible, depths, rehearsed, made, held, has_ended) = Default::default();

@@ -4,7 +4,7 @@ use super::slots::FrameSlot;
 use crate::brick_table::BrickTable;
 use slabcast_common::brick::{Brick, BrickSetKey};
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::{Counters, HandedOver, Lease, Pixels, RegionLease, Sampling};
+use slabcast_common::message::{Counters, ErrorsBySource, Lease, Pixels, RegionLease, RegionSplit};
 use slabcast_render::region::{BrickSupply, Region};
 use slabcast_trace::RegionProgress;
 use std::sync::Arc;
@@ -138,7 +138,7 @@ pub(crate) struct DrawnRegion {
     /// Places in the directory of the bricks that it touched, ascending.
     pub(crate) touched: Vec<u32>,
     /// Measured errors of some of its pixels, if the lease asked for them.
-    pub(crate) sampled: Sampling,
+    pub(crate) sampled: ErrorsBySource,
 }
 
 /// The state in which a thread leaves a region.
@@ -177,7 +177,7 @@ pub(crate) enum Report {
     Slab(SlabReport),
     Region(RegionReport),
     /// A piece split off a region that goes on.
-    Piece(Box<HandedOver>),
+    Piece(Box<RegionSplit>),
     /// Places of bricks in a table that regions in the queue will need, judged by earlier frames.
     Prefetch(BrickSetKey, Arc<BrickTable>, Vec<u32>),
 }

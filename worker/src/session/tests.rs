@@ -1,22 +1,23 @@
 use super::*;
 use slabcast_common::brick::{Brick, BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, WorkerId};
-use slabcast_common::image::{Background, PixelFormat, TilePixels, TileState};
-use slabcast_common::leaves::{Finish, Leaves};
+use slabcast_common::image::{
+    Background, PixelEncoding, PixelFormat, SparseTile, TilePixels, TileState,
+};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::path::{Orientation, Turntable, ViewPath};
-use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, Samples, Volume};
+use slabcast_scene::path::{Orientation, Turntable, ViewPath};
+use slabcast_scene::presets;
 
 const FRAME: FrameId = FrameId(5);
 /// A frame of the same view whose regions are finished.
 const FINISHED: FrameId = FrameId(9);
-const FINISH: Finish =
-    Finish { format: PixelFormat::Rgb8, background: Background::Colour([1.0, 0.5, 0.0]) };
+const FINISH: PixelEncoding =
+    PixelEncoding { format: PixelFormat::Rgb8, background: Background::Colour([1.0, 0.5, 0.0]) };
 const SET: BrickSetKey = BrickSetKey(Digest32([7; 32]));
 
 /// The master's end of a link, and a worker behind it.
@@ -59,11 +60,11 @@ impl World {
         assert!(matches!(world.hear().await, ToMaster::Hello(_)), "the hello comes first");
 
         let volume = Volume::from_fn_u8("pair", [16, 8, 8], |_, _, _| 200);
-        assert_eq!(BrickGrid::of(volume.lattice.dims).len(), 2);
+        assert_eq!(BrickGrid::new(volume.lattice.dims).len(), 2);
         let quality = Quality { sums: Sums::I32, ..Quality::default() };
         let mut transfer = presets::by_name("peer-opaque", &volume.summary).unwrap();
         transfer.shading.on = false;
-        let path = ViewPath::turn([32, 32], Turntable::default());
+        let path = ViewPath::from_turntable([32, 32], Turntable::default());
         let orientation = Orientation::new(None, None).unwrap();
         let camera = path.camera(0, &volume.lattice, orientation).unwrap();
         let view = View::new(&volume.lattice, &camera, [32, 32], &quality).unwrap();
@@ -119,7 +120,7 @@ impl World {
         let info = |id| {
             let b = brick(id);
             let bytes = b.encoded_len() as u32;
-            BrickInfo { id: b.id, tight: b.tight(&grid), voxels: 512, bytes }
+            BrickInfo { id: b.id, tight: b.tight_box(&grid), voxels: 512, bytes }
         };
         let bricks = [info(0), info(1)].into();
         self.say(ToWorker::Directory { set: SET, grid, first: 0, total: 2, bricks });
@@ -282,7 +283,7 @@ async fn lookahead_grows_while_render_threads_wait_for_bricks() {
     let spec = SceneSpec { id: SceneId(4), transfer, ..known };
     let turntable = Turntable { start: 90.0, ..Turntable::default() };
     let orientation = Orientation::new(None, None).unwrap();
-    let path = ViewPath::turn([32, 32], turntable);
+    let path = ViewPath::from_turntable([32, 32], turntable);
     let camera = path.camera(0, &volume.lattice, orientation).unwrap();
     let view = View::new(&volume.lattice, &camera, [32, 32], &spec.quality).unwrap();
     let (scene, finish) = (spec.id, None);
@@ -341,7 +342,7 @@ async fn region_is_finished_on_the_worker_if_its_frame_asks_and_a_slab_never() {
     let raw = world.result().await;
     world.region_of(FINISHED, 2, tile);
     let finished = world.result().await;
-    let want = Leaves::of(sums(&raw), [32, 32], &FINISH);
+    let want = SparseTile::encode(sums(&raw), [32, 32], &FINISH);
     assert!(!want.data.is_empty());
     assert_eq!(finished.pixels, Pixels::Finished(want));
     world.lease_of(FINISHED, 3, &[0, 1]);
@@ -358,7 +359,7 @@ async fn work_stealing_piece_of_a_region_resumes_with_the_same_pixels() {
     requested(&mut world, 2).await;
     let split = |task, epoch| {
         let (frame, task, epoch) = (FRAME, TaskId(task), Epoch(epoch));
-        ToWorker::HandOver { frame, task, epoch, share: 500 }
+        ToWorker::SplitRegion { frame, task, epoch, share: 500 }
     };
     // Of what it does not have, or not so, it gives nothing.
     world.say(split(1, 1));
@@ -366,7 +367,7 @@ async fn work_stealing_piece_of_a_region_resumes_with_the_same_pixels() {
     world.settle().await;
     // Though it stands still.
     world.say(split(1, 0));
-    let ToMaster::HandedOver(piece) = world.hear().await else { panic!("a piece") };
+    let ToMaster::RegionSplit(piece) = world.hear().await else { panic!("a piece") };
     assert_eq!((piece.task, piece.epoch), (TaskId(1), Epoch(0)));
     assert_eq!(piece.kept.union(&piece.given), tile);
     assert_eq!((piece.kept.area(), piece.given.area()), (512, 512));
@@ -386,7 +387,7 @@ async fn work_stealing_piece_of_a_region_resumes_with_the_same_pixels() {
     world.say(lease(3, tile, None));
     let whole = world.result().await;
     for (part, rect) in [(kept, piece.kept), (given, piece.given)] {
-        assert_eq!(*sums(&part), sums(&whole).piece(tile, rect), "as if it had never moved");
+        assert_eq!(*sums(&part), sums(&whole).crop(tile, rect), "as if it had never moved");
     }
     // What can't have been begun so is refused.
     world.say(lease(4, tile, Some(Arc::new(piece.begun.clone()))));

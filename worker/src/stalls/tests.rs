@@ -32,7 +32,7 @@ impl World {
         let info = |id| {
             let b = brick(id);
             let bytes = b.encoded_len() as u32;
-            let tight = b.tight(&GRID);
+            let tight = b.tight_box(&GRID);
             slabcast_common::brick::BrickInfo { id: b.id, tight, voxels: 512, bytes }
         };
         let mut cache = BrickCache::default();

@@ -20,7 +20,7 @@ use clap::error::{ContextKind, ContextValue};
 use clap::parser::ValueSource;
 use clap::{Arg, ArgAction, ArgMatches, Command};
 use file::File;
-use slabcast_common::presets::distance;
+use slabcast_common::spelling::distance;
 use slabcast_session::fail::Fail;
 use slabcast_session::progress;
 use std::collections::BTreeMap;

@@ -297,8 +297,8 @@ pub(crate) fn owner(picture: &Frame, stats: &FrameStats) -> Frame {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use slabcast_common::path::{Orientation, ViewPath};
     use slabcast_render::judge::reference::{Reference, stratified};
+    use slabcast_scene::path::{Orientation, ViewPath};
     use slabcast_session::request::RenderRequest;
 
     fn stage(tf: &str) -> Stage {

@@ -3,9 +3,9 @@
 
 use super::*;
 use slabcast_common::image::Picture;
-use slabcast_common::path::{Turntable, ViewPath};
 use slabcast_common::volume::Digest32;
 use slabcast_master::finish::view_sha256;
+use slabcast_scene::path::{Turntable, ViewPath};
 use std::collections::BTreeMap;
 use std::sync::mpsc::sync_channel;
 
@@ -25,7 +25,7 @@ const WARM: u32 = 12;
 /// So many frames of a path, a degree apart, as PNGs into a folder.
 fn run(tf: &str, edge: u32, frames: u32, folder: &Path) -> Run {
     let turn = Turntable { frames, step: 1.0, ..Turntable::default() };
-    let path = ViewPath::turn([edge, edge], turn);
+    let path = ViewPath::from_turntable([edge, edge], turn);
     let mut request = RenderRequest::plain(path, tf).expect("a request");
     request.hashed = false;
     let args = OutputArgs {

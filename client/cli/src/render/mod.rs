@@ -8,13 +8,13 @@ mod master_cost;
 
 use debug_views::Show;
 use slabcast_client::{Client, VolumeDescription};
-use slabcast_common::message::PathRequest;
-use slabcast_common::path::Orientation;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_lab::autotune::choose::{choose, lab};
 use slabcast_lab::autotune::cluster::{There, Through, Wire};
 use slabcast_lab::autotune::here::{Clock, Here};
+use slabcast_scene::path::Orientation;
+use slabcast_scene::request::PathRequest;
 use slabcast_session::direct::Cut;
 use slabcast_session::embedded::{self, Cluster, Crew};
 use slabcast_session::fail::{Fail, say};

@@ -13,9 +13,9 @@ use super::here::{Clock, Here};
 use super::place::{Place, stopped};
 use super::setting::{Setting, fraction};
 use super::trial::{Lab, Off};
-use slabcast_common::path::Orientation;
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_scene::path::Orientation;
 use slabcast_session::direct::Cut;
 use slabcast_session::fail::Fail;
 use slabcast_session::progress::{self, Progress};
@@ -64,7 +64,7 @@ pub struct Chosen {
 /// for a sheet.
 pub(super) fn ladder(base: &Setting, size: [u32; 2]) -> Vec<Setting> {
     let b = base.quality;
-    let short = b.fits_short();
+    let short = b.fits_i16();
     let few = if short { Sums::I16 } else { Sums::Auto };
     let rungs: [(u32, f64, f64, Sums); 16] = [
         (4, 4.0, 1.0 / 16.0, few),

@@ -9,11 +9,11 @@ use super::setting::Setting;
 use super::trial::Off;
 use slabcast_client::Client;
 use slabcast_common::image::{Background, Picture, PixelFormat};
-use slabcast_common::path::ViewPath;
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::volume::VolumeInfo;
 use slabcast_master::Handle;
 use slabcast_render::judge::reference::ErrorFigures;
+use slabcast_scene::path::ViewPath;
 use slabcast_session::fail::Fail;
 use slabcast_session::magnify::magnified;
 use slabcast_session::output::{Frame, png};
@@ -271,7 +271,7 @@ impl Place for There<'_> {
             let n = VIEWS.min(views);
             for i in 0..n {
                 progress.stage(&format!("drawing what it should be, view {} of {n}", i + 1));
-                let view = path.only(path.first_frame() + (2 * i + 1) * views / (2 * n));
+                let view = path.single_frame(path.first_frame() + (2 * i + 1) * views / (2 * n));
                 let picture = self.picture(&finest, &view)?;
                 let truth = picture.pixels.iter().map(|p| p.map(f64::from)).collect();
                 self.truths.push((view, truth));
@@ -312,13 +312,13 @@ pub fn all_around(path: &ViewPath) -> ViewPath {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use slabcast_common::path::Turntable;
+    use slabcast_scene::path::Turntable;
 
     #[test]
     fn few_views_stand_for_a_path() {
         let turn = |frames, step| {
             let turn = Turntable { frames, step, start: 10.0, ..Turntable::default() };
-            ViewPath::turn([64, 64], turn)
+            ViewPath::from_turntable([64, 64], turn)
         };
         let few = spread(&turn(18, 5.0), 6).turntable.unwrap();
         assert_eq!((few.start, few.step, few.frames), (10.0, 17.0, 6));

@@ -8,12 +8,12 @@ use super::setting::Setting;
 use serde::{Deserialize, Serialize};
 use slabcast_common::image::Picture;
 use slabcast_common::message::{Counters, SceneSpec};
-use slabcast_common::path::Orientation;
 use slabcast_common::quality::{Compositing, Quality, Sums};
 use slabcast_common::transfer::Classifier;
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_render::judge::reference::{ErrorFigures, Reference, stratified};
 use slabcast_render::{Frame, Scene};
+use slabcast_scene::path::Orientation;
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::Fail;
 use slabcast_session::magnify::magnified;
@@ -317,7 +317,7 @@ impl Lab {
         let info = self.info.clone();
         let spec = self.stage(setting)?.spec(view);
         let classifier = Classifier::new(&spec.transfer, &info, quality.compositing);
-        let sums = classifier.sums(&quality, &info.lattice).map_err(|e| Fail::flag(&e))?;
+        let sums = classifier.choose_sums(&quality, &info.lattice).map_err(|e| Fail::flag(&e))?;
         let quality = Quality { sums, ..quality };
         Ok(Way { scene: Arc::new(Scene::new(&SceneSpec { quality, ..spec })), quality })
     }
@@ -354,11 +354,12 @@ fn ground(setting: &Setting) -> Ground {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use slabcast_common::path::{Turntable, ViewPath};
+    use slabcast_scene::path::{Turntable, ViewPath};
 
     fn lab(tf: &str) -> Lab {
         let volume = slabcast_session::volume::open("formula:spheres:32".as_ref()).unwrap();
-        let path = ViewPath::turn([64, 64], Turntable { frames: 3, ..Turntable::default() });
+        let path =
+            ViewPath::from_turntable([64, 64], Turntable { frames: 3, ..Turntable::default() });
         let request = RenderRequest::plain(path, tf).unwrap();
         let info = volume.info(volume.digest());
         Lab::new(volume, info, &request, Orientation::new(None, None).unwrap(), 2).unwrap()

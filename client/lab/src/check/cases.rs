@@ -3,15 +3,15 @@
 
 use super::{cluster, looks};
 use glam::DVec3;
-use slabcast_common::message::PathRequest;
-use slabcast_common::path::{Orientation, PathView, ProjectionKind, ViewPath};
-use slabcast_common::presets;
 use slabcast_common::quality::{Compositing, Kernel, Quality, Sums, Work};
 use slabcast_common::transfer::{OpacityUnit, TransferFunction};
 use slabcast_common::view::View;
 use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
 use slabcast_render::oracle::serial;
 use slabcast_render::{Frame, Scene};
+use slabcast_scene::path::{Orientation, PathView, ProjectionKind, ViewPath};
+use slabcast_scene::presets;
+use slabcast_scene::request::PathRequest;
 use slabcast_session::fail::Fail;
 use slabcast_session::path_scenes::Drawn;
 use slabcast_session::volume;
@@ -181,7 +181,7 @@ impl Case {
             view(DVec3::new(0.75, 1.5, 0.625), ProjectionKind::Ortho),
             view(DVec3::new(-0.75, 0.625, -0.375), ProjectionKind::Persp),
         ];
-        ViewPath::of_views(self.size, views)
+        ViewPath::from_views(self.size, views)
     }
 
     /// The request for both views.

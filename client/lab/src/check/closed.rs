@@ -4,14 +4,14 @@
 use super::case::{Case, Row};
 use super::shot::{Ready, Shot, sane};
 use slabcast_common::image::Picture;
-use slabcast_common::path::{PathView, ProjectionKind};
 use slabcast_common::quality::{Compositing, Quality, Sums};
 use slabcast_common::shade::Shading;
 use slabcast_common::transfer::{
-    Classifier, ColorSpace, Domain, NanLook, OpacityUnit, SIGMA_MAX, TransferFunction,
+    Classifier, ColorSpace, Domain, NanColour, OpacityUnit, SIGMA_MAX, TransferFunction,
 };
 use slabcast_common::view::SUBPIXELS;
 use slabcast_render::judge::analytic::{Bell, Layer, Profile, Rounding, Stack};
+use slabcast_scene::path::{PathView, ProjectionKind};
 use slabcast_session::direct::Cut;
 use slabcast_session::fail::Fail;
 use slabcast_session::volume;
@@ -56,7 +56,7 @@ fn look(unit: OpacityUnit, colors: Vec<[f64; 4]>, opacities: Vec<[f64; 2]>) -> T
         opacities,
         color_space: ColorSpace::Linear,
         opacity_unit: unit,
-        nan: NanLook::default(),
+        nan: NanColour::default(),
         gradient_opacity: vec![],
         shading: Shading { on: false, ..Shading::default() },
     }

@@ -3,8 +3,6 @@
 use sha2::{Digest, Sha256};
 use slabcast_client::Client;
 use slabcast_common::image::{Background, PixelFormat};
-use slabcast_common::message::{PathRequest, TransferChoice};
-use slabcast_common::path::{Orientation, ViewPath};
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::volume::{Digest32, Volume};
@@ -12,6 +10,9 @@ use slabcast_master::SubmitError;
 use slabcast_master::jobs::{FinishedFrame, JobState, WatchItem};
 use slabcast_master::{Handle, Master, MasterConfig};
 use slabcast_render::Simd;
+use slabcast_scene::path::{Orientation, ViewPath};
+use slabcast_scene::request::PathRequest;
+use slabcast_scene::transfer::TransferChoice;
 use slabcast_session::embedded::{Cluster, Crew, start_master};
 use slabcast_session::fail::Fail;
 use std::time::Duration;

@@ -14,7 +14,7 @@
 //! subpixel beside an edge of extinction 1e9, a pixel may be anything.
 
 use super::shot::Ready;
-use slabcast_common::bounds::raw_per_payload;
+use slabcast_common::bounds::i32_units_per_payload;
 use slabcast_common::brick::TightBox;
 use slabcast_common::kernel::{Lean, Profile};
 use slabcast_common::occlusion::Rect;
@@ -115,12 +115,12 @@ impl<'a> Enclosure<'a> {
     pub(crate) fn new(ready: &'a Ready) -> Self {
         let (view, frame) = (&ready.view, ready.frame());
         let floats = ready.spec.quality.sums == Sums::F32;
-        let scale = raw_per_payload(frame.scene.payload_max, view.thickness);
+        let scale = i32_units_per_payload(frame.scene.payload_max, view.thickness);
         let grid = &frame.scene.grid;
         let rects = ready
             .bricks
             .iter()
-            .map(|b| view.project(&b.tight(grid)).map_or(Rect::default(), |p| p.rect))
+            .map(|b| view.project(&b.tight_box(grid)).map_or(Rect::default(), |p| p.rect))
             .collect();
         let whole = TightBox { lo: [0; 3], hi: frame.scene.dims.map(|n| n - 1) };
         let range = view.project(&whole).map_or(SheetRange::default(), |p| p.sheets);

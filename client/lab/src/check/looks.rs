@@ -5,7 +5,7 @@
 //! `auto`, `grey` and `bone` gave for these volumes when the first golden frames were made.
 
 use slabcast_common::shade::Shading;
-use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
+use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 
 /// The function of a golden case by its name, if it is one of a preset that changes.
 pub(super) fn of(case: &str) -> Option<TransferFunction> {
@@ -63,7 +63,7 @@ pub(super) fn grey(opacities: Vec<[f64; 2]>) -> TransferFunction {
         opacities,
         color_space: ColorSpace::Srgb,
         opacity_unit: OpacityUnit::AlphaPerVox,
-        nan: NanLook::default(),
+        nan: NanColour::default(),
         gradient_opacity: Vec::new(),
         shading: Shading { on: false, ..Shading::default() },
     }

@@ -6,8 +6,7 @@
 
 use super::cluster::{self, Either, Link};
 use slabcast_common::image::Picture;
-use slabcast_common::message::{PathRequest, SceneSpec};
-use slabcast_common::path::{Orientation, PathView, ViewPath};
+use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Quality, Sums, Work};
 use slabcast_common::transfer::{Classifier, TransferFunction};
 use slabcast_common::view::View;
@@ -15,6 +14,8 @@ use slabcast_common::volume::{Digest32, Volume, VolumeInfo};
 use slabcast_render::judge::reference::{Reference, stratified};
 use slabcast_render::oracle::serial;
 use slabcast_render::{Frame, Scene};
+use slabcast_scene::path::{Orientation, PathView, ViewPath};
+use slabcast_scene::request::PathRequest;
 use slabcast_session::direct::{self, Bricks, Cut};
 use slabcast_session::embedded::Crew;
 use slabcast_session::fail::Fail;
@@ -51,7 +52,7 @@ pub(crate) struct Shot {
 /// here is off by so little that 16 bits would show.
 pub(crate) fn finely(quality: Quality, transfer: &TransferFunction, info: &VolumeInfo) -> Quality {
     let classifier = Classifier::new(transfer, info, quality.compositing);
-    match (quality.sums, classifier.sums(&quality, &info.lattice)) {
+    match (quality.sums, classifier.choose_sums(&quality, &info.lattice)) {
         (Sums::Auto, Ok(Sums::I16)) => Quality { sums: Sums::I32, ..quality },
         _ => quality,
     }
@@ -68,7 +69,7 @@ pub(crate) struct Ready {
 
 impl Shot {
     fn path(&self) -> ViewPath {
-        ViewPath::of_views(self.size, vec![self.view])
+        ViewPath::from_views(self.size, vec![self.view])
     }
 
     /// The request that has a cluster draw it.
@@ -83,7 +84,7 @@ impl Shot {
     /// # Errors
     /// What the master would refuse, in the master's words.
     pub(crate) fn ready(&self) -> Result<Ready, Fail> {
-        let refused = |e: slabcast_common::quality::Refused| Fail::failed(e.to_string());
+        let refused = |e: slabcast_common::quality::InvalidField| Fail::failed(e.to_string());
         self.volume.lattice.check().map_err(Fail::failed)?;
         self.quality.check().map_err(refused)?;
         self.transfer.check().map_err(refused)?;

@@ -159,7 +159,7 @@ mod tests {
         for size in [[1u32, 1], [90, 3]] {
             let n = (size[0] * size[1]) as usize;
             let picture = Picture { size, pixels: vec![[0.0, 0.0, 1.0, 1.0]; n] };
-            let whole = Rect::of_size(size);
+            let whole = Rect::from_size(size);
             let canvas = draw(&picture, Background::Transparent, &[(whole, VIRIDIS[3])]);
             let at = |x: usize, y: usize| {
                 let i = (y * canvas.size[0] + x) * 3;

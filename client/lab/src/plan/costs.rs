@@ -7,8 +7,7 @@ use super::clock::cpu_ns;
 use super::measure::FINISH;
 use prost::Message;
 use slabcast_common::ids::{Epoch, FrameId, TaskId};
-use slabcast_common::image::{Picture, TilePixels, TileState};
-use slabcast_common::leaves::Leaves;
+use slabcast_common::image::{Picture, SparseTile, TilePixels, TileState};
 use slabcast_common::message::{
     Counters, Lease, Pixels, TaskTimes, TileResult, ToMaster, ToWorker,
 };
@@ -180,7 +179,7 @@ fn region_bytes(trace: &Trace) -> Option<f64> {
 
 /// A region of 64x64 pixels that weighs what those of the trace do, half of it packed away: what is
 /// inside the outline of what is drawn packs to some half.
-fn region(trace: &Trace) -> Leaves {
+fn region(trace: &Trace) -> SparseTile {
     let bytes = region_bytes(trace).unwrap_or(0.5) * 64.0 * 64.0;
     let tile = Rect::new(0, 0, 64, 64);
     let mut leaves = trace::placeholder_finished(&tile, (2.0 * bytes) as u32, &FINISH);
@@ -196,12 +195,12 @@ fn finish(trace: &Trace, by_region: bool) -> f64 {
     use slabcast_common::image::{FrameState, TilePixels};
     let size = trace.about.size;
     let mut state = FrameState::new(size);
-    let whole = Rect::of_size(size);
+    let whole = Rect::from_size(size);
     if by_region {
         let leaves = region(trace);
         for y in (0..whole.y1 - 63).step_by(64) {
             for x in (0..whole.x1 - 63).step_by(64) {
-                state.lay_finished(Rect::new(x, y, x + 64, y + 64), leaves.clone());
+                state.place_encoded(Rect::new(x, y, x + 64, y + 64), leaves.clone());
             }
         }
     } else {
@@ -210,7 +209,7 @@ fn finish(trace: &Trace, by_region: bool) -> f64 {
         let a = (0..whole.area()).map(|i| if full(i) { 0.5 } else { 0.0 }).collect();
         let colour =
             (0..whole.area()).map(|i| if full(i) { [1 << 27; 3] } else { [0; 3] }).collect();
-        state.lay(whole, TilePixels { a, colour, last: None });
+        state.place_sums(whole, TilePixels { a, colour, last: None });
     }
     let ns = (0..3)
         .map(|_| {

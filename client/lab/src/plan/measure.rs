@@ -16,14 +16,15 @@ use prost::Message;
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::brick::Brick;
 use slabcast_common::ids::{Epoch, FrameId, TaskId};
-use slabcast_common::image::{Background, FrameState, PixelFormat, TilePixels};
-use slabcast_common::leaves::{Finish, Leaves};
+use slabcast_common::image::{
+    Background, FrameState, PixelEncoding, PixelFormat, SparseTile, TilePixels,
+};
 use slabcast_common::message::{
     Counters, Lease, Pixels, TaskTimes, TileResult, ToMaster, ToWorker,
 };
 use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::quality::Work;
-use slabcast_common::region::PART;
+use slabcast_common::region::PART_EDGE;
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::Projected;
 use slabcast_proto::convert::{self, Compression, Down};
@@ -68,8 +69,8 @@ pub(crate) struct Path<'a> {
 
 /// What a plain `slabcast render` has tiles finished to, over the usual background: others weigh about the
 /// same.
-pub(crate) const FINISH: Finish =
-    Finish { format: PixelFormat::Rgb8, background: Background::Colour([0.0; 3]) };
+pub(crate) const FINISH: PixelEncoding =
+    PixelEncoding { format: PixelFormat::Rgb8, background: Background::Colour([0.0; 3]) };
 
 /// The path's frames as the scheduler gets them.
 pub(crate) fn jobs(stage: &Stage, frames: usize, work: Work) -> Result<Vec<FrameJob>, Fail> {
@@ -149,7 +150,7 @@ impl Packed {
     }
 
     /// Bytes of a result of finished pixels as it crosses, packed and as it is; what packing takes counts.
-    fn weigh(&mut self, repeats: u32, leaves: Leaves, counters: Counters) -> [u32; 2] {
+    fn weigh(&mut self, repeats: u32, leaves: SparseTile, counters: Counters) -> [u32; 2] {
         self.bytes += leaves.data.len() as u64;
         let result = result_of(Pixels::Finished(leaves), counters);
         let [packed, plain] = [true, false].map(|packs| {
@@ -207,7 +208,7 @@ impl Bench {
         let regions = self.regions(path, job, &frame, &projected);
         let size = job.view.size;
         let mut state = FrameState::new(size);
-        let mut shut = ShutMap::open(Rect::of_size(size));
+        let mut shut = ShutMap::open(Rect::from_size(size));
         let mut slabs = Vec::new();
         let voxels = |i: usize| job.bricks[i].voxels;
         let cuts = if path.slab {
@@ -219,11 +220,11 @@ impl Bench {
             let drawn = self.slab(path, job, &frame, &projected, range, &state, &shut);
             let (levels, pixels) = drawn;
             for (rect, pixels) in &pixels {
-                state.put(*rect, pixels);
+                state.add_slab_tile(*rect, pixels);
             }
             state.end_slab();
             let eps = job.scene.quality.eps;
-            let bits: Vec<bool> = state.a().map(|a| is_shut(a, eps)).collect();
+            let bits: Vec<bool> = state.opacities().map(|a| is_shut(a, eps)).collect();
             for (i, _) in bits.iter().enumerate().filter(|(_, s)| **s) {
                 shut.shut(i);
             }
@@ -284,7 +285,7 @@ impl Bench {
                 let places = needed.iter().zip(&rects).filter(|(_, r)| over(r));
                 let bricks: Vec<Arc<Brick>> =
                     places.map(|(&i, _)| path.stage.bricks[i].clone()).collect();
-                let before = state.tile(t.rect);
+                let before = state.tile_state(t.rect);
                 let (simd, scratch) = (Simd::detect(), &mut self.scratch);
                 let (ns, (pixels, counters)) = shortest(self.repeats, || {
                     tile::render(frame, simd, t.rect, range, &bricks, &before, scratch)
@@ -347,7 +348,7 @@ impl Bench {
         // Of a frame that is alone it cuts some tiles of 64 pixels in parts of 32.
         let mut edges: BTreeSet<u32> = match job.work.tile {
             // What says when a large tile comes to its bricks are its parts.
-            Some(edge) => [edge, edge.min(PART as u32)].into(),
+            Some(edge) => [edge, edge.min(PART_EDGE as u32)].into(),
             None => [32, 64, 128, 256].into(),
         };
         for &wanted in path.wanted.iter().filter(|_| job.work.tile.is_none()) {
@@ -368,7 +369,7 @@ impl Bench {
                 done.record_depths(&depths);
                 let FinishedRegion { pixels, counters, touched, .. } = done;
                 let size = [t.width() as u32, t.height() as u32];
-                (Leaves::of(&pixels, size, &FINISH), counters, touched)
+                (SparseTile::encode(&pixels, size, &FINISH), counters, touched)
             };
             let mut tiles: Vec<RegionTile> = Vec::with_capacity(cut.tiles.len());
             for t in &cut.tiles {
@@ -390,7 +391,7 @@ impl Bench {
             opened.for_each(|block| outlook.project_block(*block));
             let rects: Vec<Rect> = cut.tiles.iter().map(|t| t.rect).collect();
             let times = in_turn(self.repeats, &rects, |t| drop(draw(t, &outlook, bricks)));
-            if edge <= PART as u32 {
+            if edge <= PART_EDGE as u32 {
                 for (tile, rect) in tiles.iter_mut().zip(&rects) {
                     let clocked = Clocked::new(bricks);
                     drop(draw(*rect, &outlook, &clocked));
@@ -408,7 +409,7 @@ impl Bench {
     /// The best cut of one core through all depths: edge and time, looks at blocks included.
     fn alone(&mut self, path: &Path<'_>, frame: &Frame, looked: &Looked) -> (u32, u64) {
         let bricks = &path.stage.bricks;
-        let whole = Rect::of_size(frame.view.size);
+        let whole = Rect::from_size(frame.view.size);
         let simd = Simd::detect();
         let repeats = self.repeats;
         let mut pixels = TilePixels::default();
@@ -525,10 +526,10 @@ pub(crate) fn fits(trace: &Trace, jobs: &[FrameJob]) -> Result<(), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use slabcast_common::leaves::Mosaic;
-    use slabcast_common::path::{Turntable, ViewPath};
+    use slabcast_common::image::FrameAssembler;
     use slabcast_render::tile::ProjectedBrick;
     use slabcast_render::visibility::Directory;
+    use slabcast_scene::path::{Turntable, ViewPath};
     use slabcast_session::direct::Cut;
     use slabcast_session::request::RenderRequest;
 
@@ -546,8 +547,8 @@ mod tests {
         let (volume, orientation) = slabcast_session::testing::data_volume(file, axis)?;
         let info = volume.info(volume.digest());
         let turn = Turntable { frames: 4, step: 22.5, ..Turntable::default() };
-        let request =
-            RenderRequest::plain(ViewPath::turn([512, 512], turn), tf).expect("a request");
+        let request = RenderRequest::plain(ViewPath::from_turntable([512, 512], turn), tf)
+            .expect("a request");
         Some(Stage::new(&volume, &info, &request, orientation).expect("a stage"))
     }
 
@@ -568,8 +569,9 @@ mod tests {
                 let mut state = FrameState::new([512, 512]);
                 for (rect, sums) in tiles_of(&picture.pixels) {
                     tiles += 1;
-                    let (finishing, leaves) = shortest(9, || Leaves::of(&sums, [64, 64], &FINISH));
-                    let noise = Leaves { data: noise(leaves.data.len()), ..leaves.clone() };
+                    let (finishing, leaves) =
+                        shortest(9, || SparseTile::encode(&sums, [64, 64], &FINISH));
+                    let noise = SparseTile { data: noise(leaves.data.len()), ..leaves.clone() };
                     let (sums_ns, of_sums) = write(Pixels::Sums(sums));
                     let (packing, packed) = write(Pixels::Finished(leaves.clone()));
                     let (hopeless, _) = write(Pixels::Finished(noise));
@@ -579,7 +581,7 @@ mod tests {
                     let plain = leaves.data.len() + leaves.mask.len() + 40;
                     let each = [of_sums.len(), plain, packed.len()];
                     bytes.iter_mut().zip(each).for_each(|(sum, one)| *sum += one);
-                    state.lay_finished(rect, leaves);
+                    state.place_encoded(rect, leaves);
                 }
                 composed += shortest(9, || state.encode(&FINISH, false)).0;
             }
@@ -604,21 +606,21 @@ mod tests {
             colour: (0..64 * 64).map(|i| [i * 7919 % (1 << 27); 3]).collect(),
             last: None,
         };
-        let leaves = Leaves::of(&full, [64, 64], &FINISH);
+        let leaves = SparseTile::encode(&full, [64, 64], &FINISH);
         for n in [512, 1024, 1536, 2048] {
             let at = (0..n).step_by(64);
             let corners = at.clone().flat_map(|y| at.clone().map(move |x| (x, y)));
             let tiles: Vec<_> =
                 corners.map(|(x, y)| (Rect::new(x, y, x + 64, y + 64), leaves.clone())).collect();
             let took = |before: usize| {
-                let mut mosaic = Mosaic::new([n as u32; 2], &FINISH);
-                mosaic.lay(&tiles[..before]);
+                let mut mosaic = FrameAssembler::new([n as u32; 2], &FINISH);
+                mosaic.place(&tiles[..before]);
                 let mut state = FrameState::new([n as u32; 2]);
                 for (rect, leaves) in &tiles[before..] {
-                    state.lay_finished(*rect, leaves.clone());
+                    state.place_encoded(*rect, leaves.clone());
                 }
                 let began = cpu_ns();
-                let bytes = state.encode_on(mosaic).bytes;
+                let bytes = state.encode_onto(mosaic).bytes;
                 (cpu_ns() - began, bytes)
             };
             let least = |before| (0..15).map(|_| took(before).0).min().unwrap_or(0) as f64 / 1e6;
@@ -650,7 +652,7 @@ mod tests {
                 let infos = bricks.directory().bricks().clone();
                 let directory = Arc::new(Directory::with_blocks(infos, shift, usize::MAX));
                 let all = VisibleBricks::new(&frame.view, &directory);
-                let tiles = direct::tiles(Rect::of_size([512; 2]), 64);
+                let tiles = direct::tiles(Rect::from_size([512; 2]), 64);
                 let tiles: Vec<Rect> = tiles.filter(|tile| all.weight(tile) > 0).collect();
                 let (mut scratch, mut pixels) = Default::default();
                 let mut look = |tiles: &[Rect]| {

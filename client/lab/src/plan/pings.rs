@@ -6,9 +6,9 @@
 //! ([`costs`](super::costs) has how). Waking differs between machines by a factor of three and more: in a virtual one it is
 //! the host that wakes a processor.
 
-use slabcast_common::path::Orientation;
 use slabcast_master::{Master, MasterConfig};
 use slabcast_render::Simd;
+use slabcast_scene::path::Orientation;
 use slabcast_trace::Pings;
 use slabcast_worker::Config;
 use std::fmt::Display;

@@ -255,7 +255,7 @@ pub(crate) fn orders(
         let pairs = tiles.iter().filter_map(|t| {
             let [x, y, edge] = [t.x, t.y, t.size].map(|n| n as i32);
             let rect =
-                Rect::new(x, y, x + edge, y + edge).intersect(&Rect::of_size(jobs[i].view.size));
+                Rect::new(x, y, x + edge, y + edge).intersect(&Rect::from_size(jobs[i].view.size));
             let known = trace.frames[i].region(&rect, trace.about.size)?;
             Some((t.est as f64, known.ns as f64))
         });

@@ -9,9 +9,9 @@ use super::measure::FINISH;
 use super::predict::{self, Question};
 use slabcast_client::{Client, Update};
 use slabcast_common::ids::FrameId;
-use slabcast_common::leaves::Finish;
-use slabcast_common::message::PathRequest;
+use slabcast_common::image::PixelEncoding;
 use slabcast_common::stats::FrameStats;
+use slabcast_scene::request::PathRequest;
 use slabcast_schedule::{FrameJob, Spans};
 use slabcast_session::fail::Fail;
 use slabcast_session::progress::Progress;
@@ -214,7 +214,7 @@ impl Stage<'_> {
         let requests: Vec<PathRequest> = (0..paths)
             .map(|_| {
                 // As a plain `render` asks.
-                let Finish { format, background } = FINISH;
+                let PixelEncoding { format, background } = FINISH;
                 let mut request = self.request.clone();
                 (request.hashed, request.background) = (false, background);
                 request.to_message(&served.info, format, false)

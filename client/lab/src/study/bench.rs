@@ -256,7 +256,7 @@ impl Bench<'_> {
             );
         }
         let q = &self.request.quality;
-        let [std, radius] = q.shape();
+        let [std, radius] = q.kernel_shape();
         Study {
             version: 1,
             slabcast: env!("CARGO_PKG_VERSION"),

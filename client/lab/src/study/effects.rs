@@ -65,7 +65,7 @@ fn boxes(bricks: &[Arc<Brick>], grid: &BrickGrid, edge: u32) -> Vec<(TightBox, u
 fn count(boxes: &[(TightBox, u64)], edge: u32, view: &View, frame: &FrameTrace) -> Bricks {
     let size = view.size;
     let seen: Vec<Option<Projected>> = boxes.iter().map(|b| view.project(&b.0)).collect();
-    let mut shut = ShutMap::open(Rect::of_size(size));
+    let mut shut = ShutMap::open(Rect::from_size(size));
     let mut needed = vec![false; boxes.len()];
     let mut looked_at = [0u64; 2];
     for slab in &frame.slabs {
@@ -107,7 +107,7 @@ fn count(boxes: &[(TightBox, u64)], edge: u32, view: &View, frame: &FrameTrace) 
 
 /// Bricks of 4, 8 and 16 in the middle view of a bed.
 pub(super) fn bricks(stage: &Stage, bed: &Bed) -> Vec<Bricks> {
-    let grid = BrickGrid::of(stage.spec(0).volume.lattice.dims);
+    let grid = BrickGrid::new(stage.spec(0).volume.lattice.dims);
     let i = bed.trace.frames.len() / 2;
     [4, 8, 16]
         .into_iter()
@@ -195,7 +195,7 @@ mod tests {
         let full = Brick::new(BrickId(0), (0..512).collect(), Samples::U8(vec![1; 512]), None);
         let one = Brick::new(BrickId(1), vec![9], Samples::U8(vec![1]), None);
         let bricks = [Arc::new(full), Arc::new(one)];
-        let grid = BrickGrid::of([16, 8, 8]);
+        let grid = BrickGrid::new([16, 8, 8]);
         let n = |edge| {
             let all = boxes(&bricks, &grid, edge);
             (all.len(), all.iter().map(|b| b.1).sum::<u64>())

@@ -66,7 +66,7 @@ fn tiles(bed: &Bed, told: &[Told], frame: usize) -> Vec<Tile> {
     let ms = |frame: usize, x: u32, y: u32| {
         let slab = bed.trace.frames.get(frame)?.slabs.first()?;
         let (x, y, edge) = (x as i32, y as i32, EDGE as i32);
-        let rect = Rect::new(x, y, x + edge, y + edge).intersect(&Rect::of_size(size));
+        let rect = Rect::new(x, y, x + edge, y + edge).intersect(&Rect::from_size(size));
         slab.tile(&rect, size).map(|t| t.ns as f64 / 1e6)
     };
     let (stats, spans) = &told[frame];

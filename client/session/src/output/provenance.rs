@@ -11,14 +11,14 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::image::Background;
-use slabcast_common::message::PathRequest;
-use slabcast_common::path::{Orientation, ViewPath};
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::stats::FrameStats;
 use slabcast_common::transfer::TransferFunction;
-use slabcast_common::tween::Tween;
 use slabcast_common::view::MAX_EDGE;
 use slabcast_common::volume::{Digest32, VolumeInfo};
+use slabcast_scene::path::{Orientation, ViewPath};
+use slabcast_scene::request::PathRequest;
+use slabcast_scene::tween::Tween;
 use std::path::Path;
 
 /// Largest picture that is read: one of 8192x8192 in floats that do not compress.
@@ -226,7 +226,7 @@ impl Recipe {
             k.front = k.front.or(front);
             k.up = k.up.or(Some(orientation.up));
             // Presets may get better; the picture stays.
-            Tween::fix(k, &info.summary).map_err(|e| request.blame(&e))?;
+            Tween::resolve_presets(k, &info.summary).map_err(|e| request.blame(&e))?;
         }
         if let Some(f) = &mut path.flythrough {
             f.up = f.up.or(Some(orientation.up.vector().to_array()));
@@ -260,7 +260,7 @@ impl Recipe {
     /// What made the frame of these statistics, alone.
     pub fn frame(&self, stats: &FrameStats) -> Provenance {
         let mut p = self.whole(stats.quality.sums);
-        p.path = p.path.only(stats.frame as usize);
+        p.path = p.path.single_frame(stats.frame as usize);
         p.view_sha256 = Some(stats.view_sha256.clone());
         p.pixels_sha256 = self.hash_inside.then(|| stats.pixels_sha256.clone());
         p

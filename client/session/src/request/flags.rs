@@ -11,13 +11,13 @@ use crate::transfer::{Transfer, TransferFlags, read_json};
 use crate::volume::InputArgs;
 use clap::builder::{PossibleValuesParser, TypedValueParser, ValueParser};
 use slabcast_common::image::Background;
-use slabcast_common::path::{
-    Axis, Crop, Key, KeyFrames, Orientation, ProjectionKind, Side, Turntable, ViewPath,
-};
 use slabcast_common::quality::{
     Borders, Compositing, Kernel, Quality, Schedule, Splat, Sums, Work,
 };
 use slabcast_common::volume::{Volume, VolumeInfo};
+use slabcast_scene::path::{
+    Axis, Crop, Key, KeyFrames, Orientation, ProjectionKind, Side, Turntable, ViewPath,
+};
 use std::path::{Path, PathBuf};
 
 /// Returns a parser of one word of a closed list into its value.
@@ -55,7 +55,7 @@ impl AxisArgs {
     /// # Errors
     /// The axes are parallel.
     pub fn for_volume(&self, volume: &Volume) -> Result<Orientation, Fail> {
-        Orientation::of(self.up, self.front, &volume.summary, volume.anatomical)
+        Orientation::for_volume(self.up, self.front, &volume.summary, volume.anatomical)
             .map_err(|e| Fail::flag(&e))
     }
 }
@@ -447,7 +447,7 @@ impl ViewArgs {
                 front: self.axes.front,
                 keys: vec![key],
             };
-            return Ok(ViewPath { keyframes: Some(one), ..ViewPath::of_views(size, Vec::new()) });
+            return Ok(ViewPath { keyframes: Some(one), ..ViewPath::from_views(size, Vec::new()) });
         }
         let (start, frames) = match (self.azimuth, self.frames) {
             (Some(azimuth), _) => (azimuth, Frames::Count(1)),
@@ -469,6 +469,6 @@ impl ViewArgs {
             up: self.axes.up,
             front: self.axes.front,
         };
-        Ok(ViewPath { range, ..ViewPath::turn(size, turntable) })
+        Ok(ViewPath { range, ..ViewPath::from_turntable(size, turntable) })
     }
 }

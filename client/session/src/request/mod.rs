@@ -17,13 +17,13 @@ use crate::fail::Fail;
 use crate::quality_target::QualityTarget;
 use crate::transfer::Transfer;
 use slabcast_common::image::{Background, PixelFormat};
-use slabcast_common::message::PathRequest;
-use slabcast_common::path::{Orientation, ViewPath};
-use slabcast_common::quality::{Quality, Refused, Work};
-use slabcast_common::tween::Tween;
+use slabcast_common::quality::{InvalidField, Quality, Work};
 use slabcast_common::view::View;
 use slabcast_common::volume::VolumeInfo;
-use slabcast_common::wanted::Wanted;
+use slabcast_scene::brick_needs::BrickNeeds;
+use slabcast_scene::path::{Orientation, ViewPath};
+use slabcast_scene::request::PathRequest;
+use slabcast_scene::tween::Tween;
 use std::path::PathBuf;
 
 /// A request as the command line or a picture gives it, before its volume is known.
@@ -102,7 +102,7 @@ impl RenderRequest {
         anatomical: bool,
     ) -> Result<(), Fail> {
         if let Some(axes) = &self.side {
-            let usual = Orientation::of(None, None, &info.summary, anatomical)
+            let usual = Orientation::for_volume(None, None, &info.summary, anatomical)
                 .map_err(|e| Fail::flag(&e))?;
             let given = axes.up.is_some() || axes.front.is_some();
             if anatomical && orientation != usual {
@@ -120,9 +120,10 @@ impl RenderRequest {
         }
         let function = self.transfer.function(info).map_err(|e| self.blame(&e))?;
         let blame = |e| self.blame(&e);
-        let tween = Tween::of(&self.path, &info.summary).map_err(blame)?;
+        let tween = Tween::from_path(&self.path, &info.summary).map_err(blame)?;
         let compositing = self.quality.compositing;
-        Wanted::of_path(&self.path, &function, tween.as_ref(), info, compositing).map_err(blame)?;
+        BrickNeeds::for_path(&self.path, &function, tween.as_ref(), info, compositing)
+            .map_err(blame)?;
         let cameras = self.path.prepare(&info.lattice, orientation).map_err(blame)?;
         for i in 0..self.path.frames() {
             let camera = cameras.camera(i).map_err(blame)?;
@@ -145,7 +146,7 @@ impl RenderRequest {
     }
 
     /// Returns a refusal that names where the user wrote what is refused: a flag, or a field of a file.
-    pub fn blame(&self, refused: &Refused) -> Fail {
+    pub fn blame(&self, refused: &InvalidField) -> Fail {
         const FLAGS: [&str; 24] = [
             "thickness",
             "eps",
@@ -218,7 +219,7 @@ impl RenderRequest {
             return Fail::field(file, "transfer function", refused);
         }
         if FLAGS.contains(&field) {
-            return Fail::flag(&Refused::new(field, &refused.problem));
+            return Fail::flag(&InvalidField::new(field, &refused.problem));
         }
         Fail::usage(refused.to_string())
     }

@@ -2,9 +2,9 @@
 
 use super::*;
 use clap::Parser;
-use slabcast_common::message::TransferChoice;
-use slabcast_common::path::{ProjectionKind, Turntable};
 use slabcast_common::volume::{Digest32, Volume};
+use slabcast_scene::path::{ProjectionKind, Turntable};
+use slabcast_scene::transfer::TransferChoice;
 
 #[derive(Parser)]
 struct Flags {
@@ -30,7 +30,7 @@ fn cube() -> VolumeInfo {
 #[test]
 fn no_flag_is_the_protocol_of_the_contract() {
     let a = asked("").unwrap();
-    assert_eq!(a.path, ViewPath::turn([512, 512], Turntable::default()));
+    assert_eq!(a.path, ViewPath::from_turntable([512, 512], Turntable::default()));
     assert_eq!((a.quality, a.work), (Quality::default(), Work::default()));
     let message = a.to_message(&cube(), PixelFormat::Rgb8, false);
     assert_eq!(message.transfer, TransferChoice::Name("auto".into()));

@@ -13,11 +13,11 @@ use crate::state::workers::Worker;
 use crate::{Micros, Span, Spans};
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::ids::WorkerId;
-use slabcast_common::message::{Counters, RegionCost, Sampling, TaskTimes};
+use slabcast_common::message::{Counters, ErrorsBySource, RegionCost, TaskTimes};
 use slabcast_common::quality::{Quality, Schedule};
 use slabcast_common::stats::{
-    BoundAndEstimate, BrickStats, EXTRAPOLATION, ErrorStats, Estimate, FrameMs, FrameStats,
-    PoisonedTile, SlabStats, VoxelStats, WorkerStats,
+    BoundAndEstimate, BrickStats, ErrorStats, Estimate, FrameMs, FrameStats, PoisonedTile,
+    SlabStats, THICKNESS_EXTRAPOLATION, VoxelStats, WorkerStats,
 };
 use std::sync::Arc;
 
@@ -57,7 +57,7 @@ pub(crate) struct Ledger {
     accounts: WorkerMap<Account>,
     pub(crate) counters: Counters,
     /// Error of sampled pixels.
-    sampled: Sampling,
+    sampled: ErrorsBySource,
     result_bytes: Option<u64>,
     pub(crate) slabs: Vec<SlabStats>,
     pub(crate) spans: Spans,
@@ -98,7 +98,7 @@ impl Ledger {
             composite_us: 0,
             accounts: WorkerMap::default(),
             counters: Counters::default(),
-            sampled: Sampling::default(),
+            sampled: ErrorsBySource::default(),
             result_bytes: None,
             slabs: Vec::new(),
             spans: Spans::with_capacity(SPANS_RESERVED),
@@ -280,7 +280,7 @@ impl Ledger {
             left_out: Vec::new(),
             error: ErrorStats {
                 thickness: Estimate {
-                    estimate: self.sampled.thickness.rmse().map(|e| e * EXTRAPOLATION),
+                    estimate: self.sampled.thickness.rmse().map(|e| e * THICKNESS_EXTRAPOLATION),
                 },
                 rounding: BoundAndEstimate {
                     estimate: self.sampled.positions.rmse(),

@@ -226,7 +226,7 @@ impl Frame {
                     let (grid, bricks) = (self.job.scene.volume.lattice.dims, &self.job.bricks);
                     let message = ToWorker::Directory {
                         set,
-                        grid: BrickGrid::of(grid),
+                        grid: BrickGrid::new(grid),
                         first: 0,
                         total: bricks.len() as u32,
                         bricks: bricks.clone(),
@@ -248,7 +248,7 @@ impl Frame {
                 tile,
                 slab: slab.sheets,
                 bricks: lent.bricks.iter().map(name).collect(),
-                state: self.state.tile(tile),
+                state: self.state.tile_state(tile),
             };
             cluster.send(id, ToWorker::Lease(Box::new(lease)));
         }

@@ -32,8 +32,8 @@ use crate::state::cluster::Cluster;
 use crate::state::frame::{Frame, Slab, check};
 use crate::state::task_queue::{End, Verdict};
 use slabcast_common::ids::{Epoch, WorkerId};
-use slabcast_common::leaves::LEAF;
-use slabcast_common::message::{HandedOver, ToWorker};
+use slabcast_common::image::LEAF_EDGE;
+use slabcast_common::message::{RegionSplit, ToWorker};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::parts;
 use std::collections::BTreeMap;
@@ -168,7 +168,7 @@ impl Frame {
         let Some(slab) = &self.slab else { return };
         for ((place, id, epoch), share) in questions {
             let (frame, task) = (self.job.frame, slab.queue.id(place));
-            cluster.send(id, ToWorker::HandOver { frame, task, epoch, share });
+            cluster.send(id, ToWorker::SplitRegion { frame, task, epoch, share });
         }
     }
 
@@ -259,7 +259,7 @@ impl Frame {
         &mut self,
         cluster: &mut Cluster,
         worker: WorkerId,
-        piece: HandedOver,
+        piece: RegionSplit,
         now: Micros,
     ) -> Result<(), String> {
         let Some(slab) = &mut self.slab else { return Ok(()) };
@@ -272,7 +272,7 @@ impl Frame {
         }
         let tile = slab.cut.tiles[place as usize].rect;
         check_pieces(tile, &piece)?;
-        let HandedOver { kept, given, begun, .. } = piece;
+        let RegionSplit { kept, given, begun, .. } = piece;
         if !slab.queue.is_only_lease(place, worker, lease.epoch) {
             // Somebody else was lent it as it was.
             slab.queue.release(place, worker, lease.epoch);
@@ -312,7 +312,7 @@ impl Frame {
         slab.cut.tiles[place as usize] = of(kept);
         let task = &mut slab.queue.tasks[place as usize];
         task.tile = of(kept);
-        task.begun = task.begun.as_ref().map(|begun| Arc::new(begun.piece(tile, kept)));
+        task.begun = task.begun.as_ref().map(|begun| Arc::new(begun.crop(tile, kept)));
         let at = slab.queue.add_piece(of(given), Arc::new(begun));
         slab.cut.add(vec![of(given)]);
         let root = slab.roots.get(&place).copied().unwrap_or(place);
@@ -403,7 +403,7 @@ fn far(a: &Rect, b: &Rect) -> i32 {
 }
 
 /// Whether what a stranger says are two pieces of a tile.
-fn check_pieces(tile: Rect, piece: &HandedOver) -> Result<(), String> {
+fn check_pieces(tile: Rect, piece: &RegionSplit) -> Result<(), String> {
     let (kept, given) = (piece.kept, piece.given);
     let whole = !kept.is_empty() && !given.is_empty() && kept.union(&given) == tile;
     if !whole || kept.area() + given.area() != tile.area() {
@@ -411,7 +411,7 @@ fn check_pieces(tile: Rect, piece: &HandedOver) -> Result<(), String> {
     }
     let lines = |r: &Rect| [r.x0, r.y0, r.x1, r.y1];
     let mut cuts = lines(&given).into_iter().zip(lines(&tile)).filter(|(at, end)| at != end);
-    if cuts.any(|(at, _)| at % LEAF as i32 != 0) {
+    if cuts.any(|(at, _)| at % LEAF_EDGE as i32 != 0) {
         return Err("it cut its tile through a leaf".into());
     }
     if piece.begun.sheets.len() != parts(given).count() {

@@ -294,7 +294,7 @@ fn list(
     is_shut: impl Fn(&Rect) -> bool,
 ) -> Cut {
     let edge = LEAF << level;
-    let picture = Rect::of_size(size);
+    let picture = Rect::from_size(size);
     let (mut empty, mut all_shut) = (0, 0);
     let mut tiles = Vec::new();
     for y in 0..grid.rows {
@@ -400,7 +400,7 @@ mod tests {
     #[test]
     fn workload_of_border_leaves_is_clipped_to_the_picture() {
         for size in [[64, 64], [70, 33], [16, 100], [17, 1]] {
-            let picture = Rect::of_size(size);
+            let picture = Rect::from_size(size);
             let through = Through::new(size, &[picture]);
             let [columns, rows] = size.map(|n| n.div_ceil(LEAF) as usize);
             assert_eq!(through.count(LEAF), columns * rows);
@@ -414,14 +414,14 @@ mod tests {
     use proptest::prelude::*;
 
     fn open(size: [u32; 2]) -> ShutMap {
-        ShutMap::open(Rect::of_size(size))
+        ShutMap::open(Rect::from_size(size))
     }
 
     #[test]
     fn cut_chooses_the_coarsest_level_with_more_tiles_than_wanted() {
         // 512x512, all covered: 4 tiles of 256, 16 of 128, 64 of 64, 256 of 32, 1024 of 16.
         let size = [512, 512];
-        let all = [Rect::of_size(size)];
+        let all = [Rect::from_size(size)];
         let edge = |wanted| cut(size, &all, &open(size), true, wanted, None).edge;
         assert_eq!(edge(0), 256);
         assert_eq!(edge(3), 256);
@@ -507,7 +507,7 @@ mod tests {
     #[test]
     fn cut_clips_border_tiles_and_sorts_by_workload() {
         let size = [40, 20];
-        let c = cut(size, &[Rect::of_size(size)], &open(size), true, 0, Some(16));
+        let c = cut(size, &[Rect::from_size(size)], &open(size), true, 0, Some(16));
         let got: Vec<_> = c.tiles.iter().map(|t| (t.rect.x0, t.rect.y0, t.est)).collect();
         let want =
             [(0, 0, 256), (16, 0, 256), (32, 0, 128), (0, 16, 64), (16, 16, 64), (32, 16, 32)];
@@ -520,7 +520,7 @@ mod tests {
         // A row of leaves in 8192 columns: nothing depends on the number of pixels a brick covers,
         // or on that of its tiles.
         let size = [8192, 64];
-        let all = vec![Rect::of_size(size); 20_000];
+        let all = vec![Rect::from_size(size); 20_000];
         let c = cut(size, &all, &open(size), true, 0, Some(16));
         assert_eq!(c.tiles.len(), 512 * 4);
         assert!(all.iter().all(|r| c.first_in(r) == Some(0)));
@@ -529,7 +529,7 @@ mod tests {
     #[test]
     fn region_cut_is_as_coarse_as_rendering_allows() {
         let size = [512, 512];
-        let all = [Rect::of_size(size)];
+        let all = [Rect::from_size(size)];
         let edge = |wanted, many| cut_through(size, &all, (wanted, many), None).edge;
         assert_eq!(edge(5, 32), 64);
         assert_eq!(edge(2, 3), 256, "few threads, few tiles");
@@ -591,7 +591,7 @@ mod tests {
                 let under = |b: &Rect| !b.intersect(r).is_empty();
                 rects.iter().any(under).then_some(r.area() as u64)
             };
-            let whole = Rect::of_size(size);
+            let whole = Rect::from_size(size);
             for y0 in (0..h).step_by(16) {
                 for x0 in (0..w).step_by(16) {
                     let r = Rect::new(x0, y0, x0 + 16, y0 + 16).intersect(&whole);

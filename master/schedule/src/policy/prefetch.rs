@@ -161,7 +161,7 @@ mod tests {
     use crate::policy::macrotile::cut_through;
     use crate::state::residency::Residency;
     use proptest::prelude::*;
-    use slabcast_common::brick::{BRICK, BrickInfo, BrickSetKey, TightBox};
+    use slabcast_common::brick::{BRICK_EDGE, BrickInfo, BrickSetKey, TightBox};
     use slabcast_common::ids::BrickId;
     use slabcast_common::quality::Quality;
     use slabcast_common::view::{Camera, CameraProjection, View};
@@ -175,8 +175,8 @@ mod tests {
     /// The bricks of a cube of 32 voxels.
     fn bricks() -> Arc<[BrickInfo]> {
         let brick = |i: u32| {
-            let lo = [i % 4, i / 4 % 4, i / 16].map(|x| x * BRICK);
-            let tight = TightBox { lo, hi: lo.map(|x| x + BRICK - 1) };
+            let lo = [i % 4, i / 4 % 4, i / 16].map(|x| x * BRICK_EDGE);
+            let tight = TightBox { lo, hi: lo.map(|x| x + BRICK_EDGE - 1) };
             BrickInfo { id: BrickId(i), tight, voxels: 512, bytes: 100 }
         };
         (0..64).map(brick).collect()
@@ -240,7 +240,7 @@ mod tests {
                 drawn.iter().for_each(|&place| last[place as usize] = Some(round));
             }
             r.open(KEY, &bricks, true);
-            let outline = |place: u32| view.outline(&bricks[place as usize].tight);
+            let outline = |place: u32| view.project_rect(&bricks[place as usize].tight);
             let rects: Vec<Rect> = (0..64).filter_map(outline).collect();
             let cut = cut_through(SIZE, &rects, (0, 0), Some(edge));
             let owner = |place: u32| WorkerId(owners[place as usize % owners.len()]);
@@ -257,8 +257,8 @@ mod tests {
             let lately = (0..64).filter(|p| last[*p as usize].is_some_and(|round| round >= first));
             let by_hand: Lists = lately.flat_map(owes).collect();
             for shift in [3, 4, 5] {
-                let blocks = Blocks::of(&bricks, shift, 64);
-                let lies = |b: &slabcast_common::blocks::Block| view.outline(&b.tight).unwrap_or_default();
+                let blocks = Blocks::new(&bricks, shift, 64);
+                let lies = |b: &slabcast_common::blocks::Block| view.project_rect(&b.tight).unwrap_or_default();
                 let outlines: Vec<Rect> = blocks.all().iter().map(lies).collect();
                 let lists = grid.lacked(&presence, (&blocks, &outlines), outline);
                 prop_assert_eq!(&flat(lists), &by_hand, "blocks of 2^{}", shift);

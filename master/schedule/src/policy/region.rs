@@ -231,7 +231,7 @@ impl CostHistory {
     /// Boxes around neighbouring bricks, together around all: where anything may be seen.
     fn blocks(&mut self, key: BrickSetKey, bricks: &[BrickInfo]) -> &[Block] {
         if self.blocks.as_ref().is_none_or(|(k, _)| *k != key) {
-            self.blocks = Some((key, Blocks::of(bricks, SMALLEST, BLOCKS)));
+            self.blocks = Some((key, Blocks::new(bricks, SMALLEST, BLOCKS)));
         }
         self.blocks.as_ref().map_or(&[], |(_, blocks)| blocks.all())
     }
@@ -525,7 +525,7 @@ fn whole_of(tile: &Rect, size: [u32; 2]) -> Rect {
     let edge = PLAIN as i32;
     let corner = |at: i32| at / edge * edge;
     let (x0, y0) = (corner(tile.x0), corner(tile.y0));
-    Rect::new(x0, y0, x0 + edge, y0 + edge).intersect(&Rect::of_size(size))
+    Rect::new(x0, y0, x0 + edge, y0 + edge).intersect(&Rect::from_size(size))
 }
 
 /// The parts that a tile is cut into, of half of [`PLAIN`]; at the picture's border there may be
@@ -595,7 +595,7 @@ impl Regions {
         history.frames += 1;
         let frame = history.frames;
         let blocks = history.blocks(key, &job.bricks);
-        let outline = |b: &Block| job.view.outline(&b.tight).unwrap_or_default();
+        let outline = |b: &Block| job.view.project_rect(&b.tight).unwrap_or_default();
         let outlines: Vec<Rect> = blocks.iter().map(outline).collect();
         let rects: Vec<Rect> = outlines.iter().filter(|r| !r.is_empty()).copied().collect();
         let through = Through::new(size, &rects);

@@ -74,7 +74,7 @@ fn hidden_from(
     let leaf = LEAF as i32;
     let across = size[0].div_ceil(LEAF) as usize;
     let mut front = vec![i32::MAX; across * size[1].div_ceil(LEAF) as usize];
-    let whole = Rect::of_size(size);
+    let whole = Rect::from_size(size);
     let leaves = |p: &Projected| {
         let r = p.rect.intersect(&whole);
         let (y0, y1) = (r.y0.max(0) / leaf, (r.y1 - 1).max(-1));

@@ -33,8 +33,7 @@ use crate::state::task_queue::{End, NAMES_PER_TILE, TaskQueue, Verdict};
 use crate::state::worker_map::WorkerMap;
 use crate::{Action, Clock, FrameJob, Micros, Span};
 use slabcast_common::ids::{Epoch, TaskId, WorkerId};
-use slabcast_common::image::{FrameState, TilePixels};
-use slabcast_common::leaves::{Finish, Leaves};
+use slabcast_common::image::{FrameState, PixelEncoding, SparseTile, TilePixels};
 use slabcast_common::message::{Pixels, RegionCost, TileResult, ToWorker};
 use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::quality::Schedule;
@@ -214,7 +213,7 @@ impl Frame {
             at: 0,
             state: FrameState::new(view.size),
             // Regions shut their pixels at the workers.
-            shut: ShutMap::open(Rect::of_size(if by_region { [0; 2] } else { view.size })),
+            shut: ShutMap::open(Rect::from_size(if by_region { [0; 2] } else { view.size })),
             slab: None,
             ended: None,
             first_task: TaskId(cluster.next_task),
@@ -548,13 +547,13 @@ impl Frame {
 
         match result.pixels {
             Pixels::Finished(leaves) => {
-                self.state.lay_finished(tile, leaves);
-                if self.state.finished().len() >= LAID_TOGETHER {
-                    let (frame, tiles) = (self.job.frame, self.state.take_finished());
+                self.state.place_encoded(tile, leaves);
+                if self.state.encoded_tiles().len() >= LAID_TOGETHER {
+                    let (frame, tiles) = (self.job.frame, self.state.take_encoded());
                     cluster.out.push_back(Action::Finished { frame, tiles });
                 }
             }
-            Pixels::Sums(sums) if slab.regions.is_some() => self.state.lay(tile, sums),
+            Pixels::Sums(sums) if slab.regions.is_some() => self.state.place_sums(tile, sums),
             Pixels::Sums(sums) => {
                 let width = self.job.view.size[0] as usize;
                 let eps = self.job.scene.quality.eps;
@@ -566,7 +565,7 @@ impl Frame {
                         }
                     }
                 }
-                self.state.put(tile, &sums);
+                self.state.add_slab_tile(tile, &sums);
             }
         }
         self.any_result = true;
@@ -870,13 +869,13 @@ pub(crate) fn carry(
 
 /// Where each brick lies in a frame's picture.
 fn outline(job: &FrameJob) -> impl Fn(u32) -> Option<Rect> {
-    |place| job.view.outline(&job.bricks[place as usize].tight)
+    |place| job.view.project_rect(&job.bricks[place as usize].tight)
 }
 
 /// Whether what a stranger says of a region can be counted.
 fn check_cost(cost: Option<&RegionCost>, tile: Rect, bricks: usize) -> Result<(), String> {
     let sampled =
-        cost.map_or(0, |c| c.sampled.each().map(|s| s.pixels).into_iter().max().unwrap_or(0));
+        cost.map_or(0, |c| c.sampled.to_array().map(|s| s.pixels).into_iter().max().unwrap_or(0));
     if sampled as usize > tile.area() {
         let (n, area) = (sampled, tile.area());
         return Err(format!("a result sampled {n} pixels of a tile of {area}"));
@@ -896,12 +895,16 @@ fn note_needed(ever: &mut [bool], needed: &mut (u64, u64), job: &FrameJob, place
 }
 
 /// What the results of a frame's tasks are finished to.
-pub(crate) fn finish_of(job: &FrameJob) -> Option<Finish> {
+pub(crate) fn finish_of(job: &FrameJob) -> Option<PixelEncoding> {
     job.finish.filter(|_| goes_by_region(job))
 }
 
 /// Whether a stranger's finished pixels are those of a tile.
-fn check_leaves(tile: Rect, leaves: &Leaves, finish: Option<Finish>) -> Result<(), String> {
+fn check_leaves(
+    tile: Rect,
+    leaves: &SparseTile,
+    finish: Option<PixelEncoding>,
+) -> Result<(), String> {
     let Some(finish) = finish else {
         return Err("a result is finished where sums were asked for".into());
     };
@@ -921,7 +924,11 @@ fn check_leaves(tile: Rect, leaves: &Leaves, finish: Option<Finish>) -> Result<(
 }
 
 /// Whether a stranger's pixels are those of a tile.
-pub(crate) fn check(tile: Rect, pixels: &TilePixels, finish: Option<Finish>) -> Result<(), String> {
+pub(crate) fn check(
+    tile: Rect,
+    pixels: &TilePixels,
+    finish: Option<PixelEncoding>,
+) -> Result<(), String> {
     if finish.is_some() {
         return Err("a result has sums where finished pixels were asked for".into());
     }

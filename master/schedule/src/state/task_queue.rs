@@ -19,7 +19,7 @@
 use crate::policy::macrotile::Macrotile;
 use crate::{Config, Micros};
 use slabcast_common::ids::{Epoch, TaskId, WorkerId};
-use slabcast_common::message::Begun;
+use slabcast_common::message::Checkpoint;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -60,7 +60,7 @@ pub(crate) struct Task {
     /// Workers that refused it: id, name and reason.
     pub(crate) failed: Vec<(WorkerId, String, String)>,
     /// State in which another worker gave the piece away; `None`: it starts from nothing.
-    pub(crate) begun: Option<Arc<Begun>>,
+    pub(crate) begun: Option<Arc<Checkpoint>>,
 }
 
 /// Limit: task ids, and keys in the queue's order, reserved for a tile and its parts.
@@ -174,7 +174,7 @@ impl TaskQueue {
     }
 
     /// Queues a piece of a tile in front of all. Returns its index. The caller reserves its id.
-    pub(crate) fn add_piece(&mut self, piece: Macrotile, begun: Arc<Begun>) -> u32 {
+    pub(crate) fn add_piece(&mut self, piece: Macrotile, begun: Arc<Checkpoint>) -> u32 {
         let place = self.tasks.len() as u32;
         let mut task = Task::new(piece, self.front);
         task.begun = Some(begun);

@@ -84,7 +84,7 @@ mod tests {
             let size = [size.0, size.1];
             let (mut map, mut tree) = (TileMap::new(size), BTreeMap::new());
             let sides = |r: &Rect| [r.x0, r.y0, r.x1, r.y1];
-            let cut = |level| cut_through(size, &[Rect::of_size(size)], (1, 1), Some(LEAF << level));
+            let cut = |level| cut_through(size, &[Rect::from_size(size)], (1, 1), Some(LEAF << level));
             for (level, which, value) in deeds {
                 let cut = cut(level);
                 let tile = which.get(&cut.tiles).rect;

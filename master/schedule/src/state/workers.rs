@@ -19,7 +19,7 @@ use crate::state::worker_map::WorkerMap;
 use crate::{Config, Micros};
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, SceneId, WorkerId};
-use slabcast_common::message::DIRECTORIES;
+use slabcast_common::message::DIRECTORIES_KEPT;
 use slabcast_common::protocol::MAX_THREADS;
 use std::cmp::Reverse;
 use std::collections::{BTreeSet, VecDeque};
@@ -77,7 +77,7 @@ impl Worker {
             return false;
         }
         self.directories.push_back(set);
-        if self.directories.len() > DIRECTORIES {
+        if self.directories.len() > DIRECTORIES_KEPT {
             self.directories.pop_front();
         }
         true

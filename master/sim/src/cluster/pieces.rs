@@ -3,9 +3,9 @@
 use super::{Lent, Nanos, SMALL, Task, World};
 use slabcast_common::ids::{Epoch, FrameId, TaskId, WorkerId};
 use slabcast_common::image::TilePixels;
-use slabcast_common::message::{Begun, HandedOver};
+use slabcast_common::message::{Checkpoint, RegionSplit};
 use slabcast_common::occlusion::Rect;
-use slabcast_common::region::{cut, parts, square_of};
+use slabcast_common::region::{enclosing_square, parts, split_tile};
 use slabcast_schedule::{Event, FrameJob};
 use slabcast_trace::{RegionProgress, RegionTile, Trace};
 use std::borrow::Cow;
@@ -44,7 +44,7 @@ impl<'a> World<'a> {
         let over = |p: &u32| sees(*p).is_some_and(|p| !p.rect.intersect(&tile).is_empty());
         let mut all = RegionTile { x: tile.x0 as u32, y: tile.y0 as u32, ..RegionTile::default() };
         for part in parts(tile) {
-            let whole = traced.region(&square_of(&part, size), size)?;
+            let whole = traced.region(&enclosing_square(&part, size), size)?;
             all.touched.extend(whole.touched.iter().copied().filter(over));
             all.opened.extend_from_slice(&whole.opened);
             all.expected.extend(whole.expected.iter().copied().filter(over));
@@ -85,7 +85,7 @@ impl<'a> World<'a> {
             return;
         }
         let (frame, tile) = (lease.frame, lease.tile);
-        let Some((kept, given)) = cut(tile, share, |piece| course.left_in_ns(piece)) else {
+        let Some((kept, given)) = split_tile(tile, share, |piece| course.left_in_ns(piece)) else {
             return;
         };
         let job: &'a FrameJob = {
@@ -107,7 +107,7 @@ impl<'a> World<'a> {
         // Of one that nothing was drawn into there are no sums.
         let last = (left < all).then(|| vec![[0; 4]; n]);
         let pixels = TilePixels { a: vec![0.0; n], colour: vec![[0; 3]; n], last };
-        let begun = Begun { sheets: piece.next_sheets(given, &sees), pixels };
+        let begun = Checkpoint { sheets: piece.next_sheets(given, &sees), pixels };
         if let Some(thread) = thread {
             self.goes_until(id, thread);
         }
@@ -115,7 +115,7 @@ impl<'a> World<'a> {
         self.outcome.frames[frame.0 as usize - 1].handed_over += 1;
         self.pieces.insert((frame, corners(&given)), piece);
         let bytes = state_bytes(&begun.pixels);
-        let piece = Box::new(HandedOver { task, epoch, kept, given, begun });
+        let piece = Box::new(RegionSplit { task, epoch, kept, given, begun });
         self.up(id, Event::HandedOver { worker: id, piece }, bytes, at);
     }
 }

@@ -3,17 +3,18 @@
 //! the last one stopped, and nothing is drawn where no brick is or where a pixel is shut.
 
 use crate::rng::Rng;
-use slabcast_common::brick::{BRICK, BrickGrid, BrickInfo, BrickSetKey, TightBox};
+use slabcast_common::brick::{BRICK_EDGE, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId};
-use slabcast_common::image::{Background, FrameState, Picture, PixelFormat, TilePixels, TileState};
-use slabcast_common::leaves::Finish;
+use slabcast_common::image::{
+    Background, FrameState, Picture, PixelEncoding, PixelFormat, TilePixels, TileState,
+};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::presets;
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Camera, CameraProjection, Projected, View};
 use slabcast_common::volume::{Digest32, Volume};
+use slabcast_scene::presets;
 use slabcast_schedule::{FrameJob, is_shut};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -24,7 +25,7 @@ pub(crate) fn key(n: u8) -> BrickSetKey {
 
 /// A volume of `dims` in which about `fill` of 8 bricks are relevant.
 pub(crate) fn bricks(rng: &mut Rng, dims: [u32; 3], fill: u64) -> Arc<[BrickInfo]> {
-    let grid = BrickGrid::of(dims);
+    let grid = BrickGrid::new(dims);
     let mut bricks = Vec::new();
     for id in (0..grid.len() as u32).map(BrickId) {
         if rng.below(8) >= fill {
@@ -32,7 +33,7 @@ pub(crate) fn bricks(rng: &mut Rng, dims: [u32; 3], fill: u64) -> Arc<[BrickInfo
         }
         let corner = grid.corner(id);
         let lo: [u32; 3] = std::array::from_fn(|a| corner[a] + rng.below(3) as u32);
-        let hi = std::array::from_fn(|a| (corner[a] + BRICK - 1).min(dims[a] - 1).max(lo[a]));
+        let hi = std::array::from_fn(|a| (corner[a] + BRICK_EDGE - 1).min(dims[a] - 1).max(lo[a]));
         let voxels = 1 + rng.below(512) as u16;
         let tight = TightBox { lo, hi };
         bricks.push(BrickInfo { id, tight, voxels, bytes: 11 + 3 * u32::from(voxels) });
@@ -78,7 +79,7 @@ pub(crate) fn job(
     // Nobody's dice: seeds stay the stories that they were.
     let finish = [None, Some(PixelFormat::Rgb8), None, Some(PixelFormat::Rgba32F)]
         [(frame % 4) as usize]
-        .map(|format| Finish { format, background: Background::Colour([0.1, 0.7, 0.4]) });
+        .map(|format| PixelEncoding { format, background: Background::Colour([0.1, 0.7, 0.4]) });
     Box::new(FrameJob { frame: FrameId(frame), number: frame, scene, bricks, view, work, finish })
 }
 
@@ -149,9 +150,9 @@ pub(crate) fn serial(job: &FrameJob) -> Picture {
     let p = projections(job);
     let sheets = p.values().fold(SheetRange::default(), |all, p| all.union(p.sheets));
     let all: Vec<_> = job.bricks.iter().map(|b| b.id).collect();
-    let whole = Rect::of_size(job.view.size);
+    let whole = Rect::from_size(job.view.size);
     let mut state = FrameState::new(job.view.size);
-    let pixels = render(&p, &job.scene.quality, whole, sheets, &all, &state.tile(whole));
-    state.put(whole, &pixels);
-    state.finish()
+    let pixels = render(&p, &job.scene.quality, whole, sheets, &all, &state.tile_state(whole));
+    state.add_slab_tile(whole, &pixels);
+    state.to_picture()
 }

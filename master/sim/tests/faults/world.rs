@@ -6,16 +6,14 @@ use crate::fake;
 use crate::rng::Rng;
 use slabcast_common::brick::{BrickGrid, BrickInfo, BrickSetKey};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, SceneId, TaskId, WorkerId};
-use slabcast_common::image::Picture;
-use slabcast_common::image::{TilePixels, TileState};
-use slabcast_common::leaves::{Leaves, Mosaic};
+use slabcast_common::image::{FrameAssembler, Picture, SparseTile, TilePixels, TileState};
 use slabcast_common::message::{
-    Begun, Counters, DIRECTORIES, HandedOver, Lease, Pixels, RegionCost, RegionLease, TaskTimes,
-    TileResult, ToWorker,
+    Checkpoint, Counters, DIRECTORIES_KEPT, Lease, Pixels, RegionCost, RegionLease, RegionSplit,
+    TaskTimes, TileResult, ToWorker,
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Schedule;
-use slabcast_common::region::{cut, parts};
+use slabcast_common::region::{parts, split_tile};
 use slabcast_common::slab::SheetRange;
 use slabcast_common::stats::FrameStats;
 use slabcast_common::view::Projected;
@@ -217,7 +215,7 @@ pub(crate) struct World {
     jobs: BTreeMap<FrameId, Known>,
     cancelled: BTreeSet<FrameId>,
     /// Of frames whose tiles come finished, as far as they have come.
-    pictures: BTreeMap<FrameId, Mosaic>,
+    pictures: BTreeMap<FrameId, FrameAssembler>,
     pub(crate) done: BTreeMap<FrameId, Done>,
     pub(crate) failed: BTreeMap<FrameId, String>,
     pub(crate) drops: Vec<(WorkerId, String)>,
@@ -436,10 +434,10 @@ impl World {
                         assert_eq!((*first, *total as usize), (0, bricks.len()), "seed {seed}");
                         assert_eq!(*bricks, known.bricks, "seed {seed}");
                         let dims = known.scene.volume.lattice.dims;
-                        assert_eq!(*grid, BrickGrid::of(dims), "seed {seed}");
+                        assert_eq!(*grid, BrickGrid::new(dims), "seed {seed}");
                         assert!(!w.directories.contains(set), "seed {seed}: directory twice");
                         w.directories.push(*set);
-                        if w.directories.len() > DIRECTORIES {
+                        if w.directories.len() > DIRECTORIES_KEPT {
                             w.directories.remove(0);
                         }
                     }
@@ -455,7 +453,7 @@ impl World {
                         assert_eq!(same, 1, "seed {seed}: {} twice to {id}", lease.task);
                         self.leases_given += 1;
                     }
-                    ToWorker::HandOver { frame, task, epoch, share } => {
+                    ToWorker::SplitRegion { frame, task, epoch, share } => {
                         assert!(w.frames.contains(frame), "seed {seed}: a piece before its frame");
                         let there = w.outstanding.contains_key(&(*task, *epoch));
                         assert!(there, "seed {seed}: {id} is asked for a piece of nothing");
@@ -517,8 +515,8 @@ impl World {
             Action::Finished { frame, tiles } => {
                 let job = &self.jobs[&frame].job;
                 let finish = job.finish.expect("its tiles come finished");
-                let begun = || Mosaic::new(job.view.size, &finish);
-                self.pictures.entry(frame).or_insert_with(begun).lay(&tiles);
+                let begun = || FrameAssembler::new(job.view.size, &finish);
+                self.pictures.entry(frame).or_insert_with(begun).place(&tiles);
             }
             Action::FrameDone { frame, state, stats, spans } => {
                 self.note("done", frame.0, 0);
@@ -526,10 +524,10 @@ impl World {
                 let finish = self.jobs[&frame].job.finish;
                 let begun = self.pictures.remove(&frame);
                 let bytes = finish.map(|finish| match begun {
-                    Some(begun) => state.encode_on(begun).bytes,
+                    Some(begun) => state.encode_onto(begun).bytes,
                     None => state.encode(&finish, false).bytes,
                 });
-                let picture = finish.is_none().then(|| state.finish());
+                let picture = finish.is_none().then(|| state.to_picture());
                 let (at, stats) = (self.now(), *stats);
                 let before = self
                     .done
@@ -663,7 +661,7 @@ impl World {
                         w.leases.push((Loan::Region(lease, going), now));
                         self.begin(id);
                     }
-                    ToWorker::HandOver { task, epoch, share, .. } => {
+                    ToWorker::SplitRegion { task, epoch, share, .. } => {
                         self.hand_over(id, (task, epoch), f64::from(share) / 1000.0);
                     }
                     ToWorker::EndFrame { frame } => w.leases.retain(|(l, _)| l.frame() != frame),
@@ -784,7 +782,7 @@ impl World {
         };
         let known = &self.jobs[&lease.frame];
         let tile = lease.tile;
-        let Some((kept, given)) = cut(tile, share, |r| r.area() as f64) else { return };
+        let Some((kept, given)) = split_tile(tile, share, |r| r.area() as f64) else { return };
         if let Some(since) = since {
             // As far as it has come by now, of what it was to draw from where it was begun last.
             let until = going.drawn.as_ref().map_or(0, |d| d.0);
@@ -803,15 +801,15 @@ impl World {
         };
         let whole = going.drawn.as_ref().map_or_else(blank, |d| d.1.clone());
         let sheets = parts(given).map(|_| Some(at)).collect();
-        let begun = Begun { sheets, pixels: whole.piece(tile, given) };
-        going.drawn = going.drawn.is_some().then(|| (at, whole.piece(tile, kept)));
+        let begun = Checkpoint { sheets, pixels: whole.crop(tile, given) };
+        going.drawn = going.drawn.is_some().then(|| (at, whole.crop(tile, kept)));
         lease.tile = kept;
         if since.is_some() {
             going.before = going.drawn.clone();
             going.advance_to(known, kept, &w.present, i32::MAX);
         }
         let (task, epoch) = name;
-        let mut piece = Box::new(HandedOver { task, epoch, kept, given, begun });
+        let mut piece = Box::new(RegionSplit { task, epoch, kept, given, begun });
         if lies {
             match self.rng.below(5) {
                 0 => piece.begun.pixels.a.truncate(3),
@@ -878,9 +876,9 @@ impl World {
             Some(finish) if pixels.a.len() == pixels.colour.len() && pixels.last.is_none() => {
                 let tile = r.loan.tile();
                 let size = [tile.width() as u32, tile.height() as u32];
-                let mut leaves = Leaves::of(&pixels, size, &finish);
+                let mut leaves = SparseTile::encode(&pixels, size, &finish);
                 if pixels.a[0].is_nan() {
-                    leaves.alpha_most = f32::NAN;
+                    leaves.max_alpha = f32::NAN;
                 }
                 Pixels::Finished(leaves)
             }

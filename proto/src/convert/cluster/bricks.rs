@@ -186,7 +186,7 @@ pub fn bricks_from_wire(message: wire::BricksResponse) -> Result<Bricks, WireErr
                 let wrong =
                     |problem: &str| Err(WireError::value(format!("batch.bricks[{i}]"), problem));
                 let decoded = Brick::decode(bytes);
-                let name = decoded.as_ref().map_or_else(|_| Brick::name(bytes), |b| Some(b.id));
+                let name = decoded.as_ref().map_or_else(|_| Brick::peek_id(bytes), |b| Some(b.id));
                 match (name, decoded) {
                     (None, _) => return wrong("is too short to have an id"),
                     (Some(id), _) if u64::from(id.0) >= MAX_BRICKS => {

@@ -4,7 +4,7 @@ use super::bricks::{ascending_from_wire, brick_ids_to_wire, key_from_wire, key_t
 use super::wire;
 use crate::convert::WireError;
 use slabcast_common::brick::{
-    BRICK, BRICK_VOXELS, BrickGrid, BrickInfo, BrickSetKey, MAX_BRICKS, TightBox,
+    BRICK_EDGE, BRICK_VOXELS, BrickGrid, BrickInfo, BrickSetKey, MAX_BRICKS, TightBox,
 };
 use slabcast_common::ids::BrickId;
 use slabcast_common::message::ToWorker;
@@ -27,7 +27,7 @@ pub(super) fn to_wire(
 ) -> Vec<wire::ControlResponse> {
     let word = |b: &BrickInfo| {
         let local =
-            |place: [u32; 3]| place.iter().rev().fold(0, |word, x| (word << 3) | (x % BRICK));
+            |place: [u32; 3]| place.iter().rev().fold(0, |word, x| (word << 3) | (x % BRICK_EDGE));
         local(b.tight.lo) | local(b.tight.hi) << 9 | (u32::from(b.voxels) - 1) << 18
     };
     let part = |(i, bricks): (usize, &[BrickInfo])| {

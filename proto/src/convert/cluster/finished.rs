@@ -9,7 +9,7 @@ use super::shared::{format_from_wire, format_to_wire};
 use super::wire;
 use crate::convert::{MAX_TILE_PIXELS, WireError};
 use lz4_flex::block;
-use slabcast_common::leaves::Leaves;
+use slabcast_common::image::SparseTile;
 
 /// Compression of finished pixels on their way to the master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -20,7 +20,7 @@ pub enum Compression {
     Lz4,
 }
 
-pub(super) fn to_wire(leaves: &Leaves, compression: Compression) -> wire::FinishedPixels {
+pub(super) fn to_wire(leaves: &SparseTile, compression: Compression) -> wire::FinishedPixels {
     let packed = (compression == Compression::Lz4).then(|| block::compress(&leaves.data));
     let packed = packed.filter(|packed| packed.len() < leaves.data.len());
     let written = match packed {
@@ -34,11 +34,11 @@ pub(super) fn to_wire(leaves: &Leaves, compression: Compression) -> wire::Finish
         blocks: leaves.mask.clone().into(),
         data: packed.unwrap_or_else(|| leaves.data.clone()).into(),
         compression: written as i32,
-        max_opacity: leaves.alpha_most,
+        max_opacity: leaves.max_alpha,
     }
 }
 
-pub(super) fn from_wire(pixels: wire::FinishedPixels) -> Result<Leaves, WireError> {
+pub(super) fn from_wire(pixels: wire::FinishedPixels) -> Result<SparseTile, WireError> {
     let wire::FinishedPixels { width, height, format, blocks, data, compression, max_opacity } =
         pixels;
     let n = u64::from(width) * u64::from(height);
@@ -48,12 +48,12 @@ pub(super) fn from_wire(pixels: wire::FinishedPixels) -> Result<Leaves, WireErro
     }
     let size = [width, height];
     let format = format_from_wire("format", format)?;
-    let mask_len = Leaves::mask_len(size);
+    let mask_len = SparseTile::mask_len(size);
     if blocks.len() != mask_len {
         return Err(WireError::length("blocks", blocks.len(), mask_len));
     }
     // At most 16 bytes a pixel, whatever the compressed bytes say.
-    let len = Leaves::data_len(size, format, &blocks);
+    let len = SparseTile::data_len(size, format, &blocks);
     let data = match wire::Compression::try_from(compression) {
         Ok(wire::Compression::Lz4) => decompress(&data, len)?,
         Ok(wire::Compression::Unspecified | wire::Compression::None) if data.len() == len => {
@@ -62,7 +62,7 @@ pub(super) fn from_wire(pixels: wire::FinishedPixels) -> Result<Leaves, WireErro
         Ok(_) => return Err(WireError::length("data", data.len(), len)),
         Err(_) => return Err(WireError::unknown("compression", compression)),
     };
-    let leaves = Leaves { size, format, mask: blocks.to_vec(), data, alpha_most: max_opacity };
+    let leaves = SparseTile { size, format, mask: blocks.to_vec(), data, max_alpha: max_opacity };
     match leaves.check() {
         Ok(()) => Ok(leaves),
         Err(problem) => Err(WireError::value("blocks", problem)),
@@ -92,8 +92,8 @@ mod tests {
     }
 
     /// All blocks of a tile of 40x20, of bytes that repeat after `period`.
-    fn tile(format: PixelFormat, period: usize) -> Leaves {
-        let mut leaves = Leaves::blank([40, 20], format);
+    fn tile(format: PixelFormat, period: usize) -> SparseTile {
+        let mut leaves = SparseTile::blank([40, 20], format);
         leaves.mask = vec![0b11_1111];
         let mut x = 1u32;
         let mut noise = || {
@@ -101,9 +101,9 @@ mod tests {
             (x >> 24) as u8
         };
         let pattern: Vec<u8> = (0..period).map(|_| noise()).collect();
-        let len = Leaves::data_len(leaves.size, format, &leaves.mask);
+        let len = SparseTile::data_len(leaves.size, format, &leaves.mask);
         leaves.data = pattern.into_iter().cycle().take(len).collect();
-        leaves.alpha_most = 0.5;
+        leaves.max_alpha = 0.5;
         leaves
     }
 
@@ -122,7 +122,7 @@ mod tests {
                 assert!(!is_lz4(&plain) && plain.data == tile.data);
                 assert_eq!(from_wire(plain), Ok(tile));
             }
-            let blank = Leaves::blank([256, 256], format);
+            let blank = SparseTile::blank([256, 256], format);
             let message = to_wire(&blank, Compression::Lz4);
             assert!(message.data.is_empty() && !is_lz4(&message));
             assert_eq!(from_wire(message), Ok(blank));

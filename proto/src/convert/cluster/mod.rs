@@ -83,7 +83,7 @@ pub fn from_worker_to_wire_as(message: &ToMaster, compress: Compression) -> wire
             set: key_to_wire(set),
             bricks: Some(brick_ids_to_wire(bricks)),
         }),
-        ToMaster::HandedOver(split) => Message::RegionSplit(task::split_to_wire(split)),
+        ToMaster::RegionSplit(split) => Message::RegionSplit(task::split_to_wire(split)),
         ToMaster::Pong { nonce, clock_us } => {
             Message::Pong(wire::Pong { nonce: *nonce, clock_us: *clock_us })
         }
@@ -129,7 +129,7 @@ pub fn from_worker_from_wire(message: wire::ControlRequest) -> Result<ToMaster, 
             set: key_from_wire("bricks_evicted.set", &evicted.set)?,
             bricks: brick_ids_from_wire("bricks_evicted.bricks", evicted.bricks)?,
         },
-        Message::RegionSplit(split) => ToMaster::HandedOver(Box::new(
+        Message::RegionSplit(split) => ToMaster::RegionSplit(Box::new(
             task::split_from_wire(split).map_err(|e| e.within("region_split"))?,
         )),
         Message::Pong(pong) => ToMaster::Pong { nonce: pong.nonce, clock_us: pong.clock_us },
@@ -170,7 +170,7 @@ pub fn to_worker_to_wire(message: &ToWorker, session: u64) -> Down {
         }
         ToWorker::Lease(lease) => Message::Lease(task::lease_to_wire(lease)),
         ToWorker::Region(lease) => Message::Region(task::region_to_wire(lease)),
-        ToWorker::HandOver { frame, task, epoch, share } => {
+        ToWorker::SplitRegion { frame, task, epoch, share } => {
             Message::SplitRegion(wire::SplitRegion {
                 frame: frame.0,
                 task: task.0,
@@ -227,7 +227,7 @@ pub fn to_worker_from_wire(
                 let field = "split_region.share_permille";
                 return Err(WireError::value(field, format!("{share}; give 1 to 999")));
             }
-            ToWorker::HandOver {
+            ToWorker::SplitRegion {
                 frame: FrameId(split.frame),
                 task: TaskId(split.task),
                 epoch: Epoch(split.epoch),

@@ -13,8 +13,8 @@ use crate::convert::numbers::{
 use bytes::Bytes;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::{FrameId, SceneId};
+use slabcast_common::image::PixelEncoding;
 use slabcast_common::kernel::Lean;
-use slabcast_common::leaves::Finish;
 use slabcast_common::message::{SceneSpec, ToWorker};
 use slabcast_common::quality::Sums;
 use slabcast_common::view::{Projection, View};
@@ -98,7 +98,7 @@ pub fn scene_from_wire(scene: wire::Scene) -> Result<SceneSpec, WireError> {
 pub(super) fn frame_to_wire(
     (frame, scene): (FrameId, SceneId),
     view: &View,
-    finish: Option<&Finish>,
+    finish: Option<&PixelEncoding>,
     uncompressed: bool,
 ) -> wire::Frame {
     let compression =
@@ -117,7 +117,7 @@ pub(super) fn frame_to_wire(
 
 pub(super) fn frame_from_wire(frame: wire::Frame) -> Result<ToWorker, WireError> {
     let finish = |finish: wire::Finish| {
-        Ok::<_, WireError>(Finish {
+        Ok::<_, WireError>(PixelEncoding {
             format: format_from_wire("format", finish.format)?,
             background: background_from_wire(required("background", finish.background)?)?,
         })

@@ -7,8 +7,8 @@ use crate::convert::{MAX_BRICK_LIST, MAX_TILE_PIXELS, WireError};
 use slabcast_common::ids::{BrickId, Epoch, FrameId, TaskId};
 use slabcast_common::image::{RawSums, TilePixels, TileState};
 use slabcast_common::message::{
-    Begun, Counters, HandedOver, Lease, Pixels, RegionCost, RegionLease, Sampled, Sampling,
-    TaskTimes, TileResult,
+    Checkpoint, Counters, ErrorsBySource, Lease, Pixels, RegionCost, RegionLease, RegionSplit,
+    SampledError, TaskTimes, TileResult,
 };
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::parts;
@@ -141,7 +141,7 @@ pub(super) fn region_from_wire(lease: wire::Region) -> Result<RegionLease, WireE
 // ---------------------------------------------------------------------------------------------
 // Work stealing
 
-fn checkpoint_to_wire(begun: &Begun) -> wire::Checkpoint {
+fn checkpoint_to_wire(begun: &Checkpoint) -> wire::Checkpoint {
     let (p, n) = (&begun.pixels, begun.pixels.a.len());
     assert_eq!(p.colour.len(), n, "colour has its tile's size");
     let part = |&next_sheet: &Option<i32>| wire::PartCheckpoint { next_sheet };
@@ -154,7 +154,7 @@ fn checkpoint_to_wire(begun: &Begun) -> wire::Checkpoint {
 }
 
 /// The state of `tile`; errors name fields from `checkpoint` on.
-fn checkpoint_from_wire(checkpoint: wire::Checkpoint, tile: Rect) -> Result<Begun, WireError> {
+fn checkpoint_from_wire(checkpoint: wire::Checkpoint, tile: Rect) -> Result<Checkpoint, WireError> {
     let read = || {
         let (n, of_tile) = (tile.area(), parts(tile).count());
         if checkpoint.parts.len() != of_tile {
@@ -164,12 +164,12 @@ fn checkpoint_from_wire(checkpoint: wire::Checkpoint, tile: Rect) -> Result<Begu
         let a = opacity_from_wire(checkpoint.opacity, n)?;
         let last = last_from_wire(checkpoint.last_sheet, n)?;
         let sheets = checkpoint.parts.iter().map(|part| part.next_sheet).collect();
-        Ok(Begun { sheets, pixels: TilePixels { a, colour, last } })
+        Ok(Checkpoint { sheets, pixels: TilePixels { a, colour, last } })
     };
     read().map_err(|e: WireError| e.within("checkpoint"))
 }
 
-pub(super) fn split_to_wire(split: &HandedOver) -> wire::RegionSplit {
+pub(super) fn split_to_wire(split: &RegionSplit) -> wire::RegionSplit {
     wire::RegionSplit {
         task: split.task.0,
         epoch: split.epoch.0,
@@ -179,10 +179,10 @@ pub(super) fn split_to_wire(split: &HandedOver) -> wire::RegionSplit {
     }
 }
 
-pub(super) fn split_from_wire(split: wire::RegionSplit) -> Result<HandedOver, WireError> {
+pub(super) fn split_from_wire(split: wire::RegionSplit) -> Result<RegionSplit, WireError> {
     let kept = rect_from_wire("kept", split.kept)?;
     let given = rect_from_wire("given", split.given)?;
-    Ok(HandedOver {
+    Ok(RegionSplit {
         task: TaskId(split.task),
         epoch: Epoch(split.epoch),
         kept,
@@ -288,8 +288,9 @@ fn region_cost_to_wire(cost: &RegionCost) -> wire::RegionCost {
 }
 
 /// `None` where no pixel was sampled.
-fn sampled_to_wire(s: Sampled) -> Option<wire::SampledError> {
-    (s != Sampled::default()).then_some(wire::SampledError { pixels: s.pixels, squares: s.squares })
+fn sampled_to_wire(s: SampledError) -> Option<wire::SampledError> {
+    (s != SampledError::default())
+        .then_some(wire::SampledError { pixels: s.pixels, squares: s.squares })
 }
 
 fn region_cost_from_wire(cost: wire::RegionCost) -> Result<RegionCost, WireError> {
@@ -297,8 +298,11 @@ fn region_cost_from_wire(cost: wire::RegionCost) -> Result<RegionCost, WireError
     let touched = touched.into_iter().map(|id| id.0).collect();
     let wire::RegionCost { stalls, parked_us, idle_us, .. } = cost;
     let each = [cost.thickness, cost.positions, cost.truncation, cost.ripple];
-    let sampled = Sampling::of(each.map(|s| {
-        s.map_or_else(Sampled::default, |s| Sampled { pixels: s.pixels, squares: s.squares })
+    let sampled = ErrorsBySource::from_array(each.map(|s| {
+        s.map_or_else(SampledError::default, |s| SampledError {
+            pixels: s.pixels,
+            squares: s.squares,
+        })
     }));
     Ok(RegionCost { touched, stalls, parked_us, idle_us, sampled })
 }

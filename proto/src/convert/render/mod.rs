@@ -19,7 +19,7 @@ pub use watch::{frame_to_wire, notice_to_wire, watch_from_wire};
 
 use super::{WireError, enum_conversions};
 use crate::render_v1 as wire;
-use slabcast_common::path::Axis;
+use slabcast_scene::path::Axis;
 
 /// An axis; `None` is the default that the field names.
 fn axis_to_wire(axis: Option<Axis>) -> i32 {

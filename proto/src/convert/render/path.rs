@@ -5,7 +5,7 @@ use super::submit::{choice_from_wire, choice_to_wire};
 use super::{axis_from_wire, axis_to_wire, enum_conversions, wire};
 use crate::convert::numbers::{finite, size_from_wire};
 use crate::convert::{WireError, required};
-use slabcast_common::path::{
+use slabcast_scene::path::{
     Crop, CropUnit, Easing, FlyThrough, Key, KeyFrames, MAX_KEYS, PathView, ProjectionKind, Side,
     Turntable, ViewPath,
 };
@@ -69,7 +69,7 @@ pub(super) fn path_from_wire(path: wire::ViewPath) -> Result<ViewPath, WireError
         // Whether its numbers are finite its own check sees.
         crop: path.crop.map(crop_from_wire).transpose().map_err(|e| e.within("crop"))?,
         range: path.range.map(|r| [r.first_frame, r.last_frame]),
-        ..ViewPath::of_views(size_from_wire(path.width, path.height)?, Vec::new())
+        ..ViewPath::from_views(size_from_wire(path.width, path.height)?, Vec::new())
     };
     match required("cameras", path.cameras)? {
         Cameras::Views(v) => {

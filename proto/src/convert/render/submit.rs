@@ -8,8 +8,9 @@ use super::shared::{
 use super::{enum_conversions, wire};
 use crate::convert::{WireError, name_from_wire, required};
 use slabcast_common::image::PixelFormat;
-use slabcast_common::message::{PathRequest, TransferChoice};
 use slabcast_common::quality::{Borders, Keep, Schedule, Work};
+use slabcast_scene::request::PathRequest;
+use slabcast_scene::transfer::TransferChoice;
 
 enum_conversions!(schedule_to_wire, schedule_from_wire, Schedule, wire::Schedule,
     Some(Schedule::Auto),

@@ -7,8 +7,8 @@ use crate::convert::{MAX_REASON, WireError, digest_from_wire, required};
 use crate::model::VolumeDescription;
 use bytes::Bytes;
 use glam::DVec3;
-use slabcast_common::path::Orientation;
 use slabcast_common::volume::{Lattice, ValueMap, ValueSummary, VolumeInfo};
+use slabcast_scene::path::Orientation;
 
 /// Writes the volume of a master.
 pub fn volume_to_wire(volume: &VolumeDescription) -> wire::DescribeVolumeResponse {

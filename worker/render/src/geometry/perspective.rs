@@ -406,7 +406,7 @@ impl<S: Recorded, const N: usize> Drawing<'_, S, N> {
                 if row != 0 {
                     let place = &mut places[axis][at];
                     for i in 0..n {
-                        let at = view.screen_along(axis, eye[i], scale);
+                        let at = view.screen_coordinate(axis, eye[i], scale);
                         place[i] = (at - (i64::from(origin) << SUBPIXEL_BITS)) as i32;
                     }
                     if axis == 0 {
@@ -417,7 +417,7 @@ impl<S: Recorded, const N: usize> Drawing<'_, S, N> {
                 }
                 let (to_first, to_from) = (&mut first[axis][at], &mut from[axis][at]);
                 for i in 0..n {
-                    let at = view.screen_along(axis, eye[i], scale);
+                    let at = view.screen_coordinate(axis, eye[i], scale);
                     let (pixel, phase) =
                         ((at >> SUBPIXEL_BITS) as i32, at as i32 & (SUBPIXELS - 1));
                     to_first[i] = pixel - origin + phases.first(phase);

@@ -41,7 +41,7 @@ impl Profile {
 
     /// The kernel of a quality, on a lattice of steps of one vox.
     pub fn of(quality: &Quality) -> Profile {
-        let [std, radius] = quality.shape();
+        let [std, radius] = quality.kernel_shape();
         match quality.kernel {
             Kernel::Gaussian => Profile::new(std, radius),
             Kernel::Bspline => Profile { std, radius, norm: 1.0, degree: Some(3) },

@@ -1,7 +1,7 @@
 //! Looks of many voxels, taken from a table.
 
 use super::Simd;
-use slabcast_common::transfer::Look;
+use slabcast_common::transfer::OpticalSample;
 
 /// Extinctions, then each colour, of the looks that `table` has at `codes`.
 ///
@@ -10,7 +10,7 @@ use slabcast_common::transfer::Look;
 #[inline(always)]
 pub fn take<const MOST: usize>(
     simd: Simd,
-    table: &[Look],
+    table: &[OpticalSample],
     codes: &[u32],
     out: &mut [[f32; MOST]; 4],
 ) {
@@ -27,7 +27,7 @@ pub fn take<const MOST: usize>(
 
 #[inline(always)]
 pub fn one_by_one<const MOST: usize>(
-    table: &[Look],
+    table: &[OpticalSample],
     codes: &[u32],
     from: usize,
     [sigma, colours @ ..]: &mut [[f32; MOST]; 4],
@@ -43,12 +43,12 @@ pub fn one_by_one<const MOST: usize>(
 
 #[cfg(target_arch = "x86_64")]
 mod wide {
-    use super::{Look, one_by_one};
+    use super::{OpticalSample, one_by_one};
     use crate::kernels::lanes::{Eight, Lanes, Sixteen};
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     pub(super) fn avx512<const MOST: usize>(
-        table: &[Look],
+        table: &[OpticalSample],
         codes: &[u32],
         out: &mut [[f32; MOST]; 4],
     ) {
@@ -58,7 +58,7 @@ mod wide {
 
     #[target_feature(enable = "avx2")]
     pub(super) fn avx2<const MOST: usize>(
-        table: &[Look],
+        table: &[OpticalSample],
         codes: &[u32],
         out: &mut [[f32; MOST]; 4],
     ) {
@@ -68,11 +68,11 @@ mod wide {
 
     #[inline(always)]
     unsafe fn some<L: Lanes, const MOST: usize>(
-        table: &[Look],
+        table: &[OpticalSample],
         codes: &[u32],
         out: &mut [[f32; MOST]; 4],
     ) {
-        const { assert!(size_of::<Look>() == 16) };
+        const { assert!(size_of::<OpticalSample>() == 16) };
         let codes = &codes[..codes.len().min(MOST)];
         let largest = codes.iter().fold(0, |most, &code| code.max(most));
         assert!(codes.is_empty() || (largest as usize) < table.len(), "a code of the table");

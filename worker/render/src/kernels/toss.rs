@@ -264,7 +264,7 @@ impl<P: Placing> Sieve<'_, P> {
         }
         let reached = fate[..n].iter().map(|&fate| usize::from(fate != 0)).sum();
         let wanted = if self.cull { 3 } else { 1 };
-        brick.values.bits(samples);
+        brick.values.write_bits(samples);
         match &brick.normals {
             Some(of) => normals.iter_mut().zip(of).for_each(|(to, &of)| *to = of.into()),
             None => normals[..n].fill(NO_NORMAL.into()),
@@ -680,7 +680,7 @@ mod wide {
         let (grown, reach) = open.grown();
         let (front, back, shift) = sections.reach();
         let (mut rank, mut reached, mut kept) = (0, 0, 0);
-        for (group, present) in brick.present().iter().enumerate() {
+        for (group, present) in brick.occupancy().iter().enumerate() {
             for part in 0..64 / L::LANES {
                 let present = (present >> (L::LANES * part)) as u32 & ((1 << L::LANES) - 1);
                 if present == 0 {
@@ -780,7 +780,7 @@ mod sixteen {
     use super::wide::Placed;
     use super::{DeepBrick, FAR};
     use crate::kernels::lanes::Sixteen;
-    use slabcast_common::view::MAGIC;
+    use slabcast_common::view::ROUND_F64;
     use std::arch::x86_64::*;
 
     impl Placed<Sixteen> for DeepBrick<'_> {
@@ -796,7 +796,7 @@ mod sixteen {
     #[inline]
     fn round(both: [__m512d; 2]) -> __m512i {
         let lower = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
-        let magic = _mm512_set1_pd(MAGIC);
+        let magic = _mm512_set1_pd(ROUND_F64);
         let [low, high] = both;
         let low = _mm512_castpd_si512(_mm512_add_pd(low, magic));
         let high = _mm512_castpd_si512(_mm512_add_pd(high, magic));

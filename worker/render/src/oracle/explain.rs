@@ -148,7 +148,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
         let mut found = Vec::new();
         for (b, brick) in bricks.iter().enumerate() {
             // Never too small, so nothing is missed.
-            let Some(p) = view.project(&brick.tight(&frame.scene.grid)) else { continue };
+            let Some(p) = view.project(&brick.tight_box(&frame.scene.grid)) else { continue };
             if p.rect.intersect(&here).is_empty() {
                 continue;
             }
@@ -312,7 +312,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
         let section = |&(raw, part): &(f32, &Part<S>)| {
             let v = &self.voxels[part.voxel as usize];
             let brick = &self.bricks[v.brick as usize];
-            let local = slabcast_common::brick::local(brick.index[v.i as usize]);
+            let local = slabcast_common::brick::local_position(brick.index[v.i as usize]);
             let corner = self.frame.scene.grid.corner(brick.id);
             let [sigma, r, g, b] = v.payload;
             SectionAtPixel {
@@ -332,6 +332,6 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
 fn finish(a: f32, colour: [u32; 3]) -> [f32; 4] {
     let mut state = FrameState::new([1, 1]);
     let pixels = TilePixels { a: vec![a], colour: vec![colour], last: None };
-    state.put(Rect::new(0, 0, 1, 1), &pixels);
-    state.finish().pixels[0]
+    state.add_slab_tile(Rect::new(0, 0, 1, 1), &pixels);
+    state.to_picture().pixels[0]
 }

@@ -169,7 +169,7 @@ fn render_sums<S: Sum>(
     down: impl Fn(&Footprint<'_>, &[Above<'_, S>], i32) -> [S; 4],
 ) -> Picture {
     let [w, h] = frame.view.size.map(|n| n as usize);
-    let whole = Rect::of_size(frame.view.size);
+    let whole = Rect::from_size(frame.view.size);
     let mut voxels = Vec::new();
     let mut range = SheetRange::default();
     for (b, brick) in bricks.iter().enumerate() {
@@ -272,6 +272,6 @@ fn render_sums<S: Sum>(
         std::mem::swap(&mut before, &mut here);
     }
     let mut state = FrameState::new(frame.view.size);
-    state.put(whole, &pixels);
-    state.finish()
+    state.add_slab_tile(whole, &pixels);
+    state.to_picture()
 }

@@ -29,7 +29,7 @@ pub struct ProjectedBrick {
 impl ProjectedBrick {
     /// `brick` in `frame`; `None` if it is off the picture or behind the near plane.
     pub fn new(frame: &Frame, brick: &Arc<Brick>) -> Option<ProjectedBrick> {
-        let projected = frame.view.project(&brick.tight(&frame.scene.grid))?;
+        let projected = frame.view.project(&brick.tight_box(&frame.scene.grid))?;
         Some(ProjectedBrick { brick: brick.clone(), projected, corner: frame.corner(brick.id) })
     }
 

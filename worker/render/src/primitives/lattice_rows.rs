@@ -103,7 +103,7 @@ impl LatticeRows {
     pub fn at(&self, view: &View, s: usize, footprint: &Footprint<'_>) -> i64 {
         match &self.flat {
             Some(flat) => flat[s],
-            None => view.screen_along(1, self.eye[s], footprint.scale),
+            None => view.screen_coordinate(1, self.eye[s], footprint.scale),
         }
     }
 

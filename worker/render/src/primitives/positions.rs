@@ -8,7 +8,7 @@
 //! be rounded the other way.
 
 use glam::DVec3;
-use slabcast_common::brick::local;
+use slabcast_common::brick::local_position;
 use slabcast_common::view::{Projection, SUBPIXELS, View, round_i64};
 
 /// Parts of a subpixel, and of a phase of depth, that corners and offsets are kept in.
@@ -48,7 +48,7 @@ impl Places {
         let deep = f64::from(view.depth_phases()) * FINER / view.thickness;
         let mut offsets = Box::new([[0; 512]; 3]);
         for i in 0..512u16 {
-            let v = view.offset_in_eye(local(i));
+            let v = view.offset_in_eye(local_position(i));
             let across = scale * f64::from(SUBPIXELS) * FINER;
             for (axis, at) in [v.x * across, v.y * across, v.z * deep].into_iter().enumerate() {
                 offsets[axis][i as usize] = whole(at);

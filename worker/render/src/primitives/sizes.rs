@@ -5,7 +5,7 @@
 /// frame) for their overlap and no less time (docs/measurements.md); at 128 a row would need two
 /// words, and the sheets 1.5 MiB.
 pub const PART: i32 = 64;
-const _: () = assert!(PART == slabcast_common::region::PART);
+const _: () = assert!(PART == slabcast_common::region::PART_EDGE);
 
 /// Most sheets of one pixel record.
 pub const MOST: usize = 8;

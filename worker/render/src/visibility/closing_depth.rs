@@ -14,7 +14,7 @@
 
 use crate::visibility::open_mask::OpenMask;
 use slabcast_common::occlusion::Rect;
-use slabcast_common::region::PART;
+use slabcast_common::region::PART_EDGE;
 use std::sync::atomic::{AtomicI32, Ordering};
 
 /// Edge of a cell in pixels: a brick of a head of 256 voxels is some 20 pixels wide in a picture of 512. With cells of 16, one
@@ -22,7 +22,7 @@ use std::sync::atomic::{AtomicI32, Ordering};
 pub(crate) const CELL: i32 = 8;
 
 /// Cells of a part's row.
-const ROW: usize = (PART / CELL) as usize;
+const ROW: usize = (PART_EDGE / CELL) as usize;
 
 /// How often a part looks which of its cells are shut, in sheets.
 pub const LOOKS: i32 = 8;

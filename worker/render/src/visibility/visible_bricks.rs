@@ -55,7 +55,7 @@ impl Directory {
 
     /// The same with blocks of `2^shift` voxels along each axis, or of more, so that there are `most`.
     pub fn with_blocks(bricks: Arc<[BrickInfo]>, shift: u32, most: usize) -> Directory {
-        let blocks = Blocks::of(&bricks, shift, most);
+        let blocks = Blocks::new(&bricks, shift, most);
         let fullest = blocks.all().iter().map(|b| blocks.places(b).len()).max().unwrap_or(0);
         Directory { bricks, blocks, fullest, spare: Mutex::default() }
     }

@@ -44,7 +44,7 @@ proptest! {
         let nearest = placed.iter().map(|p| first(p.z)).min().expect("512 of them");
         for (y0, x0) in [0, 64, 128, 192, 256].into_iter().flat_map(|y| [(y, 0), (y, 64), (y, y)]) {
             let part = Rect::new(x0, y0, x0 + PART, y0 + PART)
-                .intersect(&Rect::of_size([edge; 2]));
+                .intersect(&Rect::from_size([edge; 2]));
             let lean = sheared::takes(&frame);
             let near = match parallel {
                 false => deep(&frame, &part, nearest).map(|deep| deep.reach),

@@ -1,6 +1,6 @@
 use glam::DVec3;
 use proptest::prelude::*;
-use slabcast_common::brick::local;
+use slabcast_common::brick::local_position;
 use slabcast_common::ids::BrickId;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Quality, Sums};
@@ -65,7 +65,7 @@ proptest! {
         let part = Rect::new(0, y0, 64, 90);
         let corner = frame.corner(BrickId(which));
         let (per, first) = lattice_rows.by_eye();
-        for l in (0..512).filter(|&l| (0..3).all(|a| corner.index[a] + local(l)[a] < [20, 16, 24][a])) {
+        for l in (0..512).filter(|&l| (0..3).all(|a| corner.index[a] + local_position(l)[a] < [20, 16, 24][a])) {
             let lattice_row = frame.lattice_row(&corner, l).expect("a level view");
             let placed = frame.place(&corner, l);
             prop_assert_eq!(libm::floor(placed.eye.y * per + first + 0.5) as u32, lattice_row);

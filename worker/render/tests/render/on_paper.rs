@@ -45,7 +45,7 @@ impl Shot {
     ) -> Shot {
         let info = volume.info(Digest32::default());
         let sums = Classifier::new(&transfer, &info, quality.compositing);
-        let sums = sums.sums(&Quality { eps: 0.0, ..quality }, &info.lattice).unwrap();
+        let sums = sums.choose_sums(&Quality { eps: 0.0, ..quality }, &info.lattice).unwrap();
         let quality = Quality { eps: 0.0, sums, ..quality };
         let n = (f64::from(wide + 8) * scale) as u32;
         let projection = CameraProjection::Ortho { height: f64::from(n) / scale };
@@ -187,7 +187,7 @@ fn partial_slab_has_the_optical_depth_in_front_of_its_border() {
     let shot = Shot::new(block(n, n), tf, q, DVec3::Y, (n, scale));
     let stack = stack(n, vec![Layer { sigma, rgb: [1.0; 3] }; n as usize]);
     let (frame, bricks) = (shot.frame(), bricks_of(&shot.volume));
-    let whole = Rect::of_size(shot.view.size);
+    let whole = Rect::from_size(shot.view.size);
     let how = shot.rounding(0.0);
     for end in [-7, -3, 0, 2, 5] {
         let blank = tile::blank(whole);
@@ -196,8 +196,8 @@ fn partial_slab_has_the_optical_depth_in_front_of_its_border() {
         let (pixels, _): (TilePixels, _) =
             tile::render(&frame, Simd::detect(), whole, sheets, &bricks, &blank, &mut scratch);
         let mut state = FrameState::new(shot.view.size);
-        state.put(whole, &pixels);
-        let picture = state.finish();
+        state.add_slab_tile(whole, &pixels);
+        let picture = state.to_picture();
         for x in 0..shot.view.size[0] {
             let y = shot.view.size[1] / 2;
             let [u, v] = shot.offset(x, y, scale);

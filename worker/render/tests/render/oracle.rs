@@ -48,17 +48,17 @@ fn tiled(
     for &slab in slabs {
         for y in (0..size[1] as i32).step_by(edge as usize) {
             for x in (0..size[0] as i32).step_by(edge as usize) {
-                let rect = Rect::new(x, y, x + edge, y + edge).intersect(&Rect::of_size(size));
-                let from = state.tile(rect);
+                let rect = Rect::new(x, y, x + edge, y + edge).intersect(&Rect::from_size(size));
+                let from = state.tile_state(rect);
                 let (pixels, counters) =
                     tile::render(frame, simd, rect, slab, bricks, &from, &mut scratch);
-                state.put(rect, &pixels);
+                state.add_slab_tile(rect, &pixels);
                 counted += counters;
             }
         }
         state.end_slab();
     }
-    (state.finish(), counted)
+    (state.to_picture(), counted)
 }
 
 /// A worker's bricks, some of which are not here yet, and some of which go again.
@@ -113,7 +113,7 @@ fn in_regions(
     let mut tiles = Vec::new();
     for y in (0..size[1] as i32).step_by(edge as usize) {
         for x in (0..size[0] as i32).step_by(edge as usize) {
-            let rect = Rect::new(x, y, x + edge, y + edge).intersect(&Rect::of_size(size));
+            let rect = Rect::new(x, y, x + edge, y + edge).intersect(&Rect::from_size(size));
             tiles.push((Region::new(&outlook, rect), rect));
         }
     }
@@ -157,7 +157,7 @@ fn in_regions(
     // Who has nothing asks for what he will need before he draws it again, if nothing is hidden for all of it.
     store.here.borrow_mut().fill(false);
     let rest = Rect::new(7, 0, size[0] as i32, size[1] as i32);
-    let [again, of_rest] = [Rect::of_size(size), rest].map(|tile| match tile.is_empty() {
+    let [again, of_rest] = [Rect::from_size(size), rest].map(|tile| match tile.is_empty() {
         false => expected_bricks(frame, &outlook, &store, tile, &depths),
         true => Vec::new(),
     });
@@ -165,13 +165,13 @@ fn in_regions(
     assert!(cull || touched.iter().all(|place| again.binary_search(place).is_ok()));
     // A brick's border does not count, but of one of which a tile has 6 pixels or fewer all do.
     let narrow = |place: u32| {
-        let seen = frame.view.project(&bricks[place as usize].tight(&frame.scene.grid));
+        let seen = frame.view.project(&bricks[place as usize].tight_box(&frame.scene.grid));
         let seen = seen.map_or(Rect::default(), |p| p.rect.intersect(&rest));
         seen.width().min(seen.height()) <= 6
     };
     assert!(of_rest.iter().all(|place| again.binary_search(place).is_ok() || narrow(*place)));
     let unknown = ClosingDepths::new(size);
-    let nothing = expected_bricks(frame, &outlook, &store, Rect::of_size(size), &unknown);
+    let nothing = expected_bricks(frame, &outlook, &store, Rect::from_size(size), &unknown);
     assert!(!cull || nothing.is_empty());
     (picture, counted, asked, touched)
 }
@@ -249,7 +249,7 @@ proptest! {
         let frame = make(true);
         let want = serial::render(&frame, &bricks);
         prop_assert!(want.pixels.iter().flatten().all(|x| x.is_finite() && (0.0..=1.0001).contains(x)));
-        let run = bricks.iter().filter_map(|b| view.project(&b.tight(&frame.scene.grid)))
+        let run = bricks.iter().filter_map(|b| view.project(&b.tight_box(&frame.scene.grid)))
             .fold(SheetRange::default(), |r, p| r.union(p.sheets));
         let mut at: Vec<i32> = cuts.iter()
             .map(|c| run.first + (c * f64::from(run.len())) as i32).collect();

@@ -842,10 +842,10 @@ fn model_error_bounds_hold_on_every_pixel() {
                 }
                 let within = TightBox::whole(volume.lattice.dims);
                 let (spec, view) = (&asked.spec, &asked.view);
-                for alpha_most in [None, Some(most)] {
+                for max_alpha in [None, Some(most)] {
                     let bounds = [
-                        bounds::rounding(spec, view, &within, alpha_most),
-                        bounds::truncation(spec, view, &within, alpha_most),
+                        bounds::rounding(spec, view, &within, max_alpha),
+                        bounds::truncation(spec, view, &within, max_alpha),
                     ];
                     for (i, (bound, found)) in bounds.into_iter().zip(found).enumerate() {
                         let bound = bound.expect("extinctions");
@@ -854,7 +854,7 @@ fn model_error_bounds_hold_on_every_pixel() {
                         println!("{scene}, {what}: {found:.4} of at most {bound:.4}");
                         // The reference itself is this near to the limit.
                         assert!(found <= bound + 1e-3, "{scene}: {what} {found} above {bound}");
-                        if bound < 255.0 && alpha_most.is_some() && opacity < 0.1 {
+                        if bound < 255.0 && max_alpha.is_some() && opacity < 0.1 {
                             said += 1;
                             widest[i] = widest[i].max(bound / found);
                         }

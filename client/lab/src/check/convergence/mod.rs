@@ -12,9 +12,9 @@ mod sweep;
 use super::case::number;
 use super::scenes::SCENES;
 use crate::plot;
-use slabcast_common::path::{Orientation, ProjectionKind, Turntable, ViewPath};
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::transfer::TransferFunction;
+use slabcast_scene::path::{Orientation, ProjectionKind, Turntable, ViewPath};
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress::{self, Progress};
 use slabcast_session::request::{RenderRequest, SceneArgs, ThreadArgs};
@@ -159,7 +159,7 @@ fn subjects<'a>(
     if args.volumes.is_empty() {
         // From no axis and no diagonal, so that nothing falls on a sheet by chance.
         let turn = Turntable { start: 25.0, elevation: 20.0, frames: 1, ..Turntable::default() };
-        let views = both(&ViewPath::turn(FORMULA_SIZE, turn));
+        let views = both(&ViewPath::from_turntable(FORMULA_SIZE, turn));
         return Ok(SCENES
             .iter()
             .map(|scene| {

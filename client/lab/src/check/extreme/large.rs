@@ -5,8 +5,8 @@ use super::mixed;
 use super::scene::{against_truth, from, rough, shot};
 use crate::check::case::Case;
 use crate::check::shot::Shot;
-use slabcast_common::path::PathView;
 use slabcast_common::quality::{Quality, Work};
+use slabcast_scene::path::PathView;
 use slabcast_session::direct::Cut;
 use slabcast_session::embedded::Crew;
 

@@ -17,10 +17,10 @@ use scene::{
 };
 use slabcast_common::bounds;
 use slabcast_common::brick::TightBox;
-use slabcast_common::path::PathView;
 use slabcast_common::quality::{Compositing, Quality, Sums, Work};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::volume::Volume;
+use slabcast_scene::path::PathView;
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::embedded::Crew;
 

@@ -7,12 +7,12 @@ use glam::DVec3;
 use slabcast_common::bounds;
 use slabcast_common::brick::TightBox;
 use slabcast_common::image::Picture;
-use slabcast_common::path::{PathView, ProjectionKind};
 use slabcast_common::quality::{Compositing, Quality};
 use slabcast_common::shade::Shading;
-use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
+use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 use slabcast_common::view::Projection;
 use slabcast_common::volume::{Lattice, Volume};
+use slabcast_scene::path::{PathView, ProjectionKind};
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::Fail;
 use std::sync::Arc;
@@ -30,7 +30,7 @@ pub(super) fn look(opacities: &[[f64; 2]]) -> TransferFunction {
         opacities: opacities.to_vec(),
         color_space: ColorSpace::Linear,
         opacity_unit: OpacityUnit::AlphaPerVox,
-        nan: NanLook::default(),
+        nan: NanColour::default(),
         gradient_opacity: vec![],
         shading: Shading { on: false, ..Shading::default() },
     }

@@ -4,7 +4,7 @@ use super::scene::{look, shot};
 use super::{PIXELS, judge, one};
 use crate::check::case::Case;
 use crate::check::shot::Shot;
-use slabcast_common::transfer::{Domain, NanLook, TransferFunction};
+use slabcast_common::transfer::{Domain, NanColour, TransferFunction};
 use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
 use slabcast_session::fail::Fail;
 use slabcast_session::volume;
@@ -72,7 +72,7 @@ fn unit() -> TransferFunction {
         domain: Domain::Unit,
         colors: vec![[0.0, 0.1, 0.2, 0.9], [1.0, 1.0, 0.6, 0.1]],
         opacities: vec![[0.0, 0.02], [1.0, 0.9]],
-        nan: NanLook { color: [0.0, 1.0, 0.0], opacity: 0.3 },
+        nan: NanColour { color: [0.0, 1.0, 0.0], opacity: 0.3 },
         ..look(&[[0.0, 0.0]])
     }
 }

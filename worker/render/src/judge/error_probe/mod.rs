@@ -3,7 +3,7 @@
 //!
 //! What thin sheets come to is not known where a frame is drawn; how much a picture changes when they
 //! become thinner is, and it tells: an error that falls with the power p of the thickness is
-//! 1 / (1 - 2^-p) of that change (Richardson's extrapolation; [`slabcast_common::stats::EXTRAPOLATION`]).
+//! 1 / (1 - 2^-p) of that change (Richardson's extrapolation; [`slabcast_common::stats::THICKNESS_EXTRAPOLATION`]).
 //! One pixel in 128 is drawn twice, in blocks, since neighbours share footprints.
 
 mod model;
@@ -14,7 +14,7 @@ use crate::scene::{Frame, Scene};
 use crate::tile::{self, Scratch};
 use slabcast_common::brick::{Brick, TightBox};
 use slabcast_common::image::{COLOUR_UNIT, TilePixels, TileState};
-use slabcast_common::message::{Sampled, Sampling, SceneSpec};
+use slabcast_common::message::{ErrorsBySource, SampledError, SceneSpec};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Quality;
 use slabcast_common::region::parts;
@@ -53,7 +53,7 @@ impl ThicknessPair {
     /// A view of it.
     pub fn frames(&self, view: &View) -> [Frame; 2] {
         let ThicknessPair([whole, half]) = self;
-        let thin = view.in_sheets_of(&half.quality);
+        let thin = view.with_thickness_of(&half.quality);
         [Frame::new(whole.clone(), *view), Frame::new(half.clone(), thin)]
     }
 }
@@ -104,9 +104,9 @@ impl ErrorProbe {
         tile: Rect,
         bricks: &[Arc<Brick>],
         scratch: &mut Scratch,
-    ) -> Sampling {
-        let mut samples = Sampling::default();
-        let seen = |b: &Arc<Brick>| frame.view.project(&b.tight(&frame.scene.grid));
+    ) -> ErrorsBySource {
+        let mut samples = ErrorsBySource::default();
+        let seen = |b: &Arc<Brick>| frame.view.project(&b.tight_box(&frame.scene.grid));
         let mut rects: Vec<Option<Projected>> = Vec::new();
         for block in blocks(tile, frame.view.size) {
             if let Some(pair) = &self.pair {
@@ -135,7 +135,7 @@ fn thinner(
     block: Rect,
     bricks: &[Arc<Brick>],
     scratch: &mut Scratch,
-    sampled: &mut Sampled,
+    sampled: &mut SampledError,
 ) {
     let [coarse, fine] = frames.each_ref().map(|frame| {
         let whole = TightBox { lo: [0; 3], hi: frame.scene.dims.map(|n| n - 1) };

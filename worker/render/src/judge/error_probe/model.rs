@@ -19,7 +19,7 @@ use crate::primitives::profile_table::ProfileTable;
 use crate::scene::Frame;
 use glam::DVec3;
 use slabcast_common::brick::Brick;
-use slabcast_common::message::Sampling;
+use slabcast_common::message::ErrorsBySource;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Compositing, Kernel};
 use slabcast_common::view::{NEAR, Projection, SUBPIXELS, View};
@@ -178,7 +178,7 @@ impl Model {
         frame: &Frame,
         block: Rect,
         bricks: &[Arc<Brick>],
-        samples: &mut Sampling,
+        samples: &mut ErrorsBySource,
     ) {
         let Some(mut column) = self.near(frame, block, bricks) else { return };
         for (x, y) in [(0, 3), (1, 6), (2, 1), (3, 4), (4, 7), (5, 2), (6, 5), (7, 0)] {
@@ -342,7 +342,7 @@ impl Model {
                     let sheet = libm::floor(z / frame.view.thickness) as i32;
                     if let Some(scale) = frame.view.scale_at(sheet) {
                         let off = [0, 1].map(|a| {
-                            let there = frame.view.screen_along(a, v.seen[a], scale) as f64
+                            let there = frame.view.screen_coordinate(a, v.seen[a], scale) as f64
                                 / f64::from(SUBPIXELS);
                             let exact = v.seen[a] * scale + f64::from(frame.view.size[a]) * 0.5;
                             (there - exact) / scale

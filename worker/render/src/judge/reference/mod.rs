@@ -48,7 +48,7 @@ pub use sheets::{Section, Sheet, Sheets};
 use glam::{DMat3, DVec3};
 use profile::Profile;
 use quadrature::{DEEP, Field, Gauss, HALVINGS, Light};
-use slabcast_common::brick::{Brick, BrickGrid, local};
+use slabcast_common::brick::{Brick, BrickGrid, local_position};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::Compositing;
 use slabcast_common::shade::Shader;
@@ -102,15 +102,15 @@ struct EyeBox {
 impl Reference {
     /// Makes `view` of the scene ready; `bricks` are all bricks of the scene, in any order.
     pub fn new(spec: &SceneSpec, view: View, bricks: &[Arc<Brick>]) -> Reference {
-        let grid = BrickGrid::of(spec.volume.lattice.dims);
-        let [std, radius] = spec.quality.shape();
+        let grid = BrickGrid::new(spec.volume.lattice.dims);
+        let [std, radius] = spec.quality.kernel_shape();
         let (spread, lean) = upright::of(&view, std);
         let m = upright::steps(&view.eye_from_index, lean);
         let origin = upright::point(view.eye_origin, lean);
         let mut bricks: Vec<_> = bricks
             .iter()
             .map(|brick| {
-                let tight = brick.tight(&grid);
+                let tight = brick.tight_box(&grid);
                 let lo = DVec3::from_array(tight.lo.map(f64::from));
                 let hi = DVec3::from_array(tight.hi.map(f64::from));
                 let (centre, half) = (origin + m * ((lo + hi) * 0.5), (hi - lo) * 0.5);
@@ -138,7 +138,9 @@ impl Reference {
             origin,
             index_from_eye: m.inverse(),
             bricks,
-            offsets: (0..512).map(|i| m * DVec3::from_array(local(i).map(f64::from))).collect(),
+            offsets: (0..512)
+                .map(|i| m * DVec3::from_array(local_position(i).map(f64::from)))
+                .collect(),
             rule: Gauss::new(),
             tolerance: TOLERANCE,
             level: false,

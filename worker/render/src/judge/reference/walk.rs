@@ -2,7 +2,7 @@
 
 use super::{EyeBox, Reference, upright};
 use glam::DVec3;
-use slabcast_common::brick::{BRICK, Brick};
+use slabcast_common::brick::{BRICK_EDGE, Brick};
 use slabcast_common::shade::NO_NORMAL;
 use slabcast_common::transfer::Classifier;
 use slabcast_common::view::{NEAR, Projection};
@@ -168,8 +168,8 @@ impl<'a> Walk<'a> {
             return None;
         }
         let a = self.axis;
-        let lo = f64::from(layer * BRICK) - self.reach[a];
-        let hi = f64::from(layer * BRICK + BRICK - 1) + self.reach[a];
+        let lo = f64::from(layer * BRICK_EDGE) - self.reach[a];
+        let hi = f64::from(layer * BRICK_EDGE + BRICK_EDGE - 1) + self.reach[a];
         let (p, q) = ((lo - self.index[a]) / self.step[a], (hi - self.index[a]) / self.step[a]);
         Some((layer, p.min(q), p.max(q)))
     }
@@ -219,8 +219,8 @@ impl<'a> Walk<'a> {
                 continue;
             }
             let (p, q) = (self.index[a] + self.step[a] * from, self.index[a] + self.step[a] * to);
-            let lo = libm::floor((p.min(q) - self.reach[a]) / f64::from(BRICK));
-            let hi = libm::floor((p.max(q) + self.reach[a]) / f64::from(BRICK));
+            let lo = libm::floor((p.min(q) - self.reach[a]) / f64::from(BRICK_EDGE));
+            let hi = libm::floor((p.max(q) + self.reach[a]) / f64::from(BRICK_EDGE));
             let end = f64::from(self.of.grid.dims[a] - 1);
             if hi < 0.0 || lo > end {
                 return;
@@ -255,7 +255,7 @@ impl<'a> Walk<'a> {
             let offset = self.of.offsets[local as usize];
             let eye = corner + offset;
             let Some((enter, leave)) = self.ray.inside(eye, eye, self.of_use) else { continue };
-            let look = self.looks.look_of(brick, i);
+            let look = self.looks.classify_voxel(brick, i);
             if look.sigma <= 0.0 {
                 continue;
             }
@@ -266,7 +266,7 @@ impl<'a> Walk<'a> {
                     shader.shade(
                         look.rgb,
                         normal,
-                        view.to_eye(seen + upright::seen(offset, self.of.lean)),
+                        view.direction_to_eye(seen + upright::seen(offset, self.of.lean)),
                     )
                 }
             };

@@ -11,7 +11,7 @@
 pub mod rows;
 
 use crate::kernels::truncate;
-use slabcast_common::math::{SWITCH, opacity, phi, phis};
+use slabcast_common::math::{PHI_SERIES_BELOW, opacity, phi, phi_both};
 use slabcast_common::quality::Compositing;
 
 /// A sum of a sheet: integers, whose sum has no order, or floats, added in one order.
@@ -335,8 +335,9 @@ impl Rule {
         }
         let [mut weights, mut light] = [[0.0f32; LANES]; 2];
         for i in 0..LANES {
-            let (small, large) = phis(taus[i], per_raws[i] * per_unit * row.cosine[i], sheet[i]);
-            let weight = select(taus[i] < SWITCH, small, large);
+            let (small, large) =
+                phi_both(taus[i], per_raws[i] * per_unit * row.cosine[i], sheet[i]);
+            let weight = select(taus[i] < PHI_SERIES_BELOW, small, large);
             weights[i] = select(taus[i] > 0.0, weight, 0.0);
         }
         // Where there is nothing, colours are nothing too, and neighbours may be anything.

@@ -60,7 +60,7 @@ mod wide {
     use crate::kernels::LARGEST;
     use crate::kernels::composite::{FAINTEST, LANES, ONE, Row, Rule, Sum};
     use crate::kernels::lanes::{Eight, Floats, Sixteen};
-    use slabcast_common::math::{LN2, MAGIC, PHI, SWITCH, TAYLOR};
+    use slabcast_common::math::{LN2, PHI, PHI_SERIES_BELOW, ROUND_F32, TAYLOR};
     use std::slice::from_mut;
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
@@ -109,7 +109,7 @@ mod wide {
     unsafe fn opacity<L: Floats>(tau: L::Floats) -> L::Floats {
         // SAFETY: the caller has these instructions.
         unsafe {
-            let magic = L::all(MAGIC);
+            let magic = L::all(ROUND_F32);
             let x = L::most(L::sub(L::all(-0.0), tau), L::all(-87.0));
             let shifted = L::add(L::mul(x, L::all(std::f32::consts::LOG2_E)), magic);
             let n = L::sub(shifted, magic);
@@ -189,7 +189,7 @@ mod wide {
                 let per_tau = L::mul(per_tau, load(&rows[row].cosine, from));
                 let half = L::mul(p.opacity, L::all(0.5));
                 let large = L::sub(L::add(L::mul(p.opacity, per_tau), half), one);
-                let weight = L::select(L::below(tau, L::all(SWITCH)), small, large);
+                let weight = L::select(L::below(tau, L::all(PHI_SERIES_BELOW)), small, large);
                 p.weight = L::only(L::below(zero, tau), weight);
             }
             for (r, p) in pixels.iter_mut().enumerate() {

@@ -1,10 +1,10 @@
 //! Small worlds for the renderer's tests.
 #![allow(dead_code, unreachable_pub, reason = "several test programs use a part each")]
 
-use slabcast_common::brick::{Brick, BrickGrid, BrickInfo, local};
+use slabcast_common::brick::{Brick, BrickGrid, BrickInfo, local_position};
 use slabcast_common::ids::BrickId;
 use slabcast_common::shade::{Shading, encode_normal};
-use slabcast_common::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
+use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 use slabcast_common::volume::{Samples, Volume};
 use slabcast_render::Simd;
 use std::sync::Arc;
@@ -34,7 +34,7 @@ pub fn transfer(
         opacities,
         color_space: ColorSpace::Linear,
         opacity_unit: unit,
-        nan: NanLook::default(),
+        nan: NanColour::default(),
         gradient_opacity: vec![],
         shading: Shading { on: false, ..Shading::default() },
     }
@@ -64,7 +64,7 @@ pub fn sum(u: f64, range: std::ops::Range<i32>) -> f64 {
 
 /// The bricks of `volume` with every voxel that is not zero, and its normal.
 pub fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
-    let grid = BrickGrid::of(volume.lattice.dims);
+    let grid = BrickGrid::new(volume.lattice.dims);
     let [nx, ny, _] = volume.lattice.dims.map(|n| n as usize);
     let matrix = volume.gradient_matrix();
     let mut out = Vec::new();
@@ -73,7 +73,7 @@ pub fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
         let (mut index, mut normals) = (Vec::new(), Vec::new());
         let mut values = Samples::empty(volume.samples.kind());
         for l in 0..512u16 {
-            let p: [u32; 3] = std::array::from_fn(|a| corner[a] + local(l)[a]);
+            let p: [u32; 3] = std::array::from_fn(|a| corner[a] + local_position(l)[a]);
             if (0..3).any(|a| p[a] >= volume.lattice.dims[a]) {
                 continue;
             }
@@ -95,7 +95,7 @@ pub fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
 pub fn infos_of(bricks: &[Arc<Brick>], grid: &BrickGrid) -> Vec<BrickInfo> {
     let info = |b: &Arc<Brick>| BrickInfo {
         id: b.id,
-        tight: b.tight(grid),
+        tight: b.tight_box(grid),
         voxels: b.len() as u16,
         bytes: b.encoded_len() as u32,
     };

@@ -13,12 +13,13 @@ mod levels;
 mod maps;
 
 pub use levels::{Content, Levels};
-pub use maps::{MAPS, colours as map_colours};
+pub use maps::{MAPS, colour_map};
 
-use crate::quality::Refused;
-use crate::shade::Shading;
-use crate::transfer::{ColorSpace, Domain, NanLook, OpacityUnit, TransferFunction};
-use crate::volume::{SampleKind, ValueSummary};
+use slabcast_common::quality::InvalidField;
+use slabcast_common::shade::Shading;
+use slabcast_common::spelling::nearest;
+use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
+use slabcast_common::volume::{SampleKind, ValueSummary};
 
 /// Every name but those of [`MAPS`], and what it is for, in the order of the help text.
 pub const NAMES: [(&str, &str); 20] = [
@@ -107,8 +108,8 @@ const GREY: [[f64; 4]; 2] = [[0.0, 0.35, 0.35, 0.35], [255.0, 1.0, 1.0, 1.0]];
 ///
 /// # Errors
 /// If there is none of that name; says what there is.
-pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, Refused> {
-    let l = Levels::of(summary);
+pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, InvalidField> {
+    let l = Levels::from_summary(summary);
     let at = hounsfield(summary, &l);
     let (air, solid, top) = (l.air, l.solid, l.top);
     let unlit = |tf: TransferFunction| TransferFunction {
@@ -238,10 +239,10 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, R
         }
         "peer-skull" => peer(summary, &WARM, &[[0.0, 0.0], [25.0, 0.0], [45.0, 1.0], [255.0, 1.0]]),
         map => {
-            let Some(colours) = map_colours(map) else { return Err(unknown(map)) };
+            let Some(colours) = colour_map(map) else { return Err(unknown_name(map)) };
             // Unlit, since light would change what a colour says; thin enough to see through.
             let mut tf = unlit(look(&[], [air, top], &[[air, 0.0], [solid, 0.03], [top, 0.10]]));
-            tf.colors = spread(&colours, air, top);
+            tf.colors = stretch_colours(&colours, air, top);
             tf
         }
     };
@@ -249,11 +250,11 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, R
 }
 
 /// The refusal of a name that is neither a preset nor a map, with the nearest one.
-pub fn unknown(name: &str) -> Refused {
+pub fn unknown_name(name: &str) -> InvalidField {
     let names: Vec<&str> = NAMES.iter().chain(&MAPS).map(|(n, _)| *n).collect();
     let meant = nearest(name, &names).map(|n| format!("did you mean `{n}`? ")).unwrap_or_default();
     let (presets, maps) = names.split_at(NAMES.len());
-    Refused::new(
+    InvalidField::new(
         "tf",
         format!(
             "`{name}` is neither a preset nor a file; {meant}presets are {}; maps are {}",
@@ -261,13 +262,6 @@ pub fn unknown(name: &str) -> Refused {
             maps.join(", ")
         ),
     )
-}
-
-/// The word of a list that is two edits away at most, if there is one; of several, one that begins
-/// alike.
-pub fn nearest<'a>(word: &str, list: &[&'a str]) -> Option<&'a str> {
-    let near = list.iter().filter(|n| distance(word, n) <= 2);
-    near.min_by_key(|n| (distance(word, n), word.chars().next() != n.chars().next())).copied()
 }
 
 /// A fitting look for whatever there is: a surface where there is one, a cloud that can be seen
@@ -327,18 +321,18 @@ fn look(colours: &Colours, range: [f64; 2], opacities: &[[f64; 2]]) -> TransferF
     TransferFunction {
         version: 1,
         domain: Domain::Unit,
-        colors: spread(&over_bytes, range[0], range[1]),
+        colors: stretch_colours(&over_bytes, range[0], range[1]),
         opacities: ascending,
         color_space: ColorSpace::Srgb,
         opacity_unit: OpacityUnit::AlphaPerVox,
-        nan: NanLook::default(),
+        nan: NanColour::default(),
         gradient_opacity: Vec::new(),
         shading: Shading::default(),
     }
 }
 
 /// Colours given over 0 to 1, spread from `lo` to `hi`.
-pub fn spread(colours: &Colours, lo: f64, hi: f64) -> Vec<[f64; 4]> {
+pub fn stretch_colours(colours: &Colours, lo: f64, hi: f64) -> Vec<[f64; 4]> {
     let width = (hi - lo).max(1e-6);
     colours.iter().map(|c| [lo + width * c[0], c[1], c[2], c[3]]).collect()
 }
@@ -359,30 +353,14 @@ fn peer(summary: &ValueSummary, colors: &Colours, opacities: &[[f64; 2]]) -> Tra
 }
 
 /// Where the air ends, as a share of the range.
-pub fn air_cut(summary: &ValueSummary) -> f64 {
-    Levels::of(summary).air
-}
-
-/// Edits between two short words (Levenshtein).
-pub fn distance(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, ca) in a.chars().enumerate() {
-        let mut diagonal = row[0];
-        row[0] = i + 1;
-        for (j, cb) in b.iter().enumerate() {
-            let change = diagonal + usize::from(ca != *cb);
-            diagonal = row[j + 1];
-            row[j + 1] = change.min(diagonal + 1).min(row[j] + 1);
-        }
-    }
-    row[b.len()]
+pub fn air_threshold(summary: &ValueSummary) -> f64 {
+    Levels::from_summary(summary).air
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::volume::{Samples, ValueMap};
+    use slabcast_common::volume::{Samples, ValueMap};
 
     #[test]
     fn every_preset_passes_its_own_check_on_every_kind_of_volume() {
@@ -396,7 +374,7 @@ mod tests {
         ];
         for v in volumes {
             for map in [ValueMap::IDENTITY, ValueMap { scale: -2.5, offset: 10.0 }] {
-                let s = ValueSummary::of(&v, map);
+                let s = ValueSummary::from_samples(&v, map);
                 for (name, _) in NAMES.iter().chain(&MAPS) {
                     let tf = by_name(name, &s).unwrap();
                     tf.check().unwrap_or_else(|e| panic!("{name} on {s:?}: {e}"));
@@ -411,17 +389,17 @@ mod tests {
         let hills = [(0, 80_000), (40, 800), (170, 9_000), (220, 6_000)];
         let v = hills.iter().flat_map(|&(at, n)| (0..n).map(move |i| (at + i % 30) as u8));
         let v = v.map(|x| if x < 30 { 0 } else { x }).collect();
-        let s = ValueSummary::of(&Samples::U8(v), ValueMap::IDENTITY);
+        let s = ValueSummary::from_samples(&Samples::U8(v), ValueMap::IDENTITY);
         let opacity = |x: f64| {
             let tf = by_name("brain", &s).unwrap();
-            crate::transfer::interpolate(&tf.opacities, x / 249.0)[1]
+            slabcast_common::transfer::interpolate(&tf.opacities, x / 249.0)[1]
         };
         assert_eq!((opacity(55.0), opacity(175.0)), (0.0, 1.0));
     }
 
     #[test]
     fn unknown_names_are_told_what_there_is() {
-        let s = ValueSummary::of(&Samples::U8(vec![0, 255]), ValueMap::IDENTITY);
+        let s = ValueSummary::from_samples(&Samples::U8(vec![0, 255]), ValueMap::IDENTITY);
         let e = by_name("bonee", &s).unwrap_err().to_string();
         assert!(e.contains("did you mean `bone`") && e.contains("peer-opaque"), "{e}");
         assert!(by_name("gray", &s).unwrap_err().to_string().contains("did you mean `grey`"));
@@ -438,8 +416,8 @@ mod tests {
         for i in 0..600 {
             v[i] = 90 + (i % 160) as u8;
         }
-        let s = ValueSummary::of(&Samples::U8(v), ValueMap::IDENTITY);
-        let cut = air_cut(&s) * 249.0;
+        let s = ValueSummary::from_samples(&Samples::U8(v), ValueMap::IDENTITY);
+        let cut = air_threshold(&s) * 249.0;
         assert!((11.0..100.0).contains(&cut), "cut at {cut}");
     }
 }

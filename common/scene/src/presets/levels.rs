@@ -20,7 +20,7 @@
 //!
 //! All numbers are shares of the range: 0 the smallest value, 1 the largest.
 
-use crate::volume::{SampleKind, ValueSummary};
+use slabcast_common::volume::{SampleKind, ValueSummary};
 use std::ops::Range;
 
 /// Bins are averaged over this share of the range to either side when valleys are looked for.
@@ -75,7 +75,7 @@ pub struct Levels {
 
 impl Levels {
     /// Looks at a histogram.
-    pub fn of(summary: &ValueSummary) -> Levels {
+    pub fn from_summary(summary: &ValueSummary) -> Levels {
         let bins = unit_histogram(summary);
         let nothing = Levels {
             content: Content::Constant,
@@ -280,10 +280,10 @@ fn water(s: &ValueSummary) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::volume::{Samples, ValueMap};
+    use slabcast_common::volume::{Samples, ValueMap};
 
     fn levels(samples: Samples) -> Levels {
-        Levels::of(&ValueSummary::of(&samples, ValueMap::IDENTITY))
+        Levels::from_summary(&ValueSummary::from_samples(&samples, ValueMap::IDENTITY))
     }
 
     /// `n` samples spread evenly over a span.
@@ -389,11 +389,11 @@ mod tests {
     #[test]
     fn values_that_fall_with_the_code_are_turned_first() {
         let up = levels(bytes(&[(0, 1, 70_000), (60, 140, 30_000)]));
-        let down = ValueSummary::of(
+        let down = ValueSummary::from_samples(
             &bytes(&[(255, 256, 70_000), (116, 196, 30_000)]),
             ValueMap { scale: -1.0, offset: 255.0 },
         );
-        let down = Levels::of(&down);
+        let down = Levels::from_summary(&down);
         assert_eq!(down.content, up.content);
         assert!((down.air - up.air).abs() < 0.02, "{down:?} {up:?}");
     }

@@ -7,12 +7,12 @@
 //! written. Between two keys the eye turns the short way: a whole turn takes three keys.
 
 use super::{Axis, Orientation, ProjectionKind, turn};
-use crate::quality::Refused;
 use crate::transfer::TransferChoice;
-use crate::view::{Camera, CameraProjection};
-use crate::volume::Lattice;
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
+use slabcast_common::quality::InvalidField;
+use slabcast_common::view::{Camera, CameraProjection};
+use slabcast_common::volume::Lattice;
 
 /// Most keys of a path.
 pub const MAX_KEYS: usize = 10_000;
@@ -136,8 +136,8 @@ pub struct KeyFrames {
 
 impl KeyFrames {
     /// Checks counts and times.
-    pub fn check(&self) -> Result<(), Refused> {
-        let refuse = |field: String, problem: String| Err(Refused::new(field, problem));
+    pub fn check(&self) -> Result<(), InvalidField> {
+        let refuse = |field: String, problem: String| Err(InvalidField::new(field, problem));
         if self.keys.is_empty() || self.keys.len() > MAX_KEYS {
             return refuse(
                 "keyframes.keys".into(),
@@ -208,15 +208,15 @@ impl KeyFrames {
         &self,
         lattice: &Lattice,
         orientation: Orientation,
-    ) -> Result<KeyedPath, Refused> {
+    ) -> Result<KeyedPath, InvalidField> {
         let orientation = orientation.or_else(self.up, self.front)?;
         let mut keys = Vec::with_capacity(self.keys.len());
         for (i, k) in self.keys.iter().enumerate() {
-            let camera = k
-                .camera(lattice, orientation)
-                .map_err(|e| Refused::new(format!("keyframes.keys[{i}].{}", e.field), e.problem))?;
+            let camera = k.camera(lattice, orientation).map_err(|e| {
+                InvalidField::new(format!("keyframes.keys[{i}].{}", e.field), e.problem)
+            })?;
             let pose = Pose::of(&camera).ok_or_else(|| {
-                Refused::new(
+                InvalidField::new(
                     format!("keyframes.keys[{i}].up"),
                     "lies along the line of sight; give another",
                 )
@@ -234,10 +234,10 @@ impl KeyFrames {
 }
 
 impl Key {
-    fn camera(&self, lattice: &Lattice, o: Orientation) -> Result<Camera, Refused> {
+    fn camera(&self, lattice: &Lattice, o: Orientation) -> Result<Camera, InvalidField> {
         let finite = |field: &str, x: [f64; 3]| match DVec3::from_array(x) {
             v if v.is_finite() => Ok(v),
-            _ => Err(Refused::new(field, "must be finite numbers")),
+            _ => Err(InvalidField::new(field, "must be finite numbers")),
         };
         let target = match self.target {
             Some(t) => finite("target", t)? - lattice.centre(),
@@ -245,11 +245,11 @@ impl Key {
         };
         let height = self.height.unwrap_or(1.25 * lattice.largest_extent());
         if !(height.is_finite() && height > 0.0) {
-            return Err(Refused::new("height", "must be finite and above zero"));
+            return Err(InvalidField::new("height", "must be finite and above zero"));
         }
         let fov = self.fov.unwrap_or(30.0);
         if !(0.01..=179.0).contains(&fov) {
-            return Err(Refused::new("fov", format!("{fov} degrees; give 0.01 to 179")));
+            return Err(InvalidField::new("fov", format!("{fov} degrees; give 0.01 to 179")));
         }
         let mut distance = height / 2.0 / libm::tan(fov.to_radians() / 2.0);
         let (to_eye, up) = match self.eye {
@@ -257,7 +257,7 @@ impl Key {
                 let to_eye = finite("eye", eye)? - lattice.centre() - target;
                 distance = to_eye.length();
                 if distance == 0.0 {
-                    return Err(Refused::new("eye", "is the target; move one of them"));
+                    return Err(InvalidField::new("eye", "is the target; move one of them"));
                 }
                 let up = self.up.map_or(Ok(o.up.vector()), |up| finite("up", up))?;
                 (to_eye, up)
@@ -268,10 +268,10 @@ impl Key {
                     None => (self.azimuth.unwrap_or(0.0), self.elevation.unwrap_or(0.0)),
                 };
                 if !azimuth.is_finite() || azimuth.abs() > 1e9 {
-                    return Err(Refused::new("azimuth", "must be a finite angle in degrees"));
+                    return Err(InvalidField::new("azimuth", "must be a finite angle in degrees"));
                 }
                 if !(-90.0..=90.0).contains(&elevation) {
-                    return Err(Refused::new(
+                    return Err(InvalidField::new(
                         "elevation",
                         format!("{elevation} degrees; give -90 to 90"),
                     ));
@@ -480,7 +480,7 @@ mod tests {
     fn path(frames: u32, easing: Easing, keys: Vec<Key>) -> ViewPath {
         ViewPath {
             keyframes: Some(KeyFrames { frames, easing, up: None, front: None, keys }),
-            ..ViewPath::of_views([64; 2], vec![])
+            ..ViewPath::from_views([64; 2], vec![])
         }
     }
 

@@ -8,7 +8,7 @@ use libm::{acos, atan2, cbrt, cos, pow, sin, sqrt};
 
 /// Where a line between two colours is drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Space {
+pub enum ColourSpace {
     /// sRGB numbers.
     Rgb,
     /// Hue, saturation, value, the short way round.
@@ -22,15 +22,15 @@ pub enum Space {
 }
 
 /// The colour at `t` from 0 to 1 between two colours (sRGB numbers, 0 to 1).
-pub fn between(space: Space, a: [f64; 3], b: [f64; 3], t: f64) -> [f64; 3] {
+pub fn interpolate_colour(space: ColourSpace, a: [f64; 3], b: [f64; 3], t: f64) -> [f64; 3] {
     let mix = |a: [f64; 3], b: [f64; 3]| -> [f64; 3] {
         std::array::from_fn(|i| a[i] * (1.0 - t) + b[i] * t)
     };
     match space {
-        Space::Rgb => mix(a, b),
-        Space::Step => b,
-        Space::Lab => rgb_from_lab(mix(lab_from_rgb(a), lab_from_rgb(b))),
-        Space::Hsv => {
+        ColourSpace::Rgb => mix(a, b),
+        ColourSpace::Step => b,
+        ColourSpace::Lab => rgb_from_lab(mix(lab_from_rgb(a), lab_from_rgb(b))),
+        ColourSpace::Hsv => {
             let (mut a, mut b) = (hsv_from_rgb(a), hsv_from_rgb(b));
             if a[0] - b[0] > 0.5 {
                 a[0] -= 1.0;
@@ -40,7 +40,7 @@ pub fn between(space: Space, a: [f64; 3], b: [f64; 3], t: f64) -> [f64; 3] {
             let [h, s, v] = mix(a, b);
             rgb_from_hsv([if h < 0.0 { h + 1.0 } else { h }, s, v])
         }
-        Space::Diverging => diverging(a, b, t),
+        ColourSpace::Diverging => diverging(a, b, t),
     }
 }
 
@@ -168,30 +168,30 @@ mod tests {
             a in [0.0..=1.0f64, 0.0..=1.0, 0.0..=1.0], b in [0.0..=1.0f64, 0.0..=1.0, 0.0..=1.0],
             t in 0.0..=1.0f64,
         ) {
-            for space in [Space::Rgb, Space::Hsv, Space::Lab, Space::Diverging] {
+            for space in [ColourSpace::Rgb, ColourSpace::Hsv, ColourSpace::Lab, ColourSpace::Diverging] {
                 // The rounded matrices are no exact inverses of each other; and a colour that is
                 // nearly white is given another's hue, which moves it by ten units of CIELAB at most
                 // (a bluish white beside a bluish black by more than 0.06).
-                let off = if space == Space::Diverging { 0.1 } else { 2e-3 };
-                prop_assert!(near(between(space, a, b, 0.0), a, off), "{space:?}");
-                prop_assert!(near(between(space, a, b, 1.0), b, off), "{space:?}");
-                let c = between(space, a, b, t);
+                let off = if space == ColourSpace::Diverging { 0.1 } else { 2e-3 };
+                prop_assert!(near(interpolate_colour(space, a, b, 0.0), a, off), "{space:?}");
+                prop_assert!(near(interpolate_colour(space, a, b, 1.0), b, off), "{space:?}");
+                let c = interpolate_colour(space, a, b, t);
                 prop_assert!(c.iter().all(|x| (0.0..=1.0).contains(x)), "{space:?}: {c:?}");
             }
-            prop_assert_eq!(between(Space::Step, a, b, t), b);
+            prop_assert_eq!(interpolate_colour(ColourSpace::Step, a, b, t), b);
         }
     }
 
     #[test]
     fn halfway_between_red_and_blue() {
         let (red, blue) = ([1.0, 0.0, 0.0], [0.0, 0.0, 1.0]);
-        let at = |space| between(space, red, blue, 0.5).map(|c| (c * 255.0).round());
-        assert_eq!(at(Space::Rgb), [128.0, 0.0, 128.0]);
-        assert_eq!(at(Space::Hsv), [255.0, 0.0, 255.0], "the short way round");
-        assert_eq!(at(Space::Step), [0.0, 0.0, 255.0]);
-        let [r, g, b] = between(Space::Lab, red, blue, 0.5);
+        let at = |space| interpolate_colour(space, red, blue, 0.5).map(|c| (c * 255.0).round());
+        assert_eq!(at(ColourSpace::Rgb), [128.0, 0.0, 128.0]);
+        assert_eq!(at(ColourSpace::Hsv), [255.0, 0.0, 255.0], "the short way round");
+        assert_eq!(at(ColourSpace::Step), [0.0, 0.0, 255.0]);
+        let [r, g, b] = interpolate_colour(ColourSpace::Lab, red, blue, 0.5);
         assert!(r > 0.7 && g < 0.2 && b > 0.45, "{r} {g} {b}");
-        let white = between(Space::Diverging, red, blue, 0.5);
+        let white = interpolate_colour(ColourSpace::Diverging, red, blue, 0.5);
         assert!(near(white, [white[0]; 3], 0.01) && white[0] > 0.85, "{white:?}");
     }
 }

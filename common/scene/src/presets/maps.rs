@@ -25,7 +25,7 @@ const COOL: [f64; 3] = [0.230, 0.299, 0.754];
 const WARM: [f64; 3] = [0.706, 0.016, 0.150];
 
 /// Colours of a map: `[t, r, g, b]` with t from 0 to 1, sRGB numbers.
-pub fn colours(name: &str) -> Option<Vec<[f64; 4]>> {
+pub fn colour_map(name: &str) -> Option<Vec<[f64; 4]>> {
     let table = match name {
         "viridis" => &VIRIDIS,
         "inferno" => &INFERNO,
@@ -34,7 +34,8 @@ pub fn colours(name: &str) -> Option<Vec<[f64; 4]>> {
         "cividis" => &CIVIDIS,
         "turbo" => &TURBO,
         "cool-warm" => {
-            let at = |t: f64| colour::between(colour::Space::Diverging, COOL, WARM, t);
+            let at =
+                |t: f64| colour::interpolate_colour(colour::ColourSpace::Diverging, COOL, WARM, t);
             return Some(spread(33, at));
         }
         // Equal steps of sRGB numbers are about equal steps of lightness.
@@ -97,7 +98,7 @@ const TURBO: [u32; 33] = [
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::math::linear_from_srgb;
+    use slabcast_common::math::linear_from_srgb;
 
     #[test]
     fn maps_have_the_published_ends_and_lightness_that_rises() {
@@ -114,7 +115,7 @@ mod tests {
             ("cool-warm", 0x3b_4cc0, 0xb4_0426),
             ("greys", 0x00_0000, 0xff_ffff),
         ] {
-            let map = colours(name).unwrap();
+            let map = colour_map(name).unwrap();
             assert_eq!((hex(&map[0]), hex(&map[map.len() - 1])), (first, last), "{name}");
             assert!(map.windows(2).all(|w| w[0][0] < w[1][0]), "{name}");
             let light = |c: &[f64; 4]| {
@@ -125,10 +126,10 @@ mod tests {
                 assert!(map.windows(2).all(|w| light(&w[0]) < light(&w[1])), "{name}");
             }
         }
-        assert!(MAPS.iter().all(|(name, _)| colours(name).is_some()));
-        assert_eq!(colours("jet"), None);
+        assert!(MAPS.iter().all(|(name, _)| colour_map(name).is_some()));
+        assert_eq!(colour_map("jet"), None);
         // The middle of cool-warm is its published grey, 221.
-        let middle = colours("cool-warm").unwrap()[16];
+        let middle = colour_map("cool-warm").unwrap()[16];
         assert!(middle[1..].iter().all(|c| (c * 255.0 - 221.0).abs() < 1.0), "{middle:?}");
     }
 }

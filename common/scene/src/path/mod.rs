@@ -14,11 +14,11 @@ pub use fly::FlyThrough;
 pub use keys::{Easing, Key, KeyFrames, MAX_KEYS, Side};
 
 use crate::presets::Levels;
-use crate::quality::{Refused, json_error};
-use crate::view::{Camera, CameraProjection};
-use crate::volume::{Lattice, ValueSummary};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
+use slabcast_common::quality::{InvalidField, json_error};
+use slabcast_common::view::{Camera, CameraProjection};
+use slabcast_common::volume::{Lattice, ValueSummary};
 
 /// Most frames of one path.
 pub const MAX_FRAMES: usize = 100_000;
@@ -199,11 +199,11 @@ pub struct Orientation {
 impl Orientation {
     /// Checks a choice and fills in what is missing: up +z; front +y for up along z, else +z
     /// (CONTRACTS.md; the front of measuring protocols).
-    pub fn new(up: Option<Axis>, front: Option<Axis>) -> Result<Self, Refused> {
+    pub fn new(up: Option<Axis>, front: Option<Axis>) -> Result<Self, InvalidField> {
         let up = up.unwrap_or(Axis::positive(2));
         let front = front.unwrap_or(Axis::positive(if up.index == 2 { 1 } else { 2 }));
         if front.index == up.index {
-            return Err(Refused::new(
+            return Err(InvalidField::new(
                 "front",
                 format!("{front} lies along up ({up}); give another axis"),
             ));
@@ -215,20 +215,20 @@ impl Orientation {
     /// lies. A CT that does not is taken as scanners store its slices (patient on the back, rows
     /// from anterior to posterior, DICOM's axes): its front is -y. Seen from +y, a couch hides the
     /// patient.
-    pub fn of(
+    pub fn for_volume(
         up: Option<Axis>,
         front: Option<Axis>,
         summary: &ValueSummary,
         anatomical: bool,
-    ) -> Result<Self, Refused> {
+    ) -> Result<Self, InvalidField> {
         let upright = up.is_none_or(|up| up == Axis::positive(2));
-        let scanned = !anatomical && upright && Levels::of(summary).water.is_some();
+        let scanned = !anatomical && upright && Levels::from_summary(summary).water.is_some();
         let usual = scanned.then_some(Axis { index: 1, negative: true });
         Orientation::new(up, front.or(usual))
     }
 
     /// These axes, unless a path has others of its own.
-    fn or_else(self, up: Option<Axis>, front: Option<Axis>) -> Result<Self, Refused> {
+    fn or_else(self, up: Option<Axis>, front: Option<Axis>) -> Result<Self, InvalidField> {
         let same_up = up.is_none_or(|up| up == self.up);
         Orientation::new(up.or(Some(self.up)), front.or(same_up.then_some(self.front)))
     }
@@ -236,7 +236,7 @@ impl Orientation {
 
 impl ViewPath {
     /// Explicit views.
-    pub fn of_views(size: [u32; 2], views: Vec<PathView>) -> Self {
+    pub fn from_views(size: [u32; 2], views: Vec<PathView>) -> Self {
         ViewPath {
             version: 1,
             size,
@@ -250,21 +250,21 @@ impl ViewPath {
     }
 
     /// A turntable.
-    pub fn turn(size: [u32; 2], turntable: Turntable) -> Self {
-        ViewPath { turntable: Some(turntable), ..ViewPath::of_views(size, Vec::new()) }
+    pub fn from_turntable(size: [u32; 2], turntable: Turntable) -> Self {
+        ViewPath { turntable: Some(turntable), ..ViewPath::from_views(size, Vec::new()) }
     }
 
     /// Reads the JSON of CONTRACTS.md.
-    pub fn from_json(text: &str) -> Result<Self, Refused> {
+    pub fn from_json(text: &str) -> Result<Self, InvalidField> {
         let path: ViewPath = serde_json::from_str(text).map_err(|e| json_error("view path", &e))?;
         path.check()?;
         Ok(path)
     }
 
     /// Checks version, counts, and whatever needs no volume.
-    pub fn check(&self) -> Result<(), Refused> {
+    pub fn check(&self) -> Result<(), InvalidField> {
         if self.version != 1 {
-            return Err(Refused::new("version", "this program knows version 1; set it to 1"));
+            return Err(InvalidField::new("version", "this program knows version 1; set it to 1"));
         }
         let kinds = [
             ("views", !self.views.is_empty()),
@@ -275,23 +275,26 @@ impl ViewPath {
         let given: Vec<&str> = kinds.iter().filter(|k| k.1).map(|k| k.0).collect();
         match given[..] {
             [] => {
-                return Err(Refused::new(
+                return Err(InvalidField::new(
                     "views",
                     "no view; give views, a turntable, keyframes or a flythrough",
                 ));
             }
             [first, second, ..] => {
                 let problem = format!("given beside {first}; leave one of them out");
-                return Err(Refused::new(second, problem));
+                return Err(InvalidField::new(second, problem));
             }
             [_] => {}
         }
         let n = self.all_frames();
         if n > MAX_FRAMES && !self.views.is_empty() {
-            return Err(Refused::new("views", format!("{n} views; give at most {MAX_FRAMES}")));
+            return Err(InvalidField::new(
+                "views",
+                format!("{n} views; give at most {MAX_FRAMES}"),
+            ));
         }
         if n == 0 || n > MAX_FRAMES {
-            return Err(Refused::new("frames", format!("{n} frames; give 1 to {MAX_FRAMES}")));
+            return Err(InvalidField::new("frames", format!("{n} frames; give 1 to {MAX_FRAMES}")));
         }
         self.keyframes.as_ref().map_or(Ok(()), KeyFrames::check)?;
         self.flythrough.as_ref().map_or(Ok(()), FlyThrough::check)?;
@@ -299,7 +302,7 @@ impl ViewPath {
         if let Some([first, last]) = self.range
             && (first > last || last as usize >= self.all_frames())
         {
-            return Err(Refused::new(
+            return Err(InvalidField::new(
                 "range",
                 format!("{first}..{last}; the path has frames 0 to {}", self.all_frames() - 1),
             ));
@@ -331,7 +334,7 @@ impl ViewPath {
     ///
     /// # Panics
     /// If that frame is not wanted.
-    pub fn only(&self, number: usize) -> ViewPath {
+    pub fn single_frame(&self, number: usize) -> ViewPath {
         let first = self.first_frame();
         assert!((first..first + self.frames()).contains(&number), "frame {number}");
         let one = ViewPath { range: None, ..self.clone() };
@@ -356,7 +359,7 @@ impl ViewPath {
         i: usize,
         lattice: &Lattice,
         orientation: Orientation,
-    ) -> Result<Camera, Refused> {
+    ) -> Result<Camera, InvalidField> {
         self.prepare(lattice, orientation)?.camera(i)
     }
 
@@ -368,7 +371,7 @@ impl ViewPath {
         &self,
         lattice: &Lattice,
         orientation: Orientation,
-    ) -> Result<Cameras<'_>, Refused> {
+    ) -> Result<Cameras<'_>, InvalidField> {
         let curve = if let Some(keys) = &self.keyframes {
             Curve::Keys(keys.prepare(lattice, orientation)?)
         } else if let Some(f) = &self.flythrough {
@@ -399,7 +402,7 @@ impl Cameras<'_> {
     ///
     /// # Errors
     /// Names the field that is not finite or has no meaning.
-    pub fn camera(&self, i: usize) -> Result<Camera, Refused> {
+    pub fn camera(&self, i: usize) -> Result<Camera, InvalidField> {
         let i = self.path.first_frame() + i;
         match (&self.curve, &self.path.turntable) {
             (Curve::Keys(keys), _) => Ok(keys.at(i as f64)),
@@ -411,14 +414,14 @@ impl Cameras<'_> {
 }
 
 impl PathView {
-    fn camera(&self, i: usize, lattice: &Lattice) -> Result<Camera, Refused> {
+    fn camera(&self, i: usize, lattice: &Lattice) -> Result<Camera, InvalidField> {
         let name = |f: &str| format!("views[{i}].{f}");
         let finite = |field: &str, x: [f64; 3]| {
             let v = DVec3::from_array(x);
             if v.is_finite() {
                 Ok(v)
             } else {
-                Err(Refused::new(name(field), "must be finite numbers"))
+                Err(InvalidField::new(name(field), "must be finite numbers"))
             }
         };
         let (eye, target) = (finite("eye", self.eye)?, finite("target", self.target)?);
@@ -433,7 +436,7 @@ impl PathView {
             }
         };
         if to_eye.length() == 0.0 {
-            return Err(Refused::new(name("eye"), "is the target; move one of them"));
+            return Err(InvalidField::new(name("eye"), "is the target; move one of them"));
         }
         Ok(Camera { to_eye, up, target: target - lattice.centre(), projection })
     }
@@ -445,15 +448,15 @@ impl Turntable {
         i: usize,
         lattice: &Lattice,
         orientation: Orientation,
-    ) -> Result<Camera, Refused> {
+    ) -> Result<Camera, InvalidField> {
         let t = self;
         for (field, x) in [("start", t.start), ("step", t.step)] {
             if x.is_nan() || x.abs() > 1e9 {
-                return Err(Refused::new(field, format!("{x} degrees; give a finite angle")));
+                return Err(InvalidField::new(field, format!("{x} degrees; give a finite angle")));
             }
         }
         if t.elevation.is_nan() || t.elevation.abs() > 90.0 {
-            return Err(Refused::new(
+            return Err(InvalidField::new(
                 "elevation",
                 format!("{} degrees; give -90 to 90", t.elevation),
             ));
@@ -500,12 +503,12 @@ fn sin_cos_degrees(degrees: f64) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::volume::{Samples, ValueMap};
+    use slabcast_common::volume::{Samples, ValueMap};
 
     fn cameras(t: Turntable, up: Option<Axis>) -> Camera {
         let l = Lattice::from_spacing([256; 3], [1.0; 3]);
         let o = Orientation::new(up, None).unwrap();
-        ViewPath::turn([512, 512], t).camera(0, &l, o).unwrap()
+        ViewPath::from_turntable([512, 512], t).camera(0, &l, o).unwrap()
     }
 
     #[test]
@@ -513,12 +516,12 @@ mod tests {
         let l = Lattice::from_spacing([9; 3], [1.0; 3]);
         let o = Orientation::new(None, None).unwrap();
         let turn = Turntable { start: 20.1, step: 5.3, frames: 40, ..Turntable::default() };
-        let path = ViewPath::turn([4, 4], turn);
+        let path = ViewPath::from_turntable([4, 4], turn);
         for i in 0..40 {
-            let one = path.only(i);
+            let one = path.single_frame(i);
             assert_eq!(one.frames(), 1);
             assert_eq!(path.camera(i, &l, o), one.camera(0, &l, o), "{i}");
-            assert_eq!(one.only(0), one);
+            assert_eq!(one.single_frame(0), one);
         }
     }
 
@@ -528,12 +531,13 @@ mod tests {
         let values = [(-1000.0, 500), (-40.0, 250), (60.0, 250), (900.0, 40)];
         let ct: Vec<f32> =
             values.iter().flat_map(|&(hu, n)| std::iter::repeat_n(hu as f32, n)).collect();
-        let summary = |v: Vec<f32>| ValueSummary::of(&Samples::F32(v), ValueMap::IDENTITY);
+        let summary =
+            |v: Vec<f32>| ValueSummary::from_samples(&Samples::F32(v), ValueMap::IDENTITY);
         let mr = summary(ct.iter().map(|v| v + 5000.0).collect());
         let ct = summary(ct);
         let front = |up: Option<&str>, summary, anatomical| {
             let up = up.map(|a| a.parse().unwrap());
-            Orientation::of(up, None, summary, anatomical).unwrap().front.to_string()
+            Orientation::for_volume(up, None, summary, anatomical).unwrap().front.to_string()
         };
         assert_eq!(front(None, &ct, false), "-y");
         assert_eq!(front(Some("z"), &ct, false), "-y");
@@ -542,7 +546,7 @@ mod tests {
         assert_eq!(front(Some("y"), &ct, false), "+z");
         assert_eq!(front(None, &ct, true), "+y");
         assert_eq!(front(None, &mr, false), "+y");
-        let given = Orientation::of(None, Some(Axis::positive(0)), &ct, false).unwrap();
+        let given = Orientation::for_volume(None, Some(Axis::positive(0)), &ct, false).unwrap();
         assert_eq!(given.front, Axis::positive(0));
     }
 

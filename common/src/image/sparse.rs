@@ -6,26 +6,13 @@
 //! whoever does it does it to the same bytes. A leaf of 16x16 pixels whose every byte is that of a pixel
 //! without a volume is left out, whatever its sums are: what is put back in its place is the same.
 
-use crate::image::{Background, Encoder, PixelFormat, TilePixels};
+use super::encode::{Encoder, PixelEncoding, PixelFormat};
+use super::tile::{LEAF_EDGE, TilePixels};
 use crate::occlusion::Rect;
-use serde::{Deserialize, Serialize};
-
-/// Edge of a leaf in pixels: that of the smallest macrotile. Of 8 pixels four times as many are looked
-/// at to save a rim of empty ones, which pack to nearly nothing anyway.
-pub const LEAF: usize = 16;
-
-/// What finished pixels are.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Finish {
-    /// How they are written.
-    pub format: PixelFormat,
-    /// Over what.
-    pub background: Background,
-}
 
 /// Finished pixels of a tile.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Leaves {
+pub struct SparseTile {
     /// Columns and rows of the tile, in pixels.
     pub size: [u32; 2],
     /// How pixels are written.
@@ -36,16 +23,16 @@ pub struct Leaves {
     /// Pixels of the leaves that are there, one leaf after the other, row-major in each.
     pub data: Vec<u8>,
     /// The largest opacity of a pixel of the tile.
-    pub alpha_most: f32,
+    pub max_alpha: f32,
 }
 
 /// The leaves of a tile of so many pixels, in order: columns and rows of pixels.
 fn leaves(size: [u32; 2]) -> impl Iterator<Item = [std::ops::Range<usize>; 2]> {
     let [w, h] = size.map(|n| n as usize);
-    let cut = |at: usize, end: usize| at..(at + LEAF).min(end);
+    let cut = |at: usize, end: usize| at..(at + LEAF_EDGE).min(end);
     (0..h)
-        .step_by(LEAF)
-        .flat_map(move |y| (0..w).step_by(LEAF).map(move |x| [cut(x, w), cut(y, h)]))
+        .step_by(LEAF_EDGE)
+        .flat_map(move |y| (0..w).step_by(LEAF_EDGE).map(move |x| [cut(x, w), cut(y, h)]))
 }
 
 /// The largest of opacities: of eighths first, since each of one after the other waits for the one before it.
@@ -64,27 +51,18 @@ fn there(mask: &[u8], leaf: usize) -> bool {
     mask.get(leaf / 8).is_some_and(|byte| byte >> (leaf % 8) & 1 == 1)
 }
 
-impl Finish {
-    /// Bytes of a pixel that shows nothing but the background.
-    fn blank(&self) -> Vec<u8> {
-        let mut blank = Vec::new();
-        Encoder::new(self.format, self.background).put(&[[0.0; 4]], &mut blank);
-        blank
-    }
-}
-
-impl Leaves {
+impl SparseTile {
     /// Finishes a tile of sums that went through all sheets.
     ///
     /// # Panics
     /// If the planes do not have the tile's size.
-    pub fn of(pixels: &TilePixels, size: [u32; 2], finish: &Finish) -> Leaves {
+    pub fn encode(pixels: &TilePixels, size: [u32; 2], finish: &PixelEncoding) -> SparseTile {
         let width = size[0] as usize;
         let n = width * size[1] as usize;
         assert!(pixels.a.len() == n && pixels.colour.len() == n, "planes of the tile's size");
         let encoder = Encoder::new(finish.format, finish.background);
-        let blank = finish.blank().repeat(LEAF * LEAF);
-        let mut mask = vec![0; Leaves::mask_len(size)];
+        let blank = finish.blank().repeat(LEAF_EDGE * LEAF_EDGE);
+        let mut mask = vec![0; SparseTile::mask_len(size)];
         let mut data = Vec::new();
         for (i, [xs, ys]) in leaves(size).enumerate() {
             let row = |y: usize| {
@@ -99,18 +77,18 @@ impl Leaves {
                 mask[i / 8] |= 1 << (i % 8);
             }
         }
-        Leaves { size, format: finish.format, mask, data, alpha_most: most(&pixels.a) }
+        SparseTile { size, format: finish.format, mask, data, max_alpha: most(&pixels.a) }
     }
 
     /// A tile without a leaf.
-    pub fn blank(size: [u32; 2], format: PixelFormat) -> Leaves {
-        let mask = vec![0; Leaves::mask_len(size)];
-        Leaves { size, format, mask, data: Vec::new(), alpha_most: 0.0 }
+    pub fn blank(size: [u32; 2], format: PixelFormat) -> SparseTile {
+        let mask = vec![0; SparseTile::mask_len(size)];
+        SparseTile { size, format, mask, data: Vec::new(), max_alpha: 0.0 }
     }
 
     /// Bytes of the mask of a tile of so many pixels.
     pub fn mask_len(size: [u32; 2]) -> usize {
-        let [columns, rows] = size.map(|n| (n as usize).div_ceil(LEAF));
+        let [columns, rows] = size.map(|n| (n as usize).div_ceil(LEAF_EDGE));
         (columns * rows).div_ceil(8)
     }
 
@@ -128,16 +106,16 @@ impl Leaves {
     /// Whether the parts fit each other; says what does not.
     pub fn check(&self) -> Result<(), &'static str> {
         let leaves = leaves(self.size).count();
-        if self.mask.len() != Leaves::mask_len(self.size) {
+        if self.mask.len() != SparseTile::mask_len(self.size) {
             return Err("a mask that is not of its tile");
         }
         if (leaves..8 * self.mask.len()).any(|i| there(&self.mask, i)) {
             return Err("a leaf beyond its tile");
         }
-        if self.data.len() != Leaves::data_len(self.size, self.format, &self.mask) {
+        if self.data.len() != SparseTile::data_len(self.size, self.format, &self.mask) {
             return Err("more or fewer bytes than its leaves have");
         }
-        if !self.alpha_most.is_finite() {
+        if !self.max_alpha.is_finite() {
             return Err("an opacity that is not finite");
         }
         Ok(())
@@ -163,15 +141,15 @@ impl Leaves {
 
 /// A picture that finished tiles are laid into; the background is where none is.
 #[derive(Clone, Debug)]
-pub struct Mosaic {
+pub struct FrameAssembler {
     format: PixelFormat,
     width: usize,
     picture: Vec<u8>,
 }
 
-impl Mosaic {
+impl FrameAssembler {
     /// Nothing but the background.
-    pub fn new(size: [u32; 2], finish: &Finish) -> Mosaic {
+    pub fn new(size: [u32; 2], finish: &PixelEncoding) -> FrameAssembler {
         let [width, height] = size.map(|n| n as usize);
         let blank = finish.blank();
         let picture = if blank.iter().all(|b| *b == blank[0]) {
@@ -179,14 +157,14 @@ impl Mosaic {
         } else {
             blank.repeat(width * height)
         };
-        Mosaic { format: finish.format, width, picture }
+        FrameAssembler { format: finish.format, width, picture }
     }
 
     /// Lays tiles into it.
     ///
     /// # Panics
     /// If a tile has another format, its parts do not fit each other, or it leaves the picture.
-    pub fn lay(&mut self, tiles: &[(Rect, Leaves)]) {
+    pub fn place(&mut self, tiles: &[(Rect, SparseTile)]) {
         for (tile, leaves) in tiles {
             assert!(leaves.format == self.format, "a frame has one format");
             leaves.write(*tile, self.width, &mut self.picture);
@@ -194,7 +172,7 @@ impl Mosaic {
     }
 
     /// Its bytes.
-    pub fn end(self) -> Vec<u8> {
+    pub fn into_bytes(self) -> Vec<u8> {
         self.picture
     }
 }
@@ -202,7 +180,7 @@ impl Mosaic {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::image::{COLOUR_UNIT, FrameState};
+    use crate::image::{Background, COLOUR_UNIT, FrameState};
 
     const FORMATS: [PixelFormat; 4] =
         [PixelFormat::Rgb8, PixelFormat::Rgba8, PixelFormat::Rgba16, PixelFormat::Rgba32F];
@@ -217,7 +195,7 @@ mod tests {
         let (mut a, mut colour) = (Vec::new(), Vec::new());
         for y in 0..tile.height() {
             for x in 0..tile.width() {
-                let there = match (x / LEAF + y / LEAF) % 4 {
+                let there = match (x / LEAF_EDGE + y / LEAF_EDGE) % 4 {
                     0 => 0.0,
                     1 => 1.0,
                     2 => [0.0, 1.0, next() as f32 * COLOUR_UNIT][(x + y) % 3],
@@ -247,52 +225,55 @@ mod tests {
                 Background::Colour([0.0; 3]),
                 Background::Colour([0.2, 0.5, 1.0]),
             ] {
-                let finish = Finish { format, background };
+                let finish = PixelEncoding { format, background };
                 let (mut sums, mut done) = (FrameState::new(size), FrameState::new(size));
                 let (mut left_out, mut all) = (0, 0);
                 for (tile, seed) in tiles.into_iter().zip(1..) {
                     let pixels = pixels(tile, seed);
                     let size = [tile.width() as u32, tile.height() as u32];
-                    let leaves = Leaves::of(&pixels, size, &finish);
+                    let leaves = SparseTile::encode(&pixels, size, &finish);
                     assert_eq!(leaves.check(), Ok(()));
                     assert_eq!(leaves.pixels(), tile.area());
                     left_out += tile.area() - leaves.data.len() / format.bytes();
                     all += tile.area();
-                    sums.lay(tile, pixels);
-                    done.lay_finished(tile, leaves);
+                    sums.place_sums(tile, pixels);
+                    done.place_encoded(tile, leaves);
                 }
                 assert!(left_out > all / 8 && left_out < all, "{left_out} of {all} pixels");
                 let want = sums.encode(&finish, true);
-                assert_eq!(want.bytes, sums.finish().encode(format, background));
-                assert_eq!(want.sha256, Some(sums.finish().sha256()));
+                assert_eq!(want.bytes, sums.to_picture().encode(format, background));
+                assert_eq!(want.sha256, Some(sums.to_picture().sha256()));
                 let plain = sums.encode(&finish, false);
                 assert_eq!((plain.bytes, plain.sha256), (want.bytes.clone(), None));
                 let composed = done.encode(&finish, false);
                 assert_eq!((composed.bytes, composed.sha256), (want.bytes, None));
-                assert_eq!(done.alpha_most(), sums.alpha_most());
+                assert_eq!(done.max_alpha(), sums.max_alpha());
             }
         }
     }
 
     #[test]
     fn a_frame_that_nothing_came_of_is_background() {
-        let finish =
-            Finish { format: PixelFormat::Rgb8, background: Background::Colour([1.0, 0.5, 0.0]) };
+        let finish = PixelEncoding {
+            format: PixelFormat::Rgb8,
+            background: Background::Colour([1.0, 0.5, 0.0]),
+        };
         let state = FrameState::new([33, 5]);
         assert_eq!(state.encode(&finish, false).bytes, state.encode(&finish, true).bytes);
         let mut laid = FrameState::new([33, 5]);
         let tile = Rect::new(0, 0, 33, 5);
-        laid.lay_finished(tile, Leaves::blank([33, 5], PixelFormat::Rgb8));
+        laid.place_encoded(tile, SparseTile::blank([33, 5], PixelFormat::Rgb8));
         assert_eq!(laid.encode(&finish, false).bytes, state.encode(&finish, true).bytes);
     }
 
     #[test]
     fn parts_that_do_not_fit_are_named() {
         let tile = Rect::new(0, 0, 40, 20);
-        let finish = Finish { format: PixelFormat::Rgba8, background: Background::Transparent };
-        let good = Leaves::of(&pixels(tile, 3), [40, 20], &finish);
+        let finish =
+            PixelEncoding { format: PixelFormat::Rgba8, background: Background::Transparent };
+        let good = SparseTile::encode(&pixels(tile, 3), [40, 20], &finish);
         assert_eq!(good.mask.len(), 1, "six leaves");
-        let broken = |change: fn(&mut Leaves)| {
+        let broken = |change: fn(&mut SparseTile)| {
             let mut leaves = good.clone();
             change(&mut leaves);
             leaves.check().unwrap_err()
@@ -301,7 +282,7 @@ mod tests {
         assert!(broken(|l| l.mask[0] |= 1 << 6).contains("beyond"));
         assert!(broken(|l| l.data.truncate(1)).contains("bytes"));
         assert!(broken(|l| l.mask[0] ^= 1).contains("bytes"));
-        assert!(broken(|l| l.alpha_most = f32::NAN).contains("finite"));
+        assert!(broken(|l| l.max_alpha = f32::NAN).contains("finite"));
         assert!(broken(|l| l.format = PixelFormat::Rgb8).contains("bytes"));
     }
 }

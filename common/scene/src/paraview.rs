@@ -11,14 +11,14 @@
 //! are of one vox. `Prolab` and `Lab/CIEDE2000` are refused: their lines are defined by an
 //! iteration.
 
-use crate::colour::{Space, between};
-use crate::math::{linear_from_srgb, srgb_from_linear};
-use crate::quality::Refused;
-use crate::shade::Shading;
-use crate::transfer::{
-    ColorSpace, Domain, MAX_POINTS, NanLook, OpacityUnit, TransferFunction, interpolate,
-};
+use crate::colour::{ColourSpace, interpolate_colour};
 use serde::Deserialize;
+use slabcast_common::math::{linear_from_srgb, srgb_from_linear};
+use slabcast_common::quality::InvalidField;
+use slabcast_common::shade::Shading;
+use slabcast_common::transfer::{
+    ColorSpace, Domain, MAX_POINTS, NanColour, OpacityUnit, TransferFunction, interpolate,
+};
 
 /// How far off a line may be, in sRGB numbers and alphas: half an 8-bit step.
 const OFF: f64 = 0.5 / 255.0;
@@ -48,7 +48,7 @@ struct Map {
 
 /// A map as it was read.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Read {
+pub struct ColourMap {
     /// What ParaView calls it.
     pub name: Option<String>,
     /// Colours over file values; opacities only if the file has `Points`.
@@ -56,11 +56,11 @@ pub struct Read {
     /// `[x, alpha]`; empty where the file has none.
     pub opacities: Vec<[f64; 2]>,
     /// Look of NaN.
-    pub nan: NanLook,
+    pub nan: NanColour,
 }
 
 /// Whether a text looks like ParaView's: a list, or an object with `RGBPoints`.
-pub fn is(text: &str) -> bool {
+pub fn looks_like_paraview(text: &str) -> bool {
     text.trim_start().starts_with('[') || text.contains("\"RGBPoints\"")
 }
 
@@ -68,8 +68,8 @@ pub fn is(text: &str) -> bool {
 ///
 /// # Errors
 /// Names the key that can't be used.
-pub fn read(text: &str) -> Result<Read, Refused> {
-    let whole = |problem: String| Refused::new("colour map", problem);
+pub fn parse(text: &str) -> Result<ColourMap, InvalidField> {
+    let whole = |problem: String| InvalidField::new("colour map", problem);
     let value: serde_json::Value =
         serde_json::from_str(text).map_err(|e| whole(format!("not valid: {e}")))?;
     let first = match value {
@@ -79,7 +79,10 @@ pub fn read(text: &str) -> Result<Read, Refused> {
     let first = first.ok_or_else(|| whole("is an empty list; give a map".into()))?;
     let map: Map = serde_json::from_value(first).map_err(|e| whole(format!("not valid: {e}")))?;
     if map.use_log_scale.is_some_and(|x| x != 0.0) {
-        return Err(Refused::new("UseLogScale", "a logarithmic scale is not drawn; turn it off"));
+        return Err(InvalidField::new(
+            "UseLogScale",
+            "a logarithmic scale is not drawn; turn it off",
+        ));
     }
     let (points, rest) = map.rgb_points.as_chunks::<4>();
     if points.is_empty() || !rest.is_empty() {
@@ -88,12 +91,12 @@ pub fn read(text: &str) -> Result<Read, Refused> {
         } else {
             "is missing: this map has colours for categories (IndexedColors) alone".into()
         };
-        return Err(Refused::new("RGBPoints", problem));
+        return Err(InvalidField::new("RGBPoints", problem));
     }
     let unit = |x: f64| (0.0..=1.0).contains(&x);
     for (i, p) in points.iter().enumerate() {
         if !p[0].is_finite() || !p[1..].iter().all(|&c| unit(c)) {
-            return Err(Refused::new(
+            return Err(InvalidField::new(
                 format!("RGBPoints[{}]", 4 * i),
                 "x must be finite and r, g, b in 0 to 1",
             ));
@@ -102,13 +105,13 @@ pub fn read(text: &str) -> Result<Read, Refused> {
     let mut points = points.to_vec();
     points.sort_by(|a, b| a[0].total_cmp(&b[0]));
     let space = match map.color_space.as_deref() {
-        None | Some("RGB") => Space::Rgb,
-        Some("HSV") => Space::Hsv,
-        Some("Lab" | "CIELAB" | "LAB") => Space::Lab,
-        Some("Diverging") => Space::Diverging,
-        Some("Step") => Space::Step,
+        None | Some("RGB") => ColourSpace::Rgb,
+        Some("HSV") => ColourSpace::Hsv,
+        Some("Lab" | "CIELAB" | "LAB") => ColourSpace::Lab,
+        Some("Diverging") => ColourSpace::Diverging,
+        Some("Step") => ColourSpace::Step,
         Some(other) => {
-            return Err(Refused::new(
+            return Err(InvalidField::new(
                 "ColorSpace",
                 format!("`{other}` is not drawn; give RGB, HSV, Lab, Diverging or Step"),
             ));
@@ -116,11 +119,14 @@ pub fn read(text: &str) -> Result<Read, Refused> {
     };
     let (opacities, rest) = map.points.as_chunks::<4>();
     if !rest.is_empty() {
-        return Err(Refused::new("Points", "give x, alpha, midpoint, sharpness of each point"));
+        return Err(InvalidField::new(
+            "Points",
+            "give x, alpha, midpoint, sharpness of each point",
+        ));
     }
     for (i, p) in opacities.iter().enumerate() {
         if !p[0].is_finite() || !p[1..].iter().all(|&c| unit(c)) {
-            return Err(Refused::new(
+            return Err(InvalidField::new(
                 format!("Points[{}]", 4 * i),
                 "x must be finite and alpha, midpoint, sharpness in 0 to 1",
             ));
@@ -131,13 +137,13 @@ pub fn read(text: &str) -> Result<Read, Refused> {
     let color = map.nan_color.unwrap_or([1.0, 1.0, 0.0]);
     let opacity = map.nan_opacity.unwrap_or(0.0);
     if !color.iter().all(|&c| unit(c)) || !unit(opacity) {
-        return Err(Refused::new("NanColor, NanOpacity", "must be in 0 to 1"));
+        return Err(InvalidField::new("NanColor, NanOpacity", "must be in 0 to 1"));
     }
-    let read = Read {
+    let read = ColourMap {
         name: map.name.and_then(|name| name.as_str().map(String::from)),
         colours: colours(&points, space),
         opacities: alphas(&opacities),
-        nan: NanLook { color, opacity },
+        nan: NanColour { color, opacity },
     };
     if read.colours.len() > MAX_POINTS || read.opacities.len() > MAX_POINTS {
         return Err(whole("has too many points; give fewer".into()));
@@ -145,14 +151,14 @@ pub fn read(text: &str) -> Result<Read, Refused> {
     Ok(read)
 }
 
-impl Read {
+impl ColourMap {
     /// The whole transfer function.
     ///
     /// # Errors
     /// If the file has no opacities.
-    pub fn function(self) -> Result<TransferFunction, Refused> {
+    pub fn into_function(self) -> Result<TransferFunction, InvalidField> {
         if self.opacities.is_empty() {
-            return Err(Refused::new(
+            return Err(InvalidField::new(
                 "Points",
                 "is missing: the file has colours and no opacities; use it with --colors, beside a \
                  --tf that has opacities",
@@ -182,7 +188,7 @@ impl Read {
 }
 
 /// The same colours on lines of linear light.
-fn colours(points: &[[f64; 4]], space: Space) -> Vec<[f64; 4]> {
+fn colours(points: &[[f64; 4]], space: ColourSpace) -> Vec<[f64; 4]> {
     let mut out = vec![points[0]];
     for pair in points.windows(2) {
         let ([xa, ra, ga, ba], [xb, rb, gb, bb]) = (pair[0], pair[1]);
@@ -192,7 +198,7 @@ fn colours(points: &[[f64; 4]], space: Space) -> Vec<[f64; 4]> {
             out.push(place(0.0, b));
             continue;
         }
-        if space == Space::Step {
+        if space == ColourSpace::Step {
             out.extend([place(0.0, b), place(1.0, b)]);
             continue;
         }
@@ -200,7 +206,7 @@ fn colours(points: &[[f64; 4]], space: Space) -> Vec<[f64; 4]> {
         let at = |t: f64| match t {
             0.0 => a,
             1.0 => b,
-            t => between(space, a, b, t),
+            t => interpolate_colour(space, a, b, t),
         };
         curve(&at, (0.0, a), (1.0, b), 0, &mut |t, c| out.push(place(t, c)));
     }
@@ -299,16 +305,19 @@ fn sharp(a: f64, b: f64, midpoint: f64, sharpness: f64, s: f64) -> f64 {
 ///
 /// # Errors
 /// If it has opacities that ParaView can't have.
-pub fn write(
+pub fn to_json(
     tf: &TransferFunction,
     name: &str,
     range: Option<(f64, f64)>,
-) -> Result<String, Refused> {
+) -> Result<String, InvalidField> {
     if tf.opacity_unit == OpacityUnit::Extinction {
-        return Err(Refused::new("opacity_unit", "ParaView has alphas alone; give alpha_per_vox"));
+        return Err(InvalidField::new(
+            "opacity_unit",
+            "ParaView has alphas alone; give alpha_per_vox",
+        ));
     }
     if !tf.gradient_opacity.is_empty() {
-        return Err(Refused::new(
+        return Err(InvalidField::new(
             "gradient_opacity",
             "ParaView's colour maps have none; leave it out",
         ));
@@ -399,17 +408,18 @@ mod tests {
     #[test]
     fn what_is_read_looks_as_it_does_in_paraview() {
         for (name, space) in [
-            ("RGB", Space::Rgb),
-            ("HSV", Space::Hsv),
-            ("Lab", Space::Lab),
-            ("Diverging", Space::Diverging),
+            ("RGB", ColourSpace::Rgb),
+            ("HSV", ColourSpace::Hsv),
+            ("Lab", ColourSpace::Lab),
+            ("Diverging", ColourSpace::Diverging),
         ] {
-            let tf = read(&map(name, &RGB, &OPACITY)).unwrap().function().unwrap();
+            let tf = parse(&map(name, &RGB, &OPACITY)).unwrap().into_function().unwrap();
             for i in 1..100 {
                 let x = -10.0 + 0.5 * f64::from(i);
                 let (a, b) = if x < 5.0 { (0, 4) } else { (4, 8) };
                 let end = |i: usize| [RGB[i + 1], RGB[i + 2], RGB[i + 3]];
-                let want = between(space, end(a), end(b), (x - RGB[a]) / (RGB[b] - RGB[a]));
+                let want =
+                    interpolate_colour(space, end(a), end(b), (x - RGB[a]) / (RGB[b] - RGB[a]));
                 let got = colour_at(&tf, x);
                 for c in 0..3 {
                     assert!(
@@ -421,7 +431,7 @@ mod tests {
             assert_eq!(tf.opacities, [[-10.0, 0.0], [0.0, 0.3], [40.0, 1.0]]);
             assert_eq!(tf.nan.color, [0.1, 0.2, 0.3]);
         }
-        let step = read(&map("Step", &RGB, &OPACITY)).unwrap().function().unwrap();
+        let step = parse(&map("Step", &RGB, &OPACITY)).unwrap().into_function().unwrap();
         assert_eq!(
             colour_at(&step, 6.0).map(|c| (c * 10.0).round()),
             [7.0, 0.0, 1.0],
@@ -432,16 +442,16 @@ mod tests {
     #[test]
     fn round_trips_give_the_same_bytes_after_the_first() {
         for space in ["RGB", "HSV", "Lab", "Diverging", "Step"] {
-            let first = read(&map(space, &RGB, &OPACITY)).unwrap().function().unwrap();
-            let text = write(&first, "t", None).unwrap();
-            let second = read(&text).unwrap().function().unwrap();
+            let first = parse(&map(space, &RGB, &OPACITY)).unwrap().into_function().unwrap();
+            let text = to_json(&first, "t", None).unwrap();
+            let second = parse(&text).unwrap().into_function().unwrap();
             for i in 0..=100 {
                 let x = -11.0 + 0.52 * f64::from(i);
                 let (a, b) = (colour_at(&first, x), colour_at(&second, x));
                 assert!((0..3).all(|c| (a[c] - b[c]).abs() < 1.0 / 255.0), "{space} at {x}");
             }
             assert_eq!(first.opacities, second.opacities);
-            assert_eq!(write(&second, "t", None).unwrap(), text, "{space}");
+            assert_eq!(to_json(&second, "t", None).unwrap(), text, "{space}");
         }
     }
 
@@ -460,11 +470,11 @@ mod tests {
                 opacities: alphas.iter().enumerate().map(|(i, &a)| [9.0 * i as f64, a]).collect(),
                 color_space: if linear { ColorSpace::Linear } else { ColorSpace::Srgb },
                 opacity_unit: OpacityUnit::AlphaPerVox,
-                nan: NanLook { color: [0.5; 3], opacity: 0.25 },
+                nan: NanColour { color: [0.5; 3], opacity: 0.25 },
                 gradient_opacity: vec![],
                 shading: Shading::default(),
             };
-            let back = read(&write(&tf, "ours", None).unwrap()).unwrap().function().unwrap();
+            let back = parse(&to_json(&tf, "ours", None).unwrap()).unwrap().into_function().unwrap();
             prop_assert_eq!(&back.opacities, &tf.opacities);
             for i in 0..80 {
                 let (a, b) = (colour_at(&tf, f64::from(i) * 0.5), colour_at(&back, f64::from(i) * 0.5));
@@ -478,7 +488,7 @@ mod tests {
     fn midpoints_and_sharpness_bend_opacities_as_vtk_does() {
         let with = |m: f64, s: f64| {
             let points = [0.0, 0.0, m, s, 10.0, 1.0, 0.5, 0.0];
-            read(&map("RGB", &RGB, &points)).unwrap().opacities
+            parse(&map("RGB", &RGB, &points)).unwrap().opacities
         };
         let at = |p: &[[f64; 2]], x: f64| interpolate(p, x)[1];
         assert!((at(&with(0.2, 0.0), 2.0) - 0.5).abs() < 1e-9, "half at the midpoint");
@@ -491,7 +501,7 @@ mod tests {
 
     #[test]
     fn files_that_cannot_be_used_name_the_key() {
-        let field = |text: &str| read(text).and_then(Read::function).unwrap_err().field;
+        let field = |text: &str| parse(text).and_then(ColourMap::into_function).unwrap_err().field;
         assert_eq!(field("[]"), "colour map");
         assert_eq!(field("[{"), "colour map");
         assert_eq!(field(r#"[{"RGBPoints":[0,0,0]}]"#), "RGBPoints");
@@ -501,6 +511,10 @@ mod tests {
         assert_eq!(field(r#"[{"RGBPoints":[0,0,0,1],"ColorSpace":"Prolab"}]"#), "ColorSpace");
         assert_eq!(field(r#"[{"RGBPoints":[0,0,0,1],"UseLogScale":1}]"#), "UseLogScale");
         assert_eq!(field(r#"[{"IndexedColors":[0,0,0]}]"#), "RGBPoints");
-        assert!(is("[{}]") && is(r#"{"RGBPoints":[]}"#) && !is(r#"{"version":1}"#));
+        assert!(
+            looks_like_paraview("[{}]")
+                && looks_like_paraview(r#"{"RGBPoints":[]}"#)
+                && !looks_like_paraview(r#"{"version":1}"#)
+        );
     }
 }

@@ -4,10 +4,10 @@
 //! belongs to the picture if its centre is inside, ends included. What is cut away still counts for
 //! the gradients at the cut, which are those of the data.
 
-use crate::quality::Refused;
-use crate::volume::Lattice;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
+use slabcast_common::quality::InvalidField;
+use slabcast_common::volume::Lattice;
 
 /// What the numbers of a [`Crop`] are.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -36,9 +36,9 @@ pub struct Crop {
 
 impl Crop {
     /// Checks what needs no lattice.
-    pub fn check(&self) -> Result<(), Refused> {
+    pub fn check(&self) -> Result<(), InvalidField> {
         for (name, [from, to]) in [("x", self.x), ("y", self.y), ("z", self.z)] {
-            let refuse = |problem: &str| Err(Refused::new(format!("crop.{name}"), problem));
+            let refuse = |problem: &str| Err(InvalidField::new(format!("crop.{name}"), problem));
             if [from, to].iter().flatten().any(|x| !x.is_finite()) {
                 return refuse("must be finite numbers; leave an end out that does not crop");
             }
@@ -55,7 +55,7 @@ impl Crop {
     ///
     /// # Errors
     /// If no sample can lie inside.
-    pub fn of(&self, lattice: &Lattice) -> Result<CropBox, Refused> {
+    pub fn resolve(&self, lattice: &Lattice) -> Result<CropBox, InvalidField> {
         self.check()?;
         // Relative to the centre, as everything is: a far-away origin changes no bit.
         let half = (0..3).fold(DVec3::ZERO, |sum, a| {
@@ -72,7 +72,7 @@ impl Crop {
             ends[0][a] = place(from, f64::NEG_INFINITY);
             ends[1][a] = place(to, f64::INFINITY);
             if ends[0][a] > half[a] || ends[1][a] < -half[a] {
-                return Err(Refused::new(
+                return Err(InvalidField::new(
                     format!("crop.{}", ["x", "y", "z"][a]),
                     format!(
                         "lies outside of the volume, which goes from {} to {} there",
@@ -98,7 +98,7 @@ pub struct CropBox {
 impl CropBox {
     /// Whether a sample is inside.
     #[inline]
-    pub fn holds(&self, lattice: &Lattice, at: [u32; 3]) -> bool {
+    pub fn contains(&self, lattice: &Lattice, at: [u32; 3]) -> bool {
         let from_centre = DVec3::from_array(at.map(f64::from)) - lattice.centre_index();
         let p = lattice.world_from_index() * from_centre;
         p.cmpge(self.lo).all() && p.cmple(self.hi).all()
@@ -162,9 +162,9 @@ mod tests {
         let mut l = Lattice::from_spacing([4, 4, 3], [1.0, 2.0, 1.0]);
         l.origin.x = 10.0;
         let inside = |text: &str| {
-            let b = text.parse::<Crop>().unwrap().of(&l).unwrap();
+            let b = text.parse::<Crop>().unwrap().resolve(&l).unwrap();
             let all = (0..48u32).map(|i| [i % 4, i / 4 % 4, i / 16]);
-            all.filter(|&at| b.holds(&l, at)).count()
+            all.filter(|&at| b.contains(&l, at)).count()
         };
         assert_eq!(inside(":,:,:"), 48);
         assert_eq!(inside("11:12,:,:"), 2 * 12, "ends are inside");
@@ -172,7 +172,7 @@ mod tests {
         assert_eq!(inside("50%:,:,:"), 2 * 12);
         assert_eq!(inside(":,0:3,:"), 2 * 12);
         assert_eq!(inside(":,:,0%:33%"), 16);
-        assert!("14:,:,:".parse::<Crop>().unwrap().of(&l).unwrap_err().field == "crop.x");
+        assert!("14:,:,:".parse::<Crop>().unwrap().resolve(&l).unwrap_err().field == "crop.x");
     }
 
     #[test]
@@ -195,6 +195,6 @@ mod tests {
         let l = Lattice::from_spacing([9; 3], [1.0; 3]);
         let far = Lattice { origin: DVec3::splat(1e7), ..l };
         let crop = Crop { unit: CropUnit::Unit, x: [Some(0.25), None], ..Crop::default() };
-        assert_eq!(crop.of(&l).unwrap(), crop.of(&far).unwrap());
+        assert_eq!(crop.resolve(&l).unwrap(), crop.resolve(&far).unwrap());
     }
 }

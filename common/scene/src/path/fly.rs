@@ -7,11 +7,11 @@
 //! where the flight is level.
 
 use super::Orientation;
-use crate::quality::Refused;
-use crate::view::{Camera, CameraProjection};
-use crate::volume::Lattice;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
+use slabcast_common::quality::InvalidField;
+use slabcast_common::view::{Camera, CameraProjection};
+use slabcast_common::volume::Lattice;
 
 /// Most points of a flight.
 pub(super) const MAX_POINTS: usize = 10_000;
@@ -45,9 +45,10 @@ pub struct FlyThrough {
 
 impl FlyThrough {
     /// Checks counts and numbers.
-    pub fn check(&self) -> Result<(), Refused> {
-        let refuse =
-            |field: &str, problem: &str| Err(Refused::new(format!("flythrough.{field}"), problem));
+    pub fn check(&self) -> Result<(), InvalidField> {
+        let refuse = |field: &str, problem: &str| {
+            Err(InvalidField::new(format!("flythrough.{field}"), problem))
+        };
         let least = if self.closed { 3 } else { 2 };
         if self.eyes.len() < least || self.eyes.len() > MAX_POINTS {
             return refuse(
@@ -84,7 +85,11 @@ impl FlyThrough {
     ///
     /// # Errors
     /// If it comes to its target.
-    pub(super) fn prepare(&self, lattice: &Lattice, o: Orientation) -> Result<Flight, Refused> {
+    pub(super) fn prepare(
+        &self,
+        lattice: &Lattice,
+        o: Orientation,
+    ) -> Result<Flight, InvalidField> {
         let centre = lattice.centre();
         // In vox from the centre: neither unit nor origin matters.
         let vox = lattice.vox();
@@ -128,7 +133,7 @@ impl FlyThrough {
                 } else {
                     "the flight turns on the spot"
                 };
-                return Err(Refused::new(
+                return Err(InvalidField::new(
                     "flythrough.eyes",
                     format!("{what} after point {}; move it", i / PIECES),
                 ));

@@ -3,17 +3,17 @@
 //! Bricks are kept from job to job and from worker to worker, so a set of them has a key that says
 //! what is in it. A set serves every job that wants no more.
 
-use crate::brick::BrickSetKey;
 use crate::path::{CropBox, ViewPath};
-use crate::quality::{Compositing, Keep, Refused};
-use crate::transfer::{Classifier, Support, TransferFunction};
 use crate::tween::Tween;
-use crate::volume::{Digest32, VolumeInfo};
 use sha2::{Digest, Sha256};
+use slabcast_common::brick::BrickSetKey;
+use slabcast_common::quality::{Compositing, InvalidField, Keep};
+use slabcast_common::transfer::{Classifier, Support, TransferFunction};
+use slabcast_common::volume::{Digest32, VolumeInfo};
 
 /// What bricks must hold.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Wanted {
+pub struct BrickNeeds {
     /// Codes that are visible.
     pub support: Support,
     /// A normal of each voxel.
@@ -24,10 +24,14 @@ pub struct Wanted {
     pub crop: Option<CropBox>,
 }
 
-impl Wanted {
+impl BrickNeeds {
     /// What one transfer function sees of the whole volume.
-    pub fn of(tf: &TransferFunction, info: &VolumeInfo, compositing: Compositing) -> Wanted {
-        Wanted {
+    pub fn for_transfer(
+        tf: &TransferFunction,
+        info: &VolumeInfo,
+        compositing: Compositing,
+    ) -> BrickNeeds {
+        BrickNeeds {
             support: Classifier::new(tf, info, compositing).support(),
             normals: tf.shading.on,
             gradients: !tf.gradient_opacity.is_empty(),
@@ -39,31 +43,31 @@ impl Wanted {
     ///
     /// # Errors
     /// If the box holds nothing.
-    pub fn of_path(
+    pub fn for_path(
         path: &ViewPath,
         tf: &TransferFunction,
         tween: Option<&Tween>,
         info: &VolumeInfo,
         compositing: Compositing,
-    ) -> Result<Wanted, Refused> {
-        let crop = path.crop.as_ref().map(|c| c.of(&info.lattice)).transpose()?;
+    ) -> Result<BrickNeeds, InvalidField> {
+        let crop = path.crop.as_ref().map(|c| c.resolve(&info.lattice)).transpose()?;
         let all: Vec<&TransferFunction> = match tween {
-            Some(tween) => tween.ends().collect(),
+            Some(tween) => tween.key_functions().collect(),
             None => vec![tf],
         };
-        let all = all.into_iter().map(|tf| Wanted::of(tf, info, compositing));
-        let union = all.reduce(|a, b| Wanted {
+        let all = all.into_iter().map(|tf| BrickNeeds::for_transfer(tf, info, compositing));
+        let union = all.reduce(|a, b| BrickNeeds {
             support: a.support.union(&b.support),
             normals: a.normals || b.normals,
             gradients: a.gradients || b.gradients,
             crop: None,
         });
-        Ok(Wanted { crop, ..union.unwrap_or_default() })
+        Ok(BrickNeeds { crop, ..union.unwrap_or_default() })
     }
 
     /// The same with what is kept although nothing needs it.
     #[must_use]
-    pub fn keeping(mut self, keep: Keep) -> Wanted {
+    pub fn with_kept(mut self, keep: Keep) -> BrickNeeds {
         if keep.empty {
             let all = (f64::NEG_INFINITY, f64::INFINITY);
             self.support = Support { intervals: vec![all], nan: true };
@@ -74,13 +78,13 @@ impl Wanted {
     }
 
     /// Whether voxels that nothing shows are in the bricks.
-    pub fn keeps_empty(&self) -> bool {
+    pub fn keeps_invisible(&self) -> bool {
         self.support.nan && self.support.intervals.contains(&(f64::NEG_INFINITY, f64::INFINITY))
     }
 
     /// Whether bricks made for this serve a job that wants `other`. A box must be the same: what
     /// lies outside of a smaller one would be drawn.
-    pub fn covers(&self, other: &Wanted) -> bool {
+    pub fn covers(&self, other: &BrickNeeds) -> bool {
         self.support.covers(&other.support)
             && (self.normals || !other.normals)
             && (self.gradients || !other.gradients)
@@ -88,7 +92,7 @@ impl Wanted {
     }
 
     /// The key of the brick set of a volume.
-    pub fn key(&self, volume: Digest32) -> BrickSetKey {
+    pub fn set_key(&self, volume: Digest32) -> BrickSetKey {
         let mut h = Sha256::new();
         h.update(b"slabcast bricks 1");
         h.update(volume.0);
@@ -114,30 +118,30 @@ impl Wanted {
 mod tests {
     use super::*;
     use crate::path::Crop;
-    use crate::volume::Lattice;
+    use slabcast_common::volume::Lattice;
 
     #[test]
     fn bricks_serve_whoever_wants_no_more() {
-        let wanted = |lo: f64, normals, crop: Option<&str>| Wanted {
+        let wanted = |lo: f64, normals, crop: Option<&str>| BrickNeeds {
             support: Support { intervals: vec![(lo, 255.0)], nan: false },
             normals,
             gradients: false,
             crop: crop.map(|c| {
                 let lattice = Lattice::from_spacing([9; 3], [1.0; 3]);
-                c.parse::<Crop>().unwrap().of(&lattice).unwrap()
+                c.parse::<Crop>().unwrap().resolve(&lattice).unwrap()
             }),
         };
         let all = wanted(10.0, true, None);
         assert!(all.covers(&wanted(20.0, false, None)) && all.covers(&all));
         assert!(!all.covers(&wanted(5.0, false, None)));
         assert!(!wanted(10.0, false, None).covers(&all), "normals are missing");
-        let edges = Wanted { gradients: true, ..all.clone() };
+        let edges = BrickNeeds { gradients: true, ..all.clone() };
         assert!(edges.covers(&all) && !all.covers(&edges), "gradients are missing");
         let half = wanted(10.0, true, Some("50%:,:,:"));
         assert!(half.covers(&wanted(12.0, true, Some("50%:,:,:"))));
         assert!(!all.covers(&half) && !half.covers(&all), "a box is part of what is drawn");
         let keys = [&all, &half, &edges, &wanted(10.0, false, None), &wanted(11.0, true, None)]
-            .map(|w| w.key(Digest32::default()));
+            .map(|w| w.set_key(Digest32::default()));
         for i in 0..keys.len() {
             assert!(!keys[..i].contains(&keys[i]));
         }

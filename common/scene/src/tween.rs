@@ -6,20 +6,21 @@
 //!
 //! What is visible in between is visible at one of the ends: where both opacities are zero, so is every
 //! mean of them. So the bricks of a path are those of the union of its functions' supports
-//! ([`Tween::ends`]), and no frame of it needs a brick more. A voxel that a frame holds and does not
+//! ([`Tween::key_functions`]), and no frame of it needs a brick more. A voxel that a frame holds and does not
 //! see has an extinction of zero and adds nothing: the frame is that of a job of its own, to the
 //! byte.
 
-use crate::math::{linear_from_srgb, srgb_from_linear};
-use crate::message::SceneSpec;
 use crate::path::{KeyFrames, ViewPath};
 use crate::presets;
-use crate::quality::{Quality, Refused, Sums};
-use crate::shade::{Light, Shading};
-use crate::transfer::{
-    Classifier, ColorSpace, Domain, NanLook, TransferChoice, TransferFunction, interpolate,
+use crate::transfer::TransferChoice;
+use slabcast_common::math::{linear_from_srgb, srgb_from_linear};
+use slabcast_common::message::SceneSpec;
+use slabcast_common::quality::{InvalidField, Quality, Sums};
+use slabcast_common::shade::{Light, Shading};
+use slabcast_common::transfer::{
+    Classifier, ColorSpace, Domain, NanColour, TransferFunction, interpolate,
 };
-use crate::volume::ValueSummary;
+use slabcast_common::volume::ValueSummary;
 
 /// The transfer functions of a path's frames.
 #[derive(Clone, Debug, PartialEq)]
@@ -34,21 +35,25 @@ impl Tween {
     ///
     /// # Errors
     /// Names the key whose function is wrong or can't be tweened.
-    pub fn of(path: &ViewPath, summary: &ValueSummary) -> Result<Option<Tween>, Refused> {
+    pub fn from_path(
+        path: &ViewPath,
+        summary: &ValueSummary,
+    ) -> Result<Option<Tween>, InvalidField> {
         let Some(mut frames) = path.keyframes.clone() else { return Ok(None) };
-        Tween::fix(&mut frames, summary)?;
+        Tween::resolve_presets(&mut frames, summary)?;
         let mut keys = Vec::new();
         for (i, key) in frames.keys.iter().enumerate() {
             let Some(TransferChoice::Function(tf)) = &key.tf else { continue };
-            let within =
-                |e: Refused| Refused::new(format!("keyframes.keys[{i}].tf.{}", e.field), e.problem);
+            let within = |e: InvalidField| {
+                InvalidField::new(format!("keyframes.keys[{i}].tf.{}", e.field), e.problem)
+            };
             tf.check().map_err(within)?;
             keys.push((frames.time(i), i, (**tf).clone()));
         }
         let Some((_, _, first)) = keys.first() else { return Ok(None) };
         let unit = first.opacity_unit;
         if let Some((_, i, _)) = keys.iter().find(|(_, _, tf)| tf.opacity_unit != unit) {
-            return Err(Refused::new(
+            return Err(InvalidField::new(
                 format!("keyframes.keys[{i}].tf.opacity_unit"),
                 "differs from the one before; give all keys one unit",
             ));
@@ -61,11 +66,14 @@ impl Tween {
     ///
     /// # Errors
     /// Names the key whose preset there is not.
-    pub fn fix(keys: &mut KeyFrames, summary: &ValueSummary) -> Result<(), Refused> {
+    pub fn resolve_presets(
+        keys: &mut KeyFrames,
+        summary: &ValueSummary,
+    ) -> Result<(), InvalidField> {
         for (i, key) in keys.keys.iter_mut().enumerate() {
             if let Some(TransferChoice::Name(name)) = &key.tf {
                 let tf = presets::by_name(name, summary)
-                    .map_err(|e| Refused::new(format!("keyframes.keys[{i}].tf"), e.problem))?;
+                    .map_err(|e| InvalidField::new(format!("keyframes.keys[{i}].tf"), e.problem))?;
                 key.tf = Some(TransferChoice::Function(Box::new(tf)));
             }
         }
@@ -73,7 +81,7 @@ impl Tween {
     }
 
     /// The function of a frame.
-    pub fn at(&self, frame: f64) -> TransferFunction {
+    pub fn transfer_at(&self, frame: f64) -> TransferFunction {
         let after = self.keys.partition_point(|k| k.0 <= frame);
         let Some(i) = after.checked_sub(1) else { return self.keys[0].1.clone() };
         let (from, exact, a) = &self.keys[i];
@@ -86,16 +94,17 @@ impl Tween {
     /// The scene of a frame, on the bricks of `base`, which is that of all frames but for the
     /// function. `sums` as they were asked for: the keys can have them, and no mean of two keys is
     /// less capped than both. Where they are decided it is for each frame.
-    pub fn scene(&self, base: &SceneSpec, sums: Sums, frame: f64) -> SceneSpec {
-        let transfer = self.at(frame);
+    pub fn scene_at(&self, base: &SceneSpec, sums: Sums, frame: f64) -> SceneSpec {
+        let transfer = self.transfer_at(frame);
         let classifier = Classifier::new(&transfer, &base.volume, base.quality.compositing);
         let asked = Quality { sums, ..base.quality };
-        let sums = classifier.sums(&asked, &base.volume.lattice).unwrap_or(base.quality.sums);
+        let sums =
+            classifier.choose_sums(&asked, &base.volume.lattice).unwrap_or(base.quality.sums);
         SceneSpec { transfer, quality: Quality { sums, ..base.quality }, ..base.clone() }
     }
 
     /// The functions whose supports together hold that of every frame.
-    pub fn ends(&self) -> impl Iterator<Item = &TransferFunction> {
+    pub fn key_functions(&self) -> impl Iterator<Item = &TransferFunction> {
         // Moving a point from shares to file values rounds it: both count.
         self.keys.iter().flat_map(|(_, exact, plain)| [exact, plain])
     }
@@ -117,7 +126,7 @@ fn plain(tf: &TransferFunction, summary: &ValueSummary) -> TransferFunction {
         color_space: ColorSpace::Linear,
         colors: tf.colors.iter().map(|p| [x(p[0]), c(p[1]), c(p[2]), c(p[3])]).collect(),
         opacities: tf.opacities.iter().map(|p| [x(p[0]), p[1]]).collect(),
-        nan: NanLook { color: tf.nan.color.map(c), opacity: tf.nan.opacity },
+        nan: NanColour { color: tf.nan.color.map(c), opacity: tf.nan.opacity },
         gradient_opacity: tf.gradient_opacity.clone(),
         ..tf.clone()
     }
@@ -126,7 +135,7 @@ fn plain(tf: &TransferFunction, summary: &ValueSummary) -> TransferFunction {
 /// `t` of the way from one plain function to another.
 fn blend(a: &TransferFunction, b: &TransferFunction, t: f64) -> TransferFunction {
     let mix = |x: f64, y: f64| (x * (1.0 - t) + y * t).clamp(x.min(y), x.max(y));
-    let nan = NanLook {
+    let nan = NanColour {
         color: std::array::from_fn(|i| mix(a.nan.color[i], b.nan.color[i])),
         opacity: mix(a.nan.opacity, b.nan.opacity),
     };
@@ -237,10 +246,10 @@ pub fn srgb_colours(tf: &TransferFunction) -> Vec<[f64; 4]> {
 mod tests {
     use super::*;
     use crate::path::Key;
-    use crate::quality::Compositing;
-    use crate::transfer::Classifier;
-    use crate::volume::{Digest32, Samples, Volume, VolumeInfo};
     use proptest::prelude::*;
+    use slabcast_common::quality::Compositing;
+    use slabcast_common::transfer::Classifier;
+    use slabcast_common::volume::{Digest32, Samples, Volume, VolumeInfo};
 
     fn info() -> VolumeInfo {
         Volume::from_fn_u8("v", [256, 1, 1], |i, _, _| i as u8).info(Digest32::default())
@@ -250,7 +259,7 @@ mod tests {
         let keys = choices.into_iter().map(|tf| Key { tf: Some(tf), ..Key::default() }).collect();
         let frames =
             KeyFrames { frames: 11, easing: Default::default(), up: None, front: None, keys };
-        ViewPath { keyframes: Some(frames), ..ViewPath::of_views([8, 8], vec![]) }
+        ViewPath { keyframes: Some(frames), ..ViewPath::from_views([8, 8], vec![]) }
     }
 
     fn names(names: &[&str]) -> ViewPath {
@@ -258,7 +267,7 @@ mod tests {
     }
 
     fn tween(p: &ViewPath) -> Tween {
-        Tween::of(p, &info().summary).unwrap().unwrap()
+        Tween::from_path(p, &info().summary).unwrap().unwrap()
     }
 
     fn classify(tf: &TransferFunction) -> Classifier {
@@ -270,19 +279,19 @@ mod tests {
     fn ends_are_the_functions_themselves() {
         let t = tween(&names(&["bone", "peer-semi", "fog"]));
         let named = |n: &str| presets::by_name(n, &info().summary).unwrap();
-        assert_eq!(t.at(0.0), named("bone"));
-        assert_eq!(t.at(5.0), named("peer-semi"));
-        assert_eq!(t.at(10.0), named("fog"));
-        assert_eq!(t.at(99.0), named("fog"));
-        assert_ne!(t.at(1.0), named("bone"));
+        assert_eq!(t.transfer_at(0.0), named("bone"));
+        assert_eq!(t.transfer_at(5.0), named("peer-semi"));
+        assert_eq!(t.transfer_at(10.0), named("fog"));
+        assert_eq!(t.transfer_at(99.0), named("fog"));
+        assert_ne!(t.transfer_at(1.0), named("bone"));
     }
 
     #[test]
     fn half_way_every_value_is_half_way() {
         let t = tween(&names(&["peer-opaque", "peer-vessels"]));
-        let [a, m, b] = [0.0, 5.0, 10.0].map(|x| classify(&t.at(x)));
+        let [a, m, b] = [0.0, 5.0, 10.0].map(|x| classify(&t.transfer_at(x)));
         for v in 0..=255u8 {
-            let at = |c: &Classifier| c.look(&Samples::U8(vec![v]), 0);
+            let at = |c: &Classifier| c.classify(&Samples::U8(vec![v]), 0);
             let alpha = |c: &Classifier| -libm::expm1(-f64::from(at(c).sigma));
             // The cap of opacity one is 2^-16 below it.
             assert!((alpha(&m) - (alpha(&a) + alpha(&b)) / 2.0).abs() < 2e-5, "alpha at {v}");
@@ -311,8 +320,8 @@ mod tests {
                 TransferChoice::Function(Box::new(tf))
             };
             let t = tween(&path(vec![of(&a, unit), of(&b, false)]));
-            let seen = classify(&t.at(frame)).support();
-            let union = t.ends().map(|tf| classify(tf).support())
+            let seen = classify(&t.transfer_at(frame)).support();
+            let union = t.key_functions().map(|tf| classify(tf).support())
                 .reduce(|a, b| a.union(&b)).unwrap();
             // By code: runs that touch are two in the union where a frame has one.
             let lost = (0..=255).map(f64::from).find(|&c| seen.contains(c) && !union.contains(c));
@@ -324,18 +333,18 @@ mod tests {
     #[test]
     fn light_fades_in() {
         let t = tween(&names(&["fog", "bone"]));
-        let s = t.at(5.0).shading;
+        let s = t.transfer_at(5.0).shading;
         assert!(
             s.on && (s.ambient - 0.6).abs() < 1e-12 && (s.diffuse - 0.35).abs() < 1e-12,
             "{s:?}"
         );
-        assert!(!t.at(0.0).shading.on);
+        assert!(!t.transfer_at(0.0).shading.on);
     }
 
     #[test]
     fn a_path_without_functions_has_no_tween_and_wrong_ones_are_named() {
-        let of = |p: &ViewPath| Tween::of(p, &info().summary);
-        assert_eq!(of(&ViewPath::of_views([8, 8], vec![])), Ok(None));
+        let of = |p: &ViewPath| Tween::from_path(p, &info().summary);
+        assert_eq!(of(&ViewPath::from_views([8, 8], vec![])), Ok(None));
         let e = of(&names(&["bone", "bonee"])).unwrap_err();
         assert!(e.field == "keyframes.keys[1].tf" && e.problem.contains("`bone`"), "{e}");
     }

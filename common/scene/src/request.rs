@@ -1,0 +1,37 @@
+//! A job as a client submits it.
+
+use crate::path::ViewPath;
+use crate::transfer::TransferChoice;
+use slabcast_common::image::{Background, PixelEncoding, PixelFormat};
+use slabcast_common::quality::{Quality, Work};
+
+/// What a client asks for.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PathRequest {
+    /// The client's own name for the request: the same key gives the same job.
+    pub client_key: String,
+    /// The views.
+    pub path: ViewPath,
+    /// Colours and opacities.
+    pub transfer: TransferChoice,
+    /// Quality.
+    pub quality: Quality,
+    /// How the work is cut.
+    pub work: Work,
+    /// How pixels leave the master.
+    pub format: PixelFormat,
+    /// Over which background.
+    pub background: Background,
+    /// Whether each frame's statistics come with spans for a trace.
+    pub want_trace: bool,
+    /// Whether each frame's statistics have the hash of its linear picture. Without it tiles travel as
+    /// finished pixels, which are fewer bytes.
+    pub want_hash: bool,
+}
+
+impl PathRequest {
+    /// What frames are finished to.
+    pub fn encoding(&self) -> PixelEncoding {
+        PixelEncoding { format: self.format, background: self.background }
+    }
+}

@@ -1,0 +1,82 @@
+//! Pixels of one tile while its frame is drawn: what a task starts from and what it adds.
+
+use crate::occlusion::Rect;
+
+/// Unit of fixed-point premultiplied colour.
+pub const COLOUR_UNIT: f32 = 1.0 / (1u32 << 28) as f32;
+
+/// Edge of a leaf in pixels: that of the smallest macrotile. Of 8 pixels four times as many are looked
+/// at to save a rim of empty ones, which pack to nearly nothing anyway.
+pub const LEAF_EDGE: usize = 16;
+
+/// Raw sums of one sheet at one pixel: extinction and the three sigma-weighted colours, as
+/// bits (of i32, or of f32 when the scene's sums are f32).
+pub type RawSums = [u32; 4];
+
+/// What a task starts from: its tile's pixels as the slabs before left them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TileState {
+    /// A, accumulated opacity, row-major in the tile.
+    pub a: Vec<f32>,
+    /// Raw sums of the last sheet before the slab; `None` when they are all zero.
+    pub last: Option<Vec<RawSums>>,
+}
+
+/// What a task gives back.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct TilePixels {
+    /// A after the slab, row-major in the tile.
+    pub a: Vec<f32>,
+    /// Premultiplied colour that the slab adds, in units of [`COLOUR_UNIT`].
+    pub colour: Vec<[u32; 3]>,
+    /// Raw sums of the slab's last sheet; `None` when they are all zero.
+    pub last: Option<Vec<RawSums>>,
+}
+
+/// A finished pixel: linear premultiplied RGBA.
+#[inline(always)]
+pub(crate) fn finished(a: f32, colour: [u32; 3]) -> [f32; 4] {
+    let [r, g, b] = colour;
+    [r as f32 * COLOUR_UNIT, g as f32 * COLOUR_UNIT, b as f32 * COLOUR_UNIT, a]
+}
+
+impl TilePixels {
+    /// Those of a piece of `tile`, which they are the pixels of.
+    ///
+    /// # Panics
+    /// If the piece is not inside the tile.
+    pub fn crop(&self, tile: Rect, piece: Rect) -> TilePixels {
+        fn rows<T: Copy>(plane: &[T], tile: Rect, piece: Rect) -> Vec<T> {
+            let from = (piece.x0 - tile.x0) as usize;
+            let rows = plane.chunks(tile.width()).skip((piece.y0 - tile.y0) as usize);
+            let rows = rows.take(piece.height()).map(|row| &row[from..from + piece.width()]);
+            rows.flatten().copied().collect()
+        }
+        assert_eq!(tile.union(&piece), tile, "a piece lies in its tile");
+        TilePixels {
+            a: rows(&self.a, tile, piece),
+            colour: rows(&self.colour, tile, piece),
+            last: self.last.as_ref().map(|last| rows(last, tile, piece)),
+        }
+    }
+
+    /// Writes the pixels of `tile`, which one slab made, into the rows of a picture of `size`.
+    ///
+    /// # Panics
+    /// If the tile leaves the picture.
+    pub fn write(&self, tile: Rect, size: [u32; 2], pixels: &mut [[f32; 4]]) {
+        for (y, (a, colour)) in
+            self.a.chunks(tile.width()).zip(self.colour.chunks(tile.width())).enumerate()
+        {
+            let row = (tile.y0 as usize + y) * size[0] as usize + tile.x0 as usize;
+            draw(&mut pixels[row..row + a.len()], a, colour);
+        }
+    }
+}
+
+/// Pixels of a row.
+pub(super) fn draw(row: &mut [[f32; 4]], a: &[f32], colour: &[[u32; 3]]) {
+    for ((to, &a), &colour) in row.iter_mut().zip(a).zip(colour) {
+        *to = finished(a, colour);
+    }
+}

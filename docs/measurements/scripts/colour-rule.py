@@ -3,7 +3,7 @@
     cargo build --release --locked
     python3 docs/measurements/scripts/colour-rule.py --data DIR --keep DIR --times
 
-runs `slabcast check colour-rule` on five volumes and the sample, once with the default eps and once
+runs `slabcast lab check colour-rule` on five volumes and the sample, once with the default eps and once
 with eps 0, and prints the tables. Results are kept as JSON lines in --keep; what is there already is not measured again, so an interrupted run
 goes on. Without --times frames are drawn on all cores and the column stays empty.
 """
@@ -68,7 +68,7 @@ def main():
             if a.kept and not result.exists():
                 continue
             if not result.exists():
-                command = [a.binary, "check", "colour-rule", str(volume), *flags,
+                command = [a.binary, "lab", "check", "colour-rule", str(volume), *flags,
                            "--azimuth", "20", "--eps", eps, "--steps", a.steps, "--json"]
                 done = subprocess.run(command + (["--times"] if timed else []),
                                       check=True, stdout=subprocess.PIPE, text=True)

@@ -4,7 +4,7 @@
     python3 docs/measurements/scripts/estimate.py --slabcast target/release/slabcast --data ../shared/data [--scene mri256]
 
 Each volume is drawn in two views under two looks with --stats; the same views are judged by
-`slabcast error`. A row has, for each source, what the statistics estimate (RMSE in 1/255), what the
+`slabcast lab error`. A row has, for each source, what the statistics estimate (RMSE in 1/255), what the
 reference finds, and their ratio; of bounds, how many times the largest error that was found they are.
 """
 
@@ -17,7 +17,7 @@ import tempfile
 
 UP = {"mri256": ["--up=-y"], "chris_t1": ["--up=-y"]}
 AZIMUTHS = (33, 110)
-# Name in the statistics, and in what `slabcast error` says.
+# Name in the statistics, and in what `slabcast lab error` says.
 ESTIMATES = {"thickness": "thickness", "rounding": "rounding_positions", "truncation": "truncation",
              "ripple": "ripple"}
 BOUNDS = {"cutoff": "cutoff", "quantisation": "quantisation", "rounding": "rounding_positions",
@@ -57,7 +57,7 @@ def main():
                         "--stats", str(stats), "--quiet")
                     for line, azimuth in zip(stats.read_text().splitlines(), AZIMUTHS):
                         said = json.loads(line)["error"]
-                        found = json.loads(run(args.slabcast, "error", *scene, "--azimuth", str(azimuth),
+                        found = json.loads(run(args.slabcast, "lab", "error", *scene, "--azimuth", str(azimuth),
                                                "--model-pixels", args.model_pixels, "--json"))
                         row = [f"{file.stem} {look} {thickness} {azimuth}"]
                         for name, truth in ESTIMATES.items():

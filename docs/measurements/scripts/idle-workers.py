@@ -35,7 +35,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         trace = os.path.join(folder, "s.trace")
         scene = ["formula:spheres:16", "--size", "64x64", "--frames", "1", "--workers", "1,8"]
-        subprocess.run([slabcast, "plan", *scene, "--trace", trace, "-q"], check=True,
+        subprocess.run([slabcast, "lab", "plan", *scene, "--trace", trace, "-q"], check=True,
                        stdout=subprocess.DEVNULL)
         try:
             master = subprocess.Popen(

@@ -3,7 +3,7 @@
 
     python3 docs/measurements/scripts/instructions.py --slabcast target/aarch64-unknown-linux-gnu/release/slabcast -- VOLUME [flags of bench]
 
-Runs `slabcast bench` on one thread in qemu's emulator of one program (7.2, whose plugins it was written for), which notes
+Runs `slabcast lab bench` on one thread in qemu's emulator of one program (7.2, whose plugins it was written for), which notes
 how often each piece of code ran, asks llvm-symbolizer which functions and files each instruction came from, those
 inlined included, and adds them up by stage. Numbers of instructions are no times: a load that misses the cache, a
 division and an addition count alike. Needs cc, too, for the plugin, which stands below.
@@ -80,7 +80,7 @@ def blocks(slabcast, scene):
         plugin, out = f"{folder}/count.so", f"{folder}/blocks"
         subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-x", "c", "-", "-o", plugin], input=PLUGIN, text=True, check=True)
         bench = subprocess.run(
-            ["qemu-aarch64", "-L", "/usr/aarch64-linux-gnu", "-plugin", plugin, slabcast, "bench", *scene, "--threads", "1",
+            ["qemu-aarch64", "-L", "/usr/aarch64-linux-gnu", "-plugin", plugin, slabcast, "lab", "bench", *scene, "--threads", "1",
              "--pixels", "0", "--json"], check=True, capture_output=True, text=True, env={**os.environ, "BLOCKS": out}).stdout
         runs = collections.Counter()
         for line in open(out):

@@ -1,6 +1,6 @@
 """How docs/measurements/scripts/peers.py runs each renderer, and what it takes for a time and for an error.
 
-A contender is run by its kind: `slabcast` (slabcast bench, in one process), `cluster` (slabcast
+A contender is run by its kind: `slabcast` (slabcast lab bench, in one process), `cluster` (slabcast
 master and workers as processes), `vtk`, `volpack`, `paraview`. Whatever can't run raises Missing
 with the reason; nothing else in the measurement stops for it.
 """
@@ -103,7 +103,7 @@ class Bench:
         path, axes = self.volume(row.volume)
         flags = {"eps": row.eps, **flags}
         said = json.loads(execute([
-            self.o.slabcast, "bench", path, axes, "--tf", f"peer-{row.preset}", "--json",
+            self.o.slabcast, "lab", "bench", path, axes, "--tf", f"peer-{row.preset}", "--json",
             "--size", f"{row.size}x{row.size}", "--projection", row.projection,
             "--frames", self.frames(row), "--threads", threads,
             "--pixels", self.o.pixels if judge else 0, *[f"--{k}={v}" for k, v in flags.items()]]))

@@ -3,7 +3,7 @@
 
     python3 docs/measurements/scripts/roofline.py --slabcast target/release/slabcast -- VOLUME --tf NAME [flags of bench]
 
-Runs `slabcast bench` on one thread under `perf record` (by the clock: virtual machines count no cycles), asks
+Runs `slabcast lab bench` on one thread under `perf record` (by the clock: virtual machines count no cycles), asks
 llvm-addr2line which functions each sample was in, those inlined included, and adds them up by stage. Units
 are bench's own counts. Cycles are those of the frequency that --ghz says or /proc/cpuinfo names.
 
@@ -110,7 +110,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         perf = f"{folder}/perf.data"
         bench = json.loads(subprocess.run(
-            ["perf", "record", "-q", "-F", str(HERTZ), "-o", perf, exe, "bench", *args.scene, "--threads", "1",
+            ["perf", "record", "-q", "-F", str(HERTZ), "-o", perf, exe, "lab", "bench", *args.scene, "--threads", "1",
              "--pixels", "0", "--json"], check=True, capture_output=True, text=True).stdout)
         found, total = addresses(perf, exe)
     frames = len(bench["each_ms"])

@@ -1,6 +1,6 @@
 """Tables of docs/measurements/scaling.md: `python3 docs/measurements/scripts/scaling.py SLABCAST DATA [--frames N] [--large] [--rehearse LIST] [--hidden]`.
 
-For the three scenes of the paper's kind, or the two large ones, `slabcast plan` measures tiles once and
+For the three scenes of the paper's kind, or the two large ones, `slabcast lab plan` measures tiles once and
 predicts both schedules at 1 and 10 Gbit/s and without limit; with --rehearse, processes on this machine
 are compared with what is predicted for them. With --hidden, how much of what bricks take on a link of
 1 Gbit/s is hidden behind drawing once the first frame is there, instead. Prints Markdown. DATA is the folder with mri256.nrrd and the
@@ -30,7 +30,7 @@ WORKERS = [1, 2, 4, 8, 15, 16, 32, 64]
 
 def plan(args, scene, trace, more, workers=WORKERS):
     _, file, flags = scene
-    command = [args.slabcast, "plan", os.path.join(args.data, file), *flags,
+    command = [args.slabcast, "lab", "plan", os.path.join(args.data, file), *flags,
                "--frames", str(args.frames), "--workers", ",".join(map(str, workers)),
                "--trace", trace, "-q", "--json", *more]
     out = subprocess.run(command, capture_output=True, text=True)

@@ -3,11 +3,11 @@
 # interfaces between them, each of which sends at RATE at most (tc-tbf). The master and the client are in
 # one, the workers in the other. Needs root, iproute2, and veth and tbf in the kernel.
 #
-#   docs/measurements/scripts/shaped.sh 1gbit 50us slabcast plan VOLUME --trace FILE --rehearse 2,8,15 [more of plan's flags]
+#   docs/measurements/scripts/shaped.sh 1gbit 50us slabcast lab plan VOLUME --trace FILE --rehearse 2,8,15 [more of plan's flags]
 set -eu
 
 if [ $# -lt 4 ]; then
-    echo "usage: docs/measurements/scripts/shaped.sh RATE LATENCY slabcast plan VOLUME --trace FILE --rehearse LIST ..." >&2
+    echo "usage: docs/measurements/scripts/shaped.sh RATE LATENCY slabcast lab plan VOLUME --trace FILE --rehearse LIST ..." >&2
     exit 2
 fi
 rate=$1

@@ -3,8 +3,8 @@
 
     python3 docs/measurements/scripts/sums.py --slabcast target/release/slabcast VOLUME[=FLAGS] ...
 
-Draws each volume with each transfer function in 16-bit sums, lets `slabcast error` say how far whole numbers
-put the picture off (RMSE and maximum in 1/255), and asks `slabcast bench` which sums `auto` takes. Prints a
+Draws each volume with each transfer function in 16-bit sums, lets `slabcast lab error` say how far whole numbers
+put the picture off (RMSE and maximum in 1/255), and asks `slabcast lab bench` which sums `auto` takes. Prints a
 table with a row a transfer function.
 """
 
@@ -60,9 +60,9 @@ def main():
             for volume in args.volumes:
                 file, _, flags = volume.partition("=")
                 scene = [file, *(flags and [flags] or []), "--tf", look]
-                drawn = ask(args, "bench", *scene, "--frames", "1", "--pixels", "0")
+                drawn = ask(args, "lab", "bench", *scene, "--frames", "1", "--pixels", "0")
                 taken += drawn["quality"]["sums"] == "i16"
-                off = ask(args, "error", *scene, "--sums", "i16", "--pixels", args.pixels)["quantisation"]
+                off = ask(args, "lab", "error", *scene, "--sums", "i16", "--pixels", args.pixels)["quantisation"]
                 rmse.append(off["rmse"])
                 worst.append(off["max"])
             span = lambda n: f"{min(n):.3f} to {max(n):.3f}"

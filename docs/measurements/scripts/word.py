@@ -4,7 +4,7 @@
     python3 docs/measurements/scripts/word.py --slabcast target/release/slabcast --data ../shared/data [--only error|budget]
 
 Each scene is asked for with --error, --error-max and --budget, measured once (into a folder of its
-own), and then judged in views and at pixels that the choice did not see: `slabcast bench` at two
+own), and then judged in views and at pixels that the choice did not see: `slabcast lab bench` at two
 other azimuths with another seed, the worst of which counts. Times are medians of seven views, and
 mean something on an idle machine alone. Prints a table in Markdown.
 """
@@ -60,7 +60,7 @@ def main():
             if args.scene and args.scene not in volume:
                 continue
             for flag, value in aims:
-                base = [args.slabcast, "bench", str(file), *flags, "--tf", tf, "--json", flag, value]
+                base = [args.slabcast, "lab", "bench", str(file), *flags, "--tf", tf, "--json", flag, value]
                 worst, chosen, trouble = 0.0, None, None
                 if flag == "--budget":
                     # A render comes as a user has it: by a cluster in the process.

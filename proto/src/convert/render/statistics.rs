@@ -21,11 +21,11 @@ const MAX_ENTRIES: usize = 1 << 21;
 
 /// A part of a frame's statistics, as it came in one message.
 #[derive(Clone, Debug, PartialEq)]
-pub struct StatisticsPart(wire::FrameStatistics);
+pub struct StatisticsPart(Box<wire::FrameStatistics>);
 
 impl StatisticsPart {
     pub(super) fn new(part: wire::FrameStatistics) -> Self {
-        StatisticsPart(part)
+        StatisticsPart(Box::new(part))
     }
 }
 
@@ -51,7 +51,7 @@ impl StatisticsParts {
             return Err(WireError::too_long("statistics", self.entries, MAX_ENTRIES));
         }
         match &mut self.whole {
-            None => self.whole = Some(part),
+            None => self.whole = Some(*part),
             // Protobuf's own merging.
             Some(whole) => whole
                 .merge(&part.encode_to_vec()[..])

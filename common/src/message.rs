@@ -199,9 +199,9 @@ pub enum ToWorker {
         /// Master's choice.
         nonce: u64,
     },
-    /// The master ends; come back later.
-    Leave {
-        /// For people.
+    /// The master ends. The worker drops its tasks and the link, and dials again after a wait.
+    MasterEnding {
+        /// Reason, for people.
         reason: String,
     },
 }
@@ -410,11 +410,11 @@ pub enum ToMaster {
     },
     /// A part of a region is given away, as the master asked for.
     RegionSplit(Box<RegionSplit>),
-    /// Bricks came in.
-    BricksIn {
-        /// Of which set.
+    /// Bricks arrived whole, and are held now.
+    BricksReceived {
+        /// Their set.
         set: BrickSetKey,
-        /// How many, of the batch that was sent.
+        /// Number of bricks since the last such message for this set.
         bricks: u32,
     },
     /// A brick failed its checksum; send it again.
@@ -432,11 +432,11 @@ pub enum ToMaster {
         /// Which.
         bricks: Vec<BrickId>,
     },
-    /// Bricks were forgotten to make room for others.
-    BricksForgotten {
-        /// Of which set.
+    /// Bricks were evicted to make room for others.
+    BricksEvicted {
+        /// Their set.
         set: BrickSetKey,
-        /// Which.
+        /// Their ids.
         bricks: Vec<BrickId>,
     },
     /// Answer to `Ping`.
@@ -447,8 +447,8 @@ pub enum ToMaster {
         clock_us: u64,
     },
     /// The worker ends: it finishes the tasks it has begun, takes no more and closes the link.
-    Leaving {
-        /// For people.
+    Goodbye {
+        /// Reason, for people.
         reason: String,
     },
 }

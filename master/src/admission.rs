@@ -164,7 +164,7 @@ impl WorkerTable {
         let Some(attached) = self.attached.get_mut(&worker) else { return false };
         attached.last_heard = Instant::now();
         attached.tasks_done += u64::from(matches!(message, ToMaster::Result(_)));
-        attached.leaving |= matches!(message, ToMaster::Leaving { .. });
+        attached.leaving |= matches!(message, ToMaster::Goodbye { .. });
         true
     }
 

@@ -186,7 +186,7 @@ impl Driver {
     fn leave(&mut self) {
         for link in self.workers.links() {
             let reason = "the master ends".to_string();
-            let _ = link.control.send(ToWorker::Leave { reason });
+            let _ = link.control.send(ToWorker::MasterEnding { reason });
         }
         let ids: Vec<JobId> = self.active.ids().collect();
         for id in ids {
@@ -287,7 +287,7 @@ impl Driver {
                 Happened::Failed { worker, task, epoch, reason }
             }
             ToMaster::RegionSplit(piece) => Happened::HandedOver { worker, piece },
-            ToMaster::BricksIn { set, bricks } => Happened::BricksIn { worker, set, bricks },
+            ToMaster::BricksReceived { set, bricks } => Happened::BricksIn { worker, set, bricks },
             ToMaster::BricksBroken { set, bricks } => {
                 warn!(%worker, bricks = bricks.len(), "bricks damaged in transit, sending them again");
                 Happened::BricksBroken { worker, set, bricks }
@@ -295,11 +295,11 @@ impl Driver {
             ToMaster::BricksWanted { set, bricks } => {
                 Happened::BricksWanted { worker, set, bricks }
             }
-            ToMaster::BricksForgotten { set, bricks } => {
+            ToMaster::BricksEvicted { set, bricks } => {
                 Happened::BricksForgotten { worker, set, bricks }
             }
             ToMaster::Pong { nonce, clock_us } => Happened::Pong { worker, nonce, clock_us },
-            ToMaster::Leaving { reason } => {
+            ToMaster::Goodbye { reason } => {
                 info!(%worker, reason, "worker is leaving");
                 Happened::WorkerLeaving { worker }
             }

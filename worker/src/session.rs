@@ -150,7 +150,7 @@ pub async fn run(
                          {PROTOCOL_VERSIONS}; run the same version of slabcast on both"
                     )));
                 }
-                Some(ToWorker::Leave { reason }) => return Ok(Ended::MasterLeft(reason)),
+                Some(ToWorker::MasterEnding { reason }) => return Ok(Ended::MasterLeft(reason)),
                 Some(message) => {
                     session.last_heard = tokio::time::Instant::now();
                     session.on_message(message);
@@ -310,7 +310,7 @@ impl<'a> Session<'a> {
                 let clock_us = self.us(Instant::now());
                 self.replies.push(ToMaster::Pong { nonce, clock_us });
             }
-            ToWorker::Refused { .. } | ToWorker::Leave { .. } => {}
+            ToWorker::Refused { .. } | ToWorker::MasterEnding { .. } => {}
         }
     }
 
@@ -390,7 +390,7 @@ impl<'a> Session<'a> {
         }
         self.tell_pool_of_stalls();
         if arrived > 0 {
-            self.replies.push(ToMaster::BricksIn { set, bricks: arrived });
+            self.replies.push(ToMaster::BricksReceived { set, bricks: arrived });
         }
         if !batch.broken.is_empty() {
             warn!(bricks = batch.broken.len(), "bricks damaged in transit, asking for them again");
@@ -537,7 +537,7 @@ impl<'a> Session<'a> {
                 BrickRequest::Forgotten(set, bricks) => {
                     debug!(bricks = bricks.len(), "bricks dropped for others");
                     self.waiting.bricks_dropped(set, &bricks);
-                    ToMaster::BricksForgotten { set, bricks }
+                    ToMaster::BricksEvicted { set, bricks }
                 }
                 BrickRequest::Wanted(set, bricks) => ToMaster::BricksWanted { set, bricks },
             };
@@ -550,7 +550,7 @@ impl<'a> Session<'a> {
     fn leave(&mut self) {
         self.is_leaving = true;
         self.waiting.clear();
-        self.replies.push(ToMaster::Leaving { reason: "told to stop".into() });
+        self.replies.push(ToMaster::Goodbye { reason: "told to stop".into() });
     }
 
     /// Microseconds on this worker's clock.

@@ -339,7 +339,7 @@ fn describe(message: &ToWorker) -> String {
         ToWorker::Lease(_) | ToWorker::Welcome { .. } | ToWorker::Refused { .. } => {
             unreachable!("leases are decisions of their own, and the driver welcomes and refuses")
         }
-        ToWorker::Leave { .. } => "leave".into(),
+        ToWorker::MasterEnding { .. } => "leave".into(),
     }
 }
 

@@ -217,13 +217,13 @@ pub fn to_master() -> impl Strategy<Value = ToMaster> {
             epoch: Epoch(e),
             reason
         }),
-        (key(), any::<u32>()).prop_map(|(set, bricks)| ToMaster::BricksIn { set, bricks }),
+        (key(), any::<u32>()).prop_map(|(set, bricks)| ToMaster::BricksReceived { set, bricks }),
         (key(), ids(50)).prop_map(|(set, bricks)| ToMaster::BricksBroken { set, bricks }),
         (key(), ids(50)).prop_map(|(set, bricks)| ToMaster::BricksWanted { set, bricks }),
-        (key(), ids(50)).prop_map(|(set, bricks)| ToMaster::BricksForgotten { set, bricks }),
+        (key(), ids(50)).prop_map(|(set, bricks)| ToMaster::BricksEvicted { set, bricks }),
         handed_over().prop_map(|piece| ToMaster::RegionSplit(Box::new(piece))),
         any::<[u64; 2]>().prop_map(|[nonce, clock_us]| ToMaster::Pong { nonce, clock_us }),
-        ".{0,50}".prop_map(|reason| ToMaster::Leaving { reason }),
+        ".{0,50}".prop_map(|reason| ToMaster::Goodbye { reason }),
     ]
 }
 
@@ -254,7 +254,7 @@ pub fn to_worker() -> impl Strategy<Value = ToWorker> {
         (key(), vec((0u32..1 << 27).prop_map(BrickId), 1..60))
             .prop_map(|(set, bricks)| ToWorker::DropBricks { set, bricks }),
         any::<u64>().prop_map(|nonce| ToWorker::Ping { nonce }),
-        ".{0,50}".prop_map(|reason| ToWorker::Leave { reason }),
+        ".{0,50}".prop_map(|reason| ToWorker::MasterEnding { reason }),
     ]
 }
 

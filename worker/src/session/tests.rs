@@ -95,7 +95,7 @@ impl World {
         let batch = BrickBatch { set: SET, bricks: vec![brick(id)], broken: vec![] };
         self.bricks.send(Bricks::Batch(batch)).await.expect("the worker listens");
         let heard = self.hear().await;
-        assert_eq!(heard, ToMaster::BricksIn { set: SET, bricks: 1 });
+        assert_eq!(heard, ToMaster::BricksReceived { set: SET, bricks: 1 });
     }
 
     fn lease(&self, task: u64, bricks: &[u32]) {
@@ -406,7 +406,7 @@ async fn stalled_region_ends_with_its_frame() {
     world.send(1).await;
     world.settle().await;
     world.stop.send(true).unwrap();
-    assert!(matches!(world.hear().await, ToMaster::Leaving { .. }));
+    assert!(matches!(world.hear().await, ToMaster::Goodbye { .. }));
     assert_eq!(world.ended.await.unwrap().unwrap(), Ended::Stopped, "nothing is waited for");
 }
 
@@ -417,7 +417,7 @@ async fn draining_worker_finishes_its_stalled_regions() {
     world.region(1, Rect::new(0, 0, 32, 32));
     requested(&mut world, 2).await;
     world.stop.send(true).unwrap();
-    assert!(matches!(world.hear().await, ToMaster::Leaving { .. }));
+    assert!(matches!(world.hear().await, ToMaster::Goodbye { .. }));
     world.region(2, Rect::new(0, 0, 32, 32));
     assert!(matches!(world.hear().await, ToMaster::Failed { task: TaskId(2), .. }));
     world.send(0).await;
@@ -486,7 +486,7 @@ async fn worker_that_is_told_to_stop_says_that_it_leaves_and_ends() {
     world.lease(1, &[0]);
     world.settle().await;
     world.stop.send(true).unwrap();
-    assert!(matches!(world.hear().await, ToMaster::Leaving { .. }));
+    assert!(matches!(world.hear().await, ToMaster::Goodbye { .. }));
     assert_eq!(world.ended.await.unwrap().unwrap(), Ended::Stopped);
 }
 

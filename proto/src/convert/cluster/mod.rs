@@ -68,7 +68,7 @@ pub fn from_worker_to_wire_as(message: &ToMaster, compress: Compression) -> wire
             epoch: epoch.0,
             reason: reason_to_wire(reason),
         }),
-        ToMaster::BricksIn { set, bricks } => {
+        ToMaster::BricksReceived { set, bricks } => {
             Message::BricksReceived(wire::BricksReceived { set: key_to_wire(set), bricks: *bricks })
         }
         ToMaster::BricksBroken { set, bricks } => Message::BricksBroken(wire::BricksBroken {
@@ -79,7 +79,7 @@ pub fn from_worker_to_wire_as(message: &ToMaster, compress: Compression) -> wire
             set: key_to_wire(set),
             bricks: Some(brick_ids_to_wire(bricks)),
         }),
-        ToMaster::BricksForgotten { set, bricks } => Message::BricksEvicted(wire::BricksEvicted {
+        ToMaster::BricksEvicted { set, bricks } => Message::BricksEvicted(wire::BricksEvicted {
             set: key_to_wire(set),
             bricks: Some(brick_ids_to_wire(bricks)),
         }),
@@ -87,7 +87,7 @@ pub fn from_worker_to_wire_as(message: &ToMaster, compress: Compression) -> wire
         ToMaster::Pong { nonce, clock_us } => {
             Message::Pong(wire::Pong { nonce: *nonce, clock_us: *clock_us })
         }
-        ToMaster::Leaving { reason } => {
+        ToMaster::Goodbye { reason } => {
             Message::Goodbye(wire::Goodbye { reason: reason_to_wire(reason) })
         }
     };
@@ -113,7 +113,7 @@ pub fn from_worker_from_wire(message: wire::ControlRequest) -> Result<ToMaster, 
             epoch: Epoch(failed.epoch),
             reason: reason_from_wire("failed.reason", failed.reason)?,
         },
-        Message::BricksReceived(received) => ToMaster::BricksIn {
+        Message::BricksReceived(received) => ToMaster::BricksReceived {
             set: key_from_wire("bricks_received.set", &received.set)?,
             bricks: received.bricks,
         },
@@ -125,7 +125,7 @@ pub fn from_worker_from_wire(message: wire::ControlRequest) -> Result<ToMaster, 
             set: key_from_wire("bricks_wanted.set", &wanted.set)?,
             bricks: brick_ids_from_wire("bricks_wanted.bricks", wanted.bricks)?,
         },
-        Message::BricksEvicted(evicted) => ToMaster::BricksForgotten {
+        Message::BricksEvicted(evicted) => ToMaster::BricksEvicted {
             set: key_from_wire("bricks_evicted.set", &evicted.set)?,
             bricks: brick_ids_from_wire("bricks_evicted.bricks", evicted.bricks)?,
         },
@@ -134,7 +134,7 @@ pub fn from_worker_from_wire(message: wire::ControlRequest) -> Result<ToMaster, 
         )),
         Message::Pong(pong) => ToMaster::Pong { nonce: pong.nonce, clock_us: pong.clock_us },
         Message::Goodbye(goodbye) => {
-            ToMaster::Leaving { reason: reason_from_wire("goodbye.reason", goodbye.reason)? }
+            ToMaster::Goodbye { reason: reason_from_wire("goodbye.reason", goodbye.reason)? }
         }
     })
 }
@@ -184,7 +184,7 @@ pub fn to_worker_to_wire(message: &ToWorker, session: u64) -> Down {
             return Down::Bricks(bricks::drop_to_wire(set, bricks));
         }
         ToWorker::Ping { nonce } => Message::Ping(wire::Ping { nonce: *nonce }),
-        ToWorker::Leave { reason } => {
+        ToWorker::MasterEnding { reason } => {
             Message::MasterEnding(wire::MasterEnding { reason: reason_to_wire(reason) })
         }
     };
@@ -237,9 +237,9 @@ pub fn to_worker_from_wire(
         Message::EndFrame(end) => ToWorker::EndFrame { frame: FrameId(end.frame) },
         Message::EndScene(end) => ToWorker::EndScene { scene: SceneId(end.scene) },
         Message::Ping(ping) => ToWorker::Ping { nonce: ping.nonce },
-        Message::MasterEnding(ending) => {
-            ToWorker::Leave { reason: reason_from_wire("master_ending.reason", ending.reason)? }
-        }
+        Message::MasterEnding(ending) => ToWorker::MasterEnding {
+            reason: reason_from_wire("master_ending.reason", ending.reason)?,
+        },
     };
     Ok((message, None))
 }

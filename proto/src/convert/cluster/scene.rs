@@ -98,7 +98,7 @@ pub fn scene_from_wire(scene: wire::Scene) -> Result<SceneSpec, WireError> {
 pub(super) fn frame_to_wire(
     (frame, scene): (FrameId, SceneId),
     view: &View,
-    finish: Option<&PixelEncoding>,
+    encoding: Option<&PixelEncoding>,
     uncompressed: bool,
 ) -> wire::Frame {
     let compression =
@@ -107,26 +107,29 @@ pub(super) fn frame_to_wire(
         frame: frame.0,
         scene: scene.0,
         view: Some(view_to_wire(view)),
-        finish: finish.map(|finish| wire::Finish {
-            format: format_to_wire(finish.format),
-            background: Some(background_to_wire(finish.background)),
+        encoding: encoding.map(|encoding| wire::PixelEncoding {
+            format: format_to_wire(encoding.format),
+            background: Some(background_to_wire(encoding.background)),
         }),
         compression: compression as i32,
     }
 }
 
 pub(super) fn frame_from_wire(frame: wire::Frame) -> Result<ToWorker, WireError> {
-    let finish = |finish: wire::Finish| {
+    let encoding = |encoding: wire::PixelEncoding| {
         Ok::<_, WireError>(PixelEncoding {
-            format: format_from_wire("format", finish.format)?,
-            background: background_from_wire(required("background", finish.background)?)?,
+            format: format_from_wire("format", encoding.format)?,
+            background: background_from_wire(required("background", encoding.background)?)?,
         })
     };
     Ok(ToWorker::Frame {
         frame: FrameId(frame.frame),
         scene: SceneId(frame.scene),
         view: view_from_wire(required("view", frame.view)?).map_err(|e| e.within("view"))?,
-        finish: frame.finish.map(|f| finish(f).map_err(|e| e.within("finish"))).transpose()?,
+        finish: frame
+            .encoding
+            .map(|e| encoding(e).map_err(|e| e.within("encoding")))
+            .transpose()?,
         // One that this version does not know is a wish that it can't fulfil: LZ4.
         plain: frame.compression == wire::Compression::None as i32,
     })

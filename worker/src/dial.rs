@@ -31,20 +31,36 @@ const FIRST_WAIT: Duration = Duration::from_millis(100);
 /// is the first again.
 const LONGEST_WAIT: Duration = Duration::from_secs(5);
 
+/// Why a worker can't dial at all.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum DialError {
+    /// The master's address can't be one.
+    #[error("master address `{address}`: {problem}; give HOST:PORT")]
+    Address {
+        /// The address as it was given.
+        address: String,
+        /// Problem, for people.
+        problem: String,
+    },
+    /// The system gives no render threads.
+    #[error("render threads: {0}")]
+    Threads(String),
+}
+
 /// Serves the master at `master` (`host:port`) until `stop` turns true or the master refuses
 /// this worker. A master that is not there, or ends, is dialled again for ever; bricks are
 /// kept meanwhile.
 ///
 /// # Errors
-/// An address that can't be one, or a system that gives no threads.
+/// [`DialError`] if the address can't be one, or the system gives no threads.
 pub async fn run(
     config: Config,
     master: String,
     mut stop: watch::Receiver<bool>,
-) -> Result<Ended, String> {
+) -> Result<Ended, DialError> {
     let uri = if master.contains("://") { master.clone() } else { format!("http://{master}") };
     let endpoint = Endpoint::from_shared(uri)
-        .map_err(|e| format!("master address `{master}`: {e}; give HOST:PORT"))?
+        .map_err(|e| DialError::Address { address: master.clone(), problem: e.to_string() })?
         .connect_timeout(CONNECT)
         .tcp_nodelay(true)
         .http2_keep_alive_interval(Duration::from_secs(10))
@@ -153,7 +169,7 @@ async fn link(
     channel: Channel,
     cache: &mut BrickCache,
     stop: watch::Receiver<bool>,
-) -> Result<Ended, String> {
+) -> Result<Ended, DialError> {
     let (replies, reply_rx) = mpsc::channel(64);
     // Unbounded, bounded by the leases that the master gives and its pings.
     let (control_tx, control) = mpsc::unbounded_channel();
@@ -161,7 +177,7 @@ async fn link(
     let carry = carry(channel, bricks_endpoint(endpoint), reply_rx, control_tx, bricks_tx);
     let mut carrying = tokio::spawn(carry);
     let ended = session::run(config, Link { control, replies, bricks }, cache, stop).await;
-    let ended = ended.map_err(|e| format!("render threads: {e}"))?;
+    let ended = ended.map_err(|e| DialError::Threads(e.to_string()))?;
     // The session dropped its ends. Its last messages still leave; then the streams are over.
     let carried = match tokio::time::timeout(Duration::from_secs(1), &mut carrying).await {
         Ok(joined) => joined.unwrap_or_else(|e| Err(Broken::Lost(e.to_string()))),

@@ -99,9 +99,10 @@ pub(crate) fn run(args: &WorkerArgs) -> Result<(), Fail> {
                 "the master at {} refuses this worker: {why}",
                 args.master
             ))),
-            Ok(Ok(Ended::Lost(why) | Ended::MasterLeft(why)) | Err(why)) => {
+            Ok(Ok(Ended::Lost(why) | Ended::MasterLeft(why))) => {
                 Err(Fail::failed(format!("master at {}: {why}", args.master)))
             }
+            Ok(Err(e)) => Err(Fail::failed(format!("master at {}: {e}", args.master))),
             Err(e) => Err(Fail::failed(format!("the worker failed: {e}"))),
         }
     });

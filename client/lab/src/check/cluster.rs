@@ -197,7 +197,7 @@ impl Tcp {
                 machine: String::new(),
             };
             let run = slabcast_worker::dial::run(config, address.clone(), stopped.clone());
-            tasks.spawn(async move { run.await.map(|_| ()) });
+            tasks.spawn(async move { run.await.map(drop).map_err(|e| e.to_string()) });
         }
         let client =
             Client::connect(&address).await.map_err(|e| slabcast_session::remote::fail(&e))?;

@@ -17,175 +17,167 @@ use crate::view::View;
 use crate::volume::VolumeInfo;
 use std::sync::Arc;
 
-/// Everything that stays the same over a job's frames: volume, transfer function, quality, bricks.
+/// What stays the same over a job.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneSpec {
-    /// Name of the scene on every link of the master.
+    /// Its name.
     pub id: SceneId,
-    /// The volume's lattice and value summary, without its samples.
+    /// The volume without its samples.
     pub volume: VolumeInfo,
-    /// Transfer function in full (never a preset's name).
+    /// Transfer function.
     pub transfer: TransferFunction,
-    /// Quality; `sums` is decided (never [`Sums::Auto`](crate::quality::Sums::Auto)).
+    /// Quality; `sums` is decided (never `Auto`).
     pub quality: Quality,
-    /// Key of the brick set from which the scene is drawn.
+    /// Which bricks its tasks are drawn from.
     pub bricks: BrickSetKey,
 }
 
-/// One macrotile of one slab, leased to one worker (paper section 4.3; `slab` schedule).
+/// One macrotile of one slab, lent to one worker.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lease {
-    /// The leased task.
+    /// Which task.
     pub task: TaskId,
-    /// Attempt at the task; a result counts only while its epoch is live.
+    /// Which attempt at it.
     pub epoch: Epoch,
-    /// Frame of the task. The worker received its view before.
+    /// Of which frame; the worker was sent its view before.
     pub frame: FrameId,
-    /// The macrotile, in pixels of the picture.
+    /// The macrotile, inside the picture.
     pub tile: Rect,
-    /// Sheets of the slab.
+    /// The slab's sheets.
     pub slab: SheetRange,
-    /// Bricks that the task needs, ascending. The worker holds each or has it under way; it starts
-    /// when the last has arrived.
+    /// The bricks it needs, ascending. The worker holds each of them already or has it on the
+    /// way; it starts when the last is there.
     pub bricks: Vec<BrickId>,
-    /// Pixels of the tile as the slabs in front left them.
+    /// The pixels as the slabs before left them.
     pub state: TileState,
 }
 
-/// One tile through all sheets of its frame, leased to one worker (`region` schedule). The worker
-/// requests the bricks that it turns out to need.
+/// One tile through all sheets of its frame, lent to one worker. The worker asks for the bricks that it turns out
+/// to need.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RegionLease {
-    /// The leased task.
+    /// Which task.
     pub task: TaskId,
-    /// Attempt at the task; a result counts only while its epoch is live.
+    /// Which attempt at it.
     pub epoch: Epoch,
-    /// Frame of the task. The worker received its view and the directory of its bricks before.
+    /// Of which frame; the worker was sent its view and the directory of its bricks before.
     pub frame: FrameId,
-    /// The tile, in pixels of the picture.
+    /// The tile, inside the picture.
     pub tile: Rect,
-    /// Whether some pixels are also drawn in thinner sheets, to estimate the error of the
-    /// thickness.
+    /// Some of its pixels are drawn in thinner sheets, too.
     pub estimate: bool,
-    /// What another worker has drawn of the tile; `None` if the region starts from nothing.
+    /// What another worker has drawn of it; `None`: it starts from nothing.
     pub begun: Option<Arc<Checkpoint>>,
 }
 
-/// Progress of a partly drawn region, from which another worker resumes it.
+/// A region as somebody left it who gave it away.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Checkpoint {
-    /// Next sheet to draw, for each of the tile's parts in the order of [`parts`]; `None` for a
-    /// part that is done.
+    /// The next sheet to draw of each of its parts ([`crate::region::parts`]), in their order; `None`: it is at its end.
     pub sheets: Vec<Option<i32>>,
-    /// Pixels of the tile after all sheets in front of those.
+    /// Its pixels after the sheets before these.
     pub pixels: TilePixels,
 }
 
 impl Checkpoint {
-    /// Returns the checkpoint of `piece`, a rectangle inside the checkpoint's `tile`.
+    /// The same of a piece of its `tile`.
     ///
     /// # Panics
     /// If the piece is not inside the tile.
     pub fn crop(&self, tile: Rect, piece: Rect) -> Checkpoint {
-        let next_sheet = |part: Rect| {
+        let of = |part: Rect| {
             let mut all = parts(tile).zip(&self.sheets);
-            all.find(|(whole, _)| !whole.intersect(&part).is_empty()).and_then(|(_, sheet)| *sheet)
+            all.find(|(whole, _)| !whole.intersect(&part).is_empty()).and_then(|(_, at)| *at)
         };
-        Checkpoint {
-            sheets: parts(piece).map(next_sheet).collect(),
-            pixels: self.pixels.crop(tile, piece),
-        }
+        Checkpoint { sheets: parts(piece).map(of).collect(), pixels: self.pixels.crop(tile, piece) }
     }
 }
 
-/// A region split by work stealing: its worker keeps one piece and gives the other away.
+/// What a worker gives away of a region that it draws.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RegionSplit {
-    /// The task whose lease was split.
+    /// Its lease: which task.
     pub task: TaskId,
-    /// Attempt at the task.
+    /// And which attempt at it.
     pub epoch: Epoch,
-    /// Piece of the tile that the worker keeps, in pixels of the picture. Its result has exactly
-    /// these pixels.
+    /// What it keeps of its tile: its result will have these pixels and no others.
     pub kept: Rect,
-    /// Piece that the worker gives away: the rest of the tile.
+    /// What it gives away: the rest.
     pub given: Rect,
-    /// Progress of the given piece.
+    /// How that stands.
     pub begun: Checkpoint,
 }
 
-/// Directories that a worker keeps: as many as a master keeps brick sets, and one for a job that is
-/// just ending. Master and worker both count the directories sent, so neither announces what it
-/// dropped.
+/// Sets whose directories a worker keeps: as many as a master keeps brick sets, and one for a job that
+/// is just ending. Master and worker count alike, by what was sent, so that neither has to say.
 pub const DIRECTORIES_KEPT: usize = 4;
 
-/// A message from master to worker.
+/// From master to worker.
 #[derive(Clone, Debug, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "a view is 400 bytes once a frame and worker")]
 pub enum ToWorker {
-    /// The hello was accepted. First message on every admitted link.
+    /// The hello was good. Always the first message of a link that is let in.
     Welcome {
-        /// Name of the worker from now on.
+        /// The worker's name from now on.
         worker: WorkerId,
-        /// Interval of the master's pings. Silence for three intervals means that the master is
-        /// gone.
+        /// How often the master pings; silence for three times as long means it is gone.
         heartbeat_ms: u32,
-        /// Protocol version that both sides speak on this link.
+        /// Version of the protocol that both speak on this link.
         protocol_version: u32,
     },
-    /// The hello was refused; the link ends.
+    /// The hello was not good; the link ends. Says why and what to do.
     Refused {
-        /// Why, and what to do, for people.
+        /// For people.
         reason: String,
     },
-    /// A scene, sent before its first frame. May come twice with the same content.
+    /// A scene, before its first frame. May come twice with the same content.
     Scene(Arc<SceneSpec>),
-    /// A frame's view, sent before the frame's first lease.
+    /// A frame's view, before its first lease.
     Frame {
         /// The frame.
         frame: FrameId,
-        /// The frame's scene, sent before.
+        /// Its scene, sent before.
         scene: SceneId,
-        /// The frame's camera, ready for the scene's volume.
+        /// Its view.
         view: View,
-        /// Encoding of region results; `None` if they are raw sums. Results of slab leases are
-        /// always sums.
+        /// What its regions are finished to; `None`: their results are sums. Those of leases are sums
+        /// always.
         finish: Option<PixelEncoding>,
-        /// Whether finished pixels travel uncompressed, because packing would take longer than it
-        /// saves.
+        /// Whether finished pixels go as they are: packing them takes longer than it saves.
         plain: bool,
     },
-    /// Part of a set's directory: bricks that exist, ascending by id. Parts come in order, before
-    /// the set's first region. A worker keeps the [`DIRECTORIES_KEPT`] directories that came last.
+    /// Bricks that there are of a set, some of them or all: from the `first`, ascending by id. The
+    /// parts of a directory come in order, and before the first region of the set. Those of the
+    /// [`DIRECTORIES_KEPT`] sets that came last are kept.
     Directory {
-        /// The set.
+        /// Of which set.
         set: BrickSetKey,
-        /// How the set's volume is cut into bricks.
+        /// How its volume is cut into bricks.
         grid: BrickGrid,
-        /// Bricks of the directory in earlier parts.
+        /// How many came before.
         first: u32,
-        /// Bricks of the whole directory.
+        /// How many there are in all.
         total: u32,
-        /// Bricks of this part.
+        /// These.
         bricks: Arc<[BrickInfo]>,
     },
-    /// A task of the `slab` schedule.
+    /// Work.
     Lease(Box<Lease>),
-    /// A task of the `region` schedule.
+    /// Work through all depths.
     Region(RegionLease),
-    /// Asks for part of a running region, for an idle worker. The worker answers with
-    /// [`ToMaster::RegionSplit`], or not at all if the region is done or can't be cut.
+    /// Others have time: some of what is left of a region is to be given away ([`ToMaster::RegionSplit`]). Who has
+    /// drawn it already, or can't cut it, does nothing.
     SplitRegion {
-        /// Frame of the region.
+        /// Of which frame.
         frame: FrameId,
-        /// The leased task.
+        /// The lease: which task.
         task: TaskId,
-        /// Attempt at the task.
+        /// And which attempt at it.
         epoch: Epoch,
-        /// Share of the remaining work to give away, in thousandths.
+        /// How much of what is left, in thousandths.
         share: u32,
     },
-    /// A frame is finished or cancelled: the worker drops its leases that have not begun.
+    /// A frame is over (finished or cancelled): leases of it that have not begun are dropped.
     EndFrame {
         /// The frame.
         frame: FrameId,
@@ -195,16 +187,16 @@ pub enum ToWorker {
         /// The scene.
         scene: SceneId,
     },
-    /// Evicts bricks to keep the memory budget. No lease in flight needs them.
+    /// Bricks to forget, so that the memory budget holds. No lease in flight needs them.
     DropBricks {
-        /// The set.
+        /// Of which set.
         set: BrickSetKey,
-        /// Bricks to evict.
+        /// Which.
         bricks: Vec<BrickId>,
     },
-    /// A heartbeat. The worker answers with [`ToMaster::Pong`] and the same nonce.
+    /// Are you there? Answered by `Pong` with the same nonce.
     Ping {
-        /// Number chosen by the master.
+        /// Master's choice.
         nonce: u64,
     },
     /// The master ends. The worker drops its tasks and the link, and dials again after a wait.
@@ -214,40 +206,39 @@ pub enum ToWorker {
     },
 }
 
-/// A worker's introduction, the first message on a link.
+/// Who a worker is.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Hello {
-    /// Protocol versions that the worker speaks.
+    /// Versions of the protocol that the worker speaks.
     pub protocol_versions: ProtocolVersions,
-    /// The worker's [`PIXELS_VERSION`](crate::PIXELS_VERSION).
+    /// The worker's `PIXELS_VERSION`.
     pub pixels_version: u32,
-    /// Name for people (host and process).
+    /// A name for people (host and process).
     pub name: String,
-    /// Number of render threads.
+    /// Render threads.
     pub threads: u32,
-    /// Bytes of bricks that the worker may hold.
+    /// Bytes of bricks it may hold.
     pub memory_budget_bytes: u64,
-    /// Instruction set of the worker's kernels, for people.
+    /// Instruction set of its splat loops, for people.
     pub simd: String,
-    /// SHA-256 of the self-test tile, in hexadecimal.
+    /// Hash of the self-test tile, in hexadecimal.
     pub self_test_sha256: String,
-    /// Bricks that the worker still holds from an earlier link, by set.
+    /// Bricks it still holds from before.
     pub held: Vec<(BrickSetKey, Vec<BrickId>)>,
-    /// Whether the worker only waits for recorded times instead of drawing.
+    /// It holds tiles for a recorded time instead of drawing them.
     pub rehearses: bool,
-    /// Identity of the worker's machine; empty if unknown.
+    /// Which machine it runs on; empty if unknown.
     pub machine: String,
 }
 
-/// Numbers of voxels by what a task did with them ([`VoxelStats`](crate::stats::VoxelStats) has
-/// definitions).
+/// What became of a task's voxels (see `stats::VoxelStats`).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
-    /// Voxels put into a sheet's bucket.
+    /// Put into a bucket.
     pub tossed: u64,
-    /// Voxels drawn.
+    /// Drawn.
     pub splatted: u64,
-    /// Voxels dropped as hidden, with their brick or alone.
+    /// Hidden, with their brick or alone.
     pub culled: u64,
 }
 
@@ -259,65 +250,63 @@ impl std::ops::AddAssign for Counters {
     }
 }
 
-/// Times of a task in microseconds on the worker's own clock.
+/// When a task was handled, on the worker's own clock (microseconds).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct TaskTimes {
-    /// Arrival of the lease.
+    /// The lease came.
     pub received_us: u64,
-    /// Arrival of the last brick that the task needed.
+    /// Its last brick was there.
     pub ready_us: u64,
-    /// Start of rendering.
+    /// A render thread began.
     pub start_us: u64,
-    /// End of rendering.
+    /// It ended.
     pub end_us: u64,
-    /// Number of the render thread.
+    /// Which render thread.
     pub thread: u32,
 }
 
-/// What a region cost beside drawing: bricks, stalls, idle threads.
+/// What a region took beside its drawing.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RegionCost {
-    /// Bricks that the region was drawn from, as places in the directory, ascending.
+    /// The bricks that it drew from: places in the directory, ascending.
     pub touched: Vec<u32>,
-    /// How often the region stalled for lack of bricks.
+    /// How often it stood still for want of bricks.
     pub stalls: u32,
-    /// Total time in microseconds that the region was stalled. Its thread may have drawn other
-    /// regions meanwhile.
+    /// For how long (microseconds). Others may have been drawn meanwhile.
     pub parked_us: u64,
-    /// Time in microseconds, summed over render threads, without anything to draw while some region
-    /// was stalled; since the link's previous result.
+    /// For how long render threads had nothing to do since the last result of the link, while some
     pub idle_us: u64,
-    /// Errors of sampled pixels; zero unless the lease asked for an estimate.
+    /// How far some of its pixels are off, where that was asked for.
     pub sampled: ErrorsBySource,
 }
 
-/// Errors of sampled pixels by source.
+/// How far pixels that were looked at are off, by source.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ErrorsBySource {
-    /// Change under sheets of half the thickness.
+    /// What sheets of half the thickness change.
     pub thickness: SampledError,
-    /// Change under exact instead of rounded positions.
+    /// What rounding of positions changes.
     pub positions: SampledError,
-    /// Change under an untruncated kernel.
+    /// What the kernel's cut changes.
     pub truncation: SampledError,
-    /// Change under a kernel without ripple.
+    /// What the kernel's ripple changes.
     pub ripple: SampledError,
 }
 
 impl ErrorsBySource {
-    /// Returns the sources in the order of the fields.
+    /// Each, in order.
     pub fn to_array(self) -> [SampledError; 4] {
         [self.thickness, self.positions, self.truncation, self.ripple]
     }
 
-    /// Builds from the sources in the order of the fields.
+    /// From each, in order.
     pub fn from_array(
         [thickness, positions, truncation, ripple]: [SampledError; 4],
     ) -> ErrorsBySource {
         ErrorsBySource { thickness, positions, truncation, ripple }
     }
 
-    /// Adds another tile's samples.
+    /// Adds others'.
     pub fn add(&mut self, other: ErrorsBySource) {
         self.thickness.add(other.thickness);
         self.positions.add(other.positions);
@@ -326,54 +315,50 @@ impl ErrorsBySource {
     }
 }
 
-/// Sum of squared errors over sampled pixels. Integers, so that the order of summing doesn't
-/// matter.
+/// How far pixels are off. Integers, since their sum has no order.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SampledError {
-    /// Sampled pixels that are not blank in both pictures.
+    /// Pixels that are not blank in both.
     pub pixels: u32,
-    /// Sum of squared differences over all four channels (linear premultiplied RGBA), in units of
-    /// 2^-48.
+    /// Sum of the squares of their differences, over all four channels, in units of 2^-48.
     pub squares: u64,
 }
 
 impl SampledError {
     const UNIT: f64 = (1u64 << 48) as f64;
 
-    /// Adds a pixel unless it is blank in both pictures (`visible` is false). `squares` is the sum
-    /// of squared differences over the four channels, clamped to 0..=4.
-    pub fn add_pixel(&mut self, visible: bool, squares: f64) {
-        if visible {
+    /// Counts a pixel, unless it is blank in both; squares of at most 4.
+    pub fn put(&mut self, there: bool, squares: f64) {
+        if there {
             self.pixels += 1;
             self.squares += (squares.clamp(0.0, 4.0) * SampledError::UNIT) as u64;
         }
     }
 
-    /// Adds another tile's samples, saturating.
+    /// Adds others'.
     pub fn add(&mut self, other: SampledError) {
         self.pixels = self.pixels.saturating_add(other.pixels);
         self.squares = self.squares.saturating_add(other.squares);
     }
 
-    /// Returns the root of the mean square over pixels and channels in 1/255, or `None` without a
-    /// pixel.
+    /// Root of the mean square over pixels and channels, in 1/255; `None` of no pixel.
     pub fn rmse(&self) -> Option<f64> {
         let n = 4.0 * f64::from(self.pixels);
         (self.pixels > 0).then(|| (self.squares as f64 / SampledError::UNIT / n).sqrt() * 255.0)
     }
 }
 
-/// Pixels of a finished task.
+/// What a task gave.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Pixels {
-    /// Opacity and fixed-point colour, which the master encodes.
+    /// What it adds to the picture, which the master finishes.
     Sums(TilePixels),
-    /// Encoded pixels, as they leave the master.
+    /// A piece of the picture as it leaves the master.
     Finished(SparseTile),
 }
 
 impl Pixels {
-    /// Returns the number of pixels of the tile.
+    /// How many there are.
     pub fn len(&self) -> usize {
         match self {
             Pixels::Sums(sums) => sums.a.len(),
@@ -381,49 +366,49 @@ impl Pixels {
         }
     }
 
-    /// Returns whether the tile has no pixel.
+    /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 }
 
-/// Result of a rendered task.
+/// A rendered task.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TileResult {
-    /// The task.
+    /// Which task.
     pub task: TaskId,
-    /// Attempt at the task.
+    /// Which attempt.
     pub epoch: Epoch,
-    /// The tile's pixels.
+    /// Its pixels.
     pub pixels: Pixels,
-    /// Size of the message in bytes; `None` if it crossed no network.
+    /// Bytes of the message that it came in; `None` of one that crossed no network.
     pub bytes: Option<u32>,
-    /// Voxel counts.
+    /// Its voxels.
     pub counters: Counters,
-    /// Times. For a region, `start_us` to `end_us` is drawing alone, without stalls.
+    /// Its times. Of a region, from `start_us` to `end_us` is drawing alone.
     pub times: TaskTimes,
-    /// Bricks and stalls of a region; `None` for a slab task.
+    /// Of a region.
     pub region: Option<RegionCost>,
 }
 
-/// A message from worker to master.
+/// From worker to master.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ToMaster {
-    /// First message on a link.
+    /// The first message of a link.
     Hello(Hello),
     /// A task is done.
     Result(Box<TileResult>),
-    /// A task can't be done (a brick failed its checksum twice, or the lease makes no sense). The
-    /// worker stays.
+    /// A task can't be done (a brick that fails its checksum twice, a lease that makes no
+    /// sense). The worker stays.
     Failed {
-        /// The task.
+        /// Which task.
         task: TaskId,
-        /// Attempt at the task.
+        /// Which attempt.
         epoch: Epoch,
-        /// Why, for people.
+        /// For people.
         reason: String,
     },
-    /// Part of a region is given away, as the master asked.
+    /// A part of a region is given away, as the master asked for.
     RegionSplit(Box<RegionSplit>),
     /// Bricks arrived whole, and are held now.
     BricksReceived {
@@ -432,19 +417,19 @@ pub enum ToMaster {
         /// Number of bricks since the last such message for this set.
         bricks: u32,
     },
-    /// Bricks failed their checksum; the master sends them again.
+    /// A brick failed its checksum; send it again.
     BricksBroken {
-        /// The set.
+        /// Of which set.
         set: BrickSetKey,
-        /// Bricks that failed.
+        /// Which.
         bricks: Vec<BrickId>,
     },
-    /// Requests bricks that regions lack, in this order. A worker requests a brick once a link,
-    /// unless it was evicted or broken meanwhile.
+    /// Regions lack bricks; send them, in this order. None is asked for twice on a link unless it was
+    /// forgotten or broken meanwhile.
     BricksWanted {
-        /// The set.
+        /// Of which set.
         set: BrickSetKey,
-        /// Requested bricks.
+        /// Which.
         bricks: Vec<BrickId>,
     },
     /// Bricks were evicted to make room for others.
@@ -454,11 +439,11 @@ pub enum ToMaster {
         /// Their ids.
         bricks: Vec<BrickId>,
     },
-    /// Answer to [`ToWorker::Ping`].
+    /// Answer to `Ping`.
     Pong {
-        /// Nonce of the ping.
+        /// The ping's.
         nonce: u64,
-        /// The worker's clock in microseconds.
+        /// The worker's clock.
         clock_us: u64,
     },
     /// The worker ends: it finishes the tasks it has begun, takes no more and closes the link.
@@ -468,13 +453,13 @@ pub enum ToMaster {
     },
 }
 
-/// Bricks of one set on their way to one worker.
+/// Some bricks of a set, as they go to one worker.
 #[derive(Clone, Debug)]
 pub struct BrickBatch {
-    /// The set.
+    /// Of which set.
     pub set: BrickSetKey,
-    /// Bricks that arrived whole.
+    /// The bricks.
     pub bricks: Vec<Arc<Brick>>,
-    /// Bricks that failed their checksum.
+    /// Bricks whose bytes were not whole.
     pub broken: Vec<BrickId>,
 }

@@ -5,7 +5,7 @@
 //! the table counts shut pixels in integers: a rectangle is shut when the count equals its area,
 //! exactly, in four reads.
 
-/// A half-open rectangle of pixels, in absolute image coordinates.
+/// A rectangle of pixels, half-open, in absolute image coordinates.
 #[derive(
     Clone, Copy, Debug, Default, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize,
 )]
@@ -21,42 +21,42 @@ pub struct Rect {
 }
 
 impl Rect {
-    /// Returns `[x0, x1) x [y0, y1)`.
+    /// `[x0, x1) x [y0, y1)`.
     pub fn new(x0: i32, y0: i32, x1: i32, y1: i32) -> Self {
         Rect { x0, y0, x1, y1 }
     }
 
-    /// Returns the rectangle of a whole picture of `size` (width, height) pixels.
+    /// A picture's rectangle.
     pub fn from_size(size: [u32; 2]) -> Self {
         Rect::new(0, 0, size[0] as i32, size[1] as i32)
     }
 
-    /// Returns the number of columns; 0 if empty.
+    /// Columns; 0 when empty.
     pub fn width(&self) -> usize {
         (self.x1 - self.x0).max(0) as usize
     }
 
-    /// Returns the number of rows; 0 if empty.
+    /// Rows; 0 when empty.
     pub fn height(&self) -> usize {
         (self.y1 - self.y0).max(0) as usize
     }
 
-    /// Returns the number of pixels.
+    /// Pixels.
     pub fn area(&self) -> usize {
         self.width() * self.height()
     }
 
-    /// Returns whether the rectangle holds no pixel.
+    /// Whether no pixel is in it.
     pub fn is_empty(&self) -> bool {
         self.x1 <= self.x0 || self.y1 <= self.y0
     }
 
-    /// Returns the pixels that both share (may be empty).
+    /// What both share (may be empty).
     pub fn intersect(&self, o: &Rect) -> Rect {
         Rect::new(self.x0.max(o.x0), self.y0.max(o.y0), self.x1.min(o.x1), self.y1.min(o.y1))
     }
 
-    /// Returns the smallest rectangle that holds both; an empty one counts as nothing.
+    /// The smallest rectangle that holds both (an empty one counts as nothing).
     pub fn union(&self, o: &Rect) -> Rect {
         if self.is_empty() {
             *o
@@ -68,8 +68,7 @@ impl Rect {
     }
 }
 
-/// Shut pixels of a rectangle of the image, with a summed-area table over their count (paper
-/// section 4.2).
+/// Shut pixels of a rectangle of the image, with the summed-area count over them.
 #[derive(Clone, Debug)]
 pub struct ShutMap {
     rect: Rect,
@@ -80,13 +79,13 @@ pub struct ShutMap {
 }
 
 impl ShutMap {
-    /// Returns a map of `rect` with every pixel open.
+    /// A map of `rect` with every pixel open.
     pub fn open(rect: Rect) -> Self {
         let (w, h) = (rect.width(), rect.height());
         ShutMap { rect, count: vec![0; (w + 1) * (h + 1)], shut: vec![false; w * h], stale: false }
     }
 
-    /// Returns the rectangle that the map covers.
+    /// The rectangle it covers.
     pub fn rect(&self) -> Rect {
         self.rect
     }
@@ -102,21 +101,21 @@ impl ShutMap {
         self.stale = false;
     }
 
-    /// Shuts pixel `i` (row-major in the map's rectangle). Counts are stale until
-    /// [`ShutMap::refresh`].
+    /// Shuts the pixel with index `i` (row-major in the map's rectangle). Counts are made anew
+    /// by [`ShutMap::refresh`].
     #[inline]
     pub fn shut(&mut self, i: usize) {
         self.shut[i] = true;
         self.stale = true;
     }
 
-    /// Returns whether pixel `i` (row-major in the map's rectangle) is shut.
+    /// Whether the pixel with index `i` is shut.
     #[inline]
     pub fn is_shut(&self, i: usize) -> bool {
         self.shut[i]
     }
 
-    /// Recounts after pixels were shut.
+    /// Makes the counts true again after pixels were shut.
     pub fn refresh(&mut self) {
         if !self.stale {
             return;
@@ -134,8 +133,7 @@ impl ShutMap {
         }
     }
 
-    /// Returns the number of shut pixels in the part of `r` that the map covers, as of the last
-    /// refresh.
+    /// Number of shut pixels in the part of `r` that the map covers, as of the last refresh.
     #[inline]
     pub fn shut_in(&self, r: &Rect) -> u32 {
         debug_assert!(!self.stale, "the counts are asked for before a refresh");
@@ -150,15 +148,14 @@ impl ShutMap {
         at(r.x1, r.y1) + at(r.x0, r.y0) - at(r.x1, r.y0) - at(r.x0, r.y1)
     }
 
-    /// Returns whether every pixel of `r` that the map covers is shut; true if it covers none.
+    /// Whether every pixel of `r` that the map covers is shut (true when it covers none).
     #[inline]
     pub fn all_shut(&self, r: &Rect) -> bool {
         let r = r.intersect(&self.rect);
         self.shut_in(&r) as usize == r.area()
     }
 
-    /// Returns the number of open pixels in the part of `r` that the map covers, as of the last
-    /// refresh.
+    /// Number of open pixels in the part of `r` that the map covers.
     pub fn open_in(&self, r: &Rect) -> u32 {
         let r = r.intersect(&self.rect);
         r.area() as u32 - self.shut_in(&r)
@@ -172,7 +169,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn summed_area_counts_equal_plain_counting(
+        fn counts_equal_counting(
             w in 1i32..40, h in 1i32..40, x0 in -9i32..9, y0 in -9i32..9,
             bits in prop::collection::vec(any::<bool>(), 1600),
             q in (-20i32..60, -20i32..60, 0i32..50, 0i32..50),

@@ -17,8 +17,7 @@ pub struct Lattice {
 }
 
 impl Lattice {
-    /// Returns a lattice along the world axes, `spacing` world units a step, with its first sample
-    /// at the world's origin.
+    /// Index axes times spacing, from the origin.
     pub fn from_spacing(dims: [u32; 3], spacing: [f64; 3]) -> Self {
         Lattice {
             dims,
@@ -31,51 +30,51 @@ impl Lattice {
         }
     }
 
-    /// Returns the number of samples.
+    /// Number of samples.
     pub fn len(&self) -> usize {
         self.dims.iter().map(|&n| n as usize).product()
     }
 
-    /// Returns whether there is no sample.
+    /// Whether there is no sample.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Returns the lengths of the steps along i, j, k in world units.
+    /// Lengths of the steps, in world units.
     pub fn spacing(&self) -> [f64; 3] {
         self.steps.map(|s| s.length())
     }
 
-    /// Returns the length of one vox, the smallest spacing, in world units.
+    /// One vox: the smallest spacing, in world units.
     pub fn vox(&self) -> f64 {
         let [a, b, c] = self.spacing();
         a.min(b).min(c)
     }
 
-    /// Returns the matrix from index to world coordinates, without the translation by the origin.
+    /// `world_from_index` without its translation.
     pub fn world_from_index(&self) -> DMat3 {
         DMat3::from_cols(self.steps[0], self.steps[1], self.steps[2])
     }
 
-    /// Returns the index coordinates of the centre of the volume's box.
+    /// Index coordinates of the centre of the volume's box.
     pub fn centre_index(&self) -> DVec3 {
         let [x, y, z] = self.dims.map(|n| (n as f64 - 1.0) / 2.0);
         DVec3::new(x, y, z)
     }
 
-    /// Returns the world position of the centre of the volume's box.
+    /// World position of the centre of the volume's box.
     pub fn centre(&self) -> DVec3 {
         self.origin + self.world_from_index() * self.centre_index()
     }
 
-    /// Returns the largest extent in world units (N samples count as N spacings).
+    /// The largest extent in world units (N samples count as N spacings).
     pub fn largest_extent(&self) -> f64 {
         let s = self.spacing();
         (0..3).map(|a| s[a] * self.dims[a] as f64).fold(0.0, f64::max)
     }
 
-    /// Returns the longest way through the volume, from corner to corner, in world units (N samples
-    /// count as N spacings).
+    /// The longest way through the volume, from corner to corner, in world units (N samples count as N
+    /// spacings).
     pub fn diagonal(&self) -> f64 {
         let [a, b, c] = [0, 1, 2].map(|i| self.steps[i] * f64::from(self.dims[i]));
         [a + b + c, a + b - c, a - b + c, -a + b + c]
@@ -84,8 +83,8 @@ impl Lattice {
             .fold(0.0, f64::max)
     }
 
-    /// Returns whether the lattice is cubic: equal spacings and right angles, to 1 part in 1000
-    /// (files carry spacings rounded to some digits). The kernel of other lattices is an ellipsoid
+    /// Whether the lattice is cubic: equal spacings and right angles, to 1 part in 1000 (files
+    /// carry spacings rounded to some digits). The kernel of other lattices is an ellipsoid
     /// ([`crate::kernel`]).
     pub fn is_isotropic(&self) -> bool {
         let s = self.spacing();
@@ -97,11 +96,7 @@ impl Lattice {
             && right(self.steps[1], self.steps[2])
     }
 
-    /// Checks that the lattice can be drawn.
-    ///
-    /// # Errors
-    /// If a dimension is zero, a number is not finite, a step has no length, two axes coincide, or
-    /// spacings differ by more than a factor of 10^6.
+    /// Checks that the lattice can be drawn: finite, no step of length zero, not flat.
     pub fn check(&self) -> Result<(), String> {
         let s = self.spacing();
         if self.dims.contains(&0) {
@@ -125,7 +120,7 @@ impl Lattice {
     }
 }
 
-/// Samples as stored: in the file's type where it has at most 16 bits, else as f32.
+/// Samples as stored: the file's type where it has at most 16 bits, else f32.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Samples {
     /// 8-bit codes.
@@ -149,7 +144,7 @@ pub enum SampleKind {
 }
 
 impl SampleKind {
-    /// Returns the bytes a sample.
+    /// Bytes a sample.
     pub fn bytes(self) -> usize {
         match self {
             SampleKind::U8 => 1,
@@ -160,7 +155,7 @@ impl SampleKind {
 }
 
 impl Samples {
-    /// Returns the number of samples.
+    /// Number of samples.
     pub fn len(&self) -> usize {
         match self {
             Samples::U8(v) => v.len(),
@@ -169,13 +164,12 @@ impl Samples {
         }
     }
 
-    /// Returns whether there is no sample.
+    /// Whether there is none.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Writes samples as bits into `to`: codes as they are, floats as their bit patterns. Writes as
-    /// many as both have.
+    /// Samples as bits: their codes, or those of floats. As many as there are and fit.
     #[inline(always)]
     pub fn write_bits(&self, to: &mut [u32]) {
         match self {
@@ -185,7 +179,7 @@ impl Samples {
         }
     }
 
-    /// Returns the type of the samples.
+    /// Their type.
     pub fn kind(&self) -> SampleKind {
         match self {
             Samples::U8(_) => SampleKind::U8,
@@ -194,7 +188,7 @@ impl Samples {
         }
     }
 
-    /// Returns an empty list of `kind`.
+    /// An empty list of `kind`.
     pub fn empty(kind: SampleKind) -> Self {
         match kind {
             SampleKind::U8 => Samples::U8(Vec::new()),
@@ -203,10 +197,7 @@ impl Samples {
         }
     }
 
-    /// Returns sample `i` as a code.
-    ///
-    /// # Panics
-    /// If there is no sample `i`.
+    /// Sample `i` as a code.
     #[inline]
     pub fn code(&self, i: usize) -> f64 {
         match self {
@@ -216,10 +207,7 @@ impl Samples {
         }
     }
 
-    /// Appends sample `i` of `from`.
-    ///
-    /// # Panics
-    /// If `from` has another type or no sample `i`.
+    /// Appends sample `i` of `from`, which has the same type.
     #[inline]
     pub fn push_from(&mut self, from: &Samples, i: usize) {
         match (self, from) {
@@ -231,7 +219,7 @@ impl Samples {
     }
 }
 
-/// Map from stored codes to the file's values: `value = offset + scale * code`.
+/// From stored codes to the file's values: `value = offset + scale * code`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ValueMap {
     /// Value of one code step.
@@ -241,38 +229,38 @@ pub struct ValueMap {
 }
 
 impl ValueMap {
-    /// The map of files whose codes are their values.
+    /// Codes are values.
     pub const IDENTITY: ValueMap = ValueMap { scale: 1.0, offset: 0.0 };
 
-    /// Returns the value of a code.
+    /// The value of a code.
     #[inline]
     pub fn value(&self, code: f64) -> f64 {
         self.offset + self.scale * code
     }
 }
 
-/// Range and histogram of a volume's values.
+/// What is known of a volume's values without looking at the samples again.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ValueSummary {
     /// Stored type.
     pub kind: SampleKind,
-    /// Map from codes to values.
+    /// Codes to values.
     pub map: ValueMap,
     /// Smallest finite code.
     pub min_code: f64,
     /// Largest finite code.
     pub max_code: f64,
-    /// Counts of finite samples in 256 equal bins from the smallest to the largest code. In 8-bit
+    /// Finite samples in 256 equal bins from the smallest to the largest code; for 8-bit
     /// volumes bin = code instead, so that no two codes share a bin.
     pub histogram: Vec<u64>,
-    /// Number of samples that are NaN.
+    /// Samples that are NaN.
     pub nan: u64,
-    /// Number of samples that are infinite (drawn as the nearest finite value).
+    /// Samples that are infinite (drawn as the nearest finite value).
     pub infinite: u64,
 }
 
 impl ValueSummary {
-    /// Counts `samples`, whose values are `map` of their codes.
+    /// Counts `samples`.
     pub fn from_samples(samples: &Samples, map: ValueMap) -> Self {
         let mut s = ValueSummary {
             kind: samples.kind(),
@@ -334,7 +322,7 @@ impl ValueSummary {
         s
     }
 
-    /// Returns the histogram bin of a finite code, 0 to 255.
+    /// The histogram bin of a finite code.
     pub fn bin(&self, code: f64) -> usize {
         if self.kind == SampleKind::U8 {
             return code as usize;
@@ -343,7 +331,7 @@ impl ValueSummary {
         if span > 0.0 { (((code - self.min_code) / span) * 256.0).min(255.0) as usize } else { 0 }
     }
 
-    /// Returns the code at the lower edge of bin `b`.
+    /// The code at the lower edge of bin `b`.
     pub fn bin_code(&self, b: usize) -> f64 {
         if self.kind == SampleKind::U8 {
             return b as f64;
@@ -351,13 +339,13 @@ impl ValueSummary {
         self.min_code + (self.max_code - self.min_code) * b as f64 / 256.0
     }
 
-    /// Returns the smallest and the largest finite value.
+    /// Smallest and largest finite value.
     pub fn range(&self) -> (f64, f64) {
         let (a, b) = (self.map.value(self.min_code), self.map.value(self.max_code));
         (a.min(b), a.max(b))
     }
 
-    /// Returns the number of samples, NaN and infinities included.
+    /// Number of samples.
     pub fn total(&self) -> u64 {
         self.histogram.iter().sum::<u64>() + self.nan + self.infinite
     }
@@ -366,22 +354,22 @@ impl ValueSummary {
 /// A volume in memory.
 #[derive(Clone, Debug)]
 pub struct Volume {
-    /// Name for people (the file's, without folders).
+    /// What to call it (the file's name without folders).
     pub name: String,
-    /// Type in the file, for people (`int16`).
+    /// The type in the file, for people (`int16`).
     pub file_type: String,
-    /// Whether the file says where the patient's right, anterior and superior are.
+    /// Whether the file says where patient right, anterior and superior are.
     pub anatomical: bool,
     /// Where the samples lie.
     pub lattice: Lattice,
-    /// The samples, i fastest, then j, then k.
+    /// The samples, i fastest.
     pub samples: Samples,
-    /// Range, histogram, and map from codes to values.
+    /// Range, histogram, codes to values.
     pub summary: ValueSummary,
 }
 
 impl Volume {
-    /// Returns a volume of `samples` on `lattice`, and counts them.
+    /// A volume of samples; counts them.
     ///
     /// # Panics
     /// If the lattice and the samples differ in number.
@@ -405,7 +393,7 @@ impl Volume {
         }
     }
 
-    /// Returns a volume by formula: `f(i, j, k)` as 8-bit codes on a lattice of unit spacing.
+    /// A volume by formula: `f(i, j, k)` as 8-bit codes on a unit lattice.
     pub fn from_fn_u8(name: &str, dims: [u32; 3], mut f: impl FnMut(u32, u32, u32) -> u8) -> Self {
         let mut v = Vec::with_capacity(dims.iter().map(|&n| n as usize).product());
         for k in 0..dims[2] {
@@ -419,8 +407,8 @@ impl Volume {
         Volume::new(name, "uint8", false, lattice, Samples::U8(v), ValueMap::IDENTITY)
     }
 
-    /// Returns the SHA-256 over lattice, value map and samples. Two volumes with one digest give
-    /// the same pictures; the name is not part of it.
+    /// SHA-256 over lattice, value map and samples: two volumes with one digest give the same
+    /// pictures. The name is not part of it.
     pub fn digest(&self) -> Digest32 {
         let mut h = Sha256::new();
         h.update(b"slabcast volume 1");
@@ -458,10 +446,9 @@ impl Volume {
         Digest32(h.finalize().into())
     }
 
-    /// Returns the gradient of the raw field at sample (i, j, k) in world axes, in codes per vox:
-    /// central differences with spacing, one-sided at the border, zero along an axis of one sample.
-    /// Not finite where a neighbour is not. `index_to_world_gradient` is
-    /// [`Volume::gradient_matrix`].
+    /// Gradient of the raw field in world axes at sample (i, j, k): central differences with
+    /// spacing, one-sided at the border, zero along an axis of one sample. Unit: codes per
+    /// world unit. Not finite where a neighbour is not.
     pub fn gradient(&self, [i, j, k]: [u32; 3], index_to_world_gradient: &DMat3) -> DVec3 {
         let [nx, ny, nz] = self.lattice.dims;
         let at = |x: u32, y: u32, z: u32| {
@@ -479,13 +466,13 @@ impl Volume {
         *index_to_world_gradient * g
     }
 
-    /// Returns the matrix that [`Volume::gradient`] takes: the transposed inverse of
+    /// The matrix that [`Volume::gradient`] takes: the transposed inverse of
     /// `world_from_index`, scaled to vox so that no unit overflows it.
     ///
     /// Its numbers are rounded to f32. Gradients of integers are fractions of small numbers, and
-    /// some lie just between two codes of a normal. In another unit of length the matrix has other
-    /// last bits, and one gradient in 10^4 or so would flip to the next code (the test below counts
-    /// 44 in 5 10^5 without the rounding; two voxels make 1 % of a small picture differ).
+    /// some lie just between two codes of a normal. In another unit of length the last bits of
+    /// the matrix are others, and one in 10^4 or so would flip to the next code (the test below
+    /// counts 44 in 5 10^5 without the rounding; two voxels make 1 % of a small picture differ).
     pub fn gradient_matrix(&self) -> DMat3 {
         let vox = self.lattice.vox();
         let m = DMat3::from_cols(
@@ -497,20 +484,20 @@ impl Volume {
         DMat3::from_cols_array(&m.to_cols_array().map(|x| f64::from(x as f32)))
     }
 
-    /// Returns the volume without its samples; `digest` is its [`Volume::digest`].
+    /// What workers need to know of it.
     pub fn info(&self, digest: Digest32) -> VolumeInfo {
         VolumeInfo { digest, lattice: self.lattice, summary: self.summary.clone() }
     }
 }
 
-/// A volume without its samples: what master, workers and clients share.
+/// A volume without its samples.
 #[derive(Clone, Debug, PartialEq)]
 pub struct VolumeInfo {
-    /// Digest of the volume ([`Volume::digest`]).
+    /// [`Volume::digest`].
     pub digest: Digest32,
     /// Where the samples lie.
     pub lattice: Lattice,
-    /// Range, histogram, and map from codes to values.
+    /// Range, histogram, codes to values.
     pub summary: ValueSummary,
 }
 

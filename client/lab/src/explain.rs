@@ -7,7 +7,7 @@
 use crate::ablation;
 use crate::single_frame::Still;
 use slabcast_common::volume::ValueMap;
-use slabcast_render::judge::reference::{Sheet, Sheets};
+use slabcast_render::judge::reference::{ReferenceSheet, SheetOptions};
 use slabcast_render::oracle::explain::{PixelExplanation, SectionAtPixel, SheetAtPixel, explain};
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::parse;
@@ -74,7 +74,7 @@ struct Found {
     eps: f64,
     explained: PixelExplanation,
     /// The same sheets in f64.
-    sheets: BTreeMap<i64, Sheet>,
+    sheets: BTreeMap<i64, ReferenceSheet>,
     same_thickness: [f64; 4],
     limit: [f64; 4],
     values: ValueMap,
@@ -116,7 +116,7 @@ fn find(args: &ExplainArgs, at: [u32; 2]) -> Result<Found, Fail> {
     let quality = still.spec.quality;
     let explained = explain(&still.frame(quality), &still.bricks, at, args.voxels);
     let reference = still.reference();
-    let sheets = reference.sheet_by_sheet(x, y, Sheets::default());
+    let sheets = reference.sheet_by_sheet(x, y, SheetOptions::default());
     Ok(Found {
         at,
         size: still.view.size,

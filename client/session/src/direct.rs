@@ -154,7 +154,7 @@ fn in_slabs(frame: &Frame, bricks: &[Arc<Brick>], cut: Cut) -> (Picture, Counter
         let done = shared(tiles.len(), cut.threads, |i, Kept(memory): &mut Kept| {
             let (tile, bricks) = &tiles[i];
             let before = state.tile_state(*tile);
-            tile::render_seen(frame, simd, *tile, slab, bricks, &before, &mut memory.scratch)
+            tile::render_projected(frame, simd, *tile, slab, bricks, &before, &mut memory.scratch)
         });
         for ((tile, _), (pixels, counted)) in tiles.iter().zip(&done) {
             state.add_slab_tile(*tile, pixels);

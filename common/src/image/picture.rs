@@ -10,20 +10,19 @@ use sha2::{Digest, Sha256};
 pub struct Picture {
     /// Width and height in pixels.
     pub size: [u32; 2],
-    /// Linear premultiplied RGBA, row-major from the top left.
+    /// Linear premultiplied RGBA.
     pub pixels: Vec<[f32; 4]>,
 }
 
 impl Picture {
-    /// Returns the SHA-256 over row-major linear premultiplied RGBA f32, little endian
-    /// (CONTRACTS.md, Statistics).
+    /// The hash of CONTRACTS.md: over row-major linear premultiplied RGBA f32, little endian.
     pub fn sha256(&self) -> Digest32 {
         let mut h = Sha256::new();
         hash(&mut h, &self.pixels);
         Digest32(h.finalize().into())
     }
 
-    /// Returns the pixels in `format`, composited over `background`.
+    /// The pixels in `format`.
     pub fn encode(&self, format: PixelFormat, background: Background) -> Vec<u8> {
         let mut out = Vec::with_capacity(self.pixels.len() * format.bytes());
         Encoder::new(format, background).put(&self.pixels, &mut out);
@@ -34,9 +33,9 @@ impl Picture {
 /// A picture as it leaves the master.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Encoded {
-    /// Hash as [`Picture::sha256`] gives it; `None` if the job did not ask.
+    /// As [`Picture::sha256`]; `None` where nobody asked.
     pub sha256: Option<Digest32>,
-    /// Bytes as [`Picture::encode`] gives them.
+    /// As [`Picture::encode`].
     pub bytes: Vec<u8>,
 }
 

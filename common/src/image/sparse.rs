@@ -1,32 +1,32 @@
-//! Finished pixels of a tile without the leaves that show nothing but the background.
+//! Finished pixels of a tile, without those leaves that show nothing but the background.
 //!
-//! Sums take 16 bytes a pixel, a finished pixel in 8-bit sRGB takes 3, and clients get finished
-//! pixels alone. So where nobody asks for the hash of the linear picture, workers encode their
-//! tiles themselves. They use the master's own code ([`Encoder`]), pixel by pixel, so the bytes are
-//! the same. A leaf of 16x16 pixels whose every byte is that of a pixel without a volume is left
-//! out, whatever its sums are: what is put back in its place is the same.
+//! Sums of a pixel are 16 bytes, a finished pixel in 8-bit sRGB is 3; and what a client gets is made of
+//! finished pixels alone. So where nobody asks for the hash of the linear picture, workers finish their
+//! tiles themselves, by the same code as a master (`image::Encoder`): pixels are finished one by one, and
+//! whoever does it does it to the same bytes. A leaf of 16x16 pixels whose every byte is that of a pixel
+//! without a volume is left out, whatever its sums are: what is put back in its place is the same.
 
 use super::encode::{Encoder, PixelEncoding, PixelFormat};
 use super::tile::{LEAF_EDGE, TilePixels};
 use crate::occlusion::Rect;
 
-/// Encoded pixels of a tile, without its blank leaves.
+/// Finished pixels of a tile.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SparseTile {
-    /// Width and height of the tile in pixels.
+    /// Columns and rows of the tile, in pixels.
     pub size: [u32; 2],
-    /// Pixel format.
+    /// How pixels are written.
     pub format: PixelFormat,
-    /// Which leaves are present: a bit each, row-major, leaf i at bit i % 8 of byte i / 8. Leaves
-    /// at the right and at the bottom are cut by the tile.
+    /// Which leaves are there: a bit each, row-major, leaf i at bit i % 8 of byte i / 8. Leaves at the
+    /// right and at the bottom are cut by the tile.
     pub mask: Vec<u8>,
-    /// Pixels of the present leaves, one leaf after the other, row-major in each.
+    /// Pixels of the leaves that are there, one leaf after the other, row-major in each.
     pub data: Vec<u8>,
-    /// Largest opacity of any pixel of the tile, 0 to 1.
+    /// The largest opacity of a pixel of the tile.
     pub max_alpha: f32,
 }
 
-/// Returns the leaves of a tile of `size` pixels in order, each as its columns and its rows.
+/// The leaves of a tile of so many pixels, in order: columns and rows of pixels.
 fn leaves(size: [u32; 2]) -> impl Iterator<Item = [std::ops::Range<usize>; 2]> {
     let [w, h] = size.map(|n| n as usize);
     let cut = |at: usize, end: usize| at..(at + LEAF_EDGE).min(end);
@@ -35,8 +35,7 @@ fn leaves(size: [u32; 2]) -> impl Iterator<Item = [std::ops::Range<usize>; 2]> {
         .flat_map(move |y| (0..w).step_by(LEAF_EDGE).map(move |x| [cut(x, w), cut(y, h)]))
 }
 
-/// Returns the largest opacity, or 0. Eight maxima at once, since a single chain would wait for
-/// each comparison.
+/// The largest of opacities: of eighths first, since each of one after the other waits for the one before it.
 fn most(a: &[f32]) -> f32 {
     let (eights, rest) = a.as_chunks::<8>();
     let mut most = [0.0f32; 8];
@@ -53,10 +52,10 @@ fn there(mask: &[u8], leaf: usize) -> bool {
 }
 
 impl SparseTile {
-    /// Encodes a tile of `size` pixels (width, height) that went through all sheets.
+    /// Finishes a tile of sums that went through all sheets.
     ///
     /// # Panics
-    /// If the planes don't have the tile's size.
+    /// If the planes do not have the tile's size.
     pub fn encode(pixels: &TilePixels, size: [u32; 2], finish: &PixelEncoding) -> SparseTile {
         let width = size[0] as usize;
         let n = width * size[1] as usize;
@@ -81,33 +80,30 @@ impl SparseTile {
         SparseTile { size, format: finish.format, mask, data, max_alpha: most(&pixels.a) }
     }
 
-    /// Returns a tile without a leaf: all of it shows the background.
+    /// A tile without a leaf.
     pub fn blank(size: [u32; 2], format: PixelFormat) -> SparseTile {
         let mask = vec![0; SparseTile::mask_len(size)];
         SparseTile { size, format, mask, data: Vec::new(), max_alpha: 0.0 }
     }
 
-    /// Returns the bytes of the mask of a tile of `size` pixels.
+    /// Bytes of the mask of a tile of so many pixels.
     pub fn mask_len(size: [u32; 2]) -> usize {
         let [columns, rows] = size.map(|n| (n as usize).div_ceil(LEAF_EDGE));
         (columns * rows).div_ceil(8)
     }
 
-    /// Returns the bytes of the pixels of the leaves in `mask`; at most those of the whole tile.
+    /// Bytes of the pixels of a mask's leaves; at most all of the tile.
     pub fn data_len(size: [u32; 2], format: PixelFormat, mask: &[u8]) -> usize {
         let leaves = leaves(size).enumerate().filter(|(i, _)| there(mask, *i));
         format.bytes() * leaves.map(|(_, [xs, ys])| xs.len() * ys.len()).sum::<usize>()
     }
 
-    /// Returns the number of pixels of the tile.
+    /// Number of pixels of the tile.
     pub fn pixels(&self) -> usize {
         self.size[0] as usize * self.size[1] as usize
     }
 
-    /// Checks that the parts fit each other.
-    ///
-    /// # Errors
-    /// Names the part that does not fit.
+    /// Whether the parts fit each other; says what does not.
     pub fn check(&self) -> Result<(), &'static str> {
         let leaves = leaves(self.size).count();
         if self.mask.len() != SparseTile::mask_len(self.size) {
@@ -125,10 +121,10 @@ impl SparseTile {
         Ok(())
     }
 
-    /// Writes the present leaves into the rows of a picture of `width` pixels; `tile` says where.
+    /// Writes the leaves that are there into the rows of a picture of `width` pixels.
     ///
     /// # Panics
-    /// If the parts don't fit each other, or the tile leaves the picture.
+    /// If the parts do not fit each other, or the tile leaves the picture.
     fn write(&self, tile: Rect, width: usize, picture: &mut [u8]) {
         let bytes = self.format.bytes();
         let mut data = &self.data[..];
@@ -143,7 +139,7 @@ impl SparseTile {
     }
 }
 
-/// A picture that encoded tiles are placed into. Where none was placed it shows the background.
+/// A picture that finished tiles are laid into; the background is where none is.
 #[derive(Clone, Debug)]
 pub struct FrameAssembler {
     format: PixelFormat,
@@ -152,7 +148,7 @@ pub struct FrameAssembler {
 }
 
 impl FrameAssembler {
-    /// Returns a picture of `size` (width, height) that shows nothing but the background.
+    /// Nothing but the background.
     pub fn new(size: [u32; 2], finish: &PixelEncoding) -> FrameAssembler {
         let [width, height] = size.map(|n| n as usize);
         let blank = finish.blank();
@@ -164,10 +160,10 @@ impl FrameAssembler {
         FrameAssembler { format: finish.format, width, picture }
     }
 
-    /// Places tiles at their rectangles.
+    /// Lays tiles into it.
     ///
     /// # Panics
-    /// If a tile has another format, its parts don't fit each other, or it leaves the picture.
+    /// If a tile has another format, its parts do not fit each other, or it leaves the picture.
     pub fn place(&mut self, tiles: &[(Rect, SparseTile)]) {
         for (tile, leaves) in tiles {
             assert!(leaves.format == self.format, "a frame has one format");
@@ -175,7 +171,7 @@ impl FrameAssembler {
         }
     }
 
-    /// Returns the picture's bytes, row-major from the top left.
+    /// Its bytes.
     pub fn into_bytes(self) -> Vec<u8> {
         self.picture
     }
@@ -214,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn tiles_encoded_by_workers_make_the_bytes_of_the_masters_picture() {
+    fn tiles_that_workers_finish_make_the_bytes_of_the_masters_picture() {
         let size = [90, 61];
         let tiles = [
             Rect::new(0, 0, 64, 32),
@@ -257,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_without_tiles_is_background() {
+    fn a_frame_that_nothing_came_of_is_background() {
         let finish = PixelEncoding {
             format: PixelFormat::Rgb8,
             background: Background::Colour([1.0, 0.5, 0.0]),
@@ -271,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn sparse_tile_check_names_the_part_that_does_not_fit() {
+    fn parts_that_do_not_fit_are_named() {
         let tile = Rect::new(0, 0, 40, 20);
         let finish =
             PixelEncoding { format: PixelFormat::Rgba8, background: Background::Transparent };

@@ -1,22 +1,57 @@
 //! Image-aligned sheet-based splatting with occlusion culling (paper section 3), on one tile.
 //!
+//! ```
+//! use slabcast_common::image::FrameState;
+//! use slabcast_common::occlusion::Rect;
+//! use slabcast_common::quality::Quality;
+//! use slabcast_common::slab::SheetRange;
+//! use slabcast_common::view::{Camera, CameraProjection, View};
+//! use slabcast_common::volume::Volume;
+//! use slabcast_render::{Frame, Scene, Simd, oracle, selftest, tile};
+//!
+//! let ball = |i: u32, j: u32, k: u32| {
+//!     let r2: i32 = [i, j, k].iter().map(|&n| (n as i32 - 8).pow(2)).sum();
+//!     if r2 < 36 { 200 } else { 0 }
+//! };
+//! let volume = Volume::from_fn_u8("ball", [16; 3], ball);
+//! let (bricks, quality, size) = (selftest::bricks_of(&volume), Quality::default(), [48, 48]);
+//! let projection = CameraProjection::Ortho { height: 20.0 };
+//! let camera = Camera { to_eye: glam::DVec3::Y, up: glam::DVec3::Z, target: glam::DVec3::ZERO, projection };
+//! let view = View::new(&volume.lattice, &camera, size, &quality).expect("a camera outside the volume");
+//! let frame = Frame::new(Scene::new(&selftest::spec(&volume, quality)).into(), view);
+//!
+//! let (picture, mut scratch) = (Rect::of_size(size), tile::Scratch::default());
+//! let (all, blank) = (SheetRange::new(-20, 20), tile::blank(picture));
+//! let (pixels, voxels) =
+//!     tile::render(&frame, Simd::detect(), picture, all, &bricks, &blank, &mut scratch);
+//! let mut state = FrameState::new(size);
+//! state.add_slab_tile(picture, &pixels);
+//! assert_eq!(state.to_picture().pixels, oracle::serial::render(&frame, &bricks).pixels);
+//! assert!(voxels.splatted > 0);
+//! ```
+//!
 //! Two renderers stand side by side:
 //! - [`oracle::serial`] is the paper's listing, plainly, over a whole frame: every voxel into every
 //!   bucket, sheet after sheet, nothing culled. It is the oracle for bytes.
 //! - [`tile`] is what workers run: lazy bucket toss, a ring of open sheets, bricks and voxels
 //!   tested against the occlusion map. It must give the oracle's bytes, always.
 //!
-//! [`region`] takes a tile through all depths while bricks are still coming; [`visibility`] looks at no brick
-//! that no tile needs.
+//! [`region`] takes a tile through all depths while bricks are still arriving. [`visibility`] says
+//! which bricks lie over which part of the picture, and projects those alone that a tile needs.
 //!
-//! Beside them [`judge::reference`] judges how far both are from the limit: a gather along true rays
-//! in f64 that shares none of their arithmetic, and [`judge::analytic`] has the pictures that can be
-//! worked out on paper, with derived bounds of what rounding may do to them. [`oracle::explain`]
-//! shows one pixel of theirs sheet by sheet, and [`oracle::work_counters`] what each pixel took.
+//! [`judge::reference`] judges how far both are from the limit: a gather along true rays in f64 that
+//! shares none of their arithmetic. [`judge::analytic`] has pictures in closed form, with derived
+//! bounds of what rounding may do to them, and [`judge::error_probe`] estimates a frame's error while
+//! it is drawn. [`mod@oracle::explain`] shows one pixel sheet by sheet, and
+//! [`oracle::work_counters`] counts the work of each pixel.
 //!
-//! The two share what a pixel *is*: the kernel's profile and sections ([`primitives::footprint`]) and the
-//! arithmetic of a closing sheet (`kernels::composite`). This crate refuses to know threads, networks and
-//! clocks; whoever calls it has those.
+//! Both renderers share what a pixel *is*: the kernel's profile, sections and footprints
+//! (`primitives`) and the arithmetic of compositing a sheet (`kernels::composite`).
+//!
+//! **Rooms**, from the lowest up; each imports lower ones alone (`tests/render/rooms.rs`):
+//! `primitives`, `visibility`, `kernels` (the only one with `unsafe`), `scene`, `part`, `geometry`,
+//! `tile`, `region`; beside them `oracle` and `judge`. **This crate knows no threads, network or clock**;
+//! its callers have those.
 
 pub mod judge;
 pub mod oracle;

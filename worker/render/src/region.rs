@@ -3,29 +3,29 @@
 //! A worker knows every brick of the volume by the *directory* (tight boxes, some twenty bytes a
 //! brick) and holds some of them. So it can tell by itself which bricks a region needs next, and
 //! culling need not wait for slabs: a brick is asked for at the sheet at which it begins, and only
-//! if it may touch a pixel that is open there. What hides it is then drawn already.
+//! if it may touch a pixel that is open there. Whatever hides it is drawn by then.
 //!
 //! ```text
-//! VisibleBricks::new       the directory as a frame sees it: once a frame
-//! Region::new        a tile before its first sheet
-//! expected           what it will ask for, if the frame before tells: it can be asked for before the tile is begun
-//! Region::advance    to the end, or to the first sheet that lacks a brick
-//!   .. names the bricks that it lacks there and a little farther; others render meanwhile
-//! Region::advance    from that sheet on
-//! Region::split_off  where it stands: somebody else draws a piece of it from there
-//! Region::resume      that one's, before he draws
-//! Region::finish     pixels, counts, and which bricks it touched
+//! VisibleBricks::new     once a frame: the directory, projected
+//! Region::new            a tile before its first sheet
+//! expected_bricks        bricks it will probably need, by the previous frame: to prefetch
+//! Region::advance        draws to the end, or to the first sheet with a missing brick
+//!   .. returns the bricks missing there and a little farther; other regions draw meanwhile
+//! Region::advance        draws on from that sheet
+//! Region::split_off      work stealing: cuts a piece off, which another worker draws on
+//! Region::resume         the piece at that other worker
+//! Region::finish         pixels, counters, and the bricks that were drawn
 //! ```
 //!
-//! **Why stopping changes no byte.** It is a cut between two slabs, made where it is needed: opacity
-//! and the last sheet's raw sums are kept, colour adds up in integers, and voxels that straddle the
-//! cut are tossed again ([`crate::tile`]). Where nothing is lacked there is no cut, and a region
-//! costs what a tile of one slab costs.
+//! **Why stopping changes no byte.** A stop is a cut between two slabs, made where it is needed:
+//! opacity and the last sheet's raw sums are kept, colour adds up in integers, and voxels that
+//! straddle the cut are tossed again ([`crate::tile`]). Where nothing is missing there is no cut,
+//! and a region costs what a tile of one slab costs.
 
 use crate::kernels::Simd;
 pub use crate::part::brick_feed::BrickSupply;
-use crate::part::brick_feed::{Coming, Memory};
-use crate::part::{Among, Io, Part};
+use crate::part::brick_feed::{ArrivingBricks, FeedMemory};
+use crate::part::{BrickSource, Io, Part};
 use crate::scene::Frame;
 use crate::tile::Scratch;
 use crate::visibility::closing_depth::{Cells, ClosingDepths};
@@ -35,71 +35,74 @@ use slabcast_common::message::{Checkpoint, Counters};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::{parts, split_tile};
 
-/// What a part is drawn from.
+/// What all parts of a region are drawn with.
 #[derive(Clone, Copy)]
-struct From<'a> {
+struct DrawContext<'a> {
     frame: &'a Frame,
     simd: Simd,
-    outlook: &'a VisibleBricks,
+    visible: &'a VisibleBricks,
     supply: &'a dyn BrickSupply,
-    /// Sheets beyond one that lacks a brick that are looked at.
+    /// Sheets behind the one where a brick is missing in which missing bricks are listed as well.
     ahead: u32,
 }
 
-/// How a part went.
-struct Went {
-    /// The sheet before which it stopped for what it lacks.
+/// How far a part was drawn.
+struct PartProgress {
+    /// The sheet before which it stopped; `None` if it was drawn to its end.
     stop: Option<i32>,
-    lacks: Vec<u32>,
+    missing: Vec<u32>,
     cells: Cells,
 }
 
-/// Draws the sheets of a part of `tile` from `at` on, as far as bricks are here; `came` is told the places
-/// of those that it took.
-fn go_through(
-    from: From<'_>,
-    (tile, rect, at, cells): (Rect, Rect, i32, Cells),
+/// Draws `part` of `tile` as far as its bricks are held; `took` gets the directory index of each
+/// brick that was drawn.
+fn draw_part(
+    context: DrawContext<'_>,
+    tile: Rect,
+    part: OpenPart,
     scratch: &mut Scratch,
     io: Io<'_>,
-    mut came: impl FnMut(u32),
-) -> Went {
-    let From { frame, simd, outlook, supply, ahead } = from;
-    let mut memory = std::mem::take(&mut scratch.coming);
-    let Memory { waiting, taken } = &mut memory;
-    let (seen, place) = ((frame, outlook, supply), (rect, at, ahead));
-    let coming = Coming::new(seen, place, std::mem::take(waiting), taken);
-    coming.cells.replace(cells);
-    if let Some(nearest) = coming.nearest {
-        let mut slab = coming.slab;
-        if at == outlook.sheets().first {
+    mut took: impl FnMut(u32),
+) -> PartProgress {
+    let DrawContext { frame, simd, visible, supply, ahead } = context;
+    let OpenPart { rect, next_sheet, cells } = part;
+    let mut memory = std::mem::take(&mut scratch.feed);
+    let FeedMemory { waiting, taken } = &mut memory;
+    let waiting_bricks = std::mem::take(waiting);
+    let arriving =
+        ArrivingBricks::new(frame, visible, supply, rect, next_sheet, ahead, waiting_bricks, taken);
+    arriving.cells.replace(cells);
+    if let Some(nearest) = arriving.nearest {
+        let mut slab = arriving.slab;
+        if next_sheet == visible.sheets().first {
             // Nothing is drawn yet, and nothing lies before the first brick.
-            slab.first = nearest.max(at);
+            slab.first = nearest.max(next_sheet);
         }
-        let among = Among::Coming(&coming);
-        Part { frame, rect, tile, slab, among, inside: &[] }.draw(simd, scratch, io);
+        let bricks = BrickSource::Arriving(&arriving);
+        Part { frame, rect, tile, slab, bricks, inside: &[] }.draw(simd, scratch, io);
     }
-    let mut cells = coming.cells.take();
-    let (stop, last) = (coming.stop.get(), coming.last.get());
-    if stop.is_none() && last + 1 < coming.slab.end {
+    let mut cells = arriving.cells.take();
+    let (stop, last) = (arriving.stop.get(), arriving.last.get());
+    if stop.is_none() && last + 1 < arriving.slab.end {
         // It ended before its last sheet: nothing was open any more.
         cells.shut(last + 1);
     }
-    let went = Went { stop, lacks: coming.lacks.take(), cells };
-    *waiting = coming.waiting.into_inner();
-    taken.iter().for_each(|t| came(t.place));
+    let progress = PartProgress { stop, missing: arriving.missing.take(), cells };
+    *waiting = arriving.waiting.into_inner();
+    taken.iter().for_each(|t| took(t.place));
     taken.clear();
-    scratch.coming = memory;
-    went
+    scratch.feed = memory;
+    progress
 }
 
-/// Draws a tile whose bricks are all here through all sheets, into the pixels of another, whose memory
-/// it takes over: once that and scratch have grown, nothing is allocated (`tests/allocations.rs`).
+/// Draws `tile` through all sheets of its frame, into `out`, whose memory is reused: once it and
+/// `scratch` have grown, nothing is allocated (`tests/allocations.rs`). Returns the voxel counts.
 ///
 /// # Panics
-/// If a brick is not here.
+/// If `supply` lacks a brick that the tile needs.
 pub fn draw(
     frame: &Frame,
-    outlook: &VisibleBricks,
+    visible: &VisibleBricks,
     supply: &dyn BrickSupply,
     simd: Simd,
     tile: Rect,
@@ -111,64 +114,67 @@ pub fn draw(
     out.colour.clear();
     out.colour.resize(tile.area(), [0; 3]);
     out.last = None;
-    let mut counted = Counters::default();
-    let from = From { frame, simd, outlook, supply, ahead: 0 };
+    let mut counters = Counters::default();
+    let context = DrawContext { frame, simd, visible, supply, ahead: 0 };
+    let (next_sheet, cells) = (visible.sheets().first, Cells::default());
     for rect in parts(tile) {
-        let at = (tile, rect, outlook.sheets().first, Cells::default());
-        let went = go_through(from, at, scratch, (&mut *out, &mut counted), |_| ());
-        assert!(went.stop.is_none(), "a brick is not here");
+        let part = OpenPart { rect, next_sheet, cells };
+        let progress = draw_part(context, tile, part, scratch, (&mut *out, &mut counters), |_| ());
+        assert!(progress.stop.is_none(), "a brick is missing");
     }
-    counted
+    counters
 }
 
-/// A part of a region.
+/// A part of a region that is not drawn to its end.
 #[derive(Clone, Copy, Debug)]
-struct Strand {
+struct OpenPart {
     rect: Rect,
-    /// The next sheet to draw.
-    at: i32,
-    /// How deep it is open.
+    next_sheet: i32,
+    /// The sheets at which its cells were shut.
     cells: Cells,
 }
 
-/// A tile on its way through the sheets of a frame.
+/// A tile on its way through all sheets of a frame. Its bricks may arrive while it is drawn.
 #[derive(Debug)]
 pub struct Region {
     tile: Rect,
-    /// Parts that have not come to an end.
-    open: Vec<Strand>,
+    open: Vec<OpenPart>,
     pixels: TilePixels,
     counters: Counters,
-    /// Places of bricks that were drawn, some of them twice.
+    /// Directory indices of bricks that were drawn, with repetitions.
     touched: Vec<u32>,
-    /// How deep parts were open that are at their end.
+    /// Of parts at their end: the sheets at which their cells were shut.
     depths: Vec<(Rect, Cells)>,
 }
 
-/// A region that came to its end.
+/// The result of a region.
 #[derive(Debug)]
 pub struct FinishedRegion {
-    /// Its pixels. Sums of a last sheet are not among them: nobody goes on from there.
+    /// Opacity and light of each pixel of the tile, row-major; without the sums of a last sheet,
+    /// since nothing is drawn behind them.
     pub pixels: TilePixels,
-    /// Its voxels.
+    /// Voxels splatted and culled.
     pub counters: Counters,
-    /// Places in the directory of the bricks that it touched, ascending.
+    /// Directory indices of the bricks that were drawn, ascending, without repetition.
     pub touched: Vec<u32>,
     depths: Vec<(Rect, Cells)>,
 }
 
 impl FinishedRegion {
-    /// Tells the next frame how deep it was open.
+    /// Records in `depths` the sheets at which the region's cells of 8x8 pixels were shut, from which
+    /// [`expected_bricks`] predicts the next frame's bricks.
     pub fn record_depths(&self, depths: &ClosingDepths) {
         self.depths.iter().for_each(|(part, cells)| depths.note(part, cells));
     }
 }
 
-/// What a region that is not begun will ask for, if its frame is as deep as those of `depths`: places in the directory of
-/// bricks that are not here, ascending. Nothing of what nobody knows about. Where nothing is culled, it is all that lies over it.
+/// Returns the bricks to prefetch for `tile`: directory indices, ascending, of bricks that `supply`
+/// lacks and that begin in front of the depths at which the previous frame was shut (`depths`). Of
+/// pixels that no frame has drawn yet nothing is expected. With culling off these are all missing
+/// bricks over the tile.
 pub fn expected_bricks(
     frame: &Frame,
-    outlook: &VisibleBricks,
+    visible: &VisibleBricks,
     supply: &dyn BrickSupply,
     tile: Rect,
     depths: &ClosingDepths,
@@ -178,8 +184,8 @@ pub fn expected_bricks(
     let mut places = Vec::new();
     for part in parts(tile) {
         let deepest = if all { i32::MAX } else { depths.deepest(&part) };
-        for &i in outlook.over(part.x0, part.y0) {
-            let projected = &outlook.block(i).projected;
+        for &i in visible.over(part.x0, part.y0) {
+            let projected = &visible.block(i).projected;
             if projected.sheets.first > deepest {
                 break;
             }
@@ -187,7 +193,7 @@ pub fn expected_bricks(
             if !expects(&rect, projected.sheets.first) {
                 continue;
             }
-            for &VisibleBrick { projected, place, .. } in outlook.bricks(i) {
+            for &VisibleBrick { projected, place, .. } in visible.bricks(i) {
                 let rect = projected.rect.intersect(&part);
                 if expects(&rect, projected.sheets.first) && !supply.has(place) {
                     places.push(place);
@@ -200,155 +206,181 @@ pub fn expected_bricks(
     places
 }
 
+/// Why a region can't be [resumed](Region::resume).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ResumeError {
+    /// A plane of pixels does not have as many values as the tile has pixels.
+    PlaneSize,
+    /// There are not as many next sheets as the tile has parts.
+    PartCount,
+    /// A next sheet lies outside the frame's sheets.
+    Sheet,
+}
+
+impl std::fmt::Display for ResumeError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            ResumeError::PlaneSize => "its planes do not have the tile's size",
+            ResumeError::PartCount => "it does not have as many sheets as its tile has parts",
+            ResumeError::Sheet => "its sheets are not the frame's",
+        })
+    }
+}
+
+impl std::error::Error for ResumeError {}
+
 impl Region {
-    /// `tile`, which lies inside the picture, before the first sheet.
-    pub fn new(outlook: &VisibleBricks, tile: Rect) -> Region {
-        let at = outlook.sheets().first;
-        let cells = Cells::default();
-        let open = parts(tile).map(|rect| Strand { rect, at, cells }).collect();
+    /// Begins `tile` (pixels of the picture, inside it) before the first sheet.
+    pub fn new(visible: &VisibleBricks, tile: Rect) -> Region {
+        let (next_sheet, cells) = (visible.sheets().first, Cells::default());
+        let open = parts(tile).map(|rect| OpenPart { rect, next_sheet, cells }).collect();
         let n = tile.area();
         let pixels = TilePixels { a: vec![0.0; n], colour: vec![[0; 3]; n], last: None };
         let (counters, touched, depths) = Default::default();
         Region { tile, open, pixels, counters, touched, depths }
     }
 
-    /// Its tile.
+    /// Returns the region's tile, in pixels of the picture.
     pub fn tile(&self) -> Rect {
         self.tile
     }
 
-    /// How far it has come: sheets that its parts are past, summed over those that are not at their
-    /// end. `None`: it is at its end.
+    /// Returns how many parts are not at their end, and the sum of their next sheets, which grows as
+    /// the region advances; `None` if all parts are at their end.
     pub fn depth(&self) -> Option<(usize, i64)> {
         let left = self.open.len();
-        (left > 0).then(|| (left, self.open.iter().map(|s| i64::from(s.at)).sum()))
+        (left > 0).then(|| (left, self.open.iter().map(|part| i64::from(part.next_sheet)).sum()))
     }
 
-    /// `tile`, as somebody else left it.
+    /// Continues `tile` from the state in which another worker gave it away
+    /// ([`Region::split_off`]).
     ///
     /// # Errors
-    /// In words, where it can't have been left so.
+    /// [`ResumeError`] if the state does not fit the tile or the frame's sheets.
     pub fn resume(
-        outlook: &VisibleBricks,
+        visible: &VisibleBricks,
         tile: Rect,
-        begun: &Checkpoint,
-    ) -> Result<Region, &'static str> {
-        let (n, pixels) = (tile.area(), &begun.pixels);
+        checkpoint: &Checkpoint,
+    ) -> Result<Region, ResumeError> {
+        let (n, pixels) = (tile.area(), &checkpoint.pixels);
         let last = pixels.last.as_ref().is_none_or(|last| last.len() == n);
         if pixels.a.len() != n || pixels.colour.len() != n || !last {
-            return Err("its planes do not have the tile's size");
+            return Err(ResumeError::PlaneSize);
         }
-        if begun.sheets.len() != parts(tile).count() {
-            return Err("it does not have as many sheets as its tile has parts");
+        if checkpoint.sheets.len() != parts(tile).count() {
+            return Err(ResumeError::PartCount);
         }
-        let all = outlook.sheets();
-        if begun.sheets.iter().flatten().any(|at| !(all.first..=all.end).contains(at)) {
-            return Err("its sheets are not the frame's");
+        let all = visible.sheets();
+        if checkpoint.sheets.iter().flatten().any(|k| !(all.first..=all.end).contains(k)) {
+            return Err(ResumeError::Sheet);
         }
-        let open = parts(tile).zip(&begun.sheets);
         let cells = Cells::default();
-        let strand = |(rect, at): (Rect, &Option<i32>)| Some(Strand { rect, at: (*at)?, cells });
-        let open = open.filter_map(strand).collect();
+        let part = |(rect, next_sheet): (Rect, &Option<i32>)| {
+            Some(OpenPart { rect, next_sheet: (*next_sheet)?, cells })
+        };
+        let open = parts(tile).zip(&checkpoint.sheets).filter_map(part).collect();
         let pixels = pixels.clone();
         let (counters, touched, depths) = Default::default();
         Ok(Region { tile, open, pixels, counters, touched, depths })
     }
 
-    /// Gives away about `share` of what is left: what it keeps of its tile, what it gives, and how that stands.
-    /// `None`: it can't be cut. What is left is told by open pixels and by sheets.
+    /// Splits about `share` (0 to 1) of the remaining work off: shrinks the region's tile, and
+    /// returns the tile kept, the tile given away and its state. `None` if the tile can't be cut.
+    /// Remaining work is counted in open pixels times sheets; `eps` is the transmittance below which
+    /// a pixel is shut.
     pub fn split_off(
         &mut self,
-        outlook: &VisibleBricks,
+        visible: &VisibleBricks,
         eps: f64,
         share: f64,
     ) -> Option<(Rect, Rect, Checkpoint)> {
-        let (tile, all) = (self.tile, outlook.sheets());
-        let mut leaves = Leaves::new(tile);
-        for strand in &self.open {
-            let todo = f64::from((all.end - strand.at).max(1)) / f64::from(all.len().max(1));
-            leaves.add(&strand.rect, |i| {
+        let (tile, all) = (self.tile, visible.sheets());
+        let mut work = RemainingWork::new(tile);
+        for part in &self.open {
+            let sheets_left =
+                f64::from((all.end - part.next_sheet).max(1)) / f64::from(all.len().max(1));
+            work.add(&part.rect, |i| {
                 let shut = eps > 0.0 && (1.0f32 - self.pixels.a[i]) < eps as f32;
-                if shut { 0.0 } else { todo }
+                if shut { 0.0 } else { sheets_left }
             });
         }
-        let (kept, given) = split_tile(tile, share, |r| leaves.sum(r))?;
-        let at = |rect: Rect| {
-            let on = self.open.iter().find(|s| !s.rect.intersect(&rect).is_empty());
-            on.map(|s| s.at)
+        let (kept, given) = split_tile(tile, share, |r| work.sum(r))?;
+        let next_sheet = |rect: Rect| {
+            let part = self.open.iter().find(|part| !part.rect.intersect(&rect).is_empty());
+            part.map(|part| part.next_sheet)
         };
-        let sheets = parts(given).map(at).collect();
-        let begun = Checkpoint { sheets, pixels: self.pixels.crop(tile, given) };
-        for strand in &mut self.open {
-            let rect = strand.rect.intersect(&kept);
-            if rect != strand.rect {
-                // They are counted from its corner, and seen again.
-                (strand.rect, strand.cells) = (rect, Cells::default());
+        let sheets = parts(given).map(next_sheet).collect();
+        let checkpoint = Checkpoint { sheets, pixels: self.pixels.crop(tile, given) };
+        for part in &mut self.open {
+            let rect = part.rect.intersect(&kept);
+            if rect != part.rect {
+                // Cells are counted from the part's corner; they are looked at again.
+                (part.rect, part.cells) = (rect, Cells::default());
             }
         }
-        self.open.retain(|s| !s.rect.is_empty());
+        self.open.retain(|part| !part.rect.is_empty());
         self.pixels = self.pixels.crop(tile, kept);
         self.tile = kept;
-        Some((kept, given, begun))
+        Some((kept, given, checkpoint))
     }
 
-    /// Goes as far as bricks are here. What it lacks to go farther, by places in the directory and
-    /// without repetition: those that begin at the sheets at which its parts stand still, and those
-    /// of `ahead` sheets more that are not hidden by what is drawn already. Nothing: it is at its end, or its supply
-    /// [stops](BrickSupply::stops) it.
+    /// Draws as far as bricks are held. Returns the directory indices, without repetition and nearest
+    /// first within each part, of the bricks missing to go farther: those that begin at the sheets at which
+    /// parts stopped or up to `ahead` sheets behind, and that nothing drawn so far hides. An empty list
+    /// means that the region is at its end, or that its supply [stops](BrickSupply::stops) it.
     pub fn advance(
         &mut self,
         frame: &Frame,
         simd: Simd,
-        outlook: &VisibleBricks,
+        visible: &VisibleBricks,
         supply: &dyn BrickSupply,
         ahead: u32,
         scratch: &mut Scratch,
     ) -> Vec<u32> {
         loop {
-            let lacks = self.go(frame, simd, outlook, supply, ahead, scratch);
-            // What was lacked may have come while the list was made.
-            if self.open.is_empty() || !lacks.is_empty() || supply.stops() {
-                return lacks;
+            let missing = self.advance_once(frame, simd, visible, supply, ahead, scratch);
+            // Missing bricks may have arrived while the list was made.
+            if self.open.is_empty() || !missing.is_empty() || supply.stops() {
+                return missing;
             }
         }
     }
 
-    fn go(
+    fn advance_once(
         &mut self,
         frame: &Frame,
         simd: Simd,
-        outlook: &VisibleBricks,
+        visible: &VisibleBricks,
         supply: &dyn BrickSupply,
         ahead: u32,
         scratch: &mut Scratch,
     ) -> Vec<u32> {
-        let mut lacks = Vec::new();
+        let mut missing = Vec::new();
         let mut open = std::mem::take(&mut self.open);
         let several = open.len() > 1;
-        let from = From { frame, simd, outlook, supply, ahead };
-        open.retain_mut(|strand| {
-            let at = (self.tile, strand.rect, strand.at, strand.cells);
+        let context = DrawContext { frame, simd, visible, supply, ahead };
+        open.retain_mut(|part| {
             let io = (&mut self.pixels, &mut self.counters);
-            let touched = |place| self.touched.push(place);
-            let went = go_through(from, at, scratch, io, touched);
-            lacks.extend(went.lacks);
-            strand.at = went.stop.unwrap_or(strand.at);
-            strand.cells = went.cells;
-            if went.stop.is_none() {
-                self.depths.push((strand.rect, went.cells));
+            let took = |place| self.touched.push(place);
+            let progress = draw_part(context, self.tile, *part, scratch, io, took);
+            missing.extend(progress.missing);
+            part.next_sheet = progress.stop.unwrap_or(part.next_sheet);
+            part.cells = progress.cells;
+            if progress.stop.is_none() {
+                self.depths.push((part.rect, progress.cells));
             }
-            went.stop.is_some()
+            progress.stop.is_some()
         });
         self.open = open;
         if several {
-            // Parts lack the same brick; the first to name it says how urgent it is.
+            // Several parts may lack a brick; the first to name it says how urgent it is.
             let mut named = std::collections::BTreeSet::new();
-            lacks.retain(|&place| named.insert(place));
+            missing.retain(|&place| named.insert(place));
         }
-        lacks
+        missing
     }
 
-    /// Ends it, at its end or before.
+    /// Ends the region, at its end or before, and returns what was drawn.
     pub fn finish(self) -> FinishedRegion {
         let Region { mut pixels, counters, mut touched, depths, .. } = self;
         touched.sort_unstable();
@@ -358,48 +390,49 @@ impl Region {
     }
 }
 
-/// What is left to do in each leaf of a tile.
-struct Leaves {
+/// Remaining work in each leaf (a square of [`LEAF_EDGE`] pixels) of a tile.
+struct RemainingWork {
     tile: Rect,
-    left: Vec<f64>,
+    leaves: Vec<f64>,
 }
 
-impl Leaves {
-    fn new(tile: Rect) -> Leaves {
-        let mut leaves = Leaves { tile, left: Vec::new() };
-        let [columns, rows] = leaves.of(tile.x1 - 1, tile.y1 - 1).map(|n| n + 1);
-        leaves.left.resize(columns * rows, 0.0);
-        leaves
+impl RemainingWork {
+    fn new(tile: Rect) -> RemainingWork {
+        let mut work = RemainingWork { tile, leaves: Vec::new() };
+        let [columns, rows] = work.leaf(tile.x1 - 1, tile.y1 - 1).map(|n| n + 1);
+        work.leaves.resize(columns * rows, 0.0);
+        work
     }
 
-    /// Column and row of the leaf that a pixel lies in.
-    fn of(&self, x: i32, y: i32) -> [usize; 2] {
+    /// Column and row of the leaf of pixel (x, y).
+    fn leaf(&self, x: i32, y: i32) -> [usize; 2] {
         let leaf =
             |at: i32, first: i32| (at / LEAF_EDGE as i32 - first / LEAF_EDGE as i32) as usize;
         [leaf(x, self.tile.x0), leaf(y, self.tile.y0)]
     }
 
     fn columns(&self) -> usize {
-        self.of(self.tile.x1 - 1, self.tile.y0)[0] + 1
+        self.leaf(self.tile.x1 - 1, self.tile.y0)[0] + 1
     }
 
-    /// Adds what is left of each pixel of a rectangle, by its place in the tile.
-    fn add(&mut self, rect: &Rect, todo: impl Fn(usize) -> f64) {
+    /// Adds the work of each pixel of `rect`, which `work` tells by the pixel's index in the tile.
+    fn add(&mut self, rect: &Rect, work: impl Fn(usize) -> f64) {
         let (columns, width) = (self.columns(), self.tile.width());
         for y in rect.y0..rect.y1 {
             for x in rect.x0..rect.x1 {
                 let i = (y - self.tile.y0) as usize * width + (x - self.tile.x0) as usize;
-                let [column, row] = self.of(x, y);
-                self.left[row * columns + column] += todo(i);
+                let [column, row] = self.leaf(x, y);
+                self.leaves[row * columns + column] += work(i);
             }
         }
     }
 
-    /// What is left in a rectangle of whole leaves.
+    /// The work in a rectangle of whole leaves.
     fn sum(&self, rect: &Rect) -> f64 {
         let columns = self.columns();
-        let ([x0, y0], [x1, y1]) = (self.of(rect.x0, rect.y0), self.of(rect.x1 - 1, rect.y1 - 1));
-        let rows = self.left.chunks(columns).take(y1 + 1).skip(y0);
+        let ([x0, y0], [x1, y1]) =
+            (self.leaf(rect.x0, rect.y0), self.leaf(rect.x1 - 1, rect.y1 - 1));
+        let rows = self.leaves.chunks(columns).take(y1 + 1).skip(y0);
         rows.map(|row| row[x0..=x1].iter().sum::<f64>()).sum()
     }
 }

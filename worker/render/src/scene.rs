@@ -1,4 +1,4 @@
-//! A scene and a frame of it, made ready for drawing: tables that tiles share.
+//! A scene and one view of it, with the tables that all tiles share.
 
 use crate::kernels::composite::Rule;
 use crate::kernels::{Simd, Work, lut};
@@ -20,29 +20,29 @@ use slabcast_common::transfer::Classifier;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, View};
 use std::sync::Arc;
 
-/// A volume's looks under one transfer function and quality.
+/// A volume's appearance under one transfer function and quality, without its voxels. Frames of all
+/// views share it.
 #[derive(Debug)]
 pub struct Scene {
-    /// Looks by code.
+    /// Extinction and colour by sample code.
     pub classifier: Classifier,
-    /// Light; `None` where voxels are unshaded.
+    /// Lighting; `None` where voxels are unlit.
     pub shader: Option<Shader>,
-    /// Quality; sums decided.
+    /// The quality asked for, with [`Sums::Auto`] resolved.
     pub quality: Quality,
-    /// How the volume is cut into bricks.
+    /// The volume's division into bricks of 8x8x8 voxels.
     pub grid: BrickGrid,
-    /// Samples along the index axes.
+    /// Number of samples along each index axis.
     pub dims: [u32; 3],
-    /// Largest extinction per vox (or alpha, for the paper's compositing).
+    /// Largest extinction per vox that any code has (largest alpha, for the paper's compositing).
     pub payload_max: f64,
-    /// Whether all that is seen is grey, and that is made use of.
+    /// Whether every colour is grey and the quality allows two channels instead of four.
     pub grey: bool,
-    /// Footprints that its frames share.
     shelf: Arc<Shelf>,
 }
 
 impl Scene {
-    /// Makes `spec` ready.
+    /// Prepares the scene that `spec` describes.
     pub fn new(spec: &SceneSpec) -> Self {
         let classifier = Classifier::new(&spec.transfer, &spec.volume, spec.quality.compositing);
         let payload_max = classifier.payload_max();
@@ -58,94 +58,103 @@ impl Scene {
         }
     }
 
-    /// Tables that its frames share.
+    /// Tables that frames share.
     pub(crate) fn shelf(&self) -> &Shelf {
         &self.shelf
     }
 
-    /// Whether sheets add floats.
+    /// Returns whether sheets add floats instead of whole numbers.
     pub fn float_sums(&self) -> bool {
         self.quality.sums == Sums::F32
     }
 }
 
-/// How much light slivers of voxels may take to another sheet in 32-bit sums, in cut-offs. At the default
-/// eps it is 0.0098, and the default kernel moves 0.0078 at most (at the largest extinction, in sheets of a vox).
+/// Share of a pixel's light that merged slivers may move to another sheet in 32-bit sums, in units of
+/// eps. At the default eps this is 0.0098; the default kernel moves 0.0078 at most (at the largest
+/// extinction, in sheets of a vox).
 const SLIVERS_PER_EPS: f64 = 5.0;
 
-/// One view of a scene.
+/// One view of a scene, ready to be drawn by any number of threads. Every renderer of this crate takes
+/// positions, payloads and the rule of compositing from here.
 #[derive(Debug)]
 pub struct Frame {
-    /// The scene.
+    /// The scene that is viewed.
     pub scene: Arc<Scene>,
-    /// The view.
+    /// Camera, picture size and sheets.
     pub view: View,
-    /// Sections in depth.
+    #[doc(hidden)]
     pub sections: Arc<Sections>,
-    /// Footprints on the screen.
+    #[doc(hidden)]
     pub footprints: Footprints,
-    /// Arithmetic of a closing sheet.
-    pub rule: Rule,
-    /// What payloads are multiplied by: raw units of a sum for one unit of payload; for 16-bit
-    /// sums that times the factors of their weights.
+    pub(crate) rule: Rule,
+    /// Raw units of a sheet's sums for one unit of payload; for 16-bit sums times the factors of their
+    /// weights.
     pub raw_scale: f32,
-    /// Eye offsets of the 512 voxels of a brick, by axis.
+    /// Offsets of the 512 voxels of a brick from its corner, in vox, by the eye's axes.
     offsets: Box<[[f64; 512]; 3]>,
-    /// Unit direction to the eye in world axes, where it is the same for all voxels.
+    /// Unit direction to the eye in world axes, in orthographic views.
     pub(crate) to_eye: Option<Vec3>,
-    /// Positions, where all sections of all voxels share one footprint, be they in one place or aside of it.
+    /// Integer positions, where all sections of all voxels share one footprint.
+    #[doc(hidden)]
     pub flat: Option<Flat>,
-    /// Where sections and rows lie, where the kernel leans.
+    /// Offsets of sections and rows, where the kernel leans.
+    #[doc(hidden)]
     pub leaning: Option<Leaning>,
-    /// What lies level, where voxels are added to rows of it.
+    /// Lattice rows, where the camera is level and voxels share them.
+    #[doc(hidden)]
     pub lattice_rows: Option<LatticeRows>,
 }
 
-/// What an orthographic view has whose footprints are in a table and small enough for masks.
+/// Integer positions of an orthographic view whose footprints are in a table and small enough for
+/// masks.
 #[derive(Debug)]
+#[doc(hidden)]
 pub struct Flat {
-    /// Where voxels land.
+    /// Positions of voxels on the screen and in depth.
     pub places: Places,
-    /// Pixels along x and y that a footprint reaches at most from the one that holds its voxel's centre.
+    /// Most pixels along x and y from the pixel of a voxel's centre to the edge of its footprint.
     pub reach: [i32; 2],
 }
 
-/// Local index of the voxel at a place in its brick.
+/// Local index of the voxel at (i, j, k) of its brick.
 fn local_of([i, j, k]: [u32; 3]) -> u16 {
     (i + 8 * j + 64 * k) as u16
 }
 
-/// A brick's corner, seen by the eye.
+/// Position of a brick's first voxel in a frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Corner {
     /// Index position of its first voxel.
+    #[doc(hidden)]
     pub index: [u32; 3],
     /// Eye coordinates in vox.
     pub eye: DVec3,
-    /// Where the view is flat.
+    /// Integer position, in orthographic views.
+    #[doc(hidden)]
     pub flat: FlatCorner,
 }
 
-/// A voxel, seen by the eye.
+/// Position of a voxel in a frame.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Placed {
     /// Eye coordinates in vox.
     pub eye: DVec3,
     /// Depth in phases of a sheet ([`View::depth_phases`]).
     pub z: i32,
-    /// Screen position in subpixels, where the view is flat.
+    /// Screen position in subpixels, in orthographic views.
     screen: Option<[i64; 2]>,
 }
 
 impl Frame {
-    /// The same frame, but no pixel is ever shut: what the cut-off leaves out is the difference. With eps 0
-    /// in its quality a frame may differ in what its sums give away, too ([`Sections::given_away`]).
+    /// Returns this frame without early ray termination: no pixel is ever shut. The difference from
+    /// the frame itself is what the cut-off eps leaves out. A frame whose quality has eps 0 may differ
+    /// from it in more than that: its slivers are not merged ([`Sections::given_away`]).
     #[must_use]
     pub fn never_shut(self) -> Self {
         Frame { rule: self.rule.never_shut(), ..self }
     }
 
-    /// Makes `view` of `scene` ready.
+    /// Prepares `view` of `scene`.
     pub fn new(scene: Arc<Scene>, view: View) -> Self {
         let q = &scene.quality;
         let whole = TightBox { lo: [0; 3], hi: scene.dims.map(|n| n - 1) };
@@ -239,25 +248,30 @@ impl Frame {
         }
     }
 
-    /// Whether the colour rule looks at neighbouring sheets.
+    /// Returns whether the colour rule reads the neighbouring sheets' sums, so that a slab hands its last
+    /// sheet on to the next.
     pub fn looks_at_neighbours(&self) -> bool {
         self.scene.quality.compositing == Compositing::Linear
     }
 
-    /// Offsets of a brick's voxels from its corner, in vox along each of the eye's axes.
+    /// Offsets of the 512 voxels of a brick from its corner, in vox, by the eye's axes.
+    #[doc(hidden)]
     pub fn offsets(&self) -> &[[f64; 512]; 3] {
         &self.offsets
     }
 
-    /// The corner of brick `id`.
+    /// Returns the position of brick `id`.
     pub fn corner(&self, id: BrickId) -> Corner {
         let index = self.scene.grid.corner(id);
         let eye = self.view.corner_in_eye(index);
         Corner { index, eye, flat: self.flat.as_ref().map_or([0; 3], |f| f.places.corner(eye)) }
     }
 
-    /// Where a voxel lies: its brick's corner and its local index. The one definition of a
-    /// position, for every renderer.
+    /// Returns the position of the voxel with index `local` (0 to 511, x fastest) in the brick at
+    /// `corner`: the one definition of a position, for every renderer.
+    ///
+    /// # Panics
+    /// If `local` is above 511.
     #[inline]
     pub fn place(&self, corner: &Corner, local: u16) -> Placed {
         let [x, y, z] = self.offsets.each_ref().map(|o| o[usize::from(local)]);
@@ -271,8 +285,9 @@ impl Frame {
         }
     }
 
-    /// Screen position, in 1/256 pixel of absolute image coordinates, of a voxel's footprint in sheet `k`, one
-    /// of [its](Sections::span).
+    /// Returns the screen position, in 1/256 pixel of absolute image coordinates, of a voxel's footprint
+    /// in sheet `k`, one of [those it touches](Sections::span).
+    #[doc(hidden)]
     #[inline]
     pub fn screen(&self, placed: &Placed, k: i32, footprint: &Footprint<'_>) -> [i64; 2] {
         let leaning = self.leaning.as_ref().map(|leaning| {
@@ -293,20 +308,23 @@ impl Frame {
         }
     }
 
-    /// The lattice row of a voxel, in a level view: its brick's corner and its local index.
+    /// Returns the lattice row of a voxel, if the view has them.
+    #[doc(hidden)]
     #[inline]
     pub fn lattice_row(&self, corner: &Corner, of: u16) -> Option<u32> {
         let (at, lattice_rows) = (local_position(of), self.lattice_rows.as_ref()?);
         Some(lattice_rows.of_voxel(std::array::from_fn(|axis| corner.index[axis] + at[axis])))
     }
 
-    /// Whether all sections of a voxel have the same columns with the same weights.
+    /// Whether all sections of a voxel have the same columns and weights across.
     pub(crate) fn has_columns_alike(&self) -> bool {
         let leans = |leaning: &Leaning| leaning.most(0) > 0.0 || leaning.row() != 0;
         self.flat.is_some() && !self.leaning.as_ref().is_some_and(leans)
     }
 
-    /// Where the middle of row `y` is along x of a footprint [at](Frame::screen) a position.
+    /// Returns the x position, in 1/256 pixel, of a footprint at `at` ([`Frame::screen`]) in row `y` of
+    /// pixels. Differs from row to row where the kernel leans within the picture.
+    #[doc(hidden)]
     #[inline]
     pub fn along_row(&self, at: [i64; 2], y: i32) -> i64 {
         let Some(leaning) = self.leaning.as_ref().filter(|leaning| leaning.row() != 0) else {
@@ -316,10 +334,10 @@ impl Frame {
         at[0] + Lean::along_row(leaning.row(), middle - at[1])
     }
 
-    /// [`Frame::payload`] of many voxels by their samples' bits, normals and, where each sees the eye
-    /// in a direction of its own, eye coordinates by axis (opacities do not hang on gradients):
-    /// extinctions, then each colour. There may be more normals than samples, for
-    /// [whole registers](crate::kernels::whole_registers); what comes of those is not said.
+    /// Computes [`Frame::payload`] of many voxels from their samples' bits, their normals and, in
+    /// perspective views, their eye coordinates by axis; opacity by gradient is not supported. `out` gets
+    /// the extinctions, then each colour. There may be more normals than samples, to fill
+    /// [whole registers](crate::kernels::whole_registers); their results are unspecified.
     ///
     /// # Panics
     /// If there are fewer normals or eyes than samples; in a perspective view without eyes.
@@ -335,8 +353,12 @@ impl Frame {
         simd.run(Payloads { frame: self, samples, normals, eyes, out });
     }
 
-    /// What voxel `i` of `brick` at eye position `eye` adds to a sheet per unit of weight, in
-    /// raw units: extinction and the three sigma-weighted shaded colours.
+    /// Returns what voxel `i` of `brick`, at eye coordinates `eye` in vox, adds to a sheet per unit of
+    /// weight, in raw units ([`Frame::raw_scale`]): extinction, then the three lit colours times
+    /// extinction.
+    ///
+    /// # Panics
+    /// If the brick has no voxel `i`.
     #[inline]
     pub fn payload(&self, brick: &Brick, i: usize, eye: DVec3) -> [f32; 4] {
         let look = self.scene.classifier.classify_voxel(brick, i);
@@ -356,8 +378,8 @@ impl Frame {
     }
 }
 
-/// [`Frame::payloads`]: compiled for each instruction set by itself, and not with all that calls it. Its loops are of a
-/// length that compilers do not know, so that they run them on lanes.
+/// The work of [`Frame::payloads`], compiled once for each instruction set. Its loops have lengths
+/// unknown to the compiler, so that it vectorises them.
 struct Payloads<'a, const MOST: usize> {
     frame: &'a Frame,
     samples: &'a [u32],

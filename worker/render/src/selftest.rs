@@ -1,8 +1,8 @@
-//! A tile that every worker draws before it says hello.
+//! A small picture whose hash every worker sends in its hello.
 //!
-//! Its hash goes into the hello; the master refuses a worker whose hash differs from
-//! `slabcast_common::SELF_TEST_SHA256`, naming both. So a machine, a compiler or a build that
-//! rounds differently is found before it spoils a picture.
+//! The master refuses a worker whose hash differs from `slabcast_common::SELF_TEST_SHA256`, and names
+//! both hashes. So a machine, a compiler or a build that rounds differently is found before it spoils a
+//! picture.
 
 use crate::kernels::Simd;
 use crate::scene::{Frame, Scene};
@@ -42,7 +42,8 @@ fn vessels() -> TransferFunction {
     }
 }
 
-/// `volume` as a scene of its own, in three colours.
+/// Describes `volume` as a scene with the preset `peer-vessels` (three colours, lit). For tests and
+/// examples.
 pub fn spec(volume: &Volume, quality: Quality) -> SceneSpec {
     SceneSpec {
         id: SceneId(0),
@@ -53,8 +54,9 @@ pub fn spec(volume: &Volume, quality: Quality) -> SceneSpec {
     }
 }
 
-/// Draws the self-test with `simd` and returns its hash: a shaded ball with a hole, 24 voxels
-/// wide, from above and level, in perspective and in parallel, with integer sums and with floats, in two slabs.
+/// Draws the self-test with instruction set `simd` and returns its SHA-256: a lit ball with a hole, 24
+/// voxels wide, from above and with a level camera, in perspective and orthographic, with integer and
+/// float sums, in two slabs.
 pub fn run(simd: Simd) -> Digest32 {
     let n = 24u32;
     let volume = Volume::from_fn_u8("selftest", [n; 3], |i, j, k| {
@@ -66,7 +68,7 @@ pub fn run(simd: Simd) -> Digest32 {
     let bricks = bricks_of(&volume);
     let mut hashes = Vec::new();
     let persp = CameraProjection::Persp { fov: 35.0, distance: 50.0 };
-    // 16-bit sums have a loop of their own where footprints are all the same.
+    // Orthographic views have kernels of their own.
     let ortho = CameraProjection::Ortho { height: 30.0 };
     let ways = [
         (Sums::I32, persp, 0.4),
@@ -104,7 +106,11 @@ pub fn run(simd: Simd) -> Digest32 {
     Digest32(Sha256::digest(&hashes).into())
 }
 
-/// All voxels of an 8-bit volume that are not zero, as bricks, with normals.
+/// Cuts an 8-bit volume into bricks of all voxels that are not zero, with normals. For tests and
+/// examples.
+///
+/// # Panics
+/// If samples are not of 8 bits.
 pub fn bricks_of(volume: &Volume) -> Vec<Arc<Brick>> {
     let grid = BrickGrid::new(volume.lattice.dims);
     let Samples::U8(samples) = &volume.samples else { unreachable!("made above") };

@@ -15,12 +15,13 @@
 //! are integers (or floats in one order), an open pixel gets every voxel that covers it, and
 //! what a shut pixel gets is never read.
 //!
-//! [`crate::region`] takes a tile through all sheets of a frame while bricks are still coming: a part
-//! then stops before the first sheet at which it lacks one, and goes on from there later.
+//! [`crate::region`] takes a tile through all sheets of a frame while bricks are still arriving: a
+//! part then stops before the first sheet with a missing brick, and goes on from there later.
 //!
-//! Some rooms do that: `general` for every view and every kind of sums; far faster, in whole numbers,
-//! `flat` for most orthographic views, `leaning` for those whose kernel leans, `deep` for most perspective ones,
-//! and `level` for flat ones that are level; it keeps the sheets of `deep` ones that are level, too.
+//! Each kind of view has its geometry ([`crate::geometry`]): `general` for every view and every kind
+//! of sums; far faster, for whole-number sums, `ortho` for most orthographic views, `sheared` for those
+//! whose kernel leans, `perspective` for most perspective views, and `shared_rows` for views with a
+//! level camera. [`Part::draw`] picks the fastest that takes the view.
 
 use crate::geometry::general::{GeneralScratch, Kind, Queues, RenderGeneral};
 use crate::geometry::open_sheets::Store;
@@ -32,8 +33,8 @@ use crate::kernels::pixel_records::MOST;
 use crate::kernels::row_records::Tiered;
 use crate::kernels::{Grey, Simd};
 pub use crate::part::ProjectedBrick;
-use crate::part::brick_feed::Memory;
-use crate::part::{Among, Io, Part, Pixels};
+use crate::part::brick_feed::FeedMemory;
+use crate::part::{BrickSource, Io, Part, Pixels};
 use crate::primitives::lattice_rows::LatticeRows;
 use crate::primitives::sizes::PART;
 use crate::scene::{Frame, Scene};
@@ -45,22 +46,22 @@ use slabcast_common::quality::Sums;
 use slabcast_common::slab::SheetRange;
 use std::sync::Arc;
 
-/// Memory that a render thread keeps from tile to tile.
+/// Memory that a render thread keeps from tile to tile, so that drawing allocates nothing. It holds no
+/// state: any scratch will do for any tile.
 #[derive(Default)]
 pub struct Scratch {
     general: GeneralScratch,
     #[doc(hidden)]
     pub whole: Whole,
     pixels: Pixels,
-    /// Which of a tile's bricks lie in a part.
+    /// Indices of the tile's bricks over the part at hand.
     inside: Vec<u32>,
-    /// What lies over a part whose bricks come one by one.
-    pub(crate) coming: Memory,
-    /// Sums of a last sheet, while no tile has them.
+    pub(crate) feed: FeedMemory,
+    /// Spare plane for the sums of a last sheet.
     last: Vec<RawSums>,
 }
 
-/// Memory for sums in records.
+/// Memory of the fast geometries, for each kind of sums.
 #[doc(hidden)]
 #[derive(Default)]
 pub struct Whole {
@@ -70,7 +71,7 @@ pub struct Whole {
     waiting: Waiting,
 }
 
-/// Memory for voxels on their way to records.
+/// Memory for voxels that wait for their sheets.
 #[derive(Default)]
 struct Waiting {
     flat: ortho::Waiting,
@@ -78,8 +79,13 @@ struct Waiting {
     deep: perspective::Waiting,
 }
 
-/// Renders the sheets of `slab` on `tile`, from `state`, with `bricks` (at least all that the tile
-/// and slab need).
+/// Renders the sheets of `slab` on `tile` and returns the tile's pixels and the voxels splatted and
+/// culled.
+///
+/// `state` has the tile's opacities in front of the slab. `bricks` are at least all bricks that the tile
+/// and slab need, in any order. The result has the opacities behind the slab, the light that the slab
+/// adds (linear, premultiplied, fixed point) and, for the linear colour rule, the raw sums of its last
+/// sheet.
 ///
 /// # Panics
 /// If the planes of `state` do not have the tile's size.
@@ -92,16 +98,18 @@ pub fn render(
     state: &TileState,
     scratch: &mut Scratch,
 ) -> (TilePixels, Counters) {
-    let seen: Vec<ProjectedBrick> =
+    let projected: Vec<ProjectedBrick> =
         bricks.iter().filter_map(|b| ProjectedBrick::new(frame, b)).collect();
-    render_seen(frame, simd, tile, slab, &ProjectedBrick::front_to_back(&seen), state, scratch)
+    let sorted = ProjectedBrick::front_to_back(&projected);
+    render_projected(frame, simd, tile, slab, &sorted, state, scratch)
 }
 
-/// [`render`] with bricks that were looked at before and lie [front to back](ProjectedBrick::front_to_back).
+/// Renders as [`render`] does, from bricks that are projected and sorted
+/// [front to back](ProjectedBrick::front_to_back).
 ///
 /// # Panics
 /// If the planes of `state` do not have the tile's size.
-pub fn render_seen(
+pub fn render_projected(
     frame: &Frame,
     simd: Simd,
     tile: Rect,
@@ -115,8 +123,9 @@ pub fn render_seen(
     (out, counted)
 }
 
-/// [`render_seen`] into the pixels of another tile, whose memory it takes over: once scratch and
-/// pixels have grown to a frame's largest tile, drawing allocates nothing (`tests/allocations.rs`).
+/// Renders as [`render_projected`] does, into `out`, whose memory is reused: once `scratch` and `out`
+/// have grown to a frame's largest tile, drawing allocates nothing (`tests/allocations.rs`). Returns the
+/// voxels splatted and culled.
 ///
 /// # Panics
 /// If the planes of `state` do not have the tile's size.
@@ -130,7 +139,7 @@ pub fn render_into(
     scratch: &mut Scratch,
     out: &mut TilePixels,
 ) -> Counters {
-    assert_eq!(state.a.len(), tile.area(), "one A a pixel");
+    assert_eq!(state.a.len(), tile.area(), "one opacity a pixel");
     out.a.clear();
     out.a.extend_from_slice(&state.a);
     out.colour.clear();
@@ -158,8 +167,8 @@ pub fn render_into(
                     inside.push(i as u32);
                 }
             }
-            let among = Among::Here(bricks);
-            let part = Part { frame, rect, tile, slab, among, inside: &inside };
+            let bricks = BrickSource::Here(bricks);
+            let part = Part { frame, rect, tile, slab, bricks, inside: &inside };
             if inside.is_empty() {
                 // The slab's last sheet is empty here.
                 if let Some(last) = &mut out.last {
@@ -177,18 +186,18 @@ pub fn render_into(
     counted
 }
 
-/// What a voxel adds to.
+/// Pixels and bytes that every voxel of a frame adds to: the memory traffic of splatting.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FootprintCost {
-    /// Pixels across and down.
+    /// Width and height of a footprint in pixels; the height is 1 where lattice rows are shared.
     pub pixels: [usize; 2],
-    /// Bytes of sums that a pixel has for the sheets of all sections together: each is read and written.
+    /// Bytes of sums of one pixel in all sheets that a voxel touches; each is read and written.
     pub bytes: usize,
 }
 
 impl Frame {
-    /// What each voxel adds to, where that is the same for all: in parallel views that are drawn in whole sums,
-    /// but for kernels that lean.
+    /// Returns what each voxel adds to, where that is the same for all voxels: in orthographic views
+    /// with whole-number sums whose kernel does not lean.
     pub fn footprint_cost(&self) -> Option<FootprintCost> {
         let Scene { quality, ref classifier, .. } = *self.scene;
         let channel = match quality.sums {
@@ -209,13 +218,13 @@ impl Frame {
         Some(FootprintCost { pixels: [across?, down?], bytes: channel * channels * sheets })
     }
 
-    /// Whether its three colours are one and it is drawn where that is made use of: opacity and one
-    /// colour, half of what others add up and close.
+    /// Returns whether the frame is drawn with two channels, opacity and grey, instead of four. This
+    /// halves the work, and gives the same pixels, where all that shows is grey.
     pub fn has_two_channels(&self) -> bool {
         self.may_have_two_channels() && ortho::takes(self).is_some()
     }
 
-    /// Whether two channels are all that 32-bit sums of it need.
+    /// Whether 32-bit sums of the frame need two channels alone.
     fn may_have_two_channels(&self) -> bool {
         let Scene { grey, quality, ref classifier, .. } = *self.scene;
         let fits = !classifier.is_modulated() && self.sections.most() <= MOST;
@@ -224,7 +233,7 @@ impl Frame {
 }
 
 impl<'a> Part<'a> {
-    /// Renders it.
+    /// Draws the part with the fastest geometry that takes its view.
     pub(crate) fn draw(self, simd: Simd, scratch: &mut Scratch, io: Io<'_>) {
         let part = self;
         let Scratch { general, whole, pixels, .. } = scratch;
@@ -254,15 +263,16 @@ impl<'a> Part<'a> {
         }
     }
 
-    /// How it is drawn in two channels in perspective: where the view is level and voxels have four sheets. Each kind more
-    /// takes the compiler seconds, and records of views that are not level would be added to one by one.
+    /// The perspective view, if it is drawn in two channels: where the camera is level and voxels have
+    /// four sheets. Every further kind takes the compiler seconds, and where the camera is not level
+    /// records would be added to one by one.
     fn deep_grey(&self) -> Option<(Deep, &'a LatticeRows)> {
         let lattice_rows = self.frame.lattice_rows.as_ref()?;
         let may = self.frame.may_have_two_channels() && self.frame.sections.most() <= 4;
         Some((perspective::takes(self).filter(|_| may)?, lattice_rows))
     }
 
-    /// Renders it where the frame [has two channels](Frame::has_two_channels).
+    /// Draws the part of a frame that [has two channels](Frame::has_two_channels).
     fn render_grey(
         self,
         simd: Simd,
@@ -288,7 +298,7 @@ impl<'a> Part<'a> {
         }
     }
 
-    /// Renders it in whole sums, in the fastest room that takes it.
+    /// Draws the part in whole-number sums with the fastest geometry that takes its view.
     fn render<S: Tiered>(
         self,
         simd: Simd,
@@ -298,8 +308,8 @@ impl<'a> Part<'a> {
         pixels: &mut Pixels,
         io: Io<'_>,
     ) {
-        // Voxels wait with their samples and normals; where gradients count, too, the general way looks
-        // into the brick.
+        // Waiting voxels carry samples and normals; opacity by gradient needs the brick, which the
+        // general geometry looks into.
         let modulated = self.frame.scene.classifier.is_modulated();
         match self.frame.sections.most() {
             _ if modulated => simd.run(RenderGeneral { part: self, kind, queues, pixels, io }),
@@ -311,7 +321,7 @@ impl<'a> Part<'a> {
         }
     }
 
-    /// The same with records of N sheets.
+    /// Draws as [`Part::render`] does, with records of N sheets.
     fn render_records<S: Tiered, const N: usize>(
         self,
         simd: Simd,
@@ -345,7 +355,7 @@ impl<'a> Part<'a> {
     }
 }
 
-/// Planes as they are before the first slab.
+/// Returns the state of `tile` in front of the first slab: all opacities zero.
 pub fn blank(tile: Rect) -> TileState {
     TileState { a: vec![0.0; tile.area()], last: None::<Vec<RawSums>> }
 }

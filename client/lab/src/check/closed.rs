@@ -10,7 +10,7 @@ use slabcast_common::transfer::{
     Classifier, ColorSpace, Domain, NanColour, OpacityUnit, SIGMA_MAX, TransferFunction,
 };
 use slabcast_common::view::SUBPIXELS;
-use slabcast_render::judge::analytic::{Bell, Layer, Profile, Rounding, Stack};
+use slabcast_render::judge::analytic::{GaussianBlob, Layer, LayerStack, Profile, Rounding};
 use slabcast_scene::path::{PathView, ProjectionKind};
 use slabcast_session::direct::Cut;
 use slabcast_session::fail::Fail;
@@ -142,7 +142,7 @@ impl Nearest {
 fn rows(
     ready: &Ready,
     picture: &Picture,
-    stack: &Stack,
+    stack: &LayerStack,
     scale: f64,
     colours: bool,
     alphas: bool,
@@ -161,12 +161,13 @@ fn rows(
         let at = |p: u32, n: u32| (f64::from(p) + 0.5 - f64::from(n) / 2.0) / scale;
         let at = [middle[0] - at(x, w), middle[1] - at(y, h)];
         let got = picture.pixels[(y * w + x) as usize];
-        let [a, c] = stack.rounding(at, &how);
+        let [a, c] = stack.rounding_bound(at, &how);
         if colours {
             let want = stack.pixel(at);
             let thick = if varies {
                 // The closed form's own steps are 1/256 vox.
-                stack.thickness(at, how.thickness) * (1.0 + (1.0 / 256.0 / how.thickness).powi(2))
+                stack.thickness_bound(at, how.thickness)
+                    * (1.0 + (1.0 / 256.0 / how.thickness).powi(2))
             } else {
                 0.0
             };
@@ -175,7 +176,7 @@ fn rows(
             }
         }
         if alphas {
-            alpha.see(got[3], -libm::expm1(-stack.depth(at, 1e9)), a);
+            alpha.see(got[3], -libm::expm1(-stack.optical_depth(at, 1e9)), a);
         }
     }
     let mut out = Vec::new();
@@ -195,7 +196,8 @@ fn wall(alpha: f64, scale: f64) -> Case {
         let ready = shot.ready()?;
         let picture = ready.picture(Cut::on(tools.threads));
         let layer = Layer { sigma: sigma(alpha), rgb: [0.25, 0.5, 1.0] };
-        let stack = Stack { profile: profile(), across: [0..12, 0..12], layers: vec![layer; 7] };
+        let stack =
+            LayerStack { profile: profile(), across: [0..12, 0..12], layers: vec![layer; 7] };
         let rows = rows(&ready, &picture, &stack, scale, true, true);
         Ok(rows.into_iter().map(|r| r.with(sane(&picture))).collect())
     })
@@ -222,7 +224,7 @@ fn two_walls(front: f64, back: f64) -> Case {
         });
         let (lo, hi) = (nx as i32 / 8, nx as i32 - nx as i32 / 8);
         let stack =
-            Stack { profile: profile(), across: [lo..hi, lo..hi], layers: layers.collect() };
+            LayerStack { profile: profile(), across: [lo..hi, lo..hi], layers: layers.collect() };
         let how = rounding(&ready, 4.0);
         let (mut alpha, mut colour) = (Nearest::default(), Nearest::default());
         let [w, h] = ready.view.size;
@@ -231,12 +233,12 @@ fn two_walls(front: f64, back: f64) -> Case {
             let at = |p: u32, n: u32| (f64::from(p) + 0.5 - f64::from(n) / 2.0) / 4.0;
             let at = [middle - at(x, w), middle - at(y, h)];
             // One colour each, and a gap: no integral is needed.
-            let all = stack.depth(at, 1e9);
-            let first = stack.depth(at, 0.0);
+            let all = stack.optical_depth(at, 1e9);
+            let first = stack.optical_depth(at, 0.0);
             let a1 = -libm::expm1(-first);
             let a2 = -libm::expm1(-(all - first));
             let got = picture.pixels[(y * w + x) as usize];
-            let [a, c] = stack.rounding(at, &how);
+            let [a, c] = stack.rounding_bound(at, &how);
             alpha.see(got[3], -libm::expm1(-all), a);
             colour.see(got[0], a1, c);
             colour.see(got[2], (1.0 - a1) * a2, c);
@@ -279,7 +281,7 @@ fn along_x(
                 Layer { sigma: of(t), rgb: [red(t), 1.0 - red(t), 0.5] }
             });
             let stack =
-                Stack { profile: profile(), across: [0..9, 0..9], layers: layers.collect() };
+                LayerStack { profile: profile(), across: [0..9, 0..9], layers: layers.collect() };
             let thin = compositing == Compositing::Constant;
             for mut row in rows(&ready, &picture, &stack, 4.0, thin, !thin) {
                 row.what = match thin {
@@ -309,7 +311,8 @@ fn bell(axis: bool) -> Case {
         let shot = shot("formula:bell:36", tf, Quality::default(), to_eye, scale)?;
         let ready = shot.ready()?;
         let picture = ready.picture(Cut::on(tools.threads));
-        let bell = Bell { profile: profile(), peak: PEAK, wide: f64::from(N) / 12.0, voxels: N };
+        let blob =
+            GaussianBlob { profile: profile(), peak: PEAK, std: f64::from(N) / 12.0, voxels: N };
         let how = rounding(&ready, scale);
         let [w, h] = ready.view.size;
         let mut alpha = Nearest::default();
@@ -317,13 +320,13 @@ fn bell(axis: bool) -> Case {
             let at = |p: u32, n: u32| (f64::from(p) + 0.5 - f64::from(n) / 2.0) / scale;
             let at = [at(x, w), at(y, h)];
             let (tau, aliasing) = if axis {
-                (bell.along_an_axis(at), 0.0)
+                (blob.depth_along_axis(at), 0.0)
             } else {
-                (bell.from_any_side(at), bell.aliasing(at, &ready.view.eye_from_index))
+                (blob.depth_from(at), blob.aliasing_bound(at, &ready.view.eye_from_index))
             };
-            let moved = bell.moved(at, how.shift) + aliasing;
+            let moved = blob.position_bound(at, how.shift) + aliasing;
             let got = picture.pixels[(y * w + x) as usize];
-            let [a, _] = bell.rounding(tau, moved, &how);
+            let [a, _] = blob.rounding_bound(tau, moved, &how);
             alpha.see(got[3], -libm::expm1(-tau), a);
         }
         Ok(vec![alpha.row("opacity, nearest to its bound").with(sane(&picture))])
@@ -339,7 +342,7 @@ fn extinction(e: i32) -> Case {
         let ready = shot.ready()?;
         let picture = ready.picture(Cut::on(tools.threads));
         let layer = Layer { sigma, rgb: [0.25, 0.5, 1.0] };
-        let stack = Stack { profile: profile(), across: [0..8, 0..8], layers: vec![layer; 8] };
+        let stack = LayerStack { profile: profile(), across: [0..8, 0..8], layers: vec![layer; 8] };
         let rows = rows(&ready, &picture, &stack, 4.0, true, true);
         Ok(rows.into_iter().map(|r| r.with(sane(&picture))).collect())
     })
@@ -353,7 +356,8 @@ fn layers() -> Case {
         let ready = shot.ready()?;
         let picture = ready.picture(Cut::on(tools.threads));
         let layer = Layer { sigma: sigma(1e-6), rgb: [1.0; 3] };
-        let stack = Stack { profile: profile(), across: [0..2, 0..2], layers: vec![layer; 10_000] };
+        let stack =
+            LayerStack { profile: profile(), across: [0..2, 0..2], layers: vec![layer; 10_000] };
         let rows = rows(&ready, &picture, &stack, 4.0, true, true);
         Ok(rows.into_iter().map(|r| r.with(sane(&picture))).collect())
     })

@@ -118,7 +118,7 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
         let quality = Quality { compositing, ..request.quality };
         let drawn = Drawn::new(&volume, &info, &transfer, finely(quality, &transfer, &info))?;
         let reference = Reference::new(&drawn.spec, view(&camera, &quality)?, &drawn.bricks);
-        let reference = reference.with_what_sheets_add();
+        let reference = reference.with_sheet_payloads();
         let told = (&mut progress, limits.len() * sample.len());
         limits.push(direct::judge(&sample, threads, told, |[x, y]| reference.pixel(x, y)));
     }

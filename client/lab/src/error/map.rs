@@ -7,7 +7,7 @@
 use super::Found;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::occlusion::Rect;
-use slabcast_render::judge::reference::cells;
+use slabcast_render::judge::reference::grid_cells;
 use slabcast_session::canvas::{self, Canvas, LINE, WHITE, viridis};
 use slabcast_session::fail::Fail;
 use slabcast_session::output::write_atomic;
@@ -96,7 +96,7 @@ fn draw(picture: &Picture, background: Background, blocks: &[(Rect, [u8; 3])]) -
 
 /// Writes the map, whole or not at all.
 pub(super) fn write(path: &Path, found: &Found) -> Result<(), Fail> {
-    let cells = cells(found.picture.size, found.sample.len());
+    let cells = grid_cells(found.picture.size, found.sample.len());
     let blocks: Vec<_> =
         cells.into_iter().zip(errors(found)).map(|(cell, e)| (cell, colour(e))).collect();
     let canvas = draw(&found.picture, found.still.background, &blocks);

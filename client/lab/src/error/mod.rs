@@ -17,7 +17,7 @@ mod report;
 use crate::single_frame::Still;
 use slabcast_common::image::Picture;
 use slabcast_common::quality::{Quality, Sums};
-use slabcast_render::judge::reference::{ErrorFigures, Sheets, stratified};
+use slabcast_render::judge::reference::{ErrorFigures, SheetOptions, stratified};
 use slabcast_session::direct;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::parse::Pixels;
@@ -168,7 +168,7 @@ fn find(args: &ErrorArgs) -> Result<Found, Fail> {
     progress.frames(all, &format!("{} pixels of the reference", sample.len()));
     let reference = still.reference();
     let judging = Instant::now();
-    let rounded = Sheets { rounded: true, ..Sheets::default() };
+    let rounded = SheetOptions { rounded: true, ..SheetOptions::default() };
     let truth = direct::judge(&sample, threads, (&mut progress, 0), |[x, y]| {
         let limit = reference.pixel(x, y);
         [limit, reference.at_same_thickness(x, y), reference.by_sheets(x, y, rounded)]

@@ -1,27 +1,26 @@
-//! Pictures that can be worked out on paper, and how far a rendered one may be from them.
+//! Pictures in closed form, and bounds of how far a rendered picture may be from them.
 //!
-//! The kernel turns a block of voxels whose looks depend on their layer alone (a [`Stack`]) into
+//! The kernel turns a block of voxels whose appearance depends on their layer alone (a [`LayerStack`]) into
 //! the field `Sx(x) Sy(y) sum_j sigma_j g(z - j)`, with S the sum of the profile g over the
 //! block's lattice points. Along a parallel ray down z, Sx and Sy stay, and the integral of g is a
 //! difference of error functions, or of truncated powers where g is a spline. So optical depth
 //! between any two depths is a sum of those, edges and ripple included. A Gaussian of voxels (a
-//! [`Bell`]) is a product of three sums along an axis, and, of the Gaussian kernel, a product of
-//! convolutions from any other side.
+//! [`GaussianBlob`]) is a product of three sums along an axis, and, for the Gaussian kernel, a product
+//! of convolutions from any other direction.
 //!
-//! A rendered picture differs from these by what [`Rounding`] adds up: each term is a bound
-//! derived from the number of roundings, not from what was seen. The profile is written down here
-//! anew, for the third time: neither footprints nor the reference are leant on.
+//! A rendered picture differs from these by at most what [`Rounding`] adds up: each term is a bound
+//! derived from the number of roundings, not from observed differences. The profile is written down
+//! here anew, for the third time, so that neither footprints nor the reference are relied on.
 
 use glam::DMat3;
 use slabcast_common::quality::{Kernel, Quality};
 use std::f64::consts::PI;
 use std::ops::Range;
 
-/// Half a unit in the last place of a float between 1/2 and 1: what one rounding of f32 is off by
-/// at most, as a share.
+/// Largest relative error of one rounding to f32: half a unit in the last place, 2^-24.
 const ULP: f64 = 1.0 / 16_777_216.0;
 
-/// One axis of the kernel. Lengths in vox.
+/// The kernel along one axis. Lengths in vox.
 #[derive(Clone, Copy, Debug)]
 pub struct Profile {
     std: f64,
@@ -33,14 +32,15 @@ pub struct Profile {
 }
 
 impl Profile {
-    /// A Gaussian of deviation `std`, cut at `radius`, its edge value subtracted, its integral one.
+    /// A Gaussian of deviation `std` vox, cut at `radius` vox, with its edge value subtracted and its
+    /// integral normalised to one.
     pub fn new(std: f64, radius: f64) -> Profile {
         let bare = Profile { std, radius, norm: 1.0, degree: None };
         Profile { norm: bare.unnormalised(radius), ..bare }
     }
 
-    /// The kernel of a quality, on a lattice of steps of one vox.
-    pub fn of(quality: &Quality) -> Profile {
+    /// The kernel of `quality` on a lattice of steps of one vox.
+    pub fn from_quality(quality: &Quality) -> Profile {
         let [std, radius] = quality.kernel_shape();
         match quality.kernel {
             Kernel::Gaussian => Profile::new(std, radius),
@@ -67,7 +67,7 @@ impl Profile {
         sum / (1..=power).map(f64::from).product::<f64>()
     }
 
-    /// g(u), per vox.
+    /// Returns the profile `u` vox from its centre, per vox.
     pub fn at(&self, u: f64) -> f64 {
         match self.degree {
             _ if u.abs() >= self.radius => 0.0,
@@ -92,7 +92,7 @@ impl Profile {
         bell - (u + self.radius) * self.bell(self.radius)
     }
 
-    /// The integral of g up to `u`: 0 to 1.
+    /// Returns the profile's integral up to `u` vox from its centre: 0 to 1.
     pub fn integral_to(&self, u: f64) -> f64 {
         let u = u.clamp(-self.radius, self.radius);
         match self.degree {
@@ -108,33 +108,33 @@ impl Profile {
         first..(last + 1).max(first)
     }
 
-    /// The sum of the profile over lattice points `of` at `u`.
+    /// Returns the sum at `u` vox of the profiles about the lattice points `of`, per vox.
     pub fn sum(&self, u: f64, of: &Range<i32>) -> f64 {
         self.near(u, of).map(|i| self.at(u - f64::from(i))).sum()
     }
 }
 
-/// What all voxels of a layer look like.
+/// The appearance of all voxels of one layer.
 #[derive(Clone, Copy, Debug)]
 pub struct Layer {
     /// Extinction per vox.
     pub sigma: f64,
-    /// Linear RGB.
+    /// Linear RGB, 0 to 1.
     pub rgb: [f64; 3],
 }
 
-/// Layers of voxels one vox apart, seen down their axis by parallel rays.
+/// Layers of voxels one vox apart, seen along the layers' axis in an orthographic view.
 #[derive(Clone, Debug)]
-pub struct Stack {
-    /// The kernel.
+pub struct LayerStack {
+    /// The kernel, the same along all axes.
     pub profile: Profile,
-    /// Lattice points across, along the picture's two axes.
+    /// Lattice points of each layer along the picture's two axes.
     pub across: [Range<i32>; 2],
-    /// Front to back; the middle of them lies in the target's plane.
+    /// The layers front to back; their middle lies in the target's plane.
     pub layers: Vec<Layer>,
 }
 
-impl Stack {
+impl LayerStack {
     /// The product of the two sums across at index position (u, v).
     pub fn lateral(&self, [u, v]: [f64; 2]) -> f64 {
         self.profile.sum(u, &self.across[0]) * self.profile.sum(v, &self.across[1])
@@ -163,14 +163,14 @@ impl Stack {
         sum
     }
 
-    /// Optical depth in front of depth `z` at index position `at`.
-    pub fn depth(&self, at: [f64; 2], z: f64) -> f64 {
+    /// Returns the optical depth in front of depth `z` (vox behind the target) at index position `at`.
+    pub fn optical_depth(&self, at: [f64; 2], z: f64) -> f64 {
         self.lateral(at) * self.between(-1e9, z)[0]
     }
 
-    /// The pixel that looks at index position `at`: linear premultiplied RGBA. Where layers differ
-    /// in colour it is put together of steps of `1/256` vox, each with its exact mean colour; its
-    /// error is at most [`Stack::thickness`] of that.
+    /// Returns the pixel that looks at index position `at`: linear premultiplied RGBA. Where layers
+    /// differ in colour it is a sum over steps of 1/256 vox, each with its exact mean colour, whose error
+    /// is at most [`LayerStack::thickness_bound`] for that thickness.
     pub fn pixel(&self, at: [f64; 2]) -> [f64; 4] {
         let lateral = self.lateral(at);
         let total = lateral * self.between(-1e9, 1e9)[0];
@@ -205,12 +205,14 @@ impl Stack {
         }
     }
 
-    /// What sheets of thickness `d` with one colour each may be off by at most. In optical depth
-    /// t a sheet's light is `int C exp(-t)`; with the mean c of C it is c a. As C - c has no mean,
+    /// Returns a bound of the error, in linear premultiplied units, of sheets of thickness `d` vox with one
+    /// colour each, at index position `at`.
+    ///
+    /// In optical depth t a sheet's light is `int C exp(-t)`; with the mean c of C it is c a. As C - c has no mean,
     /// any constant may be taken from exp(-t): with half of what exp(-t) falls by, and
     /// `int |C - c| <= tau / 2` times what C spans, the difference is at most `span tau a / 4`.
     /// What C spans is read at 16 places a sheet; ratios of kernel sums have no finer structure.
-    pub fn thickness(&self, at: [f64; 2], d: f64) -> f64 {
+    pub fn thickness_bound(&self, at: [f64; 2], d: f64) -> f64 {
         let mut bound = 0.0;
         self.sheets(self.lateral(at), d, |seen, k, tau, _| {
             let mut span = [[f64::INFINITY, f64::NEG_INFINITY]; 3];
@@ -230,8 +232,9 @@ impl Stack {
         bound
     }
 
-    /// What roundings may do to the pixel at `at`, by channel as alpha and as colour.
-    pub fn rounding(&self, at: [f64; 2], how: &Rounding) -> [f64; 2] {
+    /// Returns bounds of the error of alpha and of each colour, in linear premultiplied units, that
+    /// roundings make in the pixel at index position `at`.
+    pub fn rounding_bound(&self, at: [f64; 2], how: &Rounding) -> [f64; 2] {
         let lateral = self.lateral(at);
         let thick: f64 = self.layers.iter().map(|l| l.sigma).sum();
         let near: Vec<Range<i32>> =
@@ -248,19 +251,19 @@ impl Stack {
     }
 }
 
-/// Steps of [`Stack::pixel`] where colours differ: at 1/256 vox what they add to the error stays
+/// Steps of [`LayerStack::pixel`] where colours differ: at 1/256 vox what they add to the error stays
 /// below 1e-3/255 for the scenes here; at 1/128 it is four times that.
 pub const STEP: f64 = 1.0 / 256.0;
 
-/// How a picture was rounded: what bounds are made of.
+/// How a picture was rounded, for bounds of its error.
 #[derive(Clone, Copy, Debug)]
 pub struct Rounding {
-    /// Of a sheet, in vox.
+    /// Thickness of a sheet in vox.
     pub thickness: f64,
     /// Largest extinction per vox that integer sums were made for; `None` where sums are floats.
     pub integers: Option<f64>,
-    /// What a position may be off by along an axis of the picture, in vox: half a subpixel, or
-    /// zero where all voxels fall on subpixels.
+    /// Largest error of a position along an axis of the picture, in vox: half a subpixel, or zero where
+    /// all voxels fall on subpixels.
     pub shift: f64,
 }
 
@@ -302,23 +305,23 @@ impl Rounding {
     }
 }
 
-/// Voxels with extinctions of a Gaussian about the volume's centre.
+/// Voxels whose extinction is a Gaussian about the volume's centre.
 #[derive(Clone, Copy, Debug)]
-pub struct Bell {
-    /// The kernel.
+pub struct GaussianBlob {
+    /// The kernel, the same along all axes.
     pub profile: Profile,
     /// Extinction at the peak, per vox.
     pub peak: f64,
-    /// Deviation in vox.
-    pub wide: f64,
-    /// Voxels along each axis.
+    /// Deviation of the blob in vox.
+    pub std: f64,
+    /// Number of voxels along each axis.
     pub voxels: u32,
 }
 
-impl Bell {
+impl GaussianBlob {
     #[doc(hidden)]
-    pub fn of(&self, u: f64) -> f64 {
-        libm::exp(-u * u / (2.0 * self.wide * self.wide))
+    pub fn density(&self, u: f64) -> f64 {
+        libm::exp(-u * u / (2.0 * self.std * self.std))
     }
 
     /// Lattice points from the centre, along one axis.
@@ -327,36 +330,39 @@ impl Bell {
         (0..n).map(move |i| f64::from(i) - (f64::from(n) - 1.0) / 2.0)
     }
 
-    /// Optical depth of a ray along an index axis that passes (x, y) vox from the centre: exact,
-    /// ripple included.
-    pub fn along_an_axis(&self, [x, y]: [f64; 2]) -> f64 {
-        let sum =
-            |u: f64| -> f64 { self.places().map(|i| self.of(i) * self.profile.at(u - i)).sum() };
-        let deep: f64 = self.places().map(|i| self.of(i)).sum();
+    /// Returns the optical depth of a ray along an index axis that passes (x, y) vox from the centre:
+    /// exact, with the kernel's ripple.
+    pub fn depth_along_axis(&self, [x, y]: [f64; 2]) -> f64 {
+        let sum = |u: f64| -> f64 {
+            self.places().map(|i| self.density(i) * self.profile.at(u - i)).sum()
+        };
+        let deep: f64 = self.places().map(|i| self.density(i)).sum();
         self.peak * sum(x) * sum(y) * deep
     }
 
-    /// What positions off by `shift` along each axis may do to [`Bell::along_an_axis`].
-    pub fn moved(&self, [x, y]: [f64; 2], shift: f64) -> f64 {
-        let sum =
-            |u: f64| -> f64 { self.places().map(|i| self.of(i) * self.profile.at(u - i)).sum() };
-        let steep = |u: f64| -> f64 {
-            self.places().map(|i| self.of(i) * self.profile.steepness(u - i)).sum()
+    /// Returns a bound of the change of [`GaussianBlob::depth_along_axis`] by positions that are off by up
+    /// to `shift` vox along each axis.
+    pub fn position_bound(&self, [x, y]: [f64; 2], shift: f64) -> f64 {
+        let sum = |u: f64| -> f64 {
+            self.places().map(|i| self.density(i) * self.profile.at(u - i)).sum()
         };
-        let deep: f64 = self.places().map(|i| self.of(i)).sum();
+        let steep = |u: f64| -> f64 {
+            self.places().map(|i| self.density(i) * self.profile.steepness(u - i)).sum()
+        };
+        let deep: f64 = self.places().map(|i| self.density(i)).sum();
         1.05 * shift * self.peak * (steep(x) * sum(y) + sum(x) * steep(y)) * deep
     }
 
-    /// Optical depth of a parallel ray in any direction, (x, y) vox from the centre along the
-    /// picture's axes: the Gaussian convolved with the kernel. A sum over voxels differs from it
-    /// by [`Bell::aliasing`].
-    pub fn from_any_side(&self, [x, y]: [f64; 2]) -> f64 {
-        self.peak * (2.0 * PI).sqrt() * self.wide * self.convolved(x) * self.convolved(y)
+    /// Returns the optical depth of a ray in any direction that passes (x, y) vox from the centre along
+    /// the picture's axes: the Gaussian convolved with the kernel. The sum over voxels differs from it by
+    /// at most [`GaussianBlob::aliasing_bound`].
+    pub fn depth_from(&self, [x, y]: [f64; 2]) -> f64 {
+        self.peak * (2.0 * PI).sqrt() * self.std * self.convolved(x) * self.convolved(y)
     }
 
     /// The Gaussian convolved with the profile: two Gaussians make one, cut by error functions.
     fn convolved(&self, x: f64) -> f64 {
-        let (s, q, r) = (self.wide, self.profile.std, self.profile.radius);
+        let (s, q, r) = (self.std, self.profile.std, self.profile.radius);
         let p = 1.0 / (1.0 / (s * s) + 1.0 / (q * q)).sqrt();
         let m = x * p * p / (s * s);
         let root = std::f64::consts::SQRT_2;
@@ -370,7 +376,10 @@ impl Bell {
         (bells - self.profile.bell(r) * edge) / self.profile.norm
     }
 
-    /// What the lattice may add to [`Bell::from_any_side`]. By Poisson's formula a sum over voxels
+    /// Returns a bound of what the lattice may add to [`GaussianBlob::depth_from`] at (x, y) vox, in a view
+    /// whose eye coordinates are `eye_from_index` times index coordinates.
+    ///
+    /// By Poisson's formula a sum over voxels
     /// is a sum of integrals, one for each m of the dual lattice; that of m = 0 is the convolution.
     /// Along the ray the others are smaller by `exp(-2 pi^2 wide^2 (m.z)^2)`, across it by Fourier
     /// integrals of Gaussian times profile, which are added up here in size for m up to 6 along
@@ -379,7 +388,7 @@ impl Bell {
     /// `2 pi^2 wide^2 t^2 = 23`, so there are 2 t in a unit of its area, and near its axes, since
     /// the product of two waves is small elsewhere: in four strips of width `g(0)` from 6 on. This
     /// last part is an estimate by area, doubled.
-    pub fn aliasing(&self, [x, y]: [f64; 2], eye_from_index: &DMat3) -> f64 {
+    pub fn aliasing_bound(&self, [x, y]: [f64; 2], eye_from_index: &DMat3) -> f64 {
         let mut sum = 0.0;
         let axes = -6..=6i32;
         for (i, j, k) in axes.clone().flat_map(|i| {
@@ -392,16 +401,16 @@ impl Bell {
                 continue;
             }
             let m = *eye_from_index * glam::DVec3::new(f64::from(i), f64::from(j), f64::from(k));
-            let along = libm::exp(-2.0 * PI * PI * self.wide * self.wide * m.z * m.z);
+            let along = libm::exp(-2.0 * PI * PI * self.std * self.std * m.z * m.z);
             if along < 1e-9 {
                 continue;
             }
             sum += along * self.wave(x, m.x) * self.wave(y, m.y);
         }
         let c = 2.0 * self.profile.steepness(self.profile.radius) / (4.0 * PI * PI);
-        let t = (23.0f64 / 2.0).sqrt() / (PI * self.wide);
+        let t = (23.0f64 / 2.0).sqrt() / (PI * self.std);
         let far = 2.0 * (2.0 * t) * 4.0 * self.profile.at(0.0) * c / 6.0;
-        self.peak * (2.0 * PI).sqrt() * self.wide * (sum + far)
+        self.peak * (2.0 * PI).sqrt() * self.std * (sum + far)
     }
 
     /// `|int f(x - u) g(u) exp(2 pi i w u) du|`, by the midpoint rule.
@@ -411,15 +420,16 @@ impl Bell {
         let (mut re, mut im) = (0.0, 0.0);
         for i in 0..STEPS {
             let u = -self.profile.radius + (f64::from(i) + 0.5) * h;
-            let f = self.of(x - u) * self.profile.at(u) * h;
+            let f = self.density(x - u) * self.profile.at(u) * h;
             re += f * libm::cos(2.0 * PI * w * u);
             im += f * libm::sin(2.0 * PI * w * u);
         }
         (re * re + im * im).sqrt()
     }
 
-    /// Bounds of alpha and colour by roundings at optical depth `tau`.
-    pub fn rounding(&self, tau: f64, moved: f64, how: &Rounding) -> [f64; 2] {
+    /// Returns bounds of the error of alpha and of each colour that roundings make at optical depth
+    /// `tau`, `moved` of which may come or go by rounded positions.
+    pub fn rounding_bound(&self, tau: f64, moved: f64, how: &Rounding) -> [f64; 2] {
         // Samples are floats themselves: one rounding more, which the 16 have room for.
         let reach = 2.0 * self.profile.radius + 1.0;
         how.bound(tau, moved, reach * reach, f64::from(self.voxels) * 1.8, self.profile)

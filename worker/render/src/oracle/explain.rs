@@ -1,10 +1,10 @@
 //! One pixel, sheet by sheet: what the renderer did there and which voxels made it.
 //!
 //! The paper's listing once more, for one pixel: its voxels in the order in which float sums are
-//! defined, their sections into sheets, sheets closed by the renderer's own rule. Every number is
-//! the renderer's, in its own arithmetic, and the pixel that comes out is its pixel to the bit (a
-//! test keeps it). Like [`crate::oracle::serial`] it culls nothing; what lies behind the sheet in which
-//! the pixel was shut is counted, not drawn.
+//! defined, their sections put into sheets, sheets composited by the renderer's own rule. Every number
+//! is the renderer's, in its own arithmetic, and the resulting pixel equals the rendered one bit for
+//! bit (a test keeps it). Like [`crate::oracle::serial`] it culls nothing; what lies behind the sheet in
+//! which the pixel was shut is counted, not drawn.
 
 use crate::kernels::{Accumulate, Weight};
 use crate::scene::Frame;
@@ -16,72 +16,71 @@ use slabcast_common::quality::Sums;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// A pixel explained.
+/// How a pixel came about: its sheets, their strongest voxels, and what was hidden.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PixelExplanation {
-    /// Linear premultiplied RGBA, as rendered.
+    /// Linear premultiplied RGBA, equal to the rendered pixel bit for bit.
     pub pixel: [f32; 4],
-    /// The sheets that hold something here and were read, front to back.
+    /// The sheets that hold something at the pixel and were composited, front to back.
     pub sheets: Vec<SheetAtPixel>,
-    /// The sheet after which the pixel was shut.
+    /// The sheet after which the pixel was shut; `None` if it stayed open.
     pub shut_in: Option<i32>,
-    /// Voxels with a section in one of these sheets, and their bricks.
+    /// Number of voxels with a section in one of the composited sheets.
     pub voxels: usize,
-    /// Bricks of these voxels.
+    /// Number of bricks of these voxels.
     pub bricks: usize,
-    /// Voxels and bricks of which nothing was read, since they begin behind the sheet in which
-    /// the pixel was shut.
+    /// Number of voxels that cover the pixel but begin behind the sheet in which it was shut.
     pub hidden_voxels: usize,
-    /// Bricks that are hidden with all their voxels.
+    /// Number of bricks all of whose voxels at the pixel are hidden so.
     pub hidden_bricks: usize,
 }
 
 /// One sheet at one pixel.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SheetAtPixel {
-    /// Which: between the depths `k` and `k + 1` thicknesses behind the target.
+    /// Number of the sheet, which lies between `k` and `k + 1` thicknesses behind the target.
     pub k: i32,
-    /// Its sums as the sheet holds them: extinction and the three sigma-weighted colours.
+    /// The sheet's sums in raw units: extinction, then the three colours times extinction.
     pub raw: [f32; 4],
-    /// What the sheet behind held when this one was closed: the colour rule's peek.
+    /// The sums of the sheet behind when this one was composited, half filled: the colour rule's peek.
     pub peek: [f32; 4],
-    /// Optical depth along the ray (the sum of opacities, for the paper's compositing).
+    /// Optical depth of the sheet along the ray (sum of opacities, for the paper's compositing).
     pub tau: f32,
-    /// Mean colour, weighted by extinction.
+    /// Mean linear RGB, weighted by extinction.
     pub colour: [f32; 3],
-    /// Opacity in front of the sheet and behind it. Transmittance T is `1 - a`.
+    /// Accumulated opacity in front of the sheet, 0 to 1.
     pub a_before: f32,
-    /// Opacity of this sheet and all in front of it.
+    /// Accumulated opacity behind the sheet; transmittance is `1 - a`.
     pub a: f32,
     /// Light that the sheet adds to the pixel: linear, premultiplied, one rounding to 2^-28.
     pub light: [f64; 3],
-    /// Sections that are not zero here.
+    /// Number of voxel sections that are not zero at the pixel.
     pub sections: usize,
-    /// Their bricks.
+    /// Number of bricks of these sections.
     pub bricks: usize,
-    /// The strongest sections, strongest first.
+    /// The sections with the largest optical depths, largest first.
     pub strongest: Vec<SectionAtPixel>,
 }
 
-/// What one voxel adds to one sheet at one pixel.
+/// One voxel's contribution to one sheet at one pixel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SectionAtPixel {
-    /// Index position of the voxel.
+    /// Index of the voxel in the volume.
     pub voxel: [u32; 3],
-    /// Its brick.
+    /// Brick of the voxel.
     pub brick: BrickId,
-    /// Its value's code.
+    /// Sample code of the voxel, before the map from codes to values.
     pub code: f64,
-    /// Weights: the footprint's along x and y, and the section's.
+    /// Weights of the footprint along x and y, and of the section in depth.
     pub weights: [f32; 3],
-    /// Optical depth that it adds along the ray.
+    /// Optical depth that the voxel adds along the ray.
     pub tau: f32,
-    /// Its colour, shaded.
+    /// Linear RGB of the voxel, lit.
     pub colour: [f32; 3],
 }
 
-/// Explains pixel (x, y) of `frame` from all bricks of its scene, with at most `strongest` voxels
-/// a sheet.
+/// Explains pixel (x, y) of `frame`, counted from the top left, from `bricks`, all bricks of its scene.
+/// Each sheet lists at most `strongest` voxels.
 ///
 /// # Panics
 /// If the pixel is not in the picture.
@@ -109,21 +108,21 @@ struct Voxel {
     payload: [f32; 4],
 }
 
-/// A section at the pixel: which voxel, and its weights.
+/// A section at the pixel.
 struct Part<S: Accumulate> {
     voxel: u32,
-    /// Along x and y, and of the section, as numbers.
+    /// Along x and y, and in depth, as real numbers.
     weights: [f32; 3],
-    /// As sums add them.
+    /// In the arithmetic of the sums.
     section: [S::Section; 4],
     wx: S::Weight,
     wy: S::Weight,
-    /// In a level view: whose row it adds to.
+    /// The lattice row that it adds to, in views with a level camera.
     lattice_row: Option<u32>,
 }
 
 impl<S: Accumulate> Part<S> {
-    /// `sums` with what it adds, in the renderer's arithmetic.
+    /// Adds the section to `sums` in the renderer's arithmetic.
     fn add_to(&self, sums: &mut [S; 4]) {
         for c in 0..4 {
             sums[c] = sums[c].plus(S::row(self.section[c], self.wy), self.wx);
@@ -202,7 +201,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
     /// The sums of sheet `k` of the voxels that begin at `last` or before.
     fn sums(&self, k: i32, last: i32) -> [S; 4] {
         let mut sums = [S::default(); 4];
-        // Rows of lattice rows at the pixel's column, ascending, and what they weigh there.
+        // Lattice rows at the pixel's column, ascending, and their weights there.
         let mut rows: BTreeMap<u32, ([S; 4], S::Weight)> = BTreeMap::new();
         for part in self.sheets.get(&k).into_iter().flatten() {
             let v = &self.voxels[part.voxel as usize];
@@ -328,7 +327,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
     }
 }
 
-/// From sums to a pixel, as a frame is finished.
+/// Makes a pixel of opacity and fixed-point light, as the end of a frame does.
 fn finish(a: f32, colour: [u32; 3]) -> [f32; 4] {
     let mut state = FrameState::new([1, 1]);
     let pixels = TilePixels { a: vec![a], colour: vec![colour], last: None };

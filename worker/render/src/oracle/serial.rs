@@ -18,52 +18,53 @@ use slabcast_common::quality::Sums;
 use slabcast_common::slab::SheetRange;
 use std::sync::Arc;
 
-/// Renders `frame` from all bricks of its scene.
+/// Renders `frame` from `bricks`, all bricks of its scene in any order. Returns linear premultiplied
+/// RGBA. Every other renderer of the crate gives these bytes.
 pub fn render(frame: &Frame, bricks: &[Arc<Brick>]) -> Picture {
-    watched(frame, bricks, None)
+    render_counting(frame, bricks, None)
 }
 
-/// The same; `notes` are taken on the way.
-pub(crate) fn watched(
+/// Renders as [`render`] does and counts each pixel's work in `counters`.
+pub(crate) fn render_counting(
     frame: &Frame,
     bricks: &[Arc<Brick>],
-    notes: Option<&mut WorkCounters>,
+    counters: Option<&mut WorkCounters>,
 ) -> Picture {
     match frame.scene.quality.sums {
         Sums::F32 => {
-            let add = |to: &mut [[f32; 4]], p: &Part<'_>| {
+            let add = |to: &mut [[f32; 4]], p: &Section<'_>| {
                 floats(p, |pixel, c, v| to[pixel][c] += v);
             };
-            render_sums(frame, bricks, notes, add, |_, _, _| unreachable!("floats have no rows"))
+            render_sums(frame, bricks, counters, add, |_, _, _| unreachable!("floats have no rows"))
         }
-        Sums::I16 => render_sums(frame, bricks, notes, fixed, down_fixed),
-        // Round to nearest, of two the even one, as the splat loop says; saturating, as it is.
+        Sums::I16 => render_sums(frame, bricks, counters, fixed, down_fixed),
+        // Rounded to nearest, ties to even, and saturating, as the splat loop does.
         Sums::I32 | Sums::Auto => {
-            let add = |to: &mut [[i32; 4]], p: &Part<'_>| {
+            let add = |to: &mut [[i32; 4]], p: &Section<'_>| {
                 floats(p, |pixel, c, v| {
                     to[pixel][c] = to[pixel][c].wrapping_add(v.round_ties_even() as i32);
                 });
             };
-            render_sums(frame, bricks, notes, add, down_floats)
+            render_sums(frame, bricks, counters, add, down_floats)
         }
     }
 }
 
 /// One section of one voxel.
-struct Part<'a> {
+struct Section<'a> {
     frame: &'a Frame,
-    /// Depth in phases, and which of its sections.
+    /// The voxel's depth in phases, and which of its sections this is.
     z: i32,
     section: usize,
     payload: [f32; 4],
     footprint: Footprint<'a>,
     at: [i64; 2],
-    /// In a level view: which lattice row's row it adds to, instead of rows of pixels.
+    /// The lattice row that it adds to instead of rows of pixels, in views with a level camera.
     lattice_row: Option<u32>,
 }
 
-impl Part<'_> {
-    /// The rows of pixels that it adds to: each one's first pixel, and how many there are.
+impl Section<'_> {
+    /// The rows of pixels that it adds to: the first pixel of each, and the number of pixels.
     fn rows(&self) -> Vec<([i32; 2], usize)> {
         let [w, h] = self.frame.view.size.map(|n| n as i32);
         let (mut bx, mut by) = (Vec::new(), Vec::new());
@@ -78,7 +79,7 @@ impl Part<'_> {
 }
 
 /// `((payload * wz) * wy) * wx` for every pixel and channel.
-fn floats(p: &Part<'_>, mut add: impl FnMut(usize, usize, f32)) {
+fn floats(p: &Section<'_>, mut add: impl FnMut(usize, usize, f32)) {
     let [w, h] = p.frame.view.size.map(|n| n as i32);
     let (mut bx, mut by) = (Vec::new(), Vec::new());
     let wz = p.frame.sections.of(p.z).1[p.section];
@@ -104,8 +105,9 @@ fn floats(p: &Part<'_>, mut add: impl FnMut(usize, usize, f32)) {
     }
 }
 
-/// The same in 16-bit fixed point: payload, section, row and contribution each rounded to nearest.
-fn fixed(to: &mut [[i16; 4]], p: &Part<'_>) {
+/// Adds a section in 16-bit fixed point: payload, section, row and contribution are each rounded to
+/// nearest.
+fn fixed(to: &mut [[i16; 4]], p: &Section<'_>) {
     let times = |a: i32, b: i16| (a * i32::from(b) + 16384) >> 15;
     let [w, h] = p.frame.view.size.map(|n| n as i32);
     let (mut bx, mut by) = (Vec::new(), Vec::new());
@@ -134,10 +136,10 @@ fn fixed(to: &mut [[i16; 4]], p: &Part<'_>) {
     }
 }
 
-/// Where a lattice row lies in subpixels, and the sums of its row at some column.
+/// Position of a lattice row down the picture, in subpixels, and its sums at one column.
 type Above<'a, S> = (i64, &'a [S; 4]);
 
-/// What lattice rows add up to in row `y` of pixels: each row times its weight, rounded to nearest.
+/// The sum of lattice rows at row `y` of pixels: each row times its weight, rounded to nearest.
 fn down_fixed(footprint: &Footprint<'_>, rows: &[Above<'_, i16>], y: i32) -> [i16; 4] {
     let (mut sums, mut buffer) = ([0i32; 4], Vec::new());
     for (at, row) in rows {
@@ -149,7 +151,7 @@ fn down_fixed(footprint: &Footprint<'_>, rows: &[Above<'_, i16>], y: i32) -> [i1
     sums.map(|sum| sum.min(32767) as i16)
 }
 
-/// The same in floats, of which the sum is rounded.
+/// The sum of lattice rows at row `y` of pixels in floats, then rounded.
 fn down_floats(footprint: &Footprint<'_>, rows: &[Above<'_, i32>], y: i32) -> [i32; 4] {
     let (mut sums, mut buffer) = ([0f32; 4], Vec::new());
     for (at, row) in rows {
@@ -164,8 +166,8 @@ fn down_floats(footprint: &Footprint<'_>, rows: &[Above<'_, i32>], y: i32) -> [i
 fn render_sums<S: Sum>(
     frame: &Frame,
     bricks: &[Arc<Brick>],
-    mut notes: Option<&mut WorkCounters>,
-    add: impl Fn(&mut [[S; 4]], &Part<'_>),
+    mut counters: Option<&mut WorkCounters>,
+    add: impl Fn(&mut [[S; 4]], &Section<'_>),
     down: impl Fn(&Footprint<'_>, &[Above<'_, S>], i32) -> [S; 4],
 ) -> Picture {
     let [w, h] = frame.view.size.map(|n| n as usize);
@@ -197,7 +199,7 @@ fn render_sums<S: Sum>(
     let mut before = vec![[S::default(); 4]; whole.area()];
     let mut here = before.clone();
     let mut peek = before.clone();
-    // In a level view, a row of sums for each lattice row.
+    // With a level camera, a row of sums for each lattice row.
     let lattice_rows = frame.lattice_rows.as_ref();
     let high = lattice_rows.map_or(0, LatticeRows::len);
     let mut rows = [vec![[S::default(); 4]; w * high], vec![[S::default(); 4]; w * high]];
@@ -230,11 +232,11 @@ fn render_sums<S: Sum>(
                 let Some(footprint) = frame.footprints.at(sheet) else { continue };
                 let at = frame.screen(&placed, sheet, &footprint);
                 let section = (sheet - first) as usize;
-                let part = Part { frame, z, section, payload, footprint, at, lattice_row };
+                let part = Section { frame, z, section, payload, footprint, at, lattice_row };
                 add(to, &part);
-                if let Some(notes) = notes.as_mut().filter(|_| sheet == k) {
+                if let Some(counters) = counters.as_mut().filter(|_| sheet == k) {
                     for ([x, y], n) in part.rows() {
-                        notes.section(Rect::new(x, y, x + n as i32, y + 1));
+                        counters.add_section(Rect::new(x, y, x + n as i32, y + 1));
                     }
                 }
             }
@@ -263,8 +265,8 @@ fn render_sums<S: Sum>(
                 if !frame.rule.is_shut(*a) {
                     let secant = frame.view.secant(x as i32, y as i32);
                     frame.rule.close(before[i], here[i], peek[i], secant, a, &mut pixels.colour[i]);
-                    if let Some(notes) = notes.as_mut().filter(|_| here[i][0].value() > 0.0) {
-                        notes.closed(i, k, frame.rule.is_shut(*a));
+                    if let Some(counters) = counters.as_mut().filter(|_| here[i][0].value() > 0.0) {
+                        counters.add_sheet(i, k, frame.rule.is_shut(*a));
                     }
                 }
             }

@@ -1,4 +1,8 @@
-//! Bricks of a part that arrive while it is drawn.
+//! Bricks of a part that may arrive while it is drawn.
+//!
+//! A part that runs through all sheets asks, sheet by sheet, for the bricks that begin there and may
+//! touch an open pixel ([`ArrivingBricks::is_supplied`]). Where one is missing the part stops, with a
+//! list of what it lacks.
 
 use crate::scene::{Corner, Frame};
 use crate::visibility::closing_depth::{Cells, LOOKS};
@@ -12,69 +16,72 @@ use slabcast_common::view::Projected;
 use std::cell::{Cell, OnceCell, RefCell};
 use std::sync::Arc;
 
-/// Where bricks are had from, by their place in the directory.
+/// A source of bricks, which are named by their index in the scene's
+/// [directory](crate::visibility::Directory). Calls come from the thread that draws, and should
+/// not block.
 pub trait BrickSupply {
-    /// A brick, if it is here.
+    /// Returns the brick at directory index `place`, or `None` if it is not held now.
     fn get(&self, place: u32) -> Option<Arc<Brick>>;
 
-    /// Whether it is here.
+    /// Returns whether the brick at directory index `place` is held now.
     fn has(&self, place: u32) -> bool {
         self.get(place).is_some()
     }
 
-    /// Whether regions are to stop before the next sheet, whatever is here.
+    /// Returns whether a region is to stop before its next sheet although no brick is missing, for
+    /// example because its worker is asked to give part of it away. Asked once a sheet.
     fn stops(&self) -> bool {
         false
     }
 }
 
-/// A brick that a part took.
-pub(crate) struct Taken {
+/// A brick that a part holds while it is drawn.
+pub(crate) struct TakenBrick {
     brick: Arc<Brick>,
     corner: Corner,
+    /// Its index in the directory.
     pub(crate) place: u32,
-    /// Its first sheet.
-    first: i32,
+    first_sheet: i32,
 }
 
-/// A list that grows while what is in it is looked at. Its memory stays when it is emptied.
-pub struct Growing<T> {
+/// A list that grows while its items are borrowed. Clearing it keeps its memory.
+pub struct AppendList<T> {
     len: Cell<usize>,
-    /// Each twice as long as the one before.
+    /// Chunk n holds `CHUNK << n` items.
     pub chunks: [OnceCell<Vec<OnceCell<T>>>; 26],
 }
 
-/// Items of the first chunk: what a part of a head takes fits two or three.
+/// Items of the first chunk. The bricks of a part of a head fill two or three chunks.
 const CHUNK: usize = 64;
 
-impl<T> Default for Growing<T> {
+impl<T> Default for AppendList<T> {
     fn default() -> Self {
-        Growing { len: Cell::new(0), chunks: [const { OnceCell::new() }; 26] }
+        AppendList { len: Cell::new(0), chunks: [const { OnceCell::new() }; 26] }
     }
 }
 
-impl<T> Growing<T> {
+impl<T> AppendList<T> {
     pub fn len(&self) -> usize {
         self.len.get()
     }
 
-    /// Chunk of an item, and its place there.
-    fn place(i: usize) -> (usize, usize) {
+    /// Chunk of item `i`, and its index there.
+    fn locate(i: usize) -> (usize, usize) {
         let chunk = (i / CHUNK + 1).ilog2() as usize;
         (chunk, i + CHUNK - (CHUNK << chunk))
     }
 
     pub fn push(&self, item: T) {
-        let (chunk, at) = Self::place(self.len.replace(self.len.get() + 1));
+        let (chunk, slot) = Self::locate(self.len.replace(self.len.get() + 1));
         let chunk = self.chunks[chunk]
             .get_or_init(|| std::iter::repeat_with(OnceCell::new).take(CHUNK << chunk).collect());
-        chunk[at].get_or_init(|| item);
+        chunk[slot].get_or_init(|| item);
     }
 
     pub fn get(&self, i: usize) -> &T {
-        let (chunk, at) = Self::place(i);
+        let (chunk, slot) = Self::locate(i);
         let chunk = self.chunks[chunk].get();
-        chunk.and_then(|c| c[at].get()).expect("what is in the list")
+        chunk.and_then(|c| c[slot].get()).expect("an index below the length")
     }
 
     pub fn iter(&self) -> impl Iterator<Item = &T> {
@@ -87,84 +94,86 @@ impl<T> Growing<T> {
     }
 }
 
-/// What a part has before it, by the sheet at which it begins.
+/// Bricks of opened blocks, in one linked list a sheet at which they begin.
 #[derive(Default)]
-pub(crate) struct Waiting {
-    /// The last brick of each sheet, from the first on.
+pub(crate) struct WaitingBricks {
+    /// By sheet from the part's first on: the last brick pushed, or [`NONE`].
     heads: Vec<u32>,
-    bricks: Vec<Waits>,
-    /// Voxels of those that wait.
+    bricks: Vec<WaitingBrick>,
+    /// Voxels of the bricks in the lists.
     voxels: u64,
-    /// Blocks of the part that were come to.
-    blocks: usize,
+    /// How many of the part's blocks, front to back, were opened or culled.
+    blocks_done: usize,
 }
 
-/// A brick of an open block.
 #[derive(Clone, Copy)]
-struct Waits {
+struct WaitingBrick {
     block: u32,
-    /// Its place in the block.
-    brick: u32,
-    /// Another that begins at the same sheet.
+    /// Its index in the block.
+    index: u32,
+    /// The next brick that begins at the same sheet, or [`NONE`].
     next: u32,
 }
 
-/// No brick.
 const NONE: u32 = u32::MAX;
 
-/// Memory that a thread keeps for parts whose bricks come one by one.
+/// Memory that a render thread keeps from part to part.
 #[derive(Default)]
-pub struct Memory {
-    pub(crate) waiting: Waiting,
-    pub(crate) taken: Growing<Taken>,
+pub struct FeedMemory {
+    pub(crate) waiting: WaitingBricks,
+    pub(crate) taken: AppendList<TakenBrick>,
 }
 
-/// Bricks of a part that come when they are needed.
-pub struct Coming<'a> {
+/// The bricks over a part, taken from a [`BrickSupply`] when the part comes to their first sheets.
+pub struct ArrivingBricks<'a> {
     frame: &'a Frame,
-    outlook: &'a VisibleBricks,
+    visible: &'a VisibleBricks,
     supply: &'a dyn BrickSupply,
     rect: Rect,
-    /// Sheets that are left.
+    /// Sheets that are left to draw.
     pub(crate) slab: SheetRange,
     /// Blocks over the part, front to back.
     blocks: &'a [u32],
-    pub(crate) waiting: RefCell<Waiting>,
-    taken: &'a Growing<Taken>,
-    /// How many sheets beyond the one at which something is lacked are looked at, too.
+    pub(crate) waiting: RefCell<WaitingBricks>,
+    taken: &'a AppendList<TakenBrick>,
+    /// Sheets behind the one where a brick is missing in which missing bricks are listed as well.
     ahead: u32,
     /// The first sheet that could not be drawn.
     pub(crate) stop: Cell<Option<i32>>,
-    /// What was lacked: places in the directory, in order of depth.
-    pub(crate) lacks: RefCell<Vec<u32>>,
-    /// The first sheet that any brick begins at.
+    /// Directory indices of missing bricks, by the sheet at which they begin.
+    pub(crate) missing: RefCell<Vec<u32>>,
+    /// The first sheet at which any brick begins.
     pub(crate) nearest: Option<i32>,
-    /// How deep its cells are open, and the last sheet that was come to.
     pub(crate) cells: RefCell<Cells>,
+    /// The last sheet that was asked for.
     pub(crate) last: Cell<i32>,
 }
 
-impl<'a> Coming<'a> {
-    /// What lies over a part's sheets from `at` on.
+impl<'a> ArrivingBricks<'a> {
+    /// The bricks over `rect`, one part, in sheets `from` and behind.
     pub(crate) fn new(
-        (frame, outlook, supply): (&'a Frame, &'a VisibleBricks, &'a dyn BrickSupply),
-        (rect, at, ahead): (Rect, i32, u32),
-        mut waiting: Waiting,
-        taken: &'a Growing<Taken>,
-    ) -> Coming<'a> {
-        let blocks = outlook.over(rect.x0, rect.y0);
-        let ends = blocks.iter().map(|&i| outlook.block(i).projected.sheets.end);
-        let slab = SheetRange::new(at, ends.max().unwrap_or(at));
+        frame: &'a Frame,
+        visible: &'a VisibleBricks,
+        supply: &'a dyn BrickSupply,
+        rect: Rect,
+        from: i32,
+        ahead: u32,
+        mut waiting: WaitingBricks,
+        taken: &'a AppendList<TakenBrick>,
+    ) -> ArrivingBricks<'a> {
+        let blocks = visible.over(rect.x0, rect.y0);
+        let ends = blocks.iter().map(|&i| visible.block(i).projected.sheets.end);
+        let slab = SheetRange::new(from, ends.max().unwrap_or(from));
         waiting.heads.clear();
         waiting.heads.resize(slab.len() as usize, NONE);
         waiting.bricks.clear();
-        (waiting.voxels, waiting.blocks) = (0, 0);
-        let (stop, lacks, nearest, cells) = Default::default();
+        (waiting.voxels, waiting.blocks_done) = (0, 0);
+        let (stop, missing, nearest, cells) = Default::default();
         let waiting = RefCell::new(waiting);
-        let last = Cell::new(at);
-        let mut coming = Coming {
+        let last = Cell::new(from);
+        let mut arriving = ArrivingBricks {
             frame,
-            outlook,
+            visible,
             supply,
             rect,
             slab,
@@ -173,92 +182,96 @@ impl<'a> Coming<'a> {
             taken,
             ahead,
             stop,
-            lacks,
+            missing,
             nearest,
             cells,
             last,
         };
-        coming.nearest = coming.find_nearest();
-        coming
+        arriving.nearest = arriving.find_nearest();
+        arriving
     }
 
-    /// Opens blocks up to the first brick that is left: what hides a block that begins before it would
-    /// have begun before it.
+    /// Opens blocks until no block that is left can begin before the nearest brick found; the first
+    /// sheet of that brick.
     fn find_nearest(&self) -> Option<i32> {
         let waiting = &mut *self.waiting.borrow_mut();
         let mut nearest = i32::MAX;
-        while let Some(&i) = self.blocks.get(waiting.blocks)
-            && self.outlook.block(i).projected.sheets.first < nearest
+        while let Some(&i) = self.blocks.get(waiting.blocks_done)
+            && self.visible.block(i).projected.sheets.first < nearest
         {
-            waiting.blocks += 1;
-            if self.is_over(&self.outlook.block(i).projected) {
-                nearest = nearest.min(self.open(i, self.slab.first, waiting));
+            waiting.blocks_done += 1;
+            if self.overlaps(&self.visible.block(i).projected) {
+                nearest = nearest.min(self.open_block(i, self.slab.first, waiting));
             }
         }
         (nearest < i32::MAX).then_some(nearest)
     }
 
-    /// Whether something may lie in the part's sheets.
-    fn is_over(&self, p: &Projected) -> bool {
+    /// Whether a brick or block may lie in the part's pixels and remaining sheets.
+    fn overlaps(&self, p: &Projected) -> bool {
         p.sheets.overlaps(self.slab) && !p.rect.intersect(&self.rect).is_empty()
     }
 
-    fn passes(&self, rect: &Rect, open: &OpenMask) -> bool {
+    /// Whether any pixel of `rect` is open, or culling is off.
+    fn may_show(&self, rect: &Rect, open: &OpenMask) -> bool {
         !self.frame.scene.quality.cull || open.any(rect)
     }
 
-    fn visible(&self, waits: &Waits) -> &'a VisibleBrick {
-        &self.outlook.bricks(waits.block)[waits.brick as usize]
+    fn brick_of(&self, waiting: &WaitingBrick) -> &'a VisibleBrick {
+        &self.visible.bricks(waiting.block)[waiting.index as usize]
     }
 
-    /// Has a block's bricks wait for their first sheets, at `k` soonest; the first of these.
-    fn open(&self, block: u32, k: i32, waiting: &mut Waiting) -> i32 {
+    /// Puts a block's bricks into the lists of their first sheets, of sheet `k` at the earliest;
+    /// the first sheet of any of them.
+    fn open_block(&self, block: u32, k: i32, waiting: &mut WaitingBricks) -> i32 {
         let mut nearest = i32::MAX;
-        for (visible, brick) in self.outlook.bricks(block).iter().zip(0..) {
-            if !self.is_over(&visible.projected) {
+        for (brick, index) in self.visible.bricks(block).iter().zip(0..) {
+            if !self.overlaps(&brick.projected) {
                 continue;
             }
-            let first = visible.projected.sheets.first;
+            let first = brick.projected.sheets.first;
             nearest = nearest.min(first);
             let head = &mut waiting.heads[first.max(k).abs_diff(self.slab.first) as usize];
-            waiting.bricks.push(Waits { block, brick, next: *head });
+            waiting.bricks.push(WaitingBrick { block, index, next: *head });
             *head = waiting.bricks.len() as u32 - 1;
-            waiting.voxels += u64::from(visible.voxels);
+            waiting.voxels += u64::from(brick.voxels);
         }
         nearest
     }
 
-    /// Voxels of a block that is not opened, as far as it lies over the part: as its rectangle does.
-    fn share(&self, block: u32) -> u64 {
-        let seen = self.outlook.block(block);
-        if !self.is_over(&seen.projected) {
+    /// Voxels of a block that was not opened, in proportion to how much of its rectangle lies over
+    /// the part.
+    fn voxel_share(&self, block: u32) -> u64 {
+        let block = self.visible.block(block);
+        if !self.overlaps(&block.projected) {
             return 0;
         }
-        let rect = seen.projected.rect;
-        seen.voxels * rect.intersect(&self.rect).area() as u64 / rect.area() as u64
+        let rect = block.projected.rect;
+        block.voxels * rect.intersect(&self.rect).area() as u64 / rect.area() as u64
     }
 
-    /// Opens the blocks that begin at sheet `until` or before and may touch what is open; voxels of the
-    /// others.
-    fn look(&self, until: i32, k: i32, open: &OpenMask, waiting: &mut Waiting) -> u64 {
+    /// Opens the blocks that begin at sheet `until` or before and may show; the voxels of those
+    /// that may not.
+    fn open_blocks(&self, until: i32, k: i32, open: &OpenMask, waiting: &mut WaitingBricks) -> u64 {
         let mut culled = 0;
-        while let Some(&i) = self.blocks.get(waiting.blocks) {
-            let projected = &self.outlook.block(i).projected;
+        while let Some(&i) = self.blocks.get(waiting.blocks_done) {
+            let projected = &self.visible.block(i).projected;
             if projected.sheets.first > until {
                 break;
             }
-            waiting.blocks += 1;
-            if !self.passes(&projected.rect, open) {
-                culled += self.share(i);
-            } else if self.is_over(projected) {
-                self.open(i, k, waiting);
+            waiting.blocks_done += 1;
+            if !self.may_show(&projected.rect, open) {
+                culled += self.voxel_share(i);
+            } else if self.overlaps(projected) {
+                self.open_block(i, k, waiting);
             }
         }
         culled
     }
 
-    /// Takes the bricks that begin at sheet `k` and may touch what is open; voxels of the others are
-    /// culled. If one is not here, notes what is lacked.
+    /// Takes the bricks that begin at sheet `k` and may show; the voxels of the others are counted
+    /// as culled. Returns false, and notes what is missing, if one of them is not held or the supply
+    /// [stops](BrickSupply::stops) the region. `k` rises by one from call to call.
     pub(crate) fn is_supplied(&self, k: i32, open: &OpenMask, counters: &mut Counters) -> bool {
         if self.supply.stops() {
             self.stop.set(Some(k));
@@ -269,76 +282,77 @@ impl<'a> Coming<'a> {
             self.cells.borrow_mut().look(k, open);
         }
         let waiting = &mut *self.waiting.borrow_mut();
-        let mut culled = self.look(k, k, open, waiting);
+        let mut culled = self.open_blocks(k, k, open, waiting);
         let head = k.abs_diff(self.slab.first) as usize;
         let mut next = waiting.heads[head];
-        while let Some(waits) = waiting.bricks.get(next as usize) {
-            let visible = self.visible(waits);
-            let voxels = u64::from(visible.voxels);
-            if !self.passes(&visible.projected.rect, open) {
+        while let Some(entry) = waiting.bricks.get(next as usize) {
+            let here = self.brick_of(entry);
+            let voxels = u64::from(here.voxels);
+            if !self.may_show(&here.projected.rect, open) {
                 culled += voxels;
-            } else if let Some(brick) = self.supply.get(visible.place) {
+            } else if let Some(brick) = self.supply.get(here.place) {
                 let corner = self.frame.corner(brick.id);
-                let (place, first) = (visible.place, visible.projected.sheets.first);
-                self.taken.push(Taken { brick, corner, place, first });
+                let (place, first_sheet) = (here.place, here.projected.sheets.first);
+                self.taken.push(TakenBrick { brick, corner, place, first_sheet });
             } else {
-                self.note(k, open, waiting);
+                self.note_missing(k, open, waiting);
                 return false;
             }
             waiting.voxels -= voxels;
-            next = waits.next;
+            next = entry.next;
         }
         waiting.heads[head] = NONE;
         counters.culled += culled;
         true
     }
 
-    /// Notes what is lacked at sheet `k` and a little farther.
-    fn note(&self, k: i32, open: &OpenMask, waiting: &mut Waiting) {
+    /// Lists what is missing at sheet `k` and in [`ahead`](Self::ahead) sheets more.
+    fn note_missing(&self, k: i32, open: &OpenMask, waiting: &mut WaitingBricks) {
         self.stop.set(Some(k));
         let until = k.saturating_add_unsigned(self.ahead).min(self.slab.end - 1);
-        self.look(until, k, open, waiting);
-        let mut lacked: Vec<(i32, u32)> = Vec::new();
+        self.open_blocks(until, k, open, waiting);
+        let mut missing: Vec<(i32, u32)> = Vec::new();
         for k in k..=until {
             let mut next = waiting.heads[k.abs_diff(self.slab.first) as usize];
-            while let Some(waits) = waiting.bricks.get(next as usize) {
-                let &VisibleBrick { projected, place, .. } = self.visible(waits);
-                if self.passes(&projected.rect, open) && !self.supply.has(place) {
-                    lacked.push((projected.sheets.first, place));
+            while let Some(entry) = waiting.bricks.get(next as usize) {
+                let &VisibleBrick { projected, place, .. } = self.brick_of(entry);
+                if self.may_show(&projected.rect, open) && !self.supply.has(place) {
+                    missing.push((projected.sheets.first, place));
                 }
-                next = waits.next;
+                next = entry.next;
             }
         }
-        lacked.sort_unstable();
-        self.lacks.borrow_mut().extend(lacked.into_iter().map(|(_, place)| place));
+        missing.sort_unstable();
+        self.missing.borrow_mut().extend(missing.into_iter().map(|(_, place)| place));
     }
 
-    /// The first sheet that any of its bricks begins at; `None`: nothing lies over it.
+    /// The first sheet at which any brick begins; `None` if nothing lies over the part.
     pub(crate) fn nearest(&self) -> Option<i32> {
         self.nearest
     }
 
-    /// How many bricks came.
-    pub(crate) fn came(&self) -> usize {
+    /// How many bricks were taken.
+    pub(crate) fn taken_count(&self) -> usize {
         self.taken.len()
     }
 
-    /// The first sheet of one that came.
+    /// First sheet of the `i`th brick that was taken.
     #[inline]
     pub(crate) fn first_sheet(&self, i: usize) -> i32 {
-        self.taken.get(i).first
+        self.taken.get(i).first_sheet
     }
 
-    /// One that came.
+    /// The `i`th brick that was taken.
+    #[inline]
     pub(crate) fn brick(&self, i: usize) -> (&Brick, &Corner) {
-        let Taken { brick, corner, .. } = self.taken.get(i);
+        let TakenBrick { brick, corner, .. } = self.taken.get(i);
         (brick, corner)
     }
 
-    /// Voxels of what was not come to.
+    /// Voxels of bricks that were neither taken nor culled.
     pub(crate) fn voxels_left(&self) -> u64 {
         let waiting = self.waiting.borrow();
-        let blocks = self.blocks[waiting.blocks..].iter();
-        waiting.voxels + blocks.map(|&i| self.share(i)).sum::<u64>()
+        let blocks = self.blocks[waiting.blocks_done..].iter();
+        waiting.voxels + blocks.map(|&i| self.voxel_share(i)).sum::<u64>()
     }
 }

@@ -1,5 +1,5 @@
-//! A part of a tile, at most 64x64 pixels: its bricks, its pixels, and the way between both and the
-//! tile's planes. Every geometry draws parts.
+//! A part of a tile, at most 64x64 pixels: its bricks, its pixels, and how both come from the tile
+//! and go back to it. Every geometry draws parts.
 
 pub mod brick_feed;
 
@@ -7,7 +7,7 @@ use crate::kernels::pixel_records::STRIDE;
 use crate::primitives::sizes::PART;
 use crate::scene::{Corner, Frame};
 use crate::visibility::open_mask::OpenMask;
-use brick_feed::Coming;
+use brick_feed::ArrivingBricks;
 use slabcast_common::brick::Brick;
 use slabcast_common::image::{RawSums, TilePixels};
 use slabcast_common::message::Counters;
@@ -16,61 +16,63 @@ use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Projected, Projection};
 use std::sync::Arc;
 
-/// A brick as a frame sees it: what all tiles ask of it, worked out once.
+/// A brick projected into a frame, once for all tiles.
 #[derive(Clone, Debug)]
 pub struct ProjectedBrick {
     /// The brick.
     pub brick: Arc<Brick>,
-    /// Where its voxels may land.
+    /// Pixels and sheets that its voxels may touch.
     pub projected: Projected,
     pub(crate) corner: Corner,
 }
 
 impl ProjectedBrick {
-    /// `brick` in `frame`; `None` if it is off the picture or behind the near plane.
+    /// Projects `brick` into `frame`; `None` if it is off the picture or in front of the near plane.
     pub fn new(frame: &Frame, brick: &Arc<Brick>) -> Option<ProjectedBrick> {
         let projected = frame.view.project(&brick.tight_box(&frame.scene.grid))?;
         Some(ProjectedBrick { brick: brick.clone(), projected, corner: frame.corner(brick.id) })
     }
 
-    /// `seen` front to back; those that begin together in ascending id.
-    pub fn front_to_back(seen: &[ProjectedBrick]) -> Vec<&ProjectedBrick> {
-        // Numbers and places are sorted, not bricks: a third of the time.
-        let key = |s: &ProjectedBrick| (s.projected.sheets.first, s.brick.id);
-        let mut order: Vec<_> = seen.iter().enumerate().map(|(i, s)| (key(s), i as u32)).collect();
+    /// Returns `bricks` front to back by first sheet; those that begin at the same sheet in ascending
+    /// id.
+    pub fn front_to_back(bricks: &[ProjectedBrick]) -> Vec<&ProjectedBrick> {
+        // Sorting keys and indices takes a third of the time of sorting bricks.
+        let key = |b: &ProjectedBrick| (b.projected.sheets.first, b.brick.id);
+        let mut order: Vec<_> =
+            bricks.iter().enumerate().map(|(i, b)| (key(b), i as u32)).collect();
         order.sort_unstable();
-        order.into_iter().map(|(_, i)| &seen[i as usize]).collect()
+        order.into_iter().map(|(_, i)| &bricks[i as usize]).collect()
     }
 }
 
-/// The tile's pixels, from which a part starts and which it takes farther, and what it counts.
+/// The pixels of the tile that a part belongs to, read and written, and its voxel counts.
 pub type Io<'a> = (&'a mut TilePixels, &'a mut Counters);
 
-/// Where a part's bricks are.
+/// Where a part gets its bricks from.
 #[derive(Clone, Copy)]
-pub enum Among<'a> {
-    /// All of the tile's are here.
+pub enum BrickSource<'a> {
+    /// All bricks of the tile are held.
     Here(&'a [&'a ProjectedBrick]),
-    /// They come when they are looked at, if they can be had.
-    Coming(&'a Coming<'a>),
+    /// Bricks are taken from a supply when the part comes to their first sheets.
+    Arriving(&'a ArrivingBricks<'a>),
 }
 
-/// A part of a tile.
+/// A part of a tile, with the sheets to draw and the bricks to draw them from.
 pub struct Part<'a> {
     pub(crate) frame: &'a Frame,
     pub(crate) rect: Rect,
     pub(crate) tile: Rect,
     pub(crate) slab: SheetRange,
-    pub(crate) among: Among<'a>,
-    /// Those of the part that are here, front to back.
+    pub(crate) bricks: BrickSource<'a>,
+    /// Of [`BrickSource::Here`]: indices of the bricks that lie over the part, front to back.
     pub(crate) inside: &'a [u32],
 }
 
 /// A part's pixels, in rows of [`STRIDE`] whatever the part's width.
 pub struct Pixels {
-    /// Lengths of rays in a sheet over its thickness.
+    /// Length of each pixel's ray within a sheet over the sheet's thickness.
     pub(crate) secants: Vec<f32>,
-    /// The bits of each one's opacity, and three colours.
+    /// Bits of each pixel's opacity (f32), then its three colours in fixed point.
     pub(crate) all: Vec<[u32; 4]>,
 }
 
@@ -82,65 +84,67 @@ impl Default for Pixels {
 }
 
 impl Part<'_> {
-    /// The first sheet that any of its bricks begins at; `None`: it has none.
+    /// The first sheet at which any brick begins; `None` without bricks.
     pub(crate) fn nearest(&self) -> Option<i32> {
-        match self.among {
-            Among::Here(_) => (!self.inside.is_empty()).then(|| self.first_sheet(0)),
-            Among::Coming(coming) => coming.nearest(),
+        match self.bricks {
+            BrickSource::Here(_) => (!self.inside.is_empty()).then(|| self.first_sheet(0)),
+            BrickSource::Arriving(arriving) => arriving.nearest(),
         }
     }
 
     /// The first sheet of brick `i` of the part, front to back.
     #[inline(always)]
     pub(crate) fn first_sheet(&self, i: usize) -> i32 {
-        match self.among {
-            Among::Here(bricks) => bricks[self.inside[i] as usize].projected.sheets.first,
-            Among::Coming(coming) => coming.first_sheet(i),
+        match self.bricks {
+            BrickSource::Here(bricks) => bricks[self.inside[i] as usize].projected.sheets.first,
+            BrickSource::Arriving(arriving) => arriving.first_sheet(i),
         }
     }
 
-    /// Whether there is a brick `i` of the part that begins at sheet `k` or before. Of those that come,
-    /// there are the ones that [came](Part::is_supplied).
+    /// Whether the part has a brick `i` that begins at sheet `k` or before. Arriving bricks count once
+    /// they were [supplied](Part::is_supplied).
     #[inline(always)]
     pub(crate) fn begins(&self, i: usize, k: i32) -> bool {
-        match self.among {
-            Among::Here(_) => i < self.inside.len() && self.first_sheet(i) <= k,
-            Among::Coming(coming) => i < coming.came(),
+        match self.bricks {
+            BrickSource::Here(_) => i < self.inside.len() && self.first_sheet(i) <= k,
+            BrickSource::Arriving(arriving) => i < arriving.taken_count(),
         }
     }
 
-    /// Brick `i` of the part with its corner. It was [admitted](Part::open_brick).
+    /// Brick `i` of the part with its corner, after [`Part::open_brick`] returned it.
     #[inline(always)]
     pub(crate) fn brick(&self, i: usize) -> (&Brick, &Corner) {
-        match self.among {
-            Among::Here(bricks) => {
+        match self.bricks {
+            BrickSource::Here(bricks) => {
                 let ProjectedBrick { brick, corner, .. } = bricks[self.inside[i] as usize];
                 (brick, corner)
             }
-            Among::Coming(coming) => coming.brick(i),
+            BrickSource::Arriving(arriving) => arriving.brick(i),
         }
     }
 
-    /// Brick `i` of the part, if it is known already.
+    /// Brick `i` of the part, if there is one yet: to prefetch its memory.
     #[inline(always)]
     pub(crate) fn peek(&self, i: usize) -> Option<&Brick> {
-        match self.among {
-            Among::Here(bricks) => Some(&bricks[*self.inside.get(i)? as usize].brick),
-            Among::Coming(coming) => (i < coming.came()).then(|| coming.brick(i).0),
+        match self.bricks {
+            BrickSource::Here(bricks) => Some(&bricks[*self.inside.get(i)? as usize].brick),
+            BrickSource::Arriving(arriving) => {
+                (i < arriving.taken_count()).then(|| arriving.brick(i).0)
+            }
         }
     }
 
-    /// Whether sheet `k`, the one behind the last that this was asked of, can be drawn: all bricks that
-    /// begin there and may touch an open pixel are here. If not, what is lacked is noted.
+    /// Whether sheet `k` can be drawn: all bricks that begin there and may touch an open pixel are
+    /// held. If not, the missing ones are noted. `k` rises by one from call to call.
     #[inline(always)]
     pub(crate) fn is_supplied(&self, k: i32, open: &OpenMask, counters: &mut Counters) -> bool {
-        match self.among {
-            Among::Here(_) => true,
-            Among::Coming(coming) => coming.is_supplied(k, open, counters),
+        match self.bricks {
+            BrickSource::Here(_) => true,
+            BrickSource::Arriving(arriving) => arriving.is_supplied(k, open, counters),
         }
     }
 
-    /// The part's brick `i`, unless it is culled: all that it may touch is shut.
+    /// Brick `i` of the part; `None` if it is culled, since all pixels that it may touch are shut.
     #[inline(always)]
     pub(crate) fn open_brick(
         &self,
@@ -148,25 +152,25 @@ impl Part<'_> {
         open: &OpenMask,
         counters: &mut Counters,
     ) -> Option<(&Brick, &Corner)> {
-        // Of one that came the question was asked when it was looked for.
-        if let Among::Here(bricks) = self.among {
-            let seen = bricks[self.inside[i] as usize];
-            if self.frame.scene.quality.cull && !open.any(&seen.projected.rect) {
-                counters.culled += seen.brick.len() as u64;
+        // An arriving brick was tested when it was taken.
+        if let BrickSource::Here(bricks) = self.bricks {
+            let here = bricks[self.inside[i] as usize];
+            if self.frame.scene.quality.cull && !open.any(&here.projected.rect) {
+                counters.culled += here.brick.len() as u64;
                 return None;
             }
         }
         Some(self.brick(i))
     }
 
-    /// Voxels of the bricks from `i` on; where they come one by one, of those that did not.
+    /// Voxels of the bricks from `i` on; of arriving bricks, of those that were not taken.
     pub(crate) fn voxels_from(&self, i: usize) -> u64 {
-        match self.among {
-            Among::Here(bricks) => {
+        match self.bricks {
+            BrickSource::Here(bricks) => {
                 let left = self.inside[i..].iter();
                 left.map(|&at| bricks[at as usize].brick.len() as u64).sum()
             }
-            Among::Coming(coming) => coming.voxels_left(),
+            BrickSource::Arriving(arriving) => arriving.voxels_left(),
         }
     }
 
@@ -187,7 +191,7 @@ impl Part<'_> {
         }
     }
 
-    /// Takes the part's pixels out of the tile's; returns which are open.
+    /// Loads the part's pixels from the tile's planes; returns which are open.
     pub(crate) fn begin(&self, pixels: &mut Pixels, tile: &TilePixels) -> OpenMask {
         let (w, h) = (self.rect.width(), self.rect.height());
         let mut open = OpenMask::shut(self.rect);
@@ -215,7 +219,7 @@ impl Part<'_> {
         open
     }
 
-    /// Puts the part's pixels into the tile's.
+    /// Stores the part's pixels into the tile's planes.
     pub(crate) fn end(&self, pixels: &Pixels, out: &mut TilePixels) {
         let (w, h) = (self.rect.width(), self.rect.height());
         for y in 0..h {
@@ -234,9 +238,8 @@ impl Part<'_> {
     }
 }
 
-/// Takes the sums of a part's last sheet to where the next sheet's drawing finds them.
-///
-/// Where a part stops before its slab does, they are wanted though nobody asked for them at first.
+/// Returns the tile's plane for the sums of the last sheet, if the next slab needs them. A part that
+/// stopped before its slab's end makes one.
 pub fn keep_last<'a>(
     part: &Part<'_>,
     stopped: bool,

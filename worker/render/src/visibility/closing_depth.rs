@@ -1,43 +1,47 @@
-//! How deep a picture was open, cell by cell: what a frame teaches the next one about bricks.
+//! The depth at which each cell of a picture was shut: what a frame teaches the next one about bricks.
 //!
-//! A region finds out as it is drawn which bricks what lies before them hides, and asks for the others where it comes to
-//! them; each time, it stands still for as long as they are on their way. The next frame of a path looks much the same. So
-//! each cell of 8x8 pixels keeps the sheet at which it shut, and a region of the next frame asks beforehand for those bricks
-//! that begin well before that. Who is wrong has asked for bricks too many, or asks once more.
+//! A region finds out while it is drawn which bricks are hidden, and asks for the others when it reaches
+//! them; each time it stalls for as long as they are on their way. The next frame of a path looks much
+//! alike. So each cell of 8x8 pixels keeps the sheet at which it was shut, and a region of the next
+//! frame prefetches the bricks that begin well in front of that. A wrong guess costs bricks that are not
+//! needed, or one more stall.
 //!
-//! Some slack keeps those few. mri256 `peer-opaque`, 18 views 5 degrees apart, one worker: of its bricks 25.3 % were held at the
-//! end where nothing was expected, and regions stood still ten times a later frame. If all that begins before a cell's last
-//! pixel shut were expected, it would be 34.5 % and half a time: most of these are at the surface itself, where depths that
-//! lie a few sheets off say nothing.
+//! Some slack keeps wrong guesses few. mri256 `peer-opaque`, 18 views 5 degrees apart, one worker:
+//! without prefetch 25.3 % of its bricks were held at the end, and regions stalled ten times a later
+//! frame. With a prefetch of all that begins before a cell's last pixel was shut it would be 34.5 % and
+//! half a stall: most of these bricks are at the surface itself, where depths a few sheets off say
+//! nothing.
 //!
-//! It refuses to know views: depths of a picture that was seen from elsewhere are as good as they are.
+//! Depths know no views: those of a picture seen from elsewhere are as good as they are.
 
 use crate::visibility::open_mask::OpenMask;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::PART_EDGE;
 use std::sync::atomic::{AtomicI32, Ordering};
 
-/// Edge of a cell in pixels: a brick of a head of 256 voxels is some 20 pixels wide in a picture of 512. With cells of 16, one
-/// open pixel at an outline would have all that lies behind 256 be asked for.
+/// Edge of a cell in pixels. A brick of a head of 256 voxels is some 20 pixels wide in a picture of 512.
+/// With cells of 16, one open pixel at an outline would prefetch all that lies behind 256 pixels.
 pub(crate) const CELL: i32 = 8;
 
-/// Cells of a part's row.
+/// Cells across a part.
 const ROW: usize = (PART_EDGE / CELL) as usize;
 
-/// How often a part looks which of its cells are shut, in sheets.
+/// Sheets from one look at which of a part's cells are shut to the next.
 pub const LOOKS: i32 = 8;
 
-/// A cell with fewer open pixels is shut.
+/// A cell with fewer open pixels counts as shut.
 const LEAST: u8 = 8;
 
-/// Sheets that a brick has to begin before the sheet at which what lies over it was shut: two bricks where sheets are a voxel
-/// thick. With 4, 8 and 12 that worker held 31, 29 and 28 %.
+/// Sheets that a brick must begin in front of the sheet at which its pixels were shut to be prefetched:
+/// two bricks where sheets are a voxel thick. With 4, 8 and 12 that worker held 31, 29 and 28 % of the
+/// bricks.
 const SLACK: i32 = 16;
 
-/// Pixels at a brick's border that do not count: footprints hardly reach there. Without that 0.7 % more are held.
+/// Pixels at a brick's border that do not count, since footprints hardly reach there. At zero 0.7 % more
+/// bricks are held.
 const BORDER: i32 = 3;
 
-/// How many bits each byte has.
+/// Population count of each byte.
 #[inline(always)]
 fn bits_of_bytes(x: u64) -> u64 {
     const A: u64 = 0x5555_5555_5555_5555;
@@ -48,7 +52,7 @@ fn bits_of_bytes(x: u64) -> u64 {
     (x + (x >> 4)) & C
 }
 
-/// The sheets at which a part's cells were found shut; `i32::MAX`: they are open.
+/// The sheets at which a part's cells were found shut; `i32::MAX` where they are open.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Cells(pub [i32; ROW * ROW]);
 
@@ -59,7 +63,8 @@ impl Default for Cells {
 }
 
 impl Cells {
-    /// Before sheet `k`, these pixels are open.
+    /// Notes as shut at sheet `k` the cells with hardly any of the pixels of `open`, which are open in
+    /// front of it.
     pub fn look(&mut self, k: i32, open: &OpenMask) {
         for (rows, cells) in open.rows().chunks(CELL as usize).zip(self.0.chunks_mut(ROW)) {
             // At most 64 in a byte.
@@ -70,30 +75,32 @@ impl Cells {
         }
     }
 
-    /// Nothing is open from sheet `k` on.
+    /// Notes as shut at sheet `k` the cells that are still open.
     pub fn shut(&mut self, k: i32) {
         self.0.iter_mut().for_each(|cell| *cell = k.min(*cell));
     }
 }
 
-/// A picture's cells. Threads write and read them at once: each is by itself, and none needs to be right.
+/// For each cell of 8x8 pixels of a picture, the sheet at which it was shut in the last frame that was
+/// drawn there. Threads write and read cells concurrently; no cell depends on another, and none needs to
+/// be right.
 #[derive(Debug)]
 pub struct ClosingDepths {
     columns: usize,
     rows: usize,
-    /// `i32::MIN`: never drawn.
+    /// Row-major; `i32::MIN` where nothing was drawn.
     cells: Vec<AtomicI32>,
 }
 
 impl ClosingDepths {
-    /// Of a picture of this size, of which nothing is known.
+    /// Makes the cells of a picture of `size` pixels (width, height), of which nothing is known.
     pub fn new(size: [u32; 2]) -> ClosingDepths {
         let [columns, rows] = size.map(|n| n.div_ceil(CELL as u32) as usize);
         let cells = (0..columns * rows).map(|_| AtomicI32::new(i32::MIN)).collect();
         ClosingDepths { columns, rows, cells }
     }
 
-    /// Those of cells that a rectangle touches.
+    /// The cells that a rectangle overlaps.
     fn under(&self, r: &Rect) -> impl Iterator<Item = &AtomicI32> {
         let cell = |at: i32, most: usize| ((at.max(0) / CELL) as usize).min(most);
         let (x0, x1) = (cell(r.x0, self.columns), cell(r.x1 + CELL - 1, self.columns));
@@ -101,14 +108,14 @@ impl ClosingDepths {
         (y0..y1.max(y0)).flat_map(move |y| &self.cells[y * self.columns..][x0..x1.max(x0)])
     }
 
-    /// What a part of the picture came to. It begins at a cell's corner.
+    /// Records the cells of `part`, which begins at a cell's corner.
     pub fn note(&self, part: &Rect, cells: &Cells) {
         let wide = part.width().div_ceil(CELL as usize);
         let of_part = cells.0.chunks(ROW).flat_map(|row| &row[..wide.min(ROW)]);
         self.under(part).zip(of_part).for_each(|(to, depth)| to.store(*depth, Ordering::Relaxed));
     }
 
-    /// Whether a brick over this rectangle that begins at that sheet is expected.
+    /// Whether a brick over rectangle `r` that begins at sheet `first` will probably be needed.
     pub fn expects(&self, r: &Rect, first: i32) -> bool {
         let r = match r.width().min(r.height()) as i32 > 2 * BORDER {
             true => Rect::new(r.x0 + BORDER, r.y0 + BORDER, r.x1 - BORDER, r.y1 - BORDER),
@@ -117,7 +124,8 @@ impl ClosingDepths {
         first.saturating_add(SLACK) <= self.deepest(&r)
     }
 
-    /// The deepest sheet at which anything under a rectangle was open; `i32::MIN` where nothing was ever drawn.
+    /// The deepest sheet at which anything under a rectangle was open; `i32::MIN` where nothing was
+    /// drawn.
     pub fn deepest(&self, r: &Rect) -> i32 {
         self.under(r).map(|cell| cell.load(Ordering::Relaxed)).max().unwrap_or(i32::MIN)
     }

@@ -1,4 +1,5 @@
-//! Which pixels are open, which bricks lie over them, and how deep a picture was open before.
+//! What can be seen: pixels that are still open, bricks that lie over them, and the depths at which
+//! the previous frame was shut.
 
 #[doc(hidden)]
 pub mod closing_depth;

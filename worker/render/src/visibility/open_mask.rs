@@ -1,8 +1,8 @@
-//! Which pixels of a tile part are open, one bit each: tests of rectangles in a few words.
+//! The occlusion map of a tile part (paper, section 3): one bit a pixel, set while the pixel is open.
 //!
 //! A part has at most 64 columns, so a row is a word and "is anything open under this footprint?"
-//! is an AND of some eight words. A summed-area count needs four reads but has to be made anew
-//! over the whole part whenever a pixel shuts, which is nearly every sheet. Where all footprints
+//! is an AND of some eight words. A summed-area table needs four reads but has to be made anew
+//! over the whole part whenever a pixel is shut, which is nearly every sheet. Where all footprints
 //! are of one size, a mask grown by their reach answers a coarser question in one bit: may anything
 //! be open around this centre? Most voxels need no more.
 
@@ -14,12 +14,12 @@ use slabcast_common::view::SUBPIXEL_BITS;
 pub struct OpenMask {
     rect: Rect,
     rows: [u64; 64],
-    /// Pixels with an open one at most so many columns and rows away.
+    /// Pixels with an open pixel at most `reach` columns and rows away.
     grown: [u64; 64],
     reach: [i32; 2],
 }
 
-/// By how much one pixel has to be moved, step by step together with all that it has become, to be `n`.
+/// Shifts that grow one pixel to a run of `n` when each ORs the run so far with itself moved by it.
 #[inline(always)]
 pub fn doubling(n: usize) -> impl Iterator<Item = usize> {
     let mut done = 1;
@@ -34,7 +34,7 @@ pub fn doubling(n: usize) -> impl Iterator<Item = usize> {
 pub const REACH_MOST: i32 = 31;
 
 impl OpenMask {
-    /// Every pixel of `rect` is shut.
+    /// Makes a mask with every pixel of `rect` shut.
     ///
     /// # Panics
     /// If `rect` has more than 64 columns or rows.
@@ -55,7 +55,7 @@ impl OpenMask {
         self.rows[y & 63] &= !bits;
     }
 
-    /// All rows of open pixels.
+    /// The open pixels, a word a row.
     #[inline(always)]
     pub(crate) fn rows(&self) -> &[u64; 64] {
         &self.rows
@@ -67,13 +67,13 @@ impl OpenMask {
         self.rows[y & 63]
     }
 
-    /// Grows the mask by so many columns and rows, each at most [`REACH_MOST`]: to be done again after pixels
-    /// shut.
+    /// Grows the mask by `reach` columns and rows, each at most [`REACH_MOST`]. To be called again after
+    /// pixels were shut.
     #[inline(always)]
     pub fn grow(&mut self, reach: [i32; 2]) {
         self.reach = reach.map(|reach| reach.min(REACH_MOST));
         self.grown = self.rows;
-        // To both sides at once: a pixel and so many on either side.
+        // To both sides at once: a pixel and `reach` pixels on either side.
         let [columns, rows] = self.reach.map(|reach| doubling(reach as usize + 1));
         for step in columns {
             for row in &mut self.grown {
@@ -89,8 +89,8 @@ impl OpenMask {
         }
     }
 
-    /// The nearest pixels of the part to many centres in subpixels, and whether a footprint of the
-    /// mask's reach around them may touch the part (1) or an open pixel of it, too (3).
+    /// For each centre (`x`, `y`, in subpixels from the part's corner): its nearest pixel in the part, and
+    /// whether a footprint of the mask's reach may touch the part (1) and an open pixel of it (3).
     #[inline(always)]
     pub fn near_all(&self, x: &[i32], y: &[i32], cells: &mut [u32], fate: &mut [u32]) {
         let [wide, high] = self.reach.map(|reach| (64 + 2 * reach) as u32);
@@ -105,13 +105,13 @@ impl OpenMask {
         }
     }
 
-    /// What [`OpenMask::near_all`] looks at: the grown mask and its reach.
+    /// The grown mask and its reach, which [`OpenMask::near_all`] reads.
     #[inline(always)]
     pub(crate) fn grown(&self) -> (&[u64; 64], [i32; 2]) {
         (&self.grown, self.reach)
     }
 
-    /// Whether something may be open near the pixel of the part that [`OpenMask::near_all`] named.
+    /// Whether a pixel may be open near `cell`, a pixel that [`OpenMask::near_all`] returned.
     #[inline(always)]
     pub fn is_near(&self, cell: u32) -> bool {
         self.grown[(cell >> 6 & 63) as usize] >> (cell & 63) & 1 == 1

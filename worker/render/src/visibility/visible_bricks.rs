@@ -1,11 +1,11 @@
-//! The directory of bricks as a frame sees it: in blocks, which are opened when they are needed.
+//! The directory of bricks projected into a frame, block by block and only where needed.
 //!
-//! To project every brick of a head is 9,728 boxes a frame, and most of them lie behind what is drawn
-//! before them. So bricks are put into blocks ([`slabcast_common::blocks`]) once a directory; a frame
-//! projects those, a few hundred, and a block's bricks only when a part of the picture comes to the
-//! block's first sheet and finds a pixel open under it. Whoever comes to it next, on any thread, finds
-//! them projected. A worker of fifteen that draws three parts of forty looks at what lies under these,
-//! and nobody looks at what lies inside a solid head.
+//! Projecting every brick of a head takes 9,728 boxes a frame, and most of them lie behind what is
+//! drawn in front of them. So bricks are grouped into blocks ([`slabcast_common::blocks`]) once a
+//! directory. A frame projects the blocks, a few hundred, and a block's bricks only when a part of
+//! the picture reaches the block's first sheet and finds an open pixel under it. The first thread that
+//! needs a block projects it for all. A worker of fifteen that draws three parts of forty looks at what
+//! lies under these, and nobody looks at what lies inside a solid head.
 //!
 //! ```text
 //! Directory::new                 when the directory arrives, or bricks change
@@ -13,9 +13,9 @@
 //! VisibleBricks::project_block   when a part needs a block
 //! ```
 //!
-//! What hides a block hides its bricks, since the projection of a box holds those of the boxes in it; a
-//! block that begins before the near plane, or reaches behind the eye, begins at the nearest sheet there
-//! is and is opened when that is come to.
+//! Whatever hides a block hides its bricks, since the projection of a box holds those of the boxes in
+//! it. A block that begins in front of the near plane, or reaches behind the eye, begins at the
+//! nearest sheet there is and is opened when that is reached.
 
 use crate::primitives::sizes::PART;
 use slabcast_common::blocks::Blocks;
@@ -27,40 +27,42 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 /// Edge of a block in voxels, as a power of two: four bricks.
 ///
-/// A worker of fifteen that draws its share of mri256 looks for 73 us a frame. With two bricks there are
-/// six times as many blocks, most of which are not its own (207 us); with eight it looks at 2.7 times as
-/// many bricks (128 us). Whole frames do not care: 64.8, 64.6 and 63.3 ms with two, four and eight.
+/// A worker of fifteen that draws its share of mri256 spends 73 us a frame on projection. With blocks of
+/// two bricks there are six times as many blocks, most over others' tiles (207 us); with eight it
+/// projects 2.7 times as many bricks (128 us). Whole frames take 64.8, 64.6 and 63.3 ms with two, four
+/// and eight.
 const SHIFT: u32 = 5;
 
-/// Most blocks, beyond which they are twice as large: half a millisecond a frame. Not measured: no volume
-/// at hand has as many (1024^3 voxels without air do).
+/// Most blocks; beyond this many they become twice as large. They take half a millisecond a frame. Not
+/// measured: no volume at hand has as many (1024^3 voxels without air do).
 const MOST: usize = 4096;
 
-/// Bricks, here or not, in blocks.
+/// All bricks of a scene, held or not, grouped into blocks. A brick is named by its index in here.
 #[derive(Debug)]
 pub struct Directory {
     bricks: Arc<[BrickInfo]>,
     blocks: Blocks,
-    /// Bricks of the fullest block.
+    /// Number of bricks of the fullest block.
     fullest: usize,
-    /// Memory of blocks that frames before had open: no more than frames at hand had at a time.
+    /// Memory of blocks that earlier frames projected, for reuse.
     spare: Mutex<Vec<Vec<VisibleBrick>>>,
 }
 
 impl Directory {
-    /// Puts bricks into blocks: a millisecond for ten thousand.
+    /// Groups `bricks` into blocks of 32 voxels along each axis: a millisecond for ten thousand.
     pub fn new(bricks: Arc<[BrickInfo]>) -> Directory {
         Directory::with_blocks(bricks, SHIFT, MOST)
     }
 
-    /// The same with blocks of `2^shift` voxels along each axis, or of more, so that there are `most`.
+    /// Groups `bricks` into blocks of `2^shift` voxels along each axis, or of twice as many, and so on,
+    /// until there are at most `most` blocks.
     pub fn with_blocks(bricks: Arc<[BrickInfo]>, shift: u32, most: usize) -> Directory {
         let blocks = Blocks::new(&bricks, shift, most);
         let fullest = blocks.all().iter().map(|b| blocks.places(b).len()).max().unwrap_or(0);
         Directory { bricks, blocks, fullest, spare: Mutex::default() }
     }
 
-    /// The bricks, in the order in which they were given.
+    /// Returns the bricks in the order in which they were given.
     pub fn bricks(&self) -> &Arc<[BrickInfo]> {
         &self.bricks
     }
@@ -71,60 +73,61 @@ impl Directory {
     }
 }
 
-/// A brick as a frame sees it, whether it is here or not.
+/// A brick projected into a frame, held or not.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct VisibleBrick {
     pub(crate) projected: Projected,
-    /// Its place in the directory.
+    /// Its index in the directory.
     pub(crate) place: u32,
     pub(crate) voxels: u16,
 }
 
-/// A block as a frame sees it.
+/// A block projected into a frame.
 #[derive(Debug)]
 pub(crate) struct ProjectedBlock {
     pub(crate) projected: Projected,
     pub(crate) voxels: u64,
-    /// Which of the directory's it is.
+    /// Its index among the directory's blocks.
     block: u32,
     bricks: OnceLock<Vec<VisibleBrick>>,
 }
 
-/// See the head of the file.
+/// Which bricks of a [`Directory`] lie over which part of a frame, front to back. Blocks are projected
+/// at once, their bricks when first needed, by any thread.
 #[derive(Debug)]
 pub struct VisibleBricks {
     directory: Arc<Directory>,
     view: View,
     /// Blocks front to back.
-    seen: Vec<ProjectedBlock>,
+    blocks: Vec<ProjectedBlock>,
     sheets: SheetRange,
-    /// Parts in a row of the picture.
+    /// Number of parts across the picture.
     columns: usize,
-    /// Where each part's entries begin; one more than there are parts.
+    /// Offsets of each part's entries in `entries`, and the end of the last.
     starts: Vec<usize>,
-    /// Places in `seen`, front to back in each part.
+    /// Indices into `blocks`, front to back in each part.
     entries: Vec<u32>,
 }
 
 impl VisibleBricks {
-    /// Looks at the blocks of a directory.
+    /// Projects the blocks of `directory` into `view`.
     pub fn new(view: &View, directory: &Arc<Directory>) -> VisibleBricks {
         let view = *view;
-        let mut seen = Vec::with_capacity(directory.blocks.all().len());
-        seen.extend(directory.blocks.all().iter().zip(0..).filter_map(|(b, block)| {
+        let mut blocks = Vec::with_capacity(directory.blocks.all().len());
+        blocks.extend(directory.blocks.all().iter().zip(0..).filter_map(|(b, block)| {
             let projected = view.project(&b.tight)?;
             Some(ProjectedBlock { projected, voxels: b.voxels, block, bricks: OnceLock::new() })
         }));
-        seen.sort_unstable_by_key(|s| (s.projected.sheets.first, s.block));
+        blocks.sort_unstable_by_key(|b| (b.projected.sheets.first, b.block));
         let sheets =
-            seen.iter().fold(SheetRange::default(), |all, s| all.union(s.projected.sheets));
+            blocks.iter().fold(SheetRange::default(), |all, b| all.union(b.projected.sheets));
 
         let edge = PART as u32;
         let columns = view.size[0].div_ceil(edge) as usize;
         let parts = columns * view.size[1].div_ceil(edge) as usize;
-        let over = |s: &ProjectedBlock| parts_under(s.projected.rect, columns);
+        let over = |b: &ProjectedBlock| parts_under(b.projected.rect, columns);
         let mut starts = vec![0usize; parts + 1];
-        for part in seen.iter().flat_map(over) {
+        for part in blocks.iter().flat_map(over) {
             starts[part + 1] += 1;
         }
         for i in 0..parts {
@@ -132,51 +135,62 @@ impl VisibleBricks {
         }
         let mut entries = vec![0u32; starts[parts]];
         let mut next = starts.clone();
-        for (s, i) in seen.iter().zip(0u32..) {
-            for part in over(s) {
+        for (block, i) in blocks.iter().zip(0u32..) {
+            for part in over(block) {
                 entries[next[part]] = i;
                 next[part] += 1;
             }
         }
-        VisibleBricks { directory: directory.clone(), view, seen, sheets, columns, starts, entries }
+        VisibleBricks {
+            directory: directory.clone(),
+            view,
+            blocks,
+            sheets,
+            columns,
+            starts,
+            entries,
+        }
     }
 
-    /// Sheets that anything may lie in.
+    /// Returns the sheets that any brick may touch.
     pub fn sheets(&self) -> SheetRange {
         self.sheets
     }
 
-    /// What may lie over a tile, to compare it with others: voxels of its parts' blocks. Zero: nothing.
+    /// Returns the number of voxels of the blocks over the parts of `tile`, to compare tiles by; zero
+    /// where nothing lies over it.
     pub fn weight(&self, tile: &Rect) -> u64 {
         let parts = parts_under(*tile, self.columns).flat_map(|part| self.of_part(part));
         parts.map(|&i| self.block(i).voxels).sum()
     }
 
-    /// How many blocks it has.
+    /// Returns the number of blocks in the picture. Blocks are numbered front to back from zero.
     pub fn block_count(&self) -> u32 {
-        self.seen.len() as u32
+        self.blocks.len() as u32
     }
 
-    /// Looks at a block's bricks; at once if somebody did before. Its number is that of the frame, front
-    /// to back.
+    /// Projects the bricks of block number `block`, unless a thread has done so.
+    ///
+    /// # Panics
+    /// If there are not as many blocks.
     pub fn project_block(&self, block: u32) {
         self.bricks(block);
     }
 
-    /// Numbers of the blocks that are open, ascending.
+    /// Returns the numbers of the blocks whose bricks were projected, ascending.
     pub fn projected_blocks(&self) -> impl Iterator<Item = u32> {
-        let open = self.seen.iter().zip(0..).filter(|(s, _)| s.bricks.get().is_some());
-        open.map(|(_, i)| i)
+        let done = self.blocks.iter().zip(0..).filter(|(b, _)| b.bricks.get().is_some());
+        done.map(|(_, i)| i)
     }
 
-    /// Bricks of those.
+    /// Returns the number of bricks in the blocks that were projected.
     pub fn projected_bricks(&self) -> usize {
         let blocks = self.directory.blocks.all();
-        let opened = self.projected_blocks().map(|i| &blocks[self.block(i).block as usize]);
-        opened.map(|b| self.directory.blocks.places(b).len()).sum()
+        let done = self.projected_blocks().map(|i| &blocks[self.block(i).block as usize]);
+        done.map(|b| self.directory.blocks.places(b).len()).sum()
     }
 
-    /// Blocks over the part of the picture that holds the pixel (x, y), front to back.
+    /// Numbers of the blocks over the part that holds pixel (x, y), front to back.
     pub(crate) fn over(&self, x: i32, y: i32) -> &[u32] {
         self.of_part((y / PART) as usize * self.columns + (x / PART) as usize)
     }
@@ -186,17 +200,17 @@ impl VisibleBricks {
     }
 
     pub(crate) fn block(&self, i: u32) -> &ProjectedBlock {
-        &self.seen[i as usize]
+        &self.blocks[i as usize]
     }
 
-    /// A block's bricks that are not off the picture, by place.
+    /// The bricks of a block that are in the picture, by index in the directory.
     pub(crate) fn bricks(&self, block: u32) -> &[VisibleBrick] {
-        let seen = self.block(block);
-        seen.bricks.get_or_init(|| {
+        let block = self.block(block);
+        block.bricks.get_or_init(|| {
             let directory = &*self.directory;
             let spare = directory.spare().pop();
             let mut bricks = spare.unwrap_or_else(|| Vec::with_capacity(directory.fullest));
-            let places = directory.blocks.places(&directory.blocks.all()[seen.block as usize]);
+            let places = directory.blocks.places(&directory.blocks.all()[block.block as usize]);
             bricks.extend(places.iter().filter_map(|&place| {
                 let brick = &directory.bricks[place as usize];
                 let projected = self.view.project(&brick.tight)?;
@@ -210,14 +224,14 @@ impl VisibleBricks {
 impl Drop for VisibleBricks {
     fn drop(&mut self) {
         let mut spare = self.directory.spare();
-        spare.extend(self.seen.iter_mut().filter_map(|s| s.bricks.take()).map(|mut bricks| {
+        spare.extend(self.blocks.iter_mut().filter_map(|b| b.bricks.take()).map(|mut bricks| {
             bricks.clear();
             bricks
         }));
     }
 }
 
-/// The parts of a picture, of so many in a row, that a rectangle in it lies in.
+/// Indices of the parts that rectangle `r` overlaps, in a picture `columns` parts wide.
 fn parts_under(r: Rect, columns: usize) -> impl Iterator<Item = usize> {
     let (x0, x1) = (r.x0 / PART, (r.x1 - 1) / PART);
     (r.y0 / PART..=(r.y1 - 1) / PART)

@@ -9,7 +9,7 @@ fn layered_stack_closed_form_equals_numerical_integration() {
     let layers = (0..12)
         .map(|j| Layer { sigma: 0.05 * f64::from(j), rgb: [f64::from(j) / 11.0, 0.5, 1.0] })
         .collect();
-    let stack = Stack { profile: PROFILE(), across: [0..9, 0..9], layers };
+    let stack = LayerStack { profile: PROFILE(), across: [0..9, 0..9], layers };
     for at in [[4.1, 3.7], [-0.4, 4.0], [9.3, 8.2]] {
         let lateral = stack.lateral(at);
         let (mut depth, mut light, n) = (0.0f64, 0.0, 100_000);
@@ -28,13 +28,13 @@ fn layered_stack_closed_form_equals_numerical_integration() {
         let got = stack.pixel(at);
         assert!((got[3] + libm::expm1(-depth)).abs() < 1e-7, "{at:?}");
         assert!((got[0] - light).abs() < 1e-3 / 255.0, "{at:?}: {} {light}", got[0]);
-        assert!((got[0] - light).abs() <= stack.thickness(at, STEP) + 1e-7, "{at:?}");
+        assert!((got[0] - light).abs() <= stack.thickness_bound(at, STEP) + 1e-7, "{at:?}");
     }
 }
 
 #[test]
 fn gaussian_blob_closed_form_equals_the_voxel_sum_within_aliasing_bound() {
-    let bell = Bell { profile: PROFILE(), peak: 0.2, wide: 4.0, voxels: 48 };
+    let blob = GaussianBlob { profile: PROFILE(), peak: 0.2, std: 4.0, voxels: 48 };
     for (direction, alone) in [
         (DVec3::new(0.53, 0.71, 0.36), true),
         (DVec3::new(0.2, 0.9, -0.5), true),
@@ -45,21 +45,21 @@ fn gaussian_blob_closed_form_equals_the_voxel_sum_within_aliasing_bound() {
         let m = DMat3::from_cols(x, z.cross(x), z).transpose();
         for (px, py) in [(0.0, 0.0), (1.37, -2.9), (6.2, 0.4)] {
             let mut sum = 0.0;
-            for (i, j, k) in bell.places().flat_map(|i| {
-                bell.places().flat_map(move |j| bell.places().map(move |k| (i, j, k)))
+            for (i, j, k) in blob.places().flat_map(|i| {
+                blob.places().flat_map(move |j| blob.places().map(move |k| (i, j, k)))
             }) {
                 let eye = m * DVec3::new(i, j, k);
-                let w = bell.profile.at(px - eye.x) * bell.profile.at(py - eye.y);
-                sum += bell.peak * bell.of(i) * bell.of(j) * bell.of(k) * w;
+                let w = blob.profile.at(px - eye.x) * blob.profile.at(py - eye.y);
+                sum += blob.peak * blob.density(i) * blob.density(j) * blob.density(k) * w;
             }
-            let smooth = bell.from_any_side([px, py]);
-            let aliasing = bell.aliasing([px, py], &m);
+            let smooth = blob.depth_from([px, py]);
+            let aliasing = blob.aliasing_bound([px, py], &m);
             println!("{direction}: {sum} {smooth} off {:e} of {aliasing:e}", sum - smooth);
             assert!((sum - smooth).abs() <= aliasing + 1e-6 * smooth, "{direction}, {px},{py}");
             if alone {
-                assert!(aliasing < 2e-3 * bell.from_any_side([0.0, 0.0]), "{aliasing}");
+                assert!(aliasing < 2e-3 * blob.depth_from([0.0, 0.0]), "{aliasing}");
             } else {
-                let exact = bell.along_an_axis([px, py]);
+                let exact = blob.depth_along_axis([px, py]);
                 assert!((exact - sum).abs() < 1e-9, "{exact} {sum}");
             }
         }

@@ -2,7 +2,7 @@ use slabcast_render::part::brick_feed::*;
 
 #[test]
 fn growing_list_keeps_references_and_reuses_its_memory() {
-    let mut list = Growing::default();
+    let mut list = AppendList::default();
     for n in [0, 1, 63, 64, 65, 191, 192, 1000, 5] {
         let first = (n > 0).then(|| {
             list.push(7);

@@ -13,7 +13,7 @@ use slabcast_common::transfer::{Classifier, OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, SUBPIXELS, View};
 use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
 use slabcast_render::Simd;
-use slabcast_render::judge::analytic::{Bell, Layer, Profile, Rounding, Stack};
+use slabcast_render::judge::analytic::{GaussianBlob, Layer, LayerStack, Profile, Rounding};
 use slabcast_render::oracle::serial;
 use slabcast_render::tile::{self, Scratch};
 use slabcast_render::{Frame, Scene};
@@ -87,9 +87,9 @@ fn block(across: u32, deep: u32) -> Volume {
     Volume::from_fn_u8("block", [across, deep, across], |_, _, _| 100)
 }
 
-fn stack(across: u32, layers: Vec<Layer>) -> Stack {
+fn stack(across: u32, layers: Vec<Layer>) -> LayerStack {
     let n = across as i32;
-    Stack { profile: profile(), across: [0..n, 0..n], layers }
+    LayerStack { profile: profile(), across: [0..n, 0..n], layers }
 }
 
 /// The tent only where no position is rounded: its slope jumps, and what a shift does to it is not
@@ -104,7 +104,7 @@ fn spline_kernel_walls_stay_within_rounding_bounds() {
             let shot = Shot::new(block(n, 6), tf, q, DVec3::Y, (n, scale));
             let scale = f64::from(shot.view.size[1]) / (f64::from(shot.view.size[1]) / scale);
             let layers = vec![Layer { sigma, rgb: [1.0, 0.5, 0.25] }; 6];
-            let stack = Stack { profile: Profile::of(&q), ..stack(n, layers) };
+            let stack = LayerStack { profile: Profile::from_quality(&q), ..stack(n, layers) };
             let shift = if scale == 4.0 { 0.0 } else { 0.5 / f64::from(SUBPIXELS) / scale };
             let what = format!("{kernel:?}, {sigma} in sheets of {thickness}");
             let most = judge(&shot, &shot.picture(), &stack, scale, shift, &what);
@@ -115,7 +115,14 @@ fn spline_kernel_walls_stay_within_rounding_bounds() {
 }
 
 /// Pixels of `picture` against the stack; the largest share of its bound that an error takes.
-fn judge(shot: &Shot, picture: &Picture, stack: &Stack, scale: f64, shift: f64, what: &str) -> f64 {
+fn judge(
+    shot: &Shot,
+    picture: &Picture,
+    stack: &LayerStack,
+    scale: f64,
+    shift: f64,
+    what: &str,
+) -> f64 {
     let middle = (f64::from(stack.across[0].end) - 1.0) / 2.0;
     let how = shot.rounding(shift);
     let [w, h] = shot.view.size;
@@ -125,7 +132,7 @@ fn judge(shot: &Shot, picture: &Picture, stack: &Stack, scale: f64, shift: f64, 
         let at = [middle - u, middle - v];
         let want = stack.pixel(at);
         let got = picture.pixels[(y * w + x) as usize].map(f64::from);
-        let [alpha, colour] = stack.rounding(at, &how);
+        let [alpha, colour] = stack.rounding_bound(at, &how);
         for c in 0..4 {
             let (off, bound) = ((got[c] - want[c]).abs(), if c == 3 { alpha } else { colour });
             assert!(off <= bound, "{what}, pixel {x},{y}: {got:?}, want {want:?} within {bound:e}");
@@ -202,11 +209,12 @@ fn partial_slab_has_the_optical_depth_in_front_of_its_border() {
             let y = shot.view.size[1] / 2;
             let [u, v] = shot.offset(x, y, scale);
             let at = [3.5 - u, 3.5 - v];
-            let want = -libm::expm1(-stack.depth(at, f64::from(end) * d));
+            let want = -libm::expm1(-stack.optical_depth(at, f64::from(end) * d));
             let got = f64::from(picture.pixels[(y * shot.view.size[0] + x) as usize][3]);
-            let [bound, _] = stack.rounding(at, &how);
+            let [bound, _] = stack.rounding_bound(at, &how);
             // Depths are rounded to 1/256 of a sheet: half of that of the field at the border.
-            let border = 0.5 * d / 256.0 * 1.01 * sigma * stack.depth(at, 1e9) / (sigma * 8.0);
+            let border =
+                0.5 * d / 256.0 * 1.01 * sigma * stack.optical_depth(at, 1e9) / (sigma * 8.0);
             assert!((got - want).abs() <= bound + border, "{end}, {x}: {got} {want}");
         }
     }
@@ -226,7 +234,7 @@ fn gaussian_blob_renders_its_line_integrals() {
         .collect();
     let volume =
         Volume::new("bell", "f32", false, lattice, Samples::F32(samples), ValueMap::IDENTITY);
-    let bell = Bell { profile: profile(), peak, wide, voxels: n };
+    let blob = GaussianBlob { profile: profile(), peak, std: wide, voxels: n };
     for (to_eye, axis) in [(DVec3::Y, true), (DVec3::new(0.53, 0.71, 0.36), false)] {
         let tf = extinctions(vec![[0.0, 1.0, 0.5, 0.25]], vec![[0.0, 0.0], [1.0, peak]]);
         let shot = Shot::new(volume.clone(), tf, Quality::default(), to_eye, (n, scale));
@@ -238,15 +246,15 @@ fn gaussian_blob_renders_its_line_integrals() {
         for (x, y) in (0..w * h).step_by(131).map(|i| (i % w, i / w)) {
             let at = shot.offset(x, y, scale);
             let (tau, aliasing) = if axis {
-                (bell.along_an_axis(at), 0.0)
+                (blob.depth_along_axis(at), 0.0)
             } else {
-                (bell.from_any_side(at), bell.aliasing(at, &shot.view.eye_from_index))
+                (blob.depth_from(at), blob.aliasing_bound(at, &shot.view.eye_from_index))
             };
             // Along an axis each voxel may be moved; from a side take the same, at most.
-            let moved = bell.moved(at, shift) + aliasing;
+            let moved = blob.position_bound(at, shift) + aliasing;
             let want = -libm::expm1(-tau);
             let got = f64::from(picture.pixels[(y * w + x) as usize][3]);
-            let [bound, _] = bell.rounding(tau, moved, &how);
+            let [bound, _] = blob.rounding_bound(tau, moved, &how);
             let off = (got - want).abs();
             assert!(off <= bound, "axis {axis}, {x},{y}: {got}, want {want} within {bound:e}");
             most = most.max(off / bound);

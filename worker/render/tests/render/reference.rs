@@ -13,8 +13,10 @@ use slabcast_common::shade::Shading;
 use slabcast_common::transfer::{OpacityUnit, TransferFunction};
 use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Lattice, Samples, ValueMap, Volume};
-use slabcast_render::judge::analytic::{Layer, Profile, Stack};
-use slabcast_render::judge::reference::{ErrorFigures, Reference, Section, Sheets, stratified};
+use slabcast_render::judge::analytic::{Layer, LayerStack, Profile};
+use slabcast_render::judge::reference::{
+    ErrorFigures, Reference, SectionPlacement, SheetOptions, stratified,
+};
 use slabcast_render::oracle::serial;
 use slabcast_render::{Frame, Scene};
 use std::f64::consts::PI;
@@ -590,7 +592,7 @@ fn splatter_matches_the_same_sheets_in_f64() {
 
 /// RMSE of sheets against the limit at 1, 1/2, 1/4 and 1/8 vox, in f64 so that nothing else shows:
 /// for linear and for constant colour.
-fn errors(projection: CameraProjection, section: Section) -> [[f64; 4]; 2] {
+fn errors(projection: CameraProjection, section: SectionPlacement) -> [[f64; 4]; 2] {
     let sample = stratified([64, 64], 400, 3);
     let mut out = [[0.0; 4]; 2];
     for (i, thickness) in [1.0, 0.5, 0.25, 0.125].into_iter().enumerate() {
@@ -598,7 +600,7 @@ fn errors(projection: CameraProjection, section: Section) -> [[f64; 4]; 2] {
         let asked = Asked::new(balls(20), lit(), q, oblique(projection), 64);
         let reference = asked.reference();
         let want = reference.pixels(&sample);
-        let how = Sheets { section, rounded: false };
+        let how = SheetOptions { section, rounded: false };
         let got: Vec<_> = sample
             .iter()
             .map(|&[x, y]| reference.by_sheets_linear_and_constant(x, y, how))
@@ -618,7 +620,7 @@ fn orders(e: [f64; 4]) -> [f64; 3] {
 #[test]
 fn constant_colour_rule_converges_at_second_order_and_linear_faster() {
     for projection in projections(20) {
-        let [linear, constant] = errors(projection, Section::MidPlane);
+        let [linear, constant] = errors(projection, SectionPlacement::MidPlane);
         println!("{projection:?}: constant {constant:?}, order {:?}", orders(constant));
         println!("{projection:?}: linear {linear:?}, order {:?}", orders(linear));
         assert!(orders(constant).iter().all(|o| (1.8..2.2).contains(o)), "{constant:?}");
@@ -639,11 +641,11 @@ fn constant_colour_rule_converges_at_second_order_and_linear_faster() {
 #[test]
 fn exact_sections_restore_the_convergence_order_in_perspective() {
     let [_, persp] = projections(20);
-    let [linear, _] = errors(persp, Section::Exact);
+    let [linear, _] = errors(persp, SectionPlacement::Exact);
     println!("exact: linear {linear:?}, order {:?}", orders(linear));
     assert!(orders(linear).iter().all(|&o| o > 3.0), "{linear:?}");
-    let [middle, _] = errors(persp, Section::MidPlane);
-    for section in [Section::Centroid, Section::Between] {
+    let [middle, _] = errors(persp, SectionPlacement::MidPlane);
+    for section in [SectionPlacement::Centroid, SectionPlacement::Between] {
         let [linear, _] = errors(persp, section);
         println!("{section:?}: linear {linear:?}, order {:?}", orders(linear));
     }
@@ -767,8 +769,8 @@ fn reference_spline_kernels_equal_closed_forms() {
         let asked = Asked::new(volume, tf, quality, camera, size);
         let reference = asked.reference();
         let layer = Layer { sigma: -libm::log1p(-0.4), rgb: [0.25, 0.5, 1.0] };
-        let stack = Stack {
-            profile: Profile::of(&quality),
+        let stack = LayerStack {
+            profile: Profile::from_quality(&quality),
             across: [0..n as i32, 0..n as i32],
             layers: vec![layer; deep as usize],
         };
@@ -824,7 +826,7 @@ fn model_error_bounds_hold_on_every_pixel() {
                 let asked = Asked::new(volume.clone(), tf, quality, camera, n);
                 let reference = asked.reference();
                 let whole = asked.reference().without_truncation();
-                let rounded = Sheets { rounded: true, ..Sheets::default() };
+                let rounded = SheetOptions { rounded: true, ..SheetOptions::default() };
                 let mut found = [0.0f64; 2];
                 let mut most = 0.0f64;
                 for (x, y) in (0..n * n).map(|i| (i % n, i / n)) {

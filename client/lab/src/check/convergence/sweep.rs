@@ -5,7 +5,7 @@ use slabcast_common::quality::{Compositing, Quality, Sums};
 use slabcast_common::transfer::TransferFunction;
 use slabcast_common::view::{Camera, View};
 use slabcast_common::volume::{Volume, VolumeInfo};
-use slabcast_render::judge::reference::{Reference, Section, Sheets, stratified};
+use slabcast_render::judge::reference::{Reference, SectionPlacement, SheetOptions, stratified};
 use slabcast_render::{Frame, Scene};
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::Fail;
@@ -162,7 +162,7 @@ pub(super) fn sweep(
         each(&|x, y| r.pixel(x, y))
     };
     let papers_limit = {
-        let r = reference(&papers, &q)?.with_what_sheets_add();
+        let r = reference(&papers, &q)?.with_sheet_payloads();
         each(&|x, y| r.pixel(x, y))
     };
     let mut rungs = Vec::new();
@@ -180,23 +180,25 @@ pub(super) fn sweep(
         let additive = picture(&papers, of(paper, papers.spec.quality.sums))?;
 
         let ours_in_f64 = reference(&ours, &of(linear, decided))?;
-        let both = |how: Sheets| {
+        let both = |how: SheetOptions| {
             let pixels = direct::shared(sample.len(), threads, |i, _: &mut ()| {
                 ours_in_f64.by_sheets_linear_and_constant(sample[i][0], sample[i][1], how)
             });
             pixels.into_iter().map(|[l, c]| (l, c)).unzip::<_, _, Vec<_>, Vec<_>>()
         };
-        let (linear_f64, constant_f64) = both(Sheets::default());
-        let (rounded, _) = both(Sheets { rounded: true, ..Sheets::default() });
+        let (linear_f64, constant_f64) = both(SheetOptions::default());
+        let (rounded, _) = both(SheetOptions { rounded: true, ..SheetOptions::default() });
         let paper_f64 = {
             let r = reference(&papers, &of(paper, papers.spec.quality.sums))?;
             each(&|x, y| r.at_same_thickness(x, y))
         };
         let placed = placed.then(|| {
-            [Section::Centroid, Section::Between, Section::Exact].map(|section| {
-                let (linear, _) = both(Sheets { section, rounded: false });
-                Off::between(&linear, &limit)
-            })
+            [SectionPlacement::Centroid, SectionPlacement::Between, SectionPlacement::Exact].map(
+                |section| {
+                    let (linear, _) = both(SheetOptions { section, rounded: false });
+                    Off::between(&linear, &limit)
+                },
+            )
         });
         rungs.push(Rung {
             thickness,

@@ -1,10 +1,10 @@
-//! How far a tile is off, at a few of its pixels: from sheets of half the thickness, and (by `model`) from
-//! what the model would be without rounded positions, the kernel's cut and its ripple.
+//! An estimate of a frame's error at a few of its pixels: by sheets of half the thickness and, in `model`,
+//! by the model without rounded positions, without truncation and without ripple.
 //!
-//! What thin sheets come to is not known where a frame is drawn; how much a picture changes when they
-//! become thinner is, and it tells: an error that falls with the power p of the thickness is
-//! 1 / (1 - 2^-p) of that change (Richardson's extrapolation; [`slabcast_common::stats::THICKNESS_EXTRAPOLATION`]).
-//! One pixel in 128 is drawn twice, in blocks, since neighbours share footprints.
+//! A worker does not know the limit of thin sheets, but it can measure how much a pixel changes when
+//! sheets become thinner. An error that falls with the power p of the thickness is 1 / (1 - 2^-p) of that
+//! change (Richardson extrapolation; [`slabcast_common::stats::THICKNESS_EXTRAPOLATION`]). One pixel in 128 is
+//! drawn twice, in blocks, since neighbours share footprints.
 
 mod model;
 
@@ -22,24 +22,26 @@ use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Projected, View};
 use std::sync::Arc;
 
-/// Edge of a block in pixels. A footprint of 3 pixels to each side is drawn for a block of 8 some three
-/// times as often as for a tile; for single pixels fifty times.
+/// Edge of a block in pixels. With a footprint of 3 pixels to each side, a voxel is drawn some three
+/// times as often for blocks of 8 as for a tile, and fifty times as often for single pixels.
 const BLOCK: i32 = 8;
 
-/// Of so many pixels one is drawn again, in a picture of some size.
+/// One pixel of this many is drawn again, in large pictures.
 pub const ONE_IN: u32 = 128;
 
-/// Blocks of a small picture at least. From half as many the estimate was off by more than two.
+/// Least number of blocks in a small picture. From half as many the estimate was off by more than a
+/// factor of two.
 pub const AT_LEAST: u32 = 32;
 
-/// Of eps, what is left where thickness alone is to show: a shut pixel is as far off as thickness makes it.
+/// Factor of eps, the cut-off, for both pictures: so that their difference is due to thickness alone.
 const EPS: f64 = 1.0 / 16.0;
 
-/// A scene in sheets of its thickness and of half of it.
+/// A scene at its sheet thickness and at half of it, from which frames of all views are made.
 pub struct ThicknessPair([Arc<Scene>; 2]);
 
 impl ThicknessPair {
-    /// `None` where half as thick is thinner than sheets may be.
+    /// Prepares both scenes; `None` if sheets of half the thickness are thinner than a quality may ask
+    /// for.
     pub fn new(spec: &SceneSpec) -> Option<ThicknessPair> {
         let q = spec.quality;
         let [whole, half] = [1.0, 0.5].map(|times| {
@@ -50,7 +52,7 @@ impl ThicknessPair {
         Some(ThicknessPair([whole?, half?]))
     }
 
-    /// A view of it.
+    /// Prepares `view` at both thicknesses, the whole one first.
     pub fn frames(&self, view: &View) -> [Frame; 2] {
         let ThicknessPair([whole, half]) = self;
         let thin = view.with_thickness_of(&half.quality);
@@ -58,8 +60,8 @@ impl ThicknessPair {
     }
 }
 
-/// The blocks of a tile that are drawn again: of a large picture one of 8x8 pixels in every other part of 64x64, and in
-/// a smaller tile sometimes. Of a larger one they are those of its parts, so that they lie as far apart.
+/// The blocks of `tile` that are drawn again. In a large picture every other part of 64x64 pixels has one
+/// of 8x8. A part decides by its position alone, so all workers and any tiling choose the same blocks.
 pub fn blocks(tile: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
     parts(tile).flat_map(move |part| blocks_of_part(part, size))
 }
@@ -84,19 +86,21 @@ fn blocks_of_part(part: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
     })
 }
 
-/// What tells how far pixels of a frame are off.
+/// Estimates the errors of one frame's pixels. Any number of threads may share it.
 pub struct ErrorProbe {
     pair: Option<[Frame; 2]>,
     model: Option<Model>,
 }
 
 impl ErrorProbe {
-    /// For `frame`, whose scene has this pair.
+    /// Prepares a probe of `frame`; `pair` is made of the frame's scene. Without `pair` the error by
+    /// thickness is not estimated.
     pub fn new(frame: &Frame, pair: Option<&ThicknessPair>) -> ErrorProbe {
         ErrorProbe { pair: pair.map(|p| p.frames(&frame.view)), model: Model::of(frame) }
     }
 
-    /// Looks at some pixels of a tile; `bricks` are those that the tile was drawn from.
+    /// Returns squared errors, by kind, summed over some pixels of `tile` of `frame`, the frame that the
+    /// probe was made for; `bricks` are those that the tile was drawn from.
     pub fn sample(
         &self,
         frame: &Frame,
@@ -128,7 +132,7 @@ impl ErrorProbe {
     }
 }
 
-/// Draws a block twice and compares.
+/// Draws a block at both thicknesses and adds the squared difference of each pixel to `sampled`.
 fn thinner(
     frames: &[Frame; 2],
     simd: Simd,
@@ -148,6 +152,6 @@ fn thinner(
         let (a, b) = (f64::from(coarse.a[i]), f64::from(fine.a[i]));
         let colours = (0..3).map(|k| light(&coarse, k) - light(&fine, k));
         let squares = colours.fold((a - b) * (a - b), |sum, off| sum + off * off);
-        sampled.add_pixel(a > 0.0 || b > 0.0, squares);
+        sampled.put(a > 0.0 || b > 0.0, squares);
     }
 }

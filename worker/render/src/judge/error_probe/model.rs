@@ -47,7 +47,7 @@ struct Wave {
 }
 
 /// A frame's tables.
-pub struct Model {
+pub(crate) struct Model {
     cut: [Arc<ProfileTable>; 3],
     whole: [Arc<ProfileTable>; 3],
     waves: Vec<Wave>,
@@ -186,9 +186,9 @@ impl Model {
             let seen = self.follow((frame, bricks), &ray, &mut column);
             let Some([as_is, rounded, whole, level]) = seen else { continue };
             let there = |other: &Light| as_is.through < 1.0 || other.through < 1.0;
-            samples.positions.add_pixel(there(&rounded), rounded.off(&as_is));
-            samples.truncation.add_pixel(there(&whole), whole.off(&as_is));
-            samples.ripple.add_pixel(there(&level), level.off(&as_is));
+            samples.positions.put(there(&rounded), rounded.off(&as_is));
+            samples.truncation.put(there(&whole), whole.off(&as_is));
+            samples.ripple.put(there(&level), level.off(&as_is));
         }
     }
 

@@ -1,4 +1,4 @@
-//! Errors as figures.
+//! Error figures of a picture.
 
 use slabcast_common::image::{Background, Picture, PixelFormat};
 
@@ -14,30 +14,31 @@ pub(super) fn worse(a: f64, b: f64) -> f64 {
     }
 }
 
-/// How far a picture is from what it should be (CONTRACTS.md, Colour and error): linear
-/// premultiplied RGBA in units of 1/255, over the pixels where either has alpha above zero.
+/// Errors of a picture against a reference, in linear premultiplied RGBA and units of 1/255, over the
+/// pixels where either has alpha above zero (docs/design/contracts.md, "Colour and error").
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ErrorFigures {
-    /// Root of the mean square over all four channels.
+    /// Root mean square error over all four channels, in 1/255.
     pub rmse: f64,
-    /// Largest over all four channels; infinite if a number is not finite.
+    /// Largest error over all four channels, in 1/255; infinite if a number is not finite.
     pub max: f64,
-    /// What 99.9 % of the pixels keep to in all four channels: of fewer than 1000, the maximum.
+    /// 99.9th percentile over pixels of the largest error over channels, in 1/255; of fewer than 1000
+    /// pixels, the maximum.
     pub most_999: f64,
-    /// Share of the pixels off by more than 1 in a channel.
+    /// Share (0 to 1) of the pixels with an error above 1/255 in any channel.
     pub share_above_1: f64,
-    /// Root of the mean square over RGB of the 8-bit sRGB pictures, in their steps.
+    /// Root mean square error over RGB of the 8-bit sRGB pictures, in steps of 8 bits.
     pub rmse_srgb8: f64,
-    /// Pixels that count.
+    /// Number of pixels counted.
     pub n_pixels: usize,
 }
 
 impl ErrorFigures {
-    /// Compares pixels of a picture, linear premultiplied RGBA, with what they should be, one
-    /// by one. `background` is what lies behind the 8-bit pictures.
+    /// Compares pixels `got` with reference pixels `want`, one by one, both linear premultiplied RGBA.
+    /// `background` lies behind the 8-bit pictures.
     ///
     /// # Panics
-    /// If there are not as many of the one as of the other.
+    /// If `got` and `want` differ in length.
     pub fn compare(got: &[[f32; 4]], want: &[[f64; 4]], background: Background) -> ErrorFigures {
         assert_eq!(got.len(), want.len(), "each pixel needs one to be compared with");
         let mut figures = ErrorFigures::default();

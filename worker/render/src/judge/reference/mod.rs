@@ -42,8 +42,8 @@ mod upright;
 pub mod walk;
 
 pub use figures::ErrorFigures;
-pub use sample::{cells, stratified};
-pub use sheets::{Section, Sheet, Sheets};
+pub use sample::{grid_cells, stratified};
+pub use sheets::{ReferenceSheet, SectionPlacement, SheetOptions};
 
 use glam::{DMat3, DVec3};
 use profile::Profile;
@@ -63,7 +63,8 @@ use walk::Walk;
 /// thirds of the kernel values, a tenth makes 4e-5/255 for twice as many.
 const TOLERANCE: f64 = 1e-7;
 
-/// One scene in one view, ready to be asked for pixels from any number of threads.
+/// One view of a scene in f64, as reference for rendered pixels. Any number of threads may ask for
+/// pixels.
 #[derive(Debug)]
 pub struct Reference {
     view: View,
@@ -100,7 +101,8 @@ struct EyeBox {
 }
 
 impl Reference {
-    /// Makes `view` of the scene ready; `bricks` are all bricks of the scene, in any order.
+    /// Prepares `view` of the scene that `spec` describes; `bricks` are all bricks of the scene, in any
+    /// order.
     pub fn new(spec: &SceneSpec, view: View, bricks: &[Arc<Brick>]) -> Reference {
         let grid = BrickGrid::new(spec.volume.lattice.dims);
         let [std, radius] = spec.quality.kernel_shape();
@@ -147,22 +149,22 @@ impl Reference {
         }
     }
 
-    /// The same with another tolerance on a panel: to see whether the integration itself is
-    /// exact enough.
+    /// Returns this reference with another tolerance of the integration, per panel and relative to the
+    /// opacity so far (1e-7 by default): to see whether the integration itself is exact enough.
     #[must_use]
     pub fn with_tolerance(self, tolerance: f64) -> Reference {
         Reference { tolerance, ..self }
     }
 
-    /// The same with what the sheets of the quality's compositing add in place of extinctions.
-    /// Under the paper's compositing these are alphas: thin sheets that add alphas come to
-    /// `1 - exp(-int alpha)`, another picture, and [`Reference::pixel`] is it then.
+    /// Returns this reference with the payloads that the sheets of the quality's compositing add instead
+    /// of extinctions. Under the paper's compositing these are alphas, and thin sheets that add alphas
+    /// converge to `1 - exp(-int alpha)`, which [`Reference::pixel`] then returns.
     #[must_use]
-    pub fn with_what_sheets_add(self) -> Reference {
+    pub fn with_sheet_payloads(self) -> Reference {
         Reference { looks: self.sheet_looks.clone(), ..self }
     }
 
-    /// The limit at pixel (x, y): linear premultiplied RGBA.
+    /// Returns the limit at pixel (x, y), counted from the top left: linear premultiplied RGBA.
     pub fn pixel(&self, x: u32, y: u32) -> [f64; 4] {
         let ray = self.ray(x, y);
         let mut walk = Walk::new(self, &ray, &self.looks, self.kernel[2].radius);
@@ -191,7 +193,7 @@ impl Reference {
         [r, g, b, -libm::expm1(-sum.depth)]
     }
 
-    /// [`Reference::pixel`] for each of `pixels`.
+    /// Returns the limit ([`Reference::pixel`]) at each of `pixels`.
     pub fn pixels(&self, pixels: &[[u32; 2]]) -> Vec<[f64; 4]> {
         pixels.iter().map(|&[x, y]| self.pixel(x, y)).collect()
     }

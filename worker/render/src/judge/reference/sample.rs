@@ -2,8 +2,8 @@
 
 use slabcast_common::occlusion::Rect;
 
-/// `count` pixels of a picture, one at random in each of [`cells`]; all pixels where there are no
-/// more. The same for the same seed; ascending by rows of cells.
+/// Returns `count` pixels of a picture of `size` (width, height), one at random in each of
+/// [`grid_cells`], by rows of cells; all pixels if there are no more. The result depends on `seed` alone.
 pub fn stratified(size: [u32; 2], count: usize, seed: u64) -> Vec<[u32; 2]> {
     let mut state = seed;
     let mut draw = |from: i32, to: i32| {
@@ -14,12 +14,12 @@ pub fn stratified(size: [u32; 2], count: usize, seed: u64) -> Vec<[u32; 2]> {
         let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
         from as u32 + ((u128::from(z ^ (z >> 31)) * n as u128) >> 64) as u32
     };
-    cells(size, count).into_iter().map(|r| [draw(r.x0, r.x1), draw(r.y0, r.y1)]).collect()
+    grid_cells(size, count).into_iter().map(|r| [draw(r.x0, r.x1), draw(r.y0, r.y1)]).collect()
 }
 
-/// A picture cut into `count` cells of about equal size and shape, or into its pixels where there
-/// are no more; by rows.
-pub fn cells(size: [u32; 2], count: usize) -> Vec<Rect> {
+/// Divides a picture of `size` (width, height) into `count` cells of about equal size and shape, by rows,
+/// or into its pixels if there are no more.
+pub fn grid_cells(size: [u32; 2], count: usize) -> Vec<Rect> {
     let [w, h] = size.map(|n| n as usize);
     let count = count.min(w * h);
     if count == 0 {

@@ -10,14 +10,14 @@ use super::walk::{Near, Ray, Walk};
 use slabcast_common::quality::Compositing;
 use slabcast_common::view::{Projection, SUBPIXELS};
 
-/// Where the footprint of a section lies in a perspective view. Parallel rays do not tell them
-/// apart.
+/// Depth at which the footprint of a section is placed in a perspective view. In orthographic views all
+/// are the same.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Section {
-    /// On its sheet's mid-plane: the model (DESIGN.md section 1), and what is drawn.
+pub enum SectionPlacement {
+    /// The sheet's mid-plane: the model (DESIGN.md section 1), and what is drawn.
     #[default]
     MidPlane,
-    /// At the depth of the section's centroid.
+    /// The depth of the section's centroid.
     Centroid,
     /// Half-way between the two. With L the profile across the ray and g the one along it, as
     /// functions of depth, the mid-plane makes a voxel's optical depth `d^2/24 int L'' g` too
@@ -28,34 +28,34 @@ pub enum Section {
     Exact,
 }
 
-impl Section {
+impl SectionPlacement {
     /// At which depth that is.
     fn at(self, middle: f64, centroid: f64) -> f64 {
         match self {
-            Section::MidPlane | Section::Exact => middle,
-            Section::Centroid => centroid,
-            Section::Between => 0.5 * (middle + centroid),
+            SectionPlacement::MidPlane | SectionPlacement::Exact => middle,
+            SectionPlacement::Centroid => centroid,
+            SectionPlacement::Between => 0.5 * (middle + centroid),
         }
     }
 }
 
-/// How [`Reference::by_sheets`] takes the sheets of a view.
+/// Options of [`Reference::by_sheets`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Sheets {
-    /// Placement.
-    pub section: Section,
+pub struct SheetOptions {
+    /// Where footprints of sections are placed.
+    pub section: SectionPlacement,
     /// Whether positions are rounded to subpixels and depth phases, as in a rendered picture.
     pub rounded: bool,
 }
 
-/// One sheet at one pixel.
+/// One sheet at one pixel, in f64.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Sheet {
-    /// Which: between the depths `k` and `k + 1` thicknesses behind the target.
+pub struct ReferenceSheet {
+    /// Number of the sheet, which lies between `k` and `k + 1` thicknesses behind the target.
     pub k: i64,
     /// Optical depth along the ray (the sum of opacities, for the paper's compositing).
     pub tau: f64,
-    /// Mean colour, weighted by extinction.
+    /// Mean linear RGB, weighted by extinction.
     pub colour: [f64; 3],
     /// Linear premultiplied RGBA of this sheet and all in front of it.
     pub so_far: [f64; 4],
@@ -66,33 +66,39 @@ pub struct Sheet {
 const PIECE: f64 = 0.5;
 
 impl Reference {
-    /// What sheets of the view's thickness, in the quality's compositing, give at pixel (x, y)
-    /// in f64 with nothing rounded and nothing shut.
+    /// Returns pixel (x, y), linear premultiplied RGBA, of sheets of the view's thickness composited by
+    /// the quality's rule in f64, with nothing rounded and nothing shut.
     pub fn at_same_thickness(&self, x: u32, y: u32) -> [f64; 4] {
-        self.by_sheets(x, y, Sheets::default())
+        self.by_sheets(x, y, SheetOptions::default())
     }
 
-    /// [`Reference::at_same_thickness`], with the sheets taken as `how` says.
-    pub fn by_sheets(&self, x: u32, y: u32, how: Sheets) -> [f64; 4] {
+    /// Returns pixel (x, y) as [`Reference::at_same_thickness`] does, with the sheets made as `how` says.
+    pub fn by_sheets(&self, x: u32, y: u32, how: SheetOptions) -> [f64; 4] {
         self.stack(x, y, how).map_or([0.0; 4], |stack| stack.composite(self.compositing))
     }
 
-    /// [`Reference::by_sheets`] for linear and for constant colour at once: both close the same
-    /// sums, whose making is what takes the time. The scene's compositing must be one of them.
-    pub fn by_sheets_linear_and_constant(&self, x: u32, y: u32, how: Sheets) -> [[f64; 4]; 2] {
+    /// Returns pixel (x, y) as [`Reference::by_sheets`] does, for the linear and for the constant colour
+    /// rule at once: both composite the same sums, and summing takes the time. The scene's compositing must
+    /// be one of the two.
+    pub fn by_sheets_linear_and_constant(
+        &self,
+        x: u32,
+        y: u32,
+        how: SheetOptions,
+    ) -> [[f64; 4]; 2] {
         self.stack(x, y, how).map_or([[0.0; 4]; 2], |stack| {
             [Compositing::Linear, Compositing::Constant].map(|rule| stack.composite(rule))
         })
     }
 
-    /// [`Reference::by_sheets`], sheet by sheet; the last may be empty, and those before the first
-    /// are.
-    pub fn sheet_by_sheet(&self, x: u32, y: u32, how: Sheets) -> Vec<Sheet> {
+    /// Returns the sheets of [`Reference::by_sheets`] at pixel (x, y), front to back; the last may be
+    /// empty. An empty list means that the ray meets no voxel.
+    pub fn sheet_by_sheet(&self, x: u32, y: u32, how: SheetOptions) -> Vec<ReferenceSheet> {
         let Some(stack) = self.stack(x, y, how) else { return Vec::new() };
         let mut out = Vec::with_capacity(stack.sheets.len());
         stack.walk(self.compositing, |i, sums, so_far| {
             let mean = |c: usize| if sums[0] > 0.0 { sums[c] / sums[0] } else { 0.0 };
-            out.push(Sheet {
+            out.push(ReferenceSheet {
                 k: stack.base + i as i64,
                 tau: sums[0] * stack.secant,
                 colour: [mean(1), mean(2), mean(3)],
@@ -103,7 +109,7 @@ impl Reference {
     }
 
     /// The sums of all sheets on a pixel's ray; `None` where it meets no voxel.
-    fn stack(&self, x: u32, y: u32, how: Sheets) -> Option<Stack> {
+    fn stack(&self, x: u32, y: u32, how: SheetOptions) -> Option<Stack> {
         // The profiles across are evaluated here, where positions are known.
         let ray = Ray { parallel: false, ..self.ray(x, y) };
         let d = self.view.thickness;
@@ -139,7 +145,7 @@ impl Reference {
                 let along = up_to - in_front;
                 let weight = if straight {
                     if (from + to) * 0.5 < ray.start { 0.0 } else { along * across }
-                } else if how.section == Section::Exact {
+                } else if how.section == SectionPlacement::Exact {
                     self.along_the_ray(&ray, v, [from.max(v.enter), to.min(v.leave)], |z| z)
                 } else if leans {
                     self.leaning(&ray, [x, y], v, [from, to], along, how)
@@ -166,7 +172,7 @@ impl Reference {
         v: &Near,
         from: f64,
         along: f64,
-        how: Sheets,
+        how: SheetOptions,
     ) -> f64 {
         let d = self.view.thickness;
         let middle = from + 0.5 * d;
@@ -186,7 +192,7 @@ impl Reference {
         v: &Near,
         [from, to]: [f64; 2],
         along: f64,
-        how: Sheets,
+        how: SheetOptions,
     ) -> f64 {
         let middle = 0.5 * (from + to);
         if middle < ray.start || along <= 0.0 {
@@ -196,8 +202,9 @@ impl Reference {
         let at = how.section.at(middle, centroid);
         let mut moved = *v;
         if how.rounded {
-            let off = |axis: usize, how: Sheets| self.off(ray, pixel, v, axis, [at, centroid], how);
-            let exact = Sheets { rounded: false, ..how };
+            let off =
+                |axis: usize, how: SheetOptions| self.off(ray, pixel, v, axis, [at, centroid], how);
+            let exact = SheetOptions { rounded: false, ..how };
             moved.x += off(0, how) - off(0, exact);
             moved.y += off(1, how) - off(1, exact);
         }
@@ -205,7 +212,7 @@ impl Reference {
     }
 
     /// The profiles across the ray where it passes a depth: first for the eye's slope, then for the lean's.
-    fn across(&self, ray: &Ray, pixel: [u32; 2], v: &Near, at: [f64; 2], how: Sheets) -> f64 {
+    fn across(&self, ray: &Ray, pixel: [u32; 2], v: &Near, at: [f64; 2], how: SheetOptions) -> f64 {
         let [x, y] = [0, 1].map(|axis| self.off(ray, pixel, v, axis, at, how));
         self.kernel[0].at(x) * self.kernel[1].at(y)
     }
@@ -218,7 +225,7 @@ impl Reference {
         v: &Near,
         axis: usize,
         [at, leaning]: [f64; 2],
-        how: Sheets,
+        how: SheetOptions,
     ) -> f64 {
         let offset = [v.x, v.y][axis];
         let exact = if ray.lean[axis] == 0.0 {

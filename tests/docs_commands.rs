@@ -419,22 +419,56 @@ fn sources() -> Vec<PathBuf> {
     found
 }
 
+/// Whether a page has what is cited behind its name: `section 1.2`, `answer 3` or `R13`.
+fn has_place(page: &str, behind: &str) -> bool {
+    let behind = behind.trim_start_matches([',', ' ']);
+    let number = |s: &str| -> String {
+        let digits = s.chars().take_while(|c| c.is_ascii_digit() || *c == '.');
+        digits.collect::<String>().trim_end_matches('.').into()
+    };
+    if let Some(section) = behind.strip_prefix("section ").map(number) {
+        let heading = |l: &str| number(l.trim_start_matches(['#', ' '])) == section;
+        page.lines().any(|l| l.starts_with('#') && heading(l))
+    } else if let Some(answer) = behind.strip_prefix("answer ").map(number) {
+        page.lines().any(|l| l.starts_with(&format!("{answer}. ")))
+    } else if let Some(promise) = behind.strip_prefix('R').map(number).filter(|n| !n.is_empty()) {
+        page.lines().any(|l| l.starts_with('|') && l.contains(&format!("R{promise}")))
+    } else {
+        true
+    }
+}
+
 #[test]
 fn documents_that_the_code_cites_are_there() {
     let mut broken = Vec::new();
     for path in sources() {
         let text = std::fs::read_to_string(&path).expect("a source file");
-        for (i, line) in text.lines().enumerate() {
-            for (start, _) in line.match_indices("docs/") {
-                let cited: String = line[start..]
-                    .chars()
-                    .take_while(|c| c.is_ascii_alphanumeric() || "/._-".contains(*c))
-                    .collect();
-                let cited = cited.trim_end_matches(['.', '-', '/']);
-                let names_file = [".md", ".py", ".sh", ".json", ".png", ".svg"];
-                if names_file.iter().any(|e| cited.ends_with(e)) && !root().join(cited).exists() {
-                    broken.push(format!("{}:{}: {cited}", path.display(), i + 1));
+        // A citation may go on in the next line of a comment.
+        let words: Vec<(usize, &str)> = text
+            .lines()
+            .enumerate()
+            .flat_map(|(i, l)| l.split_whitespace().map(move |w| (i + 1, w)))
+            .filter(|(_, w)| !["//", "///", "//!", "#"].contains(w))
+            .collect();
+        for (k, (line, word)) in words.iter().enumerate() {
+            let Some(start) = word.find("docs/") else { continue };
+            let kept = |c: &char| c.is_ascii_alphanumeric() || "/._-".contains(*c);
+            let cited: String = word[start..].chars().take_while(kept).collect();
+            let cited = cited.trim_end_matches(['.', '-', '/']);
+            let names_file = [".md", ".py", ".sh", ".json", ".png", ".svg"];
+            if !names_file.iter().any(|e| cited.ends_with(e)) {
+                continue;
+            }
+            let behind: Vec<&str> = words[k + 1..].iter().take(2).map(|w| w.1).collect();
+            let behind = behind.join(" ");
+            match std::fs::read_to_string(root().join(cited)) {
+                Ok(page) if !has_place(&page, &behind) => {
+                    broken.push(format!("{}:{line}: {cited} {behind}", path.display()));
                 }
+                Err(_) if !root().join(cited).exists() => {
+                    broken.push(format!("{}:{line}: {cited}", path.display()));
+                }
+                _ => {}
             }
         }
     }

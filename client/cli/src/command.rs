@@ -49,7 +49,7 @@ pub(crate) enum Commands {
     Status(status::StatusArgs),
     Jobs(jobs::JobsArgs),
     Cancel(cancel::CancelArgs),
-    Lab(LabArgs),
+    Trial(LabArgs),
     Config(config::ConfigArgs),
     Doctor(doctor::DoctorArgs),
     Completions(completions::CompletionsArgs),

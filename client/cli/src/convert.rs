@@ -75,15 +75,15 @@ pub(crate) fn run(args: &ConvertArgs) -> Result<(), Fail> {
     }
     // Better now than after a long read.
     output::probe(&args.output)?;
-    let mut bar = Progress::new(args.quiet).of("slice");
-    bar.stage(&format!("reading {}", args.volume.display()));
+    let mut bar = Progress::new(args.quiet).counting("slice");
+    bar.phase(&format!("reading {}", args.volume.display()));
     let (input, file) = (args.input.clone(), args.volume.clone());
-    let volume = signals::unless_stopped(move || input.open(&file))?;
+    let volume = signals::run_unless_stopped(move || input.open(&file))?;
     if let Some(lost) = write::loses(&volume, format) {
         progress::warn(&lost);
     }
     let (to, what) = (args.output.clone(), format!("writing {shown}"));
-    let bytes = signals::to_its_end(move || write_to(&to, &volume, format, bar, &what))?;
+    let bytes = signals::run_to_end(move || write_to(&to, &volume, format, bar, &what))?;
     if args.quiet {
         return Ok(());
     }
@@ -102,7 +102,7 @@ fn write_to(
     bar.frames(nz, what);
     let mut went_on = |samples: u64| {
         bar.step(progress::Step { frames: samples / (nx * ny), ..Default::default() });
-        match signals::told() {
+        match signals::stop_requested() {
             true => Err(std::io::Error::other("stopped")),
             false => Ok(()),
         }

@@ -76,14 +76,14 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
         warn!("--rehearse: this master's pictures are stripes, whatever is asked for");
     }
     if let Some(path) = &args.record {
-        record::may(path, &[&args.volume])?;
+        record::check_path(path, &[&args.volume])?;
     }
     let mut recording = None;
     let result = runtime.block_on(async {
         let listener = listen(socket, &args.listen)?;
         let address = local(&listener)?;
         if let Some(path) = &args.record {
-            let (recorder, begun) = record::begin(path)?;
+            let (recorder, begun) = record::start(path)?;
             config.record = Some(recorder);
             recording = Some(begun);
         }

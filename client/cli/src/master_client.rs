@@ -3,7 +3,7 @@
 use slabcast_client::{Client, ClientError, Job, JobState};
 use slabcast_session::fail::Fail;
 use slabcast_session::progress::time;
-use slabcast_session::remote::{connect, fail};
+use slabcast_session::remote::{client_failure, connect};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 /// `--master`, with its default.
@@ -34,7 +34,7 @@ pub(crate) fn ask<T>(
                 "{master} knows no such job; `slabcast jobs --master {master}` lists those that it \
                  knows"
             )),
-            _ => fail(&e),
+            _ => client_failure(&e),
         })
     });
     runtime.shutdown_timeout(Duration::from_millis(200));

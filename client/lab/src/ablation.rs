@@ -13,7 +13,7 @@ use slabcast_render::{Frame, Scene};
 use slabcast_scene::path::Orientation;
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::Fail;
-use slabcast_session::path_scenes::Stage;
+use slabcast_session::path_scenes::PathScenes;
 use slabcast_session::progress::{self, Progress};
 use slabcast_session::request::{OpenedVolume, RenderRequest, VolumeSceneArgs};
 use std::fmt::Write;
@@ -56,7 +56,7 @@ pub(crate) struct Needs {
 
 /// A scene that is ready, and what it took to cut it.
 struct Way {
-    stage: Stage,
+    stage: PathScenes,
     frame_of: Quality,
     cut_ms: f64,
 }
@@ -73,7 +73,7 @@ impl Way {
         request.work.keep = keep;
         let request = request;
         let began = Instant::now();
-        let stage = Stage::new(volume, info, &request, o)?;
+        let stage = PathScenes::new(volume, info, &request, o)?;
         let cut_ms = began.elapsed().as_secs_f64() * 1e3;
         let frame_of = stage.spec(0).quality;
         Ok(Way { stage, frame_of, cut_ms })
@@ -103,7 +103,7 @@ fn in_turn(ways: [(&Way, Quality); 2], threads: usize) -> Result<([f64; 2], bool
             let view = way.stage.view(0, &scene.quality)?;
             let began = Instant::now();
             let frame = Frame::new(scene.clone(), view);
-            let picture = direct::picture(&frame, &way.stage.bricks, cut);
+            let picture = direct::draw(&frame, &way.stage.bricks, cut);
             // The first fills tables and caches.
             if turn > 0 {
                 ms[i].push(began.elapsed().as_secs_f64() * 1e3);
@@ -124,7 +124,7 @@ pub(crate) fn find(of: &VolumeSceneArgs, threads: usize) -> Result<Needs, Fail> 
     let request = of.scene.request(Work::default())?;
     let OpenedVolume { volume, info, orientation } = of.open(&request)?;
     let mut progress = Progress::new(false);
-    progress.stage("drawing with and without");
+    progress.phase("drawing with and without");
     let way = |keep| Way::new(&volume, &info, &request, orientation, keep);
     let base = way(Keep::default())?;
     let spec = base.stage.spec(0);
@@ -190,7 +190,7 @@ pub(crate) fn find(of: &VolumeSceneArgs, threads: usize) -> Result<Needs, Fail> 
     let look = Quality { cull: false, ..quality };
     let ([ms, blind], same) = in_turn([(&base, quality), (&base, look)], threads)?;
     let frame = base.stage.frame(0)?;
-    let picture = direct::picture(&frame, &base.stage.bricks, Cut::on(threads));
+    let picture = direct::draw(&frame, &base.stage.bricks, Cut::on(threads));
     let shut = picture.pixels.iter().filter(|p| 1.0 - p[3] < quality.eps as f32).count();
     let covered = picture.pixels.iter().filter(|p| p[3] > 0.0).count();
     if shut > 0 {

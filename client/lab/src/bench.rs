@@ -14,7 +14,7 @@ use slabcast_render::judge::reference::{ErrorFigures, Reference, stratified};
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::magnify::magnified;
-use slabcast_session::path_scenes::Stage;
+use slabcast_session::path_scenes::PathScenes;
 use slabcast_session::progress::{self, Progress};
 use slabcast_session::request::{KeepArgs, OpenedVolume, ThreadArgs, VolumeSceneArgs};
 use std::fmt::Write;
@@ -63,12 +63,12 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
     let OpenedVolume { volume, info, orientation } = args.of.open(&request)?;
     let volume = Arc::new(volume);
     settle(&volume, &info, &mut request, orientation, threads)?;
-    let stage = Stage::new(&volume, &info, &request, orientation)?;
+    let stage = PathScenes::new(&volume, &info, &request, orientation)?;
     let bricks = &stage.bricks;
     drop(volume);
     let cut = Cut { threads, tile: args.tile, slabs: 1 };
     let views = request.path.frames();
-    let mut progress = Progress::new(false).of("frame");
+    let mut progress = Progress::new(false).counting("frame");
     progress.frames(views as u64, &format!("{views} views"));
     let (mut each, mut counters, mut middle) = (Vec::new(), Counters::default(), None);
     let (mut sha256, mut adds) = (String::new(), None);
@@ -76,7 +76,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
         let (view, scene) = (stage.view(i, &request.quality)?, stage.scene(i));
         let began = Instant::now();
         let frame = Frame::new(scene, view);
-        let (picture, counted) = direct::counted_picture(&frame, bricks, cut);
+        let (picture, counted) = direct::draw_counted(&frame, bricks, cut);
         let picture = magnified(picture, request.magnify, threads);
         let took = began.elapsed().as_secs_f64() * 1e3;
         each.push(took);
@@ -86,7 +86,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
         if i == views / 2 {
             sha256 = picture.sha256().to_string();
             adds = frame.footprint_cost();
-            middle = Some((stage.view_of(i, &request.quality, request.size())?, picture));
+            middle = Some((stage.view_at_size(i, &request.quality, request.size())?, picture));
         }
         progress.step(progress::Step { frames: i as u64 + 1, ..Default::default() });
     }
@@ -100,9 +100,9 @@ pub fn run(args: &BenchArgs) -> Result<(), Fail> {
     let errors = middle.filter(|_| args.pixels > 0).map(|(view, picture)| {
         let sample = stratified(request.size(), args.pixels as usize, args.seed);
         let reference = Reference::new(&stage.spec(views / 2), view, bricks);
-        let mut progress = Progress::new(false).of("pixel");
+        let mut progress = Progress::new(false).counting("pixel");
         progress.frames(sample.len() as u64, "the reference");
-        let truth = direct::judge(&sample, threads, (&mut progress, 0), |[x, y]| {
+        let truth = direct::map_pixels(&sample, threads, (&mut progress, 0), |[x, y]| {
             (reference.pixel(x, y), reference.at_same_thickness(x, y))
         });
         progress.end();

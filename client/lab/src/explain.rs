@@ -5,7 +5,7 @@
 //! f64, and below all of them the limit.
 
 use crate::ablation;
-use crate::single_frame::Still;
+use crate::single_frame::SingleFrame;
 use slabcast_common::volume::ValueMap;
 use slabcast_render::judge::reference::{ReferenceSheet, SheetOptions};
 use slabcast_render::oracle::explain::{PixelExplanation, SectionAtPixel, SheetAtPixel, explain};
@@ -85,13 +85,13 @@ pub fn run(args: &ExplainArgs) -> Result<(), Fail> {
     let Some(pixel) = args.pixel else {
         let needs = {
             let args = args.clone();
-            signals::unless_stopped(move || ablation::find(&args.of, args.threads.count()))?
+            signals::run_unless_stopped(move || ablation::find(&args.of, args.threads.count()))?
         };
         return say(&if args.json { ablation::json(&needs) } else { ablation::text(&needs) });
     };
     let found = {
         let args = args.clone();
-        signals::unless_stopped(move || find(&args, pixel))?
+        signals::run_unless_stopped(move || find(&args, pixel))?
     };
     say(&if args.json { json(&found) } else { text(&found) })
 }
@@ -99,7 +99,7 @@ pub fn run(args: &ExplainArgs) -> Result<(), Fail> {
 fn find(args: &ExplainArgs, at: [u32; 2]) -> Result<Found, Fail> {
     // A pixel that was magnified comes from no sheets of its own.
     args.of.scene.request(Default::default())?;
-    let still = Still::read(&args.of, 1, |[w, h]| {
+    let still = SingleFrame::read(&args.of, 1, |[w, h]| {
         if at[0] < w && at[1] < h {
             return Ok(());
         }

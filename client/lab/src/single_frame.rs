@@ -11,12 +11,12 @@ use slabcast_render::{Frame, Scene};
 use slabcast_session::direct::{self, Bricks, Cut};
 use slabcast_session::fail::Fail;
 use slabcast_session::magnify::magnified;
-use slabcast_session::path_scenes::Stage;
+use slabcast_session::path_scenes::PathScenes;
 use slabcast_session::request::{OpenedVolume, VolumeSceneArgs};
 use std::sync::Arc;
 
 /// The first view of a path, ready to be drawn and judged.
-pub(crate) struct Still {
+pub(crate) struct SingleFrame {
     /// Sums decided.
     pub(crate) spec: SceneSpec,
     pub(crate) view: View,
@@ -27,23 +27,23 @@ pub(crate) struct Still {
     pub(crate) background: Background,
 }
 
-impl Still {
+impl SingleFrame {
     /// Reads the volume and cuts its bricks. `check` is asked before anything is read.
     pub(crate) fn read(
         of: &VolumeSceneArgs,
         threads: usize,
         check: impl FnOnce([u32; 2]) -> Result<(), Fail>,
-    ) -> Result<Still, Fail> {
+    ) -> Result<SingleFrame, Fail> {
         let mut request = of.scene.request_with_target(Work::default())?;
         check(request.path.size)?;
         let OpenedVolume { volume, info, orientation } = of.open(&request)?;
         let volume = Arc::new(volume);
         settle(&volume, &info, &mut request, orientation, threads)?;
-        let stage = Stage::new(&volume, &info, &request, orientation)?;
+        let stage = PathScenes::new(&volume, &info, &request, orientation)?;
         let (spec, small) = (stage.spec(0), stage.view(0, &request.quality)?);
-        let view = stage.view_of(0, &request.quality, request.size())?;
+        let view = stage.view_at_size(0, &request.quality, request.size())?;
         let (background, magnify) = (request.background, request.magnify);
-        Ok(Still { spec, view, small, magnify, bricks: stage.bricks, background })
+        Ok(SingleFrame { spec, view, small, magnify, bricks: stage.bricks, background })
     }
 
     /// The frame at another quality (the same sheets and kernel).
@@ -63,7 +63,7 @@ impl Still {
     }
 
     fn draw_frame(&self, frame: &Frame, threads: usize) -> Picture {
-        let picture = direct::picture(frame, &self.bricks, Cut::on(threads));
+        let picture = direct::draw(frame, &self.bricks, Cut::on(threads));
         magnified(picture, self.magnify, threads)
     }
 

@@ -46,7 +46,7 @@ pub struct Bricks {
 
 impl Bricks {
     /// Those of a store.
-    pub fn of(store: &BrickStore) -> Bricks {
+    pub fn from_store(store: &BrickStore) -> Bricks {
         let brick = |i: &BrickInfo| store.brick(i.id).expect("a brick that the store knows");
         let all = store.infos().iter().map(brick).collect();
         Bricks { all, directory: Arc::new(Directory::new(store.infos().clone())) }
@@ -73,17 +73,17 @@ impl BrickSupply for Bricks {
 }
 
 /// A whole frame by the tile renderer.
-pub fn picture(frame: &Frame, bricks: &Bricks, cut: Cut) -> Picture {
-    counted_picture(frame, bricks, cut).0
+pub fn draw(frame: &Frame, bricks: &Bricks, cut: Cut) -> Picture {
+    draw_counted(frame, bricks, cut).0
 }
 
 /// A whole frame by the tile renderer, and what it took.
-pub fn counted_picture(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
+pub fn draw_counted(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
     if cut.slabs > 1 { in_slabs(frame, bricks, cut) } else { through(frame, bricks, cut) }
 }
 
 /// Tiles of a picture, row by row.
-pub fn tiles(whole: Rect, edge: u32) -> impl Iterator<Item = Rect> {
+pub fn tile_rects(whole: Rect, edge: u32) -> impl Iterator<Item = Rect> {
     let (step, edge) = (edge as usize, edge as i32);
     let corners = (0..whole.y1)
         .step_by(step)
@@ -97,7 +97,7 @@ fn through(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
     let edge = cut.tile as i32;
     let outlook = VisibleBricks::new(&frame.view, &bricks.directory);
     // What nothing lies in is not drawn; what may have most to draw comes first.
-    let weighed = tiles(whole, cut.tile).map(|tile| (outlook.weight(&tile), tile));
+    let weighed = tile_rects(whole, cut.tile).map(|tile| (outlook.weight(&tile), tile));
     let mut tiles: Vec<(u64, Rect)> = weighed.filter(|(weight, _)| *weight > 0).collect();
     tiles.sort_by_key(|&(weight, tile)| (std::cmp::Reverse(weight), tile.y0, tile.x0));
     let simd = Simd::detect();
@@ -105,7 +105,7 @@ fn through(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
     // A row of tiles is a band of the picture; who has drawn a tile writes it there.
     let rows = picture.pixels.chunks_mut((whole.x1 * edge) as usize);
     let bands: Vec<_> = rows.map(Mutex::new).collect();
-    let drawn = shared(tiles.len(), cut.threads, |i, Kept(memory): &mut Kept| {
+    let drawn = map_parallel(tiles.len(), cut.threads, |i, Kept(memory): &mut Kept| {
         let (_, tile) = tiles[i];
         let Memory { scratch, pixels } = memory;
         let counted = region::draw(frame, &outlook, bricks, simd, tile, scratch, pixels);
@@ -128,13 +128,13 @@ fn in_slabs(frame: &Frame, bricks: &[Arc<Brick>], cut: Cut) -> (Picture, Counter
     let across = (whole.x1 + edge - 1) / edge;
     // In portions, so that threads share the work and a portion is worth taking.
     let portions = bricks.len().div_ceil(PROJECTED);
-    let seen = shared(portions, cut.threads, |i, _: &mut ()| {
+    let seen = map_parallel(portions, cut.threads, |i, _: &mut ()| {
         let portion = &bricks[i * PROJECTED..bricks.len().min((i + 1) * PROJECTED)];
         portion.iter().filter_map(|b| ProjectedBrick::new(frame, b)).collect::<Vec<_>>()
     });
     let seen: Vec<ProjectedBrick> = seen.into_iter().flatten().collect();
     let mut tiles: Vec<(Rect, Vec<&ProjectedBrick>)> =
-        tiles(whole, cut.tile).map(|tile| (tile, Vec::new())).collect();
+        tile_rects(whole, cut.tile).map(|tile| (tile, Vec::new())).collect();
     let mut sheets = SheetRange::default();
     for brick in ProjectedBrick::front_to_back(&seen) {
         let p = &brick.projected;
@@ -151,7 +151,7 @@ fn in_slabs(frame: &Frame, bricks: &[Arc<Brick>], cut: Cut) -> (Picture, Counter
     let mut counters = Counters::default();
     let mut state = FrameState::new(frame.view.size);
     for slab in sheets.slabs(cut.slabs) {
-        let done = shared(tiles.len(), cut.threads, |i, Kept(memory): &mut Kept| {
+        let done = map_parallel(tiles.len(), cut.threads, |i, Kept(memory): &mut Kept| {
             let (tile, bricks) = &tiles[i];
             let before = state.tile_state(*tile);
             tile::render_projected(frame, simd, *tile, slab, bricks, &before, &mut memory.scratch)
@@ -200,7 +200,7 @@ const PROJECTED: usize = 512;
 
 /// `work` for each of `n` items on `threads` threads; results in order. Each thread has an `S`
 /// of its own. Not to be called inside `work`.
-pub fn shared<S: Default, T: Send>(
+pub fn map_parallel<S: Default, T: Send>(
     n: usize,
     threads: usize,
     work: impl Fn(usize, &mut S) -> T + Sync,
@@ -244,7 +244,7 @@ const PORTION: usize = 64;
 
 /// What `pixel` says of each of `sample`, in portions, so that there is something to see
 /// meanwhile. `before` pixels of the progress were done earlier.
-pub fn judge<T: Send>(
+pub fn map_pixels<T: Send>(
     sample: &[[u32; 2]],
     threads: usize,
     (progress, before): (&mut Progress, usize),
@@ -255,7 +255,7 @@ pub fn judge<T: Send>(
     let order = scattered(sample.len());
     let mut done: Vec<(usize, T)> = Vec::with_capacity(sample.len());
     for portion in order.chunks(PORTION * threads) {
-        done.extend(shared(portion.len(), threads, |i, _: &mut ()| {
+        done.extend(map_parallel(portion.len(), threads, |i, _: &mut ()| {
             (portion[i], pixel(sample[portion[i]]))
         }));
         let frames = (before + done.len()) as u64;
@@ -286,13 +286,13 @@ mod tests {
     #[test]
     fn shared_work_comes_back_in_order() {
         for threads in [1, 2, 7] {
-            let got = shared(100, threads, |i, seen: &mut usize| {
+            let got = map_parallel(100, threads, |i, seen: &mut usize| {
                 *seen += 1;
                 i * i
             });
             assert_eq!(got, (0..100).map(|i| i * i).collect::<Vec<_>>());
         }
-        assert!(shared(0, 3, |i, _: &mut ()| i).is_empty());
+        assert!(map_parallel(0, 3, |i, _: &mut ()| i).is_empty());
     }
 
     #[test]
@@ -300,7 +300,7 @@ mod tests {
         let who = || {
             // Each waits for the others, so that all take part.
             let barrier = std::sync::Barrier::new(3);
-            let mut who = shared(3, 3, |_, _: &mut ()| {
+            let mut who = map_parallel(3, 3, |_, _: &mut ()| {
                 barrier.wait();
                 std::thread::current().id()
             });
@@ -324,7 +324,7 @@ mod tests {
         }
         let sample: Vec<[u32; 2]> = (0..777).map(|i| [i, 2 * i]).collect();
         let mut progress = Progress::new(true);
-        let got = judge(&sample, 3, (&mut progress, 0), |p| p);
+        let got = map_pixels(&sample, 3, (&mut progress, 0), |p| p);
         assert_eq!(got, sample);
     }
 }

@@ -39,14 +39,14 @@ const SILENCE: u64 = 86_400_000_000;
 
 /// What embedded workers are like.
 #[derive(Clone, Copy, Debug)]
-pub struct Crew {
+pub struct WorkerGroup {
     /// Workers.
     pub workers: u32,
     /// Render threads of each.
     pub threads: u32,
 }
 
-impl Crew {
+impl WorkerGroup {
     /// `workers` workers of `threads` threads, or of their share of this machine's cores.
     pub fn new(workers: u32, threads: Option<u32>) -> Result<Self, Fail> {
         let threads = threads.unwrap_or_else(|| (cores() / workers).max(1));
@@ -55,11 +55,11 @@ impl Crew {
                 "--workers, --threads: {workers} x {threads} threads; give {MAX_THREADS} in all at most"
             )));
         }
-        Ok(Crew { workers, threads })
+        Ok(WorkerGroup { workers, threads })
     }
 }
 
-impl std::fmt::Display for Crew {
+impl std::fmt::Display for WorkerGroup {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let s = |n: u32| if n == 1 { "" } else { "s" };
         let (w, t) = (self.workers, self.threads);
@@ -79,7 +79,7 @@ impl Cluster {
     pub fn start(
         volume: impl Into<Arc<Volume>>,
         orientation: Orientation,
-        crew: Crew,
+        crew: WorkerGroup,
         record: Option<Recorder>,
     ) -> Result<Cluster, Fail> {
         let mut config = MasterConfig::new(volume, orientation);

@@ -22,7 +22,7 @@ pub fn magnified(small: Picture, factor: u32, threads: usize) -> Picture {
     let size = [small.size[0] * factor, small.size[1] * factor];
     let phases: Vec<(isize, [f32; 4])> = (0..by).map(|i| phase(i, by)).collect();
     let high = h * by;
-    let bands = direct::shared(high.div_ceil(ROWS), threads, |band, _: &mut ()| {
+    let bands = direct::map_parallel(high.div_ceil(ROWS), threads, |band, _: &mut ()| {
         let mut out = Vec::with_capacity(ROWS * w * by);
         let mut line = vec![[0.0f32; 4]; w];
         for y in band * ROWS..high.min((band + 1) * ROWS) {

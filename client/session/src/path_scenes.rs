@@ -20,37 +20,37 @@ use std::sync::Arc;
 
 /// A scene's specification and all its bricks.
 #[derive(Clone)]
-pub struct Drawn {
+pub struct SceneBricks {
     /// Specification, sums decided.
     pub spec: SceneSpec,
     /// All bricks of the scene.
     pub bricks: Bricks,
 }
 
-impl Drawn {
+impl SceneBricks {
     /// Cuts the bricks of `volume` under `transfer`, and decides the sums, as the master does.
     pub fn new(
         volume: &Volume,
         info: &VolumeInfo,
         transfer: &TransferFunction,
         quality: Quality,
-    ) -> Result<Drawn, Fail> {
+    ) -> Result<SceneBricks, Fail> {
         let wanted = BrickNeeds::for_transfer(transfer, info, quality.compositing);
-        Drawn::holding(volume, info, transfer, quality, &wanted)
+        SceneBricks::with_requirements(volume, info, transfer, quality, &wanted)
     }
 
     /// The same with bricks that hold what is wanted.
-    pub fn holding(
+    pub fn with_requirements(
         volume: &Volume,
         info: &VolumeInfo,
         transfer: &TransferFunction,
         quality: Quality,
         wanted: &BrickNeeds,
-    ) -> Result<Drawn, Fail> {
+    ) -> Result<SceneBricks, Fail> {
         let classifier = Classifier::new(transfer, info, quality.compositing);
         let sums = classifier.choose_sums(&quality, &info.lattice).map_err(|e| Fail::flag(&e))?;
         let store = BrickStore::build(volume, info.digest, wanted);
-        let bricks = Bricks::of(&store);
+        let bricks = Bricks::from_store(&store);
         let spec = SceneSpec {
             id: SceneId(0),
             volume: info.clone(),
@@ -58,12 +58,12 @@ impl Drawn {
             quality: Quality { sums, ..quality },
             bricks: store.key(),
         };
-        Ok(Drawn { spec, bricks })
+        Ok(SceneBricks { spec, bricks })
     }
 }
 
 /// A path's bricks, scenes and views.
-pub struct Stage {
+pub struct PathScenes {
     request: RenderRequest,
     orientation: Orientation,
     /// Of all frames, or of those of a tween but for the transfer function.
@@ -75,14 +75,14 @@ pub struct Stage {
     pub bricks: Bricks,
 }
 
-impl Stage {
+impl PathScenes {
     /// Cuts the bricks of a volume, which fits what is asked.
     pub fn new(
         volume: &Volume,
         info: &VolumeInfo,
         request: &RenderRequest,
         orientation: Orientation,
-    ) -> Result<Stage, Fail> {
+    ) -> Result<PathScenes, Fail> {
         let blame = |e| request.blame(&e);
         let transfer = request.transfer.function(info).map_err(blame)?;
         let tween = Tween::from_path(&request.path, &info.summary).map_err(blame)?;
@@ -91,10 +91,10 @@ impl Stage {
             BrickNeeds::for_path(&request.path, &transfer, tween.as_ref(), info, compositing)
                 .map_err(blame)?
                 .with_kept(request.work.keep);
-        let Drawn { spec: base, bricks } =
-            Drawn::holding(volume, info, &transfer, request.quality, &wanted)?;
+        let SceneBricks { spec: base, bricks } =
+            SceneBricks::with_requirements(volume, info, &transfer, request.quality, &wanted)?;
         let shared = Arc::new(Scene::new(&base));
-        Ok(Stage { request: request.clone(), orientation, base, tween, shared, bricks })
+        Ok(PathScenes { request: request.clone(), orientation, base, tween, shared, bricks })
     }
 
     /// What frame `i` of those that are wanted is drawn with; sums decided.
@@ -114,11 +114,11 @@ impl Stage {
 
     /// The view of frame `i` at a quality.
     pub fn view(&self, i: usize, quality: &Quality) -> Result<View, Fail> {
-        self.view_of(i, quality, self.request.path.size)
+        self.view_at_size(i, quality, self.request.path.size)
     }
 
     /// The same in a picture of another size.
-    pub fn view_of(&self, i: usize, quality: &Quality, size: [u32; 2]) -> Result<View, Fail> {
+    pub fn view_at_size(&self, i: usize, quality: &Quality, size: [u32; 2]) -> Result<View, Fail> {
         let lattice = &self.base.volume.lattice;
         let camera = self.request.path.camera(i, lattice, self.orientation);
         let view = camera.and_then(|c| View::new(lattice, &c, size, quality));
@@ -136,7 +136,11 @@ impl Stage {
     }
 
     /// The same at another quality.
-    pub fn other(&self, i: usize, change: impl FnOnce(Quality) -> Quality) -> Result<Frame, Fail> {
+    pub fn frame_with(
+        &self,
+        i: usize,
+        change: impl FnOnce(Quality) -> Quality,
+    ) -> Result<Frame, Fail> {
         let spec = self.spec(i);
         let quality = change(spec.quality);
         let scene = Arc::new(Scene::new(&SceneSpec { quality, ..spec }));
@@ -156,9 +160,10 @@ mod tests {
         let info = volume.info(volume.digest());
         let o = Orientation::new(None, None).unwrap();
         let picture = |path: &str, tf: &str, i: usize| {
-            let request = RenderRequest::plain(ViewPath::from_json(path).unwrap(), tf).unwrap();
-            let stage = Stage::new(&volume, &info, &request, o).unwrap();
-            direct::picture(&stage.frame(i).unwrap(), &stage.bricks, Cut::on(2)).sha256()
+            let request =
+                RenderRequest::for_preset(ViewPath::from_json(path).unwrap(), tf).unwrap();
+            let stage = PathScenes::new(&volume, &info, &request, o).unwrap();
+            direct::draw(&stage.frame(i).unwrap(), &stage.bricks, Cut::on(2)).sha256()
         };
         let path = |range: &str| {
             format!(

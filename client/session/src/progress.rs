@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 const PLAIN_EVERY: Duration = Duration::from_secs(5);
 
 /// Everything that is drawn on this terminal; others write between its lines.
-fn terminal() -> &'static MultiProgress {
+fn bars() -> &'static MultiProgress {
     static ALL: OnceLock<MultiProgress> = OnceLock::new();
     ALL.get_or_init(|| {
         let target = if terminal::terminal() {
@@ -28,7 +28,7 @@ fn terminal() -> &'static MultiProgress {
 
 /// Writes to stderr without tearing a bar. A stderr that is gone is nobody's concern.
 pub fn write_on_stderr(bytes: &[u8]) {
-    terminal().suspend(|| {
+    bars().suspend(|| {
         let _ = std::io::stderr().lock().write_all(bytes);
     });
 }
@@ -41,7 +41,7 @@ pub fn say_on_stderr(line: &str) {
 /// Takes all bars away: the command ends.
 pub fn end() {
     // A terminal that is gone is nobody's concern.
-    let _ = terminal().clear();
+    let _ = bars().clear();
 }
 
 /// `warning: ...` on stderr.
@@ -87,7 +87,7 @@ impl Progress {
     pub fn new(quiet: bool) -> Self {
         let now = Instant::now();
         let bar = (terminal::terminal() && !quiet).then(|| {
-            let bar = terminal().add(ProgressBar::new_spinner());
+            let bar = bars().add(ProgressBar::new_spinner());
             bar.enable_steady_tick(Duration::from_millis(120));
             bar
         });
@@ -104,13 +104,13 @@ impl Progress {
     }
 
     /// Counts something else than frames.
-    pub fn of(mut self, noun: &'static str) -> Self {
+    pub fn counting(mut self, noun: &'static str) -> Self {
         self.noun = noun;
         self
     }
 
     /// Something that takes a while before the first frame (`reading brain.nii.gz`).
-    pub fn stage(&mut self, what: &str) {
+    pub fn phase(&mut self, what: &str) {
         if let Some(bar) = &self.bar {
             bar.set_message(what.to_string());
         }
@@ -205,8 +205,8 @@ impl Progress {
     }
 
     /// Writes something else meanwhile, without tearing the bar.
-    pub fn aside<T>(&self, write: impl FnOnce() -> T) -> T {
-        terminal().suspend(write)
+    pub fn suspend<T>(&self, write: impl FnOnce() -> T) -> T {
+        bars().suspend(write)
     }
 
     /// Takes the bar away.

@@ -5,7 +5,7 @@
 
 use crate::fail::Fail;
 use crate::progress;
-use slabcast_master::record::{RecordSummary, Recorder, start};
+use slabcast_master::record::{self as log, RecordSummary, Recorder};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::thread::JoinHandle;
@@ -18,8 +18,8 @@ pub struct Recording {
 }
 
 /// Whether the record that `--record` asks for may lie there.
-pub fn may(path: &Path, inputs: &[&Path]) -> Result<(), Fail> {
-    crate::output::not_an_input(path, "record", inputs)?;
+pub fn check_path(path: &Path, inputs: &[&Path]) -> Result<(), Fail> {
+    crate::output::refuse_input(path, "record", inputs)?;
     if path.is_dir() {
         return Err(Fail::failed(format!("{}: is a folder; give a file", path.display())));
     }
@@ -27,12 +27,12 @@ pub fn may(path: &Path, inputs: &[&Path]) -> Result<(), Fail> {
 }
 
 /// Begins it.
-pub fn begin(path: &Path) -> Result<(Recorder, Recording), Fail> {
+pub fn start(path: &Path) -> Result<(Recorder, Recording), Fail> {
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
     let part = PathBuf::from(part);
     let file = File::create(&part).map_err(|e| Fail::io(&part, "making the file", &e))?;
-    let (recorder, thread) = start(file).map_err(|e| {
+    let (recorder, thread) = log::start(file).map_err(|e| {
         Fail::failed(format!("starting the recorder failed: {}", crate::fail::reason(&e)))
     })?;
     Ok((recorder, Recording { path: path.into(), part, thread }))

@@ -21,7 +21,7 @@ const SILENCE: Duration = Duration::from_secs(5);
 const ANEW: u32 = 3;
 
 /// What a client's error says on a terminal.
-pub fn fail(e: &ClientError) -> Fail {
+pub fn client_failure(e: &ClientError) -> Fail {
     match e {
         ClientError::Address { .. } => Fail::usage(format!("--master: {e}")),
         _ => Fail::failed(e.to_string()),
@@ -30,12 +30,12 @@ pub fn fail(e: &ClientError) -> Fail {
 
 /// A client that is connected.
 pub async fn connect(master: &str) -> Result<Client, Fail> {
-    Client::connect(master).await.map_err(|e| fail(&e))
+    Client::connect(master).await.map_err(|e| client_failure(&e))
 }
 
 /// What the master serves.
 pub async fn describe(client: &Client) -> Result<VolumeDescription, Fail> {
-    let served = client.volume().await.map_err(|e| fail(&e))?;
+    let served = client.volume().await.map_err(|e| client_failure(&e))?;
     if served.pixels_version != slabcast_common::PIXELS_VERSION {
         crate::progress::warn(&format!(
             "{} draws pixels of version {}, this program those of {}: hashes will differ; run the \
@@ -58,7 +58,7 @@ pub async fn submit(
         ClientError::InvalidField { field, problem } => {
             request.blame(&InvalidField::new(local_field(field), problem))
         }
-        _ => fail(&e),
+        _ => client_failure(&e),
     })?;
     let (name, job_now) = watch::channel(job);
     let (to, updates) = mpsc::channel(1);
@@ -87,10 +87,10 @@ async fn pump(
                 anew += 1;
                 tracing::warn!(job = name, "the master has forgotten the job: submitted again");
                 message.client_key = crate::request::client_key();
-                let name = client.submit(&message).await.map_err(|e| fail(&e))?;
+                let name = client.submit(&message).await.map_err(|e| client_failure(&e))?;
                 job.send_replace(name);
             }
-            Err(e) => return Err(fail(&e)),
+            Err(e) => return Err(client_failure(&e)),
         }
     }
 }

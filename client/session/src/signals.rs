@@ -52,22 +52,22 @@ pub async fn stopped() -> u8 {
 }
 
 /// Whether the process was told to stop, for work that looks now and then.
-pub fn told() -> bool {
+pub fn stop_requested() -> bool {
     CODE.load(Ordering::SeqCst) != 0
 }
 
 /// Does `work` on a thread of its own and waits for it, or for Ctrl-C or SIGTERM, which end the
 /// command at once (code 130 or 143; the thread ends with the process). So `work` must leave
 /// nothing half done on disk; who writes files does so with what comes back.
-pub fn unless_stopped<T: Send + 'static>(
+pub fn run_unless_stopped<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, Fail> + Send + 'static,
 ) -> Result<T, Fail> {
     watched(work, false)
 }
 
-/// As [`unless_stopped`], but a stop waits for `work`, which asks [`told`] often, ends early and
+/// As [`run_unless_stopped`], but a stop waits for `work`, which asks [`stop_requested`] often, ends early and
 /// takes its half-written files away.
-pub fn to_its_end<T: Send + 'static>(
+pub fn run_to_end<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, Fail> + Send + 'static,
 ) -> Result<T, Fail> {
     watched(work, true)

@@ -87,13 +87,13 @@ impl Transfer {
     ///
     /// # Errors
     /// No preset or colour map has that name.
-    pub fn plain(name: &str) -> Result<Self, Fail> {
+    pub fn from_name(name: &str) -> Result<Self, Fail> {
         let flags = TransferFlags { colors: None, light: None, shading: None, nan: None };
         Transfer::parse(name, &flags)
     }
 
     /// What a picture says that it was drawn with.
-    pub fn again(tf: &TransferFunction, preset: Option<String>) -> Self {
+    pub fn from_function(tf: &TransferFunction, preset: Option<String>) -> Self {
         let base = TransferChoice::Function(Box::new(tf.clone()));
         Transfer {
             base,

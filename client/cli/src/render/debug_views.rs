@@ -13,11 +13,11 @@ use slabcast_session::canvas::{Canvas, LINE, WHITE, viridis, width};
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::Fail;
 use slabcast_session::output::Frame;
-use slabcast_session::path_scenes::Stage;
+use slabcast_session::path_scenes::PathScenes;
 
 /// What is shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub(crate) enum Show {
+pub(crate) enum DebugView {
     /// Where pixels were shut, from near to far
     Depth,
     /// Which worker drew which tile of which slab
@@ -30,15 +30,15 @@ pub(crate) enum Show {
     Error,
 }
 
-impl Show {
+impl DebugView {
     /// What names of files begin with.
     pub(crate) fn stem(self) -> &'static str {
         match self {
-            Show::Depth => "depth",
-            Show::Owner => "owner",
-            Show::Work => "work",
-            Show::Sheets => "sheets",
-            Show::Error => "error",
+            DebugView::Depth => "depth",
+            DebugView::Owner => "owner",
+            DebugView::Work => "work",
+            DebugView::Sheets => "sheets",
+            DebugView::Error => "error",
         }
     }
 }
@@ -71,18 +71,23 @@ const BAR: usize = 10;
 const ERRORS: [f64; 2] = [0.01, 10.0];
 
 /// The picture about frame `i` of a path.
-pub(crate) fn draw(stage: &Stage, show: Show, i: usize, threads: usize) -> Result<Frame, Fail> {
+pub(crate) fn draw(
+    stage: &PathScenes,
+    show: DebugView,
+    i: usize,
+    threads: usize,
+) -> Result<Frame, Fail> {
     let tables = stage.frame(i)?;
     let quality = tables.scene.quality;
-    let canvas = if show == Show::Error {
-        let picture = direct::picture(&tables, &stage.bricks, Cut::on(threads));
-        let finer = direct::picture(&stage.other(i, half)?, &stage.bricks, Cut::on(threads));
+    let canvas = if show == DebugView::Error {
+        let picture = direct::draw(&tables, &stage.bricks, Cut::on(threads));
+        let finer = direct::draw(&stage.frame_with(i, half)?, &stage.bricks, Cut::on(threads));
         error(&picture, &estimate(&picture, &finer, quality.compositing))
     } else {
         let (picture, notes) = count_work(&tables, &stage.bricks);
         match show {
-            Show::Depth => depth(&picture, &notes, quality.thickness),
-            Show::Sheets => {
+            DebugView::Depth => depth(&picture, &notes, quality.thickness),
+            DebugView::Sheets => {
                 counted(&picture, &notes.sheets, "Sheets read at each pixel until it was shut")
             }
             _ => counted(
@@ -301,13 +306,13 @@ mod tests {
     use slabcast_scene::path::{Orientation, ViewPath};
     use slabcast_session::request::RenderRequest;
 
-    fn stage(tf: &str) -> Stage {
+    fn stage(tf: &str) -> PathScenes {
         let volume = slabcast_session::volume::open("formula:spheres:48".as_ref()).unwrap();
         let info = volume.info(volume.digest());
         let path = r#"{"version":1,"size":[64,64],"turntable":{"frames":1}}"#;
-        let request = RenderRequest::plain(ViewPath::from_json(path).unwrap(), tf).unwrap();
+        let request = RenderRequest::for_preset(ViewPath::from_json(path).unwrap(), tf).unwrap();
         let o = Orientation::new(None, None).unwrap();
-        Stage::new(&volume, &info, &request, o).unwrap()
+        PathScenes::new(&volume, &info, &request, o).unwrap()
     }
 
     #[test]
@@ -317,8 +322,8 @@ mod tests {
             let stage = stage(tf);
             let quality = Quality { eps: 0.0, ..stage.spec(0).quality };
             let draw = |thickness: f64| {
-                let tables = stage.other(0, |_| Quality { thickness, ..quality }).unwrap();
-                direct::picture(&tables, &stage.bricks, Cut::on(2))
+                let tables = stage.frame_with(0, |_| Quality { thickness, ..quality }).unwrap();
+                direct::draw(&tables, &stage.bricks, Cut::on(2))
             };
             let (picture, finer) = (draw(2.0), draw(1.0));
             let guess = estimate(&picture, &finer, quality.compositing);
@@ -341,7 +346,7 @@ mod tests {
     #[test]
     fn every_kind_has_a_picture_with_a_legend_below() {
         let stage = stage("skin");
-        for show in [Show::Depth, Show::Work, Show::Sheets, Show::Error] {
+        for show in [DebugView::Depth, DebugView::Work, DebugView::Sheets, DebugView::Error] {
             let f = draw(&stage, show, 0, 2).unwrap();
             assert!(f.size[0] as usize == LEAST && f.size[1] > 64 + 30, "{show:?}: {:?}", f.size);
             let colours: std::collections::BTreeSet<_> = f.bytes.chunks_exact(3).collect();

@@ -26,7 +26,7 @@ const WARM: u32 = 12;
 fn run(tf: &str, edge: u32, frames: u32, folder: &Path) -> Run {
     let turn = Turntable { frames, step: 1.0, ..Turntable::default() };
     let path = ViewPath::from_turntable([edge, edge], turn);
-    let mut request = RenderRequest::plain(path, tf).expect("a request");
+    let mut request = RenderRequest::for_preset(path, tf).expect("a request");
     request.hashed = false;
     let args = OutputArgs {
         output: folder.to_path_buf(),
@@ -41,7 +41,7 @@ fn run(tf: &str, edge: u32, frames: u32, folder: &Path) -> Run {
 
 /// What a master tells of a frame.
 async fn told(run: &mut Run, volume: Arc<Volume>, orientation: Orientation) -> Box<FrameStats> {
-    let crew = Crew::new(1, None).expect("a crew");
+    let crew = WorkerGroup::new(1, None).expect("a crew");
     let cluster = Cluster::start(volume, orientation, crew, None).expect("a cluster");
     let handle = cluster.handle();
     let message = run.request(&handle.volume().info);
@@ -69,7 +69,7 @@ async fn plain(
 ) -> Result<(), Fail> {
     let info = volume.info(volume.digest());
     let recipe = run.ready(&info, orientation, volume.anatomical)?;
-    let stage = Stage::new(&volume, &info, &run.request, orientation)?;
+    let stage = PathScenes::new(&volume, &info, &run.request, orientation)?;
     let (to, updates) = mpsc::channel(1);
     let (drawn, pictures) = sync_channel::<(Picture, Digest32)>(1);
     let (frames, background) = (run.request.path.frames(), run.request.background);
@@ -79,7 +79,7 @@ async fn plain(
             let frame = stage.frame(i).expect("a frame");
             let view = view_sha256(&stage.spec(i), None, &frame.view);
             let cut = Cut { tile: 64, ..Cut::on(threads) };
-            let picture = slabcast_session::direct::picture(&frame, &stage.bricks, cut);
+            let picture = slabcast_session::direct::draw(&frame, &stage.bricks, cut);
             if drawn.send((picture, view)).is_err() {
                 return;
             }
@@ -130,7 +130,7 @@ fn what_a_master_in_the_process_takes() {
             let began = Instant::now();
             let done = match with_master {
                 true => {
-                    let crew = Crew::new(1, Some(threads)).expect("a crew");
+                    let crew = WorkerGroup::new(1, Some(threads)).expect("a crew");
                     runtime.block_on(embedded(run, volume, orientation, crew, None))
                 }
                 false => {

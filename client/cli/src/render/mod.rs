@@ -6,21 +6,21 @@ mod debug_views;
 #[cfg(test)]
 mod master_cost;
 
-use debug_views::Show;
+use debug_views::DebugView;
 use slabcast_client::{Client, VolumeDescription};
 use slabcast_common::stats::FrameStats;
 use slabcast_common::volume::{Volume, VolumeInfo};
-use slabcast_lab::autotune::choose::{choose, lab};
-use slabcast_lab::autotune::cluster::{There, Through, Wire};
-use slabcast_lab::autotune::here::{Clock, Here};
+use slabcast_lab::autotune::choose::{choose, trial};
+use slabcast_lab::autotune::cluster_bed::{ClusterBed, ClusterRun, Connection};
+use slabcast_lab::autotune::local_bed::{Clock, LocalBed};
 use slabcast_scene::path::Orientation;
 use slabcast_scene::request::PathRequest;
 use slabcast_session::direct::Cut;
-use slabcast_session::embedded::{self, Cluster, Crew};
+use slabcast_session::embedded::{self, Cluster, WorkerGroup};
 use slabcast_session::fail::{Fail, say};
-use slabcast_session::output::provenance::Recipe;
-use slabcast_session::output::{Format, Frame, Lines, Output, OutputArgs, Patience, Writer};
-use slabcast_session::path_scenes::Stage;
+use slabcast_session::output::provenance::RunProvenance;
+use slabcast_session::output::{DiskWait, Format, Frame, Lines, Output, OutputArgs, Writer};
+use slabcast_session::path_scenes::PathScenes;
 use slabcast_session::progress::{self, Progress, Step};
 use slabcast_session::record::{self, Recording};
 use slabcast_session::request::{RenderRequest, SceneArgs, WorkArgs};
@@ -100,7 +100,7 @@ pub(crate) struct RenderArgs {
         value_enum,
         help_heading = "Output"
     )]
-    show: Option<Show>,
+    show: Option<DebugView>,
     /// Statistics, one line of JSON a frame; - is stdout
     ///
     /// For their estimates of errors one pixel in 128 is drawn again in other ways: up to a quarter more
@@ -129,8 +129,8 @@ struct Run {
     /// Whether somebody said what is up, or it does not matter.
     stands: bool,
     output: Output,
-    show: Option<Show>,
-    patience: Arc<Patience>,
+    show: Option<DebugView>,
+    patience: Arc<DiskWait>,
     /// What to mention once nothing is refused any more.
     notes: Vec<String>,
     stats: Lines,
@@ -182,7 +182,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
             }
         }
     }
-    let crew = Crew::new(args.workers.unwrap_or(1), args.threads)?;
+    let crew = WorkerGroup::new(args.workers.unwrap_or(1), args.threads)?;
     let mut request = args.scene.request_with_target(args.work.work()?)?;
     request.work.estimate = args.stats.is_some();
     request.hashed = args.stats.is_some() && !args.no_hash;
@@ -193,7 +193,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         )));
     }
     let frames = request.frames();
-    let stem = args.show.map_or("frame", Show::stem);
+    let stem = args.show.map_or("frame", DebugView::stem);
     let inputs: Vec<&Path> =
         [&args.volume, &args.scene.view.path].into_iter().flatten().map(PathBuf::as_path).collect();
     let (output, stays) = Output::look(&args.output, stem, frames, request.background, &inputs)?;
@@ -204,9 +204,9 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         showable(show, args, output.format, &request)?;
     }
     if let Some(path) = &args.record {
-        record::may(path, &inputs)?;
+        record::check_path(path, &inputs)?;
     }
-    let patience = Arc::new(Patience::default());
+    let patience = Arc::new(DiskWait::default());
     let run = Run {
         stats: Lines::open(args.stats.as_deref(), "stats", &inputs, &patience)?,
         trace: Lines::open(args.trace.as_deref(), "trace", &inputs, &patience)?,
@@ -229,7 +229,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     let result = match (&args.volume, master) {
         (Some(file), _) => {
             let mut run = run;
-            run.progress.stage(&format!("reading {}", file.display()));
+            run.progress.phase(&format!("reading {}", file.display()));
             let volume = Arc::new(args.input.open(file)?);
             let orientation = args.scene.view.axes.for_volume(&volume)?;
             let tried = if run.request.target.is_empty() {
@@ -238,7 +238,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
                 aim_here(&mut run, &volume, orientation, crew, &runtime, args.quiet)?
             };
             match args.show {
-                None | Some(Show::Owner) => {
+                None | Some(DebugView::Owner) => {
                     runtime.block_on(embedded(run, volume, orientation, crew, tried))
                 }
                 Some(show) => runtime.block_on(drawn(run, volume, orientation, show, crew)),
@@ -246,7 +246,7 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
         }
         (None, Some(master)) => {
             let mut run = run;
-            run.progress.stage(&format!("dialling {master}"));
+            run.progress.phase(&format!("dialling {master}"));
             let client = runtime.block_on(remote::connect(&master))?;
             let served = runtime.block_on(remote::describe(&client))?;
             if !run.request.target.is_empty() {
@@ -266,25 +266,25 @@ fn aim_here(
     run: &mut Run,
     volume: &Arc<Volume>,
     orientation: Orientation,
-    crew: Crew,
+    crew: WorkerGroup,
     runtime: &Runtime,
     quiet: bool,
 ) -> Result<Option<Cluster>, Fail> {
     let info = volume.info(volume.digest());
     run.request.fit(&info, orientation, volume.anatomical)?;
     let (target, threads) = (run.request.target, (crew.workers * crew.threads) as usize);
-    let lab = lab(volume, &info, &run.request, orientation, threads)?;
+    let trial = trial(volume, &info, &run.request, orientation, threads)?;
     if target.budget.is_none() {
         let clock = Clock::Plain(Cut { tile: 64, ..Cut::on(threads) });
-        choose(&mut Here::new(lab, clock), &target, quiet)?.settle(&mut run.request);
+        choose(&mut LocalBed::new(trial, clock), &target, quiet)?.settle(&mut run.request);
         return Ok(None);
     }
     let cluster =
         runtime.block_on(async { Cluster::start(volume.clone(), orientation, crew, None) })?;
     let (handle, request) = (cluster.handle(), run.request.clone());
-    let wire = Wire::Embedded(&handle);
-    let through = Through { runtime, wire, info, request, crew: crew.to_string() };
-    match choose(&mut Here::new(lab, Clock::Cluster(Box::new(through))), &target, quiet) {
+    let wire = Connection::Embedded(&handle);
+    let through = ClusterRun { runtime, wire, info, request, crew: crew.to_string() };
+    match choose(&mut LocalBed::new(trial, Clock::Cluster(Box::new(through))), &target, quiet) {
         // A record begins with the first worker.
         Ok(chosen) if run.record.is_none() => {
             chosen.settle(&mut run.request);
@@ -311,8 +311,8 @@ fn aim_there(
     run.request.fit(&info, served.orientation, served.anatomical)?;
     let (target, request) = (run.request.target, run.request.clone());
     let crew = format!("the cluster of {master}");
-    let through = Through { runtime, wire: Wire::Remote(client), info, request, crew };
-    choose(&mut There::new(through), &target, quiet)?.settle(&mut run.request);
+    let through = ClusterRun { runtime, wire: Connection::Remote(client), info, request, crew };
+    choose(&mut ClusterBed::new(through), &target, quiet)?.settle(&mut run.request);
     Ok(())
 }
 
@@ -326,8 +326,13 @@ pub(crate) fn again(
     let run = Run::bare(request, output, quiet);
     let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
     let runtime = runtime::start_embedded()?;
-    let result =
-        runtime.block_on(embedded(run, Arc::new(volume), orientation, Crew::new(1, None)?, None));
+    let result = runtime.block_on(embedded(
+        run,
+        Arc::new(volume),
+        orientation,
+        WorkerGroup::new(1, None)?,
+        None,
+    ));
     runtime::end(runtime);
     result
 }
@@ -336,7 +341,7 @@ async fn embedded(
     mut run: Run,
     volume: Arc<Volume>,
     orientation: Orientation,
-    crew: Crew,
+    crew: WorkerGroup,
     tried: Option<Cluster>,
 ) -> Result<(), Fail> {
     let name = volume.name.clone();
@@ -347,7 +352,7 @@ async fn embedded(
         ));
     }
     let anatomical = volume.anatomical;
-    let (recorder, recording) = run.record.take().map(|p| record::begin(&p)).transpose()?.unzip();
+    let (recorder, recording) = run.record.take().map(|p| record::start(&p)).transpose()?.unzip();
     let mut cluster = match tried {
         Some(cluster) => cluster,
         None => Cluster::start(volume, orientation, crew, recorder)?,
@@ -369,18 +374,18 @@ async fn embedded(
 
 /// What can be shown how.
 fn showable(
-    show: Show,
+    show: DebugView,
     args: &RenderArgs,
     format: Format,
     request: &RenderRequest,
 ) -> Result<(), Fail> {
-    if show == Show::Error {
+    if show == DebugView::Error {
         debug_views::can_estimate(&request.quality)?;
     }
     if matches!(format, Format::Png16 | Format::Exr) {
         return Err(Fail::usage("--format: what --show draws has 8 bits; give png, apng or y4m"));
     }
-    if show == Show::Owner {
+    if show == DebugView::Owner {
         return Ok(());
     }
     for (given, flag) in [
@@ -405,13 +410,13 @@ async fn drawn(
     mut run: Run,
     volume: Arc<Volume>,
     orientation: Orientation,
-    show: Show,
-    crew: Crew,
+    show: DebugView,
+    crew: WorkerGroup,
 ) -> Result<(), Fail> {
     let info = volume.info(volume.digest());
     let recipe = run.ready(&info, orientation, volume.anatomical)?;
     let threads = (crew.workers * crew.threads) as usize;
-    let stage = Stage::new(&volume, &info, &run.request, orientation)?;
+    let stage = PathScenes::new(&volume, &info, &run.request, orientation)?;
     let what = format!("{}, showing {}", volume.name, show.stem());
     drop(volume);
     let (to, updates) = mpsc::channel(1);
@@ -479,12 +484,12 @@ impl Run {
         info: &VolumeInfo,
         orientation: Orientation,
         anatomical: bool,
-    ) -> Result<Recipe, Fail> {
+    ) -> Result<RunProvenance, Fail> {
         // From here on there may be files to clean up.
         signals::listen();
         self.request.fit(info, orientation, anatomical)?;
         let as_what = (self.output.format, self.output.fps());
-        let recipe = Recipe::new(&self.request, info, orientation, as_what)?;
+        let recipe = RunProvenance::new(&self.request, info, orientation, as_what)?;
         self.output.make()?;
         self.notes.iter().for_each(|n| progress::note(n));
         Ok(recipe)
@@ -496,7 +501,7 @@ impl Run {
         mut source: Source,
         what: &str,
         info: &VolumeInfo,
-        recipe: &Recipe,
+        recipe: &RunProvenance,
     ) -> Result<(), Fail> {
         let Run {
             request,
@@ -550,7 +555,7 @@ impl Run {
                             stats.put(&format!("{stats_json}\n"))?;
                             trace.put(&trace_json)?;
                             progress.step(step.clone());
-                            if show == Some(Show::Owner) {
+                            if show == Some(DebugView::Owner) {
                                 writer.put(debug_views::owner(&frame, &facts), None);
                                 continue;
                             }

@@ -4,7 +4,7 @@
 //! file that can't be read or written costs a measurement and nothing else.
 
 use super::setting::Setting;
-use super::trial::Off;
+use super::trial::Deviation;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use slabcast_session::progress;
@@ -18,7 +18,7 @@ const MAX_BYTES: u64 = 1 << 20;
 #[serde(deny_unknown_fields)]
 struct Entry {
     setting: Setting,
-    off: Option<Off>,
+    off: Option<Deviation>,
     ms: Option<f64>,
 }
 
@@ -33,18 +33,18 @@ struct File {
 
 /// What is known of a scene.
 #[derive(Debug)]
-pub(crate) struct Kept {
+pub(crate) struct MeasurementCache {
     path: Option<PathBuf>,
     file: File,
 }
 
-impl Kept {
+impl MeasurementCache {
     /// What is known of what has this identity.
-    pub(crate) fn of(identity: String) -> Kept {
-        Kept::at(folder(), identity)
+    pub(crate) fn of(identity: String) -> MeasurementCache {
+        MeasurementCache::at(folder(), identity)
     }
 
-    fn at(folder: Option<PathBuf>, of: String) -> Kept {
+    fn at(folder: Option<PathBuf>, of: String) -> MeasurementCache {
         let name = Sha256::digest(of.as_bytes());
         let name: String = name.iter().take(16).map(|b| format!("{b:02x}")).collect();
         let path = folder.map(|f| f.join(format!("{name}.json")));
@@ -54,7 +54,7 @@ impl Kept {
             serde_json::from_str::<File>(&text).ok().filter(|f| f.version == 1 && f.of == of)
         });
         let file = file.unwrap_or(File { version: 1, of, entries: Vec::new() });
-        Kept { path, file }
+        MeasurementCache { path, file }
     }
 
     /// Settings that something is known of.
@@ -75,7 +75,7 @@ impl Kept {
         &mut entries[place]
     }
 
-    pub(crate) fn off(&self, setting: &Setting) -> Option<Off> {
+    pub(crate) fn off(&self, setting: &Setting) -> Option<Deviation> {
         self.entry(setting)?.off
     }
 
@@ -83,7 +83,7 @@ impl Kept {
         self.entry(setting)?.ms
     }
 
-    pub(crate) fn put_off(&mut self, setting: &Setting, off: Off) {
+    pub(crate) fn put_off(&mut self, setting: &Setting, off: Deviation) {
         self.entry_mut(setting).off = Some(off);
     }
 
@@ -132,12 +132,12 @@ mod tests {
     #[test]
     fn what_was_measured_is_known_the_next_time_and_of_nothing_else() {
         let dir = tempfile::tempdir().unwrap();
-        let at = |of: &str| Kept::at(Some(dir.path().join("a/b")), of.into());
+        let at = |of: &str| MeasurementCache::at(Some(dir.path().join("a/b")), of.into());
         let setting = Setting::asked(Quality::default());
         let mut kept = at("one");
         assert_eq!((kept.len(), kept.ms(&setting)), (0, None));
         kept.put_ms(&setting, 12.5);
-        kept.put_off(&setting, Off { rmse: 0.3, ..Off::default() });
+        kept.put_off(&setting, Deviation { rmse: 0.3, ..Deviation::default() });
         kept.save();
         let again = at("one");
         assert_eq!((again.len(), again.ms(&setting)), (1, Some(12.5)));

@@ -7,12 +7,11 @@
 //! The word is kept with room to spare: views between those that are judged, and pixels between
 //! those that are looked at, may be worse. How often it holds is in docs/accuracy.md.
 
-use super::cache::Kept;
-use super::cluster::all_around;
-use super::here::{Clock, Here};
-use super::place::{Place, stopped};
+use super::cache::MeasurementCache;
+use super::cluster_bed::all_around;
+use super::local_bed::{Clock, LocalBed};
 use super::setting::{Setting, fraction};
-use super::trial::{Lab, Off};
+use super::trial::{Deviation, Trial};
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::volume::{Volume, VolumeInfo};
 use slabcast_scene::path::Orientation;
@@ -35,7 +34,7 @@ const ROOM_TIME: f64 = 1.1;
 const BEYOND: usize = 3;
 
 /// Returns whether a measured error keeps the target's bounds with room to spare.
-fn keeps_error(target: &QualityTarget, off: &Off) -> bool {
+fn keeps_error(target: &QualityTarget, off: &Deviation) -> bool {
     let under =
         |bound: Option<f64>, got: f64, room: f64| bound.is_none_or(|b| got * room <= b * 255.0);
     under(target.error, off.rmse, ROOM_RMSE) && under(target.error_max, off.most_999, ROOM_MOST)
@@ -52,7 +51,7 @@ pub struct Chosen {
     /// Setting that was chosen.
     pub setting: Setting,
     /// Its measured error.
-    pub off: Off,
+    pub off: Deviation,
     /// Median of a frame.
     pub ms: f64,
 }
@@ -97,8 +96,8 @@ pub(super) fn ladder(base: &Setting, size: [u32; 2]) -> Vec<Setting> {
 
 /// Measures what is not known yet.
 struct Climb<'a> {
-    place: &'a mut dyn Place,
-    kept: &'a mut Kept,
+    place: &'a mut dyn TestBed,
+    kept: &'a mut MeasurementCache,
     /// Times of a place that does not keep them.
     times: Vec<(Setting, f64)>,
     progress: Progress,
@@ -106,7 +105,7 @@ struct Climb<'a> {
 }
 
 impl Climb<'_> {
-    fn off(&mut self, setting: &Setting) -> Result<Off, Fail> {
+    fn off(&mut self, setting: &Setting) -> Result<Deviation, Fail> {
         if let Some(off) = self.kept.off(setting) {
             return Ok(off);
         }
@@ -230,14 +229,18 @@ impl Climb<'_> {
 ///
 /// # Errors
 /// Nothing keeps it: names what would.
-pub fn choose(place: &mut dyn Place, target: &QualityTarget, quiet: bool) -> Result<Chosen, Fail> {
+pub fn choose(
+    place: &mut dyn TestBed,
+    target: &QualityTarget,
+    quiet: bool,
+) -> Result<Chosen, Fail> {
     let began = Instant::now();
-    let mut kept = Kept::of(place.identity());
+    let mut kept = MeasurementCache::of(place.identity());
     let (base, size) = (place.base(), place.size());
     let rungs = ladder(&base, size);
     let known = kept.len();
-    let mut progress = Progress::new(quiet).of("pixel");
-    progress.stage("choosing a setting");
+    let mut progress = Progress::new(quiet).counting("pixel");
+    progress.phase("choosing a setting");
     if known == 0 && !quiet {
         progress::note(&format!(
             "{}: this scene is measured first; that is kept for the next time",
@@ -296,16 +299,16 @@ impl Chosen {
 }
 
 /// A scene that is asked for with a target, to be tried out by this process.
-pub fn lab(
+pub fn trial(
     volume: &Arc<Volume>,
     info: &VolumeInfo,
     request: &RenderRequest,
     orientation: Orientation,
     threads: usize,
-) -> Result<Lab, Fail> {
+) -> Result<Trial, Fail> {
     let mut around = request.clone();
     around.path = all_around(&request.path);
-    Lab::new(volume.clone(), info.clone(), &around, orientation, threads)
+    Trial::new(volume.clone(), info.clone(), &around, orientation, threads)
 }
 
 /// Chooses the quality of what was asked for if it names none but what it should come to, by plain
@@ -320,9 +323,9 @@ pub fn settle(
     if request.target.is_empty() {
         return Ok(());
     }
-    let lab = lab(volume, info, request, orientation, threads)?;
+    let trial = trial(volume, info, request, orientation, threads)?;
     let clock = Clock::Plain(Cut { tile: 64, ..Cut::on(threads) });
-    choose(&mut Here::new(lab, clock), &request.target.clone(), false)?.settle(request);
+    choose(&mut LocalBed::new(trial, clock), &request.target.clone(), false)?.settle(request);
     Ok(())
 }
 
@@ -346,12 +349,12 @@ mod tests {
     #[test]
     fn room_is_left() {
         let target = QualityTarget { error: Some(1.0 / 255.0), ..QualityTarget::default() };
-        let off = |rmse| Off { rmse, ..Off::default() };
+        let off = |rmse| Deviation { rmse, ..Deviation::default() };
         assert!(keeps_error(&target, &off(0.8)) && !keeps_error(&target, &off(0.95)));
         let target = QualityTarget { budget: Some(100.0), error_max: Some(2.0 / 255.0), ..target };
         assert!(keeps_time(&target, 90.0) && !keeps_time(&target, 91.5));
         assert_eq!(target.flags(), "--error, --error-max, --budget");
-        let most = Off { rmse: 0.1, most_999: 1.9, ..Off::default() };
+        let most = Deviation { rmse: 0.1, most_999: 1.9, ..Deviation::default() };
         assert!(!keeps_error(&target, &most) && keeps_error(&QualityTarget::default(), &most));
     }
 }

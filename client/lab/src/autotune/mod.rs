@@ -5,13 +5,13 @@
 //! it (`slabcast_session::magnify` for pictures that are drawn small), [`pareto`] says which of many no other
 //! beats, and where more time stops to pay. `report` sweeps all of it; `--error` and `--budget`
 //! [`choose`](mod@choose) from a ladder of settings and keep what they measured ([`cache`]). They do so
-//! in a [`place`]: this process ([`here`]), or a [`cluster`], whose volume may be elsewhere.
+//! in a [`test_bed`]: this process ([`local_bed`]), or a cluster ([`cluster_bed`]), whose volume may be elsewhere.
 
 mod cache;
 pub mod choose;
-pub mod cluster;
-pub mod here;
+pub mod cluster_bed;
+pub mod local_bed;
 pub(crate) mod pareto;
-pub mod place;
 pub mod setting;
+pub mod test_bed;
 pub mod trial;

@@ -17,7 +17,7 @@ use slabcast_scene::path::Orientation;
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::Fail;
 use slabcast_session::magnify::magnified;
-use slabcast_session::path_scenes::Stage;
+use slabcast_session::path_scenes::PathScenes;
 use slabcast_session::progress::Progress;
 use slabcast_session::request::RenderRequest;
 use std::sync::Arc;
@@ -63,7 +63,7 @@ impl Timing {
 
 /// How far some pictures are from the truth: the worst view of each figure, in 1/255.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Off {
+pub struct Deviation {
     pub(crate) rmse: f64,
     pub(crate) max: f64,
     pub(crate) most_999: f64,
@@ -73,10 +73,10 @@ pub struct Off {
     pub(crate) pixels: usize,
 }
 
-impl Off {
+impl Deviation {
     /// The worse of each figure.
-    pub(super) fn with(self, f: &ErrorFigures) -> Off {
-        Off {
+    pub(super) fn with(self, f: &ErrorFigures) -> Deviation {
+        Deviation {
             rmse: self.rmse.max(f.rmse),
             max: self.max.max(f.max),
             most_999: self.most_999.max(f.most_999),
@@ -92,9 +92,9 @@ pub struct Judged {
     /// What sheets added in.
     pub(crate) sums: Sums,
     /// Against the truth.
-    pub(crate) off: Off,
+    pub(crate) off: Deviation,
     /// Against its own limit, where its model is another.
-    pub(crate) own: Option<Off>,
+    pub(crate) own: Option<Deviation>,
     /// Voxels of the first judged view.
     pub(crate) counters: Counters,
     /// Of the first judged view.
@@ -113,17 +113,17 @@ pub struct Effort {
 type Ground = (bool, bool);
 
 /// One volume and path, to be drawn in many ways.
-pub struct Lab {
+pub struct Trial {
     volume: Arc<Volume>,
     info: VolumeInfo,
     request: RenderRequest,
     orientation: Orientation,
     pub(crate) base: Setting,
     pub(crate) threads: usize,
-    grounds: Vec<(Ground, Stage)>,
+    grounds: Vec<(Ground, PathScenes)>,
 }
 
-impl Lab {
+impl Trial {
     /// Cuts the bricks of what was asked for; `volume` fits it.
     pub(crate) fn new(
         volume: impl Into<Arc<Volume>>,
@@ -131,13 +131,13 @@ impl Lab {
         request: &RenderRequest,
         orientation: Orientation,
         threads: usize,
-    ) -> Result<Lab, Fail> {
+    ) -> Result<Trial, Fail> {
         let volume = volume.into();
-        let stage = Stage::new(&volume, &info, request, orientation)?;
+        let stage = PathScenes::new(&volume, &info, request, orientation)?;
         let base = Setting::asked(request.quality);
         let ground = ground(&base);
         let request = request.clone();
-        Ok(Lab {
+        Ok(Trial {
             volume,
             info,
             request,
@@ -196,7 +196,7 @@ impl Lab {
 
     /// The stage of a setting. Without light no normals are cut, and the paper's opacities may
     /// make other voxels relevant.
-    fn stage(&mut self, setting: &Setting) -> Result<&Stage, Fail> {
+    fn stage(&mut self, setting: &Setting) -> Result<&PathScenes, Fail> {
         let wanted = ground(setting);
         let found = self.grounds.iter().position(|(g, _)| *g == wanted);
         let place = match found {
@@ -207,7 +207,7 @@ impl Lab {
                     request.transfer = request.transfer.unshaded();
                 }
                 request.quality.compositing = setting.quality.compositing;
-                let stage = Stage::new(&self.volume, &self.info, &request, self.orientation)?;
+                let stage = PathScenes::new(&self.volume, &self.info, &request, self.orientation)?;
                 self.grounds.push((wanted, stage));
                 self.grounds.len() - 1
             }
@@ -228,7 +228,7 @@ impl Lab {
         let stage = self.stage(&base)?;
         let spec = SceneSpec { quality: base.quality, ..stage.spec(view) };
         let reference = Reference::new(&spec, stage.view(view, &base.quality)?, &stage.bricks);
-        let limit = direct::judge(&sample, threads, progress, |[x, y]| reference.pixel(x, y));
+        let limit = direct::map_pixels(&sample, threads, progress, |[x, y]| reference.pixel(x, y));
         Ok(Truth { view, sample, limit })
     }
 
@@ -240,7 +240,7 @@ impl Lab {
         let view = stage.view(of.view, &setting.quality)?;
         let reference = Reference::new(&spec, view, &stage.bricks);
         let sample = of.sample.clone();
-        let limit = direct::shared(sample.len(), threads, |i, _: &mut ()| {
+        let limit = direct::map_parallel(sample.len(), threads, |i, _: &mut ()| {
             reference.pixel(sample[i][0], sample[i][1])
         });
         Ok(Truth { view: of.view, sample, limit })
@@ -256,8 +256,8 @@ impl Lab {
         let (threads, background) = (self.threads, self.request.background);
         let mut judged = Judged {
             sums: setting.quality.sums,
-            off: Off::default(),
-            own: own.map(|_| Off::default()),
+            off: Deviation::default(),
+            own: own.map(|_| Deviation::default()),
             counters: Counters::default(),
             sha256: String::new(),
         };
@@ -333,9 +333,9 @@ impl Lab {
         let size = self.size();
         let drawn = setting.drawn_size(size).unwrap_or(size);
         let stage = self.stage(setting)?;
-        let view = stage.view_of(view, &way.quality, drawn)?;
+        let view = stage.view_at_size(view, &way.quality, drawn)?;
         let frame = Frame::new(way.scene.clone(), view);
-        let (picture, counters) = direct::counted_picture(&frame, &stage.bricks, cut);
+        let (picture, counters) = direct::draw_counted(&frame, &stage.bricks, cut);
         let factor = if drawn == size { 1 } else { setting.shrink };
         Ok((magnified(picture, factor, cut.threads), counters))
     }
@@ -356,27 +356,27 @@ mod tests {
     use super::*;
     use slabcast_scene::path::{Turntable, ViewPath};
 
-    fn lab(tf: &str) -> Lab {
+    fn trial(tf: &str) -> Trial {
         let volume = slabcast_session::volume::open("formula:spheres:32".as_ref()).unwrap();
         let path =
             ViewPath::from_turntable([64, 64], Turntable { frames: 3, ..Turntable::default() });
-        let request = RenderRequest::plain(path, tf).unwrap();
+        let request = RenderRequest::for_preset(path, tf).unwrap();
         let info = volume.info(volume.digest());
-        Lab::new(volume, info, &request, Orientation::new(None, None).unwrap(), 2).unwrap()
+        Trial::new(volume, info, &request, Orientation::new(None, None).unwrap(), 2).unwrap()
     }
 
     #[test]
     fn finer_settings_are_nearer_to_the_truth() {
-        let mut lab = lab("skin");
+        let mut trial = trial("skin");
         let mut progress = Progress::new(true);
-        let truth = [lab.truth(1, 512, 1, (&mut progress, 0)).unwrap()];
-        let base = lab.base;
+        let truth = [trial.truth(1, 512, 1, (&mut progress, 0)).unwrap()];
+        let base = trial.base;
         let at = |thickness, shrink| Setting {
             quality: Quality { thickness, eps: 0.0, ..base.quality },
             shrink,
             ..base
         };
-        let mut off = |s: Setting| lab.judge(&s, &truth, None).unwrap().off;
+        let mut off = |s: Setting| trial.judge(&s, &truth, None).unwrap().off;
         let (coarse, fine, small) = (off(at(2.0, 1)), off(at(0.5, 1)), off(at(0.5, 2)));
         assert!(fine.rmse < 0.2 && fine.rmse < coarse.rmse / 4.0, "{fine:?} {coarse:?}");
         assert!(small.rmse > 10.0 * fine.rmse && small.rmse < 40.0, "{small:?}");
@@ -385,26 +385,26 @@ mod tests {
 
     #[test]
     fn another_model_has_a_truth_of_its_own() {
-        let mut lab = lab("skin");
+        let mut trial = trial("skin");
         let mut progress = Progress::new(true);
-        let truth = [lab.truth(0, 256, 1, (&mut progress, 0)).unwrap()];
+        let truth = [trial.truth(0, 256, 1, (&mut progress, 0)).unwrap()];
         let setting = Setting { shaded: false, ..lab.base };
-        assert!(!setting.same_model(&lab.base) && lab.is_shaded());
-        let own = [lab.own_truth(&setting, &truth[0]).unwrap()];
-        let judged = lab.judge(&setting, &truth, Some(&own)).unwrap();
+        assert!(!setting.same_model(&trial.base) && trial.is_shaded());
+        let own = [trial.own_truth(&setting, &truth[0]).unwrap()];
+        let judged = trial.judge(&setting, &truth, Some(&own)).unwrap();
         let own = judged.own.unwrap();
         assert!(own.rmse < 1.0 && judged.off.rmse > 5.0, "{own:?} {:?}", judged.off);
-        let (base, bare) = (lab.base, setting);
-        let ((n, bytes), (m, fewer)) = (lab.bricks(&base).unwrap(), lab.bricks(&bare).unwrap());
+        let (base, bare) = (trial.base, setting);
+        let ((n, bytes), (m, fewer)) = (trial.bricks(&base).unwrap(), trial.bricks(&bare).unwrap());
         assert!(n == m && fewer < bytes, "no normals: {fewer} of {bytes}");
     }
 
     #[test]
     fn times_are_of_frames() {
-        let mut lab = lab("fog");
+        let mut trial = trial("fog");
         let effort = Effort { cut: Cut::on(1), seconds: 0.0 };
-        let base = lab.base;
-        let t = lab.time(&base, effort).unwrap();
+        let base = trial.base;
+        let t = trial.time(&base, effort).unwrap();
         assert_eq!(t.frames, FRAMES as u32);
         assert!(t.min > 0.0 && t.min <= t.median && t.median <= t.max);
     }

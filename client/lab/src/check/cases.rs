@@ -13,7 +13,7 @@ use slabcast_scene::path::{Orientation, PathView, ProjectionKind, ViewPath};
 use slabcast_scene::presets;
 use slabcast_scene::request::PathRequest;
 use slabcast_session::fail::Fail;
-use slabcast_session::path_scenes::Drawn;
+use slabcast_session::path_scenes::SceneBricks;
 use slabcast_session::volume;
 use std::path::Path;
 use std::sync::Arc;
@@ -191,8 +191,8 @@ impl Case {
 
     /// The serial renderer's hashes of both views.
     pub(crate) fn truth(&self) -> Result<Vec<Digest32>, Fail> {
-        let Drawn { spec, bricks } =
-            Drawn::new(&self.volume, &self.info, &self.transfer, self.quality)?;
+        let SceneBricks { spec, bricks } =
+            SceneBricks::new(&self.volume, &self.info, &self.transfer, self.quality)?;
         let scene = Arc::new(Scene::new(&spec));
         let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
         let path = self.path();

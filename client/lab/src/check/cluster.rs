@@ -13,7 +13,7 @@ use slabcast_render::Simd;
 use slabcast_scene::path::{Orientation, ViewPath};
 use slabcast_scene::request::PathRequest;
 use slabcast_scene::transfer::TransferChoice;
-use slabcast_session::embedded::{Cluster, Crew, start_master};
+use slabcast_session::embedded::{Cluster, WorkerGroup, start_master};
 use slabcast_session::fail::Fail;
 use std::time::Duration;
 use tokio::net::TcpListener;
@@ -80,7 +80,11 @@ pub(crate) struct Tcp {
 
 impl Either {
     /// Starts one for `volume` and waits until its workers are there.
-    pub(crate) async fn start(volume: &Volume, link: Link, crew: Crew) -> Result<Either, Fail> {
+    pub(crate) async fn start(
+        volume: &Volume,
+        link: Link,
+        crew: WorkerGroup,
+    ) -> Result<Either, Fail> {
         let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
         let volume = volume.clone();
         let memory = match link {
@@ -178,7 +182,7 @@ pub(crate) async fn joined(handle: &Handle, workers: u32) -> Result<(), Fail> {
 }
 
 impl Tcp {
-    async fn start(config: MasterConfig, crew: Crew, memory: u64) -> Result<Tcp, Fail> {
+    async fn start(config: MasterConfig, crew: WorkerGroup, memory: u64) -> Result<Tcp, Fail> {
         let io = |e: std::io::Error| Fail::failed(format!("listening on 127.0.0.1 failed: {e}"));
         let listener = TcpListener::bind("127.0.0.1:0").await.map_err(io)?;
         let address = listener.local_addr().map_err(io)?.to_string();
@@ -199,13 +203,14 @@ impl Tcp {
             let run = slabcast_worker::dial::run(config, address.clone(), stopped.clone());
             tasks.spawn(async move { run.await.map(drop).map_err(|e| e.to_string()) });
         }
-        let client =
-            Client::connect(&address).await.map_err(|e| slabcast_session::remote::fail(&e))?;
+        let client = Client::connect(&address)
+            .await
+            .map_err(|e| slabcast_session::remote::client_failure(&e))?;
         Ok(Tcp { master, client, stop, tasks })
     }
 
     async fn hashes(&mut self, request: PathRequest) -> Result<Vec<String>, Fail> {
-        let fail = |e| slabcast_session::remote::fail(&e);
+        let fail = |e| slabcast_session::remote::client_failure(&e);
         let job = self.client.submit(&request).await.map_err(fail)?;
         let mut frames = self.client.watch(&job, 0).await.map_err(fail)?;
         let mut hashes = Vec::new();

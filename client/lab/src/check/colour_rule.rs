@@ -15,7 +15,7 @@ use slabcast_render::judge::reference::{ErrorFigures, Reference, stratified};
 use slabcast_render::{Frame, Scene};
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::{Fail, say};
-use slabcast_session::path_scenes::Drawn;
+use slabcast_session::path_scenes::SceneBricks;
 use slabcast_session::progress::{self, Progress};
 use slabcast_session::request::{OpenedVolume, ThreadArgs, VolumeSceneArgs};
 use std::fmt::Write;
@@ -110,28 +110,29 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
         View::new(&info.lattice, camera, size, quality).map_err(|e| request.blame(&e))
     };
 
-    let mut progress = Progress::new(args.json).of("pixel");
+    let mut progress = Progress::new(args.json).counting("pixel");
     let sample = stratified(size, args.pixels as usize, 1);
     progress.frames(2 * sample.len() as u64, &format!("{} pixels of the reference", sample.len()));
     let mut limits = Vec::new();
     for (_, compositing) in [RULES[0], RULES[2]] {
         let quality = Quality { compositing, ..request.quality };
-        let drawn = Drawn::new(&volume, &info, &transfer, finely(quality, &transfer, &info))?;
+        let drawn = SceneBricks::new(&volume, &info, &transfer, finely(quality, &transfer, &info))?;
         let reference = Reference::new(&drawn.spec, view(&camera, &quality)?, &drawn.bricks);
         let reference = reference.with_sheet_payloads();
         let told = (&mut progress, limits.len() * sample.len());
-        limits.push(direct::judge(&sample, threads, told, |[x, y]| reference.pixel(x, y)));
+        limits.push(direct::map_pixels(&sample, threads, told, |[x, y]| reference.pixel(x, y)));
     }
     progress.end();
 
     let frames = RULES.len() * THICKNESSES.len();
-    let mut progress = Progress::new(args.json).of("rule and thickness");
+    let mut progress = Progress::new(args.json).counting("rule and thickness");
     progress.frames(frames as u64, &format!("{} frames each", args.steps));
     let mut lines = Vec::new();
     for (rule, compositing) in RULES {
         for thickness in THICKNESSES {
             let quality = Quality { compositing, thickness, ..request.quality };
-            let drawn = Drawn::new(&volume, &info, &transfer, finely(quality, &transfer, &info))?;
+            let drawn =
+                SceneBricks::new(&volume, &info, &transfer, finely(quality, &transfer, &info))?;
             let scene = Arc::new(Scene::new(&drawn.spec));
             let cut = Cut::on(if args.times { 1 } else { threads });
             let (mut pictures, mut times) = (Vec::new(), Vec::new());
@@ -139,11 +140,7 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
                 let by = thickness * info.lattice.vox() * f64::from(step) / f64::from(args.steps);
                 let view = view(&nearer(&camera, by), &drawn.spec.quality)?;
                 let began = Instant::now();
-                pictures.push(direct::picture(
-                    &Frame::new(scene.clone(), view),
-                    &drawn.bricks,
-                    cut,
-                ));
+                pictures.push(direct::draw(&Frame::new(scene.clone(), view), &drawn.bricks, cut));
                 times.push(began.elapsed().as_secs_f64() * 1e3);
             }
             times.sort_by(f64::total_cmp);

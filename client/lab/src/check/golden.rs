@@ -6,7 +6,7 @@ use super::matrix::SAMPLE;
 use slabcast_common::PIXELS_VERSION;
 use slabcast_common::quality::Work;
 use slabcast_scene::path::Orientation;
-use slabcast_session::embedded::{Cluster, Crew};
+use slabcast_session::embedded::{Cluster, WorkerGroup};
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress::{self, Progress};
 use std::collections::BTreeMap;
@@ -42,7 +42,7 @@ pub(crate) fn run(args: &GoldenArgs) -> Result<(), Fail> {
     for case in &cases {
         let hashes = runtime.block_on(async {
             let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
-            let crew = Crew::new(1, None)?;
+            let crew = WorkerGroup::new(1, None)?;
             let mut cluster = Cluster::start((*case.volume).clone(), orientation, crew, None)?;
             let request = case.request(true, Work::default());
             let hashes = tokio::select! {

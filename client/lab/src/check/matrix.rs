@@ -5,7 +5,7 @@ use super::cluster::{Either, Link};
 use super::pairwise;
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::volume::Digest32;
-use slabcast_session::embedded::Crew;
+use slabcast_session::embedded::WorkerGroup;
 use slabcast_session::fail::{Fail, say};
 use slabcast_session::progress::{self, Progress};
 use std::cell::{Cell, RefCell};
@@ -89,8 +89,8 @@ impl Setting {
         settings
     }
 
-    fn crew(&self) -> Crew {
-        Crew { workers: self.workers, threads: self.threads }
+    fn crew(&self) -> WorkerGroup {
+        WorkerGroup { workers: self.workers, threads: self.threads }
     }
 
     fn work(&self) -> Work {
@@ -145,7 +145,7 @@ pub(crate) fn run(args: &MatrixArgs) -> Result<(), Fail> {
     let settings = Setting::all(args.pairwise);
     let began = Instant::now();
     let runtime = slabcast_session::runtime::start()?;
-    let progress = RefCell::new(Progress::new(false).of("setting"));
+    let progress = RefCell::new(Progress::new(false).counting("setting"));
     let done = Cell::new(0);
     let step = || {
         done.set(done.get() + 1);
@@ -183,7 +183,7 @@ pub(crate) fn run(args: &MatrixArgs) -> Result<(), Fail> {
                 n => format!("{n} DIFFER"),
             };
             let time = if i == 0 { progress::time(case_began.elapsed()) } else { String::new() };
-            progress.borrow().aside(|| {
+            progress.borrow().suspend(|| {
                 say(&format!(
                     "{:<32} {}  {:>4} pictures  {outcome:<10} {time}\n",
                     case.view_name(i),

@@ -17,9 +17,9 @@ use slabcast_render::{Frame, Scene};
 use slabcast_scene::path::{Orientation, PathView, ViewPath};
 use slabcast_scene::request::PathRequest;
 use slabcast_session::direct::{self, Bricks, Cut};
-use slabcast_session::embedded::Crew;
+use slabcast_session::embedded::WorkerGroup;
 use slabcast_session::fail::Fail;
-use slabcast_session::path_scenes::Drawn;
+use slabcast_session::path_scenes::SceneBricks;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -93,7 +93,8 @@ impl Shot {
         let camera = self.path().camera(0, &info.lattice, orientation).map_err(refused)?;
         let view = View::new(&info.lattice, &camera, self.size, &self.quality).map_err(refused)?;
         let quality = finely(self.quality, &self.transfer, &info);
-        let Drawn { spec, bricks } = Drawn::new(&self.volume, &info, &self.transfer, quality)?;
+        let SceneBricks { spec, bricks } =
+            SceneBricks::new(&self.volume, &info, &self.transfer, quality)?;
         Ok(Ready { spec, view, bricks })
     }
 
@@ -113,7 +114,8 @@ impl Shot {
             differ.push("threads".to_string());
         }
         let work = |slabs, tile| Work { slabs, tile: Some(tile), ..Work::default() };
-        let (three, two) = (Crew { workers: 3, threads: 1 }, Crew { workers: 2, threads: 2 });
+        let (three, two) =
+            (WorkerGroup { workers: 3, threads: 1 }, WorkerGroup { workers: 2, threads: 2 });
         for (name, tcp, crew, cull, work) in [
             ("embedded cluster", false, three, true, work(7, 16)),
             ("TCP cluster", true, two, false, work(2, 64)),
@@ -132,7 +134,7 @@ impl Shot {
     pub(crate) async fn hash(
         &self,
         tcp: bool,
-        crew: Crew,
+        crew: WorkerGroup,
         cull: bool,
         work: Work,
     ) -> Result<String, Fail> {
@@ -180,12 +182,12 @@ impl Ready {
 
     /// The tile renderer's picture on threads of this process.
     pub(crate) fn picture(&self, cut: Cut) -> Picture {
-        direct::picture(&self.frame(), &self.bricks, cut)
+        direct::draw(&self.frame(), &self.bricks, cut)
     }
 
     /// The same with no pixel ever shut.
     pub(crate) fn never_shut(&self, cut: Cut) -> Picture {
-        direct::picture(&self.frame().never_shut(), &self.bricks, cut)
+        direct::draw(&self.frame().never_shut(), &self.bricks, cut)
     }
 
     /// A seeded sample of at most `n` pixels, one from each of about `n` equal cells.
@@ -201,7 +203,7 @@ impl Ready {
         tools: &Tools,
     ) -> Vec<[f64; 4]> {
         let reference = Reference::new(&self.spec, self.view, &self.bricks);
-        direct::shared(sample.len(), tools.threads, |i, _: &mut ()| {
+        direct::map_parallel(sample.len(), tools.threads, |i, _: &mut ()| {
             let [x, y] = sample[i];
             match against {
                 Against::Limit => reference.pixel(x, y),

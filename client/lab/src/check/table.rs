@@ -99,11 +99,11 @@ pub(crate) fn run(args: &TableArgs) -> Result<(), Fail> {
     let threads = args.threads.count();
     let tools = Tools { threads, runtime };
     let began = Instant::now();
-    let mut progress = Progress::new(args.json).of("case");
+    let mut progress = Progress::new(args.json).counting("case");
     progress.frames(cases.len() as u64, &format!("{} cases", cases.len()));
     let (mut rows, mut wrong) = (0, 0);
     for (done, (group, case)) in cases.iter().enumerate() {
-        progress.stage(&case.name);
+        progress.phase(&case.name);
         let case_began = Instant::now();
         let outcome = outcome(case, &tools);
         let took = case_began.elapsed();
@@ -115,7 +115,7 @@ pub(crate) fn run(args: &TableArgs) -> Result<(), Fail> {
             } else {
                 row.text(group.name, &case.name)
             };
-            progress.aside(|| say(&line))?;
+            progress.suspend(|| say(&line))?;
         }
         progress.step(progress::Step { frames: done as u64 + 1, ..Default::default() });
     }

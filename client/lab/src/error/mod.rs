@@ -14,7 +14,7 @@
 mod map;
 mod report;
 
-use crate::single_frame::Still;
+use crate::single_frame::SingleFrame;
 use slabcast_common::image::Picture;
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_render::judge::reference::{ErrorFigures, SheetOptions, stratified};
@@ -96,7 +96,7 @@ struct Row {
 
 /// All that was found out.
 struct Found {
-    still: Still,
+    still: SingleFrame,
     picture: Picture,
     /// Pixels looked at, and what the limit is there.
     sample: Vec<[u32; 2]>,
@@ -123,7 +123,7 @@ pub fn run(args: &ErrorArgs) -> Result<(), Fail> {
     }
     let found = {
         let args = args.clone();
-        signals::unless_stopped(move || find(&args))?
+        signals::run_unless_stopped(move || find(&args))?
     };
     if let Some(path) = &args.map {
         map::write(path, &found)?;
@@ -142,12 +142,12 @@ fn shut(picture: &Picture, eps: f64) -> bool {
 
 fn find(args: &ErrorArgs) -> Result<Found, Fail> {
     let threads = args.threads.count();
-    let still = Still::read(&args.of, threads, |_| Ok(()))?;
+    let still = SingleFrame::read(&args.of, threads, |_| Ok(()))?;
     let size = still.view.size;
 
-    let mut progress = Progress::new(false).of("pixel");
+    let mut progress = Progress::new(false).counting("pixel");
     let began = Instant::now();
-    progress.stage("drawing");
+    progress.phase("drawing");
     let quality = still.spec.quality;
     let picture = still.draw(quality, threads);
     let drawn = began.elapsed();
@@ -169,13 +169,13 @@ fn find(args: &ErrorArgs) -> Result<Found, Fail> {
     let reference = still.reference();
     let judging = Instant::now();
     let rounded = SheetOptions { rounded: true, ..SheetOptions::default() };
-    let truth = direct::judge(&sample, threads, (&mut progress, 0), |[x, y]| {
+    let truth = direct::map_pixels(&sample, threads, (&mut progress, 0), |[x, y]| {
         let limit = reference.pixel(x, y);
         [limit, reference.at_same_thickness(x, y), reference.by_sheets(x, y, rounded)]
     });
     let judge = || still.reference().with_tolerance(MODEL_TOLERANCE);
     let (limit, whole, level) = (judge(), judge().without_truncation(), judge().without_ripple());
-    let ideals = direct::judge(&model, threads, (&mut progress, sample.len()), |[x, y]| {
+    let ideals = direct::map_pixels(&model, threads, (&mut progress, sample.len()), |[x, y]| {
         [limit.pixel(x, y), whole.pixel(x, y), level.pixel(x, y)]
     });
     let judged = judging.elapsed();

@@ -37,7 +37,7 @@ use slabcast_render::visibility::VisibleBricks;
 use slabcast_schedule::{FrameJob, is_shut, macrotile};
 use slabcast_session::direct;
 use slabcast_session::fail::Fail;
-use slabcast_session::path_scenes::Stage;
+use slabcast_session::path_scenes::PathScenes;
 use slabcast_session::progress::{Progress, Step};
 use slabcast_session::signals;
 use slabcast_trace::{
@@ -51,7 +51,7 @@ use std::time::{Duration, Instant};
 
 /// What is measured.
 pub(crate) struct Path<'a> {
-    pub(crate) stage: &'a Stage,
+    pub(crate) stage: &'a PathScenes,
     pub(crate) frames: usize,
     pub(crate) work: Work,
     /// Numbers of tiles that schedules will want: they decide which levels are drawn.
@@ -73,7 +73,7 @@ pub(crate) const FINISH: PixelEncoding =
     PixelEncoding { format: PixelFormat::Rgb8, background: Background::Colour([0.0; 3]) };
 
 /// The path's frames as the scheduler gets them.
-pub(crate) fn jobs(stage: &Stage, frames: usize, work: Work) -> Result<Vec<FrameJob>, Fail> {
+pub(crate) fn jobs(stage: &PathScenes, frames: usize, work: Work) -> Result<Vec<FrameJob>, Fail> {
     let bricks = stage.bricks.directory().bricks();
     let mut scene = Arc::new(stage.spec(0));
     (0..frames)
@@ -105,7 +105,7 @@ pub(crate) fn measure(
     bench.frame(path, 0, &jobs[0])?;
     bench.depths = ClosingDepths::new(jobs[0].view.size);
     for (i, job) in jobs.iter().enumerate() {
-        if signals::told() {
+        if signals::stop_requested() {
             break;
         }
         frames.push(bench.frame(path, i, job)?);
@@ -416,7 +416,7 @@ impl Bench {
         let mut of = |edge: u32| {
             let outlook = VisibleBricks::new(&frame.view, bricks.directory());
             let tiles: Vec<Rect> =
-                direct::tiles(whole, edge).filter(|tile| outlook.weight(tile) > 0).collect();
+                direct::tile_rects(whole, edge).filter(|tile| outlook.weight(tile) > 0).collect();
             let mut draw = |tile| {
                 region::draw(frame, &outlook, bricks, simd, tile, &mut self.scratch, &mut pixels);
             };
@@ -543,13 +543,13 @@ mod tests {
     ];
 
     /// Four views of 512x512 of it, or nothing, which is said, where the volume is not here.
-    fn staged((file, axis, tf): Named) -> Option<Stage> {
+    fn staged((file, axis, tf): Named) -> Option<PathScenes> {
         let (volume, orientation) = slabcast_session::testing::data_volume(file, axis)?;
         let info = volume.info(volume.digest());
         let turn = Turntable { frames: 4, step: 22.5, ..Turntable::default() };
-        let request = RenderRequest::plain(ViewPath::from_turntable([512, 512], turn), tf)
+        let request = RenderRequest::for_preset(ViewPath::from_turntable([512, 512], turn), tf)
             .expect("a request");
-        Some(Stage::new(&volume, &info, &request, orientation).expect("a stage"))
+        Some(PathScenes::new(&volume, &info, &request, orientation).expect("a stage"))
     }
 
     /// Bytes of a frame's results and what a tile takes to write and to read, for docs/scaling.md.
@@ -565,7 +565,7 @@ mod tests {
             let (mut bytes, mut ns, mut composed, mut tiles) = ([0; 3], [0; 6], 0, 0);
             for i in 0..4 {
                 let frame = stage.frame(i).expect("a frame");
-                let picture = direct::picture(&frame, &stage.bricks, Cut::on(2));
+                let picture = direct::draw(&frame, &stage.bricks, Cut::on(2));
                 let mut state = FrameState::new([512, 512]);
                 for (rect, sums) in tiles_of(&picture.pixels) {
                     tiles += 1;
@@ -652,7 +652,7 @@ mod tests {
                 let infos = bricks.directory().bricks().clone();
                 let directory = Arc::new(Directory::with_blocks(infos, shift, usize::MAX));
                 let all = VisibleBricks::new(&frame.view, &directory);
-                let tiles = direct::tiles(Rect::from_size([512; 2]), 64);
+                let tiles = direct::tile_rects(Rect::from_size([512; 2]), 64);
                 let tiles: Vec<Rect> = tiles.filter(|tile| all.weight(tile) > 0).collect();
                 let (mut scratch, mut pixels) = Default::default();
                 let mut look = |tiles: &[Rect]| {

@@ -19,8 +19,8 @@ use rehearse::Over;
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_schedule::FrameJob;
 use slabcast_session::fail::{Fail, say};
-use slabcast_session::output::{Made, probe, write_atomic};
-use slabcast_session::path_scenes::Stage;
+use slabcast_session::output::{OutputFolder, probe, write_atomic};
+use slabcast_session::path_scenes::PathScenes;
 use slabcast_session::progress::{Progress, warn};
 use slabcast_session::request::{OpenedVolume, RenderRequest, VolumeSceneArgs, WorkArgs};
 use slabcast_session::{machine, parse, signals};
@@ -137,14 +137,14 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
     }
     let mut progress = Progress::new(args.quiet);
     // Refused before minutes of measuring; what is made goes again if nothing comes into it.
-    let _made = args.output.as_deref().map(Made::new).transpose()?;
+    let _made = args.output.as_deref().map(OutputFolder::new).transpose()?;
     if let Some(file) = args.trace.as_deref().filter(|file| !file.exists()) {
         probe(file)?;
     }
     let OpenedVolume { volume, info, orientation } = args.of.open(&request)?;
-    progress.stage("cutting the volume into bricks");
+    progress.phase("cutting the volume into bricks");
     let names = (volume.name.clone(), request.transfer.name().to_string());
-    let stage = Stage::new(&volume, &info, &request, orientation)?;
+    let stage = PathScenes::new(&volume, &info, &request, orientation)?;
     drop(volume);
     let frames = request.path.frames();
     let jobs = measure::jobs(&stage, frames, work)?;
@@ -161,7 +161,7 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
             Measured { trace, now: false }
         }
         file => {
-            progress.stage("measuring what messages take");
+            progress.phase("measuring what messages take");
             let began = Instant::now();
             let pings = pinged();
             let pinging = began.elapsed();
@@ -182,8 +182,8 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
             let mut trace = measure::measure(&path, (&mut progress, 0))?;
             // Once more, unless that would be at once; who could not tell before is not asked again.
             let later = began.elapsed() > pinging;
-            if let Some(before) = pings.filter(|_| later && !signals::told()) {
-                progress.stage("measuring what messages take");
+            if let Some(before) = pings.filter(|_| later && !signals::stop_requested()) {
+                progress.phase("measuring what messages take");
                 trace.about.pings =
                     pings::measure().map_or(pings, |now| Some(pings::least(before, now)));
             }
@@ -213,7 +213,7 @@ pub fn run(args: &PlanArgs) -> Result<(), Fail> {
             (Some(list), Some(file)) => {
                 let mut request: RenderRequest = request.clone();
                 request.work.schedule = schedule;
-                let stage = rehearse::Stage {
+                let stage = rehearse::PathScenes {
                     volume: &args.of.volume,
                     file,
                     trace,

@@ -9,7 +9,7 @@ use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Schedule;
 use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{FrameJob, Spans};
-use slabcast_session::direct::shared;
+use slabcast_session::direct::map_parallel;
 use slabcast_session::fail::Fail;
 use slabcast_sim::{self as sim, Cluster, Costs, Link, Outcome, Stopwatch, Took, Unmeasured};
 use slabcast_trace::Trace;
@@ -144,7 +144,7 @@ pub(crate) fn rows(
     messages: Costs,
     threads: usize,
 ) -> Result<Vec<Row>, Fail> {
-    let rows = shared(workers.len(), threads, |i, _: &mut ()| {
+    let rows = map_parallel(workers.len(), threads, |i, _: &mut ()| {
         let cluster = (workers[i], question.threads);
         let (one, _) = decided(jobs, trace, cluster, messages, 1)?;
         let several = decided(jobs, trace, cluster, messages, IN_FLIGHT)?;

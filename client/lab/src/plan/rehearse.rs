@@ -116,7 +116,7 @@ impl Process {
 }
 
 /// What all rehearsals of a command share.
-pub(super) struct Stage<'a> {
+pub(super) struct PathScenes<'a> {
     pub(super) volume: &'a Path,
     /// The trace's file, and what is in it.
     pub(super) file: &'a Path,
@@ -129,7 +129,7 @@ pub(super) struct Stage<'a> {
     pub(super) over: Over<'a>,
 }
 
-impl Stage<'_> {
+impl PathScenes<'_> {
     /// Rehearses with each number of workers.
     pub(super) fn run(
         &self,
@@ -138,7 +138,7 @@ impl Stage<'_> {
     ) -> Result<Vec<Rehearsed>, Fail> {
         let runtime = runtime::start()?;
         let rehearsed = workers.iter().map(|&n| {
-            progress.stage(&format!("rehearsing with {n} workers"));
+            progress.phase(&format!("rehearsing with {n} workers"));
             self.beside(n, &runtime.block_on(self.one(n))?)
         });
         let result = rehearsed.collect::<Result<_, Fail>>();
@@ -194,7 +194,7 @@ impl Stage<'_> {
             .collect::<Result<Vec<_>, _>>()?;
         let client = remote::connect(&address).await?;
         let come = Instant::now();
-        while client.workers().await.map_err(|e| remote::fail(&e))?.len() < n as usize {
+        while client.workers().await.map_err(|e| remote::client_failure(&e))?.len() < n as usize {
             for worker in &mut workers {
                 if let Ok(Some(status)) = worker.0.try_wait() {
                     let by = by.map(|by| format!(" that `{by}` started")).unwrap_or_default();
@@ -324,20 +324,22 @@ async fn play(
     let mut jobs = VecDeque::new();
     let mut rest = requests.iter();
     if let Some(first) = rest.next() {
-        jobs.push_back(client.submit(first).await.map_err(|e| remote::fail(&e))?);
+        jobs.push_back(client.submit(first).await.map_err(|e| remote::client_failure(&e))?);
     }
     let (mut totals, mut came) = (Vec::new(), Vec::new());
     let (mut began, mut before) = (Instant::now(), (master.cpu(), of_workers()));
     while let Some(job) = jobs.pop_front() {
-        let mut stream = client.watch(&job, 0).await.map_err(|e| remote::fail(&e))?;
-        while let Some(update) = stream.next().await.map_err(|e| remote::fail(&e))? {
+        let mut stream = client.watch(&job, 0).await.map_err(|e| remote::client_failure(&e))?;
+        while let Some(update) = stream.next().await.map_err(|e| remote::client_failure(&e))? {
             let Update::Frame(frame) = update else { continue };
             came.push(Instant::now());
             if came.len() == 1 {
                 // Before the first frame the volume is cut into bricks and all of them are sent: from
                 // here on it counts.
                 for message in rest.by_ref() {
-                    jobs.push_back(client.submit(message).await.map_err(|e| remote::fail(&e))?);
+                    jobs.push_back(
+                        client.submit(message).await.map_err(|e| remote::client_failure(&e))?,
+                    );
                 }
                 (began, before) = (Instant::now(), (master.cpu(), of_workers()));
             }

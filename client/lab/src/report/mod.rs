@@ -9,7 +9,7 @@ mod write;
 
 use crate::autotune::pareto::{self, Point};
 use crate::autotune::setting::{Setting, lower};
-use crate::autotune::trial::{Effort, Judged, Lab, Off, Timing, Truth};
+use crate::autotune::trial::{Deviation, Effort, Judged, Timing, Trial, Truth};
 use serde::Serialize;
 use slabcast_common::quality::{Quality, Sums, Work};
 use slabcast_session::direct::Cut;
@@ -19,7 +19,7 @@ use slabcast_session::request::{OpenedVolume, ThreadArgs, VolumeSceneArgs};
 use slabcast_session::signals;
 use std::path::PathBuf;
 use std::time::Instant;
-use sweep::{Group, Knob, Trial};
+use sweep::{Group, Knob, SweepPoint};
 
 /// Sweeps the settings of quality for error against time.
 ///
@@ -95,8 +95,8 @@ struct Line {
     /// Decided.
     sums: Sums,
     work: WorkUsed,
-    error: Off,
-    own_error: Option<Off>,
+    error: Deviation,
+    own_error: Option<Deviation>,
     ms: Times,
     voxels: Voxels,
     /// Pixels that are drawn.
@@ -202,7 +202,7 @@ impl Report {
 pub fn run(args: &ReportArgs) -> Result<(), Fail> {
     let made = write::check(args)?;
     let args = args.clone();
-    signals::to_its_end(move || {
+    signals::run_to_end(move || {
         // Held until the files are there.
         let _made = made;
         let report = measure(&args)?;
@@ -217,23 +217,23 @@ pub fn run(args: &ReportArgs) -> Result<(), Fail> {
 fn measure(args: &ReportArgs) -> Result<Report, Fail> {
     let request = args.of.scene.request(Work::default())?;
     let threads = args.threads.count();
-    let mut progress = Progress::new(false).of("setting");
-    progress.stage(&format!("reading {}", args.of.volume.display()));
+    let mut progress = Progress::new(false).counting("setting");
+    progress.phase(&format!("reading {}", args.of.volume.display()));
     let OpenedVolume { volume, info, orientation } = args.of.open(&request)?;
     let (name, digest) = (volume.name.clone(), info.digest.to_string());
-    let mut lab = Lab::new(volume, info, &request, orientation, threads)?;
-    let trials = sweep::trials(&lab, &args.only);
+    let mut trial = Trial::new(volume, info, &request, orientation, threads)?;
+    let points = sweep::points(&trial, &args.only);
 
-    let views = lab.views();
+    let views = trial.views();
     let judged: Vec<usize> = spread(views, args.views as usize);
     let mut truths = Vec::new();
-    let mut judging = Progress::new(false).of("pixel");
+    let mut judging = Progress::new(false).counting("pixel");
     let all = args.pixels as usize * judged.len();
     judging.frames(all as u64, "what the picture should be, by the reference");
     for (n, &view) in judged.iter().enumerate() {
         let told = (&mut judging, n * args.pixels as usize);
-        truths.push(lab.truth(view, args.pixels as usize, args.seed, told)?);
-        if signals::told() {
+        truths.push(trial.truth(view, args.pixels as usize, args.seed, told)?);
+        if signals::stop_requested() {
             break;
         }
     }
@@ -246,7 +246,7 @@ fn measure(args: &ReportArgs) -> Result<Report, Fail> {
         volume: name,
         digest,
         tf: request.transfer.name(),
-        size: lab.size(),
+        size: trial.size(),
         views,
         judged_views: judged,
         pixels: args.pixels as usize,
@@ -260,23 +260,23 @@ fn measure(args: &ReportArgs) -> Result<Report, Fail> {
         skipped: Vec::new(),
         settings: Vec::new(),
     };
-    progress.frames(trials.len() as u64, &format!("{} settings", trials.len()));
+    progress.frames(points.len() as u64, &format!("{} settings", points.len()));
     let began = Instant::now();
-    for (n, trial) in trials.iter().enumerate() {
-        if signals::told() {
+    for (n, point) in points.iter().enumerate() {
+        if signals::stop_requested() {
             progress.end();
-            progress::note(&format!("stopped after {n} of {} settings", trials.len()));
+            progress::note(&format!("stopped after {n} of {} settings", points.len()));
             report.mark();
             return Ok(report);
         }
-        if pointless(&report.settings, trial) {
-            report.skipped.push(trial.setting.name(&lab.base));
+        if pointless(&report.settings, point) {
+            report.skipped.push(point.setting.name(&trial.base));
         } else {
-            report.settings.push(line(&mut lab, trial, &truths, args)?);
+            report.settings.push(line(&mut trial, point, &truths, args)?);
         }
         progress.step(progress::Step {
             frames: n as u64 + 1,
-            detail: trial.setting.name(&lab.base),
+            detail: point.setting.name(&trial.base),
             ..Default::default()
         });
     }
@@ -297,13 +297,13 @@ fn spread(views: usize, n: usize) -> Vec<usize> {
 
 /// Whether thinner sheets buy nothing any more: of the same setting in thicker sheets, two are known
 /// and the thinner of them is no nearer to the limit.
-fn pointless(known: &[Line], trial: &Trial) -> bool {
-    let thickness = trial.setting.quality.thickness;
+fn pointless(known: &[Line], point: &SweepPoint) -> bool {
+    let thickness = point.setting.quality.thickness;
     let mut alike: Vec<(f64, f64)> = known
         .iter()
         .filter(|l| {
             let q = Quality { thickness, ..l.setting.quality };
-            Setting { quality: q, ..l.setting } == trial.setting
+            Setting { quality: q, ..l.setting } == point.setting
         })
         .map(|l| (l.setting.quality.thickness, l.error.rmse))
         .filter(|(d, _)| *d > thickness)
@@ -312,37 +312,43 @@ fn pointless(known: &[Line], trial: &Trial) -> bool {
     matches!(&alike[..], [thin, thick, ..] if thin.1 >= thick.1 * (1.0 - pareto::WORTH))
 }
 
-fn line(lab: &mut Lab, trial: &Trial, truths: &[Truth], args: &ReportArgs) -> Result<Line, Fail> {
-    let base = lab.base;
-    let setting = &trial.setting;
+fn line(
+    trial: &mut Trial,
+    point: &SweepPoint,
+    truths: &[Truth],
+    args: &ReportArgs,
+) -> Result<Line, Fail> {
+    let base = trial.base;
+    let setting = &point.setting;
     let own = if setting.same_model(&base) {
         None
     } else {
-        let of = truths.iter().map(|t| lab.own_truth(setting, t));
+        let of = truths.iter().map(|t| trial.own_truth(setting, t));
         Some(of.collect::<Result<Vec<_>, _>>()?)
     };
-    let Judged { sums, off, own, counters, sha256 } = lab.judge(setting, truths, own.as_deref())?;
+    let Judged { sums, off, own, counters, sha256 } =
+        trial.judge(setting, truths, own.as_deref())?;
     let effort = |cut| Effort { cut, seconds: args.seconds };
-    let all = lab.time(setting, effort(trial.cut))?;
-    let one = match trial.cut.threads {
+    let all = trial.time(setting, effort(point.cut))?;
+    let one = match point.cut.threads {
         1 => Some(all),
-        _ if trial.group == Group::Work => None,
-        _ => Some(lab.time(setting, effort(Cut { threads: 1, ..trial.cut }))?),
+        _ if point.group == Group::Work => None,
+        _ => Some(trial.time(setting, effort(Cut { threads: 1, ..point.cut }))?),
     };
-    let (relevant, bytes) = lab.bricks(setting)?;
-    let drawn = setting.drawn_size(lab.size()).unwrap_or(lab.size());
+    let (relevant, bytes) = trial.bricks(setting)?;
+    let drawn = setting.drawn_size(trial.size()).unwrap_or(trial.size());
     let is_base = *setting == base;
     Ok(Line {
-        name: match trial.knob {
+        name: match point.knob {
             Knob::Quality => setting.name(&base),
             Knob::Work(what) => what.to_string(),
         },
-        group: trial.group,
-        knob: lower(&trial.group),
-        flags: setting.flags(&base, lab.size()),
+        group: point.group,
+        knob: lower(&point.group),
+        flags: setting.flags(&base, trial.size()),
         setting: *setting,
         sums,
-        work: WorkUsed { tile: trial.cut.tile, slabs: trial.cut.slabs, threads: trial.cut.threads },
+        work: WorkUsed { tile: point.cut.tile, slabs: point.cut.slabs, threads: point.cut.threads },
         error: off,
         own_error: own,
         ms: Times { one, all },
@@ -357,7 +363,7 @@ fn line(lab: &mut Lab, trial: &Trial, truths: &[Truth], args: &ReportArgs) -> Re
         pixels_sha256: sha256,
         front: false,
         knee: false,
-        default: is_base && trial.group == Group::Default,
+        default: is_base && point.group == Group::Default,
     })
 }
 

@@ -2,7 +2,7 @@
 //! knobs, which change time alone.
 
 use crate::autotune::setting::Setting;
-use crate::autotune::trial::Lab;
+use crate::autotune::trial::Trial;
 use serde::Serialize;
 use slabcast_common::quality::{Compositing, Kernel, Quality, Sums};
 use slabcast_session::direct::Cut;
@@ -53,7 +53,7 @@ pub(super) enum Knob {
 
 /// One row of the report.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Trial {
+pub(super) struct SweepPoint {
     pub(super) group: Group,
     pub(super) knob: Knob,
     pub(super) setting: Setting,
@@ -78,19 +78,25 @@ const COMBINED: ([f64; 4], [f64; 3], [Sums; 2], [u32; 2]) = (
 
 /// All trials that `only` names (or all), the default first; what is refused (16 bits under a
 /// tent) or no change is left out.
-pub(super) fn trials(lab: &Lab, only: &[Group]) -> Vec<Trial> {
-    list(lab.base, lab.size(), lab.threads, lab.is_shaded(), only)
+pub(super) fn points(trial: &Trial, only: &[Group]) -> Vec<SweepPoint> {
+    list(trial.base, trial.size(), trial.threads, trial.is_shaded(), only)
 }
 
-fn list(base: Setting, size: [u32; 2], threads: usize, shaded: bool, only: &[Group]) -> Vec<Trial> {
+fn list(
+    base: Setting,
+    size: [u32; 2],
+    threads: usize,
+    shaded: bool,
+    only: &[Group],
+) -> Vec<SweepPoint> {
     let cut = Cut { threads, tile: TILE, slabs: 1 };
-    let mut all: Vec<Trial> = Vec::new();
+    let mut all: Vec<SweepPoint> = Vec::new();
     let mut put = |group: Group, setting: Setting| {
         let wanted = group == Group::Default || only.is_empty() || only.contains(&group);
         let there = all.iter().any(|t| t.setting == setting);
         if wanted && !there && setting.quality.check().is_ok() && setting.drawn_size(size).is_some()
         {
-            all.push(Trial { group, knob: Knob::Quality, setting, cut });
+            all.push(SweepPoint { group, knob: Knob::Quality, setting, cut });
         }
     };
     let quality = |q: Quality| Setting { quality: q, ..base };
@@ -139,7 +145,7 @@ fn list(base: Setting, size: [u32; 2], threads: usize, shaded: bool, only: &[Gro
     }
     if only.is_empty() || only.contains(&Group::Work) {
         let mut work = |knob: WorkKnob, cut: Cut| {
-            all.push(Trial { group: Group::Work, knob: Knob::Work(knob), setting: base, cut });
+            all.push(SweepPoint { group: Group::Work, knob: Knob::Work(knob), setting: base, cut });
         };
         for tile in [16, 32, 64, 128, 256] {
             work(WorkKnob::Tile(tile), Cut { tile, ..cut });

@@ -6,7 +6,7 @@ use super::{Line, Report, ReportArgs};
 use crate::autotune::setting::{fraction, lower};
 use crate::chart::{self, DARK, LIGHT};
 use slabcast_session::fail::Fail;
-use slabcast_session::output::{Made, write_atomic};
+use slabcast_session::output::{OutputFolder, write_atomic};
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::Path;
@@ -16,7 +16,7 @@ const FILES: [&str; 6] =
 
 /// Refuses, before anything is measured, what could not be written.
 /// The folder goes again if nothing comes into it.
-pub(super) fn check(args: &ReportArgs) -> Result<Made, Fail> {
+pub(super) fn check(args: &ReportArgs) -> Result<OutputFolder, Fail> {
     let out = &args.out;
     let there = FILES.iter().map(|f| out.join(f)).find(|f| f.exists());
     if let (Some(file), false) = (there, args.force) {
@@ -26,7 +26,7 @@ pub(super) fn check(args: &ReportArgs) -> Result<Made, Fail> {
             file.file_name().unwrap_or_default().to_string_lossy()
         )));
     }
-    Made::new(out)
+    OutputFolder::new(out)
 }
 
 /// Writes all files.

@@ -12,7 +12,7 @@ use slabcast_common::quality::{Borders, Kernel, Quality, Schedule, Work};
 use slabcast_common::view::MAX_EDGE;
 use slabcast_session::fail::Fail;
 use slabcast_session::machine;
-use slabcast_session::path_scenes::Stage;
+use slabcast_session::path_scenes::PathScenes;
 use slabcast_session::progress::{self, Progress, Step};
 use slabcast_session::request::{OpenedVolume, RenderRequest};
 use slabcast_session::signals;
@@ -61,10 +61,10 @@ impl Bench<'_> {
             let first = request.path.first_frame() as u32;
             request.path.range = Some([first, first + QUICK_VIEWS as u32 - 1]);
         }
-        let mut progress = Progress::new(false).of("view");
-        progress.stage(&format!("reading {}", args.of.volume.display()));
+        let mut progress = Progress::new(false).counting("view");
+        progress.phase(&format!("reading {}", args.of.volume.display()));
         let opened = args.of.open(&request)?;
-        progress.stage("measuring what messages take");
+        progress.phase("measuring what messages take");
         let pings = pinged();
         let cores = machine::cores();
         let views = request.path.frames();
@@ -87,14 +87,14 @@ impl Bench<'_> {
         })
     }
 
-    fn stage(&self, request: &RenderRequest) -> Result<Stage, Fail> {
-        Stage::new(&self.opened.volume, &self.opened.info, request, self.opened.orientation)
+    fn stage(&self, request: &RenderRequest) -> Result<PathScenes, Fail> {
+        PathScenes::new(&self.opened.volume, &self.opened.info, request, self.opened.orientation)
     }
 
     /// Draws the tiles of some views and makes them ready to be simulated.
     fn bed(
         &mut self,
-        stage: &Stage,
+        stage: &PathScenes,
         request: &RenderRequest,
         views: usize,
         schedules: &[Schedule],
@@ -124,7 +124,7 @@ impl Bench<'_> {
     pub(super) fn study(mut self) -> Result<Study, Fail> {
         let threads = machine::cores() as usize;
         let mut request = self.request.clone();
-        self.progress.stage("cutting the volume into bricks");
+        self.progress.phase("cutting the volume into bricks");
         let stage = self.stage(&request)?;
         let settings = self.settings();
         let of_effects: usize = settings.iter().map(|_| EFFECT_FRAMES.min(self.views)).sum();
@@ -159,7 +159,7 @@ impl Bench<'_> {
         study.effects.bricks = effects::bricks(&stage, &bed);
 
         let alone = bed.alone_ms(Pace::Here);
-        if !(stopped || signals::told()) {
+        if !(stopped || signals::stop_requested()) {
             let works = paper::SLABS.map(work);
             for workers in self.live.clone() {
                 self.progress.step(Step {
@@ -172,12 +172,12 @@ impl Bench<'_> {
                     study.runs.push(runs::measured(slabs, workers, alone, frames));
                 }
                 self.done += 2 * self.request.path.frames();
-                if signals::told() {
+                if signals::stop_requested() {
                     break;
                 }
             }
         }
-        if !(stopped || signals::told()) {
+        if !(stopped || signals::stop_requested()) {
             request.work = work(paper::SLABS[1]);
             let five = self.bed(&stage, &request, views, &[Schedule::Slab], self.repeats)?;
             if five.trace.frames.len() == views {
@@ -188,7 +188,7 @@ impl Bench<'_> {
         drop(stage);
         let stretch = bed.stretch(Pace::Paper);
         for (name, request) in settings {
-            if stopped || signals::told() {
+            if stopped || signals::stop_requested() {
                 break;
             }
             let stage = self.stage(&request)?;
@@ -202,7 +202,7 @@ impl Bench<'_> {
             }
         }
         self.progress.end();
-        if stopped || signals::told() {
+        if stopped || signals::stop_requested() {
             progress::note("stopped: what is finished is written down");
             study.left_out.push("Stopped before the end: later parts are missing.".into());
         } else {
@@ -241,7 +241,7 @@ impl Bench<'_> {
     }
 
     /// A study without figures.
-    fn empty(&self, stage: &Stage, bed: &Bed) -> Study {
+    fn empty(&self, stage: &PathScenes, bed: &Bed) -> Study {
         let mut left_out = vec![
             "Bricks of 4 and 16 voxels are counted, not drawn: slabcast's bricks are 8. The paper has \
              no numbers for them either."

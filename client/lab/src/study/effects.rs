@@ -17,7 +17,7 @@ use slabcast_common::view::{Projected, View};
 use slabcast_schedule::macrotile;
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::Fail;
-use slabcast_session::path_scenes::Stage;
+use slabcast_session::path_scenes::PathScenes;
 use slabcast_trace::FrameTrace;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -106,7 +106,7 @@ fn count(boxes: &[(TightBox, u64)], edge: u32, view: &View, frame: &FrameTrace) 
 }
 
 /// Bricks of 4, 8 and 16 in the middle view of a bed.
-pub(super) fn bricks(stage: &Stage, bed: &Bed) -> Vec<Bricks> {
+pub(super) fn bricks(stage: &PathScenes, bed: &Bed) -> Vec<Bricks> {
     let grid = BrickGrid::new(stage.spec(0).volume.lattice.dims);
     let i = bed.trace.frames.len() / 2;
     [4, 8, 16]
@@ -170,13 +170,13 @@ pub(super) struct Culling {
 }
 
 /// Draws the middle view of `frames` both ways in turn; the shorter of two times each.
-pub(super) fn culling(stage: &Stage, frames: usize) -> Result<Culling, Fail> {
+pub(super) fn culling(stage: &PathScenes, frames: usize) -> Result<Culling, Fail> {
     let mut best = [f64::INFINITY; 2];
     for _ in 0..2 {
         for (best, cull) in best.iter_mut().zip([true, false]) {
-            let frame = stage.other(frames / 2, |q| Quality { cull, ..q })?;
+            let frame = stage.frame_with(frames / 2, |q| Quality { cull, ..q })?;
             let began = cpu_ns();
-            direct::picture(&frame, &stage.bricks, Cut { tile: 64, ..Cut::on(1) });
+            direct::draw(&frame, &stage.bricks, Cut { tile: 64, ..Cut::on(1) });
             *best = best.min((cpu_ns() - began) as f64 / 1e6);
         }
     }

@@ -7,7 +7,7 @@ use crate::check::cluster::{embedded_frames, joined};
 use slabcast_common::image::PixelFormat;
 use slabcast_common::quality::Work;
 use slabcast_common::stats::FrameStats;
-use slabcast_session::embedded::{Cluster, Crew};
+use slabcast_session::embedded::{Cluster, WorkerGroup};
 use slabcast_session::fail::Fail;
 use slabcast_session::request::{OpenedVolume, RenderRequest};
 use slabcast_session::runtime;
@@ -22,7 +22,7 @@ pub(super) fn run(
     let runtime = runtime::start()?;
     let (volume, info) = (opened.volume.clone(), &opened.info);
     let all = runtime.block_on(async {
-        let crew = Crew::new(workers, Some(1))?;
+        let crew = WorkerGroup::new(workers, Some(1))?;
         let mut cluster = Cluster::start(volume, opened.orientation, crew, None)?;
         joined(&cluster.handle(), workers).await?;
         let mut all = Vec::new();

@@ -26,7 +26,7 @@ mod write;
 use runs::Run;
 use serde::Serialize;
 use slabcast_session::fail::{Fail, say};
-use slabcast_session::output::Made;
+use slabcast_session::output::OutputFolder;
 use slabcast_session::request::VolumeSceneArgs;
 use slabcast_session::{parse, signals};
 use std::path::PathBuf;
@@ -138,9 +138,9 @@ struct Study {
 /// Runs the command.
 pub fn run(args: &StudyArgs) -> Result<(), Fail> {
     write::check(args)?;
-    let made = Made::new(&args.out)?;
+    let made = OutputFolder::new(&args.out)?;
     let args = args.clone();
-    signals::to_its_end(move || {
+    signals::run_to_end(move || {
         // Held until the files are there.
         let _made = made;
         let study = bench::Bench::open(&args)?.study()?;

@@ -12,7 +12,7 @@ use serde::Serialize;
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{FrameJob, Span, Spans};
-use slabcast_session::direct::shared;
+use slabcast_session::direct::map_parallel;
 use slabcast_session::fail::Fail;
 use slabcast_sim::{Costs, Link, Nanos, Stopwatch, alone_ms};
 use slabcast_trace::Trace;
@@ -129,6 +129,6 @@ impl Bed {
 
     /// Several, on some threads of this machine.
     pub(super) fn run_all(&self, asks: &[Ask], threads: usize) -> Result<Vec<Vec<Told>>, Fail> {
-        shared(asks.len(), threads, |i, _: &mut ()| self.run(&asks[i])).into_iter().collect()
+        map_parallel(asks.len(), threads, |i, _: &mut ()| self.run(&asks[i])).into_iter().collect()
     }
 }

@@ -8,7 +8,7 @@ use super::tables::tables;
 use super::verdict::Holds;
 use super::{Study, StudyArgs, page};
 use crate::chart::{self, DARK, LIGHT};
-use slabcast_session::direct::shared;
+use slabcast_session::direct::map_parallel;
 use slabcast_session::fail::Fail;
 use slabcast_session::output::write_atomic;
 use std::fmt::Write as _;
@@ -66,7 +66,7 @@ pub(super) fn files(out: &Path, study: &Study) -> Result<(), Fail> {
     let both = |i: usize, _: &mut ()| {
         Ok::<_, Fail>([one(&charts[i], &LIGHT, "")?, one(&charts[i], &DARK, "-dark")?])
     };
-    let svgs = shared(charts.len(), study.machine.cores, both);
+    let svgs = map_parallel(charts.len(), study.machine.cores, both);
     let svgs = svgs.into_iter().collect::<Result<Vec<_>, Fail>>()?;
     let all: Vec<(Chart, [String; 2])> = charts.into_iter().zip(svgs).collect();
     text(PAGE, &page::page(study, &all))

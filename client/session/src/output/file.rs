@@ -2,7 +2,7 @@
 //!
 //! A file is filled under a hidden name in its folder, synced, and renamed; so its own name always
 //! holds all of it, whatever happens (full disk, Ctrl-C, power). A full disk is weather, not an
-//! end: hours of rendering wait at the master for somebody to make room ([`Patience`]).
+//! end: hours of rendering wait at the master for somebody to make room ([`DiskWait`]).
 
 use crate::fail::Fail;
 use crate::progress;
@@ -68,12 +68,12 @@ const TRY_AGAIN: Duration = Duration::from_secs(1);
 
 /// Waits for room on a full disk, says so once, and goes on.
 #[derive(Debug, Default)]
-pub struct Patience {
+pub struct DiskWait {
     given_up: AtomicBool,
     waiting: AtomicBool,
 }
 
-impl Patience {
+impl DiskWait {
     /// Nobody waits any more: what has no room fails.
     pub fn give_up(&self) {
         self.given_up.store(true, Ordering::SeqCst);
@@ -132,20 +132,20 @@ fn no_room(e: &Error) -> bool {
 /// A file that grows piece by piece and gets its name at the end. A piece is there as a whole or
 /// not at all.
 #[derive(Debug)]
-pub(crate) struct Growing {
+pub(crate) struct GrowingFile {
     path: PathBuf,
     file: NamedTempFile,
     long: u64,
 }
 
-impl Growing {
+impl GrowingFile {
     pub(crate) fn new(path: &Path) -> Result<Self> {
-        Ok(Growing { path: path.to_path_buf(), file: beside(path)?, long: 0 })
+        Ok(GrowingFile { path: path.to_path_buf(), file: beside(path)?, long: 0 })
     }
 
     /// Adds a piece; waits where there is no room for it.
-    pub(crate) fn add(&mut self, piece: &[u8], patience: &Patience) -> Result<()> {
-        let Growing { path, file, long } = self;
+    pub(crate) fn add(&mut self, piece: &[u8], patience: &DiskWait) -> Result<()> {
+        let GrowingFile { path, file, long } = self;
         patience.until_room(path, || {
             // What an attempt before left goes.
             file.as_file().set_len(*long)?;
@@ -201,9 +201,9 @@ mod tests {
             }
             out.write_all(b"whole")
         };
-        Patience::default().write_atomic(&path, full_twice).unwrap();
+        DiskWait::default().write_atomic(&path, full_twice).unwrap();
         assert_eq!((tries.get(), std::fs::read(&path).unwrap()), (3, b"whole".to_vec()));
-        let patience = Patience::default();
+        let patience = DiskWait::default();
         patience.give_up();
         let e = patience.write_atomic(&path, |_| Err(ErrorKind::StorageFull.into())).unwrap_err();
         assert!(e.line().unwrap().contains("make room"), "{e:?}");
@@ -213,9 +213,9 @@ mod tests {
     fn a_growing_file_has_its_name_at_the_end() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("g");
-        let mut g = Growing::new(&path).unwrap();
-        g.add(b"0123", &Patience::default()).unwrap();
-        g.add(b"45", &Patience::default()).unwrap();
+        let mut g = GrowingFile::new(&path).unwrap();
+        g.add(b"0123", &DiskWait::default()).unwrap();
+        g.add(b"45", &DiskWait::default()).unwrap();
         g.patch(1, b"ab").unwrap();
         assert!(!path.exists());
         g.settle().unwrap();

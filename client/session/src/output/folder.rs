@@ -1,6 +1,6 @@
 //! A folder of frames: what may be written there, and what the files are called.
 
-use super::made::Made;
+use super::made::OutputFolder;
 use crate::fail::Fail;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -15,7 +15,7 @@ pub(crate) struct Folder {
     /// Digits of a frame's number: at least four, so that names sort.
     digits: usize,
     /// Once it was made.
-    made: Option<Made>,
+    made: Option<OutputFolder>,
 }
 
 impl Folder {
@@ -73,7 +73,7 @@ impl Folder {
     /// Makes the folder if it is missing, and sees whether files can be made in it: better now
     /// than after the first frame.
     pub(crate) fn make(&mut self) -> Result<(), Fail> {
-        self.made = Some(Made::new(&self.path)?);
+        self.made = Some(OutputFolder::new(&self.path)?);
         Ok(())
     }
 

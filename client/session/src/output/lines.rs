@@ -1,6 +1,6 @@
 //! Text that grows line by line beside the frames: `--stats` and `--trace`.
 
-use super::file::{Growing, Patience, beside};
+use super::file::{DiskWait, GrowingFile, beside};
 use crate::fail::Fail;
 use std::fs::File;
 use std::io::Write;
@@ -13,9 +13,9 @@ const GATHER: usize = 1 << 20;
 /// A file of lines that gets its name at the end.
 pub struct Kept {
     path: PathBuf,
-    file: Option<Growing>,
+    file: Option<GrowingFile>,
     gathered: Vec<u8>,
-    patience: Arc<Patience>,
+    patience: Arc<DiskWait>,
 }
 
 impl Kept {
@@ -23,7 +23,7 @@ impl Kept {
         let mut add = || {
             let file = match &mut self.file {
                 Some(file) => file,
-                none => none.insert(Growing::new(&self.path)?),
+                none => none.insert(GrowingFile::new(&self.path)?),
             };
             file.add(&self.gathered, &self.patience)
         };
@@ -55,13 +55,13 @@ impl Lines {
         path: Option<&Path>,
         flag: &str,
         inputs: &[&Path],
-        patience: &Arc<Patience>,
+        patience: &Arc<DiskWait>,
     ) -> Result<Self, Fail> {
         let Some(path) = path else { return Ok(Lines::None) };
         if path == Path::new("-") {
             return Ok(Lines::Stdout { open: true });
         }
-        super::not_an_input(path, flag, inputs)?;
+        super::refuse_input(path, flag, inputs)?;
         match std::fs::metadata(path) {
             Ok(meta) if meta.is_dir() => {
                 Err(Fail::failed(format!("{}: is a folder; give a file", path.display())))

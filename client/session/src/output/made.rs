@@ -6,20 +6,20 @@ use std::path::{Path, PathBuf};
 
 /// A folder that files can be made in. Whoever writes there holds it until all is written.
 #[derive(Debug)]
-pub struct Made {
+pub struct OutputFolder {
     /// Folders that were missing, outermost first.
     made: Vec<PathBuf>,
 }
 
-impl Made {
+impl OutputFolder {
     /// Makes the folder and those it lies in, where they are missing, and sees whether files can be made
     /// in it: better now than after the work.
-    pub fn new(path: &Path) -> Result<Made, Fail> {
+    pub fn new(path: &Path) -> Result<OutputFolder, Fail> {
         let mut missing: Vec<&Path> =
             path.ancestors().take_while(|p| !p.as_os_str().is_empty() && !p.exists()).collect();
         missing.reverse();
         // What was made goes again if the rest fails.
-        let mut own = Made { made: Vec::new() };
+        let mut own = OutputFolder { made: Vec::new() };
         for dir in missing {
             match std::fs::create_dir(dir) {
                 Ok(()) => own.made.push(dir.to_path_buf()),
@@ -33,7 +33,7 @@ impl Made {
     }
 }
 
-impl Drop for Made {
+impl Drop for OutputFolder {
     /// Folders that were made and left empty go again.
     fn drop(&mut self) {
         for dir in self.made.iter().rev() {
@@ -52,17 +52,17 @@ mod tests {
     fn what_was_made_stays_if_a_file_came_and_goes_if_none_did() {
         let dir = tempfile::tempdir().unwrap();
         let (empty, full) = (dir.path().join("a/b"), dir.path().join("c/d"));
-        drop(Made::new(&empty).unwrap());
-        let made = Made::new(&full).unwrap();
+        drop(OutputFolder::new(&empty).unwrap());
+        let made = OutputFolder::new(&full).unwrap();
         std::fs::write(full.join("f"), "x").unwrap();
         drop(made);
         assert!(!dir.path().join("a").exists() && full.join("f").exists());
         // A folder that was there before is nobody's to take away.
         let own = dir.path().join("own");
         std::fs::create_dir(&own).unwrap();
-        drop(Made::new(&own).unwrap());
+        drop(OutputFolder::new(&own).unwrap());
         assert!(own.is_dir());
-        let e = Made::new(&full.join("f")).unwrap_err();
+        let e = OutputFolder::new(&full.join("f")).unwrap_err();
         assert!(e.line().unwrap().contains("making a file in it"), "{e:?}");
     }
 }

@@ -14,15 +14,15 @@ pub mod png;
 pub mod provenance;
 mod y4m;
 
-pub use file::{Patience, probe, write_atomic};
+pub use file::{DiskWait, probe, write_atomic};
 pub use lines::Lines;
-pub use made::Made;
+pub use made::OutputFolder;
 
 use crate::fail::Fail;
 use crate::magnify::magnified;
 use crate::parse;
 use contact::Contact;
-use file::Growing;
+use file::GrowingFile;
 use folder::Folder;
 use provenance::Provenance;
 use serde::{Deserialize, Serialize};
@@ -156,7 +156,7 @@ enum Target {
     /// A file each.
     Folder(Folder),
     /// One frame in one file.
-    Still(PathBuf),
+    SingleFrame(PathBuf),
     /// All frames in one file.
     Movie(PathBuf),
     /// All frames into a pipe; `None` is stdout.
@@ -183,7 +183,7 @@ struct Magnify {
 }
 
 /// Refuses a file to write that is one of those to read.
-pub fn not_an_input(path: &Path, flag: &str, inputs: &[&Path]) -> Result<(), Fail> {
+pub fn refuse_input(path: &Path, flag: &str, inputs: &[&Path]) -> Result<(), Fail> {
     let same = |input: &&Path| matches!((path.canonicalize(), input.canonicalize()), (Ok(a), Ok(b)) if a == b);
     if inputs.iter().any(same) {
         return Err(Fail::usage(format!(
@@ -196,7 +196,7 @@ pub fn not_an_input(path: &Path, flag: &str, inputs: &[&Path]) -> Result<(), Fai
 
 /// Refuses a file that is there, unless `force`, and places where none can be made.
 fn may_write(path: &Path, flag: &str, inputs: &[&Path], force: bool) -> Result<(), Fail> {
-    not_an_input(path, flag, inputs)?;
+    refuse_input(path, flag, inputs)?;
     match std::fs::metadata(path) {
         Ok(meta) if meta.is_dir() => {
             Err(Fail::failed(format!("{}: is a folder; give a file", path.display())))
@@ -323,7 +323,7 @@ impl Output {
                 )));
             }
             may_write(path, "output", inputs, args.force)?;
-            Target::Still(path.clone())
+            Target::SingleFrame(path.clone())
         } else {
             let names = (stem, format.extension());
             let (folder, beside) = Folder::look(path, names, frames, args.force)?;
@@ -372,7 +372,7 @@ impl Output {
     pub fn shown(&self, written: &[u64]) -> String {
         match &self.target {
             Target::Folder(folder) => format!("{} ({})", folder.shown(), folder.list(written)),
-            Target::Still(path) | Target::Movie(path) | Target::Pipe(Some(path)) => {
+            Target::SingleFrame(path) | Target::Movie(path) | Target::Pipe(Some(path)) => {
                 path.display().to_string()
             }
             Target::Pipe(None) => "stdout".into(),
@@ -396,12 +396,12 @@ enum Sink {
     /// Not begun: the file is made with the first frame, so that a run that fails before has
     /// nothing to clean up.
     New(PathBuf),
-    File(Growing),
+    File(GrowingFile),
     Pipe(Box<dyn Write + Send>, String),
 }
 
 impl Movie {
-    fn add(&mut self, frame: &Frame, provenance: &str, patience: &Patience) -> std::io::Result<()> {
+    fn add(&mut self, frame: &Frame, provenance: &str, patience: &DiskWait) -> std::io::Result<()> {
         let piece = match &mut self.coder {
             Coder::Apng(moving) => moving.frame(frame, provenance)?,
             Coder::Y4m { fps } => {
@@ -414,7 +414,7 @@ impl Movie {
             }
         };
         if let Sink::New(path) = &self.sink {
-            self.sink = Sink::File(Growing::new(path)?);
+            self.sink = Sink::File(GrowingFile::new(path)?);
         }
         match &mut self.sink {
             Sink::New(_) => unreachable!("begun above"),
@@ -429,7 +429,7 @@ impl Movie {
     }
 
     /// Ends it with as many frames as there are; none leave nothing.
-    fn end(self, patience: &Patience) -> std::io::Result<()> {
+    fn end(self, patience: &DiskWait) -> std::io::Result<()> {
         let Sink::File(mut file) = self.sink else { return Ok(()) };
         if let Coder::Apng(moving) = &self.coder {
             let (tail, (at, patch)) = moving.end();
@@ -460,7 +460,7 @@ pub struct Writer {
     output: Arc<Output>,
     movie: Option<Arc<Mutex<Movie>>>,
     contact: Option<Arc<Mutex<Contact>>>,
-    patience: Arc<Patience>,
+    patience: Arc<DiskWait>,
     busy: JoinSet<Result<u64, Fail>>,
     written: Vec<u64>,
 }
@@ -472,13 +472,13 @@ const AT_ONCE: usize = 2;
 
 impl Writer {
     /// For `frames` frames. Opens pipes.
-    pub fn new(output: Arc<Output>, frames: u64, patience: Arc<Patience>) -> Result<Self, Fail> {
+    pub fn new(output: Arc<Output>, frames: u64, patience: Arc<DiskWait>) -> Result<Self, Fail> {
         let coder = || match output.format {
             Format::Apng => Coder::Apng(png::Moving::new(output.fps)),
             _ => Coder::Y4m { fps: output.fps },
         };
         let sink = match &output.target {
-            Target::Folder(_) | Target::Still(_) => None,
+            Target::Folder(_) | Target::SingleFrame(_) => None,
             Target::Movie(path) => Some(Sink::New(path.clone())),
             Target::Pipe(None) => Some(Sink::Pipe(Box::new(std::io::stdout()), "stdout".into())),
             Target::Pipe(Some(path)) => {
@@ -522,7 +522,7 @@ impl Writer {
             };
             match (&output.target, movie) {
                 (Target::Folder(folder), _) => to(&folder.file(frame.number))?,
-                (Target::Still(path), _) => to(path)?,
+                (Target::SingleFrame(path), _) => to(path)?,
                 (_, Some(movie)) => {
                     let mut movie = movie.lock().expect("no thread panics with it");
                     let added = movie.add(&frame, &provenance, &patience);

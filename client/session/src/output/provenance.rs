@@ -86,7 +86,7 @@ impl Provenance {
     /// Returns the request that makes the picture again.
     pub fn request(&self) -> RenderRequest {
         let hash_inside = self.pixels_sha256.is_some();
-        let transfer = Transfer::again(&self.transfer, self.preset.clone());
+        let transfer = Transfer::from_function(&self.transfer, self.preset.clone());
         let mut request = RenderRequest::with_defaults(self.path.clone(), transfer);
         request.quality = self.quality;
         request.magnify = self.magnify;
@@ -186,20 +186,20 @@ pub fn read(path: &Path) -> Result<Vec<u8>, Fail> {
 }
 
 /// Says of each frame of a run what made it.
-pub struct Recipe {
+pub struct RunProvenance {
     base: Provenance,
     /// With the hash of the linear picture instead of the file's own.
     hash_inside: bool,
 }
 
-impl Recipe {
+impl RunProvenance {
     /// For a run on the volume that `info` describes.
     pub fn new(
         request: &RenderRequest,
         info: &VolumeInfo,
         orientation: Orientation,
         (format, fps): (Format, Option<u16>),
-    ) -> Result<Recipe, Fail> {
+    ) -> Result<RunProvenance, Fail> {
         // A field that is new must be thought about here: does it decide pixels?
         let PathRequest {
             client_key: _,
@@ -231,7 +231,7 @@ impl Recipe {
         if let Some(f) = &mut path.flythrough {
             f.up = f.up.or(Some(orientation.up.vector().to_array()));
         }
-        Ok(Recipe {
+        Ok(RunProvenance {
             base: Provenance {
                 version: 1,
                 slabcast: env!("CARGO_PKG_VERSION").into(),

@@ -58,8 +58,8 @@ impl RenderRequest {
     ///
     /// # Errors
     /// No preset or colour map has that name.
-    pub fn plain(path: ViewPath, tf: &str) -> Result<Self, Fail> {
-        Ok(RenderRequest::with_defaults(path, Transfer::plain(tf)?))
+    pub fn for_preset(path: ViewPath, tf: &str) -> Result<Self, Fail> {
+        Ok(RenderRequest::with_defaults(path, Transfer::from_name(tf)?))
     }
 
     /// Returns the size of the pictures in pixels, magnified.

@@ -22,7 +22,7 @@ use slabcast_session::volume;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
-use sweep::{Off, Subject, Sweep};
+use sweep::{Deviation, Subject, Sweep};
 
 /// Says how fast pictures come to the limit as sheets become thinner, and what stops them.
 ///
@@ -85,7 +85,7 @@ pub(crate) fn run(args: &ConvergenceArgs) -> Result<(), Fail> {
         std::fs::create_dir_all(folder).map_err(|e| Fail::io(folder, "creating", &e))?;
     }
     let began = Instant::now();
-    let mut progress = Progress::new(args.json).of("sweep");
+    let mut progress = Progress::new(args.json).counting("sweep");
     let scenes = subjects(args, &request, orientation)?;
     progress.frames(scenes.iter().map(|s| s.1.len() as u64).sum(), "sweeps");
     let mut done = 0;
@@ -106,7 +106,7 @@ pub(crate) fn run(args: &ConvergenceArgs) -> Result<(), Fail> {
                 &mut progress,
             )?;
             let shown = if args.json { json(&swept) } else { text(&swept) };
-            progress.aside(|| say(&shown))?;
+            progress.suspend(|| say(&shown))?;
             sweeps.push(swept);
             done += 1;
             progress.step(progress::Step { frames: done, ..Default::default() });
@@ -124,14 +124,14 @@ pub(crate) fn run(args: &ConvergenceArgs) -> Result<(), Fail> {
 }
 
 type Views = Vec<(&'static str, ViewPath)>;
-type Made<'a> = Box<dyn Fn() -> Result<Subject, Fail> + 'a>;
+type OutputFolder<'a> = Box<dyn Fn() -> Result<Subject, Fail> + 'a>;
 
 /// What is swept, each made when its turn comes, with the views of it.
 fn subjects<'a>(
     args: &'a ConvergenceArgs,
     request: &'a RenderRequest,
     orientation: Orientation,
-) -> Result<Vec<(Made<'a>, Views)>, Fail> {
+) -> Result<Vec<(OutputFolder<'a>, Views)>, Fail> {
     let both = |path: &ViewPath| -> Views {
         let turned = |projection| {
             let turntable = path.turntable.map(|t| Turntable { projection, ..t });
@@ -168,7 +168,7 @@ fn subjects<'a>(
                     let (name, tf) = (scene.name.to_string(), Some(scene.transfer));
                     subject(name, file, tf, FORMULA_SIZE, Quality::default())
                 };
-                (Box::new(make) as Made, views.clone())
+                (Box::new(make) as OutputFolder, views.clone())
             })
             .collect());
     }
@@ -178,7 +178,7 @@ fn subjects<'a>(
         .map(|file| {
             let make =
                 move || subject(name_of(file), file, None, request.path.size, request.quality);
-            (Box::new(make) as Made, both(&request.path))
+            (Box::new(make) as OutputFolder, both(&request.path))
         })
         .collect())
 }
@@ -218,7 +218,8 @@ fn text(s: &Sweep) -> String {
     );
     let mut before: Option<&sweep::Rung> = None;
     for r in &s.rungs {
-        let fell = |of: fn(&sweep::Rung) -> Off| order(before.map(|b| of(b).rmse), of(r).rmse);
+        let fell =
+            |of: fn(&sweep::Rung) -> Deviation| order(before.map(|b| of(b).rmse), of(r).rmse);
         let _ = writeln!(
             out,
             "{:>5} | {:>7} {:>5} {:>7} | {:>7} {:>5} | {:>9} {:>7} {:>8} | {:>8} {:>6} | {:>7} \
@@ -290,7 +291,7 @@ fn text(s: &Sweep) -> String {
 }
 
 fn json(s: &Sweep) -> String {
-    let off = |o: Off| serde_json::json!({"rmse": o.rmse, "max": o.max});
+    let off = |o: Deviation| serde_json::json!({"rmse": o.rmse, "max": o.max});
     let rungs: Vec<_> = s
         .rungs
         .iter()
@@ -325,7 +326,7 @@ fn draw(sweeps: &[Sweep], file: &Path) -> Result<(), Fail> {
     let panels = sweeps
         .iter()
         .map(|s| {
-            let line = |of: fn(&sweep::Rung) -> Off| {
+            let line = |of: fn(&sweep::Rung) -> Deviation| {
                 s.rungs.iter().map(|r| (r.thickness, of(r).rmse)).collect::<Vec<_>>()
             };
             plot::Panel {

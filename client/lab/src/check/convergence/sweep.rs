@@ -9,7 +9,7 @@ use slabcast_render::judge::reference::{Reference, SectionPlacement, SheetOption
 use slabcast_render::{Frame, Scene};
 use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::Fail;
-use slabcast_session::path_scenes::Drawn;
+use slabcast_session::path_scenes::SceneBricks;
 use slabcast_session::progress::Progress;
 use std::sync::Arc;
 
@@ -30,13 +30,13 @@ pub(super) struct Subject {
 
 /// RMSE and maximum over all channels of the pixels where either is not blank, in 1/255.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Off {
+pub(super) struct Deviation {
     pub(super) rmse: f64,
     pub(super) max: f64,
 }
 
-impl Off {
-    fn between(got: &[[f64; 4]], want: &[[f64; 4]]) -> Off {
+impl Deviation {
+    fn between(got: &[[f64; 4]], want: &[[f64; 4]]) -> Deviation {
         let (mut squares, mut max, mut n) = (0.0, 0.0f64, 0usize);
         for (got, want) in got.iter().zip(want) {
             if got[3] <= 0.0 && want[3] <= 0.0 {
@@ -49,7 +49,7 @@ impl Off {
                 max = if off <= max { max } else { off };
             }
         }
-        Off { rmse: (squares / (4.0 * n.max(1) as f64)).sqrt(), max }
+        Deviation { rmse: (squares / (4.0 * n.max(1) as f64)).sqrt(), max }
     }
 }
 
@@ -59,23 +59,23 @@ pub(super) struct Rung {
     /// Of a sheet, in vox.
     pub(super) thickness: f64,
     /// Rendered pictures against the limit.
-    pub(super) linear: Off,
-    pub(super) constant: Off,
+    pub(super) linear: Deviation,
+    pub(super) constant: Deviation,
     /// The paper's form against the limit of its own, and against the limit.
-    pub(super) paper: Off,
-    pub(super) paper_limit: Off,
+    pub(super) paper: Deviation,
+    pub(super) paper_limit: Deviation,
     /// The same sheets in f64 against the limit: what thickness alone does.
-    pub(super) linear_f64: Off,
-    pub(super) constant_f64: Off,
-    pub(super) paper_f64: Off,
+    pub(super) linear_f64: Deviation,
+    pub(super) constant_f64: Deviation,
+    pub(super) paper_f64: Deviation,
     /// What makes linear's rest, each against what is without it: rounded positions in f64, f32
     /// arithmetic on these, integers for floats.
-    pub(super) positions: Off,
-    pub(super) floats: Off,
-    pub(super) integers: Off,
+    pub(super) positions: Deviation,
+    pub(super) floats: Deviation,
+    pub(super) integers: Deviation,
     /// Linear in f64 with sections placed otherwise, in perspective views and where asked for:
     /// centroid, half-way, along the ray.
-    pub(super) placed: Option<[Off; 3]>,
+    pub(super) placed: Option<[Deviation; 3]>,
 }
 
 /// What one sweep found.
@@ -87,7 +87,7 @@ pub(super) struct Sweep {
     /// Whether sheets added integers.
     pub(super) integers: bool,
     /// From the limit to that of the paper's form.
-    pub(super) elsewhere: Off,
+    pub(super) elsewhere: Deviation,
     pub(super) rungs: Vec<Rung>,
 }
 
@@ -137,25 +137,27 @@ pub(super) fn sweep(
         |compositing, thickness| Quality { compositing, thickness, eps: 0.0, ..subject.quality };
     let drawn = |compositing| {
         let q = quality(compositing, 1.0);
-        Drawn::new(&subject.volume, &subject.info, &subject.transfer, q)
+        SceneBricks::new(&subject.volume, &subject.info, &subject.transfer, q)
     };
     let (ours, papers) = (drawn(Compositing::Linear)?, drawn(Compositing::Paper)?);
     let sample = stratified(subject.size, subject.pixels, subject.seed);
-    let reference = |drawn: &Drawn, quality: &Quality| {
+    let reference = |drawn: &SceneBricks, quality: &Quality| {
         Ok::<_, Fail>(Reference::new(&drawn.spec, view(quality)?, &drawn.bricks))
     };
     let each = |pixel: &(dyn Fn(u32, u32) -> [f64; 4] + Sync)| {
-        direct::shared(sample.len(), threads, |i, _: &mut ()| pixel(sample[i][0], sample[i][1]))
+        direct::map_parallel(sample.len(), threads, |i, _: &mut ()| {
+            pixel(sample[i][0], sample[i][1])
+        })
     };
-    let picture = |drawn: &Drawn, quality: Quality| {
+    let picture = |drawn: &SceneBricks, quality: Quality| {
         let view = view(&quality)?;
         let spec = slabcast_common::message::SceneSpec { quality, ..drawn.spec.clone() };
         let frame = Frame::new(Arc::new(Scene::new(&spec)), view);
-        let picture: Picture = direct::picture(&frame, &drawn.bricks, Cut::on(threads));
+        let picture: Picture = direct::draw(&frame, &drawn.bricks, Cut::on(threads));
         let at = |p: &[u32; 2]| picture.pixels[(p[1] * subject.size[0] + p[0]) as usize];
         Ok::<_, Fail>(sample.iter().map(|p| at(p).map(f64::from)).collect::<Vec<_>>())
     };
-    progress.stage(&format!("{}, {projection}: the limit", subject.name));
+    progress.phase(&format!("{}, {projection}: the limit", subject.name));
     let q = quality(Compositing::Linear, 1.0);
     let limit = {
         let r = reference(&ours, &q)?;
@@ -167,7 +169,7 @@ pub(super) fn sweep(
     };
     let mut rungs = Vec::new();
     for &thickness in thicknesses {
-        progress.stage(&format!("{}, {projection}: {thickness} vox", subject.name));
+        progress.phase(&format!("{}, {projection}: {thickness} vox", subject.name));
         let of = |compositing, sums| Quality { sums, ..quality(compositing, thickness) };
         let (linear, paper) = (Compositing::Linear, Compositing::Paper);
         let decided = ours.spec.quality.sums;
@@ -181,7 +183,7 @@ pub(super) fn sweep(
 
         let ours_in_f64 = reference(&ours, &of(linear, decided))?;
         let both = |how: SheetOptions| {
-            let pixels = direct::shared(sample.len(), threads, |i, _: &mut ()| {
+            let pixels = direct::map_parallel(sample.len(), threads, |i, _: &mut ()| {
                 ours_in_f64.by_sheets_linear_and_constant(sample[i][0], sample[i][1], how)
             });
             pixels.into_iter().map(|[l, c]| (l, c)).unzip::<_, _, Vec<_>, Vec<_>>()
@@ -196,22 +198,22 @@ pub(super) fn sweep(
             [SectionPlacement::Centroid, SectionPlacement::Between, SectionPlacement::Exact].map(
                 |section| {
                     let (linear, _) = both(SheetOptions { section, rounded: false });
-                    Off::between(&linear, &limit)
+                    Deviation::between(&linear, &limit)
                 },
             )
         });
         rungs.push(Rung {
             thickness,
-            linear: Off::between(&drawn, &limit),
-            constant: Off::between(&constant, &limit),
-            paper: Off::between(&additive, &papers_limit),
-            paper_limit: Off::between(&additive, &limit),
-            linear_f64: Off::between(&linear_f64, &limit),
-            constant_f64: Off::between(&constant_f64, &limit),
-            paper_f64: Off::between(&paper_f64, &papers_limit),
-            positions: Off::between(&rounded, &linear_f64),
-            floats: Off::between(&floats, &rounded),
-            integers: Off::between(&drawn, &floats),
+            linear: Deviation::between(&drawn, &limit),
+            constant: Deviation::between(&constant, &limit),
+            paper: Deviation::between(&additive, &papers_limit),
+            paper_limit: Deviation::between(&additive, &limit),
+            linear_f64: Deviation::between(&linear_f64, &limit),
+            constant_f64: Deviation::between(&constant_f64, &limit),
+            paper_f64: Deviation::between(&paper_f64, &papers_limit),
+            positions: Deviation::between(&rounded, &linear_f64),
+            floats: Deviation::between(&floats, &rounded),
+            integers: Deviation::between(&drawn, &floats),
             placed,
         });
     }
@@ -220,7 +222,7 @@ pub(super) fn sweep(
         projection,
         pixels: limit.iter().filter(|p| p[3] > 0.0).count(),
         integers: ours.spec.quality.sums != Sums::F32,
-        elsewhere: Off::between(&papers_limit, &limit),
+        elsewhere: Deviation::between(&papers_limit, &limit),
         rungs,
     })
 }

@@ -8,7 +8,7 @@ use crate::check::shot::Shot;
 use slabcast_common::quality::{Quality, Work};
 use slabcast_scene::path::PathView;
 use slabcast_session::direct::Cut;
-use slabcast_session::embedded::Crew;
+use slabcast_session::embedded::WorkerGroup;
 
 pub(super) fn cases() -> Vec<Case> {
     // The volume covers a tenth of the height, so that a voxel is 64 pixels wide: a magnified
@@ -27,7 +27,7 @@ pub(super) fn cases() -> Vec<Case> {
         let mut rows = against_truth(&ready, &got, &sample, tools);
         let work = Work { tile: Some(256), ..Work::default() };
         for (name, tcp) in [("embedded cluster", false), ("TCP cluster", true)] {
-            let crew = Crew { workers: 2, threads: 1 };
+            let crew = WorkerGroup { workers: 2, threads: 1 };
             let hash = tools.runtime.block_on(s.hash(tcp, crew, true, work))?;
             let trouble = (hash != want).then(|| format!("differs: {name}"));
             rows[0] = rows[0].clone().with(trouble);

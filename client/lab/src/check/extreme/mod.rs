@@ -22,7 +22,7 @@ use slabcast_common::transfer::TransferFunction;
 use slabcast_common::volume::Volume;
 use slabcast_scene::path::PathView;
 use slabcast_session::direct::{self, Cut};
-use slabcast_session::embedded::Crew;
+use slabcast_session::embedded::WorkerGroup;
 
 /// Pixels of a case that are judged: one cell in eleven of a picture of 61x47.
 const PIXELS: usize = 256;
@@ -228,7 +228,7 @@ fn settings() -> Vec<Case> {
         all.push(Case::new(format!("eps {name} against eps 0"), move |tools| {
             let shut = scene(eps, Sums::Auto).ready()?;
             let frame = shut.frame().never_shut();
-            let open = direct::picture(&frame, &shut.bricks, Cut::on(tools.threads));
+            let open = direct::draw(&frame, &shut.bricks, Cut::on(tools.threads));
             let left_out = apart(&shut.serial(), &open);
             Ok(vec![Row::new("max that the cut-off leaves out", left_out, cutoff(&shut))])
         }));
@@ -249,7 +249,7 @@ fn settings() -> Vec<Case> {
         let s = Shot { quality: Quality { thickness: 1.0 / 64.0, ..s.quality }, ..s };
         let want = s.ready()?.serial().sha256().to_string();
         let work = Work { slabs: 1000, tile: Some(64), ..Work::default() };
-        let crew = Crew { workers: 2, threads: 1 };
+        let crew = WorkerGroup { workers: 2, threads: 1 };
         let got = tools.runtime.block_on(s.hash(false, crew, true, work))?;
         let differs = if got == want { 0.0 } else { 1.0 };
         Ok(vec![Row::new("hashes that differ", differs, 0.0)])

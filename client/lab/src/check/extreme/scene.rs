@@ -159,7 +159,7 @@ pub(super) fn against_truth(
     tools: &Tools,
 ) -> Vec<Row> {
     let enclosure = Enclosure::new(ready);
-    let spans = direct::shared(sample.len(), tools.threads, |i, _: &mut ()| {
+    let spans = direct::map_parallel(sample.len(), tools.threads, |i, _: &mut ()| {
         enclosure.pixel(sample[i][0], sample[i][1])
     });
     let parallel = matches!(ready.view.projection, Projection::Ortho { .. });

@@ -4,9 +4,9 @@
 //! What is timed is what a person waits for: frames of the path, one after the other, magnified and made
 //! PNGs as they arrive, which takes the same cores where the cluster is in this process.
 
-use super::place::{Place, VIEWS};
 use super::setting::Setting;
-use super::trial::Off;
+use super::test_bed::{TestBed, VIEWS};
+use super::trial::Deviation;
 use slabcast_client::Client;
 use slabcast_common::image::{Background, Picture, PixelFormat};
 use slabcast_common::quality::{Quality, Sums};
@@ -44,7 +44,7 @@ struct Finest {
 }
 
 /// Whom frames are asked of.
-pub enum Wire<'a> {
+pub enum Connection<'a> {
     /// A master of this process.
     Embedded(&'a Handle),
     /// One behind a network.
@@ -52,11 +52,11 @@ pub enum Wire<'a> {
 }
 
 /// A cluster, and the job that it is to be tried with.
-pub struct Through<'a> {
+pub struct ClusterRun<'a> {
     /// Runs the connection.
     pub runtime: &'a Runtime,
     /// The master that renders.
-    pub wire: Wire<'a>,
+    pub wire: Connection<'a>,
     /// The volume, with its digest.
     pub info: VolumeInfo,
     /// What was asked for; it fits the volume.
@@ -65,7 +65,7 @@ pub struct Through<'a> {
     pub crew: String,
 }
 
-impl Through<'_> {
+impl ClusterRun<'_> {
     /// Returns a description of the cluster for messages.
     pub fn crew(&self) -> &str {
         &self.crew
@@ -108,8 +108,8 @@ impl Through<'_> {
         let message = request.to_message(&self.info, format, false);
         self.runtime.block_on(async {
             let mut source = match &self.wire {
-                Wire::Embedded(handle) => embedded::submit(handle, &request, message).await?,
-                Wire::Remote(client) => {
+                Connection::Embedded(handle) => embedded::submit(handle, &request, message).await?,
+                Connection::Remote(client) => {
                     remote::submit((*client).clone(), &request, message).await?
                 }
             };
@@ -194,18 +194,18 @@ fn spread(path: &ViewPath, views: u32) -> ViewPath {
 }
 
 /// A cluster whose volume is not here.
-pub struct There<'a> {
-    through: Through<'a>,
+pub struct ClusterBed<'a> {
+    through: ClusterRun<'a>,
     base: Setting,
     /// Pictures of the finest setting.
     truths: Vec<(ViewPath, Vec<[f64; 4]>)>,
 }
 
-impl<'a> There<'a> {
+impl<'a> ClusterBed<'a> {
     /// Returns a test bed on a cluster that alone has the volume.
-    pub fn new(through: Through<'a>) -> There<'a> {
+    pub fn new(through: ClusterRun<'a>) -> ClusterBed<'a> {
         let base = Setting::asked(through.request.quality);
-        There { through, base, truths: Vec::new() }
+        ClusterBed { through, base, truths: Vec::new() }
     }
 
     fn picture(&self, setting: &Setting, path: &ViewPath) -> Result<Picture, Fail> {
@@ -230,7 +230,7 @@ impl<'a> There<'a> {
     }
 }
 
-impl Place for There<'_> {
+impl TestBed for ClusterBed<'_> {
     fn base(&self) -> Setting {
         self.base
     }
@@ -244,7 +244,7 @@ impl Place for There<'_> {
     }
 
     fn identity(&self) -> String {
-        let Through { request, info, .. } = &self.through;
+        let ClusterRun { request, info, .. } = &self.through;
         let around = all_around(&request.path);
         format!(
             "judged by its finest pictures: volume {} transfer {:?} path {} quality {:?} background \
@@ -264,21 +264,21 @@ impl Place for There<'_> {
         false
     }
 
-    fn off(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Off, Fail> {
+    fn off(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Deviation, Fail> {
         if self.truths.is_empty() {
             let path = all_around(&self.through.request.path);
             let (views, finest) = (path.frames(), self.finest());
             let n = VIEWS.min(views);
             for i in 0..n {
-                progress.stage(&format!("drawing what it should be, view {} of {n}", i + 1));
+                progress.phase(&format!("drawing what it should be, view {} of {n}", i + 1));
                 let view = path.single_frame(path.first_frame() + (2 * i + 1) * views / (2 * n));
                 let picture = self.picture(&finest, &view)?;
                 let truth = picture.pixels.iter().map(|p| p.map(f64::from)).collect();
                 self.truths.push((view, truth));
             }
-            progress.stage("trying settings");
+            progress.phase("trying settings");
         }
-        let mut off = Off::default();
+        let mut off = Deviation::default();
         for (view, truth) in &self.truths {
             let picture = self.picture(setting, view)?;
             let figures =
@@ -286,7 +286,7 @@ impl Place for There<'_> {
             off = off.with(&figures);
         }
         off.rmse = libm::hypot(off.rmse, FINEST.off);
-        Ok(Off {
+        Ok(Deviation {
             most_999: off.most_999 + 2.0 * FINEST.off,
             max: off.max + 2.0 * FINEST.off,
             ..off

@@ -1,9 +1,9 @@
 //! Tries settings in this process, which has the volume and the reference.
 
-use super::cluster::Through;
-use super::place::{Place, VIEWS, stopped};
+use super::cluster_bed::ClusterRun;
 use super::setting::Setting;
-use super::trial::{Effort, Lab, Off, Truth};
+use super::test_bed::{TestBed, VIEWS, stopped};
+use super::trial::{Deviation, Effort, Trial, Truth};
 use slabcast_session::direct::Cut;
 use slabcast_session::fail::Fail;
 use slabcast_session::machine;
@@ -19,30 +19,30 @@ pub enum Clock<'a> {
     /// Plain drawing, as `slabcast lab bench` does.
     Plain(Cut),
     /// A cluster of this process, as `slabcast render` has.
-    Cluster(Box<Through<'a>>),
+    Cluster(Box<ClusterRun<'a>>),
 }
 
 /// This process.
-pub struct Here<'a> {
-    lab: Lab,
+pub struct LocalBed<'a> {
+    trial: Trial,
     clock: Clock<'a>,
     truths: Vec<Truth>,
 }
 
-impl<'a> Here<'a> {
+impl<'a> LocalBed<'a> {
     /// Returns a test bed in this process; `clock` times its frames.
-    pub fn new(lab: Lab, clock: Clock<'a>) -> Here<'a> {
-        Here { lab, clock, truths: Vec::new() }
+    pub fn new(trial: Trial, clock: Clock<'a>) -> LocalBed<'a> {
+        LocalBed { trial, clock, truths: Vec::new() }
     }
 }
 
-impl Place for Here<'_> {
+impl TestBed for LocalBed<'_> {
     fn base(&self) -> Setting {
-        self.lab.base
+        self.trial.base
     }
 
     fn size(&self) -> [u32; 2] {
-        self.lab.size()
+        self.trial.size()
     }
 
     fn crew(&self) -> String {
@@ -57,34 +57,34 @@ impl Place for Here<'_> {
             Clock::Plain(cut) => format!("{cut:?}"),
             Clock::Cluster(through) => through.crew().into(),
         };
-        format!("{} {} {clock}", self.lab.identity(), machine::cpu())
+        format!("{} {} {clock}", self.trial.identity(), machine::cpu())
     }
 
     fn keeps_times(&self) -> bool {
         true
     }
 
-    fn off(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Off, Fail> {
+    fn off(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Deviation, Fail> {
         if self.truths.is_empty() {
-            let views = self.lab.views();
+            let views = self.trial.views();
             let n = VIEWS.min(views);
             progress.frames((n * PIXELS) as u64, "");
             for i in 0..n {
                 let view = (2 * i + 1) * views / (2 * n);
                 let told = (&mut *progress, i * PIXELS);
-                self.truths.push(self.lab.truth(view, PIXELS, 1, told)?);
+                self.truths.push(self.trial.truth(view, PIXELS, 1, told)?);
                 stopped()?;
             }
-            progress.stage("trying settings");
+            progress.phase("trying settings");
         }
-        Ok(self.lab.judge(setting, &self.truths, None)?.off)
+        Ok(self.trial.judge(setting, &self.truths, None)?.off)
     }
 
     fn ms(&mut self, setting: &Setting) -> Result<f64, Fail> {
         match &self.clock {
             Clock::Plain(cut) => {
                 let effort = Effort { cut: *cut, seconds: SECONDS };
-                Ok(self.lab.time(setting, effort)?.median)
+                Ok(self.trial.time(setting, effort)?.median)
             }
             Clock::Cluster(through) => through.ms(setting),
         }

@@ -1,7 +1,7 @@
 //! Where settings are tried: this process, which has the volume and the reference, or a cluster.
 
 use super::setting::Setting;
-use super::trial::Off;
+use super::trial::Deviation;
 use slabcast_session::fail::Fail;
 use slabcast_session::progress::Progress;
 use slabcast_session::signals;
@@ -10,7 +10,7 @@ use slabcast_session::signals;
 /// is twice as large from other sides.
 pub const VIEWS: usize = 5;
 /// Draws a scene in one setting after another and says what comes of it.
-pub trait Place {
+pub trait TestBed {
     /// What was asked for.
     fn base(&self) -> Setting;
     /// Size of the pictures.
@@ -22,12 +22,12 @@ pub trait Place {
     /// Whether times have that identity, too.
     fn keeps_times(&self) -> bool;
     /// How far its pictures are from the truth.
-    fn off(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Off, Fail>;
+    fn off(&mut self, setting: &Setting, progress: &mut Progress) -> Result<Deviation, Fail>;
     /// Milliseconds of a frame.
     fn ms(&mut self, setting: &Setting) -> Result<f64, Fail>;
 }
 
 /// Refuses to go on when somebody pressed Ctrl-C.
 pub(super) fn stopped() -> Result<(), Fail> {
-    if signals::told() { Err(Fail::failed("stopped while choosing")) } else { Ok(()) }
+    if signals::stop_requested() { Err(Fail::failed("stopped while choosing")) } else { Ok(()) }
 }

@@ -49,7 +49,7 @@ pub(crate) enum Commands {
     Status(status::StatusArgs),
     Jobs(jobs::JobsArgs),
     Cancel(cancel::CancelArgs),
-    Trial(LabArgs),
+    Lab(LabArgs),
     Config(config::ConfigArgs),
     Doctor(doctor::DoctorArgs),
     Completions(completions::CompletionsArgs),
@@ -99,7 +99,9 @@ fn about(command: &Command) -> String {
 }
 
 fn find<'a>(command: &'a Command, name: &str) -> &'a Command {
-    command.find_subcommand(name).expect("the groups list commands that exist")
+    command
+        .find_subcommand(name)
+        .unwrap_or_else(|| panic!("`{name}` of the groups is no command: {command:?}"))
 }
 
 /// Groups and commands in as many lines as commands: at most 24 lines of 80 columns with all else.
@@ -109,7 +111,7 @@ fn short_help(command: &Command) -> String {
         for (n, name) in names.iter().enumerate() {
             let group = if n == 0 { group } else { "" };
             // Writing to a string does not fail.
-            let _ = writeln!(text, "{group:<11} {name:<11} {}", about(find(command, name)));
+            let _ = writeln!(text, "{group:<11} {name:<12} {}", about(find(command, name)));
         }
     }
     text + "\nOptions: --config FILE, --log text|json, --log-level LEVEL, --version, --help\n\
@@ -150,5 +152,9 @@ fn long_help(command: &Command) -> String {
 
 /// A flag with its value, and what it does.
 fn option(arg: &Arg) -> (String, String) {
-    (arg.to_string(), arg.get_help().map(ToString::to_string).unwrap_or_default())
+    // `Arg::to_string` needs a command that is built.
+    let values = arg.get_value_names().unwrap_or_default();
+    let value = values.first().map(|v| format!(" <{v}>")).unwrap_or_default();
+    let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
+    (format!("--{}{value}", arg.get_long().unwrap_or_default()), help)
 }

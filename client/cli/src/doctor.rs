@@ -23,7 +23,9 @@ const ENOUGH_DISK: u64 = 200 << 20;
 /// set by NTP differ by some hundredths.
 const SKEW: Duration = Duration::from_secs(2);
 
-/// Checks machine, disk, port and master, and names remedies.
+/// Checks machine, disk, port and master.
+///
+/// And names the remedy for what is amiss.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:

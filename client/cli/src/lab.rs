@@ -7,12 +7,13 @@ use slabcast_lab::{bench, check, error, explain, plan, replay, report, study};
 use slabcast_session::fail::Fail;
 use slabcast_session::progress;
 
-/// The laboratory: error report study check bench explain plan replay.
+/// Experiments: error report study check bench explain plan replay.
 ///
 /// error and explain look at one picture, bench and report at quality against time, plan and study
 /// at clusters; check compares pictures with the oracle, replay a recorded run with itself.
 #[derive(clap::Args, Clone, Debug)]
 #[command(
+    about = "error report study check bench explain plan replay",
     disable_help_subcommand = true,
     subcommand_value_name = "COMMAND",
     after_help = "\

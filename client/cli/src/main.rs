@@ -71,7 +71,7 @@ fn run(cli: &Cli) -> Result<(), Fail> {
         Commands::Status(args) => status::run(args),
         Commands::Jobs(args) => jobs::run(args),
         Commands::Cancel(args) => cancel::run(args),
-        Commands::Trial(args) => lab::run(args),
+        Commands::Lab(args) => lab::run(args),
         Commands::Config(args) => config::run(args, config, &command(), usage::understood),
         Commands::Doctor(args) => doctor::run(args, config::path(config, command())),
         Commands::Completions(args) => completions::run(args, command()),

@@ -11,6 +11,7 @@ use super::cache::MeasurementCache;
 use super::cluster_bed::all_around;
 use super::local_bed::{Clock, LocalBed};
 use super::setting::{Setting, fraction};
+use super::test_bed::{TestBed, stopped};
 use super::trial::{Deviation, Trial};
 use slabcast_common::quality::{Quality, Sums};
 use slabcast_common::volume::{Volume, VolumeInfo};

@@ -388,7 +388,7 @@ mod tests {
         let mut trial = trial("skin");
         let mut progress = Progress::new(true);
         let truth = [trial.truth(0, 256, 1, (&mut progress, 0)).unwrap()];
-        let setting = Setting { shaded: false, ..lab.base };
+        let setting = Setting { shaded: false, ..trial.base };
         assert!(!setting.same_model(&trial.base) && trial.is_shaded());
         let own = [trial.own_truth(&setting, &truth[0]).unwrap()];
         let judged = trial.judge(&setting, &truth, Some(&own)).unwrap();

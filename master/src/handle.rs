@@ -249,6 +249,11 @@ impl Handle {
         answer.await.map_err(|_| AttachError::ShuttingDown)?
     }
 
+    /// The hooks of this crate's tests.
+    pub(crate) fn hooks(&self) -> &Hooks {
+        &self.hooks
+    }
+
     /// Passes a worker's message to the driver. Returns false when the master is gone.
     pub async fn worker_said(&self, worker: WorkerId, message: ToMaster) -> bool {
         self.inbox.send(Event::Said { worker, message }).await.is_ok()

@@ -7,6 +7,8 @@ pub(crate) enum Stage {
     Plan,
     /// Cutting the volume into bricks.
     CutBricks,
+    /// Sending bricks over an embedded link.
+    SendBricks,
     /// Composing finished tiles into the picture of a frame that is still being drawn.
     Compose,
     /// Encoding and hashing a frame.

@@ -4,6 +4,7 @@
 //! lies behind it. The embedded link passes the same messages over channels, and bricks as shared
 //! pointers; the TCP link ([`crate::serve`]) encodes both.
 
+use crate::hooks::Stage;
 use slabcast_common::brick::BrickSetKey;
 use slabcast_common::ids::BrickId;
 use slabcast_common::link::BRICK_BATCHES_IN_FLIGHT;
@@ -91,8 +92,10 @@ pub fn embedded(handle: crate::Handle) -> EmbeddedEnd {
     let (reply_tx, mut reply_rx) = mpsc::channel::<ToMaster>(64);
     let (order_tx, mut order_rx) = mpsc::unbounded_channel::<BrickOrder>();
     let (batch_tx, batch_rx) = mpsc::channel(BRICK_BATCHES_IN_FLIGHT);
-    tokio::spawn(async move {
+    let hooks = handle.hooks().clone();
+    let sending = tokio::spawn(async move {
         while let Some(order) = order_rx.recv().await {
+            hooks.reach(Stage::SendBricks);
             match order {
                 BrickOrder::Drop { set, bricks } => {
                     let message = ToWorker::DropBricks { set, bricks };
@@ -117,7 +120,14 @@ pub fn embedded(handle: crate::Handle) -> EmbeddedEnd {
         let Some(ToMaster::Hello(hello)) = reply_rx.recv().await else { return };
         let link = WorkerLink { control: control_tx, bricks: order_tx };
         let caller = Caller { address: String::new(), is_local: true };
-        serve_link(handle, hello, caller, link, &mut reply_rx).await;
+        let broken = async {
+            match sending.await {
+                Err(e) if e.is_panic() => "sending bricks to it panicked".to_string(),
+                // The driver dropped the link, or the worker has gone: the replies tell.
+                _ => std::future::pending().await,
+            }
+        };
+        serve_until(handle, hello, caller, link, &mut reply_rx, broken).await;
     });
     EmbeddedEnd { control: control_rx, replies: reply_tx, bricks: batch_rx }
 }
@@ -131,6 +141,18 @@ pub async fn serve_link(
     link: WorkerLink,
     replies: &mut mpsc::Receiver<ToMaster>,
 ) {
+    serve_until(handle, hello, caller, link, replies, std::future::pending()).await;
+}
+
+/// Serves a link as [`serve_link`] does, until `broken` gives a reason to detach the worker.
+async fn serve_until(
+    handle: crate::Handle,
+    hello: Hello,
+    caller: Caller,
+    link: WorkerLink,
+    replies: &mut mpsc::Receiver<ToMaster>,
+    broken: impl Future<Output = String>,
+) {
     let control = link.control.clone();
     let worker = match handle.attach(hello, caller, link).await {
         Ok(worker) => worker,
@@ -141,12 +163,21 @@ pub async fn serve_link(
     };
     // The driver holds the other sender: when it drops that, the link is over.
     drop(control);
-    while let Some(message) = replies.recv().await {
-        if !handle.worker_said(worker, message).await {
-            return;
+    let carry = async {
+        while let Some(message) = replies.recv().await {
+            if !handle.worker_said(worker, message).await {
+                return None;
+            }
         }
+        Some("its link closed".to_string())
+    };
+    let reason = tokio::select! {
+        reason = carry => reason,
+        reason = broken => Some(reason),
+    };
+    if let Some(reason) = reason {
+        handle.detach(worker, reason).await;
     }
-    handle.detach(worker, "its link closed".into()).await;
 }
 
 #[cfg(test)]

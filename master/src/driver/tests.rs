@@ -37,8 +37,8 @@ fn request(key: &str, frames: u32, preset: &str) -> PathRequest {
     }
 }
 
-/// A worker that draws nothing: it answers each lease with clear pixels, and pings with pongs.
-/// Counts the pings in `pings`.
+/// A worker that draws nothing: it answers each lease with clear pixels, and pings with pongs. It
+/// asks for the first brick of each directory. Counts the pings in `pings`.
 fn join(handle: &Handle, pings: Arc<AtomicUsize>) {
     let mut end = crate::link::embedded(handle.clone());
     tokio::spawn(async move {
@@ -71,6 +71,9 @@ fn join(handle: &Handle, pings: Arc<AtomicUsize>) {
                         region: Some(RegionCost::default()),
                     }))
                 }
+                ToWorker::Directory { set, bricks, .. } => {
+                    ToMaster::BricksWanted { set, bricks: vec![bricks[0].id] }
+                }
                 ToWorker::Ping { nonce } => {
                     pings.fetch_add(1, Ordering::Relaxed);
                     ToMaster::Pong { nonce, clock_us: 0 }
@@ -82,6 +85,13 @@ fn join(handle: &Handle, pings: Arc<AtomicUsize>) {
             }
         }
     });
+}
+
+/// Asks the master until it has so many workers.
+async fn until_workers(handle: &Handle, count: usize) {
+    while handle.workers().await.len() != count {
+        tokio::task::yield_now().await;
+    }
 }
 
 /// Watches a job to its end: its last state, and the number of its frames.
@@ -161,6 +171,21 @@ async fn panic_while_a_request_is_checked_is_answered_and_the_master_goes_on() {
     let SubmitError::Panicked(what) = error else { panic!("{error:?}") };
     assert!(what.contains("checking the request panicked: injected"), "{what}");
     assert_eq!(run(&handle, "1", "grey").await, (JobState::Done, 3));
+    master.shutdown().await;
+}
+
+/// A worker whose bricks can't be sent is detached: its tiles go to another.
+#[tokio::test]
+async fn panic_while_bricks_are_sent_detaches_the_worker_and_its_job_goes_on() {
+    let master = master(panics_at(Stage::SendBricks, 1), 1_000_000);
+    let handle = master.handle();
+    for _ in 0..2 {
+        join(&handle, Arc::default());
+    }
+    until_workers(&handle, 2).await;
+    assert_eq!(run(&handle, "1", "grey").await, (JobState::Done, 3));
+    until_workers(&handle, 1).await;
+    assert_eq!(run(&handle, "2", "grey").await, (JobState::Done, 3));
     master.shutdown().await;
 }
 

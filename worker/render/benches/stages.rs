@@ -1,12 +1,13 @@
-//! What the stages of a frame take, each in a scene where it is nearly all of the work:
+//! Times of the stages of a frame, each in a scene where it is nearly all of the work:
 //!
 //! ```text
 //! cargo bench -p slabcast-render                    all of them
 //! cargo bench -p slabcast-render -- fog             those with this in their name
 //! ```
 //!
-//! Items a second are what the situation is about: voxels tossed, sections added, pixels closed, bricks.
-//! Every scene's picture is compared, to the bit, with that of the plain renderer before it is timed.
+//! Items a second are what the situation is about: voxels tossed, sections added, pixels closed,
+//! bricks. Every scene's picture is compared, to the bit, with that of the plain renderer before it
+//! is timed.
 
 #[path = "../tests/render/support/mod.rs"]
 mod support;
@@ -39,7 +40,7 @@ fn main() {
     divan::Divan::from_args().max_time(Duration::from_secs(2)).main();
 }
 
-/// A scene and what draws it.
+/// A scene, its frame and the memory to draw it.
 struct Stage {
     frame: Frame,
     bricks: Vec<Arc<Brick>>,
@@ -47,7 +48,7 @@ struct Stage {
     scratch: Scratch,
 }
 
-/// How a scene differs from a solid ball, coloured and shaded, seen from anywhere in parallel.
+/// Parameters of a scene; the default is a solid ball, coloured and lit, in an orthographic view.
 #[derive(Clone, Copy)]
 struct How {
     opacity: f64,
@@ -117,7 +118,7 @@ impl How {
 }
 
 impl Stage {
-    /// Draws the picture as four tiles; what comes out, and what it counted.
+    /// Draws the picture as four tiles; returns their pixels and the voxel counts.
     fn draw(&mut self) -> (Vec<(Rect, TilePixels)>, Counters) {
         let mut counters = Counters::default();
         let half = self.frame.view.size[0] as i32 / 2;
@@ -141,7 +142,7 @@ impl Stage {
         (tiles.into(), counters)
     }
 
-    /// Times it, after its picture was found to be the plain renderer's.
+    /// Times drawing, after a comparison of the picture with the serial oracle's.
     fn bench(mut self, bencher: Bencher<'_, '_>, items: impl Fn(Counters) -> u64) {
         let (tiles, counters) = self.draw();
         let mut state = FrameState::new(self.frame.view.size);
@@ -158,46 +159,46 @@ impl Stage {
 
 /// Nearly all voxels are tossed and never seen: what a hidden voxel costs.
 #[divan::bench]
-fn toss_a_solid_ball_of_which_one_sees_the_skin(bencher: Bencher<'_, '_>) {
+fn toss_solid_ball_with_only_the_skin_visible(bencher: Bencher<'_, '_>) {
     let quality = Quality { cull: true, ..How::default().quality };
     How { quality, ..How::default() }.stage().bench(bencher, |c| c.tossed);
 }
 
 /// Every voxel is added, nothing shuts: what a voxel's sections cost.
 #[divan::bench]
-fn splat_fog_in_three_colours(bencher: Bencher<'_, '_>) {
+fn splat_fog_rgb(bencher: Bencher<'_, '_>) {
     How { opacity: 0.004, ..How::default() }.stage().bench(bencher, |c| c.splatted);
 }
 
-/// The same in two channels.
+/// Fog in two channels, extinction and grey.
 #[divan::bench]
-fn splat_fog_in_grey(bencher: Bencher<'_, '_>) {
+fn splat_fog_grey(bencher: Bencher<'_, '_>) {
     How { opacity: 0.004, grey: true, ..How::default() }.stage().bench(bencher, |c| c.splatted);
 }
 
-/// The same without light.
+/// Fog without lighting.
 #[divan::bench]
-fn splat_fog_without_light(bencher: Bencher<'_, '_>) {
+fn splat_fog_unlit(bencher: Bencher<'_, '_>) {
     How { opacity: 0.004, shaded: false, ..How::default() }.stage().bench(bencher, |c| c.splatted);
 }
 
-/// The same in 16-bit sums.
+/// Fog in 16-bit sums.
 #[divan::bench]
-fn splat_fog_in_sums_of_16_bits(bencher: Bencher<'_, '_>) {
+fn splat_fog_16_bit_sums(bencher: Bencher<'_, '_>) {
     let quality = Quality { sums: Sums::I16, ..Quality::default() };
     How { opacity: 0.004, quality, ..How::default() }.stage().bench(bencher, |c| c.splatted);
 }
 
-/// The same in sums of floats, which have an order.
+/// Fog in float sums, which are added in one order.
 #[divan::bench]
-fn splat_fog_in_sums_of_floats(bencher: Bencher<'_, '_>) {
+fn splat_fog_float_sums(bencher: Bencher<'_, '_>) {
     let quality = Quality { sums: Sums::F32, ..Quality::default() };
     How { opacity: 0.004, quality, ..How::default() }.stage().bench(bencher, |c| c.splatted);
 }
 
-/// The same in perspective, where footprints are of many sizes.
+/// Fog in perspective, where footprints have many sizes.
 #[divan::bench]
-fn splat_fog_in_perspective(bencher: Bencher<'_, '_>) {
+fn splat_fog_perspective(bencher: Bencher<'_, '_>) {
     How { opacity: 0.004, perspective: true, ..How::default() }
         .stage()
         .bench(bencher, |c| c.splatted);
@@ -205,13 +206,13 @@ fn splat_fog_in_perspective(bencher: Bencher<'_, '_>) {
 
 /// Five pixels a voxel: closing is what grows. Items are sheets times pixels.
 #[divan::bench]
-fn close_sheets_of_a_magnified_ball(bencher: Bencher<'_, '_>) {
+fn composite_magnified_ball(bencher: Bencher<'_, '_>) {
     magnified(Compositing::Linear, bencher);
 }
 
-/// The same with one colour a sheet.
+/// Compositing by the constant colour rule.
 #[divan::bench]
-fn close_sheets_of_constant_colour(bencher: Bencher<'_, '_>) {
+fn composite_constant_colour_rule(bencher: Bencher<'_, '_>) {
     magnified(Compositing::Constant, bencher);
 }
 
@@ -224,7 +225,7 @@ fn magnified(compositing: Compositing, bencher: Bencher<'_, '_>) {
 
 /// Sheets of a quarter of a vox: a voxel has more sections than a record, and goes the general way.
 #[divan::bench]
-fn splat_more_sections_than_a_record_holds(bencher: Bencher<'_, '_>) {
+fn splat_fog_more_sections_than_a_record(bencher: Bencher<'_, '_>) {
     let quality = Quality { thickness: 0.25, ..How::default().quality };
     How { opacity: 0.004, quality, ..How::default() }.stage().bench(bencher, |c| c.splatted);
 }
@@ -246,9 +247,9 @@ fn project_and_sort_bricks(bencher: Bencher<'_, '_>) {
     });
 }
 
-/// A tile becomes bytes of a picture; every fourth leaf of it is empty. Items are pixels.
+/// A tile is converted to bytes of a picture; every fourth leaf of it is empty. Items are pixels.
 #[divan::bench(args = [(PixelFormat::Rgb8, [0.0; 3]), (PixelFormat::Rgb8, [1.0; 3]), (PixelFormat::Rgba8, [0.0; 3])])]
-fn finish_a_tile(bencher: Bencher<'_, '_>, (format, background): (PixelFormat, [f64; 3])) {
+fn finish_tile(bencher: Bencher<'_, '_>, (format, background): (PixelFormat, [f64; 3])) {
     const EDGE: usize = 64;
     let mut x = 7u32;
     let mut next = || {
@@ -270,7 +271,7 @@ fn finish_a_tile(bencher: Bencher<'_, '_>, (format, background): (PixelFormat, [
     bencher.counter(ItemsCount::new(EDGE * EDGE)).bench_local(leaves);
 }
 
-/// Bricks as they travel.
+/// Bricks encoded for the wire.
 #[divan::bench]
 fn encode_bricks(bencher: Bencher<'_, '_>) {
     let bricks = support::bricks_of(&How::volume());
@@ -290,7 +291,7 @@ fn encode_bricks(bencher: Bencher<'_, '_>) {
     });
 }
 
-/// And as they arrive, checksums included.
+/// Bricks decoded from the wire, checksums included.
 #[divan::bench]
 fn decode_bricks(bencher: Bencher<'_, '_>) {
     let bricks = support::bricks_of(&How::volume());

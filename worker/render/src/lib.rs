@@ -39,10 +39,10 @@
 //! [`region`] takes a tile through all depths while bricks are still arriving. [`visibility`] says
 //! which bricks lie over which part of the picture, and projects those alone that a tile needs.
 //!
-//! [`judge::reference`] judges how far both are from the limit: a gather along true rays in f64 that
-//! shares none of their arithmetic. [`judge::analytic`] has pictures in closed form, with derived
-//! bounds of what rounding may do to them, and [`judge::error_probe`] estimates a frame's error while
-//! it is drawn. [`mod@oracle::explain`] shows one pixel sheet by sheet, and
+//! [`judge::reference`] judges how far both are from the limit: a gather along true rays in f64
+//! that shares none of their arithmetic. [`judge::analytic`] has pictures in closed form, with
+//! derived bounds of what rounding may do to them, and [`judge::error_probe`] estimates a frame's
+//! error while it is drawn. [`mod@oracle::explain`] shows one pixel sheet by sheet, and
 //! [`oracle::work_counters`] counts the work of each pixel.
 //!
 //! Both renderers share what a pixel *is*: the kernel's profile, sections and footprints
@@ -50,8 +50,8 @@
 //!
 //! **Rooms**, from the lowest up; each imports lower ones alone (`tests/render/rooms.rs`):
 //! `primitives`, `visibility`, `kernels` (the only one with `unsafe`), `scene`, `part`, `geometry`,
-//! `tile`, `region`; beside them `oracle` and `judge`. **This crate knows no threads, network or clock**;
-//! its callers have those.
+//! `tile`, `region`; beside them `oracle` and `judge`. **This crate knows no threads, network or
+//! clock**; its callers have those.
 
 pub mod judge;
 pub mod oracle;

@@ -161,8 +161,8 @@ pub struct FinishedRegion {
 }
 
 impl FinishedRegion {
-    /// Records in `depths` the sheets at which the region's cells of 8x8 pixels were shut, from which
-    /// [`expected_bricks`] predicts the next frame's bricks.
+    /// Records in `depths` the sheets at which the region's cells of 8x8 pixels were shut, from
+    /// which [`expected_bricks`] predicts the next frame's bricks.
     pub fn record_depths(&self, depths: &ClosingDepths) {
         self.depths.iter().for_each(|(part, cells)| depths.note(part, cells));
     }
@@ -245,8 +245,8 @@ impl Region {
         self.tile
     }
 
-    /// Returns how many parts are not at their end, and the sum of their next sheets, which grows as
-    /// the region advances; `None` if all parts are at their end.
+    /// Returns how many parts are not at their end, and the sum of their next sheets, which grows
+    /// as the region advances; `None` if all parts are at their end.
     pub fn depth(&self) -> Option<(usize, i64)> {
         let left = self.open.len();
         (left > 0).then(|| (left, self.open.iter().map(|part| i64::from(part.next_sheet)).sum()))
@@ -286,8 +286,8 @@ impl Region {
 
     /// Splits about `share` (0 to 1) of the remaining work off: shrinks the region's tile, and
     /// returns the tile kept, the tile given away and its state. `None` if the tile can't be cut.
-    /// Remaining work is counted in open pixels times sheets; `eps` is the transmittance below which
-    /// a pixel is shut.
+    /// Remaining work is counted in open pixels times sheets; `eps` is the transmittance below
+    /// which a pixel is shut.
     pub fn split_off(
         &mut self,
         visible: &VisibleBricks,
@@ -324,10 +324,11 @@ impl Region {
         Some((kept, given, checkpoint))
     }
 
-    /// Draws as far as bricks are held. Returns the directory indices, without repetition and nearest
-    /// first within each part, of the bricks missing to go farther: those that begin at the sheets at which
-    /// parts stopped or up to `ahead` sheets behind, and that nothing drawn so far hides. An empty list
-    /// means that the region is at its end, or that its supply [stops](BrickSupply::stops) it.
+    /// Draws as far as bricks are held. Returns the directory indices, without repetition and
+    /// nearest first within each part, of the bricks missing to go farther: those that begin at the
+    /// sheets at which parts stopped or up to `ahead` sheets behind, and that nothing drawn so far
+    /// hides. An empty list means that the region is at its end, or that its supply
+    /// [stops](BrickSupply::stops) it.
     pub fn advance(
         &mut self,
         frame: &Frame,

@@ -69,13 +69,13 @@ impl Scene {
     }
 }
 
-/// Share of a pixel's light that merged slivers may move to another sheet in 32-bit sums, in units of
-/// eps. At the default eps this is 0.0098; the default kernel moves 0.0078 at most (at the largest
-/// extinction, in sheets of a vox).
+/// Share of a pixel's light that merged slivers may move to another sheet in 32-bit sums, in units
+/// of eps. At the default eps this is 0.0098; the default kernel moves 0.0078 at most (at the
+/// largest extinction, in sheets of a vox).
 const SLIVERS_PER_EPS: f64 = 5.0;
 
-/// One view of a scene, ready to be drawn by any number of threads. Every renderer of this crate takes
-/// positions, payloads and the rule of compositing from here.
+/// One view of a scene, ready to be drawn by any number of threads. Every renderer of this crate
+/// takes positions, payloads and the rule of compositing from here.
 #[derive(Debug)]
 pub struct Frame {
     /// The scene that is viewed.
@@ -87,8 +87,8 @@ pub struct Frame {
     #[doc(hidden)]
     pub footprints: Footprints,
     pub(crate) rule: Rule,
-    /// Raw units of a sheet's sums for one unit of payload; for 16-bit sums times the factors of their
-    /// weights.
+    /// Raw units of a sheet's sums for one unit of payload; for 16-bit sums times the factors of
+    /// their weights.
     pub raw_scale: f32,
     /// Offsets of the 512 voxels of a brick from its corner, in vox, by the eye's axes.
     offsets: Box<[[f64; 512]; 3]>,
@@ -147,8 +147,8 @@ pub struct Placed {
 
 impl Frame {
     /// Returns this frame without early ray termination: no pixel is ever shut. The difference from
-    /// the frame itself is what the cut-off eps leaves out. A frame whose quality has eps 0 may differ
-    /// from it in more than that: its slivers are not merged ([`Sections::given_away`]).
+    /// the frame itself is what the cut-off eps leaves out. A frame whose quality has eps 0 may
+    /// differ from it in more than that: its slivers are not merged ([`Sections::given_away`]).
     #[must_use]
     pub fn never_shut(self) -> Self {
         Frame { rule: self.rule.never_shut(), ..self }
@@ -248,8 +248,8 @@ impl Frame {
         }
     }
 
-    /// Returns whether the colour rule reads the neighbouring sheets' sums, so that a slab hands its last
-    /// sheet on to the next.
+    /// Returns whether the colour rule reads the neighbouring sheets' sums, so that a slab hands
+    /// its last sheet on to the next.
     pub fn looks_at_neighbours(&self) -> bool {
         self.scene.quality.compositing == Compositing::Linear
     }
@@ -285,8 +285,8 @@ impl Frame {
         }
     }
 
-    /// Returns the screen position, in 1/256 pixel of absolute image coordinates, of a voxel's footprint
-    /// in sheet `k`, one of [those it touches](Sections::span).
+    /// Returns the screen position, in 1/256 pixel of absolute image coordinates, of a voxel's
+    /// footprint in sheet `k`, one of [those it touches](Sections::span).
     #[doc(hidden)]
     #[inline]
     pub fn screen(&self, placed: &Placed, k: i32, footprint: &Footprint<'_>) -> [i64; 2] {
@@ -322,8 +322,8 @@ impl Frame {
         self.flat.is_some() && !self.leaning.as_ref().is_some_and(leans)
     }
 
-    /// Returns the x position, in 1/256 pixel, of a footprint at `at` ([`Frame::screen`]) in row `y` of
-    /// pixels. Differs from row to row where the kernel leans within the picture.
+    /// Returns the x position, in 1/256 pixel, of a footprint at `at` ([`Frame::screen`]) in row
+    /// `y` of pixels. Differs from row to row where the kernel leans within the picture.
     #[doc(hidden)]
     #[inline]
     pub fn along_row(&self, at: [i64; 2], y: i32) -> i64 {
@@ -335,9 +335,9 @@ impl Frame {
     }
 
     /// Computes [`Frame::payload`] of many voxels from their samples' bits, their normals and, in
-    /// perspective views, their eye coordinates by axis; opacity by gradient is not supported. `out` gets
-    /// the extinctions, then each colour. There may be more normals than samples, to fill
-    /// [whole registers](crate::kernels::whole_registers); their results are unspecified.
+    /// perspective views, their eye coordinates by axis; opacity by gradient is not supported.
+    /// `out` gets the extinctions, then each colour. There may be more normals than samples, to
+    /// fill [whole registers](crate::kernels::whole_registers); their results are unspecified.
     ///
     /// # Panics
     /// If there are fewer normals or eyes than samples; in a perspective view without eyes.
@@ -353,8 +353,8 @@ impl Frame {
         simd.run(Payloads { frame: self, samples, normals, eyes, out });
     }
 
-    /// Returns what voxel `i` of `brick`, at eye coordinates `eye` in vox, adds to a sheet per unit of
-    /// weight, in raw units ([`Frame::raw_scale`]): extinction, then the three lit colours times
+    /// Returns what voxel `i` of `brick`, at eye coordinates `eye` in vox, adds to a sheet per unit
+    /// of weight, in raw units ([`Frame::raw_scale`]): extinction, then the three lit colours times
     /// extinction.
     ///
     /// # Panics

@@ -1,8 +1,8 @@
 //! A small picture whose hash every worker sends in its hello.
 //!
-//! The master refuses a worker whose hash differs from `slabcast_common::SELF_TEST_SHA256`, and names
-//! both hashes. So a machine, a compiler or a build that rounds differently is found before it spoils a
-//! picture.
+//! The master refuses a worker whose hash differs from `slabcast_common::SELF_TEST_SHA256`, and
+//! names both hashes. So a machine, a compiler or a build that rounds differently is found before
+//! it spoils a picture.
 
 use crate::kernels::Simd;
 use crate::scene::{Frame, Scene};
@@ -21,8 +21,8 @@ use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Samples, Volume};
 use std::sync::Arc;
 
-/// The self-test's transfer function, over 8-bit values: the preset `peer-vessels`, written out so that
-/// the renderer depends on no presets.
+/// The self-test's transfer function, over 8-bit values: the preset `peer-vessels`, written out so
+/// that the renderer depends on no presets.
 fn vessels() -> TransferFunction {
     TransferFunction {
         version: 1,
@@ -54,9 +54,9 @@ pub fn spec(volume: &Volume, quality: Quality) -> SceneSpec {
     }
 }
 
-/// Draws the self-test with instruction set `simd` and returns its SHA-256: a lit ball with a hole, 24
-/// voxels wide, from above and with a level camera, in perspective and orthographic, with integer and
-/// float sums, in two slabs.
+/// Draws the self-test with instruction set `simd` and returns its SHA-256: a lit ball with a hole,
+/// 24 voxels wide, from above and with a level camera, in perspective and orthographic, with
+/// integer and float sums, in two slabs.
 pub fn run(simd: Simd) -> Digest32 {
     let n = 24u32;
     let volume = Volume::from_fn_u8("selftest", [n; 3], |i, j, k| {

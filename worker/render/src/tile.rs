@@ -18,17 +18,17 @@
 //! [`crate::region`] takes a tile through all sheets of a frame while bricks are still arriving: a
 //! part then stops before the first sheet with a missing brick, and goes on from there later.
 //!
-//! Each kind of view has its geometry ([`crate::geometry`]): `general` for every view and every kind
-//! of sums; far faster, for whole-number sums, `ortho` for most orthographic views, `sheared` for those
-//! whose kernel leans, `perspective` for most perspective views, and `shared_rows` for views with a
-//! level camera. [`Part::draw`] picks the fastest that takes the view.
+//! Each kind of view has its geometry ([`crate::geometry`]): `general` for every view and every
+//! kind of sums; far faster, for whole-number sums, `ortho` for most orthographic views, `sheared`
+//! for those whose kernel leans, `perspective` for most perspective views, and `shared_rows` for
+//! views with a level camera. [`Part::draw`] picks the fastest that takes the view.
 
 use crate::geometry::general::{GeneralScratch, Kind, Queues, RenderGeneral};
 use crate::geometry::open_sheets::Store;
-use crate::geometry::ortho::{self, RenderFlat};
-use crate::geometry::perspective::{self, Deep, RenderDeep, RenderDeepLevel};
-use crate::geometry::shared_rows::{self, RenderLevel};
-use crate::geometry::sheared::{self, RenderLeaning};
+use crate::geometry::ortho::{self, RenderOrtho};
+use crate::geometry::perspective::{self, Deep, RenderPerspective, RenderPerspectiveSharedRows};
+use crate::geometry::shared_rows::{self, RenderSharedRows};
+use crate::geometry::sheared::{self, RenderSheared};
 use crate::kernels::pixel_records::MOST;
 use crate::kernels::row_records::Tiered;
 use crate::kernels::{Grey, Simd};
@@ -46,8 +46,8 @@ use slabcast_common::quality::Sums;
 use slabcast_common::slab::SheetRange;
 use std::sync::Arc;
 
-/// Memory that a render thread keeps from tile to tile, so that drawing allocates nothing. It holds no
-/// state: any scratch will do for any tile.
+/// Memory that a render thread keeps from tile to tile, so that drawing allocates nothing. It holds
+/// no state: any scratch will do for any tile.
 #[derive(Default)]
 pub struct Scratch {
     general: GeneralScratch,
@@ -82,10 +82,10 @@ struct Waiting {
 /// Renders the sheets of `slab` on `tile` and returns the tile's pixels and the voxels splatted and
 /// culled.
 ///
-/// `state` has the tile's opacities in front of the slab. `bricks` are at least all bricks that the tile
-/// and slab need, in any order. The result has the opacities behind the slab, the light that the slab
-/// adds (linear, premultiplied, fixed point) and, for the linear colour rule, the raw sums of its last
-/// sheet.
+/// `state` has the tile's opacities in front of the slab. `bricks` are at least all bricks that the
+/// tile and slab need, in any order. The result has the opacities behind the slab, the light that
+/// the slab adds (linear, premultiplied, fixed point) and, for the linear colour rule, the raw sums
+/// of its last sheet.
 ///
 /// # Panics
 /// If the planes of `state` do not have the tile's size.
@@ -123,9 +123,9 @@ pub fn render_projected(
     (out, counted)
 }
 
-/// Renders as [`render_projected`] does, into `out`, whose memory is reused: once `scratch` and `out`
-/// have grown to a frame's largest tile, drawing allocates nothing (`tests/allocations.rs`). Returns the
-/// voxels splatted and culled.
+/// Renders as [`render_projected`] does, into `out`, whose memory is reused: once `scratch` and
+/// `out` have grown to a frame's largest tile, drawing allocates nothing (`tests/allocations.rs`).
+/// Returns the voxels splatted and culled.
 ///
 /// # Panics
 /// If the planes of `state` do not have the tile's size.
@@ -196,8 +196,8 @@ pub struct FootprintCost {
 }
 
 impl Frame {
-    /// Returns what each voxel adds to, where that is the same for all voxels: in orthographic views
-    /// with whole-number sums whose kernel does not lean.
+    /// Returns what each voxel adds to, where that is the same for all voxels: in orthographic
+    /// views with whole-number sums whose kernel does not lean.
     pub fn footprint_cost(&self) -> Option<FootprintCost> {
         let Scene { quality, ref classifier, .. } = *self.scene;
         let channel = match quality.sums {
@@ -206,7 +206,7 @@ impl Frame {
             Sums::I32 | Sums::Auto => size_of::<i32>(),
         };
         let most = self.sections.most();
-        if ortho::takes(self).is_none() || classifier.is_modulated() || most > MOST {
+        if ortho::accepts(self).is_none() || classifier.is_modulated() || most > MOST {
             return None;
         }
         let footprint = self.footprints.at(0)?;
@@ -218,10 +218,10 @@ impl Frame {
         Some(FootprintCost { pixels: [across?, down?], bytes: channel * channels * sheets })
     }
 
-    /// Returns whether the frame is drawn with two channels, opacity and grey, instead of four. This
-    /// halves the work, and gives the same pixels, where all that shows is grey.
+    /// Returns whether the frame is drawn with two channels, opacity and grey, instead of four.
+    /// This halves the work, and gives the same pixels, where all that shows is grey.
     pub fn has_two_channels(&self) -> bool {
-        self.may_have_two_channels() && ortho::takes(self).is_some()
+        self.may_have_two_channels() && ortho::accepts(self).is_some()
     }
 
     /// Whether 32-bit sums of the frame need two channels alone.
@@ -254,8 +254,9 @@ impl<'a> Part<'a> {
             Sums::I32 | Sums::Auto => {
                 if let Some((deep, lattice_rows)) = part.deep_grey() {
                     let (store, waiting) = (&mut whole.greys, &mut whole.waiting.deep);
-                    let deep = RenderDeep::<Grey, 4> { part, deep, store, waiting, pixels, io };
-                    return simd.run(RenderDeepLevel { deep, lattice_rows });
+                    let deep =
+                        RenderPerspective::<Grey, 4> { part, deep, store, waiting, pixels, io };
+                    return simd.run(RenderPerspectiveSharedRows { deep, lattice_rows });
                 }
                 let (store, waiting) = (&mut whole.longs, &mut whole.waiting);
                 part.render(simd, store, waiting, (&mut kinds.longs, queues), pixels, io);
@@ -263,13 +264,13 @@ impl<'a> Part<'a> {
         }
     }
 
-    /// The perspective view, if it is drawn in two channels: where the camera is level and voxels have
-    /// four sheets. Every further kind takes the compiler seconds, and where the camera is not level
-    /// records would be added to one by one.
+    /// The perspective view, if it is drawn in two channels: where the camera is level and voxels
+    /// have four sheets. Every further kind takes the compiler seconds, and where the camera is not
+    /// level records would be added to one by one.
     fn deep_grey(&self) -> Option<(Deep, &'a LatticeRows)> {
         let lattice_rows = self.frame.lattice_rows.as_ref()?;
         let may = self.frame.may_have_two_channels() && self.frame.sections.most() <= 4;
-        Some((perspective::takes(self).filter(|_| may)?, lattice_rows))
+        Some((perspective::accepts(self).filter(|_| may)?, lattice_rows))
     }
 
     /// Draws the part of a frame that [has two channels](Frame::has_two_channels).
@@ -282,19 +283,19 @@ impl<'a> Part<'a> {
         io: Io<'_>,
     ) {
         let part = self;
-        if let Some(view) = shared_rows::takes(part.frame) {
+        if let Some(view) = shared_rows::accepts(part.frame) {
             if part.frame.sections.most() <= 4 {
-                simd.run(RenderLevel::<Grey, 4> { part, view, store, waiting, pixels, io });
+                simd.run(RenderSharedRows::<Grey, 4> { part, view, store, waiting, pixels, io });
             } else {
-                simd.run(RenderLevel::<Grey, MOST> { part, view, store, waiting, pixels, io });
+                simd.run(RenderSharedRows::<Grey, MOST> { part, view, store, waiting, pixels, io });
             }
             return;
         }
-        let view = ortho::takes(part.frame).expect("a flat view");
+        let view = ortho::accepts(part.frame).expect("a flat view");
         if part.frame.sections.most() <= 4 {
-            simd.run(RenderFlat::<Grey, 4> { part, view, store, waiting, pixels, io });
+            simd.run(RenderOrtho::<Grey, 4> { part, view, store, waiting, pixels, io });
         } else {
-            simd.run(RenderFlat::<Grey, MOST> { part, view, store, waiting, pixels, io });
+            simd.run(RenderOrtho::<Grey, MOST> { part, view, store, waiting, pixels, io });
         }
     }
 
@@ -332,21 +333,21 @@ impl<'a> Part<'a> {
         io: Io<'_>,
     ) {
         let part = self;
-        if let Some(view) = shared_rows::takes(part.frame) {
+        if let Some(view) = shared_rows::accepts(part.frame) {
             let waiting = &mut waiting.flat;
-            simd.run(RenderLevel::<S, N> { part, view, store, waiting, pixels, io });
-        } else if let Some(view) = ortho::takes(part.frame) {
+            simd.run(RenderSharedRows::<S, N> { part, view, store, waiting, pixels, io });
+        } else if let Some(view) = ortho::accepts(part.frame) {
             let waiting = &mut waiting.flat;
-            simd.run(RenderFlat::<S, N> { part, view, store, waiting, pixels, io });
-        } else if let Some(lean) = sheared::takes(part.frame) {
+            simd.run(RenderOrtho::<S, N> { part, view, store, waiting, pixels, io });
+        } else if let Some(lean) = sheared::accepts(part.frame) {
             let waiting = &mut waiting.leaning;
-            simd.run(RenderLeaning { part, lean, store, waiting, pixels, io });
-        } else if let Some(deep) = perspective::takes(&part) {
+            simd.run(RenderSheared { part, lean, store, waiting, pixels, io });
+        } else if let Some(deep) = perspective::accepts(&part) {
             let waiting = &mut waiting.deep;
             let lattice_rows = part.frame.lattice_rows.as_ref();
-            let deep = RenderDeep::<S, N> { part, deep, store, waiting, pixels, io };
+            let deep = RenderPerspective::<S, N> { part, deep, store, waiting, pixels, io };
             match lattice_rows {
-                Some(lattice_rows) => simd.run(RenderDeepLevel { deep, lattice_rows }),
+                Some(lattice_rows) => simd.run(RenderPerspectiveSharedRows { deep, lattice_rows }),
                 None => simd.run(deep),
             }
         } else {

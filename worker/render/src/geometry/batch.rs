@@ -1,4 +1,5 @@
-//! Voxels on their way from a bucket to the records, where each section has weights of its own.
+//! A batch of voxels on its way from a bucket to the pixel records, each section with weights of
+//! its own.
 
 use crate::geometry::open_sheets::{EDGE, Sheets, slot};
 use crate::kernels::pixel_records::sheet_offsets::{
@@ -91,9 +92,10 @@ impl Batch {
         }
     }
 
-    /// Keeps of the first `n` voxels those that [anything is open](Batch::near) near, and has light fall
-    /// on them; says how many there are. `eyes`: eye coordinates by axis, where each voxel sees the eye in a
-    /// direction of its own. Of `of` voxels that there were, what is added and what not is counted.
+    /// Keeps of the first `n` voxels those that [anything is open](Batch::near) near, and has light
+    /// fall on them; says how many there are. `eyes`: eye coordinates by axis, where each voxel
+    /// sees the eye in a direction of its own. Of `of` voxels that there were, what is added and
+    /// what not is counted.
     #[inline(always)]
     pub(crate) fn light<S: Recorded>(
         &mut self,
@@ -126,8 +128,8 @@ impl Batch {
         some
     }
 
-    /// Adds those of the first `n` voxels that [are kept](Batch::light) to their sheets from `k` on, which have
-    /// these footprints.
+    /// Adds those of the first `n` voxels that [are kept](Batch::light) to their sheets from `k`
+    /// on, which have these footprints.
     #[inline(always)]
     pub(crate) fn add<S: Recorded, const N: usize>(
         &mut self,
@@ -144,8 +146,8 @@ impl Batch {
         let asked = (sheets.simd, part.frame);
         let some = self.light::<S>(asked, n, eyes, &mut payloads, counted);
         let apart = &self.apart;
-        // All windows as wide and high as the largest: they are alike but for a pixel or two, and pixels that nothing was
-        // added to are found out when they close.
+        // All windows as wide and high as the largest: they are alike but for a pixel or two, and
+        // pixels that nothing was added to are found out when they close.
         let (mut corners, mut columns, mut rows) = ([0; EDGE], 1, 1);
         for &i in &apart.kept[..some] {
             let ([x, y], [wide, high]) = apart.window(i as usize % BATCH, S::step::<N>());

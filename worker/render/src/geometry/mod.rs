@@ -1,14 +1,15 @@
-//! How voxels of each kind of view get into open sheets: one room a kind.
+//! The fast paths and the general one: how voxels of each kind of view get into open sheets.
 //!
-//! | room | views | sums |
+//! | module | views | sums |
 //! |---|---|---|
-//! | [`ortho`] | orthographic, all sections of a voxel with one footprint | whole numbers |
-//! | [`sheared`] | orthographic, kernel leans (lattice not cubic) | whole numbers |
+//! | [`ortho`] | orthographic; all sections of a voxel share one footprint | whole numbers |
+//! | [`sheared`] | orthographic; the kernel leans, since the lattice is not cubic | whole numbers |
 //! | [`perspective`] | perspective | whole numbers |
-//! | [`shared_rows`] | the camera level: layers of the lattice are rows of the picture | whole numbers |
+//! | [`shared_rows`] | level camera: layers of the lattice are rows of the picture | whole numbers |
 //! | [`general`] | all | all |
 //!
-//! [`open_sheets`] and [`batch`] are shared by the fast ones.
+//! Each fast path says which views it [accepts](ortho::accepts); [`crate::tile`] takes the first
+//! that does. [`open_sheets`] and [`batch`] are shared by the fast ones.
 
 pub mod batch;
 pub mod general;

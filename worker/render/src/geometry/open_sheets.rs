@@ -1,8 +1,8 @@
-//! The open sheets of a part in records, and the walk through them, front to back.
+//! The open sheets of a part in pixel records, and the walk through them, front to back.
 //!
-//! What differs between views is how voxels get there: [`crate::geometry::ortho`] and [`crate::geometry::perspective`] toss and
-//! splat; this room closes. Pixels that something was added to are known by a bit each; a sheet that
-//! closes looks at the open ones among those alone, sixteen at a time from wherever they lie.
+//! Views differ in how voxels get into the sheets ([`Stage`]: toss and splat); the walk and the
+//! compositing of sheets are here. Touched pixels are known by a bit each. A sheet that closes
+//! reads only the open ones among them, sixteen at a time from wherever they lie.
 
 use crate::kernels::Simd;
 use crate::kernels::composite::rows::close_rows;
@@ -24,11 +24,11 @@ pub struct Store<S: Recorded> {
     /// Records of any number of sheets; nothing in them between parts.
     lines: Vec<Line>,
     pub(crate) closes: Closes<S>,
-    pub(crate) level: LevelStore<S>,
+    pub(crate) level: SharedRowsStore<S>,
 }
 
 /// Memory for level views.
-pub(crate) struct LevelStore<S: Recorded> {
+pub(crate) struct SharedRowsStore<S: Recorded> {
     /// Tiers, in which there is nothing between parts but in margins; and of which shape they are.
     tiers: Vec<Line>,
     shape: (Shape, usize),
@@ -36,7 +36,7 @@ pub(crate) struct LevelStore<S: Recorded> {
     folded: Folded<S>,
 }
 
-impl<S: Recorded> LevelStore<S> {
+impl<S: Recorded> SharedRowsStore<S> {
     /// Tiers of this shape for so many sheets, and room for the sums of a part's pixels.
     pub(crate) fn of(&mut self, shape: Shape, sheets: usize) -> (&mut [Line], &mut Folded<S>) {
         let n = shape.lines(sheets);
@@ -63,7 +63,7 @@ pub struct Closes<S: Recorded> {
 impl<S: Recorded> Default for Store<S> {
     fn default() -> Self {
         let shape = (Shape::default(), 0);
-        let level = LevelStore { tiers: Vec::new(), shape, folded: Folded::default() };
+        let level = SharedRowsStore { tiers: Vec::new(), shape, folded: Folded::default() };
         Store { lines: Vec::new(), closes: Closes::default(), level }
     }
 }
@@ -71,7 +71,7 @@ impl<S: Recorded> Default for Store<S> {
 impl<S: Recorded> Store<S> {
     /// Whether there are no sums of any part, and whether there are tiers at all.
     pub fn is_empty(&mut self) -> (bool, bool) {
-        let LevelStore { tiers, shape: (shape, sheets), .. } = &mut self.level;
+        let SharedRowsStore { tiers, shape: (shape, sheets), .. } = &mut self.level;
         let empty = match *sheets {
             4 => Tiers::<S, 4>::new(tiers, *shape).are_empty(),
             8 => Tiers::<S, 8>::new(tiers, *shape).are_empty(),
@@ -93,8 +93,8 @@ impl<S: Recorded> Default for Closes<S> {
     }
 }
 
-/// Voxels of one bucket: the first `n` items; what is behind them is there from before, so that a voxel is added by one
-/// store.
+/// Voxels of one bucket: the first `n` items; what is behind them is there from before, so that a
+/// voxel is added by one store.
 pub struct Bucket<V> {
     items: Vec<V>,
     n: usize,
@@ -168,7 +168,8 @@ pub trait Stage<H> {
         queues: &mut Queues<Self::Voxel>,
         counters: &mut Counters,
     );
-    /// Shades voxels that are due at sheet `k`, and adds them to those of their sheets that are left.
+    /// Shades voxels that are due at sheet `k`, and adds them to those of their sheets that are
+    /// left.
     fn splat(
         &mut self,
         due: &Due<'_, Self::Voxel>,
@@ -179,8 +180,8 @@ pub trait Stage<H> {
     );
 }
 
-/// Voxels that are drawn from some sheet on: those that begin there, and those that began before the slab, with their
-/// first sheets.
+/// Voxels that are drawn from some sheet on: those that begin there, and those that began before
+/// the slab, with their first sheets.
 pub struct Due<'a, V> {
     here: &'a [V],
     before: &'a [(V, i32)],
@@ -216,8 +217,8 @@ impl<V> Chunk<'_, V> {
         }
     }
 
-    /// Has each taken over as the `n`th of those that are kept so far, with as many of its sheets gone at sheet `k`,
-    /// unless it is told not to keep it; says how many are kept.
+    /// Has each taken over as the `n`th of those that are kept so far, with as many of its sheets
+    /// gone at sheet `k`, unless it is told not to keep it; says how many are kept.
     #[inline(always)]
     pub(crate) fn keep(&self, k: i32, mut take: impl FnMut(usize, &V, i32) -> bool) -> usize {
         let mut n = 0;
@@ -309,9 +310,9 @@ pub fn walk<S: Recorded, H: Open<S>, T: Stage<H>>(
 /// Pixels of a part, a bit each, row by row.
 pub type Rows = [u64; EDGE];
 
-/// When to look for touched pixels that nothing reached. In 16-bit sums a footprint's corners and much of its
-/// outermost sections round to nothing: of mri256 a quarter of what is touched, of aneurism more than a third;
-/// of fog a thirtieth, and in 32-bit sums half as much.
+/// When to look for touched pixels that nothing reached. In 16-bit sums a footprint's corners and
+/// much of its outermost sections round to nothing: of mri256 a quarter of what is touched, of
+/// aneurism more than a third; of fog a thirtieth, and in 32-bit sums half as much.
 #[derive(Default)]
 struct Sifting {
     /// Sheets until it is looked at again whether it pays.
@@ -373,8 +374,8 @@ impl<S: Recorded> Closes<S> {
         (&mut self.before, &mut self.was)
     }
 
-    /// Closes the sheet that `slot` of `records` holds at the pixels of `closing`, of those that it was
-    /// `touched` at; whether pixels were shut.
+    /// Closes the sheet that `slot` of `records` holds at the pixels of `closing`, of those that it
+    /// was `touched` at; whether pixels were shut.
     #[inline(always)]
     fn close<const N: usize>(
         &mut self,
@@ -400,7 +401,8 @@ impl<S: Recorded> Closes<S> {
         some.any_shut
     }
 
-    /// What comes before a sheet that is touched at some pixels and closes at some is there from here on.
+    /// What comes before a sheet that is touched at some pixels and closes at some is there from
+    /// here on.
     #[inline(always)]
     fn begin_sheet(&mut self, closing: &Rows, touched: &Rows) {
         let Closes { before, was, .. } = self;
@@ -494,8 +496,8 @@ impl<'a, S: Recorded, const N: usize> Sheets<'a, S, N> {
         }
     }
 
-    /// Notes that voxels that begin at sheet `k` touch so many columns and rows from where `corners` has
-    /// bits.
+    /// Notes that voxels that begin at sheet `k` touch so many columns and rows from where
+    /// `corners` has bits.
     #[inline(always)]
     pub fn touch_all(&mut self, k: i32, corners: &Rows, [wide, high]: [usize; 2]) {
         let added = &mut self.added[slot::<N>(k)];

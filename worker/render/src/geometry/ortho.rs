@@ -1,18 +1,20 @@
-//! A tile part of a flat view in whole sums: the fast way.
+//! Parts of orthographic views in which all sections of a voxel share one footprint, in
+//! whole-number sums: the fastest path.
 //!
-//! Flat is a view whose voxels have one footprint in all their sheets: orthographic, with
-//! footprints in a table ([`crate::primitives::positions`]). Then a voxel is a handful of integers, which are
-//! worked out sixteen at a time:
+//! Footprints are in a table, and positions are integers ([`crate::primitives::positions`]; such a
+//! view is called *flat* here). A voxel is a handful of integers, which are worked out sixteen at a
+//! time:
 //!
-//! 1. **Toss.** Positions are a corner and an offset; one bit of the mask says
-//!    whether a footprint may touch an open pixel. What is left waits in the bucket of its first
-//!    sheet with all that drawing it takes, so that nobody goes back to the brick.
-//! 2. **Splat.** The bit is looked at once more, since pixels have shut meanwhile; light falls on
-//!    sixteen voxels at once; each is added to the records of its footprint with all its sections
-//!    ([`crate::kernels::records`]). A footprint that leaves the part is moved inside and reads zeros.
-//! 3. **Close.** Open pixels that something was added to are composited sixteen at a time.
+//! 1. **Toss.** Positions are a corner and an offset; one bit of the mask says whether a footprint
+//!    may touch an open pixel. Voxels that may show wait in the bucket of their first sheet with
+//!    all that drawing them takes, so that the brick is not read again.
+//! 2. **Splat.** The bit is tested once more, since pixels were shut meanwhile; sixteen voxels are
+//!    lit at once; each is added with all its sections to the pixel records of its footprint
+//!    ([`crate::kernels::pixel_records`]). A footprint that leaves the part is moved inside and
+//!    reads zeros.
+//! 3. **Close.** Open pixels that were touched are composited sixteen at a time.
 //!
-//! The bytes are those of [`crate::oracle::serial`], which knows none of this.
+//! The bytes are those of [`crate::oracle::serial`], which does none of this.
 
 use crate::geometry::open_sheets::{Chunk, Due, EDGE, Queues, Sheets, Stage, Store, slot, walk};
 use crate::kernels::pixel_records::{Recorded, Splat, Table, Tables, splat};
@@ -27,7 +29,7 @@ use crate::visibility::open_mask::OpenMask;
 use slabcast_common::message::Counters;
 use slabcast_common::view::SUBPIXELS;
 
-/// Memory for voxels that a render thread keeps from part to part.
+/// Memory for waiting voxels that a render thread keeps from part to part.
 #[derive(Default)]
 pub struct Waiting {
     pub(crate) queues: Queues<Splat>,
@@ -62,8 +64,8 @@ impl Default for Batch {
 }
 
 impl Batch {
-    /// Takes over those of `some` voxels, which are due at sheet `k`, that are still wanted, notes each, and has light
-    /// fall on them; says how many there are.
+    /// Takes over those of `some` voxels, which are due at sheet `k`, that are still wanted, notes
+    /// each, and has light fall on them; says how many there are.
     #[inline(always)]
     pub(crate) fn light<S: Recorded>(
         &mut self,
@@ -100,8 +102,8 @@ impl Batch {
     }
 }
 
-/// Renders a part: compiled for each instruction set as a whole.
-pub struct RenderFlat<'a, S: Recorded, const N: usize> {
+/// Draws a part, as work that is compiled once for each instruction set.
+pub struct RenderOrtho<'a, S: Recorded, const N: usize> {
     pub(crate) part: Part<'a>,
     pub(crate) view: &'a Flat,
     pub(crate) store: &'a mut Store<S>,
@@ -110,17 +112,17 @@ pub struct RenderFlat<'a, S: Recorded, const N: usize> {
     pub(crate) io: Io<'a>,
 }
 
-/// Whether parts of `frame` may be rendered here.
-pub(crate) fn takes(frame: &Frame) -> Option<&Flat> {
+/// Returns the integer positions of `frame` if its parts may be drawn here.
+pub(crate) fn accepts(frame: &Frame) -> Option<&Flat> {
     let fits = |flat: &&Flat| flat.reach.iter().all(|reach| 2 * reach < PART);
     frame.flat.as_ref().filter(fits).filter(|_| frame.leaning.is_none())
 }
 
-impl<S: Recorded, const N: usize> Work for RenderFlat<'_, S, N> {
+impl<S: Recorded, const N: usize> Work for RenderOrtho<'_, S, N> {
     type Out = ();
     #[inline(always)]
     fn run(self, simd: Simd) {
-        let RenderFlat { part, view: flat, store, waiting, pixels, io } = self;
+        let RenderOrtho { part, view: flat, store, waiting, pixels, io } = self;
         let footprint = part.frame.footprints.at(0).expect("a flat view's sheets are all drawn");
         let axis = |axis| {
             let phases = footprint.phases(axis)?;
@@ -139,10 +141,11 @@ impl<S: Recorded, const N: usize> Work for RenderFlat<'_, S, N> {
     }
 }
 
-/// What a voxel's brick is among a part's, which pixels are open, where voxels wait, and what is counted.
+/// What a voxel's brick is among a part's, which pixels are open, where voxels wait, and what is
+/// counted.
 pub(crate) type Asked<'a> = (usize, &'a OpenMask, &'a mut Queues<Splat>, &'a mut Counters);
 
-/// [`Stage::toss`] in a view that is flat.
+/// [`Stage::toss`] for integer positions.
 #[inline(always)]
 pub(crate) fn toss(
     part: &Part<'_>,

@@ -1,16 +1,16 @@
-//! A tile part of a perspective view, or of a kernel that leans, in whole sums: sections with footprints of
-//! their own.
+//! Parts of perspective views in whole-number sums: each section has a footprint of its own.
 //!
-//! In perspective a voxel's sections lie on sheets of different scale, so each has its own place and width on
-//! the screen, rarely more than a pixel apart; those of a kernel that leans lie aside of each other in any view
-//! ([`crate::primitives::footprint::Leaning`]), and so may their rows. Their weights are put side by side, by column, row and
-//! slot, and added to the records of the window that holds them all, as in [`crate::geometry::ortho`]. Voxels
-//! are tested at the place where their own depth puts them, in a mask grown by what sections may lie
-//! aside of it. Where that is far, as very near the eye, [`crate::geometry::general`] takes over.
+//! In perspective a voxel's sections lie on sheets of different scale, so each has its own position
+//! and width on the screen, rarely more than a pixel apart. Sections of a kernel that leans lie
+//! beside each other in any view ([`crate::primitives::footprint::Leaning`]), and so may their
+//! rows. Their weights are interleaved by column, row and slot, and added to the records of the
+//! window that holds them all, as in [`crate::geometry::ortho`]. Voxels are tested at the position
+//! of their own depth, in a mask grown by how far sections may lie from it. Where that is far, as
+//! close to the eye, [`crate::geometry::general`] draws.
 
 use crate::geometry::batch::{Axes, Batch};
 use crate::geometry::open_sheets::{Chunk, Due, EDGE, Queues, Sheets, Stage, Store, slot, walk};
-use crate::geometry::shared_rows::LevelSheets;
+use crate::geometry::shared_rows::SharedRowsSheets;
 use crate::kernels::pixel_records::sheet_offsets::{Apart, BATCH, Each, WINDOW, Woven, after};
 use crate::kernels::pixel_records::{MOST, Recorded};
 use crate::kernels::row_records::{Shape, Tiered};
@@ -26,8 +26,8 @@ use slabcast_common::message::Counters;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::view::{Projection, SUBPIXEL_BITS, SUBPIXELS, round_i32};
 
-/// A voxel waiting in the bucket of its first sheet, with all that drawing it takes: nobody goes back
-/// to the brick.
+/// A voxel waiting in the bucket of its first sheet, with all that drawing it takes: nobody goes
+/// back to the brick.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct DeepVoxel {
     /// Eye coordinates in vox.
@@ -39,7 +39,7 @@ pub(crate) struct DeepVoxel {
     cell: u16,
 }
 
-/// Memory for voxels that a render thread keeps from part to part.
+/// Memory for waiting voxels that a render thread keeps from part to part.
 #[derive(Default)]
 pub(crate) struct Waiting {
     queues: Queues<DeepVoxel>,
@@ -54,8 +54,8 @@ struct Places {
     eye: [Each<f64>; 3],
     /// Where a section of each is along an axis.
     aside: Each<f64>,
-    /// In a level view, which lattice row each belongs to, the columns that hold its sections, and by slot where among
-    /// all tiers of a sheet it begins.
+    /// In a level view, which lattice row each belongs to, the columns that hold its sections, and
+    /// by slot where among all tiers of a sheet it begins.
     lattice_row: Each<i32>,
     columns: Each<u64>,
     places: [Each<u32>; MOST],
@@ -73,7 +73,7 @@ impl Default for Places {
     }
 }
 
-/// What a part needs to be rendered here.
+/// What drawing a part of a perspective view takes.
 #[derive(Clone, Copy, Debug)]
 pub struct Deep {
     focal: f64,
@@ -82,12 +82,13 @@ pub struct Deep {
     pub reach: [i32; 2],
 }
 
-/// Whether `part` may be rendered here.
-pub(crate) fn takes(part: &Part<'_>) -> Option<Deep> {
+/// Returns what drawing `part` here takes, if it may be drawn here.
+pub(crate) fn accepts(part: &Part<'_>) -> Option<Deep> {
     deep(part.frame, &part.rect, part.nearest()?)
 }
 
-/// What it takes for a part whose bricks begin at sheet `nearest` or behind it.
+/// Returns what drawing the part `r` of `frame` takes, if its bricks begin at sheet `nearest` or
+/// behind; `None` if sections may lie too far from their voxels.
 pub fn deep(frame: &Frame, r: &Rect, nearest: i32) -> Option<Deep> {
     let view = &frame.view;
     let leaning = frame.leaning.as_ref();
@@ -98,8 +99,8 @@ pub fn deep(frame: &Frame, r: &Rect, nearest: i32) -> Option<Deep> {
     let footprint = frame.footprints.at(nearest)?;
     let own = footprint.reach()?;
     let front = view.scale_at(nearest - most as i32 - 1)?;
-    // From a voxel's own depth to the middle of a sheet that it reaches: to the sheet's far side at most,
-    // and half a sheet back.
+    // From a voxel's own depth to the middle of a sheet that it reaches: to the sheet's far side at
+    // most, and half a sheet back.
     let (ahead, behind, shift) = frame.sections.reach();
     let reaches = f64::from(ahead.max(behind) + 1) / f64::from(1 << shift);
     let depth_apart = (reaches + 0.5) * view.thickness;
@@ -109,14 +110,14 @@ pub fn deep(frame: &Frame, r: &Rect, nearest: i32) -> Option<Deep> {
     let farthest = aside.into_iter().chain(above).fold(0.0, f64::max);
     // Where the kernel leans a section is farther aside, and its outermost rows are.
     let leans = leaning.map_or([0.0; 2], |leaning| leaning.pixels(front, own));
-    // x / (z + dz) lies within |x / z| dz / z of x / z, and each is rounded to a subpixel; of voxels so many
-    // pixels outside of the part.
+    // x / (z + dz) lies within |x / z| dz / z of x / z, and each is rounded to a subpixel; of
+    // voxels so many pixels outside of the part.
     let reach_of = |outside: f64| {
         let apart = (farthest + outside) * depth_apart * front / focal + 4.0 / f64::from(SUBPIXELS);
         [0, 1].map(|axis| f64::from(own[axis]) + libm::ceil(apart + leans[axis]))
     };
-    // None that is farther outside than a mask is grown at most touches the part; so none that is farther
-    // than what those reach does.
+    // None that is farther outside than a mask is grown at most touches the part; so none that is
+    // farther than what those reach does.
     let [x, y] = reach_of(f64::from(REACH_MOST));
     let of_any = x.max(y);
     let reach = reach_of(of_any);
@@ -125,8 +126,8 @@ pub fn deep(frame: &Frame, r: &Rect, nearest: i32) -> Option<Deep> {
     fits.then_some(Deep { focal, distance, reach: reach.map(|reach| reach as i32) })
 }
 
-/// Renders a part: compiled for each instruction set as a whole.
-pub struct RenderDeep<'a, S: Recorded, const N: usize> {
+/// Draws a part, as work that is compiled once for each instruction set.
+pub struct RenderPerspective<'a, S: Recorded, const N: usize> {
     pub(crate) part: Part<'a>,
     pub(crate) deep: Deep,
     pub(crate) store: &'a mut Store<S>,
@@ -135,29 +136,29 @@ pub struct RenderDeep<'a, S: Recorded, const N: usize> {
     pub(crate) io: Io<'a>,
 }
 
-impl<S: Recorded, const N: usize> Work for RenderDeep<'_, S, N> {
+impl<S: Recorded, const N: usize> Work for RenderPerspective<'_, S, N> {
     type Out = ();
     #[inline(always)]
     fn run(self, simd: Simd) {
-        let RenderDeep { part, deep, store, waiting, pixels, io } = self;
+        let RenderPerspective { part, deep, store, waiting, pixels, io } = self;
         let (stage, queues) = DeepStage::new(&part, deep, simd, waiting);
         let sheets = Sheets::<S, N>::new(simd, store, part.frame.sections.most());
         walk(&part, stage, sheets, queues, pixels, io);
     }
 }
 
-/// Renders a part of a level view, which has lattice rows: likewise.
-pub struct RenderDeepLevel<'a, S: Recorded, const N: usize> {
-    pub(crate) deep: RenderDeep<'a, S, N>,
+/// Draws a part of a view with a level camera into row records, as such work.
+pub struct RenderPerspectiveSharedRows<'a, S: Recorded, const N: usize> {
+    pub(crate) deep: RenderPerspective<'a, S, N>,
     pub(crate) lattice_rows: &'a LatticeRows,
 }
 
-impl<S: Tiered, const N: usize> Work for RenderDeepLevel<'_, S, N> {
+impl<S: Tiered, const N: usize> Work for RenderPerspectiveSharedRows<'_, S, N> {
     type Out = ();
     #[inline(always)]
     fn run(self, simd: Simd) {
-        let RenderDeepLevel { deep, lattice_rows } = self;
-        let RenderDeep { part, deep, store, waiting, pixels, io } = deep;
+        let RenderPerspectiveSharedRows { deep, lattice_rows } = self;
+        let RenderPerspective { part, deep, store, waiting, pixels, io } = deep;
         let (stage, queues) = DeepStage::new(&part, deep, simd, waiting);
         let frame = part.frame;
         // The nearest sheet has the widest footprints, the last one most lattice rows.
@@ -166,7 +167,7 @@ impl<S: Tiered, const N: usize> Work for RenderDeepLevel<'_, S, N> {
         let len = widest.expect("a table of a sheet that is not clipped").len;
         let last = frame.footprints.at(frame.footprints.last()).expect("one behind it");
         let shape = Shape::new::<S>(lattice_rows.rows(PART, last.scale), len);
-        let sheets = LevelSheets::<S, N>::new(simd, store, &part, lattice_rows, shape);
+        let sheets = SharedRowsSheets::<S, N>::new(simd, store, &part, lattice_rows, shape);
         walk(&part, stage, sheets, queues, pixels, io);
     }
 }
@@ -223,7 +224,8 @@ impl<'a, S: Recorded, const N: usize> Footprints<'a, S, N> {
         Footprints { axes, scales: [footprint.scale; N], sheets: [k; N] }
     }
 
-    /// Those of the sheets from `k` that a voxel may reach: from one sheet to the next only one of them is new.
+    /// Those of the sheets from `k` that a voxel may reach: from one sheet to the next only one of
+    /// them is new.
     #[inline(always)]
     fn come_to(&mut self, part: &'a Part<'_>, k: i32) {
         let footprints = &part.frame.footprints;
@@ -291,7 +293,8 @@ impl<S: Recorded, const N: usize> Drawing<'_, S, N> {
         counters.culled += (reached - kept) as u64;
     }
 
-    /// Takes over those of `some` voxels, which are due at sheet `k`, near which anything is open; says how many.
+    /// Takes over those of `some` voxels, which are due at sheet `k`, near which anything is open;
+    /// says how many.
     #[inline(always)]
     fn take(&mut self, some: &Chunk<'_, DeepVoxel>, k: i32, open: &OpenMask) -> usize {
         let most = self.part.frame.sections.most() as i32;
@@ -348,7 +351,7 @@ macro_rules! stage {
 }
 
 stage!(Recorded, Sheets, add);
-stage!(Tiered, LevelSheets, add_level);
+stage!(Tiered, SharedRowsSheets, add_level);
 
 impl<S: Recorded, const N: usize> Drawing<'_, S, N> {
     /// Takes over `v`, which has `left` sheets left, as voxel `i` of the batch.
@@ -361,8 +364,8 @@ impl<S: Recorded, const N: usize> Drawing<'_, S, N> {
         (samples[i], normals[i], apart.left[i]) = (v.sample, v.normal, left);
     }
 
-    /// Where each section of the first `n` voxels of the batch lies, and the windows that hold all of a voxel's,
-    /// along some axes: rows before columns, which may hang on them.
+    /// Where each section of the first `n` voxels of the batch lies, and the windows that hold all
+    /// of a voxel's, along some axes: rows before columns, which may hang on them.
     #[inline(always)]
     fn place(
         &mut self,
@@ -429,7 +432,8 @@ impl<S: Recorded, const N: usize> Drawing<'_, S, N> {
         }
     }
 
-    /// Adds the first `n` voxels of the batch, of `counted` there were, to their sheets from `k` on.
+    /// Adds the first `n` voxels of the batch, of `counted` there were, to their sheets from `k`
+    /// on.
     #[inline(always)]
     fn add(
         &mut self,
@@ -455,7 +459,7 @@ impl<S: Tiered, const N: usize> Drawing<'_, S, N> {
         n: usize,
         k: i32,
         footprints: &Footprints<'_, S, N>,
-        sheets: &mut LevelSheets<'_, S, N>,
+        sheets: &mut SharedRowsSheets<'_, S, N>,
         open: &OpenMask,
         counted: (usize, &mut Counters),
     ) {

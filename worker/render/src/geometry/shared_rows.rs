@@ -1,9 +1,11 @@
-//! The open sheets of a level view's part, and flat views that are level ([`crate::primitives::lattice_rows`]).
+//! The open sheets of views with a level camera, and orthographic views of that kind
+//! ([`crate::primitives::lattice_rows`]).
 //!
-//! Voxels get here as they do in [`crate::geometry::ortho`] and [`crate::geometry::perspective`]; they are added to tiers
-//! ([`crate::kernels::tiers`]) and not to pixels. A sheet that closes makes the sums of those of its pixels that
-//! are open and that something was added to, its own and what the sheet behind has by then, and puts those beside
-//! each other that have any extinction, with what they have of the sheet before; so they are closed.
+//! Voxels get here as they do in [`crate::geometry::ortho`] and [`crate::geometry::perspective`],
+//! and are added to row records ([`crate::kernels::row_records`]) instead of pixels. A sheet that
+//! closes makes the sums of its open, touched pixels from the rows, its own and what the sheet
+//! behind has by then, and packs those that have any extinction, with their sums of the sheet
+//! before, for compositing.
 
 use crate::geometry::open_sheets::{
     Chunk, Closes, Due, EDGE, Open, Queues, Rows, Stage, Store, close_folded, slot, walk,
@@ -35,7 +37,8 @@ struct Down<'a, W> {
     /// Rows that more than four reach.
     more: u64,
     len: i32,
-    /// By tier, the first row of pixels that it reaches, and where the weight of the part's first would lie.
+    /// By tier, the first row of pixels that it reaches, and where the weight of the part's first
+    /// would lie.
     first: [i32; ROWS],
     from: [i32; ROWS],
     /// What tiers weigh in rows that are known.
@@ -156,7 +159,7 @@ impl<'a, W: Weight> Down<'a, W> {
 }
 
 /// The open sheets of a part, in tiers.
-pub struct LevelSheets<'a, S: Recorded, const N: usize> {
+pub struct SharedRowsSheets<'a, S: Recorded, const N: usize> {
     pub(crate) simd: Simd,
     pub(crate) tiers: Tiers<'a, S, N>,
     closes: &'a mut Closes<S>,
@@ -164,7 +167,8 @@ pub struct LevelSheets<'a, S: Recorded, const N: usize> {
     folded: &'a mut Folded<S>,
     part: &'a Part<'a>,
     lattice_rows: &'a LatticeRows,
-    /// By slot and tier: columns of the part that something was added to; and whether there are any.
+    /// By slot and tier: columns of the part that something was added to; and whether there are
+    /// any.
     touched: [[u64; ROWS]; N],
     any: [bool; N],
     /// By slot, or one for all sheets.
@@ -172,7 +176,7 @@ pub struct LevelSheets<'a, S: Recorded, const N: usize> {
     pub(crate) hull: Hull,
 }
 
-impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
+impl<'a, S: Tiered, const N: usize> SharedRowsSheets<'a, S, N> {
     /// In memory of `store`, with tiers of this shape.
     pub(crate) fn new(
         simd: Simd,
@@ -184,7 +188,7 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
         let Store { closes, level, .. } = store;
         closes.begin();
         let (tiers, folded) = level.of(shape, N);
-        LevelSheets {
+        SharedRowsSheets {
             simd,
             tiers: Tiers::new(tiers, shape),
             closes,
@@ -198,7 +202,8 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
         }
     }
 
-    /// Notes that voxels that begin at sheet `k` add to these columns, tier by tier, in `most` sheets.
+    /// Notes that voxels that begin at sheet `k` add to these columns, tier by tier, in `most`
+    /// sheets.
     #[inline(always)]
     fn touch_all(&mut self, k: i32, most: usize, columns: &[u64; ROWS]) {
         let rows = self.tiers.shape().rows;
@@ -212,10 +217,11 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
         }
     }
 
-    /// Notes what the [hull](LevelSheets::hull) was [touched](Hull::touch) at, in all of its sheets.
+    /// Notes what the [hull](SharedRowsSheets::hull) was [touched](Hull::touch) at, in all of its
+    /// sheets.
     #[inline(always)]
     pub(crate) fn touch_hull(&mut self) {
-        let LevelSheets { hull, tiers, touched, any, .. } = self;
+        let SharedRowsSheets { hull, tiers, touched, any, .. } = self;
         let rows = tiers.shape().rows;
         for (sheet, base) in hull.bases.iter().enumerate().take(hull.sheets) {
             let slot = slot::<N>(hull.k + sheet as i32);
@@ -252,13 +258,15 @@ impl<'a, S: Tiered, const N: usize> LevelSheets<'a, S, N> {
     }
 }
 
-/// What is open where lattice rows reach in the sheets from one on, and where something was added to them.
+/// What is open where lattice rows reach in the sheets from one on, and where something was added
+/// to them.
 pub(crate) struct Hull {
     /// The first of the sheets, how many there are, and the lattice row of each one's first tier.
     k: i32,
     sheets: usize,
     pub(crate) bases: [i32; MOST],
-    /// Of `n` lattice rows from `base` on: columns that are open in any row that it reaches, and columns that were added to.
+    /// Of `n` lattice rows from `base` on: columns that are open in any row that it reaches, and
+    /// columns that were added to.
     base: i32,
     n: usize,
     open: [u64; 2 * ROWS],
@@ -336,12 +344,13 @@ impl AnyOpen {
     }
 }
 
-impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
-    /// What is open, or all if nothing is said of that, where lattice rows reach in `most` sheets from `k` on, of which there are
-    /// no more than slots.
+impl<S: Tiered, const N: usize> SharedRowsSheets<'_, S, N> {
+    /// What is open, or all if nothing is said of that, where lattice rows reach in `most` sheets
+    /// from `k` on, of which there are no more than slots.
     ///
-    /// Perspective's windows are below 40 pixels, so a voxel's sections lie less than 20 aside of its centre. Thus
-    /// its sheets' first tiers lie less than 2 * 20 / [`crate::primitives::lattice_rows`]' least distance apart, 54 lattice rows, and a table of
+    /// Perspective's windows are below 40 pixels, so a voxel's sections lie less than 20 aside of
+    /// its centre. Thus its sheets' first tiers lie less than 2 * 20 /
+    /// [`crate::primitives::lattice_rows`]' least distance apart, 54 lattice rows, and a table of
     /// twice the rows of a sheet holds all.
     #[inline(always)]
     pub(crate) fn hull(&mut self, k: i32, most: usize, open: Option<&OpenMask>) -> &Hull {
@@ -352,7 +361,7 @@ impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
         for (j, which) in which.iter_mut().enumerate() {
             *which = self.down(k + j.min(most - 1) as i32);
         }
-        let LevelSheets { hull, downs, tiers, .. } = self;
+        let SharedRowsSheets { hull, downs, tiers, .. } = self;
         let rows = tiers.shape().rows;
         let (mut first, mut last) = (i32::MAX, i32::MIN);
         for (to, &which) in hull.bases.iter_mut().zip(&which) {
@@ -385,7 +394,7 @@ impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
     }
 }
 
-impl<S: Tiered, const N: usize> Open<S> for LevelSheets<'_, S, N> {
+impl<S: Tiered, const N: usize> Open<S> for SharedRowsSheets<'_, S, N> {
     #[inline(always)]
     fn before(&mut self) -> (&mut [S::Pixel], &mut Rows) {
         self.closes.before()
@@ -402,7 +411,7 @@ impl<S: Tiered, const N: usize> Open<S> for LevelSheets<'_, S, N> {
             return false;
         }
         let [here, behind] = [self.down(k), self.down(k + 1)];
-        let LevelSheets { simd, tiers, folded, closes, downs, touched, .. } = self;
+        let SharedRowsSheets { simd, tiers, folded, closes, downs, touched, .. } = self;
         let (simd, rows) = (*simd, tiers.shape().rows);
         let (mut some, mut any) = (downs[here].touched(rows, &touched[slots[0]]), 0);
         for (y, some) in some.iter_mut().enumerate() {
@@ -432,7 +441,7 @@ impl<S: Tiered, const N: usize> Open<S> for LevelSheets<'_, S, N> {
     }
 }
 
-impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
+impl<S: Tiered, const N: usize> SharedRowsSheets<'_, S, N> {
     /// Empties a sheet.
     #[inline(always)]
     fn clear(&mut self, slot: usize) {
@@ -448,35 +457,38 @@ impl<S: Tiered, const N: usize> LevelSheets<'_, S, N> {
     }
 }
 
-/// Renders a part of a flat view: compiled for each instruction set as a whole.
-pub struct RenderLevel<'a, S: Recorded, const N: usize> {
+/// Draws a part of an orthographic view, as work that is compiled once for each instruction set.
+pub struct RenderSharedRows<'a, S: Recorded, const N: usize> {
     pub(crate) part: Part<'a>,
-    pub(crate) view: LevelView<'a>,
+    pub(crate) view: SharedRowsView<'a>,
     pub(crate) store: &'a mut Store<S>,
     pub(crate) waiting: &'a mut Waiting,
     pub(crate) pixels: &'a mut Pixels,
     pub(crate) io: Io<'a>,
 }
 
-/// What a flat view has that is level.
+/// What drawing parts of an orthographic view with a level camera takes.
 #[derive(Clone, Copy)]
-pub(crate) struct LevelView<'a> {
+pub(crate) struct SharedRowsView<'a> {
     flat: &'a Flat,
     lattice_rows: &'a LatticeRows,
 }
 
-/// Whether parts of `frame` may be rendered here.
-pub(crate) fn takes(frame: &Frame) -> Option<LevelView<'_>> {
-    Some(LevelView { flat: ortho::takes(frame)?, lattice_rows: frame.lattice_rows.as_ref()? })
+/// Returns what drawing parts of `frame` here takes, if they may be drawn here.
+pub(crate) fn accepts(frame: &Frame) -> Option<SharedRowsView<'_>> {
+    Some(SharedRowsView {
+        flat: ortho::accepts(frame)?,
+        lattice_rows: frame.lattice_rows.as_ref()?,
+    })
 }
 
-impl<S: Tiered, const N: usize> Work for RenderLevel<'_, S, N> {
+impl<S: Tiered, const N: usize> Work for RenderSharedRows<'_, S, N> {
     type Out = ();
     #[inline(always)]
     fn run(self, simd: Simd) {
-        let RenderLevel {
+        let RenderSharedRows {
             part,
-            view: LevelView { flat, lattice_rows },
+            view: SharedRowsView { flat, lattice_rows },
             store,
             waiting,
             pixels,
@@ -513,7 +525,7 @@ impl<S: Tiered, const N: usize> Work for RenderLevel<'_, S, N> {
             tossing,
             batch,
         };
-        let sheets = LevelSheets::<S, N>::new(simd, store, &part, lattice_rows, shape);
+        let sheets = SharedRowsSheets::<S, N>::new(simd, store, &part, lattice_rows, shape);
         walk(&part, stage, sheets, queues, pixels, io);
     }
 }
@@ -533,7 +545,7 @@ struct LevelStage<'a, S: Recorded> {
     batch: &'a mut Batch,
 }
 
-impl<S: Tiered, const N: usize> Stage<LevelSheets<'_, S, N>> for LevelStage<'_, S> {
+impl<S: Tiered, const N: usize> Stage<SharedRowsSheets<'_, S, N>> for LevelStage<'_, S> {
     type Voxel = Splat;
 
     #[inline(always)]
@@ -559,7 +571,7 @@ impl<S: Tiered, const N: usize> Stage<LevelSheets<'_, S, N>> for LevelStage<'_, 
         &mut self,
         due: &Due<'_, Splat>,
         k: i32,
-        sheets: &mut LevelSheets<'_, S, N>,
+        sheets: &mut SharedRowsSheets<'_, S, N>,
         open: &OpenMask,
         counters: &mut Counters,
     ) {

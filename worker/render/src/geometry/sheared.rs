@@ -1,8 +1,9 @@
-//! A tile part of a parallel view whose kernel leans, in whole sums.
+//! Parts of orthographic views whose kernel leans, in whole-number sums.
 //!
-//! Voxels land where integers say, as in [`crate::geometry::ortho`]. A voxel's sections lie aside of it by as many
-//! subpixels as the phase of its depth says ([`Leaning`]), and so may their rows; they are added as those of
-//! perspective views are ([`crate::geometry::perspective`]), or, where there are few pixels to each, as [`slant`] says.
+//! Positions are integers, as in [`crate::geometry::ortho`]. A voxel's sections lie beside it by a
+//! number of subpixels that the phase of its depth decides ([`Leaning`]), and so may their rows.
+//! They are added as those of perspective views are ([`crate::geometry::perspective`]), or, where
+//! footprints are small, as [`shear`] says.
 
 use crate::geometry::batch::{Axes, Batch};
 use crate::geometry::open_sheets::{Chunk, Due, EDGE, Queues, Sheets, Stage, Store, slot, walk};
@@ -20,7 +21,7 @@ use crate::visibility::open_mask::OpenMask;
 use slabcast_common::message::Counters;
 use slabcast_common::view::SUBPIXELS;
 
-/// Memory for voxels that a render thread keeps from part to part.
+/// Memory for waiting voxels that a render thread keeps from part to part.
 #[derive(Default)]
 pub(crate) struct Waiting {
     queues: Queues<Splat>,
@@ -28,23 +29,23 @@ pub(crate) struct Waiting {
     batch: Box<Batch>,
 }
 
-/// What a frame needs for its parts to be rendered here.
+/// What drawing parts of a view with a leaning kernel takes.
 #[derive(Clone, Copy)]
 pub struct Lean<'a> {
     pub flat: &'a Flat,
     leaning: &'a Leaning,
 }
 
-/// Whether parts of `frame` may be rendered here.
-pub fn takes(frame: &Frame) -> Option<Lean<'_>> {
+/// Returns what drawing parts of `frame` here takes, if they may be drawn here.
+pub fn accepts(frame: &Frame) -> Option<Lean<'_>> {
     let (flat, leaning) = (frame.flat.as_ref()?, frame.leaning.as_ref()?);
     let fits = flat.reach.iter().all(|reach| 2 * reach + 2 < WINDOW as i32);
     fits.then_some(Lean { flat, leaning })
 }
 
-/// Renders a part, in records of eight sheets, since few kernels that lean reach through four: compiled for each
-/// instruction set as a whole.
-pub struct RenderLeaning<'a, S: Recorded> {
+/// Draws a part in records of eight sheets, since few kernels that lean fit four, as work that is
+/// compiled once for each instruction set.
+pub struct RenderSheared<'a, S: Recorded> {
     pub(crate) part: Part<'a>,
     pub(crate) lean: Lean<'a>,
     pub(crate) store: &'a mut Store<S>,
@@ -53,11 +54,11 @@ pub struct RenderLeaning<'a, S: Recorded> {
     pub(crate) io: Io<'a>,
 }
 
-impl<S: Recorded> Work for RenderLeaning<'_, S> {
+impl<S: Recorded> Work for RenderSheared<'_, S> {
     type Out = ();
     #[inline(always)]
     fn run(self, simd: Simd) {
-        let RenderLeaning { part, lean, store, waiting, pixels, io } = self;
+        let RenderSheared { part, lean, store, waiting, pixels, io } = self;
         let footprint = part.frame.footprints.at(0).expect("a flat view's sheets are all drawn");
         let mut axes = Axes::new(part.frame, 0, &footprint);
         let Waiting { queues, tossing, batch } = waiting;
@@ -121,7 +122,8 @@ impl<S: Recorded, const N: usize> Stage<Sheets<'_, S, N>> for LeaningStage<'_, S
 }
 
 impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
-    /// Takes over those of `some` voxels, which are due at sheet `k`, near which anything is open; says how many.
+    /// Takes over those of `some` voxels, which are due at sheet `k`, near which anything is open;
+    /// says how many.
     #[inline(always)]
     fn take(&mut self, some: &Chunk<'_, Splat>, k: i32, open: &OpenMask) -> usize {
         let most = self.part.frame.sections.most() as i32;
@@ -142,7 +144,8 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
         apart.deep[i] = v.phase() * most as u32 + (most - left) as u32;
     }
 
-    /// Where each section of the first `n` voxels of the batch lies, and the windows that hold all of a voxel's.
+    /// Where each section of the first `n` voxels of the batch lies, and the windows that hold all
+    /// of a voxel's.
     #[inline(always)]
     fn place(&mut self, n: usize, k: i32) {
         let n = whole_registers::<BATCH>(n);
@@ -196,8 +199,8 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
         }
     }
 
-    /// Where the columns of each of the first `n` voxels of the batch lie, which all its sections have, and the windows that hold
-    /// these: from the first of them to the last.
+    /// Where the columns of each of the first `n` voxels of the batch lie, which all its sections
+    /// have, and the windows that hold these: from the first of them to the last.
     #[inline(always)]
     fn place_stacked(&mut self, n: usize, slant: &Slant<'_>) {
         let n = whole_registers::<BATCH>(n);
@@ -225,7 +228,8 @@ impl<S: Recorded, const N: usize> LeaningStage<'_, S, N> {
         apart.cut(1, n);
     }
 
-    /// Adds the first `n` voxels of the batch, of `counted` there were, to their sheets from `k` on.
+    /// Adds the first `n` voxels of the batch, of `counted` there were, to their sheets from `k`
+    /// on.
     #[inline(always)]
     fn add(
         &mut self,

@@ -1,12 +1,12 @@
 //! Pictures in closed form, and bounds of how far a rendered picture may be from them.
 //!
-//! The kernel turns a block of voxels whose appearance depends on their layer alone (a [`LayerStack`]) into
-//! the field `Sx(x) Sy(y) sum_j sigma_j g(z - j)`, with S the sum of the profile g over the
-//! block's lattice points. Along a parallel ray down z, Sx and Sy stay, and the integral of g is a
-//! difference of error functions, or of truncated powers where g is a spline. So optical depth
-//! between any two depths is a sum of those, edges and ripple included. A Gaussian of voxels (a
-//! [`GaussianBlob`]) is a product of three sums along an axis, and, for the Gaussian kernel, a product
-//! of convolutions from any other direction.
+//! The kernel turns a block of voxels whose appearance depends on their layer alone (a
+//! [`LayerStack`]) into the field `Sx(x) Sy(y) sum_j sigma_j g(z - j)`, with S the sum of the
+//! profile g over the block's lattice points. Along a parallel ray down z, Sx and Sy stay, and the
+//! integral of g is a difference of error functions, or of truncated powers where g is a spline. So
+//! optical depth between any two depths is a sum of those, edges and ripple included. A Gaussian of
+//! voxels (a [`GaussianBlob`]) is a product of three sums along an axis, and, for the Gaussian
+//! kernel, a product of convolutions from any other direction.
 //!
 //! A rendered picture differs from these by at most what [`Rounding`] adds up: each term is a bound
 //! derived from the number of roundings, not from observed differences. The profile is written down
@@ -32,8 +32,8 @@ pub struct Profile {
 }
 
 impl Profile {
-    /// A Gaussian of deviation `std` vox, cut at `radius` vox, with its edge value subtracted and its
-    /// integral normalised to one.
+    /// A Gaussian of deviation `std` vox, cut at `radius` vox, with its edge value subtracted and
+    /// its integral normalised to one.
     pub fn new(std: f64, radius: f64) -> Profile {
         let bare = Profile { std, radius, norm: 1.0, degree: None };
         Profile { norm: bare.unnormalised(radius), ..bare }
@@ -163,14 +163,15 @@ impl LayerStack {
         sum
     }
 
-    /// Returns the optical depth in front of depth `z` (vox behind the target) at index position `at`.
+    /// Returns the optical depth in front of depth `z` (vox behind the target) at index position
+    /// `at`.
     pub fn optical_depth(&self, at: [f64; 2], z: f64) -> f64 {
         self.lateral(at) * self.between(-1e9, z)[0]
     }
 
     /// Returns the pixel that looks at index position `at`: linear premultiplied RGBA. Where layers
-    /// differ in colour it is a sum over steps of 1/256 vox, each with its exact mean colour, whose error
-    /// is at most [`LayerStack::thickness_bound`] for that thickness.
+    /// differ in colour it is a sum over steps of 1/256 vox, each with its exact mean colour, whose
+    /// error is at most [`LayerStack::thickness_bound`] for that thickness.
     pub fn pixel(&self, at: [f64; 2]) -> [f64; 4] {
         let lateral = self.lateral(at);
         let total = lateral * self.between(-1e9, 1e9)[0];
@@ -205,12 +206,12 @@ impl LayerStack {
         }
     }
 
-    /// Returns a bound of the error, in linear premultiplied units, of sheets of thickness `d` vox with one
-    /// colour each, at index position `at`.
+    /// Returns a bound of the error, in linear premultiplied units, of sheets of thickness `d` vox
+    /// with one colour each, at index position `at`.
     ///
-    /// In optical depth t a sheet's light is `int C exp(-t)`; with the mean c of C it is c a. As C - c has no mean,
-    /// any constant may be taken from exp(-t): with half of what exp(-t) falls by, and
-    /// `int |C - c| <= tau / 2` times what C spans, the difference is at most `span tau a / 4`.
+    /// In optical depth t a sheet's light is `int C exp(-t)`; with the mean c of C it is c a. As C
+    /// - c has no mean, any constant may be taken from exp(-t): with half of what exp(-t) falls by,
+    /// and `int |C - c| <= tau / 2` times what C spans, the difference is at most `span tau a / 4`.
     /// What C spans is read at 16 places a sheet; ratios of kernel sums have no finer structure.
     pub fn thickness_bound(&self, at: [f64; 2], d: f64) -> f64 {
         let mut bound = 0.0;
@@ -251,8 +252,8 @@ impl LayerStack {
     }
 }
 
-/// Steps of [`LayerStack::pixel`] where colours differ: at 1/256 vox what they add to the error stays
-/// below 1e-3/255 for the scenes here; at 1/128 it is four times that.
+/// Steps of [`LayerStack::pixel`] where colours differ: at 1/256 vox what they add to the error
+/// stays below 1e-3/255 for the scenes here; at 1/128 it is four times that.
 pub const STEP: f64 = 1.0 / 256.0;
 
 /// How a picture was rounded, for bounds of its error.
@@ -262,8 +263,8 @@ pub struct Rounding {
     pub thickness: f64,
     /// Largest extinction per vox that integer sums were made for; `None` where sums are floats.
     pub integers: Option<f64>,
-    /// Largest error of a position along an axis of the picture, in vox: half a subpixel, or zero where
-    /// all voxels fall on subpixels.
+    /// Largest error of a position along an axis of the picture, in vox: half a subpixel, or zero
+    /// where all voxels fall on subpixels.
     pub shift: f64,
 }
 
@@ -330,8 +331,8 @@ impl GaussianBlob {
         (0..n).map(move |i| f64::from(i) - (f64::from(n) - 1.0) / 2.0)
     }
 
-    /// Returns the optical depth of a ray along an index axis that passes (x, y) vox from the centre:
-    /// exact, with the kernel's ripple.
+    /// Returns the optical depth of a ray along an index axis that passes (x, y) vox from the
+    /// centre: exact, with the kernel's ripple.
     pub fn depth_along_axis(&self, [x, y]: [f64; 2]) -> f64 {
         let sum = |u: f64| -> f64 {
             self.places().map(|i| self.density(i) * self.profile.at(u - i)).sum()
@@ -340,8 +341,8 @@ impl GaussianBlob {
         self.peak * sum(x) * sum(y) * deep
     }
 
-    /// Returns a bound of the change of [`GaussianBlob::depth_along_axis`] by positions that are off by up
-    /// to `shift` vox along each axis.
+    /// Returns a bound of the change of [`GaussianBlob::depth_along_axis`] by positions that are
+    /// off by up to `shift` vox along each axis.
     pub fn position_bound(&self, [x, y]: [f64; 2], shift: f64) -> f64 {
         let sum = |u: f64| -> f64 {
             self.places().map(|i| self.density(i) * self.profile.at(u - i)).sum()
@@ -353,9 +354,9 @@ impl GaussianBlob {
         1.05 * shift * self.peak * (steep(x) * sum(y) + sum(x) * steep(y)) * deep
     }
 
-    /// Returns the optical depth of a ray in any direction that passes (x, y) vox from the centre along
-    /// the picture's axes: the Gaussian convolved with the kernel. The sum over voxels differs from it by
-    /// at most [`GaussianBlob::aliasing_bound`].
+    /// Returns the optical depth of a ray in any direction that passes (x, y) vox from the centre
+    /// along the picture's axes: the Gaussian convolved with the kernel. The sum over voxels
+    /// differs from it by at most [`GaussianBlob::aliasing_bound`].
     pub fn depth_from(&self, [x, y]: [f64; 2]) -> f64 {
         self.peak * (2.0 * PI).sqrt() * self.std * self.convolved(x) * self.convolved(y)
     }
@@ -376,8 +377,8 @@ impl GaussianBlob {
         (bells - self.profile.bell(r) * edge) / self.profile.norm
     }
 
-    /// Returns a bound of what the lattice may add to [`GaussianBlob::depth_from`] at (x, y) vox, in a view
-    /// whose eye coordinates are `eye_from_index` times index coordinates.
+    /// Returns a bound of what the lattice may add to [`GaussianBlob::depth_from`] at (x, y) vox,
+    /// in a view whose eye coordinates are `eye_from_index` times index coordinates.
     ///
     /// By Poisson's formula a sum over voxels
     /// is a sum of integrals, one for each m of the dual lattice; that of m = 0 is the convolution.

@@ -1,8 +1,8 @@
-//! Numbers of 32 bits side by side in a register, as many as an instruction set has.
+//! SIMD lanes: 32-bit numbers in a register, as many as an instruction set has.
 //!
-//! What compilers do not make of plain loops, such as putting those lanes beside each other that are
-//! wanted, is written once for any number of lanes: in functions that are inlined into one that is
-//! compiled for the instruction set. Functions here need that set, and say nothing else of it.
+//! Operations that compilers do not make of plain loops, such as compressing the wanted lanes, are
+//! written once for any number of lanes, in functions that are inlined into one that is compiled
+//! for the instruction set. Functions here need that set, and check nothing.
 
 #[cfg(target_arch = "aarch64")]
 mod neon;
@@ -53,14 +53,15 @@ pub(crate) trait Lanes {
     unsafe fn marks(bits: u32) -> Self::Marks;
     /// `a`, and 1 more where it is marked.
     unsafe fn one_more(marks: Self::Marks, a: Self::Ints) -> Self::Ints;
-    /// The `at`th numbers of `table`, in lanes that are marked; of others no more than the table's first is
-    /// read.
+    /// The `at`th numbers of `table`, in lanes that are marked; of others no more than the table's
+    /// first is read.
     unsafe fn look_up(marks: Self::Marks, table: *const u32, at: Self::Ints) -> Self::Ints;
     /// Those of `bits` beside each other, from the first lane on.
     unsafe fn beside(bits: u32, a: Self::Ints) -> Self::Ints;
     /// The first ones in the lanes of `bits`.
     unsafe fn spread(bits: u32, a: Self::Ints) -> Self::Ints;
-    /// The first ones of `items`, as many as there are lanes or items; what other lanes hold is not said.
+    /// The first ones of `items`, as many as there are lanes or items; what other lanes hold is not
+    /// said.
     unsafe fn bytes(items: &[u8]) -> Self::Ints;
     /// See [`Lanes::bytes`].
     unsafe fn shorts(items: &[u16]) -> Self::Ints;
@@ -68,8 +69,8 @@ pub(crate) trait Lanes {
     unsafe fn floats(items: &[f32]) -> Self::Ints;
     /// Lane by lane, four numbers of each.
     unsafe fn store_fours(to: *mut u32, fours: [Self::Ints; 4]);
-    /// Four numbers from each of as many places as there are lanes: the first of all places, the second, and
-    /// so on. The `i`th begins at the `at[i] * stride`th number behind `from`.
+    /// Four numbers from each of as many places as there are lanes: the first of all places, the
+    /// second, and so on. The `i`th begins at the `at[i] * stride`th number behind `from`.
     unsafe fn fours(from: *const u32, stride: usize, at: *const u32) -> [Self::Ints; 4];
     /// The same of places that follow each other, from `from` on.
     unsafe fn fours_on(from: *const u32) -> [Self::Ints; 4];

@@ -1,4 +1,4 @@
-//! Looks of many voxels, taken from a table.
+//! Extinctions and colours of many voxels, looked up in a table by sample code.
 
 use super::Simd;
 use slabcast_common::transfer::OpticalSample;
@@ -79,8 +79,8 @@ mod wide {
         let whole = codes.len() / L::LANES * L::LANES;
         for i in (0..whole).step_by(L::LANES) {
             let some = &codes[i..i + L::LANES];
-            // SAFETY: the caller's. Each code was seen to be in the table, whose looks are four numbers each, in
-            // order; and as many lanes are left in what comes out.
+            // SAFETY: the caller's. Each code was seen to be in the table, whose looks are four
+            // numbers each, in order; and as many lanes are left in what comes out.
             unsafe {
                 let fours = L::fours(table.as_ptr().cast(), 4, some.as_ptr());
                 for (out, four) in out.iter_mut().zip(fours) {

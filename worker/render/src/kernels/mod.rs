@@ -1,14 +1,13 @@
-//! The innermost loop: a section of a voxel is added to a sheet.
+//! The innermost loops: sections of voxels are added to sheets, and sheets are composited.
 //!
-//! The loop is written once, plainly, over pixels of four sums; it is compiled for the
-//! machine's baseline and on x86-64 again for AVX2 and AVX-512, and chosen at run time. On 64-bit ARM
-//! NEON is in the baseline: there compilers use it in plain loops, and what they don't make of these
-//! is written for it. There is no fused multiply-add in any and compilers may not invent one, so all
-//! give the same bytes.
+//! Loops are written once, plainly; they are compiled for the machine's baseline and on x86-64
+//! again for AVX2 and AVX-512, and chosen at run time ([`Simd`]). On 64-bit ARM NEON is in the
+//! baseline; what compilers do not make of the plain loops is written for it. No fused multiply-add
+//! is used and compilers may not invent one, so all give the same bytes.
 //!
-//! This module is the wall: the only place with `unsafe`. It holds two things: the call of a
-//! function compiled for instructions that were seen on this machine, and the conversion of a
-//! float to an integer without the range check that would double the loop's cost.
+//! This room is the wall: the only one with `unsafe`. It holds two things: calls of functions
+//! compiled for instructions that were detected on this machine, and conversions of floats to
+//! integers without the range check that would double the loop's cost.
 #![expect(unsafe_code, reason = "the one wall: run-time dispatch, unchecked conversion, lanes")]
 
 /// Functions that are compiled for some features.
@@ -131,7 +130,8 @@ pub trait Accumulate: Sum {
     fn on(way: Self::Way, row: Self, wy: Self::Weight) -> Self::Way;
     /// What it is in the end.
     fn end(way: Self::Way) -> Self;
-    /// What a pixel has of lattice rows, each times its weight [for rows](Weight::of_rows), in their order.
+    /// What a pixel has of lattice rows, each times its weight [for rows](Weight::of_rows), in
+    /// their order.
     #[inline(always)]
     fn down(rows: impl Iterator<Item = (Self, Self::Weight)>) -> Self {
         Self::end(rows.fold(Self::Way::default(), |way, (row, wy)| Self::on(way, row, wy)))
@@ -154,8 +154,9 @@ impl Section {
 /// The largest f32 below 2^31.
 pub const LARGEST: f32 = 2_147_483_520.0;
 
-/// The whole number nearest to `x`, which is not negative, of two the even one; the largest that an f32 can
-/// be below 2^31 for what is larger or not a number. One instruction on lanes, where nothing is larger.
+/// The whole number nearest to `x`, which is not negative, of two the even one; the largest that an
+/// f32 can be below 2^31 for what is larger or not a number. One instruction on lanes, where
+/// nothing is larger.
 #[inline(always)]
 pub fn nearest(x: f32) -> i32 {
     let x = if x < LARGEST { x } else { LARGEST };
@@ -193,7 +194,8 @@ impl Accumulate for i32 {
         self.wrapping_add(nearest(row.0 * wx.0))
     }
 
-    /// Floats, since they have one order: four or five of them are off by less than any row is rounded.
+    /// Floats, since they have one order: four or five of them are off by less than any row is
+    /// rounded.
     #[inline(always)]
     fn on(way: f32, row: i32, wy: Tap) -> f32 {
         way + row as f32 * wy.0
@@ -430,20 +432,22 @@ impl Simd {
     }
 }
 
-/// `n`, or a few more for the last register of a loop to be full: what does not fill one is worked out one by
-/// one, and there may be as much of that as of the rest. No more than `MOST`, which compilers then know.
+/// `n`, or a few more for the last register of a loop to be full: what does not fill one is worked
+/// out one by one, and there may be as much of that as of the rest. No more than `MOST`, which
+/// compilers then know.
 #[inline(always)]
 pub fn whole_registers<const MOST: usize>(n: usize) -> usize {
     const { assert!(MOST.is_multiple_of(16)) };
     n.next_multiple_of(16).min(MOST)
 }
 
-/// Work that is compiled for every instruction set. Whatever it calls must be `inline(always)` to be
-/// compiled with it.
+/// Work that is compiled for every instruction set. Whatever it calls must be `inline(always)` to
+/// be compiled with it.
 pub trait Work {
     /// What comes out.
     type Out;
-    /// Does it. Which instruction set it is compiled for is known where it is: what is for others is left out.
+    /// Does it. Which instruction set it is compiled for is known where it is: what is for others
+    /// is left out.
     fn run(self, simd: Simd) -> Self::Out;
 }
 

@@ -1,10 +1,11 @@
-//! Sifting: which voxels of a brick are wanted in a part, and all that drawing those takes.
+//! The bucket toss (paper, section 3): which voxels of a brick may show in a part, with all that
+//! drawing them takes.
 //!
-//! Voxels are placed, in a flat view by an addition, tested against the part's sheets and one bit of
-//! its mask, and those that are left put beside each other. With AVX-512 that is done for sixteen local
-//! indices at a time, present or not, in flat views with AVX2 for eight and with NEON for four, and what is
-//! not wanted never gets out of the registers; elsewhere in loops over plain arrays, one for each step, and what is
-//! kept is put beside each other in lanes.
+//! Voxels are positioned (in orthographic views by an addition), tested against the part's sheets
+//! and one bit of its mask, and those that are left are packed. With AVX-512 that is done for
+//! sixteen local indices at a time, present or not, in orthographic views with AVX2 for eight and
+//! with NEON for four, and voxels that can't show never leave the registers; elsewhere in loops
+//! over plain arrays, one a step, and the kept ones are packed in lanes.
 
 use super::pixel_records::Splat;
 use super::row_records::Shape;
@@ -169,8 +170,9 @@ pub struct TierOf {
     pub per: i32,
 }
 
-/// Tiers lie 192 subpixels apart and more ([`crate::primitives::lattice_rows`]), and voxels less than 2^15 from the part's first
-/// row: so products stay below 2^28, and a thousandth of a tier is told apart.
+/// Tiers lie 192 subpixels apart and more ([`crate::primitives::lattice_rows`]), and voxels less
+/// than 2^15 from the part's first row: so products stay below 2^28, and a thousandth of a tier is
+/// told apart.
 pub const TIER_BITS: u32 = 20;
 
 impl TierOf {
@@ -201,8 +203,8 @@ impl Tossing {
     }
 }
 
-/// Has the memory of a brick that is sifted next come nearer: samples and normals of most bricks were
-/// last looked at a frame ago.
+/// Has the memory of a brick that is sifted next come nearer: samples and normals of most bricks
+/// were last looked at a frame ago.
 #[inline(always)]
 pub fn prefetch(brick: &Brick) {
     let Brick { values, normals, .. } = brick;
@@ -246,8 +248,8 @@ pub fn any_in_rows(simd: Simd, rows: &[u64; 64], [begin, end]: [usize; 2], colum
 }
 
 impl<P: Placing> Sieve<'_, P> {
-    /// Puts place or local index, first sheet, cell, sample and normal of those that are kept beside each
-    /// other.
+    /// Puts place or local index, first sheet, cell, sample and normal of those that are kept
+    /// beside each other.
     #[inline(always)]
     fn sift_plain(&self, simd: Simd, brick: &Brick, tossing: &mut Tossing) -> Sifted {
         let Tossing { at, first, fate, cells, samples, normals, locals, .. } = tossing;
@@ -277,8 +279,8 @@ impl<P: Placing> Sieve<'_, P> {
     }
 }
 
-/// Puts those of the first `n` whose fate is `wanted` or more beside each other, with places or with local indices;
-/// says how many there are.
+/// Puts those of the first `n` whose fate is `wanted` or more beside each other, with places or
+/// with local indices; says how many there are.
 #[inline(always)]
 fn keep(simd: Simd, tossing: &mut Tossing, n: usize, wanted: u32, places: bool) -> usize {
     let n = n.min(BRICK_VOXELS);
@@ -317,7 +319,8 @@ impl Sieve<'_, DeepBrick<'_>> {
             // SAFETY: the value proves that the instructions are there.
             #[cfg(target_arch = "x86_64")]
             Level::Avx512 => unsafe { wide::avx512::sift(self, brick, tossing) },
-            // Four divisions at a time are too few to place voxels that are not there, too; NEON has two.
+            // Four divisions at a time are too few to place voxels that are not there, too; NEON
+            // has two.
             _ => self.sift_plain(simd, brick, tossing),
         }
     }
@@ -439,7 +442,8 @@ mod wide {
     use slabcast_common::view::{SUBPIXEL_BITS, SUBPIXELS};
     use slabcast_common::volume::Samples;
 
-    /// What is compiled for an instruction set: every function that these call is inlined into them.
+    /// What is compiled for an instruction set: every function that these call is inlined into
+    /// them.
     macro_rules! compiled {
         ($name:ident, $features:literal, $lanes:ty) => {
             pub(super) mod $name {
@@ -506,8 +510,9 @@ mod wide {
         let mut kept = 0;
         for from in (0..n.min(512)).step_by(L::LANES) {
             let there = (1u64 << (n - from).min(L::LANES)) as u32 - 1;
-            // SAFETY: the caller's. Arrays have 512 numbers, a multiple of lanes; and as no more are kept than were gone
-            // through, what is stored lies where these lanes lay or in front.
+            // SAFETY: the caller's. Arrays have 512 numbers, a multiple of lanes; and as no more
+            // are kept than were gone through, what is stored lies where these lanes lay or in
+            // front.
             unsafe {
                 let fate = L::load(fate.as_ptr().add(from));
                 let mark = L::bits(L::less(L::set(wanted as i32 - 1), fate)) & there;
@@ -710,8 +715,8 @@ mod wide {
                     let [px, py] = [L::min(L::max(px, zero), last), L::min(L::max(py, zero), last)];
                     let cell = L::or(L::up(py, 6), px);
                     if *cull {
-                        // The mask in words of 32 bits; a cell is below 64 times 64, so its word is one of
-                        // the mask's 128. The bit that is asked for goes where a sign is.
+                        // The mask in words of 32 bits; a cell is below 64 times 64, so its word is
+                        // one of the mask's 128. The bit that is asked for goes where a sign is.
                         let words = L::look_up(near, grown.as_ptr().cast(), L::down(cell, 5));
                         let words = L::up_each(words, L::without(px, L::set(31)));
                         mark &= L::bits(L::less(words, zero));
@@ -724,8 +729,8 @@ mod wide {
                         Some(normals) => L::spread(present, Wide::load::<L>(&normals[here..])),
                         None => L::set(NO_NORMAL.into()),
                     };
-                    // No more are kept than were gone through, so as many lanes from there on are among an
-                    // array's 512.
+                    // No more are kept than were gone through, so as many lanes from there on are
+                    // among an array's 512.
                     if P::KEPT {
                         L::store(x_to.as_mut_ptr().add(kept).cast(), L::beside(mark, x));
                         L::store(y_to.as_mut_ptr().add(kept).cast(), L::beside(mark, y));

@@ -1,8 +1,8 @@
-//! Pixels that a closing sheet was touched at, wherever they lie in their part: lists of them, and rows
-//! of a closing sheet in, out and back.
+//! Touched pixels of a closing sheet: lists of them, and gathering and scattering of their sums.
 //!
-//! A row of lanes takes sixteen pixels from anywhere, so that no lane is spent on one that nothing was
-//! added to, and where many footprints leave nothing at their rims on none of those, either. Loops are written plainly, and once for all registers; both give the same bytes.
+//! A row of lanes takes sixteen pixels from anywhere, so that no lane is spent on a pixel that
+//! nothing was added to. Loops are written plainly, and once for all register widths; both give the
+//! same bytes.
 
 use super::Simd;
 use super::pixel_records::{Record, Recorded, STRIDE};
@@ -79,8 +79,8 @@ impl Places {
         }
     }
 
-    /// Leaves only those where the sheet that `slot` holds has any extinction. At the others it is over and
-    /// done with: what there is of its sums are the ones before, and the slot is empty.
+    /// Leaves only those where the sheet that `slot` holds has any extinction. At the others it is
+    /// over and done with: what there is of its sums are the ones before, and the slot is empty.
     ///
     /// # Panics
     /// If there are fewer records or sums than a part has.
@@ -148,7 +148,8 @@ impl Places {
         self.n
     }
 
-    /// Those from the `i`th on, at most sixteen. Lanes behind the last hold places that there are, too.
+    /// Those from the `i`th on, at most sixteen. Lanes behind the last hold places that there are,
+    /// too.
     #[inline(always)]
     pub fn from(&self, i: usize) -> Some16<'_> {
         let at = self.at[i..].first_chunk().expect("room behind the last");
@@ -163,7 +164,8 @@ pub fn column_and_row(place: u32) -> [usize; 2] {
     [place % STRIDE, place / STRIDE]
 }
 
-/// A pixel's first 32 bits: its extinction, and no more than one colour beside it. Zero: it has none.
+/// A pixel's first 32 bits: its extinction, and no more than one colour beside it. Zero: it has
+/// none.
 #[inline(always)]
 pub fn first_word<P: bytemuck::Pod>(pixel: &P) -> u32 {
     bytemuck::pod_read_unaligned(&bytemuck::bytes_of(pixel)[..4])
@@ -173,9 +175,9 @@ pub fn first_word<P: bytemuck::Pod>(pixel: &P) -> u32 {
 pub(crate) type SumsOf<'a, S, const N: usize> =
     (&'a mut [Record<S, N>], &'a mut [<S as Recorded>::Pixel]);
 
-/// Takes the sums of sheet k, which `slot` holds, at some places for a row that is to be closed: those of
-/// the sheet before, of the sheet itself, and of the one behind, and the opacity so far. Leaves those of
-/// sheet k as the ones before and nothing in the slot.
+/// Takes the sums of sheet k, which `slot` holds, at some places for a row that is to be closed:
+/// those of the sheet before, of the sheet itself, and of the one behind, and the opacity so far.
+/// Leaves those of sheet k as the ones before and nothing in the slot.
 ///
 /// # Panics
 /// If there are fewer records, sums or pixels than a part has.
@@ -395,8 +397,8 @@ mod wide {
                 let group = row.trailing_zeros() as usize / L::LANES * L::LANES;
                 let bits = (row >> group) as u32 & ((1 << L::LANES) - 1);
                 row &= u64::MAX.checked_shl((group + L::LANES) as u32).unwrap_or(0);
-                // SAFETY: the caller's. Rows have 64 times 64 bits, so as many lanes as there are fit behind
-                // those that were found.
+                // SAFETY: the caller's. Rows have 64 times 64 bits, so as many lanes as there are
+                // fit behind those that were found.
                 unsafe {
                     let at = L::from((y * STRIDE + group) as i32);
                     L::store(to.add(n), L::beside(bits, at));
@@ -419,8 +421,9 @@ mod wide {
         let first: *mut S::Pixel = records.as_mut_ptr().cast();
         let (all, mut kept) = (places.at.as_mut_ptr(), 0);
         let (empty, mut dropped) = (places.dropped.as_mut_ptr(), 0);
-        // SAFETY: the caller's. A record has N pixels, and all places are below PART. So many lanes as there are
-        // fit behind the last place, and what is kept of some is stored where they or those before them lay.
+        // SAFETY: the caller's. A record has N pixels, and all places are below PART. So many lanes
+        // as there are fit behind the last place, and what is kept of some is stored where they or
+        // those before them lay.
         unsafe {
             let now = first.add(slot % N);
             for from in (0..places.n).step_by(L::LANES) {
@@ -459,8 +462,8 @@ mod wide {
         let (pixels, slot, behind) = (&pixels[..PART], slot % N, (slot + 1) % N);
         let old: *mut S::Pixel = before.as_mut_ptr();
         let first: *mut S::Pixel = records.as_mut_ptr().cast();
-        // SAFETY: the caller's. A record has N pixels. All places are below PART, and there are as many lanes
-        // in a row's arrays from `lanes` on.
+        // SAFETY: the caller's. A record has N pixels. All places are below PART, and there are as
+        // many lanes in a row's arrays from `lanes` on.
         unsafe {
             let [now, next] = [first.add(slot), first.add(behind)];
             for lanes in (0..n).step_by(L::LANES) {
@@ -503,7 +506,8 @@ mod wide {
         let to = [&mut row.before, &mut row.here, &mut row.behind];
         for (to, sheet) in to.into_iter().zip(sheets) {
             for lanes in (0..LANES).step_by(L::LANES) {
-                // SAFETY: the caller's. There are as many pixels, and lanes in a row's arrays, from `lanes` on.
+                // SAFETY: the caller's. There are as many pixels, and lanes in a row's arrays, from
+                // `lanes` on.
                 unsafe {
                     let from: *const u32 = sheet[lanes..].as_ptr().cast();
                     let sums = if words == 4 {

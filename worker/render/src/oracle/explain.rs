@@ -1,10 +1,10 @@
 //! One pixel, sheet by sheet: what the renderer did there and which voxels made it.
 //!
 //! The paper's listing once more, for one pixel: its voxels in the order in which float sums are
-//! defined, their sections put into sheets, sheets composited by the renderer's own rule. Every number
-//! is the renderer's, in its own arithmetic, and the resulting pixel equals the rendered one bit for
-//! bit (a test keeps it). Like [`crate::oracle::serial`] it culls nothing; what lies behind the sheet in
-//! which the pixel was shut is counted, not drawn.
+//! defined, their sections put into sheets, sheets composited by the renderer's own rule. Every
+//! number is the renderer's, in its own arithmetic, and the resulting pixel equals the rendered one
+//! bit for bit (a test keeps it). Like [`crate::oracle::serial`] it culls nothing; what lies behind
+//! the sheet in which the pixel was shut is counted, not drawn.
 
 use crate::kernels::{Accumulate, Weight};
 use crate::scene::Frame;
@@ -42,7 +42,8 @@ pub struct SheetAtPixel {
     pub k: i32,
     /// The sheet's sums in raw units: extinction, then the three colours times extinction.
     pub raw: [f32; 4],
-    /// The sums of the sheet behind when this one was composited, half filled: the colour rule's peek.
+    /// The sums of the sheet behind when this one was composited, half filled: the colour rule's
+    /// peek.
     pub peek: [f32; 4],
     /// Optical depth of the sheet along the ray (sum of opacities, for the paper's compositing).
     pub tau: f32,
@@ -79,8 +80,8 @@ pub struct SectionAtPixel {
     pub colour: [f32; 3],
 }
 
-/// Explains pixel (x, y) of `frame`, counted from the top left, from `bricks`, all bricks of its scene.
-/// Each sheet lists at most `strongest` voxels.
+/// Explains pixel (x, y) of `frame`, counted from the top left, from `bricks`, all bricks of its
+/// scene. Each sheet lists at most `strongest` voxels.
 ///
 /// # Panics
 /// If the pixel is not in the picture.

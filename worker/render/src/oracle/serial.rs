@@ -18,8 +18,8 @@ use slabcast_common::quality::Sums;
 use slabcast_common::slab::SheetRange;
 use std::sync::Arc;
 
-/// Renders `frame` from `bricks`, all bricks of its scene in any order. Returns linear premultiplied
-/// RGBA. Every other renderer of the crate gives these bytes.
+/// Renders `frame` from `bricks`, all bricks of its scene in any order. Returns linear
+/// premultiplied RGBA. Every other renderer of the crate gives these bytes.
 pub fn render(frame: &Frame, bricks: &[Arc<Brick>]) -> Picture {
     render_counting(frame, bricks, None)
 }

@@ -1,8 +1,8 @@
 //! The work of each pixel of a picture: sheets, sections, and the sheet in which it was shut.
 //!
-//! The serial renderer draws once more and counts ([`crate::oracle::serial`]). So the numbers are the
-//! model's, the same on every machine, and not those of one schedule. Culling saves work beyond them;
-//! tiles and sheets that nobody reads cost some that is not in them.
+//! The serial renderer draws once more and counts ([`crate::oracle::serial`]). So the numbers are
+//! the model's, the same on every machine, and not those of one schedule. Culling saves work beyond
+//! them; tiles and sheets that nobody reads cost some that is not in them.
 
 use crate::oracle::serial;
 use crate::scene::Frame;
@@ -25,8 +25,8 @@ pub struct WorkCounters {
     pub first: Option<i32>,
 }
 
-/// Renders `frame` with the serial oracle from `bricks`, all bricks of its scene, and counts the work of
-/// each pixel.
+/// Renders `frame` with the serial oracle from `bricks`, all bricks of its scene, and counts the
+/// work of each pixel.
 pub fn count_work(frame: &Frame, bricks: &[Arc<Brick>]) -> (Picture, WorkCounters) {
     let [w, h] = frame.view.size.map(|n| n as usize);
     let mut counters = WorkCounters {

@@ -1,8 +1,8 @@
 //! Bricks of a part that may arrive while it is drawn.
 //!
-//! A part that runs through all sheets asks, sheet by sheet, for the bricks that begin there and may
-//! touch an open pixel ([`ArrivingBricks::is_supplied`]). Where one is missing the part stops, with a
-//! list of what it lacks.
+//! A part that runs through all sheets asks, sheet by sheet, for the bricks that begin there and
+//! may touch an open pixel ([`ArrivingBricks::is_supplied`]). Where one is missing the part stops,
+//! with a list of what it lacks.
 
 use crate::scene::{Corner, Frame};
 use crate::visibility::closing_depth::{Cells, LOOKS};
@@ -270,8 +270,8 @@ impl<'a> ArrivingBricks<'a> {
     }
 
     /// Takes the bricks that begin at sheet `k` and may show; the voxels of the others are counted
-    /// as culled. Returns false, and notes what is missing, if one of them is not held or the supply
-    /// [stops](BrickSupply::stops) the region. `k` rises by one from call to call.
+    /// as culled. Returns false, and notes what is missing, if one of them is not held or the
+    /// supply [stops](BrickSupply::stops) the region. `k` rises by one from call to call.
     pub(crate) fn is_supplied(&self, k: i32, open: &OpenMask, counters: &mut Counters) -> bool {
         if self.supply.stops() {
             self.stop.set(Some(k));

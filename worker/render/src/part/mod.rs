@@ -27,14 +27,15 @@ pub struct ProjectedBrick {
 }
 
 impl ProjectedBrick {
-    /// Projects `brick` into `frame`; `None` if it is off the picture or in front of the near plane.
+    /// Projects `brick` into `frame`; `None` if it is off the picture or in front of the near
+    /// plane.
     pub fn new(frame: &Frame, brick: &Arc<Brick>) -> Option<ProjectedBrick> {
         let projected = frame.view.project(&brick.tight_box(&frame.scene.grid))?;
         Some(ProjectedBrick { brick: brick.clone(), projected, corner: frame.corner(brick.id) })
     }
 
-    /// Returns `bricks` front to back by first sheet; those that begin at the same sheet in ascending
-    /// id.
+    /// Returns `bricks` front to back by first sheet; those that begin at the same sheet in
+    /// ascending id.
     pub fn front_to_back(bricks: &[ProjectedBrick]) -> Vec<&ProjectedBrick> {
         // Sorting keys and indices takes a third of the time of sorting bricks.
         let key = |b: &ProjectedBrick| (b.projected.sheets.first, b.brick.id);
@@ -101,8 +102,8 @@ impl Part<'_> {
         }
     }
 
-    /// Whether the part has a brick `i` that begins at sheet `k` or before. Arriving bricks count once
-    /// they were [supplied](Part::is_supplied).
+    /// Whether the part has a brick `i` that begins at sheet `k` or before. Arriving bricks count
+    /// once they were [supplied](Part::is_supplied).
     #[inline(always)]
     pub(crate) fn begins(&self, i: usize, k: i32) -> bool {
         match self.bricks {
@@ -238,8 +239,8 @@ impl Part<'_> {
     }
 }
 
-/// Returns the tile's plane for the sums of the last sheet, if the next slab needs them. A part that
-/// stopped before its slab's end makes one.
+/// Returns the tile's plane for the sums of the last sheet, if the next slab needs them. A part
+/// that stopped before its slab's end makes one.
 pub fn keep_last<'a>(
     part: &Part<'_>,
     stopped: bool,

@@ -1,8 +1,9 @@
 //! The kernel's profile, its sections in depth and its footprints on the screen.
 //!
-//! The kernel is a product of three 1-D profiles along the eye's axes (DESIGN.md section 1), in lattices that
-//! are not cubic along axes that [lean](slabcast_common::kernel): a Gaussian of standard deviation s, cut at
-//! radius R, with its edge value subtracted and its integral normalised to one:
+//! The kernel is a product of three 1-D profiles along the eye's axes (docs/design/model.md), in
+//! lattices that are not cubic along axes that [lean](slabcast_common::kernel): a Gaussian of
+//! standard deviation s, cut at radius R, with its edge value subtracted and its integral
+//! normalised to one:
 //!
 //! ```text
 //! g(u) = (exp(-u^2 / 2 s^2) - exp(-R^2 / 2 s^2)) / Z,   |u| < R
@@ -29,10 +30,11 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 /// Sections by depth phase: which sheets a voxel touches and how much of it lies in each.
 ///
-/// A kernel that is m sheets long lies in m + 1 of them wherever it does not begin at a plane, and of
-/// one of the outermost it has a sliver. Where slivers hold next to nothing each may be given to the sheet
-/// beside it: every voxel then lies in m sheets, its weights still add up to one, and at sheets of a vox
-/// a pixel's four fit a record where five do not ([`Sections::given_away`] says what that may cost).
+/// A kernel that is m sheets long lies in m + 1 of them wherever it does not begin at a plane, and
+/// of one of the outermost it has a sliver. Where slivers hold next to nothing each may be given to
+/// the sheet beside it: every voxel then lies in m sheets, its weights still add up to one, and at
+/// sheets of a vox a pixel's four fit a record where five do not ([`Sections::given_away`] says
+/// what that may cost).
 #[derive(Clone, Debug)]
 pub struct Sections {
     phases: i32,
@@ -48,15 +50,16 @@ pub struct Sections {
     stride: usize,
 }
 
-/// The share of a voxel beyond the m - 1 sheets in its middle up to which slivers are given away: the
-/// default kernel has 0.0045 beyond 1.5 vox from its centre, which is as much as a sliver can be at sheets
-/// of 1 vox; at 2 vox it would be 0.05, and the picture of other sheets.
+/// The share of a voxel beyond the m - 1 sheets in its middle up to which slivers are given away:
+/// the default kernel has 0.0045 beyond 1.5 vox from its centre, which is as much as a sliver can
+/// be at sheets of 1 vox; at 2 vox it would be 0.05, and the picture of other sheets.
 pub const SLIVER: f64 = 0.005;
 
-/// By how much of a sheet the sheets that are kept lie before a voxel's middle, as a divisor. What is in front
-/// of an opaque voxel's first sheet is seen whole, what is behind its last one through all of the voxel:
-/// with a quarter, the default kernel loses 0.0007 in front at most and 0.016 behind, with none 0.0045 on
-/// either side, and the picture of mri256 (`peer-opaque`) is off by 0.16 of 1/255 instead of 0.04.
+/// By how much of a sheet the sheets that are kept lie before a voxel's middle, as a divisor. What
+/// is in front of an opaque voxel's first sheet is seen whole, what is behind its last one through
+/// all of the voxel: with a quarter, the default kernel loses 0.0007 in front at most and 0.016
+/// behind, with none 0.0045 on either side, and the picture of mri256 (`peer-opaque`) is off by
+/// 0.16 of 1/255 instead of 0.04.
 const AHEAD: i32 = 4;
 
 /// A weight from 0 to 1 in 16-bit fixed point: 2^-15 a unit, rounded to nearest.
@@ -70,8 +73,8 @@ fn whole_phases(profile: &Profile, thickness: f64, phases: i32) -> i32 {
     libm::ceil(profile.radius / thickness * f64::from(phases) * (1.0 - 1e-12)) as i32
 }
 
-/// How far before and behind a voxel's depth, in phases, it is drawn where slivers are given away; `None`
-/// where they are no slivers.
+/// How far before and behind a voxel's depth, in phases, it is drawn where slivers are given away;
+/// `None` where they are no slivers.
 fn kept(profile: &Profile, thickness: f64, phases: i32) -> Option<(i32, i32)> {
     let radius = whole_phases(profile, thickness, phases);
     // As many whole sheets as are shorter than the kernel, in its middle.
@@ -82,8 +85,8 @@ fn kept(profile: &Profile, thickness: f64, phases: i32) -> Option<(i32, i32)> {
 }
 
 impl Sections {
-    /// For sheets of `thickness` and a kernel profile along z, both in vox; `merged`: with slivers given
-    /// to their neighbours.
+    /// For sheets of `thickness` and a kernel profile along z, both in vox; `merged`: with slivers
+    /// given to their neighbours.
     pub fn new(profile: &Profile, thickness: f64, phases: i32, merged: bool) -> Self {
         let radius = whole_phases(profile, thickness, phases);
         let (front, back) = match kept(profile, thickness, phases) {
@@ -113,9 +116,10 @@ impl Sections {
         sections
     }
 
-    /// How much of a pixel's light may change its sheet where slivers are given away, at most, by voxels of
-    /// extinction up to `most` per vox: 0 to 1. In front that is a sliver's opacity; behind, what shows of it
-    /// through its voxel, `t exp(-t)` of the sliver for an optical depth t of the voxel.
+    /// How much of a pixel's light may change its sheet where slivers are given away, at most, by
+    /// voxels of extinction up to `most` per vox: 0 to 1. In front that is a sliver's opacity;
+    /// behind, what shows of it through its voxel, `t exp(-t)` of the sliver for an optical depth t
+    /// of the voxel.
     pub fn given_away(profile: &Profile, thickness: f64, phases: i32, most: f64) -> f64 {
         let Some((front, back)) = kept(profile, thickness, phases) else { return 0.0 };
         let beyond = |reach: i32| {
@@ -132,7 +136,8 @@ impl Sections {
         (self.first(z), &self.weights[row..row + count])
     }
 
-    /// [`Sections::of`] with weights over the thickness, in steps of the lattice, in units of 2^-15.
+    /// [`Sections::of`] with weights over the thickness, in steps of the lattice, in units of
+    /// 2^-15.
     #[inline]
     pub fn of_fixed(&self, z: i32) -> (i32, &[i16]) {
         let (row, count) = self.row(z);
@@ -152,8 +157,8 @@ impl Sections {
         (first, (((z + self.back) >> self.shift) - first + 1) as u32)
     }
 
-    /// Phases that a voxel reaches to the front and to the back, and phases of a sheet as a shift: see
-    /// [`Sections::span`].
+    /// Phases that a voxel reaches to the front and to the back, and phases of a sheet as a shift:
+    /// see [`Sections::span`].
     #[inline(always)]
     pub(crate) fn reach(&self) -> (i32, i32, u32) {
         (self.front, self.back, self.shift)
@@ -165,14 +170,14 @@ impl Sections {
         (z - self.front) >> self.shift
     }
 
-    /// Weights of [`Sections::of`] by phase, [`Sections::most`] a phase, those that a phase does not
-    /// need zero.
+    /// Weights of [`Sections::of`] by phase, [`Sections::most`] a phase, those that a phase does
+    /// not need zero.
     pub fn all(&self) -> &[f32] {
         &self.weights
     }
 
-    /// Weights of [`Sections::of_fixed`] by phase, [`Sections::most`] a phase, those that a phase does
-    /// not need zero.
+    /// Weights of [`Sections::of_fixed`] by phase, [`Sections::most`] a phase, those that a phase
+    /// does not need zero.
     pub fn all_fixed(&self) -> &[i16] {
         &self.fixed
     }
@@ -201,15 +206,16 @@ pub struct Slant<'a> {
     pub row: i32,
     /// Whether sections or rows have columns of their own.
     pub skewed: bool,
-    /// Columns of a row that all sections of a voxel have together, at most: [`SHEAR_COLUMNS`], or if they all have the same
-    /// [`LINE`].
+    /// Columns of a row that all sections of a voxel have together, at most: [`SHEAR_COLUMNS`], or
+    /// if they all have the same [`LINE`].
     pub wide: usize,
 }
 
 /// Where sections and rows of a kernel that leans lie ([`slabcast_common::kernel`]).
 #[derive(Debug)]
 pub struct Leaning {
-    /// How far each section lies beside its voxel along x and y, in vox: as [`Sections::all`] has weights.
+    /// How far each section lies beside its voxel along x and y, in vox: as [`Sections::all`] has
+    /// weights.
     aside: [Vec<f64>; 2],
     /// The same in subpixels, where a view is parallel.
     subpixels: [Vec<i32>; 2],
@@ -224,12 +230,12 @@ pub struct Leaning {
 }
 
 impl Leaning {
-    /// For sheets of the thickness of `view`, cut by `sections`, of a kernel with profile `deep` along the depth;
-    /// `scale`: pixels a vox at most.
+    /// For sheets of the thickness of `view`, cut by `sections`, of a kernel with profile `deep`
+    /// along the depth; `scale`: pixels a vox at most.
     pub(crate) fn new(view: &View, deep: &Profile, sections: &Sections, scale: f64) -> Leaning {
         let (lean, thickness) = (&view.kernel_lean, view.thickness);
-        // Where two spacings are alike but for their last digits rows and sections lie aside by less than
-        // positions are rounded: that is nothing.
+        // Where two spacings are alike but for their last digits rows and sections lie aside by
+        // less than positions are rounded: that is nothing.
         let shows = |vox: f64| vox * scale * f64::from(SUBPIXELS) >= 1.0;
         let row = if shows(lean.row.abs() * view.kernel_radius.y) { lean.row_fixed() } else { 0 };
         let slopes =
@@ -255,13 +261,15 @@ impl Leaning {
         let [x, y] = leaning.subpixels.each_ref().map(|aside| aside.chunks(sections.stride));
         for (x, y) in x.zip(y) {
             leaning.steady &= y.is_sorted() || y.iter().rev().is_sorted();
-            // In one row of the picture. What is rounded once for a section may be otherwise in another.
+            // In one row of the picture. What is rounded once for a section may be otherwise in
+            // another.
             let of_row =
                 x.iter().zip(y).map(|(&x, &y)| i64::from(x) + Lean::along_row(row, -i64::from(y)));
             let across = between(of_row) + i64::from(row != 0);
             let down = between(y.iter().map(|&y| i64::from(y)));
             for (to, apart) in leaning.apart.iter_mut().zip([across, down]) {
-                // Two places that are hardly apart may lie on either side of where a footprint begins a pixel farther.
+                // Two places that are hardly apart may lie on either side of where a footprint
+                // begins a pixel farther.
                 *to = (*to).max((apart >> SUBPIXEL_BITS) + 1);
             }
         }
@@ -287,7 +295,8 @@ impl Leaning {
         &self.subpixels[axis]
     }
 
-    /// How sections of voxels lie aside of each other, if they have no more rows and columns than are added so.
+    /// How sections of voxels lie aside of each other, if they have no more rows and columns than
+    /// are added so.
     pub fn slant(&self, phases: [Phases; 2]) -> Option<Slant<'_>> {
         let [x, down] = &phases;
         let skewed = self.row != 0;
@@ -305,8 +314,8 @@ impl Leaning {
         fits.then_some(Slant { subpixels, phases, row, skewed, wide })
     }
 
-    /// Pixels at most along x and y that a section or an outermost row lies beside its voxel, for footprints of a
-    /// `reach` along each; `scale`: pixels a vox at most.
+    /// Pixels at most along x and y that a section or an outermost row lies beside its voxel, for
+    /// footprints of a `reach` along each; `scale`: pixels a vox at most.
     pub(crate) fn pixels(&self, scale: f64, [_, reach]: [i32; 2]) -> [f64; 2] {
         let row = self.row as f64 / 65536.0;
         let [x, y] = self.most.map(|vox| vox * scale);
@@ -348,7 +357,8 @@ struct AxisTable {
     reach: i32,
 }
 
-/// Zeros before and behind a phase's weights, if there are any: as many as these, and so many at least.
+/// Zeros before and behind a phase's weights, if there are any: as many as these, and so many at
+/// least.
 type Zeros = Option<usize>;
 
 /// Pixels that a footprint covers along one axis: `[first, last]` for a centre at phase `p`.
@@ -376,8 +386,8 @@ fn weight(profile: &Profile, scale: f64, p: i32, i: i64) -> f64 {
     profile.at(u)
 }
 
-/// First pixel of a footprint, relative to the one that holds the centre: as the centre goes through that,
-/// it goes one farther at most.
+/// First pixel of a footprint, relative to the one that holds the centre: as the centre goes
+/// through that, it goes one farther at most.
 #[derive(Clone, Copy, Debug)]
 struct First {
     /// That of the first phases.
@@ -469,8 +479,8 @@ impl AxisTable {
 const TABLE_TAPS: f64 = 1024.0;
 /// Most bytes of tables that a perspective view may take: sheets of 1/32 vox in a volume of 256
 /// voxels a side. Beyond it weights are evaluated where they are drawn, which costs a voxel some 20
-/// exponentials a section instead of a look-up: minutes a picture instead of seconds. Only tables of
-/// sheets that are drawn are made.
+/// exponentials a section instead of a look-up: minutes a picture instead of seconds. Only tables
+/// of sheets that are drawn are made.
 const TABLE_BYTES: f64 = 256.0 * 1024.0 * 1024.0;
 
 /// Tables of one scale, x and y. Where the profiles are the same (cubic lattices) there is one.
@@ -509,8 +519,8 @@ pub struct Footprints {
     shelf: Arc<Shelf>,
 }
 
-/// Tables by scale, and sections, that frames of one scene share, which has one kernel: along a turn a sheet's
-/// scale is the same in all, and so is the kernel's depth in a cubic lattice.
+/// Tables by scale, and sections, that frames of one scene share, which has one kernel: along a
+/// turn a sheet's scale is the same in all, and so is the kernel's depth in a cubic lattice.
 #[derive(Debug, Default)]
 pub struct Shelf {
     tables: Mutex<BTreeMap<Key, Arc<Tables>>>,
@@ -549,8 +559,8 @@ impl Shelf {
         shelved(&self.tables, SHELF, key, || Tables::new(x, y, scale, zeros))
     }
 
-    /// [`Sections::new`], made once: it takes 80 us, which is a twentieth of what a worker of fifteen draws of a
-    /// frame of mri256.
+    /// [`Sections::new`], made once: it takes 80 us, which is a twentieth of what a worker of
+    /// fifteen draws of a frame of mri256.
     pub fn sections(
         &self,
         profile: &Profile,
@@ -563,7 +573,8 @@ impl Shelf {
         shelved(&self.sections, SECTIONS, key, || Sections::new(profile, thickness, phases, merged))
     }
 
-    /// A profile of this deviation and radius, or the whole of what it is cut from, as [`crate::judge::error_probe::model`] has it.
+    /// A profile of this deviation and radius, or the whole of what it is cut from, as
+    /// [`crate::judge::error_probe::model`] has it.
     pub(crate) fn profile(
         &self,
         (std, radius, whole): (f64, f64, bool),
@@ -593,8 +604,8 @@ fn shelved<K: Ord, V>(
     shelf.entry(key).or_insert(made).clone()
 }
 
-/// Sections that a shelf keeps, and profiles, of some 8 KB each. A view of a lattice that is not cubic has its own, and none
-/// of them is asked for again.
+/// Sections that a shelf keeps, and profiles, of some 8 KB each. A view of a lattice that is not
+/// cubic has its own, and none of them is asked for again.
 pub const SECTIONS: usize = 64;
 
 /// Weights along one axis, inside a clip: the first pixel and one weight a pixel.
@@ -639,7 +650,8 @@ impl Footprints {
     #[inline]
     pub fn at(&self, k: i32) -> Option<Footprint<'_>> {
         let scale = self.view.scale_at(k)?;
-        // Where one table serves all sheets, windows are moved to lie inside a part, or sections lie aside of each other.
+        // Where one table serves all sheets, windows are moved to lie inside a part, or sections
+        // lie aside of each other.
         let least = if self.view.kernel_lean.is_none() { 0 } else { SHEAR_ROWS };
         let (slot, zeros) = match self.view.projection {
             Projection::Ortho { .. } => (self.tables.first(), Some(least)),
@@ -664,8 +676,8 @@ pub struct Footprint<'a> {
 }
 
 impl<'a> Footprint<'a> {
-    /// Pixels along x and y that it reaches at most from the one that holds its centre, where its weights are in
-    /// a table; otherwise they are worked out where they are drawn.
+    /// Pixels along x and y that it reaches at most from the one that holds its centre, where its
+    /// weights are in a table; otherwise they are worked out where they are drawn.
     #[inline]
     pub fn reach(&self) -> Option<[i32; 2]> {
         self.table.map(|t| [t.along(0).reach, t.along(1).reach])

@@ -1,32 +1,35 @@
-//! Level views: those in which layers of the lattice lie level.
+//! Lattice rows: layers of the lattice that a level camera sees as rows of the picture.
 //!
-//! A *lattice row* is all voxels of one index along the lattice's upright axis. Where the camera is level and that
-//! axis points up in the picture, as on a turntable, all voxels of a lattice row lie in one row of it, wherever they
-//! are in depth, in parallel views; in perspective they do in each sheet. A footprint is a product, so what is
-//! the same for a whole lattice row need not be done for each voxel: a voxel is added along x alone, to its lattice row's
-//! row of sums, and when a sheet closes a pixel's sum is that of the few lattice rows that reach it, each times its
-//! weight down the picture. Of seven rows of pixels that a voxel was added to there is one left (the separable
-//! footprint of the paper's section 3, with its second half done once for all voxels that share it).
+//! A *lattice row* is all voxels of one index along the lattice's upright axis. Where the camera is
+//! level and that axis points up in the picture, as on a turntable, all voxels of a lattice row lie
+//! in one row of the picture: at any depth in orthographic views, in each sheet in perspective
+//! ones. A footprint is a product, so its second factor need not be applied voxel by voxel: a voxel
+//! is added along x alone, to the sums of its lattice row, and when a sheet closes a pixel's sum is
+//! that of the few lattice rows that reach it, each times its weight down the picture. Of seven
+//! rows of pixels that a voxel was added to one is left (the separable footprint of the paper's
+//! section 3, with its second half done once for all voxels that share it).
 //!
 //! ```text
-//! row(k, s, x) = sum over voxels of lattice row s of  (payload * wz) * wx       each rounded to whole units
-//! sum(k, x, y) = sum over lattice rows, top down, of  row(k, s, x) * wy         rounded as the kind of sums says
+//! row(k, s, x) = sum over voxels of lattice row s of (payload * wz) * wx, each rounded
+//! sum(k, x, y) = sum over lattice rows, top down, of row(k, s, x) * wy, rounded by kind of sums
 //! ```
 //!
-//! **Why pixels stay exact.** A row is a sum of integers, which has no order. A voxel that is culled reaches
-//! shut pixels alone, with all of its columns in all of its lattice row's rows. And the lattice rows of a pixel are added
-//! in one order, from the top of the picture down, which does not hang on how the volume is stored.
+//! **Why pixels stay exact.** A row is a sum of integers, which has no order. A voxel that is
+//! culled touches shut pixels alone, with all of its columns in all rows of its lattice row. And
+//! the lattice rows of a pixel are added in one order, from the top of the picture down, which does
+//! not depend on how the volume is stored.
 //!
-//! Floats are not added so, since their sums have an order of their own, and neither are views in which
-//! lattice rows lie closer than [`CLOSEST`]: there a voxel has no more rows of pixels than a pixel has lattice rows.
+//! Float sums are not made so, since they have an order of their own. Neither are views in which
+//! lattice rows lie closer than [`CLOSEST`]: there a voxel touches no more rows of pixels than a
+//! pixel has lattice rows.
 
 use crate::primitives::footprint::Footprint;
 use crate::primitives::sizes::REACHING;
 use slabcast_common::occlusion::Rect;
 use slabcast_common::view::{SUBPIXELS, View};
 
-/// Pixels from a lattice row to the next, at least. At one a voxel has four or five rows of pixels, as a pixel has
-/// lattice rows; below, lattice rows outgrow the cache that those of pixels fit.
+/// Pixels from a lattice row to the next, at least. At one a voxel has four or five rows of pixels,
+/// as a pixel has lattice rows; below, lattice rows outgrow the cache that those of pixels fit.
 pub const CLOSEST: f64 = 0.75;
 
 /// The lattice rows of a level view, from the top of the picture down.
@@ -43,13 +46,14 @@ pub struct LatticeRows {
     flat: Option<Vec<i64>>,
     /// How many a footprint reaches to either side.
     reach: f64,
-    /// Length of a step of the lattice in vox: rows are kept over it, and weights down have it as a factor, so
-    /// that a solid's rows are as its sums.
+    /// Length of a step of the lattice in vox: rows are kept over it, and weights down have it as a
+    /// factor, so that a solid's rows are as its sums.
     pub(crate) spread: f32,
 }
 
 impl LatticeRows {
-    /// The lattice rows of `view`, if it is level and they are far enough apart in sheets up to `last`.
+    /// The lattice rows of `view`, if it is level and they are far enough apart in sheets up to
+    /// `last`.
     pub(crate) fn new(view: &View, dims: [u32; 3], spread: f64, last: i32) -> Option<LatticeRows> {
         let m = &view.eye_from_index;
         let down = [m.x_axis.y, m.y_axis.y, m.z_axis.y];
@@ -123,13 +127,14 @@ impl LatticeRows {
         self.step * scale * f64::from(SUBPIXELS)
     }
 
-    /// The lattice row that lies at position 0 of row `y` of pixels at `scale`, as a fraction; it need not be there.
+    /// The lattice row that lies at position 0 of row `y` of pixels at `scale`, as a fraction; it
+    /// need not be there.
     pub(crate) fn of_row(&self, view: &View, y: i32, scale: f64) -> f64 {
         self.of_eye((f64::from(y) - f64::from(view.size[1]) * 0.5) / scale)
     }
 
-    /// The first lattice row that row 0 of a part stands for, in a sheet of this scale: it does not reach the part,
-    /// nor does the one of row [`LatticeRows::rows`] less one.
+    /// The first lattice row that row 0 of a part stands for, in a sheet of this scale: it does not
+    /// reach the part, nor does the one of row [`LatticeRows::rows`] less one.
     #[inline(always)]
     pub fn base(&self, view: &View, part: &Rect, scale: f64) -> i32 {
         // A footprint reaches half a pixel less than its radius, and is placed to a subpixel.
@@ -138,7 +143,8 @@ impl LatticeRows {
         first.clamp(-1e9, 1e9) as i32
     }
 
-    /// Rows of lattice rows that a part of `high` pixels has at a scale, which are at most [`ROWS`].
+    /// Rows of lattice rows that a part of `high` pixels has at a scale, which are at most
+    /// [`ROWS`].
     pub fn rows(&self, high: i32, scale: f64) -> usize {
         let across = f64::from(high) / (self.step * scale);
         libm::ceil(across + 2.0 * self.reach) as usize + 4
@@ -146,8 +152,8 @@ impl LatticeRows {
 }
 
 impl LatticeRows {
-    /// The lattice rows that reach row `y` of pixels in a sheet with this footprint, top down, and each one's weight there by
-    /// `weight`; plainly, one by one.
+    /// The lattice rows that reach row `y` of pixels in a sheet with this footprint, top down, and
+    /// each one's weight there by `weight`; plainly, one by one.
     pub(crate) fn reaching<W: Copy + Default>(
         &self,
         view: &View,

@@ -1,4 +1,5 @@
-//! What kernels and every geometry work with: tables of weights, integer positions, fixed sizes.
+//! What kernels and geometries work with: tables of weights, integer positions, lattice rows, fixed
+//! sizes.
 //!
 //! Imports nothing of this crate but itself.
 

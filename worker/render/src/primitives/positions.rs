@@ -1,11 +1,11 @@
-//! Where voxels of a flat view land, in integers.
+//! Integer positions of voxels in orthographic views.
 //!
 //! In an orthographic view a voxel's screen position is that of its brick's corner plus an offset
-//! that 512 local indices share, and so is its depth. Both are kept to 2^-24 of a subpixel or phase;
-//! the rest is integer addition, the same in every lane width. Against arithmetic in f64 a position
-//! is off by at most 2^-32 pixel. With 8 bits instead of 24 it would do for the picture (1/65536
-//! pixel), but how a volume is cut into bricks, or stored, would show: one voxel in a hundred would
-//! be rounded the other way.
+//! that 512 local indices share, and so is its depth. Both are kept to 2^-24 of a subpixel or
+//! phase; the rest is integer addition, the same in every lane width. Against arithmetic in f64 a
+//! position is off by at most 2^-32 pixel. With 8 bits instead of 24 it would do for the picture
+//! (1/65536 pixel), but how a volume is cut into bricks, or stored, would show: one voxel in a
+//! hundred would be rounded the other way.
 
 use glam::DVec3;
 use slabcast_common::brick::local_position;
@@ -16,8 +16,8 @@ pub(crate) const FINER_BITS: u32 = 24;
 const FINER: f64 = (1u32 << FINER_BITS) as f64;
 
 /// What rounds a sum of a corner and an offset to the nearest subpixel or phase. A little more than
-/// half: positions half-way between two are common (a voxel on a pixel's edge), and the last bits of
-/// corner and offset must not say where those go.
+/// half: positions half-way between two are common (a voxel on a pixel's edge), and the last bits
+/// of corner and offset must not say where those go.
 const HALF: i64 = (1 << (FINER_BITS - 1)) + 64;
 
 /// The nearest whole number: beyond 2^50 there is no other.
@@ -38,7 +38,8 @@ pub struct Places {
     offsets: Box<[[i64; 512]; 3]>,
 }
 
-/// A brick's corner: x and y in 2^-24 subpixels of absolute image coordinates, depth in 2^-24 phases.
+/// A brick's corner: x and y in 2^-24 subpixels of absolute image coordinates, depth in 2^-24
+/// phases.
 pub type FlatCorner = [i64; 3];
 
 impl Places {
@@ -78,8 +79,8 @@ impl Places {
         ([at(0), at(1)], at(2) as i32)
     }
 
-    /// What offsets are added to for [`Places::at`] counted from `origin` (subpixels and phases), which
-    /// is near: positions fit i32.
+    /// What offsets are added to for [`Places::at`] counted from `origin` (subpixels and phases),
+    /// which is near: positions fit i32.
     #[inline(always)]
     pub fn from(corner: FlatCorner, origin: [i64; 3]) -> FlatCorner {
         std::array::from_fn(|axis| corner[axis] - (origin[axis] << FINER_BITS) + HALF)
@@ -91,7 +92,8 @@ impl Places {
         &self.offsets
     }
 
-    /// [`Places::at`] for some voxels of a brick, counted from [what](Places::from) `from` is counted from.
+    /// [`Places::at`] for some voxels of a brick, counted from [what](Places::from) `from` is
+    /// counted from.
     #[inline(always)]
     pub(crate) fn all(&self, from: FlatCorner, locals: &[u16], at: &mut [[i32; 512]; 3]) {
         // The lower half of a sum is the same for a shift with and without a sign.

@@ -1,4 +1,4 @@
-//! A kernel profile as a table.
+//! A kernel profile as a table, for estimates of error.
 
 /// Nodes of a profile's table.
 const NODES: usize = 2048;

@@ -1,4 +1,4 @@
-//! A footprint weight.
+//! A footprint weight that is known not to be negative.
 
 /// A weight across the view axis, not negative. Holding the value is the proof, which the unchecked
 /// conversion below leans on.

@@ -1,16 +1,17 @@
-//! The depth at which each cell of a picture was shut: what a frame teaches the next one about bricks.
+//! The depth at which each cell of a picture was shut: what a frame teaches the next one about
+//! bricks.
 //!
-//! A region finds out while it is drawn which bricks are hidden, and asks for the others when it reaches
-//! them; each time it stalls for as long as they are on their way. The next frame of a path looks much
-//! alike. So each cell of 8x8 pixels keeps the sheet at which it was shut, and a region of the next
-//! frame prefetches the bricks that begin well in front of that. A wrong guess costs bricks that are not
-//! needed, or one more stall.
+//! A region finds out while it is drawn which bricks are hidden, and asks for the others when it
+//! reaches them; each time it stalls for as long as they are on their way. The next frame of a path
+//! looks much alike. So each cell of 8x8 pixels keeps the sheet at which it was shut, and a region
+//! of the next frame prefetches the bricks that begin well in front of that. A wrong guess costs
+//! bricks that are not needed, or one more stall.
 //!
 //! Some slack keeps wrong guesses few. mri256 `peer-opaque`, 18 views 5 degrees apart, one worker:
-//! without prefetch 25.3 % of its bricks were held at the end, and regions stalled ten times a later
-//! frame. With a prefetch of all that begins before a cell's last pixel was shut it would be 34.5 % and
-//! half a stall: most of these bricks are at the surface itself, where depths a few sheets off say
-//! nothing.
+//! without prefetch 25.3 % of its bricks were held at the end, and regions stalled ten times a
+//! later frame. With a prefetch of all that begins before a cell's last pixel was shut it would be
+//! 34.5 % and half a stall: most of these bricks are at the surface itself, where depths a few
+//! sheets off say nothing.
 //!
 //! Depths know no views: those of a picture seen from elsewhere are as good as they are.
 
@@ -19,8 +20,9 @@ use slabcast_common::occlusion::Rect;
 use slabcast_common::region::PART_EDGE;
 use std::sync::atomic::{AtomicI32, Ordering};
 
-/// Edge of a cell in pixels. A brick of a head of 256 voxels is some 20 pixels wide in a picture of 512.
-/// With cells of 16, one open pixel at an outline would prefetch all that lies behind 256 pixels.
+/// Edge of a cell in pixels. A brick of a head of 256 voxels is some 20 pixels wide in a picture of
+/// 512. With cells of 16, one open pixel at an outline would prefetch all that lies behind 256
+/// pixels.
 pub(crate) const CELL: i32 = 8;
 
 /// Cells across a part.
@@ -32,13 +34,13 @@ pub const LOOKS: i32 = 8;
 /// A cell with fewer open pixels counts as shut.
 const LEAST: u8 = 8;
 
-/// Sheets that a brick must begin in front of the sheet at which its pixels were shut to be prefetched:
-/// two bricks where sheets are a voxel thick. With 4, 8 and 12 that worker held 31, 29 and 28 % of the
-/// bricks.
+/// Sheets that a brick must begin in front of the sheet at which its pixels were shut to be
+/// prefetched: two bricks where sheets are a voxel thick. With 4, 8 and 12 that worker held 31, 29
+/// and 28 % of the bricks.
 const SLACK: i32 = 16;
 
-/// Pixels at a brick's border that do not count, since footprints hardly reach there. At zero 0.7 % more
-/// bricks are held.
+/// Pixels at a brick's border that do not count, since footprints hardly reach there. At zero 0.7 %
+/// more bricks are held.
 const BORDER: i32 = 3;
 
 /// Population count of each byte.
@@ -63,8 +65,8 @@ impl Default for Cells {
 }
 
 impl Cells {
-    /// Notes as shut at sheet `k` the cells with hardly any of the pixels of `open`, which are open in
-    /// front of it.
+    /// Notes as shut at sheet `k` the cells with hardly any of the pixels of `open`, which are open
+    /// in front of it.
     pub fn look(&mut self, k: i32, open: &OpenMask) {
         for (rows, cells) in open.rows().chunks(CELL as usize).zip(self.0.chunks_mut(ROW)) {
             // At most 64 in a byte.
@@ -81,9 +83,9 @@ impl Cells {
     }
 }
 
-/// For each cell of 8x8 pixels of a picture, the sheet at which it was shut in the last frame that was
-/// drawn there. Threads write and read cells concurrently; no cell depends on another, and none needs to
-/// be right.
+/// For each cell of 8x8 pixels of a picture, the sheet at which it was shut in the last frame that
+/// was drawn there. Threads write and read cells concurrently; no cell depends on another, and none
+/// needs to be right.
 #[derive(Debug)]
 pub struct ClosingDepths {
     columns: usize,

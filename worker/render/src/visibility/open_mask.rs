@@ -1,4 +1,5 @@
-//! The occlusion map of a tile part (paper, section 3): one bit a pixel, set while the pixel is open.
+//! The occlusion map of a tile part (paper, section 3): one bit a pixel, set while the pixel is
+//! open.
 //!
 //! A part has at most 64 columns, so a row is a word and "is anything open under this footprint?"
 //! is an AND of some eight words. A summed-area table needs four reads but has to be made anew
@@ -67,8 +68,8 @@ impl OpenMask {
         self.rows[y & 63]
     }
 
-    /// Grows the mask by `reach` columns and rows, each at most [`REACH_MOST`]. To be called again after
-    /// pixels were shut.
+    /// Grows the mask by `reach` columns and rows, each at most [`REACH_MOST`]. To be called again
+    /// after pixels were shut.
     #[inline(always)]
     pub fn grow(&mut self, reach: [i32; 2]) {
         self.reach = reach.map(|reach| reach.min(REACH_MOST));
@@ -89,8 +90,9 @@ impl OpenMask {
         }
     }
 
-    /// For each centre (`x`, `y`, in subpixels from the part's corner): its nearest pixel in the part, and
-    /// whether a footprint of the mask's reach may touch the part (1) and an open pixel of it (3).
+    /// For each centre (`x`, `y`, in subpixels from the part's corner): its nearest pixel in the
+    /// part, and whether a footprint of the mask's reach may touch the part (1) and an open pixel
+    /// of it (3).
     #[inline(always)]
     pub fn near_all(&self, x: &[i32], y: &[i32], cells: &mut [u32], fate: &mut [u32]) {
         let [wide, high] = self.reach.map(|reach| (64 + 2 * reach) as u32);

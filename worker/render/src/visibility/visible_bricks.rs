@@ -3,9 +3,9 @@
 //! Projecting every brick of a head takes 9,728 boxes a frame, and most of them lie behind what is
 //! drawn in front of them. So bricks are grouped into blocks ([`slabcast_common::blocks`]) once a
 //! directory. A frame projects the blocks, a few hundred, and a block's bricks only when a part of
-//! the picture reaches the block's first sheet and finds an open pixel under it. The first thread that
-//! needs a block projects it for all. A worker of fifteen that draws three parts of forty looks at what
-//! lies under these, and nobody looks at what lies inside a solid head.
+//! the picture reaches the block's first sheet and finds an open pixel under it. The first thread
+//! that needs a block projects it for all. A worker of fifteen that draws three parts of forty
+//! looks at what lies under these, and nobody looks at what lies inside a solid head.
 //!
 //! ```text
 //! Directory::new                 when the directory arrives, or bricks change
@@ -13,8 +13,8 @@
 //! VisibleBricks::project_block   when a part needs a block
 //! ```
 //!
-//! Whatever hides a block hides its bricks, since the projection of a box holds those of the boxes in
-//! it. A block that begins in front of the near plane, or reaches behind the eye, begins at the
+//! Whatever hides a block hides its bricks, since the projection of a box holds those of the boxes
+//! in it. A block that begins in front of the near plane, or reaches behind the eye, begins at the
 //! nearest sheet there is and is opened when that is reached.
 
 use crate::primitives::sizes::PART;
@@ -27,14 +27,14 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 /// Edge of a block in voxels, as a power of two: four bricks.
 ///
-/// A worker of fifteen that draws its share of mri256 spends 73 us a frame on projection. With blocks of
-/// two bricks there are six times as many blocks, most over others' tiles (207 us); with eight it
-/// projects 2.7 times as many bricks (128 us). Whole frames take 64.8, 64.6 and 63.3 ms with two, four
-/// and eight.
+/// A worker of fifteen that draws its share of mri256 spends 73 us a frame on projection. With
+/// blocks of two bricks there are six times as many blocks, most over others' tiles (207 us); with
+/// eight it projects 2.7 times as many bricks (128 us). Whole frames take 64.8, 64.6 and 63.3 ms
+/// with two, four and eight.
 const SHIFT: u32 = 5;
 
-/// Most blocks; beyond this many they become twice as large. They take half a millisecond a frame. Not
-/// measured: no volume at hand has as many (1024^3 voxels without air do).
+/// Most blocks; beyond this many they become twice as large. They take half a millisecond a frame.
+/// Not measured: no volume at hand has as many (1024^3 voxels without air do).
 const MOST: usize = 4096;
 
 /// All bricks of a scene, held or not, grouped into blocks. A brick is named by its index in here.
@@ -54,8 +54,8 @@ impl Directory {
         Directory::with_blocks(bricks, SHIFT, MOST)
     }
 
-    /// Groups `bricks` into blocks of `2^shift` voxels along each axis, or of twice as many, and so on,
-    /// until there are at most `most` blocks.
+    /// Groups `bricks` into blocks of `2^shift` voxels along each axis, or of twice as many, and so
+    /// on, until there are at most `most` blocks.
     pub fn with_blocks(bricks: Arc<[BrickInfo]>, shift: u32, most: usize) -> Directory {
         let blocks = Blocks::new(&bricks, shift, most);
         let fullest = blocks.all().iter().map(|b| blocks.places(b).len()).max().unwrap_or(0);
@@ -92,8 +92,8 @@ pub(crate) struct ProjectedBlock {
     bricks: OnceLock<Vec<VisibleBrick>>,
 }
 
-/// Which bricks of a [`Directory`] lie over which part of a frame, front to back. Blocks are projected
-/// at once, their bricks when first needed, by any thread.
+/// Which bricks of a [`Directory`] lie over which part of a frame, front to back. Blocks are
+/// projected at once, their bricks when first needed, by any thread.
 #[derive(Debug)]
 pub struct VisibleBricks {
     directory: Arc<Directory>,
@@ -157,8 +157,8 @@ impl VisibleBricks {
         self.sheets
     }
 
-    /// Returns the number of voxels of the blocks over the parts of `tile`, to compare tiles by; zero
-    /// where nothing lies over it.
+    /// Returns the number of voxels of the blocks over the parts of `tile`, to compare tiles by;
+    /// zero where nothing lies over it.
     pub fn weight(&self, tile: &Rect) -> u64 {
         let parts = parts_under(*tile, self.columns).flat_map(|part| self.of_part(part));
         parts.map(|&i| self.block(i).voxels).sum()

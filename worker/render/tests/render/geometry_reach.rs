@@ -45,7 +45,7 @@ proptest! {
         for (y0, x0) in [0, 64, 128, 192, 256].into_iter().flat_map(|y| [(y, 0), (y, 64), (y, y)]) {
             let part = Rect::new(x0, y0, x0 + PART, y0 + PART)
                 .intersect(&Rect::from_size([edge; 2]));
-            let lean = sheared::takes(&frame);
+            let lean = sheared::accepts(&frame);
             let near = match parallel {
                 false => deep(&frame, &part, nearest).map(|deep| deep.reach),
                 true => lean.map(|lean| lean.flat.reach),

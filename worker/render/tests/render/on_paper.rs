@@ -1,5 +1,5 @@
-//! Rendered pictures against `slabcast_render::judge::analytic`: what is known on paper, within bounds
-//! that count roundings.
+//! Rendered pictures against `slabcast_render::judge::analytic`: what is known on paper, within
+//! bounds that count roundings.
 
 use crate::support::{bricks_of, transfer};
 use glam::DVec3;

@@ -81,9 +81,9 @@ impl BrickSupply for Store<'_> {
     }
 }
 
-/// The frame in regions, of whose bricks a worker holds one in `held_in` at first; one in
-/// `lost_in` rounds it forgets half of them. One in `given_in` regions stops and is cut, and one of the pieces is
-/// drawn as another worker's. With what was asked for and what was touched.
+/// The frame in regions, of whose bricks a worker holds one in `held_in` at first; one in `lost_in`
+/// rounds it forgets half of them. One in `given_in` regions stops and is cut, and one of the
+/// pieces is drawn as another worker's. With what was asked for and what was touched.
 fn in_regions(
     frame: &Frame,
     simd: Simd,
@@ -154,7 +154,8 @@ fn in_regions(
         counted += done.counters;
         done.pixels.write(rect, size, &mut picture.pixels);
     }
-    // Who has nothing asks for what he will need before he draws it again, if nothing is hidden for all of it.
+    // Who has nothing asks for what he will need before he draws it again, if nothing is hidden for
+    // all of it.
     store.here.borrow_mut().fill(false);
     let rest = Rect::new(7, 0, size[0] as i32, size[1] as i32);
     let [again, of_rest] = [Rect::from_size(size), rest].map(|tile| match tile.is_empty() {
@@ -232,7 +233,8 @@ proptest! {
         let view = View::new(&v.lattice, &camera, size, &quality).unwrap();
         let bricks = bricks_of(&v);
         let mut look = lit(top, unit);
-        // Grey is drawn in two channels where views are flat, and in perspective where they are level.
+        // Grey is drawn in two channels where views are flat, and in perspective where they are
+        // level.
         if seed & 1 == 0 {
             look.colors = look.colors.iter().map(|c| [c[0], c[1], c[1], c[1]]).collect();
         }
@@ -266,7 +268,8 @@ proptest! {
         let (got, counted) = tiled(&frame, Simd::detect(), &bricks, edge, &[run]);
         prop_assert!(got == want, "in one slab");
 
-        // All bricks here, none here at first, and coming and going; tiles handed over with what is drawn of them.
+        // All bricks here, none here at first, and coming and going; tiles handed over with what is
+        // drawn of them.
         let simd = Simd::detect();
         let never = 1 << 40;
         let worlds = [(1, never, never, 8), (3, never, never, 0), (2, 4, never, 3), (1, never, 1, 0), (2, 4, 2, 3)];

@@ -790,9 +790,9 @@ fn reference_spline_kernels_equal_closed_forms() {
     }
 }
 
-/// What rounded positions and the kernel's cut cost at most, held against every pixel of scenes that are
-/// soft and stiff, even and rough, seen along an axis (walls that rays graze), from anywhere and in
-/// perspective.
+/// What rounded positions and the kernel's cut cost at most, held against every pixel of scenes
+/// that are soft and stiff, even and rough, seen along an axis (walls that rays graze), from
+/// anywhere and in perspective.
 #[test]
 fn model_error_bounds_hold_on_every_pixel() {
     let rough = |i: u32, j: u32, k: u32| {

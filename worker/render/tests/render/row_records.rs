@@ -16,7 +16,8 @@ fn numbers(seed: u32) -> impl FnMut(u32) -> u32 {
     }
 }
 
-/// Voxels added flat and apart, and some rows folded, by every instruction set as by the plain loops.
+/// Voxels added flat and apart, and some rows folded, by every instruction set as by the plain
+/// loops.
 fn everywhere<S: Tiered, const N: usize>(
     (len, rows, reaching): (usize, usize, usize),
     seed: u32,

@@ -16,8 +16,8 @@ use slabcast_render::scene::{Frame, Scene};
 use slabcast_render::selftest;
 use std::sync::Arc;
 
-/// A view of a lattice whose third axis is `odd` times as coarse as the others; `eye`: where it is seen from, and
-/// what is up.
+/// A view of a lattice whose third axis is `odd` times as coarse as the others; `eye`: where it is
+/// seen from, and what is up.
 fn frame(sums: Sums, odd: f64, eye: [[f64; 3]; 2], height: f64) -> Frame {
     let dims = [20, 16, 24];
     let mut volume = Volume::from_fn_u8("any", dims, |i, j, k| (i + 3 * j + 7 * k) as u8);
@@ -46,7 +46,7 @@ fn as_any_others<S: Recorded>(
     let phases = axes.phases.each_ref().map(|phases| phases[0]);
     let Some(slant) = leaning.slant(phases) else { return Ok(None) };
     // Footprints of more pixels are drawn elsewhere.
-    if slabcast_render::geometry::sheared::takes(frame).is_none() {
+    if slabcast_render::geometry::sheared::accepts(frame).is_none() {
         return Ok(None);
     }
     let most = frame.sections.most();

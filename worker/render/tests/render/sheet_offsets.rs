@@ -5,8 +5,8 @@ use slabcast_render::kernels::Tap;
 use slabcast_render::kernels::pixel_records::sheet_offsets::*;
 use slabcast_render::kernels::pixel_records::{MOST, Record, Recorded, STRIDE, Table};
 
-/// Where the sections of a voxel lie: around a pixel, each so far aside of it and with weights from here
-/// on, by axis; and how many sheets it has left.
+/// Where the sections of a voxel lie: around a pixel, each so far aside of it and with weights from
+/// here on, by axis; and how many sheets it has left.
 type Somewhere = ([i32; 2], [[(i32, u32); MOST]; 2], i32);
 
 fn somewhere() -> impl Strategy<Value = Somewhere> {

@@ -39,7 +39,8 @@ fn footprint_cost_counts_pixels_and_bytes() {
     assert_eq!(level(Sums::F32, 1.0), None);
 }
 
-/// Of voxels that were culled and of sheets that were not come to, too: what is left would be added to another part.
+/// Of voxels that were culled and of sheets that were not come to, too: what is left would be added
+/// to another part.
 #[test]
 fn records_are_empty_between_parts() {
     let volume = Volume::from_fn_u8("ball", [40; 3], |i, j, k| {

@@ -1,7 +1,8 @@
-//! A tile part of any view in any sums: the general way ([`crate::tile`] tells what it does).
+//! Parts of any view in any kind of sums: the general path ([`crate::tile`] says what it does).
 //!
 //! Each section of a voxel has a footprint of its own, and sheets lie one after the other in
-//! [`Planes`]. Voxels wait as brick and index, so that float sums can be sorted into their one order.
+//! [`Planes`]. Voxels wait as brick and index, so that float sums can be sorted into their one
+//! order.
 
 mod planes;
 
@@ -56,7 +57,8 @@ pub struct Kind<S: Accumulate> {
     lofts: Lofts<S>,
     /// For weights that are in no table.
     weights: [Vec<S::Weight>; 2],
-    /// Lattice rows that reach each row of the part in a sheet, and in which: of even sheets and odd ones.
+    /// Lattice rows that reach each row of the part in a sheet, and in which: of even sheets and
+    /// odd ones.
     reaching: [Vec<OfSheet<S::Weight>>; 2],
 }
 
@@ -75,7 +77,8 @@ impl<S: Accumulate> Default for Kind<S> {
 #[derive(Default)]
 pub struct Queues {
     pub buckets: Vec<Vec<Waiting>>,
-    /// Buckets behind this hold nothing: a part that stops often doesn't look at those of all sheets each time.
+    /// Buckets behind this hold nothing: a part that stops often doesn't look at those of all
+    /// sheets each time.
     pub filled: usize,
     carried: Vec<Waiting>,
 }
@@ -105,7 +108,7 @@ impl Queues {
     }
 }
 
-/// A part with what it works on: compiled for each instruction set as a whole.
+/// Draws a part, as work that is compiled once for each instruction set.
 pub struct RenderGeneral<'a, S: Accumulate> {
     pub(crate) part: Part<'a>,
     pub(crate) kind: &'a mut Kind<S>,
@@ -393,7 +396,8 @@ impl General<'_> {
             }
             let some = &reaching.some[..reaching.n];
             let mut columns = lofts.touched(k, some) & open.row(y);
-            // Blocks of columns beside each other: in those to which nothing was added there is nothing.
+            // Blocks of columns beside each other: in those to which nothing was added there is
+            // nothing.
             while columns != 0 {
                 let x = columns.trailing_zeros() as usize / BLOCK * BLOCK;
                 columns &= !(0xff << x);

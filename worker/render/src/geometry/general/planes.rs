@@ -1,8 +1,5 @@
-//! The open sheets of a tile part: the one before k, k itself, and as many behind as a voxel has
-//! sections.
-//!
-//! Sheet after sheet, for sums of any kind and any number of sheets. Where all sections of a voxel
-//! share a footprint there is something better ([`crate::geometry::ortho`]).
+//! The open sheets of a part as planes: sheet k, the one before, and as many behind as a voxel has
+//! sections; for any kind of sums and any number of sheets.
 
 use crate::kernels::composite::Row;
 use crate::kernels::{Accumulate, Pixels, splat};
@@ -46,7 +43,8 @@ impl Touched {
     }
 }
 
-/// Rows of lattice rows in the open sheets of a level view's part ([`crate::primitives::lattice_rows`]).
+/// Rows of lattice rows in the open sheets of a level view's part
+/// ([`crate::primitives::lattice_rows`]).
 #[derive(Default)]
 pub(crate) struct Lofts<S> {
     sheets: Vec<Loft<S>>,
@@ -118,7 +116,8 @@ impl<S: Accumulate> Lofts<S> {
         lattice_rows.iter().filter_map(row).fold(0, |all, touched| all | touched)
     }
 
-    /// What these lattice rows, each with its weight, add up to in the [`BLOCK`] columns of sheet `k` from `x` on.
+    /// What these lattice rows, each with its weight, add up to in the [`BLOCK`] columns of sheet
+    /// `k` from `x` on.
     #[inline(always)]
     pub(crate) fn down(
         &self,

@@ -1,10 +1,11 @@
-//! An estimate of a frame's error at a few of its pixels: by sheets of half the thickness and, in `model`,
-//! by the model without rounded positions, without truncation and without ripple.
+//! An estimate of a frame's error at a few of its pixels: by sheets of half the thickness and, in
+//! `model`, by the model without rounded positions, without truncation and without ripple.
 //!
-//! A worker does not know the limit of thin sheets, but it can measure how much a pixel changes when
-//! sheets become thinner. An error that falls with the power p of the thickness is 1 / (1 - 2^-p) of that
-//! change (Richardson extrapolation; [`slabcast_common::stats::THICKNESS_EXTRAPOLATION`]). One pixel in 128 is
-//! drawn twice, in blocks, since neighbours share footprints.
+//! A worker does not know the limit of thin sheets, but it can measure how much a pixel changes
+//! when sheets become thinner. An error that falls with the power p of the thickness is 1 / (1 -
+//! 2^-p) of that change (Richardson extrapolation;
+//! [`slabcast_common::stats::THICKNESS_EXTRAPOLATION`]). One pixel in 128 is drawn twice, in
+//! blocks, since neighbours share footprints.
 
 mod model;
 
@@ -22,8 +23,8 @@ use slabcast_common::slab::SheetRange;
 use slabcast_common::view::{Projected, View};
 use std::sync::Arc;
 
-/// Edge of a block in pixels. With a footprint of 3 pixels to each side, a voxel is drawn some three
-/// times as often for blocks of 8 as for a tile, and fifty times as often for single pixels.
+/// Edge of a block in pixels. With a footprint of 3 pixels to each side, a voxel is drawn some
+/// three times as often for blocks of 8 as for a tile, and fifty times as often for single pixels.
 const BLOCK: i32 = 8;
 
 /// One pixel of this many is drawn again, in large pictures.
@@ -33,15 +34,16 @@ pub const ONE_IN: u32 = 128;
 /// factor of two.
 pub const AT_LEAST: u32 = 32;
 
-/// Factor of eps, the cut-off, for both pictures: so that their difference is due to thickness alone.
+/// Factor of eps, the cut-off, for both pictures: so that their difference is due to thickness
+/// alone.
 const EPS: f64 = 1.0 / 16.0;
 
 /// A scene at its sheet thickness and at half of it, from which frames of all views are made.
 pub struct ThicknessPair([Arc<Scene>; 2]);
 
 impl ThicknessPair {
-    /// Prepares both scenes; `None` if sheets of half the thickness are thinner than a quality may ask
-    /// for.
+    /// Prepares both scenes; `None` if sheets of half the thickness are thinner than a quality may
+    /// ask for.
     pub fn new(spec: &SceneSpec) -> Option<ThicknessPair> {
         let q = spec.quality;
         let [whole, half] = [1.0, 0.5].map(|times| {
@@ -60,8 +62,9 @@ impl ThicknessPair {
     }
 }
 
-/// The blocks of `tile` that are drawn again. In a large picture every other part of 64x64 pixels has one
-/// of 8x8. A part decides by its position alone, so all workers and any tiling choose the same blocks.
+/// The blocks of `tile` that are drawn again. In a large picture every other part of 64x64 pixels
+/// has one of 8x8. A part decides by its position alone, so all workers and any tiling choose the
+/// same blocks.
 pub fn blocks(tile: Rect, size: [u32; 2]) -> impl Iterator<Item = Rect> {
     parts(tile).flat_map(move |part| blocks_of_part(part, size))
 }
@@ -93,14 +96,14 @@ pub struct ErrorProbe {
 }
 
 impl ErrorProbe {
-    /// Prepares a probe of `frame`; `pair` is made of the frame's scene. Without `pair` the error by
-    /// thickness is not estimated.
+    /// Prepares a probe of `frame`; `pair` is made of the frame's scene. Without `pair` the error
+    /// by thickness is not estimated.
     pub fn new(frame: &Frame, pair: Option<&ThicknessPair>) -> ErrorProbe {
         ErrorProbe { pair: pair.map(|p| p.frames(&frame.view)), model: Model::of(frame) }
     }
 
-    /// Returns squared errors, by kind, summed over some pixels of `tile` of `frame`, the frame that the
-    /// probe was made for; `bricks` are those that the tile was drawn from.
+    /// Returns squared errors, by kind, summed over some pixels of `tile` of `frame`, the frame
+    /// that the probe was made for; `bricks` are those that the tile was drawn from.
     pub fn sample(
         &self,
         frame: &Frame,
@@ -117,7 +120,8 @@ impl ErrorProbe {
                 if rects.is_empty() {
                     rects.extend(bricks.iter().map(seen));
                 }
-                // In sheets of half the thickness footprints of perspective views may reach a pixel farther.
+                // In sheets of half the thickness footprints of perspective views may reach a pixel
+                // farther.
                 let near = Rect::new(block.x0 - 1, block.y0 - 1, block.x1 + 1, block.y1 + 1);
                 let over = |p: &Projected| !p.rect.intersect(&near).is_empty();
                 let some = bricks.iter().zip(&rects).filter(|(_, p)| p.as_ref().is_some_and(over));

@@ -1,18 +1,19 @@
 //! What the model itself and rounded positions cost, at a few of a tile's pixels.
 //!
-//! Eight pixels of each block that [`estimate`](crate::judge::error_probe) draws again are worked out point by point
-//! along their rays, as the limit is, but coarsely: the field of kernels is taken at steps of 1.2 of the
-//! kernel's deviation, which a sum of Gaussians does not feel, and light is constant between. Beside the
-//! field as it is defined stand three that differ by one thing each:
+//! Eight pixels of each block that [`estimate`](crate::judge::error_probe) draws again are worked
+//! out point by point along their rays, as the limit is, but coarsely: the field of kernels is
+//! taken at steps of 1.2 of the kernel's deviation, which a sum of Gaussians does not feel, and
+//! light is constant between. Beside the field as it is defined stand three that differ by one
+//! thing each:
 //!
 //! - *positions*: voxels where sheets have them, rounded to a part of a pixel and of a sheet;
 //! - *truncation*: the whole Gaussian, neither cut nor lowered by its edge;
-//! - *ripple*: the field divided by what an endless lattice of ones would be there. That is periodic: one
-//!   and a wave for each vector of the lattice's dual, of which the nearest are enough. As high as the
-//!   kernel's Fourier transform there, by which Poisson's formula has it.
+//! - *ripple*: the field divided by what an endless lattice of ones would be there. That is
+//!   periodic: one and a wave for each vector of the lattice's dual, of which the nearest are
+//!   enough. As high as the kernel's Fourier transform there, by which Poisson's formula has it.
 //!
-//! How far these pictures are from the first one are the errors, up to the coarseness of the steps, which
-//! all of them share.
+//! How far these pictures are from the first one are the errors, up to the coarseness of the steps,
+//! which all of them share.
 
 use crate::primitives::footprint::Profile;
 use crate::primitives::profile_table::ProfileTable;
@@ -29,8 +30,8 @@ use std::sync::Arc;
 /// Steps along a ray, in deviations of the kernel.
 const STEP: f64 = 1.2;
 
-/// Deviations after which what is left of a Gaussian is left out: 3e-5 of its integral. Voxels are looked at
-/// within this reach, so it is what they take; at 5.8 twice the time.
+/// Deviations after which what is left of a Gaussian is left out: 3e-5 of its integral. Voxels are
+/// looked at within this reach, so it is what they take; at 5.8 twice the time.
 const WHOLE: f64 = 4.2;
 
 /// Waves below this height are left out: a thousandth of a step of eight bits in all.
@@ -66,8 +67,8 @@ struct Near {
     rounded: DVec3,
     /// Which it is of which brick.
     voxel: (u32, u32),
-    /// Extinction per vox and that times the colours, for kernels that integrate to one: known of those that a ray
-    /// came to.
+    /// Extinction per vox and that times the colours, for kernels that integrate to one: known of
+    /// those that a ray came to.
     payload: Cell<Option<[f32; 4]>>,
     /// Steps that it reaches, from one on to the one behind the last.
     steps: [usize; 2],
@@ -88,7 +89,8 @@ impl Near {
     }
 }
 
-/// Voxels near a block, front to back, and the steps along its rays, which are the same for all of them.
+/// Voxels near a block, front to back, and the steps along its rays, which are the same for all of
+/// them.
 struct Column {
     near: Vec<Near>,
     start: f64,
@@ -245,7 +247,8 @@ impl Model {
                 near.push(Near { eye, seen, rounded, voxel, payload, steps, deep });
             }
         }
-        // Numbers and places are sorted, not voxels, of which each is as long as two lines of a cache.
+        // Numbers and places are sorted, not voxels, of which each is as long as two lines of a
+        // cache.
         let mut order: Vec<(f64, u32)> = near.iter().map(|v| v.eye.z).zip(0..).collect();
         order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         let mut near: Vec<Near> =

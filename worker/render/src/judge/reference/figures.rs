@@ -14,16 +14,16 @@ pub(super) fn worse(a: f64, b: f64) -> f64 {
     }
 }
 
-/// Errors of a picture against a reference, in linear premultiplied RGBA and units of 1/255, over the
-/// pixels where either has alpha above zero (docs/design/contracts.md, "Colour and error").
+/// Errors of a picture against a reference, in linear premultiplied RGBA and units of 1/255, over
+/// the pixels where either has alpha above zero (docs/design/contracts.md, "Colour and error").
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ErrorFigures {
     /// Root mean square error over all four channels, in 1/255.
     pub rmse: f64,
     /// Largest error over all four channels, in 1/255; infinite if a number is not finite.
     pub max: f64,
-    /// 99.9th percentile over pixels of the largest error over channels, in 1/255; of fewer than 1000
-    /// pixels, the maximum.
+    /// 99.9th percentile over pixels of the largest error over channels, in 1/255; of fewer than
+    /// 1000 pixels, the maximum.
     pub most_999: f64,
     /// Share (0 to 1) of the pixels with an error above 1/255 in any channel.
     pub share_above_1: f64,
@@ -34,8 +34,8 @@ pub struct ErrorFigures {
 }
 
 impl ErrorFigures {
-    /// Compares pixels `got` with reference pixels `want`, one by one, both linear premultiplied RGBA.
-    /// `background` lies behind the 8-bit pictures.
+    /// Compares pixels `got` with reference pixels `want`, one by one, both linear premultiplied
+    /// RGBA. `background` lies behind the 8-bit pictures.
     ///
     /// # Panics
     /// If `got` and `want` differ in length.

@@ -18,17 +18,18 @@ use super::walk::{Near, Ray};
 use glam::DVec3;
 
 impl Reference {
-    /// Returns this reference with the whole Gaussian instead of the truncated kernel. Its tail is cut
-    /// where less than 1e-9 is left, times the largest extinction: 3.7 lattice steps for a deviation of
-    /// 0.6 and ordinary opacities. Changes [`Reference::pixel`] alone; sheets keep the model's kernel.
+    /// Returns this reference with the whole Gaussian instead of the truncated kernel. Its tail is
+    /// cut where less than 1e-9 is left, times the largest extinction: 3.7 lattice steps for a
+    /// deviation of 0.6 and ordinary opacities. Changes [`Reference::pixel`] alone; sheets keep the
+    /// model's kernel.
     #[must_use]
     pub fn without_truncation(self) -> Reference {
         let most = self.looks.payload_max();
         Reference { kernel: self.kernel.each_ref().map(|k| k.untruncated(most)), ..self }
     }
 
-    /// Returns this reference with kernel sums divided by the kernel's sum over the infinite lattice, so
-    /// that a constant field comes back constant. Changes [`Reference::pixel`] alone.
+    /// Returns this reference with kernel sums divided by the kernel's sum over the infinite
+    /// lattice, so that a constant field comes back constant. Changes [`Reference::pixel`] alone.
     #[must_use]
     pub fn without_ripple(self) -> Reference {
         Reference { level: true, ..self }

@@ -25,9 +25,9 @@
 //! and lets [`ErrorFigures`] say how far off it is. Nothing is shared between pixels; callers
 //! split them among their threads.
 //!
-//! On lattices that are not cubic the kernel is an ellipsoid that leans against the eye's axes. All here
-//! is then in coordinates that lean along, where it is a product of three profiles again and rays are
-//! straight still (`upright`).
+//! On lattices that are not cubic the kernel is an ellipsoid that leans against the eye's axes. All
+//! here is then in coordinates that lean along, where it is a product of three profiles again and
+//! rays are straight still (`upright`).
 
 mod figures;
 mod ideal;
@@ -101,8 +101,8 @@ struct EyeBox {
 }
 
 impl Reference {
-    /// Prepares `view` of the scene that `spec` describes; `bricks` are all bricks of the scene, in any
-    /// order.
+    /// Prepares `view` of the scene that `spec` describes; `bricks` are all bricks of the scene, in
+    /// any order.
     pub fn new(spec: &SceneSpec, view: View, bricks: &[Arc<Brick>]) -> Reference {
         let grid = BrickGrid::new(spec.volume.lattice.dims);
         let [std, radius] = spec.quality.kernel_shape();
@@ -149,16 +149,16 @@ impl Reference {
         }
     }
 
-    /// Returns this reference with another tolerance of the integration, per panel and relative to the
-    /// opacity so far (1e-7 by default): to see whether the integration itself is exact enough.
+    /// Returns this reference with another tolerance of the integration, per panel and relative to
+    /// the opacity so far (1e-7 by default): to see whether the integration itself is exact enough.
     #[must_use]
     pub fn with_tolerance(self, tolerance: f64) -> Reference {
         Reference { tolerance, ..self }
     }
 
-    /// Returns this reference with the payloads that the sheets of the quality's compositing add instead
-    /// of extinctions. Under the paper's compositing these are alphas, and thin sheets that add alphas
-    /// converge to `1 - exp(-int alpha)`, which [`Reference::pixel`] then returns.
+    /// Returns this reference with the payloads that the sheets of the quality's compositing add
+    /// instead of extinctions. Under the paper's compositing these are alphas, and thin sheets that
+    /// add alphas converge to `1 - exp(-int alpha)`, which [`Reference::pixel`] then returns.
     #[must_use]
     pub fn with_sheet_payloads(self) -> Reference {
         Reference { looks: self.sheet_looks.clone(), ..self }

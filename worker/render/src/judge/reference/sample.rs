@@ -3,7 +3,8 @@
 use slabcast_common::occlusion::Rect;
 
 /// Returns `count` pixels of a picture of `size` (width, height), one at random in each of
-/// [`grid_cells`], by rows of cells; all pixels if there are no more. The result depends on `seed` alone.
+/// [`grid_cells`], by rows of cells; all pixels if there are no more. The result depends on `seed`
+/// alone.
 pub fn stratified(size: [u32; 2], count: usize, seed: u64) -> Vec<[u32; 2]> {
     let mut state = seed;
     let mut draw = |from: i32, to: i32| {
@@ -17,8 +18,8 @@ pub fn stratified(size: [u32; 2], count: usize, seed: u64) -> Vec<[u32; 2]> {
     grid_cells(size, count).into_iter().map(|r| [draw(r.x0, r.x1), draw(r.y0, r.y1)]).collect()
 }
 
-/// Divides a picture of `size` (width, height) into `count` cells of about equal size and shape, by rows,
-/// or into its pixels if there are no more.
+/// Divides a picture of `size` (width, height) into `count` cells of about equal size and shape, by
+/// rows, or into its pixels if there are no more.
 pub fn grid_cells(size: [u32; 2], count: usize) -> Vec<Rect> {
     let [w, h] = size.map(|n| n as usize);
     let count = count.min(w * h);

@@ -10,8 +10,8 @@ use super::walk::{Near, Ray, Walk};
 use slabcast_common::quality::Compositing;
 use slabcast_common::view::{Projection, SUBPIXELS};
 
-/// Depth at which the footprint of a section is placed in a perspective view. In orthographic views all
-/// are the same.
+/// Depth at which the footprint of a section is placed in a perspective view. In orthographic views
+/// all are the same.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum SectionPlacement {
     /// The sheet's mid-plane: the model (DESIGN.md section 1), and what is drawn.
@@ -66,20 +66,21 @@ pub struct ReferenceSheet {
 const PIECE: f64 = 0.5;
 
 impl Reference {
-    /// Returns pixel (x, y), linear premultiplied RGBA, of sheets of the view's thickness composited by
-    /// the quality's rule in f64, with nothing rounded and nothing shut.
+    /// Returns pixel (x, y), linear premultiplied RGBA, of sheets of the view's thickness
+    /// composited by the quality's rule in f64, with nothing rounded and nothing shut.
     pub fn at_same_thickness(&self, x: u32, y: u32) -> [f64; 4] {
         self.by_sheets(x, y, SheetOptions::default())
     }
 
-    /// Returns pixel (x, y) as [`Reference::at_same_thickness`] does, with the sheets made as `how` says.
+    /// Returns pixel (x, y) as [`Reference::at_same_thickness`] does, with the sheets made as `how`
+    /// says.
     pub fn by_sheets(&self, x: u32, y: u32, how: SheetOptions) -> [f64; 4] {
         self.stack(x, y, how).map_or([0.0; 4], |stack| stack.composite(self.compositing))
     }
 
-    /// Returns pixel (x, y) as [`Reference::by_sheets`] does, for the linear and for the constant colour
-    /// rule at once: both composite the same sums, and summing takes the time. The scene's compositing must
-    /// be one of the two.
+    /// Returns pixel (x, y) as [`Reference::by_sheets`] does, for the linear and for the constant
+    /// colour rule at once: both composite the same sums, and summing takes the time. The scene's
+    /// compositing must be one of the two.
     pub fn by_sheets_linear_and_constant(
         &self,
         x: u32,
@@ -91,8 +92,8 @@ impl Reference {
         })
     }
 
-    /// Returns the sheets of [`Reference::by_sheets`] at pixel (x, y), front to back; the last may be
-    /// empty. An empty list means that the ray meets no voxel.
+    /// Returns the sheets of [`Reference::by_sheets`] at pixel (x, y), front to back; the last may
+    /// be empty. An empty list means that the ray meets no voxel.
     pub fn sheet_by_sheet(&self, x: u32, y: u32, how: SheetOptions) -> Vec<ReferenceSheet> {
         let Some(stack) = self.stack(x, y, how) else { return Vec::new() };
         let mut out = Vec::with_capacity(stack.sheets.len());
@@ -183,8 +184,8 @@ impl Reference {
         along * self.across(ray, pixel, v, [how.section.at(middle, centroid); 2], how)
     }
 
-    /// The section between two depths of a kernel that leans: where it lies follows from the eye's rays as
-    /// [`Reference::placed`] says, and for the lean exactly.
+    /// The section between two depths of a kernel that leans: where it lies follows from the eye's
+    /// rays as [`Reference::placed`] says, and for the lean exactly.
     fn leaning(
         &self,
         ray: &Ray,
@@ -211,7 +212,8 @@ impl Reference {
         self.along_the_ray(ray, &moved, [from, to], |_| at)
     }
 
-    /// The profiles across the ray where it passes a depth: first for the eye's slope, then for the lean's.
+    /// The profiles across the ray where it passes a depth: first for the eye's slope, then for the
+    /// lean's.
     fn across(&self, ray: &Ray, pixel: [u32; 2], v: &Near, at: [f64; 2], how: SheetOptions) -> f64 {
         let [x, y] = [0, 1].map(|axis| self.off(ray, pixel, v, axis, at, how));
         self.kernel[0].at(x) * self.kernel[1].at(y)
@@ -246,8 +248,8 @@ impl Reference {
         (here - libm::rint(centre) / f64::from(SUBPIXELS)) / scale
     }
 
-    /// The kernel's integral along the ray between two depths, per unit of depth; at depth z the eye's ray is
-    /// where it passes `seen_at(z)`.
+    /// The kernel's integral along the ray between two depths, per unit of depth; at depth z the
+    /// eye's ray is where it passes `seen_at(z)`.
     fn along_the_ray(
         &self,
         ray: &Ray,

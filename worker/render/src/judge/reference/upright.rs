@@ -1,13 +1,15 @@
 //! The ellipsoid of a lattice that is not cubic, by Cholesky's factors of its covariance.
 //!
-//! With G the covariance of a kernel of deviation one, as the eye sees it, z of a point is a third of what
-//! is known of it; y has the regression `Gyz / Gzz` on z and what is left of its deviation, and x those on z
-//! and on what is left of y. Less these regressions a point is *upright*: there the kernel is a product.
+//! With G the covariance of a kernel of deviation one, as the eye sees it, z of a point is a third
+//! of what is known of it; y has the regression `Gyz / Gzz` on z and what is left of its deviation,
+//! and x those on z and on what is left of y. Less these regressions a point is *upright*: there
+//! the kernel is a product.
 
 use glam::{DMat3, DVec3};
 use slabcast_common::view::View;
 
-/// Deviations of the kernel's profiles in lattice steps, and its slopes, in `view` of a kernel of `std` steps.
+/// Deviations of the kernel's profiles in lattice steps, and its slopes, in `view` of a kernel of
+/// `std` steps.
 pub(super) fn of(view: &View, std: f64) -> ([f64; 3], [f64; 3]) {
     if view.kernel_lean.is_none() {
         // It may be cubic but for rounding, and then it is drawn as if it were.

@@ -1,4 +1,4 @@
-//! What happens at a pixel when a sheet closes.
+//! Compositing: what a closing sheet adds to a pixel.
 //!
 //! In optical depth t a sheet's light is the integral of C(t) exp(-t): extinction itself drops
 //! out. c = E / tau is the exact mean of C and tau is exact, so A is exact for any thickness;
@@ -6,7 +6,7 @@
 //! before and behind, the latter *half filled*: what voxels that begin no later than this sheet
 //! have put into the next one (the peek). That is as accurate as the finished sheet, needs no
 //! latency, and is the same for every tile, order and culling, since "begins no later" is a
-//! matter of the absolute sheet grid (NUMERICS.md section 1.2).
+//! matter of the absolute sheet grid (docs/design/numerics.md, section 1.2).
 
 pub mod rows;
 
@@ -320,8 +320,9 @@ impl Rule {
         row: &mut Row,
         live: u32,
     ) -> u32 {
-        // Several short loops over plain arrays, with what they read of `self` beside them, and selects
-        // by bits: of one long loop, of loads behind a condition or of branches compilers make scalar code.
+        // Several short loops over plain arrays, with what they read of `self` beside them, and
+        // selects by bits: of one long loop, of loads behind a condition or of branches compilers
+        // make scalar code.
         let (unit, per_unit) = (self.unit, self.per_unit);
         let [mut taus, mut per_raws, mut raws, mut sheet] = [[0.0f32; LANES]; 4];
         for i in 0..LANES {

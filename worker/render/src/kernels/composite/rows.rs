@@ -1,8 +1,8 @@
-//! Rows of a closing sheet in registers.
+//! Compositing of rows of pixels in registers.
 //!
-//! What is done is [`Rule::close_row`], operation by operation, for sums in whole numbers under the
-//! linear rule; everything else is closed there. A row is one chain of some sixty operations that wait
-//! for each other, so two rows are closed at once.
+//! The operations are those of [`Rule::close_row`], one by one, for whole-number sums under the
+//! linear rule; everything else is composited there. A row is one chain of some sixty operations
+//! that wait for each other, so two rows are composited at once.
 
 #[cfg(target_arch = "x86_64")]
 use crate::kernels::Level;
@@ -139,7 +139,8 @@ mod wide {
         light: F,
     }
 
-    /// Closes the lanes of some rows, a register after the other; says which of each one's are shut now.
+    /// Closes the lanes of some rows, a register after the other; says which of each one's are shut
+    /// now.
     ///
     /// # Safety
     /// The instructions are there.

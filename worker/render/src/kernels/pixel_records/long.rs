@@ -1,8 +1,8 @@
 //! Records of 32-bit sums in lanes.
 //!
 //! What is added is `(section * wy) * wx + 1/2`, cut off, as the plain loop has it, but without its
-//! clamps: a payload times weights stays below 2^31 (`bounds::i32_units_per_payload`), and what would not
-//! turns into i32's smallest number here and its largest there.
+//! clamps: a payload times weights stays below 2^31 (`bounds::i32_units_per_payload`), and what
+//! would not turns into i32's smallest number here and its largest there.
 
 #[cfg(target_arch = "x86_64")]
 pub(super) mod avx2 {
@@ -20,7 +20,8 @@ pub(super) mod avx2 {
     /// Registers of a record at most: eight sums each.
     pub(in super::super) const PARTS: usize = MOST / 2;
 
-    /// Which of a row's weights in depth each of the eight lanes of a register takes: that of its slot.
+    /// Which of a row's weights in depth each of the eight lanes of a register takes: that of its
+    /// slot.
     #[target_feature(enable = "avx2")]
     #[inline]
     fn turns<const C: usize, const N: usize>(slot: usize) -> [__m256i; PARTS] {
@@ -130,8 +131,8 @@ pub(super) mod avx2 {
                 let behind = _mm256_cmpgt_epi32(columns, _mm256_set1_epi32(begin - 1));
                 let before = _mm256_cmpgt_epi32(_mm256_set1_epi32(end), columns);
                 let from = row.as_ptr().wrapping_offset(first as isize - begin as isize);
-                // SAFETY: a tap is a float; lanes that are not present are not read, and those that are
-                // lie in the row.
+                // SAFETY: a tap is a float; lanes that are not present are not read, and those that
+                // are lie in the row.
                 *line =
                     unsafe { _mm256_maskload_ps(from.cast(), _mm256_and_si256(behind, before)) };
             }
@@ -286,8 +287,8 @@ pub(super) mod avx2 {
             let mut slots = [_mm256_setzero_ps(); 4];
             for (slot, line) in slots.iter_mut().enumerate() {
                 let (present, from) = lines.of(slot, i);
-                // SAFETY: these are the instructions. A tap is a float; lanes that are not present are not
-                // read, and those that are lie in the table.
+                // SAFETY: these are the instructions. A tap is a float; lanes that are not present
+                // are not read, and those that are lie in the table.
                 unsafe {
                     let present = Eight::marks(present >> (8 * eight));
                     *line = _mm256_maskload_ps(from.wrapping_add(8 * eight).cast(), present);
@@ -474,8 +475,8 @@ pub(super) mod avx512 {
         let mut lines = [_mm512_setzero_si512(); 4];
         for (line, at) in lines.iter_mut().zip(rows) {
             let (present, from) = at.columns();
-            // SAFETY: a tap is a float; lanes that are not present are not read, and those that are lie
-            // in the row.
+            // SAFETY: a tap is a float; lanes that are not present are not read, and those that are
+            // lie in the row.
             *line = unsafe { _mm512_maskz_loadu_epi32(present, from.cast()) };
         }
         for (to, four) in to.chunks_exact_mut(4).zip(by_column(lines)) {
@@ -565,16 +566,16 @@ pub(super) mod avx512 {
         by_window!(wide, side_by_side[N], at)
     }
 
-    /// Weights of voxel `i` in four slots, the first or the second ones, pixel by pixel: four pixels a
-    /// register.
+    /// Weights of voxel `i` in four slots, the first or the second ones, pixel by pixel: four
+    /// pixels a register.
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
     #[inline]
     fn four_slots<const N: usize>(lines: &Lines<'_, Tap, N>, i: usize, half: usize) -> [__m512; 4] {
         let mut slots = [_mm512_setzero_si512(); 4];
         for (slot, line) in slots.iter_mut().enumerate() {
             let (present, from) = lines.of(4 * half + slot, i);
-            // SAFETY: a tap is a float; lanes that are not present are not read, and those that are lie
-            // in the table.
+            // SAFETY: a tap is a float; lanes that are not present are not read, and those that are
+            // lie in the table.
             *line = unsafe { _mm512_maskz_loadu_epi32(present as u16, from.cast()) };
         }
         by_column(slots).map(|four| _mm512_castsi512_ps(four))
@@ -643,7 +644,8 @@ pub(super) mod avx512 {
                     for c in 0..WIDE {
                         let at: *mut __m512i = row[c].as_mut_ptr().cast();
                         let add = _mm512_mul_ps(of_row, wx[c]);
-                        // SAFETY: sixteen sums of four slots are 64 bytes, and borrowed for us alone.
+                        // SAFETY: sixteen sums of four slots are 64 bytes, and borrowed for us
+                        // alone.
                         unsafe {
                             let at = at.add(half);
                             let sums = _mm512_loadu_si512(at);

@@ -1,10 +1,11 @@
-//! Sums of some sheets of a pixel beside each other: a voxel adds all its sections at once.
+//! Pixel records: the sums of several sheets of a pixel side by side, so that a voxel adds all its
+//! sections at once.
 //!
 //! A record has N sheets, four or eight: as many as a voxel has sections, which for sheets of a vox
 //! are four. Four sheets of 16-bit sums are 32 bytes: one operation of AVX2, and one of AVX-512 for
-//! two pixels ([`short`]); 32-bit sums take twice that ([`long`]). NEON's registers are of sixteen bytes, and
-//! there all kinds of sums share their loops (`neon`). Every loop is written plainly here; what is written
-//! in lanes there must equal it.
+//! two pixels ([`short`]); 32-bit sums take twice that ([`long`]). NEON's registers have sixteen
+//! bytes, and all kinds of sums share their loops there (`neon`). Every loop is written plainly
+//! here; the loops in lanes must equal it.
 
 /// Calls a function for windows of `wide` columns, at most sixteen, or of a few more.
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
@@ -43,8 +44,8 @@ macro_rules! by_window_alike {
     };
 }
 
-/// Calls a function for footprints as wide as common ones are, so that a row's loop is of known length, or
-/// does what is for others.
+/// Calls a function for footprints as wide as common ones are, so that a row's loop is of known
+/// length, or does what is for others.
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! by_width {
     ($wide:expr, $all:ident[$($of:ident),*], $at:expr, $others:expr) => {
@@ -124,16 +125,16 @@ pub struct Tables<'a, S: Recorded> {
     pub deep: Table<'a, S::Depth>,
 }
 
-/// A voxel whose footprint, moved if need be, lies inside the part: sixteen bytes, packed as they are
-/// so that many are made on lanes.
+/// A voxel whose footprint, moved if need be, lies inside the part: sixteen bytes, packed as they
+/// are so that many are made on lanes.
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(16))]
 pub struct Splat {
-    /// First column and row of its footprint, a byte each, and above them the pixel of the part that
-    /// is nearest to its centre: 64 times the row, and the column.
+    /// First column and row of its footprint, a byte each, and above them the pixel of the part
+    /// that is nearest to its centre: 64 times the row, and the column.
     pub place: u32,
-    /// Where its weights across begin and, above that, those down; of a voxel whose sections lie aside of each
-    /// other, where it is itself.
+    /// Where its weights across begin and, above that, those down; of a voxel whose sections lie
+    /// aside of each other, where it is itself.
     pub rows: u32,
     /// Depth in phases from its sheet's front and, above that, its normal.
     pub deep: u32,
@@ -215,15 +216,15 @@ impl<'a, W> RowAt<'a, W> {
     /// No weights.
     pub const NONE: Self = RowAt { table: &[], from: 0, len: 0, column: 0 };
 
-    /// The same beside a table. A load of no lanes takes a machine hundreds of cycles where nothing is that it
-    /// could have read.
+    /// The same beside a table. A load of no lanes takes a machine hundreds of cycles where nothing
+    /// is that it could have read.
     #[inline(always)]
     pub(crate) fn none_of(table: &'a [W]) -> Self {
         RowAt { table, ..RowAt::NONE }
     }
 
-    /// Which of the first 16 columns it has a weight for, a bit each, and where that of the first column
-    /// would be.
+    /// Which of the first 16 columns it has a weight for, a bit each, and where that of the first
+    /// column would be.
     #[inline(always)]
     fn columns(&self) -> (u16, *const W) {
         let row = self.row();
@@ -250,8 +251,8 @@ pub trait Recorded: Accumulate {
     type Payload: Copy + Default;
     /// Whether sections that [lie aside of each other](slant) are added in lanes.
     const SLANTED: bool = false;
-    /// Windows begin at a column that is a multiple of it, and have as many: records of `N` sheets that may
-    /// share a register.
+    /// Windows begin at a column that is a multiple of it, and have as many: records of `N` sheets
+    /// that may share a register.
     fn step<const N: usize>() -> i32 {
         1
     }
@@ -270,8 +271,9 @@ pub trait Recorded: Accumulate {
     /// From those.
     fn from_raw(raw: RawSums) -> Self::Pixel;
 
-    /// Adds `voxels` with `payloads`, which all begin at the sheet that `slot` holds: the section of
-    /// each in a sheet is `payload * z`, a row `section * y`, what is added to a pixel `row * x`.
+    /// Adds `voxels` with `payloads`, which all begin at the sheet that `slot` holds: the section
+    /// of each in a sheet is `payload * z`, a row `section * y`, what is added to a pixel `row *
+    /// x`.
     ///
     /// # Panics
     /// If a footprint leaves the records, or if there are not as many payloads as voxels.
@@ -284,8 +286,8 @@ pub trait Recorded: Accumulate {
     );
 
     /// Puts weights of N rows, one a slot, beside each other: the `j`th of a row belongs to column
-    /// `j` plus that of its first, wherever that is one of the first `wide`; elsewhere in those there are
-    /// zeros. What the columns behind are then is not said.
+    /// `j` plus that of its first, wherever that is one of the first `wide`; elsewhere in those
+    /// there are zeros. What the columns behind are then is not said.
     ///
     /// # Panics
     /// If there are not as many columns.
@@ -318,7 +320,8 @@ pub trait Recorded: Accumulate {
         splat_deep::<Self, N>(records, at, across, payload, z);
     }
 
-    /// Adds voxels with `payloads` whose sections have footprints of their own, in `woven` if need be.
+    /// Adds voxels with `payloads` whose sections have footprints of their own, in `woven` if need
+    /// be.
     ///
     /// # Panics
     /// If there are not as many payloads as voxels are kept, or if a window leaves the part.

@@ -1,8 +1,9 @@
 //! Records in lanes of NEON: registers of sixteen bytes, written once for all kinds of sums.
 //!
-//! Whether weights are of one pixel and all slots or of a slot each, what is added is a row times as many
-//! weights as a register has sums, rounded by one instruction: for 16-bit sums the product's upper half, for
-//! 32-bit sums the nearest whole number. Those are not clamped ([`super::long`] says why).
+//! Whether weights are of one pixel and all slots or of a slot each, what is added is a row times
+//! as many weights as a register has sums, rounded by one instruction: for 16-bit sums the
+//! product's upper half, for 32-bit sums the nearest whole number. Those are not clamped
+//! ([`super::long`] says why).
 
 use crate::kernels::lanes::Four;
 use crate::kernels::pixel_records::sheet_offsets::lines::{self, Lines};
@@ -43,7 +44,8 @@ pub(in super::super) trait InLanes: Recorded {
     unsafe fn cut_by(payload: Self::Lanes, wz: Self::Lanes) -> Self::Lanes;
     /// Adds `row * w` to the sums at `at`, which nobody else looks at.
     unsafe fn add_to(at: *mut uint8x16_t, row: Self::Lanes, w: Self::Lanes);
-    /// Weights of N slots, the first ones in the first register: each once for every sum of its slot.
+    /// Weights of N slots, the first ones in the first register: each once for every sum of its
+    /// slot.
     unsafe fn spread<const N: usize>(weights: [Self::Lanes; 2]) -> Parts<Self>;
     /// Weights from `from` on, all of which can be read; zero where they have no bit in `present`.
     unsafe fn some(present: u32, from: *const Self::Weight) -> Self::Lanes;
@@ -134,7 +136,8 @@ macro_rules! four_lanes {
                 unsafe { vst1q_s32(at.cast(), vaddq_s32(vld1q_s32(at.cast()), add)) }
             }
             fn some(present: u32, from: *const Tap) -> float32x4_t {
-                // SAFETY: sixteen bytes each, and a tap is a float; the caller has four of them there.
+                // SAFETY: sixteen bytes each, and a tap is a float; the caller has four of them
+                // there.
                 let (each, some) = unsafe { (vld1q_u32([1, 2, 4, 8].as_ptr()), vld1q_u32(from.cast())) };
                 vreinterpretq_f32_u32(vandq_u32(some, vtstq_u32(vdupq_n_u32(present), each)))
             }
@@ -307,7 +310,8 @@ fn times<S: InLanes, const N: usize>(a: &Parts<S>, b: &Parts<S>) -> Parts<S> {
 fn add<S: InLanes, const N: usize>(record: &mut Record<S, N>, row: &Parts<S>, w: &Parts<S>) {
     let at: *mut uint8x16_t = record.as_mut_ptr().cast();
     for i in 0..parts::<S, N>() {
-        // SAFETY: these are the instructions; so many registers are the record, borrowed for us alone.
+        // SAFETY: these are the instructions; so many registers are the record, borrowed for us
+        // alone.
         unsafe { S::add_to(at.add(i), row[i], w[i]) };
     }
 }
@@ -398,8 +402,8 @@ pub(super) fn splat_deep<S: InLanes, const N: usize>(
     }
 }
 
-/// Puts weights of N rows beside each other in the first `n` columns and some more: those that have a bit in
-/// `present`. Rows begin at `from`.
+/// Puts weights of N rows beside each other in the first `n` columns and some more: those that have
+/// a bit in `present`. Rows begin at `from`.
 ///
 /// # Safety
 /// [`LINE`] weights are there in each, and no more columns are asked for.
@@ -412,8 +416,8 @@ unsafe fn weave_some<S: InLanes, const N: usize>(
     to: &mut [BySlot<S::Weight, N>; LINE],
 ) {
     for (i, to) in to.chunks_exact_mut(S::LANES).take(n.div_ceil(S::LANES)).enumerate() {
-        // SAFETY: these are the instructions; there is room for so many columns, and the caller has as many
-        // weights.
+        // SAFETY: these are the instructions; there is room for so many columns, and the caller has
+        // as many weights.
         unsafe {
             let mut slots = [S::nothing(); PARTS];
             for slot in 0..N {

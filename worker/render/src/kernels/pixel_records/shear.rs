@@ -1,14 +1,19 @@
-//! Voxels of parallel views whose sections lie aside of each other, as those of thick slices seen at a slant.
+//! Voxels of parallel views whose sections lie aside of each other, as those of thick slices seen
+//! at a slant.
 //!
-//! How far a section lies from its voxel hangs on the phase of the voxel's depth alone, and how far a row does from its
-//! section's middle on how far it is above or below that ([`Leaning`](crate::primitives::footprint::Leaning)). Thus where weights
-//! begin is found when a voxel is added, of all eight sections in a register; nothing is kept by voxel and sheet, as it
-//! is of sections that lie anywhere ([`super::sheet_offsets`]). Where the odd axis of the lattice stands upright, as CT is looked
-//! at, sections are *stacked*: they have the same columns, and weights across are looked up once a voxel. Else the voxel
-//! is *skewed*: its footprint is a parallelogram, and weights across are looked up row by row, from the first column of
-//! any section in that row on. That is written for AVX2 and AVX-512; elsewhere these are voxels like any others.
+//! How far a section lies from its voxel hangs on the phase of the voxel's depth alone, and how far
+//! a row does from its section's middle on how far it is above or below that
+//! ([`Leaning`](crate::primitives::footprint::Leaning)). Thus where weights begin is found when a
+//! voxel is added, of all eight sections in a register; nothing is kept by voxel and sheet, as it
+//! is of sections that lie anywhere ([`super::sheet_offsets`]). Where the odd axis of the lattice
+//! stands upright, as CT is looked at, sections are *stacked*: they have the same columns, and
+//! weights across are looked up once a voxel. Else the voxel is *skewed*: its footprint is a
+//! parallelogram, and weights across are looked up row by row, from the first column of any section
+//! in that row on. That is written for AVX2 and AVX-512; elsewhere these are voxels like any
+//! others.
 
-/// Calls a function for rows of as many columns as the voxels have, or of a few more, and for skewed voxels or not.
+/// Calls a function for rows of as many columns as the voxels have, or of a few more, and for
+/// skewed voxels or not.
 #[cfg(target_arch = "x86_64")]
 macro_rules! by_columns {
     ($slanted:ident[$n:ident], $at:expr) => {
@@ -57,7 +62,8 @@ pub fn in_lanes<S: Recorded>(simd: Simd) -> bool {
     are_there && S::SLANTED
 }
 
-/// Finds the windows of the first `n` voxels, which are skewed, where [that is done in lanes](in_lanes).
+/// Finds the windows of the first `n` voxels, which are skewed, where [that is done in
+/// lanes](in_lanes).
 ///
 /// # Panics
 /// If it is not.

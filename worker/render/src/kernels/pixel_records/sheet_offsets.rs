@@ -1,11 +1,11 @@
-//! Voxels whose sections have footprints of their own, as in perspective: each lies elsewhere on the
-//! screen and is of another width.
+//! Voxels whose sections have footprints of their own, as in perspective: each lies elsewhere on
+//! the screen and is of another width.
 //!
 //! A voxel's weights are put side by side by column and slot, and by row and slot
 //! ([`Recorded::weave`]), so that all its sections are added to a pixel's record at once
-//! ([`Recorded::splat_deep`]). With AVX2, AVX-512 and NEON, where windows are at most [`LINE`] pixels wide,
-//! what lies in a window is worked out for many voxels at once (`lines`), and weights are put side by side
-//! in registers.
+//! ([`Recorded::splat_deep`]). With AVX2, AVX-512 and NEON, where windows are at most [`LINE`]
+//! pixels wide, what lies in a window is worked out for many voxels at once (`lines`), and weights
+//! are put side by side in registers.
 
 use super::shear::Slant;
 use super::{BySlot, MOST, Record, Recorded, RowAt, STRIDE, Table};
@@ -28,18 +28,21 @@ pub const WINDOW: usize = 40;
 
 /// Where the sections of some voxels lie.
 pub struct Apart {
-    /// First pixels of footprints, from the part's corner, and where weights begin: by axis and slot.
+    /// First pixels of footprints, from the part's corner, and where weights begin: by axis and
+    /// slot.
     pub first: [[Each<i32>; MOST]; 2],
     pub from: [[Each<u32>; MOST]; 2],
-    /// Where footprints lie themselves, in subpixels from the part's corner: known where rows lie aside.
+    /// Where footprints lie themselves, in subpixels from the part's corner: known where rows lie
+    /// aside.
     pub places: [[Each<i32>; MOST]; 2],
     /// Where voxels do, where their sections lie aside of them.
     pub at: [Each<i32>; 2],
-    /// By axis, the window inside the part that holds all footprints of a voxel: its first pixel, and the
-    /// one behind its last.
+    /// By axis, the window inside the part that holds all footprints of a voxel: its first pixel,
+    /// and the one behind its last.
     pub lo: [Each<i32>; 2],
     pub hi: [Each<i32>; 2],
-    /// Sheets that a voxel has left, from the one at hand, and where its weights in depth for these begin.
+    /// Sheets that a voxel has left, from the one at hand, and where its weights in depth for these
+    /// begin.
     pub left: Each<i32>,
     pub deep: Each<u32>,
     /// Voxels that are added.
@@ -63,9 +66,10 @@ impl Default for Apart {
 }
 
 impl Apart {
-    /// Has sections of the first `n` voxels lie as far aside along `axis` as `aside` says of each phase's sheets
-    /// ([`Leaning::subpixels`](crate::primitives::footprint::Leaning::subpixels)): in so many sheets from that on which slot `first`
-    /// holds. What lies behind a voxel's last section may lie anywhere.
+    /// Has sections of the first `n` voxels lie as far aside along `axis` as `aside` says of each
+    /// phase's sheets ([`Leaning::subpixels`](crate::primitives::footprint::Leaning::subpixels)):
+    /// in so many sheets from that on which slot `first` holds. What lies behind a voxel's last
+    /// section may lie anywhere.
     #[inline(always)]
     pub fn lean<const N: usize>(
         &mut self,
@@ -105,8 +109,8 @@ impl Apart {
         self.hi[axis][..n].fill(i32::MIN);
     }
 
-    /// Has the windows hold footprints of `len` pixels along `axis` in a slot, of which voxels have some if they have
-    /// more than `sheets` left.
+    /// Has the windows hold footprints of `len` pixels along `axis` in a slot, of which voxels have
+    /// some if they have more than `sheets` left.
     #[inline(always)]
     pub fn hold(&mut self, axis: usize, slot: usize, n: usize, (len, sheets): (i32, i32)) {
         let first = &self.first[axis][slot];
@@ -118,7 +122,8 @@ impl Apart {
         }
     }
 
-    /// The same across where rows lie aside of each other: `row` is [`Lean::row_fixed`], and rows are placed.
+    /// The same across where rows lie aside of each other: `row` is [`Lean::row_fixed`], and rows
+    /// are placed.
     #[inline(always)]
     pub fn hold_skewed(
         &mut self,
@@ -168,8 +173,8 @@ mod lean {
     use crate::kernels::lanes::{Eight, Lanes, Sixteen};
     use crate::kernels::pixel_records::MOST;
 
-    /// Where sections lie by slot, and of the voxels where weights in depth begin and where they are; how far
-    /// sections lie aside.
+    /// Where sections lie by slot, and of the voxels where weights in depth begin and where they
+    /// are; how far sections lie aside.
     type At<'a> = (&'a mut [Each<i32>; MOST], &'a Each<u32>, &'a Each<i32>, &'a [i32]);
 
     #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
@@ -200,8 +205,8 @@ mod lean {
             for (to, &deep) in which[..L::LANES].iter_mut().zip(&deep[some.clone()]) {
                 *to = deep.min(last as u32);
             }
-            // SAFETY: the caller's. Fours begin at most at the `last`, and four later; as many lanes are left in
-            // what comes out.
+            // SAFETY: the caller's. Fours begin at most at the `last`, and four later; as many
+            // lanes are left in what comes out.
             unsafe {
                 let at = L::load(at[some.clone()].as_ptr().cast());
                 for four in 0..sheets.min(N).div_ceil(4) {
@@ -227,7 +232,8 @@ pub struct Layers<'a, S: Recorded, const N: usize> {
     pub slot: usize,
     /// Whether a voxel has the same columns in all of them, with the same weights.
     pub alike: bool,
-    /// How sections lie aside of each other, if where they are is looked up as voxels are added ([`slant`](super::slant)).
+    /// How sections lie aside of each other, if where they are is looked up as voxels are added
+    /// ([`slant`](super::slant)).
     pub slant: Option<Slant<'a>>,
 }
 
@@ -322,15 +328,16 @@ pub(super) fn splat_apart<S: Recorded, const N: usize>(
     }
 }
 
-/// Where the middle of row `y` is along x of a footprint at `place`, in subpixels; `row`: [`Lean::row_fixed`].
+/// Where the middle of row `y` is along x of a footprint at `place`, in subpixels; `row`:
+/// [`Lean::row_fixed`].
 #[inline(always)]
 pub(crate) fn along_row(row: i64, [x, y_of]: [i32; 2], y: i32) -> i32 {
     let middle = (y << SUBPIXEL_BITS) + SUBPIXELS / 2;
     x + Lean::along_row(row, i64::from(middle - y_of)) as i32
 }
 
-/// [`splat_apart`] of voxels whose rows lie aside of each other, too: each row has weights of its own. `phases`:
-/// where those across lie in each slot.
+/// [`splat_apart`] of voxels whose rows lie aside of each other, too: each row has weights of its
+/// own. `phases`: where those across lie in each slot.
 #[inline(always)]
 pub fn splat_skewed<S: Recorded, const N: usize>(
     simd: Simd,
@@ -373,8 +380,8 @@ pub(super) mod lines {
     use crate::primitives::sizes::PART;
     use std::ops::Range;
 
-    /// Columns that the windows of all voxels fit which are added, a multiple of the step, which is 1 or 2; `None` if
-    /// there are windows of more than [`LINE`] pixels.
+    /// Columns that the windows of all voxels fit which are added, a multiple of the step, which is
+    /// 1 or 2; `None` if there are windows of more than [`LINE`] pixels.
     #[inline(always)]
     pub(crate) fn widest(apart: &Apart, kept: &[u32], step: i32) -> Option<usize> {
         let n = kept.last().map_or(0, |&last| last as usize % BATCH + 1);
@@ -394,8 +401,9 @@ pub(super) mod lines {
         first.min(PART as usize - wide)
     }
 
-    /// Which weights in each slot windows have along an axis. These are kilobytes, and a bucket may have few voxels:
-    /// they stay where they are from one to the next, and what is of no voxel at hand is anything.
+    /// Which weights in each slot windows have along an axis. These are kilobytes, and a bucket may
+    /// have few voxels: they stay where they are from one to the next, and what is of no voxel at
+    /// hand is anything.
     pub(crate) struct Spans<const N: usize> {
         /// Which pixels of a window there are any for, a bit each.
         present: [Each<u32>; N],
@@ -409,17 +417,17 @@ pub(super) mod lines {
         }
     }
 
-    /// Weights in each slot along an axis for windows of at most [`LINE`] pixels. Those that are present lie
-    /// in the slot's weights.
+    /// Weights in each slot along an axis for windows of at most [`LINE`] pixels. Those that are
+    /// present lie in the slot's weights.
     pub(crate) struct Lines<'a, W, const N: usize> {
         spans: &'a Spans<N>,
         weights: [&'a [W]; N],
     }
 
     impl<'a, W, const N: usize> Lines<'a, W, N> {
-        /// Those across and down of the voxels in `kept`, which ascend. Windows begin at columns that are
-        /// multiples of `step` and are moved inside to be `wide` columns; they may have any number of rows.
-        /// Columns that are alike are those of the first slot alone.
+        /// Those across and down of the voxels in `kept`, which ascend. Windows begin at columns
+        /// that are multiples of `step` and are moved inside to be `wide` columns; they may have
+        /// any number of rows. Columns that are alike are those of the first slot alone.
         ///
         /// # Safety
         /// For machines with the instructions of `L`.
@@ -474,8 +482,9 @@ pub(super) mod lines {
                             lo = L::min(L::and(lo, L::set(-step)), L::set(PART - wide as i32));
                         }
                         let column = L::minus(L::load(first), lo);
-                        // From a footprint's first pixel to behind its last, of those that are looked at. In
-                        // sheets that a voxel does not reach there may be some: its section is nothing there.
+                        // From a footprint's first pixel to behind its last, of those that are
+                        // looked at. In sheets that a voxel does not reach there may be some: its
+                        // section is nothing there.
                         let (zero, one, line) = (L::set(0), L::set(1), L::set(LINE as i32));
                         let begin = L::min(L::max(column, zero), line);
                         let end = L::min(L::max(L::plus(column, L::set(len)), zero), line);
@@ -490,15 +499,16 @@ pub(super) mod lines {
             Lines { spans, weights }
         }
 
-        /// Which weights of voxel `i` there are in `slot`, a bit each, and where that of the first pixel would
-        /// lie.
+        /// Which weights of voxel `i` there are in `slot`, a bit each, and where that of the first
+        /// pixel would lie.
         #[inline(always)]
         pub(crate) fn of(&self, slot: usize, i: usize) -> (u32, *const W) {
             let from = self.weights[slot].as_ptr();
             (self.spans.present[slot][i], from.wrapping_offset(self.spans.at[slot][i] as isize))
         }
 
-        /// The same, and [`LINE`] weights from that of the first pixel on, where the table has them all.
+        /// The same, and [`LINE`] weights from that of the first pixel on, where the table has them
+        /// all.
         #[inline(always)]
         pub(crate) fn around(&self, slot: usize, i: usize) -> (u32, Option<&'a [W; LINE]>) {
             let around = usize::try_from(self.spans.at[slot][i]).ok();

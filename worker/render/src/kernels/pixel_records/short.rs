@@ -726,7 +726,8 @@ pub(super) mod avx512 {
         (records, (apart, payloads), layers, spans): ApartAt<'_, i16, N>,
     ) {
         let turn = words(|lane| (lane / 4 + 2 * N - layers.slot) % N);
-        // Which weight of a line's 64 a lane takes: that of its slot for its column, or for the row.
+        // Which weight of a line's 64 a lane takes: that of its slot for its column, or for the
+        // row.
         let column = words(|lane| lane / 4 % N * LINE + lane / (4 * N));
         let row = words(|lane| lane / 4 % N * LINE);
         let kept = &apart.kept[..payloads.len()];

@@ -1,4 +1,4 @@
-//! Tiers with AVX2: a line of the cache is two registers.
+//! Row records with AVX2: a line of the cache is two registers.
 
 use super::wide::{Pixels, Wide, compiled};
 use super::{Ends, FOUR, Folded, Tiers, Weights};
@@ -39,15 +39,16 @@ const REACH: usize = 96;
 static SHORT_BITS: [i16; 3 * REACH] = bits_of!(i16);
 static LONG_BITS: [i32; 3 * REACH] = bits_of!(i32);
 
-/// Of lanes from the `i`th on: bits of those from `shift` to where a footprint of `len` columns ends, as the bits that
-/// both of these have.
+/// Of lanes from the `i`th on: bits of those from `shift` to where a footprint of `len` columns
+/// ends, as the bits that both of these have.
 #[inline(always)]
 fn window<T>(bits: &[T; 3 * REACH], shift: usize, len: usize, i: usize) -> [&[T; 16]; 2] {
     [REACH - shift + i, 2 * REACH - shift - len + i]
         .map(|from| bits[from..].first_chunk().expect("a footprint is shorter than 64"))
 }
 
-/// A register's worth of the weights from `from` less `shift` on, and what lies around them in the table.
+/// A register's worth of the weights from `from` less `shift` on, and what lies around them in the
+/// table.
 #[inline(always)]
 fn around<T: Copy + Default, const LEN: usize>(
     table: &[T],

@@ -1,4 +1,4 @@
-//! Tiers with AVX-512: a line of the cache is a register.
+//! Row records with AVX-512: a line of the cache is a register.
 
 use super::wide::{Pixels, Wide, compiled};
 use super::{Ends, FOUR, Folded, Tiers, Weights};
@@ -15,8 +15,8 @@ pub(super) struct Longs<const C: usize>;
 
 compiled!("avx512f,avx512vl,avx512dq,avx512bw,popcnt,bmi2");
 
-/// Which of the weights from `chunk` times `of` on are those of a footprint of `len` columns that begins at
-/// `shift`.
+/// Which of the weights from `chunk` times `of` on are those of a footprint of `len` columns that
+/// begins at `shift`.
 #[inline(always)]
 fn present(len: usize, shift: usize, chunk: usize, of: usize) -> u64 {
     let len_mask = (1u64 << len) - 1;

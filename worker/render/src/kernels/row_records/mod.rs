@@ -1,10 +1,11 @@
-//! Rows of lattice rows: a voxel is added along x alone, and pixels are made of rows when a sheet closes
+//! Row records: a voxel is added along x alone, and pixels are made of rows when a sheet closes
 //! ([`crate::primitives::lattice_rows`]).
 //!
-//! A *tier* is the row of one lattice row in one open sheet. Tiers lie slot by slot; each begins with a margin of as
-//! many columns as a footprint has, and ends with one, so that no footprint need be cut: what lies there nobody
-//! reads. A register adds at a multiple of its own length alone, since what a neighbour has just written there
-//! is then read back as it was written; weights are moved to where a footprint begins in its first register.
+//! A *tier* is the row of sums of one lattice row in one open sheet. Tiers lie slot by slot. Each
+//! begins and ends with a margin of as many columns as a footprint has, which nobody reads, so that
+//! no footprint need be cut. A register adds at multiples of its own length alone, since a store
+//! that a neighbour has just made can then be forwarded to the load; weights are shifted to where a
+//! footprint begins in its first register.
 
 #[cfg(target_arch = "x86_64")]
 mod avx2;
@@ -42,7 +43,8 @@ const fn a_line<S: Recorded>() -> usize {
     size_of::<Line>() / size_of::<S::Pixel>()
 }
 
-/// How many groups of so many columns a footprint of `len` may reach: it may begin in the last column of the first.
+/// How many groups of so many columns a footprint of `len` may reach: it may begin in the last
+/// column of the first.
 #[inline(always)]
 fn groups(len: usize, columns: usize) -> usize {
     (len + columns - 1).div_ceil(columns)
@@ -54,7 +56,8 @@ impl Shape {
         assert!(rows <= ROWS && len < 64, "{rows} tiers for footprints of {len}");
         let margin = len.next_multiple_of(8);
         let groups = groups(len, a_line::<S>());
-        // Whole chunks of weights are added: of sixteen columns, or of four lines where there are more.
+        // Whole chunks of weights are added: of sixteen columns, or of four lines where there are
+        // more.
         let sixteen = 16 / a_line::<S>();
         let spare = groups.next_multiple_of(if groups > 4 { 4 } else { sixteen });
         let wide = (margin + PART as usize) / a_line::<S>() + spare;
@@ -118,13 +121,13 @@ impl<W: Weight> Default for ByRow<W> {
     }
 }
 
-/// Tiers that reach a row of pixels at least, some with no weight: as many as do if a kernel reaches two steps of the
-/// lattice to either side.
+/// Tiers that reach a row of pixels at least, some with no weight: as many as do if a kernel
+/// reaches two steps of the lattice to either side.
 pub const FOUR: usize = 4;
 
 impl<W: Weight> ByRow<W> {
-    /// Has `n` tiers from `begin` on reach row `y`, by the weight of each: those before the first and behind the last
-    /// with any are left out, but for four.
+    /// Has `n` tiers from `begin` on reach row `y`, by the weight of each: those before the first
+    /// and behind the last with any are left out, but for four.
     #[inline(always)]
     pub fn set(&mut self, y: usize, [begin, n]: [usize; 2], weight: impl Fn(usize) -> W) {
         let (mut from, mut to) = (0, n.min(REACHING));
@@ -166,16 +169,16 @@ pub struct Ends<'a, S: Recorded> {
     pub pixels: &'a [[u32; 4]],
 }
 
-/// Pixels that close, beside each other: where they are, what they have of the sheet before, of theirs and of the one
-/// behind, and how opaque they are.
+/// Pixels that close, beside each other: where they are, what they have of the sheet before, of
+/// theirs and of the one behind, and how opaque they are.
 pub struct Folded<S: Recorded> {
     pub places: Places,
     pub sheets: Box<[[S::Pixel; MOST_CLOSING]; 3]>,
     pub opacities: Box<[f32; MOST_CLOSING]>,
 }
 
-/// Pixels that are closed together, or up to a row more: these are what a first cache holds, and of the lanes behind the last
-/// one few are spent.
+/// Pixels that are closed together, or up to a row more: these are what a first cache holds, and of
+/// the lanes behind the last one few are spent.
 const ENOUGH: usize = 512;
 
 /// As many, and as many as are stored at once behind the last.
@@ -298,8 +301,8 @@ fn firsts_of(columns: u64, n: usize) -> u64 {
 
 /// Sums whose tiers are added to and folded in lanes.
 pub trait Tiered: Recorded {
-    /// Adds `voxels` with `payloads`, which begin at the sheet that `slot` holds, to the tiers that their
-    /// [rows](Splat::first) name.
+    /// Adds `voxels` with `payloads`, which begin at the sheet that `slot` holds, to the tiers that
+    /// their [rows](Splat::first) name.
     fn add_flat<const N: usize>(
         simd: Simd,
         tiers: &mut Tiers<'_, Self, N>,
@@ -317,8 +320,9 @@ pub trait Tiered: Recorded {
         layers: &Layers<'_, Self, N>,
     );
 
-    /// Makes the sums that a sheet and the one behind have in pixels of the tiers above them: in those that are open and
-    /// have any extinction in the sheet, in rows from `rows` on, until there are [`ENOUGH`]. Says where to go on.
+    /// Makes the sums that a sheet and the one behind have in pixels of the tiers above them: in
+    /// those that are open and have any extinction in the sheet, in rows from `rows` on, until
+    /// there are [`ENOUGH`]. Says where to go on.
     ///
     /// # Panics
     /// If there are fewer sums or pixels than a part has.

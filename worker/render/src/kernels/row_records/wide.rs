@@ -1,7 +1,8 @@
-//! Voxels added to tiers in registers, whatever these are: the loops that all instruction sets share.
+//! Row records in registers: the loops that all instruction sets share.
 //!
-//! A footprint reaches a few registers of its tier. Its weights are spread out over the channels of columns, as many
-//! registers at a time as a chunk of weights fills, and each section is added to those by them.
+//! A footprint spans a few registers of its tier. Its weights are repeated over the channels of
+//! each column, as many registers at a time as a chunk of weights fills, and each section is added
+//! to these registers.
 
 use super::{EDGE, ENOUGH, Ends, FOUR, Folded, Shape, Tiers, Weights, a_line, firsts_of, groups};
 use crate::kernels::composite::LANES;
@@ -23,7 +24,8 @@ pub(super) trait Wide<S: Recorded> {
     const OF_LINE: usize;
     /// Registers whose weights are read at once, at most: two or four.
     const CHUNK: usize;
-    /// Whether voxels with sections of their own are added sheet by sheet: else each to all of its sheets.
+    /// Whether voxels with sections of their own are added sheet by sheet: else each to all of its
+    /// sheets.
     const BY_SHEET: bool;
 
     /// A payload, over and over.
@@ -32,8 +34,8 @@ pub(super) trait Wide<S: Recorded> {
     /// A payload times a weight in depth.
     unsafe fn section(payload: Self::Register, wz: S::Depth) -> Self::Register;
 
-    /// The weights of a footprint of `table` from `from` on, of the `chunk`th `GROUPS` registers from the one in whose
-    /// column `shift` it begins; nothing around it.
+    /// The weights of a footprint of `table` from `from` on, of the `chunk`th `GROUPS` registers
+    /// from the one in whose column `shift` it begins; nothing around it.
     unsafe fn spread<const GROUPS: usize>(
         table: &Table<'_, S::Weight>,
         from: usize,
@@ -52,7 +54,8 @@ pub(super) trait Wide<S: Recorded> {
     /// `w` for all channels.
     unsafe fn weight(w: S::Weight) -> Self::Down;
 
-    /// What the `at`th register of `lines` and those of the tiers below add up to with these weights.
+    /// What the `at`th register of `lines` and those of the tiers below add up to with these
+    /// weights.
     unsafe fn down(
         lines: *const Line,
         at: usize,
@@ -77,13 +80,15 @@ pub(super) trait Wide<S: Recorded> {
 /// # Safety
 /// As that of [`Wide`].
 pub(super) trait Pixels: Copy {
-    /// Puts these pixels, of so many words, instead of those of `to`; which were there, of those that `which` has bits for.
+    /// Puts these pixels, of so many words, instead of those of `to`; which were there, of those
+    /// that `which` has bits for.
     unsafe fn exchange(self, words: usize, to: *mut u32, which: u32) -> Self;
 
     /// Stores those of `which` beside each other.
     unsafe fn store_beside(self, words: usize, to: *mut u32, which: u32);
 
-    /// The first numbers of as many fours as a register has such pixels, and whole numbers from `at` on, beside each other.
+    /// The first numbers of as many fours as a register has such pixels, and whole numbers from
+    /// `at` on, beside each other.
     unsafe fn store_places(
         words: usize,
         which: u32,
@@ -352,8 +357,9 @@ pub(super) unsafe fn fold<W: Wide<S>, S: Recorded, const N: usize>(
             left &= left - 1;
             let at = y * STRIDE + x;
             let (here, behind) = (here + x / columns, behind + x / columns);
-            // SAFETY: the caller's; so many tiers are there, and registers from their first in the part on. Each pixel of
-            // the part is come to once at most, and of ENOUGH and a row there is room.
+            // SAFETY: the caller's; so many tiers are there, and registers from their first in the
+            // part on. Each pixel of the part is come to once at most, and of ENOUGH and a row
+            // there is room.
             unsafe {
                 let (here, behind) = match &four {
                     // Loops of known length.
@@ -394,7 +400,8 @@ unsafe fn four<W: Wide<S>, S: Recorded>(
     else {
         return None;
     };
-    // SAFETY: the caller's. Without closures: what is compiled for `W` is inlined into nothing else.
+    // SAFETY: the caller's. Without closures: what is compiled for `W` is inlined into nothing
+    // else.
     unsafe {
         Some([
             [W::weight(a), W::weight(b), W::weight(c), W::weight(d)],

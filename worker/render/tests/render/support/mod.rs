@@ -20,8 +20,8 @@ pub fn simds() -> Vec<Simd> {
     all
 }
 
-/// An unlit transfer function over values, with `colors` (value, linear RGB) and `opacities` (value,
-/// opacity in `unit`).
+/// An unlit transfer function over values, with `colors` (value, linear RGB) and `opacities`
+/// (value, opacity in `unit`).
 pub fn transfer(
     colors: Vec<[f64; 4]>,
     opacities: Vec<[f64; 2]>,

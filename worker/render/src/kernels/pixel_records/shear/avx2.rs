@@ -23,14 +23,16 @@ static PRESENT: [u8; 64] = {
     present
 };
 
-/// All bits of the first of eight weights, as many as `deep` has: from where on a register holds them.
+/// All bits of the first of eight weights, as many as `deep` has: from where on a register holds
+/// them.
 #[inline(always)]
 fn present<W>(deep: &[W]) -> *const u8 {
     const { assert!(size_of::<W>() * MOST <= 32) };
     PRESENT[32 - size_of::<W>() * deep.len().min(MOST)..].as_ptr()
 }
 
-/// The weights of `deep`, eight at most, and zeros; `behind`: what lies in the table from the first of them on.
+/// The weights of `deep`, eight at most, and zeros; `behind`: what lies in the table from the first
+/// of them on.
 #[target_feature(enable = "avx2")]
 #[inline]
 fn eight_deep(deep: &[i16], behind: &[i16]) -> __m128i {
@@ -51,7 +53,8 @@ fn eight_deep(deep: &[i16], behind: &[i16]) -> __m128i {
     unsafe { _mm_loadu_si128(eight.as_ptr().cast()) }
 }
 
-/// [`BLOCK`] weights of each slot from the `behind`th after its begin on: of four slots a register, two and two by turns.
+/// [`BLOCK`] weights of each slot from the `behind`th after its begin on: of four slots a register,
+/// two and two by turns.
 ///
 /// # Safety
 /// For machines with AVX2. So many can be read.
@@ -195,7 +198,8 @@ fn long<const SKEWED: bool, const WIDE: usize, const N: usize>(
         let i = i as usize % BATCH;
         // SAFETY: as above.
         let Voxel { y, high, deep, begins } = unsafe { lookup.voxel(apart, i) };
-        // SAFETY: lanes that are not there are not read; four floats are 16 bytes, and eight numbers 32.
+        // SAFETY: lanes that are not there are not read; four floats are 16 bytes, and eight
+        // numbers 32.
         let (z, payload) = unsafe {
             let present = _mm256_loadu_si256(present(deep).cast());
             let z = _mm256_maskload_ps(deep.as_ptr(), present);

@@ -61,7 +61,8 @@ fn short<const SKEWED: bool, const WIDE: usize, const N: usize>(
     let turn_deep = words(|lane| (lane / 4 + 2 * MOST - slot) % MOST);
     // SAFETY: AVX2 there is where AVX-512 is.
     let lookup = unsafe { Lookup::new(layers, slant) };
-    // Which of eight weights, four slots a register, lanes take of the first row or column: that of their slot.
+    // Which of eight weights, four slots a register, lanes take of the first row or column: that of
+    // their slot.
     let first = words(|lane| lane / 4 * BLOCK);
     let next = |from| _mm512_add_epi16(from, _mm512_set1_epi16(1));
     for (&i, &payload) in apart.kept[..payloads.len()].iter().zip(payloads) {
@@ -136,7 +137,8 @@ fn long<const SKEWED: bool, const WIDE: usize, const N: usize>(
     // SAFETY: AVX2 there is where AVX-512 is.
     let lookup = unsafe { Lookup::new(layers, slant) };
     let lane = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-    // Which of four slots a lane belongs to, and of eight weights, two slots a register, those of the first row or column.
+    // Which of four slots a lane belongs to, and of eight weights, two slots a register, those of
+    // the first row or column.
     let of_four = _mm512_srli_epi32::<2>(lane);
     let first = _mm512_slli_epi32::<3>(of_four);
     let next = |from| _mm512_add_epi32(from, _mm512_set1_epi32(1));
@@ -209,7 +211,8 @@ fn long<const SKEWED: bool, const WIDE: usize, const N: usize>(
                             *of_row,
                             wx[c][if SKEWED { half } else { 0 }],
                         ));
-                        // SAFETY: sixteen sums of four slots are 64 bytes, and borrowed for us alone.
+                        // SAFETY: sixteen sums of four slots are 64 bytes, and borrowed for us
+                        // alone.
                         unsafe {
                             let at = at.add(half);
                             _mm512_storeu_si512(at, _mm512_add_epi32(_mm512_loadu_si512(at), add));

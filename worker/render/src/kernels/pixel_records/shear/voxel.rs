@@ -1,4 +1,5 @@
-//! What is looked up of a voxel when it is added: where in the tables the weights of its sections begin.
+//! What is looked up of a voxel when it is added: where in the tables the weights of its sections
+//! begin.
 
 use super::{COLUMNS, ROWS, Slant};
 use crate::kernels::pixel_records::sheet_offsets::lines::inside;
@@ -17,8 +18,9 @@ pub(super) type At<'a, S, const N: usize> = (
     Slant<'a>,
 );
 
-/// By slot, where in a table the weights of a section begin for rows or columns from some one on. As many weights can be
-/// read from each as there may be rows or columns, and what is none of the section's is zero.
+/// By slot, where in a table the weights of a section begin for rows or columns from some one on.
+/// As many weights can be read from each as there may be rows or columns, and what is none of the
+/// section's is zero.
 pub(super) type Begins = [u32; MOST];
 
 /// A voxel that is added.
@@ -47,12 +49,12 @@ pub(super) struct Lookup<'a, S: Recorded> {
 /// Rows of a voxel, one after the other.
 pub(super) struct Rows<'a> {
     across: &'a Phases,
-    /// By slot, where a section's middle is in subpixels, and which are none of the voxel's: the greatest number in
-    /// their lanes, and the least in others.
+    /// By slot, where a section's middle is in subpixels, and which are none of the voxel's: the
+    /// greatest number in their lanes, and the least in others.
     places: __m256i,
     none: __m256i,
-    /// How far the row that comes is aside of that in units of 2^-16 subpixels, by every other slot, and how much farther
-    /// the one after is.
+    /// How far the row that comes is aside of that in units of 2^-16 subpixels, by every other
+    /// slot, and how much farther the one after is.
     even: __m256i,
     odd: __m256i,
     step: __m256i,
@@ -106,7 +108,8 @@ impl<'a, S: Recorded> Lookup<'a, S> {
         &self.deep[apart.deep[i] as usize..]
     }
 
-    /// The first column of voxel `i` in a window of `WIDE` columns, and the weights from there on: the same in all sheets.
+    /// The first column of voxel `i` in a window of `WIDE` columns, and the weights from there on:
+    /// the same in all sheets.
     #[inline(always)]
     pub(super) fn columns<const WIDE: usize>(
         &self,
@@ -150,8 +153,8 @@ impl<'a, S: Recorded> Lookup<'a, S> {
 }
 
 impl Rows<'_> {
-    /// The first column of the next row in a window of `WIDE` columns, which holds what it has of all sections, and where
-    /// the weights from there on begin.
+    /// The first column of the next row in a window of `WIDE` columns, which holds what it has of
+    /// all sections, and where the weights from there on begin.
     #[inline(always)]
     pub(super) unsafe fn next<const WIDE: usize>(&mut self) -> (usize, Begins) {
         // SAFETY: the caller has the instructions.
@@ -171,8 +174,8 @@ impl Rows<'_> {
     }
 }
 
-/// Finds the [windows](Apart::lo) of the first `n` voxels, whose sections are skewed: what [`Apart::hold_skewed`] and
-/// [`Apart::cut`] do, of all sections of a voxel at once.
+/// Finds the [windows](Apart::lo) of the first `n` voxels, whose sections are skewed: what
+/// [`Apart::hold_skewed`] and [`Apart::cut`] do, of all sections of a voxel at once.
 ///
 /// # Safety
 /// For machines with AVX2.
@@ -209,8 +212,8 @@ pub(super) unsafe fn windows(slant: &Slant<'_>, apart: &mut Apart, n: usize) {
     }
 }
 
-/// The least of some numbers with the other sign and the greatest of others, by turns, but for those of
-/// [no section](none): two in each half.
+/// The least of some numbers with the other sign and the greatest of others, by turns, but for
+/// those of [no section](none): two in each half.
 #[inline(always)]
 unsafe fn ends(least: __m256i, greatest: __m256i, none: __m256i) -> __m256i {
     // SAFETY: the caller has the instructions.
@@ -235,7 +238,8 @@ unsafe fn places(slant: &Slant<'_>, apart: &Apart, i: usize, axis: usize) -> __m
     }
 }
 
-/// Which of some `sheets` behind its first voxel `i` does not reach: the greatest number, and the least where it does.
+/// Which of some `sheets` behind its first voxel `i` does not reach: the greatest number, and the
+/// least where it does.
 #[inline(always)]
 unsafe fn none(apart: &Apart, i: usize, sheets: __m256i) -> __m256i {
     // SAFETY: the caller has the instructions.
@@ -245,8 +249,9 @@ unsafe fn none(apart: &Apart, i: usize, sheets: __m256i) -> __m256i {
     }
 }
 
-/// How far rows are aside that lie so many subpixels below the middle of a footprint, in units of 2^-16 subpixels, to be
-/// rounded down: every other one, and those between ([`Lean::along_row`](slabcast_common::kernel::Lean::along_row)).
+/// How far rows are aside that lie so many subpixels below the middle of a footprint, in units of
+/// 2^-16 subpixels, to be rounded down: every other one, and those between
+/// ([`Lean::along_row`](slabcast_common::kernel::Lean::along_row)).
 #[inline(always)]
 unsafe fn along(row: i32, below: __m256i) -> [__m256i; 2] {
     // SAFETY: the caller has the instructions.

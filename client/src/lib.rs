@@ -80,8 +80,9 @@ impl Client {
             address: address.clone(),
             cause: error::root_cause(e),
         };
-        // TRANSPORT.md section 9, for the receiver of bulk on a LAN. Pings tell a master that
-        // vanished from one that renders (PROMISES.md B4: 20 s for viewers).
+        // docs/design/transport.md section 9, for the receiver of bulk on a LAN. Pings tell a
+        // master that vanished from one that renders (docs/design/promises.md B4: 20 s for
+        // viewers).
         let endpoint = Endpoint::from_shared(format!("http://{address}"))
             .map_err(|e| refused(&e))?
             .connect_timeout(CONNECT)

@@ -32,7 +32,8 @@ pub mod view;
 pub mod volume;
 
 /// Version of the arithmetic behind the pixels. Two programs that agree on it give the same
-/// bytes for the same view; a change of any golden hash raises it (CONTRACTS.md, Exactness).
+/// bytes for the same view; a change of any golden hash raises it (docs/design/contracts.md,
+/// Exactness).
 pub const PIXELS_VERSION: u32 = 10;
 
 pub use protocol::PROTOCOL_VERSION;

@@ -136,8 +136,9 @@ pub fn view_sha256(scene: &SceneSpec, crop: Option<&CropBox>, view: &View) -> Di
     Digest32(h.finalize().into())
 }
 
-/// Writes the bounds that are known without a reference (DESIGN.md section 5) into `stats`, in
-/// 1/255. `within`: box of the voxels that are drawn; `max_alpha`: largest opacity of a pixel.
+/// Writes the bounds that are known without a reference (docs/design/model.md section 5) into
+/// `stats`, in 1/255. `within`: box of the voxels that are drawn; `max_alpha`: largest opacity of a
+/// pixel.
 fn error(
     stats: &mut ErrorStats,
     scene: &SceneSpec,

@@ -73,7 +73,7 @@ pub const MAX_CONTROL_MESSAGE: usize = {
 };
 
 /// Largest message of the Bricks stream in bytes: one HTTP/2 frame of 64 KiB with room for headers
-/// (TRANSPORT.md section 3: 65,536 bytes are one full frame and a tail of 20 bytes).
+/// (docs/design/transport.md section 3: 65,536 bytes are one full frame and a tail of 20 bytes).
 pub const MAX_BRICKS_MESSAGE: usize = slabcast_common::link::MAX_BRICK_BATCH_BYTES;
 
 /// Largest message of RenderService in bytes, requests and responses: a path of 38,000 explicit

@@ -4,7 +4,8 @@
 use slabcast_master::Handle;
 use std::time::Duration;
 
-/// Time that a master or worker has to stop gracefully once it is told to (PROMISES R29).
+/// Time that a master or worker has to stop gracefully once it is told to (docs/design/promises.md
+/// R29).
 pub(crate) const DRAIN: Duration = Duration::from_secs(10);
 
 #[cfg(target_os = "linux")]

@@ -84,13 +84,14 @@ pub struct Config {
 }
 
 impl Default for Config {
-    /// - heartbeat 1 s, silence 3 s: PROMISES.md R2 allows 3 s to find a partitioned worker and
-    ///   no false alarm at twice the load its cores can bear; three pings must go unanswered.
+    /// - heartbeat 1 s, silence 3 s: docs/design/promises.md R2 allows 3 s to find a partitioned
+    ///   worker and no false alarm at twice the load its cores can bear; three pings must go
+    ///   unanswered.
     /// - lease 60 s: the slowest tile that still is honest work. At half, a 256x256 tile of a large
     ///   volume on a shared core is rendered twice for nothing; at double, a worker that lives but
     ///   hangs holds up a frame for two minutes. Not measured.
     /// - poison after 3: R5.
-    /// - two leases a thread: TRANSPORT.md, answer 3.
+    /// - two leases a thread: docs/design/transport.md, answer 3.
     fn default() -> Self {
         Config {
             heartbeat: 1_000_000,

@@ -103,7 +103,8 @@ fn volume(name: &str, dims: [u32; 3], title: &str) -> Option<Volume> {
             if !across(i, nx) || !across(k, nz) {
                 return 0;
             }
-            // Front is +y (CONTRACTS.md): the weaker plate stands nearer to the default eye.
+            // Front is +y (docs/design/contracts.md): the weaker plate stands nearer to the default
+            // eye.
             match 16 * j / ny {
                 10..12 => 100,
                 4..6 => 200,

@@ -189,7 +189,7 @@ fn mutants() -> u64 {
 
 /// Largest mutant.
 const MUTANT_MAX_BYTES: usize = 1 << 16;
-/// What reading a mutant may take: 16 MiB, and twice its bytes (PROMISES R13).
+/// What reading a mutant may take: 16 MiB, and twice its bytes (docs/design/promises.md R13).
 const GROWTH_MAX_KIB: u64 = (16 << 10) + 2 * MUTANT_MAX_BYTES as u64 / 1024;
 /// Set in a process that runs one test alone.
 const ALONE: &str = "SLABCAST_MUTANTS_ALONE";

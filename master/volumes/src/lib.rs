@@ -6,14 +6,14 @@
 //!
 //! Files are strangers: no size in a header is believed before the bytes were seen, nothing
 //! outside the header's folder is read, and every refusal is one line that names the file, the
-//! field and the remedy (PROMISES R13 to R15; the mutants in `fuzz.rs` keep it so).
+//! field and the remedy (docs/design/promises.md R13 to R15; the mutants in `fuzz.rs` keep it so).
 //!
 //! This crate refuses to know the network, tasks, views and colours. The clock is not here
 //! either; threads are, since cutting bricks is work for all cores.
 //!
-//! Read: NRRD, MetaImage, NIfTI-1 and -2, VTK image data, TIFF stacks, raw numbers (docs/files.md says what
-//! of each). Out of scope so far: NIfTI pairs, colours, time series, and volumes that are larger
-//! than memory.
+//! Read: NRRD, MetaImage, NIfTI-1 and -2, VTK image data, TIFF stacks, raw numbers
+//! (docs/reference/files.md says what of each). Out of scope so far: NIfTI pairs, colours, time
+//! series, and volumes that are larger than memory.
 
 mod data;
 #[cfg(feature = "dicom")]

@@ -29,7 +29,7 @@ pub(crate) const DIM_MAX: u64 = 16384;
 pub(crate) const SAMPLES_MAX: u64 = 1 << 33;
 /// Most bytes that are inflated only to be dropped (NIfTI extensions, a byte skip inside gzip).
 /// Dense deflate gives 240 MB/s (`examples/load` on 64 MiB of noise in 4 bits: 0.27 s), so this
-/// is 0.07 s of the 0.1 s that PROMISES R13 allows a file that turns out bad.
+/// is 0.07 s of the 0.1 s that docs/design/promises.md R13 allows a file that turns out bad.
 pub(crate) const SKIP_MAX_BYTES: u64 = 16 << 20;
 /// Bytes decoded at a time; a multiple of every type's size. Fits the second-level cache.
 const CHUNK_BYTES: usize = 128 << 10;

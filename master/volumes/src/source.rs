@@ -1,8 +1,8 @@
 //! Bytes of files that strangers made: what may be opened, and how far a reader is followed.
 //!
-//! Three rules (PROMISES R13 to R15). Only regular files are opened, so no pipe can hold us up.
-//! A header can name data only inside its own folder. Sizes that a header claims are never
-//! believed before as many bytes have been seen.
+//! Three rules (docs/design/promises.md R13 to R15). Only regular files are opened, so no pipe can
+//! hold us up. A header can name data only inside its own folder. Sizes that a header claims are
+//! never believed before as many bytes have been seen.
 
 use crate::error::{OpenErrorKind, Problem};
 use std::fs::File;

@@ -1,5 +1,5 @@
 //! What a header may not do: point outside its folder, hold us up on a pipe, or make us take
-//! memory and time for sizes that it only claims (PROMISES R13, R14, R15).
+//! memory and time for sizes that it only claims (docs/design/promises.md R13, R14, R15).
 
 use flate2::Compression;
 use flate2::write::GzEncoder;

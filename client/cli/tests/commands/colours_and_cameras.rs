@@ -1,5 +1,5 @@
-//! What docs/colours-and-cameras.md promises, by the program itself: its example files are drawn, names
-//! and ranges mean what they say, files for ParaView come back.
+//! What docs/reference/transfer-functions.md promises, by the program itself: its example files are
+//! drawn, names and ranges mean what they say, files for ParaView come back.
 
 use crate::program::{run, slabcast};
 use slabcast_common::stats::FrameStats;

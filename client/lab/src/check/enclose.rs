@@ -137,7 +137,7 @@ impl<'a> Enclosure<'a> {
             range: SheetRange::new(range.first - 1, range.end + 1),
             half_unit: if floats { 0.0 } else { 0.5 / f64::from(scale) },
             floats,
-            // As NUMERICS.md section 1.2 has them.
+            // As docs/design/numerics.md section 1.2 has them.
             gains: [(0.5 + 0.20 * y).min(2.0), (0.5 - 0.07 * y).max(0.25)],
             frame,
             ready,

@@ -1,12 +1,12 @@
 //! `slabcast lab check`: does it hold what it promises?
 //!
 //! Without a subcommand: a [`table`] of cases, each with an error, its bound and a verdict. A
-//! frame's bytes must not depend on who rendered it either (DESIGN.md, Pixels are exact):
-//! `matrix` renders views over every way to cut and carry the work and compares their hashes
-//! with the serial renderer's; `golden` prints hashes that have to be the same on every machine,
-//! build and day; `convergence` says how fast pictures come to the limit, `colour-rule` what rules
-//! of compositing buy and cost. This room belongs to the program because only here all crates can
-//! be seen.
+//! frame's bytes must not depend on who rendered it either (docs/design/model.md, Pixels are
+//! exact): `matrix` renders views over every way to cut and carry the work and compares their
+//! hashes with the serial renderer's; `golden` prints hashes that have to be the same on every
+//! machine, build and day; `convergence` says how fast pictures come to the limit, `colour-rule`
+//! what rules of compositing buy and cost. This room belongs to the program because only here all
+//! crates can be seen.
 
 mod case;
 mod cases;

@@ -1,4 +1,5 @@
-//! A frame's costs: intervals and counts while it is made, CONTRACTS.md's statistics at its end.
+//! A frame's costs: intervals and counts while it is made, docs/design/contracts.md's statistics at
+//! its end.
 //!
 //! Times of two machines meet here. A worker's clock is mapped to the master's by its offset
 //! (`state::workers`) and clamped to what the master knows for sure: a task was rendered between

@@ -132,7 +132,7 @@ fn merging_slivers_leaves_four_one_vox_sheets_per_voxel() {
     assert_eq!(most(true), [16, 8, 4, 3, 2]);
 }
 
-/// The ripple of the default kernel on a constant field, worked out in NUMERICS.md
+/// The ripple of the default kernel on a constant field, worked out in docs/design/numerics.md
 /// section 4: at most 0.6 % in any direction; here along the lattice and on a diagonal.
 #[test]
 fn gaussian_kernel_ripple_on_a_constant_field_stays_below_its_bound() {

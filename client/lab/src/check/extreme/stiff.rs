@@ -1,5 +1,5 @@
-//! Stiffness: extinctions of 10^0 to 10^6 per vox (PROMISES.md R34). Opacity never goes above
-//! one, and halving the sheets never makes a picture worse, down to the floor of rounding.
+//! Stiffness: extinctions of 10^0 to 10^6 per vox (docs/design/promises.md R34). Opacity never goes
+//! above one, and halving the sheets never makes a picture worse, down to the floor of rounding.
 
 use super::scene::{extinction, rough, shot};
 use crate::check::case::{Case, Row};

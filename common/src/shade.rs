@@ -1,16 +1,17 @@
 //! Normals in 16 bits and the light on them.
 //!
-//! A normal is stored as an octahedral code of 8 + 8 bits (255 levels a side, so that the axes
-//! are exact). Code [`NO_NORMAL`] says that the gradient was zero or not finite; such voxels
-//! are drawn unshaded.
+//! A normal is stored as an octahedral code of 8 + 8 bits (255 levels a side, so that the axes are
+//! exact). Code [`NO_NORMAL`] says that the gradient was zero or not finite; such voxels are drawn
+//! unshaded.
 
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 
-/// The code of a voxel without a gradient.
+/// Normal code of a voxel without a gradient.
 pub const NO_NORMAL: u16 = 0xFFFF;
 
-/// Encodes the direction of `v` (any length); [`NO_NORMAL`] if it has none.
+/// Returns the octahedral code of the direction of `v` (any length), or [`NO_NORMAL`] if it has
+/// none.
 pub fn encode_normal(v: DVec3) -> u16 {
     let largest = v.x.abs().max(v.y.abs()).max(v.z.abs());
     if largest == 0.0 || !v.is_finite() {
@@ -29,7 +30,7 @@ pub fn encode_normal(v: DVec3) -> u16 {
     (level(x) << 8) | level(y)
 }
 
-/// The unit vector of a code other than [`NO_NORMAL`].
+/// Returns the unit vector of a code other than [`NO_NORMAL`].
 #[inline(always)]
 pub fn decode_normal(code: u16) -> Vec3 {
     let x = ((code >> 8) as f32 - 127.0) / 127.0;
@@ -48,7 +49,7 @@ pub fn decode_normal(code: u16) -> Vec3 {
 pub enum Light {
     /// From the eye (`"head"`).
     Head(HeadWord),
-    /// From a direction in world axes (need not be a unit vector).
+    /// From a direction in world axes, of any length.
     Direction([f64; 3]),
 }
 
@@ -60,19 +61,19 @@ pub enum HeadWord {
     Head,
 }
 
-/// Ambient, Lambert and Blinn-Phong (CONTRACTS.md, Colour and error).
+/// Ambient, Lambert and Blinn-Phong shading (CONTRACTS.md, Colour and error).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Shading {
-    /// Whether voxels are shaded at all; off needs no gradients.
+    /// Whether voxels are shaded at all; if not, no normals are needed.
     pub on: bool,
-    /// Ambient factor.
+    /// Ambient factor, 0 to 10.
     pub ambient: f64,
-    /// Diffuse factor.
+    /// Diffuse factor, 0 to 10.
     pub diffuse: f64,
-    /// Specular factor.
+    /// Specular factor, 0 to 10.
     pub specular: f64,
-    /// Specular exponent.
+    /// Specular exponent, 0 to 10000.
     pub power: f64,
     /// Where light comes from.
     pub light: Light,
@@ -91,7 +92,7 @@ impl Default for Shading {
     }
 }
 
-/// Whole powers up to this are multiplied out; others are looked up.
+/// Largest whole power that is multiplied out; others are looked up.
 const POWER_MOST: f64 = 1024.0;
 
 /// Steps of the table of `x^power`; with linear interpolation the error at power 20 is 1e-5 of
@@ -101,9 +102,9 @@ const POWER_STEPS: usize = 2048;
 /// `x^power` for x from 0 to 1.
 #[derive(Clone, Debug)]
 enum Power {
-    /// By squares, for whole ones: nearer to the formula, and without two look-ups a voxel. What lies below
-    /// `least` is taken for it, whose power is 2^-120 and below any picture: smaller numbers take a processor
-    /// a hundred times as long.
+    /// Whole powers, by squaring: nearer to the formula, and without two look-ups a voxel. Bases
+    /// below `least` are raised to it: its power is 2^-120, invisible in any picture, and denormal
+    /// numbers take a processor a hundred times as long.
     Whole { power: u32, least: f32 },
     /// By a table.
     Table(Box<[f32; POWER_STEPS + 2]>),
@@ -171,7 +172,7 @@ pub struct Shader {
 }
 
 impl Shader {
-    /// The shader of `shading`.
+    /// Makes `shading` ready.
     pub fn new(shading: &Shading) -> Self {
         let light = match shading.light {
             Light::Head(_) => None,
@@ -190,15 +191,16 @@ impl Shader {
         }
     }
 
-    /// The colour of a voxel with the given base colour and normal code; `to_eye` is the unit
-    /// direction towards the eye in world axes. Linear RGB in `[0, 1]`.
+    /// Returns the colour (linear RGB in `[0, 1]`) of a voxel with linear base colour `base` and
+    /// normal code `normal`. `to_eye` is the unit direction towards the eye in world axes.
     #[inline]
     pub fn shade(&self, base: [f32; 3], normal: u16, to_eye: Vec3) -> [f32; 3] {
         let light = self.light_terms(normal, to_eye);
         base.map(|c| light.apply(c))
     }
 
-    /// The light on a voxel with this normal code.
+    /// Returns the light on a voxel with normal code `normal`. `to_eye` is the unit direction
+    /// towards the eye in world axes.
     #[inline]
     pub fn light_terms(&self, normal: u16, to_eye: Vec3) -> LightTerms {
         let mut lit = [[0.0]; 2];
@@ -206,9 +208,10 @@ impl Shader {
         LightTerms { lambert: lit[0][0], gloss: lit[1][0] }
     }
 
-    /// [`Shader::light_terms`] of many voxels, of which the `i`th sees the eye in direction `to_eye(i)`: what
-    /// their base colours are multiplied by, and what is added. Loops over plain arrays of a length
-    /// that compilers do not know, so that they run them on lanes.
+    /// Computes [`Shader::light_terms`] of many voxels. Voxel i has normal code `normals[i]` and
+    /// sees the eye in unit direction `to_eye(i)`. `lit[0]` gets the factors of base colours,
+    /// `lit[1]` what is added. Loops run over plain arrays of a length that compilers don't know,
+    /// so that they vectorise.
     #[inline(always)]
     pub fn light_terms_all<const MOST: usize>(
         &self,
@@ -253,17 +256,17 @@ impl Shader {
     }
 }
 
-/// The light on a voxel: what its base colour is multiplied by, and what is added in white.
+/// Light on a voxel: a factor of its base colour, and white that is added.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LightTerms {
-    /// Ambient and diffuse.
+    /// Factor of the base colour: ambient and diffuse light.
     pub lambert: f32,
-    /// Specular.
+    /// Specular light, added in white.
     pub gloss: f32,
 }
 
 impl LightTerms {
-    /// One component of the colour, in `[0, 1]`.
+    /// Returns one component of the shaded colour, in `[0, 1]`, from that of the base colour.
     #[inline(always)]
     pub fn apply(self, base: f32) -> f32 {
         (base * self.lambert + self.gloss).clamp(0.0, 1.0)

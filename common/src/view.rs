@@ -22,31 +22,31 @@ use glam::{DMat3, DVec2, DVec3, Vec3};
 /// promised (docs/measurements.md). Each bit doubles the footprints' tables (8 KiB an axis at 1.6
 /// pixels a vox).
 pub const SUBPIXEL_BITS: u32 = 8;
-/// Positions a pixel: see [`SUBPIXEL_BITS`].
+/// Screen positions a pixel, 256; [`SUBPIXEL_BITS`] argues for the number.
 pub const SUBPIXELS: i32 = 1 << SUBPIXEL_BITS;
 
-/// Largest picture edge, in pixels (DESIGN.md section 5: images of 1x1 and 8192x8192).
+/// Largest picture edge in pixels (DESIGN.md section 5: images of 1x1 and 8192x8192).
 pub const MAX_EDGE: u32 = 8192;
 
-/// The near plane, as a share of the eye's distance (CONTRACTS.md).
+/// Distance of the near plane, as a share of the eye's distance from the target (CONTRACTS.md).
 pub const NEAR: f64 = 1e-3;
 
 /// Most pixels a vox, 2^39: screen positions stay exact in f64 and i64 with a kernel's reach.
 const LARGEST_SCALE: f64 = (1u64 << 39) as f64;
 
-/// How the world is brought onto the picture.
+/// Projection of a camera, in world units.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum CameraProjection {
-    /// World height shown.
+    /// Parallel.
     Ortho {
-        /// In world units.
+        /// World height shown, in world units.
         height: f64,
     },
-    /// Vertical, full field of view.
+    /// Central.
     Persp {
-        /// In degrees.
+        /// Vertical full field of view in degrees.
         fov: f64,
-        /// From eye to target, in world units.
+        /// Distance from eye to target in world units.
         distance: f64,
     },
 }
@@ -54,17 +54,18 @@ pub enum CameraProjection {
 /// A camera in the world, relative to the volume's centre.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
-    /// Direction from the target to the eye (any length).
+    /// Direction from the target to the eye in world axes, of any length.
     pub to_eye: DVec3,
-    /// What is up in the picture (any length; need not be at right angles).
+    /// Up direction of the picture in world axes, of any length; need not be perpendicular to
+    /// `to_eye`.
     pub up: DVec3,
-    /// The target, from the centre of the volume's box, in world units.
+    /// Target in world units, relative to the centre of the volume's box.
     pub target: DVec3,
     /// Projection.
     pub projection: CameraProjection,
 }
 
-/// From eye space to pixels.
+/// Map from eye space to pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Projection {
     /// Parallel.
@@ -76,15 +77,16 @@ pub enum Projection {
     Persp {
         /// Focal length in pixels.
         focal: f64,
-        /// From eye to target in vox.
+        /// Distance from eye to target in vox.
         distance: f64,
     },
 }
 
-/// One camera, made ready for one volume and one quality.
+/// One camera, made ready for one volume and one quality. Eye space has its origin at the target, x
+/// to the right, y down the picture, z away from the eye, in vox.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct View {
-    /// Width and height in pixels.
+    /// Width and height of the picture in pixels.
     pub size: [u32; 2],
     /// Eye coordinates of one index step along each axis (columns), in vox.
     pub eye_from_index: DMat3,
@@ -92,21 +94,22 @@ pub struct View {
     pub eye_origin: DVec3,
     /// Rotation from world to eye axes.
     pub eye_from_world: DMat3,
-    /// Projection.
+    /// Projection to pixels.
     pub projection: Projection,
     /// Sheet thickness in vox.
     pub thickness: f64,
-    /// Standard deviation of the kernel's profiles, in vox: along the eye's axes, but for its lean.
+    /// Standard deviation of the kernel's profiles along the eye's axes, in vox, before the kernel
+    /// leans.
     pub kernel_std: DVec3,
     /// Support radius of the kernel's profiles, in vox.
     pub kernel_radius: DVec3,
-    /// How the kernel leans where the lattice is not cubic.
+    /// Shear of the kernel, where the lattice is not cubic.
     pub kernel_lean: Lean,
     /// Volume of a lattice cell in vox^3.
     pub cell: f64,
 }
 
-/// Where a box lands.
+/// Projection of a box: pixels and sheets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Projected {
     /// Pixels that any of its footprints may touch, clipped to the picture; not empty.
@@ -116,7 +119,12 @@ pub struct Projected {
 }
 
 impl View {
-    /// Makes `camera` ready. Refuses what can't be drawn, naming `size` or a camera field.
+    /// Makes `camera` ready for a picture of `size` (width, height) pixels of a volume on
+    /// `lattice`.
+    ///
+    /// # Errors
+    /// Names `size` or the camera field that can't be drawn: not finite, zero, out of range, or
+    /// magnified beyond exact screen positions.
     pub fn new(
         lattice: &Lattice,
         camera: &Camera,
@@ -239,8 +247,8 @@ impl View {
         Ok(view)
     }
 
-    /// The same camera in the sheets of another quality, whose kernel is the same: where it leans, how wide it
-    /// is drawn depends on how thick sheets are.
+    /// Returns the same camera with the sheet thickness of `quality`, whose kernel must be the
+    /// same. Where the kernel leans, its drawn width depends on the thickness too.
     #[must_use]
     pub fn with_thickness_of(&self, quality: &Quality) -> View {
         let mut view = View { thickness: quality.thickness, ..*self };
@@ -250,7 +258,7 @@ impl View {
         view
     }
 
-    /// Gives a lattice that is not cubic its kernel.
+    /// Sets the kernel of a lattice that is not cubic.
     fn lean(&mut self, quality: &Quality) {
         let [std, radius] = quality.kernel_shape();
         let shape = (quality.kernel, std, radius);
@@ -260,9 +268,9 @@ impl View {
         self.kernel_lean = lean;
     }
 
-    /// Depth positions are rounded to this part of a sheet: 1/256 of a sheet or of a vox,
-    /// whichever is finer. Half as many double the error of thin sheets' sections, which is
-    /// then no longer below that of the 1/256 pixel.
+    /// Returns the depth positions a sheet: 1/256 of a sheet or of a vox, whichever is finer. Half
+    /// as many would double the error of thin sheets' sections, which is then no longer below that
+    /// of the 1/256 pixel.
     pub fn depth_phases(&self) -> i32 {
         let mut phases = 256;
         while phases < 65536 && f64::from(phases) < 256.0 * self.thickness {
@@ -271,7 +279,8 @@ impl View {
         phases
     }
 
-    /// Eye coordinates of the voxel at index position `corner` (a brick's first voxel).
+    /// Returns the eye coordinates, in vox, of the voxel at index position `corner` (a brick's
+    /// first voxel).
     #[inline]
     pub fn corner_in_eye(&self, corner: [u32; 3]) -> DVec3 {
         let [i, j, k] = corner.map(f64::from);
@@ -279,8 +288,8 @@ impl View {
         self.eye_origin + ((m.x_axis * i + m.y_axis * j) + m.z_axis * k)
     }
 
-    /// What to add to a brick corner's eye coordinates for a voxel inside the brick. Eye
-    /// positions are corner + offset, in this order, everywhere.
+    /// Returns what to add to a brick corner's eye coordinates for the voxel at `local` inside the
+    /// brick. Eye positions are corner + offset, in this order, everywhere.
     #[inline]
     pub fn offset_in_eye(&self, local: [u32; 3]) -> DVec3 {
         let [i, j, k] = local.map(f64::from);
@@ -288,13 +297,15 @@ impl View {
         (m.x_axis * i + m.y_axis * j) + m.z_axis * k
     }
 
-    /// Depth in phases of a sheet (see [`View::depth_phases`]), rounded to nearest.
+    /// Returns eye depth `z` (vox) in phases of a sheet ([`View::depth_phases`]), rounded to
+    /// nearest.
     #[inline]
     pub fn depth_in_phases(&self, z: f64) -> i32 {
         round_i32(z / self.thickness * f64::from(self.depth_phases()))
     }
 
-    /// Pixels a vox at the mid-plane of sheet `k`, or `None` where the near plane clips it.
+    /// Returns the pixels a vox at the mid-plane of a sheet, or `None` where the near plane clips
+    /// it.
     #[inline]
     pub fn scale_at(&self, sheet: i32) -> Option<f64> {
         match self.projection {
@@ -306,14 +317,14 @@ impl View {
         }
     }
 
-    /// Screen position, in 1/256 pixel of absolute image coordinates, of the eye position
-    /// (x, y) on a plane with `scale` pixels a vox.
+    /// Returns the screen position of eye position (x, y) on a plane of `scale` pixels a vox, in
+    /// 1/256 pixel of absolute image coordinates.
     #[inline]
     pub fn screen(&self, x: f64, y: f64, scale: f64) -> [i64; 2] {
         [self.screen_coordinate(0, x, scale), self.screen_coordinate(1, y, scale)]
     }
 
-    /// [`View::screen`] along one axis (0: x, 1: y).
+    /// Returns [`View::screen`] along one axis (0: x, 1: y).
     #[inline(always)]
     pub fn screen_coordinate(&self, axis: usize, v: f64, scale: f64) -> i64 {
         // 2^42 pixels off the picture is farther than any footprint reaches: `View::new` refuses
@@ -325,7 +336,7 @@ impl View {
         round_i64(p * f64::from(SUBPIXELS))
     }
 
-    /// Length of the ray of pixel (x, y) between two planes one apart.
+    /// Returns the length of the ray of pixel (x, y) between two planes one apart.
     #[inline]
     pub fn secant(&self, x: i32, y: i32) -> f32 {
         match self.projection {
@@ -338,7 +349,7 @@ impl View {
         }
     }
 
-    /// Unit direction from an eye position towards the eye, in world axes.
+    /// Returns the unit direction from eye position `p` towards the eye, in world axes.
     #[inline]
     pub fn direction_to_eye(&self, p: DVec3) -> Vec3 {
         let d = match self.projection {
@@ -354,10 +365,8 @@ impl View {
         Vec3::new(w.x as f32, w.y as f32, w.z as f32)
     }
 
-    /// [`View::direction_to_eye`] of many eye positions, by axis, in a perspective view; the same in every bit.
-    ///
-    /// # Panics
-    /// In an orthographic view, where one direction is all there is.
+    /// Computes [`View::direction_to_eye`] of many eye positions, given by axis, in a perspective
+    /// view; equal to it in every bit. `out` gets the world directions by axis.
     #[inline(always)]
     pub fn directions_to_eye<const MOST: usize>(
         &self,
@@ -388,7 +397,7 @@ impl View {
         }
     }
 
-    /// Box in eye space of the voxel centres of a box in index space.
+    /// Returns the eye-space box of the voxel centres of a box in index space.
     fn eye_box(&self, b: &TightBox) -> (DVec3, DVec3) {
         let lo = DVec3::from_array(b.lo.map(f64::from));
         let hi = DVec3::from_array(b.hi.map(f64::from));
@@ -401,9 +410,9 @@ impl View {
         (centre - reach - guard, centre + reach + guard)
     }
 
-    /// Pixels and sheets that a brick's voxels may touch: the box of voxel centres grown by the
-    /// kernel's support, projected and rounded outward (DESIGN.md, Pixels are exact). `None`
-    /// when it is off the picture or behind the near plane. Never too small; as large as the
+    /// Returns the pixels and sheets that the voxels of a box may touch: the box of voxel centres
+    /// grown by the kernel's support, projected and rounded outward (DESIGN.md, Pixels are exact).
+    /// `None` if it is off the picture or behind the near plane. Never too small; as large as the
     /// box of the projected box.
     pub fn project(&self, b: &TightBox) -> Option<Projected> {
         let (lo, hi) = self.eye_box(b);
@@ -432,8 +441,7 @@ impl View {
         (!rect.is_empty()).then_some(Projected { rect, sheets })
     }
 
-    /// The pixels of [`Self::project`] alone. In parallel projection they hang on no sheet, and none
-    /// is worked out.
+    /// Returns the pixels of [`View::project`] alone. In parallel projection no sheet is computed.
     pub fn project_rect(&self, b: &TightBox) -> Option<Rect> {
         let Projection::Ortho { scale } = self.projection else {
             return self.project(b).map(|p| p.rect);
@@ -444,7 +452,8 @@ impl View {
         (!rect.is_empty()).then_some(rect)
     }
 
-    /// Pixels in which a box from `lo` to `hi` in eye space, grown by a reach, lies at either scale and between.
+    /// Returns the pixels of the eye-space box from `lo` to `hi`, grown by `reach`, at any scale
+    /// between the two.
     #[inline(always)]
     fn window(&self, (lo, hi): (DVec2, DVec2), reach: DVec2, scales: (f64, f64)) -> Rect {
         let span = |lo: f64, hi: f64, n: u32| {
@@ -462,18 +471,18 @@ impl View {
     }
 }
 
-/// 1.5 * 2^52: added to a number below 2^51 it leaves the nearest integer, ties to even, in the
-/// low bits of the sum.
+/// 1.5 * 2^52: adding it to a number below 2^51 rounds to the nearest integer, ties to even, and
+/// leaves that integer in the low bits of the sum.
 pub const ROUND_F64: f64 = 6_755_399_441_055_744.0;
 
-/// Nearest integer, ties to even, without a library call. `|x| < 2^31`.
+/// Returns the nearest integer, ties to even, without a library call. `|x| < 2^31`.
 #[inline(always)]
 pub fn round_i32(x: f64) -> i32 {
     (x + ROUND_F64).to_bits() as i32
 }
 
-/// The largest integer that is not above `x`. Six calls of the library were a third of what projecting a
-/// box takes.
+/// Returns the largest integer that is not above `x`. Library calls took a third of the time to
+/// project a box.
 #[inline(always)]
 fn floor(x: f64) -> f64 {
     let near = (x + ROUND_F64) - ROUND_F64;
@@ -484,13 +493,13 @@ fn floor(x: f64) -> f64 {
     }
 }
 
-/// The least integer that is not below `x`.
+/// Returns the least integer that is not below `x`.
 #[inline(always)]
 fn ceil(x: f64) -> f64 {
     -floor(-x)
 }
 
-/// Nearest integer, ties to even, without a library call. `|x| < 2^51`.
+/// Returns the nearest integer, ties to even, without a library call. `|x| < 2^51`.
 #[inline(always)]
 pub fn round_i64(x: f64) -> i64 {
     (x + ROUND_F64).to_bits().wrapping_sub(ROUND_F64.to_bits()) as i64
@@ -507,7 +516,7 @@ mod tests {
     }
 
     #[test]
-    fn floors_are_the_librarys() {
+    fn floor_and_ceil_equal_the_librarys() {
         let ones = [0.0, -0.0, 0.5, 1.5, 2.5, 1e-300, 2f64.powi(50) + 0.5, 2f64.powi(51), 1e300];
         let near = ones.iter().flat_map(|x| [x.next_down(), *x, x.next_up()]);
         for x in near.flat_map(|x| [x, -x]).chain([f64::INFINITY, f64::NEG_INFINITY]) {
@@ -517,7 +526,7 @@ mod tests {
     }
 
     #[test]
-    fn rounding_is_to_nearest() {
+    fn rounding_goes_to_the_nearest_integer() {
         assert_eq!(round_i64(-1e15 + 0.25), -1_000_000_000_000_000);
         for (x, want) in [(0.4, 0), (0.6, 1), (-0.6, -1), (1e9 + 0.3, 1_000_000_000), (-7.49, -7)] {
             assert_eq!(round_i32(x), want, "{x}");
@@ -527,7 +536,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn many_directions_to_the_eye_are_those_of_each(
+        fn directions_to_eye_equal_single_ones_in_every_bit(
             azimuth in 0.0..6.3f64, tilt in -1.5..1.5f64, distance in 0.01..1e3f64,
             at in prop::collection::vec(prop::array::uniform3(-50.0..50.0f64), 1..20),
         ) {
@@ -549,7 +558,7 @@ mod tests {
     }
 
     #[test]
-    fn right_is_right_and_up_is_up() {
+    fn picture_axes_are_right_handed() {
         // Seen from +y (the front), +x must be on the left: right = forward x up = -y x z = -x.
         let l = Lattice::from_spacing([9, 9, 9], [2.0; 3]);
         let c = camera(0.0, 0.0, CameraProjection::Ortho { height: 36.0 });
@@ -565,7 +574,7 @@ mod tests {
     }
 
     #[test]
-    fn units_and_origin_drop_out() {
+    fn views_depend_neither_on_unit_nor_on_origin() {
         let c = camera(0.3, 0.2, CameraProjection::Ortho { height: 36.0 });
         let q = Quality::default();
         let l = Lattice::from_spacing([9, 7, 5], [2.0; 3]);
@@ -578,7 +587,7 @@ mod tests {
     }
 
     #[test]
-    fn a_view_in_other_sheets_is_the_one_made_for_them() {
+    fn with_thickness_of_equals_a_view_made_with_that_thickness() {
         let p = CameraProjection::Ortho { height: 36.0 };
         for spacing in [[1.0; 3], [1.0, 1.0, 2.5], [0.3, 1.7, 1.0]] {
             let l = Lattice::from_spacing([9, 7, 5], spacing);
@@ -599,7 +608,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_that_cannot_be_drawn_are_refused_by_field() {
+    fn undrawable_cameras_are_refused_by_field() {
         let l = Lattice::from_spacing([9, 7, 5], [2.0; 3]);
         let q = Quality::default();
         let good = camera(0.3, 0.2, CameraProjection::Ortho { height: 36.0 });

@@ -1,8 +1,8 @@
-//! How far a picture can be from its own sheets in exact arithmetic: what the cut-off and the
-//! integers cost, at most, on any pixel.
+//! Bounds on how far a picture can be from its own sheets in exact arithmetic: what the cut-off and
+//! the integers cost, at most, on any pixel.
 //!
-//! These are bounds, argued below, not estimates. They are in a frame's statistics, and
-//! `slabcast check` holds pictures against them. In 1/255. `within`: where visible voxels are.
+//! These are bounds, argued below, not estimates. They are in a frame's statistics, and `slabcast
+//! check` holds pictures against them. All are in 1/255. `within` is the box of the visible voxels.
 
 use crate::brick::TightBox;
 use crate::kernel::{Lean, Profile};
@@ -19,22 +19,22 @@ use std::f64::consts::PI;
 /// one bit of precision is given away.
 const HEADROOM: f64 = 1.05;
 
-/// Raw units of an integer sum for one unit of payload: 2^30 is a sheet of `thickness` vox full
-/// of the largest payload (NUMERICS.md section 3).
+/// Returns the raw units of a 32-bit sum for one unit of payload: 2^30 is a sheet of `thickness`
+/// vox full of the largest payload (NUMERICS.md section 3).
 pub fn i32_units_per_payload(payload_max: f64, thickness: f64) -> f32 {
     let solid = HEADROOM * payload_max * thickness;
     if solid > 0.0 { (f64::from(1u32 << 30) / solid) as f32 } else { 1.0 }
 }
 
-/// Raw units of a 16-bit sum for one unit of payload: 32767 is a sheet of `thickness` vox full of
-/// the largest payload.
+/// Returns the raw units of a 16-bit sum for one unit of payload: 32767 is a sheet of `thickness`
+/// vox full of the largest payload.
 pub fn i16_units_per_payload(payload_max: f64, thickness: f64) -> f64 {
     let solid = HEADROOM * payload_max * thickness;
     if solid > 0.0 { 32767.0 / solid } else { 1.0 }
 }
 
-/// Bound of the cut-off: a shut pixel lets less than eps of the light through, and no colour is
-/// brighter than one.
+/// Returns the bound of the cut-off in 1/255: a shut pixel transmits less than eps, and no colour
+/// is brighter than one.
 pub fn cutoff(quality: &Quality) -> f64 {
     quality.eps * 255.0
 }
@@ -75,7 +75,7 @@ pub fn quantisation(scene: &SceneSpec, view: &View, within: &TightBox) -> f64 {
     // Upright, where a kernel is a box, and a ray slanted if it leans.
     let m = view.kernel_lean.upright_steps(&view.eye_from_index);
     let cell = m.x_axis.abs() + m.y_axis.abs() + m.z_axis.abs();
-    let [x, y] = view.kernel_lean.of_rays().map(|slope| slope.abs() * d);
+    let [x, y] = view.kernel_lean.ray_slopes().map(|slope| slope.abs() * d);
     let r = view.kernel_radius * 2.0 + cell + DVec3::new(x, y, d);
     let met = r.x * r.y * r.z / m.determinant().abs();
     let unit = match q.sums {
@@ -141,8 +141,8 @@ struct Change<'a> {
     deepest: Option<f64>,
 }
 
-/// What the sum over a lattice of ones is at most: one and the kernel's ripple, which is below 0.6 % for
-/// Gaussians of 0.6 (NUMERICS.md section 4) and grows to either side. A tent's is 39 %.
+/// Returns the largest sum over a lattice of ones: one and the kernel's ripple, which is below 0.6
+/// % for Gaussians of 0.6 (NUMERICS.md section 4) and grows to either side. A tent's is 39 %.
 fn ripple(quality: &Quality) -> f64 {
     let [std, _] = quality.kernel_shape();
     let even = quality.kernel != Kernel::Tent && std >= 0.55;
@@ -179,9 +179,9 @@ impl Change<'_> {
         }
     }
 
-    /// The least of what it comes to for several shares. `change(axis, x)`: |dg| at a distance, which follows
-    /// from the drawn kernel and `beyond` of that axis; `share` times the light and `sheet` (for what a sheet is
-    /// changed by beyond that) as they count in the rule of colours.
+    /// Returns the least bound over several shares. `change(axis, x)` is |dg| at a distance, which
+    /// follows from the drawn kernel and `beyond` of that axis. `share` is how often light counts
+    /// in the rule of colours, and `sheet` how often what a sheet changes beyond it.
     fn bound(&self, change: impl Fn(usize, f64) -> f64, share: f64, sheet: f64) -> f64 {
         let light = |[a, b, c]: [f64; 3]| a * b * c;
         let mut best = 1.0f64;
@@ -232,17 +232,17 @@ impl Change<'_> {
     }
 }
 
-/// A change along one axis, looked at in many places, for covers of any share.
+/// A change along one axis, sampled, for covers of any share.
 struct Axis {
-    /// Of each place: the change, the kernel, and one over the shifted kernel of its cell.
+    /// For each place: the change, the kernel, and one over the shifted kernel of its cell.
     places: Vec<[f64; 3]>,
-    /// Where each cell begins; the first is the middle one's right half.
+    /// Start of each cell; the first is the middle one's right half.
     cells: Vec<usize>,
     step: f64,
 }
 
 impl Axis {
-    /// Shifted kernels `p` are a cell apart, up to `reach`.
+    /// Samples a change covered by shifted kernels `p`, a `cell` apart, up to `reach`.
     fn new(change: impl Fn(f64) -> f64, p: &Profile, reach: f64, cell: f64) -> Axis {
         // Between the places the change moves by less than what `cover` adds. This is made for every frame,
         // in 0.03 ms an axis.
@@ -260,8 +260,8 @@ impl Axis {
         Axis { places, cells, step }
     }
 
-    /// The weights and the integral of the shifted kernels that cover what `lambda` times the kernel
-    /// leaves of the change, on both sides.
+    /// Returns the weights and the integral of the shifted kernels that cover what `lambda` times
+    /// the kernel leaves of the change, on both sides.
     fn cover(&self, lambda: f64) -> (f64, f64) {
         const BETWEEN: f64 = 1.02;
         let (mut sum, mut mass) = (0.0, 0.0);
@@ -361,7 +361,7 @@ pub fn truncation(
     Some(change.bound(cut, 1.0, 0.0))
 }
 
-/// Of all pixels' rays, the longest between two planes one apart.
+/// Returns the longest way between two planes one apart of any pixel's ray.
 fn longest_secant(view: &View) -> f64 {
     match view.projection {
         Projection::Ortho { .. } => 1.0,

@@ -1,12 +1,13 @@
-//! The kernel: its profile along one axis, and how it leans where the lattice is not cubic.
+//! The kernel: its profile along one axis, and its shear where the lattice is not cubic.
 //!
-//! A profile is a Gaussian of standard deviation s, cut at radius R, with its edge value subtracted and its
-//! integral normalised to one, or a B-spline of the lattice's steps, the cubic one or the tent (DESIGN.md
-//! section 1).
+//! A profile is a Gaussian of standard deviation s, cut at radius R, with its edge value subtracted
+//! and its integral normalised to one; or a B-spline of the lattice's steps, cubic or linear (the
+//! tent) (DESIGN.md section 1).
 //!
-//! A kernel is the product of three profiles along axes at right angles in *index* space, whose third is the
-//! eye's depth. In a cubic lattice these are the eye's axes. In others the kernel is an ellipsoid: with E the
-//! steps of the lattice as the eye sees them (columns), `E = T Q` for a rotation Q and
+//! A kernel is the product of three profiles along perpendicular axes in *index* space, the third
+//! of which is the eye's depth. In a cubic lattice these are the eye's axes. In others the kernel
+//! is an ellipsoid: with E the steps of the lattice as the eye sees them (columns), `E = T Q` for a
+//! rotation Q and
 //!
 //! ```text
 //!     [ Txx Txy Txz ]       z = Tzz c,
@@ -14,32 +15,31 @@
 //!     [         Tzz ]       x = Txx a + (Txz / Tzz) z + (Txy / Tyy) (y - (Tyz / Tzz) z)
 //! ```
 //!
-//! for rotated index coordinates (a, b, c): the middle of a section moves across as sheets go back, and that
-//! of a row as rows go down. These three slopes are a [`Lean`].
+//! for rotated index coordinates (a, b, c). The middle of a section moves across as sheets go back,
+//! and that of a row as rows go down. These three slopes are a [`Lean`].
 
 use crate::quality::Kernel;
 use glam::{DMat3, DVec3};
 
-/// One axis of the kernel. Lengths in vox.
+/// Profile of the kernel along one axis. Lengths in vox.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Profile {
-    /// Which.
+    /// Kind of kernel.
     pub kernel: Kernel,
-    /// Standard deviation.
+    /// Standard deviation in vox.
     pub std: f64,
-    /// Where it ends.
+    /// Support radius in vox.
     pub radius: f64,
-    /// What weights are multiplied by before they become 16-bit fixed point.
+    /// Length of a lattice step along this axis in vox: weights are multiplied by it before they
+    /// become 16-bit fixed point.
     pub spread: f64,
     edge: f64,
     norm: f64,
 }
 
 impl Profile {
-    /// `kernel` of deviation `std` and `radius`, which are those of [`Quality::kernel_shape`] times the
-    /// length of a step of the lattice.
-    ///
-    /// [`Quality::kernel_shape`]: crate::quality::Quality::kernel_shape
+    /// Returns the profile of `kernel` with deviation `std` and `radius` in vox: those of
+    /// [`Quality::kernel_shape`] times the length of a lattice step.
     pub fn new(kernel: Kernel, std: f64, radius: f64) -> Self {
         match kernel {
             Kernel::Gaussian => Profile::gaussian(std, radius),
@@ -49,7 +49,7 @@ impl Profile {
         }
     }
 
-    /// Gaussian of `std`, cut at `radius`.
+    /// Returns a Gaussian of deviation `std`, cut at `radius` (vox).
     pub fn gaussian(std: f64, radius: f64) -> Self {
         let edge = libm::exp(-radius * radius / (2.0 * std * std));
         let bell = std
@@ -59,14 +59,14 @@ impl Profile {
         Profile { kernel: Kernel::Gaussian, std, radius, spread: 1.0, edge, norm }
     }
 
-    /// The same for a lattice whose steps are `spread` vox along this axis: weights in fixed point
-    /// are then those per step, below one for every lattice.
+    /// Returns the profile for a lattice whose steps are `spread` vox along this axis. Weights in
+    /// fixed point are then per step, below one for every lattice.
     #[must_use]
     pub fn with_spread(self, spread: f64) -> Self {
         Profile { spread, ..self }
     }
 
-    /// g(u), per vox.
+    /// Returns the profile's value g(u) at distance `u` vox, per vox.
     pub fn at(&self, u: f64) -> f64 {
         if u.abs() >= self.radius {
             return 0.0;
@@ -85,7 +85,7 @@ impl Profile {
         }
     }
 
-    /// The integral of g from -radius to `u`: 0 to 1.
+    /// Returns the integral of g from -radius to `u` vox: 0 to 1.
     pub fn integral_to(&self, u: f64) -> f64 {
         let u = u.clamp(-self.radius, self.radius);
         // What lies between the middle and `t` steps of a spline.
@@ -109,7 +109,7 @@ impl Profile {
         if steps < 0.0 { 0.5 - half(-steps) } else { 0.5 + half(steps) }
     }
 
-    /// The integral of `u g(u)` from the middle to `u`, in vox.
+    /// Returns the integral of `u g(u)` from the middle to `u`, in vox.
     fn moment_to(&self, u: f64) -> f64 {
         let u = u.abs().min(self.radius);
         match self.kernel {
@@ -135,7 +135,7 @@ impl Profile {
         }
     }
 
-    /// The integral of `u^2 g(u)`, in vox^2.
+    /// Returns the integral of `u^2 g(u)`, in vox^2.
     fn variance(&self) -> f64 {
         // By parts, `int u^2 g = 2 int (M(R) - M(u)) du` from the middle: smooth, and zero where it ends.
         const N: u32 = 512;
@@ -145,13 +145,14 @@ impl Profile {
         2.0 * h * (0..N).map(at).sum::<f64>()
     }
 
-    /// At which distance behind its voxel the section between the distances `from` and `to` (vox) is drawn
-    /// where a kernel leans: its centroid.
+    /// Returns the distance behind its voxel at which the section between distances `from` and `to`
+    /// (vox) is drawn where the kernel leans: the section's centroid.
     pub fn placed(&self, from: f64, to: f64) -> f64 {
         self.front(from).to(&self.front(to))
     }
 
-    /// [`Profile::placed`] of the sections of `thickness` from distance `from` on.
+    /// Computes [`Profile::placed`] of consecutive sections of `thickness` vox, the first from
+    /// distance `from` on.
     pub fn places(&self, from: f64, thickness: f64, out: &mut [f64]) {
         let mut front = self.front(from);
         for (i, out) in out.iter_mut().enumerate() {
@@ -161,14 +162,15 @@ impl Profile {
         }
     }
 
-    /// What lies in front of a plane at distance `u`.
+    /// Returns weight and moment in front of a plane at distance `u`.
     fn front(&self, u: f64) -> Front {
         let at = u.clamp(-self.radius, self.radius);
         Front { at, weight: self.integral_to(at), moment: self.moment_to(at) }
     }
 
-    /// The share of [the variance](Self::variance) that places of sections ([`Profile::placed`]) leave in sheets
-    /// of `thickness`: nothing in thin ones, all in those that hold a voxel whole.
+    /// Returns the share of [the variance](Self::variance) that remains inside sections drawn at
+    /// their centroids ([`Profile::placed`]) in sheets of `thickness`: nothing in thin sheets, all
+    /// in sheets that hold a voxel whole.
     fn left_within(&self, thickness: f64) -> f64 {
         const PHASES: u32 = 16;
         // Sheets as far as the kernel reaches; of thick ones two.
@@ -190,7 +192,7 @@ impl Profile {
     }
 }
 
-/// What of a profile lies in front of a plane.
+/// Weight and moment of a profile in front of a plane.
 #[derive(Clone, Copy)]
 struct Front {
     at: f64,
@@ -199,7 +201,7 @@ struct Front {
 }
 
 impl Front {
-    /// The centroid of what lies between this plane and one behind it.
+    /// Returns the centroid between this plane and one behind it.
     fn to(&self, back: &Front) -> f64 {
         let weight = back.weight - self.weight;
         // Of less than this there is nothing to be seen, and cancellation is all that there is of its moment.
@@ -210,69 +212,71 @@ impl Front {
     }
 }
 
-/// How a kernel leans against the eye's axes. See the head of this file.
+/// Shear of a kernel against the eye's axes. The head of this file has the formulas.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Lean {
-    /// How far its middle moves along x and y for each vox of depth.
+    /// How far the kernel's middle moves along x and y for each vox of depth.
     pub depth: [f64; 2],
     /// How far the middle of a row moves along x for each vox of y.
     pub row: f64,
 }
 
 impl Lean {
-    /// That of cubic lattices.
+    /// No shear, as in cubic lattices.
     pub const NONE: Lean = Lean { depth: [0.0; 2], row: 0.0 };
 
-    /// The slopes of x and y over depth, and of x over y.
+    /// Returns the slopes of x over depth, y over depth, and x over y.
     pub fn to_array(&self) -> [f64; 3] {
         let [x, y] = self.depth;
         [x, y, self.row]
     }
 
-    /// From [those](Lean::to_array).
+    /// Returns the shear of three slopes in the order of [`Lean::to_array`].
     pub fn from_array([x, y, row]: [f64; 3]) -> Lean {
         Lean { depth: [x, y], row }
     }
 
-    /// Whether the kernel is the product of three profiles along the eye's own axes.
+    /// Returns whether the kernel is the product of three profiles along the eye's own axes.
     pub fn is_none(&self) -> bool {
         *self == Lean::NONE
     }
 
-    /// Eye coordinates in which the kernel does not lean. Depths stay.
+    /// Returns eye coordinates in which the kernel is not sheared. Depths stay.
     #[inline]
     pub fn upright(&self, v: DVec3) -> DVec3 {
         let y = v.y - self.depth[1] * v.z;
         DVec3::new(v.x - self.depth[0] * v.z - self.row * y, y, v.z)
     }
 
-    /// [`Lean::upright`] of the steps of a lattice (columns).
+    /// Returns the steps of a lattice (columns) in coordinates in which the kernel is not sheared.
     pub fn upright_steps(&self, steps: &DMat3) -> DMat3 {
         let [i, j, k] = [steps.x_axis, steps.y_axis, steps.z_axis].map(|v| self.upright(v));
         DMat3::from_cols(i, j, k)
     }
 
-    /// Slopes of a parallel ray over depth, upright.
-    pub fn of_rays(&self) -> [f64; 2] {
+    /// Returns the slopes over depth of a parallel ray, in coordinates in which the kernel is not
+    /// sheared.
+    pub fn ray_slopes(&self) -> [f64; 2] {
         let ray = self.upright(DVec3::Z);
         [ray.x, ray.y]
     }
 
-    /// How far a kernel whose profiles end at `radius` reaches along the eye's axes.
+    /// Returns how far a kernel whose profiles end at `radius` reaches along the eye's axes, in
+    /// vox.
     #[inline]
     pub fn reach(&self, radius: DVec3) -> DVec3 {
         let [x, y] = self.depth.map(|slope| slope.abs() * radius.z);
         radius + DVec3::new(x + self.row.abs() * radius.y, y, 0.0)
     }
 
-    /// [`Lean::row`] in units of 2^-16.
+    /// Returns [`Lean::row`] in units of 2^-16.
     pub fn row_fixed(&self) -> i64 {
         // Lattices' steps differ by a factor of a million at most.
         libm::floor(self.row * 65536.0 + 0.5).clamp(-1e12, 1e12) as i64
     }
 
-    /// Where a row's middle is, from that of the footprint, rounded: in the units of `down`, how far the row is
-    /// below that; `row`: [`Lean::row_fixed`].
+    /// Returns the offset along x of a row's middle from the footprint's, rounded, for a row `down`
+    /// below the footprint's middle, in the same unit. `row` is [`Lean::row_fixed`].
     #[inline(always)]
     pub fn along_row(row: i64, down: i64) -> i64 {
         // Beyond 2^62 it is off every picture, one way or the other.
@@ -281,8 +285,9 @@ impl Lean {
     }
 }
 
-/// The kernel of a lattice whose steps the eye sees as the columns of `steps` (vox): how long a step is along
-/// the axis of each profile (the diagonal of T, whose product is a cell's volume), and how it leans.
+/// Returns the kernel of a lattice whose steps the eye sees as the columns of `steps` (vox): the
+/// length of a step along the axis of each profile (the diagonal of T, whose product is a cell's
+/// volume), and the shear.
 pub fn ellipsoid(steps: &DMat3) -> (DVec3, Lean) {
     let [x, y, z] = [0, 1, 2].map(|axis| steps.row(axis));
     let tzz = z.length();
@@ -298,12 +303,14 @@ pub fn ellipsoid(steps: &DMat3) -> (DVec3, Lean) {
     (DVec3::new(txx, tyy, tzz), lean)
 }
 
-/// [`ellipsoid`] as it is drawn in sheets of `thickness` by a kernel of deviation `std` and `radius` steps. Where a
-/// kernel leans, a section is smeared across by what it is deep; it is drawn in one place, and given the width,
-/// so that all sections together are as wide as the kernel is. Against the integral of the kernel between
-/// the sheet's planes a scene of balls, 2.2 times as wide along one axis, is then off by 0.026 of 1/255 at sheets
-/// of a vox, where it is by 0.23 if sections lie half-way to the sheet's middle and need no more width, and
-/// by 0.60 if they lie there.
+/// Returns [`ellipsoid`] as it is drawn in sheets of `thickness` vox by a kernel of deviation `std`
+/// and `radius` steps.
+///
+/// Where a kernel leans, the depth of a section smears it across. It is drawn in one place instead,
+/// and widened so that all sections together are as wide as the kernel. Against the integral of the
+/// kernel between the sheet's planes, a scene of balls 2.2 times as wide along one axis is then off
+/// by 0.026 of 1/255 at sheets of a vox. It would be off by 0.23 with sections half-way to the
+/// sheet's middle, which need no more width, and by 0.60 with sections in the sheet's middle.
 pub fn drawn_ellipsoid(
     steps: &DMat3,
     (kernel, std, radius): (Kernel, f64, f64),

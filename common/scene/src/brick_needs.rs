@@ -1,7 +1,7 @@
 //! What the bricks of a job must hold: which voxels, and what of each.
 //!
 //! Bricks are kept from job to job and from worker to worker, so a set of them has a key that says
-//! what is in it. A set serves every job that wants no more.
+//! what is in it. A set serves every job that needs no more.
 
 use crate::path::{CropBox, ViewPath};
 use crate::tween::Tween;
@@ -11,21 +11,21 @@ use slabcast_common::quality::{Compositing, InvalidField, Keep};
 use slabcast_common::transfer::{Classifier, Support, TransferFunction};
 use slabcast_common::volume::{Digest32, VolumeInfo};
 
-/// What bricks must hold.
+/// What the bricks of a job must hold.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct BrickNeeds {
-    /// Codes that are visible.
+    /// Visible sample codes.
     pub support: Support,
-    /// A normal of each voxel.
+    /// Whether each voxel needs its normal.
     pub normals: bool,
-    /// The magnitude of each voxel's gradient.
+    /// Whether each voxel needs its gradient magnitude.
     pub gradients: bool,
-    /// Voxels inside this box alone.
+    /// Box outside of which no voxel is stored; `None` for the whole volume.
     pub crop: Option<CropBox>,
 }
 
 impl BrickNeeds {
-    /// What one transfer function sees of the whole volume.
+    /// Returns what one transfer function sees of the whole volume.
     pub fn for_transfer(
         tf: &TransferFunction,
         info: &VolumeInfo,
@@ -39,7 +39,8 @@ impl BrickNeeds {
         }
     }
 
-    /// What the frames of a path see: its cropping box, and the union over its functions.
+    /// Returns what the frames of a path see: its cropping box, and the union over its transfer
+    /// functions (those of `tween`, else `tf`).
     ///
     /// # Errors
     /// If the box holds nothing.
@@ -65,7 +66,7 @@ impl BrickNeeds {
         Ok(BrickNeeds { crop, ..union.unwrap_or_default() })
     }
 
-    /// The same with what is kept although nothing needs it.
+    /// Returns the needs together with data kept although nothing needs them.
     #[must_use]
     pub fn with_kept(mut self, keep: Keep) -> BrickNeeds {
         if keep.empty {
@@ -77,13 +78,13 @@ impl BrickNeeds {
         self
     }
 
-    /// Whether voxels that nothing shows are in the bricks.
+    /// Returns whether voxels that nothing shows are in the bricks.
     pub fn keeps_invisible(&self) -> bool {
         self.support.nan && self.support.intervals.contains(&(f64::NEG_INFINITY, f64::INFINITY))
     }
 
-    /// Whether bricks made for this serve a job that wants `other`. A box must be the same: what
-    /// lies outside of a smaller one would be drawn.
+    /// Returns whether bricks made for these needs serve a job with needs `other`. The box must be
+    /// the same: voxels outside of a smaller one would be drawn.
     pub fn covers(&self, other: &BrickNeeds) -> bool {
         self.support.covers(&other.support)
             && (self.normals || !other.normals)
@@ -91,7 +92,7 @@ impl BrickNeeds {
             && self.crop == other.crop
     }
 
-    /// The key of the brick set of a volume.
+    /// Returns the key of the brick set of the volume with digest `volume`.
     pub fn set_key(&self, volume: Digest32) -> BrickSetKey {
         let mut h = Sha256::new();
         h.update(b"slabcast bricks 1");
@@ -121,7 +122,7 @@ mod tests {
     use slabcast_common::volume::Lattice;
 
     #[test]
-    fn bricks_serve_whoever_wants_no_more() {
+    fn brick_sets_cover_needs_that_ask_for_no_more() {
         let wanted = |lo: f64, normals, crop: Option<&str>| BrickNeeds {
             support: Support { intervals: vec![(lo, 255.0)], nan: false },
             normals,

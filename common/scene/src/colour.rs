@@ -1,27 +1,28 @@
-//! Lines between two colours, in the spaces in which ParaView draws them.
+//! Interpolation between two colours, in the spaces in which ParaView interpolates.
 //!
-//! Colours come in and go out as sRGB numbers; what lies between them depends on where the line
-//! is drawn. The formulas are those of VTK's `vtkColorTransferFunction`, white point and rounded
-//! constants included, so that a map looks here as it looks there.
+//! Colours come in and go out as sRGB numbers; what lies between them depends on the space. The
+//! formulas are those of VTK's `vtkColorTransferFunction`, white point and rounded constants
+//! included, so that a map looks here as it looks there.
 
 use libm::{acos, atan2, cbrt, cos, pow, sin, sqrt};
 
-/// Where a line between two colours is drawn.
+/// Space in which two colours are interpolated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ColourSpace {
     /// sRGB numbers.
     Rgb,
-    /// Hue, saturation, value, the short way round.
+    /// Hue, saturation, value; hue takes the short way round.
     Hsv,
     /// CIELAB.
     Lab,
-    /// Through white, if the two hues are apart (Moreland's polar form of CIELAB).
+    /// Moreland's polar form of CIELAB, through white if the two hues are far apart (Diverging
+    /// Color Maps, 2009).
     Diverging,
-    /// No line: an interval has the colour of its second end.
+    /// No interpolation: an interval has the colour of its second end.
     Step,
 }
 
-/// The colour at `t` from 0 to 1 between two colours (sRGB numbers, 0 to 1).
+/// Returns the colour at `t` (0 to 1) from `a` to `b`, all as sRGB numbers from 0 to 1.
 pub fn interpolate_colour(space: ColourSpace, a: [f64; 3], b: [f64; 3], t: f64) -> [f64; 3] {
     let mix = |a: [f64; 3], b: [f64; 3]| -> [f64; 3] {
         std::array::from_fn(|i| a[i] * (1.0 - t) + b[i] * t)

@@ -1,15 +1,14 @@
 //! ParaView's colour maps as JSON: in and out.
 //!
 //! A file is a list of maps, of which the first is taken: `RGBPoints` (x, r, g, b, and again),
-//! `ColorSpace` (where lines between colours are drawn), `NanColor`, and in `Points` the opacities
-//! (x, alpha, midpoint, sharpness, and again). Ours has lines of linear light and of opacity alone.
-//! So what is curved there gets points here until it is nowhere off by more than half an 8-bit step; what
-//! is written has sRGB lines, and points where they would be off. Reading what was written adds
-//! no points: after the first, round trips give the same bytes.
+//! `ColorSpace` (how colours are interpolated), `NanColor`, and in `Points` the opacities (x,
+//! alpha, midpoint, sharpness, and again). Our functions interpolate linear light and opacity
+//! alone. So curves get points until they are nowhere off by more than half an 8-bit step. What is
+//! written interpolates sRGB, with points where that would be off. Reading what was written adds no
+//! points: after the first, round trips give the same bytes.
 //!
 //! ParaView's alphas are those of a unit distance that it chooses from the cells' size; here they
-//! are of one vox. `Prolab` and `Lab/CIEDE2000` are refused: their lines are defined by an
-//! iteration.
+//! are of one vox. `Prolab` and `Lab/CIEDE2000` are refused: an iteration defines them.
 
 use crate::colour::{ColourSpace, interpolate_colour};
 use serde::Deserialize;
@@ -20,11 +19,11 @@ use slabcast_common::transfer::{
     ColorSpace, Domain, MAX_POINTS, NanColour, OpacityUnit, TransferFunction, interpolate,
 };
 
-/// How far off a line may be, in sRGB numbers and alphas: half an 8-bit step.
+/// Largest error of a line, in sRGB numbers and alphas: half an 8-bit step.
 const OFF: f64 = 0.5 / 255.0;
 
-/// A colour map: what is read of it. Keys that do not change colours (creators, annotations) may
-/// be there.
+/// The keys of a colour map that are read. Keys that don't change colours (creators, annotations)
+/// may be there.
 #[derive(Deserialize)]
 #[serde(rename_all = "PascalCase")]
 struct Map {
@@ -46,20 +45,21 @@ struct Map {
     indexed_colors: Vec<f64>,
 }
 
-/// A map as it was read.
+/// A colour map as it was read.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ColourMap {
-    /// What ParaView calls it.
+    /// ParaView's name of the map.
     pub name: Option<String>,
-    /// Colours over file values; opacities only if the file has `Points`.
+    /// Colour points `[x, r, g, b]` over file values, sRGB numbers, for interpolation in linear
+    /// light.
     pub colours: Vec<[f64; 4]>,
-    /// `[x, alpha]`; empty where the file has none.
+    /// Opacity points `[x, alpha]`; empty where the file has none.
     pub opacities: Vec<[f64; 2]>,
-    /// Look of NaN.
+    /// Colour and opacity of NaN.
     pub nan: NanColour,
 }
 
-/// Whether a text looks like ParaView's: a list, or an object with `RGBPoints`.
+/// Returns whether a text looks like ParaView's: a list, or an object with `RGBPoints`.
 pub fn looks_like_paraview(text: &str) -> bool {
     text.trim_start().starts_with('[') || text.contains("\"RGBPoints\"")
 }
@@ -152,7 +152,7 @@ pub fn parse(text: &str) -> Result<ColourMap, InvalidField> {
 }
 
 impl ColourMap {
-    /// The whole transfer function.
+    /// Returns the whole transfer function.
     ///
     /// # Errors
     /// If the file has no opacities.
@@ -179,7 +179,7 @@ impl ColourMap {
         Ok(tf)
     }
 
-    /// The colours over 0 to 1 from the first to the last point.
+    /// Returns the colour points with x from 0 at the first point to 1 at the last.
     pub fn unit_colours(&self) -> Vec<[f64; 4]> {
         let (lo, hi) = (self.colours[0][0], self.colours[self.colours.len() - 1][0]);
         let x = |x: f64| if hi > lo { (x - lo) / (hi - lo) } else { 0.0 };
@@ -187,7 +187,7 @@ impl ColourMap {
     }
 }
 
-/// The same colours on lines of linear light.
+/// Adds points until interpolation in linear light follows that of `space`.
 fn colours(points: &[[f64; 4]], space: ColourSpace) -> Vec<[f64; 4]> {
     let mut out = vec![points[0]];
     for pair in points.windows(2) {
@@ -213,7 +213,8 @@ fn colours(points: &[[f64; 4]], space: ColourSpace) -> Vec<[f64; 4]> {
     out
 }
 
-/// Adds points behind the first one until lines of linear light are near enough to the curve.
+/// Appends points behind the first one until interpolation in linear light is near enough to the
+/// curve.
 fn curve(
     at: &impl Fn(f64) -> [f64; 3],
     (t0, a): (f64, [f64; 3]),
@@ -237,14 +238,14 @@ fn curve(
     curve(at, (middle, c), (t1, b), deep + 1, out);
 }
 
-/// A point of a line of linear light, in sRGB numbers.
+/// Interpolates in linear light, in sRGB numbers.
 fn line_of_light(a: [f64; 3], b: [f64; 3], t: f64) -> [f64; 3] {
     std::array::from_fn(|i| {
         srgb_from_linear(linear_from_srgb(a[i]) * (1.0 - t) + linear_from_srgb(b[i]) * t)
     })
 }
 
-/// Opacities with midpoints and sharpnesses as lines.
+/// Adds points until straight lines follow midpoints and sharpnesses.
 fn alphas(points: &[[f64; 4]]) -> Vec<[f64; 2]> {
     let Some(first) = points.first() else { return Vec::new() };
     let mut out = vec![[first[0], first[1]]];
@@ -275,7 +276,7 @@ fn alphas(points: &[[f64; 4]]) -> Vec<[f64; 2]> {
     out
 }
 
-/// VTK's curve between two opacities (`vtkPiecewiseFunction`).
+/// Evaluates VTK's curve between two opacities (`vtkPiecewiseFunction`).
 fn sharp(a: f64, b: f64, midpoint: f64, sharpness: f64, s: f64) -> f64 {
     let s = if s < midpoint {
         0.5 * s / midpoint
@@ -300,11 +301,11 @@ fn sharp(a: f64, b: f64, midpoint: f64, sharpness: f64, s: f64) -> f64 {
     value.clamp(a.min(b), a.max(b))
 }
 
-/// A transfer function as ParaView reads it: a list of one map. `range` are the file's smallest
-/// and largest value; without it, x of the unit domain stay shares.
+/// Returns a transfer function as ParaView reads it: a list of one map called `name`. `range` is
+/// the file's smallest and largest value; without it, x of the unit domain stay shares.
 ///
 /// # Errors
-/// If it has opacities that ParaView can't have.
+/// If its opacities are extinctions or modulated by gradients, which ParaView can't have.
 pub fn to_json(
     tf: &TransferFunction,
     name: &str,
@@ -355,7 +356,7 @@ pub fn to_json(
     Ok(format!("{map:#}\n"))
 }
 
-/// The points behind the first one of a line of linear light, near enough for lines in sRGB numbers.
+/// Appends points behind the first one until interpolation in sRGB follows a line of linear light.
 fn pieces(a: [f64; 3], b: [f64; 3], out: &mut impl FnMut(f64, [f64; 3])) {
     fn halve(
         a: [f64; 3],
@@ -381,7 +382,7 @@ fn pieces(a: [f64; 3], b: [f64; 3], out: &mut impl FnMut(f64, [f64; 3])) {
     halve(a, b, (0.0, 1.0), 0, out);
 }
 
-/// The colour of a function at x, in sRGB numbers.
+/// Returns the colour of a function at x, in sRGB numbers.
 pub fn colour_at(tf: &TransferFunction, x: f64) -> [f64; 3] {
     let light: Vec<[f64; 4]> = crate::tween::srgb_colours(tf)
         .into_iter()
@@ -406,7 +407,7 @@ mod tests {
     const OPACITY: [f64; 12] = [-10.0, 0.0, 0.5, 0.0, 0.0, 0.3, 0.5, 0.0, 40.0, 1.0, 0.5, 0.0];
 
     #[test]
-    fn what_is_read_looks_as_it_does_in_paraview() {
+    fn colour_maps_look_as_they_do_in_paraview() {
         for (name, space) in [
             ("RGB", ColourSpace::Rgb),
             ("HSV", ColourSpace::Hsv),
@@ -458,7 +459,7 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(64))]
         #[test]
-        fn a_function_of_ours_comes_back(
+        fn functions_survive_a_round_trip_through_paraview(
             colours in prop::collection::vec([0.0..=1.0f64, 0.0..=1.0, 0.0..=1.0], 1..6),
             alphas in prop::collection::vec(0.0..=1.0f64, 1..6), linear in any::<bool>(),
         ) {

@@ -5,32 +5,32 @@ use crate::transfer::TransferChoice;
 use slabcast_common::image::{Background, PixelEncoding, PixelFormat};
 use slabcast_common::quality::{Quality, Work};
 
-/// What a client asks for.
+/// A job as a client submits it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PathRequest {
-    /// The client's own name for the request: the same key gives the same job.
+    /// The client's own name for the request; the same key gives the same job.
     pub client_key: String,
     /// The views.
     pub path: ViewPath,
     /// Colours and opacities.
     pub transfer: TransferChoice,
-    /// Quality.
+    /// Quality of the pictures.
     pub quality: Quality,
-    /// How the work is cut.
+    /// How the work is cut and scheduled.
     pub work: Work,
-    /// How pixels leave the master.
+    /// Format in which pixels leave the master.
     pub format: PixelFormat,
-    /// Over which background.
+    /// Background behind the volume.
     pub background: Background,
     /// Whether each frame's statistics come with spans for a trace.
     pub want_trace: bool,
-    /// Whether each frame's statistics have the hash of its linear picture. Without it tiles travel as
-    /// finished pixels, which are fewer bytes.
+    /// Whether each frame's statistics have the hash of its linear picture. Without it tiles travel
+    /// encoded, which takes fewer bytes.
     pub want_hash: bool,
 }
 
 impl PathRequest {
-    /// What frames are finished to.
+    /// Returns the encoding of the job's frames.
     pub fn encoding(&self) -> PixelEncoding {
         PixelEncoding { format: self.format, background: self.background }
     }

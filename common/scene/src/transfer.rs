@@ -6,9 +6,9 @@ use slabcast_common::transfer::TransferFunction;
 /// A transfer function by name or in full. As JSON: a string, or the function.
 #[derive(Clone, Debug, PartialEq)]
 pub enum TransferChoice {
-    /// A preset, fitted to the volume.
+    /// Name of a preset or colour map, which the master fits to its volume.
     Name(String),
-    /// In full.
+    /// A function in full.
     Function(Box<TransferFunction>),
 }
 

@@ -1,14 +1,14 @@
 //! Transfer functions between transfer functions, for paths whose keys have several.
 //!
 //! Half-way between two functions, each value has the mean of the two opacities and of the two
-//! colours in linear light. As both are made of lines, so is their mean: it has the points of both.
-//! The ends are the functions themselves, bit for bit.
+//! colours in linear light. Both are piecewise linear, so their mean is too, with the points of
+//! both. The ends are the functions themselves, bit for bit.
 //!
-//! What is visible in between is visible at one of the ends: where both opacities are zero, so is every
-//! mean of them. So the bricks of a path are those of the union of its functions' supports
-//! ([`Tween::key_functions`]), and no frame of it needs a brick more. A voxel that a frame holds and does not
-//! see has an extinction of zero and adds nothing: the frame is that of a job of its own, to the
-//! byte.
+//! What is visible in between is visible at one of the ends: where both opacities are zero, so is
+//! every mean of them. So the bricks of a path are those of the union of its functions' supports
+//! ([`Tween::key_functions`]), and no frame of it needs a brick more. A voxel that a frame holds
+//! and does not see has an extinction of zero and adds nothing: the frame is that of a job of its
+//! own, to the byte.
 
 use crate::path::{KeyFrames, ViewPath};
 use crate::presets;
@@ -25,13 +25,14 @@ use slabcast_common::volume::ValueSummary;
 /// The transfer functions of a path's frames.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tween {
-    /// Frame, the function as it is written, and the same over file values in linear light.
+    /// For each key: its frame, the function as written, and the function over file values in
+    /// linear light.
     keys: Vec<(f64, TransferFunction, TransferFunction)>,
 }
 
 impl Tween {
-    /// The functions of a path; `None` if no key has one. Before the first that has one its
-    /// function holds, behind the last that one's.
+    /// Returns the functions of a path, or `None` if no key has one. Before the first key with a
+    /// function that function holds, behind the last key that one's.
     ///
     /// # Errors
     /// Names the key whose function is wrong or can't be tweened.
@@ -62,10 +63,10 @@ impl Tween {
         Ok(Some(Tween { keys: keys.collect() }))
     }
 
-    /// Puts functions in place of presets' names.
+    /// Replaces presets' names by their functions, fitted to `summary`.
     ///
     /// # Errors
-    /// Names the key whose preset there is not.
+    /// Names the key whose preset does not exist.
     pub fn resolve_presets(
         keys: &mut KeyFrames,
         summary: &ValueSummary,
@@ -80,7 +81,7 @@ impl Tween {
         Ok(())
     }
 
-    /// The function of a frame.
+    /// Returns the function of a frame.
     pub fn transfer_at(&self, frame: f64) -> TransferFunction {
         let after = self.keys.partition_point(|k| k.0 <= frame);
         let Some(i) = after.checked_sub(1) else { return self.keys[0].1.clone() };
@@ -91,9 +92,9 @@ impl Tween {
         }
     }
 
-    /// The scene of a frame, on the bricks of `base`, which is that of all frames but for the
-    /// function. `sums` as they were asked for: the keys can have them, and no mean of two keys is
-    /// less capped than both. Where they are decided it is for each frame.
+    /// Returns the scene of a frame, on the bricks of `base`, the scene of all frames but for the
+    /// function. `sums` is what was asked for; it is decided for each frame. The keys can have it,
+    /// and no mean of two keys is less capped than both.
     pub fn scene_at(&self, base: &SceneSpec, sums: Sums, frame: f64) -> SceneSpec {
         let transfer = self.transfer_at(frame);
         let classifier = Classifier::new(&transfer, &base.volume, base.quality.compositing);
@@ -103,14 +104,14 @@ impl Tween {
         SceneSpec { transfer, quality: Quality { sums, ..base.quality }, ..base.clone() }
     }
 
-    /// The functions whose supports together hold that of every frame.
+    /// Returns functions whose supports together hold that of every frame.
     pub fn key_functions(&self) -> impl Iterator<Item = &TransferFunction> {
         // Moving a point from shares to file values rounds it: both count.
         self.keys.iter().flat_map(|(_, exact, plain)| [exact, plain])
     }
 }
 
-/// The same function over file values, with colours in linear light.
+/// Converts a function to file values and linear light.
 fn plain(tf: &TransferFunction, summary: &ValueSummary) -> TransferFunction {
     let (lo, hi) = summary.range();
     let x = |x: f64| match tf.domain {
@@ -132,7 +133,7 @@ fn plain(tf: &TransferFunction, summary: &ValueSummary) -> TransferFunction {
     }
 }
 
-/// `t` of the way from one plain function to another.
+/// Returns the function `t` of the way from one plain function to another.
 fn blend(a: &TransferFunction, b: &TransferFunction, t: f64) -> TransferFunction {
     let mix = |x: f64, y: f64| (x * (1.0 - t) + y * t).clamp(x.min(y), x.max(y));
     let nan = NanColour {
@@ -160,8 +161,8 @@ fn blend(a: &TransferFunction, b: &TransferFunction, t: f64) -> TransferFunction
     }
 }
 
-/// The points of both, each at the mean of both. Two points at one x are a step: its left side and
-/// its right side are taken apart.
+/// Returns the points of both, each at the mean of both. Two points at one x are a step, whose left
+/// and right side are blended apart.
 fn lines<const N: usize>(
     a: &[[f64; N]],
     b: &[[f64; N]],
@@ -185,7 +186,7 @@ fn lines<const N: usize>(
     points
 }
 
-/// The value just left of x.
+/// Returns the value just left of x.
 fn before<const N: usize>(points: &[[f64; N]], x: f64) -> [f64; N] {
     match points.iter().position(|p| p[0] == x) {
         // The first of the points at x is the end of the line that comes from the left.
@@ -194,7 +195,7 @@ fn before<const N: usize>(points: &[[f64; N]], x: f64) -> [f64; N] {
     }
 }
 
-/// Light between two lights. No light at all is light that is ambient alone.
+/// Blends two lights. No light at all counts as ambient light alone.
 fn shading(a: &Shading, b: &Shading, t: f64) -> Shading {
     if !a.on && !b.on {
         return *a;
@@ -233,7 +234,7 @@ fn shading(a: &Shading, b: &Shading, t: f64) -> Shading {
     }
 }
 
-/// Colours as sRGB numbers, whatever a function keeps them in.
+/// Returns a function's colour points as sRGB numbers, whatever its colour space.
 pub fn srgb_colours(tf: &TransferFunction) -> Vec<[f64; 4]> {
     let c = |c: f64| match tf.color_space {
         ColorSpace::Srgb => c,
@@ -276,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn ends_are_the_functions_themselves() {
+    fn tween_at_a_key_is_the_keys_function_to_the_bit() {
         let t = tween(&names(&["bone", "peer-semi", "fog"]));
         let named = |n: &str| presets::by_name(n, &info().summary).unwrap();
         assert_eq!(t.transfer_at(0.0), named("bone"));
@@ -287,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn half_way_every_value_is_half_way() {
+    fn tween_half_way_has_the_mean_of_opacity_and_light() {
         let t = tween(&names(&["peer-opaque", "peer-vessels"]));
         let [a, m, b] = [0.0, 5.0, 10.0].map(|x| classify(&t.transfer_at(x)));
         for v in 0..=255u8 {
@@ -305,7 +306,7 @@ mod tests {
     proptest! {
         /// What a frame sees, one of the ends sees.
         #[test]
-        fn nothing_in_between_is_outside_of_the_union(
+        fn tween_supports_lie_in_the_union_of_the_keys(
             a in prop::collection::vec((0u32..64, 0u32..3), 1..6),
             b in prop::collection::vec((0u32..64, 0u32..3), 1..6),
             unit in any::<bool>(), frame in 0.0..10.0f64,
@@ -331,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn light_fades_in() {
+    fn tween_fades_lighting_in() {
         let t = tween(&names(&["fog", "bone"]));
         let s = t.transfer_at(5.0).shading;
         assert!(

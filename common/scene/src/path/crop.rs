@@ -1,15 +1,15 @@
 //! The cropping box: outside of it nothing is computed, stored or sent.
 //!
 //! Ends lie along the world's axes, in world units or as shares of the volume's box. A sample
-//! belongs to the picture if its centre is inside, ends included. What is cut away still counts for
-//! the gradients at the cut, which are those of the data.
+//! belongs to the picture if its centre is inside, ends included. Voxels that are cut away still
+//! count for the gradients at the cut, which are those of the data.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use slabcast_common::quality::InvalidField;
 use slabcast_common::volume::Lattice;
 
-/// What the numbers of a [`Crop`] are.
+/// Unit of the numbers of a [`Crop`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum CropUnit {
@@ -20,22 +20,25 @@ pub enum CropUnit {
     Unit,
 }
 
-/// A cropping box. An end that is missing does not crop.
+/// A cropping box. A missing end does not crop.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Crop {
-    /// What the numbers are.
+    /// Unit of the numbers.
     pub unit: CropUnit,
-    /// From and to along x.
+    /// Lower and upper end along x.
     pub x: [Option<f64>; 2],
-    /// From and to along y.
+    /// Lower and upper end along y.
     pub y: [Option<f64>; 2],
-    /// From and to along z.
+    /// Lower and upper end along z.
     pub z: [Option<f64>; 2],
 }
 
 impl Crop {
     /// Checks what needs no lattice.
+    ///
+    /// # Errors
+    /// Names the axis whose ends are not finite or not ascending.
     pub fn check(&self) -> Result<(), InvalidField> {
         for (name, [from, to]) in [("x", self.x), ("y", self.y), ("z", self.z)] {
             let refuse = |problem: &str| Err(InvalidField::new(format!("crop.{name}"), problem));
@@ -51,10 +54,10 @@ impl Crop {
         Ok(())
     }
 
-    /// The box of a lattice.
+    /// Returns the box for a volume on `lattice`.
     ///
     /// # Errors
-    /// If no sample can lie inside.
+    /// If an end is not valid ([`Crop::check`]), or no sample can lie inside.
     pub fn resolve(&self, lattice: &Lattice) -> Result<CropBox, InvalidField> {
         self.check()?;
         // Relative to the centre, as everything is: a far-away origin changes no bit.
@@ -86,17 +89,17 @@ impl Crop {
     }
 }
 
-/// A cropping box of one lattice: ends relative to the centre of the volume, in world units.
+/// A cropping box of one lattice. Ends are relative to the centre of the volume, in world units.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CropBox {
-    /// Lower ends, -inf where nothing is cropped.
+    /// Lower ends; -inf where nothing is cropped.
     pub lo: DVec3,
-    /// Upper ends.
+    /// Upper ends; inf where nothing is cropped.
     pub hi: DVec3,
 }
 
 impl CropBox {
-    /// Whether a sample is inside.
+    /// Returns whether the sample at index position `at` is inside, ends included.
     #[inline]
     pub fn contains(&self, lattice: &Lattice, at: [u32; 3]) -> bool {
         let from_centre = DVec3::from_array(at.map(f64::from)) - lattice.centre_index();
@@ -108,7 +111,7 @@ impl CropBox {
 impl std::str::FromStr for Crop {
     type Err = String;
 
-    /// `-40:40,:,0:90`, or in shares `0%:50%,:,:`.
+    /// Reads `-40:40,:,0:90`, or in shares `0%:50%,:,:`.
     fn from_str(text: &str) -> Result<Crop, String> {
         let bad = || {
             format!(
@@ -157,7 +160,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_box_holds_what_lies_between_its_ends() {
+    fn crop_box_contains_samples_between_its_ends() {
         // Centre of the samples at (10 + 1.5, 0 + 3, 0 + 1): a box of cells from 9.5 to 13.5.
         let mut l = Lattice::from_spacing([4, 4, 3], [1.0, 2.0, 1.0]);
         l.origin.x = 10.0;
@@ -176,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn bad_boxes_are_told_how_to_write_one() {
+    fn crop_errors_say_how_to_write_a_box() {
         for (text, says) in [
             ("1:2,3:4", "FROM:TO"),
             ("a:b,:,:", "FROM:TO"),
@@ -191,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn a_far_away_origin_changes_nothing() {
+    fn crop_box_does_not_depend_on_the_origin() {
         let l = Lattice::from_spacing([9; 3], [1.0; 3]);
         let far = Lattice { origin: DVec3::splat(1e7), ..l };
         let crop = Crop { unit: CropUnit::Unit, x: [Some(0.25), None], ..Crop::default() };

@@ -16,7 +16,7 @@ use slabcast_common::volume::Lattice;
 /// Most points of a flight.
 pub(super) const MAX_POINTS: usize = 10_000;
 
-/// Pieces of the curve between two points. Lines of a 64th keep the speed within 10^-3; at half of
+/// Pieces of the curve between two points. With 64 the speed is right within 10^-3; with half of
 /// them it is off by four times that.
 const PIECES: usize = 64;
 
@@ -24,27 +24,30 @@ const PIECES: usize = 64;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FlyThrough {
-    /// Frames of the path.
+    /// Number of frames of the path.
     pub frames: u32,
-    /// Where the eye passes, in world units; at least two.
+    /// Positions that the eye passes, in world units; at least two, three if closed.
     pub eyes: Vec<[f64; 3]>,
-    /// Where it looks; ahead if missing.
+    /// Point that the eye looks at, in world units; `None` looks ahead.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub target: Option<[f64; 3]>,
-    /// What is up; default the volume's up.
+    /// Up direction of the picture; default the volume's up.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub up: Option<[f64; 3]>,
     /// Vertical full field of view in degrees; default 60.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fov: Option<f64>,
-    /// Whether the flight goes on from the last point to the first; then the frame after the last
-    /// would be the first again.
+    /// Whether the flight goes on from the last point to the first. The frame after the last would
+    /// then be the first again.
     #[serde(default)]
     pub closed: bool,
 }
 
 impl FlyThrough {
     /// Checks counts and numbers.
+    ///
+    /// # Errors
+    /// Names the field, or the point that is not finite or equals the one before.
     pub fn check(&self) -> Result<(), InvalidField> {
         let refuse = |field: &str, problem: &str| {
             Err(InvalidField::new(format!("flythrough.{field}"), problem))

@@ -17,18 +17,18 @@ use slabcast_common::volume::Lattice;
 /// Most keys of a path.
 pub const MAX_KEYS: usize = 10_000;
 
-/// What lies between two keys.
+/// Motion between two keys.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Easing {
-    /// Curves: speeds do not jump at keys.
+    /// Curves whose speed does not jump at keys.
     #[default]
     Smooth,
     /// Arcs and lines of constant speed.
     Linear,
 }
 
-/// A side of the body, from which it is looked at.
+/// Side of the body from which it is seen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Side {
@@ -47,7 +47,7 @@ pub enum Side {
 }
 
 impl Side {
-    /// Every name.
+    /// Every side with its name.
     pub const NAMES: [(&'static str, Side); 6] = [
         ("anterior", Side::Anterior),
         ("left", Side::Left),
@@ -57,8 +57,8 @@ impl Side {
         ("inferior", Side::Inferior),
     ];
 
-    /// Azimuth and elevation in degrees of a volume that stands like this. Front is anterior and
-    /// up superior; right is what then lies to the right hand of the body.
+    /// Returns azimuth and elevation in degrees for a volume of this orientation. Front is anterior
+    /// and up is superior; right is then to the right hand of the body.
     pub fn angles(self, o: Orientation) -> (f64, f64) {
         // Azimuths grow towards the positive side axis, which is the right only if front, up
         // and side are turned like anterior, superior and right.
@@ -75,39 +75,39 @@ impl Side {
     }
 }
 
-/// One key: a camera, and what it is seen with.
+/// One key: a camera, and perhaps a transfer function.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Key {
-    /// The frame at which the path is here; need not be whole. All keys have it, or none: then
-    /// they lie evenly between the first and the last frame.
+    /// Frame at which the path passes the key; need not be whole. Either all keys have it, or none:
+    /// then they lie evenly between the first and the last frame.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub at: Option<f64>,
-    /// The eye's side; or `azimuth` and `elevation`; or `eye`.
+    /// Side from which the volume is seen. Excludes `azimuth` and `elevation`, and `eye`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub view: Option<Side>,
-    /// Degrees from the front.
+    /// Azimuth of the eye in degrees from the front.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub azimuth: Option<f64>,
-    /// Degrees towards up.
+    /// Elevation of the eye in degrees towards up, -90 to 90.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub elevation: Option<f64>,
-    /// Where the eye is, in world units.
+    /// Position of the eye in world units.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub eye: Option<[f64; 3]>,
-    /// Where it looks; default the volume's centre.
+    /// Point that the eye looks at, in world units; default the volume's centre.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub target: Option<[f64; 3]>,
-    /// What is up, beside `eye`; default the volume's up.
+    /// Up direction of the picture, beside `eye`; default the volume's up.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub up: Option<[f64; 3]>,
-    /// Projection, the same for all keys.
+    /// Kind of projection, the same for all keys.
     pub projection: ProjectionKind,
-    /// World height shown at the target; default 1.25 times the largest extent. Not beside `eye`
-    /// in perspective, where the distance says it.
+    /// World height shown at the target; default 1.25 times the largest extent. Not beside `eye` in
+    /// perspective, where the distance determines it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub height: Option<f64>,
-    /// Vertical full field of view in degrees (`persp`; default 30).
+    /// Vertical full field of view in degrees (`persp`); default 30.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fov: Option<f64>,
     /// Transfer function from here on, tweened to the next key that has one; default the path's.
@@ -115,27 +115,30 @@ pub struct Key {
     pub tf: Option<TransferChoice>,
 }
 
-/// Key frames.
+/// Key frames: cameras that the path passes, and the motion between.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct KeyFrames {
-    /// Frames of the path.
+    /// Number of frames of the path.
     pub frames: u32,
-    /// What lies between keys.
+    /// Motion between keys.
     #[serde(default)]
     pub easing: Easing,
-    /// Up; default what the volume was opened with.
+    /// Up axis; default that of the volume.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub up: Option<Axis>,
-    /// Front; default what the volume was opened with.
+    /// Front axis; default that of the volume.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub front: Option<Axis>,
-    /// The keys.
+    /// The keys, ascending in time; 1 to [`MAX_KEYS`].
     pub keys: Vec<Key>,
 }
 
 impl KeyFrames {
-    /// Checks counts and times.
+    /// Checks counts, times, and which fields go together.
+    ///
+    /// # Errors
+    /// Names the key and its field.
     pub fn check(&self) -> Result<(), InvalidField> {
         let refuse = |field: String, problem: String| Err(InvalidField::new(field, problem));
         if self.keys.is_empty() || self.keys.len() > MAX_KEYS {
@@ -191,7 +194,7 @@ impl KeyFrames {
         Ok(())
     }
 
-    /// The time of key `i`, in frames.
+    /// Returns the time of key `i` in frames.
     pub(crate) fn time(&self, i: usize) -> f64 {
         let last = f64::from(self.frames.max(1) - 1);
         self.keys[i].at.unwrap_or_else(|| match self.keys.len() {

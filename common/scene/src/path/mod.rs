@@ -27,19 +27,22 @@ pub const MAX_FRAMES: usize = 100_000;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Axis {
-    /// 0, 1 or 2.
+    /// 0, 1 or 2 for x, y or z.
     pub index: usize,
-    /// Whether it points the negative way.
+    /// Whether the axis points the negative way.
     pub negative: bool,
 }
 
 impl Axis {
-    /// +x, +y or +z.
+    /// Returns +x, +y or +z for index 0, 1 or 2.
     pub const fn positive(index: usize) -> Self {
         Axis { index, negative: false }
     }
 
-    /// As a unit vector.
+    /// Returns the axis as a unit vector.
+    ///
+    /// # Panics
+    /// If the index is above 2.
     pub fn vector(self) -> DVec3 {
         let mut v = [0.0; 3];
         v[self.index] = if self.negative { -1.0 } else { 1.0 };
@@ -84,7 +87,7 @@ impl From<Axis> for String {
     }
 }
 
-/// `ortho` or `persp`.
+/// Kind of projection: `ortho` or `persp`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ProjectionKind {
@@ -99,18 +102,18 @@ pub enum ProjectionKind {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PathView {
-    /// Where the eye is.
+    /// Position of the eye in the world.
     pub eye: [f64; 3],
-    /// Where it looks.
+    /// Point that the eye looks at.
     pub target: [f64; 3],
-    /// What is up.
+    /// Up direction of the picture.
     pub up: [f64; 3],
-    /// Projection.
+    /// Kind of projection.
     pub projection: ProjectionKind,
-    /// World height shown (`ortho`; default 1.25 times the largest extent).
+    /// World height shown (`ortho`); default 1.25 times the largest extent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub height: Option<f64>,
-    /// Vertical full field of view in degrees (`persp`; default 30).
+    /// Vertical full field of view in degrees (`persp`); default 30.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fov: Option<f64>,
 }
@@ -119,25 +122,25 @@ pub struct PathView {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Turntable {
-    /// Azimuth of the first frame, degrees from the front.
+    /// Azimuth of the first frame in degrees from the front.
     pub start: f64,
-    /// Degrees a frame.
+    /// Degrees from frame to frame.
     pub step: f64,
-    /// Frames.
+    /// Number of frames, 1 to [`MAX_FRAMES`].
     pub frames: u32,
-    /// Degrees towards up.
+    /// Elevation of the eye in degrees towards up, -90 to 90.
     pub elevation: f64,
     /// World height shown at the target; default 1.25 times the largest extent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub height: Option<f64>,
-    /// Projection.
+    /// Kind of projection.
     pub projection: ProjectionKind,
-    /// Vertical full field of view in degrees.
+    /// Vertical full field of view in degrees (`persp`).
     pub fov: f64,
-    /// Up; default what the volume was opened with.
+    /// Up axis; default that of the volume.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub up: Option<Axis>,
-    /// Front; default what the volume was opened with.
+    /// Front axis, at azimuth 0; default that of the volume.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub front: Option<Axis>,
 }
@@ -158,47 +161,50 @@ impl Default for Turntable {
     }
 }
 
-/// A view path: either views or a turntable.
+/// A view path: exactly one of `views`, `turntable`, `keyframes` and `flythrough`, and what holds
+/// for all its frames.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ViewPath {
     /// Format version, 1.
     pub version: u32,
-    /// Width and height in pixels.
+    /// Width and height of the pictures in pixels.
     pub size: [u32; 2],
-    /// Explicit cameras.
+    /// Explicit cameras, one a frame.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub views: Vec<PathView>,
-    /// Or a turn.
+    /// A turn about the up axis.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub turntable: Option<Turntable>,
-    /// Or key frames.
+    /// Key frames with curves between.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub keyframes: Option<KeyFrames>,
-    /// Or a flight.
+    /// A flight through points.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub flythrough: Option<FlyThrough>,
-    /// What of the volume is there at all; all of it if missing.
+    /// Box outside of which the volume counts as empty; `None` for the whole volume.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub crop: Option<Crop>,
-    /// The first and the last frame that are wanted, both included; all if missing. Numbers stay
-    /// those of the whole path.
+    /// First and last frame that are wanted, both included; all if `None`. Frames keep their
+    /// numbers on the whole path.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub range: Option<[u32; 2]>,
 }
 
-/// Which axes of a volume are up and front.
+/// Up and front axes of a volume.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Orientation {
-    /// Up.
+    /// Up axis.
     pub up: Axis,
-    /// Front.
+    /// Front axis (anterior, for anatomical files).
     pub front: Axis,
 }
 
 impl Orientation {
-    /// Checks a choice and fills in what is missing: up +z; front +y for up along z, else +z
-    /// (CONTRACTS.md; the front of measuring protocols).
+    /// Fills in what is missing: up +z; front +y for up along z, else +z (CONTRACTS.md).
+    ///
+    /// # Errors
+    /// Names `front` if it lies along up.
     pub fn new(up: Option<Axis>, front: Option<Axis>) -> Result<Self, InvalidField> {
         let up = up.unwrap_or(Axis::positive(2));
         let front = front.unwrap_or(Axis::positive(if up.index == 2 { 1 } else { 2 }));
@@ -211,10 +217,15 @@ impl Orientation {
         Ok(Orientation { up, front })
     }
 
-    /// The same for a volume with these values; `anatomical` says whether its file knows how it
-    /// lies. A CT that does not is taken as scanners store its slices (patient on the back, rows
+    /// Fills in what is missing as [`Orientation::new`], for a volume with values `summary`.
+    /// `anatomical` says whether its file knows how the patient lies.
+    ///
+    /// A CT whose file does not know is taken as scanners store slices (patient on the back, rows
     /// from anterior to posterior, DICOM's axes): its front is -y. Seen from +y, a couch hides the
     /// patient.
+    ///
+    /// # Errors
+    /// Names `front` if it lies along up.
     pub fn for_volume(
         up: Option<Axis>,
         front: Option<Axis>,
@@ -227,7 +238,7 @@ impl Orientation {
         Orientation::new(up, front.or(usual))
     }
 
-    /// These axes, unless a path has others of its own.
+    /// Returns these axes, unless a path has others of its own.
     fn or_else(self, up: Option<Axis>, front: Option<Axis>) -> Result<Self, InvalidField> {
         let same_up = up.is_none_or(|up| up == self.up);
         Orientation::new(up.or(Some(self.up)), front.or(same_up.then_some(self.front)))
@@ -235,7 +246,7 @@ impl Orientation {
 }
 
 impl ViewPath {
-    /// Explicit views.
+    /// Returns a path of explicit cameras, for pictures of `size` (width, height) pixels.
     pub fn from_views(size: [u32; 2], views: Vec<PathView>) -> Self {
         ViewPath {
             version: 1,
@@ -249,12 +260,15 @@ impl ViewPath {
         }
     }
 
-    /// A turntable.
+    /// Returns the path of a turntable, for pictures of `size` (width, height) pixels.
     pub fn from_turntable(size: [u32; 2], turntable: Turntable) -> Self {
         ViewPath { turntable: Some(turntable), ..ViewPath::from_views(size, Vec::new()) }
     }
 
-    /// Reads the JSON of CONTRACTS.md.
+    /// Reads and checks the JSON of CONTRACTS.md.
+    ///
+    /// # Errors
+    /// If the text is not such JSON, or as [`ViewPath::check`].
     pub fn from_json(text: &str) -> Result<Self, InvalidField> {
         let path: ViewPath = serde_json::from_str(text).map_err(|e| json_error("view path", &e))?;
         path.check()?;
@@ -262,6 +276,9 @@ impl ViewPath {
     }
 
     /// Checks version, counts, and whatever needs no volume.
+    ///
+    /// # Errors
+    /// Names the field that is missing, given twice, out of range or not finite.
     pub fn check(&self) -> Result<(), InvalidField> {
         if self.version != 1 {
             return Err(InvalidField::new("version", "this program knows version 1; set it to 1"));
@@ -310,7 +327,7 @@ impl ViewPath {
         Ok(())
     }
 
-    /// Frames of the whole path.
+    /// Returns the number of frames of the whole path.
     fn all_frames(&self) -> usize {
         let counts = [
             self.turntable.map(|t| t.frames),
@@ -320,17 +337,18 @@ impl ViewPath {
         counts.into_iter().flatten().next().map_or(self.views.len(), |n| n as usize)
     }
 
-    /// Number of frames that are wanted.
+    /// Returns the number of wanted frames.
     pub fn frames(&self) -> usize {
         self.range.map_or(self.all_frames(), |[first, last]| (last - first) as usize + 1)
     }
 
-    /// The number that the first wanted frame has on the whole path.
+    /// Returns the number of the first wanted frame on the whole path.
     pub fn first_frame(&self) -> usize {
         self.range.map_or(0, |[first, _]| first as usize)
     }
 
-    /// The path of one frame alone, by its number on the whole path: the same view, to the bit.
+    /// Returns the path of one frame alone, by its number on the whole path: the same view, to the
+    /// bit.
     ///
     /// # Panics
     /// If that frame is not wanted.
@@ -350,7 +368,7 @@ impl ViewPath {
         }
     }
 
-    /// The camera of frame `i` of those that are wanted.
+    /// Returns the camera of wanted frame `i` (counted from 0) of a volume on `lattice`.
     ///
     /// # Errors
     /// Names the field that is not finite or has no meaning.
@@ -363,7 +381,7 @@ impl ViewPath {
         self.prepare(lattice, orientation)?.camera(i)
     }
 
-    /// Makes what all cameras share ready, once for a path.
+    /// Prepares the cameras of all frames once, for a volume on `lattice`.
     ///
     /// # Errors
     /// Names the field that has no meaning.
@@ -389,7 +407,7 @@ enum Curve {
     Flight(fly::Flight, usize),
 }
 
-/// A path's cameras, in any order.
+/// The cameras of a path, in any order.
 pub struct Cameras<'a> {
     path: &'a ViewPath,
     lattice: Lattice,
@@ -398,7 +416,7 @@ pub struct Cameras<'a> {
 }
 
 impl Cameras<'_> {
-    /// The camera of frame `i` of those that are wanted.
+    /// Returns the camera of wanted frame `i` (counted from 0).
     ///
     /// # Errors
     /// Names the field that is not finite or has no meaning.
@@ -475,7 +493,8 @@ impl Turntable {
     }
 }
 
-/// The direction to the eye and the picture's up, for an azimuth and an elevation in degrees.
+/// Returns the direction to the eye and the picture's up for an azimuth and an elevation in
+/// degrees.
 fn direction(o: Orientation, azimuth: f64, elevation: f64) -> (DVec3, DVec3) {
     let side = Axis::positive(3 - o.up.index - o.front.index).vector();
     let (front, up) = (o.front.vector(), o.up.vector());
@@ -487,7 +506,7 @@ fn direction(o: Orientation, azimuth: f64, elevation: f64) -> (DVec3, DVec3) {
     (level * cos_e + up * sin_e, up * cos_e - level * sin_e)
 }
 
-/// Sine and cosine of an angle in degrees, exact at multiples of 90.
+/// Returns sine and cosine of an angle in degrees, exact at multiples of 90.
 fn sin_cos_degrees(degrees: f64) -> (f64, f64) {
     let quarter = libm::round(degrees / 90.0);
     let rest = (degrees - quarter * 90.0).to_radians();
@@ -512,7 +531,7 @@ mod tests {
     }
 
     #[test]
-    fn one_frame_of_a_path_is_the_same_view_to_the_bit() {
+    fn single_frame_of_a_path_is_the_same_view_to_the_bit() {
         let l = Lattice::from_spacing([9; 3], [1.0; 3]);
         let o = Orientation::new(None, None).unwrap();
         let turn = Turntable { start: 20.1, step: 5.3, frames: 40, ..Turntable::default() };
@@ -526,7 +545,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ct_without_axes_is_seen_from_anterior() {
+    fn orientation_of_a_ct_without_axes_has_its_front_at_minus_y() {
         // Air, soft tissue and bone in Hounsfield units.
         let values = [(-1000.0, 500), (-40.0, 250), (60.0, 250), (900.0, 40)];
         let ct: Vec<f32> =
@@ -551,7 +570,7 @@ mod tests {
     }
 
     #[test]
-    fn the_turntable_is_the_measuring_protocols() {
+    fn turntable_starts_as_in_the_measuring_protocol() {
         // Direction sin t on the first remaining axis, cos t on the second; height 320.
         let (s, c) = (libm::sin(20f64.to_radians()), libm::cos(20f64.to_radians()));
         for (up, want) in [
@@ -566,7 +585,7 @@ mod tests {
     }
 
     #[test]
-    fn perspective_shows_the_same_height_at_the_target() {
+    fn perspective_turntable_shows_its_height_at_the_target() {
         let t = Turntable { projection: ProjectionKind::Persp, ..Turntable::default() };
         let CameraProjection::Persp { fov, distance } = cameras(t, None).projection else {
             panic!("asked for perspective")
@@ -575,13 +594,13 @@ mod tests {
     }
 
     #[test]
-    fn the_pole_has_an_up() {
+    fn turntable_has_an_up_at_the_pole() {
         let c = cameras(Turntable { elevation: 90.0, start: 0.0, ..Turntable::default() }, None);
         assert_eq!((c.to_eye, c.up), (DVec3::Z, -DVec3::Y));
     }
 
     #[test]
-    fn json_names_what_is_wrong() {
+    fn path_json_errors_name_the_field() {
         let bad = |text: &str| ViewPath::from_json(text).unwrap_err().to_string();
         assert!(bad(r#"{"version":1,"size":[9,9]}"#).contains("views"));
         assert!(bad(r#"{"version":1,"size":[9,9],"turntabel":{}}"#).contains("turntabel"));

@@ -1,50 +1,48 @@
-//! What a histogram tells of a volume: where its air ends, where its solid begins, how dense it
-//! gets.
+//! Levels of a volume's histogram: where its air ends, where its solid begins, how dense it gets.
 //!
 //! A preset that knew only the smallest and the largest value would show nothing of most files:
 //! scanners leave noise around the body, saturated voxels at the top, a background of 77. Otsu's
-//! threshold, the usual answer, cuts in the middle of what is there: at 100 of 255 in a flame
-//! whose cloud begins at 5, and through the skin of a head. So the end of the air is looked for where
-//! the eye finds it: at the foot of the background's peak, or in the valley behind it if there is
-//! one.
+//! threshold, the usual answer, cuts in the middle of what is there: at 100 of 255 in a flame whose
+//! cloud begins at 5, and through the skin of a head. So the end of the air is looked for where the
+//! eye finds it: at the foot of the background's peak, or in the valley behind it if there is one.
 //!
 //! 1. The background is the fullest bin; its foot is where counts have fallen to a hundredth, or,
-//!    where a hill rises before that, in the middle of the valley's floor. (Noise about the body of
-//!    an MR falls off slowly and is still above a hundredth where the body begins: the foot would be
-//!    behind nearly all of it.)
+//!   where a hill rises before that, in the middle of the valley's floor. (Noise around the body of
+//!   an MR falls off slowly and is still above a hundredth where the body begins: the foot would be
+//!   behind nearly all of it.)
 //! 2. Behind the foot, the smoothed histogram has valleys. Of those with half of the foreground
-//!    above them the deepest counts (half: so that leaves are not cut off with the air because the
-//!    trunk is denser). There the content is *solid*: a surface can be drawn.
+//!   above them the deepest counts (half: so that leaves are not cut off with the air because the
+//!   trunk is denser). There the content is *solid*: a surface can be drawn.
 //! 3. Without a valley the histogram falls all the way. Little foreground is *sparse*: vessels, a
-//!    wire, a shell; much of it is a *cloud*, which an opaque surface would hide.
+//!   wire, a shell; much of it is a *cloud*, which an opaque surface would hide.
 //!
 //! All numbers are shares of the range: 0 the smallest value, 1 the largest.
 
 use slabcast_common::volume::{SampleKind, ValueSummary};
 use std::ops::Range;
 
-/// Bins are averaged over this share of the range to either side when valleys are looked for.
+/// Half width, as a share of the range, over which bins are averaged when valleys are looked for.
 /// At half of it the noise of 8-bit histograms has valleys of its own; at double the gap between
 /// the leaves and the air of a plant is gone.
 const SMOOTH: f64 = 0.015;
 
-/// How much higher both sides of a valley must be.
+/// How many times higher both sides of a valley must be.
 const DEPTH: f64 = 1.5;
 
-/// What is lower than this many times its lowest is the floor of a valley.
+/// Factor of the lowest bin below which a bin belongs to the valley's floor.
 const FLOOR: f64 = 1.25;
 
-/// Foreground above this share is a cloud if no valley parts it from the air.
+/// Share of the volume above which foreground without a valley is a cloud.
 const CLOUD: f64 = 0.15;
 
-/// What kind of thing the foreground is.
+/// Kind of foreground.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Content {
-    /// A valley parts it from the air.
+    /// A valley of the histogram separates it from the air.
     Solid,
     /// No valley, and less than 15 % of the volume.
     Sparse,
-    /// No valley, and more of the volume.
+    /// No valley, and 15 % of the volume or more.
     Cloud,
     /// No bin stands out as air: something is everywhere.
     Everywhere,
@@ -52,29 +50,30 @@ pub enum Content {
     Constant,
 }
 
-/// What a histogram tells.
+/// Levels of a histogram, as shares of the value range (0 to 1).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Levels {
-    /// What is there.
+    /// Kind of foreground.
     pub content: Content,
     /// Where the air ends: nothing is drawn below.
     pub air: f64,
-    /// From where on a surface is opaque; above `air`.
+    /// Where a surface becomes opaque; above `air`.
     pub solid: f64,
     /// Median of what is above the air.
     pub mid: f64,
-    /// What the densest quarter of it exceeds.
+    /// Third quartile of what is above the air.
     pub dense: f64,
-    /// What the densest tenth of it exceeds.
+    /// Ninth decile of what is above the air.
     pub densest: f64,
-    /// What 0.2 % of it exceed: where colours end.
+    /// Where colours end: 0.2 % of what is above the air exceeds it.
     pub top: f64,
-    /// The value of water, where values are Hounsfield units but for an offset.
+    /// Value of water in file units, where values are Hounsfield units but for an offset; else
+    /// `None`.
     pub water: Option<f64>,
 }
 
 impl Levels {
-    /// Looks at a histogram.
+    /// Finds the levels of a volume's histogram.
     pub fn from_summary(summary: &ValueSummary) -> Levels {
         let bins = unit_histogram(summary);
         let nothing = Levels {
@@ -297,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn a_body_in_air_is_cut_in_the_valley() {
+    fn solid_body_in_air_is_cut_in_the_valley() {
         // Air at 0, a little noise, a gap, tissue from 60 on.
         let l = levels(bytes(&[(0, 1, 70_000), (1, 40, 800), (60, 140, 29_000), (255, 256, 1)]));
         assert_eq!(l.content, Content::Solid);
@@ -308,7 +307,7 @@ mod tests {
     }
 
     #[test]
-    fn a_background_that_is_not_zero_is_still_air() {
+    fn background_above_zero_counts_as_air() {
         // As in a tooth's scan: background about 77, dark streaks below it.
         let l = levels(bytes(&[
             (0, 70, 200),
@@ -323,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn a_thin_object_in_a_sea_of_air_is_sparse_and_a_falling_tail_a_cloud() {
+    fn little_foreground_is_sparse_and_much_is_a_cloud() {
         let tail = |each: u32| -> Samples {
             let mut v = vec![0u8; 90_000];
             for x in 1..255u32 {
@@ -341,7 +340,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_that_runs_into_the_body_ends_where_the_body_begins() {
+    fn air_ends_where_noise_meets_the_body() {
         // As in a series of MR slices: noise falls off to a twentieth of its peak, and no further
         // before tissue rises.
         let noise = (0..14).map(|i| (i, i + 1, 50_000 >> (i / 3)));
@@ -357,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ramp_has_no_air_and_one_value_has_nothing() {
+    fn even_histograms_have_no_air_and_one_value_is_constant() {
         assert_eq!(levels(bytes(&[(0, 256, 25_600)])).content, Content::Everywhere);
         assert_eq!(levels(bytes(&[(9, 10, 500)])).content, Content::Constant);
         assert_eq!(levels(Samples::F32(vec![f32::NAN; 9])).content, Content::Constant);
@@ -367,7 +366,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ct_is_known_by_its_hills_with_any_of_the_usual_offsets() {
+    fn ct_values_are_recognised_with_any_usual_offset() {
         let ct = |water: f64| {
             let mut v = Vec::new();
             v.extend(spread(0, 40, 50_000).map(|x| f64::from(x) - 1010.0));

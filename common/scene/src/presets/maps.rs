@@ -8,7 +8,7 @@
 
 use crate::colour;
 
-/// Every name and what it is for.
+/// Names of the colour maps and what each is for.
 pub const MAPS: [(&str, &str); 8] = [
     ("viridis", "blue, green, yellow: the usual choice"),
     ("inferno", "black, red, yellow: as of something that glows"),
@@ -24,7 +24,8 @@ pub const MAPS: [(&str, &str); 8] = [
 const COOL: [f64; 3] = [0.230, 0.299, 0.754];
 const WARM: [f64; 3] = [0.706, 0.016, 0.150];
 
-/// Colours of a map: `[t, r, g, b]` with t from 0 to 1, sRGB numbers.
+/// Returns the colour points `[t, r, g, b]` of a map, t from 0 to 1, as sRGB numbers; `None` if
+/// there is none of that name.
 pub fn colour_map(name: &str) -> Option<Vec<[f64; 4]>> {
     let table = match name {
         "viridis" => &VIRIDIS,

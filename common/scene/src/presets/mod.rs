@@ -1,13 +1,14 @@
 //! Transfer functions by name.
 //!
-//! For people: `auto`, named looks and perceptual maps, whose ranges follow the volume's histogram
-//! ([`Levels`]), or Hounsfield units where the values are those of a CT. For measuring: the
-//! `peer-*` ramps on raw 8-bit values (other types scaled from their smallest to their largest
+//! For people: `auto`, named presets and perceptual colour maps, whose ranges follow the volume's
+//! histogram ([`Levels`]), or Hounsfield units where the values are those of a CT. For measuring:
+//! the `peer-*` ramps on raw 8-bit values (other types scaled from their smallest to their largest
 //! value), the same that other renderers are measured with.
 //!
-//! Each look has three parts (docs/colours-and-cameras.md has them as a table): a *range rule*, where opacity
-//! begins and how it grows; a *technique*, a surface (opaque within a few voxels), layers (what is
-//! outside is translucent over what is dense) or a fog (nothing hides anything); and its *light*.
+//! Each preset has three parts (docs/colours-and-cameras.md has them as a table): a *range rule*,
+//! where opacity begins and how it grows; a *technique*, a surface (opaque within a few voxels),
+//! layers (a translucent outside over a dense inside) or a fog (nothing hides anything); and its
+//! *light*.
 
 mod levels;
 mod maps;
@@ -21,7 +22,8 @@ use slabcast_common::spelling::nearest;
 use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 use slabcast_common::volume::{SampleKind, ValueSummary};
 
-/// Every name but those of [`MAPS`], and what it is for, in the order of the help text.
+/// Names of the presets and what each is for, in the order of the help text. [`MAPS`] has the
+/// colour maps.
 pub const NAMES: [(&str, &str); 20] = [
     ("auto", "cuts the air and draws what is there as surface or cloud"),
     ("skin", "the outermost surface, in a skin's colours"),
@@ -45,7 +47,7 @@ pub const NAMES: [(&str, &str); 20] = [
     ("peer-skull", "for measuring: 0 at 25, 1 at 45"),
 ];
 
-/// Colours over 0 to 255, spread over a range.
+/// Colour points over 0 to 255, stretched over a range.
 type Colours = [[f64; 4]];
 
 const WARM: [[f64; 4]; 4] = [
@@ -104,10 +106,11 @@ const MIST: [[f64; 4]; 2] = [[0.0, 0.75, 0.80, 0.86], [255.0, 1.0, 1.0, 1.0]];
 const FILM: [[f64; 4]; 2] = [[0.0, 0.55, 0.62, 0.70], [255.0, 0.97, 0.99, 1.0]];
 const GREY: [[f64; 4]; 2] = [[0.0, 0.35, 0.35, 0.35], [255.0, 1.0, 1.0, 1.0]];
 
-/// The transfer function called `name`, fitted to a volume with these values.
+/// Returns the transfer function called `name` (a preset or a colour map), fitted to a volume with
+/// values `summary`.
 ///
 /// # Errors
-/// If there is none of that name; says what there is.
+/// If there is none of that name; the error lists all, and the nearest first.
 pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, InvalidField> {
     let l = Levels::from_summary(summary);
     let at = hounsfield(summary, &l);
@@ -249,7 +252,7 @@ pub fn by_name(name: &str, summary: &ValueSummary) -> Result<TransferFunction, I
     Ok(tf)
 }
 
-/// The refusal of a name that is neither a preset nor a map, with the nearest one.
+/// Returns the error for a name that is neither a preset nor a map, with the nearest one.
 pub fn unknown_name(name: &str) -> InvalidField {
     let names: Vec<&str> = NAMES.iter().chain(&MAPS).map(|(n, _)| *n).collect();
     let meant = nearest(name, &names).map(|n| format!("did you mean `{n}`? ")).unwrap_or_default();
@@ -264,8 +267,8 @@ pub fn unknown_name(name: &str) -> InvalidField {
     )
 }
 
-/// A fitting look for whatever there is: a surface where there is one, a cloud that can be seen
-/// through where there is none.
+/// Returns a preset for whatever there is: a surface where there is one, else a cloud that can be
+/// seen through.
 fn auto(l: &Levels) -> TransferFunction {
     let (air, solid, top) = (l.air, l.solid, l.top);
     match l.content {
@@ -283,19 +286,20 @@ fn auto(l: &Levels) -> TransferFunction {
     }
 }
 
-/// From Hounsfield units to shares of the range, where the values are those of a CT.
+/// Returns the map from Hounsfield units to shares of the range, where the values are those of a
+/// CT.
 fn hounsfield(summary: &ValueSummary, l: &Levels) -> Option<impl Fn(f64) -> f64> {
     let water = l.water?;
     let (lo, hi) = summary.range();
     Some(move |hu: f64| ((hu + water - lo) / (hi - lo)).clamp(0.0, 1.0))
 }
 
-/// Opaque within a short ramp, and lit.
+/// Returns a lit surface: opaque within a short ramp.
 fn surface(colours: &Colours, range: [f64; 2], from: f64, to: f64) -> TransferFunction {
     look(colours, range, &[[from, 0.0], [to, 1.0]])
 }
 
-/// A translucent outside of at most `alpha` over an opaque inside.
+/// Returns a translucent outside of at most `alpha` over an opaque inside.
 fn layers(
     colours: &Colours,
     range: [f64; 2],
@@ -308,7 +312,8 @@ fn layers(
     look(colours, range, &[[a, 0.0], [b, alpha], [c.max(b), alpha], [d.max(c), 0.9]])
 }
 
-/// Colours over a range and opacities, over `[0, 1]` from the smallest to the largest value; lit.
+/// Returns a lit function of colours over a range and opacities, both over `[0, 1]` from the
+/// smallest to the largest value.
 fn look(colours: &Colours, range: [f64; 2], opacities: &[[f64; 2]]) -> TransferFunction {
     let over_bytes: Vec<[f64; 4]> =
         colours.iter().map(|c| [c[0] / 255.0, c[1], c[2], c[3]]).collect();
@@ -331,13 +336,13 @@ fn look(colours: &Colours, range: [f64; 2], opacities: &[[f64; 2]]) -> TransferF
     }
 }
 
-/// Colours given over 0 to 1, spread from `lo` to `hi`.
+/// Stretches colour points `[t, r, g, b]` with t from 0 to 1 over the range from `lo` to `hi`.
 pub fn stretch_colours(colours: &Colours, lo: f64, hi: f64) -> Vec<[f64; 4]> {
     let width = (hi - lo).max(1e-6);
     colours.iter().map(|c| [lo + width * c[0], c[1], c[2], c[3]]).collect()
 }
 
-/// The measuring ramps: x are raw 8-bit values; other types are scaled to 0..255.
+/// Returns a ramp for measuring: x are raw 8-bit values; other types are scaled to 0..255.
 fn peer(summary: &ValueSummary, colors: &Colours, opacities: &[[f64; 2]]) -> TransferFunction {
     let raw = summary.kind == SampleKind::U8;
     let x = |x: f64| if raw { summary.map.value(x) } else { x / 255.0 };
@@ -352,7 +357,7 @@ fn peer(summary: &ValueSummary, colors: &Colours, opacities: &[[f64; 2]]) -> Tra
     tf
 }
 
-/// Where the air ends, as a share of the range.
+/// Returns where the air ends, as a share of the value range (0 to 1).
 pub fn air_threshold(summary: &ValueSummary) -> f64 {
     Levels::from_summary(summary).air
 }
@@ -363,7 +368,7 @@ mod tests {
     use slabcast_common::volume::{Samples, ValueMap};
 
     #[test]
-    fn every_preset_passes_its_own_check_on_every_kind_of_volume() {
+    fn presets_pass_their_check_on_every_kind_of_volume() {
         let volumes = [
             Samples::U8((0..=255).collect()),
             Samples::U8(vec![7; 100]),
@@ -384,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn a_brain_shows_its_furrows() {
+    fn brain_preset_shows_furrows() {
         // As in an average brain: a little of all that fills the furrows, then grey and white.
         let hills = [(0, 80_000), (40, 800), (170, 9_000), (220, 6_000)];
         let v = hills.iter().flat_map(|&(at, n)| (0..n).map(move |i| (at + i % 30) as u8));
@@ -398,7 +403,7 @@ mod tests {
     }
 
     #[test]
-    fn unknown_names_are_told_what_there_is() {
+    fn unknown_preset_names_get_the_nearest_and_all_names() {
         let s = ValueSummary::from_samples(&Samples::U8(vec![0, 255]), ValueMap::IDENTITY);
         let e = by_name("bonee", &s).unwrap_err().to_string();
         assert!(e.contains("did you mean `bone`") && e.contains("peer-opaque"), "{e}");
@@ -407,7 +412,7 @@ mod tests {
     }
 
     #[test]
-    fn air_cut_finds_a_thin_object_in_a_sea_of_air() {
+    fn air_threshold_finds_a_thin_object_in_much_air() {
         // Less than 1 % bright voxels, as in an angiogram.
         let mut v = vec![0u8; 100_000];
         for i in 0..20_000 {

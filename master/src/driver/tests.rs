@@ -2,9 +2,12 @@
 
 use super::*;
 use crate::handle::{Handle, Master, MasterConfig};
+use crate::hooks::Stage;
 use crate::jobs::WatchItem;
-use slabcast_common::image::{Background, PixelFormat, TilePixels};
+use crate::panics::caught;
+use slabcast_common::image::{Background, PixelFormat, SparseTile, TilePixels};
 use slabcast_common::message::{Counters, Pixels, RegionCost, TaskTimes, TileResult};
+use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::{Quality, Work};
 use slabcast_common::{PIXELS_VERSION, SELF_TEST_SHA256};
 use slabcast_scene::path::{Orientation, Turntable, ViewPath};

@@ -1,0 +1,142 @@
+//! Carrying out the scheduler's actions, up to finished frames.
+
+use super::Driver;
+use crate::finish::{Assembly, FrameSums};
+use crate::finishers::FinishTask;
+use crate::jobs::FinishedFrame;
+use crate::link::BrickOrder;
+use slabcast_common::ids::{FrameId, JobId};
+use slabcast_common::image::{FrameState, SparseTile};
+use slabcast_common::message::ToWorker;
+use slabcast_common::occlusion::Rect;
+use slabcast_common::stats::FrameStats;
+use slabcast_schedule::{Action, Spans};
+use std::sync::Arc;
+use tracing::{debug, info, warn};
+
+impl Driver {
+    pub(super) fn act(&mut self) {
+        while let Some(action) = self.scheduler.next_action() {
+            match action {
+                Action::Send { worker, message } => {
+                    // A closed link says so itself, by its detach.
+                    let Some(link) = self.workers.link(worker) else { continue };
+                    if let ToWorker::DropBricks { set, bricks } = message {
+                        let _ = link.bricks.send(BrickOrder::Drop { set, bricks });
+                    } else {
+                        let _ = link.control.send(message);
+                    }
+                }
+                Action::SendBricks { worker, set, bricks } => {
+                    let store = self.brick_sets.get(set).or_else(|| self.active.store(set));
+                    if let (Some(link), Some(store)) = (self.workers.link(worker), store) {
+                        debug!(%worker, bricks = bricks.len(), "bricks sent");
+                        let store = store.clone();
+                        let _ = link.bricks.send(BrickOrder::Send { set, store, bricks });
+                    }
+                }
+                Action::Drop { worker, reason } => {
+                    if self.workers.remove(worker).is_some() {
+                        warn!(%worker, reason, "worker dropped");
+                    }
+                    self.refresh_states();
+                }
+                Action::Progress { frame, done, total, slab, slabs } => {
+                    self.progress(frame, (done, total), (slab, slabs));
+                }
+                Action::Finished { frame, tiles } => self.compose(frame, tiles),
+                Action::FrameDone { frame, state, stats, spans } => {
+                    self.finish(frame, state, stats, spans);
+                }
+                Action::FrameFailed { frame, reason } => self.fail_frame(frame, &reason),
+            }
+        }
+    }
+
+    pub(super) fn progress(&mut self, frame: FrameId, tiles: (u32, u32), slab: (u32, u32)) {
+        let Some(flight) = self.flights.get_mut(&frame) else { return };
+        if flight.slab_span.as_ref().is_none_or(|(s, _)| *s != slab.0) {
+            let span = tracing::info_span!(parent: &flight.frame_span, "slab", slab = slab.0);
+            flight.slab_span = Some((slab.0, span));
+        }
+        if let Some((_, span)) = &flight.slab_span {
+            span.in_scope(|| debug!(done = tiles.0, total = tiles.1, "tiles"));
+        }
+        self.jobs.lock().update(flight.job, |view| {
+            view.tiles = tiles;
+            view.slab = slab;
+        });
+        self.jobs.ring_tile();
+    }
+
+    /// Has finished tiles composed into their frame's picture while others are drawn.
+    pub(super) fn compose(&mut self, frame: FrameId, tiles: Vec<(Rect, SparseTile)>) {
+        // A rehearsed frame has no pixels.
+        let Some(flight) = self.flights.get_mut(&frame).filter(|_| !self.rehearse) else { return };
+        let Some(job) = self.active.get(flight.job) else { return };
+        let assembly = flight.assembly.get_or_insert_with(|| {
+            let size = job.views[flight.number as usize].size;
+            Arc::new(Assembly::new(size, job.request.encoding()))
+        });
+        assembly.add(tiles);
+        let task = FinishTask::Compose(frame, assembly.clone());
+        self.push(frame, task);
+    }
+
+    /// Hands a rendered frame to a finisher.
+    pub(super) fn finish(
+        &mut self,
+        frame: FrameId,
+        state: Box<FrameState>,
+        stats: Box<FrameStats>,
+        spans: Spans,
+    ) {
+        let Some(flight) = self.flights.get(&frame) else { return };
+        let Some(job) = self.active.get(flight.job) else {
+            self.flights.remove(&frame);
+            return;
+        };
+        let sums = Box::new(FrameSums {
+            job: flight.job,
+            frame,
+            request: job.request.clone(),
+            scene: flight.scene.clone(),
+            crop: job.wanted.crop,
+            view: job.views[flight.number as usize],
+            state,
+            assembly: flight.assembly.clone(),
+            stats,
+            spans,
+            store: job.store.clone(),
+            rehearsed: self.rehearse,
+        });
+        self.push(frame, FinishTask::Finish(sums));
+    }
+
+    pub(super) fn push(&mut self, frame: FrameId, task: FinishTask) {
+        if let Err(ended) = self.finishers.push(task) {
+            self.fail_frame(frame, &ended.to_string());
+        }
+    }
+
+    pub(super) fn finished(&mut self, id: JobId, flight: FrameId, frame: FinishedFrame) {
+        // A frame of a job that has ended meanwhile is nobody's.
+        let Some(flight) = self.flights.remove(&flight) else { return };
+        flight.frame_span.in_scope(|| {
+            let FrameStats { ms, pixels_sha256, .. } = &frame.stats;
+            info!(ms = ms.total, pixels_sha256, "frame done");
+        });
+        self.log_reserve();
+        let number = frame.number;
+        let mut table = self.jobs.lock();
+        let is_done = table.put(id, frame);
+        table.evict(self.frame_budget_bytes, (id, number));
+        drop(table);
+        if is_done {
+            info!(job = %id, "job done");
+            self.retire();
+        }
+        self.jobs.ring();
+        self.refresh_states();
+    }
+}

@@ -1,34 +1,34 @@
-//! Neighbouring bricks in blocks: who looks at a volume need not look at each of its bricks.
+//! Neighbouring bricks in blocks, so that a query need not look at each brick of a volume.
 //!
-//! A block is a cube of the lattice and stands for the bricks in it by the box around theirs. What hides
-//! the box hides them: the pixels and sheets of its projection hold those of theirs
+//! A block is a cube of the lattice and stands for its bricks by the box around theirs. What hides
+//! that box hides the bricks: the pixels and sheets of its projection hold those of theirs
 //! ([`crate::view::View::project`] grows with its box).
 
 use crate::brick::{BrickInfo, TightBox};
 use std::ops::Range;
 
-/// Bricks in blocks, each brick in one.
+/// Bricks grouped into blocks; each brick is in one.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Blocks {
     all: Vec<Block>,
-    /// Places of bricks, block after block.
+    /// Places of bricks in the original list, block after block.
     places: Vec<u32>,
 }
 
-/// Bricks that lie together.
+/// A block: neighbouring bricks.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Block {
-    /// The box around their tight boxes.
+    /// Box around the bricks' tight boxes, in index coordinates.
     pub tight: TightBox,
-    /// Their voxels.
+    /// Relevant voxels of all its bricks.
     pub voxels: u64,
-    /// Where they are in the list of places.
+    /// Its bricks, as a range of [`Blocks::places`].
     range: Range<usize>,
 }
 
 impl Blocks {
-    /// Blocks of `2^shift` voxels along each axis, or of twice as many again and again, until there are
-    /// at most `most` (or one).
+    /// Groups `bricks` into cubes of `2^shift` voxels an axis, doubling the edge until there are at
+    /// most `most` blocks (or one).
     pub fn new(bricks: &[BrickInfo], shift: u32, most: usize) -> Blocks {
         let mut keyed: Vec<([u32; 3], u32)> = Vec::with_capacity(bricks.len());
         for shift in shift..32 {
@@ -57,12 +57,12 @@ impl Blocks {
         Blocks::default()
     }
 
-    /// The blocks.
+    /// Returns the blocks.
     pub fn all(&self) -> &[Block] {
         &self.all
     }
 
-    /// Places of a block's bricks in the list that it was made of, ascending.
+    /// Returns the places of a block's bricks in the list given to [`Blocks::new`], ascending.
     pub fn places(&self, block: &Block) -> &[u32] {
         &self.places[block.range.clone()]
     }
@@ -83,7 +83,7 @@ mod tests {
     }
 
     #[test]
-    fn blocks_hold_their_bricks_and_are_few() {
+    fn blocks_hold_each_brick_once_and_are_few() {
         let brick = |i: u32| {
             let lo = [i % 50 * 8, i / 50 % 50 * 8, i / 2500 * 8];
             let tight = TightBox { lo, hi: lo.map(|x| x + 7) };
@@ -111,7 +111,7 @@ mod tests {
     proptest! {
         /// Pixels and sheets of a box hold those of every box in it, where the eye is inside, too.
         #[test]
-        fn what_hides_a_block_hides_its_bricks(
+        fn projection_of_a_block_holds_those_of_its_bricks(
             azimuth in 0.0..6.3f64, tilt in -2.0..2.0f64, d in 0.02..5.0f64,
             persp in any::<bool>(), near in 0.01..40.0f64, aniso in 1.0..4.0f64,
             target in prop::array::uniform3(-30.0..30.0f64), zoom in 0.2..60.0f64,

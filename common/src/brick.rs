@@ -1,8 +1,9 @@
 //! Bricks: 8x8x8 voxels of which only the relevant ones are kept (paper section 4.2).
 //!
-//! A brick holds values, normals and, where asked for, magnitudes of gradients, never colours or
-//! opacities, so a change of light or colour needs no new bricks (CONTRACTS.md, Wire). The paper spends 16 bytes a voxel; here an 8-bit
-//! shaded voxel takes 5 in memory (index, value, normal) and 3 to 5 on the wire.
+//! A brick holds values, normals and, where asked for, gradient magnitudes, never colours or
+//! opacities. So a change of light or colour needs no new bricks (CONTRACTS.md, Wire). The paper
+//! spends 16 bytes a voxel; here an 8-bit shaded voxel takes 5 in memory (index, value, normal) and
+//! 3 to 5 on the wire.
 
 use crate::ids::BrickId;
 use crate::volume::{Digest32, SampleKind, Samples};
@@ -11,7 +12,7 @@ use crate::volume::{Digest32, SampleKind, Samples};
 pub const BRICK_EDGE: u32 = 8;
 /// Voxels of a full brick.
 pub const BRICK_VOXELS: usize = 512;
-/// Most bricks a volume may have: a 4096^3 volume has 2^27.
+/// Most bricks that a volume may have: a 4096^3 volume has 2^27.
 pub const MAX_BRICKS: u64 = 1 << 27;
 
 /// How a volume is cut into bricks.
@@ -22,36 +23,36 @@ pub struct BrickGrid {
 }
 
 impl BrickGrid {
-    /// The grid of a volume with `dims` samples.
+    /// Returns the grid of a volume with `dims` samples along each axis.
     pub fn new(dims: [u32; 3]) -> Self {
         BrickGrid { dims: dims.map(|n| n.div_ceil(BRICK_EDGE)) }
     }
 
-    /// Number of bricks, relevant or not.
+    /// Returns the number of bricks, relevant or not.
     pub fn len(&self) -> usize {
         self.dims.iter().map(|&n| n as usize).product()
     }
 
-    /// Whether there is none.
+    /// Returns whether there is no brick.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Index of a brick's first voxel.
+    /// Returns the index coordinates of a brick's first voxel.
     #[inline]
     pub fn corner(&self, id: BrickId) -> [u32; 3] {
         let [nx, ny, _] = self.dims;
         [id.0 % nx * BRICK_EDGE, id.0 / nx % ny * BRICK_EDGE, id.0 / nx / ny * BRICK_EDGE]
     }
 
-    /// The brick at grid position (x, y, z).
+    /// Returns the brick at grid position (x, y, z).
     #[inline]
     pub fn id(&self, [x, y, z]: [u32; 3]) -> BrickId {
         BrickId(x + self.dims[0] * (y + self.dims[1] * z))
     }
 }
 
-/// The box of a brick's relevant voxels, in index coordinates of the volume, ends included.
+/// Box of a brick's relevant voxels, in index coordinates of the volume, ends included.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TightBox {
     /// Smallest index along each axis.
@@ -61,12 +62,12 @@ pub struct TightBox {
 }
 
 impl TightBox {
-    /// All of a lattice.
+    /// Returns the box of a whole lattice of `dims` samples.
     pub fn whole(dims: [u32; 3]) -> TightBox {
         TightBox { lo: [0; 3], hi: dims.map(|n| n.saturating_sub(1)) }
     }
 
-    /// The smallest box around both.
+    /// Returns the smallest box around both.
     #[must_use]
     pub fn union(self, other: TightBox) -> TightBox {
         TightBox {
@@ -76,47 +77,48 @@ impl TightBox {
     }
 }
 
-/// What the scheduler knows of a relevant brick.
+/// Directory entry of a relevant brick: what the scheduler knows without its voxels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BrickInfo {
-    /// Which brick.
+    /// The brick.
     pub id: BrickId,
-    /// Its tight box.
+    /// Box of its relevant voxels.
     pub tight: TightBox,
-    /// Relevant voxels, 1 to 512.
+    /// Number of relevant voxels, 1 to 512.
     pub voxels: u16,
     /// Bytes of its encoding on the wire.
     pub bytes: u32,
 }
 
-/// Which bricks these are: a volume, the values that are relevant, and whether normals are
-/// there (CONTRACTS.md: volume digest and support).
+/// Key of a brick set: a digest over the volume, the relevant values and what each voxel stores
+/// (CONTRACTS.md: volume digest and support).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct BrickSetKey(pub Digest32);
 
 /// One brick: its relevant voxels in ascending local index.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Brick {
-    /// Which brick.
+    /// The brick's place in its grid.
     pub id: BrickId,
     /// Local index `x + 8 y + 64 z` of each voxel, ascending.
     pub index: Vec<u16>,
     /// Code of each voxel.
     pub values: Samples,
-    /// Octahedral normal of each voxel; `None` where the scene is unshaded.
+    /// Octahedral normal code of each voxel ([`crate::shade`]); `None` in unshaded scenes.
     pub normals: Option<Vec<u16>>,
-    /// Magnitude of each voxel's gradient ([`crate::gradient`]); `None` where no opacity hangs on it.
+    /// Gradient magnitude code of each voxel ([`crate::gradient`]); `None` where it modulates no
+    /// opacity.
     pub gradients: Option<Vec<u8>>,
-    /// Tight box inside the brick, lowest and highest: asked for in every frame, so kept.
+    /// Tight box inside the brick, lowest and highest corner. Kept, since every frame asks for it.
     tight: [[u8; 3]; 2],
-    /// `index` as bits: likewise.
+    /// `index` as a bit mask. Kept, since every frame asks for it.
     present: [u64; BRICK_VOXELS / 64],
 }
 
 /// Why bytes are not a brick.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum BrickError {
-    /// The bytes end too early or late.
+    /// The bytes end too early or too late.
     #[error("brick encoding has {have} bytes, needs {need}")]
     Length {
         /// Bytes there.
@@ -124,16 +126,16 @@ pub enum BrickError {
         /// Bytes needed.
         need: usize,
     },
-    /// The checksum does not fit.
+    /// The CRC-32C does not match.
     #[error("brick {id} fails its checksum")]
     Checksum {
-        /// The id it claims.
+        /// Id that the bytes claim.
         id: BrickId,
     },
     /// A field is out of range.
     #[error("brick field {field} is out of range")]
     Field {
-        /// Which.
+        /// Name of the field.
         field: &'static str,
     },
 }
@@ -141,12 +143,12 @@ pub enum BrickError {
 const HEAD: usize = 4 + 2 + 1;
 const TAIL: usize = 4;
 const MASK_BYTES: usize = BRICK_VOXELS / 8;
-/// From this many voxels a bit mask (64 bytes) is shorter than a list of 2-byte indices.
+/// Voxels from which a bit mask (64 bytes) is shorter than a list of 2-byte indices.
 const MASK_FROM: usize = 32;
 
 impl Brick {
-    /// A brick of the voxels at `index` (ascending), with a value, and a normal where there are any,
-    /// for each.
+    /// Returns a brick of the voxels at local indices `index` (ascending), with a value for each,
+    /// and a normal for each if there are any.
     ///
     /// # Panics
     /// If there are more or fewer values or normals than voxels.
@@ -168,33 +170,33 @@ impl Brick {
         Brick { id, index, values, normals, gradients: None, tight: [lo, hi], present }
     }
 
-    /// The same with a magnitude of the gradient for each voxel, or without.
+    /// Returns the brick with a gradient magnitude code for each voxel, or without any.
     ///
     /// # Panics
-    /// If there are more or fewer than voxels.
+    /// If there are more or fewer magnitudes than voxels.
     #[must_use]
     pub fn with_gradients(self, gradients: Option<Vec<u8>>) -> Self {
         assert!(gradients.as_ref().is_none_or(|g| g.len() == self.len()), "a gradient a voxel");
         Brick { gradients, ..self }
     }
 
-    /// Number of voxels.
+    /// Returns the number of relevant voxels.
     pub fn len(&self) -> usize {
         self.index.len()
     }
 
-    /// Whether there is none (never so in a brick set).
+    /// Returns whether there is no voxel (never so in a brick set).
     pub fn is_empty(&self) -> bool {
         self.index.is_empty()
     }
 
-    /// Which of its 512 voxels there are: a bit each, by local index.
+    /// Returns which of the 512 voxels are relevant: a bit each, by local index.
     #[inline]
     pub fn occupancy(&self) -> &[u64; BRICK_VOXELS / 64] {
         &self.present
     }
 
-    /// The tight box, in index coordinates of the volume.
+    /// Returns the box of the relevant voxels, in index coordinates of the volume.
     #[inline]
     pub fn tight_box(&self, grid: &BrickGrid) -> TightBox {
         let corner = grid.corner(self.id);
@@ -202,7 +204,7 @@ impl Brick {
         TightBox { lo: at(0), hi: at(1) }
     }
 
-    /// Bytes it takes in memory, its own overhead included.
+    /// Returns the bytes that the brick takes in memory, its own overhead included.
     pub fn memory_bytes(&self) -> usize {
         let n = self.len();
         std::mem::size_of::<Brick>()
@@ -212,7 +214,7 @@ impl Brick {
                 + usize::from(self.gradients.is_some()))
     }
 
-    /// Bytes that [`Brick::encode`] makes.
+    /// Returns the bytes that [`Brick::encode`] appends.
     pub fn encoded_len(&self) -> usize {
         encoded_len(
             self.len(),
@@ -222,9 +224,9 @@ impl Brick {
         )
     }
 
-    /// Appends the encoding: id (u32), voxels (u16), flags (u8: bits 0-1 value type, bit 2
-    /// normals, bit 3 gradients), which voxels (nothing when all 512; a 64-byte mask from 32 voxels on; else u16
-    /// each), values, normals, gradients, CRC-32C over all before it. Little endian.
+    /// Appends the encoding, little endian: id (u32), voxels (u16), flags (u8: bits 0-1 value type,
+    /// bit 2 normals, bit 3 gradients), occupancy (nothing for 512 voxels; a 64-byte mask from 32
+    /// on; else u16 each), values, normals, gradients, CRC-32C over all before it.
     pub fn encode(&self, out: &mut Vec<u8>) {
         let start = out.len();
         let n = self.len();
@@ -263,8 +265,8 @@ impl Brick {
         out.extend(crc.to_le_bytes());
     }
 
-    /// The name of a brick whose encoding is broken, to ask for it again; `None` where there is none. If a
-    /// single bit of the name is what is wrong, the checksum tells which one.
+    /// Returns the id of a brick whose encoding is broken, to request it again; `None` if too
+    /// short. If a single bit of the id is wrong, the checksum tells which one.
     pub fn peek_id(bytes: &[u8]) -> Option<BrickId> {
         let (body, crc) = bytes.split_at_checked(bytes.len().checked_sub(TAIL)?)?;
         let id = u32::from_le_bytes(*bytes.first_chunk()?);
@@ -277,7 +279,10 @@ impl Brick {
         Some(BrickId(near.into_iter().find(fits).unwrap_or(id)))
     }
 
-    /// The brick that [`Brick::encode`] wrote as exactly these bytes.
+    /// Returns the brick that [`Brick::encode`] wrote as exactly these bytes.
+    ///
+    /// # Errors
+    /// If the length, the checksum or a field does not fit.
     pub fn decode(bytes: &[u8]) -> Result<Brick, BrickError> {
         let have = bytes.len();
         if have < HEAD + TAIL {
@@ -345,7 +350,7 @@ impl Brick {
     }
 }
 
-/// Position inside its brick of local index `i`.
+/// Returns the position inside its brick, 0 to 7 along each axis, of local index `i`.
 #[inline]
 pub fn local_position(i: u16) -> [u32; 3] {
     let i = u32::from(i);
@@ -356,7 +361,7 @@ fn u16s(bytes: &[u8]) -> Vec<u16> {
     bytes.chunks_exact(2).map(|c| u16::from_le_bytes([c[0], c[1]])).collect()
 }
 
-/// Bytes of the encoding of a brick of `n` voxels.
+/// Returns the bytes of the encoding of a brick of `n` voxels.
 pub fn encoded_len(n: usize, kind: SampleKind, normals: bool, gradients: bool) -> usize {
     let which = if n < MASK_FROM {
         2 * n

@@ -1,13 +1,14 @@
-//! Magnitudes of gradients in 8 bits: what modulates opacity by borders.
+//! Gradient magnitudes in 8 bits, which modulate opacity at borders.
 //!
 //! A magnitude is the change of value over one vox, as a share of the volume's range. Central
 //! differences across a border between the smallest and the largest value give 0.5, and three axes
-//! at most 0.87. Borders of tissues lie at 0.01 to 0.1, so codes are spaced evenly in its root: steps of
-//! 0.0015 at 0.01 and of 0.004 at 0.06, where even ones have 0.004 everywhere.
+//! at most 0.87. Borders of tissues lie at 0.01 to 0.1, so codes are spaced evenly in the square
+//! root: steps of 0.0015 at 0.01 and of 0.004 at 0.06, where even spacing has 0.004 everywhere.
 
 use crate::volume::ValueSummary;
 
-/// The code of a gradient of `codes` per vox, in a volume with these values. Not a number is none.
+/// Returns the code of a gradient magnitude, given in sample codes per vox, in a volume with values
+/// `summary`. NaN gives 0.
 #[inline]
 pub fn encode_magnitude(codes_per_vox: f64, summary: &ValueSummary) -> u8 {
     let span = summary.max_code - summary.min_code;
@@ -17,7 +18,7 @@ pub fn encode_magnitude(codes_per_vox: f64, summary: &ValueSummary) -> u8 {
     ((codes_per_vox / span).min(1.0).sqrt() * 255.0 + 0.5) as u8
 }
 
-/// The magnitude of a code, as a share of the range per vox.
+/// Returns the magnitude of a code as a share of the value range per vox, 0 to 1.
 #[inline]
 pub fn decode_magnitude(code: u8) -> f64 {
     let root = f64::from(code) / 255.0;

@@ -1,4 +1,4 @@
-//! Names of things, as types: a task can't be passed for a brick.
+//! Identifiers as types: a task can't be passed for a brick.
 
 use serde::{Deserialize, Serialize};
 

@@ -6,18 +6,19 @@
 //! on lanes. Formulas: Cody-Waite reduction and the Taylor series of degree 7 on
 //! `|r| <= ln 2 / 2`, whose remainder (5e-9) is below half an ulp of f32.
 
-/// 1.5 * 2^23: floats from there on are integers.
+/// 1.5 * 2^23: adding it to an f32 below 2^22 rounds to the nearest integer, ties to even, and
+/// leaves that integer in the low bits.
 pub const ROUND_F32: f32 = 12_582_912.0;
-/// ln 2 in two parts; the first has 15 trailing zero bits, so that its products with small integers are
-/// exact.
+/// ln 2 in two parts. The first has 15 trailing zero bits, so its products with small integers are
+/// exact (Cody and Waite).
 pub const LN2: [f32; 2] = [0.693_359_4, -2.121_944_4e-4];
-/// (exp(x) - 1) / x, highest power first.
+/// Coefficients of (exp(x) - 1) / x, highest power first.
 pub const TAYLOR: [f32; 7] =
     [1.0 / 5040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0];
-/// The series of [`phi`] over the square of the depth, highest power first.
+/// Coefficients of the series of [`phi`] over the square of the depth, highest power first.
 pub const PHI: [f32; 5] = [-1.0 / 2016.0, 1.0 / 360.0, -1.0 / 80.0, 1.0 / 24.0, -1.0 / 12.0];
 
-/// A polynomial by Horner's rule, highest power first.
+/// Evaluates a polynomial by Horner's rule, highest power first.
 #[inline(always)]
 fn polynomial<const N: usize>(coefficients: &[f32; N], x: f32) -> f32 {
     let mut p = coefficients[0];
@@ -27,8 +28,9 @@ fn polynomial<const N: usize>(coefficients: &[f32; N], x: f32) -> f32 {
     p
 }
 
-/// `exp(x)` as `s * (1 + q)` with a power of two s and `q` small, for `x <= 0`, clamped below at -87
-/// (where f32 results would be denormal). For `x` near 0, s is 1 and q keeps all its digits.
+/// Returns `exp(x)` as `s * (1 + q)` with a power of two s and a small q, for `x <= 0`, clamped
+/// below at -87 (where f32 results would be denormal). For `x` near 0, s is 1 and q keeps all its
+/// digits.
 #[inline(always)]
 fn exp_parts(x: f32) -> (f32, f32) {
     let x = if x > -87.0 { x } else { -87.0 };
@@ -42,15 +44,15 @@ fn exp_parts(x: f32) -> (f32, f32) {
     (f32::from_bits(((exponent + 127) as u32) << 23), p * r)
 }
 
-/// `exp(x)` for `x <= 0`, clamped below at -87. Relative error at most 2 ulp.
+/// Returns `exp(x)` for `x <= 0`, clamped below at -87. Relative error at most 2 ulp.
 #[inline(always)]
 pub fn exp_neg(x: f32) -> f32 {
     let (s, q) = exp_parts(x);
     (q + 1.0) * s
 }
 
-/// Opacity of a sheet: `a = 1 - exp(-tau)`, with full relative accuracy down to the smallest
-/// `tau` (NUMERICS.md section 2). `tau >= 0`.
+/// Returns the opacity of a sheet of optical depth `tau >= 0`: `1 - exp(-tau)`, with full relative
+/// accuracy down to the smallest `tau` (NUMERICS.md section 2).
 #[inline(always)]
 pub fn opacity(tau: f32) -> f32 {
     let (s, q) = exp_parts(-tau);
@@ -58,19 +60,20 @@ pub fn opacity(tau: f32) -> f32 {
     (1.0 - s) - s * q
 }
 
-/// Below this optical depth the series of [`phi`] takes over from its closed form.
+/// Optical depth below which the series of [`phi`] replaces its closed form.
 pub const PHI_SERIES_BELOW: f32 = 0.25;
 
-/// The weight of a colour's change through a sheet: `phi = a / tau + a / 2 - 1` (NUMERICS.md
-/// section 1.1). `a` must be `opacity(tau)` and `per_tau` 1 / tau to some digits; `tau > 0`.
+/// Returns the weight of a colour's change through a sheet: `phi = a / tau + a / 2 - 1`
+/// (NUMERICS.md section 1.1). `a` must be `opacity(tau)` and `per_tau` 1 / tau to some digits; `tau
+/// > 0`.
 #[inline(always)]
 pub fn phi(tau: f32, per_tau: f32, a: f32) -> f32 {
     let (small, large) = phi_both(tau, per_tau, a);
     if tau < PHI_SERIES_BELOW { small } else { large }
 }
 
-/// Both forms of [`phi`]: for depths below [`PHI_SERIES_BELOW`], and for others. Who needs them on lanes works
-/// out both and then chooses.
+/// Returns both forms of [`phi`]: the series for depths below [`PHI_SERIES_BELOW`], and the closed
+/// form for others. SIMD code computes both and then selects.
 #[inline(always)]
 pub fn phi_both(tau: f32, per_tau: f32, a: f32) -> (f32, f32) {
     // The closed form loses all digits below tau = 1e-3; the series takes over where both are
@@ -79,12 +82,12 @@ pub fn phi_both(tau: f32, per_tau: f32, a: f32) -> (f32, f32) {
     (small, a * per_tau + a * 0.5 - 1.0)
 }
 
-/// sRGB to linear light for one component in `[0, 1]` (IEC 61966-2-1).
+/// Converts one sRGB component in `[0, 1]` to linear light (IEC 61966-2-1).
 pub fn linear_from_srgb(s: f64) -> f64 {
     if s <= 0.04045 { s / 12.92 } else { libm::pow((s + 0.055) / 1.055, 2.4) }
 }
 
-/// Linear light to sRGB for one component in `[0, 1]`.
+/// Converts one component of linear light in `[0, 1]` to sRGB (IEC 61966-2-1).
 pub fn srgb_from_linear(l: f64) -> f64 {
     if l <= 0.003_130_8 { l * 12.92 } else { 1.055 * libm::pow(l, 1.0 / 2.4) - 0.055 }
 }

@@ -17,167 +17,175 @@ use crate::view::View;
 use crate::volume::VolumeInfo;
 use std::sync::Arc;
 
-/// What stays the same over a job.
+/// Everything that stays the same over a job's frames: volume, transfer function, quality, bricks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneSpec {
-    /// Its name.
+    /// Name of the scene on every link of the master.
     pub id: SceneId,
-    /// The volume without its samples.
+    /// The volume's lattice and value summary, without its samples.
     pub volume: VolumeInfo,
-    /// Transfer function.
+    /// Transfer function in full (never a preset's name).
     pub transfer: TransferFunction,
-    /// Quality; `sums` is decided (never `Auto`).
+    /// Quality; `sums` is decided (never [`Sums::Auto`](crate::quality::Sums::Auto)).
     pub quality: Quality,
-    /// Which bricks its tasks are drawn from.
+    /// Key of the brick set from which the scene is drawn.
     pub bricks: BrickSetKey,
 }
 
-/// One macrotile of one slab, lent to one worker.
+/// One macrotile of one slab, leased to one worker (paper section 4.3; `slab` schedule).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lease {
-    /// Which task.
+    /// The leased task.
     pub task: TaskId,
-    /// Which attempt at it.
+    /// Attempt at the task; a result counts only while its epoch is live.
     pub epoch: Epoch,
-    /// Of which frame; the worker was sent its view before.
+    /// Frame of the task. The worker received its view before.
     pub frame: FrameId,
-    /// The macrotile, inside the picture.
+    /// The macrotile, in pixels of the picture.
     pub tile: Rect,
-    /// The slab's sheets.
+    /// Sheets of the slab.
     pub slab: SheetRange,
-    /// The bricks it needs, ascending. The worker holds each of them already or has it on the
-    /// way; it starts when the last is there.
+    /// Bricks that the task needs, ascending. The worker holds each or has it under way; it starts
+    /// when the last has arrived.
     pub bricks: Vec<BrickId>,
-    /// The pixels as the slabs before left them.
+    /// Pixels of the tile as the slabs in front left them.
     pub state: TileState,
 }
 
-/// One tile through all sheets of its frame, lent to one worker. The worker asks for the bricks that it turns out
-/// to need.
+/// One tile through all sheets of its frame, leased to one worker (`region` schedule). The worker
+/// requests the bricks that it turns out to need.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RegionLease {
-    /// Which task.
+    /// The leased task.
     pub task: TaskId,
-    /// Which attempt at it.
+    /// Attempt at the task; a result counts only while its epoch is live.
     pub epoch: Epoch,
-    /// Of which frame; the worker was sent its view and the directory of its bricks before.
+    /// Frame of the task. The worker received its view and the directory of its bricks before.
     pub frame: FrameId,
-    /// The tile, inside the picture.
+    /// The tile, in pixels of the picture.
     pub tile: Rect,
-    /// Some of its pixels are drawn in thinner sheets, too.
+    /// Whether some pixels are also drawn in thinner sheets, to estimate the error of the
+    /// thickness.
     pub estimate: bool,
-    /// What another worker has drawn of it; `None`: it starts from nothing.
+    /// What another worker has drawn of the tile; `None` if the region starts from nothing.
     pub begun: Option<Arc<Checkpoint>>,
 }
 
-/// A region as somebody left it who gave it away.
+/// Progress of a partly drawn region, from which another worker resumes it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Checkpoint {
-    /// The next sheet to draw of each of its parts ([`crate::region::parts`]), in their order; `None`: it is at its end.
+    /// Next sheet to draw, for each of the tile's parts in the order of [`parts`]; `None` for a
+    /// part that is done.
     pub sheets: Vec<Option<i32>>,
-    /// Its pixels after the sheets before these.
+    /// Pixels of the tile after all sheets in front of those.
     pub pixels: TilePixels,
 }
 
 impl Checkpoint {
-    /// The same of a piece of its `tile`.
+    /// Returns the checkpoint of `piece`, a rectangle inside the checkpoint's `tile`.
     ///
     /// # Panics
     /// If the piece is not inside the tile.
     pub fn crop(&self, tile: Rect, piece: Rect) -> Checkpoint {
-        let of = |part: Rect| {
+        let next_sheet = |part: Rect| {
             let mut all = parts(tile).zip(&self.sheets);
-            all.find(|(whole, _)| !whole.intersect(&part).is_empty()).and_then(|(_, at)| *at)
+            all.find(|(whole, _)| !whole.intersect(&part).is_empty()).and_then(|(_, sheet)| *sheet)
         };
-        Checkpoint { sheets: parts(piece).map(of).collect(), pixels: self.pixels.crop(tile, piece) }
+        Checkpoint {
+            sheets: parts(piece).map(next_sheet).collect(),
+            pixels: self.pixels.crop(tile, piece),
+        }
     }
 }
 
-/// What a worker gives away of a region that it draws.
+/// A region split by work stealing: its worker keeps one piece and gives the other away.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RegionSplit {
-    /// Its lease: which task.
+    /// The task whose lease was split.
     pub task: TaskId,
-    /// And which attempt at it.
+    /// Attempt at the task.
     pub epoch: Epoch,
-    /// What it keeps of its tile: its result will have these pixels and no others.
+    /// Piece of the tile that the worker keeps, in pixels of the picture. Its result has exactly
+    /// these pixels.
     pub kept: Rect,
-    /// What it gives away: the rest.
+    /// Piece that the worker gives away: the rest of the tile.
     pub given: Rect,
-    /// How that stands.
+    /// Progress of the given piece.
     pub begun: Checkpoint,
 }
 
-/// Sets whose directories a worker keeps: as many as a master keeps brick sets, and one for a job that
-/// is just ending. Master and worker count alike, by what was sent, so that neither has to say.
+/// Directories that a worker keeps: as many as a master keeps brick sets, and one for a job that is
+/// just ending. Master and worker both count the directories sent, so neither announces what it
+/// dropped.
 pub const DIRECTORIES_KEPT: usize = 4;
 
-/// From master to worker.
+/// A message from master to worker.
 #[derive(Clone, Debug, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "a view is 400 bytes once a frame and worker")]
 pub enum ToWorker {
-    /// The hello was good. Always the first message of a link that is let in.
+    /// The hello was accepted. First message on every admitted link.
     Welcome {
-        /// The worker's name from now on.
+        /// Name of the worker from now on.
         worker: WorkerId,
-        /// How often the master pings; silence for three times as long means it is gone.
+        /// Interval of the master's pings. Silence for three intervals means that the master is
+        /// gone.
         heartbeat_ms: u32,
-        /// Version of the protocol that both speak on this link.
+        /// Protocol version that both sides speak on this link.
         protocol_version: u32,
     },
-    /// The hello was not good; the link ends. Says why and what to do.
+    /// The hello was refused; the link ends.
     Refused {
-        /// For people.
+        /// Why, and what to do, for people.
         reason: String,
     },
-    /// A scene, before its first frame. May come twice with the same content.
+    /// A scene, sent before its first frame. May come twice with the same content.
     Scene(Arc<SceneSpec>),
-    /// A frame's view, before its first lease.
+    /// A frame's view, sent before the frame's first lease.
     Frame {
         /// The frame.
         frame: FrameId,
-        /// Its scene, sent before.
+        /// The frame's scene, sent before.
         scene: SceneId,
-        /// Its view.
+        /// The frame's camera, ready for the scene's volume.
         view: View,
-        /// What its regions are finished to; `None`: their results are sums. Those of leases are sums
-        /// always.
+        /// Encoding of region results; `None` if they are raw sums. Results of slab leases are
+        /// always sums.
         finish: Option<PixelEncoding>,
-        /// Whether finished pixels go as they are: packing them takes longer than it saves.
+        /// Whether finished pixels travel uncompressed, because packing would take longer than it
+        /// saves.
         plain: bool,
     },
-    /// Bricks that there are of a set, some of them or all: from the `first`, ascending by id. The
-    /// parts of a directory come in order, and before the first region of the set. Those of the
-    /// [`DIRECTORIES_KEPT`] sets that came last are kept.
+    /// Part of a set's directory: bricks that exist, ascending by id. Parts come in order, before
+    /// the set's first region. A worker keeps the [`DIRECTORIES_KEPT`] directories that came last.
     Directory {
-        /// Of which set.
+        /// The set.
         set: BrickSetKey,
-        /// How its volume is cut into bricks.
+        /// How the set's volume is cut into bricks.
         grid: BrickGrid,
-        /// How many came before.
+        /// Bricks of the directory in earlier parts.
         first: u32,
-        /// How many there are in all.
+        /// Bricks of the whole directory.
         total: u32,
-        /// These.
+        /// Bricks of this part.
         bricks: Arc<[BrickInfo]>,
     },
-    /// Work.
+    /// A task of the `slab` schedule.
     Lease(Box<Lease>),
-    /// Work through all depths.
+    /// A task of the `region` schedule.
     Region(RegionLease),
-    /// Others have time: some of what is left of a region is to be given away ([`ToMaster::RegionSplit`]). Who has
-    /// drawn it already, or can't cut it, does nothing.
+    /// Asks for part of a running region, for an idle worker. The worker answers with
+    /// [`ToMaster::RegionSplit`], or not at all if the region is done or can't be cut.
     SplitRegion {
-        /// Of which frame.
+        /// Frame of the region.
         frame: FrameId,
-        /// The lease: which task.
+        /// The leased task.
         task: TaskId,
-        /// And which attempt at it.
+        /// Attempt at the task.
         epoch: Epoch,
-        /// How much of what is left, in thousandths.
+        /// Share of the remaining work to give away, in thousandths.
         share: u32,
     },
-    /// A frame is over (finished or cancelled): leases of it that have not begun are dropped.
+    /// A frame is finished or cancelled: the worker drops its leases that have not begun.
     EndFrame {
         /// The frame.
         frame: FrameId,
@@ -187,16 +195,16 @@ pub enum ToWorker {
         /// The scene.
         scene: SceneId,
     },
-    /// Bricks to forget, so that the memory budget holds. No lease in flight needs them.
+    /// Evicts bricks to keep the memory budget. No lease in flight needs them.
     DropBricks {
-        /// Of which set.
+        /// The set.
         set: BrickSetKey,
-        /// Which.
+        /// Bricks to evict.
         bricks: Vec<BrickId>,
     },
-    /// Are you there? Answered by `Pong` with the same nonce.
+    /// A heartbeat. The worker answers with [`ToMaster::Pong`] and the same nonce.
     Ping {
-        /// Master's choice.
+        /// Number chosen by the master.
         nonce: u64,
     },
     /// The master ends. The worker drops its tasks and the link, and dials again after a wait.
@@ -206,39 +214,40 @@ pub enum ToWorker {
     },
 }
 
-/// Who a worker is.
+/// A worker's introduction, the first message on a link.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Hello {
-    /// Versions of the protocol that the worker speaks.
+    /// Protocol versions that the worker speaks.
     pub protocol_versions: ProtocolVersions,
-    /// The worker's `PIXELS_VERSION`.
+    /// The worker's [`PIXELS_VERSION`](crate::PIXELS_VERSION).
     pub pixels_version: u32,
-    /// A name for people (host and process).
+    /// Name for people (host and process).
     pub name: String,
-    /// Render threads.
+    /// Number of render threads.
     pub threads: u32,
-    /// Bytes of bricks it may hold.
+    /// Bytes of bricks that the worker may hold.
     pub memory_budget_bytes: u64,
-    /// Instruction set of its splat loops, for people.
+    /// Instruction set of the worker's kernels, for people.
     pub simd: String,
-    /// Hash of the self-test tile, in hexadecimal.
+    /// SHA-256 of the self-test tile, in hexadecimal.
     pub self_test_sha256: String,
-    /// Bricks it still holds from before.
+    /// Bricks that the worker still holds from an earlier link, by set.
     pub held: Vec<(BrickSetKey, Vec<BrickId>)>,
-    /// It holds tiles for a recorded time instead of drawing them.
+    /// Whether the worker only waits for recorded times instead of drawing.
     pub rehearses: bool,
-    /// Which machine it runs on; empty if unknown.
+    /// Identity of the worker's machine; empty if unknown.
     pub machine: String,
 }
 
-/// What became of a task's voxels (see `stats::VoxelStats`).
+/// Numbers of voxels by what a task did with them ([`VoxelStats`](crate::stats::VoxelStats) has
+/// definitions).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
-    /// Put into a bucket.
+    /// Voxels put into a sheet's bucket.
     pub tossed: u64,
-    /// Drawn.
+    /// Voxels drawn.
     pub splatted: u64,
-    /// Hidden, with their brick or alone.
+    /// Voxels dropped as hidden, with their brick or alone.
     pub culled: u64,
 }
 
@@ -250,63 +259,65 @@ impl std::ops::AddAssign for Counters {
     }
 }
 
-/// When a task was handled, on the worker's own clock (microseconds).
+/// Times of a task in microseconds on the worker's own clock.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct TaskTimes {
-    /// The lease came.
+    /// Arrival of the lease.
     pub received_us: u64,
-    /// Its last brick was there.
+    /// Arrival of the last brick that the task needed.
     pub ready_us: u64,
-    /// A render thread began.
+    /// Start of rendering.
     pub start_us: u64,
-    /// It ended.
+    /// End of rendering.
     pub end_us: u64,
-    /// Which render thread.
+    /// Number of the render thread.
     pub thread: u32,
 }
 
-/// What a region took beside its drawing.
+/// What a region cost beside drawing: bricks, stalls, idle threads.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RegionCost {
-    /// The bricks that it drew from: places in the directory, ascending.
+    /// Bricks that the region was drawn from, as places in the directory, ascending.
     pub touched: Vec<u32>,
-    /// How often it stood still for want of bricks.
+    /// How often the region stalled for lack of bricks.
     pub stalls: u32,
-    /// For how long (microseconds). Others may have been drawn meanwhile.
+    /// Total time in microseconds that the region was stalled. Its thread may have drawn other
+    /// regions meanwhile.
     pub parked_us: u64,
-    /// For how long render threads had nothing to do since the last result of the link, while some
+    /// Time in microseconds, summed over render threads, without anything to draw while some region
+    /// was stalled; since the link's previous result.
     pub idle_us: u64,
-    /// How far some of its pixels are off, where that was asked for.
+    /// Errors of sampled pixels; zero unless the lease asked for an estimate.
     pub sampled: ErrorsBySource,
 }
 
-/// How far pixels that were looked at are off, by source.
+/// Errors of sampled pixels by source.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ErrorsBySource {
-    /// What sheets of half the thickness change.
+    /// Change under sheets of half the thickness.
     pub thickness: SampledError,
-    /// What rounding of positions changes.
+    /// Change under exact instead of rounded positions.
     pub positions: SampledError,
-    /// What the kernel's cut changes.
+    /// Change under an untruncated kernel.
     pub truncation: SampledError,
-    /// What the kernel's ripple changes.
+    /// Change under a kernel without ripple.
     pub ripple: SampledError,
 }
 
 impl ErrorsBySource {
-    /// Each, in order.
+    /// Returns the sources in the order of the fields.
     pub fn to_array(self) -> [SampledError; 4] {
         [self.thickness, self.positions, self.truncation, self.ripple]
     }
 
-    /// From each, in order.
+    /// Builds from the sources in the order of the fields.
     pub fn from_array(
         [thickness, positions, truncation, ripple]: [SampledError; 4],
     ) -> ErrorsBySource {
         ErrorsBySource { thickness, positions, truncation, ripple }
     }
 
-    /// Adds others'.
+    /// Adds another tile's samples.
     pub fn add(&mut self, other: ErrorsBySource) {
         self.thickness.add(other.thickness);
         self.positions.add(other.positions);
@@ -315,50 +326,54 @@ impl ErrorsBySource {
     }
 }
 
-/// How far pixels are off. Integers, since their sum has no order.
+/// Sum of squared errors over sampled pixels. Integers, so that the order of summing doesn't
+/// matter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SampledError {
-    /// Pixels that are not blank in both.
+    /// Sampled pixels that are not blank in both pictures.
     pub pixels: u32,
-    /// Sum of the squares of their differences, over all four channels, in units of 2^-48.
+    /// Sum of squared differences over all four channels (linear premultiplied RGBA), in units of
+    /// 2^-48.
     pub squares: u64,
 }
 
 impl SampledError {
     const UNIT: f64 = (1u64 << 48) as f64;
 
-    /// Counts a pixel, unless it is blank in both; squares of at most 4.
-    pub fn put(&mut self, there: bool, squares: f64) {
-        if there {
+    /// Adds a pixel unless it is blank in both pictures (`visible` is false). `squares` is the sum
+    /// of squared differences over the four channels, clamped to 0..=4.
+    pub fn add_pixel(&mut self, visible: bool, squares: f64) {
+        if visible {
             self.pixels += 1;
             self.squares += (squares.clamp(0.0, 4.0) * SampledError::UNIT) as u64;
         }
     }
 
-    /// Adds others'.
+    /// Adds another tile's samples, saturating.
     pub fn add(&mut self, other: SampledError) {
         self.pixels = self.pixels.saturating_add(other.pixels);
         self.squares = self.squares.saturating_add(other.squares);
     }
 
-    /// Root of the mean square over pixels and channels, in 1/255; `None` of no pixel.
+    /// Returns the root of the mean square over pixels and channels in 1/255, or `None` without a
+    /// pixel.
     pub fn rmse(&self) -> Option<f64> {
         let n = 4.0 * f64::from(self.pixels);
         (self.pixels > 0).then(|| (self.squares as f64 / SampledError::UNIT / n).sqrt() * 255.0)
     }
 }
 
-/// What a task gave.
+/// Pixels of a finished task.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Pixels {
-    /// What it adds to the picture, which the master finishes.
+    /// Opacity and fixed-point colour, which the master encodes.
     Sums(TilePixels),
-    /// A piece of the picture as it leaves the master.
+    /// Encoded pixels, as they leave the master.
     Finished(SparseTile),
 }
 
 impl Pixels {
-    /// How many there are.
+    /// Returns the number of pixels of the tile.
     pub fn len(&self) -> usize {
         match self {
             Pixels::Sums(sums) => sums.a.len(),
@@ -366,49 +381,49 @@ impl Pixels {
         }
     }
 
-    /// Whether there are none.
+    /// Returns whether the tile has no pixel.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 }
 
-/// A rendered task.
+/// Result of a rendered task.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TileResult {
-    /// Which task.
+    /// The task.
     pub task: TaskId,
-    /// Which attempt.
+    /// Attempt at the task.
     pub epoch: Epoch,
-    /// Its pixels.
+    /// The tile's pixels.
     pub pixels: Pixels,
-    /// Bytes of the message that it came in; `None` of one that crossed no network.
+    /// Size of the message in bytes; `None` if it crossed no network.
     pub bytes: Option<u32>,
-    /// Its voxels.
+    /// Voxel counts.
     pub counters: Counters,
-    /// Its times. Of a region, from `start_us` to `end_us` is drawing alone.
+    /// Times. For a region, `start_us` to `end_us` is drawing alone, without stalls.
     pub times: TaskTimes,
-    /// Of a region.
+    /// Bricks and stalls of a region; `None` for a slab task.
     pub region: Option<RegionCost>,
 }
 
-/// From worker to master.
+/// A message from worker to master.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ToMaster {
-    /// The first message of a link.
+    /// First message on a link.
     Hello(Hello),
     /// A task is done.
     Result(Box<TileResult>),
-    /// A task can't be done (a brick that fails its checksum twice, a lease that makes no
-    /// sense). The worker stays.
+    /// A task can't be done (a brick failed its checksum twice, or the lease makes no sense). The
+    /// worker stays.
     Failed {
-        /// Which task.
+        /// The task.
         task: TaskId,
-        /// Which attempt.
+        /// Attempt at the task.
         epoch: Epoch,
-        /// For people.
+        /// Why, for people.
         reason: String,
     },
-    /// A part of a region is given away, as the master asked for.
+    /// Part of a region is given away, as the master asked.
     RegionSplit(Box<RegionSplit>),
     /// Bricks arrived whole, and are held now.
     BricksReceived {
@@ -417,19 +432,19 @@ pub enum ToMaster {
         /// Number of bricks since the last such message for this set.
         bricks: u32,
     },
-    /// A brick failed its checksum; send it again.
+    /// Bricks failed their checksum; the master sends them again.
     BricksBroken {
-        /// Of which set.
+        /// The set.
         set: BrickSetKey,
-        /// Which.
+        /// Bricks that failed.
         bricks: Vec<BrickId>,
     },
-    /// Regions lack bricks; send them, in this order. None is asked for twice on a link unless it was
-    /// forgotten or broken meanwhile.
+    /// Requests bricks that regions lack, in this order. A worker requests a brick once a link,
+    /// unless it was evicted or broken meanwhile.
     BricksWanted {
-        /// Of which set.
+        /// The set.
         set: BrickSetKey,
-        /// Which.
+        /// Requested bricks.
         bricks: Vec<BrickId>,
     },
     /// Bricks were evicted to make room for others.
@@ -439,11 +454,11 @@ pub enum ToMaster {
         /// Their ids.
         bricks: Vec<BrickId>,
     },
-    /// Answer to `Ping`.
+    /// Answer to [`ToWorker::Ping`].
     Pong {
-        /// The ping's.
+        /// Nonce of the ping.
         nonce: u64,
-        /// The worker's clock.
+        /// The worker's clock in microseconds.
         clock_us: u64,
     },
     /// The worker ends: it finishes the tasks it has begun, takes no more and closes the link.
@@ -453,13 +468,13 @@ pub enum ToMaster {
     },
 }
 
-/// Some bricks of a set, as they go to one worker.
+/// Bricks of one set on their way to one worker.
 #[derive(Clone, Debug)]
 pub struct BrickBatch {
-    /// Of which set.
+    /// The set.
     pub set: BrickSetKey,
-    /// The bricks.
+    /// Bricks that arrived whole.
     pub bricks: Vec<Arc<Brick>>,
-    /// Bricks whose bytes were not whole.
+    /// Bricks that failed their checksum.
     pub broken: Vec<BrickId>,
 }

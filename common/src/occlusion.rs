@@ -5,7 +5,7 @@
 //! the table counts shut pixels in integers: a rectangle is shut when the count equals its area,
 //! exactly, in four reads.
 
-/// A rectangle of pixels, half-open, in absolute image coordinates.
+/// A half-open rectangle of pixels, in absolute image coordinates.
 #[derive(
     Clone, Copy, Debug, Default, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize,
 )]
@@ -21,42 +21,42 @@ pub struct Rect {
 }
 
 impl Rect {
-    /// `[x0, x1) x [y0, y1)`.
+    /// Returns `[x0, x1) x [y0, y1)`.
     pub fn new(x0: i32, y0: i32, x1: i32, y1: i32) -> Self {
         Rect { x0, y0, x1, y1 }
     }
 
-    /// A picture's rectangle.
+    /// Returns the rectangle of a whole picture of `size` (width, height) pixels.
     pub fn from_size(size: [u32; 2]) -> Self {
         Rect::new(0, 0, size[0] as i32, size[1] as i32)
     }
 
-    /// Columns; 0 when empty.
+    /// Returns the number of columns; 0 if empty.
     pub fn width(&self) -> usize {
         (self.x1 - self.x0).max(0) as usize
     }
 
-    /// Rows; 0 when empty.
+    /// Returns the number of rows; 0 if empty.
     pub fn height(&self) -> usize {
         (self.y1 - self.y0).max(0) as usize
     }
 
-    /// Pixels.
+    /// Returns the number of pixels.
     pub fn area(&self) -> usize {
         self.width() * self.height()
     }
 
-    /// Whether no pixel is in it.
+    /// Returns whether the rectangle holds no pixel.
     pub fn is_empty(&self) -> bool {
         self.x1 <= self.x0 || self.y1 <= self.y0
     }
 
-    /// What both share (may be empty).
+    /// Returns the pixels that both share (may be empty).
     pub fn intersect(&self, o: &Rect) -> Rect {
         Rect::new(self.x0.max(o.x0), self.y0.max(o.y0), self.x1.min(o.x1), self.y1.min(o.y1))
     }
 
-    /// The smallest rectangle that holds both (an empty one counts as nothing).
+    /// Returns the smallest rectangle that holds both; an empty one counts as nothing.
     pub fn union(&self, o: &Rect) -> Rect {
         if self.is_empty() {
             *o
@@ -68,7 +68,8 @@ impl Rect {
     }
 }
 
-/// Shut pixels of a rectangle of the image, with the summed-area count over them.
+/// Shut pixels of a rectangle of the image, with a summed-area table over their count (paper
+/// section 4.2).
 #[derive(Clone, Debug)]
 pub struct ShutMap {
     rect: Rect,
@@ -79,13 +80,13 @@ pub struct ShutMap {
 }
 
 impl ShutMap {
-    /// A map of `rect` with every pixel open.
+    /// Returns a map of `rect` with every pixel open.
     pub fn open(rect: Rect) -> Self {
         let (w, h) = (rect.width(), rect.height());
         ShutMap { rect, count: vec![0; (w + 1) * (h + 1)], shut: vec![false; w * h], stale: false }
     }
 
-    /// The rectangle it covers.
+    /// Returns the rectangle that the map covers.
     pub fn rect(&self) -> Rect {
         self.rect
     }
@@ -101,21 +102,21 @@ impl ShutMap {
         self.stale = false;
     }
 
-    /// Shuts the pixel with index `i` (row-major in the map's rectangle). Counts are made anew
-    /// by [`ShutMap::refresh`].
+    /// Shuts pixel `i` (row-major in the map's rectangle). Counts are stale until
+    /// [`ShutMap::refresh`].
     #[inline]
     pub fn shut(&mut self, i: usize) {
         self.shut[i] = true;
         self.stale = true;
     }
 
-    /// Whether the pixel with index `i` is shut.
+    /// Returns whether pixel `i` (row-major in the map's rectangle) is shut.
     #[inline]
     pub fn is_shut(&self, i: usize) -> bool {
         self.shut[i]
     }
 
-    /// Makes the counts true again after pixels were shut.
+    /// Recounts after pixels were shut.
     pub fn refresh(&mut self) {
         if !self.stale {
             return;
@@ -133,7 +134,8 @@ impl ShutMap {
         }
     }
 
-    /// Number of shut pixels in the part of `r` that the map covers, as of the last refresh.
+    /// Returns the number of shut pixels in the part of `r` that the map covers, as of the last
+    /// refresh.
     #[inline]
     pub fn shut_in(&self, r: &Rect) -> u32 {
         debug_assert!(!self.stale, "the counts are asked for before a refresh");
@@ -148,14 +150,15 @@ impl ShutMap {
         at(r.x1, r.y1) + at(r.x0, r.y0) - at(r.x1, r.y0) - at(r.x0, r.y1)
     }
 
-    /// Whether every pixel of `r` that the map covers is shut (true when it covers none).
+    /// Returns whether every pixel of `r` that the map covers is shut; true if it covers none.
     #[inline]
     pub fn all_shut(&self, r: &Rect) -> bool {
         let r = r.intersect(&self.rect);
         self.shut_in(&r) as usize == r.area()
     }
 
-    /// Number of open pixels in the part of `r` that the map covers.
+    /// Returns the number of open pixels in the part of `r` that the map covers, as of the last
+    /// refresh.
     pub fn open_in(&self, r: &Rect) -> u32 {
         let r = r.intersect(&self.rect);
         r.area() as u32 - self.shut_in(&r)
@@ -169,7 +172,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn counts_equal_counting(
+        fn summed_area_counts_equal_plain_counting(
             w in 1i32..40, h in 1i32..40, x0 in -9i32..9, y0 in -9i32..9,
             bits in prop::collection::vec(any::<bool>(), 1600),
             q in (-20i32..60, -20i32..60, 0i32..50, 0i32..50),

@@ -1,5 +1,5 @@
-//! What a client may ask of a picture (quality: part of the pixels) and of the work behind it
-//! (work: never changes a byte). Names are those of CONTRACTS.md, in flags, JSON and proto.
+//! What a client asks of a picture ([`Quality`]) and of the work behind it ([`Work`], which never
+//! changes a byte). Names are those of CONTRACTS.md, in flags, JSON and the wire.
 
 use crate::spelling::nearest;
 use serde::{Deserialize, Serialize};
@@ -30,53 +30,57 @@ pub enum Compositing {
     Paper,
 }
 
-/// How a voxel's section reaches the sheet.
+/// How a voxel's section reaches its sheet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Splat {
-    /// The footprint itself.
+    /// Its footprint is added directly.
     Direct,
-    /// A small spline deposit, filtered when the sheet closes.
+    /// A small spline is deposited and filtered when the sheet closes. Refused by this version.
     Deposit,
 }
 
-/// What the sheets add in.
+/// Number type in which sheets add.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Sums {
-    /// The master decides from transfer function and quality (`Classifier::choose_sums`).
+    /// The master decides from transfer function and quality
+    /// ([`Classifier::choose_sums`](crate::transfer::Classifier::choose_sums)).
     Auto,
     /// 16-bit fixed point.
     I16,
     /// 32-bit fixed point.
     I32,
-    /// 32-bit floating point, voxels in ascending order.
+    /// 32-bit floating point; voxels are added in ascending order.
     F32,
 }
 
-/// The quality of a picture. Every field changes pixels.
+/// Quality of a picture. All fields but `cull` and `grey` change pixels; those two change only the
+/// time that a picture takes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Quality {
-    /// Sheet thickness in vox.
+    /// Thickness of a sheet in vox (the smallest spacing); 1/64 to 65536.
     pub thickness: f64,
-    /// A pixel whose transmittance `1 - A` is below it is shut; 0 shuts nothing.
+    /// Termination threshold: a pixel whose transmittance `1 - A` is below it is shut. 0 shuts
+    /// nothing; at most 0.5.
     pub eps: f64,
     /// Reconstruction kernel.
     pub kernel: Kernel,
-    /// Standard deviation of the Gaussian, in lattice steps; other kernels have their own.
+    /// Standard deviation of the Gaussian in lattice steps, 0.4 to 1; other kernels have one width.
     pub std: f64,
-    /// Support radius of the Gaussian, in lattice steps; other kernels have their own.
+    /// Support radius of the Gaussian in lattice steps, 1 to 3; other kernels have one radius.
     pub radius: f64,
     /// Compositing rule.
     pub compositing: Compositing,
-    /// Splat.
+    /// How sections reach their sheet.
     pub splat: Splat,
-    /// Sums; `Auto` until the master has decided.
+    /// Number type of the sums; `Auto` until the master has decided.
     pub sums: Sums,
-    /// Whether bricks and voxels are tested against the occlusion map. Never changes a byte.
+    /// Whether bricks and voxels are tested against the occlusion map. Never changes a byte: pixels
+    /// are shut either way.
     pub cull: bool,
-    /// Whether grey scenes are drawn in two channels where that can be. Never changes a byte.
+    /// Whether grey scenes are drawn in two channels where possible. Never changes a byte.
     #[serde(skip_serializing_if = "is_true")]
     pub grey: bool,
 }
@@ -103,25 +107,25 @@ impl Default for Quality {
     }
 }
 
-/// A value that can't be used, with the flag (or field) that carries it and what to do.
+/// A value that can't be used: the flag or field that carries it, and what to do.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{field}: {problem}")]
 pub struct InvalidField {
-    /// The flag or JSON field, as the user wrote it (`thickness`, `views[3].eye`).
+    /// Flag or JSON field as the user wrote it (`thickness`, `views[3].eye`).
     pub field: String,
-    /// What is wrong with it and what to do.
+    /// What is wrong with the value, and what to do.
     pub problem: String,
 }
 
 impl InvalidField {
-    /// A refusal of `field`.
+    /// Returns the refusal of `field`, with its problem and remedy.
     pub fn new(field: impl Into<String>, problem: impl Into<String>) -> Self {
         InvalidField { field: field.into(), problem: problem.into() }
     }
 }
 
-/// The refusal of a JSON text. An unknown key names the nearest one that there is: serde lists all of
-/// them, which is long, and the one that was meant is not easily found.
+/// Returns the refusal of a JSON text, whose name is `whole`. An unknown key names the nearest
+/// known one: serde lists them all, among which the one that was meant is hard to find.
 pub fn json_error(whole: &str, e: &serde_json::Error) -> InvalidField {
     let said = e.to_string();
     let quoted: Vec<&str> = said.split('`').skip(1).step_by(2).collect();
@@ -133,6 +137,7 @@ pub fn json_error(whole: &str, e: &serde_json::Error) -> InvalidField {
     InvalidField::new(whole, format!("not valid: {said}{meant}"))
 }
 
+/// Checks that `x` lies in `lo..=hi`.
 fn within(field: &str, x: f64, lo: f64, hi: f64) -> Result<(), InvalidField> {
     if x >= lo && x <= hi {
         Ok(())
@@ -142,7 +147,7 @@ fn within(field: &str, x: f64, lo: f64, hi: f64) -> Result<(), InvalidField> {
 }
 
 impl Quality {
-    /// Standard deviation and support radius of the kernel, in lattice steps.
+    /// Returns standard deviation and support radius of the kernel in lattice steps.
     pub fn kernel_shape(&self) -> [f64; 2] {
         match self.kernel {
             Kernel::Gaussian => [self.std, self.radius],
@@ -151,14 +156,18 @@ impl Quality {
         }
     }
 
-    /// Whether 16-bit sums have room for a sheet's ripple: not that of a tent, of a Gaussian that is
-    /// narrow or wide, or of opacities that add up to more than one.
+    /// Returns whether 16-bit sums have room for a sheet's ripple. They have none for a tent, a
+    /// narrow or wide Gaussian, or the paper's opacities, which add up to more than one.
     pub fn fits_i16(&self) -> bool {
         let even = self.kernel != Kernel::Gaussian || (self.std >= 0.5 && self.radius <= 2.0);
         self.compositing != Compositing::Paper && self.kernel != Kernel::Tent && even
     }
 
-    /// Checks ranges and names what this version does not draw yet.
+    /// Checks all ranges.
+    ///
+    /// # Errors
+    /// Names the first field that is out of range, has no meaning beside the kernel, or is not
+    /// supported by this version.
     pub fn check(&self) -> Result<(), InvalidField> {
         // From vox/64 to thicker than any volume (DESIGN.md section 5).
         within("thickness", self.thickness, 1.0 / 64.0, 65536.0)?;
@@ -196,62 +205,62 @@ impl Quality {
     }
 }
 
-/// Which schedule the master runs.
+/// Which schedule the master runs. Never changes a byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Schedule {
-    /// The master decides: `region`.
+    /// The master decides; today `region`.
     Auto,
-    /// One task is one region through all depths.
+    /// A task is one tile through all sheets (a region).
     Region,
-    /// The paper's: slab after slab, with a barrier.
+    /// The paper's schedule: slab after slab, with a barrier between (section 4).
     Slab,
 }
 
-/// Where the slabs of the slab schedule end. Never changes a byte.
+/// Where the slabs of the `slab` schedule end. Never changes a byte.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Borders {
-    /// Where the data have been passed that hide what is behind.
+    /// Behind data that hide what follows.
     #[default]
     Data,
-    /// All slabs are of one thickness, as in the paper.
+    /// All slabs are equally thick, as in the paper.
     Equal,
 }
 
-/// What is kept although the scene does not need it: to see what leaving it out saves. Never changes
-/// a byte.
+/// Data kept although the scene does not need them, to measure what leaving them out saves. Never
+/// changes a byte.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Keep {
-    /// Voxels that nothing shows.
+    /// Keep voxels that the transfer function makes invisible.
     pub empty: bool,
-    /// Normals that nothing shades.
+    /// Keep normals in an unshaded scene.
     pub normals: bool,
-    /// Gradient magnitudes that modulate nothing.
+    /// Keep gradient magnitudes that modulate nothing.
     pub gradients: bool,
-    /// Three colours of a scene that is grey: [`Quality::grey`] is off then.
+    /// Draw a grey scene in three colours: switches [`Quality::grey`] off.
     pub colours: bool,
 }
 
-/// How the work is cut. Never changes a byte.
+/// How the work of a job is cut and scheduled. Never changes a byte.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Work {
-    /// Slabs a frame is cut into.
+    /// Slabs a frame is cut into (`slab` schedule), 1 to 1000.
     pub slabs: u32,
-    /// Wanted ratio of macrotiles to render threads (paper section 4.3: 2 to 3).
+    /// Wanted macrotiles per render *thread* (paper section 4.3: 2 to 3), 0.1 to 1000.
     pub tiles_per_worker: f64,
-    /// Macrotile edge in pixels (16, 32, 64, 128 or 256), or `None` for the quadtree to choose.
+    /// Edge of all macrotiles in pixels (16, 32, 64, 128 or 256); `None` lets the quadtree choose.
     pub tile: Option<u32>,
     /// Schedule.
     pub schedule: Schedule,
-    /// What is kept although nothing needs it.
+    /// Data kept although the scene does not need them.
     pub keep: Keep,
     /// Where slabs end.
     pub borders: Borders,
-    /// One pixel in 128 is drawn in thinner sheets, too, for the statistics' estimate of what the
-    /// thickness costs (`region` schedule).
+    /// Whether one pixel in 128 is also drawn in thinner sheets, for the statistics' estimate of
+    /// the error of the thickness (`region` schedule).
     pub estimate: bool,
 }
 
@@ -270,7 +279,10 @@ impl Default for Work {
 }
 
 impl Work {
-    /// Checks ranges.
+    /// Checks all ranges.
+    ///
+    /// # Errors
+    /// Names the first field that is out of range.
     pub fn check(&self) -> Result<(), InvalidField> {
         if !(1..=1000).contains(&self.slabs) {
             return Err(InvalidField::new(

@@ -9,34 +9,34 @@ use serde::{Deserialize, Serialize};
 /// A half-open run of sheets `[first, end)`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct SheetRange {
-    /// First sheet.
+    /// Number of the first sheet.
     pub first: i32,
-    /// One past the last sheet.
+    /// Number one past the last sheet.
     pub end: i32,
 }
 
 impl SheetRange {
-    /// `[first, end)`.
+    /// Returns the run `[first, end)`.
     pub fn new(first: i32, end: i32) -> Self {
         SheetRange { first, end }
     }
 
-    /// Number of sheets; 0 when empty.
+    /// Returns the number of sheets; 0 if empty.
     pub fn len(self) -> u32 {
         (self.end as i64 - self.first as i64).max(0) as u32
     }
 
-    /// Whether there is no sheet in it.
+    /// Returns whether the run has no sheet.
     pub fn is_empty(self) -> bool {
         self.end <= self.first
     }
 
-    /// Whether both share a sheet.
+    /// Returns whether both runs share a sheet.
     pub fn overlaps(self, other: SheetRange) -> bool {
         self.first < other.end && other.first < self.end
     }
 
-    /// The smallest run that holds both (an empty one counts as nothing).
+    /// Returns the smallest run that holds both; an empty one counts as nothing.
     pub fn union(self, other: SheetRange) -> SheetRange {
         if self.is_empty() {
             other
@@ -48,7 +48,7 @@ impl SheetRange {
     }
 
     /// Cuts the run into at most `count` slabs of equal thickness (to a sheet), front to back.
-    /// Empty slabs are left out: fewer sheets than slabs give one slab a sheet.
+    /// Empty slabs are left out: with fewer sheets than slabs, each slab has one sheet.
     pub fn slabs(self, count: u32) -> Vec<SheetRange> {
         let n = self.len() as u64;
         let count = u64::from(count.max(1));

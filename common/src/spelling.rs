@@ -1,13 +1,13 @@
 //! Spelling help: the known word that a mistyped one probably means.
 
-/// The word of a list that is two edits away at most, if there is one; of several, one that begins
-/// alike.
+/// Returns the word of `list` that is at most two edits from `word`; of several the nearest, then
+/// one with the same first letter.
 pub fn nearest<'a>(word: &str, list: &[&'a str]) -> Option<&'a str> {
     let near = list.iter().filter(|n| distance(word, n) <= 2);
     near.min_by_key(|n| (distance(word, n), word.chars().next() != n.chars().next())).copied()
 }
 
-/// Edits between two short words (Levenshtein).
+/// Returns the number of edits between two short words (Levenshtein).
 pub fn distance(a: &str, b: &str) -> usize {
     let b: Vec<char> = b.chars().collect();
     let mut row: Vec<usize> = (0..=b.len()).collect();

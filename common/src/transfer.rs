@@ -9,18 +9,18 @@ use crate::volume::{Lattice, SampleKind, Samples, ValueSummary, VolumeInfo};
 use serde::{Deserialize, Serialize};
 
 /// Cap of the extinction per vox: 16 ln 2, an alpha of `1 - 2^-16` (DESIGN.md section 1). It is
-/// part of the definition of the picture: silhouettes grow with the logarithm of sigma, so
-/// there is no limit to converge to. At 6.9 the worst alpha is 26/255 off, at 20 it is 34/255
-/// off the other way (NUMERICS.md section 2).
+/// part of the definition of the picture: silhouettes grow with the logarithm of sigma, so there is
+/// no limit to converge to. At 6.9 the worst alpha is 26/255 off, at 20 it is 34/255 off the other
+/// way (NUMERICS.md section 2).
 pub const SIGMA_MAX: f64 = 16.0 * std::f64::consts::LN_2;
 
-/// Cap of an extinction given per world unit, per vox. Beyond it f32 sums of squares overflow.
+/// Cap, per vox, of extinctions given per world unit. Beyond it f32 sums of squares overflow.
 pub const EXTINCTION_MAX: f64 = 1e9;
 
 /// Most points of a transfer function: a 16-bit volume has no more values.
 pub const MAX_POINTS: usize = 65536;
 
-/// What the x of a point means.
+/// Meaning of the x of a point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Domain {
@@ -30,40 +30,40 @@ pub enum Domain {
     Unit,
 }
 
-/// What the numbers of a colour are.
+/// Meaning of the numbers of a colour.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ColorSpace {
-    /// As on screen, and as in ParaView.
+    /// sRGB, as on screen and in ParaView.
     #[default]
     Srgb,
     /// Linear light.
     Linear,
 }
 
-/// What an opacity means.
+/// Meaning of an opacity.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OpacityUnit {
-    /// Alpha of one vox of travel.
+    /// Alpha of one vox of travel, 0 to 1.
     #[default]
     AlphaPerVox,
-    /// Extinction per world unit.
+    /// Extinction per world unit, not negative.
     Extinction,
 }
 
-/// What a NaN looks like.
+/// Colour and opacity of NaN samples.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NanColour {
     /// Colour, in the transfer function's colour space.
     pub color: [f64; 3],
-    /// Opacity, in its unit.
+    /// Opacity, in the transfer function's unit.
     pub opacity: f64,
 }
 
-/// A transfer function. Points ascend in x; linear between, clamped outside; two points at one
-/// x make a step (the later one holds at x).
+/// A transfer function (CONTRACTS.md, Transfer functions). Points ascend in x; values are linear
+/// between points and clamped outside; two points at one x make a step (the later one holds at x).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TransferFunction {
@@ -71,9 +71,9 @@ pub struct TransferFunction {
     pub version: u32,
     /// Meaning of x.
     pub domain: Domain,
-    /// `[x, r, g, b]`.
+    /// Colour points `[x, r, g, b]`.
     pub colors: Vec<[f64; 4]>,
-    /// `[x, a]`.
+    /// Opacity points `[x, a]`.
     pub opacities: Vec<[f64; 2]>,
     /// Meaning of r, g, b.
     #[serde(default)]
@@ -81,11 +81,11 @@ pub struct TransferFunction {
     /// Meaning of a.
     #[serde(default)]
     pub opacity_unit: OpacityUnit,
-    /// Look of NaN.
+    /// Colour and opacity of NaN.
     #[serde(default)]
     pub nan: NanColour,
-    /// `[gradient magnitude, factor]`: what opacities are multiplied by. Magnitudes are the change
-    /// of value over one vox as a share of the range, or, over file values, per world unit.
+    /// Points `[gradient magnitude, factor]` that opacities are multiplied by. Magnitudes are the
+    /// change of value over one vox as a share of the range; over file values, per world unit.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub gradient_opacity: Vec<[f64; 2]>,
     /// Light on voxels.
@@ -94,8 +94,8 @@ pub struct TransferFunction {
 }
 
 impl TransferFunction {
-    /// Whether all that is seen has one colour in all three channels, to the bit. Light is white,
-    /// so that holds of shaded voxels, too.
+    /// Returns whether everything visible has the same number in all three channels, to the bit.
+    /// Light is white, so this holds of shaded voxels too.
     pub fn is_grey(&self) -> bool {
         let one = |[r, g, b]: [f64; 3]| r == g && g == b;
         let nan = self.nan.opacity == 0.0 || one(self.nan.color);
@@ -103,6 +103,9 @@ impl TransferFunction {
     }
 
     /// Reads and checks the JSON of CONTRACTS.md.
+    ///
+    /// # Errors
+    /// If the text is not such JSON, or as [`TransferFunction::check`].
     pub fn from_json(text: &str) -> Result<Self, InvalidField> {
         let tf: TransferFunction =
             serde_json::from_str(text).map_err(|e| json_error("transfer function", &e))?;
@@ -110,12 +113,15 @@ impl TransferFunction {
         Ok(tf)
     }
 
-    /// As JSON.
+    /// Returns the function as JSON (CONTRACTS.md).
     pub fn to_json(&self) -> String {
         serde_json::to_string(self).expect("numbers and strings can be written")
     }
 
-    /// Checks every number; names the field that is wrong.
+    /// Checks every number.
+    ///
+    /// # Errors
+    /// Names the field that is out of range or unsorted.
     pub fn check(&self) -> Result<(), InvalidField> {
         let refuse = |field: String, problem: &str| Err(InvalidField::new(field, problem));
         if self.version != 1 {
@@ -198,7 +204,7 @@ impl TransferFunction {
     }
 }
 
-/// What a value looks like: extinction per vox (or the paper's alpha) and linear colour.
+/// Optical properties of a voxel: extinction and colour.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 #[repr(C)]
 pub struct OpticalSample {
@@ -208,7 +214,7 @@ pub struct OpticalSample {
     pub rgb: [f32; 3],
 }
 
-/// From the opacity numbers of a transfer function to what voxels add to sheets.
+/// Converts opacity numbers of a transfer function to what voxels add to sheets.
 #[derive(Clone, Copy, Debug)]
 struct OpacityRule {
     unit: OpacityUnit,
@@ -217,7 +223,7 @@ struct OpacityRule {
 }
 
 impl OpacityRule {
-    /// Extinction per vox, capped.
+    /// Returns the extinction per vox, capped.
     fn sigma(&self, a: f64) -> f64 {
         match self.unit {
             OpacityUnit::AlphaPerVox if a >= 1.0 => SIGMA_MAX,
@@ -226,7 +232,7 @@ impl OpacityRule {
         }
     }
 
-    /// What is summed in sheets: the extinction, or the paper's alpha.
+    /// Returns what sheets add: the extinction, or the paper's alpha.
     fn payload(&self, a: f64) -> f64 {
         match self.compositing {
             Compositing::Paper => -libm::expm1(-self.sigma(a)),
@@ -235,10 +241,10 @@ impl OpacityRule {
     }
 }
 
-/// A transfer function made ready for one volume: a table over codes where they are few.
+/// A transfer function made ready for one volume: a lookup table over codes where they are few.
 #[derive(Clone, Debug)]
 pub struct Classifier {
-    /// Looks by code (256 or 65536), empty for float volumes.
+    /// Optical samples by code (256 or 65536); empty for float volumes.
     table: Vec<OpticalSample>,
     /// `[x, r, g, b]`, linear light.
     colors: Vec<[f64; 4]>,
@@ -249,12 +255,12 @@ pub struct Classifier {
     summary: ValueSummary,
     payload_max: f64,
     uncapped: bool,
-    /// What opacities are multiplied by, by code of the gradient's magnitude; empty where by
-    /// nothing.
+    /// What opacities are multiplied by, by code of the gradient magnitude; empty if unmodulated.
     factors: Vec<f64>,
 }
 
-/// Value of the piecewise linear function through `points` at `x`.
+/// Returns the value at `x` of the piecewise linear function through `points`, of which there is at
+/// least one. The first number of a point is its x.
 pub fn interpolate<const N: usize>(points: &[[f64; N]], x: f64) -> [f64; N] {
     // The number of points at or left of x: of two points at one x the later one holds there.
     let after = points.partition_point(|p| p[0] <= x);
@@ -268,7 +274,7 @@ pub fn interpolate<const N: usize>(points: &[[f64; N]], x: f64) -> [f64; N] {
     std::array::from_fn(|i| a[i] * (1.0 - t) + b[i] * t)
 }
 
-/// A NaN look counts only where the volume has a NaN.
+/// Returns the opacity of NaN, or 0 if the volume has no NaN.
 fn nan_opacity(tf: &TransferFunction, info: &VolumeInfo) -> f64 {
     if info.summary.nan > 0 { tf.nan.opacity } else { 0.0 }
 }
@@ -278,8 +284,9 @@ fn largest_opacity(tf: &TransferFunction, info: &VolumeInfo) -> f64 {
 }
 
 impl Classifier {
-    /// The largest payload that `tf` (which passed its check) gives a voxel of a volume: what
-    /// [`Classifier::payload_max`] says, without a table.
+    /// Returns the largest payload (extinction per vox, or the paper's alpha) that `tf` gives a
+    /// voxel of a volume: [`Classifier::payload_max`] without making a table. `tf` must have passed
+    /// its check.
     pub fn largest_payload(
         tf: &TransferFunction,
         info: &VolumeInfo,
@@ -289,7 +296,7 @@ impl Classifier {
         rule.payload(largest_opacity(tf, info))
     }
 
-    /// Makes `tf` (which passed its check) ready for a volume.
+    /// Makes `tf`, which passed its check, ready for a volume.
     pub fn new(tf: &TransferFunction, info: &VolumeInfo, compositing: Compositing) -> Self {
         let summary = info.summary.clone();
         let rule = OpacityRule { unit: tf.opacity_unit, vox: info.lattice.vox(), compositing };
@@ -336,7 +343,7 @@ impl Classifier {
         c
     }
 
-    /// The x of the transfer function that belongs to a finite code.
+    /// Returns the x of the transfer function at a finite code.
     fn x_of(&self, code: f64) -> f64 {
         match self.domain {
             Domain::Value => self.summary.map.value(code),
@@ -359,7 +366,11 @@ impl Classifier {
         OpticalSample { sigma: self.rule.payload(a) as f32, rgb: [r as f32, g as f32, b as f32] }
     }
 
-    /// The look of sample `i` of `samples`, which are of this volume.
+    /// Returns the optical sample of sample `i` of `samples`, which are of this volume. Ignores
+    /// gradients.
+    ///
+    /// # Panics
+    /// If there is no sample `i`.
     #[inline]
     pub fn classify(&self, samples: &Samples, i: usize) -> OpticalSample {
         match samples {
@@ -369,7 +380,11 @@ impl Classifier {
         }
     }
 
-    /// The look of voxel `i` of a brick of this volume, its gradient counted.
+    /// Returns the optical sample of voxel `i` of a brick of this volume, modulated by its
+    /// gradient.
+    ///
+    /// # Panics
+    /// If there is no voxel `i`.
     #[inline]
     pub fn classify_voxel(&self, brick: &Brick, i: usize) -> OpticalSample {
         let look = self.classify(&brick.values, i);
@@ -389,12 +404,13 @@ impl Classifier {
         OpticalSample { sigma: self.rule.payload(a * factor) as f32, ..look }
     }
 
-    /// Whether opacities hang on gradients: then a sample alone does not say how a voxel looks.
+    /// Returns whether gradients modulate opacities. A code alone does not determine the optical
+    /// sample then.
     pub fn is_modulated(&self) -> bool {
         !self.factors.is_empty()
     }
 
-    /// [`Classifier::classify`] of a sample's bits ([`Samples::write_bits`]).
+    /// Returns [`Classifier::classify`] of a sample's bits ([`Samples::write_bits`]).
     #[inline]
     pub fn classify_bits(&self, bits: u32) -> OpticalSample {
         if self.table.is_empty() {
@@ -403,38 +419,39 @@ impl Classifier {
         self.table[bits as usize]
     }
 
-    /// The looks by code of an 8-bit (256) or 16-bit (65536) volume; empty for floats.
+    /// Returns the optical samples by code of an 8-bit (256) or 16-bit (65536) volume; empty for
+    /// floats.
     pub fn table(&self) -> &[OpticalSample] {
         &self.table
     }
 
-    /// Largest extinction per vox (or alpha, for the paper's compositing) of any value.
+    /// Returns the largest extinction per vox (or alpha, for the paper's compositing) of any value.
     pub fn payload_max(&self) -> f64 {
         self.payload_max
     }
 
-    /// Whether an extinction beyond [`SIGMA_MAX`] occurs; sums must be f32 then.
+    /// Returns whether an extinction beyond [`SIGMA_MAX`] occurs; sums must be f32 then.
     pub fn is_uncapped(&self) -> bool {
         self.uncapped
     }
 
-    /// About how far a picture is off at most because sheets of `thickness` vox add 16-bit integers, in
-    /// 1/255, where rays go through `depth` vox of the volume: for a largest extinction s and a faintest f
-    /// that occur, per vox,
+    /// Estimates the largest error in 1/255 of a picture whose sheets of `thickness` vox add 16-bit
+    /// integers, where rays travel `depth` vox through the volume. For a largest extinction s and a
+    /// faintest occurring one f, per vox, it is
     ///
     /// ```text
     /// s (0.25 sqrt(thickness) + 0.006 min(depth, 1 / f))
     /// ```
     ///
-    /// (NUMERICS.md section 3; fitted to real volumes, not a bound.) What is faint beside the strongest is
-    /// rounded most, and the same way sheet after sheet, until little is seen of what is behind it.
+    /// (NUMERICS.md section 3; fitted to real volumes, not a bound.) Faint samples are rounded
+    /// most, and the same way sheet after sheet, until little is seen of what is behind.
     pub fn i16_error_estimate(&self, thickness: f64, depth: f64) -> f64 {
         let seen = self.faintest().map_or(depth, |f| depth.min(1.0 / f));
         self.payload_max * (0.25 * thickness.sqrt() + 0.006 * seen)
     }
 
-    /// The smallest extinction above zero that the volume's samples have, per vox, where a table and a
-    /// histogram say so.
+    /// Returns the smallest extinction above zero, per vox, that occurs in the volume; `None` where
+    /// no table and histogram say so.
     fn faintest(&self) -> Option<f64> {
         if self.table.is_empty() || self.is_modulated() {
             return None;
@@ -448,15 +465,17 @@ impl Classifier {
         seen.map(|(_, l)| f64::from(l.sigma)).min_by(f64::total_cmp)
     }
 
-    /// What sheets add in, decided from `quality` and the volume's `lattice`: what was asked for, or
-    /// floats where extinctions are not capped, 16-bit integers where they have room
-    /// ([`Quality::fits_i16`]) and [round away](Classifier::i16_error_estimate) at most twice what the cut-off
-    /// may cost (so a 255th at the default eps of 1/512, and never more than three), and 32-bit integers
-    /// else. Thinner sheets are there to be nearer to the limit: for these it is that times the square of
-    /// their thickness.
+    /// Chooses the number type of the sums from `quality` and the volume's `lattice`.
+    ///
+    /// An explicit request is kept. `Auto` gives floats where extinctions are not capped; 16-bit
+    /// integers where they have room ([`Quality::fits_i16`]) and their [estimated
+    /// error](Classifier::i16_error_estimate) is at most twice what the cut-off may cost (1/255 at
+    /// the default eps of 1/512, and never more than three); else 32-bit integers. Sheets thinner
+    /// than a vox are meant to be nearer to the limit: their allowance is multiplied by the square
+    /// of their thickness.
     ///
     /// # Errors
-    /// Integers asked for where they can't hold the extinction.
+    /// If integers are requested that can't hold the extinction.
     pub fn choose_sums(&self, quality: &Quality, lattice: &Lattice) -> Result<Sums, InvalidField> {
         let d = quality.thickness;
         let enough = (2.0 * 255.0 * quality.eps).min(3.0) * (d * d).min(1.0);
@@ -475,7 +494,7 @@ impl Classifier {
         }
     }
 
-    /// Which codes are relevant (extinction above zero).
+    /// Returns which codes are relevant (extinction above zero).
     pub fn support(&self) -> Support {
         let mut intervals: Vec<(f64, f64)> = Vec::new();
         let nan = self.nan.sigma > 0.0;
@@ -531,17 +550,17 @@ impl Classifier {
     }
 }
 
-/// The codes that a transfer function makes visible: what decides which voxels are stored.
+/// The codes that a transfer function makes visible, which decide which voxels are stored.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Support {
-    /// Closed intervals of codes, ascending, apart from each other.
+    /// Closed intervals of codes, ascending and disjoint.
     pub intervals: Vec<(f64, f64)>,
     /// Whether NaN is visible.
     pub nan: bool,
 }
 
 impl Support {
-    /// Whether a code is relevant. Infinities count as the nearest finite code.
+    /// Returns whether a code is relevant. Infinities count as the nearest finite code.
     #[inline]
     pub fn contains(&self, code: f64) -> bool {
         if code.is_nan() {
@@ -554,7 +573,7 @@ impl Support {
         self.intervals.iter().any(|&(a, b)| a <= code && code <= b)
     }
 
-    /// Whether all of `other` is in it.
+    /// Returns whether every code of `other` is relevant here too.
     pub fn covers(&self, other: &Support) -> bool {
         (self.nan || !other.nan)
             && other
@@ -563,7 +582,7 @@ impl Support {
                 .all(|o| self.intervals.iter().any(|s| s.0 <= o.0 && o.1 <= s.1))
     }
 
-    /// What either sees.
+    /// Returns the codes that are relevant in either.
     #[must_use]
     pub fn union(&self, other: &Support) -> Support {
         let mut all: Vec<(f64, f64)> =

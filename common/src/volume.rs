@@ -17,7 +17,8 @@ pub struct Lattice {
 }
 
 impl Lattice {
-    /// Index axes times spacing, from the origin.
+    /// Returns a lattice along the world axes, `spacing` world units a step, with its first sample
+    /// at the world's origin.
     pub fn from_spacing(dims: [u32; 3], spacing: [f64; 3]) -> Self {
         Lattice {
             dims,
@@ -30,51 +31,51 @@ impl Lattice {
         }
     }
 
-    /// Number of samples.
+    /// Returns the number of samples.
     pub fn len(&self) -> usize {
         self.dims.iter().map(|&n| n as usize).product()
     }
 
-    /// Whether there is no sample.
+    /// Returns whether there is no sample.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Lengths of the steps, in world units.
+    /// Returns the lengths of the steps along i, j, k in world units.
     pub fn spacing(&self) -> [f64; 3] {
         self.steps.map(|s| s.length())
     }
 
-    /// One vox: the smallest spacing, in world units.
+    /// Returns the length of one vox, the smallest spacing, in world units.
     pub fn vox(&self) -> f64 {
         let [a, b, c] = self.spacing();
         a.min(b).min(c)
     }
 
-    /// `world_from_index` without its translation.
+    /// Returns the matrix from index to world coordinates, without the translation by the origin.
     pub fn world_from_index(&self) -> DMat3 {
         DMat3::from_cols(self.steps[0], self.steps[1], self.steps[2])
     }
 
-    /// Index coordinates of the centre of the volume's box.
+    /// Returns the index coordinates of the centre of the volume's box.
     pub fn centre_index(&self) -> DVec3 {
         let [x, y, z] = self.dims.map(|n| (n as f64 - 1.0) / 2.0);
         DVec3::new(x, y, z)
     }
 
-    /// World position of the centre of the volume's box.
+    /// Returns the world position of the centre of the volume's box.
     pub fn centre(&self) -> DVec3 {
         self.origin + self.world_from_index() * self.centre_index()
     }
 
-    /// The largest extent in world units (N samples count as N spacings).
+    /// Returns the largest extent in world units (N samples count as N spacings).
     pub fn largest_extent(&self) -> f64 {
         let s = self.spacing();
         (0..3).map(|a| s[a] * self.dims[a] as f64).fold(0.0, f64::max)
     }
 
-    /// The longest way through the volume, from corner to corner, in world units (N samples count as N
-    /// spacings).
+    /// Returns the longest way through the volume, from corner to corner, in world units (N samples
+    /// count as N spacings).
     pub fn diagonal(&self) -> f64 {
         let [a, b, c] = [0, 1, 2].map(|i| self.steps[i] * f64::from(self.dims[i]));
         [a + b + c, a + b - c, a - b + c, -a + b + c]
@@ -83,8 +84,8 @@ impl Lattice {
             .fold(0.0, f64::max)
     }
 
-    /// Whether the lattice is cubic: equal spacings and right angles, to 1 part in 1000 (files
-    /// carry spacings rounded to some digits). The kernel of other lattices is an ellipsoid
+    /// Returns whether the lattice is cubic: equal spacings and right angles, to 1 part in 1000
+    /// (files carry spacings rounded to some digits). The kernel of other lattices is an ellipsoid
     /// ([`crate::kernel`]).
     pub fn is_isotropic(&self) -> bool {
         let s = self.spacing();
@@ -96,7 +97,11 @@ impl Lattice {
             && right(self.steps[1], self.steps[2])
     }
 
-    /// Checks that the lattice can be drawn: finite, no step of length zero, not flat.
+    /// Checks that the lattice can be drawn.
+    ///
+    /// # Errors
+    /// If a dimension is zero, a number is not finite, a step has no length, two axes coincide, or
+    /// spacings differ by more than a factor of 10^6.
     pub fn check(&self) -> Result<(), String> {
         let s = self.spacing();
         if self.dims.contains(&0) {
@@ -120,7 +125,7 @@ impl Lattice {
     }
 }
 
-/// Samples as stored: the file's type where it has at most 16 bits, else f32.
+/// Samples as stored: in the file's type where it has at most 16 bits, else as f32.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Samples {
     /// 8-bit codes.
@@ -144,7 +149,7 @@ pub enum SampleKind {
 }
 
 impl SampleKind {
-    /// Bytes a sample.
+    /// Returns the bytes a sample.
     pub fn bytes(self) -> usize {
         match self {
             SampleKind::U8 => 1,
@@ -155,7 +160,7 @@ impl SampleKind {
 }
 
 impl Samples {
-    /// Number of samples.
+    /// Returns the number of samples.
     pub fn len(&self) -> usize {
         match self {
             Samples::U8(v) => v.len(),
@@ -164,12 +169,13 @@ impl Samples {
         }
     }
 
-    /// Whether there is none.
+    /// Returns whether there is no sample.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Samples as bits: their codes, or those of floats. As many as there are and fit.
+    /// Writes samples as bits into `to`: codes as they are, floats as their bit patterns. Writes as
+    /// many as both have.
     #[inline(always)]
     pub fn write_bits(&self, to: &mut [u32]) {
         match self {
@@ -179,7 +185,7 @@ impl Samples {
         }
     }
 
-    /// Their type.
+    /// Returns the type of the samples.
     pub fn kind(&self) -> SampleKind {
         match self {
             Samples::U8(_) => SampleKind::U8,
@@ -188,7 +194,7 @@ impl Samples {
         }
     }
 
-    /// An empty list of `kind`.
+    /// Returns an empty list of `kind`.
     pub fn empty(kind: SampleKind) -> Self {
         match kind {
             SampleKind::U8 => Samples::U8(Vec::new()),
@@ -197,7 +203,10 @@ impl Samples {
         }
     }
 
-    /// Sample `i` as a code.
+    /// Returns sample `i` as a code.
+    ///
+    /// # Panics
+    /// If there is no sample `i`.
     #[inline]
     pub fn code(&self, i: usize) -> f64 {
         match self {
@@ -207,7 +216,10 @@ impl Samples {
         }
     }
 
-    /// Appends sample `i` of `from`, which has the same type.
+    /// Appends sample `i` of `from`.
+    ///
+    /// # Panics
+    /// If `from` has another type or no sample `i`.
     #[inline]
     pub fn push_from(&mut self, from: &Samples, i: usize) {
         match (self, from) {
@@ -219,7 +231,7 @@ impl Samples {
     }
 }
 
-/// From stored codes to the file's values: `value = offset + scale * code`.
+/// Map from stored codes to the file's values: `value = offset + scale * code`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ValueMap {
     /// Value of one code step.
@@ -229,38 +241,38 @@ pub struct ValueMap {
 }
 
 impl ValueMap {
-    /// Codes are values.
+    /// The map of files whose codes are their values.
     pub const IDENTITY: ValueMap = ValueMap { scale: 1.0, offset: 0.0 };
 
-    /// The value of a code.
+    /// Returns the value of a code.
     #[inline]
     pub fn value(&self, code: f64) -> f64 {
         self.offset + self.scale * code
     }
 }
 
-/// What is known of a volume's values without looking at the samples again.
+/// Range and histogram of a volume's values.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ValueSummary {
     /// Stored type.
     pub kind: SampleKind,
-    /// Codes to values.
+    /// Map from codes to values.
     pub map: ValueMap,
     /// Smallest finite code.
     pub min_code: f64,
     /// Largest finite code.
     pub max_code: f64,
-    /// Finite samples in 256 equal bins from the smallest to the largest code; for 8-bit
+    /// Counts of finite samples in 256 equal bins from the smallest to the largest code. In 8-bit
     /// volumes bin = code instead, so that no two codes share a bin.
     pub histogram: Vec<u64>,
-    /// Samples that are NaN.
+    /// Number of samples that are NaN.
     pub nan: u64,
-    /// Samples that are infinite (drawn as the nearest finite value).
+    /// Number of samples that are infinite (drawn as the nearest finite value).
     pub infinite: u64,
 }
 
 impl ValueSummary {
-    /// Counts `samples`.
+    /// Counts `samples`, whose values are `map` of their codes.
     pub fn from_samples(samples: &Samples, map: ValueMap) -> Self {
         let mut s = ValueSummary {
             kind: samples.kind(),
@@ -322,7 +334,7 @@ impl ValueSummary {
         s
     }
 
-    /// The histogram bin of a finite code.
+    /// Returns the histogram bin of a finite code, 0 to 255.
     pub fn bin(&self, code: f64) -> usize {
         if self.kind == SampleKind::U8 {
             return code as usize;
@@ -331,7 +343,7 @@ impl ValueSummary {
         if span > 0.0 { (((code - self.min_code) / span) * 256.0).min(255.0) as usize } else { 0 }
     }
 
-    /// The code at the lower edge of bin `b`.
+    /// Returns the code at the lower edge of bin `b`.
     pub fn bin_code(&self, b: usize) -> f64 {
         if self.kind == SampleKind::U8 {
             return b as f64;
@@ -339,13 +351,13 @@ impl ValueSummary {
         self.min_code + (self.max_code - self.min_code) * b as f64 / 256.0
     }
 
-    /// Smallest and largest finite value.
+    /// Returns the smallest and the largest finite value.
     pub fn range(&self) -> (f64, f64) {
         let (a, b) = (self.map.value(self.min_code), self.map.value(self.max_code));
         (a.min(b), a.max(b))
     }
 
-    /// Number of samples.
+    /// Returns the number of samples, NaN and infinities included.
     pub fn total(&self) -> u64 {
         self.histogram.iter().sum::<u64>() + self.nan + self.infinite
     }
@@ -354,22 +366,22 @@ impl ValueSummary {
 /// A volume in memory.
 #[derive(Clone, Debug)]
 pub struct Volume {
-    /// What to call it (the file's name without folders).
+    /// Name for people (the file's, without folders).
     pub name: String,
-    /// The type in the file, for people (`int16`).
+    /// Type in the file, for people (`int16`).
     pub file_type: String,
-    /// Whether the file says where patient right, anterior and superior are.
+    /// Whether the file says where the patient's right, anterior and superior are.
     pub anatomical: bool,
     /// Where the samples lie.
     pub lattice: Lattice,
-    /// The samples, i fastest.
+    /// The samples, i fastest, then j, then k.
     pub samples: Samples,
-    /// Range, histogram, codes to values.
+    /// Range, histogram, and map from codes to values.
     pub summary: ValueSummary,
 }
 
 impl Volume {
-    /// A volume of samples; counts them.
+    /// Returns a volume of `samples` on `lattice`, and counts them.
     ///
     /// # Panics
     /// If the lattice and the samples differ in number.
@@ -393,7 +405,7 @@ impl Volume {
         }
     }
 
-    /// A volume by formula: `f(i, j, k)` as 8-bit codes on a unit lattice.
+    /// Returns a volume by formula: `f(i, j, k)` as 8-bit codes on a lattice of unit spacing.
     pub fn from_fn_u8(name: &str, dims: [u32; 3], mut f: impl FnMut(u32, u32, u32) -> u8) -> Self {
         let mut v = Vec::with_capacity(dims.iter().map(|&n| n as usize).product());
         for k in 0..dims[2] {
@@ -407,8 +419,8 @@ impl Volume {
         Volume::new(name, "uint8", false, lattice, Samples::U8(v), ValueMap::IDENTITY)
     }
 
-    /// SHA-256 over lattice, value map and samples: two volumes with one digest give the same
-    /// pictures. The name is not part of it.
+    /// Returns the SHA-256 over lattice, value map and samples. Two volumes with one digest give
+    /// the same pictures; the name is not part of it.
     pub fn digest(&self) -> Digest32 {
         let mut h = Sha256::new();
         h.update(b"slabcast volume 1");
@@ -446,9 +458,10 @@ impl Volume {
         Digest32(h.finalize().into())
     }
 
-    /// Gradient of the raw field in world axes at sample (i, j, k): central differences with
-    /// spacing, one-sided at the border, zero along an axis of one sample. Unit: codes per
-    /// world unit. Not finite where a neighbour is not.
+    /// Returns the gradient of the raw field at sample (i, j, k) in world axes, in codes per vox:
+    /// central differences with spacing, one-sided at the border, zero along an axis of one sample.
+    /// Not finite where a neighbour is not. `index_to_world_gradient` is
+    /// [`Volume::gradient_matrix`].
     pub fn gradient(&self, [i, j, k]: [u32; 3], index_to_world_gradient: &DMat3) -> DVec3 {
         let [nx, ny, nz] = self.lattice.dims;
         let at = |x: u32, y: u32, z: u32| {
@@ -466,13 +479,13 @@ impl Volume {
         *index_to_world_gradient * g
     }
 
-    /// The matrix that [`Volume::gradient`] takes: the transposed inverse of
+    /// Returns the matrix that [`Volume::gradient`] takes: the transposed inverse of
     /// `world_from_index`, scaled to vox so that no unit overflows it.
     ///
     /// Its numbers are rounded to f32. Gradients of integers are fractions of small numbers, and
-    /// some lie just between two codes of a normal. In another unit of length the last bits of
-    /// the matrix are others, and one in 10^4 or so would flip to the next code (the test below
-    /// counts 44 in 5 10^5 without the rounding; two voxels make 1 % of a small picture differ).
+    /// some lie just between two codes of a normal. In another unit of length the matrix has other
+    /// last bits, and one gradient in 10^4 or so would flip to the next code (the test below counts
+    /// 44 in 5 10^5 without the rounding; two voxels make 1 % of a small picture differ).
     pub fn gradient_matrix(&self) -> DMat3 {
         let vox = self.lattice.vox();
         let m = DMat3::from_cols(
@@ -484,20 +497,20 @@ impl Volume {
         DMat3::from_cols_array(&m.to_cols_array().map(|x| f64::from(x as f32)))
     }
 
-    /// What workers need to know of it.
+    /// Returns the volume without its samples; `digest` is its [`Volume::digest`].
     pub fn info(&self, digest: Digest32) -> VolumeInfo {
         VolumeInfo { digest, lattice: self.lattice, summary: self.summary.clone() }
     }
 }
 
-/// A volume without its samples.
+/// A volume without its samples: what master, workers and clients share.
 #[derive(Clone, Debug, PartialEq)]
 pub struct VolumeInfo {
-    /// [`Volume::digest`].
+    /// Digest of the volume ([`Volume::digest`]).
     pub digest: Digest32,
     /// Where the samples lie.
     pub lattice: Lattice,
-    /// Range, histogram, codes to values.
+    /// Range, histogram, and map from codes to values.
     pub summary: ValueSummary,
 }
 

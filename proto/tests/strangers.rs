@@ -10,7 +10,7 @@ use slabcast_common::image::PixelFormat;
 use slabcast_common::message::ToWorker;
 use slabcast_proto::convert::{self, Bricks, Down, StatisticsParts};
 use slabcast_proto::model::{FrameChunk, WatchMessage};
-use slabcast_proto::{FILE_DESCRIPTOR_SET, cluster_v1, render_v1};
+use slabcast_proto::{cluster_v1, render_v1};
 use slabcast_scene::brick_needs::BrickNeeds;
 
 /// Through every door, whatever the bytes are.
@@ -422,40 +422,4 @@ fn bytes_of_hello_and_refused_never_change() {
         0x0a, 1, b'r', // reason = 1
     ];
     assert_eq!(ControlResponse { message: Some(refused) }.encode_to_vec(), golden);
-}
-
-#[test]
-fn reflection_has_both_services_with_their_comments() {
-    let has = |text: &str| FILE_DESCRIPTOR_SET.windows(text.len()).any(|w| w == text.as_bytes());
-    for text in [
-        "slabcast.render.v1",
-        "slabcast.cluster.v1",
-        "RenderService",
-        "ClusterService",
-        "WatchFrames",
-        "MUST set client_key",
-    ] {
-        assert!(has(text), "{text}");
-    }
-}
-
-/// The packages change at different times: neither imports the other.
-#[test]
-fn packages_of_the_wire_do_not_import_each_other() {
-    let files = prost_types::FileDescriptorSet::decode(FILE_DESCRIPTOR_SET).unwrap().file;
-    for file in &files {
-        let package = file.package().to_owned();
-        for import in &file.dependency {
-            let other =
-                files.iter().find(|f| f.name() == import).expect("it is compiled").package();
-            assert!(
-                other == package || other == "google.protobuf",
-                "{} imports {import}",
-                file.name()
-            );
-        }
-    }
-    for package in ["slabcast.render.v1", "slabcast.cluster.v1"] {
-        assert!(files.iter().any(|f| f.package() == package), "{package}");
-    }
 }

@@ -32,10 +32,9 @@ const FIRST_WAIT: Duration = Duration::from_millis(100);
 const LONGEST_WAIT: Duration = Duration::from_secs(5);
 
 /// Why a worker can't dial at all.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum DialError {
     /// The master's address can't be one.
-    #[error("master address `{address}`: {problem}; give HOST:PORT")]
     Address {
         /// The address as it was given.
         address: String,
@@ -43,9 +42,21 @@ pub enum DialError {
         problem: String,
     },
     /// The system gives no render threads.
-    #[error("render threads: {0}")]
     Threads(String),
 }
+
+impl std::fmt::Display for DialError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            DialError::Address { address, problem } => {
+                write!(f, "master address `{address}`: {problem}; give HOST:PORT")
+            }
+            DialError::Threads(problem) => write!(f, "render threads: {problem}"),
+        }
+    }
+}
+
+impl std::error::Error for DialError {}
 
 /// Serves the master at `master` (`host:port`) until `stop` turns true or the master refuses
 /// this worker. A master that is not there, or ends, is dialled again for ever; bricks are

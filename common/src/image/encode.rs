@@ -5,17 +5,17 @@ use crate::math::{linear_from_srgb, srgb_from_linear};
 use serde::{Deserialize, Serialize};
 use std::sync::OnceLock;
 
-/// What lies behind the volume.
+/// Background of a picture.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Background {
-    /// Nothing: the picture has straight alpha.
+    /// None: the picture keeps straight alpha.
     Transparent,
-    /// A colour, sRGB numbers in `[0, 1]`.
+    /// An opaque colour, sRGB numbers in `[0, 1]`.
     Colour([f64; 3]),
 }
 
-/// How pixels leave the master.
+/// Format of pixels that leave the master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PixelFormat {
@@ -30,7 +30,7 @@ pub enum PixelFormat {
 }
 
 impl PixelFormat {
-    /// Bytes a pixel.
+    /// Returns the bytes a pixel.
     pub fn bytes(self) -> usize {
         match self {
             PixelFormat::Rgb8 => 3,
@@ -41,17 +41,17 @@ impl PixelFormat {
     }
 }
 
-/// What finished pixels are.
+/// How finished pixels are encoded: format, and the background they are composited over.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PixelEncoding {
-    /// How they are written.
+    /// Pixel format.
     pub format: PixelFormat,
-    /// Over what.
+    /// Background behind the volume.
     pub background: Background,
 }
 
 impl PixelEncoding {
-    /// Bytes of a pixel that shows nothing but the background.
+    /// Returns the bytes of a pixel that shows nothing but the background.
     pub(super) fn blank(&self) -> Vec<u8> {
         let mut blank = Vec::new();
         Encoder::new(self.format, self.background).put(&[[0.0; 4]], &mut blank);
@@ -59,10 +59,10 @@ impl PixelEncoding {
     }
 }
 
-/// Pixels to bytes of a format, over a background.
+/// Encodes linear premultiplied RGBA over a background.
 pub(crate) struct Encoder {
     format: PixelFormat,
-    /// The background's linear light.
+    /// Linear RGB of the background; `None` keeps alpha.
     background: Option<[f64; 3]>,
 }
 
@@ -101,7 +101,7 @@ impl Encoder {
         }
     }
 
-    /// The same of rows of sums.
+    /// Appends rows of fixed-point sums, encoded as [`Encoder::put`] encodes their floats.
     pub(crate) fn put_sums<'a>(
         &self,
         rows: impl Iterator<Item = (&'a [f32], &'a [[u32; 3]])>,
@@ -135,7 +135,7 @@ impl Encoder {
         }
     }
 
-    /// Linear light over the background, straight, and its alpha.
+    /// Composites over the background; returns straight linear RGB and alpha.
     #[inline(always)]
     fn over(&self, p: [f32; 4]) -> [f64; 4] {
         // f64 from here on: these are the last roundings of the picture. Channels one by one, since
@@ -155,7 +155,7 @@ impl Encoder {
     }
 }
 
-/// Rows of sums over black, of which nothing shines through: what is in front of it is all that there is.
+/// Encodes rows of sums over black, which adds nothing: no float is needed.
 fn over_black<'a, const N: usize>(
     rows: impl Iterator<Item = (&'a [f32], &'a [[u32; 3]])>,
     out: &mut Vec<u8>,
@@ -177,12 +177,12 @@ fn over_black<'a, const N: usize>(
     }
 }
 
-/// Linear to 8-bit sRGB by thresholds: what rounding the formula gives, without its power.
+/// Linear light to 8-bit sRGB by thresholds: rounds as the formula does, without its power.
 struct Srgb8 {
-    /// Linear value from which level `i + 1` is the nearest; none for level 256.
+    /// Linear value from which level `i + 1` is nearest; infinite for level 256.
     thresholds: [f64; 256],
-    /// The level at the beginning of each part of linear light; at most one threshold is in it. Part i is what
-    /// rounds to `i / PARTS`; those beyond one are there so that no place needs to be checked.
+    /// Level at the start of each part of linear light; at most one threshold lies in a part. Part
+    /// i is what rounds to `i / PARTS`. Parts beyond one save a range check.
     start: [u8; 2 * Srgb8::PARTS],
 }
 
@@ -218,12 +218,13 @@ impl Srgb8 {
     }
 }
 
-/// [`Srgb8`] of sums in units of [`COLOUR_UNIT`], without a float: what [`finished`] rounds them to is in the thresholds.
-/// Through floats three channels go in and out of a register together, which takes twice as long as looking them up.
+/// [`Srgb8`] of sums in units of [`COLOUR_UNIT`](super::COLOUR_UNIT), without floats: rounding of
+/// [`finished`] is in the thresholds. Through floats three channels share a register, which takes
+/// twice as long as looking them up.
 struct SumsSrgb8 {
-    /// The least sum of level `i + 1`; none for level 256.
+    /// Least sum of level `i + 1`; `u32::MAX` for level 256.
     thresholds: [u32; 256],
-    /// The level at the beginning of each part; at most one threshold is in it.
+    /// Level at the start of each part; at most one threshold lies in a part.
     start: [u8; SumsSrgb8::PARTS + 1],
 }
 
@@ -256,7 +257,7 @@ impl SumsSrgb8 {
         })
     }
 
-    /// By way of floats.
+    /// Returns the level of a sum by way of floats.
     fn level(sum: u32) -> u8 {
         let [light, ..] = finished(1.0, [sum; 3]);
         Srgb8::get().encode(f64::from(light).clamp(0.0, 1.0))
@@ -275,7 +276,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sums_give_what_their_floats_do() {
+    fn sums_encode_as_their_floats_do() {
         let s = SumsSrgb8::get();
         let near = |at: u32| [at.saturating_sub(1), at, at.saturating_add(1)];
         let parts = (0..=SumsSrgb8::PARTS as u32).map(|i| i << 16);
@@ -287,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn thresholds_give_what_the_formula_rounds_to() {
+    fn srgb_thresholds_round_as_the_formula_does() {
         let s = Srgb8::get();
         let even = (0..=100_000).map(|i| f64::from(i) / 100_000.0);
         let next = s.thresholds[..255].iter().flat_map(|t| [t.next_down(), *t, t.next_up()]);

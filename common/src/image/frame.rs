@@ -1,4 +1,7 @@
 //! A frame in the making.
+//!
+//! Tiles come in one of three ways: slab after slab ([`FrameState::add_slab_tile`]), whole as sums
+//! ([`FrameState::place_sums`]), or whole and encoded ([`FrameState::place_encoded`]).
 
 use super::encode::{Encoder, PixelEncoding};
 use super::picture::{Encoded, Picture, hash};
@@ -8,58 +11,61 @@ use crate::occlusion::Rect;
 use crate::volume::Digest32;
 use sha2::{Digest, Sha256};
 
-/// A frame while its tiles are rendered: slab after slab ([`FrameState::add_slab_tile`]), or each tile at once, as
-/// sums ([`FrameState::place_sums`]) or finished ([`FrameState::place_encoded`]).
+/// A frame while its tiles are rendered.
 #[derive(Clone, Debug)]
 pub struct FrameState {
     size: [u32; 2],
-    /// Tiles that one task made whole, in the order in which they came; nothing was put where they are.
-    laid: Vec<(Rect, TilePixels)>,
-    /// Tiles that came finished, likewise. A frame that has some has no others.
-    done: Vec<(Rect, SparseTile)>,
-    /// Whether some of them were taken out ([`FrameState::take_encoded`]), and the largest opacity of all that came.
+    /// Tiles that one task drew through all sheets, as sums, in order of arrival. Nothing else was
+    /// added at their pixels.
+    sums_tiles: Vec<(Rect, TilePixels)>,
+    /// Tiles that came encoded, in order of arrival. A frame with encoded tiles has no others.
+    encoded: Vec<(Rect, SparseTile)>,
+    /// Whether encoded tiles were taken out ([`FrameState::take_encoded`]).
     taken: bool,
-    done_most: f32,
-    /// Of all pixels; none before something was put.
+    /// Largest opacity of all encoded tiles that came.
+    encoded_max_alpha: f32,
+    /// Opacity of all pixels; empty before the first slab tile.
     a: Vec<f32>,
     colour: Vec<[u32; 3]>,
-    /// Sums of the last sheet of the slab before this one; no pixels while all are zero, which they
+    /// Raw sums of the last sheet of the slab before this one. Empty while all are zero, which they
     /// stay where one task goes through all sheets.
     last: Vec<RawSums>,
-    /// Sums of the last sheet of this slab, as its tiles come in; likewise.
+    /// Raw sums of the last sheet of this slab, as its tiles come in; empty while all are zero.
     next: Vec<RawSums>,
 }
 
 impl FrameState {
-    /// What a pixel takes at most: A, three colours, and two sheets' sums.
+    /// Most bytes that a pixel takes: opacity, three colours, and two sheets' sums.
     pub const BYTES_A_PIXEL: u64 = 4 + 12 + 2 * 16;
 
-    /// Nothing drawn yet.
+    /// Returns an empty frame of `size` (width, height) pixels.
     pub fn new(size: [u32; 2]) -> Self {
-        let (laid, done, taken, done_most, a, colour, last, next) = Default::default();
-        FrameState { size, laid, done, taken, done_most, a, colour, last, next }
+        let (sums_tiles, encoded, taken, encoded_max_alpha) = Default::default();
+        let (a, colour, last, next) = Default::default();
+        FrameState { size, sums_tiles, encoded, taken, encoded_max_alpha, a, colour, last, next }
     }
 
     fn pixels(&self) -> usize {
         self.size[0] as usize * self.size[1] as usize
     }
 
-    /// Width and height in pixels.
+    /// Returns width and height in pixels.
     pub fn size(&self) -> [u32; 2] {
         self.size
     }
 
-    /// A of every pixel as the slabs that were put left it, row-major.
+    /// Returns the accumulated opacity of every pixel behind the slabs added so far, row-major.
     pub fn opacities(&self) -> impl ExactSizeIterator<Item = f32> {
         (0..self.pixels()).map(|i| self.a.get(i).copied().unwrap_or(0.0))
     }
 
-    /// The largest opacity of any pixel.
+    /// Returns the largest opacity of any pixel, 0 to 1.
     pub fn max_alpha(&self) -> f32 {
-        let laid = self.laid.iter().flat_map(|(_, tile)| &tile.a);
-        self.a.iter().chain(laid).fold(self.done_most, |most, &a| a.max(most))
+        let laid = self.sums_tiles.iter().flat_map(|(_, tile)| &tile.a);
+        self.a.iter().chain(laid).fold(self.encoded_max_alpha, |most, &a| a.max(most))
     }
 
+    /// Returns the index range of each row of a rectangle.
     fn rows(&self, r: Rect) -> impl Iterator<Item = std::ops::Range<usize>> + use<> {
         let w = self.size[0] as usize;
         (r.y0..r.y1).map(move |y| {
@@ -68,7 +74,7 @@ impl FrameState {
         })
     }
 
-    /// What a task on `tile` starts from.
+    /// Returns what a slab task on `tile` starts from.
     pub fn tile_state(&self, tile: Rect) -> TileState {
         let mut a = Vec::with_capacity(tile.area());
         if self.a.is_empty() {
@@ -89,10 +95,10 @@ impl FrameState {
         TileState { a, last: (!blank).then_some(last) }
     }
 
-    /// Takes in a task's result.
+    /// Adds the result of a slab task on `tile`.
     ///
     /// # Panics
-    /// If the planes do not have the tile's size; whoever talks to strangers checks before.
+    /// If the planes don't have the tile's size; whoever reads from a network checks first.
     pub fn add_slab_tile(&mut self, tile: Rect, pixels: &TilePixels) {
         let n = tile.area();
         assert!(pixels.a.len() == n && pixels.colour.len() == n, "planes of the tile's size");
@@ -118,69 +124,71 @@ impl FrameState {
         }
     }
 
-    /// Takes in a tile that one task drew through all sheets. Nothing is copied: its pixels are read
-    /// when the picture is.
+    /// Adds a tile that one task drew through all sheets. Its pixels are not copied but read when
+    /// the picture is made.
     ///
     /// # Panics
-    /// As [`FrameState::add_slab_tile`], and if the tile leaves the picture.
+    /// If the planes don't have the tile's size, or the tile leaves the picture.
     pub fn place_sums(&mut self, tile: Rect, pixels: TilePixels) {
         let n = tile.area();
         assert!(pixels.a.len() == n && pixels.colour.len() == n, "planes of the tile's size");
         assert!(tile.intersect(&Rect::from_size(self.size)) == tile, "inside the picture");
-        self.laid.push((tile, pixels));
+        self.sums_tiles.push((tile, pixels));
     }
 
-    /// Takes in a tile that came finished.
+    /// Adds a tile that came encoded.
     ///
     /// # Panics
-    /// If its parts do not fit each other ([`SparseTile::check`]) or the tile, or if the tile leaves the
-    /// picture.
+    /// If its parts don't fit each other ([`SparseTile::check`]) or the tile, or the tile leaves
+    /// the picture.
     pub fn place_encoded(&mut self, tile: Rect, leaves: SparseTile) {
         let [w, h] = leaves.size.map(|n| n as usize);
         assert!([w, h] == [tile.width(), tile.height()], "leaves of the tile's size");
         assert_eq!(leaves.check(), Ok(()));
         assert!(tile.intersect(&Rect::from_size(self.size)) == tile, "inside the picture");
-        self.done_most = self.done_most.max(leaves.max_alpha);
-        self.done.push((tile, leaves));
+        self.encoded_max_alpha = self.encoded_max_alpha.max(leaves.max_alpha);
+        self.encoded.push((tile, leaves));
     }
 
-    /// Tiles that came finished and were not taken.
+    /// Returns the encoded tiles that were not taken out.
     pub fn encoded_tiles(&self) -> &[(Rect, SparseTile)] {
-        &self.done
+        &self.encoded
     }
 
-    /// Takes them, for whoever lays them into the picture while others are drawn. The last ones stay for
-    /// [`FrameState::encode_onto`].
+    /// Takes out the encoded tiles, so that they can be placed while others are still drawn. Tiles
+    /// that come later stay for [`FrameState::encode_onto`].
     pub fn take_encoded(&mut self) -> Vec<(Rect, SparseTile)> {
         self.taken = true;
-        std::mem::take(&mut self.done)
+        std::mem::take(&mut self.encoded)
     }
 
-    /// Ends a slab: what came in as last sums is what the next slab starts from. A pixel that
-    /// no task touched had an empty last sheet.
+    /// Ends a slab: the last sums that came in are where the next slab starts. A pixel that no task
+    /// touched had an empty last sheet.
     pub fn end_slab(&mut self) {
         std::mem::swap(&mut self.last, &mut self.next);
         self.next.fill([0; 4]);
     }
 
-    /// The finished picture.
+    /// Returns the finished picture in linear light.
     ///
     /// # Panics
-    /// If tiles came finished: sums can't be had from them.
+    /// If tiles came encoded: linear light can't be had from them.
     pub fn to_picture(&self) -> Picture {
-        assert!(self.done.is_empty() && !self.taken, "tiles as sums");
+        assert!(self.encoded.is_empty() && !self.taken, "tiles as sums");
         let mut pixels = Vec::with_capacity(self.pixels());
         self.each_row(|row| pixels.extend_from_slice(row));
         Picture { size: self.size, pixels }
     }
 
-    /// The finished picture's bytes, and its hash if it is to be `hashed`, without a picture in between.
+    /// Returns the finished picture's bytes, and its hash if `hashed`, without a picture in
+    /// between.
     ///
     /// # Panics
-    /// If tiles came finished and it is to be hashed or some were taken, or some came in another format or as sums.
+    /// If tiles came encoded and `hashed` is set or some were taken out; or if some came in another
+    /// format or as sums.
     pub fn encode(&self, finish: &PixelEncoding, hashed: bool) -> Encoded {
         assert!(!self.taken, "all tiles are here");
-        if !self.done.is_empty() {
+        if !self.encoded.is_empty() {
             assert!(!hashed, "the hash is of the linear picture");
             return self.encode_onto(FrameAssembler::new(self.size, finish));
         }
@@ -189,22 +197,23 @@ impl FrameState {
         encoding.end()
     }
 
-    /// The finished picture's bytes, where all tiles came finished and those that were taken are laid.
+    /// Places the remaining encoded tiles into `assembler`, which has those that were taken out, and
+    /// returns its bytes.
     ///
     /// # Panics
-    /// If some came as sums, and as [`FrameAssembler::place`].
-    pub fn encode_onto(&self, mut begun: FrameAssembler) -> Encoded {
-        assert!(self.laid.is_empty() && self.a.is_empty(), "all tiles came finished");
-        begun.place(&self.done);
-        Encoded { sha256: None, bytes: begun.into_bytes() }
+    /// If some tiles came as sums, and as [`FrameAssembler::place`].
+    pub fn encode_onto(&self, mut assembler: FrameAssembler) -> Encoded {
+        assert!(self.sums_tiles.is_empty() && self.a.is_empty(), "all tiles came finished");
+        assembler.place(&self.encoded);
+        Encoded { sha256: None, bytes: assembler.into_bytes() }
     }
 
-    /// Makes the picture row by row, from the top.
+    /// Makes the picture row by row from the top.
     fn each_row(&self, mut take: impl FnMut(&[[f32; 4]])) {
         let width = self.size[0] as usize;
         let mut row = vec![[0.0; 4]; width];
         // By their first rows; those that have begun and not ended.
-        let mut coming: Vec<&(Rect, TilePixels)> = self.laid.iter().collect();
+        let mut coming: Vec<&(Rect, TilePixels)> = self.sums_tiles.iter().collect();
         coming.sort_by_key(|(tile, _)| std::cmp::Reverse(tile.y0));
         let mut here: Vec<&(Rect, TilePixels)> = Vec::new();
         for y in 0..self.size[1] as usize {
@@ -229,7 +238,7 @@ impl FrameState {
     }
 }
 
-/// A picture that is encoded, and perhaps hashed, as its pixels come.
+/// A picture that is encoded, and perhaps hashed, as its rows come.
 struct Encoding {
     hash: Option<Sha256>,
     encoder: Encoder,
@@ -263,7 +272,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_frame_is_encoded_as_its_picture_is() {
+    fn encode_gives_the_bytes_and_hash_of_the_picture() {
         // Two portions and some, of every kind of pixel.
         let size = [90, 13];
         let mut f = FrameState::new(size);
@@ -296,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn tiles_lie_where_they_belong_in_whatever_order_they_come() {
+    fn tiles_are_placed_right_in_any_order_of_arrival() {
         let size = [7, 5];
         // Edges of 3: whole tiles and cut ones, and one that never came.
         let tiles: Vec<Rect> = [(0, 0), (3, 0), (6, 0), (0, 3), (6, 3)]
@@ -322,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pixel_no_task_touched_has_no_last_sheet() {
+    fn pixels_without_a_task_start_the_next_slab_from_zero_sums() {
         let mut f = FrameState::new([4, 2]);
         let tile = Rect::new(0, 0, 2, 2);
         let pixels = TilePixels {

@@ -1,8 +1,11 @@
 //! Pictures in the making and finished ones.
 //!
-//! A slab image is a continuation, not a picture of its own (DESIGN.md section 1): a task gets
-//! its tile's A and the last sheet's raw sums and goes on; its colour is fixed point and is
-//! added to what stood there. So any cut into slabs and tiles gives the same integers.
+//! A slab image is a continuation, not a picture of its own (DESIGN.md section 1). A task gets its
+//! tile's accumulated opacity and the last sheet's raw sums and goes on. Its colour is fixed point
+//! and is added to what was there. So every cut into slabs and tiles gives the same integers.
+//!
+//! From the bottom up: a tile's pixels, their encoding, a tile without its blank leaves, a finished
+//! picture, a frame in the making.
 
 mod encode;
 mod frame;

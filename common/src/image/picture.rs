@@ -10,19 +10,20 @@ use sha2::{Digest, Sha256};
 pub struct Picture {
     /// Width and height in pixels.
     pub size: [u32; 2],
-    /// Linear premultiplied RGBA.
+    /// Linear premultiplied RGBA, row-major from the top left.
     pub pixels: Vec<[f32; 4]>,
 }
 
 impl Picture {
-    /// The hash of CONTRACTS.md: over row-major linear premultiplied RGBA f32, little endian.
+    /// Returns the SHA-256 over row-major linear premultiplied RGBA f32, little endian
+    /// (CONTRACTS.md, Statistics).
     pub fn sha256(&self) -> Digest32 {
         let mut h = Sha256::new();
         hash(&mut h, &self.pixels);
         Digest32(h.finalize().into())
     }
 
-    /// The pixels in `format`.
+    /// Returns the pixels in `format`, composited over `background`.
     pub fn encode(&self, format: PixelFormat, background: Background) -> Vec<u8> {
         let mut out = Vec::with_capacity(self.pixels.len() * format.bytes());
         Encoder::new(format, background).put(&self.pixels, &mut out);
@@ -33,9 +34,9 @@ impl Picture {
 /// A picture as it leaves the master.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Encoded {
-    /// As [`Picture::sha256`]; `None` where nobody asked.
+    /// Hash as [`Picture::sha256`] gives it; `None` if the job did not ask.
     pub sha256: Option<Digest32>,
-    /// As [`Picture::encode`].
+    /// Bytes as [`Picture::encode`] gives them.
     pub bytes: Vec<u8>,
 }
 

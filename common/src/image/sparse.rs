@@ -1,32 +1,32 @@
-//! Finished pixels of a tile, without those leaves that show nothing but the background.
+//! Finished pixels of a tile without the leaves that show nothing but the background.
 //!
-//! Sums of a pixel are 16 bytes, a finished pixel in 8-bit sRGB is 3; and what a client gets is made of
-//! finished pixels alone. So where nobody asks for the hash of the linear picture, workers finish their
-//! tiles themselves, by the same code as a master (`image::Encoder`): pixels are finished one by one, and
-//! whoever does it does it to the same bytes. A leaf of 16x16 pixels whose every byte is that of a pixel
-//! without a volume is left out, whatever its sums are: what is put back in its place is the same.
+//! Sums take 16 bytes a pixel, a finished pixel in 8-bit sRGB takes 3, and clients get finished
+//! pixels alone. So where nobody asks for the hash of the linear picture, workers encode their
+//! tiles themselves. They use the master's own code ([`Encoder`]), pixel by pixel, so the bytes are
+//! the same. A leaf of 16x16 pixels whose every byte is that of a pixel without a volume is left
+//! out, whatever its sums are: what is put back in its place is the same.
 
 use super::encode::{Encoder, PixelEncoding, PixelFormat};
 use super::tile::{LEAF_EDGE, TilePixels};
 use crate::occlusion::Rect;
 
-/// Finished pixels of a tile.
+/// Encoded pixels of a tile, without its blank leaves.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SparseTile {
-    /// Columns and rows of the tile, in pixels.
+    /// Width and height of the tile in pixels.
     pub size: [u32; 2],
-    /// How pixels are written.
+    /// Pixel format.
     pub format: PixelFormat,
-    /// Which leaves are there: a bit each, row-major, leaf i at bit i % 8 of byte i / 8. Leaves at the
-    /// right and at the bottom are cut by the tile.
+    /// Which leaves are present: a bit each, row-major, leaf i at bit i % 8 of byte i / 8. Leaves
+    /// at the right and at the bottom are cut by the tile.
     pub mask: Vec<u8>,
-    /// Pixels of the leaves that are there, one leaf after the other, row-major in each.
+    /// Pixels of the present leaves, one leaf after the other, row-major in each.
     pub data: Vec<u8>,
-    /// The largest opacity of a pixel of the tile.
+    /// Largest opacity of any pixel of the tile, 0 to 1.
     pub max_alpha: f32,
 }
 
-/// The leaves of a tile of so many pixels, in order: columns and rows of pixels.
+/// Returns the leaves of a tile of `size` pixels in order, each as its columns and its rows.
 fn leaves(size: [u32; 2]) -> impl Iterator<Item = [std::ops::Range<usize>; 2]> {
     let [w, h] = size.map(|n| n as usize);
     let cut = |at: usize, end: usize| at..(at + LEAF_EDGE).min(end);
@@ -35,7 +35,8 @@ fn leaves(size: [u32; 2]) -> impl Iterator<Item = [std::ops::Range<usize>; 2]> {
         .flat_map(move |y| (0..w).step_by(LEAF_EDGE).map(move |x| [cut(x, w), cut(y, h)]))
 }
 
-/// The largest of opacities: of eighths first, since each of one after the other waits for the one before it.
+/// Returns the largest opacity, or 0. Eight maxima at once, since a single chain would wait for
+/// each comparison.
 fn most(a: &[f32]) -> f32 {
     let (eights, rest) = a.as_chunks::<8>();
     let mut most = [0.0f32; 8];
@@ -52,10 +53,10 @@ fn there(mask: &[u8], leaf: usize) -> bool {
 }
 
 impl SparseTile {
-    /// Finishes a tile of sums that went through all sheets.
+    /// Encodes a tile of `size` pixels (width, height) that went through all sheets.
     ///
     /// # Panics
-    /// If the planes do not have the tile's size.
+    /// If the planes don't have the tile's size.
     pub fn encode(pixels: &TilePixels, size: [u32; 2], finish: &PixelEncoding) -> SparseTile {
         let width = size[0] as usize;
         let n = width * size[1] as usize;
@@ -80,30 +81,33 @@ impl SparseTile {
         SparseTile { size, format: finish.format, mask, data, max_alpha: most(&pixels.a) }
     }
 
-    /// A tile without a leaf.
+    /// Returns a tile without a leaf: all of it shows the background.
     pub fn blank(size: [u32; 2], format: PixelFormat) -> SparseTile {
         let mask = vec![0; SparseTile::mask_len(size)];
         SparseTile { size, format, mask, data: Vec::new(), max_alpha: 0.0 }
     }
 
-    /// Bytes of the mask of a tile of so many pixels.
+    /// Returns the bytes of the mask of a tile of `size` pixels.
     pub fn mask_len(size: [u32; 2]) -> usize {
         let [columns, rows] = size.map(|n| (n as usize).div_ceil(LEAF_EDGE));
         (columns * rows).div_ceil(8)
     }
 
-    /// Bytes of the pixels of a mask's leaves; at most all of the tile.
+    /// Returns the bytes of the pixels of the leaves in `mask`; at most those of the whole tile.
     pub fn data_len(size: [u32; 2], format: PixelFormat, mask: &[u8]) -> usize {
         let leaves = leaves(size).enumerate().filter(|(i, _)| there(mask, *i));
         format.bytes() * leaves.map(|(_, [xs, ys])| xs.len() * ys.len()).sum::<usize>()
     }
 
-    /// Number of pixels of the tile.
+    /// Returns the number of pixels of the tile.
     pub fn pixels(&self) -> usize {
         self.size[0] as usize * self.size[1] as usize
     }
 
-    /// Whether the parts fit each other; says what does not.
+    /// Checks that the parts fit each other.
+    ///
+    /// # Errors
+    /// Names the part that does not fit.
     pub fn check(&self) -> Result<(), &'static str> {
         let leaves = leaves(self.size).count();
         if self.mask.len() != SparseTile::mask_len(self.size) {
@@ -121,10 +125,10 @@ impl SparseTile {
         Ok(())
     }
 
-    /// Writes the leaves that are there into the rows of a picture of `width` pixels.
+    /// Writes the present leaves into the rows of a picture of `width` pixels; `tile` says where.
     ///
     /// # Panics
-    /// If the parts do not fit each other, or the tile leaves the picture.
+    /// If the parts don't fit each other, or the tile leaves the picture.
     fn write(&self, tile: Rect, width: usize, picture: &mut [u8]) {
         let bytes = self.format.bytes();
         let mut data = &self.data[..];
@@ -139,7 +143,7 @@ impl SparseTile {
     }
 }
 
-/// A picture that finished tiles are laid into; the background is where none is.
+/// A picture that encoded tiles are placed into. Where none was placed it shows the background.
 #[derive(Clone, Debug)]
 pub struct FrameAssembler {
     format: PixelFormat,
@@ -148,7 +152,7 @@ pub struct FrameAssembler {
 }
 
 impl FrameAssembler {
-    /// Nothing but the background.
+    /// Returns a picture of `size` (width, height) that shows nothing but the background.
     pub fn new(size: [u32; 2], finish: &PixelEncoding) -> FrameAssembler {
         let [width, height] = size.map(|n| n as usize);
         let blank = finish.blank();
@@ -160,10 +164,10 @@ impl FrameAssembler {
         FrameAssembler { format: finish.format, width, picture }
     }
 
-    /// Lays tiles into it.
+    /// Places tiles at their rectangles.
     ///
     /// # Panics
-    /// If a tile has another format, its parts do not fit each other, or it leaves the picture.
+    /// If a tile has another format, its parts don't fit each other, or it leaves the picture.
     pub fn place(&mut self, tiles: &[(Rect, SparseTile)]) {
         for (tile, leaves) in tiles {
             assert!(leaves.format == self.format, "a frame has one format");
@@ -171,7 +175,7 @@ impl FrameAssembler {
         }
     }
 
-    /// Its bytes.
+    /// Returns the picture's bytes, row-major from the top left.
     pub fn into_bytes(self) -> Vec<u8> {
         self.picture
     }
@@ -210,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn tiles_that_workers_finish_make_the_bytes_of_the_masters_picture() {
+    fn tiles_encoded_by_workers_make_the_bytes_of_the_masters_picture() {
         let size = [90, 61];
         let tiles = [
             Rect::new(0, 0, 64, 32),
@@ -253,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_that_nothing_came_of_is_background() {
+    fn a_frame_without_tiles_is_background() {
         let finish = PixelEncoding {
             format: PixelFormat::Rgb8,
             background: Background::Colour([1.0, 0.5, 0.0]),
@@ -267,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_that_do_not_fit_are_named() {
+    fn sparse_tile_check_names_the_part_that_does_not_fit() {
         let tile = Rect::new(0, 0, 40, 20);
         let finish =
             PixelEncoding { format: PixelFormat::Rgba8, background: Background::Transparent };

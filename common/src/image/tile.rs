@@ -2,38 +2,39 @@
 
 use crate::occlusion::Rect;
 
-/// Unit of fixed-point premultiplied colour.
+/// Unit of fixed-point premultiplied colour: 2^-28 of full intensity.
 pub const COLOUR_UNIT: f32 = 1.0 / (1u32 << 28) as f32;
 
-/// Edge of a leaf in pixels: that of the smallest macrotile. Of 8 pixels four times as many are looked
-/// at to save a rim of empty ones, which pack to nearly nothing anyway.
+/// Edge of a leaf in pixels: the smallest macrotile, and the unit in which finished tiles are
+/// sparse. With 8 pixels, four times as many leaves are tested to save rims of empty ones, which
+/// compress to almost nothing anyway.
 pub const LEAF_EDGE: usize = 16;
 
-/// Raw sums of one sheet at one pixel: extinction and the three sigma-weighted colours, as
-/// bits (of i32, or of f32 when the scene's sums are f32).
+/// Raw sums of one sheet at one pixel: extinction and three extinction-weighted colours, as bits of
+/// i32, or of f32 in scenes with f32 sums.
 pub type RawSums = [u32; 4];
 
-/// What a task starts from: its tile's pixels as the slabs before left them.
+/// Pixels that a slab task starts from, as the slabs in front left them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TileState {
-    /// A, accumulated opacity, row-major in the tile.
+    /// Accumulated opacity A, row-major in the tile.
     pub a: Vec<f32>,
-    /// Raw sums of the last sheet before the slab; `None` when they are all zero.
+    /// Raw sums of the last sheet in front of the slab; `None` if all are zero.
     pub last: Option<Vec<RawSums>>,
 }
 
-/// What a task gives back.
+/// Pixels that a task returns.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TilePixels {
-    /// A after the slab, row-major in the tile.
+    /// Accumulated opacity A behind the slab, row-major in the tile.
     pub a: Vec<f32>,
     /// Premultiplied colour that the slab adds, in units of [`COLOUR_UNIT`].
     pub colour: Vec<[u32; 3]>,
-    /// Raw sums of the slab's last sheet; `None` when they are all zero.
+    /// Raw sums of the slab's last sheet; `None` if all are zero.
     pub last: Option<Vec<RawSums>>,
 }
 
-/// A finished pixel: linear premultiplied RGBA.
+/// Returns linear premultiplied RGBA.
 #[inline(always)]
 pub(crate) fn finished(a: f32, colour: [u32; 3]) -> [f32; 4] {
     let [r, g, b] = colour;
@@ -41,7 +42,7 @@ pub(crate) fn finished(a: f32, colour: [u32; 3]) -> [f32; 4] {
 }
 
 impl TilePixels {
-    /// Those of a piece of `tile`, which they are the pixels of.
+    /// Returns the pixels of `piece`, a rectangle inside `tile`; `self` has the pixels of `tile`.
     ///
     /// # Panics
     /// If the piece is not inside the tile.
@@ -60,7 +61,8 @@ impl TilePixels {
         }
     }
 
-    /// Writes the pixels of `tile`, which one slab made, into the rows of a picture of `size`.
+    /// Writes the pixels into a picture of `size` (width, height): row-major linear premultiplied
+    /// RGBA. `tile` says where; one slab made the pixels.
     ///
     /// # Panics
     /// If the tile leaves the picture.
@@ -74,7 +76,7 @@ impl TilePixels {
     }
 }
 
-/// Pixels of a row.
+/// Writes a run of pixels as linear premultiplied RGBA.
 pub(super) fn draw(row: &mut [[f32; 4]], a: &[f32], colour: &[[u32; 3]]) {
     for ((to, &a), &colour) in row.iter_mut().zip(a).zip(colour) {
         *to = finished(a, colour);

@@ -12,7 +12,7 @@ use slabcast_common::view::{Camera, CameraProjection, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_scene::presets;
 use slabcast_schedule::{FrameJob, macrotile};
-use slabcast_sim::{self as sim, Cluster, Costs, Link, Nanos, Stopwatch, Toll};
+use slabcast_sim::{self as sim, Cluster, Costs, LinearCost, Link, MessageCosts, Nanos, Observer};
 use slabcast_trace::{
     About, FrameTrace, Packing, RegionLevel, RegionTile, Trace, VERSION, view_sha256,
 };
@@ -122,32 +122,33 @@ fn ball(frames: usize) -> (Vec<FrameJob>, Trace) {
 
 struct Wall(Instant);
 
-impl Stopwatch for Wall {
-    fn read(&mut self) -> Option<Nanos> {
+impl Observer for Wall {
+    fn processor_ns(&mut self) -> Option<Nanos> {
         Some(self.0.elapsed().as_nanos() as Nanos)
     }
 }
 
 /// About what `slabcast plan` measures.
 fn costs() -> Costs {
-    let toll = |woken| Toll {
-        woken,
-        call: 3_000.0,
-        send: (800.0, 0.4),
-        receive: (800.0, 0.4),
-        bricks: (800.0, 0.3),
+    let each = |per_unit_ns| LinearCost { fixed_ns: 800.0, per_unit_ns };
+    let messages = |wake_ns| MessageCosts {
+        wake_ns,
+        call_ns: 3_000.0,
+        send: each(0.4),
+        receive: each(0.4),
+        bricks: each(0.3),
     };
     Costs {
-        first_brick: 80.0,
-        frame_brick: 20.0,
-        ahead: 100_000.0,
-        result: 3_000.0,
-        event: 1_500.0,
-        driver_woken: 10_000.0,
-        driver_message: 800.0,
-        master: toll(16_000.0),
-        worker: toll(28_000.0),
-        finish_pixel: 0.3,
+        first_brick_ns: 80.0,
+        frame_brick_ns: 20.0,
+        prefetch_ns: 100_000.0,
+        result: LinearCost { fixed_ns: 3_000.0, per_unit_ns: 0.0 },
+        event_ns: 1_500.0,
+        driver_wake_ns: 10_000.0,
+        driver_message_ns: 800.0,
+        master: messages(16_000.0),
+        worker: messages(28_000.0),
+        finish_pixel_ns: 0.3,
         ..Costs::default()
     }
 }
@@ -164,17 +165,17 @@ fn what_deciding_takes() {
             threads: 1,
             link: Link { bytes_per_s: None, latency_ns: 50_000 },
             costs: costs(),
-            cores: None,
-            in_flight,
+            shared_cores: None,
+            frames_in_flight: in_flight,
             stretch: 1.0,
             mixed: false,
         };
         let run = || {
             let (out, took) =
                 sim::run(&jobs, &trace, &cluster, &mut Wall(Instant::now())).expect("it runs");
-            let begun = took.first.1 + took.frames.1;
-            let all = begun + took.results.1 + took.ahead.1 + took.others.1;
-            (all, took, out.steady_ms(in_flight))
+            let begun = took.first_frame.ns + took.frames.ns;
+            let all = begun + took.results.ns + took.prefetches.ns + took.others.ns;
+            (all, took, out.steady_interval_ms(in_flight))
         };
         let runs: Vec<_> = (0..5).map(|_| run()).collect();
         let (all, took, ms) = runs.into_iter().min_by_key(|r| r.0).expect("five");
@@ -183,12 +184,12 @@ fn what_deciding_takes() {
             "{workers:>3} workers, {in_flight} in flight: {:>5.0} us a frame: begun {:>4.0} us, looked ahead {:>3.0} us; \
              {:>4.0} results of {:>5.2} us; {:>4.0} other events of {:.2} us; a frame every {ms:.2} ms",
             each(FRAMES as u64, all),
-            each(FRAMES as u64 - 1, took.frames.1),
-            each(FRAMES as u64, took.ahead.1),
+            each(FRAMES as u64 - 1, took.frames.ns),
+            each(FRAMES as u64, took.prefetches.ns),
             took.result_count as f64 / FRAMES as f64,
-            each(took.result_count, took.results.1),
-            took.others.0 as f64 / FRAMES as f64,
-            each(took.others.0, took.others.1),
+            each(took.result_count, took.results.ns),
+            took.others.count as f64 / FRAMES as f64,
+            each(took.others.count, took.others.ns),
         );
     }
 }

@@ -2,7 +2,8 @@
 
 use slabcast_common::brick::{BRICK_EDGE, BrickGrid, BrickInfo, BrickSetKey, TightBox};
 use slabcast_common::ids::{BrickId, FrameId, SceneId};
-use slabcast_common::image::{Background, PixelEncoding, PixelFormat};
+use slabcast_common::image::PixelEncoding;
+use slabcast_common::image::{Background, FrameState, PixelFormat};
 use slabcast_common::message::SceneSpec;
 use slabcast_common::occlusion::{Rect, ShutMap};
 use slabcast_common::quality::{Borders, Quality, Schedule, Work};
@@ -11,7 +12,9 @@ use slabcast_common::view::{Camera, CameraProjection, Projected, View};
 use slabcast_common::volume::{Digest32, Volume};
 use slabcast_scene::presets;
 use slabcast_schedule::{FrameJob, Span, Spans, macrotile, slab_ranges};
-use slabcast_sim::{self as sim, Cluster, Costs, Link, Outcome, Toll, Unknown, Unmeasured};
+use slabcast_sim::{
+    self as sim, Cluster, Costs, LinearCost, Link, MessageCosts, NoObserver, Outcome, Unpredictable,
+};
 use slabcast_trace::{
     About, FrameTrace, Level, Packing, RegionLevel, RegionTile, SlabTrace, TileTrace, Trace,
     VERSION, view_sha256,
@@ -167,17 +170,17 @@ fn cluster(workers: u32) -> Cluster {
     Cluster {
         workers,
         threads: 1,
-        link: Link::NONE,
+        link: Link::UNLIMITED,
         costs: Costs::default(),
-        cores: None,
-        in_flight: 1,
+        shared_cores: None,
+        frames_in_flight: 1,
         stretch: 1.0,
         mixed: false,
     }
 }
 
 fn run(jobs: &[FrameJob], trace: &Trace, cluster: &Cluster) -> Outcome {
-    sim::run(jobs, trace, cluster, &mut Unmeasured).expect("it can be predicted").0
+    sim::run(jobs, trace, cluster, &mut NoObserver).expect("it can be predicted").0
 }
 
 #[test]
@@ -201,8 +204,8 @@ fn one_worker_without_any_cost_takes_the_sum_of_its_tiles() {
 #[test]
 fn what_only_the_first_frame_takes_delays_no_other() {
     let (jobs, trace) = world(3);
-    let times = |first_brick| {
-        let costs = Costs { first_brick, frame_brick: 10.0, ..Costs::default() };
+    let times = |first_brick_ns| {
+        let costs = Costs { first_brick_ns, frame_brick_ns: 10.0, ..Costs::default() };
         let outcome = run(&jobs, &trace, &Cluster { costs, ..cluster(2) });
         outcome.frames.iter().map(|f| f.done - f.began).collect::<Vec<_>>()
     };
@@ -245,22 +248,28 @@ fn the_masters_link_is_shared_by_all_workers() {
 fn what_the_master_costs_shows_in_frames_and_overlaps_where_it_may() {
     let (jobs, trace) = world(4);
     let free = run(&jobs, &trace, &cluster(4));
-    let master = Toll { receive: (30_000.0, 0.0), ..Toll::default() };
-    let costs = Costs { finish_pixel: 20.0, master, ..Costs::default() };
+    let master = MessageCosts {
+        receive: LinearCost { fixed_ns: 30_000.0, per_unit_ns: 0.0 },
+        ..MessageCosts::default()
+    };
+    let costs = Costs { finish_pixel_ns: 20.0, master, ..Costs::default() };
     let one = run(&jobs, &trace, &Cluster { costs, ..cluster(4) });
-    let three = run(&jobs, &trace, &Cluster { costs, in_flight: 3, ..cluster(4) });
+    let three = run(&jobs, &trace, &Cluster { costs, frames_in_flight: 3, ..cluster(4) });
     assert!(one.frame_ms() > free.frame_ms());
     assert_eq!(free.later_work(), [0, 0]);
     // Three later pictures are finished, and each tile's result is received.
     let later: u64 = one.frames[1..].iter().map(|f| f.leases).sum();
     assert!(one.later_work()[0] >= 3 * 20 * 256 * 200 + later * 30_000);
     // 51,200 pixels at 20 ns are finished while the next frame is drawn.
-    assert!(one.each_ms() > one.frame_ms() + 1.0, "{} {}", one.each_ms(), one.frame_ms());
-    assert!(three.each_ms() < one.each_ms() - 0.5);
+    assert!(one.interval_ms() > one.frame_ms() + 1.0, "{} {}", one.interval_ms(), one.frame_ms());
+    assert!(three.interval_ms() < one.interval_ms() - 0.5);
     // On one machine with two cores there is less to overlap with.
-    let rehearsal =
-        run(&jobs, &trace, &Cluster { costs, in_flight: 3, cores: Some(1), ..cluster(4) });
-    assert!(rehearsal.each_ms() > three.each_ms());
+    let rehearsal = run(
+        &jobs,
+        &trace,
+        &Cluster { costs, frames_in_flight: 3, shared_cores: Some(1), ..cluster(4) },
+    );
+    assert!(rehearsal.interval_ms() > three.interval_ms());
 }
 
 /// A worker of one thread has one core: while it sends it does not draw.
@@ -269,7 +278,10 @@ fn what_a_result_takes_is_taken_from_what_is_drawn_next() {
     let (jobs, trace) = world(3);
     let jobs = under(Schedule::Region, &jobs);
     let last = |ns: f64| {
-        let worker = Toll { send: (ns, 0.0), ..Toll::default() };
+        let worker = MessageCosts {
+            send: LinearCost { fixed_ns: ns, per_unit_ns: 0.0 },
+            ..MessageCosts::default()
+        };
         let costs = Costs { worker, ..Costs::default() };
         run(&jobs, &trace, &Cluster { costs, ..cluster(1) }).frames[2]
     };
@@ -290,7 +302,7 @@ fn results_are_packed_where_they_would_fill_the_link() {
         .collect::<Vec<_>>();
     let at = |bytes_per_s| {
         let link = Link { bytes_per_s, latency_ns: 20_000 };
-        let costs = Costs { pack: 1.0, ..Costs::default() };
+        let costs = Costs { pack_byte_ns: 1.0, ..Costs::default() };
         run(&jobs, &trace, &Cluster { link, costs, ..cluster(2) })
     };
     // Two bytes a pixel if they are packed, three if not.
@@ -310,16 +322,21 @@ fn what_is_done_with_pictures_hardly_delays_messages() {
     let (jobs, trace) = world(40);
     let jobs = under(Schedule::Region, &jobs);
     let each_ms = |pixel: f64| {
-        let toll = Toll { woken: 2_000.0, receive: (500.0, 0.0), ..Toll::default() };
+        let toll = MessageCosts {
+            wake_ns: 2_000.0,
+            receive: LinearCost { fixed_ns: 500.0, per_unit_ns: 0.0 },
+            ..MessageCosts::default()
+        };
         let costs = Costs {
             master: toll,
             worker: toll,
-            mark_pixel: pixel,
-            deliver: [pixel; 2],
+            mark_pixel_ns: pixel,
+            deliver_pixel_ns: pixel,
+            client_pixel_ns: pixel,
             ..Costs::default()
         };
-        let cluster = Cluster { cores: Some(2), in_flight: 4, costs, ..cluster(2) };
-        run(&jobs, &trace, &cluster).each_ms()
+        let cluster = Cluster { shared_cores: Some(2), frames_in_flight: 4, costs, ..cluster(2) };
+        run(&jobs, &trace, &cluster).interval_ms()
     };
     // A frame takes two workers half a millisecond, and its picture three times 0.2 of two cores.
     let [free, dear] = [0.0, 4.0].map(each_ms);
@@ -330,20 +347,23 @@ fn what_is_done_with_pictures_hardly_delays_messages() {
 fn the_same_cluster_behaves_the_same() {
     let (jobs, trace) = world(3);
     let costs = Costs {
-        master: Toll {
-            woken: 15_000.0,
-            call: 5_000.0,
-            send: (900.0, 0.7),
-            receive: (800.0, 0.4),
-            bricks: (700.0, 0.3),
+        master: MessageCosts {
+            wake_ns: 15_000.0,
+            call_ns: 5_000.0,
+            send: LinearCost { fixed_ns: 900.0, per_unit_ns: 0.7 },
+            receive: LinearCost { fixed_ns: 800.0, per_unit_ns: 0.4 },
+            bricks: LinearCost { fixed_ns: 700.0, per_unit_ns: 0.3 },
         },
-        worker: Toll { send: (1_000.0, 1.1), ..Toll::default() },
-        result_pixel: 1.3,
-        slab_brick: 30.0,
+        worker: MessageCosts {
+            send: LinearCost { fixed_ns: 1_000.0, per_unit_ns: 1.1 },
+            ..MessageCosts::default()
+        },
+        result: LinearCost { fixed_ns: 0.0, per_unit_ns: 1.3 },
+        slab_brick_ns: 30.0,
         ..Costs::default()
     };
     let link = Link { bytes_per_s: Some(1.2e8), latency_ns: 50_000 };
-    let c = Cluster { costs, link, threads: 2, in_flight: 3, ..cluster(7) };
+    let c = Cluster { costs, link, threads: 2, frames_in_flight: 3, ..cluster(7) };
     assert_eq!(run(&jobs, &trace, &c), run(&jobs, &trace, &c));
 }
 
@@ -352,15 +372,15 @@ fn a_tile_that_was_not_measured_is_named() {
     let (jobs, mut trace) = world(1);
     trace.frames[0].slabs[1].levels.retain(|l| l.edge > 64);
     let c = cluster(30);
-    match sim::run(&jobs, &trace, &c, &mut Unmeasured) {
-        Err(Unknown::Tile { frame: 0, first, .. }) => {
+    match sim::run(&jobs, &trace, &c, &mut NoObserver) {
+        Err(Unpredictable::Tile { frame: 0, first, .. }) => {
             assert_eq!(first, trace.frames[0].slabs[1].first);
         }
         other => panic!("{other:?}"),
     }
     let (two, _) = world(2);
-    let none = sim::run(&two, &trace, &c, &mut Unmeasured);
-    assert_eq!(none.unwrap_err(), Unknown::Frames { have: 1, need: 2 });
+    let none = sim::run(&two, &trace, &c, &mut NoObserver);
+    assert_eq!(none.unwrap_err(), Unpredictable::Frames { have: 1, need: 2 });
 }
 
 #[test]
@@ -387,8 +407,8 @@ fn regions_have_no_barrier_and_bricks_come_where_they_are_asked_for() {
     // Of one size: here a tile takes as long as it is large, whatever lies in it.
     region.iter_mut().for_each(|job| job.work.tile = Some(32));
     let ms = |in_flight| {
-        let c = Cluster { in_flight, ..cluster(8) };
-        run(&region, &trace, &c).steady_ms(in_flight)
+        let c = Cluster { frames_in_flight: in_flight, ..cluster(8) };
+        run(&region, &trace, &c).steady_interval_ms(in_flight)
     };
     let each = [1, 2, 4].map(ms);
     assert!(each[1] < each[0] && each[2] < each[1], "{each:?}");
@@ -425,7 +445,7 @@ fn a_region_is_drawn_up_to_each_brick_that_it_lacks_and_those_that_are_expected_
     let (expecting, short, expected) = ran(&trace);
     assert_eq!(expecting, drawn);
     assert!(short < long, "{short} ns for {long}");
-    let waited = [&expected, &stopped].map(|o| o.spent.bricks);
+    let waited = [&expected, &stopped].map(|o| o.thread_time.bricks);
     assert!(20 * waited[0] < 19 * waited[1], "{waited:?}");
     let sent = |o: &Outcome| o.frames.iter().map(|f| f.bricks).sum::<u64>();
     assert!(sent(&expected) <= sent(&stopped) * 5 / 4, "only where it draws");
@@ -438,7 +458,7 @@ fn crews_draw_in_turn_where_tiles_are_few_and_frames_many() {
     let drew = |in_flight, bytes_per_s| {
         let mut heard = Listener::default();
         let link = Link { bytes_per_s, latency_ns: 50_000 };
-        let c = Cluster { in_flight, link, ..cluster(8) };
+        let c = Cluster { frames_in_flight: in_flight, link, ..cluster(8) };
         sim::run(&region, &trace, &c, &mut heard).expect("it can be predicted");
         let busy = |s: &FrameStats| s.workers.iter().filter(|w| w.render_ms > 0.0).count();
         heard.0[4..].iter().map(|(stats, _)| busy(stats)).collect::<Vec<_>>()
@@ -456,12 +476,16 @@ fn more_workers_than_are_good_are_held_in_reserve() {
     let mut region = under(Schedule::Region, &slab);
     region.iter_mut().for_each(|job| job.work.tile = Some(32));
     // A message costs the master 30 us, and a view that turns by six degrees brings bricks to everybody.
-    let master = Toll { send: (15_000.0, 0.0), receive: (15_000.0, 0.0), ..Toll::default() };
+    let master = MessageCosts {
+        send: LinearCost { fixed_ns: 15_000.0, per_unit_ns: 0.0 },
+        receive: LinearCost { fixed_ns: 15_000.0, per_unit_ns: 0.0 },
+        ..MessageCosts::default()
+    };
     let costs = Costs { master, ..Costs::default() };
     let drew = |workers, bytes_per_s| {
         let mut heard = Listener::default();
         let link = Link { bytes_per_s: Some(bytes_per_s), latency_ns: 50_000 };
-        let c = Cluster { costs, link, in_flight: 4, ..cluster(workers) };
+        let c = Cluster { costs, link, frames_in_flight: 4, ..cluster(workers) };
         sim::run(&region, &trace, &c, &mut heard).expect("it can be predicted");
         let drew = |some: &[(FrameStats, Vec<Span>)]| {
             let stats = some.iter().map(|(stats, _)| stats);
@@ -486,7 +510,7 @@ fn a_paths_first_frame_is_judged_with_the_second_one() {
     for workers in [32, 64] {
         let mut heard = Listener::default();
         let link = Link { bytes_per_s: Some(1e9), latency_ns: 50_000 };
-        let c = Cluster { link, in_flight: 4, ..cluster(workers) };
+        let c = Cluster { link, frames_in_flight: 4, ..cluster(workers) };
         sim::run(&region, &trace, &c, &mut heard).expect("it can be predicted");
         let frames = heard.0.iter().map(|(stats, _)| &stats.workers);
         let drew: Vec<usize> =
@@ -502,7 +526,7 @@ fn fewer_frames_are_in_the_making_while_bricks_fill_the_link() {
     let most = |bytes_per_s| {
         let mut heard = Listener::default();
         let link = Link { bytes_per_s, latency_ns: 50_000 };
-        let c = Cluster { in_flight: 4, link, ..cluster(8) };
+        let c = Cluster { frames_in_flight: 4, link, ..cluster(8) };
         sim::run(&region, &trace, &c, &mut heard).expect("it can be predicted");
         let spans = heard.0.iter().flat_map(|(_, spans)| spans);
         let made: Vec<_> = spans.filter(|s| s.category == "frame").collect();
@@ -520,24 +544,31 @@ fn fewer_frames_are_in_the_making_while_bricks_fill_the_link() {
 fn what_threads_time_goes_into_is_all_of_it() {
     let (slab, trace) = world(9);
     let region = under(Schedule::Region, &slab);
-    let toll = Toll {
-        woken: 5_000.0,
-        call: 500.0,
-        send: (300.0, 0.1),
-        receive: (300.0, 0.1),
-        bricks: (300.0, 0.1),
+    let toll = MessageCosts {
+        wake_ns: 5_000.0,
+        call_ns: 500.0,
+        send: LinearCost { fixed_ns: 300.0, per_unit_ns: 0.1 },
+        receive: LinearCost { fixed_ns: 300.0, per_unit_ns: 0.1 },
+        bricks: LinearCost { fixed_ns: 300.0, per_unit_ns: 0.1 },
     };
-    let costs = Costs { master: toll, worker: toll, result: 2_000.0, ..Costs::default() };
+    let costs = Costs {
+        master: toll,
+        worker: toll,
+        result: LinearCost { fixed_ns: 2_000.0, per_unit_ns: 0.0 },
+        ..Costs::default()
+    };
     let link = Link { bytes_per_s: Some(1.2e8), latency_ns: 50_000 };
     for (workers, threads, in_flight) in [(1, 1, 1), (3, 2, 4), (8, 1, 4)] {
-        let c = Cluster { costs, link, threads, in_flight, ..cluster(workers) };
+        let c = Cluster { costs, link, threads, frames_in_flight: in_flight, ..cluster(workers) };
         let outcome = run(&region, &trace, &c);
-        let frames = sim::Outcome::steady(9, in_flight);
-        let ms = outcome.steady_ms(in_flight) * frames as f64 * f64::from(workers * threads);
-        let all = outcome.spent.all() as f64 / 1e6;
+        let frames = sim::Outcome::steady_frames(9, in_flight);
+        let ms =
+            outcome.steady_interval_ms(in_flight) * frames as f64 * f64::from(workers * threads);
+        let all = outcome.thread_time.total() as f64 / 1e6;
         assert!((all / ms - 1.0).abs() < 0.02, "{workers}x{threads}: {all} of {ms}");
-        let drawn = outcome.spent.tiles + outcome.spent.tables + outcome.spent.blocks;
-        assert!(drawn > 0 && outcome.spent.bricks > 0, "{:?}", outcome.spent);
+        let drawn =
+            outcome.thread_time.tiles + outcome.thread_time.tables + outcome.thread_time.blocks;
+        assert!(drawn > 0 && outcome.thread_time.bricks > 0, "{:?}", outcome.thread_time);
     }
 }
 
@@ -566,12 +597,8 @@ fn a_worker_looks_at_a_block_once_a_frame() {
 #[derive(Default)]
 struct Listener(Vec<(FrameStats, Vec<Span>)>);
 
-impl sim::Stopwatch for Listener {
-    fn read(&mut self) -> Option<sim::Nanos> {
-        None
-    }
-
-    fn done(&mut self, stats: FrameStats, spans: Spans) {
+impl sim::Observer for Listener {
+    fn frame_done(&mut self, _: FrameId, _: Box<FrameState>, stats: FrameStats, spans: Spans) {
         self.0.push((stats, spans.to_vec()));
     }
 }

@@ -16,7 +16,7 @@ use slabcast_common::quality::Schedule;
 use slabcast_common::slab::SheetRange;
 use slabcast_proto::cluster_v1::{ControlRequest, ControlResponse};
 use slabcast_proto::convert::{self, Compression, Down};
-use slabcast_sim::{Costs, Toll};
+use slabcast_sim::{Costs, LinearCost, MessageCosts};
 use slabcast_trace::{self as trace, Pings, Trace};
 use std::time::Instant;
 
@@ -137,31 +137,33 @@ pub(super) fn messages(trace: &Trace, schedule: Schedule) -> Costs {
         let message = ControlResponse::decode(&lease_bytes[..]).expect("written above");
         drop(convert::to_worker_from_wire(message));
     });
+    let each = |per_unit_ns| LinearCost { fixed_ns: price.each, per_unit_ns };
     Costs {
-        master: Toll {
-            woken: price.woken[0],
-            call: price.call,
-            send: (price.each, byte(send, &lease_bytes)),
-            receive: (price.each, byte(receive, &result_bytes)),
-            bricks: (price.each, BYTE),
+        master: MessageCosts {
+            wake_ns: price.woken[0],
+            call_ns: price.call,
+            send: each(byte(send, &lease_bytes)),
+            receive: each(byte(receive, &result_bytes)),
+            bricks: each(BYTE),
         },
-        worker: Toll {
-            woken: price.woken[1],
-            call: price.call,
-            send: (price.each, byte(worker_send, &result_bytes)),
-            receive: (price.each, byte(worker_receive, &lease_bytes)),
+        worker: MessageCosts {
+            wake_ns: price.woken[1],
+            call_ns: price.call,
+            send: each(byte(worker_send, &result_bytes)),
+            receive: each(byte(worker_receive, &lease_bytes)),
             // Bricks are decoded and put into the cache: some 3 ns a byte (docs/performance.md).
-            bricks: (price.each, BYTE + 3.0),
+            bricks: each(BYTE + 3.0),
         },
-        pack: trace.about.packing.pack_ns,
-        unpack: trace.about.packing.unpack_ns,
-        finish_pixel: finish(trace, by_region),
-        mark_pixel: mark(trace.about.size),
-        deliver: DELIVER,
-        hold: (0.0, fill(by_region)),
-        late: late(),
-        driver_woken: price.driver_woken,
-        driver_message: price.driver_each,
+        pack_byte_ns: trace.about.packing.pack_ns,
+        unpack_byte_ns: trace.about.packing.unpack_ns,
+        finish_pixel_ns: finish(trace, by_region),
+        mark_pixel_ns: mark(trace.about.size),
+        deliver_pixel_ns: DELIVER[0],
+        client_pixel_ns: DELIVER[1],
+        placeholder: LinearCost { fixed_ns: 0.0, per_unit_ns: fill(by_region) },
+        late_wake_ns: late(),
+        driver_wake_ns: price.driver_woken,
+        driver_message_ns: price.driver_each,
         ..Costs::default()
     }
 }

@@ -24,7 +24,7 @@ use slabcast_session::path_scenes::PathScenes;
 use slabcast_session::progress::{Progress, warn};
 use slabcast_session::request::{OpenedVolume, RenderRequest, VolumeSceneArgs, WorkArgs};
 use slabcast_session::{machine, parse, signals};
-use slabcast_sim::{Link, alone_ms};
+use slabcast_sim::{Link, one_core_ms};
 use slabcast_trace::{MAX_BYTES, Pings, Trace};
 use std::fmt::Write as _;
 use std::io::{Read, Write};
@@ -381,7 +381,7 @@ impl Said<'_> {
             self.cluster(),
             self.tiles(),
             trace.about.repeats,
-            alone_ms(trace),
+            one_core_ms(trace),
             said_of(trace.about.pings.as_ref()),
         );
         for p in self.predicted {
@@ -494,7 +494,7 @@ impl Said<'_> {
                 "volume": trace.about.volume, "transfer": trace.about.transfer,
                 "size": trace.about.size, "frames": trace.frames.len(), "tiles": self.tiles(),
                 "repeats": trace.about.repeats, "simd": trace.about.simd,
-                "slabs": trace.about.slabs, "alone_ms": alone_ms(trace),
+                "slabs": trace.about.slabs, "alone_ms": one_core_ms(trace),
                 "pings": trace.about.pings,
             },
             "cluster": {

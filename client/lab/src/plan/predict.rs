@@ -4,6 +4,7 @@ use super::clock::cpu_ns;
 use super::costs;
 use crate::statistics::spearman;
 use slabcast_common::ids::FrameId;
+use slabcast_common::image::FrameState;
 use slabcast_common::link::{FRAMES_IN_FLIGHT, stream_threads};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Schedule;
@@ -11,7 +12,10 @@ use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{FrameJob, Spans};
 use slabcast_session::direct::map_parallel;
 use slabcast_session::fail::Fail;
-use slabcast_sim::{self as sim, Cluster, Costs, Link, Outcome, Stopwatch, Took, Unmeasured};
+use slabcast_sim::{
+    self as sim, Cluster, Costs, DecisionTimes, LinearCost, Link, NoObserver, Observer, Outcome,
+    Tally,
+};
 use slabcast_trace::Trace;
 
 /// What a frame's time goes into.
@@ -111,7 +115,16 @@ pub(crate) struct Question {
 impl Question {
     pub(crate) fn cluster(&self, workers: u32, costs: Costs, in_flight: u32) -> Cluster {
         let &Question { threads, link, cores, stretch, mixed } = self;
-        Cluster { workers, threads, link, costs, cores, in_flight, stretch, mixed }
+        Cluster {
+            workers,
+            threads,
+            link,
+            costs,
+            shared_cores: cores,
+            frames_in_flight: in_flight,
+            stretch,
+            mixed,
+        }
     }
 }
 
@@ -120,7 +133,7 @@ pub(crate) fn simulate(
     trace: &Trace,
     cluster: &Cluster,
 ) -> Result<Outcome, Fail> {
-    watched(jobs, trace, cluster, &mut Unmeasured)
+    watched(jobs, trace, cluster, &mut NoObserver)
 }
 
 /// The same while somebody looks on.
@@ -128,7 +141,7 @@ pub(crate) fn watched(
     jobs: &[FrameJob],
     trace: &Trace,
     cluster: &Cluster,
-    watch: &mut dyn Stopwatch,
+    watch: &mut dyn Observer,
 ) -> Result<Outcome, Fail> {
     let ran = sim::run(jobs, trace, cluster, watch);
     ran.map(|r| r.0).map_err(|e| Fail::failed(e.to_string()))
@@ -165,15 +178,15 @@ fn row(
         let question = Question { link, ..*question };
         simulate(jobs, trace, &question.cluster(workers, costs, in_flight))
     };
-    let alone = sim::alone_ms(trace) * question.stretch;
-    let steadily = sim::steadily_alone_ms(trace, IN_FLIGHT) * question.stretch;
+    let alone = sim::one_core_ms(trace) * question.stretch;
+    let steadily = sim::one_core_steady_ms(trace, IN_FLIGHT) * question.stretch;
     let threads = f64::from(workers * question.threads);
     let latency = run(question.link, costs, 1)?;
     let throughput = run(question.link, several, IN_FLIGHT)?;
     // What a resource costs is what a frame is shorter by where there is plenty of it.
-    let no_link = run(Link::NONE, costs, 1)?;
+    let no_link = run(Link::UNLIMITED, costs, 1)?;
     let free = Costs { worker: costs.worker, ..Costs::default() };
-    let neither = run(Link::NONE, free, 1)?;
+    let neither = run(Link::UNLIMITED, free, 1)?;
     let frame_ms = latency.frame_ms();
     let cores = neither.mean(|f| f.render) / 1e6 / threads;
     let parts = [
@@ -186,25 +199,25 @@ fn row(
     let kinds = [Bound::Cores, Bound::Straggler, Bound::Link, Bound::Master];
     let most = (0..4).max_by(|&a, &b| parts[a].total_cmp(&parts[b])).unwrap_or(0);
     let frames = jobs.len() as f64;
-    let each_ms = throughput.steady_ms(IN_FLIGHT);
-    let spent = throughput.spent;
-    let told = Outcome::steady(jobs.len(), IN_FLIGHT) >= STEADILY;
+    let each_ms = throughput.steady_interval_ms(IN_FLIGHT);
+    let spent = throughput.thread_time;
+    let told = Outcome::steady_frames(jobs.len(), IN_FLIGHT) >= STEADILY;
     let throughput_efficiency = steadily / threads / each_ms;
-    let steady = (told && spent.all() > 0).then(|| {
-        let all_spent = spent.all() as f64;
+    let steady = (told && spent.total() > 0).then(|| {
+        let all_spent = spent.total() as f64;
         let part = |ns: u64| ns as f64 / all_spent;
         let drawing = part(spent.tiles + spent.tables + spent.blocks);
         let window = all_spent / threads;
-        let [driver, streams] = [0, 1].map(|i| throughput.steady[i] as f64 / window);
+        let [driver, streams] = [0, 1].map(|i| throughput.steady_work[i] as f64 / window);
         Steady {
             lost: [
                 drawing - part(spent.tables) - throughput_efficiency,
                 part(spent.tables),
                 part(spent.messages),
                 part(spent.bricks),
-                part(spent.way),
-                part(spent.dry),
-                part(spent.tail),
+                part(spent.round_trip),
+                part(spent.no_work),
+                part(spent.path_end),
             ],
             busy: [driver, streams / stream_threads(u32::MAX) as f64],
             deciding_ms,
@@ -220,10 +233,13 @@ fn row(
         leases: latency.mean(|f| f.leases),
         bound: (kinds[most], parts[most] / all),
         parts,
-        master_ms: std::array::from_fn(|i| {
-            let all = [latency.driver, latency.streams, latency.finisher][i];
-            (all - latency.first[i]) as f64 / 1e6 / (frames - 1.0).max(1.0)
-        }),
+        master_ms: {
+            let later = |work: fn(&sim::Work) -> u64| {
+                let ns = work(&latency.work) - work(&latency.first_work);
+                ns as f64 / 1e6 / (frames - 1.0).max(1.0)
+            };
+            [later(|w| w.driver), later(|w| w.streams), later(|w| w.finishers)]
+        },
         messages: [
             latency.mean(|f| f.messages_down),
             latency.mean(|f| f.writes_down),
@@ -243,7 +259,7 @@ pub(crate) fn orders(
     workers: u32,
 ) -> Result<Option<[f64; 2]>, Fail> {
     let question =
-        Question { threads: 1, link: Link::NONE, cores: None, stretch: 1.0, mixed: false };
+        Question { threads: 1, link: Link::UNLIMITED, cores: None, stretch: 1.0, mixed: false };
     let cluster = question.cluster(workers, Costs::default(), 1);
     let told = |jobs: &[FrameJob], trace: &Trace| -> Result<Vec<FrameStats>, Fail> {
         let mut heard = Heard::default();
@@ -280,20 +296,16 @@ pub(crate) fn orders(
 #[derive(Default)]
 struct Heard(Vec<FrameStats>);
 
-impl Stopwatch for Heard {
-    fn read(&mut self) -> Option<u64> {
-        None
-    }
-
-    fn done(&mut self, stats: FrameStats, _: Spans) {
+impl Observer for Heard {
+    fn frame_done(&mut self, _: FrameId, _: Box<FrameState>, stats: FrameStats, _: Spans) {
         self.0.push(stats);
     }
 }
 
 struct Cpu;
 
-impl Stopwatch for Cpu {
-    fn read(&mut self) -> Option<u64> {
+impl Observer for Cpu {
+    fn processor_ns(&mut self) -> Option<u64> {
         Some(cpu_ns())
     }
 }
@@ -327,37 +339,37 @@ pub(crate) fn decided(
     messages: Costs,
     in_flight: u32,
 ) -> Result<(Costs, f64), Fail> {
-    let question = Question { threads, link: Link::NONE, cores: None, stretch: 1.0, mixed: false };
+    let question =
+        Question { threads, link: Link::UNLIMITED, cores: None, stretch: 1.0, mixed: false };
     let mut watch = Cpu;
     let cluster = question.cluster(workers, messages, in_flight);
     let (_, took) =
         sim::run(jobs, trace, &cluster, &mut watch).map_err(|e| Fail::failed(e.to_string()))?;
-    let per = |(n, ns): (u64, u64)| if n == 0 { 0.0 } else { ns as f64 / n as f64 };
-    let Took { first, frames, slabs, results, ahead, others, result_count, .. } = took;
-    // Of what is of the order of a microsecond that is a part.
+    let DecisionTimes { first_frame, frames, slabs, results, prefetches, others, .. } = took;
+    let result_count = took.result_count;
+    // Reading the clock takes part of what is of the order of a microsecond.
     let reading = reading();
-    let each = |counted: (u64, u64)| (per(counted) - reading).max(0.0);
+    let each = |tally: Tally| (tally.each_ns() - reading).max(0.0);
     // Sums go by their pixels, which the scheduler keeps; it keeps finished tiles as they come.
     let finished =
         jobs.first().is_some_and(|j| j.work.schedule != Schedule::Slab && j.finish.is_some());
-    let (result, result_pixel) = match finished {
-        true => (each((result_count, results.1)), 0.0),
-        false => (0.0, per(results)),
+    let (fixed_ns, per_unit_ns) = match finished {
+        true => (each(Tally { count: result_count, ns: results.ns }), 0.0),
+        false => (0.0, results.each_ns()),
     };
     // The first frame sorts the bricks into blocks.
     let begun = jobs.len().saturating_sub(1) as f64;
-    let many = (result_count + ahead.0 + others.0) as f64 + jobs.len() as f64;
-    let beside = (slabs.1 + results.1 + ahead.1 + others.1) as f64 - reading * many;
-    let a_frame = frames.1 as f64 / begun.max(1.0) + beside.max(0.0) / jobs.len() as f64;
+    let many = (result_count + prefetches.count + others.count) as f64 + jobs.len() as f64;
+    let beside = (slabs.ns + results.ns + prefetches.ns + others.ns) as f64 - reading * many;
+    let a_frame = frames.ns as f64 / begun.max(1.0) + beside.max(0.0) / jobs.len() as f64;
     let costs = Costs {
-        first_brick: per(first),
-        frame_brick: per(frames),
-        slab_brick: per(slabs),
+        first_brick_ns: first_frame.each_ns(),
+        frame_brick_ns: frames.each_ns(),
+        slab_brick_ns: slabs.each_ns(),
         // A result and the lease that follows it are handled in one go.
-        result,
-        result_pixel,
-        ahead: each(ahead),
-        event: each(others),
+        result: LinearCost { fixed_ns, per_unit_ns },
+        prefetch_ns: each(prefetches),
+        event_ns: each(others),
         ..messages
     };
     Ok((costs, a_frame / 1e6))

@@ -9,7 +9,7 @@ use super::measure::FINISH;
 use super::predict::{self, Question};
 use slabcast_client::{Client, Update};
 use slabcast_common::ids::FrameId;
-use slabcast_common::image::PixelEncoding;
+use slabcast_common::image::{FrameState, PixelEncoding};
 use slabcast_common::stats::FrameStats;
 use slabcast_scene::request::PathRequest;
 use slabcast_schedule::{FrameJob, Spans};
@@ -17,7 +17,7 @@ use slabcast_session::fail::Fail;
 use slabcast_session::progress::Progress;
 use slabcast_session::request::{AxisArgs, RenderRequest};
 use slabcast_session::{machine, remote, runtime};
-use slabcast_sim::{Costs, Link, Nanos, Outcome, Stopwatch};
+use slabcast_sim::{Costs, Link, Observer, Outcome};
 use slabcast_trace::Trace;
 use std::collections::VecDeque;
 use std::ffi::OsStr;
@@ -70,7 +70,7 @@ pub(super) struct Over<'a> {
 impl Over<'_> {
     /// This machine's own, which has no limit.
     pub(super) const LOOPBACK: Over<'static> =
-        Over { at: IpAddr::V4(Ipv4Addr::LOCALHOST), by: None, link: Link::NONE };
+        Over { at: IpAddr::V4(Ipv4Addr::LOCALHOST), by: None, link: Link::UNLIMITED };
 }
 
 /// A process that ends with this value.
@@ -271,7 +271,7 @@ impl PathScenes<'_> {
             frame_ms: mean(&played.totals),
             predicted_ms,
             each_ms: played.each_ms,
-            predicted_each_ms: predicted.each_ms(),
+            predicted_each_ms: predicted.interval_ms(),
             master_ms,
             predicted_master_ms: ms(master),
             workers_ms,
@@ -291,12 +291,8 @@ fn mean(totals: &[f64]) -> f64 {
 #[derive(Default)]
 struct Totals(Vec<f64>);
 
-impl Stopwatch for Totals {
-    fn read(&mut self) -> Option<Nanos> {
-        None
-    }
-
-    fn done(&mut self, stats: FrameStats, _: Spans) {
+impl Observer for Totals {
+    fn frame_done(&mut self, _: FrameId, _: Box<FrameState>, stats: FrameStats, _: Spans) {
         self.0.push(stats.ms.total);
     }
 }

@@ -9,12 +9,14 @@
 use super::paper;
 use crate::plan::predict::{self, Question};
 use serde::Serialize;
+use slabcast_common::ids::FrameId;
+use slabcast_common::image::FrameState;
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::stats::FrameStats;
 use slabcast_schedule::{FrameJob, Span, Spans};
 use slabcast_session::direct::map_parallel;
 use slabcast_session::fail::Fail;
-use slabcast_sim::{Costs, Link, Nanos, Stopwatch, alone_ms};
+use slabcast_sim::{Costs, Link, Observer, one_core_ms};
 use slabcast_trace::Trace;
 
 /// How fast tiles are drawn.
@@ -53,12 +55,8 @@ pub(super) type Told = (FrameStats, Vec<Span>);
 #[derive(Default)]
 struct Listener(Vec<Told>);
 
-impl Stopwatch for Listener {
-    fn read(&mut self) -> Option<Nanos> {
-        None
-    }
-
-    fn done(&mut self, stats: FrameStats, spans: Spans) {
+impl Observer for Listener {
+    fn frame_done(&mut self, _: FrameId, _: Box<FrameState>, stats: FrameStats, spans: Spans) {
         self.0.push((stats, spans.to_vec()));
     }
 }
@@ -98,14 +96,14 @@ impl Bed {
 
     /// A frame alone on one core, in ms.
     pub(super) fn alone_ms(&self, pace: Pace) -> f64 {
-        alone_ms(&self.trace) * self.stretch(pace)
+        one_core_ms(&self.trace) * self.stretch(pace)
     }
 
     /// What times are multiplied with.
     pub(super) fn stretch(&self, pace: Pace) -> f64 {
         match pace {
             Pace::Here => 1.0,
-            Pace::Paper => paper::ALONE_S * 1e3 / alone_ms(&self.trace).max(1e-6),
+            Pace::Paper => paper::ALONE_S * 1e3 / one_core_ms(&self.trace).max(1e-6),
         }
     }
 

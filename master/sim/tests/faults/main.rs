@@ -1,15 +1,14 @@
 //! The schedule against a virtual cluster (PROMISES.md R1 to R5, R9, R11).
 
-mod fake;
-mod rng;
+mod pattern;
 mod stories;
 mod world;
 
-use rng::Rng;
 use slabcast_common::ids::{FrameId, SceneId, WorkerId};
 use slabcast_common::quality::{Borders, Quality, Schedule, Work};
 use slabcast_schedule::Config;
-use world::{Nature, Script, World};
+use slabcast_sim::{Faults, Incident, Rng, WorkerProfile};
+use world::{Story, World, new_world, typical};
 
 /// Seeds of a run, `SLABCAST_SEEDS=10000` for a campaign, `SLABCAST_SEED=17` for one.
 fn seeds(default: u64) -> std::ops::Range<u64> {
@@ -20,25 +19,35 @@ fn seeds(default: u64) -> std::ops::Range<u64> {
     }
 }
 
-fn nature(rng: &mut Rng, small_budgets: bool) -> Nature {
-    let rarely = |rng: &mut Rng, n| if rng.once_in(4) { rng.between(n / 2, n) } else { 0 };
-    let slowest = rng.pick(&[200, 2_000, 30_000]);
-    Nature {
+/// A random worker, with faults.
+fn random_worker(rng: &mut Rng, small_budgets: bool) -> WorkerProfile {
+    let rarely = |rng: &mut Rng, n| if rng.one_in(4) { rng.between(n / 2, n) } else { 0 };
+    let slowest_ns = rng.pick(&[200_000, 2_000_000, 30_000_000]);
+    WorkerProfile {
         threads: rng.pick(&[1, 1, 2, 2, 3, 4, 8]),
-        is_local: rng.once_in(3),
-        us_per_pixel_sheet: rng.pick(&[0.05, 0.3, 1.0, 3.0]),
-        budget: if small_budgets { rng.pick(&[1, 3_000, 9_000, 30_000, 60_000]) } else { u64::MAX },
-        latency: (50, slowest),
-        us_per_brick: rng.pick(&[1, 20, 300, 3_000]),
-        clock_ahead: rng.below(1 << 40),
-        twice_in: rarely(rng, 8),
-        lie_in: rarely(rng, 60),
-        fail_in: rarely(rng, 60),
-        broken_in: rarely(rng, 40),
-        deadly: None,
-        hangs_at: None,
-        immune: false,
+        is_local: rng.one_in(3),
+        time_factor: rng.pick(&[0.05, 0.3, 1.0, 3.0]),
+        memory_budget_bytes: match small_budgets {
+            true => rng.pick(&[1, 3_000, 9_000, 30_000, 60_000]),
+            false => u64::MAX,
+        },
+        latency_ns: [50_000, slowest_ns],
+        brick_bytes_per_s: rng.pick(&[None, Some(4e7), Some(2.5e6), Some(2.5e5)]),
+        clock_ahead_us: rng.below(1 << 40),
+        faults: Faults {
+            duplicate_one_in: rarely(rng, 8),
+            lie_one_in: rarely(rng, 60),
+            fail_one_in: rarely(rng, 60),
+            broken_one_in: rarely(rng, 40),
+            ..Faults::default()
+        },
+        ..typical()
     }
+}
+
+/// A worker that no incident befalls.
+fn immune() -> WorkerProfile {
+    WorkerProfile { faults: Faults { immune: true, ..Faults::default() }, ..typical() }
 }
 
 /// The schedules of a world's frames.
@@ -59,14 +68,14 @@ fn chaos(seed: u64, schedules: Schedules) -> World {
         queue_ahead: rng.pick(&[1, 2, 2, 4]),
         ..Config::default()
     };
-    let mut w = World::new(seed, config);
-    let small_budgets = rng.once_in(3);
+    let mut w = new_world(seed, config);
+    let small_budgets = rng.one_in(3);
 
     let dims = [rng.between(8, 56) as u32, rng.between(8, 48) as u32, rng.between(8, 48) as u32];
     let sets: Vec<_> = (0..rng.between(1, 2) as u8)
         .map(|n| {
             let fill = rng.pick(&[1, 4, 8]);
-            (fake::key(n), fake::bricks(&mut rng, dims, fill))
+            (pattern::key(n), pattern::bricks(&mut rng, dims, fill))
         })
         .collect();
     let frames = rng.between(1, 3);
@@ -75,10 +84,10 @@ fn chaos(seed: u64, schedules: Schedules) -> World {
         let quality = Quality {
             thickness: rng.pick(&[1.0, 2.0, 4.0]),
             eps: rng.pick(&[0.0, 1.0 / 512.0, 0.05, 0.3]),
-            cull: !rng.once_in(4),
+            cull: !rng.one_in(4),
             ..Quality::default()
         };
-        let scene = fake::scene(frame, *set, dims, quality);
+        let scene = pattern::scene(frame, *set, dims, quality);
         let work = Work {
             slabs: rng.pick(&[1, 2, 3, 5, 100]),
             tiles_per_worker: rng.pick(&[0.5, 2.5, 2.5, 6.0]),
@@ -88,37 +97,37 @@ fn chaos(seed: u64, schedules: Schedules) -> World {
             ..Work::default()
         };
         let size = [rng.between(1, 130) as u32, rng.between(1, 130) as u32];
-        let job = fake::job(&mut rng, frame, &scene, bricks, size, work);
+        let job = pattern::job(&mut rng, frame, &scene, bricks, size, work);
         let when = rng.below(30_000);
         // In the order of their numbers.
-        w.script(1_000 + 50_000 * frame + when, Script::Queue(job));
-        if rng.once_in(8) {
+        w.schedule(1_000 + 50_000 * frame + when, Incident::Queue(job));
+        if rng.one_in(8) {
             let when = rng.below(200_000);
-            w.script(1_000 + 50_000 * frame + when, Script::Cancel(FrameId(frame)));
+            w.schedule(1_000 + 50_000 * frame + when, Incident::Cancel(FrameId(frame)));
         }
         let when = 60_000 * (frame + 1) + rng.below(400_000);
-        w.script(when.max(50_000 * frame + 40_000), Script::EndScene(SceneId(frame)));
+        w.schedule(when.max(50_000 * frame + 40_000), Incident::EndScene(SceneId(frame)));
     }
     for _ in 0..rng.between(0, 5) {
-        let n = nature(&mut rng, small_budgets);
-        w.join(n);
+        let n = random_worker(&mut rng, small_budgets);
+        w.add_worker(n);
     }
     // Some things go wrong, most of them while there is work.
     for _ in 0..rng.between(0, 10) {
         let when = 1_000 + rng.below(rng.clone().pick(&[100_000, 400_000, 5_000_000]));
         let whom = WorkerId(rng.between(1, 8));
         let what = match rng.below(10) {
-            0..=3 => Script::Kill(whom),
-            4 | 5 => Script::Stall(whom, rng.pick(&[10_000, 500_000, 2_000_000, 20_000_000])),
-            6 => Script::Leave(whom),
-            7 => Script::Slow(whom, 40.0),
-            _ => Script::Join(nature(&mut rng, small_budgets)),
+            0..=3 => Incident::Kill(whom),
+            4 | 5 => Incident::Partition(whom, rng.pick(&[10_000, 500_000, 2_000_000, 20_000_000])),
+            6 => Incident::Leave(whom),
+            7 => Incident::Slow(whom, 40.0),
+            _ => Incident::Join(Box::new(random_worker(&mut rng, small_budgets))),
         };
-        w.script(when, what);
+        w.schedule(when, what);
     }
     // In the end there is somebody.
     let when = rng.pick(&[1_000_000, 6_000_000]);
-    w.script(when, Script::Join(Nature { immune: true, ..Nature::default() }));
+    w.schedule(when, Incident::Join(Box::new(immune())));
     w.finish();
     w
 }
@@ -148,47 +157,47 @@ fn chaos_alone(seed: u64) -> World {
         queue_ahead: rng.pick(&[1, 2, 4]),
         ..Config::default()
     };
-    let mut w = World::new(seed, config);
-    let small_budgets = rng.once_in(4);
+    let mut w = new_world(seed, config);
+    let small_budgets = rng.one_in(4);
     let dims = [rng.between(16, 40) as u32, rng.between(16, 40) as u32, rng.between(8, 24) as u32];
-    let (set, bricks) = (fake::key(0), fake::bricks(&mut rng, dims, 6));
+    let (set, bricks) = (pattern::key(0), pattern::bricks(&mut rng, dims, 6));
     let size = [rng.between(60, 260) as u32, rng.between(60, 200) as u32];
     let quality = Quality {
         thickness: rng.pick(&[2.0, 4.0]),
         eps: rng.pick(&[0.0, 1.0 / 512.0, 0.3]),
         ..Quality::default()
     };
-    let scene = fake::scene(0, set, dims, quality);
+    let scene = pattern::scene(0, set, dims, quality);
     let work = Work { schedule: Schedule::Region, ..Work::default() };
     let turn = rng.below(1000);
     for _ in 0..rng.between(1, 10) {
-        let n = nature(&mut rng, small_budgets);
-        w.join(Nature { us_per_pixel_sheet: rng.pick(&[0.05, 0.05, 0.2]), ..n });
+        let n = random_worker(&mut rng, small_budgets);
+        w.add_worker(WorkerProfile { time_factor: rng.pick(&[0.05, 0.05, 0.2]), ..n });
     }
     for frame in 0..rng.between(3, 6) {
         // Some views are alike, as on a path.
         let mut view = Rng::new(turn + rng.pick(&[0, 0, 0, 1]));
-        w.queue(fake::job(&mut view, frame, &scene, &bricks, size, work));
+        w.add_frame(pattern::job(&mut view, frame, &scene, &bricks, size, work));
         for _ in 0..rng.pick(&[0, 0, 1, 3]) {
             let when = w.now() + rng.below(rng.clone().pick(&[3_000, 30_000]));
             let whom = WorkerId(rng.between(1, 8));
             let what = match rng.below(8) {
-                0..=2 => Script::Kill(whom),
-                3 => Script::Stall(whom, rng.pick(&[10_000, 500_000, 20_000_000])),
-                4 => Script::Leave(whom),
-                5 => Script::Slow(whom, 4.0),
-                6 => Script::Cancel(FrameId(frame)),
-                _ => Script::Join(nature(&mut rng, small_budgets)),
+                0..=2 => Incident::Kill(whom),
+                3 => Incident::Partition(whom, rng.pick(&[10_000, 500_000, 20_000_000])),
+                4 => Incident::Leave(whom),
+                5 => Incident::Slow(whom, 4.0),
+                6 => Incident::Cancel(FrameId(frame)),
+                _ => Incident::Join(Box::new(random_worker(&mut rng, small_budgets))),
             };
-            w.script(when, what);
+            w.schedule(when, what);
         }
-        if !w.scheduler.has_workers() || rng.once_in(3) {
+        if !w.scheduler().has_workers() || rng.one_in(3) {
             let when = w.now() + rng.below(20_000);
-            w.script(when, Script::Join(Nature { immune: true, ..Nature::default() }));
+            w.schedule(when, Incident::Join(Box::new(immune())));
         }
         let when = w.now() + 1_000_000;
-        w.script(when, Script::Join(Nature { immune: true, ..Nature::default() }));
-        w.run_until(|w| w.scheduler.is_idle());
+        w.schedule(when, Incident::Join(Box::new(immune())));
+        w.until(|w| w.scheduler().is_idle());
     }
     w.finish();
     w
@@ -202,17 +211,21 @@ fn pictures_of_frames_alone_are_the_serial_ones_however_their_tiles_are_cut() {
     let mut pieces = 0;
     for seed in range {
         let w = chaos_alone(seed);
-        pieces += w.handed_over;
-        frames += w.done.len();
-        lost += w.scheduler.totals().lost_workers;
-        dropped += w.scheduler.totals().dropped_results;
-        for done in w.done.values() {
+        pieces += w.handed_over();
+        frames += w.observer.done.len();
+        lost += w.scheduler().totals().lost_workers;
+        dropped += w.scheduler().totals().dropped_results;
+        for done in w.observer.done.values() {
             let has = |size| done.stats.slabs.iter().flat_map(|s| &s.tiles).any(|t| t.size == size);
             cut += usize::from(has(32));
             mixed += usize::from(has(32) && has(64));
             retries += done.stats.retries;
         }
-        assert_eq!(w.log, chaos_alone(seed).log, "seed {seed} replays");
+        assert_eq!(
+            w.observer.audit.log,
+            chaos_alone(seed).observer.audit.log,
+            "seed {seed} replays"
+        );
     }
     println!(
         "alone: {frames} frames, {cut} cut, {mixed} of them in part, {pieces} pieces given away, {retries} \
@@ -226,41 +239,41 @@ fn pictures_of_frames_alone_are_the_serial_ones_however_their_tiles_are_cut() {
 fn chaos_crowd(seed: u64) -> (World, usize) {
     let mut rng = Rng::new(seed ^ 0xc70d_5000);
     let config = Config { lease: rng.pick(&[60_000_000, 100_000]), ..Config::default() };
-    let mut w = World::new(seed, Config { poison_after: 1000, ..config });
+    let mut w = new_world(seed, Config { poison_after: 1000, ..config });
     let dims = [rng.between(8, 24) as u32, rng.between(8, 24) as u32, rng.between(8, 16) as u32];
-    let (set, bricks) = (fake::key(0), fake::bricks(&mut rng, dims, 6));
+    let (set, bricks) = (pattern::key(0), pattern::bricks(&mut rng, dims, 6));
     let size = [rng.between(40, 140) as u32, rng.between(40, 140) as u32];
     let quality = Quality { thickness: 4.0, ..Quality::default() };
-    let scene = fake::scene(0, set, dims, quality);
+    let scene = pattern::scene(0, set, dims, quality);
     let work = Work { schedule: Schedule::Region, ..Work::default() };
-    let small_budgets = rng.once_in(4);
+    let small_budgets = rng.one_in(4);
     for _ in 0..rng.between(5, 24) {
-        let n = nature(&mut rng, small_budgets);
-        w.join(Nature { us_per_pixel_sheet: 0.002, latency: (200, 2_000), ..n });
+        let n = random_worker(&mut rng, small_budgets);
+        w.add_worker(WorkerProfile { time_factor: 0.002, latency_ns: [200_000, 2_000_000], ..n });
     }
-    let (frames, one_by_one) = (rng.between(24, 40), rng.once_in(3));
+    let (frames, one_by_one) = (rng.between(24, 40), rng.one_in(3));
     let mut most = 0;
     for frame in 0..frames {
         let turn = seed + frame / 4;
-        w.queue(fake::job(&mut Rng::new(turn), frame, &scene, &bricks, size, work));
-        if rng.once_in(5) {
+        w.add_frame(pattern::job(&mut Rng::new(turn), frame, &scene, &bricks, size, work));
+        if rng.one_in(5) {
             let when = w.now() + rng.below(20_000);
             let whom = WorkerId(rng.between(1, 24));
             let what = match rng.below(8) {
-                0..=3 => Script::Kill(whom),
-                4 => Script::Stall(whom, rng.pick(&[10_000, 500_000, 20_000_000])),
-                5 => Script::Leave(whom),
-                6 => Script::Cancel(FrameId(frame)),
-                _ => Script::Join(nature(&mut rng, small_budgets)),
+                0..=3 => Incident::Kill(whom),
+                4 => Incident::Partition(whom, rng.pick(&[10_000, 500_000, 20_000_000])),
+                5 => Incident::Leave(whom),
+                6 => Incident::Cancel(FrameId(frame)),
+                _ => Incident::Join(Box::new(random_worker(&mut rng, small_budgets))),
             };
-            w.script(when, what);
+            w.schedule(when, what);
         }
         if one_by_one || frame % 8 == 7 {
             let when = w.now() + 1_000_000;
-            w.script(when, Script::Join(Nature { immune: true, ..Nature::default() }));
-            w.run_until(|w| {
-                most = most.max(w.scheduler.in_reserve());
-                w.scheduler.is_idle()
+            w.schedule(when, Incident::Join(Box::new(immune())));
+            w.until(|w| {
+                most = most.max(w.scheduler().in_reserve());
+                w.scheduler().is_idle()
             });
         }
     }
@@ -277,10 +290,14 @@ fn pictures_are_the_serial_ones_whoever_is_held_in_reserve() {
         let (w, most) = chaos_crowd(seed);
         worlds += 1;
         held += usize::from(most > 0);
-        frames += w.done.len();
-        lost += w.scheduler.totals().lost_workers;
-        retries += w.done.values().map(|d| d.stats.retries).sum::<u64>();
-        assert_eq!(w.log, chaos_crowd(seed).0.log, "seed {seed} replays");
+        frames += w.observer.done.len();
+        lost += w.scheduler().totals().lost_workers;
+        retries += w.observer.done.values().map(|d| d.stats.retries).sum::<u64>();
+        assert_eq!(
+            w.observer.audit.log,
+            chaos_crowd(seed).0.observer.audit.log,
+            "seed {seed} replays"
+        );
     }
     println!(
         "crowds: {frames} frames, workers in reserve in {held} of {worlds} worlds, {retries} retries, {lost} workers lost"
@@ -292,7 +309,7 @@ fn pictures_are_the_serial_ones_whoever_is_held_in_reserve() {
 /// statistics had bricks on their way after its end.
 #[test]
 fn a_frame_that_is_done_takes_no_part_in_what_comes_after() {
-    assert!(!chaos(738, REGION).done.is_empty());
+    assert!(!chaos(738, REGION).observer.done.is_empty());
 }
 
 fn campaign(schedules: Schedules, range: std::ops::Range<u64>) {
@@ -302,13 +319,13 @@ fn campaign(schedules: Schedules, range: std::ops::Range<u64>) {
     let clock = std::time::Instant::now();
     for seed in range {
         let w = chaos(seed, schedules);
-        frames += w.done.len();
-        retries += w.done.values().map(|d| d.stats.retries).sum::<u64>();
-        dropped += w.scheduler.totals().dropped_results;
-        lost += w.scheduler.totals().lost_workers;
-        over_budget += w.scheduler.totals().over_budget;
-        lies += w.drops.iter().filter(|d| d.1.contains("plane")).count();
-        leases += w.leases_given;
+        frames += w.observer.done.len();
+        retries += w.observer.done.values().map(|d| d.stats.retries).sum::<u64>();
+        dropped += w.scheduler().totals().dropped_results;
+        lost += w.scheduler().totals().lost_workers;
+        over_budget += w.scheduler().totals().over_budget;
+        lies += w.observer.audit.drops.iter().filter(|d| d.1.contains("plane")).count();
+        leases += w.observer.audit.leases_given;
         virtual_us += w.now();
     }
     let secs = clock.elapsed().as_secs_f64();
@@ -329,7 +346,7 @@ fn campaign(schedules: Schedules, range: std::ops::Range<u64>) {
 fn a_seed_replays() {
     for seed in [3, 17, 40, 77] {
         for schedules in [SLAB, REGION, MIXED] {
-            let logs = [(); 2].map(|()| chaos(seed, schedules).log);
+            let logs = [(); 2].map(|()| chaos(seed, schedules).observer.audit.log);
             assert_eq!(logs[0], logs[1], "seed {seed}");
         }
     }

@@ -1,0 +1,218 @@
+//! What a virtual cluster is made of: links, costs, the master and its workers.
+
+use crate::Nanos;
+use slabcast_common::link::FRAMES_IN_FLIGHT;
+use slabcast_schedule::{Config, Micros};
+
+/// One link between two machines, each way.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Link {
+    /// Bytes a second that a stream gets through; `None`: no limit.
+    pub bytes_per_s: Option<f64>,
+    /// Nanoseconds from one end to the other.
+    pub latency_ns: Nanos,
+}
+
+impl Link {
+    /// A link without limit or delay.
+    pub const UNLIMITED: Link = Link { bytes_per_s: None, latency_ns: 0 };
+}
+
+/// Processor time that grows with a count of bytes or pixels, in nanoseconds.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct LinearCost {
+    /// Nanoseconds of the operation as such.
+    pub fixed_ns: f64,
+    /// Nanoseconds for each byte or pixel.
+    pub per_unit_ns: f64,
+}
+
+impl LinearCost {
+    /// Returns the cost of `units` bytes or pixels, in nanoseconds.
+    pub fn ns(self, units: f64) -> f64 {
+        self.fixed_ns + self.per_unit_ns * units
+    }
+}
+
+/// Processor time that messages take at one end of a link.
+///
+/// A message in company costs a tenth of one alone: the sleeper is woken for the first, and messages
+/// that wait together are read and written in one call (docs/design/transport.md, answer 1). So
+/// waking is charged where a thread slept, and a call where no other message shares it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct MessageCosts {
+    /// Nanoseconds until a thread that slept begins to work.
+    pub wake_ns: f64,
+    /// Nanoseconds of a read from or a write to a socket.
+    pub call_ns: f64,
+    /// Sending a message of so many bytes.
+    pub send: LinearCost,
+    /// Receiving a message of so many bytes.
+    pub receive: LinearCost,
+    /// Sending or receiving a batch of bricks of so many bytes.
+    pub bricks: LinearCost,
+}
+
+/// Processor time of messages and decisions, in nanoseconds.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Costs {
+    /// Driver: begins the first frame, which also sorts the bricks; a brick of the frame.
+    pub first_brick_ns: f64,
+    /// Driver: begins a later frame; a brick of the frame.
+    pub frame_brick_ns: f64,
+    /// Driver: begins a slab; a brick of the frame.
+    pub slab_brick_ns: f64,
+    /// Driver: begins a slab; a pixel of the picture.
+    pub slab_pixel_ns: f64,
+    /// Driver: gives a lease of so many pixels.
+    pub lease: LinearCost,
+    /// Driver: takes a result of so many pixels.
+    pub result: LinearCost,
+    /// Driver: looks for the bricks of a frame to prefetch.
+    pub prefetch_ns: f64,
+    /// Driver: handles any other event.
+    pub event_ns: f64,
+    /// Driver: begins to work after it slept.
+    pub driver_wake_ns: f64,
+    /// Driver: takes a message from its queue, or puts one into a link's.
+    pub driver_message_ns: f64,
+    /// Master's streams: sends a pixel of a picture to the client.
+    pub deliver_pixel_ns: f64,
+    /// Client, where it runs on the master's machine: receives a pixel.
+    pub client_pixel_ns: f64,
+    /// Master's streams: messages.
+    pub master: MessageCosts,
+    /// Master's finishers: hash and encode a pixel.
+    pub finish_pixel_ns: f64,
+    /// Master's finishers in a rehearsal, whose pictures are marked all over: a pixel.
+    pub mark_pixel_ns: f64,
+    /// A worker's stream: messages. Waking one of its render threads costs as much.
+    pub worker: MessageCosts,
+    /// Worker: packs a byte of finished pixels.
+    pub pack_byte_ns: f64,
+    /// Master's streams: unpack a byte of finished pixels.
+    pub unpack_byte_ns: f64,
+    /// Rehearsing worker: fills the planes of a result of so many pixels.
+    pub placeholder: LinearCost,
+    /// Rehearsing worker: the system wakes a thread that holds a tile so much too late.
+    pub late_wake_ns: f64,
+}
+
+/// A cluster of equal workers whose times are predicted ([`run`](crate::run)).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Cluster {
+    /// Number of workers.
+    pub workers: u32,
+    /// Render threads of each worker, with a core each.
+    pub threads: u32,
+    /// Link of each worker, and the master's own, which all share.
+    pub link: Link,
+    /// Processor time of messages and decisions.
+    pub costs: Costs,
+    /// Cores of the one machine on which everything runs in a rehearsal, where rendering takes time
+    /// but no core. `None`: machines of their own; the master's has a core for each of its threads.
+    pub shared_cores: Option<u32>,
+    /// Frames that the master has in hand at once.
+    pub frames_in_flight: u32,
+    /// Factor on rendering times.
+    pub stretch: f64,
+    /// [`Config::mixed`].
+    pub mixed: bool,
+}
+
+/// The master of a virtual cluster, its machine and its link.
+#[derive(Clone, Debug)]
+pub struct Master {
+    /// The master's own link, which all workers share.
+    pub link: Link,
+    /// Processor time of messages and decisions.
+    pub costs: Costs,
+    /// See [`Cluster::shared_cores`].
+    pub shared_cores: Option<u32>,
+    /// Frames of a queued path that it has in hand at once.
+    pub frames_in_flight: u32,
+    /// Settings of the scheduler.
+    pub scheduler: Config,
+    /// Cuts bricks into messages of 1 to 16 bricks at random instead of full ones.
+    pub random_batches: bool,
+}
+
+impl Default for Master {
+    /// A master that takes no time, on a link without limit.
+    fn default() -> Self {
+        Master {
+            link: Link::UNLIMITED,
+            costs: Costs::default(),
+            shared_cores: None,
+            frames_in_flight: FRAMES_IN_FLIGHT as u32,
+            scheduler: Config::default(),
+            random_batches: false,
+        }
+    }
+}
+
+/// A virtual worker: its speed, memory and links, and the faults it has.
+#[derive(Clone, Debug)]
+pub struct WorkerProfile {
+    /// Render threads, with a core each.
+    pub threads: u32,
+    /// Whether it runs on the master's host.
+    pub is_local: bool,
+    /// Factor on the model's rendering times.
+    pub time_factor: f64,
+    /// Largest part by which a run takes longer, at random.
+    pub time_jitter: f64,
+    /// Nanoseconds that each run of a task takes besides drawing.
+    pub run_overhead_ns: Nanos,
+    /// Bytes of bricks that it may hold.
+    pub memory_budget_bytes: u64,
+    /// Bytes a second of its link each way; `None`: no limit.
+    pub bytes_per_s: Option<f64>,
+    /// Least and largest latency of a message, in nanoseconds. Messages of a stream keep their order.
+    pub latency_ns: [Nanos; 2],
+    /// Bytes a second at which its bricks arrive, besides the link; `None`: no limit.
+    pub brick_bytes_per_s: Option<f64>,
+    /// Microseconds by which its clock is ahead of the master's.
+    pub clock_ahead_us: Micros,
+    /// Faults that it has of itself.
+    pub faults: Faults,
+}
+
+impl Default for WorkerProfile {
+    /// One thread at the model's speed, with memory for everything, links without limit and no
+    /// faults.
+    fn default() -> Self {
+        WorkerProfile {
+            threads: 1,
+            is_local: false,
+            time_factor: 1.0,
+            time_jitter: 0.0,
+            run_overhead_ns: 0,
+            memory_budget_bytes: u64::MAX,
+            bytes_per_s: None,
+            latency_ns: [0; 2],
+            brick_bytes_per_s: None,
+            clock_ahead_us: 0,
+            faults: Faults::default(),
+        }
+    }
+}
+
+/// Faults of a worker that happen at random or at a tile. A rate of 0 means never.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Faults {
+    /// One result in so many is sent twice.
+    pub duplicate_one_in: u64,
+    /// One result, or handed-over piece, in so many is malformed.
+    pub lie_one_in: u64,
+    /// One task in so many is refused.
+    pub fail_one_in: u64,
+    /// One brick in so many arrives damaged.
+    pub broken_one_in: u64,
+    /// Upper left corner of tiles that kill the worker while it draws them.
+    pub deadly_tile: Option<[i32; 2]>,
+    /// Upper left corner of tiles that a thread never ends.
+    pub hanging_tile: Option<[i32; 2]>,
+    /// Whether incidents that name this worker are skipped.
+    pub immune: bool,
+}

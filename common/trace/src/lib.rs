@@ -87,7 +87,8 @@ pub struct Packing {
     pub unpack_ns: f64,
 }
 
-/// Processor time of a ping and its pong between a master and workers that TCP joins on one machine.
+/// Processor time of a ping and its pong between a master and workers that TCP joins on one
+/// machine.
 ///
 /// Each field lists the master's driver, the master's streams and the worker, in nanoseconds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -114,8 +115,8 @@ pub struct FrameTrace {
     pub alone_edge: u32,
     /// Slabs, front to back: for the `slab` schedule.
     pub slabs: Vec<SlabTrace>,
-    /// Nanoseconds each worker takes once a frame to look at the directory's blocks of bricks, under
-    /// the `region` schedule.
+    /// Nanoseconds each worker takes once a frame to look at the directory's blocks of bricks,
+    /// under the `region` schedule.
     #[serde(default)]
     pub outlook_ns: u64,
     /// Mean nanoseconds to look at the bricks of one block, which a worker does once a frame for
@@ -183,7 +184,8 @@ pub struct RegionTile {
     pub plain_bytes: u32,
     /// Places of the bricks that it is drawn from, ascending.
     pub touched: Vec<u32>,
-    /// Numbers of the blocks whose bricks it looks at, ascending; blocks are numbered front to back.
+    /// Numbers of the blocks whose bricks it looks at, ascending; blocks are numbered front to
+    /// back.
     pub opened: Vec<u32>,
     /// When drawing comes to each of `touched`, in thousandths of `ns`. Only tiles of one part have
     /// it; larger tiles take it from their parts. Empty: all bricks are needed at once.
@@ -340,7 +342,8 @@ impl SlabTrace {
     }
 }
 
-/// Returns a hash of everything that a frame's times depend on: transfer function, quality and view.
+/// Returns a hash of everything that a frame's times depend on: transfer function, quality and
+/// view.
 ///
 /// It differs from the hash in a frame's statistics, which covers the cropping box and not whether
 /// culling is on.

@@ -55,8 +55,8 @@ pub fn placeholder_sums(rect: &Rect, bytes: u32) -> TilePixels {
 
 /// Returns pixels of a tile through all sheets, finished, that take about `bytes` on the wire.
 ///
-/// Leaves are filled one after another. Their bytes have no pattern, so that nothing packs them; the
-/// rest of the last leaf is zeros, which pack to nearly nothing.
+/// Leaves are filled one after another. Their bytes have no pattern, so that nothing packs them;
+/// the rest of the last leaf is zeros, which pack to nearly nothing.
 pub fn placeholder_finished(rect: &Rect, bytes: u32, finish: &PixelEncoding) -> SparseTile {
     let size = [rect.width() as u32, rect.height() as u32];
     let mut leaves = SparseTile::blank(size, finish.format);

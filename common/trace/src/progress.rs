@@ -1,7 +1,7 @@
 //! How far a worker comes through a recorded region, and where it stalls for want of bricks.
 //!
-//! A worker draws the parts of a tile one after another. Each part stops before the first sheet that
-//! lacks a brick; the worker then sets the tile aside until the bricks it asked for have come
+//! A worker draws the parts of a tile one after another. Each part stops before the first sheet
+//! that lacks a brick; the worker then sets the tile aside until the bricks it asked for have come
 //! (`render::region`). A trace says when drawing came to each brick. So virtual workers and
 //! rehearsing ones stall at the same sheets as real ones and ask for the same bricks.
 //!
@@ -13,8 +13,8 @@ use slabcast_common::occlusion::Rect;
 use slabcast_common::region::{enclosing_square, parts};
 use slabcast_common::view::Projected;
 
-/// Pixels by which the footprints of a tile reach beyond it, both sides together. Tiles of 32 pixels
-/// take 1.24 times as long as those of 64 (mri256 `peer-semi` at 1024x1024).
+/// Pixels by which the footprints of a tile reach beyond it, both sides together. Tiles of 32
+/// pixels take 1.24 times as long as those of 64 (mri256 `peer-semi` at 1024x1024).
 const BORDER_PIXELS: f64 = 8.2;
 
 /// Bound of the rounding error of summed times, in nanoseconds.

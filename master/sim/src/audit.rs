@@ -35,8 +35,8 @@ struct AuditedJob {
 ///
 /// - a worker is sent a scene before its frames, a frame before its leases, a directory before its
 ///   regions, each once; nothing after it was dropped; no lease when it leaves;
-/// - a task is lent to a worker once at a time; a lease names its bricks in order, and they were sent
-///   unless memory is short;
+/// - a task is lent to a worker once at a time; a lease names its bricks in order, and they were
+///   sent unless memory is short;
 /// - a brick is not sent twice, not dropped under a lease, and dropped only if it was sent;
 /// - bricks under the `slab` schedule stay within the worker's memory budget;
 /// - frames end once, in their order, and never after they were cancelled;

@@ -36,9 +36,9 @@ impl LinearCost {
 
 /// Processor time that messages take at one end of a link.
 ///
-/// A message in company costs a tenth of one alone: the sleeper is woken for the first, and messages
-/// that wait together are read and written in one call (docs/design/transport.md, answer 1). So
-/// waking is charged where a thread slept, and a call where no other message shares it.
+/// A message in company costs a tenth of one alone: the sleeper is woken for the first, and
+/// messages that wait together are read and written in one call (docs/design/transport.md, answer
+/// 1). So waking is charged where a thread slept, and a call where no other message shares it.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct MessageCosts {
     /// Nanoseconds until a thread that slept begins to work.
@@ -168,7 +168,8 @@ pub struct WorkerProfile {
     pub memory_budget_bytes: u64,
     /// Bytes a second of its link each way; `None`: no limit.
     pub bytes_per_s: Option<f64>,
-    /// Least and largest latency of a message, in nanoseconds. Messages of a stream keep their order.
+    /// Least and largest latency of a message, in nanoseconds. Messages of a stream keep their
+    /// order.
     pub latency_ns: [Nanos; 2],
     /// Bytes a second at which its bricks arrive, besides the link; `None`: no limit.
     pub brick_bytes_per_s: Option<f64>,

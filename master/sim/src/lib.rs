@@ -1,9 +1,9 @@
 //! A virtual cluster: the scheduler itself, against virtual workers and links on a virtual clock.
 //!
-//! How long will a frame take on 40 machines? Is the picture whole when three of them die? A formula
-//! knows tiles and bandwidth; it knows nothing of the order in which leases are given, of barriers,
-//! of what is lent ahead, or of which copy of a late tile counts. All of that is decided by
-//! [`Scheduler`](slabcast_schedule::Scheduler), which is pure: so it decides here too, and only
+//! How long will a frame take on 40 machines? Is the picture whole when three of them die? A
+//! formula knows tiles and bandwidth; it knows nothing of the order in which leases are given, of
+//! barriers, of what is lent ahead, or of which copy of a late tile counts. All of that is decided
+//! by [`Scheduler`](slabcast_schedule::Scheduler), which is pure: so it decides here too, and only
 //! what it can't know is a model:
 //!
 //! ```text
@@ -13,9 +13,9 @@
 //!  decode <- the master's link <- a worker's link <- encode <--------------------------'
 //! ```
 //!
-//! Each arrow is a queue that serves in order. A link carries so many bytes a second each way, and all
-//! share the master's. Bricks go in batches, of which a few are under way to a worker at once, so
-//! that a lease never waits behind many.
+//! Each arrow is a queue that serves in order. A link carries so many bytes a second each way, and
+//! all share the master's. Bricks go in batches, of which a few are under way to a worker at once,
+//! so that a lease never waits behind many.
 //!
 //! One cluster serves three purposes, by its configuration:
 //!

@@ -104,8 +104,8 @@ impl Outcome {
         self.mean(|f| f.done - f.began) / 1e6
     }
 
-    /// Returns the work for all frames but the first, in nanoseconds: the master's, and the workers'
-    /// besides rendering.
+    /// Returns the work for all frames but the first, in nanoseconds: the master's, and the
+    /// workers' besides rendering.
     pub fn later_work(&self) -> [Nanos; 2] {
         let master = |w: &Work| w.driver + w.streams + w.finishers;
         let (all, first) = (&self.work, &self.first_work);
@@ -117,12 +117,12 @@ impl Outcome {
         self.frames.first().map_or(0.0, |f| (f.done - f.began) as f64 / 1e6)
     }
 
-    /// Returns how many of `frames` are delivered, one after another, while all others that a master
-    /// with so many in flight has are being drawn: from the delivery of the first to that of the
-    /// last one after which another was begun.
+    /// Returns how many of `frames` are delivered, one after another, while all others that a
+    /// master with so many in flight has are being drawn: from the delivery of the first to that of
+    /// the last one after which another was begun.
     ///
-    /// To count to the last frame would flatter: work on the last ones is done by the time the first
-    /// is delivered, and not paid for.
+    /// To count to the last frame would flatter: work on the last ones is done by the time the
+    /// first is delivered, and not paid for.
     pub fn steady_frames(frames: usize, frames_in_flight: u32) -> usize {
         frames.saturating_sub(frames_in_flight.max(1) as usize)
     }
@@ -154,8 +154,8 @@ impl Outcome {
     }
 }
 
-/// Returns the mean time that one core takes for a frame of a path in its best cut, in milliseconds.
-/// The first frame is left out if there are others.
+/// Returns the mean time that one core takes for a frame of a path in its best cut, in
+/// milliseconds. The first frame is left out if there are others.
 pub fn one_core_ms(trace: &Trace) -> f64 {
     let frames = &trace.frames[usize::from(trace.frames.len() > 1)..];
     frames.iter().map(|f| f.alone_ns as f64).sum::<f64>() / 1e6 / frames.len().max(1) as f64

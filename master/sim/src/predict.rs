@@ -8,8 +8,8 @@ use slabcast_schedule::{Config, FrameJob};
 use slabcast_trace::Trace;
 
 /// Simulates a path, its frames one after another, on a cluster. `jobs` are the frames of the trace
-/// in its order, with frame ids from 1 and numbers from 0. Returns what came of it, and how long the
-/// scheduler decided, if the observer measures that.
+/// in its order, with frame ids from 1 and numbers from 0. Returns what came of it, and how long
+/// the scheduler decided, if the observer measures that.
 ///
 /// # Errors
 /// [`Unpredictable`] if the scheduler wants a tile that was not recorded, or gives a frame up.

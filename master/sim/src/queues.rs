@@ -44,9 +44,9 @@ impl Cores {
         Cores { free: vec![0; n.max(1) as usize], work: 0 }
     }
 
-    /// Takes work of `ns` nanoseconds that is there at `when`, for the thread that begins first: one
-    /// that is awake when its work is done, one that sleeps after `wake_ns`. Returns when it is done,
-    /// and the time it took of the thread, in nanoseconds.
+    /// Takes work of `ns` nanoseconds that is there at `when`, for the thread that begins first:
+    /// one that is awake when its work is done, one that sleeps after `wake_ns`. Returns when it is
+    /// done, and the time it took of the thread, in nanoseconds.
     pub(super) fn take(&mut self, when: Nanos, ns: f64, wake_ns: f64) -> (Nanos, f64) {
         let begins = |free: &Nanos| if *free < when { when + wake_ns as Nanos } else { *free };
         let core = self.free.iter_mut().min_by_key(|free| begins(free));

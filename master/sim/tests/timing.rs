@@ -25,8 +25,8 @@ use std::sync::Arc;
 const SIZE: [u32; 2] = [256, 200];
 const BRICK_BYTES: u32 = 1000;
 
-/// Frames of a solid cube, and a trace in which a pixel takes 10 ns and two bytes each way. Half of
-/// the picture is shut behind the first slab.
+/// Frames of a solid cube and their trace: a pixel takes 10 ns to draw and two bytes each way. Half
+/// of the picture is shut behind the first slab.
 fn world(frames: usize) -> (Vec<FrameJob>, Trace) {
     let dims = [64; 3];
     let info = Volume::from_fn_u8("v", dims, |i, _, _| i as u8).info(Digest32([1; 32]));
@@ -160,7 +160,7 @@ fn through(edge: u32, rects: &[Rect], projected: &[Option<Projected>]) -> Region
     RegionLevel { edge, tiles }
 }
 
-/// The same frames under another schedule.
+/// Jobs under another schedule.
 fn under(schedule: Schedule, jobs: &[FrameJob]) -> Vec<FrameJob> {
     let work = |job: &FrameJob| Work { schedule, ..job.work };
     jobs.iter().map(|job| FrameJob { work: work(job), ..job.clone() }).collect()
@@ -184,7 +184,7 @@ fn run(jobs: &[FrameJob], trace: &Trace, cluster: &Cluster) -> Outcome {
 }
 
 #[test]
-fn one_worker_without_any_cost_takes_the_sum_of_its_tiles() {
+fn one_worker_without_costs_takes_the_sum_of_its_tiles() {
     let (jobs, trace) = world(3);
     let outcome = run(&jobs, &trace, &cluster(1));
     for f in &outcome.frames {
@@ -202,7 +202,7 @@ fn one_worker_without_any_cost_takes_the_sum_of_its_tiles() {
 }
 
 #[test]
-fn what_only_the_first_frame_takes_delays_no_other() {
+fn cost_of_the_first_frame_delays_no_later_one() {
     let (jobs, trace) = world(3);
     let times = |first_brick_ns| {
         let costs = Costs { first_brick_ns, frame_brick_ns: 10.0, ..Costs::default() };
@@ -215,7 +215,7 @@ fn what_only_the_first_frame_takes_delays_no_other() {
 }
 
 #[test]
-fn more_workers_share_the_work_and_nothing_is_won_beyond_it() {
+fn speedup_never_exceeds_the_number_of_workers() {
     let (jobs, trace) = world(3);
     let mut before = u64::MAX;
     for workers in [1, 2, 4, 8] {
@@ -229,7 +229,7 @@ fn more_workers_share_the_work_and_nothing_is_won_beyond_it() {
 }
 
 #[test]
-fn the_masters_link_is_shared_by_all_workers() {
+fn all_workers_share_the_masters_link() {
     let (jobs, trace) = world(2);
     let at = |workers, bytes_per_s| {
         let link = Link { bytes_per_s: Some(bytes_per_s), latency_ns: 20_000 };
@@ -245,7 +245,7 @@ fn the_masters_link_is_shared_by_all_workers() {
 }
 
 #[test]
-fn what_the_master_costs_shows_in_frames_and_overlaps_where_it_may() {
+fn costs_of_the_master_show_and_overlap_with_later_frames() {
     let (jobs, trace) = world(4);
     let free = run(&jobs, &trace, &cluster(4));
     let master = MessageCosts {
@@ -274,7 +274,7 @@ fn what_the_master_costs_shows_in_frames_and_overlaps_where_it_may() {
 
 /// A worker of one thread has one core: while it sends it does not draw.
 #[test]
-fn what_a_result_takes_is_taken_from_what_is_drawn_next() {
+fn sending_a_result_takes_time_from_the_next_tile() {
     let (jobs, trace) = world(3);
     let jobs = under(Schedule::Region, &jobs);
     let last = |ns: f64| {
@@ -292,7 +292,7 @@ fn what_a_result_takes_is_taken_from_what_is_drawn_next() {
 }
 
 #[test]
-fn results_are_packed_where_they_would_fill_the_link() {
+fn results_are_packed_only_on_a_slow_link() {
     let (jobs, trace) = world(6);
     let finish =
         PixelEncoding { format: PixelFormat::Rgb8, background: Background::Colour([0.0; 3]) };
@@ -311,14 +311,14 @@ fn results_are_packed_where_they_would_fill_the_link() {
         f.up as f64 / pixels
     };
     let (fast, slow) = (at(Some(1e9)), at(Some(1e7)));
-    assert!(a_pixel(&fast.frames[0]) < 2.5, "nobody knows the link yet: {fast:?}");
+    assert!(a_pixel(&fast.frames[0]) < 2.5, "the link is not known yet: {fast:?}");
     assert!(a_pixel(&fast.frames[5]) > 2.9, "{fast:?}");
     assert!(a_pixel(&slow.frames[5]) < 2.5, "{slow:?}");
 }
 
-/// Long work on the cores that all share, a picture's, holds short work up by its turns and not by all of it.
+/// Work on a picture, where all share cores, delays short work by a turn and not by all of it.
 #[test]
-fn what_is_done_with_pictures_hardly_delays_messages() {
+fn work_on_pictures_hardly_delays_messages() {
     let (jobs, trace) = world(40);
     let jobs = under(Schedule::Region, &jobs);
     let each_ms = |pixel: f64| {
@@ -344,7 +344,7 @@ fn what_is_done_with_pictures_hardly_delays_messages() {
 }
 
 #[test]
-fn the_same_cluster_behaves_the_same() {
+fn simulation_is_deterministic() {
     let (jobs, trace) = world(3);
     let costs = Costs {
         master: MessageCosts {
@@ -368,7 +368,7 @@ fn the_same_cluster_behaves_the_same() {
 }
 
 #[test]
-fn a_tile_that_was_not_measured_is_named() {
+fn unrecorded_tile_is_named() {
     let (jobs, mut trace) = world(1);
     trace.frames[0].slabs[1].levels.retain(|l| l.edge > 64);
     let c = cluster(30);
@@ -384,7 +384,7 @@ fn a_tile_that_was_not_measured_is_named() {
 }
 
 #[test]
-fn regions_have_no_barrier_and_bricks_come_where_they_are_asked_for() {
+fn regions_have_no_barrier_and_get_the_bricks_they_ask_for() {
     let (slab, trace) = world(5);
     let region = under(Schedule::Region, &slab);
     let alone = run(&region, &trace, &cluster(1));
@@ -415,7 +415,7 @@ fn regions_have_no_barrier_and_bricks_come_where_they_are_asked_for() {
 }
 
 #[test]
-fn a_region_is_drawn_up_to_each_brick_that_it_lacks_and_those_that_are_expected_come_before() {
+fn region_stalls_at_each_missing_brick_unless_it_was_prefetched() {
     let (slab, mut trace) = world(12);
     let region = under(Schedule::Region, &slab);
     let link = Link { bytes_per_s: Some(1e8), latency_ns: 100_000 };
@@ -452,7 +452,7 @@ fn a_region_is_drawn_up_to_each_brick_that_it_lacks_and_those_that_are_expected_
 }
 
 #[test]
-fn crews_draw_in_turn_where_tiles_are_few_and_frames_many() {
+fn worker_groups_draw_frames_in_turn_when_tiles_are_few() {
     let (slab, trace) = world(16);
     let region = under(Schedule::Region, &slab);
     let drew = |in_flight, bytes_per_s| {
@@ -471,11 +471,11 @@ fn crews_draw_in_turn_where_tiles_are_few_and_frames_many() {
 }
 
 #[test]
-fn more_workers_than_are_good_are_held_in_reserve() {
+fn active_set_leaves_superfluous_workers_in_reserve() {
     let (slab, trace) = world(120);
     let mut region = under(Schedule::Region, &slab);
     region.iter_mut().for_each(|job| job.work.tile = Some(32));
-    // A message costs the master 30 us, and a view that turns by six degrees brings bricks to everybody.
+    // A message costs the master 30 us, and a turn by six degrees brings bricks to all workers.
     let master = MessageCosts {
         send: LinearCost { fixed_ns: 15_000.0, per_unit_ns: 0.0 },
         receive: LinearCost { fixed_ns: 15_000.0, per_unit_ns: 0.0 },
@@ -500,10 +500,10 @@ fn more_workers_than_are_good_are_held_in_reserve() {
     assert!(all.2 < few.2 * 6 / 5, "{all:?} of 32, {few:?} of 8");
 }
 
-/// A path's second frame ends soon after the first, which had all bricks to wait for: taken by itself it says that threads draw
-/// all the time, and calls everybody.
+/// The second frame of a path ends soon after the first, which waited for all bricks. Judged by
+/// itself it shows threads that draw all the time, and all workers would be activated.
 #[test]
-fn a_paths_first_frame_is_judged_with_the_second_one() {
+fn active_set_judges_a_first_frame_together_with_the_second() {
     let (slab, trace) = world(24);
     let mut region = under(Schedule::Region, &slab);
     region.iter_mut().for_each(|job| job.work.tile = Some(32));
@@ -520,7 +520,7 @@ fn a_paths_first_frame_is_judged_with_the_second_one() {
 }
 
 #[test]
-fn fewer_frames_are_in_the_making_while_bricks_fill_the_link() {
+fn fewer_frames_overlap_while_bricks_fill_the_link() {
     let (slab, trace) = world(12);
     let region = under(Schedule::Region, &slab);
     let most = |bytes_per_s| {
@@ -531,7 +531,7 @@ fn fewer_frames_are_in_the_making_while_bricks_fill_the_link() {
         let spans = heard.0.iter().flat_map(|(_, spans)| spans);
         let made: Vec<_> = spans.filter(|s| s.category == "frame").collect();
         let beside = |at| made.iter().filter(|s| s.start <= at && at < s.end).count();
-        // Those that follow find their bricks there.
+        // Later frames find their bricks there.
         made[..5].iter().map(|s| beside(s.start)).max()
     };
     assert_eq!(most(None), Some(4));
@@ -541,7 +541,7 @@ fn fewer_frames_are_in_the_making_while_bricks_fill_the_link() {
 }
 
 #[test]
-fn what_threads_time_goes_into_is_all_of_it() {
+fn thread_time_adds_up_to_the_whole() {
     let (slab, trace) = world(9);
     let region = under(Schedule::Region, &slab);
     let toll = MessageCosts {
@@ -573,7 +573,7 @@ fn what_threads_time_goes_into_is_all_of_it() {
 }
 
 #[test]
-fn a_worker_looks_at_a_block_once_a_frame() {
+fn worker_looks_at_a_block_once_a_frame() {
     let (slab, mut trace) = world(3);
     let region = under(Schedule::Region, &slab);
     let render = |trace: &Trace, n: u32| {
@@ -588,12 +588,12 @@ fn a_worker_looks_at_a_block_once_a_frame() {
     let more = |i: usize| looked[i].iter().zip(&drawn[i]).map(|(l, d)| l - d).collect::<Vec<_>>();
     let columns = SIZE[0].div_ceil(128) as u64;
     assert!(more(0).iter().all(|ns| *ns == 100 * (columns + 1)), "{:?}", more(0));
-    // Four look at some of them each.
+    // Each of four looks at some of them.
     let (least, most) = (100 * (columns + 4), 400 * (columns + 1));
     assert!(more(1).iter().all(|ns| (least..=most).contains(ns)), "{:?}", more(1));
 }
 
-/// Keeps what is told of frames.
+/// Keeps statistics and timelines of frames.
 #[derive(Default)]
 struct Listener(Vec<(FrameStats, Vec<Span>)>);
 
@@ -604,7 +604,7 @@ impl sim::Observer for Listener {
 }
 
 #[test]
-fn a_mixed_queue_begins_with_whole_tiles_and_goes_on_with_quarters() {
+fn mixed_queue_begins_with_whole_tiles_and_goes_on_with_quarters() {
     let (mut jobs, trace) = world(2);
     for job in &mut jobs {
         job.work.tile = Some(64);

@@ -98,7 +98,8 @@ proptest! {
     /// Bricks come in any order, and a piece of the rest is handed over.
     #[test]
     fn region_ends_whatever_order_bricks_come_in(
-        order in Just(vec![0u32, 1, 4, 9, 20]).prop_shuffle(), steps in prop::collection::vec(0.0..900.0f64, 5),
+        order in Just(vec![0u32, 1, 4, 9, 20]).prop_shuffle(),
+        steps in prop::collection::vec(0.0..900.0f64, 5),
         cut in 1i32..7, across in any::<bool>(),
     ) {
         let mut c = progress(ALL);
@@ -113,7 +114,8 @@ proptest! {
             prop_assert!((all - left - drawn).abs() < 20.0, "{drawn} of {all}, {left} left");
             if c.runs_ns(&has) <= 0.0 {
                 c.resume();
-                prop_assert!(c.runs_ns(&has) > 0.0 || c.is_done() || !c.missing(&has, 5, &project).is_empty());
+                let is_stalled = !c.missing(&has, 5, &project).is_empty();
+                prop_assert!(c.runs_ns(&has) > 0.0 || c.is_done() || is_stalled);
             }
             here.insert(brick);
         }

@@ -1,8 +1,8 @@
 //! Bricks of a virtual worker: arriving, prefetching, stalling for them, making room.
 //!
 //! The rules are those of the real worker (`slabcast-worker`, `stalls`): a stalled region asks for
-//! what it lacks and waits for all of it, each brick is asked for once, and a worker that was sent a
-//! directory keeps its own memory budget.
+//! what it lacks and waits for all of it, each brick is asked for once, and a worker that was sent
+//! a directory keeps its own memory budget.
 
 use super::worker::{Loan, Run, Task, has};
 use super::{SMALL_BYTES, VirtualCluster};
@@ -141,9 +141,9 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
         self.want(id, set, fresh);
     }
 
-    /// Evicts bricks until those that are here and those that were asked for fit into the budget, as
-    /// far as no region keeps them.
-    /// Does nothing without regions: the master then keeps the budget.
+    /// Evicts bricks until those that are here and those that were asked for fit into the budget,
+    /// as far as no region keeps them. Does nothing without regions: the master then keeps the
+    /// budget.
     pub(super) fn make_room(&mut self, id: WorkerId) {
         let w = self.workers.get_mut(&id).expect("it is there");
         if !w.loans.iter().any(|l| matches!(l.task, Task::Region(..))) {

@@ -135,7 +135,8 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
         self.reschedule_runs(id);
     }
 
-    /// A worker that leaves closes its link when its threads are done and its last message is there.
+    /// A worker that leaves closes its link when its threads are done and its last message is
+    /// there.
     pub(super) fn close_if_done(&mut self, id: WorkerId) {
         let Some(w) = self.workers.get(&id) else { return };
         if w.leaving && w.running.iter().all(Option::is_none) {

@@ -67,7 +67,8 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
         if least == most { least } else { self.rng.between(least, most) }
     }
 
-    /// A worker's message goes up. Messages that are there before the one before is written go with it.
+    /// A worker's message goes up. Messages that are there before the one before is written go with
+    /// it.
     pub(super) fn up(&mut self, id: WorkerId, event: Event, bytes: u64, when: Nanos) {
         self.up_packed(id, event, bytes, 0, when);
     }

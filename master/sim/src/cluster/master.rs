@@ -102,7 +102,8 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
         }
     }
 
-    /// Hands an event to the scheduler and takes its actions. Returns what that costs, in nanoseconds.
+    /// Hands an event to the scheduler and takes its actions. Returns what that costs, in
+    /// nanoseconds.
     fn handle(&mut self, event: Event, actions: &mut Vec<Action>) -> f64 {
         let costs = self.master.costs;
         let result_pixels = match &event {

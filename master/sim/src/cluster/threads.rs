@@ -62,8 +62,8 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
     }
 
     /// Takes the task that a thread draws next: of the oldest frame, tasks that go on before tasks
-    /// that begin. A region that lacks bricks at its first sheet stalls at once, and the next one is
-    /// tried.
+    /// that begin. A region that lacks bricks at its first sheet stalls at once, and the next one
+    /// is tried.
     fn take_task(&mut self, id: WorkerId) -> Option<Loan<M::Region>> {
         let now = self.now_ns();
         self.prefetch(id);
@@ -102,7 +102,8 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
         }
     }
 
-    /// Free threads begin tasks whose bricks are here. One of them is `awake`: it just ended another.
+    /// Free threads begin tasks whose bricks are here. One of them is `awake`: it just ended
+    /// another.
     pub(super) fn start_threads(&mut self, id: WorkerId, mut awake: Option<usize>) {
         let wake_ns = self.master.costs.worker.wake_ns;
         loop {

@@ -1,6 +1,10 @@
-//! The schedule against a virtual cluster (PROMISES.md R1 to R5, R9, R11).
+//! The scheduler against faults: pictures stay those of one thread, whatever happens to workers
+//! (docs/design/promises.md, R1 to R5, R9, R11).
+//!
+//! Campaigns draw whole clusters and their incidents from seeds; [`stories`] change one thing each.
 
 mod pattern;
+mod statistics;
 mod stories;
 mod world;
 
@@ -10,7 +14,7 @@ use slabcast_schedule::Config;
 use slabcast_sim::{Faults, Incident, Rng, WorkerProfile};
 use world::{Story, World, new_world, typical};
 
-/// Seeds of a run, `SLABCAST_SEEDS=10000` for a campaign, `SLABCAST_SEED=17` for one.
+/// Seeds of a campaign: `SLABCAST_SEEDS=10000` runs that many, `SLABCAST_SEED=17` that one.
 fn seeds(default: u64) -> std::ops::Range<u64> {
     let number = |name| std::env::var(name).ok().and_then(|s| s.parse::<u64>().ok());
     match number("SLABCAST_SEED") {
@@ -50,15 +54,15 @@ fn immune() -> WorkerProfile {
     WorkerProfile { faults: Faults { immune: true, ..Faults::default() }, ..typical() }
 }
 
-/// The schedules of a world's frames.
+/// Schedules of the frames of a world, in turn.
 type Schedules = &'static [Schedule];
 
 const SLAB: Schedules = &[Schedule::Slab];
 const REGION: Schedules = &[Schedule::Region];
-/// One after the other on the same workers.
+/// Both schedules in turn on the same workers.
 const MIXED: Schedules = &[Schedule::Slab, Schedule::Auto];
 
-/// A world of one seed, run to its end.
+/// Runs the world of a seed to its end.
 fn chaos(seed: u64, schedules: Schedules) -> World {
     let mut rng = Rng::new(seed ^ 0xc4a0_5000);
     let config = Config {
@@ -112,7 +116,7 @@ fn chaos(seed: u64, schedules: Schedules) -> World {
         let n = random_worker(&mut rng, small_budgets);
         w.add_worker(n);
     }
-    // Some things go wrong, most of them while there is work.
+    // Incidents, most of them while there is work.
     for _ in 0..rng.between(0, 10) {
         let when = 1_000 + rng.below(rng.clone().pick(&[100_000, 400_000, 5_000_000]));
         let whom = WorkerId(rng.between(1, 8));
@@ -125,7 +129,7 @@ fn chaos(seed: u64, schedules: Schedules) -> World {
         };
         w.schedule(when, what);
     }
-    // In the end there is somebody.
+    // At last a worker comes that stays.
     let when = rng.pick(&[1_000_000, 6_000_000]);
     w.schedule(when, Incident::Join(Box::new(immune())));
     w.finish();
@@ -133,22 +137,22 @@ fn chaos(seed: u64, schedules: Schedules) -> World {
 }
 
 #[test]
-fn pictures_are_the_serial_ones_whatever_happens_to_the_cluster() {
+fn chaos_under_the_slab_schedule_leaves_serial_pictures() {
     campaign(SLAB, seeds(300));
 }
 
 #[test]
-fn pictures_of_regions_are_the_serial_ones_whatever_happens_to_the_cluster() {
+fn chaos_under_the_region_schedule_leaves_serial_pictures() {
     campaign(REGION, seeds(300));
 }
 
 #[test]
-fn a_job_under_one_schedule_may_follow_one_under_the_other() {
+fn chaos_under_mixed_schedules_leaves_serial_pictures() {
     campaign(MIXED, seeds(150));
 }
 
-/// A world in which frames come one by one, of one set and one size, so that each is alone in the making and the one
-/// before it teaches it: tiles are cut, before it and as it is drawn.
+/// A world whose frames come one by one, of one set and one size. Each is the only one in flight,
+/// and the times of the one before are known: tiles are cut before a frame and while it is drawn.
 fn chaos_alone(seed: u64) -> World {
     let mut rng = Rng::new(seed ^ 0xa10e_5000);
     let config = Config {
@@ -204,7 +208,7 @@ fn chaos_alone(seed: u64) -> World {
 }
 
 #[test]
-fn pictures_of_frames_alone_are_the_serial_ones_however_their_tiles_are_cut() {
+fn chaos_with_sole_frames_and_work_stealing_leaves_serial_pictures() {
     let range = seeds(150);
     let one = range.end - range.start == 1;
     let (mut frames, mut cut, mut mixed, mut lost, mut dropped, mut retries) = (0, 0, 0, 0, 0, 0);
@@ -228,14 +232,14 @@ fn pictures_of_frames_alone_are_the_serial_ones_however_their_tiles_are_cut() {
         );
     }
     println!(
-        "alone: {frames} frames, {cut} cut, {mixed} of them in part, {pieces} pieces given away, {retries} \
-         retries, {dropped} results dropped, {lost} workers lost"
+        "sole frames: {frames} frames, {cut} cut, {mixed} of them in part, {pieces} pieces handed \
+         over, {retries} retries, {dropped} results dropped, {lost} workers lost"
     );
     assert!(one || pieces > 0 && mixed > 0 && retries > 0 && dropped > 0 && lost > 0);
 }
 
-/// A world of many workers and a path of small frames, several in the making or one, so that most workers are held
-/// in reserve and called up when others are lost; and how many were at most.
+/// A world of many workers and small frames, in which most workers are outside the active set and
+/// are activated when others are lost. Also returns how many were in reserve at most.
 fn chaos_crowd(seed: u64) -> (World, usize) {
     let mut rng = Rng::new(seed ^ 0xc70d_5000);
     let config = Config { lease: rng.pick(&[60_000_000, 100_000]), ..Config::default() };
@@ -282,7 +286,7 @@ fn chaos_crowd(seed: u64) -> (World, usize) {
 }
 
 #[test]
-fn pictures_are_the_serial_ones_whoever_is_held_in_reserve() {
+fn chaos_with_a_small_active_set_leaves_serial_pictures() {
     let range = seeds(100);
     let one = range.end - range.start == 1;
     let (mut frames, mut held, mut worlds, mut lost, mut retries) = (0, 0, 0, 0, 0);
@@ -300,15 +304,16 @@ fn pictures_are_the_serial_ones_whoever_is_held_in_reserve() {
         );
     }
     println!(
-        "crowds: {frames} frames, workers in reserve in {held} of {worlds} worlds, {retries} retries, {lost} workers lost"
+        "active sets: {frames} frames, workers in reserve in {held} of {worlds} worlds, {retries} \
+         retries, {lost} workers lost"
     );
     assert!(one || 2 * held > worlds && lost > 0 && retries > 0);
 }
 
-/// Of 3,000 worlds one in which a worker was lost while a frame, done, waited for the one before it: its
-/// statistics had bricks on their way after its end.
+/// In this world a worker was once lost while a frame that was done waited for the one before it;
+/// the frame's statistics had bricks in flight after its end.
 #[test]
-fn a_frame_that_is_done_takes_no_part_in_what_comes_after() {
+fn done_frame_ignores_workers_that_are_lost_later() {
     assert!(!chaos(738, REGION).observer.done.is_empty());
 }
 
@@ -331,11 +336,12 @@ fn campaign(schedules: Schedules, range: std::ops::Range<u64>) {
     let secs = clock.elapsed().as_secs_f64();
     let ratio = virtual_us as f64 / 1e6 / secs;
     println!(
-        "{schedules:?}: {frames} frames, {leases} leases, {retries} retries, {dropped} results dropped, {lost} \
-         workers lost, {lies} lies, {over_budget} over budget; {secs:.1} s, {ratio:.0} x real time"
+        "{schedules:?}: {frames} frames, {leases} leases, {retries} retries, {dropped} results \
+         dropped, {lost} workers lost, {lies} lies, {over_budget} over budget; {secs:.1} s, \
+         {ratio:.0} x real time"
     );
     if std::env::var("SLABCAST_SEED").is_err() {
-        // The worlds do hold what they are there for.
+        // The campaign met what it is there for.
         assert!(frames > 0 && retries > 0 && dropped > 0 && lost > 0 && lies > 0);
         assert!(over_budget > 0 || schedules == REGION);
     }
@@ -343,7 +349,7 @@ fn campaign(schedules: Schedules, range: std::ops::Range<u64>) {
 }
 
 #[test]
-fn a_seed_replays() {
+fn seeds_replay() {
     for seed in [3, 17, 40, 77] {
         for schedules in [SLAB, REGION, MIXED] {
             let logs = [(); 2].map(|()| chaos(seed, schedules).observer.audit.log);

@@ -1,4 +1,4 @@
-//! One world, one change, and what comes of it.
+//! Stories: one world, one change, and what comes of it.
 
 use crate::pattern;
 use crate::world::{Story, World, new_world, typical};
@@ -7,17 +7,16 @@ use slabcast_common::ids::{FrameId, SceneId, WorkerId};
 use slabcast_common::quality::{Quality, Schedule, Work};
 use slabcast_common::stats::FrameStats;
 use slabcast_common::view::{Camera, CameraProjection, View};
-use slabcast_schedule::{Action, Clock, Config, Event, FrameJob, Micros, Scheduler};
+use slabcast_schedule::{Config, FrameJob, Micros};
 use slabcast_sim::{Faults, Incident, Rng, WorkerProfile};
-use std::cell::Cell;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 const DIMS: [u32; 3] = [48, 48, 48];
 const BOTH: [Schedule; 2] = [Schedule::Slab, Schedule::Region];
 
-/// The paper's schedule; what a story says of both it says with a loop.
-fn slab() -> Work {
+/// Work under the paper's schedule.
+pub(crate) fn slab() -> Work {
     Work { schedule: Schedule::Slab, ..Work::default() }
 }
 
@@ -25,7 +24,7 @@ fn bricks() -> Arc<[BrickInfo]> {
     pattern::bricks(&mut Rng::new(1), DIMS, 6)
 }
 
-fn job_with(frame: u64, work: Work, quality: Quality) -> Box<FrameJob> {
+pub(crate) fn job_with(frame: u64, work: Work, quality: Quality) -> Box<FrameJob> {
     let scene = pattern::scene(0, pattern::key(0), DIMS, quality);
     pattern::job(&mut Rng::new(5 + frame), frame, &scene, &bricks(), [128, 128], work)
 }
@@ -47,20 +46,20 @@ fn workers(w: &mut World, n: usize) -> Vec<WorkerId> {
     (0..n).map(|_| w.add_worker(typical())).collect()
 }
 
-/// Time from now until all frames are over.
+/// Lets time pass until all frames are over. Returns how long that took, in microseconds.
 fn time(w: &mut World) -> Micros {
     let start = w.now();
     w.until(|w| w.scheduler().is_idle());
     w.now() - start
 }
 
-/// How many leases each worker has.
+/// Number of leases of each worker.
 fn leases(w: &World) -> Vec<u32> {
     w.scheduler().workers().iter().map(|v| v.leases).collect()
 }
 
 #[test]
-fn bytes_do_not_depend_on_workers_tiles_slabs_or_culling() {
+fn picture_bytes_do_not_depend_on_workers_tiles_slabs_or_culling() {
     let quality = Quality { thickness: 2.0, eps: 0.2, ..Quality::default() };
     let want = pattern::serial(&job_with(0, slab(), quality)).sha256();
     for n in [1, 3, 7] {
@@ -89,7 +88,7 @@ fn bytes_do_not_depend_on_workers_tiles_slabs_or_culling() {
 }
 
 #[test]
-fn every_thread_gets_a_task_before_any_gets_two_and_the_tail_is_held_back() {
+fn leases_go_to_every_thread_first_and_the_last_tiles_are_held_back() {
     let mut w = world();
     w.add_worker(WorkerProfile { threads: 1, ..typical() });
     w.add_worker(WorkerProfile { threads: 3, ..typical() });
@@ -111,7 +110,7 @@ fn every_thread_gets_a_task_before_any_gets_two_and_the_tail_is_held_back() {
 }
 
 #[test]
-fn without_workers_a_frame_waits_and_nothing_is_lost() {
+fn frame_without_workers_waits_and_retries_only_lost_leases() {
     let mut w = world();
     w.add_frame(job(0));
     w.run_for(10_000_000);
@@ -127,7 +126,7 @@ fn without_workers_a_frame_waits_and_nothing_is_lost() {
 }
 
 #[test]
-fn who_joins_mid_frame_gets_bricks_and_leases_at_once() {
+fn late_joiner_gets_bricks_and_leases_at_once() {
     for schedule in BOTH {
         let mut w = world();
         workers(&mut w, 1);
@@ -143,7 +142,7 @@ fn who_joins_mid_frame_gets_bricks_and_leases_at_once() {
 }
 
 #[test]
-fn a_partitioned_worker_is_found_in_three_seconds_and_its_late_results_are_dropped() {
+fn partition_is_found_in_three_seconds_and_late_results_are_dropped() {
     let mut w = world();
     workers(&mut w, 2);
     w.add_frame(job(0));
@@ -164,7 +163,7 @@ fn a_partitioned_worker_is_found_in_three_seconds_and_its_late_results_are_dropp
 }
 
 #[test]
-fn a_busy_worker_that_answers_pings_is_never_dropped() {
+fn heartbeat_keeps_a_worker_that_is_busy_for_minutes() {
     let mut w = world();
     w.add_worker(WorkerProfile { time_factor: 1000.0, ..typical() });
     w.add_frame(job(0));
@@ -174,7 +173,7 @@ fn a_busy_worker_that_answers_pings_is_never_dropped() {
 }
 
 #[test]
-fn a_tile_that_kills_its_workers_is_given_up_after_three_and_the_rest_is_delivered() {
+fn poisoned_tile_is_given_up_after_three_workers_and_the_rest_is_delivered() {
     BOTH.into_iter().for_each(a_deadly_tile);
 }
 
@@ -210,8 +209,8 @@ fn a_deadly_tile(schedule: Schedule) {
 }
 
 #[test]
-fn seven_of_eight_workers_killed_mid_frame_leave_the_same_bytes_and_no_tile_accused() {
-    // PROMISES.md R1, in virtual time, with the poison rule as it is shipped.
+fn killed_workers_leave_the_same_bytes_and_no_poisoned_tile() {
+    // Promise R1, in virtual time, with the default poison rule.
     for seed in 0..200 {
         let mut rng = Rng::new(seed);
         let mut w = new_world(seed, Config::default());
@@ -231,7 +230,7 @@ fn seven_of_eight_workers_killed_mid_frame_leave_the_same_bytes_and_no_tile_accu
 }
 
 #[test]
-fn a_frame_of_nothing_but_failures_fails_with_the_reason() {
+fn frame_whose_tiles_all_fail_fails_with_the_reason() {
     let mut w = world();
     w.add_worker(WorkerProfile {
         faults: Faults { fail_one_in: 1, ..Faults::default() },
@@ -250,7 +249,7 @@ fn a_frame_of_nothing_but_failures_fails_with_the_reason() {
 }
 
 #[test]
-fn a_thread_that_hangs_costs_one_more_run_of_its_tile() {
+fn hanging_thread_costs_one_speculative_copy_of_its_tile() {
     for schedule in BOTH {
         let mut w = world();
         workers(&mut w, 2);
@@ -266,7 +265,7 @@ fn a_thread_that_hangs_costs_one_more_run_of_its_tile() {
 }
 
 #[test]
-fn without_idle_threads_a_late_lease_goes_to_another_worker_at_its_deadline() {
+fn lease_expires_and_goes_to_another_worker() {
     // One tile, so that nothing is known of how long tiles take.
     let mut w = world();
     w.add_worker(WorkerProfile {
@@ -283,9 +282,9 @@ fn without_idle_threads_a_late_lease_goes_to_another_worker_at_its_deadline() {
 }
 
 #[test]
-fn a_straggler_holds_up_a_frame_by_less_than_a_third() {
-    // PROMISES.md R4: one of 8 workers at a tenth of the speed, against 7 healthy ones; and of the tiles that are lent
-    // few are drawn twice for it.
+fn straggler_delays_a_frame_by_less_than_a_third() {
+    // Promise R4: one of 8 workers at a tenth of the speed, against 7 healthy ones. Few tiles are
+    // drawn twice for it.
     let run = |slow: bool, tile: Option<u32>, schedule: Schedule| {
         let mut w = world();
         workers(&mut w, 7);
@@ -307,11 +306,12 @@ fn a_straggler_holds_up_a_frame_by_less_than_a_third() {
         let ((healthy, _), (slow, twice)) = (run(false, tile, schedule), run(true, tile, schedule));
         let ratio = slow as f64 / healthy as f64;
         println!(
-            "straggler: {schedule:?}, {tile:?}, {slow} us, healthy {healthy} us, {ratio:.2} x, {:.1} % twice",
+            "straggler: {schedule:?}, {tile:?}, {slow} us, healthy {healthy} us, {ratio:.2} x, \
+             {:.1} % twice",
             100.0 * twice
         );
         worst = worst.max(ratio);
-        // What the slow one has at the end of each of three slabs others draw as well.
+        // At the end of each of three slabs, others also draw the tiles of the slow one.
         let most = if schedule == Schedule::Region { 0.1 } else { 0.15 };
         assert!(twice <= most, "{:.1} % of the tiles", 100.0 * twice);
     }
@@ -319,7 +319,7 @@ fn a_straggler_holds_up_a_frame_by_less_than_a_third() {
 }
 
 #[test]
-fn only_what_is_lacked_is_sent() {
+fn only_missing_bricks_are_sent() {
     let mut w = world();
     workers(&mut w, 2);
     w.add_frame(job(0));
@@ -349,7 +349,7 @@ fn only_what_is_lacked_is_sent() {
 }
 
 #[test]
-fn a_cancelled_frame_ends_at_once_in_any_state() {
+fn cancelled_frame_ends_at_once_in_any_state() {
     for (when, schedule) in (0..40_000).step_by(250).zip(BOTH.into_iter().cycle()) {
         let mut w = world();
         workers(&mut w, 2);
@@ -371,10 +371,10 @@ fn a_cancelled_frame_ends_at_once_in_any_state() {
 }
 
 #[test]
-fn regions_are_sent_what_they_ask_for_and_hardly_more() {
+fn regions_get_the_bricks_they_ask_for_and_hardly_more() {
     let mut w = world();
     for _ in 0..2 {
-        // No tile takes so long that a piece of it would be given away.
+        // No tile takes so long that a piece of it is handed over.
         w.add_worker(WorkerProfile { time_factor: 0.02, ..typical() });
     }
     w.add_frame(job_by(0, Schedule::Region));
@@ -383,8 +383,8 @@ fn regions_are_sent_what_they_ask_for_and_hardly_more() {
     assert!(first.workers.iter().all(|w| w.stalls > 0 && w.parked_ms > 0.0), "{first:?}");
     assert!(first.bricks.needed <= first.workers.iter().map(|w| w.bricks_held).sum());
     assert_eq!(first.slabs.len(), 1);
-    // The same view again: everybody takes the same tiles, and holds what they need. What one drew from that lies over
-    // the other's tiles as well, and is hidden there, nobody knows to be; it goes there once.
+    // In the same view again, each worker draws the same tiles and holds their bricks. A brick that
+    // also lies over the other worker's tiles is sent there once: nobody knows that it is hidden.
     for number in 1..3 {
         let mut again = job_by(0, Schedule::Region);
         again.frame = FrameId(number);
@@ -405,11 +405,11 @@ fn regions_are_sent_what_they_ask_for_and_hardly_more() {
     };
     assert_eq!(owners(second), owners(&first));
     let guesses = |s: &FrameStats| s.slabs[0].tiles.iter().map(|t| t.est).collect::<Vec<_>>();
-    assert_ne!(guesses(second), guesses(&first), "what they took is known");
+    assert_ne!(guesses(second), guesses(&first), "their times are known");
 }
 
 #[test]
-fn what_turns_into_the_tiles_of_another_is_sent_before_it_asks() {
+fn prefetch_sends_bricks_that_turn_into_another_workers_tiles() {
     let frame = |frame: u64, upside_down: bool| {
         let mut job = job_by(0, Schedule::Region);
         let side = if upside_down { -1.0 } else { 1.0 };
@@ -424,7 +424,7 @@ fn what_turns_into_the_tiles_of_another_is_sent_before_it_asks() {
         (job.frame, job.number, job.view) = (FrameId(frame), frame, view.expect("a view"));
         job
     };
-    // Two workers draw the upper and the lower half, of which the second frame swaps the bricks.
+    // Two workers draw the upper and the lower half; the second frame swaps their bricks.
     let mut w = world();
     for _ in 0..2 {
         w.add_worker(WorkerProfile { time_factor: 0.02, ..typical() });
@@ -442,21 +442,21 @@ fn what_turns_into_the_tiles_of_another_is_sent_before_it_asks() {
     let [(first, all, needed), (second, asked, _), (third, last, _)] = sent[..] else {
         unreachable!("three frames")
     };
-    assert_eq!(all, first, "of the first frame nothing is sent ahead");
-    assert!(10 * second > 6 * needed, "{second} of {needed}: others' bricks are to be drawn from");
+    assert_eq!(all, first, "nothing is prefetched for a first frame");
+    assert!(10 * second > 6 * needed, "{second} of {needed} swap");
     assert!(4 * asked < second, "{asked} of {second} were asked for");
     assert_eq!((third, last), (0, 0), "everybody has what it draws from");
 }
 
 #[test]
-fn frames_of_a_path_go_on_beside_each_other_and_end_in_order() {
+fn frames_of_a_path_overlap_and_end_in_order() {
     let mut w = world();
     workers(&mut w, 3);
     for frame in 0..4 {
         w.add_frame(job_by(frame, Schedule::Region));
     }
-    // All three have as many leases as they are lent, of several frames: more, where they are known to be
-    // short.
+    // All three have as many leases as they are lent, of several frames: more, where they are known
+    // to be short.
     w.until(|w| w.observer.audit.leases_given > 16);
     assert!(w.observer.done.is_empty() && leases(&w).iter().all(|n| (2..=8).contains(n)));
     w.finish();
@@ -470,7 +470,8 @@ fn frames_of_a_path_go_on_beside_each_other_and_end_in_order() {
     assert!(all < alone.now(), "{all} us, one after the other {} us", alone.now());
 }
 
-/// Frames of one view, each alone in the making, in which nothing hides anything; how long each took.
+/// Draws frames of one view, one at a time, in which nothing hides anything. Returns how long each
+/// took, in microseconds.
 fn one_by_one(w: &mut World, frames: std::ops::Range<u64>, work: Work) -> Vec<Micros> {
     let quality = Quality { thickness: 1.0, eps: 0.0, ..Quality::default() };
     let scene = pattern::scene(0, pattern::key(0), DIMS, quality);
@@ -484,7 +485,7 @@ fn one_by_one(w: &mut World, frames: std::ops::Range<u64>, work: Work) -> Vec<Mi
 }
 
 #[test]
-fn who_draws_by_itself_is_lent_all_that_is_short_at_once() {
+fn sole_worker_is_lent_all_short_tiles_at_once() {
     // 16 tiles, of which others might have some to take.
     let lent = |n| {
         let mut w = world();
@@ -511,7 +512,7 @@ fn who_draws_by_itself_is_lent_all_that_is_short_at_once() {
     assert!(most < Some(tiles), "{most:?} of {tiles}");
 }
 
-/// How many tiles of each size a frame had.
+/// Number of tiles of a frame by their size.
 fn sizes(w: &World, frame: u64) -> BTreeMap<u32, usize> {
     let mut sizes = BTreeMap::new();
     for t in &w.observer.done[&FrameId(frame)].stats.slabs[0].tiles {
@@ -521,7 +522,7 @@ fn sizes(w: &World, frame: u64) -> BTreeMap<u32, usize> {
 }
 
 #[test]
-fn where_tiles_are_few_and_long_a_frame_alone_is_cut_so_that_all_end_at_once() {
+fn sole_frame_with_few_long_tiles_is_cut_so_that_threads_end_together() {
     // 16 tiles of 64 pixels at most for 12 threads: four of them would have all others wait.
     let run = |tile| {
         let mut w = world();
@@ -531,7 +532,7 @@ fn where_tiles_are_few_and_long_a_frame_alone_is_cut_so_that_all_end_at_once() {
         let work = Work { tile, tiles_per_worker: 1.0, schedule: Schedule::Region, ..slab() };
         let took = one_by_one(&mut w, 0..12, work);
         w.finish();
-        // Which tile is late in one frame or another is chance.
+        // It is chance which tile is late in a frame.
         (took[2..].iter().sum::<Micros>(), w)
     };
     let (whole, _) = run(Some(64));
@@ -543,8 +544,8 @@ fn where_tiles_are_few_and_long_a_frame_alone_is_cut_so_that_all_end_at_once() {
     assert!(33 * cut < 32 * whole, "{cut} us, in tiles of 64 {whole}");
 }
 
-/// Three workers of a tile each and more, and a frame that each of them knows; what happens to the first one then, 3 ms
-/// into the next frame. How long that took, and the world.
+/// Three workers draw a frame that they know; 3 ms into it, `what` happens to the first of them.
+/// Returns how long the frame took, in microseconds, and the world.
 fn as_they_draw(what: Option<fn(WorkerId) -> Incident>) -> (Micros, World) {
     let mut w = world();
     let ids: Vec<WorkerId> =
@@ -561,13 +562,13 @@ fn as_they_draw(what: Option<fn(WorkerId) -> Incident>) -> (Micros, World) {
 }
 
 #[test]
-fn a_piece_of_what_takes_longer_than_it_was_to_is_drawn_by_who_has_nothing_to_do() {
+fn work_stealing_shares_a_region_that_takes_longer_than_expected() {
     let (healthy, _) = as_they_draw(None);
     let (slow, w) = as_they_draw(Some(|id| Incident::Slow(id, 10.0)));
     let stats = &w.observer.done[&FrameId(2)].stats;
     assert!(w.handed_over() > 0 && stats.handed_over > 0, "{stats:?}");
     assert!(2 * slow < 5 * healthy, "{slow} us, and {healthy} where nobody is slow");
-    // What it began is not drawn twice.
+    // Nothing that it began is drawn twice.
     assert_eq!(stats.dropped_results, 0);
     let render = |stats: &FrameStats| stats.workers.iter().map(|w| w.render_ms).sum::<f64>();
     assert!(render(stats) < 1.5 * render(&w.observer.done[&FrameId(1)].stats), "{stats:?}");
@@ -576,8 +577,8 @@ fn a_piece_of_what_takes_longer_than_it_was_to_is_drawn_by_who_has_nothing_to_do
 }
 
 #[test]
-fn a_piece_outlives_who_gave_it_away_and_who_was_lent_it() {
-    // Whoever is lost at whatever time: the picture is whole, and nobody is sent a piece that is not as he was told.
+fn work_stealing_survives_the_loss_of_either_worker() {
+    // Any of the workers is lost at any time: the picture is whole.
     let (mut lost_pieces, mut n) = (0, 0);
     for victim in 1..=3 {
         for after in (500..60_000).step_by(12_100) {
@@ -601,8 +602,8 @@ fn a_piece_outlives_who_gave_it_away_and_who_was_lent_it() {
 }
 
 #[test]
-fn what_a_worker_has_last_is_cut_and_shared_where_it_would_be_late() {
-    // Two tiles each; then a worker takes half as long again.
+fn work_stealing_shares_the_last_tile_of_a_slow_worker() {
+    // Two tiles each; then a worker slows down by half.
     let run = |slow: f64| {
         let mut w = world();
         for _ in 0..8 {
@@ -620,14 +621,14 @@ fn what_a_worker_has_last_is_cut_and_shared_where_it_would_be_late() {
     };
     let (before, steady, _) = run(1.0);
     assert!(steady < before + before / 10, "{steady} us after {before}");
-    // Parts of its second tile are drawn by others, or pieces of its first.
+    // Others draw parts of its second tile, or pieces of its first.
     let (before, late, parts) = run(1.5);
     assert!(parts > 0);
     assert!(10 * late < 13 * before, "{late} us after {before}");
 }
 
 #[test]
-fn frames_that_begin_while_the_first_is_drawn_are_shared_out_as_it_is() {
+fn overlapping_frames_keep_the_tile_owners_of_the_first() {
     let mut w = world();
     workers(&mut w, 8);
     for frame in 0..4 {
@@ -643,14 +644,16 @@ fn frames_that_begin_while_the_first_is_drawn_are_shared_out_as_it_is() {
         w.observer.done[&FrameId(frame)].stats.workers.iter().map(|v| v.bricks_sent).sum::<u64>()
     };
     let sent: Vec<u64> = (0..4).map(sent).collect();
-    // What the first three tiles took is known when the second begins. Later ones know enough to move some.
+    // The times of the first three tiles are known when the second frame begins. Later frames know
+    // enough to move some tiles.
     assert!(10 * sent[1] < sent[0], "{sent:?}");
 }
 
 #[test]
-fn workers_of_other_speeds_get_fitting_shares_of_a_path() {
-    // How long a frame takes, times what all can do in a unit of time: in tiles of 16 pixels, of which a frame has up to 64.
-    // Where nobody is known to be slow it is 7 % more than among equals, since others take tiles of those who are late.
+fn workers_get_shares_of_a_path_by_their_speed() {
+    // Time of a frame times the sum of all speeds, in tiles of 16 pixels, of which a frame has up
+    // to
+    // 64. If speeds were not known it would be 7 % more than among equals.
     let run = |speeds: &[f64]| {
         let mut w = world();
         for speed in speeds {
@@ -663,7 +666,7 @@ fn workers_of_other_speeds_get_fitting_shares_of_a_path() {
         }
         w.until(|w| w.observer.done.len() >= 8);
         let (from, done) = (w.now(), w.observer.done.len());
-        // Of 16 frames it is 6 % more or less, as the dice of their tiles fall.
+        // Of 16 frames it varies by 6 %, by chance.
         w.until(|w| w.observer.done.len() >= 72);
         let each = (w.now() - from) as f64 / (w.observer.done.len() - done) as f64;
         w.finish();
@@ -684,7 +687,7 @@ fn workers_of_other_speeds_get_fitting_shares_of_a_path() {
 }
 
 #[test]
-fn a_tile_that_moves_takes_its_bricks_along() {
+fn bricks_follow_a_tile_to_its_new_owner() {
     let mut w = world();
     let gone = w.add_worker(typical());
     w.add_frame(job_by(0, Schedule::Region));
@@ -700,7 +703,7 @@ fn a_tile_that_moves_takes_its_bricks_along() {
 }
 
 #[test]
-fn a_worker_short_of_memory_makes_room_itself() {
+fn memory_budget_makes_a_region_worker_evict_bricks_itself() {
     let mut w = world();
     let all: u64 = bricks().iter().map(|b| u64::from(b.bytes)).sum();
     w.add_worker(WorkerProfile { memory_budget_bytes: all / 3, ..typical() });
@@ -715,7 +718,7 @@ fn a_worker_short_of_memory_makes_room_itself() {
 }
 
 #[test]
-fn broken_bricks_are_sent_again_and_nothing_else() {
+fn broken_bricks_are_sent_again_and_no_others() {
     let mut w = world();
     w.add_worker(WorkerProfile {
         faults: Faults { broken_one_in: 5, ..Faults::default() },
@@ -732,7 +735,7 @@ fn broken_bricks_are_sent_again_and_nothing_else() {
 }
 
 #[test]
-fn a_liar_is_dropped_and_its_tiles_are_rendered_by_others() {
+fn malformed_results_drop_their_worker_and_others_draw_its_tiles() {
     for schedule in BOTH {
         let mut w = world();
         workers(&mut w, 1);
@@ -746,13 +749,13 @@ fn a_liar_is_dropped_and_its_tiles_are_rendered_by_others() {
         assert!(w.observer.audit.drops[0].1.contains("plane"), "{}", w.observer.audit.drops[0].1);
         assert!(
             w.observer.done[&FrameId(0)].stats.poisoned.is_empty(),
-            "a lie is not the tile's fault"
+            "a malformed result does not poison its tile"
         );
     }
 }
 
 #[test]
-fn a_leaving_worker_finishes_what_it_has_begun() {
+fn leaving_worker_finishes_the_tasks_it_has_begun() {
     let mut w = world();
     workers(&mut w, 2);
     w.add_frame(job(0));
@@ -766,7 +769,7 @@ fn a_leaving_worker_finishes_what_it_has_begun() {
 }
 
 #[test]
-fn a_worker_short_of_memory_gets_what_its_leases_need() {
+fn memory_budget_of_a_slab_worker_holds_the_bricks_of_its_leases() {
     // One slab, so that all bricks are needed at once and fit into neither worker.
     let mut w = world();
     let all: u64 = bricks().iter().map(|b| u64::from(b.bytes)).sum();
@@ -783,104 +786,4 @@ fn a_worker_short_of_memory_gets_what_its_leases_need() {
     for (view, budget) in w.scheduler().workers().iter().zip([all / 2, all * 2 / 3]) {
         assert!(view.bytes_held <= budget);
     }
-}
-
-/// A clock on which each look costs a millisecond.
-struct Stepping(Cell<Micros>);
-
-impl Clock for Stepping {
-    fn now(&self) -> Micros {
-        self.0.set(self.0.get() + 1000);
-        self.0.get()
-    }
-}
-
-#[test]
-fn statistics_of_a_frame_worked_out_by_hand() {
-    // One worker, one thread, a clock of our own; one tile over the whole picture, two slabs.
-    let clock = Stepping(Cell::new(0));
-    let mut s = Scheduler::new(Config::default());
-    let worker = WorkerId(1);
-    let (name, held) = ("one".to_string(), Vec::new());
-    let joined = Event::WorkerJoined {
-        worker,
-        name,
-        threads: 1,
-        is_local: false,
-        memory_budget_bytes: u64::MAX,
-        held,
-    };
-    s.handle(&clock, joined);
-    let work = Work { tile: Some(256), slabs: 2, ..slab() };
-    let job = job_with(3, work, Quality { thickness: 2.0, eps: 0.0, ..Quality::default() });
-    let projections = pattern::projections(&job);
-    s.handle(&clock, Event::FrameQueued(job.clone()));
-    let (mut done, mut sent, mut results) = (None, 0, 0);
-    while done.is_none() {
-        let mut events = Vec::new();
-        while let Some(action) = s.next_action() {
-            match action {
-                Action::SendBricks { worker, set, bricks } => {
-                    sent += bricks.len() as u64;
-                    events.push(Event::BricksIn { worker, set, bricks: bricks.len() as u32 });
-                }
-                Action::Send { message: slabcast_common::message::ToWorker::Lease(l), .. } => {
-                    clock.0.set(clock.0.get() + 50_000);
-                    let pixels = pattern::render(
-                        &projections,
-                        &job.scene.quality,
-                        l.tile,
-                        l.slab,
-                        &l.bricks,
-                        &l.state,
-                    );
-                    // It came 2 ms before it was begun, and took 40.
-                    let times = slabcast_common::message::TaskTimes {
-                        received_us: 1_000,
-                        ready_us: 2_000,
-                        start_us: 3_000,
-                        end_us: 43_000,
-                        thread: 0,
-                    };
-                    let counters = Default::default();
-                    let (task, epoch) = (l.task, l.epoch);
-                    let result = slabcast_common::message::TileResult {
-                        task,
-                        epoch,
-                        pixels: slabcast_common::message::Pixels::Sums(pixels),
-                        bytes: None,
-                        counters,
-                        times,
-                        region: None,
-                    };
-                    results += 1;
-                    events.push(Event::Result { worker, result: Box::new(result) });
-                }
-                Action::FrameDone { stats, frame, .. } => done = Some((frame, stats)),
-                _ => {}
-            }
-        }
-        for event in events {
-            s.handle(&clock, event);
-        }
-    }
-    let (frame, stats) = done.expect("the loop ended");
-    assert_eq!((frame, stats.frame, stats.v), (FrameId(3), 3, 1));
-    assert_eq!((stats.slabs.len(), results), (2, 2));
-    assert_eq!(stats.ms.render, 80.0);
-    assert_eq!(stats.ms.cull, 1.0 + 2.0 * 1.0, "one look apart: projecting, and each slab");
-    assert_eq!(stats.ms.composite, 2.0);
-    let one = &stats.workers[0];
-    assert_eq!((one.id.as_str(), one.render_ms), ("one", 80.0));
-    assert_eq!((one.bricks_sent, one.bricks_held), (sent, sent));
-    assert_eq!(one.wait_ms, stats.ms.total - 80.0);
-    assert!(one.p2p_ms >= 2.0 * 8.0 && one.p2p_ms < 40.0, "{}", one.p2p_ms);
-    assert!(stats.ms.distribute > 0.0 && stats.ms.wait > 0.0);
-    assert_eq!(stats.bricks.needed, projections.len() as u64);
-    assert_eq!(stats.bricks.relevant, job.bricks.len() as u64);
-    let voxels: u64 = job.bricks.iter().map(|b| u64::from(b.voxels)).sum();
-    assert_eq!(stats.voxels.relevant, voxels);
-    assert_eq!(stats.slabs[0].tiles[0].worker, "one");
-    assert_eq!(stats.slabs[0].tiles[0].ms, 40.0);
-    assert_eq!((stats.slabs[0].empty, stats.slabs[0].shut), (0, 0));
 }

@@ -156,6 +156,6 @@ fn thinner(
         let (a, b) = (f64::from(coarse.a[i]), f64::from(fine.a[i]));
         let colours = (0..3).map(|k| light(&coarse, k) - light(&fine, k));
         let squares = colours.fold((a - b) * (a - b), |sum, off| sum + off * off);
-        sampled.put(a > 0.0 || b > 0.0, squares);
+        sampled.add_pixel(a > 0.0 || b > 0.0, squares);
     }
 }

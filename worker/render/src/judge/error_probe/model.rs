@@ -188,9 +188,9 @@ impl Model {
             let seen = self.follow((frame, bricks), &ray, &mut column);
             let Some([as_is, rounded, whole, level]) = seen else { continue };
             let there = |other: &Light| as_is.through < 1.0 || other.through < 1.0;
-            samples.positions.put(there(&rounded), rounded.off(&as_is));
-            samples.truncation.put(there(&whole), whole.off(&as_is));
-            samples.ripple.put(there(&level), level.off(&as_is));
+            samples.positions.add_pixel(there(&rounded), rounded.off(&as_is));
+            samples.truncation.add_pixel(there(&whole), whole.off(&as_is));
+            samples.ripple.add_pixel(there(&level), level.off(&as_is));
         }
     }
 

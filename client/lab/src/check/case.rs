@@ -1,15 +1,15 @@
-//! One case of the table of `slabcast lab check`, and the rows that it gives back.
+//! One case of the table of `slabcast lab check`, and the rows that it returns.
 
 use super::shot::Tools;
 use slabcast_session::fail::Fail;
 use std::time::Duration;
 
-/// What a case does.
+/// The work of a case: draws, compares and returns rows.
 pub(crate) type Work = Box<dyn Fn(&Tools) -> Result<Vec<Row>, Fail> + Send + Sync>;
 
 /// One scene, or a few that are compared with each other.
 pub(crate) struct Case {
-    /// What is drawn, unique in its group.
+    /// The scene's name, unique in its group.
     pub(crate) name: String,
     /// Whether it takes so long that only `--long` runs it.
     pub(crate) long: bool,
@@ -18,7 +18,7 @@ pub(crate) struct Case {
 }
 
 impl Case {
-    /// A case that every run has.
+    /// Makes a case that every run includes.
     pub(crate) fn new(
         name: impl Into<String>,
         work: impl Fn(&Tools) -> Result<Vec<Row>, Fail> + Send + Sync + 'static,
@@ -26,43 +26,43 @@ impl Case {
         Case { name: name.into(), long: false, work: Box::new(work) }
     }
 
-    /// The same, for `--long` only.
+    /// Marks the case as one for `--long` alone.
     pub(crate) fn long(self) -> Case {
         Case { long: true, ..self }
     }
 }
 
-/// One thing that must hold.
+/// One property that must hold.
 #[derive(Clone, Debug)]
 pub(crate) struct Row {
-    /// What the error is of: `max against the limit`, `bytes that differ`.
+    /// The property: `max against the limit`, `bytes that differ`.
     pub(crate) what: String,
-    /// What was found, in 1/255 unless `what` says otherwise. Not a number: not held.
+    /// The error found, in 1/255 unless `what` says otherwise. NaN never holds.
     pub(crate) error: f64,
-    /// What it may be at most, in the same unit.
+    /// The largest error allowed, in the unit of `error`.
     pub(crate) bound: f64,
-    /// What else went wrong (hashes that differ, values that are not finite), if anything did.
+    /// A failure besides the error (hashes that differ, values that are not finite).
     pub(crate) trouble: Option<String>,
 }
 
 impl Row {
-    /// A row without other trouble.
+    /// Makes a row without other trouble.
     pub(crate) fn new(what: impl Into<String>, error: f64, bound: f64) -> Row {
         Row { what: what.into(), error, bound, trouble: None }
     }
 
-    /// The same with what else went wrong.
+    /// Adds a failure besides the error.
     pub(crate) fn with(self, trouble: Option<String>) -> Row {
         let all: Vec<String> = self.trouble.iter().cloned().chain(trouble).collect();
         Row { trouble: (!all.is_empty()).then(|| all.join("; ")), ..self }
     }
 
-    /// Whether it held.
+    /// Whether the property held.
     pub(crate) fn held(&self) -> bool {
         self.trouble.is_none() && self.error <= self.bound
     }
 
-    /// As one line.
+    /// Formats the row as one line of text.
     pub(super) fn text(&self, group: &str, case: &str) -> String {
         format!(
             "{group:<11} {case:<44} {:<34} {:>9} <= {:<9} {}{}\n",
@@ -74,7 +74,7 @@ impl Row {
         )
     }
 
-    /// As one line of JSON.
+    /// Formats the row as one line of JSON.
     pub(super) fn json(&self, group: &str, case: &str, took: Duration) -> String {
         let row = serde_json::json!({
             "group": group, "case": case, "what": self.what, "error": self.error,
@@ -85,7 +85,7 @@ impl Row {
     }
 }
 
-/// Three digits, wherever they begin.
+/// Formats a number with three significant digits.
 pub(crate) fn number(x: f64) -> String {
     if x == 0.0 {
         "0".into()

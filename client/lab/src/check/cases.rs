@@ -1,5 +1,5 @@
-//! What is rendered for comparison: volumes, looks, two cameras; and the serial renderer's
-//! answer to each.
+//! Scenes whose hashes are compared: volumes, transfer functions and two cameras, with the serial
+//! renderer's hash of each.
 
 use super::{cluster, looks};
 use glam::DVec3;
@@ -21,9 +21,9 @@ use std::sync::Arc;
 /// Names of the two views of every case.
 pub(crate) const VIEWS: [&str; 2] = ["ortho", "persp"];
 
-/// A volume, a look and a quality; drawn by both cameras.
+/// A volume, a transfer function and a quality; drawn from both cameras.
 pub(crate) struct Case {
-    /// `spheres/auto`.
+    /// Name as in `tests/golden.txt`, such as `spheres/auto`.
     pub(crate) name: String,
     pub(crate) volume: Arc<Volume>,
     pub(crate) info: VolumeInfo,
@@ -32,13 +32,13 @@ pub(crate) struct Case {
     pub(crate) size: [u32; 2],
 }
 
-/// What is special about a quality.
+/// Changes a default quality for a case.
 type Tweak = fn(&mut Quality);
 
-/// A volume by formula, its case's name, its look, and what is special about the quality.
+/// A formula volume, the case's name, the transfer function, and the change of quality.
 type Formula = (&'static str, &'static str, &'static str, Tweak);
 
-/// What formula volumes are there for: shaded and opaque; faint and unlit, where nothing hides
+/// Formula volumes and what each covers: lit and opaque; faint and unlit, where nothing hides
 /// anything; 16-bit; float with a ramp of opacity; step edges in thin sheets; one voxel; a line
 /// longer than any picture; each compositing rule; sums in floats; nothing shut at all; 16-bit
 /// sums; each kernel.
@@ -70,15 +70,15 @@ const FORMULAS: [Formula; 14] = [
     ("formula:spheres", "spheres/auto/tent", "auto", |q| q.kernel = Kernel::Tent),
 ];
 
-/// How many of [`FORMULAS`] the matrix takes: those that differ in how they are rendered. The
-/// others differ in arithmetic alone, which golden frames watch.
+/// Number of [`FORMULAS`] in the matrix: those that take different code paths. The others differ in
+/// arithmetic alone, which golden frames cover.
 const IN_MATRIX: usize = 8;
 
-/// A lattice that is not cubic: its case's name, its steps, and what is special about the quality.
+/// A lattice that is not cubic: the case's name, the lattice's steps, and the change of quality.
 type Leaning = (&'static str, [[f64; 3]; 3], Tweak);
 
-/// Spheres of which kernels lean: in three steps of which no two are at right angles rows of theirs do, too, and
-/// in thick slices.
+/// Spheres whose kernels lean: with three oblique steps, where rows lean as well, and with thick
+/// slices.
 const LEANING: [Leaning; 2] = [
     ("spheres/auto/oblique", [[1.1, 0.0, 0.1], [0.5, 1.3, 0.0], [-0.4, 0.6, 1.9]], |_| {}),
     ("spheres/auto/slices", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.8]], |q| {
@@ -86,8 +86,8 @@ const LEANING: [Leaning; 2] = [
     }),
 ];
 
-/// The cases of the matrix: the volume (if any), and formula volumes.
-pub(crate) fn of_matrix(file: Option<&Path>, size: [u32; 2]) -> Result<Vec<Case>, Fail> {
+/// Returns the cases of the matrix: the volume of `file` (if any) and formula volumes.
+pub(crate) fn matrix_cases(file: Option<&Path>, size: [u32; 2]) -> Result<Vec<Case>, Fail> {
     let mut cases = Vec::new();
     if let Some(file) = file {
         let volume = Arc::new(volume::open(file)?);
@@ -95,14 +95,15 @@ pub(crate) fn of_matrix(file: Option<&Path>, size: [u32; 2]) -> Result<Vec<Case>
         cases.push(Case::new(name, volume, "auto", |_| {}, size)?);
     }
     for formula in &FORMULAS[..IN_MATRIX] {
-        cases.push(of_formula(formula, size)?);
+        cases.push(formula_case(formula, size)?);
     }
     cases.push(leaning(&LEANING[0], size)?);
     Ok(cases)
 }
 
-/// The cases of golden frames: the sample in four looks, and formula volumes.
-pub(crate) fn of_golden(sample: &Path) -> Result<Vec<Case>, Fail> {
+/// Returns the cases of golden frames: the sample with four transfer functions, and formula
+/// volumes.
+pub(crate) fn golden_cases(sample: &Path) -> Result<Vec<Case>, Fail> {
     const SIZE: [u32; 2] = [256, 208];
     let volume = Arc::new(volume::open(sample)?);
     let mut cases = Vec::new();
@@ -117,7 +118,7 @@ pub(crate) fn of_golden(sample: &Path) -> Result<Vec<Case>, Fail> {
         cases.push(Case::new(name, volume.clone(), tf, tweak, SIZE)?);
     }
     for formula in &FORMULAS {
-        cases.push(of_formula(formula, SIZE)?);
+        cases.push(formula_case(formula, SIZE)?);
     }
     for lattice in &LEANING {
         cases.push(leaning(lattice, SIZE)?);
@@ -125,7 +126,7 @@ pub(crate) fn of_golden(sample: &Path) -> Result<Vec<Case>, Fail> {
     Ok(cases)
 }
 
-fn of_formula((file, name, tf, tweak): &Formula, size: [u32; 2]) -> Result<Case, Fail> {
+fn formula_case((file, name, tf, tweak): &Formula, size: [u32; 2]) -> Result<Case, Fail> {
     Case::new((*name).into(), Arc::new(volume::open(file.as_ref())?), tf, tweak, size)
 }
 
@@ -151,7 +152,7 @@ impl Case {
         let info = volume.info(volume.digest());
         let transfer = match tf {
             "extinction" => uncapped(),
-            tf => match looks::of(&name) {
+            tf => match looks::golden_transfer(&name) {
                 Some(fixed) => fixed,
                 None => presets::by_name(tf, &info.summary).map_err(|e| Fail::flag(&e))?,
             },
@@ -166,7 +167,8 @@ impl Case {
         format!("{}/{}", self.name, VIEWS[i])
     }
 
-    /// Both cameras. The second one is near enough to cut the volume at the picture's edge.
+    /// The path of both cameras. The second is near enough for the picture's edge to cut the
+    /// volume.
     fn path(&self) -> ViewPath {
         let (centre, extent) = (self.info.lattice.centre(), self.info.lattice.largest_extent());
         let view = |to_eye: DVec3, projection| PathView {
@@ -184,12 +186,12 @@ impl Case {
         ViewPath::from_views(self.size, views)
     }
 
-    /// The request for both views.
+    /// The request that has a cluster draw both views.
     pub(crate) fn request(&self, cull: bool, work: Work) -> PathRequest {
         cluster::request(self.path(), &self.transfer, Quality { cull, ..self.quality }, work)
     }
 
-    /// The serial renderer's hashes of both views.
+    /// Renders both views with the serial renderer and returns their hashes.
     pub(crate) fn truth(&self) -> Result<Vec<Digest32>, Fail> {
         let SceneBricks { spec, bricks } =
             SceneBricks::new(&self.volume, &self.info, &self.transfer, self.quality)?;
@@ -223,8 +225,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_case_can_be_drawn_and_shows_something() {
-        for case in of_matrix(None, [24, 20]).unwrap() {
+    fn every_matrix_case_renders_two_different_views() {
+        for case in matrix_cases(None, [24, 20]).unwrap() {
             let truth = case.truth().unwrap();
             assert_eq!(truth.len(), VIEWS.len());
             assert_ne!(truth[0], truth[1], "{}", case.name);

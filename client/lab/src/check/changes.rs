@@ -1,6 +1,5 @@
-//! Changes of a shot that should not matter to its picture: the unit of length, where the origin
-//! is, in which order and as what samples are stored. Each is made in all places where it shows;
-//! the rest of the program is not told.
+//! Changes of a shot that must not change its picture: unit of length, origin, storage order and
+//! sample type. Each changes the volume, the camera and the transfer function consistently.
 
 use super::shot::Shot;
 use glam::DVec3;
@@ -9,7 +8,7 @@ use slabcast_common::transfer::OpacityUnit;
 use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
 use std::sync::Arc;
 
-/// Which axis of the old world each axis of the new one is, and whether it points the other way.
+/// A permutation and flip of axes: for each new axis the old one, and whether it is reversed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Turn {
     pub(crate) from: [usize; 3],
@@ -17,7 +16,7 @@ pub(crate) struct Turn {
 }
 
 impl Turn {
-    /// All 48 ways to permute and flip three axes; the first changes nothing.
+    /// Returns all 48 permutations and flips of three axes, the identity first.
     pub(crate) fn all() -> Vec<Turn> {
         const ORDERS: [[usize; 3]; 6] =
             [[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [2, 1, 0], [1, 0, 2]];
@@ -25,7 +24,7 @@ impl Turn {
         flips.flat_map(|flipped| ORDERS.map(|from| Turn { from, flipped })).collect()
     }
 
-    /// Whether a right hand becomes a left one; the picture is then its own mirror image.
+    /// Whether the turn changes handedness, so that the picture is mirrored.
     pub(crate) fn mirrors(self) -> bool {
         let odd = matches!(self.from, [0, 2, 1] | [2, 1, 0] | [1, 0, 2]);
         odd != (self.flipped.iter().filter(|&&f| f).count() % 2 == 1)
@@ -40,7 +39,7 @@ impl Turn {
 }
 
 impl Shot {
-    /// The same in another unit: every length `s` times as long.
+    /// Scales the scene: every length becomes `s` times as long.
     pub(crate) fn scaled(&self, s: f64) -> Shot {
         let mut w = self.clone();
         let l = self.volume.lattice;
@@ -57,7 +56,7 @@ impl Shot {
         w
     }
 
-    /// The same elsewhere.
+    /// Moves the scene by `by` world units.
     pub(crate) fn moved(&self, by: DVec3) -> Shot {
         let mut w = self.clone();
         let l = self.volume.lattice;
@@ -68,7 +67,7 @@ impl Shot {
         w
     }
 
-    /// Axes permuted and flipped: of samples, lattice (whose steps stay positive), camera and
+    /// Permutes and flips the axes of samples, lattice (whose steps stay positive), camera and
     /// light.
     pub(crate) fn turned(&self, t: Turn) -> Shot {
         let mut w = self.stored(t);
@@ -85,7 +84,7 @@ impl Shot {
         w
     }
 
-    /// Samples stored along other axes and from other corners; each stays where it is.
+    /// Stores samples along other axes and from other corners; each stays at its position.
     pub(crate) fn stored(&self, t: Turn) -> Shot {
         let mut w = self.clone();
         let old = self.volume.lattice;
@@ -116,7 +115,7 @@ impl Shot {
         w
     }
 
-    /// `border` more samples of the smallest code on every side; the camera stays.
+    /// Adds `border` samples of the smallest code on every side; the camera stays.
     pub(crate) fn padded(&self, border: u32) -> Shot {
         let mut w = self.clone();
         let old = self.volume.lattice;
@@ -145,12 +144,12 @@ impl Shot {
         w
     }
 
-    /// The volume on another lattice of as many samples.
+    /// Returns the volume on another lattice of as many samples.
     pub(crate) fn on(&self, lattice: Lattice) -> Arc<Volume> {
         Arc::new(Volume { lattice, ..(*self.volume).clone() })
     }
 
-    /// The volume with samples picked from the old ones, on another lattice.
+    /// Returns a volume on another lattice whose sample i is the old sample `from[i]`.
     fn picked(&self, lattice: Lattice, from: &[usize]) -> Arc<Volume> {
         let v = &self.volume;
         let mut samples = Samples::empty(v.samples.kind());
@@ -159,13 +158,13 @@ impl Shot {
         Arc::new(Volume::new(name, kind, v.anatomical, lattice, samples, v.summary.map))
     }
 
-    /// The same 8-bit values as 16-bit codes, of which `per_value` are one value.
+    /// Stores 8-bit values as 16-bit codes, `per_value` codes a value.
     pub(crate) fn in_16_bits(&self, per_value: u16) -> Shot {
         let codes = self.codes().map(|c| c as u16 * per_value).collect();
         self.coded(Samples::U16(codes), 1.0 / f64::from(per_value))
     }
 
-    /// The same 8-bit values as floats.
+    /// Stores 8-bit values as floats.
     pub(crate) fn in_floats(&self) -> Shot {
         self.coded(Samples::F32(self.codes().map(|c| c as f32).collect()), 1.0)
     }

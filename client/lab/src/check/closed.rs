@@ -1,8 +1,8 @@
-//! Scenes whose pictures are known on paper (`slabcast_render::judge::analytic`), each within bounds that
-//! count roundings.
+//! Scenes with pictures in closed form (`slabcast_render::judge::analytic`), each within bounds
+//! that count roundings.
 
 use super::case::{Case, Row};
-use super::shot::{Ready, Shot, sane};
+use super::shot::{PreparedShot, Shot, sane};
 use slabcast_common::image::Picture;
 use slabcast_common::quality::{Compositing, Quality, Sums};
 use slabcast_common::shade::Shading;
@@ -18,7 +18,7 @@ use slabcast_session::volume;
 use std::path::Path;
 use std::sync::Arc;
 
-/// The cases of the group.
+/// Returns the cases of the group.
 pub(crate) fn cases() -> Vec<Case> {
     let mut all = vec![
         wall(0.02, 4.0),
@@ -42,7 +42,7 @@ pub(crate) fn cases() -> Vec<Case> {
     all
 }
 
-/// As `Quality::default` draws.
+/// The default quality's kernel.
 fn profile() -> Profile {
     let q = Quality::default();
     Profile::new(q.std, q.radius)
@@ -62,7 +62,7 @@ fn look(unit: OpacityUnit, colors: Vec<[f64; 4]>, opacities: Vec<[f64; 2]>) -> T
     }
 }
 
-/// The extinction of an alpha per vox.
+/// Returns the extinction per vox of an alpha per vox.
 fn sigma(alpha: f64) -> f64 {
     (-libm::log1p(-alpha)).min(SIGMA_MAX)
 }
@@ -98,12 +98,13 @@ fn shot(
     })
 }
 
-/// Half a subpixel in vox, or nothing where every voxel falls on one: at 4 pixels a voxel.
+/// Returns the largest rounding of a position in vox: half a subpixel, or zero at 4 pixels a voxel,
+/// where every voxel falls on a subpixel.
 fn shift(scale: f64) -> f64 {
     if scale == 4.0 { 0.0 } else { 0.5 / f64::from(SUBPIXELS) / scale }
 }
 
-fn rounding(ready: &Ready, scale: f64) -> Rounding {
+fn rounding(ready: &PreparedShot, scale: f64) -> Rounding {
     let classifier = Classifier::new(&ready.spec.transfer, &ready.spec.volume, Compositing::Linear);
     let integers = ready.spec.quality.sums == Sums::I32;
     Rounding {
@@ -113,8 +114,8 @@ fn rounding(ready: &Ready, scale: f64) -> Rounding {
     }
 }
 
-/// The largest error of pixels and the bound of the pixel that comes nearest to its own, in
-/// 1/255: where one bound is not kept, it is that pixel.
+/// The error and the bound, in 1/255, of the pixel that comes nearest to its own bound or exceeds
+/// it most.
 #[derive(Default)]
 struct Nearest {
     error: f64,
@@ -126,7 +127,7 @@ impl Nearest {
     fn see(&mut self, got: f32, want: f64, bound: f64) {
         let error = (f64::from(got) - want).abs();
         let share = error / bound.max(1e-300);
-        // What is not a number comes out on top, and stays.
+        // NaN counts as the largest, and stays.
         let level = share == self.share && bound > self.bound;
         if share > self.share || level || share.is_nan() {
             *self = Nearest { error, bound, share };
@@ -138,9 +139,9 @@ impl Nearest {
     }
 }
 
-/// Pixels against a stack: opacity where `alphas`, colour where `colours`.
+/// Compares pixels with a stack's closed form: opacity if `alphas`, colour if `colours`.
 fn rows(
-    ready: &Ready,
+    ready: &PreparedShot,
     picture: &Picture,
     stack: &LayerStack,
     scale: f64,

@@ -1,4 +1,4 @@
-//! Clusters in this process, over either link, and the hashes of what they draw.
+//! Clusters in this process, embedded or over TCP, and the hashes of their frames.
 
 use sha2::{Digest, Sha256};
 use slabcast_client::Client;
@@ -20,10 +20,10 @@ use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-/// How long workers may take to join: each draws its self-test first.
+/// Time limit for workers to join; each draws its self-test first.
 const JOIN: Duration = Duration::from_secs(30);
 
-/// The request for the floats of a path's pictures: what is hashed and judged.
+/// Returns the request for a path's pictures as floats, which are hashed and judged.
 pub(super) fn request(
     path: ViewPath,
     transfer: &TransferFunction,
@@ -43,14 +43,15 @@ pub(super) fn request(
     }
 }
 
-/// How master and workers of this process speak.
+/// The link between master and workers in this process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Link {
-    /// Through channels; bricks are shared.
+    /// Channels; bricks are shared in memory.
     Embedded,
     /// gRPC over loopback.
     Tcp,
-    /// The same, to workers that may hold 32 KiB of bricks: some twenty, less than any view needs.
+    /// gRPC over loopback to workers that may hold 32 KiB of bricks: some twenty, fewer than any
+    /// view needs.
     TcpShort,
 }
 
@@ -64,27 +65,27 @@ impl std::fmt::Display for Link {
     }
 }
 
-/// A cluster over either link.
-pub(crate) enum Either {
+/// A cluster over any link.
+pub(crate) enum TestCluster {
     Embedded(Cluster),
-    Tcp(Box<Tcp>),
+    Tcp(Box<TcpCluster>),
 }
 
 /// A master and workers in this process that speak gRPC over loopback.
-pub(crate) struct Tcp {
+pub(crate) struct TcpCluster {
     master: Master,
     client: Client,
     stop: watch::Sender<bool>,
     tasks: JoinSet<Result<(), String>>,
 }
 
-impl Either {
-    /// Starts one for `volume` and waits until its workers are there.
+impl TestCluster {
+    /// Starts a cluster for `volume` and waits until its workers have joined.
     pub(crate) async fn start(
         volume: &Volume,
         link: Link,
         crew: WorkerGroup,
-    ) -> Result<Either, Fail> {
+    ) -> Result<TestCluster, Fail> {
         let orientation = Orientation::new(None, None).map_err(|e| Fail::flag(&e))?;
         let volume = volume.clone();
         let memory = match link {
@@ -93,41 +94,45 @@ impl Either {
             Link::TcpShort => Some(32 << 10),
         };
         let (cluster, handle) = if let Some(memory) = memory {
-            let tcp = Tcp::start(MasterConfig::new(volume, orientation), crew, memory).await?;
+            let tcp =
+                TcpCluster::start(MasterConfig::new(volume, orientation), crew, memory).await?;
             let handle = tcp.master.handle();
-            (Either::Tcp(Box::new(tcp)), handle)
+            (TestCluster::Tcp(Box::new(tcp)), handle)
         } else {
             let cluster = Cluster::start(volume, orientation, crew, None)?;
             let handle = cluster.handle();
-            (Either::Embedded(cluster), handle)
+            (TestCluster::Embedded(cluster), handle)
         };
         joined(&handle, crew.workers).await?;
         Ok(cluster)
     }
 
-    /// Hashes of a request's frames, over the bytes that came.
+    /// Renders `request` and returns the hash of each frame's bytes.
     pub(crate) async fn hashes(&mut self, request: PathRequest) -> Result<Vec<String>, Fail> {
         match self {
-            Either::Embedded(cluster) => {
+            TestCluster::Embedded(cluster) => {
                 tokio::select! {
                     hashes = embedded_hashes(cluster.handle(), request) => hashes,
                     trouble = cluster.trouble() => Err(trouble),
                 }
             }
-            Either::Tcp(tcp) => tcp.hashes(request).await,
+            TestCluster::Tcp(tcp) => tcp.hashes(request).await,
         }
     }
 
-    /// Ends master and workers.
+    /// Stops workers and master.
     pub(crate) async fn end(self) {
         match self {
-            Either::Embedded(cluster) => cluster.end().await,
-            Either::Tcp(tcp) => tcp.end().await,
+            TestCluster::Embedded(cluster) => cluster.end().await,
+            TestCluster::Tcp(tcp) => tcp.end().await,
         }
     }
 }
 
-/// Hash of a frame's floats; also whether the statistics say the same.
+/// Returns the hash of a frame's floats.
+///
+/// # Errors
+/// If the frame's statistics name another hash.
 fn hash(number: u64, bytes: &[u8], said: &str) -> Result<String, Fail> {
     let hash = Digest32(Sha256::digest(bytes).into()).to_string();
     if hash == said {
@@ -143,7 +148,7 @@ pub(super) async fn embedded_hashes(
     embedded_frames(handle, request, |f| hash(f.number, &f.bytes, &f.stats.pixels_sha256)).await
 }
 
-/// What `of` makes of each frame of a request, by a master of this process.
+/// Renders `request` by a master in this process and returns `of` each frame.
 pub(crate) async fn embedded_frames<T>(
     handle: Handle,
     request: PathRequest,
@@ -169,7 +174,7 @@ pub(crate) async fn embedded_frames<T>(
     Ok(frames)
 }
 
-/// Waits until so many workers are there.
+/// Waits until `workers` workers have joined.
 pub(crate) async fn joined(handle: &Handle, workers: u32) -> Result<(), Fail> {
     let all = async {
         while handle.workers().await.len() < workers as usize {
@@ -181,8 +186,12 @@ pub(crate) async fn joined(handle: &Handle, workers: u32) -> Result<(), Fail> {
     })
 }
 
-impl Tcp {
-    async fn start(config: MasterConfig, crew: WorkerGroup, memory: u64) -> Result<Tcp, Fail> {
+impl TcpCluster {
+    async fn start(
+        config: MasterConfig,
+        crew: WorkerGroup,
+        memory: u64,
+    ) -> Result<TcpCluster, Fail> {
         let io = |e: std::io::Error| Fail::failed(format!("listening on 127.0.0.1 failed: {e}"));
         let listener = TcpListener::bind("127.0.0.1:0").await.map_err(io)?;
         let address = listener.local_addr().map_err(io)?.to_string();
@@ -206,7 +215,7 @@ impl Tcp {
         let client = Client::connect(&address)
             .await
             .map_err(|e| slabcast_session::remote::client_failure(&e))?;
-        Ok(Tcp { master, client, stop, tasks })
+        Ok(TcpCluster { master, client, stop, tasks })
     }
 
     async fn hashes(&mut self, request: PathRequest) -> Result<Vec<String>, Fail> {

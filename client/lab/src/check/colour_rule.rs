@@ -1,13 +1,14 @@
-//! `slabcast lab check colour-rule`: what a rule of compositing and a thickness of sheets buy and cost.
+//! `slabcast lab check colour-rule`: error, popping and time by compositing rule and sheet
+//! thickness.
 //!
-//! Whole frames of one view by each rule in sheets of several thicknesses: error against the
-//! limit, time, and how much the picture *pops* when its sheets move. The sheet grid hangs on the
-//! target's depth (CONTRACTS.md, World and camera). So a target that moves along the view axis,
-//! with the eye where it was, moves the sheets through the volume and nothing else; what then
-//! changes in the picture is seen as flicker on a slow path.
+//! Whole frames of one view by each rule in sheets of several thicknesses: error against the limit,
+//! time, and how much the picture *pops* when its sheets move. The sheet grid depends on the
+//! target's depth (docs/design/contracts.md, World and camera). So a target that moves along the
+//! view axis, with the eye where it was, moves the sheets through the volume and nothing else; what
+//! then changes in the picture is seen as flicker on a slow path.
 
 use super::case::number;
-use super::shot::finely;
+use super::shot::with_precise_sums;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::quality::{Compositing, Quality, Work};
 use slabcast_common::view::{Camera, CameraProjection, View};
@@ -71,20 +72,20 @@ const RULES: [(&str, Compositing); 3] = [
 ];
 const THICKNESSES: [f64; 4] = [2.0, 1.0, 0.5, 0.25];
 
-/// What one rule and thickness came to.
+/// Figures of one rule and thickness.
 struct Line {
     rule: &'static str,
     thickness: f64,
-    /// Against the limit.
+    /// ReferenceKind the limit.
     limit: ErrorFigures,
-    /// Against the limit of the rule itself, where that is another.
+    /// ReferenceKind the limit of the rule itself, where that is another.
     own: Option<ErrorFigures>,
     /// Root of the mean square over all pairs of frames half a sheet apart; the largest.
     pop: f64,
     pop_max: f64,
-    /// The same between frames one step apart.
+    /// Popping between frames one step apart.
     step: f64,
-    /// A frame on one thread.
+    /// Time of a frame on one thread.
     ms: Option<f64>,
 }
 
@@ -116,7 +117,12 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
     let mut limits = Vec::new();
     for (_, compositing) in [RULES[0], RULES[2]] {
         let quality = Quality { compositing, ..request.quality };
-        let drawn = SceneBricks::new(&volume, &info, &transfer, finely(quality, &transfer, &info))?;
+        let drawn = SceneBricks::new(
+            &volume,
+            &info,
+            &transfer,
+            with_precise_sums(quality, &transfer, &info),
+        )?;
         let reference = Reference::new(&drawn.spec, view(&camera, &quality)?, &drawn.bricks);
         let reference = reference.with_sheet_payloads();
         let told = (&mut progress, limits.len() * sample.len());
@@ -131,8 +137,12 @@ pub(crate) fn run(args: &ColourRuleArgs) -> Result<(), Fail> {
     for (rule, compositing) in RULES {
         for thickness in THICKNESSES {
             let quality = Quality { compositing, thickness, ..request.quality };
-            let drawn =
-                SceneBricks::new(&volume, &info, &transfer, finely(quality, &transfer, &info))?;
+            let drawn = SceneBricks::new(
+                &volume,
+                &info,
+                &transfer,
+                with_precise_sums(quality, &transfer, &info),
+            )?;
             let scene = Arc::new(Scene::new(&drawn.spec));
             let cut = Cut::on(if args.times { 1 } else { threads });
             let (mut pictures, mut times) = (Vec::new(), Vec::new());
@@ -249,7 +259,7 @@ mod tests {
     use glam::DVec3;
 
     #[test]
-    fn a_nearer_target_leaves_the_eye_where_it_was() {
+    fn moving_the_target_keeps_the_eye() {
         let projection = CameraProjection::Persp { fov: 30.0, distance: 10.0 };
         let to_eye = DVec3::new(0.0, 0.0, 5.0);
         let camera = Camera { to_eye, up: DVec3::Y, target: DVec3::ONE, projection };
@@ -259,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn pops_are_those_of_pairs_half_a_sheet_apart() {
+    fn popping_compares_frames_half_a_sheet_apart() {
         let picture = |v: f32| Picture { size: [2, 1], pixels: vec![[v; 4], [0.0; 4]] };
         let pictures = [0.2, 0.4, 0.4, 0.4].map(picture);
         let (pop, max) = apart(&pictures, 2);

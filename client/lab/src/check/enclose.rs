@@ -1,19 +1,18 @@
-//! Between what and what a pixel must lie, when all that comes between the model and its bytes
-//! is what is meant to: rounded positions, integer sums, f32, fixed-point colour, and the
-//! cut-off.
+//! Rigorous bounds of a pixel by interval arithmetic, if nothing but the intended roundings lies
+//! between the model and its bytes: rounded positions, integer sums, f32, fixed-point colour and
+//! the cut-off.
 //!
-//! Sheets of the same thickness are taken once more, in intervals. A voxel's place is known to
-//! half a subpixel across and half a phase in depth, so its weight lies between the least and
-//! the most that its kernel has there. Sums of weights, colours, the rule of a closing sheet and
-//! the compositing follow in interval arithmetic: every step is given the least and the most
-//! that goes in, and keeps the least and the most that may come out. So the result is a bound
-//! for this very pixel, and it holds whatever the roundings are; what it is not is tight: it
-//! takes all roundings to fall the same way, in truth they scatter.
+//! Sheets of the view's thickness are computed once more, in intervals. A voxel's position is known
+//! to half a subpixel across and half a phase in depth, so its weight lies between the least and
+//! the greatest value of its kernel there. Sums of weights, colours, the colour rule and
+//! compositing follow in interval arithmetic. The result is a bound for each pixel, and it holds
+//! whatever the roundings are. It is not tight: it assumes that all roundings have the same sign,
+//! while in truth they scatter.
 //!
 //! Where an edge of the volume is stiff, the bound is wide because the picture is: half a
 //! subpixel beside an edge of extinction 1e9, a pixel may be anything.
 
-use super::shot::Ready;
+use super::shot::PreparedShot;
 use slabcast_common::bounds::i32_units_per_payload;
 use slabcast_common::brick::TightBox;
 use slabcast_common::kernel::{Lean, Profile};
@@ -36,7 +35,7 @@ const COLOUR: f64 = 0.5 / (1u32 << 28) as f64;
 /// Below this `sheet` takes a float sum for nothing.
 const FAINTEST: f64 = 1e-30;
 
-/// The least and the most.
+/// An interval.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct Span {
     pub(crate) lo: f64,
@@ -72,18 +71,18 @@ impl Span {
         Span::new(self.lo - by, self.hi + by)
     }
 
-    /// The part in [lo, hi]; an end of it where there is none.
+    /// Clamps both ends to [lo, hi].
     fn within(self, lo: f64, hi: f64) -> Span {
         Span::new(self.lo.clamp(lo, hi), self.hi.clamp(lo, hi))
     }
 }
 
-/// What a sheet holds at the pixel: optical depth and three colour sums; and the colours and
-/// number of those that contribute.
+/// A sheet at the pixel: optical depth and three colour sums, the range of the contributing
+/// colours, and the number of contributions.
 #[derive(Clone, Copy, Debug, Default)]
 struct Sheet {
     sums: [Span; 4],
-    /// The same without voxels that begin here: what the sheet in front peeks at.
+    /// The sums without voxels that begin in this sheet, which the sheet in front peeks at.
     peek: [Span; 4],
     count: u32,
     hull: [Span; 3],
@@ -91,18 +90,18 @@ struct Sheet {
 
 /// A sheet's optical depth and mean colours.
 #[derive(Clone, Copy, Debug, Default)]
-struct Closed {
+struct CompositedSheet {
     tau: Span,
     c: [Span; 3],
 }
 
 /// A picture's bounds.
 pub(crate) struct Enclosure<'a> {
-    ready: &'a Ready,
+    ready: &'a PreparedShot,
     frame: Frame,
     kernel: [Profile; 3],
     rects: Vec<Rect>,
-    /// Those that the volume may touch, and one more on each side.
+    /// Sheets that the volume may touch, and one more on each side.
     range: SheetRange,
     /// Optical depth of half a raw unit.
     half_unit: f64,
@@ -111,8 +110,8 @@ pub(crate) struct Enclosure<'a> {
 }
 
 impl<'a> Enclosure<'a> {
-    /// Of the picture that `ready` draws.
-    pub(crate) fn new(ready: &'a Ready) -> Self {
+    /// Prepares bounds of the picture that `ready` draws.
+    pub(crate) fn new(ready: &'a PreparedShot) -> Self {
         let (view, frame) = (&ready.view, ready.frame());
         let floats = ready.spec.quality.sums == Sums::F32;
         let scale = i32_units_per_payload(frame.scene.payload_max, view.thickness);
@@ -137,14 +136,14 @@ impl<'a> Enclosure<'a> {
             range: SheetRange::new(range.first - 1, range.end + 1),
             half_unit: if floats { 0.0 } else { 0.5 / f64::from(scale) },
             floats,
-            // As docs/design/numerics.md section 1.2 has them.
+            // docs/design/numerics.md, section 1.2.
             gains: [(0.5 + 0.20 * y).min(2.0), (0.5 - 0.07 * y).max(0.25)],
             frame,
             ready,
         }
     }
 
-    /// The least and the most of the four channels at pixel (x, y).
+    /// Returns bounds of the four channels at pixel (x, y), linear premultiplied.
     pub(crate) fn pixel(&self, x: u32, y: u32) -> [Span; 4] {
         let sheets = self.gather(x, y);
         let secant = f64::from(self.ready.view.secant(x as i32, y as i32));
@@ -181,7 +180,8 @@ impl<'a> Enclosure<'a> {
                 let end = libm::ceil((eye.z + dz + radius) / d) as i32;
                 let place = |k: i32| {
                     let scale = view.scale_at(k)?;
-                    // Where the kernel leans, its section is beside its voxel, and its row beside that.
+                    // Where the kernel leans, its section is beside its voxel, and its row beside
+                    // that.
                     let Lean { depth: [lean_x, lean_y], row } = view.kernel_lean;
                     let from = f64::from(k) * d - eye.z;
                     let behind = self.kernel[2].placed(from, from + d);
@@ -197,7 +197,8 @@ impl<'a> Enclosure<'a> {
                     let gy = across(&self.kernel[1], py, at_y, scale, off_y);
                     (gx.hi > 0.0 && gy.hi > 0.0).then(|| gx.times(gy))
                 };
-                // Where rays are parallel and the kernel does not lean the place is the same in all sheets.
+                // Where rays are parallel and the kernel does not lean the place is the same in all
+                // sheets.
                 let parallel = matches!(view.projection, Projection::Ortho { .. })
                     && view.kernel_lean.is_none();
                 let same = if parallel { place(f_lo) } else { None };
@@ -270,7 +271,7 @@ impl<'a> Enclosure<'a> {
         })
     }
 
-    fn colours(&self, sums: [Span; 4], sheet: &Sheet, secant: f64) -> Closed {
+    fn colours(&self, sums: [Span; 4], sheet: &Sheet, secant: f64) -> CompositedSheet {
         let tau = sums[0];
         let noise = f64::from(sheet.count) * self.half_unit * secant;
         let c = std::array::from_fn(|c| {
@@ -288,7 +289,7 @@ impl<'a> Enclosure<'a> {
             let e = sums[c + 1];
             Span::new((e.lo / tau.hi).max(hull.lo), (e.hi / tau.lo).min(hull.hi)).within(0.0, 1.0)
         });
-        Closed { tau, c }
+        CompositedSheet { tau, c }
     }
 
     fn composite(&self, sheets: &[Sheet], secant: f64) -> [Span; 4] {
@@ -297,7 +298,7 @@ impl<'a> Enclosure<'a> {
         let (mut a, mut light) = (Span::default(), [Span::default(); 3]);
         // As the pixel would stand if it was shut as early as it may be.
         let mut shut: Option<[f64; 4]> = None;
-        let mut before: Option<(usize, Closed)> = None;
+        let mut before: Option<(usize, CompositedSheet)> = None;
         let touched = sheets.iter().enumerate().filter(|(_, s)| s.count > 0);
         for (k, sheet) in touched.clone() {
             let open = Span::new(1.0 - a.hi, 1.0 - a.lo);
@@ -353,7 +354,13 @@ impl<'a> Enclosure<'a> {
     }
 
     /// Change of colour through a sheet, by the neighbours on both sides.
-    fn change(&self, front: &Closed, here: &Closed, behind: &Closed, c: usize) -> Span {
+    fn change(
+        &self,
+        front: &CompositedSheet,
+        here: &CompositedSheet,
+        behind: &CompositedSheet,
+        c: usize,
+    ) -> Span {
         let ratio = |a: Span, b: Span| {
             Span::new(
                 if b.hi > 0.0 { a.lo / b.hi } else { 0.0 },
@@ -362,13 +369,14 @@ impl<'a> Enclosure<'a> {
         };
         let square = |q: f64| if q.is_finite() { q * q / (q * q + 4e-4) } else { 1.0 };
         let line = |q: f64| if q.is_finite() { q / (q + 0.05) } else { 1.0 };
-        let part = |gain: f64, other: &Closed, weight: &dyn Fn(f64) -> f64, slope: Span| {
-            if other.tau.hi <= 0.0 {
-                return Span::default();
-            }
-            let q = ratio(other.tau, here.tau);
-            Span::new(gain * weight(q.lo), gain * weight(q.hi)).times(slope)
-        };
+        let part =
+            |gain: f64, other: &CompositedSheet, weight: &dyn Fn(f64) -> f64, slope: Span| {
+                if other.tau.hi <= 0.0 {
+                    return Span::default();
+                }
+                let q = ratio(other.tau, here.tau);
+                Span::new(gain * weight(q.lo), gain * weight(q.hi)).times(slope)
+            };
         let mine = here.c[c];
         let d = part(self.gains[0], front, &square, mine.minus(front.c[c]))
             .plus(part(self.gains[1], behind, &line, behind.c[c].minus(mine)))
@@ -400,7 +408,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn spans_hold_every_product_and_difference() {
+    fn interval_arithmetic_contains_every_product_and_difference() {
         let (a, b) = (Span::new(-1.0, 2.0), Span::new(0.5, 3.0));
         for x in [-1.0, 0.3, 2.0] {
             for y in [0.5, 1.0, 3.0] {
@@ -413,7 +421,7 @@ mod tests {
     }
 
     #[test]
-    fn phi_falls_from_nothing_to_a_half() {
+    fn phi_falls_from_zero_to_minus_half() {
         let all: Vec<f64> = (0..4000).map(|i| phi(0.005 * f64::from(i))).collect();
         assert!(all.windows(2).all(|w| w[1] <= w[0] + 1e-15));
         assert!(all[0] == 0.0 && phi(1e9) > -0.5 && phi(1e9) < -0.499_999);

@@ -1,4 +1,5 @@
-//! Hashes that are the same on every machine, build and day (CONTRACTS.md, Exactness).
+//! Golden frames: hashes that are equal on every machine and build (docs/design/contracts.md,
+//! Exactness).
 
 use super::cases::{self, VIEWS};
 use super::cluster::embedded_hashes;
@@ -33,7 +34,7 @@ pub(crate) struct GoldenArgs {
 pub(crate) fn run(args: &GoldenArgs) -> Result<(), Fail> {
     let want = args.verify.as_deref().map(read).transpose()?;
     let began = Instant::now();
-    let cases = cases::of_golden(&args.sample)?;
+    let cases = cases::golden_cases(&args.sample)?;
     let runtime = slabcast_session::runtime::start()?;
     let mut progress = Progress::new(false);
     let total = (cases.len() * VIEWS.len()) as u64;
@@ -93,7 +94,7 @@ fn read(file: &Path) -> Result<BTreeMap<String, String>, Fail> {
     Ok(want)
 }
 
-/// What differs, and how often.
+/// Returns a report of the hashes that differ, are missing or are left over, and their number.
 fn compare(want: &BTreeMap<String, String>, lines: &[(String, String)]) -> (String, usize) {
     let (mut report, mut wrong) = (String::new(), 0);
     for (name, got) in lines {
@@ -152,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn what_differs_lacks_or_is_left_over_is_counted() {
+    fn golden_compare_counts_hashes_that_differ_are_missing_or_left_over() {
         let want: BTreeMap<String, String> =
             [("a", "1"), ("b", "2"), ("d", "4")].map(|(n, h)| (n.into(), h.into())).into();
         let lines = [("a", "1"), ("b", "3"), ("c", "3")].map(|(n, h)| (n.into(), h.into()));

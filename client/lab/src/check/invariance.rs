@@ -1,11 +1,11 @@
-//! What must not matter to a picture: the unit of length, where the origin is, along which axes
-//! samples are stored and in which type, empty borders, points on a transfer function's lines.
-//! And what must matter one way only: thinner sheets are not worse, more opacity does not let
-//! more light through.
+//! Invariance: changes that must not change a picture (unit of length, origin, storage order,
+//! sample type, empty borders, extra points on a transfer function's lines), and monotony: thinner
+//! sheets are not worse, and more opacity does not let more light through.
 //!
-//! Each bound is zero (no byte may differ) or derived where it stands, but for [`CUT_OTHERWISE`]. Positions are rounded, so
-//! two ways to compute one position could fall on two sides of a boundary. They differ by 1e-13
-//! pixels or so and boundaries are 1/256 pixel apart: no scene here has a voxel that near to one.
+//! Each bound is zero (no byte may differ) or derived where it stands, but for [`CUT_OTHERWISE`].
+//! Positions are rounded, so two ways to compute one position could fall on two sides of a
+//! boundary. They differ by 1e-13 pixels or so and boundaries are 1/256 pixel apart: no scene here
+//! has a voxel that near to one.
 
 use super::case::{Case, Row};
 use super::changes::Turn;
@@ -13,7 +13,7 @@ use super::invariance_scenes::{
     BYTES, Effort, InvarianceCase, LARGEST, Scene, VIEWS, cropped, largest, mirrored,
     pixels_that_differ, rolled,
 };
-use super::shot::{Against, Shot};
+use super::shot::{ReferenceKind, Shot};
 use glam::DVec3;
 use slabcast_common::image::{Background, Picture};
 use slabcast_common::quality::Quality;
@@ -23,13 +23,14 @@ use slabcast_render::judge::reference::ErrorFigures;
 use slabcast_session::direct::Cut;
 use slabcast_session::fail::Fail;
 
-/// A picture on its side against the upright one where the kernel leans, in 1/255. Such a kernel is a product of
-/// profiles along two axes across the depth, and these are others then; a Gaussian does not feel that, but each profile
-/// has its edge value taken away, 0.0039 of its peak. As much as 5 % of a voxel's weight may move by two steps, which
-/// bounds nothing; 0.2 to 0.5 is what it comes to.
+/// A picture on its side against the upright one where the kernel leans, in 1/255. Such a kernel is
+/// a product of profiles along two axes across the depth, and these are others then; a Gaussian
+/// does not feel that, but each profile has its edge value taken away, 0.0039 of its peak. As much
+/// as 5 % of a voxel's weight may move by two steps, which bounds nothing; 0.2 to 0.5 is what it
+/// comes to.
 const CUT_OTHERWISE: f64 = 1.0;
 
-/// The cases of the group.
+/// Returns the cases of the group.
 pub(crate) fn cases() -> Vec<Case> {
     with(Effort { samples: 48, size: [160, 128], pixels: 2000, every: 5 })
 }
@@ -63,9 +64,9 @@ fn with(effort: Effort) -> Vec<Case> {
 /// One invariance of one scene.
 type Check = fn(&InvarianceCase) -> Result<Vec<Row>, Fail>;
 
-/// Lengths in another unit. Powers of two change nothing. Other factors round lengths in their
+/// Scales lengths. Powers of two change nothing. Other factors round lengths in their
 /// last bit, 1e-16 of them, and weights and looks, kept in f32, then change in one case of 10^8.
-/// What is demanded is at most 1/255 in at most 0.01 % of the pixels.
+/// The bound is 1/255 in at most 0.01 % of the pixels.
 fn units(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
     let powers = case.same_bytes("powers of 2", |s| {
         [-60, -30, -1, 10, 30, 60].map(|e| s.scaled(2f64.powi(e))).into()
@@ -150,7 +151,7 @@ fn borders(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
     Ok(vec![Row::new(LARGEST, off, 255.0 * order)])
 }
 
-/// The same values as 8-bit codes, 16-bit codes and floats.
+/// Values stored as 8-bit codes, 16-bit codes and floats give one picture.
 fn types(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
     if case.scene == Scene::Stiff {
         // Its values have 16 bits, of which floats hold all.
@@ -242,13 +243,13 @@ fn sheets(case: &InvarianceCase) -> Result<Vec<Row>, Fail> {
         let (mut shot, _) = case.views()?.swap_remove(at);
         shot.quality.eps = 0.0;
         let sample = shot.ready()?.sample(case.effort.pixels);
-        let limit = shot.ready()?.truth(Against::Limit, &sample, case.tools);
+        let limit = shot.ready()?.truth(ReferenceKind::Limit, &sample, case.tools);
         let (mut before, mut worst) = (f64::INFINITY, 0.0f64);
         for d in [2.0, 1.0, 0.5, 0.25, 0.125] {
             shot.quality.thickness = d;
             let ready = shot.ready()?;
             let got = ready.at(&ready.picture(Cut::on(case.tools.threads)), &sample);
-            let same = ready.truth(Against::SameSheets, &sample, case.tools);
+            let same = ready.truth(ReferenceKind::SameSheets, &sample, case.tools);
             let black = Background::Colour([0.0; 3]);
             let rmse = |want: &[[f64; 4]]| ErrorFigures::compare(&got, want, black).rmse;
             let (now, floor) = (rmse(&limit), rmse(&same));
@@ -311,7 +312,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn everything_holds_on_small_scenes() {
+    fn invariances_hold_on_small_scenes() {
         let effort = Effort { samples: 24, size: [64, 48], pixels: 400, every: 7 };
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
         let tools = Tools { threads: 2, runtime };

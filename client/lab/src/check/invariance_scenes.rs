@@ -1,5 +1,5 @@
-//! What the invariances are tried on: four scenes from four sides, the bounds of their roundings,
-//! and the ways to compare and turn pictures.
+//! Scenes of the invariance tests: four scenes from four views, bounds of their roundings, and
+//! comparisons and turns of pictures.
 
 use super::case::Row;
 use super::cases;
@@ -18,19 +18,19 @@ use slabcast_session::fail::Fail;
 use slabcast_session::volume;
 use std::sync::Arc;
 
-/// How much is drawn.
+/// Size of the test scenes.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Effort {
-    /// Samples along the axes of a volume.
+    /// Samples along each axis of a volume.
     pub(super) samples: u32,
     pub(super) size: [u32; 2],
     /// Pixels that are compared with the reference.
     pub(super) pixels: usize,
-    /// Every how manyth of the 47 turns is tried.
+    /// Stride through the 47 turns.
     pub(super) every: usize,
 }
 
-/// One scene, ready to be changed and drawn.
+/// One scene with its effort and tools.
 pub(super) struct InvarianceCase<'a> {
     pub(super) scene: Scene,
     pub(super) effort: Effort,
@@ -38,12 +38,12 @@ pub(super) struct InvarianceCase<'a> {
     pub(super) tools: &'a Tools,
 }
 
-/// What is drawn.
+/// A test scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Scene {
     /// Lit and opaque.
     Opaque,
-    /// Unlit, nothing hides anything.
+    /// Unlit and translucent, so that nothing is hidden.
     Translucent,
     /// Extinctions far beyond the cap of opacities: the sums are floats.
     Stiff,
@@ -118,7 +118,7 @@ impl InvarianceCase<'_> {
         Ok(shot.ready()?.picture(Cut::on(self.tools.threads)))
     }
 
-    /// The shot from each of the views, with its picture.
+    /// Returns the shot from each view, with its picture.
     pub(super) fn views(&self) -> Result<Vec<(Shot, Picture)>, Fail> {
         VIEWS
             .iter()
@@ -134,7 +134,8 @@ impl InvarianceCase<'_> {
             .collect()
     }
 
-    /// One row: by how many pixels any of `others` differs at most, from any view.
+    /// Returns a row with the largest number of pixels in which any of `others` differs, over all
+    /// views.
     pub(super) fn same_bytes(
         &self,
         what: &str,
@@ -149,7 +150,7 @@ impl InvarianceCase<'_> {
         Ok(Row::new(format!("{BYTES}: {what}"), most as f64, 0.0))
     }
 
-    /// Sheets that the volume takes at most.
+    /// Returns the number of sheets that the volume takes at most.
     pub(super) fn sheets(&self) -> f64 {
         let l = &self.shot.volume.lattice;
         let n = l.dims.map(f64::from);
@@ -193,13 +194,13 @@ pub(super) fn pixels_that_differ(a: &Picture, b: &Picture) -> usize {
     a.pixels.iter().zip(&b.pixels).filter(differ).count()
 }
 
-/// In 1/255, over all channels; not a number where one of them is none.
+/// Returns the largest difference over all channels, in 1/255; NaN if any channel is.
 pub(super) fn largest(a: &Picture, b: &Picture) -> f64 {
     let want: Vec<[f64; 4]> = b.pixels.iter().map(|p| p.map(f64::from)).collect();
     super::shot::largest(&a.pixels, &want)
 }
 
-/// Left and right exchanged.
+/// Returns the picture with left and right exchanged.
 pub(super) fn mirrored(p: &Picture) -> Picture {
     let mut p = p.clone();
     let width = p.size[0] as usize;
@@ -207,7 +208,7 @@ pub(super) fn mirrored(p: &Picture) -> Picture {
     p
 }
 
-/// A square picture a quarter turn round.
+/// Returns a square picture turned by a quarter.
 pub(super) fn rolled(p: &Picture) -> Picture {
     let n = p.size[0] as usize;
     let at = |i: usize| p.pixels[(i % n) * n + (n - 1 - i / n)];

@@ -1,4 +1,4 @@
-//! What golden frames look like: fixed, while presets get better.
+//! Transfer functions of golden frames: fixed, while presets improve.
 //!
 //! A golden frame watches the arithmetic behind pixels. If it were drawn with a preset by name, a
 //! better rule for where air ends would look like a broken renderer. So these functions are what
@@ -7,8 +7,8 @@
 use slabcast_common::shade::Shading;
 use slabcast_common::transfer::{ColorSpace, Domain, NanColour, OpacityUnit, TransferFunction};
 
-/// The function of a golden case by its name, if it is one of a preset that changes.
-pub(super) fn of(case: &str) -> Option<TransferFunction> {
+/// Returns the transfer function of the golden case `case`, if its preset may change.
+pub(super) fn golden_transfer(case: &str) -> Option<TransferFunction> {
     let tf = match case {
         "mni152_t1/auto" => surface(
             [0.2147058823529412, 0.392_114_571_318_718_6, 0.569523260284506, 0.9215686274509803],

@@ -1,7 +1,7 @@
-//! One hash a view: over workers, tiles, slabs, threads, culling and links.
+//! Exactness: one hash a view over workers, tiles, slabs, threads, culling and links.
 
 use super::cases::{self, Case};
-use super::cluster::{Either, Link};
+use super::cluster::{Link, TestCluster};
 use super::pairwise;
 use slabcast_common::quality::{Schedule, Work};
 use slabcast_common::volume::Digest32;
@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Where the sample lies in a checkout.
+/// Path of the sample in a checkout.
 pub(crate) const SAMPLE: &str = "samples/mni152_t1.nii.gz";
 
 const WORKERS: [u32; 4] = [1, 2, 3, 5];
@@ -25,8 +25,8 @@ const LINKS: [Link; 3] = [Link::Embedded, Link::Tcp, Link::TcpShort];
 const SCHEDULES: [Schedule; 2] = [Schedule::Slab, Schedule::Region];
 
 /// Compares pixels over workers (1, 2, 3, 5), tiles (16 to 256, auto), slabs (1, 3, 5) or regions,
-/// threads (1, 2), culling (on, off) and links (embedded, TCP, TCP to workers of 32 KiB) with those of the
-/// serial renderer.
+/// threads (1, 2), culling (on, off) and links (embedded, TCP, TCP to workers of 32 KiB) with those
+/// of the serial renderer.
 #[derive(clap::Args, Clone, Debug)]
 #[command(after_help = "\
 Examples:
@@ -43,7 +43,7 @@ pub(crate) struct MatrixArgs {
     size: [u32; 2],
 }
 
-/// One way to make a picture.
+/// One way to divide and carry the work of a picture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Setting {
     // A cluster is started for each of the first three, so rows are sorted by them.
@@ -114,11 +114,11 @@ impl std::fmt::Display for Setting {
     }
 }
 
-/// What became of a view.
+/// The results of one view.
 struct Verdict {
     want: Digest32,
     pictures: usize,
-    /// Settings that gave another hash.
+    /// Settings with another hash, and the hash.
     wrong: Vec<(Setting, String)>,
 }
 
@@ -127,8 +127,8 @@ impl Verdict {
         Verdict { want, pictures: 0, wrong: Vec::new() }
     }
 
-    /// Takes what others found of the same view.
-    fn take(&mut self, more: Verdict) {
+    /// Adds results of the same view.
+    fn add(&mut self, more: Verdict) {
         self.pictures += more.pictures;
         self.wrong.extend(more.wrong);
     }
@@ -141,7 +141,7 @@ pub(crate) fn run(args: &MatrixArgs) -> Result<(), Fail> {
     if file.is_none() {
         progress::note(&format!("no {SAMPLE} here: formula volumes alone are checked"));
     }
-    let cases = cases::of_matrix(file, args.size)?;
+    let cases = cases::matrix_cases(file, args.size)?;
     let settings = Setting::all(args.pairwise);
     let began = Instant::now();
     let runtime = slabcast_session::runtime::start()?;
@@ -165,7 +165,8 @@ pub(crate) fn run(args: &MatrixArgs) -> Result<(), Fail> {
         for s in &settings {
             groups.entry((s.link, s.workers, s.threads)).or_default().push(*s);
         }
-        // Two clusters at a time: one alone leaves a processor free while its messages are on their way.
+        // Two clusters at a time: one alone leaves a processor free while its messages are on their
+        // way.
         let queue = RefCell::new(groups.values());
         let lane = || async {
             let mut verdicts: Vec<Verdict> = truth.iter().map(|&want| Verdict::new(want)).collect();
@@ -176,7 +177,7 @@ pub(crate) fn run(args: &MatrixArgs) -> Result<(), Fail> {
             }
         };
         let (mut verdicts, other) = runtime.block_on(async { tokio::try_join!(lane(), lane()) })?;
-        verdicts.iter_mut().zip(other).for_each(|(all, more)| all.take(more));
+        verdicts.iter_mut().zip(other).for_each(|(all, more)| all.add(more));
         for (i, v) in verdicts.iter().enumerate() {
             let outcome = match v.wrong.len() {
                 0 => "exact".to_string(),
@@ -223,7 +224,7 @@ async fn check(
     done: impl Fn(),
 ) -> Result<(), Fail> {
     let Some(first) = settings.first() else { return Ok(()) };
-    let mut cluster = Either::start(&case.volume, first.link, first.crew()).await?;
+    let mut cluster = TestCluster::start(&case.volume, first.link, first.crew()).await?;
     for setting in settings {
         let request = case.request(setting.cull, setting.work());
         let hashes = cluster
@@ -259,7 +260,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_matrix_has_every_setting_of_the_promise() {
+    fn matrix_has_every_combination_of_settings() {
         let all = Setting::all(false);
         assert_eq!(all.len(), 4 * 6 * (3 + 1) * 2 * 2 * 3);
         let few = Setting::all(true);

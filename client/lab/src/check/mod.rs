@@ -1,12 +1,11 @@
-//! `slabcast lab check`: does it hold what it promises?
+//! `slabcast lab check`: tests of the shipped program against its promises.
 //!
-//! Without a subcommand: a [`table`] of cases, each with an error, its bound and a verdict. A
-//! frame's bytes must not depend on who rendered it either (docs/design/model.md, Pixels are
-//! exact): `matrix` renders views over every way to cut and carry the work and compares their
-//! hashes with the serial renderer's; `golden` prints hashes that have to be the same on every
-//! machine, build and day; `convergence` says how fast pictures come to the limit, `colour-rule`
-//! what rules of compositing buy and cost. This room belongs to the program because only here all
-//! crates can be seen.
+//! Without a subcommand: a [`table`] of cases, each with an error, its bound and a verdict. Pixels
+//! must not depend on who rendered them: `matrix` renders views over every way to divide and carry
+//! the work and compares their hashes with the serial renderer's; `golden` prints hashes that are
+//! equal on every machine and build; `convergence` measures how fast pictures converge with thinner
+//! sheets; `colour-rule` compares error, popping and time of the compositing rules. The checks are
+//! here and not in a lower crate because they need all crates.
 
 mod case;
 mod cases;

@@ -1,10 +1,11 @@
-//! Few settings that cover every pair.
+//! Pairwise testing: few settings that cover every pair of values.
 //!
 //! Most mistakes show when two settings meet (D. Cohen et al. 1997, "The AETG system"): with
 //! every value of each setting beside every value of every other one, 30 rows stand for 576.
 
-/// Rows of `levels` (number of values of each setting) such that any two values of two settings
-/// meet in a row. Greedy and deterministic: each row is the first of those that cover most.
+/// Returns rows of value indices, one a setting, in which any two values of two settings occur
+/// together; `levels` has the number of values of each setting. Greedy and deterministic: each row
+/// is the first of those that cover most new pairs.
 pub(crate) fn rows(levels: &[usize]) -> Vec<Vec<usize>> {
     let all = product(levels);
     let mut open: std::collections::BTreeSet<[usize; 4]> = std::collections::BTreeSet::new();
@@ -24,7 +25,7 @@ pub(crate) fn rows(levels: &[usize]) -> Vec<Vec<usize>> {
     chosen
 }
 
-/// Every combination, the last setting changing fastest.
+/// Returns every combination, the last setting changing fastest.
 pub(crate) fn product(levels: &[usize]) -> Vec<Vec<usize>> {
     levels.iter().fold(vec![Vec::new()], |rows, &n| {
         rows.iter()
@@ -43,7 +44,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_pair_meets_in_few_rows() {
+    fn pairwise_rows_cover_every_pair_in_few_rows() {
         let levels = [4, 6, 3, 2, 2, 2];
         let (all, some) = (product(&levels), rows(&levels));
         assert_eq!(all.len(), 576);

@@ -1,8 +1,8 @@
-//! Scenes by formula whose pictures are known, at least along some rays.
+//! Scenes of formula volumes, one for each source of error by sheet thickness.
 
-/// A volume by formula and what it looks like.
+/// A formula volume and its transfer function.
 pub(crate) struct Scene {
-    /// What it is called in tables and file names.
+    /// Name in tables and file names.
     pub(crate) name: &'static str,
     /// The volume.
     pub(crate) volume: &'static str,

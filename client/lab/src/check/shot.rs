@@ -1,10 +1,10 @@
-//! One picture: what is drawn, how and from where; drawn in every way there is.
+//! One picture to check, drawn by every renderer there is.
 //!
-//! Groups of the table build a [`Shot`] from a volume, a look, a quality and a camera, make it
-//! [`Ready`], and ask for what they need: the serial picture, one on threads, the hashes of
-//! clusters, the reference.
+//! Groups of the table build a [`Shot`] from a volume, a transfer function, a quality and a camera,
+//! make it a [`PreparedShot`], and ask for what they need: the serial picture, one on threads, the
+//! hashes of clusters, the reference.
 
-use super::cluster::{self, Either, Link};
+use super::cluster::{self, Link, TestCluster};
 use slabcast_common::image::Picture;
 use slabcast_common::message::SceneSpec;
 use slabcast_common::quality::{Quality, Sums, Work};
@@ -23,19 +23,19 @@ use slabcast_session::path_scenes::SceneBricks;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// How long one cluster may take over one picture; the longest default case needs a few
-/// seconds. A cluster that hangs is a case that did not hold, not a check that never ends.
+/// Time limit of one picture by a cluster; the longest default case needs a few seconds. A cluster
+/// that hangs fails its case, and the check goes on.
 const PATIENCE: Duration = Duration::from_secs(600);
 
-/// What cases may use of this process.
+/// Resources that cases share.
 pub(crate) struct Tools {
     /// Threads to draw and judge with.
     pub(crate) threads: usize,
-    /// Where clusters run. Cases run on a thread outside it and may block on it.
+    /// Runtime of clusters. Cases run on a thread outside it and may block on it.
     pub(crate) runtime: tokio::runtime::Runtime,
 }
 
-/// What is drawn, how and from where.
+/// A scene and a view of it.
 #[derive(Clone, Debug)]
 pub(crate) struct Shot {
     pub(crate) volume: Arc<Volume>,
@@ -48,9 +48,13 @@ pub(crate) struct Shot {
     pub(crate) view: PathView,
 }
 
-/// `quality` with sums of 32 bits or floats where they are for the program to decide: what is judged
-/// here is off by so little that 16 bits would show.
-pub(crate) fn finely(quality: Quality, transfer: &TransferFunction, info: &VolumeInfo) -> Quality {
+/// Returns `quality` with sums of 32 bits or floats where they are automatic: errors judged here
+/// are so small that 16 bits would show.
+pub(crate) fn with_precise_sums(
+    quality: Quality,
+    transfer: &TransferFunction,
+    info: &VolumeInfo,
+) -> Quality {
     let classifier = Classifier::new(transfer, info, quality.compositing);
     match (quality.sums, classifier.choose_sums(&quality, &info.lattice)) {
         (Sums::Auto, Ok(Sums::I16)) => Quality { sums: Sums::I32, ..quality },
@@ -58,10 +62,10 @@ pub(crate) fn finely(quality: Quality, transfer: &TransferFunction, info: &Volum
     }
 }
 
-/// A shot with everything that draws it.
+/// A shot with its bricks and tables, ready to be drawn.
 #[derive(Clone)]
-pub(crate) struct Ready {
-    /// Sums decided.
+pub(crate) struct PreparedShot {
+    /// With sums resolved.
     pub(crate) spec: SceneSpec,
     pub(crate) view: View,
     pub(crate) bricks: Bricks,
@@ -72,18 +76,18 @@ impl Shot {
         ViewPath::from_views(self.size, vec![self.view])
     }
 
-    /// The request that has a cluster draw it.
+    /// Returns the request that has a cluster draw the shot.
     pub(crate) fn request(&self, cull: bool, work: Work) -> PathRequest {
         let info = self.volume.info(Digest32::default());
-        let quality = Quality { cull, ..finely(self.quality, &self.transfer, &info) };
+        let quality = Quality { cull, ..with_precise_sums(self.quality, &self.transfer, &info) };
         cluster::request(self.path(), &self.transfer, quality, work)
     }
 
-    /// Makes it ready.
+    /// Prepares the shot for drawing.
     ///
     /// # Errors
-    /// What the master would refuse, in the master's words.
-    pub(crate) fn ready(&self) -> Result<Ready, Fail> {
+    /// If a master would refuse the request, with the master's message.
+    pub(crate) fn ready(&self) -> Result<PreparedShot, Fail> {
         let refused = |e: slabcast_common::quality::InvalidField| Fail::failed(e.to_string());
         self.volume.lattice.check().map_err(Fail::failed)?;
         self.quality.check().map_err(refused)?;
@@ -92,18 +96,18 @@ impl Shot {
         let orientation = Orientation::new(None, None).map_err(refused)?;
         let camera = self.path().camera(0, &info.lattice, orientation).map_err(refused)?;
         let view = View::new(&info.lattice, &camera, self.size, &self.quality).map_err(refused)?;
-        let quality = finely(self.quality, &self.transfer, &info);
+        let quality = with_precise_sums(self.quality, &self.transfer, &info);
         let SceneBricks { spec, bricks } =
             SceneBricks::new(&self.volume, &info, &self.transfer, quality)?;
-        Ok(Ready { spec, view, bricks })
+        Ok(PreparedShot { spec, view, bricks })
     }
 
-    /// The serial renderer's picture, and what differs from it, if anything does: on threads in
-    /// odd tiles and slabs, by an embedded cluster in small tiles and many slabs, by a TCP
-    /// cluster with culling off. `None`: one hash everywhere.
+    /// Draws the shot with the serial renderer, on threads in odd tiles and slabs, by an embedded
+    /// cluster in small tiles and many slabs, and by a TCP cluster with culling off. Returns the
+    /// serial picture and what differs from it; `None` if all hashes are equal.
     pub(crate) fn everywhere(
         &self,
-        ready: &Ready,
+        ready: &PreparedShot,
         tools: &Tools,
     ) -> Result<(Picture, Option<String>), Fail> {
         let picture = ready.serial();
@@ -130,7 +134,7 @@ impl Shot {
         Ok((picture, trouble))
     }
 
-    /// The hash of the frame that a cluster draws.
+    /// Returns the hash of the frame that a cluster draws.
     pub(crate) async fn hash(
         &self,
         tcp: bool,
@@ -140,7 +144,7 @@ impl Shot {
     ) -> Result<String, Fail> {
         let drawn = async {
             let link = if tcp { Link::Tcp } else { Link::Embedded };
-            let mut cluster = Either::start(&self.volume, link, crew).await?;
+            let mut cluster = TestCluster::start(&self.volume, link, crew).await?;
             let hashes = cluster.hashes(self.request(cull, work)).await;
             cluster.end().await;
             hashes?.pop().ok_or_else(|| Fail::failed("no frame came"))
@@ -152,53 +156,53 @@ impl Shot {
     }
 }
 
-/// What a picture is compared with.
+/// The reference that a picture is compared with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Against {
+pub(crate) enum ReferenceKind {
     /// The limit: the integral along true rays.
     Limit,
     /// Sheets of the same thickness in f64, nothing rounded and nothing shut.
     SameSheets,
 }
 
-impl Ready {
-    /// The same scene and camera in another quality; `sums` must be decided.
-    pub(crate) fn with(&self, quality: Quality) -> Ready {
+impl PreparedShot {
+    /// Returns the scene and camera with another quality, whose `sums` must not be automatic.
+    pub(crate) fn with(&self, quality: Quality) -> PreparedShot {
         let mut other = self.clone();
         other.spec.quality = quality;
         other.view.thickness = quality.thickness;
         other
     }
 
-    /// Tables for drawing.
+    /// Returns the frame's tables.
     pub(crate) fn frame(&self) -> Frame {
         Frame::new(Arc::new(Scene::new(&self.spec)), self.view)
     }
 
-    /// The serial renderer's picture.
+    /// Draws the picture with the serial renderer.
     pub(crate) fn serial(&self) -> Picture {
         serial::render(&self.frame(), &self.bricks)
     }
 
-    /// The tile renderer's picture on threads of this process.
+    /// Draws the picture with the tile renderer on threads of this process.
     pub(crate) fn picture(&self, cut: Cut) -> Picture {
         direct::draw(&self.frame(), &self.bricks, cut)
     }
 
-    /// The same with no pixel ever shut.
+    /// Draws the picture with the tile renderer without shutting any pixel.
     pub(crate) fn never_shut(&self, cut: Cut) -> Picture {
         direct::draw(&self.frame().never_shut(), &self.bricks, cut)
     }
 
-    /// A seeded sample of at most `n` pixels, one from each of about `n` equal cells.
+    /// Returns a seeded sample of at most `n` pixels, one from each of about `n` equal cells.
     pub(crate) fn sample(&self, n: usize) -> Vec<[u32; 2]> {
         stratified(self.view.size, n, 1)
     }
 
-    /// The reference at `sample`, linear premultiplied RGBA.
+    /// Returns the reference at `sample`, linear premultiplied RGBA.
     pub(crate) fn truth(
         &self,
-        against: Against,
+        against: ReferenceKind,
         sample: &[[u32; 2]],
         tools: &Tools,
     ) -> Vec<[f64; 4]> {
@@ -206,20 +210,20 @@ impl Ready {
         direct::map_parallel(sample.len(), tools.threads, |i, _: &mut ()| {
             let [x, y] = sample[i];
             match against {
-                Against::Limit => reference.pixel(x, y),
-                Against::SameSheets => reference.at_same_thickness(x, y),
+                ReferenceKind::Limit => reference.pixel(x, y),
+                ReferenceKind::SameSheets => reference.at_same_thickness(x, y),
             }
         })
     }
 
-    /// Pixels of `picture` at `sample`.
+    /// Returns the pixels of `picture` at `sample`.
     pub(crate) fn at(&self, picture: &Picture, sample: &[[u32; 2]]) -> Vec<[f32; 4]> {
         let w = self.view.size[0];
         sample.iter().map(|[x, y]| picture.pixels[(y * w + x) as usize]).collect()
     }
 }
 
-/// Largest difference over all four channels, in 1/255; not a number where one of them is none.
+/// Returns the largest difference over all four channels, in 1/255; NaN if any channel is.
 pub(crate) fn largest(got: &[[f32; 4]], want: &[[f64; 4]]) -> f64 {
     let off = got.iter().flatten().zip(want.iter().flatten());
     off.map(|(&g, &w)| (f64::from(g) - w).abs() * 255.0).fold(0.0, |a: f64, b| {
@@ -228,12 +232,13 @@ pub(crate) fn largest(got: &[[f32; 4]], want: &[[f64; 4]]) -> f64 {
     })
 }
 
-/// What is wrong with a picture by itself: a channel that is not finite or leaves 0 to 1.
+/// Describes the first channel that is not finite or not in 0 to 1, if there is one.
 pub(crate) fn sane(picture: &Picture) -> Option<String> {
     first_bad(picture, |p| p.iter().all(|c| (0.0..=1.0 + 1e-6).contains(c)))
 }
 
-/// The same; also a colour above its opacity by more than `slack`.
+/// Describes the first such channel, or the first colour that exceeds its opacity by more than
+/// `slack`.
 pub(crate) fn sane_within(picture: &Picture, slack: f64) -> Option<String> {
     first_bad(picture, |p| {
         let most = f64::from(p[3]) + slack;
@@ -252,7 +257,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_not_a_number_is_the_largest_difference() {
+    fn nan_is_the_largest_difference() {
         assert_eq!(largest(&[[0.0, 1.0, 0.0, 0.5]], &[[0.0, 0.0, 0.0, 0.5]]), 255.0);
         assert!(largest(&[[f32::NAN; 4], [0.0; 4]], &[[0.0; 4]; 2]).is_nan());
         let picture = |p| Picture { size: [1, 1], pixels: vec![p] };

@@ -1,9 +1,8 @@
 //! The table of `slabcast lab check`: groups of cases, one row for each thing that must hold.
 //!
-//! A group is a name and a function that gives its cases; [`GROUPS`] lists them. A case draws
-//! what it needs with the [`Tools`] and gives back rows; the table adds group and case to them,
-//! prints them as they come, and counts. A case that panics, or that ends with an error, has not
-//! held, and the others go on.
+//! A group is a name and a function that returns its cases; [`GROUPS`] lists them. A case draws
+//! with the [`Tools`] and returns rows; the table adds group and case to them, prints them as they
+//! come, and counts. A case that panics or returns an error has not held, and the others go on.
 
 use super::case::{Case, Row};
 use super::shot::Tools;
@@ -13,11 +12,11 @@ use slabcast_session::progress::{self, Progress};
 use slabcast_session::request::ThreadArgs;
 use std::time::{Duration, Instant};
 
-/// Some cases that belong together.
+/// A group of cases.
 pub(crate) struct Group {
-    /// As in `--group`: one or two words.
+    /// Name as given to `--group`: one or two words.
     pub(crate) name: &'static str,
-    /// What it shows, for `--list`.
+    /// What the group tests, for `--list`.
     pub(crate) about: &'static str,
     /// Its cases, in the order of the table.
     pub(crate) cases: fn() -> Vec<Case>,
@@ -43,7 +42,7 @@ pub(crate) const GROUPS: &[Group] = &[
     },
 ];
 
-/// What `slabcast lab check` without a subcommand takes.
+/// Flags of `slabcast lab check` without a subcommand.
 #[derive(clap::Args, Clone, Debug)]
 pub(crate) struct TableArgs {
     /// Run this group only; may be given more than once
@@ -138,7 +137,7 @@ pub(crate) fn run(args: &TableArgs) -> Result<(), Fail> {
     say(&format!("{cases} cases, {rows} rows, all held; {time}{left}\n"))
 }
 
-/// Runs a case on a thread of its own, where a panic ends nothing else.
+/// Runs a case on a thread of its own, so that a panic ends nothing else.
 fn outcome(case: &Case, tools: &Tools) -> Vec<Row> {
     let failed =
         |trouble: String| vec![Row::new("the case itself", f64::NAN, 0.0).with(Some(trouble))];
@@ -152,13 +151,13 @@ fn outcome(case: &Case, tools: &Tools) -> Vec<Row> {
         Ok(Ok(Ok(rows))) if rows.is_empty() => failed("no row".into()),
         Ok(Ok(Ok(rows))) => rows,
         Ok(Ok(Err(e))) => failed(e.line().unwrap_or("stopped").to_string()),
-        Ok(Err(panic)) => failed(format!("panicked: {}", words(&*panic))),
+        Ok(Err(panic)) => failed(format!("panicked: {}", panic_message(&*panic))),
         Err(e) => failed(format!("starting a thread failed: {e}")),
     }
 }
 
-/// What a panic said.
-fn words(panic: &(dyn std::any::Any + Send)) -> &str {
+/// Returns the message of a panic.
+fn panic_message(panic: &(dyn std::any::Any + Send)) -> &str {
     panic
         .downcast_ref::<String>()
         .map(String::as_str)
@@ -189,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_is_not_held() {
+    fn rows_with_nan_or_trouble_are_not_held() {
         let row = |error, trouble: Option<&str>| {
             Row::new("max", error, 1.0).with(trouble.map(String::from))
         };
@@ -202,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn a_case_that_panics_fails_or_says_nothing_has_not_held() {
+    fn cases_that_panic_fail_or_return_no_row_are_not_held() {
         let held = |case: Case| outcome(&case, &tools()).iter().all(Row::held);
         assert!(held(Case::new("good", |_| Ok(vec![Row::new("max", 0.0, 0.0)]))));
         assert!(!held(Case::new("panics", |_| panic!("at {}", 3))));
@@ -213,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn groups_and_their_cases_have_names_of_their_own() {
+    fn case_names_are_unique_in_their_group() {
         let mut seen = std::collections::BTreeSet::new();
         for group in GROUPS {
             for case in (group.cases)() {

@@ -1,4 +1,5 @@
-//! `slabcast lab check convergence`: how fast do sheets come to the limit, and what stops them?
+//! `slabcast lab check convergence`: how fast pictures converge with thinner sheets, and what
+//! limits it.
 //!
 //! The model says: with one colour in a sheet the error falls with the square of the thickness,
 //! with the linear rule with up to its fourth power, and the paper's additive opacity with its
@@ -22,7 +23,7 @@ use slabcast_session::volume;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
-use sweep::{Deviation, Subject, Sweep};
+use sweep::{Deviation, Sweep, SweepScene};
 
 /// Says how fast pictures come to the limit as sheets become thinner, and what stops them.
 ///
@@ -124,9 +125,9 @@ pub(crate) fn run(args: &ConvergenceArgs) -> Result<(), Fail> {
 }
 
 type Views = Vec<(&'static str, ViewPath)>;
-type OutputFolder<'a> = Box<dyn Fn() -> Result<Subject, Fail> + 'a>;
+type OutputFolder<'a> = Box<dyn Fn() -> Result<SweepScene, Fail> + 'a>;
 
-/// What is swept, each made when its turn comes, with the views of it.
+/// Returns the scenes to sweep, each made when needed, with its views.
 fn subjects<'a>(
     args: &'a ConvergenceArgs,
     request: &'a RenderRequest,
@@ -154,10 +155,10 @@ fn subjects<'a>(
             }
         };
         let pixels = args.pixels as usize;
-        Ok(Subject { name, volume, info, transfer, quality, size, pixels, seed: args.seed })
+        Ok(SweepScene { name, volume, info, transfer, quality, size, pixels, seed: args.seed })
     };
     if args.volumes.is_empty() {
-        // From no axis and no diagonal, so that nothing falls on a sheet by chance.
+        // An oblique view, so that nothing falls on a sheet boundary by chance.
         let turn = Turntable { start: 25.0, elevation: 20.0, frames: 1, ..Turntable::default() };
         let views = both(&ViewPath::from_turntable(FORMULA_SIZE, turn));
         return Ok(SCENES
@@ -177,21 +178,21 @@ fn subjects<'a>(
         .iter()
         .map(|file| {
             let make =
-                move || subject(name_of(file), file, None, request.path.size, request.quality);
+                move || subject(file_stem(file), file, None, request.path.size, request.quality);
             (Box::new(make) as OutputFolder, both(&request.path))
         })
         .collect())
 }
 
-/// A volume's name without its folder and ending, fit for a file.
-fn name_of(file: &Path) -> String {
+/// Returns a volume's name without its folder and ending, fit for a file.
+fn file_stem(file: &Path) -> String {
     let shown = file.file_name().unwrap_or(file.as_os_str()).to_string_lossy();
     let shown = shown.strip_prefix("formula:").unwrap_or(&shown);
     let stem = shown.split('.').next().unwrap_or(shown);
     stem.chars().map(|c| if c.is_alphanumeric() || c == '_' { c } else { '-' }).collect()
 }
 
-/// The power of the thickness with which an error fell over a halving.
+/// Formats the power of the thickness with which an error fell over a halving.
 fn order(before: Option<f64>, here: f64) -> String {
     match before {
         Some(b) if b > 0.0 && here > 0.0 => format!("{:.1}", libm::log2(b / here)),
@@ -216,10 +217,11 @@ fn text(s: &Sweep) -> String {
         "  vox | linear  order     max |  in f64  order | positions    f32  integers | constant  \
          order | paper's  order   off"
     );
-    let mut before: Option<&sweep::Rung> = None;
-    for r in &s.rungs {
-        let fell =
-            |of: fn(&sweep::Rung) -> Deviation| order(before.map(|b| of(b).rmse), of(r).rmse);
+    let mut before: Option<&sweep::ThicknessFigures> = None;
+    for r in &s.figures {
+        let fell = |of: fn(&sweep::ThicknessFigures) -> Deviation| {
+            order(before.map(|b| of(b).rmse), of(r).rmse)
+        };
         let _ = writeln!(
             out,
             "{:>5} | {:>7} {:>5} {:>7} | {:>7} {:>5} | {:>9} {:>7} {:>8} | {:>8} {:>6} | {:>7} \
@@ -260,11 +262,11 @@ fn text(s: &Sweep) -> String {
         }
         None => out.push_str("  no floor: thickness is the largest error all the way\n"),
     }
-    if s.rungs.iter().any(|r| r.placed.is_some()) {
+    if s.figures.iter().any(|r| r.placed.is_some()) {
         out.push_str("  linear in f64 by placement of sections:\n");
         out.push_str("  vox | mid-plane order | centroid order | half-way order | along the ray\n");
-        let mut before: Option<&sweep::Rung> = None;
-        for r in &s.rungs {
+        let mut before: Option<&sweep::ThicknessFigures> = None;
+        for r in &s.figures {
             let Some([centroid, between, exact]) = r.placed else { continue };
             let fell = |i: usize| {
                 let now = [centroid, between, exact][i];
@@ -292,8 +294,8 @@ fn text(s: &Sweep) -> String {
 
 fn json(s: &Sweep) -> String {
     let off = |o: Deviation| serde_json::json!({"rmse": o.rmse, "max": o.max});
-    let rungs: Vec<_> = s
-        .rungs
+    let figures: Vec<_> = s
+        .figures
         .iter()
         .map(|r| {
             let placed = r.placed.map(|[c, b, e]| {
@@ -315,7 +317,7 @@ fn json(s: &Sweep) -> String {
         .map(|f| serde_json::json!({"thickness": f.thickness, "rmse": f.rmse, "name": f.name}));
     let line = serde_json::json!({
         "scene": s.name, "projection": s.projection, "pixels": s.pixels,
-        "papers_limit": off(s.elsewhere), "floor": floor, "rungs": rungs,
+        "papers_limit": off(s.elsewhere), "floor": floor, "rungs": figures,
     });
     format!("{line}\n")
 }
@@ -326,8 +328,8 @@ fn draw(sweeps: &[Sweep], file: &Path) -> Result<(), Fail> {
     let panels = sweeps
         .iter()
         .map(|s| {
-            let line = |of: fn(&sweep::Rung) -> Deviation| {
-                s.rungs.iter().map(|r| (r.thickness, of(r).rmse)).collect::<Vec<_>>()
+            let line = |of: fn(&sweep::ThicknessFigures) -> Deviation| {
+                s.figures.iter().map(|r| (r.thickness, of(r).rmse)).collect::<Vec<_>>()
             };
             plot::Panel {
                 title: match s.projection {

@@ -1,4 +1,4 @@
-//! One scene in one projection at one thickness after another, and what the errors are made of.
+//! A sweep of one scene in one projection over sheet thicknesses, with the sources of its errors.
 
 use slabcast_common::image::Picture;
 use slabcast_common::quality::{Compositing, Quality, Sums};
@@ -13,17 +13,17 @@ use slabcast_session::path_scenes::SceneBricks;
 use slabcast_session::progress::Progress;
 use std::sync::Arc;
 
-/// What is swept.
-pub(super) struct Subject {
-    /// What it is called in tables and file names.
+/// A scene to sweep.
+pub(super) struct SweepScene {
+    /// Name in tables and file names.
     pub(super) name: String,
     pub(super) volume: Volume,
     pub(super) info: VolumeInfo,
     pub(super) transfer: TransferFunction,
-    /// Thickness is replaced, `eps` is zero.
+    /// Quality; its thickness is replaced and its `eps` set to zero.
     pub(super) quality: Quality,
     pub(super) size: [u32; 2],
-    /// Pixels that are compared.
+    /// Number of pixels compared.
     pub(super) pixels: usize,
     pub(super) seed: u64,
 }
@@ -55,8 +55,8 @@ impl Deviation {
 
 /// All figures of one thickness.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Rung {
-    /// Of a sheet, in vox.
+pub(super) struct ThicknessFigures {
+    /// Sheet thickness in vox.
     pub(super) thickness: f64,
     /// Rendered pictures against the limit.
     pub(super) linear: Deviation,
@@ -64,12 +64,12 @@ pub(super) struct Rung {
     /// The paper's form against the limit of its own, and against the limit.
     pub(super) paper: Deviation,
     pub(super) paper_limit: Deviation,
-    /// The same sheets in f64 against the limit: what thickness alone does.
+    /// Sheets in f64 against the limit: the error of thickness alone.
     pub(super) linear_f64: Deviation,
     pub(super) constant_f64: Deviation,
     pub(super) paper_f64: Deviation,
-    /// What makes linear's rest, each against what is without it: rounded positions in f64, f32
-    /// arithmetic on these, integers for floats.
+    /// The linear rule's other errors, each against a picture without it: rounded positions, f32
+    /// arithmetic, integer sums.
     pub(super) positions: Deviation,
     pub(super) floats: Deviation,
     pub(super) integers: Deviation,
@@ -78,7 +78,7 @@ pub(super) struct Rung {
     pub(super) placed: Option<[Deviation; 3]>,
 }
 
-/// What one sweep found.
+/// Results of a sweep.
 pub(super) struct Sweep {
     pub(super) name: String,
     pub(super) projection: &'static str,
@@ -88,10 +88,10 @@ pub(super) struct Sweep {
     pub(super) integers: bool,
     /// From the limit to that of the paper's form.
     pub(super) elsewhere: Deviation,
-    pub(super) rungs: Vec<Rung>,
+    pub(super) figures: Vec<ThicknessFigures>,
 }
 
-/// The rounding that is largest where it hides what thickness does.
+/// The largest rounding error at the thickness where it exceeds the error of thickness.
 pub(super) struct Floor {
     pub(super) thickness: f64,
     pub(super) rmse: f64,
@@ -102,7 +102,7 @@ impl Sweep {
     /// Where linear compositing stops to gain: the thickest rung whose roundings are larger than
     /// what thickness does, and the largest of them.
     pub(super) fn floor(&self) -> Option<Floor> {
-        let r = self.rungs.iter().find(|r| r.linear_f64.rmse < rest(r))?;
+        let r = self.figures.iter().find(|r| r.linear_f64.rmse < rest(r))?;
         let mut all = [
             (r.positions.rmse, "rounded positions"),
             (r.floats.rmse, "f32 arithmetic"),
@@ -114,14 +114,14 @@ impl Sweep {
 }
 
 /// Roundings of all kinds together.
-fn rest(r: &Rung) -> f64 {
+fn rest(r: &ThicknessFigures) -> f64 {
     let all = [r.positions, r.floats, r.integers];
     all.iter().map(|o| o.rmse * o.rmse).sum::<f64>().sqrt()
 }
 
 /// Sweeps `thicknesses` from `camera`. `placed`: also with sections placed otherwise.
 pub(super) fn sweep(
-    subject: &Subject,
+    subject: &SweepScene,
     projection: &'static str,
     camera: &Camera,
     thicknesses: &[f64],
@@ -167,7 +167,7 @@ pub(super) fn sweep(
         let r = reference(&papers, &q)?.with_sheet_payloads();
         each(&|x, y| r.pixel(x, y))
     };
-    let mut rungs = Vec::new();
+    let mut figures = Vec::new();
     for &thickness in thicknesses {
         progress.phase(&format!("{}, {projection}: {thickness} vox", subject.name));
         let of = |compositing, sums| Quality { sums, ..quality(compositing, thickness) };
@@ -202,7 +202,7 @@ pub(super) fn sweep(
                 },
             )
         });
-        rungs.push(Rung {
+        figures.push(ThicknessFigures {
             thickness,
             linear: Deviation::between(&drawn, &limit),
             constant: Deviation::between(&constant, &limit),
@@ -223,6 +223,6 @@ pub(super) fn sweep(
         pixels: limit.iter().filter(|p| p[3] > 0.0).count(),
         integers: ours.spec.quality.sums != Sums::F32,
         elsewhere: Deviation::between(&papers_limit, &limit),
-        rungs,
+        figures,
     })
 }

@@ -2,7 +2,7 @@
 //! pixel, 3.2 GB, and its finished floats 1.1 GB.
 
 use super::mixed;
-use super::scene::{against_truth, from, rough, shot};
+use super::scene::{against_truth, ortho_camera, rough, shot};
 use crate::check::case::Case;
 use crate::check::shot::Shot;
 use slabcast_common::quality::{Quality, Work};
@@ -15,7 +15,10 @@ pub(super) fn cases() -> Vec<Case> {
     // one would take a hundred times as long and show no more.
     let case = Case::new("a picture of 8192x8192", |tools| {
         let volume = rough([10, 9, 8]);
-        let view = PathView { height: Some(128.0), ..from(&volume, [0.53, 0.71, 0.36], super::UP) };
+        let view = PathView {
+            height: Some(128.0),
+            ..ortho_camera(&volume, [0.53, 0.71, 0.36], super::UP)
+        };
         let s = Shot { view, size: [8192, 8192], ..shot(volume, mixed()) };
         let s = Shot { quality: Quality { eps: 0.0, ..s.quality }, ..s };
         let ready = s.ready()?;

@@ -1,4 +1,4 @@
-//! Stiff and extreme scenes (DESIGN.md section 5, PROMISES.md R33 to R35).
+//! Stiff and extreme scenes (docs/design/promises.md, R33 to R35).
 //!
 //! Each must come out finite, with the same bytes from the serial renderer, from threads and
 //! from clusters over both links, and no farther from the truth than its bound. At the same
@@ -13,7 +13,8 @@ mod values;
 use super::case::{Case, Row};
 use super::shot::Shot;
 use scene::{
-    apart, cutoff, extinction, from, judge, look, on_lattice, persp, ramp, rough, shaded, shot,
+    cutoff_bound, extinction, judge, largest_difference, look, on_lattice, ortho_camera,
+    persp_camera, ramp, rough, shaded, shot,
 };
 use slabcast_common::bounds;
 use slabcast_common::brick::TightBox;
@@ -30,7 +31,7 @@ const PIXELS: usize = 256;
 /// Those where a ray meets thousands of voxels.
 const FEW: usize = 8;
 
-/// The cases of the group.
+/// Returns the cases of the group.
 pub(crate) fn cases() -> Vec<Case> {
     let mut all = opacities();
     all.extend(sheets());
@@ -53,7 +54,7 @@ fn block() -> Volume {
     rough([20, 16, 14])
 }
 
-/// From nothing to everything.
+/// Opacities from zero to one.
 fn opacities() -> Vec<Case> {
     let mut all = Vec::new();
     for (name, alpha) in
@@ -91,7 +92,7 @@ fn opacities() -> Vec<Case> {
     all
 }
 
-/// From hair-thin to thicker than the volume.
+/// Sheets from 1/64 vox to thicker than the volume.
 fn sheets() -> Vec<Case> {
     let mut all = Vec::new();
     let stiff = || shot(block(), look(&[[0.0, 0.0], [39.0, 0.0], [40.0, 0.02], [255.0, 0.999]]));
@@ -130,30 +131,36 @@ fn cameras() -> Vec<Case> {
         }
     };
     vec![
-        one("eye inside", seen(|v| persp(v, [0.1, 0.05, -0.02], [0.4, 0.3, 0.1], 60.0))),
+        one("eye inside", seen(|v| persp_camera(v, [0.1, 0.05, -0.02], [0.4, 0.3, 0.1], 60.0))),
         one(
             "eye at a voxel",
             seen(|v| {
-                let mut view = persp(v, [0.0; 3], [0.5, 0.3, 0.2], 60.0);
+                let mut view = persp_camera(v, [0.0; 3], [0.5, 0.3, 0.2], 60.0);
                 view.eye = [9.0, 8.0, 7.0];
                 view
             }),
         ),
-        one("along +x", seen(|v| from(v, [1.0, 0.0, 0.0], UP))),
-        one("along -y", seen(|v| from(v, [0.0, -1.0, 0.0], UP))),
-        one("along +z, up along it too", seen(|v| from(v, [0.0, 0.0, 1.0], UP))),
+        one("along +x", seen(|v| ortho_camera(v, [1.0, 0.0, 0.0], UP))),
+        one("along -y", seen(|v| ortho_camera(v, [0.0, -1.0, 0.0], UP))),
+        one("along +z, up along it too", seen(|v| ortho_camera(v, [0.0, 0.0, 1.0], UP))),
         // Where a turntable's elevation of 90 degrees puts the eye.
-        one("the pole of a turntable", seen(|v| from(v, UP, [0.0, -1.0, 0.0]))),
+        one("the pole of a turntable", seen(|v| ortho_camera(v, UP, [0.0, -1.0, 0.0]))),
         one(
             "along +z, perspective",
-            seen(|v| PathView { up: [0.0, 1.0, 0.0], ..persp(v, [0.0, 0.0, 2.0], [0.0; 3], 30.0) }),
+            seen(|v| PathView {
+                up: [0.0, 1.0, 0.0],
+                ..persp_camera(v, [0.0, 0.0, 2.0], [0.0; 3], 30.0)
+            }),
         ),
         // From so far away that the volume fills the picture again.
-        one("fov 0.01 degrees", seen(|v| persp(v, [3700.0, 4900.0, 2500.0], [0.0; 3], 0.01))),
+        one(
+            "fov 0.01 degrees",
+            seen(|v| persp_camera(v, [3700.0, 4900.0, 2500.0], [0.0; 3], 0.01)),
+        ),
         // A vox is a fifth of a pixel at its own distance: all is seen in the middle.
         Case::new("fov 179 degrees", |tools| {
             let volume = block();
-            let view = persp(&volume, [0.1, 0.1, 0.05], [0.0; 3], 179.0);
+            let view = persp_camera(&volume, [0.1, 0.1, 0.05], [0.0; 3], 179.0);
             let s = Shot { view, size: [21, 17], ..shot(volume, mixed()) };
             let quality = Quality { thickness: 0.25, ..s.quality };
             judge(&Shot { quality, ..s }, 21 * 17, tools)
@@ -161,7 +168,7 @@ fn cameras() -> Vec<Case> {
     ]
 }
 
-/// A look of every opacity.
+/// A transfer function with every opacity.
 fn mixed() -> TransferFunction {
     look(&[[0.0, 0.0], [39.0, 0.0], [40.0, 0.05], [255.0, 0.9]])
 }
@@ -170,12 +177,12 @@ const UP: [f64; 3] = [0.0, 0.0, 1.0];
 
 /// Along x, `height` world units of it.
 fn along(volume: &Volume, height: f64) -> PathView {
-    PathView { height: Some(height), ..from(volume, [1.0, 0.0, 0.0], UP) }
+    PathView { height: Some(height), ..ortho_camera(volume, [1.0, 0.0, 0.0], UP) }
 }
 
 /// From the default direction, so near that `height` world units fill the picture.
 fn near(volume: &Volume, height: f64) -> PathView {
-    PathView { height: Some(height), ..from(volume, [0.53, 0.71, 0.36], UP) }
+    PathView { height: Some(height), ..ortho_camera(volume, [0.53, 0.71, 0.36], UP) }
 }
 
 /// One voxel, a line of them, and spacings and places far from one.
@@ -217,7 +224,7 @@ fn pictures() -> Vec<Case> {
     ]
 }
 
-/// What must not matter, or not by more than its bound.
+/// Settings that must not change the picture by more than a bound.
 fn settings() -> Vec<Case> {
     let scene = |eps, sums| {
         let s = shot(block(), look(&[[0.0, 0.0], [39.0, 0.0], [40.0, 0.02], [255.0, 0.999]]));
@@ -229,8 +236,8 @@ fn settings() -> Vec<Case> {
             let shut = scene(eps, Sums::Auto).ready()?;
             let frame = shut.frame().never_shut();
             let open = direct::draw(&frame, &shut.bricks, Cut::on(tools.threads));
-            let left_out = apart(&shut.serial(), &open);
-            Ok(vec![Row::new("max that the cut-off leaves out", left_out, cutoff(&shut))])
+            let left_out = largest_difference(&shut.serial(), &open);
+            Ok(vec![Row::new("max that the cut-off leaves out", left_out, cutoff_bound(&shut))])
         }));
     }
     // The bound of a frame's statistics. Floats round too: 15 times half an ulp a contribution
@@ -241,7 +248,7 @@ fn settings() -> Vec<Case> {
         let bound = bounds::quantisation(&ints.spec, &ints.view, &within)
             + bounds::quantisation(&floats.spec, &floats.view, &within)
             + 255.0 * 2.0 * 315.0 * 6e-8;
-        let apart = apart(&ints.serial(), &floats.serial());
+        let apart = largest_difference(&ints.serial(), &floats.serial());
         Ok(vec![Row::new("max of the difference", apart, bound)])
     }));
     all.push(Case::new("1000 slabs", move |tools| {

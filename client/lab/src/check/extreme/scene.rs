@@ -1,8 +1,8 @@
-//! What extreme scenes are made of: volumes, looks and cameras, and how one is judged.
+//! Volumes, transfer functions and cameras of extreme scenes, and how a scene is judged.
 
 use crate::check::case::Row;
 use crate::check::enclose::Enclosure;
-use crate::check::shot::{Against, Ready, Shot, Tools, largest, sane_within};
+use crate::check::shot::{PreparedShot, ReferenceKind, Shot, Tools, largest, sane_within};
 use glam::DVec3;
 use slabcast_common::bounds;
 use slabcast_common::brick::TightBox;
@@ -17,11 +17,12 @@ use slabcast_session::direct::{self, Cut};
 use slabcast_session::fail::Fail;
 use std::sync::Arc;
 
-/// What the reference itself may be off by, in 1/255: its head gives 7e-5 at its tolerance.
+/// Largest error of the reference itself, in 1/255: 7e-5 at its tolerance, by its own
+/// documentation.
 const JUDGE: f64 = 1e-3;
 
-/// A look: blue where values are small, orange where they are large; unshaded. `opacities` are
-/// alphas of one vox.
+/// A transfer function: blue where values are small, orange where they are large; unshaded.
+/// `opacities` are alphas of one vox.
 pub(super) fn look(opacities: &[[f64; 2]]) -> TransferFunction {
     TransferFunction {
         version: 1,
@@ -36,12 +37,12 @@ pub(super) fn look(opacities: &[[f64; 2]]) -> TransferFunction {
     }
 }
 
-/// The same with light.
+/// Such a transfer function, lit.
 pub(super) fn shaded(opacities: &[[f64; 2]]) -> TransferFunction {
     TransferFunction { shading: Shading::default(), ..look(opacities) }
 }
 
-/// The same with extinctions per world unit.
+/// Such a transfer function with extinctions per world unit.
 pub(super) fn extinction(opacities: &[[f64; 2]]) -> TransferFunction {
     TransferFunction { opacity_unit: OpacityUnit::Extinction, ..look(opacities) }
 }
@@ -76,12 +77,12 @@ pub(super) fn on_lattice(volume: Volume, spacing: [f64; 3], origin: [f64; 3]) ->
 
 /// `volume` as `transfer` shows it, from an oblique direction, orthographic.
 pub(super) fn shot(volume: Volume, transfer: TransferFunction) -> Shot {
-    let view = from(&volume, [0.53, 0.71, 0.36], [0.0, 0.0, 1.0]);
+    let view = ortho_camera(&volume, [0.53, 0.71, 0.36], [0.0, 0.0, 1.0]);
     Shot { volume: Arc::new(volume), transfer, quality: Quality::default(), size: [61, 47], view }
 }
 
 /// The orthographic camera that sees all of `volume` from direction `to_eye`.
-pub(super) fn from(volume: &Volume, to_eye: [f64; 3], up: [f64; 3]) -> PathView {
+pub(super) fn ortho_camera(volume: &Volume, to_eye: [f64; 3], up: [f64; 3]) -> PathView {
     let (centre, extent) = (volume.lattice.centre(), volume.lattice.largest_extent());
     PathView {
         eye: (centre + DVec3::from_array(to_eye) * (2.0 * extent)).to_array(),
@@ -95,7 +96,7 @@ pub(super) fn from(volume: &Volume, to_eye: [f64; 3], up: [f64; 3]) -> PathView 
 
 /// The perspective camera at `eye`, looking at `target`, both from the volume's centre in units
 /// of its largest extent.
-pub(super) fn persp(volume: &Volume, eye: [f64; 3], target: [f64; 3], fov: f64) -> PathView {
+pub(super) fn persp_camera(volume: &Volume, eye: [f64; 3], target: [f64; 3], fov: f64) -> PathView {
     let (centre, extent) = (volume.lattice.centre(), volume.lattice.largest_extent());
     let at = |p: [f64; 3]| (centre + DVec3::from_array(p) * extent).to_array();
     PathView {
@@ -119,9 +120,9 @@ pub(super) fn judge(shot: &Shot, pixels: usize, tools: &Tools) -> Result<Vec<Row
     let (picture, trouble) = shot.everywhere(&ready, tools)?;
     let open = ready.with(Quality { eps: 0.0, ..ready.spec.quality });
     let never_shut = open.picture(Cut::on(tools.threads));
-    let left_out = apart(&picture, &ready.never_shut(Cut::on(tools.threads)));
+    let left_out = largest_difference(&picture, &ready.never_shut(Cut::on(tools.threads)));
     let mut rows = vec![
-        Row::new("max that the cut-off leaves out", left_out, cutoff(&ready))
+        Row::new("max that the cut-off leaves out", left_out, cutoff_bound(&ready))
             .with(trouble)
             .with(sane_within(&picture, slack(&ready)))
             .with(sane_within(&never_shut, slack(&ready))),
@@ -132,7 +133,7 @@ pub(super) fn judge(shot: &Shot, pixels: usize, tools: &Tools) -> Result<Vec<Row
 }
 
 /// Sheets that the volume may touch.
-fn sheets(ready: &Ready) -> f64 {
+fn sheets(ready: &PreparedShot) -> f64 {
     let whole = TightBox { lo: [0; 3], hi: ready.spec.volume.lattice.dims.map(|n| n - 1) };
     ready.view.project(&whole).map_or(0.0, |p| f64::from(p.sheets.len()))
 }
@@ -140,20 +141,20 @@ fn sheets(ready: &Ready) -> f64 {
 /// By how much colour may exceed opacity. Opacity is kept in f32: where a sheet adds less than
 /// half an ulp of it, it stands still while colour goes on. And colour is rounded to half a unit
 /// of fixed point.
-fn slack(ready: &Ready) -> f64 {
+fn slack(ready: &PreparedShot) -> f64 {
     sheets(ready) * (0.5 / f64::from(1u32 << 24) + 0.5 / f64::from(1u32 << 28)) + 1e-6
 }
 
 /// What a pixel that goes on may gain on one that was shut: eps, and what f32 and fixed-point
 /// colour round in each sheet behind.
-pub(super) fn cutoff(ready: &Ready) -> f64 {
+pub(super) fn cutoff_bound(ready: &PreparedShot) -> f64 {
     bounds::cutoff(&ready.spec.quality) + 255.0 * slack(ready)
 }
 
 /// Compares pixels with the truth, each with its own bound; shows the one that comes nearest to
 /// its bound.
 pub(super) fn against_truth(
-    ready: &Ready,
+    ready: &PreparedShot,
     got: &[[f32; 4]],
     sample: &[[u32; 2]],
     tools: &Tools,
@@ -164,9 +165,9 @@ pub(super) fn against_truth(
     });
     let parallel = matches!(ready.view.projection, Projection::Ortho { .. });
     let paper = ready.spec.quality.compositing == Compositing::Paper;
-    let mut kinds = vec![(Against::SameSheets, 0..4, "max from the same sheets in f64")];
+    let mut kinds = vec![(ReferenceKind::SameSheets, 0..4, "max from the same sheets in f64")];
     if parallel && !paper {
-        kinds.push((Against::Limit, 3..4, "max of alpha from the limit"));
+        kinds.push((ReferenceKind::Limit, 3..4, "max of alpha from the limit"));
     }
     let mut rows = Vec::new();
     for (against, channels, what) in kinds {
@@ -177,7 +178,7 @@ pub(super) fn against_truth(
                 let off = (f64::from(got[c]) - want[c]).abs() * 255.0;
                 let most = (spans[c].hi - want[c]).max(want[c] - spans[c].lo) * 255.0 + JUDGE;
                 let ratio = off / most;
-                // What is not a number is worse than anything.
+                // NaN is worse than any error.
                 if ratio > seen || ratio.is_nan() {
                     worst = Row::new(what, off, most);
                     seen = if ratio.is_nan() { f64::INFINITY } else { ratio };
@@ -189,8 +190,8 @@ pub(super) fn against_truth(
     rows
 }
 
-/// Largest difference of two pictures, in 1/255.
-pub(super) fn apart(a: &Picture, b: &Picture) -> f64 {
+/// Returns the largest difference of two pictures, in 1/255.
+pub(super) fn largest_difference(a: &Picture, b: &Picture) -> f64 {
     let wide: Vec<[f64; 4]> = b.pixels.iter().map(|p| p.map(f64::from)).collect();
     largest(&a.pixels, &wide)
 }

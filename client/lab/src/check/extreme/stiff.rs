@@ -1,9 +1,10 @@
-//! Stiffness: extinctions of 10^0 to 10^6 per vox (docs/design/promises.md R34). Opacity never goes
-//! above one, and halving the sheets never makes a picture worse, down to the floor of rounding.
+//! Stiffness: extinctions of 10^0 to 10^6 per vox (docs/design/promises.md, R34). Opacity never
+//! goes above one, and halving the sheets never makes a picture worse, down to the floor of
+//! rounding.
 
 use super::scene::{extinction, rough, shot};
 use crate::check::case::{Case, Row};
-use crate::check::shot::{Against, Shot};
+use crate::check::shot::{ReferenceKind, Shot};
 use slabcast_common::quality::Quality;
 
 /// From twice a vox to a sixteenth.
@@ -24,7 +25,7 @@ pub(super) fn cases() -> Vec<Case> {
                 let s = Shot { quality: Quality { eps: 0.0, ..s.quality }, ..s };
                 let ready = s.ready()?;
                 let sample = ready.sample(PIXELS);
-                let limit = ready.truth(Against::Limit, &sample, tools);
+                let limit = ready.truth(ReferenceKind::Limit, &sample, tools);
                 let mut above = 0.0f64;
                 let (mut before, mut worst) = (f64::NAN, 0.0f64);
                 let mut floor_at = None;
@@ -33,7 +34,7 @@ pub(super) fn cases() -> Vec<Case> {
                     let picture = r.serial();
                     above = picture.pixels.iter().fold(above, |m, p| m.max(f64::from(p[3]) - 1.0));
                     let got = wide(&r.at(&picture, &sample));
-                    let sheets = r.truth(Against::SameSheets, &sample, tools);
+                    let sheets = r.truth(ReferenceKind::SameSheets, &sample, tools);
                     let (error, floor) = (rmse(&got, &limit), rmse(&got, &sheets));
                     // Below it positions and f32 decide, which no sheet makes better.
                     if rmse(&sheets, &limit) < floor {

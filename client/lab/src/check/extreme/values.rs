@@ -1,4 +1,4 @@
-//! Samples that files may hold and nobody expects.
+//! Unusual samples: NaN, infinities and extreme values.
 
 use super::scene::{look, shot};
 use super::{PIXELS, judge, one};
@@ -11,9 +11,9 @@ use slabcast_session::volume;
 
 pub(super) fn cases() -> Vec<Case> {
     vec![
-        one("constant", || of_floats(|_| 3.25)),
+        one("constant", || float_shot(|_| 3.25)),
         one("NaN, infinities, denormals", || {
-            of_floats(|i| match i % 7 {
+            float_shot(|i| match i % 7 {
                 0 => f32::NAN,
                 1 => f32::INFINITY,
                 2 => f32::NEG_INFINITY,
@@ -22,17 +22,17 @@ pub(super) fn cases() -> Vec<Case> {
                 _ => (i % 11) as f32,
             })
         }),
-        one("nothing but NaN", || of_floats(|_| f32::NAN)),
-        one("nothing but denormals", || of_floats(|i| f32::from_bits(i % 97))),
-        one("f32 from end to end", || of_floats(|i| if i % 3 == 0 { f32::MAX } else { f32::MIN })),
-        one("all empty", || Shot { transfer: look(&[[0.0, 0.0]]), ..of_floats(|i| i as f32) }),
-        one("all opaque", || Shot { transfer: look(&[[0.0, 1.0]]), ..of_floats(|i| i as f32) }),
-        of_file("int16 from end to end", "int16", |i| match i % 5 {
+        one("nothing but NaN", || float_shot(|_| f32::NAN)),
+        one("nothing but denormals", || float_shot(|i| f32::from_bits(i % 97))),
+        one("f32 from end to end", || float_shot(|i| if i % 3 == 0 { f32::MAX } else { f32::MIN })),
+        one("all empty", || Shot { transfer: look(&[[0.0, 0.0]]), ..float_shot(|i| i as f32) }),
+        one("all opaque", || Shot { transfer: look(&[[0.0, 1.0]]), ..float_shot(|i| i as f32) }),
+        file_case("int16 from end to end", "int16", |i| match i % 5 {
             0 => i16::MIN.to_le_bytes().to_vec(),
             1 => i16::MAX.to_le_bytes().to_vec(),
             _ => (i as i16 * 31).to_le_bytes().to_vec(),
         }),
-        of_file("double up to 1e300", "double", |i| {
+        file_case("double up to 1e300", "double", |i| {
             let x = [1e300, -1e300, 0.0, f64::NAN, 1e-300, f64::INFINITY][i as usize % 6];
             (x * f64::from(i % 11)).to_le_bytes().to_vec()
         }),
@@ -41,7 +41,7 @@ pub(super) fn cases() -> Vec<Case> {
 
 const DIMS: [u32; 3] = [12, 10, 8];
 
-fn of_floats(f: impl Fn(u32) -> f32) -> Shot {
+fn float_shot(f: impl Fn(u32) -> f32) -> Shot {
     let samples = Samples::F32((0..DIMS.iter().product()).map(f).collect());
     let lattice = Lattice::from_spacing(DIMS, [1.0; 3]);
     let volume = Volume::new("odd", "float32", false, lattice, samples, ValueMap::IDENTITY);
@@ -49,7 +49,7 @@ fn of_floats(f: impl Fn(u32) -> f32) -> Shot {
 }
 
 /// A volume that is read from a file, with `f(i)` as the bytes of sample i.
-fn of_file(name: &str, number: &'static str, f: fn(u32) -> Vec<u8>) -> Case {
+fn file_case(name: &str, number: &'static str, f: fn(u32) -> Vec<u8>) -> Case {
     Case::new(name, move |tools| {
         let [a, b, c] = DIMS;
         let mut bytes = format!(
@@ -66,7 +66,7 @@ fn of_file(name: &str, number: &'static str, f: fn(u32) -> Vec<u8>) -> Case {
     })
 }
 
-/// A look over whatever the range is; what is not a number is green.
+/// A transfer function over the volume's range, with NaN in green.
 fn unit() -> TransferFunction {
     TransferFunction {
         domain: Domain::Unit,

@@ -87,7 +87,7 @@ fn a_longer_plan_says_where_the_threads_time_goes() {
     let dir = tempfile::tempdir().unwrap();
     let frames =
         ["lab", "plan", "formula:spheres:32", "--size", "128x128", "--frames", "16", "--quiet"];
-    let cluster = ["--workers", "2", "--schedule", "region", "--trace", "s.trace"];
+    let cluster = ["--workers", "2", "--schedule", "region", "--trace", "s.trace", "--no-pings"];
     let said = good(dir.path(), &[&frames[..], &cluster].concat());
     assert!(said.contains("four in flight: % of the render threads' time"), "{said}");
     assert!(!said.contains("can't be told"), "{said}");

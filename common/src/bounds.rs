@@ -20,7 +20,7 @@ use std::f64::consts::PI;
 const HEADROOM: f64 = 1.05;
 
 /// Returns the raw units of a 32-bit sum for one unit of payload: 2^30 is a sheet of `thickness`
-/// vox full of the largest payload (NUMERICS.md section 3).
+/// vox full of the largest payload (docs/design/numerics.md section 3).
 pub fn i32_units_per_payload(payload_max: f64, thickness: f64) -> f32 {
     let solid = HEADROOM * payload_max * thickness;
     if solid > 0.0 { (f64::from(1u32 << 30) / solid) as f32 } else { 1.0 }
@@ -58,8 +58,9 @@ pub fn cutoff(quality: &Quality) -> f64 {
 /// - colour itself is kept in units of 2^-28, rounded once a sheet: N 2^-29. This is what is
 ///   left of it where sheets add floats.
 ///
-/// In a level view 32-bit contributions are rounded in rows of storeys, then times a weight that is below one but for
-/// narrow kernels, and their sum is rounded once more; so m is one more there, times that weight if it is larger.
+/// In a level view 32-bit contributions are rounded in rows of storeys, then times a weight that is
+/// below one but for narrow kernels, and their sum is rounded once more; so m is one more there,
+/// times that weight if it is larger.
 ///
 /// m: a voxel belongs to a cell, and cells of voxels in a box lie in the box grown by half a cell
 /// at each face; so there are no more than the grown box has cells.
@@ -109,26 +110,27 @@ pub fn accumulation(view: &View, within: &TightBox) -> f64 {
     255.0 * 2.0 * sheets / f64::from(1u32 << 25)
 }
 
-/// How far a picture is at most from one whose kernels differ from the drawn ones, by a bound that holds
-/// on every pixel, in 1/255. See [`rounding`] and [`truncation`].
+/// How far a picture is at most from one whose kernels differ from the drawn ones, by a bound that
+/// holds on every pixel, in 1/255. See [`rounding`] and [`truncation`].
 ///
-/// Let a change of the field take sigma to sigma' and sigma C to sigma' C' along a ray, T be what is let
-/// through before it and R' the light that comes from behind after it. Then the pixel changes by exactly
+/// Let a change of the field take sigma to sigma' and sigma C to sigma' C' along a ray, T be what
+/// is let through before it and R' the light that comes from behind after it. Then the pixel
+/// changes by exactly
 ///
 /// ```text
 /// int T (d(sigma C) - R' d(sigma)) ds = sum over voxels of int T sigma_v (C_v - R') dg_v ds,
 /// ```
 ///
-/// and by at most `D = int T sum(sigma_v |dg_v|) ds`, as colours lie between zero and one; opacity, too.
-/// On each axis `|dg| <= lambda g + sum of c_j g(x - s_j)`: a share of the kernel itself, and shifted
-/// kernels where it ends. The product of the three axes is then a share `s` of g itself, of which no
-/// more than the light that there is can be lost, `int T sigma ds <= 1`, and shifted kernels of weight `w`
-/// in all. Of these T is taken for one, and their sum over a ray is `w` times
+/// and by at most `D = int T sum(sigma_v |dg_v|) ds`, as colours lie between zero and one; opacity,
+/// too. On each axis `|dg| <= lambda g + sum of c_j g(x - s_j)`: a share of the kernel itself, and
+/// shifted kernels where it ends. The product of the three axes is then a share `s` of g itself, of
+/// which no more than the light that there is can be lost, `int T sigma ds <= 1`, and shifted
+/// kernels of weight `w` in all. Of these T is taken for one, and their sum over a ray is `w` times
 ///
 /// - at most the largest extinction times the way through the volume times [`ripple`];
-/// - where shifts across the ray are whole pixels of a parallel view, no pixel is shut and the kernel does not
-///   lean: at most the largest optical depth that any pixel has, which is -ln(1 - alpha). Shifts along the ray move
-///   nothing then, and their cover is as heavy as what it covers.
+/// - where shifts across the ray are whole pixels of a parallel view, no pixel is shut and the
+///   kernel does not lean: at most the largest optical depth that any pixel has, which is -ln(1 -
+///   alpha). Shifts along the ray move nothing then, and their cover is as heavy as what it covers.
 struct Change<'a> {
     view: &'a View,
     /// The drawn kernel by axis, and how far beyond its radius the other one reaches.
@@ -142,7 +144,8 @@ struct Change<'a> {
 }
 
 /// Returns the largest sum over a lattice of ones: one and the kernel's ripple, which is below 0.6
-/// % for Gaussians of 0.6 (NUMERICS.md section 4) and grows to either side. A tent's is 39 %.
+/// % for Gaussians of 0.6 (docs/design/numerics.md section 4) and grows to either side. A tent's is
+/// 39 %.
 fn ripple(quality: &Quality) -> f64 {
     let [std, _] = quality.kernel_shape();
     let even = quality.kernel != Kernel::Tent && std >= 0.55;
@@ -244,8 +247,8 @@ struct Axis {
 impl Axis {
     /// Samples a change covered by shifted kernels `p`, a `cell` apart, up to `reach`.
     fn new(change: impl Fn(f64) -> f64, p: &Profile, reach: f64, cell: f64) -> Axis {
-        // Between the places the change moves by less than what `cover` adds. This is made for every frame,
-        // in 0.03 ms an axis.
+        // Between the places the change moves by less than what `cover` adds. This is made for
+        // every frame, in 0.03 ms an axis.
         const PLACES: usize = 1000;
         let step = reach / PLACES as f64;
         let (mut places, mut cells) = (Vec::with_capacity(PLACES + 1), vec![0]);
@@ -281,15 +284,15 @@ impl Axis {
     }
 }
 
-/// Bound of rounded positions: half a part of a pixel across and half a phase in depth. `max_alpha` is the
-/// picture's largest opacity, where it is known. `None` for the paper's opacities, which add up to another
-/// picture.
+/// Bound of rounded positions: half a part of a pixel across and half a phase in depth. `max_alpha`
+/// is the picture's largest opacity, where it is known. `None` for the paper's opacities, which add
+/// up to another picture.
 ///
-/// By what is said at `Change`; sheets hold light as a field does that is constant in each. Where colours have a slope,
-/// their sums and those of the sheets beside have a part in it: a share s of all sums moves c and its
-/// neighbours by 2 s and the weights by 4 s, so the slope by at most (5 G + 6 H) s, and light by |phi| / a of
-/// that, at most half and at most a twelfth of a sheet's optical depth; what is beyond that share counts 17
-/// times, once, as in [`quantisation`].
+/// By what is said at `Change`; sheets hold light as a field does that is constant in each. Where
+/// colours have a slope, their sums and those of the sheets beside have a part in it: a share s of
+/// all sums moves c and its neighbours by 2 s and the weights by 4 s, so the slope by at most (5 G
+/// + 6 H) s, and light by |phi| / a of that, at most half and at most a twelfth of a sheet's
+/// optical depth; what is beyond that share counts 17 times, once, as in [`quantisation`].
 pub fn rounding(
     scene: &SceneSpec,
     view: &View,
@@ -310,7 +313,8 @@ pub fn rounding(
         Projection::Persp { .. } => 1.0 / 32768.0,
     };
     let deep = 0.5 * view.thickness / f64::from(view.depth_phases());
-    // A section lies where its voxel's depth has it, and a row where its footprint does, rounded once more.
+    // A section lies where its voxel's depth has it, and a row where its footprint does, rounded
+    // once more.
     let Lean { depth: [lean_x, lean_y], row } = view.kernel_lean;
     let down = across + lean_y.abs() * deep;
     let along = across + lean_x.abs() * deep;
@@ -332,11 +336,11 @@ pub fn rounding(
     Some(change.bound(moved, share, sheet))
 }
 
-/// Bound of the kernel's cut: against a picture with whole Gaussians, in the limit of thin sheets. Zero for
-/// splines, of which nothing is cut.
+/// Bound of the kernel's cut: against a picture with whole Gaussians, in the limit of thin sheets.
+/// Zero for splines, of which nothing is cut.
 ///
-/// By what is said at `Change`. The largest of all pictures' differences, 255, is what it comes to wherever solid matter
-/// may lie just beyond a ray's reach all along it.
+/// By what is said at `Change`. The largest of all pictures' differences, 255, is what it comes to
+/// wherever solid matter may lie just beyond a ray's reach all along it.
 pub fn truncation(
     scene: &SceneSpec,
     view: &View,

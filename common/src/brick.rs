@@ -1,9 +1,9 @@
 //! Bricks: 8x8x8 voxels of which only the relevant ones are kept (paper section 4.2).
 //!
 //! A brick holds values, normals and, where asked for, gradient magnitudes, never colours or
-//! opacities. So a change of light or colour needs no new bricks (CONTRACTS.md, Wire). The paper
-//! spends 16 bytes a voxel; here an 8-bit shaded voxel takes 5 in memory (index, value, normal) and
-//! 3 to 5 on the wire.
+//! opacities. So a change of light or colour needs no new bricks (docs/design/contracts.md, Wire).
+//! The paper spends 16 bytes a voxel; here an 8-bit shaded voxel takes 5 in memory (index, value,
+//! normal) and 3 to 5 on the wire.
 
 use crate::ids::BrickId;
 use crate::volume::{Digest32, SampleKind, Samples};
@@ -91,7 +91,7 @@ pub struct BrickInfo {
 }
 
 /// Key of a brick set: a digest over the volume, the relevant values and what each voxel stores
-/// (CONTRACTS.md: volume digest and support).
+/// (docs/design/contracts.md: volume digest and support).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct BrickSetKey(pub Digest32);
 

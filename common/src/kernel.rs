@@ -2,7 +2,7 @@
 //!
 //! A profile is a Gaussian of standard deviation s, cut at radius R, with its edge value subtracted
 //! and its integral normalised to one; or a B-spline of the lattice's steps, cubic or linear (the
-//! tent) (DESIGN.md section 1).
+//! tent) (docs/design/model.md section 1).
 //!
 //! A kernel is the product of three profiles along perpendicular axes in *index* space, the third
 //! of which is the eye's depth. In a cubic lattice these are the eye's axes. In others the kernel
@@ -137,7 +137,8 @@ impl Profile {
 
     /// Returns the integral of `u^2 g(u)`, in vox^2.
     fn variance(&self) -> f64 {
-        // By parts, `int u^2 g = 2 int (M(R) - M(u)) du` from the middle: smooth, and zero where it ends.
+        // By parts, `int u^2 g = 2 int (M(R) - M(u)) du` from the middle: smooth, and zero where it
+        // ends.
         const N: u32 = 512;
         let h = self.radius / f64::from(N);
         let whole = self.moment_to(self.radius);
@@ -204,7 +205,8 @@ impl Front {
     /// Returns the centroid between this plane and one behind it.
     fn to(&self, back: &Front) -> f64 {
         let weight = back.weight - self.weight;
-        // Of less than this there is nothing to be seen, and cancellation is all that there is of its moment.
+        // Of less than this there is nothing to be seen, and cancellation is all that there is of
+        // its moment.
         if weight < 1e-9 {
             return 0.5 * (self.at + back.at);
         }

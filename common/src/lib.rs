@@ -1,12 +1,34 @@
 //! The paper's words as types.
 //!
-//! This crate refuses to know clocks, sockets, files and threads. What it holds is shared by
-//! the deciding crates (`render`, `schedule`, `volumes`) and by the wire (`proto`): a volume on
-//! its lattice, bricks, transfer functions, one camera as a [`view::View`], sheets and slabs,
-//! the occlusion map, pictures in the making, and the messages between master and worker.
+//! This crate refuses to know clocks, sockets, files and threads. What it holds is shared by the
+//! deciding crates (`render`, `schedule`, `volumes`) and by the wire (`proto`): a volume on its
+//! lattice, bricks, transfer functions, one camera as a [`view::View`], sheets and slabs, the
+//! occlusion map, pictures in the making, and the messages between master and worker.
 //!
-//! Everything here that ends up in a pixel has one result on every machine: no fused
-//! multiply-add, no platform maths library, sums in one order or in integers.
+//! Everything here that ends up in a pixel has one result on every machine: no fused multiply-add,
+//! no platform maths library, sums in one order or in integers.
+//!
+//! ```
+//! use slabcast_common::quality::Quality;
+//! use slabcast_common::view::{Camera, CameraProjection, View};
+//! use slabcast_common::{brick::TightBox, volume::Volume};
+//!
+//! // A ball of 32 voxels, seen from the front.
+//! let volume = Volume::from_fn_u8("ball", [32; 3], |i, j, k| {
+//!     let d = [i, j, k].map(|x| x as i32 - 16);
+//!     (255 - d.iter().map(|x| x * x).sum::<i32>()).clamp(0, 255) as u8
+//! });
+//! let camera = Camera {
+//!     to_eye: glam::DVec3::Y,
+//!     up: glam::DVec3::Z,
+//!     target: glam::DVec3::ZERO,
+//!     projection: CameraProjection::Ortho { height: 40.0 },
+//! };
+//! let view = View::new(&volume.lattice, &camera, [64, 64], &Quality::default()).unwrap();
+//! // Pixels and sheets that the volume may touch.
+//! let projected = view.project(&TightBox::whole(volume.lattice.dims)).unwrap();
+//! assert!(projected.rect.width() < 64 && projected.sheets.len() >= 32);
+//! ```
 
 pub mod blocks;
 pub mod bounds;

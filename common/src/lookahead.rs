@@ -1,32 +1,34 @@
 //! How far ahead a stalled region asks for bricks.
 //!
-//! A region that reaches a sheet for which it lacks bricks asks for those and, in the same message, for
-//! bricks of the next sheets that nothing hides yet. Looking far fetches bricks that nearer ones then
-//! hide; looking near stalls again a few sheets on. A worker whose other regions keep its threads busy
-//! loses nothing by another stall and looks [`AHEAD_SHEETS`] ahead. A worker whose threads idle looks
-//! further, and doubles the distance each time the same region stalls: mouse_skull on 15 workers had
-//! tiles that stalled 15 times in a frame, for 0.16 ms each (docs/measurements/scaling.md). A
-//! scene's first frame lacks every brick; it looks as near as possible, and its waits don't count.
+//! A region that reaches a sheet for which it lacks bricks asks for those and, in the same message,
+//! for bricks of the next sheets that nothing hides yet. Looking far fetches bricks that nearer
+//! ones then hide; looking near stalls again a few sheets on. A worker whose other regions keep its
+//! threads busy loses nothing by another stall and looks [`AHEAD_SHEETS`] ahead. A worker whose
+//! threads idle looks further, and doubles the distance each time the same region stalls:
+//! mouse_skull on 15 workers had tiles that stalled 15 times in a frame, for 0.16 ms each
+//! (docs/measurements/scaling.md). A scene's first frame lacks every brick; it looks as near as
+//! possible, and its waits don't count.
 
-/// Sheets beyond the one that lacks a brick, for a worker whose threads are busy. A brick is 8 sheets
-/// thick: at 8, regions of mri256 were sent bricks that others then hid (26.8 % of the set held after 18
-/// views; 25.4 % at 5, 25.1 % at 4). In exchange the first view asks 322 times instead of 228.
+/// Sheets beyond the one that lacks a brick, for a worker whose threads are busy. A brick is 8
+/// sheets thick: at 8, regions of mri256 were sent bricks that others then hid (26.8 % of the set
+/// held after 18 views; 25.4 % at 5, 25.1 % at 4). In exchange the first view asks 322 times
+/// instead of 228.
 pub const AHEAD_SHEETS: u32 = 4;
 
-/// First distance in sheets of a worker whose threads idle; doubles with each stall of a region, up to
-/// [`MAX_AHEAD_IDLE_SHEETS`]. mri256 on 15 workers of one machine, a later frame: with 4 always, 7.7 %
-/// of the set sent and 48 stalls; with 8, 7.4 % and 31; with 16, 8.3 % and 27; with 16 and a factor of
-/// four a stall, 9.7 % and 26 (docs/measurements/scaling.md).
+/// First distance in sheets of a worker whose threads idle; doubles with each stall of a region, up
+/// to [`MAX_AHEAD_IDLE_SHEETS`]. mri256 on 15 workers of one machine, a later frame: with 4 always,
+/// 7.7 % of the set sent and 48 stalls; with 8, 7.4 % and 31; with 16, 8.3 % and 27; with 16 and a
+/// factor of four a stall, 9.7 % and 26 (docs/measurements/scaling.md).
 const AHEAD_IDLE_SHEETS: u32 = 16;
 const MAX_AHEAD_IDLE_SHEETS: u32 = 1024;
 
-/// A worker counts as idle when its threads idled for at least one part in this many of the time that
-/// the average remembers. At half and at twice this, frames take as long.
+/// A worker counts as idle when its threads idled for at least one part in this many of the time
+/// that the average remembers. At half and at twice this, frames take as long.
 const IDLE_ONE_IN: u64 = 50;
 
-/// Span of the moving average in ns: older waits count half. Below half of it a single wait would weigh
-/// too much: one worker alone with mri256, which hardly ever idles, then held up to 26.4 % of the set
-/// instead of 25.9 %.
+/// Span of the moving average in ns: older waits count half. Below half of it a single wait would
+/// weigh too much: one worker alone with mri256, which hardly ever idles, then held up to 26.4 % of
+/// the set instead of 25.9 %.
 const AVERAGE_NS: u64 = 60_000_000;
 
 /// A worker's look-ahead: a moving average of how long its threads idled for lack of bricks.

@@ -34,8 +34,8 @@ fn polynomial<const N: usize>(coefficients: &[f32; N], x: f32) -> f32 {
 #[inline(always)]
 fn exp_parts(x: f32) -> (f32, f32) {
     let x = if x > -87.0 { x } else { -87.0 };
-    // Adding it rounds to the nearest integer, ties to even, and leaves that integer in the low bits: no
-    // conversion instruction, the same on every machine.
+    // Adding it rounds to the nearest integer, ties to even, and leaves that integer in the low
+    // bits: no conversion instruction, the same on every machine.
     let shifted = x * std::f32::consts::LOG2_E + ROUND_F32;
     let n = shifted - ROUND_F32;
     let r = (x - n * LN2[0]) - n * LN2[1];
@@ -52,7 +52,7 @@ pub fn exp_neg(x: f32) -> f32 {
 }
 
 /// Returns the opacity of a sheet of optical depth `tau >= 0`: `1 - exp(-tau)`, with full relative
-/// accuracy down to the smallest `tau` (NUMERICS.md section 2).
+/// accuracy down to the smallest `tau` (docs/design/numerics.md section 2).
 #[inline(always)]
 pub fn opacity(tau: f32) -> f32 {
     let (s, q) = exp_parts(-tau);
@@ -64,8 +64,8 @@ pub fn opacity(tau: f32) -> f32 {
 pub const PHI_SERIES_BELOW: f32 = 0.25;
 
 /// Returns the weight of a colour's change through a sheet: `phi = a / tau + a / 2 - 1`
-/// (NUMERICS.md section 1.1). `a` must be `opacity(tau)` and `per_tau` 1 / tau to some digits; `tau
-/// > 0`.
+/// (docs/design/numerics.md section 1.1). `a` must be `opacity(tau)` and `per_tau` 1 / tau to some
+/// digits; `tau > 0`.
 #[inline(always)]
 pub fn phi(tau: f32, per_tau: f32, a: f32) -> f32 {
     let (small, large) = phi_both(tau, per_tau, a);

@@ -1,5 +1,5 @@
 //! What a client asks of a picture ([`Quality`]) and of the work behind it ([`Work`], which never
-//! changes a byte). Names are those of CONTRACTS.md, in flags, JSON and the wire.
+//! changes a byte). Names are those of docs/design/contracts.md, in flags, JSON and the wire.
 
 use crate::spelling::nearest;
 use serde::{Deserialize, Serialize};
@@ -14,7 +14,7 @@ pub enum Kernel {
     /// from any side.
     Bspline,
     /// Tent, the linear B-spline. Sharpest, and of a constant field from a slanted side up to 39 %
-    /// ripple (NUMERICS.md section 4).
+    /// ripple (docs/design/numerics.md section 4).
     Tent,
 }
 
@@ -22,7 +22,7 @@ pub enum Kernel {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Compositing {
-    /// Extinction with the neighbour-linear colour rule (NUMERICS.md section 1.2).
+    /// Extinction with the neighbour-linear colour rule (docs/design/numerics.md section 1.2).
     Linear,
     /// Extinction, one colour inside a sheet.
     Constant,
@@ -169,7 +169,7 @@ impl Quality {
     /// Names the first field that is out of range, has no meaning beside the kernel, or is not
     /// supported by this version.
     pub fn check(&self) -> Result<(), InvalidField> {
-        // From vox/64 to thicker than any volume (DESIGN.md section 5).
+        // From vox/64 to thicker than any volume (docs/design/model.md section 5).
         within("thickness", self.thickness, 1.0 / 64.0, 65536.0)?;
         within("eps", self.eps, 0.0, 0.5)?;
         // Below .4 a lattice shows through as dots (ripple over 20 %), and the head-room of the

@@ -1,9 +1,10 @@
-//! A tile's geometry under the `region` schedule: the parts in which it is drawn, and how it is split.
+//! A tile's geometry under the `region` schedule: the parts in which it is drawn, and how it is
+//! split.
 //!
-//! A tile is drawn part by part: squares of [`PART_EDGE`] pixels, aligned to the picture, each through
-//! all sheets. When an idle worker steals work, what is left are parts not yet begun and one part that
-//! is some sheets deep. A split is one straight line, so both pieces are rectangles. It lies on a
-//! multiple of [`LEAF_EDGE`] pixels, where finished tiles may be cut.
+//! A tile is drawn part by part: squares of [`PART_EDGE`] pixels, aligned to the picture, each
+//! through all sheets. When an idle worker steals work, what is left are parts not yet begun and
+//! one part that is some sheets deep. A split is one straight line, so both pieces are rectangles.
+//! It lies on a multiple of [`LEAF_EDGE`] pixels, where finished tiles may be cut.
 
 use crate::image::LEAF_EDGE;
 use crate::occlusion::Rect;
@@ -23,16 +24,16 @@ pub fn parts(tile: Rect) -> impl Iterator<Item = Rect> {
     })
 }
 
-/// Returns the square of the picture's [`PART_EDGE`] grid that holds `part`, clipped to a picture of
-/// `size` (width and height in pixels).
+/// Returns the square of the picture's [`PART_EDGE`] grid that holds `part`, clipped to a picture
+/// of `size` (width and height in pixels).
 pub fn enclosing_square(part: &Rect, size: [u32; 2]) -> Rect {
     let grid_line = |x: i32| x.div_euclid(PART_EDGE) * PART_EDGE;
     let (x0, y0) = (grid_line(part.x0), grid_line(part.y0));
     Rect::new(x0, y0, x0 + PART_EDGE, y0 + PART_EDGE).intersect(&Rect::from_size(size))
 }
 
-/// Splits a tile in two rectangles, (kept, given), so that about `share` (0 to 1) of the remaining work
-/// lies in the second. `work_left` returns the work left in a rectangle, in any unit.
+/// Splits a tile in two rectangles, (kept, given), so that about `share` (0 to 1) of the remaining
+/// work lies in the second. `work_left` returns the work left in a rectangle, in any unit.
 ///
 /// Returns `None` if no line leaves work on both sides. Of lines that do equally well, the first
 /// horizontal one wins: rows keep their length.

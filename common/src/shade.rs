@@ -61,7 +61,7 @@ pub enum HeadWord {
     Head,
 }
 
-/// Ambient, Lambert and Blinn-Phong shading (CONTRACTS.md, Colour and error).
+/// Ambient, Lambert and Blinn-Phong shading (docs/design/contracts.md, Colour and error).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Shading {

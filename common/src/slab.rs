@@ -1,8 +1,8 @@
 //! Sheets and slabs along the view direction.
 //!
-//! Sheet `k` lies between the planes `k d` and `(k + 1) d` behind the target (CONTRACTS.md), in
-//! both projections, whatever the volume. A slab is a run of sheets; its borders are sheet
-//! borders, so slabs never change a pixel.
+//! Sheet `k` lies between the planes `k d` and `(k + 1) d` behind the target
+//! (docs/design/contracts.md), in both projections, whatever the volume. A slab is a run of sheets;
+//! its borders are sheet borders, so slabs never change a pixel.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,5 +1,5 @@
-//! Statistics of a frame: one line of JSON (CONTRACTS.md, Statistics). Figures that nobody measured
-//! are `null`, never zero.
+//! Statistics of a frame: one line of JSON (docs/design/contracts.md, Statistics). Figures that
+//! nobody measured are `null`, never zero.
 
 use crate::quality::{Quality, Schedule};
 use serde::{Deserialize, Serialize};
@@ -158,7 +158,7 @@ pub struct Estimate {
 
 /// Ratio of the error of the thickness to the change under sheets of half the thickness: 1 / (1 -
 /// 2^-p) at the order p = 3. At about one vox the error falls more steeply than in the limit
-/// (docs/accuracy.md); at p = 2 the estimate would be a sixth larger.
+/// (docs/measurements/accuracy.md); at p = 2 the estimate would be a sixth larger.
 pub const THICKNESS_EXTRAPOLATION: f64 = 8.0 / 7.0;
 
 /// Errors of a frame by source.

@@ -1,4 +1,5 @@
-//! Transfer functions: from values to colour and opacity (CONTRACTS.md, Transfer functions).
+//! Transfer functions: from values to colour and opacity (docs/design/contracts.md, Transfer
+//! functions).
 
 use crate::brick::Brick;
 use crate::gradient::decode_magnitude;
@@ -8,10 +9,10 @@ use crate::shade::Shading;
 use crate::volume::{Lattice, SampleKind, Samples, ValueSummary, VolumeInfo};
 use serde::{Deserialize, Serialize};
 
-/// Cap of the extinction per vox: 16 ln 2, an alpha of `1 - 2^-16` (DESIGN.md section 1). It is
-/// part of the definition of the picture: silhouettes grow with the logarithm of sigma, so there is
-/// no limit to converge to. At 6.9 the worst alpha is 26/255 off, at 20 it is 34/255 off the other
-/// way (NUMERICS.md section 2).
+/// Cap of the extinction per vox: 16 ln 2, an alpha of `1 - 2^-16` (docs/design/model.md section
+/// 1). It is part of the definition of the picture: silhouettes grow with the logarithm of sigma,
+/// so there is no limit to converge to. At 6.9 the worst alpha is 26/255 off, at 20 it is 34/255
+/// off the other way (docs/design/numerics.md section 2).
 pub const SIGMA_MAX: f64 = 16.0 * std::f64::consts::LN_2;
 
 /// Cap, per vox, of extinctions given per world unit. Beyond it f32 sums of squares overflow.
@@ -62,8 +63,9 @@ pub struct NanColour {
     pub opacity: f64,
 }
 
-/// A transfer function (CONTRACTS.md, Transfer functions). Points ascend in x; values are linear
-/// between points and clamped outside; two points at one x make a step (the later one holds at x).
+/// A transfer function (docs/design/contracts.md, Transfer functions). Points ascend in x; values
+/// are linear between points and clamped outside; two points at one x make a step (the later one
+/// holds at x).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TransferFunction {
@@ -102,7 +104,7 @@ impl TransferFunction {
         nan && self.colors.iter().all(|&[_, r, g, b]| one([r, g, b]))
     }
 
-    /// Reads and checks the JSON of CONTRACTS.md.
+    /// Reads and checks the JSON of docs/design/contracts.md.
     ///
     /// # Errors
     /// If the text is not such JSON, or as [`TransferFunction::check`].
@@ -113,7 +115,7 @@ impl TransferFunction {
         Ok(tf)
     }
 
-    /// Returns the function as JSON (CONTRACTS.md).
+    /// Returns the function as JSON (docs/design/contracts.md).
     pub fn to_json(&self) -> String {
         serde_json::to_string(self).expect("numbers and strings can be written")
     }
@@ -443,8 +445,8 @@ impl Classifier {
     /// s (0.25 sqrt(thickness) + 0.006 min(depth, 1 / f))
     /// ```
     ///
-    /// (NUMERICS.md section 3; fitted to real volumes, not a bound.) Faint samples are rounded
-    /// most, and the same way sheet after sheet, until little is seen of what is behind.
+    /// (docs/design/numerics.md section 3; fitted to real volumes, not a bound.) Faint samples are
+    /// rounded most, and the same way sheet after sheet, until little is seen of what is behind.
     pub fn i16_error_estimate(&self, thickness: f64, depth: f64) -> f64 {
         let seen = self.faintest().map_or(depth, |f| depth.min(1.0 / f));
         self.payload_max * (0.25 * thickness.sqrt() + 0.006 * seen)

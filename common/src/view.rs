@@ -17,18 +17,19 @@ use glam::{DMat3, DVec2, DVec3, Vec3};
 /// Screen positions are rounded to 1/2^8 = 1/256 pixel.
 ///
 /// In an orthographic view whole layers of the lattice are rounded alike, so this rounding is what
-/// is left of the error when sheets are thin. At 1/64 pixel thin sheets miss the reference by up
-/// to 0.14/255 (RMSE), at 1/128 by 0.07, at 1/256 by 0.034: the first below the 0.05 that is
-/// promised (docs/measurements.md). Each bit doubles the footprints' tables (8 KiB an axis at 1.6
+/// is left of the error when sheets are thin. At 1/64 pixel thin sheets miss the reference by up to
+/// 0.14/255 (RMSE), at 1/128 by 0.07, at 1/256 by 0.034: the first below the 0.05 that is promised
+/// (docs/measurements/accuracy.md). Each bit doubles the footprints' tables (8 KiB an axis at 1.6
 /// pixels a vox).
 pub const SUBPIXEL_BITS: u32 = 8;
 /// Screen positions a pixel, 256; [`SUBPIXEL_BITS`] argues for the number.
 pub const SUBPIXELS: i32 = 1 << SUBPIXEL_BITS;
 
-/// Largest picture edge in pixels (DESIGN.md section 5: images of 1x1 and 8192x8192).
+/// Largest picture edge in pixels (docs/design/model.md section 5: images of 1x1 and 8192x8192).
 pub const MAX_EDGE: u32 = 8192;
 
-/// Distance of the near plane, as a share of the eye's distance from the target (CONTRACTS.md).
+/// Distance of the near plane, as a share of the eye's distance from the target
+/// (docs/design/contracts.md).
 pub const NEAR: f64 = 1e-3;
 
 /// Most pixels a vox, 2^39: screen positions stay exact in f64 and i64 with a kernel's reach.
@@ -411,9 +412,9 @@ impl View {
     }
 
     /// Returns the pixels and sheets that the voxels of a box may touch: the box of voxel centres
-    /// grown by the kernel's support, projected and rounded outward (DESIGN.md, Pixels are exact).
-    /// `None` if it is off the picture or behind the near plane. Never too small; as large as the
-    /// box of the projected box.
+    /// grown by the kernel's support, projected and rounded outward (docs/design/model.md, Pixels
+    /// are exact). `None` if it is off the picture or behind the near plane. Never too small; as
+    /// large as the box of the projected box.
     pub fn project(&self, b: &TightBox) -> Option<Projected> {
         let (lo, hi) = self.eye_box(b);
         let r = self.kernel_lean.reach(self.kernel_radius);

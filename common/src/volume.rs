@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 /// Where a volume's samples lie. World units are the file's (mm), world axes anatomical (RAS+)
-/// where the file has them (CONTRACTS.md, World and camera).
+/// where the file has them (docs/design/contracts.md, World and camera).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Lattice {
     /// Samples along the index axes i, j, k (i fastest).
@@ -102,26 +102,52 @@ impl Lattice {
     /// # Errors
     /// If a dimension is zero, a number is not finite, a step has no length, two axes coincide, or
     /// spacings differ by more than a factor of 10^6.
-    pub fn check(&self) -> Result<(), String> {
+    pub fn check(&self) -> Result<(), LatticeError> {
         let s = self.spacing();
         if self.dims.contains(&0) {
-            return Err(format!("a dimension is zero ({:?})", self.dims));
+            return Err(LatticeError::ZeroDimension(self.dims));
         }
         if !self.steps.iter().all(|v| v.is_finite()) || !self.origin.is_finite() {
-            return Err("spacing or origin is not finite".into());
+            return Err(LatticeError::NotFinite);
         }
         if s.iter().any(|&x| x <= 0.0 || !x.is_normal()) {
-            return Err(format!("a spacing is zero or too small ({s:?})"));
+            return Err(LatticeError::ZeroSpacing(s));
         }
         let u = DMat3::from_cols(self.steps[0] / s[0], self.steps[1] / s[1], self.steps[2] / s[2]);
         if u.determinant().abs() < 1e-6 {
-            return Err("two index axes point the same way; the volume would be flat".into());
+            return Err(LatticeError::Flat);
         }
         let ratio = s.iter().copied().fold(0.0, f64::max) / self.vox();
         if ratio > 1e6 {
-            return Err(format!("spacings differ by a factor of {ratio:.3e}; at most 1e6"));
+            return Err(LatticeError::UnequalSpacings(ratio));
         }
         Ok(())
+    }
+}
+
+/// Why a lattice can't be drawn.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum LatticeError {
+    /// An axis has no sample. Holds the dimensions.
+    #[error("a dimension is zero ({0:?})")]
+    ZeroDimension([u32; 3]),
+    /// A step or the origin is infinite or NaN.
+    #[error("spacing or origin is not finite")]
+    NotFinite,
+    /// A step has no length, or a denormal one. Holds the spacings in world units.
+    #[error("a spacing is zero or too small ({0:?})")]
+    ZeroSpacing([f64; 3]),
+    /// Two index axes coincide.
+    #[error("two index axes point the same way; the volume would be flat")]
+    Flat,
+    /// Spacings differ too much. Holds the largest over the smallest.
+    #[error("spacings differ by a factor of {0:.3e}; at most 1e6")]
+    UnequalSpacings(f64),
+}
+
+impl From<LatticeError> for String {
+    fn from(error: LatticeError) -> String {
+        error.to_string()
     }
 }
 

@@ -171,8 +171,8 @@ mod tests {
         ) {
             for space in [ColourSpace::Rgb, ColourSpace::Hsv, ColourSpace::Lab, ColourSpace::Diverging] {
                 // The rounded matrices are no exact inverses of each other; and a colour that is
-                // nearly white is given another's hue, which moves it by ten units of CIELAB at most
-                // (a bluish white beside a bluish black by more than 0.06).
+                // nearly white is given another's hue, which moves it by ten units of CIELAB at
+                // most (a bluish white beside a bluish black by more than 0.06).
                 let off = if space == ColourSpace::Diverging { 0.1 } else { 2e-3 };
                 prop_assert!(near(interpolate_colour(space, a, b, 0.0), a, off), "{space:?}");
                 prop_assert!(near(interpolate_colour(space, a, b, 1.0), b, off), "{space:?}");

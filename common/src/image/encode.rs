@@ -209,8 +209,9 @@ impl Srgb8 {
     /// `linear` in `[0, 1]`.
     #[inline(always)]
     fn encode(&self, linear: f64) -> u8 {
-        // From here on the last bit of a number is a one: what is added to it is rounded to a whole number,
-        // which are its last bits. That is quicker than a conversion, which looks at what no number can hold.
+        // From here on the last bit of a number is a one: what is added to it is rounded to a whole
+        // number, which are its last bits. That is quicker than a conversion, which looks at what
+        // no number can hold.
         const WHOLE: f64 = (1u64 << 52) as f64;
         let part = (linear * Srgb8::PARTS as f64 + WHOLE).to_bits() as usize;
         let level = self.start[part % (2 * Srgb8::PARTS)];

@@ -197,8 +197,8 @@ impl FrameState {
         encoding.end()
     }
 
-    /// Places the remaining encoded tiles into `assembler`, which has those that were taken out, and
-    /// returns its bytes.
+    /// Places the remaining encoded tiles into `assembler`, which has those that were taken out,
+    /// and returns its bytes.
     ///
     /// # Panics
     /// If some tiles came as sums, and as [`FrameAssembler::place`].

@@ -16,7 +16,7 @@ pub struct Picture {
 
 impl Picture {
     /// Returns the SHA-256 over row-major linear premultiplied RGBA f32, little endian
-    /// (CONTRACTS.md, Statistics).
+    /// (docs/design/contracts.md, Statistics).
     pub fn sha256(&self) -> Digest32 {
         let mut h = Sha256::new();
         hash(&mut h, &self.pixels);

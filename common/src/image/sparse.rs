@@ -26,6 +26,29 @@ pub struct SparseTile {
     pub max_alpha: f32,
 }
 
+/// Why the parts of a [`SparseTile`] don't fit each other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum SparseTileError {
+    /// The mask has not one bit for each leaf of the tile.
+    #[error("a mask that is not of its tile")]
+    MaskLength,
+    /// The mask marks a leaf outside of the tile.
+    #[error("a leaf beyond its tile")]
+    LeafBeyondTile,
+    /// The data have not the bytes of the marked leaves.
+    #[error("more or fewer bytes than its leaves have")]
+    DataLength,
+    /// The largest opacity is infinite or NaN.
+    #[error("an opacity that is not finite")]
+    Opacity,
+}
+
+impl From<SparseTileError> for String {
+    fn from(error: SparseTileError) -> String {
+        error.to_string()
+    }
+}
+
 /// Returns the leaves of a tile of `size` pixels in order, each as its columns and its rows.
 fn leaves(size: [u32; 2]) -> impl Iterator<Item = [std::ops::Range<usize>; 2]> {
     let [w, h] = size.map(|n| n as usize);
@@ -108,19 +131,19 @@ impl SparseTile {
     ///
     /// # Errors
     /// Names the part that does not fit.
-    pub fn check(&self) -> Result<(), &'static str> {
+    pub fn check(&self) -> Result<(), SparseTileError> {
         let leaves = leaves(self.size).count();
         if self.mask.len() != SparseTile::mask_len(self.size) {
-            return Err("a mask that is not of its tile");
+            return Err(SparseTileError::MaskLength);
         }
         if (leaves..8 * self.mask.len()).any(|i| there(&self.mask, i)) {
-            return Err("a leaf beyond its tile");
+            return Err(SparseTileError::LeafBeyondTile);
         }
         if self.data.len() != SparseTile::data_len(self.size, self.format, &self.mask) {
-            return Err("more or fewer bytes than its leaves have");
+            return Err(SparseTileError::DataLength);
         }
         if !self.max_alpha.is_finite() {
-            return Err("an opacity that is not finite");
+            return Err(SparseTileError::Opacity);
         }
         Ok(())
     }
@@ -282,11 +305,11 @@ mod tests {
             change(&mut leaves);
             leaves.check().unwrap_err()
         };
-        assert!(broken(|l| l.mask.push(0)).contains("mask"));
-        assert!(broken(|l| l.mask[0] |= 1 << 6).contains("beyond"));
-        assert!(broken(|l| l.data.truncate(1)).contains("bytes"));
-        assert!(broken(|l| l.mask[0] ^= 1).contains("bytes"));
-        assert!(broken(|l| l.max_alpha = f32::NAN).contains("finite"));
-        assert!(broken(|l| l.format = PixelFormat::Rgb8).contains("bytes"));
+        assert_eq!(broken(|l| l.mask.push(0)), SparseTileError::MaskLength);
+        assert_eq!(broken(|l| l.mask[0] |= 1 << 6), SparseTileError::LeafBeyondTile);
+        assert_eq!(broken(|l| l.data.truncate(1)), SparseTileError::DataLength);
+        assert_eq!(broken(|l| l.mask[0] ^= 1), SparseTileError::DataLength);
+        assert_eq!(broken(|l| l.max_alpha = f32::NAN), SparseTileError::Opacity);
+        assert_eq!(broken(|l| l.format = PixelFormat::Rgb8), SparseTileError::DataLength);
     }
 }

@@ -2,8 +2,8 @@
 //!
 //! The curve is a centripetal Catmull-Rom spline: it passes every point and makes no loops between
 //! near ones. Speed along it is constant to some 10^-3, by a table of lengths. The eye looks ahead,
-//! or at a target. Level flight stays level: up is carried along the curve without turning about the line
-//! of sight, so that a climb through the vertical flips nothing, and is drawn back to `up`
+//! or at a target. Level flight stays level: up is carried along the curve without turning about
+//! the line of sight, so that a climb through the vertical flips nothing, and is drawn back to `up`
 //! where the flight is level.
 
 use super::Orientation;

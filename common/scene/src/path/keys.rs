@@ -392,8 +392,8 @@ impl KeyedPath {
         .camera()
     }
 
-    /// How fast everything changes at key `i`, per frame: the speed of the parabola through it and its
-    /// neighbours; at the ends that of the only side there is. A key that repeats its neighbour
+    /// How fast everything changes at key `i`, per frame: the speed of the parabola through it and
+    /// its neighbours; at the ends that of the only side there is. A key that repeats its neighbour
     /// is a halt.
     fn speed(&self, i: usize) -> Speed {
         let side = |a: usize, b: usize| {

@@ -1,4 +1,5 @@
-//! View paths: what a client submits and the cameras that follow from it (CONTRACTS.md).
+//! View paths: what a client submits and the cameras that follow from it
+//! (docs/design/contracts.md).
 //!
 //! A path is one of four: explicit [`views`](ViewPath::views), a [`Turntable`], [`KeyFrames`], a
 //! [`FlyThrough`]. Beside it stand what holds for all frames: a [`Crop`], and a range of frames
@@ -201,7 +202,8 @@ pub struct Orientation {
 }
 
 impl Orientation {
-    /// Fills in what is missing: up +z; front +y for up along z, else +z (CONTRACTS.md).
+    /// Fills in what is missing: up +z; front +y for up along z, else +z
+    /// (docs/design/contracts.md).
     ///
     /// # Errors
     /// Names `front` if it lies along up.
@@ -265,7 +267,7 @@ impl ViewPath {
         ViewPath { turntable: Some(turntable), ..ViewPath::from_views(size, Vec::new()) }
     }
 
-    /// Reads and checks the JSON of CONTRACTS.md.
+    /// Reads and checks the JSON of docs/design/contracts.md.
     ///
     /// # Errors
     /// If the text is not such JSON, or as [`ViewPath::check`].

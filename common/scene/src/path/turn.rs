@@ -2,7 +2,8 @@
 //!
 //! glam's `slerp` takes a polynomial for the arc cosine, so that its speed is off by some 10^-4 and
 //! it does not quite end where it should. Camera paths are drawn twice by people who compare; here
-//! everything goes by `libm`, ends are hit exactly, and the speed along an arc is constant to 10^-9.
+//! everything goes by `libm`, ends are hit exactly, and the speed along an arc is constant to
+//! 10^-9.
 
 use glam::{DMat3, DQuat, DVec3};
 use libm::{atan2, cos, sin};

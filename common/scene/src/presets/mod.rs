@@ -5,10 +5,10 @@
 //! the `peer-*` ramps on raw 8-bit values (other types scaled from their smallest to their largest
 //! value), the same that other renderers are measured with.
 //!
-//! Each preset has three parts (docs/colours-and-cameras.md has them as a table): a *range rule*,
-//! where opacity begins and how it grows; a *technique*, a surface (opaque within a few voxels),
-//! layers (a translucent outside over a dense inside) or a fog (nothing hides anything); and its
-//! *light*.
+//! Each preset has three parts (docs/reference/transfer-functions.md has them as a table): a *range
+//! rule*, where opacity begins and how it grows; a *technique*, a surface (opaque within a few
+//! voxels), layers (a translucent outside over a dense inside) or a fog (nothing hides anything);
+//! and its *light*.
 
 mod levels;
 mod maps;

@@ -36,7 +36,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ranks_agree_turn_round_and_share_ties() {
+    fn spearman_of_equal_reversed_and_tied_ranks() {
         let up: Vec<(f64, f64)> = (0..9).map(|i| (f64::from(i), f64::from(i * i))).collect();
         let down: Vec<(f64, f64)> = up.iter().map(|p| (p.0, -p.1)).collect();
         assert_eq!(spearman(&up), Some(1.0));

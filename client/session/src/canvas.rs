@@ -5,7 +5,8 @@ use crate::software::{SOFTWARE, io_error};
 use slabcast_common::image::{Background, Picture, PixelFormat};
 use std::io::Write;
 
-/// Viridis at tenths (matplotlib, CC0): ascends evenly in lightness, also for the colour-blind.
+/// Viridis at tenths, sRGB bytes (matplotlib, CC0): ascends evenly in lightness, also for
+/// colour-blind readers.
 pub const VIRIDIS: [[u8; 3]; 11] = [
     [68, 1, 84],
     [72, 36, 117],
@@ -19,15 +20,15 @@ pub const VIRIDIS: [[u8; 3]; 11] = [
     [189, 223, 38],
     [253, 231, 37],
 ];
-/// What lies under everything.
+/// Background of a new board, sRGB bytes.
 pub const PAPER: [u8; 3] = [24; 3];
-/// White, for text.
+/// White, for text, sRGB bytes.
 pub const WHITE: [u8; 3] = [255; 3];
-/// Height and width of a letter's cell, in dots.
+/// Height of a line of text, in dots.
 pub const LINE: usize = 9;
 const CELL: usize = 6;
 
-/// Viridis at `t` from 0 to 1.
+/// Returns the colour of the viridis scale at `t`, clamped to 0 to 1, as sRGB bytes.
 pub fn viridis(t: f64) -> [u8; 3] {
     let at = t.clamp(0.0, 1.0) * 10.0;
     let i = (at as usize).min(9);
@@ -38,7 +39,7 @@ pub fn viridis(t: f64) -> [u8; 3] {
     })
 }
 
-/// 8-bit sRGB, row-major.
+/// A drawing board of 8-bit sRGB pixels.
 pub struct Canvas {
     /// Width and height in pixels.
     pub size: [usize; 2],
@@ -52,7 +53,8 @@ impl Canvas {
         Canvas { size, bytes: PAPER.repeat(size[0] * size[1]) }
     }
 
-    /// Fills a rectangle; what lies outside is left out.
+    /// Fills the rectangle of `w` by `h` pixels whose top left corner is `x`, `y`; parts
+    /// outside are left out.
     pub fn fill(&mut self, [x, y]: [usize; 2], [w, h]: [usize; 2], colour: [u8; 3]) {
         for y in y..(y + h).min(self.size[1]) {
             for x in x..(x + w).min(self.size[0]) {
@@ -62,14 +64,21 @@ impl Canvas {
         }
     }
 
-    /// Puts rows of RGB, `w` pixels each, with their top left corner at `x`, `y`; they must fit.
+    /// Copies rows of RGB bytes, `w` pixels each, with their top left corner at `x`, `y`.
+    ///
+    /// # Panics
+    /// The rows don't fit on the board.
     pub fn put(&mut self, [x, y]: [usize; 2], w: usize, rgb: &[u8]) {
         for (j, row) in rgb.chunks_exact(w * 3).enumerate() {
             self.bytes[((y + j) * self.size[0] + x) * 3..][..w * 3].copy_from_slice(row);
         }
     }
 
-    /// Puts a picture, over black where it is transparent.
+    /// Draws a picture with its top left corner at `corner`, over black where it is
+    /// transparent.
+    ///
+    /// # Panics
+    /// The picture doesn't fit on the board.
     pub fn picture(&mut self, at: [usize; 2], picture: &Picture, background: Background) {
         let behind = match background {
             Background::Transparent => Background::Colour([0.0; 3]),
@@ -79,7 +88,8 @@ impl Canvas {
         self.put(at, picture.size[0] as usize, &bytes);
     }
 
-    /// Writes a line; each dot is `dot` pixels wide. Characters that the font lacks are left blank.
+    /// Writes a line of text with its top left corner at `x`, `y`; each dot is `dot` pixels
+    /// wide. Characters that the font lacks stay blank.
     pub fn text(&mut self, [x, y]: [usize; 2], dot: usize, text: &str, colour: [u8; 3]) {
         for (n, c) in text.chars().enumerate() {
             let Some(glyph) = (c as usize).checked_sub(32).and_then(|i| FONT.get(i)) else {
@@ -94,7 +104,10 @@ impl Canvas {
         }
     }
 
-    /// As a PNG, with words about it.
+    /// Encodes the board as a PNG with text chunks `about` (key and text).
+    ///
+    /// # Errors
+    /// `out` can't be written.
     pub fn png(&self, out: &mut impl Write, about: &[(&str, String)]) -> std::io::Result<()> {
         let [w, h] = self.size.map(|n| n as u32);
         let mut png = png::Encoder::new(out, w, h);
@@ -112,7 +125,7 @@ impl Canvas {
     }
 }
 
-/// Width of a line of text in pixels.
+/// Returns the width in pixels of a line of text whose dots are `dot` pixels wide.
 pub fn width(text: &str, dot: usize) -> usize {
     (text.chars().count() * CELL).saturating_sub(1) * dot
 }
@@ -166,7 +179,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn letters_stay_inside_and_are_told_apart() {
+    fn text_stays_inside_the_canvas_and_glyphs_differ() {
         let mut canvas = Canvas::new([12, 8]);
         canvas.text([9, 2], 3, "W~\u{e9}", WHITE);
         assert_eq!(canvas.bytes.len(), 12 * 8 * 3);

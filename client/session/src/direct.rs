@@ -19,25 +19,25 @@ use std::ops::Deref;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// How a picture is cut. Never changes a byte.
+/// How a picture is cut for threads; never changes a byte.
 #[derive(Clone, Copy, Debug)]
 pub struct Cut {
-    /// Threads.
+    /// Number of threads.
     pub threads: usize,
     /// Edge of the tiles in pixels; any number.
     pub tile: u32,
-    /// Slabs.
+    /// Number of slabs; with 1 each tile is drawn through all sheets.
     pub slabs: u32,
 }
 
 impl Cut {
-    /// One slab, tiles of 128 pixels.
+    /// Returns a cut into tiles of 128 pixels and one slab.
     pub fn on(threads: usize) -> Cut {
         Cut { threads, tile: 128, slabs: 1 }
     }
 }
 
-/// Bricks of a scene, by id, and what tells which of them lie where.
+/// Bricks of a scene by id, with the directory that says where each lies.
 #[derive(Clone)]
 pub struct Bricks {
     all: Vec<Arc<Brick>>,
@@ -45,14 +45,14 @@ pub struct Bricks {
 }
 
 impl Bricks {
-    /// Those of a store.
+    /// Returns all bricks of a store.
     pub fn from_store(store: &BrickStore) -> Bricks {
         let brick = |i: &BrickInfo| store.brick(i.id).expect("a brick that the store knows");
         let all = store.infos().iter().map(brick).collect();
         Bricks { all, directory: Arc::new(Directory::new(store.infos().clone())) }
     }
 
-    /// The directory of them.
+    /// Returns the directory of the bricks.
     pub fn directory(&self) -> &Arc<Directory> {
         &self.directory
     }
@@ -72,17 +72,17 @@ impl BrickSupply for Bricks {
     }
 }
 
-/// A whole frame by the tile renderer.
+/// Draws a whole frame by the tile renderer; the bytes don't depend on `cut`.
 pub fn draw(frame: &Frame, bricks: &Bricks, cut: Cut) -> Picture {
     draw_counted(frame, bricks, cut).0
 }
 
-/// A whole frame by the tile renderer, and what it took.
+/// Draws a whole frame and returns the renderer's counters with it.
 pub fn draw_counted(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
     if cut.slabs > 1 { in_slabs(frame, bricks, cut) } else { through(frame, bricks, cut) }
 }
 
-/// Tiles of a picture, row by row.
+/// Returns the tiles of a picture with edges of `edge` pixels, row by row.
 pub fn tile_rects(whole: Rect, edge: u32) -> impl Iterator<Item = Rect> {
     let (step, edge) = (edge as usize, edge as i32);
     let corners = (0..whole.y1)
@@ -198,8 +198,10 @@ impl Drop for Kept {
 /// Bricks that a thread projects at a time: some 0.1 ms.
 const PROJECTED: usize = 512;
 
-/// `work` for each of `n` items on `threads` threads; results in order. Each thread has an `S`
-/// of its own. Not to be called inside `work`.
+/// Calls `work` for each index below `n` on `threads` threads and returns the results in order.
+/// Each thread has an `S` of its own.
+///
+/// Must not be called inside `work`.
 pub fn map_parallel<S: Default, T: Send>(
     n: usize,
     threads: usize,
@@ -242,8 +244,8 @@ fn pool(threads: usize) -> Option<Arc<ThreadPool>> {
 /// Half as many cost nothing yet; at double the bar stands still for seconds.
 const PORTION: usize = 64;
 
-/// What `pixel` says of each of `sample`, in portions, so that there is something to see
-/// meanwhile. `before` pixels of the progress were done earlier.
+/// Calls `pixel` for each pixel of `sample` on `threads` threads and returns the results in
+/// order. The progress advances by pixels; `before` were counted earlier.
 pub fn map_pixels<T: Send>(
     sample: &[[u32; 2]],
     threads: usize,
@@ -284,7 +286,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shared_work_comes_back_in_order() {
+    fn map_parallel_returns_results_in_order() {
         for threads in [1, 2, 7] {
             let got = map_parallel(100, threads, |i, seen: &mut usize| {
                 *seen += 1;
@@ -296,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn threads_live_across_frames() {
+    fn thread_pool_is_reused_across_frames() {
         let who = || {
             // Each waits for the others, so that all take part.
             let barrier = std::sync::Barrier::new(3);
@@ -311,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn pixels_are_judged_in_any_order_and_come_back_in_theirs() {
+    fn map_pixels_scatters_work_and_returns_results_in_order() {
         for n in [0, 1, 2, 5, 97, 1000] {
             let mut order = scattered(n);
             // The first tenth reaches into every third.

@@ -37,17 +37,21 @@ const SHARED: u64 = 1 << 40;
 /// `kill -STOP`, six seconds and `kill -CONT`.
 const SILENCE: u64 = 86_400_000_000;
 
-/// What embedded workers are like.
+/// Number and size of the workers in this process.
 #[derive(Clone, Copy, Debug)]
 pub struct WorkerGroup {
-    /// Workers.
+    /// Number of workers.
     pub workers: u32,
-    /// Render threads of each.
+    /// Render threads of each worker.
     pub threads: u32,
 }
 
 impl WorkerGroup {
-    /// `workers` workers of `threads` threads, or of their share of this machine's cores.
+    /// Returns `workers` workers of `threads` threads each, or of their share of this machine's
+    /// cores.
+    ///
+    /// # Errors
+    /// More than 4096 threads in all.
     pub fn new(workers: u32, threads: Option<u32>) -> Result<Self, Fail> {
         let threads = threads.unwrap_or_else(|| (cores() / workers).max(1));
         if workers.saturating_mul(threads) > MAX_THREADS {
@@ -67,7 +71,7 @@ impl std::fmt::Display for WorkerGroup {
     }
 }
 
-/// A small cluster in this process.
+/// A master and its workers in this process.
 pub struct Cluster {
     master: Master,
     stop: watch::Sender<bool>,
@@ -75,7 +79,11 @@ pub struct Cluster {
 }
 
 impl Cluster {
-    /// Starts it. Must be called inside a tokio runtime.
+    /// Starts a master of `volume` and the workers of `group`. Must be called inside a tokio
+    /// runtime.
+    ///
+    /// # Errors
+    /// The system gives no threads.
     pub fn start(
         volume: impl Into<Arc<Volume>>,
         orientation: Orientation,
@@ -107,12 +115,13 @@ impl Cluster {
         Ok(Cluster { master, stop, workers })
     }
 
-    /// A way to speak to its master.
+    /// Returns a handle to the master.
     pub fn handle(&self) -> Handle {
         self.master.handle()
     }
 
-    /// Waits for a worker to end before it was told to, which should not happen; says why.
+    /// Waits for a worker to end without having been told to, which should not happen, and
+    /// returns why.
     pub async fn trouble(&mut self) -> Fail {
         let why = match self.workers.join_next().await {
             None => return std::future::pending().await,
@@ -125,8 +134,8 @@ impl Cluster {
         Fail::failed(format!("a worker of this process ended: {why}"))
     }
 
-    /// Ends master and workers. The master first: it says goodbye, so that nobody takes the
-    /// workers for lost.
+    /// Shuts down the master, which says goodbye to its workers, and waits for them at most
+    /// two seconds.
     pub async fn end(mut self) {
         let leave = async {
             self.master.shutdown().await;
@@ -137,14 +146,20 @@ impl Cluster {
     }
 }
 
-/// A master that runs, or why the system does not let it.
+/// Starts a master.
+///
+/// # Errors
+/// The system gives no threads.
 pub fn start_master(config: MasterConfig) -> Result<Master, Fail> {
     Master::start(config).map_err(|e| {
         Fail::failed(format!("starting the master's threads failed: {}", crate::fail::reason(&e)))
     })
 }
 
-/// Submits a path to a master of this process and follows it.
+/// Submits a path to a master of this process and returns its updates.
+///
+/// # Errors
+/// The master refuses the request; the error names the flag or the file.
 pub async fn submit(
     handle: &Handle,
     request: &RenderRequest,

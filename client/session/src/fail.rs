@@ -9,7 +9,7 @@ use slabcast_common::quality::InvalidField;
 use std::io::{ErrorKind, Write};
 use std::path::Path;
 
-/// The end of a command that did not do what it was asked.
+/// Why a command failed: an exit code and one line for stderr.
 #[derive(Debug)]
 pub struct Fail {
     code: u8,
@@ -18,28 +18,28 @@ pub struct Fail {
 }
 
 impl Fail {
-    /// The command line is wrong.
+    /// Returns a failure of the command line (exit code 2).
     pub fn usage(line: impl Into<String>) -> Self {
         Fail { code: 2, line: Some(line.into()) }
     }
 
-    /// Something else is wrong: a file, the network, the machine.
+    /// Returns any other failure, of a file, the network or the machine (exit code 1).
     pub fn failed(line: impl Into<String>) -> Self {
         Fail { code: 1, line: Some(line.into()) }
     }
 
-    /// Everything was said.
+    /// Returns a failure whose line was printed already.
     pub fn silent(code: u8) -> Self {
         Fail { code, line: None }
     }
 
-    /// A value of a flag is wrong.
+    /// Returns the refusal of a flag's value (exit code 2).
     pub fn flag(refused: &InvalidField) -> Self {
         Fail::usage(format!("--{}: {}", refused.field, refused.problem))
     }
 
-    /// A field of a file is wrong. `whole` is what the reader calls the file when no field is
-    /// to blame.
+    /// Returns the refusal of a field of a file (exit code 1). A refusal whose field is `whole`
+    /// blames the file as such.
     pub fn field(file: &Path, whole: &str, refused: &InvalidField) -> Self {
         let InvalidField { field, problem } = refused;
         let file = file.display();
@@ -50,7 +50,8 @@ impl Fail {
         })
     }
 
-    /// The operating system refused something about a file.
+    /// Returns a failure of the operating system while `doing` something with a file, with a
+    /// remedy where one is known (exit code 1).
     pub fn io(path: &Path, doing: &str, e: &std::io::Error) -> Self {
         let remedy = match e.kind() {
             ErrorKind::NotFound => "; check the path",
@@ -63,22 +64,22 @@ impl Fail {
         Fail::failed(format!("{}: {doing} failed: {}{remedy}", path.display(), reason(e)))
     }
 
-    /// The same with more said.
+    /// Returns the failure with `more` at the end of its line.
     pub fn add(self, more: &str) -> Self {
         Fail { line: self.line.map(|l| l + more), ..self }
     }
 
-    /// The same, but a file is to blame and not the command line.
+    /// Returns the failure with exit code 1: a file is to blame, not the command line.
     pub fn of_a_file(self) -> Self {
         Fail { code: 1, ..self }
     }
 
-    /// The line, for tests and for lines about it.
+    /// Returns the line without `error: `, unless it was printed already.
     pub fn line(&self) -> Option<&str> {
         self.line.as_deref()
     }
 
-    /// Says it and gives the exit code.
+    /// Prints the line to stderr and returns the exit code.
     pub fn end(self) -> u8 {
         if let Some(line) = &self.line {
             progress::say_on_stderr(&format!("{} {}", terminal::error(), one_line(line)));
@@ -87,7 +88,7 @@ impl Fail {
     }
 }
 
-/// What the system says, in small letters and without its number.
+/// Returns the system's message in lower case, without its number.
 pub fn reason(e: &std::io::Error) -> String {
     let text = e.to_string();
     let text = text.split(" (os error").next().unwrap_or_default();
@@ -95,7 +96,11 @@ pub fn reason(e: &std::io::Error) -> String {
     chars.next().map(|c| c.to_lowercase().chain(chars).collect()).unwrap_or_default()
 }
 
-/// Writes results to stdout. A reader that has gone away (`| head`) ends the command quietly.
+/// Writes results to stdout.
+///
+/// # Errors
+/// stdout can't be written. A reader that has gone away (`| head`) ends the command quietly,
+/// with code 0.
 pub fn say(text: &str) -> Result<(), Fail> {
     let mut out = std::io::stdout().lock();
     out.write_all(text.as_bytes()).and_then(|()| out.flush()).map_err(|e| match e.kind() {

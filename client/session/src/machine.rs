@@ -1,6 +1,6 @@
 //! The machine that this process runs on: its processor's name and its cores.
 
-/// Its processor, as the system names it; where that is not to be had, the architecture.
+/// Returns the processor's name as the system has it, else the architecture.
 pub fn cpu() -> String {
     let listed = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = listed.lines().find_map(|l| l.strip_prefix("model name")?.split_once(": "));

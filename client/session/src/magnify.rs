@@ -11,8 +11,8 @@ use slabcast_common::image::Picture;
 /// Rows that a thread magnifies at a time.
 const ROWS: usize = 32;
 
-/// `small`, `factor` times as large along each edge, on so many threads. Colours are kept between
-/// nothing and their alpha, alpha between nothing and one.
+/// Returns `small` with each edge `factor` times as long, computed on `threads` threads.
+/// Colours stay between 0 and their alpha, alpha between 0 and 1.
 pub fn magnified(small: Picture, factor: u32, threads: usize) -> Picture {
     if factor == 1 {
         return small;

@@ -6,7 +6,7 @@ use slabcast_common::transfer::NanColour;
 use slabcast_common::view::MAX_EDGE;
 use slabcast_scene::path::MAX_FRAMES;
 
-/// A finite number.
+/// Parses a finite number.
 pub fn number(text: &str) -> Result<f64, String> {
     match text.trim().parse::<f64>() {
         Ok(x) if x.is_finite() => Ok(x),
@@ -15,7 +15,7 @@ pub fn number(text: &str) -> Result<f64, String> {
     }
 }
 
-/// A finite number above zero.
+/// Parses a finite number above 0.
 pub fn positive(text: &str) -> Result<f64, String> {
     match number(text)? {
         x if x > 0.0 => Ok(x),
@@ -23,7 +23,7 @@ pub fn positive(text: &str) -> Result<f64, String> {
     }
 }
 
-/// A number or a fraction (`1/512`).
+/// Parses a number or a fraction (`1/512`).
 pub fn fraction(text: &str) -> Result<f64, String> {
     let bad = || "give a number or a fraction, like 0.002 or 1/512".to_string();
     let x = match text.split_once('/') {
@@ -39,7 +39,7 @@ pub fn fraction(text: &str) -> Result<f64, String> {
     if x.is_finite() { Ok(x) } else { Err(bad()) }
 }
 
-/// A time with its unit (`100ms`, `0.5s`), in milliseconds.
+/// Parses a time with its unit (`100ms`, `0.5s`) into ms.
 pub fn time(text: &str) -> Result<f64, String> {
     let bad = || "give a time above 0 with its unit, like 100ms or 0.5s".to_string();
     let digits = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
@@ -53,7 +53,7 @@ pub fn time(text: &str) -> Result<f64, String> {
     if ms > 0.0 && ms.is_finite() { Ok(ms) } else { Err(bad()) }
 }
 
-/// `WxH` in pixels.
+/// Parses `WxH` into pixels.
 pub fn size(text: &str) -> Result<[u32; 2], String> {
     let bad = || format!("give WIDTHxHEIGHT in pixels, 1 to {MAX_EDGE} each, like 512x512");
     let (w, h) = text.split_once(['x', 'X']).ok_or_else(bad)?;
@@ -64,7 +64,7 @@ pub fn size(text: &str) -> Result<[u32; 2], String> {
     Ok([edge(w)?, edge(h)?])
 }
 
-/// `transparent`, `black`, `white`, `R,G,B` in 0 to 1, or `#rrggbb`.
+/// Parses `transparent`, `black`, `white`, `R,G,B` (0 to 1) or `#rrggbb`.
 pub fn background(text: &str) -> Result<Background, String> {
     let bad = "give transparent, R,G,B with numbers from 0 to 1 (like 0.1,0.1,0.2), or #rrggbb";
     match text {
@@ -93,7 +93,7 @@ pub fn background(text: &str) -> Result<Background, String> {
     Err(bad.into())
 }
 
-/// Bytes: `512MiB`, `2GB`, `1073741824`. At least 16 MiB, at most 1 PiB.
+/// Parses a number of bytes: `512MiB`, `2GB`, `1073741824`; 16 MiB to 1 PiB.
 pub fn memory(text: &str) -> Result<u64, String> {
     let bad = || "give bytes with a unit, from 16MiB to 1024TiB, like 512MiB or 2GiB".to_string();
     let digits = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
@@ -135,17 +135,17 @@ fn host_port(text: &str, any_port: bool) -> Result<String, String> {
     }
 }
 
-/// Where a master is.
+/// Parses the address of a master, `HOST:PORT`.
 pub fn master(text: &str) -> Result<String, String> {
     host_port(text, false)
 }
 
-/// Where a master listens.
+/// Parses the address that a master listens on, `HOST:PORT`.
 pub fn listen(text: &str) -> Result<String, String> {
     host_port(text, true)
 }
 
-/// A macrotile's edge, or `auto` for the quadtree to choose.
+/// Parses the edge of a macrotile, or `auto`.
 pub fn tile(text: &str) -> Result<Tile, String> {
     match text {
         "auto" => Ok(Tile(None)),
@@ -154,12 +154,12 @@ pub fn tile(text: &str) -> Result<Tile, String> {
     }
 }
 
-/// Edge of a macrotile; `None` is `auto`. (A type of its own: clap takes a bare `Option` for a
-/// flag that may be left out.)
+/// Edge of a macrotile in pixels; `None` is `auto`. (A type of its own, since clap takes a bare
+/// `Option` for a flag that may be left out.)
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Tile(pub Option<u32>);
 
-/// A worker's name: what fits a line of a table.
+/// Parses a worker's name: one line of a table.
 pub fn worker_name(text: &str) -> Result<String, String> {
     if (1..=100).contains(&text.len()) && !text.chars().any(char::is_control) {
         Ok(text.into())
@@ -168,13 +168,13 @@ pub fn worker_name(text: &str) -> Result<String, String> {
     }
 }
 
-/// Three sizes, `AxBxC`.
+/// Parses three numbers of samples, `AxBxC`.
 pub fn dims(text: &str) -> Result<[u64; 3], String> {
     three(text, |n: &u64| (1..=16384).contains(n))
         .ok_or_else(|| "give AxBxC, like 256x256x128, each from 1 to 16384".into())
 }
 
-/// Three lengths, `AxBxC`.
+/// Parses three lengths, `AxBxC`, in mm.
 pub fn spacing(text: &str) -> Result<[f64; 3], String> {
     three(text, |x: &f64| x.is_normal() && *x > 0.0)
         .ok_or_else(|| "give three lengths above 0 as AxBxC, like 0.5x0.5x1.25".into())
@@ -185,7 +185,7 @@ fn three<T: std::str::FromStr>(text: &str, good: impl Fn(&T) -> bool) -> Option<
     numbers.filter(|n| n.iter().all(good))?.try_into().ok()
 }
 
-/// The type of raw numbers.
+/// Parses the type of raw numbers, such as `uint8`.
 pub fn number_type(text: &str) -> Result<String, String> {
     let types = slabcast_volumes::RawHints::TYPES;
     match slabcast_volumes::RawHints::default().with_type(text) {
@@ -194,7 +194,7 @@ pub fn number_type(text: &str) -> Result<String, String> {
     }
 }
 
-/// `little` or `big`; true is big.
+/// Parses `little` or `big`; true is big.
 pub fn byte_order(text: &str) -> Result<bool, String> {
     match text {
         "little" => Ok(false),
@@ -203,7 +203,7 @@ pub fn byte_order(text: &str) -> Result<bool, String> {
     }
 }
 
-/// `on` or `off`.
+/// Parses `on` or `off`.
 pub fn on_off(text: &str) -> Result<bool, String> {
     match text {
         "on" => Ok(true),
@@ -216,7 +216,7 @@ pub fn on_off(text: &str) -> Result<bool, String> {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Workers(pub Vec<u32>);
 
-/// `16`, `1..64`, `1,2,4,8` or a mixture.
+/// Parses numbers of workers: `16`, `1..64`, `1,2,4,8` or a mixture.
 pub fn workers(text: &str) -> Result<Workers, String> {
     let bad = || "give numbers from 1 to 1024, as 1..64 or 1,2,4,8".to_string();
     let number = |t: &str| {
@@ -241,7 +241,7 @@ pub fn workers(text: &str) -> Result<Workers, String> {
     Ok(Workers(all))
 }
 
-/// Bits a second; `None`: no limit.
+/// Rate of a link in bits a second; `None` is unlimited.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rate(pub Option<f64>);
 
@@ -255,7 +255,7 @@ impl std::fmt::Display for Rate {
     }
 }
 
-/// `1gbit`, `2.5gbit`, `100mbit` or `unlimited`.
+/// Parses the rate of a link: `1gbit`, `2.5gbit`, `100mbit` or `unlimited`.
 pub fn link(text: &str) -> Result<Rate, String> {
     let bad = || "give a rate, as 1gbit, 10gbit or 100mbit, or unlimited".to_string();
     if text == "unlimited" {
@@ -272,7 +272,7 @@ pub fn link(text: &str) -> Result<Rate, String> {
     if (1e6..=1e13).contains(&rate) { Ok(Rate(Some(rate))) } else { Err(bad()) }
 }
 
-/// `100us`, `1.5ms`, `0`: in nanoseconds.
+/// Parses a latency (`100us`, `1.5ms`, `0`) into ns.
 pub fn latency(text: &str) -> Result<u64, String> {
     let bad = || "give a time, as 50us or 1ms, at most 10s".to_string();
     let (digits, unit) = match text {
@@ -286,7 +286,7 @@ pub fn latency(text: &str) -> Result<u64, String> {
     if (0.0..=1e10).contains(&ns) { Ok(ns as u64) } else { Err(bad()) }
 }
 
-/// How many pixels are looked at.
+/// Number of pixels to look at.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pixels {
     /// Each.
@@ -296,7 +296,7 @@ pub enum Pixels {
 }
 
 impl Pixels {
-    /// How many of a picture of this size.
+    /// Returns the number of pixels of a picture of this size.
     pub fn count(self, size: [u32; 2]) -> usize {
         let all = size[0] as usize * size[1] as usize;
         match self {
@@ -306,7 +306,7 @@ impl Pixels {
     }
 }
 
-/// A number of pixels, or `all`.
+/// Parses a number of pixels, or `all`.
 pub fn pixels(text: &str) -> Result<Pixels, String> {
     match text.parse::<u32>() {
         _ if text == "all" => Ok(Pixels::All),
@@ -315,7 +315,7 @@ pub fn pixels(text: &str) -> Result<Pixels, String> {
     }
 }
 
-/// A pixel, `X,Y` from the top left.
+/// Parses a pixel, `X,Y` from the top left.
 pub fn pixel(text: &str) -> Result<[u32; 2], String> {
     let bad = || "give a pixel as X,Y, from 0,0 at the top left".to_string();
     let (x, y) = text.split_once(',').ok_or_else(bad)?;
@@ -323,7 +323,7 @@ pub fn pixel(text: &str) -> Result<[u32; 2], String> {
     Ok([number(x)?, number(y)?])
 }
 
-/// A file for a PNG.
+/// Parses the name of a PNG file.
 pub fn png(text: &str) -> Result<std::path::PathBuf, String> {
     let path = std::path::PathBuf::from(text);
     match path.extension() {
@@ -332,7 +332,7 @@ pub fn png(text: &str) -> Result<std::path::PathBuf, String> {
     }
 }
 
-/// How many frames, or which.
+/// Number or range of frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Frames {
     /// As many.
@@ -341,7 +341,7 @@ pub enum Frames {
     Range([u32; 2]),
 }
 
-/// `18` or `30..60`.
+/// Parses `18` or `30..60`.
 pub fn frames(text: &str) -> Result<Frames, String> {
     let bad =
         || format!("give 1..={MAX_FRAMES} frames, or the first and last wanted, as in 30..60");
@@ -360,7 +360,7 @@ pub fn frames(text: &str) -> Result<Frames, String> {
     }
 }
 
-/// `head` or `X,Y,Z`.
+/// Parses `head` or a direction `X,Y,Z`.
 pub fn light(text: &str) -> Result<Light, String> {
     if text == "head" {
         return Ok(Light::Head(HeadWord::Head));
@@ -374,7 +374,7 @@ pub fn light(text: &str) -> Result<Light, String> {
     }
 }
 
-/// `COLOUR` or `COLOUR:OPACITY`.
+/// Parses the look of NaN: `COLOUR` or `COLOUR:OPACITY`.
 pub fn nan(text: &str) -> Result<NanColour, String> {
     let bad = || {
         "give a colour, R,G,B (0 to 1) or #rrggbb, and after a colon its opacity (0 to 1)"

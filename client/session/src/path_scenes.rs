@@ -28,7 +28,11 @@ pub struct SceneBricks {
 }
 
 impl SceneBricks {
-    /// Cuts the bricks of `volume` under `transfer`, and decides the sums, as the master does.
+    /// Cuts the bricks that `transfer` needs and decides the number type of sums, as a master
+    /// does.
+    ///
+    /// # Errors
+    /// The sums asked for can't hold the scene.
     pub fn new(
         volume: &Volume,
         info: &VolumeInfo,
@@ -39,7 +43,11 @@ impl SceneBricks {
         SceneBricks::with_requirements(volume, info, transfer, quality, &wanted)
     }
 
-    /// The same with bricks that hold what is wanted.
+    /// Cuts the bricks with the content that `wanted` names and decides the number type of
+    /// sums.
+    ///
+    /// # Errors
+    /// The sums asked for can't hold the scene.
     pub fn with_requirements(
         volume: &Volume,
         info: &VolumeInfo,
@@ -62,7 +70,7 @@ impl SceneBricks {
     }
 }
 
-/// A path's bricks, scenes and views.
+/// Bricks, scenes and views of a path, ready to be drawn.
 pub struct PathScenes {
     request: RenderRequest,
     orientation: Orientation,
@@ -71,12 +79,15 @@ pub struct PathScenes {
     tween: Option<Tween>,
     /// What frames share if there is no tween: they keep footprints in it.
     shared: Arc<Scene>,
-    /// Enough for all frames.
+    /// Bricks for all frames.
     pub bricks: Bricks,
 }
 
 impl PathScenes {
-    /// Cuts the bricks of a volume, which fits what is asked.
+    /// Cuts the bricks of a volume that fits the request.
+    ///
+    /// # Errors
+    /// The request doesn't fit the volume; the error names the flag or file.
     pub fn new(
         volume: &Volume,
         info: &VolumeInfo,
@@ -97,14 +108,14 @@ impl PathScenes {
         Ok(PathScenes { request: request.clone(), orientation, base, tween, shared, bricks })
     }
 
-    /// What frame `i` of those that are wanted is drawn with; sums decided.
+    /// Returns the scene of the `i`-th wanted frame, sums decided.
     pub fn spec(&self, i: usize) -> SceneSpec {
         let Some(tween) = &self.tween else { return self.base.clone() };
         let at = (self.request.path.first_frame() + i) as f64;
         tween.scene_at(&self.base, self.request.quality.sums, at)
     }
 
-    /// The same, made ready.
+    /// Returns the scene of the `i`-th wanted frame with its tables.
     pub fn scene(&self, i: usize) -> Arc<Scene> {
         match self.tween {
             None => self.shared.clone(),
@@ -112,12 +123,18 @@ impl PathScenes {
         }
     }
 
-    /// The view of frame `i` at a quality.
+    /// Returns the view of the `i`-th wanted frame at a quality.
+    ///
+    /// # Errors
+    /// The quality doesn't fit the view.
     pub fn view(&self, i: usize, quality: &Quality) -> Result<View, Fail> {
         self.view_at_size(i, quality, self.request.path.size)
     }
 
-    /// The same in a picture of another size.
+    /// Returns the view of the `i`-th wanted frame in a picture of `size` pixels.
+    ///
+    /// # Errors
+    /// The quality or the size doesn't fit the view.
     pub fn view_at_size(&self, i: usize, quality: &Quality, size: [u32; 2]) -> Result<View, Fail> {
         let lattice = &self.base.volume.lattice;
         let camera = self.request.path.camera(i, lattice, self.orientation);
@@ -125,17 +142,23 @@ impl PathScenes {
         view.map_err(|e| self.request.blame(&e))
     }
 
-    /// Whether frames have transfer functions of their own.
+    /// Returns whether frames have transfer functions of their own.
     pub fn is_tween(&self) -> bool {
         self.tween.is_some()
     }
 
-    /// Tables of frame `i`.
+    /// Returns the `i`-th wanted frame, ready for the renderer.
+    ///
+    /// # Errors
+    /// The quality doesn't fit the view.
     pub fn frame(&self, i: usize) -> Result<Frame, Fail> {
         Ok(Frame::new(self.scene(i), self.view(i, &self.base.quality)?))
     }
 
-    /// The same at another quality.
+    /// Returns the `i`-th wanted frame at a changed quality.
+    ///
+    /// # Errors
+    /// The quality doesn't fit the view.
     pub fn frame_with(
         &self,
         i: usize,

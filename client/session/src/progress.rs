@@ -26,50 +26,50 @@ fn bars() -> &'static MultiProgress {
     })
 }
 
-/// Writes to stderr without tearing a bar. A stderr that is gone is nobody's concern.
+/// Writes bytes to stderr between redraws of the progress bar. A closed stderr is ignored.
 pub fn write_on_stderr(bytes: &[u8]) {
     bars().suspend(|| {
         let _ = std::io::stderr().lock().write_all(bytes);
     });
 }
 
-/// A line on stderr.
+/// Writes a line to stderr.
 pub fn say_on_stderr(line: &str) {
     write_on_stderr(format!("{line}\n").as_bytes());
 }
 
-/// Takes all bars away: the command ends.
+/// Removes all progress bars; the command ends.
 pub fn end() {
     // A terminal that is gone is nobody's concern.
     let _ = bars().clear();
 }
 
-/// `warning: ...` on stderr.
+/// Writes `warning: ...` to stderr.
 pub fn warn(line: &str) {
     say_on_stderr(&format!("{} {}", terminal::warning(), crate::terminal::one_line(line)));
 }
 
-/// `note: ...` on stderr.
+/// Writes `note: ...` to stderr.
 pub fn note(line: &str) {
     say_on_stderr(&format!("{} {}", terminal::note(), crate::terminal::one_line(line)));
 }
 
-/// Where a run is.
+/// Where a run stands.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Step {
-    /// What it waits for; empty while frames are rendered.
+    /// What the run waits for; empty while frames are rendered.
     pub waiting: String,
-    /// Frames rendered.
+    /// Number of frames that are done.
     pub frames: u64,
-    /// Macrotiles of the slab at hand, done and in all; (0, 0) where that is not known.
+    /// Macrotiles of the current slab, done and in all; (0, 0) if unknown.
     pub tiles: (u32, u32),
-    /// Slab at hand (from 0) and slabs of the frame at hand.
+    /// Current slab (from 0) and number of slabs of the current frame.
     pub slab: (u32, u32),
-    /// The same in the master's words, where it has no numbers.
+    /// State in the master's words, where there are no numbers.
     pub detail: String,
 }
 
-/// The progress of one run.
+/// Progress of one run: a bar on a terminal, else a line every five seconds.
 pub struct Progress {
     /// What is counted: `frame`.
     noun: &'static str,
@@ -83,7 +83,7 @@ pub struct Progress {
 }
 
 impl Progress {
-    /// Begins. `quiet` shows nothing but warnings.
+    /// Starts without a total. `quiet` shows warnings alone.
     pub fn new(quiet: bool) -> Self {
         let now = Instant::now();
         let bar = (terminal::terminal() && !quiet).then(|| {
@@ -103,20 +103,20 @@ impl Progress {
         }
     }
 
-    /// Counts something else than frames.
+    /// Returns the progress with another unit than `frame`, such as `pixel`.
     pub fn counting(mut self, noun: &'static str) -> Self {
         self.noun = noun;
         self
     }
 
-    /// Something that takes a while before the first frame (`reading brain.nii.gz`).
+    /// Shows what goes on before the first frame, such as `reading brain.nii.gz`.
     pub fn phase(&mut self, what: &str) {
         if let Some(bar) = &self.bar {
             bar.set_message(what.to_string());
         }
     }
 
-    /// Frames begin.
+    /// Starts counting to `total`; `what` is the line for a log.
     pub fn frames(&mut self, total: u64, what: &str) {
         self.total = total;
         self.began = Instant::now();
@@ -138,7 +138,7 @@ impl Progress {
         }
     }
 
-    /// The run went on.
+    /// Shows how far the run has come.
     pub fn step(&mut self, step: Step) {
         if step.frames > 0 && self.first.is_none() {
             self.first = Some(Instant::now());
@@ -204,12 +204,12 @@ impl Progress {
         bar.set_message(format!("{left}{detail}"));
     }
 
-    /// Writes something else meanwhile, without tearing the bar.
+    /// Calls `write`, which may print, without tearing the bar.
     pub fn suspend<T>(&self, write: impl FnOnce() -> T) -> T {
         bars().suspend(write)
     }
 
-    /// Takes the bar away.
+    /// Removes the bar.
     pub fn end(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
@@ -223,7 +223,7 @@ impl Drop for Progress {
     }
 }
 
-/// A time as a person says it.
+/// Returns a time for people: `3 ms`, `3.2 s`, `1 min 01 s`.
 pub fn time(d: Duration) -> String {
     let s = d.as_secs_f64();
     match s {
@@ -234,7 +234,7 @@ pub fn time(d: Duration) -> String {
     }
 }
 
-/// Bytes as a person says them.
+/// Returns a number of bytes for people: `2 KiB`, `512.0 MiB`.
 pub fn bytes(n: u64) -> String {
     match n {
         0..1024 => format!("{n} B"),

@@ -17,7 +17,10 @@ pub struct Recording {
     thread: JoinHandle<std::io::Result<RecordSummary>>,
 }
 
-/// Whether the record that `--record` asks for may lie there.
+/// Checks that `--record` can write to `path`.
+///
+/// # Errors
+/// The path is a folder or one of the run's inputs.
 pub fn check_path(path: &Path, inputs: &[&Path]) -> Result<(), Fail> {
     crate::output::refuse_input(path, "record", inputs)?;
     if path.is_dir() {
@@ -26,7 +29,10 @@ pub fn check_path(path: &Path, inputs: &[&Path]) -> Result<(), Fail> {
     Ok(())
 }
 
-/// Begins it.
+/// Starts a record; the [`Recorder`] goes to the master.
+///
+/// # Errors
+/// The file or the recorder's thread can't be made.
 pub fn start(path: &Path) -> Result<(Recorder, Recording), Fail> {
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
@@ -39,7 +45,10 @@ pub fn start(path: &Path) -> Result<(Recorder, Recording), Fail> {
 }
 
 impl Recording {
-    /// Waits for the last line and gives the file its name. The master must have ended.
+    /// Waits for the last line and renames the file. The master must have ended.
+    ///
+    /// # Errors
+    /// The record couldn't be written.
     pub fn end(self) -> Result<(), Fail> {
         let Recording { path, part, thread } = self;
         let written = match thread.join() {

@@ -20,7 +20,7 @@ const SILENCE: Duration = Duration::from_secs(5);
 /// often than this is not well.
 const ANEW: u32 = 3;
 
-/// What a client's error says on a terminal.
+/// Returns a client's error as the failure of a command.
 pub fn client_failure(e: &ClientError) -> Fail {
     match e {
         ClientError::Address { .. } => Fail::usage(format!("--master: {e}")),
@@ -28,12 +28,18 @@ pub fn client_failure(e: &ClientError) -> Fail {
     }
 }
 
-/// A client that is connected.
+/// Connects to a master at `HOST:PORT`.
+///
+/// # Errors
+/// The address is wrong or nobody answers.
 pub async fn connect(master: &str) -> Result<Client, Fail> {
     Client::connect(master).await.map_err(|e| client_failure(&e))
 }
 
-/// What the master serves.
+/// Returns the volume that a master serves; warns if its pixels are of another version.
+///
+/// # Errors
+/// The master doesn't answer.
 pub async fn describe(client: &Client) -> Result<VolumeDescription, Fail> {
     let served = client.volume().await.map_err(|e| client_failure(&e))?;
     if served.pixels_version != slabcast_common::PIXELS_VERSION {
@@ -48,7 +54,10 @@ pub async fn describe(client: &Client) -> Result<VolumeDescription, Fail> {
     Ok(served)
 }
 
-/// Submits a path and follows it.
+/// Submits a path to a master behind a network and returns its updates.
+///
+/// # Errors
+/// The master refuses the request or doesn't answer.
 pub async fn submit(
     client: Client,
     request: &RenderRequest,

@@ -7,7 +7,11 @@ use slabcast_common::link::stream_threads;
 use std::time::Duration;
 use tokio::runtime::{Builder, Runtime};
 
-/// Starts the runtime of a command with streams, with [`stream_threads`] for this machine's cores.
+/// Starts the runtime of a command with streams: [`stream_threads`] threads for this machine's
+/// cores.
+///
+/// # Errors
+/// The system gives no threads.
 pub fn start() -> Result<Runtime, Fail> {
     with_threads(stream_threads(cores()))
 }
@@ -15,15 +19,25 @@ pub fn start() -> Result<Runtime, Fail> {
 /// Render threads up to which a worker has one thread for its streams.
 const FEW: u32 = 8;
 
-/// Starts it for a worker of so many render threads: as for any command with streams, or with one thread where render
-/// threads are few. Another one is woken for each lease that comes, and finds nothing to do: a ping and its pong take a worker
-/// 38 us of a Xeon's processors with two and 24 with one (docs/scaling.md).
+/// Starts the runtime of a worker: one thread for its streams up to eight render threads,
+/// else as [`start`].
+///
+/// A second thread wakes for each lease and finds nothing to do: a ping takes a worker 38 us of
+/// processors with two threads and 24 with one.
+///
+/// # Errors
+/// The system gives no threads.
 pub fn start_worker(render_threads: u32) -> Result<Runtime, Fail> {
     if render_threads <= FEW { with_threads(1) } else { start() }
 }
 
-/// Starts it for a cluster in this process. Messages are passed on and nothing is encoded: a second
-/// thread would be woken for each of them to look for work, and take the render threads' cores.
+/// Starts the runtime of a cluster in this process: one thread.
+///
+/// Messages are passed on and nothing is encoded; a second thread would take the render
+/// threads' cores.
+///
+/// # Errors
+/// The system gives no threads.
 pub fn start_embedded() -> Result<Runtime, Fail> {
     with_threads(1)
 }
@@ -37,7 +51,7 @@ fn with_threads(threads: usize) -> Result<Runtime, Fail> {
         .map_err(|e| Fail::failed(format!("starting threads failed: {}", reason(&e))))
 }
 
-/// Ends it. A thread that still encodes, draws or resolves a name must not hold a command up.
+/// Ends a runtime within 200 ms, whatever its threads still do.
 pub fn end(runtime: Runtime) {
     runtime.shutdown_timeout(Duration::from_millis(200));
 }

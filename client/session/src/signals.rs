@@ -40,7 +40,7 @@ pub fn listen() {
     });
 }
 
-/// Waits until the process is told to stop; gives the exit code for it (128 + signal).
+/// Waits until the process is told to stop and returns the exit code for it (128 + signal).
 pub async fn stopped() -> u8 {
     loop {
         let told = TOLD.notified();
@@ -51,22 +51,29 @@ pub async fn stopped() -> u8 {
     }
 }
 
-/// Whether the process was told to stop, for work that looks now and then.
+/// Returns whether the process was told to stop.
 pub fn stop_requested() -> bool {
     CODE.load(Ordering::SeqCst) != 0
 }
 
-/// Does `work` on a thread of its own and waits for it, or for Ctrl-C or SIGTERM, which end the
-/// command at once (code 130 or 143; the thread ends with the process). So `work` must leave
-/// nothing half done on disk; who writes files does so with what comes back.
+/// Runs `work` on a thread of its own until it ends or the process is told to stop.
+///
+/// A stop ends the command at once and the thread with it, so `work` must leave nothing half
+/// done on disk.
+///
+/// # Errors
+/// Those of `work`; code 130 or 143 after a stop.
 pub fn run_unless_stopped<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, Fail> + Send + 'static,
 ) -> Result<T, Fail> {
     watched(work, false)
 }
 
-/// As [`run_unless_stopped`], but a stop waits for `work`, which asks [`stop_requested`] often, ends early and
-/// takes its half-written files away.
+/// Runs `work` on a thread of its own and waits for it also after a stop. `work` asks
+/// [`stop_requested`] often, ends early and removes its half-written files.
+///
+/// # Errors
+/// Those of `work`; code 130 or 143 after a stop.
 pub fn run_to_end<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, Fail> + Send + 'static,
 ) -> Result<T, Fail> {

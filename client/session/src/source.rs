@@ -12,7 +12,7 @@ use tokio::sync::mpsc;
 /// How long cancelling may take before the command ends without the master's word.
 const CANCEL: Duration = Duration::from_secs(2);
 
-/// News of the job.
+/// News of a job.
 pub enum Update {
     /// Where it stands.
     Step(Step),
@@ -31,8 +31,8 @@ pub enum Update {
     Done,
 }
 
-/// Where updates come from, and how to cancel. One message of room: frames wait at the master,
-/// not here.
+/// Updates of a job, and a way to cancel it. The channel holds one message: frames wait at the
+/// master.
 pub struct Source {
     /// Updates of the job, in order; the last is `Done` or an error.
     pub updates: mpsc::Receiver<Result<Update, Fail>>,
@@ -54,7 +54,7 @@ impl Cancel {
         Cancel::new(std::future::ready(()))
     }
 
-    /// Tells the master, and waits at most [`CANCEL`] for its answer.
+    /// Tells the master, and waits at most two seconds for its answer.
     pub async fn now(self) {
         let _ = tokio::time::timeout(CANCEL, self.0).await;
     }

@@ -3,7 +3,7 @@
 use std::io::IsTerminal;
 use std::sync::OnceLock;
 
-/// Whether stderr is a terminal that understands cursor movements.
+/// Returns whether stderr is a terminal that can move its cursor.
 pub fn terminal() -> bool {
     static IS: OnceLock<bool> = OnceLock::new();
     *IS.get_or_init(|| {
@@ -11,27 +11,27 @@ pub fn terminal() -> bool {
     })
 }
 
-/// Whether stderr gets colours.
+/// Returns whether stderr gets colours: on a terminal, unless NO_COLOR is set.
 pub fn colours() -> bool {
     terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())
 }
 
-/// `error:`
+/// Returns `error:`, in red where stderr has colours.
 pub fn error() -> &'static str {
     if colours() { "\u{1b}[1;31merror:\u{1b}[0m" } else { "error:" }
 }
 
-/// `warning:`
+/// Returns `warning:`, in yellow where stderr has colours.
 pub fn warning() -> &'static str {
     if colours() { "\u{1b}[1;33mwarning:\u{1b}[0m" } else { "warning:" }
 }
 
-/// `note:`
+/// Returns `note:`, in cyan where stderr has colours.
 pub fn note() -> &'static str {
     if colours() { "\u{1b}[1;36mnote:\u{1b}[0m" } else { "note:" }
 }
 
-/// One line, whatever a file's name holds.
+/// Returns `text` trimmed and on one line; control characters become U+FFFD.
 pub fn one_line(text: &str) -> String {
     let text: String = text
         .trim()

@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 /// Largest transfer function or path file that is read: a path of 100,000 views has 20 MB.
 const MAX_JSON_BYTES: u64 = 64 << 20;
 
-/// What flags change of a transfer function.
+/// A transfer function with its origin and the changes of flags.
 #[derive(clap::Args, Clone, Debug)]
 pub struct TransferFlags {
     /// Colours of a colour map or ParaView file instead
@@ -55,8 +55,12 @@ pub struct Transfer {
 }
 
 impl Transfer {
-    /// A preset or map by name, or a file if it exists or its name ends in `.json`. A preset's name
-    /// means the preset even beside a file of that name; `./bone` means the file.
+    /// Returns a preset or colour map by name, or reads a file that exists or whose name ends
+    /// in `.json`. A preset's name means the preset even beside a file of that name; `./bone`
+    /// means the file.
+    ///
+    /// # Errors
+    /// Neither a name nor a file, or a field of the file is wrong.
     pub fn parse(text: &str, flags: &TransferFlags) -> Result<Self, Fail> {
         let colours = flags.colors.as_deref().map(colours).transpose()?;
         let TransferFlags { light, shading, nan, .. } = *flags;
@@ -92,7 +96,7 @@ impl Transfer {
         Transfer::parse(name, &flags)
     }
 
-    /// What a picture says that it was drawn with.
+    /// Returns a function as a picture records it, with the preset that it came from.
     pub fn from_function(tf: &TransferFunction, preset: Option<String>) -> Self {
         let base = TransferChoice::Function(Box::new(tf.clone()));
         Transfer {
@@ -107,12 +111,12 @@ impl Transfer {
         }
     }
 
-    /// The same without light.
+    /// Returns the transfer function without light.
     pub fn unshaded(&self) -> Self {
         Transfer { light: None, shading: Some(false), ..self.clone() }
     }
 
-    /// The preset that it is or came from.
+    /// Returns the preset that it is or came from.
     pub fn preset(&self) -> Option<&str> {
         match &self.base {
             TransferChoice::Name(name) => Some(name),
@@ -120,12 +124,12 @@ impl Transfer {
         }
     }
 
-    /// Its file, if it has one.
+    /// Returns the file that it was read from.
     pub fn file(&self) -> Option<&Path> {
         self.file.as_deref()
     }
 
-    /// What it is called in ParaView: as there, else after the preset or the file.
+    /// Returns its name for ParaView: its own there, else that of the preset or file.
     pub fn title(&self) -> String {
         let own = || {
             let name = self.name();
@@ -135,7 +139,7 @@ impl Transfer {
         self.title.clone().unwrap_or_else(own)
     }
 
-    /// What it is called in messages.
+    /// Returns its name for messages.
     pub fn name(&self) -> String {
         match (&self.base, &self.file) {
             (TransferChoice::Name(name), _) => name.clone(),
@@ -144,7 +148,10 @@ impl Transfer {
         }
     }
 
-    /// In full, for a volume with these values.
+    /// Returns the function in full for a volume with these values.
+    ///
+    /// # Errors
+    /// It doesn't fit the values.
     pub fn function(&self, info: &VolumeInfo) -> Result<TransferFunction, InvalidField> {
         let mut tf = match &self.base {
             TransferChoice::Name(name) => presets::by_name(name, &info.summary)?,
@@ -165,7 +172,8 @@ impl Transfer {
         Ok(tf)
     }
 
-    /// What is sent: a name as it is, so that a master may know it better, unless flags change it.
+    /// Returns what a request carries: the name, which the master resolves, unless flags change
+    /// the function.
     pub fn choice(&self, info: &VolumeInfo) -> TransferChoice {
         let changed = self.colours.is_some()
             || self.light.is_some()

@@ -9,10 +9,10 @@ use slabcast_volumes::{Hints, Opened, RawHints};
 use std::ffi::OsString;
 use std::path::Path;
 
-/// What the help of every command says of its volume.
+/// Help text of every command's volume argument.
 pub const VOLUME: &str = "Volume file, folder with a stack or series, or formula:NAME";
 
-/// What the file does not say of itself.
+/// Flags that say what a file doesn't say itself.
 #[derive(clap::Args, Clone, Debug, Default, PartialEq)]
 pub struct InputArgs {
     /// Samples of raw numbers along x, y, z, such as 256x256x128 [default: as in the file's name]
@@ -68,12 +68,15 @@ impl InputArgs {
         }
     }
 
-    /// Whether nothing was said.
+    /// Returns whether none of the flags is given.
     pub fn is_empty(&self) -> bool {
         *self == InputArgs::default()
     }
 
-    /// Opens a file, a folder or a `formula:` volume.
+    /// Opens a file, a folder or a `formula:` volume and prints notes about it.
+    ///
+    /// # Errors
+    /// The volume can't be read; the error names file and remedy.
     pub fn open(&self, path: &Path) -> Result<Volume, Fail> {
         let opened = open_with(path, &self.hints())?;
         opened.notes.iter().for_each(|note| progress::note(note));
@@ -88,7 +91,10 @@ fn dicom_reader() -> Option<Vec<OsString>> {
     Some(vec![program.into(), "read-dicom".into()])
 }
 
-/// Opens a file, a folder or a `formula:` volume of which nothing else is known.
+/// Opens a file, a folder or a `formula:` volume without any flags.
+///
+/// # Errors
+/// The volume can't be read; the error names file and remedy.
 pub fn open(path: &Path) -> Result<Volume, Fail> {
     InputArgs::default().open(path)
 }

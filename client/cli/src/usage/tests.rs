@@ -4,7 +4,7 @@ use super::*;
 use crate::command::GROUPS;
 
 #[test]
-fn the_command_line_is_sound() {
+fn command_line_passes_clap_checks() {
     command().debug_assert();
 }
 
@@ -15,7 +15,7 @@ fn says(line: &str) -> String {
 }
 
 #[test]
-fn what_is_not_understood_becomes_one_line() {
+fn clap_errors_become_one_line() {
     for (line, want) in [
         (
             "slabcast render --elevatoin 3 x",
@@ -63,7 +63,7 @@ fn example(line: &str) -> Option<Vec<String>> {
 }
 
 #[test]
-fn every_help_has_examples_that_are_understood() {
+fn every_help_has_examples_that_parse() {
     let (mut helps, mut count) = (Vec::new(), 0);
     let mut cli = command().max_term_width(0).term_width(0);
     cli.build();

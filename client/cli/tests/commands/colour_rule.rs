@@ -23,7 +23,7 @@ fn colour_rule(arguments: &[&str]) -> Output {
 }
 
 #[test]
-fn linear_colour_is_nearer_and_paper_has_a_limit_of_its_own() {
+fn linear_compositing_has_smaller_error_and_paper_compositing_its_own_limit() {
     let out = colour_rule(&["--json"]);
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
     let text = String::from_utf8(out.stdout).expect("text");
@@ -49,7 +49,7 @@ fn linear_colour_is_nearer_and_paper_has_a_limit_of_its_own() {
 }
 
 #[test]
-fn what_is_compared_is_not_to_be_given() {
+fn colour_rule_refuses_flags_that_it_sweeps() {
     for flag in ["--thickness=2", "--compositing=paper", "--steps=3"] {
         let out = colour_rule(&[flag]);
         assert_eq!(out.status.code(), Some(2), "{flag}");

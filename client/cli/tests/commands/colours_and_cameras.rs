@@ -25,7 +25,7 @@ fn hashes(frames: &[FrameStats]) -> Vec<&str> {
 }
 
 #[test]
-fn every_example_of_the_docs_is_drawn() {
+fn every_example_file_of_the_docs_is_rendered() {
     let dir = tempfile::tempdir().unwrap();
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/examples");
     let mut files: Vec<PathBuf> =
@@ -73,7 +73,7 @@ fn a_range_of_frames_keeps_its_numbers_and_bytes() {
 }
 
 #[test]
-fn sides_are_those_of_azimuths() {
+fn anatomical_view_equals_its_azimuth() {
     let dir = tempfile::tempdir().unwrap();
     let standing = ["--up=z", "--front=y", "--size", "40x30"];
     let by =
@@ -95,7 +95,7 @@ fn sides_are_those_of_azimuths() {
 }
 
 #[test]
-fn a_box_leaves_out_what_is_outside() {
+fn crop_removes_voxels_outside_the_box() {
     let dir = tempfile::tempdir().unwrap();
     let one = ["--azimuth", "30", "--size", "40x30"];
     let of = |more: &[&str]| draw(dir.path(), &[&one[..], more].concat()).remove(0);
@@ -111,7 +111,7 @@ fn a_box_leaves_out_what_is_outside() {
 
 /// The cluster, and this process alone, whose picture the reference then judges.
 #[test]
-fn what_hangs_on_gradients_is_exact_and_right() {
+fn gradient_opacity_has_small_error_and_same_bytes_on_clusters() {
     let dir = tempfile::tempdir().unwrap();
     let glass = example("glass.json");
     let look = ["--tf", &glass, "--azimuth", "30", "--size", "64x48"];
@@ -135,7 +135,7 @@ fn what_hangs_on_gradients_is_exact_and_right() {
 }
 
 #[test]
-fn files_for_paraview_come_back_the_same() {
+fn paraview_colour_map_round_trips() {
     let dir = tempfile::tempdir().unwrap();
     let small = ["--azimuth", "30", "--size", "40x30"];
     let tf = |args: &[&str]| {
@@ -161,7 +161,7 @@ fn files_for_paraview_come_back_the_same() {
 }
 
 #[test]
-fn flags_change_colours_light_and_what_nan_looks_like() {
+fn colors_light_shading_and_nan_flags_change_the_transfer_function() {
     let dir = tempfile::tempdir().unwrap();
     let of = |more: &[&str]| {
         let one = ["--azimuth", "30", "--size", "40x30"];
@@ -184,7 +184,7 @@ fn flags_change_colours_light_and_what_nan_looks_like() {
 
 /// A blank picture says why, whichever look is asked for.
 #[test]
-fn a_blank_picture_says_why() {
+fn blank_picture_gives_a_note_with_the_reason() {
     let dir = tempfile::tempdir().unwrap();
     for (args, why) in [
         (&["formula:full:9"][..], "every value of the volume is 200"),

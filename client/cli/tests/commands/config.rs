@@ -24,7 +24,7 @@ fn is(value: &str, source: &str, from: Option<&str>) -> [Option<String>; 3] {
 }
 
 #[test]
-fn a_flag_beats_the_environment_that_beats_the_file_that_beats_the_default() {
+fn config_precedence_is_flag_environment_file_default() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     std::fs::write(
@@ -63,7 +63,7 @@ fn a_flag_beats_the_environment_that_beats_the_file_that_beats_the_default() {
 }
 
 #[test]
-fn a_users_own_file_is_found_and_an_empty_name_means_none() {
+fn config_file_in_home_is_found_and_empty_name_disables_it() {
     let dir = tempfile::tempdir().unwrap();
     let own = dir.path().join("home/slabcast");
     std::fs::create_dir_all(&own).unwrap();
@@ -77,7 +77,7 @@ fn a_users_own_file_is_found_and_an_empty_name_means_none() {
 }
 
 #[test]
-fn a_flag_silences_what_it_excludes_below() {
+fn flag_silences_conflicting_values_of_lower_config_layers() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     std::fs::write(dir.join("c.toml"), "[render]\nframes = 2\nmaster = \"127.0.0.1:1\"\n").unwrap();
@@ -103,7 +103,7 @@ fn a_flag_silences_what_it_excludes_below() {
 }
 
 #[test]
-fn the_doctor_says_what_is_amiss_and_what_to_do() {
+fn doctor_names_problem_and_remedy() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     let listen = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
@@ -144,7 +144,7 @@ fn the_doctor_says_what_is_amiss_and_what_to_do() {
 }
 
 #[test]
-fn a_demo_needs_nothing_and_may_be_repeated() {
+fn demo_needs_no_file_and_can_be_repeated() {
     let dir = tempfile::tempdir().unwrap();
     let folder = dir.path().join("slabcast-demo");
     std::fs::create_dir(&folder).unwrap();

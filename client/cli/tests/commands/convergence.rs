@@ -3,7 +3,7 @@
 use std::process::Command;
 
 #[test]
-fn orders_are_printed_and_figures_drawn() {
+fn convergence_prints_orders_and_writes_figures() {
     let dir = tempfile::tempdir().expect("a folder");
     let tf = dir.path().join("ramp.json");
     let look = r#"{"version":1,"domain":"unit","color_space":"linear","opacity_unit":"extinction",

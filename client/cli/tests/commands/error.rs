@@ -20,7 +20,7 @@ fn rmse(figures: &serde_json::Value, source: &str) -> f64 {
 }
 
 #[test]
-fn sources_add_up_to_the_whole_and_the_cutoff_keeps_its_bound() {
+fn error_sources_add_up_and_cutoff_keeps_its_bound() {
     let f = error(&[]);
     let whole = rmse(&f, "limit");
     assert!(whole > 0.0 && whole < 2.0, "{whole}/255");
@@ -41,7 +41,7 @@ fn sources_add_up_to_the_whole_and_the_cutoff_keeps_its_bound() {
 }
 
 #[test]
-fn thinner_sheets_are_nearer_and_the_papers_are_elsewhere() {
+fn error_falls_with_thickness_except_for_paper_compositing() {
     let at = |thickness: &str, rule: &str| {
         rmse(&error(&["--thickness", thickness, "--compositing", rule]), "thickness")
     };
@@ -55,7 +55,7 @@ fn thinner_sheets_are_nearer_and_the_papers_are_elsewhere() {
 
 /// Each pixel once is all pixels, however one asks for it.
 #[test]
-fn all_pixels_are_as_many_as_there_are() {
+fn error_over_all_pixels_counts_the_whole_picture() {
     let figures = |pixels: &str| {
         let mut f = error(&["--size", "40x30", "--pixels", pixels, "--model-pixels", "100"]);
         for time in ["draw_ms", "judge_ms", "total_ms"] {
@@ -76,7 +76,7 @@ fn all_pixels_are_as_many_as_there_are() {
 /// Rounding parts into positions and arithmetic, of which positions are nearly all; truncation
 /// and ripple are those of the kernel: a wider cut mends the one, a narrower kernel ripples more.
 #[test]
-fn rounding_has_two_parts_and_the_model_two_errors() {
+fn error_splits_rounding_and_model_in_two_parts_each() {
     let f = error(&[]);
     let (positions, arithmetic) = (rmse(&f, "rounding_positions"), rmse(&f, "rounding_arithmetic"));
     assert!(arithmetic > 0.0 && arithmetic < 1e-3, "{arithmetic}");
@@ -95,7 +95,7 @@ fn rounding_has_two_parts_and_the_model_two_errors() {
 
 /// A map has the picture left, its error right and says its scale; blank pixels are grey.
 #[test]
-fn a_map_shows_where_the_error_is() {
+fn error_map_shows_where_the_error_is() {
     let dir = tempfile::tempdir().expect("a folder");
     let path = dir.path().join("map.png");
     let f = error(&["--pixels", "all", "--map", path.to_str().expect("text")]);
@@ -121,7 +121,7 @@ fn a_map_shows_where_the_error_is() {
 }
 
 #[test]
-fn a_map_never_replaces_the_volume_and_needs_the_name_of_a_picture() {
+fn error_map_never_replaces_the_volume_and_must_be_a_png() {
     let refused = |arguments: &[&str]| {
         let out = Command::new(env!("CARGO_BIN_EXE_slabcast"))
             .args(["lab", "error"])
@@ -144,18 +144,20 @@ fn a_map_never_replaces_the_volume_and_needs_the_name_of_a_picture() {
 /// Ctrl-C ends a long run at once, with its code and no map.
 #[cfg(unix)]
 #[test]
-fn ctrl_c_ends_it_at_once() {
+fn ctrl_c_ends_an_error_measurement_at_once() {
+    use std::io::{BufRead, BufReader};
     use std::time::{Duration, Instant};
     let dir = tempfile::tempdir().expect("a folder");
     let map = dir.path().join("map.png");
     let mut child = Command::new(env!("CARGO_BIN_EXE_slabcast"))
         .args(["lab", "error", "formula:spheres:96", "--size", "1024x1024", "--pixels", "all"])
         .args(["--map", map.to_str().expect("text")])
-        .stderr(std::process::Stdio::null())
+        .stderr(std::process::Stdio::piped())
         .spawn()
         .expect("slabcast runs");
-    std::thread::sleep(Duration::from_millis(1500));
-    assert!(child.try_wait().expect("a child").is_none(), "it ended by itself: make it longer");
+    let mut said = BufReader::new(child.stderr.take().expect("piped")).lines();
+    let begins = said.find(|l| l.as_ref().is_ok_and(|l| l.contains("pixels of the reference")));
+    assert!(begins.is_some(), "the measurement never began");
     let told = Instant::now();
     let killed =
         Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill runs");

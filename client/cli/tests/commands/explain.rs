@@ -11,7 +11,7 @@ fn run(arguments: &[&str]) -> Output {
 }
 
 #[test]
-fn a_pixel_is_explained_as_json_and_its_sheets_lead_to_it() {
+fn explain_pixel_as_json_lists_sheets_that_composite_to_it() {
     for arguments in [&["--projection", "persp"][..], &["--thickness", "0.5", "--eps", "0"]] {
         let mut line = vec!["formula:spheres:32", "--size", "64x64", "--pixel", "30,32"];
         line.extend(["--json", "--voxels", "2"].iter().chain(arguments));
@@ -39,7 +39,7 @@ fn a_pixel_is_explained_as_json_and_its_sheets_lead_to_it() {
 }
 
 #[test]
-fn text_says_where_it_was_shut_and_what_it_should_be() {
+fn explain_pixel_as_text_says_where_it_was_shut_and_its_limit() {
     let out = run(&["formula:spheres:32", "--size", "64x64", "--pixel", "32,32"]);
     let text = String::from_utf8_lossy(&out.stdout);
     for part in ["pixel 32,32 of 64x64", "shut in sheet", "of brick", "T in f64", "limit  "] {
@@ -51,7 +51,7 @@ fn text_says_where_it_was_shut_and_what_it_should_be() {
 }
 
 #[test]
-fn what_cannot_be_explained_is_a_usage_error() {
+fn explain_refuses_pixels_outside_and_unsupported_flags() {
     for (arguments, want) in [
         (&["no-such-file.nrrd", "--pixel", "512,0"][..], "which has 512x512 pixels"),
         (&["formula:spheres", "--pixel", "3"], "X,Y"),
@@ -64,7 +64,7 @@ fn what_cannot_be_explained_is_a_usage_error() {
 }
 
 #[test]
-fn what_a_scene_leaves_out_changes_no_pixel() {
+fn ablation_of_unneeded_brick_content_changes_no_pixel() {
     for (scene, left_out, needed) in [
         (
             &["--tf", "fog"][..],
@@ -109,7 +109,7 @@ fn what_a_scene_leaves_out_changes_no_pixel() {
 /// What `--keep` keeps is kept by a master and its workers too; the statistics no longer name it, and
 /// the picture is the same.
 #[test]
-fn what_is_kept_is_not_named_as_left_out() {
+fn keep_flag_is_not_reported_as_left_out() {
     let dir = tempfile::tempdir().unwrap();
     let frame = |keep: &[&str]| -> serde_json::Value {
         // In 16-bit sums, which `auto` would take, grey is no less than three colours.

@@ -37,7 +37,7 @@ fn picture(dir: &Path, file: &Path, out: &str) -> String {
 }
 
 #[test]
-fn every_file_is_taken_as_it_is_with_the_voxels_of_its_twin() {
+fn every_format_opens_with_the_voxels_of_its_twin() {
     let Some(data) = data() else { return };
     let dir = tempfile::tempdir().unwrap();
     let mut twins = BTreeMap::new();
@@ -75,7 +75,7 @@ fn every_file_is_taken_as_it_is_with_the_voxels_of_its_twin() {
 }
 
 #[test]
-fn a_folder_of_dicom_slices_and_one_of_them_are_the_series() {
+fn dicom_folder_and_single_slice_open_the_series() {
     let Some(data) = data() else { return };
     let dir = tempfile::tempdir().unwrap();
     let folder = data.join("formats/dicom");
@@ -95,7 +95,7 @@ fn a_folder_of_dicom_slices_and_one_of_them_are_the_series() {
 
 /// A file's voxels, values and place, whatever it is called.
 #[test]
-fn convert_keeps_voxels_values_and_place() {
+fn convert_keeps_voxels_values_and_orientation() {
     let dir = tempfile::tempdir().unwrap();
     let sample = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../samples/mni152_t1.nii.gz");
     let sample = sample.to_string_lossy();

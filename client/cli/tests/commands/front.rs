@@ -19,7 +19,7 @@ fn run(dir: &Path, words: &[&[&str]]) -> Output {
 const SCENE: [&str; 5] = ["formula:spheres:40", "--tf", "skin", "--size", "96x96"];
 
 #[test]
-fn a_report_has_every_file_a_front_and_the_default() {
+fn report_writes_all_files_and_marks_front_and_default() {
     let dir = tempfile::tempdir().unwrap();
     let only =
         ["--only", "thickness,eps,sums,shading,work", "--pixels", "900", "--seconds", "0.01"];
@@ -83,7 +83,7 @@ fn bench(dir: &Path, flags: &[&str]) -> (f64, f64, Value, u64, String) {
 }
 
 #[test]
-fn an_error_that_is_asked_for_is_kept_and_what_was_measured_is_remembered() {
+fn error_target_is_kept_and_measurements_are_cached() {
     let dir = tempfile::tempdir().unwrap();
     let (loose, _, coarse, _, said) = bench(dir.path(), &["--error", "2/255"]);
     assert!(loose <= 2.0 && said.contains("measured first"), "{loose}: {said}");
@@ -99,7 +99,7 @@ fn an_error_that_is_asked_for_is_kept_and_what_was_measured_is_remembered() {
 }
 
 #[test]
-fn what_no_setting_keeps_is_refused_with_what_would_do() {
+fn unreachable_quality_target_is_refused_with_a_reachable_one() {
     let dir = tempfile::tempdir().unwrap();
     for (flags, says) in [
         (["--error", "1e-9"], "--error: no setting comes so near"),
@@ -115,7 +115,7 @@ fn what_no_setting_keeps_is_refused_with_what_would_do() {
 
 /// A picture that was drawn small says so, is as large as was asked for, and can be made again.
 #[test]
-fn a_picture_that_was_magnified_is_made_again_byte_by_byte() {
+fn magnified_picture_is_rerendered_byte_by_byte() {
     let dir = tempfile::tempdir().unwrap();
     // Figures by which only a picture of half the size is fast enough.
     let cache = dir.path().join("cache");
@@ -145,7 +145,7 @@ fn a_picture_that_was_magnified_is_made_again_byte_by_byte() {
 
 /// The volume is at the master: errors are found by comparing its pictures.
 #[test]
-fn a_cluster_keeps_an_error_that_is_asked_for() {
+fn error_target_is_kept_on_a_cluster() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     let (_master, address) = master(dir, SCENE[0], &[]);
@@ -182,7 +182,7 @@ fn a_cluster_keeps_an_error_that_is_asked_for() {
 /// What a frame's statistics say of errors, beside the reference's word: estimates of RMSE, and bounds that
 /// hold on every pixel.
 #[test]
-fn statistics_tell_errors_by_source() {
+fn statistics_contain_error_estimates_by_source() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     let sources =

@@ -1,6 +1,6 @@
 //! How the program behaves when all is well: what goes where, what is left, how it stops.
 
-use crate::program::{end, names, run, signal, slabcast, text};
+use crate::program::{Process, end, master, names, run, signal, slabcast, text, wait_for_text};
 use slabcast_common::stats::FrameStats;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -8,7 +8,7 @@ use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 #[test]
-fn a_turn_says_where_the_pictures_are_and_how_long_it_took() {
+fn render_says_where_pictures_are_and_how_long_it_took() {
     let dir = tempfile::tempdir().unwrap();
     let out =
         run(dir.path(), &["render", "formula:spheres:24", "--size", "40x30", "--frames", "3"]);
@@ -27,7 +27,7 @@ fn a_turn_says_where_the_pictures_are_and_how_long_it_took() {
 }
 
 #[test]
-fn statistics_on_stdout_are_alone_there_and_equal_those_in_a_file() {
+fn statistics_on_stdout_equal_those_in_a_file() {
     let dir = tempfile::tempdir().unwrap();
     let views = ["render", "formula:spheres:24", "--size", "40x30", "--frames", "2", "-q"];
     let out = run(dir.path(), &[&views[..], &["--stats", "-", "-o", "a"]].concat());
@@ -55,7 +55,7 @@ fn statistics_on_stdout_are_alone_there_and_equal_those_in_a_file() {
 }
 
 #[test]
-fn a_path_file_and_a_transfer_function_file_are_drawn() {
+fn path_file_and_transfer_function_file_are_rendered() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(
         dir.path().join("p.json"),
@@ -93,7 +93,7 @@ fn a_path_file_and_a_transfer_function_file_are_drawn() {
 }
 
 #[test]
-fn a_blank_picture_says_why() {
+fn blank_picture_gives_a_note_with_the_reason() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(
         dir.path().join("t.json"),
@@ -109,7 +109,7 @@ fn a_blank_picture_says_why() {
 }
 
 #[test]
-fn nothing_to_read_stdout_is_no_trouble() {
+fn closed_stdout_ends_the_command_quietly() {
     let dir = tempfile::tempdir().unwrap();
     let mut child = slabcast(dir.path(), &["completions", "bash"])
         .stdout(Stdio::piped())
@@ -130,7 +130,7 @@ fn nothing_to_read_stdout_is_no_trouble() {
 }
 
 #[test]
-fn info_tells_a_person_and_a_program() {
+fn info_prints_text_and_json() {
     let dir = tempfile::tempdir().unwrap();
     let said = text(&run(dir.path(), &["info", "formula:spheres"]).stdout);
     for part in ["64 x 64 x 64", "world box", "histogram", "peer-skull", "turntable"] {
@@ -143,7 +143,7 @@ fn info_tells_a_person_and_a_program() {
 }
 
 #[test]
-fn logs_are_json_on_request_and_plain_for_the_journal() {
+fn logs_are_json_on_request_and_plain_under_systemd() {
     let dir = tempfile::tempdir().unwrap();
     let args =
         ["render", "formula:blob", "--azimuth", "0", "--size", "8x8", "-q", "--log-level", "info"];
@@ -163,7 +163,7 @@ fn logs_are_json_on_request_and_plain_for_the_journal() {
 /// Started so that its first frame is a while away, and stopped when two are there.
 #[cfg(unix)]
 #[test]
-fn ctrl_c_keeps_whole_frames_and_says_so() {
+fn ctrl_c_keeps_whole_frames() {
     let dir = tempfile::tempdir().unwrap();
     let args = [
         "render",
@@ -201,11 +201,17 @@ fn ctrl_c_keeps_whole_frames_and_says_so() {
     assert_eq!(names(dir.path()), ["s.jsonl", "slabcast-out"]);
 }
 
-/// Longer than a cluster lets a worker be silent.
+/// The render is stopped for as long as a cluster needs to lose a silent worker.
 #[cfg(unix)]
 #[test]
-fn a_run_that_is_stopped_for_a_while_goes_on() {
+fn render_survives_sigstop_longer_than_worker_silence() {
     let dir = tempfile::tempdir().unwrap();
+    let (_master, address) = master(dir.path(), "formula:one", &["--record", "events.log"]);
+    let worker = ["worker", "--master", &address, "--threads", "1"];
+    let worker = slabcast(dir.path(), &worker).stderr(Stdio::null()).spawn().unwrap();
+    let worker = Process(worker);
+    let record = dir.path().join("events.log.part");
+    wait_for_text(&record, "\"joined\"");
     let args = ["render", "formula:spheres:48", "--size", "160x160", "--frames", "40"];
     let args = [&args[..], &["--thickness", "0.25"]].concat();
     let mut child =
@@ -216,7 +222,8 @@ fn a_run_that_is_stopped_for_a_while_goes_on() {
         std::thread::sleep(Duration::from_millis(5));
     }
     signal(&child, "-STOP");
-    std::thread::sleep(Duration::from_millis(3500));
+    worker.signal("-STOP");
+    wait_for_text(&record, "\"lost\"");
     signal(&child, "-CONT");
     let code = end(&mut child, Duration::from_secs(60));
     let mut said = String::new();
@@ -226,7 +233,7 @@ fn a_run_that_is_stopped_for_a_while_goes_on() {
 
 #[cfg(unix)]
 #[test]
-fn daemons_say_where_they_are_and_leave_when_told() {
+fn master_and_worker_print_address_and_stop_on_sigterm() {
     let dir = tempfile::tempdir().unwrap();
     let mut master = slabcast(
         dir.path(),
@@ -276,7 +283,7 @@ fn daemons_say_where_they_are_and_leave_when_told() {
 
 #[cfg(target_os = "linux")]
 #[test]
-fn systemd_hears_when_it_is_ready_alive_and_stopping() {
+fn systemd_gets_ready_watchdog_and_stopping() {
     use std::os::unix::net::UnixDatagram;
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("notify");

@@ -11,7 +11,7 @@ fn json(text: &str) -> Value {
 }
 
 #[test]
-fn a_plan_says_what_is_measured_and_what_is_predicted() {
+fn plan_separates_measured_from_predicted() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     let cluster = ["--workers", "1..3,8", "--link", "1gbit", "--latency", "100us"];
@@ -83,7 +83,7 @@ fn a_plan_says_what_is_measured_and_what_is_predicted() {
 }
 
 #[test]
-fn a_longer_plan_says_where_the_threads_time_goes() {
+fn plan_of_many_frames_lists_where_thread_time_goes() {
     let dir = tempfile::tempdir().unwrap();
     let frames =
         ["lab", "plan", "formula:spheres:32", "--size", "128x128", "--frames", "16", "--quiet"];
@@ -101,7 +101,7 @@ fn a_longer_plan_says_where_the_threads_time_goes() {
 }
 
 #[test]
-fn flags_of_a_plan_are_refused_by_name_and_with_a_remedy() {
+fn plan_refuses_bad_flags_with_name_and_remedy() {
     let dir = tempfile::tempdir().unwrap();
     for (flag, value, remedy) in [
         ("--workers", "4..1", "1..64"),

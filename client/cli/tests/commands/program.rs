@@ -7,7 +7,7 @@ pub(crate) use processes::{Process, master, signal, slabcast};
 
 use std::path::Path;
 use std::process::{Child, Output};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 pub(crate) fn run(dir: &Path, args: &[&str]) -> Output {
     slabcast(dir, args).output().expect("the program starts")
@@ -32,6 +32,15 @@ pub(crate) fn names(dir: &Path) -> Vec<String> {
         entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
     names.sort();
     names
+}
+
+/// Waits until a file contains `text`. Fails the test after a minute.
+pub(crate) fn wait_for_text(file: &Path, text: &str) {
+    let until = Instant::now() + Duration::from_secs(60);
+    while !std::fs::read_to_string(file).is_ok_and(|t| t.contains(text)) {
+        assert!(Instant::now() < until, "{} never contained `{text}`", file.display());
+        std::thread::sleep(Duration::from_millis(5));
+    }
 }
 
 /// Waits for the exit code; -1 if a signal ended the child. Fails the test after `within`.

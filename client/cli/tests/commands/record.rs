@@ -1,11 +1,11 @@
 //! `--record` and `slabcast lab replay` on real runs.
 
-use crate::program::{end, good, names, run, signal, slabcast, text};
+use crate::program::{end, good, names, run, signal, slabcast, text, wait_for_text};
 use std::process::Stdio;
 use std::time::Duration;
 
 #[test]
-fn a_run_of_this_process_is_recorded_and_replays_identically() {
+fn recorded_render_replays_identically() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     let views = ["render", "formula:spheres:40", "--size", "150x130", "--frames", "3", "-q"];
@@ -46,7 +46,7 @@ fn a_run_of_this_process_is_recorded_and_replays_identically() {
 }
 
 #[test]
-fn a_master_records_until_it_is_told_to_stop() {
+fn recorded_master_replays_identically_after_sigterm() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     let (mut master, address) =
@@ -64,7 +64,7 @@ fn a_master_records_until_it_is_told_to_stop() {
     // One goes in the middle of nothing; the other is told to leave.
     workers[0].kill().unwrap();
     workers[0].wait().unwrap();
-    std::thread::sleep(Duration::from_millis(300));
+    wait_for_text(&dir.join("events.log.part"), "\"lost\"");
     assert!(names(dir).contains(&"events.log.part".to_string()), "{:?}", names(dir));
     signal(&master.0, "-TERM");
     assert_eq!(end(&mut master.0, Duration::from_secs(12)), 0);

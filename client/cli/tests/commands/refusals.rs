@@ -550,14 +550,14 @@ fn bad_variables_are_named() {
 }
 
 #[test]
-fn the_tables_hold_what_was_promised() {
+fn refusal_tables_are_large_enough() {
     let rows = files().len() + flags().len() + OUTPUTS.len() + OTHERS.len();
     let rows = rows + VALUES.len() + VARIABLES.len();
     assert!(rows >= 60, "at least 60 bad inputs were promised, {rows} are there");
 }
 
 #[test]
-fn the_network_is_named_with_the_remedy() {
+fn network_failures_are_named_with_the_remedy() {
     let dir = world();
     // Held and never listened to again: whoever calls is turned away.
     let free = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string();
@@ -576,7 +576,7 @@ fn the_network_is_named_with_the_remedy() {
 }
 
 #[test]
-fn frames_that_are_there_stay_as_they_are_without_force() {
+fn existing_frames_are_not_replaced_without_force() {
     let dir = world();
     refused(dir.path(), &["render", "good.nrrd", "-o", "full"], 1, &["--force"]);
     assert_eq!(std::fs::read(dir.path().join("full/frame_0000.png")).unwrap(), b"mine");
@@ -593,7 +593,7 @@ fn frames_that_are_there_stay_as_they_are_without_force() {
 }
 
 #[test]
-fn a_variable_of_the_environment_is_refused_like_its_flag() {
+fn bad_environment_variable_is_refused_like_its_flag() {
     let dir = world();
     let args = ["worker", "--master", "127.0.0.1:1"];
     let out = slabcast(dir.path(), &args).env("SLABCAST_THREADS", "none").output().unwrap();

@@ -14,7 +14,7 @@ fn master(dir: &Path, more: &[&str]) -> (Process, String) {
 }
 
 #[test]
-fn a_cluster_of_two_is_rehearsed_beside_its_prediction() {
+fn rehearsal_of_two_workers_stands_beside_its_prediction() {
     let dir = tempfile::tempdir().unwrap();
     let more = ["--trace", "s.trace", "--workers", "2", "--rehearse", "2", "--json"];
     let plan: Value =
@@ -40,7 +40,7 @@ fn a_cluster_of_two_is_rehearsed_beside_its_prediction() {
 }
 
 #[test]
-fn a_rehearsal_goes_over_the_address_that_is_named() {
+fn rehearsal_uses_the_given_address() {
     let dir = tempfile::tempdir().unwrap();
     // All of 127.0.0.0/8 is this machine, on Linux.
     let at = if cfg!(target_os = "linux") { "127.0.0.2" } else { "127.0.0.1" };
@@ -73,7 +73,7 @@ fn a_rehearsal_goes_over_the_address_that_is_named() {
 }
 
 #[test]
-fn what_is_rehearsed_is_never_taken_for_a_picture() {
+fn rehearsed_frames_are_marked_as_no_pictures() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     let plan = ["--trace", "s.trace", "--workers", "1"];

@@ -51,7 +51,7 @@ fn balanced(page: &str) -> Result<(), String> {
 }
 
 #[test]
-fn a_study_agrees_with_itself() {
+fn study_tables_and_charts_agree() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     let name = volume(dir);

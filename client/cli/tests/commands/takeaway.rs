@@ -14,7 +14,7 @@ fn render(dir: &Path, more: &[&str]) -> String {
 }
 
 #[test]
-fn rerender_gives_the_same_bytes_of_the_whole_file() {
+fn rerender_gives_the_same_file_bytes() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     std::fs::write(
@@ -56,7 +56,7 @@ fn rerender_gives_the_same_bytes_of_the_whole_file() {
 }
 
 #[test]
-fn a_picture_is_the_same_file_whether_it_is_hashed_or_not() {
+fn picture_file_does_not_depend_on_hashing() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     for (ending, format) in [("png", "png"), ("png", "png16"), ("exr", "exr")] {
@@ -86,7 +86,7 @@ fn a_picture_is_the_same_file_whether_it_is_hashed_or_not() {
 }
 
 #[test]
-fn another_volume_is_refused_with_both_digests() {
+fn rerender_refuses_another_volume_with_both_digests() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     render(dir, &["--azimuth", "0", "-o", "a.png"]);
@@ -105,7 +105,7 @@ fn another_volume_is_refused_with_both_digests() {
 }
 
 #[test]
-fn a_picture_that_says_nothing_or_was_changed_is_told_apart() {
+fn rerender_tells_missing_provenance_from_changed_pixels() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     render(dir, &["--azimuth", "0", "-o", "a.png"]);
@@ -135,7 +135,7 @@ fn a_picture_that_says_nothing_or_was_changed_is_told_apart() {
 }
 
 #[test]
-fn a_moving_png_and_a_contact_sheet_hold_all_frames() {
+fn apng_and_contact_sheet_hold_all_frames() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     render(dir, &["--frames", "4", "-o", "turn.apng", "--contact-sheet", "all.png"]);
@@ -160,7 +160,7 @@ fn a_moving_png_and_a_contact_sheet_hold_all_frames() {
 }
 
 #[test]
-fn video_goes_through_a_pipe_and_nothing_else_is_on_stdout() {
+fn y4m_on_stdout_is_alone_there() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     let args = ["render", "formula:spheres:24", "--size", "40x30", "--frames", "3", "-o", "-"];
@@ -191,7 +191,7 @@ fn video_goes_through_a_pipe_and_nothing_else_is_on_stdout() {
 /// Stopped when some frames are there: the moving picture has those, and is whole.
 #[cfg(unix)]
 #[test]
-fn ctrl_c_keeps_the_frames_of_a_moving_picture() {
+fn ctrl_c_keeps_the_frames_of_an_apng() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();
     let args = [
@@ -281,7 +281,7 @@ fn listen(child: &mut std::process::Child) -> std::sync::mpsc::Receiver<String> 
 
 #[cfg(target_os = "linux")]
 #[test]
-fn a_full_disk_pauses_the_job_until_there_is_room() {
+fn full_disk_pauses_the_job_until_there_is_room() {
     let Some(small) = Small::mount("1m") else { return };
     let room = small.0.path();
     let patience = Duration::from_secs(60);
@@ -341,7 +341,7 @@ fn a_full_disk_pauses_the_job_until_there_is_room() {
 
 #[cfg(target_os = "linux")]
 #[test]
-fn ctrl_c_ends_a_paused_job_and_keeps_what_is_whole() {
+fn ctrl_c_ends_a_paused_job_and_keeps_whole_files() {
     let Some(small) = Small::mount("400k") else { return };
     let room = small.0.path();
     let mut ballast = std::fs::File::create(room.join("ballast")).unwrap();

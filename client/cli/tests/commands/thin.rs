@@ -42,18 +42,18 @@ fn thin(volume: &str, look: &[&str]) {
 }
 
 #[test]
-fn of_a_volume_by_formula() {
+fn thin_sheets_converge_on_a_formula_volume() {
     thin("formula:spheres:40", &[]);
 }
 
 #[test]
-fn of_the_sample() {
+fn thin_sheets_converge_on_the_sample_volume() {
     thin(concat!(env!("CARGO_MANIFEST_DIR"), "/../../samples/mni152_t1.nii.gz"), &[]);
 }
 
 /// Volumes that are kept beside the repository; without them this says that it looked at nothing.
 #[test]
-fn of_measured_volumes_where_they_are() {
+fn thin_sheets_converge_on_measured_volumes() {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
     for (name, look) in [
         ("mri256", &["--up=-y", "--tf", "peer-opaque"][..]),

@@ -336,7 +336,7 @@ mod tests {
     use slabcast_common::quality::Kernel;
 
     #[test]
-    fn the_ladder_goes_from_coarse_to_fine_and_may_be_drawn() {
+    fn ladder_of_settings_is_valid_and_ordered_from_coarse_to_fine() {
         let base = Setting::asked(Quality::default());
         let all = ladder(&base, [512, 512]);
         assert_eq!(all.len(), 16);
@@ -348,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn room_is_left() {
+    fn targets_are_kept_with_room_to_spare() {
         let target = QualityTarget { error: Some(1.0 / 255.0), ..QualityTarget::default() };
         let off = |rmse| Deviation { rmse, ..Deviation::default() };
         assert!(keeps_error(&target, &off(0.8)) && !keeps_error(&target, &off(0.95)));

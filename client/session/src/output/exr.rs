@@ -20,7 +20,10 @@ const MAX_HEADER: usize = 16 << 20;
 /// CIE x and y of red, green, blue and white: those of BT.709, as sRGB has them.
 const CHROMATICITIES: [f32; 8] = [0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290];
 
-/// Encodes a frame of floats.
+/// Encodes a frame of floats as an EXR with its provenance.
+///
+/// # Errors
+/// `out` can't be written.
 pub fn encode(frame: &Frame, provenance: &str, out: &mut impl Write) -> Result<()> {
     if frame.format != PixelFormat::Rgba32F {
         return Err(Error::other("an EXR takes floats"));
@@ -106,7 +109,10 @@ fn pack(bytes: &[u8]) -> Result<Vec<u8>> {
     zlib.finish()
 }
 
-/// The provenance in an EXR; `None` where it has none.
+/// Returns the provenance in an EXR, if it has one.
+///
+/// # Errors
+/// The file is damaged; the text says where.
 pub fn provenance(bytes: &[u8]) -> std::result::Result<Option<String>, String> {
     let cut = || "its header ends early".to_string();
     let mut rest = bytes[..bytes.len().min(MAX_HEADER)].get(8..).ok_or_else(cut)?;

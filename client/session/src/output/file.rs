@@ -34,7 +34,10 @@ pub(super) fn beside(path: &Path) -> Result<NamedTempFile> {
     hidden(folder, &path.file_name().unwrap_or_default().to_string_lossy())
 }
 
-/// Sees whether a file can be made beside `path`.
+/// Checks that a file can be made beside `path`.
+///
+/// # Errors
+/// It can't.
 pub fn probe(path: &Path) -> std::result::Result<(), Fail> {
     beside(path).map(drop).map_err(|e| Fail::io(path, "making the file", &e))
 }
@@ -54,7 +57,10 @@ fn whole(path: &Path, fill: impl FnOnce(&mut BufWriter<&File>) -> Result<()>) ->
     settle(file, path)
 }
 
-/// Writes a whole file or none; a disk without room is a failure.
+/// Writes a whole file or none.
+///
+/// # Errors
+/// The file can't be written; a full disk too.
 pub fn write_atomic(
     path: &Path,
     fill: impl FnOnce(&mut BufWriter<&File>) -> Result<()>,
@@ -66,7 +72,7 @@ pub fn write_atomic(
 /// within a second or two; at a tenth of this, nothing is gained and logs of the file system fill.
 const TRY_AGAIN: Duration = Duration::from_secs(1);
 
-/// Waits for room on a full disk, says so once, and goes on.
+/// Waits for room on a full disk: warns once and tries again.
 #[derive(Debug, Default)]
 pub struct DiskWait {
     given_up: AtomicBool,
@@ -74,7 +80,7 @@ pub struct DiskWait {
 }
 
 impl DiskWait {
-    /// Nobody waits any more: what has no room fails.
+    /// Ends all waiting: writes to a full disk fail from now on.
     pub fn give_up(&self) {
         self.given_up.store(true, Ordering::SeqCst);
     }
@@ -114,7 +120,10 @@ impl DiskWait {
         }
     }
 
-    /// Writes a whole file or none, and waits where there is no room for it.
+    /// Writes a whole file or none, and waits while the disk is full.
+    ///
+    /// # Errors
+    /// The file can't be written.
     pub fn write_atomic(
         &self,
         path: &Path,

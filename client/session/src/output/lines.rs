@@ -33,8 +33,8 @@ impl Kept {
     }
 }
 
-/// Text that is written line by line and gets its name only when the run ends: `--stats`,
-/// `--trace`. A pipe, a device or stdout (`-`) gets it at once.
+/// Lines of `--stats` or `--trace`: a file that gets its name when the run ends, or a pipe or
+/// stdout (`-`) that gets them at once.
 pub enum Lines {
     /// Nothing is written.
     None,
@@ -50,7 +50,10 @@ pub enum Lines {
 }
 
 impl Lines {
-    /// Opens what the flag says; refuses places where no file can be made, and `inputs`.
+    /// Opens what a flag names.
+    ///
+    /// # Errors
+    /// The file can't be made or is one of the inputs.
     pub fn open(
         path: Option<&Path>,
         flag: &str,
@@ -82,6 +85,9 @@ impl Lines {
     }
 
     /// Adds text as it is.
+    ///
+    /// # Errors
+    /// The text can't be written.
     pub fn put(&mut self, text: &str) -> Result<(), Fail> {
         match self {
             Lines::None | Lines::Stdout { open: false } => Ok(()),
@@ -107,17 +113,20 @@ impl Lines {
         }
     }
 
-    /// Whether lines go to stdout.
+    /// Returns whether lines go to stdout.
     pub fn on_stdout(&self) -> bool {
         matches!(self, Lines::Stdout { .. })
     }
 
-    /// Whether lines are wanted.
+    /// Returns whether lines are wanted.
     pub fn wanted(&self) -> bool {
         !matches!(self, Lines::None)
     }
 
-    /// Puts the file under its name.
+    /// Gives the file its name.
+    ///
+    /// # Errors
+    /// The file can't be written.
     pub fn keep(self) -> Result<(), Fail> {
         match self {
             Lines::Kept(mut kept) => {

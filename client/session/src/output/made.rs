@@ -4,7 +4,8 @@ use super::file::hidden;
 use crate::fail::Fail;
 use std::path::{Path, PathBuf};
 
-/// A folder that files can be made in. Whoever writes there holds it until all is written.
+/// A folder for files; folders that were made for it and stay empty are removed when it is
+/// dropped.
 #[derive(Debug)]
 pub struct OutputFolder {
     /// Folders that were missing, outermost first.
@@ -12,8 +13,10 @@ pub struct OutputFolder {
 }
 
 impl OutputFolder {
-    /// Makes the folder and those it lies in, where they are missing, and sees whether files can be made
-    /// in it: better now than after the work.
+    /// Makes the folder and its missing parents, and checks that files can be made in it.
+    ///
+    /// # Errors
+    /// They can't.
     pub fn new(path: &Path) -> Result<OutputFolder, Fail> {
         let mut missing: Vec<&Path> =
             path.ancestors().take_while(|p| !p.as_os_str().is_empty() && !p.exists()).collect();
@@ -49,7 +52,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_was_made_stays_if_a_file_came_and_goes_if_none_did() {
+    fn output_folder_is_removed_if_it_stays_empty() {
         let dir = tempfile::tempdir().unwrap();
         let (empty, full) = (dir.path().join("a/b"), dir.path().join("c/d"));
         drop(OutputFolder::new(&empty).unwrap());

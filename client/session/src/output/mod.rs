@@ -33,7 +33,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use tokio::task::JoinSet;
 
-/// A finished frame on its way to disk.
+/// A finished frame.
 #[derive(Clone, Debug)]
 pub struct Frame {
     /// Number of the frame on its whole path.
@@ -47,7 +47,7 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// As 8-bit sRGB, over black where it is transparent.
+    /// Returns the pixels as 8-bit sRGB, over black where they are transparent.
     pub fn rgb8(&self) -> Vec<u8> {
         let over = |c: u8, a: u8| {
             let light = linear_from_srgb(f64::from(c) / 255.0) * f64::from(a) / 255.0;
@@ -69,7 +69,7 @@ impl Frame {
         }
     }
 
-    /// The picture of a frame of floats.
+    /// Returns the picture of a frame of floats (`Rgba32F`).
     pub fn picture(&self) -> Picture {
         let float = |p: &[u8], c: usize| f32::from_le_bytes(std::array::from_fn(|i| p[c * 4 + i]));
         let pixels = self.bytes.chunks_exact(16).map(|p| std::array::from_fn(|c| float(p, c)));
@@ -77,7 +77,7 @@ impl Frame {
     }
 }
 
-/// What frames become.
+/// File format of frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Format {
@@ -94,7 +94,7 @@ pub enum Format {
 }
 
 impl Format {
-    /// What the master sends.
+    /// Returns the pixel format that a master sends for this file format.
     pub fn pixels(self, background: Background) -> PixelFormat {
         match (self, background) {
             (Format::Png16, _) => PixelFormat::Rgba16,
@@ -122,7 +122,7 @@ impl Format {
     }
 }
 
-/// `-o` and what belongs to it.
+/// Where frames go and in which format, checked before any work.
 #[derive(clap::Args, Clone, Debug)]
 #[command(next_help_heading = "Output")]
 pub struct OutputArgs {
@@ -182,7 +182,10 @@ struct Magnify {
     background: Background,
 }
 
-/// Refuses a file to write that is one of those to read.
+/// Checks that a file to write is none of the inputs.
+///
+/// # Errors
+/// It is one; the error names the flag.
 pub fn refuse_input(path: &Path, flag: &str, inputs: &[&Path]) -> Result<(), Fail> {
     let same = |input: &&Path| matches!((path.canonicalize(), input.canonicalize()), (Ok(a), Ok(b)) if a == b);
     if inputs.iter().any(same) {
@@ -236,8 +239,11 @@ fn other_programs(path: &Path, ends: &str) -> Result<(), Fail> {
 }
 
 impl Output {
-    /// Looks at what is there, refuses what would be spoilt or cannot be, and writes nothing. Also
-    /// says which files of an earlier run will stay beside the new ones.
+    /// Checks the target without writing anything. Also returns a note about files of an
+    /// earlier run that stay beside the new ones.
+    ///
+    /// # Errors
+    /// A file would be replaced without `--force`, or the target doesn't fit the format.
     pub fn look(
         args: &OutputArgs,
         stem: &'static str,
@@ -334,8 +340,8 @@ impl Output {
         Ok((Output { target, format, fps: args.fps, contact, magnify: None }, stays))
     }
 
-    /// What the master should send for pictures over `background` that are drawn `times` smaller
-    /// than they come out.
+    /// Sets the factor by which frames are magnified and returns the pixel format to ask the
+    /// master for.
     pub fn takes(&mut self, times: u32, background: Background) -> PixelFormat {
         self.magnify = (times > 1).then_some(Magnify { times, background });
         if times > 1 { PixelFormat::Rgba32F } else { self.format.pixels(background) }
@@ -350,12 +356,15 @@ impl Output {
         Frame { number: frame.number, size: large.size, format, bytes }
     }
 
-    /// Frames a second, where there is such a thing.
+    /// Returns the frames a second of a moving picture.
     pub fn fps(&self) -> Option<u16> {
         self.format.moves().then_some(self.fps)
     }
 
-    /// Makes what must be there before the first frame.
+    /// Creates the folder.
+    ///
+    /// # Errors
+    /// The folder can't be made.
     pub fn make(&mut self) -> Result<(), Fail> {
         match &mut self.target {
             Target::Folder(folder) => folder.make(),
@@ -363,12 +372,13 @@ impl Output {
         }
     }
 
-    /// Whether frames go to stdout, where nothing else may be written then.
+    /// Returns whether frames go to stdout.
     pub fn on_stdout(&self) -> bool {
         matches!(self.target, Target::Pipe(None))
     }
 
-    /// `slabcast-out/ (frame_0000.png ... frame_0017.png)`, `turn.y4m`, `stdout`.
+    /// Returns the target for people: `slabcast-out/ (frame_0000.png ... frame_0017.png)`,
+    /// `turn.y4m`, `stdout`.
     pub fn shown(&self, written: &[u64]) -> String {
         match &self.target {
             Target::Folder(folder) => format!("{} ({})", folder.shown(), folder.list(written)),
@@ -455,7 +465,7 @@ impl Movie {
     }
 }
 
-/// Frames on their way out, encoded on blocking threads of the runtime.
+/// Writes frames, encoded on blocking threads of the runtime.
 pub struct Writer {
     output: Arc<Output>,
     movie: Option<Arc<Mutex<Movie>>>,
@@ -471,7 +481,10 @@ pub struct Writer {
 const AT_ONCE: usize = 2;
 
 impl Writer {
-    /// For `frames` frames. Opens pipes.
+    /// Starts writing `frames` frames; opens pipes.
+    ///
+    /// # Errors
+    /// The pipe can't be opened.
     pub fn new(output: Arc<Output>, frames: u64, patience: Arc<DiskWait>) -> Result<Self, Fail> {
         let coder = || match output.format {
             Format::Apng => Coder::Apng(png::Moving::new(output.fps)),
@@ -493,18 +506,18 @@ impl Writer {
         Ok(Writer { output, movie, contact, patience, busy: JoinSet::new(), written: Vec::new() })
     }
 
-    /// Whether another frame may come.
+    /// Returns whether [`Writer::put`] may be called.
     pub fn has_room(&self) -> bool {
         // Frames of a moving picture follow each other.
         self.busy.len() < if self.movie.is_some() { 1 } else { AT_ONCE }
     }
 
-    /// Whether a frame is on its way.
+    /// Returns whether a frame is being written.
     pub fn is_busy(&self) -> bool {
         !self.busy.is_empty()
     }
 
-    /// Takes a frame, the next one in order. Call [`Writer::has_room`] first.
+    /// Takes the next frame in order, with its provenance.
     pub fn put(&mut self, frame: Frame, made: Option<Provenance>) {
         let (output, movie) = (self.output.clone(), self.movie.clone());
         let (contact, patience) = (self.contact.clone(), self.patience.clone());
@@ -534,7 +547,11 @@ impl Writer {
         });
     }
 
-    /// Waits for the next frame to be on disk. Pending for ever where none is on its way.
+    /// Waits for the next frame to be on disk and returns its number. Pending for ever if none
+    /// is being written.
+    ///
+    /// # Errors
+    /// The frame can't be written.
     pub async fn next_written(&mut self) -> Result<u64, Fail> {
         match self.busy.join_next().await {
             None => std::future::pending().await,
@@ -547,8 +564,11 @@ impl Writer {
         }
     }
 
-    /// Waits for all that are on their way; the first failure counts, the others go on. Then ends
-    /// what is in one file, with as many frames as there are, and the contact sheet.
+    /// Waits for all frames, then finishes the moving picture and the contact sheet with the
+    /// frames that there are.
+    ///
+    /// # Errors
+    /// The first failure; other frames are still written.
     pub async fn end(&mut self) -> Result<(), Fail> {
         let mut first = Ok(());
         while self.is_busy() {
@@ -579,7 +599,7 @@ impl Writer {
         first.and(ended.unwrap_or_else(|e| Err(Fail::failed(format!("writing failed: {e}")))))
     }
 
-    /// Frames on disk, ascending.
+    /// Returns the numbers of the frames on disk, ascending.
     pub fn written(&mut self) -> &[u64] {
         self.written.sort_unstable();
         &self.written

@@ -9,12 +9,15 @@ use crate::software::{SOFTWARE, io_error};
 use slabcast_common::image::PixelFormat;
 use std::io::{Error, Result, Write};
 
-/// The chunk that holds the provenance.
+/// Keyword of the text chunk that holds the provenance.
 pub const KEYWORD: &str = "slabcast";
 /// Longer provenances (a transfer function of many points) are compressed.
 const PLAIN: usize = 2048;
 
-/// Encodes a frame, with `provenance` as text unless it is empty.
+/// Encodes a frame as a PNG, with `provenance` as text unless it is empty.
+///
+/// # Errors
+/// `out` can't be written.
 pub fn encode(frame: &Frame, provenance: &str, out: &mut impl Write) -> Result<()> {
     let mut png = png::Encoder::new(out, frame.size[0], frame.size[1]);
     let (colour, depth, bytes) = match frame.format {
@@ -51,7 +54,10 @@ pub fn encode(frame: &Frame, provenance: &str, out: &mut impl Write) -> Result<(
     png.finish().map_err(io_error)
 }
 
-/// The provenance in a PNG; `None` where it has none.
+/// Returns the provenance in a PNG, if it has one.
+///
+/// # Errors
+/// The file is damaged; the text says where.
 pub fn provenance(bytes: &[u8]) -> std::result::Result<Option<String>, String> {
     let reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info();
     let reader = reader.map_err(|e| e.to_string())?;

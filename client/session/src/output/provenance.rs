@@ -24,28 +24,28 @@ use std::path::Path;
 /// Largest picture that is read: one of 8192x8192 in floats that do not compress.
 const MAX_BYTES: u64 = 2 << 30;
 
-/// All that decides a picture's bytes.
+/// Everything that decides a picture's bytes, as the picture's file records it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Provenance {
     /// Format version, 1.
     version: u32,
-    /// The program's version.
+    /// Version of the program.
     pub slabcast: String,
     /// Version of the pixels that the program drew (`PIXELS_VERSION`).
     pub pixels_version: u32,
-    /// The volume's digest.
+    /// Digest of the volume.
     pub volume_sha256: String,
-    /// The view; the whole path of a moving picture.
+    /// The view, or the whole path of a moving picture.
     pub path: ViewPath,
-    /// The preset that the transfer function came from.
+    /// Preset that the transfer function came from.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub preset: Option<String>,
     /// Transfer function, presets resolved.
     pub transfer: TransferFunction,
-    /// Sums decided.
+    /// Quality, sums decided.
     pub quality: Quality,
-    /// The picture was drawn at the path's size and is so many times as large.
+    /// Factor by which the picture is larger than the path's size, at which it was drawn.
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub magnify: u32,
     background: Ground,
@@ -57,11 +57,11 @@ pub struct Provenance {
     /// Hash of the view and all else that decides the pixels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     view_sha256: Option<String>,
-    /// Hash of the linear picture. Pictures said it while masters hashed each; who draws one of them again
-    /// has it hashed.
+    /// Hash of the linear picture. Early versions recorded it; a picture that has one is hashed
+    /// when it is made again.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pixels_sha256: Option<String>,
-    /// Hash of the pixels that are in the file, as bytes of the format that a master sends for it.
+    /// Hash of the pixels in the file, as bytes of the format that a master sends for it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub picture_sha256: Option<String>,
 }
@@ -113,13 +113,16 @@ impl Provenance {
         serde_json::to_string(&self).expect("numbers and strings can be written")
     }
 
-    /// Whether two pictures say that they have the same pixels.
+    /// Returns whether two pictures record the same pixels.
     pub fn same_pixels(&self, other: &Provenance) -> bool {
         let hashes = |p: &Provenance| (p.pixels_sha256.clone(), p.picture_sha256.clone());
         hashes(self) == hashes(other)
     }
 
-    /// What made the picture in a file.
+    /// Returns the provenance in the bytes of a PNG or EXR; `path` is for messages.
+    ///
+    /// # Errors
+    /// The picture has none, is damaged, or is of another version.
     pub fn read(path: &Path, bytes: &[u8]) -> Result<Provenance, Fail> {
         let file = path.display();
         let text = if bytes.starts_with(b"\x89PNG") {
@@ -168,7 +171,10 @@ impl Provenance {
     }
 }
 
-/// The bytes of a picture's file, if it is no larger than pictures are.
+/// Reads a picture's file.
+///
+/// # Errors
+/// The file can't be read or is larger than any picture.
 pub fn read(path: &Path) -> Result<Vec<u8>, Fail> {
     let fail = |e: std::io::Error| Fail::io(path, "reading", &e);
     let meta = std::fs::metadata(path).map_err(fail)?;
@@ -185,7 +191,7 @@ pub fn read(path: &Path) -> Result<Vec<u8>, Fail> {
     std::fs::read(path).map_err(fail)
 }
 
-/// Says of each frame of a run what made it.
+/// Makes the provenance of each frame of a run.
 pub struct RunProvenance {
     base: Provenance,
     /// With the hash of the linear picture instead of the file's own.
@@ -193,7 +199,10 @@ pub struct RunProvenance {
 }
 
 impl RunProvenance {
-    /// For a run on the volume that `info` describes.
+    /// Returns the provenance of a run on the volume that `info` describes.
+    ///
+    /// # Errors
+    /// The transfer function doesn't fit the volume.
     pub fn new(
         request: &RenderRequest,
         info: &VolumeInfo,
@@ -257,7 +266,7 @@ impl RunProvenance {
         })
     }
 
-    /// What made the frame of these statistics, alone.
+    /// Returns the provenance of the single frame of these statistics.
     pub fn frame(&self, stats: &FrameStats) -> Provenance {
         let mut p = self.whole(stats.quality.sums);
         p.path = p.path.single_frame(stats.frame as usize);
@@ -266,7 +275,7 @@ impl RunProvenance {
         p
     }
 
-    /// What makes all frames, with sums as the master decided them.
+    /// Returns the provenance of all frames in one file, with sums as the master decided them.
     pub fn movie(&self, stats: &FrameStats) -> Provenance {
         self.whole(stats.quality.sums)
     }

@@ -28,7 +28,7 @@ fn cube() -> VolumeInfo {
 }
 
 #[test]
-fn no_flag_is_the_protocol_of_the_contract() {
+fn defaults_are_those_of_the_contract() {
     let a = asked("").unwrap();
     assert_eq!(a.path, ViewPath::from_turntable([512, 512], Turntable::default()));
     assert_eq!((a.quality, a.work), (Quality::default(), Work::default()));
@@ -92,7 +92,7 @@ fn refusals_name_the_flag() {
 }
 
 #[test]
-fn what_the_lattice_refuses_names_the_flag_or_the_files_field() {
+fn requests_that_do_not_fit_the_volume_name_flag_or_field() {
     let o = Orientation::new(None, None).unwrap();
     for (line, says) in [
         ("--elevation 91", "--elevation:"),
@@ -117,7 +117,7 @@ fn what_the_lattice_refuses_names_the_flag_or_the_files_field() {
 }
 
 #[test]
-fn keys_are_never_the_same() {
+fn client_keys_are_unique() {
     let a: std::collections::BTreeSet<String> = (0..100).map(|_| client_key()).collect();
     assert_eq!(a.len(), 100);
 }

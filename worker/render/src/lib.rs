@@ -1,6 +1,7 @@
 //! Image-aligned sheet-based splatting with occlusion culling (paper section 3), on one tile.
 //!
 //! ```
+//! use glam::DVec3;
 //! use slabcast_common::image::FrameState;
 //! use slabcast_common::occlusion::Rect;
 //! use slabcast_common::quality::Quality;
@@ -16,8 +17,8 @@
 //! let volume = Volume::from_fn_u8("ball", [16; 3], ball);
 //! let (bricks, quality, size) = (selftest::bricks_of(&volume), Quality::default(), [48, 48]);
 //! let projection = CameraProjection::Ortho { height: 20.0 };
-//! let camera = Camera { to_eye: glam::DVec3::Y, up: glam::DVec3::Z, target: glam::DVec3::ZERO, projection };
-//! let view = View::new(&volume.lattice, &camera, size, &quality).expect("a camera outside the volume");
+//! let camera = Camera { to_eye: DVec3::Y, up: DVec3::Z, target: DVec3::ZERO, projection };
+//! let view = View::new(&volume.lattice, &camera, size, &quality).expect("a valid camera");
 //! let frame = Frame::new(Scene::new(&selftest::spec(&volume, quality)).into(), view);
 //!
 //! let (picture, mut scratch) = (Rect::of_size(size), tile::Scratch::default());

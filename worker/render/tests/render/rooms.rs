@@ -7,7 +7,7 @@ const ROOMS: [(&str, &[&str]); 10] = [
     ("primitives", &[]),
     ("visibility", &["primitives"]),
     ("kernels", &["primitives", "visibility::open_mask"]),
-    ("scene", &["kernels", "primitives"]),
+    ("scene", &["kernels", "primitives", "visibility::open_mask"]),
     ("part", &["kernels", "primitives", "scene", "visibility"]),
     ("geometry", &["kernels", "part", "primitives", "scene", "visibility"]),
     ("tile", &["geometry", "kernels", "part", "primitives", "scene"]),

@@ -345,7 +345,7 @@ impl SlabTrace {
 /// Returns a hash of everything that a frame's times depend on: transfer function, quality and
 /// view.
 ///
-/// It differs from the hash in a frame's statistics, which covers the cropping box and not whether
+/// The hash in a frame's statistics is another one: it covers the cropping box and not whether
 /// culling is on.
 pub fn view_sha256(scene: &SceneSpec, view: &View) -> Digest32 {
     let mut h = Sha256::new();

@@ -99,7 +99,7 @@ pub struct RegionProgress {
     current: usize,
 }
 
-/// How many times longer a pixel of a piece takes than one of the whole tile, since the piece is
+/// Returns how many times longer a pixel of a piece takes than one of the tile, since the piece is
 /// drawn with a border of its own.
 fn border_slowdown(piece: &Rect, tile: &Rect) -> f64 {
     let with_border =

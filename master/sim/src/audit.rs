@@ -8,7 +8,7 @@ use slabcast_common::quality::Schedule;
 use slabcast_schedule::{Action, Event, FrameJob, Micros};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// What the master owes a worker, by the messages that were exchanged.
+/// State of a worker by the messages that were exchanged: scenes, bricks and leases it was sent.
 #[derive(Debug, Default)]
 struct Account {
     memory_budget_bytes: u64,

@@ -46,7 +46,7 @@ impl Clock for VirtualClock {
     }
 }
 
-/// What happens at a moment.
+/// Something that happens at a moment of virtual time.
 enum Occurrence {
     /// A message of so many bytes has crossed the link to the master, where unpacking it takes so
     /// many nanoseconds.
@@ -123,7 +123,7 @@ pub struct VirtualCluster<M: TileModel, O: Observer> {
     driver: Cores,
     streams: Cores,
     finishers: Cores,
-    /// Where everything runs on one machine.
+    /// The shared cores of a rehearsal, in which everything runs on one machine.
     machine: Option<Cores>,
     /// The frame and first sheet of the slab that was begun last.
     last_slab: Option<(FrameId, i32)>,
@@ -134,7 +134,7 @@ pub struct VirtualCluster<M: TileModel, O: Observer> {
     /// When the driver lent what has not begun yet.
     decided: BTreeMap<(WorkerId, TaskId, Epoch), Nanos>,
 
-    // What came of it.
+    // Results.
     worker_work: Nanos,
     first_work: Work,
     steady_work: [Nanos; 2],

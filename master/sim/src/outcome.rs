@@ -37,7 +37,7 @@ pub struct FrameOutcome {
     pub messages_up: u64,
 }
 
-/// Where the render threads' time went while frames were delivered steadily
+/// Use of the render threads' time while frames were delivered steadily
 /// ([`Outcome::steady_frames`]): nanoseconds, summed over all threads. The parts make up the whole.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ThreadTime {
@@ -81,7 +81,7 @@ pub struct Work {
     pub workers: Nanos,
 }
 
-/// What came of a path.
+/// Result of the simulation of a path.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Outcome {
     /// Frames in the order of the path.
@@ -93,7 +93,7 @@ pub struct Outcome {
     pub first_work: Work,
     /// Work of driver and streams while `thread_time` was counted, in nanoseconds.
     pub steady_work: [Nanos; 2],
-    /// Where render threads' time went.
+    /// Use of the render threads' time while frames were delivered steadily.
     pub thread_time: ThreadTime,
 }
 
@@ -275,7 +275,7 @@ impl<O: Observer + ?Sized> Observer for &mut O {
     }
 }
 
-/// How often the scheduler did something, and the processor time of all of it.
+/// Number of operations of one kind, and the processor time of all of them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Tally {
     /// Number of operations, or of the bricks or pixels they were about.

@@ -87,7 +87,7 @@ impl<'a> TracedTiles<'a> {
         Some(piece.piece(&whole, tile, &|place| project(&job.view, &job.bricks, place)))
     }
 
-    /// What was recorded of a whole region. A tile that was not recorded, since pieces of it were
+    /// Looks up the record of a whole region. A tile that was not recorded, since pieces of it were
     /// handed over, takes it from the squares in which its parts lie.
     fn region(&self, job: &FrameJob, tile: Rect) -> Option<Cow<'a, RegionTile>> {
         let trace: &'a Trace = self.trace;

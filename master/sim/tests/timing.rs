@@ -54,7 +54,7 @@ fn world(frames: usize) -> (Vec<FrameJob>, Trace) {
             let lattice = &scene.volume.lattice;
             let view = View::new(lattice, &camera, SIZE, &quality).expect("drawable");
             let (frame, number) = (FrameId(i as u64 + 1), i as u64);
-            // What the cube's second view needs anew can be worked out for equal slabs alone.
+            // The new bricks of the cube's second view can be worked out for equal slabs only.
             let (schedule, borders) = (Schedule::Slab, Borders::Equal);
             let work = Work { schedule, borders, ..Work::default() };
             let (scene, bricks) = (scene.clone(), bricks.clone());
@@ -194,7 +194,7 @@ fn one_worker_without_costs_takes_the_sum_of_its_tiles() {
         let pixels = (f.render - 5_000) / 10;
         assert!(f.up >= 2 * pixels && f.up < 2 * pixels + 64 * 200, "{f:?}");
     }
-    // Those behind the shut half are never sent.
+    // Bricks behind the shut half are never sent.
     let sent = outcome.frames[0].bricks / u64::from(BRICK_BYTES);
     assert!((257..512).contains(&sent), "{sent} of 512 bricks");
     let later = outcome.frames[1].bricks / u64::from(BRICK_BYTES);

@@ -124,7 +124,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
         self.drive();
     }
 
-    /// What a worker's threads draw now takes so many times longer from now on.
+    /// Stretches the tasks that a worker's threads draw now by a factor, from now on.
     fn slow_runs(&mut self, id: WorkerId, factor: f64) {
         let now = self.now_ns();
         let w = self.workers.get_mut(&id).expect("it is there");

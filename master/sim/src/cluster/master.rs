@@ -27,7 +27,7 @@ pub(super) enum Chore {
 /// is short beside a tile, and a picture of 1024x1024 takes some hundred such turns to simulate.
 const TURN_NS: f64 = 50_000.0;
 
-/// What the actions of one event begin.
+/// Frames, slabs and leases that the actions of one event begin.
 #[derive(Default)]
 struct Begun {
     frames: u64,
@@ -132,7 +132,7 @@ impl<M: TileModel, O: Observer> VirtualCluster<M, O> {
         let bricks = job.as_ref().map_or(0, |j| j.bricks.len());
         let [wide, high] = job.as_ref().map_or([0; 2], |j| j.view.size);
         let pixels = f64::from(wide) * f64::from(high);
-        // What begins a frame or a slab also gives its first leases.
+        // The event that begins a frame or a slab also gives its first leases.
         let is_first = begun.frames > 0 && self.frames_begun == 0;
         self.frames_begun += begun.frames;
         cost += if is_first {

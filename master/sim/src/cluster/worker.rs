@@ -19,7 +19,7 @@ pub(super) enum Lent {
     Region(RegionLease),
 }
 
-/// What a worker draws for a lease.
+/// A task of a worker: its lease and, for a region, the progress.
 pub(super) enum Task<R> {
     Slab(Box<Lease>),
     Region(RegionLease, R),
@@ -70,7 +70,7 @@ pub(super) struct Loan<R> {
     pub(super) waits: BTreeSet<u32>,
     /// Places of the bricks that it waited for since it last came farther: they are not evicted.
     pub(super) keeps: BTreeSet<u32>,
-    /// How long it was drawn.
+    /// Time for which threads drew it.
     pub(super) drawn_ns: Nanos,
     /// Rehearsal: when its placeholder pixels are there.
     pub(super) pixels: Nanos,
@@ -151,7 +151,7 @@ pub(super) struct Worker<R> {
     pub(super) has_directory: bool,
     /// Parts of pictures that it drew, whose depths it knows.
     pub(super) drawn: BTreeSet<(BrickSetKey, i32, i32)>,
-    /// How far its regions look ahead, and the first frame that it drew of each set.
+    /// Look-ahead of its regions, and the first frame that it drew of each set.
     pub(super) lookahead: Lookahead,
     pub(super) first: BTreeMap<BrickSetKey, FrameId>,
 

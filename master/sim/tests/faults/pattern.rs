@@ -87,7 +87,7 @@ pub(crate) fn job(
     Box::new(FrameJob { frame: FrameId(frame), number: frame, scene, bricks, view, work, finish })
 }
 
-/// Where each brick of a job lands.
+/// Returns the rectangle and sheets of each brick of a job.
 pub(crate) fn projections(job: &FrameJob) -> BTreeMap<BrickId, Projected> {
     job.bricks.iter().filter_map(|b| Some((b.id, job.view.project(&b.tight)?))).collect()
 }

@@ -23,7 +23,7 @@ pub(crate) struct DemoArgs {
 
 /// Balls beside and inside each other, in a shell cut open.
 const VOLUME: &str = "formula:spheres:128";
-/// What is asked for, as it would be typed.
+/// Flags of `render` for the demo.
 const FLAGS: [&str; 8] =
     ["--frames", "12", "--step", "30", "--elevation", "25", "--size", "400x400"];
 

@@ -60,7 +60,7 @@ enum State {
     Skipped,
 }
 
-/// What one check found.
+/// Result of one check.
 struct Found {
     name: &'static str,
     state: State,
@@ -226,7 +226,7 @@ fn port(address: &str, master: bool) -> Found {
     }
 }
 
-/// What a master says of itself: that it is there, its versions, its clock.
+/// Checks a master: whether it answers, its versions and its clock.
 async fn master(address: &str) -> Result<Vec<Found>, String> {
     let fail = |e: slabcast_client::ClientError| e.to_string();
     let client = Client::connect(address).await.map_err(fail)?;
@@ -264,7 +264,7 @@ async fn master(address: &str) -> Result<Vec<Found>, String> {
     Ok(all)
 }
 
-/// How far the master's clock is from ours.
+/// Checks how far the master's clock is from this machine's.
 fn clock(theirs_unix_ms: i64, here: Duration, round_trip: Duration) -> Found {
     let name = "clock";
     if theirs_unix_ms == 0 {

@@ -34,7 +34,7 @@ pub(crate) struct InfoArgs {
     json: bool,
 }
 
-/// What a preset would draw.
+/// Share of the volume that a preset draws.
 struct Share {
     name: &'static str,
     what: &'static str,
@@ -101,7 +101,7 @@ fn world_box(lattice: &Lattice) -> [DVec3; 2] {
     [lattice.centre() - half, lattice.centre() + half]
 }
 
-/// Where an index axis goes: world axis and sign, and whether it lies along it.
+/// Returns the world axis nearest to an index axis, its sign, and whether both are parallel.
 fn along(step: DVec3) -> (usize, bool, bool) {
     let a = step.abs();
     let axis = if a.x >= a.y && a.x >= a.z {

@@ -23,7 +23,7 @@ pub(crate) struct LogArgs {
     log_level: Option<String>,
 }
 
-/// What a level or filter stands for. Libraries beneath speak one level more quietly.
+/// Expands a level or filter; libraries log one level less than slabcast's crates.
 fn filter(text: &str) -> Result<EnvFilter, String> {
     let expanded = match text {
         "off" | "error" | "warn" => text.to_string(),

@@ -42,14 +42,14 @@ pub(crate) struct MasterArgs {
     /// a CT whose file has no anatomical axes, as slices are stored]
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
     front: Option<Axis>,
-    /// Where workers and clients call; port 0 takes any free one and says which
+    /// Address for workers and clients; port 0 takes any free one and prints it
     #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:7433", value_parser = parse::listen)]
     listen: String,
-    /// Listen beyond this machine although nothing is encrypted and nobody is asked who they are
+    /// Listen beyond this machine although nothing is encrypted or authenticated
     #[arg(long,
           value_parser = clap::builder::FalseyValueParser::new())]
     insecure: bool,
-    /// What the scheduler is told and decides, for `slabcast lab replay`; some 25 KB a frame
+    /// Events and decisions of the scheduler, for `slabcast lab replay`; some 25 KB a frame
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
     /// Take workers that hold tiles for recorded times (`slabcast worker --rehearse`), and no others;
@@ -118,7 +118,7 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
                 return Err(Fail::failed(format!("serving {address} failed: {why}")));
             }
         };
-        info!(signal = code - 128, "stopping: workers are told to leave, jobs end");
+        info!(signal = code - 128, "stopping: workers are asked to leave, jobs end");
         systemd::stopping();
         let _ = stop.send(true);
         let drained = async {
@@ -126,7 +126,7 @@ pub(crate) fn run(args: &MasterArgs) -> Result<(), Fail> {
             let _ = served.await;
         };
         if tokio::time::timeout(DRAIN, drained).await.is_err() {
-            warn!("gave up waiting for connections to end");
+            warn!("connections did not end in time");
         }
         Ok(())
     });

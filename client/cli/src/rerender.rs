@@ -1,4 +1,4 @@
-//! `slabcast rerender`: a picture once more, from what it says of itself.
+//! `slabcast rerender`: renders a picture again from its provenance and compares the files.
 
 use crate::render;
 use slabcast_session::fail::{Fail, say};

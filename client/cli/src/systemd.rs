@@ -11,11 +11,11 @@ pub(crate) const DRAIN: Duration = Duration::from_secs(10);
 #[cfg(target_os = "linux")]
 fn tell(states: &[sd_notify::NotifyState<'_>]) {
     if let Err(e) = sd_notify::notify(states) {
-        tracing::warn!(error = %e, "systemd was not told");
+        tracing::warn!(error = %e, "systemd could not be notified");
     }
 }
 
-/// It serves.
+/// Tells systemd that the process serves, with a status line.
 pub(crate) fn ready(status: &str) {
     #[cfg(target_os = "linux")]
     tell(&[sd_notify::NotifyState::Ready, sd_notify::NotifyState::Status(status)]);
@@ -23,7 +23,7 @@ pub(crate) fn ready(status: &str) {
     let _ = status;
 }
 
-/// It ends.
+/// Tells systemd that the process is about to end.
 pub(crate) fn stopping() {
     #[cfg(target_os = "linux")]
     tell(&[sd_notify::NotifyState::Stopping]);

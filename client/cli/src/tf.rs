@@ -99,7 +99,7 @@ fn any() -> VolumeInfo {
     VolumeInfo { summary, ..volume.info(Digest32::default()) }
 }
 
-/// The same function over file values.
+/// Returns the function over values of the file.
 fn in_values(tf: &mut TransferFunction, lo: f64, hi: f64) {
     if tf.domain == Domain::Unit {
         let x = |x: f64| lo + x * (hi - lo);

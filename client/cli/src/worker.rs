@@ -86,7 +86,7 @@ pub(crate) fn run(args: &WorkerArgs) -> Result<(), Fail> {
                 match tokio::time::timeout(DRAIN, &mut running).await {
                     Ok(ended) => ended,
                     Err(_) => {
-                        warn!("gave up waiting for tasks");
+                        warn!("tasks did not end in time");
                         return Ok(());
                     }
                 }

@@ -96,7 +96,7 @@ fn through(frame: &Frame, bricks: &Bricks, cut: Cut) -> (Picture, Counters) {
     let whole = Rect::from_size(frame.view.size);
     let edge = cut.tile as i32;
     let outlook = VisibleBricks::new(&frame.view, &bricks.directory);
-    // What nothing lies in is not drawn; what may have most to draw comes first.
+    // Empty tiles are not drawn; the heaviest come first.
     let weighed = tile_rects(whole, cut.tile).map(|tile| (outlook.weight(&tile), tile));
     let mut tiles: Vec<(u64, Rect)> = weighed.filter(|(weight, _)| *weight > 0).collect();
     tiles.sort_by_key(|&(weight, tile)| (std::cmp::Reverse(weight), tile.y0, tile.x0));
@@ -165,7 +165,7 @@ fn in_slabs(frame: &Frame, bricks: &[Arc<Brick>], cut: Cut) -> (Picture, Counter
     (state.to_picture(), counters)
 }
 
-/// What a thread draws in.
+/// A thread's buffers.
 #[derive(Default)]
 struct Memory {
     scratch: Scratch,
@@ -187,7 +187,7 @@ impl Default for Kept {
 
 impl Drop for Kept {
     fn drop(&mut self) {
-        // What a panic left half done is not for the next frame.
+        // A panic may have left them half written.
         if !std::thread::panicking() {
             let memory = std::mem::take(&mut self.0);
             SPARE.lock().unwrap_or_else(PoisonError::into_inner).push(memory);

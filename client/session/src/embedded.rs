@@ -24,8 +24,8 @@ use std::time::Duration;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 
-/// How long workers may take to leave. They finish the tile at hand, some 50 ms at most; what
-/// takes longer ends with the process.
+/// Time for workers to leave. They finish their current tile, some 50 ms at most; what takes longer
+/// ends with the process.
 const LEAVE: Duration = Duration::from_secs(2);
 
 /// Brick budget of a worker that shares the master's bricks: none of its own is used.

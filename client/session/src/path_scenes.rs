@@ -77,7 +77,7 @@ pub struct PathScenes {
     /// Of all frames, or of those of a tween but for the transfer function.
     base: SceneSpec,
     tween: Option<Tween>,
-    /// What frames share if there is no tween: they keep footprints in it.
+    /// Scene of all frames if there is no tween; it caches footprints.
     shared: Arc<Scene>,
     /// Bricks for all frames.
     pub bricks: Bricks,

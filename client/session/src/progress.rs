@@ -54,7 +54,7 @@ pub fn note(line: &str) {
     say_on_stderr(&format!("{} {}", terminal::note(), crate::terminal::one_line(line)));
 }
 
-/// Where a run stands.
+/// State of a run, for its progress bar.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Step {
     /// What the run waits for; empty while frames are rendered.
@@ -71,7 +71,7 @@ pub struct Step {
 
 /// Progress of one run: a bar on a terminal, else a line every five seconds.
 pub struct Progress {
-    /// What is counted: `frame`.
+    /// Unit that is counted: `frame`.
     noun: &'static str,
     total: u64,
     quiet: bool,

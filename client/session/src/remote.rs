@@ -15,7 +15,7 @@ use tokio::sync::{mpsc, watch};
 /// master that is away is dialled again meanwhile.
 const SILENCE: Duration = Duration::from_secs(5);
 
-/// How often a job that a restarted master has forgotten is submitted anew. Frames are a pure
+/// Times that a job is submitted anew which a restarted master has forgotten. Frames are a pure
 /// function of the request, so the rest of them fits what is there; a master that forgets more
 /// often than this is not well.
 const ANEW: u32 = 3;
@@ -94,7 +94,10 @@ async fn pump(
             Ok(()) => return Ok(()),
             Err(ClientError::NotFound { .. }) if anew < ANEW => {
                 anew += 1;
-                tracing::warn!(job = name, "the master has forgotten the job: submitted again");
+                tracing::warn!(
+                    job = name,
+                    "the master does not know the job any more; submitting it again"
+                );
                 message.client_key = crate::request::client_key();
                 let name = client.submit(&message).await.map_err(|e| client_failure(&e))?;
                 job.send_replace(name);
@@ -187,6 +190,6 @@ fn step(n: &slabcast_client::JobNotice, master: &str) -> Step {
 async fn cancel(client: Client, job: watch::Receiver<String>) {
     let job = job.borrow().clone();
     if let Err(e) = client.cancel(&job).await {
-        tracing::warn!(job, error = %e, "the job could not be cancelled");
+        tracing::warn!(job, error = %e, "cancelling the job failed");
     }
 }

@@ -62,7 +62,7 @@ pub fn stop_requested() -> bool {
 /// done on disk.
 ///
 /// # Errors
-/// Those of `work`; code 130 or 143 after a stop.
+/// Returns those of `work`; a failure with code 130 or 143 after a stop.
 pub fn run_unless_stopped<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, Fail> + Send + 'static,
 ) -> Result<T, Fail> {
@@ -73,7 +73,7 @@ pub fn run_unless_stopped<T: Send + 'static>(
 /// [`stop_requested`] often, ends early and removes its half-written files.
 ///
 /// # Errors
-/// Those of `work`; code 130 or 143 after a stop.
+/// Returns those of `work`; a failure with code 130 or 143 after a stop.
 pub fn run_to_end<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, Fail> + Send + 'static,
 ) -> Result<T, Fail> {

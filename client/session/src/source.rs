@@ -9,25 +9,25 @@ use std::pin::Pin;
 use std::time::Duration;
 use tokio::sync::mpsc;
 
-/// How long cancelling may take before the command ends without the master's word.
+/// Time for cancelling before the command ends without the master's answer.
 const CANCEL: Duration = Duration::from_secs(2);
 
 /// News of a job.
 pub enum Update {
-    /// Where it stands.
+    /// The job's state.
     Step(Step),
     /// A frame, its statistics, those as JSON, and its trace.
     Frame {
-        /// Its pixels.
+        /// Pixels of the frame.
         frame: Frame,
-        /// Where a master made the frame.
+        /// Statistics, if a master made the frame.
         stats: Option<Box<FrameStats>>,
         /// Statistics as one line of JSON.
         stats_json: String,
         /// Time line as JSON; empty unless asked for.
         trace_json: String,
     },
-    /// It ended with all frames delivered.
+    /// The job ended with all frames delivered.
     Done,
 }
 

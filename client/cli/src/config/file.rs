@@ -17,7 +17,7 @@ pub(crate) struct File {
     table: toml::Table,
 }
 
-/// Where the user's own file is: `$XDG_CONFIG_HOME/slabcast/slabcast.toml`, or below `~/.config`.
+/// Returns the path of the user's own file: `$XDG_CONFIG_HOME/slabcast/slabcast.toml`, or below `~/.config`.
 pub(crate) fn own() -> Option<PathBuf> {
     let of = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
     let base = of("XDG_CONFIG_HOME").or_else(|| of("HOME").map(|home| home.join(".config")))?;
@@ -89,7 +89,7 @@ impl File {
         Ok(File { path: path.to_path_buf(), table })
     }
 
-    /// What it says of a key, as it would be typed.
+    /// Returns the value of a key as text.
     pub(crate) fn value(&self, section: &str, key: &str) -> Option<String> {
         self.table.get(section)?.get(key).and_then(scalar)
     }

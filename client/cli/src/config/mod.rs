@@ -46,7 +46,7 @@ const OTHERS: [&str; 7] = [
     "SLABCAST_WORKER_LIMIT",
 ];
 
-/// Where a value comes from.
+/// The layer that gives a value.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Source {
     Flag,
@@ -63,7 +63,7 @@ pub(crate) struct Given {
     id: String,
     /// The flag without dashes.
     pub(crate) key: String,
-    /// As text; `None` where there is no value.
+    /// The value as text, if there is one.
     pub(crate) value: Option<String>,
     pub(crate) source: Source,
 }
@@ -82,7 +82,7 @@ impl From<clap::Error> for Trouble {
     }
 }
 
-/// What the command at hand was given by others than flags, for [`blame`].
+/// Values of the current command from environment and file, for [`blame`].
 static GIVEN: OnceLock<Vec<Given>> = OnceLock::new();
 
 /// The matches of a command line, with all layers.

@@ -15,7 +15,7 @@ use slabcast_session::fail::Fail;
 use slabcast_session::output::Frame;
 use slabcast_session::path_scenes::PathScenes;
 
-/// What is shown.
+/// The debug view of `--show`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum DebugView {
     /// Where pixels were shut, from near to far
@@ -31,7 +31,7 @@ pub(crate) enum DebugView {
 }
 
 impl DebugView {
-    /// What names of files begin with.
+    /// Stem of the file names.
     pub(crate) fn stem(self) -> &'static str {
         match self {
             DebugView::Depth => "depth",
@@ -48,7 +48,7 @@ fn half(quality: Quality) -> Quality {
     Quality { thickness: quality.thickness / 2.0, ..quality }
 }
 
-/// Whether an error can be estimated at this quality.
+/// Checks that an error can be estimated at this quality.
 pub(crate) fn can_estimate(quality: &Quality) -> Result<(), Fail> {
     half(*quality).check().map_err(|_| {
         Fail::usage(format!(
@@ -149,7 +149,7 @@ fn nothing(p: &[f32; 4]) -> bool {
     p[3] <= 0.0
 }
 
-/// Where pixels were shut, counted from the first sheet that held anything.
+/// Draws the depth at which pixels were shut, counted from the first sheet that held anything.
 fn depth(picture: &Picture, notes: &WorkCounters, thickness: f64) -> Canvas {
     let first = notes.first.unwrap_or(0);
     let far = notes.shut_in.iter().flatten().max().map_or(0, |k| k - first).max(1);
@@ -189,7 +189,7 @@ fn counted(picture: &Picture, counts: &[u32], title: &str) -> Canvas {
     board(size(picture), colours, &legend)
 }
 
-/// How far each pixel is off because its sheets are thick, in 1/255: from the difference to sheets
+/// Estimates the error of each pixel from the thickness of sheets, in 1/255: from the difference to sheets
 /// of half the thickness. Where the error falls with the square of the thickness, the finer
 /// picture has a quarter of it left, so that the whole is 4/3 of the difference; the linear rule
 /// does better and is overrated by a quarter at most. The paper's rule has an error of first order

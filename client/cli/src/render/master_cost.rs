@@ -22,7 +22,7 @@ const SCENES: [Scene; 4] = [
 /// Frames that are not timed: reading, cutting the volume into bricks and the first views.
 const WARM: u32 = 12;
 
-/// So many frames of a path, a degree apart, as PNGs into a folder.
+/// Returns a run of `frames` frames, a degree apart, as PNGs into a folder.
 fn run(tf: &str, edge: u32, frames: u32, folder: &Path) -> Run {
     let turn = Turntable { frames, step: 1.0, ..Turntable::default() };
     let path = ViewPath::from_turntable([edge, edge], turn);
@@ -39,7 +39,7 @@ fn run(tf: &str, edge: u32, frames: u32, folder: &Path) -> Run {
     Run::bare(request, looked.expect("a folder").0, true)
 }
 
-/// What a master tells of a frame.
+/// Statistics of a frame as a master gives them.
 async fn told(run: &mut Run, volume: Arc<Volume>, orientation: Orientation) -> Box<FrameStats> {
     let crew = WorkerGroup::new(1, None).expect("a crew");
     let cluster = Cluster::start(volume, orientation, crew, None).expect("a cluster");
@@ -107,7 +107,7 @@ async fn plain(
     done
 }
 
-/// For docs/scaling.md: ms from frame to frame by threads alone and by a master and a worker, in turn.
+/// Measures ms from frame to frame by threads alone and by a master and a worker, in turn.
 #[test]
 #[ignore = "measures; cargo test --release -p slabcast --bin slabcast what_a_master -- --ignored --nocapture"]
 fn what_a_master_in_the_process_takes() {

@@ -32,7 +32,7 @@ use std::time::{Duration, Instant};
 use tokio::runtime::Runtime;
 use tokio::sync::mpsc;
 
-/// How long what is being written may take once the run has failed or was stopped: ten times what
+/// Time for frames that are being written once the run has failed or was stopped: ten times what
 /// the largest picture takes on a slow disk.
 const LAST: Duration = Duration::from_secs(20);
 
@@ -123,22 +123,22 @@ pub(crate) struct RenderArgs {
     quiet: bool,
 }
 
-/// What all of a run shares.
+/// State of one run, whoever renders its frames.
 struct Run {
     request: RenderRequest,
-    /// Whether somebody said what is up, or it does not matter.
+    /// Whether the up axis was given or needs no note.
     stands: bool,
     output: Output,
     show: Option<DebugView>,
     patience: Arc<DiskWait>,
-    /// What to mention once nothing is refused any more.
+    /// Notes for stderr once the request has been accepted.
     notes: Vec<String>,
     stats: Lines,
     trace: Lines,
     record: Option<PathBuf>,
     progress: Progress,
     began: Instant,
-    /// Whether it ends with a line that says where the pictures are.
+    /// Whether the run ends with a line that names the pictures.
     tell: bool,
 }
 
@@ -260,8 +260,8 @@ pub(crate) fn run(args: &RenderArgs) -> Result<(), Fail> {
     result
 }
 
-/// Chooses the quality by what it should come to: errors by the reference, times by a cluster like the
-/// one that is to draw, which then draws: it has the bricks.
+/// Chooses the quality for a target: errors by the reference, times by a cluster of this process. The
+/// cluster then renders, since it has the bricks.
 fn aim_here(
     run: &mut Run,
     volume: &Arc<Volume>,
@@ -298,7 +298,7 @@ fn aim_here(
     }
 }
 
-/// The same where the volume is at a master: by its pictures.
+/// Chooses the quality by the cluster's own pictures, where only the master has the volume.
 fn aim_there(
     run: &mut Run,
     client: &Client,
@@ -316,7 +316,7 @@ fn aim_there(
     Ok(())
 }
 
-/// Draws what a picture says of itself, by this process alone. Says nothing at the end.
+/// Renders the request of a picture's provenance in this process. Prints nothing at the end.
 pub(crate) fn again(
     request: RenderRequest,
     output: Output,
@@ -372,7 +372,7 @@ async fn embedded(
     result.and(recorded)
 }
 
-/// What can be shown how.
+/// Checks that `--show` fits the other flags.
 fn showable(
     show: DebugView,
     args: &RenderArgs,
@@ -405,7 +405,7 @@ fn showable(
     Ok(())
 }
 
-/// Pictures about pictures, drawn by this process without any master.
+/// Draws debug views in this process, without a master.
 async fn drawn(
     mut run: Run,
     volume: Arc<Volume>,
@@ -455,7 +455,7 @@ async fn cluster(
 }
 
 impl Run {
-    /// Pictures alone, of which nothing is said at the end.
+    /// Returns a run that prints nothing at its end.
     fn bare(request: RenderRequest, output: Output, quiet: bool) -> Run {
         Run {
             request,
@@ -668,7 +668,7 @@ impl Trace {
     }
 }
 
-/// What is odd about the frames: a person should hear of a blank picture, and why.
+/// Watches for blank frames, so that a note can give the reason.
 #[derive(Default)]
 struct Look {
     blank: Vec<u64>,

@@ -72,7 +72,7 @@ pub fn encode(frame: &Frame, provenance: &str, out: &mut impl Write) -> Result<(
             }
         }
         let packed = pack(&planes)?;
-        // What does not become smaller is stored as it is.
+        // A block that compression does not shrink is stored as it is.
         blocks.push((n * BLOCK, if packed.len() < planes.len() { packed } else { planes }));
     }
     debug_assert_eq!(blocks.len(), h.div_ceil(BLOCK));
@@ -113,7 +113,7 @@ fn pack(bytes: &[u8]) -> Result<Vec<u8>> {
 ///
 /// # Errors
 /// The file is damaged; the text says where.
-pub fn provenance(bytes: &[u8]) -> std::result::Result<Option<String>, String> {
+pub(crate) fn provenance(bytes: &[u8]) -> std::result::Result<Option<String>, String> {
     let cut = || "its header ends early".to_string();
     let mut rest = bytes[..bytes.len().min(MAX_HEADER)].get(8..).ok_or_else(cut)?;
     if bytes[..4] != MAGIC[..4] {
@@ -147,7 +147,7 @@ mod tests {
     use crate::output::tests::frame;
     use std::io::Read;
 
-    /// What [`pack`] does, undone.
+    /// Undoes [`pack`].
     fn unpack(packed: &[u8], long: usize) -> Vec<u8> {
         if packed.len() == long {
             return packed.to_vec();

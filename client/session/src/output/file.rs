@@ -37,7 +37,7 @@ pub(super) fn beside(path: &Path) -> Result<NamedTempFile> {
 /// Checks that a file can be made beside `path`.
 ///
 /// # Errors
-/// It can't.
+/// The file can't be made.
 pub fn probe(path: &Path) -> std::result::Result<(), Fail> {
     beside(path).map(drop).map_err(|e| Fail::io(path, "making the file", &e))
 }
@@ -68,7 +68,7 @@ pub fn write_atomic(
     whole(path, fill).map_err(|e| Fail::io(path, "writing", &e))
 }
 
-/// How often a full disk is tried again. A person who deletes something looks at the progress
+/// Time between two attempts on a full disk. A person who deletes something looks at the progress
 /// within a second or two; at a tenth of this, nothing is gained and logs of the file system fill.
 const TRY_AGAIN: Duration = Duration::from_secs(1);
 
@@ -156,7 +156,7 @@ impl GrowingFile {
     pub(crate) fn add(&mut self, piece: &[u8], patience: &DiskWait) -> Result<()> {
         let GrowingFile { path, file, long } = self;
         patience.until_room(path, || {
-            // What an attempt before left goes.
+            // Removes what a failed attempt left.
             file.as_file().set_len(*long)?;
             file.seek(SeekFrom::Start(*long))?;
             file.write_all(piece)

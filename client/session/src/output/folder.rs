@@ -5,11 +5,11 @@ use crate::fail::Fail;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-/// Where the frames of one run go.
+/// Folder for the frames of one run.
 #[derive(Debug)]
 pub(crate) struct Folder {
     path: PathBuf,
-    /// What names begin with: `frame`.
+    /// Stem of the file names: `frame`.
     stem: &'static str,
     extension: &'static str,
     /// Digits of a frame's number: at least four, so that names sort.

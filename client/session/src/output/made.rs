@@ -16,12 +16,12 @@ impl OutputFolder {
     /// Makes the folder and its missing parents, and checks that files can be made in it.
     ///
     /// # Errors
-    /// They can't.
+    /// A folder or a file in it can't be made.
     pub fn new(path: &Path) -> Result<OutputFolder, Fail> {
         let mut missing: Vec<&Path> =
             path.ancestors().take_while(|p| !p.as_os_str().is_empty() && !p.exists()).collect();
         missing.reverse();
-        // What was made goes again if the rest fails.
+        // Dropped if the rest fails, which removes the folders.
         let mut own = OutputFolder { made: Vec::new() };
         for dir in missing {
             match std::fs::create_dir(dir) {

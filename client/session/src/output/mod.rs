@@ -40,7 +40,7 @@ pub struct Frame {
     pub number: u64,
     /// Width and height in pixels.
     pub size: [u32; 2],
-    /// What `bytes` holds.
+    /// Pixel format of `bytes`.
     pub format: PixelFormat,
     /// Pixels, row-major from the top left, in `format`.
     pub bytes: bytes::Bytes,
@@ -122,7 +122,7 @@ impl Format {
     }
 }
 
-/// Where frames go and in which format, checked before any work.
+/// Target and format of the frames, checked before any work.
 #[derive(clap::Args, Clone, Debug)]
 #[command(next_help_heading = "Output")]
 pub struct OutputArgs {
@@ -150,7 +150,7 @@ pub struct OutputArgs {
     pub force: bool,
 }
 
-/// Where frames go.
+/// Target of the frames.
 #[derive(Debug)]
 enum Target {
     /// A file each.
@@ -163,7 +163,7 @@ enum Target {
     Pipe(Option<PathBuf>),
 }
 
-/// Where frames go and as what.
+/// Target and format of the frames, checked before any work.
 #[derive(Debug)]
 pub struct Output {
     target: Target,
@@ -171,11 +171,11 @@ pub struct Output {
     pub format: Format,
     fps: u16,
     contact: Option<PathBuf>,
-    /// What frames that come as small pictures of floats become.
+    /// How frames that arrive as small pictures of floats are magnified.
     magnify: Option<Magnify>,
 }
 
-/// How a small picture becomes a frame.
+/// Factor and background of magnified frames.
 #[derive(Clone, Copy, Debug)]
 struct Magnify {
     times: u32,
@@ -185,7 +185,7 @@ struct Magnify {
 /// Checks that a file to write is none of the inputs.
 ///
 /// # Errors
-/// It is one; the error names the flag.
+/// The file is an input; the error names the flag.
 pub fn refuse_input(path: &Path, flag: &str, inputs: &[&Path]) -> Result<(), Fail> {
     let same = |input: &&Path| matches!((path.canonicalize(), input.canonicalize()), (Ok(a), Ok(b)) if a == b);
     if inputs.iter().any(same) {

@@ -58,7 +58,7 @@ pub fn encode(frame: &Frame, provenance: &str, out: &mut impl Write) -> Result<(
 ///
 /// # Errors
 /// The file is damaged; the text says where.
-pub fn provenance(bytes: &[u8]) -> std::result::Result<Option<String>, String> {
+pub(crate) fn provenance(bytes: &[u8]) -> std::result::Result<Option<String>, String> {
     let reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info();
     let reader = reader.map_err(|e| e.to_string())?;
     let info = reader.info();

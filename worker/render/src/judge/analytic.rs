@@ -256,7 +256,7 @@ impl LayerStack {
 /// stays below 1e-3/255 for the scenes here; at 1/128 it is four times that.
 pub const STEP: f64 = 1.0 / 256.0;
 
-/// How a picture was rounded, for bounds of its error.
+/// Rounding parameters of a picture, for bounds of its error.
 #[derive(Clone, Copy, Debug)]
 pub struct Rounding {
     /// Thickness of a sheet in vox.

@@ -444,7 +444,7 @@ pub fn whole_registers<const MOST: usize>(n: usize) -> usize {
 /// Work that is compiled for every instruction set. Whatever it calls must be `inline(always)` to
 /// be compiled with it.
 pub trait Work {
-    /// What comes out.
+    /// Result of the work.
     type Out;
     /// Does it. Which instruction set it is compiled for is known where it is: what is for others
     /// is left out.

@@ -16,7 +16,7 @@ use slabcast_common::quality::Sums;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// How a pixel came about: its sheets, their strongest voxels, and what was hidden.
+/// Explanation of one pixel: its sheets, their strongest voxels, and what was hidden.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PixelExplanation {
     /// Linear premultiplied RGBA, equal to the rendered pixel bit for bit.
@@ -207,7 +207,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
         for part in self.sheets.get(&k).into_iter().flatten() {
             let v = &self.voxels[part.voxel as usize];
             if v.first > last {
-                // They ascend.
+                // Voxels ascend by first sheet.
                 break;
             }
             match part.lattice_row {
@@ -285,7 +285,8 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
         }
     }
 
-    /// How many sections of sheet `k` are not zero, of how many bricks, and the strongest.
+    /// Number of sections of sheet `k` that are not zero, number of their bricks, and the
+    /// strongest.
     fn sections(&self, k: i32, secant: f32, n: usize) -> (usize, usize, Vec<SectionAtPixel>) {
         let mut all = Vec::new();
         for part in self.sheets.get(&k).into_iter().flatten() {
@@ -295,7 +296,7 @@ impl<'a, S: Accumulate> Pixel<'a, S> {
                     part.add_to(&mut sums);
                     sums[0].value()
                 }
-                // Its share of a sum that is rounded with others.
+                // The section's share of a sum that is rounded with others.
                 Some(lattice_rows) => {
                     let row = S::default().plus(part.section[0], part.wx).value();
                     row * (part.weights[1] * lattice_rows.spread)

@@ -49,7 +49,7 @@ impl ProjectedBrick {
 /// The pixels of the tile that a part belongs to, read and written, and its voxel counts.
 pub type Io<'a> = (&'a mut TilePixels, &'a mut Counters);
 
-/// Where a part gets its bricks from.
+/// Source of a part's bricks.
 #[derive(Clone, Copy)]
 pub enum BrickSource<'a> {
     /// All bricks of the tile are held.

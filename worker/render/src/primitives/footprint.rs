@@ -45,7 +45,7 @@ pub struct Sections {
     back: i32,
     /// Row of `stride` weights a phase; those that a phase does not need are zero.
     weights: Vec<f32>,
-    /// The same over the thickness, in steps of the lattice, as [`fixed`] point.
+    /// Weights over the thickness, in lattice steps, as [`fixed`] point.
     fixed: Vec<i16>,
     stride: usize,
 }
@@ -67,7 +67,7 @@ fn fixed(w: f64) -> i16 {
     libm::floor(w * 32768.0 + 0.5).clamp(0.0, 32767.0) as i16
 }
 
-/// How far a kernel reaches, in phases.
+/// Reach of a kernel in phases.
 fn whole_phases(profile: &Profile, thickness: f64, phases: i32) -> i32 {
     // What f64 leaves above an integer is not a phase more.
     libm::ceil(profile.radius / thickness * f64::from(phases) * (1.0 - 1e-12)) as i32
@@ -194,7 +194,7 @@ impl Sections {
     }
 }
 
-/// How sections of voxels lie aside of each other.
+/// Shear of a view's sections: offsets of a voxel's sections from each other.
 #[derive(Clone, Copy, Debug)]
 #[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))] // Some of it is read in lanes alone.
 pub struct Slant<'a> {
@@ -211,13 +211,13 @@ pub struct Slant<'a> {
     pub wide: usize,
 }
 
-/// Where sections and rows of a kernel that leans lie ([`slabcast_common::kernel`]).
+/// Offsets of sections and rows of a kernel that leans ([`slabcast_common::kernel`]).
 #[derive(Debug)]
 pub struct Leaning {
     /// How far each section lies beside its voxel along x and y, in vox: as [`Sections::all`] has
     /// weights.
     aside: [Vec<f64>; 2],
-    /// The same in subpixels, where a view is parallel.
+    /// Offsets in subpixels, in orthographic views.
     subpixels: [Vec<i32>; 2],
     /// [`Lean::row_fixed`].
     row: i64,
@@ -347,7 +347,7 @@ struct AxisTable {
     first: First,
     count: Vec<u32>,
     weights: Vec<Tap>,
-    /// The same in steps of the lattice, as fixed point.
+    /// Weights in lattice steps, as fixed point.
     fixed: Vec<i16>,
     /// Weights of a phase at most.
     stride: usize,
@@ -403,7 +403,7 @@ impl First {
     }
 }
 
-/// Where the weights of each phase lie in a table along one axis.
+/// Layout of a weight table along one axis: where the weights of each phase begin.
 #[derive(Clone, Copy, Debug)]
 pub struct Phases {
     first: First,
@@ -669,7 +669,7 @@ impl Footprints {
 pub struct Footprint<'a> {
     /// Pixels a vox, which says where it lies.
     pub scale: f64,
-    /// The same, rounded, which says how wide it is.
+    /// Scale rounded to a table's, which decides the footprint's width.
     wide: f64,
     table: Option<&'a Tables>,
     profiles: [&'a Profile; 2],
@@ -744,7 +744,7 @@ impl<'a> Footprint<'a> {
         self.table.map(|t| &t.along(axis).fixed[..])
     }
 
-    /// Where they lie.
+    /// Layout of the weight table along `axis`.
     pub fn phases(&self, axis: usize) -> Option<Phases> {
         self.table.map(|t| t.along(axis).phases())
     }

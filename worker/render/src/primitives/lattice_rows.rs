@@ -44,7 +44,7 @@ pub struct LatticeRows {
     step: f64,
     /// Positions in subpixels, where places are in integers.
     flat: Option<Vec<i64>>,
-    /// How many a footprint reaches to either side.
+    /// Lattice rows that a footprint reaches to either side.
     reach: f64,
     /// Length of a step of the lattice in vox: rows are kept over it, and weights down have it as a
     /// factor, so that a solid's rows are as its sums.
@@ -85,7 +85,7 @@ impl LatticeRows {
         (0..n).map(|s| of(along(if self.upwards { n - 1 - s } else { s }))).collect()
     }
 
-    /// Which one a voxel belongs to, by its index.
+    /// Lattice row of the voxel at `index`.
     #[inline(always)]
     pub(crate) fn of_voxel(&self, index: [u32; 3]) -> u32 {
         let n = index[self.axis];
@@ -97,7 +97,7 @@ impl LatticeRows {
         self.flat = Some(self.all(at));
     }
 
-    /// How many there are.
+    /// Number of lattice rows.
     pub(crate) fn len(&self) -> usize {
         self.eye.len()
     }
@@ -182,7 +182,7 @@ impl LatticeRows {
 /// The lattice rows that reach a row of pixels in one sheet.
 #[derive(Clone, Copy, Default)]
 pub(crate) struct Reaching<W> {
-    /// Which, and each one's weight.
+    /// Index and weight of each.
     pub(crate) some: [(i32, W); REACHING],
     pub(crate) n: usize,
 }

@@ -92,7 +92,7 @@ pub(crate) struct ProjectedBlock {
     bricks: OnceLock<Vec<VisibleBrick>>,
 }
 
-/// Which bricks of a [`Directory`] lie over which part of a frame, front to back. Blocks are
+/// Bricks of a [`Directory`] over each part of a frame, front to back. Blocks are
 /// projected at once, their bricks when first needed, by any thread.
 #[derive(Debug)]
 pub struct VisibleBricks {

@@ -61,18 +61,19 @@ pub(crate) struct Model {
 #[derive(Clone)]
 struct Near {
     eye: DVec3,
-    /// The same as the eye sees it.
+    /// Position in eye coordinates.
     seen: DVec3,
-    /// Where sheets have it (in perspective each sheet has it somewhere else: across as it is).
+    /// Position rounded as sheets have it; in perspective, where each sheet rounds otherwise, in
+    /// depth alone.
     rounded: DVec3,
-    /// Which it is of which brick.
+    /// Index of the brick and of the voxel in it.
     voxel: (u32, u32),
     /// Extinction per vox and that times the colours, for kernels that integrate to one: known of
     /// those that a ray came to.
     payload: Cell<Option<[f32; 4]>>,
     /// Steps that it reaches, from one on to the one behind the last.
     steps: [usize; 2],
-    /// Where its weights in depth are, once they are known.
+    /// Offset of the voxel's weights in depth, once they are known.
     deep: Cell<Option<usize>>,
 }
 

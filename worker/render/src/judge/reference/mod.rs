@@ -1,6 +1,6 @@
 //! The judge of error: what a pixel would be with no approximation at all.
 //!
-//! The picture in the limit (DESIGN.md section 1) is an integral along a ray,
+//! The picture in the limit (docs/design/model.md) is an integral along a ray,
 //!
 //! ```text
 //! I = int sigma(s) C(s) exp(-int sigma) ds,     alpha = 1 - exp(-int sigma)
@@ -71,14 +71,14 @@ pub struct Reference {
     grid: BrickGrid,
     /// Extinctions, whatever the quality's compositing: the limit knows no other.
     looks: Classifier,
-    /// What the sheets of the quality's compositing add.
+    /// Payloads that the sheets of the quality's compositing add.
     sheet_looks: Classifier,
     compositing: Compositing,
     shader: Option<Shader>,
     kernel: [Profile; 3],
-    /// Its deviations.
+    /// The kernel's deviations in vox along the eye's axes.
     std: DVec3,
-    /// How the kernel leans: slopes of x and y over depth, and of x over y.
+    /// Shear of the kernel: slopes of x and y over depth, and of x over y.
     lean: [f64; 3],
     /// Steps of the lattice, sample (0, 0, 0), and back to the index, upright.
     steps: DMat3,
@@ -118,7 +118,7 @@ impl Reference {
                 let (centre, half) = (origin + m * ((lo + hi) * 0.5), (hi - lo) * 0.5);
                 let reach =
                     m.x_axis.abs() * half.x + m.y_axis.abs() * half.y + m.z_axis.abs() * half.z;
-                // What two ways to compute a position may differ by.
+                // Two ways to compute a position may differ by this much.
                 let reach = reach + DVec3::splat(1e-9 * (1.0 + centre.abs().max_element()));
                 (brick.clone(), EyeBox { lo: centre - reach, hi: centre + reach })
             })

@@ -103,7 +103,7 @@ pub(super) struct Panel {
     pub(super) light: [f64; 4],
 }
 
-/// What a ray has gathered.
+/// Optical depth and light that a ray has gathered.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Light {
     pub(super) depth: f64,

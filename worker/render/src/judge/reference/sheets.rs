@@ -14,7 +14,7 @@ use slabcast_common::view::{Projection, SUBPIXELS};
 /// all are the same.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum SectionPlacement {
-    /// The sheet's mid-plane: the model (DESIGN.md section 1), and what is drawn.
+    /// The sheet's mid-plane: the model (docs/design/model.md), and what is drawn.
     #[default]
     MidPlane,
     /// The depth of the section's centroid.
@@ -42,7 +42,7 @@ impl SectionPlacement {
 /// Options of [`Reference::by_sheets`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SheetOptions {
-    /// Where footprints of sections are placed.
+    /// Depth at which footprints of sections are placed.
     pub section: SectionPlacement,
     /// Whether positions are rounded to subpixels and depth phases, as in a rendered picture.
     pub rounded: bool,
@@ -283,7 +283,7 @@ struct Stack {
     /// Index of the first.
     base: i64,
     sheets: Vec<[f64; 4]>,
-    /// The same without the voxels that begin in the sheet: what the one in front peeks at.
+    /// Sums without the voxels that begin in the sheet, which the sheet in front peeks at.
     peeks: Vec<[f64; 4]>,
     /// Thickness over the kernel's standard deviation.
     y: f64,
@@ -315,7 +315,8 @@ impl Stack {
     }
 }
 
-/// Light and opacity of one sheet (NUMERICS.md section 1.2, the paper's section 3), in f64.
+/// Light and opacity of one sheet (docs/design/numerics.md, section 1.2, the paper's section 3), in
+/// f64.
 /// `y`: thickness over the kernel's standard deviation along z.
 fn close(
     compositing: Compositing,

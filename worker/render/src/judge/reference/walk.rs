@@ -18,7 +18,7 @@ const PANEL: f64 = 0.8;
 pub struct Ray {
     pub(super) at: [f64; 2],
     pub(super) slope: [f64; 2],
-    /// What part of the slope is the kernel's lean and not the eye's.
+    /// Part of the slope that is the kernel's shear and not the eye's.
     pub(super) lean: [f64; 2],
     /// The near plane.
     pub(super) start: f64,

@@ -22,7 +22,7 @@ pub trait Sum: Copy + Default + PartialEq {
     const GREY: bool = false;
     /// The sum as a number.
     fn value(self) -> f32;
-    /// Its bits.
+    /// Bits of the sum, as it travels.
     fn bits(self) -> u32;
     /// From bits.
     fn from_bits(bits: u32) -> Self;
@@ -112,7 +112,7 @@ impl Rule {
         }
     }
 
-    /// The same, but no pixel is ever shut.
+    /// Returns this rule without a cut-off: no pixel is ever shut.
     #[must_use]
     pub(crate) fn never_shut(self) -> Self {
         Rule { eps: 0.0, ..self }
@@ -266,11 +266,11 @@ pub struct Row {
     pub behind: [[f32; LANES]; 4],
     /// Length of the rays in the sheet over its thickness, and one over it.
     pub secant: [f32; LANES],
-    /// See there.
+    /// One over the secant.
     pub cosine: [f32; LANES],
     /// Opacity before, and after.
     pub a: [f32; LANES],
-    /// What the sheet adds to the fixed-point colour.
+    /// Light that the sheet adds, in fixed point.
     pub light: [[u32; LANES]; 3],
 }
 

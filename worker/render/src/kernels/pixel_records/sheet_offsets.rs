@@ -166,7 +166,8 @@ impl Apart {
     }
 }
 
-/// [`Apart::lean`]: a voxel's sheets lie beside each other in the table, and voxels in what comes out.
+/// [`Apart::lean`]: a voxel's sheets lie beside each other in the table, and voxels in what comes
+/// out.
 #[cfg(target_arch = "x86_64")]
 mod lean {
     use super::{BATCH, Each, LINE};

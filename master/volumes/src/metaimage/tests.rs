@@ -1,0 +1,106 @@
+use super::*;
+use slabcast_common::volume::Samples;
+
+const HEAD: &str = "ObjectType = Image\nNDims = 3\nDimSize = 3 2 1\nElementType = MET_UCHAR\n";
+
+fn open(header: &str, data: &[u8]) -> Result<Volume, Problem> {
+    let bytes = [header.as_bytes(), data].concat();
+    crate::read(Source::memory(bytes), Path::new("."), "test.mha", &crate::Hints::default())
+}
+
+#[test]
+fn local_data_are_read_raw_packed_and_as_text() {
+    let data = [1, 2, 3, 4, 5, 6];
+    let want = Samples::U8(data.to_vec());
+    let local = |more: &str| format!("{HEAD}{more}ElementDataFile = LOCAL\n");
+    assert_eq!(open(&local(""), &data).unwrap().samples, want);
+    let packed = local("CompressedData = True\nCompressedDataSize = 99\n");
+    assert_eq!(open(&packed, &crate::fuzz::zlib(&data)).unwrap().samples, want);
+    assert_eq!(open(&packed, &crate::fuzz::gzip(&data)).unwrap().samples, want);
+    assert_eq!(open(&local("BinaryData = False\n"), b"1 2 3\n4 5 6\n").unwrap().samples, want);
+    assert_eq!(
+        open(&local("HeaderSize = 2\n"), b"xx\x01\x02\x03\x04\x05\x06").unwrap().samples,
+        want
+    );
+    assert_eq!(
+        open(&local("HeaderSize = -1\n"), b"xxx\x01\x02\x03\x04\x05\x06").unwrap().samples,
+        want
+    );
+    let dos = local("").replace('\n', "\r\n");
+    assert_eq!(open(&dos, &data).unwrap().samples, want);
+}
+
+#[test]
+fn rows_of_the_matrix_are_index_axes_in_lps() {
+    let more = "TransformMatrix = 0 1 0 0 0 1 -1 0 0\nElementSpacing = 1 2 3\nOffset = 4 5 6\n";
+    let v = open(&format!("{HEAD}{more}ElementDataFile = LOCAL\n"), &[0; 6]).unwrap();
+    assert!(v.anatomical);
+    assert_eq!(v.lattice.steps, [-DVec3::Y, DVec3::Z * 2.0, DVec3::X * 3.0]);
+    assert_eq!(v.lattice.origin, DVec3::new(-4.0, -5.0, 6.0));
+    let v = open(&format!("{HEAD}ElementSize = 1 2 3\nElementDataFile=LOCAL\n"), &[0; 6]);
+    let v = v.unwrap();
+    assert!(!v.anatomical, "spacings alone do not say where the axes point");
+    assert_eq!(v.lattice.spacing(), [1.0, 2.0, 3.0]);
+}
+
+#[test]
+fn types_and_orders_are_as_named() {
+    for (kind, name, bytes) in [
+        ("MET_CHAR", "int8", 1),
+        ("MET_USHORT", "uint16", 2),
+        ("MET_LONG", "int32", 4),
+        ("MET_ULONG_LONG", "uint64", 8),
+        ("MET_FLOAT", "float32", 4),
+        ("MET_DOUBLE", "float64", 8),
+    ] {
+        let head = HEAD.replace("MET_UCHAR", kind) + "ElementDataFile = LOCAL\n";
+        assert_eq!(open(&head, &vec![0; 6 * bytes]).unwrap().file_type, name);
+        let e = open(&head, &vec![0; 6 * bytes - 1]).unwrap_err().to_string();
+        assert!(e.contains("bytes are needed and"), "{e}");
+    }
+    let head = HEAD.replace("MET_UCHAR", "MET_USHORT").replace("3 2 1", "1 1 1");
+    let msb = format!("{head}BinaryDataByteOrderMSB = True\nElementDataFile = LOCAL\n");
+    assert_eq!(open(&msb, &[1, 2]).unwrap().samples, Samples::U16(vec![258]));
+}
+
+#[test]
+fn what_is_not_read_is_refused_by_field_and_remedy() {
+    let with = |from: &str, to: &str| format!("{HEAD}ElementDataFile = LOCAL\n").replace(from, to);
+    for (header, say) in [
+        (HEAD.to_string(), "line 5: `\\0\\0\\0\\0\\0\\0` is not `Key = Value`"),
+        (with("Image", "Tube"), "ObjectType (line 1): `Tube` is no image"),
+        (with("NDims = 3", "NDims = 4"), "NDims (line 2): `4` is not 3"),
+        (with("DimSize = 3 2 1\n", ""), "DimSize: is missing"),
+        (with("3 2 1", "3 2"), "`3 2` is not three whole numbers"),
+        (with("3 2 1", "3 0 1"), "3 x 0 x 1 has no samples"),
+        (with("3 2 1", "3 2 -1"), "is not three whole numbers"),
+        (with("MET_UCHAR", "MET_STRING"), "ElementType (line 4): `MET_STRING` is no type"),
+        (with("ElementDataFile", "CompressedData = Maybe\nElementDataFile"), "give True or False"),
+        (with("ElementDataFile", "ElementSpacing = 1 1\nElementDataFile"), "is not 3 numbers"),
+        (
+            with("ElementDataFile", "ElementSpacing = 1 1 0\nElementDataFile"),
+            "ElementSpacing: a spacing is zero",
+        ),
+        (
+            with("ElementDataFile", "TransformMatrix = 1 0 0 1 0 0 0 0 1\nElementDataFile"),
+            "would be flat",
+        ),
+        (
+            with("ElementDataFile", "ElementNumberOfChannels = 3\nElementDataFile"),
+            "save one channel",
+        ),
+        (with("ElementDataFile", "NDims = 3\nElementDataFile"), "was given in line 2 already"),
+        (with("ElementDataFile", "HeaderSize = x\nElementDataFile"), "is no number of bytes"),
+        (with("LOCAL", "no.raw"), "ElementDataFile: `no.raw` is not there"),
+        (with("LOCAL", "../x.raw"), "ElementDataFile"),
+        (with("LOCAL", "LIST\na\nb"), "names 3 files where DimSize wants 1"),
+        (with("LOCAL", "a%03d.raw 1 2 1"), "names 2 files where DimSize wants 1"),
+        (with("LOCAL", "a%s.raw 1 2 1"), "in a way that is not known"),
+        (with("ElementDataFile", "nonsense\nElementDataFile"), "`nonsense` is not `Key = Value`"),
+    ] {
+        let e = open(&header, &[0; 6]).unwrap_err().to_string();
+        assert!(e.contains(say), "want {say:?} in {e}");
+    }
+    let e = open(HEAD, b"").unwrap_err().to_string();
+    assert!(e.contains("ElementDataFile: is missing; end the header with"), "{e}");
+}

@@ -1,0 +1,184 @@
+use super::*;
+use proptest::prelude::*;
+use slabcast_common::brick::local_position;
+use slabcast_common::shade::NO_NORMAL;
+use slabcast_common::volume::{Lattice, ValueMap};
+use slabcast_scene::path::{Crop, CropUnit};
+
+fn span(a: f64, b: f64) -> Support {
+    Support { intervals: vec![(a, b)], nan: false }
+}
+
+/// Looks at every voxel of a volume, plainly, and compares with what the store holds.
+fn check(volume: &Volume, support: &Support, normals: bool) -> BrickStore {
+    let support = support.clone();
+    check_all(volume, &BrickNeeds { support, normals, gradients: false, crop: None })
+}
+
+fn check_all(volume: &Volume, wanted: &BrickNeeds) -> BrickStore {
+    let (support, normals) = (&wanted.support, wanted.normals);
+    let digest = volume.digest();
+    let store = BrickStore::build(volume, digest, wanted);
+    let dims = volume.lattice.dims;
+    let grid = BrickGrid::new(dims);
+    let m = volume.gradient_matrix();
+    assert_eq!(store.key(), wanted.set_key(digest));
+    assert!(store.infos().windows(2).all(|w| w[0].id < w[1].id), "ids ascend");
+    let mut seen = std::collections::BTreeMap::new();
+    let mut bytes = 0;
+    for info in store.infos().iter() {
+        let encoded = store.encoded(info.id).expect("every info has an encoding");
+        assert_eq!(encoded.len(), info.bytes as usize);
+        let again = store.encoded(info.id).expect("as before");
+        assert_eq!(again.as_ptr(), encoded.as_ptr(), "encoded once, then shared");
+        let brick = store.brick(info.id).expect("every info has a brick");
+        let again = store.brick(info.id).expect("as before");
+        assert!(Arc::ptr_eq(&brick, &again), "unpacked once, then shared");
+        assert_eq!(store.encoded(info.id).expect("as before"), encoded, "packed anew");
+        assert_eq!(brick.id, info.id);
+        assert_eq!(brick.len(), usize::from(info.voxels));
+        assert!(!brick.is_empty() && brick.index.windows(2).all(|w| w[0] < w[1]));
+        assert_eq!(brick.tight_box(&grid), info.tight);
+        assert_eq!(brick.normals.is_some(), normals);
+        assert_eq!(brick.gradients.is_some(), wanted.gradients);
+        // NaN is not equal to itself; its bytes are.
+        let decoded = Brick::decode(&encoded).expect("our own bytes are good");
+        let mut re_encoded = Vec::new();
+        decoded.encode(&mut re_encoded);
+        assert_eq!(re_encoded, encoded);
+        bytes += encoded.len() as u64;
+        let corner = grid.corner(info.id);
+        for (n, &i) in brick.index.iter().enumerate() {
+            let l = local_position(i);
+            let at: [u32; 3] = std::array::from_fn(|a| corner[a] + l[a]);
+            let normal = brick.normals.as_ref().map(|v| v[n]);
+            if let Some(g) = &brick.gradients {
+                let want = volume.gradient(at, &m).length();
+                assert_eq!(g[n], encode_magnitude(want, &volume.summary), "gradient at {at:?}");
+            }
+            let before = seen.insert([at[2], at[1], at[0]], (brick.values.code(n), normal));
+            assert_eq!(before, None, "voxel {at:?} is in two bricks");
+        }
+    }
+    assert_eq!(bytes, store.bytes());
+    let mut relevant = 0;
+    for k in 0..dims[2] {
+        for j in 0..dims[1] {
+            for i in 0..dims[0] {
+                let offset = ((k * dims[1] + j) * dims[0] + i) as usize;
+                let code = volume.samples.code(offset);
+                let found = seen.remove(&[k, j, i]);
+                let inside = wanted.crop.is_none_or(|c| c.contains(&volume.lattice, [i, j, k]));
+                if !support.contains(code) || !inside {
+                    assert!(found.is_none(), "({i}, {j}, {k}) is not relevant");
+                    continue;
+                }
+                relevant += 1;
+                let (value, normal) = found.unwrap_or_else(|| panic!("({i}, {j}, {k}) is missing"));
+                assert_eq!(value.to_bits(), code.to_bits());
+                let want = normals.then(|| encode_normal(volume.gradient([i, j, k], &m)));
+                assert_eq!(normal, want, "normal at ({i}, {j}, {k})");
+            }
+        }
+    }
+    assert!(seen.is_empty(), "voxels outside of the volume: {seen:?}");
+    assert_eq!(relevant, store.relevant_voxels());
+    store
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+    #[test]
+    fn every_relevant_voxel_is_in_one_brick_with_its_value_and_normal(
+        dims in [1u32..20, 1u32..20, 1u32..20], kind in 0u8..3, normals in any::<bool>(),
+        seed in any::<u32>(), cut in 0.0..1.2f64, shear in -0.5..0.5f64, crop in any::<bool>(),
+    ) {
+        let n = dims.iter().product::<u32>();
+        let hash = |i: u32| (seed ^ i).wrapping_mul(2_654_435_761).rotate_left(13) >> 5;
+        let (samples, top) = match kind {
+            0 => (Samples::U8((0..n).map(|i| hash(i) as u8).collect()), 255.0),
+            1 => (Samples::U16((0..n).map(|i| hash(i) as u16).collect()), 65535.0),
+            _ => (Samples::F32((0..n).map(|i| match hash(i) % 31 {
+                0 => f32::NAN,
+                1 => f32::INFINITY,
+                _ => (hash(i) % 1000) as f32 * 1e-3,
+            }).collect()), 1.0),
+        };
+        let mut lattice = Lattice::from_spacing(dims, [1.0, 0.7, 2.5]);
+        lattice.steps[1].x = shear;
+        let volume = Volume::new("v", "t", false, lattice, samples, ValueMap::IDENTITY);
+        let support = Support {
+            intervals: vec![(0.1 * top * cut, 0.2 * top * cut), (top * cut, top)],
+            nan: seed % 2 == 0,
+        };
+        let crop = crop.then(|| {
+            let share = Some(f64::from(seed % 7) / 10.0);
+            let crop = Crop { unit: CropUnit::Unit, x: [None, share.map(|s| s + 0.2)], y: [share, None], ..Crop::default() };
+            crop.resolve(&volume.lattice).unwrap()
+        });
+        check_all(&volume, &BrickNeeds { support, normals, gradients: seed % 3 == 0, crop });
+    }
+}
+
+#[test]
+fn empty_and_full_and_flat_volumes() {
+    let full = Volume::from_fn_u8("full", [17, 9, 8], |_, _, _| 200);
+    let store = check(&full, &span(1.0, 255.0), true);
+    assert_eq!((store.infos().len(), store.relevant_voxels()), (6, 17 * 9 * 8));
+    let flat = store.infos().iter().all(|b| {
+        let brick = store.brick(b.id).unwrap();
+        brick.normals.as_ref().unwrap().iter().all(|&n| n == NO_NORMAL)
+    });
+    assert!(flat, "a constant field has no normals");
+    let none = check(&full, &span(201.0, 255.0), true);
+    assert_eq!((none.infos().len(), none.bytes()), (0, 0));
+    assert!(none.brick(BrickId(0)).is_none() && none.encoded(BrickId(0)).is_none());
+    let nothing = Support::default();
+    assert_eq!(check(&full, &nothing, false).relevant_voxels(), 0);
+    for dims in [[1, 1, 1], [4096, 1, 1], [1, 65, 1], [1, 1, 33]] {
+        let line = Volume::from_fn_u8("line", dims, |i, j, k| (i + j + k) as u8 | 1);
+        check(&line, &span(1.0, 255.0), true);
+    }
+}
+
+#[test]
+fn a_set_with_normals_and_one_without_have_different_keys() {
+    let v = Volume::from_fn_u8("v", [8; 3], |i, _, _| i as u8);
+    let support = span(3.0, 4.0);
+    let (with, without) = (check(&v, &support, true), check(&v, &support, false));
+    assert_ne!(with.key(), without.key());
+    assert!(with.wanted().normals && !without.wanted().normals);
+    assert_eq!(with.wanted().support, support);
+    assert!(with.bytes() > without.bytes());
+}
+
+#[test]
+fn a_table_is_what_the_support_says_for_every_code() {
+    for intervals in [
+        vec![],
+        vec![(0.0, 255.0)],
+        vec![(0.0, 0.0), (7.0, 9.0), (255.0, 255.0)],
+        vec![(-5.0, 2.5), (250.2, 1e9)],
+        vec![(3.2, 3.8), (f64::NEG_INFINITY, -1.0), (300.0, f64::INFINITY)],
+    ] {
+        let support = Support { intervals, nan: true };
+        for (code, &relevant) in table(&support, 256).iter().enumerate() {
+            assert_eq!(relevant, support.contains(code as f64), "{code} of {support:?}");
+        }
+    }
+}
+
+#[test]
+fn many_threads_get_the_same_bytes() {
+    let v = Volume::from_fn_u8("v", [32; 3], |i, j, k| (i * j + k) as u8 | 1);
+    let wanted =
+        BrickNeeds { support: span(1.0, 255.0), normals: true, gradients: false, crop: None };
+    let store = BrickStore::build(&v, Digest32::default(), &wanted);
+    let id = store.infos()[7].id;
+    let seen: Vec<usize> = std::thread::scope(|s| {
+        let ask = || store.encoded(id).expect("it is relevant").as_ptr() as usize;
+        let threads: Vec<_> = (0..8).map(|_| s.spawn(ask)).collect();
+        threads.into_iter().map(|t| t.join().expect("no panic")).collect()
+    });
+    assert!(seen.windows(2).all(|w| w[0] == w[1]));
+}

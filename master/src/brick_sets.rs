@@ -18,7 +18,7 @@ pub(crate) struct BrickSets {
 impl BrickSets {
     /// A set that covers `wanted`.
     pub(crate) fn covering(&self, wanted: &BrickNeeds) -> Option<&Arc<BrickStore>> {
-        self.sets.iter().find(|s| s.wanted().covers(wanted))
+        self.sets.iter().find(|s| s.needs().covers(wanted))
     }
 
     /// The set with this key.

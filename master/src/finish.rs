@@ -172,7 +172,7 @@ fn left_out(
     request: &PathRequest,
     bricks: &BrickStats,
 ) -> Vec<LeftOut> {
-    let (wanted, voxels) = (store.wanted(), store.relevant_voxels());
+    let (wanted, voxels) = (store.needs(), store.relevant_voxels());
     let all: u64 = scene.volume.lattice.dims.iter().map(|&n| u64::from(n)).product();
     // Stored voxels, with their index and their share of the brick's header.
     let bytes = |n: u64| (n as f64 * store.bytes() as f64 / voxels.max(1) as f64) as u64;

@@ -41,20 +41,20 @@ pub(crate) struct ConvertArgs {
 pub(crate) fn run(args: &ConvertArgs) -> Result<(), Fail> {
     let shown = args.output.display();
     let name = args.output.file_name().unwrap_or_default().to_string_lossy();
-    let Some(mut format) = Format::of_name(&name) else {
+    let Some(mut format) = Format::from_name(&name) else {
         return Err(Fail::usage(format!(
             "OUT: `{shown}` names no format that is written; end it with .nrrd, .nii or .nii.gz"
         )));
     };
     if let Some(encoding) = &args.encoding {
         let gzip = encoding == "gzip";
-        if format.packed(gzip) != format && matches!(format, Format::Nifti { .. }) {
+        if format.with_gzip(gzip) != format && matches!(format, Format::Nifti { .. }) {
             return Err(Fail::usage(format!(
                 "--encoding: {encoding} does not go with `{name}`; a packed NIfTI file ends in \
                  .nii.gz, any other in .nii"
             )));
         }
-        format = format.packed(gzip);
+        format = format.with_gzip(gzip);
     }
     if args.output.is_dir() {
         return Err(Fail::failed(format!("{shown}: is a folder; give a file")));
@@ -79,7 +79,7 @@ pub(crate) fn run(args: &ConvertArgs) -> Result<(), Fail> {
     bar.phase(&format!("reading {}", args.volume.display()));
     let (input, file) = (args.input.clone(), args.volume.clone());
     let volume = signals::run_unless_stopped(move || input.open(&file))?;
-    if let Some(lost) = write::loses(&volume, format) {
+    if let Some(lost) = write::loss_warning(&volume, format) {
         progress::warn(&lost);
     }
     let (to, what) = (args.output.clone(), format!("writing {shown}"));

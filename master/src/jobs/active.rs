@@ -99,7 +99,7 @@ impl ActiveJobs {
     pub(crate) fn share_bricks(&mut self, sets: &BrickSets) {
         for job in self.by_id.values_mut().filter(|job| job.store.is_none()) {
             let set = sets.get(job.scene.bricks);
-            job.store = set.filter(|s| s.wanted().covers(&job.wanted)).cloned();
+            job.store = set.filter(|s| s.needs().covers(&job.wanted)).cloned();
         }
     }
 

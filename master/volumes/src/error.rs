@@ -1,45 +1,45 @@
-//! Why a file was not opened: one line for a person, with the file, the field and the remedy.
+//! Errors of opening a file: one line each, with the file, the field and the remedy.
 
-/// What kind of trouble it is, for callers that treat kinds differently.
+/// Kind of failure, for callers that treat kinds differently.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum OpenErrorKind {
-    /// Missing, a folder, a pipe or device, or the operating system refused.
+    /// The file is missing, is a folder, or the operating system refused to read it.
     Unreadable,
-    /// The content is something else.
+    /// The content is no volume: another kind of file, or empty.
     NotAVolume,
-    /// A volume file whose fields contradict themselves or its format.
+    /// The fields of a volume file contradict each other, its format or the hints.
     Malformed,
-    /// A proper file of a sort that this version does not read.
+    /// The file is sound, but of a variant that this version does not read.
     Unsupported,
-    /// A header that points at data outside its own folder, or at something that is no file.
+    /// A header points outside its own folder, or something is a pipe, socket or device.
     Forbidden,
-    /// Beyond this program's limits or this machine's memory.
+    /// The volume exceeds a limit of this program or the memory of this machine.
     TooLarge,
     /// The samples end early, go on too long, or fail their checksum.
     Damaged,
 }
 
-/// What is wrong, before anybody said in which file.
+/// A failure without the name of the file: kind, field, what is wrong, and the remedy.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{}", one_line(&format!("{field}: {what}; {remedy}")))]
 pub struct Problem {
-    /// What kind of trouble.
+    /// Kind of failure.
     pub kind: OpenErrorKind,
-    /// Which field of the file, in the words of its format (`content` where it has none).
+    /// Field of the file, in the words of its format (`content` where it has none).
     pub field: String,
-    /// What is wrong with it.
+    /// What is wrong with the field, for a person.
     pub what: String,
-    /// What to do.
+    /// What the user can do about it.
     pub remedy: String,
 }
 
-/// A file that was not opened, and why. It is shown as one line.
+/// A file that was not opened, and why. `Display` prints one line without control characters.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{}: {problem}", one_line(file))]
 pub struct OpenError {
-    /// The path as it was given.
+    /// Path as the caller gave it.
     pub file: String,
-    /// What is wrong.
+    /// The failure.
     pub problem: Problem,
 }
 
@@ -69,7 +69,7 @@ impl Problem {
         Problem::new(OpenErrorKind::Unsupported, field, what, remedy)
     }
 
-    /// A reader's thread panicked: a mistake of this program, which the file brought out.
+    /// A panic in a reader's thread, which is a bug of this program.
     pub(crate) fn panicked(field: impl Into<String>, panic: &(dyn std::any::Any + Send)) -> Self {
         let message = panic
             .downcast_ref::<String>()
@@ -93,7 +93,7 @@ impl Problem {
     }
 }
 
-/// A stranger's text between quotes, short and without control characters.
+/// Quotes text of a file: at most 60 characters, control characters escaped.
 pub(crate) fn quoted(text: &str) -> String {
     const SHOWN: usize = 60;
     let mut s: String = text.chars().take(SHOWN).flat_map(char::escape_debug).collect();
@@ -103,7 +103,7 @@ pub(crate) fn quoted(text: &str) -> String {
     format!("`{s}`")
 }
 
-/// Errors are one line even when a file's name is not.
+/// Replaces control characters, so that an error stays one line whatever the file's name.
 fn one_line(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect()
 }
@@ -113,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_error_is_one_line_whatever_the_name() {
+    fn error_is_one_line_even_if_the_file_name_has_newlines() {
         let e = OpenError {
             file: "evil\nname\u{1b}[31m.nrrd".into(),
             problem: Problem::malformed("sizes", quoted("a\nb"), "give three numbers"),

@@ -1,16 +1,17 @@
-//! Volumes by formula: for tests, checks and demos, with answers that can be worked out on
-//! paper. `open` takes them as `formula:NAME` or `formula:NAME:SIZE`.
+//! Volumes computed from formulas, for tests, checks and demos whose results can be worked out on
+//! paper. [`open`](crate::open) takes `formula:NAME` or `formula:NAME:SIZE`, where SIZE is `N` or
+//! `AxBxC` samples.
 //!
-//! Their digests are part of golden frames, so a formula is never changed; a better one gets a
-//! new name. All arithmetic is exact or by `libm`, the same on every machine.
+//! Golden frames depend on the digests, so a formula never changes; a better one gets a new name.
+//! All arithmetic is exact or by `libm`, and gives the same volume on every machine.
 
 use crate::error::{Problem, quoted};
 use slabcast_common::volume::{Lattice, Samples, ValueMap, Volume};
 
-/// What the names of formula volumes begin with.
+/// Prefix that marks a path as a formula: `formula:`.
 pub const PREFIX: &str = "formula:";
 
-/// Every name and what it shows.
+/// Names of all formulas, each with a line for a person on what the volume shows.
 pub const NAMES: [(&str, &str); 11] = [
     ("wall", "a block of 200 in the middle half: closed form of every ray"),
     ("two-walls", "two plates across y, 100 in front of 200: the first hides the second"),
@@ -25,16 +26,16 @@ pub const NAMES: [(&str, &str); 11] = [
     ("line", "4096x1x1"),
 ];
 
-/// Most samples of a formula volume: `spheres`, the slowest, then takes 9 s and 256 MiB.
+/// Most samples of a formula volume. `spheres`, the slowest, then takes 9 s and 256 MiB.
 const SAMPLES_MAX: u64 = 1 << 28;
 
-/// The volume called `text`, `formula:` included.
+/// Computes the volume that `text` names, with or without the prefix.
 pub(crate) fn open(text: &str) -> Result<Volume, Problem> {
     let mut parts = text.strip_prefix(PREFIX).unwrap_or(text).splitn(2, ':');
     let name = parts.next().unwrap_or_default();
     let dims = match parts.next() {
         None => default_dims(name),
-        Some(size) => match sized(name, size) {
+        Some(size) => match parse_size(name, size) {
             Some(dims) => dims,
             None => {
                 return Err(Problem::malformed(
@@ -66,7 +67,7 @@ fn default_dims(name: &str) -> [u32; 3] {
     }
 }
 
-fn sized(name: &str, size: &str) -> Option<[u32; 3]> {
+fn parse_size(name: &str, size: &str) -> Option<[u32; 3]> {
     let numbers: Vec<u32> = size.split('x').map(str::parse).collect::<Result<_, _>>().ok()?;
     let dims = match (name, numbers[..].try_into()) {
         (_, Ok(dims)) => dims,
@@ -80,14 +81,14 @@ fn sized(name: &str, size: &str) -> Option<[u32; 3]> {
     fits.then_some(dims)
 }
 
-/// The formula `name` with `dims` samples on a unit lattice, called `title`; `None` if there is
-/// no such name.
+/// Computes the formula `name` with `dims` samples on a unit lattice as a volume called `title`;
+/// `None` if there is no such formula.
 fn volume(name: &str, dims: [u32; 3], title: &str) -> Option<Volume> {
     let [nx, ny, nz] = dims;
     let u8s = |f: &dyn Fn(u32, u32, u32) -> u8| Some(Volume::from_fn_u8(title, dims, f));
-    // Positions from -1 to 1 over each axis, voxel centres inside.
+    // Positions of voxel centres, -1 to 1 over each axis.
     let p = |i: u32, n: u32| (2.0 * f64::from(i) + 1.0) / f64::from(n) - 1.0;
-    let at = |i, j, k| [p(i, nx), p(j, ny), p(k, nz)];
+    let position = |i, j, k| [p(i, nx), p(j, ny), p(k, nz)];
     let in_ball = |q: [f64; 3], c: [f64; 3], r: f64| {
         let d = [q[0] - c[0], q[1] - c[1], q[2] - c[2]];
         d[0] * d[0] + d[1] * d[1] + d[2] * d[2] < r * r
@@ -103,8 +104,7 @@ fn volume(name: &str, dims: [u32; 3], title: &str) -> Option<Volume> {
             if !across(i, nx) || !across(k, nz) {
                 return 0;
             }
-            // Front is +y (docs/design/contracts.md): the weaker plate stands nearer to the default
-            // eye.
+            // The default eye looks from +y (docs/design/contracts.md): the weaker plate is in front.
             match 16 * j / ny {
                 10..12 => 100,
                 4..6 => 200,
@@ -113,13 +113,13 @@ fn volume(name: &str, dims: [u32; 3], title: &str) -> Option<Volume> {
         }),
         "ramp" => {
             let n = dims.iter().map(|&n| n as usize).product();
-            let v = (0..n).map(|at| (at % nx as usize) as f32).collect();
+            let v = (0..n).map(|i| (i % nx as usize) as f32).collect();
             let lattice = Lattice::from_spacing(dims, [1.0; 3]);
             let samples = Samples::F32(v);
             Some(Volume::new(title, "float32", false, lattice, samples, ValueMap::IDENTITY))
         }
         "blob" => {
-            // exp(-18 r^2) is a product of one factor for each axis: three small tables.
+            // exp(-18 r^2) is a product of one factor per axis: three small tables.
             let tables = dims.map(|n| {
                 let factor = |i| libm::exp(-4.5 * p(i, n) * p(i, n));
                 (0..n).map(factor).collect::<Vec<f64>>()
@@ -135,7 +135,7 @@ fn volume(name: &str, dims: [u32; 3], title: &str) -> Option<Volume> {
             Some(Volume::new(title, "uint16", false, lattice, Samples::U16(v), map))
         }
         "bell" => {
-            // exp(-r^2 / 2 s^2) with s = n / 12: 1.5e-8 at the middle of a face, below the last
+            // exp(-r^2 / 2 s^2) with s = n / 12 is 1.5e-8 at the middle of a face, below the last
             // bit of a float at the peak.
             let tables = dims.map(|n| {
                 let factor = |i| libm::exp(-18.0 * p(i, n) * p(i, n));
@@ -152,7 +152,7 @@ fn volume(name: &str, dims: [u32; 3], title: &str) -> Option<Volume> {
             Some(Volume::new(title, "float32", false, lattice, samples, ValueMap::IDENTITY))
         }
         "marker" => u8s(&|i, j, k| {
-            let q = at(i, j, k);
+            let q = position(i, j, k);
             if in_ball(q, [0.7, 0.0, 0.0], 0.2) {
                 160
             } else if in_box(q, [0.0, 0.7, 0.0], [0.16; 3]) {
@@ -168,7 +168,7 @@ fn volume(name: &str, dims: [u32; 3], title: &str) -> Option<Volume> {
             }
         }),
         "spheres" => u8s(&|i, j, k| {
-            let q = at(i, j, k);
+            let q = position(i, j, k);
             // Smooth edges two samples wide, so that gradients are those of balls.
             let ball = |c: [f64; 3], r: f64, value: f64| {
                 let d = [q[0] - c[0], q[1] - c[1], q[2] - c[2]];

@@ -1,19 +1,43 @@
-//! Files in, bricks out.
+//! Reads volume files and cuts volumes into bricks.
 //!
-//! [`open`] reads a file into a [`Volume`] (or makes one by formula), and [`BrickStore::build`]
-//! cuts a volume into the bricks that a transfer function can see (paper section 4.2). Each
-//! brick is encoded once, and every worker is sent the same bytes.
+//! [`open`] reads a file into a [`Volume`] or computes one from a formula. [`BrickStore::build`] cuts
+//! a volume into the bricks that a transfer function can see (paper section 4.2). Each brick is
+//! encoded once, and every worker is sent those bytes.
 //!
-//! Files are strangers: no size in a header is believed before the bytes were seen, nothing
-//! outside the header's folder is read, and every refusal is one line that names the file, the
-//! field and the remedy (docs/design/promises.md R13 to R15; the mutants in `fuzz.rs` keep it so).
+//! ```
+//! use slabcast_common::quality::Compositing;
+//! use slabcast_scene::{brick_needs::BrickNeeds, presets};
+//! use slabcast_volumes::{BrickStore, open};
 //!
-//! This crate refuses to know the network, tasks, views and colours. The clock is not here
-//! either; threads are, since cutting bricks is work for all cores.
+//! let volume = open("formula:spheres:32".as_ref()).expect("a formula of this name");
+//! let digest = volume.digest();
+//! let transfer = presets::by_name("peer-opaque", &volume.summary).expect("a preset");
+//! let needs = BrickNeeds::for_transfer(&transfer, &volume.info(digest), Compositing::Linear);
+//! let store = BrickStore::build(&volume, digest, &needs);
+//! let first = store.infos()[0];
+//! assert_eq!(store.encoded(first.id).expect("its bytes").len(), first.bytes as usize);
+//! ```
 //!
-//! Read: NRRD, MetaImage, NIfTI-1 and -2, VTK image data, TIFF stacks, raw numbers
-//! (docs/reference/files.md says what of each). Out of scope so far: NIfTI pairs, colours, time
-//! series, and volumes that are larger than memory.
+//! Formats read (docs/reference/files.md lists the variants of each):
+//!
+//! - NRRD: `.nrrd`, and `.nhdr` with its data files
+//! - MetaImage: `.mha`, and `.mhd` with its data files
+//! - NIfTI-1 and NIfTI-2 in one file: `.nii`, `.nii.gz`
+//! - VTK image data in XML: `.vti`
+//! - TIFF: the pages of one file, or a folder of single pages
+//! - raw numbers, with size and type from flags or from the file's name
+//! - DICOM series, one folder of slices (feature `dicom`)
+//! - Zarr arrays of versions 2 and 3, and OME-Zarr pyramids (feature `zarr`)
+//!
+//! [`write`](mod@write) writes NRRD and NIfTI-1. Not read: NIfTI pairs, colours, time series, and
+//! volumes larger than memory.
+//!
+//! Input files are not trusted. A size in a header takes no memory before the bytes were seen;
+//! nothing outside the header's folder is read; every refusal is one line that names the file, the
+//! field and the remedy (docs/design/promises.md R13 to R15; the mutants in `fuzz.rs` test it).
+//!
+//! This crate has no network, no clock, and knows neither tasks, views nor colours. It does use
+//! threads, since cutting bricks is work for all cores.
 
 mod data;
 #[cfg(feature = "dicom")]
@@ -51,42 +75,53 @@ use source::Source;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// What this version reads, for remedies.
+/// The formats read, as the remedy of an error names them.
 const READS: &str = "give NRRD (.nrrd, .nhdr), NIfTI (.nii, .nii.gz), MetaImage (.mha, .mhd), VTK \
                      image data (.vti), TIFF pages (.tif) or a folder of them, or raw numbers with \
                      --dims and --type";
 
-/// What whoever opens a file knows of it beside its path.
+/// Hints for opening a volume: what its files do not say, and limits. All are optional.
 #[derive(Clone, Debug, Default)]
 pub struct Hints {
-    /// Of files without a header.
+    /// Size, type and spacing of files without a header; the spacing also serves TIFF stacks.
     pub raw: RawHints,
-    /// Which of several DICOM series: its number, description, name or UID.
+    /// The DICOM series to read where a folder holds several: its number, description, name or UID.
     pub series: Option<String>,
-    /// Program and first arguments of the process that parses DICOM: what runs `dicom::serve`.
-    /// Without one a thread does so, unconfined.
+    /// Program and first arguments of the process that parses DICOM by calling `dicom::serve`.
+    /// `None` parses in a thread of this process, without limits on memory and time.
     pub dicom_reader: Option<Vec<std::ffi::OsString>>,
-    /// Which level of a Zarr pyramid; 0 is the finest.
+    /// Level of a Zarr pyramid, 0 the finest. `None` takes the finest that fits `max_bytes`.
     pub level: Option<u32>,
-    /// Most bytes that the samples of a Zarr array may have.
+    /// Most bytes that the samples of a Zarr array may have, in the file's type. `None` allows
+    /// three quarters of the free memory for an array and a quarter for a level of a pyramid.
     pub max_bytes: Option<u64>,
 }
 
-/// A volume, and what its reader wants a person to know of how it was read.
+/// A volume and the reader's notes on how it was read.
 #[derive(Clone, Debug)]
 pub struct Opened {
     /// The volume.
     pub volume: Volume,
-    /// Choices that were made, one sentence each.
+    /// Choices that the reader made, one sentence each, to show to the user.
     pub notes: Vec<String>,
 }
 
-/// Opens a volume: a file, told by its content rather than its name, or `formula:NAME[:SIZE]`.
+/// Opens a volume: a file or folder, whose format its content decides and not its name, or
+/// `formula:NAME[:SIZE]` (see [`formula`]).
+///
+/// # Errors
+/// The file can't be read, is no volume, is malformed, truncated or damaged, is of a kind that is
+/// not read, points outside its folder, or exceeds a limit or the memory. The error's
+/// [`kind`](Problem::kind) tells these apart.
 pub fn open(path: &Path) -> Result<Volume, OpenError> {
     open_with(path, &Hints::default()).map(|opened| opened.volume)
 }
 
-/// Opens a volume as [`open`] does, with hints.
+/// Opens a volume like [`open`], with hints, and returns the reader's notes with it.
+///
+/// # Errors
+/// Those of [`open`]. Also hints that contradict the file: a type or spacing for a file with a
+/// header, an unknown series or level, sizes that do not match the file's length.
 pub fn open_with(path: &Path, hints: &Hints) -> Result<Opened, OpenError> {
     let shown = path.to_string_lossy();
     let volume = match shown.strip_prefix(formula::PREFIX) {
@@ -106,7 +141,10 @@ fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
     if path.is_dir() {
         return folder::open(path, hints);
     }
-    #[cfg_attr(not(feature = "dicom"), expect(unused_mut, reason = "nobody looks into it"))]
+    #[cfg_attr(
+        not(feature = "dicom"),
+        expect(unused_mut, reason = "only the DICOM check reads the head")
+    )]
     let mut source = Source::open(path, "file")?;
     #[cfg(feature = "dicom")]
     if dicom::sniff(source.head()?) && hints.raw.dims.is_none() {
@@ -118,23 +156,23 @@ fn open_file(path: &Path, hints: &Hints) -> Result<Opened, Problem> {
         Ok(volume) => return Ok(volume.into()),
         Err(e) => e,
     };
-    // Data whose header lies beside them are opened by it.
+    // A data file with a header beside it is opened through the header.
     if error.kind == OpenErrorKind::NotAVolume
         && let Some(header) = header_beside(path)
     {
         let source = Source::open(&header, "file")?;
-        let called = header.file_name().unwrap_or_default().to_string_lossy();
-        let volume = read(source, folder, &called, hints).map_err(|mut p| {
-            p.field = format!("its header {}: {}", error::quoted(&called), p.field);
+        let header_name = header.file_name().unwrap_or_default().to_string_lossy();
+        let volume = read(source, folder, &header_name, hints).map_err(|mut p| {
+            p.field = format!("its header {}: {}", error::quoted(&header_name), p.field);
             p
         })?;
-        let note = format!("{name} is raw data; its header {called} beside it was read");
+        let note = format!("{name} is raw data; its header {header_name} beside it was read");
         return Ok(Opened { volume, notes: vec![note] });
     }
     Err(error)
 }
 
-/// The header of the same name as a data file, if it names that file.
+/// Returns the header beside a data file: of the same stem, with the data file's name inside.
 fn header_beside(path: &Path) -> Option<PathBuf> {
     let name = path.file_name()?.to_str()?;
     let stem = name.split('.').next().filter(|stem| !stem.is_empty())?;
@@ -147,13 +185,13 @@ fn header_beside(path: &Path) -> Option<PathBuf> {
     })
 }
 
-/// Reads a volume from a source, by content.
+/// Reads a volume; its first bytes decide the format. `folder` is where detached data may lie.
 fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<Volume, Problem> {
     let head = source.head()?;
     if head.is_empty() {
         return Err(Problem::new(OpenErrorKind::NotAVolume, "content", "is empty", READS));
     }
-    // Flags say that these are numbers, whatever they look like.
+    // With --dims the file is raw numbers, whatever its content looks like.
     if hints.raw.dims.is_some() {
         let gzip = head.starts_with(GZIP);
         return raw::read(source, gzip, name, &hints.raw);
@@ -174,7 +212,7 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
     }
     if head.starts_with(GZIP) {
         let mut start = Vec::new();
-        // An early end or damage inside the first bytes is the reader's to report.
+        // The reader reports an early end or damage.
         let _ = flate2::read::MultiGzDecoder::new(head).take(4).read_to_end(&mut start);
         if nifti::sniff(&start) {
             return nifti::read(source, true, name);
@@ -214,16 +252,16 @@ fn read(mut source: Source, folder: &Path, name: &str, hints: &Hints) -> Result<
     Err(Problem::new(OpenErrorKind::NotAVolume, "content", describe(head, name), READS))
 }
 
-/// What gzip begins with.
+/// First bytes of a gzip stream.
 const GZIP: &[u8] = &[0x1f, 0x8b];
 
-/// Whether a name says that its file is numbers alone.
+/// Returns whether a file name has an ending used for raw numbers.
 fn is_raw(name: &str) -> bool {
     let name = name.to_ascii_lowercase();
     [".raw", ".zraw", ".img", ".dat", ".bin"].iter().any(|end| name.ends_with(end))
 }
 
-/// What a file that we can't read seems to be.
+/// Describes a file of no readable format, by its first bytes and its name.
 fn describe(head: &[u8], name: &str) -> String {
     let is = |magic: &[u8]| head.starts_with(magic);
     let ends = |e: &str| name.to_ascii_lowercase().ends_with(e);

@@ -132,7 +132,7 @@ fn anatomical_formats_put_right_at_the_right() {
         // What we write ourselves.
         for name in ["v.nrrd", "v.nii", "v.nii.gz"] {
             let mut bytes = Vec::new();
-            let format = crate::write::Format::of_name(name).unwrap();
+            let format = crate::write::Format::from_name(name).unwrap();
             crate::write::write(&v, format, &mut bytes, &mut |_| Ok(())).unwrap();
             let again = open(bytes, name);
             check(&again, name);

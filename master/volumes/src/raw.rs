@@ -1,5 +1,6 @@
-//! Raw numbers without a header: size and type from flags or from the file's name, as in
-//! `head_256x256x256_uint8.raw`, and a right guess where they don't fit.
+//! Reader of raw numbers without a header. Size and type come from flags or from the file's name, as
+//! in `head_256x256x256_uint8.raw`. Where they do not match the file's length, the error suggests
+//! flags that would.
 
 use crate::data::{self, Form, Skip};
 use crate::error::{OpenErrorKind, Problem};
@@ -8,24 +9,24 @@ use crate::source::Source;
 use crate::unpack::Encoding;
 use slabcast_common::volume::{Lattice, Volume};
 
-/// What somebody says of raw numbers, or of pictures in a stack; what is `None` is taken from the
-/// file's name, or from the default.
+/// Layout of a file of raw numbers, as the user gives it. A `None` is taken from the file's name,
+/// else from the default. Of a TIFF stack only `spacing` is used.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RawHints {
-    /// Samples along x, y, z (x fastest).
+    /// Number of samples along x, y and z; x is fastest in the file.
     pub dims: Option<[u64; 3]>,
-    /// The type's name, such as `uint8`; parsed by [`RawHints::with_type`].
+    /// Type of a sample, set by [`RawHints::with_type`].
     pub(crate) number: Option<Number>,
-    /// Bytes come highest first.
+    /// Whether the highest byte of a number comes first; little-endian by default.
     pub big_endian: Option<bool>,
-    /// Distances of the samples; 1 by default.
+    /// Distances between samples along x, y and z, in world units (mm); 1 by default.
     pub spacing: Option<[f64; 3]>,
-    /// Bytes before the first sample; 0 by default.
+    /// Bytes of the file before the first sample; 0 by default.
     pub skip: Option<u64>,
 }
 
 impl RawHints {
-    /// Hints of everything but the type.
+    /// Returns hints without a type, which [`RawHints::with_type`] adds. Units are the fields'.
     pub fn new(
         dims: Option<[u64; 3]>,
         big_endian: Option<bool>,
@@ -35,29 +36,30 @@ impl RawHints {
         RawHints { dims, number: None, big_endian, spacing, skip }
     }
 
-    /// Types by name, for help and remedies.
+    /// Names of all sample types, separated by commas, for help and error texts.
     pub const TYPES: &str =
         "uint8, int8, uint16, int16, uint32, int32, uint64, int64, float32, float64";
 
-    /// These hints with the type of that name; `None` where there is no such type.
+    /// Returns the hints with the sample type called `name`, such as `uint8` or `float`, in any
+    /// case; `None` if there is no such type.
     pub fn with_type(mut self, name: &str) -> Option<RawHints> {
         self.set_type(name).then_some(self)
     }
 
     fn set_type(&mut self, name: &str) -> bool {
-        self.number = number(&name.to_ascii_lowercase());
+        self.number = number_type(&name.to_ascii_lowercase());
         self.number.is_some()
     }
 
-    /// Whether nothing was said.
+    /// Returns whether no hint is set.
     pub fn is_empty(&self) -> bool {
         *self == RawHints::default()
     }
 
-    /// What a file's name says, where the flags say nothing.
-    fn or_name(mut self, name: &str) -> RawHints {
+    /// Fills in from a file's name what the flags leave open.
+    fn or_from_name(mut self, name: &str) -> RawHints {
         let stem = name.to_ascii_lowercase();
-        // Letters stick to digits in sizes and types; everything else parts words.
+        // Sizes and types are runs of letters and digits; everything else separates words.
         for word in stem.split(|c: char| !c.is_ascii_alphanumeric()) {
             let sizes: Vec<&str> = word.split('x').collect();
             if let [a, b, c] = sizes[..]
@@ -71,8 +73,8 @@ impl RawHints {
                 "be" | "big" => self.big_endian = self.big_endian.or(Some(true)),
                 _ => {}
             }
-            for (end, big) in [("", None), ("le", Some(false)), ("be", Some(true))] {
-                if let Some(n) = word.strip_suffix(end).and_then(number) {
+            for (suffix, big) in [("", None), ("le", Some(false)), ("be", Some(true))] {
+                if let Some(n) = word.strip_suffix(suffix).and_then(number_type) {
                     self.number = self.number.or(Some(n));
                     self.big_endian = self.big_endian.or(big);
                 }
@@ -82,7 +84,7 @@ impl RawHints {
     }
 }
 
-fn number(name: &str) -> Option<Number> {
+fn number_type(name: &str) -> Option<Number> {
     Some(match name {
         "uint8" | "u8" | "uchar" | "byte" => Number::U8,
         "int8" | "i8" | "char" => Number::I8,
@@ -98,29 +100,29 @@ fn number(name: &str) -> Option<Number> {
     })
 }
 
-/// Whether a name or flags say enough to read the file as raw numbers.
+/// Returns whether the file's name or the hints give a size.
 pub(crate) fn is_described(name: &str, hints: &RawHints) -> bool {
-    hints.or_name(name).dims.is_some()
+    hints.or_from_name(name).dims.is_some()
 }
 
-/// Reads raw numbers from a source at its beginning; `gzip` says that they are packed.
+/// Reads raw numbers from the start of a source. `gzip` says that the file is compressed.
 pub(crate) fn read(
     source: Source,
     gzip: bool,
     name: &str,
     hints: &RawHints,
 ) -> Result<Volume, Problem> {
-    let told = hints.or_name(name);
+    let known = hints.or_from_name(name);
     let len = source.len;
-    let Some(dims) = told.dims else { return Err(unknown(len)) };
-    let Some(number) = told.number else {
+    let Some(dims) = known.dims else { return Err(unknown_size(len)) };
+    let Some(number) = known.number else {
         return Err(Problem::malformed(
             "--type",
             match hints.dims {
                 Some(dims) => {
-                    format!("is missing, and the file's name has none, for {}", shown(dims))
+                    format!("is missing, and the file's name has none, for {}", format_dims(dims))
                 }
-                None => format!("the file's name says {}, but no type", shown(dims)),
+                None => format!("the file's name says {}, but no type", format_dims(dims)),
             },
             match (gzip, types_that_fit(len, dims)) {
                 (false, Some(types)) => format!("give {types}, which would fit the {len} bytes"),
@@ -128,15 +130,15 @@ pub(crate) fn read(
             },
         ));
     };
-    let endian = if told.big_endian == Some(true) { Endian::Big } else { Endian::Little };
+    let endian = if known.big_endian == Some(true) { Endian::Big } else { Endian::Little };
     let layout = Layout::new(dims, number, endian, "--dims")?;
-    let skip = told.skip.unwrap_or(0);
+    let skip = known.skip.unwrap_or(0);
     let need = layout.bytes();
-    // A packed file's size is known when it was unpacked; the reader tells.
+    // The size of compressed data is known only after decompression; the reader checks it then.
     if !gzip && len.checked_sub(skip) != Some(need) {
-        return Err(misfit(len, skip, dims, number));
+        return Err(wrong_size(len, skip, dims, number));
     }
-    let lattice = Lattice::from_spacing(layout.dims, told.spacing.unwrap_or([1.0; 3]));
+    let lattice = Lattice::from_spacing(layout.dims, known.spacing.unwrap_or([1.0; 3]));
     lattice.check().map_err(|e| Problem::malformed("--spacing", e, "give three lengths"))?;
     let form = Form {
         encoding: if gzip { Encoding::Gzip } else { Encoding::Raw },
@@ -148,7 +150,7 @@ pub(crate) fn read(
     Ok(Volume::new(name, number.name(), false, lattice, samples, map))
 }
 
-fn shown([x, y, z]: [u64; 3]) -> String {
+fn format_dims([x, y, z]: [u64; 3]) -> String {
     format!("{x}x{y}x{z}")
 }
 
@@ -156,7 +158,7 @@ fn product(dims: [u64; 3]) -> Option<u64> {
     dims.iter().try_fold(1u64, |n, &d| n.checked_mul(d)).filter(|n| *n > 0)
 }
 
-/// The types of which `dims` make `len` bytes, as flags.
+/// Returns the types with which `dims` samples fill `len` bytes, as flags.
 fn types_that_fit(len: u64, dims: [u64; 3]) -> Option<&'static str> {
     match len.checked_div(product(dims)?)? * product(dims)? == len {
         true => match len / product(dims)? {
@@ -170,15 +172,18 @@ fn types_that_fit(len: u64, dims: [u64; 3]) -> Option<&'static str> {
     }
 }
 
-/// The file's size is not what flags or name say: what would fit it.
-fn misfit(len: u64, skip: u64, dims: [u64; 3], number: Number) -> Problem {
+/// Returns the error for a file of the wrong length, with flags that would fit it.
+fn wrong_size(len: u64, skip: u64, dims: [u64; 3], number: Number) -> Problem {
     let need = product(dims).unwrap_or(u64::MAX).saturating_mul(number.bytes());
     let left = len.saturating_sub(skip);
     let after = if skip > 0 { format!(" after {skip} skipped ones") } else { String::new() };
-    let what =
-        format!("holds {left} bytes{after}, and {} of {} take {need}", shown(dims), number.name());
+    let what = format!(
+        "holds {left} bytes{after}, and {} of {} take {need}",
+        format_dims(dims),
+        number.name()
+    );
     let [x, y, z] = dims;
-    // In the order in which mistakes are made: the type, the slices, a header.
+    // The likeliest mistakes first: the type, the number of slices, a header.
     let remedy = if let Some(types) = types_that_fit(left, dims) {
         format!("{types} would fit")
     } else if let Some(slice) = product([x, y, number.bytes()])
@@ -186,25 +191,25 @@ fn misfit(len: u64, skip: u64, dims: [u64; 3], number: Number) -> Problem {
         && (1..=16384).contains(&(left / slice))
         && left / slice != z
     {
-        format!("--dims {} would fit", shown([x, y, left / slice]))
+        format!("--dims {} would fit", format_dims([x, y, left / slice]))
     } else if left > need && left - need <= 1 << 16 {
         format!("--skip {} would fit, if the first {} bytes are a header", len - need, len - need)
     } else if let Some(n) = cube(left, number.bytes()) {
-        format!("--dims {} would fit", shown([n; 3]))
+        format!("--dims {} would fit", format_dims([n; 3]))
     } else {
         "give --dims, --type and --skip as the file has them".into()
     };
     Problem::new(OpenErrorKind::Malformed, "size", what, remedy)
 }
 
-/// Nothing says how large it is.
-fn unknown(len: u64) -> Problem {
+/// Returns the error for a file of unknown_size size, with a cube that would fit.
+fn unknown_size(len: u64) -> Problem {
     let guess = [(1, "uint8"), (2, "uint16"), (4, "float32")]
         .into_iter()
         .find_map(|(bytes, name)| Some((cube(len, bytes)?, name)));
     let example = match guess {
         Some((n, kind)) => {
-            format!("--dims {} --type {kind} would fit its {len} bytes", shown([n; 3]))
+            format!("--dims {} --type {kind} would fit its {len} bytes", format_dims([n; 3]))
         }
         None => format!("such as --dims 256x256x128 --type uint8; it has {len} bytes"),
     };
@@ -216,7 +221,7 @@ fn unknown(len: u64) -> Problem {
     )
 }
 
-/// The `n` of n x n x n samples of `bytes` that make `len`.
+/// Returns `n` where n x n x n samples of `bytes` bytes fill `len` bytes.
 fn cube(len: u64, bytes: u64) -> Option<u64> {
     let n = libm::cbrt((len / bytes) as f64).round() as u64;
     (n > 1 && n.checked_pow(3)?.checked_mul(bytes)? == len).then_some(n)

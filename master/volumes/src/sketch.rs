@@ -1,14 +1,15 @@
-//! A histogram as one line of bars, for `slabcast info`.
+//! Draws a histogram as one line of bars, for `slabcast info`.
 
 use slabcast_common::volume::ValueSummary;
 
 const BARS: [char; 9] = [' ', '▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
 
-/// The histogram as `width` bars (1 to 256) over a line with the smallest and largest value.
-/// Heights are logarithms of counts, since air outnumbers a thin object by thousands; every
-/// bar that has any sample shows.
+/// Draws a histogram as two lines of text: `width` bars, then the smallest and largest value.
+///
+/// `width` is clamped to 1 to 256 characters. Heights are logarithms of counts, since air
+/// outnumbers a thin object by thousands; a bar with any sample is at least one step high.
 pub fn histogram_sketch(summary: &ValueSummary, width: usize) -> String {
-    // Bins of 8-bit volumes are codes: those outside of the volume's range are left out.
+    // Bins of 8-bit volumes are codes; those outside the volume's range are left out.
     let (first, last) =
         (summary.bin(summary.min_code), summary.bin(summary.max_code.max(summary.min_code)));
     let last = if summary.max_code > summary.min_code { last.max(first) } else { first };
@@ -16,9 +17,9 @@ pub fn histogram_sketch(summary: &ValueSummary, width: usize) -> String {
     let width = width.clamp(1, 256);
     let mut counts: Vec<u64> = (0..width)
         .map(|c| {
-            let from = c * bins.len() / width;
-            let to = ((c + 1) * bins.len() / width).max(from + 1).min(bins.len());
-            bins[from.min(to)..to].iter().sum()
+            let first = c * bins.len() / width;
+            let end = ((c + 1) * bins.len() / width).max(first + 1).min(bins.len());
+            bins[first.min(end)..end].iter().sum()
         })
         .collect();
     if summary.map.scale < 0.0 {
@@ -39,7 +40,7 @@ pub fn histogram_sketch(summary: &ValueSummary, width: usize) -> String {
     format!("{bars}\n{lo}{}{hi}", " ".repeat(gap))
 }
 
-/// A value in few digits.
+/// Formats a value with at most three decimals, or four significant digits in scientific form.
 fn number(x: f64) -> String {
     let size = x.abs();
     if x == 0.0 || (1e-3..1e6).contains(&size) {
@@ -56,7 +57,7 @@ mod tests {
     use slabcast_common::volume::{Samples, ValueMap};
 
     #[test]
-    fn a_sea_of_air_does_not_drown_a_thin_object() {
+    fn histogram_sketch_shows_rare_values_beside_frequent_ones() {
         let mut v = vec![0u8; 100_000];
         v.extend([200; 30]);
         let s = ValueSummary::from_samples(&Samples::U8(v), ValueMap::IDENTITY);
@@ -69,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn odd_volumes_and_widths_are_drawn_too() {
+    fn histogram_sketch_handles_any_width_nan_and_negative_scale() {
         let flipped = ValueMap { scale: -2.0, offset: 1.0 };
         for samples in [
             Samples::U8(vec![7]),
@@ -88,7 +89,7 @@ mod tests {
                 }
             }
         }
-        // A slope below zero turns the values around: the bars stand over their values.
+        // A negative slope reverses the order of values; bars must stand over their values.
         let s = ValueSummary::from_samples(&Samples::U8(vec![0, 0, 0, 9]), flipped);
         assert!(histogram_sketch(&s, 10).starts_with('▄'), "{}", histogram_sketch(&s, 10));
     }

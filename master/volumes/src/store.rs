@@ -1,11 +1,11 @@
-//! The bricks of one volume that a transfer function can see, each held once.
+//! Store of the bricks of one volume that a transfer function can see.
 //!
-//! A store is built once and what it says never changes, so an [`std::sync::Arc`] of it is shared by
-//! all that send. Bricks are packed as they are cut: a worker elsewhere gets these bytes, and sending
-//! to sixty copies a pointer sixty times. A brick that a worker of this process asks for is unpacked
-//! then, and shared from then on. Both forms beside each other would take 10 bytes a voxel of 8 bits
-//! where the promise is 8, so a brick has one or the other; a master with workers of both kinds
-//! packs a brick anew for each that is elsewhere.
+//! A store does not change after it was built, so all senders share it in an [`std::sync::Arc`].
+//! Bricks are encoded as they are cut; remote workers are sent these bytes, and sending to sixty
+//! copies a pointer sixty times. A brick that an embedded worker asks for is decoded then, and
+//! shared from then on. Keeping both forms would take 10 bytes for a voxel of 8 bits where the
+//! promise is 8, so a brick has one or the other: with workers of both kinds, the master encodes a
+//! brick anew for each remote worker.
 
 use bytes::Bytes;
 use rayon::prelude::*;
@@ -20,110 +20,116 @@ use slabcast_common::volume::{Digest32, Samples, Volume};
 use slabcast_scene::brick_needs::BrickNeeds;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// The relevant bricks of a volume for one support, in ascending id.
+/// The bricks of a volume that hold a relevant voxel, in ascending id. Each is kept once, encoded
+/// or decoded. A voxel is relevant if the transfer function shows its value and it lies inside the
+/// cropping box.
 pub struct BrickStore {
     key: BrickSetKey,
-    wanted: BrickNeeds,
+    needs: BrickNeeds,
     infos: Arc<[BrickInfo]>,
-    /// The bricks, in the order of `infos`.
-    held: Vec<Mutex<Held>>,
+    /// Contents of the bricks, in the order of `infos`.
+    contents: Vec<Mutex<Content>>,
     relevant_voxels: u64,
     bytes: u64,
     extent: Option<TightBox>,
 }
 
-/// A brick in the form in which it was last wanted.
-enum Held {
-    /// Encoded.
-    Packed(Bytes),
-    /// As workers of this process share it.
-    Open(Arc<Brick>),
+/// A brick in the form in which it was last asked for.
+enum Content {
+    /// Encoded for remote workers ([`Brick::encode`]).
+    Encoded(Bytes),
+    /// Decoded, and shared by the embedded workers.
+    Decoded(Arc<Brick>),
 }
 
 impl BrickStore {
-    /// Cuts a volume on all cores. `digest` is [`Volume::digest`]; bricks without a relevant
-    /// voxel are left out, and so is all that `wanted` does not ask for.
-    pub fn build(volume: &Volume, digest: Digest32, wanted: &BrickNeeds) -> Self {
-        let support = &wanted.support;
-        let cut = match &volume.samples {
+    /// Cuts a volume into bricks on all cores of rayon's pool.
+    ///
+    /// `digest` is [`Volume::digest`] of `volume`. Bricks without a relevant voxel are left out, and
+    /// so are normals and gradients that `needs` does not ask for.
+    pub fn build(volume: &Volume, digest: Digest32, needs: &BrickNeeds) -> Self {
+        let support = &needs.support;
+        let bricks = match &volume.samples {
             Samples::U8(v) => {
-                let relevant = table(support, 256);
-                cut(volume, v, wanted, Samples::U8, |c| relevant[usize::from(c)])
+                let relevant = relevance_table(support, 256);
+                cut(volume, v, needs, Samples::U8, |c| relevant[usize::from(c)])
             }
             Samples::U16(v) => {
-                let relevant = table(support, 65536);
-                cut(volume, v, wanted, Samples::U16, |c| relevant[usize::from(c)])
+                let relevant = relevance_table(support, 65536);
+                cut(volume, v, needs, Samples::U16, |c| relevant[usize::from(c)])
             }
             Samples::F32(v) => {
-                cut(volume, v, wanted, Samples::F32, |c| support.contains(f64::from(c)))
+                cut(volume, v, needs, Samples::F32, |c| support.contains(f64::from(c)))
             }
         };
-        let (infos, held): (Vec<BrickInfo>, Vec<Mutex<Held>>) = cut.into_iter().unzip();
+        let (infos, contents): (Vec<BrickInfo>, Vec<Mutex<Content>>) = bricks.into_iter().unzip();
         BrickStore {
-            key: wanted.set_key(digest),
-            wanted: wanted.clone(),
+            key: needs.set_key(digest),
+            needs: needs.clone(),
             relevant_voxels: infos.iter().map(|b| u64::from(b.voxels)).sum(),
             bytes: infos.iter().map(|b| u64::from(b.bytes)).sum(),
             extent: infos.iter().map(|info| info.tight).reduce(TightBox::union),
             infos: infos.into(),
-            held,
+            contents,
         }
     }
 
-    /// Which bricks these are.
+    /// Returns the key of this set of bricks: of the volume's digest and the needs.
     pub fn key(&self) -> BrickSetKey {
         self.key
     }
 
-    /// What the bricks hold.
-    pub fn wanted(&self) -> &BrickNeeds {
-        &self.wanted
+    /// Returns the needs that the bricks were cut for: visible values, normals, gradients and crop.
+    pub fn needs(&self) -> &BrickNeeds {
+        &self.needs
     }
 
-    /// The directory of bricks, in ascending id.
+    /// Returns the directory: id, tight box, voxels and encoded bytes of each brick, in ascending id.
     pub fn infos(&self) -> &Arc<[BrickInfo]> {
         &self.infos
     }
 
-    /// A brick, if it has a relevant voxel: unpacked once, then shared.
+    /// Returns a decoded brick; `None` if it has no relevant voxel. It is decoded at the first call,
+    /// and shared and kept decoded from then on.
     pub fn brick(&self, id: BrickId) -> Option<Arc<Brick>> {
-        let mut held = self.held(id)?;
-        let brick = match &*held {
-            Held::Open(brick) => return Some(brick.clone()),
-            Held::Packed(bytes) => Brick::decode(bytes).expect("we packed it ourselves"),
+        let mut content = self.content(id)?;
+        let brick = match &*content {
+            Content::Decoded(brick) => return Some(brick.clone()),
+            Content::Encoded(bytes) => Brick::decode(bytes).expect("the store encoded it"),
         };
         let brick = Arc::new(brick);
-        *held = Held::Open(brick.clone());
+        *content = Content::Decoded(brick.clone());
         Some(brick)
     }
 
-    /// A brick's encoding ([`Brick::encode`]): shared, unless a worker of this process has asked for
-    /// the brick itself.
+    /// Returns the encoding of a brick ([`Brick::encode`]); `None` if it has no relevant voxel. The
+    /// bytes are shared, unless [`BrickStore::brick`] was called for it: then they are encoded anew.
     pub fn encoded(&self, id: BrickId) -> Option<Bytes> {
-        Some(match &*self.held(id)? {
-            Held::Packed(bytes) => bytes.clone(),
-            Held::Open(brick) => packed(brick),
+        Some(match &*self.content(id)? {
+            Content::Encoded(bytes) => bytes.clone(),
+            Content::Decoded(brick) => encode(brick),
         })
     }
 
-    /// Voxels in all bricks.
+    /// Returns the number of voxels in all bricks.
     pub fn relevant_voxels(&self) -> u64 {
         self.relevant_voxels
     }
 
-    /// Where they are; `None` without bricks.
+    /// Returns the smallest box, in voxel indices of the volume, that holds all relevant voxels;
+    /// `None` if there are none.
     pub fn extent(&self) -> Option<TightBox> {
         self.extent
     }
 
-    /// Bytes of all encodings.
+    /// Returns the size of all bricks in encoded form, in bytes.
     pub fn bytes(&self) -> u64 {
         self.bytes
     }
 
-    fn held(&self, id: BrickId) -> Option<MutexGuard<'_, Held>> {
-        let at = self.infos.binary_search_by_key(&id, |b| b.id).ok()?;
-        Some(self.held[at].lock().unwrap_or_else(PoisonError::into_inner))
+    fn content(&self, id: BrickId) -> Option<MutexGuard<'_, Content>> {
+        let i = self.infos.binary_search_by_key(&id, |b| b.id).ok()?;
+        Some(self.contents[i].lock().unwrap_or_else(PoisonError::into_inner))
     }
 }
 
@@ -131,54 +137,53 @@ impl std::fmt::Debug for BrickStore {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("BrickStore")
             .field("key", &self.key)
-            .field("bricks", &self.held.len())
+            .field("bricks", &self.contents.len())
             .field("relevant_voxels", &self.relevant_voxels)
             .field("bytes", &self.bytes)
             .finish_non_exhaustive()
     }
 }
 
-/// A brick's encoding.
-fn packed(brick: &Brick) -> Bytes {
+fn encode(brick: &Brick) -> Bytes {
     let mut out = Vec::new();
     brick.encode(&mut out);
     out.into()
 }
 
-/// Which of `codes` codes are relevant. Filled by interval: asking for each code would take
-/// codes times intervals, 2^31 steps for a 16-bit comb.
-fn table(support: &Support, codes: usize) -> Vec<bool> {
+/// Returns for each of `codes` codes whether it is relevant. Filled by interval: a test of each
+/// code would take codes times intervals, 2^31 steps for a 16-bit comb.
+fn relevance_table(support: &Support, codes: usize) -> Vec<bool> {
     let mut relevant = vec![false; codes];
     for &(a, b) in &support.intervals {
-        let (from, to) = (a.ceil().max(0.0), b.floor().min(codes as f64 - 1.0));
-        if from <= to {
-            relevant[from as usize..=to as usize].fill(true);
+        let (first, last) = (a.ceil().max(0.0), b.floor().min(codes as f64 - 1.0));
+        if first <= last {
+            relevant[first as usize..=last as usize].fill(true);
         }
     }
     relevant
 }
 
-/// All bricks with a relevant voxel. One task is a row of bricks along x: a 256^3 volume has
-/// 1024 of them with 16 Ki samples each, which keeps any number of cores evenly busy.
+/// Cuts all bricks with a relevant voxel. A task is a row of bricks along x: a 256^3 volume has
+/// 1024 rows of 16 Ki samples, which keeps any number of cores evenly busy.
 fn cut<T: Copy + Into<f64> + Sync>(
     volume: &Volume,
     codes: &[T],
-    wanted: &BrickNeeds,
+    needs: &BrickNeeds,
     samples: fn(Vec<T>) -> Samples,
     relevant: impl Fn(T) -> bool + Sync,
-) -> Vec<(BrickInfo, Mutex<Held>)> {
-    let field = Field { codes, dims: volume.lattice.dims };
+) -> Vec<(BrickInfo, Mutex<Content>)> {
+    let field = Codes { codes, dims: volume.lattice.dims };
     let grid = BrickGrid::new(field.dims);
     let gradient_matrix = volume.gradient_matrix();
     let row = |row: u32| {
         let mut bricks = Vec::new();
         let (y, z) = (row % grid.dims[1], row / grid.dims[1]);
-        let mut found = Found::default();
+        let mut found = RelevantVoxels::default();
         for x in 0..grid.dims[0] {
             let id = grid.id([x, y, z]);
             found.clear();
-            let inside = |at| wanted.crop.is_none_or(|c| c.contains(&volume.lattice, at));
-            field.search([x, y, z].map(|n| n * BRICK_EDGE), &relevant, &inside, &mut found);
+            let inside = |voxel| needs.crop.is_none_or(|c| c.contains(&volume.lattice, voxel));
+            field.collect([x, y, z].map(|n| n * BRICK_EDGE), &relevant, &inside, &mut found);
             let index = &found.index[..found.voxels];
             if index.is_empty() {
                 continue;
@@ -187,13 +192,13 @@ fn cut<T: Copy + Into<f64> + Sync>(
             let corner = grid.corner(id);
             let gradient = |(&i, &offset)| {
                 let local = slabcast_common::brick::local_position(i);
-                let at = std::array::from_fn(|a| corner[a] + local[a]);
-                gradient_matrix * field.difference(at, offset)
+                let voxel = std::array::from_fn(|a| corner[a] + local[a]);
+                gradient_matrix * field.central_difference(voxel, offset)
             };
             let all = || index.iter().zip(offsets).map(gradient);
-            let normals = wanted.normals.then(|| all().map(encode_normal).collect());
+            let normals = needs.normals.then(|| all().map(encode_normal).collect());
             let magnitude = |g: glam::DVec3| encode_magnitude(g.length(), &volume.summary);
-            let gradients = wanted.gradients.then(|| all().map(magnitude).collect());
+            let gradients = needs.gradients.then(|| all().map(magnitude).collect());
             let values = samples(offsets.iter().map(|&o| codes[o]).collect());
             let brick = Brick::new(id, index.to_vec(), values, normals).with_gradients(gradients);
             let info = BrickInfo {
@@ -202,7 +207,7 @@ fn cut<T: Copy + Into<f64> + Sync>(
                 voxels: found.voxels as u16,
                 bytes: brick.encoded_len() as u32,
             };
-            bricks.push((info, Mutex::new(Held::Packed(packed(&brick)))));
+            bricks.push((info, Mutex::new(Content::Encoded(encode(&brick)))));
         }
         bricks
     };
@@ -212,18 +217,20 @@ fn cut<T: Copy + Into<f64> + Sync>(
 }
 
 /// The relevant voxels of one brick, in ascending local index.
-struct Found {
+struct RelevantVoxels {
+    /// Number of voxels found.
     voxels: usize,
     index: [u16; BRICK_VOXELS],
-    /// Where each lies in the volume's samples.
+    /// Offset of each in the volume's samples.
     offset: [usize; BRICK_VOXELS],
+    /// Corners of their box in the volume, both inclusive.
     lo: [u32; 3],
     hi: [u32; 3],
 }
 
-impl Default for Found {
+impl Default for RelevantVoxels {
     fn default() -> Self {
-        Found {
+        RelevantVoxels {
             voxels: 0,
             index: [0; BRICK_VOXELS],
             offset: [0; BRICK_VOXELS],
@@ -233,7 +240,7 @@ impl Default for Found {
     }
 }
 
-impl Found {
+impl RelevantVoxels {
     fn clear(&mut self) {
         (self.voxels, self.lo, self.hi) = (0, [u32::MAX; 3], [0; 3]);
     }
@@ -243,19 +250,20 @@ impl Found {
     }
 }
 
-/// A volume's codes by their own type, so that the compiler sees through them.
-struct Field<'a, T> {
+/// A volume's codes in their own type, so that the compiler specialises the loops.
+struct Codes<'a, T> {
     codes: &'a [T],
     dims: [u32; 3],
 }
 
-impl<T: Copy + Into<f64>> Field<'_, T> {
-    fn search(
+impl<T: Copy + Into<f64>> Codes<'_, T> {
+    /// Adds the relevant voxels of the brick at `corner` to `found`.
+    fn collect(
         &self,
         corner: [u32; 3],
         relevant: &impl Fn(T) -> bool,
         inside: &impl Fn([u32; 3]) -> bool,
-        found: &mut Found,
+        found: &mut RelevantVoxels,
     ) {
         let [nx, ny, _] = self.dims.map(|n| n as usize);
         let end: [u32; 3] = std::array::from_fn(|a| (corner[a] + BRICK_EDGE).min(self.dims[a]));
@@ -265,12 +273,12 @@ impl<T: Copy + Into<f64>> Field<'_, T> {
                 let run = &self.codes[start..start + (end[0] - corner[0]) as usize];
                 let row = (y - corner[1]) * 8 + (z - corner[2]) * 64;
                 let before = found.voxels;
-                // Each is put there and counted if it is to stay: no branch hangs on the data.
+                // Each voxel is stored, and counted only if relevant: no branch depends on the data.
                 for (x, &code) in run.iter().enumerate() {
                     found.index[found.voxels] = (row + x as u32) as u16;
                     found.offset[found.voxels] = start + x;
-                    let stays = relevant(code) && inside([corner[0] + x as u32, y, z]);
-                    found.voxels += usize::from(stays);
+                    let counts = relevant(code) && inside([corner[0] + x as u32, y, z]);
+                    found.voxels += usize::from(counts);
                 }
                 if found.voxels > before {
                     let x = |i: usize| corner[0] + u32::from(found.index[i] & 7);
@@ -284,10 +292,10 @@ impl<T: Copy + Into<f64>> Field<'_, T> {
         }
     }
 
-    /// Differences along the index axes at `at`, whose sample lies at `offset`: the same
-    /// arithmetic as [`Volume::gradient`], bit for bit (a test compares).
+    /// Returns the differences along the index axes at `voxel`, whose sample lies at `offset`, with
+    /// the arithmetic of [`Volume::gradient`] bit for bit (a test compares).
     #[inline]
-    fn difference(&self, at: [u32; 3], offset: usize) -> glam::DVec3 {
+    fn central_difference(&self, voxel: [u32; 3], offset: usize) -> glam::DVec3 {
         let [nx, ny, nz] = self.dims;
         let along = |p: u32, n: u32, stride: usize| {
             let below = usize::from(p > 0);
@@ -297,13 +305,13 @@ impl<T: Copy + Into<f64>> Field<'_, T> {
             }
             let hi: f64 = self.codes[offset + above * stride].into();
             let lo: f64 = self.codes[offset - below * stride].into();
-            // A product with a half is that quotient to the bit.
+            // Exact: a product with 0.5 equals the quotient by 2.
             (hi - lo) * if below + above == 2 { 0.5 } else { 1.0 }
         };
         glam::DVec3::new(
-            along(at[0], nx, 1),
-            along(at[1], ny, nx as usize),
-            along(at[2], nz, nx as usize * ny as usize),
+            along(voxel[0], nx, 1),
+            along(voxel[1], ny, nx as usize),
+            along(voxel[2], nz, nx as usize * ny as usize),
         )
     }
 }

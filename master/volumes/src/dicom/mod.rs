@@ -179,12 +179,16 @@ impl Write for Begun<'_> {
     }
 }
 
-/// The other end: what a process does that was started to parse a folder. It confines itself and
-/// writes the wished series, or why there is none, to `out`. What goes wrong after the samples
-/// began is an error: the process has to end badly and say it on stderr.
+/// Parses a folder of DICOM files in the process started for it ([`crate::Hints::dicom_reader`]) and
+/// writes one series, or the problem that prevents it, to `out`.
+///
+/// `series` names the series (its number, description, name or UID); `file` is a slice whose series
+/// is meant. First the process limits itself for good, where the system allows it: 512 MiB of
+/// memory, 120 s of processor time, no file written.
 ///
 /// # Errors
-/// If samples can't be read any more, or nobody listens.
+/// Reading fails after the first samples were written, or `out` can't be written. The process must
+/// then print the error to stderr and exit with a failure.
 pub fn serve(
     folder: &Path,
     series: Option<&str>,

@@ -6,7 +6,7 @@ fn formula(text: &str) -> Volume {
 }
 
 #[test]
-fn every_formula_has_every_awkward_size() {
+fn formula_volumes_open_in_awkward_sizes() {
     for (name, _) in NAMES {
         let v = formula(&format!("formula:{name}"));
         assert_eq!(v.name, format!("formula:{name}"));
@@ -26,7 +26,7 @@ fn every_formula_has_every_awkward_size() {
 }
 
 #[test]
-fn strange_names_and_sizes_are_refused() {
+fn formula_refuses_unknown_names_and_bad_sizes() {
     let blown = format!("formula:wall:{}", "9".repeat(400));
     for text in [
         "formula:",
@@ -49,7 +49,7 @@ fn strange_names_and_sizes_are_refused() {
 }
 
 #[test]
-fn the_marker_tells_every_axis_and_every_sense_from_the_others() {
+fn formula_marker_distinguishes_all_axes_and_directions() {
     let v = formula("formula:marker:40");
     let at = |x: f64, y: f64, z: f64| {
         let i = [x, y, z].map(|c| ((c + 1.0) * 20.0) as usize);
@@ -62,7 +62,7 @@ fn the_marker_tells_every_axis_and_every_sense_from_the_others() {
 }
 
 #[test]
-fn answers_are_those_on_paper() {
+fn formula_values_match_hand_computed_answers() {
     let count =
         |v: &Volume, code: f64| (0..v.samples.len()).filter(|&i| v.samples.code(i) == code).count();
     assert_eq!(count(&formula("formula:wall:16"), 200.0), 8 * 8 * 8);
@@ -83,8 +83,8 @@ fn answers_are_those_on_paper() {
 }
 
 #[test]
-fn formulas_are_the_same_on_every_machine() {
-    // Golden frames are made of these; a digest that differs is a new formula.
+fn formula_digests_are_the_same_on_every_machine() {
+    // Golden frames depend on these digests.
     for (name, start) in [
         ("wall", "cb8666f2e156c6f1"),
         ("two-walls", "ed4e5af521a120fc"),

@@ -6,7 +6,7 @@ fn open(name: &str, hints: &RawHints, bytes: &[u8]) -> Result<Volume, Problem> {
 }
 
 #[test]
-fn names_say_size_type_and_order() {
+fn raw_file_name_gives_size_type_and_byte_order() {
     let none = RawHints::default();
     for (name, kind, first) in [
         ("x_3x2x1_uint16.raw", "uint16", 1.0),
@@ -25,7 +25,7 @@ fn names_say_size_type_and_order() {
 }
 
 #[test]
-fn flags_go_before_the_name() {
+fn raw_flags_override_the_file_name() {
     let mut hints =
         RawHints { dims: Some([1, 2, 3]), spacing: Some([1.0, 2.0, 3.0]), ..RawHints::default() };
     assert!(hints.set_type("int8") && !hints.is_empty());
@@ -37,7 +37,7 @@ fn flags_go_before_the_name() {
 }
 
 #[test]
-fn what_does_not_fit_is_told_what_would() {
+fn raw_size_mismatch_suggests_flags_that_fit() {
     let none = RawHints::default();
     for (name, bytes, say) in [
         ("x_2x2x2_uint8.raw", 16, "holds 16 bytes, and 2x2x2 of uint8 take 8; --type uint16"),

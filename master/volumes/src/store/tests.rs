@@ -9,20 +9,20 @@ fn span(a: f64, b: f64) -> Support {
     Support { intervals: vec![(a, b)], nan: false }
 }
 
-/// Looks at every voxel of a volume, plainly, and compares with what the store holds.
+/// Builds a store and compares it with a plain loop over all voxels of the volume.
 fn check(volume: &Volume, support: &Support, normals: bool) -> BrickStore {
     let support = support.clone();
     check_all(volume, &BrickNeeds { support, normals, gradients: false, crop: None })
 }
 
-fn check_all(volume: &Volume, wanted: &BrickNeeds) -> BrickStore {
-    let (support, normals) = (&wanted.support, wanted.normals);
+fn check_all(volume: &Volume, needs: &BrickNeeds) -> BrickStore {
+    let (support, normals) = (&needs.support, needs.normals);
     let digest = volume.digest();
-    let store = BrickStore::build(volume, digest, wanted);
+    let store = BrickStore::build(volume, digest, needs);
     let dims = volume.lattice.dims;
     let grid = BrickGrid::new(dims);
     let m = volume.gradient_matrix();
-    assert_eq!(store.key(), wanted.set_key(digest));
+    assert_eq!(store.key(), needs.set_key(digest));
     assert!(store.infos().windows(2).all(|w| w[0].id < w[1].id), "ids ascend");
     let mut seen = std::collections::BTreeMap::new();
     let mut bytes = 0;
@@ -40,7 +40,7 @@ fn check_all(volume: &Volume, wanted: &BrickNeeds) -> BrickStore {
         assert!(!brick.is_empty() && brick.index.windows(2).all(|w| w[0] < w[1]));
         assert_eq!(brick.tight_box(&grid), info.tight);
         assert_eq!(brick.normals.is_some(), normals);
-        assert_eq!(brick.gradients.is_some(), wanted.gradients);
+        assert_eq!(brick.gradients.is_some(), needs.gradients);
         // NaN is not equal to itself; its bytes are.
         let decoded = Brick::decode(&encoded).expect("our own bytes are good");
         let mut re_encoded = Vec::new();
@@ -68,7 +68,7 @@ fn check_all(volume: &Volume, wanted: &BrickNeeds) -> BrickStore {
                 let offset = ((k * dims[1] + j) * dims[0] + i) as usize;
                 let code = volume.samples.code(offset);
                 let found = seen.remove(&[k, j, i]);
-                let inside = wanted.crop.is_none_or(|c| c.contains(&volume.lattice, [i, j, k]));
+                let inside = needs.crop.is_none_or(|c| c.contains(&volume.lattice, [i, j, k]));
                 if !support.contains(code) || !inside {
                     assert!(found.is_none(), "({i}, {j}, {k}) is not relevant");
                     continue;
@@ -89,7 +89,7 @@ fn check_all(volume: &Volume, wanted: &BrickNeeds) -> BrickStore {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
     #[test]
-    fn every_relevant_voxel_is_in_one_brick_with_its_value_and_normal(
+    fn brick_store_holds_every_relevant_voxel_once_with_value_and_normal(
         dims in [1u32..20, 1u32..20, 1u32..20], kind in 0u8..3, normals in any::<bool>(),
         seed in any::<u32>(), cut in 0.0..1.2f64, shear in -0.5..0.5f64, crop in any::<bool>(),
     ) {
@@ -121,7 +121,7 @@ proptest! {
 }
 
 #[test]
-fn empty_and_full_and_flat_volumes() {
+fn brick_store_handles_empty_full_constant_and_thin_volumes() {
     let full = Volume::from_fn_u8("full", [17, 9, 8], |_, _, _| 200);
     let store = check(&full, &span(1.0, 255.0), true);
     assert_eq!((store.infos().len(), store.relevant_voxels()), (6, 17 * 9 * 8));
@@ -142,18 +142,18 @@ fn empty_and_full_and_flat_volumes() {
 }
 
 #[test]
-fn a_set_with_normals_and_one_without_have_different_keys() {
+fn brick_set_key_depends_on_normals() {
     let v = Volume::from_fn_u8("v", [8; 3], |i, _, _| i as u8);
     let support = span(3.0, 4.0);
     let (with, without) = (check(&v, &support, true), check(&v, &support, false));
     assert_ne!(with.key(), without.key());
-    assert!(with.wanted().normals && !without.wanted().normals);
-    assert_eq!(with.wanted().support, support);
+    assert!(with.needs().normals && !without.needs().normals);
+    assert_eq!(with.needs().support, support);
     assert!(with.bytes() > without.bytes());
 }
 
 #[test]
-fn a_table_is_what_the_support_says_for_every_code() {
+fn relevance_table_matches_support_for_every_code() {
     for intervals in [
         vec![],
         vec![(0.0, 255.0)],
@@ -162,18 +162,18 @@ fn a_table_is_what_the_support_says_for_every_code() {
         vec![(3.2, 3.8), (f64::NEG_INFINITY, -1.0), (300.0, f64::INFINITY)],
     ] {
         let support = Support { intervals, nan: true };
-        for (code, &relevant) in table(&support, 256).iter().enumerate() {
+        for (code, &relevant) in relevance_table(&support, 256).iter().enumerate() {
             assert_eq!(relevant, support.contains(code as f64), "{code} of {support:?}");
         }
     }
 }
 
 #[test]
-fn many_threads_get_the_same_bytes() {
+fn brick_encoding_is_shared_between_threads() {
     let v = Volume::from_fn_u8("v", [32; 3], |i, j, k| (i * j + k) as u8 | 1);
-    let wanted =
+    let needs =
         BrickNeeds { support: span(1.0, 255.0), normals: true, gradients: false, crop: None };
-    let store = BrickStore::build(&v, Digest32::default(), &wanted);
+    let store = BrickStore::build(&v, Digest32::default(), &needs);
     let id = store.infos()[7].id;
     let seen: Vec<usize> = std::thread::scope(|s| {
         let ask = || store.encoded(id).expect("it is relevant").as_ptr() as usize;

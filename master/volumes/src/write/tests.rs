@@ -13,11 +13,11 @@ const ALL: [Format; 4] = [
 
 fn again(volume: &Volume, format: Format) -> Volume {
     let (mut bytes, mut seen) = (Vec::new(), 0);
-    let went_on = &mut |n| {
+    let on_progress = &mut |n| {
         seen = n;
         Ok(())
     };
-    write(volume, format, &mut bytes, went_on).unwrap();
+    write(volume, format, &mut bytes, on_progress).unwrap();
     assert_eq!(seen, volume.samples.len() as u64);
     let source = Source::memory(bytes);
     crate::read(source, Path::new("."), "x", &crate::Hints::default())
@@ -35,7 +35,7 @@ fn volume(samples: Samples, map: ValueMap, file_type: &str) -> Volume {
 }
 
 #[test]
-fn what_is_written_is_read_with_the_same_digest() {
+fn written_volume_reads_back_with_the_same_digest() {
     let shift = |offset| ValueMap { scale: 1.0, offset };
     let bytes = || Samples::U8(vec![0, 1, 2, 128, 254, 255]);
     let words = || Samples::U16(vec![0, 1, 255, 256, 40000, 65535]);
@@ -64,7 +64,7 @@ fn what_is_written_is_read_with_the_same_digest() {
 }
 
 #[test]
-fn codes_with_a_slope_keep_their_values() {
+fn written_volume_with_slope_keeps_its_values() {
     let half = ValueMap { scale: 0.5, offset: -3.25 };
     let odd = ValueMap { scale: 0.1, offset: 1.0 / 3.0 };
     let wide = ValueMap { scale: 4e9, offset: -2e9 };
@@ -87,12 +87,12 @@ fn codes_with_a_slope_keep_their_values() {
 }
 
 #[test]
-fn a_lattice_without_anatomy_stays_without_where_the_format_can_say_so() {
+fn written_lattice_without_anatomy_stays_without_where_the_format_allows() {
     let samples = || Samples::U8(vec![0; 6]);
     let mut v = volume(samples(), ValueMap::IDENTITY, "uint8");
     v.anatomical = false;
-    assert_eq!(loses(&v, ALL[0]), None);
-    assert!(loses(&v, ALL[2]).unwrap().contains("right, anterior"));
+    assert_eq!(loss_warning(&v, ALL[0]), None);
+    assert!(loss_warning(&v, ALL[2]).unwrap().contains("right, anterior"));
     let back = again(&v, ALL[0]);
     assert!(!back.anatomical && back.lattice == v.lattice);
     assert_eq!(again(&v, ALL[2]).lattice, v.lattice);
@@ -100,12 +100,12 @@ fn a_lattice_without_anatomy_stays_without_where_the_format_can_say_so() {
     for format in ALL {
         let back = again(&v, format);
         assert!(!back.anatomical && back.lattice == v.lattice, "{format:?}");
-        assert_eq!(loses(&v, format), None);
+        assert_eq!(loss_warning(&v, format), None);
     }
 }
 
 #[test]
-fn writing_ends_when_it_is_told_to() {
+fn write_stops_with_the_error_of_on_progress() {
     let v = volume(Samples::U8(vec![0; 6]), ValueMap::IDENTITY, "uint8");
     let stop = &mut |_| Err(io::Error::other("stopped"));
     let e = write(&v, ALL[0], &mut Vec::new(), stop).unwrap_err();

@@ -65,7 +65,8 @@ pub enum Event {
         worker: WorkerId,
     },
     /// A frame is requested. Frames complete in the order in which they are queued. The `slab`
-    /// schedule renders one frame at a time; the `region` schedule overlaps frames of one brick set.
+    /// schedule renders one frame at a time; the `region` schedule overlaps frames of one brick
+    /// set.
     FrameQueued(Box<FrameJob>),
     /// A frame is no longer wanted. Produces no answer.
     CancelFrame {
@@ -104,8 +105,8 @@ pub enum Event {
         /// The piece, with its state so far.
         piece: Box<RegionSplit>,
     },
-    /// Bricks arrived intact. Bricks of a set arrive in the order in which they were sent, so a count
-    /// is enough. Damaged bricks are not counted.
+    /// Bricks arrived intact. Bricks of a set arrive in the order in which they were sent, so a
+    /// count is enough. Damaged bricks are not counted.
     BricksIn {
         /// The worker that received them.
         worker: WorkerId,

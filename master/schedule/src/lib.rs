@@ -9,15 +9,15 @@
 //! 2. Turn whatever happens into an [`Event`] and hand it to [`Scheduler::handle`], with a
 //!    [`Clock`] that never goes back. Hand in [`Event::WorkerHeard`] for messages that have no
 //!    event of their own.
-//! 3. After each event take [`Scheduler::next_action`] until it is `None`, and do what it says,
-//!    in order for each worker. Control messages and bricks may travel on two links; each keeps
-//!    its own order.
+//! 3. After each event take [`Scheduler::next_action`] until it is `None`, and do what it says, in
+//!    order for each worker. Control messages and bricks may travel on two links; each keeps its
+//!    own order.
 //! 4. Sleep until the next message or [`Scheduler::next_deadline`], whichever is first; at the
 //!    deadline hand in [`Event::Tick`].
 //!
-//! A worker that [`Action::Drop`] names, and one that was reported with
-//! [`Event::WorkerLost`], is forgotten: close its link, ignore what still comes. When it dials
-//! again it is a new worker with a new id.
+//! A worker that [`Action::Drop`] names, and one that was reported with [`Event::WorkerLost`], is
+//! forgotten: close its link, ignore what still comes. When it dials again it is a new worker with
+//! a new id.
 //!
 //! ```text
 //! +-------------------------------------------------------------------------------------------+
@@ -79,7 +79,8 @@ pub struct Config {
     pub queue_ahead: u32,
     /// Cuts mixed tile sizes under the `slab` schedule: each render thread starts with a whole
     /// macrotile, later ones are quarters ([`macrotile::cut_mixed`]). The paper's experiment, which
-    /// `slabcast study` repeats by simulation (`slabcast-sim`). No master sets it, and records do not have it.
+    /// `slabcast study` repeats by simulation (`slabcast-sim`). No master sets it, and records do
+    /// not have it.
     pub mixed: bool,
 }
 

@@ -1,6 +1,5 @@
-//! Who is lent which task, and when: leases, work stealing and speculative copies.
+//! Which worker is lent which task, and when: leases, work stealing and speculative copies.
 
 pub(crate) mod lend;
-pub(crate) mod pace;
-pub(crate) mod split_on_lend;
+pub(crate) mod speculate;
 pub(crate) mod steal;

@@ -1,356 +1,154 @@
-//! Hand-overs: a region that is being drawn is cut where it stands, and a worker that has nothing
-//! left to do draws a piece of it from there (DESIGN.md section 3: take-over with its state;
-//! `region` schedule, a frame that is alone).
+//! Work stealing (`region` schedule): an idle worker takes a waiting tile of the worker that would
+//! end later, or, at the end of a sole frame, a piece of a tile that is being rendered (DESIGN.md
+//! section 3: take-over with its state).
 //!
 //! ```text
-//! nothing waits, a thread is dry        the region that takes longest yet is asked for a piece      (ask_for_pieces)
-//! its worker cuts it at the next sheet  it goes on with what it keeps; the rest comes as a state    (handed_over)
-//! the piece is a task like any other    lent with that state to who is dry, again if he is lost
+//! a thread is idle                    takes a waiting tile of another worker      (steal_waiting)
+//! no tile waits                       the longest running region is to be split   (find_pieces)
+//! its worker cuts it at a sheet       it keeps a part; the rest comes as a state  (take_piece)
+//! the piece is a task like any other  lent with its state to an idle worker
 //! ```
 //!
-//! Before the frame tiles are dealt out by what they took in the view before (`alone`), and a last
-//! one that would be late is cut as it is lent (`late`). What neither knows is found out here: a
-//! view in which a tile takes longer, a worker that is slower than it was. Pieces cost no drawing
-//! twice but the voxels at their border and at the cut sheet, three ways between machines, and
-//! bricks. So they come before running a straggler's tile twice, which is left for who does not
-//! answer.
+//! Before the frame tiles are assigned by what they took in the frame before. What that does not
+//! know is mended here: a view in which a tile takes longer, a worker that is slower than it was.
+//! Pieces render nothing twice but the voxels at their border and at the cut sheet. So they come
+//! before a speculative copy, which is left for workers that do not answer.
 //!
-//! The first lease goes on, for what is left of its tile. So there is nothing to wait for: who has
-//! drawn his region when the question comes has nothing to give, and his result counts as ever. If
-//! he is lost after he gave a piece away, the piece is not; what he kept is drawn again from the
-//! front. The price is that a task's tile may shrink while it is lent. It must not be lent to two
-//! then: who has it as it was would send too many pixels. So where somebody else was lent it
-//! meanwhile, the piece is dropped, and so is what its giver sends.
+//! The first lease goes on, for what is left of its tile. A worker that has finished its region
+//! when the question arrives has nothing to give, and its result counts as ever. If it is lost
+//! after it gave a piece away, the piece is not; what it kept is rendered again from the front. The
+//! price is that a task's tile may shrink while it is lent, so it must not be lent twice then:
+//! where another worker was lent it meanwhile, the piece is dropped, and so is what its giver
+//! sends.
 //!
-//! Statistics and what is learnt for the next frame are of the whole tile ([`SplitGroup`]).
+//! Statistics and the cost history are of the whole tile ([`SplitGroup`]).
 
 use crate::Micros;
-use crate::dispatch::pace::Measured;
+use crate::dispatch::lend::NewLeases;
+use crate::dispatch::speculate::patience_us;
+use crate::policy::cost_history::WHOLE_PX;
 use crate::policy::macrotile::Macrotile;
-use crate::policy::region::Regions;
 use crate::state::cluster::Cluster;
-use crate::state::frame::{Frame, Slab, check};
-use crate::state::task_queue::{End, Verdict};
+use crate::state::frame::{StepContext, check_sums};
+use crate::state::region_frame::RegionFrame;
+use crate::state::task_queue::{End, Lease, TaskQueue};
+use crate::state::worker_map::WorkerMap;
 use slabcast_common::ids::{Epoch, WorkerId};
 use slabcast_common::image::LEAF_EDGE;
 use slabcast_common::message::{RegionSplit, ToWorker};
 use slabcast_common::occlusion::Rect;
 use slabcast_common::region::parts;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// What goes by until a piece is drawn that is asked for now, in microseconds: the question, the
-/// piece to the master and on to who is dry, and those of its bricks that nobody thought of. At 300
-/// and at 800 the figures of [`GAIN`] change by their noise.
-const AWAY: f64 = 500.0;
+/// Tuning (us): time until a piece that is asked for now is rendered: the question, the piece to
+/// the master and on to an idle worker, and bricks that nobody prefetched. At 300 and 800 frames
+/// change by their noise.
+const PIECE_TRANSFER_US: f64 = 500.0;
 
-/// Bytes of a piece, which pass the link twice: of 64x32 pixels in a scene that fills them.
-const BYTES: f64 = 48_000.0;
+/// Tuning (us): what stealing has to win, to be worth its messages. At 150 twice as many pieces are
+/// asked for, and 64 workers win nothing by them (mri256 `peer-semi` at 1536x1536).
+const STEAL_GAIN_US: f64 = 300.0;
 
-/// How much longer the pieces of a region take together than it would have taken, at least.
-const MORE: f64 = 1.1;
+/// Tuning (ratio): rendering time of the pieces of a region to that of the region.
+const PIECE_TIME_RATIO: f64 = 1.1;
 
-/// What a hand-over has to win, in microseconds, to be worth its messages. At 150 as many again are
-/// asked for, and 64 workers win nothing by them (mri256 `peer-semi` at 1536x1536, `plan`).
-const GAIN: f64 = 300.0;
+/// Limit: bytes of a piece's state, which pass the link twice: 64x32 pixels in a scene that fills
+/// them.
+const PIECE_STATE_BYTES: f64 = 48_000.0;
 
-/// The least and the most that is asked for, of what is left.
-const SHARE: (f64, f64) = (0.15, 0.95);
+/// Limit: least and largest part that is asked for, of what is left of a region.
+const PIECE_SHARE: [f64; 2] = [0.15, 0.95];
 
-/// So long a worker may take to answer before its tile is run twice, in microseconds: the
-/// scheduling of two busy machines.
-const PATIENCE: Micros = 5_000;
+/// A lease that is to be split: index of its task, worker, attempt.
+type Victim = (u32, WorkerId, Epoch);
 
-/// A lease of which a piece is to be given away: its place, whose it is, and which attempt.
-type Leased = (u32, WorkerId, Epoch);
+/// Leases to split, and how many thousandths of what is left to ask for.
+pub(super) type Questions = Vec<(Victim, u32)>;
 
-/// Leases that are to be asked for so many thousandths of what is left.
-pub(crate) type Questions = Vec<(Leased, u32)>;
-
-/// A tile of which pieces were given away, with all of them.
+/// A tile of which pieces were given away, with all its pieces.
 #[derive(Debug)]
 pub(crate) struct SplitGroup {
-    /// As it was cut first, and whose it was then.
+    /// The whole tile, and its first owner.
     pub(crate) tile: Rect,
     pub(crate) owner: WorkerId,
-    /// Of its tasks so many have no result.
+    /// Tasks without a result.
     open: u32,
-    /// What they took in all, and what they were drawn from.
+    /// Rendering time of all tasks, and the bricks they used.
     us: Micros,
-    touched: Vec<u32>,
+    bricks: Vec<u32>,
 }
 
-/// What a result says of a tile.
-pub(crate) enum Drawn {
-    /// Nothing of it was given away.
-    Itself,
-    /// Others have pieces of it.
-    InPart,
-    /// It was the last of the tile's at this place.
-    Whole(u32, SplitGroup),
-}
-
-/// How long a region takes yet that was to take so long, in microseconds, and has taken some of it.
-/// What takes longer than it was to is slower than was known, by how much it is over so far.
-fn left(us: f64, elapsed: f64) -> f64 {
-    (us - elapsed).abs()
-}
-
-/// How much of what is left of a region is to be given away for both pieces to be done at once, if
-/// others are so many times quicker and what is given is `away` for so long; `None`: it does not
-/// pay.
-fn share(left: f64, quicker: f64, away: f64) -> Option<f64> {
-    let share = (1.0 - away / (MORE * left)) / (1.0 + 1.0 / quicker);
-    let ends = MORE * left * (1.0 - share);
-    (share >= SHARE.0 && ends + GAIN <= left).then(|| share.min(SHARE.1))
-}
-
-/// The least that has to be left for [`share`] to pay, where others are as quick: half of it, drawn
-/// as a piece, and half of the way are to be shorter by [`GAIN`].
-fn least(away: f64) -> f64 {
-    (0.5 * away + GAIN) / (1.0 - 0.5 * MORE)
-}
-
-/// [`AWAY`], by a link as quick as was seen.
-fn away(cluster: &Cluster) -> f64 {
-    AWAY + cluster.link_use.rate().map_or(0.0, |rate| 2.0 * BYTES / rate)
-}
-
-impl Frame {
-    /// Of which regions, those that take longest yet, pieces are asked for: one for each thread
-    /// that has nothing to do soon.
-    pub(crate) fn find_pieces(&mut self, cluster: &Cluster, now: Micros) -> Questions {
-        self.pieces_at = None;
-        let Some(slab) = self.slab.as_ref().filter(|_| self.alone) else { return Vec::new() };
-        if slab.queue.waiting() > 0 || cluster.link_use.binds_alone() {
-            return Vec::new();
-        }
-        // Where all tiles are short nobody need be looked at.
-        let longest = slab.regions.as_ref().map_or(0.0, Regions::longest_us);
-        if longest < least(AWAY) {
-            return Vec::new();
-        }
-        let away = away(cluster);
-        let price = |place: u32| {
-            let tile = &slab.cut.tiles[place as usize].rect;
-            let regions = slab.regions.as_ref();
-            regions.map_or(0.0, |regions| regions.price_of_piece(place, tile, &cluster.history))
-        };
-        let pays = |(left, quicker, lease): (f64, f64, Leased)| {
-            // What its bricks take is looked up only where it pays without.
-            share(left, quicker, away)?;
-            let share = share(left, quicker, away + price(lease.0))?;
-            Some((lease, (1000.0 * share) as u32))
-        };
-        let pace = self.pace.measure();
-        let drawn = self.being_drawn((cluster, slab, pace), now).into_iter();
-        let drawn: Vec<_> = drawn.filter_map(pays).collect();
-        let free = self.free((cluster, slab, pace), now);
-        let soon = free.iter().filter(|f| f.0 <= away).map(|f| f.2).sum::<u64>();
-        let names = slab.names.saturating_sub(slab.queue.tasks.len() as u64);
-        let room = soon.min(names).saturating_sub(slab.handing.len() as u64) as usize;
-        // When the next one is free soon; or, if one is now, when a region is late enough.
-        self.pieces_at = if drawn.len() < room {
-            self.overtime((cluster, slab, pace), away, now)
-        } else {
-            let next = free.iter().find(|f| f.0 > away).filter(|_| drawn.len() > room);
-            next.map(|f| now.saturating_add((f.0 - away).ceil() as Micros).max(now + 1))
-        };
-        let asked: Questions = drawn.into_iter().take(room).collect();
-        if let Some(slab) = &mut self.slab {
-            slab.handing.extend(asked.iter().map(|((place, id, _), _)| (*place, (*id, now))));
-        }
-        asked
-    }
-
-    /// Asks for them; their leases are sent.
-    pub(crate) fn ask_for_pieces(&self, cluster: &mut Cluster, questions: Questions) {
-        let Some(slab) = &self.slab else { return };
-        for ((place, id, epoch), share) in questions {
-            let (frame, task) = (self.job.frame, slab.queue.id(place));
-            cluster.send(id, ToWorker::SplitRegion { frame, task, epoch, share });
-        }
-    }
-
-    /// Regions that workers draw now and could give pieces of: how long they take yet, and how many
-    /// times quicker others are, longest first.
-    fn being_drawn(
-        &self,
-        of: (&Cluster, &Slab, Option<Measured>),
-        now: Micros,
-    ) -> Vec<(f64, f64, Leased)> {
-        let left = |(lease, us, since): (Leased, f64, Micros)| {
-            let elapsed = now.saturating_sub(since) as f64;
-            (left(us, elapsed), (elapsed / us.max(1.0)).max(1.0), lease)
-        };
-        let mut drawn: Vec<_> = self.running(of).map(left).collect();
-        drawn.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.2.cmp(&b.2)));
-        drawn
-    }
-
-    /// Workers that take leases, by when they have nothing more to do: in how many microseconds,
-    /// and how many threads of theirs. Who takes longer than he was to is none of them.
-    fn free(
-        &self,
-        (cluster, slab, pace): (&Cluster, &Slab, Option<Measured>),
-        now: Micros,
-    ) -> Vec<(f64, WorkerId, u64)> {
-        let mut free = Vec::new();
-        for (id, worker) in cluster.roster.active() {
-            let threads = u64::from(worker.threads);
-            let dry = threads.saturating_sub(worker.leases);
-            if dry > 0 {
-                free.push((0.0, id, dry));
-                continue;
-            }
-            let answered = self.answered.get(id).copied().unwrap_or(0);
-            let lent = self.lent.get(id).into_iter().flatten();
-            let us = lent.enumerate().map(|(i, lent)| {
-                let place = slab.queue.place(lent.task)?;
-                let us = slab.us(place, pace)?;
-                let drawn = if (i as u64) < threads { lent.sent.max(answered) } else { now };
-                Some(us - now.saturating_sub(drawn) as f64).filter(|us| *us >= 0.0)
-            });
-            if let Some(us) = us.sum::<Option<f64>>() {
-                free.push((us / threads as f64, id, 1));
-            }
-        }
-        free.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        free
-    }
-
-    /// When the first region that is drawn now will have taken so much longer than it was to that a
-    /// piece of it pays.
-    fn overtime(
-        &self,
-        of: (&Cluster, &Slab, Option<Measured>),
-        away: f64,
-        now: Micros,
-    ) -> Option<Micros> {
-        // What is over its time by so much will take as much again.
-        let enough = 1.0 + least(away);
-        let at = |(_, us, since): (Leased, f64, Micros)| {
-            since.saturating_add((us + enough).min(1e15) as Micros)
-        };
-        self.running(of).map(at).filter(|at| *at > now).min()
-    }
-
-    /// What threads are probably at that one worker alone has: its place, whose, and which attempt;
-    /// how long it was to take, and since when.
-    fn running<'a>(
-        &'a self,
-        (cluster, slab, pace): (&'a Cluster, &'a Slab, Option<Measured>),
-    ) -> impl Iterator<Item = (Leased, f64, Micros)> + 'a {
-        self.lent.iter().flat_map(move |(id, lent)| {
-            let threads = cluster.roster.get(id).map_or(0, |w| w.threads);
-            let answered = self.answered.get(id).copied().unwrap_or(0);
-            lent.iter().take(threads as usize).filter_map(move |lent| {
-                let place = slab.queue.place(lent.task)?;
-                let asked = slab.handing.contains_key(&place);
-                let may = !asked && slab.queue.is_only_lease(place, id, lent.epoch);
-                let us = slab.us(place, pace).filter(|_| may)?;
-                Some(((place, id, lent.epoch), us, lent.sent.max(answered)))
-            })
-        })
-    }
-
-    /// A worker gives a piece of a region away. An error is its lie.
-    pub(crate) fn handed_over(
-        &mut self,
-        cluster: &mut Cluster,
-        worker: WorkerId,
-        piece: RegionSplit,
-        now: Micros,
-    ) -> Result<(), String> {
-        let Some(slab) = &mut self.slab else { return Ok(()) };
-        let verdict = slab.queue.judge(piece.task, piece.epoch, worker);
-        let Verdict::Counts(place, lease) = verdict else { return Ok(()) };
-        if slab.regions.is_none()
-            || slab.handing.remove(&place).map(|asked| asked.0) != Some(worker)
-        {
-            return Err("it gave away a piece of a tile that nobody asked for".into());
-        }
-        let tile = slab.cut.tiles[place as usize].rect;
-        check_pieces(tile, &piece)?;
-        let RegionSplit { kept, given, begun, .. } = piece;
-        if !slab.queue.is_only_lease(place, worker, lease.epoch) {
-            // Somebody else was lent it as it was.
-            slab.queue.release(place, worker, lease.epoch);
-            return Ok(());
-        }
-        let since = lease.sent.max(self.answered.get(worker).copied().unwrap_or(0));
-        let elapsed = now.saturating_sub(since) as f64;
-        let Some(slab) = &self.slab else { return Ok(()) };
-        let pace = self.pace.measure();
-        let us = slab.us(place, pace).unwrap_or(0.0);
-        let free = self.free((cluster, slab, pace), now);
-        let Some(slab) = &mut self.slab else { return Ok(()) };
-        let Some(regions) = &mut slab.regions else { return Ok(()) };
-        let near = |id: WorkerId| {
-            let owned = regions.owned(id).iter().map(|p| slab.cut.tiles[*p as usize].rect);
-            owned.map(|r| far(&r, &given)).min().unwrap_or(i32::MAX)
-        };
-        // Of those who can have begun it as soon as it is there, who has drawn nearest to it and
-        // lacks least bricks.
-        let away = away(cluster);
-        let soon = free.iter().filter(|f| f.0 <= away && f.1 != worker);
-        let first = || free.iter().find(|f| f.1 != worker);
-        let taker = soon.min_by_key(|f| (near(f.1), f.1)).or_else(first).map_or(worker, |f| f.1);
-        let part = given.area() as f64 / tile.area() as f64;
-        let us = MORE * left(us, elapsed);
-        regions.hand_over(
-            (place, &tile),
-            (elapsed + us * (1.0 - part), us * part),
-            taker,
-            &cluster.history,
-        );
-        let est = slab.cut.tiles[place as usize].est;
-        let of = |rect: Rect| {
-            let est = (est as f64 * rect.area() as f64 / tile.area() as f64) as u64;
-            Macrotile { rect, est: est.max(1) }
-        };
-        slab.cut.tiles[place as usize] = of(kept);
-        let task = &mut slab.queue.tasks[place as usize];
-        task.tile = of(kept);
-        task.begun = task.begun.as_ref().map(|begun| Arc::new(begun.crop(tile, kept)));
-        let at = slab.queue.add_piece(of(given), Arc::new(begun));
-        slab.cut.add(vec![of(given)]);
-        let root = slab.roots.get(&place).copied().unwrap_or(place);
-        slab.roots.insert(at, root);
-        let whole = SplitGroup { tile, owner: worker, open: 1, us: 0, touched: Vec::new() };
-        slab.split_groups.entry(root).or_insert(whole).open += 1;
-        self.ledger.handed_over += 1;
-        self.progress(cluster);
-        Ok(())
+impl SplitGroup {
+    /// Returns the rendering time of all tasks, and the bricks they used.
+    pub(crate) fn cost(&self) -> (Micros, &[u32]) {
+        (self.us, &self.bricks)
     }
 }
 
-impl Slab {
-    /// Until when it is waited for a piece of a task to be given away.
-    pub(crate) fn waits_for_piece(&self, place: u32) -> Micros {
-        self.handing.get(&place).map_or(0, |(_, asked)| asked.saturating_add(PATIENCE))
+/// The pieces of a frame.
+#[derive(Debug, Default)]
+pub(crate) struct Splits {
+    /// Tasks whose workers were asked for a piece, and when.
+    asked: BTreeMap<u32, (WorkerId, Micros)>,
+    /// The task of the whole tile that each piece comes from.
+    roots: BTreeMap<u32, u32>,
+    /// Groups with tasks that have no result, by root.
+    groups: BTreeMap<u32, SplitGroup>,
+}
+
+impl Splits {
+    /// Forgets that a task's worker was asked for a piece. Returns the worker.
+    pub(crate) fn forget_question(&mut self, place: u32) -> Option<WorkerId> {
+        self.asked.remove(&place).map(|asked| asked.0)
     }
 
-    /// The same of each piece that is waited for now.
-    pub(crate) fn waits_for_pieces(&self, now: Micros) -> Vec<Micros> {
-        let until = self.handing.keys().map(|place| self.waits_for_piece(*place));
+    /// Forgets all questions to a worker.
+    pub(crate) fn forget_worker(&mut self, id: WorkerId) {
+        self.asked.retain(|_, (asked, _)| *asked != id);
+    }
+
+    /// Returns until when to wait for a piece of a task; 0 if none was asked for.
+    pub(crate) fn asked_until(&self, place: u32) -> Micros {
+        let patience = patience_us(0.0);
+        self.asked.get(&place).map_or(0, |(_, asked)| asked.saturating_add(patience))
+    }
+
+    /// Returns until when to wait for each piece that is asked for now.
+    pub(crate) fn open_questions(&self, now: Micros) -> Vec<Micros> {
+        let until = self.asked.keys().map(|place| self.asked_until(*place));
         until.filter(|until| *until > now).collect()
     }
 
-    /// How long a region was to take: as it did in the frame before, or by what others of this one
-    /// took.
-    fn us(&self, place: u32, pace: Option<Measured>) -> Option<f64> {
-        let guess = || pace.map(|pace| pace.expects(self.cut.tiles[place as usize].est) as f64);
-        self.regions.as_ref()?.took(place).or_else(guess)
+    /// Notes a result. `None`: the task's tile was not split. `Some(None)`: other tasks of the tile
+    /// have no result. Otherwise the group, which is complete.
+    pub(crate) fn rendered(
+        &mut self,
+        place: u32,
+        us: Micros,
+        bricks: &[u32],
+    ) -> Option<Option<SplitGroup>> {
+        let root = self.roots.get(&place).copied().unwrap_or(place);
+        let group = self.groups.get_mut(&root)?;
+        group.open -= 1;
+        group.us += us;
+        group.bricks.extend_from_slice(bricks);
+        if group.open > 0 {
+            return Some(None);
+        }
+        let mut group = self.groups.remove(&root)?;
+        group.bricks.sort_unstable();
+        group.bricks.dedup();
+        Some(Some(group))
     }
 
-    /// Tiles of which pieces were given away and that were drawn: as they were cut first, with what
-    /// was expected of them then, and what their pieces took.
-    pub(crate) fn whole_tiles(&self) -> BTreeMap<u32, (Rect, u64, Micros)> {
+    /// Returns tiles whose pieces were rendered, by root: the whole tile, its estimate, and the
+    /// rendering time of the pieces.
+    pub(crate) fn whole_tiles(&self, queue: &TaskQueue) -> BTreeMap<u32, (Rect, u64, Micros)> {
         let mut whole = BTreeMap::new();
-        for (at, root) in self.roots.iter().filter(|(at, _)| self.is_told_elsewhere(**at)) {
-            let (task, piece) =
-                (&self.queue.tasks[*root as usize], &self.queue.tasks[*at as usize]);
+        let rendered = self.roots.iter().filter(|(at, _)| self.is_part_of_a_whole(queue, **at));
+        for (place, root) in rendered {
+            let [task, piece] = [*root, *place].map(|place| &queue.tasks[place as usize]);
             let tile = whole.entry(*root).or_insert((task.tile.rect, task.tile.est, 0));
             tile.0 = tile.0.union(&piece.tile.rect);
             tile.1 += piece.tile.est;
@@ -361,49 +159,327 @@ impl Slab {
         whole
     }
 
-    /// Whether a task is a piece that is told as its tile's: both were drawn.
-    pub(crate) fn is_told_elsewhere(&self, place: u32) -> bool {
-        let done = |at: u32| matches!(self.queue.tasks[at as usize].end, End::Done { .. });
+    /// Whether a task is a piece that counts as part of its whole tile: both were rendered.
+    pub(crate) fn is_part_of_a_whole(&self, queue: &TaskQueue, place: u32) -> bool {
+        let done = |at: u32| matches!(queue.tasks[at as usize].end, End::Done { .. });
         self.roots.get(&place).is_some_and(|root| done(*root) && done(place))
     }
+}
 
-    /// A task was drawn, in so long and from these bricks: what that says of the tile that it is,
-    /// or is a piece of.
-    pub(crate) fn drawn(&mut self, place: u32, us: Micros, touched: &[u32]) -> Drawn {
-        let root = self.roots.get(&place).copied().unwrap_or(place);
-        let Some(group) = self.split_groups.get_mut(&root) else { return Drawn::Itself };
-        group.open -= 1;
-        group.us += us;
-        group.touched.extend_from_slice(touched);
-        if group.open > 0 {
-            return Drawn::InPart;
+/// Returns the remaining time of a region that was predicted to take `us`. One that takes longer
+/// than predicted is slower than was known, by as much as it is over so far.
+fn remaining_us(us: f64, elapsed: f64) -> f64 {
+    (us - elapsed).abs()
+}
+
+/// Returns which share of what is left of a region to give away, for both pieces to end at once.
+///
+/// `quicker`: how many times quicker other workers are. `away`: time until the piece is rendered.
+/// `None`: it does not pay.
+fn piece_share(left: f64, quicker: f64, away: f64) -> Option<f64> {
+    let share = (1.0 - away / (PIECE_TIME_RATIO * left)) / (1.0 + 1.0 / quicker);
+    let ends = PIECE_TIME_RATIO * left * (1.0 - share);
+    let pays = share >= PIECE_SHARE[0] && ends + STEAL_GAIN_US <= left;
+    pays.then(|| share.min(PIECE_SHARE[1]))
+}
+
+/// Returns the least remaining time for which [`piece_share`] pays where others are as quick.
+fn least_to_split(away: f64) -> f64 {
+    (0.5 * away + STEAL_GAIN_US) / (1.0 - 0.5 * PIECE_TIME_RATIO)
+}
+
+/// A region that is probably being rendered by exactly one worker.
+struct Running {
+    victim: Victim,
+    /// Predicted rendering time in microseconds.
+    us: f64,
+    /// When it began.
+    since: Micros,
+}
+
+/// A worker that is idle soon.
+struct IdleSoon {
+    in_us: f64,
+    id: WorkerId,
+    threads: u64,
+}
+
+impl RegionFrame {
+    /// Time until a piece that is asked for now is rendered, by the link's rate.
+    fn piece_transfer_us(&self) -> f64 {
+        PIECE_TRANSFER_US + 2.0 * PIECE_STATE_BYTES * self.costs.byte_us
+    }
+
+    /// Lends idle threads tasks that other workers own.
+    pub(super) fn steal_waiting(
+        &mut self,
+        cluster: &mut Cluster,
+        context: StepContext,
+        now: Micros,
+    ) -> NewLeases {
+        let mut leases = Vec::new();
+        // An owner that is heard is waited for longer, and none shorter: the time that was found
+        // last is looked at when it has come.
+        let is_known = context.freed_worker.is_some() && self.steal_at.is_some_and(|at| now < at);
+        if !is_known {
+            self.steal_at = None;
         }
-        match self.split_groups.remove(&root) {
-            Some(mut group) => {
-                group.touched.sort_unstable();
-                group.touched.dedup();
-                Drawn::Whole(root, group)
+        if !cluster.roster.any_idle_thread() {
+            return leases;
+        }
+        let mut refused = BTreeSet::new();
+        let mut left = None;
+        while self.core.table.queue.waiting() > 0 {
+            let may = |id: &WorkerId| {
+                !refused.contains(id) && context.freed_worker.is_none_or(|freed| freed == *id)
+            };
+            let idle = cluster.roster.active().filter(|(id, w)| w.has_idle_thread() && may(id));
+            let Some((id, _)) = idle.min_by_key(|(_, w)| w.leases) else { break };
+            let queue = &self.core.table.queue;
+            let left = left.get_or_insert_with(|| {
+                let tasks = queue.tasks.iter().zip(0..);
+                let open = tasks.filter(|(t, _)| t.end == End::Open).map(|(_, place)| place);
+                self.tiles.left_us(open, &cluster.roster)
+            });
+            let suits = |place| {
+                let task = &queue.tasks[place as usize];
+                task.was_leased()
+                    || task.begun.is_some()
+                    || self.pays_to_steal(cluster, place, id, left)
+                    || self.owner_keeps_until(place) <= now
+            };
+            match self.core.next_for(cluster, id, |_| true, suits) {
+                Some(place) => {
+                    self.give(cluster, place, id, now);
+                    leases.push((id, place));
+                }
+                None => {
+                    refused.insert(id);
+                }
             }
-            None => Drawn::Itself,
+        }
+        if !is_known && !refused.is_empty() {
+            let waiting = self.core.table.queue.all_waiting();
+            let until = waiting.map(|place| self.owner_keeps_until(place)).min();
+            self.steal_at = until.filter(|at| *at > now);
+        }
+        leases
+    }
+
+    /// Whether an idle worker ends earlier with a waiting task than its owner, which has so much
+    /// left. Nobody holds the bricks of a tile that was never rendered.
+    fn pays_to_steal(
+        &self,
+        cluster: &Cluster,
+        place: u32,
+        id: WorkerId,
+        left: &WorkerMap<f64>,
+    ) -> bool {
+        let Some(predicted) = self.tiles.predicted(place) else { return true };
+        let here = predicted.us * cluster.history.rates.ratio(id, predicted.worker);
+        left.get(self.tiles.owner(place)).is_none_or(|left| *left > 2.0 * here)
+    }
+
+    /// Returns until when an owner that says nothing keeps a task from idle workers.
+    fn owner_keeps_until(&self, place: u32) -> Micros {
+        let heard = self.core.table.answered(self.tiles.owner(place)).max(self.core.phase_began);
+        heard.saturating_add(patience_us(self.tiles.us(place).unwrap_or(0.0)))
+    }
+
+    /// Predicted rendering time of a region: as in the frame before, or by what other tasks of this
+    /// frame took.
+    fn expected_us(&self, place: u32) -> Option<f64> {
+        let est = self.core.table.cut.tiles[place as usize].est;
+        let guess = || self.core.pace.median().map(|pace| pace.render_us(est) as f64);
+        self.tiles.us(place).or_else(guess)
+    }
+
+    /// Chooses which regions to split, those with most time left: one for each thread that is idle
+    /// soon.
+    pub(super) fn find_pieces(&mut self, cluster: &Cluster, now: Micros) -> Questions {
+        let queue = &self.core.table.queue;
+        if !self.core.sole || queue.waiting() > 0 || cluster.link_use.bricks_bind() {
+            return Vec::new();
+        }
+        // Where all tiles are short none need be looked at.
+        if self.tiles.longest_us() < least_to_split(PIECE_TRANSFER_US) {
+            return Vec::new();
+        }
+        let away = self.piece_transfer_us();
+        let mut running: Vec<(f64, f64, Victim)> = self
+            .running(cluster)
+            .map(|r| {
+                let elapsed = now.saturating_sub(r.since) as f64;
+                let quicker = (elapsed / r.us.max(1.0)).max(1.0);
+                (remaining_us(r.us, elapsed), quicker, r.victim)
+            })
+            .collect();
+        running.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.2.cmp(&b.2)));
+        let pays = |(left, quicker, victim): (f64, f64, Victim)| {
+            // The price of its bricks is looked up only where it pays without.
+            piece_share(left, quicker, away)?;
+            let share = piece_share(left, quicker, away + self.piece_bricks_us(cluster, victim.0))?;
+            Some((victim, (1000.0 * share) as u32))
+        };
+        let victims: Questions = running.into_iter().filter_map(pays).collect();
+        let idle = self.idle_soon(cluster, now);
+        let threads = idle.iter().filter(|i| i.in_us <= away).map(|i| i.threads).sum::<u64>();
+        let ids = self.core.table.spare_ids.saturating_sub(self.splits.roots.len() as u64);
+        let room = threads.min(ids).saturating_sub(self.splits.asked.len() as u64) as usize;
+        // Looks again when the next worker is idle soon; or, if one is now, when a region is late
+        // enough.
+        self.steal_at = if victims.len() < room {
+            let enough = 1.0 + least_to_split(away);
+            let late = |r: Running| r.since.saturating_add((r.us + enough).min(1e15) as Micros);
+            self.running(cluster).map(late).filter(|at| *at > now).min()
+        } else {
+            let next = idle.iter().find(|i| i.in_us > away).filter(|_| victims.len() > room);
+            next.map(|i| now.saturating_add((i.in_us - away).ceil() as Micros).max(now + 1))
+        };
+        let asked: Questions = victims.into_iter().take(room).collect();
+        let questions = asked.iter().map(|((place, id, _), _)| (*place, (*id, now)));
+        self.splits.asked.extend(questions);
+        asked
+    }
+
+    /// Time that the bricks of a piece take on the link: half of those of its tile overlap it.
+    fn piece_bricks_us(&self, cluster: &Cluster, place: u32) -> f64 {
+        let history = cluster.history.view(self.key);
+        let cost = history.and_then(|h| h.cost(&self.core.table.tile(place)));
+        let job = &self.core.job;
+        let bytes: u64 = job.bricks.iter().map(|b| u64::from(b.bytes)).sum();
+        let brick = bytes as f64 / job.bricks.len().max(1) as f64;
+        0.5 * self.costs.byte_us * brick * cost.map_or(0, |c| c.bricks) as f64
+    }
+
+    /// Sends the questions; the leases have left.
+    pub(super) fn ask_for_pieces(&self, cluster: &mut Cluster, questions: Questions) {
+        for ((place, id, epoch), share) in questions {
+            let (frame, task) = (self.core.job.frame, self.core.table.queue.id(place));
+            cluster.send(id, ToWorker::SplitRegion { frame, task, epoch, share });
         }
     }
-}
 
-impl SplitGroup {
-    /// What its tasks took in all, and what they were drawn from.
-    pub(crate) fn cost(&self) -> (Micros, &[u32]) {
-        (self.us, &self.touched)
+    /// Returns the workers that have nothing more to do soon, earliest first. A worker that takes
+    /// longer than predicted is none of them.
+    fn idle_soon(&self, cluster: &Cluster, now: Micros) -> Vec<IdleSoon> {
+        let table = &self.core.table;
+        let mut idle = Vec::new();
+        for (id, worker) in cluster.roster.active() {
+            let threads = u64::from(worker.threads);
+            let free = threads.saturating_sub(worker.leases);
+            if free > 0 {
+                idle.push(IdleSoon { in_us: 0.0, id, threads: free });
+                continue;
+            }
+            let us = table.lent(id).iter().enumerate().map(|(i, lent)| {
+                let us = self.expected_us(table.queue.place(lent.task)?)?;
+                let is_running = (i as u64) < threads;
+                let since = if is_running { table.started(id, lent.sent) } else { now };
+                Some(us - now.saturating_sub(since) as f64).filter(|us| *us >= 0.0)
+            });
+            if let Some(us) = us.sum::<Option<f64>>() {
+                idle.push(IdleSoon { in_us: us / threads as f64, id, threads: 1 });
+            }
+        }
+        idle.sort_by(|a, b| a.in_us.total_cmp(&b.in_us).then(a.id.cmp(&b.id)));
+        idle
+    }
+
+    /// Returns the regions that are probably being rendered by exactly one worker, and that were
+    /// not asked for a piece.
+    fn running<'a>(&'a self, cluster: &'a Cluster) -> impl Iterator<Item = Running> + 'a {
+        let table = &self.core.table;
+        table.all_lent().flat_map(move |(id, lent)| {
+            let threads = cluster.roster.get(id).map_or(0, |w| w.threads);
+            lent.iter().take(threads as usize).filter_map(move |lent| {
+                let place = table.queue.place(lent.task)?;
+                let is_asked = self.splits.asked.contains_key(&place);
+                // The state of a larger tile takes longer than it saves.
+                let is_small = table.tile(place).area() <= (WHOLE_PX * WHOLE_PX) as usize;
+                let may = !is_asked && is_small && table.queue.is_only_lease(place, id, lent.epoch);
+                let us = self.expected_us(place).filter(|_| may)?;
+                let (victim, since) = ((place, id, lent.epoch), table.started(id, lent.sent));
+                Some(Running { victim, us, since })
+            })
+        })
+    }
+
+    /// Takes a piece that a worker gave away. Returns whether it is used.
+    ///
+    /// # Errors
+    /// The worker's message is a lie; what is wrong with it.
+    pub(crate) fn take_piece(
+        &mut self,
+        cluster: &mut Cluster,
+        worker: WorkerId,
+        place: u32,
+        lease: Lease,
+        piece: RegionSplit,
+        now: Micros,
+    ) -> Result<bool, String> {
+        if self.splits.forget_question(place) != Some(worker) {
+            return Err("it gave away a piece of a tile that nobody asked for".into());
+        }
+        let tile = self.core.table.tile(place);
+        check_piece(tile, &piece)?;
+        let RegionSplit { kept, given, begun, .. } = piece;
+        if !self.core.table.queue.is_only_lease(place, worker, lease.epoch) {
+            // Another worker was lent the tile as it was.
+            self.core.table.queue.release(place, worker, lease.epoch);
+            return Ok(false);
+        }
+        let since = self.core.table.started(worker, lease.sent);
+        let elapsed = now.saturating_sub(since) as f64;
+        let us = self.expected_us(place).unwrap_or(0.0);
+        let taker = self.taker(cluster, worker, &given, now);
+        let part = given.area() as f64 / tile.area() as f64;
+        let us = PIECE_TIME_RATIO * remaining_us(us, elapsed);
+        self.tiles.split(place, elapsed + us * (1.0 - part), us * part, taker);
+        let table = &mut self.core.table;
+        let est = table.cut.tiles[place as usize].est;
+        let part_of = |rect: Rect| {
+            let est = (est as f64 * rect.area() as f64 / tile.area() as f64) as u64;
+            Macrotile { rect, est: est.max(1) }
+        };
+        table.cut.tiles[place as usize] = part_of(kept);
+        let task = &mut table.queue.tasks[place as usize];
+        task.tile = part_of(kept);
+        task.begun = task.begun.as_ref().map(|begun| Arc::new(begun.crop(tile, kept)));
+        let new = table.queue.add_piece(part_of(given), Arc::new(begun));
+        table.cut.add(vec![part_of(given)]);
+        let root = self.splits.roots.get(&place).copied().unwrap_or(place);
+        self.splits.roots.insert(new, root);
+        let whole = SplitGroup { tile, owner: worker, open: 1, us: 0, bricks: Vec::new() };
+        self.splits.groups.entry(root).or_insert(whole).open += 1;
+        self.core.ledger.handed_over += 1;
+        Ok(true)
+    }
+
+    /// Returns who is to render a piece: of the workers that can begin as soon as it is there, the
+    /// one whose own tiles are nearest, which lacks least bricks.
+    fn taker(&self, cluster: &Cluster, giver: WorkerId, piece: &Rect, now: Micros) -> WorkerId {
+        let distance = |id: WorkerId| {
+            let owned = self.tiles.owned(id).iter().map(|place| self.core.table.tile(*place));
+            owned.map(|tile| distance_px(&tile, piece)).min().unwrap_or(i32::MAX)
+        };
+        let away = self.piece_transfer_us();
+        let idle = self.idle_soon(cluster, now);
+        let others = || idle.iter().filter(|i| i.id != giver);
+        let soon = others().filter(|i| i.in_us <= away);
+        let nearest = soon.min_by_key(|i| (distance(i.id), i.id));
+        nearest.or_else(|| others().next()).map_or(giver, |i| i.id)
     }
 }
 
-/// How far two tiles are from each other, in pixels along one axis or the other.
-fn far(a: &Rect, b: &Rect) -> i32 {
+/// Returns the distance of two tiles in pixels, along the axis where it is larger.
+fn distance_px(a: &Rect, b: &Rect) -> i32 {
     let gap = |a: (i32, i32), b: (i32, i32)| (a.0 - b.1).max(b.0 - a.1).max(0);
     gap((a.x0, a.x1), (b.x0, b.x1)).max(gap((a.y0, a.y1), (b.y0, b.y1)))
 }
 
-/// Whether what a stranger says are two pieces of a tile.
-fn check_pieces(tile: Rect, piece: &RegionSplit) -> Result<(), String> {
+/// Checks that a peer's piece and what it keeps make up a tile.
+fn check_piece(tile: Rect, piece: &RegionSplit) -> Result<(), String> {
     let (kept, given) = (piece.kept, piece.given);
     let whole = !kept.is_empty() && !given.is_empty() && kept.union(&given) == tile;
     if !whole || kept.area() + given.area() != tile.area() {
@@ -417,7 +493,7 @@ fn check_pieces(tile: Rect, piece: &RegionSplit) -> Result<(), String> {
     if piece.begun.sheets.len() != parts(given).count() {
         return Err("a piece has other parts than its tile".into());
     }
-    check(given, &piece.begun.pixels, None)
+    check_sums(given, &piece.begun.pixels, None)
 }
 
 #[cfg(test)]
@@ -425,31 +501,34 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_piece_is_asked_for_where_both_are_done_sooner() {
-        assert_eq!(
-            [0.0, 400.0, 1000.0].map(|us| share(us, 1.0, AWAY)),
-            [None; 3],
-            "it would come too late"
-        );
+    fn work_stealing_splits_a_region_where_both_pieces_end_sooner() {
+        let away = PIECE_TRANSFER_US;
+        let too_late = [0.0, 400.0, 1000.0].map(|us| piece_share(us, 1.0, away));
+        assert_eq!(too_late, [None; 3]);
         for us in [2500.0, 5000.0, 50_000.0] {
             for quicker in [1.0, 1.5, 8.0] {
-                let share = share(us, quicker, AWAY).expect("it pays");
-                let (kept, given) = (MORE * us * (1.0 - share), MORE * us * share / quicker);
-                assert!((kept - (AWAY + given)).abs() < 1.0 && kept < us, "{us}: {kept}, {given}");
+                let share = piece_share(us, quicker, away).expect("it pays");
+                let kept = PIECE_TIME_RATIO * us * (1.0 - share);
+                let given = PIECE_TIME_RATIO * us * share / quicker;
+                assert!((kept - (away + given)).abs() < 1.0 && kept < us, "{us}: {kept}, {given}");
             }
         }
-        let least = least(AWAY);
-        assert!(share(least - 1.0, 1.0, AWAY).is_none() && share(least + 1.0, 1.0, AWAY).is_some());
-        assert_eq!(left(1000.0, 400.0), 600.0);
-        assert_eq!(left(1000.0, 4000.0), 3000.0, "as late again");
+        let least = least_to_split(away);
+        assert!(piece_share(least - 1.0, 1.0, away).is_none());
+        assert!(piece_share(least + 1.0, 1.0, away).is_some());
     }
 
     #[test]
-    fn tiles_that_touch_are_near() {
-        let at = |x, y| Rect::new(x, y, x + 64, y + 64);
-        assert_eq!(
-            [at(64, 0), at(64, 64), at(192, 64), at(0, 128)].map(|r| far(&at(0, 0), &r)),
-            [0, 0, 128, 64]
-        );
+    fn work_stealing_takes_a_late_region_for_as_late_again() {
+        assert!((remaining_us(1000.0, 400.0) - 600.0).abs() < 1e-9);
+        assert!((remaining_us(1000.0, 4000.0) - 3000.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn work_stealing_measures_distance_between_tiles() {
+        let tile = |x, y| Rect::new(x, y, x + 64, y + 64);
+        let distances = [tile(64, 0), tile(64, 64), tile(192, 64), tile(0, 128)]
+            .map(|r| distance_px(&tile(0, 0), &r));
+        assert_eq!(distances, [0, 0, 128, 64]);
     }
 }

@@ -1,213 +1,188 @@
-//! Whether the link bears crews (`region`), each of which is sent what a view needs: most of it
-//! when they are formed, and more a frame than all together. And whether bricks fill it, where
-//! fewer frames are best.
+//! How fast the link is, and which share of the time bricks and results take of it.
 //!
-//! Nobody tells the scheduler how fast the link is; it sees when bricks leave and when workers say
-//! that they have them. From the moment at which some are on their way to anybody until none are,
-//! what has landed by now in the time since is never more than the link carries, however few they
-//! are and however long words take; and where many leave at once, as for the first frame, it comes
-//! near. So the **rate** is the highest that was seen. What the last frames were sent takes a
-//! **share** of their time at that rate:
+//! Nobody tells the scheduler how fast the link is; it sees when bricks leave and when workers
+//! acknowledge them. From the moment at which some are in flight to any worker until none are, the
+//! bytes acknowledged divided by the time are never more than the link carries, and where many
+//! leave at once, as for the first frame, they come near. So the **rate** is the highest that was
+//! seen: 80 to 101 MB/s at 1 Gbit/s and 900 to 990 at 10, for mri256 on 15 and 32 workers. The
+//! bytes of the last frames take a **share** of their time at that rate.
 //!
-//! | mri256 at 512x512, 15 and 32 workers | rate seen, MB/s | share, all together | share, crews |
-//! |---|--:|--:|--:|
-//! | 1 Gbit/s  | 86 to 101, 80 to 95   | 0.85 to 0.98, 0.87 to 1.0 | |
-//! | 10 Gbit/s | 896, 990   | 0.55 to 0.6, 0.58 to 0.63 | 0.3 to 0.2, 0.8 to 0.4 |
-//! | unlimited | 1487, 2304 | 0.4, 0.3                  | 0.4 to 0.2, 0.5 to 0.2 |
+//! Results travel the other way and are judged at the same rate, links being alike either way:
+//! until they take a good part of the time, packing them keeps render threads longer than anybody
+//! waits for bytes.
 //!
-//! What workers' results take the other way is judged at the same rate, links being alike either
-//! way: until they take a good part of the time, packing them keeps render threads longer than
-//! anybody waits for bytes.
+//! Sole frames (no other in flight) and overlapping frames are told apart: the time of a sole frame
+//! has round trips in it, in which nobody draws.
 //!
-//! Frames that are alone are told apart: what these are sent takes another share of other time, and
-//! says whether the next one may be cut in another way than the one before it (`region`).
-//!
-//! It refuses to forget: that a link has become slower it never learns.
+//! It refuses to forget: it never learns that a link has become slower.
 
+use super::active_set::SETTLE_FRAMES;
+use super::signal::{Hysteresis, MovingRatio};
 use crate::Micros;
 
-/// Crews are formed where the share is below this. At 0.7 they come and go at 1 Gbit/s, at 0.5 they
-/// come late at 10 (70 % of n times one worker's frames with 15 workers, where 74 are with this).
-const FORM: f64 = 0.6;
+/// Tuning (share of the time): something takes a good part of the link above the first value, until
+/// its share falls below the second.
+///
+/// - Bricks bind sole frames. Then tiles keep one size, since a worker that draws other tiles than
+///   before lacks bricks. mri256 at 512x512 has shares of 0.4 to 0.7 at 1 Gbit/s after its first
+///   frame and 0.1 to 0.4 at 10.
+/// - Results are packed. One and two workers do not pack at 1 Gbit/s, which saves 3 % of a frame of
+///   mri256; four and more do, which saves 8 %.
+const BUSY_SHARE: [f64; 2] = [0.6, 0.3];
 
-/// The same once the first frames are over, which were sent all that the view needs: the share of
-/// those that follow is half as large. At 1 Gbit/s it is 0.5 to 1 on a turn, where crews come and
-/// go if this is as large as [`FORM`].
-const FORM_LATER: f64 = 0.3;
+/// Tuning (share of the time): overlapping frames saturate the link above the first value: fewer of
+/// them overlap then. Below the second value there is room for prefetch again. At 0.65, paths of
+/// overlapping frames take up to a seventh longer on 15 workers.
+const SATURATED_SHARE: [f64; 2] = [0.8, 0.1];
 
-/// Bricks that may not be needed are sent until the share is above [`DISSOLVE`], and again when it
-/// is below this. On a link of 1 Gbit/s the share goes up and down; if they were sent whenever it
-/// is below 0.65, or in the first frame, paths of overlapping frames would take up to a seventh
-/// longer on 15 workers (docs/scaling.md).
-const SPARE: f64 = 0.1;
-
-/// How many frames are the first.
-const FIRST: u32 = 8;
-
-/// They are dissolved where it is above this, and fewer frames are in the making
-/// ([`LinkUse::is_full`]). Between the two lies what forming them is sent.
-const DISSOLVE: f64 = 0.8;
-
-/// What frames before count against one. Of four that are in the making two may be done at once.
-const KEEP: f64 = 0.75;
-
-/// Bricks bind frames that are alone where their share is above the first, until it is below the
-/// second. After its first frame, which is sent all that the view needs, mri256 at 512x512 has 0.4
-/// to 0.7 at 1 Gbit/s and 0.1 to 0.4 at 10; aneurism has 0.1 to 0.3 at 1 Gbit/s. If 0.35 were
-/// enough, aneurism's first frames at 10 Gbit/s would be, and it takes 3 % longer; and below 0.2 or
-/// 0.3 makes no difference beyond 1 %.
-const BIND: [f64; 2] = [0.6, 0.3];
-
-/// Results are packed once they take more than the first of the time at the rate that was seen,
-/// until, packed, they take less than the second. On one worker and two they are not at 1 Gbit/s
-/// and more, which saves 3 % of a frame of mri256; on four and more at 1 Gbit/s they are, where as
-/// they are they would take 8 % more time on eight (aneurism: 23). With 0.8 and 0.5 such frames
-/// take 5 to 8 % longer, with 0.4 and 0.2 one and two workers pack (docs/scaling.md).
-const PACK: [f64; 2] = [0.55, 0.35];
-
-/// What is left of what frames that were alone told once another one was: the first of them tells
-/// of itself.
-const KEEP_ALONE: f64 = 0.5;
-
-/// Frames that nothing changes for after a change: bricks that it brings are sent in the first
-/// four.
-const SETTLE: u32 = 8;
-
-/// What bricks on their way tell.
-#[derive(Debug, Default)]
+/// Observations of the link.
+#[derive(Debug)]
 pub(crate) struct LinkUse {
-    /// Workers that some are on their way to.
-    aloft: usize,
-    /// Since when any are, and bytes that landed since.
+    /// Workers with bricks in flight.
+    receivers: usize,
+    /// Since when any bricks are in flight, and bytes acknowledged since.
     since: Micros,
-    landed: u64,
-    /// Bytes a microsecond, the most that was seen.
+    acknowledged: u64,
+    /// Highest rate seen, in bytes a microsecond.
     rate: f64,
-    /// Bytes that left since a frame was done, or began alone, and when that was.
-    sent: u64,
-    done: Micros,
-    /// How long what the last frames were sent takes at that rate, and how long they took, in
-    /// microseconds; each frame weighs less than the one after it.
-    carried: f64,
-    took: f64,
-    /// What bricks took of the time of frames that were alone, as far as any was; and whether they
-    /// bind such.
-    alone: Option<f64>,
-    bind: bool,
-    /// Bytes of results since a frame was done, how long those of the last frames take at that
-    /// rate, and how long these frames took; and whether there is room for more.
-    results: u64,
-    results_took: f64,
-    frames_took: f64,
-    roomy: bool,
-    /// How many, up to [`FIRST`].
-    frames: u32,
-    crews: bool,
-    settling: u32,
-    /// Whether there is no room for bricks that may not be needed.
-    crowded: bool,
+    /// Bytes of bricks and of results since `frame_began`.
+    brick_bytes: u64,
+    result_bytes: u64,
+    /// When the last frame ended, or a sole frame began.
+    frame_began: Micros,
+    /// Bricks of overlapping frames, bricks of sole frames, results of all.
+    overlapping: MovingRatio,
+    sole: MovingRatio,
+    results: MovingRatio,
+    bricks_bind: Hysteresis,
+    packs_results: Hysteresis,
+    no_room: Hysteresis,
+    no_lanes: Hysteresis,
+}
+
+impl Default for LinkUse {
+    fn default() -> Self {
+        let switch = |[on, off]: [f64; 2], is_on| Hysteresis::new(on, off, 0, is_on);
+        LinkUse {
+            receivers: 0,
+            since: 0,
+            acknowledged: 0,
+            rate: 0.0,
+            brick_bytes: 0,
+            result_bytes: 0,
+            frame_began: 0,
+            overlapping: MovingRatio::default(),
+            sole: MovingRatio::default(),
+            results: MovingRatio::default(),
+            bricks_bind: switch(BUSY_SHARE, false),
+            // Until the link is known.
+            packs_results: switch(BUSY_SHARE, true),
+            no_room: switch(SATURATED_SHARE, false),
+            no_lanes: Hysteresis::new(SATURATED_SHARE[0], BUSY_SHARE[1], SETTLE_FRAMES, true),
+        }
+    }
+}
+
+/// Load of the link since the frame before ended, or since the frame began if none was in flight.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct FrameLoad {
+    /// Time in microseconds.
+    pub(crate) frame_us: f64,
+    /// Time that bricks sent meanwhile take on the link.
+    pub(crate) bricks_us: f64,
 }
 
 impl LinkUse {
-    /// Bricks leave for a worker; whether none were on their way to it.
-    pub(crate) fn leave(&mut self, bytes: u64, first: bool, now: Micros) {
-        self.sent += bytes;
-        if first {
-            if self.aloft == 0 {
-                (self.since, self.landed) = (now, 0);
+    /// Notes bricks that leave for a worker. `is_first`: none were in flight to it.
+    pub(crate) fn bricks_sent(&mut self, bytes: u64, is_first: bool, now: Micros) {
+        self.brick_bytes += bytes;
+        if is_first {
+            if self.receivers == 0 {
+                (self.since, self.acknowledged) = (now, 0);
             }
-            self.aloft += 1;
+            self.receivers += 1;
         }
     }
 
-    /// So many bytes are there; whether no more are on their way to that worker.
-    pub(crate) fn land(&mut self, bytes: u64, last: bool, now: Micros) {
-        self.landed += bytes;
+    /// Notes bricks that a worker acknowledged. `is_last`: no more are in flight to it.
+    pub(crate) fn bricks_arrived(&mut self, bytes: u64, is_last: bool, now: Micros) {
+        self.acknowledged += bytes;
         let time = now.saturating_sub(self.since).max(1);
-        self.rate = self.rate.max(self.landed as f64 / time as f64);
-        self.aloft -= usize::from(last);
+        self.rate = self.rate.max(self.acknowledged as f64 / time as f64);
+        self.receivers -= usize::from(is_last);
     }
 
-    /// A result came, in a message of so many bytes.
-    pub(crate) fn result(&mut self, bytes: u64) {
-        self.results += bytes;
+    /// Notes the message of a result, by its bytes.
+    pub(crate) fn result_arrived(&mut self, bytes: u64) {
+        self.result_bytes += bytes;
     }
 
-    /// A frame begins, and none is in the making.
-    pub(crate) fn begin(&mut self, now: Micros) {
-        (self.sent, self.results, self.done) = (0, 0, now);
+    /// A frame begins while none is in flight.
+    pub(crate) fn frame_begins(&mut self, now: Micros) {
+        (self.brick_bytes, self.result_bytes, self.frame_began) = (0, 0, now);
     }
 
-    /// A frame is done; whether others are in the making. Crews are for those that have others
-    /// beside them, and learn from these alone; those that are alone learn from such.
-    pub(crate) fn done(&mut self, beside: bool, now: Micros) {
-        let took = now.saturating_sub(self.done) as f64;
-        let carried = if self.sent == 0 { 0.0 } else { self.sent as f64 / self.rate };
-        let carried = carried.min(took);
-        if !beside {
-            let share = carried / took.max(1.0);
-            let mean = self.alone.map_or(share, |m| KEEP_ALONE * m + (1.0 - KEEP_ALONE) * share);
-            self.alone = Some(mean);
-            self.bind = mean > BIND[usize::from(self.bind)];
+    /// A frame ended. `sole`: no other is in flight.
+    pub(crate) fn frame_ended(&mut self, sole: bool, now: Micros) -> FrameLoad {
+        let frame_us = now.saturating_sub(self.frame_began) as f64;
+        let carried = |bytes: u64| if bytes == 0 { 0.0 } else { bytes as f64 / self.rate };
+        let bricks_us = carried(self.brick_bytes).min(frame_us);
+        let results_us = carried(self.result_bytes);
+        if sole {
+            // Each sole frame weighs the same: the first, which is sent all of the view, is long.
+            self.sole.add(bricks_us / frame_us.max(1.0), 1.0);
+            self.bricks_bind.update(self.sole.value().unwrap_or(0.0));
         } else {
-            self.carried = KEEP * self.carried + carried;
-            self.took = KEEP * self.took + took;
-            let most = if self.crowded { SPARE } else { DISSOLVE };
-            self.crowded = self.carried > most * self.took;
-            self.settling = self.settling.saturating_sub(1);
-            self.frames = FIRST.min(self.frames + 1);
-            let form = if self.frames < FIRST { FORM } else { FORM_LATER };
-            let bearable = if self.crews { DISSOLVE } else { form };
-            if (self.carried < bearable * self.took) != self.crews && self.settling == 0 {
-                self.crews = !self.crews;
-                self.settling = SETTLE;
-            }
+            self.overlapping.add(bricks_us, frame_us);
+            let share = self.overlapping.value().unwrap_or(0.0);
+            self.no_room.update(share);
+            self.no_lanes.update(share);
         }
         if self.rate > 0.0 {
-            self.results_took = KEEP * self.results_took + self.results as f64 / self.rate;
-            self.frames_took = KEEP * self.frames_took + took;
-            self.roomy = self.results_took < PACK[usize::from(!self.roomy)] * self.frames_took;
+            self.results.add(results_us, frame_us);
+            self.packs_results.update(self.results.value().unwrap_or(0.0));
         }
-        (self.sent, self.results, self.done) = (0, 0, now);
+        (self.brick_bytes, self.result_bytes, self.frame_began) = (0, 0, now);
+        FrameLoad { frame_us, bricks_us }
     }
 
-    /// Whether results are to be packed. As long as nobody knows the link they are.
-    pub(crate) fn packs(&self) -> bool {
-        !self.roomy
+    /// Returns the time in microseconds that the bricks sent since the last frame ended take.
+    pub(crate) fn bricks_us(&self) -> f64 {
+        if self.rate > 0.0 { self.brick_bytes as f64 / self.rate } else { 0.0 }
     }
 
-    /// Bytes a microsecond that the link carries, as far as that was seen.
+    /// Whether workers pack their results. They do until the link is known.
+    pub(crate) fn packs_results(&self) -> bool {
+        self.packs_results.is_on()
+    }
+
+    /// Returns the link's rate in bytes a microsecond, if any bricks were acknowledged.
     pub(crate) fn rate(&self) -> Option<f64> {
         (self.rate > 0.0).then_some(self.rate)
     }
 
-    /// Whether crews are to draw.
-    pub(crate) fn bears_crews(&self) -> bool {
-        self.crews
+    /// Whether sole frames wait for bricks before all.
+    pub(crate) fn bricks_bind(&self) -> bool {
+        self.bricks_bind.is_on()
     }
 
-    /// Whether bricks bind frames that are alone.
-    pub(crate) fn binds_alone(&self) -> bool {
-        self.bind
+    /// Whether bricks of overlapping frames took nearly all of the last frames' time.
+    pub(crate) fn is_saturated(&self) -> bool {
+        self.overlapping.value().is_some_and(|share| share > SATURATED_SHARE[0])
     }
 
-    /// Whether bricks of the last frames took nearly all the time that there was.
-    pub(crate) fn is_full(&self) -> bool {
-        self.carried > DISSOLVE * self.took
+    /// Whether the link bears that overlapping frames are rendered by lanes of workers in turn.
+    pub(crate) fn bears_lanes(&self) -> bool {
+        !self.no_lanes.is_on()
     }
 
-    /// Whether frames that are alone, or such as overlap, leave room for bricks that may not be
-    /// needed. Until one is done nobody knows.
-    pub(crate) fn has_room(&self, alone: bool) -> bool {
-        match alone {
-            true => self.alone.is_some() && !self.is_full_alone(),
-            false => self.took > 0.0 && !self.crowded,
+    /// Whether there is room for bricks that may not be needed. Unknown, and so false, until a
+    /// frame ended.
+    pub(crate) fn has_room(&self, sole: bool) -> bool {
+        match sole {
+            true => self.sole.value().is_some_and(|share| share <= SATURATED_SHARE[0]),
+            false => self.overlapping.value().is_some() && !self.no_room.is_on(),
         }
-    }
-
-    /// The same of frames that were alone.
-    pub(crate) fn is_full_alone(&self) -> bool {
-        self.alone.is_some_and(|share| share > DISSOLVE)
     }
 }
 
@@ -215,137 +190,74 @@ impl LinkUse {
 mod tests {
     use super::*;
 
-    /// Frames of 2 ms or longer, each sent so many bytes in two halves, over a link that carries so
-    /// many a microsecond and takes 100 us besides. The first is sent 3 MB. How often crews were
-    /// there, and changes.
-    fn frames(n: usize, bytes: u64, link: f64) -> (usize, usize) {
-        let mut traffic = LinkUse::default();
-        let (mut now, mut with, mut changes) = (0, 0, 0);
-        traffic.begin(now);
-        for i in 0..n {
-            let bytes = if i == 0 { 3_000_000 } else { bytes };
-            let on_way = 100 + (bytes as f64 / link) as Micros;
-            traffic.leave(bytes / 2, true, now);
-            traffic.leave(bytes / 2, true, now);
-            traffic.land(bytes / 2, true, now + on_way / 2 + 50);
-            traffic.land(bytes / 2, true, now + on_way);
-            assert!(traffic.rate <= link, "{} of {link}", traffic.rate);
-            now += on_way.max(2_000);
-            let before = traffic.bears_crews();
-            traffic.done(true, now);
-            with += usize::from(traffic.bears_crews());
-            changes += usize::from(before != traffic.bears_crews());
+    /// Ends `n` frames of 2 ms and so many bytes of bricks each on a link of 100 bytes/us.
+    fn frames(link: &mut LinkUse, n: usize, bytes: u64, sole: bool) {
+        for _ in 0..n {
+            link.frame_begins(0);
+            link.bricks_sent(bytes, false, 0);
+            link.frame_ended(sole, 2_000);
         }
-        (with, changes)
     }
 
     #[test]
-    fn crews_are_formed_where_the_link_bears_them() {
-        assert_eq!(frames(40, 300_000, 120.0), (0, 0), "1 Gbit/s and full");
-        let (with, changes) = frames(40, 300_000, 1200.0);
-        assert!(with > 25 && changes == 1, "10 Gbit/s: {with}, {changes}");
-        let (with, changes) = frames(40, 10_000, 120.0);
-        assert!(with > 15 && changes == 1, "1 Gbit/s and little to carry: {with}, {changes}");
-    }
-
-    #[test]
-    fn crews_are_dissolved_where_they_fill_the_link() {
-        let mut traffic = LinkUse { rate: 100.0, ..LinkUse::default() };
-        let mut frame = |i: u64, bytes| {
-            traffic.leave(bytes, false, i * 2_000);
-            traffic.done(true, (i + 1) * 2_000);
-            (traffic.bears_crews(), traffic.is_full())
-        };
-        assert_eq!(frame(0, 50_000), (true, false));
-        let filled: Vec<_> = (1..10).map(|i| frame(i, 200_000)).collect();
-        let with = filled.iter().filter(|(crews, _)| *crews).count();
-        assert_eq!(with, SETTLE as usize - 1, "{filled:?}");
-        assert_eq!(filled.last(), Some(&(false, true)), "{filled:?}");
-        assert_eq!(frame(10, 130_000), (false, true), "and between the two nothing changes");
-        assert_eq!(frame(11, 20_000), (false, false));
-    }
-
-    #[test]
-    fn what_may_not_be_needed_is_not_sent_where_the_link_was_full_until_it_is_all_but_empty() {
-        let mut traffic = LinkUse { rate: 100.0, ..LinkUse::default() };
-        assert!(!traffic.has_room(false), "of no frame is known what it was sent");
+    fn link_rate_never_exceeds_the_link() {
+        let (mut link, carries) = (LinkUse::default(), 120.0);
         let mut now = 0;
-        let mut frames = |n: usize, bytes| {
-            let mut frame = || {
-                traffic.leave(bytes, false, now);
-                now += 2_000;
-                traffic.done(true, now);
-                traffic.has_room(false)
-            };
-            (0..n).map(|_| frame()).collect::<Vec<_>>()
-        };
-        assert_eq!(frames(1, 190_000), [false], "the first is sent all that it needs");
-        assert!(!frames(20, 30_000).contains(&true), "0.15 is not enough");
-        assert_eq!(frames(20, 10_000).last(), Some(&true));
-        assert!(!frames(20, 150_000).contains(&false), "0.75 is");
-        assert_eq!(frames(20, 190_000).last(), Some(&false));
+        for bytes in [3_000_000, 40_000, 300_000] {
+            let transfer = 100 + (bytes as f64 / carries) as Micros;
+            link.bricks_sent(bytes / 2, true, now);
+            link.bricks_sent(bytes / 2, true, now);
+            link.bricks_arrived(bytes / 2, true, now + transfer / 2 + 50);
+            link.bricks_arrived(bytes / 2, true, now + transfer);
+            now += transfer;
+        }
+        let rate = link.rate().expect("bricks were acknowledged");
+        assert!((0.9 * carries..=carries).contains(&rate), "{rate}");
     }
 
     #[test]
-    fn frames_alone_say_nothing() {
-        let mut traffic = LinkUse::default();
-        traffic.done(false, 1_000);
-        assert!(!traffic.bears_crews());
-        assert!(!traffic.is_full(), "of no frame is known what it was sent");
-        traffic.done(true, 2_000);
-        assert!(traffic.bears_crews(), "nothing had to be sent");
-    }
-
-    /// A path of frames one by one, of 2 ms and so many bytes each, over a link of 100 bytes a
-    /// microsecond.
-    fn alone(traffic: &mut LinkUse, n: usize, bytes: u64) -> Vec<bool> {
-        let mut frame = || {
-            traffic.begin(0);
-            traffic.leave(bytes, false, 0);
-            traffic.done(false, 2_000);
-            traffic.binds_alone()
-        };
-        (0..n).map(|_| frame()).collect()
+    fn prefetch_stops_on_a_saturated_link_until_it_is_nearly_free() {
+        let mut link = LinkUse { rate: 100.0, ..LinkUse::default() };
+        assert!(!link.has_room(false) && !link.is_saturated(), "nothing is known");
+        frames(&mut link, 1, 190_000, false);
+        assert!(!link.has_room(false) && link.is_saturated());
+        frames(&mut link, 20, 30_000, false);
+        assert!(!link.has_room(false) && !link.is_saturated(), "a share of 0.15 is not enough");
+        frames(&mut link, 20, 10_000, false);
+        assert!(link.has_room(false));
+        frames(&mut link, 20, 150_000, false);
+        assert!(link.has_room(false), "a share of 0.75 does not saturate it");
     }
 
     #[test]
-    fn results_are_packed_where_they_would_fill_the_link_or_nobody_knows() {
-        let mut traffic = LinkUse::default();
-        let frames = |traffic: &mut LinkUse, n: usize, bytes: u64| {
-            let mut frame = || {
-                traffic.begin(0);
-                traffic.result(bytes / 2);
-                traffic.result(bytes / 2);
-                traffic.done(false, 2_000);
-                traffic.packs()
-            };
-            (0..n).map(|_| frame()).collect::<Vec<_>>()
-        };
-        assert_eq!(frames(&mut traffic, 3, 100), [true; 3], "nobody knows the link");
-        traffic.rate = 100.0;
-        assert!(!frames(&mut traffic, 20, 90_000).contains(&false), "0.45 packed");
-        assert_eq!(frames(&mut traffic, 20, 60_000).last(), Some(&false), "0.3");
-        assert!(!frames(&mut traffic, 20, 100_000).contains(&true), "0.5 as they are");
-        assert_eq!(frames(&mut traffic, 20, 120_000).last(), Some(&true), "0.6");
+    fn sole_and_overlapping_frames_are_told_apart() {
+        let mut link = LinkUse { rate: 100.0, ..LinkUse::default() };
+        frames(&mut link, 1, 190_000, true);
+        assert!(link.bricks_bind() && !link.has_room(true) && !link.is_saturated());
+        frames(&mut link, 9, 90_000, true);
+        assert!(link.bricks_bind(), "a share of 0.45 keeps them binding");
+        frames(&mut link, 9, 40_000, true);
+        assert!(!link.bricks_bind() && link.has_room(true) && !link.has_room(false));
+        frames(&mut link, 9, 190_000, false);
+        assert!(link.is_saturated() && !link.bricks_bind());
     }
 
     #[test]
-    fn bricks_bind_frames_alone_while_they_take_half_of_their_time() {
-        let mut traffic = LinkUse { rate: 100.0, ..LinkUse::default() };
-        let nothing = !traffic.binds_alone() && !traffic.has_room(true);
-        assert!(nothing, "of no frame is known what it was sent");
-        assert_eq!(alone(&mut traffic, 1, 190_000), [true], "the first is sent all that it needs");
-        assert!(traffic.is_full_alone() && !traffic.has_room(true));
-        assert!(!alone(&mut traffic, 9, 90_000).contains(&false), "0.45");
-        assert_eq!(alone(&mut traffic, 3, 40_000), [true, false, false]);
-        assert!(!alone(&mut traffic, 9, 90_000).contains(&true), "and now that is not enough");
-        assert!(!traffic.is_full_alone() && traffic.has_room(true) && !traffic.has_room(false));
-        assert!(
-            !traffic.is_full() && !traffic.bears_crews(),
-            "which says nothing of frames beside others"
-        );
-        traffic.leave(190_000, false, 2_000);
-        traffic.done(true, 4_000);
-        assert!(traffic.is_full() && !traffic.binds_alone(), "nor do these of frames alone");
+    fn results_are_packed_while_the_link_is_unknown_or_busy() {
+        let mut link = LinkUse::default();
+        let result = |link: &mut LinkUse, bytes: u64| {
+            for _ in 0..20 {
+                link.frame_begins(0);
+                link.result_arrived(bytes);
+                link.frame_ended(true, 2_000);
+            }
+            link.packs_results()
+        };
+        assert!(result(&mut link, 100), "the link is unknown");
+        link.rate = 100.0;
+        assert!(result(&mut link, 90_000), "a share of 0.45, packed");
+        assert!(!result(&mut link, 50_000));
+        assert!(!result(&mut link, 100_000), "a share of 0.5, as they are");
+        assert!(result(&mut link, 130_000));
     }
 }

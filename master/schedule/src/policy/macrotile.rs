@@ -14,10 +14,10 @@
 use slabcast_common::occlusion::{Rect, ShutMap};
 use std::collections::BTreeSet;
 
-/// Edge of a quadtree leaf in pixels (the paper's choice).
+/// Limit: edge of a quadtree leaf in pixels (the paper's choice).
 pub const LEAF: u32 = 16;
 
-/// Levels of the quadtree: 16, 32, 64, 128 and 256 pixels. The paper saw "only around three
+/// Limit: levels of the quadtree: 16, 32, 64, 128 and 256 pixels. The paper saw "only around three
 /// levels"; a tile of 512 has a state of 5 MiB on the wire, and one render thread would hold up the
 /// slab with it.
 pub const LEVELS: usize = 5;
@@ -32,7 +32,7 @@ pub struct Macrotile {
 }
 
 /// How one slab is cut.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Cut {
     /// Edge of the level's tiles in pixels; of a mixed cut, of the smaller ones.
     pub edge: u32,
@@ -222,6 +222,7 @@ impl Through {
 
     /// Returns the edge in pixels that [`cut_through`] chooses.
     pub(crate) fn edge(&self, (wanted, many): (u64, u64)) -> u32 {
+        /// Limit: level of the tiles of 64 pixels that are rendered in one part.
         const PART: usize = 2;
         let coarsest = |wanted| coarsest(&self.tree, &|n| n.covered > 0, wanted);
         let level = coarsest(many)

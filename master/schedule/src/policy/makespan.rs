@@ -1,74 +1,55 @@
-//! A frame that is alone in the making: which of its tiles are cut, and who draws what, so that all
-//! are done at once.
+//! Which tiles of a sole frame are split, and which worker draws each tile, so that all workers end
+//! at once.
 //!
-//! While several frames are in the making, whoever is done with one goes on with the next. Alone, a
-//! frame is there when its last tile is, and threads that are done before wait. So what counts is
-//! its *end*: how late the last thread is done. Tiles of 64 pixels may be too coarse for that
-//! (mri256 `peer-semi` at 1024x1024 has 115 of them for 64 threads, and the longest takes longer
-//! than a 64th of the frame), and tiles of 32 take a quarter longer altogether. Neither is right
-//! for all tiles of a frame: those that are longer than a thread's share have to be cut, most
-//! others need not be.
+//! While several frames overlap, a worker that is done with one goes on with the next. A sole frame
+//! is complete with its last tile, and threads that are done before wait. So its *makespan* counts.
+//! Tiles of 64 pixels may be too coarse (mri256 `peer-semi` at 1024x1024 has 115 of them for 64
+//! threads, and the longest takes longer than a 64th of the frame), and tiles of 32 take a quarter
+//! longer altogether. Neither is right for all tiles: those longer than a thread's share have to be
+//! split, most others need not be.
 //!
-//! **Which are cut** ([`which`]) is tried on paper before the frame, with what the frames before
-//! taught: the longest tile goes to whoever is free first, and so on, for a growing number of tiles
-//! cut, the longest first, and then for a growing number of the shortest. The least end counts.
+//! - [`choose_splits`] predicts the makespan before the frame for a growing number of tiles split,
+//!   the longest first, then for a growing number of the shortest. The least prediction wins.
+//! - [`rebalance`] starts from the owners of the frame before and moves or swaps tiles as long as
+//!   the makespan shrinks by more than the bricks that come along are worth.
 //!
-//! **Who draws them** ([`balance`]): who drew them last. From there tiles move, or change places,
-//! as long as the end comes earlier by more than the bricks that go along are worth.
+//! Views turn, and a tile takes some percent more or less than in the frame before. Work stealing
+//! (`dispatch::steal`) mends that while the frame is drawn.
 //!
-//! Views turn, and what a tile took in the view before is some percent off. What is late then is
-//! cut as it is lent (`frame::late`).
-//!
-//! It refuses to know frames, tiles' places and bricks: it sees times.
+//! It refuses to know frames, positions and bricks: it sees times.
 
-use std::cmp::Reverse;
-use std::collections::BinaryHeap;
+use super::cost_model::{CostModel, WORTHWHILE_RATIO, predict_end};
 
-/// What a tile costs its thread beyond drawing, in microseconds: a result and a lease (`plan`
-/// charges a worker 28 for waking and some more for the messages). At nothing or at 100 the figures
-/// of [`WORTH`] change by their noise.
-const EACH: f64 = 40.0;
+/// Tuning (ratio): price of bricks for those who share the link with them, to that for the worker
+/// that waits for them. At nothing a third more bricks move; at 1 a tenth fewer, for a later end.
+const SHARED_LINK_RATIO: f64 = 0.2;
 
-/// What a tile costs everybody, in microseconds, since the master hears of one after the other. At
-/// nothing small scenes and large ones alike are cut into more tiles than pay: mri256 `peer-semi`
-/// on 64 workers has 61 % where it has 66.
-const LEASE: f64 = 10.0;
+/// Limit: a prediction worse by this ratio ends a search, since more splits only take longer.
+const GIVE_UP_RATIO: f64 = 1.1;
 
-/// What is left of the end where more tiles are cut. Estimates are no better than that: mri256
-/// `peer-semi` at 1024x1024 on 15, 32 and 64 workers has 89, 82, 68 % with this, and 89, 81, 66
-/// with each tile cut that seems to win anything.
-const WORTH: f64 = 0.99;
-
-/// An end that is so much later is not followed by one that is earlier, since all that is cut takes
-/// longer. Trying on costs the master 10 us each.
-const FAR: f64 = 1.1;
-
-/// Who is done last is later than the mean by so little that nothing moves.
-const EVEN: f64 = 1.01;
-
-/// The least that a move has to win, as a part of the mean.
-const LEAST: f64 = 0.002;
-
-/// What bricks cost those who share the link with them, as a part of what they cost who waits for
-/// them. At nothing a third more bricks move, and at 1 no more than a tenth fewer, for a later end.
-const PAYS: f64 = 0.2;
-
-/// Which tiles are cut for the frame to end first, on so many threads. They take so many
-/// microseconds whole; what the parts of one take is asked for only where whole tiles are not fine
-/// enough.
-pub(crate) fn which(us: &[f64], parts: impl Fn(usize) -> Vec<f64>, threads: usize) -> Vec<bool> {
+/// Returns which tiles to split for the earliest end on `threads` threads.
+///
+/// `us`: rendering time of each whole tile. `parts`: rendering times of a tile's parts, asked for
+/// only where whole tiles are too coarse.
+pub(crate) fn choose_splits(
+    costs: &CostModel,
+    us: &[f64],
+    parts: impl Fn(usize) -> Vec<f64>,
+    threads: usize,
+) -> Vec<bool> {
     let n = us.len();
-    let whole: Vec<u64> = us.iter().map(|us| item(*us)).collect();
-    let (mut least, mut long, mut short) = (end(&mut whole.clone(), threads), 0, 0);
+    let better = 1.0 - WORTHWHILE_RATIO;
+    let whole: Vec<u64> = us.iter().map(|us| costs.item(*us)).collect();
+    let (mut least, mut long, mut short) = (predict_end(&mut whole.clone(), threads), 0, 0);
     let share = us.iter().sum::<f64>() / threads.max(1) as f64;
-    if WORTH * WORTH * least <= share {
+    if better * better * least <= share {
         return vec![false; n];
     }
-    let parts = |i: usize| parts(i).into_iter().map(item).collect();
+    let parts = |i: usize| parts(i).into_iter().map(|us| costs.item(us)).collect();
     let parts: Vec<Vec<u64>> = (0..n).map(parts).collect();
     let mut order: Vec<usize> = (0..n).collect();
     order.sort_by(|&a, &b| us[b].total_cmp(&us[a]));
-    // What it adds to cut so many of the longest: to the time of all tiles, and to their number.
+    // What splitting so many of the longest adds: to the time of all tiles, and to their number.
     let mut added = vec![(0.0, 0)];
     for (&i, rank) in order.iter().zip(0..) {
         let (time, tiles): (f64, usize) = added[rank];
@@ -77,17 +58,16 @@ pub(crate) fn which(us: &[f64], parts: impl Fn(usize) -> Vec<f64>, threads: usiz
         added.push((time + more, tiles + parts.len()));
     }
     let all = whole.iter().sum::<u64>() as f64;
-    // When all would be done if no thread waited.
+    // The end if no thread waited: what can't be better is not predicted.
     let soonest = |long: usize, short: usize| {
         let [a, b, c] = [long, n, n - short].map(|rank| added[rank]);
         let (time, tiles) = (all + a.0 + b.0 - c.0, n - long - short + a.1 + b.1 - c.1);
-        time / (16.0 * threads as f64) + LEASE * tiles as f64
+        time / (16.0 * threads as f64) + costs.master_us(tiles)
     };
     let mut items = Vec::new();
     let mut end_with = |(long, short): (usize, usize), least: f64| {
-        // What can't be sooner by enough is not tried.
         let soonest = soonest(long, short);
-        if soonest >= WORTH * least {
+        if soonest >= better * least {
             return soonest;
         }
         items.clear();
@@ -98,63 +78,48 @@ pub(crate) fn which(us: &[f64], parts: impl Fn(usize) -> Vec<f64>, threads: usiz
                 items.push(whole[i]);
             }
         }
-        end(&mut items, threads)
+        predict_end(&mut items, threads)
     };
     for count in counts(n) {
         let end = end_with((count, 0), least);
-        if end < WORTH * least {
+        if end < better * least {
             (least, long) = (end, count);
-        } else if end > FAR * least {
+        } else if end > GIVE_UP_RATIO * least {
             break;
         }
     }
     for count in counts(n - long) {
         let end = end_with((long, count), least);
-        if end < WORTH * least {
+        if end < better * least {
             (least, short) = (end, count);
-        } else if end > FAR * least {
+        } else if end > GIVE_UP_RATIO * least {
             break;
         }
     }
-    let mut cut = vec![false; n];
+    let mut split = vec![false; n];
     for (rank, &i) in order.iter().enumerate() {
-        cut[i] = rank < long || rank + short >= n;
+        split[i] = rank < long || rank + short >= n;
     }
-    cut
+    split
 }
 
-/// How many tiles are tried: each time half as many again, and all.
+/// Returns the numbers of tiles that are tried: each half as large again as the one before, up to
+/// `n`.
 fn counts(n: usize) -> impl Iterator<Item = usize> {
     let next = move |&c: &usize| (c < n).then(|| (c + 1).max(c * 3 / 2).min(n));
     std::iter::successors((n > 0).then_some(1), next)
 }
 
-/// What a tile takes its thread, in sixteenths of a microsecond, which have an order and are sorted
-/// in a third of the time.
-fn item(us: f64) -> u64 {
-    (16.0 * (us + EACH)) as u64
-}
-
-/// When the last thread is done, if each that is free takes the longest that is left; with what the
-/// master needs.
-fn end(items: &mut [u64], threads: usize) -> f64 {
-    items.sort_unstable();
-    let mut free: BinaryHeap<Reverse<u64>> = (0..threads).map(|_| Reverse(0)).collect();
-    let mut last = 0;
-    for item in items.iter().rev() {
-        let Some(mut first) = free.peek_mut() else { break };
-        first.0 += item;
-        last = last.max(first.0);
-    }
-    last as f64 / 16.0 + LEASE * items.len() as f64
-}
-
-/// Moves tiles from who is done last, and has them change places, while that pays. `owners` says
-/// whose each tile is, `cost` what it takes a worker, and `price` what its bricks take one that it
-/// comes to.
-pub(crate) fn balance(
+/// Moves tiles away from the worker that ends last, or swaps them, while the end gets earlier by
+/// enough.
+///
+/// `slack`: part of the mean by which a worker may end late. `owners`: index of each tile's worker,
+/// changed in place. `cost`: time that a tile takes a worker. `price`: time that its bricks take a
+/// worker that gets it.
+pub(crate) fn rebalance(
     owners: &mut [usize],
     workers: usize,
+    slack: f64,
     cost: impl Fn(usize, usize) -> f64,
     price: impl Fn(usize, usize) -> f64,
 ) {
@@ -168,14 +133,14 @@ pub(crate) fn balance(
     for _ in 0..2 * owners.len() + workers {
         let by = |a: &usize, b: &usize| load[*a].total_cmp(&load[*b]);
         let Some(most) = (0..workers).max_by(by) else { break };
-        // A tile that leaves a slow worker takes less.
+        // A tile that leaves a slow worker takes less, so the mean is taken anew.
         let mean = load.iter().sum::<f64>() / workers as f64;
-        if load[most] <= EVEN * mean {
+        if load[most] <= (1.0 + slack) * mean {
             break;
         }
-        // What is won, what goes there, what comes back, and to whom. Between two that are as fast
-        // no more is won than half of what one is later by than the other; so who has most time
-        // comes first, and most others are not looked at.
+        // Gain, tile that goes, tile that comes back, receiver. Between two equally fast workers no
+        // more is gained than half of what one is later by; so workers with most time come first,
+        // and most others are not looked at.
         let mut best: Option<(f64, usize, Option<usize>, usize)> = None;
         let mut others: Vec<usize> = (0..workers).filter(|&to| to != most).collect();
         others.sort_by(by);
@@ -185,8 +150,9 @@ pub(crate) fn balance(
             }
             for &i in &owned[most] {
                 let mut consider = |from: f64, here: f64, back: Option<usize>, paid: f64| {
-                    let gain = load[most] - from.max(here) - PAYS * paid.max(0.0);
-                    if gain > LEAST * mean && best.is_none_or(|b| gain > b.0) {
+                    let gain = load[most] - from.max(here) - SHARED_LINK_RATIO * paid.max(0.0);
+                    // A fifth, since it takes several moves to level all.
+                    if gain > 0.2 * slack * mean && best.is_none_or(|b| gain > b.0) {
                         best = Some((gain, i, back, to));
                     }
                 };
@@ -217,14 +183,15 @@ pub(crate) fn balance(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::policy::cost_model::TEST_COSTS;
 
-    /// Which are cut of tiles whose parts take a quarter longer.
+    /// Splits tiles whose parts take a quarter longer.
     fn cut(us: &[f64], threads: usize) -> Vec<bool> {
-        which(us, |i| vec![0.31 * us[i]; 4], threads)
+        choose_splits(&TEST_COSTS, us, |i| vec![0.31 * us[i]; 4], threads)
     }
 
     #[test]
-    fn a_tile_longer_than_a_share_is_cut_and_the_others_are_not() {
+    fn makespan_splits_a_tile_longer_than_a_threads_share_and_few_others() {
         // 41 ms for four threads, one tile of 20.
         let us = [3000.0, 20_000.0, 3000.0, 3000.0, 3000.0, 3000.0, 3000.0, 3000.0];
         let cut = cut(&us, 4);
@@ -233,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_cut_where_tiles_are_fine_enough_or_short() {
+    fn makespan_splits_nothing_where_tiles_are_fine_enough_or_short() {
         let many: Vec<f64> = (0..100).map(|i| 2000.0 + 10.0 * f64::from(i)).collect();
         assert!(!cut(&many, 4).contains(&true));
         // Of 50 us each, cutting would only have the master hear more of them.
@@ -243,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_tiles_a_few_more_than_threads_are_cut_where_that_ends_sooner() {
+    fn makespan_splits_equal_tiles_a_few_more_than_threads() {
         // Five tiles for four threads: whole, the fifth has everybody wait for as long again.
         let cut = cut(&[10_000.0; 5], 4);
         let n = cut.iter().filter(|c| **c).count();
@@ -251,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn tiles_move_and_change_places_until_all_are_done_at_once() {
+    fn rebalance_moves_and_swaps_tiles_until_all_workers_end_at_once() {
         let us = [8.0, 7.0, 6.0, 5.0, 3.0, 1.0].map(|ms| 1000.0 * ms);
         let load = |owners: &[usize]| {
             let of = |w| (0..us.len()).filter(|&i| owners[i] == w).map(|i| us[i]).sum::<f64>();
@@ -259,13 +226,19 @@ mod tests {
         };
         // 15, 11 and 4 ms; with 10 each nobody waits, which takes a swap.
         let mut owners = [0, 0, 1, 1, 2, 2];
-        balance(&mut owners, 3, |i, _| us[i], |_, _| 0.0);
+        rebalance(&mut owners, 3, WORTHWHILE_RATIO, |i, _| us[i], |_, _| 0.0);
         let all = load(&owners);
         assert!(all.iter().all(|l| (8_900.0..11_100.0).contains(l)), "{all:?}");
         // Bricks that take longer than what is won keep all where they are.
         let mut owners = [0, 0, 1, 1, 2, 2];
         let home = owners;
-        balance(&mut owners, 3, |i, _| us[i], |i, w| if home[i] == w { 0.0 } else { 9_000.0 });
+        rebalance(
+            &mut owners,
+            3,
+            WORTHWHILE_RATIO,
+            |i, _| us[i],
+            |i, w| if home[i] == w { 0.0 } else { 9_000.0 },
+        );
         assert_eq!(owners, home);
     }
 }

@@ -1,49 +1,39 @@
-//! One frame. Under the paper's schedule: slab after slab, with a barrier (section 4.5).
+//! One frame: what both schedules share, and the enum of the two.
 //!
 //! ```text
-//! queued -> [slab 0] -> [slab 1] -> ... -> done
-//!             | cull bricks, cut into macrotiles, sort        (begin_slab)
-//!             | lend tasks, broadcast bricks                  (dispatch)
-//!             | take in results, lend the next                (result)
-//!             | no task open: occlusion map updated           (end_slab)
+//! waiting -> [phase] -> ... -> done      slab: one phase a slab, with a barrier (section 4.5)
+//!               | begin_phase            region: one phase through all depths
+//!               | dispatch               leases, work stealing, speculative copies
+//!               | result                 the first result of a task counts
+//!               | end_phase              no task is open
 //! ```
 //!
-//! Under the `region` schedule it is one slab through all depths of which the master knows nothing
-//! but where something may be seen: `region` cuts it and shares it out, workers cull it and ask for
-//! bricks. Leases, results, stragglers and the lost are the same, and so is the code. Several such
-//! frames may be in the making at a time; what a worker has of the others comes as a
-//! [`StepContext`].
+//! Under the `region` schedule the master knows nothing of a frame's depths but where something may
+//! be seen: workers cull and ask for bricks. Several such frames may be in flight at a time.
 //!
-//! `lend` says who gets which task and when, `late` cuts a tile that would be done last as it is
-//! lent, `handover` one that is being drawn, and `pace` knows how long tasks take.
-//!
-//! A frame waits, with nothing lost, while there is no worker. It refuses to know who is silent
-//! (`roster`), which copy of a result counts (`queue`) and where bricks are (`residency`).
+//! A frame waits, with nothing lost, while there is no worker. It refuses to know which worker is
+//! silent (`workers`), which copy of a result counts (`task_queue`) and where bricks are
+//! (`residency`).
 
 use crate::account::critical_path::RenderedTile;
 use crate::account::ledger::{Ledger, Rendered, ms, place_in_time};
 use crate::account::spans;
-use crate::policy::macrotile::{self, Cut, LEAF, LEVELS};
-use crate::policy::prefetch::TileOwnerGrid;
-use crate::policy::region::{Crew, Regions};
-use crate::policy::slab_borders;
+use crate::dispatch::speculate::Pace;
+use crate::policy::macrotile::Cut;
 use crate::state::cluster::Cluster;
+use crate::state::leases::{LeaseTable, Lent};
+use crate::state::region_frame::RegionFrame;
 use crate::state::residency::{ResidencyAction, Transfer};
-use crate::state::task_queue::{End, NAMES_PER_TILE, TaskQueue, Verdict};
-use crate::state::worker_map::WorkerMap;
+use crate::state::slab_frame::SlabFrame;
+use crate::state::task_queue::{End, Task, Verdict};
 use crate::{Action, Clock, FrameJob, Micros, Span};
 use slabcast_common::ids::{Epoch, TaskId, WorkerId};
 use slabcast_common::image::{FrameState, PixelEncoding, SparseTile, TilePixels};
-use slabcast_common::message::{Pixels, RegionCost, TileResult, ToWorker};
-use slabcast_common::occlusion::{Rect, ShutMap};
+use slabcast_common::message::{Pixels, RegionCost, RegionSplit, TileResult, ToWorker};
+use slabcast_common::occlusion::Rect;
 use slabcast_common::quality::Schedule;
-use slabcast_common::slab::SheetRange;
 use slabcast_common::stats::{BrickStats, PoisonedTile, SlabStats, TileStats};
-use slabcast_common::view::Projected;
 use std::collections::{BTreeMap, BTreeSet};
-
-use crate::dispatch::pace::Pace;
-use crate::dispatch::steal::{Drawn, SplitGroup};
 
 /// Whether a pixel with accumulated opacity `a` is shut for good.
 ///
@@ -54,125 +44,93 @@ pub fn is_shut(a: f32, eps: f64) -> bool {
     eps > 0.0 && (1.0f32 - a) < eps as f32
 }
 
-/// Finished tiles that leave for the picture together: what is left when the last one has come is
-/// laid in 20 us at most, where all of a picture of 1536x1536 take 0.6 ms (docs/scaling.md). Each
-/// time a finisher is woken, so that it is not each tile.
-const LAID_TOGETHER: usize = 16;
-
-/// A lease that a worker has and has not answered; perhaps dead.
-#[derive(Debug)]
-pub(crate) struct Lent {
-    pub(crate) task: TaskId,
-    pub(crate) epoch: Epoch,
-    pub(crate) sent: Micros,
-    /// Places of its bricks.
-    pub(crate) bricks: Vec<u32>,
+/// Where a frame stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Stage {
+    /// The next phase has not begun.
+    Waiting,
+    /// A phase is being rendered.
+    Drawing,
+    /// The last phase ended.
+    Done,
 }
 
-/// The slab that is being rendered.
+/// Bricks that a frame needed, each counted once.
 #[derive(Debug)]
-pub(crate) struct Slab {
-    pub(crate) sheets: SheetRange,
-    pub(crate) began: Micros,
-    pub(crate) cut: Cut,
-    pub(crate) queue: TaskQueue,
-    /// Places of the needed bricks, ascending, and their rectangles.
-    pub(crate) needed: Vec<u32>,
-    pub(crate) rects: Vec<Rect>,
-    /// Needed bricks in the order in which the queue's tiles come to them.
-    pub(crate) order: Vec<u32>,
-    /// Whose its tiles are, under the `region` schedule.
-    pub(crate) regions: Option<Regions>,
-    /// Workers that the slab's bricks were queued for.
-    pub(crate) served: BTreeSet<WorkerId>,
-    /// [`Roster::changes`](crate::state::workers::Roster::changes) up to which it was looked at.
-    pub(crate) changes: Option<u64>,
-    /// Whether some of its owners took no leases then.
-    pub(crate) orphaned: bool,
-    /// End of each render thread's last task; not of regions, which have no barrier.
-    pub(crate) dry: BTreeMap<(WorkerId, u32), Micros>,
-    /// Tiles that counted.
-    pub(crate) pieces: Vec<RenderedTile>,
-    /// Names that its tasks may have.
-    pub(crate) names: u64,
-    /// Regions of which their worker was asked for a piece, by their places.
-    pub(crate) handing: BTreeMap<u32, (WorkerId, Micros)>,
-    /// The tile that each piece is of which was given away, and such tiles whose tasks are not all
-    /// drawn.
-    pub(crate) roots: BTreeMap<u32, u32>,
-    pub(crate) split_groups: BTreeMap<u32, SplitGroup>,
+pub(crate) struct BrickUse {
+    is_needed: Vec<bool>,
+    bricks: u64,
+    voxels: u64,
 }
 
-impl Slab {
-    pub(crate) fn bricks_of(&self, place: u32) -> Vec<u32> {
-        let tile = self.cut.tiles[place as usize].rect;
-        let over = |r: &Rect| !r.intersect(&tile).is_empty();
-        let needed = self.needed.iter().zip(&self.rects);
-        needed.filter(|(_, r)| over(r)).map(|(&i, _)| i).collect()
+impl BrickUse {
+    fn new(bricks: usize) -> Self {
+        BrickUse { is_needed: vec![false; bricks], bricks: 0, voxels: 0 }
     }
+
+    /// Notes that the brick at an index is needed.
+    pub(crate) fn note(&mut self, job: &FrameJob, index: usize) {
+        if !std::mem::replace(&mut self.is_needed[index], true) {
+            self.bricks += 1;
+            self.voxels += u64::from(job.bricks[index].voxels);
+        }
+    }
+}
+
+/// What frames of both schedules have.
+#[derive(Debug)]
+pub(crate) struct FrameCore {
+    pub(crate) job: Box<FrameJob>,
+    /// Format of results; `None`: sums.
+    pub(crate) finish: Option<PixelEncoding>,
+    /// No other frame was in flight or queued when it began.
+    pub(crate) sole: bool,
+    pub(crate) stage: Stage,
+    /// When the current phase began, and when the last one ended.
+    pub(crate) phase_began: Micros,
+    pub(crate) ended: Option<Micros>,
+    pub(crate) picture: FrameState,
+    pub(crate) table: LeaseTable,
+    /// The frame's first task id.
+    pub(crate) first_task: TaskId,
+    /// Workers that were sent the frame's view.
+    pub(crate) announced_to: BTreeSet<WorkerId>,
+    pub(crate) pace: Pace,
+    /// When the next task outlives its estimate, while a thread is idle.
+    pub(crate) speculate_at: Option<Micros>,
+    /// Tiles of the phase whose results were accepted.
+    pub(crate) rendered: Vec<RenderedTile>,
+    pub(crate) brick_use: BrickUse,
+    /// Voxels of all bricks.
+    relevant_voxels: u64,
+    any_result: bool,
+    last_reason: String,
+    pub(crate) ledger: Ledger,
 }
 
 /// A frame in the making.
 #[derive(Debug)]
-pub(crate) struct Frame {
-    pub(crate) job: Box<FrameJob>,
-    /// Which crew draws it, if not everybody has to.
-    pub(crate) beside: Option<u32>,
-    /// Whether no other was in the making or waited when it began.
-    pub(crate) alone: bool,
-    pub(crate) projected: Vec<Option<Projected>>,
-    pub(crate) slabs: Vec<SheetRange>,
-    pub(crate) at: usize,
-    pub(crate) state: FrameState,
-    pub(crate) shut: ShutMap,
-    pub(crate) slab: Option<Slab>,
-    /// When its last slab ended.
-    pub(crate) ended: Option<Micros>,
-    pub(crate) first_task: TaskId,
-    /// Workers that were sent the frame's view.
-    pub(crate) told: BTreeSet<WorkerId>,
-    pub(crate) lent: WorkerMap<Vec<Lent>>,
-    /// When each worker answered last.
-    pub(crate) answered: WorkerMap<Micros>,
-    pub(crate) pace: Pace,
-    /// When the next task outlives its estimate, while a thread is idle.
-    pub(crate) outlived: Option<Micros>,
-    /// When the next region may be taken from an owner that is silent, while a thread is idle.
-    pub(crate) forborne: Option<Micros>,
-    /// When a region that takes longer than it was to is late enough to be cut, while a thread is
-    /// idle.
-    pub(crate) pieces_at: Option<Micros>,
-    /// Parts of tiles that were cut late, and who is to have them: what they were drawn from goes
-    /// along.
-    pub(crate) gained: Vec<(WorkerId, u32)>,
-    /// Whose tiles lie where; of regions that several draw.
-    pub(crate) outlook: Option<TileOwnerGrid>,
-    /// Where each block of bricks lies, until bricks are sent ahead.
-    pub(crate) outlines: Option<Vec<Rect>>,
-    pub(crate) needed_ever: Vec<bool>,
-    /// Bricks among them, and their voxels.
-    pub(crate) needed: (u64, u64),
-    /// Voxels of all bricks.
-    pub(crate) relevant: u64,
-    pub(crate) any_result: bool,
-    pub(crate) last_reason: String,
-    pub(crate) ledger: Ledger,
+pub(crate) enum Frame {
+    /// Rendered slab after slab.
+    Slab(Box<SlabFrame>),
+    /// Rendered in regions through all depths.
+    Region(Box<RegionFrame>),
 }
 
-/// Where a frame stands.
+/// Outcome of a step.
 pub(crate) enum Step {
-    /// It waits for events.
+    /// The frame waits for events.
     Waits,
-    /// Its last slab ended.
+    /// The last phase ended.
     Done,
-    /// It can't be rendered.
+    /// The frame can't be rendered; the reason.
     Failed(String),
 }
 
-/// What a step of one frame may do, given the other frames in transfer.
+/// What a step of one frame may do, given the other frames in flight.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct StepContext {
-    /// No later frame is in transfer or queued whose tasks could keep idle threads busy.
+    /// No later frame is in flight or queued whose tasks could keep idle threads busy.
     pub(crate) is_last_frame: bool,
     /// Idle threads may take tasks that another worker owns.
     pub(crate) may_steal: bool,
@@ -180,309 +138,119 @@ pub(crate) struct StepContext {
     pub(crate) freed_worker: Option<WorkerId>,
 }
 
-/// Whether a frame is rendered under the `region` schedule. `auto` is that, always: where nothing
-/// hides anything it needs as many bricks as the other and has no barriers.
-pub(crate) fn goes_by_region(job: &FrameJob) -> bool {
+/// Whether a frame is rendered under the `region` schedule. `auto` always is: where nothing hides
+/// anything it needs as many bricks as the other and has no barriers.
+pub(crate) fn uses_regions(job: &FrameJob) -> bool {
     job.work.schedule != Schedule::Slab
 }
 
-impl Frame {
-    pub(crate) fn start(
-        job: Box<FrameJob>,
-        (beside, alone): (Option<u32>, bool),
-        cluster: &mut Cluster,
-        clock: &dyn Clock,
-    ) -> Self {
-        let began = clock.now();
-        let (view, by_region) = (&job.view, goes_by_region(&job));
-        let mut projected = Vec::new();
-        let slabs = if by_region {
-            // Workers know its depths.
-            vec![SheetRange::default()]
-        } else {
-            projected.extend(job.bricks.iter().map(|b| view.project(&b.tight)));
-            slab_borders::slab_ranges(view, &projected, &|i| job.bricks[i].voxels, &job.work)
-        };
-        cluster.residency.open(job.scene.bricks, &job.bricks, by_region);
+/// Limit: finished tiles that are laid into the picture together. What is left when the last one
+/// comes then takes 20 us at most, where all of a picture of 1536x1536 take 0.6 ms; a finisher is
+/// woken for each batch.
+pub(crate) const TILES_LAID_TOGETHER: usize = 16;
+
+impl FrameCore {
+    fn new(job: Box<FrameJob>, sole: bool, cluster: &Cluster, began: Micros) -> Self {
         let mut ledger = Ledger::new(began);
         for (id, worker) in cluster.roster.iter() {
             ledger.open_account(id, worker, began);
         }
-        let mut frame = Frame {
-            slabs,
-            at: 0,
-            state: FrameState::new(view.size),
-            // Regions shut their pixels at the workers.
-            shut: ShutMap::open(Rect::from_size(if by_region { [0; 2] } else { view.size })),
-            slab: None,
+        FrameCore {
+            finish: job.finish.filter(|_| uses_regions(&job)),
+            sole,
+            stage: Stage::Waiting,
+            phase_began: began,
             ended: None,
+            picture: FrameState::new(job.view.size),
+            table: LeaseTable::new(),
             first_task: TaskId(cluster.next_task),
-            told: BTreeSet::new(),
-            lent: WorkerMap::default(),
-            answered: WorkerMap::default(),
+            announced_to: BTreeSet::new(),
             pace: Pace::default(),
-            outlived: None,
-            forborne: None,
-            pieces_at: None,
-            gained: Vec::new(),
-            outlook: None,
-            outlines: None,
-            needed_ever: vec![false; job.bricks.len()],
-            needed: (0, 0),
-            relevant: cluster.residency.voxels(job.scene.bricks),
+            speculate_at: None,
+            rendered: Vec::new(),
+            brick_use: BrickUse::new(job.bricks.len()),
+            relevant_voxels: cluster.residency.voxels(job.scene.bricks),
             any_result: false,
             last_reason: String::new(),
             ledger,
-            projected,
             job,
-            beside,
-            alone,
-        };
-        frame.ledger.cull_us += clock.now().saturating_sub(began);
-        frame
-    }
-
-    /// Goes as far as it can.
-    pub(crate) fn step(
-        &mut self,
-        cluster: &mut Cluster,
-        context: StepContext,
-        clock: &dyn Clock,
-    ) -> Step {
-        loop {
-            match &self.slab {
-                Some(slab) if slab.queue.open() > 0 => {
-                    self.dispatch(cluster, context, clock.now());
-                    return Step::Waits;
-                }
-                Some(slab) => {
-                    let tried = !slab.queue.tasks.is_empty();
-                    self.end_slab(cluster, clock.now());
-                    if tried && !self.any_result {
-                        return Step::Failed(std::mem::take(&mut self.last_reason));
-                    }
-                }
-                None if self.at == self.slabs.len() => return Step::Done,
-                // The level of the quadtree depends on how many there are.
-                None if cluster.roster.threads() == 0 => return Step::Waits,
-                None if self.by_region() => self.begin_regions(cluster, clock),
-                None => self.begin_slab(cluster, clock),
-            }
         }
     }
 
-    /// Whether its last slab ended.
-    pub(crate) fn is_done(&self) -> bool {
-        self.slab.is_none() && self.at == self.slabs.len()
-    }
-
-    /// Whether no other was in the making or waited when it began.
-    pub(crate) fn is_alone(&self) -> bool {
-        self.alone
-    }
-
-    /// Whether it can go beside other frames of its set.
-    pub(crate) fn by_region(&self) -> bool {
-        goes_by_region(&self.job)
-    }
-
-    /// Who draws it.
-    pub(crate) fn crew(&self) -> Option<Crew> {
-        self.slab.as_ref()?.regions.as_ref().map(Regions::crew)
-    }
-
-    /// Cuts the whole depth into regions.
-    fn begin_regions(&mut self, cluster: &mut Cluster, clock: &dyn Clock) {
-        let began = clock.now();
-        let (cut, regions, outlines) = Regions::cut(
-            &self.job,
-            (self.beside, self.alone),
-            (cluster.link_use.rate(), cluster.link_use.binds_alone()),
-            &cluster.roster,
-            &mut cluster.history,
-        );
-        // Who draws alone has drawn all that was drawn.
-        let several = cluster.roster.active().nth(1).is_some();
-        let ahead = several && cluster.link_use.has_room(self.alone);
-        let owner = |place| regions.owner(place);
-        self.outlook = ahead.then(|| TileOwnerGrid::new(self.job.view.size, &cut, owner));
-        self.outlines = ahead.then_some(outlines);
-        self.put_on(cluster, began, cut, (Vec::new(), Vec::new()), Some(regions));
-        self.ledger.cull_us += clock.now().saturating_sub(began);
-    }
-
-    /// Whether bricks may still be sent ahead ([`Self::foresee`]).
-    pub(crate) fn foresees(&self) -> bool {
-        self.outlines.is_some()
-    }
-
-    /// Sends what was drawn from lately to those over whose tiles it lies now. Nobody waits for it:
-    /// it comes after the frame's first leases.
-    pub(crate) fn foresee(&mut self, cluster: &mut Cluster, now: Micros) {
-        let set = self.job.scene.bricks;
-        let outlines = self.outlines.take().filter(|_| self.slab.is_some());
-        let (Some(outlines), Some(outlook)) = (outlines, &self.outlook) else { return };
-        let presence = cluster.residency.presence(set, self.alone);
-        let (Some(presence), Some(blocks)) = (presence, cluster.history.blocks_of(set)) else {
-            return;
-        };
-        let lacked = outlook.lacked(&presence, (blocks, &outlines), outline(&self.job));
-        for id in cluster.residency.queue_prefetch(set, lacked) {
-            carry(cluster, Some(&mut self.ledger), id, now);
-        }
-    }
-
-    /// What was drawn from for the first time for long goes to those over whose tiles of this frame
-    /// it lies, when they are told something anyway.
-    pub(crate) fn foresee_fresh(&self, cluster: &mut Cluster, fresh: &[u32]) {
-        let set = self.job.scene.bricks;
-        let Some(outlook) = self.outlook.as_ref().filter(|_| self.slab.is_some()) else { return };
-        let Some(presence) = cluster.residency.presence(set, self.alone) else { return };
-        let lacked = outlook.lacked_among(&presence, fresh, outline(&self.job));
-        cluster.residency.queue_prefetch(set, lacked);
-    }
-
-    /// Culls bricks, cuts the slab into macrotiles and sorts them.
-    fn begin_slab(&mut self, cluster: &mut Cluster, clock: &dyn Clock) {
-        let began = clock.now();
-        let sheets = self.slabs[self.at];
-        let cull = self.job.scene.quality.cull;
-        let (mut needed, mut rects) = (Vec::new(), Vec::new());
-        for (i, projected) in self.projected.iter().enumerate() {
-            let Some(p) = projected.filter(|p| p.sheets.overlaps(sheets)) else { continue };
-            if cull && self.shut.all_shut(&p.rect) {
-                self.ledger.counters.culled += u64::from(self.job.bricks[i].voxels);
-                continue;
-            }
-            note_needed(&mut self.needed_ever, &mut self.needed, &self.job, i);
-            needed.push(i as u32);
-            rects.push(p.rect);
-        }
-        let work = &self.job.work;
-        let wanted = (work.tiles_per_worker * cluster.roster.threads() as f64).ceil() as u64;
-        // A slab without bricks has no best level; the coarsest tells it shortest.
-        let forced = work.tile.or(needed.is_empty().then_some(LEAF << (LEVELS - 1)));
-        let size = self.job.view.size;
-        let cut = if cluster.config.mixed {
-            let whole = cluster.roster.threads() as usize;
-            macrotile::cut_mixed(size, &rects, &self.shut, cull, (wanted, forced), whole)
-        } else {
-            macrotile::cut(size, &rects, &self.shut, cull, wanted, forced)
-        };
-        cluster.residency.begin_slab(&needed);
-        self.put_on(cluster, began, cut, (needed, rects), None);
-        self.ledger.cull_us += clock.now().saturating_sub(began);
-    }
-
-    /// Queues a cut's tiles. With the bricks that they need, and their rectangles.
-    fn put_on(
+    /// Begins a phase with the tasks of a cut. `spare_ids`: task ids for pieces.
+    pub(crate) fn begin_phase(
         &mut self,
         cluster: &mut Cluster,
         began: Micros,
         cut: Cut,
-        (needed, rects): (Vec<u32>, Vec<Rect>),
-        regions: Option<Regions>,
+        spare_ids: u64,
     ) {
-        let mut order: Vec<(u32, u32)> =
-            needed.iter().zip(&rects).filter_map(|(&i, r)| Some((cut.first_in(r)?, i))).collect();
-        order.sort_unstable();
-        let queue = TaskQueue::new(TaskId(cluster.next_task), &cut.tiles);
-        // Of such that may be cut, in parts and then in pieces.
-        let names = if self.alone { 2 * NAMES_PER_TILE as u64 } else { 1 };
-        let names = names * cut.tiles.len() as u64;
-        cluster.next_task += names;
-        self.slab = Some(Slab {
-            sheets: self.slabs[self.at],
-            began,
-            cut,
-            queue,
-            needed,
-            rects,
-            order: order.into_iter().map(|(_, i)| i).collect(),
-            regions,
-            served: BTreeSet::new(),
-            changes: None,
-            orphaned: false,
-            dry: BTreeMap::new(),
-            pieces: Vec::new(),
-            names,
-            handing: BTreeMap::new(),
-            roots: BTreeMap::new(),
-            split_groups: BTreeMap::new(),
-        });
+        let first = TaskId(cluster.next_task);
+        cluster.next_task += cut.tiles.len() as u64 + spare_ids;
+        self.table.begin(first, cut, spare_ids);
+        self.phase_began = began;
+        self.rendered.clear();
+        self.stage = Stage::Drawing;
     }
 
-    /// The barrier: the picture moves on to the next slab.
-    fn end_slab(&mut self, cluster: &Cluster, now: Micros) {
-        let slab = self.slab.take().expect("a slab that ends has begun");
-        if slab.regions.is_none() {
-            self.state.end_slab();
-            self.shut.refresh();
-        }
-        // What was given away of a tile is told as the tile's.
-        let whole = slab.whole_tiles();
-        let tile = |(task, place): (&crate::state::task_queue::Task, u32)| {
+    /// Ends a phase: enters its statistics. `wholes`: for tasks that pieces were stolen from, their
+    /// whole tile, its estimate, and the rendering time of the pieces. `is_piece`: the task is part
+    /// of such a whole.
+    pub(crate) fn end_phase(
+        &mut self,
+        index: usize,
+        bricks: usize,
+        barrier_wait: Micros,
+        wholes: &BTreeMap<u32, (Rect, u64, Micros)>,
+        is_piece: impl Fn(u32) -> bool,
+        now: Micros,
+    ) {
+        let table = &self.table;
+        let tile = |(task, place): (&Task, u32)| {
             let (worker, us) = match &task.end {
                 End::Done { worker, render_us } => (worker.to_string(), *render_us),
-                End::Open | End::Poisoned | End::Cut => (String::new(), 0),
+                End::Open | End::Poisoned => (String::new(), 0),
             };
-            let (rect, est, more) =
-                whole.get(&place).copied().unwrap_or((task.tile.rect, task.tile.est, 0));
+            let own = (task.tile.rect, task.tile.est, 0);
+            let (rect, est, more) = wholes.get(&place).copied().unwrap_or(own);
             TileStats {
                 x: rect.x0 as u32,
                 y: rect.y0 as u32,
-                size: slab.cut.edge_of(&rect),
+                size: table.cut.edge_of(&rect),
                 est,
                 ms: ms(us + more),
                 worker,
             }
         };
-        let mut waited = 0;
-        // Regions have no barrier: threads go on with the next frame.
-        if !slab.queue.tasks.is_empty() && slab.regions.is_none() {
-            for (id, worker) in cluster.roster.active() {
-                let mut busy = 0;
-                for (_, end) in slab.dry.range((id, 0)..=(id, u32::MAX)) {
-                    busy += 1;
-                    waited += now.saturating_sub((*end).max(slab.began));
-                }
-                let idle = u64::from(worker.threads).saturating_sub(busy);
-                waited += idle * now.saturating_sub(slab.began.max(worker.since));
-            }
-        }
-        self.ledger.end_phase(&slab.pieces, slab.began);
-        self.ledger.retries += slab.queue.retries;
-        let tasks = slab.queue.tasks.iter().zip(0..);
-        let told = tasks.filter(|(t, at)| t.end != End::Cut && !slab.is_told_elsewhere(*at));
-        let mut tiles: Vec<TileStats> = told.map(tile).collect();
-        // Parts that were cut late stand behind all others.
+        let tasks = table.queue.tasks.iter().zip(0..).filter(|(_, place)| !is_piece(*place));
+        let mut tiles: Vec<TileStats> = tasks.map(tile).collect();
+        // Pieces stand behind all others.
         tiles.sort_by_key(|t| std::cmp::Reverse(t.est));
+        self.ledger.end_phase(&self.rendered, self.phase_began);
+        self.ledger.retries += table.queue.retries;
         self.ledger.slabs.push(SlabStats {
             tiles,
-            empty: slab.cut.empty,
-            shut: slab.cut.shut,
-            barrier_wait_ms: ms(waited),
+            empty: table.cut.empty,
+            shut: table.cut.shut,
+            barrier_wait_ms: ms(barrier_wait),
         });
         self.ledger.spans.push(Span {
-            name: format!("slab {}", self.at),
+            name: format!("slab {index}"),
             category: "slab",
             worker: None,
             thread: 0,
-            start: slab.began,
+            start: self.phase_began,
             end: now,
             args: vec![
-                ("tiles", slab.queue.all().to_string()),
-                ("edge", slab.cut.edge.to_string()),
-                ("bricks", slab.needed.len().to_string()),
+                ("tiles", table.queue.all().to_string()),
+                ("edge", table.cut.edge.to_string()),
+                ("bricks", bricks.to_string()),
             ],
         });
-        self.at += 1;
-        if self.at == self.slabs.len() {
-            self.ended = Some(now);
-        }
+        self.stage = Stage::Waiting;
     }
 
-    /// Takes back a lease that its worker answered. `None`: it has no such lease.
+    /// Takes back a lease that its worker answered; `None` if it has no such lease.
     fn take_answered(
         &mut self,
         cluster: &mut Cluster,
@@ -490,9 +258,7 @@ impl Frame {
         task: TaskId,
         epoch: Epoch,
     ) -> Option<Lent> {
-        let lent = self.lent.get_mut(worker)?;
-        let at = lent.iter().position(|l| l.task == task && l.epoch == epoch)?;
-        let lent = lent.remove(at);
+        let lent = self.table.take(worker, task, epoch)?;
         if !lent.bricks.is_empty() {
             cluster.residency.unpin(worker, &lent.bricks);
         }
@@ -500,182 +266,31 @@ impl Frame {
         Some(lent)
     }
 
-    /// Whether a worker has this lease of it, or had.
-    pub(crate) fn has_lent(&self, worker: WorkerId, task: TaskId, epoch: Epoch) -> bool {
-        let lent = self.lent.get(worker).into_iter().flatten();
-        lent.into_iter().any(|l| l.task == task && l.epoch == epoch)
+    /// Returns the number of leases of a worker.
+    pub(crate) fn leases(&self, id: WorkerId) -> u32 {
+        self.table.lent(id).len() as u32
     }
 
-    /// A result came. An error is the worker's lie. When its tile was rendered, if it counts.
-    pub(crate) fn result(
-        &mut self,
-        cluster: &mut Cluster,
-        worker: WorkerId,
-        result: TileResult,
-        clock: &dyn Clock,
-    ) -> Result<Option<(Micros, Micros)>, String> {
-        let now = clock.now();
-        let before = self.answered.insert(worker, now).unwrap_or(0);
-        let lent = self.take_answered(cluster, worker, result.task, result.epoch);
-        let verdict = match &self.slab {
-            Some(slab) if lent.is_some() => slab.queue.judge(result.task, result.epoch, worker),
-            _ => Verdict::Dead,
-        };
-        let Verdict::Counts(place, lease) = verdict else {
-            cluster.totals.dropped_results += 1;
-            if result.task >= self.first_task {
-                self.ledger.dropped_results += 1;
-            }
-            return Ok(None);
-        };
-        let slab = self.slab.as_mut().expect("a lease that counts is of this slab");
-        let tile = slab.cut.tiles[place as usize].rect;
-        let cost = slab.regions.as_ref().and(result.region.as_ref());
-        let bricks = self.job.bricks.len();
-        let finish = finish_of(&self.job);
-        let checked = match &result.pixels {
-            Pixels::Sums(sums) => check(tile, sums, finish),
-            Pixels::Finished(leaves) => check_leaves(tile, leaves, finish),
-        };
-        if let Err(lie) = checked.and_then(|()| check_cost(cost, tile, bricks)) {
-            // Its other leases go back when it is dropped; this one it has just answered.
-            let given_up =
-                slab.queue.lose(worker, "", &[(place, result.epoch)], 0, &cluster.config);
-            self.give_up(given_up);
-            return Err(lie);
-        }
-
-        match result.pixels {
-            Pixels::Finished(leaves) => {
-                self.state.place_encoded(tile, leaves);
-                if self.state.encoded_tiles().len() >= LAID_TOGETHER {
-                    let (frame, tiles) = (self.job.frame, self.state.take_encoded());
-                    cluster.out.push_back(Action::Finished { frame, tiles });
-                }
-            }
-            Pixels::Sums(sums) if slab.regions.is_some() => self.state.place_sums(tile, sums),
-            Pixels::Sums(sums) => {
-                let width = self.job.view.size[0] as usize;
-                let eps = self.job.scene.quality.eps;
-                let rows = sums.a.chunks(tile.width()).zip(tile.y0..);
-                for (row, y) in rows.filter(|_| eps > 0.0) {
-                    for (&a, x) in row.iter().zip(tile.x0..) {
-                        if is_shut(a, eps) {
-                            self.shut.shut(y as usize * width + x as usize);
-                        }
-                    }
-                }
-                self.state.add_slab_tile(tile, &sums);
+    /// Returns the leases of the current phase that a worker has, oldest first, and how many of
+    /// them it is probably running.
+    fn running_leases(&self, id: WorkerId, threads: u32) -> (Vec<(u32, Epoch)>, usize) {
+        let mut running = 0;
+        let mut leases = Vec::new();
+        for (i, lent) in self.table.lent(id).iter().enumerate() {
+            if let Some(place) = self.table.queue.place(lent.task) {
+                leases.push((place, lent.epoch));
+                running += usize::from(i < threads as usize);
             }
         }
-        self.any_result = true;
-        self.ledger.add_result_bytes(result.bytes);
-        self.ledger.composite_us += clock.now().saturating_sub(now);
-
-        let who = cluster.roster.get(worker).expect("a worker whose result came is known");
-        let r = place_in_time(who, &result.times, lease.sent, now);
-        let lasted = now.saturating_sub(lease.sent.max(before));
-        self.pace.note(slab.cut.tiles[place as usize].est, r.end - r.start, lasted);
-        self.ledger.add_rendering(worker, &r, &result.counters);
-        let thread = result.times.thread.min(who.threads - 1);
-        if slab.regions.is_none() {
-            let dry = slab.dry.entry((worker, thread)).or_insert(r.end);
-            *dry = r.end.max(*dry);
-        }
-        let Rendered { start, end, .. } = r;
-        slab.pieces.push(RenderedTile {
-            corner: [tile.x0, tile.y0],
-            edge: slab.cut.edge_of(&tile),
-            thread: (worker, thread),
-            lacked_bricks_us: result.times.ready_us.saturating_sub(result.times.received_us),
-            start,
-            end,
-            arrived: now,
-        });
-        let mut drawn_from = lent.map_or(0, |l| l.bricks.len());
-        if let Some(cost) = cost {
-            drawn_from = cost.touched.len();
-            for &i in &cost.touched {
-                note_needed(&mut self.needed_ever, &mut self.needed, &self.job, i as usize);
-            }
-            self.ledger.add_region_cost(worker, cost);
-            let set = self.job.scene.bricks;
-            cluster.residency.mark_used(set, &cost.touched, &mut cluster.fresh);
-        }
-        slab.handing.remove(&place);
-        let touched = cost.map_or(&[][..], |cost| &cost.touched[..]);
-        let drawn = slab.drawn(place, end - start, touched);
-        if let Some(regions) = &slab.regions {
-            let mut learn = |place, tile: &Rect, owner, us, touched: &[u32]| {
-                cluster.history.learn(regions, (place, tile), owner, us, touched);
-            };
-            match &drawn {
-                Drawn::Whole(root, group) => {
-                    let (us, touched) = group.cost();
-                    learn(*root, &group.tile, group.owner, us, touched);
-                }
-                Drawn::Itself if cost.is_some() => {
-                    learn(place, &tile, worker, end - start, touched);
-                }
-                Drawn::Itself | Drawn::InPart => {}
-            }
-        }
-        self.ledger.spans.tile(spans::Tile {
-            corner: [tile.x0, tile.y0],
-            worker: who.name.clone(),
-            thread,
-            start,
-            end,
-            slab: self.at,
-            edge: slab.cut.edge_of(&tile),
-            est: slab.cut.tiles[place as usize].est,
-            bricks: drawn_from,
-            attempt: result.epoch.0,
-        });
-        slab.queue.finish(place, End::Done { worker: who.name.clone(), render_us: end - start });
-        self.progress(cluster);
-        Ok(Some((start, end)))
+        (leases, running)
     }
 
-    pub(crate) fn progress(&self, cluster: &mut Cluster) {
-        let Some(slab) = &self.slab else { return };
-        let total = slab.queue.all();
-        cluster.out.push_back(Action::Progress {
-            frame: self.job.frame,
-            done: total - slab.queue.open(),
-            total,
-            slab: self.at as u32,
-            slabs: self.slabs.len() as u32,
-        });
-    }
-
-    /// A worker can't do a task.
-    pub(crate) fn failed(
-        &mut self,
-        cluster: &mut Cluster,
-        worker: WorkerId,
-        task: TaskId,
-        epoch: Epoch,
-        reason: String,
-    ) {
-        if self.take_answered(cluster, worker, task, epoch).is_none() {
-            return;
-        }
-        let Some(slab) = &mut self.slab else { return };
-        let Verdict::Counts(place, _) = slab.queue.judge(task, epoch, worker) else { return };
-        let name = cluster.roster.get(worker).map_or("", |w| &w.name);
-        slab.handing.remove(&place);
-        let given_up = slab.queue.fail(place, epoch, worker, name, reason, &cluster.config);
-        self.give_up(given_up);
-        self.progress(cluster);
-    }
-
-    /// These tasks are given up: their pixels stay as the slabs before left them.
-    pub(crate) fn give_up(&mut self, places: Vec<u32>) {
+    /// Gives tasks up: their pixels stay as the slabs before left them.
+    fn give_up(&mut self, places: Vec<u32>, slab: usize) {
         for place in places {
-            let slab = self.slab.as_mut().expect("a task that is given up is of this slab");
-            slab.queue.finish(place, End::Poisoned);
-            let task = &slab.queue.tasks[place as usize];
+            let table = &mut self.table;
+            table.queue.finish(place, End::Poisoned);
+            let task = &table.queue.tasks[place as usize];
             let rect = task.tile.rect;
             let mut workers: Vec<String> = task.blamed.iter().map(|(_, n)| n.clone()).collect();
             workers.extend(task.failed.iter().map(|(_, n, _)| n.clone()));
@@ -686,10 +301,10 @@ impl Frame {
             reasons.extend(task.failed.iter().map(|(_, n, reason)| format!("{n}: {reason}")));
             let reason = reasons.join("; ");
             self.ledger.poisoned.push(PoisonedTile {
-                slab: self.at as u32,
+                slab: slab as u32,
                 x: rect.x0 as u32,
                 y: rect.y0 as u32,
-                size: slab.cut.edge_of(&rect),
+                size: table.cut.edge_of(&rect),
                 workers: workers.clone(),
             });
             self.ledger.spans.push(Span {
@@ -697,104 +312,364 @@ impl Frame {
                 category: "tile",
                 worker: None,
                 thread: 0,
-                start: slab.began,
-                end: slab.began,
+                start: self.phase_began,
+                end: self.phase_began,
                 args: vec![("workers", workers.join(", ")), ("reason", reason.clone())],
             });
             self.last_reason = format!(
-                "no tile could be rendered; tile {},{} of slab {}: {reason}",
-                rect.x0, rect.y0, self.at,
+                "no tile could be rendered; tile {},{} of slab {slab}: {reason}",
+                rect.x0, rect.y0,
             );
         }
     }
+}
 
-    /// A worker came.
-    pub(crate) fn joined(&mut self, cluster: &Cluster, id: WorkerId, now: Micros) {
-        if let Some(worker) = cluster.roster.get(id) {
-            self.ledger.open_account(id, worker, now);
+impl Frame {
+    /// Begins a frame. `lane`: the lane of workers that renders it, if not all do. `sole`: no other
+    /// frame is in flight or queued.
+    pub(crate) fn start(
+        job: Box<FrameJob>,
+        lane: Option<u32>,
+        sole: bool,
+        cluster: &mut Cluster,
+        clock: &dyn Clock,
+    ) -> Self {
+        let began = clock.now();
+        let by_region = uses_regions(&job);
+        cluster.residency.open(job.scene.bricks, &job.bricks, by_region);
+        let core = FrameCore::new(job, sole, cluster, began);
+        let mut frame = match by_region {
+            true => Frame::Region(Box::new(RegionFrame::new(core, lane))),
+            false => Frame::Slab(Box::new(SlabFrame::new(core))),
+        };
+        frame.core_mut().ledger.cull_us += clock.now().saturating_sub(began);
+        frame
+    }
+
+    pub(crate) fn core(&self) -> &FrameCore {
+        match self {
+            Frame::Slab(frame) => &frame.core,
+            Frame::Region(frame) => &frame.core,
         }
     }
 
-    /// Leases of this slab that a worker has, in the order in which it got them, and how many of
-    /// them it is probably running.
-    fn probably(&self, id: WorkerId, threads: u32) -> (Vec<(u32, Epoch)>, usize) {
-        let Some(slab) = &self.slab else { return (Vec::new(), 0) };
-        let mut running = 0;
-        let mut leases = Vec::new();
-        for (i, lent) in self.lent.get(id).into_iter().flatten().enumerate() {
-            if let Some(place) = slab.queue.place(lent.task) {
-                leases.push((place, lent.epoch));
-                running += usize::from(i < threads as usize);
+    pub(crate) fn core_mut(&mut self) -> &mut FrameCore {
+        match self {
+            Frame::Slab(frame) => &mut frame.core,
+            Frame::Region(frame) => &mut frame.core,
+        }
+    }
+
+    pub(crate) fn as_region(&self) -> Option<&RegionFrame> {
+        match self {
+            Frame::Slab(_) => None,
+            Frame::Region(frame) => Some(frame),
+        }
+    }
+
+    pub(crate) fn as_region_mut(&mut self) -> Option<&mut RegionFrame> {
+        match self {
+            Frame::Slab(_) => None,
+            Frame::Region(frame) => Some(frame),
+        }
+    }
+
+    /// Index of the current slab, and number of slabs.
+    fn slab(&self) -> (usize, usize) {
+        match self {
+            Frame::Slab(frame) => frame.position(),
+            Frame::Region(_) => (0, 1),
+        }
+    }
+
+    /// Advances as far as possible.
+    pub(crate) fn step(
+        &mut self,
+        cluster: &mut Cluster,
+        context: StepContext,
+        clock: &dyn Clock,
+    ) -> Step {
+        loop {
+            let core = self.core();
+            match core.stage {
+                Stage::Done => return Step::Done,
+                Stage::Drawing if core.table.queue.open() > 0 => {
+                    match self {
+                        Frame::Slab(frame) => frame.dispatch(cluster, context, clock.now()),
+                        Frame::Region(frame) => frame.dispatch(cluster, context, clock.now()),
+                    }
+                    return Step::Waits;
+                }
+                Stage::Drawing => {
+                    let tried = !core.table.queue.tasks.is_empty();
+                    match self {
+                        Frame::Slab(frame) => frame.end_slab(cluster, clock.now()),
+                        Frame::Region(frame) => frame.end_regions(clock.now()),
+                    }
+                    let core = self.core_mut();
+                    if tried && !core.any_result {
+                        return Step::Failed(std::mem::take(&mut core.last_reason));
+                    }
+                }
+                // How a frame is cut depends on the number of threads.
+                Stage::Waiting if cluster.roster.threads() == 0 => return Step::Waits,
+                Stage::Waiting => {
+                    let began = clock.now();
+                    match self {
+                        Frame::Slab(frame) => frame.begin_slab(cluster, began),
+                        Frame::Region(frame) => frame.begin_regions(cluster, began),
+                    }
+                    self.core_mut().ledger.cull_us += clock.now().saturating_sub(began);
+                }
             }
         }
-        (leases, running)
     }
 
-    /// A worker leaves when it has done what it has begun.
-    pub(crate) fn leaving(&mut self, id: WorkerId, threads: u32) {
-        let (leases, running) = self.probably(id, threads);
-        if let Some(slab) = &mut self.slab {
-            let not_begun: Vec<_> = leases[running..].iter().map(|l| l.0).collect();
-            slab.queue.share_queued(&not_begun);
+    /// Whether the last phase ended.
+    pub(crate) fn is_done(&self) -> bool {
+        self.core().stage == Stage::Done
+    }
+
+    /// Whether a worker has this lease of the frame.
+    pub(crate) fn has_lent(&self, worker: WorkerId, task: TaskId, epoch: Epoch) -> bool {
+        self.core().table.has_lent(worker, task, epoch)
+    }
+
+    /// Takes a result. Returns when its tile was rendered, if it counts.
+    ///
+    /// # Errors
+    /// The worker's message is a lie; what is wrong with it.
+    pub(crate) fn result(
+        &mut self,
+        cluster: &mut Cluster,
+        worker: WorkerId,
+        result: TileResult,
+        clock: &dyn Clock,
+    ) -> Result<Option<(Micros, Micros)>, String> {
+        let now = clock.now();
+        let (slab, _) = self.slab();
+        let by_region = self.as_region().is_some();
+        let core = self.core_mut();
+        let before = core.table.note_answer(worker, now);
+        let lent = core.take_answered(cluster, worker, result.task, result.epoch);
+        let verdict = match &lent {
+            Some(_) => core.table.queue.judge(result.task, result.epoch, worker),
+            None => Verdict::Dead,
+        };
+        let who = cluster.roster.get(worker);
+        let (Verdict::Counts(place, lease), Some(who)) = (verdict, who) else {
+            cluster.totals.dropped_results += 1;
+            if result.task >= core.first_task {
+                core.ledger.dropped_results += 1;
+            }
+            return Ok(None);
+        };
+        let tile = core.table.tile(place);
+        let cost = result.region.as_ref().filter(|_| by_region);
+        let checked = match &result.pixels {
+            Pixels::Sums(sums) => check_sums(tile, sums, core.finish),
+            Pixels::Finished(leaves) => check_leaves(tile, leaves, core.finish),
+        };
+        let bricks = core.job.bricks.len();
+        if let Err(lie) = checked.and_then(|()| check_cost(cost, tile, bricks)) {
+            // Its other leases go back when it is dropped; this one it has just answered.
+            let lease = [(place, result.epoch)];
+            let given_up = core.table.queue.lose(worker, "", &lease, 0, &cluster.config);
+            core.give_up(given_up, slab);
+            return Err(lie);
+        }
+        let rendered = place_in_time(who, &result.times, lease.sent, now);
+        let Rendered { start, end, .. } = rendered;
+        let (name, thread) = (who.name.clone(), result.times.thread.min(who.threads - 1));
+        let edge = core.table.cut.edge_of(&tile);
+        let est = core.table.cut.tiles[place as usize].est;
+        let lasted = now.saturating_sub(lease.sent.max(before));
+        core.pace.note(est, end - start, lasted);
+        core.any_result = true;
+        core.ledger.add_result_bytes(result.bytes);
+        core.ledger.add_rendering(worker, &rendered, &result.counters);
+        core.rendered.push(RenderedTile {
+            corner: [tile.x0, tile.y0],
+            edge,
+            thread: (worker, thread),
+            lacked_bricks_us: result.times.ready_us.saturating_sub(result.times.received_us),
+            start,
+            end,
+            arrived: now,
+        });
+        let mut bricks_used = lent.map_or(0, |l| l.bricks.len());
+        if let Some(cost) = cost {
+            bricks_used = cost.touched.len();
+            for &i in &cost.touched {
+                core.brick_use.note(&core.job, i as usize);
+            }
+            core.ledger.add_region_cost(worker, cost);
+        }
+        core.ledger.spans.tile(spans::Tile {
+            corner: [tile.x0, tile.y0],
+            worker: name.clone(),
+            thread,
+            start,
+            end,
+            slab,
+            edge,
+            est,
+            bricks: bricks_used,
+            attempt: result.epoch.0,
+        });
+        match self {
+            Frame::Slab(frame) => frame.rendered(tile, result.pixels, (worker, thread), end),
+            Frame::Region(frame) => {
+                frame.rendered(cluster, place, worker, end - start, result.pixels, result.region);
+            }
+        }
+        let core = self.core_mut();
+        core.ledger.composite_us += clock.now().saturating_sub(now);
+        core.table.queue.finish(place, End::Done { worker: name, render_us: end - start });
+        self.report_progress(cluster);
+        Ok(Some((start, end)))
+    }
+
+    /// Queues a progress report.
+    pub(crate) fn report_progress(&self, cluster: &mut Cluster) {
+        let core = self.core();
+        let total = core.table.queue.all();
+        let (slab, slabs) = self.slab();
+        cluster.out.push_back(Action::Progress {
+            frame: core.job.frame,
+            done: total - core.table.queue.open(),
+            total,
+            slab: slab as u32,
+            slabs: slabs as u32,
+        });
+    }
+
+    /// Takes back a task that a worker refused.
+    pub(crate) fn failed(
+        &mut self,
+        cluster: &mut Cluster,
+        worker: WorkerId,
+        task: TaskId,
+        epoch: Epoch,
+        reason: String,
+    ) {
+        let (slab, _) = self.slab();
+        let core = self.core_mut();
+        if core.take_answered(cluster, worker, task, epoch).is_none() {
+            return;
+        }
+        let verdict = core.table.queue.judge(task, epoch, worker);
+        let Verdict::Counts(place, _) = verdict else { return };
+        let name = cluster.roster.get(worker).map_or("", |w| &w.name);
+        let queue = &mut core.table.queue;
+        let given_up = queue.fail(place, epoch, worker, name, reason, &cluster.config);
+        core.give_up(given_up, slab);
+        if let Some(region) = self.as_region_mut() {
+            region.splits.forget_question(place);
+        }
+        self.report_progress(cluster);
+    }
+
+    /// Takes a piece of a region that a worker gave away.
+    ///
+    /// # Errors
+    /// The worker's message is a lie; what is wrong with it.
+    pub(crate) fn handed_over(
+        &mut self,
+        cluster: &mut Cluster,
+        worker: WorkerId,
+        piece: RegionSplit,
+        now: Micros,
+    ) -> Result<(), String> {
+        let core = self.core();
+        if core.stage != Stage::Drawing {
+            return Ok(());
+        }
+        let verdict = core.table.queue.judge(piece.task, piece.epoch, worker);
+        let Verdict::Counts(place, lease) = verdict else { return Ok(()) };
+        let Some(region) = self.as_region_mut() else {
+            return Err("it gave away a piece of a tile that nobody asked for".into());
+        };
+        if region.take_piece(cluster, worker, place, lease, piece, now)? {
+            self.report_progress(cluster);
+        }
+        Ok(())
+    }
+
+    /// Opens the account of a worker that joined.
+    pub(crate) fn joined(&mut self, cluster: &Cluster, id: WorkerId, now: Micros) {
+        if let Some(worker) = cluster.roster.get(id) {
+            self.core_mut().ledger.open_account(id, worker, now);
         }
     }
 
-    /// A worker is gone. `blame` says whether a task may have killed it; as many as it had
-    /// `threads` for were probably running. The caller has not taken its bricks off the books yet.
+    /// Shares the tasks that a leaving worker has not begun.
+    pub(crate) fn leaving(&mut self, id: WorkerId, threads: u32) {
+        let core = self.core_mut();
+        let (leases, running) = core.running_leases(id, threads);
+        let not_begun: Vec<_> = leases[running..].iter().map(|l| l.0).collect();
+        core.table.queue.share_queued(&not_begun);
+    }
+
+    /// Takes back the leases of a lost worker. `blame`: a task may have killed it. `threads`: as
+    /// many leases were probably running. The caller has not removed its bricks from the books yet.
     pub(crate) fn lost(
         &mut self,
         cluster: &mut Cluster,
         id: WorkerId,
         worker: &crate::state::workers::Worker,
-        (blame, threads): (bool, u32),
+        blame: bool,
+        threads: u32,
         now: Micros,
     ) {
-        // A frame that is done and waits for one before it is over.
-        let now = self.ended.unwrap_or(now);
-        let (leases, running) = self.probably(id, threads);
-        self.lent.remove(id);
-        self.told.remove(&id);
+        let (slab, _) = self.slab();
+        if let Some(region) = self.as_region_mut() {
+            region.splits.forget_worker(id);
+        }
+        let core = self.core_mut();
+        // A frame that is done waits for earlier ones to be done.
+        let now = core.ended.unwrap_or(now);
+        let (leases, running) = core.running_leases(id, threads);
+        core.table.remove(id);
+        core.announced_to.remove(&id);
         if let Some(transfer) = cluster.residency.transfer(id) {
-            self.ledger.transfer_ended(id, transfer, now);
+            core.ledger.transfer_ended(id, transfer, now);
         }
-        self.ledger.close_account(id, now);
-        if let Some(slab) = &mut self.slab {
-            slab.handing.retain(|_, (asked, _)| *asked != id);
+        core.ledger.close_account(id, now);
+        if core.stage == Stage::Drawing {
             let running = if blame { running } else { 0 };
-            let given_up = slab.queue.lose(id, &worker.name, &leases, running, &cluster.config);
-            self.give_up(given_up);
+            let queue = &mut core.table.queue;
+            let given_up = queue.lose(id, &worker.name, &leases, running, &cluster.config);
+            core.give_up(given_up, slab);
         }
     }
 
-    /// Bricks to a worker were under way until now.
-    pub(crate) fn landed(&mut self, id: WorkerId, transfer: Transfer, now: Micros) {
-        self.ledger.transfer_ended(id, transfer, now);
+    /// Records a transfer of bricks that ended.
+    pub(crate) fn transfer_ended(&mut self, id: WorkerId, transfer: Transfer, now: Micros) {
+        self.core_mut().ledger.transfer_ended(id, transfer, now);
     }
 
-    /// Time went on.
+    /// Requeues tasks whose leases expired.
     pub(crate) fn tick(&mut self, now: Micros) {
-        if let Some(slab) = &mut self.slab {
-            slab.queue.requeue_overdue(now);
-        }
+        self.core_mut().table.queue.requeue_overdue(now);
     }
 
-    /// The next lease deadline.
+    /// Returns the next time at which the frame has something to do; `None` once it is done.
     pub(crate) fn next_deadline(&self) -> Option<Micros> {
-        // A frame that is done and waits for one before it has none.
-        let slab = self.slab.as_ref()?;
-        let waits = [self.outlived, self.forborne, self.pieces_at].into_iter().flatten();
-        slab.queue.next_deadline().into_iter().chain(waits).min()
+        let core = self.core();
+        if core.stage != Stage::Drawing {
+            return None;
+        }
+        let steal_at = self.as_region().and_then(|r| r.steal_at);
+        let waits = [core.speculate_at, steal_at].into_iter().flatten();
+        core.table.queue.next_deadline().into_iter().chain(waits).min()
     }
 
-    /// Leases that a worker has.
-    pub(crate) fn leases(&self, id: WorkerId) -> u32 {
-        self.lent.get(id).map_or(0, |l| l.len() as u32)
-    }
-
-    /// The frame is over, in whatever way: workers forget it.
+    /// Ends the frame, in whatever way: workers forget it.
     pub(crate) fn end(&mut self, cluster: &mut Cluster) {
+        let core = self.core_mut();
         let mut busy = BTreeSet::new();
-        for (id, lent) in std::mem::take(&mut self.lent) {
+        for (id, lent) in core.table.take_all() {
             if cluster.roster.get(id).is_some() && !lent.is_empty() {
                 cluster.roster.end_leases(id, lent.len() as u64);
                 busy.insert(id);
@@ -804,8 +679,8 @@ impl Frame {
             }
         }
         cluster.residency.clear_wanted();
-        let frame = self.job.frame;
-        for id in std::mem::take(&mut self.told) {
+        let frame = core.job.frame;
+        for id in std::mem::take(&mut core.announced_to) {
             if busy.contains(&id) {
                 cluster.send(id, ToWorker::EndFrame { frame });
             } else if let Some(w) = cluster.roster.get_mut(id) {
@@ -815,39 +690,47 @@ impl Frame {
         }
     }
 
-    /// The finished picture with what it cost.
-    pub(crate) fn finish(mut self, cluster: &mut Cluster, now: Micros) -> Action {
-        let now = self.ended.unwrap_or(now);
+    /// Returns the finished picture with what it cost.
+    pub(crate) fn finish(self, cluster: &mut Cluster, now: Micros) -> Action {
+        let schedule = if self.as_region().is_some() { Schedule::Region } else { Schedule::Slab };
+        let mut core = match self {
+            Frame::Slab(frame) => frame.core,
+            Frame::Region(frame) => frame.core,
+        };
+        let now = core.ended.unwrap_or(now);
         for (id, transfer) in cluster.residency.split_transfers(now) {
             if transfer.since < now {
-                self.ledger.transfer_ended(id, transfer, now);
+                core.ledger.transfer_ended(id, transfer, now);
             }
         }
         for (id, _) in cluster.roster.iter() {
-            self.ledger.set_held(id, cluster.residency.held_of_set(id, self.job.scene.bricks));
+            let held = cluster.residency.held_of_set(id, core.job.scene.bricks);
+            core.ledger.set_held(id, held);
         }
-        let mut bricks =
-            BrickStats { relevant: self.job.bricks.len() as u64, ..BrickStats::default() };
-        (bricks.needed, bricks.needed_voxels) = self.needed;
-        let relevant = self.relevant;
-        let quality = self.job.scene.quality;
-        let schedule = if self.by_region() { Schedule::Region } else { Schedule::Slab };
+        let bricks = BrickStats {
+            relevant: core.job.bricks.len() as u64,
+            needed: core.brick_use.bricks,
+            needed_voxels: core.brick_use.voxels,
+            ..BrickStats::default()
+        };
+        let quality = core.job.scene.quality;
+        let relevant = core.relevant_voxels;
         let (stats, spans) =
-            self.ledger.close(self.job.number, schedule, quality, relevant, bricks, now);
-        let frame = self.job.frame;
-        Action::FrameDone { frame, state: Box::new(self.state), stats: Box::new(stats), spans }
+            core.ledger.close(core.job.number, schedule, quality, relevant, bricks, now);
+        let (frame, state) = (core.job.frame, Box::new(core.picture));
+        Action::FrameDone { frame, state, stats: Box::new(stats), spans }
     }
 }
 
-/// Sends a worker what it is to be sent, and tells it what to drop.
-pub(crate) fn carry(
+/// Sends a worker the bricks it is to be sent, and tells it which to drop.
+pub(crate) fn send_bricks(
     cluster: &mut Cluster,
     mut ledger: Option<&mut Ledger>,
     id: WorkerId,
     now: Micros,
 ) {
     let roster = &mut cluster.roster;
-    let mut grounded = cluster.residency.transfer(id).is_none();
+    let mut is_first = cluster.residency.transfer(id).is_none();
     let actions = cluster.residency.flush(id, now, &mut || roster.ping(id, now));
     for action in actions {
         match action {
@@ -856,7 +739,7 @@ pub(crate) fn carry(
                 cluster.send(id, ToWorker::Ping { nonce });
             }
             ResidencyAction::Send { set, bricks, bytes, over_budget } => {
-                cluster.link_use.leave(bytes, std::mem::take(&mut grounded), now);
+                cluster.link_use.bricks_sent(bytes, std::mem::take(&mut is_first), now);
                 if let Some(ledger) = &mut ledger {
                     ledger.bricks_sent(id, bricks.len() as u64, bytes);
                 }
@@ -867,39 +750,21 @@ pub(crate) fn carry(
     }
 }
 
-/// Where each brick lies in a frame's picture.
-fn outline(job: &FrameJob) -> impl Fn(u32) -> Option<Rect> {
-    |place| job.view.project_rect(&job.bricks[place as usize].tight)
-}
-
-/// Whether what a stranger says of a region can be counted.
+/// Checks a peer's figures of a region.
 fn check_cost(cost: Option<&RegionCost>, tile: Rect, bricks: usize) -> Result<(), String> {
-    let sampled =
-        cost.map_or(0, |c| c.sampled.to_array().map(|s| s.pixels).into_iter().max().unwrap_or(0));
+    let Some(cost) = cost else { return Ok(()) };
+    let sampled = cost.sampled.to_array().map(|s| s.pixels).into_iter().max().unwrap_or(0);
     if sampled as usize > tile.area() {
-        let (n, area) = (sampled, tile.area());
-        return Err(format!("a result sampled {n} pixels of a tile of {area}"));
+        let area = tile.area();
+        return Err(format!("a result sampled {sampled} pixels of a tile of {area}"));
     }
-    let beyond = cost.and_then(|c| c.touched.iter().max()).filter(|&&i| i as usize >= bricks);
-    match beyond {
+    match cost.touched.iter().max().filter(|&&i| i as usize >= bricks) {
         Some(i) => Err(format!("a result touched brick {i} of {bricks}")),
         None => Ok(()),
     }
 }
 
-/// A brick of a frame is needed: once each is counted.
-fn note_needed(ever: &mut [bool], needed: &mut (u64, u64), job: &FrameJob, place: usize) {
-    if !std::mem::replace(&mut ever[place], true) {
-        *needed = (needed.0 + 1, needed.1 + u64::from(job.bricks[place].voxels));
-    }
-}
-
-/// What the results of a frame's tasks are finished to.
-pub(crate) fn finish_of(job: &FrameJob) -> Option<PixelEncoding> {
-    job.finish.filter(|_| goes_by_region(job))
-}
-
-/// Whether a stranger's finished pixels are those of a tile.
+/// Checks that a peer's finished pixels are those of a tile.
 fn check_leaves(
     tile: Rect,
     leaves: &SparseTile,
@@ -923,8 +788,8 @@ fn check_leaves(
     leaves.check().map_err(|_| "a result's leaves do not fit each other".into())
 }
 
-/// Whether a stranger's pixels are those of a tile.
-pub(crate) fn check(
+/// Checks that a peer's sums are those of a tile.
+pub(crate) fn check_sums(
     tile: Rect,
     pixels: &TilePixels,
     finish: Option<PixelEncoding>,
@@ -956,7 +821,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_pixel_is_shut_below_eps_and_not_at_it() {
+    fn pixel_is_shut_below_eps_and_not_at_it() {
         let eps = 1.0 / 512.0;
         assert!(!is_shut(511.0 / 512.0, eps), "transmittance is eps");
         assert!(is_shut((511.0f32 / 512.0).next_up(), eps));
@@ -965,9 +830,9 @@ mod tests {
     }
 
     #[test]
-    fn results_of_a_mad_clock_stay_between_lease_and_arrival() {
+    fn task_times_of_a_wrong_clock_stay_between_lease_and_arrival() {
         let mut roster = crate::state::workers::Roster::default();
-        roster.join(WorkerId(1), "mad".into(), (1, false), 0);
+        roster.join(WorkerId(1), "mad".into(), 1, false, 0);
         let worker = roster.get(WorkerId(1)).expect("it joined");
         for (start_us, end_us) in [(0, u64::MAX), (u64::MAX, 0), (5, 6), (7, 7)] {
             let times = slabcast_common::message::TaskTimes {

@@ -3,8 +3,11 @@
 
 pub(crate) mod cluster;
 pub(crate) mod frame;
+pub(crate) mod leases;
+pub(crate) mod region_frame;
+pub(crate) mod region_tiles;
 pub(crate) mod residency;
+pub(crate) mod slab_frame;
 pub(crate) mod task_queue;
-pub(crate) mod tile_map;
 pub(crate) mod worker_map;
 pub(crate) mod workers;

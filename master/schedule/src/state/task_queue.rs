@@ -42,8 +42,6 @@ pub(crate) enum End {
     Done { worker: Arc<str>, render_us: Micros },
     /// Given up.
     Poisoned,
-    /// Replaced by its parts before any worker was lent it.
-    Cut,
 }
 
 /// One tile to render.
@@ -62,9 +60,6 @@ pub(crate) struct Task {
     /// State in which another worker gave the piece away; `None`: it starts from nothing.
     pub(crate) begun: Option<Arc<Checkpoint>>,
 }
-
-/// Limit: task ids, and keys in the queue's order, reserved for a tile and its parts.
-pub(crate) const NAMES_PER_TILE: i64 = 5;
 
 impl Task {
     fn new(tile: Macrotile, order: i64) -> Task {
@@ -118,8 +113,6 @@ pub(crate) struct TaskQueue {
     front: i64,
     deadlines: BTreeSet<(Micros, u32, Epoch)>,
     open: u32,
-    /// Tasks replaced by their parts.
-    cut: u32,
     /// Workers lost meanwhile that a task may have killed.
     losses: usize,
     /// Leases beyond the first of a task.
@@ -129,15 +122,14 @@ pub(crate) struct TaskQueue {
 impl TaskQueue {
     /// Makes a queue of tiles in this order; their ids count up from `first`.
     pub(crate) fn new(first: TaskId, tiles: &[Macrotile]) -> Self {
-        let task = |(&tile, order): (&Macrotile, i64)| Task::new(tile, order * NAMES_PER_TILE);
+        let task = |(&tile, order): (&Macrotile, i64)| Task::new(tile, order);
         TaskQueue {
             first,
             tasks: tiles.iter().zip(0..).map(task).collect(),
-            waiting: (0..).step_by(NAMES_PER_TILE as usize).zip(0..tiles.len() as u32).collect(),
+            waiting: (0..).zip(0..tiles.len() as u32).collect(),
             front: -1,
             deadlines: BTreeSet::new(),
             open: tiles.len() as u32,
-            cut: 0,
             losses: 0,
             retries: 0,
         }
@@ -148,29 +140,9 @@ impl TaskQueue {
         self.open
     }
 
-    /// Returns the number of tasks that are not replaced by parts.
+    /// Returns the number of tasks.
     pub(crate) fn all(&self) -> u32 {
-        self.tasks.len() as u32 - self.cut
-    }
-
-    /// Replaces a waiting task that was never lent by its parts, in their order. The caller
-    /// reserves [`NAMES_PER_TILE`] ids for each tile.
-    pub(crate) fn cut(&mut self, place: u32, parts: &[Macrotile]) {
-        let task = &mut self.tasks[place as usize];
-        assert!(
-            !task.was_leased() && parts.len() < NAMES_PER_TILE as usize,
-            "only whole tiles are cut"
-        );
-        let order = task.queued.take().expect("a task is cut while it waits");
-        task.end = End::Cut;
-        self.waiting.remove(&order);
-        self.cut += 1;
-        self.open += parts.len() as u32;
-        self.open -= 1;
-        for (&tile, order) in parts.iter().zip(order..) {
-            self.waiting.insert(order, self.tasks.len() as u32);
-            self.tasks.push(Task::new(tile, order));
-        }
+        self.tasks.len() as u32
     }
 
     /// Queues a piece of a tile in front of all. Returns its index. The caller reserves its id.
@@ -546,27 +518,6 @@ mod tests {
         // It had begun it after all.
         q.finish(2, done());
         assert_eq!(take(&mut q, 2, &[1], 0), (3, Epoch(0)));
-    }
-
-    #[test]
-    fn parts_replace_a_tile_that_was_never_lent() {
-        let c = Config::default();
-        let mut q = queue(3);
-        assert_eq!(take(&mut q, 1, &[], 0), (0, Epoch(0)));
-        let tile = |est| Macrotile { rect: Rect::new(0, 0, 8, 8), est };
-        q.cut(1, &[tile(30), tile(20), tile(10)]);
-        assert_eq!((q.open(), q.all(), q.waiting()), (5, 5, 4));
-        assert_eq!(q.all_waiting().collect::<Vec<_>>(), [3, 4, 5, 2], "before what came after it");
-        assert_eq!((q.place(TaskId(15)), q.place(TaskId(16))), (Some(5), None));
-        assert_eq!(q.judge(TaskId(11), Epoch(0), WorkerId(1)), Verdict::Dead);
-        // They are tasks like any other.
-        assert_eq!(take(&mut q, 2, &[], 0), (3, Epoch(0)));
-        assert!(q.lose(WorkerId(2), "two", &[(3, Epoch(0))], 1, &c).is_empty());
-        assert_eq!(take(&mut q, 3, &[], 0), (3, Epoch(1)));
-        for place in [0, 3, 4, 5, 2] {
-            q.finish(place, done());
-        }
-        assert_eq!((q.open(), q.waiting(), q.next_deadline()), (0, 0, None));
     }
 
     #[test]

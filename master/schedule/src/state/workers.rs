@@ -14,7 +14,6 @@
 //! in a socket. So when the time between two events is longer than two heartbeats, which can't
 //! happen to a driver that keeps `next_deadline`, the excess is added to everybody's account.
 
-use crate::policy::active_set;
 use crate::state::worker_map::WorkerMap;
 use crate::{Config, Micros};
 use slabcast_common::brick::BrickSetKey;
@@ -33,6 +32,9 @@ const DRIFT: f64 = 100e-6;
 /// Limit: pings without a pong while the worker lives on other messages. 1024 heartbeats are a
 /// quarter of an hour; a worker that owes more will not answer the oldest.
 const MAX_PINGS: usize = 1024;
+
+/// Limit: lanes of workers that render overlapping frames in turn.
+pub(crate) const LANES: u32 = 2;
 
 /// One worker.
 #[derive(Debug)]
@@ -101,7 +103,7 @@ impl Worker {
 }
 
 /// All workers.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(crate) struct Roster {
     workers: WorkerMap<Worker>,
     next_nonce: u64,
@@ -116,8 +118,23 @@ pub(crate) struct Roster {
     idle: usize,
     /// Counts changes of who is active.
     changes: u64,
-    /// How often the active set is halved.
-    halved: u32,
+    /// Most workers that are active.
+    limit: usize,
+}
+
+impl Default for Roster {
+    fn default() -> Self {
+        Roster {
+            workers: WorkerMap::default(),
+            next_nonce: 0,
+            watched: None,
+            quiet_until: 0,
+            threads: 0,
+            idle: 0,
+            changes: 0,
+            limit: usize::MAX,
+        }
+    }
 }
 
 impl Roster {
@@ -125,7 +142,8 @@ impl Roster {
         &mut self,
         id: WorkerId,
         name: String,
-        (threads, is_local): (u32, bool),
+        threads: u32,
+        is_local: bool,
         now: Micros,
     ) {
         let worker = Worker {
@@ -161,10 +179,17 @@ impl Roster {
         Some(worker)
     }
 
-    /// Halves the active set `often` times.
-    pub(crate) fn halve(&mut self, often: u32) {
-        if self.halved != often {
-            self.halved = often;
+    /// Returns the number of workers that are not leaving.
+    pub(crate) fn staying(&self) -> usize {
+        self.workers.values().filter(|w| !w.leaving).count()
+    }
+
+    /// Makes `limit` workers active, and holds the others in reserve. Where all are active,
+    /// newcomers are too.
+    pub(crate) fn activate(&mut self, limit: usize) {
+        let limit = if limit < self.staying() { limit } else { usize::MAX };
+        if self.limit != limit {
+            self.limit = limit;
             self.choose();
         }
     }
@@ -183,17 +208,16 @@ impl Roster {
     /// once; of equal ones every second, fourth, eighth pair, so that what was two neighbours'
     /// becomes one's.
     fn choose(&mut self) {
-        if self.halved == 0 && self.in_reserve() == 0 {
+        if self.limit >= self.workers.len() && self.in_reserve() == 0 {
             return;
         }
         let key = |id: WorkerId, w: &Worker| (Reverse(w.threads), (id.0 / 2).reverse_bits(), id);
         let staying = self.workers.iter().filter(|(_, w)| !w.leaving);
         let mut order: Vec<_> = staying.map(|(id, w)| key(id, w)).collect();
         order.sort_unstable();
-        let drawing = active_set::drawing(order.len(), self.halved);
         for (i, (Reverse(threads), _, id)) in order.into_iter().enumerate() {
             let w = self.workers.get_mut(id).expect("just listed");
-            let is_spare = i >= drawing;
+            let is_spare = i >= self.limit;
             if std::mem::replace(&mut w.is_spare, is_spare) != is_spare {
                 let threads = u64::from(threads);
                 self.threads =
@@ -256,6 +280,27 @@ impl Roster {
     /// Returns the active workers, by id.
     pub(crate) fn active(&self) -> impl Iterator<Item = (WorkerId, &Worker)> {
         self.iter().filter(|(_, w)| w.is_active())
+    }
+
+    /// Returns the active workers of a lane with their threads, by id; `None`: all active workers.
+    pub(crate) fn lane(&self, lane: Option<u32>) -> impl Iterator<Item = (WorkerId, u64)> {
+        let threads = self.active().map(|(id, w)| (id, u64::from(w.threads)));
+        threads.filter(move |(id, _)| {
+            lane.is_none_or(|lane| id.0 % u64::from(LANES) == u64::from(lane))
+        })
+    }
+
+    /// Whether most active threads are on the master's host.
+    pub(crate) fn is_mostly_local(&self) -> bool {
+        let local = self.active().filter(|(_, w)| w.is_local).map(|(_, w)| u64::from(w.threads));
+        2 * local.sum::<u64>() > self.threads
+    }
+
+    /// Returns the longest round trip to an active worker in microseconds, by each one's best ping;
+    /// 0 before any pong.
+    pub(crate) fn round_trip_us(&self) -> f64 {
+        let half = self.active().filter_map(|(_, w)| Some(w.offset?.half_rtt)).max();
+        2.0 * half.unwrap_or(0) as f64
     }
 
     /// Returns the number of render threads of active workers.
@@ -363,7 +408,7 @@ mod tests {
     fn clock_offset_comes_from_the_shortest_round_trip() {
         let mut r = Roster::default();
         let w = WorkerId(1);
-        r.join(w, "a".into(), (1, false), 0);
+        r.join(w, "a".into(), 1, false, 0);
         assert_eq!(r.get(w).unwrap().to_master(5), None);
         // The worker's clock is 1,000,000 ahead. A slow, lopsided pong first.
         let n = r.ping(w, 100);
@@ -383,7 +428,7 @@ mod tests {
         let mut r = Roster::default();
         let counted = |r: &Roster| r.active().map(|(_, w)| u64::from(w.threads)).sum::<u64>();
         for (id, threads) in [(1, 3), (2, 0), (3, u32::MAX)] {
-            r.join(WorkerId(id), "a".into(), (threads, false), 0);
+            r.join(WorkerId(id), "a".into(), threads, false, 0);
         }
         assert_eq!((r.threads(), counted(&r)), (4 + u64::from(MAX_THREADS), r.threads()));
         assert!(r.leaves(WorkerId(3)) && !r.leaves(WorkerId(3)) && !r.leaves(WorkerId(9)));
@@ -398,11 +443,11 @@ mod tests {
     fn active_set_prefers_large_workers_then_every_second_pair() {
         let mut r = Roster::default();
         for id in 0..16 {
-            r.join(WorkerId(id), "a".into(), (1, false), 0);
+            r.join(WorkerId(id), "a".into(), 1, false, 0);
         }
         let drawing = |r: &Roster| r.active().map(|(id, _)| id.0).collect::<Vec<_>>();
         let before = r.changes();
-        r.halve(1);
+        r.activate(8);
         assert_eq!(drawing(&r), [0, 1, 4, 5, 8, 9, 12, 13]);
         assert_eq!((r.threads(), r.in_reserve()), (8, 8));
         assert_ne!(r.changes(), before);
@@ -410,13 +455,13 @@ mod tests {
         // Somebody is lost, and somebody leaves: others take their places at once.
         r.remove(WorkerId(0));
         r.leaves(WorkerId(4));
-        assert_eq!(drawing(&r).len(), 7);
+        assert_eq!(drawing(&r).len(), 8);
         assert!(!r.has_in_reserve(WorkerId(4)), "who leaves is nobody's reserve");
-        r.join(WorkerId(20), "large".into(), (8, false), 0);
+        r.join(WorkerId(20), "large".into(), 8, false, 0);
         assert!(drawing(&r).contains(&20), "it has the most threads: {:?}", drawing(&r));
         let counted = r.active().map(|(_, w)| u64::from(w.threads)).sum::<u64>();
         assert_eq!(r.threads(), counted);
-        r.halve(0);
+        r.activate(usize::MAX);
         assert_eq!((drawing(&r).len(), r.in_reserve()), (15, 0));
         assert_eq!(r.threads(), 14 + 8);
     }
@@ -426,7 +471,7 @@ mod tests {
         let mut r = Roster::default();
         let w = WorkerId(1);
         r.watch(0, &config());
-        r.join(w, "a".into(), (1, false), 0);
+        r.join(w, "a".into(), 1, false, 0);
         r.watch(900_000, &config());
         r.watch(60_000_000, &config());
         assert!(r.silent(60_000_000, &config()).is_empty());

@@ -37,7 +37,7 @@ use crate::state::worker_map::WorkerMap;
 pub(crate) use books::Transfer;
 use books::{BrickState, Mode, Set, SetBooks, WorkerBricks, evict, request, send_requested};
 
-/// Tuning (copies): a brick at the corner of four workers' tiles is sent to all of them.
+/// Limit: copies of a brick: one at the corner of four workers' tiles is sent to all of them.
 const COPIES: u128 = 4;
 
 /// Tuning (rounds, one a frame): a brick used in this many rounds before the present one counts as

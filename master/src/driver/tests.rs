@@ -144,7 +144,7 @@ async fn panic_in_a_finisher_fails_the_job_and_the_master_goes_on() {
             assert_eq!(frames, 3);
             done += 1;
         } else {
-            let words = ["finishing the frame panicked", "injected into PixelEncoding"];
+            let words = ["finishing the frame panicked", "injected into Finish"];
             assert!(failed_with(&state, words), "{state:?}");
             failed += 1;
         }

@@ -65,6 +65,15 @@ pub struct ReferenceSheet {
 /// is smooth; at half a vox the rule errs by 1e-9 of the weight (deviation .6), at one by 1e-6.
 const PIECE: f64 = 0.5;
 
+/// The rule's 2 %, squared: below that share of a sheet, the sheet before hardly counts
+/// (docs/design/numerics.md section 1.2). Written out again, since the reference shares no code with
+/// the kernels.
+const FAINT_BEFORE: f64 = 4e-4;
+
+/// The rule's share of a sheet beside the one behind, which fades thin neighbours
+/// (docs/design/numerics.md section 1.2).
+const FADE_BEHIND: f64 = 0.05;
+
 impl Reference {
     /// Returns pixel (x, y), linear premultiplied RGBA, of sheets of the view's thickness
     /// composited by the quality's rule in f64, with nothing rounded and nothing shut.
@@ -340,9 +349,9 @@ fn close(
         let ratio = before[0] / here[0];
         // Through the larger of the two, since ratios may be infinite.
         let share = if ratio > 1.0 {
-            1.0 / (1.0 + 4e-4 / ratio / ratio)
+            1.0 / (1.0 + FAINT_BEFORE / ratio / ratio)
         } else {
-            ratio * ratio / (ratio * ratio + 4e-4)
+            ratio * ratio / (ratio * ratio + FAINT_BEFORE)
         };
         let phi = if tau < 0.02 {
             let series = -1.0 / 80.0 + tau * (1.0 / 360.0 - tau / 2016.0);
@@ -350,7 +359,7 @@ fn close(
         } else {
             a / tau + a * 0.5 - 1.0
         };
-        (left * share, right / (behind[0] + 0.05 * here[0]), phi)
+        (left * share, right / (behind[0] + FADE_BEHIND * here[0]), phi)
     } else {
         (0.0, 0.0, 0.0)
     };

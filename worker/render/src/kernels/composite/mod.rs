@@ -76,6 +76,14 @@ impl Sum for f32 {
     }
 }
 
+/// Weight of the squared sheet against the squared sheet before it in the neighbour-linear rule: the
+/// sheet before counts unless it is below 2 % of this one (docs/design/numerics.md section 1.2).
+pub(crate) const FAINT_BEFORE: f32 = 4e-4;
+
+/// Weight of the sheet beside the one behind it in the neighbour-linear rule: thin, noisy sheets
+/// behind fade out (docs/design/numerics.md section 1.2).
+pub(crate) const FADE_BEHIND: f32 = 0.05;
+
 /// Below this a float sum is taken for nothing: colours over denormal sums lose their digits
 /// (E / tau of a denormal is off by half).
 pub(crate) const FAINTEST: f32 = 1e-30;
@@ -185,13 +193,13 @@ impl Rule {
         let ml = 1.0 / tl.max(h);
         let (ql, qh) = (tl * ml, h * ml);
         // The sheet before counts unless it is below 2 % of this one.
-        let before = self.gain_before * (ql * ql) / (ql * ql + 4e-4 * (qh * qh));
+        let before = self.gain_before * (ql * ql) / (ql * ql + FAINT_BEFORE * (qh * qh));
         let seen = tl > FAINTEST;
         let per_tl = 1.0 / if seen { tl } else { 1.0 };
         let per_tl = if seen { per_tl } else { 0.0 };
         // A thin, noisy sheet behind fades out.
         let unit = 1.0 / tn.max(h);
-        let behind = self.gain_behind / (tn * unit + 0.05 * (h * unit));
+        let behind = self.gain_behind / (tn * unit + FADE_BEHIND * (h * unit));
         Slopes { before, per_tl, behind, unit }
     }
 
@@ -199,8 +207,8 @@ impl Rule {
     /// instead of five, since their products stay below 2e37 and above 2e-5.
     #[inline(always)]
     fn slopes_whole(&self, tl: f32, h: f32, tn: f32) -> Slopes {
-        let squares = tl * tl + 4e-4 * (h * h);
-        let sum = tn + 0.05 * h;
+        let squares = tl * tl + FAINT_BEFORE * (h * h);
+        let sum = tn + FADE_BEHIND * h;
         let some = tl.max(1.0);
         let per_all = 1.0 / (some * (squares * sum));
         Slopes {

@@ -58,7 +58,9 @@ impl<S: Sum, const ROWS: usize> Work for CloseRows<'_, S, ROWS> {
 #[cfg(target_arch = "x86_64")]
 mod wide {
     use crate::kernels::LARGEST;
-    use crate::kernels::composite::{FAINTEST, LANES, ONE, Row, Rule, Sum};
+    use crate::kernels::composite::{
+        FADE_BEHIND, FAINT_BEFORE, FAINTEST, LANES, ONE, Row, Rule, Sum,
+    };
     use crate::kernels::lanes::{Eight, Floats, Sixteen};
     use slabcast_common::math::{LN2, PHI, PHI_SERIES_BELOW, ROUND_F32, TAYLOR};
     use std::slice::from_mut;
@@ -198,9 +200,9 @@ mod wide {
                 let row = &rows[row];
                 let (tl, tn) = (load(&row.before[0], from), load(&row.behind[0], from));
                 let tl_2 = L::mul(tl, tl);
-                let h_2 = L::mul(L::all(4e-4), L::mul(p.raw, p.raw));
+                let h_2 = L::mul(L::all(FAINT_BEFORE), L::mul(p.raw, p.raw));
                 let squares = L::add(tl_2, h_2);
-                let sum = L::add(tn, L::mul(L::all(0.05), p.raw));
+                let sum = L::add(tn, L::mul(L::all(FADE_BEHIND), p.raw));
                 let some = L::most(tl, one);
                 let both = L::mul(squares, sum);
                 let per_all = L::div(one, L::mul(some, both));

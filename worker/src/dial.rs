@@ -217,8 +217,8 @@ async fn carry(
     // How results are compressed, by the frame that came last.
     let uncompressed = Arc::new(AtomicBool::new(false));
     // Encoded on this runtime thread: handing a message to another thread and back takes some 25
-    // us (TRANSPORT.md section 0), and the message of a 64x64 tile 35 us. Of the largest tiles it
-    // takes 0.6 ms, during which a ping waits.
+    // us (docs/design/transport.md section 0), and the message of a 64x64 tile 35 us. Of the
+    // largest tiles it takes 0.6 ms, during which a ping waits.
     let outbound = ReceiverStream::new(replies).map({
         let uncompressed = uncompressed.clone();
         move |message| {
